@@ -25,8 +25,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from capture.devices.wire import Code
-from capture.rig import Caliper
-from rigsim.boxes.controller import Command, Refused, number
+from capture.rig import Rig
+from rigsim.boxes.command import Act, Command, Refused, command_table, number
+from rigsim.boxes.device import Device
+from rigsim.boxes.faults import NO_FAULTS, Faults
 
 CALIPER_CONTROL_PERIOD_S = 5e-3
 """Period in which position and force are looked at while the motor runs, s."""
@@ -46,13 +48,6 @@ COMES_OFF_SHARE = 0.25
 LET_GO_S = 0.25
 """Force that is still beyond the limit so long after the jaws have turned back: let go."""
 
-STATUS_MOVING, STATUS_HOMED, STATUS_INTERLOCK, STATUS_ATTACHED, STATUS_TRIPPED = (
-    16,
-    32,
-    256,
-    512,
-    1024,
-)
 _STEP_PATTERN = re.compile(r"-?[0-9]{1,3}")
 
 
@@ -110,21 +105,17 @@ class _Move:
         return self.from_mm + self.direction * self.speed_mm_per_s * (now - self.start_s)
 
 
-class CaliperUnit:
+class CaliperUnit(Device):
     """State of the caliper's box behind its controller.
 
     Parameters
     ----------
-    caliper
-        Its travel, steps, angles and speed; at most 15 steps either way.
+    rig, faults
+        Its caliper's travel, of which at most 15 steps either way, angles and speed; what is wrong.
     load
         What is between its jaws.
     on_change
         Called with the world time in s after whatever has changed what the jaws hold.
-    stall
-        Probability that a move's motor stalls on the way.
-    home_missed, sensor_dead, interlock, interlock_after
-        See `rigsim.world.faults.Faults`.
     rng
         Where the jaws stand at first, and stalls.
     """
@@ -134,24 +125,20 @@ class CaliperUnit:
 
     def __init__(
         self,
-        caliper: Caliper,
-        load: JawLoad,
+        rig: Rig,
+        load: JawLoad | None,
+        faults: Faults = NO_FAULTS,
         *,
         on_change: Callable[[float], None],
-        stall: float = 0.0,
-        home_missed: bool = False,
-        sensor_dead: bool = False,
-        interlock: bool = False,
-        interlock_after: float = math.inf,
         rng: np.random.Generator,
     ) -> None:
-        self._caliper = caliper
+        super().__init__(rig, faults)
+        if rig.caliper is None or load is None:
+            raise ValueError(f"caliper: got none in rig {rig.name!r}, expected its description")
+        self._caliper = caliper = rig.caliper
         self._load = load
         self._on_change = on_change
-        self._stall = stall
-        self._home_missed = home_missed
-        self._sensor_dead = sensor_dead
-        self._interlock_at = -math.inf if interlock else interlock_after
+        self._stall = faults.jaw_stall
         self._rng = rng
         self.step_min = max(caliper.first_step, -MAX_CAPTURE_STEPS)
         self.step_max = min(caliper.last_step, MAX_CAPTURE_STEPS)
@@ -160,14 +147,12 @@ class CaliperUnit:
             caliper.reading_mm(self.step_min) - half,
             caliper.reading_mm(self.step_max) + half,
         )
-        self.interlock = interlock
         # what stays as it is without power: jaws, ring, and the count of moves
         self.aperture_mm = float(rng.uniform(*self._ends_mm))
         self.angle_deg = caliper.angles_deg[0]
         self._offset_n = float(rng.normal(0.0, FORCE_ZERO_DEVIATION_N))
         self._zero_n = 0.0
         self.moves: list[tuple[float, float]] = []  # when and whereto each began
-        self._events: list[tuple[str, str]] = []
         self._move: _Move | None = None
         self.attached = False
         load.move(self.aperture_mm)
@@ -178,10 +163,8 @@ class CaliperUnit:
 
     def reset(self, now: float, *, power_up: bool) -> None:
         """Return to the settings of power-up: nothing held, no force limit, not homed."""
-        self.go_dark(now)
+        super().reset(now, power_up=power_up)
         if power_up:
-            self._powered_at = now
-            self._events.clear()
             self.last_report = ""
         self.homed = False
         self.limit_n: float | None = None
@@ -204,42 +187,31 @@ class CaliperUnit:
             "control_period_ms": CALIPER_CONTROL_PERIOD_S * 1e3,
         }
 
-    def commands(self) -> Mapping[str, Command]:
+    def commands(self) -> dict[str, Command]:
         """Return the command table: the manual of the box."""
-        return {
-            "CAL:HOME": Command(
-                self._home, armed=True, manual="find the home mark, end at step 0: number"
+        acts: dict[str, Act] = {
+            "CAL:HOME": self._home,
+            "CAL:STEP:ABS": self._step,
+            "CAL:POS?": lambda *_: f"{self.aperture_mm:.3f}" if self.homed else "NONE",
+            "CAL:LAST?": lambda *_: self.last_report or "NONE",
+            "CAL:ANG": self._turn,
+            "CAL:ANG?": lambda *_: (
+                f"{self.angle_deg if self._turning is None else self._turning[1]:g}"
             ),
-            "CAL:STEP:ABS": Command(
-                self._step, "<n>", armed=True, manual="jaws to n steps from home: number"
-            ),
-            "CAL:POS?": Command(self._position, manual="distance of the jaws, mm, or NONE"),
-            "CAL:LAST?": Command(
-                self._last,
-                manual="last move: number, REACHED, FORCE, STALL, DETACHED, NOHOME or STOPPED, "
-                "step, mm, N, us; or NONE",
-            ),
-            "CAL:ANG": Command(
-                self._turn, "<deg>", armed=True, manual="turn empty jaws to one of their angles"
-            ),
-            "CAL:ANG?": Command(self._get_angle, manual="angle aimed at, degrees"),
-            "CAL:ATT": Command(
-                self._attach, armed=True, manual="a person has taped the jaws: tare, and hold"
-            ),
-            "CAL:ATT?": Command(self._is_attached, manual="1 skin is held, 0 not"),
-            "CAL:REL": Command(self._let_go, bare=True, manual="let the skin go at once"),
-            "CAL:FORC?": Command(self._get_force, manual="N, > 0 pulls the jaws together"),
-            "CAL:FORC:LIM": Command(
-                self._set_limit, "<N>", manual="most force, pulling or pushing; no default"
-            ),
-            "CAL:FORC:LIM?": Command(self._get_limit, manual="that limit, N, or NONE"),
+            "CAL:ATT": self._attach,
+            "CAL:ATT?": lambda *_: str(int(self.attached)),
+            "CAL:REL": lambda _, now: self._release(now, "ASKED"),
+            "CAL:FORC?": self._get_force,
+            "CAL:FORC:LIM": self._set_limit,
+            "CAL:FORC:LIM?": lambda *_: "NONE" if self.limit_n is None else f"{self.limit_n:g}",
         }
+        return command_table("caliper", acts)
 
     # time -------------------------------------------------------------------------------------
 
     def deadline(self) -> float:
         """Return when the box will next look at a move, or something ends by itself, in s."""
-        due = math.inf if self.interlock else self._interlock_at
+        due = self._stop_opens_s()
         if self._move is not None:
             due = min(due, self._move.next_s)
         if self._turning is not None:
@@ -249,7 +221,7 @@ class CaliperUnit:
     def advance(self, now: float) -> None:
         """Let time pass up to `now`, in s."""
         while (due := self.deadline()) <= now:
-            if not self.interlock and self._interlock_at <= due:
+            if self._stop_opens_s() <= due:
                 self.interlock = True
                 self._release(due, "INTERLOCK")
             if self._turning is not None and self._turning[0] <= due:
@@ -259,11 +231,6 @@ class CaliperUnit:
             if self._move is not None and self._move.next_s <= due:
                 self._control(self._move, due)
 
-    def take_events(self) -> list[tuple[str, str]]:
-        """Return and forget what the box has to say unasked: name and payload."""
-        events, self._events = self._events, []
-        return events
-
     def go_dark(self, now: float) -> None:
         """Let the skin go and stop whatever moves."""
         self._release(now, "DARK")
@@ -272,14 +239,10 @@ class CaliperUnit:
         """Tell whether jaws or ring move."""
         return self._move is not None or self._turning is not None
 
-    def status_bits(self, now: float) -> int:
-        """Return 16 moving, 32 homed, 256 stop open, 512 skin held, 1024 force limit met."""
-        bits = (
-            STATUS_MOVING * self.busy(now)
-            + STATUS_HOMED * self.homed
-            + STATUS_INTERLOCK * self.interlock
-        )
-        return bits + STATUS_ATTACHED * self.attached + STATUS_TRIPPED * (self._barred is not None)
+    def states(self, now: float) -> dict[int, bool]:
+        """Return 16 moving, 32 homed, 512 skin held, 1024 force limit met."""
+        tripped = self._barred is not None
+        return {16: self.busy(now), 32: self.homed, 512: self.attached, 1024: tripped}
 
     @property
     def felt_n(self) -> float:
@@ -325,7 +288,7 @@ class CaliperUnit:
         """Go back to where the jaws stood before: the force has met its limit."""
         move.reading_mm, move.force_n, move.tripped_s = self.aperture_mm, self.felt_n, now
         self._barred = (move.direction, self.aperture_mm)
-        self._say("CAL:FORC:TRIP", f"{self.aperture_mm:.3f},{move.force_n:.3f}", now)
+        self.say("CAL:FORC:TRIP", f"{self.aperture_mm:.3f},{move.force_n:.3f},{self.clock_us(now)}")
         move.to_mm, move.from_mm = move.from_mm, self.aperture_mm
         move.start_s, move.ticks, move.stalls_at_mm = now, 0, None
 
@@ -348,12 +311,9 @@ class CaliperUnit:
         reading_mm, force_n = self.aperture_mm, self.felt_n
         if how == "FORCE":
             reading_mm, force_n = move.reading_mm, move.force_n
-        clock_us = round((now - self._powered_at) * 1e6)
+        clock_us = self.clock_us(now)
         self.last_report = f"{move.number},{how},{step},{reading_mm:.3f},{force_n:.3f},{clock_us}"
         self._events.append(("CAL:END", self.last_report))
-
-    def _say(self, name: str, payload: str, now: float) -> None:
-        self._events.append((name, f"{payload},{round((now - self._powered_at) * 1e6)}"))
 
     def _release(self, now: float, why: str) -> None:
         if self._move is not None:
@@ -362,7 +322,7 @@ class CaliperUnit:
         self._barred = None
         if self.attached:
             self.attached = False
-            self._say("CAL:FREE", why, now)
+            self.say("CAL:FREE", f"{why},{self.clock_us(now)}")
         self._last_force_n = 0.0
         self._load.release()
         self._on_change(now)
@@ -371,9 +331,8 @@ class CaliperUnit:
 
     def _require_fit(self, now: float) -> None:
         """Refuse to move with the stop open, a dead sensor, no limit, or on the move."""
-        if self.interlock:
-            raise Refused(Code.INTERLOCK)
-        if self._sensor_dead:
+        self._require_closed_stop()
+        if self.faults.force_dead:
             raise Refused(Code.HARDWARE, "the force sensor is dead")
         if self.busy(now):
             raise Refused(Code.IGNORED, "on the move")
@@ -407,7 +366,7 @@ class CaliperUnit:
         self.homed = False
         home_mm = self._caliper.aperture_mm
         answer = self._begin(home_mm, now, homing=True)
-        if self._home_missed and self._move is not None:
+        if self.faults.home_missed and self._move is not None:
             # on to the end of the travel, where the motor loses its steps
             end_mm = self._ends_mm[0] if self.aperture_mm > home_mm else self._ends_mm[1]
             beyond_mm = math.copysign(2.0 * LAG_MM, end_mm - home_mm)
@@ -431,13 +390,7 @@ class CaliperUnit:
                 raise Refused(Code.FORCE, f"the limit was met at {reading_mm:.3f} mm")
         return self._begin(to_mm, now, homing=False)
 
-    def _position(self, _: str, now: float) -> str:
-        return f"{self.aperture_mm:.3f}" if self.homed else "NONE"
-
-    def _last(self, _: str, now: float) -> str:
-        return self.last_report or "NONE"
-
-    def _turn(self, arguments: str, now: float) -> str:
+    def _turn(self, arguments: str, now: float) -> None:
         angle_deg = number(arguments, 0.0, 180.0, "degrees")
         if angle_deg not in self._caliper.angles_deg:
             known = ", ".join(f"{angle:g}" for angle in self._caliper.angles_deg)
@@ -447,14 +400,10 @@ class CaliperUnit:
         turns_s = abs(angle_deg - self.angle_deg) / TURN_DEG_PER_S
         self._turning = (now + turns_s, angle_deg)
         self.advance(now)
-        return ""
-
-    def _get_angle(self, _: str, now: float) -> str:
-        return f"{self.angle_deg if self._turning is None else self._turning[1]:g}"
 
     # skin -------------------------------------------------------------------------------------
 
-    def _attach(self, _: str, now: float) -> str:
+    def _attach(self, _: str, now: float) -> None:
         self._require_fit(now)
         self._require_free()
         home_mm = self._caliper.aperture_mm
@@ -465,27 +414,15 @@ class CaliperUnit:
         self.attached = True
         self._barred = None
         self._on_change(now)
-        return ""
-
-    def _is_attached(self, _: str, now: float) -> str:
-        return str(int(self.attached))
-
-    def _let_go(self, _: str, now: float) -> str:
-        self._release(now, "ASKED")
-        return ""
 
     def _get_force(self, _: str, now: float) -> str:
-        if self._sensor_dead:
+        if self.faults.force_dead:
             raise Refused(Code.HARDWARE, "the force sensor is dead")
         return f"{self.felt_n:.3f}"
 
-    def _set_limit(self, arguments: str, now: float) -> str:
+    def _set_limit(self, arguments: str, now: float) -> None:
         limit_n = number(arguments, *FORCE_LIMIT_N, "N")
         if abs(self.felt_n) >= limit_n:
             raise Refused(Code.FORCE, f"there are {self.felt_n:.3f} N now; CAL:REL first")
         self.limit_n = limit_n
         self._barred = None
-        return ""
-
-    def _get_limit(self, _: str, now: float) -> str:
-        return "NONE" if self.limit_n is None else f"{self.limit_n:g}"

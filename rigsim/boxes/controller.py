@@ -11,16 +11,14 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
 
 from capture.devices import wire
 from capture.devices.wire import Code, Event, Reply, Request
+from rigsim.boxes.command import Act, Command, Later, Refused, command_table, number
+from rigsim.boxes.device import Device
 
 CACHED_REPLIES = 8
 ERROR_QUEUE = 16
@@ -28,102 +26,6 @@ CAPABILITY_PART = 48
 """Characters of the limits that one line carries: a short line survives a bad cable."""
 LEASE_MS = (300, 5000)
 DEFAULT_LEASE_MS = 1000
-
-_NUMBER_PATTERN = re.compile(r"-?[0-9]{1,9}(\.[0-9]{1,9})?")
-_WORD_PATTERN = re.compile(r"[A-Za-z0-9._-]{1,48}")
-
-_CODE_TEXTS = {
-    Code.SYNTAX: "Syntax error",
-    Code.UNDEFINED_HEADER: "Undefined header",
-    Code.NOT_ARMED: "Command protected; SYST:ARM first",
-    Code.IGNORED: "Init ignored",
-    Code.OUT_OF_RANGE: "Data out of range",
-    Code.HARDWARE: "Hardware error",
-    Code.QUEUE_OVERFLOW: "Queue overflow",
-    Code.DUTY: "Duty limit",
-    Code.THERMAL: "Too hot",
-    Code.RECYCLE: "Recycling",
-    Code.LIGHT_DOSE: "Light dose",
-    Code.FLICKER: "Flicker; SAFE:EYES says whether eyes are safe",
-    Code.FORCE: "Force limit",
-    Code.INTERLOCK: "Interlock open",
-    Code.WATCHDOG_TRIPPED: "Watchdog tripped; SYST:ARM first",
-    Code.BOOT_CHANGED: "Boot changed; SYST:HELLO? first",
-    Code.SEQ_REUSED: "Sequence number reused",
-    Code.UNFRAMED: "Unframed command",
-    Code.BAD_CRC: "Bad frame",
-}
-
-
-class Refused(Exception):
-    """A command that is not carried out, with its code; the box did nothing."""
-
-    def __init__(self, code: Code, detail: str = "") -> None:
-        super().__init__(code, detail)
-        self.code = code
-        self.reason = _CODE_TEXTS[code] + (f"; {detail}" if detail else "")
-
-
-@dataclass(frozen=True, slots=True)
-class Later:
-    """An act that is under way: it is answered when it is over."""
-
-    at_s: float
-    """When, s, on the world's clock."""
-    outcome: Callable[[], str | Refused]
-    """Payload of the answer, or why there is none; asked for then."""
-
-
-@dataclass(frozen=True, slots=True)
-class Command:
-    """One row of a command table."""
-
-    run: Callable[[str, float], str | Later]
-    """(arguments, now in s) -> payload of the answer, or when it comes; raises `Refused`."""
-    arguments: str = ""
-    """What follows the header, as the manual writes it; empty: nothing may follow."""
-    armed: bool = False
-    """Whether it makes light, and so is refused unless the box is armed."""
-    bare: bool = False
-    """Whether it is taken without a frame although it is no query: only what makes dark."""
-    harmless: tuple[str, ...] = ()
-    """Arguments, upper case, with which it makes dark: taken unarmed and without a frame."""
-    manual: str = ""
-    """What it does, in one line."""
-
-
-class Device(Protocol):
-    """What a controller controls."""
-
-    kind: str
-    model: str
-
-    def commands(self) -> Mapping[str, Command]:
-        """Return the command table."""
-
-    def capabilities(self) -> Mapping[str, Any]:
-        """Return limits and counts, units in the names, as JSON values."""
-
-    def status_bits(self, now: float) -> int:
-        """Return bits 4 and up of ``STAT?``."""
-
-    def busy(self, now: float) -> bool:
-        """Tell whether something that was accepted is still going on."""
-
-    def go_dark(self, now: float) -> None:
-        """Switch every light off at once."""
-
-    def reset(self, now: float, *, power_up: bool) -> None:
-        """Return to the settings of power-up."""
-
-    def advance(self, now: float) -> None:
-        """Let time pass up to `now`, in s."""
-
-    def deadline(self) -> float:
-        """Return when the device will next change by itself, in s; inf for never."""
-
-    def take_events(self) -> Iterable[tuple[str, str]]:
-        """Return and forget what the device has to say unasked: name and payload."""
 
 
 class Controller:
@@ -307,7 +209,7 @@ class Controller:
             raise Refused(Code.SYNTAX, f"expected {header.upper()} {command.arguments}".strip())
         if command.armed and not (self.armed or arguments.upper() in command.harmless):
             raise Refused(Code.WATCHDOG_TRIPPED if self.tripped else Code.NOT_ARMED)
-        return command.run(arguments, now)
+        return command.run(arguments, now) or ""
 
     def _same_request(self, seq: int, text: str, frame: Request) -> bool:
         return seq == frame.seq and text == frame.text
@@ -321,9 +223,9 @@ class Controller:
 
     def _remember(self, refused: Refused) -> None:
         if len(self._errors) == ERROR_QUEUE:
-            self._errors[-1] = (int(Code.QUEUE_OVERFLOW), _CODE_TEXTS[Code.QUEUE_OVERFLOW])
-        else:
-            self._errors.append((int(refused.code), refused.reason))
+            self._errors.pop()
+            refused = Refused(Code.QUEUE_OVERFLOW)
+        self._errors.append((int(refused.code), refused.reason))
 
     # lease and arming -------------------------------------------------------------------------
 
@@ -338,52 +240,32 @@ class Controller:
     # the commands every box knows -------------------------------------------------------------
 
     def _own_commands(self) -> dict[str, Command]:
-        return {
-            "*IDN?": Command(self._identify, manual="maker, model, serial number, firmware"),
-            "*RST": Command(self._reset, manual="dark, disarmed, settings of power-up"),
-            "*CLS": Command(self._clear, bare=True, manual="empty the error queue"),
-            "*OPC?": Command(self._complete, manual="1 when nothing is under way, else 0"),
-            "SYST:ERR?": Command(self._error, manual="oldest error and its text, removed"),
-            "SYST:HELLO?": Command(self._greet, manual="protocol, kind, serial number, firmware"),
-            "SYST:CAP?": Command(self._capable, manual="limits as JSON, with its checksum"),
-            "SYST:CAP:PART?": Command(
-                self._capable_part,
-                "<n>",
-                manual="part n of SYST:CAP?, from 0: 1 for the last, text",
-            ),
-            "SYST:WDOG": Command(self._set_lease, "<ms>", manual="lease, 300 to 5000 ms"),
-            "SYST:WDOG?": Command(self._get_lease, manual="lease in ms"),
-            "SYST:ARM": Command(self._arm, manual="allow light; starts the lease"),
-            "SYST:ARM?": Command(self._is_armed, manual="1 armed, 0 not"),
-            "SYST:PING?": Command(self._ping, manual="box clock since power-up, us"),
-            "SAFE": Command(self._safe, bare=True, manual="dark and disarmed at once"),
-            "ABOR": Command(self._safe, bare=True, manual="the same as SAFE"),
-            "STAT?": Command(
-                self._status,
-                manual="sum of 1 armed, 2 watchdog tripped, 4 error queued, and the device's bits",
-            ),
+        acts: dict[str, Act] = {
+            "*IDN?": lambda *_: f"RIGSIM,{self.device.model},{self.serial},{self._firmware}",
+            "*RST": self._reset,
+            "*CLS": lambda *_: self._errors.clear(),
+            "*OPC?": lambda _, now: "0" if self.device.busy(now) else "1",
+            "SYST:ERR?": self._error,
+            "SYST:HELLO?": lambda *_: self._hello(),
+            "SYST:CAP?": self._capable,
+            "SYST:CAP:PART?": self._capable_part,
+            "SYST:WDOG": self._set_lease,
+            "SYST:WDOG?": lambda *_: str(self._lease_ms),
+            "SYST:ARM": self._arm,
+            "SYST:ARM?": lambda *_: str(int(self.armed)),
+            "SYST:PING?": lambda _, now: str(round((now - self._powered_at) * 1e6)),
+            "SAFE": self._safe,
+            "ABOR": self._safe,
+            "STAT?": self._status,
         }
+        return command_table("any", acts)
 
     def _hello(self) -> str:
         return f"{self._protocol},{self.device.kind},{self.serial},{self._firmware}"
 
-    def _identify(self, _: str, now: float) -> str:
-        return f"RIGSIM,{self.device.model},{self.serial},{self._firmware}"
-
-    def _greet(self, _: str, now: float) -> str:
-        return self._hello()
-
-    def _reset(self, _: str, now: float) -> str:
+    def _reset(self, _: str, now: float) -> None:
         self._disarm(now)
         self.device.reset(now, power_up=False)
-        return ""
-
-    def _clear(self, _: str, now: float) -> str:
-        self._errors.clear()
-        return ""
-
-    def _complete(self, _: str, now: float) -> str:
-        return "0" if self.device.busy(now) else "1"
 
     def _error(self, _: str, now: float) -> str:
         code, text = self._errors.popleft() if self._errors else (0, "No error")
@@ -406,58 +288,16 @@ class Controller:
         start = part * CAPABILITY_PART
         return f"{int(part == last)},{text[start : start + CAPABILITY_PART]}"
 
-    def _set_lease(self, arguments: str, now: float) -> str:
+    def _set_lease(self, arguments: str, now: float) -> None:
         self._lease_ms = int(number(arguments, LEASE_MS[0], LEASE_MS[1], "ms"))
-        return ""
 
-    def _get_lease(self, _: str, now: float) -> str:
-        return str(self._lease_ms)
-
-    def _arm(self, _: str, now: float) -> str:
+    def _arm(self, _: str, now: float) -> None:
         self.armed = True
         self.tripped = False
-        return ""
 
-    def _is_armed(self, _: str, now: float) -> str:
-        return str(int(self.armed))
-
-    def _ping(self, _: str, now: float) -> str:
-        return str(round((now - self._powered_at) * 1e6))
-
-    def _safe(self, _: str, now: float) -> str:
+    def _safe(self, _: str, now: float) -> None:
         self._disarm(now)
-        return ""
 
     def _status(self, _: str, now: float) -> str:
         own = self.armed + 2 * self.tripped + 4 * bool(self._errors)
         return str(own | self.device.status_bits(now))
-
-
-def number(text: str, low: float, high: float, unit: str) -> float:
-    """Return the number that a command gives, or refuse with -102 or -222.
-
-    Examples
-    --------
-    >>> number("0.5", 0.0, 1.0, "of full power")
-    0.5
-    """
-    if _NUMBER_PATTERN.fullmatch(text) is None:
-        raise Refused(Code.SYNTAX, "expected a number")
-    value = float(text)
-    if not low <= value <= high:
-        raise Refused(Code.OUT_OF_RANGE, f"expected {low:g} to {high:g} {unit}")
-    return value
-
-
-def choice(text: str, names: tuple[str, ...]) -> str:
-    """Return the upper-case word that a command gives, or refuse with -102."""
-    if text.upper() not in names:
-        raise Refused(Code.SYNTAX, f"expected {' or '.join(names)}")
-    return text.upper()
-
-
-def word(text: str) -> str:
-    """Return the token that a command gives, or refuse with -102."""
-    if _WORD_PATTERN.fullmatch(text) is None:
-        raise Refused(Code.SYNTAX, "expected 1 to 48 of A-Z a-z 0-9 . _ -")
-    return text

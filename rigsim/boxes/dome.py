@@ -12,23 +12,17 @@ that open eyes may see (105). Light carries its own end; LEDs that draw no curre
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from capture.devices.wire import Code
-from capture.rig import LedLimits, Light
-from rigsim.boxes.controller import Command, Refused, number
+from capture.rig import Rig
+from rigsim.boxes import led_table
+from rigsim.boxes.command import Act, Command, Refused, command_table, number, whole
 from rigsim.boxes.eye_guard import Lit
-from rigsim.boxes.led_sequencer import LED_MS, LedSequencer, Run, whole
-from rigsim.boxes.led_table import (
-    LEVEL_STEPS,
-    Row,
-    Switch,
-    lit_by,
-    parse_leds,
-    parse_rows,
-    switches,
-)
+from rigsim.boxes.faults import Faults
+from rigsim.boxes.led_sequencer import LED_MS, LedSequencer, Run
+from rigsim.boxes.led_table import LEVEL_STEPS, Row, Switch
 
 DEFAULT_LED_MS = 100.0
 
@@ -52,16 +46,12 @@ class DomeUnit(LedSequencer[Row]):
 
     Parameters
     ----------
-    lights, limits
-        Its LEDs, and what they may do.
-    cameras
-        How many cameras hang on it.
+    rig, faults
+        Its LEDs, what they may do, and its cameras; what is wrong with it.
     on_pulse
         Called with each stretch of light when it has ended.
     on_trigger
         Called with the world time in s and the mask of each release of cameras.
-    dead, weak, heat, interlock
-        See `rigsim.world.faults.Faults`; dead and weak LEDs by number.
     """
 
     kind = "dome"
@@ -69,56 +59,32 @@ class DomeUnit(LedSequencer[Row]):
 
     def __init__(
         self,
-        lights: Sequence[Light],
-        limits: LedLimits,
+        rig: Rig,
+        faults: Faults,
         *,
-        cameras: int,
         on_pulse: Callable[[LedPulse], None],
         on_trigger: Callable[[float, int], None],
-        dead: frozenset[int] = frozenset(),
-        weak: Mapping[int, float] | None = None,
-        heat: float = 0.0,
-        interlock: bool = False,
     ) -> None:
         def pass_on(lit: Lit) -> None:
             on_pulse(LedPulse(lit.led, lit.level, lit.on_s, lit.off_s))
 
-        super().__init__(
-            lights,
-            limits,
-            cameras=cameras,
-            on_light=pass_on,
-            on_trigger=on_trigger,
-            dead=dead,
-            weak=weak,
-            heat=heat,
-            interlock=interlock,
-        )
+        super().__init__(rig, faults, on_light=pass_on, on_trigger=on_trigger)
         self.reset(0.0, power_up=True)
 
-    def commands(self) -> Mapping[str, Command]:
+    def commands(self) -> dict[str, Command]:
         """Return the command table: the manual of the box."""
-        return {
-            **super().commands(),
-            "SEQ:DEF": Command(
-                self._define_rows,
-                "<first>,<leds>:<level>:<us>:<mask>;...",
-                manual="rows from number first: LEDs 3+17 or -, thousandths, us, hex cameras",
-            ),
-            "LED:ON": Command(
-                self._light,
-                "<leds>[,<ms>[,<level>]]",
-                armed=True,
-                manual="light LEDs 3+17 for 1 to 500 ms (100), in thousandths (1000)",
-            ),
-            "LED:OFF": Command(self._put_out, "<leds>|ALL", manual="put LEDs out"),
-            "LED?": Command(self._lit_now, manual="LEDs that are on, as 3+17, or -"),
+        acts: dict[str, Act] = {
+            "SEQ:DEF": self._define_rows,
+            "LED:ON": self._light,
+            "LED:OFF": self._put_out,
+            "LED?": lambda *_: "+".join(map(str, self.bank.lit)) or "-",
         }
+        return super().commands() | command_table("dome", acts)
 
     # sequence ---------------------------------------------------------------------------------
 
     def _parse_rows(self, text: str) -> list[Row]:
-        return parse_rows(
+        return led_table.parse_rows(
             text,
             count=self.bank.count,
             at_once=self._limits.max_at_once,
@@ -127,11 +93,11 @@ class DomeUnit(LedSequencer[Row]):
         )
 
     def _lit_by(self, rows: Sequence[Row], now: float) -> list[Lit]:
-        return lit_by(rows, now, overlap_s=self._limits.overlap_s)
+        return led_table.lit_by(rows, now, overlap_s=self._limits.overlap_s)
 
     def _schedule(self, rows: Sequence[Row]) -> list[Switch]:
         limits = self._limits
-        return switches(rows, overlap_s=limits.overlap_s, settle_s=limits.settle_s)
+        return led_table.switches(rows, overlap_s=limits.overlap_s, settle_s=limits.settle_s)
 
     def _switch_light(self, run: Run[Row], switch: Switch, now: float) -> None:
         row = run.rows[switch.row]
@@ -151,7 +117,7 @@ class DomeUnit(LedSequencer[Row]):
     def _turn_on(self, leds: Sequence[int], level: float, now: float) -> None:
         for led in leds:
             if not self.bank.switch_on(led, level, now):
-                self._events.append(("LED:FAIL", str(led)))
+                self.say("LED:FAIL", str(led))
 
     def light_now(self, now: float) -> list[LedPulse]:
         """Return the stretches of light that are going on, as given so far."""
@@ -160,9 +126,9 @@ class DomeUnit(LedSequencer[Row]):
     # single LEDs ------------------------------------------------------------------------------
 
     def _leds(self, text: str) -> tuple[int, ...]:
-        return parse_leds(text, count=self.bank.count, at_once=self._limits.max_at_once)
+        return led_table.parse_leds(text, count=self.bank.count, at_once=self._limits.max_at_once)
 
-    def _light(self, arguments: str, now: float) -> str:
+    def _light(self, arguments: str, now: float) -> None:
         self._require_still()
         parts = arguments.split(",")
         if len(parts) > 3:
@@ -186,14 +152,9 @@ class DomeUnit(LedSequencer[Row]):
         self._sequence_armed = False
         for led in leds:
             self.bank.switch_on(led, level, now, end_s=end_s)
-        return ""
 
-    def _put_out(self, arguments: str, now: float) -> str:
+    def _put_out(self, arguments: str, now: float) -> None:
         leds = self.bank.lit if arguments.upper() == "ALL" else self._leds(arguments)
         self._require_still()
         for led in leds:
             self.bank.switch_off(led, now)
-        return ""
-
-    def _lit_now(self, _: str, now: float) -> str:
-        return "+".join(map(str, self.bank.lit)) or "-"

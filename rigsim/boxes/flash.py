@@ -22,7 +22,10 @@ from typing import Any, Literal
 import numpy as np
 
 from capture.devices.wire import Code
-from rigsim.boxes.controller import Command, Later, Refused, choice, number, word
+from capture.rig import Rig
+from rigsim.boxes.command import Act, Command, Later, Refused, choice, command_table, number, word
+from rigsim.boxes.device import Device
+from rigsim.boxes.faults import NO_FAULTS, Faults
 
 Polarizer = Literal["parallel", "crossed"]
 
@@ -42,8 +45,6 @@ LAMP_TAU_S = 20.0
 """Time constant of the lamp driver's temperature, s."""
 HEAT_TRIP, HEAT_CLEAR = 0.8, 0.5
 """Temperatures at which the lamp's driver trips and recovers; 1 is where it would settle."""
-
-STATUS_MOVING, STATUS_NOT_READY, STATUS_LAMP_ON, STATUS_HOT, STATUS_INTERLOCK = 16, 32, 64, 128, 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,27 +71,17 @@ class _Lamp:
     hot: bool = False
 
 
-class FlashUnit:
+class FlashUnit(Device):
     """State of the flash box behind its controller.
 
     Parameters
     ----------
+    rig, faults
+        Its recycling, pops per minute and analyser; what is wrong with it.
     on_pop
         Called with each pop.
     on_trigger
         Called with the world time in s of each pulse on the camera line.
-    recycle_s
-        Least time after a full pop, s; proportional to the power.
-    pops_per_min
-        Most pops in any 60 s.
-    move_s
-        Time the analyser takes for 90 degrees, s.
-    misfire
-        Probability that the tube does not ignite.
-    slow_charge
-        How many times longer than normal the capacitor takes.
-    lamp_dead, heat, interlock
-        See `rigsim.world.faults.Faults`.
     rng
         Decides misfires.
     """
@@ -100,35 +91,26 @@ class FlashUnit:
 
     def __init__(
         self,
+        rig: Rig,
+        faults: Faults = NO_FAULTS,
         *,
         on_pop: Callable[[FlashPop], None],
         on_trigger: Callable[[float], None],
-        recycle_s: float,
-        pops_per_min: float,
-        move_s: float,
-        misfire: float = 0.0,
-        slow_charge: float = 1.0,
-        lamp_dead: bool = False,
-        heat: float = 0.0,
-        interlock: bool = False,
         rng: np.random.Generator,
     ) -> None:
+        super().__init__(rig, faults)
         self._on_pop = on_pop
         self._on_trigger = on_trigger
-        self._recycle_s = recycle_s
-        self._pops_per_min = math.floor(pops_per_min)
-        self._s_per_deg = move_s / 90.0
+        self._pops_per_min = math.floor(rig.max_pops_per_min)
+        self._s_per_deg = rig.polarizer_move_s / 90.0
         headroom = math.log(CHARGER_HEADROOM / (CHARGER_HEADROOM - 1.0))
-        self._charge_tau_s = slow_charge * CHARGE_SHARE * recycle_s / headroom
-        self._misfire = misfire
-        self._lamp_dead = lamp_dead
+        self._charge_tau_s = faults.slow_charge * CHARGE_SHARE * rig.recycle_s / headroom
         self._rng = rng
         self._now = 0.0
-        self.interlock = interlock
         # what the box keeps without power: the count, heat, charge and the last pops
         self.count = 0
         self.lamp_times: deque[tuple[float, float]] = deque(maxlen=10_000)
-        self._lamp = _Lamp(heat=heat, hot=heat >= HEAT_TRIP)
+        self._lamp = _Lamp(heat=faults.heat, hot=faults.heat >= HEAT_TRIP)
         self._lamp_since = 0.0
         self._pops: deque[float] = deque(maxlen=max(1, self._pops_per_min))
         self._volt = 1.0  # of full, at `_volt_at`; delivered charged
@@ -145,9 +127,7 @@ class FlashUnit:
 
     def reset(self, now: float, *, power_up: bool) -> None:
         """Return to the settings of power-up: parallel, full power, dark."""
-        self.go_dark(now)
-        if power_up:
-            self._powered_at = now
+        super().reset(now, power_up=power_up)
         self.power = 1.0
         self.sync_s = 0.0
         self.polarizer: Polarizer = "parallel"
@@ -166,47 +146,31 @@ class FlashUnit:
             "sync_max_us": SYNC_US[1],
             "lamp_min_ms": LAMP_MS[0],
             "lamp_max_ms": LAMP_MS[1],
-            "recycle_s": self._recycle_s,
+            "recycle_s": self.rig.recycle_s,
             "pops_per_min": self._pops_per_min,
             "move_s_per_deg": round(self._s_per_deg, 6),
         }
 
-    def commands(self) -> Mapping[str, Command]:
+    def commands(self) -> dict[str, Command]:
         """Return the command table: the manual of the box."""
-        return {
-            "FLAS:POL": Command(
-                self._set_polarizer, "PAR|CROS", manual="turn the analyser to a stop"
-            ),
-            "FLAS:POL?": Command(self._get_polarizer, manual="PAR or CROS, the last stop asked"),
-            "FLAS:POL:ANG": Command(
-                self._set_angle, "<deg>", manual="turn the analyser to a reading, 0 to 180 degrees"
-            ),
-            "FLAS:POL:ANG?": Command(self._get_angle, manual="reading aimed at, degrees"),
-            "FLAS:POW": Command(self._set_power, "<share>", manual="power, 1/256 to 1 of full"),
-            "FLAS:POW?": Command(self._get_power, manual="power of the next pop"),
-            "FLAS:SYNC": Command(
-                self._set_sync, "<us>", manual="camera line to pop, 0 to 50000 us; 0 at power-up"
-            ),
-            "FLAS:SYNC?": Command(self._get_sync, manual="that delay, us"),
-            "FLAS:CHAR?": Command(
-                self._get_charge, manual="charge 0 to 1, ready 0 or 1, ready in ms"
-            ),
-            "FLAS:FIRE": Command(
-                self._fire,
-                "<token>",
-                armed=True,
-                manual="pulse the camera line and pop: token, box us, power, stop, degrees, count",
-            ),
-            "FLAS:LAST?": Command(self._get_last, manual="answer of the last pop, or NONE"),
-            "FLAS:COUN?": Command(self._get_count, manual="pops since the box was made"),
-            "FLAS:LAMP": Command(
-                self._set_lamp, "ON,<ms>|OFF", armed=True, manual="modelling lamps, 1 to 500 ms"
-            ),
-            "FLAS:LAMP?": Command(self._get_lamp, manual="1 lit, 0 dark"),
-            "CAM:TRIG": Command(
-                self._trigger, "<token>", manual="pulse the camera line without light: token, us"
-            ),
+        acts: dict[str, Act] = {
+            "FLAS:POL": self._set_polarizer,
+            "FLAS:POL?": self._get_polarizer,
+            "FLAS:POL:ANG": self._set_angle,
+            "FLAS:POL:ANG?": self._get_angle,
+            "FLAS:POW": self._set_power,
+            "FLAS:POW?": self._get_power,
+            "FLAS:SYNC": self._set_sync,
+            "FLAS:SYNC?": lambda *_: f"{1e6 * self.sync_s:.0f}",
+            "FLAS:CHAR?": self._get_charge,
+            "FLAS:FIRE": self._fire,
+            "FLAS:LAST?": lambda *_: self.last_report or "NONE",
+            "FLAS:COUN?": lambda *_: str(self.count),
+            "FLAS:LAMP": self._set_lamp,
+            "FLAS:LAMP?": lambda *_: str(int(self._lamp.lit)),
+            "CAM:TRIG": self._trigger,
         }
+        return command_table("flash", acts)
 
     # time -------------------------------------------------------------------------------------
 
@@ -242,10 +206,6 @@ class FlashUnit:
         lamp.heat = goal + (lamp.heat - goal) * math.exp(-max(0.0, now - self._now) / LAMP_TAU_S)
         self._now = max(now, self._now)
 
-    def take_events(self) -> tuple[tuple[str, str], ...]:
-        """Return what the box has to say unasked: nothing."""
-        return ()
-
     def go_dark(self, now: float) -> None:
         """Switch the lamps off and prevent a pop that has not come yet."""
         self._lamps_out(now)
@@ -268,17 +228,10 @@ class FlashUnit:
         """Tell whether the analyser is turning."""
         return now < self._settled_at
 
-    def status_bits(self, now: float) -> int:
-        """Return 16 turning, 32 no pop possible yet, 64 lamp on, 128 too hot, 256 stop open."""
-        bits = STATUS_MOVING * self.busy(now) + STATUS_NOT_READY * (
-            self._wait_for_fire(now)[0] > 0.0
-        )
-        bits += (
-            STATUS_LAMP_ON * self._lamp.lit
-            + STATUS_HOT * self._lamp.hot
-            + STATUS_INTERLOCK * self.interlock
-        )
-        return bits
+    def states(self, now: float) -> dict[int, bool]:
+        """Return 16 turning, 32 no pop possible yet, 64 lamp on, 128 too hot."""
+        waits = self._wait_for_fire(now)[0] > 0.0
+        return {16: self.busy(now), 32: waits, 64: self._lamp.lit, 128: self._lamp.hot}
 
     # analyser ---------------------------------------------------------------------------------
 
@@ -287,39 +240,32 @@ class FlashUnit:
         self._settled_at = start + abs(reading_deg - self.angle_deg) * self._s_per_deg
         self.angle_deg = reading_deg
 
-    def _set_polarizer(self, arguments: str, now: float) -> str:
+    def _set_polarizer(self, arguments: str, now: float) -> None:
         stop = choice(arguments, ("PAR", "CROS"))
         self.polarizer = "parallel" if stop == "PAR" else "crossed"
         self.analyser_deg = None
         self._turn(READINGS_DEG[self.polarizer], now)
-        return ""
 
     def _get_polarizer(self, _: str, now: float) -> str:
         return "PAR" if self.polarizer == "parallel" else "CROS"
 
-    def _set_angle(self, arguments: str, now: float) -> str:
+    def _set_angle(self, arguments: str, now: float) -> None:
         self.analyser_deg = number(arguments, *ANALYZER_RANGE_DEG, "degrees")
         self._turn(self.analyser_deg, now)
-        return ""
 
     def _get_angle(self, _: str, now: float) -> str:
         return f"{self.angle_deg:.3f}"
 
     # flash ------------------------------------------------------------------------------------
 
-    def _set_power(self, arguments: str, now: float) -> str:
+    def _set_power(self, arguments: str, now: float) -> None:
         self.power = number(arguments, MIN_POWER, 1.0, "of full power")
-        return ""
 
     def _get_power(self, _: str, now: float) -> str:
         return f"{self.power:.8f}"
 
-    def _set_sync(self, arguments: str, now: float) -> str:
+    def _set_sync(self, arguments: str, now: float) -> None:
         self.sync_s = number(arguments, *SYNC_US, "us") / 1e6
-        return ""
-
-    def _get_sync(self, _: str, now: float) -> str:
-        return f"{1e6 * self.sync_s:.0f}"
 
     def charge(self, now: float) -> float:
         """Return the energy in the capacitor at `now`, 0 to 1 of a full pop."""
@@ -340,7 +286,7 @@ class FlashUnit:
         waits = [
             (coming_s, Code.IGNORED, "about to pop"),
             (self._settled_at - now, Code.IGNORED, "analyser turning"),
-            (self._last_pop + self._recycle_s * self._last_power - now, Code.RECYCLE, "tube"),
+            (self._last_pop + self.rig.recycle_s * self._last_power - now, Code.RECYCLE, "tube"),
             (self._pops[0] + POP_WINDOW_S - now if full else 0.0, Code.DUTY, "pops per minute"),
             (self._charge_tau_s * math.log(max(gap, 1.0)), Code.IGNORED, "charging"),
         ]
@@ -352,8 +298,7 @@ class FlashUnit:
 
     def _fire(self, arguments: str, now: float) -> str | Later:
         token = word(arguments)
-        if self.interlock:
-            raise Refused(Code.INTERLOCK)
+        self._require_closed_stop()
         wait_s, code, why = self._wait_for_fire(now)
         # a clock of microseconds cannot tell a shorter wait from none
         if wait_s > 1e-6:
@@ -374,7 +319,7 @@ class FlashUnit:
         token = "" if self._coming is None else self._coming[1]
         self._coming = None
         self._lamps_out(now)
-        if self._rng.random() < self._misfire:
+        if self._rng.random() < self.faults.misfire:
             self._outcome = Refused(Code.HARDWARE, "the tube did not ignite")
             return
         self._volt = math.sqrt(max(0.0, self._voltage(now) ** 2 - self.power))
@@ -386,7 +331,7 @@ class FlashUnit:
         self.last_report = ",".join(
             (
                 token,
-                str(self._clock_us(now)),
+                str(self.clock_us(now)),
                 self._get_power("", now),
                 self._get_polarizer("", now),
                 self._get_angle("", now),
@@ -395,41 +340,27 @@ class FlashUnit:
         )
         self._outcome = self.last_report
 
-    def _get_last(self, _: str, now: float) -> str:
-        return self.last_report or "NONE"
-
-    def _get_count(self, _: str, now: float) -> str:
-        return str(self.count)
-
     def _trigger(self, arguments: str, now: float) -> str:
         token = word(arguments)
         self._on_trigger(now)
-        return f"{token},{self._clock_us(now)}"
+        return f"{token},{self.clock_us(now)}"
 
     # lamps ------------------------------------------------------------------------------------
 
-    def _set_lamp(self, arguments: str, now: float) -> str:
+    def _set_lamp(self, arguments: str, now: float) -> None:
         what, _, length = arguments.partition(",")
         if choice(what, ("ON", "OFF")) == "OFF":
             if length:
                 raise Refused(Code.SYNTAX, "expected OFF")
             self._lamps_out(now)
-            return ""
+            return
         span_ms = number(length, *LAMP_MS, "ms")
-        if self.interlock:
-            raise Refused(Code.INTERLOCK)
+        self._require_closed_stop()
         if self._lamp.hot:
             raise Refused(Code.THERMAL, f"wait until below {HEAT_CLEAR:g}")
-        if self._lamp_dead:
+        if self.faults.lamp_dead:
             raise Refused(Code.HARDWARE, "the lamp draws no current")
         if not self._lamp.lit:
             self._lamp.lit = True
             self._lamp_since = now
         self._lamp.end_s = now + span_ms / 1e3
-        return ""
-
-    def _get_lamp(self, _: str, now: float) -> str:
-        return str(int(self._lamp.lit))
-
-    def _clock_us(self, now: float) -> int:
-        return round((now - self._powered_at) * 1e6)

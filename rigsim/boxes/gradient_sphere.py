@@ -22,23 +22,15 @@ from typing import Any
 import numpy as np
 
 from capture.devices.wire import Code
-from capture.rig import LedLimits, Light
-from rigsim.boxes.controller import Command, Refused, choice, number
+from capture.rig import Rig
+from rigsim.boxes import led_table
+from rigsim.boxes.command import Act, Command, Refused, choice, command_table, number, whole
 from rigsim.boxes.eye_guard import Lit
-from rigsim.boxes.led_sequencer import LED_MS, LedSequencer, Run, whole
+from rigsim.boxes.faults import Faults
+from rigsim.boxes.led_sequencer import LED_MS, LedSequencer, Run
 from rigsim.boxes.led_table import LEVEL_STEPS, Switch, table_crc
-from rigsim.boxes.pattern_table import (
-    ANALYZER_RANGE_DEG,
-    PatternRow,
-    parse_patterns,
-    pattern_name,
-    pattern_shares,
-    schedule,
-    starts,
-)
 
 DEFAULT_LED_MS = 100.0
-STATUS_TURNING = 1024
 _GAINS_PATTERN = re.compile(r"[0-9]{1,4}(\+[0-9]{1,4})*")
 
 
@@ -61,23 +53,17 @@ class PatternLight:
     (0 when dead, less than 1 when weak); empty: 1 for all."""
 
 
-class GradientSphereUnit(LedSequencer[PatternRow]):
+class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
     """State of the gradient sphere's box behind its controller.
 
     Parameters
     ----------
-    lights, limits
-        Its LEDs, and what they may do.
-    cameras
-        How many cameras hang on it.
-    move_s
-        Time the analyser takes for 90 degrees, s.
+    rig, faults
+        Its LEDs, what they may do, its analyser and cameras; what is wrong with it.
     on_pattern
         Called with each stretch of light when it has ended.
     on_trigger
         Called with the world time in s and the mask of each release of cameras.
-    dead, weak, heat, interlock
-        See `rigsim.world.faults.Faults`; dead and weak LEDs by number.
     """
 
     kind = "gradient_sphere"
@@ -85,40 +71,24 @@ class GradientSphereUnit(LedSequencer[PatternRow]):
 
     def __init__(
         self,
-        lights: Sequence[Light],
-        limits: LedLimits,
+        rig: Rig,
+        faults: Faults,
         *,
-        cameras: int,
-        move_s: float,
         on_pattern: Callable[[PatternLight], None],
         on_trigger: Callable[[float, int], None],
-        dead: frozenset[int] = frozenset(),
-        weak: Mapping[int, float] | None = None,
-        heat: float = 0.0,
-        interlock: bool = False,
     ) -> None:
         self._on_pattern = on_pattern
-        self._s_per_deg = move_s / 90.0
-        self._shares = pattern_shares(lights)
-        health = np.ones(len(lights))
-        for led, share in (weak or {}).items():
+        self._s_per_deg = rig.polarizer_move_s / 90.0
+        self._shares = led_table.pattern_shares(rig.lights)
+        health = np.ones(len(rig.lights))
+        for led, share in faults.weak_leds.items():
             health[led] = share
-        health[list(dead)] = 0.0
+        health[list(faults.dead_leds)] = 0.0
         self._health = health
         self._shining: PatternLight | None = None  # what is on; its end is not known yet
         self.analyser_deg = 0.0
         self._settled_at = 0.0
-        super().__init__(
-            lights,
-            limits,
-            cameras=cameras,
-            on_light=self._ended,
-            on_trigger=on_trigger,
-            dead=dead,
-            weak=weak,
-            heat=heat,
-            interlock=interlock,
-        )
+        super().__init__(rig, faults, on_light=self._ended, on_trigger=on_trigger)
         self.reset(0.0, power_up=True)
 
     def reset(self, now: float, *, power_up: bool) -> None:
@@ -133,40 +103,25 @@ class GradientSphereUnit(LedSequencer[PatternRow]):
         """Return limits and counts, units in the names."""
         return {
             **super().capabilities(),
-            "analyser_min_deg": ANALYZER_RANGE_DEG[0],
-            "analyser_max_deg": ANALYZER_RANGE_DEG[1],
+            "analyser_min_deg": led_table.ANALYZER_RANGE_DEG[0],
+            "analyser_max_deg": led_table.ANALYZER_RANGE_DEG[1],
             "move_s_per_deg": round(self._s_per_deg, 9),
         }
 
-    def commands(self) -> Mapping[str, Command]:
+    def commands(self) -> dict[str, Command]:
         """Return the command table: the manual of the box."""
-        return {
-            **super().commands(),
-            "SEQ:DEF": Command(
-                self._define_rows,
-                "<first>,<pattern>:<deg>:<level>:<us>:<mask>;...",
-                manual="rows from number first: pattern, analyser, thousandths, us, hex cameras",
-            ),
-            "PATT": Command(
-                self._light,
-                "<pattern>[,<ms>[,<level>]]",
-                armed=True,
-                manual="FULL, X, Y, Z, -X, -Y, -Z for 1 to 500 ms (100), thousandths (1000); DARK",
-            ),
-            "PATT?": Command(self._lit_now, manual="pattern that is on, DARK for none"),
-            "POL": Command(self._set_stop, "0|90", manual="turn the analyser to a stop"),
-            "POL:ANG": Command(
-                self._set_angle, "<deg>", manual="turn the analyser to a reading, 0 to 180 degrees"
-            ),
-            "POL?": Command(self._get_angle, manual="reading aimed at, degrees"),
-            "GAIN:CLE": Command(self._clear_gains, manual="all gains 1000"),
-            "GAIN:DEF": Command(
-                self._define_gains,
-                "<first>,<gain>+<gain>...",
-                manual="gains of LEDs from number first on, thousandths",
-            ),
-            "GAIN:CRC?": Command(self._gains_checksum, manual="gains sent, and their checksum"),
+        acts: dict[str, Act] = {
+            "SEQ:DEF": self._define_rows,
+            "PATT": self._light,
+            "PATT?": self._lit_now,
+            "POL": self._set_stop,
+            "POL:ANG": self._set_angle,
+            "POL?": lambda *_: f"{self.analyser_deg:.3f}",
+            "GAIN:CLE": self._clear_gains,
+            "GAIN:DEF": self._define_gains,
+            "GAIN:CRC?": lambda *_: f"{len(self._gains_sent)},{table_crc(self._gains_sent)}",
         }
+        return super().commands() | command_table("gradient_sphere", acts)
 
     # analyser ---------------------------------------------------------------------------------
 
@@ -178,29 +133,25 @@ class GradientSphereUnit(LedSequencer[PatternRow]):
         """Tell whether a scan is stepping or the analyser turns."""
         return super().busy(now) or self.turning(now)
 
-    def status_bits(self, now: float) -> int:
+    def states(self, now: float) -> dict[int, bool]:
         """Return those of all boxes with LEDs, and 1024 turning."""
-        return super().status_bits(now) | STATUS_TURNING * self.turning(now)
+        return super().states(now) | {1024: self.turning(now)}
 
     def _turn(self, reading_deg: float, now: float) -> None:
         start = max(now, self._settled_at)
         self._settled_at = start + abs(reading_deg - self.analyser_deg) * self._s_per_deg
         self.analyser_deg = reading_deg
 
-    def _set_stop(self, arguments: str, now: float) -> str:
-        return self._set_angle(choice(arguments, ("0", "90")), now)
+    def _set_stop(self, arguments: str, now: float) -> None:
+        self._set_angle(choice(arguments, ("0", "90")), now)
 
-    def _set_angle(self, arguments: str, now: float) -> str:
-        reading_deg = round(number(arguments, *ANALYZER_RANGE_DEG, "degrees"), 3)
+    def _set_angle(self, arguments: str, now: float) -> None:
+        reading_deg = round(number(arguments, *led_table.ANALYZER_RANGE_DEG, "degrees"), 3)
         self._require_still()
         if self.lit:
             raise Refused(Code.IGNORED, "a light is on; PATT DARK first")
         self._sequence_armed = False
         self._turn(reading_deg, now)
-        return ""
-
-    def _get_angle(self, _: str, now: float) -> str:
-        return f"{self.analyser_deg:.3f}"
 
     def _require_settled(self, now: float) -> None:
         if self.turning(now):
@@ -241,7 +192,7 @@ class GradientSphereUnit(LedSequencer[PatternRow]):
         for led, driven in enumerate(self._levels(pattern, level)):
             if not self.bank.switch_on(led, driven, now, end_s=end_s) and led not in self._failed:
                 self._failed.add(led)
-                self._events.append(("LED:FAIL", str(led)))
+                self.say("LED:FAIL", str(led))
         shares = np.array(self.gains) / LEVEL_STEPS * self._health
         given = () if (shares == 1.0).all() else tuple(shares.tolist())
         self._shining = PatternLight(pattern, level, now, now, self.analyser_deg, given)
@@ -250,17 +201,17 @@ class GradientSphereUnit(LedSequencer[PatternRow]):
         levels = self._levels(pattern, level)
         return [Lit(led, driven, on_s, off_s) for led, driven in enumerate(levels) if driven > 0.0]
 
-    def _light(self, arguments: str, now: float) -> str:
+    def _light(self, arguments: str, now: float) -> None:
         self._require_still()
         name, *more = arguments.split(",")
         if len(more) > 2:
             raise Refused(Code.SYNTAX, "expected PATTERN,MS,LEVEL")
-        pattern = pattern_name(name)
+        pattern = led_table.pattern_name(name)
         if pattern == "dark":
             if more:
                 raise Refused(Code.SYNTAX, "expected DARK")
             self.bank.all_off(now)
-            return ""
+            return
         longest_ms = min(LED_MS[1], self._limits.max_on_s * 1e3)
         span_ms = number(more[0], LED_MS[0], longest_ms, "ms") if more else DEFAULT_LED_MS
         level = whole(more[1], 1, LEVEL_STEPS) / LEVEL_STEPS if len(more) > 1 else 1.0
@@ -273,7 +224,6 @@ class GradientSphereUnit(LedSequencer[PatternRow]):
         self._sequence_armed = False
         self._failed = set()
         self._shine(pattern, level, now, end_s=end_s)
-        return ""
 
     def _lit_now(self, _: str, now: float) -> str:
         shining = self._shining
@@ -281,28 +231,28 @@ class GradientSphereUnit(LedSequencer[PatternRow]):
 
     # scans ------------------------------------------------------------------------------------
 
-    def _parse_rows(self, text: str) -> list[PatternRow]:
-        return parse_patterns(text, cameras=self._cameras, most_us=self._row_max_us)
+    def _parse_rows(self, text: str) -> list[led_table.PatternRow]:
+        return led_table.parse_patterns(text, cameras=self._cameras, most_us=self._row_max_us)
 
-    def _lit_by(self, rows: Sequence[PatternRow], now: float) -> list[Lit]:
+    def _lit_by(self, rows: Sequence[led_table.PatternRow], now: float) -> list[Lit]:
         self._require_settled(now)
-        times = starts(rows, reading_deg=self.analyser_deg, s_per_deg=self._s_per_deg)
+        times = led_table.starts(rows, reading_deg=self.analyser_deg, s_per_deg=self._s_per_deg)
         found: list[Lit] = []
         for row, (_, lit_s) in zip(rows, times, strict=True):
             start_s = now + lit_s
             found += self._wanted(row.pattern, row.level, start_s, start_s + row.dwell_us * 1e-6)
         return found
 
-    def _schedule(self, rows: Sequence[PatternRow]) -> list[Switch]:
+    def _schedule(self, rows: Sequence[led_table.PatternRow]) -> list[Switch]:
         self._failed = set()
-        return schedule(
+        return led_table.schedule(
             rows,
             reading_deg=self.analyser_deg,
             s_per_deg=self._s_per_deg,
             settle_s=self._limits.settle_s,
         )
 
-    def _switch_light(self, run: Run[PatternRow], switch: Switch, now: float) -> None:
+    def _switch_light(self, run: Run[led_table.PatternRow], switch: Switch, now: float) -> None:
         row = run.rows[switch.row]
         if switch.what == "rotate":
             self.bank.all_off(now)
@@ -312,14 +262,13 @@ class GradientSphereUnit(LedSequencer[PatternRow]):
 
     # gains ------------------------------------------------------------------------------------
 
-    def _clear_gains(self, _: str, now: float) -> str:
+    def _clear_gains(self, _: str, now: float) -> None:
         self._require_still()
         self.gains = [LEVEL_STEPS] * self.bank.count
         self._gains_sent = []
         self._sequence_armed = False
-        return ""
 
-    def _define_gains(self, arguments: str, now: float) -> str:
+    def _define_gains(self, arguments: str, now: float) -> None:
         self._require_still()
         first_text, _, rest = arguments.partition(",")
         if _GAINS_PATTERN.fullmatch(rest) is None:
@@ -333,7 +282,3 @@ class GradientSphereUnit(LedSequencer[PatternRow]):
         self._gains_sent[first : first + len(gains)] = gains
         self.gains[first : first + len(gains)] = gains
         self._sequence_armed = False
-        return ""
-
-    def _gains_checksum(self, _: str, now: float) -> str:
-        return f"{len(self._gains_sent)},{table_crc(self._gains_sent)}"

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
 from capture.devices.wire import Code
 from capture.rig import LedLimits, Light
-from rigsim.boxes.controller import Refused
+from rigsim.boxes.command import Refused
 from rigsim.boxes.eye_guard import Lit
+from rigsim.boxes.faults import Faults
 
 CLEAR_SHARE = 0.5
 """Temperature, of the trip's, below which a hot LED may be lit again."""
@@ -26,34 +27,28 @@ class LedBank:
         What they are, and what they may do.
     on_light
         Called with each stretch of light when it ends: LED, level, start and end in s.
-    dead
-        Numbers of LEDs that draw no current.
-    weak
-        Light of aged LEDs relative to a new one, by number; the driver does not notice.
-    heat
-        Temperature of all at power-up, 0 to 1.
+    faults
+        Dead LEDs, weak ones, which the driver does not notice, and the heat of all at power-up.
     """
 
     def __init__(
         self,
         lights: Sequence[Light],
         limits: LedLimits,
+        faults: Faults,
         *,
         on_light: Callable[[Lit], None],
-        dead: frozenset[int] = frozenset(),
-        weak: Mapping[int, float] | None = None,
-        heat: float = 0.0,
     ) -> None:
         self.limits = limits
-        self.dead = dead
+        self.dead = faults.dead_leds
         self.count = len(lights)
         self._power_w = np.array([light.power_w or 0.0 for light in lights])
-        self._weak = dict(weak or {})
+        self._weak = faults.weak_leds
         self._on_light = on_light
         # number -> (level, since, end); a stretch of light that is still going on
         self._lit: dict[int, tuple[float, float, float]] = {}
         self._past: dict[int, deque[Lit]] = {}
-        self._heat = np.full(self.count, heat)
+        self._heat = np.full(self.count, faults.heat)
         self._hot = self._heat >= limits.thermal_trip
         self._heat_at = 0.0
         self._dose_ws = np.zeros(self.count)

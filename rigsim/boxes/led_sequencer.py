@@ -10,44 +10,25 @@ beyond the flicker that open eyes may see (105). Heat, dose and duty survive a r
 from __future__ import annotations
 
 import re
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from capture.devices.wire import Code
-from capture.rig import LedLimits, Light
-from rigsim.boxes.controller import Command, Refused, choice, word
+from capture.rig import LedLimits, Rig
+from rigsim.boxes.command import Act, Command, Refused, choice, command_table, whole, word
+from rigsim.boxes.device import Device
 from rigsim.boxes.eye_guard import EyeGuard, Lit
+from rigsim.boxes.faults import Faults
 from rigsim.boxes.led_bank import LedBank
-from rigsim.boxes.led_table import LEVEL_STEPS, ROW_US, Switch, table_crc
+from rigsim.boxes.led_table import LEVEL_STEPS, ROW_US, Switch, TableRow, table_crc
 
 _MASK_PATTERN = re.compile(r"[0-9A-Fa-f]{1,8}")
 LED_MS = (1.0, 500.0)
 EYE_STATES = ("OPEN", "CLOSED", "SHIELDED")
 HISTORY_S = 1.0
 """Light so long ago counts as one with light to come."""
-
-(
-    STATUS_RUNNING,
-    STATUS_SEQUENCE_ARMED,
-    STATUS_LIT,
-    STATUS_HOT,
-    STATUS_INTERLOCK,
-    STATUS_EYES_SAFE,
-) = 16, 32, 64, 128, 256, 512
-
-
-class TableRow(Protocol):
-    """What rows of all tables have; their text is what the checksum is taken of."""
-
-    @property
-    def dwell_us(self) -> int:
-        """How long it is lit, us."""
-
-    @property
-    def mask(self) -> int:
-        """Cameras that are released: bit 0 is the first."""
 
 
 RowT = TypeVar("RowT", bound=TableRow)
@@ -65,46 +46,33 @@ class Run(Generic[RowT]):
     row: int = -1
 
 
-class LedSequencer(ABC, Generic[RowT]):
+class LedSequencer(Device, Generic[RowT]):
     """State of a box with LEDs and a table, behind its controller.
 
     Parameters
     ----------
-    lights, limits
-        Its LEDs, and what they may do.
-    cameras
-        How many cameras hang on it.
+    rig, faults
+        Its LEDs, what they may do, and its cameras; what is wrong with it.
     on_light
         Called with each stretch of light of an LED when it has ended.
     on_trigger
         Called with the world time in s and the mask of each release of cameras.
-    dead, weak, heat, interlock
-        See `rigsim.world.faults.Faults`; dead and weak LEDs by number.
     """
-
-    kind: str
-    model: str
 
     def __init__(
         self,
-        lights: Sequence[Light],
-        limits: LedLimits,
+        rig: Rig,
+        faults: Faults,
         *,
-        cameras: int,
         on_light: Callable[[Lit], None],
         on_trigger: Callable[[float, int], None],
-        dead: frozenset[int] = frozenset(),
-        weak: Mapping[int, float] | None = None,
-        heat: float = 0.0,
-        interlock: bool = False,
     ) -> None:
-        self._limits = limits
-        self._cameras = cameras
+        super().__init__(rig, faults)
+        self._limits = rig.leds or LedLimits()
+        self._cameras = len(rig.views)
         self._on_trigger = on_trigger
-        self.interlock = interlock
-        self.bank = LedBank(lights, limits, on_light=on_light, dead=dead, weak=weak, heat=heat)
-        self._guard = EyeGuard(lights)
-        self._events: list[tuple[str, str]] = []
+        self.bank = LedBank(rig.lights, self._limits, faults, on_light=on_light)
+        self._guard = EyeGuard(rig.lights)
         self._run: Run[RowT] | None = None
         # tokens and times of all sequences since the box was made
         self.runs: list[tuple[str, float]] = []
@@ -131,10 +99,7 @@ class LedSequencer(ABC, Generic[RowT]):
 
     def reset(self, now: float, *, power_up: bool) -> None:
         """Return to the settings of power-up: no table, all cameras, open eyes, dark."""
-        self.go_dark(now)
-        if power_up:
-            self._powered_at = now
-            self._events.clear()
+        super().reset(now, power_up=power_up)
         self.table: list[RowT] = []
         self.mask = (1 << self._cameras) - 1
         self.eyes = "OPEN"
@@ -169,44 +134,24 @@ class LedSequencer(ABC, Generic[RowT]):
     def _row_max_us(self) -> int:
         return min(ROW_US[1], round(self._limits.max_on_s * 1e6))
 
-    def commands(self) -> Mapping[str, Command]:
+    def commands(self) -> dict[str, Command]:
         """Return the commands that these boxes share."""
-        return {
-            "SEQ:CLE": Command(self._clear_table, manual="empty the table"),
-            "SEQ:CRC?": Command(self._checksum, manual="rows and checksum of the table"),
-            "SEQ:ARM": Command(
-                self._arm_sequence,
-                "<rows>",
-                armed=True,
-                manual="judge the table: flashes per s, flicker rms, duty, heat, dose in Ws",
-            ),
-            "TRIG": Command(
-                self._trigger, "<token>", armed=True, manual="run the armed table: token, box us"
-            ),
-            "SEQ:POS?": Command(
-                self._position, manual="IDLE, READY, RUN, DONE or STOP, row, rows, token"
-            ),
-            "SEQ:STEP?": Command(
-                self._step_time, "<row>", manual="box us of a row's release in the last run, NONE"
-            ),
-            "CAM:MASK": Command(
-                self._set_mask, "<hex>", manual="cameras that are released at all; bit 0 the first"
-            ),
-            "CAM:MASK?": Command(self._get_mask, manual="that mask"),
-            "CAM:TRIG": Command(
-                self._release, "<token>", manual="release the cameras without light: token, us"
-            ),
-            "SAFE:EYES": Command(
-                self._set_eyes,
-                "OPEN|CLOSED|SHIELDED",
-                manual="what a person says of the subject's eyes; OPEN at power-up",
-            ),
-            "SAFE:EYES?": Command(self._get_eyes, manual="what was said of the eyes"),
-            "DOSE?": Command(self._dose, "<led>", manual="sent out to this subject, Ws"),
-            "DOSE:NEW": Command(
-                self._new_subject, "<token>", manual="another subject: count the dose anew"
-            ),
+        acts: dict[str, Act] = {
+            "SEQ:CLE": self._clear_table,
+            "SEQ:CRC?": lambda *_: f"{len(self.table)},{table_crc(self.table)}",
+            "SEQ:ARM": self._arm_sequence,
+            "TRIG": self._trigger,
+            "SEQ:POS?": self._position,
+            "SEQ:STEP?": self._step_time,
+            "CAM:MASK": self._set_mask,
+            "CAM:MASK?": lambda *_: f"{self.mask:X}",
+            "CAM:TRIG": self._release,
+            "SAFE:EYES": self._set_eyes,
+            "SAFE:EYES?": lambda *_: self.eyes,
+            "DOSE?": self._dose,
+            "DOSE:NEW": self._new_subject,
         }
+        return command_table("led_sequencer", acts)
 
     # time -------------------------------------------------------------------------------------
 
@@ -236,20 +181,15 @@ class LedSequencer(ABC, Generic[RowT]):
     def _switch(self, run: Run[RowT], switch: Switch, now: float) -> None:
         if switch.what == "pulse":
             run.row = switch.row
-            self._steps[switch.row] = self._clock_us(now)
+            self._steps[switch.row] = self.clock_us(now)
             self._on_trigger(now, run.rows[switch.row].mask & self.mask)
-            self._events.append(("SEQ:STEP", f"{switch.row},{self._clock_us(now)}"))
+            self.say("SEQ:STEP", f"{switch.row},{self.clock_us(now)}")
         elif switch.what == "end":
             self.bank.all_off(now)
             run.state = "DONE"
-            self._events.append(("SEQ:DONE", f"{len(run.rows)},{self._clock_us(now)}"))
+            self.say("SEQ:DONE", f"{len(run.rows)},{self.clock_us(now)}")
         else:
             self._switch_light(run, switch, now)
-
-    def take_events(self) -> list[tuple[str, str]]:
-        """Return and forget what the box has to say unasked: name and payload."""
-        events, self._events = self._events, []
-        return events
 
     def go_dark(self, now: float) -> None:
         """Put every LED out and stop the sequence."""
@@ -259,7 +199,7 @@ class LedSequencer(ABC, Generic[RowT]):
         if run is not None and run.todo:
             run.todo.clear()
             run.state = "STOP"
-            self._events.append(("SEQ:STOP", f"{run.row},{self._clock_us(now)}"))
+            self.say("SEQ:STOP", f"{run.row},{self.clock_us(now)}")
 
     @property
     def lit(self) -> bool:
@@ -275,15 +215,10 @@ class LedSequencer(ABC, Generic[RowT]):
         """Tell whether a sequence is stepping."""
         return self.running
 
-    def status_bits(self, now: float) -> int:
-        """Return 16 running, 32 sequence armed, 64 lit, 128 hot, 256 stop open, 512 eyes safe."""
-        bits = (
-            STATUS_RUNNING * self.running
-            + STATUS_SEQUENCE_ARMED * self._sequence_armed
-            + STATUS_LIT * self.lit
-        )
-        bits += STATUS_HOT * self.bank.any_hot + STATUS_INTERLOCK * self.interlock
-        return bits + STATUS_EYES_SAFE * (self.eyes != "OPEN")
+    def states(self, now: float) -> dict[int, bool]:
+        """Return 16 running, 32 sequence armed, 64 lit, 128 hot, 512 eyes safe."""
+        running = {16: self.running, 32: self._sequence_armed, 64: self.lit}
+        return running | {128: self.bank.any_hot, 512: self.eyes != "OPEN"}
 
     # sequence ---------------------------------------------------------------------------------
 
@@ -291,17 +226,12 @@ class LedSequencer(ABC, Generic[RowT]):
         if self.running:
             raise Refused(Code.IGNORED, "a sequence is running")
 
-    def _require_closed_stop(self) -> None:
-        if self.interlock:
-            raise Refused(Code.INTERLOCK)
-
-    def _clear_table(self, _: str, now: float) -> str:
+    def _clear_table(self, _: str, now: float) -> None:
         self._require_still()
         self.table.clear()
         self._sequence_armed = False
-        return ""
 
-    def _define_rows(self, arguments: str, now: float) -> str:
+    def _define_rows(self, arguments: str, now: float) -> None:
         self._require_still()
         first_text, comma, rest = arguments.partition(",")
         if not comma:
@@ -316,10 +246,6 @@ class LedSequencer(ABC, Generic[RowT]):
             raise Refused(Code.OUT_OF_RANGE, f"expected rows longer than {settle_us:g} us")
         self.table[first : first + len(rows)] = rows
         self._sequence_armed = False
-        return ""
-
-    def _checksum(self, _: str, now: float) -> str:
-        return f"{len(self.table)},{table_crc(self.table)}"
 
     def _arm_sequence(self, arguments: str, now: float) -> str:
         self._require_still()
@@ -363,7 +289,7 @@ class LedSequencer(ABC, Generic[RowT]):
         self._run = Run(token, now, rows, self._schedule(rows))
         self.runs.append((token, now))
         self.advance(now)
-        return f"{token},{self._clock_us(now)}"
+        return f"{token},{self.clock_us(now)}"
 
     def _position(self, _: str, now: float) -> str:
         run = self._run
@@ -379,7 +305,7 @@ class LedSequencer(ABC, Generic[RowT]):
 
     # cameras, eyes, dose ----------------------------------------------------------------------
 
-    def _set_mask(self, arguments: str, now: float) -> str:
+    def _set_mask(self, arguments: str, now: float) -> None:
         if _MASK_PATTERN.fullmatch(arguments) is None:
             raise Refused(Code.SYNTAX, "expected a mask in hexadecimal digits")
         mask = int(arguments, 16)
@@ -387,45 +313,23 @@ class LedSequencer(ABC, Generic[RowT]):
             raise Refused(Code.OUT_OF_RANGE, f"expected a mask of {self._cameras} cameras")
         self._require_still()
         self.mask = mask
-        return ""
-
-    def _get_mask(self, _: str, now: float) -> str:
-        return f"{self.mask:X}"
 
     def _release(self, arguments: str, now: float) -> str:
         token = word(arguments)
         self._require_still()
         self._on_trigger(now, self.mask)
-        return f"{token},{self._clock_us(now)}"
+        return f"{token},{self.clock_us(now)}"
 
-    def _set_eyes(self, arguments: str, now: float) -> str:
+    def _set_eyes(self, arguments: str, now: float) -> None:
         self.eyes = choice(arguments, EYE_STATES)
         self._sequence_armed = False
-        return ""
-
-    def _get_eyes(self, _: str, now: float) -> str:
-        return self.eyes
 
     def _dose(self, arguments: str, now: float) -> str:
         return f"{self.bank.dose_ws(whole(arguments, 0, self.bank.count - 1)):.6f}"
 
-    def _new_subject(self, arguments: str, now: float) -> str:
+    def _new_subject(self, arguments: str, now: float) -> None:
         word(arguments)
         self._require_still()
         self.bank.new_subject()
         # eyes are a person's, and so is what was said of them
         self.eyes = "OPEN"
-        return ""
-
-    def _clock_us(self, now: float) -> int:
-        return round((now - self._powered_at) * 1e6)
-
-
-def whole(text: str, low: int, high: int) -> int:
-    """Return a whole number that a command gives, or refuse with -102 or -222."""
-    if not (text.isascii() and text.isdecimal() and len(text) <= 9):
-        raise Refused(Code.SYNTAX, "expected a whole number")
-    value = int(text)
-    if not low <= value <= high:
-        raise Refused(Code.OUT_OF_RANGE, f"expected {low} to {high}")
-    return value

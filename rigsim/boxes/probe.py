@@ -16,7 +16,6 @@ The box does not know what it sits on: it draws at a `SuctionLoad` and has a gau
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -24,8 +23,10 @@ from typing import Any
 import numpy as np
 
 from capture.devices.wire import Code
-from capture.rig import LedLimits, Light, Probe
-from rigsim.boxes.controller import Command, Later, Refused, number, word
+from capture.rig import Rig
+from rigsim.boxes.command import Act, Command, Later, Refused, command_table, number, word
+from rigsim.boxes.device import Device
+from rigsim.boxes.faults import Faults
 from rigsim.boxes.source_shutter import COVER_S, LEVEL_STEPS, SHUTTER_MS, SourceLight, SourceShutter
 from rigsim.boxes.suction_pump import (
     MAX_PUMPING_S,
@@ -39,39 +40,24 @@ from rigsim.boxes.suction_pump import (
 
 __all__ = ["ProbeUnit", "SourceLight"]
 
-(
-    STATUS_MOVING,
-    STATUS_SUCKING,
-    STATUS_LIT,
-    STATUS_INTERLOCK,
-    STATUS_PLACED,
-    STATUS_RESTING,
-    STATUS_JAMMED,
-) = 16, 32, 64, 256, 512, 1024, 2048
 THERMOMETER_C = 0.03
 """Standard deviation of one reading of the camera's thermometer, kelvin."""
 _WHOLE_PATTERN = re.compile(r"[0-9]{1,4}")
 
 
-class ProbeUnit:
+class ProbeUnit(Device):
     """State of the probe's box behind its controller.
 
     Parameters
     ----------
-    probe
-        Its fibres and limits.
-    source, limits
-        The LED at the source fibre, and what it may do; the dose of one subject among it.
+    rig, faults
+        Its probe, the LED at the source fibre and what that may do; what is wrong with it.
     load
         What the head sits on.
     on_light
         Called with each stretch of light when it ends.
     on_trigger
         Called with the world time in s when the camera's line is pulsed.
-    shutter_stuck, shutter_jam, gauge_dead_after, interlock, interlock_after
-        See `rigsim.world.faults.Faults`.
-    dead, weak
-        The LED draws no current; it gives so much of a new one's light, which nobody notices.
     rng
         Noise of gauge and thermometer, and what sticks.
     """
@@ -81,63 +67,34 @@ class ProbeUnit:
 
     def __init__(
         self,
-        probe: Probe,
-        source: Light,
-        limits: LedLimits,
-        load: SuctionLoad,
+        rig: Rig,
+        load: SuctionLoad | None,
+        faults: Faults,
         *,
         on_light: Callable[[SourceLight], None],
         on_trigger: Callable[[float], None],
-        shutter_stuck: float = 0.0,
-        shutter_jam: float = 0.0,
-        gauge_dead_after: float = math.inf,
-        interlock: bool = False,
-        interlock_after: float = math.inf,
-        dead: bool = False,
-        weak: float = 1.0,
         rng: np.random.Generator,
     ) -> None:
-        self._probe = probe
-        self._source = source
+        super().__init__(rig, faults)
+        if rig.probe is None or load is None:
+            raise ValueError(f"probe: got none in rig {rig.name!r}, expected its description")
+        self._probe = rig.probe
         self._load = load
         self._on_trigger = on_trigger
-        self._interlock_at = -math.inf if interlock else interlock_after
-        self.interlock = interlock
         self._rng = rng
-        self._powered_at = 0.0
-        self._events: list[tuple[str, str]] = []
-        self.shutter = SourceShutter(
-            len(probe.fibres),
-            power_w=source.power_w or 0.0,
-            dose_ws=limits.dose_ws,
-            on_light=on_light,
-            on_open=on_trigger,
-            say=self._say,
-            clock_us=self._clock_us,
-            stuck=shutter_stuck,
-            jam=shutter_jam,
-            dead=dead,
-            weak=weak,
-            rng=rng,
-        )
+        self.shutter = SourceShutter(self, on_light=on_light, on_open=on_trigger, rng=rng)
+        gauge = Gauge(rng=rng, dead_after_s=faults.gauge_dead_after)
         self.pump = SuctionPump(
-            probe,
-            load,
-            Gauge(rng=rng, dead_after_s=gauge_dead_after),
-            on_end=lambda now: self.shutter.shut(now, "PUMP"),
-            say=self._say,
-            clock_us=self._clock_us,
+            self, rig.probe, load, gauge, on_end=lambda now: self.shutter.shut(now, "PUMP")
         )
 
     # settings ---------------------------------------------------------------------------------
 
     def reset(self, now: float, *, power_up: bool) -> None:
         """Return to the settings of power-up: dark, vented, no place, no fibre covered."""
-        self.go_dark(now)
+        super().reset(now, power_up=power_up)
         self.shutter.forget(power_up=power_up, now=now)
         if power_up:
-            self._powered_at = now
-            self._events.clear()
             self.pump.last_report = ""
 
     def capabilities(self) -> Mapping[str, Any]:
@@ -158,92 +115,51 @@ class ProbeUnit:
             "rest_ms": round(probe.rest_s * 1e3, 6),
             "control_period_ms": PUMP_CONTROL_PERIOD_S * 1e3,
             "camera_c": probe.camera_c,
-            "source_w": self._source.power_w,
+            "source_w": self.rig.lights[0].power_w,
             "dose_ws": self.shutter.dose_limit_ws,
         }
 
-    def commands(self) -> Mapping[str, Command]:
+    def commands(self) -> dict[str, Command]:
         """Return the command table: the manual of the box."""
-        return {
-            "HEAD:SITE": Command(
-                self._place,
-                "<label>,<deg>",
-                armed=True,
-                manual="a person says where the head sits, and how it is turned",
+        acts: dict[str, Act] = {
+            "HEAD:SITE": self._place,
+            "HEAD:SITE?": self._get_place,
+            "HEAD:FREE": self._take_away,
+            "PUMP": self._pump,
+            "PUMP?": lambda _, now: self.pump.state(now),
+            "PUMP:LAST?": lambda *_: self.pump.last_report or "NONE",
+            "PRES?": lambda _, now: f"{self.pump.read(now):.1f}",
+            "LED": self._set_level,
+            "LED?": lambda *_: str(self.shutter.level),
+            "SHUT": self._shut,
+            "SHUT?": self._get_shutter,
+            "SHUT:LAST?": lambda *_: self.shutter.last_report or "NONE",
+            "SHUT:COUN?": lambda *_: str(self.shutter.count),
+            "FIB": self._cover,
+            "FIB?": lambda *_: "ALL" if self.shutter.fibre is None else str(self.shutter.fibre),
+            "CAM:TRIG": self._trigger,
+            "CAM:TEMP?": lambda _, now: (
+                f"{self._load.camera_c(now) + float(self._rng.normal(0.0, THERMOMETER_C)):.2f}"
             ),
-            "HEAD:SITE?": Command(self._get_place, manual="label, degrees; or NONE"),
-            "HEAD:FREE": Command(self._take_away, bare=True, manual="the head is taken off: vent"),
-            "PUMP": Command(
-                self._pump,
-                "ON,<ms>,<mbar>|VENT",
-                armed=True,
-                harmless=("VENT",),
-                manual="suck, with an end: number; or vent",
-            ),
-            "PUMP?": Command(self._get_pump, manual="ON,mbar,ms left; REST,ms left; or VENT"),
-            "PUMP:LAST?": Command(
-                self._last_suction,
-                manual="last suction that ended: number, TIMED, ASKED, LOW, LOST, HIGH, GAUGE, "
-                "INTERLOCK or DARK, mbar, us; or NONE",
-            ),
-            "PRES?": Command(self._pressure, manual="suction, mbar below the air's pressure"),
-            "LED": Command(
-                self._set_level,
-                "<level>",
-                armed=True,
-                harmless=("0",),
-                manual="light of the source's LED, thousandths of full",
-            ),
-            "LED?": Command(self._get_level, manual="that level"),
-            "SHUT": Command(
-                self._shut,
-                "OPEN,<ms>|CLOSE",
-                armed=True,
-                harmless=("CLOSE",),
-                manual="open, pulsing the camera line, with an end: number, us; or close",
-            ),
-            "SHUT?": Command(self._get_shutter, manual="OPEN,ms left; CLOSED; or JAM"),
-            "SHUT:LAST?": Command(
-                self._last_opening,
-                manual="last opening: number, OPEN, TIMED, ASKED, PUMP, JAM, INTERLOCK or DARK, "
-                "us it opened, us it closed or -; or NONE",
-            ),
-            "SHUT:COUN?": Command(self._count, manual="openings tried since the box was made"),
-            "FIB": Command(
-                self._cover, "<n>|ALL", manual="uncover one detection fibre, from 0, or all"
-            ),
-            "FIB?": Command(self._get_cover, manual="the only one that is not covered, or ALL"),
-            "CAM:TRIG": Command(
-                self._trigger, "<token>", manual="pulse the camera line without light: token, us"
-            ),
-            "CAM:TEMP?": Command(self._temperature, manual="of the camera, degrees Celsius"),
-            "DOSE?": Command(self._dose, manual="light into this subject, Ws"),
-            "DOSE:NEW": Command(
-                self._new_subject, "<token>", manual="another subject: count the dose anew"
-            ),
+            "DOSE?": lambda *_: f"{self.shutter.dose_ws:.6f}",
+            "DOSE:NEW": self._new_subject,
         }
+        return command_table("probe", acts)
 
     # time -------------------------------------------------------------------------------------
 
     def deadline(self) -> float:
         """Return when something will next happen by itself, in s."""
-        stop = math.inf if self.interlock else self._interlock_at
-        return min(stop, self.shutter.deadline(), self.pump.deadline())
+        return min(self._stop_opens_s(), self.shutter.deadline(), self.pump.deadline())
 
     def advance(self, now: float) -> None:
         """Let time pass up to `now`, in s."""
         while (due := self.deadline()) <= now:
-            if not self.interlock and self._interlock_at <= due:
+            if self._stop_opens_s() <= due:
                 self.interlock = True
                 self._let_go(due, "INTERLOCK")
             self.shutter.advance(due)
             self.pump.advance(due)
-
-    def take_events(self) -> list[tuple[str, str]]:
-        """Return and forget what the box has to say unasked: name and payload."""
-        events = list(self._events)
-        self._events.clear()
-        return events
 
     def go_dark(self, now: float) -> None:
         """Shut the shutter, put the LED out, vent, and forget where the head sits."""
@@ -262,35 +178,20 @@ class ProbeUnit:
         """Tell whether the shutter is open or the cover moves."""
         return self.shutter.under_way(now)
 
-    def status_bits(self, now: float) -> int:
-        """Return 16 busy, 32 sucking, 64 lit, 256 stop, 512 placed, 1024 resting, 2048 jammed."""
+    def states(self, now: float) -> dict[int, bool]:
+        """Return 16 busy, 32 sucking, 64 lit, 512 placed, 1024 resting, 2048 jammed."""
         pump, shutter = self.pump, self.shutter
-        bits = (
-            STATUS_MOVING * self.busy(now)
-            + STATUS_SUCKING * pump.drawing
-            + STATUS_LIT * shutter.lit
-        )
-        bits += STATUS_INTERLOCK * self.interlock + STATUS_PLACED * (pump.placement is not None)
-        return bits + STATUS_RESTING * (pump.rest_ms(now) > 0) + STATUS_JAMMED * shutter.jammed
+        lit = {16: self.busy(now), 32: pump.drawing, 64: shutter.lit, 2048: shutter.jammed}
+        return lit | {512: pump.placement is not None, 1024: pump.rest_ms(now) > 0}
 
     def _let_go(self, now: float, how: str) -> None:
         self.shutter.go_dark(now, how)
         self.pump.vent(now, how)
         self.pump.take_away(now)
 
-    def _say(self, name: str, payload: str) -> None:
-        self._events.append((name, payload))
-
-    def _clock_us(self, now: float) -> int:
-        return round((now - self._powered_at) * 1e6)
-
-    def _require_stop_closed(self) -> None:
-        if self.interlock:
-            raise Refused(Code.INTERLOCK)
-
     # head and pump ----------------------------------------------------------------------------
 
-    def _place(self, arguments: str, now: float) -> str:
+    def _place(self, arguments: str, now: float) -> None:
         label, _, angle = arguments.partition(",")
         site = word(label)
         angle_deg = number(angle, 0.0, 360.0, "degrees, less than 360")
@@ -298,7 +199,6 @@ class ProbeUnit:
             raise Refused(Code.OUT_OF_RANGE, "expected 0 to less than 360 degrees")
         self.shutter.require_closed(now)
         self.pump.place(site, angle_deg, now)
-        return ""
 
     def _get_place(self, _: str, now: float) -> str:
         if self.pump.placement is None:
@@ -306,11 +206,10 @@ class ProbeUnit:
         site, angle_deg = self.pump.placement
         return f"{site},{angle_deg:g}"
 
-    def _take_away(self, _: str, now: float) -> str:
+    def _take_away(self, _: str, now: float) -> None:
         self.shutter.shut(now, "ASKED")
         self.pump.vent(now, "ASKED")
         self.pump.take_away(now)
-        return ""
 
     def _pump(self, arguments: str, now: float) -> str:
         if arguments.upper() == "VENT":
@@ -322,33 +221,20 @@ class ProbeUnit:
             raise Refused(Code.SYNTAX, "expected ON,<ms>,<mbar> or VENT")
         span_ms = number(length, MIN_SUCTION_MS, self._probe.max_suction_s * 1e3, "ms")
         mbar = number(suction, MIN_SUCTION_MBAR, self._probe.max_suction_mbar, "mbar")
-        self._require_stop_closed()
+        self._require_closed_stop()
         return self.pump.draw(span_ms / 1e3, mbar, now)
-
-    def _get_pump(self, _: str, now: float) -> str:
-        return self.pump.state(now)
-
-    def _last_suction(self, _: str, now: float) -> str:
-        return self.pump.last_report or "NONE"
-
-    def _pressure(self, _: str, now: float) -> str:
-        return f"{self.pump.read(now):.1f}"
 
     # light ------------------------------------------------------------------------------------
 
-    def _set_level(self, arguments: str, now: float) -> str:
+    def _set_level(self, arguments: str, now: float) -> None:
         if _WHOLE_PATTERN.fullmatch(arguments) is None:
             raise Refused(Code.SYNTAX, "expected a whole number of thousandths")
         level = int(arguments)
         if level > LEVEL_STEPS:
             raise Refused(Code.OUT_OF_RANGE, f"expected 0 to {LEVEL_STEPS} thousandths")
         if level > 0:
-            self._require_stop_closed()
+            self._require_closed_stop()
         self.shutter.set_level(level, now)
-        return ""
-
-    def _get_level(self, _: str, now: float) -> str:
-        return str(self.shutter.level)
 
     def _shut(self, arguments: str, now: float) -> str | Later:
         if arguments.upper() == "CLOSE":
@@ -358,7 +244,7 @@ class ProbeUnit:
         if what.upper() != "OPEN":
             raise Refused(Code.SYNTAX, "expected OPEN,<ms> or CLOSE")
         span_ms = number(length, SHUTTER_MS, self._probe.max_open_s * 1e3, "ms")
-        self._require_stop_closed()
+        self._require_closed_stop()
         if self.shutter.level > 0 and not self.pump.holds:
             raise Refused(Code.IGNORED, "the head is not held; PUMP ON, and wait")
         at_s, outcome = self.shutter.open(span_ms / 1e3, now)
@@ -369,40 +255,23 @@ class ProbeUnit:
             return "JAM"
         return f"OPEN,{self.shutter.left_ms(now)}" if self.shutter.is_open else "CLOSED"
 
-    def _last_opening(self, _: str, now: float) -> str:
-        return self.shutter.last_report or "NONE"
-
-    def _count(self, _: str, now: float) -> str:
-        return str(self.shutter.count)
-
-    def _cover(self, arguments: str, now: float) -> str:
+    def _cover(self, arguments: str, now: float) -> None:
         if arguments.upper() == "ALL":
             self.shutter.cover(None, now)
-            return ""
+            return
         if _WHOLE_PATTERN.fullmatch(arguments) is None:
             raise Refused(Code.SYNTAX, "expected the number of a fibre, or ALL")
         if int(arguments) >= self.shutter.fibres:
             raise Refused(Code.OUT_OF_RANGE, f"expected 0 to {self.shutter.fibres - 1} or ALL")
         self.shutter.cover(int(arguments), now)
-        return ""
 
-    def _get_cover(self, _: str, now: float) -> str:
-        return "ALL" if self.shutter.fibre is None else str(self.shutter.fibre)
-
-    def _dose(self, _: str, now: float) -> str:
-        return f"{self.shutter.dose_ws:.6f}"
-
-    def _new_subject(self, arguments: str, now: float) -> str:
+    def _new_subject(self, arguments: str, now: float) -> None:
         word(arguments)
         self.shutter.dose_ws = 0.0
-        return ""
 
     # camera -----------------------------------------------------------------------------------
 
     def _trigger(self, arguments: str, now: float) -> str:
         token = word(arguments)
         self._on_trigger(now)
-        return f"{token},{self._clock_us(now)}"
-
-    def _temperature(self, _: str, now: float) -> str:
-        return f"{self._load.camera_c(now) + float(self._rng.normal(0.0, THERMOMETER_C)):.2f}"
+        return f"{token},{self.clock_us(now)}"

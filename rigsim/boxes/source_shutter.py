@@ -13,7 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture.devices.wire import Code
-from rigsim.boxes.controller import Refused
+from capture.rig import LedLimits
+from rigsim.boxes.command import Refused
+from rigsim.boxes.device import Device
 
 LEVEL_STEPS = 1000
 SHUTTER_MS = 1.0
@@ -55,53 +57,34 @@ class SourceShutter:
 
     Parameters
     ----------
-    fibres
-        How many detection fibres there are.
-    power_w, dose_ws
-        Light out of the source at full, W, and the most of it for one subject, Ws.
+    box
+        Whose rig has the fibres and the LED, whose faults say what sticks, and who sends events.
     on_light
         Called with each stretch of light when it ends.
     on_open
         Called with the world time in s when the blades have cleared the fibre.
-    say
-        Called with name and payload of an event.
-    clock_us
-        Turns world time into the box's.
-    stuck, jam
-        Probability that an opening, or a closing, does not happen.
-    dead, weak
-        The LED draws no current; it gives so much of a new one's light.
     rng
         Decides what sticks.
     """
 
     def __init__(
         self,
-        fibres: int,
+        box: Device,
         *,
-        power_w: float,
-        dose_ws: float,
         on_light: Callable[[SourceLight], None],
         on_open: Callable[[float], None],
-        say: Callable[[str, str], None],
-        clock_us: Callable[[float], int],
-        stuck: float,
-        jam: float,
-        dead: bool,
-        weak: float,
         rng: np.random.Generator,
     ) -> None:
-        self.fibres = fibres
-        self._power_w = power_w
-        self.dose_limit_ws = dose_ws
+        rig, faults = box.rig, box.faults
+        self._box = box
+        self.fibres = 0 if rig.probe is None else len(rig.probe.fibres)
+        self._power_w = rig.lights[0].power_w or 0.0
+        self.dose_limit_ws = (rig.leds or LedLimits()).dose_ws
         self._on_light = on_light
         self._on_open = on_open
-        self._say = say
-        self._clock_us = clock_us
-        self._stuck = stuck
-        self._jam = jam
-        self._dead = dead
-        self._weak = weak
+        self._stuck, self._jam = faults.shutter_stuck, faults.shutter_jam
+        self._dead = 0 in faults.dead_leds
+        self._weak = faults.weak_leds.get(0, 1.0)
         self._rng = rng
         self._opening: _Opening | None = None
         self._light_since: float | None = None
@@ -171,8 +154,8 @@ class SourceShutter:
             return
         opening.open = True
         self._begin_light(now)
-        self.last_report = f"{opening.number},OPEN,{self._clock_us(now)},-"
-        opening.outcome = f"{opening.number},{self._clock_us(now)}"
+        self.last_report = f"{opening.number},OPEN,{self._box.clock_us(now)},-"
+        opening.outcome = f"{opening.number},{self._box.clock_us(now)}"
         self._on_open(now)
 
     def _shut(self, opening: _Opening, how: str, now: float) -> None:
@@ -192,8 +175,8 @@ class SourceShutter:
         self._end_light(now)
         self._opening = None
         opened = self.last_report.split(",")[2]
-        self.last_report = f"{opening.number},{how},{opened},{self._clock_us(now)}"
-        self._say("SHUT:END", self.last_report)
+        self.last_report = f"{opening.number},{how},{opened},{self._box.clock_us(now)}"
+        self._box.say("SHUT:END", self.last_report)
 
     def _begin_light(self, now: float) -> None:
         if self.level > 0:

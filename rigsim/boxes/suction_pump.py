@@ -17,7 +17,8 @@ import numpy as np
 
 from capture.devices.wire import Code
 from capture.rig import Probe
-from rigsim.boxes.controller import Refused
+from rigsim.boxes.command import Refused
+from rigsim.boxes.device import Device
 
 PUMP_CONTROL_PERIOD_S = 0.05
 """Period in which the gauge is looked at while the pump runs, s."""
@@ -102,6 +103,8 @@ class SuctionPump:
 
     Parameters
     ----------
+    box
+        Who sends events.
     probe
         Its limits and the skin's rest.
     load
@@ -110,28 +113,22 @@ class SuctionPump:
         Of the suction under it.
     on_end
         Called with the world time in s when the suction has ended, whatever the reason.
-    say
-        Called with name and payload of an event.
-    clock_us
-        Turns world time into the box's.
     """
 
     def __init__(
         self,
+        box: Device,
         probe: Probe,
         load: SuctionLoad,
         gauge: Gauge,
         *,
         on_end: Callable[[float], None],
-        say: Callable[[str, str], None],
-        clock_us: Callable[[float], int],
     ) -> None:
         self._probe = probe
         self._load = load
         self._gauge = gauge
         self._on_end = on_end
-        self._say = say
-        self._clock_us = clock_us
+        self._box = box
         self._draw: _Draw | None = None
         # a clock of its own keeps the skin's rest through a reset of the box
         self._rested_s = -math.inf
@@ -203,8 +200,8 @@ class SuctionPump:
         self._draw = None
         self._load.vent(now)
         self._rested_s = now + self._probe.rest_s
-        self.last_report = f"{draw.number},{how},{draw.mbar:.1f},{self._clock_us(now)}"
-        self._say("PUMP:END", self.last_report)
+        self.last_report = f"{draw.number},{how},{draw.mbar:.1f},{self._box.clock_us(now)}"
+        self._box.say("PUMP:END", self.last_report)
         self._on_end(now)
 
     def _fail(self, draw: _Draw, how: str, now: float) -> None:

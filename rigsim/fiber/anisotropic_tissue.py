@@ -148,24 +148,11 @@ def anisotropic_profile(
     ) -> tuple[Float64Array, ...]:
         tally = np.zeros(shape)
         visited = np.zeros((2, window.size))
+        bins = starts.astype(np.int64), counts.astype(np.int64), bins_per_mm
         walk_anisotropic(
-            medium,
-            fibres.source_numerical_aperture,
-            fibres.numerical_aperture,
-            places,
-            overlap,
-            per_mm,
-            starts.astype(np.int64),
-            counts.astype(np.int64),
-            bins_per_mm,
-            rings,
-            window,
-            splitting.WINDOW_CELLS / reach,
-            deeper,
-            traced,
-            seed.copy(),
-            tally,
-            visited,
+            *(medium, fibres.source_numerical_aperture, fibres.numerical_aperture),
+            *(places, overlap, per_mm, *bins, rings, window),
+            *(splitting.WINDOW_CELLS / reach, deeper, traced, seed.copy(), tally, visited),
         )
         return tally / traced, visited
 

@@ -86,9 +86,7 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
         reflected, uz = fresnel(sqrt(1.0 - ux * ux - uy * uy), 1.0, eta)
         ux /= eta
         uy /= eta
-        x = 0.0
-        y = 0.0
-        z = 0.0
+        x, y, z = 0.0, 0.0, 0.0
         weight = 1.0 - reflected
         alive = 0
         while True:
@@ -189,31 +187,15 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
                     copies = min(int(weight / target), MAX_COPIES, STACK_DEPTH - alive + 1)
                     weight /= copies
                     for _copy in range(copies - 1):
-                        waiting[alive, 0] = x
-                        waiting[alive, 1] = y
-                        waiting[alive, 2] = z
-                        waiting[alive, 3] = ux
-                        waiting[alive, 4] = uy
-                        waiting[alive, 5] = uz
-                        waiting[alive, 6] = weight
+                        row = waiting[alive]
+                        row[0], row[1], row[2] = x, y, z
+                        row[3], row[4], row[5], row[6] = ux, uy, uz, weight
                         alive += 1
                 s0, s1, s2, s3, ux, uy, uz = _turn(s0, s1, s2, s3, ux, uy, uz, g, strength, most)
             if alive == 0:
                 break
             alive -= 1
-            x = waiting[alive, 0]
-            y = waiting[alive, 1]
-            z = waiting[alive, 2]
-            weight = waiting[alive, 6]
-            s0, s1, s2, s3, ux, uy, uz = _turn(
-                s0,
-                s1,
-                s2,
-                s3,
-                waiting[alive, 3],
-                waiting[alive, 4],
-                waiting[alive, 5],
-                g,
-                strength,
-                most,
-            )
+            row = waiting[alive]
+            x, y, z, weight = row[0], row[1], row[2], row[6]
+            ux, uy, uz = row[3], row[4], row[5]
+            s0, s1, s2, s3, ux, uy, uz = _turn(s0, s1, s2, s3, ux, uy, uz, g, strength, most)

@@ -416,25 +416,22 @@ class _Plan:
         tally = np.zeros(fibres)
         histogram = np.zeros((fibres, _path_nodes()) if self.counts_paths else (0, 0))
         visited = np.zeros((2, len(window)))
+        sines = self.fibres.source_numerical_aperture, self.fibres.numerical_aperture
+        rings = self.kernels, self.starts, self.counts
+        per_mm = WINDOW_CELLS / self.reach_mm, self.deeper_per_mm, self.chances_per_mm
+        paths = PATH_STEP, PATH_SCALE_MM
+        found = tally, histogram, visited
         walk_to_fibres(
             self.table,
-            self.fibres.source_numerical_aperture,
-            self.fibres.numerical_aperture,
-            self.kernels,
-            self.starts,
-            self.counts,
+            *sines,
+            *rings,
             window,
             self.chances,
-            WINDOW_CELLS / self.reach_mm,
-            self.deeper_per_mm,
-            self.chances_per_mm,
-            PATH_STEP,
-            PATH_SCALE_MM,
+            *per_mm,
+            *paths,
             photons,
             seed.copy(),
-            tally,
-            histogram,
-            visited,
+            *found,
         )
         return (histogram if self.counts_paths else tally), visited
 

@@ -136,12 +136,8 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
         s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
         sine2 = source_sine * source_sine * u / (eta_above * eta_above)
         reflected, mu = fresnel(sqrt(1.0 - sine2), eta_above, table[1, 5])
-        x = 0.0  # position, mm
-        y = 0.0
-        z = 0.0
-        ux = sqrt(sine2) * eta_ratio  # direction
-        uy = 0.0
-        uz = mu
+        x, y, z = 0.0, 0.0, 0.0  # position, mm
+        ux, uy, uz = sqrt(sine2) * eta_ratio, 0.0, mu  # direction
         weight = 1.0 - reflected
         path = 0.0  # in the counted absorber, mm
         layer = 1
@@ -242,15 +238,10 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
                         if copies > 1:
                             weight /= copies
                             for _copy in range(copies - 1):
-                                waiting[alive, 0] = x
-                                waiting[alive, 1] = y
-                                waiting[alive, 2] = z
-                                waiting[alive, 3] = ux
-                                waiting[alive, 4] = uy
-                                waiting[alive, 5] = uz
-                                waiting[alive, 6] = weight
-                                waiting[alive, 7] = path
-                                waiting[alive, 8] = layer
+                                row = waiting[alive]
+                                row[0], row[1], row[2] = x, y, z
+                                row[3], row[4], row[5] = ux, uy, uz
+                                row[6], row[7], row[8] = weight, path, layer
                                 alive += 1
                     # The light that goes straight on from here has been scored, in part.
                     direct = True
@@ -317,16 +308,13 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
             if alive == 0:
                 break
             alive -= 1
-            x = waiting[alive, 0]
-            y = waiting[alive, 1]
-            z = waiting[alive, 2]
-            weight = waiting[alive, 6]
-            path = waiting[alive, 7]
-            layer = int(waiting[alive, 8])
+            row = waiting[alive]
+            x, y, z = row[0], row[1], row[2]
+            weight, path, layer = row[6], row[7], int(row[8])
             level = int(z * chances_per_mm)
             chance = chances[level] if level < levels else 0.0
             direct = True
-            was_x, was_y, was_z = waiting[alive, 3], waiting[alive, 4], waiting[alive, 5]
+            was_x, was_y, was_z = row[3], row[4], row[5]
             s0, s1, s2, s3, ux, uy, uz = scatter(
                 s0, s1, s2, s3, was_x, was_y, was_z, table[layer, 4]
             )

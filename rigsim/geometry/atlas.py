@@ -45,6 +45,11 @@ class Atlas:
             np.linalg.norm(self.dp_dv_mm, axis=-1) * scale,
         )
 
+    def typical_texel_mm(self) -> float:
+        """Return the median of the covered texels' longer sides, mm."""
+        along_u, along_v = self.texel_mm()
+        return float(np.median(np.maximum(along_u, along_v)[self.covered]))
+
     def moved_by(self, way_mm: Float32Array) -> Atlas:
         """Return the atlas of the surface moved as a whole by (3,) mm, rig frame."""
         there = np.where(self.covered[..., None], self.position_mm + way_mm, self.position_mm)

@@ -119,6 +119,19 @@ def build_mesh(
     )
 
 
+def grid_faces(rows: int, columns: int) -> Int32Array:
+    """Return the two triangles of each cell of a grid of vertices, shape (F, 3).
+
+    Parameters
+    ----------
+    rows, columns
+        Vertices along each side; they are numbered row by row.
+    """
+    at = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
+    a, b, c, d = at[:-1, :-1], at[:-1, 1:], at[1:, :-1], at[1:, 1:]
+    return np.concatenate([np.stack(f, -1).reshape(-1, 3) for f in ([a, c, b], [b, c, d])])
+
+
 def vertex_normals(vertices_mm: ArrayLike, faces: ArrayLike) -> Float32Array:
     """Return unit vertex normals, weighted by the angle of each face at the vertex.
 

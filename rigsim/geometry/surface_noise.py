@@ -119,16 +119,8 @@ def scattered_spots(
     flat = _flat(points_mm)
     chance = np.ascontiguousarray(np.broadcast_to(density, points_mm.shape[:-1]), np.float32)
     floor = np.ascontiguousarray(np.broadcast_to(smallest_mm, points_mm.shape[:-1]), np.float32)
-    spots = _spots(
-        flat,
-        chance.reshape(-1),
-        floor.reshape(-1),
-        float(cell_mm),
-        float(radius_mm[0]),
-        float(radius_mm[1]),
-        float(softness),
-        _salt(seed, 0),
-    )
+    sizes = (float(size) for size in (cell_mm, *radius_mm, softness))
+    spots = _spots(flat, chance.reshape(-1), floor.reshape(-1), *sizes, _salt(seed, 0))
     return spots.reshape(points_mm.shape[:-1])
 
 

@@ -7,16 +7,15 @@ blood and melanin make uneven, the mean of the square is larger than the square 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from capture.rig import View
-from model import spectra
 from rigsim.arrays import Float32Array, Float64Array
 from rigsim.geometry.atlas import dilate_texture, sample
 from rigsim.light.interreflection import DEFAULT_LAST_BOUNCE, Interreflection
-from rigsim.subject import SimulatedSubject
+from rigsim.light.seen_skin import SeenSkin
 from rigsim.tissue.skin_table import SkinTable
 
 WAVELENGTH_STEPS: Final = (5, 3, 2)
@@ -26,59 +25,52 @@ MIN_REFLECTANCE: Final = 1e-6
 """Reflectance and cover below which a patch has no color."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Bounces:
+    """How light goes from skin to skin."""
+
+    exchange: Interreflection
+    """From patch to patch."""
+    spectral: bool = True
+    """Whether wavelengths are told apart; without, each channel is taken as one."""
+    step: int = 1
+    """Every how many of the table's wavelengths are summed at, 1 or one of `WAVELENGTH_STEPS`."""
+    enough: float = DEFAULT_LAST_BOUNCE
+    """Share of the first bounce below which further ones are left out."""
+
+
 class InterreflectionColor:
     """How light goes from skin to skin on one face in one state, seen by one camera.
 
     Parameters
     ----------
-    bounce
+    bounces
         How light goes from patch to patch.
-    subject, state
-        Whose skin, in which state of its blood.
+    skin
+        The face.
     r_d
         Factor of the diffuse term per channel with what covers the skin, shape (N, N, 3).
     reflectance
         White-balanced reflectance of the skin per channel, shape (N, N, 3).
-    camera, light
-        Names known to `model.spectra`.
-    spectral
-        Whether wavelengths are told apart; without, each channel is taken as one.
-    step
-        Every how many of the table's wavelengths are summed at, 1 or one of `WAVELENGTH_STEPS`.
-    enough
-        Share of the first bounce below which further ones are left out.
     """
 
     def __init__(
-        self,
-        bounce: Interreflection,
-        subject: SimulatedSubject,
-        state: str,
-        r_d: Float32Array,
-        reflectance: Float32Array,
-        *,
-        camera: str,
-        light: str,
-        spectral: bool = True,
-        step: int = 1,
-        enough: float = DEFAULT_LAST_BOUNCE,
+        self, bounces: Bounces, skin: SeenSkin, r_d: Float32Array, reflectance: Float32Array
     ) -> None:
-        self._bounce, self._enough = bounce, enough
+        self._bounce, self._enough = bounces.exchange, bounces.enough
+        subject = skin.subject
         covered = subject.atlas.covered.astype(np.float32)
-        blood = subject.hemoglobin(state)
         factor = r_d / np.maximum(reflectance, np.float32(MIN_REFLECTANCE))
-        layers = np.dstack([covered, subject.melanin, blood, factor, r_d]) * covered[..., None]
-        coarse = bounce.coarsen(np.asarray(layers, np.float32))
+        layers = np.dstack([covered, subject.melanin, skin.blood, factor, r_d])
+        coarse = self._bounce.coarsen(np.asarray(layers * covered[..., None], np.float32))
         coarse[:, 1:] /= np.maximum(coarse[:, :1], np.float32(MIN_REFLECTANCE))
         self._r_d = np.ascontiguousarray(coarse[:, 6:])
         self._weights: Float32Array | None = None
-        if spectral:
-            table = SkinTable.load()
-            weights = spectra.band_weights(camera, light, table.wavelength_nm[::step])
-            skin = table.spectra(coarse[:, 1], coarse[:, 2])[:, ::step]
-            # what covers the skin (hair, makeup) is gray beside it
+        if bounces.spectral:
+            weights = skin.band_weights(bounces.step)
+            spectra = SkinTable.load().spectra(coarse[:, 1], coarse[:, 2])[:, :: bounces.step]
             cover = coarse[:, 3:6].mean(axis=1, keepdims=True)
-            self._spectrum = np.asarray(skin * cover, np.float32)
+            self._spectrum = np.asarray(spectra * cover, np.float32)
             self._channel = np.maximum(self._spectrum @ weights, MIN_REFLECTANCE).astype(np.float32)
             self._weights = np.asarray(weights, np.float32)
 
@@ -114,30 +106,23 @@ class InterreflectionColor:
         return sample(filled, uv, np.ones((size, size), np.bool_))
 
 
-def color_error(subject: SimulatedSubject, state: str, view: View, illuminant: str) -> Float64Array:
+def color_error(skin: SeenSkin) -> Float64Array:
     """Return by how much each channel's mean of R^2 is off the square of its mean, shape (3,).
 
     Of typical skin.
     """
-    table = SkinTable.load()
-    weights = spectra.band_weights(view.spectral_sensitivity, illuminant, table.wavelength_nm)
-    covered = subject.atlas.covered
-    blood = subject.hemoglobin(state)
-    skin = table.spectra(np.median(subject.melanin[covered]), np.median(blood[covered]))
-    return np.asarray(np.abs((skin**2 @ weights) / (skin @ weights) ** 2 - 1.0), np.float64)
+    weights = skin.band_weights()
+    typical = SkinTable.load().spectra(*(np.median(part) for part in skin.covered()))
+    return np.asarray(np.abs((typical**2 @ weights) / (typical @ weights) ** 2 - 1.0), np.float64)
 
 
-def step_error(
-    subject: SimulatedSubject, state: str, camera: str, light: str, step: int
-) -> Float64Array:
+def step_error(skin: SeenSkin, step: int) -> Float64Array:
     """Return by how much each channel of light from skin to skin is off at fewer wavelengths.
 
     Parameters
     ----------
-    subject, state
-        Whose skin, in which state.
-    camera, light
-        Names known to `model.spectra`.
+    skin
+        The face.
     step
         Every how many of the table's wavelengths are summed at.
 
@@ -147,18 +132,12 @@ def step_error(
         Relative, shape (3,): the most for light that goes between any two of the face's extremes
         and middles of melanin and blood, by its mean of products over its mean.
     """
-    table = SkinTable.load()
-    covered = subject.atlas.covered
-    ends = [
-        [part.min(), np.median(part), part.max()]
-        for part in (subject.melanin[covered], subject.hemoglobin(state)[covered])
-    ]
+    ends = [[part.min(), np.median(part), part.max()] for part in skin.covered()]
     melanin, blood = (axis.ravel() for axis in np.meshgrid(*ends))
-    skin = table.spectra(melanin, blood)
+    spectra = SkinTable.load().spectra(melanin, blood)
 
     def bounced(every: int) -> Float64Array:
-        weights = spectra.band_weights(camera, light, table.wavelength_nm[::every])
-        some = skin[:, ::every]
+        some, weights = spectra[:, ::every], skin.band_weights(every)
         twice = np.einsum("al,bl,lc->abc", some, some, weights)
         return np.asarray(twice / (some @ weights)[None], np.float64)
 

@@ -15,15 +15,13 @@ from rigsim import shading
 from rigsim.arrays import Float32Array
 from rigsim.geometry.atlas import dilate_texture
 from rigsim.light import lateral
-from rigsim.light.interreflection import Interreflection
-from rigsim.light.interreflection_color import InterreflectionColor
+from rigsim.light.interreflection_color import Bounces, InterreflectionColor
 from rigsim.light.olat import Lamp
 from rigsim.light.relief_shadow import ReliefShadow
-from rigsim.light.subsurface_radiance import PIGMENT_BLUR_MM, typical_kernels
+from rigsim.light.seen_skin import SeenSkin
+from rigsim.light.subsurface_radiance import PIGMENT_BLUR_MM
 from rigsim.light.surface_brdf import HAIR_REFLECTANCE, SkinSurface
 from rigsim.render import Caster, visibility
-from rigsim.subject import SimulatedSubject
-from rigsim.tissue.skin_color import skin_color
 from rigsim.tissue.skin_layers import ETA
 
 LED_SHADOW_SAMPLES: Final = 4
@@ -35,64 +33,41 @@ class LateralScattering:
 
     Parameters
     ----------
-    subject
-        The face.
+    skin
+        The face; its blood is that of a neutral face.
     surface
         Its reflection.
     caster
         Its mesh.
-    camera, light
-        Names known to `model.spectra`.
     subsurface
         Whether light spreads sideways.
-    bounce
+    bounces
         How light goes from skin to skin; None leaves that out.
-    spectral
-        Whether that light is reflected wavelength by wavelength.
-    enough
-        Share of the first bounce below which further ones are left out.
     relief
         What of the texture's relief hides lights; None: nothing.
     """
 
     def __init__(
         self,
-        subject: SimulatedSubject,
+        skin: SeenSkin,
         surface: SkinSurface,
         caster: Caster,
         *,
-        camera: str,
-        light: str,
         subsurface: bool,
-        bounce: Interreflection | None,
-        spectral: bool = True,
-        enough: float = 1e-3,
-        relief: ReliefShadow | None = None,
+        bounces: Bounces | None,
+        relief: ReliefShadow | None,
     ) -> None:
-        self._relief = relief
-        self._subject, self._surface, self._caster = subject, surface, caster
-        self.subsurface = subsurface
-        self._bounce = bounce
-        if bounce is not None:
-            self._color = InterreflectionColor(
-                bounce,
-                subject,
-                "neutral",
-                surface.r_d,
-                surface.reflectance,
-                camera=camera,
-                light=light,
-                spectral=spectral,
-                enough=enough,
-            )
+        self._subject, self._surface, self._caster = skin.subject, surface, caster
+        self._relief, self.subsurface, self._bounces = relief, subsurface, bounces
+        if bounces is not None:
+            self._color = InterreflectionColor(bounces, skin, surface.r_d, surface.reflectance)
         if subsurface:
-            blood = subject.hemoglobin("neutral")
-            clear = skin_color(camera, light).rgb(np.zeros_like(subject.melanin), blood)
+            clear = skin.without_melanin()
             log_m = np.log(surface.reflectance / clear) * np.float32(0.5)
             blurred = lateral.scatter_laterally(
-                log_m, subject.atlas, [PIGMENT_BLUR_MM], np.ones((3, 1))
+                log_m, skin.subject.atlas, [PIGMENT_BLUR_MM], np.ones((3, 1))
             )
-            self._kernels = typical_kernels(subject, "neutral", camera, light)
+            self._kernels = skin.kernels()
             self._pigment = np.exp(blurred)
             self._inside = self._pigment * clear
 
@@ -115,8 +90,8 @@ class LateralScattering:
         atlas = subject.atlas
         covered = atlas.covered[..., None]
         came: Float32Array | None = None
-        if self._bounce is not None:
-            point, normal = self._bounce.surface()
+        if self._bounces is not None:
+            point, normal = self._bounces.exchange.surface()
             direct = entering(self._caster, lamp, point, normal, normal)[0]
             came = self._color.on_texture(direct, atlas.size)
         if not self.subsurface:

@@ -33,6 +33,7 @@ from numpy.typing import ArrayLike
 from rigsim import shading
 from rigsim.arrays import BoolArray, Float32Array, Float64Array
 from rigsim.as_built.sphere import REFERENCE_MM, BuiltSphere
+from rigsim.light.led_light import lobe_exponent
 
 MAX_TILT_DEG: Final = 70.0
 """Tilt of normals up to which the table is used."""
@@ -103,12 +104,7 @@ def irradiance_share(
     square = np.einsum("ni,ni->n", way, way)
     to_light = way / np.sqrt(square)[:, None]
     off = np.clip(to_light @ (place / np.linalg.norm(place)), 0.0, 1.0)
-    half_deg = sphere.nominal.lights[led].half_intensity_deg
-    lobe = (
-        1.0
-        if half_deg is None
-        else off ** (math.log(0.5) / math.log(math.cos(math.radians(half_deg))))
-    )
+    lobe = off ** lobe_exponent(sphere.nominal.lights[led])
     return to_light, sphere.intensity[led] * lobe * REFERENCE_MM**2 / square
 
 
@@ -248,17 +244,10 @@ class MomentTable:
             t = (alpha - np.float32(self.alphas[1])) / np.float32(self.alphas[1] - self.alphas[0])
             share[:, 0], share[:, 1], share[:, 2] = 0.5 * t * (t - 1), 1 - t * t, 0.5 * t * (t + 1)
         out = np.zeros((len(normals), MOMENT_CHANNELS), np.float32)
-        _lookup(
-            self.values,
-            np.float32(self.half_field_mm),
-            np.float32(self.reach),
-            np.float32(math.cos(math.radians(MAX_TILT_DEG))),
-            np.ascontiguousarray(normals, np.float32),
-            np.ascontiguousarray(x_mm, np.float32),
-            np.ascontiguousarray(y_mm, np.float32),
-            share,
-            out,
-        )
+        least_z = math.cos(math.radians(MAX_TILT_DEG))
+        limits = (np.float32(part) for part in (self.half_field_mm, self.reach, least_z))
+        at = (np.ascontiguousarray(part, np.float32) for part in (normals, x_mm, y_mm))
+        _lookup(self.values, *limits, *at, share, out)
         return out
 
 

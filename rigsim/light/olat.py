@@ -7,25 +7,25 @@ summed into the pixels.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import ArrayLike, NDArray
 
 from capture.rig import View
 from rigsim.arrays import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array, UInt16Array
-from rigsim.light.surface_brdf import (
-    MAX_R_D,
-    boundary,
-    coated_terms,
-    ggx,
-    surface_terms,
-    transmittance,
+from rigsim.light import olat_kernels as kernels
+from rigsim.light.olat_kernels import (
+    BARE_COLUMNS,
+    ETA_COLUMN,
+    MAX_FUZZ,
+    ROWS_PER_CHUNK,
+    SKIN_ROWS,
+    UINT16_FULL_SCALE,
 )
+from rigsim.light.surface_brdf import MAX_R_D
 from rigsim.render import OFFSET_MM, Caster, GBuffer, g_buffer
 from rigsim.render.depth_of_field import LensPicture, before_focus, lens_spread
 
@@ -36,8 +36,6 @@ with a coating (n, 11)."""
 RAYS_PER_BAND: Final = 1 << 20
 """Camera rays worked on at a time; bounds memory at full resolution."""
 
-ROWS_PER_CHUNK: Final = 1 << 13
-"""Rows that one thread works on at a time."""
 
 INVERSE_PLASTIC_NUMBER: Final = 0.7548776662466927
 """Inverse of the plastic number, the root of x^3 = x + 1."""
@@ -45,17 +43,8 @@ INVERSE_PLASTIC_NUMBER: Final = 0.7548776662466927
 DISC_POINTS: Final = 1 << 12
 """Points on a light's disc that rows take in turn."""
 
-SKIN_ROWS, MATT_ROWS, METAL_ROWS = 0, 1, 2
-"""How rows reflect: skin of `rigsim.light.surface_brdf`, Lambertian, GGX facets of a metal."""
 
-UINT16_FULL_SCALE: Final = 65535.0
 NORMAL_SCALE: Final = 32767.0
-MAX_FUZZ: Final = 0.01
-"""Largest optical depth of vellus hair that a row can hold."""
-BARE_COLUMNS: Final = 7
-"""Columns of a surface without a coating."""
-ETA_COLUMN: Final = 9
-"""The column that holds the index of a coating's film."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,21 +103,6 @@ class Hits:
     lens: LensPicture | None = None
     """How the lens spreads the rows' light; None: it is sharp everywhere."""
 
-    @property
-    def megabytes(self) -> float:
-        """Memory held by the rows."""
-        arrays = (
-            self.pixel,
-            self.first,
-            self.position_mm,
-            self.normal,
-            self.prim,
-            self.slot,
-            self.uv,
-            self.surface,
-        )
-        return sum(array.nbytes for array in arrays) / 1e6
-
     def scatter(self, rows: Float32Array) -> Float32Array:
         """Average rows over each pixel's covered part, shape (H, W, C); zero elsewhere."""
         count = np.diff(self.first)
@@ -147,6 +121,10 @@ class Hits:
     def normals(self) -> Float32Array:
         """Return the shading normals, shape (n, 3)."""
         return np.asarray(self.normal, np.float32) / np.float32(NORMAL_SCALE)
+
+    def texture_uv(self) -> Float32Array:
+        """Return the texture coordinates, shape (n, 2)."""
+        return np.asarray(self.uv, np.float32) / np.float32(UINT16_FULL_SCALE)
 
 
 def pack_surface(values: Float32Array) -> UInt16Array:
@@ -209,13 +187,14 @@ def find_hits(
     """
     k, width, height = subpixels, view.width_px, view.height_px
     band = max(1, RAYS_PER_BAND // (width * k * k))
-    parts: list[tuple[NDArray[np.generic], ...]] = []
+    parts: list[tuple[Any, ...]] = []
     begin, end = _rows_of(caster, view, bent=distortion is not None and bool(np.any(distortion)))
     for top in range(begin, end, band):
         rows = (top, min(top + band, end))
         buffers = g_buffer(caster, view, subpixels=k, rows=rows, distortion=distortion)
         order, pixel, first, slot = pixel_order(buffers.mask, k)
         normal, surface = look_up(buffers, order)
+        scaled_uv = buffers.uv.reshape(-1, 2)[order] * np.float32(UINT16_FULL_SCALE)
         parts.append(
             (
                 np.repeat(pixel + np.int32(top * width), np.diff(first)),
@@ -223,9 +202,7 @@ def find_hits(
                 np.rint(normal * np.float32(NORMAL_SCALE)).astype(np.int16),
                 buffers.prim.reshape(-1)[order],
                 slot,
-                np.rint(buffers.uv.reshape(-1, 2)[order] * np.float32(UINT16_FULL_SCALE)).astype(
-                    np.uint16
-                ),
+                np.rint(scaled_uv).astype(np.uint16),
                 pack_surface(surface),
             )
         )
@@ -233,34 +210,18 @@ def find_hits(
         np.concatenate(column) for column in zip(*parts, strict=True)
     )
     starts = np.flatnonzero(np.diff(owner, prepend=-1))
-    pixels = np.asarray(owner[starts], np.int32)
-    begins = np.append(starts, len(owner)).astype(np.int32)
+    pixels, begins = owner[starts], np.append(starts, len(owner)).astype(np.int32)
     lens = None
     if illuminant is not None:
-        toward = before_focus(view, np.asarray(position, np.float32))
-        spread = lens_spread(view, illuminant, subpixels=k, depths_mm=_extremes(toward))
-        lens = LensPicture(
-            spread, (height, width), pixels, begins, np.asarray(slots, np.uint8), toward
-        )
+        toward = before_focus(view, position)
+        depths = float(toward.min(initial=0.0)), float(toward.max(initial=0.0))
+        spread = lens_spread(view, illuminant, subpixels=k, depths_mm=depths)
+        lens = LensPicture(spread, (height, width), pixels, begins, slots, toward)
+    eye = np.asarray(view.position_mm, np.float64)
+    shape, eye = (height, width), np.asarray(view.position_mm, np.float64)
     return Hits(
-        shape=(height, width),
-        subpixels=k,
-        pixel=pixels,
-        first=begins,
-        position_mm=np.asarray(position, np.float32),
-        normal=np.asarray(normals, np.int16),
-        prim=np.asarray(prim, np.int32),
-        slot=np.asarray(slots, np.uint8),
-        uv=np.asarray(uv, np.uint16),
-        surface=np.asarray(packed, np.uint16),
-        camera_mm=np.asarray(view.position_mm, np.float64),
-        kind=kind,
-        lens=lens,
+        shape, k, pixels, begins, position, normals, prim, slots, uv, packed, eye, kind, lens
     )
-
-
-def _extremes(values: Float32Array) -> tuple[float, float]:
-    return float(values.min(initial=0.0)), float(values.max(initial=0.0))
 
 
 def pixel_order(
@@ -342,26 +303,15 @@ def seen_from(hits: Hits, caster: Caster, lamp: Lamp) -> BoolArray:
     targets = center + points.sum(axis=0)
     chunks = -(-len(hits.position_mm) // ROWS_PER_CHUNK)
     count = np.zeros(chunks + 1, np.int64)
-    _count_facing(hits.position_mm, hits.normal, center, count)
+    kernels.count_facing(hits.position_mm, hits.normal, center, count)
     count = np.cumsum(count)
     index = np.empty(count[-1], np.int32)
     start = np.empty((count[-1], 3), np.float32)
     way = np.empty((count[-1], 3), np.float32)
     length = np.empty(count[-1], np.float32)
-    _aim(
-        hits.position_mm,
-        hits.normal,
-        hits.prim,
-        caster.mesh.vertices_mm,
-        caster.mesh.faces,
-        center,
-        targets,
-        count,
-        index,
-        start,
-        way,
-        length,
-    )
+    rows, mesh = (hits.position_mm, hits.normal, hits.prim), caster.mesh
+    rays = (index, start, way, length)
+    kernels.aim(*rows, mesh.vertices_mm, mesh.faces, center, targets, count, *rays)
     visible = np.zeros(len(hits.position_mm), np.bool_)
     visible[index] = ~caster.blocked(start, way, length)
     return visible
@@ -381,7 +331,7 @@ def sum_rows(
         return hits.lens.see(np.stack([red, green, blue], axis=1)) * np.asarray(color, np.float32)
     out = np.zeros((hits.shape[0] * hits.shape[1], 3), np.float32)
     share = np.asarray(color, np.float32) / np.float32(hits.subpixels**2)
-    _sum_rows(hits.pixel, hits.first, red, green, blue, share, out)
+    kernels.sum_rows(hits.pixel, hits.first, red, green, blue, share, out)
     return out.reshape(*hits.shape, 3)
 
 
@@ -424,21 +374,10 @@ def light_up(
     extra = np.zeros((0, 3), np.float32) if glow is None else glow
     center = np.ascontiguousarray(lamp.position_mm, np.float64)
     axis = np.ascontiguousarray(lamp.axis, np.float64)
-    _shade(
-        hits.position_mm,
-        hits.normal,
-        hits.surface,
-        hits.camera_mm,
-        hits.kind,
-        center,
-        axis,
-        float(lamp.exponent),
-        visible,
-        extra,
-        diffuse,
-        np.ones(0, np.float32) if relief is None else relief,
-        rows,
-    )
+    faded = np.ones(0, np.float32) if relief is None else relief
+    samples = (hits.position_mm, hits.normal, hits.surface, hits.camera_mm, hits.kind)
+    light = (center, axis, float(lamp.exponent))
+    kernels.shade(*samples, *light, visible, extra, diffuse, faded, rows)
     return sum_rows(hits, rows[0], rows[1], rows[2], color)
 
 
@@ -454,172 +393,3 @@ def disc_points(count: int) -> tuple[Float32Array, Float32Array]:
     )
     radius, angle = np.sqrt(u), 2.0 * np.pi * v
     return (radius * np.cos(angle)).astype(np.float32), (radius * np.sin(angle)).astype(np.float32)
-
-
-@njit(cache=True)  # a few ms at most: waiting for a second thread would take longer
-def _sum_rows(pixel, first, red, green, blue, share, out):  # type: ignore[no-untyped-def]
-    for p in range(pixel.shape[0]):
-        r = g = b = np.float32(0.0)
-        for i in range(first[p], first[p + 1]):
-            r += red[i]
-            g += green[i]
-            b += blue[i]
-        out[pixel[p], 0] = share[0] * r
-        out[pixel[p], 1] = share[1] * g
-        out[pixel[p], 2] = share[2] * b
-
-
-@njit(cache=True, inline="always")
-def _faces(i, position, normal, center):  # type: ignore[no-untyped-def]
-    dot = (
-        (center[0] - position[i, 0]) * normal[i, 0]
-        + (center[1] - position[i, 1]) * normal[i, 1]
-        + (center[2] - position[i, 2]) * normal[i, 2]
-    )
-    return dot > 0.0
-
-
-@njit(parallel=True, cache=True)
-def _count_facing(position, normal, center, count):  # type: ignore[no-untyped-def]
-    for chunk in prange(count.shape[0] - 1):
-        n = 0
-        for i in range(
-            chunk * ROWS_PER_CHUNK, min((chunk + 1) * ROWS_PER_CHUNK, position.shape[0])
-        ):
-            n += _faces(i, position, normal, center)
-        count[chunk + 1] = n
-
-
-@njit(parallel=True, cache=True)
-def _aim(  # type: ignore[no-untyped-def]
-    position, normal, prim, vertices, faces, center, targets, count, index, start, way, length
-):
-    for chunk in prange(count.shape[0] - 1):
-        at = count[chunk]
-        for i in range(
-            chunk * ROWS_PER_CHUNK, min((chunk + 1) * ROWS_PER_CHUNK, position.shape[0])
-        ):
-            if not _faces(i, position, normal, center):
-                continue
-            k = i % targets.shape[0]
-            x, y, z = targets[k, 0], targets[k, 1], targets[k, 2]
-            p0, p1, p2 = float(position[i, 0]), float(position[i, 1]), float(position[i, 2])
-            a, b, c = faces[prim[i], 0], faces[prim[i], 1], faces[prim[i], 2]
-            e0 = float(vertices[b, 0]) - vertices[a, 0]
-            e1 = float(vertices[b, 1]) - vertices[a, 1]
-            e2 = float(vertices[b, 2]) - vertices[a, 2]
-            f0 = float(vertices[c, 0]) - vertices[a, 0]
-            f1 = float(vertices[c, 1]) - vertices[a, 1]
-            f2 = float(vertices[c, 2]) - vertices[a, 2]
-            n0, n1, n2 = e1 * f2 - e2 * f1, e2 * f0 - e0 * f2, e0 * f1 - e1 * f0
-            norm = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
-            # Rays start above the triangle, on the side that the light is on if it is in front.
-            lift = OFFSET_MM / norm if norm > 0.0 else 0.0
-            p0, p1, p2 = p0 + lift * n0, p1 + lift * n1, p2 + lift * n2
-            w0, w1, w2 = x - p0, y - p1, z - p2
-            far = math.sqrt(w0 * w0 + w1 * w1 + w2 * w2)
-            index[at] = i
-            start[at, 0], start[at, 1], start[at, 2] = p0, p1, p2
-            way[at, 0], way[at, 1], way[at, 2] = w0 / far, w1 / far, w2 / far
-            length[at] = 0.999 * far
-            at += 1
-
-
-@njit(parallel=True, cache=True)
-def _shade(  # type: ignore[no-untyped-def]
-    position,
-    normal,
-    surface,
-    camera,
-    kind,
-    center,
-    axis,
-    exponent,
-    visible,
-    glow,
-    diffuse,
-    relief,
-    out,
-):
-    has_glow = glow.shape[0] > 0
-    for i in prange(position.shape[0]):
-        if not visible[i] and not has_glow:
-            continue
-        n0, n1, n2 = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
-        norm = 1.0 / math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
-        n0, n1, n2 = n0 * norm, n1 * norm, n2 * norm
-        p0, p1, p2 = float(position[i, 0]), float(position[i, 1]), float(position[i, 2])
-        v0, v1, v2 = camera[0] - p0, camera[1] - p1, camera[2] - p2
-        norm = 1.0 / math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
-        v0, v1, v2 = v0 * norm, v1 * norm, v2 * norm
-        nv = min(n0 * v0 + n1 * v1 + n2 * v2, 1.0)
-        if nv <= 0.0:
-            continue
-        if has_glow:
-            leaving = transmittance(nv)
-            out[0, i] += leaving * glow[i, 0]
-            out[1, i] += leaving * glow[i, 1]
-            out[2, i] += leaving * glow[i, 2]
-        if not visible[i]:
-            continue
-        l0, l1, l2 = center[0] - p0, center[1] - p1, center[2] - p2
-        squared = l0 * l0 + l1 * l1 + l2 * l2
-        norm = 1.0 / math.sqrt(squared)
-        l0, l1, l2 = l0 * norm, l1 * norm, l2 * norm
-        nl = min(n0 * l0 + n1 * l1 + n2 * l2, 1.0)
-        if nl <= 0.0:
-            continue
-        strength = nl / squared
-        off = -(axis[0] * l0 + axis[1] * l1 + axis[2] * l2)
-        if off <= 0.0:
-            continue
-        strength *= off**exponent
-        if relief.shape[0] > 0:
-            strength *= relief[i]
-        s0, s1, s2 = (
-            surface[i, 0] / UINT16_FULL_SCALE,
-            surface[i, 1] / UINT16_FULL_SCALE,
-            surface[i, 2] / UINT16_FULL_SCALE,
-        )
-        r0, r1, r2 = MAX_R_D * s0 * s0, MAX_R_D * s1 * s1, MAX_R_D * s2 * s2
-        if kind == MATT_ROWS:
-            out[0, i] += strength * r0
-            out[1, i] += strength * r1
-            out[2, i] += strength * r2
-            continue
-        h0, h1, h2 = l0 + v0, l1 + v1, l2 + v2
-        length = math.sqrt(h0 * h0 + h1 * h1 + h2 * h2)
-        nh = min((nl + nv) / length, 1.0)
-        rough = surface[i, 3] / UINT16_FULL_SCALE
-        if kind == METAL_ROWS:
-            lobe = math.pi * strength * ggx(nl, nv, nh, rough)
-            out[0, i] += lobe * r0
-            out[1, i] += lobe * r1
-            out[2, i] += lobe * r2
-            continue
-        oil, fuzz, bare = (
-            surface[i, 4] / UINT16_FULL_SCALE,
-            surface[i, 5] / UINT16_FULL_SCALE,
-            surface[i, 6] / UINT16_FULL_SCALE,
-        )
-        if surface.shape[1] > BARE_COLUMNS:
-            lobe = coated_terms(
-                nl,
-                nv,
-                nh,
-                0.5 * length,
-                rough,
-                oil,
-                MAX_FUZZ * fuzz,
-                surface[i, 7] / UINT16_FULL_SCALE,
-                surface[i, 8] / UINT16_FULL_SCALE,
-                1.0 + surface[i, 9] / UINT16_FULL_SCALE,
-                surface[i, 10] / UINT16_FULL_SCALE,
-            )
-        else:
-            lobe = surface_terms(nl, nv, nh, 0.5 * length, rough, oil, MAX_FUZZ * fuzz)
-        gloss = math.pi * strength * bare * lobe
-        inside = strength * boundary(nl, nv) if diffuse else 0.0
-        out[0, i] += gloss + inside * r0
-        out[1, i] += gloss + inside * r1
-        out[2, i] += gloss + inside * r2

@@ -13,26 +13,9 @@ from typing import Any
 import numpy as np
 
 from rigsim.arrays import Float32Array, Float64Array
-from rigsim.light.olat import (
-    BARE_COLUMNS,
-    DISC_POINTS,
-    ETA_COLUMN,
-    MAX_FUZZ,
-    UINT16_FULL_SCALE,
-    Hits,
-    Lamp,
-    disc_points,
-    lift,
-    sum_rows,
-)
-from rigsim.light.surface_brdf import (
-    ETA_OIL,
-    FUZZ_ALBEDO,
-    MAX_R_D,
-    OIL_SMOOTHING,
-    POWDER_ALBEDO,
-    POWDER_ASYMMETRY,
-)
+from rigsim.light import surface_brdf as brdf
+from rigsim.light.olat import DISC_POINTS, Hits, Lamp, disc_points, lift, sum_rows
+from rigsim.light.olat_kernels import BARE_COLUMNS, ETA_COLUMN, MAX_FUZZ, UINT16_FULL_SCALE
 from rigsim.render import Caster, load, with_slack
 from rigsim.tissue.skin_layers import ETA
 
@@ -122,13 +105,17 @@ class VectorLight:
         # Cosines below zero are masked out; keep their square roots real.
         cl, cv = dr.maximum(nl, 1e-6), dr.maximum(nv, 1e-6)
         surface = (1.0 - oil) * _fresnel(dr, lh, ETA) * _beckmann(dr, cl, cv, nh, roughness)
-        surface += oil * _fresnel(dr, lh, ETA_OIL) * _ggx(dr, cl, cv, nh, OIL_SMOOTHING * roughness)
+        surface += (
+            oil
+            * _fresnel(dr, lh, brdf.ETA_OIL)
+            * _ggx(dr, cl, cv, nh, brdf.OIL_SMOOTHING * roughness)
+        )
         if coating:
             film, alpha, eta, _ = coating
             surface *= 1.0 - film
             surface += film * _fresnel(dr, lh, eta) * _ggx(dr, cl, cv, nh, dr.maximum(alpha, 0.01))
         through = 1.0 - dr.exp(-fuzz * (1.0 / cl + 1.0 / cv))
-        surface += FUZZ_ALBEDO / (4.0 * math.pi) * through / (cl + cv)
+        surface += brdf.FUZZ_ALBEDO / (4.0 * math.pi) * through / (cl + cv)
         if coating:
             powder = coating[3]
             surface = (1.0 - powder) * surface + powder * _grains(cl, cv, lh)
@@ -156,7 +143,7 @@ class VectorLight:
         signed = [mi.Int32(half << 16) >> 16 for half in halves[:3]]
         normal = dr.normalize(mi.Vector3f(*(mi.Float(half) for half in signed)))
         unit = [mi.Float(half) * (1.0 / UINT16_FULL_SCALE) for half in halves[3:]]
-        colors = [MAX_R_D * root * root for root in unit[:3]]
+        colors = [brdf.MAX_R_D * root * root for root in unit[:3]]
         known = [*colors, unit[3], unit[4], MAX_FUZZ * unit[5], *unit[6:]]
         if len(known) > BARE_COLUMNS:
             known[ETA_COLUMN] = 1.0 + known[ETA_COLUMN]
@@ -168,10 +155,10 @@ def _columns(rows: Float32Array) -> list[Float32Array]:
 
 
 def _grains(nl: Any, nv: Any, lh: Any) -> Any:
-    g = POWDER_ASYMMETRY
+    g = brdf.POWDER_ASYMMETRY
     spread = 1.0 + g * g - 2.0 * g * (1.0 - 2.0 * lh * lh)
     phase = (1.0 - g * g) / (spread * spread**0.5)
-    return POWDER_ALBEDO / (4.0 * math.pi) * phase / (nl + nv)
+    return brdf.POWDER_ALBEDO / (4.0 * math.pi) * phase / (nl + nv)
 
 
 def _fresnel(dr: Any, cosine: Any, eta: Any) -> Any:

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit, prange
 
 from rigsim.arrays import Float32Array
-from rigsim.light.self_shadow import horizon_tangent
+from rigsim.light.relief_shadow import horizon_tangent
 from rigsim.light.surface_brdf import transmittance
 
 ELEVATION_NODES: Final = 6

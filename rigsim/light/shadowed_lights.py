@@ -10,8 +10,9 @@ from numba import njit, prange
 
 from rigsim.arrays import BoolArray, Float32Array
 from rigsim.as_built.sphere import REFERENCE_MM, BuiltSphere
+from rigsim.light.led_light import lobe_exponent
 from rigsim.light.lobe_moments import Surface
-from rigsim.shading import entry_one, specular_one
+from rigsim.shading_kernels import entry_one, specular_one
 
 
 class Elements(Protocol):
@@ -68,33 +69,18 @@ def remove_hidden(
     distance = float(np.linalg.norm(place))
     elevation = math.asin(min(max(float(place[2]) / distance, -1.0), 1.0))
     radius = float(sphere.radius_mm[led]) / distance
-    half_deg = sphere.nominal.lights[led].half_intensity_deg
-    exponent = (
-        0.0 if half_deg is None else math.log(0.5) / math.log(math.cos(math.radians(half_deg)))
-    )
     first, second, between = horizon
+    flat = (elements.x_mm, elements.y_mm, elements.alpha, elements.skin, first, second)
+    low = np.float32(math.tan(max(elevation - radius, 0.0)))
+    intensity = float(sphere.intensity[led]) * REFERENCE_MM**2
+    lobe = (intensity, lobe_exponent(sphere.nominal.lights[led]), sphere.weights[led])
+    look = (np.array(surface.eye_mm, np.float64), np.array(surface.image_right, np.float64))
     _remove(
         packed.reshape(len(packed), -1),
         elements.normals.reshape(-1, 3),
-        elements.x_mm.reshape(-1),
-        elements.y_mm.reshape(-1),
-        elements.alpha.reshape(-1),
-        elements.skin.reshape(-1),
-        first.reshape(-1),
-        second.reshape(-1),
-        np.float32(between),
-        np.float32(math.tan(max(elevation - radius, 0.0))),
-        elevation,
-        radius,
-        place,
-        sphere.absorbs[led],
-        float(sphere.intensity[led]) * REFERENCE_MM**2,
-        exponent,
-        sphere.weights[led],
-        np.array(surface.eye_mm, np.float64),
-        np.array(surface.image_right, np.float64),
-        surface.eta,
-        1.0 / surface.extinction,
+        *(part.reshape(-1) for part in flat),
+        *(np.float32(between), low, elevation, radius, place, sphere.absorbs[led]),
+        *(*lobe, *look, surface.eta, 1.0 / surface.extinction),
     )
 
 

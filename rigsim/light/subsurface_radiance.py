@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from capture.rig import Light
-from model import spectra
 from rigsim import shading
 from rigsim.arrays import Float32Array, Float64Array
 from rigsim.as_built.polarizers import Polarizers, absorbing_axis
 from rigsim.geometry.atlas import Atlas
 from rigsim.light import lateral
-from rigsim.light.interreflection_color import InterreflectionColor
+from rigsim.light.interreflection_color import Bounces, InterreflectionColor
 from rigsim.light.relief_shadow import ReliefShadow
+from rigsim.light.seen_skin import SeenSkin
 from rigsim.light.surface_brdf import HAIR_REFLECTANCE
 from rigsim.render import Caster, visibility
 from rigsim.subject import SimulatedSubject
-from rigsim.tissue.lateral_kernels import SIGMAS_MM, GaussianSum
-from rigsim.tissue.skin_color import skin_color
+from rigsim.tissue.lateral_kernels import GaussianSum
 from rigsim.tissue.skin_layers import ETA
-from rigsim.tissue.skin_table import SkinTable
-
-if TYPE_CHECKING:
-    from rigsim.light.interreflection import Interreflection
-
 
 PIGMENT_BLUR_MM: Final = 0.12
 """Width of the blur of melanin's absorbance; fitted to photons that walk through patterned skin,
@@ -140,104 +134,64 @@ def light_surface(
 
 
 def light_skin(
-    subject: SimulatedSubject,
-    state: str,
-    surface: SurfaceLight,
-    *,
-    camera: str,
-    illuminant: str,
-    lateral_transport: bool,
-    bounce: Interreflection | None = None,
-    spectral: bool = True,
-    step: int = 1,
-    enough: float = 1e-3,
+    skin: SeenSkin, surface: SurfaceLight, *, lateral_transport: bool, bounces: Bounces | None
 ) -> SubsurfaceRadiance:
     """Let the light on a face into its skin and out again.
 
     Parameters
     ----------
-    subject, state
-        Whose skin, in which state of its blood.
+    skin
+        The face.
     surface
-        Light on the face.
-    camera, illuminant
-        Names of the camera's sensitivity and of the flashes' spectrum.
+        Light on it.
     lateral_transport
         Whether light spreads inside the skin.
-    bounce
+    bounces
         How light goes from skin to skin; None leaves that out.
-    spectral
-        Whether that light is reflected wavelength by wavelength.
-    step
-        Every how many of the table's wavelengths, see `rigsim.light.interreflection_color`.
-    enough
-        Share of the first bounce below which further ones are left out.
 
     Returns
     -------
     SubsurfaceRadiance
         Textures.
     """
-    melanin, blood = subject.melanin, subject.hemoglobin(state)
-    reflectance = skin_color(camera, illuminant).rgb(melanin, blood)
+    subject, reflectance = skin.subject, skin.reflectance()
     scale = np.float32(shading.interior_scale(ETA))
     hair = subject.hair[..., None]
     covering = np.asarray(HAIR_REFLECTANCE, np.float32) * hair
     within = surface.entered[..., None]
-    if bounce is not None:
+    if bounces is not None:
         outside = scale * ((1.0 - hair) * reflectance + covering)
-        color = InterreflectionColor(
-            bounce,
-            subject,
-            state,
-            outside,
-            reflectance,
-            camera=camera,
-            light=illuminant,
-            spectral=spectral,
-            step=step,
-            enough=enough,
-        )
+        color = InterreflectionColor(bounces, skin, outside, reflectance)
         covered = subject.atlas.covered
-        sums = bounce.coarsen(np.dstack([surface.entered, covered]).astype(np.float32))
+        sums = bounces.exchange.coarsen(np.dstack([surface.entered, covered]).astype(np.float32))
         direct = np.asarray(sums[:, 0] / np.maximum(sums[:, 1], 1e-6), np.float32)
         came = color.on_texture(direct, subject.size)
         within = within + np.where(covered[..., None], came, np.float32(0.0))
     sharp = scale * within * reflectance
-    kernels = typical_kernels(subject, state, camera, illuminant)
+    kernels = skin.kernels()
     spread = sharp
     if lateral_transport:
-        spread = scale * spread_through_pigment(
-            subject, state, reflectance, within, kernels, camera, illuminant
-        )
+        spread = scale * spread_through_pigment(skin, reflectance, within, kernels)
     # Hair is dark and matt, and lets no light into the skin below it.
     spread = (1.0 - hair) * spread + scale * within * covering
     return SubsurfaceRadiance(surface, reflectance, sharp, spread, kernels)
 
 
 def spread_through_pigment(
-    subject: SimulatedSubject,
-    state: str,
-    reflectance: Float32Array,
-    entered: Float32Array,
-    kernels: GaussianSum,
-    camera: str,
-    light: str,
+    skin: SeenSkin, reflectance: Float32Array, entered: Float32Array, kernels: GaussianSum
 ) -> Float32Array:
     """Return the light that leaves after it has spread, per unit of the interior's scale.
 
     Parameters
     ----------
-    subject, state
-        Whose skin, in which state.
+    skin
+        The face.
     reflectance
         Sharp reflectance, shape (N, N, 3).
     entered
-        Light that enters, shape (N, N).
+        Light that enters, shape (N, N[, 3]).
     kernels
         Lateral profile.
-    camera, light
-        Names known to `model.spectra`.
 
     Returns
     -------
@@ -248,9 +202,8 @@ def spread_through_pigment(
     --------
     spread_pattern : what is done, and how well it holds.
     """
-    table = skin_color(camera, light)
-    without = table.rgb(np.zeros_like(subject.melanin), subject.hemoglobin(state))
-    return spread_pattern(reflectance, without, entered, subject.atlas, kernels)
+    without = skin.without_melanin()
+    return spread_pattern(reflectance, without, entered, skin.subject.atlas, kernels)
 
 
 def spread_pattern(
@@ -298,16 +251,6 @@ def spread_pattern(
     light = entered if entered.ndim == 3 else entered[..., None]
     inside = np.ascontiguousarray(pigment * without_melanin * light, np.float32)
     return pigment * lateral.scatter_laterally(inside, atlas, kernels.sigmas_mm, kernels.weights)
-
-
-def typical_kernels(subject: SimulatedSubject, state: str, camera: str, light: str) -> GaussianSum:
-    """Return the lateral profile of a face's median skin as Gaussians per channel."""
-    table = SkinTable.load()
-    covered = subject.atlas.covered
-    melanin = float(np.median(subject.melanin[covered]))
-    blood = float(np.median(subject.hemoglobin(state)[covered]))
-    weights = spectra.band_weights(camera, light, table.wavelength_nm)
-    return table.lateral_kernels(melanin, blood, weights).gaussians(SIGMAS_MM)
 
 
 def toward(light: Light, position_mm: Float32Array) -> tuple[Float32Array, Float32Array]:

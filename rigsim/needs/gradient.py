@@ -13,6 +13,7 @@ from rigsim import shading
 from rigsim.arrays import Float64Array, FloatArray
 from rigsim.as_built.sphere import BuiltSphere
 from rigsim.light.relief_interreflection import hidden_share
+from rigsim.needs import face
 from rigsim.needs.effect_sizes import bounced, edge_loss, steepest_slope
 from rigsim.needs.effects import (
     Effect,
@@ -22,14 +23,6 @@ from rigsim.needs.effects import (
     absent,
     decide,
     unmodeled,
-)
-from rigsim.needs.flash import (
-    INTERREFLECTION_EFFECT,
-    LATERAL_EFFECT,
-    RELIEF_EFFECT,
-    SHADOW_EFFECT,
-    bands,
-    polarization,
 )
 from rigsim.render.lens_blur import Lens
 from rigsim.skin_patch.microrelief import MicroSkin, lateral_kernel
@@ -80,16 +73,16 @@ def gradient_needs(
         ("ambient light", "the room is dark"),
         ("light from the sphere's frame and between its LEDs", "they are black"),
     ]
-    made = [polarization(rig, view), bands(view), _optics(lens, effects.optics, noise)]
+    made = [face.polarization(rig, view), face.bands(view), _optics(lens, effects.optics, noise)]
     limits = [("aberrations of the lens", "a macro lens at f/16 is near diffraction's limit")]
     if not isinstance(subject, MicroSkin):
         flat = "a ball bulges" if subject == "ball" else "the target is flat"
         for name, switch in (
-            (SHADOW_EFFECT, "shadows"),
-            (INTERREFLECTION_EFFECT, "interreflections"),
+            (face.SHADOW_EFFECT, "shadows"),
+            (face.INTERREFLECTION_EFFECT, "interreflections"),
         ):
             made.append(decide(name, 0.0, None, switch=switch, because=flat))
-        made.append(Effect(LATERAL_EFFECT, "absent", f"{subject} is glass, gray or nothing"))
+        made.append(Effect(face.LATERAL_EFFECT, "absent", f"{subject} is glass, gray or nothing"))
         return EffectSelection((*made, *absent(world), *unmodeled(limits)))
     made += _of_skin(subject, sphere, lens, noise, white, effects)
     if moving:
@@ -164,23 +157,23 @@ def _of_skin(
     level = min(1.0, white * brightest)
     deg = (math.degrees(math.atan(steepest)), math.degrees(math.atan(lowest)))
     return [
-        Effect(RELIEF_EFFECT, "built", f"pixels of {1e3 * pixel_mm:.1f} um resolve it"),
+        Effect(face.RELIEF_EFFECT, "built", f"pixels of {1e3 * pixel_mm:.1f} um resolve it"),
         decide(
-            SHADOW_EFFECT,
+            face.SHADOW_EFFECT,
             noise.share(1.0) if steepest > lowest else 0.0,
             effects.relief_shadows,
             switch="shadows",
             because=f"slopes up to {deg[0]:.0f} degrees, LEDs down to {deg[1]:.0f}",
         ),
         decide(
-            LATERAL_EFFECT,
+            face.LATERAL_EFFECT,
             noise.share(lost, level),
             effects.lateral,
             switch="lateral",
             because=f"pixels of {1e3 * pixel_mm:.1f} um lose {100 * lost:.0f} % at a shadow's edge",
         ),
         decide(
-            INTERREFLECTION_EFFECT,
+            face.INTERREFLECTION_EFFECT,
             noise.share(more, level),
             effects.interreflections,
             switch="interreflections",

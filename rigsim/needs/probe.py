@@ -10,7 +10,7 @@ from capture.rig import Rig
 from rigsim.as_built.probe import ProbeBuild
 from rigsim.fiber.probe_tissue import HomogeneousTissue, ProbedTissue
 from rigsim.needs.effects import Effect, EffectSelection, Noise, absent, unmodeled
-from rigsim.needs.flash import bands, polarization
+from rigsim.needs.face import bands, polarization
 
 TRANSPORT_EFFECT: Final = "paths of photons between source and fibres"
 CROSSTALK_EFFECT: Final = "light that fibres pass to each other"

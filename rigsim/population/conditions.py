@@ -217,16 +217,7 @@ def conditioned(
         on = _over(on, change.film, np.asarray(share, np.float32))
     if change.powder > 0.0:
         grainy = np.float32(amount * change.powder) * surface.bare
-        below = grainy[..., None]
-        found = dataclasses.replace(
-            found,
-            r_d=np.asarray((1.0 - below) * found.r_d + below * POWDER_MATTE, np.float32),
-            reflectance=np.asarray(
-                (1.0 - below) * found.reflectance
-                + below * POWDER_MATTE / np.float32(interior_scale(ETA)),
-                np.float32,
-            ),
-        )
+        found = _mixed(found, grainy, POWDER_MATTE)
         on = dataclasses.replace(on, powder=np.asarray(1.0 - (1.0 - on.powder) * (1.0 - grainy)))
     return dataclasses.replace(found, coating=on)
 
@@ -278,7 +269,6 @@ def _painted(
     foundation: ArrayLike | None,
 ) -> SkinSurface:
     """Cover the diffuse color by a pigment; hair and, where they are known, lips stay."""
-    scale = np.float32(interior_scale(ETA))
     if foundation is None:
         skin = (surface.bare > 0.98) & (np.linalg.norm(surface.normal, axis=-1) > 0.5)
         if not skin.any():
@@ -291,13 +281,17 @@ def _painted(
     share = np.float32(cover) * surface.bare
     if regions is not None:
         share = share * (1.0 - regions["lips"])
-    share = share[..., None]
+    return _mixed(surface, share, color)
+
+
+def _mixed(surface: SkinSurface, share: Float32Array, color: Float32Array) -> SkinSurface:
+    """Return a surface of which a share has another diffuse color."""
+    part, scale = share[..., None], np.float32(interior_scale(ETA))
+    reflectance = (1.0 - part) * surface.reflectance + part * color / scale
     return dataclasses.replace(
         surface,
-        r_d=np.asarray((1.0 - share) * surface.r_d + share * color, np.float32),
-        reflectance=np.asarray(
-            (1.0 - share) * surface.reflectance + share * color / scale, np.float32
-        ),
+        r_d=np.asarray((1.0 - part) * surface.r_d + part * color, np.float32),
+        reflectance=np.asarray(reflectance, np.float32),
     )
 
 

@@ -322,15 +322,3 @@ def record(text: str) -> str | dict[str, Any]:
         elif value != getattr(usual, key):
             said[key] = value
     return said
-
-
-__all__ = [
-    "SCHEMA",
-    "SubjectFile",
-    "SubjectFileError",
-    "is_file",
-    "load_subject",
-    "read",
-    "record",
-    "tissue",
-]

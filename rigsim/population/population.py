@@ -137,7 +137,9 @@ class Member:
         flat = self._flat(size)
         points, regions = flat.perfusion.points_mm, flat.perfusion.regions
         old = (self.age_years - 15.0) / 60.0
-        height = relief.height_um(points, regions, texel_mm=_texel_mm(flat.atlas), seed=self.seed)
+        height = relief.height_um(
+            points, regions, texel_mm=flat.atlas.typical_texel_mm(), seed=self.seed
+        )
         height = np.asarray(height * np.float32(0.7 + 0.75 * old), np.float32)
         roughness = relief.roughness_map(points, regions, seed=self.seed)
         rougher = np.clip(roughness * np.float32(0.95 + 0.17 * old), 0.15, 0.5)
@@ -163,7 +165,9 @@ class Member:
             height_um=even,
             hair=relief.hair_map(points, seed=self.seed),
             normal=atlas.normal,
-            beard=_stubble(points, regions, self.beard, _texel_mm(atlas), seed=self.seed),
+            beard=relief.stubble_map(
+                points, regions, self.beard, atlas.typical_texel_mm(), seed=self.seed
+            ),
             oiliness=self.oil,
         )
 
@@ -412,46 +416,6 @@ def _drawn(group: Group, index: int, number: int, rng: np.random.Generator) -> M
 def _nearest_preset(melanin: float) -> str:
     presets = pigment.MELANIN_PRESETS
     return min(presets, key=lambda name: abs(np.log(presets[name] / melanin)))
-
-
-def _stubble(
-    points: Float32Array,
-    regions: Mapping[str, Float32Array],
-    amount: float,
-    texel_mm: float,
-    *,
-    seed: int,
-) -> Float32Array | None:
-    """Draw the stubble below the surface: follicles on chin, jaw and upper lip."""
-    if amount == 0.0:
-        return None
-    x, y, z = points[..., 0], points[..., 1], points[..., 2]
-    # The border runs from the ears down the cheeks to the corners of the mouth.
-    reach = np.clip((np.abs(x) - 24.0) / 34.0, 0.0, 1.0)
-    upper = -34.0 + 22.0 * reach**1.5 - y
-    moustache = np.exp(-((x / 26.0) ** 4) - ((y + 29.0) / 7.0) ** 4)
-    area = np.maximum(1.0 / (1.0 + np.exp(-upper / 3.0)), 0.9 * moustache)
-    area *= 1.0 / (1.0 + np.exp(-(z + 62.0) / 6.0))
-    area *= 1.0 / (1.0 + np.exp(-(y + 92.0) / 5.0))  # it ends on the neck
-    area *= (1.0 - regions["lips"]) * (1.0 - 0.8 * regions["nose"])
-    area *= np.clip(1.0 + 0.25 * smooth_noise(points, (12.0, 5.0), seed=seed + 511), 0.3, 1.5)
-    dense = np.asarray(np.clip(amount * area, 0.0, 1.0), np.float32)
-    dots = scattered_spots(
-        points,
-        dense,
-        cell_mm=0.9,
-        radius_mm=(0.12, 0.22),
-        seed=seed + 512,
-        softness=4.0,
-        smallest_mm=0.7 * texel_mm,
-    )
-    # Half of the shadow is blurred: light spreads in skin further than between two follicles.
-    return np.asarray(np.clip(0.45 * dense + 0.55 * dots, 0.0, 1.0), np.float32)
-
-
-def _texel_mm(atlas: Atlas) -> float:
-    along_u, along_v = atlas.texel_mm()
-    return float(np.median(np.maximum(along_u, along_v)[atlas.covered]))
 
 
 @lru_cache(maxsize=HEAD_SHAPES)

@@ -255,26 +255,15 @@ class LensPicture:
         toward_mm: Float32Array,
     ) -> None:
         self.spread, self.shape = spread, shape
-        self._lookup = np.full(shape[0] * shape[1], -1, np.int32)
-        self._lookup[pixel] = np.arange(len(pixel), dtype=np.int32)
-        self._lookup = self._lookup.reshape(shape)
-        self._first, self._slot = np.asarray(first, np.int32), np.asarray(slot, np.uint8)
-        self._toward = np.asarray(toward_mm, np.float32)
-        self._slice = spread.slices(toward_mm)
+        lookup = np.full(shape[0] * shape[1], -1, np.int32)
+        lookup[pixel] = np.arange(len(pixel), dtype=np.int32)
+        toward = np.asarray(toward_mm, np.float32)
+        starts, slots = np.asarray(first, np.int32), np.asarray(slot, np.uint8)
+        samples = (lookup.reshape(shape), starts, slots, spread.slices(toward_mm), toward)
+        self._samples = (*samples, spread.table, spread.radius)
         self._cut = np.full(shape, np.inf, np.float32)
         self._far = np.zeros(shape, np.float32)
-        _layers(
-            self._lookup,
-            self._first,
-            self._slot,
-            self._slice,
-            self._toward,
-            spread.table,
-            spread.radius,
-            np.float32(spread.gap_mm),
-            self._cut,
-            self._far,
-        )
+        _layers(*self._samples, np.float32(spread.gap_mm), self._cut, self._far)
 
     def see(self, rows: Float32Array) -> Float32Array:
         """Return the picture of samples of some radiance.
@@ -291,19 +280,8 @@ class LensPicture:
         """
         out = np.zeros((*self.shape, rows.shape[1]), np.float32)
         if len(rows):
-            _gather(
-                self._lookup,
-                self._first,
-                self._slot,
-                self._slice,
-                self._toward,
-                self.spread.table,
-                self.spread.radius,
-                self._cut,
-                self._far,
-                np.ascontiguousarray(rows, np.float32),
-                out,
-            )
+            light = np.ascontiguousarray(rows, np.float32)
+            _gather(*self._samples, self._cut, self._far, light, out)
         return out
 
 

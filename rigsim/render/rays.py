@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from capture.rig import View
 from rigsim.arrays import BoolArray, Float32Array, Int32Array
@@ -37,6 +37,18 @@ class GBuffer:
     """Texture coordinates."""
     to_camera: Float32Array
     """Unit vector from the point to the camera."""
+
+    def inside(
+        self,
+    ) -> tuple[NDArray[np.int_], Float32Array, Float32Array, Float32Array, Float32Array]:
+        """Return index, uv, position, normal and way to the camera of samples that meet the mesh.
+
+        Shapes (n,), (n, 2), and (n, 3) thrice; the index is into the flat mask.
+        """
+        at = np.flatnonzero(self.mask.reshape(-1))
+        vectors = (self.position_mm, self.normal, self.to_camera)
+        position, normal, to_camera = (part.reshape(-1, 3)[at] for part in vectors)
+        return at, self.uv.reshape(-1, 2)[at], position, normal, to_camera
 
 
 def camera_rays(

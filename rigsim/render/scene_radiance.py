@@ -1,43 +1,20 @@
-"""What is rendered: radiance of described scenes, by the renderer's own materials and sampling.
-
-A mesh that rays are cast on (`rigsim.render.caster`), what rays meet (`rigsim.render.rays`) and the
-renderer's start (`rigsim.render.renderer`) are modules of their own; their names are found here,
-too.
-"""
+"""What is rendered: radiance of described scenes, by the renderer's own materials and sampling."""
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from capture.rig import Rig, View
 from rigsim.arrays import Float32Array, Float64Array
 from rigsim.geometry.mesh import Mesh
-from rigsim.render.caster import Caster
-from rigsim.render.rays import OFFSET_MM, GBuffer, camera_rays, g_buffer, trace, visibility
-from rigsim.render.renderer import RenderError, load, thread_count, with_slack
-from rigsim.render.variant import Kind, VariantChoice, choose_variant
-
-__all__ = [
-    "OFFSET_MM",
-    "Caster",
-    "GBuffer",
-    "MovedLight",
-    "RenderError",
-    "VariantChoice",
-    "camera_rays",
-    "choose_variant",
-    "g_buffer",
-    "load",
-    "look_at",
-    "radiance",
-    "thread_count",
-    "trace",
-    "visibility",
-    "with_slack",
-]
+from rigsim.render.renderer import RenderError, load
+from rigsim.render.variant import Kind, choose_variant
 
 
 def radiance(
@@ -165,6 +142,81 @@ def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> Float64Array
     matrix = np.eye(4)
     matrix[:3] = np.column_stack([left, np.cross(forward, left), forward, place])
     return matrix
+
+
+def perspective(
+    view: View, pixel_format: str, *, up: ArrayLike | None = None, sampler: str = ""
+) -> dict[str, Any]:
+    """Return the description of a camera with square pixels.
+
+    Parameters
+    ----------
+    view
+        The camera.
+    pixel_format
+        "rgb" or "luminance".
+    up
+        Direction of its local +y, shape (3,); None takes the view's.
+    sampler
+        Mitsuba's; empty takes its default.
+    """
+    description = {
+        "type": "perspective",
+        "fov": math.degrees(2.0 * math.atan(0.5 * view.width_px / view.focal_px)),
+        "fov_axis": "x",
+        "near_clip": 1.0,
+        "far_clip": 1e4,
+        "to_world": look_at(view.position_mm, view.target_mm, view.up if up is None else up),
+        "film": {
+            "type": "hdrfilm",
+            "width": view.width_px,
+            "height": view.height_px,
+            "pixel_format": pixel_format,
+            "rfilter": {"type": "box"},
+        },
+    }
+    return description | ({"sampler": {"type": sampler, "sample_count": 4}} if sampler else {})
+
+
+def point_rig(rig: Rig) -> Rig:
+    """Return a rig whose lights are points that shine evenly, as Mitsuba's point light does."""
+    lights = tuple(
+        dataclasses.replace(light, half_intensity_deg=None, radius_mm=1e-3) for light in rig.lights
+    )
+    return dataclasses.replace(rig, lights=lights)
+
+
+def rough_metal(distribution: str, eta: float, alpha: Any) -> dict[str, Any]:
+    """Return the description of facets: without absorption, a metal reflects as a dielectric."""
+    return {
+        "type": "roughconductor",
+        "distribution": distribution,
+        "alpha": alpha,
+        "eta": eta,
+        "k": 0.0,
+    }
+
+
+def matt_plastic(eta: float, reflectance: Any) -> dict[str, Any]:
+    """Return the description of an interior behind a smooth boundary that does not shine."""
+    return {
+        "type": "plastic",
+        "int_ior": eta,
+        "ext_ior": 1.0,
+        "specular_reflectance": 0.0,
+        "diffuse_reflectance": reflectance,
+    }
+
+
+def plastic_scale(eta: float) -> float:
+    """Return eta^2 (1 - F_inner) with the polynomial that Mitsuba takes for the latter.
+
+    References
+    ----------
+    Egan and Hilgeman 1973, doi:10.1364/AO.12.001816; 0.1 % off the exact value at 1.4.
+    """
+    inner = -1.4399 / eta**2 + 0.7099 / eta + 0.6681 + 0.0636 * eta
+    return eta * eta * (1.0 - inner)
 
 
 def _with_transforms(mi: Any, description: Mapping[str, Any]) -> dict[str, Any]:

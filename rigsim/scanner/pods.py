@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from rigsim.arrays import BoolArray, Float32Array, Float64Array, Int32Array
 from rigsim.geometry.atlas import interpolate, sample
-from rigsim.geometry.mesh import Mesh, MeshError, build_mesh
+from rigsim.geometry.mesh import Mesh, MeshError, build_mesh, grid_faces
 from rigsim.geometry.surface_noise import smooth_noise
 from rigsim.render import Caster
 from rigsim.scanner.flaws import add_flaws, binary_ply
@@ -275,10 +275,7 @@ def _with_collar(mesh: Mesh) -> Mesh:
     points = np.stack(
         [wide * np.sin(phi), low + 6.0 - 55.0 * t, middle[2] + 0.8 * wide * np.cos(phi)], axis=-1
     ).reshape(-1, 3)
-    at = np.arange(points.shape[0]).reshape(phi.shape)
-    a, b, c, d = at[:-1, :-1], at[:-1, 1:], at[1:, :-1], at[1:, 1:]
-    faces = np.concatenate([np.stack(f, -1).reshape(-1, 3) for f in ([a, c, b], [b, c, d])])
-    collar = build_mesh(points, faces, np.zeros((len(points), 2)))
+    collar = build_mesh(points, grid_faces(*phi.shape), np.zeros((len(points), 2)))
     return Mesh(
         np.concatenate([mesh.vertices_mm, collar.vertices_mm]),
         np.concatenate([mesh.faces, collar.faces + np.int32(len(mesh.vertices_mm))]),

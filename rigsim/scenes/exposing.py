@@ -1,31 +1,29 @@
-"""What exposures of every scene share: the light that they are given, and what is wrong with it."""
+"""What scenes share: views, sensors, the light of their exposures, and what is kept of it."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+from capture.rig import Rig, RigError, View
+from rigsim.needs.effects import EffectSelection, Noise, SceneEffects
+from rigsim.needs.face import INTERREFLECTION_EFFECT, Scenery, last_bounce
+from rigsim.render import Caster
+from rigsim.sensor import Sensor, sensor_of
+from rigsim.subject import SimulatedSubject
+from rigsim.targets import Target
+from rigsim.world.light_record import SwitchedLight
+
+KeyT = TypeVar("KeyT")
+ValueT = TypeVar("ValueT")
 
 
 class SceneError(ValueError):
     """A scene is asked for something that it does not hold."""
 
 
-class LitLight(Protocol):
-    """A stretch of steady light, as the world reports it, clipped to the exposure."""
-
-    @property
-    def level(self) -> float:
-        """Fraction of full power, 0 to 1."""
-
-    @property
-    def t_on_s(self) -> float:
-        """World time at which it went on, s."""
-
-    @property
-    def t_off_s(self) -> float:
-        """World time at which it went off, s."""
-
-
-def full_power_s(light: LitLight, name: str) -> float:
+def full_power_s(light: SwitchedLight, name: str) -> float:
     """Return for how long full power would give the light of a stretch, s.
 
     Parameters
@@ -59,3 +57,106 @@ def full_power_s(light: LitLight, name: str) -> float:
             "expected an end after its beginning"
         )
     return light.level * (light.t_off_s - light.t_on_s)
+
+
+class Kept(Generic[KeyT, ValueT]):
+    """The latest of what is slow to make.
+
+    Parameters
+    ----------
+    most
+        How many values like a given one are kept, at least 1.
+    """
+
+    def __init__(self, most: Callable[[ValueT], int]) -> None:
+        self._most = most
+        self._values: OrderedDict[KeyT, ValueT] = OrderedDict()
+
+    def get(self, key: KeyT, make: Callable[[], ValueT]) -> ValueT:
+        """Return what is kept under a key, or make it."""
+        if key not in self._values:
+            value = make()
+            while self._values and len(self._values) >= self._most(value):
+                self._values.popitem(last=False)
+            self._values[key] = value
+        self._values.move_to_end(key)
+        return self._values[key]
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._values.clear()
+
+
+class RigScene:
+    """What scenes of every rig have."""
+
+    rig: Rig
+    needs: EffectSelection
+    """What is built, what is not, and why."""
+
+    @property
+    def left_out(self) -> list[tuple[str, str]]:
+        """What the scene does not build, with the reason."""
+        return self.needs.left_out
+
+    def _camera(self, name: str | None) -> View:
+        """Return a camera by its name; None takes the first."""
+        if name is None:
+            return self.rig.views[0]
+        try:
+            return self.rig.view(name)
+        except RigError as error:
+            raise SceneError(str(error)) from error
+
+
+class FaceScene(RigScene):
+    """A face or a target, lit by lights of one spectrum, before cameras."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        subject: SimulatedSubject | Target,
+        *,
+        state: str,
+        movement: bool,
+        sensor: Sensor | None,
+        seed: int,
+        subpixels: int,
+    ) -> None:
+        spectra_names = {light.illuminant for light in rig.lights}
+        if len(spectra_names) > 1:
+            raise SceneError(
+                f"lights: got the spectra {', '.join(sorted(spectra_names))}, expected one"
+            )
+        if subpixels < 1:
+            raise SceneError(f"subpixels: got {subpixels}, expected at least 1")
+        if movement and isinstance(subject, SimulatedSubject) and subject.pose is None:
+            subject = subject.posed(state)
+        self.rig, self.subject, self.state, self.movement = rig, subject, state, movement
+        self.seed, self.subpixels = seed, subpixels
+        self._illuminant = rig.lights[0].illuminant
+        self._sensors = {
+            view.name: sensor_of(view) if sensor is None else sensor for view in rig.views
+        }
+
+    def sensor(self, view_name: str | None = None) -> Sensor:
+        """Return the sensor of a view; None takes the first."""
+        return self._sensors[self._camera(view_name).name]
+
+    def _face(self, what: str = "truth") -> SimulatedSubject:
+        """Return the face, or say what of a target was asked for."""
+        if not isinstance(self.subject, SimulatedSubject):
+            raise SceneError(f"{what}: got the target {self.subject.name!r}, expected a face")
+        return self.subject
+
+    def _scenery(
+        self, view: View, caster: Caster, share: float, noise: Noise, effects: SceneEffects
+    ) -> Scenery:
+        """Return what a camera looks at and with."""
+        return Scenery(view, self._illuminant, caster, share, noise, effects, self.subpixels)
+
+    def _last_bounce(self, effects: SceneEffects) -> float:
+        """Return the share of the first bounce below which further ones are left out."""
+        if effects.last_bounce is not None:
+            return effects.last_bounce
+        return last_bounce(self.needs[INTERREFLECTION_EFFECT].over_noise or 0.0)

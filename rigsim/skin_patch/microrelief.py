@@ -26,6 +26,7 @@ from scipy.ndimage import map_coordinates
 from rigsim.arrays import Float32Array, Float64Array
 from rigsim.geometry.polygon_net import polygon_net
 from rigsim.geometry.surface_noise import line_network, scattered_spots, smooth_noise
+from rigsim.package_data import package_table
 from rigsim.subject.pigment import MAX_MELANIN, MELANIN_PRESETS
 from rigsim.tissue.lateral_kernels import SIGMAS_MM
 from rigsim.tissue.skin_layers import MAX_C_HD
@@ -70,67 +71,8 @@ class _Site:
     alpha: float
 
 
-_SITE_PARAMETERS: Final[dict[str, _Site]] = {
-    # Long furrows across the brow: elongated polygons, along x.
-    "forehead": _Site(
-        0.42,
-        44.0,
-        0.095,
-        1.7,
-        4.0,
-        0.75,
-        13.0,
-        3.5,
-        7.0,
-        0.8,
-        0.20,
-        28.0,
-        6.5,
-        0.60,
-        2.0,
-        0.20,
-        0.22,
-    ),
-    # An even, finer net with many pores.
-    "cheek": _Site(
-        0.34,
-        30.0,
-        0.080,
-        1.15,
-        65.0,
-        0.9,
-        10.0,
-        3.0,
-        5.0,
-        0.7,
-        0.45,
-        34.0,
-        6.0,
-        0.65,
-        2.0,
-        0.20,
-        0.26,
-    ),
-    # Coarse, deep and irregular.
-    "chin": _Site(
-        0.55,
-        56.0,
-        0.125,
-        1.3,
-        -35.0,
-        1.0,
-        17.0,
-        4.5,
-        9.0,
-        1.0,
-        0.60,
-        40.0,
-        7.0,
-        0.70,
-        2.0,
-        0.20,
-        0.24,
-    ),
+_SITE_PARAMETERS: Final = {
+    name: _Site(**numbers) for name, numbers in package_table("skin_sites").items()
 }
 
 

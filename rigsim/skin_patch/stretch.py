@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Final, Literal
 
 import numpy as np
@@ -281,24 +282,11 @@ def deform(
     gradient = mean_gradient(stretch, angle_deg, compensation)
     s, t = stretches(stretch, compensation)
     before = _excess_length(skin.height_um, skin.texel_um, np.eye(2), angle_deg)
+    made = partial(StretchedSkin, skin, s, t, angle_deg, gradient)
     if s == 1.0 and t == 1.0:
-        still = np.zeros((*skin.height_um.shape, 2), np.float32)
-        return StretchedSkin(
-            skin,
-            s,
-            t,
-            angle_deg,
-            gradient,
-            skin.height_um,
-            skin.albedo,
-            skin.alpha,
-            still,
-            before,
-            before,
-            Convergence(0, 0.0, (), ()),
-            _coefficients(skin.height_um),
-            _coefficients(skin.albedo),
-        )
+        still, none = np.zeros((*skin.height_um.shape, 2), np.float32), Convergence(0, 0.0, (), ())
+        splines = _coefficients(skin.height_um), _coefficients(skin.albedo)
+        return made(skin.height_um, skin.albedo, skin.alpha, still, before, before, none, *splines)
     count = skin.height_um.shape[0]
     mean = float(skin.height_um.mean())
     problem = layer_problem(skin, gradient)
@@ -317,21 +305,17 @@ def deform(
     spline(_coefficients(skin.albedo), *inner, False, tint, tint, tint)
     albedo = tint.reshape(count, count)[::-1]
     alpha = _bilinear(skin.alpha, *inner).reshape(count, count)[::-1]
-    return StretchedSkin(
-        skin=skin,
-        stretch_s=s,
-        stretch_t=t,
-        angle_deg=angle_deg,
-        gradient=gradient,
-        height_um=np.asarray(height, np.float32),
-        albedo=np.asarray(albedo, np.float32),
-        alpha=np.asarray(alpha, np.float32),
-        displacement_um=np.asarray(np.moveaxis(state[:2, :count, :count], 0, -1)[::-1], np.float32),
-        excess_length=_excess_length(height, skin.texel_um, gradient, angle_deg),
-        neutral_excess_length=before,
-        convergence=convergence,
-        _coefficients=_coefficients(height),
-        _pigment=_coefficients(albedo),
+    displacement = np.moveaxis(state[:2, :count, :count], 0, -1)[::-1]
+    return made(
+        np.asarray(height, np.float32),
+        np.asarray(albedo, np.float32),
+        np.asarray(alpha, np.float32),
+        np.asarray(displacement, np.float32),
+        _excess_length(height, skin.texel_um, gradient, angle_deg),
+        before,
+        convergence,
+        _coefficients(height),
+        _coefficients(albedo),
     )
 
 

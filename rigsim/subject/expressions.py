@@ -19,10 +19,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from rigsim.arrays import BoolArray, Float32Array, Float64Array, Int32Array
+from rigsim.arrays import Float32Array, Float64Array
 from rigsim.geometry.mesh import Mesh, build_mesh, vertex_normals
+from rigsim.package_data import package_table
 from rigsim.subject.face_regions import mean_head_scale, on_mean_head
 from rigsim.subject.perfusion import STATE_NAMES
 
@@ -51,29 +51,8 @@ class _Pull:
 
 
 _ACTION_PULLS: Final[Mapping[str, tuple[_Pull, ...]]] = {
-    "inner brow raiser": (_Pull((14.0, 40.0, 3.0), (17.0, 21.0, 42.0), (0.4, 5.8, -0.8)),),
-    "outer brow raiser": (_Pull((40.0, 41.0, -12.0), (20.0, 21.0, 42.0), (0.8, 5.8, -1.6)),),
-    "brow lowerer": (_Pull((14.0, 42.0, 4.0), (14.0, 16.0, 40.0), (-3.4, -4.2, 0.8)),),
-    "cheek raiser": (
-        _Pull((40.0, 4.0, -12.0), (20.0, 18.0, 42.0), (0.4, 4.2, 1.0)),
-        _Pull((50.0, 37.0, -22.0), (14.0, 13.0, 36.0), (-0.8, -2.6, 0.2)),
-    ),
-    "nose wrinkler": (
-        _Pull((10.0, 2.0, 10.0), (10.0, 15.0, 30.0), (-0.3, 3.6, 0.5)),
-        _Pull((15.0, -13.0, 9.0), (10.0, 11.0, 25.0), (0.8, 2.6, 0.3)),
-    ),
-    "upper lip raiser": (_Pull((13.0, -33.0, 12.0), (13.0, 10.0, 30.0), (0.8, 3.2, 0.6)),),
-    "lip corner puller": (
-        _Pull((26.0, -41.0, 0.0), (18.0, 17.0, 45.0), (5.3, 5.3, -2.8)),
-        _Pull((38.0, -15.0, -6.0), (18.0, 16.0, 40.0), (0.6, 2.0, 1.8)),
-    ),
-    "lip corner depressor": (_Pull((25.0, -45.0, -2.0), (14.0, 13.0, 40.0), (0.8, -4.4, -1.0)),),
-    "chin raiser": (_Pull((0.0, -61.0, 8.0), (18.0, 14.0, 30.0), (0.0, 3.8, 1.2), pair=False),),
-    "lip stretcher": (_Pull((26.0, -43.0, 0.0), (18.0, 15.0, 40.0), (4.6, -1.0, -3.2)),),
-    "lip tightener": (
-        _Pull((0.0, -42.0, 12.0), (18.0, 8.0, 30.0), (0.0, 0.0, -1.2), pair=False),
-        _Pull((25.0, -42.0, 0.0), (14.0, 12.0, 40.0), (-1.8, 0.0, 0.4)),
-    ),
+    action: tuple(_Pull(**pull) for pull in pulls)
+    for action, pulls in package_table("face")["action_pulls"].items()
 }
 
 _JAW_ACTION: Final = "jaw drop"
@@ -84,49 +63,12 @@ _JAW_JOINT_MM: Final = (0.0, 10.0, -90.0)
 ACTION_NAMES: Final = (*_ACTION_PULLS, _JAW_ACTION)
 """Names of the actions."""
 
-EXPRESSION_STRENGTHS: Final[Mapping[str, Mapping[str, float]]] = {
-    "anger": {"brow lowerer": 1.0, "lip tightener": 1.0, "nose wrinkler": 0.2, "chin raiser": 0.3},
-    "disgust": {
-        "nose wrinkler": 1.0,
-        "upper lip raiser": 0.7,
-        "brow lowerer": 0.35,
-        "lip corner depressor": 0.3,
-        "chin raiser": 0.5,
-    },
-    "fear": {
-        "inner brow raiser": 0.9,
-        "outer brow raiser": 0.4,
-        "brow lowerer": 0.5,
-        "lip stretcher": 0.9,
-        _JAW_ACTION: 0.35,
-    },
-    "happiness": {"cheek raiser": 1.0, "lip corner puller": 0.85},
-    "sadness": {
-        "inner brow raiser": 0.9,
-        "brow lowerer": 0.5,
-        "lip corner depressor": 0.9,
-        "chin raiser": 0.6,
-    },
-    "surprise": {"inner brow raiser": 1.0, "outer brow raiser": 1.0, _JAW_ACTION: 1.0},
-    "smile": {"lip corner puller": 1.0, "cheek raiser": 0.5},
-}
+EXPRESSION_STRENGTHS: Final[Mapping[str, Mapping[str, float]]] = package_table("face")[
+    "expression_strengths"
+]
 """Strength of each action in each expression; states that are none do not move the face."""
 
-# Weight of a mesh's own shapes at strength 1, so that they reach about as far as the pulls here.
-_OWN_SHAPES: Final[Mapping[str, Mapping[str, float]]] = {
-    "inner brow raiser": {"browInnerUp": 0.9},
-    "outer brow raiser": {"browOuterUp": 0.65},
-    "brow lowerer": {"browDown": 0.8},
-    "cheek raiser": {"cheekSquint": 0.75},
-    "nose wrinkler": {"noseSneer": 0.45},
-    "upper lip raiser": {"noseSneer": 0.2, "mouthUpperUp": 0.4},
-    "lip corner puller": {"mouthSmile": 0.52},
-    "lip corner depressor": {"mouthFrown": 0.8},
-    "chin raiser": {"mouthShrugLower": 0.5},
-    "lip stretcher": {"mouthStretch": 0.55},
-    "lip tightener": {"mouthPucker": 0.15},
-    _JAW_ACTION: {"jawOpen": 0.2},
-}
+_OWN_SHAPES: Final[Mapping[str, Mapping[str, float]]] = package_table("face")["own_shapes"]
 
 STRENGTH_RANGE: Final = (0.86, 1.12)
 """Range of a person's own strength in each action."""
@@ -220,47 +162,6 @@ def moved(mesh: Mesh, deltas_mm: Float32Array) -> Mesh:
     normals = mesh.normals + turned
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-6)
     return build_mesh(vertices, mesh.faces, mesh.uv, normals)
-
-
-def principal_stretches(
-    rest_mm: ArrayLike, posed_mm: ArrayLike, faces: Int32Array
-) -> tuple[Float64Array, BoolArray]:
-    """Return how the triangles of a surface are stretched.
-
-    Parameters
-    ----------
-    rest_mm, posed_mm
-        Vertices before and after, shape (V, 3).
-    faces
-        Vertex indices, shape (F, 3).
-
-    Returns
-    -------
-    stretches : ndarray
-        Least and greatest ratio of lengths after to before, shape (F, 2); 1 for triangles that had
-        no area.
-    folded : ndarray of bool
-        Triangles whose normal has turned by more than a right angle, shape (F,).
-    """
-    before = _edges(np.asarray(rest_mm, np.float64), faces)
-    after = _edges(np.asarray(posed_mm, np.float64), faces)
-    a, b = np.cross(before[:, 0], before[:, 1]), np.cross(after[:, 0], after[:, 1])
-    whole = np.sum(a * a, axis=-1) > 1e-12
-    gram = before @ before.swapaxes(1, 2)
-    gram[~whole] = np.eye(2)
-    target = after @ after.swapaxes(1, 2)
-    target[~whole] = np.eye(2)
-    # squared stretches are the eigenvalues of G^-1 G'; both are 2 x 2
-    product = np.linalg.solve(gram, target)
-    half = 0.5 * np.trace(product, axis1=1, axis2=2)
-    spread = np.sqrt(np.maximum(half**2 - np.linalg.det(product), 0.0))
-    squares = np.maximum(np.stack([half - spread, half + spread], axis=-1), 0.0)
-    return np.sqrt(squares), whole & (np.sum(a * b, axis=-1) <= 0.0)
-
-
-def _edges(points: Float64Array, faces: Int32Array) -> Float64Array:
-    corners = points[faces]
-    return np.asarray(corners[:, 1:] - corners[:, :1])
 
 
 def _sides(seed: int) -> dict[str, tuple[float, float]]:

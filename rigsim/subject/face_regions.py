@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
 from rigsim.arrays import Float32Array, Float64Array, FloatArray
 from rigsim.geometry.mesh import Mesh
+from rigsim.package_data import package_table
 from rigsim.subject.head import LANDMARKS_MM, lip_outline
 
 REGION_NAMES: Final = (
@@ -28,28 +29,9 @@ REGION_NAMES: Final = (
 )
 """Regions that `region_masks` draws."""
 
-# Landmarks and radii along x, y, z in mm of each region's soft balls.
-_REGION_BALLS: Final[Mapping[str, tuple[tuple[str, tuple[float, float, float]], ...]]] = {
-    "forehead": (("forehead", (42.0, 22.0, 40.0)),),
-    "cheeks": (("cheek left", (18.0, 17.0, 25.0)), ("cheek right", (18.0, 17.0, 25.0))),
-    "nose": (
-        ("nose tip", (13.0, 11.0, 18.0)),
-        ("nose wing left", (8.0, 8.0, 10.0)),
-        ("nose wing right", (8.0, 8.0, 10.0)),
-    ),
-    "lids": (("eye left", (18.0, 11.0, 18.0)), ("eye right", (18.0, 11.0, 18.0))),
-    "temples": (("temple left", (14.0, 20.0, 25.0)), ("temple right", (14.0, 20.0, 25.0))),
-    "chin": (("chin", (20.0, 13.0, 25.0)),),
-    "jaw": (("jaw left", (20.0, 20.0, 30.0)), ("jaw right", (20.0, 20.0, 30.0))),
-    "neck": (("neck", (60.0, 28.0, 60.0)),),
-    "crow": (("crow left", (9.0, 13.0, 14.0)), ("crow right", (9.0, 13.0, 14.0))),
-    "brows": (("brow left", (20.0, 7.0, 20.0)), ("brow right", (20.0, 7.0, 20.0))),
-    "mouth corners": (
-        ("mouth corner left", (7.0, 8.0, 12.0)),
-        ("mouth corner right", (7.0, 8.0, 12.0)),
-    ),
-    "nose sides": (("fold left", (6.0, 13.0, 12.0)), ("fold right", (6.0, 13.0, 12.0))),
-}
+_RegionBall: TypeAlias = tuple[str, tuple[float, float, float]]
+"""A landmark, and radii along x, y, z in mm of a soft ball around it."""
+_REGION_BALLS: Final[Mapping[str, tuple[_RegionBall, ...]]] = package_table("face")["region_balls"]
 
 _BALL_CENTERS_MM: Final = dict(LANDMARKS_MM) | {
     "crow left": (-52.0, 24.0, -22.0),

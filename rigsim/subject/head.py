@@ -18,6 +18,7 @@ from numba import njit, prange
 
 from rigsim.arrays import Float64Array, FloatArray
 from rigsim.geometry.mesh import Mesh, build_mesh
+from rigsim.package_data import package_table
 
 Point = tuple[float, float, float]
 
@@ -36,29 +37,7 @@ LIP_HALF_WIDTH_MM: Final = 25.0
 SHAPE_DEVIATION: Final = 0.045
 """Relative standard deviation of the solids' sizes from seed to seed."""
 
-LANDMARKS_MM: Final[Mapping[str, Point]] = {
-    "nose tip": (0.0, -8.0, 26.0),
-    "nose wing left": (-15.0, -14.0, 10.0),
-    "nose wing right": (15.0, -14.0, 10.0),
-    "nose bridge": (0.0, 18.0, 8.0),
-    "cheek left": (-45.0, -8.0, -12.0),
-    "cheek right": (45.0, -8.0, -12.0),
-    "forehead": (0.0, 68.0, 5.0),
-    "temple left": (-58.0, 48.0, -35.0),
-    "temple right": (58.0, 48.0, -35.0),
-    "eye left": (-31.0, 25.0, -6.0),
-    "eye right": (31.0, 25.0, -6.0),
-    "brow left": (-31.0, 42.0, -2.0),
-    "brow right": (31.0, 42.0, -2.0),
-    "upper lip": (0.0, -37.0, 14.0),
-    "lower lip": (0.0, -48.0, 14.0),
-    "mouth corner left": (-25.0, -42.0, 0.0),
-    "mouth corner right": (25.0, -42.0, 0.0),
-    "chin": (0.0, -66.0, 8.0),
-    "jaw left": (-46.0, -52.0, -40.0),
-    "jaw right": (46.0, -52.0, -40.0),
-    "neck": (0.0, -120.0, -25.0),
-}
+LANDMARKS_MM: Final[Mapping[str, Point]] = package_table("face")["landmarks_mm"]
 """Points of the mean head in mm, rig frame; left and right as seen in the image."""
 
 

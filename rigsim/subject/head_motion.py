@@ -13,7 +13,8 @@ from typing import Final
 import numpy as np
 
 from rigsim.arrays import Float64Array
-from rigsim.geometry.mesh import Mesh, build_mesh, vertex_normals
+from rigsim.geometry.mesh import Mesh
+from rigsim.subject.expressions import moved
 from rigsim.subject.face_regions import on_mean_head
 from rigsim.subject.head import LANDMARKS_MM
 
@@ -114,12 +115,8 @@ class HeadMotion:
         outward = -1.0 if self.twitch_side == "left" else 1.0
         way = np.array([0.75 * outward, 0.6, -0.28])
         way /= np.linalg.norm(way)
-        moved = np.exp(-squared)[:, None] * (amount * self.twitch_mm * way)
-        vertices = mesh.vertices_mm + moved.astype(np.float32)
-        turned = vertex_normals(vertices, mesh.faces) - vertex_normals(mesh.vertices_mm, mesh.faces)
-        normals = mesh.normals + turned
-        normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-6)
-        return build_mesh(vertices, mesh.faces, mesh.uv, normals)
+        deltas = np.exp(-squared)[:, None] * (amount * self.twitch_mm * way)
+        return moved(mesh, deltas.astype(np.float32))
 
 
 def head_motion(

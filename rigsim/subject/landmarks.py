@@ -11,24 +11,14 @@ import numpy as np
 from capture.rig import View
 from rigsim.arrays import BoolArray, Float64Array, Int32Array
 from rigsim.geometry.mesh import Mesh
+from rigsim.package_data import package_table
 from rigsim.render import Caster
 from rigsim.subject.face_regions import from_mean_head
 from rigsim.subject.head import LANDMARKS_MM
 
-_PAIRED_POINTS_MM: Final[Mapping[str, tuple[float, float]]] = {
-    "brow inner": (15.0, 41.0),
-    "brow outer": (47.0, 41.0),
-    "eye inner": (16.5, 22.0),
-    "eye outer": (46.0, 21.0),
-    "lid": (31.0, 17.5),
-    "cheekbone": (42.0, 4.0),
-    "cheek middle": (32.0, -14.0),
-    "fold": (24.0, -26.0),
-    "lip peak": (7.0, -35.5),
-    "cheek low": (36.0, -36.0),
-    "chin side": (18.0, -62.0),
-    "forehead side": (28.0, 62.0),
-}
+_PAIRED_POINTS_MM: Final[Mapping[str, tuple[float, float]]] = package_table("face")[
+    "paired_points_mm"
+]
 _MIDLINE_POINTS_MM: Final[Mapping[str, tuple[float, float]]] = {
     "forehead low": (0.0, 52.0),
     "glabella": (0.0, 38.0),

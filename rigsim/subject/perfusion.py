@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from rigsim.arrays import Float32Array
 from rigsim.geometry.surface_noise import line_network, smooth_noise
+from rigsim.package_data import package_table
 
 MAX_HEMOGLOBIN: Final = 0.32
 """Largest volume fraction of blood, Jimenez et al. 2010, table 1."""
@@ -25,17 +26,7 @@ BASE_BLOOD_FRACTION: Final = 0.018
 """Blood volume fraction of facial skin between the regions; dermal values of 0.2 to 7 % are
 usual, Jacques 1998, "Skin optics summary", Oregon Medical Laser Center."""
 
-# Added to the base, in units of it: cheeks, nose and lips hold more blood.
-_REGION_GAIN: Final[Mapping[str, float]] = {
-    "cheeks": 0.85,
-    "nose": 1.1,
-    "lips": 2.6,
-    "chin": 0.35,
-    "lids": 0.25,
-    "nose sides": 0.3,
-    "temples": -0.12,
-    "neck": -0.15,
-}
+_REGION_GAIN: Final[Mapping[str, float]] = package_table("face")["region_gain"]
 
 _COMPARTMENT_FRACTIONS: Final = (0.56, 0.28, 0.16)
 """Parts of the blood in bed, loops and plexus."""
@@ -44,22 +35,7 @@ _COMPARTMENT_RESPONSES: Final = (0.45, 1.0, 0.8)
 """How far each compartment's vessels follow a change of radius: loops are muscular and answer
 most, the bed is mostly filled by what reaches it."""
 
-# Relative change of the vessels' radius by region; "all" holds everywhere. Directions follow
-# Jimenez et al. 2010, figures 2 to 5 and section 5: anger flushes and fear pales the whole face
-# (127 % and 81 %), a smile fills the cheeks and empties stretched skin, exercise and alcohol
-# redden different regions.
-_STATE_CHANGES: Final[Mapping[str, Mapping[str, float]]] = {
-    "neutral": {},
-    "anger": {"all": 0.13, "forehead": 0.10, "cheeks": 0.06, "brows": 0.08, "lips": -0.04},
-    "disgust": {"nose sides": 0.14, "nose": 0.08, "lips": -0.08, "lids": 0.05, "cheeks": 0.03},
-    "fear": {"all": -0.11, "lips": -0.05, "cheeks": -0.04},
-    "happiness": {"cheeks": 0.14, "nose sides": -0.06, "mouth corners": -0.08, "lids": 0.03},
-    "sadness": {"all": -0.03, "lids": 0.12, "nose": 0.10, "chin": 0.06, "brows": 0.05},
-    "surprise": {"forehead": 0.07, "brows": -0.06, "cheeks": -0.03, "all": -0.02},
-    "smile": {"cheeks": 0.18, "nose sides": -0.09, "mouth corners": -0.12, "lips": -0.07},
-    "exercise": {"all": 0.16, "cheeks": 0.22, "forehead": 0.12, "temples": 0.08, "chin": 0.05},
-    "alcohol": {"all": 0.08, "nose": 0.22, "cheeks": 0.13, "lids": 0.05, "neck": 0.09},
-}
+_STATE_CHANGES: Final[Mapping[str, Mapping[str, float]]] = package_table("face")["state_changes"]
 
 STATE_NAMES: Final = tuple(_STATE_CHANGES)
 """Names of the states."""

@@ -326,7 +326,7 @@ def make_subject(
     atlas = unwrap(surface, size)
     points = face_regions.on_mean_head(atlas.position_mm, surface)
     regions = face_regions.region_masks(points)
-    height = relief.height_um(points, regions, texel_mm=_typical_texel_mm(atlas), seed=seed)
+    height = relief.height_um(points, regions, texel_mm=atlas.typical_texel_mm(), seed=seed)
     return SimulatedSubject(
         preset=preset,
         seed=seed,
@@ -344,11 +344,6 @@ def make_subject(
 @lru_cache(maxsize=4)
 def _head(seed: int) -> Mesh:
     return build_head(np.random.default_rng([seed, 0]))
-
-
-def _typical_texel_mm(atlas: Atlas) -> float:
-    along_u, along_v = atlas.texel_mm()
-    return float(np.median(np.maximum(along_u, along_v)[atlas.covered]))
 
 
 __all__ = ["PRESET_NAMES", "STATE_NAMES", "SimulatedSubject", "SubjectError", "make_subject"]

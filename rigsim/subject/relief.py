@@ -221,3 +221,38 @@ def _furrows(
     drawn = max(width_mm, 1.2 * texel_mm)
     lines = line_network(points, cell_mm, drawn, seed=seed)
     return np.asarray(depth_um * width_mm / drawn * lines, np.float32)
+
+
+def stubble_map(
+    points: Float32Array,
+    regions: Mapping[str, Float32Array],
+    amount: float,
+    texel_mm: float,
+    *,
+    seed: int,
+) -> Float32Array | None:
+    """Draw the stubble below the surface: follicles on chin, jaw and upper lip."""
+    if amount == 0.0:
+        return None
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    # The border runs from the ears down the cheeks to the corners of the mouth.
+    reach = np.clip((np.abs(x) - 24.0) / 34.0, 0.0, 1.0)
+    upper = -34.0 + 22.0 * reach**1.5 - y
+    moustache = np.exp(-((x / 26.0) ** 4) - ((y + 29.0) / 7.0) ** 4)
+    area = np.maximum(1.0 / (1.0 + np.exp(-upper / 3.0)), 0.9 * moustache)
+    area *= 1.0 / (1.0 + np.exp(-(z + 62.0) / 6.0))
+    area *= 1.0 / (1.0 + np.exp(-(y + 92.0) / 5.0))  # it ends on the neck
+    area *= (1.0 - regions["lips"]) * (1.0 - 0.8 * regions["nose"])
+    area *= np.clip(1.0 + 0.25 * smooth_noise(points, (12.0, 5.0), seed=seed + 511), 0.3, 1.5)
+    dense = np.asarray(np.clip(amount * area, 0.0, 1.0), np.float32)
+    dots = scattered_spots(
+        points,
+        dense,
+        cell_mm=0.9,
+        radius_mm=(0.12, 0.22),
+        seed=seed + 512,
+        softness=4.0,
+        smallest_mm=0.7 * texel_mm,
+    )
+    # Half of the shadow is blurred: light spreads in skin further than between two follicles.
+    return np.asarray(np.clip(0.45 * dense + 0.55 * dots, 0.0, 1.0), np.float32)

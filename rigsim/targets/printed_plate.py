@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from rigsim.arrays import BoolArray, Float32Array, Float64Array
+from rigsim.package_data import package_table
 from rigsim.targets.flat import WHITE_REFLECTANCE
 
 CELL_MM: Final = 4.5
@@ -24,48 +25,7 @@ SQUARE_CELLS: Final = 8
 PAPER_REFLECTANCE: Final = 0.80
 INK_REFLECTANCE: Final = 0.05
 
-DICT_4X4_50: Final = (
-    0xB532,
-    0x0F9A,
-    0x332D,
-    0x9946,
-    0x549E,
-    0x79CD,
-    0x9E2E,
-    0xC4F2,
-    0xFEDA,
-    0xCF56,
-    0xF991,
-    0x11A7,
-    0x0EB7,
-    0x2A0F,
-    0x24B1,
-    0x263E,
-    0x4665,
-    0x6600,
-    0x6C5E,
-    0x76AF,
-    0x868B,
-    0xB02B,
-    0xCCD5,
-    0xDD82,
-    0xFE47,
-    0x9471,
-    0xACE4,
-    0xA554,
-    0x2123,
-    0x346F,
-    0x4415,
-    0x57B2,
-    0x9ECF,
-    0xF0CB,
-    0x08AE,
-    0x0929,
-    0x1875,
-    0x04FF,
-    0x0DF6,
-    0x1C5A,
-)
+DICT_4X4_50: Final[tuple[int, ...]] = package_table("dome_targets")["marker_bits"]
 """Bits of the first markers of the ArUco dictionary of that name, rows from the top, white is 1;
 the dictionary is made as in Garrido-Jurado et al. 2014, doi:10.1016/j.patcog.2014.01.005."""
 

@@ -157,25 +157,10 @@ def _run(
         s[3] = (s[3] << 11) | (s[3] >> 21)
         return dr.fma(Float(word >> 9), _UNIFORM_STEP, 0.5 * _UNIFORM_STEP)
 
-    def body(
-        s0: Any,
-        s1: Any,
-        s2: Any,
-        s3: Any,
-        x: Any,
-        y: Any,
-        z: Any,
-        ux: Any,
-        uy: Any,
-        uz: Any,
-        weight: Any,
-        layer: Any,
-        scattered: Any,
-        at: Any,
-        lost: Any,
-        *absorbed: Any,
-    ) -> tuple[Any, ...]:
-        s = [s0, s1, s2, s3]
+    def body(*state: Any) -> tuple[Any, ...]:
+        """Take every lane one step further, and begin with its next photon where one ends."""
+        *s, x, y, z, ux, uy, uz, weight, layer, scattered, at, lost = state[:15]
+        absorbed = state[15:]
         if single:
             thick, free_mm, albedo, g, eta, half_by_g = only
         else:
@@ -277,11 +262,7 @@ def _run(
         scattered |= collides
 
         # The next photon of the lane.
-        x = dr.select(ends, 0.0, x)
-        y = dr.select(ends, 0.0, y)
-        z = dr.select(ends, 0.0, z)
-        ux = dr.select(ends, 0.0, ux)
-        uy = dr.select(ends, 0.0, uy)
+        x, y, z, ux, uy = (dr.select(ends, 0.0, part) for part in (x, y, z, ux, uy))
         uz = dr.select(ends, 1.0, uz)
         weight = dr.select(ends, start, weight)
         layer = dr.select(ends, UInt32(1), layer)
@@ -292,11 +273,7 @@ def _run(
     zero = dr.zeros(Float, lanes)
     state = (
         *(UInt32(word) for word in words),
-        zero,
-        Float(zero),
-        Float(zero),
-        Float(zero),
-        Float(zero),
+        *(Float(zero) for _ in range(5)),
         dr.full(Float, 1.0, lanes),
         Float(zero) + start,
         dr.full(UInt32, 1, lanes),

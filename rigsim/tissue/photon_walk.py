@@ -123,12 +123,8 @@ def walk(table, ring_edges2, photons, seed, tally, events):  # type: ignore[no-u
     specular = ((table[1, 5] - table[0, 5]) / (table[1, 5] + table[0, 5])) ** 2
 
     for _ in range(photons):
-        x = 0.0  # position, mm
-        y = 0.0
-        z = 0.0
-        ux = 0.0  # direction
-        uy = 0.0
-        uz = 1.0
+        x, y, z = 0.0, 0.0, 0.0  # position, mm
+        ux, uy, uz = 0.0, 0.0, 1.0  # direction
         weight = 1.0 - specular
         layer = 1  # row of the table
         scattered = False

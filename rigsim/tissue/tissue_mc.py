@@ -162,23 +162,6 @@ class EscapePaths:
     photons: int
     """Photons that were traced for them."""
 
-    def reflectance_at(self, extra_sigma_a_per_mm: ArrayLike) -> Float64Array:
-        """Return the diffuse reflectance of this batch with absorption added to the layers.
-
-        Parameters
-        ----------
-        extra_sigma_a_per_mm
-            Absorption in 1/mm above that of the traced stack, >= 0, shape (..., layers).
-
-        Returns
-        -------
-        ndarray
-            Diffuse reflectance, shape (...).
-        """
-        extra = np.asarray(extra_sigma_a_per_mm, dtype=np.float64)
-        survival = np.exp(-np.tensordot(extra, self.path_mm, axes=(-1, 1)))
-        return np.asarray(survival @ self.weight / self.photons)
-
 
 def transport(
     stack: LayerStack,

@@ -4,7 +4,7 @@
 made and registered under it; ``name=NAME`` says the same. Without a name the whole URL is the name:
 the same URL is the same box, which keeps its state while its port is closed, and its cameras are
 ``sim://flash/VIEW``. ``seed``, ``clock`` (virtual or real) and the
-switches of `rigsim.world.faults.Faults` say how a new world is made.
+switches of `rigsim.boxes.faults.Faults` say how a new world is made.
 
 The port fails as real ones do: a pulled cable is a SerialException in read and write, an OSError in
 ``in_waiting`` and a ``termios.error`` in ``reset_input_buffer``.
@@ -22,8 +22,8 @@ from serial.serialutil import PortNotOpenError, SerialBase, SerialException, Ser
 
 from capture.rig import load_rig
 from rigsim import world as worlds
+from rigsim.boxes.faults import Faults
 from rigsim.world import World
-from rigsim.world.faults import Faults
 from rigsim.world.link import Link, LinkStalled, Unplugged
 from rigsim.world.rig_boxes import RIG_OF_BOX
 

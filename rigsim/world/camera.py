@@ -7,15 +7,7 @@ and misses edges meanwhile. Its pixels are made when somebody asks for the frame
 
 from __future__ import annotations
 
-from capture.devices.camera import (
-    Camera,
-    CameraError,
-    CameraInfo,
-    CameraUrlError,
-    Exposure,
-    Frame,
-    Trigger,
-)
+from capture.devices import camera
 from capture.rig import RigError
 from rigsim.world.camera_body import EXPOSURE_RANGE_S, ISO, CameraBody
 from rigsim.world.world import get_by_name_or_box
@@ -23,18 +15,18 @@ from rigsim.world.world import get_by_name_or_box
 __all__ = ["CameraBody", "SimCamera", "open_camera"]
 
 
-def open_camera(rest: str) -> Camera:
+def open_camera(rest: str) -> camera.Camera:
     """Open ``sim://WORLD/VIEW``; the world must be registered, or its box be open.
 
     WORLD is the name of ``sim://BOX?world=NAME``, or BOX itself where no name was given.
     """
     name, slash, view_name = rest.partition("/")
     if not (name and slash and view_name):
-        raise CameraUrlError(f"sim://{rest}: got {rest!r}, expected WORLD/VIEW")
+        raise camera.CameraUrlError(f"sim://{rest}: got {rest!r}, expected WORLD/VIEW")
     try:
         return SimCamera(get_by_name_or_box(name).camera(view_name))
     except (KeyError, RigError) as exc:
-        raise CameraUrlError(
+        raise camera.CameraUrlError(
             f"sim://{rest}: {exc.args[0]}; open its box first, by "
             "sim://BOX?world=NAME, and its cameras by sim://NAME/VIEW"
         ) from exc
@@ -52,7 +44,7 @@ class SimCamera:
     def __init__(self, body: CameraBody) -> None:
         self.body = body
         view = body.view
-        self._info = CameraInfo(
+        self._info = camera.CameraInfo(
             serial=view.serial,
             model=view.camera_model,
             width_px=view.width_px,
@@ -60,11 +52,11 @@ class SimCamera:
             pattern=view.cfa,
             black=(float(view.black_level),) * (1 if view.cfa == "MONO" else 4),
             white=view.white_level,
-            triggers=(Trigger.SOFTWARE, Trigger.EDGE),
+            triggers=(camera.Trigger.SOFTWARE, camera.Trigger.EDGE),
         )
 
     @property
-    def info(self) -> CameraInfo:
+    def info(self) -> camera.CameraInfo:
         """What it is."""
         return self._info
 
@@ -72,28 +64,28 @@ class SimCamera:
         """Return the time on the clock that stamps its frames, s."""
         return self.body.clock_s()
 
-    def configure(self, want: Exposure) -> Exposure:
+    def configure(self, want: camera.Exposure) -> camera.Exposure:
         """Set an exposure within what the camera can do, and return it."""
-        set_to = Exposure(
+        set_to = camera.Exposure(
             min(max(want.exposure_s, EXPOSURE_RANGE_S[0]), EXPOSURE_RANGE_S[1]),
             min(max(want.iso, ISO[0]), ISO[1]),
         )
         self.body.exposure = set_to
         return set_to
 
-    def arm(self, count: int, trigger: Trigger) -> None:
+    def arm(self, count: int, trigger: camera.Trigger) -> None:
         """Make ready for `count` frames; frames waiting from before are dropped."""
         if count < 1:
-            raise CameraError(f"count: got {count}, expected 1 or more")
+            raise camera.CameraError(f"count: got {count}, expected 1 or more")
         if trigger not in self._info.triggers:
-            raise CameraError(f"camera {self._info.serial}: knows no {trigger} trigger")
+            raise camera.CameraError(f"camera {self._info.serial}: knows no {trigger} trigger")
         self.body.arm(count, trigger)
 
     def fire(self) -> None:
         """Start one exposure."""
         self.body.fire()
 
-    def frame(self, timeout_s: float) -> Frame:
+    def frame(self, timeout_s: float) -> camera.Frame:
         """Return the next frame, or raise `FrameTimeout`."""
         return self.body.develop(self.body.next_shot(timeout_s))
 

@@ -15,7 +15,7 @@ import numpy as np
 from capture.devices.camera import CameraError, Exposure, Frame, FrameTimeout, Trigger
 from capture.rig import View
 from rigsim.arrays import UInt16Array
-from rigsim.world.faults import Faults
+from rigsim.boxes.faults import Faults
 from rigsim.world.light_record import Light
 
 ISO = (50, 25_600)

@@ -12,12 +12,13 @@ from rigsim.boxes.flash import FlashPop
 from rigsim.boxes.gradient_sphere import PatternLight
 from rigsim.boxes.probe import SourceLight
 
-__all__ = ["FlashPop", "LedPulse", "Light", "LightRecord", "PatternLight", "SourceLight"]
+SwitchedLight = LedPulse | PatternLight | SourceLight
+"""A stretch of steady light: of an LED, of a pattern, or out of a fibre."""
 
-Light = FlashPop | LedPulse | PatternLight | SourceLight
+Light = FlashPop | SwitchedLight
 """Light out of a box: a pop of the flash, or a stretch of an LED's, a pattern's or a fibre's."""
 
-_Switched = TypeVar("_Switched", bound=LedPulse | PatternLight | SourceLight)
+_Switched = TypeVar("_Switched", bound=SwitchedLight)
 
 
 def _none(now: float) -> list[_Switched]:

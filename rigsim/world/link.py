@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 
 from rigsim.boxes.controller import Controller
-from rigsim.world.faults import Faults
+from rigsim.boxes.faults import Faults
 
 STALL_BUFFER_BYTES = 256
 """What the line holds while a stalled box takes nothing."""
@@ -39,7 +39,7 @@ class Link:
     box
         At the far end.
     faults
-        Switches, see `rigsim.world.faults.Faults`.
+        Switches, see `rigsim.boxes.faults.Faults`.
     rng
         Decides when they strike.
     record

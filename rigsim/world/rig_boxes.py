@@ -8,14 +8,15 @@ from typing import Final
 
 import numpy as np
 
-from capture.rig import LedLimits, Rig
+from capture.rig import Rig
 from rigsim.boxes.caliper import CaliperUnit
-from rigsim.boxes.controller import Controller, Device
+from rigsim.boxes.controller import Controller
+from rigsim.boxes.device import Device
 from rigsim.boxes.dome import DomeUnit
+from rigsim.boxes.faults import Faults
 from rigsim.boxes.flash import FlashUnit
 from rigsim.boxes.gradient_sphere import GradientSphereUnit
 from rigsim.boxes.probe import ProbeUnit
-from rigsim.world.faults import Faults
 from rigsim.world.light_record import LightRecord
 from rigsim.world.suction import SuckedHead
 from rigsim.world.taped_skin import TapedSkin
@@ -72,113 +73,35 @@ def make_box(name: str, wiring: Wiring, *, rng: np.random.Generator) -> Controll
     ValueError
         Unknown name, or the rig does not describe what the box moves.
     """
-    if name not in _BOX_MAKERS:
-        raise ValueError(f"boxes: got {name!r}, expected one of {', '.join(_BOX_MAKERS)}")
+    if name not in SERIAL_NUMBERS:
+        raise ValueError(f"boxes: got {name!r}, expected one of {', '.join(SERIAL_NUMBERS)}")
+    faults = wiring.faults
     return Controller(
-        _BOX_MAKERS[name](wiring, rng),
-        serial=wiring.faults.serial or SERIAL_NUMBERS[name],
-        protocol=wiring.faults.protocol,
+        _make_unit(name, wiring, rng),
+        serial=faults.serial or SERIAL_NUMBERS[name],
+        protocol=faults.protocol,
         rng=rng,
     )
 
 
-def _flash(wiring: Wiring, rng: np.random.Generator) -> Device:
-    rig, faults = wiring.rig, wiring.faults
-    return FlashUnit(
-        on_pop=wiring.light.pops.append,
-        on_trigger=wiring.trigger,
-        recycle_s=rig.recycle_s,
-        pops_per_min=rig.max_pops_per_min,
-        move_s=rig.polarizer_move_s,
-        misfire=faults.misfire,
-        slow_charge=faults.slow_charge,
-        lamp_dead=faults.lamp_dead,
-        heat=faults.heat,
-        interlock=faults.interlock,
-        rng=rng,
+def _make_unit(name: str, wiring: Wiring, rng: np.random.Generator) -> Device:
+    rig, faults, light, trigger = wiring.rig, wiring.faults, wiring.light, wiring.trigger
+    if name == "flash":
+        return FlashUnit(rig, faults, on_pop=light.pops.append, on_trigger=trigger, rng=rng)
+    if name == "dome":
+        dome = DomeUnit(rig, faults, on_pulse=light.pulses.append, on_trigger=trigger)
+        light.pulses_now = dome.light_now
+        return dome
+    if name == "gradient_sphere":
+        sphere = GradientSphereUnit(
+            rig, faults, on_pattern=light.patterns.append, on_trigger=trigger
+        )
+        light.patterns_now = sphere.light_now
+        return sphere
+    if name == "caliper":
+        return CaliperUnit(rig, wiring.skin, faults, on_change=wiring.note_grip, rng=rng)
+    probe = ProbeUnit(
+        rig, wiring.head, faults, on_light=light.sources.append, on_trigger=trigger, rng=rng
     )
-
-
-def _dome(wiring: Wiring, rng: np.random.Generator) -> Device:
-    rig, faults = wiring.rig, wiring.faults
-    unit = DomeUnit(
-        rig.lights,
-        rig.leds or LedLimits(),
-        cameras=len(rig.views),
-        on_pulse=wiring.light.pulses.append,
-        on_trigger=wiring.trigger,
-        dead=faults.dead_leds,
-        weak=faults.weak_leds,
-        heat=faults.heat,
-        interlock=faults.interlock,
-    )
-    wiring.light.pulses_now = unit.light_now
-    return unit
-
-
-def _gradient_sphere(wiring: Wiring, rng: np.random.Generator) -> Device:
-    rig, faults = wiring.rig, wiring.faults
-    unit = GradientSphereUnit(
-        rig.lights,
-        rig.leds or LedLimits(),
-        cameras=len(rig.views),
-        move_s=rig.polarizer_move_s,
-        on_pattern=wiring.light.patterns.append,
-        on_trigger=wiring.trigger,
-        dead=faults.dead_leds,
-        weak=faults.weak_leds,
-        heat=faults.heat,
-        interlock=faults.interlock,
-    )
-    wiring.light.patterns_now = unit.light_now
-    return unit
-
-
-def _caliper(wiring: Wiring, rng: np.random.Generator) -> Device:
-    rig, faults = wiring.rig, wiring.faults
-    if rig.caliper is None or wiring.skin is None:
-        raise ValueError(f"caliper: got none in rig {rig.name!r}, expected its description")
-    return CaliperUnit(
-        rig.caliper,
-        wiring.skin,
-        on_change=wiring.note_grip,
-        stall=faults.jaw_stall,
-        home_missed=faults.home_missed,
-        sensor_dead=faults.force_dead,
-        interlock=faults.interlock,
-        interlock_after=faults.interlock_after,
-        rng=rng,
-    )
-
-
-def _probe(wiring: Wiring, rng: np.random.Generator) -> Device:
-    rig, faults = wiring.rig, wiring.faults
-    if rig.probe is None or wiring.head is None:
-        raise ValueError(f"probe: got none in rig {rig.name!r}, expected its description")
-    unit = ProbeUnit(
-        rig.probe,
-        rig.lights[0],
-        rig.leds or LedLimits(),
-        wiring.head,
-        on_light=wiring.light.sources.append,
-        on_trigger=wiring.trigger,
-        shutter_stuck=faults.shutter_stuck,
-        shutter_jam=faults.shutter_jam,
-        gauge_dead_after=faults.gauge_dead_after,
-        interlock=faults.interlock,
-        interlock_after=faults.interlock_after,
-        dead=0 in faults.dead_leds,
-        weak=faults.weak_leds.get(0, 1.0),
-        rng=rng,
-    )
-    wiring.light.sources_now = unit.light_now
-    return unit
-
-
-_BOX_MAKERS: Final[dict[str, Callable[[Wiring, np.random.Generator], Device]]] = {
-    "flash": _flash,
-    "dome": _dome,
-    "gradient_sphere": _gradient_sphere,
-    "caliper": _caliper,
-    "probe": _probe,
-}
+    light.sources_now = probe.light_now
+    return probe

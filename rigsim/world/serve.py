@@ -19,11 +19,10 @@ from types import TracebackType
 from typing import Self
 
 from capture.rig import Rig, load_rig
+from rigsim.boxes.faults import Faults
 from rigsim.world.box_ends import BoxEnd, PtyEnd, TcpEnd
 from rigsim.world.camera_service import CameraService
-from rigsim.world.faults import Faults
-from rigsim.world.scene_protocols import CaliperScene, ProbeScene, Scene
-from rigsim.world.world import World
+from rigsim.world.world import Scene, World
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +42,7 @@ def serve(
     tcp: str = "127.0.0.1:0",
     allow_remote: bool = False,
     seed: int = 0,
-    scene: Scene | CaliperScene | ProbeScene | None = None,
+    scene: Scene | None = None,
     faults: Faults | None = None,
     shots_made: Mapping[str, int] | None = None,
     world: World | None = None,

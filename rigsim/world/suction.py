@@ -107,21 +107,6 @@ class SuctionMechanics:
             self.regulator_ml_per_s_mbar + self.leak_ml_per_s_mbar
         )
 
-    def settles_at_mbar(self, wanted_mbar: float) -> float:
-        """Return the suction that the pump keeps when it is asked for `wanted_mbar`.
-
-        Examples
-        --------
-        >>> round(SuctionMechanics().settles_at_mbar(60.0), 2)
-        59.26
-        """
-        leak = self.leak_ml_per_s_mbar
-        regulated = self.regulator_ml_per_s_mbar
-        most = self.free_flow_ml_per_s / self.dead_head_mbar
-        return min(
-            regulated * wanted_mbar / (regulated + leak), self.free_flow_ml_per_s / (most + leak)
-        )
-
 
 @dataclass(frozen=True, slots=True)
 class CameraCooler:

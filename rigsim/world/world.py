@@ -14,8 +14,8 @@ import time
 import zlib
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Iterable, Mapping
-from typing import Literal, cast
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
@@ -23,37 +23,29 @@ from capture.devices.camera import Exposure
 from capture.rig import Rig, View, load_rig
 from rigsim.arrays import UInt16Array
 from rigsim.boxes.controller import Controller
-from rigsim.boxes.dome import LedPulse
+from rigsim.boxes.faults import NO_FAULTS, Faults
 from rigsim.boxes.flash import FlashPop
-from rigsim.boxes.gradient_sphere import PatternLight
-from rigsim.boxes.probe import SourceLight
 from rigsim.world.camera_body import CameraBody
-from rigsim.world.faults import NO_FAULTS, Faults
 from rigsim.world.light_record import Light, LightRecord
 from rigsim.world.link import Link
 from rigsim.world.rig_boxes import Wiring, make_box
-from rigsim.world.scene_protocols import CaliperScene, ProbeScene, Scene
 from rigsim.world.suction import CameraCooler, HeadState, SuckedHead
 from rigsim.world.taped_skin import GripState, TapedSkin
 
-__all__ = [
-    "CaliperScene",
-    "FlashPop",
-    "GripState",
-    "HeadState",
-    "LedPulse",
-    "Light",
-    "PatternLight",
-    "ProbeScene",
-    "Scene",
-    "SourceLight",
-    "World",
-    "WorldClock",
-    "get",
-    "get_by_name_or_box",
-]
-
 TRANSCRIPT_LINES = 4096
+
+
+class Scene(Protocol):
+    """What stands before the rig."""
+
+    @property
+    def exposure(self) -> Callable[..., UInt16Array]:
+        """Return the DN, shape (H, W), of an exposure.
+
+        It takes the camera's name and ``pops``, the light that was seen; ``exposure_s``; ``seed``,
+        of the sensor's noise; before a caliper ``grip``, a `rigsim.world.taped_skin.GripState`, and
+        under a contact probe ``head``, a `rigsim.world.suction.HeadState`.
+        """
 
 
 class WorldClock:
@@ -116,7 +108,7 @@ class World:
         *,
         seed: int = 0,
         clock: Literal["virtual", "real"] = "virtual",
-        scene: Scene | CaliperScene | ProbeScene | None = None,
+        scene: Scene | None = None,
         faults: Faults | None = None,
         shots_made: Mapping[str, int] | None = None,
     ) -> None:
@@ -181,10 +173,8 @@ class World:
     def deadline(self) -> float:
         """Return when something will next happen, in s; inf for never."""
         with self.lock:
-            due = math.inf
-            for link in self._links.values():
-                due = min(due, link.deadline(self._now))
-            return due
+            dues = [link.deadline(self._now) for link in self._links.values()]
+            return min(dues, default=math.inf)
 
     def advance(self, now: float) -> float:
         """Let time pass up to `now`, in s; everything due before happens at its own time.
@@ -332,19 +322,13 @@ class World:
         seen = self.light_between(t_start, end) if pops is None else tuple(pops)
         if self.scene is None:
             return _dark_frame(self.rig.view(view_name), np.random.default_rng(seed))
-        exposure_s = exposure.exposure_s
+        held: dict[str, Any] = {}
         if self.rig.caliper is not None:
-            held = cast(CaliperScene, self.scene)
-            grip = self.grip_at(t_start)
-            return held.exposure(view_name, pops=seen, exposure_s=exposure_s, seed=seed, grip=grip)
-        if self.rig.probe is not None:
-            touching = cast(ProbeScene, self.scene)
-            head = self.head_at(t_start)
-            return touching.exposure(
-                view_name, pops=seen, exposure_s=exposure_s, seed=seed, head=head
-            )
-        scene = cast(Scene, self.scene)
-        return scene.exposure(view_name, pops=seen, exposure_s=exposure_s, seed=seed)
+            held = {"grip": self.grip_at(t_start)}
+        elif self.rig.probe is not None:
+            held = {"head": self.head_at(t_start)}
+        exposure_s = exposure.exposure_s
+        return self.scene.exposure(view_name, pops=seen, exposure_s=exposure_s, seed=seed, **held)
 
     # names ------------------------------------------------------------------------------------
 
@@ -405,9 +389,6 @@ def get_by_name_or_box(name: str) -> World:
 
 
 def _dark_frame(view: View, rng: np.random.Generator) -> UInt16Array:
-    noise = rng.normal(view.black_level, view.read_noise_e / view.gain_e_per_dn, _shape(view))
+    shape = (view.height_px, view.width_px)
+    noise = rng.normal(view.black_level, view.read_noise_e / view.gain_e_per_dn, shape)
     return np.rint(np.clip(noise, 0, 2**view.bit_depth - 1)).astype(np.uint16)
-
-
-def _shape(view: View) -> tuple[int, int]:
-    return view.height_px, view.width_px

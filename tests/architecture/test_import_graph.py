@@ -121,7 +121,7 @@ BREACHES = {
     ),
     "layers inside model": ("model/fresnel.py", "import model.brdf.tables"),
     "the model stays light": ("model/traits/space.py", "import sklearn"),
-    "layers inside rigsim": ("rigsim/world/faults.py", "import rigsim.targets.flat"),
+    "layers inside rigsim": ("rigsim/boxes/faults.py", "import rigsim.targets.flat"),
     "no inverse crime": ("rigsim/light/led_light.py", "import model.fresnel"),
     "the renderer is imported in one place": ("rigsim/render/rays.py", "import mitsuba"),
     "drivers alone open serial ports": ("capture/plan/dome.py", "import serial"),

@@ -13,14 +13,6 @@ LONG_MODULES = {
     "reconstruction/chromophores/posterior_kernels.py": 593,
     "reconstruction/correspondence/common_parameterization.py": 484,
     "reconstruction/scan/registration.py": 502,
-    "rigsim/boxes/caliper.py": 491,
-    "rigsim/boxes/controller.py": 463,
-    "rigsim/light/olat.py": 625,
-    "rigsim/population/population.py": 475,
-    "rigsim/scenes/flash/scene.py": 503,
-    "rigsim/scenes/gradient/scene.py": 533,
-    "rigsim/shading.py": 500,
-    "rigsim/skin_patch/stretch.py": 458,
 }
 LONG_FUNCTIONS = {
     "capture/calibration/fiber/discs.py:fit_disc": 81,
@@ -30,12 +22,8 @@ LONG_FUNCTIONS = {
     "reconstruction/diffuse_albedo/estimation.py:estimate": 94,
     "reconstruction/kernel_fit/outcome.py:summarize_search": 87,
     "reconstruction/photometric_stereo/kernels.py:_fit_points": 92,
-    "rigsim/fiber/anisotropic_tissue.py:anisotropic_profile": 85,
-    "rigsim/needs/dome.py:dome_needs": 82,
-    "rigsim/needs/flash.py:flash_needs": 94,
-    "rigsim/scenes/dome/scene.py:__init__": 94,
-    "rigsim/tissue/photon_lanes.py:_run": 188,
-    "rigsim/tissue/photon_lanes.py:body": 131,
+    "rigsim/tissue/photon_lanes.py:_run": 165,
+    "rigsim/tissue/photon_lanes.py:body": 111,
 }
 MANY_PARAMETERS = {
     "model/displacement_synthesis/growth.py:lay_out": 13,
@@ -45,10 +33,6 @@ MANY_PARAMETERS = {
     "reconstruction/kernel_fit/fit.py:fit_kernel": 17,
     "reconstruction/photometric_stereo/kernels.py:_fit_points": 16,
     "reconstruction/photometric_stereo/refinement.py:_judged": 13,
-    "rigsim/boxes/probe.py:__init__": 14,
-    "rigsim/scenes/dome/scene.py:__init__": 13,
-    "rigsim/scenes/gradient/scene.py:__init__": 13,
-    "rigsim/tissue/photon_lanes.py:body": 15,
 }
 """What a bound does not fit yet, with its present size, which may only fall."""
 

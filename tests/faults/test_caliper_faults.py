@@ -8,8 +8,8 @@ import pytest
 from capture.devices.caliper import CaliperBox
 from capture.devices.port import BoxRebooted, CommandRefused, LinkLost, Port, PortTimeout
 from capture.rig import load_rig
+from rigsim.boxes.faults import Faults
 from rigsim.world import World
-from rigsim.world.faults import Faults
 
 SLOW = load_rig("gradient").cropped(16)
 RIG = dataclasses.replace(SLOW, caliper=dataclasses.replace(SLOW.caliper, speed_mm_per_s=8.0))

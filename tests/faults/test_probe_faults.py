@@ -9,8 +9,8 @@ from capture.devices.port import BoxRebooted, CommandRefused, LinkLost, Port, Po
 from capture.devices.probe import ProbeBox
 from capture.devices.wire import Code
 from capture.rig import load_rig
+from rigsim.boxes.faults import Faults
 from rigsim.world import World
-from rigsim.world.faults import Faults
 
 SHIPPED = load_rig("probe")
 RIG = dataclasses.replace(SHIPPED, probe=dataclasses.replace(SHIPPED.probe, rest_s=0.5))

@@ -13,8 +13,8 @@ from capture.devices.port import BoxRebooted, DeviceError, LinkLost, Port
 from capture.plan import Plan, Step, flash_plan
 from capture.rig import load_rig
 from capture.session import Session, Subject, verify
+from rigsim.boxes.faults import Faults
 from rigsim.world import World
-from rigsim.world.faults import Faults
 
 RIG = load_rig("flash").resized(16)
 NAMES = (f"capture-{number}" for number in itertools.count())

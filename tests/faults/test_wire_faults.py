@@ -8,8 +8,8 @@ import pytest
 from capture.devices.flash import FlashBox
 from capture.devices.port import LinkLost, Port, PortTimeout, WrongDevice
 from capture.rig import load_rig
+from rigsim.boxes.faults import FAULT_CATALOG, Faults
 from rigsim.world import World
-from rigsim.world.faults import FAULT_CATALOG, Faults
 from rigsim.world.serve import serve
 
 RIG = load_rig("flash").resized(16)

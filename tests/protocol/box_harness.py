@@ -7,6 +7,7 @@ much time passes before. The box must survive, answer each frame once, and light
 Usage: python box_harness.py [libFuzzer options] CORPUS_FOLDER
 """
 
+import dataclasses
 import resource
 import sys
 
@@ -20,15 +21,16 @@ with atheris.instrument_imports(include=["rigsim.boxes", "capture.devices.wire"]
     from rigsim.boxes.controller import Controller
     from rigsim.boxes.flash import FlashUnit
 
+from capture.rig import load_rig
+
+RIG = dataclasses.replace(
+    load_rig("flash"), recycle_s=0.1, max_pops_per_min=20, polarizer_move_s=0.1
+)
+
 
 def one_input(data):
     unit = FlashUnit(
-        on_pop=lambda pop: None,
-        on_trigger=lambda t_s: None,
-        recycle_s=0.1,
-        pops_per_min=20,
-        move_s=0.1,
-        rng=np.random.default_rng(0),
+        RIG, on_pop=lambda pop: None, on_trigger=lambda t_s: None, rng=np.random.default_rng(0)
     )
     box = Controller(unit, serial="FL-0001", rng=np.random.default_rng(1))
     now_s = 0.0

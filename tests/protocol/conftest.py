@@ -17,8 +17,8 @@ from capture.devices.camera import open_camera
 from capture.devices.flash import FlashBox
 from capture.devices.port import Port
 from capture.rig import load_rig
+from rigsim.boxes.faults import Faults
 from rigsim.world import World
-from rigsim.world.faults import Faults
 from rigsim.world.serve import serve
 
 NAMES = (f"protocol-{number}" for number in itertools.count())

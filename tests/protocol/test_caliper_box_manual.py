@@ -11,8 +11,8 @@ from capture.devices import wire
 from capture.devices.wire import Code, Request
 from capture.rig import load_rig
 from rigsim.boxes.caliper import CALIPER_CONTROL_PERIOD_S, CaliperUnit
+from rigsim.boxes.faults import Faults
 from rigsim.world import World
-from rigsim.world.faults import Faults
 from rigsim.world.taped_skin import TapedSkin, TapeMechanics
 
 RIG = load_rig("gradient").cropped(16)
@@ -168,7 +168,10 @@ def test_the_data_dictionary_holds_the_rigs_limits(bench):
 def test_no_caliper_goes_further_than_fifteen_steps():
     long = dataclasses.replace(RIG.caliper, step_mm=0.1, first_step=-40, last_step=60)
     unit = CaliperUnit(
-        long, TapedSkin(long), on_change=lambda now: None, rng=np.random.default_rng(0)
+        dataclasses.replace(RIG, caliper=long),
+        TapedSkin(long),
+        on_change=lambda now: None,
+        rng=np.random.default_rng(0),
     )
     assert (unit.step_min, unit.step_max) == (-15, 15)
 

@@ -11,8 +11,8 @@ from capture.devices.port import BadAnswer, CommandRefused, Port, PortTimeout, W
 from capture.devices.wire import Code
 from capture.rig import load_rig
 from rigsim.boxes import caliper as emulated
+from rigsim.boxes.faults import Faults
 from rigsim.world import World
-from rigsim.world.faults import Faults
 from rigsim.world.serve import serve
 
 SLOW = load_rig("gradient").cropped(16)

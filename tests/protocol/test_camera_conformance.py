@@ -27,8 +27,8 @@ from capture.devices.cameras import camera_wire
 from capture.devices.cameras.remote_camera import RemoteCamera
 from capture.devices.port import LinkLost
 from capture.rig import load_rig
+from rigsim.boxes.faults import Faults
 from rigsim.world import World
-from rigsim.world.faults import Faults
 from rigsim.world.serve import serve
 
 WANT = Exposure(0.008, 100)

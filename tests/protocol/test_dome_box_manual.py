@@ -15,9 +15,9 @@ from capture.plan.flicker import flicker_of_rows
 from capture.plan.light_order import LIGHT_ORDERS
 from capture.plan.rows import LedRow, led_rows
 from capture.rig import load_rig
+from rigsim.boxes.faults import Faults
 from rigsim.boxes.led_table import LEVEL_STEPS, Row, table_crc
 from rigsim.world import World
-from rigsim.world.faults import Faults
 
 DOME = load_rig("dome")
 RIG = DOME.subset(views=["C00", "C05", "C15"]).resized(16)

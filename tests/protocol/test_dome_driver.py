@@ -11,8 +11,8 @@ from capture.devices.port import BadAnswer, CommandRefused, Port, WrongDevice
 from capture.devices.wire import Code
 from capture.plan.eye_light import eye_light
 from capture.rig import load_rig
+from rigsim.boxes.faults import Faults
 from rigsim.world import World
-from rigsim.world.faults import Faults
 from rigsim.world.serve import serve
 
 RIG = load_rig("dome").subset(views=["C00", "C05"]).resized(16)

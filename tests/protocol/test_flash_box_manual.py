@@ -11,8 +11,8 @@ from capture.devices import wire
 from capture.devices.wire import Code, Event, Reply, Request
 from capture.rig import load_rig
 from rigsim.boxes.controller import CACHED_REPLIES, ERROR_QUEUE
+from rigsim.boxes.faults import Faults
 from rigsim.world import World
-from rigsim.world.faults import Faults
 
 RIG = load_rig("flash").resized(16)
 

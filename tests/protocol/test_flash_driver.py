@@ -14,8 +14,8 @@ from capture.devices.port import (
     WrongDevice,
 )
 from capture.devices.wire import Code
+from rigsim.boxes.faults import Faults
 from rigsim.world import World
-from rigsim.world.faults import Faults
 
 
 def test_the_box_says_who_it_is_and_what_it_allows(bench):

@@ -15,8 +15,8 @@ from capture.plan.multiplexed import course_plan, multiplexed_plan
 from capture.plan.phases import reorder
 from capture.rig import load_rig
 from capture.session import Session, Subject
+from rigsim.boxes.faults import Faults
 from rigsim.world import World
-from rigsim.world.faults import Faults
 
 RIG = load_rig("flash").resized(32)
 

@@ -12,9 +12,9 @@ from capture.devices.gradient_sphere import PatternRow as HostRow
 from capture.devices.wire import Code, Request
 from capture.plan.steps import LIGHT_PATTERNS
 from capture.rig import load_rig
-from rigsim.boxes.pattern_table import PatternRow
+from rigsim.boxes.faults import Faults
+from rigsim.boxes.led_table import PatternRow
 from rigsim.world import World
-from rigsim.world.faults import Faults
 
 RIG = load_rig("gradient").cropped(16)
 LEDS = len(RIG.lights)

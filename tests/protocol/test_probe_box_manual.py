@@ -9,10 +9,10 @@ from fixtures.framed_bench import ANY, SHARED_COMMANDS
 from capture.devices import wire
 from capture.devices.wire import Code, Request
 from capture.rig import load_rig
+from rigsim.boxes.faults import Faults
 from rigsim.boxes.probe import SourceLight
 from rigsim.boxes.suction_pump import MAX_PUMPING_S, PUMP_CONTROL_PERIOD_S
 from rigsim.world import World
-from rigsim.world.faults import Faults
 
 RIG = load_rig("probe")
 PROBE = RIG.probe

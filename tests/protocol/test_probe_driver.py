@@ -14,9 +14,9 @@ from capture.devices.probe import ProbeBox
 from capture.devices.wire import Code
 from capture.rig import load_rig
 from rigsim.boxes import source_shutter
+from rigsim.boxes.faults import Faults
 from rigsim.boxes.probe import ProbeUnit
 from rigsim.world import World
-from rigsim.world.faults import Faults
 from rigsim.world.serve import serve
 
 SHIPPED = load_rig("probe")

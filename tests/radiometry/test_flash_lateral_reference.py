@@ -7,12 +7,12 @@ percent; the even patch, which checks the walk itself, is quick.
 import numpy as np
 import pytest
 from scipy import stats
+from twins.patterned_tissue import patterned_reflectance
 
 from rigsim.geometry.atlas import unwrap
 from rigsim.geometry.mesh import build_mesh
 from rigsim.light.subsurface_radiance import spread_pattern
 from rigsim.tissue.lateral_kernels import SIGMAS_MM
-from rigsim.tissue.patterned_tissue import patterned_reflectance
 from rigsim.tissue.skin_table import SkinTable
 
 FALSE_ALARM = 1e-4  # per test

@@ -15,6 +15,7 @@ import typer
 from fixtures.product_code import PACKAGES, modules, tree_of
 
 from capture.devices import wire
+from capture.rig import load_rig
 from rigsim.boxes.controller import Controller
 from rigsim.boxes.flash import FlashUnit
 from skinrig.cli import app
@@ -51,11 +52,9 @@ def rows(page, heading):
 
 def flash_box():
     unit = FlashUnit(
+        load_rig("flash"),
         on_pop=lambda pop: None,
         on_trigger=lambda t_s: None,
-        recycle_s=1.5,
-        pops_per_min=20,
-        move_s=0.5,
         rng=np.random.default_rng(0),
     )
     return Controller(unit, serial="FL-0001", rng=np.random.default_rng(1))

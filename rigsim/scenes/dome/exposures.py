@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from typing import Final, Protocol
+from functools import partial
+from typing import Final
 
 import numpy as np
 
 from capture.rig import View
 from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.as_built.dome import BuiltDome
-from rigsim.scenes.exposing import LitLight, full_power_s
+from rigsim.boxes.dome import LedPulse
+from rigsim.scenes.exposing import Kept, full_power_s
 from rigsim.sensor import Sensor, expose
 
 LED_POWER_DEVIATION: Final = 0.001
@@ -22,14 +23,6 @@ KEPT_FRAME_BYTES: Final = 2**28
 """Latest frames that are kept, the more of the two, so that a second exposure costs nothing."""
 
 
-class Pulse(LitLight, Protocol):
-    """A lit LED, as the world reports it, clipped to the exposure."""
-
-    @property
-    def led(self) -> int:
-        """Index of the light in the rig."""
-
-
 class Exposures:
     """Exposures of one scene; frames of single lights are kept for the capture's next pass.
 
@@ -37,25 +30,30 @@ class Exposures:
     ----------
     dome
         Whose LEDs answer as they are wired.
+    render
+        The light on a camera, (H, W, 3), of a light alone, by index, at a time.
+    instant
+        World time, s, to the time that decides how the scene stands.
     seed
         Seeds what differs from pulse to pulse.
     """
 
-    def __init__(self, dome: BuiltDome, *, seed: int) -> None:
-        self._dome = dome
-        self._seed = seed
-        self._frames: OrderedDict[tuple[str, int, float], Float32Array] = OrderedDict()
+    def __init__(
+        self,
+        dome: BuiltDome,
+        render: Callable[[View, int, float], Float32Array],
+        instant: Callable[[float], float],
+        *,
+        seed: int,
+    ) -> None:
+        self._dome, self._render, self._instant, self._seed = dome, render, instant, seed
+        # a capture comes back to each light in its next pass
+        self._frames: Kept[tuple[str, int, float], Float32Array] = Kept(
+            lambda frame: max(KEPT_FRAMES, KEPT_FRAME_BYTES // frame.nbytes)
+        )
 
     def expose(
-        self,
-        view: View,
-        sensor: Sensor,
-        render: Callable[[View, int, float], Float32Array],
-        *,
-        pops: Sequence[Pulse],
-        exposure_s: float,
-        seed: int,
-        instant: Callable[[float], float],
+        self, view: View, sensor: Sensor, *, pops: Sequence[LedPulse], exposure_s: float, seed: int
     ) -> UInt16Array:
         """Expose a camera once.
 
@@ -63,16 +61,12 @@ class Exposures:
         ----------
         view, sensor
             The camera and what it sees with.
-        render
-            The light on it, (H, W, 3), of a light alone, by index, at a world time in s.
         pops
             The pulses of the LEDs, clipped to the exposure; none gives a dark frame.
         exposure_s
             Exposure time, s.
         seed
             Seed of this exposure's noise.
-        instant
-            World time, s, to the time that decides how the scene stands.
 
         Returns
         -------
@@ -85,20 +79,8 @@ class Exposures:
             on_s = full_power_s(pulse, f"LED {pulse.led}")
             energy = on_s * (1.0 + LED_POWER_DEVIATION * rng.standard_normal())
             if energy > 0.0:
-                middle = instant(0.5 * (pulse.t_on_s + pulse.t_off_s))
+                middle = self._instant(0.5 * (pulse.t_on_s + pulse.t_off_s))
                 led = self._dome.answering(pulse.led)
-                light += np.float32(energy) * self._frame(view, led, middle, render)
+                frame = partial(self._render, view, led, middle)
+                light += np.float32(energy) * self._frames.get((view.name, led, middle), frame)
         return expose(light, sensor=sensor, rng=rng, exposure_s=exposure_s)
-
-    def _frame(
-        self, view: View, light: int, t_s: float, render: Callable[[View, int, float], Float32Array]
-    ) -> Float32Array:
-        key = (view.name, light, t_s)
-        if key not in self._frames:
-            # a capture comes back to each light in its next pass
-            most = max(KEPT_FRAMES, KEPT_FRAME_BYTES // (12 * view.width_px * view.height_px))
-            while len(self._frames) >= most:
-                self._frames.popitem(last=False)
-            self._frames[key] = render(view, light, t_s)
-        self._frames.move_to_end(key)
-        return self._frames[key]

@@ -18,10 +18,16 @@ import numpy as np
 from capture.rig import Rig, View, load_rig
 from rigsim.arrays import BoolArray, Float32Array, Float64Array
 from rigsim.geometry.atlas import dilate_texture
-from rigsim.light.plastic import plastic_scale
 from rigsim.light.surface_brdf import ETA_OIL, OIL_SMOOTHING, SkinSurface
 from rigsim.needs.effects import SceneEffects
-from rigsim.render import MovedLight, look_at, radiance
+from rigsim.render import MovedLight, radiance
+from rigsim.render.scene_radiance import (
+    matt_plastic,
+    perspective,
+    plastic_scale,
+    point_rig,
+    rough_metal,
+)
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import SimulatedSubject, make_subject
 from rigsim.tissue.skin_layers import ETA
@@ -79,15 +85,6 @@ class DirectScene(DomeScene):
         **settings: Any,
     ) -> None:
         super().__init__(rig, subject, effects=effects, **settings)
-
-
-class MattScene(DirectScene):
-    """A dome whose skin does not shine: the diffuse term behind the boundary alone."""
-
-    def surface(self, view: View) -> SkinSurface:
-        """Return how the face reflects for a camera."""
-        surface = super().surface(view)
-        return dataclasses.replace(surface, bare=np.zeros_like(surface.bare))
 
 
 class PlainScene(DirectScene):
@@ -196,14 +193,6 @@ def _per_steradian(scene: PlainScene, light: int) -> Float32Array:
     return np.asarray(image / scene.intensity(light) / np.float32(math.pi), np.float32)
 
 
-def point_rig(rig: Rig) -> Rig:
-    """Return a dome whose lights are points that shine evenly, as Mitsuba's point light does."""
-    lights = tuple(
-        dataclasses.replace(light, half_intensity_deg=None, radius_mm=1e-3) for light in rig.lights
-    )
-    return dataclasses.replace(rig, lights=lights)
-
-
 def mitsuba_image(
     scene: PlainScene, view: View, light: dict[str, Any], *, samples: int, seed: int
 ) -> Float32Array:
@@ -233,55 +222,13 @@ def _look(view: View, sampler: str = "independent") -> dict[str, Any]:
     """Return a scene with a camera and a point of intensity 1 per steradian."""
     return {
         "type": "scene",
-        "sensor": {
-            "type": "perspective",
-            "fov": math.degrees(2.0 * math.atan(0.5 * view.width_px / view.focal_px)),
-            "fov_axis": "x",
-            "near_clip": 1.0,
-            "far_clip": 1e4,
-            "to_world": look_at(view.position_mm, view.target_mm, view.up),
-            "sampler": {"type": sampler, "sample_count": 4},
-            "film": {
-                "type": "hdrfilm",
-                "width": view.width_px,
-                "height": view.height_px,
-                "pixel_format": "rgb",
-                "rfilter": {"type": "box"},
-            },
-        },
+        "sensor": perspective(view, "rgb", sampler=sampler),
         "light": {
             "type": "point",
             "position": [0.0, 0.0, 700.0],
             "intensity": {"type": "rgb", "value": [1.0, 1.0, 1.0]},
         },
     }
-
-
-def matt_image(
-    scene: MattScene, view: View, light: int, *, depth: int, samples: int, seed: int
-) -> Float32Array:
-    """Return one image of matt skin by Mitsuba's path tracer with several bounces, (H, W, 3).
-
-    Parameters
-    ----------
-    scene
-        The dome.
-    view, light
-        Camera, and index of the light, a point of intensity 1 per steradian.
-    depth
-        Surfaces on a path and the light: 2 is direct light alone.
-    samples, seed
-        Of Mitsuba.
-    """
-    subject = _face(scene)
-    description = _look(view) | {
-        "integrator": {"type": "path", "max_depth": depth, "rr_depth": depth + 1},
-        "face": {"type": "mesh", "mesh": subject.mesh, "bsdf": _matt(scene.surface(view), subject)},
-    }
-    description["light"] = dict(
-        description["light"], position=list(scene.rig.lights[light].position_mm)
-    )
-    return radiance(description, kind="rgb", samples=samples, seed=seed)[..., :3]
 
 
 def _face(scene: DomeScene) -> SimulatedSubject:
@@ -297,17 +244,8 @@ def _skin(surface: SkinSurface, subject: SimulatedSubject) -> dict[str, Any]:
     face is rendered with R_d of twice as much as here times that factor, since a blend averages.
     """
     covered = subject.atlas.covered
-
-    def metal(kind: str, eta: float, alpha: Float32Array) -> dict[str, Any]:
-        # A conductor without absorption reflects as a dielectric does.
-        return {
-            "type": "roughconductor",
-            "distribution": kind,
-            "alpha": _texture(alpha, covered),
-            "eta": eta,
-            "k": 0.0,
-        }
-
+    rough = surface.roughness
+    smoothed = np.float32(OIL_SMOOTHING) * rough
     return {
         "type": "blendbsdf",
         "weight": 0.5,
@@ -315,8 +253,8 @@ def _skin(surface: SkinSurface, subject: SimulatedSubject) -> dict[str, Any]:
         "outside": {
             "type": "blendbsdf",
             "weight": _texture(surface.oil, covered),
-            "skin": metal("beckmann", ETA, surface.roughness),
-            "oil": metal("ggx", ETA_OIL, np.float32(OIL_SMOOTHING) * surface.roughness),
+            "skin": rough_metal("beckmann", ETA, _texture(rough, covered)),
+            "oil": rough_metal("ggx", ETA_OIL, _texture(smoothed, covered)),
         },
     }
 
@@ -324,13 +262,7 @@ def _skin(surface: SkinSurface, subject: SimulatedSubject) -> dict[str, Any]:
 def _matt(surface: SkinSurface, subject: SimulatedSubject) -> dict[str, Any]:
     """Return the diffuse term behind the boundary, without the mirror that stands on it."""
     r_d = surface.r_d * np.float32(plastic_scale(ETA))
-    return {
-        "type": "plastic",
-        "int_ior": ETA,
-        "ext_ior": 1.0,
-        "specular_reflectance": 0.0,
-        "diffuse_reflectance": _texture(r_d, subject.atlas.covered),
-    }
+    return matt_plastic(ETA, _texture(r_d, subject.atlas.covered))
 
 
 def _texture(values: Float32Array, covered: BoolArray) -> dict[str, Any]:

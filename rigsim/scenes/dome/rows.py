@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import OrderedDict
 from collections.abc import Callable
 
 import numpy as np
@@ -16,8 +15,8 @@ from rigsim.light.led_light import lobe_exponent
 from rigsim.light.olat import Hits, Lamp
 from rigsim.light.olat_vector import VectorLight
 from rigsim.render import Caster
-from rigsim.scenes.dome import views as dome_views
-from rigsim.scenes.exposing import SceneError
+from rigsim.scenes.dome.views import Looking, at_skin, at_target
+from rigsim.scenes.exposing import Kept, SceneError
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.head_motion import HeadMotion
 from rigsim.targets import Target
@@ -36,12 +35,8 @@ class DomeRows:
         Its mesh at rest.
     motion
         How the head moves; None holds it still. Targets stand still.
-    illuminant
-        Spectrum of the lights, a name known to `model.spectra`.
-    optics
-        Whether lenses blur what is out of focus, and diffract.
-    subpixels
-        Rays along each side of a pixel.
+    how
+        How cameras look.
     """
 
     def __init__(
@@ -51,15 +46,14 @@ class DomeRows:
         caster: Caster,
         *,
         motion: HeadMotion | None,
-        illuminant: str,
-        optics: bool,
-        subpixels: int,
+        how: Looking,
     ) -> None:
         self._dome, self._subject, self._caster = dome, subject, caster
         self._motion = motion if isinstance(subject, SimulatedSubject) else None
-        self._illuminant, self._optics, self._subpixels = illuminant, optics, subpixels
-        self._hits: OrderedDict[tuple[str, float], tuple[Hits, Caster]] = OrderedDict()
-        self._vector: dict[tuple[str, float], VectorLight] = {}
+        self._how = how
+        most = len(dome.rig.views) if self._motion is None else 2
+        self._hits: Kept[tuple[str, float], tuple[Hits, Caster]] = Kept(lambda _: most)
+        self._vector: Kept[tuple[str, float], VectorLight] = Kept(lambda _: most)
 
     def instant(self, t_s: float) -> float:
         """Return the time that decides how the subject stands, s; 0 of one that holds still."""
@@ -90,23 +84,11 @@ class DomeRows:
         texture
             How the face reflects for a camera, with its normals, (N, N, C); of a target not asked.
         """
-        key = (view.name, t_s)
-        if key not in self._hits:
-            # Still heads need every camera's rows again for every light; moving ones never do.
-            most = len(self._dome.rig.views) if self.instant(1.0) == 0.0 else 2
-            while len(self._hits) >= most:
-                old, _ = self._hits.popitem(last=False)
-                self._vector.pop(old, None)
-            self._hits[key] = self._look(view, t_s, texture)
-        self._hits.move_to_end(key)
-        return self._hits[key]
+        return self._hits.get((view.name, t_s), lambda: self._look(view, t_s, texture))
 
     def vector_light(self, view: View, t_s: float, hits: Hits, caster: Caster) -> VectorLight:
         """Return what lights rows of `seen` by compiled loops; kept as long as they are."""
-        key = (view.name, t_s)
-        if key not in self._vector:
-            self._vector[key] = VectorLight(hits, caster)
-        return self._vector[key]
+        return self._vector.get((view.name, t_s), lambda: VectorLight(hits, caster))
 
     def _pose(self, t_s: float) -> tuple[Float64Array, Float64Array]:
         return (np.eye(3), np.zeros(3)) if self._motion is None else self._motion.pose(t_s)
@@ -121,14 +103,12 @@ class DomeRows:
             target_mm=_vector((np.asarray(view.target_mm) - shift) @ rotation),
             up=_vector(np.asarray(view.up) @ rotation),
         )
-        how = dome_views.Looking(
-            self._subpixels, self._dome.distortion.get(view.name), self._illuminant, self._optics
-        )
+        how, distortion = self._how, self._dome.distortion.get(view.name)
         subject, caster = self._subject, self._caster
         if isinstance(subject, Target):
             if subject.kind == "source":
                 raise SceneError(f"target {subject.name!r}: shines itself, no dome holds it")
-            return dome_views.at_target(caster, moved, subject, how), caster
+            return at_target(caster, moved, subject, how, distortion), caster
         amount = 0.0 if self._motion is None else self._motion.twitch(t_s)
         texture = texture_of(view)
         if amount > 0.0 and self._motion is not None:
@@ -137,7 +117,7 @@ class DomeRows:
             # The relief turns with the surface below it.
             turned = dilate_texture(unwrap(mesh, atlas.size).normal - atlas.normal, atlas.covered)
             texture = np.concatenate([texture[..., :-3], texture[..., -3:] + turned], axis=-1)
-        return dome_views.at_skin(caster, moved, texture, how), caster
+        return at_skin(caster, moved, texture, how, distortion), caster
 
 
 def _vector(values: Float64Array) -> tuple[float, float, float]:

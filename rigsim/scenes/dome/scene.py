@@ -22,43 +22,42 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from capture.rig import Light, Rig, RigError, View
+from capture.rig import Light, Rig, View
 from model import spectra
 from model.skin import SkinAppearance
 from rigsim.arrays import Float32Array, Float64Array, UInt16Array
 from rigsim.as_built.dome import BuiltDome
+from rigsim.boxes.dome import LedPulse
 from rigsim.geometry.atlas import dilate_texture, sample
 from rigsim.light import olat, surface_brdf
+from rigsim.light.interreflection import interreflection_for
+from rigsim.light.interreflection_color import Bounces
+from rigsim.light.lateral_scattering import LateralScattering
 from rigsim.light.led_light import white_intensity
 from rigsim.light.olat import Hits, Lamp
+from rigsim.light.olat_kernels import SKIN_ROWS
 from rigsim.light.relief_shadow import ReliefShadow
+from rigsim.light.seen_skin import SeenSkin
 from rigsim.light.surface_brdf import SkinSurface, skin_surface
-from rigsim.needs import flash as flash_needs
+from rigsim.needs import face as face_needs
 from rigsim.needs.dome import dome_needs, least_noise
-from rigsim.needs.effects import EFFECTS_BY_SIZE, EffectSelection, Noise, SceneEffects
-from rigsim.needs.flash import (
-    INTERREFLECTION_EFFECT,
-    LATERAL_EFFECT,
-    LENS_EFFECT,
-    SPECTRAL_EFFECT,
-    WRINKLE_SHADOW_EFFECT,
-)
+from rigsim.needs.effect_sizes import exchange_share
+from rigsim.needs.effects import EFFECTS_BY_SIZE, Noise, SceneEffects
 from rigsim.population import conditions as skin_conditions
 from rigsim.render import Caster
 from rigsim.render.variant import VariantChoice
 from rigsim.scenes.dome import truth as dome_truth
-from rigsim.scenes.dome import views as dome_views
-from rigsim.scenes.dome.exposures import Exposures, Pulse
+from rigsim.scenes.dome.exposures import Exposures
 from rigsim.scenes.dome.rows import DomeRows
 from rigsim.scenes.dome.subsurface_radiance import DomeSubsurfaceRadiance
-from rigsim.scenes.exposing import SceneError
-from rigsim.sensor import Sensor, sensor_of
+from rigsim.scenes.dome.views import Looking, unit
+from rigsim.scenes.exposing import FaceScene, SceneError
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.head_motion import HeadMotion
 from rigsim.targets import Target
 
 
-class DomeScene:
+class DomeScene(FaceScene):
     """One subject or target inside the dome.
 
     Parameters
@@ -80,8 +79,6 @@ class DomeScene:
     conditions
         Conditions of the skin with their amounts, see `rigsim.population.conditions`; targets have
         none.
-    sensor
-        Sensor of every view; ``None`` takes what each view states.
     seed
         Seeds what differs from pulse to pulse.
     effects
@@ -106,101 +103,84 @@ class DomeScene:
         state: str = "neutral",
         movement: bool = True,
         conditions: Mapping[str, float] | None = None,
-        sensor: Sensor | None = None,
         seed: int = 0,
         effects: SceneEffects = EFFECTS_BY_SIZE,
         on_s: float | None = None,
         subpixels: int = 2,
         choice: VariantChoice | None = None,
     ) -> None:
-        spectra_names = {light.illuminant for light in rig.lights}
-        if len(spectra_names) > 1:
-            raise SceneError(
-                f"lights: got the spectra {', '.join(sorted(spectra_names))}, expected one"
-            )
         for light in rig.lights:
             if light.power_w is None:
                 raise SceneError(f"light {light.name!r}: is no LED, it has no power_w")
-        if subpixels < 1:
-            raise SceneError(f"subpixels: got {subpixels}, expected at least 1")
         if dome is None:
-            axes = np.array([_toward_origin(light) for light in rig.lights])
-            dome = BuiltDome(rig, rig, axes)
+            dome = BuiltDome(rig, rig, np.array([_toward_origin(light) for light in rig.lights]))
         self.dome = dome
-        self.rig = dome.rig
         self.conditions = skin_conditions.checked(conditions or {})
         if isinstance(subject, SimulatedSubject):
             subject = skin_conditions.conditioned_subject(subject, self.conditions)
         elif self.conditions:
             raise SceneError(f"conditions: got {', '.join(self.conditions)}, but a target has none")
-        if movement and isinstance(subject, SimulatedSubject) and subject.pose is None:
-            subject = subject.posed(state)
-        self.subject = subject
-        self.state = state
-        self.movement = movement
+        super().__init__(
+            dome.rig,
+            subject,
+            state=state,
+            movement=movement,
+            sensor=None,
+            seed=seed,
+            subpixels=subpixels,
+        )
         self.motion = motion
-        self.seed = seed
-        self.subpixels = subpixels
-        self._illuminant = rig.lights[0].illuminant
-        self._sensors = {
-            view.name: sensor_of(view) if sensor is None else sensor for view in rig.views
-        }
-        self._caster = Caster(subject.mesh, choice=choice)
+        self._effects = effects
+        self._caster = Caster(self.subject.mesh, choice=choice)
         self._surfaces: dict[str, SkinSurface] = {}
         self._textures: dict[str, Float32Array] = {}
-        self._exposures = Exposures(dome, seed=seed)
-        self.needs: EffectSelection = dome_needs(
+        noise = least_noise([Noise.of(sensor) for sensor in self._sensors.values()])
+        share = exchange_share(self._caster)
+        self.needs = dome_needs(
             rig,
-            subject,
+            self.subject,
             state,
-            caster=self._caster,
-            noise=least_noise([Noise.of(sensor) for sensor in self._sensors.values()]),
+            self._scenery(rig.views[0], self._caster, share, noise, effects),
             white_rgb=None if on_s is None else on_s * self._white_in_origin(),
             movement=movement,
             motion=motion,
-            effects=effects,
-            subpixels=subpixels,
         )
-        """What is built, what is not, and why."""
-        self.interreflections = self.needs.builds(INTERREFLECTION_EFFECT)
-        self.subsurface = self.needs.builds(LATERAL_EFFECT)
-        self.optics = self.needs.builds(LENS_EFFECT)
+        self.interreflections = self.needs.builds(face_needs.INTERREFLECTION_EFFECT)
+        self.subsurface = self.needs.builds(face_needs.LATERAL_EFFECT)
+        self.optics = self.needs.builds(face_needs.LENS_EFFECT)
         self._relief: ReliefShadow | None = None
-        if isinstance(subject, SimulatedSubject) and self.needs.builds(WRINKLE_SHADOW_EFFECT):
-            self._relief = ReliefShadow(subject)
-        summed = flash_needs.last_bounce(self.needs[INTERREFLECTION_EFFECT].over_noise or 0.0)
         self._glow: DomeSubsurfaceRadiance | None = None
-        if isinstance(subject, SimulatedSubject) and (self.subsurface or self.interreflections):
-            self._glow = DomeSubsurfaceRadiance(
-                subject,
-                self._caster,
-                illuminant=self._illuminant,
-                subsurface=self.subsurface,
-                interreflections=self.interreflections,
-                spectral=self.interreflections and self.needs.builds(SPECTRAL_EFFECT),
-                enough=summed if effects.last_bounce is None else effects.last_bounce,
-                relief=self._relief,
+        if isinstance(self.subject, SimulatedSubject):
+            if self.needs.builds(face_needs.WRINKLE_SHADOW_EFFECT):
+                self._relief = ReliefShadow(self.subject)
+            if self.subsurface or self.interreflections:
+                self._glow = DomeSubsurfaceRadiance(self._scattering)
+        how = Looking(subpixels, self._illuminant, self.optics)
+        self._rows = DomeRows(dome, self.subject, self._caster, motion=motion, how=how)
+        self._exposures = Exposures(dome, self._render, self._rows.instant, seed=seed)
+
+    def _scattering(self, view: View) -> LateralScattering:
+        """Return the face, ready to be lit from within for a camera."""
+        skin = SeenSkin(self._face(), "neutral", view.spectral_sensitivity, self._illuminant)
+        bounces = None
+        if self.interreflections:
+            spectral, enough = (
+                self.needs.builds(face_needs.SPECTRAL_EFFECT),
+                self._last_bounce(self._effects),
             )
-        self._rows = DomeRows(
-            dome,
-            subject,
+            bounces = Bounces(interreflection_for(self._caster), spectral, enough=enough)
+        return LateralScattering(
+            skin,
+            self.surface(view),
             self._caster,
-            motion=motion,
-            illuminant=self._illuminant,
-            optics=self.optics,
-            subpixels=subpixels,
+            subsurface=self.subsurface,
+            bounces=bounces,
+            relief=self._relief,
         )
-
-    @property
-    def left_out(self) -> list[tuple[str, str]]:
-        """What this scene does not build, with the reason."""
-        return self.needs.left_out
-
-    # light ------------------------------------------------------------------------------------
 
     def white_rgb(self, view_name: str | None = None) -> Float32Array:
         """Return the camera RGB of white under the LEDs, shape (3,), the strongest channel 1."""
-        view = self._view(view_name)
+        view = self._camera(view_name)
         white = spectra.camera_white(view.spectral_sensitivity, self._illuminant)
         return np.asarray(white / white.max(), np.float32)
 
@@ -214,7 +194,7 @@ class DomeScene:
         led = self.rig.lights[light]
         if led.name in self.dome.dead:
             return np.zeros(3, np.float32)
-        return white_intensity(led, self._view(view_name)).astype(np.float32)
+        return white_intensity(led, self._camera(view_name)).astype(np.float32)
 
     def _white_in_origin(self) -> Float64Array:
         """Return full scales per second of a white plate that faces the brightest light."""
@@ -223,10 +203,6 @@ class DomeScene:
             for light in self.rig.lights
         ]
         return np.asarray(np.max(each, axis=0), np.float64)
-
-    def sensor(self, view_name: str | None = None) -> Sensor:
-        """Return the sensor of a view."""
-        return self._sensors[self._view(view_name).name]
 
     def radiance(
         self, view_name: str, lights: Sequence[int] | None = None, *, t_s: float = 0.0
@@ -248,7 +224,7 @@ class DomeScene:
             Camera RGB without white balance, shape (n, H, W, 3), fraction of full scale per second
             of on-time at level 1.
         """
-        view = self._view(view_name)
+        view = self._camera(view_name)
         chosen = range(len(self.rig.lights)) if lights is None else lights
         if len(chosen) == 1:  # the usual stream, one light after the other, is not copied
             return self._render(view, chosen[0], self._rows.instant(t_s))[None]
@@ -258,7 +234,7 @@ class DomeScene:
         return out
 
     def exposure(
-        self, view_name: str, *, pops: Sequence[Pulse], exposure_s: float, seed: int
+        self, view_name: str, *, pops: Sequence[LedPulse], exposure_s: float, seed: int
     ) -> UInt16Array:
         """Expose a camera once.
 
@@ -278,16 +254,9 @@ class DomeScene:
         ndarray of uint16
             Raw DN, shape (H, W).
         """
-        view = self._view(view_name)
-        return self._exposures.expose(
-            view,
-            self._sensors[view.name],
-            self._render,
-            pops=pops,
-            exposure_s=exposure_s,
-            seed=seed,
-            instant=self._rows.instant,
-        )
+        view = self._camera(view_name)
+        sensor = self._sensors[view.name]
+        return self._exposures.expose(view, sensor, pops=pops, exposure_s=exposure_s, seed=seed)
 
     # truth ------------------------------------------------------------------------------------
 
@@ -317,7 +286,7 @@ class DomeScene:
             A target stands there; only faces have these maps.
         """
         self._face()
-        hits, _ = self._rows.seen(self._view(view_name), 0.0, self._texture)
+        hits, _ = self._rows.seen(self._camera(view_name), 0.0, self._texture)
         return dome_truth.maps_of(hits)
 
     def truth_appearance(self, view_name: str | None = None) -> SkinAppearance:
@@ -341,7 +310,7 @@ class DomeScene:
         """
         return dome_truth.appearance_of(
             self._face(),
-            self.surface(self._view(view_name)),
+            self.surface(self._camera(view_name)),
             conditions=self.conditions,
             left_out=tuple(self.left_out),
             seed=self.seed,
@@ -375,27 +344,12 @@ class DomeScene:
             Its surface terms, shape (n,).
         """
         self._face()
-        texture = self._texture(self._view(view_name))
+        texture = self._texture(self._camera(view_name))
         points = np.atleast_2d(np.asarray(uv, np.float32))
         values = sample(texture, points, np.ones(len(points), np.bool_))
-        return surface_brdf.evaluate(
-            values[:, :-3], dome_views.unit(values[:, -3:]), to_light, to_camera
-        )
+        return surface_brdf.evaluate(values[:, :-3], unit(values[:, -3:]), to_light, to_camera)
 
     # inside -----------------------------------------------------------------------------------
-
-    def _face(self) -> SimulatedSubject:
-        if not isinstance(self.subject, SimulatedSubject):
-            raise SceneError(f"truth: got the target {self.subject.name!r}, expected a face")
-        return self.subject
-
-    def _view(self, name: str | None) -> View:
-        if name is None:
-            return self.rig.views[0]
-        try:
-            return self.rig.view(name)
-        except RigError as error:
-            raise SceneError(str(error)) from error
 
     def surface(self, view: View) -> SkinSurface:
         """Return how the face reflects for a camera, under its conditions."""
@@ -426,11 +380,11 @@ class DomeScene:
         gain = np.float32(self.dome.gain.get(view.name, 1.0))
         color = gain * self.intensity(light, view_name=view.name)
         glow = None
-        if self._glow is not None and hits.kind == olat.SKIN_ROWS:
-            glow = self._glow.on_rows(hits, lamp, view, self.surface, light=light, t_s=t_s)
+        if self._glow is not None and hits.kind == SKIN_ROWS:
+            glow = self._glow.on_rows(hits, lamp, view, light, t_s)
         diffuse = not (self.subsurface and glow is not None)
         relief = self._relief_of(hits, lamp)
-        if hits.kind == olat.SKIN_ROWS and caster.scene is not None:
+        if hits.kind == SKIN_ROWS and caster.scene is not None:
             rows = self._rows.vector_light(view, t_s, hits, caster)
             return rows.light_up(lamp, color, glow, diffuse=diffuse, relief=relief)
         visible = olat.seen_from(hits, caster, lamp)
@@ -438,9 +392,9 @@ class DomeScene:
 
     def _relief_of(self, hits: Hits, lamp: Lamp) -> Float32Array | None:
         """Return which part of a light the texture's relief leaves to each row."""
-        if self._relief is None or hits.kind != olat.SKIN_ROWS:
+        if self._relief is None or hits.kind != SKIN_ROWS:
             return None
-        uv = np.asarray(hits.uv, np.float32) / np.float32(olat.UINT16_FULL_SCALE)
+        uv = hits.texture_uv()
         return self._relief.seen(uv, hits.position_mm, lamp.position_mm, radius_mm=lamp.radius_mm)
 
 

@@ -18,9 +18,12 @@ from numpy.typing import NDArray
 from capture.rig import Rig, RigError, View
 from rigsim.arrays import Float32Array, Float64Array, Int64Array, UInt16Array
 from rigsim.as_built.dome import BuiltDome, build, image_of, pixel_corner_rays
+from rigsim.boxes.dome import LedPulse
 from rigsim.light.led_light import lobe_exponent, white_intensity
 from rigsim.needs.effects import Effect, EffectSelection, Noise, absent, decide, unmodeled
-from rigsim.scenes.dome.exposures import LED_POWER_DEVIATION, Pulse
+from rigsim.package_data import package_table
+from rigsim.scenes.dome.exposures import LED_POWER_DEVIATION
+from rigsim.scenes.exposing import RigScene
 from rigsim.sensor import expose, sensor_of
 from rigsim.targets import mirror_ball, printed_plate
 from rigsim.targets.printed_plate import CELL_MM, Plate
@@ -33,41 +36,16 @@ WHITE_SLOPE_DEG: Final = 0.05
 LED_SIZES: Final = 2e-4
 """By how much light of an LED's disc differs from that of its middle, relative, at most."""
 
-BOARD_PLACES: Final = (
-    (0, 0, 0, 0, 0, 0),
-    (38, 5, 12, 10, 0, 0),
-    (-38, 5, -12, -10, 0, 0),
-    (5, 32, 90, 0, 10, 0),
-    (-62, 15, 8, 0, 0, 10),
-    (62, 15, -8, 0, 0, 10),
-    (-18, -24, 95, 0, -10, 0),
-    (20, 18, -90, 10, 10, -30),
-    (-45, 28, 20, -15, 10, 20),
-    (45, 28, -20, 15, 10, 20),
-    (-75, -8, 90, 0, 0, 0),
-    (75, -8, -90, 0, 0, 0),
-    (30, -20, 5, 20, 0, 40),
-    (-30, -20, -5, -20, 0, 40),
-)
+_Place: TypeAlias = tuple[float, float, float, float, float, float]
+BOARD_PLACES: Final[tuple[_Place, ...]] = package_table("dome_targets")["board_places"]
 """Azimuth and elevation of the front's normal, turn in its plane (degrees), middle (mm)."""
 
-PLATE_PLACES: Final = (
-    (0, 20, 0, 0, 0, 0),
-    (70, 20, 0, 0, 0, 0),
-    (-70, 20, 0, 0, 0, 0),
-    (20, -35, 90, 0, 0, 0),
-    (-30, 55, 90, 0, 0, 0),
-    (105, 5, 0, 0, 0, 0),
-    (-105, 5, 0, 0, 0, 0),
-)
+PLATE_PLACES: Final[tuple[_Place, ...]] = package_table("dome_targets")["plate_places"]
 """The same of the white plate; the first three face most lights."""
 
-BALL_PLACES: Final = (
-    (-85.0, 45.0, 30.0),
-    (85.0, -45.0, -30.0),
-    (-75.0, -50.0, -40.0),
-    (75.0, 50.0, 40.0),
-)
+BALL_PLACES: Final[tuple[tuple[float, float, float], ...]] = package_table("dome_targets")[
+    "ball_places"
+]
 """Middle of the ball, mm."""
 
 TARGET_POSES: Final[dict[str, int]] = {
@@ -86,7 +64,7 @@ class TargetError(ValueError):
     """A target is asked for something that it is not."""
 
 
-class TargetScene:
+class TargetScene(RigScene):
     """A calibration target in the middle of a dome that was built near its drawing.
 
     Parameters
@@ -119,13 +97,12 @@ class TargetScene:
         )
         self._hand = rng.standard_normal((max(TARGET_POSES.values()), 6))
         self._rays: dict[str, Float64Array] = {}
+        self.needs = self._needs()
         lights = self.rig.lights
         self._lamp_mm = np.array([light.position_mm for light in lights])
         self._exponent = np.array([lobe_exponent(light) for light in lights])
 
-    @property
-    def needs(self) -> EffectSelection:
-        """What is built, what is not, and why."""
+    def _needs(self) -> EffectSelection:
         noise = Noise.of(sensor_of(self.rig.views[0]))
         sizes = noise.share(LED_SIZES)
         mirror = self.kind == "mirror"
@@ -157,11 +134,6 @@ class TargetScene:
         ]
         return EffectSelection(tuple(effects))
 
-    @property
-    def left_out(self) -> list[tuple[str, str]]:
-        """What this scene does not build, with the reason."""
-        return self.needs.left_out
-
     def show(self, pose: int) -> None:
         """Put the target into its place number ``pose``."""
         if not 0 <= pose < TARGET_POSES[self.kind]:
@@ -169,7 +141,7 @@ class TargetScene:
         self.pose = pose
 
     def exposure(
-        self, view_name: str, *, pops: Sequence[Pulse], exposure_s: float, seed: int
+        self, view_name: str, *, pops: Sequence[LedPulse], exposure_s: float, seed: int
     ) -> UInt16Array:
         """Expose a camera once.
 
@@ -229,16 +201,9 @@ class TargetScene:
         else:
             rotation, place = self.plate_pose()
             plate = self._plate
+            paper = (plate.reflectance, CELL_MM, plate.waviness)
             gray = printed_plate.plate_light(
-                rays,
-                eye,
-                rotation,
-                place,
-                plate.reflectance,
-                CELL_MM,
-                plate.waviness,
-                *lamps,
-                EDGE_SUBPIXELS,
+                rays, eye, rotation, place, *paper, *lamps, EDGE_SUBPIXELS
             )
         return np.asarray(gray[..., None] * color.astype(np.float32))
 
@@ -252,22 +217,9 @@ class TargetScene:
         values = np.array(places[number], np.float64)
         if number > 0 or self.kind == "white":
             hand = self._hand[number]
-            values = values + hand * [
-                PLACEMENT_DEVIATION_DEG,
-                PLACEMENT_DEVIATION_DEG,
-                PLACEMENT_DEVIATION_DEG,
-                PLACEMENT_DEVIATION_MM,
-                PLACEMENT_DEVIATION_MM,
-                PLACEMENT_DEVIATION_MM,
-            ]
+            values = values + hand * ([PLACEMENT_DEVIATION_DEG] * 3 + [PLACEMENT_DEVIATION_MM] * 3)
         azimuth, elevation, turn = np.radians(values[:3])
-        front = np.array(
-            [
-                math.cos(elevation) * math.sin(azimuth),
-                math.sin(elevation),
-                math.cos(elevation) * math.cos(azimuth),
-            ]
-        )
+        front = _front(azimuth, elevation)
         right = np.array([math.cos(azimuth), 0.0, -math.sin(azimuth)])
         down = -np.cross(front, right)
         x = math.cos(turn) * right + math.sin(turn) * down
@@ -328,33 +280,18 @@ class TargetScene:
         lit: NDArray[np.intp],
         lamps: tuple[Float64Array, Float64Array, Float64Array, Float64Array],
     ) -> Float32Array:
-        ball = self.ball_mm()
+        place = self.ball_mm()
+        ball = (place, BALL_RADIUS_MM, mirror_ball.CHROMIUM_REFLECTANCE)
         cloth = mirror_ball.light_on_cloth(*lamps)
-        image = mirror_ball.surroundings(
-            rays, eye, ball, BALL_RADIUS_MM, mirror_ball.CHROMIUM_REFLECTANCE, cloth, EDGE_SUBPIXELS
-        )
+        image = mirror_ball.surroundings(rays, eye, *ball, cloth, EDGE_SUBPIXELS)
         for index, lamp, axis, exponent, strength in zip(lit, *lamps, strict=True):
             radius = self.rig.lights[index].radius_mm
             for reflected in (True, False):
-                box = self._box(view, eye, ball, lamp, axis, radius, reflected=reflected)
+                box = self._box(view, eye, place, lamp, axis, radius, reflected=reflected)
                 if box is None:
                     continue
-                mirror_ball.add_lamp(
-                    image,
-                    rays,
-                    box,
-                    eye,
-                    ball,
-                    BALL_RADIUS_MM,
-                    mirror_ball.CHROMIUM_REFLECTANCE,
-                    lamp,
-                    axis,
-                    float(exponent),
-                    radius,
-                    float(strength),
-                    reflected,
-                    SPOT_SUBPIXELS,
-                )
+                led = (lamp, axis, float(exponent), radius, float(strength))
+                mirror_ball.add_lamp(image, rays, box, eye, *ball, *led, reflected, SPOT_SUBPIXELS)
         return np.asarray(image)
 
     def _box(
@@ -419,11 +356,14 @@ def target_scene(kind: Kind, rig: Rig, *, seed: int, dome: BuiltDome | None = No
 
 def plate_normals() -> list[tuple[float, float, float]]:
     """Return where the white plate's front looks in each place, before the operator's hand."""
-    out = []
-    for azimuth, elevation in np.radians([place[:2] for place in PLATE_PLACES]):
-        x, z = math.cos(elevation) * math.sin(azimuth), math.cos(elevation) * math.cos(azimuth)
-        out.append((x, math.sin(elevation), z))
-    return out
+    turns = np.radians([place[:2] for place in PLATE_PLACES])
+    return [tuple(_front(azimuth, elevation).tolist()) for azimuth, elevation in turns]
+
+
+def _front(azimuth: float, elevation: float) -> Float64Array:
+    """Return where a plate's front looks that is turned by angles in rad."""
+    x, z = math.sin(azimuth), math.cos(azimuth)
+    return np.array([math.cos(elevation) * x, math.sin(elevation), math.cos(elevation) * z])
 
 
 def board(kind: Literal["charuco", "white"]) -> Plate:

@@ -27,7 +27,7 @@ def maps_of(hits: Hits) -> dict[str, NDArray[np.generic]]:
     maps = hits.scatter(surface)
     hair = hits.scatter(1.0 - surface[:, 6:7])[..., 0]
     coverage = hits.coverage()
-    uv = np.asarray(hits.uv, np.float32) / np.float32(olat.UINT16_FULL_SCALE)
+    uv = hits.texture_uv()
     coating = dict(zip(COATING_MAPS, np.moveaxis(maps, -1, 0)[7:], strict=False))
     return {
         **coating,

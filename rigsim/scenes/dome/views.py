@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 from capture.rig import View
 from rigsim.arrays import Float32Array, Int32Array
 from rigsim.geometry.atlas import sample
-from rigsim.light import olat
-from rigsim.light.olat import Hits
+from rigsim.light.olat import Hits, LookUp, find_hits
+from rigsim.light.olat_kernels import MATT_ROWS, METAL_ROWS, SKIN_ROWS
 from rigsim.render import Caster, GBuffer
 from rigsim.targets import Target
 
@@ -22,15 +22,34 @@ class Looking:
 
     subpixels: int
     """Rays along each side of a pixel."""
-    distortion: ArrayLike | None
-    """Of the lens, see `rigsim.render.camera_rays`."""
     illuminant: str
     """Spectrum of the lights."""
     optics: bool
     """Whether the lens blurs."""
 
+    def hits(
+        self,
+        caster: Caster,
+        view: View,
+        look_up: LookUp,
+        distortion: ArrayLike | None,
+        kind: int = SKIN_ROWS,
+    ) -> Hits:
+        """Return what a camera's rays meet, see `rigsim.light.olat.find_hits`."""
+        return find_hits(
+            caster,
+            view,
+            look_up,
+            subpixels=self.subpixels,
+            kind=kind,
+            distortion=distortion,
+            illuminant=self.illuminant if self.optics else None,
+        )
 
-def at_skin(caster: Caster, view: View, texture: Float32Array, how: Looking) -> Hits:
+
+def at_skin(
+    caster: Caster, view: View, texture: Float32Array, how: Looking, distortion: ArrayLike | None
+) -> Hits:
     """Look at a face.
 
     Parameters
@@ -41,8 +60,8 @@ def at_skin(caster: Caster, view: View, texture: Float32Array, how: Looking) -> 
         The camera, in the frame of the mesh.
     texture
         Surface and normals with relief in the last three, shape (N, N, 10) or (N, N, 14).
-    how
-        Rays and lens.
+    how, distortion
+        Rays and lens; its distortion, see `rigsim.render.camera_rays`.
     """
 
     def look_up(buffers: GBuffer, rows: Int32Array) -> tuple[Float32Array, Float32Array]:
@@ -50,17 +69,12 @@ def at_skin(caster: Caster, view: View, texture: Float32Array, how: Looking) -> 
         values = sample(texture, uv, np.ones(len(rows), np.bool_))
         return unit(values[:, -3:]), np.maximum(values[:, :-3], 0.0)
 
-    return olat.find_hits(
-        caster,
-        view,
-        look_up,
-        subpixels=how.subpixels,
-        distortion=how.distortion,
-        illuminant=how.illuminant if how.optics else None,
-    )
+    return how.hits(caster, view, look_up, distortion)
 
 
-def at_target(caster: Caster, view: View, target: Target, how: Looking) -> Hits:
+def at_target(
+    caster: Caster, view: View, target: Target, how: Looking, distortion: ArrayLike | None
+) -> Hits:
     """Look at a target that reflects."""
     rgb = target.rgb(view.spectral_sensitivity, how.illuminant)
 
@@ -74,15 +88,8 @@ def at_target(caster: Caster, view: View, target: Target, how: Looking) -> Hits:
         surface[:, 3] = target.alpha
         return buffers.normal.reshape(-1, 3)[rows], surface
 
-    return olat.find_hits(
-        caster,
-        view,
-        look_up,
-        subpixels=how.subpixels,
-        kind=olat.METAL_ROWS if target.kind == "metal" else olat.MATT_ROWS,
-        distortion=how.distortion,
-        illuminant=how.illuminant if how.optics else None,
-    )
+    kind = METAL_ROWS if target.kind == "metal" else MATT_ROWS
+    return how.hits(caster, view, look_up, distortion, kind)
 
 
 def unit(vectors: Float32Array) -> Float32Array:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from capture.rig import Rig
 from rigsim.arrays import Float32Array, UInt16Array
+from rigsim.boxes.flash import FlashPop
 from rigsim.needs.effects import EFFECTS_BY_SIZE, EffectSelection, SceneEffects, unmodeled
 from rigsim.scenes.exposing import SceneError
 from rigsim.scenes.flash.scene import POP_ENERGY_DEVIATION, FlashScene
@@ -138,27 +139,23 @@ class FlashCourseScene:
         return np.maximum(total, 0.0)
 
     def exposure(
-        self, view_name: str, *, pops: Sequence[object], exposure_s: float, seed: int
+        self, view_name: str, *, pops: Sequence[FlashPop], exposure_s: float, seed: int
     ) -> UInt16Array:
         """Expose a camera once, with the blood of the time of each pop; see `FlashScene`."""
         view = self.rig.view(view_name)
         rng = np.random.default_rng([self.seed, seed])
         light = np.zeros((view.height_px, view.width_px, 3), np.float32)
         for pop in pops:
-            power, t_s = float(pop.power), float(pop.t_s)  # type: ignore[attr-defined]
+            power, t_s = pop.power, pop.t_s
             if not 0.0 <= power <= 1.0:
                 raise SceneError(f"power: got {power}, expected 0 to 1")
             level, pose = self.course.level(t_s), self.course.pose(t_s)
             energy = power * (1.0 + POP_ENERGY_DEVIATION * rng.standard_normal())
             light += np.float32(energy) * self.radiance(
-                pose,
-                level,
-                pop.polarizer,  # type: ignore[attr-defined]
-                pop.analyser_deg,  # type: ignore[attr-defined]
-                view_name=view_name,
+                pose, level, pop.polarizer, pop.analyser_deg, view_name=view_name
             )
             if self._on_flash is not None:
-                self._on_flash(FlashTime(str(pop.token), t_s, level, pose))  # type: ignore[attr-defined]
+                self._on_flash(FlashTime(pop.token, t_s, level, pose))
         sensor = self.at("neutral", BLOOD_LEVELS[0]).sensor(view_name)
         return expose(light, sensor=sensor, rng=rng, exposure_s=exposure_s)
 

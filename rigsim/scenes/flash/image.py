@@ -16,12 +16,12 @@ from rigsim.arrays import BoolArray, Float32Array, Float64Array
 from rigsim.as_built.polarizers import Polarizers, absorbing_axis
 from rigsim.geometry.atlas import dilate_texture, sample
 from rigsim.light.olat import pixel_order
+from rigsim.light.seen_skin import SeenSkin
 from rigsim.light.subsurface_radiance import SubsurfaceRadiance, spread_through_pigment, toward
 from rigsim.render import Caster, GBuffer, RenderError, g_buffer
 from rigsim.render.depth_of_field import LensPicture, LensSpread, before_focus
 from rigsim.subject import SimulatedSubject
 from rigsim.targets import Target
-from rigsim.tissue.skin_color import skin_color
 from rigsim.tissue.skin_layers import ETA
 
 RAYS_PER_BAND: Final = 1 << 21
@@ -157,17 +157,15 @@ class Look:
         dict
             Textures of shape (N, N[, 3]).
         """
-        melanin, blood = subject.melanin, subject.hemoglobin(state)
         camera, light = self.view.spectral_sensitivity, self.rig.lights[0].illuminant
+        skin = SeenSkin(subject, state, camera, light)
         even = subject.atlas.covered.astype(np.float32)
-        blurred = spread_through_pigment(
-            subject, state, glow.reflectance, even, glow.kernels, camera, light
-        )
-        nearest = skin_color(camera, light).nearest(blurred, melanin, blood)
+        blurred = spread_through_pigment(skin, glow.reflectance, even, glow.kernels)
+        melanin, blood = skin.color.nearest(blurred, subject.melanin, skin.blood)
         return {
             "reflectance_blurred": blurred,
-            "melanin_blurred": nearest[0],
-            "hemoglobin_blurred": nearest[1],
+            "melanin_blurred": melanin,
+            "hemoglobin_blurred": blood,
         }
 
     def at_maps(
@@ -193,8 +191,7 @@ class Look:
         return self._in_bands(caster, lambda buffers: self._see_maps(buffers, textures))
 
     def _see_maps(self, buffers: GBuffer, textures: dict[str, Float32Array]) -> Parts:
-        inside = np.flatnonzero(buffers.mask.reshape(-1))
-        uv = buffers.uv.reshape(-1, 2)[inside]
+        inside, uv, *_ = buffers.inside()
         everywhere = np.ones(len(inside), np.bool_)
         parts = {"diffuse": np.zeros((len(inside), 3, 3), np.float32)}
         parts |= {name: np.zeros((len(inside), 3), np.float32) for name in _LIGHT_NAMES[1:]}
@@ -204,14 +201,11 @@ class Look:
         return {name: _scatter(values, inside, buffers.mask) for name, values in parts.items()}
 
     def _see_skin(self, buffers: GBuffer, textures: dict[str, Float32Array]) -> Parts:
-        inside = np.flatnonzero(buffers.mask.reshape(-1))
-        uv = buffers.uv.reshape(-1, 2)[inside]
+        inside, uv, position, _, to_camera = buffers.inside()
         everywhere = np.ones(len(inside), np.bool_)
         seen = {name: sample(layer, uv, everywhere) for name, layer in textures.items()}
         normal = seen["normals"]
         normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
-        to_camera = buffers.to_camera.reshape(-1, 3)[inside]
-        position = buffers.position_mm.reshape(-1, 3)[inside]
         right = self.view.axes[0]
         leaving = shading.exit_stokes(normal, to_camera, eta=ETA, image_right=right)
         alpha = np.clip(seen["roughness"][:, 0], *shading.ALPHA_RANGE)
@@ -246,11 +240,7 @@ class Look:
         return {name: _scatter(values, inside, buffers.mask) for name, values in parts.items()}
 
     def _see_target(self, buffers: GBuffer, target: Target) -> Parts:
-        inside = np.flatnonzero(buffers.mask.reshape(-1))
-        position = buffers.position_mm.reshape(-1, 3)[inside]
-        normal = buffers.normal.reshape(-1, 3)[inside]
-        to_camera = buffers.to_camera.reshape(-1, 3)[inside]
-        uv = buffers.uv.reshape(-1, 2)[inside]
+        inside, uv, position, normal, to_camera = buffers.inside()
         camera, spectrum = self.view.spectral_sensitivity, self.rig.lights[0].illuminant
         rgb = _nearest(target.rgb(camera, spectrum), uv)
         leak = 1.0 / self.films.light_extinction

@@ -7,6 +7,7 @@ traced, and both images come from it by closed forms.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from dataclasses import dataclass
@@ -18,9 +19,10 @@ from capture.rig import Rig, View, load_rig
 from rigsim import shading
 from rigsim.arrays import BoolArray, Float32Array
 from rigsim.as_built.polarizers import absorbing_axis
-from rigsim.geometry.mesh import Mesh, build_mesh
+from rigsim.geometry.mesh import Mesh, build_mesh, grid_faces
 from rigsim.light.subsurface_radiance import toward
 from rigsim.render import Caster, g_buffer, look_at, radiance
+from rigsim.render.scene_radiance import perspective
 from rigsim.render.variant import choose_variant
 
 SPHERE_RADIUS_MM: Final = 80.0
@@ -126,10 +128,7 @@ def closed_forms(
 ) -> dict[str, Float32Array]:
     """Return both images by closed forms, shape (H, W), in radiance."""
     buffers = g_buffer(caster, view, subpixels=subpixels)
-    inside = np.flatnonzero(buffers.mask.reshape(-1))
-    position = buffers.position_mm.reshape(-1, 3)[inside]
-    normal = buffers.normal.reshape(-1, 3)[inside]
-    to_camera = buffers.to_camera.reshape(-1, 3)[inside]
+    inside, _, position, normal, to_camera = buffers.inside()
     right, up, _ = view.axes
     leaving = shading.exit_stokes(normal, to_camera, eta=ETA, image_right=right)
     stokes = np.zeros_like(leaving)
@@ -179,21 +178,7 @@ def describe(rig: Rig, view: View, analyser_deg: float) -> dict[str, Any]:
     scene: dict[str, Any] = {
         "type": "scene",
         "integrator": {"type": "volpath", "max_depth": 8},
-        "sensor": {
-            "type": "perspective",
-            "fov": math.degrees(2.0 * math.atan(0.5 * view.width_px / view.focal_px)),
-            "fov_axis": "x",
-            "near_clip": 1.0,
-            "far_clip": 1e4,
-            "to_world": look_at(place, view.target_mm, up),
-            "film": {
-                "type": "hdrfilm",
-                "width": view.width_px,
-                "height": view.height_px,
-                "pixel_format": "luminance",
-                "rfilter": {"type": "box"},
-            },
-        },
+        "sensor": perspective(view, "luminance", up=up),
         "analyser": _film(place - [0.0, 0.0, 10.0], view.target_mm, 15.0 * half, analyser_deg),
         "ball": {
             "type": "sphere",
@@ -224,8 +209,6 @@ def describe(rig: Rig, view: View, analyser_deg: float) -> dict[str, Any]:
 
 def reference_rig(width_px: int) -> tuple[Rig, View]:
     """Return the flash rig and its camera cut to a square that the sphere fills."""
-    import dataclasses
-
     rig = load_rig("flash")
     view = rig.views[0]
     pixel_um = 2.2 * SPHERE_RADIUS_MM / width_px / view.distance_mm * view.focal_mm * 1e3
@@ -240,12 +223,7 @@ def sphere_mesh(*, columns: int = 480, rows: int = 240) -> Mesh:
     t, p = np.meshgrid(theta, phi, indexing="ij")
     unit = np.stack([-np.sin(t) * np.sin(p), np.cos(t), -np.sin(t) * np.cos(p)], axis=-1)
     uv = np.stack([p / (2.0 * np.pi), 1.0 - t / np.pi], axis=-1).reshape(-1, 2)
-    at = np.arange((rows + 1) * (columns + 1)).reshape(rows + 1, columns + 1)
-    a, b, c, d = at[:-1, :-1], at[:-1, 1:], at[1:, :-1], at[1:, 1:]
-    faces = np.concatenate(
-        [np.stack([a, c, b], axis=-1).reshape(-1, 3), np.stack([b, c, d], axis=-1).reshape(-1, 3)]
-    )
-    flat = unit.reshape(-1, 3)
+    flat, faces = unit.reshape(-1, 3), grid_faces(rows + 1, columns + 1)
     return build_mesh(SPHERE_RADIUS_MM * flat, faces, np.clip(uv, 0.0, 1.0), flat)
 
 

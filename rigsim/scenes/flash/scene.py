@@ -12,26 +12,29 @@ behind crossed films, whatever stands there later.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from capture.rig import Rig, RigError, View
+from capture.rig import Rig, View
 from model import spectra
 from rigsim import shading
 from rigsim.arrays import Float32Array, Float64Array, UInt16Array
 from rigsim.as_built.polarizers import Polarizers, draw_polarizers
+from rigsim.boxes.flash import FlashPop
 from rigsim.geometry.mesh import Mesh
+from rigsim.light.interreflection_color import Bounces
 from rigsim.light.lateral import line_spread_mm
 from rigsim.light.relief_shadow import ReliefShadow
+from rigsim.light.seen_skin import SeenSkin
 from rigsim.light.subsurface_radiance import (
     SubsurfaceRadiance,
     SurfaceLight,
     light_skin,
     light_surface,
 )
-from rigsim.needs import flash as flash_needs
+from rigsim.needs import face as face_needs
 from rigsim.needs.effects import (
     EFFECTS_BY_SIZE,
     EffectSelection,
@@ -39,21 +42,15 @@ from rigsim.needs.effects import (
     SceneEffects,
     merge_selections,
 )
-from rigsim.needs.flash import (
-    INTERREFLECTION_EFFECT,
-    LATERAL_EFFECT,
-    LENS_EFFECT,
-    SPECTRAL_EFFECT,
-    WRINKLE_SHADOW_EFFECT,
-)
+from rigsim.needs.flash import flash_needs
 from rigsim.render import camera_rays
 from rigsim.render.depth_of_field import facing_depths, lens_spread
 from rigsim.render.variant import VariantChoice
-from rigsim.scenes.exposing import SceneError
+from rigsim.scenes.exposing import FaceScene, SceneError
 from rigsim.scenes.flash import truth as flash_truth
 from rigsim.scenes.flash.image import Look, Picture
 from rigsim.scenes.flash.stage import flash_geometry
-from rigsim.sensor import Sensor, expose, sensor_of
+from rigsim.sensor import Sensor, expose
 from rigsim.subject import SimulatedSubject, landmarks
 from rigsim.targets import Target
 
@@ -67,27 +64,7 @@ POP_ENERGY_DEVIATION: Final = 0.002
 """Relative standard deviation of a flash's energy from pop to pop."""
 
 
-class Pop(Protocol):
-    """A fired flash, as the world reports it."""
-
-    @property
-    def token(self) -> object:
-        """What the host called it."""
-
-    @property
-    def power(self) -> float:
-        """Fraction of full energy, 0 to 1."""
-
-    @property
-    def polarizer(self) -> str:
-        """State of the analyser: "parallel" or "crossed"."""
-
-    @property
-    def analyser_deg(self) -> float | None:
-        """Reading of the analyser's rotator in degrees; ``None`` for that of the state."""
-
-
-class FlashScene:
+class FlashScene(FaceScene):
     """One subject or target before the flash rig, in one state.
 
     Scenes that differ in the blood alone share what they trace, as long as one of them lives.
@@ -136,77 +113,49 @@ class FlashScene:
         subpixels: int = 2,
         choice: VariantChoice | None = None,
     ) -> None:
-        spectra_names = {light.illuminant for light in rig.lights}
-        if len(spectra_names) > 1:
-            raise SceneError(
-                f"lights: got the spectra {', '.join(sorted(spectra_names))}, expected one"
-            )
-        if subpixels < 1:
-            raise SceneError(f"subpixels: got {subpixels}, expected at least 1")
         if not 0.0 < power <= 1.0:
             raise SceneError(f"power: got {power}, expected above 0 to 1")
-        if movement and isinstance(subject, SimulatedSubject) and subject.pose is None:
-            subject = subject.posed(state)
-        self.rig = rig
-        self.subject = subject
-        self.state = state
-        self.movement = movement
+        super().__init__(
+            rig,
+            subject,
+            state=state,
+            movement=movement,
+            sensor=sensor,
+            seed=seed,
+            subpixels=subpixels,
+        )
         self.films = draw_polarizers(rig) if films is None else films
-        self.seed = seed
-        self.subpixels = subpixels
-        self._illuminant = rig.lights[0].illuminant
-        self._sensors = {
-            view.name: sensor_of(view) if sensor is None else sensor for view in rig.views
-        }
         self._weights = _light_weights(rig)
         self._choice = choice
-        self._stage = flash_geometry(subject, choice)
+        self._stage = flash_geometry(self.subject, choice)
         self._caster = self._stage.caster
         self._glow: dict[str, SubsurfaceRadiance] = {}
         self._pictures: dict[str, Picture] = {}
         self._blurs: dict[str, Mapping[str, Float32Array]] = {}
         self._spreads: dict[str, Mapping[str, Float32Array]] = {}
-        self.needs: EffectSelection = merge_selections(
-            [
-                flash_needs.flash_needs(
-                    rig,
-                    subject,
-                    state,
-                    view=view,
-                    caster=self._caster,
-                    noise=Noise.of(self._sensors[view.name]),
-                    white_rgb=np.asarray(self.white_rgb(view.name), np.float64) * power,
-                    weights_mm2=self._weights,
-                    movement=movement,
-                    effects=effects,
-                    subpixels=subpixels,
-                    share=self._stage.share(),
-                )
-                for view in rig.views
-            ]
-        )
-        """What is built, what is not, and why."""
-        self.lateral = self.needs.builds(LATERAL_EFFECT)
-        self.interreflections = self.needs.builds(INTERREFLECTION_EFFECT)
-        self.optics = self.needs.builds(LENS_EFFECT)
-        summed = flash_needs.last_bounce(self.needs[INTERREFLECTION_EFFECT].over_noise or 0.0)
-        self._last_bounce = summed if effects.last_bounce is None else effects.last_bounce
-        self._step = effects.spectral_step
+        self._effects = effects
+        self.needs = merge_selections([self._needs_of(view, power) for view in rig.views])
+        self.lateral = self.needs.builds(face_needs.LATERAL_EFFECT)
+        self.interreflections = self.needs.builds(face_needs.INTERREFLECTION_EFFECT)
+        self.optics = self.needs.builds(face_needs.LENS_EFFECT)
 
-    @property
-    def left_out(self) -> list[tuple[str, str]]:
-        """What this scene does not build, with the reason."""
-        return self.needs.left_out
+    def _needs_of(self, view: View, power: float) -> EffectSelection:
+        noise, share = Noise.of(self._sensors[view.name]), self._stage.share()
+        return flash_needs(
+            self.rig,
+            self.subject,
+            self.state,
+            self._scenery(view, self._caster, share, noise, self._effects),
+            white_rgb=np.asarray(self.white_rgb(view.name), np.float64) * power,
+            weights_mm2=self._weights,
+            movement=self.movement,
+        )
 
     def white_rgb(self, view_name: str | None = None) -> Float32Array:
         """Return the camera RGB of the white reference at power 1, fraction of full scale, (3,)."""
-        view = self._view(view_name)
+        view = self._camera(view_name)
         white = spectra.camera_white(view.spectral_sensitivity, self._illuminant)
         return np.asarray(METER_LEVEL * white / white.max(), np.float32)
-
-    def sensor(self, view_name: str | None = None) -> Sensor:
-        """Return the sensor of a view."""
-        return self._sensors[self._view(view_name).name]
 
     def radiance(
         self,
@@ -231,7 +180,7 @@ class FlashScene:
         ndarray of float32
             Camera RGB without white balance, shape (H, W, 3), fraction of full scale.
         """
-        view = self._view(view_name)
+        view = self._camera(view_name)
         passes_deg = self.films.passes_deg(view, polarizer, analyser_deg)
         white = self.white_rgb(view.name)
         shape = (view.height_px, view.width_px, 3)
@@ -246,7 +195,7 @@ class FlashScene:
         return np.maximum((diffuse + specular[..., None]) * white, 0.0)
 
     def exposure(
-        self, view_name: str, *, pops: Sequence[Pop], exposure_s: float, seed: int
+        self, view_name: str, *, pops: Sequence[FlashPop], exposure_s: float, seed: int
     ) -> UInt16Array:
         """Expose a camera once.
 
@@ -266,7 +215,7 @@ class FlashScene:
         ndarray of uint16
             Raw DN, shape (H, W).
         """
-        view = self._view(view_name)
+        view = self._camera(view_name)
         rng = np.random.default_rng([self.seed, seed])
         light = np.zeros((view.height_px, view.width_px, 3), np.float32)
         for pop in pops:
@@ -319,9 +268,8 @@ class FlashScene:
         SceneError
             A target stands there; only faces have these maps.
         """
-        if not isinstance(self.subject, SimulatedSubject):
-            raise SceneError(f"truth: got the target {self.subject.name!r}, expected a face")
-        view = self._view(view_name)
+        self._face()
+        view = self._camera(view_name)
         picture = self._picture(view)
         passes_deg = self.films.passes_deg(view, "crossed", None)
         truth = flash_truth.maps_of(
@@ -354,11 +302,9 @@ class FlashScene:
         SceneError
             A target stands there.
         """
-        if not isinstance(self.subject, SimulatedSubject):
-            raise SceneError(f"landmarks: got the target {self.subject.name!r}, expected a face")
-        view = self._view(view_name)
-        points = self.subject.surface_landmarks()
-        places = points.on(self.subject.mesh)
+        face, view = self._face("landmarks"), self._camera(view_name)
+        points = face.surface_landmarks()
+        places = points.on(face.mesh)
         pixels = landmarks.project(places, view)
         visible = landmarks.seen(places, view, self._caster)
         return {
@@ -369,16 +315,8 @@ class FlashScene:
 
     def resolution_mm(self, view_name: str | None = None) -> Float64Array:
         """Return the widths from 10 to 90 % of an edge that lateral transport blurs, mm, (3,)."""
-        glow = self._skin_glow(self._view(view_name))
+        glow = self._skin_glow(self._camera(view_name))
         return line_spread_mm(glow.kernels.sigmas_mm, glow.kernels.weights)
-
-    def _view(self, name: str | None) -> View:
-        if name is None:
-            return self.rig.views[0]
-        try:
-            return self.rig.view(name)
-        except RigError as error:
-            raise SceneError(str(error)) from error
 
     def _analysed(self, stokes: Float32Array, view: View, passes_deg: float) -> Float32Array:
         """Apply the analyser to Stokes vectors of shape (H, W, 3) or (H, W, 3 RGB, 3)."""
@@ -396,32 +334,26 @@ class FlashScene:
         )
 
     def _skin_glow(self, view: View) -> SubsurfaceRadiance:
-        if not isinstance(self.subject, SimulatedSubject):
-            raise SceneError(f"skin: got the target {self.subject.name!r}, expected a face")
         camera = view.spectral_sensitivity
         if camera not in self._glow:
+            face = self._face("skin")
+            skin = SeenSkin(face, self.state, camera, self._illuminant)
+            surface, bounces = self._surface_light(face), self._bounces(skin)
             self._glow[camera] = light_skin(
-                self.subject,
-                self.state,
-                self._surface_light(self.subject),
-                camera=camera,
-                illuminant=self._illuminant,
-                lateral_transport=self.lateral,
-                bounce=self._stage.exchange() if self.interreflections else None,
-                spectral=self.interreflections and self.needs.builds(SPECTRAL_EFFECT),
-                step=self._spectral_step(self.subject, view),
-                enough=self._last_bounce,
+                skin, surface, lateral_transport=self.lateral, bounces=bounces
             )
         return self._glow[camera]
 
-    def _spectral_step(self, subject: SimulatedSubject, view: View) -> int:
-        if self._step is not None:
-            return self._step
-        bounces = self.needs[INTERREFLECTION_EFFECT]
-        return flash_needs.spectral_step(subject, self.state, view, self._illuminant, bounces)[0]
+    def _bounces(self, skin: SeenSkin) -> Bounces | None:
+        if not self.interreflections:
+            return None
+        step, spectral = self._effects.spectral_step, self.needs.builds(face_needs.SPECTRAL_EFFECT)
+        if step is None:
+            step, _ = face_needs.spectral_step(skin, self.needs[face_needs.INTERREFLECTION_EFFECT])
+        return Bounces(self._stage.exchange(), spectral, step, self._last_bounce(self._effects))
 
     def _surface_light(self, subject: SimulatedSubject) -> SurfaceLight:
-        wrinkled = self.needs.builds(WRINKLE_SHADOW_EFFECT)
+        wrinkled = self.needs.builds(face_needs.WRINKLE_SHADOW_EFFECT)
         key = (self.rig.lights, tuple(self._weights.tolist()), self.films, wrinkled)
         known = self._stage.light
         if key not in known:

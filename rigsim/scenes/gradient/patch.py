@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from capture.rig import View
-from rigsim.arrays import BoolArray, Float32Array, Float64Array, FloatArray
+from rigsim.arrays import BoolArray, Float32Array, Float64Array
 from rigsim.skin_patch.motion import Pose
+from rigsim.skin_patch.stretch import SurfaceSample
+from rigsim.world.taped_skin import GripState
 
 JAW_REFLECTANCE: Final = 0.03
 """Of the jaws' matt black."""
@@ -40,62 +42,10 @@ SHADOW_MARGIN_PX: Final = 40
 """Pixels around the picture whose relief casts shadows into it."""
 
 
-class Grip(Protocol):
-    """What the caliper holds, see `rigsim.world.taped_skin.GripState`."""
-
-    @property
-    def angle_deg(self) -> float:
-        """Direction of the jaws' axis, from +x towards +y."""
-
-    @property
-    def step(self) -> int:
-        """Step of the caliper."""
-
-    @property
-    def aperture_mm(self) -> float:
-        """Distance of the jaws."""
-
-    @property
-    def stretch(self) -> float:
-        """The skin's own stretch along the axis."""
-
-    @property
-    def attached(self) -> bool:
-        """Whether the tape holds."""
-
-    @property
-    def buckled(self) -> bool:
-        """Whether the skin has left its plane."""
-
-
-class Sampled(Protocol):
-    """A relief at points, see `rigsim.skin_patch.stretch.SurfaceSample`."""
-
-    @property
-    def height_um(self) -> FloatArray:
-        """Height, um."""
-
-    @property
-    def slope_x(self) -> FloatArray:
-        """Slope dh/dx, dimensionless."""
-
-    @property
-    def slope_y(self) -> FloatArray:
-        """Slope dh/dy, y up."""
-
-    @property
-    def albedo(self) -> FloatArray:
-        """Diffuse reflectance."""
-
-    @property
-    def inside(self) -> BoolArray:
-        """Whether there is skin."""
-
-
 class Relief(Protocol):
     """Skin in one state, see `rigsim.skin_patch.stretch.StretchedSkin`."""
 
-    def sample(self, x_mm: ArrayLike, y_mm: ArrayLike) -> Sampled:
+    def sample(self, x_mm: ArrayLike, y_mm: ArrayLike) -> SurfaceSample:
         """Return the relief at points of the skin's frame."""
 
 
@@ -147,7 +97,7 @@ def sample_grid(view: View, *, subpixels: int, border_px: int) -> tuple[Float64A
 
 def stand(
     relief: Relief,
-    grip: Grip,
+    grip: GripState,
     pose: Pose,
     x_mm: Float64Array,
     y_mm: Float64Array,
@@ -188,16 +138,12 @@ def stand(
     slope_x, slope_y = cosine * slope_u - sine * slope_v, sine * slope_u + cosine * slope_v
     normals = np.empty((*x.shape, 3), np.float32)
     length = np.sqrt(1.0 + slope_x**2 + slope_y**2)
-    normals[..., 0], normals[..., 1], normals[..., 2] = (
-        -slope_x / length,
-        -slope_y / length,
-        (1.0 / length),
-    )
+    normals[..., 0], normals[..., 1] = -slope_x / length, -slope_y / length
+    normals[..., 2] = 1.0 / length
     angle = math.radians(grip.angle_deg)
     along = math.cos(angle) * own_x + math.sin(angle) * own_y
     skin = np.asarray(found.inside, bool) & (np.abs(along) < 0.5 * grip.aperture_mm)
     normals[~skin] = (0.0, 0.0, 1.0)
-    rough = getattr(found, "alpha", None)
     return PatchSurface(
         x.astype(np.float32),
         y.astype(np.float32),
@@ -205,15 +151,13 @@ def stand(
         np.where(skin, 1e3 * bulge_mm, 0.0).astype(np.float32),
         normals,
         np.where(skin, found.albedo, JAW_REFLECTANCE).astype(np.float32),
-        np.full(x.shape, alpha, np.float32)
-        if rough is None
-        else np.where(skin, rough, alpha).astype(np.float32),
+        np.where(skin, found.alpha, alpha).astype(np.float32),
         skin,
     )
 
 
 def bulge(
-    grip: Grip, x_mm: Float64Array, y_mm: Float64Array
+    grip: GripState, x_mm: Float64Array, y_mm: Float64Array
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return how far skin stands out of its plane in mm, and its slopes in x and y.
 

@@ -21,11 +21,17 @@ from rigsim import shading
 from rigsim.arrays import Float32Array, Float64Array
 from rigsim.as_built.polarizers import Polarizers
 from rigsim.as_built.sphere import PATTERN_WEIGHTS, REFERENCE_MM
-from rigsim.geometry.mesh import Mesh, build_mesh
+from rigsim.geometry.mesh import Mesh, build_mesh, grid_faces
 from rigsim.light.lobe_moments import led_moments
-from rigsim.light.plastic import plastic_scale
 from rigsim.needs.effects import SceneEffects
-from rigsim.render import Caster, MovedLight, look_at
+from rigsim.render import Caster, MovedLight
+from rigsim.render.scene_radiance import (
+    matt_plastic,
+    perspective,
+    plastic_scale,
+    point_rig,
+    rough_metal,
+)
 from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
 from rigsim.tissue.skin_layers import ETA
@@ -75,12 +81,8 @@ def plain_scene(
     interreflections: bool = False,
 ) -> GradientScene:
     """Return the patch under LEDs that are points without films, without lens and spreading."""
-    rig = load_rig("gradient").cropped(width_px)
-    lights = tuple(
-        dataclasses.replace(light, half_intensity_deg=None, radius_mm=1e-3) for light in rig.lights
-    )
     return GradientScene(
-        dataclasses.replace(rig, lights=lights),
+        point_rig(load_rig("gradient").cropped(width_px)),
         skin,
         films=NO_FILM,
         effects=SceneEffects(
@@ -97,14 +99,9 @@ def relief_mesh(scene: GradientScene, *, subpixels: int = 2) -> Mesh:
     patch = scene.surface(NEUTRAL, subpixels=subpixels, border_px=MESH_MARGIN_PX)
     rows, columns = patch.skin.shape
     vertices = np.stack([patch.x_mm, patch.y_mm, patch.height_mm], axis=-1).reshape(-1, 3)
-    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
-    right, below, across = corner + 1, corner + columns, corner + columns + 1
-    faces = np.concatenate(
-        [np.stack([corner, below, right], -1), np.stack([right, below, across], -1)]
-    )
     v, u = np.mgrid[0:rows, 0:columns] / max(rows, columns)
     uv = np.stack([u, v], axis=-1).reshape(-1, 2)
-    return build_mesh(vertices, faces, uv, patch.normals.reshape(-1, 3))
+    return build_mesh(vertices, grid_faces(rows, columns), uv, patch.normals.reshape(-1, 3))
 
 
 def traced(
@@ -181,51 +178,14 @@ def describe(
     """
     view = scene.rig.views[0]
     r_d = PATCH_ALBEDO * shading.interior_scale(ETA) * plastic_scale(ETA)
-    inside = {
-        "type": "plastic",
-        "int_ior": ETA,
-        "ext_ior": 1.0,
-        "specular_reflectance": 0.0,
-        "diffuse_reflectance": {"type": "rgb", "value": [float(r_d)] * 3},
-    }
+    inside = matt_plastic(ETA, {"type": "rgb", "value": [float(r_d)] * 3})
+    facets = rough_metal("ggx", ETA, float(np.median(scene.skin.alpha)))
+    glossy = {"type": "blendbsdf", "weight": 0.5, "inside": inside, "surface": facets}
     description: dict[str, Any] = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": depth, "rr_depth": depth + 1},
-        "sensor": {
-            "type": "perspective",
-            "fov": math.degrees(2.0 * math.atan(0.5 * view.width_px / view.focal_px)),
-            "fov_axis": "x",
-            "near_clip": 1.0,
-            "far_clip": 1e4,
-            "to_world": look_at(view.position_mm, view.target_mm, view.up),
-            "sampler": {"type": "stratified", "sample_count": 4},
-            "film": {
-                "type": "hdrfilm",
-                "width": view.width_px,
-                "height": view.height_px,
-                "pixel_format": "luminance",
-                "rfilter": {"type": "box"},
-            },
-        },
-        "patch": {
-            "type": "mesh",
-            "mesh": relief_mesh(scene),
-            "bsdf": {
-                "type": "blendbsdf",
-                "weight": 0.5,
-                "inside": inside,
-                # a conductor without absorption reflects as a dielectric does
-                "surface": {
-                    "type": "roughconductor",
-                    "distribution": "ggx",
-                    "alpha": float(np.median(scene.skin.alpha)),
-                    "eta": ETA,
-                    "k": 0.0,
-                },
-            }
-            if gloss
-            else inside,
-        },
+        "sensor": perspective(view, "luminance", sampler="stratified"),
+        "patch": {"type": "mesh", "mesh": relief_mesh(scene), "bsdf": glossy if gloss else inside},
     }
     shares = scene.sphere.weights @ np.array(PATTERN_WEIGHTS[pattern])
     name = "light"  # the entry that `MovedLight` moves, to where it is

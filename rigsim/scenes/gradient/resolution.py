@@ -19,12 +19,13 @@ from numpy.typing import ArrayLike
 from capture.rig import load_rig
 from rigsim.arrays import Float64Array
 from rigsim.needs.effects import SceneEffects
-from rigsim.scenes.gradient.patch import Grip, PatchSurface, sample_grid, stand
+from rigsim.scenes.gradient.patch import PatchSurface, sample_grid, stand
 from rigsim.scenes.gradient.reference import NEUTRAL
 from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.skin_patch.motion import Pose
 from rigsim.skin_patch.stretch import SurfaceSample
+from rigsim.world.taped_skin import GripState
 
 LONG_UM: Final = 240.0
 """Period of waves without lens and pixels that give the scale of the others."""
@@ -80,7 +81,7 @@ class WavyScene(GradientScene):
 
     def surface(
         self,
-        grip: Grip,
+        grip: GripState,
         *,
         subpixels: int = 1,
         border_px: int = 0,
@@ -122,13 +123,6 @@ def slope_transfer(periods_um: Sequence[float], *, slope: float = 0.05) -> Float
     scale = _amplitude(wavy_scene(optics=False), Waves(LONG_UM, slope))
     scene = wavy_scene()
     return np.array([_amplitude(scene, Waves(float(p), slope)) / scale for p in periods_um])
-
-
-def resolved_period_um(least: float = 0.1) -> float:
-    """Return the period at which a part ``least`` of slopes is left, um, by interpolation."""
-    periods = np.array([60.0, 45.0, 36.0, 30.0, 26.0, 23.0, 21.0, 19.0])
-    left = slope_transfer(periods.tolist())
-    return float(1.0 / np.interp(least, left[::-1], 1.0 / periods[::-1]))
 
 
 def _amplitude(scene: WavyScene, waves: Waves) -> float:

@@ -12,40 +12,38 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections import OrderedDict
 from collections.abc import Sequence
-from typing import Final, Literal, Protocol, TypeAlias
+from typing import Final, Literal, TypeAlias
 
 import numpy as np
 
-from capture.rig import Rig, RigError
-from rigsim import shading
+from capture.rig import Rig
 from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.as_built.polarizers import Polarizers, draw_polarizers
 from rigsim.as_built.sphere import PATTERN_WEIGHTS, BuiltSphere, diffuser_radiance, nominal_sphere
+from rigsim.boxes.gradient_sphere import PatternLight
 from rigsim.light.lobe_moments import Surface
-from rigsim.needs.effects import EFFECTS_BY_SIZE, EffectSelection, Noise, SceneEffects
-from rigsim.needs.flash import INTERREFLECTION_EFFECT, LATERAL_EFFECT, SHADOW_EFFECT
+from rigsim.needs.effects import EFFECTS_BY_SIZE, Noise, SceneEffects
+from rigsim.needs.face import INTERREFLECTION_EFFECT, LATERAL_EFFECT, SHADOW_EFFECT
 from rigsim.needs.gradient import OPTICS_EFFECT, gradient_needs
 from rigsim.render.lens_blur import Lens, blur, lens_of
-from rigsim.scenes.exposing import LitLight, SceneError, full_power_s
+from rigsim.scenes.exposing import Kept, RigScene, SceneError, full_power_s
+from rigsim.scenes.gradient.analyser import GridAnalyser
 from rigsim.scenes.gradient.lighting import Lighting, light_skin
-from rigsim.scenes.gradient.patch import SHADOW_MARGIN_PX, Grip, PatchSurface, sample_grid, stand
+from rigsim.scenes.gradient.patch import SHADOW_MARGIN_PX, PatchSurface, sample_grid, stand
+from rigsim.scenes.gradient.target import target_moments
 from rigsim.sensor import Sensor, expose, sensor_of
 from rigsim.skin_patch.microrelief import MicroSkin
 from rigsim.skin_patch.motion import PatchMotion, Pose, shifted
 from rigsim.skin_patch.stretch import StretchedSkin, deform
-from rigsim.targets.glass_ball import ball_center_mm, ball_stokes
 from rigsim.tissue.skin_layers import ETA
+from rigsim.world.taped_skin import GripState
 
 TargetName: TypeAlias = Literal["ball", "flat", "dark"]
 
 GRADIENT_METER_RATE_PER_S: Final = 100.0
 """Full scales per second of white under all LEDs at level 1: in 18 ms pale skin gets 0.4 to 0.8 of
 full scale."""
-
-FLAT_REFLECTANCE: Final = 0.3
-"""Of the diffuser in the patch's place: 30 ms at level 1 give 0.9 of full scale."""
 
 PATTERN_POWER_DEVIATION: Final = 0.001
 """Relative standard deviation of the LEDs' common energy from pattern to pattern."""
@@ -67,23 +65,7 @@ KEPT_RELIEFS: Final = 4
 """Stretched patches that are kept."""
 
 
-class Pattern(LitLight, Protocol):
-    """A stretch of light, see `rigsim.boxes.gradient_sphere.PatternLight`."""
-
-    @property
-    def pattern(self) -> str:
-        """One of `rigsim.as_built.sphere.PATTERN_WEIGHTS`."""
-
-    @property
-    def analyser_deg(self) -> float:
-        """Reading of the analyser's rotator, degrees."""
-
-    @property
-    def led_shares(self) -> tuple[float, ...]:
-        """What each LED gave of what the pattern asks of it; empty: all of it."""
-
-
-class GradientScene:
+class GradientScene(RigScene):
     """One patch of skin or one target in the gradient rig.
 
     Parameters
@@ -93,8 +75,6 @@ class GradientScene:
     subject
         A patch of skin, or "ball" (12 mm of black glass), "flat" (a gray diffuser in the
         patch's place) or "dark" (a cap on the lens).
-    compensation
-        How stretched skin narrows, see `rigsim.skin_patch.stretch.deform`.
     films
         The polarizing films; None takes the rig's own, which its serial numbers decide.
     sphere
@@ -124,7 +104,6 @@ class GradientScene:
         rig: Rig,
         subject: MicroSkin | TargetName,
         *,
-        compensation: Literal["volume", "none"] | float = "volume",
         films: Polarizers | None = None,
         sphere: BuiltSphere | None = None,
         motion: PatchMotion | None = None,
@@ -144,22 +123,24 @@ class GradientScene:
             raise SceneError(f"subpixels: got {subpixels}, expected at least 1")
         if sectors < 4 or sectors % 4:
             raise SceneError(f"sectors: got {sectors}, expected a multiple of 4")
-        self.rig, self.subject, self.compensation = rig, subject, compensation
+        self.rig, self.subject = rig, subject
         self.films = draw_polarizers(rig) if films is None else films
         self.sphere = nominal_sphere(rig) if sphere is None else sphere
         self.motion, self.seed = motion, seed
         self.sectors, self.subpixels, self.table_size = sectors, subpixels, table_size
         self._view = rig.views[0]
         self._sensor = sensor_of(self._view) if sensor is None else sensor
-        self._lighting: OrderedDict[tuple[float, ...], Lighting] = OrderedDict()
+        self._lighting: Kept[tuple[float, ...], Lighting] = Kept(lambda _: KEPT_LIGHTINGS)
         # behind two ideal films, one of which the unit of radiance holds already
         white = float(diffuser_radiance(nominal_sphere(rig), np.zeros(1), np.zeros(1))[0, 0])
         # full scales per second for a unit of radiance of `rigsim.light.lobe_moments`
         self.unit = GRADIENT_METER_RATE_PER_S / (0.5 * white)
-        self._pictures: OrderedDict[tuple[object, ...], Float32Array] = OrderedDict()
-        self._reliefs: OrderedDict[tuple[float, float], StretchedSkin] = OrderedDict()
-        self._frames: dict[tuple[float, int], tuple[Float32Array, Float32Array]] = {}
-        self.needs: EffectSelection = gradient_needs(
+        self._pictures: Kept[tuple[object, ...], Float32Array] = Kept(
+            lambda picture: KEPT_IMAGE_BYTES // picture.nbytes
+        )
+        self._reliefs: Kept[tuple[float, float], StretchedSkin] = Kept(lambda _: KEPT_RELIEFS)
+        self._analyser = GridAnalyser(self.films, self._view)
+        self.needs = gradient_needs(
             rig,
             subject,
             self.sphere,
@@ -170,17 +151,10 @@ class GradientScene:
             effects=effects,
         )
         """What is built, what is not, and why."""
-        self.shadows, self.optics = (
-            self.needs.builds(SHADOW_EFFECT),
-            self.needs.builds(OPTICS_EFFECT),
-        )
+        self.shadows = self.needs.builds(SHADOW_EFFECT)
+        self.optics = self.needs.builds(OPTICS_EFFECT)
         self.lateral = self.needs.builds(LATERAL_EFFECT)
         self.interreflections = self.needs.builds(INTERREFLECTION_EFFECT)
-
-    @property
-    def left_out(self) -> list[tuple[str, str]]:
-        """What this scene does not build, with the reason."""
-        return self.needs.left_out
 
     @property
     def lens(self) -> Lens:
@@ -189,12 +163,12 @@ class GradientScene:
 
     def sensor(self, view_name: str | None = None) -> Sensor:
         """Return the camera's sensor."""
-        self._check_view(view_name)
+        self._camera(view_name)
         return self._sensor
 
     # pictures -----------------------------------------------------------------------------------
 
-    def stokes(self, grip: Grip | None = None) -> Float32Array:
+    def stokes(self, grip: GripState | None = None) -> Float32Array:
         """Return the light on the sensor for each moment, before the analyser.
 
         Parameters
@@ -213,7 +187,7 @@ class GradientScene:
         border = (wide.shape[1] - h) // 2
         return wide[:, border : border + h, border : border + w].reshape(4, 3, h, w)
 
-    def moments(self, grip: Grip | None = None) -> dict[str, Float32Array]:
+    def moments(self, grip: GripState | None = None) -> dict[str, Float32Array]:
         """Return the four moments behind the parallel and the crossed analyser.
 
         Parameters
@@ -229,7 +203,7 @@ class GradientScene:
         """
         stokes = self.stokes(grip)
         return {
-            name: np.stack([self._analysed(s, reading) for s in stokes])
+            name: np.stack([self._analyser.analyse(s, reading) for s in stokes])
             for name, reading in (("parallel", 0.0), ("crossed", 90.0))
         }
 
@@ -237,7 +211,7 @@ class GradientScene:
         self,
         pattern: str,
         *,
-        grip: Grip | None = None,
+        grip: GripState | None = None,
         analyser_deg: float = 0.0,
         t_s: float | None = None,
         led_shares: tuple[float, ...] = (),
@@ -280,7 +254,7 @@ class GradientScene:
         )
         for m in np.flatnonzero(weights):
             stokes += weights[m] * wide[3 * m : 3 * m + 3, part, column]
-        image = self._analysed(stokes, analyser_deg, border_px=reach)
+        image = self._analyser.analyse(stokes, analyser_deg, border_px=reach)
         if reach:
             pixel_um = self.lens.pixel_on_subject_um
             image = shifted(image, drift, pixel_um=pixel_um, border_px=reach)
@@ -291,10 +265,10 @@ class GradientScene:
         self,
         view_name: str,
         *,
-        pops: Sequence[Pattern],
+        pops: Sequence[PatternLight],
         exposure_s: float,
         seed: int,
-        grip: Grip | None = None,
+        grip: GripState | None = None,
     ) -> UInt16Array:
         """Expose the camera once.
 
@@ -316,7 +290,7 @@ class GradientScene:
         ndarray of uint16
             Raw DN, shape (H, W).
         """
-        self._check_view(view_name)
+        self._camera(view_name)
         rng = np.random.default_rng([self.seed, seed])
         light = np.zeros((self._view.height_px, self._view.width_px), np.float32)
         for pop in pops:
@@ -340,7 +314,7 @@ class GradientScene:
 
     def surface(
         self,
-        grip: Grip,
+        grip: GripState,
         *,
         subpixels: int = 1,
         border_px: int = 0,
@@ -361,33 +335,19 @@ class GradientScene:
             alpha=float(np.median(skin.alpha)),
         )
 
-    def relief(self, grip: Grip) -> StretchedSkin:
+    def relief(self, grip: GripState) -> StretchedSkin:
         """Return the skin in a state, in its own frame."""
         skin = self.skin
         key = (grip.stretch, grip.angle_deg if grip.stretch != 1.0 else 0.0)
-        if key not in self._reliefs:
-            while len(self._reliefs) >= KEPT_RELIEFS:
-                self._reliefs.popitem(last=False)
-            self._reliefs[key] = deform(
-                skin, stretch=key[0], angle_deg=key[1], compensation=self.compensation
-            )
-        self._reliefs.move_to_end(key)
-        return self._reliefs[key]
+        return self._reliefs.get(key, lambda: deform(skin, stretch=key[0], angle_deg=key[1]))
 
-    def pose(self, grip: Grip) -> Pose:
+    def pose(self, grip: GripState) -> Pose:
         """Return where the skin lies in a state, drift and jumps aside."""
         if self.motion is None:
             return Pose(0.0, 0.0, 0.0)
         return self.motion.pose(grip.angle_deg, grip.step)
 
     # inside -------------------------------------------------------------------------------------
-
-    def _check_view(self, name: str | None) -> None:
-        if name is not None:
-            try:
-                self.rig.view(name)
-            except RigError as error:
-                raise SceneError(str(error)) from error
 
     @property
     def skin(self) -> MicroSkin:
@@ -396,37 +356,9 @@ class GradientScene:
             raise SceneError(f"skin: got the target {self.subject!r}, expected a patch of skin")
         return self.subject
 
-    def _analysed(
-        self, stokes: Float32Array, reading_deg: float, *, border_px: int = 0
-    ) -> Float32Array:
-        """Apply the analyser to Stokes vectors of shape (3, H, W)."""
-        cos2, sin2 = self._frame(reading_deg, border_px)
-        leak = 1.0 / self.films.analyser_extinction
-        turned = stokes[1] * cos2 + stokes[2] * sin2
-        return np.asarray(
-            np.float32(0.5 * (1.0 + leak)) * stokes[0] + np.float32(0.5 * (1.0 - leak)) * turned
-        )
-
-    def _frame(self, reading_deg: float, border_px: int) -> tuple[Float32Array, Float32Array]:
-        key = (reading_deg, border_px)
-        if key not in self._frames:
-            if len(self._frames) >= 4:
-                self._frames.clear()
-            passes_deg = self.films.passes_deg(self._view, "parallel", reading_deg)
-            x, y = sample_grid(self._view, subpixels=1, border_px=border_px)
-            right, up, _ = self._view.axes
-            to_camera = np.empty((len(y), len(x), 3), np.float32)
-            to_camera[..., 0], to_camera[..., 1] = -x[None, :], -y[:, None]
-            to_camera[..., 2] = self._view.distance_mm
-            to_camera /= np.linalg.norm(to_camera, axis=-1, keepdims=True)
-            self._frames[key] = shading.analyser_frame(
-                to_camera, passes_deg=passes_deg, image_right=right, image_up=up
-            )
-        return self._frames[key]
-
     def _picture(
         self,
-        grip: Grip | None,
+        grip: GripState | None,
         *,
         jump_mm: tuple[float, float] = (0.0, 0.0),
         shares: tuple[float, ...] = (),
@@ -437,24 +369,27 @@ class GradientScene:
         if isinstance(self.subject, MicroSkin):
             if grip is None:
                 raise SceneError("grip: got none, expected what the caliper holds")
-            held = (grip.angle_deg, grip.step, grip.aperture_mm, grip.stretch)
-            key: tuple[object, ...] = (*held, grip.attached, grip.buckled, *jump_mm, shares)
+            key: tuple[object, ...] = (grip, *jump_mm, shares)
         else:
             key = (self.subject, shares)
-        if key not in self._pictures:
+
+        def make() -> Float32Array:
             if isinstance(self.subject, MicroSkin) and grip is not None:
                 picture = self._render(grip, jump_mm, shares)
             else:
-                picture = self._target(shares)
+                sphere, extinction = self._lit(shares), self.films.light_extinction
+                picture = target_moments(
+                    str(self.subject), self._view, sphere, extinction, seed=self.seed
+                )
+                if self.subject == "ball" and self.optics:
+                    picture = blur(picture, self.lens, averaged=True)
             picture *= np.float32(self.unit)
-            while self._pictures and (len(self._pictures) + 1) * picture.nbytes > KEPT_IMAGE_BYTES:
-                self._pictures.popitem(last=False)
-            self._pictures[key] = picture
-        self._pictures.move_to_end(key)
-        return self._pictures[key]
+            return picture
+
+        return self._pictures.get(key, make)
 
     def _render(
-        self, grip: Grip, jump_mm: tuple[float, float], shares: tuple[float, ...]
+        self, grip: GripState, jump_mm: tuple[float, float], shares: tuple[float, ...]
     ) -> Float32Array:
         s = self.subpixels
         margin = SHADOW_MARGIN_PX if self.shadows or self.interreflections else 0
@@ -479,10 +414,9 @@ class GradientScene:
         shares
             What each LED gives of what the sphere says; empty: all of it.
         """
-        if shares not in self._lighting:
-            while len(self._lighting) >= KEPT_LIGHTINGS:
-                self._lighting.popitem(last=False)
-            self._lighting[shares] = light_skin(
+
+        def make() -> Lighting:
+            return light_skin(
                 self.skin,
                 self._lit(shares),
                 self.optical_surface(float(np.median(self.skin.alpha))),
@@ -492,8 +426,8 @@ class GradientScene:
                 lateral=self.lateral,
                 furrow_sectors=FURROW_SECTORS if self.interreflections else 0,
             )
-        self._lighting.move_to_end(shares)
-        return self._lighting[shares]
+
+        return self._lighting.get(shares, make)
 
     def _lit(self, shares: tuple[float, ...]) -> BuiltSphere:
         if not shares:
@@ -507,24 +441,6 @@ class GradientScene:
         return Surface(
             alpha, ETA, self._view.position_mm, self._view.axes[0], self.films.light_extinction
         )
-
-    def _target(self, shares: tuple[float, ...]) -> Float32Array:
-        sphere = self._lit(shares)
-        if self.subject == "ball":
-            raw = ball_stokes(
-                self._view,
-                sphere,
-                extinction=self.films.light_extinction,
-                center_mm=ball_center_mm(self.seed),
-            )
-            return blur(raw, self.lens, averaged=True) if self.optics else raw
-        out = np.zeros((12, self._view.height_px, self._view.width_px), np.float32)
-        if self.subject == "flat":
-            x, y = sample_grid(self._view, subpixels=1, border_px=0)
-            out[::3] = FLAT_REFLECTANCE * diffuser_radiance(
-                sphere, x[None, :], y[:, None], extinction=self.films.light_extinction
-            )
-        return out
 
 
 def _weights(pattern: str) -> tuple[float, float, float, float]:

@@ -13,7 +13,8 @@ from rigsim.arrays import Float32Array, Float64Array
 from rigsim.as_built.sphere import BuiltSphere
 from rigsim.light.lobe_moments import Surface, led_moments
 from rigsim.render.lens_blur import blur
-from rigsim.scenes.gradient.patch import Grip, PatchSurface
+from rigsim.scenes.gradient.patch import PatchSurface
+from rigsim.world.taped_skin import GripState
 
 if TYPE_CHECKING:
     from rigsim.scenes.gradient.scene import GradientScene
@@ -31,7 +32,7 @@ def state_name(angle_deg: float, step: int) -> str:
     return f"a{round(angle_deg):03d}_{sign}{abs(step)}"
 
 
-def appearance(scene: GradientScene, grips: Sequence[Grip]) -> SkinAppearance:
+def appearance(scene: GradientScene, grips: Sequence[GripState]) -> SkinAppearance:
     """Return the truth of some states.
 
     Parameters
@@ -113,7 +114,7 @@ def appearance(scene: GradientScene, grips: Sequence[Grip]) -> SkinAppearance:
     )
 
 
-def _placement(scene: GradientScene, grip: Grip) -> Float64Array:
+def _placement(scene: GradientScene, grip: GripState) -> Float64Array:
     """Return the gradient of the map from relaxed skin to the rig, turn included, (2, 2)."""
     turn = scene.pose(grip).turn_rad
     c, s = np.cos(turn), np.sin(turn)

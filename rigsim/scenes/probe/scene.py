@@ -12,7 +12,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final
 
 import numpy as np
 
@@ -20,17 +20,14 @@ from capture.rig import Rig
 from model import spectra
 from rigsim.arrays import Float32Array, Float64Array, UInt16Array
 from rigsim.as_built.probe import ProbeBuild, build_probe, unit_images
+from rigsim.boxes.probe import SourceLight
 from rigsim.fiber.probe_profile import Profile, Profiles
 from rigsim.fiber.probe_tissue import ProbedTissue, TissueError
-from rigsim.needs.effects import EffectSelection, Noise
+from rigsim.needs.effects import Noise
 from rigsim.needs.probe import probe_needs
-from rigsim.scenes.exposing import LitLight, SceneError, full_power_s
+from rigsim.scenes.exposing import RigScene, SceneError, full_power_s
 from rigsim.sensor import Sensor, expose, sensor_of
 from rigsim.world.suction import HeadState
-
-if TYPE_CHECKING:
-    pass
-
 
 PROBE_METER_RATE_PER_S: Final = 0.8 / 2.0 / (30.0 * 2.0 ** (-44.0 / 3.0))
 """Full scales per second in a spot's middle per R_f in 1/mm^2."""
@@ -58,15 +55,7 @@ PHOTONS_PER_ANGLE: Final = 200_000
 """Photons for each site and angle."""
 
 
-class Light(LitLight, Protocol):
-    """A stretch of light, see `rigsim.boxes.source_shutter.SourceLight`."""
-
-    @property
-    def fibre(self) -> int | None:
-        """Number of the only detection fibre that is not covered; None: none is covered."""
-
-
-class ProbeScene:
+class ProbeScene(RigScene):
     """One subject, or a phantom, under the probe.
 
     Parameters
@@ -114,7 +103,7 @@ class ProbeScene:
         self.hot_e_per_s = _hot_pixels(self._sensor, images.shape[1:])
         """What hot pixels add to the dark current at `DARK_C`, electrons/s, shape (H, W)."""
         full_e = self._sensor.gain_e_per_dn * (self._sensor.white - self._sensor.black)
-        self.needs: EffectSelection = probe_needs(
+        self.needs = probe_needs(
             rig,
             tissue,
             self.build,
@@ -122,11 +111,6 @@ class ProbeScene:
             hot=float(self.hot_e_per_s.max()) * MAX_USUAL_EXPOSURE_S / full_e,
         )
         """What is built, what is not, and why."""
-
-    @property
-    def left_out(self) -> list[tuple[str, str]]:
-        """What this scene does not build, with the reason."""
-        return self.needs.left_out
 
     def sensor(self, view_name: str | None = None, *, camera_c: float = DARK_C) -> Sensor:
         """Return the camera's sensor at a temperature in degrees Celsius."""
@@ -201,7 +185,7 @@ class ProbeScene:
         self,
         view_name: str,
         *,
-        pops: Sequence[Light],
+        pops: Sequence[SourceLight],
         exposure_s: float,
         seed: int,
         head: HeadState,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +14,7 @@ from capture.calibration.sensor.mosaic import channel_levels, neutral_mosaic
 from capture.raw import RawFrame, linear_rgb
 from capture.rig import Rig, load_rig
 from rigsim.as_built.dome import Tolerances, build, image_of
+from rigsim.boxes.dome import LedPulse
 from rigsim.scenes.dome.targets import target_scene
 from rigsim.sensor import sensor_of
 from skinrig.arrays import Float64Array
@@ -29,14 +29,6 @@ if TYPE_CHECKING:
 CHARUCO_BOARD = Board.of(("charuco", 7, 5, "4X4_50"), square_mm=36.0)
 SPHERE_RADIUS_MM = 50.0
 DOME_SEED = 5
-
-
-@dataclass(frozen=True, slots=True)
-class _Pulse:
-    led: int
-    level: float
-    t_on_s: float
-    t_off_s: float
 
 
 def geometry(*, toy: bool) -> StageBenchmark:
@@ -139,7 +131,7 @@ def _frame(
 ) -> RawFrame:
 
     view = scene.rig.view(name)
-    pops = [_Pulse(k, level, 0.0, exposure_s) for k in lit]
+    pops = [LedPulse(k, level, 0.0, exposure_s) for k in lit]
     cfa = scene.exposure(name, pops=pops, exposure_s=exposure_s, seed=seed)
     return RawFrame(
         cfa=cfa,

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from capture.rig import load_rig
-from rigsim.scenes.dome.reference import PlainScene, compare, plain_face, point_rig
+from rigsim.render.scene_radiance import point_rig
+from rigsim.scenes.dome.reference import PlainScene, compare, plain_face
 from skinrig.benchmarks.description import described
 from skinrig.benchmarks.resampling import drawn_again, tiled_rms
 from skinrig.benchmarks.results import BandError, Point, StageBenchmark, Timing

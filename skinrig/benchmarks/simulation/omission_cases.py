@@ -16,7 +16,7 @@ from model import spectra
 from rigsim.light.interreflection import Interreflection
 from rigsim.needs.effect_sizes import is_flat
 from rigsim.needs.effects import Noise, SceneEffects
-from rigsim.needs.flash import BAND_EFFECT, PIGMENT_EFFECT, RELIEF_EFFECT, WAVELENGTH_STEP_EFFECT
+from rigsim.needs.face import BAND_EFFECT, PIGMENT_EFFECT, RELIEF_EFFECT, WAVELENGTH_STEP_EFFECT
 from rigsim.render import Caster, visibility
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from rigsim.needs.flash import LATERAL_EFFECT
+from rigsim.needs.face import LATERAL_EFFECT
 from skinrig.benchmarks.description import Findings, described
 from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark, Timing
 from skinrig.benchmarks.simulation import omission_cases, omission_probe

@@ -17,7 +17,7 @@ from capture.plan.dome import dome_calibration_plan, dome_plan
 from capture.plan.rows import lights_of
 from capture.rig import load_rig
 from capture.session import Session, Subject, verify
-from rigsim.world.faults import Faults
+from rigsim.boxes.faults import Faults
 from rigsim.world.world import World
 
 DOME = load_rig("dome")

@@ -11,7 +11,7 @@ import pytest
 from capture.rig import load_rig
 from rigsim.light.relief_shadow import HORIZON_DIRECTIONS, SOFT_RAD, ReliefShadow
 from rigsim.needs.effects import SceneEffects
-from rigsim.needs.flash import WRINKLE_SHADOW_EFFECT
+from rigsim.needs.face import WRINKLE_SHADOW_EFFECT
 from rigsim.render.variant import VariantChoice, choose_variant
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene

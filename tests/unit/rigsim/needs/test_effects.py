@@ -12,8 +12,9 @@ from rigsim.geometry.mesh import build_mesh
 from rigsim.light.interreflection_color import WAVELENGTH_STEPS, step_error
 from rigsim.light.lateral import scatter_laterally
 from rigsim.light.relief_interreflection import hidden_share
+from rigsim.light.seen_skin import SeenSkin
 from rigsim.needs import effect_sizes
-from rigsim.needs import flash as flash_needs
+from rigsim.needs import face as face_needs
 from rigsim.needs.effects import (
     NEGLIGIBLE_NOISE_RATIO,
     Effect,
@@ -141,9 +142,9 @@ def flash():
 
 def test_pale_skin_needs_what_the_darkest_does_not(flash, faces):
     pale, dark = (FlashScene(flash, faces[name]).needs for name in ("II", "darkest"))
-    assert pale.builds(flash_needs.SPECTRAL_EFFECT)
-    assert dark[flash_needs.SPECTRAL_EFFECT].verdict == "negligible"
-    sizes = [needs[flash_needs.INTERREFLECTION_EFFECT].over_noise for needs in (pale, dark)]
+    assert pale.builds(face_needs.SPECTRAL_EFFECT)
+    assert dark[face_needs.SPECTRAL_EFFECT].verdict == "negligible"
+    sizes = [needs[face_needs.INTERREFLECTION_EFFECT].over_noise for needs in (pale, dark)]
     assert sizes[0] > 20.0 * sizes[1]
 
 
@@ -152,24 +153,24 @@ def test_a_noisier_sensor_needs_less(flash, faces):
     noisy = dataclasses.replace(sensor, read_noise_e=1e4)
     sharp = FlashScene(flash, faces["darkest"], sensor=sensor).needs
     coarse = FlashScene(flash, faces["darkest"], sensor=noisy).needs
-    for name in (flash_needs.INTERREFLECTION_EFFECT, flash_needs.LATERAL_EFFECT):
+    for name in (face_needs.INTERREFLECTION_EFFECT, face_needs.LATERAL_EFFECT):
         assert sharp.builds(name)
         assert coarse[name].verdict == "negligible"
-    assert coarse[flash_needs.SPECTRAL_EFFECT].reason.startswith("there is no such light")
+    assert coarse[face_needs.SPECTRAL_EFFECT].reason.startswith("there is no such light")
 
 
 def test_what_is_asked_for_is_done_and_said(flash, faces):
     asked = FlashScene(
         flash, faces["II"], effects=SceneEffects(lateral=False, interreflections=False)
     )
-    for name in (flash_needs.INTERREFLECTION_EFFECT, flash_needs.LATERAL_EFFECT):
+    for name in (face_needs.INTERREFLECTION_EFFECT, face_needs.LATERAL_EFFECT):
         effect = asked.needs[name]
         assert effect.verdict == "asked"
         assert f"{effect.switch}=False asks for it" in effect.reason
     assert (asked.lateral, asked.interreflections) == (False, False)
     forced = FlashScene(flash, faces["darkest"], effects=SceneEffects(spectral=True))
-    assert forced.needs[flash_needs.SPECTRAL_EFFECT].verdict == "built"
-    assert "spectral=True asks for it" in forced.needs[flash_needs.SPECTRAL_EFFECT].reason
+    assert forced.needs[face_needs.SPECTRAL_EFFECT].verdict == "built"
+    assert "spectral=True asks for it" in forced.needs[face_needs.SPECTRAL_EFFECT].reason
 
 
 def grazing(rig, angle_deg=88.0):
@@ -219,17 +220,18 @@ def test_fewer_wavelengths_change_no_pixel_by_more_than_is_told(flash, faces):
     face = faces["II"]
     scene = FlashScene(flash, face)
     noise, view = Noise.of(scene.sensor()), flash.views[0]
-    effect = scene.needs[flash_needs.WAVELENGTH_STEP_EFFECT]
+    effect = scene.needs[face_needs.WAVELENGTH_STEP_EFFECT]
     assert effect.verdict == "built"
     assert "each 20 nm would not be enough" in effect.reason
     fine = scene.radiance()
     sensor = dataclasses.replace(scene.sensor(), read_noise_e=2e3)
-    coarse = FlashScene(flash, face, sensor=sensor).needs[flash_needs.WAVELENGTH_STEP_EFFECT]
+    coarse = FlashScene(flash, face, sensor=sensor).needs[face_needs.WAVELENGTH_STEP_EFFECT]
     assert coarse.verdict == "negligible"
-    bounces = scene.needs[flash_needs.INTERREFLECTION_EFFECT].over_noise
+    bounces = scene.needs[face_needs.INTERREFLECTION_EFFECT].over_noise
     changes = []
+    skin = SeenSkin(face, "neutral", view.spectral_sensitivity, "D55")
     for step in WAVELENGTH_STEPS:
-        error = step_error(face, "neutral", view.spectral_sensitivity, "D55", step)
+        error = step_error(skin, step)
         lack = FlashScene(flash, face, effects=SceneEffects(spectral_step=step)).radiance()
         changes.append(float((np.abs(lack - fine) / noise.sigma(fine)).max()))
         assert 0.0 < changes[-1] <= bounces * error.max()
@@ -244,26 +246,26 @@ def test_of_two_cameras_the_one_that_tells_more_decides(flash, faces):
         FlashScene(dataclasses.replace(flash, views=views), faces["darkest"]).needs
         for views in ((dull,), (dull, keen), (keen, dull))
     )
-    assert alone[flash_needs.INTERREFLECTION_EFFECT].verdict == "negligible"
+    assert alone[face_needs.INTERREFLECTION_EFFECT].verdict == "negligible"
     for needs in (both, swapped):
-        assert needs.builds(flash_needs.INTERREFLECTION_EFFECT)
+        assert needs.builds(face_needs.INTERREFLECTION_EFFECT)
         assert (
-            needs[flash_needs.LATERAL_EFFECT].over_noise
-            > alone[flash_needs.LATERAL_EFFECT].over_noise
+            needs[face_needs.LATERAL_EFFECT].over_noise
+            > alone[face_needs.LATERAL_EFFECT].over_noise
         )
 
 
 def test_flat_targets_need_neither_shadows_nor_bounces(flash):
     dome = load_rig("dome").resized(64).subset(views=["C02"])
     for scene in (FlashScene(flash, make_target("chart")), DomeScene(dome, make_target("white"))):
-        assert scene.needs[flash_needs.INTERREFLECTION_EFFECT].verdict == "negligible"
-        assert scene.needs[flash_needs.LATERAL_EFFECT].verdict == "absent"
+        assert scene.needs[face_needs.INTERREFLECTION_EFFECT].verdict == "negligible"
+        assert scene.needs[face_needs.LATERAL_EFFECT].verdict == "absent"
 
 
 def test_films_alone_ask_for_polarization(flash, faces):
-    assert FlashScene(flash, faces["II"]).needs.builds(flash_needs.POLARIZATION_EFFECT)
+    assert FlashScene(flash, faces["II"]).needs.builds(face_needs.POLARIZATION_EFFECT)
     dome = load_rig("dome").resized(64).subset(views=["C02"])
-    assert DomeScene(dome, faces["II"]).needs[flash_needs.POLARIZATION_EFFECT].verdict == "absent"
+    assert DomeScene(dome, faces["II"]).needs[face_needs.POLARIZATION_EFFECT].verdict == "absent"
 
 
 def test_gray_tissue_is_traced_once_and_skin_color_by_color():

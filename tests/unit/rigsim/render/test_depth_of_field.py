@@ -11,7 +11,7 @@ from scipy.special import j1
 
 from capture.rig import Rig, load_rig
 from rigsim.light.olat import pixel_order
-from rigsim.needs import flash as flash_needs
+from rigsim.needs import face as face_needs
 from rigsim.needs.effects import Noise, SceneEffects
 from rigsim.render.caster import Caster
 from rigsim.render.depth_of_field import (
@@ -202,12 +202,12 @@ def test_a_scene_blurs_where_its_needs_say_so_and_truth_stays_sharp(rig):
     blurred = FlashScene(rig, face, effects=plain, choice=EMBREE)
     bare = dataclasses.replace(plain, optics=False)
     sharp = FlashScene(rig, face, effects=bare, choice=EMBREE)
-    assert blurred.needs[flash_needs.LENS_EFFECT].verdict == "built"
-    assert sharp.needs[flash_needs.LENS_EFFECT].verdict == "asked"
+    assert blurred.needs[face_needs.LENS_EFFECT].verdict == "built"
+    assert sharp.needs[face_needs.LENS_EFFECT].verdict == "asked"
     change = np.abs(blurred.radiance() - sharp.radiance())
     sigma = Noise.of(blurred.sensor()).sigma(blurred.radiance())
     over = float((change / sigma).max())
-    told = blurred.needs[flash_needs.LENS_EFFECT].over_noise or 0.0
+    told = blurred.needs[face_needs.LENS_EFFECT].over_noise or 0.0
     assert 1.0 < over <= told
     one, two = blurred.truth(), sharp.truth()
     for name in ("melanin", "reflectance", "shading", "normals"):
@@ -223,7 +223,7 @@ def test_small_holes_and_noisy_sensors_need_no_lens(rig):
     needs = FlashScene(
         poor, face, choice=EMBREE, effects=SceneEffects(lateral=False, interreflections=False)
     ).needs
-    assert needs[flash_needs.LENS_EFFECT].verdict == "negligible"
+    assert needs[face_needs.LENS_EFFECT].verdict == "negligible"
 
 
 def test_depths_behind_the_camera_are_refused(rig):

@@ -4,15 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from twins.triangle_stretch import principal_stretches
 
 from rigsim.geometry.mesh import Mesh, MeshError, build_mesh, centered, load_mesh
 from rigsim.subject import expressions, face_regions
-from rigsim.subject.expressions import (
-    EXPRESSION_STRENGTHS,
-    ExpressionError,
-    displacement_mm,
-    principal_stretches,
-)
+from rigsim.subject.expressions import EXPRESSION_STRENGTHS, ExpressionError, displacement_mm
 from rigsim.subject.head import LANDMARKS_MM, build_head
 from rigsim.subject.perfusion import STATE_NAMES
 

@@ -213,7 +213,9 @@ def test_kept_paths_reweighted_give_the_reflectance_at_more_absorption():
     layers = (Layer(0.2, 0.1, 20.0, 0.8, 1.4), Layer(inf, 0.1, 10.0, 0.8, 1.4))
     extra = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 1.0], [2.0, 4.0]])
     kept = escape_paths(LayerStack(layers), photons=60_000, rng=np.random.default_rng(13))
-    each = np.array([batch.reflectance_at(extra) for batch in kept])
+    each = np.array(
+        [np.exp(-extra @ batch.path_mm.T) @ batch.weight / batch.photons for batch in kept]
+    )
     error = each.std(axis=0, ddof=1) / np.sqrt(len(kept))
     for index, added in enumerate(extra):
         darker = tuple(

@@ -11,8 +11,8 @@ from capture.devices.camera import Exposure
 from capture.devices.gradient_sphere import GradientSphereBox
 from capture.devices.port import Port
 from capture.rig import load_rig
+from rigsim.boxes.faults import Faults
 from rigsim.boxes.gradient_sphere import PatternLight
-from rigsim.world.faults import Faults
 from rigsim.world.rig_boxes import RIG_OF_BOX, SERIAL_NUMBERS
 from rigsim.world.taped_skin import GripState
 from rigsim.world.world import World

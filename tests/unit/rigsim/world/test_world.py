@@ -15,8 +15,8 @@ from capture.devices.port import Port
 from capture.devices.wire import Request, encode
 from capture.rig import load_rig
 from rigsim import world as worlds
+from rigsim.boxes.faults import Faults
 from rigsim.urlhandler.protocol_sim import Serial, world_of_url
-from rigsim.world.faults import Faults
 from rigsim.world.world import World
 
 RIG = load_rig("flash").resized(16)

@@ -9,7 +9,7 @@ from capture.devices.port import PortBusy
 from capture.plan import Plan, flash_plan
 from capture.rig import load_rig
 from capture.session import Session
-from rigsim.world.faults import Faults
+from rigsim.boxes.faults import Faults
 from rigsim.world.world import World
 from skinrig.capturing import acquisition, addresses
 from skinrig.cli import main

@@ -20,7 +20,7 @@ from capture.plan.gradient import gradient_calibration_plan, gradient_plan, stat
 from capture.plan.steps import LIGHT_PATTERNS
 from capture.rig import load_rig
 from capture.session import Session, Subject, verify
-from rigsim.world.faults import Faults
+from rigsim.boxes.faults import Faults
 from rigsim.world.world import World
 
 RIG = load_rig("gradient").cropped(16)

@@ -15,7 +15,7 @@ from capture.devices.probe import ProbeBox
 from capture.plan.probe import all_series, probe_calibration_plan, probe_plan
 from capture.rig import load_rig
 from capture.session import Session, Subject, verify
-from rigsim.world.faults import Faults
+from rigsim.boxes.faults import Faults
 from rigsim.world.world import World
 
 WHOLE = load_rig("probe")

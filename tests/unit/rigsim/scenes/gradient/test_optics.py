@@ -9,7 +9,7 @@ import pytest
 from capture.rig import load_rig
 from rigsim.as_built.sphere import SphereError, build_sphere, nominal_sphere
 from rigsim.light.lobe_moments import MomentError, Surface, build_table, direct_moments, ripple
-from rigsim.light.self_shadow import HorizonError, horizon_tangent
+from rigsim.light.relief_shadow import HorizonError, horizon_tangent
 from rigsim.render.lens_blur import BlurError, Lens, blur, lens_of
 from rigsim.scenes.gradient.resolution import slope_transfer
 from rigsim.scenes.gradient.scene import GradientScene

@@ -12,7 +12,8 @@ from rigsim.as_built.sphere import PATTERN_WEIGHTS, build_sphere
 from rigsim.boxes.gradient_sphere import PatternLight
 from rigsim.scenes.exposing import SceneError
 from rigsim.scenes.gradient.resolution import Waves, wavy_scene
-from rigsim.scenes.gradient.scene import FLAT_REFLECTANCE, GRADIENT_METER_RATE_PER_S, GradientScene
+from rigsim.scenes.gradient.scene import GRADIENT_METER_RATE_PER_S, GradientScene
+from rigsim.scenes.gradient.target import FLAT_REFLECTANCE
 from rigsim.scenes.gradient.truth import appearance as ground_truth
 from rigsim.sensor import fixed_pattern
 from rigsim.skin_patch.microrelief import make_micro_skin

@@ -11,42 +11,15 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Final, TypeAlias
 
 from capture.documents import near_miss
+from rigsim.package_data import package_table
 
-_PROBABILITY_FIELDS = (
-    "drop",
-    "flip",
-    "glue",
-    "cut",
-    "late",
-    "lose_answer",
-    "duplicate",
-    "babble",
-    "brownout",
-    "misfire",
-    "jaw_stall",
-    "shutter_stuck",
-    "shutter_jam",
-    "stale",
-    "drop_frame",
-    "wrong_camera",
-    "wrong_exposure",
-)
-_TIME_FIELDS = (
-    "late_s",
-    "latency",
-    "boot_s",
-    "reset_after",
-    "unplug_after",
-    "replug_after",
-    "stall_after",
-    "stall_s",
-    "interlock_after",
-    "gauge_dead_after",
-    "head_lifts_after",
-    "camera_warms_after",
-)
+Probability: TypeAlias = float
+"""From 0 to 1."""
+Seconds: TypeAlias = float
+"""0 or more, s."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,43 +36,43 @@ class Faults:
     ValueError: dorp: no such switch; did you mean drop?
     """
 
-    drop: float = 0.0
+    drop: Probability = 0.0
     """Probability that a byte is lost, either way."""
-    flip: float = 0.0
+    flip: Probability = 0.0
     """Probability that one bit of a byte is flipped, either way."""
-    glue: float = 0.0
+    glue: Probability = 0.0
     """Probability that the newline of a line is lost, so that two lines become one."""
-    cut: float = 0.0
+    cut: Probability = 0.0
     """Probability that a line is cut somewhere and its rest, newline included, is lost."""
-    late: float = 0.0
+    late: Probability = 0.0
     """Probability that an answer comes late (and all behind it: the line keeps its order)."""
-    late_s: float = 0.6
+    late_s: Seconds = 0.6
     """How late."""
-    lose_answer: float = 0.0
+    lose_answer: Probability = 0.0
     """Probability that an answer is lost after the act was done."""
-    duplicate: float = 0.0
+    duplicate: Probability = 0.0
     """Probability that a line arrives twice, either way."""
-    babble: float = 0.0
+    babble: Probability = 0.0
     """Probability that the box prints a line of its own before an answer."""
-    latency: float = 0.0
+    latency: Seconds = 0.0
     """Delay of the line one way, s."""
     baud: float = 115_200.0
     """Bits per second at ten bits per byte; 0: bytes take no time."""
     reset_on_open: bool = False
     """Opening the port resets the box, as the DTR line of many boards does."""
-    boot_s: float = 0.8
+    boot_s: Seconds = 0.8
     """How long the box is deaf after a reset, s."""
-    reset_after: float = math.inf
+    reset_after: Seconds = math.inf
     """The box resets without a word, once, so long after power-up, s."""
-    brownout: float = 0.0
+    brownout: Probability = 0.0
     """Probability that a line to the box finds its supply dipping: a reset without a word."""
-    unplug_after: float = math.inf
+    unplug_after: Seconds = math.inf
     """The cable is pulled so long after the port was first opened, s."""
-    replug_after: float = math.inf
+    replug_after: Seconds = math.inf
     """... and put back so much later, s."""
-    stall_after: float = math.inf
+    stall_after: Seconds = math.inf
     """The box stops taking bytes so long after the port was first opened, s."""
-    stall_s: float = 2.0
+    stall_s: Seconds = 2.0
     """... for so long, s."""
     serial: str = ""
     """Serial number of another box behind the same name."""
@@ -113,15 +86,15 @@ class Faults:
     """Numbers of LEDs that draw no current, joined by +."""
     led_weak: str = ""
     """LEDs that give less light than they are driven for: number=share, joined by +."""
-    misfire: float = 0.0
+    misfire: Probability = 0.0
     """Probability that the tube does not ignite."""
     slow_charge: float = 1.0
     """How many times longer the capacitor takes."""
     interlock: bool = False
     """The emergency-stop line is open."""
-    interlock_after: float = math.inf
+    interlock_after: Seconds = math.inf
     """The emergency stop of a caliper or a probe is opened so long after power-up, s."""
-    jaw_stall: float = 0.0
+    jaw_stall: Probability = 0.0
     """Probability that the motor of a caliper stalls in a move."""
     home_missed: bool = False
     """The home mark of a caliper is never seen."""
@@ -134,36 +107,34 @@ class Faults:
     at no more than 1 / (1 + leak) of what is asked."""
     pump_dead: bool = False
     """The motor of a probe's pump does not turn."""
-    gauge_dead_after: float = math.inf
+    gauge_dead_after: Seconds = math.inf
     """The pressure gauge of a probe draws no current from then on, s after power-up."""
-    head_lifts_after: float = math.inf
+    head_lifts_after: Seconds = math.inf
     """A probe's head comes off the skin so long after its pump was first switched on, s, once."""
-    shutter_stuck: float = 0.0
+    shutter_stuck: Probability = 0.0
     """Probability that a probe's shutter does not open."""
-    shutter_jam: float = 0.0
+    shutter_jam: Probability = 0.0
     """Probability that a probe's shutter, once open, does not close."""
-    camera_warms_after: float = math.inf
+    camera_warms_after: Seconds = math.inf
     """The cooling of a probe's camera fails so long after power-up, s."""
-    stale: float = 0.0
+    stale: Probability = 0.0
     """Probability that a camera hands out its previous frame first."""
-    drop_frame: float = 0.0
+    drop_frame: Probability = 0.0
     """Probability that a frame is lost."""
-    wrong_camera: float = 0.0
+    wrong_camera: Probability = 0.0
     """Probability that a frame bears another camera's serial number."""
-    wrong_exposure: float = 0.0
+    wrong_exposure: Probability = 0.0
     """Probability that a frame was taken one stop off."""
     drift_ppm: float = 0.0
     """Error of the camera's clock, microseconds per second."""
 
     def __post_init__(self) -> None:
-        for field in _PROBABILITY_FIELDS:
-            value = getattr(self, field)
-            if not 0.0 <= value <= 1.0:
-                raise ValueError(f"{field}: got {value}, expected a probability from 0 to 1")
-        for field in _TIME_FIELDS:
-            value = getattr(self, field)
-            if not value >= 0.0:
-                raise ValueError(f"{field}: got {value}, expected seconds >= 0")
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if field.type == "Probability" and not 0.0 <= value <= 1.0:
+                raise ValueError(f"{field.name}: got {value}, expected a probability from 0 to 1")
+            if field.type == "Seconds" and not value >= 0.0:
+                raise ValueError(f"{field.name}: got {value}, expected seconds >= 0")
         if not 0.0 <= self.baud < math.inf:
             raise ValueError(f"baud: got {self.baud}, expected 0 or bits per second")
         if not 0.0 <= self.heat < 1.0:
@@ -255,54 +226,4 @@ class FaultKind:
     """What is promised then."""
 
 
-FAULT_CATALOG: tuple[FaultKind, ...] = (
-    FaultKind(1, "byte lost", ("drop",), "retried, done once"),
-    FaultKind(2, "bit flipped", ("flip",), "NAK or retried, done once"),
-    FaultKind(3, "line cut or glued to the next", ("glue", "cut"), "retried, done once"),
-    FaultKind(4, "answer late, after the timeout", ("late", "late_s"), "stale answers thrown away"),
-    FaultKind(5, "answer lost after the act", ("lose_answer",), "answer replayed, done once"),
-    FaultKind(6, "line twice", ("duplicate",), "done once"),
-    FaultKind(7, "babble or boot banner at any time", ("babble",), "thrown away"),
-    FaultKind(8, "reset when the port is opened", ("reset_on_open", "boot_s"), "hello waits"),
-    FaultKind(9, "reset without a word", ("reset_after", "brownout"), "BoxRebooted, dark"),
-    FaultKind(10, "cable pulled", ("unplug_after", "replug_after"), "LinkLost, reopen"),
-    FaultKind(11, "two hosts on one port", (), "PortBusy for the second"),
-    FaultKind(12, "box takes no bytes", ("stall_after", "stall_s"), "retried or PortTimeout"),
-    FaultKind(13, "host frozen or killed with a light on", (), "dark within the lease"),
-    FaultKind(14, "wrong box or firmware", ("serial", "protocol"), "WrongDevice"),
-    FaultKind(
-        15,
-        "lamp or LED dead or weak, driver too hot",
-        ("lamp_dead", "led_dead", "led_weak", "heat"),
-        "refused -240 or 102, dead LEDs named; weak ones are left to calibration",
-    ),
-    FaultKind(16, "flash not charged, or misfire", ("slow_charge", "misfire"), "-213 or -240"),
-    FaultKind(
-        17,
-        "stepper stalls, home missed, force trip, force sensor dead, stop opened",
-        ("jaw_stall", "home_missed", "skin_stiff", "force_dead", "interlock_after"),
-        "the move ends and says why, or is refused 106, 107 or -240; no force beyond its limit",
-    ),
-    FaultKind(
-        18,
-        "pump leaks or is dead, head comes off, gauge dead, shutter stuck, camera warm",
-        (
-            "pump_leak",
-            "pump_dead",
-            "head_lifts_after",
-            "gauge_dead_after",
-            "shutter_stuck",
-            "shutter_jam",
-            "camera_warms_after",
-        ),
-        "vented and shut and the event says why, or refused -240; gauge and thermometer tell the "
-        "rest",
-    ),
-    FaultKind(
-        19,
-        "camera: stale, lost, foreign or wrongly exposed frame, clock drift",
-        ("stale", "drop_frame", "wrong_camera", "wrong_exposure", "drift_ppm"),
-        "frame not accepted, step taken again",
-    ),
-    FaultKind(20, "disk full or torn, program killed", (), "session resumes"),
-)
+FAULT_CATALOG: Final = tuple(FaultKind(**kind) for kind in package_table("faults")["faults"])

@@ -1,0 +1,61 @@
+"""The skin of a face as a camera sees it: its colors, and how light spreads in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from model import spectra
+from rigsim.arrays import Float32Array, Float64Array
+from rigsim.subject import SimulatedSubject
+from rigsim.tissue.lateral_kernels import SIGMAS_MM, GaussianSum
+from rigsim.tissue.skin_color import SkinColor, skin_color
+from rigsim.tissue.skin_table import SkinTable
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenSkin:
+    """A face in a state, before a camera and under a light."""
+
+    subject: SimulatedSubject
+    state: str
+    """State of its blood."""
+    camera: str
+    """Name of the camera's sensitivity, known to `model.spectra`."""
+    illuminant: str
+    """Name of the light's spectrum, known to `model.spectra`."""
+
+    @property
+    def color(self) -> SkinColor:
+        """How skin of any pigment looks to the camera."""
+        return skin_color(self.camera, self.illuminant)
+
+    @property
+    def blood(self) -> Float32Array:
+        """Fraction of hemoglobin, shape (N, N)."""
+        return self.subject.hemoglobin(self.state)
+
+    def reflectance(self) -> Float32Array:
+        """Return the white-balanced reflectance, shape (N, N, 3)."""
+        return self.color.rgb(self.subject.melanin, self.blood)
+
+    def without_melanin(self) -> Float32Array:
+        """Return the reflectance that it would have without melanin, shape (N, N, 3)."""
+        return self.color.rgb(np.zeros_like(self.subject.melanin), self.blood)
+
+    def covered(self) -> tuple[Float32Array, Float32Array]:
+        """Return melanin and hemoglobin where the texture holds skin, shape (n,) each."""
+        covered = self.subject.atlas.covered
+        return self.subject.melanin[covered], self.blood[covered]
+
+    def band_weights(self, step: int = 1) -> Float64Array:
+        """Return each channel's weights of every so many wavelengths of the skin's table."""
+        wavelength_nm = SkinTable.load().wavelength_nm[::step]
+        return spectra.band_weights(self.camera, self.illuminant, wavelength_nm)
+
+    def kernels(self) -> GaussianSum:
+        """Return the lateral profile of its median melanin and hemoglobin, per channel."""
+        melanin, blood = (float(np.median(part)) for part in self.covered())
+        table = SkinTable.load()
+        return table.lateral_kernels(melanin, blood, self.band_weights()).gaussians(SIGMAS_MM)

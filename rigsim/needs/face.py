@@ -1,0 +1,298 @@
+"""What pictures of a face must hold whichever rig takes them, and what they need not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from capture.rig import Rig, View
+from rigsim.arrays import Float64Array, FloatArray
+from rigsim.light.interreflection_color import WAVELENGTH_STEPS, color_error, step_error
+from rigsim.light.seen_skin import SeenSkin
+from rigsim.needs.effect_sizes import bounced, edge_loss, spread_over_noise
+from rigsim.needs.effects import NEGLIGIBLE_NOISE_RATIO, Effect, Noise, SceneEffects, decide
+from rigsim.render import Caster
+from rigsim.render.depth_of_field import facing_depths, lens_spread
+from rigsim.subject import SimulatedSubject
+
+LATERAL_EFFECT = "light spreading sideways in skin"
+INTERREFLECTION_EFFECT = "light from skin to skin"
+SPECTRAL_EFFECT = "color of light from skin to skin, wavelength by wavelength"
+WAVELENGTH_STEP_EFFECT = "wavelengths between those at which light from skin to skin is summed"
+FURTHER_BOUNCES_EFFECT = "bounces after the last that is summed"
+POLARIZATION_EFFECT = "polarization"
+SHADOW_EFFECT = "shadows"
+LENS_EFFECT = "depth of field and lens blur"
+BAND_EFFECT = "bands of the camera"
+RELIEF_EFFECT = "relief of the skin"
+PIGMENT_EFFECT = "pattern of pigment"
+WRINKLE_SHADOW_EFFECT = "shadows of wrinkles"
+
+TEXEL_STEP = 16
+"""Of the texels whose reflectance is looked at."""
+
+MAX_LAST_BOUNCE = 1e-3
+"""The last bounce that is summed is at most this share of the first."""
+
+MIN_PIGMENT_CONTRAST = 1e-5
+MIN_RELIEF_TILT_DEG = 1e-3
+"""Relative change of reflectance, and tilt of normals, that no sensor tells: full scale is at most
+some thousand times its noise, of which a tenth counts."""
+
+MAX_REMAINING_NOISE_RATIO = 0.05
+"""Of the noise: what further bounces may add at most, about."""
+
+UNMODELED_GLARE = [("glare and far rings of the lens", "light goes as far as the nearest rings")]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scenery:
+    """What a camera looks at and with, and what of it is asked for."""
+
+    view: View
+    illuminant: str
+    """Spectrum of the lights."""
+    caster: Caster
+    """The mesh."""
+    share: float
+    """`exchange_share` of the mesh."""
+    noise: Noise
+    """Of the sensor."""
+    effects: SceneEffects
+    """What is asked for."""
+    subpixels: int
+    """Rays along each side of a pixel."""
+
+    def skin(self, subject: SimulatedSubject, state: str) -> SeenSkin:
+        """Return a face as the camera sees it."""
+        return SeenSkin(subject, state, self.view.spectral_sensitivity, self.illuminant)
+
+
+def face_effects(
+    skin: SeenSkin,
+    scenery: Scenery,
+    brightest: Float64Array,
+    *,
+    level: FloatArray,
+    peak: float,
+    finer: bool,
+    lateral_switch: str = "lateral",
+) -> list[Effect]:
+    """Return what every picture of a face holds, or not.
+
+    Parameters
+    ----------
+    skin, scenery
+        The face, and the camera that looks at it.
+    brightest
+        Its `brightest_rgb`.
+    level
+        What its brightest skin gives, full scales, shape (3,).
+    peak
+        What its brightest highlight gives, full scales.
+    finer
+        Whether the wavelengths can be thinned out at which light from skin to skin is summed.
+    lateral_switch
+        What switches lateral transport.
+    """
+    noise, share, effects = scenery.noise, scenery.share, scenery.effects
+    pixel_mm = scenery.view.distance_mm / scenery.view.focal_px
+    kernels = skin.kernels()
+    lost = edge_loss(kernels.sigmas_mm, kernels.weights, pixel_mm)
+    more = level * [bounced(share, float(reflectance)) for reflectance in brightest]
+    more = np.minimum(more, 1.0)
+    unseen = more / noise.sigma(more)  # where nothing else shines
+    bounces = decide(
+        INTERREFLECTION_EFFECT,
+        float(unseen.max()),
+        effects.interreflections,
+        switch="interreflections",
+        because=f"hollows get {100 * share:.0f} % of what their surroundings send out",
+    )
+    off = float((unseen * color_error(skin)).max()) if bounces.built else 0.0
+    why = "a channel's mean of squares is not the square of its mean"
+    why = why if bounces.built else "there is no such light"
+    asked = effects.spectral
+    spectral = off >= NEGLIGIBLE_NOISE_RATIO if asked is None else asked
+    thinned = [_finer(bounces, spectral, spectral_step(skin, bounces))] if finer else []
+    return [
+        *textures(skin),
+        Effect(SHADOW_EFFECT, "built", "a face shades itself", noise.share(1.0, min(peak, 1.0))),
+        decide(
+            LATERAL_EFFECT,
+            float(spread_over_noise(lost, level, noise).max()),
+            effects.lateral,
+            switch=lateral_switch,
+            because=f"pixels of {pixel_mm:.2f} mm lose {100 * lost.max():.1f} % at a shadow's edge",
+        ),
+        bounces,
+        decide(SPECTRAL_EFFECT, off, asked, switch="spectral", because=why),
+        *thinned,
+        further_bounces(bounces, share * float(brightest.max())),
+        lens(scenery, peak),
+        wrinkles(skin.subject, scenery, peak),
+    ]
+
+
+def wrinkles(subject: SimulatedSubject, scenery: Scenery, level: float) -> Effect:
+    """Return whether the relief of a face that has moved hides lights from itself.
+
+    Pores of a face at rest tilt less than 4 degrees and are not built: under a light that grazes
+    the skin they would take up to a tenth of its cosine away, see docs/leaving-out.md.
+    """
+    if subject.pose is None:
+        return Effect(
+            WRINKLE_SHADOW_EFFECT, "unmodeled", "pores of a face at rest tilt the surface only"
+        )
+    covered = subject.atlas.covered
+    across, along = (mm[covered] for mm in subject.atlas.texel_mm())
+    down, right = (
+        np.asarray(slope)[covered] for slope in np.gradient(subject.height_um.astype(np.float64))
+    )
+    steepest = 1e-3 * float(np.hypot(right / across, down / along).max(initial=0.0))
+    # a light as low as the relief is steep shines with that sine, and may be hidden
+    most = min(1.0, steepest / math.hypot(1.0, steepest) * level)
+    return decide(
+        WRINKLE_SHADOW_EFFECT,
+        most / float(scenery.noise.sigma(0.0)),
+        scenery.effects.relief_shadows,
+        switch="relief_shadows",
+        because=f"wrinkles as steep as {math.degrees(math.atan(steepest)):.0f} degrees",
+    )
+
+
+def lens(scenery: Scenery, level: float) -> Effect:
+    """Return whether a camera's lens blurs: what a pixel loses to its neighbors where it is worst.
+
+    Parameters
+    ----------
+    scenery
+        Where its mesh faces the camera decides how far it is out of focus.
+    level
+        The brightest pixel, full scales; it may be over-full.
+    """
+    view, noise, subpixels = scenery.view, scenery.noise, scenery.subpixels
+    depths = facing_depths(view, scenery.caster.mesh)
+    spread = lens_spread(view, scenery.illuminant, subpixels=subpixels, depths_mm=depths)
+    spilled = spread.spilled(depths)
+    far = max(abs(depth) for depth in depths)
+    gained = min(1.0, level * spilled)  # by a black pixel amid bright ones, where noise is least
+    return decide(
+        LENS_EFFECT,
+        gained / float(noise.sigma(gained)),
+        scenery.effects.optics,
+        switch="optics",
+        because=f"at f/{view.f_number:g}, up to {far:.0f} mm off focus, "
+        f"{100 * spilled:.0f} % of a pixel's light falls on others",
+    )
+
+
+def polarization(rig: Rig, view: View) -> Effect:
+    """Return whether light is kept as Stokes vectors: films alone tell polarized light apart."""
+    films = [light.name for light in rig.lights if light.polarizer_axis_deg is not None]
+    if films or view.analyser_axis_deg is not None:
+        reason = (
+            f"films before {len(films)} of {len(rig.lights)} lights, an analyser before {view.name}"
+        )
+        return Effect(POLARIZATION_EFFECT, "built", reason)
+    return Effect(
+        POLARIZATION_EFFECT, "absent", "the rig has no polarizing film, and sensors see none"
+    )
+
+
+def bands(view: View) -> Effect:
+    """Return how many colors are kept."""
+    if view.cfa == "MONO":
+        return Effect(BAND_EFFECT, "built", "one: the sensor has no filters")
+    return Effect(BAND_EFFECT, "built", "three: those of the sensor's filters")
+
+
+def textures(skin: SeenSkin) -> list[Effect]:
+    """Return whether a face needs its relief and its map of pigment."""
+    subject = skin.subject
+    covered = subject.atlas.covered
+    cosine = np.einsum("ij,ij->i", subject.normal[covered], subject.atlas.normal[covered])
+    tilt = math.degrees(math.acos(min(max(float(cosine.min()), -1.0), 1.0)))
+    melanin = subject.melanin[covered]
+    ends = np.array([melanin.min(), np.median(melanin), melanin.max()], np.float32)
+    blood = np.full_like(ends, np.median(subject.hemoglobin("neutral")[covered]))
+    rgb = skin.color.rgb(ends, blood)
+    least, most = float((rgb[2] / rgb[1]).min()), float((rgb[0] / rgb[1]).max())
+    flat, even = tilt < MIN_RELIEF_TILT_DEG, max(most - 1.0, 1.0 - least) < MIN_PIGMENT_CONTRAST
+    return [
+        Effect(
+            RELIEF_EFFECT, "negligible" if flat else "built", f"it tilts up to {tilt:.0f} degrees"
+        ),
+        Effect(
+            PIGMENT_EFFECT,
+            "negligible" if even else "built",
+            f"reflectance is {least:.2g} to {most:.2g} times its median's",
+        ),
+    ]
+
+
+def brightest_rgb(skin: SeenSkin) -> Float64Array:
+    """Return the largest white-balanced reflectance of a face's skin in each channel, (3,)."""
+    rgb = skin.color.rgb(*(part[::TEXEL_STEP] for part in skin.covered()))
+    return np.asarray(rgb.reshape(-1, 3).max(axis=0), np.float64)
+
+
+def last_bounce(over_noise: float) -> float:
+    """Return the share of the first bounce at which summing ends, by what bounces change at most.
+
+    Examples
+    --------
+    >>> last_bounce(0.5), last_bounce(500.0)
+    (0.001, 0.0001)
+    """
+    return min(MAX_LAST_BOUNCE, MAX_REMAINING_NOISE_RATIO / max(over_noise, 1e-9))
+
+
+def spectral_step(skin: SeenSkin, bounces: Effect) -> tuple[int, float]:
+    """Return at which of the table's wavelengths light from skin to skin is summed: every n-th.
+
+    Returns
+    -------
+    step, over_noise
+        The largest that changes no pixel, and how much it changes one at most over its noise; 1
+        and what the least larger one would change, where each does.
+    """
+    size = float(bounces.over_noise or 0.0)
+    change = math.inf
+    for step in WAVELENGTH_STEPS:
+        change = size * float(step_error(skin, step).max())
+        if change < NEGLIGIBLE_NOISE_RATIO:
+            return step, change
+    return 1, change
+
+
+def _finer(bounces: Effect, spectral: bool, found: tuple[int, float]) -> Effect:
+    """Return whether all of the table's wavelengths are needed for light from skin to skin."""
+    step, over_noise = found
+    if not (bounces.built and spectral):
+        why = "there is no such light" if not bounces.built else "channels are taken whole"
+        return Effect(WAVELENGTH_STEP_EFFECT, "negligible", why, 0.0, "spectral_step")
+    nm = f"each {10 * step} nm are enough" if step > 1 else "each 20 nm would not be enough"
+    return decide(WAVELENGTH_STEP_EFFECT, over_noise, None, switch="spectral_step", because=nm)
+
+
+def further_bounces(bounces: Effect, once: float) -> Effect:
+    """Return what is left of light from skin to skin; ``once`` is the share that bounces on."""
+    if not bounces.built:
+        return Effect(
+            FURTHER_BOUNCES_EFFECT, "negligible", "there is no such light", 0.0, "last_bounce"
+        )
+    over_noise = float(bounces.over_noise or 0.0)
+    last = last_bounce(over_noise)
+    because = f"summing ends at {last:.1g} of the first"
+    left = over_noise * last / (1.0 - once)
+    return decide(FURTHER_BOUNCES_EFFECT, left, None, switch="last_bounce", because=because)
+
+
+def hollows(scenery: Scenery) -> tuple[float, str]:
+    """Return the size of light from one part of a target to another, over noise, and why."""
+    if scenery.share == 0.0:
+        return 0.0, "the target is flat"
+    return math.inf, "the target has hollows"
