@@ -35,42 +35,6 @@ SIGMAS_UM = np.linspace(1.0, 100.0, 199)
 """The paper's grid of standard deviations, by 0.5 um."""
 
 
-def convolved_histogram(
-    neutral_height_um: ArrayLike,
-    alpha: float,
-    sigma_um: float,
-    *,
-    stretch: float,
-    axis: Axis,
-    pixel_um: float | tuple[float, float],
-    bins: int = 64,
-    limit: float = 1.0,
-    stretch_across: float = 1.0,
-    valid: ArrayLike | None = None,
-    y_up: bool = True,
-) -> Float64Array:
-    """Return the histogram that :func:`fit_kernel` compares with its target, (bins, bins).
-
-    Axes (n_y, n_x); the shares of all samples, so that what is beyond the limit is missing from
-    the sum. Parameters as of :func:`fit_kernel`.
-    """
-    relief = relief_of(
-        neutral_height_um,
-        stretch=stretch,
-        axis=axis,
-        pixel_um=pixel_um,
-        stretch_across=stretch_across,
-        valid=valid,
-        y_up=y_up,
-    )
-    normal_histogram.check_buckets(bins, limit)
-    buckets = Buckets(np.zeros(bins * bins + 1), bins, limit)
-    change = relief.change(sigma_um)
-    counts = buckets.count((relief.along, relief.across), change, np.array([alpha])).sum(axis=0)[0]
-    shares = counts[:-1].reshape(bins, bins) / relief.places.size
-    return shares.T if axis in ("y", 0) else shares
-
-
 def fit_kernel(
     neutral_height_um: ArrayLike,
     target_histogram: FloatArray,

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int32Array
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.lumitexels.ray_casting import RayCaster
 from reconstruction.lumitexels.samples import (
     MIN_VISIBLE_COSINE,
@@ -105,10 +105,6 @@ class LumitexelStore:
     def view_count(self) -> int:
         """Number of cameras."""
         return len(self._cameras)
-
-    def seen_by(self, view: int) -> Int32Array:
-        """Return the indices of the points that a camera sees."""
-        return self._rows[view]
 
     def add(
         self,

@@ -2,7 +2,7 @@
 
 The slopes that the normals give are integrated by weighted least squares over any mask, for
 parallel rays or a pinhole camera. See `discontinuity_integration` for surfaces that jump,
-`height_filters` for what follows, `height_errors` for standard errors.
+`height_filters` for what follows, `relief_errors` for standard errors.
 """
 
 from __future__ import annotations

@@ -190,38 +190,6 @@ def fit_texels(
     return Texels(values, stderr, valid)
 
 
-def low_passed(
-    derivatives: FloatArray,
-    shape: tuple[int, int],
-    *,
-    variance: FloatArray | None = None,
-    valid: ArrayLike | None = None,
-) -> Texels:
-    """Return a map of derivatives at a lower resolution, invalid pixels left out.
-
-    Parameters
-    ----------
-    derivatives : ndarray, shape (H, W, 2)
-    shape : (int, int)
-        Rows and columns of texels.
-    variance : ndarray, shape (H, W, 2), optional
-    valid : array_like of bool, shape (H, W), optional
-
-    Examples
-    --------
-    >>> low_passed(np.full((8, 8, 2), 0.25), (2, 2)).values[..., 0].round(9).tolist()
-    [[0.25, 0.25], [0.25, 0.25]]
-    """
-    d = np.asarray(derivatives, np.float64)
-    good = np.asarray(np.isfinite(d).all(axis=2))
-    if valid is not None:
-        good = good & np.asarray(valid, bool)
-    kept = good[..., None]
-    spread = np.zeros(d.shape) if variance is None else np.where(kept, variance, 0.0)
-    ones: Float64Array = good.astype(np.float64)
-    return fit_texels(ones, np.where(kept, d, 0.0), spread, ones, shape)
-
-
 def gathered(by: Any, bx: Any, image: FloatArray) -> Float64Array:
     """Return what each texel's weights gather from an image: B^T image.
 
