@@ -34,7 +34,6 @@ LONG_FUNCTIONS = {
     "reconstruction/chromophores/face_distribution.py:fit": 84,
     "reconstruction/diffuse_albedo/estimation.py:estimate": 94,
     "reconstruction/facial_color/shared_melanin.py:estimate_shared_melanin": 115,
-    "reconstruction/kernel_fit/outcome.py:summarize_search": 87,
     "reconstruction/photometric_stereo/kernels.py:_fit_points": 92,
     "reconstruction/pipeline/flash/facial_color.py:fit": 83,
     "rigsim/fiber/anisotropic_tissue.py:anisotropic_profile": 85,

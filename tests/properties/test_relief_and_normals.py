@@ -1,5 +1,7 @@
 """Normals, heights and their histograms over their declared domains."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,7 +14,6 @@ from reconstruction.correspondence import landmark_field
 from reconstruction.gradient_normals import patterns as gradient_patterns
 from reconstruction.gradient_normals import wiener as gradient_wiener
 from reconstruction.kernel_fit import neutral_relief
-from reconstruction.kernel_fit import search as kernel_search
 from reconstruction.kernel_fit import table as kernel_table
 from reconstruction.normal_histogram import blocks as normal_blocks
 from reconstruction.normal_histogram import relief_slopes
@@ -115,16 +116,10 @@ def test_histograms_and_kernels_of_what_is_not_finite_are_an_error(bad):
     with pytest.raises(relief_slopes.SlopeError, match="angle_rad"):
         relief_slopes.turned(np.ones(1), np.ones(1), bad)
     height = np.random.default_rng(0).standard_normal((12, 12))
-    relief = neutral_relief.relief_of(height, stretch=1.0, axis="x", pixel_um=10.0)
-    buckets = kernel_search.Buckets(np.append(shares.reshape(-1), 0.0), 4, 1.0)
-    told = {"search": "exhaustive", "target_samples": 50.0, "first_sample": 2, "seed": 0}
-    for grids, name in ((([-1.0, bad], [5.0]), "alphas"), (([-1.0, 0.0], [bad]), "sigmas_um")):
+    fit = partial(kernel_fit.fit_kernel, height, shares, stretch=1.0, axis="x", pixel_um=10.0)
+    for name, values in (("alphas", [-1.0, bad]), ("sigmas_um", [bad]), ("target_samples", np.nan)):
         with pytest.raises(neutral_relief.KernelFitError, match=name):
-            kernel_fit.fit_relief(relief, buckets, *map(np.array, grids), **told)
-    with pytest.raises(neutral_relief.KernelFitError, match="target_samples"):
-        kernel_fit.fit_relief(
-            relief, buckets, np.zeros(1), np.ones(1), **(told | {"target_samples": np.nan})
-        )
+            fit(bins=4, **{name: values})
     with pytest.raises(profile_length.ProfileError, match="height_um"):
         profile_length.convolved([0.0, bad, 1.0], 0.5, 10.0, spacing_um=5.0)
     with pytest.raises(profile_length.ProfileError, match="alpha"):

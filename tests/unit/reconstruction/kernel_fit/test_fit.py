@@ -103,8 +103,9 @@ def compared(rng, side, first_sample, **grid):
     flat = (target.T if axis == "y" else target).reshape(-1)
     buckets = ks.Buckets(np.append(flat, 0.0), 64, 1.0)
     alphas, sigmas = grid.get("alphas", ALPHA_GRID), grid.get("sigmas_um", SIGMAS_UM)
-    full = ks.exhaustive(relief, buckets, alphas, sigmas)
-    part = ks.hierarchical(relief, buckets, alphas, sigmas, first_sample=first_sample, rng=rng)
+    kernels_tried = ks.KernelGrid(relief, buckets, alphas, sigmas)
+    full = ks.exhaustive(kernels_tried)
+    part = ks.hierarchical(kernels_tried, first_sample=first_sample, rng=rng)
     return full, part
 
 
@@ -141,9 +142,9 @@ def test_no_kernel_is_dropped_that_is_better_than_its_bound(rng):
     target = nh.histogram(unlike(height, rng), pixel=PIXEL_UM)
     relief = relief_of(height, stretch=1.0, axis="x", pixel_um=PIXEL_UM)
     buckets = ks.Buckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
-    alphas, sigmas = COARSE["alphas"], COARSE["sigmas_um"]
-    full = ks.exhaustive(relief, buckets, alphas, sigmas)
-    race = ks._Race(relief, buckets, alphas, sigmas)
+    grid = ks.KernelGrid(relief, buckets, COARSE["alphas"], COARSE["sigmas_um"])
+    full = ks.exhaustive(grid)
+    race = ks._Race(grid)
     race.run([2048, 8192], rng)
     assert (race.low <= full.distance + 1e-12).all()
     assert race.low.max() > 0.05  # and they say something
