@@ -27,16 +27,6 @@ from reconstruction.normal_integration.weighted_poisson import (
 )
 from reconstruction.normal_maps import NormalMaps
 
-__all__ = [
-    "HeightMap",
-    "IntegrationError",
-    "NotConverged",
-    "Perspective",
-    "Settings",
-    "integrate",
-    "integrate_map",
-]
-
 Method = Literal["auto", "multigrid", "dct"]
 
 

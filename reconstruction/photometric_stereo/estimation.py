@@ -8,9 +8,7 @@ found by their residuals and lose their weight.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,19 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from reconstruction.arrays import BoolArray, FloatArray
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
 from reconstruction.photometric_stereo import kernels
-from reconstruction.photometric_stereo.refinement import refine
 from reconstruction.photometric_stereo.solver_kernels import Settings
-from reconstruction.tiles import map_tiles
-
-__all__ = [
-    "NormalMaps",
-    "PhotometricStereoError",
-    "Robustness",
-    "estimate_normals",
-    "refine",
-    "require_spread",
-]
-
+from reconstruction.tiles import map_on_threads
 
 TILE_POINTS = 8192
 MIN_AGREEING_FRACTION = 0.5
@@ -245,8 +232,8 @@ def estimate_normals(
             good[span],
         )
 
-    for _ in _mapped(solve, count, executor):
-        pass
+    spans = [slice(a, min(a + TILE_POINTS, count)) for a in range(0, count, TILE_POINTS)]
+    map_on_threads(solve, spans, executor)
     out[~good] = 0.0
     out[~good, kernels.STDERR] = np.pi
     out[~good, kernels.STDERR_ALBEDO] = np.inf
@@ -268,15 +255,6 @@ def _of_kind(array: NDArray[Any], kind: Any) -> FloatArray:
         return array
     whole = tuple(slice(0, 1) if step == 0 else slice(None) for step in array.strides)
     return np.broadcast_to(array[whole].astype(kind), array.shape)
-
-
-def _mapped(solve: Any, count: int, executor: Executor | None) -> Iterator[None]:
-    spans = [slice(a, min(a + TILE_POINTS, count)) for a in range(0, count, TILE_POINTS)]
-    if executor is not None or len(spans) < 2:
-        yield from map_tiles(solve, spans, executor=executor)
-        return
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
-        yield from map_tiles(solve, spans, executor=pool)
 
 
 def _geometry(

@@ -6,8 +6,7 @@ The published estimate, to stand beside photometric stereo. doi 10.1145/1141911.
 from __future__ import annotations
 
 import math
-import os
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from reconstruction.arrays import BoolArray, FloatArray, Int32Array
-from reconstruction.tiles import map_tiles
+from reconstruction.tiles import map_on_threads
 
 TILE_POINTS = 2048
 N_BRIGHTEST = 4
@@ -142,11 +141,7 @@ def estimate(
         )
 
     spans = [slice(a, min(a + TILE_POINTS, points)) for a in range(0, points, TILE_POINTS)]
-    if executor is not None or len(spans) < 2:
-        list(map_tiles(solve, spans, executor=executor))
-    else:
-        with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
-            list(map_tiles(solve, spans, executor=pool))
+    map_on_threads(solve, spans, executor)
     return HalfVectorNormals(normals, views >= 2, stderr, views)
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
-from reconstruction.tiles import map_tiles
+from reconstruction.tiles import map_on_threads
 
 Predict = Callable[[Float64Array, Float64Array, Float64Array, NDArray[np.intp]], ArrayLike]
 """(normals (P, 3), light_dir (P, M, 3), view_dir (P, M, 3), points (P,)) -> f_r (P, M), 1/sr."""
@@ -126,11 +125,7 @@ def refine(
 
     size = max(1, TILE_SAMPLES // max(count, 1))
     tiles = [np.arange(a, min(a + size, points)) for a in range(0, points, size)]
-    if executor is not None or len(tiles) < 2:
-        done = list(map_tiles(solve, tiles, executor=executor))
-    else:
-        with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
-            done = list(map_tiles(solve, tiles, executor=pool, window=4))
+    done = map_on_threads(solve, tiles, executor, window=4)
     names = ("normals", "albedo", "residual", "valid", "stderr_rad", "stderr_albedo", "used")
     if not done:
         return NormalMaps(np.zeros((0, 3)), *(np.zeros(0) for _ in names[1:]))  # type: ignore[arg-type]

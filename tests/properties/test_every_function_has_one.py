@@ -142,9 +142,8 @@ NOT_DRIVEN = {
             {
                 "model.brdf.recipe": "materials",
                 "model.vectors": "unit_vectors",
-                "reconstruction.gradient_normals.inversion": (
-                    "analyzer_of grid_of invert_moments places_of views_of"
-                ),
+                "reconstruction.gradient_normals.inversion": "places_of views_of",
+                "reconstruction.polarization": "fresnel_amplitudes",
                 "reconstruction.gradient_normals.reflection": "separate_reflection",
                 "reconstruction.gradient_normals.sphere_lights": (
                     "require_finite require_unit_vectors"

@@ -269,7 +269,9 @@ def test_the_plateau_is_one_of_the_ranks(errors, share):
 @CHEAP
 @given(values=st.lists(st.integers(), max_size=30), window=st.integers(1, 9))
 def test_tiles_come_back_in_their_order(values, window):
-    assert list(tiles.map_tiles(lambda v: v + 1, values, window=window)) == [v + 1 for v in values]
+    more = [v + 1 for v in values]
+    assert list(tiles.map_tiles(lambda v: v + 1, values, window=window)) == more
+    assert tiles.map_on_threads(lambda v: v + 1, values, window=window) == more
 
 
 TURNS = np.arange(12) * (np.pi / 6)
