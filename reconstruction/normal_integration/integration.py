@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -157,36 +158,27 @@ def integrate(
     >>> np.round(np.diff(height, axis=1)[0], 6), np.round(np.diff(height, axis=0)[:, 0], 6)
     (array([-0.5, -0.5, -0.5]), array([-1., -1.]))
     """
-    if not isinstance(normals, NormalMaps):
-        stack = np.asarray(normals)
-        if stack.ndim > 3:
-            masks = _for_each("valid", valid, stack.shape[:-1])
-            errors = _for_each("stderr_rad", stderr_rad, stack.shape[:-1])
-            out = np.empty(stack.shape[:-1], np.float32 if stack.dtype == np.float32 else float)
-            for at in np.ndindex(stack.shape[:-3]):
-                out[at] = integrate(
-                    stack[at],
-                    pixel=pixel,
-                    valid=masks(at),
-                    stderr_rad=errors(at),
-                    y_up=y_up,
-                    camera=camera,
-                    method=method,
-                    denoise=denoise,
-                    settings=settings,
-                )
-            return out
-    found = integrate_map(
-        normals,
+    one = partial(
+        integrate_map,
         pixel=pixel,
-        valid=valid,
-        stderr_rad=stderr_rad,
         y_up=y_up,
         camera=camera,
         method=method,
         denoise=denoise,
         settings=settings,
     )
+    if isinstance(normals, NormalMaps) or np.ndim(normals) <= 3:
+        return _converged(one(normals, valid=valid, stderr_rad=stderr_rad))
+    stack = np.asarray(normals)
+    masks = _for_each("valid", valid, stack.shape[:-1])
+    errors = _for_each("stderr_rad", stderr_rad, stack.shape[:-1])
+    out = np.empty(stack.shape[:-1], np.float32 if stack.dtype == np.float32 else float)
+    for at in np.ndindex(stack.shape[:-3]):
+        out[at] = _converged(one(stack[at], valid=masks(at), stderr_rad=errors(at)))
+    return out
+
+
+def _converged(found: HeightMap) -> FloatArray:
     if not found.convergence.converged:
         raise NotConverged(
             f"iterations: residual {found.convergence.residual:.1e} after "

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -198,8 +198,8 @@ def estimate_normals(
             f"intensity: got {lights} light(s), expected at least 3 to tell a normal"
         )
     kind: Any = np.float64 if samples.dtype == np.float64 else np.float32
-    way, geometry = _geometry(light_directions_n3, light_positions_mm, points_mm, lights, shape)
-    strength = _strength(light_intensity, geometry if way == kernels.NEAR else None, lights, shape)
+    lit = _geometry(light_directions_n3, light_positions_mm, points_mm, lights, shape)
+    strength = _strength(light_intensity, lit, lights, shape)
     chosen = robustness or Robustness()
     settings = chosen.settings(kind)
     count = int(np.prod(shape))
@@ -208,12 +208,14 @@ def estimate_normals(
     good = np.empty(count, bool)
     noise = _per_sample("variance", variance, lights, shape)
     mask = _usable(valid, lights, shape)
-    shared, per_point, positions, points = _light_arrays(way, geometry, kind)
-
+    # float32 keeps millimetres to 1e-4 at the size of a room
+    shared, positions, points = (
+        array.astype(kind, order="C") for array in (lit.shared, lit.positions, lit.points)
+    )
     fit_points = kernels.fit_points(kind)
 
     def solve(span: slice) -> None:
-        each = per_point[:, span] if way == kernels.PER_POINT else per_point
+        each = lit.per_point[:, span] if lit.way == kernels.PER_POINT else lit.per_point
         fit_points(
             *(_of_kind(array[:, span], kind) for array in (flat, noise)),
             mask[:, span],
@@ -221,8 +223,8 @@ def estimate_normals(
             shared,
             _of_kind(each, kind),
             positions,
-            points[span] if way == kernels.NEAR else points,
-            way,
+            points[span] if lit.way == kernels.NEAR else points,
+            lit.way,
             robust,
             variance is not None,
             chosen.l1_iterations,
@@ -257,14 +259,23 @@ def _of_kind(array: NDArray[Any], kind: Any) -> FloatArray:
     return np.broadcast_to(array[whole].astype(kind), array.shape)
 
 
+class _Geometry(NamedTuple):
+    """How light vectors are given, and the arrays that give them."""
+
+    way: int
+    shared: FloatArray = np.zeros((1, 3))
+    per_point: FloatArray = np.zeros((1, 1, 3))
+    positions: FloatArray = np.zeros((1, 3))
+    points: FloatArray = np.zeros((1, 3))
+
+
 def _geometry(
     directions: ArrayLike,
     positions: ArrayLike | None,
     points: ArrayLike | None,
     lights: int,
     shape: tuple[int, ...],
-) -> tuple[int, tuple[FloatArray, ...]]:
-    """Return how light vectors are given, and the arrays that give them."""
+) -> _Geometry:
     if (positions is None) != (points is None):
         raise PhotometricStereoError(
             "light_positions_mm, points_mm: got one of the two, expected both or neither"
@@ -280,10 +291,10 @@ def _geometry(
             raise PhotometricStereoError(
                 f"points_mm: got shape {surface.shape}, expected {(*shape, 3)}"
             )
-        return kernels.NEAR, (where, surface.reshape(-1, 3))
+        return _Geometry(kernels.NEAR, positions=where, points=surface.reshape(-1, 3))
     towards = np.asarray(directions)
     if towards.shape == (lights, *shape, 3):
-        return kernels.PER_POINT, (towards.reshape(lights, -1, 3),)
+        return _Geometry(kernels.PER_POINT, per_point=towards.reshape(lights, -1, 3))
     towards = towards.astype(np.float64)
     if towards.shape != (lights, 3):
         raise PhotometricStereoError(
@@ -298,7 +309,7 @@ def _geometry(
         )
     towards = towards / length[:, None]
     require_spread(towards)
-    return kernels.SHARED, (towards,)
+    return _Geometry(kernels.SHARED, shared=towards)
 
 
 def require_spread(directions: FloatArray) -> None:
@@ -321,29 +332,14 @@ def require_spread(directions: FloatArray) -> None:
         )
 
 
-def _light_arrays(
-    way: int, geometry: tuple[FloatArray, ...], kind: Any
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    none2, none3 = np.zeros((1, 3), kind), np.zeros((1, 1, 3), kind)
-    if way == kernels.SHARED:
-        return geometry[0].astype(kind, order="C"), none3, none2, none2
-    if way == kernels.PER_POINT:
-        return none2, geometry[0], none2, none2
-    # float32 keeps millimetres to 1e-4 at the size of a room
-    return none2, none3, geometry[0].astype(kind, order="C"), geometry[1].astype(kind)
-
-
 def _strength(
-    intensity: ArrayLike | None,
-    near: tuple[FloatArray, ...] | None,
-    lights: int,
-    shape: tuple[int, ...],
+    intensity: ArrayLike | None, lit: _Geometry, lights: int, shape: tuple[int, ...]
 ) -> FloatArray:
     if intensity is None:
         level = 1.0
-        if near is not None:
-            some = near[1][:: max(1, len(near[1]) // 100)]
-            distance = np.linalg.norm(near[0][:, None] - some[None], axis=-1)
+        if lit.way == kernels.NEAR:
+            some = lit.points[:: max(1, len(lit.points) // 100)]
+            distance = np.linalg.norm(lit.positions[:, None] - some[None], axis=-1)
             level = float(np.nanmedian(distance)) ** 2
         return np.broadcast_to(np.float32(level), (lights, int(np.prod(shape))))
     given = _per_sample("light_intensity", intensity, lights, shape)

@@ -213,9 +213,8 @@ def _refine_tile(
             factor = np.maximum(factor + shorter * move[:, 2], 1e-3 * factor)
         if float(np.max(reach, initial=0.0)) < 1e-6:
             iterations = step + 1  # one more pass for the errors
-    return _judged(
-        n, first, factor, r, scale, seen & (w > 0), weight, J, u2, begun, unknowns, known, most_rad
-    )
+    near = begun & (np.linalg.norm(n - first, axis=-1) < 2 * np.sin(most_rad / 2))
+    return _judged(n, near, factor, r, seen & (w > 0), weight, J, u2, known)
 
 
 def _ratio(samples: Float64Array, model: Float64Array, weight: Float64Array) -> Float64Array:
@@ -248,19 +247,16 @@ def _solved(A: Float64Array, g: Float64Array) -> Float64Array:
 
 def _judged(
     n: Float64Array,
-    first: Float64Array,
+    near: BoolArray,
     factor: Float64Array,
     r: Float64Array,
-    scale: Float64Array,
     used: BoolArray,
     weight: Float64Array,
     J: Float64Array,
     u2: Float64Array,
-    begun: BoolArray,
-    unknowns: int,
     known: bool,
-    most_rad: float,
 ) -> NormalMaps:
+    unknowns = J.shape[-1]
     count = np.count_nonzero(used, axis=-1)
     free = np.maximum(count - unknowns, 1)
     psi = np.where(used, r * (1 - u2) ** 2, 0.0)
@@ -274,12 +270,11 @@ def _judged(
     size = np.sqrt(np.maximum(np.einsum("pii->pi", B), 1e-300))
     correlation = B / (size[:, :, None] * size[:, None, :])
     told = np.linalg.eigvalsh(correlation)[:, 0] > 1e-6
-    ok = begun & told & (count > unknowns)
+    ok = near & told & (count > unknowns)
     safe = np.where(ok[:, None, None], correlation, np.eye(unknowns))
     covariance = np.linalg.inv(safe) / (size[:, :, None] * size[:, None, :])
     stderr = np.sqrt(sigma2 * (covariance[:, 0, 0] + covariance[:, 1, 1]))
-    turn = np.linalg.norm(n - first, axis=-1)
-    ok &= (turn < 2 * np.sin(most_rad / 2)) & (stderr < 1.0)
+    ok &= stderr < 1.0
     error = np.sqrt(sigma2 * covariance[:, 2, 2]) if unknowns == 3 else np.zeros(len(n))
     raw = np.where(used, r / weight, 0.0)
     rms = np.sqrt(np.sum(raw**2, axis=-1) / np.maximum(count, 1))

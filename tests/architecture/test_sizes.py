@@ -68,7 +68,6 @@ MANY_PARAMETERS = {
     "reconstruction/gradient_normals/estimation.py:from_patterns": 14,
     "reconstruction/kernel_fit/fit.py:fit_kernel": 17,
     "reconstruction/photometric_stereo/kernels.py:_fit_points": 16,
-    "reconstruction/photometric_stereo/refinement.py:_judged": 13,
     "reconstruction/pipeline/recipes.py:reconstruct": 13,
     "rigsim/boxes/probe.py:__init__": 14,
     "rigsim/scenes/dome/scene.py:__init__": 13,
