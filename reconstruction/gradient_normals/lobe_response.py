@@ -192,28 +192,24 @@ def _cached(
     layers = np.empty((len(places), TABLE_LAYERS + (FIELD_LAYERS if near else 0)))
     for start in range(0, len(places), 2048):
         part = slice(start, start + 2048)
-        shift = np.zeros(3)
-        layers[part, :TABLE_LAYERS] = _layers(lights, frame, see(normals[part], shift), not matte)
+
+        def seen(
+            point_mm: Float64Array, see: Sums = see, normals: Float64Array = normals[part]
+        ) -> Float64Array:
+            return _layers(lights, frame, see(normals, point_mm), not matte)
+
+        layers[part, :TABLE_LAYERS] = seen(np.zeros(3))
         for k in (0, 1) if near else ():
-            ends = [
-                _layers(lights, frame, see(normals[part], sign * FIELD_MM * frame[k]), not matte)
-                for sign in (-1.0, 1.0)
-            ]
-            layers[part, TABLE_LAYERS + 2 * k : TABLE_LAYERS + 2 * k + 2] = (
-                ends[1][:, :2] - ends[0][:, :2]
-            ) / (2.0 * FIELD_MM)
+            before, after = (seen(sign * FIELD_MM * frame[k])[:, :2] for sign in (-1.0, 1.0))
+            first = TABLE_LAYERS + 2 * k
+            layers[part, first : first + 2] = (after - before) / (2.0 * FIELD_MM)
         if alpha_stderr > 0.0:
             step_a = 0.02 * alpha
-            ends = [
-                _layers(
-                    lights,
-                    frame,
-                    _glossy_sums(lights, frame, a, eta)(normals[part], np.zeros(3)),
-                    True,
-                )
+            before, after = (
+                seen(np.zeros(3), _glossy_sums(lights, frame, a, eta))[:, :2]
                 for a in (alpha - step_a, alpha + step_a)
-            ]
-            move = (ends[1][:, :2] - ends[0][:, :2]) / (2.0 * step_a) * alpha_stderr
+            )
+            move = (after - before) / (2.0 * step_a) * alpha_stderr
             layers[part, SYS_XX] += move[:, 0] ** 2
             layers[part, SYS_XY] += move[:, 0] * move[:, 1]
             layers[part, SYS_YY] += move[:, 1] ** 2

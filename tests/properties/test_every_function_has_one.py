@@ -155,7 +155,7 @@ NOT_DRIVEN = {
                 "reconstruction.subsurface.nearest": "fit_nearest",
                 "reconstruction.subsurface.profile_batch": "fit_from",
                 "reconstruction.subsurface.profile_fit": "fit_profiles",
-                "reconstruction.anisotropy.profile_comparison": "compare",
+                "reconstruction.anisotropy.profile_anisotropy": "compare",
                 "reconstruction.subsurface.models": "profile_model",
                 "reconstruction.subsurface.outcome": "evaluate_fits",
             },
