@@ -37,6 +37,7 @@ from reconstruction.anisotropy.plane_vectors import (
     within_period,
 )
 from reconstruction.arrays import BoolArray, Float64Array, Int64Array
+from reconstruction.checks import require_shapes
 
 Errors: TypeAlias = Literal["relative", "absolute"]
 
@@ -281,9 +282,9 @@ def _checked(
     if stderr_per_mm is not None:
         stderr = np.asarray(stderr_per_mm, np.float64)
     good = np.ones(given.shape, bool) if valid is None else np.array(valid, bool)
-    for name, array in (("stderr_per_mm", stderr), ("valid", good)):
-        if array.shape != given.shape:
-            raise AnisotropyError(f"{name}: got shape {array.shape}, expected {given.shape}")
+    require_shapes(
+        AnisotropyError, ("stderr_per_mm", stderr, given.shape), ("valid", good, given.shape)
+    )
     shape = given.shape[1:]
     values, stderr, good = (a.reshape(angle.size, -1) for a in (given, stderr, good))
     good = good & np.isfinite(values) & (values > 0) & np.isfinite(stderr)

@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike
 from model import photon_table
 from reconstruction.anisotropy.estimation import Anisotropy, AnisotropyError, Errors, estimate
 from reconstruction.arrays import BoolArray, Float64Array
+from reconstruction.checks import require_shapes
 
 Table: TypeAlias = Callable[[Float64Array, Float64Array], tuple[Float64Array, Float64Array]]
 """sigma_a (B, 1, 1) and sigma_s' (B, N, 1) to T and dT / d sigma_s', (B, N, F)."""
@@ -235,9 +236,9 @@ def estimate_from_profiles(
     if variance is not None:
         of_each = np.asarray(variance, np.float64)
     good = np.ones(profiles.shape, bool) if valid is None else np.array(valid, bool)
-    for name, array in (("variance", of_each), ("valid", good)):
-        if array.shape != profiles.shape:
-            raise AnisotropyError(f"{name}: got shape {array.shape}, expected {profiles.shape}")
+    require_shapes(
+        AnisotropyError, ("variance", of_each, profiles.shape), ("valid", good, profiles.shape)
+    )
     good = good & np.isfinite(profiles) & np.isfinite(of_each)
     if (of_each[good] < 0).any():
         raise AnisotropyError(f"variance: got {of_each[good].min()}, expected 0 or above")

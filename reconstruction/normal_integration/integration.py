@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray, Int32Array
+from reconstruction.checks import require_settings
 from reconstruction.normal_integration import slope_fields
 from reconstruction.normal_integration.height_filters import denoise_slopes
 from reconstruction.normal_integration.slope_fields import Perspective, SlopeField
@@ -55,15 +56,13 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Refuse settings out of range."""
-        for name, good, expected in (
+        require_settings(
+            self,
+            IntegrationError,
             ("tolerance", 0.0 < self.tolerance < 1.0, "in (0, 1)"),
             ("iterations", self.iterations >= 1, "at least 1"),
             ("order", self.order in (2, 4), "2 or 4"),
-        ):
-            if not good:
-                raise IntegrationError(
-                    f"Settings.{name}: got {getattr(self, name)}, expected {expected}"
-                )
+        )
 
 
 @dataclass(frozen=True, slots=True)

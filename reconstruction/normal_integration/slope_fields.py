@@ -15,6 +15,7 @@ from numba import njit, prange
 from numpy.typing import ArrayLike
 
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
+from reconstruction.checks import require_settings
 from reconstruction.normal_integration.weighted_poisson import IntegrationError
 from reconstruction.normal_maps import NormalMaps
 
@@ -43,14 +44,13 @@ class Perspective:
 
     def __post_init__(self) -> None:
         """Refuse what is no camera."""
-        if not 0.0 < self.focal_px < np.inf:
-            raise IntegrationError(
-                f"Perspective.focal_px: got {self.focal_px}, expected above 0 and finite"
-            )
-        if len(self.center_px) != 2 or not np.isfinite(self.center_px).all():
-            raise IntegrationError(
-                f"Perspective.center_px: got {self.center_px}, expected two finite numbers"
-            )
+        center = len(self.center_px) == 2 and bool(np.isfinite(self.center_px).all())
+        require_settings(
+            self,
+            IntegrationError,
+            ("focal_px", 0.0 < self.focal_px < np.inf, "above 0 and finite"),
+            ("center_px", center, "two finite numbers"),
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reconstruction.arrays import BoolArray, FloatArray
+from reconstruction.checks import require_settings
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
 from reconstruction.photometric_stereo import kernels
 from reconstruction.photometric_stereo.solver_kernels import Settings
@@ -67,18 +68,16 @@ class Robustness:
 
     def __post_init__(self) -> None:
         """Refuse settings out of range."""
-        for name, good, expected in (
+        require_settings(
+            self,
+            PhotometricStereoError,
             ("l1_iterations", self.l1_iterations >= 0, "at least 0"),
             ("iterations", self.iterations >= 1, "at least 1"),
             ("shadow", 0.0 <= self.shadow < 1.0, "in [0, 1)"),
             ("grazing", 0.0 <= self.grazing < 1.0, "in [0, 1)"),
             ("few", self.few >= 0, "at least 0"),
             ("tuning", 1.0 <= self.tuning < np.inf, "1 or more"),
-        ):
-            if not good:
-                raise PhotometricStereoError(
-                    f"Robustness.{name}: got {getattr(self, name)}, expected {expected}"
-                )
+        )
 
     def settings(self, kind: Any) -> Settings:
         """Return the limits of a fit in the data's type."""

@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from reconstruction.arrays import BoolArray, FloatArray, Int32Array
+from reconstruction.checks import require_shapes
 from reconstruction.tiles import map_on_threads
 
 TILE_POINTS = 2048
@@ -111,14 +112,13 @@ def estimate(
     points, count = samples.shape
     cameras = np.asarray(view)
     mask = np.broadcast_to(np.True_, samples.shape) if valid is None else np.asarray(valid)
-    for name, array, shape in (
+    require_shapes(
+        HalfVectorError,
         ("light_dir", light_dir, (points, count, 3)),
         ("view_dir", view_dir, (points, count, 3)),
         ("view", cameras, (count,)),
         ("valid", mask, (points, count)),
-    ):
-        if np.shape(array) != shape:
-            raise HalfVectorError(f"{name}: got shape {np.shape(array)}, expected {shape}")
+    )
     if cameras.dtype.kind not in "iu" or (count and int(cameras.min()) < 0):
         raise HalfVectorError("view: expected whole numbers, 0 or more")
     cameras = cameras.astype(np.int64)

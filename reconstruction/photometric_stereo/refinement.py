@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
+from reconstruction.checks import require_shapes
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
 from reconstruction.tiles import map_on_threads
 
@@ -82,15 +83,14 @@ def refine(
     if samples.ndim != 2:
         raise PhotometricStereoError(f"values: got shape {samples.shape}, expected (P, M)")
     points, count = samples.shape
-    for name, array, shape in (
+    require_shapes(
+        PhotometricStereoError,
         ("light_dir", light_dir, (points, count, 3)),
         ("view_dir", view_dir, (points, count, 3)),
         ("normals", normals, (points, 3)),
         ("valid", valid, (points, count)),
         ("predict", None if callable(predict) else predict, (points, count)),
-    ):
-        if array is not None and np.shape(array) != shape:
-            raise PhotometricStereoError(f"{name}: got shape {np.shape(array)}, expected {shape}")
+    )
     noise = None
     if variance is not None:
         try:

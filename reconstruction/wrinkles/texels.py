@@ -21,6 +21,7 @@ from model import texture_resampling as resampling
 from model import wrinkles
 from model.wrinkles import WrinkleError
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
+from reconstruction.checks import require_shapes
 from reconstruction.normal_maps import NormalMaps
 
 MAX_DERIVATIVE = 4.0
@@ -89,9 +90,8 @@ def derivatives_of(
         raise WrinkleError(f"normals: got shape {n.shape}, expected (H, W, 3)")
     report = wrinkles.encoding_report(n, limit=None)
     good = report.valid.copy()
-    for name, given in (("valid", valid), ("stderr_rad", stderr_rad)):
-        if given is not None and np.shape(given) != n.shape[:2]:
-            raise WrinkleError(f"{name}: got shape {np.shape(given)}, expected {n.shape[:2]}")
+    shape = n.shape[:2]
+    require_shapes(WrinkleError, ("valid", valid, shape), ("stderr_rad", stderr_rad, shape))
     if valid is not None:
         good &= np.asarray(valid, bool)
     steep = good & (np.abs(report.derivatives) > MAX_DERIVATIVE).any(axis=2)

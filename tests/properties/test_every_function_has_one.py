@@ -143,6 +143,7 @@ NOT_DRIVEN = {
                 "model.brdf.recipe": "materials",
                 "model.vectors": "unit_vectors",
                 "reconstruction.gradient_normals.inversion": "places_of views_of",
+                "reconstruction.checks": "require_settings require_shapes",
                 "reconstruction.polarization": "fresnel_amplitudes",
                 "reconstruction.gradient_normals.reflection": "separate_reflection",
                 "reconstruction.gradient_normals.sphere_lights": (
