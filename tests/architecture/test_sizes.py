@@ -13,7 +13,6 @@ LONG_MODULES = {
     "reconstruction/chromophores/posterior_kernels.py": 633,
     "reconstruction/correspondence/common_parameterization.py": 554,
     "reconstruction/facial_color/repeatability.py": 457,
-    "reconstruction/scan/registration.py": 502,
     "rigsim/boxes/caliper.py": 493,
     "rigsim/boxes/controller.py": 465,
     "rigsim/light/olat.py": 625,

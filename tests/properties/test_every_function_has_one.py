@@ -93,6 +93,7 @@ NOT_DRIVEN = {
                 "reconstruction.photometric_stereo.refinement": "refine",
                 "reconstruction.facial_color.rig_transfer": "transfer_rig",
                 "reconstruction.scan.registration": "align register",
+                "reconstruction.scan.rough_normals": "photometric_normals",
                 "reconstruction.registration.strain": "measure_strain",
                 "reconstruction.surface.errors": "of_albedo of_normals",
                 "reconstruction.surface.estimates": (
