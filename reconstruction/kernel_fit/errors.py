@@ -22,7 +22,7 @@ from reconstruction.arrays import Float64Array, Int64Array
 from reconstruction.kernel_fit.search import Found, KernelGrid
 from reconstruction.normal_histogram import blocks as normal_blocks
 from reconstruction.normal_histogram import kernels
-from reconstruction.normal_histogram.block_errors import MIN_BLOCKS
+from reconstruction.normal_histogram.blocks import MIN_BLOCKS
 
 N_DRAWS = 200
 """Histograms drawn for the standard errors."""
@@ -213,7 +213,7 @@ def widths_of_pair(
     Returns
     -------
     HalfWidths or None
-        None where fewer than `block_errors.LEAST_BLOCKS` blocks are in both maps.
+        None where fewer than `MIN_BLOCKS` blocks are in both maps.
     """
     relief, buckets = grid.relief, grid.buckets
     shape = (relief.code.shape[0], relief.code.shape[1])

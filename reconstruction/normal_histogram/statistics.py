@@ -52,7 +52,7 @@ class NormalStatistics:
         Of n_x and n_y (n_s, n_t on turned axes) about their means, over all samples.
     stderr_x, stderr_y : float
         Standard errors of the variances, of what another patch of the same skin and size would
-        show (`reconstruction.normal_histogram.block_errors`); infinite below five blocks.
+        show (`reconstruction.normal_histogram.blocks.stderr_of_mean`); infinite below five blocks.
     """
 
     histogram: Float64Array

@@ -146,7 +146,6 @@ NOT_DRIVEN = {
                 "reconstruction.gradient_normals.inversion": "places_of views_of",
                 "reconstruction.checks": "require_settings require_shapes",
                 "reconstruction.polarization": "fresnel_amplitudes",
-                "reconstruction.gradient_normals.reflection": "separate_reflection",
                 "reconstruction.gradient_normals.sphere_lights": (
                     "require_finite require_unit_vectors"
                 ),

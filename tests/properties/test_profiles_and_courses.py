@@ -14,7 +14,7 @@ from reconstruction.anisotropy import (
     profile_anisotropy,
 )
 from reconstruction.anisotropy import estimation as anisotropy
-from reconstruction.anisotropy.one_direction_bias import one_direction_bias
+from reconstruction.anisotropy.estimation import one_direction_bias
 from reconstruction.facial_color import perfusion_curves, perfusion_fit, repeatability
 from reconstruction.subsurface import smooth_misfit, translucency
 
