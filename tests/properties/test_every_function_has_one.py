@@ -88,7 +88,6 @@ NOT_DRIVEN = {
                 "reconstruction.gradient_normals.estimation": "estimate_roughness from_patterns",
                 "reconstruction.registration.head_motion": "estimate",
                 "reconstruction.lumitexels.samples": "visibility",
-                "reconstruction.lumitexels.store": "gather",
                 "reconstruction.surface.model_normals": "estimate",
                 "reconstruction.photometric_stereo.refinement": "refine",
                 "reconstruction.facial_color.rig_transfer": "transfer_rig",
