@@ -119,10 +119,9 @@ NOT_DRIVEN = {
                     "fit_face_distribution fit_with_white_reference"
                 ),
                 "reconstruction.chromophores.face_distribution": "fit",
-                "reconstruction.kernel_fit.fit": "fit_kernel",
                 "reconstruction.kernel_fit.outcome": "summarize_search",
                 "reconstruction.kernel_fit.search": "exhaustive gentlest hierarchical",
-                "reconstruction.kernel_fit.neutral_relief": "convolved",
+                "reconstruction.kernel_fit.neutral_relief": "convolved relief_of",
                 "reconstruction.facial_color.shared_melanin": "estimate_shared_melanin",
                 "reconstruction.wrinkles.fit": "differences fit fit_weights",
                 "reconstruction.wrinkles.weights": "equations_of zone_weights",
@@ -145,6 +144,7 @@ NOT_DRIVEN = {
                 "reconstruction.gradient_normals.inversion": "places_of views_of",
                 "reconstruction.checks": "require_settings require_shapes",
                 "reconstruction.polarization": "fresnel_amplitudes",
+                "reconstruction.scan.repair": "directed_edges",
                 "reconstruction.gradient_normals.sphere_lights": (
                     "require_finite require_unit_vectors"
                 ),
