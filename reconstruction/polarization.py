@@ -284,11 +284,16 @@ def _light_absorbs(axes: PolarizerAxes, light: FloatArray) -> FloatArray:
     return _normalized(np.cross(middle, np.asarray(axes.light, dtype=light.dtype)))
 
 
-def _transmittances(cosine: FloatArray, eta: float) -> tuple[FloatArray, FloatArray]:
-    """Fresnel's power transmittance of a smooth surface across (s) and in (p) the plane."""
+def fresnel_amplitudes(cosine: FloatArray, eta: float) -> tuple[FloatArray, FloatArray]:
+    """Return the amplitudes r_s and r_p that a surface of index `eta` reflects, of cosines > 0."""
     inside = np.sqrt(1.0 - (1.0 - cosine**2) / eta**2)
     r_s = (cosine - eta * inside) / (cosine + eta * inside)
-    r_p = (eta * cosine - inside) / (eta * cosine + inside)
+    return r_s, (eta * cosine - inside) / (eta * cosine + inside)
+
+
+def _transmittances(cosine: FloatArray, eta: float) -> tuple[FloatArray, FloatArray]:
+    """Fresnel's power transmittance of a smooth surface across (s) and in (p) the plane."""
+    r_s, r_p = fresnel_amplitudes(cosine, eta)
     return 1.0 - r_s**2, 1.0 - r_p**2
 
 
@@ -365,9 +370,7 @@ def _tilted_leak(
         s = np.where(length > 1e-6, s, np.cross(np.asarray([0.3, 0.8, 0.52], kind), to_light))
         s = _normalized(s)
         cosine = np.clip(_dot(half, to_light), 0.0, 1.0)
-        inside = np.sqrt(1.0 - (1.0 - cosine**2) / eta**2)
-        r_s = (cosine - eta * inside) / (cosine + eta * inside)
-        r_p = (eta * cosine - inside) / (eta * cosine + inside)
+        r_s, r_p = fresnel_amplitudes(cosine, eta)
         field = _passed_field(_light_absorbs(axes, one), to_light)
         out = (r_s * _dot(field, s))[..., None] * s + (r_p * _dot(field, np.cross(-to_light, s)))[
             ..., None

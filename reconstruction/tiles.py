@@ -6,9 +6,10 @@ The one seam for parallel and distributed work: any executor with ``submit`` fit
 
 from __future__ import annotations
 
+import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Executor, Future
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import TypeVar
 
 Tile = TypeVar("Tile")
@@ -68,3 +69,21 @@ def map_tiles(
     finally:
         for future in pending:
             future.cancel()
+
+
+def map_on_threads(
+    fn: Callable[[Tile], Result],
+    tiles: Sequence[Tile],
+    executor: Executor | None = None,
+    *,
+    window: int = 8,
+) -> list[Result]:
+    """Return ``fn(tile)`` of all tiles: on an executor, or on one thread a core, at most 8.
+
+    Several tiles get threads where no executor is given; one runs in this thread. The other
+    parameters are those of :func:`map_tiles`.
+    """
+    if executor is not None or len(tiles) < 2:
+        return list(map_tiles(fn, tiles, executor=executor))
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
+        return list(map_tiles(fn, tiles, executor=pool, window=window))

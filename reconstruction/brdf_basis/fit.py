@@ -29,6 +29,7 @@ from sklearn.exceptions import ConvergenceWarning
 from model.brdf.tables import BrdfBasis
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.brdf_basis.nnls_kernels import fit_points
+from reconstruction.checks import require_shapes
 from reconstruction.lumitexels import boundary_kernels
 
 MIN_SAMPLE_COSINE = 0.1
@@ -72,16 +73,14 @@ class SurfaceSamples:
         if self.value.ndim != 2:
             raise SampleError(f"value: got shape {self.value.shape}, expected (P, M)")
         points, samples = self.value.shape
-        for name, shape in (
-            ("variance", (points, samples)),
-            ("light_dir", (points, samples, 3)),
-            ("view_dir", (points, samples, 3)),
-            ("normals", (points, 3)),
-            ("valid", (points, samples)),
-        ):
-            got = getattr(self, name).shape
-            if got != shape:
-                raise SampleError(f"{name}: got shape {got}, expected {shape}")
+        require_shapes(
+            SampleError,
+            ("variance", self.variance, (points, samples)),
+            ("light_dir", self.light_dir, (points, samples, 3)),
+            ("view_dir", self.view_dir, (points, samples, 3)),
+            ("normals", self.normals, (points, 3)),
+            ("valid", self.valid, (points, samples)),
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,10 +1,5 @@
-"""Diffuse albedo R_d from lumitexels, and the reduced albedo."""
+"""Diffuse albedo R_d from lumitexels."""
 
-from reconstruction.diffuse_albedo.estimation import (
-    DiffuseAlbedo,
-    ReducedAlbedo,
-    estimate,
-    reduced_albedo,
-)
+from reconstruction.diffuse_albedo.estimation import DiffuseAlbedo, estimate
 
-__all__ = ["DiffuseAlbedo", "ReducedAlbedo", "estimate", "reduced_albedo"]
+__all__ = ["DiffuseAlbedo", "estimate"]

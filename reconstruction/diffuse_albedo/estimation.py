@@ -19,7 +19,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model import dipole
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from reconstruction.diffuse_albedo.kernels import MIN_FACTOR_COSINE, fit_envelope
 from reconstruction.lumitexels import boundary_kernels
@@ -55,31 +54,6 @@ class DiffuseAlbedo:
     stderr: Float64Array
     valid: BoolArray
     discarded: Int64Array
-
-
-@dataclass(frozen=True, slots=True)
-class ReducedAlbedo:
-    """Reduced albedo alpha' of surface points.
-
-    Attributes
-    ----------
-    albedo_prime : ndarray of float64, shape (..., C)
-        In [0, 1]; NaN where not `valid`.
-    deficit : ndarray of float64, shape (..., C)
-        1 - alpha' with all its digits.
-    stderr : ndarray of float64, shape (..., C)
-        Of both, to first order; NaN where that of R_d is.
-    valid : ndarray of bool, shape (..., C)
-        False where R_d is not known or an outlier.
-    outlier : ndarray of bool, shape (..., C)
-        R_d is known and outside [0, 1]: no medium has it.
-    """
-
-    albedo_prime: Float64Array
-    deficit: Float64Array
-    stderr: Float64Array
-    valid: BoolArray
-    outlier: BoolArray
 
 
 def estimate(
@@ -222,28 +196,6 @@ def estimate(
         found.reshape(lead),
         np.asarray(dropped, dtype=np.int64).reshape(lead),
     )
-
-
-def reduced_albedo(albedo: DiffuseAlbedo, *, eta: float) -> ReducedAlbedo:
-    """Invert eq. (5): the reduced albedo of a medium that reflects R_d.
-
-    Parameters
-    ----------
-    albedo
-        Estimated R_d.
-    eta
-        Relative refractive index, as in the estimate.
-    """
-    r_d = np.asarray(albedo.r_d, dtype=np.float64)
-    known: BoolArray = np.asarray(np.isfinite(r_d))
-    outlier = known & dipole.is_outlier(r_d)
-    usable = known & ~outlier
-    inside = np.where(usable, r_d, 0.5)
-    deficit = np.atleast_1d(dipole.invert_to_deficit(inside, eta)).reshape(r_d.shape)
-    alpha = np.atleast_1d(dipole.invert_total_reflectance(inside, eta)).reshape(r_d.shape)
-    stderr = dipole.albedo_slope(deficit, eta) * albedo.stderr
-    alpha, deficit, stderr = (np.where(usable, v, np.nan) for v in (alpha, deficit, stderr))
-    return ReducedAlbedo(alpha, deficit, stderr, usable, outlier)
 
 
 def _spread(name: str, values: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:

@@ -12,10 +12,10 @@ lights show of this lobe (:mod:`reconstruction.gradient_normals.lobe_response`).
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Mapping
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -23,37 +23,30 @@ from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
 from model.fresnel import ETA_SKIN
-from reconstruction.arrays import FloatArray
+from reconstruction.arrays import BoolArray, FloatArray
 from reconstruction.gradient_normals import kernels, lobe_response, moment_kernels
 from reconstruction.gradient_normals.channels import channel_count, joined, sliced, summed
-from reconstruction.gradient_normals.inversion import (
-    analyzer_of,
-    grid_of,
-    invert_moments,
-    places_of,
-    views_of,
-)
+from reconstruction.gradient_normals.inversion import Inversion, places_of, views_of
 from reconstruction.gradient_normals.lobe_response import Response
-from reconstruction.gradient_normals.moments import Reflection, with_filter
+from reconstruction.gradient_normals.moments import (
+    Reflection,
+    prepare,
+    with_filter,
+    with_shared_dark,
+)
 from reconstruction.gradient_normals.noise import SensorNoise
-from reconstruction.gradient_normals.patterns import GradientError, Key, MissingPatterns
-from reconstruction.gradient_normals.reflection import Valid, Variance, separate_reflection
-from reconstruction.gradient_normals.sphere_lights import SphereLights, SphereLightsError, frame_of
+from reconstruction.gradient_normals.patterns import GradientError, Key, collect
+from reconstruction.gradient_normals.sphere_lights import SphereLights, frame_of
 from reconstruction.normal_maps import NormalMaps
-from reconstruction.tiles import map_tiles
-
-__all__ = [
-    "GradientError",
-    "MissingPatterns",
-    "Roughness",
-    "SensorNoise",
-    "SphereLights",
-    "SphereLightsError",
-    "estimate_roughness",
-    "from_patterns",
-]
+from reconstruction.tiles import map_on_threads
 
 _log = logging.getLogger(__name__)
+
+Variance = float | SensorNoise | Mapping[Key, ArrayLike] | None
+Valid = BoolArray | Mapping[Key, BoolArray] | None
+
+MAX_MEDIAN_LEAKAGE = 0.02
+"""Median leakage from which polarizers do not cross well: 8 degrees off."""
 
 
 MAX_RESIDUAL_RATIO = 3.0
@@ -210,7 +203,7 @@ def from_patterns(
                 for k in range(channels)
             ]
         )
-    reflection = separate_reflection(
+    reflection = _reflection_of(
         patterns, component, variance, valid, saturation, lights, smooth_px, smooth_crossed_px
     )
     shape = reflection.shape
@@ -236,7 +229,7 @@ def from_patterns(
         )
     if wiener:
         reflection = with_filter(reflection)
-    return _maps(reflection, table, analyzer_of(lights, table), eta, each_view, places, executor)
+    return _maps(Inversion.of(reflection, table, lights, eta), each_view, places, executor)
 
 
 def estimate_roughness(
@@ -270,13 +263,58 @@ def estimate_roughness(
     if channel_count(patterns) is not None:
         patterns, variance = summed(patterns, variance=variance, valid=valid, saturation=saturation)
         valid = saturation = None
-    reflection = separate_reflection(
+    reflection = _reflection_of(
         patterns, "specular", variance, valid, saturation, lights, smooth_px, smooth_crossed_px
     )
     found = _roughness(reflection, lights, views_of(view, reflection.shape)[0], eta)
     if found.pixels == 0:
         raise GradientError("patterns: no pixel has a specular signal above its noise")
     return found
+
+
+def _reflection_of(
+    patterns: Mapping[Key, ArrayLike],
+    component: Literal["specular", "diffuse"],
+    variance: Variance,
+    valid: Valid,
+    saturation: float | None,
+    lights: SphereLights | None,
+    smooth_px: float,
+    smooth_crossed_px: float | None,
+) -> Reflection:
+    """Return the moments of one component's reflection, corrected for leaking polarizers."""
+    noise = variance if isinstance(variance, SensorNoise) else None
+    stacks = collect(
+        patterns,
+        variance=None if isinstance(variance, SensorNoise) else variance,
+        valid=valid,
+        saturation=saturation,
+    )
+    leakage = 0.0
+    if lights is not None:
+        # lights near Brewster's angle reflect next to nothing, most of it crossed: not a mean
+        leakage = float(np.median(lights.leakage[lights.intensities > 0]))
+        if leakage > MAX_MEDIAN_LEAKAGE:
+            _warn_of_leakage(round(leakage, 4))
+    return prepare(
+        with_shared_dark(stacks),
+        component,
+        noise=noise,
+        leakage=leakage,
+        smooth_px=smooth_px,
+        smooth_crossed_px=smooth_crossed_px,
+    )
+
+
+@lru_cache(maxsize=64)
+def _warn_of_leakage(leakage: float) -> None:
+    """Say once for all pictures of one sphere how much passes crossed polarizers."""
+    _log.warning(
+        "polarizers leak: crossed pictures hold %.1f %% of the specular reflection, as if the"
+        " analyser were %.0f degrees off; corrected, at the price of signal",
+        100.0 * leakage,
+        np.degrees(np.arctan(np.sqrt(leakage))),
+    )
 
 
 def _roughness(
@@ -301,16 +339,7 @@ def _roughness(
     def excess(log_alpha: float) -> tuple[float, FloatArray]:
         """Return how much longer the vectors are than this roughness makes them, each and all."""
         table = lobe_response.specular(lights, view=middle, alpha=float(np.exp(log_alpha)), eta=eta)
-        found = invert_moments(
-            reflection,
-            moments,
-            table,
-            grid_of(table),
-            analyzer_of(lights, table),
-            eta,
-            np.zeros((0, 3)),
-            np.zeros((0, 2)),
-        )
+        found = Inversion.of(reflection, table, lights, eta).normals(moments)
         # no vector is longer than its light; a lobe that falls between lights has no length at all
         length = found[:, kernels.CONCENTRATION]
         good = (found[:, kernels.STATUS] == kernels.GOOD) & (length >= 0.0) & (length <= 1.0)
@@ -326,11 +355,8 @@ def _roughness(
     steps = [excess(a) for a in ladder]
     pixels = max(len(each) for _, each in steps)
     if pixels == 0:
-        return Roughness(
-            ROUGHNESS_LADDER[len(ROUGHNESS_LADDER) // 2],
-            ROUGHNESS_LADDER[len(ROUGHNESS_LADDER) // 2],
-            0,
-        )
+        taken = ROUGHNESS_LADDER[len(ROUGHNESS_LADDER) // 2]
+        return Roughness(taken, taken, 0)
     values = np.array([value for value, _ in steps])
     change = np.flatnonzero((values[:-1] < 0.0) & (values[1:] >= 0.0))
     if change.size == 0:
@@ -354,34 +380,22 @@ def _roughness(
 
 
 def _maps(
-    reflection: Reflection,
-    table: Response,
-    analyser: FloatArray,
-    eta: float,
-    view: FloatArray,
+    inversion: Inversion,
+    view: FloatArray | None,
     places: FloatArray | None,
     executor: Executor | None,
 ) -> NormalMaps:
-    height, width = reflection.shape
-    kind = reflection.kind
+    reflection = inversion.reflection
+    (height, width), kind = reflection.shape, reflection.kind
     normals = np.zeros((height, width, 3), kind)
     flats = [np.zeros((height, width), kind) for _ in range(4)]
     valid, used = np.zeros((height, width), bool), np.zeros((height, width), np.int32)
-    grid = grid_of(table)
 
     def solve(rows: slice) -> tuple[float, float]:
         span = slice(rows.start * width, rows.stop * width)
         moments = reflection.moments(rows)
-        found = invert_moments(
-            reflection,
-            moments,
-            table,
-            grid,
-            analyser,
-            eta,
-            view[span] if len(view) else view,
-            np.zeros((0, 2)) if places is None else places[span],
-        ).reshape(-1, width, kernels.NORMAL_COLUMNS)
+        each = (None if given is None else given[span] for given in (view, places))
+        found = inversion.normals(moments, *each).reshape(-1, width, kernels.NORMAL_COLUMNS)
         good = found[..., kernels.STATUS] == kernels.GOOD
         valid[rows] = good
         normals[rows] = found[..., :3]
@@ -405,12 +419,7 @@ def _maps(
         used[rows] = count.reshape(good.shape)
         return chi, free
 
-    tiles = list(reflection.tiles())
-    if executor is not None or len(tiles) < 2:
-        contradiction = list(map_tiles(solve, tiles, executor=executor))
-    else:
-        with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
-            contradiction = list(map_tiles(solve, tiles, executor=pool))
+    contradiction = map_on_threads(solve, list(reflection.tiles()), executor)
     chi, free = (sum(part) for part in zip(*contradiction, strict=True))
     if reflection.judged and free and chi > MAX_RESIDUAL_RATIO * free:
         _log.warning(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -16,7 +18,7 @@ MIN_MOMENT_SIGMAS = 3.0
 """Length of the moment vector over its standard error, below which a pixel has no normal."""
 
 
-def views_of(view: ArrayLike, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+def views_of(view: ArrayLike, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray | None]:
     """Return the mean view (3,), and every pixel's (P, 3) or none (0, 3)."""
     v = np.asarray(view, np.float64)
     if v.shape not in ((3,), (*shape, 3)):
@@ -26,7 +28,7 @@ def views_of(view: ArrayLike, shape: tuple[int, int]) -> tuple[FloatArray, Float
         raise GradientError("view: expected unit vectors, got lengths other than 1")
     v = v / length
     if v.ndim == 1:
-        return v, np.zeros((0, 3))
+        return v, None
     middle = v.reshape(-1, 3).mean(axis=0)
     return middle / np.linalg.norm(middle), v.reshape(-1, 3)
 
@@ -58,50 +60,77 @@ def places_of(
     return np.asarray(flat @ frame_of(middle)[:2].T)
 
 
-def analyzer_of(lights: SphereLights | None, table: Response) -> FloatArray:
-    """Return the analyser's axis in the frame of the view, (2,)."""
-    if lights is None:
-        return np.zeros(2)
-    return np.asarray(table.frame[:2] @ np.asarray(lights.analyser))
+@dataclass(frozen=True, slots=True)
+class Inversion:
+    """What turns the moments of a reflection into normals.
 
+    Attributes
+    ----------
+    reflection : Reflection
+    table : Response
+        Of size 0: vectors point where they should.
+    eta : float
+        Refractive index.
+    analyser : ndarray, shape (2,)
+        Passing axis in the frame of the table; zeros without lights.
+    starts : ndarray of float64, shape (G, G, 2)
+        Where the search for a place begins, by what is seen.
+    """
 
-def grid_of(table: Response) -> Float64Array:
-    """Return places for the search to begin at, see :func:`gradient_kernels.starts`."""
-    if table.coefficients.size == 0:
-        return np.zeros((2, 2, 2))
-    lines = int(np.clip(3.0 / table.step, 65, 257))
-    grid = np.empty((lines, lines, 2))
-    kernels.starts(table.coefficients, table.least, table.step, grid)
-    return grid
+    reflection: Reflection
+    table: Response
+    eta: float
+    analyser: Float64Array
+    starts: Float64Array
 
+    @staticmethod
+    def of(
+        reflection: Reflection, table: Response, lights: SphereLights | None, eta: float
+    ) -> Inversion:
+        """Prepare the inversion by a table that was made for these lights."""
+        analyser, starts = np.zeros(2), np.zeros((2, 2, 2))
+        if lights is not None:
+            analyser = np.asarray(table.frame[:2] @ np.asarray(lights.analyser))
+        if table.coefficients.size:
+            lines = int(np.clip(3.0 / table.step, 65, 257))
+            starts = np.empty((lines, lines, 2))
+            kernels.starts(table.coefficients, table.least, table.step, starts)
+        return Inversion(reflection, table, eta, analyser, starts)
 
-def invert_moments(
-    reflection: Reflection,
-    moments: tuple[FloatArray, FloatArray],
-    table: Response,
-    grid: FloatArray,
-    analyser: FloatArray,
-    eta: float,
-    view: FloatArray,
-    place: FloatArray,
-) -> Float64Array:
-    """Return the normals' columns (P, 9) of moments, by the table of responses."""
-    out = np.empty((moments[0].shape[1], kernels.NORMAL_COLUMNS))
-    kernels.invert(
-        *moments,
-        table.frame,
-        reflection.component == "specular",
-        table.coefficients,
-        table.least,
-        table.step,
-        grid,
-        analyser,
-        eta,
-        view,
-        place,
-        reflection.told > 0,
-        MIN_MOMENT_SIGMAS,
-        1e-5 if reflection.kind == np.float32 else 1e-9,
-        out,
-    )
-    return out
+    def normals(
+        self,
+        moments: tuple[FloatArray, FloatArray],
+        view: FloatArray | None = None,
+        place: FloatArray | None = None,
+    ) -> Float64Array:
+        """Return normals and what is known of them (P, NORMAL_COLUMNS), see :mod:`kernels`.
+
+        Parameters
+        ----------
+        moments : pair of ndarray, shape (MOMENT_ROWS, P)
+            As of `Reflection.moments`.
+        view : ndarray, shape (P, 3), optional
+            Each pixel's view, where it is not the table's.
+        place : ndarray, shape (P, 2), optional
+            Each pixel's place in the field, mm.
+        """
+        table, reflection = self.table, self.reflection
+        out = np.empty((moments[0].shape[1], kernels.NORMAL_COLUMNS))
+        kernels.invert(
+            *moments,
+            table.frame,
+            reflection.component == "specular",
+            table.coefficients,
+            table.least,
+            table.step,
+            self.starts,
+            self.analyser,
+            self.eta,
+            np.zeros((0, 3)) if view is None else view,
+            np.zeros((0, 2)) if place is None else place,
+            reflection.told > 0,
+            MIN_MOMENT_SIGMAS,
+            1e-5 if reflection.kind == np.float32 else 1e-9,
+            out,
+        )
+        return out

@@ -12,7 +12,7 @@ azimuthal): a place ``u`` is 2 sin(tilt / 2) long and points where the normal le
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -32,6 +32,7 @@ from reconstruction.gradient_normals.sphere_lights import (
     require_finite,
     require_unit_vectors,
 )
+from reconstruction.polarization import fresnel_amplitudes
 
 TABLE_REACH = 1.3
 """Length of the places that tables are made for: tilts up to 81 degrees."""
@@ -95,9 +96,7 @@ def facet_reflectance(lights: SphereLights, view: Float64Array, eta: float) -> F
     length = np.linalg.norm(facet, axis=1, keepdims=True)
     facet = np.where(length > 1e-9, facet / np.maximum(length, 1e-9), view)
     cosine = np.clip(np.sum(facet * light, axis=1), 1e-6, 1.0)
-    inside = np.sqrt(1.0 - (1.0 - cosine**2) / eta**2)
-    r_s = (cosine - eta * inside) / (cosine + eta * inside)
-    r_p = (eta * cosine - inside) / (eta * cosine + inside)
+    r_s, r_p = fresnel_amplitudes(cosine, eta)
     s = np.cross(facet, light)
     size = np.linalg.norm(s, axis=1, keepdims=True)
     # a light along the view: s and p are alike, and any direction across serves
@@ -149,12 +148,12 @@ def specular(
     if not 0.0 <= alpha_stderr < np.inf:
         raise SphereLightsError(f"alpha_stderr: got {alpha_stderr}, expected 0 or more, finite")
     way = _direction(view)
-    return _cached(_key(lights), way, float(alpha), _index(eta), near, float(alpha_stderr))
+    return _cached(lights, way, float(alpha), _index(eta), near, float(alpha_stderr))
 
 
 def diffuse(lights: SphereLights, *, view: ArrayLike, eta: float, near: bool = False) -> Response:
     """Return the table of a matte interior below a smooth surface: Lambert, Fresnel on entry."""
-    return _cached(_key(lights), _direction(view), np.nan, _index(eta), near, 0.0)
+    return _cached(lights, _direction(view), np.nan, _index(eta), near, 0.0)
 
 
 def _direction(view: ArrayLike) -> tuple[float, ...]:
@@ -169,44 +168,17 @@ def _index(eta: float) -> float:
     return float(eta)
 
 
-_Key = tuple[bytes, ...]
-
-
-def _key(lights: SphereLights) -> _Key:
-    arrays = (
-        lights.directions,
-        lights.intensities,
-        lights.leakage,
-        lights.polarizers,
-        np.asarray(lights.analyser),
-        lights.programmed,
-        np.asarray(lights.distance_mm),
-        lights.intensity_stderr,
-        lights.leakage_stderr,
-    )
-    return tuple(np.asarray(a, np.float64).tobytes() for a in arrays)
-
-
-def _lights(key: _Key) -> SphereLights:
-    d, e, k, p, a, w, distance, se, sk = (np.frombuffer(b) for b in key)
-    return SphereLights(
-        d.reshape(-1, 3),
-        e,
-        k,
-        p.reshape(-1, 3),
-        (float(a[0]), float(a[1]), float(a[2])),
-        w.reshape(-1, 3),
-        float(distance[0]),
-        se,
-        sk,
-    )
-
-
 @lru_cache(maxsize=48)
 def _cached(
-    key: _Key, view: tuple[float, ...], alpha: float, eta: float, near: bool, alpha_stderr: float
+    lights: SphereLights,
+    view: tuple[float, ...],
+    alpha: float,
+    eta: float,
+    near: bool,
+    alpha_stderr: float,
 ) -> Response:
-    lights, frame = _lights(key), frame_of(view)
+    # directions rounded twice, as all tables so far were made of
+    lights, frame = replace(lights), frame_of(view)
     matte = np.isnan(alpha)
     step = 0.05 if matte else float(np.clip(alpha / 4.0, FINEST, COARSEST))
     lines = int(np.ceil(TABLE_REACH / step)) + MARGIN_LINES
@@ -220,28 +192,24 @@ def _cached(
     layers = np.empty((len(places), TABLE_LAYERS + (FIELD_LAYERS if near else 0)))
     for start in range(0, len(places), 2048):
         part = slice(start, start + 2048)
-        shift = np.zeros(3)
-        layers[part, :TABLE_LAYERS] = _layers(lights, frame, see(normals[part], shift), not matte)
+
+        def seen(
+            point_mm: Float64Array, see: Sums = see, normals: Float64Array = normals[part]
+        ) -> Float64Array:
+            return _layers(lights, frame, see(normals, point_mm), not matte)
+
+        layers[part, :TABLE_LAYERS] = seen(np.zeros(3))
         for k in (0, 1) if near else ():
-            ends = [
-                _layers(lights, frame, see(normals[part], sign * FIELD_MM * frame[k]), not matte)
-                for sign in (-1.0, 1.0)
-            ]
-            layers[part, TABLE_LAYERS + 2 * k : TABLE_LAYERS + 2 * k + 2] = (
-                ends[1][:, :2] - ends[0][:, :2]
-            ) / (2.0 * FIELD_MM)
+            before, after = (seen(sign * FIELD_MM * frame[k])[:, :2] for sign in (-1.0, 1.0))
+            first = TABLE_LAYERS + 2 * k
+            layers[part, first : first + 2] = (after - before) / (2.0 * FIELD_MM)
         if alpha_stderr > 0.0:
             step_a = 0.02 * alpha
-            ends = [
-                _layers(
-                    lights,
-                    frame,
-                    _glossy_sums(lights, frame, a, eta)(normals[part], np.zeros(3)),
-                    True,
-                )
+            before, after = (
+                seen(np.zeros(3), _glossy_sums(lights, frame, a, eta))[:, :2]
                 for a in (alpha - step_a, alpha + step_a)
-            ]
-            move = (ends[1][:, :2] - ends[0][:, :2]) / (2.0 * step_a) * alpha_stderr
+            )
+            move = (after - before) / (2.0 * step_a) * alpha_stderr
             layers[part, SYS_XX] += move[:, 0] ** 2
             layers[part, SYS_XY] += move[:, 0] * move[:, 1]
             layers[part, SYS_YY] += move[:, 1] ** 2
@@ -296,9 +264,7 @@ def _matte_sums(lights: SphereLights, frame: Float64Array, eta: float) -> Sums:
         ways, strength = _local(lights, point_mm)
         mu = normals @ ways.T
         c = np.clip(mu, 1e-6, 1.0)
-        inside = np.sqrt(1.0 - (1.0 - c**2) / eta**2)
-        t_s = 1.0 - ((c - eta * inside) / (c + eta * inside)) ** 2
-        t_p = 1.0 - ((eta * c - inside) / (eta * c + inside)) ** 2
+        t_s, t_p = (1.0 - r**2 for r in fresnel_amplitudes(c, eta))
         share_s: Float64Array | float = 0.5
         if len(lights.polarizers):
             # s is along n x l: its part of the field, squared, by the triple product

@@ -18,7 +18,7 @@ def _none() -> Float64Array:
     return np.zeros(0)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class SphereLights:
     """The lights of a gradient sphere and their films, as they were measured.
 
@@ -110,6 +110,18 @@ class SphereLights:
             raise SphereLightsError(f"distance_mm: got {self.distance_mm}, expected more than 0")
         _keep(self, "directions", ways)
         object.__setattr__(self, "analyser", tuple(float(a) for a in axis))
+
+    def _contents(self) -> tuple[object, ...]:
+        values = (getattr(self, name) for name in self.__slots__)
+        return tuple(v.tobytes() if isinstance(v, np.ndarray) else v for v in values)
+
+    def __eq__(self, other: object) -> bool:
+        """Compare by numbers, so that a table that one holds serves the other."""
+        return isinstance(other, SphereLights) and self._contents() == other._contents()
+
+    def __hash__(self) -> int:
+        """Hash the numbers."""
+        return hash(self._contents())
 
 
 def _keep(lights: SphereLights, name: str, values: Float64Array) -> None:

@@ -19,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction.arrays import Float64Array, Int64Array
-from reconstruction.kernel_fit.neutral_relief import Relief
-from reconstruction.kernel_fit.search import Buckets, Found
+from reconstruction.kernel_fit.search import Found, KernelGrid
 from reconstruction.normal_histogram import blocks as normal_blocks
 from reconstruction.normal_histogram import kernels
-from reconstruction.normal_histogram.block_errors import MIN_BLOCKS
+from reconstruction.normal_histogram.blocks import MIN_BLOCKS
 
 N_DRAWS = 200
 """Histograms drawn for the standard errors."""
@@ -100,16 +99,17 @@ class BlockCounts:
         return self.residuals() * math.sqrt(1.0 + self.effective_samples / target_samples)
 
 
-def of_kernel(relief: Relief, buckets: Buckets, alpha: float, sigma_um: float) -> BlockCounts:
+def of_kernel(grid: KernelGrid, alpha: float, sigma_um: float) -> BlockCounts:
     """Count the normals of a relief that a kernel has changed, in blocks of its map.
 
     Parameters
     ----------
-    relief, buckets
+    grid
         Of the search.
     alpha, sigma_um
         The kernel; sigma in um.
     """
+    relief, buckets = grid.relief, grid.buckets
     shape = (relief.code.shape[0], relief.code.shape[1])
     blocks = normal_blocks.BLOCKS_PER_SIDE
     group, groups = normal_blocks.block_of(relief.places, shape, blocks)
@@ -123,14 +123,12 @@ def of_kernel(relief: Relief, buckets: Buckets, alpha: float, sigma_um: float) -
     return BlockCounts(np.asarray(counts, np.float64), 0.5 * (growth[0] + growth[1]))
 
 
-def nearly_as_good(
-    found: Found, alphas: Float64Array, sigmas_um: Float64Array, noise: float
-) -> Int64Array:
+def nearly_as_good(grid: KernelGrid, found: Found, noise: float) -> Int64Array:
     """Return the kernels that are no further than `noise` from the best, (K, 2).
 
     Parameters
     ----------
-    found, alphas, sigmas_um
+    grid, found
         Of the search.
     noise : float
         In units of the distance.
@@ -143,7 +141,7 @@ def nearly_as_good(
     distance = found.distance
     i, j = np.nonzero(distance <= distance[found.best] + noise)
     first = (i == found.best[0]) & (j == found.best[1])
-    order = np.lexsort((sigmas_um[i], np.abs(alphas[j]), distance[i, j], ~first))
+    order = np.lexsort((grid.sigmas_um[i], np.abs(grid.alphas[j]), distance[i, j], ~first))
     return np.stack([i, j], axis=1)[order]
 
 
@@ -162,15 +160,7 @@ class HalfWidths:
 
 
 def widths_of_best(
-    relief: Relief,
-    buckets: Buckets,
-    found: Found,
-    alphas: Float64Array,
-    sigmas_um: Float64Array,
-    *,
-    noise: float,
-    scatter: Float64Array,
-    rng: np.random.Generator,
+    grid: KernelGrid, found: Found, *, noise: float, scatter: Float64Array, rng: np.random.Generator
 ) -> HalfWidths:
     """Return ways of the best kernel that most drawn histograms of other skin stay within.
 
@@ -178,7 +168,7 @@ def widths_of_best(
 
     Parameters
     ----------
-    relief, buckets, found, alphas, sigmas_um
+    grid, found
         Of the search.
     noise : float
         Standard error of the distance.
@@ -187,24 +177,21 @@ def widths_of_best(
     rng
         Draws the histograms.
     """
-    near = nearly_as_good(found, alphas, sigmas_um, DRAWN_SIGMAS * noise)
+    near = nearly_as_good(grid, found, DRAWN_SIGMAS * noise)
     some = near[np.unique(np.linspace(0, len(near) - 1, MAX_DRAWN).round().astype(int))]
-    gap = found.shares(relief, buckets, sigmas_um, alphas, some) - buckets.target
+    gap = found.shares(grid, some) - grid.buckets.target
     used = np.flatnonzero(gap.any(axis=0) | scatter.any(axis=0))
     gap, scatter = gap[:, used], scatter[:, used]
     best = np.empty(N_DRAWS, int)
     for draw in range(N_DRAWS):
         moved = rng.standard_normal(len(scatter)) @ scatter
         best[draw] = int(np.argmin(np.abs(gap + moved).sum(axis=1)))
-    return _widths(alphas, sigmas_um, some, best)
+    return _widths(grid, some, best)
 
 
 def widths_of_pair(
-    relief: Relief,
-    buckets: Buckets,
+    grid: KernelGrid,
     found: Found,
-    alphas: Float64Array,
-    sigmas_um: Float64Array,
     *,
     noise: float,
     target_blocks: Float64Array,
@@ -215,7 +202,7 @@ def widths_of_pair(
 
     Parameters
     ----------
-    relief, buckets, found, alphas, sigmas_um, noise, rng
+    grid, found, noise, rng
         As of `widths_of_best`.
     target_blocks : ndarray, shape (blocks, buckets)
         Counts behind the target in the skin of each block of the relief, of `of_kernel`.
@@ -226,8 +213,9 @@ def widths_of_pair(
     Returns
     -------
     HalfWidths or None
-        None where fewer than `block_errors.LEAST_BLOCKS` blocks are in both maps.
+        None where fewer than `MIN_BLOCKS` blocks are in both maps.
     """
+    relief, buckets = grid.relief, grid.buckets
     shape = (relief.code.shape[0], relief.code.shape[1])
     group, groups = normal_blocks.block_of(relief.places, shape, normal_blocks.BLOCKS_PER_SIDE)
     ours = np.bincount(group, minlength=groups)
@@ -238,35 +226,29 @@ def widths_of_pair(
     factors = rng.standard_normal((N_DRAWS, len(both)))
     factors = np.float32(math.sqrt(len(both) / (len(both) - 1) * growth)) * factors
     factors = factors.astype(np.float32)
-    near = nearly_as_good(found, alphas, sigmas_um, PAIRED_SIGMAS * noise)
+    near = nearly_as_good(grid, found, PAIRED_SIGMAS * noise)
     # dense about the best, sparse where hardly a draw comes
     most = max(MAX_DRAWN, min(MAX_PAIRED, MAX_PAIRED * PAIRED_PX // relief.places.size))
     steps = np.linspace(0.0, 1.0, most) ** 1.5 * (len(near) - 1)
     some = near[np.unique(steps.round().astype(int))]
     distance = np.empty((N_DRAWS, len(some)), np.float32)
     for i in np.unique(some[:, 0]).tolist():
-        da, db = relief.change(float(sigmas_um[i]))
+        da, db = relief.change(float(grid.sigmas_um[i]))
         for column in np.flatnonzero(some[:, 0] == i).tolist():
-            alpha = np.float32(alphas[some[column, 1]])
-            counts = kernels.count_in_groups(
-                -(relief.along + alpha * da),
-                -(relief.across + alpha * db),
-                group,
-                groups,
-                buckets.bins,
-                buckets.limit,
-            )
+            alpha = np.float32(grid.alphas[some[column, 1]])
+            a, b = -(relief.along + alpha * da), -(relief.across + alpha * db)
+            counts = kernels.count_in_groups(a, b, group, groups, buckets.bins, buckets.limit)
             gap = counts.sum(axis=0) / relief.places.size - buckets.target
             apart = normal_blocks.residuals_of(np.asarray(counts[both], np.float64)) - theirs
             used = np.flatnonzero((gap != 0.0) | apart.any(axis=0))
             moved = factors @ apart[:, used].astype(np.float32)
             distance[:, column] = np.abs(gap[used].astype(np.float32) + moved).sum(axis=1)
-    return _widths(alphas, sigmas_um, some, distance.argmin(axis=1))
+    return _widths(grid, some, distance.argmin(axis=1))
 
 
-def of_grid(widths: HalfWidths, alphas: Float64Array, sigmas_um: Float64Array) -> HalfWidths:
+def of_grid(widths: HalfWidths, grid: KernelGrid) -> HalfWidths:
     """Return half widths with the grid's own: a step over sqrt(12), as of an even error."""
-    step = [float(np.diff(g).min()) if g.size > 1 else 0.0 for g in (alphas, sigmas_um)]
+    step = [float(np.diff(g).min()) if g.size > 1 else 0.0 for g in (grid.alphas, grid.sigmas_um)]
     (alpha, alpha_95), (sigma, sigma_95) = (
         tuple(
             math.hypot(w, factor * s / math.sqrt(12.0))
@@ -277,10 +259,9 @@ def of_grid(widths: HalfWidths, alphas: Float64Array, sigmas_um: Float64Array) -
     return HalfWidths((alpha, alpha_95), (sigma, sigma_95))
 
 
-def _widths(
-    alphas: Float64Array, sigmas_um: Float64Array, some: Int64Array, best: NDArray[np.intp]
-) -> HalfWidths:
+def _widths(grid: KernelGrid, some: Int64Array, best: NDArray[np.intp]) -> HalfWidths:
     """Return quantiles of how far draws' best kernels are from the best, which is the first."""
+    sigmas_um, alphas = grid.sigmas_um, grid.alphas
     i, j = some[best].T
     ways = np.abs([alphas[j] - alphas[some[0, 1]], sigmas_um[i] - sigmas_um[some[0, 0]]])
     (alpha, sigma), (alpha_95, sigma_95) = np.quantile(ways, INTERVAL_COVERAGES, axis=1).tolist()

@@ -21,11 +21,10 @@ from numpy.typing import ArrayLike, NDArray
 from model.microstructure import ALPHA_LIMITS
 from reconstruction import normal_histogram
 from reconstruction.arrays import Float64Array, FloatArray
-from reconstruction.kernel_fit import outcome as kernel_outcome
 from reconstruction.kernel_fit import search as kernel_search
 from reconstruction.kernel_fit.neutral_relief import Axis, KernelFitError, Relief, relief_of
-from reconstruction.kernel_fit.outcome import KernelFit
-from reconstruction.kernel_fit.search import Buckets
+from reconstruction.kernel_fit.outcome import KernelFit, summarize_search
+from reconstruction.kernel_fit.search import Buckets, KernelGrid
 from reconstruction.normal_histogram import blocks as normal_blocks
 from reconstruction.normal_histogram import kernels
 
@@ -33,42 +32,6 @@ ALPHA_GRID = np.round(np.linspace(*ALPHA_LIMITS, 301), 2)
 """The paper's grid of strengths, by 0.01."""
 SIGMAS_UM = np.linspace(1.0, 100.0, 199)
 """The paper's grid of standard deviations, by 0.5 um."""
-
-
-def convolved_histogram(
-    neutral_height_um: ArrayLike,
-    alpha: float,
-    sigma_um: float,
-    *,
-    stretch: float,
-    axis: Axis,
-    pixel_um: float | tuple[float, float],
-    bins: int = 64,
-    limit: float = 1.0,
-    stretch_across: float = 1.0,
-    valid: ArrayLike | None = None,
-    y_up: bool = True,
-) -> Float64Array:
-    """Return the histogram that :func:`fit_kernel` compares with its target, (bins, bins).
-
-    Axes (n_y, n_x); the shares of all samples, so that what is beyond the limit is missing from
-    the sum. Parameters as of :func:`fit_kernel`.
-    """
-    relief = relief_of(
-        neutral_height_um,
-        stretch=stretch,
-        axis=axis,
-        pixel_um=pixel_um,
-        stretch_across=stretch_across,
-        valid=valid,
-        y_up=y_up,
-    )
-    normal_histogram.check_buckets(bins, limit)
-    buckets = Buckets(np.zeros(bins * bins + 1), bins, limit)
-    change = relief.change(sigma_um)
-    counts = buckets.count((relief.along, relief.across), change, np.array([alpha])).sum(axis=0)[0]
-    shares = counts[:-1].reshape(bins, bins) / relief.places.size
-    return shares.T if axis in ("y", 0) else shares
 
 
 def fit_kernel(
@@ -154,61 +117,27 @@ def fit_kernel(
         valid=valid,
         y_up=y_up,
     )
-    return fit_relief(
+    grid = KernelGrid(
         relief,
         Buckets(target, bins, float(limit)),
-        ALPHA_GRID if alphas is None else alphas,
-        SIGMAS_UM if sigmas_um is None else sigmas_um,
-        search=search,
-        target_samples=target_samples,
-        first_sample=first_sample,
-        seed=seed,
-        target_blocks=_blocks(target_blocks, relief, bins, transposed=axis in ("y", 0)),
+        _grid("alphas", ALPHA_GRID if alphas is None else alphas, *ALPHA_LIMITS),
+        _grid("sigmas_um", SIGMAS_UM if sigmas_um is None else sigmas_um, 1e-9, math.inf),
     )
-
-
-def fit_relief(
-    relief: Relief,
-    buckets: Buckets,
-    alphas: ArrayLike,
-    sigmas_um: ArrayLike,
-    *,
-    search: Literal["hierarchical", "exhaustive"],
-    target_samples: float | None,
-    first_sample: int,
-    seed: int,
-    target_blocks: Float64Array | None = None,
-) -> KernelFit:
-    """Fit the kernel of a prepared relief; parameters and errors as of :func:`fit_kernel`.
-
-    The counts of `target_blocks` have the shape (blocks, bins ** 2 + 1), axes as of the relief.
-    """
-    strengths = _grid("alphas", alphas, *ALPHA_LIMITS)
-    widths = _grid("sigmas_um", sigmas_um, 1e-9, math.inf)
     if search not in ("hierarchical", "exhaustive"):
         raise KernelFitError(f'search: got {search!r}, expected "hierarchical" or "exhaustive"')
     if first_sample < 2:
         raise KernelFitError(f"first_sample: got {first_sample}, expected at least 2")
     if not (target_samples is None or target_samples > 0):
         raise KernelFitError(f"target_samples: got {target_samples}, expected above 0")
+    blocks = _blocks(target_blocks, relief, bins, transposed=axis in ("y", 0))
     rng = np.random.default_rng(seed)
     if search == "exhaustive":
-        found = kernel_search.exhaustive(relief, buckets, strengths, widths)
+        found = kernel_search.exhaustive(grid)
     else:
-        found = kernel_search.hierarchical(
-            relief, buckets, strengths, widths, first_sample=first_sample, rng=rng
-        )
+        found = kernel_search.hierarchical(grid, first_sample=first_sample, rng=rng)
     with kernels.threads_for(500 * relief.places.size):
-        return kernel_outcome.summarize_search(
-            relief,
-            buckets,
-            strengths,
-            widths,
-            found,
-            search=search,
-            target_samples=target_samples,
-            target_blocks=target_blocks,
-            rng=rng,
+        return summarize_search(
+            grid, found, search=search, target_samples=target_samples, target_blocks=blocks, rng=rng
         )
 
 

@@ -11,8 +11,7 @@ from reconstruction import normal_histogram
 from reconstruction.arrays import Float64Array
 from reconstruction.kernel_fit import errors as kernel_errors
 from reconstruction.kernel_fit import search as kernel_search
-from reconstruction.kernel_fit.neutral_relief import Relief
-from reconstruction.kernel_fit.search import Buckets, Found
+from reconstruction.kernel_fit.search import Found, KernelGrid
 from reconstruction.normal_histogram.statistics import SAMPLES_PER_BUCKET
 
 FINER_ALPHA, FINER_SIGMA = 10, 5
@@ -103,10 +102,7 @@ class KernelFit:
 
 
 def summarize_search(
-    relief: Relief,
-    buckets: Buckets,
-    alphas: Float64Array,
-    sigmas_um: Float64Array,
+    grid: KernelGrid,
     found: Found,
     *,
     search: str,
@@ -118,8 +114,8 @@ def summarize_search(
 
     Parameters
     ----------
-    relief, buckets, alphas, sigmas_um, found
-        Of the search; sigmas in um.
+    grid, found
+        Of the search.
     search : str
         Its name.
     target_samples : float or None
@@ -130,66 +126,51 @@ def summarize_search(
     rng
         Draws histograms for the standard errors.
     """
-    start = relief.along, relief.across
+    relief, target = grid.relief, grid.buckets.target
+    alphas, sigmas_um = grid.alphas, grid.sigmas_um
     samples = relief.places.size
-    still = np.zeros(samples, np.float32)
-    before = float(buckets.distances(start, (still, still), np.zeros(1))[0])
+    before = float(grid.distances(sigmas_um[0], np.zeros(1))[0])
     i, j = found.best
     alpha, sigma, distance = float(alphas[j]), float(sigmas_um[i]), float(found.distance[i, j])
-    blocks = kernel_errors.of_kernel(relief, buckets, alpha, sigma)
+    blocks = kernel_errors.of_kernel(grid, alpha, sigma)
     effective, occupied = blocks.effective_samples, blocks.occupied
     theirs = effective if target_samples is None else float(target_samples)
-    noise = blocks.noise(buckets.target, theirs)
-    floor = normal_histogram.noise_floor(buckets.target, effective, theirs)
-    rows, columns = kernel_errors.nearly_as_good(found, alphas, sigmas_um, noise).T
+    noise = blocks.noise(target, theirs)
+    floor = normal_histogram.noise_floor(target, effective, theirs)
+    rows, columns = kernel_errors.nearly_as_good(grid, found, noise).T
     near = np.stack([alphas[columns], sigmas_um[rows], found.distance[rows, columns]], axis=1)
     reason = ""
     if np.ptp(relief.along) == 0.0 and np.ptp(relief.across) == 0.0:
         reason = "the neutral relief is flat: every kernel leaves it so"
-    elif occupied == 1 and np.count_nonzero(buckets.target) == 1 and distance in (0.0, 2.0):
+    elif occupied == 1 and np.count_nonzero(target) == 1 and distance in (0.0, 2.0):
         reason = "one bucket holds everything"
     elif float(found.distance.max()) - distance <= noise:
         reason = "the distance does not depend on the kernel beyond its noise"
-    refined = (alpha, sigma, distance)
-    told = kernel_errors.HalfWidths((math.inf, math.inf), (math.inf, math.inf))
-    if not reason:
-        refined = _refined(relief, buckets, alphas, sigmas_um, (i, j), distance)
-        pair = None
-        if target_blocks is not None:
-            pair = kernel_errors.widths_of_pair(
-                relief,
-                buckets,
-                found,
-                alphas,
-                sigmas_um,
-                noise=noise,
-                target_blocks=target_blocks,
-                growth=blocks.growth,
-                rng=rng,
-            )
-        told = pair or kernel_errors.widths_of_best(
-            relief,
-            buckets,
-            found,
-            alphas,
-            sigmas_um,
-            noise=noise,
-            scatter=blocks.scatter(theirs),
-            rng=rng,
+    if reason:
+        alpha, distance = 0.0, before
+        refined = (alpha, sigma, distance)
+        told = kernel_errors.HalfWidths((math.inf, math.inf), (math.inf, math.inf))
+    else:
+        refined = _refined(grid, (i, j), distance)
+        pair = target_blocks is not None and kernel_errors.widths_of_pair(
+            grid, found, noise=noise, target_blocks=target_blocks, growth=blocks.growth, rng=rng
         )
-        told = kernel_errors.of_grid(told, alphas, sigmas_um)
+        told = pair or kernel_errors.widths_of_best(
+            grid, found, noise=noise, scatter=blocks.scatter(theirs), rng=rng
+        )
+        told = kernel_errors.of_grid(told, grid)
     return KernelFit(
-        alpha=alpha if not reason else 0.0,
+        alpha=alpha,
         sigma_um=sigma,
-        distance=distance if not reason else before,
+        distance=distance,
         near_best=near,
         valid=not reason,
         noise=noise,
         floor=floor,
         distance_before=before,
-        alpha_refined=refined[0] if not reason else 0.0,
+        alpha_refined=refined[0],
         sigma_refined_um=refined[1],
-        distance_refined=refined[2] if not reason else before,
+        distance_refined=refined[2],
         alpha_stderr=told.alpha[0],
         sigma_stderr_um=told.sigma_um[0],
         alpha_95=told.alpha[1],
@@ -208,20 +189,14 @@ def summarize_search(
 
 
 def _refined(
-    relief: Relief,
-    buckets: Buckets,
-    alphas: Float64Array,
-    sigmas: Float64Array,
-    best: tuple[int, int],
-    distance: float,
+    grid: KernelGrid, best: tuple[int, int], distance: float
 ) -> tuple[float, float, float]:
     """Return the best of a finer grid that spans one step to either side, within the grid."""
     i, j = best
-    result = (float(alphas[j]), float(sigmas[i]), distance)
-    fine_alpha = _finer(alphas, j, FINER_ALPHA)
-    for sigma in _finer(sigmas, i, FINER_SIGMA):
-        change = relief.change(float(sigma))
-        found = buckets.distances((relief.along, relief.across), change, fine_alpha)
+    result = (float(grid.alphas[j]), float(grid.sigmas_um[i]), distance)
+    fine_alpha = _finer(grid.alphas, j, FINER_ALPHA)
+    for sigma in _finer(grid.sigmas_um, i, FINER_SIGMA):
+        found = grid.distances(sigma, fine_alpha)
         k = int(np.argmin(found))
         if found[k] < result[2] - kernel_search.TIE_TOL:
             result = (float(fine_alpha[k]), float(sigma), float(found[k]))

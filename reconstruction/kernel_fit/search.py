@@ -55,6 +55,10 @@ class KernelSearchError(ValueError):
     """A search for kernels without anything to search."""
 
 
+Slopes = tuple[Float32Array, Float32Array]
+"""Along and across the axis of the kernel."""
+
+
 @dataclass(frozen=True, slots=True)
 class Buckets:
     """The target of a search.
@@ -71,25 +75,39 @@ class Buckets:
     bins: int
     limit: float
 
-    def count(
-        self,
-        start: tuple[Float32Array, Float32Array],
-        change: tuple[Float32Array, Float32Array],
-        alphas: Float64Array,
-    ) -> Int32Array:
+    def count(self, start: Slopes, change: Slopes, alphas: Float64Array) -> Int32Array:
         """Count the samples of each alpha, in parts: (parts, A, bins ** 2 + 1)."""
         given = alphas.astype(np.float32)
         parts = kernels.threads()
         return kernels.count_kernels(*start, *change, given, self.bins, self.limit, parts)
 
-    def distances(
-        self,
-        start: tuple[Float32Array, Float32Array],
-        change: tuple[Float32Array, Float32Array],
-        alphas: Float64Array,
-    ) -> Float64Array:
+
+@dataclass(frozen=True, slots=True)
+class KernelGrid:
+    """Kernels that change a relief, and the target that its normals shall come to.
+
+    Attributes
+    ----------
+    relief : Relief
+    buckets : Buckets
+    alphas, sigmas_um : ndarray of float64, shapes (A,), (S,)
+        Increasing.
+    """
+
+    relief: Relief
+    buckets: Buckets
+    alphas: Float64Array
+    sigmas_um: Float64Array
+
+    def count(self, sigma_um: float, alphas: Float64Array) -> Int32Array:
+        """Count all pixels of the relief that kernels of one sigma have changed, in parts."""
+        relief = self.relief
+        change = relief.change(float(sigma_um))
+        return self.buckets.count((relief.along, relief.across), change, alphas)
+
+    def distances(self, sigma_um: float, alphas: Float64Array) -> Float64Array:
         """Return eq. (7)'s sum for each alpha."""
-        return kernels.distances(self.count(start, change, alphas), self.target)
+        return kernels.distances(self.count(sigma_um, alphas), self.buckets.target)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,24 +135,17 @@ class Found:
     passes: float
     counts: dict[tuple[int, int], Int32Array] = field(default_factory=dict)
 
-    def shares(
-        self,
-        relief: Relief,
-        buckets: Buckets,
-        sigmas_um: Float64Array,
-        alphas: Float64Array,
-        wanted: Int64Array,
-    ) -> Float64Array:
+    def shares(self, grid: KernelGrid, wanted: Int64Array) -> Float64Array:
         """Return histograms of kernels, (K, buckets), counting what the search has not kept.
 
         Parameters
         ----------
-        relief, buckets, sigmas_um, alphas
+        grid
             Of the search.
         wanted : ndarray, shape (K, 2)
             Indices (sigma, alpha).
         """
-        out = np.empty((len(wanted), buckets.target.size))
+        out = np.empty((len(wanted), grid.buckets.target.size))
         missing = []
         for row, (i, j) in enumerate(wanted.tolist()):
             kept = self.counts.get((i, j))
@@ -145,10 +156,8 @@ class Found:
         rows = np.array(missing, int)
         for i in np.unique(wanted[rows, 0]):
             some = rows[wanted[rows, 0] == i]
-            start = relief.along, relief.across
-            change = relief.change(float(sigmas_um[i]))
-            out[some] = buckets.count(start, change, alphas[wanted[some, 1]]).sum(axis=0)
-        return out / relief.places.size
+            out[some] = grid.count(grid.sigmas_um[i], grid.alphas[wanted[some, 1]]).sum(axis=0)
+        return out / grid.relief.places.size
 
 
 def gentlest(
@@ -171,36 +180,25 @@ def gentlest(
     return int(i[order[0]]), int(j[order[0]])
 
 
-def exhaustive(
-    relief: Relief, buckets: Buckets, alphas: Float64Array, sigmas_um: Float64Array
-) -> Found:
+def exhaustive(grid: KernelGrid) -> Found:
     """Evaluate all kernels of the grid on all pixels."""
-    start = relief.along, relief.across
-    distance = np.empty((sigmas_um.size, alphas.size))
-    with kernels.threads_for(relief.places.size * distance.size):
-        for i, sigma in enumerate(sigmas_um):
-            distance[i] = buckets.distances(start, relief.change(float(sigma)), alphas)
-    best = gentlest(distance, alphas, sigmas_um)
+    distance = np.empty((grid.sigmas_um.size, grid.alphas.size))
+    with kernels.threads_for(grid.relief.places.size * distance.size):
+        for i, sigma in enumerate(grid.sigmas_um):
+            distance[i] = grid.distances(sigma, grid.alphas)
+    best = gentlest(distance, grid.alphas, grid.sigmas_um)
     return Found(distance, np.ones(distance.shape, bool), best, float(distance.size))
 
 
 def hierarchical(
-    relief: Relief,
-    buckets: Buckets,
-    alphas: Float64Array,
-    sigmas_um: Float64Array,
-    *,
-    first_sample: int = FIRST_SAMPLE,
-    rng: np.random.Generator,
+    grid: KernelGrid, *, first_sample: int = FIRST_SAMPLE, rng: np.random.Generator
 ) -> Found:
     """Find what :func:`exhaustive` does, but for a chance of `MAX_MISS_PROBABILITY`.
 
     Parameters
     ----------
-    relief, buckets
-        What is convolved, and what it shall come to.
-    alphas, sigmas_um : ndarray, shapes (A,), (S,)
-        The grid.
+    grid
+        What is convolved with which kernels, and what it shall come to.
     first_sample : int
         Pixels that all kernels are evaluated on; grows by `SAMPLE_GROWTH` from one round to the
         next.
@@ -208,37 +206,34 @@ def hierarchical(
         Draws the pixels. The result does not depend on it, but for the chance
         `MAX_MISS_PROBABILITY`.
     """
-    pixels = relief.places.size
+    pixels = grid.relief.places.size
     if first_sample >= MAX_SAMPLE_FRACTION * pixels:
-        return exhaustive(relief, buckets, alphas, sigmas_um)
+        return exhaustive(grid)
     sizes = [first_sample]
     while sizes[-1] * SAMPLE_GROWTH < MAX_SAMPLE_FRACTION * pixels:
         sizes.append(int(sizes[-1] * SAMPLE_GROWTH))
-    with kernels.threads_for(first_sample * alphas.size * sigmas_um.size):
-        return _Race(relief, buckets, alphas, sigmas_um).run(sizes, rng)
+    with kernels.threads_for(first_sample * grid.alphas.size * grid.sigmas_um.size):
+        return _Race(grid).run(sizes, rng)
 
 
 class _Race:
     """State of a hierarchical search."""
 
-    def __init__(
-        self, relief: Relief, buckets: Buckets, alphas: Float64Array, sigmas: Float64Array
-    ) -> None:
-        shape = (sigmas.size, alphas.size)
-        self.relief, self.buckets, self.alphas, self.sigmas = relief, buckets, alphas, sigmas
+    def __init__(self, grid: KernelGrid) -> None:
+        shape = (grid.sigmas_um.size, grid.alphas.size)
+        self.grid, self.alphas, self.sigmas = grid, grid.alphas, grid.sigmas_um
         self.low = np.zeros(shape)  # distances are at least this
         self.guess = np.full(shape, np.inf)  # on the largest sample so far
         self.level = np.zeros(shape, int)  # which sample that was
         self.exact = np.zeros(shape, bool)
         self.distance = np.full(shape, np.inf)  # exact ones
         self.counts: dict[tuple[int, int], Int32Array] = {}
-        self.signs: list[
-            Float64Array
-        ] = []  # of target - histogram, of kernels evaluated on all pixels
+        # of target - histogram, of kernels evaluated on all pixels
+        self.signs: list[Float64Array] = []
         self.passes = 0.0
 
     def run(self, sizes: list[int], rng: np.random.Generator) -> Found:
-        pixels = self.relief.places.size
+        pixels = self.grid.relief.places.size
         order = rng.permutation(pixels)[: sizes[-1]]
         tests = self.low.size * len(sizes) * (1 + N_ANCHORS)
         log = math.log(tests / MAX_MISS_PROBABILITY)
@@ -269,7 +264,7 @@ class _Race:
         return ~self.exact & (self.low <= self.distance.min())
 
     def _sample(self, chosen: Int64Array, before: int, log: float, number: int) -> None:
-        relief, target = self.relief, self.buckets.target
+        relief, buckets = self.grid.relief, self.grid.buckets
         pixels, m = relief.places.size, chosen.size
         rest, fresh = pixels - before, m - before
         # Serfling's bound, of the mean over what was not drawn before
@@ -277,7 +272,7 @@ class _Race:
             math.sqrt(2.0 * log * (1.0 - (fresh - 1) / rest) / fresh) * rest / pixels
             + DISTANCE_ROUNDING
         )
-        signs = np.array(self.signs).reshape(-1, target.size)
+        signs = np.array(self.signs).reshape(-1, buckets.target.size)
         start = relief.along[chosen], relief.across[chosen]
         old = start[0][:before], start[1][:before]
         new = start[0][before:], start[1][before:]
@@ -285,9 +280,9 @@ class _Race:
         for i in np.flatnonzero(self._open.any(axis=1)):
             j = np.flatnonzero(self._open[i])
             da, db = change.at(float(self.sigmas[i]))
-            first = self.buckets.count(old, (da[:before], db[:before]), self.alphas[j])
-            second = self.buckets.count(new, (da[before:], db[before:]), self.alphas[j])
-            found = kernels.bounds(first, second, target, before, fresh, pixels, signs)
+            first = buckets.count(old, (da[:before], db[:before]), self.alphas[j])
+            second = buckets.count(new, (da[before:], db[before:]), self.alphas[j])
+            found = kernels.bounds(first, second, buckets.target, before, fresh, pixels, signs)
             self.guess[i, j], low = found.T
             self.level[i, j] = number
             self.low[i, j] = np.maximum(self.low[i, j], low - slack)
@@ -309,11 +304,9 @@ class _Race:
                 self._evaluate(i, np.array([j]), j)
 
     def _evaluate(self, i: int, j: Int64Array, keep: int | None = None) -> None:
-        relief = self.relief
-        counts = self.buckets.count(
-            (relief.along, relief.across), relief.change(float(self.sigmas[i])), self.alphas[j]
-        )
-        self.distance[i, j] = kernels.distances(counts, self.buckets.target)
+        target = self.grid.buckets.target
+        counts = self.grid.count(self.sigmas[i], self.alphas[j])
+        self.distance[i, j] = kernels.distances(counts, target)
         self.exact[i, j] = True
         self.passes += j.size
         whole = counts.sum(axis=0, dtype=np.int32)
@@ -321,8 +314,8 @@ class _Race:
             if (len(self.counts) + 1) * whole[row].nbytes <= KEPT_BYTES:
                 self.counts[i, column] = whole[row]
         if keep is not None:
-            shares = whole[list(j).index(keep)] / relief.places.size
-            self.signs.append(np.sign(self.buckets.target - shares))
+            shares = whole[list(j).index(keep)] / self.grid.relief.places.size
+            self.signs.append(np.sign(target - shares))
 
     def _finish(self) -> None:
         """Evaluate the open ones, most promising sigma first."""

@@ -149,28 +149,27 @@ def fit_table(
         raise KernelTableFitError("stretch: got no point beside the neutral one")
     order = np.argsort(r)
     r, a, s, w, low, high = r[order], a[order], s[order], w[order], low[order], high[order]
-    fits: dict[int, tuple[Float64Array, float]] = {}
+    points = _Points(r, a, w[:, 0])
+    fits: dict[int, _AlphaFit] = {}
     criterion = {}
     n = r.size
     for segments in range(1, max_segments + 1):
-        fit = _fit_alpha(r, a, w[:, 0], segments, least_points)
+        fit = points.fitted(segments, least_points)
         if fit is None or n <= 2 * segments - 1:
             continue
         fits[segments] = fit
         # mean of the squares, with a floor for points that lie on lines
-        mean = max(fit[1] / w[:, 0].sum(), 1e-12)
+        mean = max(fit.rss / points.w.sum(), 1e-12)
         criterion[segments] = n * math.log(mean) + (2 * segments - 1) * math.log(n)
     if not fits:
         raise KernelTableFitError(f"alpha: got {n} points, expected more than a line's one slope")
     segments = min(criterion, key=lambda k: criterion[k])
-    theta, rss = fits[segments]
-    slopes, breaks = theta[:segments], theta[segments:]
-    covariance = _alpha_covariance(r, a, w[:, 0], theta, segments, rss)
-    lines = _lines(slopes, breaks)
+    lines = fits[segments]
+    covariance = lines.covariance()
     branches = [_fit_sigma(r[side], s[side], w[side, 1]) for side in (low, high)]
     table = KernelTable(
-        alpha_breaks=tuple(breaks.tolist()),
-        alpha_lines=lines,
+        alpha_breaks=tuple(lines.breaks.tolist()),
+        alpha_lines=_lines(lines.slopes, lines.breaks),
         sigma_compression_um=branches[0][0],
         sigma_stretch_um=branches[1][0],
         stretch_range=(min(float(r[0]), 1.0), max(float(r[-1]), 1.0)),
@@ -180,10 +179,10 @@ def fit_table(
         table=table,
         segments=segments,
         criterion=criterion,
-        alpha_rms=math.sqrt(rss / w[:, 0].sum()),
+        alpha_rms=math.sqrt(lines.rss / points.w.sum()),
         sigma_rms_um=(branches[0][3], branches[1][3]),
         alpha_stderr=tuple(np.sqrt(np.diag(covariance)).tolist()),
-        break_stderr=_break_stderr(r, a, w[:, 0], theta, segments, rss),
+        break_stderr=lines.break_stderr(),
         sigma_compression_stderr_um=branches[0][1],
         sigma_stretch_stderr_um=branches[1][1],
         sigma_compression_covariance_um2=branches[0][2],
@@ -217,108 +216,111 @@ def _lines(slopes: Float64Array, breaks: Float64Array) -> tuple[tuple[float, flo
     return tuple(lines)
 
 
-def _fit_slopes(
-    r: Float64Array, a: Float64Array, w: Float64Array, breaks: Float64Array
-) -> tuple[Float64Array, BoolArray, float]:
-    """Return slopes of least squares, which points inform them, and the sum of squares.
+@dataclass(frozen=True, slots=True)
+class _Points:
+    """Stretches, strengths and weights that lines are fitted to."""
 
-    A point on a limit where the lines go beyond it is met exactly, and says nothing more.
-    """
-    X, root = _design(r, breaks), np.sqrt(w)
-    used = np.ones(r.size, bool)
-    best: tuple[Float64Array, BoolArray, float] | None = None
-    for _ in range(8):
-        solved = np.linalg.lstsq(root[used, None] * X[used], root[used] * a[used])[0]
-        slopes = np.asarray(solved, np.float64)
-        line = X @ slopes
-        beyond = ((a <= ALPHA_LIMITS[0]) & (line < a)) | ((a >= ALPHA_LIMITS[1]) & (line > a))
-        rss = float(np.sum(w * (np.clip(line, *ALPHA_LIMITS) - a) ** 2))
-        if best is None or rss < best[2]:
-            best = slopes, ~beyond, rss
-        if (used == ~beyond).all() or beyond.all():
-            break
-        used = ~beyond
-    assert best is not None  # noqa: S101
-    return best
+    r: Float64Array
+    a: Float64Array
+    w: Float64Array
 
+    def slopes(self, breaks: Float64Array) -> tuple[Float64Array, BoolArray, float]:
+        """Return slopes of least squares, which points inform them, and the sum of squares.
 
-def _fit_alpha(
-    r: Float64Array, a: Float64Array, w: Float64Array, segments: int, least_points: int
-) -> tuple[Float64Array, float] | None:
-    """Return slopes, then breaks, of least squares, and the sum of squares; None without room."""
+        A point on a limit where the lines go beyond it is met exactly, and says nothing more.
+        """
+        a, X, root = self.a, _design(self.r, breaks), np.sqrt(self.w)
+        used = np.ones(a.size, bool)
+        best: tuple[Float64Array, BoolArray, float] | None = None
+        for _ in range(8):
+            solved = np.linalg.lstsq(root[used, None] * X[used], root[used] * a[used])[0]
+            slopes = np.asarray(solved, np.float64)
+            line = X @ slopes
+            beyond = ((a <= ALPHA_LIMITS[0]) & (line < a)) | ((a >= ALPHA_LIMITS[1]) & (line > a))
+            rss = float(np.sum(self.w * (np.clip(line, *ALPHA_LIMITS) - a) ** 2))
+            if best is None or rss < best[2]:
+                best = slopes, ~beyond, rss
+            if (used == ~beyond).all() or beyond.all():
+                break
+            used = ~beyond
+        assert best is not None  # noqa: S101
+        return best
 
-    def tried(breaks: Float64Array) -> tuple[float, Float64Array]:
-        if (np.diff(breaks) <= 0).any():
-            return math.inf, breaks
-        slopes, informing, rss = _fit_slopes(r, a, w, breaks)
-        edges = np.concatenate([[-np.inf], breaks, [np.inf]])
-        points = np.append(r[informing], 1.0)
-        for first, last in pairwise(edges):
-            if np.count_nonzero((points >= first) & (points <= last)) < least_points:
-                return math.inf, breaks
-        return rss, np.concatenate([slopes, breaks])
+    def fitted(self, segments: int, least_points: int) -> _AlphaFit | None:
+        """Return lines and breaks of least squares; None without room."""
 
-    span = r[0], max(r[-1], 1.0)
-    places = np.union1d(np.linspace(min(span[0], 1.0), span[1], BREAK_GRID), r)
-    found = [tried(np.array(chosen)) for chosen in combinations(places, segments - 1)]
-    rss, theta = min(found, key=lambda pair: pair[0])
-    if not math.isfinite(rss):
-        return None
-    step = (span[1] - min(span[0], 1.0)) / BREAK_GRID
-    for _ in range(3):  # finer around the best, one break at a time
-        for k in range(segments, 2 * segments - 1):
-            for place in np.linspace(theta[k] - step, theta[k] + step, 41):
-                breaks = theta[segments:].copy()
-                breaks[k - segments] = place
-                other = tried(breaks)
-                if other[0] < rss - 1e-15:
-                    rss, theta = other
-        step /= 10.0
-    return theta, rss
+        def tried(breaks: Float64Array) -> _AlphaFit:
+            none = _AlphaFit(self, breaks, breaks, math.inf)
+            if (np.diff(breaks) <= 0).any():
+                return none
+            slopes, informing, rss = self.slopes(breaks)
+            edges = np.concatenate([[-np.inf], breaks, [np.inf]])
+            points = np.append(self.r[informing], 1.0)
+            for first, last in pairwise(edges):
+                if np.count_nonzero((points >= first) & (points <= last)) < least_points:
+                    return none
+            return _AlphaFit(self, slopes, breaks, rss)
 
-
-def _alpha_covariance(
-    r: Float64Array,
-    a: Float64Array,
-    w: Float64Array,
-    theta: Float64Array,
-    segments: int,
-    rss: float,
-) -> Float64Array:
-    """Return the covariance of the slopes at these breaks; infinite where no point is left over."""
-    slopes, informing, _ = _fit_slopes(r, a, w, theta[segments:])
-    X = _design(r, theta[segments:])[informing]
-    free = r.size - theta.size
-    if free <= 0 or np.linalg.matrix_rank(X) < slopes.size:
-        return np.diag(np.full(segments, np.inf))
-    return np.asarray(np.linalg.inv((X * w[informing, None]).T @ X) * rss / free)
+        low, high = min(self.r[0], 1.0), max(self.r[-1], 1.0)
+        places = np.union1d(np.linspace(low, high, BREAK_GRID), self.r)
+        found = [tried(np.array(chosen)) for chosen in combinations(places, segments - 1)]
+        best = min(found, key=lambda fit: fit.rss)
+        if not math.isfinite(best.rss):
+            return None
+        step = (high - low) / BREAK_GRID
+        for _ in range(3):  # finer around the best, one break at a time
+            for k in range(segments - 1):
+                for place in np.linspace(best.breaks[k] - step, best.breaks[k] + step, 41):
+                    other = tried(best.moved(k, place))
+                    if other.rss < best.rss - 1e-15:
+                        best = other
+            step /= 10.0
+        return best
 
 
-def _break_stderr(
-    r: Float64Array,
-    a: Float64Array,
-    w: Float64Array,
-    theta: Float64Array,
-    segments: int,
-    rss: float,
-) -> tuple[float, ...]:
-    """Return half of the ways that breaks can move until the misfit grows by one residual's."""
-    free = r.size - theta.size
-    if free <= 0:
-        return (math.inf,) * (segments - 1)
-    widths = []
-    places = np.linspace(r[0], r[-1], 400)
-    for k in range(segments - 1):
-        near = [float(theta[segments + k])]
-        for place in places:
-            breaks = theta[segments:].copy()
-            breaks[k] = place
-            if (np.diff(breaks) > 0).all() and _fit_slopes(r, a, w, breaks)[2] <= rss * (
-                1.0 + 1.0 / free
-            ):
-                near.append(float(place))
-        widths.append(0.5 * (max(near) - min(near)))
-    return tuple(widths)
+@dataclass(frozen=True, slots=True)
+class _AlphaFit:
+    """Lines of least squares, with the sum of squares that they leave."""
+
+    points: _Points
+    slopes: Float64Array
+    breaks: Float64Array
+    rss: float
+
+    @property
+    def free(self) -> int:
+        """Degrees of freedom."""
+        return self.points.r.size - self.slopes.size - self.breaks.size
+
+    def moved(self, k: int, place: float) -> Float64Array:
+        """Return the breaks with one of them elsewhere."""
+        breaks = self.breaks.copy()
+        breaks[k] = place
+        return breaks
+
+    def covariance(self) -> Float64Array:
+        """Return that of the slopes at these breaks; infinite where no point is left over."""
+        slopes, informing, _ = self.points.slopes(self.breaks)
+        X = _design(self.points.r, self.breaks)[informing]
+        if self.free <= 0 or np.linalg.matrix_rank(X) < slopes.size:
+            return np.diag(np.full(slopes.size, np.inf))
+        weighted = X * self.points.w[informing, None]
+        return np.asarray(np.linalg.inv(weighted.T @ X) * self.rss / self.free)
+
+    def break_stderr(self) -> tuple[float, ...]:
+        """Return half of the ways that breaks can move until the misfit grows by one residual's."""
+        if self.free <= 0:
+            return (math.inf,) * self.breaks.size
+        most = self.rss * (1.0 + 1.0 / self.free)
+        widths = []
+        for k in range(self.breaks.size):
+            near = [float(self.breaks[k])]
+            for place in np.linspace(self.points.r[0], self.points.r[-1], 400):
+                breaks = self.moved(k, place)
+                if (np.diff(breaks) > 0).all() and self.points.slopes(breaks)[2] <= most:
+                    near.append(float(place))
+            widths.append(0.5 * (max(near) - min(near)))
+        return tuple(widths)
 
 
 def _fit_sigma(

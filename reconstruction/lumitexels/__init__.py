@@ -8,6 +8,5 @@ from reconstruction.lumitexels.samples import (
     Visibility,
     visibility,
 )
-from reconstruction.lumitexels.store import gather
 
-__all__ = ["Camera", "Lights", "Lumitexels", "Surface", "Visibility", "gather", "visibility"]
+__all__ = ["Camera", "Lights", "Lumitexels", "Surface", "Visibility", "visibility"]

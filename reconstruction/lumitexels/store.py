@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int32Array
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.lumitexels.ray_casting import RayCaster
 from reconstruction.lumitexels.samples import (
     MIN_VISIBLE_COSINE,
@@ -33,7 +33,6 @@ BYTES_PER_SAMPLE: Final = 57
 """Of one sample of `Lumitexels`."""
 MAX_CACHED_BYTES: Final = 2**28
 """Up to this size chunks are kept for the next estimate, unless the tables are on disk."""
-Image = tuple[FloatArray, FloatArray, BoolArray | None]
 """Signal and its variance, shape (H, W, 3), and the pixels that are good or None for all."""
 
 
@@ -105,10 +104,6 @@ class LumitexelStore:
     def view_count(self) -> int:
         """Number of cameras."""
         return len(self._cameras)
-
-    def seen_by(self, view: int) -> Int32Array:
-        """Return the indices of the points that a camera sees."""
-        return self._rows[view]
 
     def add(
         self,
@@ -367,61 +362,3 @@ def _assemble(  # type: ignore[no-untyped-def]
                 f[p, m, c] = table[m, 0, k, c] * scale[m, 0] * over
                 spread = table[m, 1, k, c] * scale[m, 1] * over
                 variance[p, m, c] = spread * spread
-
-
-def gather(
-    surface: Surface,
-    *,
-    cameras: Sequence[Camera],
-    lights: Lights,
-    images: Callable[[int, int], Image | None],
-    caster: RayCaster,
-    poses: ArrayLike | None = None,
-    binning: int = 1,
-    light_radius_mm: float = 0.0,
-    offset_mm: float = SHADOW_RAY_OFFSET_MM,
-) -> Lumitexels:
-    """Gather the lumitexels of a surface that fit into memory (about 60 bytes a sample).
-
-    Parameters
-    ----------
-    surface : Surface
-    cameras : sequence of Camera
-    lights : Lights
-    images : callable
-        Returns signal, variance and good pixels (or None) of view and light by their indices, or
-        None where there is no such frame.
-    caster : RayCaster
-        What may cast shadows.
-    poses : array_like, shape (L, 4, 4) or (V L, 4, 4), optional
-        Motion of the subject: matrices that take the points to where they were in each frame.
-    binning : int
-        Camera pixels along each side of an image pixel: 2 for images of 2 x 2 cells.
-    light_radius_mm, offset_mm : float
-        See `visibility`.
-
-    Returns
-    -------
-    Lumitexels
-
-    See Also
-    --------
-    reconstruction.lumitexels.store.LumitexelStore : for any number of points.
-    """
-    store = LumitexelStore(
-        surface,
-        cameras=cameras,
-        lights=lights,
-        caster=caster,
-        poses=poses,
-        binning=binning,
-        light_radius_mm=light_radius_mm,
-        offset_mm=offset_mm,
-        dtype=np.float32,
-    )
-    for view in range(len(cameras)):
-        for light in range(store.light_count):
-            image = images(view, light)
-            if image is not None:
-                store.add(view, light, *image)
-    return store.chunk(0, len(surface))

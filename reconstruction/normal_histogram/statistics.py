@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reconstruction.arrays import BoolArray, Float64Array
+from reconstruction.arrays import Float64Array
 from reconstruction.normal_histogram import kernels
 from reconstruction.normal_histogram.blocks import (
     BLOCKS_PER_SIDE,
@@ -21,12 +21,7 @@ from reconstruction.normal_histogram.blocks import (
     effective_number,
 )
 from reconstruction.normal_histogram.counting import check_buckets, shares_of
-from reconstruction.normal_histogram.relief_slopes import (
-    SlopeError,
-    slopes,
-    slopes_of_normals,
-    turned,
-)
+from reconstruction.normal_histogram.relief_slopes import slopes, turned
 
 SAMPLES_PER_BUCKET = 16.0
 """Mean number of samples in an occupied bucket below which a histogram is called aliased: its
@@ -57,7 +52,7 @@ class NormalStatistics:
         Of n_x and n_y (n_s, n_t on turned axes) about their means, over all samples.
     stderr_x, stderr_y : float
         Standard errors of the variances, of what another patch of the same skin and size would
-        show (`reconstruction.normal_histogram.block_errors`); infinite below five blocks.
+        show (`reconstruction.normal_histogram.blocks.stderr_of_mean`); infinite below five blocks.
     """
 
     histogram: Float64Array
@@ -112,56 +107,18 @@ def measure(
     >>> found.samples, found.occupied, round(found.variance_x, 4), found.variance_y
     (1600, 4, 0.0458, 0.0)
     """
-    a, b, known = slopes(height, pixel=pixel, y_up=y_up, valid=valid)
-    return _measured(*turned(a, b, angle_rad), known, bins, limit, blocks)
-
-
-def measure_normals(
-    normals: ArrayLike,
-    *,
-    bins: int = 64,
-    limit: float = 1.0,
-    valid: ArrayLike | None = None,
-    angle_rad: float = 0.0,
-    blocks: int = BLOCKS_PER_SIDE,
-) -> NormalStatistics:
-    """Return what :func:`measure` does, of a map of normals.
-
-    Parameters
-    ----------
-    normals : array_like, shape (H, W, 3)
-        As of `relief_slopes.slopes_of_normals`.
-    bins, limit, valid, angle_rad, blocks
-        As of :func:`measure`.
-
-    Returns
-    -------
-    NormalStatistics
-
-    Raises
-    ------
-    HistogramError, SlopeError
-        As of :func:`measure`.
-    """
-    if np.ndim(normals) != 3:
-        raise SlopeError(f"normals: got shape {np.shape(normals)}, expected (H, W, 3)")
-    a, b, known = slopes_of_normals(normals, valid=valid)
-    return _measured(*turned(a, b, angle_rad), known, bins, limit, blocks)
-
-
-def _measured(
-    a: Float64Array, b: Float64Array, known: BoolArray, bins: int, limit: float, blocks: int
-) -> NormalStatistics:
-    group, groups = block_of(np.flatnonzero(known), (known.shape[0], known.shape[1]), blocks)
-    p, q = a[known], b[known]
     check_buckets(bins, limit)
+    a, b, known = slopes(height, pixel=pixel, y_up=y_up, valid=valid)
+    a, b = turned(a, b, angle_rad)
+    shape = (known.shape[0], known.shape[1])
+    group, groups = block_of(np.flatnonzero(known), shape, blocks)
+    p, q = a[known], b[known]
     counts = kernels.count_in_groups(p, q, group, groups, bins, float(limit))
     outside = int(counts[:, -1].sum())
     counts = counts[:, :-1]
     shares = shares_of(counts.sum(axis=0)).reshape(bins, bins)
     w = 1.0 / np.sqrt(1.0 + p * p + q * q)
     x, y = -p * w, -q * w
-    shape = (known.shape[0], known.shape[1])
     errors = [block_error((m - m.mean()) ** 2, group, groups, shape, blocks) for m in (x, y)]
     growth = 0.5 * (errors[0][1] + errors[1][1])
     samples = int(counts.sum())

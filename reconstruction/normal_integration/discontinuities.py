@@ -17,6 +17,7 @@ from numba import njit, prange
 from numpy.typing import ArrayLike
 
 from reconstruction.arrays import BoolArray, Float32Array, FloatArray, Int32Array
+from reconstruction.checks import require_settings
 from reconstruction.normal_integration import slope_fields
 from reconstruction.normal_integration.integration import parts, to_height
 from reconstruction.normal_integration.slope_fields import Perspective, SlopeField
@@ -100,16 +101,14 @@ class Bilateral:
 
     def __post_init__(self) -> None:
         """Refuse settings out of range."""
-        for name, good, expected in (
+        require_settings(
+            self,
+            IntegrationError,
             ("sharpness", 0.0 < self.sharpness < np.inf, "above 0 and finite"),
             ("rounds", self.rounds >= 1, "at least 1"),
             ("stop", 0.0 <= self.stop < 1.0, "in [0, 1)"),
             ("inner", self.inner >= 1, "at least 1"),
-        ):
-            if not good:
-                raise IntegrationError(
-                    f"Bilateral.{name}: got {getattr(self, name)}, expected {expected}"
-                )
+        )
 
 
 @dataclass(frozen=True, slots=True)

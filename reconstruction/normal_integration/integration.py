@@ -2,13 +2,14 @@
 
 The slopes that the normals give are integrated by weighted least squares over any mask, for
 parallel rays or a pinhole camera. See `discontinuity_integration` for surfaces that jump,
-`height_filters` for what follows, `height_errors` for standard errors.
+`height_filters` for what follows, `relief_errors` for standard errors.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray, Int32Array
+from reconstruction.checks import require_settings
 from reconstruction.normal_integration import slope_fields
 from reconstruction.normal_integration.height_filters import denoise_slopes
 from reconstruction.normal_integration.slope_fields import Perspective, SlopeField
@@ -26,16 +28,6 @@ from reconstruction.normal_integration.weighted_poisson import (
     solve,
 )
 from reconstruction.normal_maps import NormalMaps
-
-__all__ = [
-    "HeightMap",
-    "IntegrationError",
-    "NotConverged",
-    "Perspective",
-    "Settings",
-    "integrate",
-    "integrate_map",
-]
 
 Method = Literal["auto", "multigrid", "dct"]
 
@@ -64,15 +56,13 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Refuse settings out of range."""
-        for name, good, expected in (
+        require_settings(
+            self,
+            IntegrationError,
             ("tolerance", 0.0 < self.tolerance < 1.0, "in (0, 1)"),
             ("iterations", self.iterations >= 1, "at least 1"),
             ("order", self.order in (2, 4), "2 or 4"),
-        ):
-            if not good:
-                raise IntegrationError(
-                    f"Settings.{name}: got {getattr(self, name)}, expected {expected}"
-                )
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,36 +157,27 @@ def integrate(
     >>> np.round(np.diff(height, axis=1)[0], 6), np.round(np.diff(height, axis=0)[:, 0], 6)
     (array([-0.5, -0.5, -0.5]), array([-1., -1.]))
     """
-    if not isinstance(normals, NormalMaps):
-        stack = np.asarray(normals)
-        if stack.ndim > 3:
-            masks = _for_each("valid", valid, stack.shape[:-1])
-            errors = _for_each("stderr_rad", stderr_rad, stack.shape[:-1])
-            out = np.empty(stack.shape[:-1], np.float32 if stack.dtype == np.float32 else float)
-            for at in np.ndindex(stack.shape[:-3]):
-                out[at] = integrate(
-                    stack[at],
-                    pixel=pixel,
-                    valid=masks(at),
-                    stderr_rad=errors(at),
-                    y_up=y_up,
-                    camera=camera,
-                    method=method,
-                    denoise=denoise,
-                    settings=settings,
-                )
-            return out
-    found = integrate_map(
-        normals,
+    one = partial(
+        integrate_map,
         pixel=pixel,
-        valid=valid,
-        stderr_rad=stderr_rad,
         y_up=y_up,
         camera=camera,
         method=method,
         denoise=denoise,
         settings=settings,
     )
+    if isinstance(normals, NormalMaps) or np.ndim(normals) <= 3:
+        return _converged(one(normals, valid=valid, stderr_rad=stderr_rad))
+    stack = np.asarray(normals)
+    masks = _for_each("valid", valid, stack.shape[:-1])
+    errors = _for_each("stderr_rad", stderr_rad, stack.shape[:-1])
+    out = np.empty(stack.shape[:-1], np.float32 if stack.dtype == np.float32 else float)
+    for at in np.ndindex(stack.shape[:-3]):
+        out[at] = _converged(one(stack[at], valid=masks(at), stderr_rad=errors(at)))
+    return out
+
+
+def _converged(found: HeightMap) -> FloatArray:
     if not found.convergence.converged:
         raise NotConverged(
             f"iterations: residual {found.convergence.residual:.1e} after "

@@ -1,4 +1,4 @@
-"""What the errors of a relief hold beside noise: light and lens that the estimator does not model.
+"""Errors of integrated heights: of slopes with white noise, and of what no estimator models.
 
 Light goes from one wall of a furrow to the other, facets hide one another, and the lens averages
 light where the estimator takes it to average slopes. On simulated patches of forehead, cheek and
@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 
 from reconstruction.arrays import BoolArray, Float32Array, FloatArray
+from reconstruction.normal_integration.height_filters import SIGMA_OF_CUTOFF
 
 RELATIVE_HEIGHT_ERROR: Final = 0.07
 """Error of a height over the standard deviation of the relief."""
@@ -73,3 +74,58 @@ def of_normals(normals: FloatArray, stderr: Float32Array, valid: BoolArray) -> F
     across = np.var(normals[valid][:, :2], axis=0, dtype=np.float64)
     model = RELATIVE_SLOPE_ERROR * float(np.sqrt(across.mean()))
     return np.where(valid, np.hypot(stderr, np.float32(model)), stderr)
+
+
+def expected_rms(
+    shape: tuple[int, int],
+    slope_stderr: float,
+    *,
+    pixel: float = 1.0,
+    cutoff: float | None = None,
+    order: int = 4,
+) -> float:
+    """Return the height's RMS error over a rectangle whose slopes have white noise.
+
+    White noise of slopes becomes noise of heights whose spectrum falls with the square of
+    frequency: most of it is long waves, which `height_filters.high_pass` removes.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        (H, W) of the rectangle; all pixels valid, all weights alike.
+    slope_stderr : float
+        Standard deviation of each of both slopes, dimensionless.
+    pixel : float
+    cutoff : float, optional
+        Of `high_pass`, same unit as `pixel`.
+    order : int
+        Of the quadrature, see `normal_integration.Settings`.
+
+    Returns
+    -------
+    float
+        In the unit of `pixel`; borders are treated as if the picture were mirrored.
+
+    Examples
+    --------
+    Noise of 1.5 degrees' tilt on 2048 x 2048 pixels of 6 um, without what is longer than 1 mm:
+
+    >>> round(expected_rms((2048, 2048), 0.026, pixel=6.0, cutoff=1000.0), 2)
+    0.12
+    """
+    waves = [np.pi * np.arange(n) / n for n in shape]
+    laplacian, power = np.zeros(shape), np.zeros(shape)
+    squared = np.zeros(shape)
+    for axis, theta in enumerate(waves):
+        half = 0.5 * theta
+        mean = np.cos(half) if order == 2 else (13 * np.cos(half) - np.cos(3 * half)) / 12
+        along = (-1, 1) if axis == 0 else (1, -1)
+        laplacian += (4 * np.sin(half) ** 2).reshape(along)
+        power += ((2 * np.sin(half) * mean) ** 2).reshape(along)
+        squared += (theta**2).reshape(along)
+    laplacian[0, 0] = np.inf
+    density = power / laplacian**2
+    if cutoff is not None:
+        sigma = SIGMA_OF_CUTOFF * cutoff / pixel
+        density *= (1.0 - np.exp(-0.5 * sigma**2 * squared)) ** 2
+    return float(slope_stderr * pixel * np.sqrt(density.sum() / (shape[0] * shape[1])))

@@ -15,6 +15,7 @@ from numba import njit, prange
 from numpy.typing import ArrayLike
 
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
+from reconstruction.checks import require_settings
 from reconstruction.normal_integration.weighted_poisson import IntegrationError
 from reconstruction.normal_maps import NormalMaps
 
@@ -43,14 +44,13 @@ class Perspective:
 
     def __post_init__(self) -> None:
         """Refuse what is no camera."""
-        if not 0.0 < self.focal_px < np.inf:
-            raise IntegrationError(
-                f"Perspective.focal_px: got {self.focal_px}, expected above 0 and finite"
-            )
-        if len(self.center_px) != 2 or not np.isfinite(self.center_px).all():
-            raise IntegrationError(
-                f"Perspective.center_px: got {self.center_px}, expected two finite numbers"
-            )
+        center = len(self.center_px) == 2 and bool(np.isfinite(self.center_px).all())
+        require_settings(
+            self,
+            IntegrationError,
+            ("focal_px", 0.0 < self.focal_px < np.inf, "above 0 and finite"),
+            ("center_px", center, "two finite numbers"),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,6 +213,30 @@ def _difference(before, a, b, after, has_before, has_after):  # type: ignore[no-
     return 0.5 * (a + b)
 
 
+@njit(cache=True, inline="always")
+def _edge(g, v, valid, i, j, down, right, smooth, weighted, a, d):  # type: ignore[no-untyped-def]
+    """Write weight and difference of the edge from a pixel to the next along one axis."""
+    rows, columns = g.shape
+    y, x = i + down, j + right
+    if not (y < rows and x < columns and valid[y, x]):
+        return
+    both = v[i, j] + v[y, x] if weighted else np.float32(2.0)
+    before = smooth and i >= down and j >= right and valid[i - down, j - right]
+    after = smooth and y + down < rows and x + right < columns and valid[y + down, x + right]
+    if weighted:
+        before = before and v[i - down, j - right] < _MAX_VARIANCE_RATIO * both
+        after = after and v[y + down, x + right] < _MAX_VARIANCE_RATIO * both
+    a[i + 1, j + 1] = np.float32(2.0) / both
+    d[i + 1, j + 1] = _difference(
+        g[i - down, j - right] if before else 0.0,
+        g[i, j],
+        g[y, x],
+        g[y + down, x + right] if after else 0.0,
+        before,
+        after,
+    )
+
+
 @njit(cache=True, parallel=True, error_model="numpy")
 def _edges(gx, gy, vx, vy, valid, smooth, ax, ay, dx, dy):  # type: ignore[no-untyped-def]
     """Write weights and differences of the edges; the arrays have an empty border of one."""
@@ -220,40 +244,9 @@ def _edges(gx, gy, vx, vy, valid, smooth, ax, ay, dx, dy):  # type: ignore[no-un
     weighted = vx.shape[0] == rows and vx.shape[1] == columns
     for i in prange(rows):
         for j in range(columns):
-            if not valid[i, j]:
-                continue
-            if j + 1 < columns and valid[i, j + 1]:
-                v = vx[i, j] + vx[i, j + 1] if weighted else np.float32(2.0)
-                before = smooth and j > 0 and valid[i, j - 1]
-                after = smooth and j + 2 < columns and valid[i, j + 2]
-                if weighted:
-                    before = before and vx[i, j - 1] < _MAX_VARIANCE_RATIO * v
-                    after = after and vx[i, j + 2] < _MAX_VARIANCE_RATIO * v
-                ax[i + 1, j + 1] = np.float32(2.0) / v
-                dx[i + 1, j + 1] = _difference(
-                    gx[i, j - 1] if before else 0.0,
-                    gx[i, j],
-                    gx[i, j + 1],
-                    gx[i, j + 2] if after else 0.0,
-                    before,
-                    after,
-                )
-            if i + 1 < rows and valid[i + 1, j]:
-                v = vy[i, j] + vy[i + 1, j] if weighted else np.float32(2.0)
-                before = smooth and i > 0 and valid[i - 1, j]
-                after = smooth and i + 2 < rows and valid[i + 2, j]
-                if weighted:
-                    before = before and vy[i - 1, j] < _MAX_VARIANCE_RATIO * v
-                    after = after and vy[i + 2, j] < _MAX_VARIANCE_RATIO * v
-                ay[i + 1, j + 1] = np.float32(2.0) / v
-                dy[i + 1, j + 1] = _difference(
-                    gy[i - 1, j] if before else 0.0,
-                    gy[i, j],
-                    gy[i + 1, j],
-                    gy[i + 2, j] if after else 0.0,
-                    before,
-                    after,
-                )
+            if valid[i, j]:
+                _edge(gx, vx, valid, i, j, 0, 1, smooth, weighted, ax, dx)
+                _edge(gy, vy, valid, i, j, 1, 0, smooth, weighted, ay, dy)
 
 
 def edges(

@@ -2,7 +2,7 @@
 
 Minimises sum a_e (x_q - x_p - d_e)^2 over the edges e = (p, q) of a grid of pixels. Its normal
 equations are solved by conjugate gradients with a multigrid cycle as preconditioner, without a
-matrix. See `integration_kernels` for the multigrid.
+matrix. See `multigrid_kernels` for the multigrid.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Convergence:
 @dataclass(frozen=True, slots=True)
 class _Level:
     A: Float32Array
-    """Planes of `integration_kernels`; of the finest level (3, ...): edges, one over diagonal."""
+    """Planes of `multigrid_kernels`; of the finest level (3, ...): edges, one over diagonal."""
     P: Float32Array
     b: Float32Array
     x: Float32Array

@@ -8,31 +8,19 @@ found by their residuals and lose their weight.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reconstruction.arrays import BoolArray, FloatArray
+from reconstruction.checks import require_settings
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
 from reconstruction.photometric_stereo import kernels
-from reconstruction.photometric_stereo.refinement import refine
 from reconstruction.photometric_stereo.solver_kernels import Settings
-from reconstruction.tiles import map_tiles
-
-__all__ = [
-    "NormalMaps",
-    "PhotometricStereoError",
-    "Robustness",
-    "estimate_normals",
-    "refine",
-    "require_spread",
-]
-
+from reconstruction.tiles import map_on_threads
 
 TILE_POINTS = 8192
 MIN_AGREEING_FRACTION = 0.5
@@ -80,18 +68,16 @@ class Robustness:
 
     def __post_init__(self) -> None:
         """Refuse settings out of range."""
-        for name, good, expected in (
+        require_settings(
+            self,
+            PhotometricStereoError,
             ("l1_iterations", self.l1_iterations >= 0, "at least 0"),
             ("iterations", self.iterations >= 1, "at least 1"),
             ("shadow", 0.0 <= self.shadow < 1.0, "in [0, 1)"),
             ("grazing", 0.0 <= self.grazing < 1.0, "in [0, 1)"),
             ("few", self.few >= 0, "at least 0"),
             ("tuning", 1.0 <= self.tuning < np.inf, "1 or more"),
-        ):
-            if not good:
-                raise PhotometricStereoError(
-                    f"Robustness.{name}: got {getattr(self, name)}, expected {expected}"
-                )
+        )
 
     def settings(self, kind: Any) -> Settings:
         """Return the limits of a fit in the data's type."""
@@ -211,8 +197,8 @@ def estimate_normals(
             f"intensity: got {lights} light(s), expected at least 3 to tell a normal"
         )
     kind: Any = np.float64 if samples.dtype == np.float64 else np.float32
-    way, geometry = _geometry(light_directions_n3, light_positions_mm, points_mm, lights, shape)
-    strength = _strength(light_intensity, geometry if way == kernels.NEAR else None, lights, shape)
+    lit = _geometry(light_directions_n3, light_positions_mm, points_mm, lights, shape)
+    strength = _strength(light_intensity, lit, lights, shape)
     chosen = robustness or Robustness()
     settings = chosen.settings(kind)
     count = int(np.prod(shape))
@@ -221,12 +207,14 @@ def estimate_normals(
     good = np.empty(count, bool)
     noise = _per_sample("variance", variance, lights, shape)
     mask = _usable(valid, lights, shape)
-    shared, per_point, positions, points = _light_arrays(way, geometry, kind)
-
+    # float32 keeps millimetres to 1e-4 at the size of a room
+    shared, positions, points = (
+        array.astype(kind, order="C") for array in (lit.shared, lit.positions, lit.points)
+    )
     fit_points = kernels.fit_points(kind)
 
     def solve(span: slice) -> None:
-        each = per_point[:, span] if way == kernels.PER_POINT else per_point
+        each = lit.per_point[:, span] if lit.way == kernels.PER_POINT else lit.per_point
         fit_points(
             *(_of_kind(array[:, span], kind) for array in (flat, noise)),
             mask[:, span],
@@ -234,8 +222,8 @@ def estimate_normals(
             shared,
             _of_kind(each, kind),
             positions,
-            points[span] if way == kernels.NEAR else points,
-            way,
+            points[span] if lit.way == kernels.NEAR else points,
+            lit.way,
             robust,
             variance is not None,
             chosen.l1_iterations,
@@ -245,8 +233,8 @@ def estimate_normals(
             good[span],
         )
 
-    for _ in _mapped(solve, count, executor):
-        pass
+    spans = [slice(a, min(a + TILE_POINTS, count)) for a in range(0, count, TILE_POINTS)]
+    map_on_threads(solve, spans, executor)
     out[~good] = 0.0
     out[~good, kernels.STDERR] = np.pi
     out[~good, kernels.STDERR_ALBEDO] = np.inf
@@ -270,13 +258,14 @@ def _of_kind(array: NDArray[Any], kind: Any) -> FloatArray:
     return np.broadcast_to(array[whole].astype(kind), array.shape)
 
 
-def _mapped(solve: Any, count: int, executor: Executor | None) -> Iterator[None]:
-    spans = [slice(a, min(a + TILE_POINTS, count)) for a in range(0, count, TILE_POINTS)]
-    if executor is not None or len(spans) < 2:
-        yield from map_tiles(solve, spans, executor=executor)
-        return
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
-        yield from map_tiles(solve, spans, executor=pool)
+class _Geometry(NamedTuple):
+    """How light vectors are given, and the arrays that give them."""
+
+    way: int
+    shared: FloatArray = np.zeros((1, 3))
+    per_point: FloatArray = np.zeros((1, 1, 3))
+    positions: FloatArray = np.zeros((1, 3))
+    points: FloatArray = np.zeros((1, 3))
 
 
 def _geometry(
@@ -285,8 +274,7 @@ def _geometry(
     points: ArrayLike | None,
     lights: int,
     shape: tuple[int, ...],
-) -> tuple[int, tuple[FloatArray, ...]]:
-    """Return how light vectors are given, and the arrays that give them."""
+) -> _Geometry:
     if (positions is None) != (points is None):
         raise PhotometricStereoError(
             "light_positions_mm, points_mm: got one of the two, expected both or neither"
@@ -302,10 +290,10 @@ def _geometry(
             raise PhotometricStereoError(
                 f"points_mm: got shape {surface.shape}, expected {(*shape, 3)}"
             )
-        return kernels.NEAR, (where, surface.reshape(-1, 3))
+        return _Geometry(kernels.NEAR, positions=where, points=surface.reshape(-1, 3))
     towards = np.asarray(directions)
     if towards.shape == (lights, *shape, 3):
-        return kernels.PER_POINT, (towards.reshape(lights, -1, 3),)
+        return _Geometry(kernels.PER_POINT, per_point=towards.reshape(lights, -1, 3))
     towards = towards.astype(np.float64)
     if towards.shape != (lights, 3):
         raise PhotometricStereoError(
@@ -320,7 +308,7 @@ def _geometry(
         )
     towards = towards / length[:, None]
     require_spread(towards)
-    return kernels.SHARED, (towards,)
+    return _Geometry(kernels.SHARED, shared=towards)
 
 
 def require_spread(directions: FloatArray) -> None:
@@ -343,29 +331,14 @@ def require_spread(directions: FloatArray) -> None:
         )
 
 
-def _light_arrays(
-    way: int, geometry: tuple[FloatArray, ...], kind: Any
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    none2, none3 = np.zeros((1, 3), kind), np.zeros((1, 1, 3), kind)
-    if way == kernels.SHARED:
-        return geometry[0].astype(kind, order="C"), none3, none2, none2
-    if way == kernels.PER_POINT:
-        return none2, geometry[0], none2, none2
-    # float32 keeps millimetres to 1e-4 at the size of a room
-    return none2, none3, geometry[0].astype(kind, order="C"), geometry[1].astype(kind)
-
-
 def _strength(
-    intensity: ArrayLike | None,
-    near: tuple[FloatArray, ...] | None,
-    lights: int,
-    shape: tuple[int, ...],
+    intensity: ArrayLike | None, lit: _Geometry, lights: int, shape: tuple[int, ...]
 ) -> FloatArray:
     if intensity is None:
         level = 1.0
-        if near is not None:
-            some = near[1][:: max(1, len(near[1]) // 100)]
-            distance = np.linalg.norm(near[0][:, None] - some[None], axis=-1)
+        if lit.way == kernels.NEAR:
+            some = lit.points[:: max(1, len(lit.points) // 100)]
+            distance = np.linalg.norm(lit.positions[:, None] - some[None], axis=-1)
             level = float(np.nanmedian(distance)) ** 2
         return np.broadcast_to(np.float32(level), (lights, int(np.prod(shape))))
     given = _per_sample("light_intensity", intensity, lights, shape)

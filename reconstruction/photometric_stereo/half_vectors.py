@@ -6,8 +6,7 @@ The published estimate, to stand beside photometric stereo. doi 10.1145/1141911.
 from __future__ import annotations
 
 import math
-import os
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +15,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from reconstruction.arrays import BoolArray, FloatArray, Int32Array
-from reconstruction.tiles import map_tiles
+from reconstruction.checks import require_shapes
+from reconstruction.tiles import map_on_threads
 
 TILE_POINTS = 2048
 N_BRIGHTEST = 4
@@ -112,14 +112,13 @@ def estimate(
     points, count = samples.shape
     cameras = np.asarray(view)
     mask = np.broadcast_to(np.True_, samples.shape) if valid is None else np.asarray(valid)
-    for name, array, shape in (
+    require_shapes(
+        HalfVectorError,
         ("light_dir", light_dir, (points, count, 3)),
         ("view_dir", view_dir, (points, count, 3)),
         ("view", cameras, (count,)),
         ("valid", mask, (points, count)),
-    ):
-        if np.shape(array) != shape:
-            raise HalfVectorError(f"{name}: got shape {np.shape(array)}, expected {shape}")
+    )
     if cameras.dtype.kind not in "iu" or (count and int(cameras.min()) < 0):
         raise HalfVectorError("view: expected whole numbers, 0 or more")
     cameras = cameras.astype(np.int64)
@@ -142,11 +141,7 @@ def estimate(
         )
 
     spans = [slice(a, min(a + TILE_POINTS, points)) for a in range(0, points, TILE_POINTS)]
-    if executor is not None or len(spans) < 2:
-        list(map_tiles(solve, spans, executor=executor))
-    else:
-        with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
-            list(map_tiles(solve, spans, executor=pool))
+    map_on_threads(solve, spans, executor)
     return HalfVectorNormals(normals, views >= 2, stderr, views)
 
 

@@ -109,15 +109,14 @@ def check(
             f"intensity: got light from {np.count_nonzero(~dead)} of {lights} lights, expected at"
             " least 4 to compare an order with the shading"
         )
-    misfit: dict[str, float] = {}
+    evidence = _Evidence(samples, usable, dead)
     orders = _orders(lights, names)
-    for name, permutation in orders.items():
-        misfit[name] = _misfit(samples, directions[permutation], usable, dead)
+    misfit = {name: evidence.misfit(directions[order]) for name, order in orders.items()}
     best = min(misfit, key=lambda name: misfit[name])
     listed = misfit["as listed"]
     order = best if misfit[best] < ORDER_MISFIT_RATIO * listed else "as listed"
     permutation = orders[order]
-    strength = _strength(samples, directions[permutation], usable, dead)
+    strength = evidence.strength(directions[permutation])
     if misfit[order] > MAX_SHADING_MISFIT:
         order = "unknown"
     return LightCheck(order, permutation, misfit, strength, dead, samples.shape[1])
@@ -188,36 +187,39 @@ def _orders(lights: int, names: Sequence[str] | None) -> dict[str, NDArray[np.in
     return distinct
 
 
-def _fit(
-    samples: Float64Array, directions: Float64Array, usable: BoolArray, dead: BoolArray
-) -> tuple[Float64Array, BoolArray]:
-    """Return the shading fitted under living lights (N, P), and the points that have it."""
-    alive = ~dead
-    found = estimate_normals(samples[alive], directions[alive], valid=usable[alive], robust=True)
-    return np.maximum(
-        unit_vectors(directions) @ (found.normals * found.albedo[:, None]).T, 0.0
-    ), found.valid
+@dataclass(frozen=True, slots=True)
+class _Evidence:
+    """Samples (L, P) of some points, which of them count, and lights that give nothing."""
 
+    samples: Float64Array
+    usable: BoolArray
+    dead: BoolArray
 
-def _misfit(
-    samples: Float64Array, directions: Float64Array, usable: BoolArray, dead: BoolArray
-) -> float:
-    shading, valid = _fit(samples, directions, usable, dead)
-    counted = usable & ~dead[:, None]
-    size = float(np.mean(samples[counted]))
-    # a point without a fit is explained by nothing
-    residual = np.where(valid[None], np.abs(samples - shading), samples)
-    return float(np.mean(residual[counted])) / size
+    def shading(self, directions: Float64Array) -> tuple[Float64Array, BoolArray]:
+        """Return what a matte surface shows under lights of these directions, and where."""
+        alive = ~self.dead
+        found = estimate_normals(
+            self.samples[alive], directions[alive], valid=self.usable[alive], robust=True
+        )
+        matte = unit_vectors(directions) @ (found.normals * found.albedo[:, None]).T
+        return np.maximum(matte, 0.0), found.valid
 
+    def misfit(self, directions: Float64Array) -> float:
+        """Return the mean size of what no matte surface explains, over that of the samples."""
+        shading, valid = self.shading(directions)
+        counted = self.usable & ~self.dead[:, None]
+        size = float(np.mean(self.samples[counted]))
+        # a point without a fit is explained by nothing
+        residual = np.where(valid[None], np.abs(self.samples - shading), self.samples)
+        return float(np.mean(residual[counted])) / size
 
-def _strength(
-    samples: Float64Array, directions: Float64Array, usable: BoolArray, dead: BoolArray
-) -> Float64Array:
-    shading, valid = _fit(samples, directions, usable, dead)
-    strength = np.zeros(len(samples))
-    for light in np.flatnonzero(~dead):
-        seen = valid & usable[light] & (shading[light] > 0.2 * np.max(shading, axis=0))
-        if seen.any():
-            strength[light] = np.median(samples[light, seen] / shading[light, seen])
-    middle = np.median(strength[strength > 0]) if (strength > 0).any() else 1.0
-    return strength / middle
+    def strength(self, directions: Float64Array) -> Float64Array:
+        """Return each light's strength over the median one's; 0 for dead lights."""
+        shading, valid = self.shading(directions)
+        strength = np.zeros(len(self.samples))
+        for light in np.flatnonzero(~self.dead):
+            seen = valid & self.usable[light] & (shading[light] > 0.2 * np.max(shading, axis=0))
+            if seen.any():
+                strength[light] = np.median(self.samples[light, seen] / shading[light, seen])
+        middle = np.median(strength[strength > 0]) if (strength > 0).any() else 1.0
+        return strength / middle

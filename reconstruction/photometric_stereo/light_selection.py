@@ -243,31 +243,13 @@ def select(
         prediction = predict(found, chosen, least=least)
         path.append((len(chosen), prediction.median_rad, prediction.valid_share))
     if _good(prediction, median_rad, valid_share):
-        chosen, prediction = _pruned(
-            found, chosen, prediction, median_rad, valid_share, least, fixed
-        )
+        for light in [light for light in chosen if light not in fixed]:
+            without = [other for other in chosen if other != light]
+            now = predict(found, without, least=least)
+            if _good(now, median_rad, valid_share):
+                chosen, prediction = without, now
     reached = _good(prediction, median_rad, valid_share)
     return Selection(tuple(chosen), tuple(path), prediction, reached)
-
-
-def _pruned(
-    found: Information,
-    chosen: list[int],
-    prediction: Prediction,
-    median_rad: float,
-    valid_share: float,
-    least: int,
-    fixed: tuple[int, ...],
-) -> tuple[list[int], Prediction]:
-    """Take off lights, the earliest first, that later ones made superfluous."""
-    for light in list(chosen):
-        if light in fixed:
-            continue
-        without = [other for other in chosen if other != light]
-        now = predict(found, without, least=least)
-        if _good(now, median_rad, valid_share):
-            chosen, prediction = without, now
-    return chosen, prediction
 
 
 def _good(prediction: Prediction, median_rad: float, valid_share: float) -> bool:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
+from reconstruction.checks import require_shapes
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
-from reconstruction.tiles import map_tiles
+from reconstruction.tiles import map_on_threads
 
 Predict = Callable[[Float64Array, Float64Array, Float64Array, NDArray[np.intp]], ArrayLike]
 """(normals (P, 3), light_dir (P, M, 3), view_dir (P, M, 3), points (P,)) -> f_r (P, M), 1/sr."""
@@ -83,15 +83,14 @@ def refine(
     if samples.ndim != 2:
         raise PhotometricStereoError(f"values: got shape {samples.shape}, expected (P, M)")
     points, count = samples.shape
-    for name, array, shape in (
+    require_shapes(
+        PhotometricStereoError,
         ("light_dir", light_dir, (points, count, 3)),
         ("view_dir", view_dir, (points, count, 3)),
         ("normals", normals, (points, 3)),
         ("valid", valid, (points, count)),
         ("predict", None if callable(predict) else predict, (points, count)),
-    ):
-        if array is not None and np.shape(array) != shape:
-            raise PhotometricStereoError(f"{name}: got shape {np.shape(array)}, expected {shape}")
+    )
     noise = None
     if variance is not None:
         try:
@@ -126,11 +125,7 @@ def refine(
 
     size = max(1, TILE_SAMPLES // max(count, 1))
     tiles = [np.arange(a, min(a + size, points)) for a in range(0, points, size)]
-    if executor is not None or len(tiles) < 2:
-        done = list(map_tiles(solve, tiles, executor=executor))
-    else:
-        with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
-            done = list(map_tiles(solve, tiles, executor=pool, window=4))
+    done = map_on_threads(solve, tiles, executor, window=4)
     names = ("normals", "albedo", "residual", "valid", "stderr_rad", "stderr_albedo", "used")
     if not done:
         return NormalMaps(np.zeros((0, 3)), *(np.zeros(0) for _ in names[1:]))  # type: ignore[arg-type]
@@ -218,9 +213,8 @@ def _refine_tile(
             factor = np.maximum(factor + shorter * move[:, 2], 1e-3 * factor)
         if float(np.max(reach, initial=0.0)) < 1e-6:
             iterations = step + 1  # one more pass for the errors
-    return _judged(
-        n, first, factor, r, scale, seen & (w > 0), weight, J, u2, begun, unknowns, known, most_rad
-    )
+    near = begun & (np.linalg.norm(n - first, axis=-1) < 2 * np.sin(most_rad / 2))
+    return _judged(n, near, factor, r, seen & (w > 0), weight, J, u2, known)
 
 
 def _ratio(samples: Float64Array, model: Float64Array, weight: Float64Array) -> Float64Array:
@@ -253,19 +247,16 @@ def _solved(A: Float64Array, g: Float64Array) -> Float64Array:
 
 def _judged(
     n: Float64Array,
-    first: Float64Array,
+    near: BoolArray,
     factor: Float64Array,
     r: Float64Array,
-    scale: Float64Array,
     used: BoolArray,
     weight: Float64Array,
     J: Float64Array,
     u2: Float64Array,
-    begun: BoolArray,
-    unknowns: int,
     known: bool,
-    most_rad: float,
 ) -> NormalMaps:
+    unknowns = J.shape[-1]
     count = np.count_nonzero(used, axis=-1)
     free = np.maximum(count - unknowns, 1)
     psi = np.where(used, r * (1 - u2) ** 2, 0.0)
@@ -279,12 +270,11 @@ def _judged(
     size = np.sqrt(np.maximum(np.einsum("pii->pi", B), 1e-300))
     correlation = B / (size[:, :, None] * size[:, None, :])
     told = np.linalg.eigvalsh(correlation)[:, 0] > 1e-6
-    ok = begun & told & (count > unknowns)
+    ok = near & told & (count > unknowns)
     safe = np.where(ok[:, None, None], correlation, np.eye(unknowns))
     covariance = np.linalg.inv(safe) / (size[:, :, None] * size[:, None, :])
     stderr = np.sqrt(sigma2 * (covariance[:, 0, 0] + covariance[:, 1, 1]))
-    turn = np.linalg.norm(n - first, axis=-1)
-    ok &= (turn < 2 * np.sin(most_rad / 2)) & (stderr < 1.0)
+    ok &= stderr < 1.0
     error = np.sqrt(sigma2 * covariance[:, 2, 2]) if unknowns == 3 else np.zeros(len(n))
     raw = np.where(used, r / weight, 0.0)
     rms = np.sqrt(np.sum(raw**2, axis=-1) / np.maximum(count, 1))

@@ -295,23 +295,21 @@ def _pose(
     left = np.full(found.size, np.inf)
     if np.count_nonzero(found) < MIN_TRACKS:
         return _Pose(np.zeros(6), np.full(6, np.inf), left)
-    motion = np.zeros(6)
-    for _ in range(iterations):
+    motion, settled = np.zeros(6), False
+    for step in range(iterations + 1):
         r, J = _residuals(seen, motion)
         length = np.linalg.norm(r, axis=1)
         scale = max(float(np.median(length)) / _RAYLEIGH_MEDIAN, 1e-6)
-        w = np.maximum(1.0 - (length / (TRACK_TUKEY_SIGMAS * scale)) ** 2, 0.0) ** 2
+        u2 = (length / (TRACK_TUKEY_SIGMAS * scale)) ** 2
+        if settled or step == iterations:
+            break
+        w = np.maximum(1.0 - u2, 0.0) ** 2
         A = np.einsum("n,nki,nkj->ij", w, J, J)
         size = np.sqrt(np.maximum(np.diag(A), 1e-300))
         A = A / np.outer(size, size) + 1e-9 * np.eye(6)
-        step = np.linalg.solve(A, np.einsum("n,nki,nk->i", w, J, r) / size) / size
-        motion = motion + step
-        if float(np.abs(step[:3]).max()) < 1e-8 and float(np.abs(step[3:]).max()) < 1e-6:
-            break
-    r, J = _residuals(seen, motion)
-    length = np.linalg.norm(r, axis=1)
-    scale = max(float(np.median(length)) / _RAYLEIGH_MEDIAN, 1e-6)
-    u2 = (length / (TRACK_TUKEY_SIGMAS * scale)) ** 2
+        move = np.linalg.solve(A, np.einsum("n,nki,nk->i", w, J, r) / size) / size
+        motion = motion + move
+        settled = bool(np.abs(move[:3]).max() < 1e-8 and np.abs(move[3:]).max() < 1e-6)
     stderr = _stderr(r, J, u2, _blocks(seen))
     if not np.isfinite(stderr).all():
         motion = np.zeros(6)

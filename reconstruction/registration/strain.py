@@ -220,14 +220,20 @@ def _from_pixels(affine: Float64Array, shape: tuple[int, int]) -> tuple[Float64A
     return _FLIP_Y @ affine[:, :2] @ _FLIP_Y, _FLIP_Y @ shift
 
 
+def _warped_back(
+    image: UInt8Array, affine: Float64Array, interpolation: int, border: int = 128
+) -> Any:
+    """Return an image of the second picture's size where the first one's pixels have come to."""
+    size, flags = (image.shape[1], image.shape[0]), interpolation | cv2.WARP_INVERSE_MAP
+    return cv2.warpAffine(image, affine, size, flags=flags, borderValue=border)
+
+
 def _phase_shift(
     one: UInt8Array, two: UInt8Array, affine: Float64Array, mask: BoolArray
 ) -> Float64Array:
     """Return how far the second picture, warped back, lies from the first, px."""
     size = one.shape[1], one.shape[0]
-    back = cv2.warpAffine(
-        two, affine, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderValue=128
-    )
+    back = _warped_back(two, affine, cv2.INTER_LINEAR)
     window = cv2.createHanningWindow(size, cv2.CV_32F)
     weighted = [
         (np.where(mask, picture, 128).astype(np.float32) - 128.0) * window
@@ -280,31 +286,19 @@ def _by_windows(
 ) -> Strain:
     """Follow windows of the first picture into the second, warped back, and fit all of them."""
     shape = one.shape[0], one.shape[1]
-    size = shape[1], shape[0]
     grid = np.stack(np.meshgrid(np.arange(0, shape[1], 3), np.arange(0, shape[0], 3)), axis=-1)
     candidates = grid.reshape(-1, 2).astype(np.float64)
-    eroded = cv2.erode(
-        mask.astype(np.uint8), np.ones((STRAIN_WINDOW_PX, STRAIN_WINDOW_PX), np.uint8)
-    )
+    window = np.ones((STRAIN_WINDOW_PX, STRAIN_WINDOW_PX), np.uint8)
+    eroded = cv2.erode(mask.astype(np.uint8), window)
     candidates = candidates[eroded[candidates[:, 1].astype(int), candidates[:, 0].astype(int)] > 0]
     chosen = textured(
         one, candidates, count=count, cell_px=STRAIN_WINDOW_PX, margin_px=STRAIN_WINDOW_PX // 2 + 1
     )
     start = candidates[chosen]
     for number in range(N_STRAIN_ROUNDS):
-        back = cv2.warpAffine(
-            two, affine, size, flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, borderValue=128
-        )
-        seen = cv2.warpAffine(
-            other.astype(np.uint8),
-            affine,
-            size,
-            flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
-            borderValue=0,
-        )
-        seen = cv2.erode(
-            seen, np.ones((STRAIN_WINDOW_PX, STRAIN_WINDOW_PX), np.uint8), borderValue=0
-        )
+        back = _warped_back(two, affine, cv2.INTER_CUBIC)
+        seen = _warped_back(other.astype(np.uint8), affine, cv2.INTER_NEAREST, border=0)
+        seen = cv2.erode(seen, window, borderValue=0)
         tracks = track(one, back, start, window_px=STRAIN_WINDOW_PX, levels=2 if number == 0 else 0)
         inside = seen[start[:, 1].astype(int), start[:, 0].astype(int)] > 0
         good = tracks.valid & inside

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -15,20 +15,9 @@ from reconstruction.scan.repair import (
     TriangleMesh,
     boundary_edges,
     crop,
+    directed_edges,
     repair,
 )
-
-__all__ = [
-    "FACE_BOX_MM",
-    "RefinedScan",
-    "RepairReport",
-    "ScanMeshError",
-    "TriangleMesh",
-    "load_ply",
-    "prepare",
-    "refine",
-    "unwrap",
-]
 
 FACE_BOX_MM: Final = ((-100.0, -108.0, -105.0), (100.0, 150.0, 60.0))
 """Where a face is in the rig frame; the neck below the chin and clothes are outside."""
@@ -55,18 +44,13 @@ class RefinedScan:
     def moved(self, rotation: Float64Array, translation_mm: Float64Array) -> RefinedScan:
         """Return the surface after a rigid motion ``rotation @ p + translation_mm``."""
         turn = np.asarray(rotation, np.float64)
-        coarse = TriangleMesh(
-            self.coarse.vertices_mm @ turn.T + translation_mm,
-            self.coarse.faces,
-            self.coarse.corner_uv,
-        )
-        return RefinedScan(
-            (self.points_mm @ turn.T + translation_mm).astype(np.float32),
-            (self.normals @ turn.T).astype(np.float32),
-            self.faces,
-            self.corner_uv,
-            coarse,
-            self.report,
+        vertices_mm = self.coarse.vertices_mm @ turn.T + translation_mm
+        coarse = replace(self.coarse, vertices_mm=vertices_mm)
+        return replace(
+            self,
+            points_mm=(self.points_mm @ turn.T + translation_mm).astype(np.float32),
+            normals=(self.normals @ turn.T).astype(np.float32),
+            coarse=coarse,
         )
 
 
@@ -203,7 +187,7 @@ def _split_chords(mesh: TriangleMesh) -> TriangleMesh:
         rim = np.zeros(len(vertices), np.bool_)
         edges_of_rim = boundary_edges(faces)
         rim[edges_of_rim] = True
-        edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        edges = np.sort(directed_edges(faces), axis=1)
         alone = {tuple(e) for e in np.sort(edges_of_rim, axis=1).tolist()}
         chord = rim[edges].all(axis=1)
         rows = [k for k in np.flatnonzero(chord).tolist() if tuple(edges[k].tolist()) not in alone]

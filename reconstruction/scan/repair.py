@@ -179,28 +179,30 @@ def largest_surface(mesh: TriangleMesh) -> TriangleMesh:
 
 def boundary_edges(faces: Int64Array) -> Int64Array:
     """Return the directed edges that one triangle has alone, shape (E, 2)."""
-    edges, _ = _edges(faces)
-    _, place, counts = np.unique(
-        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    return np.asarray(edges[counts[place.reshape(-1)] == 1])
+    edges = directed_edges(faces)
+    return np.asarray(edges[_uses(edges)[1] == 1])
 
 
-def _edges(faces: Int64Array) -> tuple[Int64Array, NDArray[np.intp]]:
-    """Return all directed edges, shape (3 F, 2), and their triangles."""
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    return edges, np.repeat(np.arange(len(faces)), 3)
+def directed_edges(faces: Int64Array) -> Int64Array:
+    """Return all directed edges, shape (3 F, 2); triangle k has rows 3 k to 3 k + 2."""
+    return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
 
 
-def _pairs(faces: Int64Array) -> tuple[NDArray[np.intp], BoolArray]:
-    """Return rows of edges (in `_edges`) that two triangles share, and which run the same way."""
-    edges, _ = _edges(faces)
+def _uses(edges: Int64Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the number of each row's edge, whatever its direction, and how many rows have it."""
     _, place, counts = np.unique(
         np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
     )
     place = place.reshape(-1)
+    return place, counts[place]
+
+
+def _pairs(faces: Int64Array) -> tuple[NDArray[np.intp], BoolArray]:
+    """Return rows of directed edges that two triangles share, and which run the same way."""
+    edges = directed_edges(faces)
+    place, uses = _uses(edges)
     order = np.argsort(place, kind="stable")
-    order = order[counts[place[order]] == 2].reshape(-1, 2)
+    order = order[uses[order] == 2].reshape(-1, 2)
     same = edges[order[:, 0], 0] == edges[order[:, 1], 0]
     return order, same
 
@@ -218,16 +220,13 @@ def _sound(mesh: TriangleMesh) -> BoolArray:
 def _without_surplus(mesh: TriangleMesh) -> TriangleMesh:
     """Take away triangles until no edge has more than two: fins first, else all at that edge."""
     while True:
-        edges, rows = _edges(mesh.faces)
-        _, place, counts = np.unique(
-            np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
-        )
-        of_edge = counts[place.reshape(-1)]
+        _, uses = _uses(directed_edges(mesh.faces))
+        rows = np.arange(len(uses)) // 3
         crowded = np.zeros(len(mesh.faces), np.bool_)
-        crowded[rows[of_edge > 2]] = True
+        crowded[rows[uses > 2]] = True
         if not crowded.any():
             return mesh
-        free = np.bincount(rows[of_edge == 1], minlength=len(mesh.faces))
+        free = np.bincount(rows[uses == 1], minlength=len(mesh.faces))
         fins = crowded & (free == 2)
         mesh = _some(mesh, ~(fins if fins.any() else crowded))
 
@@ -280,7 +279,7 @@ def _split_pinches(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
     """Give each fan of triangles at a vertex a vertex of its own."""
     pairs, same = _pairs(mesh.faces)
     pairs = pairs[~same]  # triangles that agree about the edge
-    corner = np.arange(3 * len(mesh.faces))  # corner k begins edge k of `_edges`
+    corner = np.arange(3 * len(mesh.faces))  # corner k begins edge k of `directed_edges`
     after = corner - corner % 3 + (corner + 1) % 3
     # an edge from a to b of one triangle is the edge from b to a of the other
     one = np.concatenate([corner[pairs[:, 0]], after[pairs[:, 0]]])
@@ -299,9 +298,8 @@ def _fill_holes(mesh: TriangleMesh, max_hole_mm: float) -> tuple[TriangleMesh, i
     edges = boundary_edges(mesh.faces)
     follows = {int(a): int(b) for a, b in edges}
     owner = {}
-    directed, _ = _edges(mesh.faces)
     if mesh.corner_uv is not None:
-        owner = {(int(a), int(b)): k for k, (a, b) in enumerate(directed)}
+        owner = {(int(a), int(b)): k for k, (a, b) in enumerate(directed_edges(mesh.faces))}
     vertices, faces, uvs = [mesh.vertices_mm], [mesh.faces], [mesh.corner_uv]
     new, filled = len(mesh.vertices_mm), 0
     while follows:

@@ -92,27 +92,6 @@ class WrinkleFit:
         )
 
 
-def wrinkle_map(neutral: Measured, expression: Measured, *, size: tuple[int, int]) -> Texels:
-    """Return one expression's wrinkle map: difference of derivatives, low-passed to its size.
-
-    Parameters
-    ----------
-    neutral, expression : array_like (H, W, 3), NormalMaps, or Derivatives
-        Tangent-space normals in the same map space; see `wrinkle_texels.derivatives_of` for
-        errors and masks.
-    size : (int, int)
-        Rows and columns of the wrinkle map, at most those of the normals; the paper's is
-        (256, 256).
-
-    Returns
-    -------
-    Texels
-        Derivatives to add to the neutral ones, their standard error and valid mask.
-    """
-    difference = differences(derivatives_of(neutral), {"expression": expression})["expression"]
-    return _map_of([(np.ones(difference.weight.shape), difference)], size)
-
-
 def fit_weights(
     layer: Layer, neutral: Measured, expression: Measured, *, clamp: Clamp = "unit"
 ) -> ZoneWeights:
@@ -326,25 +305,12 @@ def _shown_by(
     tolerance: float = SOLVER_TOL,
 ) -> Texels:
     """Return the map that expressions with known weights show best."""
-    parts = []
-    for name, one in data.items():
-        shape = one.weight.shape
-        small = np.tensordot(rows[name], masks, axes=1)
-        parts.append((resampling.resampled(small, (shape[0], shape[1])), one))
-    return _map_of(parts, size, tolerance=tolerance)
-
-
-def _map_of(
-    parts: list[tuple[FloatArray, Difference]],
-    size: tuple[int, int],
-    *,
-    tolerance: float = SOLVER_TOL,
-) -> Texels:
-    """Return the map that differences show, each with a strength (H, W)."""
-    shape = parts[0][0].shape
+    shape = next(iter(data.values())).weight.shape
     weight, covered = np.zeros(shape), np.zeros(shape)
     product, noise = np.zeros((*shape, 2)), np.zeros((*shape, 2))
-    for strength, one in parts:
+    for name, one in data.items():
+        small = np.tensordot(rows[name], masks, axes=1)
+        strength = resampling.resampled(small, (shape[0], shape[1]))
         v = one.weight * strength
         weight += v * strength
         product += v[..., None] * one.values

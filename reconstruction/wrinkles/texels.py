@@ -21,6 +21,7 @@ from model import texture_resampling as resampling
 from model import wrinkles
 from model.wrinkles import WrinkleError
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
+from reconstruction.checks import require_shapes
 from reconstruction.normal_maps import NormalMaps
 
 MAX_DERIVATIVE = 4.0
@@ -89,9 +90,8 @@ def derivatives_of(
         raise WrinkleError(f"normals: got shape {n.shape}, expected (H, W, 3)")
     report = wrinkles.encoding_report(n, limit=None)
     good = report.valid.copy()
-    for name, given in (("valid", valid), ("stderr_rad", stderr_rad)):
-        if given is not None and np.shape(given) != n.shape[:2]:
-            raise WrinkleError(f"{name}: got shape {np.shape(given)}, expected {n.shape[:2]}")
+    shape = n.shape[:2]
+    require_shapes(WrinkleError, ("valid", valid, shape), ("stderr_rad", stderr_rad, shape))
     if valid is not None:
         good &= np.asarray(valid, bool)
     steep = good & (np.abs(report.derivatives) > MAX_DERIVATIVE).any(axis=2)
@@ -188,38 +188,6 @@ def fit_texels(
         variance = np.divide(scatter, summed**2, out=np.zeros_like(scatter), where=valid)
         stderr[..., c] = np.where(valid, np.sqrt(spread * variance), np.inf)
     return Texels(values, stderr, valid)
-
-
-def low_passed(
-    derivatives: FloatArray,
-    shape: tuple[int, int],
-    *,
-    variance: FloatArray | None = None,
-    valid: ArrayLike | None = None,
-) -> Texels:
-    """Return a map of derivatives at a lower resolution, invalid pixels left out.
-
-    Parameters
-    ----------
-    derivatives : ndarray, shape (H, W, 2)
-    shape : (int, int)
-        Rows and columns of texels.
-    variance : ndarray, shape (H, W, 2), optional
-    valid : array_like of bool, shape (H, W), optional
-
-    Examples
-    --------
-    >>> low_passed(np.full((8, 8, 2), 0.25), (2, 2)).values[..., 0].round(9).tolist()
-    [[0.25, 0.25], [0.25, 0.25]]
-    """
-    d = np.asarray(derivatives, np.float64)
-    good = np.asarray(np.isfinite(d).all(axis=2))
-    if valid is not None:
-        good = good & np.asarray(valid, bool)
-    kept = good[..., None]
-    spread = np.zeros(d.shape) if variance is None else np.where(kept, variance, 0.0)
-    ones: Float64Array = good.astype(np.float64)
-    return fit_texels(ones, np.where(kept, d, 0.0), spread, ones, shape)
 
 
 def gathered(by: Any, bx: Any, image: FloatArray) -> Float64Array:

@@ -147,19 +147,6 @@ class ZoneEquations:
         return np.clip(weights, *bounds)
 
 
-def zone_equations(masks: FloatArray, wrinkle: FloatArray, difference: Difference) -> ZoneEquations:
-    """Return the normal equations of one expression's weights.
-
-    Parameters
-    ----------
-    masks : ndarray, shape (Z, h, w)
-    wrinkle : ndarray, shape (H, W, 2)
-        At the resolution of the difference.
-    difference : Difference
-    """
-    return equations_of(masks, wrinkle, {"": difference})[""]
-
-
 def equations_of(
     masks: FloatArray,
     wrinkle: FloatArray,
@@ -171,8 +158,9 @@ def equations_of(
 
     Parameters
     ----------
-    masks, wrinkle
-        As of :func:`zone_equations`.
+    masks : ndarray, shape (Z, h, w)
+    wrinkle : ndarray, shape (H, W, 2)
+        Derivatives to add, read at the pixels of the differences.
     data : mapping of str to Difference
     with_noise : bool
         False leaves `noise` at 0, which weights do not need.
@@ -219,11 +207,12 @@ def zone_weights(
 
     Parameters
     ----------
-    masks, wrinkle, difference
-        As of :func:`zone_equations`.
+    masks, wrinkle
+        As of :func:`equations_of`.
+    difference : Difference
     bounds : (float, float)
     """
-    equations = zone_equations(masks, wrinkle, difference)
+    equations = equations_of(masks, wrinkle, {"": difference})[""]
     fast = equations.determined()
     weights = np.where(fast, equations.least(bounds), 0.0)
     inverse = equations.inverse()

@@ -12,15 +12,12 @@ LONG_MODULES = {
     "reconstruction/brdf_basis/nnls_kernels.py": 568,
     "reconstruction/chromophores/posterior_kernels.py": 593,
     "reconstruction/correspondence/common_parameterization.py": 484,
-    "reconstruction/scan/registration.py": 502,
 }
 LONG_FUNCTIONS = {
     "capture/calibration/fiber/discs.py:fit_disc": 81,
     "model/displacement_synthesis/growth.py:_choose": 89,
     "reconstruction/anisotropy/estimation.py:estimate": 96,
-    "reconstruction/anisotropy/profile_anisotropy.py:estimate_from_profiles": 87,
     "reconstruction/diffuse_albedo/estimation.py:estimate": 94,
-    "reconstruction/kernel_fit/outcome.py:summarize_search": 87,
     "reconstruction/photometric_stereo/kernels.py:_fit_points": 92,
     "rigsim/tissue/photon_lanes.py:_run": 165,
     "rigsim/tissue/photon_lanes.py:body": 111,
@@ -28,11 +25,9 @@ LONG_FUNCTIONS = {
 MANY_PARAMETERS = {
     "model/displacement_synthesis/growth.py:lay_out": 13,
     "model/texture_statistics/description.py:match": 13,
-    "reconstruction/anisotropy/profile_anisotropy.py:estimate_from_profiles": 15,
     "reconstruction/gradient_normals/estimation.py:from_patterns": 14,
     "reconstruction/kernel_fit/fit.py:fit_kernel": 17,
     "reconstruction/photometric_stereo/kernels.py:_fit_points": 16,
-    "reconstruction/photometric_stereo/refinement.py:_judged": 13,
 }
 """What a bound does not fit yet, with its present size, which may only fall."""
 

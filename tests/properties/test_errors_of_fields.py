@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from reconstruction.correspondence.expression_alignment import Alignment
 from reconstruction.facial_color import light_change, perfusion_fit, repeat_average
 from reconstruction.facial_color import registration_error as misplacement
-from reconstruction.normal_histogram import block_errors
+from reconstruction.normal_histogram import blocks
 from reconstruction.normal_histogram import blocks as normal_blocks
 from reconstruction.registration import affine_fit, dense_flow
 
@@ -55,18 +55,18 @@ def test_points_on_a_line_make_no_map(count, seed):
 def test_the_error_of_a_mean_has_the_unit_of_values_and_no_place_of_zero(seed, side, unit, shift):
     rng = np.random.default_rng(seed)
     values, sizes = rng.normal(size=side**2), rng.integers(1, 50, side**2).astype(float)
-    error, growth = block_errors.stderr_of_mean(values, sizes, grid(side))
+    error, growth = blocks.stderr_of_mean(values, sizes, grid(side))
     assert growth >= 1.0
     assert 0.3 / side < error < 6.0  # between independent blocks and one that stands for all
-    scaled, again = block_errors.stderr_of_mean(unit * (values + shift), sizes, grid(side))
+    scaled, again = blocks.stderr_of_mean(unit * (values + shift), sizes, grid(side))
     assert scaled == pytest.approx(unit * error, rel=1e-4)
     assert again == pytest.approx(growth, rel=1e-4)
 
 
 @CHEAP
-@given(count=st.integers(0, block_errors.MIN_BLOCKS - 1))
+@given(count=st.integers(0, blocks.MIN_BLOCKS - 1))
 def test_too_few_blocks_have_an_endless_error(count):
-    told = block_errors.stderr_of_mean(np.zeros(count), np.ones(count), np.zeros((count, 2)))
+    told = blocks.stderr_of_mean(np.zeros(count), np.ones(count), np.zeros((count, 2)))
     assert told == (np.inf, 1.0)
 
 

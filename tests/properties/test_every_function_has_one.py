@@ -92,11 +92,11 @@ NOT_DRIVEN = {
                 "reconstruction.gradient_normals.estimation": "estimate_roughness from_patterns",
                 "reconstruction.registration.head_motion": "estimate",
                 "reconstruction.lumitexels.samples": "visibility",
-                "reconstruction.lumitexels.store": "gather",
                 "reconstruction.surface.model_normals": "estimate",
                 "reconstruction.photometric_stereo.refinement": "refine",
                 "reconstruction.facial_color.rig_transfer": "transfer_rig",
                 "reconstruction.scan.registration": "align register",
+                "reconstruction.scan.rough_normals": "photometric_normals",
                 "reconstruction.registration.strain": "measure_strain",
                 "reconstruction.surface.errors": "of_albedo of_normals",
                 "reconstruction.surface.estimates": (
@@ -122,14 +122,12 @@ NOT_DRIVEN = {
                     "estimate_face fit_face_distribution fit_with_white_reference"
                 ),
                 "reconstruction.chromophores.face_distribution": "fit",
-                "reconstruction.kernel_fit.fit": "convolved_histogram fit_kernel",
                 "reconstruction.kernel_fit.outcome": "summarize_search",
                 "reconstruction.kernel_fit.search": "exhaustive gentlest hierarchical",
-                "reconstruction.kernel_fit.neutral_relief": "convolved",
+                "reconstruction.kernel_fit.neutral_relief": "convolved relief_of",
                 "reconstruction.facial_color.shared_melanin": "estimate_shared_melanin",
-                "reconstruction.kernel_fit.two_axes": "fit_two_axes",
-                "reconstruction.wrinkles.fit": "differences fit fit_weights wrinkle_map",
-                "reconstruction.wrinkles.weights": "equations_of zone_equations zone_weights",
+                "reconstruction.wrinkles.fit": "differences fit fit_weights",
+                "reconstruction.wrinkles.weights": "equations_of zone_weights",
                 "reconstruction.wrinkles.zones": "amplitudes fit_zones",
             },
         ),
@@ -146,10 +144,10 @@ NOT_DRIVEN = {
             {
                 "model.brdf.recipe": "materials",
                 "model.vectors": "unit_vectors",
-                "reconstruction.gradient_normals.inversion": (
-                    "analyzer_of grid_of invert_moments places_of views_of"
-                ),
-                "reconstruction.gradient_normals.reflection": "separate_reflection",
+                "reconstruction.gradient_normals.inversion": "places_of views_of",
+                "reconstruction.checks": "require_settings require_shapes",
+                "reconstruction.polarization": "fresnel_amplitudes",
+                "reconstruction.scan.repair": "directed_edges",
                 "reconstruction.gradient_normals.sphere_lights": (
                     "require_finite require_unit_vectors"
                 ),
@@ -163,7 +161,7 @@ NOT_DRIVEN = {
                 "reconstruction.subsurface.nearest": "fit_nearest",
                 "reconstruction.subsurface.profile_batch": "fit_from",
                 "reconstruction.subsurface.profile_fit": "fit_profiles",
-                "reconstruction.anisotropy.profile_comparison": "compare",
+                "reconstruction.anisotropy.profile_anisotropy": "compare",
                 "reconstruction.subsurface.models": "profile_model",
                 "reconstruction.subsurface.outcome": "evaluate_fits",
             },

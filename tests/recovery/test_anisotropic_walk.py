@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from reconstruction import subsurface
 from reconstruction.anisotropy import estimation as anisotropy
 from reconstruction.anisotropy import profile_anisotropy
-from reconstruction.anisotropy.one_direction_bias import one_direction_bias
+from reconstruction.anisotropy.estimation import one_direction_bias
 
 DIRECTIONS, RADIUS_MM, PITCH_MM = 16, 0.3 + 0.25 * np.arange(28), 0.25
 ANGLE = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS

@@ -8,8 +8,9 @@ from capture.calibration.lights import LightTable
 from capture.rig import load_rig
 from reconstruction.lumitexels.ray_casting import RayCaster
 from reconstruction.scan.mesh import FACE_BOX_MM, load_ply
-from reconstruction.scan.registration import NormalEvidence, RegistrationError, align, register
+from reconstruction.scan.registration import align, register
 from reconstruction.scan.repair import crop, repair
+from reconstruction.scan.rough_normals import NormalEvidence, RegistrationError
 from rigsim.render import Caster, g_buffer
 from rigsim.scanner.pods import Scanner, scan_face
 from rigsim.subject.head import build_head

@@ -13,6 +13,7 @@ from reconstruction.pipeline.inputs import InputsError
 from reconstruction.scan import registration as scan_registration
 from reconstruction.scan.registration import RigidFit
 from reconstruction.scan.repair import TriangleMesh
+from reconstruction.scan.rough_normals import RegistrationError
 
 ALIGNING_LIGHTS: Final = 40
 """Lights whose images say where the mesh is."""
@@ -58,7 +59,7 @@ def register(dome: Dome, mesh: TriangleMesh) -> RigidFit:
             binning=2,
             rng=np.random.default_rng(0),
         )
-    except scan_registration.RegistrationError as exc:
+    except RegistrationError as exc:
         lost, seen = 100.0 * np.mean(shares, axis=0)
         raise InputsError(
             f"surface: the scan was not found in the images: {exc}; {lost:.1f} % of their pixels "

@@ -19,7 +19,7 @@ from model.fresnel import ETA_SKIN
 from model.skin import SkinMap
 from reconstruction.anisotropy import estimation as anisotropy
 from reconstruction.anisotropy.direction_harmonics import MIN_DIRECTIONS
-from reconstruction.anisotropy.one_direction_bias import one_direction_bias
+from reconstruction.anisotropy.estimation import one_direction_bias
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.probe.images import Measurement, ProbeImages

@@ -13,8 +13,8 @@ from scipy.sparse.linalg import splu
 
 from reconstruction.normal_integration import Settings, integrate, integrate_map, slope_fields
 from reconstruction.normal_integration.discontinuities import integrate_broken
-from reconstruction.normal_integration.height_errors import expected_rms
 from reconstruction.normal_integration.height_filters import high_pass
+from reconstruction.normal_integration.relief_errors import expected_rms
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
 from skinrig.benchmarks.description import Findings, described
 from skinrig.benchmarks.measurement import LIMIT_CORES, measured, processor_seconds

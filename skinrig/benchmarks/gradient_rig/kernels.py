@@ -111,8 +111,7 @@ def search(*, toy: bool) -> StageBenchmark:
         )
 
     best = fit("exhaustive", side, 2)
-    whole = neutral_relief.relief_of(height, stretch=STRETCH_RATIO, axis="x", pixel_um=PIXEL_UM)
-    buckets = kernel_search.Buckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
+    whole = _grid_of(height, target)
     ways: list[tuple[Literal["hierarchical", "exhaustive"], int, int, int]] = [
         ("exhaustive", side, 2, 1),
         ("exhaustive", side, 2, 2 if toy else 5),
@@ -123,8 +122,7 @@ def search(*, toy: bool) -> StageBenchmark:
         ways += [("hierarchical", side, 16_384, 1), ("exhaustive", side, 2, 10)]
 
     def error(found: kernel_outcome.KernelFit) -> BandError:
-        change = whole.change(found.sigma_um)
-        there = buckets.distances((whole.along, whole.across), change, np.array([found.alpha]))
+        there = whole.distances(found.sigma_um, np.array([found.alpha]))
         return BandError.around(float(there[0]) - best.distance, 0.0)
 
     points = []
@@ -142,16 +140,23 @@ def search(*, toy: bool) -> StageBenchmark:
     return described("kernel-fit", points, {} if toy else _full_size(rng))
 
 
+def _grid_of(
+    height: Float64Array, target: Float64Array, sigmas_um: Float64Array = SIGMAS_UM
+) -> kernel_search.KernelGrid:
+    whole = neutral_relief.relief_of(height, stretch=STRETCH_RATIO, axis="x", pixel_um=PIXEL_UM)
+    buckets = kernel_search.Buckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
+    return kernel_search.KernelGrid(whole, buckets, ALPHA_GRID, sigmas_um)
+
+
 def _full_size(rng: np.random.Generator) -> Findings:
     """Measure 2000 x 2000: the default search, and the exhaustive ones by some candidates."""
     height = relief(FULL_SIDE_PX, rng=rng)
     target = normal_histogram.histogram(
         strained(height, rng=rng), pixel=(PIXEL_UM, PIXEL_UM * STRETCH_RATIO)
     )
-    whole = neutral_relief.relief_of(height, stretch=STRETCH_RATIO, axis="x", pixel_um=PIXEL_UM)
-    buckets = kernel_search.Buckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
     few = SIGMAS_UM[[10, 60, 150]]
-    ours_s = _spent(lambda: kernel_search.exhaustive(whole, buckets, ALPHA_GRID, few))
+    whole = _grid_of(height, target, few)
+    ours_s = _spent(lambda: kernel_search.exhaustive(whole))
     ours_s *= SIGMAS_UM.size / few.size
     tried = [(-1.5, 6.0), (-0.2, 31.0), (0.7, 76.0)][:N_PEER_CANDIDATES]
     peer_s = _spent(lambda: [numpy_distance(height, target, *k) for k in tried])
@@ -159,11 +164,7 @@ def _full_size(rng: np.random.Generator) -> Findings:
     mismatch = max(
         abs(
             numpy_distance(height, target, alpha, sigma)
-            - float(
-                buckets.distances(
-                    (whole.along, whole.across), whole.change(sigma), np.array([alpha])
-                )[0]
-            )
+            - float(whole.distances(sigma, np.array([alpha]))[0])
         )
         for alpha, sigma in tried
     )

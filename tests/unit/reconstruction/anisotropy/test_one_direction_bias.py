@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from reconstruction.anisotropy import plane_vectors
-from reconstruction.anisotropy.estimation import AnisotropyError, estimate
-from reconstruction.anisotropy.one_direction_bias import one_direction_bias
+from reconstruction.anisotropy.estimation import AnisotropyError, estimate, one_direction_bias
 
 SIXTEEN = np.deg2rad(np.arange(16) * 22.5)
 STDERR = 0.02

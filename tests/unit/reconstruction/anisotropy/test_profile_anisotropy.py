@@ -3,7 +3,7 @@ import pytest
 from scipy import stats
 
 from model import photon_table
-from reconstruction.anisotropy import profile_comparison
+from reconstruction.anisotropy import profile_anisotropy
 from reconstruction.anisotropy.estimation import AnisotropyError
 from reconstruction.anisotropy.profile_anisotropy import estimate_from_profiles
 
@@ -72,7 +72,7 @@ def test_coefficients_that_are_a_tenth_off_hardly_change_the_ratio():
             sigma_s_prime_per_mm=factor_s * SIGMA_S_PRIME,
         )
         assert np.log(found.ratio) == pytest.approx(
-            np.log(1.3), rel=profile_comparison.LOG_RATIO_MODEL_ERROR
+            np.log(1.3), rel=profile_anisotropy.LOG_RATIO_MODEL_ERROR
         )
 
 
@@ -92,7 +92,7 @@ def test_profiles_tell_the_ratio_within_its_standard_error(rng):
     seen, variance = read(rng, truth, 500)
     found = estimate_from_profiles(SIXTEEN, RADIUS_MM, seen, variance, **MEDIUM)
     # the truth is the table's own, so that the model's error has no part in it
-    of_model = profile_comparison.LOG_RATIO_MODEL_ERROR * found.ratio * np.log(found.ratio)
+    of_model = profile_anisotropy.LOG_RATIO_MODEL_ERROR * found.ratio * np.log(found.ratio)
     stderr = np.sqrt(found.ratio_stderr**2 - of_model**2)
     off = np.abs(np.angle(np.exp(2j * (found.axis_rad - 2.5)))) / 2
     # 68 % of 500, but for a chance of 1e-6
@@ -114,7 +114,7 @@ def test_far_fibres_lost_in_noise_do_not_tilt_the_answer(rng):
     error = np.log(found.ratio).std() / np.sqrt(200)
     assert abs(
         mean - np.log(1.3)
-    ) < 4.9 * error + profile_comparison.LOG_RATIO_MODEL_ERROR * np.log(1.3)
+    ) < 4.9 * error + profile_anisotropy.LOG_RATIO_MODEL_ERROR * np.log(1.3)
 
 
 def test_readings_that_do_not_count_may_be_anything(rng):

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from model import dipole
-from reconstruction.diffuse_albedo.estimation import estimate, reduced_albedo
+from reconstruction.diffuse_albedo.estimation import estimate
 from skinrig.benchmarks.dome import brdf_truth
 
 SKINS = {"light": brdf_truth.LIGHT_SKIN_ALBEDO, "dark": brdf_truth.DARK_SKIN_ALBEDO}
@@ -223,7 +222,6 @@ def test_samples_of_one_channel_need_no_axis_for_it(method):
     )
     assert point.r_d.shape == point.stderr.shape == point.valid.shape == ()
     assert point.r_d == gray.r_d[4]
-    assert np.isfinite(reduced_albedo(point, eta=1.3).albedo_prime)
 
 
 @pytest.mark.parametrize("method", ["envelope", "stable_minimum", "minimum"])
@@ -261,23 +259,3 @@ def test_shapes_that_fit_nothing_are_named(change, says):
     given = {"brdf_samples": p.f, "light_dirs": p.light, "view_dirs": p.view, "normals": p.normals}
     with pytest.raises(ValueError, match=says):
         estimate(**(given | change), eta=1.3)
-
-
-def test_the_reduced_albedo_carries_errors_and_flags_outliers():
-    p = scene("light", points=20, samples=100)
-    found = fitted(p)
-    r_d = found.r_d.copy()
-    r_d[0, 0], r_d[1, 1], r_d[2] = 1.02, -0.001, np.nan
-    changed = type(found)(r_d, found.stderr, found.valid, found.discarded)
-    reduced = reduced_albedo(changed, eta=1.3)
-    assert reduced.outlier.sum() == 2
-    assert reduced.outlier[0, 0]
-    assert not reduced.valid[2].any()
-    np.testing.assert_array_equal(np.isfinite(reduced.albedo_prime), reduced.valid)
-    good = reduced.valid[5:]
-    assert good.all()
-    np.testing.assert_allclose(
-        dipole.total_reflectance(reduced.albedo_prime[5:], 1.3), r_d[5:], rtol=1e-12
-    )
-    up = dipole.invert_total_reflectance(r_d[5:] + found.stderr[5:], 1.3)
-    np.testing.assert_allclose(up - reduced.albedo_prime[5:], reduced.stderr[5:], rtol=0.05)

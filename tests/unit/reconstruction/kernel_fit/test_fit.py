@@ -5,9 +5,8 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from model.microstructure.kernel_table import gaussian_weights
 from reconstruction import normal_histogram as nh
 from reconstruction.kernel_fit import search as ks
-from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM, convolved_histogram, fit_kernel
+from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM, fit_kernel
 from reconstruction.kernel_fit.neutral_relief import KernelFitError, convolved, relief_of
-from reconstruction.kernel_fit.two_axes import fit_two_axes
 from reconstruction.normal_histogram import kernels
 
 PIXEL_UM = 6.0
@@ -22,6 +21,16 @@ def skin(side, rng, *, slope=0.3):
     wave = gaussian_filter(white[2], 8.0, mode="wrap")
     height -= 0.5 * np.exp(-((wave / wave.std() / 0.3) ** 2))
     return height * slope * PIXEL_UM / np.gradient(height)[1].std()
+
+
+def convolved_histogram(height, alpha, sigma_um, *, stretch, axis):
+    """Return the histogram that the search compares with its target."""
+    relief = relief_of(height, stretch=stretch, axis=axis, pixel_um=PIXEL_UM)
+    buckets = ks.Buckets(np.zeros(64 * 64 + 1), 64, 1.0)
+    start, change = (relief.along, relief.across), relief.change(sigma_um)
+    counts = buckets.count(start, change, np.array([alpha])).sum(axis=0)[0]
+    shares = counts[:-1].reshape(64, 64) / relief.places.size
+    return shares.T if axis == "y" else shares
 
 
 def scipy_target(height, alpha, sigma_um, *, stretch, axis):
@@ -40,7 +49,7 @@ def scipy_target(height, alpha, sigma_um, *, stretch, axis):
 @pytest.mark.parametrize(("alpha", "sigma_um"), [(-1.3, 9.0), (0.8, 44.5), (0.5, 3.0)])
 def test_the_search_sees_the_histogram_of_plain_numpy(rng, axis, number, alpha, sigma_um):
     height = skin(96, rng)
-    ours = convolved_histogram(height, alpha, sigma_um, stretch=0.8, axis=axis, pixel_um=PIXEL_UM)
+    ours = convolved_histogram(height, alpha, sigma_um, stretch=0.8, axis=axis)
     twin = scipy_target(height, alpha, sigma_um, stretch=0.8, axis=number)
     assert nh.distance(ours, twin) <= 2 * 4 / height.size  # samples on an edge, in single precision
     other = scipy_target(height, alpha, sigma_um, stretch=0.8, axis=1 - number)
@@ -94,8 +103,9 @@ def compared(rng, side, first_sample, **grid):
     flat = (target.T if axis == "y" else target).reshape(-1)
     buckets = ks.Buckets(np.append(flat, 0.0), 64, 1.0)
     alphas, sigmas = grid.get("alphas", ALPHA_GRID), grid.get("sigmas_um", SIGMAS_UM)
-    full = ks.exhaustive(relief, buckets, alphas, sigmas)
-    part = ks.hierarchical(relief, buckets, alphas, sigmas, first_sample=first_sample, rng=rng)
+    kernels_tried = ks.KernelGrid(relief, buckets, alphas, sigmas)
+    full = ks.exhaustive(kernels_tried)
+    part = ks.hierarchical(kernels_tried, first_sample=first_sample, rng=rng)
     return full, part
 
 
@@ -132,9 +142,9 @@ def test_no_kernel_is_dropped_that_is_better_than_its_bound(rng):
     target = nh.histogram(unlike(height, rng), pixel=PIXEL_UM)
     relief = relief_of(height, stretch=1.0, axis="x", pixel_um=PIXEL_UM)
     buckets = ks.Buckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
-    alphas, sigmas = COARSE["alphas"], COARSE["sigmas_um"]
-    full = ks.exhaustive(relief, buckets, alphas, sigmas)
-    race = ks._Race(relief, buckets, alphas, sigmas)
+    grid = ks.KernelGrid(relief, buckets, COARSE["alphas"], COARSE["sigmas_um"])
+    full = ks.exhaustive(grid)
+    race = ks._Race(grid)
     race.run([2048, 8192], rng)
     assert (race.low <= full.distance + 1e-12).all()
     assert race.low.max() > 0.05  # and they say something
@@ -235,7 +245,7 @@ def test_extreme_strains_are_fitted_as_any_other(rng, stretch):
 
 def test_sigma_far_below_a_pixel_is_a_tie_that_goes_to_the_gentlest_kernel(rng):
     height = skin(100, rng)
-    target = convolved_histogram(height, 0.0, 1.0, stretch=1.0, axis="x", pixel_um=PIXEL_UM)
+    target = convolved_histogram(height, 0.0, 1.0, stretch=1.0, axis="x")
     assert gaussian_weights(0.4 / PIXEL_UM).size == 1
     fit = fit_kernel(
         height,
@@ -313,24 +323,6 @@ def test_standard_errors_tell_how_far_another_patch_is_off(rng):
     assert 0.1 < np.mean(np.square(pulls)) < 5.2
 
 
-@pytest.mark.long
-def test_both_axes_are_found_in_turn(rng):
-    height = skin(160, rng)
-    both = convolved(height, -0.8, 14.0, axis="x", pixel_um=PIXEL_UM)
-    both = convolved(both, 0.6, 20.0, axis="y", pixel_um=PIXEL_UM)
-    target = nh.histogram(both, pixel=(PIXEL_UM * 1.05, PIXEL_UM * 0.85))
-    one = fit_kernel(
-        height, target, stretch=0.85, stretch_across=1.05, axis="x", pixel_um=PIXEL_UM, **COARSE
-    )
-    fit = fit_two_axes(
-        height, target, stretch=0.85, stretch_across=1.05, axis="x", pixel_um=PIXEL_UM, **COARSE
-    )
-    assert fit.settled
-    assert (fit.along.alpha, fit.along.sigma_um) == (-0.8, 14.0)
-    assert (fit.across.alpha, fit.across.sigma_um) == (0.6, 20.0)
-    assert fit.distance < 0.005 < one.distance
-
-
 def test_settings_that_do_not_fit_are_refused(rng):
     height, target = np.zeros((8, 8)), np.full((64, 64), 1 / 4096)
     good = {"stretch": 1.0, "axis": "x", "pixel_um": PIXEL_UM}
@@ -355,14 +347,6 @@ def test_settings_that_do_not_fit_are_refused(rng):
     ):
         with pytest.raises(KernelFitError, match=f"neutral relief, {word}"):
             fit_kernel(wrong, target, **{**good, **change})
-
-
-def test_fits_of_two_axes_need_a_round_and_a_start():
-    height, target = np.zeros((8, 8)), np.full((64, 64), 1 / 4096)
-    good = {"stretch": 0.9, "stretch_across": 1.0, "axis": "x", "pixel_um": PIXEL_UM}
-    for change in ({"most_rounds": 0}, {"starts": ()}):
-        with pytest.raises(KernelFitError, match=next(iter(change))):
-            fit_two_axes(height, target, **good, **change)
 
 
 @pytest.mark.parametrize("shape", [(0, 0), (0, 3), (3, 0), (3, 2)])

@@ -9,9 +9,22 @@ import trimesh
 
 from reconstruction.lumitexels.ray_casting import RayCaster
 from reconstruction.lumitexels.samples import Surface, visibility
-from reconstruction.lumitexels.store import LumitexelStore, gather
+from reconstruction.lumitexels.store import LumitexelStore
 
 RADIUS = 80.0
+
+
+def gather(surface, *, images, **settings):
+    """Return the samples of a whole surface, whose images are given by view and light."""
+    store = LumitexelStore(surface, **settings, dtype=np.float32)
+    for view in range(store.view_count):
+        for light in range(store.light_count):
+            image = images(view, light)
+            if image is not None:
+                store.add(view, light, *image)
+    return store.chunk(0, len(surface))
+
+
 FOCAL_PX, WIDTH, HEIGHT = 500.0, 200, 160
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from reconstruction.normal_histogram.block_errors import MIN_BLOCKS, stderr_of_mean
+from reconstruction.normal_histogram.blocks import MIN_BLOCKS, stderr_of_mean
 
 SIDE = 8
 PLACES = np.stack(np.divmod(np.arange(SIDE * SIDE), SIDE), axis=1).astype(np.float64)

@@ -3,8 +3,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from reconstruction import normal_histogram as nh
-from reconstruction.normal_histogram.relief_slopes import SlopeError, slopes
-from reconstruction.normal_histogram.statistics import measure, measure_normals
+from reconstruction.normal_histogram.statistics import measure
 
 
 def rough(side, rng, *, correlation_px=2.0, slope=0.3):
@@ -62,18 +61,3 @@ def test_effective_number_of_correlated_normals_tells_the_distance_of_two_patche
     naive = nh.noise_floor(pairs[0][0].histogram, pairs[0][0].samples)
     assert 0.7 < real / told < 1.4
     assert real / naive > 2.0
-
-
-def test_normals_have_the_statistics_of_the_relief_they_are_of(rng):
-    height = rough(50, rng)
-    a, b, _ = slopes(height, pixel=1.0)
-    normals = np.stack([-a, -b, np.ones_like(a)], axis=-1)
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    ours, theirs = measure_normals(normals), measure(height, pixel=1.0)
-    assert ours.variance_x == pytest.approx(np.var(normals[..., 0]), rel=1e-9)
-    assert ours.variance_y == pytest.approx(theirs.variance_y, rel=1e-9)
-    assert ours.stderr_y == pytest.approx(theirs.stderr_y, rel=1e-6)
-    # at the edge of a bucket rounding decides
-    assert nh.distance(ours.histogram, theirs.histogram) <= 4 / height.size
-    with pytest.raises(SlopeError, match=r"normals: got shape \(2500, 3\)"):
-        measure_normals(normals.reshape(-1, 3))

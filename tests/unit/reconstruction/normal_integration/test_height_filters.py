@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from reconstruction.normal_integration import slope_fields
-from reconstruction.normal_integration.height_errors import expected_rms, sampled_stderr
 from reconstruction.normal_integration.height_filters import denoise_slopes, high_pass
 from reconstruction.normal_integration.integration import integrate, integrate_map
+from reconstruction.normal_integration.relief_errors import expected_rms
 from reconstruction.normal_integration.weighted_poisson import IntegrationError
 
 
@@ -95,10 +95,6 @@ def test_filters_refuse_what_makes_no_sense():
         lambda: denoise_slopes(
             slope_fields.from_normals(np.ones((4, 4, 3)), stderr_rad=0.1), sigma_px=9.0
         ),
-        lambda: sampled_stderr(np.ones((4, 4, 3)), rng=np.random.default_rng(0)),
-        lambda: sampled_stderr(
-            np.ones((4, 4, 3)), stderr_rad=0.1, samples=1, rng=np.random.default_rng(0)
-        ),
     ):
         with pytest.raises(IntegrationError, match="got"):
             call()
@@ -170,18 +166,3 @@ def test_errors_of_height_are_those_of_repeated_noise(cutoff, rng):
     spectral = expected_rms(shape, sigma / np.sqrt(2.0), pixel=pixel, cutoff=cutoff)
     # 4 sigma of 12 draws (Student: 1 in 500); borders add up to 3 % behind a high-pass
     assert spectral == pytest.approx(found, rel=4 * chance + (0.03 if cutoff else 0.01))
-    flat = np.broadcast_to([0.0, 0.0, 1.0], (*shape, 3))
-    map_of = sampled_stderr(flat, stderr_rad=sigma, pixel=pixel, cutoff=cutoff, rng=rng)
-    sampled = np.sqrt(np.mean(map_of**2))
-    assert sampled == pytest.approx(found, rel=4 * np.sqrt(1 + 12 / 16) * chance + 0.02)
-
-
-def test_errors_grow_where_noise_is(rng):
-    sigma = np.full((64, 64), 0.01)
-    sigma[:, 32:] = 0.1
-    valid = np.ones((64, 64), bool)
-    valid[0, 0] = False
-    flat = np.broadcast_to([0.0, 0.0, 1.0], (64, 64, 3))
-    error = sampled_stderr(flat, stderr_rad=sigma, valid=valid, cutoff=12.0, rng=rng)
-    assert error[0, 0] == 0.0
-    assert error[:, 40:].mean() > 5.0 * error[:, :24].mean()

@@ -59,27 +59,35 @@ def pixels(texels, shape):
     return np.moveaxis(resampling.resampled(np.moveaxis(texels, 2, 0), shape), 0, 2)
 
 
+def low_passed(derivatives, shape, *, variance=0.0, valid=True):
+    """Return the texels whose bilinear reading is nearest to some derivatives."""
+    good = valid & np.isfinite(derivatives).all(axis=2)
+    kept, ones = good[..., None], good.astype(float)
+    noise = np.where(kept, variance, np.zeros(derivatives.shape))
+    return wrinkle_texels.fit_texels(ones, np.where(kept, derivatives, 0.0), noise, ones, shape)
+
+
 # --- texels ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("shape", [(32, 32), (20, 31), (1, 1), (64, 128)])
 def test_texels_come_back_from_their_own_bilinear_reading(rng, shape):
     texels = rng.standard_normal((*shape, 2))
-    got = wrinkle_texels.low_passed(pixels(texels, (128, 128)), shape)
+    got = low_passed(pixels(texels, (128, 128)), shape)
     assert got.valid.all()
     np.testing.assert_allclose(got.values, texels, atol=1e-6)
 
 
 def test_a_map_at_full_resolution_is_kept(rng):
     d = rng.standard_normal((24, 17, 2))
-    np.testing.assert_allclose(wrinkle_texels.low_passed(d, (24, 17)).values, d, atol=1e-7)
+    np.testing.assert_allclose(low_passed(d, (24, 17)).values, d, atol=1e-7)
 
 
 def test_detail_finer_than_a_texel_is_averaged_away_and_does_not_alias():
     x = np.arange(256)
     ripple = np.zeros((256, 256, 2))
     ripple[..., 0] = np.cos(np.pi * x)  # one period in two pixels; sixteen pixels a texel
-    got = wrinkle_texels.low_passed(ripple, (16, 16)).values
+    got = low_passed(ripple, (16, 16)).values
     assert np.abs(got[:, 2:-2]).max() < 0.02
     assert np.abs(got).max() < 0.05  # half a texel's weights are missing at the border
     picked = ripple[::16, ::16]  # what taking every sixteenth pixel would keep
@@ -88,7 +96,7 @@ def test_detail_finer_than_a_texel_is_averaged_away_and_does_not_alias():
 
 def test_the_fitted_low_pass_reads_closer_than_averages(rng):
     d = gaussian_filter(rng.standard_normal((128, 128, 2)), (6, 6, 0))
-    fitted = wrinkle_texels.low_passed(d, (16, 16)).values
+    fitted = low_passed(d, (16, 16)).values
     averaged = np.moveaxis(resampling.resampled(np.moveaxis(d, 2, 0), (16, 16)), 0, 2)
     misfit = [np.mean((pixels(t, (128, 128)) - d) ** 2) for t in (fitted, averaged)]
     assert misfit[0] < 0.8 * misfit[1]
@@ -100,13 +108,13 @@ def test_holes_do_not_leak_into_texels(rng):
     valid = rng.random((128, 128)) > 0.4
     valid[30:60, 40:90] = False
     d[~valid] = 1e6
-    got = wrinkle_texels.low_passed(d, (16, 16), valid=valid)
+    got = low_passed(d, (16, 16), valid=valid)
     np.testing.assert_allclose(got.values[got.valid], texels[got.valid], atol=1e-5)
     assert not got.valid[5, 7]
     assert not got.values[~got.valid].any()
     assert np.isinf(got.stderr[~got.valid]).all()
     assert np.isfinite(got.stderr[got.valid]).all()
-    nothing = wrinkle_texels.low_passed(d, (16, 16), valid=np.zeros((128, 128), bool))
+    nothing = low_passed(d, (16, 16), valid=np.zeros((128, 128), bool))
     assert not nothing.valid.any()
 
 
@@ -114,7 +122,7 @@ def test_holes_do_not_leak_into_texels(rng):
 def test_a_texel_scatters_as_its_standard_error_says(rng, side):
     sigma = 0.1
     noise = sigma * rng.standard_normal((128, 128, 2))
-    got = wrinkle_texels.low_passed(noise, (side, side), variance=np.full(noise.shape, sigma**2))
+    got = low_passed(noise, (side, side), variance=np.full(noise.shape, sigma**2))
     edge = max(side // 8, 1)  # the error holds away from borders
     z = (got.values / got.stderr)[edge:-edge, edge:-edge]
     # neighbours scatter against each other: at least a quarter of the samples is independent
@@ -125,7 +133,7 @@ def test_a_texel_scatters_as_its_standard_error_says(rng, side):
 
 def test_more_texels_than_pixels_are_refused():
     with pytest.raises(WrinkleError, match="size"):
-        wrinkle_texels.low_passed(np.zeros((8, 8, 2)), (9, 8))
+        low_passed(np.zeros((8, 8, 2)), (9, 8))
 
 
 def test_errors_of_normals_become_errors_of_derivatives(rng):
@@ -157,14 +165,6 @@ def test_grazing_normals_and_unknown_errors_are_masked_and_counted():
 
 
 # --- one expression -------------------------------------------------------------------------
-
-
-def test_the_wrinkle_map_is_the_difference_of_derivatives(face):
-    base, layer = face
-    every = np.ones((1, 1, 1))
-    n = wrinkles.combine(base, layer.wrinkle, every, np.ones(1))
-    got = wrinkle_fit.wrinkle_map(wrinkles.decode(base), n, size=(32, 32))
-    np.testing.assert_allclose(got.values, layer.wrinkle, atol=1e-6)
 
 
 @pytest.mark.parametrize("clamp", ["unit", "signed"])
@@ -365,7 +365,7 @@ def test_the_normal_equations_are_those_of_the_full_design(face, rng):
     weight = rng.random((SIDE, SIDE)).astype(np.float32)
     difference = wrinkle_weights.Difference(d, np.zeros_like(d), weight)
     read = pixels(np.asarray(layer.wrinkle), (SIDE, SIDE))
-    got = wrinkle_weights.zone_equations(layer.masks, read, difference)
+    got = wrinkle_weights.equations_of(layer.masks, read, {"": difference})[""]
     full = np.stack([resampling.resampled(m, (SIDE, SIDE)) for m in layer.masks])
     design = (full[..., None] * read).reshape(8, -1)
     v = np.repeat(weight.ravel().astype(float), 2)
