@@ -4,6 +4,8 @@ Sources nearer than their reach are summed one by one in float64. Everything els
 nodes that need not be opened, goes to a buffer that is evaluated in one stream in float32.
 """
 
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import math
@@ -21,7 +23,7 @@ _TWO_PI = 2.0 * math.pi
 
 
 @njit(inline="always")
-def _decay(x):  # type: ignore[no-untyped-def]
+def _decay(x):
     """Return exp(-x) for x >= 0, within 5e-6 of itself up to 20 and 2e-3 up to 64, held there."""
     y = min(x, float32(64.0)) * float32(-0.015625)
     p = float32(0.008333333)
@@ -39,7 +41,7 @@ def _decay(x):  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath=_FAST_MATH, error_model="numpy")
-def _far(count, away2, area, light, pull, sigma, depth, height, scale, total):  # type: ignore[no-untyped-def]
+def _far(count, away2, area, light, pull, sigma, depth, height, scale, total):
     """Add light and mass of a buffer in one channel, first moments of the light included."""
     s = float32(sigma)
     z_r, z_v = float32(depth), float32(height)
@@ -64,7 +66,7 @@ def _far(count, away2, area, light, pull, sigma, depth, height, scale, total):  
 
 
 @njit(error_model="numpy")
-def _disc(r2, sigma, depth, height, scale):  # type: ignore[no-untyped-def]
+def _disc(r2, sigma, depth, height, scale):
     """Return the profile at a radius, and the share of light within it."""
     value = within = 0.0
     for z in (depth, height):
@@ -77,7 +79,7 @@ def _disc(r2, sigma, depth, height, scale):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy")
-def _near(count, away2, reach, area, light, sigma, depth, height, scale, own, total):  # type: ignore[no-untyped-def]
+def _near(count, away2, reach, area, light, sigma, depth, height, scale, own, total):
     """Add light and mass of sources within their reach, float64; see `dipole_sum.kernel`.
 
     ``own`` is the light at the exit point itself; NaN: not known, each source's own counts.
@@ -103,7 +105,7 @@ def _near(count, away2, reach, area, light, sigma, depth, height, scale, own, to
 
 
 @njit
-def _nearest(point, place, seen, low, high, skip):  # type: ignore[no-untyped-def]
+def _nearest(point, place, seen, low, high, skip):
     """Return the source nearest to a point."""
     best, found = np.inf, 0
     node = 0
@@ -128,7 +130,7 @@ def _nearest(point, place, seen, low, high, skip):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def gather(  # type: ignore[no-untyped-def]
+def gather(
     at,
     sigma,
     depth,

@@ -1,8 +1,8 @@
 """Cheapest cuts between overlapping windows, compiled."""
 
-from __future__ import annotations
+# mypy: allow-untyped-defs
 
-from typing import Any
+from __future__ import annotations
 
 import numpy as np
 from numba import njit
@@ -11,9 +11,7 @@ _INFINITE_COST = np.float32(3.0e38)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _misfit_row(
-    a: Any, b: Any, a0: Any, a1: Any, b0: Any, b1: Any, per_step: Any, out: Any
-) -> None:
+def _misfit_row(a, b, a0, a1, b0, b1, per_step, out):
     """Write what a cut costs at each place of a row: squared slope that closing a step leaves.
 
     Parameters
@@ -37,17 +35,7 @@ def _misfit_row(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def cut_cost(
-    heights: Any,
-    a: Any,
-    a_step: Any,
-    b: Any,
-    b_step: Any,
-    length: Any,
-    overlap: Any,
-    per_step: Any,
-    bound: Any,
-) -> Any:
+def cut_cost(heights, a, a_step, b, b_step, length, overlap, per_step, bound):
     """Return the cost of the cheapest cut through an overlap, or `bound` once it must exceed it.
 
     Parameters
@@ -95,7 +83,7 @@ def cut_cost(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cheapest_path(misfit: Any, first: Any, last: Any, path: Any) -> Any:
+def _cheapest_path(misfit, first, last, path):
     """Write the cheapest path down the rows of ``misfit`` and return its cost.
 
     Parameters
@@ -136,18 +124,7 @@ def _cheapest_path(misfit: Any, first: Any, last: Any, path: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def cut_columns(
-    row: Any,
-    cells: Any,
-    lines_x: Any,
-    wrap_x: Any,
-    window: Any,
-    overlap: Any,
-    sources: Any,
-    heights: Any,
-    per_step: Any,
-    paths: Any,
-) -> None:
+def cut_columns(row, cells, lines_x, wrap_x, window, overlap, sources, heights, per_step, paths):
     """Cut between the windows of a row of cells.
 
     Parameters
@@ -183,7 +160,7 @@ def cut_columns(
 
 
 @njit(cache=True, nogil=True)
-def cell_of(line: Any, lines: Any) -> Any:
+def cell_of(line, lines):
     """Return which cell a pixel within the map lies in."""
     count = lines.size - 1
     cell = min(int(line * count / lines[count]), count - 1)
@@ -195,17 +172,7 @@ def cell_of(line: Any, lines: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def place_in_row(
-    row: Any,
-    y: Any,
-    x: Any,
-    cells: Any,
-    lines_x: Any,
-    wrap_x: Any,
-    overlap: Any,
-    sources: Any,
-    across: Any,
-) -> Any:
+def place_in_row(row, y, x, cells, lines_x, wrap_x, overlap, sources, across):
     """Return (cell's column, pixel in the sources or -1) that a row of cells shows at (y, x).
 
     ``y`` is the row within the windows, ``x`` within the map.
@@ -232,21 +199,21 @@ def place_in_row(
 
 @njit(cache=True, nogil=True)
 def _band(
-    line: Any,
-    first: Any,
-    last: Any,
-    cells: Any,
-    lines_y: Any,
-    lines_x: Any,
-    wrap_x: Any,
-    overlap: Any,
-    sources: Any,
-    heights: Any,
-    across: Any,
-    upper: Any,
-    lower: Any,
-    known: Any,
-) -> None:
+    line,
+    first,
+    last,
+    cells,
+    lines_y,
+    lines_x,
+    wrap_x,
+    overlap,
+    sources,
+    heights,
+    across,
+    upper,
+    lower,
+    known,
+):
     """Write both rows of cells at a line between them, turned: (column of the map, place)."""
     ny = cells.shape[0]
     above = (line - 1) % ny
@@ -268,18 +235,8 @@ def _band(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def cut_rows(
-    line: Any,
-    cells: Any,
-    lines_y: Any,
-    lines_x: Any,
-    wrap_x: Any,
-    overlap: Any,
-    sources: Any,
-    heights: Any,
-    per_step: Any,
-    across: Any,
-    down: Any,
-) -> None:
+    line, cells, lines_y, lines_x, wrap_x, overlap, sources, heights, per_step, across, down
+):
     """Cut between the row of cells ``line`` and the one above it, cell by cell.
 
     Where two cells of a row meet, the cut passes through the cheapest place of that column, so

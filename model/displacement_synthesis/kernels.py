@@ -9,9 +9,9 @@ second array with every source transposed, so that a cut that runs along a row i
 that runs along a column.
 """
 
-from __future__ import annotations
+# mypy: allow-untyped-defs
 
-from typing import Any
+from __future__ import annotations
 
 import numpy as np
 from numba import njit
@@ -23,7 +23,7 @@ MAX_DRAWS = 24
 
 
 @njit(cache=True, nogil=True)
-def mixed(key: Any) -> Any:
+def mixed(key):
     """Return 64 bits that depend on every bit of ``key`` (the finalizer of splitmix64)."""
     z = np.uint64(key) + np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -32,12 +32,12 @@ def mixed(key: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _uniform(key: Any) -> Any:
+def _uniform(key):
     return float(mixed(key) >> np.uint64(11)) * 2.0**-53
 
 
 @njit(cache=True, nogil=True)
-def _drawn(key: Any, sources: Any, filled: Any, window: Any, most_filled: Any) -> Any:
+def _drawn(key, sources, filled, window, most_filled):
     """Return (source, row, column) of a window with few filled pixels; source -1: none found.
 
     Places are drawn as if windows might stand out of the source by half their size, and are then
@@ -71,28 +71,28 @@ def _drawn(key: Any, sources: Any, filled: Any, window: Any, most_filled: Any) -
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def choose_windows(
-    row: Any,
-    first_column: Any,
-    cells: Any,
-    lines_y: Any,
-    lines_x: Any,
-    neighbours_x: Any,
-    neighbours_y: Any,
-    wrap_x: Any,
-    wrap_y: Any,
-    window: Any,
-    overlap: Any,
-    levels: Any,
-    level_first: Any,
-    sources: Any,
-    heights: Any,
-    turned: Any,
-    filled: Any,
-    most_filled: Any,
-    candidates: Any,
-    seed: Any,
-    per_step: Any,
-) -> Any:
+    row,
+    first_column,
+    cells,
+    lines_y,
+    lines_x,
+    neighbours_x,
+    neighbours_y,
+    wrap_x,
+    wrap_y,
+    window,
+    overlap,
+    levels,
+    level_first,
+    sources,
+    heights,
+    turned,
+    filled,
+    most_filled,
+    candidates,
+    seed,
+    per_step,
+):
     """Choose windows for every other cell of a row, by the cheapest cuts to neighbours there.
 
     Parameters
@@ -236,22 +236,22 @@ def choose_windows(
 
 @njit(cache=True, nogil=True)
 def lay_down(
-    top: Any,
-    left: Any,
-    cells: Any,
-    lines_y: Any,
-    lines_x: Any,
-    wrap_x: Any,
-    wrap_y: Any,
-    overlap: Any,
-    sources: Any,
-    heights: Any,
-    across: Any,
-    down: Any,
-    out: Any,
-    labels: Any,
-    pixels: Any,
-) -> None:
+    top,
+    left,
+    cells,
+    lines_y,
+    lines_x,
+    wrap_x,
+    wrap_y,
+    overlap,
+    sources,
+    heights,
+    across,
+    down,
+    out,
+    labels,
+    pixels,
+):
     """Write the windows' pixels of one tile.
 
     Parameters
@@ -303,9 +303,7 @@ def lay_down(
 
 
 @njit(cache=True, nogil=True)
-def steps_at_cuts(
-    out: Any, labels: Any, pixels: Any, cells: Any, sources: Any, heights: Any, divergence: Any
-) -> None:
+def steps_at_cuts(out, labels, pixels, cells, sources, heights, divergence):
     """Write the divergence of what differences across cuts have too much.
 
     Across a cut the difference ought to be the mean of those that both windows have there.

@@ -1,8 +1,8 @@
 """Loops of the statistics in a disc: a square, two caps by row sums, two lobes by column sums."""
 
-from __future__ import annotations
+# mypy: allow-untyped-defs
 
-from typing import Any
+from __future__ import annotations
 
 import numpy as np
 from numba import njit, prange
@@ -11,13 +11,13 @@ from model.facial_color.row_kernels import disc_row, square_row
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _counts(h: Any, valid: Any, masked: Any, y: Any, x: Any) -> Any:
+def _counts(h, valid, masked, y, x):
     """Return whether a pixel counts."""
     return np.isfinite(h[y, x]) and (not masked or valid[y, x] != 0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc"})
-def _sum_about(row: Any, about: Any) -> Any:
+def _sum_about(row, about):
     """Return the sum of the differences from a value."""
     total = 0.0
     for i in range(row.size):
@@ -26,7 +26,7 @@ def _sum_about(row: Any, about: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
-def _powers(out: Any, row: Any, about: Any, moment: Any) -> None:
+def _powers(out, row, about, moment):
     """Write differences from a value, or their squares."""
     if moment == 0:
         for i in range(row.size):
@@ -38,7 +38,7 @@ def _powers(out: Any, row: Any, about: Any, moment: Any) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
-def _add_down(running: Any, new: Any, out: Any) -> None:
+def _add_down(running, new, out):
     """Go one row down with sums down columns."""
     for i in range(new.size):
         running[i] += new[i]
@@ -46,7 +46,7 @@ def _add_down(running: Any, new: Any, out: Any) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
-def _along(v: Any, n: Any, r0: Any, r1: Any, r2: Any, r3: Any) -> Any:
+def _along(v, n, r0, r1, r2, r3):
     """Write the sums along four rows, before each entry and after the last; return the largest."""
     v0, v1, v2, v3 = v[0], v[1], v[2], v[3]
     s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
@@ -62,18 +62,7 @@ def _along(v: Any, n: Any, r0: Any, r1: Any, r2: Any, r3: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
-def _finish(
-    s1: Any,
-    s2: Any,
-    whole: Any,
-    about: Any,
-    trusted: Any,
-    blur1: Any,
-    blur2: Any,
-    unit: Any,
-    mean: Any,
-    deviation: Any,
-) -> Any:
+def _finish(s1, s2, whole, about, trusted, blur1, blur2, unit, mean, deviation):
     """Write mean and deviation of a row of whole discs; return how many need another look."""
     doubtful = 0
     per = 1.0 / whole
@@ -89,7 +78,7 @@ def _finish(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never", fastmath={"reassoc"})
-def _moments_of(row: Any, about: Any) -> Any:
+def _moments_of(row, about):
     """Return number, sum and sum of squares about a value of the finite entries."""
     n, s1, s2 = 0, 0.0, 0.0
     for i in range(row.size):
@@ -103,7 +92,7 @@ def _moments_of(row: Any, about: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never", fastmath={"reassoc"})
-def _valid_moments_of(row: Any, valid: Any, about: Any) -> Any:
+def _valid_moments_of(row, valid, about):
     """Do the work of `_moments_of` where an entry is valid."""
     n, s1, s2 = 0, 0.0, 0.0
     for i in range(row.size):
@@ -117,7 +106,7 @@ def _valid_moments_of(row: Any, valid: Any, about: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _directly(h: Any, valid: Any, masked: Any, half: Any, y: Any, x: Any) -> Any:
+def _directly(h, valid, masked, half, y, x):
     """Return mean and variance of one disc by summing its pixels about one of them."""
     rows, columns = h.shape
     reach = half.size - 1
@@ -143,7 +132,7 @@ def _directly(h: Any, valid: Any, masked: Any, half: Any, y: Any, x: Any) -> Any
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _stays(h: Any, valid: Any, masked: Any, half: Any, y: Any, x: Any, level: Any) -> Any:
+def _stays(h, valid, masked, half, y, x, level):
     """Return whether what a disc gains by a step to column `x` is all of one value."""
     rows, columns = h.shape
     reach = half.size - 1
@@ -156,29 +145,29 @@ def _stays(h: Any, valid: Any, masked: Any, half: Any, y: Any, x: Any, level: An
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _tile(
-    h: Any,
-    valid: Any,
-    masked: Any,
-    half: Any,
-    high: Any,
-    inner: Any,
-    whole: Any,
-    trusted: Any,
-    y0: Any,
-    y1: Any,
-    x0: Any,
-    x1: Any,
-    p: Any,
-    q: Any,
-    nothing: Any,
-    sums: Any,
-    v: Any,
-    down: Any,
-    squares_of: Any,
-    mean: Any,
-    deviation: Any,
-    count: Any,
-) -> None:
+    h,
+    valid,
+    masked,
+    half,
+    high,
+    inner,
+    whole,
+    trusted,
+    y0,
+    y1,
+    x0,
+    x1,
+    p,
+    q,
+    nothing,
+    sums,
+    v,
+    down,
+    squares_of,
+    mean,
+    deviation,
+    count,
+):
     """Do the work of `disc_moments` for rows y0 to y1 and columns x0 to x1.
 
     Parameters
@@ -309,20 +298,8 @@ def _tile(
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def disc_moments(
-    h: Any,
-    valid: Any,
-    masked: Any,
-    half: Any,
-    high: Any,
-    inner: Any,
-    tall: Any,
-    wide: Any,
-    parts: Any,
-    trusted: Any,
-    mean: Any,
-    deviation: Any,
-    count: Any,
-) -> None:
+    h, valid, masked, half, high, inner, tall, wide, parts, trusted, mean, deviation, count
+):
     """Write mean, deviation and number of valid pixels in a disc about each pixel.
 
     A tile takes the mean of all that its discs can see as the value to sum about, and sums in

@@ -4,10 +4,11 @@ Kernels are parallel over rows and called from one thread. None uses fast-math, 
 becomes depends neither on the number of threads nor on the window it is computed in.
 """
 
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numba import njit, prange
@@ -27,7 +28,7 @@ FINE, NOT_FINITE, ALPHA, SIGMA, AXIS = range(5)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def distance_to_invalid(valid: Any) -> Any:
+def distance_to_invalid(valid):
     """Return how many king's moves each pixel is from the nearest one that is not valid.
 
     Parameters
@@ -72,7 +73,7 @@ def distance_to_invalid(valid: Any) -> Any:
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def check_rows(alpha: Any, sigma: Any, axis: Any, rows: Any, columns: Any, most: Any) -> Any:
+def check_rows(alpha, sigma, axis, rows, columns, most):
     """Return what is wrong with each row's parameters, and the largest sigma that is used there.
 
     Parameters
@@ -118,7 +119,7 @@ def check_rows(alpha: Any, sigma: Any, axis: Any, rows: Any, columns: Any, most:
 
 
 @njit(inline="always")
-def _cubic(f):  # type: ignore[no-untyped-def]
+def _cubic(f):
     """Return Keys' weights (a = -1/2) of the pixels at -1, 0, 1, 2 for a sample at f."""
     f2 = f * f
     f3 = f2 * f
@@ -131,16 +132,14 @@ def _cubic(f):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _mirrored(i, n):  # type: ignore[no-untyped-def]
+def _mirrored(i, n):
     """Return the index within n that i comes to, mirrored about the edges of the end pixels."""
     j = i % (2 * n)
     return j if j < n else 2 * n - 1 - j
 
 
 @njit
-def _slow_sample(  # type: ignore[no-untyped-def]
-    source, clear, top, left, rows, columns, border, y, x, fy, fx, reach
-):
+def _slow_sample(source, clear, top, left, rows, columns, border, y, x, fy, fx, reach):
     """Return a sample between the pixels y, y + 1 and x, x + 1 and whether all it needs is valid.
 
     `reach` pixels to each side are weighed; a weight of 0 needs nothing.
@@ -172,7 +171,7 @@ def _slow_sample(  # type: ignore[no-untyped-def]
 
 
 @njit
-def _tap(f, k, reach):  # type: ignore[no-untyped-def]
+def _tap(f, k, reach):
     if reach == LINEAR:
         return f if k == 1 else np.float32(1.0) - f
     a, b, c, d = _cubic(f)
@@ -184,19 +183,7 @@ def _tap(f, k, reach):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def along_lines(
-    source: Any,
-    clear: Any,
-    source_at: Any,
-    size: Any,
-    axis: Any,
-    alpha: Any,
-    sigma: Any,
-    out_at: Any,
-    reach: Any,
-    border: Any,
-    out: Any,
-) -> None:
+def along_lines(source, clear, source_at, size, axis, alpha, sigma, out_at, reach, border, out):
     """Write ``h + alpha (G * h - h)`` with the Gaussian along each pixel's own line (eqs. 3 and 6).
 
     Two samples at the same distance to both sides are one pair; a pair of which one cannot be

@@ -1,9 +1,10 @@
 """Strain of vertices drawn into a texture, compiled."""
 
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numba import njit, prange
@@ -17,21 +18,7 @@ EMPTY, COVERED, PADDED = range(3)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def fill_texture(
-    faces: Any,
-    x: Any,
-    y: Any,
-    values: Any,
-    valid: Any,
-    top: Any,
-    left: Any,
-    width: Any,
-    height: Any,
-    state: Any,
-    stretch: Any,
-    axes: Any,
-    scale: Any,
-) -> None:
+def fill_texture(faces, x, y, values, valid, top, left, width, height, state, stretch, axes, scale):
     """Fill a window of a texture: tensors between vertices, their principal axes at each pixel.
 
     The triangle of the lowest number has a pixel that several hold. What a pixel becomes does
@@ -130,7 +117,7 @@ def fill_texture(
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def pad_once(state: Any, before: Any, stretch: Any, axes: Any, scale: Any) -> None:
+def pad_once(state, before, stretch, axes, scale):
     """Give empty pixels the values of a neighbour that had some; `before` is a copy of `state`."""
     rows, columns = state.shape
     for r in prange(rows):
@@ -153,18 +140,7 @@ def pad_once(state: Any, before: Any, stretch: Any, axes: Any, scale: Any) -> No
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def look_up(
-    stretch: Any,
-    state: Any,
-    breaks: Any,
-    alpha_lines: Any,
-    sigma_lines: Any,
-    ends: Any,
-    limits: Any,
-    scale: Any,
-    alpha: Any,
-    sigma: Any,
-) -> None:
+def look_up(stretch, state, breaks, alpha_lines, sigma_lines, ends, limits, scale, alpha, sigma):
     """Write strength and sigma in pixels for each pixel's two stretch ratios (eqs. 8 and 9).
 
     Parameters

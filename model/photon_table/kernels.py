@@ -1,5 +1,7 @@
 """The compiled evaluation of the photon table (see `model.photon_table`)."""
 
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 from math import exp, log, log1p, sqrt
@@ -21,7 +23,7 @@ _ROOT_FLOOR = 1e-6  # slopes by sigma_a at 0 are limits; here they are reached t
 
 
 @njit(inline="always")
-def _basis(t):  # type: ignore[no-untyped-def]
+def _basis(t):
     """Return the four uniform cubic B-splines at t in [0, 1] of their interval, and slopes."""
     s = 1.0 - t
     t2, s2 = t * t, s * s
@@ -55,7 +57,7 @@ def _basis(t):  # type: ignore[no-untyped-def]
     nogil=True,
     error_model="numpy",
 )
-def evaluate(  # type: ignore[no-untyped-def]
+def evaluate(
     sigma_a,
     sigma_s_prime,
     coefficients,
