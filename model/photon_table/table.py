@@ -28,7 +28,6 @@ __all__ = [
     "Slopes",
     "TableDomainError",
     "asymmetries",
-    "by_asymmetry",
     "derivatives",
     "domain",
     "reflectance",
@@ -179,46 +178,6 @@ def derivatives(
     )
     out[:, ~scatters] = 0.0
     return Slopes(*(part.reshape(shape) for part in out))
-
-
-def by_asymmetry(
-    radius_mm: ArrayLike,
-    sigma_a_per_mm: ArrayLike,
-    sigma_s_prime_per_mm: ArrayLike,
-    *,
-    eta: float = 1.4,
-    g: float = 0.8,
-    collection: Collection = "all",
-    core_mm: float = 0.0,
-    source_core_mm: float = 0.0,
-    step: float = 0.05,
-) -> Float64Array:
-    """Return dR/dg, 1/mm^2, at constant sigma_s': a difference over 2 `step` (one-sided at ends).
-
-    Other parameters and errors as :func:`reflectance`.
-
-    Examples
-    --------
-    >>> slope = by_asymmetry([0.5, 20.0], 0.0, 1.0)
-    >>> bool(abs(slope[1]) < 0.1 * abs(slope[0]))
-    True
-    """
-    held = asymmetries()
-    low, high = max(g - step, held[0]), min(g + step, held[-1])
-    first, second = (
-        reflectance(
-            radius_mm,
-            sigma_a_per_mm,
-            sigma_s_prime_per_mm,
-            eta=eta,
-            g=value,
-            collection=collection,
-            core_mm=core_mm,
-            source_core_mm=source_core_mm,
-        )
-        for value in (low, high)
-    )
-    return np.asarray((second - first) / (high - low))
 
 
 def relative_error(

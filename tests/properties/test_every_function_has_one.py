@@ -107,7 +107,6 @@ NOT_DRIVEN = {
         (
             FITTED,
             {
-                "model.brdf.tables": "of_merl",
                 "model.displacement_synthesis.growth": "grow lay_out",
                 "model.brdf.rgl": "of_brdf",
                 "reconstruction.brdf_basis.space": "curve",
@@ -133,7 +132,7 @@ NOT_DRIVEN = {
         (
             WHOLE,
             {
-                "model.skin_reflectance": "assemble lobes_of local_diffuse surface_brdf",
+                "model.skin_reflectance": "assemble lobes_of surface_brdf",
                 "reconstruction.scan.repair": "repair",
                 "reconstruction.scan.mesh": "prepare refine unwrap",
             },
