@@ -41,8 +41,9 @@ def _decay(x):
 
 
 @njit(fastmath=_FAST_MATH, error_model="numpy")
-def _far(count, away2, area, light, pull, sigma, depth, height, scale, total):
+def _far(count, away2, area, light, pull, medium, total):
     """Add light and mass of a buffer in one channel, first moments of the light included."""
+    sigma, depth, height, scale = medium
     s = float32(sigma)
     z_r, z_v = float32(depth), float32(height)
     z_r2, z_v2 = z_r * z_r, z_v * z_v
@@ -66,8 +67,9 @@ def _far(count, away2, area, light, pull, sigma, depth, height, scale, total):
 
 
 @njit(error_model="numpy")
-def _disc(r2, sigma, depth, height, scale):
+def _disc(r2, medium):
     """Return the profile at a radius, and the share of light within it."""
+    sigma, depth, height, scale = medium
     value = within = 0.0
     for z in (depth, height):
         d = max(math.sqrt(r2 + z * z), 1e-300)
@@ -79,16 +81,16 @@ def _disc(r2, sigma, depth, height, scale):
 
 
 @njit(error_model="numpy")
-def _near(count, away2, reach, area, light, sigma, depth, height, scale, own, total):
+def _near(count, away2, reach, area, light, medium, own, total):
     """Add light and mass of sources within their reach, float64; see `dipole_sum.kernel`.
 
     ``own`` is the light at the exit point itself; NaN: not known, each source's own counts.
     """
     for i in range(count):
         a = reach[i]
-        fine = a <= MIN_RADIUS_PER_DEPTH * depth
+        fine = a <= MIN_RADIUS_PER_DEPTH * medium[1]
         r2 = float(away2[i]) if fine else a * a
-        value, within = _disc(r2, sigma, depth, height, scale)
+        value, within = _disc(r2, medium)
         total[1] += value * area[i]
         total[0] += value * light[i]
         if not fine:
@@ -99,9 +101,33 @@ def _near(count, away2, reach, area, light, sigma, depth, height, scale, own, to
             total[0] += shape * missing * light[i]
             if own == own:
                 r2 *= SELF_RADIUS_FRACTION * SELF_RADIUS_FRACTION
-                value, within = _disc(r2, sigma, depth, height, scale)
+                value, within = _disc(r2, medium)
                 missing = within - math.pi * r2 * value
                 total[0] += shape * missing * (own * area[i] - light[i])
+
+
+@njit
+def _medium_at(media, q, c):
+    """Return the dipole of an exit point's channel."""
+    sigma, depth, height, scale = media
+    return sigma[q, c], depth[q, c], height[q, c], scale[q, c]
+
+
+@njit
+def _add_far(count, far, media, q, total):
+    """Do the work of `_far` for each channel of an exit point."""
+    away2, mass, light, pull = far
+    for c in range(3):
+        _far(count, away2, mass, light[c], pull[c], _medium_at(media, q, c), total[c])
+
+
+@njit
+def _add_near(count, near, media, q, own, total):
+    """Do the work of `_near` for each channel of an exit point."""
+    away2, reach, area, light = near
+    for c in range(3):
+        medium = _medium_at(media, q, c)
+        _near(count, away2, reach, area, light[c], medium, own[q, c], total[c])
 
 
 @njit
@@ -177,12 +203,10 @@ def gather(
     mass = np.empty(BUFFER_SIZE, np.float32)
     light = np.empty((3, BUFFER_SIZE), np.float32)
     pull = np.empty((3, BUFFER_SIZE), np.float32)
-    near_away2, near_reach, near_area = (
-        np.empty(NEAR_SIZE),
-        np.empty(NEAR_SIZE),
-        np.empty(NEAR_SIZE),
-    )
-    near_light = np.empty((3, NEAR_SIZE))
+    near_away2, near_reach = np.empty(NEAR_SIZE), np.empty(NEAR_SIZE)
+    near_area, near_light = np.empty(NEAR_SIZE), np.empty((3, NEAR_SIZE))
+    media, far = (sigma, depth, height, scale), (away2, mass, light, pull)
+    near = (near_away2, near_reach, near_area, near_light)
     total = np.zeros((3, 2))
     nodes = len(skip)
     for q in range(len(at)):
@@ -222,19 +246,7 @@ def gather(
                     opened = False
             if not opened:
                 if count == BUFFER_SIZE:
-                    for c in range(3):
-                        _far(
-                            count,
-                            away2,
-                            mass,
-                            light[c],
-                            pull[c],
-                            sigma[q, c],
-                            depth[q, c],
-                            height[q, c],
-                            scale[q, c],
-                            total[c],
-                        )
+                    _add_far(count, far, media, q, total)
                     count = 0
                 err += strays / room
                 away2[count] = r2
@@ -257,20 +269,7 @@ def gather(
                     used += 1
                     if r2 < reach[i] * reach[i]:
                         if close == NEAR_SIZE:
-                            for c in range(3):
-                                _near(
-                                    close,
-                                    near_away2,
-                                    near_reach,
-                                    near_area,
-                                    near_light[c],
-                                    sigma[q, c],
-                                    depth[q, c],
-                                    height[q, c],
-                                    scale[q, c],
-                                    own[q, c],
-                                    total[c],
-                                )
+                            _add_near(close, near, media, q, own, total)
                             close = 0
                         near_away2[close] = r2
                         near_reach[close] = reach[i]
@@ -280,19 +279,7 @@ def gather(
                         close += 1
                     else:
                         if count == BUFFER_SIZE:
-                            for c in range(3):
-                                _far(
-                                    count,
-                                    away2,
-                                    mass,
-                                    light[c],
-                                    pull[c],
-                                    sigma[q, c],
-                                    depth[q, c],
-                                    height[q, c],
-                                    scale[q, c],
-                                    total[c],
-                                )
+                            _add_far(count, far, media, q, total)
                             count = 0
                         away2[count] = r2
                         mass[count] = area[i]
@@ -301,32 +288,8 @@ def gather(
                             pull[c, count] = 0.0
                         count += 1
             node += 1
-        for c in range(3):
-            _far(
-                count,
-                away2,
-                mass,
-                light[c],
-                pull[c],
-                sigma[q, c],
-                depth[q, c],
-                height[q, c],
-                scale[q, c],
-                total[c],
-            )
-            _near(
-                close,
-                near_away2,
-                near_reach,
-                near_area,
-                near_light[c],
-                sigma[q, c],
-                depth[q, c],
-                height[q, c],
-                scale[q, c],
-                own[q, c],
-                total[c],
-            )
+        _add_far(count, far, media, q, total)
+        _add_near(close, near, media, q, own, total)
         nearest = -1
         for c in range(3):
             if not normalize:

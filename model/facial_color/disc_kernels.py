@@ -11,8 +11,9 @@ from model.facial_color.row_kernels import disc_row, square_row
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _counts(h, valid, masked, y, x):
+def _counts(image, y, x):
     """Return whether a pixel counts."""
+    h, valid, masked = image
     return np.isfinite(h[y, x]) and (not masked or valid[y, x] != 0)
 
 
@@ -106,8 +107,9 @@ def _valid_moments_of(row, valid, about):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _directly(h, valid, masked, half, y, x):
+def _directly(image, half, y, x):
     """Return mean and variance of one disc by summing its pixels about one of them."""
+    h, valid, masked = image
     rows, columns = h.shape
     reach = half.size - 1
     n, s1, s2, about = 0, 0.0, 0.0, 0.0
@@ -115,7 +117,7 @@ def _directly(h, valid, masked, half, y, x):
         w = half[abs(k - y)]
         low, end = max(0, x - w), min(columns, x + w + 1)
         if n == 0:
-            while low < end and not _counts(h, valid, masked, k, low):
+            while low < end and not _counts(image, k, low):
                 low += 1
             if low == end:
                 continue
@@ -132,54 +134,43 @@ def _directly(h, valid, masked, half, y, x):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _stays(h, valid, masked, half, y, x, level):
+def _stays(image, half, y, x, level):
     """Return whether what a disc gains by a step to column `x` is all of one value."""
+    h = image[0]
     rows, columns = h.shape
     reach = half.size - 1
     for k in range(max(0, y - reach), min(rows, y + reach + 1)):
         c = x + half[abs(k - y)]
-        if c < columns and h[k, c] != level and _counts(h, valid, masked, k, c):
+        if c < columns and h[k, c] != level and _counts(image, k, c):
             return False
     return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _tile(
-    h,
-    valid,
-    masked,
-    half,
-    high,
-    inner,
-    whole,
-    trusted,
-    y0,
-    y1,
-    x0,
-    x1,
-    p,
-    q,
-    nothing,
-    sums,
-    v,
-    down,
-    squares_of,
-    mean,
-    deviation,
-    count,
-):
-    """Do the work of `disc_moments` for rows y0 to y1 and columns x0 to x1.
+def _tile(image, disc, trusted, box, room, found):
+    """Do the work of `disc_moments` for one tile.
 
     Parameters
     ----------
-    whole : int
-        Pixels of a disc.
-    p, q : (K, L), (K + 1, L) in the type of `h`
-        Room for sums along rows and down columns; entry j stands for column x0 - width + j.
-    nothing : (L,), 0
-    sums, v, down, squares_of
-        Room for the sums of a tile, four rows, sums down columns, and over squares.
+    image
+        `h`, `valid` and `masked`.
+    disc
+        `half`, `high`, `inner`, and the pixels of a disc.
+    trusted : float
+    box
+        Rows y0 to y1 and columns x0 to x1.
+    room
+        p, q: (K, L), (K + 1, L) in the type of `h`, for sums along rows and down columns; entry j
+        stands for column x0 - width + j. nothing: (L,), 0. Then for the sums of a tile, four rows,
+        sums down columns, and over squares.
+    found
+        `mean`, `deviation` and `count`, written.
     """
+    h, _, masked = image
+    half, high, inner, whole = disc
+    y0, y1, x0, x1 = box
+    p, q, nothing, sums, v, down, squares_of = room
+    mean, deviation, count = found
     rows, columns = h.shape
     reach, width = half.size - 1, half[0]
     k0, k1 = max(0, y0 - reach), min(rows, y1 + reach)
@@ -196,7 +187,7 @@ def _tile(
         seen, total = 0, 0.0
         for k in range(k0, k1):
             for c in range(c0, c1):
-                if _counts(h, valid, masked, k, c):
+                if _counts(image, k, c):
                     if seen == 0:
                         first = np.float64(h[k, c])
                     seen += 1
@@ -233,7 +224,7 @@ def _tile(
                 else:
                     for c in range(c0, c1):
                         value = 0.0
-                        if _counts(h, valid, masked, k0 + k + b, c):
+                        if _counts(image, k0 + k + b, c):
                             d = np.float64(h[k0 + k + b, c]) - about
                             value = d if moment == 0 else (d * d if moment == 1 else 1.0)
                         v[b, c - c0] = value
@@ -286,11 +277,11 @@ def _tile(
             mean[y, x0 + i] = about + m
             if held * variance * trusted >= doubt:
                 constant = False
-            elif constant and _stays(h, valid, masked, half, y, x0 + i, level):
+            elif constant and _stays(image, half, y, x0 + i, level):
                 mean[y, x0 + i] = level
                 variance = np.float64(0.0)
             else:
-                level, variance = _directly(h, valid, masked, half, y, x0 + i)
+                level, variance = _directly(image, half, y, x0 + i)
                 mean[y, x0 + i] = level
                 constant = variance == 0.0
             deviation[y, x0 + i] = np.sqrt(max(variance, 0.0))
@@ -333,6 +324,7 @@ def disc_moments(
     whole = np.int64(0)
     for a in range(reach + 1):
         whole += (2 * half[a] + 1) * (1 if a == 0 else 2)
+    image, disc, found = (h, valid, masked), (half, high, inner, whole), (mean, deviation, count)
     # each part keeps its buffers: fresh ones for every tile would be mapped and cleared anew
     most_rows = min(rows, tall + 2 * reach)
     length = min(wide, columns) + 2 * width + 1
@@ -345,27 +337,6 @@ def disc_moments(
         down_columns, squares = np.empty(length), np.empty(wide)
         for tile in range(part * across * down // parts, (part + 1) * across * down // parts):
             y0, x0 = (tile // across) * tall, (tile % across) * wide
-            _tile(
-                h,
-                valid,
-                masked,
-                half,
-                high,
-                inner,
-                whole,
-                trusted,
-                y0,
-                min(rows, y0 + tall),
-                x0,
-                min(columns, x0 + wide),
-                p,
-                q,
-                nothing,
-                sums,
-                v,
-                down_columns,
-                squares,
-                mean,
-                deviation,
-                count,
-            )
+            box = (y0, min(rows, y0 + tall), x0, min(columns, x0 + wide))
+            room = (p, q, nothing, sums, v, down_columns, squares)
+            _tile(image, disc, trusted, box, room, found)

@@ -172,9 +172,7 @@ def derivatives(
         starts,
         log_distance,
         weight,
-        out[0],
-        out[1],
-        out[2],
+        out,
     )
     out[:, ~scatters] = 0.0
     return Slopes(*(part.reshape(shape) for part in out))
