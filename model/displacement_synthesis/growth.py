@@ -30,9 +30,7 @@ from model.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from model.displacement_synthesis import cut_kernels, kernels
 from model.displacement_synthesis.layout import CellGrid, Layout, SiteLayout
 from model.displacement_synthesis.regions import coarse_weights, interpolated
-from model.displacement_synthesis.sources import Sources, SynthesisError, gather, leveled
-
-__all__ = ["Layout", "SynthesisError", "grow", "lay_out", "leveled"]
+from model.displacement_synthesis.sources import Sources, SynthesisError, gather
 
 Wrap: TypeAlias = Literal["none", "u", "both"]
 Patches: TypeAlias = Sequence[ArrayLike] | Mapping[str, Sequence[ArrayLike]]

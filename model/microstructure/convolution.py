@@ -37,19 +37,6 @@ from model.arrays import BoolArray, Float32Array, FloatArray, UInt8Array
 from model.microstructure import convolution_kernels as kernels
 from model.microstructure.map_windows import Window
 
-__all__ = [
-    "MAX_SIGMA_PX",
-    "Border",
-    "ConvolutionError",
-    "LineKernels",
-    "Sampling",
-    "Window",
-    "convolve",
-    "convolve_tiled",
-    "reach_of",
-    "tiles_of",
-]
-
 Sampling = Literal["cubic", "linear"]
 Border = Literal["mirror", "open"]
 

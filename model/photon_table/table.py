@@ -22,17 +22,7 @@ from model.arrays import BoolArray, Float64Array
 from model.dipole.kienle_patterson import Slopes
 from model.photon_table import kernels
 from model.photon_table.disc_distances import distance_rules
-from model.photon_table.medium import Collection, TableDomainError, asymmetries, prepare
-
-__all__ = [
-    "Slopes",
-    "TableDomainError",
-    "asymmetries",
-    "derivatives",
-    "domain",
-    "reflectance",
-    "relative_error",
-]
+from model.photon_table.medium import Collection, prepare
 
 NUMERICAL_APERTURE = 0.22
 """Of the source and of the detectors in the collection "fibre", in air."""

@@ -27,6 +27,7 @@ from model.arrays import FloatArray
 from model.wrinkles import block_compression as blocks
 from model.wrinkles import partial_derivatives as wrinkles
 from model.wrinkles.expressions import WrinkleError
+from model.wrinkles.masks import Masks, mask_stack, mask_textures
 
 MapEncoding: TypeAlias = Literal["float32", "float16", "unit8", "bc5"]
 MaskEncoding: TypeAlias = Literal["float32", "float16", "unit8", "bc3"]
@@ -151,7 +152,7 @@ def stored_map(derivatives: FloatArray, encoding: MapEncoding) -> FloatArray:
     return d.astype(np.float32)
 
 
-def stored_masks(masks: wrinkles.Masks, encoding: MaskEncoding) -> FloatArray:
+def stored_masks(masks: Masks, encoding: MaskEncoding) -> FloatArray:
     """Return masks (Z, h, w), float32, as they come back from RGBA textures.
 
     "unit8" and "bc3" hold [0, 1]; the others what their numbers hold.
@@ -163,7 +164,7 @@ def stored_masks(masks: wrinkles.Masks, encoding: MaskEncoding) -> FloatArray:
     """
     if encoding not in MASK_BYTES:
         raise WrinkleError(f"masks: got {encoding!r}, expected one of {', '.join(MASK_BYTES)}")
-    stack = wrinkles.mask_stack(masks)
+    stack = mask_stack(masks)
     if encoding in ("unit8", "bc3") and not (stack.min() >= 0.0 and stack.max() <= 1.0):
         raise WrinkleError(
             f"masks: got {stack.min():.3g}...{stack.max():.3g}, expected [0, 1] for {encoding}"
@@ -180,9 +181,9 @@ def stored_masks(masks: wrinkles.Masks, encoding: MaskEncoding) -> FloatArray:
         shape = stack.shape[1:]
         textures = [
             blocks.decode_bc3(blocks.encode_bc3(texture), (shape[0], shape[1]))
-            for texture in wrinkles.mask_textures(stack)
+            for texture in mask_textures(stack)
         ]
-        stack = wrinkles.mask_stack(textures)[: len(stack)]
+        stack = mask_stack(textures)[: len(stack)]
     return stack.astype(np.float32)
 
 

@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 
 from model.displacement_synthesis import cut_kernels
 from model.displacement_synthesis import growth as synthesis
-from model.displacement_synthesis.sources import filled
+from model.displacement_synthesis.sources import filled, leveled
 from reconstruction import normal_histogram
 from rigsim.skin_patch.microrelief import make_micro_skin
 
@@ -18,7 +18,7 @@ SIDE = 640
 
 def measured(site, seed, size_mm=4.8):
     skin = make_micro_skin(site, seed=seed, size_mm=size_mm, texel_um=PIXEL_UM)
-    return synthesis.leveled(skin.height_um, pixel_um=PIXEL_UM)
+    return leveled(skin.height_um, pixel_um=PIXEL_UM)
 
 
 @pytest.fixture(scope="module")
@@ -208,7 +208,7 @@ def test_leveling_halves_a_wave_of_the_cutoff_and_keeps_short_ones():
     x = np.arange(600) * 10.0
     for wave_um, kept in ((1000.0, 0.5), (100.0, 1.0), (8000.0, 0.01)):
         wave = np.tile(np.sin(2 * np.pi * x / wave_um), (600, 1))
-        part = synthesis.leveled(wave, pixel_um=10.0)[200:400, 100:500]
+        part = leveled(wave, pixel_um=10.0)[200:400, 100:500]
         gain = (part * wave[200:400, 100:500]).sum() / (wave[200:400, 100:500] ** 2).sum()
         assert abs(gain - kept) < 0.05
 
