@@ -6,8 +6,6 @@ nodes that need not be opened, goes to a buffer that is evaluated in one stream 
 
 # mypy: allow-untyped-defs
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -11,8 +11,6 @@ that runs along a column.
 
 # mypy: allow-untyped-defs
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

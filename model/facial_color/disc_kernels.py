@@ -2,8 +2,6 @@
 
 # mypy: allow-untyped-defs
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit, prange
 
@@ -63,8 +61,9 @@ def _along(v, n, r0, r1, r2, r3):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
-def _finish(s1, s2, whole, about, trusted, blur1, blur2, unit, mean, deviation):
+def _finish(s1, s2, whole, about, rounding, mean, deviation):
     """Write mean and deviation of a row of whole discs; return how many need another look."""
+    trusted, blur1, blur2, unit = rounding
     doubtful = 0
     per = 1.0 / whole
     for i in range(mean.size):
@@ -247,19 +246,9 @@ def _tile(image, disc, trusted, box, room, found):
         s1, s2 = sums[0, y - y0, :n], sums[1, y - y0, :n]
         if not partial:
             count[y, x0:x1] = whole
-            doubtful = _finish(
-                s1,
-                s2,
-                np.float64(whole),
-                about,
-                trusted,
-                blur1,
-                blur2,
-                unit,
-                mean[y, x0:x1],
-                deviation[y, x0:x1],
-            )
-            if doubtful == 0:
+            rounding = (trusted, blur1, blur2, unit)
+            row = (mean[y, x0:x1], deviation[y, x0:x1])
+            if _finish(s1, s2, np.float64(whole), about, rounding, *row) == 0:
                 continue
         constant, level = False, np.float64(0.0)  # whether the disc to the left is, and its value
         for i in range(n):

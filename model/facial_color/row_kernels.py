@@ -2,8 +2,6 @@
 
 # mypy: allow-untyped-defs
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 
@@ -17,8 +15,9 @@ def _add_run(t, a, left, right):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
-def _add_runs(t, a, b, c, d, left, right, left2, right2):
-    """Do the work of `_add_run` for rows `a` and `b`, and between others for `c` and `d`."""
+def _add_runs(t, a, b, c, d, width, w, v):
+    """Add runs of half-width `w` of rows `a` and `b`, and of half-width `v` of `c` and `d`."""
+    left, right, left2, right2 = width - w, width + w + 1, width - v, width + v + 1
     al, ar, bl, br = a[left:], a[right:], b[left:], b[right:]
     cl, cr, dl, dr = c[left2:], c[right2:], d[left2:], d[right2:]
     for i in range(t.size):
@@ -88,18 +87,7 @@ def disc_row(t, square, p, q, half, high, inner, rows, y):
     while a <= reach:
         w = half[a]
         if a < reach and y - a - 1 >= 0 and y + a + 1 < rows:
-            v = half[a + 1]
-            _add_runs(
-                t,
-                p[y - a],
-                p[y + a],
-                p[y - a - 1],
-                p[y + a + 1],
-                width - w,
-                width + w + 1,
-                width - v,
-                width + v + 1,
-            )
+            _add_runs(t, p[y - a], p[y + a], p[y - a - 1], p[y + a + 1], width, w, half[a + 1])
             a += 2
             continue
         if y - a >= 0:

@@ -5,8 +5,6 @@ Symmetric 2 x 2 tensors are three numbers (11, 12, 22).
 
 # mypy: allow-untyped-defs
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -8,6 +8,7 @@ from scipy.ndimage import gaussian_filter
 
 from model.displacement_synthesis import cut_kernels
 from model.displacement_synthesis import growth as synthesis
+from model.displacement_synthesis.layout import CellGrid
 from model.displacement_synthesis.sources import filled, leveled
 from reconstruction import normal_histogram
 from rigsim.skin_patch.microrelief import make_micro_skin
@@ -246,9 +247,11 @@ def test_the_cost_of_a_choice_is_that_of_its_cut(rng):
     )
     path = np.zeros(29, np.int16)
     cost = cut_kernels._cheapest_path(misfit, -1, -1, path)
-    found = cut_kernels.cut_cost(heights, 0, 12, 360, 12, 30, 12, np.float32(0.1), np.inf)
+    nowhere = np.zeros(1, np.int64)
+    grid = CellGrid(nowhere, nowhere, 12, 30, (False, False))
+    found = cut_kernels.cut_cost(heights, 0, 12, 360, 12, grid, np.float32(0.1), np.inf)
     assert found == pytest.approx(cost, rel=1e-5)
-    assert cut_kernels.cut_cost(heights, 0, 12, 360, 12, 30, 12, np.float32(0.1), 1.0) == 1.0
+    assert cut_kernels.cut_cost(heights, 0, 12, 360, 12, grid, np.float32(0.1), 1.0) == 1.0
 
 
 def test_windows_are_no_smoother_than_the_patches_they_are_chosen_from(foreheads):
