@@ -14,6 +14,8 @@ far away. tools/make_photon_table.py makes model/data/photon_table.npz and says 
 
 from __future__ import annotations
 
+from typing import TypedDict, Unpack
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import RectBivariateSpline
@@ -36,16 +38,21 @@ MAX_RELATIVE_ERROR = 0.03
 """Standard error of the table itself, relative, up to which a point is in the domain."""
 
 
+class Optics(TypedDict, total=False):
+    """What `reflectance` and `derivatives` assume of skin and fibers."""
+
+    eta: float
+    g: float
+    collection: Collection
+    core_mm: float
+    source_core_mm: float
+
+
 def reflectance(
     radius_mm: ArrayLike,
     sigma_a_per_mm: ArrayLike,
     sigma_s_prime_per_mm: ArrayLike,
-    *,
-    eta: float = 1.4,
-    g: float = 0.8,
-    collection: Collection = "all",
-    core_mm: float = 0.0,
-    source_core_mm: float = 0.0,
+    **optics: Unpack[Optics],
 ) -> Float64Array:
     """Return the reflectance per area at a distance from the source.
 
@@ -88,16 +95,8 @@ def reflectance(
     >>> reflectance(radius, 0.05, 1.5, collection="fibre", core_mm=0.2, source_core_mm=0.2).shape
     (3,)
     """
-    return derivatives(
-        radius_mm,
-        sigma_a_per_mm,
-        sigma_s_prime_per_mm,
-        eta=eta,
-        g=g,
-        collection=collection,
-        core_mm=core_mm,
-        source_core_mm=source_core_mm,
-    ).reflectance_per_mm2
+    slopes = derivatives(radius_mm, sigma_a_per_mm, sigma_s_prime_per_mm, **optics)
+    return slopes.reflectance_per_mm2
 
 
 def derivatives(
