@@ -63,7 +63,6 @@ LONG_FUNCTIONS = {
 MANY_PARAMETERS = {
     "capture/acquire/run.py:run_plan": 15,
     "model/displacement_synthesis/growth.py:lay_out": 13,
-    "model/texture_statistics/description.py:match": 13,
     "reconstruction/anisotropy/profile_anisotropy.py:estimate_from_profiles": 15,
     "reconstruction/gradient_normals/estimation.py:from_patterns": 14,
     "reconstruction/kernel_fit/fit.py:fit_kernel": 17,
