@@ -16,7 +16,7 @@ EMPTY, COVERED, PADDED = range(3)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def fill_texture(faces, x, y, values, valid, top, left, width, height, state, stretch, axes, scale):
+def fill_texture(faces, places, values, valid, window, size, found):
     """Fill a window of a texture: tensors between vertices, their principal axes at each pixel.
 
     The triangle of the lowest number has a pixel that several hold. What a pixel becomes does
@@ -25,23 +25,22 @@ def fill_texture(faces, x, y, values, valid, top, left, width, height, state, st
     Parameters
     ----------
     faces : (F, 3) int64
-    x, y : (V,) float64
-        Vertices in pixels of the whole texture, y down.
+    places : two (V,) float64
+        x and y of the vertices in pixels of the whole texture, y down.
     values : (V, 6) float64
         T - 1 and the metric, texture per length.
     valid : (V,) bool
-    top, left : int
-        First row and column of the window.
-    width, height : float
+    window : Window
+    size : (float, float)
         Pixels per unit of the texture's u and v.
-    state : (m, n) uint8, of 0
-    stretch : (m, n, 2) float32
-        r_s, r_t.
-    axes : (m, n, 2, 2) float32
-        Unit vectors (right, down) of s and t.
-    scale : (m, n, 2) float32
-        Pixels per length along s and t.
+    found
+        Written: state, (m, n) uint8, of 0; r_s and r_t, (m, n, 2) float32; unit vectors (right,
+        down) of s and t, (m, n, 2, 2) float32; pixels per length along s and t, (m, n, 2) float32.
     """
+    x, y = places
+    top, left = window.top, window.left
+    width, height = size
+    state, stretch, axes, scale = found
     rows, columns = state.shape
     bands = (rows + BAND_ROWS - 1) // BAND_ROWS
     for band in prange(bands):
