@@ -122,22 +122,6 @@ def diffuse_internal_flux_moment(eta: float) -> float:
     return float(1.0 - transmitted)
 
 
-def diffuse_internal_polynomial(eta: float) -> float:
-    """Return the usual polynomial for F_dr, within 1.1e-3 of the exact value for 1.1 to 1.6.
-
-    References
-    ----------
-    Egan and Hilgeman 1973, doi:10.1364/AO.12.001816 (as used by Jensen 2001 and Weyrich 2005).
-
-    Examples
-    --------
-    >>> round(diffuse_internal_polynomial(1.4), 6)
-    0.529489
-    """
-    eta = _denser(eta)
-    return -1.440 / eta**2 + 0.710 / eta + 0.668 + 0.0636 * eta
-
-
 def boundary_factor(eta: float) -> float:
     """Return A = (1 + F_dr)/(1 - F_dr) of the extrapolated boundary, from the exact average.
 

@@ -299,29 +299,6 @@ def lobe_brdf(
     return found
 
 
-def local_diffuse(
-    model: SkinReflectance,
-    rows: ArrayLike,
-    light_dir: ArrayLike,
-    view_dir: ArrayLike,
-    normals: ArrayLike,
-) -> Float64Array:
-    """Return R_d F_t(light) F_t(view) / pi, the diffuse part of skin that light does not spread in.
-
-    Parameters as of `surface_brdf`.
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        1/sr; 0 below the horizon.
-    """
-    r_d = model.r_d.reshape(-1, 3)[_rows(model, rows)].astype(np.float64)
-    light, view, n = (np.asarray(v, np.float64) for v in (light_dir, view_dir, normals))
-    cos_light, cos_view = np.sum(light * n, axis=-1), np.sum(view * n, axis=-1)
-    passed = transmitted(cos_light, model.eta) * transmitted(cos_view, model.eta)
-    return np.asarray(r_d * passed[..., None] / np.pi)
-
-
 def transmitted(cosine: ArrayLike, eta: float = fresnel.ETA_SKIN) -> Float64Array:
     """Return F_t, the share of light that passes the surface at a cosine; 0 below the horizon.
 
@@ -333,27 +310,6 @@ def transmitted(cosine: ArrayLike, eta: float = fresnel.ETA_SKIN) -> Float64Arra
     mu = np.asarray(cosine, np.float64)
     passed = 1.0 - fresnel.reflectance(np.clip(mu, 0.0, 1.0), eta)
     return np.asarray(np.where(mu > 0.0, passed, 0.0))
-
-
-def leaving_radiance(
-    exitance: ArrayLike, cos_view: ArrayLike, eta: float = fresnel.ETA_SKIN
-) -> Float64Array:
-    """Return the radiance towards a view of light that the skin gives back.
-
-    Parameters
-    ----------
-    exitance
-        R_d times what entered, below the surface's transmittance, (..., 3), W/mm^2.
-    cos_view
-        Cosine of the view, (...).
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-        F_t(view) exitance / pi, W/(mm^2 sr).
-    """
-    passed = transmitted(cos_view, eta)[..., None]
-    return np.asarray(passed * np.asarray(exitance, np.float64) / np.pi)
 
 
 def _require(name: str, good: BoolArray, expected: str) -> None:

@@ -210,12 +210,6 @@ def _of_file(path: Path, light_radius_rad: float) -> Float32Array:
     return _convolved(_nearest_bin(mean), light_radius_rad).astype(np.float32)
 
 
-def of_merl(table: merl.MerlTable) -> Brdf:
-    """Return a MERL table as a function, the mean of its channels, NaN where not measured."""
-    mean = np.where(table.measured, np.tensordot(merl.BRDF_SCALE, table.stored, 1) / 3.0, np.nan)
-    return _nearest_bin(mean)
-
-
 def _nearest_bin(mean: Float64Array) -> Brdf:
     def brdf(light: Float64Array, view: Float64Array) -> Float64Array:
         h, d, phi = merl.to_angles(light, view, [0.0, 0.0, 1.0])

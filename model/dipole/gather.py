@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -131,6 +132,16 @@ class Gathered:
     work: Int32Array
 
 
+class Gathering(TypedDict, total=False):
+    """What `exitance` leaves to `gather`."""
+
+    eta: float
+    normalize: bool
+    tolerance: float
+    entered_at: ArrayLike | None
+    workers: int
+
+
 def exitance(
     source_mm: ArrayLike,
     source_area_mm2: ArrayLike,
@@ -138,12 +149,7 @@ def exitance(
     at_mm: ArrayLike,
     r_d: ArrayLike,
     translucency_mm: ArrayLike,
-    *,
-    eta: float = fresnel.ETA_SKIN,
-    normalize: bool = True,
-    tolerance: float = GATHER_TOL,
-    entered_at: ArrayLike | None = None,
-    workers: int = 1,
+    **gathering: Unpack[Gathering],
 ) -> Float64Array:
     """Return the radiant exitance below the surface at points, from light that entered at others.
 
@@ -193,18 +199,8 @@ def exitance(
     >>> out[0].round(5).tolist()
     [1.2, 0.6, 0.4]
     """
-    return gather(
-        SourceTree.of(source_mm, source_area_mm2),
-        entered,
-        at_mm,
-        r_d,
-        translucency_mm,
-        eta=eta,
-        normalize=normalize,
-        tolerance=tolerance,
-        entered_at=entered_at,
-        workers=workers,
-    ).exitance
+    tree = SourceTree.of(source_mm, source_area_mm2)
+    return gather(tree, entered, at_mm, r_d, translucency_mm, **gathering).exitance
 
 
 def gather(
@@ -225,10 +221,8 @@ def gather(
     at = np.asarray(at_mm, np.float64)
     _expect("entered", light, (tree.size, 3))
     _expect("at_mm", at, (len(at), 3))
-    albedo, length = (
-        _spread("r_d", r_d, len(at)),
-        _spread("translucency_mm", translucency_mm, len(at)),
-    )
+    albedo = _spread("r_d", r_d, len(at))
+    length = _spread("translucency_mm", translucency_mm, len(at))
     own = np.full((1, 3), np.nan)
     if entered_at is not None:
         own = np.asarray(entered_at, np.float64)

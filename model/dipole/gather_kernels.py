@@ -4,7 +4,7 @@ Sources nearer than their reach are summed one by one in float64. Everything els
 nodes that need not be opened, goes to a buffer that is evaluated in one stream in float32.
 """
 
-from __future__ import annotations
+# mypy: allow-untyped-defs
 
 import math
 
@@ -21,7 +21,7 @@ _TWO_PI = 2.0 * math.pi
 
 
 @njit(inline="always")
-def _decay(x):  # type: ignore[no-untyped-def]
+def _decay(x):
     """Return exp(-x) for x >= 0, within 5e-6 of itself up to 20 and 2e-3 up to 64, held there."""
     y = min(x, float32(64.0)) * float32(-0.015625)
     p = float32(0.008333333)
@@ -39,8 +39,9 @@ def _decay(x):  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath=_FAST_MATH, error_model="numpy")
-def _far(count, away2, area, light, pull, sigma, depth, height, scale, total):  # type: ignore[no-untyped-def]
+def _far(count, away2, area, light, pull, medium, total):
     """Add light and mass of a buffer in one channel, first moments of the light included."""
+    sigma, depth, height, scale = medium
     s = float32(sigma)
     z_r, z_v = float32(depth), float32(height)
     z_r2, z_v2 = z_r * z_r, z_v * z_v
@@ -64,8 +65,9 @@ def _far(count, away2, area, light, pull, sigma, depth, height, scale, total):  
 
 
 @njit(error_model="numpy")
-def _disc(r2, sigma, depth, height, scale):  # type: ignore[no-untyped-def]
+def _disc(r2, medium):
     """Return the profile at a radius, and the share of light within it."""
+    sigma, depth, height, scale = medium
     value = within = 0.0
     for z in (depth, height):
         d = max(math.sqrt(r2 + z * z), 1e-300)
@@ -77,16 +79,16 @@ def _disc(r2, sigma, depth, height, scale):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy")
-def _near(count, away2, reach, area, light, sigma, depth, height, scale, own, total):  # type: ignore[no-untyped-def]
+def _near(count, away2, reach, area, light, medium, own, total):
     """Add light and mass of sources within their reach, float64; see `dipole_sum.kernel`.
 
     ``own`` is the light at the exit point itself; NaN: not known, each source's own counts.
     """
     for i in range(count):
         a = reach[i]
-        fine = a <= MIN_RADIUS_PER_DEPTH * depth
+        fine = a <= MIN_RADIUS_PER_DEPTH * medium[1]
         r2 = float(away2[i]) if fine else a * a
-        value, within = _disc(r2, sigma, depth, height, scale)
+        value, within = _disc(r2, medium)
         total[1] += value * area[i]
         total[0] += value * light[i]
         if not fine:
@@ -97,13 +99,37 @@ def _near(count, away2, reach, area, light, sigma, depth, height, scale, own, to
             total[0] += shape * missing * light[i]
             if own == own:
                 r2 *= SELF_RADIUS_FRACTION * SELF_RADIUS_FRACTION
-                value, within = _disc(r2, sigma, depth, height, scale)
+                value, within = _disc(r2, medium)
                 missing = within - math.pi * r2 * value
                 total[0] += shape * missing * (own * area[i] - light[i])
 
 
 @njit
-def _nearest(point, place, seen, low, high, skip):  # type: ignore[no-untyped-def]
+def _medium_at(media, q, c):
+    """Return the dipole of an exit point's channel."""
+    sigma, depth, height, scale = media
+    return sigma[q, c], depth[q, c], height[q, c], scale[q, c]
+
+
+@njit
+def _add_far(count, far, media, q, total):
+    """Do the work of `_far` for each channel of an exit point."""
+    away2, mass, light, pull = far
+    for c in range(3):
+        _far(count, away2, mass, light[c], pull[c], _medium_at(media, q, c), total[c])
+
+
+@njit
+def _add_near(count, near, media, q, own, total):
+    """Do the work of `_near` for each channel of an exit point."""
+    away2, reach, area, light = near
+    for c in range(3):
+        medium = _medium_at(media, q, c)
+        _near(count, away2, reach, area, light[c], medium, own[q, c], total[c])
+
+
+@njit
+def _nearest(point, place, seen, low, high, skip):
     """Return the source nearest to a point."""
     best, found = np.inf, 0
     node = 0
@@ -128,7 +154,7 @@ def _nearest(point, place, seen, low, high, skip):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def gather(  # type: ignore[no-untyped-def]
+def gather(
     at,
     sigma,
     depth,
@@ -175,12 +201,10 @@ def gather(  # type: ignore[no-untyped-def]
     mass = np.empty(BUFFER_SIZE, np.float32)
     light = np.empty((3, BUFFER_SIZE), np.float32)
     pull = np.empty((3, BUFFER_SIZE), np.float32)
-    near_away2, near_reach, near_area = (
-        np.empty(NEAR_SIZE),
-        np.empty(NEAR_SIZE),
-        np.empty(NEAR_SIZE),
-    )
-    near_light = np.empty((3, NEAR_SIZE))
+    near_away2, near_reach = np.empty(NEAR_SIZE), np.empty(NEAR_SIZE)
+    near_area, near_light = np.empty(NEAR_SIZE), np.empty((3, NEAR_SIZE))
+    media, far = (sigma, depth, height, scale), (away2, mass, light, pull)
+    near = (near_away2, near_reach, near_area, near_light)
     total = np.zeros((3, 2))
     nodes = len(skip)
     for q in range(len(at)):
@@ -220,19 +244,7 @@ def gather(  # type: ignore[no-untyped-def]
                     opened = False
             if not opened:
                 if count == BUFFER_SIZE:
-                    for c in range(3):
-                        _far(
-                            count,
-                            away2,
-                            mass,
-                            light[c],
-                            pull[c],
-                            sigma[q, c],
-                            depth[q, c],
-                            height[q, c],
-                            scale[q, c],
-                            total[c],
-                        )
+                    _add_far(count, far, media, q, total)
                     count = 0
                 err += strays / room
                 away2[count] = r2
@@ -255,20 +267,7 @@ def gather(  # type: ignore[no-untyped-def]
                     used += 1
                     if r2 < reach[i] * reach[i]:
                         if close == NEAR_SIZE:
-                            for c in range(3):
-                                _near(
-                                    close,
-                                    near_away2,
-                                    near_reach,
-                                    near_area,
-                                    near_light[c],
-                                    sigma[q, c],
-                                    depth[q, c],
-                                    height[q, c],
-                                    scale[q, c],
-                                    own[q, c],
-                                    total[c],
-                                )
+                            _add_near(close, near, media, q, own, total)
                             close = 0
                         near_away2[close] = r2
                         near_reach[close] = reach[i]
@@ -278,19 +277,7 @@ def gather(  # type: ignore[no-untyped-def]
                         close += 1
                     else:
                         if count == BUFFER_SIZE:
-                            for c in range(3):
-                                _far(
-                                    count,
-                                    away2,
-                                    mass,
-                                    light[c],
-                                    pull[c],
-                                    sigma[q, c],
-                                    depth[q, c],
-                                    height[q, c],
-                                    scale[q, c],
-                                    total[c],
-                                )
+                            _add_far(count, far, media, q, total)
                             count = 0
                         away2[count] = r2
                         mass[count] = area[i]
@@ -299,32 +286,8 @@ def gather(  # type: ignore[no-untyped-def]
                             pull[c, count] = 0.0
                         count += 1
             node += 1
-        for c in range(3):
-            _far(
-                count,
-                away2,
-                mass,
-                light[c],
-                pull[c],
-                sigma[q, c],
-                depth[q, c],
-                height[q, c],
-                scale[q, c],
-                total[c],
-            )
-            _near(
-                close,
-                near_away2,
-                near_reach,
-                near_area,
-                near_light[c],
-                sigma[q, c],
-                depth[q, c],
-                height[q, c],
-                scale[q, c],
-                own[q, c],
-                total[c],
-            )
+        _add_far(count, far, media, q, total)
+        _add_near(close, near, media, q, own, total)
         nearest = -1
         for c in range(3):
             if not normalize:

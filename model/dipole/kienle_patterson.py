@@ -88,14 +88,9 @@ def derivatives(
     True
     """
     radius, absorption, scattering = np.broadcast_arrays(
-        *(
-            _not_negative(name, value)
-            for name, value in (
-                ("radius_mm", radius_mm),
-                ("sigma_a_per_mm", sigma_a_per_mm),
-                ("sigma_s_prime_per_mm", sigma_s_prime_per_mm),
-            )
-        )
+        _not_negative("radius_mm", radius_mm),
+        _not_negative("sigma_a_per_mm", sigma_a_per_mm),
+        _not_negative("sigma_s_prime_per_mm", sigma_s_prime_per_mm),
     )
     c_phi, c_flux = exit_coefficients(eta)
     scatters = scattering > 0.0

@@ -1,6 +1,6 @@
 """Builds a tree over weighted points: halves along the longest side, sums and spreads of nodes."""
 
-from __future__ import annotations
+# mypy: allow-untyped-defs
 
 import math
 
@@ -18,7 +18,7 @@ NODE_COLUMNS = 8
 
 
 @njit(cache=True, nogil=True)
-def split(place, leaf):  # type: ignore[no-untyped-def]
+def split(place, leaf):
     """Return the sources' order and the nodes' first and last sources, nodes before their halves.
 
     ``place`` is (S, 3). A node ``i`` with ``skip[i] == i + 1`` is a leaf; any other's halves are
@@ -61,7 +61,7 @@ def split(place, leaf):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _select(place, order, axis, lo, hi, middle):  # type: ignore[no-untyped-def]
+def _select(place, order, axis, lo, hi, middle):
     """Reorder so that what lies below ``middle`` is no greater than what lies above (Hoare)."""
     while lo < hi:
         pivot = place[order[(lo + hi) // 2], axis]
@@ -84,7 +84,7 @@ def _select(place, order, axis, lo, hi, middle):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def summarize(place, area, reach, low, high):  # type: ignore[no-untyped-def]
+def summarize(place, area, reach, low, high):
     """Return what a walk reads of each node, (N, 8), from sources in the tree's order."""
     nodes = len(low)
     found = np.zeros((nodes, NODE_COLUMNS), np.float32)
@@ -113,7 +113,7 @@ def summarize(place, area, reach, low, high):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def light_moments(place, area, entered, low, high, seen):  # type: ignore[no-untyped-def]
+def light_moments(place, area, entered, low, high, seen):
     """Return light (3) and its first moments about the centroid (3 x 3) of each node, (N, 12)."""
     nodes = len(low)
     found = np.zeros((nodes, 12), np.float32)

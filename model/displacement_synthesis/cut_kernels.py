@@ -1,8 +1,6 @@
 """Cheapest cuts between overlapping windows, compiled."""
 
-from __future__ import annotations
-
-from typing import Any
+# mypy: allow-untyped-defs
 
 import numpy as np
 from numba import njit
@@ -11,23 +9,24 @@ _INFINITE_COST = np.float32(3.0e38)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _misfit_row(
-    a: Any, b: Any, a0: Any, a1: Any, b0: Any, b1: Any, per_step: Any, out: Any
-) -> None:
+def _misfit_row(a, a0, a_step, b, b0, b_step, per_step, out):
     """Write what a cut costs at each place of a row: squared slope that closing a step leaves.
 
     Parameters
     ----------
     a, b : (N,) float32
         Heights, flat.
-    a0, a1, b0, b1 : int
-        First pixel of this row and of the next one in ``a`` and in ``b``.
+    a0, b0 : int
+        First pixel of this row in ``a`` and in ``b``.
+    a_step, b_step : int
+        Pixels from there to the next row.
     per_step : float32
         Squared slope per squared step of height, px^-2.
     out : (O,) float32, written
         The last place has no neighbour and cannot be cut.
     """
     count = out.size
+    a1, b1 = a0 + a_step, b0 + b_step
     for x in range(count - 1):
         d = a[a0 + x] - b[b0 + x]
         right = a[a0 + x + 1] - b[b0 + x + 1] - d
@@ -37,17 +36,7 @@ def _misfit_row(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def cut_cost(
-    heights: Any,
-    a: Any,
-    a_step: Any,
-    b: Any,
-    b_step: Any,
-    length: Any,
-    overlap: Any,
-    per_step: Any,
-    bound: Any,
-) -> Any:
+def cut_cost(heights, a, a_step, b, b_step, grid, per_step, bound):
     """Return the cost of the cheapest cut through an overlap, or `bound` once it must exceed it.
 
     Parameters
@@ -57,25 +46,17 @@ def cut_cost(
         First pixel of the overlap in each of two windows.
     a_step, b_step : int
         Pixels from one row of the overlap to the next.
-    length, overlap : int
-        Rows, and places of a row.
+    grid : CellGrid
     per_step : float32
     bound : float
     """
+    overlap = grid.overlap
     cost = np.zeros(overlap, np.float32)
     before = np.zeros(overlap, np.float32)
     row = np.empty(overlap, np.float32)
-    for y in range(length - 1):
-        _misfit_row(
-            heights,
-            heights,
-            a + y * a_step,
-            a + (y + 1) * a_step,
-            b + y * b_step,
-            b + (y + 1) * b_step,
-            per_step,
-            row,
-        )
+    for y in range(grid.window - 1):
+        from_a, from_b = a + y * a_step, b + y * b_step
+        _misfit_row(heights, from_a, a_step, heights, from_b, b_step, per_step, row)
         for x in range(overlap):
             before[x] = cost[x]
         for x in range(1, overlap - 1):
@@ -95,7 +76,7 @@ def cut_cost(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cheapest_path(misfit: Any, first: Any, last: Any, path: Any) -> Any:
+def _cheapest_path(misfit, first, last, path):
     """Write the cheapest path down the rows of ``misfit`` and return its cost.
 
     Parameters
@@ -136,150 +117,117 @@ def _cheapest_path(misfit: Any, first: Any, last: Any, path: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def cut_columns(
-    row: Any,
-    cells: Any,
-    lines_x: Any,
-    wrap_x: Any,
-    window: Any,
-    overlap: Any,
-    sources: Any,
-    heights: Any,
-    per_step: Any,
-    paths: Any,
-) -> None:
+def cut_columns(row, grid, site, per_step):
     """Cut between the windows of a row of cells.
 
     Parameters
     ----------
-    paths : (ny, nx, window) int16, written at [row]
-        paths[row, c, y]: first place of the overlap that belongs to cell c, of those it shares
-        with cell c - 1, in row y of the windows.
+    row : int
+    grid : CellGrid
+    site : SiteLayout
+        ``across`` is written at [row].
+    per_step : float32
     """
+    cells, sources, heights = site.cells, site.sources.table, site.sources.heights
     nx = cells.shape[1]
-    misfit = np.empty((window, overlap), np.float32)
-    for column in range(0 if wrap_x else 1, nx):
+    misfit = np.empty((grid.window, grid.overlap), np.float32)
+    for column in range(0 if grid.wrap[1] else 1, nx):
         left = (column - 1) % nx
         a, b = cells[row, left], cells[row, column]
         if a[0] < 0 or b[0] < 0:
-            paths[row, column] = overlap // 2
+            site.across[row, column] = grid.overlap // 2
             continue
         wide_a, wide_b = sources[a[0], 2], sources[b[0], 2]
-        from_a = sources[a[0], 0] + a[1] * wide_a + a[2] + lines_x[left + 1] - lines_x[left]
+        from_a = sources[a[0], 0] + a[1] * wide_a + a[2]
+        from_a += grid.lines_x[left + 1] - grid.lines_x[left]
         from_b = sources[b[0], 0] + b[1] * wide_b + b[2]
-        for y in range(window):
-            down = 1 if y < window - 1 else 0
-            _misfit_row(
-                heights,
-                heights,
-                from_a + y * wide_a,
-                from_a + (y + down) * wide_a,
-                from_b + y * wide_b,
-                from_b + (y + down) * wide_b,
-                per_step,
-                misfit[y],
-            )
-        _cheapest_path(misfit, -1, -1, paths[row, column])
+        for y in range(grid.window):
+            down = 1 if y < grid.window - 1 else 0
+            a0, b0 = from_a + y * wide_a, from_b + y * wide_b
+            _misfit_row(heights, a0, down * wide_a, heights, b0, down * wide_b, per_step, misfit[y])
+        _cheapest_path(misfit, -1, -1, site.across[row, column])
 
 
 @njit(cache=True, nogil=True)
-def cell_of(line: Any, lines: Any) -> Any:
-    """Return which cell a pixel within the map lies in."""
+def cell_and_place(at, lines, wrap, overlap, cuts):
+    """Return which of a row of cells shows a pixel of the map, and where in its window.
+
+    Parameters
+    ----------
+    at : int
+        Pixel within the map, along the row of cells.
+    lines : (n + 1,) int64
+        Where cells begin.
+    wrap : bool
+    overlap : int
+    cuts : (n,) int16
+        Where each cell begins within what it shares with the one before.
+    """
     count = lines.size - 1
-    cell = min(int(line * count / lines[count]), count - 1)
-    while line < lines[cell]:
+    cell = min(int(at * count / lines[count]), count - 1)
+    while at < lines[cell]:
         cell -= 1
-    while line >= lines[cell + 1]:
+    while at >= lines[cell + 1]:
         cell += 1
-    return cell
+    half = overlap // 2
+    place = at - lines[cell] + half
+    if place < overlap and (wrap or cell > 0):
+        if place < cuts[cell]:
+            cell = (cell - 1) % count
+            place += lines[cell + 1] - lines[cell]
+    elif at >= lines[cell + 1] - half and (wrap or cell < count - 1):
+        following = (cell + 1) % count
+        after = at - lines[cell + 1] + half
+        if after >= cuts[following]:
+            return following, after
+    return cell, place
 
 
 @njit(cache=True, nogil=True)
-def place_in_row(
-    row: Any,
-    y: Any,
-    x: Any,
-    cells: Any,
-    lines_x: Any,
-    wrap_x: Any,
-    overlap: Any,
-    sources: Any,
-    across: Any,
-) -> Any:
+def place_in_row(row, y, x, grid, site):
     """Return (cell's column, pixel in the sources or -1) that a row of cells shows at (y, x).
 
     ``y`` is the row within the windows, ``x`` within the map.
     """
-    nx = cells.shape[1]
-    half = overlap // 2
-    column = cell_of(x, lines_x)
-    local = x - lines_x[column] + half
-    if local < overlap and (wrap_x or column > 0):
-        if local < across[row, column, y]:
-            column = (column - 1) % nx
-            local += lines_x[column + 1] - lines_x[column]
-    elif x >= lines_x[column + 1] - half and (wrap_x or column < nx - 1):
-        following = (column + 1) % nx
-        place = x - lines_x[column + 1] + half
-        if place >= across[row, following, y]:
-            column = following
-            local = place
-    cell = cells[row, column]
+    cuts = site.across[row, :, y]
+    column, local = cell_and_place(x, grid.lines_x, grid.wrap[1], grid.overlap, cuts)
+    cell, sources = site.cells[row, column], site.sources.table
     if cell[0] < 0:
         return column, -1
     return column, sources[cell[0], 0] + (cell[1] + y) * sources[cell[0], 2] + cell[2] + local
 
 
-@njit(cache=True, nogil=True)
-def _band(
-    line: Any,
-    first: Any,
-    last: Any,
-    cells: Any,
-    lines_y: Any,
-    lines_x: Any,
-    wrap_x: Any,
-    overlap: Any,
-    sources: Any,
-    heights: Any,
-    across: Any,
-    upper: Any,
-    lower: Any,
-    known: Any,
-) -> None:
-    """Write both rows of cells at a line between them, turned: (column of the map, place)."""
-    ny = cells.shape[0]
-    above = (line - 1) % ny
-    width = lines_x[lines_x.size - 1]
-    start = lines_y[above + 1] - lines_y[above]
+@njit(cache=True, nogil=True, error_model="numpy")
+def _band_misfit(line, first, last, grid, site, per_step, band, misfit):
+    """Write what a cut costs between the rows of cells at a line, by the map's columns.
+
+    Parameters
+    ----------
+    first, last : int
+        Columns of the map; the last one is not cut itself.
+    band : (2, n, overlap) float32, written
+        Heights of the row above and of the row ``line``, turned.
+    misfit : (n, overlap) float32, written at the first ``last - first - 1``
+    """
+    heights, overlap = site.sources.heights, grid.overlap
+    above = (line - 1) % site.cells.shape[0]
+    width = grid.lines_x[grid.lines_x.size - 1]
+    start = grid.lines_y[above + 1] - grid.lines_y[above]
     for i in range(first, last):
-        x = i % width if wrap_x else min(max(i, 0), width - 1)
-        good = True
+        x = i % width if grid.wrap[1] else min(max(i, 0), width - 1)
         for place in range(overlap):
-            _, p = place_in_row(
-                above, start + place, x, cells, lines_x, wrap_x, overlap, sources, across
-            )
-            _, q = place_in_row(line, place, x, cells, lines_x, wrap_x, overlap, sources, across)
-            upper[i - first, place] = heights[p] if p >= 0 else 0.0
-            lower[i - first, place] = heights[q] if q >= 0 else 0.0
-            good = good and p >= 0 and q >= 0
-        known[i - first] = good
+            _, p = place_in_row(above, start + place, x, grid, site)
+            _, q = place_in_row(line, place, x, grid, site)
+            band[0, i - first, place] = heights[p] if p >= 0 else 0.0
+            band[1, i - first, place] = heights[q] if q >= 0 else 0.0
+    upper, lower = band[0].reshape(-1), band[1].reshape(-1)
+    for i in range(last - first - 1):
+        at = i * overlap
+        _misfit_row(upper, at, overlap, lower, at, overlap, per_step, misfit[i])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def cut_rows(
-    line: Any,
-    cells: Any,
-    lines_y: Any,
-    lines_x: Any,
-    wrap_x: Any,
-    overlap: Any,
-    sources: Any,
-    heights: Any,
-    per_step: Any,
-    across: Any,
-    down: Any,
-) -> None:
+def cut_rows(line, grid, site, per_step):
     """Cut between the row of cells ``line`` and the one above it, cell by cell.
 
     Where two cells of a row meet, the cut passes through the cheapest place of that column, so
@@ -287,51 +235,27 @@ def cut_rows(
 
     Parameters
     ----------
-    across : (ny, nx, window) int16, of `cut_columns`
-    down : (ny, width) int16, written at [line]
-        First place of the overlap that belongs to the row ``line``.
+    line : int
+    grid : CellGrid
+    site : SiteLayout
+        ``across`` of `cut_columns`; ``down`` is written at [line].
+    per_step : float32
     """
-    nx = cells.shape[1]
+    lines_x, overlap = grid.lines_x, grid.overlap
+    nx = lines_x.size - 1
     longest = 0
     for c in range(nx):
         longest = max(longest, lines_x[c + 1] - lines_x[c])
-    upper = np.empty((longest + 1, overlap), np.float32)
-    lower = np.empty_like(upper)
-    known = np.empty(longest + 1, np.bool_)
+    band = np.empty((2, longest + 1, overlap), np.float32)
     misfit = np.empty((longest + 1, overlap), np.float32)
     gates = np.empty(nx + 1, np.int64)
     for c in range(nx + 1):
         # the cheapest place over a few columns
         reach = 3
         begin = lines_x[c] - reach
-        _band(
-            line,
-            begin,
-            begin + 2 * reach + 2,
-            cells,
-            lines_y,
-            lines_x,
-            wrap_x,
-            overlap,
-            sources,
-            heights,
-            across,
-            upper,
-            lower,
-            known,
-        )
+        _band_misfit(line, begin, begin + 2 * reach + 2, grid, site, per_step, band, misfit)
         sums = np.zeros(overlap, np.float64)
         for i in range(2 * reach + 1):
-            _misfit_row(
-                upper.reshape(-1),
-                lower.reshape(-1),
-                i * overlap,
-                (i + 1) * overlap,
-                i * overlap,
-                (i + 1) * overlap,
-                per_step,
-                misfit[i],
-            )
             for place in range(overlap):
                 sums[place] += misfit[i, place]
         gate = overlap // 2
@@ -339,36 +263,10 @@ def cut_rows(
             if sums[place] < sums[gate]:
                 gate = place
         gates[c] = gate
-    if wrap_x:
+    if grid.wrap[1]:
         gates[nx] = gates[0]
     for c in range(nx):
         begin, end = lines_x[c], lines_x[c + 1]
-        length = end - begin
-        _band(
-            line,
-            begin,
-            end + 1,
-            cells,
-            lines_y,
-            lines_x,
-            wrap_x,
-            overlap,
-            sources,
-            heights,
-            across,
-            upper,
-            lower,
-            known,
-        )
-        for i in range(length):
-            _misfit_row(
-                upper.reshape(-1),
-                lower.reshape(-1),
-                i * overlap,
-                (i + 1) * overlap,
-                i * overlap,
-                (i + 1) * overlap,
-                per_step,
-                misfit[i],
-            )
-        _cheapest_path(misfit[:length], gates[c], gates[c + 1], down[line, begin:end])
+        _band_misfit(line, begin, end + 1, grid, site, per_step, band, misfit)
+        path = site.down[line, begin:end]
+        _cheapest_path(misfit[: end - begin], gates[c], gates[c + 1], path)

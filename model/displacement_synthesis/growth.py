@@ -30,9 +30,7 @@ from model.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from model.displacement_synthesis import cut_kernels, kernels
 from model.displacement_synthesis.layout import CellGrid, Layout, SiteLayout
 from model.displacement_synthesis.regions import coarse_weights, interpolated
-from model.displacement_synthesis.sources import Sources, SynthesisError, gather, leveled
-
-__all__ = ["Layout", "SynthesisError", "grow", "lay_out", "leveled"]
+from model.displacement_synthesis.sources import Sources, SynthesisError, gather
 
 Wrap: TypeAlias = Literal["none", "u", "both"]
 Patches: TypeAlias = Sequence[ArrayLike] | Mapping[str, Sequence[ArrayLike]]
@@ -278,69 +276,26 @@ def _choose(
     threads: int,
 ) -> SiteLayout:
     """Choose windows in four groups and cut between them."""
-    candidates, per_step, seed = knobs
-    wrap_y, wrap_x = grid.wrap
+    candidates, per_step, _ = knobs
     ny, nx = levels.shape
-    cells = np.full((ny, nx, 4), -1, np.int64)
+    site = SiteLayout(
+        sources,
+        cells=np.full((ny, nx, 4), -1, np.int64),
+        across=np.full((ny, nx, grid.window), grid.overlap // 2, np.int16),
+        down=np.full((ny, int(grid.lines_x[-1])), grid.overlap // 2, np.int16),
+    )
     if needed is not None:
-        cells[~needed, 0] = -2
-    across = np.full((ny, nx, grid.window), grid.overlap // 2, np.int16)
-    down = np.full((ny, int(grid.lines_x[-1])), grid.overlap // 2, np.int16)
+        site.cells[~needed, 0] = -2
     allowed = _allowance(sources, grid.window)
 
     def choose(row: int, first: int, beside: bool, above: bool) -> None:
-        kernels.choose_windows(
-            row,
-            first,
-            cells,
-            grid.lines_y,
-            grid.lines_x,
-            beside,
-            above,
-            wrap_x,
-            wrap_y,
-            grid.window,
-            grid.overlap,
-            levels,
-            sources.level_first,
-            sources.table,
-            sources.heights,
-            sources.turned,
-            sources.filled,
-            allowed,
-            candidates,
-            seed,
-            per_step,
-        )
+        kernels.choose_windows(row, first, beside, above, grid, levels, site, allowed, knobs)
 
     def cut_columns(row: int) -> None:
-        cut_kernels.cut_columns(
-            row,
-            cells,
-            grid.lines_x,
-            wrap_x,
-            grid.window,
-            grid.overlap,
-            sources.table,
-            sources.heights,
-            per_step,
-            across,
-        )
+        cut_kernels.cut_columns(row, grid, site, per_step)
 
     def cut_rows(line: int) -> None:
-        cut_kernels.cut_rows(
-            line,
-            cells,
-            grid.lines_y,
-            grid.lines_x,
-            wrap_x,
-            grid.overlap,
-            sources.table,
-            sources.heights,
-            per_step,
-            across,
-            down,
-        )
+        cut_kernels.cut_rows(line, grid, site, per_step)
 
     with ThreadPoolExecutor(threads) as pool:
         for parity, first, beside, above in (
@@ -351,14 +306,14 @@ def _choose(
         ):
             rows = range(parity, ny, 2)
             list(pool.map(choose, rows, *([v] * len(rows) for v in (first, beside, above))))
-        if (cells[..., 0] == -1).any():
+        if (site.cells[..., 0] == -1).any():
             raise SynthesisError(
                 f"patches: got no window with at most {allowed} filled pixels in "
                 f"{candidates * kernels.MAX_DRAWS} draws, expected fewer holes or more candidates"
             )
         list(pool.map(cut_columns, range(ny)))
-        list(pool.map(cut_rows, range(0 if wrap_y else 1, ny)))
-    return SiteLayout(sources, cells, across, down)
+        list(pool.map(cut_rows, range(0 if grid.wrap[0] else 1, ny)))
+    return site
 
 
 def _allowance(sources: Sources, window: int) -> int:

@@ -9,21 +9,19 @@ second array with every source transposed, so that a cut that runs along a row i
 that runs along a column.
 """
 
-from __future__ import annotations
-
-from typing import Any
+# mypy: allow-untyped-defs
 
 import numpy as np
 from numba import njit
 
-from model.displacement_synthesis.cut_kernels import cell_of, cut_cost, place_in_row
+from model.displacement_synthesis.cut_kernels import cell_and_place, cut_cost, place_in_row
 
 MAX_DRAWS = 24
 """Places drawn before a window with too many filled pixels is given up for another candidate."""
 
 
 @njit(cache=True, nogil=True)
-def mixed(key: Any) -> Any:
+def mixed(key):
     """Return 64 bits that depend on every bit of ``key`` (the finalizer of splitmix64)."""
     z = np.uint64(key) + np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -32,12 +30,22 @@ def mixed(key: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _uniform(key: Any) -> Any:
+def _uniform(key):
     return float(mixed(key) >> np.uint64(11)) * 2.0**-53
 
 
 @njit(cache=True, nogil=True)
-def _drawn(key: Any, sources: Any, filled: Any, window: Any, most_filled: Any) -> Any:
+def _filled_in(filled, source, y, x, window):
+    """Return how many pixels of a source's window were filled, by the summed-area table."""
+    wide = source[2]
+    first = source[3] + y * (wide + 1) + x
+    down = window * (wide + 1)
+    count = filled[first + down + window] - filled[first + down]
+    return count - (filled[first + window] - filled[first])
+
+
+@njit(cache=True, nogil=True)
+def _drawn(key, sources, filled, window, most_filled):
     """Return (source, row, column) of a window with few filled pixels; source -1: none found.
 
     Places are drawn as if windows might stand out of the source by half their size, and are then
@@ -60,198 +68,94 @@ def _drawn(key: Any, sources: Any, filled: Any, window: Any, most_filled: Any) -
         x = int(_uniform(at + np.uint64(2)) * wide) - window // 2
         y = min(max(y, 0), high - window)
         x = min(max(x, 0), wide - window)
-        first = sources[chosen, 3] + y * (wide + 1) + x
-        down = window * (wide + 1)
-        count = filled[first + down + window] - filled[first + down]
-        count -= filled[first + window] - filled[first]
-        if count <= most_filled:
+        if _filled_in(filled, sources[chosen], y, x, window) <= most_filled:
             return chosen, y, x
     return -1, 0, 0
 
 
+@njit(cache=True, nogil=True)
+def _neighbour(row, column, axis, side, grid, cells):
+    """Return the cell beside (axis 1) or above and below (axis 0) one, or -1: none is chosen."""
+    cell = column if axis else row
+    other, count = cell - 1 + 2 * side, cells.shape[axis]
+    if grid.wrap[axis]:
+        other %= count
+    if other < 0 or other >= count:
+        return -1
+    there = cells[row, other, 0] if axis else cells[other, column, 0]
+    return other if there >= 0 else -1
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def choose_windows(
-    row: Any,
-    first_column: Any,
-    cells: Any,
-    lines_y: Any,
-    lines_x: Any,
-    neighbours_x: Any,
-    neighbours_y: Any,
-    wrap_x: Any,
-    wrap_y: Any,
-    window: Any,
-    overlap: Any,
-    levels: Any,
-    level_first: Any,
-    sources: Any,
-    heights: Any,
-    turned: Any,
-    filled: Any,
-    most_filled: Any,
-    candidates: Any,
-    seed: Any,
-    per_step: Any,
-) -> Any:
+def choose_windows(row, first_column, beside, above, grid, levels, site, most_filled, knobs):
     """Choose windows for every other cell of a row, by the cheapest cuts to neighbours there.
 
     Parameters
     ----------
     row, first_column : int
         Cells (row, first_column), (row, first_column + 2), ...
-    cells : (ny, nx, 4) int64, written
-        Source, row and column of the window in it, filled pixels; source -1: not chosen yet or,
-        after the call, no window was to be had; -2: no cell is needed here.
-    lines_y, lines_x : (ny + 1,), (nx + 1,) int64
-        Where cells begin on the map.
-    neighbours_x, neighbours_y : bool
+    beside, above : bool
         Whether windows beside, and above and below, are chosen already.
-    wrap_x, wrap_y : bool
-    window, overlap : int
+    grid : CellGrid
     levels : (ny, nx) int64
         Scale of each cell.
-    level_first : (L + 1,) int64
-        Sources of scale l are those from level_first[l] to before level_first[l + 1].
-    sources : (S, 5) int64
-        First pixel in ``heights``, height, width, first entry in ``filled``, first pixel in
-        ``turned`` (where height and width are exchanged).
-    heights, turned : (N,) float32
-    filled : (M,) int32
-        Summed-area tables of the pixels that were filled.
+    site : SiteLayout
+        ``cells`` are written; their source before: -1 not chosen yet, -2 no cell is needed here;
+        after the call, -1: no window was to be had.
     most_filled : int
         Filled pixels of a window.
-    candidates : int
-    seed : uint64
-    per_step : float32
-
-    Returns
-    -------
-    float
-        Sum of the costs of cuts.
+    knobs : (int, float32, uint64)
+        Candidates, squared slope per squared step, seed.
     """
-    ny, nx = levels.shape
-    total = 0.0
-    for column in range(first_column, nx, 2):
+    candidates, per_step, seed = knobs
+    cells, sources = site.cells, site.sources
+    for column in range(first_column, levels.shape[1], 2):
         if cells[row, column, 0] == -2:
             continue
-        level = levels[row, column]
-        own = sources[level_first[level] : level_first[level + 1]]
+        first = sources.level_first[levels[row, column]]
+        own = sources.table[first : sources.level_first[levels[row, column] + 1]]
         key = mixed(seed ^ mixed(np.uint64(row) * np.uint64(1 << 24) + np.uint64(column)))
         best = np.inf
         for number in range(candidates):
-            k, y, x = _drawn(
-                key + np.uint64(number) * np.uint64(1 << 16), own, filled, window, most_filled
-            )
+            drawn = key + np.uint64(number) * np.uint64(1 << 16)
+            k, y, x = _drawn(drawn, own, sources.filled, grid.window, most_filled)
             if k < 0:
                 continue
             cost = 0.0
-            wide, high = own[k, 2], own[k, 1]
-            here = own[k, 0] + y * wide + x
-            here_turned = own[k, 4] + x * high + y
-            if neighbours_x:
+            for axis in (1, 0):
+                if not (beside if axis else above):
+                    continue
+                heights = sources.heights if axis else sources.turned
+                lines = grid.lines_x if axis else grid.lines_y
+                here, step = own[k, 0] + y * own[k, 2] + x, own[k, 2]
+                if axis == 0:
+                    here, step = own[k, 4] + x * own[k, 1] + y, own[k, 1]
                 for side in range(2):
-                    other = column - 1 + 2 * side
-                    if wrap_x:
-                        other %= nx
-                    if other < 0 or other >= nx or cells[row, other, 0] < 0 or cost >= best:
+                    other = _neighbour(row, column, axis, side, grid, cells)
+                    if other < 0 or cost >= best:
                         continue
-                    o = cells[row, other]
-                    there = sources[o[0], 0] + o[1] * sources[o[0], 2] + o[2]
-                    if side == 0:
-                        to = lines_x[other + 1] - lines_x[other]
-                        cost += cut_cost(
-                            heights,
-                            there + to,
-                            sources[o[0], 2],
-                            here,
-                            wide,
-                            window,
-                            overlap,
-                            per_step,
-                            best - cost,
-                        )
-                    else:
-                        to = lines_x[column + 1] - lines_x[column]
-                        cost += cut_cost(
-                            heights,
-                            here + to,
-                            wide,
-                            there,
-                            sources[o[0], 2],
-                            window,
-                            overlap,
-                            per_step,
-                            best - cost,
-                        )
-            if neighbours_y:
-                for side in range(2):
-                    other = row - 1 + 2 * side
-                    if wrap_y:
-                        other %= ny
-                    if other < 0 or other >= ny or cells[other, column, 0] < 0 or cost >= best:
-                        continue
-                    o = cells[other, column]
-                    there = sources[o[0], 4] + o[2] * sources[o[0], 1] + o[1]
-                    if side == 0:
-                        to = lines_y[other + 1] - lines_y[other]
-                        cost += cut_cost(
-                            turned,
-                            there + to,
-                            sources[o[0], 1],
-                            here_turned,
-                            high,
-                            window,
-                            overlap,
-                            per_step,
-                            best - cost,
-                        )
-                    else:
-                        to = lines_y[row + 1] - lines_y[row]
-                        cost += cut_cost(
-                            turned,
-                            here_turned + to,
-                            high,
-                            there,
-                            sources[o[0], 1],
-                            window,
-                            overlap,
-                            per_step,
-                            best - cost,
-                        )
+                    o = cells[row, other] if axis else cells[other, column]
+                    source = sources.table[o[0]]
+                    there, stride = source[0] + o[1] * source[2] + o[2], source[2]
+                    if axis == 0:
+                        there, stride = source[4] + o[2] * source[1] + o[1], source[1]
+                    a, a_step, b, b_step, cell = there, stride, here, step, other
+                    if side == 1:
+                        a, a_step, b, b_step = here, step, there, stride
+                        cell = column if axis else row
+                    a += lines[cell + 1] - lines[cell]
+                    cost += cut_cost(heights, a, a_step, b, b_step, grid, per_step, best - cost)
             if cost < best:
                 best = cost
-                first = own[k, 3] + y * (wide + 1) + x
-                down = window * (wide + 1)
-                count = filled[first + down + window] - filled[first + down]
-                cells[row, column, 0] = level_first[level] + k
-                cells[row, column, 1] = y
-                cells[row, column, 2] = x
-                cells[row, column, 3] = count - filled[first + window] + filled[first]
-                if not (neighbours_x or neighbours_y):
+                count = _filled_in(sources.filled, own[k], y, x, grid.window)
+                cells[row, column, 0], cells[row, column, 1] = first + k, y
+                cells[row, column, 2], cells[row, column, 3] = x, count
+                if not (beside or above):
                     break
-        if best < np.inf:
-            total += best
-    return total
 
 
 @njit(cache=True, nogil=True)
-def lay_down(
-    top: Any,
-    left: Any,
-    cells: Any,
-    lines_y: Any,
-    lines_x: Any,
-    wrap_x: Any,
-    wrap_y: Any,
-    overlap: Any,
-    sources: Any,
-    heights: Any,
-    across: Any,
-    down: Any,
-    out: Any,
-    labels: Any,
-    pixels: Any,
-) -> None:
+def lay_down(top, left, grid, site, out, labels, pixels):
     """Write the windows' pixels of one tile.
 
     Parameters
@@ -259,15 +163,17 @@ def lay_down(
     top, left : int
         First row and column of the tile on the map; it may stand out where the map wraps, and
         is left at label -1 where it stands out of a map that does not.
+    grid : CellGrid
+    site : SiteLayout
     out : (h, w) float32, written
     labels : (h, w) int64, written
         Number of the cell, -1 without.
     pixels : (h, w) int64, written
-        Pixel in ``heights``.
+        Pixel in the sources' heights.
     """
-    ny, nx = cells.shape[:2]
-    height, width = lines_y[ny], lines_x[nx]
-    half = overlap // 2
+    nx = site.cells.shape[1]
+    wrap_y, wrap_x = grid.wrap
+    height, width = grid.lines_y[-1], grid.lines_x[-1]
     for i in range(out.shape[0]):
         y = top + i
         if wrap_y:
@@ -281,35 +187,21 @@ def lay_down(
             pixels[i, j] = -1
             if y < 0 or y >= height or x < 0 or x >= width:
                 continue
-            row = cell_of(y, lines_y)
-            local = y - lines_y[row] + half
-            if local < overlap and (wrap_y or row > 0):
-                if local < down[row, x]:
-                    row = (row - 1) % ny
-                    local += lines_y[row + 1] - lines_y[row]
-            elif y >= lines_y[row + 1] - half and (wrap_y or row < ny - 1):
-                following = (row + 1) % ny
-                place = y - lines_y[row + 1] + half
-                if place >= down[following, x]:
-                    row = following
-                    local = place
-            column, p = place_in_row(
-                row, local, x, cells, lines_x, wrap_x, overlap, sources, across
-            )
+            row, local = cell_and_place(y, grid.lines_y, wrap_y, grid.overlap, site.down[:, x])
+            column, p = place_in_row(row, local, x, grid, site)
             if p >= 0:
-                out[i, j] = heights[p]
+                out[i, j] = site.sources.heights[p]
                 labels[i, j] = row * nx + column
                 pixels[i, j] = p
 
 
 @njit(cache=True, nogil=True)
-def steps_at_cuts(
-    out: Any, labels: Any, pixels: Any, cells: Any, sources: Any, heights: Any, divergence: Any
-) -> None:
+def steps_at_cuts(out, labels, pixels, site, divergence):
     """Write the divergence of what differences across cuts have too much.
 
     Across a cut the difference ought to be the mean of those that both windows have there.
     """
+    cells, sources, heights = site.cells, site.sources.table, site.sources.heights
     nx = cells.shape[1]
     rows, columns = out.shape
     divergence[:] = 0.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,7 @@ MARGIN_RANGES = 8.0
 """A tile's margin in ranges of the screened Poisson equation: e^-8 of a step is left there."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CellGrid:
+class CellGrid(NamedTuple):
     """Where cells are on a map."""
 
     lines_y: Int64Array
@@ -37,8 +37,7 @@ class CellGrid:
     """Whether the map goes on at its other side, vertically and horizontally."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SiteLayout:
+class SiteLayout(NamedTuple):
     """What the patches of one site were laid out to."""
 
     sources: Sources
@@ -158,24 +157,7 @@ class Layout:
     ) -> tuple[Float32Array, Int64Array, Int64Array]:
         out = np.empty(size, np.float32)
         labels, pixels = np.empty(size, np.int64), np.empty(size, np.int64)
-        grid = self.grid
-        kernels.lay_down(
-            top,
-            left,
-            site.cells,
-            grid.lines_y,
-            grid.lines_x,
-            grid.wrap[1],
-            grid.wrap[0],
-            grid.overlap,
-            site.sources.table,
-            site.sources.heights,
-            site.across,
-            site.down,
-            out,
-            labels,
-            pixels,
-        )
+        kernels.lay_down(top, left, self.grid, site, out, labels, pixels)
         return out, labels, pixels
 
     def _relief(self, site: SiteLayout, top: int, left: int, size: tuple[int, int]) -> Float32Array:
@@ -184,9 +166,7 @@ class Layout:
             site, top - margin, left - margin, (size[0] + 2 * margin, size[1] + 2 * margin)
         )
         steps = np.empty_like(out)
-        kernels.steps_at_cuts(
-            out, labels, pixels, site.cells, site.sources.table, site.sources.heights, steps
-        )
+        kernels.steps_at_cuts(out, labels, pixels, site, steps)
         out += _closing(steps, self.range_px)
         return out[margin : margin + size[0], margin : margin + size[1]]
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -122,8 +122,7 @@ def filled(height: FloatArray, known: BoolArray) -> Float32Array:
     return values.astype(np.float32)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Sources:
+class Sources(NamedTuple):
     """All patches of a site at all scales, in one flat array."""
 
     table: Int64Array

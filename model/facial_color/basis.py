@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,6 +26,49 @@ _MAX_TEXTURE_LINES = 256
 """Rows and columns that the size of a map's texture is taken from."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Neutral:
+    """The neutral map of a rig, with its statistics in discs."""
+
+    image: FloatArray
+    valid: BoolArray
+    stderr: Float64Array
+    radius_px: float
+    cells: coarse_maps.Cells
+    own: DiscStatistics
+    mean: Float64Array
+    """Of discs, a value a cell."""
+    mean_valid: BoolArray
+
+    @classmethod
+    def of(
+        cls,
+        images: Mapping[str, FloatArray],
+        masks: Mapping[str, BoolArray],
+        errors: Mapping[str, Float64Array],
+        radius_px: float,
+        cells: coarse_maps.Cells,
+    ) -> _Neutral:
+        image, valid = images[NEUTRAL], masks[NEUTRAL]
+        if not valid.any():
+            raise FacialColorError(f"{NEUTRAL}: no pixel is valid, expected some")
+        own = disc_statistics.measure(image, radius_px, valid=valid)
+        mean, mean_valid = cells.coarsen(own.mean, valid)
+        return cls(image, valid, errors[NEUTRAL], radius_px, cells, own, mean, mean_valid)
+
+    def rig(self, states: Mapping[str, StateMaps], global_states: Iterable[str]) -> RigMaps:
+        """Return the rig of these states."""
+        return RigMaps(
+            neutral=np.where(self.valid, self.image, self.image.dtype.type(0)),
+            valid=self.valid,
+            neutral_stderr=np.where(self.valid, self.stderr, 0.0).astype(self.image.dtype),
+            neutral_mean=self.mean,
+            states=states,
+            radius_px=float(self.radius_px),
+            global_states=tuple(global_states),
+        )
+
+
 def fitted(
     neutral: ArrayLike,
     states: Mapping[str, ArrayLike],
@@ -45,62 +89,25 @@ def fitted(
     images = {NEUTRAL: base} | {n: _image(n, m, shape) for n, m in states.items()}
     masks = _masks(valid, images)
     errors = _errors(stderr, images)
-    held = masks[NEUTRAL]
-    if not held.any():
-        raise FacialColorError(f"{NEUTRAL}: no pixel is valid, expected some")
-    cells = coarse_maps.fitting(shape, stored_size)
-    own = disc_statistics.measure(base, radius_px, valid=held)
-    texture_px = texture_area_px(base - own.mean, held)
-    mean, _ = cells.coarsen(own.mean, held)
-    made = {
-        name: _state(
-            images[name],
-            base,
-            own,
-            held,
-            masks[name],
-            errors[name],
-            errors[NEUTRAL],
-            radius_px=radius_px,
-            cells=cells,
-            texture_px=texture_px,
-        )
-        for name in states
-    }
+    rest = _Neutral.of(images, masks, errors, radius_px, coarse_maps.fitting(shape, stored_size))
+    texture_px = texture_area_px(base - rest.own.mean, rest.valid)
+    made = {n: _state(images[n], masks[n], errors[n], rest, texture_px) for n in states}
     listed = [n for n in GLOBAL_STATES if n in states] if global_states is None else global_states
-    return RigMaps(
-        neutral=np.where(held, base, base.dtype.type(0)),
-        valid=held,
-        neutral_stderr=np.where(held, errors[NEUTRAL], 0.0).astype(base.dtype),
-        neutral_mean=mean,
-        states=made,
-        radius_px=float(radius_px),
-        global_states=tuple(listed),
-    )
+    return rest.rig(made, listed)
 
 
 def _state(
-    image: FloatArray,
-    neutral: FloatArray,
-    own: DiscStatistics,
-    held: BoolArray,
-    mask: BoolArray,
-    error: Float64Array,
-    neutral_error: Float64Array,
-    *,
-    radius_px: float,
-    cells: coarse_maps.Cells,
-    texture_px: float,
+    image: FloatArray, mask: BoolArray, error: Float64Array, neutral: _Neutral, texture_px: float
 ) -> StateMaps:
     """Compare one state with the neutral map over the pixels that both have."""
+    base, held, own = neutral.image, neutral.valid, neutral.own
+    radius_px, cells = neutral.radius_px, neutral.cells
     both = held & mask
     alike = bool((both == held).all())
-    rest = own if alike else disc_statistics.measure(neutral, radius_px, valid=both)
+    rest = own if alike else disc_statistics.measure(base, radius_px, valid=both)
     seen = disc_statistics.measure(image, radius_px, valid=both)
     total = disc_statistics.measure(
-        np.where(both, image, 0).astype(np.float64) + np.where(both, neutral, 0),
-        radius_px,
-        valid=both,
+        np.where(both, image, 0).astype(np.float64) + np.where(both, base, 0), radius_px, valid=both
     )
     where = held & seen.valid
     covariance = 0.5 * (total.deviation**2 - seen.deviation**2 - rest.deviation**2)
@@ -114,7 +121,7 @@ def _state(
         _deviation_variance(
             stats, disc_statistics.measure(e.astype(np.float32), radius_px, valid=both), draws
         )
-        for stats, e in ((seen, error), (rest, neutral_error))
+        for stats, e in ((seen, error), (rest, neutral.stderr))
     ]
     ratio = deviation_ratio.estimate(
         seen.deviation, rest.deviation, sampled + measured[0] + measured[1], where
@@ -137,10 +144,10 @@ def _state(
         ("misfit", misfit),
     ):
         stored[name], few = cells.coarsen(full, where)
-    exact = bias + s * (neutral - own.mean)
+    exact = bias + s * (base - own.mean)
     mean, _ = cells.coarsen(own.mean, where)
     up = cells.refine(stored["scale"], stored["bias"], mean, valid=few)
-    lost = (up[1] + up[0] * (neutral - up[2]) - exact)[where]
+    lost = (up[1] + up[0] * (base - up[2]) - exact)[where]
     return StateMaps(
         **stored,
         valid=few,
@@ -225,17 +232,14 @@ def transferred(
         raise FacialColorError(f"transfer: got {transfer!r}, expected one of {TRANSFER_METHODS}")
     base = _image(NEUTRAL, neutral)
     images = {NEUTRAL: base}
-    held = _masks(valid, images)[NEUTRAL]
-    if not held.any():
-        raise FacialColorError(f"{NEUTRAL}: no pixel is valid, expected some")
-    error = _errors({} if stderr is None else {NEUTRAL: stderr}, images)[NEUTRAL]
+    masks = _masks(valid, images)
+    errors = _errors({} if stderr is None else {NEUTRAL: stderr}, images)
     size = rig.neutral_mean.shape
     stored = (min(size[0], base.shape[0]), min(size[1], base.shape[1]))
     cells = coarse_maps.Cells((base.shape[0], base.shape[1]), stored)
-    growth = np.sqrt(base.size / rig.neutral.size)
-    radius_px = float(rig.radius_px * growth)
-    own = disc_statistics.measure(base, radius_px, valid=held)
-    mean, here = cells.coarsen(own.mean, held)
+    radius_px = float(rig.radius_px * np.sqrt(base.size / rig.neutral.size))
+    rest = _Neutral.of(images, masks, errors, radius_px, cells)
+    mean, here = rest.mean, rest.mean_valid
     source_mean, source_valid = _resampled(rig.neutral_mean, rig.neutral_mean_valid, stored)
     made = {}
     for name, state in rig.states.items():
@@ -261,15 +265,7 @@ def transferred(
             storage_rms=state.storage_rms,
             storage_largest=state.storage_largest,
         )
-    return RigMaps(
-        neutral=np.where(held, base, base.dtype.type(0)),
-        valid=held,
-        neutral_stderr=np.where(held, error, 0.0).astype(base.dtype),
-        neutral_mean=mean,
-        states=made,
-        radius_px=radius_px,
-        global_states=rig.global_states,
-    )
+    return rest.rig(made, rig.global_states)
 
 
 def _resampled(

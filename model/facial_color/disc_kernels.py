@@ -1,8 +1,6 @@
 """Loops of the statistics in a disc: a square, two caps by row sums, two lobes by column sums."""
 
-from __future__ import annotations
-
-from typing import Any
+# mypy: allow-untyped-defs
 
 import numpy as np
 from numba import njit, prange
@@ -11,13 +9,14 @@ from model.facial_color.row_kernels import disc_row, square_row
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _counts(h: Any, valid: Any, masked: Any, y: Any, x: Any) -> Any:
+def _counts(image, y, x):
     """Return whether a pixel counts."""
+    h, valid, masked = image
     return np.isfinite(h[y, x]) and (not masked or valid[y, x] != 0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc"})
-def _sum_about(row: Any, about: Any) -> Any:
+def _sum_about(row, about):
     """Return the sum of the differences from a value."""
     total = 0.0
     for i in range(row.size):
@@ -26,7 +25,7 @@ def _sum_about(row: Any, about: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
-def _powers(out: Any, row: Any, about: Any, moment: Any) -> None:
+def _powers(out, row, about, moment):
     """Write differences from a value, or their squares."""
     if moment == 0:
         for i in range(row.size):
@@ -38,7 +37,7 @@ def _powers(out: Any, row: Any, about: Any, moment: Any) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
-def _add_down(running: Any, new: Any, out: Any) -> None:
+def _add_down(running, new, out):
     """Go one row down with sums down columns."""
     for i in range(new.size):
         running[i] += new[i]
@@ -46,7 +45,7 @@ def _add_down(running: Any, new: Any, out: Any) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
-def _along(v: Any, n: Any, r0: Any, r1: Any, r2: Any, r3: Any) -> Any:
+def _along(v, n, r0, r1, r2, r3):
     """Write the sums along four rows, before each entry and after the last; return the largest."""
     v0, v1, v2, v3 = v[0], v[1], v[2], v[3]
     s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
@@ -62,19 +61,9 @@ def _along(v: Any, n: Any, r0: Any, r1: Any, r2: Any, r3: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
-def _finish(
-    s1: Any,
-    s2: Any,
-    whole: Any,
-    about: Any,
-    trusted: Any,
-    blur1: Any,
-    blur2: Any,
-    unit: Any,
-    mean: Any,
-    deviation: Any,
-) -> Any:
+def _finish(s1, s2, whole, about, rounding, mean, deviation):
     """Write mean and deviation of a row of whole discs; return how many need another look."""
+    trusted, blur1, blur2, unit = rounding
     doubtful = 0
     per = 1.0 / whole
     for i in range(mean.size):
@@ -89,7 +78,7 @@ def _finish(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never", fastmath={"reassoc"})
-def _moments_of(row: Any, about: Any) -> Any:
+def _moments_of(row, about):
     """Return number, sum and sum of squares about a value of the finite entries."""
     n, s1, s2 = 0, 0.0, 0.0
     for i in range(row.size):
@@ -103,7 +92,7 @@ def _moments_of(row: Any, about: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never", fastmath={"reassoc"})
-def _valid_moments_of(row: Any, valid: Any, about: Any) -> Any:
+def _valid_moments_of(row, valid, about):
     """Do the work of `_moments_of` where an entry is valid."""
     n, s1, s2 = 0, 0.0, 0.0
     for i in range(row.size):
@@ -117,8 +106,9 @@ def _valid_moments_of(row: Any, valid: Any, about: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _directly(h: Any, valid: Any, masked: Any, half: Any, y: Any, x: Any) -> Any:
+def _directly(image, half, y, x):
     """Return mean and variance of one disc by summing its pixels about one of them."""
+    h, valid, masked = image
     rows, columns = h.shape
     reach = half.size - 1
     n, s1, s2, about = 0, 0.0, 0.0, 0.0
@@ -126,7 +116,7 @@ def _directly(h: Any, valid: Any, masked: Any, half: Any, y: Any, x: Any) -> Any
         w = half[abs(k - y)]
         low, end = max(0, x - w), min(columns, x + w + 1)
         if n == 0:
-            while low < end and not _counts(h, valid, masked, k, low):
+            while low < end and not _counts(image, k, low):
                 low += 1
             if low == end:
                 continue
@@ -143,54 +133,43 @@ def _directly(h: Any, valid: Any, masked: Any, half: Any, y: Any, x: Any) -> Any
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _stays(h: Any, valid: Any, masked: Any, half: Any, y: Any, x: Any, level: Any) -> Any:
+def _stays(image, half, y, x, level):
     """Return whether what a disc gains by a step to column `x` is all of one value."""
+    h = image[0]
     rows, columns = h.shape
     reach = half.size - 1
     for k in range(max(0, y - reach), min(rows, y + reach + 1)):
         c = x + half[abs(k - y)]
-        if c < columns and h[k, c] != level and _counts(h, valid, masked, k, c):
+        if c < columns and h[k, c] != level and _counts(image, k, c):
             return False
     return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _tile(
-    h: Any,
-    valid: Any,
-    masked: Any,
-    half: Any,
-    high: Any,
-    inner: Any,
-    whole: Any,
-    trusted: Any,
-    y0: Any,
-    y1: Any,
-    x0: Any,
-    x1: Any,
-    p: Any,
-    q: Any,
-    nothing: Any,
-    sums: Any,
-    v: Any,
-    down: Any,
-    squares_of: Any,
-    mean: Any,
-    deviation: Any,
-    count: Any,
-) -> None:
-    """Do the work of `disc_moments` for rows y0 to y1 and columns x0 to x1.
+def _tile(image, disc, trusted, box, room, found):
+    """Do the work of `disc_moments` for one tile.
 
     Parameters
     ----------
-    whole : int
-        Pixels of a disc.
-    p, q : (K, L), (K + 1, L) in the type of `h`
-        Room for sums along rows and down columns; entry j stands for column x0 - width + j.
-    nothing : (L,), 0
-    sums, v, down, squares_of
-        Room for the sums of a tile, four rows, sums down columns, and over squares.
+    image
+        `h`, `valid` and `masked`.
+    disc
+        `half`, `high`, `inner`, and the pixels of a disc.
+    trusted : float
+    box
+        Rows y0 to y1 and columns x0 to x1.
+    room
+        p, q: (K, L), (K + 1, L) in the type of `h`, for sums along rows and down columns; entry j
+        stands for column x0 - width + j. nothing: (L,), 0. Then for the sums of a tile, four rows,
+        sums down columns, and over squares.
+    found
+        `mean`, `deviation` and `count`, written.
     """
+    h, _, masked = image
+    half, high, inner, whole = disc
+    y0, y1, x0, x1 = box
+    p, q, nothing, sums, v, down, squares_of = room
+    mean, deviation, count = found
     rows, columns = h.shape
     reach, width = half.size - 1, half[0]
     k0, k1 = max(0, y0 - reach), min(rows, y1 + reach)
@@ -207,7 +186,7 @@ def _tile(
         seen, total = 0, 0.0
         for k in range(k0, k1):
             for c in range(c0, c1):
-                if _counts(h, valid, masked, k, c):
+                if _counts(image, k, c):
                     if seen == 0:
                         first = np.float64(h[k, c])
                     seen += 1
@@ -244,7 +223,7 @@ def _tile(
                 else:
                     for c in range(c0, c1):
                         value = 0.0
-                        if _counts(h, valid, masked, k0 + k + b, c):
+                        if _counts(image, k0 + k + b, c):
                             d = np.float64(h[k0 + k + b, c]) - about
                             value = d if moment == 0 else (d * d if moment == 1 else 1.0)
                         v[b, c - c0] = value
@@ -267,19 +246,9 @@ def _tile(
         s1, s2 = sums[0, y - y0, :n], sums[1, y - y0, :n]
         if not partial:
             count[y, x0:x1] = whole
-            doubtful = _finish(
-                s1,
-                s2,
-                np.float64(whole),
-                about,
-                trusted,
-                blur1,
-                blur2,
-                unit,
-                mean[y, x0:x1],
-                deviation[y, x0:x1],
-            )
-            if doubtful == 0:
+            rounding = (trusted, blur1, blur2, unit)
+            row = (mean[y, x0:x1], deviation[y, x0:x1])
+            if _finish(s1, s2, np.float64(whole), about, rounding, *row) == 0:
                 continue
         constant, level = False, np.float64(0.0)  # whether the disc to the left is, and its value
         for i in range(n):
@@ -297,11 +266,11 @@ def _tile(
             mean[y, x0 + i] = about + m
             if held * variance * trusted >= doubt:
                 constant = False
-            elif constant and _stays(h, valid, masked, half, y, x0 + i, level):
+            elif constant and _stays(image, half, y, x0 + i, level):
                 mean[y, x0 + i] = level
                 variance = np.float64(0.0)
             else:
-                level, variance = _directly(h, valid, masked, half, y, x0 + i)
+                level, variance = _directly(image, half, y, x0 + i)
                 mean[y, x0 + i] = level
                 constant = variance == 0.0
             deviation[y, x0 + i] = np.sqrt(max(variance, 0.0))
@@ -309,20 +278,8 @@ def _tile(
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def disc_moments(
-    h: Any,
-    valid: Any,
-    masked: Any,
-    half: Any,
-    high: Any,
-    inner: Any,
-    tall: Any,
-    wide: Any,
-    parts: Any,
-    trusted: Any,
-    mean: Any,
-    deviation: Any,
-    count: Any,
-) -> None:
+    h, valid, masked, half, high, inner, tall, wide, parts, trusted, mean, deviation, count
+):
     """Write mean, deviation and number of valid pixels in a disc about each pixel.
 
     A tile takes the mean of all that its discs can see as the value to sum about, and sums in
@@ -356,6 +313,7 @@ def disc_moments(
     whole = np.int64(0)
     for a in range(reach + 1):
         whole += (2 * half[a] + 1) * (1 if a == 0 else 2)
+    image, disc, found = (h, valid, masked), (half, high, inner, whole), (mean, deviation, count)
     # each part keeps its buffers: fresh ones for every tile would be mapped and cleared anew
     most_rows = min(rows, tall + 2 * reach)
     length = min(wide, columns) + 2 * width + 1
@@ -368,27 +326,6 @@ def disc_moments(
         down_columns, squares = np.empty(length), np.empty(wide)
         for tile in range(part * across * down // parts, (part + 1) * across * down // parts):
             y0, x0 = (tile // across) * tall, (tile % across) * wide
-            _tile(
-                h,
-                valid,
-                masked,
-                half,
-                high,
-                inner,
-                whole,
-                trusted,
-                y0,
-                min(rows, y0 + tall),
-                x0,
-                min(columns, x0 + wide),
-                p,
-                q,
-                nothing,
-                sums,
-                v,
-                down_columns,
-                squares,
-                mean,
-                deviation,
-                count,
-            )
+            box = (y0, min(rows, y0 + tall), x0, min(columns, x0 + wide))
+            room = (p, q, nothing, sums, v, down_columns, squares)
+            _tile(image, disc, trusted, box, room, found)

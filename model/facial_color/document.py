@@ -17,7 +17,7 @@ SCHEMA: Final = "skinrig.facial-color/1"
 RIG_DOCUMENT: Final = "facial_color.json"
 _BLOOD_UNIT: Final = MAP_UNITS["hemoglobin"]
 _DOCUMENT_KEYS: Final = {"schema", "radius_px", "shape", "stored", "global_states", "states"}
-_STATE_KEYS: Final = {"prior", "storage_rms", "storage_largest"}
+_STATE_KEYS: Final = ("prior", "storage_rms", "storage_largest")
 
 
 def to_maps(rig: HemoglobinRig) -> tuple[dict[str, SkinMap], bytes]:
@@ -61,11 +61,7 @@ def to_maps(rig: HemoglobinRig) -> tuple[dict[str, SkinMap], bytes]:
             state.valid,
             "deviation in a disc of the measured state from scale and bias",
         )
-        states[name] = {
-            "prior": state.prior,
-            "storage_rms": state.storage_rms,
-            "storage_largest": state.storage_largest,
-        }
+        states[name] = {key: getattr(state, key) for key in _STATE_KEYS}
     document = {
         "schema": SCHEMA,
         "radius_px": rig.radius_px,
@@ -105,7 +101,7 @@ def from_maps_and_document(maps: Mapping[str, SkinMap], document: bytes) -> Hemo
     for name, entry in loaded["states"].items():
         if not isinstance(entry, dict):
             raise FacialColorError(f"{RIG_DOCUMENT}: states.{name}: expected an object")
-        _exactly(f"states.{name}.", entry, _STATE_KEYS)
+        _exactly(f"states.{name}.", entry, set(_STATE_KEYS))
         number = {key: _number(f"states.{name}.{key}", entry[key]) for key in _STATE_KEYS}
         scale, bias, misfit = (
             _map(maps, f"{kind}_{name}", stored, unit)
@@ -119,9 +115,7 @@ def from_maps_and_document(maps: Mapping[str, SkinMap], document: bytes) -> Hemo
             bias_stderr=_double(_stderr(bias), valid),
             misfit=_double(misfit.values, valid),
             valid=valid,
-            prior=number["prior"],
-            storage_rms=number["storage_rms"],
-            storage_largest=number["storage_largest"],
+            **number,
         )
     mean = _map(maps, f"bias_{NEUTRAL}", stored, _BLOOD_UNIT)
     held = neutral.mask

@@ -1,8 +1,8 @@
 """Local histogram matching without the Gaussian assumption (Jimenez 2010, section 4).
 
-Each value of the neutral map goes to the value at its percentile in the target's disc. Done in
-full about every pixel (`match_sliding`), or about the nodes of a grid of windows whose mappings
-are blended bilinearly (`match`). `model.facial_color` does it with two numbers a disc instead.
+Each value of the neutral map goes to the value at its percentile in the target's disc, about the
+nodes of a grid of windows whose mappings are blended bilinearly. `model.facial_color` does it with
+two numbers a disc instead.
 """
 
 from __future__ import annotations
@@ -87,31 +87,6 @@ def match(
         _match_windows(a, b, va, vb, half, spacing, parity, total, weight)
     found = va & (weight > 0.0)
     return HistogramMatch(np.where(found, total / np.where(found, weight, 1.0), np.nan), found)
-
-
-def match_sliding(
-    neutral: ArrayLike,
-    target: ArrayLike,
-    radius_px: float,
-    *,
-    valid: BoolArray | None = None,
-    valid_target: BoolArray | None = None,
-) -> HistogramMatch:
-    """Match the histograms in the disc about every single pixel: exact, and O(r^2) a pixel.
-
-    Parameters and errors as of `match`.
-
-    Examples
-    --------
-    >>> ramp = np.arange(20.0).reshape(4, 5)
-    >>> match_sliding(ramp, ramp**2, 2.0).hemoglobin[0].round(2).tolist()
-    [0.0, 1.0, 4.0, 9.0, 16.0]
-    """
-    a, b, va, vb = _checked(neutral, target, valid, valid_target)
-    half = half_widths(radius_px, a.shape[0] - 1, a.shape[1] - 1)
-    out = np.empty(a.shape)
-    _match_pixels(a, b, va, vb, half, out)
-    return HistogramMatch(out, np.isfinite(out))
 
 
 def _checked(
@@ -214,37 +189,3 @@ def _match_windows(
                     share = 0.5 * (below + upto) / source.size
                     total[k, c] += hat * _at_share(wanted, share)
                     weight[k, c] += hat
-
-
-@njit(
-    "void(float64[:, ::1], float64[:, ::1], boolean[:, ::1], boolean[:, ::1], int64[::1], "
-    "float64[:, ::1])",
-    cache=True,
-    parallel=True,
-    error_model="numpy",
-)
-def _match_pixels(a: Any, b: Any, va: Any, vb: Any, half: Any, out: Any) -> None:
-    """Write what each pixel's own window makes of it, NaN where it is not valid or empty.
-
-    Parameters
-    ----------
-    a, b : (H, W) float64
-    va, vb : (H, W) bool
-    half : (R + 1,) int64
-    out : (H, W) float64, written
-    """
-    rows, columns = a.shape
-    for y in prange(rows):
-        for x in range(columns):
-            out[y, x] = np.nan
-            if not va[y, x]:
-                continue
-            wanted = np.sort(_gather(b, vb, half, y, x))
-            if wanted.size == 0:
-                continue
-            source = _gather(a, va, half, y, x)
-            below, same = 0, 0
-            for value in source:
-                below += value < a[y, x]
-                same += value == a[y, x]
-            out[y, x] = _at_share(wanted, (below + 0.5 * same) / source.size)

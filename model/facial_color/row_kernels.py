@@ -1,15 +1,13 @@
 """Sums of one row of discs by running sums, compiled."""
 
-from __future__ import annotations
-
-from typing import Any
+# mypy: allow-untyped-defs
 
 import numpy as np
 from numba import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
-def _add_run(t: Any, a: Any, left: Any, right: Any) -> None:
+def _add_run(t, a, left, right):
     """Add what lies between entries `left` and `right` of one row of prefix sums."""
     al, ar = a[left:], a[right:]
     for i in range(t.size):
@@ -17,10 +15,9 @@ def _add_run(t: Any, a: Any, left: Any, right: Any) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
-def _add_runs(
-    t: Any, a: Any, b: Any, c: Any, d: Any, left: Any, right: Any, left2: Any, right2: Any
-) -> None:
-    """Do the work of `_add_run` for rows `a` and `b`, and between others for `c` and `d`."""
+def _add_runs(t, a, b, c, d, width, w, v):
+    """Add runs of half-width `w` of rows `a` and `b`, and of half-width `v` of `c` and `d`."""
+    left, right, left2, right2 = width - w, width + w + 1, width - v, width + v + 1
     al, ar, bl, br = a[left:], a[right:], b[left:], b[right:]
     cl, cr, dl, dr = c[left2:], c[right2:], d[left2:], d[right2:]
     for i in range(t.size):
@@ -28,7 +25,7 @@ def _add_runs(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
-def _add_columns(t: Any, upper: Any, lower: Any, one: Any, other: Any) -> None:
+def _add_columns(t, upper, lower, one, other):
     """Add the columns' sums between two rows of prefix sums, of columns on both sides."""
     ul, ur, ll, lr = upper[one:], upper[other:], lower[one:], lower[other:]
     for i in range(t.size):
@@ -36,9 +33,7 @@ def _add_columns(t: Any, upper: Any, lower: Any, one: Any, other: Any) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
-def _add_column_pairs(
-    t: Any, upper: Any, lower: Any, upper2: Any, lower2: Any, one: Any, other: Any
-) -> None:
+def _add_column_pairs(t, upper, lower, upper2, lower2, one, other):
     """Do the work of `_add_columns`, and of the next columns outward between other rows."""
     ul, ur, ll, lr = upper[one:], upper[other:], lower[one:], lower[other:]
     vl, vr = upper2[one - 1 :], upper2[other + 1 :]
@@ -48,7 +43,7 @@ def _add_column_pairs(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
-def _move_square(square: Any, new: Any, old: Any, left: Any, right: Any) -> None:
+def _move_square(square, new, old, left, right):
     """Add a run of the row that a square reaches, take off that of the row that it leaves."""
     nl, nr, ol, orr = new[left:], new[right:], old[left:], old[right:]
     for i in range(square.size):
@@ -56,9 +51,7 @@ def _move_square(square: Any, new: Any, old: Any, left: Any, right: Any) -> None
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def disc_row(
-    t: Any, square: Any, p: Any, q: Any, half: Any, high: Any, inner: Any, rows: Any, y: Any
-) -> None:
+def disc_row(t, square, p, q, half, high, inner, rows, y):
     """Write the sums over the discs about one row of a tile.
 
     Parameters
@@ -94,18 +87,7 @@ def disc_row(
     while a <= reach:
         w = half[a]
         if a < reach and y - a - 1 >= 0 and y + a + 1 < rows:
-            v = half[a + 1]
-            _add_runs(
-                t,
-                p[y - a],
-                p[y + a],
-                p[y - a - 1],
-                p[y + a + 1],
-                width - w,
-                width + w + 1,
-                width - v,
-                width + v + 1,
-            )
+            _add_runs(t, p[y - a], p[y + a], p[y - a - 1], p[y + a + 1], width, w, half[a + 1])
             a += 2
             continue
         if y - a >= 0:
@@ -116,9 +98,7 @@ def disc_row(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def square_row(
-    square: Any, p: Any, nothing: Any, inner: Any, width: Any, rows: Any, y: Any, first: Any
-) -> None:
+def square_row(square, p, nothing, inner, width, rows, y, first):
     """Move the square's sums down to row `y`, or begin them there."""
     left, right = width - inner, width + inner + 1
     if first:

@@ -27,8 +27,7 @@ Keys 1981, Cubic convolution interpolation, IEEE Trans. ASSP 29(6). doi:10.1109/
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,19 +35,6 @@ from numpy.typing import ArrayLike
 from model.arrays import BoolArray, Float32Array, FloatArray, UInt8Array
 from model.microstructure import convolution_kernels as kernels
 from model.microstructure.map_windows import Window
-
-__all__ = [
-    "MAX_SIGMA_PX",
-    "Border",
-    "ConvolutionError",
-    "LineKernels",
-    "Sampling",
-    "Window",
-    "convolve",
-    "convolve_tiled",
-    "reach_of",
-    "tiles_of",
-]
 
 Sampling = Literal["cubic", "linear"]
 Border = Literal["mirror", "open"]
@@ -70,8 +56,7 @@ class ConvolutionError(ValueError):
     """Maps, kernels or settings that cannot be convolved."""
 
 
-@dataclass(frozen=True, slots=True)
-class LineKernels:
+class LineKernels(NamedTuple):
     """Kernels of one pass for a window of a map.
 
     Attributes
@@ -132,9 +117,7 @@ def reach_of(lines: LineKernels, shape: tuple[int, int], sampling: Sampling = "c
     ConvolutionError
         For parameters that are not finite or beyond their ranges, or axes that are no unit vectors.
     """
-    code, largest = kernels.check_rows(
-        lines.alpha, lines.sigma_px, lines.axis, *shape, np.float32(MAX_SIGMA_PX)
-    )
+    code, largest = kernels.check_rows(lines, shape[0], np.float32(MAX_SIGMA_PX))
     if code.any():
         row = int(np.flatnonzero(code)[0])
         raise ConvolutionError(f"alpha, sigma, axis: {_ERROR_TEXTS[int(code[row])]}, row {row}")
@@ -179,19 +162,8 @@ def _pass(
         inner = window.within(source_window)
         return source[inner.rows, inner.columns]
     out = np.empty(window.shape, source.dtype)
-    kernels.along_lines(
-        source,
-        clear,
-        np.array([source_window.top, source_window.left]),
-        np.array(shape),
-        lines.axis,
-        lines.alpha,
-        lines.sigma_px,
-        np.array([window.top, window.left]),
-        _INTERPOLATION_CODES[sampling],
-        _BORDER_CODES[border],
-        out,
-    )
+    reach, code = _INTERPOLATION_CODES[sampling], _BORDER_CODES[border]
+    kernels.along_lines(source, clear, source_window, shape, lines, window, reach, code, out)
     return out
 
 
@@ -384,8 +356,7 @@ def convolve_tiled(
 
 
 def _fits(lines: LineKernels, window: Window) -> None:
-    for name in ("axis", "alpha", "sigma_px"):
-        values = getattr(lines, name)
+    for name, values in lines._asdict().items():
         if values.shape[:2] not in (window.shape, (1, 1)) or values.dtype != np.float32:
             raise ConvolutionError(
                 f"fields_at: got {name} {values.dtype} {values.shape}, expected float32 "

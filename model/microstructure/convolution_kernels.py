@@ -4,10 +4,9 @@ Kernels are parallel over rows and called from one thread. None uses fast-math, 
 becomes depends neither on the number of threads nor on the window it is computed in.
 """
 
-from __future__ import annotations
+# mypy: allow-untyped-defs
 
 import math
-from typing import Any
 
 import numpy as np
 from numba import njit, prange
@@ -27,7 +26,7 @@ FINE, NOT_FINITE, ALPHA, SIGMA, AXIS = range(5)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def distance_to_invalid(valid: Any) -> Any:
+def distance_to_invalid(valid):
     """Return how many king's moves each pixel is from the nearest one that is not valid.
 
     Parameters
@@ -72,14 +71,14 @@ def distance_to_invalid(valid: Any) -> Any:
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def check_rows(alpha: Any, sigma: Any, axis: Any, rows: Any, columns: Any, most: Any) -> Any:
+def check_rows(lines, rows, most):
     """Return what is wrong with each row's parameters, and the largest sigma that is used there.
 
     Parameters
     ----------
-    alpha, sigma : (1 or rows, 1 or columns) float32
-    axis : (1 or rows, 1 or columns, 2) float32
-    rows, columns : int
+    lines : LineKernels
+    rows : int
+        Of the window.
     most : float
         Largest sigma allowed, px.
 
@@ -89,6 +88,8 @@ def check_rows(alpha: Any, sigma: Any, axis: Any, rows: Any, columns: Any, most:
     largest : (rows,) float64
         0 in rows where nothing is convolved.
     """
+    axis, alpha, sigma = lines
+    columns = max(alpha.shape[1], sigma.shape[1], axis.shape[1])
     code = np.zeros(rows, np.int64)
     largest = np.zeros(rows)
     ah, aw = alpha.shape[0] > 1, alpha.shape[1] > 1
@@ -118,7 +119,7 @@ def check_rows(alpha: Any, sigma: Any, axis: Any, rows: Any, columns: Any, most:
 
 
 @njit(inline="always")
-def _cubic(f):  # type: ignore[no-untyped-def]
+def _cubic(f):
     """Return Keys' weights (a = -1/2) of the pixels at -1, 0, 1, 2 for a sample at f."""
     f2 = f * f
     f3 = f2 * f
@@ -131,20 +132,19 @@ def _cubic(f):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _mirrored(i, n):  # type: ignore[no-untyped-def]
+def _mirrored(i, n):
     """Return the index within n that i comes to, mirrored about the edges of the end pixels."""
     j = i % (2 * n)
     return j if j < n else 2 * n - 1 - j
 
 
 @njit
-def _slow_sample(  # type: ignore[no-untyped-def]
-    source, clear, top, left, rows, columns, border, y, x, fy, fx, reach
-):
+def _slow_sample(source, clear, frame, y, x, fy, fx, reach):
     """Return a sample between the pixels y, y + 1 and x, x + 1 and whether all it needs is valid.
 
     `reach` pixels to each side are weighed; a weight of 0 needs nothing.
     """
+    top, left, rows, columns, border = frame
     nothing = source.dtype.type(0.0)
     total = nothing
     for l in range(1 - reach, reach + 1):  # noqa: E741
@@ -172,7 +172,7 @@ def _slow_sample(  # type: ignore[no-untyped-def]
 
 
 @njit
-def _tap(f, k, reach):  # type: ignore[no-untyped-def]
+def _tap(f, k, reach):
     if reach == LINEAR:
         return f if k == 1 else np.float32(1.0) - f
     a, b, c, d = _cubic(f)
@@ -184,19 +184,7 @@ def _tap(f, k, reach):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def along_lines(
-    source: Any,
-    clear: Any,
-    source_at: Any,
-    size: Any,
-    axis: Any,
-    alpha: Any,
-    sigma: Any,
-    out_at: Any,
-    reach: Any,
-    border: Any,
-    out: Any,
-) -> None:
+def along_lines(source, clear, seen, size, lines, window, reach, border, out):
     """Write ``h + alpha (G * h - h)`` with the Gaussian along each pixel's own line (eqs. 3 and 6).
 
     Two samples at the same distance to both sides are one pair; a pair of which one cannot be
@@ -208,30 +196,32 @@ def along_lines(
         A window of the map.
     clear : (h, w) uint8 or (0, 0)
         Of `distance_to_invalid` there; empty: all is valid.
-    source_at, out_at : (2,) int64
-        Row and column in the map of the windows' first pixels.
-    size : (2,) int64
+    seen, window : Window
+        Where source and output are in the map.
+    size : (int, int)
         Of the map.
-    axis, alpha, sigma : (m or 1, n or 1[, 2]) float32
-        Where the output is; unit vectors (right, down), strength, px.
+    lines : LineKernels
+        Where the output is.
     reach, border : int
         `LINEAR` or `CUBIC`; `MIRROR` or `OPEN`.
     out : (m, n) of the source's type, written
         Pixels that are not valid keep their value.
     """
-    rows, columns = size[0], size[1]
-    top, left = source_at[0], source_at[1]
+    rows, columns = size
+    top, left = seen.top, seen.left
+    axis, alpha, sigma = lines
     ah, aw = alpha.shape[0] > 1, alpha.shape[1] > 1
     sh, sw = sigma.shape[0] > 1, sigma.shape[1] > 1
     xh, xw = axis.shape[0] > 1, axis.shape[1] > 1
     masked = clear.size > 0
+    frame = (top, left, rows, columns, border)
     kind = source.dtype.type
     zero, one, two = kind(0.0), kind(1.0), kind(2.0)
     for row in prange(out.shape[0]):
-        gy = row + out_at[0]
+        gy = row + window.top
         y = gy - top
         for column in range(out.shape[1]):
-            gx = column + out_at[1]
+            gx = column + window.left
             x = gx - left
             own = source[y, x]
             out[row, column] = own
@@ -315,19 +305,10 @@ def along_lines(
                         for side in (1, -1):
                             dx, dy = side * i * ax, side * i * ay
                             bx, by = math.floor(dx), math.floor(dy)
+                            fy, fx = kind(dy - by), kind(dx - bx)
+                            at_y, at_x = gy + int(by), gx + int(bx)
                             value, there = _slow_sample(
-                                source,
-                                clear,
-                                top,
-                                left,
-                                rows,
-                                columns,
-                                border,
-                                gy + int(by),
-                                gx + int(bx),
-                                kind(dy - by),
-                                kind(dx - bx),
-                                finer,
+                                source, clear, frame, at_y, at_x, fy, fx, finer
                             )
                             pair += value
                             good = good and there

@@ -27,28 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float64Array
-from model.microstructure.convolution import ConvolutionError, convolve, convolve_tiled
 from model.microstructure.convolution_kernels import TRUNCATE_SIGMAS
-from model.microstructure.mesh_strain import MeshStrain, StrainError, strain
-
-__all__ = [
-    "ALPHA_LIMITS",
-    "FOREHEAD",
-    "TABLE_SCHEMA",
-    "TRUNCATE_SIGMAS",
-    "ConvolutionError",
-    "KernelPoints",
-    "KernelTable",
-    "KernelTableError",
-    "MeshStrain",
-    "StrainError",
-    "convolve",
-    "convolve_tiled",
-    "forehead_points",
-    "gaussian_weights",
-    "kernel_parameters",
-    "strain",
-]
 
 Line: TypeAlias = tuple[float, float]
 """Slope and intercept of a line over the stretch ratio."""

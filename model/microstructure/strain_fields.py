@@ -92,21 +92,11 @@ def rasterize(
     stretch = np.ones((*shape, 2), np.float32)
     axes = np.zeros((*shape, 2, 2), np.float32)
     scale = np.zeros((*shape, 2), np.float32)
-    texture_kernels.fill_texture(
-        triangles,
-        texture[:, 0] * width - 0.5,
-        (1.0 - texture[:, 1]) * height - 0.5,
-        np.concatenate([strain.tensor, strain.uv_metric], axis=1),
-        strain.valid,
-        around.top,
-        around.left,
-        float(width),
-        float(height),
-        state,
-        stretch,
-        axes,
-        scale,
-    )
+    places = (texture[:, 0] * width - 0.5, (1.0 - texture[:, 1]) * height - 0.5)
+    values = np.concatenate([strain.tensor, strain.uv_metric], axis=1)
+    found = (state, stretch, axes, scale)
+    size_px = (float(width), float(height))
+    texture_kernels.fill_texture(triangles, places, values, strain.valid, around, size_px, found)
     for _ in range(pad_px):
         texture_kernels.pad_once(state, state.copy(), stretch, axes, scale)
     inner = asked.within(around)

@@ -3,10 +3,9 @@
 Symmetric 2 x 2 tensors are three numbers (11, 12, 22).
 """
 
-from __future__ import annotations
+# mypy: allow-untyped-defs
 
 import math
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -20,22 +19,22 @@ FINE, DEGENERATE, NO_TEXTURE, TURNED = range(4)
 
 
 @njit(inline="always")
-def _cross(a, b):  # type: ignore[no-untyped-def]
+def _cross(a, b):
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 @njit(inline="always")
-def _dot(a, b):  # type: ignore[no-untyped-def]
+def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @njit(inline="always")
-def _edge(points, i, j):  # type: ignore[no-untyped-def]
+def _edge(points, i, j):
     return (points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2])
 
 
 @njit(inline="always")
-def principal(p, q, r):  # type: ignore[no-untyped-def]
+def principal(p, q, r):
     """Return mean and half the difference of the eigenvalues of (p, q, r), and the larger's axis.
 
     The axis is the first one where there is no difference.
@@ -53,7 +52,7 @@ def principal(p, q, r):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def triangle_strain(rest: Any, moved: Any, faces: Any, uv: Any) -> Any:
+def triangle_strain(rest, moved, faces, uv):
     """Return what each triangle does, in its own plane.
 
     Parameters
@@ -139,7 +138,7 @@ def triangle_strain(rest: Any, moved: Any, faces: Any, uv: Any) -> Any:
 
 
 @njit(inline="always")
-def _carried(basis, normal):  # type: ignore[no-untyped-def]
+def _carried(basis, normal):
     """Return a triangle's axes turned by the shortest way into the plane across `normal`."""
     n = (basis[2, 0], basis[2, 1], basis[2, 2])
     c = _dot(n, normal)
@@ -154,9 +153,7 @@ def _carried(basis, normal):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def vertex_strain(
-    faces: Any, place: Any, places: Any, kind: Any, basis: Any, area: Any, change: Any, to_uv: Any
-) -> Any:
+def vertex_strain(faces, place, places, kind, basis, area, change, to_uv):
     """Average triangles at vertices, weighed by their rest areas.
 
     Parameters

@@ -1,9 +1,8 @@
 """Strain of vertices drawn into a texture, compiled."""
 
-from __future__ import annotations
+# mypy: allow-untyped-defs
 
 import math
-from typing import Any
 
 import numpy as np
 from numba import njit, prange
@@ -17,21 +16,7 @@ EMPTY, COVERED, PADDED = range(3)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def fill_texture(
-    faces: Any,
-    x: Any,
-    y: Any,
-    values: Any,
-    valid: Any,
-    top: Any,
-    left: Any,
-    width: Any,
-    height: Any,
-    state: Any,
-    stretch: Any,
-    axes: Any,
-    scale: Any,
-) -> None:
+def fill_texture(faces, places, values, valid, window, size, found):
     """Fill a window of a texture: tensors between vertices, their principal axes at each pixel.
 
     The triangle of the lowest number has a pixel that several hold. What a pixel becomes does
@@ -40,23 +25,22 @@ def fill_texture(
     Parameters
     ----------
     faces : (F, 3) int64
-    x, y : (V,) float64
-        Vertices in pixels of the whole texture, y down.
+    places : two (V,) float64
+        x and y of the vertices in pixels of the whole texture, y down.
     values : (V, 6) float64
         T - 1 and the metric, texture per length.
     valid : (V,) bool
-    top, left : int
-        First row and column of the window.
-    width, height : float
+    window : Window
+    size : (float, float)
         Pixels per unit of the texture's u and v.
-    state : (m, n) uint8, of 0
-    stretch : (m, n, 2) float32
-        r_s, r_t.
-    axes : (m, n, 2, 2) float32
-        Unit vectors (right, down) of s and t.
-    scale : (m, n, 2) float32
-        Pixels per length along s and t.
+    found
+        Written: state, (m, n) uint8, of 0; r_s and r_t, (m, n, 2) float32; unit vectors (right,
+        down) of s and t, (m, n, 2, 2) float32; pixels per length along s and t, (m, n, 2) float32.
     """
+    x, y = places
+    top, left = window.top, window.left
+    width, height = size
+    state, stretch, axes, scale = found
     rows, columns = state.shape
     bands = (rows + BAND_ROWS - 1) // BAND_ROWS
     for band in prange(bands):
@@ -130,7 +114,7 @@ def fill_texture(
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def pad_once(state: Any, before: Any, stretch: Any, axes: Any, scale: Any) -> None:
+def pad_once(state, before, stretch, axes, scale):
     """Give empty pixels the values of a neighbour that had some; `before` is a copy of `state`."""
     rows, columns = state.shape
     for r in prange(rows):
@@ -153,18 +137,7 @@ def pad_once(state: Any, before: Any, stretch: Any, axes: Any, scale: Any) -> No
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def look_up(
-    stretch: Any,
-    state: Any,
-    breaks: Any,
-    alpha_lines: Any,
-    sigma_lines: Any,
-    ends: Any,
-    limits: Any,
-    scale: Any,
-    alpha: Any,
-    sigma: Any,
-) -> None:
+def look_up(stretch, state, breaks, alpha_lines, sigma_lines, ends, limits, scale, alpha, sigma):
     """Write strength and sigma in pixels for each pixel's two stretch ratios (eqs. 8 and 9).
 
     Parameters

@@ -1,6 +1,6 @@
 """The compiled evaluation of the photon table (see `model.photon_table`)."""
 
-from __future__ import annotations
+# mypy: allow-untyped-defs
 
 from math import exp, log, log1p, sqrt
 
@@ -12,16 +12,17 @@ ROOT_SCALE, ROOT_STEP, ROOT_COUNT = 0.1, log(41.0) / 24.0, 27
 """The same over ln(1 + u/0.1) with u = sqrt(sigma_a/sigma_s') in [0, 4]."""
 ROOT_END = 4.0
 _READ_1, _READ_2 = (types.Array(types.float64, n, "C", readonly=True) for n in (1, 2))
-_READ_INTEGERS_1, _READ_INTEGERS_2 = (
-    types.Array(types.int64, n, "C", readonly=True) for n in (1, 2)
+_COEFFICIENT_TYPES = (_READ_1, _READ_1, _READ_2, _READ_1)
+_RULE_TYPES = (
+    *(types.Array(types.int64, n, "C", readonly=True) for n in (2, 1)),
+    *(_READ_1, _READ_1),
 )
-_ROWS_TYPE = types.float64[:, ::1]
 _MAX_ROOT = 1e6  # exp(-u^2) is 0 long before, and u^4 still a number
 _ROOT_FLOOR = 1e-6  # slopes by sigma_a at 0 are limits; here they are reached to 1e-12
 
 
 @njit(inline="always")
-def _basis(t):  # type: ignore[no-untyped-def]
+def _basis(t):
     """Return the four uniform cubic B-splines at t in [0, 1] of their interval, and slopes."""
     s = 1.0 - t
     t2, s2 = t * t, s * s
@@ -38,35 +39,13 @@ def _basis(t):  # type: ignore[no-untyped-def]
 
 
 @njit(
-    types.void(
-        _READ_1,
-        _READ_1,
-        _READ_2,
-        _READ_1,
-        _READ_INTEGERS_2,
-        _READ_INTEGERS_1,
-        _READ_1,
-        _READ_1,
-        _ROWS_TYPE,
-        _ROWS_TYPE,
-        _ROWS_TYPE,
-    ),
+    types.void(*_COEFFICIENT_TYPES, *_RULE_TYPES, types.float64[:, :, ::1]),
     cache=True,
     nogil=True,
     error_model="numpy",
 )
-def evaluate(  # type: ignore[no-untyped-def]
-    sigma_a,
-    sigma_s_prime,
-    coefficients,
-    decay,
-    groups,
-    starts,
-    log_distance,
-    weight,
-    out,
-    out_by_a,
-    out_by_s,
+def evaluate(
+    sigma_a, sigma_s_prime, coefficients, decay, groups, starts, log_distance, weight, out
 ):
     """Evaluate profiles and their slopes by both coefficients.
 
@@ -83,10 +62,10 @@ def evaluate(  # type: ignore[no-untyped-def]
     starts, log_distance, weight
         Radius k is averaged over the distances starts[k] to starts[k + 1]: logarithms of mm, and
         weights.
-    out, out_by_a, out_by_s
-        1/mm^2, 1/mm, 1/mm, shape (N, F), written.
+    out
+        1/mm^2, 1/mm, 1/mm, shape (3, N, F), written.
     """
-    n_rows, n_columns = out.shape
+    _, n_rows, n_columns = out.shape
     row = coefficients.shape[0]
     along = [0.0] * row
     along_slope = [0.0] * row
@@ -96,7 +75,7 @@ def evaluate(  # type: ignore[no-untyped-def]
         u = max(sqrt(sigma_a[n] / s), _ROOT_FLOOR)
         if u > _MAX_ROOT:
             for f in range(n_columns):
-                out[n, f] = out_by_a[n, f] = out_by_s[n, f] = 0.0
+                out[0, n, f] = out[1, n, f] = out[2, n, f] = 0.0
             continue
         inside = u <= ROOT_END
         u_in = u if inside else ROOT_END
@@ -164,6 +143,6 @@ def evaluate(  # type: ignore[no-untyped-def]
                 total += reduced
                 by_a += reduced * by_log_a
                 by_s += reduced * by_log_rho
-            out[n, f] = s * s * total
-            out_by_a[n, f] = s * by_a
-            out_by_s[n, f] = s * (2.0 * total + by_s - a * by_a)
+            out[0, n, f] = s * s * total
+            out[1, n, f] = s * by_a
+            out[2, n, f] = s * (2.0 * total + by_s - a * by_a)

@@ -14,6 +14,8 @@ far away. tools/make_photon_table.py makes model/data/photon_table.npz and says 
 
 from __future__ import annotations
 
+from typing import TypedDict, Unpack
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import RectBivariateSpline
@@ -22,18 +24,7 @@ from model.arrays import BoolArray, Float64Array
 from model.dipole.kienle_patterson import Slopes
 from model.photon_table import kernels
 from model.photon_table.disc_distances import distance_rules
-from model.photon_table.medium import Collection, TableDomainError, asymmetries, prepare
-
-__all__ = [
-    "Slopes",
-    "TableDomainError",
-    "asymmetries",
-    "by_asymmetry",
-    "derivatives",
-    "domain",
-    "reflectance",
-    "relative_error",
-]
+from model.photon_table.medium import Collection, prepare
 
 NUMERICAL_APERTURE = 0.22
 """Of the source and of the detectors in the collection "fibre", in air."""
@@ -47,16 +38,21 @@ MAX_RELATIVE_ERROR = 0.03
 """Standard error of the table itself, relative, up to which a point is in the domain."""
 
 
+class Optics(TypedDict, total=False):
+    """What `reflectance` and `derivatives` assume of skin and fibers."""
+
+    eta: float
+    g: float
+    collection: Collection
+    core_mm: float
+    source_core_mm: float
+
+
 def reflectance(
     radius_mm: ArrayLike,
     sigma_a_per_mm: ArrayLike,
     sigma_s_prime_per_mm: ArrayLike,
-    *,
-    eta: float = 1.4,
-    g: float = 0.8,
-    collection: Collection = "all",
-    core_mm: float = 0.0,
-    source_core_mm: float = 0.0,
+    **optics: Unpack[Optics],
 ) -> Float64Array:
     """Return the reflectance per area at a distance from the source.
 
@@ -99,16 +95,8 @@ def reflectance(
     >>> reflectance(radius, 0.05, 1.5, collection="fibre", core_mm=0.2, source_core_mm=0.2).shape
     (3,)
     """
-    return derivatives(
-        radius_mm,
-        sigma_a_per_mm,
-        sigma_s_prime_per_mm,
-        eta=eta,
-        g=g,
-        collection=collection,
-        core_mm=core_mm,
-        source_core_mm=source_core_mm,
-    ).reflectance_per_mm2
+    slopes = derivatives(radius_mm, sigma_a_per_mm, sigma_s_prime_per_mm, **optics)
+    return slopes.reflectance_per_mm2
 
 
 def derivatives(
@@ -173,52 +161,10 @@ def derivatives(
         starts,
         log_distance,
         weight,
-        out[0],
-        out[1],
-        out[2],
+        out,
     )
     out[:, ~scatters] = 0.0
     return Slopes(*(part.reshape(shape) for part in out))
-
-
-def by_asymmetry(
-    radius_mm: ArrayLike,
-    sigma_a_per_mm: ArrayLike,
-    sigma_s_prime_per_mm: ArrayLike,
-    *,
-    eta: float = 1.4,
-    g: float = 0.8,
-    collection: Collection = "all",
-    core_mm: float = 0.0,
-    source_core_mm: float = 0.0,
-    step: float = 0.05,
-) -> Float64Array:
-    """Return dR/dg, 1/mm^2, at constant sigma_s': a difference over 2 `step` (one-sided at ends).
-
-    Other parameters and errors as :func:`reflectance`.
-
-    Examples
-    --------
-    >>> slope = by_asymmetry([0.5, 20.0], 0.0, 1.0)
-    >>> bool(abs(slope[1]) < 0.1 * abs(slope[0]))
-    True
-    """
-    held = asymmetries()
-    low, high = max(g - step, held[0]), min(g + step, held[-1])
-    first, second = (
-        reflectance(
-            radius_mm,
-            sigma_a_per_mm,
-            sigma_s_prime_per_mm,
-            eta=eta,
-            g=value,
-            collection=collection,
-            core_mm=core_mm,
-            source_core_mm=source_core_mm,
-        )
-        for value in (low, high)
-    )
-    return np.asarray((second - first) / (high - low))
 
 
 def relative_error(

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypedDict, TypeVar, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,6 +30,9 @@ from model.texture_statistics.steerable_pyramid import Responses, thread_count
 
 Weights = tuple[FloatArray, tuple[FloatArray, ...]] | None
 T = TypeVar("T")
+MATCH_TOL = 1e-4
+"""A response no farther from its target, in spreads, is left alone: rounding would only shuffle
+its rare values."""
 _MIN_PARALLEL_PIXELS = 128 * 128
 
 
@@ -74,14 +77,16 @@ class MatchedTexture:
         return self.distances[-1]
 
 
-def describe(
-    image: ArrayLike,
-    *,
-    space: TextureSpace | None = None,
-    valid: BoolArray | None = None,
-    region: ArrayLike | None = None,
-    workers: int | None = None,
-) -> Float64Array:
+class Sampled(TypedDict, total=False):
+    """What of an image is described, and in which space."""
+
+    space: TextureSpace | None
+    valid: BoolArray | None
+    region: ArrayLike | None
+    workers: int | None
+
+
+def describe(image: ArrayLike, **sampled: Unpack[Sampled]) -> Float64Array:
     """Return the statistics of a texture as a row vector, (23808,) for RGB.
 
     The vector of `statistics`, with its parameters.
@@ -92,7 +97,7 @@ def describe(
     >>> vector.shape, round(float(vector.sum()), 6)
     ((23808,), 93.0)
     """
-    return statistics(image, space=space, valid=valid, region=region, workers=workers).vector
+    return statistics(image, **sampled).vector
 
 
 def statistics(
@@ -159,7 +164,6 @@ def match(
     target_valid: BoolArray | None = None,
     target_region: ArrayLike | None = None,
     start: Literal["image", "noise"] = "image",
-    tolerance: float = 1e-4,
     rng: np.random.Generator | None = None,
     workers: int | None = None,
 ) -> MatchedTexture:
@@ -184,9 +188,6 @@ def match(
         The same for a target image.
     start : {"image", "noise"}
         From the source, or from white noise with the mean and deviation of the target.
-    tolerance : float
-        A response no farther from its target, in spreads, is left alone: rounding would only
-        shuffle its rare values.
     rng : numpy.random.Generator or None
         Needed for noise.
     workers : int or None
@@ -212,11 +213,8 @@ def match(
     True
     """
     colors, mask = checked_image(image, valid)
-    if iterations < 0 or not (np.isfinite(noise) and noise >= 0.0 and tolerance >= 0.0):
-        raise TextureError(
-            f"iterations, noise, tolerance: got {iterations}, {noise}, {tolerance}, expected at "
-            "least 0"
-        )
+    if iterations < 0 or not (np.isfinite(noise) and noise >= 0.0):
+        raise TextureError(f"iterations, noise: got {iterations}, {noise}, expected at least 0")
     if start not in ("image", "noise"):
         raise TextureError(f'start: got {start!r}, expected "image" or "noise"')
     if (noise > 0.0 or start == "noise") and rng is None:
@@ -258,7 +256,7 @@ def match(
                 distances[iteration, c] = distance(shares, wanted[c], used.edges[c])
                 if iteration == iterations:
                     break
-                far = distances[iteration, c] > tolerance
+                far = distances[iteration, c] > MATCH_TOL
                 if far[1:].any():
                     _move(pool, pyramid, counted, bins, wanted[c], far)
                     now = steerable_pyramid.synthesize(pyramid, workers=workers)

@@ -1,8 +1,6 @@
 """Loops over the values of one response: counting them in bins, moving them to other ranks."""
 
-from __future__ import annotations
-
-from typing import Any
+# mypy: allow-untyped-defs
 
 import numpy as np
 from numba import njit
@@ -14,7 +12,7 @@ SHARE_TOL = 1e-12
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def bound_bins(edges: Any, count: int, scale: float, least: Any, most: Any) -> None:
+def bound_bins(edges, count, scale, least, most):
     """Bound the bin of all values in each cell.
 
     Parameters
@@ -36,7 +34,7 @@ def bound_bins(edges: Any, count: int, scale: float, least: Any, most: Any) -> N
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def find(x: float, edges: Any, scale: float, least: Any, most: Any) -> int:
+def find(x, edges, scale, least, most):
     """Return which edge is the last at or below ``x``; the first if none is.
 
     Parameters as of `bound_bins`.
@@ -55,7 +53,7 @@ def find(x: float, edges: Any, scale: float, least: Any, most: Any) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def count(values: Any, edges: Any, scale: float, least: Any, most: Any, sums: Any) -> Any:
+def count(values, edges, scale, least, most, sums):
     """Count values in bins; the end bins take what lies beyond.
 
     Parameters
@@ -83,9 +81,7 @@ def count(values: Any, edges: Any, scale: float, least: Any, most: Any, sums: An
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def count_weighted(
-    values: Any, weights: Any, edges: Any, scale: float, least: Any, most: Any, sums: Any
-) -> Any:
+def count_weighted(values, weights, edges, scale, least, most, sums):
     """Add the weights of values to their bins; values of weight 0 are no values.
 
     Parameters as of `count`; ``weights`` is (n,) float. Returns weights below and above, least
@@ -108,7 +104,7 @@ def count_weighted(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def plan(source: Any, target: Any, edges: Any, begin: Any, end: Any, to: Any, slope: Any) -> int:
+def plan(source, target, edges, begin, end, to, slope):
     """Lay out the rising, piecewise straight map from one distribution to another.
 
     Parameters
@@ -153,7 +149,7 @@ def plan(source: Any, target: Any, edges: Any, begin: Any, end: Any, to: Any, sl
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def move(values: Any, source: Any, target: Any, edges: Any, out: Any) -> None:
+def move(values, source, target, edges, out):
     """Write each value's counterpart of the same rank under the target's distribution.
 
     Parameters

@@ -1,25 +1,12 @@
 """Loops of the steerable pyramid over half spectra, several orientations in one pass."""
 
-from __future__ import annotations
-
-from typing import Any
+# mypy: allow-untyped-defs
 
 from numba import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def split(
-    spectrum: Any,
-    rows: Any,
-    weight: Any,
-    fy: Any,
-    fx: Any,
-    toward: Any,
-    factor: Any,
-    out: Any,
-    begin: int,
-    end: int,
-) -> None:
+def split(spectrum, rows, weight, fy, fx, toward, factor, out, begin, end):
     """Cut the orientations of one level out of a spectrum.
 
     Parameters
@@ -51,18 +38,7 @@ def split(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def merge(
-    bands: Any,
-    rows: Any,
-    weight: Any,
-    fy: Any,
-    fx: Any,
-    toward: Any,
-    factor: Any,
-    spectrum: Any,
-    begin: int,
-    end: int,
-) -> None:
+def merge(bands, rows, weight, fy, fx, toward, factor, spectrum, begin, end):
     """Add the filtered orientations of one level to a spectrum: the adjoint of `split`.
 
     Parameters as of `split`; ``spectrum`` is added to, ``bands`` is read.

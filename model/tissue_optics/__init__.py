@@ -1,17 +1,7 @@
 """Tissue optics: absorption of chromophores and reflectance of layered skin."""
 
-from model.tissue_optics.layers import (
-    TissueError,
-    blood_absorption,
-    layer_stack_reflectance,
-    skin_layers,
-    two_layer_reflectance,
-)
-
-__all__ = [
-    "TissueError",
-    "blood_absorption",
-    "layer_stack_reflectance",
-    "skin_layers",
-    "two_layer_reflectance",
-]
+from model.tissue_optics.layers import TissueError as TissueError
+from model.tissue_optics.layers import blood_absorption as blood_absorption
+from model.tissue_optics.layers import layer_stack_reflectance as layer_stack_reflectance
+from model.tissue_optics.layers import skin_layers as skin_layers
+from model.tissue_optics.layers import two_layer_reflectance as two_layer_reflectance

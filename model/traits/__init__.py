@@ -1,5 +1,5 @@
 """Trait spaces: reduced spaces, trait vectors and edits."""
 
-from model.traits.space import EditOutcome, TraitSpace, cosine
-
-__all__ = ["EditOutcome", "TraitSpace", "cosine"]
+from model.traits.space import EditOutcome as EditOutcome
+from model.traits.space import TraitSpace as TraitSpace
+from model.traits.space import cosine as cosine

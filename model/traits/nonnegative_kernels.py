@@ -4,6 +4,8 @@ Active sets through the materials' matrix of products (Lawson and Hanson 1974, S
 Problems, chapter 23), started from the shares that are positive.
 """
 
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import math
@@ -49,7 +51,7 @@ def nearest(gram: Float64Array, wanted: Float64Array) -> Float64Array:
 
 
 @njit(cache=True, nogil=True)
-def _factor(gram, active, used, low):  # type: ignore[no-untyped-def]
+def _factor(gram, active, used, low):
     """Fill the Cholesky factor of the active rows; return the first dependent one, or -1."""
     for i in range(used):
         for j in range(i + 1):
@@ -66,7 +68,7 @@ def _factor(gram, active, used, low):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _back(low, used, y):  # type: ignore[no-untyped-def]
+def _back(low, used, y):
     """Solve low low' y = y in place."""
     for i in range(used):
         for k in range(i):
@@ -79,7 +81,7 @@ def _back(low, used, y):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _one(gram, t, x, rhs, active, low, y, refused):  # type: ignore[no-untyped-def]
+def _one(gram, t, x, rhs, active, low, y, refused):
     size = len(t)
     norm = 0.0
     for p in range(size):
@@ -140,7 +142,7 @@ def _one(gram, t, x, rhs, active, low, y, refused):  # type: ignore[no-untyped-d
 
 
 @njit(parallel=True, cache=True)
-def _nearest(gram, rows):  # type: ignore[no-untyped-def]
+def _nearest(gram, rows):
     count, size = rows.shape
     for block in prange((count + BLOCK_ROWS - 1) // BLOCK_ROWS):
         x, rhs, y = np.empty(size), np.empty(size), np.empty(size)

@@ -29,6 +29,8 @@ Source = Literal["simulated", "measured"]
 
 SCHEMA = "skinrig.traits/1"
 PACKAGED_FILE = "trait_space.npz"
+_SPACE_KEYS = ("kind", "samples", "lost", "seed")
+_TRAIT_KEYS = ("name", "kind", "members", "others")
 SCALE_BLOCK = 256
 """Numbers that share one scale in 8 bits."""
 _MIN_REDUCED_LENGTH = 1024  # samples at least so long are stored in fewer bits
@@ -209,21 +211,15 @@ def _packed(
         miss = float(reduced_spaces.lengths(gap, space.metric))
         errors[name] = miss / size if size > 0.0 else 0.0
     return {
-        "kind": space.kind,
+        **{key: getattr(space, key) for key in _SPACE_KEYS},
         "feasible": space.feasible.document(),
-        "samples": space.samples,
-        "lost": space.lost,
-        "seed": space.seed,
         "names": list(space.names),
         "notes": dict(space.notes),
         "precision": precision,
         "storage_error": errors,
         "traits": [
             {
-                "name": t.name,
-                "kind": t.kind,
-                "members": t.members,
-                "others": t.others,
+                **{key: getattr(t, key) for key in _TRAIT_KEYS},
                 "p_value": t.confidence.p_value,
                 "expected_cosine": t.confidence.expected_cosine,
                 "bootstrap_cosine": list(t.confidence.bootstrap_cosine),
@@ -254,13 +250,10 @@ def _unpacked(
         noise = one["relative_noise"]
         low, middle, high = one["bootstrap_cosine"]
         traits[one["name"]] = TraitVector(
-            name=one["name"],
-            kind=one["kind"],
+            **{key: one[key] for key in _TRAIT_KEYS},
             vector=vectors[k],
             stderr=stderr[k],
             coordinates=coordinates[k],
-            members=one["members"],
-            others=one["others"],
             confidence=Confidence(
                 one["p_value"],
                 one["expected_cosine"],
@@ -272,15 +265,12 @@ def _unpacked(
         )
     metric = arrays.get(prefix + "metric")
     return TraitSpace(
-        kind=entry["kind"],
+        **{key: entry[key] for key in _SPACE_KEYS},
         center=center,
         basis=basis,
         traits=traits,
         feasible=feasible,
         metric=None if metric is None else np.asarray(metric, np.float64),
-        samples=entry["samples"],
-        lost=entry["lost"],
-        seed=entry["seed"],
         names=tuple(entry["names"]),
         notes=entry["notes"],
         storage_error=entry["storage_error"],

@@ -1,40 +1,21 @@
 """Wrinkles as signed blends of partial-derivative normal maps."""
 
-from model.wrinkles.expressions import JIMENEZ2011_TABLE, ZONE_SUM_LIMITS, WrinkleError
-from model.wrinkles.masks import Masks, mask_stack, mask_textures, zone_strength
-from model.wrinkles.partial_derivatives import (
-    MAX_DERIVATIVE,
-    ZONE_NAMES,
-    Encoding,
-    Layer,
-    combine,
-    combine_layers,
-    decode,
-    encode,
-    encoding_report,
-    from_unit,
-    to_unit,
-    widened,
-)
-
-__all__ = [
-    "JIMENEZ2011_TABLE",
-    "MAX_DERIVATIVE",
-    "ZONE_NAMES",
-    "ZONE_SUM_LIMITS",
-    "Encoding",
-    "Layer",
-    "Masks",
-    "WrinkleError",
-    "combine",
-    "combine_layers",
-    "decode",
-    "encode",
-    "encoding_report",
-    "from_unit",
-    "mask_stack",
-    "mask_textures",
-    "to_unit",
-    "widened",
-    "zone_strength",
-]
+from model.wrinkles.expressions import JIMENEZ2011_TABLE as JIMENEZ2011_TABLE
+from model.wrinkles.expressions import ZONE_SUM_LIMITS as ZONE_SUM_LIMITS
+from model.wrinkles.expressions import WrinkleError as WrinkleError
+from model.wrinkles.masks import Masks as Masks
+from model.wrinkles.masks import mask_stack as mask_stack
+from model.wrinkles.masks import mask_textures as mask_textures
+from model.wrinkles.masks import zone_strength as zone_strength
+from model.wrinkles.partial_derivatives import MAX_DERIVATIVE as MAX_DERIVATIVE
+from model.wrinkles.partial_derivatives import ZONE_NAMES as ZONE_NAMES
+from model.wrinkles.partial_derivatives import Encoding as Encoding
+from model.wrinkles.partial_derivatives import Layer as Layer
+from model.wrinkles.partial_derivatives import combine as combine
+from model.wrinkles.partial_derivatives import combine_layers as combine_layers
+from model.wrinkles.partial_derivatives import decode as decode
+from model.wrinkles.partial_derivatives import encode as encode
+from model.wrinkles.partial_derivatives import encoding_report as encoding_report
+from model.wrinkles.partial_derivatives import from_unit as from_unit
+from model.wrinkles.partial_derivatives import to_unit as to_unit
+from model.wrinkles.partial_derivatives import widened as widened

@@ -29,7 +29,7 @@ from model.wrinkles.expressions import (
     clamped,
     zone_sums,
 )
-from model.wrinkles.masks import Masks
+from model.wrinkles.masks import Masks, mask_stack, zone_strength
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +112,7 @@ def combine(
     d = wrinkles.from_unit(_normals("difference", given))
     if not np.isfinite(d).all():
         raise WrinkleError("difference: got NaN or infinity, expected values in [0, 1]")
-    stack = wrinkles.mask_stack(masks)
+    stack = mask_stack(masks)
     sums = clamped(zone_sums(weights, table), clamp)
     shape = (normals.shape[0], normals.shape[1])
     out = np.empty_like(normals)
@@ -120,7 +120,7 @@ def combine(
         kernels.add_difference(
             normals,
             *wrinkles.widened(np.moveaxis(d, 2, 0), shape, normals.dtype),
-            *wrinkles.widened(wrinkles.zone_strength(stack, sums)[None], shape, normals.dtype),
+            *wrinkles.widened(zone_strength(stack, sums)[None], shape, normals.dtype),
             int(renormalize),
             out,
         )

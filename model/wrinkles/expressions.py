@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import csv
 import difflib
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -101,16 +100,6 @@ class ExpressionTable:
                 f"expression: got {expression!r}, expected one of {', '.join(self.rows)}{hint}"
             )
         return np.array(self.rows[expression])
-
-    def to_csv(self) -> str:
-        """Return the table as text that :func:`read_table` reads."""
-        out = io.StringIO()
-        for line in self.source.splitlines():
-            out.write(f"# {line}\n")
-        writer = csv.writer(out, lineterminator="\n")
-        writer.writerow(["expression", *self.zones])
-        writer.writerows([name, *map(repr, row)] for name, row in self.rows.items())
-        return out.getvalue()
 
 
 def read_table(text: str) -> ExpressionTable:

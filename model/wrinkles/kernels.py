@@ -4,12 +4,13 @@ Textures are widened to the base's columns beforehand, so that the inner loop on
 rows of each and runs without look-ups. Kernels are parallel over rows and called from one thread.
 """
 
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from math import sqrt
-from typing import Any
 
 import numba
 import numpy as np
@@ -32,9 +33,7 @@ def threads_for(pixels: int) -> Iterator[None]:
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def add(
-    total: Any, wx: Any, wy: Any, w_rows: Any, w_part: Any, a: Any, a_rows: Any, a_part: Any
-) -> None:
+def add(total, wx, wy, w_rows, w_part, a, a_rows, a_part):
     """Add a wrinkle map times its strength to derivatives in place.
 
     Parameters
@@ -60,17 +59,7 @@ def add(
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def add_and_normalize(
-    base: Any,
-    wx: Any,
-    wy: Any,
-    w_rows: Any,
-    w_part: Any,
-    a: Any,
-    a_rows: Any,
-    a_part: Any,
-    normals: Any,
-) -> None:
+def add_and_normalize(base, wx, wy, w_rows, w_part, a, a_rows, a_part, normals):
     """Write unit normals of the base's derivatives plus a wrinkle map times its strength.
 
     Parameters as of :func:`add`; `normals` (H, W, 3) is written, 0 where a derivative is not
@@ -95,19 +84,7 @@ def add_and_normalize(
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def add_difference(
-    base: Any,
-    dx: Any,
-    dy: Any,
-    dz: Any,
-    d_rows: Any,
-    d_part: Any,
-    a: Any,
-    a_rows: Any,
-    a_part: Any,
-    renormalize: Any,
-    normals: Any,
-) -> None:
+def add_difference(base, dx, dy, dz, d_rows, d_part, a, a_rows, a_part, renormalize, normals):
     """Write normals of a base (H, W, 3) plus a difference of normals times its strength.
 
     Parameters as of :func:`add`, with three planes of the difference; `renormalize` is 0 or 1.

@@ -33,7 +33,6 @@ from model.vectors import unit_vectors
 from model.wrinkles import kernels
 from model.wrinkles.expressions import (
     JIMENEZ2011_TABLE,
-    ZONE_SUM_LIMITS,
     Clamp,
     Table,
     Weights,
@@ -41,33 +40,11 @@ from model.wrinkles.expressions import (
     clamped,
     zone_sums,
 )
-from model.wrinkles.masks import Masks, mask_stack, mask_textures, real_array, zone_strength
+from model.wrinkles.masks import Masks, mask_stack, real_array, zone_strength
 
 ZONE_NAMES = JIMENEZ2011_TABLE.zones
 MAX_DERIVATIVE = 1.0
 """Largest derivative that a texture of [0, 1] holds: slopes of 45 degrees along x and y."""
-
-__all__ = [
-    "JIMENEZ2011_TABLE",
-    "MAX_DERIVATIVE",
-    "ZONE_NAMES",
-    "ZONE_SUM_LIMITS",
-    "Encoding",
-    "Layer",
-    "Masks",
-    "WrinkleError",
-    "combine",
-    "combine_layers",
-    "decode",
-    "encode",
-    "encoding_report",
-    "from_unit",
-    "mask_stack",
-    "mask_textures",
-    "to_unit",
-    "widened",
-    "zone_strength",
-]
 
 
 @dataclass(frozen=True, slots=True)

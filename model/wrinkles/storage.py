@@ -16,20 +16,18 @@ GPU Pro 2, chapter 1 (section 1.3). ISBN 978-1-56881-718-7
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal, TypeAlias
 
 import numpy as np
 
-from model import metrics
-from model.arrays import BoolArray, FloatArray
-from model.texture_resampling import resampled
+from model.arrays import FloatArray
 from model.wrinkles import block_compression as blocks
 from model.wrinkles import partial_derivatives as wrinkles
-from model.wrinkles.expressions import Clamp, Weights, WrinkleError
-from model.wrinkles.partial_derivatives import Layer
+from model.wrinkles.expressions import WrinkleError
+from model.wrinkles.masks import Masks, mask_stack, mask_textures
 
 MapEncoding: TypeAlias = Literal["float32", "float16", "unit8", "bc5"]
 MaskEncoding: TypeAlias = Literal["float32", "float16", "unit8", "bc3"]
@@ -75,24 +73,6 @@ def texture_bytes(shape: tuple[int, int], bytes_per_texel: int, *, in_blocks: bo
         rows, columns = blocks.blocks_of(shape)
         h, w = rows * blocks.BLOCK_SIDE, columns * blocks.BLOCK_SIDE
     return h * w * bytes_per_texel
-
-
-def mip_chain_bytes(
-    shape: tuple[int, int], bytes_per_texel: int, *, in_blocks: bool = False
-) -> int:
-    """Return the bytes of all levels down to 1 x 1, each half of the one before, rounded down.
-
-    Examples
-    --------
-    >>> mip_chain_bytes((256, 256), 1, in_blocks=True), mip_chain_bytes((4, 2), 4)
-    (87408, 44)
-    """
-    h, w = shape
-    total = texture_bytes((h, w), bytes_per_texel, in_blocks=in_blocks)
-    while h > 1 or w > 1:
-        h, w = max(h // 2, 1), max(w // 2, 1)
-        total += texture_bytes((h, w), bytes_per_texel, in_blocks=in_blocks)
-    return total
 
 
 def footprint(
@@ -172,7 +152,7 @@ def stored_map(derivatives: FloatArray, encoding: MapEncoding) -> FloatArray:
     return d.astype(np.float32)
 
 
-def stored_masks(masks: wrinkles.Masks, encoding: MaskEncoding) -> FloatArray:
+def stored_masks(masks: Masks, encoding: MaskEncoding) -> FloatArray:
     """Return masks (Z, h, w), float32, as they come back from RGBA textures.
 
     "unit8" and "bc3" hold [0, 1]; the others what their numbers hold.
@@ -184,7 +164,7 @@ def stored_masks(masks: wrinkles.Masks, encoding: MaskEncoding) -> FloatArray:
     """
     if encoding not in MASK_BYTES:
         raise WrinkleError(f"masks: got {encoding!r}, expected one of {', '.join(MASK_BYTES)}")
-    stack = wrinkles.mask_stack(masks)
+    stack = mask_stack(masks)
     if encoding in ("unit8", "bc3") and not (stack.min() >= 0.0 and stack.max() <= 1.0):
         raise WrinkleError(
             f"masks: got {stack.min():.3g}...{stack.max():.3g}, expected [0, 1] for {encoding}"
@@ -201,115 +181,11 @@ def stored_masks(masks: wrinkles.Masks, encoding: MaskEncoding) -> FloatArray:
         shape = stack.shape[1:]
         textures = [
             blocks.decode_bc3(blocks.encode_bc3(texture), (shape[0], shape[1]))
-            for texture in wrinkles.mask_textures(stack)
+            for texture in mask_textures(stack)
         ]
-        stack = wrinkles.mask_stack(textures)[: len(stack)]
+        stack = mask_stack(textures)[: len(stack)]
     return stack.astype(np.float32)
 
 
 def _eight_bits(values: FloatArray) -> FloatArray:
     return np.rint(values * 255.0) / 255.0
-
-
-@dataclass(frozen=True, slots=True)
-class StorageRow:
-    """What one way of storing wrinkles costs.
-
-    Attributes
-    ----------
-    side, mask_side : int
-        Texels a side of wrinkle map and masks.
-    maps, masks : str
-        Encodings.
-    total_bytes : float
-        Map and masks with mip-maps, without the base.
-    mean_deg, percentile_99_deg : float
-        Angle between the normals and those of the given maps, over the face's pixels.
-    """
-
-    side: int
-    mask_side: int
-    maps: MapEncoding
-    masks: MaskEncoding
-    total_bytes: float
-    mean_deg: float
-    percentile_99_deg: float
-
-
-def storage_table(
-    base: FloatArray,
-    layer: Layer,
-    weights: Weights,
-    *,
-    sides: Sequence[int] = (2048, 1024, 512, 256, 128, 64),
-    mask_side: int | None = None,
-    encodings: Sequence[tuple[MapEncoding, MaskEncoding]] = (
-        ("float32", "float32"),
-        ("float16", "float16"),
-        ("unit8", "unit8"),
-        ("bc5", "bc3"),
-    ),
-    clamp: Clamp = "unit",
-    valid: BoolArray | None = None,
-) -> tuple[StorageRow, ...]:
-    """Store a layer at several sizes and encodings, and compare the normals with its own.
-
-    Parameters
-    ----------
-    base : ndarray, shape (H, W, 2)
-        Derivatives of the neutral face; not stored anew.
-    layer : Layer
-        At its full resolution, which is the reference.
-    weights : mapping or array_like
-        Of the expression to show.
-    sides : sequence of int
-        Wrinkle maps of so many texels a side, averaged down; larger ones than the layer are left
-        out.
-    mask_side : int, optional
-        Side of the masks; as they are by default.
-    encodings : sequence of (str, str)
-    clamp : {"unit", "signed"}
-    valid : ndarray of bool, shape (H, W), optional
-        Pixels that count.
-
-    Returns
-    -------
-    tuple of StorageRow
-    """
-    whole = np.asarray(base, np.float64)
-    reference = wrinkles.combine_layers(whole, [layer], weights, clamp=clamp)
-    given = layer.masks.shape[1:]
-    mask_shape = (mask_side, mask_side) if mask_side is not None else (given[0], given[1])
-    masks = resampled(layer.masks, mask_shape)
-    rows = []
-    for side in sides:
-        if side > max(layer.wrinkle.shape[:2]):
-            continue
-        small = np.moveaxis(resampled(np.moveaxis(layer.wrinkle, 2, 0), (side, side)), 0, 2)
-        for maps_as, masks_as in encodings:
-            stored = Layer(stored_map(small, maps_as), stored_masks(masks, masks_as), layer.table)
-            shown = wrinkles.combine_layers(whole, [stored], weights, clamp=clamp)
-            mean, high = normal_error_deg(shown, reference, valid)
-            size = footprint(
-                (side, side), mask_shape, maps=maps_as, masks=masks_as, zones=len(masks)
-            )
-            rows.append(
-                StorageRow(side, mask_shape[0], maps_as, masks_as, size.total_bytes, mean, high)
-            )
-    return tuple(rows)
-
-
-def normal_error_deg(
-    normals: FloatArray, reference: FloatArray, valid: BoolArray | None = None
-) -> tuple[float, float]:
-    """Return mean and 99th percentile of the angle between two maps of normals, degrees.
-
-    Pixels without a direction in either map do not count; NaN when none is left.
-    """
-    angle = np.degrees(metrics.angular_error_rad(normals, reference))
-    if valid is not None:
-        angle = angle[valid]
-    angle = angle[np.isfinite(angle)]
-    if not angle.size:
-        return float("nan"), float("nan")
-    return float(angle.mean()), float(np.percentile(angle, 99))

@@ -16,6 +16,7 @@ from threadpoolctl import ThreadpoolController
 
 from model import fresnel
 from model.dipole import kienle_patterson as diffusion
+from model.photon_table import asymmetries
 from model.photon_table import table as photon_table
 from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.subsurface import kernels
@@ -241,7 +242,7 @@ def _bounds(sigma_s: tuple[float, float], g: tuple[float, float]) -> Float64Arra
 def _tabled(radius: bytes, optics: Optics) -> ProfileModel:
     """Lay the photon table out as log R + sigma_tr r over (sigma_s', root, g)."""
     radius_mm = np.frombuffer(radius, np.float64).copy()  # not read-only: one kernel for all
-    held = photon_table.asymmetries()
+    held = asymmetries()
     low = max(optics.g - 3.0 * optics.g_error, held[0])
     high = min(optics.g + 3.0 * optics.g_error, held[-1])
     count = 4 if high - low > 1e-6 else 1

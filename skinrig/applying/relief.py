@@ -13,6 +13,7 @@ import numpy as np
 from scipy import ndimage
 
 from model.displacement_synthesis import growth as displacement_synthesis
+from model.displacement_synthesis.sources import leveled
 from model.displacement_synthesis.volume_noise import VolumeNoise
 from model.microstructure import KernelTable
 from model.microstructure.strain_fields import KernelRegions
@@ -270,9 +271,7 @@ def _patch(site: str, appearance: SkinAppearance, entry: Mapping[str, Any]) -> F
             f"{site}: a patch of {relief.values.shape} px, expected {MIN_PATCH_PX} px or more "
             "a side"
         )
-    return displacement_synthesis.leveled(
-        relief.values, pixel_um=float(entry["pixel_um"]), valid=relief.valid
-    )
+    return leveled(relief.values, pixel_um=float(entry["pixel_um"]), valid=relief.valid)
 
 
 def _noise(

@@ -15,7 +15,6 @@ LONG_MODULES = {
 }
 LONG_FUNCTIONS = {
     "capture/calibration/fiber/discs.py:fit_disc": 81,
-    "model/displacement_synthesis/growth.py:_choose": 89,
     "reconstruction/anisotropy/estimation.py:estimate": 96,
     "reconstruction/diffuse_albedo/estimation.py:estimate": 94,
     "reconstruction/photometric_stereo/kernels.py:_fit_points": 92,
@@ -24,7 +23,6 @@ LONG_FUNCTIONS = {
 }
 MANY_PARAMETERS = {
     "model/displacement_synthesis/growth.py:lay_out": 13,
-    "model/texture_statistics/description.py:match": 13,
     "reconstruction/gradient_normals/estimation.py:from_patterns": 14,
     "reconstruction/kernel_fit/fit.py:fit_kernel": 17,
     "reconstruction/photometric_stereo/kernels.py:_fit_points": 16,

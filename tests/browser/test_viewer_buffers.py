@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fixtures.packed_scenes import as_packed
+from twins import facial_specular, screen_scattering, tone_mapping
 
 from model import color_table, spectra
 from model.facial_color import HemoglobinRig, StateMaps
 from model.facial_color.rig import GLOBAL_GAINS
-from model.real_time import facial_specular, screen_scattering, tone_mapping
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from skinrig.viewer import page
 from skinrig.viewer.scene import Texture

@@ -229,13 +229,10 @@ def test_a_prior_of_samples_lies_where_they_do(counts, low):
 
 
 @CHEAP
-@given(cosine=st.floats(-1.0, 1.0), exitance=st.floats(0.0, 1e100))
-def test_skin_gives_back_no_more_than_left_it(cosine, exitance):
+@given(cosine=st.floats(-1.0, 1.0))
+def test_the_surface_lets_through_a_share_of_the_light(cosine):
     share = skin_reflectance.transmitted(cosine)
     assert 0.0 <= share <= 1.0
-    radiance = skin_reflectance.leaving_radiance(np.full(3, exitance), cosine)
-    assert np.all(radiance >= 0.0)
-    assert np.all(radiance <= exitance / np.pi * (1.0 + 1e-12))
 
 
 KIND = st.sampled_from(["ggx", "beckmann"])

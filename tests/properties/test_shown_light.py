@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from twins import facial_specular, screen_scattering, tone_mapping
 
 from model import color_table
-from model.real_time import facial_specular, screen_scattering, tone_mapping
 
 CHEAP = settings(derandomize=True, deadline=None, max_examples=60, database=None)
 FEW = settings(CHEAP, max_examples=15)

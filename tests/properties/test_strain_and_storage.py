@@ -1,7 +1,5 @@
 """Strain in textures, sources of relief, stored wrinkles, pictures and compared kernels."""
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -183,25 +181,6 @@ def test_stored_masks_come_back_or_are_refused(seed, sides, zones, huge, encodin
     masks[0, 0, 0] = bad
     with pytest.raises(wrinkle_expressions.WrinkleError, match="masks"):
         wrinkle_storage.stored_masks(masks, encoding)
-
-
-@FEW
-@given(seed=SEED, side=st.integers(4, 12), weight=st.floats(-1e6, 1e6))
-def test_a_finer_store_is_no_farther_off_and_takes_no_fewer_bytes(seed, side, weight):
-    rng = np.random.default_rng(seed)
-    base = 0.2 * rng.uniform(-1.0, 1.0, (side, side, 2))
-    layer = wrinkles.Layer(rng.uniform(-0.5, 0.5, (side, side, 2)), rng.uniform(size=(8, 2, 2)))
-    rows = wrinkle_storage.storage_table(
-        base, layer, np.full(8, weight), sides=(side, 2 * side, max(side // 2, 1))
-    )
-    assert {row.side for row in rows} == {side, max(side // 2, 1)}
-    exact = rows[0]
-    assert exact.mean_deg <= 1e-3
-    for row in rows:
-        assert math.isfinite(row.mean_deg)
-        assert 0.0 <= row.mean_deg <= 180.0
-        assert row.mean_deg <= row.percentile_99_deg * (1 + 1e-9) + 1e-9 or row.mean_deg < 180.0
-        assert row.total_bytes <= exact.total_bytes
 
 
 @CHEAP

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from twins import sliding_histograms
 
 from model import (
     facial_color,
@@ -141,7 +142,7 @@ def test_a_pyramid_gives_its_image_back(seed, levels, orientations, kind, sides)
 def test_an_increasing_affine_target_is_matched_exactly(seed, gain, offset, radius):
     neutral = np.random.default_rng(seed).standard_normal((9, 8))
     target = gain * neutral + offset
-    for match in (histogram_matching.match, histogram_matching.match_sliding):
+    for match in (histogram_matching.match, sliding_histograms.match_sliding):
         found = match(neutral, target, radius)
         np.testing.assert_allclose(found.hemoglobin, target, atol=1e-6 * (gain + abs(offset)))
 
@@ -423,13 +424,9 @@ def test_a_difference_of_normals_at_full_strength_is_the_other_map(seed, strengt
 
 @CHEAP
 @given(sides=st.tuples(*[st.integers(1, 4096)] * 2), texel=st.integers(1, 16), blocks=st.booleans())
-def test_a_chain_of_maps_takes_more_than_its_first_and_less_than_three(sides, texel, blocks):
+def test_a_stored_map_takes_no_less_than_its_texels(sides, texel, blocks):
     one = wrinkle_storage.texture_bytes(sides, texel, in_blocks=blocks)
-    chain = wrinkle_storage.mip_chain_bytes(sides, texel, in_blocks=blocks)
     assert one >= sides[0] * sides[1] * texel
-    assert one <= chain
-    if min(sides) >= 64:
-        assert chain <= 1.5 * one
 
 
 @FEW
@@ -439,8 +436,6 @@ def test_stored_derivatives_come_back_to_their_encoding(seed, encoding):
     found = wrinkle_storage.stored_map(values, encoding)
     worst = {"float32": 0.0, "float16": 1e-3, "unit8": 1.0 / 255 + 1e-6, "bc5": 0.16}[encoding]
     assert np.abs(found - values).max() <= worst
-    mean, high = wrinkle_storage.normal_error_deg(wrinkles.decode(found), wrinkles.decode(values))
-    assert 0.0 <= mean <= high + 1e-9
 
 
 @CHEAP

@@ -10,6 +10,7 @@ from scipy import fft
 from scipy.special import ndtri
 
 from model.displacement_synthesis import growth as displacement_synthesis
+from model.displacement_synthesis.sources import leveled
 from reconstruction import normal_histogram
 from reconstruction.normal_histogram import relief_slopes
 from rigsim.skin_patch.microrelief import make_micro_skin
@@ -108,7 +109,7 @@ def growth(*, toy: bool) -> StageBenchmark:
     site = "forehead"
     count, size_mm, side = (2, 1.6, 200) if toy else (4, 8.0, 2048)
     patches = [
-        displacement_synthesis.leveled(
+        leveled(
             make_micro_skin(site, seed=seed, size_mm=size_mm, texel_um=PIXEL_UM).height_um,
             pixel_um=PIXEL_UM,
         )

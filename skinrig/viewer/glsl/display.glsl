@@ -3,7 +3,7 @@ vec3 srgb(vec3 linear) {
   vec3 c = clamp(linear, 0.0, 1.0);
   return mix(12.92 * c, 1.055 * pow(c, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, c));
 }
-// Hable's operator, model.tone_mapping.filmic
+// Hable's operator, tests/twins/tone_mapping.py
 vec3 filmicCurve(vec3 x) {
   return (x * (0.15 * x + 0.05) + 0.004) / (x * (0.15 * x + 0.5) + 0.06) - 0.02 / 0.3;
 }

@@ -8,7 +8,7 @@ void main() {
   o_source = vec4(light * pow(texel_albedo(at).rgb, vec3(u_pre)), texel_albedo(at).a);
 }
 //@chunk scatter_fragment
-// One direction of one Gaussian, as model.screen_scattering defines it: taps are as far apart as
+// One direction of one Gaussian, as tests/twins/screen_scattering.py defines it: taps are as far apart as
 // the slant of the surface makes them on the screen, and count less where they leave its plane.
 uniform sampler2D u_source;
 uniform ivec2 u_axis;     // one pixel along the direction

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from twins import sliding_histograms
 
 from model.facial_color import deviation_ratio, histogram_matching
 from reconstruction import photometric_stereo
@@ -65,7 +66,7 @@ def matched(layout, rng):
     neutral, target = rng.random((2, 24, 20))
     return (
         histogram_matching.match(layout(neutral), layout(target), 4.0).hemoglobin,
-        histogram_matching.match_sliding(layout(neutral), layout(target), 3.0).hemoglobin,
+        sliding_histograms.match_sliding(layout(neutral), layout(target), 3.0).hemoglobin,
     )
 
 

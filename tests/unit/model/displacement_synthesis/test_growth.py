@@ -8,7 +8,8 @@ from scipy.ndimage import gaussian_filter
 
 from model.displacement_synthesis import cut_kernels
 from model.displacement_synthesis import growth as synthesis
-from model.displacement_synthesis.sources import filled
+from model.displacement_synthesis.layout import CellGrid
+from model.displacement_synthesis.sources import filled, leveled
 from reconstruction import normal_histogram
 from rigsim.skin_patch.microrelief import make_micro_skin
 
@@ -18,7 +19,7 @@ SIDE = 640
 
 def measured(site, seed, size_mm=4.8):
     skin = make_micro_skin(site, seed=seed, size_mm=size_mm, texel_um=PIXEL_UM)
-    return synthesis.leveled(skin.height_um, pixel_um=PIXEL_UM)
+    return leveled(skin.height_um, pixel_um=PIXEL_UM)
 
 
 @pytest.fixture(scope="module")
@@ -208,7 +209,7 @@ def test_leveling_halves_a_wave_of_the_cutoff_and_keeps_short_ones():
     x = np.arange(600) * 10.0
     for wave_um, kept in ((1000.0, 0.5), (100.0, 1.0), (8000.0, 0.01)):
         wave = np.tile(np.sin(2 * np.pi * x / wave_um), (600, 1))
-        part = synthesis.leveled(wave, pixel_um=10.0)[200:400, 100:500]
+        part = leveled(wave, pixel_um=10.0)[200:400, 100:500]
         gain = (part * wave[200:400, 100:500]).sum() / (wave[200:400, 100:500] ** 2).sum()
         assert abs(gain - kept) < 0.05
 
@@ -246,9 +247,11 @@ def test_the_cost_of_a_choice_is_that_of_its_cut(rng):
     )
     path = np.zeros(29, np.int16)
     cost = cut_kernels._cheapest_path(misfit, -1, -1, path)
-    found = cut_kernels.cut_cost(heights, 0, 12, 360, 12, 30, 12, np.float32(0.1), np.inf)
+    nowhere = np.zeros(1, np.int64)
+    grid = CellGrid(nowhere, nowhere, 12, 30, (False, False))
+    found = cut_kernels.cut_cost(heights, 0, 12, 360, 12, grid, np.float32(0.1), np.inf)
     assert found == pytest.approx(cost, rel=1e-5)
-    assert cut_kernels.cut_cost(heights, 0, 12, 360, 12, 30, 12, np.float32(0.1), 1.0) == 1.0
+    assert cut_kernels.cut_cost(heights, 0, 12, 360, 12, grid, np.float32(0.1), 1.0) == 1.0
 
 
 def test_windows_are_no_smoother_than_the_patches_they_are_chosen_from(foreheads):

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from scipy import stats
 from scipy.ndimage import gaussian_filter
+from twins.sliding_histograms import match_sliding
 
 from model import facial_color
 from model.facial_color.disc_statistics import DiscStatisticsError
-from model.facial_color.histogram_matching import match, match_sliding
+from model.facial_color.histogram_matching import match
 
 
 def texture(rng, shape=(70, 60)):

@@ -252,9 +252,6 @@ def test_similar_phase_functions_differ_near_the_source_and_agree_far_away():
     )
     assert abs(ratio[0] - 1.0) > 0.05
     assert abs(ratio[1] - 1.0) < 0.02
-    slope = photon_table.by_asymmetry([0.1, 10.0], 0.01, 1.0, g=0.85, step=0.05)
-    expected = photon_table.reflectance([0.1, 10.0], 0.01, 1.0, g=0.8) * (ratio - 1.0) / 0.1
-    np.testing.assert_allclose(slope, expected, rtol=1e-9)
 
 
 def test_indices_between_the_nodes_are_interpolated():

@@ -229,16 +229,6 @@ def test_weights_that_are_no_numbers_are_refused():
         zone_sums(np.array([0, 0, 0, 0, 0, 0, 0, np.inf]))
 
 
-def test_a_table_comes_back_from_its_own_text():
-    table = ExpressionTable(("a", "b"), {"wink": (0.1, -1 / 3)}, "mine\nof today")
-    again = read_table(table.to_csv())
-    assert (again.zones, dict(again.rows), again.source) == (
-        table.zones,
-        dict(table.rows),
-        table.source,
-    )
-
-
 @pytest.mark.parametrize(
     ("text", "says"),
     [

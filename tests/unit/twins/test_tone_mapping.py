@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from model.real_time.tone_mapping import filmic, srgb_encoded
+from twins.tone_mapping import filmic, srgb_encoded
 
 
 def test_srgb_is_continuous_where_its_pieces_meet():

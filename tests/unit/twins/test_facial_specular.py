@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from twins.facial_specular import F0, kelemen, schlick
 
 from model import fresnel
-from model.real_time.facial_specular import F0, kelemen, schlick
 
 
 def _hemisphere(cosines=64, turns=128):

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.special import erf
-
-from model.real_time import screen_scattering
-from model.real_time.screen_scattering import ScreenScatteringError, scatter
+from twins import screen_scattering
+from twins.screen_scattering import ScreenScatteringError, scatter
 
 DEPTH_MM = 500.0
 VARIANCES = (0.05, 0.4, 3.0)

@@ -1,1 +1,0 @@
-"""NumPy twins of the viewer's shaders."""
