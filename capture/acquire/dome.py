@@ -22,8 +22,8 @@ from capture.acquire.outcome import (
 )
 from capture.acquire.table_run import TableRun
 from capture.devices.camera import Frame
-from capture.devices.dome import DomeBox, Eyes, TableRow
-from capture.devices.led_box import LedBox
+from capture.devices.dome import DomeBox, TableRow
+from capture.devices.led_box import Eyes, LedBox
 from capture.devices.port import CommandRefused
 from capture.devices.wire import Code
 from capture.plan import Plan, Step, Value

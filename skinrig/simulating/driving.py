@@ -10,7 +10,7 @@ from typing import Any
 
 from capture.acquire import Operator, run_plan
 from capture.devices.camera import open_camera
-from capture.devices.dome import Eyes
+from capture.devices.led_box import Eyes
 from capture.plan import Plan
 from capture.rig import Rig
 from capture.session import Session, Subject

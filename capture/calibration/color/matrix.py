@@ -86,18 +86,6 @@ class ColorMatrix:
         """Return linear sRGB (D65, Bradford adaptation) of linear camera RGB, shape (..., 3)."""
         return xyz_to_linear_srgb(self.apply(rgb), illuminant=self.illuminant)
 
-    def xyz_to_camera(self) -> Float64Array:
-        """Return the inverse of the linear matrix, as DNG's ColorMatrix wants it, shape (3, 3).
-
-        Raises
-        ------
-        ValueError
-            For a root polynomial, which has no inverse matrix.
-        """
-        if self.method != "linear":
-            raise ValueError(f"method: got {self.method!r}, only a linear matrix can be inverted")
-        return np.linalg.inv(self.matrix).astype(np.float64)
-
 
 def fit_matrix(
     camera_rgb: ArrayLike,
