@@ -221,7 +221,7 @@ def to_calibration(fit: ColorMatrix, white: Quantity, **about: Unpack[Provenance
             "delta_e_fitted_mean": Quantity(np.array(float(np.nanmean(fit.fitted_delta_e)))),
             "patches": Quantity(np.array(float(np.isfinite(fit.delta_e).sum()))),
         },
-        notes={
+        {
             "method": fit.method,
             "illuminant": fit.illuminant,
             "delta_e": "CIEDE2000, each patch held out of its fit",
@@ -233,14 +233,13 @@ def to_calibration(fit: ColorMatrix, white: Quantity, **about: Unpack[Provenance
 def from_calibration(calibration: Calibration, serial: str) -> ColorMatrix:
     """Return the color matrix of one camera; the per-patch Delta E are not stored."""
     matrix = calibration.quantity(serial, "camera_to_xyz")
-    stderr = matrix.stderr if matrix.stderr is not None else np.zeros_like(matrix.value)
     method: Method = "linear" if matrix.value.shape == (3, 3) else "root_polynomial"
     mean = calibration.quantity(serial, "delta_e_mean").value
     fitted = calibration.quantity(serial, "delta_e_fitted_mean").value
     return ColorMatrix(
         matrix.value,
         mean.reshape(1),
-        stderr,
+        matrix.known_stderr,
         method,
         calibration.notes["illuminant"],
         fitted.reshape(1),

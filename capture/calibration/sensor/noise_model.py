@@ -139,7 +139,7 @@ class SensorCalibration:
         return of_one_device(
             "sensor",
             values,
-            notes={
+            {
                 "pattern": self.pattern,
                 "colors": " ".join(self.colors),
                 "saturated_by": ", ".join(self.saturated_by),
@@ -152,9 +152,7 @@ class SensorCalibration:
         """Return the sensor calibration of one camera from a loaded `Calibration`."""
         get = calibration.quantity
         coefficients = get(serial, "flat_coefficients")
-        errors = coefficients.stderr
-        if errors is None:
-            errors = np.zeros_like(coefficients.value)
+        errors = coefficients.known_stderr
         residuals = get(serial, "flat_residual").value
         has_dark = "dark_e_per_s" in calibration.values[serial]
         return cls(
