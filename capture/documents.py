@@ -5,8 +5,6 @@ pydantic, ranges by the dataclass's own ``__post_init__``, so that a file and a 
 the same rules.
 """
 
-from __future__ import annotations
-
 import difflib
 import json
 import math

@@ -5,8 +5,6 @@ it lights anything; while it runs only the lease is renewed. Afterwards the fram
 few rows of all cameras at a time: a row that lacks one camera's frame is taken again as a whole.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any

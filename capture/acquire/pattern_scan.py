@@ -5,8 +5,6 @@ renewed, those of everybody who asked for it. Frames are matched to patterns by 
 lacks a camera's frame is taken again; what a scan gives is whole.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Arrays of frozen results: converted, checked and made read-only."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

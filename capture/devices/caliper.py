@@ -9,8 +9,6 @@ What the caliper reads is the distance of its jaws; the skin between them has st
 because the tape gives way.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar, Literal, get_args
 

@@ -5,8 +5,6 @@ and triggered; from then on the box steps by itself and reports each release of 
 runs meanwhile: `DomeBox.listen` renews it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar

@@ -5,8 +5,6 @@ and disarms itself. After `BoxRebooted` call `hello` and set everything up again
 forgotten it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal

@@ -7,8 +7,6 @@ the analyser where a row asks for another reading (in the dark), releases the ca
 light is steady, and reports each release. The lease runs meanwhile: `listen` renews it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal

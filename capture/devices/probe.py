@@ -8,8 +8,6 @@ driver do the same. Whatever vents, but `ProbeBox.vent` and the pump's own end, 
 where the head sits: a person has to look, and `ProbeBox.place` has to say it anew.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import ClassVar, Literal, get_args

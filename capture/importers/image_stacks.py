@@ -1,7 +1,5 @@
 """Pictures of one object under many lights into a closed SESSION/."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The session of imported pictures: appears whole or not at all; its camera is a stand-in."""
 
-from __future__ import annotations
-
 import shutil
 import uuid
 from collections.abc import Callable, Iterator, Mapping

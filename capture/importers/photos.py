@@ -1,7 +1,5 @@
 """A folder of photographs into a closed SESSION/, with everything that had to be assumed."""
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import re

@@ -1,7 +1,5 @@
 """Plans of the light dome: one light at a time at several exposures, and its targets."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Literal, get_args

@@ -1,7 +1,5 @@
 """Plans of the flash rig: a subject in several states, and the calibration targets."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal, get_args
 

@@ -6,8 +6,6 @@ complete each other stand side by side, so that the light flickers little and sk
 moved little between x and -x.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 from typing import Literal, get_args

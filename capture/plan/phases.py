@@ -4,8 +4,6 @@ Periods are taken as the decimals they are written with, and counted as fraction
 sequence meets is a question of common measures, which rounded numbers do not have.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from decimal import Decimal

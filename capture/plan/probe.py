@@ -6,8 +6,6 @@ placement of the head. A pump holds the head on the skin for as long as skin bea
 rest; what does not fit into that time follows after the rest, with the head where it was.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 from typing import Literal, get_args

@@ -5,8 +5,6 @@ of RECORD; the first is chained to the seal of session.json. So a line of anothe
 left out, and any changed byte are found, and a line cut by a crash can only be the last.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """session.json: who, what, with which rig and plan; written once, sealed in every byte."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import platform

@@ -1,7 +1,5 @@
 """What a session can be asked, whether it is being written or only read."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from datetime import UTC, date, datetime
 from pathlib import Path

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from capture.arrays import Float64Array
-from capture.calibration.color.chart import ChartError, Patches, find_chart, measure_patches
 from capture.calibration.color.colorimetry import (
     chart_reference,
     delta_e_2000,
@@ -17,18 +16,6 @@ from capture.calibration.color.colorimetry import (
     xyz_to_linear_srgb,
 )
 from capture.calibration.record import Calibration, Provenance, Quantity, of_one_device
-
-__all__ = [
-    "ChartError",
-    "ColorMatrix",
-    "Method",
-    "Patches",
-    "chart_reference",
-    "find_chart",
-    "fit_matrix",
-    "measure_patches",
-    "neutral_white",
-]
 
 Method: TypeAlias = Literal["linear", "root_polynomial"]
 

@@ -1,7 +1,5 @@
 """Blurred discs in a raw mosaic: places that look like one, and the fit of one."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 import numpy as np

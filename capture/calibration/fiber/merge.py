@@ -1,7 +1,5 @@
 """Brackets of exposures merged to the rate of light on each pixel, the dark signal taken off."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final

@@ -5,8 +5,6 @@ shift), each pose of the board six. The normal equations are summed from blocks,
 with analytic derivatives.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias

@@ -11,20 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from capture.arrays import Float64Array
-from capture.calibration.geometry.board import Intrinsics, calibrate_intrinsics
 from capture.calibration.record import Calibration, Origin, Quantity, of_devices
 from capture.rig import Rig, View
-
-__all__ = [
-    "CameraPose",
-    "Intrinsics",
-    "calibrate_intrinsics",
-    "distort",
-    "nominal_cameras",
-    "poses_from",
-    "to_calibration",
-]
-
 
 _LEFT_OUT: Any = None  # __post_init__ puts an array in its place
 

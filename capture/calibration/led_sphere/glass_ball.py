@@ -6,8 +6,6 @@ together tell the ball's place much better than one light's place is known, and 
 spot tells its own light's direction.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

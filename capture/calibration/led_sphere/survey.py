@@ -1,7 +1,5 @@
 """From photographs of a ball of black glass to the lights and the films of a polarized sphere."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

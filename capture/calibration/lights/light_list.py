@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 
 from capture.arrays import BoolArray, Float64Array
 from capture.calibration.frozen_arrays import freeze_array
-from capture.calibration.lights.chrome_ball import directions_from_chrome_ball
 from capture.calibration.record import (
     Calibration,
     DeviceColumns,
@@ -22,9 +21,6 @@ from capture.calibration.record import (
     of_devices,
 )
 from capture.rig import Rig
-
-__all__ = ["CameraResponse", "LightTable", "directions_from_chrome_ball"]
-
 
 _LEFT_OUT: Any = None  # __post_init__ puts an array in its place
 

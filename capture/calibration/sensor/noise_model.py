@@ -26,9 +26,6 @@ from capture.calibration.sensor.transfer_curve import (
     plane,
 )
 
-__all__ = ["FlatPair", "PhotonTransferError", "SensorCalibration", "photon_transfer"]
-
-
 QUANTIZATION_DN2 = 1.0 / 12.0  # variance of rounding to whole DN
 N_FLAT_BLOCKS = 16  # samples of the flat field along the shorter side
 

@@ -19,8 +19,6 @@ blob of a frame is uint16, little endian, row by row (``"shape": [H, W]``), or a
 (no ``shape``).
 """
 
-from __future__ import annotations
-
 import json
 import zlib
 from collections.abc import Mapping
