@@ -19,6 +19,7 @@ from capture.documents import (
     parse,
     read_json,
     shown,
+    table_of,
 )
 from capture.plan.suction import held_s
 from capture.rig import ID_RULE, Rig, is_id
@@ -142,13 +143,7 @@ class Step:
 
     def to_json(self) -> dict[str, Any]:
         """Return the step as JSON values."""
-        return {
-            "id": self.id,
-            "kind": self.kind,
-            "index": dict(self.index),
-            "settings": dict(self.settings),
-            "cameras": list(self.cameras),
-        }
+        return table_of(self)
 
 
 def _check_settings(settings: Mapping[str, Value]) -> list[Fault]:
@@ -268,11 +263,7 @@ class Plan:
 
     def to_json(self) -> dict[str, Any]:
         """Return the plan as JSON values."""
-        return {
-            "rig": self.rig,
-            "steps": [step.to_json() for step in self.steps],
-            "limits": dict(self.limits),
-        }
+        return table_of(self)
 
     @staticmethod
     def from_json(data: Mapping[str, Any] | str | bytes, *, where: str = "plan") -> Plan:
