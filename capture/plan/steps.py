@@ -25,6 +25,7 @@ from capture.plan.suction import held_s
 from capture.rig import ID_RULE, Rig, is_id
 
 Value = str | int | float | bool
+Index = Mapping[str, str | int | float]
 Kind = Literal[
     "dark",
     "flat",
@@ -113,7 +114,7 @@ class Step:
 
     id: str
     kind: Kind
-    index: Mapping[str, str | int | float]
+    index: Index
     settings: Mapping[str, Value]
     cameras: tuple[str, ...]
 
@@ -277,6 +278,32 @@ class Plan:
         if isinstance(data, str | bytes):
             data = read_json(data, where=where, error=PlanError)
         return parse(Plan, data, where=where, error=PlanError)
+
+
+class StepSeries:
+    """Steps being collected, for all views of one rig.
+
+    Parameters
+    ----------
+    rig
+        The rig.
+    **every
+        Settings of every step that does not say otherwise.
+    """
+
+    def __init__(self, rig: Rig, **every: Value) -> None:
+        self._rig, self._every = rig, every
+        self._cameras = tuple(view.name for view in rig.views)
+        self._steps: list[Step] = []
+
+    def add(self, identity: str, kind: Kind, index: Index, **settings: Value) -> None:
+        """Add a step with settings of its own."""
+        settings = {**self._every, **settings}
+        self._steps.append(Step(identity, kind, index, settings, self._cameras))
+
+    def plan_within(self, **limits: float) -> Plan:
+        """Return the plan of the steps."""
+        return Plan(self._rig.name, tuple(self._steps), limits)
 
 
 def require(good: bool, name: str, got: object, expected: str) -> None:

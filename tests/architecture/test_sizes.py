@@ -27,7 +27,6 @@ LONG_MODULES = {
     "skinrig/rendering/figures.py": 456,
 }
 LONG_FUNCTIONS = {
-    "capture/calibration/fiber/discs.py:fit_disc": 81,
     "model/displacement_synthesis/growth.py:_choose": 89,
     "reconstruction/anisotropy/estimation.py:estimate": 96,
     "reconstruction/anisotropy/profile_anisotropy.py:estimate_from_profiles": 87,
