@@ -5,16 +5,15 @@ pydantic, ranges by the dataclass's own ``__post_init__``, so that a file and a 
 the same rules.
 """
 
-from __future__ import annotations
-
 import difflib
 import json
 import math
 import tomllib
 import typing
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, is_dataclass
 from dataclasses import fields as dataclass_fields
+from datetime import date
 from functools import cache
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -210,6 +209,32 @@ def canonical_json(data: object) -> bytes:
     b'{"a":[0.5,"\\u00e9"],"b":1}'
     """
     return json.dumps(data, sort_keys=True, separators=(",", ":"), allow_nan=False).encode("ascii")
+
+
+def table_of(row: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass as JSON values, those of dataclasses in it too.
+
+    Parameters
+    ----------
+    row : dataclass
+        Tuples become lists, and dates ISO 8601; what mappings hold is left as it is.
+
+    Examples
+    --------
+    >>> table_of(Fault("a", "1", "2"))
+    {'path': 'a', 'got': '1', 'expected': '2', 'hint': ''}
+    """
+    return {field.name: _plain(getattr(row, field.name)) for field in dataclass_fields(row)}
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value):
+        return table_of(value)
+    if isinstance(value, tuple):
+        return [_plain(part) for part in value]
+    if isinstance(value, date):
+        return value.isoformat()
+    return dict(value) if isinstance(value, Mapping) else value
 
 
 def near_miss(key: str, known: Iterable[str]) -> str:

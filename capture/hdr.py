@@ -1,7 +1,5 @@
 """Brackets of exposures merged to linear radiance with its variance."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """What a rig is made of but its cameras: lights, LEDs' limits, a caliper, a contact probe."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ it lights anything; while it runs only the lease is renewed. Afterwards the fram
 few rows of all cameras at a time: a row that lacks one camera's frame is taken again as a whole.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -22,8 +20,8 @@ from capture.acquire.outcome import (
 )
 from capture.acquire.table_run import TableRun
 from capture.devices.camera import Frame
-from capture.devices.dome import DomeBox, Eyes, TableRow
-from capture.devices.led_box import LedBox
+from capture.devices.dome import DomeBox, TableRow
+from capture.devices.led_box import Eyes, LedBox
 from capture.devices.port import CommandRefused
 from capture.devices.wire import Code
 from capture.plan import Plan, Step, Value

@@ -5,8 +5,6 @@ every later frame to the wrong light. So a frame belongs to the row whose pulse 
 shutter opened, on clocks that were compared just before.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Cameras set as a step wants them, and their frames as files of a session."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

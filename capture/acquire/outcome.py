@@ -1,7 +1,5 @@
 """A run of a plan, on any rig: what it uses, what it keeps, its account, its end in the dark."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import secrets

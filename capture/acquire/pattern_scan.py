@@ -5,8 +5,6 @@ renewed, those of everybody who asked for it. Frames are matched to patterns by 
 lacks a camera's frame is taken again; what a scan gives is whole.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +13,8 @@ from capture.acquire.frames import configure, wanted_exposure
 from capture.acquire.outcome import MAX_ATTEMPTS, CaptureRun
 from capture.acquire.table_run import TableRun
 from capture.devices.camera import Frame
-from capture.devices.gradient_sphere import ANALYZER_DEG, GradientSphereBox, Judgment, PatternRow
+from capture.devices.gradient_sphere import ANALYZER_DEG, GradientSphereBox, PatternRow
+from capture.devices.led_box import Judgment
 from capture.devices.port import CommandRefused
 from capture.devices.wire import Code
 from capture.plan import Step, Value

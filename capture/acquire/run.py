@@ -1,7 +1,5 @@
 """Run a plan on the rig that it is for."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

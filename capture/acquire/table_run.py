@@ -4,8 +4,6 @@ The box steps through its table by itself; meanwhile only leases are renewed, th
 asked for it. Afterwards the frames are gathered and matched to rows by time.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterator, Sequence
 

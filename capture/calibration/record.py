@@ -2,10 +2,10 @@
 
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date, timedelta
-from typing import Any, Literal, NotRequired, TypeAlias, TypedDict, Unpack
+from typing import Any, Literal, NotRequired, TypeAlias, TypedDict, Unpack, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,6 +73,11 @@ class Quantity:
                 f" {value.shape}"
             )
         object.__setattr__(self, "stderr", stderr)
+
+    @property
+    def known_stderr(self) -> Float64Array:
+        """Standard errors of the value's shape; 0 where none is stated."""
+        return np.zeros_like(self.value) if self.stderr is None else self.stderr
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,50 +166,123 @@ class Calibration:
         return self.values[serial][name]
 
 
-class Provenance(TypedDict):
-    """For which device a calibration holds, from when to when, and what it was made from."""
+class Origin(TypedDict):
+    """For which rig a calibration holds, from when to when, and what it was made from."""
 
-    serial: str
     rig: str
     source: Source
     created: date
     valid_until: NotRequired[date | None]
     """Default: `DEFAULT_VALIDITY_DAYS` after `created`."""
+    notes: NotRequired[Mapping[str, str] | None]
     inputs: NotRequired[Mapping[str, str] | None]
     versions: NotRequired[Mapping[str, str] | None]
+
+
+class Provenance(Origin):
+    """The same of one device."""
+
+    serial: str
+
+
+def of_devices(
+    kind: str,
+    values: Mapping[str, Mapping[str, Quantity]],
+    meaning: Mapping[str, str],
+    *,
+    maps: Mapping[str, Float32Array] | None = None,
+    **about: Unpack[Origin],
+) -> Calibration:
+    """Return the `Calibration` of some devices.
+
+    Parameters
+    ----------
+    kind, values, maps
+        As in `Calibration`.
+    meaning
+        Notes that belong to every calibration of this kind.
+    **about
+        See `Origin`; its notes are added.
+    """
+    return Calibration(
+        kind=kind,
+        rig=about["rig"],
+        serials=tuple(values),
+        created=about["created"],
+        valid_until=about.get("valid_until") or default_validity(about["created"]),
+        source=about["source"],
+        values=values,
+        maps=maps or {},
+        notes={**meaning, **(about.get("notes") or {})},
+        inputs=dict(about.get("inputs") or {}),
+        versions=dict(about.get("versions") or {}),
+    )
 
 
 def of_one_device(
     kind: str,
     values: Mapping[str, Quantity],
+    meaning: Mapping[str, str],
     *,
     maps: Mapping[str, Float32Array] | None = None,
-    notes: Mapping[str, str] | None = None,
     **about: Unpack[Provenance],
 ) -> Calibration:
-    """Return the `Calibration` of one device.
+    """Return the `Calibration` of one device; see `of_devices`."""
+    origin = cast(Origin, {key: word for key, word in about.items() if key != "serial"})
+    return of_devices(kind, {about["serial"]: values}, meaning, maps=maps, **origin)
+
+
+Column: TypeAlias = NDArray[Any] | tuple[NDArray[Any], NDArray[Any]]
+
+
+def device_rows(names: Sequence[str], **columns: Column) -> dict[str, dict[str, Quantity]]:
+    """Return the quantities of devices, by device, from a column of each quantity.
 
     Parameters
     ----------
-    kind, values, maps, notes
-        As in `Calibration`; `values` of the one device.
-    **about
-        See `Provenance`.
+    names : sequence of N str
+        Of the devices.
+    **columns : ndarray, shape (N, ...), or a pair of them
+        The values by device, alone or with their standard errors.
+
+    Examples
+    --------
+    >>> device_rows(["a", "b"], gain=np.array([1.0, 2.0]))["b"]["gain"].value.tolist()
+    2.0
     """
-    serial, created = about["serial"], about["created"]
-    return Calibration(
-        kind=kind,
-        rig=about["rig"],
-        serials=(serial,),
-        created=created,
-        valid_until=about.get("valid_until") or default_validity(created),
-        source=about["source"],
-        values={serial: values},
-        maps=maps or {},
-        notes=notes or {},
-        inputs=dict(about.get("inputs") or {}),
-        versions=dict(about.get("versions") or {}),
-    )
+    return {
+        name: {
+            key: Quantity(column[0][k], column[1][k])
+            if isinstance(column, tuple)
+            else Quantity(column[k])
+            for key, column in columns.items()
+        }
+        for k, name in enumerate(names)
+    }
+
+
+class DeviceColumns:
+    """The quantities of devices of a calibration, by column; see `device_rows`."""
+
+    def __init__(self, calibration: Calibration, names: Sequence[str]) -> None:
+        self.names = tuple(names)
+        self._calibration = calibration
+
+    def values(self, name: str) -> Float64Array:
+        """Return the values of a quantity, shape (N, ...)."""
+        return np.array([self._calibration.quantity(n, name).value for n in self.names])
+
+    def flags(self, name: str) -> NDArray[np.bool_]:
+        """Return a quantity that says yes or no, shape (N, ...)."""
+        return np.asarray(self.values(name) > 0)
+
+    def errors(self, name: str) -> Float64Array:
+        """Return the standard errors of a quantity, shape (N, ...); 0 where none is stated."""
+        return np.array([self._calibration.quantity(n, name).known_stderr for n in self.names])
+
+    def both(self, name: str) -> tuple[Float64Array, Float64Array]:
+        """Return the values of a quantity and their standard errors."""
+        return self.values(name), self.errors(name)
 
 
 def digest_arrays(*arrays: NDArray[Any]) -> str:

@@ -1,7 +1,5 @@
 """Robust statistics of residuals: scale by the median, and Huber's weights."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

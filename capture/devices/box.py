@@ -4,14 +4,33 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeVar
 
 from capture.devices import wire
-from capture.devices.port import BadAnswer, DeviceError, Hello, Port, WrongDevice
+from capture.devices.port import BadAnswer, DeviceError, Hello, Port, PortTimeout, WrongDevice
 
 log = logging.getLogger(__name__)
+
+
+T = TypeVar("T")
+
+
+class StatusBit:
+    """One bit of a status, as a property of it.
+
+    Parameters
+    ----------
+    place
+        Of the bit; 0 is worth 1.
+    """
+
+    def __init__(self, place: int) -> None:
+        self._worth = 1 << place
+
+    def __get__(self, status: BoxStatus, kind: object = None) -> bool:
+        return bool(status.bits & self._worth)
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,35 +40,16 @@ class BoxStatus:
     bits: int
     """Their sum."""
 
-    @property
-    def armed(self) -> bool:
-        """Whether light is allowed."""
-        return bool(self.bits & 1)
-
-    @property
-    def tripped(self) -> bool:
-        """Whether the lease ran out since the box was last armed."""
-        return bool(self.bits & 2)
-
-    @property
-    def errors_waiting(self) -> bool:
-        """Whether `Box.errors` would find something."""
-        return bool(self.bits & 4)
-
-    @property
-    def lit(self) -> bool:
-        """Whether a lamp is on."""
-        return bool(self.bits & 64)
-
-    @property
-    def too_hot(self) -> bool:
-        """Whether a lamp's driver has tripped."""
-        return bool(self.bits & 128)
-
-    @property
-    def stopped(self) -> bool:
-        """Whether the emergency stop is open."""
-        return bool(self.bits & 256)
+    armed = StatusBit(0)
+    """Whether light is allowed."""
+    tripped = StatusBit(1)
+    """Whether the lease ran out since the box was last armed."""
+    errors_waiting = StatusBit(2)
+    """Whether `Box.errors` would find something."""
+    lit = StatusBit(6)
+    """Whether a lamp is on."""
+    stopped = StatusBit(8)
+    """Whether the emergency stop is open."""
 
 
 class Box:
@@ -187,18 +187,93 @@ class Box:
             f"{self._port.url}: {text!r} was answered with {payload!r}, expected {expected}"
         )
 
-    def _number(self, text: str) -> float:
+    def _read(self, text: str, decode: Callable[[str], T], expected: str, *, shown: str = "") -> T:
+        """Ask and decode the answer; a ValueError or KeyError of ``decode`` is a bad answer.
+
+        Parameters
+        ----------
+        text
+            The command.
+        decode
+            Of the payload.
+        expected
+            What the payload should have been, in words.
+        shown
+            The command as an error shows it, where not as it is.
+        """
         payload = self._port.ask(text)
         try:
-            value = float(payload)
-        except ValueError as exc:
-            raise self._bad(text, payload, "a number") from exc
+            return decode(payload)
+        except (ValueError, KeyError) as exc:
+            raise self._bad(shown or text, payload, expected) from exc
+
+    def _read_or_none(
+        self, text: str, decode: Callable[[str], T], expected: str, *, shown: str = ""
+    ) -> T | None:
+        """Ask and decode the answer; None where the box says that there is nothing."""
+        return self._read(
+            text, lambda got: None if got == "NONE" else decode(got), expected, shown=shown
+        )
+
+    def _number(self, text: str) -> float:
+        payload, value = self._read(text, lambda got: (got, float(got)), "a number")
         if not math.isfinite(value):
             raise self._bad(text, payload, "a finite number")
         return value
 
     def _flag(self, text: str) -> bool:
-        payload = self._port.ask(text)
-        if payload not in ("0", "1"):
-            raise self._bad(text, payload, "0 or 1")
-        return payload == "1"
+        return self._read(text, {"0": False, "1": True}.__getitem__, "0 or 1")
+
+    def _count(self, text: str, expected: str, *, shown: str) -> int:
+        return self._read(text, whole_number, expected, shown=shown)
+
+    def _token_time(self, command: str, token: str, *, shown: str = "") -> float:
+        """Give a command with a token; return the box's time at which it was done, s."""
+
+        def time_s(payload: str) -> float:
+            name, _, t_us = payload.partition(",")
+            if name != token:
+                raise ValueError(payload)
+            return whole_number(t_us) / 1e6
+
+        return self._read(f"{command} {token}", time_s, "token,us", shown=shown or command)
+
+    def _wait_settled(
+        self, timeout_s: float, poll_s: float, listen: Callable[[float], object], fault: str
+    ) -> None:
+        """Wait until all acts are over, by the box's time whatever the box is."""
+        waited_s = 0.0
+        while not self._flag("*OPC?"):
+            if waited_s >= timeout_s:
+                raise PortTimeout(f"{self._port.url}: {fault}")
+            listen(poll_s)
+            waited_s += poll_s
+
+    def _keep_lease(self, seconds: float, every_s: float) -> None:
+        """Let time pass and renew the lease."""
+        left_s = seconds
+        while left_s > 0.0:
+            self._port.listen(min(left_s, every_s))
+            self.ping()
+            left_s -= every_s
+
+
+def whole_number(text: str) -> int:
+    """Return a number that is written in digits only; raise ValueError otherwise."""
+    if not text.isdecimal():
+        raise ValueError(text)
+    return int(text)
+
+
+def decimal(field: str, value: float, digits: int) -> str:
+    """Return a finite number in as few digits as it needs, at most ``digits`` after the point.
+
+    Examples
+    --------
+    >>> decimal("seconds", 0.25, 6), decimal("angle_deg", -0.0, 3)
+    ('0.25', '0')
+    """
+    if not math.isfinite(value):
+        raise ValueError(f"{field}: got {value}, expected a finite number")
+    text = f"{value:.{digits}f}".rstrip("0").rstrip(".")
+    return "0" if text in ("-0", "") else text

@@ -9,24 +9,13 @@ What the caliper reads is the distance of its jaws; the skin between them has st
 because the tape gives way.
 """
 
-from __future__ import annotations
-
-import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, get_args
 
-from capture.devices.box import Box, BoxStatus
-from capture.devices.port import PortTimeout
+from capture.devices.box import Box, BoxStatus, StatusBit, decimal
 
 Ended = Literal["reached", "force", "stall", "detached", "no_home", "stopped"]
-_END_WORDS: dict[str, Ended] = {
-    "REACHED": "reached",
-    "FORCE": "force",
-    "STALL": "stall",
-    "DETACHED": "detached",
-    "NOHOME": "no_home",
-    "STOPPED": "stopped",
-}
+_END_WORDS: dict[str, Ended] = {word.replace("_", "").upper(): word for word in get_args(Ended)}
 _TRAVEL_POLL_S = 0.1
 """Silence between two renewals of the lease; shorter than the shortest lease."""
 _TRAVEL_MARGIN_S = 2.0
@@ -61,25 +50,14 @@ class CaliperStatus(BoxStatus):
 
     __slots__ = ()
 
-    @property
-    def moving(self) -> bool:
-        """Whether something moves."""
-        return bool(self.bits & 16)
-
-    @property
-    def homed(self) -> bool:
-        """Whether the box knows where its jaws are."""
-        return bool(self.bits & 32)
-
-    @property
-    def attached(self) -> bool:
-        """Whether the box holds skin, as far as it knows."""
-        return bool(self.bits & 512)
-
-    @property
-    def force_tripped(self) -> bool:
-        """Whether the last move met the force limit."""
-        return bool(self.bits & 1024)
+    moving = StatusBit(4)
+    """Whether something moves."""
+    homed = StatusBit(5)
+    """Whether the box knows where its jaws are."""
+    attached = StatusBit(9)
+    """Whether the box holds skin, as far as it knows."""
+    force_tripped = StatusBit(10)
+    """Whether the last move met the force limit."""
 
 
 class CaliperBox(Box):
@@ -114,14 +92,11 @@ class CaliperBox(Box):
         CommandRefused
             Out of the range of the sensor (-222), or below the force that there is now (106).
         """
-        self._port.ask(f"CAL:FORC:LIM {_decimal('newton', newton)}")
+        self._port.ask(f"CAL:FORC:LIM {decimal('newton', newton, 4)}")
 
     def force_limit_n(self) -> float | None:
         """Return the force limit, N; None: nobody has set one, and nothing will move."""
-        payload = self._port.ask("CAL:FORC:LIM?")
-        if payload == "NONE":
-            return None
-        return self._to_number("CAL:FORC:LIM?", payload)
+        return self._read_or_none("CAL:FORC:LIM?", float, "a number")
 
     def force_n(self) -> float:
         """Return the force between the jaws, N; > 0 pulls them together. Renews the lease."""
@@ -129,20 +104,17 @@ class CaliperBox(Box):
 
     def reading_mm(self) -> float | None:
         """Return the distance of the jaws by the box's count, mm; None: it is not homed."""
-        payload = self._port.ask("CAL:POS?")
-        if payload == "NONE":
-            return None
-        return self._to_number("CAL:POS?", payload)
+        return self._read_or_none("CAL:POS?", float, "a number")
 
     # moves ------------------------------------------------------------------------------------
 
     def home(self) -> MoveReport:
         """Find the home mark and stand at step 0; refused while skin is held."""
-        return self._finish(self._port.ask("CAL:HOME"))
+        return self._finish("CAL:HOME")
 
     def set_angle(self, angle_deg: float) -> None:
         """Turn the jaws to one of ``limits["angles_deg"]`` and wait; refused while skin is held."""
-        self._port.ask(f"CAL:ANG {_decimal('angle_deg', angle_deg)}")
+        self._port.ask(f"CAL:ANG {decimal('angle_deg', angle_deg, 4)}")
         self._wait(360.0 / float(self.limits["turn_deg_per_s"]) + _TRAVEL_MARGIN_S)
 
     def angle_deg(self) -> float:
@@ -177,12 +149,11 @@ class CaliperBox(Box):
         PortTimeout
             When the box does not report the end.
         """
-        return self._finish(self._port.ask(f"CAL:STEP:ABS {step}"))
+        return self._finish(f"CAL:STEP:ABS {step}")
 
     def last_move(self) -> MoveReport | None:
         """Return how the last move ended, None when there was none since power-up."""
-        payload = self._port.ask("CAL:LAST?")
-        return None if payload == "NONE" else self._report("CAL:LAST?", payload)
+        return self._read_or_none("CAL:LAST?", _report, "number,END,step,mm,N,us")
 
     def release(self) -> None:
         """Let the skin go, at once; a person has to tape the jaws again."""
@@ -190,17 +161,12 @@ class CaliperBox(Box):
 
     def listen(self, seconds: float) -> None:
         """Let `seconds` pass while the box holds what it holds: the lease is renewed."""
-        left_s = seconds
-        while left_s > 0.0:
-            self._port.listen(min(left_s, _TRAVEL_POLL_S))
-            self.ping()
-            left_s -= _TRAVEL_POLL_S
+        self._keep_lease(seconds, _TRAVEL_POLL_S)
 
-    def _finish(self, payload: str) -> MoveReport:
-        """Wait for the end of the move that the box has accepted as number `payload`."""
-        if not payload.isdecimal():
-            raise self._bad("CAL:STEP:ABS", payload, "the number of the move")
-        number, limits = int(payload), self.limits
+    def _finish(self, text: str) -> MoveReport:
+        """Begin a move and wait for its end."""
+        number = self._count(text, "the number of the move", shown="CAL:STEP:ABS")
+        limits = self.limits
         travel_mm = (limits["step_max"] - limits["step_min"] + 2) * float(limits["step_mm"])
         self._wait(4.0 * travel_mm / float(limits["speed_mm_per_s"]) + _TRAVEL_MARGIN_S)
         report = self.last_move()
@@ -209,38 +175,11 @@ class CaliperBox(Box):
         return report
 
     def _wait(self, timeout_s: float) -> None:
-        waited_s = 0.0
-        while not self._flag("*OPC?"):
-            if waited_s >= timeout_s:
-                raise PortTimeout(
-                    f"{self._port.url}: the caliper still moves after {timeout_s:.1f} s; stop it"
-                )
-            self._port.listen(_TRAVEL_POLL_S)
-            waited_s += _TRAVEL_POLL_S
-
-    def _report(self, text: str, payload: str) -> MoveReport:
-        try:
-            number, ended, step, reading, force, t_us = payload.split(",")
-            return MoveReport(
-                int(number),
-                _END_WORDS[ended],
-                int(step),
-                float(reading),
-                float(force),
-                int(t_us) / 1e6,
-            )
-        except (ValueError, KeyError) as exc:
-            raise self._bad(text, payload, "number,END,step,mm,N,us") from exc
-
-    def _to_number(self, text: str, payload: str) -> float:
-        try:
-            return float(payload)
-        except ValueError as exc:
-            raise self._bad(text, payload, "a number") from exc
+        fault = f"the caliper still moves after {timeout_s:.1f} s; stop it"
+        self._wait_settled(timeout_s, _TRAVEL_POLL_S, self._port.listen, fault)
 
 
-def _decimal(field: str, value: float) -> str:
-    if not math.isfinite(value):
-        raise ValueError(f"{field}: got {value}, expected a finite number")
-    text = f"{value:.4f}".rstrip("0").rstrip(".")
-    return "0" if text in ("-0", "") else text
+def _report(payload: str) -> MoveReport:
+    number, ended, step, mm, newton, t_us = payload.split(",")
+    end, t_s = _END_WORDS[ended], int(t_us) / 1e6
+    return MoveReport(int(number), end, int(step), float(mm), float(newton), t_s)

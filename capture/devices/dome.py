@@ -5,15 +5,11 @@ and triggered; from then on the box steps by itself and reports each release of 
 runs meanwhile: `DomeBox.listen` renews it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from capture.devices.led_box import LEVEL_STEPS, Eyes, Judgment, LedBox, LedStatus, Position
-
-__all__ = ["DomeBox", "Eyes", "Judgment", "Position", "TableRow"]
+from capture.devices.led_box import LEVEL_STEPS, Judgment, LedBox, LedStatus
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,8 +83,8 @@ class DomeBox(LedBox):
 
     def lit(self) -> tuple[int, ...]:
         """Return the numbers of the LEDs that are on."""
-        payload = self._port.ask("LED?")
-        try:
+
+        def numbers(payload: str) -> tuple[int, ...]:
             return () if payload == "-" else tuple(int(part) for part in payload.split("+"))
-        except ValueError as exc:
-            raise self._bad("LED?", payload, "numbers joined by +, or -") from exc
+
+        return self._read("LED?", numbers, "numbers joined by +, or -")

@@ -1,7 +1,5 @@
 """Errors that devices raise."""
 
-from __future__ import annotations
-
 
 class DeviceError(Exception):
     """Root of what drivers raise about a device."""

@@ -5,19 +5,17 @@ and disarms itself. After `BoxRebooted` call `hello` and set everything up again
 forgotten it.
 """
 
-from __future__ import annotations
-
-import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from capture.devices.box import Box, BoxStatus
-from capture.devices.port import Clock, LinkLost, Port, PortTimeout, WrongDevice
+from capture.devices.box import Box, BoxStatus, StatusBit, decimal
+from capture.devices.port import PortTimeout
 
 FLASH_KIND = "flash"
 Polarizer = Literal["parallel", "crossed"]
 _POLARIZER_WORDS: Mapping[str, Polarizer] = {"PAR": "parallel", "CROS": "crossed"}
+_REPORT_FIELDS = "token,us,power,PAR|CROS,degrees,count"
 _MIN_WAIT_S = 0.02
 _CHARGE_POLL_S = 0.2
 """Longest silence while waiting; shorter than the shortest lease."""
@@ -58,10 +56,8 @@ class Status(BoxStatus):
 
     __slots__ = ()
 
-    @property
-    def turning(self) -> bool:
-        """Whether the analyser turns."""
-        return bool(self.bits & 16)
+    turning = StatusBit(4)
+    """Whether the analyser turns."""
 
 
 class FlashBox(Box):
@@ -97,11 +93,11 @@ class FlashBox(Box):
 
     def polarizer(self) -> Polarizer:
         """Return the stop that was last asked for."""
-        return self._stop("FLAS:POL?", self._port.ask("FLAS:POL?"))
+        return self._read("FLAS:POL?", _POLARIZER_WORDS.__getitem__, "PAR or CROS")
 
     def set_analyser(self, angle_deg: float) -> None:
         """Begin to turn the analyser to a reading, in degrees."""
-        self._port.ask(f"FLAS:POL:ANG {_decimal('angle_deg', angle_deg)}")
+        self._port.ask(f"FLAS:POL:ANG {decimal('angle_deg', angle_deg, 9)}")
 
     def analyser_deg(self) -> float:
         """Return the reading that the analyser has or turns to, in degrees."""
@@ -115,7 +111,7 @@ class FlashBox(Box):
 
     def set_power(self, power: float) -> None:
         """Set the power of the next pops, 0 to 1 of full."""
-        self._port.ask(f"FLAS:POW {_decimal('power', power)}")
+        self._port.ask(f"FLAS:POW {decimal('power', power, 9)}")
 
     def power(self) -> float:
         """Return the power of the next pop, 0 to 1 of full."""
@@ -123,7 +119,7 @@ class FlashBox(Box):
 
     def set_sync_delay(self, seconds: float) -> None:
         """Set how long after the camera line the flash pops, in s; 0 at power-up."""
-        self._port.ask(f"FLAS:SYNC {_decimal('seconds', seconds * 1e6)}")
+        self._port.ask(f"FLAS:SYNC {decimal('seconds', seconds * 1e6, 9)}")
 
     def sync_delay_s(self) -> float:
         """Return how long after the camera line the flash pops, in s."""
@@ -131,13 +127,7 @@ class FlashBox(Box):
 
     def charge_state(self) -> ChargeState:
         """Tell whether a pop is possible, and when it will be."""
-        payload = self._port.ask("FLAS:CHAR?")
-        fields = payload.split(",")
-        try:
-            charge, ready, wait_ms = float(fields[0]), int(fields[1]), int(fields[2])
-        except (ValueError, IndexError) as exc:
-            raise self._bad("FLAS:CHAR?", payload, "charge,ready,ms") from exc
-        return ChargeState(charge, ready == 1, wait_ms / 1e3)
+        return self._read("FLAS:CHAR?", _charge_state, "charge,ready,ms")
 
     def wait_charged(self, timeout_s: float) -> None:
         """Wait until a pop is possible: charged, recovered, and the analyser at rest.
@@ -167,12 +157,11 @@ class FlashBox(Box):
         A retry on the line never pops twice. After `PortTimeout` or `LinkLost` it is not known
         whether it popped: `last_pop` tells, unless the box has rebooted.
         """
-        return self._report("FLAS:FIRE", self._port.ask(f"FLAS:FIRE {token}"))
+        return self._read(f"FLAS:FIRE {token}", _report, _REPORT_FIELDS, shown="FLAS:FIRE")
 
     def last_pop(self) -> FlashReport | None:
         """Return the report of the last pop since power-up, None when there was none."""
-        payload = self._port.ask("FLAS:LAST?")
-        return None if payload == "NONE" else self._report("FLAS:LAST?", payload)
+        return self._read_or_none("FLAS:LAST?", _report, _REPORT_FIELDS)
 
     def count(self) -> int:
         """Return the number of pops since the box was made."""
@@ -180,17 +169,13 @@ class FlashBox(Box):
 
     def trigger_cameras(self, token: str) -> float:
         """Pulse the camera line without light; return the box's time of the pulse, in s."""
-        payload = self._port.ask(f"CAM:TRIG {token}")
-        name, _, t_us = payload.partition(",")
-        if name != token or not t_us.isdecimal():
-            raise self._bad("CAM:TRIG", payload, "token,us")
-        return int(t_us) / 1e6
+        return self._token_time("CAM:TRIG", token)
 
     # lamps ------------------------------------------------------------------------------------
 
     def lamp_on(self, seconds: float) -> None:
         """Light the modelling lamps for `seconds` (at most 0.5) from now."""
-        self._port.ask(f"FLAS:LAMP ON,{_decimal('seconds', seconds * 1e3)}")
+        self._port.ask(f"FLAS:LAMP ON,{decimal('seconds', seconds * 1e3, 9)}")
 
     def lamp_off(self) -> None:
         """Put the modelling lamps out."""
@@ -200,57 +185,13 @@ class FlashBox(Box):
         """Tell whether the modelling lamps are on."""
         return self._flag("FLAS:LAMP?")
 
-    # answers ----------------------------------------------------------------------------------
 
-    def _stop(self, text: str, payload: str) -> Polarizer:
-        if payload not in _POLARIZER_WORDS:
-            raise self._bad(text, payload, "PAR or CROS")
-        return _POLARIZER_WORDS[payload]
-
-    def _report(self, text: str, payload: str) -> FlashReport:
-        fields = payload.split(",")
-        try:
-            token, t_us, power, stop, angle_deg, count = fields
-            return FlashReport(
-                token,
-                int(t_us) / 1e6,
-                float(power),
-                self._stop(text, stop),
-                float(angle_deg),
-                int(count),
-            )
-        except ValueError as exc:
-            raise self._bad(text, payload, "token,us,power,PAR|CROS,degrees,count") from exc
+def _charge_state(payload: str) -> ChargeState:
+    charge, ready, wait_ms, *_ = payload.split(",")
+    return ChargeState(float(charge), int(ready) == 1, int(wait_ms) / 1e3)
 
 
-def find_box(urls: Iterable[str], serial: str, *, clock: Clock | None = None) -> FlashBox:
-    """Return the flash box with a serial number, wherever it is plugged in.
-
-    Parameters
-    ----------
-    urls
-        Ports to look at, e.g. all of ``/dev/serial/by-id``.
-    serial
-        Its serial number.
-    clock
-        See `Port`.
-
-    Raises
-    ------
-    WrongDevice
-        When it is on none of them; what was found is listed.
-    """
-    found = []
-    for url in urls:
-        try:
-            return FlashBox(Port(url, clock=clock), serial=serial)
-        except (LinkLost, PortTimeout, WrongDevice) as exc:
-            found.append(str(exc))
-    seen = "\n  ".join(found) or "no ports"
-    raise WrongDevice(f"no flash box {serial} was found; looked at:\n  {seen}")
-
-
-def _decimal(field: str, value: float) -> str:
-    if not math.isfinite(value):
-        raise ValueError(f"{field}: got {value}, expected a finite number")
-    return f"{value:.9f}".rstrip("0").rstrip(".")
+def _report(payload: str) -> FlashReport:
+    token, t_us, power, stop, angle_deg, count = payload.split(",")
+    polarizer, t_s = _POLARIZER_WORDS[stop], int(t_us) / 1e6
+    return FlashReport(token, t_s, float(power), polarizer, float(angle_deg), int(count))

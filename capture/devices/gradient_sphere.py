@@ -7,26 +7,13 @@ the analyser where a row asks for another reading (in the dark), releases the ca
 light is steady, and reports each release. The lease runs meanwhile: `listen` renews it.
 """
 
-from __future__ import annotations
-
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from capture.devices.led_box import LEVEL_STEPS, Eyes, Judgment, LedBox, LedStatus, Position
-from capture.devices.port import PortTimeout
+from capture.devices.box import StatusBit, decimal
+from capture.devices.led_box import LEVEL_STEPS, Judgment, LedBox, LedStatus
 from capture.plan.steps import LIGHT_PATTERNS
-
-__all__ = [
-    "ANALYZER_DEG",
-    "Eyes",
-    "GradientSphereBox",
-    "Judgment",
-    "PatternRow",
-    "Position",
-    "SphereStatus",
-]
 
 Polarizer = Literal["parallel", "crossed"]
 ANALYZER_DEG: dict[str, float] = {"parallel": 0.0, "crossed": 90.0}
@@ -62,7 +49,7 @@ class PatternRow:
         'DARK:0:0:30000:1'
         """
         level = 0 if self.pattern == "dark" else round(self.level * LEVEL_STEPS)
-        angle = _decimal("analyser_deg", self.analyser_deg, 3)
+        angle = decimal("analyser_deg", self.analyser_deg, 3)
         dwell_us = round(self.dwell_s * 1e6)
         return f"{_pattern(self.pattern).upper()}:{angle}:{level}:{dwell_us}:{self.mask:X}"
 
@@ -72,10 +59,8 @@ class SphereStatus(LedStatus):
 
     __slots__ = ()
 
-    @property
-    def turning(self) -> bool:
-        """Whether the analyser turns."""
-        return bool(self.bits & 1024)
+    turning = StatusBit(10)
+    """Whether the analyser turns."""
 
 
 class GradientSphereBox(LedBox):
@@ -101,7 +86,7 @@ class GradientSphereBox(LedBox):
 
     def set_analyser(self, angle_deg: float) -> None:
         """Begin to turn the analyser to a reading of 0 to 180 degrees."""
-        self._port.ask(f"POL:ANG {_decimal('angle_deg', angle_deg, 3)}")
+        self._port.ask(f"POL:ANG {decimal('angle_deg', angle_deg, 3)}")
 
     def analyser_deg(self) -> float:
         """Return the reading that the analyser has or turns to, in degrees."""
@@ -119,14 +104,8 @@ class GradientSphereBox(LedBox):
         PortTimeout
             When it does not in `timeout_s`.
         """
-        waited_s = 0.0
-        while not self.settled():
-            if waited_s >= timeout_s:
-                raise PortTimeout(
-                    f"{self._port.url}: the analyser still turns after {timeout_s:g} s; check it"
-                )
-            self.listen(_ANALYZER_POLL_S)
-            waited_s += _ANALYZER_POLL_S
+        fault = f"the analyser still turns after {timeout_s:g} s; check it"
+        self._wait_settled(timeout_s, _ANALYZER_POLL_S, self.listen, fault)
 
     # single patterns --------------------------------------------------------------------------
 
@@ -138,7 +117,7 @@ class GradientSphereBox(LedBox):
         if pattern == "dark":
             self.put_out()
             return
-        span_ms = _decimal("seconds", seconds * 1e3, 6)
+        span_ms = decimal("seconds", seconds * 1e3, 6)
         self._port.ask(f"PATT {_pattern(pattern).upper()},{span_ms},{round(level * LEVEL_STEPS)}")
 
     def put_out(self) -> None:
@@ -204,10 +183,3 @@ def _pattern(name: str) -> str:
     if name not in LIGHT_PATTERNS:
         raise ValueError(f"pattern: got {name!r}, expected one of {', '.join(LIGHT_PATTERNS)}")
     return name
-
-
-def _decimal(field: str, value: float, digits: int) -> str:
-    if not math.isfinite(value):
-        raise ValueError(f"{field}: got {value}, expected a finite number")
-    text = f"{value:.{digits}f}".rstrip("0").rstrip(".")
-    return "0" if text in ("-0", "") else text

@@ -5,14 +5,12 @@ and triggered; from then on the box steps by itself and reports each release of 
 runs meanwhile: `LedBox.listen` renews it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from capture.devices import wire
-from capture.devices.box import Box, BoxStatus
+from capture.devices.box import Box, BoxStatus, StatusBit, whole_number
 from capture.devices.port import Port
 
 Eyes = Literal["open", "closed", "shielded"]
@@ -59,15 +57,10 @@ class LedStatus(BoxStatus):
 
     __slots__ = ()
 
-    @property
-    def running(self) -> bool:
-        """Whether a sequence is stepping."""
-        return bool(self.bits & 16)
-
-    @property
-    def eyes_safe(self) -> bool:
-        """Whether a person has said that the subject's eyes are closed or shielded."""
-        return bool(self.bits & 512)
+    running = StatusBit(4)
+    """Whether a sequence is stepping."""
+    eyes_safe = StatusBit(9)
+    """Whether a person has said that the subject's eyes are closed or shielded."""
 
 
 class LedBox(Box):
@@ -104,12 +97,8 @@ class LedBox(Box):
             raise self._bad(f"{name}:CRC?", payload, f"{wanted}, the table that was sent")
 
     def _arm_table(self, rows: int) -> Judgment:
-        payload = self._port.ask(f"SEQ:ARM {rows}")
-        try:
-            flashes, rms, duty, heat, dose_ws = (float(field) for field in payload.split(","))
-        except ValueError as exc:
-            raise self._bad("SEQ:ARM", payload, "flashes,rms,duty,heat,Ws") from exc
-        return Judgment(flashes, rms, duty, heat, dose_ws)
+        expected = "flashes,rms,duty,heat,Ws"
+        return self._read(f"SEQ:ARM {rows}", _judgment, expected, shown="SEQ:ARM")
 
     def trigger(self, token: str) -> float:
         """Run the armed table once; return the box's time of its beginning, in s.
@@ -121,21 +110,13 @@ class LedBox(Box):
 
     def position(self) -> Position:
         """Tell where the sequence stands."""
-        payload = self._port.ask("SEQ:POS?")
-        try:
-            state, row, rows, token = payload.split(",")
-            return Position(state, int(row), int(rows), "" if token == "-" else token)
-        except ValueError as exc:
-            raise self._bad("SEQ:POS?", payload, "state,row,rows,token") from exc
+        return self._read("SEQ:POS?", _position, "state,row,rows,token")
 
     def step_time(self, row: int) -> float | None:
         """Return the box's time at which a row released its cameras, in s; None: it has not."""
-        payload = self._port.ask(f"SEQ:STEP? {row}")
-        if payload == "NONE":
-            return None
-        if not payload.isdecimal():
-            raise self._bad("SEQ:STEP?", payload, "us or NONE")
-        return int(payload) / 1e6
+        text, expected = f"SEQ:STEP? {row}", "us or NONE"
+        t_us = self._read_or_none(text, whole_number, expected, shown="SEQ:STEP?")
+        return None if t_us is None else t_us / 1e6
 
     def listen(self, seconds: float) -> dict[int, float]:
         """Let `seconds` pass, renew the lease, and return the releases reported: row to box time.
@@ -165,11 +146,7 @@ class LedBox(Box):
 
     def cameras(self) -> int:
         """Return the mask of the cameras that are released at all."""
-        payload = self._port.ask("CAM:MASK?")
-        try:
-            return int(payload, 16)
-        except ValueError as exc:
-            raise self._bad("CAM:MASK?", payload, "hexadecimal digits") from exc
+        return self._read("CAM:MASK?", lambda got: int(got, 16), "hexadecimal digits")
 
     def trigger_cameras(self, token: str) -> float:
         """Release the cameras without light; return the box's time, in s."""
@@ -196,9 +173,12 @@ class LedBox(Box):
         """Begin to count the dose anew; what was said of the eyes is forgotten."""
         self._port.ask(f"DOSE:NEW {pseudonym}")
 
-    def _token_time(self, text: str, token: str) -> float:
-        payload = self._port.ask(f"{text} {token}")
-        name, _, t_us = payload.partition(",")
-        if name != token or not t_us.isdecimal():
-            raise self._bad(text, payload, "token,us")
-        return int(t_us) / 1e6
+
+def _judgment(payload: str) -> Judgment:
+    flashes, rms, duty, heat, dose_ws = (float(field) for field in payload.split(","))
+    return Judgment(flashes, rms, duty, heat, dose_ws)
+
+
+def _position(payload: str) -> Position:
+    state, row, rows, token = payload.split(",")
+    return Position(state, int(row), int(rows), "" if token == "-" else token)

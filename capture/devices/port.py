@@ -8,8 +8,6 @@ One thread uses a port. One request is under way at a time; a retry sends the sa
 the box can tell it from a new request and never acts twice.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

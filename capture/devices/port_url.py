@@ -1,7 +1,5 @@
 """Serial ports by URL: handlers, names, and what to do where one does not open."""
 
-from __future__ import annotations
-
 import errno
 import importlib
 import importlib.metadata

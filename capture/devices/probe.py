@@ -8,36 +8,16 @@ driver do the same. Whatever vents, but `ProbeBox.vent` and the pump's own end, 
 where the head sits: a person has to look, and `ProbeBox.place` has to say it anew.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, get_args
 
-from capture.devices.box import Box, BoxStatus
-from capture.devices.port import PortTimeout
+from capture.devices.box import Box, BoxStatus, StatusBit, decimal
 
 Shut = Literal["open", "timed", "asked", "pump", "jam", "interlock", "dark"]
 Vented = Literal["timed", "asked", "low", "lost", "high", "gauge", "interlock", "dark"]
-_SHUTTER_WORDS: dict[str, Shut] = {
-    "OPEN": "open",
-    "TIMED": "timed",
-    "ASKED": "asked",
-    "PUMP": "pump",
-    "JAM": "jam",
-    "INTERLOCK": "interlock",
-    "DARK": "dark",
-}
-_VENT_WORDS: dict[str, Vented] = {
-    "TIMED": "timed",
-    "ASKED": "asked",
-    "LOW": "low",
-    "LOST": "lost",
-    "HIGH": "high",
-    "GAUGE": "gauge",
-    "INTERLOCK": "interlock",
-    "DARK": "dark",
-}
+_SHUTTER_WORDS: dict[str, Shut] = {word.upper(): word for word in get_args(Shut)}
+_VENT_WORDS: dict[str, Vented] = {word.upper(): word for word in get_args(Vented)}
 _VALVE_POLL_S = 0.1
 """Silence between two renewals of the lease; shorter than the shortest lease."""
 _VALVE_MARGIN_S = 2.0
@@ -94,30 +74,16 @@ class ProbeStatus(BoxStatus):
 
     __slots__ = ()
 
-    @property
-    def busy(self) -> bool:
-        """Whether the shutter is open or opens, or the cover moves."""
-        return bool(self.bits & 16)
-
-    @property
-    def sucking(self) -> bool:
-        """Whether the pump is on."""
-        return bool(self.bits & 32)
-
-    @property
-    def placed(self) -> bool:
-        """Whether a person has said where the head sits, and nothing has happened since."""
-        return bool(self.bits & 512)
-
-    @property
-    def resting(self) -> bool:
-        """Whether the skin has to rest yet."""
-        return bool(self.bits & 1024)
-
-    @property
-    def jammed(self) -> bool:
-        """Whether the shutter is stuck open."""
-        return bool(self.bits & 2048)
+    busy = StatusBit(4)
+    """Whether the shutter is open or opens, or the cover moves."""
+    sucking = StatusBit(5)
+    """Whether the pump is on."""
+    placed = StatusBit(9)
+    """Whether a person has said where the head sits, and nothing has happened since."""
+    resting = StatusBit(10)
+    """Whether the skin has to rest yet."""
+    jammed = StatusBit(11)
+    """Whether the shutter is stuck open."""
 
 
 class ProbeBox(Box):
@@ -155,15 +121,11 @@ class ProbeBox(Box):
         CommandRefused
             Unless armed (-203, 108); while the pump is on or the shutter open (-213).
         """
-        self._port.ask(f"HEAD:SITE {site},{_decimal('angle_deg', angle_deg)}")
+        self._port.ask(f"HEAD:SITE {site},{decimal('angle_deg', angle_deg, 6)}")
 
     def placement(self) -> tuple[str, float] | None:
         """Return site and angle in degrees; None: nobody has said it since the head was let go."""
-        payload = self._port.ask("HEAD:SITE?")
-        if payload == "NONE":
-            return None
-        site, _, angle = payload.partition(",")
-        return site, self._to_number("HEAD:SITE?", angle)
+        return self._read_or_none("HEAD:SITE?", _placement, "a number")
 
     def take_away(self) -> None:
         """Pass on that the head is taken off; it is vented and its place is forgotten."""
@@ -182,11 +144,9 @@ class ProbeBox(Box):
             placed or the pump on (-213), the skin rests (103), beyond the limits (-222), the gauge
             dead (-240), the emergency stop open (107).
         """
-        span_ms = _decimal("seconds", seconds * 1e3)
-        payload = self._port.ask(f"PUMP ON,{span_ms},{_decimal('mbar', mbar)}")
-        if not payload.isdecimal():
-            raise self._bad("PUMP ON", payload, "the number of the suction")
-        return int(payload)
+        span_ms = decimal("seconds", seconds * 1e3, 6)
+        text = f"PUMP ON,{span_ms},{decimal('mbar', mbar, 6)}"
+        return self._count(text, "the number of the suction", shown="PUMP ON")
 
     def vent(self) -> None:
         """Switch the pump off and open the vent; the head stays placed, and the skin rests."""
@@ -194,29 +154,11 @@ class ProbeBox(Box):
 
     def suction(self) -> SuctionState:
         """Return what the pump does."""
-        payload = self._port.ask("PUMP?")
-        try:
-            match payload.split(","):
-                case ["ON", mbar, left_ms]:
-                    return SuctionState(True, float(mbar), int(left_ms) / 1e3)
-                case ["REST", left_ms]:
-                    return SuctionState(False, 0.0, int(left_ms) / 1e3)
-                case ["VENT"]:
-                    return SuctionState(False, 0.0, 0.0)
-        except ValueError as exc:
-            raise self._bad("PUMP?", payload, "ON,mbar,ms or REST,ms or VENT") from exc
-        raise self._bad("PUMP?", payload, "ON,mbar,ms or REST,ms or VENT")
+        return self._read("PUMP?", _suction_state, "ON,mbar,ms or REST,ms or VENT")
 
     def last_suction(self) -> SuctionReport | None:
         """Return how the last suction ended, None when none has since power-up."""
-        payload = self._port.ask("PUMP:LAST?")
-        if payload == "NONE":
-            return None
-        try:
-            number, ended, mbar, t_us = payload.split(",")
-            return SuctionReport(int(number), _VENT_WORDS[ended], float(mbar), int(t_us) / 1e6)
-        except (ValueError, KeyError) as exc:
-            raise self._bad("PUMP:LAST?", payload, "number,END,mbar,us") from exc
+        return self._read_or_none("PUMP:LAST?", _suction_report, "number,END,mbar,us")
 
     def pressure_mbar(self) -> float:
         """Return the suction under the head, mbar below the air's pressure; has noise."""
@@ -256,13 +198,8 @@ class ProbeBox(Box):
             blades stuck or made dark meanwhile (-240), the dose of light reached (104), the
             emergency stop open (107).
         """
-        span_ms = _decimal("seconds", seconds * 1e3)
-        payload = self._port.ask(f"SHUT OPEN,{span_ms}")
-        try:
-            number, t_us = payload.split(",")
-            return Opening(int(number), int(t_us) / 1e6, "open", math.inf)
-        except ValueError as exc:
-            raise self._bad("SHUT OPEN", payload, "number,us") from exc
+        span_ms = decimal("seconds", seconds * 1e3, 6)
+        return self._read(f"SHUT OPEN,{span_ms}", _begun, "number,us", shown="SHUT OPEN")
 
     def close_shutter(self) -> None:
         """Close the shutter before its own end; where it is stuck open, try to close it again."""
@@ -270,15 +207,7 @@ class ProbeBox(Box):
 
     def last_opening(self) -> Opening | None:
         """Return the last opening and how it ended, None when there was none since power-up."""
-        payload = self._port.ask("SHUT:LAST?")
-        if payload == "NONE":
-            return None
-        try:
-            number, ended, open_us, shut_us = payload.split(",")
-            shut_s = math.inf if shut_us == "-" else int(shut_us) / 1e6
-            return Opening(int(number), int(open_us) / 1e6, _SHUTTER_WORDS[ended], shut_s)
-        except (ValueError, KeyError) as exc:
-            raise self._bad("SHUT:LAST?", payload, "number,END,us,us") from exc
+        return self._read_or_none("SHUT:LAST?", _opening, "number,END,us,us")
 
     def openings(self) -> int:
         """Return how many openings were tried since the box was made."""
@@ -299,8 +228,7 @@ class ProbeBox(Box):
 
     def uncovered(self) -> int | None:
         """Return the number of the only fibre that is not covered; None: none is covered."""
-        payload = self._port.ask("FIB?")
-        return None if payload == "ALL" else int(self._to_number("FIB?", payload))
+        return self._read("FIB?", lambda got: None if got == "ALL" else int(float(got)), "a number")
 
     def dose_ws(self) -> float:
         """Return the light that went into this subject, Ws."""
@@ -318,12 +246,7 @@ class ProbeBox(Box):
 
     def trigger_camera(self, token: str) -> float:
         """Pulse the camera's line without light; return the box's time, s."""
-        text = f"CAM:TRIG {token}"
-        payload = self._port.ask(text)
-        name, _, t_us = payload.partition(",")
-        if name != token or not t_us.isdecimal():
-            raise self._bad(text, payload, "token,us")
-        return int(t_us) / 1e6
+        return self._token_time("CAM:TRIG", token, shown=f"CAM:TRIG {token}")
 
     # time -------------------------------------------------------------------------------------
 
@@ -337,31 +260,40 @@ class ProbeBox(Box):
         every_s
             Silence between two renewals, s; shorter than the lease.
         """
-        left_s = seconds
-        while left_s > 0.0:
-            self._port.listen(min(left_s, every_s))
-            self.ping()
-            left_s -= every_s
+        self._keep_lease(seconds, every_s)
 
     def _wait(self, timeout_s: float) -> None:
-        waited_s = 0.0
-        while not self._flag("*OPC?"):
-            if waited_s >= timeout_s:
-                raise PortTimeout(
-                    f"{self._port.url}: the probe still moves after {timeout_s:.1f} s; check it"
-                )
-            self._port.listen(_VALVE_POLL_S)
-            waited_s += _VALVE_POLL_S
-
-    def _to_number(self, text: str, payload: str) -> float:
-        try:
-            return float(payload)
-        except ValueError as exc:
-            raise self._bad(text, payload, "a number") from exc
+        fault = f"the probe still moves after {timeout_s:.1f} s; check it"
+        self._wait_settled(timeout_s, _VALVE_POLL_S, self._port.listen, fault)
 
 
-def _decimal(field: str, value: float) -> str:
-    if not math.isfinite(value):
-        raise ValueError(f"{field}: got {value}, expected a finite number")
-    text = f"{value:.6f}".rstrip("0").rstrip(".")
-    return "0" if text in ("-0", "") else text
+def _placement(payload: str) -> tuple[str, float]:
+    site, _, angle = payload.partition(",")
+    return site, float(angle)
+
+
+def _suction_state(payload: str) -> SuctionState:
+    match payload.split(","):
+        case ["ON", mbar, left_ms]:
+            return SuctionState(True, float(mbar), int(left_ms) / 1e3)
+        case ["REST", left_ms]:
+            return SuctionState(False, 0.0, int(left_ms) / 1e3)
+        case ["VENT"]:
+            return SuctionState(False, 0.0, 0.0)
+    raise ValueError(payload)
+
+
+def _suction_report(payload: str) -> SuctionReport:
+    number, ended, mbar, t_us = payload.split(",")
+    return SuctionReport(int(number), _VENT_WORDS[ended], float(mbar), int(t_us) / 1e6)
+
+
+def _begun(payload: str) -> Opening:
+    number, t_us = payload.split(",")
+    return Opening(int(number), int(t_us) / 1e6, "open", math.inf)
+
+
+def _opening(payload: str) -> Opening:
+    number, ended, open_us, shut_us = payload.split(",")
+    shut_s = math.inf if shut_us == "-" else int(shut_us) / 1e6
+    return Opening(int(number), int(open_us) / 1e6, _SHUTTER_WORDS[ended], shut_s)

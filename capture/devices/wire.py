@@ -13,8 +13,6 @@ frame has exactly one encoding, so that a retry can be recognised by its bytes. 
 bare: people and foreign programs may send queries that way, never a command.
 """
 
-from __future__ import annotations
-
 import binascii
 import enum
 import re

@@ -1,7 +1,5 @@
 """Pictures of one object under many lights into a closed SESSION/."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,16 +15,15 @@ from capture.arrays import Float64Array, FloatArray
 from capture.documents import Fault
 from capture.importers import light_lists
 from capture.importers.images import Photo, PhotoError, read_photo
+from capture.importers.imported_session import DISTANCE_MM, imported_session, stand_in_view
 from capture.importers.light_lists import LightList, LightListError
-from capture.importers.new_folder import new_folder, require_new
 from capture.plan import Plan, Step, Value
-from capture.rig import Light, Rig, View
+from capture.rig import Light, Rig
 from capture.session import Session, Subject
 
 Encoding = Literal["auto", "sRGB", "linear"]
 
 LIGHT_LIST_RIG_NAME = "light-list"
-ASSUMED_LIGHT_DISTANCE_MM = 1000.0
 N_SAMPLE_POINTS = 3000
 LINEAR_MISFIT_RATIO = 0.8
 """Linear values are believed when they leave less than this part of the misfit."""
@@ -119,38 +116,26 @@ def import_light_list(
     assumed = _assumed(found, notes, near=near, as_linear=as_linear, encoding=encoding)
     rig = _rig(found, first.frame, near=near)
     steps = _steps(found)
+    extra = {
+        "assumed": assumed,
+        "light_list": {
+            "kind": found.kind,
+            "near": near,
+            "mm_per_px": mm_per_px,
+            "encoding": shown,
+            "intensity": None if found.intensity is None else found.intensity.tolist(),
+        },
+        "photographs": [
+            {"step": step.id, "sha256": _sha256(file), "encoding": shown}
+            for step, file in zip(steps, found.pictures, strict=True)
+        ],
+    }
     target = Path(out)
-    require_new(target)
-    with new_folder(target) as part:
-        session = Session.create(
-            part,
-            plan=Plan(rig.name, steps),
-            rig=rig,
-            devices={},
-            subject=subject or Subject("unnamed"),
-            source="measured",
-            extra={
-                "assumed": assumed,
-                "light_list": {
-                    "kind": found.kind,
-                    "near": near,
-                    "mm_per_px": mm_per_px,
-                    "encoding": shown,
-                    "intensity": None if found.intensity is None else found.intensity.tolist(),
-                },
-                "photographs": [
-                    {"step": step.id, "sha256": _sha256(file), "encoding": shown}
-                    for step, file in zip(steps, found.pictures, strict=True)
-                ],
-            },
-            now=clock,
-        )
-        with session:
-            if where_mask is not None:
-                session.attach("mask.png", _mask_png(where_mask, first.frame))
-            for step, file in zip(steps, found.pictures, strict=True):
-                _commit(session, step, file, clock, as_linear=as_linear)
-            session.close()
+    with imported_session(target, Plan(rig.name, steps), rig, subject, extra, clock) as session:
+        if where_mask is not None:
+            session.attach("mask.png", _mask_png(where_mask, first.frame))
+        for step, file in zip(steps, found.pictures, strict=True):
+            _commit(session, step, file, clock, as_linear=as_linear)
     return ImportedStack(
         str(target),
         len(steps),
@@ -257,9 +242,7 @@ def _assumed(
 
 
 def _rig(found: LightList, frame: raw.RawFrame, *, near: bool) -> Rig:
-    positions = found.vectors if near else ASSUMED_LIGHT_DISTANCE_MM * found.directions
-    height, width = frame.cfa.shape
-    black = round(sum(frame.black) / len(frame.black))
+    positions = found.vectors if near else DISTANCE_MM * found.directions
     return Rig(
         name=LIGHT_LIST_RIG_NAME,
         lights=tuple(
@@ -272,29 +255,7 @@ def _rig(found: LightList, frame: raw.RawFrame, *, near: bool) -> Rig:
             )
             for k, position in enumerate(positions)
         ),
-        views=(
-            View(
-                name="cam",
-                camera_model=frame.camera_model or "unknown camera",
-                serial="unknown",
-                position_mm=(0.0, 0.0, ASSUMED_LIGHT_DISTANCE_MM),
-                target_mm=(0.0, 0.0, 0.0),
-                up=(0.0, 1.0, 0.0),
-                focal_mm=frame.focal_mm or 50.0,
-                pixel_um=36e3 / width,  # of the full-frame sensor that stands in for an unknown one
-                width_px=width,
-                height_px=height,
-                f_number=8.0,
-                readout_s=0.0,
-                bit_depth=min(max(frame.white.bit_length(), 8), 16),
-                cfa=frame.pattern,  # type: ignore[arg-type]
-                black_level=black,
-                white_level=frame.white,
-                spectral_sensitivity="linear sRGB",
-                full_well_e=20_000.0,
-                read_noise_e=10.0,
-            ),
-        ),
+        views=(stand_in_view(frame, spectral_sensitivity="linear sRGB"),),
         boxes=(),
         recycle_s=0.0,
     )

@@ -1,7 +1,5 @@
 """One photograph, of whatever format, as a raw frame of linear values without its metadata."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from dataclasses import dataclass, replace

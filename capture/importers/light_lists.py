@@ -3,8 +3,6 @@
 Directions are towards the lights: x right, y up, z towards the camera, as .lp files have them.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Scanned meshes of any maker into SESSION/: OBJ and PLY, checked, in millimetres."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import re

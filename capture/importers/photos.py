@@ -1,7 +1,5 @@
 """A folder of photographs into a closed SESSION/, with everything that had to be assumed."""
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import re
@@ -14,10 +12,10 @@ from pathlib import Path
 from capture import raw
 from capture.documents import Fault, InputError
 from capture.importers.images import Encoding, Photo, PhotoError, read_photo
-from capture.importers.new_folder import new_folder, require_new
+from capture.importers.imported_session import DISTANCE_MM, imported_session, stand_in_view
 from capture.plan import Kind, Plan, Step, Value
 from capture.rig import Light, Rig, View
-from capture.session import Session, SessionDiskError, Subject
+from capture.session import Session, Subject
 
 logger = logging.getLogger(__name__)
 
@@ -29,8 +27,6 @@ SIDECAR_SUFFIXES = frozenset(
     ".txt .md .csv .json .xmp .thm .pp3 .dop .xml .html .pdf .zip .mov .mp4 .lp".split()
 )
 _POLARIZER_WORDS = {"parallel": "parallel", "crossed": "crossed", "cross": "crossed"}
-_SENSOR_MM = 36.0  # width of the full-frame sensor that stands in for an unknown one
-_DISTANCE_MM = 1000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,19 +53,17 @@ class _Entry:
     file: Path
     sha256: str
     encoding: Encoding
-    model: str
-    pattern: str
-    shape: tuple[int, int]
-    levels: tuple[int, int]
-    focal_mm: float | None
+    view: View
     exposure_s: float | None
     iso: int | None
     notes: tuple[str, ...]
 
     @property
-    def camera(self) -> tuple[str, str, tuple[int, int], tuple[int, int]]:
+    def camera(self) -> tuple[object, ...]:
         """What tells one camera (and its setting) from another."""
-        return self.model, self.pattern, self.shape, self.levels
+        view = self.view
+        shape = (view.height_px, view.width_px)
+        return view.camera_model, view.cfa, shape, view.black_level, view.white_level
 
 
 def import_photos(
@@ -131,38 +125,20 @@ def import_photos(
     used, views = _rig(entries, rig, camera_serial, sensitivity, light)
     steps = _steps(entries, views, kind)
     assumed = _assumptions(entries, made_up=rig is None, light=light, camera=used.views[0])
+    plan = Plan(used.name, tuple(step for step, _ in steps))
+    extra = {
+        "assumed": assumed,
+        "photographs": [
+            {"step": step.id, "sha256": entry.sha256, "encoding": entry.encoding}
+            for step, entry in steps
+        ],
+    }
     target = Path(out)
-    require_new(target)
-    try:
-        with new_folder(target) as part:
-            session = Session.create(
-                part,
-                plan=Plan(used.name, tuple(step for step, _ in steps)),
-                rig=used,
-                devices={},
-                subject=subject or Subject("unnamed"),
-                source="measured",
-                extra={
-                    "assumed": assumed,
-                    "photographs": [
-                        {"step": step.id, "sha256": entry.sha256, "encoding": entry.encoding}
-                        for step, entry in steps
-                    ],
-                },
-                now=clock,
-            )
-            with session:
-                for step, entry in steps:
-                    _commit(session, step, entry, clock)
-                session.close()
-    except SessionDiskError as exc:
-        raise SessionDiskError(
-            exc.what,
-            where=str(target),
-            advice="Free space or name another folder, then import again; nothing was kept.",
-        ) from exc
+    with imported_session(target, plan, used, subject, extra, clock) as session:
+        for step, entry in steps:
+            _commit(session, step, entry, clock)
     states = tuple(dict.fromkeys(str(step.index["state"]) for step, _ in steps))
-    color = {str(step.index["state"]) for step, entry in steps if entry.pattern != "MONO"}
+    color = {str(step.index["state"]) for step, entry in steps if entry.view.cfa != "MONO"}
     return Imported(
         str(target),
         len(steps),
@@ -220,20 +196,9 @@ def _inspect(files: Sequence[Path]) -> list[_Entry]:
 
 def _entry(file: Path, photo: Photo) -> _Entry:
     frame = photo.frame
-    height, width = frame.cfa.shape
-    return _Entry(
-        file=file,
-        sha256=f"sha256:{hashlib.sha256(file.read_bytes()).hexdigest()}",
-        encoding=photo.encoding,
-        model=frame.camera_model or "unknown camera",
-        pattern=frame.pattern,
-        shape=(height, width),
-        levels=(round(sum(frame.black) / len(frame.black)), frame.white),
-        focal_mm=frame.focal_mm,
-        exposure_s=frame.exposure_s,
-        iso=frame.iso,
-        notes=photo.notes,
-    )
+    sha256 = f"sha256:{hashlib.sha256(file.read_bytes()).hexdigest()}"
+    view = stand_in_view(frame, analyser_axis_deg=0.0)
+    return _Entry(file, sha256, photo.encoding, view, frame.exposure_s, frame.iso, photo.notes)
 
 
 def _rig(
@@ -246,67 +211,48 @@ def _rig(
     """Return the session's rig and the view of every photograph."""
     if rig is not None:
         view = rig.views[0]
-        wanted = (view.cfa, (view.height_px, view.width_px))
+        wanted = f"raw {view.width_px} x {view.height_px} {view.cfa}"
         for entry in entries:
-            if entry.encoding != "raw" or (entry.pattern, entry.shape) != wanted:
-                got = f"{entry.encoding} {entry.shape[1]} x {entry.shape[0]} {entry.pattern}"
+            own = entry.view
+            got = f"{entry.encoding} {own.width_px} x {own.height_px} {own.cfa}"
+            if got != wanted:
                 raise PhotoError(
                     "was not taken by this rig's camera",
                     where=str(entry.file),
-                    faults=[
-                        Fault("picture", got, f"raw {view.width_px} x {view.height_px} {view.cfa}")
-                    ],
+                    faults=[Fault("picture", got, wanted)],
                     advice="Import it without a rig.",
                 )
         return rig, [view.name] * len(entries)
     cameras = list(dict.fromkeys(entry.camera for entry in entries))
     names = {camera: "cam" if k == 0 else f"cam{k + 1}" for k, camera in enumerate(cameras)}
     first = {entry.camera: entry for entry in reversed(entries)}
+    views = tuple(
+        replace(
+            first[camera].view,
+            name=name,
+            serial=serial,
+            spectral_sensitivity=sensitivity
+            or (RAW_CURVES if first[camera].encoding == "raw" else IMAGE_CURVES),
+        )
+        for camera, name in names.items()
+    )
     made = Rig(
         name=IMPORTED_RIG_NAME,
         lights=(
             Light(
                 name="unknown",
-                position_mm=(0.0, 0.0, _DISTANCE_MM),
+                position_mm=(0.0, 0.0, DISTANCE_MM),
                 illuminant=illuminant,
                 polarizer_axis_deg=0.0,
                 energy_ws=1.0,
                 radius_mm=1.0,
             ),
         ),
-        views=tuple(_view(names[c], first[c], serial, sensitivity) for c in cameras),
+        views=views,
         boxes=(),
         recycle_s=0.0,
     )
     return made, [names[entry.camera] for entry in entries]
-
-
-def _view(name: str, entry: _Entry, serial: str, sensitivity: str | None) -> View:
-    height, width = entry.shape
-    black, white = entry.levels
-    return View(
-        name=name,
-        camera_model=entry.model,
-        serial=serial,
-        position_mm=(0.0, 0.0, _DISTANCE_MM),
-        target_mm=(0.0, 0.0, 0.0),
-        up=(0.0, 1.0, 0.0),
-        focal_mm=entry.focal_mm or 50.0,
-        pixel_um=1e3 * _SENSOR_MM / width,
-        width_px=width,
-        height_px=height,
-        f_number=8.0,
-        readout_s=0.0,
-        bit_depth=min(max(white.bit_length(), 8), 16),
-        cfa=entry.pattern,  # type: ignore[arg-type]
-        black_level=black,
-        white_level=white,
-        spectral_sensitivity=sensitivity
-        or (RAW_CURVES if entry.encoding == "raw" else IMAGE_CURVES),
-        analyser_axis_deg=0.0,
-        full_well_e=20_000.0,
-        read_noise_e=10.0,
-    )
 
 
 def _named(stem: str) -> tuple[str, str | None]:

@@ -1,7 +1,5 @@
 """Plans of the light dome: one light at a time at several exposures, and its targets."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Literal, get_args
@@ -11,7 +9,7 @@ import numpy as np
 from capture.plan.eye_light import eye_light
 from capture.plan.light_order import best_order
 from capture.plan.rows import LedRow
-from capture.plan.steps import Kind, Plan, Step, Value, require
+from capture.plan.steps import Index, Kind, Plan, StepSeries, Value, require
 from capture.rig import LedLimits, Rig
 
 DomeTarget = Literal["charuco", "mirror", "white", "dark"]
@@ -97,7 +95,7 @@ def dome_plan(
             if tracking_every and place % tracking_every == 0:
                 series.tracking(number, place, exposure_s, shown[max(place - 1, 0)], level)
             name = rig.lights[light].name
-            series.add(
+            series.expose(
                 f"{name}-{number}",
                 "olat",
                 {"light": name, "exposure": number, "pass": number},
@@ -184,7 +182,7 @@ def dome_calibration_plan(
         for light in order:
             name = rig.lights[light].name
             if normal is None or _cosine(rig.lights[light].position_mm, normal) > MIN_PLATE_COSINE:
-                series.add(
+                series.expose(
                     f"W{pose}-{name}",
                     "white",
                     {"pose": pose, "light": name},
@@ -214,13 +212,12 @@ def tracking_lights(rig: Rig) -> list[int]:
     return sorted(chosen)
 
 
-class _Series:
+class _Series(StepSeries):
     """Steps being numbered, for all views of one dome."""
 
     def __init__(self, rig: Rig, *, frames_per_s: float, iso: int) -> None:
         require(rig.leds is not None, "rig", rig.name, "one with LEDs and their limits")
         require(frames_per_s > 0, "frames_per_s", frames_per_s, "> 0")
-        self._rig = rig
         self._limits = rig.leds or LedLimits()
         # the box counts microseconds
         self.dwell_s = round(1e6 / frames_per_s) / 1e6
@@ -228,18 +225,12 @@ class _Series:
         require(
             self.dwell_s <= most_s, "frames_per_s", frames_per_s, f"at least {1.0 / most_s:g} 1/s"
         )
-        self._iso = iso
-        self._steps: list[Step] = []
+        super().__init__(rig, iso=iso, dwell_s=self.dwell_s)
         self._tracking = tracking_lights(rig)
         self._eye = eye_light(rig)
 
-    def add(
-        self,
-        identity: str,
-        kind: Kind,
-        index: dict[str, str | int | float],
-        exposure_s: float,
-        **settings: Value,
+    def expose(
+        self, identity: str, kind: Kind, index: Index, exposure_s: float, **settings: Value
     ) -> None:
         level = float(settings.get("level", 0.0))
         require(0 <= level <= 1, "level", level, "0 to 1")
@@ -255,19 +246,13 @@ class _Series:
             exposure_s,
             f"to fit with read-out {readout_s:g} s into {self.dwell_s:g} s a light",
         )
-        cameras = tuple(view.name for view in self._rig.views)
-        every: dict[str, Value] = {
-            "exposure_s": float(exposure_s),
-            "iso": self._iso,
-            "dwell_s": self.dwell_s,
-        }
-        self._steps.append(Step(identity, kind, index, {**settings, **every}, cameras))
+        self.add(identity, kind, index, exposure_s=float(exposure_s), **settings)
 
     def darks(self, count: int, exposure_s: float, number: int) -> None:
         for repeat in range(count):
-            index: dict[str, str | int | float] = {"repeat": repeat, "exposure": number}
+            index: Index = {"repeat": repeat, "exposure": number}
             identity = f"D{number}-{repeat:02d}"
-            self.add(identity, "dark", index, exposure_s, light="none", level=0.0)
+            self.expose(identity, "dark", index, exposure_s, light="none", level=0.0)
 
     def tracking(
         self, number: int, after: int, exposure_s: float, before: int, level: float
@@ -291,7 +276,7 @@ class _Series:
         self,
         identity: str,
         kind: Kind,
-        index: dict[str, str | int | float],
+        index: Index,
         exposure_s: float,
         level: float,
         number: int | None = None,
@@ -304,7 +289,7 @@ class _Series:
         level = min(most, max(1.0, np.ceil(LEVEL_STEPS * level)) / LEVEL_STEPS)
         names = "+".join(self._rig.lights[k].name for k in self._tracking)
         index = index if number is None else {**index, "pass": number}
-        self.add(identity, kind, index, exposure_s, leds=names, level=float(level))
+        self.expose(identity, kind, index, exposure_s, leds=names, level=float(level))
 
     def mirrors(self, count: int, order: Sequence[int], exposures_s: Sequence[float]) -> None:
         """Add the steps of mirror spheres: outlines by the lit dome, then lights by groups.
@@ -331,28 +316,19 @@ class _Series:
                 )
 
     def _lit(
-        self,
-        identity: str,
-        index: dict[str, str | int | float],
-        lights: Sequence[int],
-        exposure_s: float,
-        level: float,
+        self, identity: str, index: Index, lights: Sequence[int], exposure_s: float, level: float
     ) -> None:
         names = "+".join(self._rig.lights[k].name for k in lights)
-        self.add(identity, "mirror", index, exposure_s, leds=names, level=level)
+        self.expose(identity, "mirror", index, exposure_s, leds=names, level=level)
 
     def plan(self) -> Plan:
         limits = self._limits
-        return Plan(
-            self._rig.name,
-            tuple(self._steps),
-            {
-                "max_duty": limits.max_duty,
-                "max_on_s": limits.max_on_s,
-                "max_flashes_per_s": limits.max_flashes_per_s,
-                "max_flicker_rms": limits.max_flicker_rms,
-                "dose_ws": limits.dose_ws,
-            },
+        return self.plan_within(
+            max_duty=limits.max_duty,
+            max_on_s=limits.max_on_s,
+            max_flashes_per_s=limits.max_flashes_per_s,
+            max_flicker_rms=limits.max_flicker_rms,
+            dose_ws=limits.dose_ws,
         )
 
 

@@ -5,8 +5,6 @@ The blue-light limit of a source that somebody stares at is a weighted radiance 
 as blue, which no spectrum exceeds, so the figure is an upper bound. A laboratory must measure.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -8,8 +8,6 @@ In the gradient sphere a patch of skin is at the origin and the eyes are somewhe
 a sixth of the way to the lights: they are taken at the patch.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

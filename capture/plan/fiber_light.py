@@ -8,8 +8,6 @@ within 1e4 s (IEC 62471:2006, section 4.3.3), of which here all light counts as 
 must measure.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

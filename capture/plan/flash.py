@@ -1,11 +1,19 @@
 """Plans of the flash rig: a subject in several states, and the calibration targets."""
 
-from __future__ import annotations
-
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from typing import Literal, get_args
 
-from capture.plan.steps import POLARIZER_STATES, Kind, Plan, Polarizer, Step, Value, require
+from capture.plan.steps import (
+    POLARIZER_STATES,
+    Index,
+    Kind,
+    Plan,
+    Polarizer,
+    StepSeries,
+    Value,
+    require,
+)
 from capture.rig import Rig
 
 Target = Literal["dark", "flat", "chart", "malus"]
@@ -78,9 +86,8 @@ def flash_plan(
         order = [(state, repeat) for repeat in range(repeats) for state in states]
     for state, repeat in order:
         for polarizer in pair:
-            index: dict[str, str | int | float] = {"state": state, "polarizer": polarizer}
-            index["repeat"] = repeat
-            series.add("S", "subject", index, polarizer=polarizer, power=power)
+            index: Index = {"state": state, "polarizer": polarizer, "repeat": repeat}
+            series.number("S", "subject", index, polarizer=polarizer, power=power)
         pair.reverse()
     return series.plan()
 
@@ -139,32 +146,26 @@ def flash_calibration_plan(
         ]
     for index, settings in conditions:
         for repeat in range(repeats):
-            series.add(target[0].upper(), target, {**index, "repeat": repeat}, **settings)
+            series.number(target[0].upper(), target, {**index, "repeat": repeat}, **settings)
     return series.plan()
 
 
-class _Series:
+class _Series(StepSeries):
     """Steps being numbered, for all views of one rig at one exposure."""
 
     def __init__(self, rig: Rig, *, exposure_s: float, iso: int) -> None:
-        self._rig = rig
-        self._exposure: dict[str, Value] = {"exposure_s": exposure_s, "iso": iso}
-        self._steps: list[Step] = []
-        self._counts: dict[str, int] = {}
+        super().__init__(rig, exposure_s=exposure_s, iso=iso)
+        self._counts: Counter[str] = Counter()
 
-    def add(
-        self, letter: str, kind: Kind, index: Mapping[str, str | int | float], **settings: Value
-    ) -> None:
-        number = self._counts.get(letter, 0)
-        self._counts[letter] = number + 1
-        cameras = tuple(view.name for view in self._rig.views)
-        identity = f"{letter}{number:03d}"
-        self._steps.append(Step(identity, kind, index, {**settings, **self._exposure}, cameras))
+    def number(self, letter: str, kind: Kind, index: Index, **settings: Value) -> None:
+        """Add a step that is named by a letter and its number among those of that letter."""
+        self.add(f"{letter}{self._counts[letter]:03d}", kind, index, **settings)
+        self._counts[letter] += 1
 
     def darks(self, count: int) -> None:
         for repeat in range(count):
-            self.add("D", "dark", {"repeat": repeat}, polarizer="parallel", power=0.0)
+            self.number("D", "dark", {"repeat": repeat}, polarizer="parallel", power=0.0)
 
     def plan(self) -> Plan:
-        limits = {"max_pops_per_min": self._rig.max_pops_per_min, "recycle_s": self._rig.recycle_s}
-        return Plan(self._rig.name, tuple(self._steps), limits)
+        rig = self._rig
+        return self.plan_within(max_pops_per_min=rig.max_pops_per_min, recycle_s=rig.recycle_s)

@@ -8,8 +8,6 @@ the maximum, counted in the worst second, and the rms of its 3 to 65 Hz part ove
 These are planning figures, not a medical certificate.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ complete each other stand side by side, so that the light flickers little and sk
 moved little between x and -x.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 from typing import Literal, get_args
@@ -15,7 +13,15 @@ from typing import Literal, get_args
 import numpy as np
 
 from capture.plan.rows import led_rows, passes
-from capture.plan.steps import LIGHT_PATTERNS, POLARIZER_STATES, Kind, Plan, Step, Value, require
+from capture.plan.steps import (
+    LIGHT_PATTERNS,
+    POLARIZER_STATES,
+    Plan,
+    Step,
+    StepSeries,
+    Value,
+    require,
+)
 from capture.rig import Caliper, LedLimits, Rig
 
 GradientTarget = Literal["ball", "dark", "flat"]
@@ -40,8 +46,6 @@ BALL_DARK_S = 0.4
 """Darkness between two readings: eyes nearby then see fewer than three flashes a second."""
 FLAT_LEVELS = (0.03, 0.06, 0.11, 0.17, 0.23, 0.34, 0.45, 0.57, 0.7, 0.85)
 """Levels of the photon transfer series: dense in the shadows, and near full scale at the end."""
-
-_Index = dict[str, str | int | float]
 
 
 def state_name(angle_deg: float, step: int) -> str:
@@ -304,7 +308,7 @@ def _ordered(patterns: Sequence[str]) -> list[str]:
     return sorted(chosen, key=SCAN_ORDER.index)
 
 
-class _Series:
+class _Series(StepSeries):
     """Steps being collected, for all views of one rig at one exposure."""
 
     def __init__(self, rig: Rig, *, exposure_s: float, dwell_s: float, iso: int) -> None:
@@ -320,30 +324,13 @@ class _Series:
             exposure_s,
             f"to fit with read-out {readout_s:g} s into {dwell_s:g} s a pattern",
         )
-        self._rig = rig
+        super().__init__(rig, exposure_s=float(exposure_s), dwell_s=float(dwell_s), iso=iso)
         self._limits = limits
-        self._cameras = tuple(view.name for view in rig.views)
-        self._every: dict[str, Value] = {
-            "exposure_s": float(exposure_s),
-            "dwell_s": float(dwell_s),
-            "iso": iso,
-        }
-        self._steps: list[Step] = []
-
-    def add(self, identity: str, kind: Kind, index: _Index, **settings: Value) -> None:
-        step = Step(identity, kind, index, {**self._every, **settings}, self._cameras)
-        self._steps.append(step)
 
     def darks(self, count: int) -> None:
         for repeat in range(count):
-            self.add(
-                f"D{repeat:03d}",
-                "dark",
-                {"repeat": repeat},
-                pattern="dark",
-                polarizer="parallel",
-                level=0.0,
-            )
+            dark: dict[str, Value] = {"pattern": "dark", "polarizer": "parallel", "level": 0.0}
+            self.add(f"D{repeat:03d}", "dark", {"repeat": repeat}, **dark)
 
     def plan(self) -> Plan:
         """Return the plan; a piece of it that asks too much of an LED is refused."""
@@ -360,8 +347,6 @@ class _Series:
             f"{most:.3f} over {limits.duty_window_s:g} s",
             f"at most {limits.max_duty:g}: less level, shorter light or fewer patterns",
         )
-        return Plan(
-            self._rig.name,
-            tuple(self._steps),
-            {"max_duty": limits.max_duty, "max_on_s": limits.max_on_s, "dose_ws": limits.dose_ws},
+        return self.plan_within(
+            max_duty=limits.max_duty, max_on_s=limits.max_on_s, dose_ws=limits.dose_ws
         )

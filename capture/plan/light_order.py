@@ -4,8 +4,6 @@ All orders begin and end where the eyes see least, because a piece of a plan beg
 Which order is best is not decided here by rule but measured, see `best_order`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 

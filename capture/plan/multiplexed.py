@@ -10,8 +10,6 @@ Periods are taken as the decimals they are written with, and counted as fraction
 sequence meets is a question of common measures, which rounded numbers do not have.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from fractions import Fraction

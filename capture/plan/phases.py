@@ -4,10 +4,7 @@ Periods are taken as the decimals they are written with, and counted as fraction
 sequence meets is a question of common measures, which rounded numbers do not have.
 """
 
-from __future__ import annotations
-
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
@@ -122,29 +119,6 @@ def equivalent_period_s(
     raise AssertionError("a whole cycle more meets the same phases")  # pragma: no cover
 
 
-def period_for(prompt_period_s: Seconds, interval_s: Seconds, read_out_s: Seconds) -> Fraction:
-    """Return the shortest period a camera can keep that samples a cycle every ``interval_s``, s.
-
-    Examples
-    --------
-    >>> float(period_for(5, 0.5, 5.5)), float(period_for(5, "0.25", 5.5))
-    (5.5, 5.75)
-
-    Raises
-    ------
-    PlanError
-        Where the interval is no whole part of the cycle.
-    """
-    cycle, interval = 2 * exact(prompt_period_s), exact(interval_s)
-    whole = interval > 0 and (cycle / interval).denominator == 1
-    require(whole, "interval_s", interval_s, f"a whole part of the cycle of {float(cycle):g} s")
-    phases = int(cycle / interval)
-    steps = max(1, math.ceil(exact(read_out_s) / interval))
-    while math.gcd(steps, phases) != 1:
-        steps += 1
-    return steps * interval
-
-
 @dataclass(frozen=True, slots=True)
 class Phases:
     """Which phases of its cycle a sequence covers."""
@@ -229,31 +203,6 @@ largest gap 0.25 s
 def timed_steps(plan: Plan) -> tuple[Step, ...]:
     """Return the steps of a plan that are to be taken at a time."""
     return tuple(step for step in plan.steps if "start_s" in step.settings)
-
-
-def reorder(plan: Plan, *, phases_s: Mapping[str, float] | None = None) -> tuple[Step, ...]:
-    """Return the shots of a multiplexed plan in the order of their phases.
-
-    Parameters
-    ----------
-    plan : Plan
-    phases_s : mapping of str to float, optional
-        Phase, s, at which each step was really taken, by its id; steps that it lacks are left
-        out. Without it, as planned.
-
-    Examples
-    --------
-    >>> from capture.plan.multiplexed import multiplexed_plan
-    >>> from capture.rig import load_rig
-    >>> plan = multiplexed_plan(load_rig("flash"))
-    >>> [(s.index["number"], s.index["phase_s"]) for s in reorder(plan)[:4]]
-    [(0, 0.0), (20, 0.0), (11, 0.5), (2, 1.0)]
-    """
-    shots: Sequence[Step] = timed_steps(plan)
-    if phases_s is not None:
-        known = [step for step in shots if step.id in phases_s]
-        return tuple(sorted(known, key=lambda step: phases_s[step.id]))
-    return tuple(sorted(shots, key=lambda step: float(step.index["phase_s"])))
 
 
 def _common_measure(a: Fraction, b: Fraction) -> Fraction:

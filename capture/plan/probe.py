@@ -6,13 +6,11 @@ placement of the head. A pump holds the head on the skin for as long as skin bea
 rest; what does not fit into that time follows after the rest, with the head where it was.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 from typing import Literal, get_args
 
-from capture.plan.steps import Kind, Plan, Step, Value, require
+from capture.plan.steps import Kind, Plan, Step, StepSeries, require
 from capture.plan.suction import Placement, placement_of
 from capture.rig import Probe, Rig, is_id
 
@@ -215,7 +213,7 @@ def all_series(plan: Plan) -> Iterator[tuple[Placement, tuple[Step, ...]]]:
             yield placement, tuple(group)
 
 
-class _Series:
+class _Series(StepSeries):
     """Steps being collected, for the one camera of a probe."""
 
     def __init__(
@@ -223,7 +221,6 @@ class _Series:
     ) -> None:
         require(rig.probe is not None, "rig", rig.name, "one with a probe")
         self._probe: Probe = rig.probe  # type: ignore[assignment]
-        self._rig = rig
         probe = self._probe
         require(brackets >= 2, "brackets", brackets, ">= 2")
         require(step_ev > 0, "step_ev", step_ev, "stops > 0")
@@ -237,41 +234,28 @@ class _Series:
         )
         require(0 < level <= 1, "level", level, "0 < level <= 1")
         self._exposures_s = exposure_series_s(brackets, longest_s=longest_s, step_ev=step_ev)
-        self._level, self._iso = float(level), iso
-        self._cameras = tuple(view.name for view in rig.views)
-        self._steps: list[Step] = []
-
-    def _add(
-        self,
-        identity: str,
-        kind: Kind,
-        index: dict[str, str | int | float],
-        exposure_s: float,
-        **settings: Value,
-    ) -> None:
-        every: dict[str, Value] = {"exposure_s": exposure_s, "level": self._level, "iso": self._iso}
-        self._steps.append(Step(identity, kind, index, {**every, **settings}, self._cameras))
+        super().__init__(rig, level=float(level), iso=iso)
 
     def darks(self, count: int) -> None:
         require(count >= 0, "darks", count, ">= 0")
         last = len(self._exposures_s) - 1
         for bracket in dict.fromkeys(round(share * last) for share in DARK_POSITIONS):
             for repeat in range(count):
-                self._add(
+                self.add(
                     f"dark-b{bracket:02d}-r{repeat}",
                     "dark",
                     {"bracket": bracket, "repeat": repeat},
-                    self._exposures_s[bracket],
+                    exposure_s=self._exposures_s[bracket],
                     level=0.0,
                 )
 
     def measure(self, kind: Kind, site: str, repeat: int, angle_deg: float) -> None:
         for bracket, exposure_s in enumerate(self._exposures_s):
-            self._add(
+            self.add(
                 f"{site}-r{repeat}-a{_angle_text(angle_deg)}-b{bracket:02d}",
                 kind,
                 {"site": site, "repeat": repeat, "angle": _whole(angle_deg), "bracket": bracket},
-                exposure_s,
+                exposure_s=exposure_s,
                 suction_mbar=self._probe.suction_mbar,
             )
 
@@ -280,11 +264,11 @@ class _Series:
         exposures_s = [t for t in self._exposures_s if t <= longest_s][::-MASK_INTERVAL][::-1]
         for fibre in range(len(self._probe.fibres)):
             for bracket, exposure_s in enumerate(exposures_s):
-                self._add(
+                self.add(
                     f"mask-f{fibre:02d}-b{bracket}",
                     "mask",
                     {"fibre": fibre, "bracket": bracket},
-                    exposure_s,
+                    exposure_s=exposure_s,
                     suction_mbar=self._probe.suction_mbar,
                     fibre=fibre,
                 )

@@ -1,7 +1,5 @@
 """Rows of light: what the steps of a plan ask of a rig's LEDs, one after the other."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache

@@ -19,11 +19,13 @@ from capture.documents import (
     parse,
     read_json,
     shown,
+    table_of,
 )
 from capture.plan.suction import held_s
 from capture.rig import ID_RULE, Rig, is_id
 
 Value = str | int | float | bool
+Index = Mapping[str, str | int | float]
 Kind = Literal[
     "dark",
     "flat",
@@ -112,7 +114,7 @@ class Step:
 
     id: str
     kind: Kind
-    index: Mapping[str, str | int | float]
+    index: Index
     settings: Mapping[str, Value]
     cameras: tuple[str, ...]
 
@@ -142,13 +144,7 @@ class Step:
 
     def to_json(self) -> dict[str, Any]:
         """Return the step as JSON values."""
-        return {
-            "id": self.id,
-            "kind": self.kind,
-            "index": dict(self.index),
-            "settings": dict(self.settings),
-            "cameras": list(self.cameras),
-        }
+        return table_of(self)
 
 
 def _check_settings(settings: Mapping[str, Value]) -> list[Fault]:
@@ -268,11 +264,7 @@ class Plan:
 
     def to_json(self) -> dict[str, Any]:
         """Return the plan as JSON values."""
-        return {
-            "rig": self.rig,
-            "steps": [step.to_json() for step in self.steps],
-            "limits": dict(self.limits),
-        }
+        return table_of(self)
 
     @staticmethod
     def from_json(data: Mapping[str, Any] | str | bytes, *, where: str = "plan") -> Plan:
@@ -286,6 +278,32 @@ class Plan:
         if isinstance(data, str | bytes):
             data = read_json(data, where=where, error=PlanError)
         return parse(Plan, data, where=where, error=PlanError)
+
+
+class StepSeries:
+    """Steps being collected, for all views of one rig.
+
+    Parameters
+    ----------
+    rig
+        The rig.
+    **every
+        Settings of every step that does not say otherwise.
+    """
+
+    def __init__(self, rig: Rig, **every: Value) -> None:
+        self._rig, self._every = rig, every
+        self._cameras = tuple(view.name for view in rig.views)
+        self._steps: list[Step] = []
+
+    def add(self, identity: str, kind: Kind, index: Index, **settings: Value) -> None:
+        """Add a step with settings of its own."""
+        settings = {**self._every, **settings}
+        self._steps.append(Step(identity, kind, index, settings, self._cameras))
+
+    def plan_within(self, **limits: float) -> Plan:
+        """Return the plan of the steps."""
+        return Plan(self._rig.name, tuple(self._steps), limits)
 
 
 def require(good: bool, name: str, got: object, expected: str) -> None:

@@ -1,7 +1,5 @@
 """How long a head is held by suction: which steps share a placement, and where skin has a rest."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol

@@ -5,8 +5,6 @@ References
 Digital Negative (DNG) Specification 1.6, Adobe, 2021; EXIF 2.32, CIPA DC-008, 2019.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import struct

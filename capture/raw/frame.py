@@ -1,7 +1,5 @@
 """One raw frame in memory: sensor values and what is needed to understand them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

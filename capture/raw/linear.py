@@ -1,7 +1,5 @@
 """From DN to linear camera RGB with the variance that shot and read noise leave in it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

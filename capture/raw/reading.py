@@ -1,7 +1,5 @@
 """Raw files of any make: ours by our own reader, all others through LibRaw."""
 
-from __future__ import annotations
-
 import mmap
 from pathlib import Path
 from typing import Any

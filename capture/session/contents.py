@@ -1,7 +1,5 @@
 """Reading a session folder: the manifest, the journal, and what they say about each other."""
 
-from __future__ import annotations
-
 import os
 import stat
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Reading needs no such care and is one function.
 """
 
-from __future__ import annotations
-
 import fcntl
 import os
 import stat

@@ -1,7 +1,5 @@
 """What can be wrong with a session."""
 
-from __future__ import annotations
-
 from capture.documents import InputError
 
 

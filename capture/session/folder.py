@@ -1,7 +1,5 @@
 """The folder of a session made and put in order, one disk operation after the other."""
 
-from __future__ import annotations
-
 import logging
 import os
 from pathlib import Path

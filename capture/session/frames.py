@@ -1,7 +1,5 @@
 """Committed frames and attachments as they are asked for and checked."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ of RECORD; the first is chained to the seal of session.json. So a line of anothe
 left out, and any changed byte are found, and a line cut by a crash can only be the last.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 from collections.abc import Mapping
@@ -15,7 +13,16 @@ from typing import Any, ClassVar
 
 from pydantic import ConfigDict
 
-from capture.documents import STRICT_CONFIG, Checks, Fault, canonical_json, parse, read_json, shown
+from capture.documents import (
+    STRICT_CONFIG,
+    Checks,
+    Fault,
+    canonical_json,
+    parse,
+    read_json,
+    shown,
+    table_of,
+)
 from capture.plan import Value
 from capture.rig import ID_RULE, is_id
 from capture.session.errors import SessionDamage
@@ -58,22 +65,6 @@ class FrameLine:
         checks.that("xxh128", self.xxh128, good, "32 hexadecimal digits")
         checks.close()
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the line's record."""
-        return {
-            "type": "frame",
-            "step": self.step,
-            "camera": self.camera,
-            "attempt": self.attempt,
-            "file": self.file,
-            "bytes": self.bytes,
-            "xxh128": self.xxh128,
-            "settings": dict(self.settings),
-            "actual": dict(self.actual),
-            "t_box_s": self.t_box_s,
-            "t_host_s": self.t_host_s,
-        }
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AttachmentLine:
@@ -99,17 +90,6 @@ class AttachmentLine:
         checks.that("xxh128", self.xxh128, good, "32 hexadecimal digits")
         checks.close()
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the line's record."""
-        return {
-            "type": "attachment",
-            "name": self.name,
-            "file": self.file,
-            "bytes": self.bytes,
-            "xxh128": self.xxh128,
-            "about": dict(self.about),
-        }
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LeftOutLine:
@@ -133,16 +113,6 @@ class LeftOutLine:
         checks.that("reason", self.reason, bool(self.reason.strip()), "a text")
         checks.close()
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the line's record."""
-        return {
-            "type": "left_out",
-            "steps": list(self.steps),
-            "reason": self.reason,
-            "about": dict(self.about),
-            "t_host_s": self.t_host_s,
-        }
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CloseLine:
@@ -156,17 +126,14 @@ class CloseLine:
     reason: str
     """Why they were not, empty where none is missing."""
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the line's record."""
-        return {
-            "type": "close",
-            "frames": self.frames,
-            "missing": list(self.missing),
-            "reason": self.reason,
-        }
-
 
 Line = FrameLine | AttachmentLine | LeftOutLine | CloseLine
+_LINE_KINDS: Mapping[str, type[Any]] = {
+    "frame": FrameLine,
+    "attachment": AttachmentLine,
+    "left_out": LeftOutLine,
+    "close": CloseLine,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,7 +193,8 @@ def attachment_file(name: str) -> str:
 
 def seal_line(previous: str, line: Line) -> tuple[bytes, str]:
     """Return the bytes of the line that follows ``previous``, and its hash."""
-    record = canonical_json(line.to_json())
+    kind = next(name for name, known in _LINE_KINDS.items() if isinstance(line, known))
+    record = canonical_json({"type": kind, **table_of(line)})
     digest = hashlib.sha256(previous.encode("ascii") + record).hexdigest()
     return b'{"h":"' + digest.encode("ascii") + b'","r":' + record + b"}\n", digest
 
@@ -274,14 +242,8 @@ def _unseal(text: bytes, head: str, where: str) -> tuple[Line | None, str]:
             return None, digest
         got = shown(content.get("h"))
         raise _damage(where, None, "hash", got, f"{digest}: the line is not what was written")
-    if kind == "frame":
-        return parse(FrameLine, record, where=where, error=SessionDamage), digest
-    if kind == "attachment":
-        return parse(AttachmentLine, record, where=where, error=SessionDamage), digest
-    if kind == "left_out":
-        return parse(LeftOutLine, record, where=where, error=SessionDamage), digest
-    if kind == "close":
-        return parse(CloseLine, record, where=where, error=SessionDamage), digest
+    if isinstance(kind, str) and kind in _LINE_KINDS:
+        return parse(_LINE_KINDS[kind], record, where=where, error=SessionDamage), digest
     raise _damage(where, None, "type", shown(kind), '"frame", "attachment", "left_out" or "close"')
 
 

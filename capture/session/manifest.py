@@ -1,7 +1,5 @@
 """session.json: who, what, with which rig and plan; written once, sealed in every byte."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import platform
@@ -15,7 +13,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from pydantic import ConfigDict
 
-from capture.documents import STRICT_CONFIG, Checks, Fault, parse, read_json
+from capture.documents import STRICT_CONFIG, Checks, Fault, parse, read_json, table_of
 from capture.plan import Plan
 from capture.rig import ID_RULE, Rig, is_id
 from capture.session.errors import SessionDamage, SessionError
@@ -116,27 +114,7 @@ class Manifest:
 
     def to_json(self) -> dict[str, Any]:
         """Return the manifest as JSON values, schema included, without the seal."""
-        expires = self.subject.consent_expires
-        return {
-            "schema": SCHEMA,
-            "id": self.id,
-            "created_at": self.created_at.isoformat(),
-            "source": self.source,
-            "subject": {
-                "pseudonym": self.subject.pseudonym,
-                "consent_scope": list(self.subject.consent_scope),
-                "consent_expires": None if expires is None else expires.isoformat(),
-            },
-            "plan": self.plan.to_json(),
-            "rig": self.rig.to_json(),
-            "devices": dict(self.devices),
-            "calibrations": [
-                {"kind": c.kind, "sha256": c.sha256, "path": c.path} for c in self.calibrations
-            ],
-            "seed": self.seed,
-            "versions": dict(self.versions),
-            "extra": dict(self.extra),
-        }
+        return {"schema": SCHEMA, **table_of(self)}
 
     def encode(self) -> tuple[bytes, str]:
         """Return the bytes of session.json and the seal that the journal starts from."""

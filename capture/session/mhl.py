@@ -9,8 +9,6 @@ ASC Media Hash List 2.0, American Society of Cinematographers, schemas urn:ASC:M
 urn:ASC:MHL:DIRECTORY:v2.0; C4 ID: SMPTE ST 2114:2017, doi 10.5594/SMPTE.ST2114.2017.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """A closed session is never modified; what must be added goes into a copy that is open again."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from capture.documents import Fault

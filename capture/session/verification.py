@@ -1,7 +1,5 @@
 """Recompute everything a session says about itself, and name what is not so."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from datetime import UTC, date, datetime

@@ -1,29 +1,47 @@
 """What a session can be asked, whether it is being written or only read."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from datetime import UTC, date, datetime
 from pathlib import Path
-from typing import Literal
 
 from capture import raw
 from capture.documents import Fault, shown
-from capture.plan import Plan, Step
-from capture.rig import Rig
+from capture.plan import Step
 from capture.session.contents import Contents
 from capture.session.errors import ConsentError, SessionDamage, SessionError
 from capture.session.frames import FrameRecord, check_file
 from capture.session.journal import AttachmentLine, FrameLine, LeftOutLine
-from capture.session.manifest import ANY_USE, Manifest, Subject
+from capture.session.manifest import ANY_USE
 
 
 class SessionView:
-    """Plan, frames, consent and provenance of one session."""
+    """Plan, frames, consent and provenance of one session.
+
+    Attributes
+    ----------
+    path : Path
+        Its folder.
+    manifest : Manifest
+        All that was known when the session began.
+    id : str
+        Name of the session, written into each of its frames.
+    plan : Plan
+        What was to be captured.
+    rig : Rig
+        The nominal rig, resized as it was used.
+    source : {"measured", "simulated"}
+        Whether light or a simulation made the frames.
+    subject : Subject
+        Who was captured.
+    seed : int or None
+        Seed of the simulation, None for a measured session.
+    """
 
     def __init__(self, path: Path, contents: Contents) -> None:
         self.path = path
-        self._contents = contents
+        self.manifest = manifest = contents.manifest
+        self.id, self.plan, self.rig = manifest.id, manifest.plan, manifest.rig
+        self.source, self.subject, self.seed = manifest.source, manifest.subject, manifest.seed
         self._head = contents.walk.head
         self._close_line = contents.close_line
         self._lines: dict[tuple[str, str], list[FrameLine]] = {}
@@ -156,41 +174,6 @@ class SessionView:
             faults = [Fault("scope", shown(scope), expected)]
             advice = "Ask the subject again, or keep the data inside the agreed scope."
             raise ConsentError(what, where=str(self.path), faults=faults, advice=advice)
-
-    @property
-    def id(self) -> str:
-        """Name of the session, written into each of its frames."""
-        return self._contents.manifest.id
-
-    @property
-    def manifest(self) -> Manifest:
-        """All that was known when the session began."""
-        return self._contents.manifest
-
-    @property
-    def plan(self) -> Plan:
-        """What was to be captured."""
-        return self._contents.manifest.plan
-
-    @property
-    def rig(self) -> Rig:
-        """The nominal rig, resized as it was used."""
-        return self._contents.manifest.rig
-
-    @property
-    def source(self) -> Literal["measured", "simulated"]:
-        """Whether light or a simulation made the frames."""
-        return self._contents.manifest.source
-
-    @property
-    def subject(self) -> Subject:
-        """Who was captured."""
-        return self._contents.manifest.subject
-
-    @property
-    def seed(self) -> int | None:
-        """Seed of the simulation, None for a measured session."""
-        return self._contents.manifest.seed
 
     @property
     def closed(self) -> bool:

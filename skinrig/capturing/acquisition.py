@@ -15,7 +15,7 @@ from typing import Any
 from capture.acquire import Operator, run_plan
 from capture.devices.box import Box
 from capture.devices.camera import Camera, open_camera
-from capture.devices.dome import Eyes
+from capture.devices.led_box import Eyes
 from capture.plan import Plan
 from capture.rig import Rig
 from capture.session import Session, Subject

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import get_args
 
-from capture.devices.dome import Eyes
+from capture.devices.led_box import Eyes
 from skinrig.capturing.sequences import SequenceOrder
 from skinrig.errors import UsageError, one_of
 

@@ -68,9 +68,12 @@ def imported_aliases_with_none(tree):
     found = set()
     for node in tree.body:
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in PACKAGES:
-            path = ROOT.joinpath(*node.module.split(".")).with_suffix(".py")
-            there = aliases_of_module(path)
-            found |= {a.asname or a.name for a in node.names if a.name in there}
+            folder = ROOT.joinpath(*node.module.split("."))
+            there = aliases_of_module(folder.with_suffix(".py"))
+            for alias in node.names:
+                name = alias.asname or alias.name
+                found |= {name} if alias.name in there else set()
+                found |= {f"{name}.{n}" for n in aliases_of_module(folder / f"{alias.name}.py")}
     return found
 
 
@@ -108,9 +111,11 @@ def test_a_default_of_none_shows_in_the_annotation():
 
 def test_a_hidden_none_would_be_found():
     imports = "from skinrig.commands.options import Json, Site\n"
+    modules_alone = "from skinrig.commands import options\n"
     for code in (
         "def f(a: int = None, b: int | None = None): ...",
         imports + "def f(a: Json = None, b: Site = None): ...",
+        modules_alone + "def f(a: options.Json = None, b: options.Site = None): ...",
     ):
         assert none_defaults_without_none(ast.parse(code)) == ["f.a"]
 

@@ -14,7 +14,6 @@ LONG_MODULES = {
     "reconstruction/correspondence/common_parameterization.py": 484,
 }
 LONG_FUNCTIONS = {
-    "capture/calibration/fiber/discs.py:fit_disc": 81,
     "reconstruction/anisotropy/estimation.py:estimate": 96,
     "reconstruction/diffuse_albedo/estimation.py:estimate": 94,
     "reconstruction/photometric_stereo/kernels.py:_fit_points": 92,

@@ -247,12 +247,16 @@ def test_a_caliper_that_never_arrives_is_given_up(alone, monkeypatch):
 def test_an_end_of_another_move_is_no_answer(alone):
     _, box = alone()
     ready(box)
+    said, ask = {"CAL:HOME": "7"}, box._port.ask
+    box._port.ask = lambda text: said.get(text) or ask(text)
     with pytest.raises(BadAnswer, match="the end of move 7"):
-        box._finish("7")
+        box.home()
+    said["CAL:HOME"] = "x"
     with pytest.raises(BadAnswer, match="number of the move"):
-        box._finish("x")
+        box.home()
+    said["CAL:LAST?"] = "1,MELTED,0,8.0,0.0,5"
     with pytest.raises(BadAnswer, match=r"number,END,step,mm,N,us"):
-        box._report("CAL:LAST?", "1,MELTED,0,8.0,0.0,5")
+        box.last_move()
     box.close()
 
 

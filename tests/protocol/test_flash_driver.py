@@ -2,7 +2,7 @@
 
 import pytest
 
-from capture.devices.flash import FlashBox, FlashReport, find_box
+from capture.devices.flash import FlashBox, FlashReport
 from capture.devices.port import (
     BadAnswer,
     BoxRebooted,
@@ -184,14 +184,6 @@ def test_another_serial_number_is_another_box(bench):
     with pytest.raises(WrongDevice, match=r"FL-0001.*expected FL-0002"):
         bench.box(serial="FL-0002")
     assert bench.box(serial="FL-0001").identity.serial == "FL-0001"
-
-
-def test_a_box_is_found_by_its_serial_number(bench, tmp_path):
-    urls = [str(tmp_path / "ttyUSB0"), bench.addresses["flash"]]
-    with find_box(urls, "FL-0001") as box:
-        assert box.identity.serial == "FL-0001"
-    with pytest.raises(WrongDevice, match="looked at"):
-        find_box(urls, "FL-0007")
 
 
 def test_a_reset_box_is_not_driven_on_old_assumptions(bench):

@@ -1,7 +1,5 @@
 """Run a plan on the flash rig: one pop a step, its frame believed or the step shot again."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

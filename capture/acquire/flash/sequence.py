@@ -12,8 +12,6 @@ and counts its time on as if no time had passed in between; its frames bear the 
 with the reason.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 from collections import deque

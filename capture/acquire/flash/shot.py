@@ -1,7 +1,5 @@
 """One shot of the flash rig: its light set, its exposure made, its frames collected and kept."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Mapping
 

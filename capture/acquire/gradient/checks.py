@@ -1,7 +1,5 @@
 """What of a plan of the gradient sphere can be refused before anything is lit or moves."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

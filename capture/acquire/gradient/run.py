@@ -1,7 +1,5 @@
 """Run a plan on the gradient sphere: skin in a caliper, state of strain by state, or a target."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -7,8 +7,6 @@ is let go in between, for whatever reason, it is taped again, the newly taped ne
 once, the jaws walk the same way, and the state is scanned anew.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass

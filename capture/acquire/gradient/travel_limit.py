@@ -1,7 +1,5 @@
 """How far skin lets itself be moved: it buckles, comes off, or meets the force limit."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

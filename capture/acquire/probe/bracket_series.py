@@ -6,8 +6,6 @@ long, and those that can show no more are left out, with the reason. No short on
 one saturates nowhere is known only when it is there, and it costs a read-out.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass

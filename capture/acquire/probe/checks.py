@@ -1,7 +1,5 @@
 """What of a plan of the fibre probe can be refused before anything is lit or sucked at."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -5,8 +5,6 @@ stop; the measurement itself is made later, of the raw frames, by a calibration 
 spots are.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

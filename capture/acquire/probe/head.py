@@ -5,8 +5,6 @@ itself, or is not reached, nobody knows whether the head is still where it was: 
 anew, and all exposures of the series are taken again.
 """
 
-from __future__ import annotations
-
 import logging
 
 from capture.acquire.outcome import MAX_ATTEMPTS, AcquisitionError, Operator

@@ -4,8 +4,6 @@ With all fibres covered but one, its own spot is to be seen unsaturated, and the
 to others, of a thousandth of it, above the noise. The phantom has told how bright each fibre is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

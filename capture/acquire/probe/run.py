@@ -1,7 +1,5 @@
 """Run a plan on the fibre probe: darks, then series of exposures, placement by placement."""
 
-from __future__ import annotations
-
 from capture.acquire.outcome import Acquired, CaptureRun
 from capture.acquire.probe.bracket_series import BracketSeries
 from capture.acquire.probe.checks import check_cameras, check_probe

@@ -5,8 +5,6 @@ is believed when it began with that pulse and has the exposure that was asked fo
 shutter says that its light lasted as long.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 

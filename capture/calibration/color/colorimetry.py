@@ -111,11 +111,6 @@ def _chart_rows() -> list[dict[str, str]]:
     return list(csv.DictReader(lines))
 
 
-def _patch_names() -> tuple[str, ...]:
-    """Return the names of the 24 patches, row-major from dark skin."""
-    return tuple(row["name"] for row in _chart_rows())
-
-
 def chart_reference(illuminant: str = "D50") -> Float64Array:
     """Return XYZ (Y of the perfect diffuser = 1) of the ColorChecker Classic, shape (24, 3).
 

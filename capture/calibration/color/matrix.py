@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from capture.arrays import Float64Array
-from capture.calibration.color.chart import ChartError, Patches, find_chart, measure_patches
 from capture.calibration.color.colorimetry import (
     chart_reference,
     delta_e_2000,
@@ -17,18 +16,6 @@ from capture.calibration.color.colorimetry import (
     xyz_to_linear_srgb,
 )
 from capture.calibration.record import Calibration, Provenance, Quantity, of_one_device
-
-__all__ = [
-    "ChartError",
-    "ColorMatrix",
-    "Method",
-    "Patches",
-    "chart_reference",
-    "find_chart",
-    "fit_matrix",
-    "measure_patches",
-    "neutral_white",
-]
 
 Method: TypeAlias = Literal["linear", "root_polynomial"]
 
@@ -85,18 +72,6 @@ class ColorMatrix:
     def to_linear_srgb(self, rgb: ArrayLike) -> Float64Array:
         """Return linear sRGB (D65, Bradford adaptation) of linear camera RGB, shape (..., 3)."""
         return xyz_to_linear_srgb(self.apply(rgb), illuminant=self.illuminant)
-
-    def xyz_to_camera(self) -> Float64Array:
-        """Return the inverse of the linear matrix, as DNG's ColorMatrix wants it, shape (3, 3).
-
-        Raises
-        ------
-        ValueError
-            For a root polynomial, which has no inverse matrix.
-        """
-        if self.method != "linear":
-            raise ValueError(f"method: got {self.method!r}, only a linear matrix can be inverted")
-        return np.linalg.inv(self.matrix).astype(np.float64)
 
 
 def fit_matrix(
@@ -233,7 +208,7 @@ def to_calibration(fit: ColorMatrix, white: Quantity, **about: Unpack[Provenance
             "delta_e_fitted_mean": Quantity(np.array(float(np.nanmean(fit.fitted_delta_e)))),
             "patches": Quantity(np.array(float(np.isfinite(fit.delta_e).sum()))),
         },
-        notes={
+        {
             "method": fit.method,
             "illuminant": fit.illuminant,
             "delta_e": "CIEDE2000, each patch held out of its fit",
@@ -245,14 +220,13 @@ def to_calibration(fit: ColorMatrix, white: Quantity, **about: Unpack[Provenance
 def from_calibration(calibration: Calibration, serial: str) -> ColorMatrix:
     """Return the color matrix of one camera; the per-patch Delta E are not stored."""
     matrix = calibration.quantity(serial, "camera_to_xyz")
-    stderr = matrix.stderr if matrix.stderr is not None else np.zeros_like(matrix.value)
     method: Method = "linear" if matrix.value.shape == (3, 3) else "root_polynomial"
     mean = calibration.quantity(serial, "delta_e_mean").value
     fitted = calibration.quantity(serial, "delta_e_fitted_mean").value
     return ColorMatrix(
         matrix.value,
         mean.reshape(1),
-        stderr,
+        matrix.known_stderr,
         method,
         calibration.notes["illuminant"],
         fitted.reshape(1),

@@ -81,11 +81,11 @@ class WhiteReference:
         return of_one_device(
             "white",
             {"mean_signal": Quantity(white), "residual": Quantity(self.residual)},
+            {"unit": "fraction of full scale for reflectance 1 at unit light"},
             maps={
                 "signal": np.where(self.valid[..., None], self.signal, np.float32(0.0)),
                 "stderr": np.where(self.valid[..., None], self.stderr, np.float32(0.0)),
             },
-            notes={"unit": "fraction of full scale for reflectance 1 at unit light"},
             **about,
         )
 

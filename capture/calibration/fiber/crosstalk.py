@@ -1,7 +1,5 @@
 """Cross-talk of fibres: what each spot reads of every other fibre's light, and stray light."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final

@@ -1,7 +1,5 @@
 """Blurred discs in a raw mosaic: places that look like one, and the fit of one."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 import numpy as np
@@ -98,8 +96,7 @@ def fit_disc(
     colors = [mask[rows, columns] & good for mask in color_masks(merged.rate.shape, pattern)]
     value, spread = merged.rate[rows, columns], merged.variance[rows, columns]
     gray = image[0][rows, columns]
-    top = float(np.quantile(gray, 0.98))
-    bottom = float(np.quantile(gray, 0.02))
+    bottom, top = np.quantile(gray, [0.02, 0.98])
     if top <= bottom:
         return None
     area = float((gray > 0.5 * (top + bottom)).sum())

@@ -1,7 +1,5 @@
 """A fibre probe as calibrated: from light in the spots to reflectance in the fibres."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Brackets of exposures merged to the rate of light on each pixel, the dark signal taken off."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -10,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import uniform_filter
 
-from capture.arrays import BoolArray, Float64Array
+from capture.arrays import BoolArray, Float64Array, Int64Array
 from capture.calibration.fiber.darks import CameraNoise, DarkModel
 from capture.calibration.sensor.transfer_curve import cfa_planes
 from capture.documents import Checks
@@ -116,33 +114,19 @@ def merge_series(
     stack, times, lit = [stack[k] for k in order], times[order], lit[order]
     # what each frame shows without light is the same in all that follows
     base = [noise.black_dn + darks.bias_dn + darks.rate_dn_per_s * t for t in times]
-    shape = stack[0].shape
-    usable = _usable(stack, noise)
+    series = _Series(stack, times, base, _usable(stack, noise), darks, noise)
     hot = darks.hot
     # first by read noise alone, then with the noise of the light that was found
-    guess, seen = _weigh(stack, times, lit, base, usable, darks, noise, np.zeros(shape))[:2]
+    guess, seen, _ = series.weigh(lit, np.zeros(stack[0].shape))
     smooth = _smooth(guess, seen & ~hot, noise.pattern)
     light = np.maximum(smooth, 0.0)
-    rate, seen, variance = _weigh(stack, times, lit, base, usable, darks, noise, light)
+    rate, seen, variance = series.weigh(lit, light)
     clear = np.flatnonzero(seen & ~hot & (rate > MIN_RIPPLE_SIGMAS * np.sqrt(variance)))
     scale, scale_stderr = np.ones(len(times)), np.zeros(len(times))
     if len(times) > 1 and clear.size:
-        scale, scale_stderr = _scales(
-            np.stack(
-                [f.ravel()[clear] - b.ravel()[clear] for f, b in zip(stack, base, strict=True)]
-            ),
-            np.stack([use.ravel()[clear] for use in usable]),
-            times,
-            lit,
-            rate.ravel()[clear],
-            light.ravel()[clear],
-            darks,
-            noise,
-        )
+        scale, scale_stderr = series.scales(lit, rate, light, clear)
         if (scale != 1.0).any():
-            rate, seen, variance = _weigh(
-                stack, times, lit * scale, base, usable, darks, noise, light
-            )
+            rate, seen, variance = series.weigh(lit * scale, light)
     valid = seen & ~hot
     rate, variance = np.where(valid, rate, 0.0), np.where(valid, variance, 0.0)
     span = noise.span_dn
@@ -210,76 +194,79 @@ def _usable(stack: list[NDArray[np.integer]], noise: CameraNoise) -> list[BoolAr
     return result
 
 
-def _weigh(
-    stack: list[NDArray[np.integer]],
-    times: Float64Array,
-    lit: Float64Array,
-    base: list[Float64Array],
-    usable: list[BoolArray],
-    darks: DarkModel,
-    noise: CameraNoise,
-    light: Float64Array,
-) -> tuple[Float64Array, BoolArray, Float64Array]:
-    """Return rate, where any frame counts, and variance, DN/s, weighed for light of some rate."""
-    shape, gain = stack[0].shape, noise.gain_e_per_dn
-    current = max(darks.mean_rate_dn_per_s, 0.0) / gain
-    shot = light / gain
-    signal, time = np.zeros(shape), np.zeros(shape)
-    weights, dark_time = np.zeros(shape), np.zeros(shape)
-    for frame, t, t_light, dark, use in zip(stack, times, lit, base, usable, strict=True):
-        weight = np.where(use, t_light / (noise.floor_dn2 + current * t + shot * t_light), 0.0)
-        signal += weight * (frame - dark)
-        time += weight * t_light
-        weights += weight
-        dark_time += weight * t
-    seen = time > 0
-    below = np.where(seen, time, 1.0)
-    # what errors of a pixel's bias and dark current become
-    by_bias, by_rate = weights / below, dark_time / below
-    (bias2, both), (_, rate2) = darks.covariance
-    variance = 1.0 / below + bias2 * by_bias**2 + 2.0 * both * by_bias * by_rate
-    return signal / below, seen, variance + rate2 * by_rate**2
+@dataclass(frozen=True, slots=True, eq=False)
+class _Series:
+    """Raw frames in order of their times, with what they show without light."""
 
+    stack: list[NDArray[np.integer]]
+    times: Float64Array
+    base: list[Float64Array]
+    usable: list[BoolArray]
+    darks: DarkModel
+    noise: CameraNoise
 
-def _scales(
-    value: Float64Array,
-    usable: BoolArray,
-    times: Float64Array,
-    lit: Float64Array,
-    rate: Float64Array,
-    light: Float64Array,
-    darks: DarkModel,
-    noise: CameraNoise,
-) -> tuple[Float64Array, Float64Array]:
-    """Return the light of each frame over the mean, and its standard error.
+    def weigh(
+        self, lit: Float64Array, light: Float64Array
+    ) -> tuple[Float64Array, BoolArray, Float64Array]:
+        """Return rate, where any frame counts, and variance, DN/s, weighed for a rate of light."""
+        darks, noise = self.darks, self.noise
+        shape, gain = self.stack[0].shape, noise.gain_e_per_dn
+        current = max(darks.mean_rate_dn_per_s, 0.0) / gain
+        shot = light / gain
+        signal, time = np.zeros(shape), np.zeros(shape)
+        weights, dark_time = np.zeros(shape), np.zeros(shape)
+        frames = zip(self.stack, self.times, lit, self.base, self.usable, strict=True)
+        for frame, t, t_light, dark, use in frames:
+            weight = np.where(use, t_light / (noise.floor_dn2 + current * t + shot * t_light), 0.0)
+            signal += weight * (frame - dark)
+            time += weight * t_light
+            weights += weight
+            dark_time += weight * t
+        seen = time > 0
+        below = np.where(seen, time, 1.0)
+        # what errors of a pixel's bias and dark current become
+        by_bias, by_rate = weights / below, dark_time / below
+        (bias2, both), (_, rate2) = darks.covariance
+        variance = 1.0 / below + bias2 * by_bias**2 + 2.0 * both * by_bias * by_rate
+        return signal / below, seen, variance + rate2 * by_rate**2
 
-    Least squares of ``value = rate scale time`` over pixels (K, P) whose rates are free, with a
-    normal prior of the scales about 1, as wide as their evidence is greatest for.
-    """
-    variance = (
-        noise.floor_dn2
-        + (max(darks.mean_rate_dn_per_s, 0.0) * times[:, None] + light * lit[:, None])
-        / noise.gain_e_per_dn
-    )
-    expected = rate * lit[:, None]
-    information = np.where(usable, expected**2 / variance, 0.0)
-    miss = np.where(usable, value / expected - 1.0, 0.0)
-    total = information.sum(axis=0)
-    mean = (information * miss).sum(axis=0) / total
-    normal = np.diag(information.sum(axis=1)) - (information / total) @ information.T
-    right = (information * (miss - mean)).sum(axis=1)
-    # the prior's width of most evidence; where the frames tell little of each other, none
-    values, vectors = np.linalg.eigh(0.5 * (normal + normal.T))
-    values, along = np.maximum(values, 0.0), vectors.T @ right
-    best, width2 = MIN_RIPPLE_LOG_EVIDENCE, 0.0
-    for width in np.geomspace(1e-4, MAX_RIPPLE, 16):
-        grown = 1.0 + width**2 * values
-        evidence = 0.5 * float(width**2 * (along**2 / grown).sum() - np.log(grown).sum())
-        if evidence > best:
-            best, width2 = evidence, float(width**2)
-    covariance = (vectors * (width2 / (1.0 + width2 * values))) @ vectors.T
-    away = covariance @ right
-    return 1.0 + away, np.sqrt(np.diag(covariance))
+    def scales(
+        self, lit: Float64Array, rate: Float64Array, light: Float64Array, clear: Int64Array
+    ) -> tuple[Float64Array, Float64Array]:
+        """Return the light of each frame over the mean, and its standard error.
+
+        Least squares of ``value = rate scale time`` over pixels (K, P) whose rates are free, with a
+        normal prior of the scales about 1, as wide as their evidence is greatest for.
+        """
+        darks, noise = self.darks, self.noise
+        rate, light = rate.ravel()[clear], light.ravel()[clear]
+        shown = zip(self.stack, self.base, strict=True)
+        value = np.stack([f.ravel()[clear] - b.ravel()[clear] for f, b in shown])
+        usable = np.stack([use.ravel()[clear] for use in self.usable])
+        variance = (
+            noise.floor_dn2
+            + (max(darks.mean_rate_dn_per_s, 0.0) * self.times[:, None] + light * lit[:, None])
+            / noise.gain_e_per_dn
+        )
+        expected = rate * lit[:, None]
+        information = np.where(usable, expected**2 / variance, 0.0)
+        miss = np.where(usable, value / expected - 1.0, 0.0)
+        total = information.sum(axis=0)
+        mean = (information * miss).sum(axis=0) / total
+        normal = np.diag(information.sum(axis=1)) - (information / total) @ information.T
+        right = (information * (miss - mean)).sum(axis=1)
+        # the prior's width of most evidence; where the frames tell little of each other, none
+        values, vectors = np.linalg.eigh(0.5 * (normal + normal.T))
+        values, along = np.maximum(values, 0.0), vectors.T @ right
+        best, width2 = MIN_RIPPLE_LOG_EVIDENCE, 0.0
+        for width in np.geomspace(1e-4, MAX_RIPPLE, 16):
+            grown = 1.0 + width**2 * values
+            evidence = 0.5 * float(width**2 * (along**2 / grown).sum() - np.log(grown).sum())
+            if evidence > best:
+                best, width2 = evidence, float(width**2)
+        covariance = (vectors * (width2 / (1.0 + width2 * values))) @ vectors.T
+        away = covariance @ right
+        return 1.0 + away, np.sqrt(np.diag(covariance))
 
 
 def _smooth(values: Float64Array, valid: BoolArray, pattern: str) -> Float64Array:

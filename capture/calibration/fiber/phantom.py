@@ -1,7 +1,5 @@
 """A block of known optics: its certificate, and what the fibres should take from it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Final

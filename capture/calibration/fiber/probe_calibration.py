@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import Unpack
 
 import numpy as np
 
@@ -19,9 +19,11 @@ from capture.calibration.record import (
     Calibration,
     CalibrationError,
     CalibrationMismatch,
+    DeviceColumns,
+    Origin,
     Quantity,
-    Source,
-    default_validity,
+    device_rows,
+    of_devices,
 )
 from capture.calibration.store import load
 from capture.calibration.validity import require
@@ -209,9 +211,7 @@ class FiberCalibration:
                 reasons[name] = "too many hot pixels in its spot"
         return reasons
 
-    def to_calibration(
-        self, *, serial: str, rig: str, source: Source, created: date, **about: Any
-    ) -> Calibration:
+    def to_calibration(self, *, serial: str, **about: Unpack[Origin]) -> Calibration:
         """Return this as a `Calibration` of kind "fibre", by fibre, and of the camera.
 
         Parameters
@@ -224,30 +224,28 @@ class FiberCalibration:
             ``valid_until``, ``notes``, ``inputs``, ``versions`` of `Calibration`.
         """
         spots, mixed = self.spots, self.crosstalk
-        values: dict[str, dict[str, Quantity]] = {
-            name: {
-                "spot_px": Quantity(spots.center_px[i], spots.center_stderr_px[i]),
-                "spot_radius_px": _one(spots.radius_px[i], spots.radius_stderr_px[i]),
-                "spot_edge_px": _one(spots.edge_px[i]),
-                "found": _one(float(spots.found[i])),
-                "radius_mm": _one(self.radius_mm[i]),
-                "gain": Quantity(self.gain[i], self.gain_stderr[i]),
-                "gain_common": Quantity(self.common[:, i]),
-                "phantom_light": Quantity(self.light[i]),
-                "stray": Quantity(mixed.offset[i], mixed.offset_stderr[i]),
-                "stray_common": Quantity(mixed.offset_common[i]),
-                "crosstalk": Quantity(mixed.matrix[i], mixed.stderr[i]),
-                "valid": Quantity(self.valid[i].astype(np.float64)),
-                "dead": _one(float(self.dead[i])),
-            }
-            for i, name in enumerate(self.names)
-        }
+        values = device_rows(
+            self.names,
+            spot_px=(spots.center_px, spots.center_stderr_px),
+            spot_radius_px=(spots.radius_px, spots.radius_stderr_px),
+            spot_edge_px=spots.edge_px,
+            found=spots.found,
+            radius_mm=self.radius_mm,
+            gain=(self.gain, self.gain_stderr),
+            gain_common=self.common.transpose(1, 0, 2),
+            phantom_light=self.light,
+            stray=(mixed.offset, mixed.offset_stderr),
+            stray_common=mixed.offset_common,
+            crosstalk=(mixed.matrix, mixed.stderr),
+            valid=self.valid,
+            dead=self.dead,
+        )
         values[serial] = {
-            "aperture_px": _one(spots.aperture_px),
+            "aperture_px": Quantity(np.array(spots.aperture_px)),
             "row_shift_px": Quantity(np.array(spots.shift_px)),
-            "row_rotation_rad": _one(spots.rotation_rad),
-            "crosstalk_measured": _one(float(mixed.measured)),
-            "cover_leak": _one(mixed.cover_leak, mixed.cover_leak_stderr),
+            "row_rotation_rad": Quantity(np.array(spots.rotation_rad)),
+            "crosstalk_measured": Quantity(np.array(mixed.measured)),
+            "cover_leak": Quantity(np.array(mixed.cover_leak), np.array(mixed.cover_leak_stderr)),
         }
         notes = {
             "unit": "gain: full scales per second, summed over a spot, for a reflectance in the"
@@ -255,18 +253,7 @@ class FiberCalibration:
             "crosstalk": "row: what this spot reads of each fibre's light",
             "gain_common": "relative, at one standard uncertainty of each cause",
         }
-        return Calibration(
-            kind="fibre",
-            rig=rig,
-            serials=tuple(values),
-            created=created,
-            valid_until=about.get("valid_until") or default_validity(created),
-            source=source,
-            values=values,
-            notes={**notes, **(about.get("notes") or {})},
-            inputs=dict(about.get("inputs") or {}),
-            versions=dict(about.get("versions") or {}),
-        )
+        return of_devices("fibre", values, notes, **about)
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, rig: Rig, serial: str) -> FiberCalibration:
@@ -282,16 +269,7 @@ class FiberCalibration:
                 f"calibration: got kind {calibration.kind!r} of rig {calibration.rig!r}, expected"
                 f" 'fibre' of {rig.name!r}, a rig with a probe"
             )
-        names = tuple(fibre.name for fibre in rig.probe.fibres)
-
-        def value(name: str) -> Float64Array:
-            return np.array([calibration.quantity(n, name).value for n in names])
-
-        def stderr(name: str) -> Float64Array:
-            rows = [calibration.quantity(n, name) for n in names]
-            return np.array(
-                [np.zeros_like(q.value) if q.stderr is None else q.stderr for q in rows]
-            )
+        table = DeviceColumns(calibration, [fibre.name for fibre in rig.probe.fibres])
 
         def camera(name: str) -> Float64Array:
             return calibration.quantity(serial, name).value
@@ -299,34 +277,29 @@ class FiberCalibration:
         shift, leak = camera("row_shift_px"), calibration.quantity(serial, "cover_leak")
         return cls(
             FiberSpots(
-                names,
-                value("spot_px"),
-                stderr("spot_px"),
-                value("spot_radius_px"),
-                stderr("spot_radius_px"),
-                value("spot_edge_px"),
-                value("found") > 0,
+                table.names,
+                *table.both("spot_px"),
+                *table.both("spot_radius_px"),
+                table.values("spot_edge_px"),
+                table.flags("found"),
                 float(camera("aperture_px")),
                 (float(shift[0]), float(shift[1])),
                 float(camera("row_rotation_rad")),
             ),
-            value("radius_mm"),
-            value("gain"),
-            stderr("gain"),
-            value("gain_common").transpose(1, 0, 2),
-            value("phantom_light"),
+            table.values("radius_mm"),
+            *table.both("gain"),
+            table.values("gain_common").transpose(1, 0, 2),
+            table.values("phantom_light"),
             CrossTalk(
-                value("crosstalk"),
-                stderr("crosstalk"),
-                value("stray"),
-                stderr("stray"),
-                value("stray_common"),
+                *table.both("crosstalk"),
+                *table.both("stray"),
+                table.values("stray_common"),
                 bool(camera("crosstalk_measured")),
                 float(leak.value),
-                0.0 if leak.stderr is None else float(leak.stderr),
+                float(leak.known_stderr),
             ),
-            value("valid") > 0,
-            value("dead") > 0,
+            table.flags("valid"),
+            table.flags("dead"),
         )
 
     @classmethod
@@ -384,7 +357,3 @@ def fill_invalid(readings: FiberReadings) -> tuple[Float64Array, Float64Array, B
         signal[gap, c] = np.exp(np.minimum(guess, value.max() + 10.0))[gap]
         variance[gap, c] = signal[gap, c] ** 2
     return signal, variance, possible
-
-
-def _one(value: float | Float64Array, stderr: float | Float64Array | None = None) -> Quantity:
-    return Quantity(np.array(value), None if stderr is None else np.array(stderr))

@@ -1,7 +1,5 @@
 """What each detection fibre gives: a series of brackets summed over the fibres' spots."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final

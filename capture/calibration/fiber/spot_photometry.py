@@ -1,7 +1,5 @@
 """Light of small bright spots: exposures put together, middles, and sums over apertures."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

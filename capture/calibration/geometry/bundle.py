@@ -6,8 +6,6 @@ with analytic derivatives; what the workshop guarantees of a lens enters as a we
 camera that saw few boards keeps a sensible lens.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

@@ -5,8 +5,6 @@ shift), each pose of the board six. The normal equations are summed from blocks,
 with analytic derivatives.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
@@ -69,19 +67,8 @@ class LensPrior:
         """Return the deviations of a camera's nine lens numbers."""
         fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
         shift = self.principal * camera.image_size[0]
-        return np.array(
-            [
-                self.focal * fx,
-                self.focal * fy,
-                shift,
-                shift,
-                self.k1,
-                self.k2,
-                self.tangential,
-                self.tangential,
-                self.k3,
-            ]
-        )
+        bending = [self.k1, self.k2, self.tangential, self.tangential, self.k3]
+        return np.array([self.focal * fx, self.focal * fy, shift, shift, *bending])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,27 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import date
-from typing import Any
+from functools import partial
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from capture.arrays import Float64Array
-from capture.calibration.geometry.board import Intrinsics, calibrate_intrinsics
-from capture.calibration.record import Calibration, Quantity, Source, default_validity
+from capture.calibration.record import Calibration, Origin, Quantity, of_devices
 from capture.rig import Rig, View
-
-__all__ = [
-    "CameraPose",
-    "Intrinsics",
-    "calibrate_intrinsics",
-    "distort",
-    "nominal_cameras",
-    "poses_from",
-    "to_calibration",
-]
-
 
 _LEFT_OUT: Any = None  # __post_init__ puts an array in its place
 
@@ -241,13 +229,8 @@ def nominal_cameras(rig: Rig) -> dict[str, CameraPose]:
 def to_calibration(
     cameras: Mapping[str, CameraPose],
     *,
-    rig: str,
-    source: Source,
-    created: date,
-    valid_until: date | None = None,
     reprojection_px: Mapping[str, float] | None = None,
-    inputs: Mapping[str, str] | None = None,
-    versions: Mapping[str, str] | None = None,
+    **about: Unpack[Origin],
 ) -> Calibration:
     """Return cameras as a `Calibration` of kind "geometry", keyed by serial.
 
@@ -276,21 +259,11 @@ def to_calibration(
         if reprojection_px is not None:
             rms = np.array(reprojection_px[name])
             values[c.serial]["reprojection_px"] = Quantity(rms)
-    return Calibration(
-        kind="geometry",
-        rig=rig,
-        serials=serials,
-        created=created,
-        valid_until=valid_until or default_validity(created),
-        source=source,
-        values=values,
-        notes={
-            "frame": "x_camera = rotation x_rig + translation_mm; x right, y down, z forward",
-            "distortion": "k1 k2 p1 p2 k3 on normalized coordinates",
-        },
-        inputs=dict(inputs or {}),
-        versions=dict(versions or {}),
-    )
+    notes = {
+        "frame": "x_camera = rotation x_rig + translation_mm; x right, y down, z forward",
+        "distortion": "k1 k2 p1 p2 k3 on normalized coordinates",
+    }
+    return of_devices("geometry", values, notes, **about)
 
 
 def poses_from(calibration: Calibration, rig: Rig) -> dict[str, CameraPose]:
@@ -303,32 +276,19 @@ def poses_from(calibration: Calibration, rig: Rig) -> dict[str, CameraPose]:
     """
     poses = {}
     for view in rig.views:
-        got = {
-            name: calibration.quantity(view.serial, name)
-            for name in (
-                "matrix",
-                "distortion",
-                "rotation",
-                "rotation_stderr_rad",
-                "translation_mm",
-                "image_size",
-            )
-        }
-        errors = {
-            name: np.zeros_like(q.value) if q.stderr is None else q.stderr
-            for name, q in got.items()
-        }
-        columns, rows = got["image_size"].value
+        got = partial(calibration.quantity, view.serial)
+        matrix, distortion, shift = got("matrix"), got("distortion"), got("translation_mm")
+        columns, rows = got("image_size").value
         poses[view.name] = CameraPose(
             view.serial,
-            got["matrix"].value,
-            got["distortion"].value,
-            got["rotation"].value,
-            got["translation_mm"].value,
+            matrix.value,
+            distortion.value,
+            got("rotation").value,
+            shift.value,
             (int(columns), int(rows)),
-            errors["matrix"],
-            errors["distortion"],
-            got["rotation_stderr_rad"].value,
-            errors["translation_mm"],
+            matrix.known_stderr,
+            distortion.known_stderr,
+            got("rotation_stderr_rad").value,
+            shift.known_stderr,
         )
     return poses

@@ -1,7 +1,5 @@
 """A camera that moved since the last calibration, found by who disagrees with whom."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

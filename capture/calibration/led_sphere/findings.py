@@ -1,7 +1,5 @@
 """Findings of a survey: what is wrong with a sphere of lights, in sentences."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import Unpack
 
 import numpy as np
 
@@ -15,9 +15,11 @@ from capture.calibration.frozen_arrays import freeze_array
 from capture.calibration.record import (
     Calibration,
     CalibrationMismatch,
+    DeviceColumns,
+    Origin,
     Quantity,
-    Source,
-    default_validity,
+    device_rows,
+    of_devices,
 )
 from capture.calibration.store import load
 from capture.calibration.validity import require
@@ -98,13 +100,7 @@ class SphereLightTable:
         )
 
     def to_calibration(
-        self,
-        *,
-        rig: str,
-        source: Source,
-        created: date,
-        ball: Mapping[str, Quantity] | None = None,
-        **about: Any,
+        self, *, ball: Mapping[str, Quantity] | None = None, **about: Unpack[Origin]
     ) -> Calibration:
         """Return this as a `Calibration` of kind "lights", keyed by light.
 
@@ -117,20 +113,18 @@ class SphereLightTable:
         **about
             ``valid_until``, ``notes``, ``inputs``, ``versions`` of `Calibration`.
         """
-        values: dict[str, dict[str, Quantity]] = {
-            name: {
-                "direction": Quantity(self.directions[i], self.directions_stderr[i]),
-                "intensity": Quantity(self.intensities[i], self.intensities_stderr[i]),
-                "seen": Quantity(np.array(float(self.seen[i]))),
-                "valid": Quantity(np.array(float(self.valid[i]))),
-                "dead": Quantity(np.array(float(self.dead[i]))),
-            }
-            for i, name in enumerate(self.names)
-        }
+        values = device_rows(
+            self.names,
+            direction=(self.directions, self.directions_stderr),
+            intensity=(self.intensities, self.intensities_stderr),
+            seen=self.seen,
+            valid=self.valid,
+            dead=self.dead,
+        )
         if ball:
             values["ball"] = dict(ball)
         notes = {"unit": "intensity: light at the origin over the mean of the measured lights"}
-        return _calibration("lights", values, rig, source, created, notes, about)
+        return of_devices("lights", values, notes, **about)
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, rig: Rig) -> SphereLightTable:
@@ -141,14 +135,14 @@ class SphereLightTable:
         CalibrationMismatch
             If the calibration is of another rig or lacks one of its lights.
         """
-        table = _Columns(calibration, rig, "lights")
+        table = _columns(calibration, rig, "lights")
         return cls(
             table.names,
             *table.both("direction"),
             *table.both("intensity"),
-            table.values("seen").astype(bool),
-            table.values("valid").astype(bool),
-            table.values("dead").astype(bool),
+            table.flags("seen"),
+            table.flags("valid"),
+            table.flags("dead"),
         )
 
 
@@ -202,9 +196,7 @@ class SphereFilms:
         if (self.leakage < 0).any() or not self.eta > 1:
             raise ValueError("SphereFilms: got a leakage < 0 or eta <= 1, expected >= 0 and > 1")
 
-    def to_calibration(
-        self, *, serial: str, rig: str, source: Source, created: date, **about: Any
-    ) -> Calibration:
+    def to_calibration(self, *, serial: str, **about: Unpack[Origin]) -> Calibration:
         """Return this as a `Calibration` of kind "polarization", by light, and of the camera.
 
         Parameters
@@ -214,15 +206,13 @@ class SphereFilms:
         rig, source, created, **about
             As for `SphereLightTable.to_calibration`.
         """
-        values: dict[str, dict[str, Quantity]] = {
-            name: {
-                "leakage": Quantity(self.leakage[i], self.leakage_stderr[i]),
-                "glass_leakage": Quantity(self.glass_leakage[i], self.glass_leakage_stderr[i]),
-                "axis_error_rad": Quantity(self.axis_error_rad[i], self.axis_error_stderr_rad[i]),
-                "valid": Quantity(np.array(float(self.valid[i]))),
-            }
-            for i, name in enumerate(self.names)
-        }
+        values = device_rows(
+            self.names,
+            leakage=(self.leakage, self.leakage_stderr),
+            glass_leakage=(self.glass_leakage, self.glass_leakage_stderr),
+            axis_error_rad=(self.axis_error_rad, self.axis_error_stderr_rad),
+            valid=self.valid,
+        )
         values[serial] = {
             "analyser_zero_rad": _one(self.misalignment_rad, self.misalignment_stderr_rad),
             "light_leak": _one(self.light_leak, self.light_leak_stderr),
@@ -233,7 +223,7 @@ class SphereFilms:
             "leakage": "of a mirror reflection into the camera, crossed over parallel",
             "analyser_zero": "true angle of the analyser less its reading; from +x towards +y",
         }
-        return _calibration("polarization", values, rig, source, created, notes, about)
+        return of_devices("polarization", values, notes, **about)
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, rig: Rig, serial: str) -> SphereFilms:
@@ -244,7 +234,7 @@ class SphereFilms:
         CalibrationMismatch
             If the calibration is of another rig or camera, or lacks one of the rig's lights.
         """
-        table = _Columns(calibration, rig, "polarization")
+        table = _columns(calibration, rig, "polarization")
         leakage, glass, axis = (table.both(name) for name in _LEAKAGE_FIELDS)
         zero, light, analyser = (
             calibration.quantity(serial, name)
@@ -255,7 +245,7 @@ class SphereFilms:
             *leakage,
             *glass,
             *axis,
-            table.values("valid").astype(bool),
+            table.flags("valid"),
             *_pair(zero),
             *_pair(light),
             *_pair(analyser),
@@ -320,48 +310,14 @@ class SphereCalibration:
         return self.lights.valid & ~self.lights.dead
 
 
-class _Columns:
-    """Quantities of the lights of a rig, out of a calibration."""
-
-    def __init__(self, calibration: Calibration, rig: Rig, kind: str) -> None:
-        if calibration.kind != kind or calibration.rig != rig.name:
-            raise CalibrationMismatch(
-                f"calibration: got kind {calibration.kind!r} of rig {calibration.rig!r}, expected"
-                f" {kind!r} of {rig.name!r}"
-            )
-        self.names = tuple(light.name for light in rig.lights)
-        self._calibration = calibration
-
-    def values(self, name: str) -> Float64Array:
-        return np.array([self._calibration.quantity(n, name).value for n in self.names])
-
-    def both(self, name: str) -> tuple[Float64Array, Float64Array]:
-        rows = [self._calibration.quantity(n, name) for n in self.names]
-        errors = [np.zeros_like(q.value) if q.stderr is None else q.stderr for q in rows]
-        return np.array([q.value for q in rows]), np.array(errors)
-
-
-def _calibration(
-    kind: str,
-    values: Mapping[str, Mapping[str, Quantity]],
-    rig: str,
-    source: Source,
-    created: date,
-    notes: Mapping[str, str],
-    about: Mapping[str, Any],
-) -> Calibration:
-    return Calibration(
-        kind=kind,
-        rig=rig,
-        serials=tuple(values),
-        created=created,
-        valid_until=about.get("valid_until") or default_validity(created),
-        source=source,
-        values=values,
-        notes={**notes, **(about.get("notes") or {})},
-        inputs=dict(about.get("inputs") or {}),
-        versions=dict(about.get("versions") or {}),
-    )
+def _columns(calibration: Calibration, rig: Rig, kind: str) -> DeviceColumns:
+    """Return the quantities of a rig's lights; refuse another kind or rig."""
+    if calibration.kind != kind or calibration.rig != rig.name:
+        raise CalibrationMismatch(
+            f"calibration: got kind {calibration.kind!r} of rig {calibration.rig!r}, expected"
+            f" {kind!r} of {rig.name!r}"
+        )
+    return DeviceColumns(calibration, [light.name for light in rig.lights])
 
 
 def _one(value: float, stderr: float) -> Quantity:
@@ -369,4 +325,4 @@ def _one(value: float, stderr: float) -> Quantity:
 
 
 def _pair(quantity: Quantity) -> tuple[float, float]:
-    return float(quantity.value), 0.0 if quantity.stderr is None else float(quantity.stderr)
+    return float(quantity.value), float(quantity.known_stderr)

@@ -1,7 +1,5 @@
 """What a mirroring ball shows a camera of the lights around it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

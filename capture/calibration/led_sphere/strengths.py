@@ -1,7 +1,5 @@
 """Intensities and films of the lights, from what their spots in the ball give in each exposure."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

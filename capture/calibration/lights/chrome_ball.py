@@ -1,7 +1,5 @@
 """Light directions from photographs of a chrome ball, seen from far away."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

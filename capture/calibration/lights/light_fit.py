@@ -8,8 +8,6 @@ that, each light is asked whether the shading it makes is its own: the plate's p
 the frames without light tell where a light stands.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -5,19 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from datetime import date
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from capture.arrays import BoolArray, Float64Array
-from capture.calibration.lights.chrome_ball import directions_from_chrome_ball
-from capture.calibration.record import Calibration, Quantity, Source, default_validity
+from capture.calibration.frozen_arrays import freeze_array
+from capture.calibration.record import (
+    Calibration,
+    DeviceColumns,
+    Origin,
+    Quantity,
+    device_rows,
+    of_devices,
+)
 from capture.rig import Rig
-
-__all__ = ["CameraResponse", "LightTable", "directions_from_chrome_ball"]
-
 
 _LEFT_OUT: Any = None  # __post_init__ puts an array in its place
 
@@ -46,7 +49,7 @@ class CameraResponse:
         """Convert to float64 and refuse what is no response."""
         for name, n in (("gain", 3), ("vignetting", 2)):
             for full in (name, f"{name}_stderr"):
-                object.__setattr__(self, full, _array("CameraResponse", full, self, (n,)))
+                freeze_array(self, full, (n,))
         if (self.gain <= 0).any() or 1 + self.vignetting.sum() <= 0:
             raise ValueError(
                 f"CameraResponse: got gain {self.gain.tolist()} and vignetting"
@@ -130,18 +133,17 @@ class LightTable:
             "exponent_stderr": (n,),
         }
         for name, shape in shapes.items():
-            object.__setattr__(self, name, _array("LightTable", name, self, shape))
+            freeze_array(self, name, shape)
         if (self.intensity < 0).any() or (self.exponent < 0).any():
             raise ValueError("LightTable: got a negative intensity or exponent, expected >= 0")
         axis = self.axis if self.axis is not None else -self.position_mm
         object.__setattr__(self, "axis", axis)
-        axis = _array("LightTable", "axis", self, (n, 3))
-        length = np.linalg.norm(axis, axis=-1, keepdims=True)
+        freeze_array(self, "axis", (n, 3))
+        length = np.linalg.norm(self.axis, axis=-1, keepdims=True)
         if (length == 0).any():
             raise ValueError("LightTable.axis: got a zero vector, expected directions")
-        axis = axis / length
-        axis.setflags(write=False)
-        object.__setattr__(self, "axis", axis)
+        object.__setattr__(self, "axis", self.axis / length)
+        freeze_array(self, "axis", (n, 3))
         valid = np.ones(n, bool) if self.valid is None else np.array(self.valid)
         if valid.shape != (n,) or valid.dtype != bool:
             raise ValueError(
@@ -225,47 +227,23 @@ class LightTable:
         """Return a camera's response at pixels, shape (..., 3); see `CameraResponse.at`."""
         return self.cameras.get(serial, CameraResponse()).at(pixels, image_size)
 
-    def to_calibration(
-        self,
-        *,
-        rig: str,
-        source: Source,
-        created: date,
-        valid_until: date | None = None,
-        notes: Mapping[str, str] | None = None,
-        inputs: Mapping[str, str] | None = None,
-        versions: Mapping[str, str] | None = None,
-    ) -> Calibration:
+    def to_calibration(self, **about: Unpack[Origin]) -> Calibration:
         """Return this as a `Calibration` of kind "lights", keyed by light and camera serial."""
-        values: dict[str, dict[str, Quantity]] = {}
-        for i, name in enumerate(self.names):
-            values[name] = {
-                "position_mm": Quantity(self.position_mm[i], self.position_stderr_mm[i]),
-                "axis": Quantity(self.axis[i]),
-                "intensity": Quantity(self.intensity[i], self.intensity_stderr[i]),
-                "exponent": Quantity(self.exponent[i], self.exponent_stderr[i]),
-                "valid": Quantity(np.array(float(self.valid[i]))),
-            }
+        values = device_rows(
+            self.names,
+            position_mm=(self.position_mm, self.position_stderr_mm),
+            axis=self.axis,
+            intensity=(self.intensity, self.intensity_stderr),
+            exponent=(self.exponent, self.exponent_stderr),
+            valid=self.valid,
+        )
         for serial, camera in self.cameras.items():
             values[serial] = {
                 "gain": Quantity(camera.gain, camera.gain_stderr),
                 "vignetting": Quantity(camera.vignetting, camera.vignetting_stderr),
             }
-        return Calibration(
-            kind="lights",
-            rig=rig,
-            serials=tuple(values),
-            created=created,
-            valid_until=valid_until or default_validity(created),
-            source=source,
-            values=values,
-            notes={
-                "unit": "intensity: fraction of full scale per second x mm^2 for a perfect white",
-                **(notes or {}),
-            },
-            inputs=dict(inputs or {}),
-            versions=dict(versions or {}),
-        )
+        notes = {"unit": "intensity: fraction of full scale per second x mm^2 for a perfect white"}
+        return of_devices("lights", values, notes, **about)
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, rig: Rig) -> LightTable:
@@ -276,47 +254,24 @@ class LightTable:
         CalibrationMismatch
             If the calibration lacks a light of the rig.
         """
-
-        def of(name: str) -> list[Quantity]:
-            return [calibration.quantity(light.name, name) for light in rig.lights]
-
-        def errors(name: str) -> Float64Array:
-            return np.array(
-                [np.zeros_like(q.value) if q.stderr is None else q.stderr for q in of(name)]
-            )
-
         cameras = {}
         for view in rig.views:
             if view.serial in calibration.values:
                 gain = calibration.quantity(view.serial, "gain")
                 vignetting = calibration.quantity(view.serial, "vignetting")
                 cameras[view.serial] = CameraResponse(
-                    gain.value,
-                    vignetting.value,
-                    np.zeros(3) if gain.stderr is None else gain.stderr,
-                    np.zeros(2) if vignetting.stderr is None else vignetting.stderr,
+                    gain.value, vignetting.value, gain.known_stderr, vignetting.known_stderr
                 )
+        table = DeviceColumns(calibration, [light.name for light in rig.lights])
         return cls(
-            np.array([q.value for q in of("position_mm")]),
-            np.array([q.value for q in of("intensity")]),
-            np.array([q.value for q in of("exponent")]),
-            tuple(light.name for light in rig.lights),
-            np.array([q.value for q in of("axis")]),
-            np.array([bool(q.value) for q in of("valid")]),
-            errors("position_mm"),
-            errors("intensity"),
-            errors("exponent"),
+            table.values("position_mm"),
+            table.values("intensity"),
+            table.values("exponent"),
+            table.names,
+            table.values("axis"),
+            table.flags("valid"),
+            table.errors("position_mm"),
+            table.errors("intensity"),
+            table.errors("exponent"),
             cameras,
         )
-
-
-def _array(owner: str, name: str, row: object, shape: tuple[int, ...]) -> Float64Array:
-    """Return a field as a read-only float64 array of a shape; None becomes zeros."""
-    given = getattr(row, name)
-    array = np.array(np.zeros(shape) if given is None else given, dtype=np.float64)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise ValueError(
-            f"{owner}.{name}: got shape {array.shape}, expected finite numbers of shape {shape}"
-        )
-    array.setflags(write=False)
-    return array

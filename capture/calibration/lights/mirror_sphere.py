@@ -5,8 +5,6 @@ ellipse whose middle is not the centre's image. Centres are therefore fitted to 
 circle in the image.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Reflection in a sphere: where rays go from it, and where it shows a light."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from capture.arrays import BoolArray, Float64Array

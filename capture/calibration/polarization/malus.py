@@ -116,7 +116,7 @@ class PolarizationCalibration:
         return of_one_device(
             "polarization",
             values,
-            notes={
+            {
                 "colors": " ".join(self.colors),
                 "extinction": "middle of its 95 % interval; the lower end where there is no upper",
             },

@@ -1,7 +1,5 @@
 """Lights behind films, mirrored by smooth facets into a camera behind an analyser."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Self
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from capture.arrays import UInt16Array
 from capture.calibration.sensor.darks import Darks
 from capture.calibration.sensor.transfer_curve import FlatPair, plane
 
@@ -36,22 +37,13 @@ def fit_linearity(
         scatter of one level.
     """
     light = np.array([pair.light for pair in pairs])
-    signals = np.array(
-        [
-            [
-                np.mean(
-                    [
-                        plane(frame, position, pattern)[ok].mean() - black
-                        for position, black, ok in zip(
-                            positions, dark.black_dn, dark.good, strict=True
-                        )
-                    ]
-                )
-                for frame in (pair.first, pair.second)
-            ]
-            for pair in pairs
-        ]
-    )
+    cells = tuple(zip(positions, dark.black_dn, dark.good, strict=True))
+
+    def level(frame: UInt16Array) -> float:
+        parts = [plane(frame, at, pattern)[ok].mean() - black for at, black, ok in cells]
+        return float(np.mean(parts))
+
+    signals = np.array([[level(pair.first), level(pair.second)] for pair in pairs])
     response = signals.mean(axis=1) / light
     half_difference = (signals[:, 0] - signals[:, 1]) / (2.0 * signals.mean(axis=1))
     design = np.stack([np.ones_like(light), light / light.max()], axis=1)

@@ -1,7 +1,5 @@
 """A color mosaic read as one gray image, where everything seen has the color of the light."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

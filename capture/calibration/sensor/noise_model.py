@@ -26,9 +26,6 @@ from capture.calibration.sensor.transfer_curve import (
     plane,
 )
 
-__all__ = ["FlatPair", "PhotonTransferError", "SensorCalibration", "photon_transfer"]
-
-
 QUANTIZATION_DN2 = 1.0 / 12.0  # variance of rounding to whole DN
 N_FLAT_BLOCKS = 16  # samples of the flat field along the shorter side
 
@@ -139,7 +136,7 @@ class SensorCalibration:
         return of_one_device(
             "sensor",
             values,
-            notes={
+            {
                 "pattern": self.pattern,
                 "colors": " ".join(self.colors),
                 "saturated_by": ", ".join(self.saturated_by),
@@ -152,9 +149,7 @@ class SensorCalibration:
         """Return the sensor calibration of one camera from a loaded `Calibration`."""
         get = calibration.quantity
         coefficients = get(serial, "flat_coefficients")
-        errors = coefficients.stderr
-        if errors is None:
-            errors = np.zeros_like(coefficients.value)
+        errors = coefficients.known_stderr
         residuals = get(serial, "flat_residual").value
         has_dark = "dark_e_per_s" in calibration.values[serial]
         return cls(

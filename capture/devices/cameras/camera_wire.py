@@ -19,8 +19,6 @@ blob of a frame is uint16, little endian, row by row (``"shape": [H, W]``), or a
 (no ``shape``).
 """
 
-from __future__ import annotations
-
 import json
 import zlib
 from collections.abc import Mapping
@@ -31,6 +29,7 @@ import numpy as np
 from capture.arrays import UInt16Array
 from capture.devices import wire
 from capture.devices.camera import CameraInfo, Exposure, Frame, Trigger
+from capture.documents import table_of
 
 CAMERA_WIRE_VERSION = 1
 MAX_HEADER_BYTES = 65_536
@@ -83,16 +82,7 @@ def check_blob(fields: Mapping[str, Any], blob: bytes) -> None:
 
 def info_to_json(info: CameraInfo) -> dict[str, Any]:
     """Return what a camera is as JSON values."""
-    return {
-        "serial": info.serial,
-        "model": info.model,
-        "width_px": info.width_px,
-        "height_px": info.height_px,
-        "pattern": info.pattern,
-        "black": list(info.black),
-        "white": info.white,
-        "triggers": [str(trigger) for trigger in info.triggers],
-    }
+    return table_of(info)
 
 
 def info_from_json(table: Mapping[str, Any]) -> CameraInfo:

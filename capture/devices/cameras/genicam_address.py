@@ -1,7 +1,5 @@
 """Addresses of industrial cameras: ``genicam:SERIAL`` and what may follow it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from urllib.parse import parse_qsl

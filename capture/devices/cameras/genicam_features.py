@@ -1,7 +1,5 @@
 """Features of a GenICam camera by their standard names (SFNC 2.7): read, set, and read back."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from capture.devices.camera import CameraError

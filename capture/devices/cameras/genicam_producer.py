@@ -4,8 +4,6 @@ A producer is a file ``*.cti`` that comes with a camera maker's software. One pr
 producer once only, so cameras of one producer share it; it is closed with the last of them.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os

@@ -5,8 +5,6 @@ format, known levels, a trigger and a clock that can be read, no frame of it cou
 it is refused.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from capture.devices.camera import CameraError, CameraInfo, CameraUrlError, Trigger

@@ -5,8 +5,6 @@ is one pixel in one or two bytes, ``p`` is packed without gaps from the lowest b
 GigE Vision's older packing of two pixels in three bytes.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass

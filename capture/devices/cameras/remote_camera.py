@@ -3,8 +3,6 @@
 Another program can serve its cameras in the same way: see `capture.devices.cameras.camera_wire`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import socket
 from typing import Any

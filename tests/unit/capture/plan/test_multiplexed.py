@@ -14,14 +14,7 @@ from hypothesis import strategies as st
 
 from capture.plan import Plan, PlanError, flash_plan
 from capture.plan.multiplexed import ReadOutError, course_plan, image_s, multiplexed_plan
-from capture.plan.phases import (
-    equivalent_period_s,
-    period_for,
-    phase_grid,
-    phases,
-    reorder,
-    timed_steps,
-)
+from capture.plan.phases import equivalent_period_s, phase_grid, phases, timed_steps
 from capture.rig import load_rig
 
 FLASH = load_rig("flash")
@@ -115,32 +108,11 @@ def test_decimal_periods_do_not_suffer_from_binary_rounding():
     assert (found.distinct, found.interval_s) == (100, 0.1)
 
 
-def test_a_period_can_be_found_for_a_sampling_interval():
-    for interval in ("0.5", "0.25", "0.1"):
-        period = period_for(5, interval, "5.5")
-        assert period >= Fraction("5.5")
-        assert phase_grid(5, period).interval_s == Fraction(interval)
-    with pytest.raises(PlanError, match="whole part of the cycle"):
-        period_for(5, 0.3, 5.5)
-
-
 def test_cycles_or_captures_set_the_length():
     assert len(timed_steps(multiplexed_plan(FLASH, cycles=12))) == 22
     assert len(timed_steps(multiplexed_plan(FLASH, captures=7))) == 7
     with pytest.raises(PlanError, match="one only"):
         multiplexed_plan(FLASH, cycles=2, captures=3)
-
-
-def test_reordered_shots_rise_in_phase_and_true_times_go_before_planned_ones():
-    plan = multiplexed_plan(FLASH)
-    planned = [float(step.index["phase_s"]) for step in reorder(plan)]
-    assert planned == sorted(planned)
-    first = timed_steps(plan)[0]
-    late = {step.id: float(step.index["phase_s"]) for step in timed_steps(plan)} | {first.id: 3.2}
-    order = [step.id for step in reorder(plan, phases_s=late)]
-    assert order.index(first.id) == 7  # after two shots at 0, of which it was one, ...
-    del late[first.id]
-    assert first.id not in [step.id for step in reorder(plan, phases_s=late)]
 
 
 def test_each_shot_knows_its_state_and_its_phase():

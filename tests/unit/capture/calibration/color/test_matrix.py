@@ -124,8 +124,6 @@ def test_a_camera_that_is_a_matrix_of_the_eye_is_recovered_exactly(method):
     fit = fit_matrix(7.0 * xyz @ CAMERA.T, xyz, method=method, illuminant="D55")
     assert fit.max_delta_e < 1e-6
     np.testing.assert_allclose(fit.matrix[:, :3], np.linalg.inv(CAMERA) / 7.0, atol=1e-8)
-    if method == "linear":
-        np.testing.assert_allclose(fit.xyz_to_camera(), 7.0 * CAMERA, rtol=1e-8)
 
 
 @pytest.mark.parametrize("method", ["linear", "root_polynomial"])

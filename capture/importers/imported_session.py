@@ -1,0 +1,106 @@
+"""The session of imported pictures: appears whole or not at all; its camera is a stand-in."""
+
+import shutil
+import uuid
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from capture.documents import Fault
+from capture.importers.images import PhotoError
+from capture.plan import Plan
+from capture.raw import RawFrame
+from capture.rig import Rig, View
+from capture.session import Session, SessionDiskError, Subject
+
+SENSOR_MM = 36.0
+"""Width of the full-frame sensor that stands in for an unknown one."""
+DISTANCE_MM = 1000.0
+"""Distance of a camera, or of a light, that nobody measured."""
+
+
+def stand_in_view(frame: RawFrame, **known: Any) -> View:
+    """Return a view that fits a picture of which only the frame is known.
+
+    Parameters
+    ----------
+    frame
+        The picture.
+    **known
+        Other fields of the view.
+    """
+    height, width = frame.cfa.shape
+    about: dict[str, Any] = {
+        "name": "cam",
+        "camera_model": frame.camera_model or "unknown camera",
+        "serial": "unknown",
+        "position_mm": (0.0, 0.0, DISTANCE_MM),
+        "target_mm": (0.0, 0.0, 0.0),
+        "up": (0.0, 1.0, 0.0),
+        "focal_mm": frame.focal_mm or 50.0,
+        "pixel_um": 1e3 * SENSOR_MM / width,
+        "width_px": width,
+        "height_px": height,
+        "f_number": 8.0,
+        "readout_s": 0.0,
+        "bit_depth": min(max(frame.white.bit_length(), 8), 16),
+        "cfa": frame.pattern,
+        "black_level": round(sum(frame.black) / len(frame.black)),
+        "white_level": frame.white,
+        "full_well_e": 20_000.0,
+        "read_noise_e": 10.0,
+    }
+    return View(**{**about, **known})
+
+
+@contextmanager
+def imported_session(
+    target: Path,
+    plan: Plan,
+    rig: Rig,
+    subject: Subject | None,
+    extra: Mapping[str, Any],
+    clock: Callable[[], datetime],
+) -> Iterator[Session]:
+    """Make a session at ``target`` that is closed at the end, or none.
+
+    Raises
+    ------
+    PhotoError
+        Unless ``target`` is a new or empty folder.
+    SessionDiskError
+        Where the disk refuses; nothing is kept.
+    """
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise PhotoError(
+            "cannot write here",
+            where=str(target),
+            faults=[Fault("out", "something that exists", "a new or empty folder")],
+            advice="Choose a new folder.",
+        )
+    part = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with Session.create(
+            part,
+            plan=plan,
+            rig=rig,
+            devices={},
+            subject=subject or Subject("unnamed"),
+            source="measured",
+            extra=extra,
+            now=clock,
+        ) as session:
+            yield session
+            session.close()
+        if target.exists():
+            target.rmdir()
+        part.rename(target)
+    except BaseException as exc:
+        shutil.rmtree(part, ignore_errors=True)
+        if isinstance(exc, SessionDiskError):
+            advice = "Free space or name another folder, then import again; nothing was kept."
+            raise SessionDiskError(exc.what, where=str(target), advice=advice) from exc
+        raise
