@@ -13,7 +13,8 @@ import numpy as np
 from capture.calibration import sensor, store
 from capture.calibration.fiber.spot_photometry import Shot, shot
 from capture.calibration.led_sphere.findings import SphereSurvey
-from capture.calibration.led_sphere.survey import GlassBall, survey_sphere
+from capture.calibration.led_sphere.glass_ball import GlassBall
+from capture.calibration.led_sphere.survey import survey_sphere
 from capture.calibration.record import Quantity
 from capture.calibration.sensor.transfer_curve import FlatPair
 from capture.raw import RawFrame

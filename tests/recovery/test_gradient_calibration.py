@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from capture.calibration.fiber.spot_photometry import shot
-from capture.calibration.led_sphere.glass_ball import BallError
-from capture.calibration.led_sphere.survey import GlassBall, survey_sphere
+from capture.calibration.led_sphere.glass_ball import BallError, GlassBall
+from capture.calibration.led_sphere.survey import survey_sphere
 from capture.plan.gradient import BALL_SERIES, EXPOSURE_S
 from capture.raw import RawFrame
 from capture.rig import load_rig

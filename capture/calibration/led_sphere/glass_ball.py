@@ -9,7 +9,7 @@ spot tells its own light's direction.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter
 from scipy.spatial import cKDTree
 
@@ -35,6 +35,30 @@ MEDIAN_CHI2_2 = 1.3863  # median of chi-square with two degrees of freedom, 2 ln
 
 class BallError(CalibrationError):
     """Photographs of the ball that tell nothing; the message says why and what to change."""
+
+
+@dataclass(frozen=True, slots=True)
+class GlassBall:
+    """The target: a polished ball of black glass."""
+
+    center_mm: tuple[float, float, float] = (0.0, 0.0, -3.0)
+    """About where its middle stands, mm, rig frame: half a radius behind the origin, where the
+    camera is focused, spots near the axis are sharp."""
+    radius_mm: float = 6.0
+    radius_stderr_mm: float = 0.02
+    eta: float = 1.52
+    """Refractive index, > 1."""
+    eta_stderr: float = 0.002
+    depth_stderr_mm: float = 1.0
+    """How well it stands there along the camera's axis, mm."""
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        for name in ("radius_mm", "radius_stderr_mm", "depth_stderr_mm", "eta_stderr"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise ValueError(f"GlassBall.{name}: got {getattr(self, name)}, expected > 0")
+        if not 1 < self.eta < 4:
+            raise ValueError(f"GlassBall.eta: got {self.eta}, expected 1 < eta < 4")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,11 +178,8 @@ def locate_ball(
     spots: Float64Array,
     camera: CameraPose,
     lights_mm: Float64Array,
+    target: GlassBall,
     *,
-    center_mm: ArrayLike = (0.0, 0.0, 0.0),
-    radius_mm: float = 6.0,
-    radius_stderr_mm: float = 0.02,
-    depth_stderr_mm: float = 1.0,
     margin_mm: float = 0.1,
     noise_px: float = 0.5,
     lit: BoolArray | None = None,
@@ -172,12 +193,8 @@ def locate_ball(
     camera : CameraPose
     lights_mm : ndarray of float64, shape (L, 3)
         Nominal places of the lights; what they have wrong in common becomes the ball's.
-    center_mm : array_like, shape (3,)
-        About where the ball's middle stands, rig frame.
-    radius_mm, radius_stderr_mm : float
-        The ball's, and how well it is known.
-    depth_stderr_mm : float
-        How well the ball's middle stands there along the camera's axis.
+    target : GlassBall
+        About where the ball stands, and how well that and its radius are known.
     margin_mm : float
         A spot's own size: closer to the image's border it is not whole.
     noise_px : float
@@ -199,7 +216,7 @@ def locate_ball(
     found = np.asarray(spots, np.float64).reshape(-1, 2)
     shows = np.ones(len(lights), bool) if lit is None else lit
     pixel_mm = float(np.linalg.norm(camera.center_mm)) / float(camera.matrix[0, 0])
-    about = np.array(center_mm, np.float64)
+    about, radius_mm = np.array(target.center_mm, np.float64), target.radius_mm
     nominal = reflection_pixels(camera, about, radius_mm, lights)
     _require_field(nominal[shows], camera, pixel_mm, radius_mm)
     if len(found) == 0:
@@ -217,18 +234,8 @@ def locate_ball(
         )
     right, down = camera.rotation[0], camera.rotation[1]
     start = about + pixel_mm * (shift[0] * right + shift[1] * down)
-    return _refine(
-        found,
-        camera,
-        lights,
-        shows,
-        np.append(start, radius_mm),
-        pixel_mm,
-        expected=np.append(about, radius_mm),
-        prior=np.array([MAX_BALL_OFFSET_MM, MAX_BALL_OFFSET_MM, depth_stderr_mm, radius_stderr_mm]),
-        margin_px=margin_mm / pixel_mm,
-        noise_px=noise_px,
-    )
+    margin_px = margin_mm / pixel_mm
+    return _refine(found, camera, lights, shows, start, target, margin_px, noise_px)
 
 
 def light_directions(
@@ -317,15 +324,17 @@ def _refine(
     camera: CameraPose,
     lights: Float64Array,
     shows: BoolArray,
-    place: Float64Array,
-    pixel_mm: float,
-    *,
-    expected: Float64Array,
-    prior: Float64Array,
+    start_mm: Float64Array,
+    target: GlassBall,
     margin_px: float,
     noise_px: float,
 ) -> BallFit:
     """Fit centre and radius by Gauss and Newton, each light free about its nominal place."""
+    pixel_mm = float(np.linalg.norm(camera.center_mm)) / float(camera.matrix[0, 0])
+    place = np.append(start_mm, target.radius_mm)
+    expected = np.append(target.center_mm, target.radius_mm)
+    errors_mm = (target.depth_stderr_mm, target.radius_stderr_mm)
+    prior = np.array([MAX_BALL_OFFSET_MM, MAX_BALL_OFFSET_MM, *errors_mm])
     tree = cKDTree(found)
     scatter_mm, gate_px = 2.0, SPOT_GATE_MM / pixel_mm
     spot = np.full(len(lights), -1)

@@ -19,6 +19,7 @@ from capture.calibration.led_sphere.findings import SphereSurvey, describe_findi
 from capture.calibration.led_sphere.glass_ball import (
     BallError,
     BallFit,
+    GlassBall,
     find_spots,
     light_directions,
     locate_ball,
@@ -47,30 +48,6 @@ MAX_INTENSITY_STDERR = 0.3  # relative error above which an intensity is not cal
 STRAY_PEAK_RATIO = 0.2
 STRAY_MM = 0.4
 SKIN_ETA = 1.4
-
-
-@dataclass(frozen=True, slots=True)
-class GlassBall:
-    """The target: a polished ball of black glass."""
-
-    center_mm: tuple[float, float, float] = (0.0, 0.0, -3.0)
-    """About where its middle stands, mm, rig frame: half a radius behind the origin, where the
-    camera is focused, spots near the axis are sharp."""
-    radius_mm: float = 6.0
-    radius_stderr_mm: float = 0.02
-    eta: float = 1.52
-    """Refractive index, > 1."""
-    eta_stderr: float = 0.002
-    depth_stderr_mm: float = 1.0
-    """How well it stands there along the camera's axis, mm."""
-
-    def __post_init__(self) -> None:
-        """Check ranges."""
-        for name in ("radius_mm", "radius_stderr_mm", "depth_stderr_mm", "eta_stderr"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise ValueError(f"GlassBall.{name}: got {getattr(self, name)}, expected > 0")
-        if not 1 < self.eta < 4:
-            raise ValueError(f"GlassBall.eta: got {self.eta}, expected 1 < eta < 4")
 
 
 def survey_sphere(
@@ -183,14 +160,23 @@ def _find_lights(
     """Return the lights' directions by their spots; nominal ones where a spot is not measured."""
     total = _both_states(shots)
     spots = find_spots(total.rate, pixel_mm=pixel_mm)
-    fit = _locate(spots, camera, place, what)
+    margin_mm = RING_RADII[1] * SPOT_MARGIN_MM
+    fit = locate_ball(spots, camera, place, what, margin_mm=margin_mm)
     start = np.where((fit.spot >= 0)[:, None], spots[fit.spot], np.nan)
     middle, noise_px, clipped = measure_middles(total, start, aperture_px=aperture_px)
     measured = np.asarray(np.isfinite(middle).all(axis=1), bool)
     if not measured.any():
         raise BallError("ball: no spot lies whole within the image; centre the ball")
     # the ball by the spots' middles instead of their brightest pixels
-    sharp = _locate(middle[measured], camera, place, what, measured, TYPICAL_CENTER_STDERR_PX)
+    sharp = locate_ball(
+        middle[measured],
+        camera,
+        place,
+        what,
+        margin_mm=margin_mm,
+        noise_px=TYPICAL_CENTER_STDERR_PX,
+        lit=measured,
+    )
     fit = replace(fit, ball=sharp.ball, light_scatter_mm=sharp.light_scatter_mm)
     errors = np.hypot(
         np.where(measured, noise_px, 0.0), np.where(clipped, 0.5, MIN_CENTER_STDERR_PX)
@@ -242,28 +228,6 @@ def _bright_strays(seen: _SeenLights, pixel_mm: float) -> int:
         peak[k] > STRAY_PEAK_RATIO * usual_peak
         and np.linalg.norm(own - spots[k], axis=1).min() > STRAY_MM / pixel_mm
         for k in fit.stray
-    )
-
-
-def _locate(
-    spots: Float64Array,
-    camera: CameraPose,
-    place: Float64Array,
-    what: GlassBall,
-    lit: BoolArray | None = None,
-    noise_px: float = 0.5,
-) -> BallFit:
-    return locate_ball(
-        spots,
-        camera,
-        place,
-        center_mm=what.center_mm,
-        radius_mm=what.radius_mm,
-        radius_stderr_mm=what.radius_stderr_mm,
-        depth_stderr_mm=what.depth_stderr_mm,
-        margin_mm=RING_RADII[1] * SPOT_MARGIN_MM,
-        noise_px=noise_px,
-        lit=lit,
     )
 
 
