@@ -22,7 +22,8 @@ VIEW = RIG.view("cam")
 CAMERA = CameraPose.nominal(VIEW)
 PLACE = np.array([light.position_mm for light in RIG.lights])
 DISTANCE = np.linalg.norm(PLACE, axis=1)
-BEHIND = GlassBall(center_mm=(0.0, 0.0, -3.0))
+BEHIND = np.array([0.0, 0.0, -3.0])
+TARGET = GlassBall(center_mm=(0.0, 0.0, -3.0))
 ALARM = 1e-3
 
 
@@ -62,7 +63,7 @@ def test_a_spot_lies_where_the_way_of_light_is_stationary():
 def test_the_ball_is_found_to_microns_by_lights_known_to_millimetres(rng):
     center, places = np.array([0.4, -0.3, -2.7]), sphere(rng)
     pixels = seen(center, places, 6.01) + 0.1 * rng.standard_normal(PLACE[:, :2].shape)
-    fit = locate_ball(pixels, CAMERA, PLACE, BEHIND, noise_px=0.1)
+    fit = locate_ball(pixels, CAMERA, PLACE, TARGET, noise_px=0.1)
     np.testing.assert_array_equal(fit.spot, np.arange(len(PLACE)))
     gap = np.append(fit.ball.center_mm - center, fit.ball.radius_mm - 6.01)
     assert np.abs(gap[:2]).max() < 0.005
@@ -73,7 +74,7 @@ def test_the_ball_is_found_to_microns_by_lights_known_to_millimetres(rng):
 def test_directions_are_found_within_their_errors_and_better_than_drawn(rng):
     center, places = np.array([-0.2, 0.5, -3.2]), sphere(rng)
     pixels = seen(center, places) + 0.05 * rng.standard_normal(PLACE[:, :2].shape)
-    fit = locate_ball(pixels, CAMERA, PLACE, BEHIND, noise_px=0.05)
+    fit = locate_ball(pixels, CAMERA, PLACE, TARGET, noise_px=0.05)
     found = light_directions(CAMERA, fit.ball, pixels, np.full(len(PLACE), 0.05), DISTANCE)
     error = angle_deg(found.direction, directions_of(places))
     drawn = angle_deg(directions_of(PLACE), directions_of(places))
@@ -97,7 +98,7 @@ def test_a_tenth_of_the_lights_dead_and_stray_spots_change_nothing(rng):
     dead = rng.choice(len(PLACE), 13, replace=False)
     pixels = np.delete(seen(center, places), dead, axis=0)
     stray = rng.uniform(100, 1900, (20, 2))
-    fit = locate_ball(np.concatenate([stray, pixels]), CAMERA, PLACE, BEHIND)
+    fit = locate_ball(np.concatenate([stray, pixels]), CAMERA, PLACE, TARGET)
     alive = np.setdiff1d(np.arange(len(PLACE)), dead)
     np.testing.assert_array_equal(fit.spot[alive], 20 + np.arange(len(alive)))
     assert np.mean(fit.spot[dead] == -1) > 0.8  # a stray may lie where a dead light would
@@ -109,7 +110,7 @@ def test_a_ball_two_millimetres_off_is_found_and_what_falls_outside_is_known(rng
     pixels = seen(center, places)
     inside = ((pixels > 0) & (pixels < 2047)).all(axis=1)
     assert 5 < np.sum(~inside) < 66
-    fit = locate_ball(pixels[inside], CAMERA, PLACE, BEHIND)
+    fit = locate_ball(pixels[inside], CAMERA, PLACE, TARGET)
     assert np.abs(fit.ball.center_mm - center)[:2].max() < 0.01
     np.testing.assert_array_equal(fit.spot[inside], np.arange(inside.sum()))
     assert (fit.spot[~inside] == -1).all()
@@ -118,23 +119,23 @@ def test_a_ball_two_millimetres_off_is_found_and_what_falls_outside_is_known(rng
 
 def test_a_crop_that_shows_half_the_ball_is_refused_by_name(rng):
     small = CameraPose.nominal(RIG.cropped(512).view("cam"))
-    pixels = seen(BEHIND.center_mm, PLACE, camera=small)
+    pixels = seen(BEHIND, PLACE, camera=small)
     inside = ((pixels > 0) & (pixels < 511)).all(axis=1)
     with pytest.raises(BallError, match="can show only"):
-        locate_ball(pixels[inside], small, PLACE, BEHIND)
+        locate_ball(pixels[inside], small, PLACE, TARGET)
     half = CameraPose.nominal(RIG.cropped(1300).view("cam"))
     pixels = seen([3.2, 2.0, -3.0], PLACE, camera=half)
     inside = ((pixels > 0) & (pixels < 1299)).all(axis=1)
     assert 30 < inside.sum() < 66
     with pytest.raises(BallError, match="spots lie in the field"):
-        locate_ball(pixels[inside], half, PLACE, BEHIND)
+        locate_ball(pixels[inside], half, PLACE, TARGET)
 
 
 def test_no_spots_and_spots_of_something_else_are_refused_by_name(rng):
     with pytest.raises(BallError, match="no spot stands out"):
-        locate_ball(np.zeros((0, 2)), CAMERA, PLACE, BEHIND)
+        locate_ball(np.zeros((0, 2)), CAMERA, PLACE, TARGET)
     with pytest.raises(BallError, match="lights' pattern"):
-        locate_ball(rng.uniform(0, 2047, (100, 2)), CAMERA, PLACE, BEHIND)
+        locate_ball(rng.uniform(0, 2047, (100, 2)), CAMERA, PLACE, TARGET)
 
 
 def test_an_image_of_noise_has_no_spots(rng):
