@@ -192,7 +192,7 @@ def relative_error(
         _not_negative("sigma_a_per_mm", sigma_a_per_mm),
         _not_negative("sigma_s_prime_per_mm", sigma_s_prime_per_mm),
     )
-    scatters = (sigma_s > 0.0) & (radius > 0.0)
+    scatters = (sigma_s >= np.finfo(np.float64).tiny) & (radius > 0.0)
     s = np.where(scatters, sigma_s, 1.0)
     rho = np.where(scatters, radius * s, 1.0)
     u = np.sqrt(sigma_a / s)

@@ -175,6 +175,7 @@ def test_effective_transport_of_any_medium_is_a_number(sigma_a, sigma_s):
     g=TABLE_G,
     collection=st.sampled_from(["all", "fibre"]),
 )
+@example(radius=1.0, sigma_a=1.0, sigma_s=2.2e-311, eta=1.4, g=0.0, collection="all")
 def test_the_photon_table_is_finite_and_says_where_it_holds(
     radius, sigma_a, sigma_s, eta, g, collection
 ):

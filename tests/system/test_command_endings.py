@@ -146,7 +146,7 @@ def test_a_served_rig_prints_one_document_and_ends_without_another(monkeypatch, 
         def __exit__(self, *error):
             return None
 
-        def wait(self, seconds):
+        def wait(self):
             raise KeyboardInterrupt
 
     monkeypatch.setattr(
