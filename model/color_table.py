@@ -1,7 +1,5 @@
 """The color of skin as a table over melanin and hemoglobin (Jimenez 2010, eq. 7)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib import resources

@@ -1,7 +1,5 @@
 """Fresnel reflection at a smooth dielectric surface, and its exact averages over directions."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How far an estimate is from a truth, and whether its standard errors are honest."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

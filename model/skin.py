@@ -1,7 +1,5 @@
 """What is known about a piece of skin: named maps with unit, standard error and valid mask."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -10,8 +10,6 @@ References
 Weyrich et al. 2006, doi:10.1145/1141911.1141987, sections 3 and 9 (the dome of 2005).
 """
 
-from __future__ import annotations
-
 import io
 import zipfile
 from dataclasses import dataclass

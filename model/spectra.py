@@ -4,8 +4,6 @@ The tables are CSV files in ``model/data``; each file's header names its source 
 Everything is sampled by linear interpolation at the wavelengths that the caller asks for.
 """
 
-from __future__ import annotations
-
 from functools import cache, lru_cache
 from importlib import resources
 

@@ -4,8 +4,6 @@
 or not at all. TRUTH/ folders have the same format.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -4,8 +4,6 @@ Texel i of n covers [i/n, (i + 1)/n] of the square, its centre at (i + 1/2)/n; b
 centres the edge texel holds, as a graphics sampler that clamps does.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

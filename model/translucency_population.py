@@ -19,8 +19,6 @@ Weyrich et al. 2005, A Measurement-Based Skin Reflectance Model for Face Renderi
 MERL TR2005-071, section 10.3. Published as doi:10.1145/1141911.1141987
 """
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

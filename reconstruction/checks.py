@@ -1,7 +1,5 @@
 """Checks of settings and shapes that estimators have in common."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -3,8 +3,6 @@
 Contraction is the only liberty that they take with arithmetic: NaN and infinity keep their meaning.
 """
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 from numba import types

@@ -1,7 +1,5 @@
 """Normals with what is known about them: what every estimator of normals returns."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

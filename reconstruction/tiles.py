@@ -4,8 +4,6 @@ The one seam for parallel and distributed work: any executor with ``submit`` fit
 ``concurrent.futures`` pool or ``distributed.Client(...).get_executor()`` alike.
 """
 
-from __future__ import annotations
-
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Tables that come with the package, read from its folder ``data``."""
 
-from __future__ import annotations
-
 import tomllib
 from functools import cache
 from importlib.resources import files

@@ -1,7 +1,5 @@
 """An image sensor: light on it to digital numbers, step by step in electrons."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from dataclasses import dataclass

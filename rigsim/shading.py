@@ -21,8 +21,6 @@ Walter et al. 2007, doi:10.2312/EGWR/EGSR07/195-206 (GGX and its shadowing).
 Born and Wolf, Principles of Optics, section 1.5 (Fresnel's amplitudes).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Kernels of `rigsim.shading`: reflection, entry and exit of filtered light, element by element."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

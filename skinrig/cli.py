@@ -1,7 +1,5 @@
 """The command line: what `skinrig` is, its demo, and how it ends."""
 
-from __future__ import annotations
-
 import logging
 import os
 import sys

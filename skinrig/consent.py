@@ -1,7 +1,5 @@
 """What subjects agreed to: said on the command line, carried by maps, asked for by exports."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from datetime import UTC, date, datetime
 from typing import Any, Protocol

@@ -1,7 +1,5 @@
 """What commands print: results on stdout, progress on stderr, one document with --json."""
 
-from __future__ import annotations
-
 import json
 import math
 import sys

@@ -1,7 +1,5 @@
 """The demo: simulate, capture, calibrate, reconstruct, measure and report, in one go."""
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os

@@ -4,8 +4,6 @@ Each rig runs in a process of its own, which compiles the kernels that it import
 one rig is imported in its function.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Say what is installed, what is missing, and how to mend it."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import importlib.util
 import os

@@ -16,8 +16,6 @@ What a command ends with:
 === ================================================================================
 """
 
-from __future__ import annotations
-
 import errno
 from collections.abc import Iterable, Sequence
 from typing import TypeVar

@@ -1,7 +1,5 @@
 """Where compiled kernels are kept when neither the installation nor the home can be written."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Mapping, MutableMapping

@@ -1,7 +1,5 @@
 """What to do next: after a session was captured, and with what lies in a folder."""
 
-from __future__ import annotations
-
 import shlex
 import sys
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """One self-contained HTML page of what was measured, and how far from the truth it is."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

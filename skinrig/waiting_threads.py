@@ -1,7 +1,5 @@
 """How threads of a numerical library wait for the next loop that is theirs."""
 
-from __future__ import annotations
-
 from collections.abc import MutableMapping
 
 WAITING_ASLEEP = {"OMP_WAIT_POLICY": "PASSIVE"}

@@ -4,8 +4,6 @@ Folders are told apart by their documents alone, and no map is read, so that a p
 answers at once.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """How people are told a number with its unit: one way for pages and for the terminal."""
 
-from __future__ import annotations
-
 from typing import Final
 
 DEGREE_SIGN: Final = "°"

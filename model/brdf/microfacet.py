@@ -11,8 +11,6 @@ Heitz 2014, http://jcgt.org/published/0003/02/03/ (height-correlated shadowing).
 Blinn 1977, doi:10.1145/563858.563893 (cosine power).
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

@@ -5,8 +5,6 @@ reflection of three kinds of facets at three refractive indices, sheen, light th
 source, and what is left of the diffuse part.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import numpy as np

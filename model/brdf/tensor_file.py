@@ -9,8 +9,6 @@ Dupuy and Jakob 2018, doi:10.1145/3272127.3275059 (the materials; Mitsuba's ``te
 same container).
 """
 
-from __future__ import annotations
-
 import math
 import os
 import struct

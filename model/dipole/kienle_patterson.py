@@ -10,8 +10,6 @@ Kienle and Patterson 1997, doi:10.1364/JOSAA.14.000246 (the reflectance).
 Haskell et al. 1994, doi:10.1364/JOSAA.11.002727 (the effective reflection).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

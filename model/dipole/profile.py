@@ -9,8 +9,6 @@ Jensen et al. 2001, doi:10.1145/383259.383319 (dipole).
 Weyrich et al. 2006, doi:10.1145/1141911.1141987, eq. (5) and section 9 (the dome of 2005).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

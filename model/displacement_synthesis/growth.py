@@ -16,8 +16,6 @@ Nagano et al. 2015 (doi:10.1145/2766894) cover faces by the synthesis of Graham 
 (doi:10.1111/cgf.12053), which is constrained by a coarser scan; this one is not.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Which window of which patch each place of a map shows, and drawing any part of it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass

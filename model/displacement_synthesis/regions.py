@@ -1,7 +1,5 @@
 """Where on a map each site's skin is: coarse weights, and their smooth values at pixels."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -6,8 +6,6 @@ ISO 16610-21:2011, Geometrical product specifications, filtration: linear profil
 filters (a wave of the cut-off's length keeps half its height).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """How far a predicted state is from its truth, beside what simpler animation would give."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

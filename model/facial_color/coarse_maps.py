@@ -1,7 +1,5 @@
 """Smooth maps kept small: averaged down over the pixels that count, and made large again."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -16,8 +16,6 @@ doi:10.1080/01621459.1995.10476592): in a disc that holds n of them it moves the
 of 1/n, and eq. (5) holds as it stands.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

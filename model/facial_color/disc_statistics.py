@@ -5,8 +5,6 @@ variance is the mean of squared deviations about a value of the neighbourhood: i
 on a map that is nearly constant or drifts.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, Final

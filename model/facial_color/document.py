@@ -1,7 +1,5 @@
 """A hemoglobin rig as maps of an APPEARANCE/ folder with one JSON document, and back."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from typing import Any, Final

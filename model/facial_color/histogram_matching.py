@@ -5,8 +5,6 @@ nodes of a grid of windows whose mappings are blended bilinearly. `model.facial_
 two numbers a disc instead.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

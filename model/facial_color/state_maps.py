@@ -1,7 +1,5 @@
 """Maps of one expression of the hemoglobin rig, and the names of expressions."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -15,8 +15,6 @@ Nagano et al. 2015, Skin Microstructure Deformation with Displacement Map Convol
 Graph. 34(4), 109, section 3. doi:10.1145/2766894
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

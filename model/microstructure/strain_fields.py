@@ -5,8 +5,6 @@ texture's scale. Pixel (0, 0)'s centre is (0, 0) and row 0 is the top: u = (x + 
 v = 1 - (y + 1/2) / H.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Literal

@@ -5,8 +5,6 @@ core and one of the detector's. The average over four coordinates needs only the
 the distance; a few Gauss nodes of that distribution give it for a whole family of profiles.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

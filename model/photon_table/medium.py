@@ -3,8 +3,6 @@
 See `model.photon_table` for what is stored.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files

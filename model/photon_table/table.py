@@ -12,8 +12,6 @@ ln(1 + 10 sqrt(sigma_a/sigma_s')): smooth, positive, with exact slopes for least
 far away. tools/make_photon_table.py makes model/data/photon_table.npz and says how.
 """
 
-from __future__ import annotations
-
 from typing import TypedDict, Unpack
 
 import numpy as np

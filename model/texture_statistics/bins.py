@@ -5,8 +5,6 @@ References
 Heeger, Bergen 1995, doi:10.1145/218380.218446, section 3.5 (decorrelated colors).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

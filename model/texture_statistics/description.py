@@ -11,8 +11,6 @@ Heeger, Bergen 1995, doi:10.1145/218380.218446.
 Weyrich et al. 2006, doi:10.1145/1141911.1141987, sections 10.2 and 11.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Masked textures before a pyramid: what stands outside the mask, and which responses count."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import convolve1d

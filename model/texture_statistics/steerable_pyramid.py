@@ -15,8 +15,6 @@ Simoncelli, Freeman 1995, doi:10.1109/ICIP.1995.537667.
 Portilla, Simoncelli 2000, doi:10.1023/A:1026553619983 (the filters).
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable, Iterator

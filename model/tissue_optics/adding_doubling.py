@@ -5,8 +5,6 @@ radiance falling on it into the radiance that leaves it; they are known in close
 layer, doubled until the layer has its thickness, and layers are added from the bottom up.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Diffusion theory of plane layers in closed form: the fast tier of layered reflectance."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from model import fresnel

@@ -1,7 +1,5 @@
 """From chromophores to the absorption, scattering and reflectance of layered skin."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

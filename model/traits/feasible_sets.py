@@ -4,8 +4,6 @@ Both are convex, and what falls outside is put on the nearest place inside. Such
 moves two points apart, which bounds what an edit and its opposite leave: see `model.traits`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias

@@ -10,8 +10,6 @@ References
 Villani 2003, Topics in Optimal Transportation, section 2.2 (the line), doi:10.1090/gsm/058
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

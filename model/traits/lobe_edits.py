@@ -21,8 +21,6 @@ References
 Weyrich et al. 2005, "Measuring and modeling human skin reflectance", section 11.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

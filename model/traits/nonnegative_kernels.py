@@ -6,8 +6,6 @@ Problems, chapter 23), started from the shares that are positive.
 
 # mypy: allow-untyped-defs
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,8 +5,6 @@ References
 Weyrich et al. 2005, "Measuring and modeling human skin reflectance", sections 10 and 11.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal

@@ -4,8 +4,6 @@ Spaces of long samples can be stored in fewer bits. What that changes in each tr
 measured while writing and told by the document.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile

@@ -9,8 +9,6 @@ References
 Khronos Data Format Specification 1.3, chapters "S3TC" (BC1, BC3) and "RGTC" (BC4, BC5).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from model.arrays import Float64Array, FloatArray, Int64Array, UInt8Array

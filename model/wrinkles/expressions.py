@@ -6,8 +6,6 @@ Jimenez, Echevarria, Oat, Gutierrez 2011, Practical and Realistic Facial Wrinkle
 GPU Pro 2, chapter 1 (table 1.1, section 1.2). ISBN 978-1-56881-718-7
 """
 
-from __future__ import annotations
-
 import csv
 import difflib
 import math

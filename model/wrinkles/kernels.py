@@ -6,8 +6,6 @@ rows of each and runs without look-ups. Kernels are parallel over rows and calle
 
 # mypy: allow-untyped-defs
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from math import sqrt

@@ -1,7 +1,5 @@
 """Masks of wrinkle zones: as planes, as RGBA textures of four each, and summed by their weights."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import TypeAlias

@@ -18,8 +18,6 @@ GPU Pro 2, chapter 1. ISBN 978-1-56881-718-7. Listing 1.1 lost an operator in pr
 ``mask = weights`` is ``mask *= weights``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -9,8 +9,6 @@ extremes of sigma_tr^2::
 Any (l, u, v) is an ellipse, and none is singular at the circle, u = v = 0.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from reconstruction.anisotropy.direction_harmonics import AXIAL_COLUMNS, ODD_COLUMNS, HarmonicFit

@@ -8,8 +8,6 @@ over that of the residuals is F's with 2 degrees of freedom above, whose tail ha
 ``P(F > f) = (1 + 2 f / d)^(-d/2)``; for known errors, ``P(chi2 > x) = exp(-x/2)``.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -17,8 +17,6 @@ Nickell et al. 2000, Anisotropy of light propagation in human skin, Phys. Med. B
 doi:10.1088/0031-9155/45/10/310
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias

@@ -1,7 +1,5 @@
 """Length and direction of plane vectors that are known with errors."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

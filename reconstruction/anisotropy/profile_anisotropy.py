@@ -13,8 +13,6 @@ mistaken for coupling. Readings are compared as they are, not as logarithms: tho
 even negative ones, count without bias.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -15,8 +15,6 @@ References
 Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 7.
 """
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 from typing import Literal

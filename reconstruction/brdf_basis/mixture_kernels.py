@@ -3,8 +3,6 @@
 `reconstruction.brdf_basis.evaluate` is the plain twin; tests hold both together.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

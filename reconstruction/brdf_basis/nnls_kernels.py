@@ -10,8 +10,6 @@ References
 Lawson and Hanson 1974, Solving Least Squares Problems, chapter 23.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

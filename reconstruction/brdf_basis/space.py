@@ -10,8 +10,6 @@ References
 Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 10.1 and figure 15.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal

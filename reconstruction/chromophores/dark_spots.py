@@ -13,8 +13,6 @@ like lighter, and so one that by itself has less melanin than by its face, by mo
 error, is one of both, too.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Final

@@ -4,8 +4,6 @@ Asking each pixel alone whether its estimate exceeds its error keeps the pixels 
 large and drops the others: what is kept is then far too high, with errors that look small.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import ndimage
 

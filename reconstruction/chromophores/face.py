@@ -5,8 +5,6 @@
 mole, shade, lip or lid (`reconstruction.chromophores.dark_spots`).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import partial

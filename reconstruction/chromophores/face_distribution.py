@@ -15,8 +15,6 @@ the error is what it moves to the other side. Blood that ends at next to none is
 at all, for all skin that lives has some: any is then as probable.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """How probable each pixel's color is over a plane of chromophores, one pixel after the other."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ Each pixel is fitted by the color table of the two-layer skin model (Jimenez et 
 doi:10.1145/1866158.1866167, eq. 7), in the cube roots of both volume fractions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal

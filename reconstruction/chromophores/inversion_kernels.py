@@ -3,8 +3,6 @@
 `reconstruction.chromophores` is the door; its tests do the same in plain NumPy.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ Both axes run evenly in the cube root of the volume fraction over its largest, f
 `MIN_AXIS_FRACTION` to 1.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

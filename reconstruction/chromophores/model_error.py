@@ -13,8 +13,6 @@ All are relative errors of white-balanced camera RGB, fitted on simulated subjec
 at two resolutions by ``tools/fit_model_error.py``; judge them on others.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterator

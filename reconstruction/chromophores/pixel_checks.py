@@ -1,7 +1,5 @@
 """Checks of what goes along with the pixels of a picture."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

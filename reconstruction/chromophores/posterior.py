@@ -8,8 +8,6 @@ face. The estimate is the median of what remains, its standard error reaches as 
 probability, over both solutions where both are possible.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

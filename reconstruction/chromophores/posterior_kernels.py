@@ -17,8 +17,6 @@ A pixel goes through `_weights`, `_follow`, `_lowest`, `_look_across` and `_sum_
 - `between`: the lowest cost between each line and the next, of `_lowest`.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -7,8 +7,6 @@ lighter skin: the start then lies on the light side of the fold, and the grid re
 the other solution would be.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

@@ -4,8 +4,6 @@ No model of skin and no scale: optical density, freed of the brightness that is 
 channels, is unmixed into two independent components.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 

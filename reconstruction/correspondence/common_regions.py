@@ -5,8 +5,6 @@ References
 Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 10.2 (beard and no beard).
 """
 
-from __future__ import annotations
-
 from types import MappingProxyType
 from typing import Final
 

@@ -8,8 +8,6 @@ vessels it fills stay where they are in the skin.
 Without landmarks, points are found by features, and the result says so.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

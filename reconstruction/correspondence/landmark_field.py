@@ -12,8 +12,6 @@ Wahba 1990, Spline Models for Observational Data, chapters 2 and 4, doi:10.1137/
 Cressie 1993, Statistics for Spatial Data, section 3.4, doi:10.1002/9781119115151
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

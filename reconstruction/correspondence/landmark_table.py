@@ -1,7 +1,5 @@
 """Named points of a picture, as a user writes them down: a table ``name,x,y``."""
 
-from __future__ import annotations
-
 import csv
 import math
 from pathlib import Path

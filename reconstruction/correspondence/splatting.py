@@ -1,7 +1,5 @@
 """Texels at scattered places of a map: added to the pixels around them, covered by others."""
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

@@ -10,8 +10,6 @@ References
 Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 6.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, Literal

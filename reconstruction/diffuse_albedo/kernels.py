@@ -1,7 +1,5 @@
 """The diffuse albedo's inner loop: R_d and a few white lobes fitted together, point by point."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

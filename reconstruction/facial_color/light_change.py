@@ -1,7 +1,5 @@
 """How the light on a face changes from picture to picture, told by the colors of many pixels."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

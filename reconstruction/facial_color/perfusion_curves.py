@@ -11,8 +11,6 @@ References
 Jimenez et al. 2010, doi:10.1145/1866158.1866167, section 3.1
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -9,8 +9,6 @@ step, the same in all samples of a pose. It comes as promptly as the movement an
 for quick blood; so it is one more level of each curve, with its standard error as prior.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Literal
 

@@ -10,8 +10,6 @@ how the light changes from picture to picture (`reconstruction.facial_color.ligh
 that off: what is left is the slopes that are finer than the window in which it is followed.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -6,8 +6,6 @@ darker, and how bright a pixel is is left open by those who take chromophores fr
 (`reconstruction.facial_color.shared_melanin`).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.stats import chi2
 

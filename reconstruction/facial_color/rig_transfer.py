@@ -4,8 +4,6 @@ Two faces that were not photographed alike share no map space: where the rig's s
 the other face is told by points that have the same name on both.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

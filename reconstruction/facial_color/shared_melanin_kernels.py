@@ -4,8 +4,6 @@
 twin is in its tests.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pictures of several channels: added up where the reflection has no color, one by one else."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

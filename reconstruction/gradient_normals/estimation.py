@@ -9,8 +9,6 @@ normal. With `SphereLights` the vector is not taken at its word, but looked up i
 lights show of this lobe (:mod:`reconstruction.gradient_normals.lobe_response`).
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 from concurrent.futures import Executor

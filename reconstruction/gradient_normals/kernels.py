@@ -3,8 +3,6 @@
 Every kernel is serial and releases the interpreter, for tiles of rows on threads.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -9,8 +9,6 @@ Normals and what is seen of them are written as places in an equal-area disc abo
 azimuthal): a place ``u`` is 2 sin(tilt / 2) long and points where the normal leans.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache

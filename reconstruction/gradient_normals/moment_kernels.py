@@ -1,7 +1,5 @@
 """Moments of the lights from the patterns of a pixel, compiled."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

@@ -1,7 +1,5 @@
 """Moments of a reflection under a sphere's patterns, by tiles of rows, smoothed or not."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal

@@ -1,7 +1,5 @@
 """The noise of a gradient sphere's pictures, as far as these tell it themselves."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Four numbers a polarization are asked for, the full light and its moments along 
 picture is a weighted sum of them: the full light itself, or half of it plus or less half a moment.
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Lights of a gradient sphere, and the disc that normals are looked up on."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

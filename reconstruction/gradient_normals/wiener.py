@@ -5,8 +5,6 @@ noise has as much at all. With the noise known, the spectrum of a moment's image
 each frequency is signal (Wiener 1949), and that share is kept.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import fft
 from scipy.ndimage import gaussian_filter, uniform_filter

@@ -10,8 +10,6 @@ each kernel with the scatter of its own histogram: a kernel that deepens furrows
 one that does not. Else the target is drawn as of other skin.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

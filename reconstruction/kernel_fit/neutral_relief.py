@@ -12,8 +12,6 @@ What is fixed, here and in `model.microstructure`:
   another bucket than in double precision.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Literal

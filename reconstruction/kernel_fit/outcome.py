@@ -1,7 +1,5 @@
 """What a search for a kernel found: the kernel with its noise, its valley and a finer minimum."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

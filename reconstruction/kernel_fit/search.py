@@ -20,8 +20,6 @@ Serfling 1974, Probability Inequalities for the Sum in Sampling without Replacem
 2(1), 39. doi:10.1214/aos/1176342611
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 

@@ -4,8 +4,6 @@
 arrays of millions of samples where one is enough.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

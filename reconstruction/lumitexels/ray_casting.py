@@ -1,7 +1,5 @@
 """Rays against a triangle mesh, by Embree: what a ray meets first, and whether anything bars it."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 import numpy as np

@@ -4,8 +4,6 @@ The samples of a point are BRDF values with their variances, their directions to
 and a mask of those that count: the point faces both, nothing stands between, the pixel is good.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final, Protocol
 

@@ -6,8 +6,6 @@ Memory holds one image, one row and one chunk, however many points there are. Wi
 tables are in memory, and so are the chunks of a small surface, which every estimate asks for.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -7,8 +7,6 @@ is that of the mean of such a field (parameters integrated out; Handcock and Ste
 doi:10.1080/00401706.1993.10485354).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

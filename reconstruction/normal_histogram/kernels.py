@@ -4,8 +4,6 @@ Kernels are parallel and called from one thread. None uses fast-math and every s
 so that a result depends neither on the number of threads nor on where a sample stands in a block.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager

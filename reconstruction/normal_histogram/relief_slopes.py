@@ -5,8 +5,6 @@ neighbour is there, at a border or beside a hole, they are one-sided, and a pixe
 neighbour along an axis has none.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

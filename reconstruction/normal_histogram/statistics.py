@@ -5,8 +5,6 @@ References
 Nagano et al. 2015, ACM Trans. Graph. 34(4), 109. doi:10.1145/2766894
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -8,8 +8,6 @@ and direction sum to one, so that a border takes at most one of a pixel's two ne
 A jump all around a closed contour leaves no trace in normals: nothing can find its height.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Relief without bulge, and slopes without needless noise."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -5,8 +5,6 @@ parallel rays or a pinhole camera. See `discontinuity_integration` for surfaces 
 `height_filters` for what follows, `relief_errors` for standard errors.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

@@ -6,8 +6,6 @@ without weight (Alcouffe, Brandt, Dendy and Painter 1981, doi 10.1137/0902035; D
 doi 10.1016/0021-9991(82)90057-2); the coarse couplings are those of Galerkin.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit, prange
 

@@ -10,8 +10,6 @@ colour of a sweep its residuals are zero, which restriction makes use of. Sums a
 float64 and added in order. Kernels with ``parallel=True`` are called from one thread.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit, prange
 

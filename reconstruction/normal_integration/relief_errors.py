@@ -7,8 +7,6 @@ about the same share of the relief itself on each. The shares are those with whi
 lie in 68 % regions; ``skinrig bench --stage intervals`` judges them on other seeds.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -6,8 +6,6 @@ are those of -f log(depth), with f in pixels (Quéau, Durou and Aujol 2018,
 doi 10.1007/s10851-017-0773-x, section 2).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ equations are solved by conjugate gradients with a multigrid cycle as preconditi
 matrix. See `multigrid_kernels` for the multigrid.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

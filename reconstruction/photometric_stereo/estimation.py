@@ -6,8 +6,6 @@ positions are known). Samples that do not obey it, which are shadows, highlights
 found by their residuals and lose their weight.
 """
 
-from __future__ import annotations
-
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any, NamedTuple

@@ -3,8 +3,6 @@
 The published estimate, to stand beside photometric stereo. doi 10.1145/1141911.1141987
 """
 
-from __future__ import annotations
-
 import math
 from concurrent.futures import Executor
 from dataclasses import dataclass

@@ -4,8 +4,6 @@
 of points are mapped over threads. All reals have the type of the data (float32 or float64).
 """
 
-from __future__ import annotations
-
 import math
 from functools import cache
 from typing import Any

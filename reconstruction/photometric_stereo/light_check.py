@@ -5,8 +5,6 @@ explain it. Whatever turns all directions alike (a mirrored axis) explains the s
 is not seen here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

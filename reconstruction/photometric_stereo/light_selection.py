@@ -15,8 +15,6 @@ Fedorov 1972, Theory of Optimal Experiments (exchange); Pukelsheim 2006,
 doi:10.1137/1.9780898719109 (A-optimality).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

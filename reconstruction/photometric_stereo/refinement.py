@@ -1,7 +1,5 @@
 """Normals refined by rendering: turned until a fitted BRDF explains the samples best."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import Executor
 

@@ -1,7 +1,5 @@
 """Steps of one point's robust least squares, compiled."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 from numba import njit

@@ -1,7 +1,5 @@
 """A graph of stages: compute only what is wanted, reuse what is current, say what was left out."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

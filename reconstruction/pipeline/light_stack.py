@@ -1,7 +1,5 @@
 """Stages of pictures under listed lights, without a calibrated rig: normals and albedo."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Maps of what stages estimate, 0 where it means nothing."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from model.skin import SkinMap

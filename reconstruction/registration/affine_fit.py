@@ -9,8 +9,6 @@ squares with the field's parameters integrated out; Handcock and Stein 1993,
 doi:10.1080/00401706.1993.10485354).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.linalg import solve_triangular
 

@@ -13,8 +13,6 @@ doi:10.1007/978-3-319-46493-0_29
 Lucas and Kanade 1981, An iterative image registration technique, IJCAI 7, 674-679
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -10,8 +10,6 @@ Lowe 2004, Distinctive image features from scale-invariant keypoints,
 doi:10.1023/B:VISI.0000029664.99615.94
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

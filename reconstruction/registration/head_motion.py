@@ -5,8 +5,6 @@ motion a frame explains all cameras' tracks together. What it does not explain i
 and a frame with much of that is not usable.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol

@@ -8,8 +8,6 @@ followed separately, whose scatter, as alike as it is in neighbors, gives the st
 (`reconstruction.registration.affine_fit`).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Where points of one image are in another of the same scene: optical flow, checked both ways."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -7,8 +7,6 @@ Turning the scan turns its normals, so rotation follows from thousands of normal
 from where nose, eyes and mouth bend them. No texture, no landmark and no true mesh is needed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final

@@ -1,7 +1,5 @@
 """Rough normals of a scan's surface in one view, by photometric stereo without exact geometry."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final, Protocol
 

@@ -34,8 +34,6 @@ Weyrich et al. 2006, section 8, doi:10.1145/1141911.1141987. Jensen et al. 2001,
 doi:10.1145/383259.383319. Kienle and Patterson 1997, doi:10.1364/JOSAA.14.000246.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace

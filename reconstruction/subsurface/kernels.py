@@ -10,8 +10,6 @@ Jensen et al. 2001, doi:10.1145/383259.383319. Kienle and Patterson 1997,
 doi:10.1364/JOSAA.14.000246.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -8,8 +8,6 @@ References
 Marquardt 1963, doi:10.1137/0111030.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

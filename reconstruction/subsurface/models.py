@@ -5,8 +5,6 @@
 knows of a fibre's cone or core: R(r) of all directions at the fibre's middle stands for it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple

@@ -23,8 +23,6 @@ References
 White 1982, doi:10.2307/1912526: errors of what is nearest in a family that does not hold the truth.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 

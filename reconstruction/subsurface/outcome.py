@@ -1,7 +1,5 @@
 """What fits of radial profiles tell: estimates with errors and intervals, and what to doubt."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import IntFlag

@@ -1,7 +1,5 @@
 """Where on a face's texture a probe's sites are."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final

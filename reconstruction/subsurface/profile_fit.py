@@ -1,7 +1,5 @@
 """Fits of radial profiles: what is used, how it is weighted, where it begins."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -12,8 +12,6 @@ Wahba 1983, doi:10.1111/j.2517-6161.1983.tb01239.x: intervals of smoothing splin
 Silverman 1994, Nonparametric Regression and Generalized Linear Models, section 2.1: the penalty.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

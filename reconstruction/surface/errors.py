@@ -7,8 +7,6 @@ for the normals of a wrinkle, hardly for smooth skin. One number each, common to
 much of that change is error.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

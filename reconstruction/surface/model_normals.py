@@ -7,8 +7,6 @@ Gauss and Newton on two tilts, with weights that hold how well lobes are known a
 outliers pull with constant force, halved while they do not lower the misfit.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -5,8 +5,6 @@ What wrinkles add is seen against the shape without them: the position map, smoo
 wrinkles are gone, gives the frame at each texel.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

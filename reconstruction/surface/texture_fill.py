@@ -9,8 +9,6 @@ References
 Gortler, Grzeszczuk, Szeliski, Cohen 1996, The Lumigraph, doi 10.1145/237170.237200 (push-pull).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

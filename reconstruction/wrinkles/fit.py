@@ -12,8 +12,6 @@ Jimenez, Echevarria, Oat, Gutierrez 2011, Practical and Realistic Facial Wrinkle
 GPU Pro 2, chapter 1. ISBN 978-1-56881-718-7
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ and strengths are 1 this is the low-pass of the map to its resolution, and the b
 reading.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -5,8 +5,6 @@ in the weights, and masks are read bilinearly: the normal equations of all weigh
 scalar image, |W|^2, gathered at the masks' resolution.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A dome as it was built: near the drawing, never on it."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The polarizing films of a simulated rig as they really are: leaky, and not quite aligned."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A fibre probe as it was built: gains, spots before the camera, cross-talk and stray light."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass

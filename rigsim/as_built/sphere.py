@@ -1,7 +1,5 @@
 """A sphere of polarized LEDs as it was built: near the drawing, never on it."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass

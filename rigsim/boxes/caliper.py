@@ -14,8 +14,6 @@ has to tape the jaws to the skin again, and to say so with ``CAL:ATT``, which ta
 The box does not know what is between its jaws: it moves a `JawLoad` and feels its force.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Commands of a box: the rows of its table, the arguments they read, and how they refuse."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ The lease: an armed box wants a valid frame at least every ``SYST:WDOG`` millise
 comes it goes dark and disarms itself, and only a deliberate ``SYST:ARM`` arms it again.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections import deque

@@ -1,7 +1,5 @@
 """What a controller controls, and what all of them have: a clock, events, an emergency stop."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping

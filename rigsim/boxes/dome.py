@@ -10,8 +10,6 @@ that open eyes may see (105). Light carries its own end; LEDs that draw no curre
 -240, or reported as ``LED:FAIL`` in a sequence. Heat, dose and duty survive a reset.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

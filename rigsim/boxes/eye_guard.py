@@ -5,8 +5,6 @@ hide from it: one eye between the subject's two, exact integrals of light that i
 Fourier sums instead of a transform.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

@@ -11,8 +11,6 @@ and what makes dark before it prevents it (-240 too). Modelling lamps carry thei
 go out before a pop, and their driver trips when too hot (102).
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable, Mapping

@@ -11,8 +11,6 @@ current are reported as ``LED:FAIL``; that others give less light than they are 
 does not notice.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The LEDs of the dome and their driver: switching, heat, duty and dose; sans-I/O."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence

@@ -7,8 +7,6 @@ may give, and, as long as a person has not said that the subject's eyes are clos
 beyond the flicker that open eyes may see (105). Heat, dose and duty survive a reset.
 """
 
-from __future__ import annotations
-
 import re
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Rows of light that hosts send to boxes with LEDs, and what those switch when."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

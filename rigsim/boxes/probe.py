@@ -14,8 +14,6 @@ it: the skin rests, and is sucked at again. A suction that ends by a fault forge
 The box does not know what it sits on: it draws at a `SuctionLoad` and has a gauge.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from typing import Any

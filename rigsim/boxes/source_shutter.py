@@ -4,8 +4,6 @@ The LED shines on the closed shutter and is steady when it opens. The blades car
 opening that does not happen is known, and when blades stay open the LED is put out instead.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ rests between two times of suction. Only a vent that was asked for and the pump'
 head where it was placed: after anything else nobody knows whether it is still there.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

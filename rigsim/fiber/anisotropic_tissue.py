@@ -8,8 +8,6 @@ so light is reciprocal. As p keeps a second-order harmonic with the factor g^2, 
 light less along the fibres than across: it goes farther along them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import isfinite
 from typing import Final

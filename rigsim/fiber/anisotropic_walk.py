@@ -1,7 +1,5 @@
 """The compiled walk of photons through tissue that scatters by direction (see there)."""
 
-from __future__ import annotations
-
 from math import exp, log, sqrt
 
 import numpy as np

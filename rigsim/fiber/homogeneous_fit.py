@@ -11,8 +11,6 @@ skin the nearest medium scatters without bounds: its profile is that of a dipole
 which tells sigma_tr and no more; the search ends at `MAX_SCATTERING`.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Final

@@ -4,8 +4,6 @@ A photon is kept at a target weight that depends on its distance from the entry 
 The targets are learned from pilot runs and change the cost of a result, never its expectation.
 """
 
-from __future__ import annotations
-
 from math import inf
 from typing import Final
 

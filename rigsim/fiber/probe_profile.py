@@ -1,7 +1,5 @@
 """What the probe's fibres take from a tissue, by Monte Carlo, kept for a whole series."""
 
-from __future__ import annotations
-
 import dataclasses
 import zlib
 from collections import OrderedDict

@@ -1,7 +1,5 @@
 """What a fibre probe sits on: tissues by site, turn of the head and suction."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

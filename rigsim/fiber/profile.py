@@ -11,8 +11,6 @@ are split where few arrive and merged by roulette where many do, so that every d
 alike; weights keep all of it unbiased.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import isfinite
 from typing import Final

@@ -1,7 +1,5 @@
 """Noise of traced profiles lowered by what is known of them: they are smooth in the distance."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.interpolate import BSpline
 

@@ -4,8 +4,6 @@ Source and detection fibre are discs whose centres are a given distance apart. T
 are those of the displacement between a point in the one and a point in the other.
 """
 
-from __future__ import annotations
-
 from math import pi
 from typing import Final
 

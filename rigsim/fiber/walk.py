@@ -8,8 +8,6 @@ Guibas 1995, doi:10.1145/218380.218498): photons that leave within the cone stra
 collision count for the rest. After a reflection at some interface they count in full.
 """
 
-from __future__ import annotations
-
 from math import copysign, exp, log, sqrt
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Triangle meshes in millimetres with texture coordinates: checks, normals, files."""
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ The net is a Voronoi diagram of one jittered point per lattice cell, hashed from
 function of the position alone, so a larger patch of the same seed contains the smaller one.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

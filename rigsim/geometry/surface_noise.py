@@ -4,8 +4,6 @@ Fields are functions of the position in mm, so patterns keep their size on every
 texture; the seed is hashed with the lattice, so no state is kept and threads cannot change them.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -11,8 +11,6 @@ Only light from inside is passed on, and it is taken up by the interior only: hi
 on skin, and lit skin mirrored in skin, are left out (a few percent of a few percent).
 """
 
-from __future__ import annotations
-
 import math
 from typing import Final
 from weakref import WeakValueDictionary

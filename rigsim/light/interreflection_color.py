@@ -5,8 +5,6 @@ channel's mean reflectance; a product of two reflectances may not: in skin's red
 blood and melanin make uneven, the mean of the square is larger than the square of the mean.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

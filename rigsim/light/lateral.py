@@ -13,8 +13,6 @@ the order; the kernel of a stage made of `IMPLICIT_STEPS` of them has an excess 
 STEPS.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

@@ -5,8 +5,6 @@ in the flash rig (`rigsim.light.subsurface_radiance.spread_pattern` says how wel
 comes from other skin by `rigsim.light.interreflection`.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

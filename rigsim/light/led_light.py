@@ -1,7 +1,5 @@
 """The dome's unit of light: what a camera sees of a perfect white before an LED."""
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

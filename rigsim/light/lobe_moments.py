@@ -19,8 +19,6 @@ into the camera differ by 8.5 degrees: a lobe narrower than that resolves them, 
 the normal shows their lattice. `ripple` measures it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ for every light, rays that face it are tested against the mesh, and what arrives
 summed into the pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """Kernels of `rigsim.light.olat`: who faces a light, where shadow rays go, what rows send."""
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

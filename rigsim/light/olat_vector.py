@@ -5,8 +5,6 @@ needs Mitsuba's LLVM variants; without them, and for targets, `rigsim.light.olat
 The reflection is written a second time here, from the same formulas; a test holds both together.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

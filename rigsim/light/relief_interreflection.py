@@ -8,8 +8,6 @@ the sky stands low, and light goes from wall to wall nearly along the surface, w
 lets little through.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

@@ -9,8 +9,6 @@ For each direction over the texture the elevation of its own horizon is found on
 relief over the mesh as if that were flat over a few millimeters; what the mesh hides, rays tell.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

@@ -1,7 +1,5 @@
 """The skin of a face as a camera sees it: its colors, and how light spreads in it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

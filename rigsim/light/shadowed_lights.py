@@ -1,7 +1,5 @@
 """Light that a relief keeps from its own points, taken away from the sum over all LEDs."""
 
-from __future__ import annotations
-
 import math
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """Light that comes back from inside the skin, laid out in the texture of a face."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -36,8 +36,6 @@ Koenderink and Pont 2003, doi:10.1007/s00138-002-0089-7 (glow of vellus hair at 
 its radiance is Chandrasekhar's single scattering of a layer, isotropic.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Final

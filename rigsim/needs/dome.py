@@ -1,7 +1,5 @@
 """What the dome's pictures of a face or a target must hold, and what they need not."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

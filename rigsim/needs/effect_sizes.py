@@ -4,8 +4,6 @@ Each is a bound or a worst case, since what it decides is whether a scene must h
 may be too large, which costs time, but not too small, which would cost truth.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What pictures of a face must hold whichever rig takes them, and what they need not."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What the flash rig's pictures of a face or a target must hold, and what they need not."""
 
-from __future__ import annotations
-
 from capture.rig import Rig
 from rigsim import shading
 from rigsim.arrays import FloatArray

@@ -1,7 +1,5 @@
 """What the gradient sphere's pictures of a patch of skin must hold, and what they need not."""
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

@@ -1,7 +1,5 @@
 """What the fibre probe's pictures must hold, and what they need not."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

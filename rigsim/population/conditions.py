@@ -32,8 +32,6 @@ All these amounts are chosen; what is known is their direction and order of size
 - Dataset A of Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 10, has these seven.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass

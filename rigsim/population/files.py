@@ -19,8 +19,6 @@ is the top (v = 1), on the texture coordinates of the mesh, or of the procedural
 What is left to chance is drawn by the seed, as for a preset.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib

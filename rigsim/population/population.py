@@ -26,8 +26,6 @@ References
 Weyrich et al. 2006, doi:10.1145/1141911.1141987, table 1 and section 10 (groups and ages).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Textures that a subject's file names: read, checked, and brought to a scene's texels."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

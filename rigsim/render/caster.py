@@ -3,8 +3,6 @@
 Mitsuba's LLVM variants trace where they work, else Embree through embreex, which needs no LLVM.
 """
 
-from __future__ import annotations
-
 from typing import Any, Final, Protocol
 
 import numpy as np

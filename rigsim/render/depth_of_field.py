@@ -16,8 +16,6 @@ rest does. Light further out than `LensSpread.radius` pixels is put back: the fa
 diffraction, and the glare of real lenses, are not in the picture.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass

@@ -9,8 +9,6 @@ Hopkins 1955, doi:10.1098/rspa.1955.0158 (OTF of a defocused circular pupil).
 Goodman, Introduction to Fourier Optics, section 7.4.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Final

@@ -1,7 +1,5 @@
 """What a camera's rays meet first on a mesh, and which part of a light a point of it sees."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -1,7 +1,5 @@
 """The only module that imports Mitsuba: its start, its threads, and memory that it may read."""
 
-from __future__ import annotations
-
 import os
 from functools import cache
 from typing import Any, Final

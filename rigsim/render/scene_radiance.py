@@ -1,7 +1,5 @@
 """What is rendered: radiance of described scenes, by the renderer's own materials and sampling."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping

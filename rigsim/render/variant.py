@@ -6,8 +6,6 @@ by the version in its file name, then by rendering eight by eight pixels in anot
 verdict is kept in the user's cache folder by the library's real path and its time of change.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import logging

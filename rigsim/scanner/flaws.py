@@ -1,7 +1,5 @@
 """What is wrong with the triangles of real scans, and the file they come in."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial import cKDTree
 

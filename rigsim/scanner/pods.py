@@ -5,8 +5,6 @@ no camera sees together with its pod's projector is missing, clothes are there t
 are flawed, and all of it stands in the scanner's own frame.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Final

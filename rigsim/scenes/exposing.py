@@ -1,7 +1,5 @@
 """What scenes share: views, sensors, the light of their exposures, and what is kept of it."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Generic, TypeVar

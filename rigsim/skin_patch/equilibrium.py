@@ -19,8 +19,6 @@ stiffer along than across (it softens towards Biot's instability at r = 0.54), c
 walls, layers below the half-space's first.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -14,8 +14,6 @@ doi:10.1016/j.colsurfb.2005.12.013). Relief governs how skin folds at such moder
 number without a citation, is this project's choice, within those figures.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Final, Literal, get_args

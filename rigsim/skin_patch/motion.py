@@ -1,7 +1,5 @@
 """How a taped patch of skin lies under the camera: never twice alike, and never quite still."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

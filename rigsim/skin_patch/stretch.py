@@ -3,8 +3,6 @@
 What holds the patch together and how it settles is in `rigsim.skin_patch.equilibrium`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Compiled kernels of a stretched surface layer: energy and forces on a periodic grid of nodes."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

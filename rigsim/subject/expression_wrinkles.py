@@ -7,8 +7,6 @@ Where wrinkles can rise is drawn once for a person, so every expression that sho
 the same lines.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass

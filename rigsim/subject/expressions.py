@@ -12,8 +12,6 @@ the manual"; Ekman and Friesen 1983, "EMFACS-7". How far skin goes is chosen her
 the mouth by 6 to 10 mm in a smile.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final

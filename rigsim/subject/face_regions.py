@@ -1,7 +1,5 @@
 """Soft regions of a face, drawn around the landmarks of the mean head."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Final, TypeAlias
 

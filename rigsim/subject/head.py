@@ -6,8 +6,6 @@ closed. Dimensions are near the means of adults in
 Young 1993 (head and face anthropometry, DOT/FAA/AM-93/10).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Both are functions of the world's time alone, and both are zero at time zero, wh
 are taken.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Final

@@ -1,7 +1,5 @@
 """Named points of a face, tied to its surface, so that they move with the skin."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final

@@ -6,8 +6,6 @@ of their own. A prompt is answered after the person's reaction time, each a litt
 Exercise is at its height when it ends, and fades; alcohol is absorbed after it was drunk.
 """
 
-from __future__ import annotations
-
 import bisect
 import dataclasses
 import math

@@ -1,7 +1,5 @@
 """Melanin of a face: base, slow variation, sun, freckles, moles."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Final
 

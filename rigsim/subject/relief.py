@@ -1,7 +1,5 @@
 """Fine geometry of the skin's surface: pores, wrinkles, and how rough and oily it is."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -8,8 +8,6 @@ zones' thicknesses are chosen to give the distances between furrows that faces s
 the eyes to 8 mm on the forehead; the furrows are narrower than the ridges between them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Calibration targets that stand where the subject's face would be."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache

@@ -5,8 +5,6 @@ lens's pupil the ray goes: spots far from the axis lie out of the plane in focus
 Rays are traced from points of the pupil; diffraction is left to `rigsim.render.lens_blur`.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

@@ -4,8 +4,6 @@ The cloth is a sphere around the rig; it is lit by the LEDs themselves, once, an
 the gap beside it show it. An LED is a flat disc of even radiance.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

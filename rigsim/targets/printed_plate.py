@@ -3,8 +3,6 @@
 Every edge of print lies on a lattice, so that a plate is a small raster of reflectances.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

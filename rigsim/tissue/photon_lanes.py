@@ -5,8 +5,6 @@ the longest walk of its neighbours. Directions and places are float32, counted f
 photon's layer, so that thin and deep layers keep their digits; sums are float64.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """The compiled random walk of photons through plane layers (see `rigsim.tissue.tissue_mc`)."""
 
-from __future__ import annotations
-
 from math import copysign, log, sqrt
 
 import numpy as np

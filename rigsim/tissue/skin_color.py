@@ -4,8 +4,6 @@ The table here belongs to the simulated world. It is made from photons, for ever
 anew, and shares nothing with the table that estimators invert.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final

@@ -5,8 +5,6 @@ coefficients are evaluated here, on their own, so that the simulated world does 
 equation with the estimators that are judged by it; only tabulated data are shared.
 """
 
-from __future__ import annotations
-
 from math import exp, inf, isfinite, log
 
 from model.spectra import hemoglobin_extinction

@@ -7,8 +7,6 @@ ones without bias. The random numbers of a batch depend on nothing but the calle
 the batch's index, so a result is the same for any number of threads.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

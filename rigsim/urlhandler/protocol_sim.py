@@ -10,8 +10,6 @@ The port fails as real ones do: a pulled cable is a SerialException in read and 
 ``in_waiting`` and a ``termios.error`` in ``reset_input_buffer``.
 """
 
-from __future__ import annotations
-
 import errno
 import math
 import termios

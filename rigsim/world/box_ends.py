@@ -1,7 +1,5 @@
 """Where the bytes of a served box go in and out: a pseudo-terminal, or a TCP port."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os

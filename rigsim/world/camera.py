@@ -5,8 +5,6 @@ line. It sees the light that pops while the shutter is open, is busy until the f
 and misses edges meanwhile. Its pixels are made when somebody asks for the frame.
 """
 
-from __future__ import annotations
-
 from capture.devices import camera
 from capture.rig import RigError
 from rigsim.world.camera_body import EXPOSURE_RANGE_S, ISO, CameraBody

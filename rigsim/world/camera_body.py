@@ -1,7 +1,5 @@
 """The body of a simulated camera: shots, exposures and sensor."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import threading

@@ -1,7 +1,5 @@
 """Serve a world's cameras on one TCP port; see `capture.devices.cameras.camera_wire`."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import socket

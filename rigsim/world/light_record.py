@@ -1,7 +1,5 @@
 """Light that came out of a world's boxes: what has ended, and what still shines."""
 
-from __future__ import annotations
-
 import dataclasses
 from bisect import bisect_right
 from collections.abc import Callable, Sequence

@@ -5,8 +5,6 @@ it arrives, and `advance` delivers what is due. The line keeps its order; late m
 that follows.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable

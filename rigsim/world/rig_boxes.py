@@ -1,7 +1,5 @@
 """The boxes of a rig, made as its drawing says, with what is wrong with them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final

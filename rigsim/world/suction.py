@@ -14,8 +14,6 @@ exponential, so that a head can be asked for any time, in steps of any length.
 The skin's giving way is the quick, elastic one; that it creeps on for some seconds is left out.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import zlib

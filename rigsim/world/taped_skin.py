@@ -19,8 +19,6 @@ References
    27-38 (2011), doi:10.1007/s10237-010-0216-8
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What the albedo of faces has in common: color histograms of groups (fig. 16), and components."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import io

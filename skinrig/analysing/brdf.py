@@ -1,7 +1,5 @@
 """How many lobes the surfaces of faces need, simulated or measured ones; figures 14 and 15."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import io

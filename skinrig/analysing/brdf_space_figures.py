@@ -1,7 +1,5 @@
 """The two figures of the space of surface BRDFs: error against rank, and mean BRDFs on spheres."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """What several readers take from an appearance: valid texels, assumptions, digest, versions."""
 
-from __future__ import annotations
-
 import hashlib
 from importlib import metadata
 from pathlib import Path

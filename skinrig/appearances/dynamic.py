@@ -3,8 +3,6 @@
 Each fit adds its part to the folder and replaces an older one of its kind; the other parts stay.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A reconstructed face laid out in a common map: its landmarks, positions and albedo."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Where the truth of a simulated session's state lies."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Final
 

@@ -1,7 +1,5 @@
 """A dynamic appearance evaluated: blood, color, normals and displacement of an expression."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -13,8 +13,6 @@ Walter et al. 2007, Microfacet models for refraction through rough surfaces, EGS
 doi:10.2312/EGWR/EGSR07/195-206
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What stages measure and promise, as `data/benchmarks.toml` has it, with what a run found."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Iterable, Mapping
 from functools import cache

@@ -1,7 +1,5 @@
 """The one JSON schema of all benchmarks: fronts, knees, bands."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

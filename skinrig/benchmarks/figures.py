@@ -1,7 +1,5 @@
 """Plots of benchmarks: error against seconds, of one and of two."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Error against run time: how a stage is measured."""
 
-from __future__ import annotations
-
 import time
 import tracemalloc
 from collections.abc import Callable, Mapping

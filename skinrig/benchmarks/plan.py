@@ -5,8 +5,6 @@ Without names `skinrig bench` measures every stage: first at its small size, whi
 budget lasts. Limits are promises about full sizes and are judged at no other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final

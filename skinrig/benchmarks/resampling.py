@@ -1,7 +1,5 @@
 """Intervals of errors by drawing again: of medians over things, of root mean squares over tiles."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 from typing import Any

@@ -4,8 +4,6 @@
 the pages of all libraries for nothing, but not those that were free in the heap already.
 """
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress

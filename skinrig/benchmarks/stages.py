@@ -1,7 +1,5 @@
 """Which stages can be measured, and running them."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Iterator, Sequence

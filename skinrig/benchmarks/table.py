@@ -1,7 +1,5 @@
 """What a benchmark prints and writes beside its JSON: tables, verdicts, one plot a stage."""
 
-from __future__ import annotations
-
 import csv
 import io
 import os

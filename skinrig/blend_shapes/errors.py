@@ -1,7 +1,5 @@
 """What may be wrong with a mesh that has blend shapes."""
 
-from __future__ import annotations
-
 
 class BlendShapeError(ValueError):
     """A mesh, or weights of its shapes, that contradict themselves."""

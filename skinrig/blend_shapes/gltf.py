@@ -12,8 +12,6 @@ References
 glTF 2.0 specification, ISO/IEC 12113:2022.
 """
 
-from __future__ import annotations
-
 import base64
 import binascii
 import json

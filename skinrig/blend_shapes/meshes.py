@@ -1,7 +1,5 @@
 """Meshes whose vertices move by blend shapes: checked, loaded from .npz, OBJ and glTF files."""
 
-from __future__ import annotations
-
 import difflib
 import zipfile
 from collections.abc import Mapping

@@ -4,8 +4,6 @@ Polygons are cut into fans, and vertices split where a seam of the texture gives
 texture coordinates. Normals, materials, groups, points, lines and smoothing are passed over.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

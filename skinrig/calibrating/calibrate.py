@@ -1,7 +1,5 @@
 """From sessions of targets to CALIBRATION/: hands the frames of a session to the estimators."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import date

@@ -1,7 +1,5 @@
 """Sessions of the dome's targets to its calibrations: geometry, and lights."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import date

@@ -1,7 +1,5 @@
 """Sessions of the gradient sphere's targets to its calibrations: sensor, lights, polarization."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from datetime import date

@@ -1,7 +1,5 @@
 """What the calibrations of all rigs share: results, provenance, the camera's sensor."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What a fibre probe should take from a phantom, from its certificate by the photon table."""
 
-from __future__ import annotations
-
 from importlib.resources import files
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A session of a fibre probe on a phantom to its calibration: spots, gains, cross-talk."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import date

@@ -1,7 +1,5 @@
 """Whether a picture shows a white tile: one even, neutral surface, and not a face."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Run a plan on a rig by the addresses of its boxes and cameras, whatever answers there."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import signal

@@ -1,7 +1,5 @@
 """What the light of LEDs will be for the subject, said before it is given."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Final
 

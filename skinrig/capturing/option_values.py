@@ -1,7 +1,5 @@
 """Values of options: texts of the command line, read."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import get_args

@@ -1,7 +1,5 @@
 """The plan of a capture: a file's, or the rig's own for a target or a subject."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

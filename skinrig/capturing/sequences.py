@@ -1,7 +1,5 @@
 """Sequences in time of the flash rig: what is asked for, its plan, and what is said of it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`skinrig analyse`: what fitted faces have in common."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, cast, get_args
 

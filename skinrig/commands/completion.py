@@ -4,8 +4,6 @@ Each function takes what is typed so far and returns what it may become. They ar
 shell's completion alone, so that what they import costs no command anything.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 from skinrig.next_steps import CALIBRATION_BY_TARGET, DEFAULT_WANTS

@@ -1,7 +1,5 @@
 """The command that hands captures and appearances to other programs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """How ``skinrig --help`` lists commands: by what people come for, each with its whole summary."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator
 from typing import Any, Final, cast

@@ -1,7 +1,5 @@
 """The commands that measure error against run time, and that say what is installed."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """The commands that choose plans, one a rig."""
 
-from __future__ import annotations
-
 import json as json_text
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The commands that make calibrations, and maps."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """The commands that show what was measured: one page, or a face drawn live."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any

@@ -1,7 +1,5 @@
 """Plots of the report as SVG text, equal bytes for equal input."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

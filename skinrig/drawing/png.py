@@ -1,7 +1,5 @@
 """PNG images and color scales."""
 
-from __future__ import annotations
-
 import base64
 import io
 

@@ -1,7 +1,5 @@
 """Names of a plot's points, each where nothing else stands."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Plots as short SVG text that needs no style sheet and can be read aloud."""
 
-from __future__ import annotations
-
 import hashlib
 import html
 import re

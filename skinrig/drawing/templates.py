@@ -1,7 +1,5 @@
 """Templates of HTML pages, which hold all markup that is not a drawing."""
 
-from __future__ import annotations
-
 import functools
 
 from jinja2 import Environment, PackageLoader, StrictUndefined

@@ -6,8 +6,6 @@ matching changed each place, each texel is changed: nothing becomes negative, an
 the common map shows is kept.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final

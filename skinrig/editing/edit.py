@@ -1,7 +1,5 @@
 """An appearance with other traits and other spots, in the same layout: `skinrig edit`."""
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 from collections.abc import Callable, Mapping, Sequence

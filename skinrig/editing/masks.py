@@ -1,7 +1,5 @@
 """Masks that say where an edit holds: pictures laid over a texture, and regions of the face."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -6,8 +6,6 @@ dark skin is faint. Spots are balls around points of the surface, in mm: what th
 over the islands of a texture.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType

@@ -5,8 +5,6 @@ as brows and folds, are not taken for spots. What is filled in is a membrane thr
 around, with no grain of its own.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Spots added to an appearance's R_d, and those that are there taken away."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Lobes with more or less of some traits: `model.traits.lobe_edits` on an appearance's maps."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The lobes of an appearance as mixtures of named materials, and a face's mean mixture."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 from dataclasses import dataclass

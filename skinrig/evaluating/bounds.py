@@ -1,7 +1,5 @@
 """The least error that maps of chromophores could have had, at the true chromophores."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from model import color_table

@@ -1,7 +1,5 @@
 """A fitted hemoglobin rig against the true blood of each state, and against simpler ways."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final

@@ -1,7 +1,5 @@
 """Estimated maps against their truth: error, coverage and share masked, by melanin band."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Normals, heights, strain and kernels of stretched skin against their truths."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Reflection in directions that no light of the capture had: predicted against the truth."""
 
-from __future__ import annotations
-
 import io
 import math
 from dataclasses import dataclass

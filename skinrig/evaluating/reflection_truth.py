@@ -1,7 +1,5 @@
 """True reflection, asked of a simulated face in directions that no light had, and on spheres."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, Protocol

@@ -1,7 +1,5 @@
 """Skin in bands: by the individual typology angle of its reflectance, and by its melanin."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final

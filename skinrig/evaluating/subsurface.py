@@ -1,7 +1,5 @@
 """Radial profiles and sigma_tr of a fibre probe against their truths."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Maps on a mesh against the truth on another: nearest points, then errors with intervals."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Appearances handed to other programs: the formats, the consent, and the sealed folder."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from datetime import date, datetime
 from importlib import import_module

@@ -1,7 +1,5 @@
 """Fitted lobes, and the BRDF of a place on the skin, as files of other programs."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Every map of an appearance as float EXR and 16-bit PNG, with one document that says it all."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path

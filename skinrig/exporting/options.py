@@ -1,7 +1,5 @@
 """How the receiver of an export wants it: scene unit, green of normal maps, names of tiles."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass

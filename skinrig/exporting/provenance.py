@@ -1,7 +1,5 @@
 """What every export's document says of where it is from and how its images lie."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 from model.skin import SkinAppearance

@@ -1,7 +1,5 @@
 """A new folder that appears whole or not at all, listed file by file in an ASC MHL manifest."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

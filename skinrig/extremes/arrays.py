@@ -1,7 +1,5 @@
 """Extremes of what is handed over: no numbers, single pixels, 8K pictures, singular systems."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

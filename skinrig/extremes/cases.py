@@ -6,8 +6,6 @@ error. Nothing else counts as held: a NaN without a mask, a traceback of another
 clamp fails the case.
 """
 
-from __future__ import annotations
-
 import csv
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence

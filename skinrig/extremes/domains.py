@@ -1,7 +1,5 @@
 """Extremes of what functions state of their arguments: ends of domains, and beyond them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from capture import hdr

@@ -1,7 +1,5 @@
 """Cases of the extremes and what is expected of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

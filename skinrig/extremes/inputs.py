@@ -1,7 +1,5 @@
 """What cases hand over: arrays of a precision, rings of lights, sheets of triangles."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Extremes of light inside the skin: coefficients of the model, and the gathered dipole."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

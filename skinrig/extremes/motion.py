@@ -1,7 +1,5 @@
 """Extremes of a moving face: local statistics, blends, wrinkles, strain, kernels."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from model import facial_color, microstructure, wrinkles

@@ -1,7 +1,5 @@
 """Extremes of the photons' random walks: no absorption, nothing else, thin and stiff layers."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

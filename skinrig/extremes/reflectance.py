@@ -1,7 +1,5 @@
 """Extremes of the skin's reflectance: lobes, factorizations, tables."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from model import dipole, merl

@@ -1,7 +1,5 @@
 """Extremes of the surface: normals from light, heights, histograms, albedo, filled textures."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

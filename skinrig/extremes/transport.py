@@ -1,7 +1,5 @@
 """Extremes of light inside the skin: dipole, diffusion, layers, Monte Carlo, profiles."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

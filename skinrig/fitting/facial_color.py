@@ -1,7 +1,5 @@
 """From flash sessions to a hemoglobin rig that can be blended: `skinrig fit facial-color`."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence

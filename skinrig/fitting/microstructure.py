@@ -1,7 +1,5 @@
 """From caliper sessions to microstructure that moves: neutral relief and its table of kernels."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """From a dome's maps and a probe's measurements to one model: `skinrig fit reflectance`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

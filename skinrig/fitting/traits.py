@@ -1,7 +1,5 @@
 """From labelled appearances to trait spaces: `skinrig fit traits`."""
 
-from __future__ import annotations
-
 import os
 import uuid
 from collections.abc import Callable, Sequence

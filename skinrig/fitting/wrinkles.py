@@ -1,7 +1,5 @@
 """From normals of a neutral face and its expressions to wrinkle maps: `skinrig fit wrinkles`."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

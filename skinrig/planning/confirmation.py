@@ -1,7 +1,5 @@
 """A choice simulated, reconstructed and compared with its forecast."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

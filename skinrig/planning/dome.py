@@ -5,8 +5,6 @@ much light comes back, how noisy the sensor is. What no sample removes is taken 
 reconstruction itself states: samples misplaced by part of a pixel, and relief too fine for it.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What the dome's lights and cameras reach of a simulated face, and how noisily."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ sensor's noise at the light that comes back, the model error and the prior of th
 report; what noise leaves beside the model error is what the knobs can change.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any

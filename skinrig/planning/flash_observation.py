@@ -1,7 +1,5 @@
 """What the flash rig's crossed camera sees of a simulated face."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -6,8 +6,6 @@ pixel. What measured patches were off beyond it is added, and what the lens take
 told beside.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

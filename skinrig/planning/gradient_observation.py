@@ -1,7 +1,5 @@
 """What the gradient sphere's camera sees of a small patch of simulated skin."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

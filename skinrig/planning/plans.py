@@ -5,8 +5,6 @@ its own, the Fisher information of its samples with the part of the error that n
 and knobs that it may turn; this module reads what is wanted and says what came of it.
 """
 
-from __future__ import annotations
-
 import difflib
 import importlib
 import math

@@ -3,8 +3,6 @@
 What readings of a plan are worth is forecast in `skinrig.planning.probe_forecast`.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping

@@ -5,8 +5,6 @@ the photon table, the misfit of layers, and the certificate of the phantom, whic
 removes.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What the fibres of the probe take from simulated skin, and how noisily the camera reads it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The same face with fewer lobes: a model reduced to common mixtures of its own lobes."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Cameras to render by: a calibrated view of a rig, or one that looks at a point."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Final

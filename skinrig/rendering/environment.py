@@ -6,8 +6,6 @@ is towards -x. Values are radiances over that of a perfect white in the same roo
 of 1 a white patch shows 1.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Final

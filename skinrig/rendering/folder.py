@@ -1,7 +1,5 @@
 """The folder that a rendering is written to: whole or not at all."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import uuid

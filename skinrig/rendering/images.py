@@ -1,7 +1,5 @@
 """Renderings to look at: exposure, tone, and sheets of labelled pictures."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass

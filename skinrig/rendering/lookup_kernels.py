@@ -1,7 +1,5 @@
 """Look textures up among the texels that show the same place of a surface."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -4,8 +4,6 @@ The simulator's surface is put on tables at some roughnesses, with and without o
 them are linear. Nothing is fitted: what a rendering of it misses is the renderer's own error.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache, partial
 from typing import Final
 

@@ -1,7 +1,5 @@
 """What the people agreed to whose skin a report shows: it is a copy of them, too."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What lies at the paths of a report: appearances, truths, calibrations, sessions, documents."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

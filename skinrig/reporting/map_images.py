@@ -1,7 +1,5 @@
 """Pictures of maps for the report: what each shows is also told in numbers, as its alt text."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

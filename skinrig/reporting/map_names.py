@@ -1,7 +1,5 @@
 """What maps, states of skin and bands are called where people read of them."""
 
-from __future__ import annotations
-
 import re
 from typing import Final
 

@@ -1,7 +1,5 @@
 """What a map was made of, by what, with which settings, and what was left out: as tables."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from typing import Any

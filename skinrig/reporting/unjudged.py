@@ -1,7 +1,5 @@
 """Maps without a truth: what their own standard errors and residuals say, and no more."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

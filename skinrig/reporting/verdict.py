@@ -1,7 +1,5 @@
 """What a report says first: did it work, how good is it, and where is it bad."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

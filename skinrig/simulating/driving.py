@@ -1,7 +1,5 @@
 """Drive a simulated rig through a plan into a session."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager

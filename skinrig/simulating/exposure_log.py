@@ -4,8 +4,6 @@ The truth needs the state of the world at each exposure, also of exposures befor
 and no session may contain it.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

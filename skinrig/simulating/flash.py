@@ -1,7 +1,5 @@
 """The flash rig simulated: a face or a target, its plan, its truth."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from capture.plan import Plan, flash_calibration_plan, flash_plan

@@ -1,7 +1,5 @@
 """Ground truth of simulated flash images."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The gradient sphere simulated: a patch of skin in a caliper, or a target, and the truth."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """What a simulated scene is asked not to build, by the names that its list of effects shows."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Final

@@ -1,7 +1,5 @@
 """Orders of simulations, one class a rig, and what a simulation returns."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, field, fields

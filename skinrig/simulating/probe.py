@@ -1,7 +1,5 @@
 """The fibre probe simulated: tissue at several sites, or a target, and the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 

@@ -1,7 +1,5 @@
 """Whether and from where a simulated session may be gone on with: settings and shot numbers."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping
 from typing import Any

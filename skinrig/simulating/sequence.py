@@ -1,7 +1,5 @@
 """A sequence in time before the flash rig simulated: prompts, blood that follows, its truth."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import time

@@ -1,7 +1,5 @@
 """Simulated captures: a world of boxes and a scene, driven through the real drivers by URL."""
 
-from __future__ import annotations
-
 import importlib
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What manifests and truths of simulated captures hold of whom they show."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

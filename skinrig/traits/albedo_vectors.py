@@ -5,8 +5,6 @@ lies between a light and a dark one and not half on each, and pigment is a facto
 Vectors of quantiles are in units of each response's spread in the population, so that all count.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What a user says of faces: a table of names, of traits that they have or not, and of values."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Sequence

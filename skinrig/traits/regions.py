@@ -1,7 +1,5 @@
 """Which space of a trait library belongs to which region, and how its samples were made."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

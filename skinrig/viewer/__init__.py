@@ -1,3 +1,1 @@
 """The live viewer: one self-contained WebGL2 page with the real-time systems of the papers."""
-
-from __future__ import annotations

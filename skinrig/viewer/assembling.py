@@ -1,7 +1,5 @@
 """From what is known of a face to a scene: every asset builder adds its part."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, Final
 

@@ -4,8 +4,6 @@ A whole person of 2048 texels takes several times as long: normals, gloss, hair 
 state are drawn from a coarser one.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -3,8 +3,6 @@
 What a folder does not hold is simulated on its mesh, and the scene says so.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path

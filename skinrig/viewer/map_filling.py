@@ -1,7 +1,5 @@
 """Maps without holes, and maps of fewer texels."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from model.facial_color.coarse_maps import Cells, fitting

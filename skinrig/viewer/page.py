@@ -1,7 +1,5 @@
 """Pack a scene, our shaders and our script into ONE HTML page that asks the network for nothing."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -9,8 +9,6 @@ Jimenez et al. 2010, doi:10.1145/1866158.1866167, figures 1 and 11 (combinations
 Ekman and Friesen 1978, Facial Action Coding System; Friesen and Ekman 1983, EMFACS-7.
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Iterable, Mapping
 from importlib import resources

@@ -1,7 +1,5 @@
 """Simulated faces: the procedural head, needing no file at all, or another mesh grown a skin."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -6,8 +6,6 @@ are not readable across origins, and nothing but two kinds of paths is answered.
 file.
 """
 
-from __future__ import annotations
-
 import re
 import threading
 from collections.abc import Iterator

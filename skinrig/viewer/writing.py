@@ -1,7 +1,5 @@
 """From what a user names to a page on disk or on a port of this machine."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 from collections.abc import Callable, Sequence

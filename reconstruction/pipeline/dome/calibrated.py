@@ -1,7 +1,5 @@
 """The dome as it is calibrated, or as drawn, with the images it took."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Basis BRDFs of a dome session, and normals refined by them."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 from collections.abc import Callable, Iterator, Mapping

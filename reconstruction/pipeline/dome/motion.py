@@ -1,7 +1,5 @@
 """How the head moved during a dome session, and which images that leaves usable."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """Where a mesh of the face stands in the dome, from its images under one light each."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The dome's stages: images under one light each and a scan, to normals, albedo and lobes."""
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections.abc import Mapping

@@ -8,8 +8,6 @@ References
 Jimenez et al. 2010, doi:10.1145/1866158.1866167, sections 3 and 4
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass

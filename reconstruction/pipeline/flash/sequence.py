@@ -5,8 +5,6 @@ share one melanin, so that only the blood is free from frame to frame; frames in
 moved are laid over the face at rest. The curves take the times at which the flash really popped.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any

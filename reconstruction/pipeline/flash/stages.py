@@ -1,7 +1,5 @@
 """The flash rig's stages: parallel and crossed frames to chromophores and pictures."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """What flash sessions show of one subject: every state and repeat, reconstructed alike."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

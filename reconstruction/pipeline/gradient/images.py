@@ -1,7 +1,5 @@
 """Pictures of a gradient-sphere session: one state of the skin at a time, darks subtracted."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """What strain the skin of each state was under, beside what the caliper says of it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass

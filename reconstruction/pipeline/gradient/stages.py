@@ -1,7 +1,5 @@
 """The gradient sphere's stages: patterns to normals, heights, strain, histograms and kernels."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Mapping

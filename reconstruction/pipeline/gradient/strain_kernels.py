@@ -1,7 +1,5 @@
 """Histograms of the normals of strained skin, and the kernels that make them of neutral skin's."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

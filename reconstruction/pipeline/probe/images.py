@@ -1,7 +1,5 @@
 """Frames of a fibre probe's session: darks, and one series of exposures for each placement."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

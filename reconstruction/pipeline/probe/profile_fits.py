@@ -1,7 +1,5 @@
 """Optical coefficients of the profiles of a fiber probe, per site."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The fibre probe's stages: series of exposures to profiles, coefficients and translucency."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial

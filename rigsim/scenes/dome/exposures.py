@@ -1,7 +1,5 @@
 """Exposures of the dome's cameras: the light of pulses that fell into them, summed on a sensor."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final

@@ -5,8 +5,6 @@ face that both sides render has neither; everything else (diffuse term behind th
 Beckmann facets and GGX oil, all from textures) is put together from Mitsuba's own materials.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import time

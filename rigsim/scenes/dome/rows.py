@@ -1,7 +1,5 @@
 """What the dome's cameras see of a subject that may move, as rows that any light can light."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 

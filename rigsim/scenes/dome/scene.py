@@ -15,8 +15,6 @@ drawing says, or as it was built (`rigsim.as_built.dome`): with other places and
 images, responses that differ, dead LEDs and crossed wires.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

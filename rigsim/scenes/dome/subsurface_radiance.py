@@ -1,7 +1,5 @@
 """Light from inside a face in the dome, light after light, kept between the cameras."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Final
 

@@ -6,8 +6,6 @@ first place is exact: a jig holds the board in the rig's origin, facing +z, and 
 frame.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, Final, Literal, TypeAlias, get_args

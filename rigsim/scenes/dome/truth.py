@@ -1,7 +1,5 @@
 """What an estimator should find in the dome: the face's maps as a camera sees them, and its own."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Final
 

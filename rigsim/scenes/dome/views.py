@@ -1,7 +1,5 @@
 """What a camera of the dome meets: a face by its texture, or a target."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

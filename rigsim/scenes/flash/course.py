@@ -5,8 +5,6 @@ levels of each pose, and taken from the parabola through them in between. So a s
 number of pictures costs three renders, six where the face moves.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final

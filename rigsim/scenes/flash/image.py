@@ -1,7 +1,5 @@
 """What a camera of the flash rig sees of a face or a target, with its truth maps."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

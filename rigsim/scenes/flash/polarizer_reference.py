@@ -5,8 +5,6 @@ and a camera behind an analyser. Mitsuba traces paths through the films; here on
 traced, and both images come from it by closed forms.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import time

@@ -9,8 +9,6 @@ the camera gives `METER_LEVEL` of full scale in the strongest channel at power 1
 behind crossed films, whatever stands there later.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Final
 

@@ -1,7 +1,5 @@
 """What scenes of one geometry before the flash rig have in common, whatever the blood does."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from weakref import WeakValueDictionary
 

@@ -3,8 +3,6 @@
 The maps are described at `rigsim.scenes.flash.scene.FlashScene.truth`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Final
 

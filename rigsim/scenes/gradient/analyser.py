@@ -1,7 +1,5 @@
 """The analyser before the gradient rig's camera, at the samples of its pixels."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -4,8 +4,6 @@ For one state the whole picture is made once, as Stokes vectors for each of the 
 light (see `rigsim.light.lobe_moments`); patterns and analysers are sums of these.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Final

@@ -5,8 +5,6 @@ analysers together under LEDs without films. The patch is even in pigment and ro
 are points, and light leaves the skin where it entered.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import time

@@ -5,8 +5,6 @@ the working f-number N' passes no period below N' times the wavelength, here 18 
 green; so 10 um is the pixels' pitch, twice over, but not what the lens resolves.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

@@ -8,8 +8,6 @@ faces the camera gives `GRADIENT_METER_RATE_PER_S` full scales per second under 
 behind the parallel analyser as behind the crossed one.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

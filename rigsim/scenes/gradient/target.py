@@ -1,7 +1,5 @@
 """Targets in the patch's place: what the gradient rig's LEDs make of them."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -6,8 +6,6 @@ shortest of the usual exposures at full level. The channels' ratio is that of a 
 source's LED.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

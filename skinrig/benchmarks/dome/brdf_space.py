@@ -1,7 +1,5 @@
 """Benchmark of the space of surface BRDFs: common mixtures against error and seconds."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Final, Literal
 

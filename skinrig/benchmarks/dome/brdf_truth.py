@@ -1,7 +1,5 @@
 """Synthetic points for the BRDF benchmarks, in code of their own: no estimator is used here."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Benchmark of edited albedo maps: a tan put on a face against the same face simulated with one."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """Benchmark of merging exposure brackets, beside OpenCV's Debevec merge in the same run."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import replace

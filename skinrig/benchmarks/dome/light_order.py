@@ -1,7 +1,5 @@
 """Benchmark of the order in which the dome shows its lights: flicker against planning time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Benchmark of the head's motion: frames of the simulated dome, and what is found of its drift."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial

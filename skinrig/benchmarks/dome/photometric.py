@@ -1,7 +1,5 @@
 """Benchmark of robust photometric stereo, beside a per-pixel NumPy IRLS in the same run."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """Benchmark of the reflectance model: how many lobes skin needs, and the statistics of albedo."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """Benchmarks of what is done on the surface: gathering lumitexels, filling textures."""
 
-from __future__ import annotations
-
 import itertools
 import tempfile
 import time

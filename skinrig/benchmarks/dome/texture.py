@@ -1,7 +1,5 @@
 """Benchmark of texture matching, beside pyrtools and scikit-image in the same run."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """Benchmark of trait vectors against traits that a simulated population is known to have."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from functools import partial

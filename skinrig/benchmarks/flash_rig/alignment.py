@@ -1,7 +1,5 @@
 """Benchmark of expression images laid over neutral, and of what a misalignment does to blends."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

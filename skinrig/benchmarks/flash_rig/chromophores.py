@@ -1,7 +1,5 @@
 """Benchmark of the chromophore inversion, beside SciPy's least squares in the same run."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

@@ -6,8 +6,6 @@ estimator can have. Bounds are taken from each forward equation by differences, 
 estimator's own standard errors.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial

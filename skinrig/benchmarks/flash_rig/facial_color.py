@@ -1,7 +1,5 @@
 """Benchmark of the hemoglobin rig: discs beside libraries, and error against the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

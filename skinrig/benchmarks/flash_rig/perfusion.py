@@ -1,7 +1,5 @@
 """Benchmark of curves of blood in time: the time constant of five places, beside scipy's fit."""
 
-from __future__ import annotations
-
 import time
 import warnings
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Benchmark of the gradient sphere's calibration: errors over the exposures of the glass ball."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from capture.calibration.fiber.spot_photometry import Shot, shot

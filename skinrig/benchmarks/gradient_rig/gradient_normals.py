@@ -1,7 +1,5 @@
 """Benchmark of gradient normals on simulated skin: patterns, corrections, filters, pixels."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any

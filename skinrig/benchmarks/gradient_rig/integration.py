@@ -1,7 +1,5 @@
 """Benchmark of height from normals, beside Frankot-Chellappa, cosines and a sparse direct solve."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """Benchmarks of histograms of normals and of the search for kernels, beside plain NumPy."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Literal

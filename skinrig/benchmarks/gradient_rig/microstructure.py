@@ -1,7 +1,5 @@
 """Benchmarks of reliefs under strain: against skin that settled, and of the convolution itself."""
 
-from __future__ import annotations
-
 import math
 import tempfile
 import tracemalloc

@@ -1,7 +1,5 @@
 """Benchmark of maps grown from patches, beside histogram-preserving blending."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Benchmarks of wrinkles: maps fitted to furrows, ways of storing them, weights under noise."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from functools import partial

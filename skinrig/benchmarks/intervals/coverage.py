@@ -5,8 +5,6 @@ subjects' shares, and its own interval is that of a mean of so many subjects (St
 pixels each has.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -11,8 +11,6 @@ intervals' confidence is such that a run in which every coverage is in truth at 
 range misses one with a chance of 5 % at most (Bonferroni).
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Trials of the light dome's intervals: normals, diffuse albedo and surface lobes of faces."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final

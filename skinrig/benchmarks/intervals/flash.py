@@ -5,8 +5,6 @@ Stated errors are of people who do not stand exactly where the white tile stood
 place off it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final

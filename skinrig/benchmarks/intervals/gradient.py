@@ -7,8 +7,6 @@ and strain. Both reliefs of the truth are of one piece of skin, as the patch's a
 other skin lead to narrower and stronger kernels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final

@@ -1,7 +1,5 @@
 """Trials of the fibre probe's intervals: media, skin of two layers, and directions."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Iterator, Mapping

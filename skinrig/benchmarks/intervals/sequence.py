@@ -5,8 +5,6 @@ Of prompts the delay, too: the mean time from prompt to movement.
 A subject is a person with a time constant of their own; the places of the face are the truths.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -5,8 +5,6 @@ Each trial goes the whole way of a user, from calibration targets to maps, at th
 compared with the truth that the simulator wrote.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Benchmark of reading a probe's fibres: errors over the number of exposures."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Benchmark of the fibre probe from end to end: sigma_tr of media through simulated sessions."""
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections.abc import Mapping

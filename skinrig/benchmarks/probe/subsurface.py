@@ -1,7 +1,5 @@
 """Benchmarks of inverting radial profiles: model tier, fibres used, and batches beside SciPy."""
 
-from __future__ import annotations
-
 from math import inf
 from typing import Any
 

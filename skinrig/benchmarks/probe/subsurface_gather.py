@@ -1,7 +1,5 @@
 """Benchmark of light gathered in skin, beside the direct sum in NumPy in the same run."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """Benchmarks of the layered reflectance and of the color table."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

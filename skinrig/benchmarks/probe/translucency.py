@@ -1,7 +1,5 @@
 """Benchmarks of anisotropy by directions and of translucency maps by sites, beside their bounds."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

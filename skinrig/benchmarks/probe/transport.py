@@ -1,7 +1,5 @@
 """Benchmark of photon transport: what a fibre sees, and photons a second, beside their peers."""
 
-from __future__ import annotations
-
 import time
 from contextlib import suppress
 from functools import partial

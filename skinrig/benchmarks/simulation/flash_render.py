@@ -1,7 +1,5 @@
 """Benchmark of the flash rig's renderer: both polarization images, and Mitsuba's polarizers."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import binary_erosion
 

@@ -1,7 +1,5 @@
 """Benchmark of the gradient rig's pictures: all conditions from four moments, and Mitsuba's."""
 
-from __future__ import annotations
-
 import math
 import time
 

@@ -1,7 +1,5 @@
 """Small scenes of each rig, rendered with and without what their needs speak of."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import time

@@ -1,7 +1,5 @@
 """The probe's pictures with and without what its needs speak of."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Benchmark of what scenes leave out: how much pixels change by it, and the seconds it saves."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 from rigsim.needs.face import LATERAL_EFFECT

@@ -1,7 +1,5 @@
 """Benchmark of stretched skin: how far the equilibrium is from converged, against seconds."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 

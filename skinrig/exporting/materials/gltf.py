@@ -8,8 +8,6 @@ References
 glTF 2.0 specification, ISO/IEC 12113:2022; KHR_materials_ior, KHR_materials_specular.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from importlib import resources
 from importlib.metadata import version

@@ -1,7 +1,5 @@
 """Materials as MaterialX text: an OpenPBR surface, and image nodes that state color spaces."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final

@@ -20,8 +20,6 @@ Kulla and Conty 2017, Revisiting Physically Based Shading at Imageworks, SIGGRAP
 OpenPBR Surface 1.1, section on subsurface; Case and Zweifel 1967, Linear Transport Theory (k).
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

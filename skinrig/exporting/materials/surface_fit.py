@@ -5,8 +5,6 @@ and view, each counting by its solid angle and both cosines over the mean lobe t
 peak nor the tail decides alone. All sums are those of K lobes: a texel costs K (K + 69) products.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final

@@ -9,8 +9,6 @@ References
 OpenUSD: UsdGeom, UsdSkel (blend shapes), UsdPreviewSurface specification 2.6.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """Base color on a pack's layout, and how expressions change it, from the hemoglobin rig."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final

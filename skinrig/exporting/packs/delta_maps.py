@@ -10,8 +10,6 @@ Colors come from the hemoglobin rig, whose maps lie on the flash camera's pictur
 face's texture only where another appearance and landmarks of both tell how one lies on the other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final

@@ -8,8 +8,6 @@ References
 Max 1988, Horizon Mapping, doi 10.1007/BF01905562 (light that relief leaves).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """Relief that repeats without a seam, and its normals."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

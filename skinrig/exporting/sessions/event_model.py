@@ -9,8 +9,6 @@ References
 Event model 1.x, https://blueskyproject.io/event-model (schemas of each document).
 """
 
-from __future__ import annotations
-
 import uuid
 from collections.abc import Iterator
 from typing import Any

@@ -1,7 +1,5 @@
 """Sessions handed to other programs, as agreed to by their subjects."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence

@@ -4,8 +4,6 @@ One camera's pictures as linear 16-bit TIFF on one common scale, and ``lights.lp
 a file name and a unit vector towards the light in each line; x right, y up, z to the camera.
 """
 
-from __future__ import annotations
-
 from datetime import date, datetime
 from pathlib import Path
 from typing import Any, Final

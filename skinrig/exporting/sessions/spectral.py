@@ -10,8 +10,6 @@ References
 Fichet, Pacanowski, Wilkie 2021, An OpenEXR Layout for Spectral Images, JCGT 10(3).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Final
 

@@ -11,8 +11,6 @@ Fichet, Pacanowski, Wilkie 2021, An OpenEXR Layout for Spectral Images, JCGT 10(
 Ma et al. 2007, Rapid Acquisition of Specular and Diffuse Normal Maps, EGSR.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from datetime import date, datetime

@@ -1,7 +1,5 @@
 """A fitted model with one of its parts taken out, to show what the part buys."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """What photographs say of a fitted model: numbers, their record, and words for them."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -11,8 +11,6 @@ two agree has no part in it. Everything else on the skin, shadows and their bord
 `total_error` only.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final

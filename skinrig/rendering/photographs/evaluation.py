@@ -1,7 +1,5 @@
 """Renderings of a fitted model against photographs under lights and views that it has not seen."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Callable, Mapping

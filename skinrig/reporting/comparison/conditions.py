@@ -1,7 +1,5 @@
 """What two runs were made with, as far as it differs: settings, calibrations, times."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any

@@ -5,8 +5,6 @@ proportion to light; else by the codes of their PNG files, whose brightness each
 for itself.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Two estimates of one map: how far apart they are, in the unit and in their standard errors."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

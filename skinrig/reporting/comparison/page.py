@@ -1,7 +1,5 @@
 """The report on two runs: what changed, where estimates disagree, and what made the difference."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Errors of whatever kind of appearance against its truth, as rows that two runs share."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

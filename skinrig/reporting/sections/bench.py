@@ -1,7 +1,5 @@
 """The report's section on benchmarks: error against seconds, by setting and by skin."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Any
 

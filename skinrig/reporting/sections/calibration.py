@@ -1,7 +1,5 @@
 """The report's section on calibrations: how good they are, and whether they were in force."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence

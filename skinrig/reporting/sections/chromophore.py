@@ -1,7 +1,5 @@
 """The report's section on chromophores: errors by melanin band, and where they can be told."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """The report's section on a moving face: blood of its states, wrinkle zones, kernels by site."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Any
 

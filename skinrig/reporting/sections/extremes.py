@@ -1,7 +1,5 @@
 """The table of extremes: run, printed, written, and as a section of the report."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The report's section on the blood of a moving face: its states, their repeats and errors."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The report's section on rendered models and analyses: their pictures, and what they were told."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

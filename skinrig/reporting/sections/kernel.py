@@ -1,7 +1,5 @@
 """The report's section on kernels that turn the relief of resting skin into that of strained."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The report's section on microrelief: states of strain beside their truths, and their trends."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from typing import TypeVar

@@ -1,7 +1,5 @@
 """The report's table of what simulated scenes built and left out, and why."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

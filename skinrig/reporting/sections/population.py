@@ -1,7 +1,5 @@
 """The report's section on people: sigma_tr in table 2's layout, measured, simulated, published."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any

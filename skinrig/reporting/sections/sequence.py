@@ -1,7 +1,5 @@
 """The report's section on a sequence in time: blood at places against phase, and how fast it is."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from typing import Any

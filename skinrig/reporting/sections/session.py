@@ -1,7 +1,5 @@
 """The report's section on sessions: what was captured, when, on what."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

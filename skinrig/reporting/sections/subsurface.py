@@ -1,7 +1,5 @@
 """The report's section on a fibre probe: profiles with fits and residuals, sigma_tr by method."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """The report's section on a surface: maps seen from the front beside their truth."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -4,8 +4,6 @@ A color calibration comes first. Without one, a session beside the folder names 
 light: both are tabulated, and skin of any melanin and hemoglobin has a color in either space.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass

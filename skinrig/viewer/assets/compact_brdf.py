@@ -10,8 +10,6 @@ Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 7 (the lobes).
 Kautz and McCool 1999, doi:10.1007/978-3-7091-6809-7_24 (separable factors of BRDFs).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Textures and tables of Jimenez 2010: chromophores, the hemoglobin rig, the color of skin."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 import numpy as np

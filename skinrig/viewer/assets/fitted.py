@@ -1,7 +1,5 @@
 """Everything of Weyrich et al. 2006 that a page shows: lobes, translucency, traits."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from skinrig.viewer.assets import albedo_traits as albedo_trait_assets

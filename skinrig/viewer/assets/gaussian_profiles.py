@@ -10,8 +10,6 @@ d'Eon et al. 2007, doi:10.2312/EGWR/EGSR07/147-157, section 4 (sums of Gaussians
 Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 9 (albedo and translucency to a dipole).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """The flash rig's facial color, drawn on a picture, brought to the texture of a mesh."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ smooth field takes up what is left: another head's shape. Texels that the camera
 at all are left empty.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final

@@ -5,8 +5,6 @@ lobes) and `translucency` (how much wider than the profile light spreads at a te
 `reflectance` and `profile` (variances and weights of the Gaussians, stated errors).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 

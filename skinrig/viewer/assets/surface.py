@@ -1,7 +1,5 @@
 """The static surface: relief of pores and lines, roughness and strength of the reflection."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

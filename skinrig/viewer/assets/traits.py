@@ -9,8 +9,6 @@ References
 Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 11.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ them, otherwise fitted to the simulated person's own expressions. The page adds 
 `model.wrinkles.combine_layers` does.
 """
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 import numpy as np

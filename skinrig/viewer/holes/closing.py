@@ -11,8 +11,6 @@ Botsch, Kobbelt 2004, An intuitive framework for real-time freeform modeling,
 doi:10.1145/1015706.1015772, section 3 (the energy and its boundary conditions).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

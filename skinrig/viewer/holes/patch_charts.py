@@ -5,8 +5,6 @@ them: it gets a disc of its own where the texture is empty. Maps that are drawn 
 surface cover it by themselves; those that were measured are painted on.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass

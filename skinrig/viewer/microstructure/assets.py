@@ -7,8 +7,6 @@ that are computed here: how much of the variance each level of the pyramid keeps
 variance changes with the stretch of the skin.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Final

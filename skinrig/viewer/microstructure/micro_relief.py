@@ -1,7 +1,5 @@
 """Neutral relief of a patch of skin with the kernels of that skin: fitted, or simulated."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

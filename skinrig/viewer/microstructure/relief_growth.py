@@ -25,8 +25,6 @@ Heitz, Neyret 2018, High-Performance By-Example Noise using a Histogram-Preservi
 Operator, Proc. ACM Comput. Graph. Interact. Tech. 1(2), 31. doi:10.1145/3233304
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Final

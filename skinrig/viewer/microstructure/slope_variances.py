@@ -3,8 +3,6 @@
 Tables for the page: what a pixel does not show goes into the roughness of the highlight.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

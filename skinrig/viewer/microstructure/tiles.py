@@ -5,8 +5,6 @@ written once into a folder of their own. A tile is 16-bit words over the range o
 that its error is known before it is fetched.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ cumulative sum undoes, and their bytes are sorted by rank; which neighbors is ch
 compresses best.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass

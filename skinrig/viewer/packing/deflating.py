@@ -5,8 +5,6 @@ none in the noise that fine textures are: Huffman codes and runs alone are as sm
 smaller, in a hundredth of the time.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """Words of a texture whose finest octave is kept coarsely: noise costs most, shows least there."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from skinrig.arrays import Float64Array, Int64Array, UInt8Array

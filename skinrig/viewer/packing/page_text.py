@@ -1,7 +1,5 @@
 """Bytes as text that HTML leaves alone, seven bits a byte of UTF-8."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np
