@@ -175,7 +175,7 @@ def test_a_head_that_moved_is_followed_and_errs_less_than_one_whose_motion_is_ig
     # far enough to show at this size of a pixel
     far = head_motion.head_motion(0, drift_mm=3.0, drift_deg=1.0)
     with monkeypatch.context() as patch:
-        patch.setattr(head_motion, "head_motion", lambda _: far)
+        patch.setattr("skinrig.simulating.dome.head_motion", lambda _: far)
         # light between parts of the face would be worked out for each frame
         alone = {"leave_out": ("subsurface", "interreflections")}
         # every other light of the same dome: each frame of a head that moves is seen anew
@@ -236,7 +236,7 @@ def faulty(dome):
     calibration = out / "calibration"
     shutil.copytree(dome / "calibration", calibration)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dome_build, "build", build)
+        patch.setattr("skinrig.simulating.dome.build", build)
         for target in ("charuco", "mirror", "white"):
             simulate_session("dome", out / f"session-{target}", target=target, **SMALL)
         simulate_session("dome", out / "session-face", **FACE)

@@ -73,7 +73,8 @@ def fitted(tmp_path_factory):
     build, drawn = dome_build.build, dome_build.Tolerances(**exact)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            dome_build, "build", lambda rig, seed: build(rig, seed=seed, tolerances=drawn)
+            "skinrig.simulating.dome.build",
+            lambda rig, seed: build(rig, seed=seed, tolerances=drawn),
         )
         simulate_session("dome", out / "session-face", subject=SUBJECT, width_px=WIDTH_PX, **DOME)
     pipeline.reconstruct(

@@ -112,5 +112,5 @@ def test_normals_are_reconstructed_from_four_patterns_as_well_as_is_forecast(rig
     error = np.arccos(np.clip(cosine, -1.0, 1.0))[made.valid[inner]]
     # the stated spread of forecasts
     ratio = float(np.median(error)) / found.median_rad
-    spread = gradient.FORECAST_RELATIVE_SD
+    spread = gradient.FORECAST_RELATIVE_SD["normals"]
     assert 1.0 / (1.0 + spread) < ratio < 1.0 + spread, math.degrees(found.median_rad)
