@@ -224,7 +224,7 @@ class CaptureRun:
             box.dark()
         except DeviceError as error:
             # the box's own lease puts the light out when the host is not heard
-            log.error("the box could not be told to go dark: %s; its lease ends the light", error)
+            log.error("the box did not go dark on command: %s; its lease ends the light", error)
         for camera in self.cameras.values():
             with contextlib.suppress(DeviceError):
                 camera.abort()

@@ -371,9 +371,9 @@ def one_direction_bias(found: Anisotropy, angle_rad: ArrayLike) -> OneDirectionB
     if angle.ndim != 1 or not np.isfinite(angle).all():
         raise AnisotropyError(f"angle_rad: got shape {angle.shape}, expected (K,), all finite")
     shape = found.valid.shape
-    told = found.valid.reshape(-1)
+    valid = found.valid.reshape(-1)
     p = found.parameters.reshape(-1, 3)
-    covariance = np.where(told[:, None, None], found.covariance.reshape(-1, 3, 3), 0.0)
+    covariance = np.where(valid[:, None, None], found.covariance.reshape(-1, 3, 3), 0.0)
     flat = np.column_stack([np.zeros(len(p)), p[:, 1:]])
     mean, mean_by = diffusion_ellipse.mean_over_directions(flat)
     values, by_uv = diffusion_ellipse.relative_sigma_tr(angle, p[:, 1:])
@@ -386,7 +386,7 @@ def one_direction_bias(found: Anisotropy, angle_rad: ArrayLike) -> OneDirectionB
     h = np.hypot(p[:, 1], p[:, 2])
     every = diffusion_ellipse.all_directions()
     around = diffusion_ellipse.relative_sigma_tr(every, p[:, 1:])[0] / mean[:, None]
-    stderr = np.where(told, np.sqrt(np.maximum(variance, 0.0)), math.inf)
+    stderr = np.where(valid, np.sqrt(np.maximum(variance, 0.0)), math.inf)
     return OneDirectionBias(
         bias=(ratio - 1.0).T.reshape((-1, *shape)),
         stderr=stderr.reshape((-1, *shape)),

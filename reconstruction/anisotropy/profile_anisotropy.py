@@ -109,15 +109,15 @@ def compare(
     noise = np.sqrt(v.sum(axis=1) / count)
     used = (2 * good.sum(axis=1) > n) & (m > MIN_FIBER_SIGNAL_SIGMAS * noise)
     used &= table(a, s)[0][:, 0] > 0
-    told = ((good & used[:, None]).sum(axis=2) >= MIN_COMPARED_FIBERS) & known[:, None]
-    keep = good & used[:, None] & told[..., None]
+    comparable = ((good & used[:, None]).sum(axis=2) >= MIN_COMPARED_FIBERS) & known[:, None]
+    keep = good & used[:, None] & comparable[..., None]
     m = np.asarray(np.where(used, m, 1.0)[:, None], np.float64)
     relative = np.where((keep & (v == 0)).any(axis=(1, 2)), max(floor, MIN_READING_ERROR), floor)
     relative = relative[:, None, None]
     at_mean = np.where(used[:, None], table(a, s)[0], 1.0)
     d, b = np.zeros((series, n)), np.zeros((series, n))
     inverse = np.zeros((series, n, 2, 2))
-    members = np.maximum(told.sum(axis=1), 1)[:, None]
+    members = np.maximum(comparable.sum(axis=1), 1)[:, None]
     for _ in range(N_COMPARISON_ROUNDS):
         scattering = s * np.exp(d)[..., None]
         light, slope = table(a, scattering)
@@ -129,7 +129,7 @@ def compare(
         entries = [(weight * p * q).sum(axis=2) for p, q in ((model, model), (model, by_d))]
         entries.append((weight * by_d * by_d).sum(axis=2))
         bb, bd, dd = (
-            np.where(told, e, fill) for e, fill in zip(entries, (1.0, 0.0, 1.0), strict=True)
+            np.where(comparable, e, fill) for e, fill in zip(entries, (1.0, 0.0, 1.0), strict=True)
         )
         normal = np.stack([np.stack([bb, bd], -1), np.stack([bd, dd], -1)], -2)
         inverse = np.linalg.inv(normal)
@@ -139,14 +139,18 @@ def compare(
         step = np.clip(
             (inverse @ right[..., None])[..., 0], -MAX_COMPARISON_STEP, MAX_COMPARISON_STEP
         )
-        b, d = (np.where(told, x + step[..., k], 0.0) for k, x in enumerate((b, d)))
-        b, d = (np.where(told, x - x.sum(axis=1, keepdims=True) / members, 0.0) for x in (b, d))
+        b, d = (np.where(comparable, x + step[..., k], 0.0) for k, x in enumerate((b, d)))
+        b, d = (
+            np.where(comparable, x - x.sum(axis=1, keepdims=True) / members, 0.0) for x in (b, d)
+        )
         shape = table(a, s * np.exp(d)[..., None])[0] / at_mean * np.exp(b)[..., None]
         below = (weight * shape**2).sum(axis=1, keepdims=True)
         fresh = (weight * shape * y).sum(axis=1, keepdims=True) / np.where(below > 0, below, 1.0)
         m = np.where(below > 0, np.maximum(fresh, MIN_ROUND_RATIO * m), m)
-    stderr = np.where(told, np.sqrt(inverse[..., 1, 1]), np.inf)
-    return ProfileComparison(d.T, stderr.T, b.T, told.T, used & told.any(axis=1)[:, None])
+    stderr = np.where(comparable, np.sqrt(inverse[..., 1, 1]), np.inf)
+    return ProfileComparison(
+        d.T, stderr.T, b.T, comparable.T, used & comparable.any(axis=1)[:, None]
+    )
 
 
 def estimate_from_profiles(
