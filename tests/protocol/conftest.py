@@ -10,7 +10,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import serial
-from fixtures.framed_bench import FramedBench
 from serial import rfc2217
 
 from capture.devices.camera import open_camera
@@ -153,8 +152,3 @@ def _bench(world, addresses, transport):
 
 def _clock(world):
     return world.clock if world.virtual else None
-
-
-@pytest.fixture
-def framed():
-    return FramedBench

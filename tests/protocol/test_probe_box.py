@@ -1,69 +1,23 @@
-"""Every row of the probe box's manual, on the box itself: bytes and time in, bytes out."""
+"""What the probe box does with light, suction and time, beyond the rows of its manual."""
 
 import json
 
 import numpy as np
 import pytest
-from fixtures.framed_bench import ANY, SHARED_COMMANDS
+from fixtures.box_manuals import HEAD, ProbeBench
+from fixtures.box_manuals import PROBE as PROBE_BOX
 
 from capture.devices import wire
 from capture.devices.wire import Code, Request
-from capture.rig import load_rig
-from rigsim.boxes.faults import Faults
 from rigsim.boxes.probe import SourceLight
 from rigsim.boxes.suction_pump import MAX_PUMPING_S, PUMP_CONTROL_PERIOD_S
-from rigsim.world import World
 
-RIG = load_rig("probe")
-PROBE = RIG.probe
-LAG_S = 1e-3  # from the command to blades that have cleared the fibre
-
-HEAD = ("SYST:ARM", "HEAD:SITE cheek,22.5")
-# header -> text, what must come before, expected payload
-MANUAL = {
-    "HEAD:SITE": ("HEAD:SITE forehead,0", ("SYST:ARM",), ""),
-    "HEAD:SITE?": ("HEAD:SITE?", (), "NONE"),
-    "HEAD:FREE": ("HEAD:FREE", (), ""),
-    "PUMP": ("PUMP ON,5000,60", HEAD, "1"),
-    "PUMP?": ("PUMP?", (), "VENT"),
-    "PUMP:LAST?": ("PUMP:LAST?", (), "NONE"),
-    "PRES?": ("PRES?", (), ANY),
-    "LED": ("LED 500", ("SYST:ARM",), ""),
-    "LED?": ("LED?", (), "0"),
-    "SHUT": ("SHUT OPEN,100", ("SYST:ARM",), ANY),
-    "SHUT?": ("SHUT?", (), "CLOSED"),
-    "SHUT:LAST?": ("SHUT:LAST?", (), "NONE"),
-    "SHUT:COUN?": ("SHUT:COUN?", (), "0"),
-    "FIB": ("FIB 12", (), ""),
-    "FIB?": ("FIB?", (), "ALL"),
-    "CAM:TRIG": ("CAM:TRIG d1", (), "d1,1000000"),
-    "CAM:TEMP?": ("CAM:TEMP?", (), ANY),
-    "DOSE?": ("DOSE?", (), "0.000000"),
-    "DOSE:NEW": ("DOSE:NEW S1", (), ""),
-}
-HARMLESS = ("PUMP VENT", "SHUT CLOSE", "LED 0", "HEAD:FREE")
-ACTS = ("HEAD:SITE cheek,0", "PUMP ON,5000,60", "LED 500", "SHUT OPEN,100")
+PROBE = PROBE_BOX.rig.probe
 
 
 @pytest.fixture
-def make(framed):
-    def make(seed=3, **faults):
-        bench = framed(World(RIG, seed=seed, faults=Faults(**faults)), "probe")
-        bench.edges = []
-        bench.unit.shutter._on_open = bench.unit._on_trigger = bench.edges.append
-        return bench
-
-    return make
-
-
-@pytest.fixture
-def bench(make):
-    return make()
-
-
-def say(bench, lines):
-    for line in lines:
-        bench.ask(line)
+def bench():
+    return PROBE_BOX.bench()
 
 
 def open_for(bench, ms):
@@ -71,7 +25,7 @@ def open_for(bench, ms):
     bench.seq += 1
     data = bench.raw(wire.encode(Request(bench.seq, bench.box.boot, f"SHUT OPEN,{ms}")))
     assert data == b""
-    bench.now += LAG_S
+    bench.now += ProbeBench.LAG_S
     data = bench.box.advance(bench.now)
     bench.hear(data)
     (reply,) = [f for f in map(wire.decode, data.splitlines()) if isinstance(f, wire.Reply)]
@@ -83,7 +37,7 @@ def open_for(bench, ms):
 
 
 def suck(bench, mbar=60, ms=20_000, wait_s=2.0):
-    say(bench, ("SYST:ARM", "HEAD:SITE cheek,0"))
+    bench.say(("SYST:ARM", "HEAD:SITE cheek,0"))
     bench.ask(f"PUMP ON,{ms},{mbar}")
     bench.wait(wait_s)
 
@@ -94,39 +48,7 @@ def light(bench, level=1000, **more):
     bench.ask(f"LED {level}")
 
 
-def nothing_on(bench):
-    unit = bench.unit
-    return not (unit.lit or unit.shutter.level or unit.shutter.is_open or unit.pump.drawing)
-
-
-def test_the_manual_is_complete(bench):
-    assert set(MANUAL) | SHARED_COMMANDS == set(bench.box.commands)
-    assert all(command.manual for command in bench.box.commands.values())
-
-
-@pytest.mark.parametrize("header", [h for h in MANUAL if h != "SHUT"])
-def test_a_framed_command_is_answered_as_its_manual_says(bench, header):
-    text, before, expected = MANUAL[header]
-    say(bench, before)
-    payload = bench.ask(text)
-    assert expected is ANY or payload == expected
-
-
-@pytest.mark.parametrize("header", [h for h in MANUAL if not h.endswith("?") and h != "HEAD:FREE"])
-def test_a_bare_command_is_refused_and_does_nothing(bench, header):
-    text, before, _ = MANUAL[header]
-    say(bench, before)
-    placed, cover = bench.unit.pump.placement, bench.unit.shutter.fibre
-    assert bench.raw(text.encode() + b"\n") == b""
-    assert bench.raw(b"SYST:ERR?\n") == b'203,"Unframed command"\n'
-    bench.wait(0.5)
-    assert nothing_on(bench)
-    assert bench.edges == []
-    assert (bench.unit.pump.placement, bench.unit.shutter.fibre) == (placed, cover)
-    assert bench.unit.shutter.count == bench.unit.pump.count == 0
-
-
-@pytest.mark.parametrize("text", HARMLESS)
+@pytest.mark.parametrize("text", PROBE_BOX.unframed)
 def test_what_makes_dark_needs_neither_frame_nor_arming(bench, text):
     assert bench.code(text) == Code.OK
     suck(bench)
@@ -149,55 +71,6 @@ def test_what_makes_dark_needs_neither_frame_nor_arming(bench, text):
     assert bench.unit.pump.drawing == (text in ("SHUT CLOSE", "LED 0"))
 
 
-@pytest.mark.parametrize("header", [h for h in MANUAL if h.endswith("?")])
-def test_a_bare_query_is_answered_plainly(bench, header):
-    text, _, expected = MANUAL[header]
-    answer = bench.raw(text.encode() + b"\n")
-    assert answer == expected.encode() + b"\n" if expected is not ANY else abs(float(answer)) < 9.0
-
-
-@pytest.mark.parametrize(
-    ("text", "code"),
-    [
-        ("HEAD:SITE cheek", Code.SYNTAX),
-        ("HEAD:SITE cheek,", Code.SYNTAX),
-        ("HEAD:SITE ,0", Code.SYNTAX),
-        ("HEAD:SITE left cheek,0", Code.SYNTAX),
-        ("HEAD:SITE cheek,360", Code.OUT_OF_RANGE),
-        ("HEAD:SITE cheek,-1", Code.OUT_OF_RANGE),
-        ("PUMP ON", Code.SYNTAX),
-        ("PUMP ON,5000", Code.SYNTAX),
-        ("PUMP OFF", Code.SYNTAX),
-        ("PUMP ON,x,60", Code.SYNTAX),
-        ("PUMP ON,60001,60", Code.OUT_OF_RANGE),
-        ("PUMP ON,99,60", Code.OUT_OF_RANGE),
-        ("PUMP ON,5000,150.1", Code.OUT_OF_RANGE),
-        ("PUMP ON,5000,9", Code.OUT_OF_RANGE),
-        ("PUMP ON,5000,-60", Code.OUT_OF_RANGE),
-        ("LED", Code.SYNTAX),
-        ("LED 1001", Code.OUT_OF_RANGE),
-        ("LED -1", Code.SYNTAX),
-        ("LED 0.5", Code.SYNTAX),
-        ("SHUT OPEN", Code.SYNTAX),
-        ("SHUT OPEN,", Code.SYNTAX),
-        ("SHUT HALF,100", Code.SYNTAX),
-        ("SHUT OPEN,30001", Code.OUT_OF_RANGE),
-        ("SHUT OPEN,0.5", Code.OUT_OF_RANGE),
-        ("FIB 28", Code.OUT_OF_RANGE),
-        ("FIB -1", Code.SYNTAX),
-        ("FIB NONE", Code.SYNTAX),
-        ("CAM:TRIG a b", Code.SYNTAX),
-        ("DOSE:NEW", Code.SYNTAX),
-    ],
-)
-def test_what_makes_no_sense_is_refused_and_does_nothing(bench, text, code):
-    say(bench, HEAD)
-    assert bench.code(text) == code
-    assert bench.ask("HEAD:SITE?") == "cheek,22.5"
-    assert nothing_on(bench)
-    assert (bench.edges, bench.unit.shutter.count, bench.unit.pump.count) == ([], 0, 0)
-
-
 def test_the_data_dictionary_holds_the_rigs_limits(bench):
     limits = json.loads(wire.unseal(bench.ask("SYST:CAP?")))
     assert (limits["kind"], limits["fibres"]) == ("probe", 28)
@@ -206,16 +79,7 @@ def test_the_data_dictionary_holds_the_rigs_limits(bench):
     assert limits["shutter_max_ms"] == 1e3 * PROBE.max_open_s <= 30_000
     assert limits["rest_ms"] == 1e3 * PROBE.rest_s
     assert limits["camera_c"] == PROBE.camera_c
-    assert limits["shutter_lag_ms"] == 1e3 * LAG_S
-
-
-@pytest.mark.parametrize("text", ACTS)
-def test_nothing_shines_or_sucks_unless_armed(bench, text):
-    assert bench.code(text) == Code.NOT_ARMED
-    bench.ask("SYST:ARM")
-    bench.silence(1.5)
-    assert bench.code(text) == Code.WATCHDOG_TRIPPED
-    assert nothing_on(bench)
+    assert limits["shutter_lag_ms"] == 1e3 * ProbeBench.LAG_S
 
 
 # light -----------------------------------------------------------------------------------------
@@ -224,12 +88,12 @@ def test_nothing_shines_or_sucks_unless_armed(bench, text):
 def test_the_shutter_opens_pulses_the_camera_line_and_closes_by_itself(bench):
     light(bench, 800)
     begin_s = bench.now
-    assert open_for(bench, 500) == (1, round(1e6 * (begin_s + LAG_S)))
-    assert bench.edges == [begin_s + LAG_S]
+    assert open_for(bench, 500) == (1, round(1e6 * (begin_s + ProbeBench.LAG_S)))
+    assert bench.edges == [begin_s + ProbeBench.LAG_S]
     assert bench.ask("SHUT?") == "OPEN,500"
     assert bench.ask("*OPC?") == "0"
     assert int(bench.ask("STAT?")) & 64
-    opened_us = round(1e6 * (begin_s + LAG_S))
+    opened_us = round(1e6 * (begin_s + ProbeBench.LAG_S))
     assert bench.ask("SHUT:LAST?") == f"1,OPEN,{opened_us},-"
     bench.wait(0.6)
     assert bench.ask("SHUT?") == "CLOSED"
@@ -312,7 +176,7 @@ def test_the_led_is_put_out_under_an_open_shutter(bench):
 
 
 def test_no_light_leaves_a_head_that_is_not_held(bench):
-    say(bench, ("SYST:ARM", "LED 1000"))
+    bench.say(("SYST:ARM", "LED 1000"))
     assert bench.code("SHUT OPEN,100") == Code.IGNORED
     bench.ask("HEAD:SITE cheek,0")
     assert bench.code("SHUT OPEN,100") == Code.IGNORED
@@ -366,7 +230,7 @@ def test_a_retry_of_an_opening_opens_once_and_is_answered_alike(bench):
     frame = wire.encode(Request(bench.seq, bench.box.boot, "SHUT OPEN,50"))
     assert bench.raw(frame) == b""
     assert bench.raw(frame) == b""  # under way: the answer comes when it is open
-    bench.now += LAG_S
+    bench.now += ProbeBench.LAG_S
     first = bench.box.advance(bench.now)
     assert bench.raw(frame) == first
     bench.silence(1.0)
@@ -376,7 +240,7 @@ def test_a_retry_of_an_opening_opens_once_and_is_answered_alike(bench):
 
 
 def test_a_retry_of_a_suction_sucks_once(bench):
-    say(bench, ("SYST:WDOG 5000", *HEAD))
+    bench.say(("SYST:WDOG 5000", *HEAD))
     bench.seq += 1
     frame = wire.encode(Request(bench.seq, bench.box.boot, "PUMP ON,500,60"))
     first = bench.raw(frame)
@@ -385,8 +249,8 @@ def test_a_retry_of_a_suction_sucks_once(bench):
     assert (bench.unit.pump.count, bench.unit.pump.drawing) == (1, False)
 
 
-def test_a_shutter_that_does_not_open_says_so_and_pulses_nothing(make):
-    bench = make(shutter_stuck=1.0)
+def test_a_shutter_that_does_not_open_says_so_and_pulses_nothing():
+    bench = PROBE_BOX.bench(shutter_stuck=1.0)
     light(bench)
     assert open_for(bench, 100) == Code.HARDWARE
     bench.wait(0.5)
@@ -396,8 +260,8 @@ def test_a_shutter_that_does_not_open_says_so_and_pulses_nothing(make):
 
 
 @pytest.mark.parametrize("end", ["own", "SHUT CLOSE", "SAFE", "silence"])
-def test_blades_that_do_not_close_put_the_led_out(make, end):
-    bench = make(shutter_jam=1.0)
+def test_blades_that_do_not_close_put_the_led_out(end):
+    bench = PROBE_BOX.bench(shutter_jam=1.0)
     light(bench)
     open_for(bench, 100 if end == "own" else 5000)
     bench.wait(0.05)
@@ -423,11 +287,11 @@ def test_blades_that_do_not_close_put_the_led_out(make, end):
     assert open_for(bench, 100)[0] == 2
 
 
-def test_a_dead_led_is_refused_and_a_weak_one_is_not_noticed(make):
-    dead = make(led_dead="0")
+def test_a_dead_led_is_refused_and_a_weak_one_is_not_noticed():
+    dead = PROBE_BOX.bench(led_dead="0")
     dead.ask("SYST:ARM")
     assert dead.code("LED 500") == Code.HARDWARE
-    weak = make(led_weak="0=0.5")
+    weak = PROBE_BOX.bench(led_weak="0=0.5")
     light(weak, 500)
     open_for(weak, 100)
     weak.wait(0.2)
@@ -473,7 +337,7 @@ def test_suction_comes_within_its_tolerance_and_ends_by_itself(bench):
 
 
 def test_suction_ends_on_time_although_the_host_is_silent(bench):
-    say(bench, ("SYST:WDOG 5000", *HEAD))
+    bench.say(("SYST:WDOG 5000", *HEAD))
     bench.ask("PUMP ON,3000,60")
     bench.silence(4.9)
     assert bench.box.armed
@@ -482,10 +346,10 @@ def test_suction_ends_on_time_although_the_host_is_silent(bench):
     assert bench.world.head_at(bench.now).suction_mbar < 0.1
 
 
-def test_the_gauge_has_a_zero_and_noise_of_its_own(make):
+def test_the_gauge_has_a_zero_and_noise_of_its_own():
     zeros = []
     for seed in range(12):
-        bench = make(seed=seed)
+        bench = PROBE_BOX.bench(seed=seed)
         readings = [float(bench.ask("PRES?")) for _ in range(50)]
         assert 0.15 < np.std(readings) < 0.5
         zeros.append(np.mean(readings))
@@ -509,7 +373,7 @@ def test_skin_has_its_rest_and_keeps_its_place(bench):
 def test_the_rest_survives_a_reset_of_the_box(bench):
     suck(bench)
     bench.box.power_cycle(bench.now, boot_s=0.0, announce=False)
-    say(bench, HEAD)
+    bench.say(HEAD)
     assert bench.code("PUMP ON,5000,60") == Code.RECYCLE
 
 
@@ -572,8 +436,8 @@ def test_a_silent_host_is_dark_and_vented_within_the_lease(bench):
 
 
 @pytest.mark.parametrize("fault", [{"pump_leak": 3.0}, {"pump_dead": True}])
-def test_suction_that_is_not_reached_is_given_up(make, fault):
-    bench = make(**fault)
+def test_suction_that_is_not_reached_is_given_up(fault):
+    bench = PROBE_BOX.bench(**fault)
     suck(bench, wait_s=MAX_PUMPING_S + 0.2)
     _, how, mbar, t_us = bench.events("PUMP:END")[0].split(",")
     assert how == "LOW"
@@ -585,8 +449,8 @@ def test_suction_that_is_not_reached_is_given_up(make, fault):
 
 
 @pytest.mark.parametrize(("leak", "mbar"), [(0.05, 57.0), (0.2, 50.0), (0.35, 44.4)])
-def test_a_smaller_leak_sags_and_only_the_gauge_tells(make, leak, mbar):
-    bench = make(pump_leak=leak)
+def test_a_smaller_leak_sags_and_only_the_gauge_tells(leak, mbar):
+    bench = PROBE_BOX.bench(pump_leak=leak)
     suck(bench)
     bench.wait(3.0)
     assert bench.unit.pump.drawing
@@ -595,8 +459,8 @@ def test_a_smaller_leak_sags_and_only_the_gauge_tells(make, leak, mbar):
     assert 0.975 * mbar - 2.8 < np.mean(readings) < mbar + 2.8
 
 
-def test_a_head_that_comes_off_is_vented_and_dark_at_once(make):
-    bench = make(head_lifts_after=3.0)
+def test_a_head_that_comes_off_is_vented_and_dark_at_once():
+    bench = PROBE_BOX.bench(head_lifts_after=3.0)
     suck(bench)
     bench.ask("LED 1000")
     open_for(bench, 10_000)
@@ -615,8 +479,8 @@ def test_a_head_that_comes_off_is_vented_and_dark_at_once(make):
     assert bench.unit.pump.drawing
 
 
-def test_a_dead_gauge_bars_the_pump_and_ends_a_suction(make):
-    bench = make(gauge_dead_after=4.0)
+def test_a_dead_gauge_bars_the_pump_and_ends_a_suction():
+    bench = PROBE_BOX.bench(gauge_dead_after=4.0)
     suck(bench)
     assert bench.now < 4.0
     bench.wait(2.0)
@@ -629,16 +493,16 @@ def test_a_dead_gauge_bars_the_pump_and_ends_a_suction(make):
     assert bench.unit.pump.count == 1
 
 
-def test_a_regulator_that_does_not_hold_is_vented(make, monkeypatch):
-    bench = make()
+def test_a_regulator_that_does_not_hold_is_vented(monkeypatch):
+    bench = PROBE_BOX.bench()
     suck(bench)
     monkeypatch.setattr(bench.world.head, "suction_mbar", lambda now: 170.0)
     bench.wait(0.1)
     assert bench.events("PUMP:END")[0].split(",")[1] == "HIGH"
 
 
-def test_the_emergency_stop_lets_go_and_bars_light_and_suction(make):
-    bench = make(interlock_after=6.0)
+def test_the_emergency_stop_lets_go_and_bars_light_and_suction():
+    bench = PROBE_BOX.bench(interlock_after=6.0)
     suck(bench)
     bench.ask("LED 1000")
     open_for(bench, 20_000)
@@ -651,21 +515,21 @@ def test_the_emergency_stop_lets_go_and_bars_light_and_suction(make):
     for text in ("PUMP ON,5000,60", "LED 100", "SHUT OPEN,100"):
         assert bench.code(text) == Code.INTERLOCK
     assert bench.code("LED 0") == Code.OK
-    closed = make(interlock=True)
-    say(closed, HEAD)
+    closed = PROBE_BOX.bench(interlock=True)
+    closed.say(HEAD)
     assert closed.code("PUMP ON,5000,60") == Code.INTERLOCK
 
 
-def test_the_thermometer_tells_of_a_camera_that_warms(make):
-    bench = make(camera_warms_after=2.0)
+def test_the_thermometer_tells_of_a_camera_that_warms():
+    bench = PROBE_BOX.bench(camera_warms_after=2.0)
     assert float(bench.ask("CAM:TEMP?")) == pytest.approx(5.0, abs=0.2)
     bench.wait(121.0, ping_s=0.9)
     assert float(bench.ask("CAM:TEMP?")) == pytest.approx(24.0 - 19.0 / np.e, abs=0.2)
 
 
-def test_one_big_step_of_time_equals_many_small_ones(make):
+def test_one_big_step_of_time_equals_many_small_ones():
     def play(step_s):
-        bench = make(head_lifts_after=4.0, shutter_jam=0.5)
+        bench = PROBE_BOX.bench(head_lifts_after=4.0, shutter_jam=0.5)
         bench.ask("SYST:WDOG 5000")
         light(bench, 700, mbar=150, wait_s=1.0)
         open_for(bench, 1500)

@@ -1,11 +1,11 @@
-"""Every row of the dome box's manual, on the box itself: bytes and time in, bytes out."""
+"""What the dome box does with tables, light and time, beyond the rows of its manual."""
 
 import itertools
 import json
 
 import numpy as np
 import pytest
-from fixtures.framed_bench import ANY, SHARED_COMMANDS, FramedBench
+from fixtures.box_manuals import DOME
 
 from capture.devices import wire
 from capture.devices.wire import Code, Event, Request
@@ -15,53 +15,10 @@ from capture.plan.flicker import flicker_of_rows
 from capture.plan.light_order import LIGHT_ORDERS
 from capture.plan.rows import LedRow, led_rows
 from capture.rig import load_rig
-from rigsim.boxes.faults import Faults
 from rigsim.boxes.led_table import LEVEL_STEPS, Row, table_crc
-from rigsim.world import World
 
-DOME = load_rig("dome")
-RIG = DOME.subset(views=["C00", "C05", "C15"]).resized(16)
-
-# header -> (text, needs arming, what must come before, expected payload)
-MANUAL = {
-    "SEQ:CLE": ("SEQ:CLE", (), ""),
-    "SEQ:DEF": ("SEQ:DEF 0,3+17:500:83333:7;-:0:50000:0", (), ""),
-    "SEQ:CRC?": ("SEQ:CRC?", (), "0,FFFF"),
-    "SEQ:ARM": ("SEQ:ARM 1", ("SYST:ARM", "SEQ:DEF 0,140:1000:80000:7"), ANY),
-    "TRIG": ("TRIG a1", ("SYST:ARM", "SEQ:DEF 0,140:1000:80000:7", "SEQ:ARM 1"), "a1,1000000"),
-    "SEQ:POS?": ("SEQ:POS?", (), "IDLE,-1,0,-"),
-    "SEQ:STEP?": ("SEQ:STEP? 0", (), "NONE"),
-    "LED:ON": ("LED:ON 3+17,80,500", ("SYST:ARM",), ""),
-    "LED:OFF": ("LED:OFF ALL", (), ""),
-    "LED?": ("LED?", (), "-"),
-    "CAM:MASK": ("CAM:MASK 5", (), ""),
-    "CAM:MASK?": ("CAM:MASK?", (), "7"),
-    "CAM:TRIG": ("CAM:TRIG d1", (), "d1,1000000"),
-    "SAFE:EYES": ("SAFE:EYES CLOSED", (), ""),
-    "SAFE:EYES?": ("SAFE:EYES?", (), "OPEN"),
-    "DOSE?": ("DOSE? 3", (), "0.000000"),
-    "DOSE:NEW": ("DOSE:NEW P042", (), ""),
-}
-
-
-class Bench(FramedBench):
-    """A dome's box that notes which cameras it releases, and when."""
-
-    def __init__(self, rig=RIG, **faults):
-        super().__init__(World(rig, seed=3, faults=Faults(**faults)), "dome")
-        self.edges = []
-        self.unit._on_trigger = lambda now, mask: self.edges.append((now, mask))
-
-    def load(self, rows):
-        self.ask("SEQ:CLE")
-        for first in range(0, len(rows), 10):
-            self.ask(f"SEQ:DEF {first},{';'.join(str(row) for row in rows[first : first + 10])}")
-
-    def run(self, rows, token="r1"):
-        self.ask("SYST:ARM")
-        self.load(rows)
-        self.ask(f"SEQ:ARM {len(rows)}")
-        self.ask(f"TRIG {token}")
+WHOLE = load_rig("dome")
+RIG = DOME.rig
 
 
 def rows_of(leds, *, ms=80, level=LEVEL_STEPS, mask=7):
@@ -70,7 +27,7 @@ def rows_of(leds, *, ms=80, level=LEVEL_STEPS, mask=7):
 
 @pytest.fixture
 def bench():
-    return Bench()
+    return DOME.bench()
 
 
 def front(count):
@@ -81,94 +38,6 @@ def front(count):
 def behind(count):
     """Numbers of LEDs that the eyes do not see."""
     return [int(k) for k in np.argsort(eye_light(RIG), kind="stable")[:count]]
-
-
-def test_the_manual_is_complete(bench):
-    assert set(MANUAL) | SHARED_COMMANDS == set(bench.box.commands)
-    assert all(command.manual for command in bench.box.commands.values())
-
-
-@pytest.mark.parametrize("header", MANUAL)
-def test_a_framed_command_is_answered_as_its_manual_says(bench, header):
-    text, before, expected = MANUAL[header]
-    for line in before:
-        bench.ask(line)
-    payload = bench.ask(text)
-    assert expected is ANY or payload == expected
-
-
-@pytest.mark.parametrize("header", [h for h in MANUAL if not h.endswith("?")])
-def test_a_bare_command_is_refused_and_changes_nothing(bench, header):
-    bench.ask("SYST:ARM")
-    before = bench.ask("SEQ:CRC?"), bench.unit.mask, bench.unit.eyes, bench.unit.bank.lit
-    assert bench.raw(MANUAL[header][0].encode() + b"\n") == b""
-    assert bench.raw(b"SYST:ERR?\n") == b'203,"Unframed command"\n'
-    assert before == (bench.ask("SEQ:CRC?"), bench.unit.mask, bench.unit.eyes, bench.unit.bank.lit)
-    assert bench.edges == []
-
-
-@pytest.mark.parametrize("header", [h for h in MANUAL if h.endswith("?")])
-def test_a_bare_query_is_answered_plainly(bench, header):
-    text, _, expected = MANUAL[header]
-    assert bench.raw(text.encode() + b"\n") == expected.encode() + b"\n"
-
-
-@pytest.mark.parametrize("header", ["LED:ON", "SEQ:ARM", "TRIG"])
-def test_what_makes_light_is_refused_unless_armed(bench, header):
-    bench.ask("SEQ:DEF 0,140:1000:80000:7")
-    assert bench.code(MANUAL[header][0]) == Code.NOT_ARMED
-    assert not bench.unit.lit
-
-
-@pytest.mark.parametrize(
-    ("text", "code"),
-    [
-        ("LED:ON 150,80", Code.OUT_OF_RANGE),
-        ("LED:ON 3,501", Code.OUT_OF_RANGE),
-        ("LED:ON 3,0", Code.OUT_OF_RANGE),
-        ("LED:ON 3,80,1001", Code.OUT_OF_RANGE),
-        ("LED:ON 3,80,0", Code.OUT_OF_RANGE),
-        ("LED:ON 3+3,80", Code.SYNTAX),
-        ("LED:ON x,80", Code.SYNTAX),
-        ("LED:ON 3,80,5,5", Code.SYNTAX),
-        ("LED:ON 3+", Code.SYNTAX),
-        ("LED:ON " + "+".join(map(str, range(25))) + ",5,10", Code.OUT_OF_RANGE),
-        ("LED:OFF 150", Code.OUT_OF_RANGE),
-        ("LED:OFF all+1", Code.SYNTAX),
-        ("SEQ:DEF 1,3:1000:80000:7", Code.OUT_OF_RANGE),
-        ("SEQ:DEF 0", Code.SYNTAX),
-        ("SEQ:DEF 0,3:1000:80000", Code.SYNTAX),
-        ("SEQ:DEF 0,3:1000:80000:7;", Code.SYNTAX),
-        ("SEQ:DEF 0,3:1001:80000:7", Code.OUT_OF_RANGE),
-        ("SEQ:DEF 0,3:0:80000:7", Code.OUT_OF_RANGE),
-        ("SEQ:DEF 0,-:1:80000:7", Code.OUT_OF_RANGE),
-        ("SEQ:DEF 0,3:1:1999:7", Code.OUT_OF_RANGE),
-        ("SEQ:DEF 0,3:1:500001:7", Code.OUT_OF_RANGE),
-        ("SEQ:DEF 0,3:1:80000:8", Code.OUT_OF_RANGE),
-        ("SEQ:DEF 0,150:1:80000:7", Code.OUT_OF_RANGE),
-        ("SEQ:DEF -1,3:1:80000:7", Code.SYNTAX),
-        ("SEQ:ARM 2", Code.OUT_OF_RANGE),
-        ("SEQ:ARM 0", Code.OUT_OF_RANGE),
-        ("SEQ:ARM x", Code.SYNTAX),
-        ("SEQ:STEP? 1024", Code.OUT_OF_RANGE),
-        ("SEQ:STEP? -1", Code.SYNTAX),
-        ("CAM:MASK 8", Code.OUT_OF_RANGE),
-        ("CAM:MASK 0x5", Code.SYNTAX),
-        ("CAM:MASK -1", Code.SYNTAX),
-        ("SAFE:EYES SHUT", Code.SYNTAX),
-        ("DOSE? 150", Code.OUT_OF_RANGE),
-        ("DOSE:NEW a b", Code.SYNTAX),
-        ("TRIG a b", Code.SYNTAX),
-        ("CAM:TRIG " + "x" * 49, Code.SYNTAX),
-    ],
-)
-def test_what_makes_no_sense_is_refused_and_does_nothing(bench, text, code):
-    bench.ask("SYST:ARM")
-    before = bench.ask("SEQ:CRC?")
-    assert bench.code(text) == code
-    assert bench.ask("SEQ:CRC?") == before
-    assert not bench.unit.lit
-    assert bench.edges == []
 
 
 def test_the_data_dictionary_holds_the_rigs_limits(bench):
@@ -299,7 +168,7 @@ def test_a_sequence_of_a_silent_host_ends_dark_within_the_lease(bench):
 
 def test_one_big_step_equals_many_small_ones():
     def play(step_s):
-        bench = Bench()
+        bench = DOME.bench()
         bench.ask("SYST:WDOG 5000")
         bench.run(rows_of(behind(20)))
         while bench.now < 4.0:
@@ -378,7 +247,7 @@ def test_light_under_way_at_arming_counts_when_the_table_runs(bench):
 
 
 def test_an_led_warms_as_a_resistor_and_a_capacitor_and_trips():
-    bench = Bench(heat=0.55)
+    bench = DOME.bench(heat=0.55)
     led = behind(1)[0]
     tau, trip = RIG.leds.thermal_tau_s, RIG.leds.thermal_trip
     cooled = 0.55 * np.exp(-1.0 / tau)
@@ -386,7 +255,7 @@ def test_an_led_warms_as_a_resistor_and_a_capacitor_and_trips():
     bench.load(rows_of([led], ms=50))
     heat = float(bench.ask("SEQ:ARM 1").split(",")[3])
     assert heat == pytest.approx(1.0 + (cooled - 1.0) * np.exp(-0.05 / tau), abs=1e-4)
-    hot = Bench(heat=0.9)
+    hot = DOME.bench(heat=0.9)
     hot.ask("SYST:ARM")
     assert hot.code(f"LED:ON {led},5") == Code.THERMAL
     assert int(hot.ask("STAT?")) & 128
@@ -468,8 +337,8 @@ def test_single_leds_cannot_be_made_to_flicker_either(bench):
 
 
 def test_the_planned_order_is_accepted_and_a_bad_one_refused():
-    bench = Bench(rig=DOME.resized(16))
-    rig, plan = bench.world.rig, dome_plan(DOME)
+    bench = DOME.bench(rig=WHOLE.resized(16))
+    rig, plan = bench.world.rig, dome_plan(WHOLE)
     steps = [step for step in plan.steps if step.index.get("pass") == 0]
     table = as_table(led_rows(steps, rig))
     bench.ask("SYST:ARM")
@@ -491,7 +360,7 @@ def test_the_planned_order_is_accepted_and_a_bad_one_refused():
 
 def test_a_dead_led_is_refused_alone_and_named_in_a_sequence():
     a, b = behind(2)
-    bench = Bench(led_dead=str(b))
+    bench = DOME.bench(led_dead=str(b))
     bench.ask("SYST:ARM")
     assert bench.code(f"LED:ON {b},50") == Code.HARDWARE
     bench.run(rows_of([a, b]))
@@ -503,7 +372,7 @@ def test_a_dead_led_is_refused_alone_and_named_in_a_sequence():
 
 def test_a_weak_led_gives_less_than_it_is_driven_for_and_nobody_notices():
     a, b = behind(2)
-    bench = Bench(led_weak=f"{b}=0.25")
+    bench = DOME.bench(led_weak=f"{b}=0.25")
     bench.run(rows_of([a, b]))
     bench.wait(0.3)
     assert [(p.led, p.level) for p in bench.world.pulses] == [(a, 1.0), (b, 0.25)]
@@ -511,7 +380,7 @@ def test_a_weak_led_gives_less_than_it_is_driven_for_and_nobody_notices():
 
 
 def test_the_emergency_stop_is_reported_and_nothing_lights():
-    bench = Bench(interlock=True)
+    bench = DOME.bench(interlock=True)
     bench.ask("SYST:ARM")
     assert int(bench.ask("STAT?")) & 256
     assert bench.code("LED:ON 3,50") == Code.INTERLOCK
