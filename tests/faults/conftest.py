@@ -126,24 +126,22 @@ def end(host):
 def host_at_work():
     """Start a process that keeps served boxes at work; it is gone when the test ends.
 
-    ``host_at_work(script, rig, boxes, *arguments, pty=, word=, at_work=)`` runs the script with the
-    boxes' addresses and the arguments, and returns the served rig and the process when it has said
-    ``word`` twice and ``at_work(world)`` holds. A busy machine may hold a host up for longer than
-    its lease before anybody strikes it, which says nothing of a blow: then another is started, on
-    boxes of its own.
+    ``host_at_work(script, rig, lease_s, pty=, at_work=)`` runs the script with the boxes' addresses
+    as arguments, and returns the served rig and the process when it has printed "at work" twice and
+    ``at_work(world)`` holds. A busy machine may hold a host up for longer than its lease before
+    anybody strikes it, which proves nothing: then another is started, on boxes of its own.
     """
     with ExitStack() as started:
 
-        def host_at_work(script, rig, boxes, *arguments, pty, word, at_work):
+        def host_at_work(script, rig, lease_s, *, pty, at_work):
+            head = f"import sys\nfrom capture.devices.port import Port\nlease_s = {lease_s}\n"
             for _ in range(8):
                 served = started.enter_context(serve(rig, pty=pty))
-                given = [served.addresses[name] for name in boxes] + [str(a) for a in arguments]
-                host = subprocess.Popen(
-                    [sys.executable, "-c", script, *given], stdout=subprocess.PIPE, text=True
-                )
+                command = [sys.executable, "-c", head + script, *served.addresses.values()]
+                host = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
                 started.callback(end, host)
                 said = [host.stdout.readline() for _ in range(2)]
-                if said == [f"{word}\n"] * 2 and at_work(served.world):
+                if said == ["at work\n"] * 2 and at_work(served.world):
                     return served, host
             return pytest.fail("eight hosts in turn did not get to work")
 

@@ -1,50 +1,76 @@
-"""Programs that know nothing of us talk to what is served: bash, PyVISA and serialx."""
+"""Programs that know nothing of us talk to each served box: bash, PyVISA and serialx."""
 
+import contextlib
 import shutil
 import subprocess
 
 import pytest
 import serial
+from fixtures.box_manuals import ANY, BOXES, FLASH
 
 from capture.devices.flash import FlashBox
-from capture.devices.port import Port
+from capture.devices.port import Port, PortBusy
 from rigsim.world import World
 from rigsim.world.serve import ServeError, serve
 
-IDN = "RIGSIM,FLASH2,FL-0001,1.0"
-SCRIPT = """
-printf '*IDN?\\n' >&3; read -r -t 5 -u 3 line; echo "$line"
-printf 'FLAS:FIRE a\\n' >&3
-printf 'SYST:ERR?\\n' >&3; read -r -t 5 -u 3 line; echo "$line"
-printf 'FLAS:COUN?\\n' >&3; read -r -t 5 -u 3 line; echo "$line"
-"""
-ANSWERS = [IDN, '203,"Unframed command"', "0"]
+UNFRAMED = '203,"Unframed command"'
+NO_ERROR = '0,"No error"'
+
+each_box = pytest.mark.parametrize("manual", BOXES.values(), ids=BOXES)
 
 
 @pytest.fixture(params=["pty", "tcp"])
-def served(request, rig):
-    with serve(rig, pty=request.param == "pty") as served:
-        yield served
+def url_of(request):
+    """Serve a box's rig and return its address; gone when the test ends."""
+    with contextlib.ExitStack() as stack:
+
+        def url_of(manual):
+            served = stack.enter_context(serve(manual.rig, pty=request.param == "pty"))
+            url_of.box = served.world.box(manual.name)
+            return served.addresses[manual.name]
+
+        yield url_of
 
 
-def test_bash_asks_and_is_refused_a_bare_command(served):
+def exchange(manual):
+    """What a program says to a box that nobody armed, and what each line is answered."""
+    said = [("*IDN?", manual.identity)]
+    for text in manual.acts:
+        said += [(text, None), ("SYST:ERR?", UNFRAMED)]
+    for text in manual.unframed:
+        said += [(text, None), ("SYST:ERR?", NO_ERROR)]
+    answers = manual.answers.values()
+    return said + [(text, payload) for text, _, payload in answers if _plain_query(text, payload)]
+
+
+def _plain_query(text, payload):
+    return text.endswith("?") and payload is not ANY
+
+
+@each_box
+def test_bash_asks_and_is_refused_a_bare_command(url_of, manual):
     bash = shutil.which("bash")
     if bash is None:
         pytest.skip("no bash")
-    url = served.addresses["flash"]
-    path = url.replace("socket://", "/dev/tcp/").replace(":", "/")
-    run = subprocess.run(
-        [bash, "-c", f"exec 3<>{path}\n{SCRIPT}"], capture_output=True, text=True, timeout=120
-    )
-    assert run.stdout.splitlines() == ANSWERS, run.stderr
-    assert served.world.pops == []
+    path = url_of(manual).replace("socket://", "/dev/tcp/").replace(":", "/")
+    said = exchange(manual)
+    script = f"exec 3<>{path}\n"
+    for text, answer in said:
+        script += f"printf '{text}\\n' >&3\n"
+        script += 'read -r -t 5 -u 3 line; echo "$line"\n' * (answer is not None)
+    run = subprocess.run([bash, "-c", script], capture_output=True, text=True, timeout=120)
+    expected = [answer for _, answer in said if answer is not None]
+    assert run.stdout.splitlines() == expected, run.stderr
+    assert manual.begun(url_of.box.device) == 0
+    assert manual.idle(url_of.box.device)
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
-def test_pyvisa_asks_and_is_refused_a_bare_command(served):
+@each_box
+def test_pyvisa_asks_and_is_refused_a_bare_command(url_of, manual):
     pyvisa = pytest.importorskip("pyvisa")
     pytest.importorskip("pyvisa_py")
-    url = served.addresses["flash"]
+    url = url_of(manual)
     if url.startswith("socket://"):
         host, _, port = url.removeprefix("socket://").rpartition(":")
         name = f"TCPIP::{host}::{port}::SOCKET"
@@ -52,26 +78,38 @@ def test_pyvisa_asks_and_is_refused_a_bare_command(served):
         name = f"ASRL{url}::INSTR"
     manager = pyvisa.ResourceManager("@py")
     box = manager.open_resource(name, read_termination="\n", write_termination="\r\n", timeout=5000)
-    assert box.query("*IDN?") == IDN
-    box.write("FLAS:FIRE a")
-    assert [box.query("SYST:ERR?"), box.query("FLAS:COUN?")] == ANSWERS[1:]
-    assert box.query("SYST:CAP?").startswith('{"kind":"flash"')
+    for text, answer in exchange(manual):
+        if answer is None:
+            box.write(text)
+        else:
+            assert box.query(text) == answer
+    assert box.query("SYST:CAP?").startswith(f'{{"kind":"{manual.name}"')
     box.close()
     manager.close()
 
 
-def test_serialx_asks_and_is_refused_a_bare_command(served):
+@each_box
+def test_serialx_asks_and_is_refused_a_bare_command(url_of, manual):
     serialx = pytest.importorskip("serialx")
-    with serialx.serial_for_url(served.addresses["flash"], baudrate=115_200, timeout=5.0) as box:
+    with serialx.serial_for_url(url_of(manual), baudrate=115_200, timeout=5.0) as box:
+        for text, answer in exchange(manual):
+            box.write(text.encode() + b"\r\n")
+            if answer is not None:
+                assert box.readline().decode().rstrip() == answer
 
-        def query(text):
-            box.write(text + b"\r\n")
-            return box.readline().decode().rstrip()
 
-        assert query(b"*IDN?") == IDN
-        box.write(b"FLAS:FIRE a\n")
-        assert [query(b"SYST:ERR?"), query(b"FLAS:COUN?")] == ANSWERS[1:]
-    assert served.world.pops == []
+@each_box
+def test_a_box_that_is_held_is_busy(manual):
+    with serve(manual.rig, pty=True) as served:
+        url = served.addresses[manual.name]
+        with contextlib.closing(Port(url)), pytest.raises(PortBusy):
+            Port(url)
+
+
+@pytest.fixture(params=["pty", "tcp"])
+def served(request, rig):
+    with serve(rig, pty=request.param == "pty") as served:
+        yield served
 
 
 def test_the_driver_works_on_serialx_in_place_of_pyserial(served, monkeypatch):
@@ -85,7 +123,7 @@ def test_the_driver_works_on_serialx_in_place_of_pyserial(served, monkeypatch):
 
     monkeypatch.setattr(serial, "serial_for_url", serial_for_url)
     with FlashBox(Port(served.addresses["flash"])) as box:
-        assert box.identify() == IDN
+        assert box.identify() == FLASH.identity
         box.wait_charged(5.0)
         box.arm()
         assert box.fire("serialx").count == 1
