@@ -8,6 +8,8 @@ import pytest
 from model import store
 from skinrig.cli import main
 
+QUICK = ["--width", "64", "--leave-out", "lateral,interreflections,relief_shadows"]
+"""What becomes of a file's skin is judged elsewhere: here of its words and numbers."""
 FILE = 'schema = "skinrig.subject/1"\npreset = "II"\nmelanin = {melanin}\nfreckles = 0.0\n'
 
 
@@ -19,7 +21,7 @@ def here(tmp_path, monkeypatch):
 
 def truth_of(here, melanin):
     (here / "ann.toml").write_text(FILE.format(melanin=melanin), encoding="utf-8")
-    argv = ["simulate", "flash", "--width", "64", "--subject", "ann.toml", "--json"]
+    argv = ["simulate", "flash", *QUICK, "--subject", "ann.toml", "--json"]
     assert main([*argv, "--out", f"session-{melanin}"]) == 0
     return store.read(here / f"truth-{melanin}")
 
@@ -49,7 +51,7 @@ def test_a_files_melanin_is_that_of_the_truth_which_tells_of_the_file(here, caps
 def killed(here, capsys, monkeypatch):
     """Arguments of a simulation that was interrupted before its first frame."""
     (here / "ann.toml").write_text(FILE.format(melanin=0.02), encoding="utf-8")
-    argv = ["simulate", "flash", "--width", "64", "--subject", "ann.toml", "--out", "session"]
+    argv = ["simulate", "flash", *QUICK, "--subject", "ann.toml", "--out", "session"]
 
     def broken(*args, **settings):
         raise KeyboardInterrupt

@@ -47,7 +47,10 @@ def known_face(table, melanin, spread, blood, blood_spread):
 
 
 def test_the_kernel_sums_what_plain_numpy_sums_under_a_face(table, prior, rng):
-    """Narrow and wide faces, of the pixels' skin and of darker skin; two skins are possible."""
+    """Narrow and wide faces, of the pixels' skin and of darker skin; two skins are possible.
+
+    Against a grid twice as fine the plain sum errs by 0.002 of a width, and 2 % of the width.
+    """
     melanin = np.repeat([0.006, 0.03, 0.09, 0.17, 0.45], 3)
     light = np.tile([0.9, 0.2, 0.6], 5)
     rgb = light[:, None] * table.lookup(melanin, np.tile([0.018, 0.03, 0.025], 5))
@@ -68,7 +71,7 @@ def test_the_kernel_sums_what_plain_numpy_sums_under_a_face(table, prior, rng):
             slow = np.array(
                 [
                     chromophore_reference.estimate(
-                        color, table, covariance, prior, face=known, size=(1200, 300)
+                        color, table, covariance, prior, face=known, size=(600, 150)
                     )
                     for color in rgb[here]
                 ]
