@@ -154,3 +154,13 @@ def test_the_beard_lies_about_the_mouth_and_not_on_the_lips():
     assert abs(int(beard[:, :60].sum()) - int(beard[:, 60:].sum())) < 0.02 * beard.sum()
     with pytest.raises(common_regions.RegionError, match="got 'ears'"):
         common_regions.region("ears", frame)
+
+
+def test_a_face_without_landmarks_is_unrolled_from_its_foremost_texels():
+    position = surface()
+    valid = np.ones(position.shape[:2], np.bool_)
+    found = common.find_cylinder(position + np.array([3.0, -4.0, 5.0]), valid)
+    np.testing.assert_allclose(found.tip_mm, [3.0, -4.0, 5.0], atol=1.0)
+    valid[:] = False
+    with pytest.raises(ParameterizationError, match="no texel is valid"):
+        common.find_cylinder(position, valid)
