@@ -4,29 +4,19 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from capture.rig import Rig, load_rig
+from capture.rig import Rig
 from rigsim.needs.effects import SceneEffects
 from rigsim.render.caster import Caster
 from rigsim.render.variant import VariantChoice
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject import face_regions, landmarks
 from rigsim.subject.expressions import displacement_mm
-from rigsim.subject.person import SimulatedSubject, make_subject
+from rigsim.subject.person import SimulatedSubject
 from skinrig.simulating.flash_truth import landmarks_at_superpixels, to_superpixels
 
 # Embree traces the rays, so these tests need no Mitsuba.
 EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")
-WIDTH = 252
-
-
-@pytest.fixture(scope="module")
-def rig() -> Rig:
-    return load_rig("flash").resized(WIDTH)
-
-
-@pytest.fixture(scope="module")
-def face() -> SimulatedSubject:
-    return make_subject("II", seed=4, size=128)
+WIDTH = 252  # of the shared rig
 
 
 @pytest.fixture(scope="module")

@@ -17,11 +17,6 @@ SIZE = 256
 
 
 @pytest.fixture(scope="module")
-def face() -> SimulatedSubject:
-    return make_subject("II", seed=4, size=SIZE)
-
-
-@pytest.fixture(scope="module")
 def regions(face: SimulatedSubject) -> dict[str, np.ndarray]:
     return face_regions.region_masks(face_regions.on_mean_head(face.atlas.position_mm, face.mesh))
 

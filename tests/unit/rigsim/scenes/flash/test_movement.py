@@ -23,11 +23,6 @@ def rig() -> Rig:
     return load_rig("flash").resized(WIDTH)
 
 
-@pytest.fixture(scope="module")
-def face() -> SimulatedSubject:
-    return make_subject("II", seed=4, size=160)
-
-
 def scene_of(
     rig: Rig, face: SimulatedSubject, state: str, lateral: bool = False, **kwargs
 ) -> FlashScene:
@@ -151,7 +146,7 @@ def test_a_posed_subject_keeps_its_pose_whatever_its_blood_does(rig, face, tired
 
 def test_scenes_that_share_their_light_give_what_they_give_alone(rig, rest, tired):
     beside = tired.radiance()
-    stranger = make_subject("II", seed=4, size=160)  # the same person, nothing shared
+    stranger = make_subject("II", seed=4, size=256)  # the same person, nothing shared
     alone = scene_of(rig, stranger, "exercise").radiance()
     np.testing.assert_array_equal(beside, alone)
     assert (beside != rest.radiance()).any()

@@ -15,12 +15,12 @@ from rigsim.render.variant import VariantChoice
 from rigsim.scenes.exposing import SceneError
 from rigsim.scenes.flash.scene import FLAT_LEVEL, METER_LEVEL, FlashScene
 from rigsim.sensor import sensor_of
-from rigsim.subject.person import SimulatedSubject, make_subject
+from rigsim.subject.person import SimulatedSubject
 from rigsim.targets.flat import make_target, patch_centers_mm
 
 # Embree traces the rays, so these tests need no Mitsuba.
 EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")
-WIDTH = 252
+WIDTH = 252  # of the shared rig
 
 
 @dataclass(frozen=True)
@@ -31,16 +31,6 @@ class Fired:
     power: float = 1.0
     polarizer: str = "crossed"
     analyser_deg: float | None = None
-
-
-@pytest.fixture(scope="module")
-def rig() -> Rig:
-    return load_rig("flash").resized(WIDTH)
-
-
-@pytest.fixture(scope="module")
-def face() -> SimulatedSubject:
-    return make_subject("II", seed=4, size=256)
 
 
 PLAIN = {"choice": EMBREE, "subpixels": 1}

@@ -10,7 +10,7 @@ from rigsim.render.depth_of_field import facing_depths
 from rigsim.render.variant import VariantChoice
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject import landmarks
-from rigsim.subject.person import SimulatedSubject, SubjectError, make_subject
+from rigsim.subject.person import SimulatedSubject, SubjectError
 
 EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")
 WIDTH = 192
@@ -26,11 +26,6 @@ def scene_of(rig: Rig, face: SimulatedSubject, *, optics: bool) -> FlashScene:
 @pytest.fixture(scope="module")
 def rig() -> Rig:
     return load_rig("flash").resized(WIDTH)
-
-
-@pytest.fixture(scope="module")
-def face() -> SimulatedSubject:
-    return make_subject("II", seed=4, size=160)
 
 
 @pytest.fixture(scope="module")
