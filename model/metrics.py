@@ -35,58 +35,6 @@ def angular_error_rad(a: ArrayLike, b: ArrayLike) -> Float64Array:
     return np.where((cross == 0) & (dot == 0), np.nan, angle)
 
 
-def delta_e_2000(lab_a: ArrayLike, lab_b: ArrayLike) -> Float64Array:
-    """Return the CIEDE2000 color difference with k_L = k_C = k_H = 1.
-
-    Parameters
-    ----------
-    lab_a, lab_b
-        (..., 3), CIE L*a*b* under the same white.
-
-    Returns
-    -------
-    ndarray
-        (...).
-
-    References
-    ----------
-    Sharma, Wu, Dalal 2005, doi 10.1002/col.20070 (with its equation numbers).
-    """
-    L1, a1, b1 = np.moveaxis(np.asarray(lab_a, np.float64), -1, 0)
-    L2, a2, b2 = np.moveaxis(np.asarray(lab_b, np.float64), -1, 0)
-    c_mean7 = ((np.hypot(a1, b1) + np.hypot(a2, b2)) / 2) ** 7  # eqs. (2), (3)
-    G = 0.5 * (1 - np.sqrt(c_mean7 / (c_mean7 + 25.0**7)))  # eq. (4)
-    a1p, a2p = (1 + G) * a1, (1 + G) * a2  # eq. (5)
-    C1, C2 = np.hypot(a1p, b1), np.hypot(a2p, b2)  # eq. (6)
-    h1 = np.degrees(np.arctan2(b1, a1p)) % 360  # eq. (7)
-    h2 = np.degrees(np.arctan2(b2, a2p)) % 360
-    gray = C1 * C2 == 0
-    dh = (h2 - h1 + 180) % 360 - 180  # eq. (10); a turn of 180 keeps either sign
-    dh = np.where(gray, 0.0, dh)
-    dH = 2 * np.sqrt(C1 * C2) * np.sin(np.radians(dh) / 2)  # eq. (11)
-    dL, dC = L2 - L1, C2 - C1  # eqs. (8), (9)
-    far = np.abs(h1 - h2) > 180
-    h_mean = np.where(far, (h1 + h2 + np.where(h1 + h2 < 360, 360, -360)) / 2, (h1 + h2) / 2)
-    h_mean = np.where(gray, h1 + h2, h_mean)  # eq. (14)
-    L_mean, C_mean = (L1 + L2) / 2, (C1 + C2) / 2
-    T = (  # eq. (15)
-        1
-        - 0.17 * np.cos(np.radians(h_mean - 30))
-        + 0.24 * np.cos(np.radians(2 * h_mean))
-        + 0.32 * np.cos(np.radians(3 * h_mean + 6))
-        - 0.20 * np.cos(np.radians(4 * h_mean - 63))
-    )
-    theta = 30 * np.exp(-(((h_mean - 275) / 25) ** 2))  # eq. (16)
-    R_C = 2 * np.sqrt(C_mean**7 / (C_mean**7 + 25.0**7))  # eq. (17)
-    S_L = 1 + 0.015 * (L_mean - 50) ** 2 / np.sqrt(20 + (L_mean - 50) ** 2)  # eq. (18)
-    S_C = 1 + 0.045 * C_mean  # eq. (19)
-    S_H = 1 + 0.015 * C_mean * T  # eq. (20)
-    R_T = -np.sin(np.radians(2 * theta)) * R_C  # eq. (21)
-    lightness, chroma, hue = dL / S_L, dC / S_C, dH / S_H
-    squared = lightness**2 + chroma**2 + hue**2 + R_T * chroma * hue  # eq. (22)
-    return np.sqrt(np.maximum(squared, 0.0))
-
-
 def individual_typology_angle_deg(lightness: ArrayLike, b_star: ArrayLike) -> Float64Array:
     """Return the individual typology angle, arctan((L* - 50) / b*), in degrees.
 

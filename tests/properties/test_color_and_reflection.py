@@ -5,6 +5,7 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
+from capture.calibration.color import colorimetry
 from model import color_table, merl, metrics, skin_reflectance, spectra
 from model.brdf import microfacet
 from model.tissue_optics.layers import ANISOTROPY_SKIN
@@ -53,11 +54,13 @@ def test_an_angle_knows_no_length_and_no_order(a, b, scale):
     second=st.tuples(st.floats(0, 100), *[st.floats(-120, 120)] * 2),
 )
 def test_a_color_difference_is_none_to_itself_and_alike_both_ways(first, second):
-    there = metrics.delta_e_2000(first, second)
+    there = colorimetry.delta_e_2000(first, second)
     assert np.isfinite(there)
     assert there >= 0.0
-    assert metrics.delta_e_2000(second, first) == pytest.approx(float(there), rel=1e-6, abs=1e-9)
-    assert metrics.delta_e_2000(first, first) == 0.0
+    assert colorimetry.delta_e_2000(second, first) == pytest.approx(
+        float(there), rel=1e-6, abs=1e-9
+    )
+    assert colorimetry.delta_e_2000(first, first) == 0.0
 
 
 @CHEAP
