@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,10 +19,9 @@ from rigsim.boxes.dome import LedPulse
 from rigsim.scenes.dome.targets import target_scene
 from rigsim.sensor import sensor_of
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import measure, measure_and_keep
-from skinrig.benchmarks.resampling import drawn_again
-from skinrig.benchmarks.results import Knobs, Point, StageBenchmark, Timing
+from skinrig.benchmarks.resampling import drawn_rms
+from skinrig.benchmarks.results import BandError
+from skinrig.benchmarks.stage import Stage
 
 if TYPE_CHECKING:
     from rigsim.scenes.dome.targets import TargetScene
@@ -31,13 +31,15 @@ SPHERE_RADIUS_MM = 50.0
 DOME_SEED = 5
 
 
-def geometry(*, toy: bool) -> StageBenchmark:
+def geometry(stage: Stage) -> None:
     """Adjust cameras to 4 to 12 places of a simulated board."""
-    views = ["C03", "C07", "C11", "C14"] if toy else ["C03", "C05", "C07", "C10", "C11", "C14"]
-    rig = load_rig("dome").subset(views=views).resized(324 if toy else 650)
+    views = (
+        ["C03", "C07", "C11", "C14"] if stage.toy else ["C03", "C05", "C07", "C10", "C11", "C14"]
+    )
+    rig = load_rig("dome").subset(views=views).resized(324 if stage.toy else 650)
     dome = build(rig, seed=DOME_SEED, tolerances=Tolerances(distortion=0.2))
     scene = target_scene("charuco", rig, seed=DOME_SEED, dome=dome)
-    counts = (5, 6, 7, 8) if toy else (6, 8, 10, 12)
+    counts = (5, 6, 7, 8) if stage.toy else (6, 8, 10, 12)
     sightings: dict[tuple[str, int], Sighting] = {}
     for pose in range(counts[-1]):
         scene.show(pose)
@@ -48,7 +50,6 @@ def geometry(*, toy: bool) -> StageBenchmark:
                 sightings[name, pose] = found
     start = nominal_cameras(rig)
     probes = np.random.default_rng(0).uniform(-70, 70, (300, 3))
-    points, worst = [], 0.0
     for count in counts:
         seen = {key: s for key, s in sightings.items() if key[1] < count}
         result = bundle.adjust(seen, CHARUCO_BOARD, start)
@@ -59,19 +60,17 @@ def geometry(*, toy: bool) -> StageBenchmark:
             variances.append(np.trace(result.center_covariance_mm2[name]) / 3)
             truth = image_of(view, dome.distortion[name], probes)
             projected.append(np.linalg.norm(camera.project(probes) - truth, axis=1).mean())
-        worst = float(max(projected))
-
-        timing = measure(lambda: bundle.adjust(seen, CHARUCO_BOARD, start))
-        points.append(_point({"places": count}, timing, np.array(gaps), np.array(variances)))
-    return described("dome-geometry", points, {"reprojection": worst})
+        stage.limits["reprojection"] = float(max(projected))
+        timing, _ = stage.time(lambda: bundle.adjust(seen, CHARUCO_BOARD, start), repeats=3)
+        stage.add({"places": count}, timing, _error(np.array(gaps), np.array(variances)))
 
 
-def lights(*, toy: bool) -> StageBenchmark:
+def lights(stage: Stage) -> None:
     """Place lights by one to four places of a simulated mirror sphere."""
-    views = ["C05", "C07", "C14"] if toy else ["C01", "C05", "C07", "C10", "C11", "C14"]
+    views = ["C05", "C07", "C14"] if stage.toy else ["C01", "C05", "C07", "C10", "C11", "C14"]
     dome_rig = load_rig("dome")
-    every = [light.name for light in dome_rig.lights][:: 30 if toy else 10]
-    rig = dome_rig.subset(views=views, lights=every).resized(324 if toy else 1300)
+    every = [light.name for light in dome_rig.lights][:: 30 if stage.toy else 10]
+    rig = dome_rig.subset(views=views, lights=every).resized(324 if stage.toy else 1300)
     dome = build(rig, seed=DOME_SEED)
     scene = target_scene("mirror", rig, seed=DOME_SEED, dome=dome)
     cameras = {view.name: CameraPose.nominal(view) for view in dome.rig.views}
@@ -83,20 +82,18 @@ def lights(*, toy: bool) -> StageBenchmark:
         _add_sphere(scene, rig, cameras, number, spheres, seen)
     nominal = {light.name: np.array(light.position_mm) for light in rig.lights}
     truth = scene.truth()["position_mm"]
-    points, last = [], np.inf
     for count in range(1, most + 1):
         rows = [row for row in seen if row.sphere < count]
         some = {number: spheres[number] for number in range(count)}
 
-        timing, result = measure_and_keep(
-            lambda: mirror_lights.locate_lights(rows, cameras, some, nominal)
-        )
+        locate = partial(mirror_lights.locate_lights, rows, cameras, some, nominal)
+        timing, result = stage.time(locate, repeats=3)
         ok = result.valid
         gaps = np.mean((result.position_mm - truth)[ok] ** 2, axis=1)
-        last = float(np.median(np.linalg.norm((result.position_mm - truth)[ok], axis=1)))
+        away = np.linalg.norm((result.position_mm - truth)[ok], axis=1)
+        stage.limits["distance"] = float(np.median(away))
         variances = np.mean(result.stderr_mm[ok] ** 2, axis=1)
-        points.append(_point({"spheres": count}, timing, gaps, variances))
-    return described("dome-lights", points, {"distance": last})
+        stage.add({"spheres": count}, timing, _error(gaps, variances))
 
 
 def _add_sphere(
@@ -142,8 +139,6 @@ def _frame(
     )
 
 
-def _point(knobs: Knobs, timing: Timing, squares: Float64Array, variances: Float64Array) -> Point:
-    """Return a point with a bootstrap interval of the error and the bound that errors state."""
-    low, high = np.sqrt(drawn_again(squares, np.mean, draws=400))
-    error, bound = (float(np.sqrt(part.mean())) for part in (squares, variances))
-    return Point(knobs, timing, error, (float(low), float(high)), bound)
+def _error(squares: Float64Array, variances: Float64Array) -> BandError:
+    """Return the root of squares' mean beside that of the variances that errors state."""
+    return drawn_rms(squares, float(np.sqrt(variances.mean())), draws=400)

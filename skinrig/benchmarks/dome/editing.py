@@ -10,12 +10,10 @@ import numpy as np
 from reconstruction.correspondence.common_parameterization import Chart
 from rigsim.population.population import Member, table_1
 from skinrig.arrays import BoolArray, Float32Array, FloatArray
-from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import measure
 from skinrig.benchmarks.resampling import mean_error, squares
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
+from skinrig.benchmarks.results import BandError, Knobs
+from skinrig.benchmarks.stage import Stage
 from skinrig.editing import albedo as editing_albedo
-from skinrig.evaluating.skin_bands import MELANIN_BANDS
 from skinrig.fitting import traits
 from skinrig.traits.albedo_vectors import AlbedoSample, AlbedoTraits, VectorKind
 from skinrig.traits.labels import Labels
@@ -27,14 +25,14 @@ N_EDITED_FACES: Final = 4
 """Faces that are edited; the traits are learned of others."""
 
 
-def editing(*, toy: bool) -> StageBenchmark:
+def editing(stage: Stage) -> None:
     """Edit faces over iterations of matching, noise and kinds of vectors."""
-    count, size = (4, 64) if toy else (28, 192)
+    count, size = (4, 64) if stage.toy else (28, 192)
     # heads take long to build: one of them is enough to see that this runs
-    everybody = [p for p in table_1() if not toy or p.head == 0]
+    everybody = [p for p in table_1() if not stage.toy or p.head == 0]
     order = np.random.default_rng(0).permutation(len(everybody))[: count + N_EDITED_FACES]
     people = [dataclasses.replace(everybody[k], applied=()) for k in order]
-    faces = CommonFaces.of(people, size=size, common=64 if toy else 128)
+    faces = CommonFaces.of(people, size=size, common=64 if stage.toy else 128)
     learned, edited = people[:count], people[count:]
     tanned = [p if k % 2 else _tanned(p) for k, p in enumerate(learned)]
     rng = np.random.default_rng(1)
@@ -42,14 +40,13 @@ def editing(*, toy: bool) -> StageBenchmark:
     labels = Labels(tuple(p.name for p in learned), {"tan": np.arange(count) % 2 == 0}, {}, ())
     before = [faces.albedo(p, noise=0.0, rng=rng) for p in edited]
     after = [faces.albedo(_tanned(p), noise=0.0, rng=rng) for p in edited]
-    points, kept = [], {}
-    bands: dict[str, BandError] = {}
+    kept = {}
     usual = editing_albedo.MATCHING_NOISE
     settings: list[tuple[VectorKind, int, float]] = [
         ("quantiles", 5, usual),
         ("quantiles", 5, 0.0),
         ("histograms", 5, usual),
-        *(("quantiles", n, usual) for n in ((1,) if toy else (1, 2, 10))),
+        *(("quantiles", n, usual) for n in ((1,) if stage.toy else (1, 2, 10))),
     ]
     spaces: dict[str, AlbedoTraits] = {}
     for kind, iterations, noise in settings:
@@ -64,30 +61,20 @@ def editing(*, toy: bool) -> StageBenchmark:
             errors.append(_error_percent(new, one, truth))
             there = one.valid & truth.valid
             back.append(100 * float(np.sqrt(np.mean((again / one.r_d - 1)[there] ** 2))))
-        timing = measure(
-            partial(call, before[0].r_d, before[0].valid, 1.0),
-            repeats=1 if toy else 3,
-            memory=not toy,
-        )
-        if not bands:
-            bands = {
-                name: _on_skin(call, faces, band.melanin, people[0])
-                for name, band in MELANIN_BANDS.items()
-            }
+        first = partial(call, before[0].r_d, before[0].valid, 1.0)
+        timing, _ = stage.time(first, memory=not stage.toy)
+        if not stage.by_band:
+            stage.on_each_skin(lambda band: _on_skin(call, faces, band.melanin, people[0]))
         knobs: Knobs = {"vectors": kind, "iterations": iterations, "noise": noise}
-        points.append(Point.of(knobs, timing, mean_error(errors)))
-        kept[kind, iterations, noise] = points[-1].error, float(np.mean(back))
+        outcome = stage.add(knobs, timing, mean_error(errors))
+        kept[kind, iterations, noise] = outcome.error, float(np.mean(back))
     error, returned = kept[settings[0]]
     pairs = zip(before, after, strict=True)
     none = float(np.mean([_error_percent(a.r_d, a, b) for a, b in pairs]))
     same = _edit(spaces["quantiles"], 5, usual, before[0].r_d, before[0].valid, 0.0)
     zero = float(np.abs(same / before[0].r_d - 1)[before[0].valid].max())
-    return described(
-        "editing",
-        points,
-        {"error": error, "over_no_edit": error / none, "round_trip": returned, "zero": zero},
-        by_band=bands,
-    )
+    stage.limits |= {"error": error, "over_no_edit": error / none}
+    stage.limits |= {"round_trip": returned, "zero": zero}
 
 
 def _on_skin(

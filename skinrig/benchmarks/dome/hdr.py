@@ -8,9 +8,8 @@ import numpy as np
 
 from capture import hdr
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, UInt16Array
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import measure_and_keep
-from skinrig.benchmarks.results import BandError, Point, StageBenchmark, Timing
+from skinrig.benchmarks.results import BandError, Timing
+from skinrig.benchmarks.stage import Stage
 
 GAIN_E_PER_DN, READ_NOISE_E, BLACK_DN, WHITE_DN = 2.0, 8.0, 512.0, 16383.0
 N_FRAMES, FULL_SIDE_PX = 23, 1024
@@ -19,22 +18,19 @@ EXPOSURE_RANGE_S = (1e-3, 1.0)
 Frames = list[UInt16Array]
 
 
-def merging(*, toy: bool) -> StageBenchmark:
+def merging(stage: Stage) -> None:
     """Merge brackets of 2 to 23 frames over three decades of exposure, four of radiance."""
-    side = 64 if toy else FULL_SIDE_PX
+    side = 64 if stage.toy else FULL_SIDE_PX
     rng = np.random.default_rng(0)
     scene = np.geomspace(20.0, 2e5, side * side * 3)
     scene = rng.permutation(scene).reshape(side, side, 3)  # DN per second
-    points = []
     worst = 0.0
     frames: Frames = []
     times = np.ones(1)
     for count in (2, 3, 5, 9, N_FRAMES):
         times = np.geomspace(*EXPOSURE_RANGE_S, count)
         frames = [_expose(scene, t, rng) for t in times]
-        timing, (radiance, _, valid) = measure_and_keep(
-            lambda: _merge(frames, times), repeats=1 if toy else 3
-        )
+        timing, (radiance, _, valid) = stage.time(lambda: _merge(frames, times))
         bound = _bound(scene, times)
         # near a frame's saturation noise decides whether the frame counts
         settled = valid & ~np.any(
@@ -46,12 +42,11 @@ def merging(*, toy: bool) -> StageBenchmark:
         least = 100 * float(np.sqrt(((bound / scene**2)[settled]).mean()))
         worst = max(worst, error / least)
         outcome = BandError.around(error, spread, least)
-        points.append(Point.of({"frames": count}, timing, outcome))
-    ours, theirs, ratio = _beside_opencv(frames, times, rounds=1 if toy else 15)
+        stage.add({"frames": count}, timing, outcome)
+    ours, theirs, ratio = _beside_opencv(frames, times, rounds=1 if stage.toy else 15)
     ours = replace(ours, peak_memory_mb=timing.peak_memory_mb)
-    points.append(Point.of({"frames": N_FRAMES, "way": "beside"}, ours, outcome))
-    limits: Findings = {("speed_up", side, theirs): ratio, "over_bound": worst}
-    return described("hdr", points, limits)
+    stage.add({"frames": N_FRAMES, "way": "beside"}, ours, outcome)
+    stage.limits = {("speed_up", side, theirs): ratio, "over_bound": worst}
 
 
 def _merge(frames: Frames, times: Float64Array) -> tuple[Float32Array, Float32Array, BoolArray]:

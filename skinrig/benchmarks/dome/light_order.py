@@ -8,45 +8,38 @@ from capture.plan.flicker import FlickerReport, flicker_of_rows
 from capture.plan.light_order import LIGHT_ORDERS, best_order
 from capture.plan.rows import LedRow
 from capture.rig import LedLimits, Rig, load_rig
-from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import measure_and_keep
-from skinrig.benchmarks.results import BandError, Point, StageBenchmark
+from skinrig.benchmarks.results import BandError
+from skinrig.benchmarks.stage import Stage
 
 DWELL_S = 1.0 / 12.0
 DARK_TIME_FRACTION = 0.3
 """Share of each light's time that is dark where lights do not overlap."""
 
 
-def light_order(*, toy: bool) -> StageBenchmark:
+def light_order(stage: Stage) -> None:
     """Time each order of the lights and take the flicker of one pass at open eyes."""
     rig = load_rig("dome")
-    rig = rig.subset(lights=[light.name for light in rig.lights[::3]]) if toy else rig
+    rig = rig.subset(lights=[light.name for light in rig.lights[::3]]) if stage.toy else rig
     limits = rig.leds or LedLimits()
-    points, found = [], {}
+    found = {}
     orders: dict[str, Callable[[Rig], list[int]]] = dict(LIGHT_ORDERS)
     orders["chosen"] = partial(best_order, dwell_s=DWELL_S)
     for name, order in orders.items():
-        timing, shown = measure_and_keep(partial(order, rig), repeats=1)
+        timing, shown = stage.time(partial(order, rig), repeats=1)
         for gaps in (False, True) if name == "spiral" else (False,):
-            found[name, gaps] = _flicker(rig, shown, gaps=gaps)
-            points.append(
-                Point.of(
-                    {"order": name, "gaps": "dark" if gaps else "none"},
-                    timing,
-                    BandError.around(100.0 * found[name, gaps].rms, 0.0),
-                    {"flashes a second": found[name, gaps].flashes_per_s},
-                )
+            found[name, gaps] = flicker = _flicker(rig, shown, gaps=gaps)
+            stage.add(
+                {"order": name, "gaps": "dark" if gaps else "none"},
+                timing,
+                BandError.around(100.0 * flicker.rms, 0.0),
+                {"flashes a second": flicker.flashes_per_s},
             )
     chosen, worst = found["chosen", False], found["spiral", True]
-    return described(
-        "light-order",
-        points,
-        {
-            "flashes": (chosen.flashes_per_s, limits.max_flashes_per_s - 0.5),
-            "rms": (chosen.rms, limits.max_flicker_rms),
-            "reduction": worst.rms / chosen.rms,
-        },
-    )
+    stage.limits = {
+        "flashes": (chosen.flashes_per_s, limits.max_flashes_per_s - 0.5),
+        "rms": (chosen.rms, limits.max_flicker_rms),
+        "reduction": worst.rms / chosen.rms,
+    }
 
 
 def _flicker(rig: Rig, shown: list[int], *, gaps: bool) -> FlickerReport:

@@ -13,10 +13,8 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.correspondence import expression_alignment
 from rigsim.subject import SimulatedSubject, make_subject
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import measure_and_keep
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
-from skinrig.evaluating.skin_bands import MELANIN_BANDS
+from skinrig.benchmarks.results import BandError, Knobs
+from skinrig.benchmarks.stage import Stage
 
 Points = dict[str, tuple[float, float]]
 
@@ -213,49 +211,37 @@ def face_of(preset: str, side: int, *, seed: int = 0) -> SimulatedSubject:
     return make_subject(preset, seed=seed, size=side)
 
 
-def aligned(*, toy: bool) -> StageBenchmark:
+def aligned(stage: Stage) -> None:
     """Align moved faces by landmarks few and many, by features, with and without dense flow."""
-    side = 128 if toy else 512
+    side = 128 if stage.toy else 512
     rng = np.random.default_rng(1)
     face = face_of("III", side, seed=2)
     away = smooth_displacement(side, bend_px=side / 10, rms_px=side / 50, rng=rng)
     seen = moved_face(face, away, state="exercise", noise=0.005, landmarks=48, rng=rng)
     still = moved_face(face, np.zeros_like(away), state="exercise", noise=0.005, rng=rng)
     effort = [(8, 0), (24, 0), (48, 0), (24, 2)]
-    if not toy:
-        effort = [
-            (8, 0),
-            (8, 2),
-            *((24, n) for n in (0, 1, 2, 4)),
-            (48, 0),
-            (48, 2),
-            (0, 0),
-            (0, 2),
-        ]
-    points = {}
+    if not stage.toy:
+        both = [(n, rounds) for n in (48, 0) for rounds in (0, 2)]
+        effort = [(8, 0), (8, 2), *((24, n) for n in (0, 1, 2, 4)), *both]
     for count, rounds in effort:
-        timing, found = measure_and_keep(
+        timing, found = stage.time(
             lambda: seen.align(count, rounds), repeats=1, memory=(count, rounds) == (24, 2)
         )
         error = seen.errors_px(found)
         if (count, rounds) == (24, 2):
             covered = float((error < 2.0 * found.error_px[found.valid]).mean())
         knobs = {"by": found.by, "landmarks": count, "rounds": rounds}
-        points[count, rounds] = Point.of(knobs, timing, _rms(error, side))
-    bands = {
-        name: _on_skin(band.preset, 128 if toy else 256) for name, band in MELANIN_BANDS.items()
-    }
-    limits: Findings = {}
-    if not toy:
-        limits = {
+        stage.add(knobs, timing, _rms(error, side))
+    stage.on_each_skin(lambda band: _on_skin(band.preset, 128 if stage.toy else 256))
+    stage.words["moved_px"] = side / 50
+    if not stage.toy:
+        bare, dense = (stage.at(landmarks=24, rounds=n) for n in (0, 2))
+        stage.limits = {
             "false_motion": float(np.median(still.errors_px(still.align(24, 2)))),
             "covered": covered,
-            "by_flow": points[24, 0].error / points[24, 2].error,
-            "seconds": points[24, 2].timing.seconds,
+            "by_flow": bare.error / dense.error,
+            "seconds": dense.timing.seconds,
         }
-    return described(
-        "expression-alignment", points.values(), limits, by_band=bands, moved_px=side / 50
-    )
 
 
 def _on_skin(preset: str, side: int) -> BandError:
@@ -269,22 +255,20 @@ def _on_skin(preset: str, side: int) -> BandError:
 MISALIGNMENTS_PX = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)
 
 
-def misaligned(*, toy: bool) -> StageBenchmark:
+def misaligned(stage: Stage) -> None:
     """Blend from maps that were put in a wrong place on purpose, beside interpolating them.
 
     The paper's claim (Jimenez et al. 2010, section 4.2) is that local statistics bear alignments
     that are not perfect, and interpolated maps do not.
     """
-    side = 128 if toy else 512
+    side = 128 if stage.toy else 512
     face = face_of("III", side, seed=2)
     mask = oval(side)
     neutral = face.hemoglobin().astype(np.float64)
-    points = []
-    errors: dict[tuple[float, float, str], float] = {}
-    for state in ("exercise",) if toy else ("exercise", "smile"):
+    for state in ("exercise",) if stage.toy else ("exercise", "smile"):
         truth = face.hemoglobin(state).astype(np.float64)
         size = _rms((truth - neutral)[mask], side).error
-        for off_px in MISALIGNMENTS_PX[:3] if toy else MISALIGNMENTS_PX:
+        for off_px in MISALIGNMENTS_PX[:3] if stage.toy else MISALIGNMENTS_PX:
             map_of_state = displaced(truth, off_px, rng=np.random.default_rng(3))
 
             def blended(radius: float) -> Float64Array:
@@ -295,20 +279,18 @@ def misaligned(*, toy: bool) -> StageBenchmark:
                 )
                 return np.asarray(rig.blend({state: 1.0, "neutral": 0.0}), np.float64)
 
-            for radius in (0.0, 16.0) if toy else (0.0, 8.0, 16.0, 32.0):
-                timing, found = measure_and_keep(lambda: blended(radius), repeats=1, memory=False)
+            for radius in (0.0, 16.0) if stage.toy else (0.0, 8.0, 16.0, 32.0):
+                timing, found = stage.time(lambda: blended(radius), repeats=1, memory=False)
                 error = (found - truth)[mask] / size
                 outcome = _rms(error[np.isfinite(error)], side)
-                errors[radius, off_px, state] = outcome.error
                 way = "blended" if radius else "interpolated"
                 knobs: Knobs = {"state": state, "way": way, "off_px": off_px}
                 knobs |= {"radius_px": radius} if radius else {}
-                points.append(Point.of(knobs, timing, outcome))
-    limits: Findings = {}
-    if not toy:
-        for state in ("exercise", "smile"):
-            limits["ratio", state] = errors[0.0, 2.0, state] / errors[16.0, 2.0, state]
-    return described("misalignment", points, limits)
+                stage.add(knobs, timing, outcome)
+        if not stage.toy:
+            kept = stage.at(state=state, off_px=2.0, way="interpolated")
+            blend = stage.at(state=state, off_px=2.0, radius_px=16.0)
+            stage.limits["ratio", state] = kept.error / blend.error
 
 
 def displaced(image: Float64Array, rms_px: float, *, rng: np.random.Generator) -> Float64Array:

@@ -1,28 +1,29 @@
 """Benchmark of the chromophore inversion, beside SciPy's least squares in the same run."""
 
 import time
+from typing import Literal
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from model import color_table, metrics
+from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import chromophores
 from skinrig.arrays import Float64Array, FloatArray
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import measure_and_keep
 from skinrig.benchmarks.resampling import median_error
-from skinrig.benchmarks.results import BandError, Point, StageBenchmark
-from skinrig.evaluating.skin_bands import MELANIN_BANDS
+from skinrig.benchmarks.results import BandError
+from skinrig.benchmarks.stage import Stage
+from skinrig.evaluating.skin_bands import MelaninBand
 
 CHANNEL_NOISE = 0.01
+SHADINGS: dict[str, Literal["known"] | None] = {"known": "known", "free": None}
 MIN_MELANIN = 0.004
 """Volume fraction of the palest skin that is drawn."""
 
 
-def inversion(*, toy: bool) -> StageBenchmark:
+def inversion(stage: Stage) -> None:
     """Invert a noisy picture with the shading known and free, through tables of several sizes."""
-    side, pixels = (96, 8) if toy else (2048, 40)
+    side, pixels = (96, 8) if stage.toy else (2048, 40)
     rng = np.random.default_rng(0)
     table = color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
     y, x = np.mgrid[0:side, 0:side] / side
@@ -32,43 +33,25 @@ def inversion(*, toy: bool) -> StageBenchmark:
     noisy = (color * (1 + CHANNEL_NOISE * rng.standard_normal(color.shape))).astype(np.float32)
     picture = noisy.reshape(side, side, 3)
     variance = (CHANNEL_NOISE * color.reshape(side, side, 3)).astype(np.float32) ** 2
-    points = []
-    limits: Findings = {}
-    for shading in ("known", "free"):
-        for size in (16, 128) if toy else (16, 32, 64, 128):
+    for shading in SHADINGS:
+        for size in (16, 128) if stage.toy else (16, 32, 64, 128):
             coarse = color_table.build(
                 "Nikon 5100 (NPL)", "D55", size=size, anisotropy=ANISOTROPY_SKIN
             )
-            timing, found = measure_and_keep(
+            timing, found = stage.time(
                 lambda: chromophores.invert(
-                    picture,
-                    coarse,
-                    shading="known" if shading == "known" else None,
-                    variance=variance,
-                ),
-                repeats=1 if toy else 3,
+                    picture, coarse, shading=SHADINGS[shading], variance=variance
+                )
             )
-            relative = 100 * np.abs(found.melanin / c_m - 1)
-            median, interval = metrics.median_with_interval(relative[found.valid], rng=rng)
-            # the median of |error| of a normal error of the bound's size
-            bound = 67.45 * float(np.median((found.stderr_melanin / c_m)[found.valid]))
-            knobs = {"shading": shading, "table": size}
-            points.append(Point(knobs, timing, median, interval, bound))
+            outcome = _error(found, c_m, rng)
+            stage.add({"shading": shading, "table": size}, timing, outcome)
         if shading == "free":
             peer_s = _scipy_seconds(picture.reshape(-1, 3)[:: side * side // pixels], table)
             ours_s = timing.seconds / side**2
-            limits = {("seconds", side): timing.seconds, "speed_up": peer_s / ours_s}
-    return described(
-        "chromophores", points, limits, by_band=_by_band(table, 500 if toy else 20_000, rng)
-    )
+            stage.limits = {("seconds", side): timing.seconds, "speed_up": peer_s / ours_s}
+    count = 500 if stage.toy else 20_000
 
-
-def _by_band(
-    table: color_table.ColorTable, count: int, rng: np.random.Generator
-) -> dict[str, BandError]:
-    """Return the median error of melanin in percent, shading free, from light skin to dark."""
-    errors = {}
-    for name, band in MELANIN_BANDS.items():
+    def on_skin(band: MelaninBand) -> BandError:
         low, high = band.melanin_range
         c_m = rng.uniform(max(low, MIN_MELANIN), min(high, table.c_m_max), count)
         c_hd = rng.uniform(0.02, 0.08, count)
@@ -79,11 +62,19 @@ def _by_band(
             table,
             variance=(CHANNEL_NOISE * color[None]).astype(np.float32) ** 2,
         )
-        valid = found.valid[0]
-        off = 100 * np.abs(found.melanin[0] / c_m - 1)[valid]
-        bound = 67.45 * float(np.median((found.stderr_melanin[0] / c_m)[valid]))
-        errors[name] = median_error(off, bound=bound)
-    return errors
+        return _error(found, c_m)
+
+    stage.on_each_skin(on_skin)
+
+
+def _error(
+    found: chromophores.ChromophoreMaps, c_m: Float64Array, rng: np.random.Generator | None = None
+) -> BandError:
+    """Return the median error of melanin, %."""
+    off = 100 * np.abs(found.melanin / c_m - 1)[found.valid]
+    # the median of |error| of a normal error of the bound's size
+    bound = 67.45 * float(np.median((found.stderr_melanin / c_m)[found.valid]))
+    return median_error(off, bound, rng=rng)
 
 
 def _scipy_seconds(rgb: FloatArray, table: color_table.ColorTable) -> float:

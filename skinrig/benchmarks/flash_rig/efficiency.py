@@ -18,9 +18,8 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import chromophores, diffuse_albedo, photometric_stereo, subsurface
 from reconstruction.photometric_stereo import light_selection
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import measure_and_keep
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
+from skinrig.benchmarks.results import BandError, Knobs, Point
+from skinrig.benchmarks.stage import Stage
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, melanin_band
 
 
@@ -60,27 +59,24 @@ FIBER_NOISE = 0.01
 """Relative noise of each fibre."""
 
 
-def efficiency(*, toy: bool) -> StageBenchmark:
+def efficiency(stage: Stage) -> None:
     """Measure mean squared errors over Cramér-Rao bounds."""
-    draws = 500 if toy else 20_000
-    points: list[Point] = []
-    limits: Findings = {}
-    left_out: list[tuple[str, str]] = []
-    worst: dict[str, BandError] = {}
+    draws = 500 if stage.toy else 20_000
+    worst = stage.by_band
     for name, made in _ESTIMATOR_TRIALS.items():
         ratios: dict[str, list[tuple[float, float]]] = {band: [] for band in MELANIN_BANDS}
         for subject, trial in made(draws):
-            timing, squared = measure_and_keep(trial.squared_errors, repeats=1)
+            timing, squared = stage.time(trial.squared_errors, repeats=1)
             ratio = float(squared.mean()) / trial.bound
             spread = float(squared.std() / np.sqrt(len(squared))) / trial.bound
             knobs: Knobs = {"estimator": name, "subject": subject}
             knobs["noise_percent"] = round(100 * trial.noise, 2)
             judged = trial.clear >= MIN_EVALUATED_SIGMAS
             outcome = BandError.around(ratio, spread, 1.0)
-            points.append(Point.of(knobs, timing, outcome, {"judged": judged}))
+            stage.add(knobs, timing, outcome, {"judged": judged})
             if judged:
                 ratios[str(melanin_band(SUBJECT_CHROMOPHORES[subject][0]))].append((ratio, spread))
-        left_out += _left_out(name, points)
+        stage.left_out += _left_out(name, stage.points)
         for band, pairs in ratios.items():
             if not pairs:
                 continue
@@ -88,10 +84,9 @@ def efficiency(*, toy: bool) -> StageBenchmark:
             ratio = float(np.mean(each))
             spread = float(np.sqrt(np.sum(spreads**2))) / len(pairs)
             # what so many draws leave open of the ratio counts for the estimator
-            limits["ratio", name, band] = ratio - 2.0 * spread
+            stage.limits["ratio", name, band] = ratio - 2.0 * spread
             if band not in worst or ratio > worst[band].error:
                 worst[band] = BandError.around(ratio, spread, 1.0)
-    return described("efficiency", points, limits, left_out=tuple(left_out), by_band=worst)
 
 
 def _left_out(name: str, points: Sequence[Point]) -> list[tuple[str, str]]:

@@ -15,12 +15,11 @@ from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.facial_color import shared_melanin
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.description import Findings, described
 from skinrig.benchmarks.flash_rig.alignment import face_of, oval, table
-from skinrig.benchmarks.measurement import LIMIT_CORES, measured, processor_seconds
+from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds
 from skinrig.benchmarks.resampling import median_error
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
-from skinrig.evaluating.skin_bands import MELANIN_BANDS
+from skinrig.benchmarks.results import BandError, Knobs
+from skinrig.benchmarks.stage import Findings, Stage
 
 STATE_NAMES = ("neutral", "smile", "anger", "fear", "happiness", "sadness", "surprise")
 SUPERPIXEL_NOISE = 0.003
@@ -30,9 +29,9 @@ LIGHT_CHANGE = 0.05
 FULL_SIDE_PX = 1024
 
 
-def inversion(*, toy: bool) -> StageBenchmark:
+def inversion(stage: Stage) -> None:
     """Invert 1 to 7 states together, the light free or smooth, beside each state alone."""
-    side = 64 if toy else 192
+    side = 64 if stage.toy else 192
     model = _Model(table(), shading_prior.of_faces(), model_error.load())
     seen = _States.of("II", side, STATE_NAMES, model)
 
@@ -53,32 +52,27 @@ def inversion(*, toy: bool) -> StageBenchmark:
     def together(count: int, window: float | None) -> shared_melanin.SharedMelanin:
         return seen.together(count, window, model)
 
-    def point(
-        knobs: Knobs, call: Callable[[], Any], change: Callable[[Any], Float64Array]
-    ) -> Point:
-        return measured(
-            knobs, call, lambda made: _error(seen.errors(change(made))), repeats=1, memory=False
-        )
+    def add(knobs: Knobs, call: Callable[[], Any], change: Callable[[Any], Float64Array]) -> None:
+        timing, made = stage.time(call, repeats=1, memory=False)
+        stage.add(knobs, timing, _error(seen.errors(change(made))))
 
-    points = [point({"way": "each alone", "states": 2}, alone, lambda made: made)]
+    add({"way": "each alone", "states": 2}, alone, lambda made: made)
     settings: list[tuple[int, float | None]] = [(2, None), (3, None), (2, 3.0)]
-    if not toy:
+    if not stage.toy:
         settings = [(2, None), (4, None), (7, None), (7, 3.0), (7, 8.0)]
     for count, window in settings:
         knobs: Knobs = {"way": "together", "states": count, "light": window or "free"}
-        points.append(point(knobs, lambda: together(count, window), lambda made: made.change[1]))
-    bands = {name: _on_skin(band.preset, side, model) for name, band in MELANIN_BANDS.items()}
-    limits: Findings = {}
-    if not toy:
+        add(knobs, lambda: together(count, window), lambda made: made.change[1])
+    stage.on_each_skin(lambda band: _on_skin(band.preset, side, model))
+    if not stage.toy:
         found = together(7, 3.0)
         stated = found.stderr_change[1][seen.mask]
-        limits = {
-            "over_alone": points[0].error / points[4].error,
+        stage.limits = {
+            "over_alone": stage.points[0].error / stage.points[4].error,
             "within": float(np.mean(seen.errors(found.change[1]) < 2.0 * stated)),
             **_melanin_limits(model),
             **_full_size(model),
         }
-    return described("shared-melanin", points, limits, by_band=bands)
 
 
 def pictures(

@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from skinrig.benchmarks.description import Findings, described
 from skinrig.benchmarks.intervals import dome as interval_trials_dome
 from skinrig.benchmarks.intervals import flash as interval_trials_flash
 from skinrig.benchmarks.intervals import gradient as interval_trials_gradient
@@ -25,7 +24,8 @@ from skinrig.benchmarks.intervals import sequence as interval_trials_sequence
 from skinrig.benchmarks.intervals import trials as interval_trials
 from skinrig.benchmarks.intervals.coverage import COVERAGE_RANGES, Covered, Trial, by_band
 from skinrig.benchmarks.measurement import once
-from skinrig.benchmarks.results import Point, StageBenchmark, Timing
+from skinrig.benchmarks.results import Point, Timing
+from skinrig.benchmarks.stage import Findings, Stage
 
 FIRST_SEED: Final = 400
 FALSE_ALARM_RATE: Final = 0.05
@@ -54,26 +54,27 @@ DOME_PRESETS: Final = ("I", "III", "V", "II", "IV", "VI")
 Trials = Iterable[Trial]
 
 
-def intervals(*, toy: bool) -> Iterator[StageBenchmark]:
+def intervals(stage: Stage) -> Iterator[None]:
     """Count how often 68 and 95 % intervals of every rig's maps hold the truth.
 
     Yields
     ------
-    StageBenchmark
-        After each kind of trial that of all so far: the last is the whole one.
+    None
+        After each kind of trial, when the stage holds what is known of all so far.
     """
     trials: list[Trial] = []
     spent: dict[str, Timing] = {}
-    for make in (_small() if toy else _full()).values():
+    for make in (_small() if stage.toy else _full()).values():
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
             timing, made = once(lambda make=make, folder=folder: list(make(folder)))  # type: ignore[misc]
         trials += made
         spent |= dict.fromkeys((trial.quantity for trial in made), timing)
-        yield _judged(trials, spent, toy=toy)
+        _judge(stage, trials, spent)
+        yield
 
 
-def _judged(trials: Sequence[Trial], spent: Mapping[str, Timing], *, toy: bool) -> StageBenchmark:
+def _judge(stage: Stage, trials: Sequence[Trial], spent: Mapping[str, Timing]) -> None:
     judged = [trial for trial in trials if trial.deviation.size]
     counted = len(by_band(judged, level=68, confidence=0.95))
     # one-sided at each end of the range, of two levels
@@ -83,16 +84,13 @@ def _judged(trials: Sequence[Trial], spent: Mapping[str, Timing], *, toy: bool) 
         for level in COVERAGE_RANGES
         for row in by_band(judged, level=level, confidence=confidence)
     ]
-    return described(
-        "intervals",
-        tuple(_point(row, spent[row.quantity]) for row in rows),
-        {} if toy else {k: v for row in rows for k, v in _limits(row).items()},
-        left_out=tuple(
-            (f"{trial.quantity}, {trial.subject}", "every pixel is masked")
-            for trial in trials
-            if not trial.deviation.size
-        ),
-    )
+    stage.points = [_point(row, spent[row.quantity]) for row in rows]
+    stage.limits = {key: found for row in rows for key, found in _limits(row).items()}
+    stage.left_out = [
+        (f"{trial.quantity}, {trial.subject}", "every pixel is masked")
+        for trial in trials
+        if not trial.deviation.size
+    ]
 
 
 def _full() -> Mapping[str, Callable[[Path], Trials]]:

@@ -9,10 +9,9 @@ import numpy as np
 from capture.rig import load_rig
 from rigsim.render.scene_radiance import point_rig
 from rigsim.scenes.dome.reference import PlainScene, compare, plain_face
-from skinrig.benchmarks.description import described
 from skinrig.benchmarks.resampling import drawn_again, tiled_rms
-from skinrig.benchmarks.results import BandError, Point, StageBenchmark, Timing
-from skinrig.evaluating.skin_bands import MELANIN_BANDS
+from skinrig.benchmarks.results import BandError, Timing
+from skinrig.benchmarks.stage import Stage
 
 if TYPE_CHECKING:
     from rigsim.scenes.dome.reference import Way
@@ -20,17 +19,15 @@ if TYPE_CHECKING:
 WHY_NO_MEMORY = "three ways take turns in one process, each with its scene held"
 
 
-def render(*, toy: bool) -> StageBenchmark:
+def render(stage: Stage) -> None:
     """Time one view of the dome, light after light, in three ways.
 
     The full size is that of the rig's cameras. Mitsuba's samples are stratified, which makes them
     as even as our regular rays: with its default, independent ones it is twice as noisy.
     """
-    width, lights = (64, 2) if toy else (1300, 4)
-    points = []
-
-    efforts = (1, 2) if toy else (1, 3, 2)
-    fine = 4 if toy else 6
+    width, lights = (64, 2) if stage.toy else (1300, 4)
+    efforts = (1, 2) if stage.toy else (1, 3, 2)
+    fine = 4 if stage.toy else 6
     for subpixels in efforts:
         found = compare(
             width_px=width,
@@ -42,21 +39,13 @@ def render(*, toy: bool) -> StageBenchmark:
         for name in ("ours", "path", "direct"):
             way = getattr(found, name)
             timing = Timing.single(way.seconds, no_memory=WHY_NO_MEMORY)
-            points.append(Point.of({"way": name, "rays": subpixels**2}, timing, _error(way)))
-    bands = {
-        name: _on_skin(band.preset, 64 if toy else 650, fine)
-        for name, band in MELANIN_BANDS.items()
-    }
-    finest = next(p for p in points if p.knobs == {"way": "ours", "rays": max(efforts) ** 2})
-    limits = {"over_path": found.speed_up(found.path), "over_direct": found.speed_up(found.direct)}
-    return described(
-        "render-dome",
-        points,
-        limits,
-        reference_error=finest.error * max(efforts) / fine,
-        by_band=bands,
-        rays=fine**2,
-    )
+            stage.add({"way": name, "rays": subpixels**2}, timing, _error(way))
+    stage.on_each_skin(lambda band: _on_skin(band.preset, 64 if stage.toy else 650, fine))
+    stage.limits["over_path"] = found.speed_up(found.path)
+    stage.limits["over_direct"] = found.speed_up(found.direct)
+    finest = stage.at(way="ours", rays=max(efforts) ** 2)
+    stage.reference_error = finest.error * max(efforts) / fine
+    stage.words["rays"] = fine**2
 
 
 def _error(way: Way) -> BandError:

@@ -1,5 +1,7 @@
 """Benchmark of the flash rig's renderer: both polarization images, and Mitsuba's polarizers."""
 
+from functools import partial
+
 import numpy as np
 from scipy.ndimage import binary_erosion
 
@@ -14,52 +16,42 @@ from rigsim.scenes.flash.polarizer_reference import (
     sphere_mesh,
 )
 from skinrig.arrays import Float32Array
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import measured
 from skinrig.benchmarks.resampling import tiled_rms
-from skinrig.benchmarks.results import BandError, StageBenchmark
+from skinrig.benchmarks.results import BandError
+from skinrig.benchmarks.stage import Stage
 
 REFERENCE_RAYS = 144
 
 
-def render(*, toy: bool) -> StageBenchmark:
+def render(stage: Stage) -> None:
     """Time both polarization images by closed forms and by Mitsuba's own polarizers."""
-    efforts = ((1, 2), (2, 4)) if toy else ((1, 4), (2, 16), (3, 64))
-    width = 48 if toy else 256
+    efforts = ((1, 2), (2, 4)) if stage.toy else ((1, 4), (2, 16), (3, 64))
+    width = 48 if stage.toy else 256
     rig, view = reference_rig(width)
     caster = Caster(sphere_mesh(), choice=choose_variant("mono_polarized"))
     truth = closed_forms(rig, view, caster, subpixels=round(REFERENCE_RAYS**0.5))
-    ours, theirs = [], []
-    for subpixels, samples in efforts:
-        ours.append(
-            measured(
-                {"way": "closed form", "subpixels": subpixels},
-                lambda: closed_forms(rig, view, caster, subpixels=subpixels),
-                lambda found: _worse(found, truth),
-                memory=None,
-            )
+    worse = partial(_worse, truth=truth)
+    for subpixels, _ in efforts:
+        stage.measure(
+            {"way": "closed form", "subpixels": subpixels},
+            lambda: closed_forms(rig, view, caster, subpixels=subpixels),
+            worse,
+            repeats=3,
+            memory=None,
         )
-        theirs.append(
-            measured(
-                {"way": "mitsuba", "samples": samples},
-                lambda: {
-                    name: np.asarray(mitsuba_image(rig, view, name, samples=samples, seed=k))
-                    for k, name in enumerate(ANALYZER_AXIS_DEG)
-                },
-                lambda found: _worse(found, truth),
-                memory=None,
-            )
+    stage.reference_error = stage.points[-1].error * efforts[-1][0] / REFERENCE_RAYS**0.5
+    for _, samples in efforts:
+        image = partial(mitsuba_image, rig, view, samples=samples)
+        stage.measure(
+            {"way": "mitsuba", "samples": samples},
+            lambda: {name: image(name, seed=k) for k, name in enumerate(ANALYZER_AXIS_DEG)},
+            worse,
+            repeats=3,
+            memory=None,
         )
-    limits: Findings = {}
-    if not toy:
+    if not stage.toy:
         final = polarizer_reference(width_px=width, samples=efforts[-1][1], subpixels=1)
-        limits = {"speed_up": final.speed_up, "noise": final.noise_ratio}
-    return described(
-        "render-flash",
-        (*ours, *theirs),
-        limits,
-        reference_error=ours[-1].error * efforts[-1][0] / REFERENCE_RAYS**0.5,
-    )
+        stage.limits = {"speed_up": final.speed_up, "noise": final.noise_ratio}
 
 
 def _worse(found: dict[str, Float32Array], truth: dict[str, Float32Array]) -> BandError:

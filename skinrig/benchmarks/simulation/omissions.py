@@ -3,10 +3,10 @@
 from collections.abc import Iterator
 
 from rigsim.needs.face import LATERAL_EFFECT
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark, Timing
+from skinrig.benchmarks.results import BandError, Knobs, Timing
 from skinrig.benchmarks.simulation import omission_cases, omission_probe
 from skinrig.benchmarks.simulation.omission_cases import Omission
+from skinrig.benchmarks.stage import Stage
 
 WHY_NO_MEMORY = "scenes share what they trace: a picture's memory is not its own"
 FLASH_PX = 192
@@ -18,16 +18,14 @@ GRADIENT_PX = 128
 N_DOME_LIGHTS = 3
 
 
-def omissions(*, toy: bool) -> StageBenchmark:
+def omissions(stage: Stage) -> None:
     """Render scenes of each rig with and without what their rules decide on.
 
     A point is one effect of one scene: its seconds are those of the picture without the effect, its
     error the largest change of any pixel over that pixel's noise. All pictures but the probe's are
     sums without chance, so that what is uncertain is rounding; the probe's are of equal photons.
     """
-    found = list(_cases(toy))
-    points = []
-    limits: Findings = {}
+    found = list(_cases(stage.toy))
     for one in found:
         timing = Timing.single(one.without_s, no_memory=WHY_NO_MEMORY)
         knobs: Knobs = {"rig": one.rig, "subject": one.subject}
@@ -35,18 +33,15 @@ def omissions(*, toy: bool) -> StageBenchmark:
         also: Knobs = {"seconds saved": one.with_s - one.without_s}
         if one.told is not None:
             also["told by the rule"] = one.told
-        interval = (max(one.found - one.uncertain, 0.0), one.found + one.uncertain)
-        points.append(Point.of(knobs, timing, BandError(one.found, interval), also))
+        stage.add(knobs, timing, BandError.of_size(one.found, one.uncertain), also)
         if one.verdict == "negligible":
-            limits["change", one.rig, one.subject, one.effect] = one.at_most
+            stage.limits["change", one.rig, one.subject, one.effect] = one.at_most
     built = [one for one in found if one.verdict == "built"]
     told = [one for one in built if one.told is not None and not _other_shadows(one)]
-    limits["over_rule"] = max(
+    stage.limits["over_rule"] = max(
         ((one.found - one.uncertain) / (one.told or 1e-30) for one in told), default=0.0
     )
-    return described(
-        "omissions", points, limits, reference_error=max(one.uncertain for one in found)
-    )
+    stage.reference_error = max(one.uncertain for one in found)
 
 
 def _other_shadows(one: Omission) -> bool:
