@@ -213,7 +213,20 @@ def lights(stage: Stage) -> None:
     most = 4
     for number in range(most):
         scene.show(number)
-        _add_sphere(scene, rig, cameras, number, spheres, seen)
+        outlines, colors = {}, {}
+        for name, camera in cameras.items():
+            frame = _frame(scene, name, range(len(every)), 0.06, 1.0, number)
+            colors[name] = channel_levels(frame)
+            image = neutral_mosaic(frame, colors[name])
+            edges = mirror_sphere.find_outline(image, camera, SPHERE_RADIUS_MM)
+            if edges is not None:
+                outlines[name] = edges
+        spheres[number] = mirror_sphere.locate_sphere(outlines, cameras, SPHERE_RADIUS_MM)
+        for name, camera in cameras.items():
+            window = mirror_lights.SphereWindow.of(camera, spheres[number])
+            frame = _frame(scene, name, range(len(every)), 0.012, 0.002, number)
+            spots = mirror_lights.find_highlights(neutral_mosaic(frame, colors[name]), window)
+            seen.append(mirror_lights.Highlights(name, number, tuple(every), *spots))
     nominal = {light.name: np.array(light.position_mm) for light in rig.lights}
     truth = scene.truth()["position_mm"]
     for count in range(1, most + 1):
@@ -228,33 +241,6 @@ def lights(stage: Stage) -> None:
         stage.limits["distance"] = float(np.median(away))
         variances = np.mean(result.stderr_mm[ok] ** 2, axis=1)
         stage.add({"spheres": count}, timing, _rms(gaps, variances))
-
-
-def _add_sphere(
-    scene: TargetScene,
-    rig: Rig,
-    cameras: dict[str, CameraPose],
-    number: int,
-    spheres: dict[int, mirror_sphere.SpherePosition],
-    seen: list[mirror_lights.Highlights],
-) -> None:
-    """Add one place of the sphere and its highlights."""
-    every = range(len(rig.lights))
-    outlines, colors = {}, {}
-    for name, camera in cameras.items():
-        frame = _frame(scene, name, every, 0.06, 1.0, number)
-        colors[name] = channel_levels(frame)
-        image = neutral_mosaic(frame, colors[name])
-        edges = mirror_sphere.find_outline(image, camera, SPHERE_RADIUS_MM)
-        if edges is not None:
-            outlines[name] = edges
-    spheres[number] = mirror_sphere.locate_sphere(outlines, cameras, SPHERE_RADIUS_MM)
-    for name, camera in cameras.items():
-        window = mirror_lights.SphereWindow.of(camera, spheres[number])
-        frame = _frame(scene, name, every, 0.012, 0.002, number)
-        spots = mirror_lights.find_highlights(neutral_mosaic(frame, colors[name]), window)
-        names = tuple(light.name for light in rig.lights)
-        seen.append(mirror_lights.Highlights(name, number, names, *spots))
 
 
 def _frame(

@@ -83,28 +83,18 @@ def glossy_ball(
     return Scene(images, towards, n, inside, matte, paint)
 
 
-def numpy_irls_l1(
-    samples: Float64Array,
-    lights: Float64Array,
-    *,
-    shadow: float = 0.1,
-    steps: int = 100,
-    tiny: float = 1e-6,
-) -> Float64Array:
+def numpy_irls_l1(samples: Float64Array, lights: Float64Array) -> Float64Array:
     """Fit pixels one by one by least absolute deviations, in plain NumPy.
 
-    Iteratively reweighted least squares with weights 1 / max(|r|, tiny) from the least-squares
-    start until the solution moves by less than 1e-6 (Schlossmacher 1973, J. Am. Stat. Assoc. 68,
-    857), over the samples that are not dark.
+    Iteratively reweighted least squares with weights 1 / max(|r|, 1e-6) from the least-squares
+    start until the solution moves by less than 1e-6 or 100 times (Schlossmacher 1973, J. Am. Stat.
+    Assoc. 68, 857), over the samples that are not dark: not below a tenth of a pixel's bright
+    sample (its eighth part from above).
 
     Parameters
     ----------
     samples : ndarray, shape (N, P)
     lights : ndarray, shape (N, 3)
-    shadow : float
-        Part of a pixel's bright sample (its eighth part from above) below which one is dark.
-    steps, tiny
-        Most steps, and the least residual that is told from none.
 
     Returns
     -------
@@ -115,13 +105,13 @@ def numpy_irls_l1(
     normals = np.zeros((samples.shape[1], 3))
     for pixel, values in enumerate(samples.T):
         bright = np.partition(values, -rank)[-rank]
-        lit = values > shadow * bright
+        lit = values > 0.1 * bright
         if bright <= 0 or np.count_nonzero(lit) < 3:
             continue
         A, i = lights[lit], values[lit]
         b = np.linalg.lstsq(A, i)[0]
-        for _ in range(steps):
-            root = 1.0 / np.sqrt(np.maximum(np.abs(i - A @ b), tiny))
+        for _ in range(100):
+            root = 1.0 / np.sqrt(np.maximum(np.abs(i - A @ b), 1e-6))
             before, b = b, np.linalg.lstsq(root[:, None] * A, root * i)[0]
             if np.linalg.norm(b - before) < 1e-6 * np.linalg.norm(b):
                 break

@@ -14,6 +14,7 @@ from rigsim.light import surface_brdf
 from rigsim.subject import make_subject
 from skinrig.arrays import BoolArray, Float64Array, Int64Array
 from skinrig.benchmarks.dome import texture as bench_texture
+from skinrig.benchmarks.dome.brdf_truth import Samples
 from skinrig.benchmarks.resampling import drawn_median
 from skinrig.benchmarks.results import Knobs
 from skinrig.benchmarks.stage import Stage
@@ -33,36 +34,13 @@ EXTREME_PRESETS: Final = ("palest", "darkest")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FacePoints:
-    """Points of a simulated face under the dome's lights, and what is true of them.
+class FacePoints(Samples):
+    """Points of a simulated face."""
 
-    Attributes
-    ----------
-    f
-        (P, M, 3) samples with noise, 1/sr; `variance` is theirs.
-    light, view
-        (P, M, 3), unit.
-    normals
-        (P, 3).
-    seen
-        (P, M) bool: light and view stand above the horizon.
-    left_out
-        (P, M) bool: samples of lights that no fit may see.
-    surface
-        (P, M) true surface term, 1/sr.
-    total
-        (P, M, 3) true reflection, 1/sr.
-    """
-
-    f: Float64Array
-    variance: Float64Array
-    light: Float64Array
-    view: Float64Array
-    normals: Float64Array
-    seen: BoolArray
     left_out: BoolArray
-    surface: Float64Array
+    """(P, M): samples of lights that no fit may see."""
     total: Float64Array
+    """(P, M, 3): true reflection, 1/sr."""
 
 
 def face_points(subject: str, *, points: int, samples: int, rng: np.random.Generator) -> FacePoints:
@@ -111,8 +89,8 @@ def face_points(subject: str, *, points: int, samples: int, rng: np.random.Gener
         to[1],
         normals,
         seen,
-        held[which[0]],
         np.asarray(specular, np.float64).reshape(len(chosen), count),
+        held[which[0]],
         clean,
     )
 
@@ -125,10 +103,10 @@ def model(stage: Stage) -> None:
     usual: list[float] = []
     for subject in BAND_PRESETS if stage.toy else (*BAND_PRESETS, *EXTREME_PRESETS):
         p = face_points(subject, points=count, samples=samples, rng=rng)
-        use = p.seen & ~p.left_out
+        use = p.valid & ~p.left_out
         known: dict[str, Any] = {"eta": ETA, "variance": p.variance, "valid": use}
-        albedo = diffuse_albedo.estimate(p.f, p.light, p.view, p.normals, **known)
-        given = brdf_basis.surface_samples(p.f, p.light, p.view, p.normals, albedo.r_d, **known)
+        albedo = diffuse_albedo.estimate(*p.samples, **known)
+        given = brdf_basis.surface_samples(*p.samples, albedo.r_d, **known)
         full = brdf_basis.fit_weights(given, materials)
         for rank in LOBE_RANKS:
             if rank > min(count, materials.size):
@@ -160,7 +138,7 @@ def _errors(
 ) -> tuple[Float64Array, Float64Array]:
     """Return of each point the surface term's error over its sum, and that of all light, %."""
     known = np.asarray(np.isfinite(r_d).all(axis=1))
-    at = p.seen & p.left_out & known[:, None]
+    at = p.valid & p.left_out & known[:, None]
     some = np.flatnonzero(at.any(axis=1))
     surface, everything = [], []
     for point in some:

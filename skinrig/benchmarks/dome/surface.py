@@ -4,7 +4,6 @@ import itertools
 import tempfile
 import time
 import tracemalloc
-from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -42,13 +41,37 @@ def lumitexels(stage: Stage) -> None:
     sphere = trimesh.creation.icosphere(subdivisions=4 if stage.toy else 6, radius=SPHERE_RADIUS_MM)
     caster = RayCaster(sphere.vertices, sphere.faces)
     seen = [_seen(camera) for camera in cameras]
+
+    def gathered(count: int, **table: Any) -> tuple[Timing, list[FloatArray]]:
+        """Gather some points; return seconds and MB held, and relative errors of the samples."""
+        where = sphere.vertices[:count]
+        surface = Surface(where, where / SPHERE_RADIUS_MM)
+        tracemalloc.start()
+        start = time.perf_counter()
+        store = LumitexelStore(surface, cameras=cameras, lights=lights, caster=caster, **table)
+        spent = time.perf_counter() - start
+        for view, light in itertools.product(range(len(cameras)), range(len(names))):
+            image = _image(seen[view], lights, light)
+            start = time.perf_counter()
+            store.add(view, light, image, np.full_like(image, 1e-6))
+            spent += time.perf_counter() - start
+        errors = []
+        start = time.perf_counter()
+        for _, part in store.chunks(1000):
+            inner = part.valid & (part.cos_light > 0.3) & (part.cos_view > 0.4)
+            errors.append(part.f[inner][:, 1] * np.pi / SPHERE_ALBEDO - 1)
+        spent += time.perf_counter() - start
+        peak = tracemalloc.get_traced_memory()[1] / 1e6
+        tracemalloc.stop()
+        return Timing.single(spent, peak), errors
+
     counts = (250, 500) if stage.toy else (2_000, 10_000, 40_000)
     for count, kind in [(n, k) for n in counts for k in ("memory", "disk")]:
         with tempfile.TemporaryDirectory() as folder:
-            table: dict[str, Any] = {"folder": None, "dtype": np.float32}
-            if kind == "disk":
-                table = {"folder": Path(folder), "dtype": np.float16}
-            timing, errors = _gathered(sphere, count, cameras, lights, caster, seen, table)
+            if kind == "memory":
+                timing, errors = gathered(count, folder=None, dtype=np.float32)
+            else:
+                timing, errors = gathered(count, folder=Path(folder), dtype=np.float16)
         off = 100 * np.abs(np.concatenate(errors))
         samples = count * len(cameras) * len(names)
         # samples of a point err alike: blocks of points are drawn
@@ -57,38 +80,6 @@ def lumitexels(stage: Stage) -> None:
         stage.add({"points": count, "tables": kind}, timing, outcome)
     hours = timing.seconds / samples * N_FULL_SAMPLES / 3600
     stage.limits = {"memory": timing.peak_memory_mb or 0.0, "hours": hours}
-
-
-def _gathered(
-    sphere: trimesh.Trimesh,
-    count: int,
-    cameras: Sequence[CameraPose],
-    lights: LightTable,
-    caster: RayCaster,
-    seen: Sequence[Float64Array],
-    table: Mapping[str, Any],
-) -> tuple[Timing, list[FloatArray]]:
-    """Gather some points; return seconds and MB held, and relative errors of the samples."""
-    where = sphere.vertices[:count]
-    surface = Surface(where, where / SPHERE_RADIUS_MM)
-    tracemalloc.start()
-    start = time.perf_counter()
-    store = LumitexelStore(surface, cameras=cameras, lights=lights, caster=caster, **table)
-    spent = time.perf_counter() - start
-    for view, light in itertools.product(range(len(cameras)), range(len(lights.position_mm))):
-        image = _image(seen[view], lights, light)
-        start = time.perf_counter()
-        store.add(view, light, image, np.full_like(image, 1e-6))
-        spent += time.perf_counter() - start
-    errors = []
-    start = time.perf_counter()
-    for _, part in store.chunks(1000):
-        inner = part.valid & (part.cos_light > 0.3) & (part.cos_view > 0.4)
-        errors.append(part.f[inner][:, 1] * np.pi / SPHERE_ALBEDO - 1)
-    spent += time.perf_counter() - start
-    peak = tracemalloc.get_traced_memory()[1] / 1e6
-    tracemalloc.stop()
-    return Timing.single(spent, peak), errors
 
 
 def filling(stage: Stage) -> None:

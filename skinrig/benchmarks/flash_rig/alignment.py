@@ -18,6 +18,8 @@ from skinrig.benchmarks.stage import Stage
 
 Points = dict[str, tuple[float, float]]
 
+LANDMARK_NOISE_PX = 1.0
+"""Standard deviation along each axis of where somebody places a landmark."""
 TABLE_CAMERA, TABLE_ILLUMINANT = "Nikon 5100 (NPL)", "D65"
 
 
@@ -113,6 +115,13 @@ def oval(side: int) -> BoolArray:
     return np.asarray((x / 0.34) ** 2 + (y / 0.40) ** 2 < 1.0)
 
 
+def seen_at(image: Float64Array, away: Float64Array, order: int = 3) -> Float64Array:
+    """Return an image (N, N) at places that are away from each pixel by columns and rows."""
+    rows, columns = np.indices(image.shape, np.float64)
+    at = [rows + away[..., 1], columns + away[..., 0]]
+    return np.asarray(map_coordinates(image, at, order=order, mode="nearest"))
+
+
 def moved_face(
     face: SimulatedSubject,
     displacement_px: Float64Array,
@@ -120,7 +129,6 @@ def moved_face(
     state: str = "smile",
     noise: float = 0.01,
     landmarks: int = 24,
-    landmark_noise_px: float = 1.0,
     rng: np.random.Generator,
 ) -> MovedFace:
     """Picture a face in neutral, and moved in a state of its blood.
@@ -135,28 +143,15 @@ def moved_face(
         Of `rigsim.subject.perfusion.STATE_NAMES`.
     noise
         Relative standard deviation of each channel of each pixel.
-    landmarks, landmark_noise_px
-        How many, and how precisely somebody placed each along each axis.
+    landmarks
+        How many somebody placed.
     rng
         Draws noise.
     """
     side = face.size
-    rows, columns = np.mgrid[:side, :side].astype(np.float64)
     back = np.zeros_like(displacement_px)
     for _ in range(60):
-        at = [rows + back[..., 1], columns + back[..., 0]]
-        back = -np.stack(
-            [
-                map_coordinates(displacement_px[..., k], at, order=1, mode="nearest")
-                for k in range(2)
-            ],
-            axis=-1,
-        )
-    at = [rows + back[..., 1], columns + back[..., 0]]
-
-    def pulled(image: Float64Array, order: int = 3) -> Float64Array:
-        return np.asarray(map_coordinates(image, at, order=order, mode="nearest"))
-
+        back = -np.stack([seen_at(displacement_px[..., k], back, 1) for k in range(2)], axis=-1)
     colors = table()
     light = 0.75 * np.clip(face.normal[..., 2], 0.05, 1.0)
     rest = face.hemoglobin(state)
@@ -165,7 +160,7 @@ def moved_face(
     for blood, moved in ((face.hemoglobin(), False), (rest, True)):
         clean = colors.lookup(face.melanin, blood) * light[..., None]
         if moved:
-            clean = np.stack([pulled(clean[..., k]) for k in range(3)], axis=-1)
+            clean = np.stack([seen_at(clean[..., k], back) for k in range(3)], axis=-1)
         pictures.append((clean * (1.0 + noise * rng.standard_normal(clean.shape))).astype("f4"))
         variances.append(((noise * clean) ** 2).astype("f4"))
     points = spread_points(mask, landmarks)
@@ -173,7 +168,7 @@ def moved_face(
     placed = [
         {
             f"point {k + 1}": (float(x), float(y))
-            for k, (x, y) in enumerate(p + rng.normal(0.0, landmark_noise_px, p.shape))
+            for k, (x, y) in enumerate(p + rng.normal(0.0, LANDMARK_NOISE_PX, p.shape))
         }
         for p in (points.astype(np.float64), gone)
     ]
@@ -183,14 +178,14 @@ def moved_face(
         variances[0],
         variances[1],
         mask,
-        pulled(mask.astype(np.float64), 1) > 0.99,
-        np.stack([columns, rows], axis=-1) + displacement_px,
+        seen_at(mask.astype(np.float64), back, 1) > 0.99,
+        np.indices((side, side), np.float64)[::-1].transpose(1, 2, 0) + displacement_px,
         placed[0],
         placed[1],
         face.melanin,
         face.hemoglobin(),
         rest,
-        pulled(rest.astype(np.float64)).astype("f4"),
+        seen_at(rest.astype(np.float64), back).astype("f4"),
     )
 
 
@@ -298,10 +293,7 @@ def displaced(image: Float64Array, rms_px: float, *, rng: np.random.Generator) -
     if rms_px == 0.0:
         return image
     side = image.shape[0]
-    away = smooth_displacement(side, bend_px=side / 12.8, rms_px=rms_px, rng=rng)
-    rows, columns = np.mgrid[:side, :side].astype(np.float64)
-    at = [rows + away[..., 1], columns + away[..., 0]]
-    return np.asarray(map_coordinates(image, at, order=3, mode="nearest"))
+    return seen_at(image, smooth_displacement(side, bend_px=side / 12.8, rms_px=rms_px, rng=rng))
 
 
 def _rms(values: Float64Array, side: int) -> BandError:

@@ -56,10 +56,12 @@ class Train:
         settled_s = 10 * CYCLE_S
         return np.array([course.level(settled_s + phase) for phase in self.phase_s])
 
-    def draw(self, constant_s: float, rng: np.random.Generator) -> Float64Array:
+    def draw(
+        self, constant_s: float, rng: np.random.Generator, noise: float = BLOOD_NOISE
+    ) -> Float64Array:
         """Return curves of the five places, (5, captures)."""
         clean = REST_BLOOD + np.outer(BLOOD_CHANGES, self.levels(constant_s))
-        return np.asarray(clean + BLOOD_NOISE * rng.standard_normal(clean.shape))
+        return np.asarray(clean + noise * rng.standard_normal(clean.shape))
 
     def bound_s(self) -> float:
         """Return the Cramér-Rao bound of the time constant, s; delay and levels unknown too."""
@@ -156,11 +158,10 @@ def noise_by_band() -> dict[str, float]:
 def _on_skin(noisier: float, runs: int) -> BandError:
     """Return the error of five places in 44 captures, with so many times the noise."""
     train, rng = Train(44, 10.25), np.random.default_rng(0)
-    clean = REST_BLOOD + np.outer(BLOOD_CHANGES, train.levels(TIME_CONSTANT_S))
     found = []
     for _ in range(runs):
-        noise = noisier * BLOOD_NOISE * rng.standard_normal(clean.shape)
-        found.append(fit_cycle(train.phase_s, clean + noise, cycle_s=CYCLE_S).time_constant_s)
+        values = train.draw(TIME_CONSTANT_S, rng, noisier * BLOOD_NOISE)
+        found.append(fit_cycle(train.phase_s, values, cycle_s=CYCLE_S).time_constant_s)
     return rms_of_draws(np.array(found) - TIME_CONSTANT_S, bound=noisier * train.bound_s())
 
 

@@ -70,13 +70,9 @@ def frankot_chellappa(normals: Float64Array, *, pixel: float) -> Float64Array:
     return np.asarray(pixel * fft.irfft2(waves, gx.shape))
 
 
-def sparse_direct(
-    normals: Float64Array, valid: BoolArray, *, pixel: float, order: int = 4
-) -> Float64Array:
+def sparse_direct(normals: Float64Array, valid: BoolArray, *, pixel: float) -> Float64Array:
     """Solve the same normal equations with SciPy's SuperLU; one connected part."""
-    ax, ay, dx, dy = slope_fields.edges(
-        slope_fields.from_normals(normals, valid=valid), order=order
-    )
+    ax, ay, dx, dy = slope_fields.edges(slope_fields.from_normals(normals, valid=valid), order=4)
     number = np.full(ax.shape, -1)
     inside = np.pad(valid, 1)
     number[inside] = np.arange(np.count_nonzero(inside))

@@ -102,6 +102,11 @@ def furrowed_face(
     return normals(furrows(np.zeros(8))), {name: normals(h) for name, h in deep.items()}
 
 
+def _resized(texture: FloatArray, side: int) -> FloatArray:
+    """Return a texture (H, W, 2) at (side, side, 2)."""
+    return np.moveaxis(resampling.resampled(np.moveaxis(texture, 2, 0), (side, side)), 0, 2)
+
+
 def numpy_combine(
     base: Float32Array, wrinkle: Float64Array, masks: Float64Array, sums: Float64Array
 ) -> Float64Array:
@@ -196,7 +201,7 @@ def summing(stage: Stage) -> None:
     row = np.full(8, 0.5)
     truth = numpy_combine(base, wrinkle, masks, row)
     neutral = wrinkles.decode(base)
-    low = np.moveaxis(resampling.resampled(np.moveaxis(base, 2, 0), (coarse, coarse)), 0, 2)
+    low = _resized(base, coarse)
     difference = wrinkle_differences.difference_map(
         wrinkles.decode(low.astype(np.float64)), wrinkles.decode(low + wrinkle)
     )
@@ -249,7 +254,7 @@ def storing(stage: Stage) -> None:
     weights = {"surprise": 1.0, "disgust": 0.6}
     whole = wrinkles.combine(base.astype(np.float64), wrinkle, masks, weights, table=table)
     for at in (64, 32) if stage.toy else (512, 256, 128, 64):
-        small = np.moveaxis(resampling.resampled(np.moveaxis(wrinkle, 2, 0), (at, at)), 0, 2)
+        small = _resized(wrinkle, at)
         for maps_as, masks_as in ENCODINGS if at in (64, 256) else ENCODINGS[:1]:
             layer = Layer(
                 wrinkle_storage.stored_map(small, maps_as),
@@ -317,7 +322,7 @@ def _bound(layer: Layer, clean: FloatArray, stderr_rad: Float64Array) -> Float64
     the weights follow from n = (p, q, 1) / |(p, q, 1)|.
     """
     side = stderr_rad.shape[0]
-    read = np.moveaxis(resampling.resampled(np.moveaxis(layer.wrinkle, 2, 0), (side, side)), 0, 2)
+    read = _resized(layer.wrinkle, side)
     n = np.asarray(clean, np.float64)
     step = np.concatenate([read, np.zeros((side, side, 1))], axis=2) * n[..., 2:]
     step -= (step * n).sum(axis=2, keepdims=True) * n

@@ -33,7 +33,7 @@ def dome(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Iterato
     """Yield trials of normals, diffuse albedo and lobes of faces.
 
     Each seed has a dome of its own, built off the drawing, with its own calibration: errors of
-    calibration are drawn anew with each subject. Parameters as of `interval_trials_flash.flash`.
+    calibration are drawn anew with each subject. Parameters as of `flash.flash`.
     """
     shown = {key: {"width_px": width_px} for key in ("charuco", "mirror", "white")}
     kinds = (("geometry", ("charuco",)), ("lights", ("mirror", "white")))

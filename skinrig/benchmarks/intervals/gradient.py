@@ -49,7 +49,7 @@ def gradient(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Ite
     """Yield trials of normals and heights at rest, and of stretch and kernels to either side.
 
     Each seed has a sphere of its own, built off the drawing, with its own calibration. Parameters
-    as of `interval_trials_flash.flash`; a subject is a site of the face.
+    as of `flash.flash`; a subject is a site of the face.
     """
     kinds = [(kind, ("ball",)) for kind in ("lights", "polarization")]
     jaws = {"angles": (0.0,), "steps": (-MAX_STRETCH_STEP, MAX_STRETCH_STEP)}

@@ -46,7 +46,7 @@ def probe(
     Parameters
     ----------
     folder
-        As of `interval_trials_flash.flash`.
+        As of `flash.flash`.
     media
         Seed of each and "homogeneous:SIGMA_A,SIGMA_S_PRIME,G": sigma_tr, sigma_a and sigma_s'.
     skin

@@ -1,7 +1,7 @@
 """From a simulated subject's maps to trials of their intervals; what all rigs' trials share.
 
 Each trial goes the whole way of a user, from calibration targets to maps, at the sensor's noise:
-`interval_trials_flash` and its like of the other rigs. Nothing there knows the model: maps are
+`flash` and its like of the other rigs. Nothing there knows the model: maps are
 compared with the truth that the simulator wrote.
 """
 

@@ -1,8 +1,9 @@
 """Benchmark of what scenes leave out: how much pixels change by it, and the seconds it saves."""
 
 import dataclasses
-import time
 from collections.abc import Iterator
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from rigsim.needs.probe import COLOR_EFFECT, CROSSTALK_EFFECT, DARK_CURRENT_EFFE
 from rigsim.scenes.probe.scene import MAX_USUAL_EXPOSURE_S, ProbeScene
 from rigsim.world.suction import HeadState
 from skinrig.arrays import Float32Array
+from skinrig.benchmarks.measurement import spent
 from skinrig.benchmarks.results import BandError, Knobs, Timing
 from skinrig.benchmarks.simulation import omission_cases
 from skinrig.benchmarks.simulation.omission_cases import ComparedScene, Omission
@@ -68,9 +70,10 @@ def _cases(toy: bool) -> Iterator[Omission]:
     for preset in ("II", "VI", "darkest"):
         yield from omission_cases.flash_face(preset, width_px=FLASH_PX)
     yield from omission_cases.flash_face("darkest", width_px=GRAZED_PX, light_deg=GRAZING_DEG)
+    dome_face = partial(omission_cases.dome_face, width_px=DOME_PX, lights=N_DOME_LIGHTS)
     for preset in ("II", "darkest"):
-        yield from omission_cases.dome_face(preset, width_px=DOME_PX, lights=N_DOME_LIGHTS)
-    yield from omission_cases.moved_face("II", width_px=DOME_PX, lights=N_DOME_LIGHTS)
+        yield from dome_face(preset)
+    yield from dome_face("II", state="surprise")
     yield from omission_cases.gradient_skin("forehead", width_px=GRADIENT_PX)
 
 
@@ -82,11 +85,14 @@ def gray_tissue() -> Iterator[Omission]:
     colored = dataclasses.replace(gray, sigma_a_per_mm=(0.05,) * len(bands), wavelength_nm=bands)
     head = HeadState("forehead", 0.0, True, 0.0, 5.0)
     images, seconds = [], []
-    for tissue in (colored, gray):
-        begin = time.process_time()
+
+    def profiled(tissue: HomogeneousTissue) -> tuple[ProbeScene, Any]:
         made = ProbeScene(rig, tissue)
-        profile = made.profile(head)
-        seconds.append(time.process_time() - begin)
+        return made, made.profile(head)
+
+    for tissue in (colored, gray):
+        spent_s, (made, profile) = spent(partial(profiled, tissue))
+        seconds.append(spent_s)
         if profile is None:
             raise ValueError("gray tissue: the head touches nothing")
         images.append(made.image(made.through_fibres(profile.reflectance_per_mm2)))
@@ -103,25 +109,22 @@ def _probe_build(compared: ComparedScene, head: HeadState) -> Iterator[Omission]
     scene = compared.scene
     profile, build = scene.profile(head), scene.build
 
-    def timed(made: ProbeScene) -> tuple[Float32Array, float]:
-        begin = time.process_time()
-        light = made.image(made.through_fibres(profile.reflectance_per_mm2))
-        return light, time.process_time() - begin
+    def timed(made: ProbeScene) -> tuple[float, Float32Array]:
+        return spent(lambda: made.image(made.through_fibres(profile.reflectance_per_mm2)))
 
-    have, with_s = timed(scene)
+    with_s, have = timed(scene)
     unit = np.float32(have.max())
     plain = {
         CROSSTALK_EFFECT: dataclasses.replace(build, crosstalk=np.eye(len(build.crosstalk))),
         WINGS_EFFECT: dataclasses.replace(build, wings=0.0),
     }
     for name, without in plain.items():
-        lack, spent = timed(ProbeScene(scene.rig, scene.tissue, build=without))
-        yield compared.changed(scene.needs[name], have / unit, lack / unit, (with_s, spent))
+        without_s, lack = timed(ProbeScene(scene.rig, scene.tissue, build=without))
+        yield compared.changed(scene.needs[name], have / unit, lack / unit, (with_s, without_s))
     sensor = scene.sensor()
     full_e = sensor.gain_e_per_dn * (sensor.white - sensor.black)
-    begin = time.process_time()
-    hot = np.asarray(scene.hot_e_per_s * MAX_USUAL_EXPOSURE_S / full_e, np.float32)
-    middle = time.process_time()
-    none = np.zeros_like(hot)
-    spent_s = middle - begin, time.process_time() - middle
-    yield compared.changed(scene.needs[DARK_CURRENT_EFFECT], hot, none, spent_s)
+    hot_s, hot = spent(
+        lambda: np.asarray(scene.hot_e_per_s * MAX_USUAL_EXPOSURE_S / full_e, np.float32)
+    )
+    none_s, none = spent(lambda: np.zeros_like(hot))
+    yield compared.changed(scene.needs[DARK_CURRENT_EFFECT], hot, none, (hot_s, none_s))

@@ -9,14 +9,14 @@ from skinrig.benchmarks.stage import Stage
 
 def test_points_of_the_benchmark_lie_above_their_horizon_and_keep_lights_apart(rng):
     p = reflectance.face_points("III", points=6, samples=40, rng=rng)
-    assert p.seen.mean() > 0.9
+    assert p.valid.mean() > 0.9
     assert 0.02 < p.left_out.mean() < 0.6
     np.testing.assert_allclose(np.linalg.norm(p.light, axis=-1), 1.0, atol=1e-6)
     # noise is what the variance says: 4 standard errors of the mean of squared deviates
     deviates = ((p.f - p.total) / np.sqrt(p.variance)) ** 2
     assert abs(deviates.mean() - 1.0) < 4 * np.sqrt(2.0 / deviates.size)
-    assert (p.surface[p.seen] > 0).all()
-    assert (p.total.min(axis=-1) > p.surface * (1 - 1e-5))[p.seen].all()
+    assert (p.surface[p.valid] > 0).all()
+    assert (p.total.min(axis=-1) > p.surface * (1 - 1e-5))[p.valid].all()
 
 
 @pytest.mark.long
