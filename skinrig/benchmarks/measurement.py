@@ -2,13 +2,13 @@
 
 import time
 import tracemalloc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numpy as np
 
 from skinrig.benchmarks import resident_memory
-from skinrig.benchmarks.results import BandError, Knob, Point, Timing
+from skinrig.benchmarks.results import Timing
 
 Made = TypeVar("Made")
 
@@ -80,6 +80,22 @@ def measure_and_keep(
     return timing, made[0]
 
 
+def spent(call: Callable[[], Made], repeats: int = 1) -> tuple[float, Made]:
+    """Return the least processor time of some calls, s, and what the last made.
+
+    Examples
+    --------
+    >>> spent(lambda: sum(range(100)), 2)[1]
+    4950
+    """
+    seconds = np.inf
+    for _ in range(repeats):
+        begin = time.process_time()
+        made = call()
+        seconds = min(seconds, time.process_time() - begin)
+    return seconds, made
+
+
 def processor_seconds(call: Callable[[], object], repeats: int = 1) -> float:
     """Return the least processor time of some calls, s.
 
@@ -88,12 +104,7 @@ def processor_seconds(call: Callable[[], object], repeats: int = 1) -> float:
     >>> 0.0 <= processor_seconds(lambda: sum(range(100)), 2) < 1.0
     True
     """
-    seconds = []
-    for _ in range(repeats):
-        begin = time.process_time()
-        call()
-        seconds.append(time.process_time() - begin)
-    return min(seconds)
+    return spent(call, repeats)[0]
 
 
 def once(call: Callable[[], Made]) -> tuple[Timing, Made]:
@@ -124,36 +135,3 @@ def _allocated_mb(call: Callable[[], Any]) -> float:
         return tracemalloc.get_traced_memory()[1] / 1e6
     finally:
         tracemalloc.stop()
-
-
-def measured(
-    knobs: Mapping[str, Knob],
-    call: Callable[[], Made],
-    error: Callable[[Made], BandError],
-    *,
-    also: Callable[[Made], Mapping[str, Knob]] | None = None,
-    repeats: int = 3,
-    memory: bool | None = True,
-) -> Point:
-    """Measure one setting of a stage.
-
-    Parameters
-    ----------
-    knobs
-        What is set.
-    call
-        What is timed.
-    error
-        Takes what the call made; returns its error with interval and bound.
-    also
-        Takes the same; returns what else is reported.
-    repeats, memory
-        As of :func:`measure`.
-
-    Examples
-    --------
-    >>> measured({"n": 9}, lambda: sum(range(9)), lambda s: BandError(s - 30.0, (5.0, 7.0))).error
-    6.0
-    """
-    timing, made = measure_and_keep(call, repeats=repeats, memory=memory)
-    return Point.of(knobs, timing, error(made), also(made) if also else None)

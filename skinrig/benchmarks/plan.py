@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from skinrig.benchmarks.description import descriptions
+from skinrig.benchmarks.stage import descriptions
 
 TIME_SAFETY_FACTOR: Final = 1.25
 """A stage begins if so many times what it should take is left."""

@@ -15,7 +15,9 @@ N_BOOTSTRAP_DRAWS = 200
 TILE_PX = 16
 
 
-def median_error(values: ArrayLike, *, bound: float | None = None, seed: int = 0) -> BandError:
+def median_error(
+    values: ArrayLike, bound: float | None = None, *, rng: np.random.Generator | None = None
+) -> BandError:
     """Return the median of errors that are independent of each other, with its 68 % interval.
 
     Parameters
@@ -24,16 +26,16 @@ def median_error(values: ArrayLike, *, bound: float | None = None, seed: int = 0
         Sizes of errors, any shape; NaN are dropped.
     bound
         Least median that any unbiased estimator could have.
-    seed
-        Of the bootstrap.
+    rng
+        Of the bootstrap; None: one of seed 0.
 
     Examples
     --------
     >>> median_error([1.0, 2.0, 3.0]).error
     2.0
     """
-    found, interval = metrics.median_with_interval(values, rng=np.random.default_rng(seed))
-    return BandError(found, interval, bound)
+    rng = rng or np.random.default_rng(0)
+    return BandError(*metrics.median_with_interval(values, rng=rng), bound)
 
 
 def mean_error(values: ArrayLike) -> BandError:
@@ -80,6 +82,30 @@ def drawn_again(
     again = statistic(one[rng.integers(0, len(one), (draws, len(one)))], axis=1)
     low, high = np.quantile(again, [0.16, 0.84])
     return float(low), float(high)
+
+
+def drawn_median(values: ArrayLike, bound: float | None = None, **draws: Any) -> BandError:
+    """Return the median of independent errors with the interval that `drawn_again` gives.
+
+    Examples
+    --------
+    >>> drawn_median([2.0, 2.0]).error_interval
+    (2.0, 2.0)
+    """
+    middle = float(np.median(np.asarray(values)))
+    return BandError(middle, drawn_again(values, **draws), bound)
+
+
+def drawn_rms(squared: ArrayLike, bound: float | None = None, **draws: Any) -> BandError:
+    """Return the root of the mean of independent squares with the bootstrap's 68 % interval.
+
+    Examples
+    --------
+    >>> drawn_rms([4.0, 4.0]).error_interval
+    (2.0, 2.0)
+    """
+    low, high = np.sqrt(drawn_again(squared, np.mean, **draws)).tolist()
+    return BandError(float(np.sqrt(np.mean(np.asarray(squared)))), (low, high), bound)
 
 
 def squares(side: int) -> list[tuple[slice, slice]]:

@@ -50,24 +50,6 @@ class Point:
     also: Mapping[str, Knob] = field(default_factory=dict)
     """What else was measured at this setting; no knob."""
 
-    @classmethod
-    def of(
-        cls,
-        knobs: Mapping[str, Knob],
-        timing: Timing,
-        outcome: BandError,
-        also: Mapping[str, Knob] | None = None,
-    ) -> Point:
-        """Return the point of an error with interval and bound."""
-        return cls(
-            knobs,
-            timing,
-            outcome.error,
-            outcome.error_interval,
-            outcome.cramer_rao_bound,
-            also or {},
-        )
-
     def efficiency(self, *, squared: bool = False) -> tuple[float, float, float] | None:
         """Return variance over the least variance, with its 68 % interval; None without a bound.
 
@@ -125,6 +107,17 @@ class BandError:
         (1.5, 2.5)
         """
         return cls(error, (error - half, error + half), bound)
+
+    @classmethod
+    def of_size(cls, size: float, half: float, bound: float | None = None) -> BandError:
+        """Return the same of a size, which is never below 0.
+
+        Examples
+        --------
+        >>> BandError.of_size(2.0, 2.5).error_interval
+        (0.0, 4.5)
+        """
+        return cls(size, (max(size - half, 0.0), size + half), bound)
 
 
 @dataclass(frozen=True, slots=True)

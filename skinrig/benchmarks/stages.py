@@ -10,9 +10,9 @@ from typing import Any, Literal
 
 from skinrig.benchmarks import plan as bench_plan
 from skinrig.benchmarks import table as bench_table
-from skinrig.benchmarks.description import descriptions
 from skinrig.benchmarks.document import to_document
 from skinrig.benchmarks.results import StageBenchmark
+from skinrig.benchmarks.stage import Stage, descriptions
 from skinrig.console import Console, plain
 from skinrig.errors import EXTRA_MISSING, exit_code, sentence
 
@@ -31,11 +31,11 @@ class BenchError(ValueError):
 def _measured(name: str, *, toy: bool) -> Iterator[StageBenchmark]:
     """Yield what a stage has measured: once, or of a long one ever more until it is whole."""
     module, function = STAGES[name].rsplit(".", 1)
-    made = getattr(import_module(f"skinrig.benchmarks.{module}"), function)(toy=toy)
-    if isinstance(made, StageBenchmark):
-        yield made
-    else:
-        yield from made
+    stage = Stage(name, toy=toy)
+    run = getattr(import_module(f"skinrig.benchmarks.{module}"), function)
+    for _ in run(stage) or ():
+        yield stage.benchmark()
+    yield stage.benchmark()
 
 
 def run_stages(

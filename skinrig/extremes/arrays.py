@@ -14,7 +14,7 @@ from reconstruction import photometric_stereo as stereo
 from reconstruction.surface import texture_fill
 from rigsim import render
 from skinrig.extremes.expectations import Unexpected, clean, masked, near, refused, rising, within
-from skinrig.extremes.inputs import Real, as_real, ring
+from skinrig.extremes.inputs import Real, ring
 
 NON_FINITE_VALUES = (np.nan, np.inf, -np.inf)
 
@@ -22,7 +22,7 @@ NON_FINITE_VALUES = (np.nan, np.inf, -np.inf)
 def _no_numbers_in_light(real: Real) -> str:
     lights = ring(8, 0.6)
     for bad in NON_FINITE_VALUES:
-        seen = as_real(np.tile(lights[:, 2:, None], (1, 2, 2)), real)
+        seen = real(np.tile(lights[:, 2:, None], (1, 2, 2)))
         seen[3, 0, 1] = bad
         seen[:, 1, 0] = bad
         found = stereo.estimate_normals(seen, lights)
@@ -37,8 +37,8 @@ def _no_numbers_in_normals(real: Real) -> str:
     y, x = np.mgrid[0:12, 0:12]
     normals = np.stack([-0.3 + 0.0 * x, 0.1 + 0.0 * y, np.ones((12, 12))], -1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    whole = normal_integration.integrate(as_real(normals, real))
-    holed = as_real(normals, real)
+    whole = normal_integration.integrate(real(normals))
+    holed = real(normals)
     holed[5, 5], holed[7, 2] = np.nan, np.inf
     found = normal_integration.integrate(holed)
     kept = np.ones((12, 12), bool)
@@ -48,7 +48,7 @@ def _no_numbers_in_normals(real: Real) -> str:
 
 
 def _no_numbers_in_statistics(real: Real) -> str:
-    plain = as_real(0.1 + 0.01 * np.random.default_rng(0).random((12, 12)), real)
+    plain = real(0.1 + 0.01 * np.random.default_rng(0).random((12, 12)))
     told = []
     for bad in NON_FINITE_VALUES:
         broken = plain.copy()
@@ -69,9 +69,7 @@ def _each_refused(calls: list[tuple[str, Callable[[float], object]]]) -> str:
 
 def _no_numbers_in_media(real: Real) -> str:
     def stack(value: float) -> object:
-        return tissue_optics.layer_stack_reflectance(
-            as_real([value], real), as_real([1.0], real), as_real([math.inf], real)
-        )
+        return tissue_optics.layer_stack_reflectance(real([value]), real([1.0]), real([math.inf]))
 
     return _each_refused(
         [
@@ -86,8 +84,8 @@ def _no_numbers_in_media(real: Real) -> str:
 
 
 def _single_pixels(real: Real) -> str:
-    near(normal_integration.integrate(as_real([[[0.0, 0.6, 0.8]]], real)), [[0.0]])
-    one = as_real(np.full((1, 1, 3), 0.5), real)
+    near(normal_integration.integrate(real([[[0.0, 0.6, 0.8]]])), [[0.0]])
+    one = real(np.full((1, 1, 3), 0.5))
     masked(polarization.separate(one, 0.4 * one).valid, share=(1.0, 1.0))
     mean, deviation = facial_color.local_statistics(one[..., 0], 2.0)
     near(mean, [[0.5]], relative=1e-6)
@@ -137,7 +135,7 @@ def _mirror_and_chalk(real: Real) -> str:
     seen[:, 0, 1] = lights[:, 2]  # chalk
     seen[:, 0, 2] = lights[:, 2]
     seen[7, 0, 2] += 50.0  # chalk under varnish
-    found = stereo.estimate_normals(as_real(seen, real), lights)
+    found = stereo.estimate_normals(real(seen), lights)
     if found.valid.tolist() != [[False, True, True]]:
         raise Unexpected(f"valid: got {found.valid.tolist()}, expected all but the mirror")
     off = np.arccos(np.clip(found.normals[0, 1:, 2], -1.0, 1.0))
@@ -152,13 +150,13 @@ def _conditions(real: Real) -> str:
     told, worst = [], []
     for apart in (1.0, 1e-3, 1e-6, 1e-9, 1e-12):
         each = np.concatenate([[0.0], np.full(5, apart)])[:, None] * rng.random((6, 20))
-        basis = np.asarray(as_real(one + each, real), np.float64)
+        basis = np.asarray(real(one + each), np.float64)
         told.append(float(np.linalg.cond(basis)))
         samples = rng.random((5, 6)) @ basis
         got = reduced_spaces.mixture_coordinates(samples, basis, None)
         within(got, 0.0, 1e3, what="shares")
         worst.append(np.max(np.abs(got @ basis - samples)) / samples.max())
-    rising(told[: 2 if real is np.float32 else 5], what="conditions")
+    rising(told[: 2 if real.single else 5], what="conditions")
     return f"conditions {told[0]:.2g} to {max(told):.2g}: samples again within " + within(
         worst, 0.0, 1e-6, what="share"
     )

@@ -24,7 +24,7 @@ CASES_TABLE = resources.files("skinrig").joinpath("data/extremes.csv")
 """Name, stage, extreme, danger and expectation of each case, with module and function of its trial;
 `one_precision` says why one run stands for both, where a trial has no precision to choose."""
 
-INPUT_PRECISIONS: Mapping[str, Real] = {"float32": np.float32, "float64": np.float64}
+INPUT_PRECISIONS: Mapping[str, Real] = {"float32": Real(np.float32), "float64": Real(np.float64)}
 """What the inputs of each case are given in."""
 
 

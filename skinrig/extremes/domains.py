@@ -8,7 +8,7 @@ from model.texture_statistics import masks as texture_masks
 from model.tissue_optics import adding_doubling, layered_diffusion
 from reconstruction import photometric_stereo as stereo
 from skinrig.extremes.expectations import Unexpected, clean, masked, near, refused, within
-from skinrig.extremes.inputs import Real, as_real, ring, sheet_faces, stretched_sheet
+from skinrig.extremes.inputs import Real, ring, sheet_faces, stretched_sheet
 
 INVALID_COEFFICIENTS = (np.nan, np.inf, -1.0)
 
@@ -16,7 +16,7 @@ INVALID_COEFFICIENTS = (np.nan, np.inf, -1.0)
 def _far_lights(real: Real) -> str:
     way = ring(8, np.pi / 6)
     normal = np.array([0.1, -0.2, np.sqrt(0.95)])
-    lit = as_real((way @ normal)[:, None, None], real)
+    lit = real((way @ normal)[:, None, None])
     infinite = stereo.estimate_normals(lit, way)
     far = stereo.estimate_normals(
         1e-12 * lit, way, light_positions_mm=1e6 * way, points_mm=np.zeros((1, 1, 3))
@@ -45,9 +45,7 @@ def _one_photon(real: Real) -> str:
             for frame in frames
         ]
         radiance, variance, valid = (np.stack(part) for part in zip(*merged, strict=True))
-        return stereo.estimate_normals(
-            as_real(radiance, real), way, variance=as_real(variance, real), valid=valid
-        )
+        return stereo.estimate_normals(real(radiance), way, variance=real(variance), valid=valid)
 
     dark, bright = seen(1.0), seen(100.0)
     masked(dark.valid, share=(0.0, 0.05))
@@ -62,7 +60,7 @@ def _one_photon(real: Real) -> str:
 
 
 def _one_turned_triangle(real: Real) -> str:
-    flat, moved, uv = (as_real(part, real) for part in stretched_sheet((1.1, 1.0, 1.0)))
+    flat, moved, uv = (real(part) for part in stretched_sheet((1.1, 1.0, 1.0)))
     faces = sheet_faces(9)
     faces[20] = faces[20][::-1]
     found = microstructure.strain(flat, moved, faces, uv)
@@ -71,7 +69,7 @@ def _one_turned_triangle(real: Real) -> str:
 
 
 def _profile_beyond_numbers(real: Real) -> str:
-    ends = as_real([1e-18, 1e18] if real is np.float32 else [1e-50, 1e50], real)
+    ends = real([1e-18, 1e18] if real.single else [1e-50, 1e50])
     slopes = photon_table.derivatives(ends, real(0.02), real(1.0))
     clean(np.stack(slopes), np.ones((3, 2), bool), what="profile and slopes")
     near(slopes.reflectance_per_mm2[1], 0.0, absolute=1e-30)
@@ -89,11 +87,7 @@ def _layers_of_no_medium(real: Real) -> str:
     for solver in (adding_doubling, layered_diffusion):
         for place, name in enumerate(("sigma_a_per_mm", "sigma_s_prime_per_mm", "thickness_mm")):
             for bad in (np.nan, -1.0):
-                values = [
-                    as_real([[0.1, 0.1]], real),
-                    as_real([[1.0, 1.0]], real),
-                    as_real([[0.2, np.inf]], real),
-                ]
+                values = [real([[0.1, 0.1]]), real([[1.0, 1.0]]), real([[0.2, np.inf]])]
                 values[place][0, 0] = bad
                 refused(lambda v=values, s=solver: s.reflectance(*v), ValueError, name)  # type: ignore[misc]
                 told += 1
@@ -101,7 +95,7 @@ def _layers_of_no_medium(real: Real) -> str:
 
 
 def _nothing_to_continue(real: Real) -> str:
-    image = as_real(np.full((7, 5, 3), 0.4), real)
+    image = real(np.full((7, 5, 3), 0.4))
     refused(lambda: texture_masks.fill_smoothly(image, np.zeros((7, 5), bool)), ValueError, "valid")
     one = np.zeros((7, 5), bool)
     one[3, 2] = True
@@ -114,7 +108,7 @@ def _index_of_nothing(real: Real) -> str:
     for average in averages:
         for bad in (np.nan, np.inf, 0.0, -1.0):
             refused(lambda a=average, b=bad: a(float(real(b))), ValueError, "eta")  # type: ignore[misc]
-    most = float(np.finfo(real).max)
+    most = float(np.finfo(real.dtype).max)
     for eta, cosine in ((most, 0.5), (1.0 / most, 0.5), (most, 0.0)):
         if not 0.0 <= float(fresnel.reflectance(real(cosine), eta)) <= 1.0:
             raise Unexpected(f"eta {eta:g}: expected a reflectance from 0 to 1")

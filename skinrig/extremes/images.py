@@ -11,7 +11,7 @@ from capture import hdr
 from model import color_table
 from reconstruction import chromophores, polarization
 from skinrig.extremes.expectations import Unexpected, clean, masked, near, refused, within
-from skinrig.extremes.inputs import Real, as_real
+from skinrig.extremes.inputs import Real
 
 if TYPE_CHECKING:
     from model.color_table import ColorTable
@@ -78,18 +78,18 @@ def _one_electron(_: Real) -> str:
 
 
 def _not_polarized(real: Real) -> str:
-    same = as_real(np.full((2, 2, 3), 0.3), real)
+    same = real(np.full((2, 2, 3), 0.3))
     found = polarization.separate(same, same)
     return near(found.specular, np.zeros((2, 2, 3)), absolute=1e-6)
 
 
 def _useless_polarizer(real: Real) -> str:
-    same = as_real(np.full((2, 2, 3), 0.3), real)
+    same = real(np.full((2, 2, 3), 0.3))
     return refused(lambda: polarization.separate(same, same, extinction=1.0), ValueError, "1")
 
 
 def _not_a_number(real: Real) -> str:
-    one, other = (as_real(np.full((2, 2, 3), v), real) for v in (0.5, 0.2))
+    one, other = (real(np.full((2, 2, 3), v)) for v in (0.5, 0.2))
     one[0, 0] = np.nan
     other[1, 1] = np.inf
     found = polarization.separate(one, other)
@@ -103,15 +103,15 @@ def _table() -> ColorTable:
 
 
 def _black_pixels(real: Real) -> str:
-    found = chromophores.invert(as_real(np.zeros((4, 3)), real), _table())
+    found = chromophores.invert(real(np.zeros((4, 3))), _table())
     clean(found.melanin, found.valid, what="melanin")
     return masked(found.valid)
 
 
 def _odd_colors(real: Real) -> str:
     no_skin = [[0, 0, 1], [0, 1, 0], [-0.2, 0.1, 0.1], [np.nan, 0.3, 0.2], [np.inf, 1, 1]]
-    rgb = as_real(np.array(no_skin), real)
-    variance = as_real(np.full((5, 3), 1e-6), real)
+    rgb = real(np.array(no_skin))
+    variance = real(np.full((5, 3), 1e-6))
     found = chromophores.invert(rgb, _table(), shading="known", variance=variance)
     clean(found.melanin, found.valid, what="melanin")
     clean(found.hemoglobin, found.valid, what="hemoglobin")
@@ -121,7 +121,7 @@ def _odd_colors(real: Real) -> str:
 def _pigment_corners(real: Real) -> str:
     table = _table()
     c_m, c_hd = np.array([0.0, 0.0, 0.5, 0.5]), np.array([0.0, 0.32, 0.0, 0.32])
-    found = chromophores.invert(as_real(table.lookup(c_m, c_hd), real), table, shading="known")
+    found = chromophores.invert(real(table.lookup(c_m, c_hd)), table, shading="known")
     near(found.melanin, c_m, absolute=2e-3)
     near(found.hemoglobin[:2], c_hd[:2], absolute=2e-3)
     # through that much melanin hardly any light comes from the blood: the error must say so
@@ -135,13 +135,13 @@ def _pigment_corners(real: Real) -> str:
 def _tiny_light(real: Real) -> str:
     table = _table()
     rgb = table.lookup(np.array([0.03]), np.array([0.05]))
-    found = chromophores.invert(as_real(1e-5 * rgb, real), table)
-    plain = chromophores.invert(as_real(rgb, real), table)
+    found = chromophores.invert(real(1e-5 * rgb), table)
+    plain = chromophores.invert(real(rgb), table)
     return near(found.melanin, plain.melanin, relative=0.02)
 
 
 def _no_pixel(real: Real) -> str:
-    found = chromophores.invert(as_real(np.zeros((0, 3)), real), _table())
+    found = chromophores.invert(real(np.zeros((0, 3))), _table())
     if found.melanin.shape != (0,):
         raise Unexpected(f"got shape {found.melanin.shape}, expected (0,)")
     return "an empty map"

@@ -1,5 +1,6 @@
 """What cases hand over: arrays of a precision, rings of lights, sheets of triangles."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -7,12 +8,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from skinrig.arrays import Float64Array, Int64Array
 
-Real = type[np.float32] | type[np.float64]
 
+@dataclass(frozen=True, slots=True)
+class Real:
+    """A precision of inputs; called, it returns values as numbers of it."""
 
-def as_real(values: ArrayLike, real: Real) -> NDArray[Any]:
-    """Return values as an array of a precision."""
-    return np.asarray(values, real)
+    dtype: type[np.float32] | type[np.float64]
+
+    def __call__(self, values: ArrayLike) -> NDArray[Any]:
+        """Return values in the precision: an array, or of one number a number."""
+        made: Any = self.dtype(values)  # type: ignore[arg-type]
+        return made
+
+    @property
+    def single(self) -> bool:
+        """Whether it is that of 24 bits."""
+        return self.dtype is np.float32
 
 
 def ring(count: int, tilt_rad: float) -> Float64Array:

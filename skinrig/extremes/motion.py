@@ -5,12 +5,12 @@ import numpy as np
 from model import facial_color, microstructure, wrinkles
 from model.facial_color import FacialColorError, HemoglobinRig
 from skinrig.extremes.expectations import clean, masked, near, refused, within
-from skinrig.extremes.inputs import Real, as_real, sheet_faces, stretched_sheet
+from skinrig.extremes.inputs import Real, sheet_faces, stretched_sheet
 
 
 def _near_constant(real: Real) -> str:
     rng = np.random.default_rng(0)
-    h = as_real(1.0 + 1e-6 * rng.standard_normal((64, 64)), real)
+    h = real(1.0 + 1e-6 * rng.standard_normal((64, 64)))
     mean, deviation = facial_color.local_statistics(h, 40.0)
     exact = float(np.std(np.asarray(h, np.float64)))
     near(np.mean(mean), 1.0, relative=1e-6)
@@ -20,13 +20,13 @@ def _near_constant(real: Real) -> str:
 
 
 def _constant(real: Real) -> str:
-    _, deviation = facial_color.local_statistics(as_real(np.full((16, 16), 0.1), real), 5.0)
+    _, deviation = facial_color.local_statistics(real(np.full((16, 16), 0.1)), 5.0)
     return within(deviation, 0.0, 1e-7, what="deviation")
 
 
 def _flat_neutral(real: Real) -> str:
-    neutral = as_real(np.full((64, 64), 0.05), real)
-    smile = as_real(0.05 + 0.01 * np.random.default_rng(1).random((64, 64)), real)
+    neutral = real(np.full((64, 64), 0.05))
+    smile = real(0.05 + 0.01 * np.random.default_rng(1).random((64, 64)))
     rig = HemoglobinRig.from_maps(neutral, {"smile": smile}, radius_px=8.0)
     found = rig.evaluate({"neutral": 0.0, "smile": 1.0})
     clean(found.hemoglobin, found.valid, what="hemoglobin")
@@ -34,20 +34,20 @@ def _flat_neutral(real: Real) -> str:
 
 
 def _weights_do_not_sum(real: Real) -> str:
-    h = as_real(0.05 + 0.01 * np.random.default_rng(1).random((32, 32)), real)
+    h = real(0.05 + 0.01 * np.random.default_rng(1).random((32, 32)))
     rig = HemoglobinRig.from_maps(h, {"smile": 1.2 * h}, radius_px=4.0)
     return refused(lambda: rig.blend({"neutral": 0.5, "smile": 0.9}), FacialColorError, "neutral")
 
 
 def _disc_beyond_map(real: Real) -> str:
-    h = as_real(np.random.default_rng(2).random((8, 8)), real)
+    h = real(np.random.default_rng(2).random((8, 8)))
     mean, deviation = facial_color.local_statistics(h, 1000.0)
     near(mean, np.full((8, 8), np.mean(h, dtype=np.float64)), relative=1e-5)
     return near(deviation, np.full((8, 8), np.std(h, dtype=np.float64)), relative=1e-4)
 
 
 def _horizon_normals(real: Real) -> str:
-    normals = as_real([[[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]], real)
+    normals = real([[[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
     report = wrinkles.encoding_report(normals)
     near(report.valid, [[False, True, False]])
     found = wrinkles.encode(normals)
@@ -57,11 +57,11 @@ def _horizon_normals(real: Real) -> str:
 
 def _wrinkle_sum(real: Real) -> str:
     outward = np.array([0.0, 0.0, 1.0])
-    base = wrinkles.encode(as_real(np.zeros((4, 4, 3)) + outward, real))
+    base = wrinkles.encode(real(np.zeros((4, 4, 3)) + outward))
     tilted = np.array([0.6, 0.0, 0.8])
-    wrinkle = wrinkles.encode(as_real(np.zeros((4, 4, 3)) + tilted, real))
-    masks = as_real(np.ones((8, 4, 4)), real)
-    weights = as_real(np.full(8, 1e6), real)
+    wrinkle = wrinkles.encode(real(np.zeros((4, 4, 3)) + tilted))
+    masks = real(np.ones((8, 4, 4)))
+    weights = real(np.full(8, 1e6))
     unit = wrinkles.combine(base, wrinkle, masks, weights)
     near(np.linalg.norm(unit, axis=-1), np.ones((4, 4)), absolute=1e-5)
     anger = wrinkles.combine(base, wrinkle, masks, -weights, clamp="unit")
@@ -70,7 +70,7 @@ def _wrinkle_sum(real: Real) -> str:
 
 
 def _strained(real: Real, factors: tuple[float, float, float]) -> microstructure.MeshStrain:
-    flat, moved, uv = (as_real(part, real) for part in stretched_sheet(factors))
+    flat, moved, uv = (real(part) for part in stretched_sheet(factors))
     return microstructure.strain(flat, moved, sheet_faces(9), uv)
 
 
@@ -94,15 +94,15 @@ def _turned_over(real: Real) -> str:
 
 
 def _no_area(real: Real) -> str:
-    points = as_real([[0, 0, 0], [1, 0, 0], [2, 0, 0]], real)
-    uv = as_real([[0, 0], [1, 0], [0, 1]], real)
+    points = real([[0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    uv = real([[0, 0], [1, 0], [0, 1]])
     found = microstructure.strain(points, points, np.array([[0, 1, 2]]), uv)
     clean(found.r_s, np.ones(3, bool), what="r_s")
     return masked(found.valid)
 
 
 def _sharpened_again(real: Real) -> str:
-    height = as_real(np.random.default_rng(4).standard_normal((48, 48)), real)
+    height = real(np.random.default_rng(4).standard_normal((48, 48)))
     axes = np.array([1.0, 0.0]), np.array([0.0, 1.0])
     start = float(np.max(np.abs(height)))
     for _ in range(4):
@@ -112,14 +112,14 @@ def _sharpened_again(real: Real) -> str:
 
 
 def _vanishing_kernel(real: Real) -> str:
-    height = as_real(np.random.default_rng(4).standard_normal((32, 32)), real)
+    height = real(np.random.default_rng(4).standard_normal((32, 32)))
     axes = np.array([1.0, 0.0]), np.array([0.0, 1.0])
     same = microstructure.convolve(height, *axes, 1.0, 0.0, -2.0, 1e-9)
     return near(same, np.asarray(height), absolute=1e-5)
 
 
 def _table_ends(real: Real) -> str:
-    alpha, sigma = microstructure.kernel_parameters(as_real([0.01, 0.5, 1.0, 2.0, 50.0], real))
+    alpha, sigma = microstructure.kernel_parameters(real([0.01, 0.5, 1.0, 2.0, 50.0]))
     within(alpha, -2.0, 1.0, what="alpha")
     refused(lambda: microstructure.kernel_parameters(real(0.0)), ValueError, "stretch")
     return "0 refused; " + within(sigma, 1.0, 60.0, what="sigma")

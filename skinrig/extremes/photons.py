@@ -7,7 +7,7 @@ import numpy as np
 from model import tissue_optics
 from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
 from skinrig.extremes.expectations import Unexpected, near, within
-from skinrig.extremes.inputs import Real, as_real
+from skinrig.extremes.inputs import Real
 
 Matter = tuple[float, float, float, float]
 """Thickness, sigma_a, sigma_s (mm, 1/mm) and g."""
@@ -33,11 +33,7 @@ def _z_of_layers(real: Real, *layers: Matter, eta: float = 1.4) -> str:
     found = _walked(real, *layers, eta=eta)
     told = float(
         tissue_optics.layer_stack_reflectance(
-            as_real(absorption, real),
-            as_real(scattering, real),
-            as_real(depth, real),
-            eta=float(real(eta)),
-            directions=32,
+            real(absorption), real(scattering), real(depth), eta=float(real(eta)), directions=32
         )
     )
     # the layers' own error: half a percent of what comes back

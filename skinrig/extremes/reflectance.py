@@ -6,7 +6,7 @@ from model import dipole, merl
 from model.brdf import tables as brdf_tables
 from reconstruction import brdf_basis
 from skinrig.extremes.expectations import masked, near, refused, rising, within
-from skinrig.extremes.inputs import Real, as_real
+from skinrig.extremes.inputs import Real
 
 
 def _samples(value, real: Real, *, points: int = 3, count: int = 40):  # type: ignore[no-untyped-def]
@@ -19,7 +19,7 @@ def _samples(value, real: Real, *, points: int = 3, count: int = 40):  # type: i
     up = np.broadcast_to([0.0, 0.0, 1.0], (points, 3))
     brdf = np.broadcast_to(np.asarray(value(light, view))[..., None], (points, count, 3))
     return brdf_basis.surface_samples(
-        as_real(brdf, real), light, view, up, as_real(np.zeros((points, 3)), real), eta=1.4
+        real(brdf), light, view, up, real(np.zeros((points, 3))), eta=1.4
     )
 
 
@@ -76,21 +76,21 @@ def _no_samples(real: Real) -> str:
 
 
 def _rank_above_data(real: Real) -> str:
-    weights = as_real(np.random.default_rng(1).random((3, 59)), real)
+    weights = real(np.random.default_rng(1).random((3, 59)))
     return refused(lambda: brdf_basis.reduce(weights, 10), ValueError, "rank")
 
 
 def _zero_rows(real: Real) -> str:
     weights = np.random.default_rng(1).random((40, 12))
     weights[:20] = 0.0
-    shares, mix, error = brdf_basis.reduce(as_real(weights, real), 4)
+    shares, mix, error = brdf_basis.reduce(real(weights), 4)
     within(shares[:20] @ mix, 0.0, 1e-2, what="rows of zeros")
     return within(error, 0.0, 0.5, what="error")
 
 
 def _duplicated_rows(real: Real) -> str:
     one = np.random.default_rng(1).random(12)
-    _, _, error = brdf_basis.reduce(as_real(np.tile(one, (30, 1)), real), 3)
+    _, _, error = brdf_basis.reduce(real(np.tile(one, (30, 1))), 3)
     return within(error, 0.0, 1e-3, what="error")
 
 
@@ -104,8 +104,8 @@ def _merl_bins(real: Real) -> str:
 
 def _conditions(real: Real) -> str:
     # sigma_t' = sigma_tr / sqrt(3 (1 - alpha')): sixteen decades of 1 - alpha'
-    deficit = as_real(np.logspace(-15, 0, 16), real)
-    sigma_a, sigma_s = dipole.coefficients(deficit, as_real(np.ones(16), real))
+    deficit = real(np.logspace(-15, 0, 16))
+    sigma_a, sigma_s = dipole.coefficients(deficit, real(np.ones(16)))
     back = dipole.effective_transport(sigma_a, sigma_s)
     near(back, np.ones(16), relative=1e-5)
     return rising(sigma_a, what="sigma_a")
@@ -113,9 +113,9 @@ def _conditions(real: Real) -> str:
 
 def _mirror_like(real: Real) -> str:
     basis = brdf_tables.default(0.0)
-    up = as_real([0.0, 0.0, 1.0], real)
+    up = real([0.0, 0.0, 1.0])
     lobe = basis.names.index("ggx 0.05 eta 1.4")
-    below = basis.evaluate(as_real([0.0, 0.6, -0.8], real), up, up)
+    below = basis.evaluate(real([0.0, 0.6, -0.8]), up, up)
     within(below, 0.0, 0.0, what="below the horizon")
     # D = 1 / (pi a^2), G = 1 at the peak: F0 / (4 pi a^2)
     peak = (0.4 / 2.4) ** 2 / (4 * np.pi * 0.05**2)

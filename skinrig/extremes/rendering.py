@@ -17,7 +17,7 @@ from rigsim.render import Caster, visibility
 from rigsim.sensor import sensor_of
 from skinrig.arrays import Float64Array, FloatArray
 from skinrig.extremes.expectations import Unexpected, near, refused, within
-from skinrig.extremes.inputs import Real, as_real, sheet_faces
+from skinrig.extremes.inputs import Real, sheet_faces
 
 if TYPE_CHECKING:
     from rigsim.sensor import Sensor
@@ -91,7 +91,7 @@ def _light_behind(_: Real) -> str:
 
 
 def _zero_triangles(real: Real) -> str:
-    points = as_real(np.array([[0, 0, 0], [40, 0, 0], [0, 40, 0], [80, 0, 0], [40, 40, 9]]), real)
+    points = real(np.array([[0, 0, 0], [40, 0, 0], [0, 40, 0], [80, 0, 0], [40, 40, 9]]))
     faces = np.array([[0, 1, 2], [0, 1, 3], [1, 4, 2]])  # the second has no area
     normals = vertex_normals(points, faces)
     near(np.linalg.norm(normals, axis=-1)[[0, 1, 2]], np.ones(3), absolute=1e-5)
@@ -100,7 +100,7 @@ def _zero_triangles(real: Real) -> str:
 
 
 def _wrong_unit(real: Real) -> str:
-    points = as_real(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]), real)
+    points = real(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]))
     return refused(
         lambda: build_mesh(points, np.array([[0, 1, 2]]), np.zeros((3, 2))),
         MeshError,
@@ -110,7 +110,7 @@ def _wrong_unit(real: Real) -> str:
 
 def _surface(direction: Float64Array, roughness: float, real: Real) -> tuple[float, float]:
 
-    packed = as_real([0.5, 0.4, 0.3, roughness, 0.5, 0.0015, 1.0], real)
+    packed = real([0.5, 0.4, 0.3, roughness, 0.5, 0.0015, 1.0])
     up = np.array([0.0, 0.0, 1.0])
     total, specular = surface_brdf.evaluate(packed, up, direction, direction * [-1, -1, 1])
     return float(total[0].max()), float(specular[0])
@@ -161,7 +161,7 @@ def _furnace(real: Real) -> str:
     light = np.stack(
         [np.sqrt(u) * np.cos(2 * np.pi * v), np.sqrt(u) * np.sin(2 * np.pi * v), np.sqrt(1 - u)], -1
     )
-    packed = as_real([1.0, 1.0, 1.0, 0.35, 0.6, 0.0015, 1.0], real)
+    packed = real([1.0, 1.0, 1.0, 0.35, 0.6, 0.0015, 1.0])
     back = []
     for degrees in (0.0, 45.0, 80.0):
         total, _ = surface_brdf.evaluate(packed, [0.0, 0.0, 1.0], light, _tilted(degrees))
@@ -176,7 +176,7 @@ def _chip() -> Sensor:
 
 def _bad_light(real: Real) -> str:
     def exposed(value: float) -> object:
-        light = as_real(np.full((2, 2, 3), value), real)
+        light = real(np.full((2, 2, 3), value))
         return sensor.expose(light, sensor=_chip(), rng=np.random.default_rng(0))
 
     for value in (np.nan, np.inf):
@@ -186,9 +186,7 @@ def _bad_light(real: Real) -> str:
 
 def _very_bright(real: Real) -> str:
     chip = _chip()
-    dn = sensor.expose(
-        as_real(np.full((4, 4, 3), 1e9), real), sensor=chip, rng=np.random.default_rng(0)
-    )
+    dn = sensor.expose(real(np.full((4, 4, 3), 1e9)), sensor=chip, rng=np.random.default_rng(0))
     return near(dn, np.full((4, 4), chip.white), absolute=0.0)
 
 

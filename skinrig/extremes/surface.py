@@ -11,7 +11,7 @@ from reconstruction import photometric_stereo as stereo
 from reconstruction.surface import texture_fill
 from skinrig.arrays import Float64Array, FloatArray
 from skinrig.extremes.expectations import Unexpected, clean, masked, near, refused, within
-from skinrig.extremes.inputs import Real, as_real, ring
+from skinrig.extremes.inputs import Real, ring
 
 UP_NORMAL = np.array([0.0, 0.0, 1.0])
 
@@ -22,7 +22,7 @@ def _degrees_off(normals: FloatArray, truth: FloatArray) -> float:
 
 
 def _lit(lights: Float64Array, normal: Float64Array, real: Real) -> NDArray[Any]:
-    return as_real(np.clip(lights @ normal, 0.0, None)[:, None, None], real)
+    return real(np.clip(lights @ normal, 0.0, None)[:, None, None])
 
 
 def _coplanar(real: Real) -> str:
@@ -47,7 +47,7 @@ def _collinear(real: Real) -> str:
 
 def _all_shadowed(real: Real) -> str:
     lights = ring(8, 0.6)
-    found = stereo.estimate_normals(as_real(np.zeros((8, 3, 3)), real), lights)
+    found = stereo.estimate_normals(real(np.zeros((8, 3, 3))), lights)
     clean(found.normals, found.valid, what="normals")
     return masked(found.valid)
 
@@ -69,11 +69,9 @@ def _nearly_coplanar(real: Real) -> str:
     )
     lights /= np.linalg.norm(lights, axis=-1, keepdims=True)
     rng = np.random.default_rng(2)
-    noisy = _lit(lights, UP_NORMAL, real) + as_real(rng.normal(0, 1e-3, (9, 1, 1)), real)
+    noisy = _lit(lights, UP_NORMAL, real) + real(rng.normal(0, 1e-3, (9, 1, 1)))
     try:
-        found = stereo.estimate_normals(
-            noisy, lights, variance=as_real(np.full((9, 1, 1), 1e-6), real)
-        )
+        found = stereo.estimate_normals(noisy, lights, variance=real(np.full((9, 1, 1), 1e-6)))
     except stereo.PhotometricStereoError as error:
         return f"refused: {error}"
     clean(found.normals, found.valid, what="normals")
@@ -103,7 +101,7 @@ def _near_light(real: Real) -> str:
     away = np.linalg.norm(places, axis=-1)
     lit = np.clip(places @ UP_NORMAL / away, 0, None) / away**2
     found = stereo.estimate_normals(
-        as_real(lit[:, None, None], real),
+        real(lit[:, None, None]),
         places / away[:, None],
         light_positions_mm=places,
         points_mm=np.zeros((1, 1, 3)),
@@ -116,7 +114,7 @@ def _far_light(real: Real) -> str:
     places = 1e7 * ring(8, 0.6)
     lit = np.clip(ring(8, 0.6) @ UP_NORMAL, 0, None) / 1e14
     found = stereo.estimate_normals(
-        as_real(1e14 * lit[:, None, None], real),
+        real(1e14 * lit[:, None, None]),
         ring(8, 0.6),
         light_positions_mm=places,
         points_mm=np.zeros((1, 1, 3)),
@@ -131,7 +129,7 @@ def _scales(real: Real) -> str:
     tilted = np.array([0.3, -0.2, np.sqrt(1 - 0.13)])
     off = []
     for scale in (1e-12, 1e12):
-        found = stereo.estimate_normals(as_real(scale, real) * _lit(lights, tilted, real), lights)
+        found = stereo.estimate_normals(real(scale) * _lit(lights, tilted, real), lights)
         masked(found.valid, share=(1.0, 1.0))
         off.append(_degrees_off(found.normals[0], tilted[None]))
     return within(off, 0.0, 0.05, what="degrees")
@@ -142,7 +140,7 @@ def _cliff(real: Real) -> str:
     slope[:, 12] = 20.0  # a wall of 87 degrees
     normals = np.stack([-slope, np.zeros_like(slope), np.ones_like(slope)], -1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    height = normal_integration.integrate(as_real(normals, real))
+    height = normal_integration.integrate(real(normals))
     step = float(height[:, 14:].mean() - height[:, :11].mean())
     within(height, -40.0, 40.0, what="height")
     return "step of " + within(abs(step), 10.0, 21.0, what="pixels")
@@ -153,7 +151,7 @@ def _horizontal_normals(real: Real) -> str:
     normals[..., 2] = 1.0
     normals[4, 4] = (1.0, 0.0, 0.0)
     try:
-        height = normal_integration.integrate(as_real(normals, real))
+        height = normal_integration.integrate(real(normals))
     except normal_integration.IntegrationError as error:
         return f"refused: {error}"
     return within(height[np.isfinite(height)], -1e4, 1e4, what="height")
@@ -164,7 +162,7 @@ def _islands(real: Real) -> str:
     normals[..., 2] = 1.0
     valid = np.zeros((16, 16), bool)
     valid[2:5, 2:5] = valid[10:14, 9:15] = valid[0, 15] = True
-    height = normal_integration.integrate(as_real(normals, real), valid=valid)
+    height = normal_integration.integrate(real(normals), valid=valid)
     return near(height[valid], np.zeros(int(valid.sum())), absolute=1e-4)
 
 
@@ -172,21 +170,21 @@ def _empty_mask(real: Real) -> str:
     normals = np.zeros((4, 4, 3))
     normals[..., 2] = 1.0
     return refused(
-        lambda: normal_integration.integrate(as_real(normals, real), valid=np.zeros((4, 4), bool)),
+        lambda: normal_integration.integrate(real(normals), valid=np.zeros((4, 4), bool)),
         normal_integration.IntegrationError,
         "valid",
     )
 
 
 def _flat_height(real: Real) -> str:
-    shares = normal_histogram.histogram(as_real(np.zeros((64, 64)), real), pixel=10.0)
+    shares = normal_histogram.histogram(real(np.zeros((64, 64))), pixel=10.0)
     near(shares.sum(), 1.0, absolute=1e-9)
     return near(np.max(shares[31:33, 31:33]), np.max(shares), absolute=0.0)
 
 
 def _steep_height(real: Real) -> str:
     rows = np.arange(64.0)[:, None] * np.ones((1, 64))
-    shares = normal_histogram.histogram(as_real(1e6 * rows, real), pixel=1.0)
+    shares = normal_histogram.histogram(real(1e6 * rows), pixel=1.0)
     near(shares.sum(), 1.0, absolute=1e-9)
     edge = shares[0].sum() + shares[-1].sum()
     return near(edge, 1.0, absolute=1e-6)
@@ -194,12 +192,12 @@ def _steep_height(real: Real) -> str:
 
 def _one_point(real: Real) -> str:
     return refused(
-        lambda: normal_histogram.histogram(as_real(np.zeros((1, 1)), real), pixel=1.0), ValueError
+        lambda: normal_histogram.histogram(real(np.zeros((1, 1))), pixel=1.0), ValueError
     )
 
 
 def _relief_without_relief(real: Real) -> str:
-    flat = as_real(np.zeros((64, 64)), real)
+    flat = real(np.zeros((64, 64)))
     target = normal_histogram.histogram(flat, pixel=10.0)
     try:
         found = kernel_fit.fit_kernel(flat, target, stretch=1.1, axis="x", pixel_um=10.0)
@@ -213,7 +211,7 @@ def _no_diffuse(real: Real) -> str:
     views = np.broadcast_to(UP_NORMAL, lights.shape)
     samples = np.zeros((1, 40, 3))
     found = diffuse_albedo.estimate(
-        as_real(samples, real), lights[None], views[None], UP_NORMAL[None], eta=1.4
+        real(samples), lights[None], views[None], UP_NORMAL[None], eta=1.4
     )
     clean(found.r_d, found.valid, what="R_d")
     return (
@@ -224,9 +222,9 @@ def _no_diffuse(real: Real) -> str:
 
 
 def _nothing_to_fill(real: Real) -> str:
-    empty = texture_fill.push_pull(as_real(np.zeros((9, 7, 3)), real), np.zeros((9, 7)))
+    empty = texture_fill.push_pull(real(np.zeros((9, 7, 3))), np.zeros((9, 7)))
     one = np.zeros((9, 7))
     one[4, 3] = 1.0
-    filled = texture_fill.push_pull(as_real(np.full((9, 7, 3), 0.4), real), one)
+    filled = texture_fill.push_pull(real(np.full((9, 7, 3), 0.4)), one)
     clean(empty.values, np.ones((9, 7), bool), what="empty texture")
     return near(filled.values, np.full((9, 7, 3), 0.4), relative=1e-5)

@@ -10,7 +10,7 @@ from reconstruction import subsurface
 from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
 from skinrig.arrays import Float64Array
 from skinrig.extremes.expectations import Unexpected, clean, masked, near, refused, rising, within
-from skinrig.extremes.inputs import Real, as_real
+from skinrig.extremes.inputs import Real
 
 
 def _layers(
@@ -18,19 +18,19 @@ def _layers(
 ) -> Float64Array:
     """Return the reflectance of layers by sigma_a and sigma_s', 1/mm, and thickness, mm."""
     return tissue_optics.layer_stack_reflectance(
-        *(as_real(part, real) for part in zip(*layers, strict=True)), eta=eta, directions=directions
+        *(real(part) for part in zip(*layers, strict=True)), eta=eta, directions=directions
     )
 
 
 def _albedo_near_one(real: Real) -> str:
     deficit = np.logspace(-15, -1, 57)
-    lost = dipole.absorbed_fraction(as_real(deficit, real), 1.4)
+    lost = dipole.absorbed_fraction(real(deficit), 1.4)
     said = rising(lost, what="1 - R_d")
     back = dipole.invert_to_deficit(1.0 - np.asarray(lost[deficit > 1e-12]), 1.4)
     # 1 - R_d carries the rounding of R_d itself, eps; the deficit goes with its square
     rounding = np.finfo(np.float64).eps / np.asarray(lost[deficit > 1e-12])
-    single = float(np.finfo(real).eps) * 4
-    away = np.abs(back / np.asarray(as_real(deficit, real), np.float64)[deficit > 1e-12] - 1)
+    single = float(np.finfo(real.dtype).eps) * 4
+    away = np.abs(back / np.asarray(real(deficit), np.float64)[deficit > 1e-12] - 1)
     if np.any(away > single + 8 * rounding):
         raise Unexpected(f"the inverse is off by {float(np.max(away)):.2g}")
     return f"{said}; inverse within {float(np.max(away)):.1g}"
@@ -38,12 +38,12 @@ def _albedo_near_one(real: Real) -> str:
 
 def _least_step(real: Real) -> float:
     """Return the exponent of the smallest 1 - R_d that a precision tells from the next."""
-    return -9.0 if real is np.float64 else -6.5
+    return -6.5 if real.single else -9.0
 
 
 def _reflectance_ends(real: Real) -> str:
     r_d = np.concatenate([np.logspace(-6, -1, 21), 1.0 - np.logspace(-1.2, _least_step(real), 21)])
-    return rising(-dipole.invert_to_deficit(as_real(r_d, real), 1.4), what="alpha' - 1")
+    return rising(-dipole.invert_to_deficit(real(r_d), 1.4), what="alpha' - 1")
 
 
 def _all_light_back(real: Real) -> str:
@@ -63,7 +63,7 @@ def _more_than_all(real: Real) -> str:
 
 
 def _no_absorption(real: Real) -> str:
-    r = as_real([0.1, 1.0, 10.0], real)
+    r = real([0.1, 1.0, 10.0])
     clear = dipole.reflectance(r, real(0.0), real(1.0), 1.4)
     faint = dipole.reflectance(r, real(1e-12), real(1.0), 1.4)
     return near(faint, clear, relative=1e-4)
@@ -72,9 +72,7 @@ def _no_absorption(real: Real) -> str:
 def _black_medium(real: Real) -> str:
     inside = _layers(real, (1e3, 1.0, math.inf))
     said = within(inside, 0.0, 2e-3, what="R_d of layers")
-    value = dipole.reflectance(
-        as_real([0.0, 0.01, 0.1, 1.0, 10.0], real), real(1e3), real(1.0), 1.4
-    )
+    value = dipole.reflectance(real([0.0, 0.01, 0.1, 1.0, 10.0]), real(1e3), real(1.0), 1.4)
     rising(-np.asarray(value, np.float64), strictly=False, what="-R(r)")
     # of 1000 / 1001 that is absorbed at each event hardly anything comes back
     total = dipole.total_reflectance(1.0 / 1001.0, 1.4)
@@ -83,11 +81,11 @@ def _black_medium(real: Real) -> str:
 
 
 def _radius_ends(real: Real) -> str:
-    r = as_real([0.0, 1e-9, 1e-3, 1e2, 1e4], real)
+    r = real([0.0, 1e-9, 1e-3, 1e2, 1e4])
     one = dipole.reflectance(r, real(0.02), real(1.0), 1.4)
     two = diffusion.reflectance(r, real(0.02), real(1.0), 1.4)
     near(one[0], one[1], relative=1e-5)
-    far = as_real([1e30], real)
+    far = real([1e30])
     within(dipole.reflectance(far, real(0.02), real(1.0), 1.4), 0.0, 0.0, what="at 1e30 mm")
     refused(
         lambda: dipole.reflectance(real(np.inf), real(0.02), real(1.0), 1.4),
@@ -141,8 +139,8 @@ def _conserving_layers(real: Real) -> str:
 
 
 def _pigment_ends(real: Real) -> str:
-    wavelength = as_real([400.0, 500.0, 600.0, 700.0], real)
-    c_m, c_hd = as_real([0.0, 0.5], real)[:, None, None], as_real([0.0, 0.32], real)[:, None]
+    wavelength = real([400.0, 500.0, 600.0, 700.0])
+    c_m, c_hd = real([0.0, 0.5])[:, None, None], real([0.0, 0.32])[:, None]
     value = tissue_optics.two_layer_reflectance(wavelength, c_m, c_hd)
     if not (np.all(value[0] > value[1]) and np.all(value[:, 0] >= value[:, 1])):
         raise Unexpected("more pigment reflects more")
@@ -159,7 +157,7 @@ def _pigment_beyond(real: Real) -> str:
 
 def _table_far(real: Real) -> str:
     refused(lambda: photon_table.reflectance(real(0.0), 0.05, 1.0), ValueError, "radius_mm")
-    r = as_real([1e-4, 0.5, 20.0, 1e3], real)
+    r = real([1e-4, 0.5, 20.0, 1e3])
     value = photon_table.reflectance(r, real(0.05), real(1.0))
     rising(-value[:-1], what="-R(r)")
     return "r = 0 refused; " + within(value, 0.0, 1e6, what="R(r)")
@@ -167,16 +165,14 @@ def _table_far(real: Real) -> str:
 
 def _profile_flat(real: Real) -> str:
     r = np.linspace(1.0, 15.0, 28)
-    fit = subsurface.invert(r, as_real(np.full((1, 28), 1e-3), real))
+    fit = subsurface.invert(r, real(np.full((1, 28), 1e-3)))
     clean(fit.sigma_tr_per_mm, fit.valid, what="sigma_tr")
     return masked(fit.valid)
 
 
 def _profile_dark(real: Real) -> str:
     r = np.linspace(1.0, 15.0, 28)
-    fit = subsurface.invert(
-        r, as_real(np.zeros((1, 28)), real), variance=as_real(np.full((1, 28), 1e-12), real)
-    )
+    fit = subsurface.invert(r, real(np.zeros((1, 28))), variance=real(np.full((1, 28), 1e-12)))
     clean(fit.sigma_tr_per_mm, fit.valid, what="sigma_tr")
     return masked(fit.valid)
 
@@ -184,7 +180,7 @@ def _profile_dark(real: Real) -> str:
 def _profile_broken(real: Real) -> str:
     r = np.linspace(1.0, 15.0, 28)
     truth = photon_table.reflectance(r, 0.08, 1.2)
-    profile = as_real(np.stack([truth, truth]), real)
+    profile = real(np.stack([truth, truth]))
     profile[1, 5] = np.nan
     fit = subsurface.invert(r, profile, valid=np.isfinite(profile))
     both = np.asarray(fit.sigma_tr_per_mm)

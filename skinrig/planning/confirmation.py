@@ -1,6 +1,6 @@
 """A choice simulated, reconstructed and compared with its forecast."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +29,9 @@ def confirmed(
     """
     rig = planner(choice.rig.name)
     steps = rig.rehearsal(choice)
-    for target, options in steps.targets.items():
-        progress(f"simulate {target}")
-        shown = out / f"session-{target}"
-        simulate_session(choice.rig.name, shown, target=target, seed=seed, **options)
-    calibration = out / "calibration"
-    for kind, targets in steps.calibrations:
-        calibrate(kind, [out / f"session-{target}" for target in targets], calibration)
+    calibrate_simulated(
+        choice.rig.name, out, steps.targets, steps.calibrations, seed=seed, progress=progress
+    )
     progress(f"simulate the skin {subject}")
     done = simulate_session(
         choice.rig.name,
@@ -50,7 +46,7 @@ def confirmed(
         done.session,
         want=steps.want,
         out=out / "appearance",
-        calibration=calibration,
+        calibration=out / "calibration",
         truth=done.truth_name,
     )
     appearance, truth = store.read(out / "appearance"), store.read(out / "truth-face")
@@ -63,3 +59,38 @@ def confirmed(
             found = {"median": median, "forecast": one.value, "within": low <= median <= high}
             rows.append({"name": one.name, "unit": one.unit, **found, "valid_share": share})
     return rows
+
+
+def calibrate_simulated(
+    rig: str,
+    folder: Path,
+    targets: Mapping[str, Mapping[str, Any]],
+    kinds: Iterable[tuple[str, Sequence[str]]],
+    *,
+    seed: int,
+    progress: Callable[[str], None] | None = None,
+) -> None:
+    """Simulate targets and calibrate a rig by them into a folder's `calibration`.
+
+    Parameters
+    ----------
+    rig
+        Its name.
+    folder
+        For sessions and the calibration.
+    targets
+        Options of each target's session.
+    kinds
+        Of calibration, each with the targets that it is made from.
+    seed
+        Of the sessions.
+    progress
+        Is told each target.
+    """
+    for target, options in targets.items():
+        if progress is not None:
+            progress(f"simulate {target}")
+        simulate_session(rig, folder / f"session-{target}", target=target, seed=seed, **options)
+    for kind, used in kinds:
+        sessions = [folder / f"session-{target}" for target in used]
+        calibrate(kind, sessions, folder / "calibration")

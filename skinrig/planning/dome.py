@@ -148,16 +148,9 @@ def _choice(
     }
     forecasts = plans.forecasts_of(medians, FORECAST_RELATIVE_SD, asked, "dome")
     left_out = plans.left_out_of(
-        (
-            bool(unlit),
-            f"{len(unlit)} of {len(rig.lights)} lights: {', '.join(unlit)}",
-            "the others reach what is wanted",
-        ),
-        (
-            bool(unseen),
-            f"{len(unseen)} of {len(rig.views)} cameras: {', '.join(unseen)}",
-            "two others see each point that is asked for",
-        ),
+        "dome",
+        (unlit, "lights", len(unlit), len(rig.lights), ", ".join(unlit)),
+        (unseen, "cameras", len(unseen), len(rig.views), ", ".join(unseen)),
     )
     knobs = {
         "lights": [rig.lights[k].name for k in sorted(lights)],

@@ -233,22 +233,10 @@ def _choice(
     medians = {name: 100.0 * found.median(name) for name in CHROMOPHORE_NAMES}
     forecasts = plans.forecasts_of(medians, FORECAST_RELATIVE_SD, asked, "flash")
     left_out = plans.left_out_of(
-        (
-            not parallel,
-            f"{own['repeats']} parallel frames",
-            "the crossed ones alone hold the light that melanin and hemoglobin color; the "
-            "parallel ones add the gloss",
-        ),
-        (
-            own["darks"] < 4,
-            f"{4 - own['darks']} of 4 dark frames",
-            "at this exposure the black level that the camera states is off by less than the noise",
-        ),
-        (
-            own["power"] < 1.0,
-            f"{100.0 * (1.0 - own['power']):.3g} % of the flashes' energy",
-            plans.why_less(reasons),
-        ),
+        "flash",
+        (not parallel, "parallel", own["repeats"]),
+        (own["darks"] < 4, "darks", 4 - own["darks"]),
+        (own["power"] < 1.0, "energy", 100.0 * (1.0 - own["power"]), plans.why_less(reasons)),
     )
     powers = [float(step.settings.get("power", 0.0)) for step in plan.steps]
     pops = sum(power > 0 for power in powers)

@@ -276,27 +276,13 @@ def _choice(
     predicted = plans.forecasts_of(medians, FORECAST_RELATIVE_SD, asked, "gradient")
     missing = [name for name in LIGHT_PATTERNS if name not in setting.patterns]
     states, every = ({state_of(s) for s in one.steps} - {None} for one in (plan, full))
+    lost_ms, full_ms = 1e3 * (EXPOSURE_S - setting.exposure_s), 1e3 * EXPOSURE_S
     left_out = plans.left_out_of(
-        (
-            bool(missing),
-            f"patterns {', '.join(missing)}",
-            "full light and three gradients are told without them; they would lower the noise",
-        ),
-        (
-            len(states) < len(every),
-            f"{len(every) - len(states)} of {len(every)} states of strain",
-            "normals are wanted of neutral skin",
-        ),
-        (
-            setting.exposure_s < EXPOSURE_S,
-            f"{1e3 * (EXPOSURE_S - setting.exposure_s):.3g} of {1e3 * EXPOSURE_S:.3g} ms exposed",
-            plans.why_less(reasons),
-        ),
-        (
-            not setting.darks,
-            "dark frames",
-            "at this exposure the fixed pattern of the sensor is below its noise",
-        ),
+        "gradient",
+        (missing, "patterns", ", ".join(missing)),
+        (len(states) < len(every), "states", len(every) - len(states), len(every)),
+        (lost_ms > 0.0, "exposure", lost_ms, full_ms, plans.why_less(reasons)),
+        (not setting.darks, "darks"),
     )
     reasons += (
         "normals are those that the lens shows; the relief's own are "

@@ -9,8 +9,10 @@ import difflib
 import importlib
 import math
 import re
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,8 @@ WANTED_UNITS: Mapping[str, Mapping[str, str]] = {
 
 PERCENT_BY_SITE = "percent_by_site"
 """Knob of the probe's choices: error of sigma_tr by site, red, green and blue, %."""
+
+LEFT_OUT_TABLE = resources.files("skinrig").joinpath("data/left_out.toml")
 
 _WANTED_LIMIT = re.compile(r"\s*([a-z_]+)\s*<=\s*([0-9.eE+-]+)\s*(deg|%)?\s*")
 
@@ -226,9 +230,19 @@ def forecasts_of(
     )
 
 
-def left_out_of(*rows: tuple[bool, str, str]) -> tuple[tuple[str, str], ...]:
-    """Return what is left out and why, of rows that say first whether it is."""
-    return tuple((what, why) for left, what, why in rows if left)
+def left_out_of(rig: str, *rows: tuple[Any, ...]) -> tuple[tuple[str, str], ...]:
+    """Return what a plan leaves out and why.
+
+    Parameters
+    ----------
+    rig
+        Its name.
+    rows
+        Whether it is left out, its name in `data/left_out.toml`, and what fills its braces.
+    """
+    table = tomllib.loads(LEFT_OUT_TABLE.read_text(encoding="utf-8"))[rig]
+    named = [(table[name], words) for left, name, *words in rows if left]
+    return tuple((row["what"].format(*words), row["why"].format(*words)) for row, words in named)
 
 
 def why_less(reasons: Sequence[str]) -> str:

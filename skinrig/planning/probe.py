@@ -217,33 +217,16 @@ def _choice(
         "sigma_tr", "%", value, (100.0 * low, 100.0 * high), wants.get("sigma_tr")
     )
     fewer = N_BRACKETS - len(setting.exposures_s)
-    unmeasured = [(k, site) for k, site in enumerate(observation.sites) if not found.measured[k]]
+    longest_s = setting.exposures_s[-1]
+    percent = [100.0 * float(np.median(sigma)) for sigma in found.sigma]
+    sites = zip(observation.sites, percent, found.measured, strict=True)
     turned = {name for step in plan.steps for name in step.index if step.index[name]}
     left_out = plans.left_out_of(
-        (
-            fewer > 0,
-            f"{fewer} of {N_BRACKETS} exposures of a series",
-            "wider steps still show every fibre unsaturated and above the noise",
-        ),
-        (
-            setting.exposures_s[-1] < 0.99 * MAX_EXPOSURE_S,
-            f"exposures above {setting.exposures_s[-1]:.3g} s",
-            "what the farthest fibres would add does not show beside misfit and certificate",
-        ),
-        *(
-            (
-                True,
-                f"the {site}",
-                "the other sites and people in general tell its sigma_tr to "
-                f"{100.0 * float(np.median(found.sigma[k])):.2g} %",
-            )
-            for k, site in unmeasured
-        ),
-        (
-            "angle" not in turned,
-            "further directions of the head",
-            "sigma_tr is wanted, not how it changes with them",
-        ),
+        "probe",
+        (fewer > 0, "exposures", fewer, N_BRACKETS),
+        (longest_s < 0.99 * MAX_EXPOSURE_S, "longest", longest_s),
+        *((not told, "site", site, error) for site, error, told in sites),
+        ("angle" not in turned, "directions"),
     )
     knobs = {
         "sites": list(setting.sites),

@@ -13,6 +13,7 @@ from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.flash.facial_color import UnknownBloodError
 from skinrig.applying.expression import hemoglobin_rig
 from skinrig.benchmarks.intervals import flash as interval_trials_flash
+from skinrig.benchmarks.intervals.trials import Subject
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating.facial_color import PREDICTION_METHODS, compare, true_blood
 from skinrig.fitting.facial_color import fit_facial_color
@@ -126,7 +127,7 @@ def test_skin_whose_blood_no_color_tells_is_refused_with_what_can_be_had(folder,
         )
     assert not (tmp_path / "moving").exists()
     (tmp_path / "calibration").symlink_to(folder / "calibration")
-    trials = interval_trials_flash._of_rig(done, tmp_path, "smile", subject="a", band="b")
+    trials = interval_trials_flash._of_rig(done, tmp_path, "smile", Subject("a", "b"))
     assert not list(trials)
 
 

@@ -1,12 +1,12 @@
-"""Benchmarks of the dome's reflectance: diffuse albedo, and surface BRDFs on a tabulated basis."""
+"""Benchmarks of the dome's reflectance: diffuse albedo, surface BRDFs, and their space."""
 
 from __future__ import annotations
 
 import dataclasses
-import time
+import itertools
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from scipy.optimize import nnls
@@ -15,16 +15,18 @@ from model.brdf import microfacet
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis
+from reconstruction.brdf_basis import space as brdf_space
 from reconstruction.diffuse_albedo import estimation as diffuse_albedo
+from rigsim.population.population import table_1
+from skinrig.analysing import brdf_space_datasets
+from skinrig.analysing.brdf_space_datasets import Dataset
 from skinrig.arrays import BoolArray, Float64Array
-from skinrig.benchmarks.description import Findings, described
 from skinrig.benchmarks.dome import brdf_truth
-from skinrig.benchmarks.measurement import measure, measure_and_keep, once
+from skinrig.benchmarks.measurement import LIMIT_CORES, once, spent
 from skinrig.benchmarks.resampling import drawn_again
-from skinrig.benchmarks.results import BandError, Point, StageBenchmark, Timing
+from skinrig.benchmarks.results import BandError, Knobs, Timing
+from skinrig.benchmarks.stage import Stage
 
-FIT_CORES = 2
-"""Cores that the fit shares its points out to."""
 ETA = 1.3
 METHODS: tuple[diffuse_albedo.Method, ...] = ("envelope", "stable_minimum", "minimum")
 WAYS: tuple[Literal["cbrt", "none"], ...] = ("cbrt", "none")
@@ -37,22 +39,18 @@ BAND_ALBEDOS: dict[str, tuple[float, float, float]] = {
 of the others."""
 
 
-def albedo(*, toy: bool) -> StageBenchmark:
+def albedo(stage: Stage) -> None:
     """Estimate R_d over noise and samples, by the fit and by the paper's minima."""
     rng = np.random.default_rng(0)
-    count = 12 if toy else 150
-    points = []
-    limits: Findings = {}
-    bands: dict[str, BandError] = {}
+    count = 12 if stage.toy else 150
     for skin, r_d in BAND_ALBEDOS.items():
-        for noise in (0.02,) if toy else (0.005, 0.02, 0.08):
-            for samples in (60,) if toy else (60, 240, 900):
+        for noise in (0.02,) if stage.toy else (0.005, 0.02, 0.08):
+            for samples in (60,) if stage.toy else (60, 240, 900):
                 p = brdf_truth.dome(count, r_d=r_d, noise=noise, samples=samples, rng=rng)
                 for method in METHODS:
-                    timing, found = measure_and_keep(
-                        lambda: diffuse_albedo.estimate(
-                            *p.samples, eta=ETA, variance=p.variance, valid=p.valid, method=method
-                        ),
+                    estimate = partial(diffuse_albedo.estimate, *p.samples, eta=ETA, method=method)
+                    timing, found = stage.time(
+                        lambda: estimate(variance=p.variance, valid=p.valid),
                         repeats=1,
                         memory=False,
                     )
@@ -61,61 +59,52 @@ def albedo(*, toy: bool) -> StageBenchmark:
                     channel = relative[:, int(np.argmax(worst))]
                     # 68 % interval of a median of `count` errors of this spread
                     half = 1.2533 * float(np.std(np.abs(channel))) / np.sqrt(count)
-                    error = float(worst.max())
-                    outcome = BandError(error, (max(error - half, 0.0), error + half))
+                    outcome = BandError.of_size(float(worst.max()), half)
                     knobs = {"skin": skin, "noise": noise, "samples": p.f.shape[1]}
                     also = {
                         "bias_percent": round(float(np.median(channel)), 2),
                         "spread_percent": round(float(np.std(channel)), 2),
                     }
-                    points.append(Point.of(knobs | {"method": method}, timing, outcome, also))
-                    if method == "envelope" and noise == 0.02 and (toy or samples == 900):
-                        bands[skin] = outcome
-                        limits["error", skin] = error
-    return described("diffuse-albedo", points, limits, by_band=bands)
+                    stage.add(knobs | {"method": method}, timing, outcome, also)
+                    if method == "envelope" and noise == 0.02 and (stage.toy or samples == 900):
+                        stage.by_band[skin] = outcome
+                        stage.limits["error", skin] = outcome.error
 
 
-def surface(*, toy: bool) -> StageBenchmark:
+def surface(stage: Stage) -> None:
     """Fit surface BRDFs, and predict lights that were left out; beside GGX and SciPy."""
     rng = np.random.default_rng(0)
     basis = brdf_tables.default()
-    count = 12 if toy else 120
-    points = []
-    error = np.nan
-    for samples in (100,) if toy else (100, 300, 900):
+    count = 12 if stage.toy else 120
+    for samples in (100,) if stage.toy else (100, 300, 900):
         given = _Given.draw(BAND_ALBEDOS["light"], count, samples, rng)
         for compress in WAYS:
-            timing, fit = measure_and_keep(
+            timing, fit = stage.time(
                 lambda: brdf_basis.fit_weights(given.samples, basis, compress=compress),
                 repeats=2,
                 memory=False,
             )
-            points.append(given.point(f"basis, {compress}", timing, given.lobes(fit, basis)))
+            outcome = given.add(stage, f"basis, {compress}", timing, given.lobes(fit, basis))
             if compress == "cbrt":
-                error = points[-1].error
+                stage.limits["error"] = outcome.error
                 full = fit
-        for rank in (2, 4) if toy else (1, 2, 3, 4, 6, 8):
-            if samples < 900 and not toy:
+        for rank in (2, 4) if stage.toy else (1, 2, 3, 4, 6, 8):
+            if samples < 900 and not stage.toy:
                 continue
             mixed = basis.mixed(brdf_basis.reduce(full, rank, basis=basis)[1])
-            timing = measure(
-                lambda: brdf_basis.fit_weights(given.samples, mixed, compress="none"),
-                repeats=1,
-                memory=False,
-            )
+            quick = partial(brdf_basis.fit_weights, given.samples, mixed, compress="none")
+            timing, _ = stage.time(quick, repeats=1, memory=False)
             fit = brdf_basis.fit_weights(given.samples, mixed, compress="cbrt")
-            points.append(given.point("NMF, refitted", timing, given.lobes(fit, mixed), rank=rank))
+            given.add(stage, "NMF, refitted", timing, given.lobes(fit, mixed), rank=rank)
         for way, peer in (("GGX", _ggx), ("roots of elements", partial(_rooted, basis=basis))):
             timing, lobe = once(lambda: peer(given.truth, given.samples))
-            points.append(given.point(way, timing, lobe))
-    bands = {}
+            given.add(stage, way, timing, lobe)
     for skin, r_d in BAND_ALBEDOS.items():
-        given = _Given.draw(r_d, count, 100 if toy else 300, rng)
+        given = _Given.draw(r_d, count, 100 if stage.toy else 300, rng)
         fit = brdf_basis.fit_weights(given.samples, basis, compress="cbrt")
-        bands[skin] = given.error(given.lobes(fit, basis))
-    faster, excess = _beside_scipy(basis, toy=toy)
-    limits = {"error": error, "speed_up": faster, "residual": 100.0 * excess}
-    return described("brdf", points, limits, by_band=bands)
+        stage.by_band[skin] = given.error(given.lobes(fit, basis))
+    faster, excess = _beside_scipy(basis, toy=stage.toy)
+    stage.limits |= {"speed_up": faster, "residual": 100.0 * excess}
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,18 +144,20 @@ class _Given:
         by_point = np.array([np.median(r[a]) for r, a in zip(relative, at, strict=True) if a.any()])
         return BandError(float(np.median(by_point)), drawn_again(by_point, rng=self.rng))
 
-    def point(self, way: str, timing: Timing, lobe: Float64Array, *, rank: int = 0) -> Point:
+    def add(
+        self, stage: Stage, way: str, timing: Timing, lobe: Float64Array, **rank: int
+    ) -> BandError:
         p = self.truth
         at = p.valid & self.left_out
         root = np.sqrt(np.mean((np.cbrt(lobe) - np.cbrt(p.surface))[at] ** 2))
         bright = at & (p.surface > 0.5 * _diffuse(p, p.r_d))
         highlight = np.median(np.abs(lobe[bright] / p.surface[bright] - 1.0))
-        knobs = {"way": way, "samples": p.f.shape[1], "points": len(p.f)}
+        knobs = {"way": way, "samples": p.f.shape[1], "points": len(p.f), **rank}
         also = {
             "highlight_error_percent": round(float(highlight) * 100.0, 2),
             "cube_root_rms": round(float(root), 4),
         }
-        return Point.of(knobs | ({"rank": rank} if rank else {}), timing, self.error(lobe), also)
+        return stage.add(knobs, timing, self.error(lobe), also)
 
 
 def _left_out(p: brdf_truth.Points, rng: np.random.Generator) -> BoolArray:
@@ -249,14 +240,67 @@ def _beside_scipy(basis: BrdfBasis, *, toy: bool) -> tuple[float, float]:
     # Processor time, which does not see who else keeps the cores busy; SciPy uses one.
     ours, theirs = [], []
     for _ in range(1 if toy else 5):
-        start = time.process_time()
-        found = brdf_basis.fit_weights(many, basis, compress="none")
-        ours.append((time.process_time() - start) / FIT_CORES)
-        start = time.process_time()
-        least = [nnls(a, y)[1] for a, y in problems]
-        theirs.append((time.process_time() - start) / subset * len(many.value))
+        ours_s, found = spent(lambda: brdf_basis.fit_weights(many, basis, compress="none"))
+        peer_s, least = spent(lambda: [nnls(a, y)[1] for a, y in problems])
+        ours.append(ours_s / LIMIT_CORES)
+        theirs.append(peer_s / subset * len(many.value))
     excess = [
         float(np.linalg.norm(a @ x - y) / norm - 1.0)
         for (a, y), x, norm in zip(problems, found.weights[:subset], least, strict=True)
     ]
     return float(np.median(theirs) / np.median(ours)), max(excess)
+
+
+SPACE_WAYS: Final[tuple[Literal["shares", "brdf"], ...]] = ("shares", "brdf")
+SPACE_RANKS: Final = (1, 2, 3, 4, 6, 8, 12)
+NOISE_RANK: Final = 4
+"""Lobes of a model of one face, whose error is to stay below what noise leaves."""
+HELD_OUT_POINT_FRACTION: Final = 0.3
+"""Part of the points that no mixture is made of."""
+
+
+def space(stage: Stage) -> None:
+    """Factor the mixtures of three datasets into ever more common ones, in two ways."""
+    basis = brdf_tables.default()
+    ranks = (1, 2, 4) if stage.toy else SPACE_RANKS
+    steepest, excess, beyond = -np.inf, 0.0, 0.0
+    for number, data in enumerate(_datasets(toy=stage.toy)):
+        rng = np.random.default_rng([number, 72])
+        order = rng.permutation(len(data.weights))
+        kept = round(HELD_OUT_POINT_FRACTION * len(order))
+        tried, trained = data.weights[order[:kept]], data.weights[order[kept:]]
+        whose = data.label[order[:kept]] if data.name == "dataset B" else None
+        for method, rank in itertools.product(SPACE_WAYS, ranks):
+            # Each rank alone, as somebody who asks for it would have it.
+            curve = partial(brdf_space.curve, trained, basis, ranks=(rank,), method=method)
+            timing, found = stage.time(
+                lambda: curve(held_out=tried, groups=whose), repeats=1, memory=not stage.toy
+            )
+            inside, error = float(found.error[0]), 100.0 * float(found.held_out[0])
+            outcome = BandError.of_size(error, 100.0 * float(found.held_out_stderr[0]))
+            knobs: Knobs = {"set": data.name, "way": method, "rank": rank, "points": found.points}
+            also = {
+                "own_points_error_percent": round(100.0 * inside, 3),
+                "noise_percent": round(100.0 * data.noise, 1),
+            }
+            stage.add(knobs, timing, outcome, also)
+            if method == "shares" and rank == NOISE_RANK:
+                beyond = max(beyond, inside / data.noise)
+        shares, brdf = (
+            brdf_space.curve(trained, basis, ranks=ranks, method=way).error for way in SPACE_WAYS
+        )
+        steepest = max(steepest, float(np.diff(brdf).max()))
+        excess = max(excess, float((brdf / shares).max()))
+    stage.limits = {"rise": 100.0 * steepest, "over_nmf": excess, "over_noise": beyond}
+
+
+def _datasets(*, toy: bool) -> tuple[Dataset, ...]:
+
+    rng = np.random.default_rng(72)
+    if toy:
+        return (brdf_space_datasets.one_person(60, rng=rng),)
+    return (
+        brdf_space_datasets.one_person(700, rng=rng),
+        brdf_space_datasets.dataset_a(1_400, rng=rng),
+        brdf_space_datasets.dataset_b(70, members=table_1()[::4], rng=rng),
+    )

@@ -12,28 +12,44 @@ LIGHT_SKIN_ALBEDO = (0.62, 0.42, 0.32)
 DARK_SKIN_ALBEDO = (0.16, 0.085, 0.055)
 
 
-@dataclass(frozen=True, slots=True)
-class Points:
-    """P points under a dome's lights, with what is true of them."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """Samples of P points under a dome's lights, and their true surface.
+
+    Attributes
+    ----------
+    f, variance
+        (P, M, 3) BRDF samples with noise, 1/sr, and the variance of that.
+    light, view
+        (P, M, 3) unit.
+    normals
+        (P, 3).
+    valid
+        (P, M) bool: light and view stand above the horizon.
+    surface
+        (P, M) surface BRDF without noise, 1/sr.
+    """
 
     f: Float64Array
-    """BRDF samples with noise, (P, M, 3), 1/sr."""
     variance: Float64Array
-    """Of `f`."""
     light: Float64Array
     view: Float64Array
     normals: Float64Array
     valid: BoolArray
-    """(P, M)."""
-    r_d: Float64Array
-    """(P, 3)."""
     surface: Float64Array
-    """Surface BRDF without noise, (P, M), 1/sr."""
 
     @property
     def samples(self) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
         """Samples, their directions of light and view, and normals, as estimators take them."""
         return self.f, self.light, self.view, self.normals
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Points(Samples):
+    """The same with the diffuse reflectance that is true."""
+
+    r_d: Float64Array
+    """(P, 3)."""
 
 
 def dome(
@@ -106,7 +122,7 @@ def dome(
     # Noise of the radiance, hence of f times the light's cosine; white is 1/pi.
     sigma = noise * (clean * mu_l[..., None] + 0.02 / np.pi) / mu_l[..., None]
     f = clean + sigma * rng.standard_normal(clean.shape)
-    return Points(f, sigma**2, light, view, normals, valid, albedo, surface)
+    return Points(f, sigma**2, light, view, normals, valid, surface, albedo)
 
 
 def _slopes(tan_h: Float64Array, m: Float64Array, tail: str) -> Float64Array:

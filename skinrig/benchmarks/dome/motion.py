@@ -15,11 +15,10 @@ from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import make_subject
 from rigsim.subject.head_motion import head_motion as drawn
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import measured
 from skinrig.benchmarks.resampling import mean_error
-from skinrig.benchmarks.results import BandError, StageBenchmark
-from skinrig.evaluating.skin_bands import MELANIN_BANDS
+from skinrig.benchmarks.results import BandError
+from skinrig.benchmarks.stage import Stage
+from skinrig.evaluating.skin_bands import MelaninBand
 
 TRACKING_EXPOSURE_S = 0.03
 
@@ -159,28 +158,25 @@ def simulate(
     )
 
 
-def motion(*, toy: bool) -> StageBenchmark:
+def motion(stage: Stage) -> None:
     """Follow heads that drift little and much, with few and many tracks."""
-    width, views, times = (160, 2, (0.0, 8.0, 16.0)) if toy else (484, 3, (0.0, 5.0, 12.5, 20.0))
-    texels = 128 if toy else 512
+    width, views, times = (
+        (160, 2, (0.0, 8.0, 16.0)) if stage.toy else (484, 3, (0.0, 5.0, 12.5, 20.0))
+    )
+    texels = 128 if stage.toy else 512
     drift = partial(simulate, width_px=width, views=views, texels=texels)
 
-    points = []
-    for drift_mm in (1.0,) if toy else (0.3, 1.0, 3.0):
+    for drift_mm in (1.0,) if stage.toy else (0.3, 1.0, 3.0):
         seen = drift(drift_mm=drift_mm, times_s=times)
         moved_mm = round(float(seen.moved_mm().mean()), 3)
-        points += [
-            measured(
-                {"drift mm": drift_mm, "tracks": tracks},
-                partial(seen.estimate, tracks),
-                seen.error,
-                also=lambda _: {"moved_mm": moved_mm},
-                repeats=1 if toy else 3,
-            )
-            for tracks in ((30, 60, 120, 200) if toy else (30, 100, 300))
-        ]
-    bands = {}
-    for name, band in MELANIN_BANDS.items():
+        for tracks in (30, 60, 120, 200) if stage.toy else (30, 100, 300):
+            knobs = {"drift mm": drift_mm, "tracks": tracks}
+            follow = partial(seen.estimate, tracks)
+            stage.measure(knobs, follow, seen.error, also={"moved_mm": moved_mm})
+
+    def on_skin(band: MelaninBand) -> BandError:
         seen = drift(drift_mm=1.0, times_s=times[:3], preset=band.preset)
-        bands[name] = seen.error(seen.estimate(100))
-    return described("head-motion", points, by_band=bands, width=width // 2, views=views)
+        return seen.error(seen.estimate(100))
+
+    stage.on_each_skin(on_skin)
+    stage.words = {"width": width // 2, "views": views}

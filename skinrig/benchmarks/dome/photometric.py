@@ -1,6 +1,5 @@
 """Benchmark of robust photometric stereo, beside a per-pixel NumPy IRLS in the same run."""
 
-import time
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -11,11 +10,11 @@ from threadpoolctl import threadpool_limits
 from model.metrics import angular_error_rad
 from reconstruction.photometric_stereo import NormalMaps, Robustness, estimate_normals
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import LIMIT_CORES, measured, processor_seconds
+from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds, spent
 from skinrig.benchmarks.resampling import drawn_again
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
-from skinrig.evaluating.skin_bands import MELANIN_BANDS
+from skinrig.benchmarks.results import BandError, Knobs
+from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.evaluating.skin_bands import MelaninBand
 
 SAMPLE_NOISE = 0.005
 """Standard deviation of every sample; a white pixel that faces a light is 1."""
@@ -84,28 +83,18 @@ def glossy_ball(
     return Scene(images, towards, n, inside, matte, paint)
 
 
-def numpy_irls_l1(
-    samples: Float64Array,
-    lights: Float64Array,
-    *,
-    shadow: float = 0.1,
-    steps: int = 100,
-    tiny: float = 1e-6,
-) -> Float64Array:
+def numpy_irls_l1(samples: Float64Array, lights: Float64Array) -> Float64Array:
     """Fit pixels one by one by least absolute deviations, in plain NumPy.
 
-    Iteratively reweighted least squares with weights 1 / max(|r|, tiny) from the least-squares
-    start until the solution moves by less than 1e-6 (Schlossmacher 1973, J. Am. Stat. Assoc. 68,
-    857), over the samples that are not dark.
+    Iteratively reweighted least squares with weights 1 / max(|r|, 1e-6) from the least-squares
+    start until the solution moves by less than 1e-6 or 100 times (Schlossmacher 1973, J. Am. Stat.
+    Assoc. 68, 857), over the samples that are not dark: not below a tenth of a pixel's bright
+    sample (its eighth part from above).
 
     Parameters
     ----------
     samples : ndarray, shape (N, P)
     lights : ndarray, shape (N, 3)
-    shadow : float
-        Part of a pixel's bright sample (its eighth part from above) below which one is dark.
-    steps, tiny
-        Most steps, and the least residual that is told from none.
 
     Returns
     -------
@@ -116,13 +105,13 @@ def numpy_irls_l1(
     normals = np.zeros((samples.shape[1], 3))
     for pixel, values in enumerate(samples.T):
         bright = np.partition(values, -rank)[-rank]
-        lit = values > shadow * bright
+        lit = values > 0.1 * bright
         if bright <= 0 or np.count_nonzero(lit) < 3:
             continue
         A, i = lights[lit], values[lit]
         b = np.linalg.lstsq(A, i)[0]
-        for _ in range(steps):
-            root = 1.0 / np.sqrt(np.maximum(np.abs(i - A @ b), tiny))
+        for _ in range(100):
+            root = 1.0 / np.sqrt(np.maximum(np.abs(i - A @ b), 1e-6))
             before, b = b, np.linalg.lstsq(root[:, None] * A, root * i)[0]
             if np.linalg.norm(b - before) < 1e-6 * np.linalg.norm(b):
                 break
@@ -152,40 +141,38 @@ def _mean_deg(found: NormalMaps, scene: Scene, noise: float, rng: np.random.Gene
     return BandError(float(error.mean()), interval, _mean_bound_deg(scene, noise))
 
 
-def normals(*, toy: bool) -> StageBenchmark:
+def normals(stage: Stage) -> None:
     """Estimate the normals of a glossy ball: lights, robust steps, noise; then at full size."""
     rng = np.random.default_rng(0)
-    points: list[Point] = []
-    ball = partial(glossy_ball, 40 if toy else 192, noise=SAMPLE_NOISE, rng=rng)
+    ball = partial(glossy_ball, 40 if stage.toy else 192, noise=SAMPLE_NOISE, rng=rng)
 
     def add(knobs: Knobs, scene: Scene, noise: float = SAMPLE_NOISE, **options: Any) -> None:
-        points.append(
-            measured(
-                {"noise": noise} | knobs,
-                lambda: estimate_normals(scene.images, scene.lights, **options),
-                lambda found: _mean_deg(found, scene, noise, rng),
-                repeats=1 if toy else 3,
-            )
+        stage.measure(
+            {"noise": noise} | knobs,
+            lambda: estimate_normals(scene.images, scene.lights, **options),
+            lambda found: _mean_deg(found, scene, noise, rng),
         )
 
-    for lights in (30, 12) if toy else (150, 75, 30, 12):
+    for lights in (30, 12) if stage.toy else (150, 75, 30, 12):
         add({"lights": lights, "fit": "robust"}, ball(lights))
-    count = 30 if toy else 150
+    count = 30 if stage.toy else 150
     dense = ball(count)
-    for steps in (0, 4) if toy else (0, 2, 4, 8):
+    for steps in (0, 4) if stage.toy else (0, 2, 4, 8):
         robustness = Robustness(l1_iterations=steps)
         add({"lights": count, "fit": "robust", "L1 steps": steps}, dense, robustness=robustness)
     add({"lights": count, "fit": "least squares"}, dense, robust=False)
-    for noise in (0.02,) if toy else (0.001, 0.02):
+    for noise in (0.02,) if stage.toy else (0.001, 0.02):
         add({"lights": count, "fit": "robust"}, ball(count, noise=noise), noise)
-    bands = {}
-    for name, band in MELANIN_BANDS.items():
+
+    def on_skin(band: MelaninBand) -> BandError:
         # gloss and noise stay as they are: on dark skin there is less of what is fitted
         scene = ball(count, albedo=float(band.reflectance()[1]))
         found = estimate_normals(scene.images, scene.lights)
-        bands[name] = _mean_deg(found, scene, SAMPLE_NOISE, rng)
-    limits = {} if toy else _full_size(rng)
-    return described("normals", points, limits, by_band=bands)
+        return _mean_deg(found, scene, SAMPLE_NOISE, rng)
+
+    stage.on_each_skin(on_skin)
+    if not stage.toy:
+        stage.limits = _full_size(rng)
 
 
 def _full_size(rng: np.random.Generator) -> Findings:
@@ -197,10 +184,9 @@ def _full_size(rng: np.random.Generator) -> Findings:
     ours_s /= LIMIT_CORES
     places = np.sort(rng.choice(np.flatnonzero(scene.inside), 300, replace=False))
     some = scene.images.reshape(150, -1)[:, places].astype(np.float64)
-    begin = time.process_time()
     with threadpool_limits(1):
-        theirs = numpy_irls_l1(some, scene.lights)
-    peer_s = (time.process_time() - begin) / len(places) * side**2
+        peer_s, theirs = spent(lambda: numpy_irls_l1(some, scene.lights))
+    peer_s *= side**2 / len(places)
     ours = estimate_normals(scene.images.reshape(150, -1)[:, places], scene.lights)
     truth = scene.normals.reshape(-1, 3)[places]
     both = ours.valid & (np.linalg.norm(theirs, axis=1) > 0)

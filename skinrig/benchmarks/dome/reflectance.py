@@ -1,6 +1,5 @@
 """Benchmark of the reflectance model: how many lobes skin needs, and the statistics of albedo."""
 
-import dataclasses
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -14,11 +13,11 @@ from reconstruction import brdf_basis, diffuse_albedo
 from rigsim.light import surface_brdf
 from rigsim.subject import make_subject
 from skinrig.arrays import BoolArray, Float64Array, Int64Array
-from skinrig.benchmarks.description import described
 from skinrig.benchmarks.dome import texture as bench_texture
-from skinrig.benchmarks.measurement import measure_and_keep
-from skinrig.benchmarks.resampling import drawn_again
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
+from skinrig.benchmarks.dome.brdf_truth import Samples
+from skinrig.benchmarks.resampling import drawn_median
+from skinrig.benchmarks.results import Knobs
+from skinrig.benchmarks.stage import Stage
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 from skinrig.rendering.photographs.errors import luminance
 
@@ -35,36 +34,13 @@ EXTREME_PRESETS: Final = ("palest", "darkest")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FacePoints:
-    """Points of a simulated face under the dome's lights, and what is true of them.
+class FacePoints(Samples):
+    """Points of a simulated face."""
 
-    Attributes
-    ----------
-    f
-        (P, M, 3) samples with noise, 1/sr; `variance` is theirs.
-    light, view
-        (P, M, 3), unit.
-    normals
-        (P, 3).
-    seen
-        (P, M) bool: light and view stand above the horizon.
-    left_out
-        (P, M) bool: samples of lights that no fit may see.
-    surface
-        (P, M) true surface term, 1/sr.
-    total
-        (P, M, 3) true reflection, 1/sr.
-    """
-
-    f: Float64Array
-    variance: Float64Array
-    light: Float64Array
-    view: Float64Array
-    normals: Float64Array
-    seen: BoolArray
     left_out: BoolArray
-    surface: Float64Array
+    """(P, M): samples of lights that no fit may see."""
     total: Float64Array
+    """(P, M, 3): true reflection, 1/sr."""
 
 
 def face_points(subject: str, *, points: int, samples: int, rng: np.random.Generator) -> FacePoints:
@@ -113,26 +89,24 @@ def face_points(subject: str, *, points: int, samples: int, rng: np.random.Gener
         to[1],
         normals,
         seen,
-        held[which[0]],
         np.asarray(specular, np.float64).reshape(len(chosen), count),
+        held[which[0]],
         clean,
     )
 
 
-def model(*, toy: bool) -> StageBenchmark:
+def model(stage: Stage) -> None:
     """Fit the surface term with few and many lobes, and predict lights that were left out."""
     rng = np.random.default_rng(0)
     materials = brdf_tables.default()
-    count, samples = (10, 120) if toy else (150, 400)
-    points: list[Point] = []
-    bands: dict[str, BandError] = {}
+    count, samples = (10, 120) if stage.toy else (150, 400)
     usual: list[float] = []
-    for subject in BAND_PRESETS if toy else (*BAND_PRESETS, *EXTREME_PRESETS):
+    for subject in BAND_PRESETS if stage.toy else (*BAND_PRESETS, *EXTREME_PRESETS):
         p = face_points(subject, points=count, samples=samples, rng=rng)
-        use = p.seen & ~p.left_out
+        use = p.valid & ~p.left_out
         known: dict[str, Any] = {"eta": ETA, "variance": p.variance, "valid": use}
-        albedo = diffuse_albedo.estimate(p.f, p.light, p.view, p.normals, **known)
-        given = brdf_basis.surface_samples(p.f, p.light, p.view, p.normals, albedo.r_d, **known)
+        albedo = diffuse_albedo.estimate(*p.samples, **known)
+        given = brdf_basis.surface_samples(*p.samples, albedo.r_d, **known)
         full = brdf_basis.fit_weights(given, materials)
         for rank in LOBE_RANKS:
             if rank > min(count, materials.size):
@@ -142,22 +116,21 @@ def model(*, toy: bool) -> StageBenchmark:
                 lobes = materials.mixed(brdf_basis.reduce(full, rank, basis=materials)[1])
                 return lobes, brdf_basis.fit_weights(given, lobes).weights
 
-            timing, made = measure_and_keep(reduced, repeats=1, memory=not toy)
+            timing, made = stage.time(reduced, repeats=1, memory=not stage.toy)
             surface, everything = _errors(p, *made, albedo.r_d)
-            outcome = BandError(float(np.median(surface)), drawn_again(surface, rng=rng))
+            outcome = drawn_median(surface, rng=rng)
             total = float(np.median(everything))
             knobs: Knobs = {"part": "lobes", "rank": rank, "subject": subject}
             knobs |= {"points": len(surface), "samples": samples}
             also = {"all_light_error_percent": round(total, 3)}
-            points.append(Point.of(knobs, timing, outcome, also))
+            stage.add(knobs, timing, outcome, also)
             if rank == USUAL_RANK:
-                bands |= {b: outcome for b, one in MELANIN_BANDS.items() if one.preset == subject}
+                stage.by_band |= {
+                    b: outcome for b, one in MELANIN_BANDS.items() if one.preset == subject
+                }
                 usual.append(total)
-    texture = [
-        dataclasses.replace(point, knobs={"part": "texture", **point.knobs})
-        for point in bench_texture.points(toy=toy)
-    ]
-    return described("reflectance", (*points, *texture), {"total": max(usual)}, by_band=bands)
+    bench_texture.add_efforts(stage, {"part": "texture"})
+    stage.limits["total"] = max(usual)
 
 
 def _errors(
@@ -165,7 +138,7 @@ def _errors(
 ) -> tuple[Float64Array, Float64Array]:
     """Return of each point the surface term's error over its sum, and that of all light, %."""
     known = np.asarray(np.isfinite(r_d).all(axis=1))
-    at = p.seen & p.left_out & known[:, None]
+    at = p.valid & p.left_out & known[:, None]
     some = np.flatnonzero(at.any(axis=1))
     surface, everything = [], []
     for point in some:

@@ -17,11 +17,10 @@ from rigsim.render import Caster
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import make_subject
 from skinrig.arrays import FloatArray
-from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import measured
 from skinrig.benchmarks.resampling import tiled_rms
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
-from skinrig.evaluating.skin_bands import MELANIN_BANDS
+from skinrig.benchmarks.results import BandError, Knobs
+from skinrig.benchmarks.stage import Stage
+from skinrig.evaluating.skin_bands import MelaninBand
 from skinrig.rendering.geometry import FittedSurface
 from skinrig.rendering.interior import Interior
 from skinrig.rendering.lights import Light
@@ -35,23 +34,21 @@ MEAN_SIGMA_TR_PER_MM: Final = (0.598, 1.069, 1.672)
 """Of a mean face, 1/mm: Weyrich et al. 2005, table 2."""
 
 
-def model(*, toy: bool) -> StageBenchmark:
+def model(stage: Stage) -> None:
     """Render a simulated face's true maps, and compare with the simulator's own pictures.
 
     Rays and textures are judged by the simulator at 36 rays a pixel, with every light from inside
     leaving where it entered; the tolerance of light that spreads by our own finest one.
     """
-    width, size, fine = (48, 128, 3) if toy else (325, 512, REFERENCE_SUBPIXELS)
-    rays = (1, 2) if toy else (1, 2, 3, 4)
+    width, size, fine = (48, 128, 3) if stage.toy else (325, 512, REFERENCE_SUBPIXELS)
+    rays = (1, 2) if stage.toy else (1, 2, 3, 4)
     rig = load_rig("dome").resized(width + width % 2).subset(views=[VIEW_NAME])
     seen = _Seen.of("III", rig, size=size, fine=fine)
-    points: list[Point] = []
-    binnings = (1, 2) if toy else (1, 2, 4, 8)
+    binnings = (1, 2) if stage.toy else (1, 2, 4, 8)
     laid = {k: seen.laid(binning=k) for k in binnings}
 
     def add(knobs: Knobs, call: Callable[[], FloatArray], true: FloatArray, repeats: int) -> None:
-        error = partial(_relative, true=true)
-        points.append(measured(knobs, call, error, repeats=repeats, memory=None))
+        stage.measure(knobs, call, partial(_relative, true=true), repeats=repeats, memory=None)
 
     for k in rays:
         knobs: Knobs = {"vary": "rays", "rays": k**2}
@@ -62,7 +59,7 @@ def model(*, toy: bool) -> StageBenchmark:
     skin = laid[1].of_medium(MEAN_SIGMA_TR_PER_MM)
     spread = partial(seen.shown, skin, subsurface="dipole", interior=Interior.of(skin), subpixels=1)
     best = spread(tolerance=0.001).diffuse
-    for tolerance in (0.1, 0.01) if toy else (3.0, 1.0, 0.3, 0.1, 0.01):
+    for tolerance in (0.1, 0.01) if stage.toy else (3.0, 1.0, 0.3, 0.1, 0.01):
         knobs = {"vary": "spreading", "tolerance": tolerance}
         add(knobs, lambda: spread(tolerance=tolerance).diffuse, best, 1)
     usual, true = seen.shown(laid[1]), seen.true
@@ -74,18 +71,16 @@ def model(*, toy: bool) -> StageBenchmark:
         for n, w in (("a", 0.3), ("b", 0.7))
     ]
     both = render(laid[1], seen.camera, two, subpixels=2, caster=seen.caster).radiance
-    bands = {}
-    for name, band in MELANIN_BANDS.items():
-        other = _Seen.of(band.preset, rig, size=128 if toy else 256, fine=fine)
-        bands[name] = _relative(other.shown(other.laid()).radiance, other.true)
-    return described(
-        "render-model",
-        points,
-        {"median": 100.0 * float(np.median(gap)), "sum": _relative(both, usual.radiance).error},
-        reference_error=points[len(rays) - 1].error * rays[-1] / fine,
-        by_band=bands,
-        rays=fine**2,
-    )
+
+    def on_skin(band: MelaninBand) -> BandError:
+        other = _Seen.of(band.preset, rig, size=128 if stage.toy else 256, fine=fine)
+        return _relative(other.shown(other.laid()).radiance, other.true)
+
+    stage.on_each_skin(on_skin)
+    stage.limits["median"] = 100.0 * float(np.median(gap))
+    stage.limits["sum"] = _relative(both, usual.radiance).error
+    stage.reference_error = stage.points[len(rays) - 1].error * rays[-1] / fine
+    stage.words["rays"] = fine**2
 
 
 @dataclass(frozen=True, slots=True)

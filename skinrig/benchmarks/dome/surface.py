@@ -4,7 +4,6 @@ import itertools
 import tempfile
 import time
 import tracemalloc
-from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,10 +20,9 @@ from reconstruction.lumitexels.ray_casting import RayCaster
 from reconstruction.lumitexels.store import LumitexelStore
 from reconstruction.surface import texture_fill
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import measured
 from skinrig.benchmarks.resampling import mean_error, tiled_rms
-from skinrig.benchmarks.results import BandError, Point, StageBenchmark, Timing
+from skinrig.benchmarks.results import BandError, Timing
+from skinrig.benchmarks.stage import Stage
 
 SPHERE_RADIUS_MM, SPHERE_ALBEDO = 80.0, 0.4
 N_FULL_SAMPLES = 500_000 * 16 * 150
@@ -32,72 +30,61 @@ N_ERROR_BLOCKS = 40
 """Of samples, whose means scatter independently."""
 
 
-def lumitexels(*, toy: bool) -> StageBenchmark:
+def lumitexels(stage: Stage) -> None:
     """Gather a Lambertian sphere, with tables in memory and on disk, of both precisions."""
-    width, step = (130, 30) if toy else (1300, 10)
+    width, step = (130, 30) if stage.toy else (1300, 10)
     names = [f"L{k:03d}" for k in range(0, 150, step)]
-    views = ["C02", "C07"] if toy else ["C02", "C07", "C13"]
+    views = ["C02", "C07"] if stage.toy else ["C02", "C07", "C13"]
     rig = load_rig("dome").resized(width).subset(lights=names, views=views)
     cameras = [CameraPose.nominal(view) for view in rig.views]
     lights = LightTable.nominal(rig)
-    sphere = trimesh.creation.icosphere(subdivisions=4 if toy else 6, radius=SPHERE_RADIUS_MM)
+    sphere = trimesh.creation.icosphere(subdivisions=4 if stage.toy else 6, radius=SPHERE_RADIUS_MM)
     caster = RayCaster(sphere.vertices, sphere.faces)
     seen = [_seen(camera) for camera in cameras]
-    points = []
-    rate = peak = 0.0
-    counts = (250, 500) if toy else (2_000, 10_000, 40_000)
+
+    def gathered(count: int, **table: Any) -> tuple[Timing, list[FloatArray]]:
+        """Gather some points; return seconds and MB held, and relative errors of the samples."""
+        where = sphere.vertices[:count]
+        surface = Surface(where, where / SPHERE_RADIUS_MM)
+        tracemalloc.start()
+        start = time.perf_counter()
+        store = LumitexelStore(surface, cameras=cameras, lights=lights, caster=caster, **table)
+        spent = time.perf_counter() - start
+        for view, light in itertools.product(range(len(cameras)), range(len(names))):
+            image = _image(seen[view], lights, light)
+            start = time.perf_counter()
+            store.add(view, light, image, np.full_like(image, 1e-6))
+            spent += time.perf_counter() - start
+        errors = []
+        start = time.perf_counter()
+        for _, part in store.chunks(1000):
+            inner = part.valid & (part.cos_light > 0.3) & (part.cos_view > 0.4)
+            errors.append(part.f[inner][:, 1] * np.pi / SPHERE_ALBEDO - 1)
+        spent += time.perf_counter() - start
+        peak = tracemalloc.get_traced_memory()[1] / 1e6
+        tracemalloc.stop()
+        return Timing.single(spent, peak), errors
+
+    counts = (250, 500) if stage.toy else (2_000, 10_000, 40_000)
     for count, kind in [(n, k) for n in counts for k in ("memory", "disk")]:
         with tempfile.TemporaryDirectory() as folder:
-            table: dict[str, Any] = {"folder": None, "dtype": np.float32}
-            if kind == "disk":
-                table = {"folder": Path(folder), "dtype": np.float16}
-            spent, peak, errors = _gathered(sphere, count, cameras, lights, caster, seen, table)
+            if kind == "memory":
+                timing, errors = gathered(count, folder=None, dtype=np.float32)
+            else:
+                timing, errors = gathered(count, folder=Path(folder), dtype=np.float16)
         off = 100 * np.abs(np.concatenate(errors))
-        rate = spent / (count * len(cameras) * len(names))
+        samples = count * len(cameras) * len(names)
         # samples of a point err alike: blocks of points are drawn
         blocks = mean_error([part.mean() for part in np.array_split(off, N_ERROR_BLOCKS)])
         outcome = BandError(float(off.mean()), blocks.error_interval)
-        points.append(
-            Point.of({"points": count, "tables": kind}, Timing.single(spent, peak), outcome)
-        )
-    return described("lumitexels", points, {"memory": peak, "hours": rate * N_FULL_SAMPLES / 3600})
+        stage.add({"points": count, "tables": kind}, timing, outcome)
+    hours = timing.seconds / samples * N_FULL_SAMPLES / 3600
+    stage.limits = {"memory": timing.peak_memory_mb or 0.0, "hours": hours}
 
 
-def _gathered(
-    sphere: trimesh.Trimesh,
-    count: int,
-    cameras: Sequence[CameraPose],
-    lights: LightTable,
-    caster: RayCaster,
-    seen: Sequence[Float64Array],
-    table: Mapping[str, Any],
-) -> tuple[float, float, list[FloatArray]]:
-    """Gather some points; return seconds, MB held, and relative errors of the samples."""
-    where = sphere.vertices[:count]
-    surface = Surface(where, where / SPHERE_RADIUS_MM)
-    tracemalloc.start()
-    start = time.perf_counter()
-    store = LumitexelStore(surface, cameras=cameras, lights=lights, caster=caster, **table)
-    spent = time.perf_counter() - start
-    for view, light in itertools.product(range(len(cameras)), range(len(lights.position_mm))):
-        image = _image(seen[view], lights, light)
-        start = time.perf_counter()
-        store.add(view, light, image, np.full_like(image, 1e-6))
-        spent += time.perf_counter() - start
-    errors = []
-    start = time.perf_counter()
-    for _, part in store.chunks(1000):
-        inner = part.valid & (part.cos_light > 0.3) & (part.cos_view > 0.4)
-        errors.append(part.f[inner][:, 1] * np.pi / SPHERE_ALBEDO - 1)
-    spent += time.perf_counter() - start
-    peak = tracemalloc.get_traced_memory()[1] / 1e6
-    tracemalloc.stop()
-    return spent, peak, errors
-
-
-def filling(*, toy: bool) -> StageBenchmark:
+def filling(stage: Stage) -> None:
     """Fill a smooth texture of three channels of which a part of the texels is known."""
-    side = 128 if toy else 2048
+    side = 128 if stage.toy else 2048
     rng = np.random.default_rng(0)
     y, x = np.mgrid[0:side, 0:side] / side
     truth = np.stack(
@@ -109,20 +96,15 @@ def filling(*, toy: bool) -> StageBenchmark:
         off = 100 * (filled - truth) / truth.std()
         return tiled_rms(off, unknown, tile_px=max(side // 16, 8))
 
-    points = []
     for share in (0.05, 0.15, 0.35, 0.75):
         weight = (rng.random((side, side)) < share).astype(np.float32)
         weight[side // 3 : side // 3 + side // 16, side // 3 : side // 2] = 0.0
         for way, fill in (("push-pull", _push_pull), ("nearest texel", _nearest)):
-            points.append(
-                measured(
-                    {"known": share, "way": way, "side": side},
-                    partial(fill, truth, weight),
-                    lambda filled: error(filled, weight == 0),
-                    repeats=1 if toy else 3,
-                )
+            stage.measure(
+                {"known": share, "way": way, "side": side},
+                partial(fill, truth, weight),
+                lambda filled: error(filled, weight == 0),
             )
-    return described("texture-fill", points)
 
 
 def _push_pull(values: Float32Array, weight: Float32Array) -> FloatArray:

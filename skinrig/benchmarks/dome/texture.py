@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,10 +12,9 @@ from model.texture_statistics import describe, match, steerable_pyramid
 from model.texture_statistics.histograms import distance
 from model.texture_statistics.space import TextureSpace
 from skinrig.arrays import Float32Array, Float64Array
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import measure
 from skinrig.benchmarks.resampling import mean_error
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
+from skinrig.benchmarks.results import BandError, Knobs
+from skinrig.benchmarks.stage import Stage
 
 MIN_SPEEDUP_OVER_PYRTOOLS = 10.0
 FULL_SIDE_PX, FULL_ITERATIONS = 1024, 4
@@ -70,18 +69,15 @@ def _error(images: list[Any], target: Float64Array, space: TextureSpace) -> Band
     return mean_error(off)
 
 
-def _point(
-    side: int,
+def _add(
+    stage: Stage,
     knobs: Knobs,
-    *,
-    repeats: int,
     levels: int = steerable_pyramid.LEVELS,
-    iterations: int = 5,
     dtype: type = np.float32,
-    start: Literal["image", "noise"] = "image",
-) -> Point:
+    **options: Any,
+) -> None:
     """Match plain skin to spotted skin; errors are at full depth, whatever depth is matched."""
-    rng = np.random.default_rng(0)
+    side, rng = int(knobs["side"]), np.random.default_rng(0)
     target: Any = skin_texture(side, spots=10.0, rng=rng).astype(dtype)
     sources = [0.9 * skin_texture(side, spots=0.0, rng=rng).astype(dtype) for _ in range(N_SOURCES)]
     full = TextureSpace.fit([target, *sources])
@@ -89,54 +85,40 @@ def _point(
     vector = describe(target, space=used)
 
     def run(source: Any) -> Any:
-        return match(
-            source,
-            vector,
-            space=used,
-            iterations=iterations,
-            noise=0.05,
-            start=start,
-            rng=np.random.default_rng(1),
-        ).image
+        rng = np.random.default_rng(1)
+        how = {"iterations": 5, "noise": 0.05} | options
+        return match(source, vector, space=used, rng=rng, **how).image
 
-    timing = measure(lambda: run(sources[0]), repeats=repeats)
+    timing, _ = stage.time(lambda: run(sources[0]))
     outcome = _error([run(s) for s in sources], describe(target, space=full), full)
-    return Point.of({"side": side, **knobs}, timing, outcome)
+    stage.add(knobs, timing, outcome)
 
 
-def points(toy: bool) -> tuple[Point, ...]:
+def add_efforts(stage: Stage, knobs: Knobs) -> None:
     """Measure pyramid depth and iterations (error: `matching`'s)."""
-    side, repeats = (48, 1) if toy else (256, 3)
-    depths, counts = ((1, 7), (0, 2)) if toy else ((1, 3, 5, 7), (0, 1, 2, 5, 10, 20))
-    found = [
-        _point(side, {"levels": n, "iterations": 5}, repeats=repeats, levels=n) for n in depths
-    ]
-    found += [
-        _point(side, {"levels": 7, "iterations": n}, repeats=repeats, iterations=n)
-        for n in counts
-        if n != 5
-    ]
-    return tuple(found)
+    at = knobs | {"side": _side(stage)}
+    depths, counts = ((1, 7), (0, 2)) if stage.toy else ((1, 3, 5, 7), (0, 1, 2, 10, 20))
+    for n in depths:
+        _add(stage, at | {"levels": n, "iterations": 5}, levels=n)
+    for n in counts:
+        _add(stage, at | {"levels": 7, "iterations": n}, iterations=n)
 
 
-def matching(*, toy: bool) -> StageBenchmark:
+def _side(stage: Stage) -> int:
+    return 48 if stage.toy else 256
+
+
+def matching(stage: Stage) -> None:
     """Match textures: depth, iterations, precision, size, start; then one channel at full size."""
-    side, repeats = (48, 1) if toy else (256, 3)
-    found = list(points(toy))
-    usual: Knobs = {"levels": 7, "iterations": 5}
-    found += [
-        _point(side, usual | {"precision": "float64"}, repeats=repeats, dtype=np.float64),
-        _point(side, usual | {"start": "noise"}, repeats=repeats, start="noise"),
-    ]
-    found += [_point(other, usual, repeats=repeats) for other in ((32,) if toy else (128, 512))]
-    limits, left_out = ({}, ()) if toy else against_peer()
-    return described(
-        "texture-matching",
-        tuple(found),
-        limits,
-        reference_error=_same_texture(side),
-        left_out=left_out,
-    )
+    add_efforts(stage, {})
+    usual: Knobs = {"side": _side(stage), "levels": 7, "iterations": 5}
+    _add(stage, usual | {"precision": "float64"}, dtype=np.float64)
+    _add(stage, usual | {"start": "noise"}, start="noise")
+    for other in (32,) if stage.toy else (128, 512):
+        _add(stage, usual | {"side": other})
+    stage.reference_error = _same_texture(_side(stage))
+    if not stage.toy:
+        against_peer(stage)
 
 
 def _same_texture(side: int) -> float:
@@ -195,13 +177,14 @@ def peer_responses(image: ArrayLike) -> list[Float64Array]:
     return [found["residual_highpass"], *bands, found["residual_lowpass"] / 4.0**levels]
 
 
-def against_peer(side: int = FULL_SIDE_PX) -> tuple[Findings, tuple[tuple[str, str], ...]]:
-    """Match one channel by turns with the peer; return limits, or what is left out and why."""
+def against_peer(stage: Stage, side: int = FULL_SIDE_PX) -> None:
+    """Match one channel by turns with the peer; take down limits, or what is left out and why."""
     try:
         peer_responses(np.zeros((512, 512)))
     except ImportError as error:
         why = f"the peer is missing ({error}); to measure it: pip install 'skinrig[peers]'"
-        return {}, ((f"{MIN_SPEEDUP_OVER_PYRTOOLS:g} x {PEER_NAME}", why),)
+        stage.left_out.append((f"{MIN_SPEEDUP_OVER_PYRTOOLS:g} x {PEER_NAME}", why))
+        return
     rng = np.random.default_rng(0)
     target = skin_texture(side, spots=10.0, rng=rng)[..., 1].copy()
     source = 0.9 * skin_texture(side, spots=0.0, rng=rng)[..., 1]
@@ -219,22 +202,17 @@ def against_peer(side: int = FULL_SIDE_PX) -> tuple[Findings, tuple[tuple[str, s
         spent = [_spent(partial(ours, n)) for n in (0, FULL_ITERATIONS)]
         ratios.append(FULL_ITERATIONS * _spent(theirs) / (spent[1] - spent[0]))
     wall, busy = np.median(ratios, axis=0)
-    wanted = space.histograms(vector)
-    off = [
-        float(distance(space.histograms(describe(i, space=space)), wanted, space.edges).mean())
-        for i in (own.astype(np.float32), peer.astype(np.float32))
-    ]
+    off = [_error([one.astype(np.float32)], vector, space).error for one in (own, peer)]
     apart = [
         float(np.abs(a - b).max() / source.max())
         for a, b in zip(steerable_pyramid.analyze(source), peer_responses(source), strict=True)
     ]
-    limits: Findings = {
+    stage.limits = {
         ("speed_up", side): float(wall),
         ("processor", side): float(busy),
         "distance": off[0] / off[1],
         "responses": max(apart),
     }
-    return limits, ()
 
 
 def _spent(call: Callable[[], Any]) -> Float64Array:

@@ -1,9 +1,10 @@
-"""Benchmark of trait vectors against traits that a simulated population is known to have."""
+"""Benchmarks of trait vectors, and of albedo maps edited by one, against a simulated population."""
 
+import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,18 +14,132 @@ from model.traits import TraitSpace, cosine, lobe_edits, reduced_spaces
 from model.traits.reduced_spaces import SpaceKind
 from reconstruction import brdf_basis
 from reconstruction.correspondence import common_regions
+from reconstruction.correspondence.common_parameterization import Chart
 from rigsim.population.population import Member, shifted, table_1
-from skinrig.arrays import BoolArray, Float64Array
+from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.benchmarks import resident_memory
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.dome.editing import TAN_MELANIN_FACTOR
-from skinrig.benchmarks.results import Knobs, Point, StageBenchmark, Timing
+from skinrig.benchmarks.resampling import mean_error, squares
+from skinrig.benchmarks.results import BandError, Knobs, Timing
+from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.editing import albedo as editing_albedo
 from skinrig.fitting import traits as fitting_traits
 from skinrig.traits import albedo_vectors
 from skinrig.traits import truth as trait_truth
-from skinrig.traits.albedo_vectors import VectorKind
+from skinrig.traits.albedo_vectors import AlbedoSample, AlbedoTraits, VectorKind
 from skinrig.traits.labels import Labels
 from skinrig.traits.truth import CommonFaces
+
+TAN_MELANIN_FACTOR: Final = 1.5
+"""Factor of melanin."""
+N_EDITED_FACES: Final = 4
+"""Faces that are edited; the traits are learned of others."""
+
+
+def editing(stage: Stage) -> None:
+    """Edit faces over iterations of matching, noise and kinds of vectors."""
+    count, size = (4, 64) if stage.toy else (28, 192)
+    # heads take long to build: one of them is enough to see that this runs
+    everybody = [p for p in table_1() if not stage.toy or p.head == 0]
+    order = np.random.default_rng(0).permutation(len(everybody))[: count + N_EDITED_FACES]
+    people = [dataclasses.replace(everybody[k], applied=()) for k in order]
+    faces = CommonFaces.of(people, size=size, common=64 if stage.toy else 128)
+    learned, edited = people[:count], people[count:]
+    tanned = [p if k % 2 else _tanned(p) for k, p in enumerate(learned)]
+    rng = np.random.default_rng(1)
+    samples = [faces.albedo(p, noise=0.01, rng=rng) for p in tanned]
+    labels = Labels(tuple(p.name for p in learned), {"tan": np.arange(count) % 2 == 0}, {}, ())
+    before = [faces.albedo(p, noise=0.0, rng=rng) for p in edited]
+    after = [faces.albedo(_tanned(p), noise=0.0, rng=rng) for p in edited]
+    kept = {}
+    usual = editing_albedo.MATCHING_NOISE
+    settings: list[tuple[VectorKind, int, float]] = [
+        ("quantiles", 5, usual),
+        ("quantiles", 5, 0.0),
+        ("histograms", 5, usual),
+        *(("quantiles", n, usual) for n in ((1,) if stage.toy else (1, 2, 10))),
+    ]
+    spaces: dict[str, AlbedoTraits] = {}
+    for kind, iterations, noise in settings:
+        if kind not in spaces:
+            found = fitting_traits.albedo_spaces(samples, labels, faces.frame, kind, left_out=[])
+            spaces[kind] = AlbedoTraits(kind, found["texture"], found["albedo"])
+        call = partial(_edit, spaces[kind], iterations, noise)
+        errors, back = [], []
+        for one, truth in zip(before, after, strict=True):
+            new = call(one.r_d, one.valid, 1.0)
+            again = call(new, one.valid, -1.0)
+            errors.append(_error_percent(new, one, truth))
+            there = one.valid & truth.valid
+            back.append(100 * float(np.sqrt(np.mean((again / one.r_d - 1)[there] ** 2))))
+        first = partial(call, before[0].r_d, before[0].valid, 1.0)
+        timing, _ = stage.time(first, memory=not stage.toy)
+        if not stage.by_band:
+            stage.on_each_skin(lambda band: _on_skin(call, faces, band.melanin, people[0]))
+        knobs: Knobs = {"vectors": kind, "iterations": iterations, "noise": noise}
+        outcome = stage.add(knobs, timing, mean_error(errors))
+        kept[kind, iterations, noise] = outcome.error, float(np.mean(back))
+    error, returned = kept[settings[0]]
+    pairs = zip(before, after, strict=True)
+    none = float(np.mean([_error_percent(a.r_d, a, b) for a, b in pairs]))
+    same = _edit(spaces["quantiles"], 5, usual, before[0].r_d, before[0].valid, 0.0)
+    zero = float(np.abs(same / before[0].r_d - 1)[before[0].valid].max())
+    stage.limits |= {"error": error, "over_no_edit": error / none}
+    stage.limits |= {"round_trip": returned, "zero": zero}
+
+
+def _on_skin(
+    edit: Callable[..., Float32Array], faces: CommonFaces, melanin: float, person: Member
+) -> BandError:
+    """Return the error of a tan put on one face of so much melanin, %."""
+    here = dataclasses.replace(person, melanin=melanin)
+    rng = np.random.default_rng(2)
+    one, truth = (faces.albedo(p, noise=0.0, rng=rng) for p in (here, _tanned(here)))
+    new = edit(one.r_d, one.valid, 1.0)
+    good = one.valid & truth.valid
+    sizes = 100 * np.abs(new / truth.r_d - 1)
+    # neighbors err alike: the face is cut into squares
+    places = [at for at in squares(len(good)) if good[at].any()]
+    medians = [float(np.median(sizes[at][good[at]])) for at in places]
+    half = 1.2533 * float(np.std(medians)) / np.sqrt(len(medians))
+    return BandError.around(float(np.median(sizes[good])), half)
+
+
+def _error_percent(r_d: FloatArray, one: AlbedoSample, truth: AlbedoSample) -> float:
+    """Return the median error of an edited R_d where both faces are known, %."""
+    return 100 * float(np.median(np.abs(r_d / truth.r_d - 1)[one.valid & truth.valid]))
+
+
+def _tanned(person: Member) -> Member:
+    return dataclasses.replace(person, melanin=TAN_MELANIN_FACTOR * person.melanin)
+
+
+def _edit(
+    space: AlbedoTraits,
+    iterations: int,
+    noise: float,
+    r_d: FloatArray,
+    valid: BoolArray,
+    amount: float,
+) -> Float32Array:
+    """Edit a map that lies in the common map already."""
+    size = len(r_d)
+    place = np.stack(np.meshgrid(np.arange(size), np.arange(size)), axis=-1).astype(np.float64)
+    on = np.ones((size, size), np.bool_)
+    chart = Chart(size, place, on, on, np.zeros((size, size), np.float32))
+    found = editing_albedo.edit_albedo(
+        r_d,
+        valid,
+        chart,
+        space,
+        {"tan": amount},
+        region=on,
+        share=np.ones((size, size)),
+        iterations=iterations,
+        noise=noise,
+        rng=np.random.default_rng(int(amount < 0)),
+    )
+    return found.apply(r_d)[0]
+
 
 N_GROUP_DRAWS = 12
 """Random choices of so many people, whose scatter is the error's."""
@@ -36,23 +151,22 @@ SPACE_KINDS: tuple[SpaceKind, ...] = ("pca", "nmf")
 VECTOR_KINDS: tuple[VectorKind, ...] = ("quantiles", "histograms")
 
 
-def traits(*, toy: bool) -> StageBenchmark:
+def traits(stage: Stage) -> None:
     """Learn lotion from fitted lobes and tan from albedo maps, over people, spaces and noise."""
     people = table_1()
     rng = np.random.default_rng(0)
-    some = [people[i] for i in np.sort(rng.permutation(len(people))[: 8 if toy else 40])]
-    points, limits = _surface(some, toy=toy)
-    more, bounds = _albedo(some, toy=toy)
-    return described("traits", (*points, *more), limits | bounds)
+    some = [people[i] for i in np.sort(rng.permutation(len(people))[: 8 if stage.toy else 40])]
+    _surface(stage, some)
+    _albedo(stage, some)
 
 
-def _surface(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], Findings]:
+def _surface(stage: Stage, people: Sequence[Member]) -> None:
     basis = brdf_tables.default()
     strength = basis.strength()
     metric = basis.kinship() * np.outer(strength, strength)
     dressed = shifted(people, "lotion", apply={"lotion": 0.9}, rng=np.random.default_rng(1))
     label = np.array(["lotion" in person.marks for person in dressed])
-    compared = [people[i] for i in range(0, len(people), 4 if toy else 8)]
+    compared = [people[i] for i in range(0, len(people), 4 if stage.toy else 8)]
     worn = shifted(
         compared, "lotion", apply={"lotion": 0.9}, share=1.0, rng=np.random.default_rng(1)
     )
@@ -61,37 +175,35 @@ def _surface(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], Findi
     truth = trait_truth.lobe_change(
         bare,
         worn,
-        points=4 if toy else 60,
-        pairs=500 if toy else 1000,
+        points=4 if stage.toy else 60,
+        pairs=500 if stage.toy else 1000,
         rng=np.random.default_rng(2),
     )
 
     def judged(space: TraitSpace) -> float:
         return truth.cosine(space.trait("trait").vector, basis)
 
-    found: list[Point] = []
-    limits: Findings = {}
     rng = np.random.default_rng(3)
-    most = 4 if toy else 20
+    most = 4 if stage.toy else 20
     seen = [trait_truth.surface_points(p, most, rng=rng) for p in dressed]
-    for noise, places in ((0.02, 4),) if toy else ((0.2, 20), (0.02, 5), (0.02, 20)):
+    for noise, places in ((0.02, 4),) if stage.toy else ((0.2, 20), (0.02, 5), (0.02, 20)):
         means = np.array(
             [
                 trait_truth.mean_mixture(
-                    p[:places], basis, pairs=60 if toy else 160, noise=noise, rng=rng
+                    p[:places], basis, pairs=60 if stage.toy else 160, noise=noise, rng=rng
                 )
                 for p in seen
             ]
         )
-        for group in (2, 3) if toy else (3, 8, int(label.sum())):
+        for group in (2, 3) if stage.toy else (3, 8, int(label.sum())):
             for kind in SPACE_KINDS:
-                knobs = {"trait": "lotion", "space": kind, "noise": noise, "points": places}
+                knobs: Knobs = {"trait": "lotion", "space": kind, "noise": noise, "points": places}
                 fit = partial(_fitted, means, label, kind, metric, basis)
-                found.append(_drawn(fit, label, group, knobs, judged))
+                _add(stage, knobs, fit, label, group, judged)
     space = _fitted(means, label, "nmf", metric, basis, np.arange(len(means)))
-    limits["lotion"] = judged(space)
-    limits |= _false_alarms("lobes", means, metric, toy=toy)
-    return found, limits | _returned(means[~label], space, metric)
+    stage.limits["lotion"] = judged(space)
+    stage.limits["false_alarms", "lobes"] = _false_alarms(stage, means, metric)
+    stage.limits |= _returned(means[~label], space, metric)
 
 
 def _fitted(
@@ -109,14 +221,15 @@ def _fitted(
     return TraitSpace.fit(some, {"trait": label[rows]}, space=kind, basis=mix, metric=metric)
 
 
-def _drawn(
+def _add(
+    stage: Stage,
+    knobs: Knobs,
     fit: Callable[[NDArray[np.intp]], TraitSpace],
     label: BoolArray,
     group: int,
-    knobs: dict[str, Any],
     judged: Callable[[TraitSpace], float],
-) -> Point:
-    """Learn from random groups of people; the error is the median over them."""
+) -> float:
+    """Learn from random groups of people; add and return the error, the median over them."""
     sides = [np.flatnonzero(label), np.flatnonzero(~label)]
     most = min(group, *(len(side) for side in sides))
     whole = most == min(len(side) for side in sides)
@@ -141,12 +254,12 @@ def _drawn(
         low, high = max(middle - half, 0.0), middle + half
     spread = min(seconds), max(seconds)
     timing = Timing(float(np.median(seconds)), spread, seconds[0], rise.mb, "resident")
-    shown = {**knobs, "people": 2 * most if not whole else len(label)}
+    shown: Knobs = {**knobs, "people": 2 * most if not whole else len(label)}
     also = {
         "components": int(np.median(kept)),
         "expected_cosine": round(float(np.median(expected)), 4),
     }
-    return Point(shown, timing, middle, (low, high), also=also)
+    return stage.add(shown, timing, BandError(middle, (low, high)), also).error
 
 
 def _jackknife(value: Callable[[NDArray[np.intp]], float], rows: NDArray[np.intp]) -> float:
@@ -157,17 +270,15 @@ def _jackknife(value: Callable[[NDArray[np.intp]], float], rows: NDArray[np.intp
     return float(np.std(values) * np.sqrt(count - 1))
 
 
-def _false_alarms(
-    what: str, samples: Float64Array, metric: Float64Array | None, *, toy: bool
-) -> Findings:
+def _false_alarms(stage: Stage, samples: Float64Array, metric: Float64Array | None) -> float:
     """Return how often shuffled labels pass for a trait."""
     rng = np.random.default_rng(6)
     passed = []
-    for _ in range(10 if toy else N_LABEL_SHUFFLES):
+    for _ in range(10 if stage.toy else N_LABEL_SHUFFLES):
         label = rng.permutation(np.arange(len(samples)) < len(samples) // 3)
         space = TraitSpace.fit(samples, {"none": label}, components=1, metric=metric)
         passed.append(space.trait("none").confidence.p_value < 0.05)
-    return {("false_alarms", what): float(np.mean(passed))}
+    return float(np.mean(passed))
 
 
 def _returned(faces: Float64Array, space: TraitSpace, metric: Float64Array) -> Findings:
@@ -195,19 +306,17 @@ def _returned(faces: Float64Array, space: TraitSpace, metric: Float64Array) -> F
     }
 
 
-def _albedo(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], Findings]:
+def _albedo(stage: Stage, people: Sequence[Member]) -> None:
     tanned = shifted(people, "tan", melanin=TAN_MELANIN_FACTOR, rng=np.random.default_rng(1))
     label = np.array(["tan" in person.marks for person in tanned])
-    faces = CommonFaces.of(people, size=64 if toy else 128, common=48 if toy else 80)
+    faces = CommonFaces.of(people, size=64 if stage.toy else 128, common=48 if stage.toy else 80)
     inside = common_regions.region("face", faces.frame)
     compared = list(range(0, len(people), 4))
     seen = list(range(2, len(people), 4))
     after = shifted(
         people, "tan", melanin=TAN_MELANIN_FACTOR, share=1.0, rng=np.random.default_rng(1)
     )
-    points: list[Point] = []
-    limits: Findings = {}
-    for noise in (0.01,) if toy else (0.01, 0.1):
+    for noise in (0.01,) if stage.toy else (0.01, 0.1):
         maps = [
             faces.albedo(p, noise=noise, rng=np.random.default_rng([8, k]))
             for k, p in enumerate(tanned)
@@ -236,19 +345,18 @@ def _albedo(people: Sequence[Member], *, toy: bool) -> tuple[list[Point], Findin
                 return cosine(space.trait("trait").vector, truth)
 
             knobs: Knobs = {"trait": "tan", "space": f"pca of {kind}", "noise": noise}
-            for group in (2, 3) if toy else (3, 8, int(label.sum())):
-                for components in (None, 1) if toy else (None, 1, 4):
+            for group in (2, 3) if stage.toy else (3, 8, int(label.sum())):
+                for components in (None, 1) if stage.toy else (None, 1, 4):
                     asked = knobs | {"asked": components or "chosen"}
                     fit = partial(_learned, rows, label, components)
-                    points.append(_drawn(fit, label, group, asked, judged))
+                    _add(stage, asked, fit, label, group, judged)
             tan = np.arange(len(pairs)) >= len(seen)
             fit, asked = partial(_learned, pairs, tan, None), knobs | {"asked": "seen twice"}
-            points.append(_drawn(fit, tan, len(pairs), asked, judged))
+            error = _add(stage, asked, fit, tan, len(pairs), judged)
             # Plain histograms are measured, and miss it: their points say by how much
             if noise == 0.01 and kind == "quantiles":
-                limits["tan", kind, len(seen)] = 1.0 - points[-1].error
-                limits |= _false_alarms("albedo", rows, None, toy=toy)
-    return points, limits
+                stage.limits["tan", kind, len(seen)] = 1.0 - error
+                stage.limits["false_alarms", "albedo"] = _false_alarms(stage, rows, None)
 
 
 def _vectors(

@@ -13,13 +13,13 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.correspondence import expression_alignment
 from rigsim.subject import SimulatedSubject, make_subject
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import measure_and_keep
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
-from skinrig.evaluating.skin_bands import MELANIN_BANDS
+from skinrig.benchmarks.results import BandError, Knobs
+from skinrig.benchmarks.stage import Stage
 
 Points = dict[str, tuple[float, float]]
 
+LANDMARK_NOISE_PX = 1.0
+"""Standard deviation along each axis of where somebody places a landmark."""
 TABLE_CAMERA, TABLE_ILLUMINANT = "Nikon 5100 (NPL)", "D65"
 
 
@@ -115,6 +115,13 @@ def oval(side: int) -> BoolArray:
     return np.asarray((x / 0.34) ** 2 + (y / 0.40) ** 2 < 1.0)
 
 
+def seen_at(image: Float64Array, away: Float64Array, order: int = 3) -> Float64Array:
+    """Return an image (N, N) at places that are away from each pixel by columns and rows."""
+    rows, columns = np.indices(image.shape, np.float64)
+    at = [rows + away[..., 1], columns + away[..., 0]]
+    return np.asarray(map_coordinates(image, at, order=order, mode="nearest"))
+
+
 def moved_face(
     face: SimulatedSubject,
     displacement_px: Float64Array,
@@ -122,7 +129,6 @@ def moved_face(
     state: str = "smile",
     noise: float = 0.01,
     landmarks: int = 24,
-    landmark_noise_px: float = 1.0,
     rng: np.random.Generator,
 ) -> MovedFace:
     """Picture a face in neutral, and moved in a state of its blood.
@@ -137,28 +143,15 @@ def moved_face(
         Of `rigsim.subject.perfusion.STATE_NAMES`.
     noise
         Relative standard deviation of each channel of each pixel.
-    landmarks, landmark_noise_px
-        How many, and how precisely somebody placed each along each axis.
+    landmarks
+        How many somebody placed.
     rng
         Draws noise.
     """
     side = face.size
-    rows, columns = np.mgrid[:side, :side].astype(np.float64)
     back = np.zeros_like(displacement_px)
     for _ in range(60):
-        at = [rows + back[..., 1], columns + back[..., 0]]
-        back = -np.stack(
-            [
-                map_coordinates(displacement_px[..., k], at, order=1, mode="nearest")
-                for k in range(2)
-            ],
-            axis=-1,
-        )
-    at = [rows + back[..., 1], columns + back[..., 0]]
-
-    def pulled(image: Float64Array, order: int = 3) -> Float64Array:
-        return np.asarray(map_coordinates(image, at, order=order, mode="nearest"))
-
+        back = -np.stack([seen_at(displacement_px[..., k], back, 1) for k in range(2)], axis=-1)
     colors = table()
     light = 0.75 * np.clip(face.normal[..., 2], 0.05, 1.0)
     rest = face.hemoglobin(state)
@@ -167,7 +160,7 @@ def moved_face(
     for blood, moved in ((face.hemoglobin(), False), (rest, True)):
         clean = colors.lookup(face.melanin, blood) * light[..., None]
         if moved:
-            clean = np.stack([pulled(clean[..., k]) for k in range(3)], axis=-1)
+            clean = np.stack([seen_at(clean[..., k], back) for k in range(3)], axis=-1)
         pictures.append((clean * (1.0 + noise * rng.standard_normal(clean.shape))).astype("f4"))
         variances.append(((noise * clean) ** 2).astype("f4"))
     points = spread_points(mask, landmarks)
@@ -175,7 +168,7 @@ def moved_face(
     placed = [
         {
             f"point {k + 1}": (float(x), float(y))
-            for k, (x, y) in enumerate(p + rng.normal(0.0, landmark_noise_px, p.shape))
+            for k, (x, y) in enumerate(p + rng.normal(0.0, LANDMARK_NOISE_PX, p.shape))
         }
         for p in (points.astype(np.float64), gone)
     ]
@@ -185,14 +178,14 @@ def moved_face(
         variances[0],
         variances[1],
         mask,
-        pulled(mask.astype(np.float64), 1) > 0.99,
-        np.stack([columns, rows], axis=-1) + displacement_px,
+        seen_at(mask.astype(np.float64), back, 1) > 0.99,
+        np.indices((side, side), np.float64)[::-1].transpose(1, 2, 0) + displacement_px,
         placed[0],
         placed[1],
         face.melanin,
         face.hemoglobin(),
         rest,
-        pulled(rest.astype(np.float64)).astype("f4"),
+        seen_at(rest.astype(np.float64), back).astype("f4"),
     )
 
 
@@ -213,49 +206,37 @@ def face_of(preset: str, side: int, *, seed: int = 0) -> SimulatedSubject:
     return make_subject(preset, seed=seed, size=side)
 
 
-def aligned(*, toy: bool) -> StageBenchmark:
+def aligned(stage: Stage) -> None:
     """Align moved faces by landmarks few and many, by features, with and without dense flow."""
-    side = 128 if toy else 512
+    side = 128 if stage.toy else 512
     rng = np.random.default_rng(1)
     face = face_of("III", side, seed=2)
     away = smooth_displacement(side, bend_px=side / 10, rms_px=side / 50, rng=rng)
     seen = moved_face(face, away, state="exercise", noise=0.005, landmarks=48, rng=rng)
     still = moved_face(face, np.zeros_like(away), state="exercise", noise=0.005, rng=rng)
     effort = [(8, 0), (24, 0), (48, 0), (24, 2)]
-    if not toy:
-        effort = [
-            (8, 0),
-            (8, 2),
-            *((24, n) for n in (0, 1, 2, 4)),
-            (48, 0),
-            (48, 2),
-            (0, 0),
-            (0, 2),
-        ]
-    points = {}
+    if not stage.toy:
+        both = [(n, rounds) for n in (48, 0) for rounds in (0, 2)]
+        effort = [(8, 0), (8, 2), *((24, n) for n in (0, 1, 2, 4)), *both]
     for count, rounds in effort:
-        timing, found = measure_and_keep(
+        timing, found = stage.time(
             lambda: seen.align(count, rounds), repeats=1, memory=(count, rounds) == (24, 2)
         )
         error = seen.errors_px(found)
         if (count, rounds) == (24, 2):
             covered = float((error < 2.0 * found.error_px[found.valid]).mean())
         knobs = {"by": found.by, "landmarks": count, "rounds": rounds}
-        points[count, rounds] = Point.of(knobs, timing, _rms(error, side))
-    bands = {
-        name: _on_skin(band.preset, 128 if toy else 256) for name, band in MELANIN_BANDS.items()
-    }
-    limits: Findings = {}
-    if not toy:
-        limits = {
+        stage.add(knobs, timing, _rms(error, side))
+    stage.on_each_skin(lambda band: _on_skin(band.preset, 128 if stage.toy else 256))
+    stage.words["moved_px"] = side / 50
+    if not stage.toy:
+        bare, dense = (stage.at(landmarks=24, rounds=n) for n in (0, 2))
+        stage.limits = {
             "false_motion": float(np.median(still.errors_px(still.align(24, 2)))),
             "covered": covered,
-            "by_flow": points[24, 0].error / points[24, 2].error,
-            "seconds": points[24, 2].timing.seconds,
+            "by_flow": bare.error / dense.error,
+            "seconds": dense.timing.seconds,
         }
-    return described(
-        "expression-alignment", points.values(), limits, by_band=bands, moved_px=side / 50
-    )
 
 
 def _on_skin(preset: str, side: int) -> BandError:
@@ -269,22 +250,20 @@ def _on_skin(preset: str, side: int) -> BandError:
 MISALIGNMENTS_PX = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)
 
 
-def misaligned(*, toy: bool) -> StageBenchmark:
+def misaligned(stage: Stage) -> None:
     """Blend from maps that were put in a wrong place on purpose, beside interpolating them.
 
     The paper's claim (Jimenez et al. 2010, section 4.2) is that local statistics bear alignments
     that are not perfect, and interpolated maps do not.
     """
-    side = 128 if toy else 512
+    side = 128 if stage.toy else 512
     face = face_of("III", side, seed=2)
     mask = oval(side)
     neutral = face.hemoglobin().astype(np.float64)
-    points = []
-    errors: dict[tuple[float, float, str], float] = {}
-    for state in ("exercise",) if toy else ("exercise", "smile"):
+    for state in ("exercise",) if stage.toy else ("exercise", "smile"):
         truth = face.hemoglobin(state).astype(np.float64)
         size = _rms((truth - neutral)[mask], side).error
-        for off_px in MISALIGNMENTS_PX[:3] if toy else MISALIGNMENTS_PX:
+        for off_px in MISALIGNMENTS_PX[:3] if stage.toy else MISALIGNMENTS_PX:
             map_of_state = displaced(truth, off_px, rng=np.random.default_rng(3))
 
             def blended(radius: float) -> Float64Array:
@@ -295,20 +274,18 @@ def misaligned(*, toy: bool) -> StageBenchmark:
                 )
                 return np.asarray(rig.blend({state: 1.0, "neutral": 0.0}), np.float64)
 
-            for radius in (0.0, 16.0) if toy else (0.0, 8.0, 16.0, 32.0):
-                timing, found = measure_and_keep(lambda: blended(radius), repeats=1, memory=False)
+            for radius in (0.0, 16.0) if stage.toy else (0.0, 8.0, 16.0, 32.0):
+                timing, found = stage.time(lambda: blended(radius), repeats=1, memory=False)
                 error = (found - truth)[mask] / size
                 outcome = _rms(error[np.isfinite(error)], side)
-                errors[radius, off_px, state] = outcome.error
                 way = "blended" if radius else "interpolated"
                 knobs: Knobs = {"state": state, "way": way, "off_px": off_px}
                 knobs |= {"radius_px": radius} if radius else {}
-                points.append(Point.of(knobs, timing, outcome))
-    limits: Findings = {}
-    if not toy:
-        for state in ("exercise", "smile"):
-            limits["ratio", state] = errors[0.0, 2.0, state] / errors[16.0, 2.0, state]
-    return described("misalignment", points, limits)
+                stage.add(knobs, timing, outcome)
+        if not stage.toy:
+            kept = stage.at(state=state, off_px=2.0, way="interpolated")
+            blend = stage.at(state=state, off_px=2.0, radius_px=16.0)
+            stage.limits["ratio", state] = kept.error / blend.error
 
 
 def displaced(image: Float64Array, rms_px: float, *, rng: np.random.Generator) -> Float64Array:
@@ -316,10 +293,7 @@ def displaced(image: Float64Array, rms_px: float, *, rng: np.random.Generator) -
     if rms_px == 0.0:
         return image
     side = image.shape[0]
-    away = smooth_displacement(side, bend_px=side / 12.8, rms_px=rms_px, rng=rng)
-    rows, columns = np.mgrid[:side, :side].astype(np.float64)
-    at = [rows + away[..., 1], columns + away[..., 0]]
-    return np.asarray(map_coordinates(image, at, order=3, mode="nearest"))
+    return seen_at(image, smooth_displacement(side, bend_px=side / 12.8, rms_px=rms_px, rng=rng))
 
 
 def _rms(values: Float64Array, side: int) -> BandError:

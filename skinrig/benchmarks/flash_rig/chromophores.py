@@ -1,28 +1,41 @@
-"""Benchmark of the chromophore inversion, beside SciPy's least squares in the same run."""
+"""Benchmarks of the chromophore inversion: of one picture, and of states with one melanin."""
+
+from __future__ import annotations
 
 import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from model import color_table, metrics
+from model import color_table
+from model.color_table import ColorTable
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import chromophores
-from skinrig.arrays import Float64Array, FloatArray
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import measure_and_keep
+from reconstruction.chromophores import model_error, shading_prior
+from reconstruction.chromophores import posterior as chromophore_posterior
+from reconstruction.chromophores.shading_prior import ShadingPrior
+from reconstruction.facial_color import shared_melanin
+from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
+from skinrig.benchmarks.flash_rig.alignment import face_of, oval, table
+from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds
 from skinrig.benchmarks.resampling import median_error
-from skinrig.benchmarks.results import BandError, Point, StageBenchmark
-from skinrig.evaluating.skin_bands import MELANIN_BANDS
+from skinrig.benchmarks.results import BandError, Knobs
+from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.evaluating.skin_bands import MelaninBand
 
 CHANNEL_NOISE = 0.01
+SHADINGS: dict[str, Literal["known"] | None] = {"known": "known", "free": None}
 MIN_MELANIN = 0.004
 """Volume fraction of the palest skin that is drawn."""
 
 
-def inversion(*, toy: bool) -> StageBenchmark:
+def inversion(stage: Stage) -> None:
     """Invert a noisy picture with the shading known and free, through tables of several sizes."""
-    side, pixels = (96, 8) if toy else (2048, 40)
+    side, pixels = (96, 8) if stage.toy else (2048, 40)
     rng = np.random.default_rng(0)
     table = color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
     y, x = np.mgrid[0:side, 0:side] / side
@@ -32,43 +45,25 @@ def inversion(*, toy: bool) -> StageBenchmark:
     noisy = (color * (1 + CHANNEL_NOISE * rng.standard_normal(color.shape))).astype(np.float32)
     picture = noisy.reshape(side, side, 3)
     variance = (CHANNEL_NOISE * color.reshape(side, side, 3)).astype(np.float32) ** 2
-    points = []
-    limits: Findings = {}
-    for shading in ("known", "free"):
-        for size in (16, 128) if toy else (16, 32, 64, 128):
+    for shading in SHADINGS:
+        for size in (16, 128) if stage.toy else (16, 32, 64, 128):
             coarse = color_table.build(
                 "Nikon 5100 (NPL)", "D55", size=size, anisotropy=ANISOTROPY_SKIN
             )
-            timing, found = measure_and_keep(
+            timing, found = stage.time(
                 lambda: chromophores.invert(
-                    picture,
-                    coarse,
-                    shading="known" if shading == "known" else None,
-                    variance=variance,
-                ),
-                repeats=1 if toy else 3,
+                    picture, coarse, shading=SHADINGS[shading], variance=variance
+                )
             )
-            relative = 100 * np.abs(found.melanin / c_m - 1)
-            median, interval = metrics.median_with_interval(relative[found.valid], rng=rng)
-            # the median of |error| of a normal error of the bound's size
-            bound = 67.45 * float(np.median((found.stderr_melanin / c_m)[found.valid]))
-            knobs = {"shading": shading, "table": size}
-            points.append(Point(knobs, timing, median, interval, bound))
+            outcome = _error(found, c_m, rng)
+            stage.add({"shading": shading, "table": size}, timing, outcome)
         if shading == "free":
             peer_s = _scipy_seconds(picture.reshape(-1, 3)[:: side * side // pixels], table)
             ours_s = timing.seconds / side**2
-            limits = {("seconds", side): timing.seconds, "speed_up": peer_s / ours_s}
-    return described(
-        "chromophores", points, limits, by_band=_by_band(table, 500 if toy else 20_000, rng)
-    )
+            stage.limits = {("seconds", side): timing.seconds, "speed_up": peer_s / ours_s}
+    count = 500 if stage.toy else 20_000
 
-
-def _by_band(
-    table: color_table.ColorTable, count: int, rng: np.random.Generator
-) -> dict[str, BandError]:
-    """Return the median error of melanin in percent, shading free, from light skin to dark."""
-    errors = {}
-    for name, band in MELANIN_BANDS.items():
+    def on_skin(band: MelaninBand) -> BandError:
         low, high = band.melanin_range
         c_m = rng.uniform(max(low, MIN_MELANIN), min(high, table.c_m_max), count)
         c_hd = rng.uniform(0.02, 0.08, count)
@@ -79,11 +74,19 @@ def _by_band(
             table,
             variance=(CHANNEL_NOISE * color[None]).astype(np.float32) ** 2,
         )
-        valid = found.valid[0]
-        off = 100 * np.abs(found.melanin[0] / c_m - 1)[valid]
-        bound = 67.45 * float(np.median((found.stderr_melanin[0] / c_m)[valid]))
-        errors[name] = median_error(off, bound=bound)
-    return errors
+        return _error(found, c_m)
+
+    stage.on_each_skin(on_skin)
+
+
+def _error(
+    found: chromophores.ChromophoreMaps, c_m: Float64Array, rng: np.random.Generator | None = None
+) -> BandError:
+    """Return the median error of melanin, %."""
+    off = 100 * np.abs(found.melanin / c_m - 1)[found.valid]
+    # the median of |error| of a normal error of the bound's size
+    bound = 67.45 * float(np.median((found.stderr_melanin / c_m)[found.valid]))
+    return median_error(off, bound, rng=rng)
 
 
 def _scipy_seconds(rgb: FloatArray, table: color_table.ColorTable) -> float:
@@ -97,3 +100,176 @@ def _scipy_seconds(rgb: FloatArray, table: color_table.ColorTable) -> float:
 
         least_squares(residual, [0.27, 0.33, 0.0])
     return (time.perf_counter() - start) / len(rgb)
+
+
+STATE_NAMES = ("neutral", "smile", "anger", "fear", "happiness", "sadness", "surprise")
+SUPERPIXEL_NOISE = 0.003
+"""Relative noise of a superpixel of the flash rig's camera on light skin."""
+LIGHT_CHANGE = 0.05
+"""How much the light of a state differs, smoothly over the face."""
+FULL_SIDE_PX = 1024
+
+
+def shared(stage: Stage) -> None:
+    """Invert 1 to 7 states together, the light free or smooth, beside each state alone."""
+    side = 64 if stage.toy else 192
+    model = _Model(table(), shading_prior.of_faces(), model_error.load())
+    seen = _States.of("II", side, STATE_NAMES, model)
+
+    def alone() -> Float64Array:
+        each = [
+            chromophore_posterior.estimate(
+                seen.rgb[k],
+                model.colors,
+                prior=model.prior,
+                variance=seen.variance[k],
+                model_error=model.covariance,
+                valid=seen.mask,
+            )
+            for k in (0, 1)
+        ]
+        return np.asarray(each[1].hemoglobin - each[0].hemoglobin, np.float64)
+
+    def together(count: int, window: float | None) -> shared_melanin.SharedMelanin:
+        return seen.together(count, window, model)
+
+    def add(knobs: Knobs, call: Callable[[], Any], change: Callable[[Any], Float64Array]) -> None:
+        timing, made = stage.time(call, repeats=1, memory=False)
+        stage.add(knobs, timing, _dense_error(seen.errors(change(made))))
+
+    add({"way": "each alone", "states": 2}, alone, lambda made: made)
+    settings: list[tuple[int, float | None]] = [(2, None), (3, None), (2, 3.0)]
+    if not stage.toy:
+        settings = [(2, None), (4, None), (7, None), (7, 3.0), (7, 8.0)]
+    for count, window in settings:
+        knobs: Knobs = {"way": "together", "states": count, "light": window or "free"}
+        add(knobs, lambda: together(count, window), lambda made: made.change[1])
+    stage.on_each_skin(lambda band: _on_skin(band.preset, side, model))
+    if not stage.toy:
+        found = together(7, 3.0)
+        stated = found.stderr_change[1][seen.mask]
+        stage.limits = {
+            "over_alone": stage.points[0].error / stage.points[4].error,
+            "within": float(np.mean(seen.errors(found.change[1]) < 2.0 * stated)),
+            **_melanin_limits(model),
+            **_full_size(model),
+        }
+
+
+def pictures(
+    colors: ColorTable,
+    melanin: FloatArray,
+    blood: Float64Array,
+    covariance: Float64Array,
+    *,
+    rng: np.random.Generator,
+    noise: float = SUPERPIXEL_NOISE,
+) -> tuple[Float32Array, Float32Array]:
+    """Return colors (S, H, W, 3) of one melanin and S bloods, and their variance.
+
+    Each pixel has an error of the model that all its states share, and each state a light that
+    differs smoothly over the face.
+    """
+    rows, columns = np.mgrid[: melanin.shape[0], : melanin.shape[1]] / melanin.shape[0]
+    light = np.stack(
+        [
+            0.6 * np.exp(LIGHT_CHANGE * np.sin(3 * columns + k) * np.cos(2 * rows - k))
+            for k in range(len(blood))
+        ]
+    )
+    shared = rng.multivariate_normal(np.zeros(3), covariance, melanin.shape)
+    clean = colors.lookup(np.broadcast_to(melanin, blood.shape), blood)
+    clean = clean * np.exp(shared) * light[..., None]
+    seen = clean * (1.0 + noise * rng.standard_normal(clean.shape))
+    return seen.astype(np.float32), ((noise * clean) ** 2).astype(np.float32)
+
+
+def _on_skin(preset: str, side: int, model: _Model) -> BandError:
+    """Return the error of smile's change of blood on skin of a preset, three states together."""
+    seen = _States.of(preset, side, STATE_NAMES[:3], model)
+    found = seen.together(3, 3.0, model)
+    return median_error(seen.errors(found.change[1]))
+
+
+@dataclass(frozen=True, slots=True)
+class _Model:
+    """What inversions know of all faces."""
+
+    colors: ColorTable
+    prior: ShadingPrior
+    covariance: Float64Array
+
+    def invert(
+        self, rgb: Float32Array, variance: Float32Array, **options: Any
+    ) -> shared_melanin.SharedMelanin:
+        return shared_melanin.estimate_shared_melanin(
+            rgb,
+            self.colors,
+            prior=self.prior,
+            variance=variance,
+            model_error=self.covariance,
+            **options,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _States:
+    """Pictures of a face in states of its blood."""
+
+    rgb: Float32Array
+    variance: Float32Array
+    blood: Float64Array
+    mask: BoolArray
+
+    @classmethod
+    def of(cls, preset: str, side: int, names: Sequence[str], model: _Model) -> _States:
+        face = face_of(preset, side, seed=3)
+        blood = np.stack([face.hemoglobin(name) for name in names]).astype(np.float64)
+        rng = np.random.default_rng(0)
+        seen = pictures(model.colors, face.melanin, blood, model.covariance, rng=rng)
+        return cls(*seen, blood, oval(side))
+
+    def together(
+        self, count: int, window: float | None, model: _Model
+    ) -> shared_melanin.SharedMelanin:
+        """Invert the first states together, the light smooth in a window, px, or free."""
+        valid = np.broadcast_to(self.mask, self.blood[:count].shape)
+        return model.invert(
+            self.rgb[:count], self.variance[:count], valid=valid, shading_window_px=window
+        )
+
+    def errors(self, change: Float64Array) -> Float64Array:
+        """Return how far the second state's change of blood is off, (n,)."""
+        return np.asarray(np.abs(change - (self.blood[1] - self.blood[0]))[self.mask])
+
+
+def _dense_error(off: Float64Array) -> BandError:
+    """Return the median; its interval is by the density about it."""
+    off = off[np.isfinite(off)]
+    low, high = np.quantile(off, 0.5 + np.array([-0.5, 0.5]) / np.sqrt(off.size))
+    return BandError(float(np.median(off)), (float(low), float(high)))
+
+
+def _melanin_limits(model: _Model) -> Findings:
+    """Check how melanin's variance by noise goes with the number of states."""
+    rng = np.random.default_rng(1)
+    variances = {}
+    for count in (1, 7):
+        clean = 0.6 * np.broadcast_to(model.colors.lookup(0.02, 0.025), (count, 4000, 3))
+        seen = clean * (1.0 + 2e-3 * rng.standard_normal(clean.shape))
+        found = shared_melanin.estimate_shared_melanin(
+            seen, model.colors, prior=model.prior, variance=(2e-3 * clean) ** 2
+        )
+        variances[count] = float(found.melanin.var())
+    return {"melanin": variances[1] / variances[7]}
+
+
+def _full_size(model: _Model) -> Findings:
+    """Time 7 states of a megapixel by a band of it."""
+    rng = np.random.default_rng(2)
+    band = 96
+    melanin = np.full((band, FULL_SIDE_PX), 0.02)
+    blood = 0.32 * rng.uniform(0.35, 0.5, (len(STATE_NAMES), band, FULL_SIDE_PX)) ** 3
+    seen = pictures(model.colors, melanin, blood, model.covariance, rng=rng)
+    run = partial(model.invert, *seen, shading_window_px=shared_melanin.SHADING_WINDOW_PX)
+    return {"seconds": processor_seconds(run, 2) * FULL_SIDE_PX / band / LIMIT_CORES}

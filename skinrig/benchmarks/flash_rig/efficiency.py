@@ -18,9 +18,8 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import chromophores, diffuse_albedo, photometric_stereo, subsurface
 from reconstruction.photometric_stereo import light_selection
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import measure_and_keep
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
+from skinrig.benchmarks.results import BandError, Knobs, Point
+from skinrig.benchmarks.stage import Stage
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, melanin_band
 
 
@@ -38,15 +37,25 @@ class Trial:
     """Bounds between what is sought and 0, where it cannot be negative."""
 
 
-SUBJECT_CHROMOPHORES: Final = {
-    "palest": (0.005, 0.03),
-    "II": (0.014, 0.05),
-    "III": (0.028, 0.05),
-    "IV": (0.047, 0.05),
-    "V": (0.085, 0.05),
-    "VI": (0.17, 0.05),
+@dataclass(frozen=True, slots=True)
+class Skin:
+    """Typical skin."""
+
+    melanin: float
+    hemoglobin: float
+    r_d: float
+    sigma_a_per_mm: float
+    sigma_s_per_mm: float
+
+
+SUBJECTS: Final = {
+    "palest": Skin(0.005, 0.03, 0.6, 0.02, 1.4),
+    "II": Skin(0.014, 0.05, 0.5, 0.03, 1.3),
+    "III": Skin(0.028, 0.05, 0.4, 0.05, 1.2),
+    "IV": Skin(0.047, 0.05, 0.3, 0.08, 1.2),
+    "V": Skin(0.085, 0.05, 0.2, 0.15, 1.1),
+    "VI": Skin(0.17, 0.05, 0.1, 0.3, 1.0),
 }
-"""Melanin and hemoglobin of typical skin."""
 MIN_MEASURED_SIGMAS, MIN_EVALUATED_SIGMAS = 2.5, 10.0
 """Standard errors between a fraction and 0. Below the first an estimate that cannot be negative is
 cut off, and a bound on unbiased ones says nothing of it. Below the second the color bends within
@@ -60,27 +69,24 @@ FIBER_NOISE = 0.01
 """Relative noise of each fibre."""
 
 
-def efficiency(*, toy: bool) -> StageBenchmark:
+def efficiency(stage: Stage) -> None:
     """Measure mean squared errors over Cramér-Rao bounds."""
-    draws = 500 if toy else 20_000
-    points: list[Point] = []
-    limits: Findings = {}
-    left_out: list[tuple[str, str]] = []
-    worst: dict[str, BandError] = {}
+    draws = 500 if stage.toy else 20_000
+    worst = stage.by_band
     for name, made in _ESTIMATOR_TRIALS.items():
         ratios: dict[str, list[tuple[float, float]]] = {band: [] for band in MELANIN_BANDS}
         for subject, trial in made(draws):
-            timing, squared = measure_and_keep(trial.squared_errors, repeats=1)
+            timing, squared = stage.time(trial.squared_errors, repeats=1)
             ratio = float(squared.mean()) / trial.bound
             spread = float(squared.std() / np.sqrt(len(squared))) / trial.bound
             knobs: Knobs = {"estimator": name, "subject": subject}
             knobs["noise_percent"] = round(100 * trial.noise, 2)
             judged = trial.clear >= MIN_EVALUATED_SIGMAS
             outcome = BandError.around(ratio, spread, 1.0)
-            points.append(Point.of(knobs, timing, outcome, {"judged": judged}))
+            stage.add(knobs, timing, outcome, {"judged": judged})
             if judged:
-                ratios[str(melanin_band(SUBJECT_CHROMOPHORES[subject][0]))].append((ratio, spread))
-        left_out += _left_out(name, points)
+                ratios[str(melanin_band(SUBJECTS[subject].melanin))].append((ratio, spread))
+        stage.left_out += _left_out(name, stage.points)
         for band, pairs in ratios.items():
             if not pairs:
                 continue
@@ -88,10 +94,9 @@ def efficiency(*, toy: bool) -> StageBenchmark:
             ratio = float(np.mean(each))
             spread = float(np.sqrt(np.sum(spreads**2))) / len(pairs)
             # what so many draws leave open of the ratio counts for the estimator
-            limits["ratio", name, band] = ratio - 2.0 * spread
+            stage.limits["ratio", name, band] = ratio - 2.0 * spread
             if band not in worst or ratio > worst[band].error:
                 worst[band] = BandError.around(ratio, spread, 1.0)
-    return described("efficiency", points, limits, left_out=tuple(left_out), by_band=worst)
 
 
 def _left_out(name: str, points: Sequence[Point]) -> list[tuple[str, str]]:
@@ -103,9 +108,7 @@ def _left_out(name: str, points: Sequence[Point]) -> list[tuple[str, str]]:
         f"a fraction is nearer to 0 than {MIN_EVALUATED_SIGMAS:g} bounds even at "
         f"{100 * CHANNEL_NOISES[-1]:g} % of noise"
     )
-    return [
-        (f"{name}, {subject}", why) for subject in SUBJECT_CHROMOPHORES if subject not in judged
-    ]
+    return [(f"{name}, {subject}", why) for subject in SUBJECTS if subject not in judged]
 
 
 def _chromophores(
@@ -115,9 +118,7 @@ def _chromophores(
 
     table = color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
 
-    def squared(
-        noisy: Float64Array, sigma: Float64Array, truth: tuple[float, float]
-    ) -> Float64Array:
+    def squared(noisy: Float64Array, sigma: Float64Array, true: float) -> Float64Array:
         found = chromophores.invert(
             noisy.astype(np.float32),
             table,
@@ -125,9 +126,10 @@ def _chromophores(
             variance=np.broadcast_to(np.float32(sigma**2), noisy.shape),
         )
         value = getattr(found, which)
-        return np.square(np.asarray(value, np.float64)[found.valid] - truth[index])
+        return np.square(np.asarray(value, np.float64)[found.valid] - true)
 
-    for number, (subject, truth) in enumerate(SUBJECT_CHROMOPHORES.items()):
+    for number, (subject, skin) in enumerate(SUBJECTS.items()):
+        truth = skin.melanin, skin.hemoglobin
         color = table.lookup(*truth).reshape(3)
         slopes = _differences(lambda p: table.lookup(p[0], p[1]).reshape(3), np.array(truth))
         if shading == "free":
@@ -142,7 +144,7 @@ def _chromophores(
             sigma = noise * color
             rng = np.random.default_rng([1, number])
             noisy = color + sigma * rng.standard_normal((draws, 3))
-            call = partial(squared, noisy, sigma, truth)
+            call = partial(squared, noisy, sigma, truth[index])
             yield subject, Trial(call, float(noise**2 * least[index]), noise, clear)
             if clear >= MIN_EVALUATED_SIGMAS:
                 break
@@ -157,7 +159,8 @@ def _normals(draws: int) -> Iterator[tuple[str, Trial]]:
     normal[2] = np.sqrt(1.0 - normal @ normal)
     lit = lights @ normal
     lights, lit = lights[lit > 0.15], lit[lit > 0.15]
-    for subject, albedo in zip(SUBJECT_CHROMOPHORES, (0.6, 0.5, 0.4, 0.3, 0.2, 0.1), strict=True):
+    for subject, skin in SUBJECTS.items():
+        albedo = skin.r_d
         # shot noise of 20,000 electrons at full scale, read noise of 5
         sigma = np.sqrt(albedo * lit / 20_000 + (5 / 20_000) ** 2)
         information = light_selection.information(
@@ -166,16 +169,14 @@ def _normals(draws: int) -> Iterator[tuple[str, Trial]]:
         tilt = light_selection.predict(information, range(len(lights)), least=3).tilt_rad[0]
         noisy = albedo * lit[:, None] + sigma[:, None] * rng.standard_normal((len(lights), draws))
 
-        def squared(noisy: Float64Array = noisy, sigma: Float64Array = sigma) -> Float64Array:
+        def squared() -> Float64Array:
             found = photometric_stereo.estimate_normals(
                 noisy, lights, variance=np.broadcast_to((sigma**2)[:, None], noisy.shape)
             )
             return np.asarray(np.sum(np.cross(found.normals, normal) ** 2, axis=-1), np.float64)
 
-        yield (
-            subject,
-            Trial(squared, 2.0 * float(tilt) ** 2, float(np.mean(sigma / (albedo * lit)))),
-        )
+        noise = float(np.mean(sigma / (albedo * lit)))
+        yield subject, Trial(squared, 2.0 * float(tilt) ** 2, noise)
 
 
 def _albedo(draws: int) -> Iterator[tuple[str, Trial]]:
@@ -185,16 +186,15 @@ def _albedo(draws: int) -> Iterator[tuple[str, Trial]]:
     light, view = ways / np.linalg.norm(ways, axis=-1, keepdims=True)
     through = np.prod([1.0 - fresnel.reflectance(way[:, 2], 1.4) for way in (light, view)], axis=0)
     up = np.array([0.0, 0.0, 1.0])
-    for subject, albedo in zip(SUBJECT_CHROMOPHORES, (0.6, 0.5, 0.4, 0.3, 0.2, 0.1), strict=True):
+    for subject, skin in SUBJECTS.items():
+        albedo = skin.r_d
         value = albedo * through / np.pi
         sigma = ALBEDO_NOISE * value
         bound = 1.0 / np.sum((through / np.pi / sigma) ** 2)
         count = draws // 4
         noisy = value[:, None] + sigma[:, None] * rng.standard_normal((count, 60, 1))
 
-        def squared(
-            noisy: Float64Array = noisy, sigma: Float64Array = sigma, albedo: float = albedo
-        ) -> Float64Array:
+        def squared() -> Float64Array:
             every = (len(noisy), 60, 3)
             found = diffuse_albedo.estimate(
                 noisy,
@@ -213,14 +213,8 @@ def _albedo(draws: int) -> Iterator[tuple[str, Trial]]:
 def _subsurface(draws: int) -> Iterator[tuple[str, Trial]]:
     radius = np.linspace(1.0, 15.0, 28)
     count = draws // 20
-    for number, (subject, (sigma_a, sigma_s)) in enumerate(
-        zip(
-            SUBJECT_CHROMOPHORES,
-            ((0.02, 1.4), (0.03, 1.3), (0.05, 1.2), (0.08, 1.2), (0.15, 1.1), (0.3, 1.0)),
-            strict=True,
-        )
-    ):
-        truth = np.array([sigma_a, sigma_s])
+    for number, (subject, skin) in enumerate(SUBJECTS.items()):
+        truth = np.array([skin.sigma_a_per_mm, skin.sigma_s_per_mm])
         profile = photon_table.reflectance(radius, *truth)
         sigma = FIBER_NOISE * profile + 1e-3 * profile.max() * FIBER_NOISE
         slopes = _differences(lambda p: photon_table.reflectance(radius, p[0], p[1]), truth)
@@ -229,9 +223,7 @@ def _subsurface(draws: int) -> Iterator[tuple[str, Trial]]:
         rng = np.random.default_rng([4, number])
         noisy = profile + sigma * rng.standard_normal((count, 28))
 
-        def squared(
-            noisy: Float64Array = noisy, sigma: Float64Array = sigma, truth: Float64Array = truth
-        ) -> Float64Array:
+        def squared() -> Float64Array:
             fit = subsurface.invert(
                 radius,
                 noisy,

@@ -7,13 +7,13 @@ import cv2
 import numpy as np
 from scipy import fft, ndimage
 
-from model import metrics
 from model.facial_color import HemoglobinRig, blood_errors, disc_statistics, histogram_matching
 from rigsim import subject
 from skinrig.arrays import BoolArray, Float32Array, FloatArray
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import measure, processor_seconds
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
+from skinrig.benchmarks.measurement import processor_seconds
+from skinrig.benchmarks.resampling import median_error
+from skinrig.benchmarks.results import Knobs
+from skinrig.benchmarks.stage import Findings, Stage
 
 PREDICTED_STATES = ("smile", "anger", "fear", "disgust", "exercise", "alcohol")
 """States that are predicted."""
@@ -29,24 +29,21 @@ CROP_SIDES_PX = {16: 256, 32: 160, 64: 96}
 """Sides of the crops on which scipy.ndimage.convolve is timed; its work goes with the pixels."""
 
 
-def rig(*, toy: bool) -> StageBenchmark:
+def rig(stage: Stage) -> None:
     """Predict states whose vessels dilated; then time discs of 2048 x 2048 beside libraries."""
     rng = np.random.default_rng(0)
-    face = subject.make_subject("III", seed=3, size=96 if toy else 512)
+    face = subject.make_subject("III", seed=3, size=96 if stage.toy else 512)
     neutral, covered = face.hemoglobin(), face.atlas.covered
-    names = PREDICTED_STATES[:2] if toy else PREDICTED_STATES
+    names = PREDICTED_STATES[:2] if stage.toy else PREDICTED_STATES
     truths = {name: face.hemoglobin(name) for name in names}
 
-    points: list[Point] = []
-
     def add(knobs: Knobs, predict: Callable[[str], FloatArray]) -> None:
-        timing = measure(lambda: predict(names[0]), repeats=1 if toy else 3, memory=False)
+        timing, _ = stage.time(lambda: predict(names[0]), memory=False)
         left = []
         for name in names:
             found = blood_errors.compare(predict(name), truths[name], neutral, valid=covered)
             left.append(100.0 * found.predicted / found.neutral_kept)
-        outcome = BandError(*metrics.median_with_interval(left, rng=rng))
-        points.append(Point.of({"misaligned_px": 0} | knobs, timing, outcome))
+        stage.add({"misaligned_px": 0} | knobs, timing, median_error(left, rng=rng))
 
     def fitted(radius_px: float, stored: int | None, moved_px: int = 0) -> HemoglobinRig:
         return HemoglobinRig.from_maps(
@@ -63,7 +60,7 @@ def rig(*, toy: bool) -> StageBenchmark:
     add({"method": "neutral map kept"}, lambda name: neutral)
     add({"method": "one gain"}, gained)
     sweep: list[tuple[float, int | None, int]] = [(RIG_RADIUS_PX, 256, 0)]
-    if not toy:
+    if not stage.toy:
         sweep += [(r, 256, 0) for r in (4.0, 8.0, 32.0, 64.0)]
         sweep += [(RIG_RADIUS_PX, stored, 0) for stored in (None, 128, 64, 32)]
         sweep += [(RIG_RADIUS_PX, 256, moved) for moved in (1, 2, 4, 8)]
@@ -79,7 +76,7 @@ def rig(*, toy: bool) -> StageBenchmark:
         ).blend({name: 1.0}),
     )
     matched = partial(histogram_matching.match, valid=covered, valid_target=covered)
-    for spacing in [8] if toy else [11, 8, 4]:
+    for spacing in [8] if stage.toy else [11, 8, 4]:
         knobs = {"method": "exact histograms, windows", "radius_px": RIG_RADIUS_PX}
         add(
             knobs | {"spacing_px": spacing},
@@ -87,8 +84,8 @@ def rig(*, toy: bool) -> StageBenchmark:
                 matched(neutral, truths[name], RIG_RADIUS_PX, spacing_px=spacing).hemoglobin
             ),
         )
-    limits = {} if toy else _round_trip(neutral, covered) | _digits(rng) | _speed(rng)
-    return described("facial-color", points, limits)
+    if not stage.toy:
+        stage.limits = _round_trip(neutral, covered) | _digits(rng) | _speed(rng)
 
 
 def _round_trip(neutral: Float32Array, covered: BoolArray) -> Findings:

@@ -1,6 +1,5 @@
 """Benchmark of curves of blood in time: the time constant of five places, beside scipy's fit."""
 
-import time
 import warnings
 from dataclasses import dataclass
 
@@ -16,10 +15,10 @@ from reconstruction.facial_color.perfusion_curves import TRANSITION_FALSE_ALARM_
 from reconstruction.facial_color.perfusion_fit import RelaxationFit, fit_cycle
 from rigsim.subject.perfusion_course import PromptedCourse
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import measure
+from skinrig.benchmarks.measurement import processor_seconds
 from skinrig.benchmarks.resampling import rms_of_draws
-from skinrig.benchmarks.results import BandError, Point, StageBenchmark
+from skinrig.benchmarks.results import BandError
+from skinrig.benchmarks.stage import Findings, Stage
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 PROMPT_S = 5.0
@@ -57,10 +56,12 @@ class Train:
         settled_s = 10 * CYCLE_S
         return np.array([course.level(settled_s + phase) for phase in self.phase_s])
 
-    def draw(self, constant_s: float, rng: np.random.Generator) -> Float64Array:
+    def draw(
+        self, constant_s: float, rng: np.random.Generator, noise: float = BLOOD_NOISE
+    ) -> Float64Array:
         """Return curves of the five places, (5, captures)."""
         clean = REST_BLOOD + np.outer(BLOOD_CHANGES, self.levels(constant_s))
-        return np.asarray(clean + BLOOD_NOISE * rng.standard_normal(clean.shape))
+        return np.asarray(clean + noise * rng.standard_normal(clean.shape))
 
     def bound_s(self) -> float:
         """Return the Cramér-Rao bound of the time constant, s; delay and levels unknown too."""
@@ -104,14 +105,12 @@ def scipy_fit(phase_s: Float64Array, value: Float64Array) -> tuple[float, float]
     return float(found[3]), float(np.sqrt(covariance[3, 3]))
 
 
-def curves(*, toy: bool) -> StageBenchmark:
+def curves(stage: Stage) -> None:
     """Fit five places: number of shots, together or each alone, and scipy's fit beside it."""
     trains = [Train(22, 5.5), Train(44, 10.25)]
-    if not toy:
+    if not stage.toy:
         trains = [Train(11, 5.5), *trains, Train(88, 10.25)]
-    runs = 3 if toy else 30
-    points = []
-    errors: dict[tuple[str, int], float] = {}
+    runs = 3 if stage.toy else 30
     for train in trains:
         phase = train.phase_s
         for way in ("five places", "best place", "best place, scipy"):
@@ -126,13 +125,12 @@ def curves(*, toy: bool) -> StageBenchmark:
 
             off = np.array([fitted_s(values) for values in draws]) - TIME_CONSTANT_S
             outcome = rms_of_draws(off, bound=train.bound_s() if way == "five places" else None)
-            errors[way, train.captures] = outcome.error
-            timing = measure(lambda: fitted_s(draws[0]))
+            timing, _ = stage.time(lambda: fitted_s(draws[0]))
             knobs = {"captures": train.captures, "every s": train.shot_period_s, "fit": way}
-            points.append(Point.of(knobs, timing, outcome))
-    bands = {name: _on_skin(factor, runs) for name, factor in noise_by_band().items()}
-    limits = {} if toy else _limits(runs, errors, trains)
-    return described("perfusion-curves", points, limits, by_band=bands)
+            stage.add(knobs, timing, outcome)
+    stage.by_band |= {name: _on_skin(factor, runs) for name, factor in noise_by_band().items()}
+    if not stage.toy:
+        stage.limits = _limits(stage, runs)
 
 
 def noise_by_band() -> dict[str, float]:
@@ -160,15 +158,14 @@ def noise_by_band() -> dict[str, float]:
 def _on_skin(noisier: float, runs: int) -> BandError:
     """Return the error of five places in 44 captures, with so many times the noise."""
     train, rng = Train(44, 10.25), np.random.default_rng(0)
-    clean = REST_BLOOD + np.outer(BLOOD_CHANGES, train.levels(TIME_CONSTANT_S))
     found = []
     for _ in range(runs):
-        noise = noisier * BLOOD_NOISE * rng.standard_normal(clean.shape)
-        found.append(fit_cycle(train.phase_s, clean + noise, cycle_s=CYCLE_S).time_constant_s)
+        values = train.draw(TIME_CONSTANT_S, rng, noisier * BLOOD_NOISE)
+        found.append(fit_cycle(train.phase_s, values, cycle_s=CYCLE_S).time_constant_s)
     return rms_of_draws(np.array(found) - TIME_CONSTANT_S, bound=noisier * train.bound_s())
 
 
-def _limits(runs: int, errors: dict[tuple[str, int], float], trains: list[Train]) -> Findings:
+def _limits(stage: Stage, runs: int) -> Findings:
     rig = load_rig("flash")
     half, quarter = (phases(multiplexed_plan(rig, shot_period_s=s)) for s in ("5.5", "10.25"))
     rng = np.random.default_rng(1)
@@ -182,10 +179,9 @@ def _limits(runs: int, errors: dict[tuple[str, int], float], trains: list[Train]
         alarms += found.seen
         slow = fit_cycle(fine.phase_s, fine.draw(TIME_CONSTANT_S, rng), cycle_s=CYCLE_S)
         held += slow.interval_s[0] <= TIME_CONSTANT_S <= slow.interval_s[1]
-    begin = time.process_time()
-    fit_cycle(fine.phase_s, fine.draw(TIME_CONSTANT_S, rng), cycle_s=CYCLE_S)
-    spent_s = time.process_time() - begin
-    bound_s = next(train for train in trains if train.captures == 44).bound_s()
+    again = fine.draw(TIME_CONSTANT_S, rng)
+    spent_s = processor_seconds(lambda: fit_cycle(fine.phase_s, again, cycle_s=CYCLE_S))
+    five, _, by_scipy = (p.error for p in stage.points if p.knobs["captures"] == 44)
     # three binomial standard deviations beyond the stated rates
     beyond = 3 * float(
         np.sqrt(TRANSITION_FALSE_ALARM_RATE * (1 - TRANSITION_FALSE_ALARM_RATE) / runs)
@@ -196,7 +192,7 @@ def _limits(runs: int, errors: dict[tuple[str, int], float], trains: list[Train]
         "quick": max(fit.interval_s[1] for fit in quick),
         "alarms": (alarms / runs, TRANSITION_FALSE_ALARM_RATE + beyond),
         "held": (held / runs, 0.95 - beyond),
-        "over_bound": (errors["five places", 44] / bound_s, 1.0 + 3 / float(np.sqrt(2 * runs))),
-        "over_scipy": errors["five places", 44] / errors["best place, scipy", 44],
+        "over_bound": (five / fine.bound_s(), 1.0 + 3 / float(np.sqrt(2 * runs))),
+        "over_scipy": five / by_scipy,
         "seconds": spent_s,
     }

@@ -1,5 +1,7 @@
 """Benchmark of the gradient sphere's calibration: errors over the exposures of the glass ball."""
 
+from functools import partial
+
 import numpy as np
 
 from capture.calibration.fiber.spot_photometry import Shot, shot
@@ -11,28 +13,28 @@ from rigsim.as_built.sphere import build_sphere
 from rigsim.boxes.gradient_sphere import PatternLight
 from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.sensor import vignetting_map
-from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import measure_and_keep, once
-from skinrig.benchmarks.resampling import drawn_again
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
+from skinrig.benchmarks.measurement import once
+from skinrig.benchmarks.resampling import drawn_median
+from skinrig.benchmarks.results import Knobs
+from skinrig.benchmarks.stage import Stage
 
 SPHERE_SEED = 7
 
 
-def sphere_lights(*, toy: bool) -> StageBenchmark:
+def sphere_lights(stage: Stage) -> None:
     """Survey a simulated sphere with two and four readings of the analyser, and large pixels."""
-    points = []
-    for width_px in (192,) if toy else (512, 1024):
+    for width_px in (192,) if stage.toy else (512, 1024):
         rig = load_rig("gradient").resized(width_px)
         sphere = build_sphere(rig, seed=SPHERE_SEED)
         scene = GradientScene(rig, "ball", sphere=sphere, seed=SPHERE_SEED)
         shots = _shots(scene, rig)
-        fewer = ((0, 80, 90), (0, 90, 100)) if toy else ()
+        fewer = ((0, 80, 90), (0, 90, 100)) if stage.toy else ()
         for readings in (*fewer, (0, 90), (0, 80, 90, 100)):
             part = [one for one in shots if one.reading_deg in readings]
 
             # nine tenths of a small survey's seconds are the LEDs': it is made once
-            timing, result = (once if toy else measure_and_keep)(lambda: survey_sphere(part, rig))
+            survey = partial(survey_sphere, part, rig)
+            timing, result = once(survey) if stage.toy else stage.time(survey)
             lights, films = result.lights, result.films
             good = lights.valid & ~lights.dead
             place = sphere.position_mm
@@ -41,18 +43,16 @@ def sphere_lights(*, toy: bool) -> StageBenchmark:
             stated = 100 * (lights.intensities_stderr / lights.intensities)[good]
             # the median of a normal distribution's size is 0.674 of its deviation
             bound = float(0.674 * np.median(stated))
-            outcome = BandError(float(np.median(error)), drawn_again(error, draws=400), bound)
             knobs: Knobs = {"pixels": width_px, "readings": " ".join(map(str, readings))}
-            points.append(Point.of(knobs, timing, outcome))
+            outcome = stage.add(knobs, timing, drawn_median(error, bound, draws=400))
     aim = place / np.linalg.norm(place, axis=1, keepdims=True)
     off = np.degrees(np.linalg.norm(lights.directions - aim, axis=1))
     zero = np.degrees(films.misalignment_rad) - scene.films.analyser_zero_deg
-    limits = {
+    stage.limits = {
         "direction": float(np.median(off[lights.seen])),
         "intensity": outcome.error,
         "misalignment": float(abs(zero) / np.degrees(films.misalignment_stderr_rad)),
     }
-    return described("sphere-lights", points, limits)
 
 
 def _shots(scene: GradientScene, rig: Rig) -> list[Shot]:

@@ -19,11 +19,11 @@ from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.subject.pigment import MELANIN_PRESETS
 from rigsim.world.taped_skin import GripState
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import LIMIT_CORES, measured, processor_seconds
+from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds
 from skinrig.benchmarks.resampling import drawn_again
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
-from skinrig.evaluating.skin_bands import MELANIN_BANDS, MelaninBand
+from skinrig.benchmarks.results import BandError, Knobs
+from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.evaluating.skin_bands import MelaninBand
 
 Images = Mapping[tuple[str, str], FloatArray]
 
@@ -142,13 +142,12 @@ def _judged(normals: FloatArray, valid: BoolArray, truth: Float64Array) -> BandE
     return BandError(float(error.mean()), drawn_again(parts, np.mean))
 
 
-def normals(*, toy: bool) -> StageBenchmark:
+def normals(stage: Stage) -> None:
     """Compute the normals of a patch of skin: patterns, corrections, filters; then all pixels."""
     rng = np.random.default_rng(0)
-    side = 40 if toy else 192
+    side = 40 if stage.toy else 192
     patch = skin_patch(side, smooth=False)
     noisy = exposed(patch, rng)
-    points: list[Point] = []
     corrections = {"lights": patch.lights, **patch.geometry}
 
     def add(knobs: Knobs, images: Images, **options: Any) -> float:
@@ -161,11 +160,7 @@ def normals(*, toy: bool) -> StageBenchmark:
             return replace(outcome, cramer_rao_bound=rms)
 
         knobs.setdefault("noise", "the sensor's")
-        repeats = 1 if toy else 3
-        points.append(
-            measured(knobs, lambda: from_patterns(images, **options), error, repeats=repeats)
-        )
-        return points[-1].error
+        return stage.measure(knobs, lambda: from_patterns(images, **options), error).error
 
     subsets = {
         "16": PATTERN_NAMES,
@@ -180,23 +175,19 @@ def normals(*, toy: bool) -> StageBenchmark:
         some = {key: image for key, image in noisy.items() if key[0] in names}
         error = add({"patterns": label, "filter": "Wiener"}, some, **base)
         worst = error if label == "16" else worst
-        if toy and label != "16":
+        if stage.toy and label != "16":
             break
     plain = {**corrections, "variance": patch.noise}
     add({"patterns": "16", "filter": "none"}, noisy, **plain)
-    for sigma in (1.0,) if toy else (0.7, 1.0, 1.5):
+    for sigma in (1.0,) if stage.toy else (0.7, 1.0, 1.5):
         add({"patterns": "16", "filter": "Gaussian", "px": sigma}, noisy, smooth_px=sigma, **plain)
-    add(
-        {"patterns": "16", "filter": "Wiener", "lights": "ideal"},
-        noisy,
-        variance=patch.noise,
-        wiener=True,
-    )
+    knobs: Knobs = {"patterns": "16", "filter": "Wiener", "lights": "ideal"}
+    add(knobs, noisy, variance=patch.noise, wiener=True)
     add({"patterns": "16", "noise": "none"}, patch.images, **corrections)
     add({"patterns": "16", "noise": "none", "lights": "ideal"}, patch.images)
-    bands = {name: _on_skin(patch, band) for name, band in MELANIN_BANDS.items()}
-    limits = {} if toy else _limits(worst, rng)
-    return described("gradient-normals", points, limits, by_band=bands)
+    stage.on_each_skin(lambda band: _on_skin(patch, band))
+    if not stage.toy:
+        stage.limits = _limits(worst, rng)
 
 
 def _on_skin(patch: Patch, band: MelaninBand) -> BandError:

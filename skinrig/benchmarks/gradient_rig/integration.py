@@ -1,6 +1,5 @@
 """Benchmark of height from normals, beside Frankot-Chellappa, cosines and a sparse direct solve."""
 
-import time
 from collections.abc import Callable
 from functools import partial
 
@@ -14,10 +13,10 @@ from reconstruction.normal_integration.discontinuities import integrate_broken
 from reconstruction.normal_integration.height_filters import high_pass
 from reconstruction.normal_integration.relief_errors import expected_rms
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import LIMIT_CORES, measured, processor_seconds
-from skinrig.benchmarks.resampling import drawn_again, squares
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
+from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds, spent
+from skinrig.benchmarks.resampling import drawn_rms, squares
+from skinrig.benchmarks.results import BandError, Knobs
+from skinrig.benchmarks.stage import Findings, Stage
 
 PIXEL_UM = 6.0
 CUTOFF_UM = 1000.0
@@ -71,13 +70,9 @@ def frankot_chellappa(normals: Float64Array, *, pixel: float) -> Float64Array:
     return np.asarray(pixel * fft.irfft2(waves, gx.shape))
 
 
-def sparse_direct(
-    normals: Float64Array, valid: BoolArray, *, pixel: float, order: int = 4
-) -> Float64Array:
+def sparse_direct(normals: Float64Array, valid: BoolArray, *, pixel: float) -> Float64Array:
     """Solve the same normal equations with SciPy's SuperLU; one connected part."""
-    ax, ay, dx, dy = slope_fields.edges(
-        slope_fields.from_normals(normals, valid=valid), order=order
-    )
+    ax, ay, dx, dy = slope_fields.edges(slope_fields.from_normals(normals, valid=valid), order=4)
     number = np.full(ax.shape, -1)
     inside = np.pad(valid, 1)
     number[inside] = np.arange(np.count_nonzero(inside))
@@ -100,22 +95,22 @@ def sparse_direct(
     return height
 
 
-def integration(*, toy: bool) -> StageBenchmark:
+def integration(stage: Stage) -> None:
     """Integrate a relief's normals: tolerance, order, mask, noise, peers; then at full size."""
     rng = np.random.default_rng(0)
-    side = 64 if toy else 512
+    side = 64 if stage.toy else 512
     truth, clean = relief(side, rng=rng)
     noisy = clean + NORMAL_NOISE_RAD / np.sqrt(2.0) * rng.standard_normal(clean.shape)
     whole = np.ones((side, side), bool)
     disc = _disc(side)
 
-    def point(
+    def add(
         method: str,
         call: Callable[[Float64Array], FloatArray],
         normals: Float64Array,
         valid: BoolArray,
         **effort: float,
-    ) -> Point:
+    ) -> None:
         bound = None
         if normals is noisy:
             slope = NORMAL_NOISE_RAD / np.sqrt(2.0)
@@ -125,46 +120,39 @@ def integration(*, toy: bool) -> StageBenchmark:
             off = _high_passed(height - truth, valid)
             places = [at for at in squares(len(off)) if valid[at].any()]
             tiles = [float(np.mean(off[at][valid[at]] ** 2)) for at in places]
-            low, high = np.sqrt(drawn_again(tiles, np.mean, rng=rng))
+            low, high = drawn_rms(tiles, rng=rng).error_interval
             rms = float(np.sqrt(np.mean(off[valid] ** 2)))
-            return BandError(rms, (min(float(low), rms), max(float(high), rms)), bound)
+            return BandError(rms, (min(low, rms), max(high, rms)), bound)
 
         about: Knobs = {
             "noise": "1.5 deg" if normals is noisy else "none",
             "method": method,
             "mask": "none" if valid is whole else "disc",
         }
-        repeats = 1 if toy else 3
-        return measured(about | effort, lambda: call(normals), error, repeats=repeats)
+        stage.measure(about | effort, lambda: call(normals), error)
 
     def ours(valid: BoolArray, **options: object) -> Callable[[Float64Array], NDArray]:
         return lambda n: integrate(n, pixel=PIXEL_UM, valid=valid, **options)  # type: ignore[arg-type]
 
-    points = []
     for normals in (clean, noisy):
-        for tolerance in (1e-2, 1e-5) if toy else (1e-1, 1e-2, 1e-3, 1e-5, 1e-7):
+        for tolerance in (1e-2, 1e-5) if stage.toy else (1e-1, 1e-2, 1e-3, 1e-5, 1e-7):
             solve = ours(disc, settings=Settings(tolerance=tolerance))
-            points.append(point("multigrid", solve, normals, disc, tolerance=tolerance))
+            add("multigrid", solve, normals, disc, tolerance=tolerance)
+        add("multigrid", ours(disc, settings=Settings(order=2)), normals, disc, order=2)
+        add("cosines", ours(whole), normals, whole)
         by_fourier = partial(frankot_chellappa, pixel=PIXEL_UM)
-        points += [
-            point("multigrid", ours(disc, settings=Settings(order=2)), normals, disc, order=2),
-            point("cosines", ours(whole), normals, whole),
-            point("Frankot-Chellappa", by_fourier, normals, whole),
-        ]
+        add("Frankot-Chellappa", by_fourier, normals, whole)
     denoised = ours(disc, stderr_rad=NORMAL_NOISE_RAD, denoise=1.0)
     bilateral = partial(integrate_broken, pixel=PIXEL_UM, valid=disc)
     direct = partial(sparse_direct, valid=disc, pixel=PIXEL_UM)
-    points += [
-        point("multigrid", denoised, noisy, disc, denoise=1),
-        point("bilateral", lambda n: bilateral(n).height, noisy, disc),
-        point("sparse direct", direct, clean, disc),
-    ]
-    if toy:
-        return described("normal-integration", points)
+    add("multigrid", denoised, noisy, disc, denoise=1)
+    add("bilateral", lambda n: bilateral(n).height, noisy, disc)
+    add("sparse direct", direct, clean, disc)
+    if stage.toy:
+        return
     error = _high_passed(integrate(noisy, pixel=PIXEL_UM, valid=disc) - truth, disc)
     size = np.std(_high_passed(truth, disc)[disc])
-    limits: Findings = {"relative_rms": float(np.std(error[disc]) / size)}
-    return described("normal-integration", points, limits | _full_size(rng))
+    stage.limits = {"relative_rms": float(np.std(error[disc]) / size), **_full_size(rng)}
 
 
 def _high_passed(height: FloatArray, valid: BoolArray) -> FloatArray:
@@ -185,18 +173,14 @@ def _full_size(rng: np.random.Generator) -> Findings:
     )
     disc = _disc(2048)
     integrate_map(noisy[:64, :64], method="multigrid")
-    spent_s = processor_seconds(lambda: integrate_map(noisy, pixel=PIXEL_UM, valid=disc), 3)
-    found = integrate_map(noisy, pixel=PIXEL_UM, valid=disc)
+    spent_s, found = spent(lambda: integrate_map(noisy, pixel=PIXEL_UM, valid=disc), 3)
     small = np.ascontiguousarray(noisy[:1024, :1024])
     integrate_broken(small[:64, :64])
     broken_s = processor_seconds(lambda: integrate_broken(small, pixel=PIXEL_UM), 3)
     part = _disc(512)
     flat = np.asarray(noisy[:512, :512], float)
-    mine = integrate(flat, pixel=PIXEL_UM, valid=part)
-    ours_s = processor_seconds(lambda: integrate(flat, pixel=PIXEL_UM, valid=part), 3)
-    begin = time.process_time()
-    theirs = sparse_direct(flat, part, pixel=PIXEL_UM)
-    peer_s = time.process_time() - begin
+    ours_s, mine = spent(lambda: integrate(flat, pixel=PIXEL_UM, valid=part), 3)
+    peer_s, theirs = spent(lambda: sparse_direct(flat, part, pixel=PIXEL_UM))
     return {
         "seconds": spent_s / LIMIT_CORES,
         "residual": found.convergence.residual,

@@ -16,10 +16,10 @@ from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM
 from reconstruction.normal_histogram import relief_slopes
 from reconstruction.normal_histogram import statistics as normal_statistics
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import LIMIT_CORES, measure, measured, processor_seconds
+from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds
 from skinrig.benchmarks.resampling import mean_error
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
+from skinrig.benchmarks.results import BandError, Knobs
+from skinrig.benchmarks.stage import Findings, Stage
 
 PIXEL_UM = 6.0
 STRETCH_RATIO = 0.88
@@ -63,10 +63,15 @@ def numpy_distance(
     blurred = gaussian_filter1d(height, sigma_um / PIXEL_UM, axis=1)
     dy, dx = np.gradient((1.0 - alpha) * height + alpha * blurred, PIXEL_UM)
     dx /= STRETCH_RATIO
+    return float(np.abs(numpy_histogram(dx, -dy) - target).sum())
+
+
+def numpy_histogram(dx: Float64Array, dy: Float64Array) -> Float64Array:
+    """Return the shares of normals in 64 x 64 buckets, in vectorised NumPy."""
     w = 1.0 / np.sqrt(1.0 + dx * dx + dy * dy)
     edges = np.linspace(-1.0, 1.0, 65)
-    counts = np.histogram2d((dy * w).ravel(), (-dx * w).ravel(), bins=(edges, edges))[0]
-    return float(np.abs(counts / counts.sum() - target).sum())
+    counts = np.histogram2d((-dy * w).ravel(), (-dx * w).ravel(), bins=(edges, edges))[0]
+    return np.asarray(counts / counts.sum())
 
 
 def _spent(call: Callable[[], object], repeats: int = 1) -> float:
@@ -83,15 +88,15 @@ def _spent(call: Callable[[], object], repeats: int = 1) -> float:
         numba.set_num_threads(threads)
 
 
-def search(*, toy: bool) -> StageBenchmark:
+def search(stage: Stage) -> None:
     """Fit kernels: pixels used, search and its first sample; then 2000 x 2000 beside NumPy."""
     rng = np.random.default_rng(0)
-    side = 64 if toy else 256
+    side = 64 if stage.toy else 256
     height = relief(side, rng=rng)
     target = normal_histogram.histogram(
         strained(height, rng=rng), pixel=(PIXEL_UM, PIXEL_UM * STRETCH_RATIO)
     )
-    alphas, sigmas = (ALPHA_GRID[::50], SIGMAS_UM[::20]) if toy else (ALPHA_GRID, SIGMAS_UM)
+    alphas, sigmas = (ALPHA_GRID[::50], SIGMAS_UM[::20]) if stage.toy else (ALPHA_GRID, SIGMAS_UM)
 
     def fit(
         way: Literal["hierarchical", "exhaustive"], part: int, first: int, thin: int = 1
@@ -112,30 +117,24 @@ def search(*, toy: bool) -> StageBenchmark:
     whole = _grid_of(height, target)
     ways: list[tuple[Literal["hierarchical", "exhaustive"], int, int, int]] = [
         ("exhaustive", side, 2, 1),
-        ("exhaustive", side, 2, 2 if toy else 5),
+        ("exhaustive", side, 2, 2 if stage.toy else 5),
         ("exhaustive", side // 2, 2, 1),
-        ("hierarchical", side, 512 if toy else 4096, 1),
+        ("hierarchical", side, 512 if stage.toy else 4096, 1),
     ]
-    if not toy:
+    if not stage.toy:
         ways += [("hierarchical", side, 16_384, 1), ("exhaustive", side, 2, 10)]
 
     def error(found: kernel_outcome.KernelFit) -> BandError:
         there = whole.distances(found.sigma_um, np.array([found.alpha]))
         return BandError.around(float(there[0]) - best.distance, 0.0)
 
-    points = []
     for way, part, first, thin in ways:
         only: Knobs = {"first sample": first} if way == "hierarchical" else {}
-        points.append(
-            measured(
-                {"search": way, "side": part, "every": thin, **only},
-                lambda: fit(way, part, first, thin),
-                error,
-                repeats=1,
-                memory=False,
-            )
-        )
-    return described("kernel-fit", points, {} if toy else _full_size(rng))
+        knobs = {"search": way, "side": part, "every": thin, **only}
+        fitted = partial(fit, way, part, first, thin)
+        stage.measure(knobs, fitted, error, repeats=1, memory=False)
+    if not stage.toy:
+        stage.limits = _full_size(rng)
 
 
 def _grid_of(
@@ -191,54 +190,35 @@ def _full_size(rng: np.random.Generator) -> Findings:
     }
 
 
-def histograms(*, toy: bool) -> StageBenchmark:
+def histograms(stage: Stage) -> None:
     """Make histograms of normals: pixels and buckets; beside numpy.histogram2d."""
     rng = np.random.default_rng(0)
-    side = 96 if toy else 1024
-    truth_side = 256 if toy else 2048
+    side = 96 if stage.toy else 1024
+    truth_side = 256 if stage.toy else 2048
     truth_map = relief(truth_side, rng=rng)
-    points = []
-    for bins in (32, 64) if toy else (16, 32, 64, 128):
+    for bins in (32, 64) if stage.toy else (16, 32, 64, 128):
         truth = normal_statistics.measure(truth_map, pixel=PIXEL_UM, bins=bins)
-        for part in (side // 2, side) if toy else (128, 256, 512, 1024):
+        for part in (side // 2, side) if stage.toy else (128, 256, 512, 1024):
             patches = [
                 np.ascontiguousarray(truth_map[rows, columns])
                 for rows in (slice(part), slice(-part, None))
                 for columns in (slice(part), slice(-part, None))
             ]
-
             measure_patch = partial(normal_statistics.measure, pixel=PIXEL_UM, bins=bins)
-            timing = measure(
-                lambda: measure_patch(patches[0]), repeats=1 if toy else 3, memory=part == side
-            )
-            off = mean_error(
-                [
-                    normal_histogram.distance(measure_patch(patch).histogram, truth.histogram)
-                    for patch in patches
-                ]
-            )
-            points.append(Point.of({"side": part, "bins": bins}, timing, off))
+            timing, _ = stage.time(lambda: measure_patch(patches[0]), memory=part == side)
+            off = [
+                normal_histogram.distance(measure_patch(patch).histogram, truth.histogram)
+                for patch in patches
+            ]
+            stage.add({"side": part, "bins": bins}, timing, mean_error(off))
     height = truth_map[:side, :side]
     dx, dy, _ = relief_slopes.slopes(height, pixel=PIXEL_UM)
-    edges = np.linspace(-1.0, 1.0, 65)
-
-    def theirs() -> Float64Array:
-        w = 1.0 / np.sqrt(1.0 + dx * dx + dy * dy)
-        counts = np.histogram2d((-dy * w).ravel(), (-dx * w).ravel(), bins=(edges, edges))[0]
-        return np.asarray(counts / counts.sum())
-
-    def ours() -> Float64Array:
-        return normal_histogram.from_slopes(dx, dy)
-
-    repeats = 1 if toy else 3
+    theirs = partial(numpy_histogram, dx, dy)
+    ours = partial(normal_histogram.from_slopes, dx, dy)
+    repeats = 1 if stage.toy else 3
     times = _spent(theirs, repeats) / max(_spent(ours, repeats), 1e-9)
-    limits = {"speed_up": times, "distance": normal_histogram.distance(ours(), theirs())}
-    return described(
-        "normal-histogram",
-        points,
-        {} if toy else limits,
-        reference_error=float(
-            normal_histogram.noise_floor(truth.histogram, truth.effective_samples, 1e12)
-        ),
-        truth_side=truth_side,
+    stage.limits = {"speed_up": times, "distance": normal_histogram.distance(ours(), theirs())}
+    stage.reference_error = float(
+        normal_histogram.noise_floor(truth.histogram, truth.effective_samples, 1e12)
     )
+    stage.words["truth_side"] = truth_side

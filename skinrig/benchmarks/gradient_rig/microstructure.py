@@ -29,10 +29,10 @@ from reconstruction.normal_histogram import relief_slopes
 from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
 from rigsim.skin_patch.stretch import StretchedSkin, deform
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import LIMIT_CORES, measure, measure_and_keep, processor_seconds
+from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds
 from skinrig.benchmarks.resampling import mean_error
-from skinrig.benchmarks.results import Knobs, Point, StageBenchmark
+from skinrig.benchmarks.results import Knobs
+from skinrig.benchmarks.stage import Findings, Stage
 
 TEXEL_UM = 10.0
 FITTED_STRETCHES = (0.76, 0.82, 0.88, 0.94, 1.06, 1.12, 1.18, 1.25)
@@ -125,30 +125,31 @@ def _slope_errors(made: Float32Array, state: StretchedSkin) -> tuple[float, floa
     return distance, abs(math.log(ours[0].var() / there[0].var()))
 
 
-def truth(*, toy: bool) -> StageBenchmark:
+def truth(stage: Stage) -> None:
     """Judge convolved reliefs by skin whose stiff layer came to rest; then time the convolution."""
-    patch = partial(make_micro_skin, "forehead", size_mm=0.8 if toy else 2.4, texel_um=TEXEL_UM)
-    states = (0.82, 0.94, 1.06, 1.18) if toy else FITTED_STRETCHES
-    table = fitted_table([patch(seed=1)], states, every=4 if toy else 1)
-    skins = [patch(seed=seed) for seed in ((7, 8) if toy else (7, 8, 9))]
+    patch = partial(
+        make_micro_skin, "forehead", size_mm=0.8 if stage.toy else 2.4, texel_um=TEXEL_UM
+    )
+    states = (0.82, 0.94, 1.06, 1.18) if stage.toy else FITTED_STRETCHES
+    table = fitted_table([patch(seed=1)], states, every=4 if stage.toy else 1)
+    skins = [patch(seed=seed) for seed in ((7, 8) if stage.toy else (7, 8, 9))]
     ways: list[tuple[str, KernelTable | None, Sampling]] = [
         ("none", None, "cubic"),
         ("the paper's forehead", FOREHEAD, "cubic"),
         ("fitted", table, "cubic"),
         ("fitted", table, "linear"),
     ]
-    points = []
     found: dict[tuple[str, str, str], tuple[float, float]] = {}
-    for angle, across in JAW_CONDITIONS[-1:] if toy else JAW_CONDITIONS:
+    for angle, across in JAW_CONDITIONS[-1:] if stage.toy else JAW_CONDITIONS:
         pairs = [
             (skin, deform(skin, stretch=r, angle_deg=angle, compensation=across))
             for skin in skins
-            for r in (EVALUATED_STRETCHES[::3] if toy else EVALUATED_STRETCHES)
+            for r in (EVALUATED_STRETCHES[::3] if stage.toy else EVALUATED_STRETCHES)
         ]
         for name, kernels, sampling in ways:
             if sampling == "linear" and across == "none":
                 continue
-            timing, made = measure_and_keep(
+            timing, made = stage.time(
                 lambda: [
                     skin.height_um
                     if kernels is None
@@ -166,16 +167,16 @@ def truth(*, toy: bool) -> StageBenchmark:
             knobs: Knobs = {"kernels": name, "jaws_deg": angle}
             knobs |= {"across": across, "sampling": sampling}
             also = {"variance_error_percent": 100.0 * math.expm1(variance)}
-            points.append(Point.of(knobs, timing, outcome, also))
-    if toy:
-        return described("microstructure", points)
+            stage.add(knobs, timing, outcome, also)
+    if stage.toy:
+        return
     kept, by_volume = (
         np.divide(found["fitted", across, "cubic"], found["none", across, "cubic"]).tolist()
         for across in ("none", "volume")
     )
-    limits: Findings = {"normals": kept[0], "variance": kept[1]}
-    limits |= {"normals_volume": by_volume[0], "variance_volume": by_volume[1]}
-    return described("microstructure", points, limits | _full_size())
+    names = ("normals", "variance", "normals_volume", "variance_volume")
+    stage.limits |= zip(names, (*kept, *by_volume), strict=True)
+    stage.limits |= _full_size()
 
 
 def varying_fields(
@@ -390,40 +391,37 @@ def two_passes_error(
     return float(np.sqrt(np.mean(off**2) / np.mean(change**2))), call
 
 
-def passes(*, toy: bool) -> StageBenchmark:
+def passes(stage: Stage) -> None:
     """Compare two passes with the true convolution: turning axes, growing sigma, samples, sizes."""
     tried = [(0.0, 0.0), (0.1, 0.0), (0.0, 0.1)]
-    if not toy:
+    if not stage.toy:
         values = (0.01, GRADUAL_CHANGE_PER_SIGMA, 0.05, 0.1, 0.2)
         tried = [(0.0, 0.0), *((v, 0.0) for v in values), *((0.0, v) for v in values)]
-    points, errors = [], {}
-    efforts: list[tuple[Sampling, list[tuple[float, float]]]] = [
-        ("cubic", tried),
-        ("linear", tried[::5]),
-    ]
-    for sigma_px in (2.0,) if toy else (1.5, 3.0):
-        for sampling, turn, growth in ((s, *pair) for s, pairs in efforts for pair in pairs):
+    efforts: dict[Sampling, list[tuple[float, float]]] = {"cubic": tried, "linear": tried[::5]}
+    for sigma_px in (2.0,) if stage.toy else (1.5, 3.0):
+        for sampling, turn, growth in (
+            (s, *pair) for s, pairs in efforts.items() for pair in pairs
+        ):
             found = []
-            for seed in range(2 if toy else 3):
+            for seed in range(2 if stage.toy else 3):
                 error, call = two_passes_error(
                     turn=turn,
                     growth=growth,
                     sigma_px=sigma_px,
                     sampling=sampling,
-                    side=48 if toy else 160,
+                    side=48 if stage.toy else 160,
                     rng=np.random.default_rng(seed),
                 )
                 found.append(100.0 * error)
-            outcome = mean_error(found)
-            errors[sigma_px, sampling, turn, growth] = outcome.error
             knobs: Knobs = {"turn_rad_per_sigma": turn, "growth_per_sigma": growth}
             knobs |= {"sigma_px": sigma_px, "sampling": sampling}
-            points.append(Point.of(knobs, measure(call, repeats=1, memory=False), outcome))
-    limits: Findings = {}
-    if not toy:
-        limits = {
-            "constant": errors[3.0, "cubic", 0.0, 0.0],
-            "turn": errors[3.0, "cubic", GRADUAL_CHANGE_PER_SIGMA, 0.0],
-            "growth": errors[3.0, "cubic", 0.0, GRADUAL_CHANGE_PER_SIGMA],
-        }
-    return described("microstructure-passes", points, limits)
+            stage.add(knobs, stage.time(call, repeats=1, memory=False)[0], mean_error(found))
+    if not stage.toy:
+        some = GRADUAL_CHANGE_PER_SIGMA
+        for name, (turn, growth) in {
+            "constant": (0.0, 0.0),
+            "turn": (some, 0.0),
+            "growth": (0.0, some),
+        }.items():
+            varied = {"turn_rad_per_sigma": turn, "growth_per_sigma": growth}
+            stage.limits[name] = stage.at(sigma_px=3.0, sampling="cubic", **varied).error

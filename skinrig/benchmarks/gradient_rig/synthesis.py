@@ -1,7 +1,7 @@
 """Benchmark of maps grown from patches, beside histogram-preserving blending."""
 
-import time
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from scipy import fft
@@ -13,9 +13,9 @@ from reconstruction import normal_histogram
 from reconstruction.normal_histogram import relief_slopes
 from rigsim.skin_patch.microrelief import make_micro_skin
 from skinrig.arrays import Float32Array, Float64Array
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import measure, measure_and_keep
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
+from skinrig.benchmarks.measurement import measure, processor_seconds, spent
+from skinrig.benchmarks.results import BandError, Knobs
+from skinrig.benchmarks.stage import Findings, Stage
 
 PIXEL_UM = 10.0
 LARGEST_PX = 16_384
@@ -102,10 +102,10 @@ def skewness_of_curvature(height: Float32Array) -> float:
     return float(((inner - inner.mean()) ** 3).mean() / inner.std() ** 3)
 
 
-def growth(*, toy: bool) -> StageBenchmark:
+def growth(stage: Stage) -> None:
     """Grow a map: cells, what they share, windows tried; beside blending; then the largest map."""
     site = "forehead"
-    count, size_mm, side = (2, 1.6, 200) if toy else (4, 8.0, 2048)
+    count, size_mm, side = (2, 1.6, 200) if stage.toy else (4, 8.0, 2048)
     patches = [
         leveled(
             make_micro_skin(site, seed=seed, size_mm=size_mm, texel_um=PIXEL_UM).height_um,
@@ -116,41 +116,30 @@ def growth(*, toy: bool) -> StageBenchmark:
     truth = slope_histogram(patches)
     halves = [slope_histogram(patches[part::2]) for part in (0, 1)]
     efforts = [(24, 8, 4), (32, 12, 4), (40, 16, 4)]
-    if not toy:
+    if not stage.toy:
         efforts = [(64, 32, 16), (96, 32, 16), (128, 64, 16), *((192, 64, n) for n in (1, 16, 64))]
         efforts += [(256, 64, 16), (256, 128, 16)]
-    points = []
     for cell, overlap, tried in efforts:
-        timing, grown = measure_and_keep(
-            lambda: displacement_synthesis.grow(
-                patches,
-                side,
-                rng=np.random.default_rng(1),
-                cell_px=cell,
-                overlap_px=overlap,
-                candidates=tried,
-            ),
+        grow = partial(
+            displacement_synthesis.grow, cell_px=cell, overlap_px=overlap, candidates=tried
+        )
+        timing, grown = stage.time(
+            lambda: grow(patches, side, rng=np.random.default_rng(1)),
             repeats=1,
             memory=(cell, tried) == (efforts[-1][0], efforts[-1][2]),
         )
         knobs: Knobs = {"method": "cut", "cell": cell, "overlap": overlap, "candidates": tried}
-        points.append(Point.of(knobs, timing, _error(grown, truth)))
-    edge = 40 if toy else 128
-    timing, theirs = measure_and_keep(
-        lambda: blended(patches, side, edge_px=edge, rng=np.random.default_rng(1)),
-        repeats=1,
-        memory=False,
+        stage.add(knobs, timing, _error(grown, truth))
+    edge = 40 if stage.toy else 128
+    blend = partial(blended, patches, side, edge_px=edge)
+    timing, theirs = stage.time(
+        lambda: blend(rng=np.random.default_rng(1)), repeats=1, memory=False
     )
-    points.append(Point.of({"method": "blend", "cell": edge}, timing, _error(theirs, truth)))
-    return described(
-        "displacement-synthesis",
-        points,
-        {} if toy else _judged(patches, truth, theirs),
-        reference_error=normal_histogram.halved_distance(*halves),
-        count=count,
-        size_mm=size_mm,
-        side=side,
-    )
+    stage.add({"method": "blend", "cell": edge}, timing, _error(theirs, truth))
+    stage.reference_error = normal_histogram.halved_distance(*halves)
+    stage.words = {"count": count, "size_mm": size_mm, "side": side}
+    if not stage.toy:
+        stage.limits = _judged(patches, truth, theirs)
 
 
 def _error(height: Float32Array, truth: Float64Array) -> BandError:
@@ -167,22 +156,19 @@ def _error(height: Float32Array, truth: Float64Array) -> BandError:
         normal_histogram.halved_distance((sum(quarters) - each) / 3.0, truth) for each in quarters
     ]
     spread = float(np.sqrt(0.75 * np.sum((np.array(left_out) - np.mean(left_out)) ** 2)))
-    return BandError(error, (max(error - spread, 0.0), error + spread))
+    return BandError.of_size(error, spread)
 
 
 def _judged(patches: Sequence[Float32Array], truth: Float64Array, theirs: Float32Array) -> Findings:
     """Lay out the largest map, draw a band of its tiles, and judge them."""
-    begin = time.process_time()
-    layout = displacement_synthesis.lay_out(
-        patches, LARGEST_PX, rng=np.random.default_rng(0), threads=N_THREADS
+    rng = np.random.default_rng(0)
+    laid_s, layout = spent(
+        lambda: displacement_synthesis.lay_out(patches, LARGEST_PX, rng=rng, threads=N_THREADS)
     )
-    laid_s = time.process_time() - begin
     tile = layout.tile(0, 0)
     rows, columns = tile.shape
     timing = measure(lambda: layout.tile(rows, columns), repeats=1)
-    begin = time.process_time()
-    layout.tile(rows, columns)
-    tile_s = time.process_time() - begin
+    tile_s = processor_seconds(lambda: layout.tile(rows, columns))
     tiles = sum(1 for _ in layout.tiles())
     site = layout.sites[0]
     held = site.sources.heights.nbytes * 2 + site.sources.filled.nbytes

@@ -17,10 +17,10 @@ from reconstruction.wrinkles import fit as wrinkle_fit
 from reconstruction.wrinkles import texels as wrinkle_texels
 from reconstruction.wrinkles import weights as wrinkle_weights
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import measure, measured, once, processor_seconds
+from skinrig.benchmarks.measurement import once, processor_seconds
 from skinrig.benchmarks.resampling import rms_of_draws, squares
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
+from skinrig.benchmarks.results import BandError, Knobs
+from skinrig.benchmarks.stage import Stage
 
 ZONE_CENTERS_UV = (
     *((x, y) for y in (0.12, 0.3) for x in (0.3, 0.7)),
@@ -102,6 +102,11 @@ def furrowed_face(
     return normals(furrows(np.zeros(8))), {name: normals(h) for name, h in deep.items()}
 
 
+def _resized(texture: FloatArray, side: int) -> FloatArray:
+    """Return a texture (H, W, 2) at (side, side, 2)."""
+    return np.moveaxis(resampling.resampled(np.moveaxis(texture, 2, 0), (side, side)), 0, 2)
+
+
 def numpy_combine(
     base: Float32Array, wrinkle: Float64Array, masks: Float64Array, sums: Float64Array
 ) -> Float64Array:
@@ -157,14 +162,13 @@ def _mean_error(model: Any, states: dict[str, Float64Array]) -> BandError:
     return BandError(float(np.mean([one.error for one in errors])), (low, high))
 
 
-def fitting(*, toy: bool) -> StageBenchmark:
+def fitting(stage: Stage) -> None:
     """Fit a map and weights to six expressions: sizes of map and masks, known masks or not."""
-    side = 64 if toy else 512
+    side = 64 if stage.toy else 512
     neutral, states = furrowed_face(side, rng=np.random.default_rng(0))
-    points = []
     sizes = (
         ((64, 16), (32, 16), (16, 16), (32, 8))
-        if toy
+        if stage.toy
         else ((512, 64), (256, 64), (128, 64), (64, 64), (256, 256), (256, 16))
     )
     for map_side, mask_side in sizes:
@@ -180,16 +184,15 @@ def fitting(*, toy: bool) -> StageBenchmark:
         size = wrinkle_storage.footprint((map_side, map_side), (mask_side, mask_side))
         knobs: Knobs = {"map": map_side, "masks": mask_side}
         knobs["KB as BC5 and BC3"] = size.total_bytes / 1024
-        points.append(Point.of(knobs, timing, _mean_error(found.model(), states)))
+        stage.add(knobs, timing, _mean_error(found.model(), states))
     rest = float(np.mean([_error(neutral, n).error for n in states.values()]))
-    best = min(point.error for point in points)
-    return described("wrinkles", points, {} if toy else {"best": best / rest})
+    stage.limits["best"] = min(point.error for point in stage.points) / rest
 
 
-def summing(*, toy: bool) -> StageBenchmark:
+def summing(stage: Stage) -> None:
     """Add half of a wrinkle's relief to a base: derivatives, differences of normals, NumPy."""
     rng = np.random.default_rng(1)
-    side, coarse, mask_side = (256, 32, 8) if toy else (FULL_SIDE_PX, 256, 64)
+    side, coarse, mask_side = (256, 32, 8) if stage.toy else (FULL_SIDE_PX, 256, 64)
     base = gaussian_filter(rng.standard_normal((side, side, 2)), (1, 1, 0)).astype(np.float32)
     base *= 0.1 / base.std()
     wrinkle = gaussian_filter(rng.standard_normal((coarse, coarse, 2)), (2, 2, 0))
@@ -198,7 +201,7 @@ def summing(*, toy: bool) -> StageBenchmark:
     row = np.full(8, 0.5)
     truth = numpy_combine(base, wrinkle, masks, row)
     neutral = wrinkles.decode(base)
-    low = np.moveaxis(resampling.resampled(np.moveaxis(base, 2, 0), (coarse, coarse)), 0, 2)
+    low = _resized(base, coarse)
     difference = wrinkle_differences.difference_map(
         wrinkles.decode(low.astype(np.float64)), wrinkles.decode(low + wrinkle)
     )
@@ -217,45 +220,41 @@ def summing(*, toy: bool) -> StageBenchmark:
         "NumPy": lambda: numpy_combine(base, wrinkle, masks, row),
     }
 
-    points = [
-        measured(
+    for way, call in ways.items():
+        stage.measure(
             {"way": way, "side": side},
             call,
             lambda normals: _error(normals, truth),
             repeats=1 if way == "NumPy" else 5,
             memory=False,
         )
-        for way, call in ways.items()
-    ]
-    if toy:
-        return described("wrinkle-sum", points)
+    if stage.toy:
+        return
     peer_s, own_s = processor_seconds(ways["NumPy"], 1), processor_seconds(by_derivatives, 5)
-    limits = {
+    stage.limits = {
         "over_numpy": peer_s / own_s,
         "over_opencv": processor_seconds(ways["OpenCV and NumPy"], 5) / own_s,
         "difference": float(np.abs(by_derivatives() - truth).max()),
-        "differences": points[0].error / points[1].error,
+        "differences": stage.points[0].error / stage.points[1].error,
         "storage": wrinkle_storage.paper_footprint().total_bytes / 1024,
     }
-    return described("wrinkle-sum", points, limits)
 
 
-def storing(*, toy: bool) -> StageBenchmark:
+def storing(stage: Stage) -> None:
     """Store a wrinkle map at sizes and encodings, and show it: angle, bytes, seconds."""
-    side = 64 if toy else 512
+    side = 64 if stage.toy else 512
     neutral, states = furrowed_face(side, rng=np.random.default_rng(0))
     base = wrinkles.encode(neutral).astype(np.float32)
     fitted = wrinkle_fit.fit(
-        neutral, states, zone_masks(16 if toy else 64), size=(side, side), clamp="signed"
+        neutral, states, zone_masks(16 if stage.toy else 64), size=(side, side), clamp="signed"
     )
     wrinkle = np.clip(fitted.layer.wrinkle, -wrinkles.MAX_DERIVATIVE, wrinkles.MAX_DERIVATIVE)
     masks = fitted.layer.masks
     table = fitted.layer.table
     weights = {"surprise": 1.0, "disgust": 0.6}
     whole = wrinkles.combine(base.astype(np.float64), wrinkle, masks, weights, table=table)
-    points = []
-    for at in (64, 32) if toy else (512, 256, 128, 64):
-        small = np.moveaxis(resampling.resampled(np.moveaxis(wrinkle, 2, 0), (at, at)), 0, 2)
+    for at in (64, 32) if stage.toy else (512, 256, 128, 64):
+        small = _resized(wrinkle, at)
         for maps_as, masks_as in ENCODINGS if at in (64, 256) else ENCODINGS[:1]:
             layer = Layer(
                 wrinkle_storage.stored_map(small, maps_as),
@@ -266,30 +265,27 @@ def storing(*, toy: bool) -> StageBenchmark:
                 (at, at), (masks.shape[1], masks.shape[2]), maps=maps_as, masks=masks_as
             )
             knobs: Knobs = {"map": at, "as": maps_as, "masks as": masks_as}
-            points.append(
-                measured(
-                    knobs | {"KB": round(size.total_bytes / 1024, 3)},
-                    partial(wrinkles.combine_layers, base, [layer], weights),
-                    lambda normals: _error(normals, whole),
-                    memory=False,
-                )
+            stage.measure(
+                knobs | {"KB": round(size.total_bytes / 1024, 3)},
+                partial(wrinkles.combine_layers, base, [layer], weights),
+                lambda normals: _error(normals, whole),
+                memory=False,
             )
-    return described("wrinkle-storage", points)
 
 
-def weighing(*, toy: bool) -> StageBenchmark:
+def weighing(stage: Stage) -> None:
     """Fit the weights of an expression that the model made, at several noises and sizes."""
     rng = np.random.default_rng(2)
-    draws = 4 if toy else 12
+    draws = 4 if stage.toy else 12
     true = np.array([0.3, 0.8, 0.4, 0.7, 0.25, 0.5, 0.6, 0.2])
-    points, ratios = [], []
-    for side in (64, 96) if toy else (128, 256):
+    ratios = []
+    for side in (64, 96) if stage.toy else (128, 256):
         base = 0.1 * rng.standard_normal((side, side, 2))
         wrinkle = gaussian_filter(rng.standard_normal((64, 64, 2)), (1.5, 1.5, 0))
         layer = Layer(0.5 * wrinkle / np.abs(wrinkle).max(), zone_masks(32))
         neutral = wrinkle_texels.derivatives_of(wrinkles.decode(base))
         clean = wrinkles.combine_layers(base, [layer], true)
-        for noise in (0.005, NORMAL_NOISE_RAD) if toy else (0.005, NORMAL_NOISE_RAD, 0.08):
+        for noise in (0.005, NORMAL_NOISE_RAD) if stage.toy else (0.005, NORMAL_NOISE_RAD, 0.08):
             stderr = np.full((side, side), noise)
             bound = _bound(layer, clean, stderr)
 
@@ -298,14 +294,13 @@ def weighing(*, toy: bool) -> StageBenchmark:
                 seen = wrinkle_texels.derivatives_of(noisy, stderr_rad=stderr)
                 return wrinkle_fit.fit_weights(layer, neutral, seen, clamp="signed")
 
-            timing = measure(run, repeats=1, memory=False)
+            timing, _ = stage.time(run, repeats=1, memory=False)
             miss = np.array([run(seed).weights - true for seed in range(draws)])
             ratios.append(float(np.sqrt(np.mean((miss / bound) ** 2))))
             outcome = rms_of_draws(miss, bound=float(np.sqrt(np.mean(bound**2))))
-            points.append(Point.of({"side": side, "noise, mrad": 1e3 * noise}, timing, outcome))
+            stage.add({"side": side, "noise, mrad": 1e3 * noise}, timing, outcome)
     # the mean of six ratios of 96 weights each scatters by 3 %: 1.1 is missed by chance in 1e-3
-    limits = {"over_bound": float(np.mean(ratios))}
-    return described("wrinkle-weights", points, {} if toy else limits)
+    stage.limits["over_bound"] = float(np.mean(ratios))
 
 
 def _disturbed(
@@ -327,7 +322,7 @@ def _bound(layer: Layer, clean: FloatArray, stderr_rad: Float64Array) -> Float64
     the weights follow from n = (p, q, 1) / |(p, q, 1)|.
     """
     side = stderr_rad.shape[0]
-    read = np.moveaxis(resampling.resampled(np.moveaxis(layer.wrinkle, 2, 0), (side, side)), 0, 2)
+    read = _resized(layer.wrinkle, side)
     n = np.asarray(clean, np.float64)
     step = np.concatenate([read, np.zeros((side, side, 1))], axis=2) * n[..., 2:]
     step -= (step * n).sum(axis=2, keepdims=True) * n

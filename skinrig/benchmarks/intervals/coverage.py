@@ -19,8 +19,6 @@ COVERAGE_RANGES: Final = {68: (0.60, 0.76), 95: (0.92, 0.98)}
 
 GAUSSIAN_95: Final = 1.959964
 """Half width of a 95 % interval of a Gaussian error over that of its 68.27 % interval."""
-RAYLEIGH_95: Final = math.sqrt(math.log(0.05) / math.log(1.0 - 0.6827))
-"""The same of an angle whose two components are Gaussian and alike."""
 
 
 @dataclass(frozen=True, slots=True)

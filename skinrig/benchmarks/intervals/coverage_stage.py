@@ -3,7 +3,7 @@
 Terms of error models, and the factors from 68 to 95 %, were set on subjects of seeds 0 to 19
 (`reconstruction.chromophores.model_error`); subjects here have seeds from 400 on. Each goes the
 whole way, from calibration targets to maps, with a calibration of its rig's own
-(`interval_trials_flash` and its like).
+(`skinrig.benchmarks.intervals.flash` and its like).
 
 A coverage is the mean of the subjects' shares, and its interval is that of the mean of so many
 subjects. A promise is missed where the interval lies wholly outside the promised range. The
@@ -11,21 +11,19 @@ intervals' confidence is such that a run in which every coverage is in truth at 
 range misses one with a chance of 5 % at most (Bonferroni).
 """
 
+import itertools
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.intervals import dome as interval_trials_dome
-from skinrig.benchmarks.intervals import flash as interval_trials_flash
-from skinrig.benchmarks.intervals import gradient as interval_trials_gradient
-from skinrig.benchmarks.intervals import probe as interval_trials_probe
-from skinrig.benchmarks.intervals import sequence as interval_trials_sequence
-from skinrig.benchmarks.intervals import trials as interval_trials
+from skinrig.benchmarks.intervals import dome, flash, gradient, probe, sequence
 from skinrig.benchmarks.intervals.coverage import COVERAGE_RANGES, Covered, Trial, by_band
+from skinrig.benchmarks.intervals.trials import ANY_BAND
 from skinrig.benchmarks.measurement import once
-from skinrig.benchmarks.results import Point, StageBenchmark, Timing
+from skinrig.benchmarks.results import Point, Timing
+from skinrig.benchmarks.stage import Findings, Stage
 
 FIRST_SEED: Final = 400
 FALSE_ALARM_RATE: Final = 0.05
@@ -54,84 +52,69 @@ DOME_PRESETS: Final = ("I", "III", "V", "II", "IV", "VI")
 Trials = Iterable[Trial]
 
 
-def intervals(*, toy: bool) -> Iterator[StageBenchmark]:
+def intervals(stage: Stage) -> Iterator[None]:
     """Count how often 68 and 95 % intervals of every rig's maps hold the truth.
 
     Yields
     ------
-    StageBenchmark
-        After each kind of trial that of all so far: the last is the whole one.
+    None
+        After each kind of trial, when the stage holds what is known of all so far.
     """
     trials: list[Trial] = []
     spent: dict[str, Timing] = {}
-    for make in (_small() if toy else _full()).values():
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            timing, made = once(lambda make=make, folder=folder: list(make(folder)))  # type: ignore[misc]
+    for make in (_small() if stage.toy else _full()).values():
+        with tempfile.TemporaryDirectory() as folder:
+            timing, made = once(lambda: list(make(Path(folder))))
         trials += made
         spent |= dict.fromkeys((trial.quantity for trial in made), timing)
-        yield _judged(trials, spent, toy=toy)
+        _judge(stage, trials, spent)
+        yield
 
 
-def _judged(trials: Sequence[Trial], spent: Mapping[str, Timing], *, toy: bool) -> StageBenchmark:
-    judged = [trial for trial in trials if trial.deviation.size]
-    counted = len(by_band(judged, level=68, confidence=0.95))
+def _judge(stage: Stage, trials: Sequence[Trial], spent: Mapping[str, Timing]) -> None:
+    counted = len(by_band(trials, level=68, confidence=0.95))
     # one-sided at each end of the range, of two levels
     confidence = 1.0 - 2.0 * FALSE_ALARM_RATE / (4 * counted)
-    rows = [
-        row
-        for level in COVERAGE_RANGES
-        for row in by_band(judged, level=level, confidence=confidence)
+    tried = (by_band(trials, level=level, confidence=confidence) for level in COVERAGE_RANGES)
+    rows = list(itertools.chain(*tried))
+    stage.points = [_point(row, spent[row.quantity]) for row in rows]
+    stage.limits = {key: found for row in rows for key, found in _limits(row).items()}
+    stage.left_out = [
+        (f"{trial.quantity}, {trial.subject}", "every pixel is masked")
+        for trial in trials
+        if not trial.deviation.size
     ]
-    return described(
-        "intervals",
-        tuple(_point(row, spent[row.quantity]) for row in rows),
-        {} if toy else {k: v for row in rows for k, v in _limits(row).items()},
-        left_out=tuple(
-            (f"{trial.quantity}, {trial.subject}", "every pixel is masked")
-            for trial in trials
-            if not trial.deviation.size
-        ),
-    )
+
+
+def _subjects(names: Sequence[str], count: int, first: int = 0) -> dict[int, str]:
+    """Return names in turn by seeds, the first of which are left to others."""
+    return {FIRST_SEED + first + k: names[k % len(names)] for k in range(count)}
 
 
 def _full() -> Mapping[str, Callable[[Path], Trials]]:
-    flash = {FIRST_SEED + k: FLASH_PRESETS[k % len(FLASH_PRESETS)] for k in range(16)}
-    sites = {FIRST_SEED + k: GRADIENT_SITES[k % len(GRADIENT_SITES)] for k in range(6)}
-    faces = {FIRST_SEED + k: DOME_PRESETS[k] for k in range(len(DOME_PRESETS))}
-    media = {FIRST_SEED + k: medium for k, medium in enumerate(PROBE_MEDIA)}
-    skin = {FIRST_SEED + k: PROBE_PRESETS[k] for k in range(len(PROBE_PRESETS))}
-    coarse = {FIRST_SEED + 16 + k: FLASH_PRESETS[k] for k in range(len(FLASH_PRESETS))}
-    moving = {FIRST_SEED + 24 + k: FLASH_PRESETS[k + 1] for k in range(4)}
+    moving = _subjects(FLASH_PRESETS[1:], 4, first=24)
+    coarse: dict[str, Any] = {"moving": False, "resolution": ", half resolution"}
     return {
-        "flash": lambda folder: interval_trials_flash.flash(folder, flash, width_px=768),
-        "coarse": lambda folder: interval_trials_flash.flash(
-            folder, coarse, width_px=384, moving=False, resolution=", half resolution"
+        "flash": partial(flash.flash, subjects=_subjects(FLASH_PRESETS, 16), width_px=768),
+        "coarse": partial(
+            flash.flash, subjects=_subjects(FLASH_PRESETS, 8, first=16), width_px=384, **coarse
         ),
-        "event": lambda folder: interval_trials_sequence.sequences(
-            folder, moving, width_px=192, state="exercise"
-        ),
-        "prompts": lambda folder: interval_trials_sequence.sequences(
-            folder, moving, width_px=192, state="smile"
-        ),
-        "gradient": lambda folder: interval_trials_gradient.gradient(folder, sites, width_px=128),
-        "dome": lambda folder: interval_trials_dome.dome(folder, faces, width_px=320),
-        "probe": lambda folder: interval_trials_probe.probe(
-            folder,
-            media,
-            skin=skin,
-            directed={FIRST_SEED + k: medium for k, medium in enumerate(ANISOTROPIC_MEDIA)},
+        "event": partial(sequence.sequences, subjects=moving, width_px=192, state="exercise"),
+        "prompts": partial(sequence.sequences, subjects=moving, width_px=192, state="smile"),
+        "gradient": partial(gradient.gradient, subjects=_subjects(GRADIENT_SITES, 6), width_px=128),
+        "dome": partial(dome.dome, subjects=_subjects(DOME_PRESETS, 6), width_px=320),
+        "probe": partial(
+            probe.probe,
+            media=_subjects(PROBE_MEDIA, 8),
+            skin=_subjects(PROBE_PRESETS, 6),
+            directed=_subjects(ANISOTROPIC_MEDIA, 2),
         ),
     }
 
 
 def _small() -> Mapping[str, Callable[[Path], Trials]]:
     faces = {FIRST_SEED + 1: "I"}
-    return {
-        "flash": lambda folder: interval_trials_flash.flash(
-            folder, faces, width_px=96, moving=False
-        )
-    }
+    return {"flash": partial(flash.flash, subjects=faces, width_px=96, moving=False)}
 
 
 def _point(row: Covered, timing: Timing) -> Point:
@@ -159,7 +142,7 @@ def _point(row: Covered, timing: Timing) -> Point:
 
 def _limits(row: Covered) -> Findings:
     low, high = COVERAGE_RANGES[row.level]
-    skin = "" if row.band in ("all", interval_trials.ANY_BAND) else f", {row.band} skin"
+    skin = "" if row.band in ("all", ANY_BAND) else f", {row.band} skin"
     return {
         ("upper", f"{row.level}", f"{row.quantity}{skin}"): (row.interval[1], low),
         ("lower", f"{row.level}", f"{row.quantity}{skin}"): (row.interval[0], high),

@@ -1,5 +1,6 @@
 """Trials of the light dome's intervals: normals, diffuse albedo and surface lobes of faces."""
 
+import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -9,20 +10,13 @@ import numpy as np
 from model import metrics
 from model.skin import SkinAppearance
 from reconstruction.pipeline.dome.stages import WEIGHT_NAMES
+from skinrig.appearances.contents import jointly_valid
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.intervals.coverage import Trial
-from skinrig.benchmarks.intervals.trials import (
-    delete_trial_outputs,
-    maps_of,
-    of_errors,
-    of_map,
-    of_normals,
-    valid_of,
-)
-from skinrig.calibrating.calibrate import calibrate
+from skinrig.benchmarks.intervals.trials import Subject, maps_of, simulated
 from skinrig.evaluating import reflection, skin_bands
 from skinrig.evaluating import surface as surface_evaluation
-from skinrig.simulating.simulation import simulate_session
+from skinrig.planning.confirmation import calibrate_simulated
 
 FACTORS_95: Final[Mapping[str, float]] = {"normals": 2.1, "R_d": 2.2, "surface": 2.5}
 """Half width of a 95 % interval over that of the 68 % one, to 0.1, set on faces of seeds 0 to 5 and
@@ -39,25 +33,20 @@ def dome(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Iterato
     """Yield trials of normals, diffuse albedo and lobes of faces.
 
     Each seed has a dome of its own, built off the drawing, with its own calibration: errors of
-    calibration are drawn anew with each subject. Parameters as of `interval_trials_flash.flash`.
+    calibration are drawn anew with each subject. Parameters as of `flash.flash`.
     """
+    shown = {key: {"width_px": width_px} for key in ("charuco", "mirror", "white")}
+    kinds = (("geometry", ("charuco",)), ("lights", ("mirror", "white")))
     for seed, preset in subjects.items():
-        calibration = folder / "calibration"
-        targets = [folder / f"session-{name}" for name in ("charuco", "mirror", "white")]
-        for target in targets:
-            name = target.name.removeprefix("session-")
-            simulate_session("dome", target, target=name, seed=seed, width_px=width_px)
-        calibrate("geometry", targets[:1], calibration)
-        calibrate("lights", targets[1:], calibration)
-        done = simulate_session(
-            "dome", folder / "session-subject", subject=preset, seed=seed, width_px=width_px
-        )
-        found, truth = maps_of(folder, done, [*NORMAL_MAP_NAMES, "r_d", *WEIGHT_NAMES])
+        with tempfile.TemporaryDirectory(dir=folder) as name:
+            own = Path(name)
+            calibrate_simulated("dome", own, shown, kinds, seed=seed)
+            done = simulated("dome", own, subject=preset, seed=seed, width_px=width_px)
+            found, truth = maps_of(own, done, [*NORMAL_MAP_NAMES, "r_d", *WEIGHT_NAMES])
         yield from of_face(found, truth, f"{preset} {seed}")
-        delete_trial_outputs(folder, done, *targets, calibration)
 
 
-def of_face(found: SkinAppearance, truth: SkinAppearance, subject: str) -> Iterator[Trial]:
+def of_face(found: SkinAppearance, truth: SkinAppearance, name: str) -> Iterator[Trial]:
     """Yield the trials of one face.
 
     Parameters
@@ -66,7 +55,7 @@ def of_face(found: SkinAppearance, truth: SkinAppearance, subject: str) -> Itera
         Its maps, of the dome.
     truth
         Of the same face.
-    subject
+    name
         Preset and seed.
     """
     pairs = surface_evaluation.match(found, truth)
@@ -75,39 +64,27 @@ def of_face(found: SkinAppearance, truth: SkinAppearance, subject: str) -> Itera
         for key in ("normals", "r_d")
     )
     band = str(skin_bands.bands_of(np.median(skin_bands.typology_angle_deg(true_albedo))))
-    who: dict[str, Any] = {"subject": subject, "band": band}
+    subject = Subject(name, band)
     for name, quantity in NORMAL_MAP_NAMES.items():
         normals = found.maps[name]
-        good = valid_of(normals)[pairs.rows, pairs.columns]
+        good = jointly_valid(normals)[pairs.rows, pairs.columns]
         if normals.stderr is not None:
             at = (pairs.rows[good], pairs.columns[good])
-            yield of_normals(
-                quantity,
-                metrics.angular_error_rad(normals.values[at], true_normals[good]),
-                normals.stderr[at][:, 0].astype(np.float64),
-                **who,
-                factor_95=FACTORS_95["normals"],
-            )
+            angle = metrics.angular_error_rad(normals.values[at], true_normals[good])
+            factor = FACTORS_95["normals"]
+            yield subject.of_normals(quantity, angle, normals.stderr[at], factor_95=factor)
     albedo = found.maps["r_d"]
-    shape = valid_of(albedo).shape
+    shape = albedo.values.shape[:2]
     true = np.zeros((*shape, 3))
     true[pairs.rows, pairs.columns] = true_albedo
     covered = np.zeros(shape, bool)
     covered[pairs.rows, pairs.columns] = True
     for channel, color in enumerate(CHANNEL_NAMES):
-        yield of_map(
-            f"R_d, {color}",
-            albedo,
-            true,
-            covered,
-            **who,
-            channel=channel,
-            factor_95=FACTORS_95["R_d"],
-        )
+        how: dict[str, Any] = {"channel": channel, "factor_95": FACTORS_95["R_d"]}
+        yield subject.of_map(f"R_d, {color}", albedo, true, covered, **how)
     off, stderr = lobe_strength(found, truth)
-    yield of_errors(
-        "light from the surface, dome", np.abs(off), stderr, **who, factor_95=FACTORS_95["surface"]
-    )
+    quantity, factor = "light from the surface, dome", FACTORS_95["surface"]
+    yield subject.of_errors(quantity, np.abs(off), stderr, factor_95=factor)
 
 
 def lobe_strength(
@@ -135,17 +112,13 @@ def lobe_strength(
     if test is None:
         return np.zeros(0), np.zeros(0)
     weights = [found.maps[name] for name in WEIGHT_NAMES]
-    valid = valid_of(weights[0]).reshape(-1)[test.texels]
+    valid = jointly_valid(weights[0]).reshape(-1)[test.texels]
     shares, errors = (
-        np.stack(
-            [
-                np.zeros(valid.shape)
-                if part is None
-                else part.reshape(-1)[test.texels].astype(np.float64)
-                for part in parts
-            ]
+        np.stack([part.reshape(-1)[test.texels].astype(np.float64) for part in parts])
+        for parts in (
+            [w.values for w in weights],
+            [np.zeros(w.values.shape) if w.stderr is None else w.stderr for w in weights],
         )
-        for parts in ([w.values for w in weights], [w.stderr for w in weights])
     )
     level, spread = shares.sum(axis=0), errors.sum(axis=0)
     fitted, true = test.fitted.mean(axis=1), test.true.mean(axis=1)

@@ -7,7 +7,7 @@ place off it.
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -15,19 +15,13 @@ from capture.rig import load_rig
 from model import store
 from reconstruction.chromophores import shading_prior
 from reconstruction.pipeline.flash.facial_color import UnknownBloodError
+from skinrig.appearances.contents import jointly_valid
 from skinrig.benchmarks.intervals.coverage import Trial
-from skinrig.benchmarks.intervals.trials import (
-    band_of,
-    calibrated,
-    delete_trial_outputs,
-    maps_of,
-    of_map,
-    valid_of,
-)
+from skinrig.benchmarks.intervals.trials import Subject, band_of, maps_of, simulated
 from skinrig.evaluating import facial_color
 from skinrig.fitting.facial_color import fit_facial_color
+from skinrig.planning.confirmation import calibrate_simulated
 from skinrig.simulating.orders import Simulated, truth_folder
-from skinrig.simulating.simulation import simulate_session
 
 BLOOD_STATES: Final = ("smile", "anger", "fear", "exercise")
 FACTOR_95: Final = 2.4
@@ -37,6 +31,7 @@ subjects of seeds 0 to 15 at 384 and 768 px: tails are heavier than a Gaussian's
 STANCE_DEVIATION: Final = 0.5 * shading_prior.LOG_SHADING_SOFTNESS
 """Standard deviation of how far subjects stand off the tile's place, over the camera's distance:
 what the stated errors take it for. Light goes with the square of the distance."""
+CALIBRATION_SEED: Final = 900
 _STANCE_STREAM: Final = 1
 """Beside a subject's seed: of the draw of its place."""
 
@@ -77,13 +72,12 @@ def flash(
         Said behind the quantities' names.
     """
     targets = {"sensor": "flat", "white": "white", "polarization": "malus"}
-    calibrated("flash", folder, targets, width_px=width_px)
+    calibrate_flash(folder, targets, width_px)
     for seed, preset in subjects.items():
         state = BLOOD_STATES[seed % len(BLOOD_STATES)]
-        name = f"{preset} {seed}"
-        done = simulate_session(
+        done = simulated(
             "flash",
-            folder / "session-subject",
+            folder,
             subject=preset,
             seed=seed,
             width_px=width_px,
@@ -92,23 +86,23 @@ def flash(
         )
         found, truth = maps_of(folder, done, ["melanin", "hemoglobin"])
         skin = truth.maps["mask"].values > 0.5
-        who: dict[str, Any] = {"subject": name, "band": band_of(truth, "reflectance_blurred", skin)}
-        for quantity in ("melanin", "hemoglobin"):
-            true = truth.maps[f"{quantity}_blurred"].values
-            yield of_map(
-                f"{quantity}{resolution}",
-                found.maps[quantity],
-                true,
-                skin,
-                **who,
-                factor_95=FACTOR_95,
-            )
+        subject = Subject(f"{preset} {seed}", band_of(truth, "reflectance_blurred", skin))
+        for name in ("melanin", "hemoglobin"):
+            true = truth.maps[f"{name}_blurred"].values
+            quantity, estimate = f"{name}{resolution}", found.maps[name]
+            yield subject.of_map(quantity, estimate, true, skin, factor_95=FACTOR_95)
         if moving:
-            yield from _of_rig(done, folder, state, **who)
-        delete_trial_outputs(folder, done)
+            yield from _of_rig(done, folder, state, subject)
 
 
-def _of_rig(done: Simulated, folder: Path, state: str, **who: Any) -> Iterator[Trial]:
+def calibrate_flash(folder: Path, targets: Mapping[str, str], width_px: int) -> None:
+    """Calibrate a simulated flash rig by these targets, each of the kind it is for."""
+    shown = {key: {"width_px": width_px} for key in targets.values()}
+    kinds = ((kind, (target,)) for kind, target in targets.items())
+    calibrate_simulated("flash", folder, shown, kinds, seed=CALIBRATION_SEED)
+
+
+def _of_rig(done: Simulated, folder: Path, state: str, subject: Subject) -> Iterator[Trial]:
     try:
         fit_facial_color([done.session], out=folder / "moving", calibration=folder / "calibration")
     except UnknownBloodError:
@@ -122,7 +116,8 @@ def _of_rig(done: Simulated, folder: Path, state: str, **who: Any) -> Iterator[T
     )
     if blood is None or found is None or rest is None or moved is None:
         return
-    both = valid_of(rest) & valid_of(moved) & (moved.values > 0)
+    both = jointly_valid(rest, moved) & (moved.values > 0)
     change = moved.values.astype(np.float64) - rest.values
-    yield of_map("hemoglobin of the rig", blood, moved.values, both, **who, factor_95=FACTOR_95)
-    yield of_map("change of hemoglobin", found, change, both, **who, over=rest.values)
+    quantity = "hemoglobin of the rig"
+    yield subject.of_map(quantity, blood, moved.values, both, factor_95=FACTOR_95)
+    yield subject.of_map("change of hemoglobin", found, change, both, over=rest.values)

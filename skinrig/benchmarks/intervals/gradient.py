@@ -7,9 +7,10 @@ and strain. Both reliefs of the truth are of one piece of skin, as the patch's a
 other skin lead to narrower and stronger kernels.
 """
 
+import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -24,18 +25,12 @@ from reconstruction.pipeline.gradient.stages import CUTOFF_UM, KERNEL_FILE
 from reconstruction.pipeline.gradient.strain_kernels import COARSE_GRID_STEP
 from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.skin_patch.stretch import deform
+from skinrig.appearances.contents import jointly_valid
 from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, Trial
-from skinrig.benchmarks.intervals.trials import (
-    delete_trial_outputs,
-    maps_of,
-    of_errors,
-    of_normals,
-    valid_of,
-)
-from skinrig.calibrating.calibrate import calibrate
+from skinrig.benchmarks.intervals.trials import Subject, maps_of, simulated
 from skinrig.evaluating.microrelief import compare_stretch, true_relief
 from skinrig.evaluating.subsurface import document_of
-from skinrig.simulating.simulation import simulate_session
+from skinrig.planning.confirmation import calibrate_simulated
 
 FACTORS_95: Final[Mapping[str, float]] = {"normals": 1.9, "height": 2.1, "stretch": GAUSSIAN_95}
 """Half width of a 95 % interval over that of the 68 % one, to 0.1, set on 6 patches of seeds 0 to
@@ -54,60 +49,47 @@ def gradient(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Ite
     """Yield trials of normals and heights at rest, and of stretch and kernels to either side.
 
     Each seed has a sphere of its own, built off the drawing, with its own calibration. Parameters
-    as of `interval_trials_flash.flash`; a subject is a site of the face.
+    as of `flash.flash`; a subject is a site of the face.
     """
+    kinds = [(kind, ("ball",)) for kind in ("lights", "polarization")]
+    jaws = {"angles": (0.0,), "steps": (-MAX_STRETCH_STEP, MAX_STRETCH_STEP)}
     for seed, site in subjects.items():
-        name = f"{site} {seed}"
-        ball, calibration = folder / "session-ball", folder / "calibration"
-        simulate_session("gradient", ball, target="ball", seed=seed)
-        for kind in ("lights", "polarization"):
-            calibrate(kind, [ball], calibration)
-        done = simulate_session(
-            "gradient",
-            folder / "session-subject",
-            site=site,
-            seed=seed,
-            width_px=width_px,
-            angles=(0.0,),
-            steps=(-MAX_STRETCH_STEP, MAX_STRETCH_STEP),
-        )
-        found, truth = maps_of(folder, done, ["normals", "height", "strain", "kernels"])
+        with tempfile.TemporaryDirectory(dir=folder) as name:
+            own = Path(name)
+            calibrate_simulated("gradient", own, {"ball": {}}, kinds, seed=seed)
+            asked: dict[str, Any] = {"site": site, "seed": seed, "width_px": width_px, **jaws}
+            done = simulated("gradient", own, **asked)
+            found, truth = maps_of(own, done, ["normals", "height", "strain", "kernels"])
+        subject = Subject(f"{site} {seed}")
         state = next(
             key.removeprefix("normals_")
             for key in found.maps
             if key.startswith("normals_a") and key.endswith("_n0")
         )
         normals, seen = found.maps[f"normals_{state}"], truth.maps[f"normals_seen_{state}"]
-        good = valid_of(normals) & valid_of(seen)
+        good = jointly_valid(normals, seen)
         if normals.stderr is not None:
             angle = metrics.angular_error_rad(normals.values[good], seen.values[good])
-            yield of_normals(
-                "normals of the gradient sphere",
-                angle,
-                normals.stderr[good][:, 0].astype(np.float64),
-                subject=name,
-                factor_95=FACTORS_95["normals"],
-            )
+            quantity, factor = "normals of the gradient sphere", FACTORS_95["normals"]
+            yield subject.of_normals(quantity, angle, normals.stderr[good], factor_95=factor)
         height = found.maps[f"height_{state}"]
         relief = true_relief(found, truth, state)
-        good = valid_of(height) & valid_of(truth.maps[f"height_{state}"])
+        good = jointly_valid(height, truth.maps[f"height_{state}"])
         if height.stderr is not None:
             stderr = height.stderr[good].astype(np.float64)
             off = np.abs(height.values.astype(np.float64)[good] - relief[good])
-            yield of_errors(
-                "height", off, stderr, subject=name, unit="um", factor_95=FACTORS_95["height"]
-            )
+            factor = FACTORS_95["height"]
+            yield subject.of_errors("height", off, stderr, unit="um", factor_95=factor)
         # the neutral state is what stretch is told against: exact by definition
         rows = [row for row in compare_stretch(found, truth) if row.state != state]
         spread = np.array([row.stderr for row in rows])
         off = np.array([abs(row.error) for row in rows])
-        yield of_errors("stretch ratio", off, spread, subject=name, factor_95=FACTORS_95["stretch"])
-        yield from _kernels(found, truth, site=site, seed=seed)
-        delete_trial_outputs(folder, done, ball, calibration)
+        yield subject.of_errors("stretch ratio", off, spread, factor_95=FACTORS_95["stretch"])
+        yield from _kernels(found, truth, subject, site=site, seed=seed)
 
 
 def _kernels(
-    found: SkinAppearance, truth: SkinAppearance, *, site: str, seed: int
+    found: SkinAppearance, truth: SkinAppearance, subject: Subject, *, site: str, seed: int
 ) -> Iterator[Trial]:
     """Compare the kernels of strained states with those of more of the same skin."""
     document = document_of(found, KERNEL_FILE)
@@ -130,11 +112,10 @@ def _kernels(
             off[key].append(deviation(error, float(fit[half]), float(fit[half_95])))
             widths[key].append(float(fit[half]))
     for key, unit in (("alpha", ""), ("sigma_um", "um")):
-        yield of_errors(
+        yield subject.of_errors(
             f"{key.removesuffix('_um')} of kernels",
             np.array(off[key]),
             np.ones(len(off[key])),
-            subject=f"{site} {seed}",
             unit=unit,
             widths=np.array(widths[key]),
         )

@@ -14,7 +14,7 @@ from reconstruction.pipeline.probe.stages import ANISOTROPY_FILE, CHANNEL_NAMES,
 from rigsim.fiber.probe_tissue import PHANTOM_DEVIATIONS, phantom_certificate
 from rigsim.subject.pigment import MELANIN_PRESETS
 from skinrig.benchmarks.intervals.coverage import Trial
-from skinrig.benchmarks.intervals.trials import ANY_BAND, delete_trial_outputs, maps_of, of_errors
+from skinrig.benchmarks.intervals.trials import Subject, maps_of, simulated
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import skin_bands
 from skinrig.evaluating import subsurface as evaluation
@@ -46,7 +46,7 @@ def probe(
     Parameters
     ----------
     folder
-        As of `interval_trials_flash.flash`.
+        As of `flash.flash`.
     media
         Seed of each and "homogeneous:SIGMA_A,SIGMA_S_PRIME,G": sigma_tr, sigma_a and sigma_s'.
     skin
@@ -58,22 +58,20 @@ def probe(
     for seed, medium in media.items():
         done = _subject(folder, medium, seed, sites=("cheek",), size=PHOTON_BUDGET)
         found, truth = maps_of(folder, done, ["subsurface"])
-        name = f"{medium} {seed}"
-        yield of_decay("sigma_tr of media", found, truth, subject=name, band=ANY_BAND)
+        subject = Subject(f"{medium} {seed}")
+        yield of_decay("sigma_tr of media", found, truth, subject)
         for coefficient in COEFFICIENT_LABELS:
-            yield of_coefficient(coefficient, found, truth, subject=name)
-        delete_trial_outputs(folder, done)
+            yield of_coefficient(coefficient, found, truth, subject)
     for seed, preset in (skin or {}).items():
         done = _subject(folder, preset, seed)
         found, truth = maps_of(folder, done, ["subsurface"])
-        band = melanin_band_of(preset)
-        yield of_decay("sigma_tr of skin", found, truth, subject=f"{preset} {seed}", band=band)
-        delete_trial_outputs(folder, done)
+        subject = Subject(f"{preset} {seed}", melanin_band_of(preset))
+        yield of_decay("sigma_tr of skin", found, truth, subject)
     for seed, medium in (directed or {}).items():
         done = _subject(folder, medium, seed, sites=("cheek",), angles=(N_DIRECTIONS,))
         found, truth = maps_of(folder, done, ["anisotropy"])
-        yield from of_directions(found, truth, _farthest_deg(medium), f"{medium} {seed}")
-        delete_trial_outputs(folder, done)
+        subject = Subject(f"{medium} {seed}")
+        yield from of_directions(found, truth, _farthest_deg(medium), subject)
 
 
 def _subject(folder: Path, subject: str, seed: int, **asked: Any) -> Simulated:
@@ -92,9 +90,7 @@ def _subject(folder: Path, subject: str, seed: int, **asked: Any) -> Simulated:
         json.dumps(drawn_certificate(np.random.default_rng([seed, BLOCK_SEED_OFFSET])))
     )
     calibrate("fibre", [phantom], folder / "calibration", phantom=paper)
-    return simulate_session(
-        "probe", folder / "session-subject", subject=subject, seed=seed, **asked
-    )
+    return simulated("probe", folder, subject=subject, seed=seed, **asked)
 
 
 def drawn_certificate(rng: np.random.Generator) -> dict[str, Any]:
@@ -131,13 +127,13 @@ def melanin_band_of(preset: str) -> str:
 
 
 def of_decay(
-    quantity: str, found: SkinAppearance, truth: SkinAppearance, *, subject: str, band: str
+    quantity: str, found: SkinAppearance, truth: SkinAppearance, subject: Subject
 ) -> Trial:
     """Compare valid fits of sigma_tr; their interval is one of the logarithm, its halves alike.
 
     Parameters
     ----------
-    quantity, subject, band
+    quantity, subject
         Of the trial.
     found, truth
         With fits, and with true profiles.
@@ -150,11 +146,11 @@ def of_decay(
     half = np.array([0.5 * np.log(fit.interval[1] / fit.interval[0]) for fit in fits])
     center = np.array([0.5 * np.log(fit.interval[1] * fit.interval[0]) for fit in fits])
     true = np.log(np.array([fit.truth for fit in fits]))
-    return of_errors(quantity, np.abs(center - true), half, subject=subject, band=band)
+    return subject.of_errors(quantity, np.abs(center - true), half)
 
 
 def of_coefficient(
-    name: str, found: SkinAppearance, truth: SkinAppearance, *, subject: str
+    name: str, found: SkinAppearance, truth: SkinAppearance, subject: Subject
 ) -> Trial:
     """Compare sigma_a or sigma_s' of a homogeneous medium, where the fit says that it is told.
 
@@ -179,11 +175,11 @@ def of_coefficient(
             value = evaluation.number(fit[f"{name}_per_mm"])
             off.append(abs(value / true[CHANNEL_NAMES.index(fit["channel"])] - 1.0))
             stderr.append(evaluation.number(fit[f"{name}_stderr"]) / value)
-    return of_errors(COEFFICIENT_LABELS[name], np.array(off), np.array(stderr), subject=subject)
+    return subject.of_errors(COEFFICIENT_LABELS[name], np.array(off), np.array(stderr))
 
 
 def of_directions(
-    found: SkinAppearance, truth: SkinAppearance, axis_deg: float, subject: str
+    found: SkinAppearance, truth: SkinAppearance, axis_deg: float, subject: Subject
 ) -> Iterator[Trial]:
     """Yield trials of axis and ratio of a medium that scatters by direction.
 
@@ -208,11 +204,11 @@ def of_directions(
     )
     turn = np.array([abs((row["axis_deg"] - axis_deg + 90.0) % 180.0 - 90.0) for row in rows])
     stderr = np.array([row["axis_stderr_deg"] for row in rows])
-    yield of_errors("axis of anisotropy", turn, stderr, subject=subject, unit="degrees")
+    yield subject.of_errors("axis of anisotropy", turn, stderr, unit="degrees")
     ratio = np.array([true.ratio[CHANNEL_NAMES.index(row["channel"])] for row in rows])
     off = np.abs(np.array([row["ratio"] for row in rows]) - ratio)
     spread = np.array([row["ratio_stderr"] for row in rows])
-    yield of_errors("ratio of anisotropy", off, spread, subject=subject, widths=spread / ratio)
+    yield subject.of_errors("ratio of anisotropy", off, spread, widths=spread / ratio)
 
 
 def _farthest_deg(medium: str) -> float:

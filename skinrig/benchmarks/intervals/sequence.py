@@ -17,10 +17,10 @@ import numpy as np
 from model import store
 from reconstruction.pipeline import recipes as pipeline
 from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, Trial
-from skinrig.benchmarks.intervals.trials import band_of, calibrated, delete_trial_outputs, truth_of
+from skinrig.benchmarks.intervals.flash import calibrate_flash
+from skinrig.benchmarks.intervals.trials import band_of, simulated, truth_of
 from skinrig.capturing.sequences import SequenceOrder
 from skinrig.simulating.sequence import COURSE_FILE
-from skinrig.simulating.simulation import simulate_session
 
 TIME_CONSTANTS_S: Final[Mapping[str, Sequence[float]]] = {
     "exercise": (15.0, 30.0, 60.0),
@@ -48,12 +48,12 @@ def sequences(
     state
         One of `TIME_CONSTANTS_S`.
     """
-    calibrated("flash", folder, {"white": "white"}, width_px=width_px)
+    calibrate_flash(folder, {"white": "white"}, width_px)
     for seed, preset in subjects.items():
         constant_s = TIME_CONSTANTS_S[state][seed % len(TIME_CONSTANTS_S[state])]
-        done = simulate_session(
+        done = simulated(
             "flash",
-            folder / "session-subject",
+            folder,
             subject=preset,
             seed=seed,
             width_px=width_px,
@@ -69,13 +69,13 @@ def sequences(
             landmarks=truth / "landmarks.csv",
         )
         document = json.loads((folder / "maps" / "perfusion_curves.json").read_text("utf-8"))
-        who: dict[str, Any] = {"subject": f"{preset} {seed}", "band": _band(truth)}
+        name, band = f"{preset} {seed}", _band(truth)
         fits = list(document["fits"].values())
-        yield of_fits(f"time constant after {state}", fits, constant_s, **who)
+        yield of_fits(f"time constant after {state}", fits, constant_s, name, band)
         course = json.loads((truth / COURSE_FILE).read_text("utf-8"))["constants_s"]
         if "reaction_s" in course:
-            yield of_fits(f"delay of {state}", fits, course["reaction_s"], **who, delay=True)
-        delete_trial_outputs(folder, done)
+            reaction_s = course["reaction_s"]
+            yield of_fits(f"delay of {state}", fits, reaction_s, name, band, delay=True)
 
 
 def order_of(state: str, seed: int) -> SequenceOrder:
@@ -99,9 +99,9 @@ def of_fits(
     quantity: str,
     fits: Iterable[Mapping[str, Any]],
     true_s: float,
-    *,
     subject: str,
     band: str,
+    *,
     delay: bool = False,
 ) -> Trial:
     """Compare fits with the true time constant, or the true delay.

@@ -14,10 +14,9 @@ from capture.rig import load_rig
 from rigsim.as_built.probe import ProbeTolerances, build_probe, unit_images
 from rigsim.sensor import expose, fixed_pattern, sensor_of
 from skinrig.arrays import Float64Array, UInt16Array
-from skinrig.benchmarks.description import described
-from skinrig.benchmarks.measurement import measure
 from skinrig.benchmarks.resampling import drawn_again
-from skinrig.benchmarks.results import BandError, Point, StageBenchmark
+from skinrig.benchmarks.results import BandError
+from skinrig.benchmarks.stage import Stage
 
 PROBE_SEED = 5
 LIGHT_DECADES = 7.0
@@ -44,13 +43,11 @@ class _Bench:
     """Of each fibre and color, summed over its aperture, (F, 3)."""
 
 
-def fibre_readings(*, toy: bool) -> StageBenchmark:
+def fibre_readings(stage: Stage) -> None:
     """Read 28 fibres whose light falls by seven decades with 1 to 23 exposures."""
-    bench = _bench(draws=2 if toy else N_NOISE_DRAWS)
-    points = []
-    for count in (1, 3, 8, 23) if toy else EXPOSURE_COUNTS:
+    bench = _bench(draws=2 if stage.toy else N_NOISE_DRAWS)
+    for count in (1, 3, 8, 23) if stage.toy else EXPOSURE_COUNTS:
         chosen = _spread(len(bench.times), count)
-
         results = [_read(bench, chosen, draw) for draw in range(len(bench.frames))]
         valid, signal, stderr = (
             np.array([getattr(r, name) for r in results]) for name in ("valid", "signal", "stderr")
@@ -60,24 +57,20 @@ def fibre_readings(*, toy: bool) -> StageBenchmark:
         bound = np.sqrt(_bound(bench, chosen)) / bench.truth
         # the median of a normal distribution's size is 0.674 of its deviation
         least = 67.4 * float(np.median(np.where(np.isfinite(bound), bound, 1 / 0.674)))
-        timing = measure(lambda: _read(bench, chosen, 0), repeats=1 if toy else 3)
+        timing, _ = stage.time(lambda: _read(bench, chosen, 0))
         also = {
             "exposed_s": round(float(bench.times[chosen].sum()), 1),
             "measured_percent": round(float(100 * valid.mean()), 1),
         }
         outcome = BandError(float(np.median(miss)), _interval(miss.reshape(len(miss), -1)), least)
-        points.append(Point.of({"exposures": count}, timing, outcome, also))
+        stage.add({"exposures": count}, timing, outcome, also)
         away = ((signal - bench.truth) / np.where(valid, stderr, np.inf))[valid]
         relative = (signal / bench.truth - 1).reshape(-1, bench.truth.size)
     near = bench.truth.ravel() > 1e-5 * bench.truth.max()
     worst = 100 * float(np.sqrt((relative[:, near] ** 2).mean(axis=0)).max())
     ratio = float(np.sqrt((relative**2 / bound.ravel() ** 2).mean()))
     inside = 100 * float((np.abs(away) < 1).mean())
-    return described(
-        "fibre-readings",
-        points,
-        {"rms": worst, "over_bound": ratio, "inside": inside, "inside_most": inside},
-    )
+    stage.limits |= {"rms": worst, "over_bound": ratio, "inside": inside, "inside_most": inside}
 
 
 def _bench(*, draws: int) -> _Bench:

@@ -2,7 +2,6 @@
 
 import math
 import tempfile
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +9,9 @@ import numpy as np
 from model import store
 from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.probe.profile_fits import METHOD_NAMES
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import measure
-from skinrig.benchmarks.resampling import drawn_again
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
+from skinrig.benchmarks.resampling import drawn_median
+from skinrig.benchmarks.results import BandError, Knobs
+from skinrig.benchmarks.stage import Stage
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import subsurface as evaluation
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
@@ -29,7 +27,7 @@ BAND_G = 0.8
 """g of the media that stand for bands of skin."""
 
 
-def session(*, toy: bool) -> StageBenchmark:
+def session(stage: Stage) -> None:
     """Capture, calibrate and invert media whose sigma_tr is known; seconds are of the inversion."""
     with tempfile.TemporaryDirectory(prefix="skinrig-probe-") as name:
         folder = Path(name)
@@ -44,23 +42,28 @@ def session(*, toy: bool) -> StageBenchmark:
             for seed, (name, band) in enumerate(MELANIN_BANDS.items())
         }
         of_bands = {name: _invert(folder, place) for name, place in like_skin.items()}
-        rows = [row for some in of_bands.values() for row in some] if toy else []
+        rows = [row for some in of_bands.values() for row in some] if stage.toy else []
         last = like_skin["dark"]
-        for seed in () if toy else range(FIRST_MEDIUM_SEED, FIRST_MEDIUM_SEED + N_MEDIA):
+        for seed in () if stage.toy else range(FIRST_MEDIUM_SEED, FIRST_MEDIUM_SEED + N_MEDIA):
             last = _captured(folder, f"{seed}", medium(seed), seed)
             rows += _invert(folder, last)
-        bands = {name: _best(some) for name, some in of_bands.items()}
-        timing = measure(lambda: _invert(folder, last, "again"), repeats=1, memory=False)
+        stage.by_band |= {name: _best(some) for name, some in of_bands.items()}
+        timing, _ = stage.time(lambda: _invert(folder, last, "again"), repeats=1, memory=False)
     by_method = {row.method: row for row in evaluation.by_method(rows)}
-    points = []
     for method in (name for name in METHOD_NAMES if name in by_method):
         valid = [row for row in rows if row.method == method and row.valid]
         for channel in ("all", *sorted({row.channel for row in valid})):
             sizes = [abs(row.relative) for row in valid if channel in ("all", row.channel)]
             knobs: Knobs = {"method": method, "channel": channel}
             knobs["media"] = len({row.name for row in rows})
-            points.append(Point.of(knobs, timing, _error(sizes)))
-    return described("probe-session", points, {} if toy else _limits(by_method), by_band=bands)
+            stage.add(knobs, timing, _error(sizes))
+    best, dipole = by_method[METHOD_NAMES[0]], by_method["dipole"]
+    stage.limits = {
+        "median": 100 * best.median,
+        "worst": 100 * best.worst,
+        "valid": best.fits,
+        "dipole": 100 * dipole.median,
+    }
 
 
 def medium(seed: int) -> tuple[float, float, float]:
@@ -97,16 +100,6 @@ def _invert(folder: Path, session: Path, name: str = "") -> list[evaluation.FitE
     return evaluation.compare_fits(store.read(out), store.read(truth_folder(session)))
 
 
-def _limits(by_method: Mapping[str, evaluation.MethodError]) -> Findings:
-    best, dipole = by_method[METHOD_NAMES[0]], by_method["dipole"]
-    return {
-        "median": 100 * best.median,
-        "worst": 100 * best.worst,
-        "valid": best.fits,
-        "dipole": 100 * dipole.median,
-    }
-
-
 def _captured(folder: Path, name: str, coefficients: tuple[float, float, float], seed: int) -> Path:
     """Return a session of a medium by its sigma_a, sigma_s' and g."""
     sigma_a, sigma_s_prime, g = coefficients
@@ -129,4 +122,4 @@ def _best(rows: list[evaluation.FitError]) -> BandError:
 def _error(sizes: list[float]) -> BandError:
     """Return the median in percent, with its interval."""
     percent = 100 * np.array(sizes)
-    return BandError(float(np.median(percent)), drawn_again(percent, draws=400))
+    return drawn_median(percent, draws=400)

@@ -12,10 +12,10 @@ from reconstruction.subsurface.models import Method
 from rigsim.fiber.profile import fibre_profile
 from rigsim.tissue.tissue_mc import Layer, LayerStack
 from skinrig.arrays import BoolArray, Float64Array
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import measure_and_keep, processor_seconds
+from skinrig.benchmarks.measurement import processor_seconds
 from skinrig.benchmarks.resampling import drawn_again, median_error
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
+from skinrig.benchmarks.results import BandError, Knobs
+from skinrig.benchmarks.stage import Findings, Stage
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, MelaninBand
 
 FIBER_RADII_MM = 0.3 + 0.25 * np.arange(28)
@@ -56,13 +56,12 @@ def transport_profiles(*, toy: bool) -> tuple[Float64Array, Float64Array, Float6
     return sigma_tr, profiles, errors
 
 
-def tiers(*, toy: bool) -> StageBenchmark:
+def tiers(stage: Stage) -> None:
     """Fit Monte Carlo profiles by the three models, with all fibres and with fewer."""
     rng = np.random.default_rng(1)
-    sigma_tr, profiles, errors = transport_profiles(toy=toy)
+    sigma_tr, profiles, errors = transport_profiles(toy=stage.toy)
     spread = slice(0, len(sigma_tr) - len(MELANIN_BANDS))
-    bands: dict[str, BandError] = {}
-    draws = 4 if toy else 40
+    draws = 4 if stage.toy else 40
     shape = (draws, *profiles.shape)
     noisy = profiles * np.exp(RELATIVE_COMMON_ERROR * rng.standard_normal((*shape[:2], 1)))
     noisy *= 1.0 + RELATIVE_FIBER_ERROR * rng.standard_normal(shape)
@@ -77,11 +76,9 @@ def tiers(*, toy: bool) -> StageBenchmark:
         ("photon_table", slice(0, 14)),
         ("photon_table", slice(0, None, 4)),
     ]
-    points = []
-    limits: Findings = {}
     best = np.zeros(1)
     for method, part in chosen:
-        timing, found = measure_and_keep(
+        timing, found = stage.time(
             lambda: subsurface.invert(
                 FIBER_RADII_MM[part],
                 noisy[..., part],
@@ -91,34 +88,26 @@ def tiers(*, toy: bool) -> StageBenchmark:
                 core_mm=FIBER_CORE_MM,
                 source_core_mm=FIBER_CORE_MM,
                 common_error=RELATIVE_COMMON_ERROR,
-            ),
-            repeats=1 if toy else 3,
+            )
         )
         relative = found.sigma_tr_per_mm / sigma_tr - 1.0
-        if not bands:
-            bands = {
-                name: median_error(np.abs(relative[:, k - len(MELANIN_BANDS)]))
-                for k, name in enumerate(MELANIN_BANDS)
-            }
+        if not stage.by_band:
+            own = np.abs(relative[:, -len(MELANIN_BANDS) :].T)
+            stage.by_band |= dict(zip(MELANIN_BANDS, map(median_error, own), strict=True))
         error = np.abs(relative[:, spread])
         outcome = BandError(float(np.median(error)), _over_media(error))
         radius = FIBER_RADII_MM[part]
         knobs: Knobs = {"model": method, "fibres": radius.size}
         knobs |= {"from mm": float(radius[0]), "to mm": float(radius[-1])}
-        points.append(Point.of(knobs, timing, outcome))
+        stage.add(knobs, timing, outcome)
         if part == slice(None):
             bias = np.median(relative[:, spread], axis=0)
             low, high = np.moveaxis(found.interval_per_mm, -1, 0)
             inside = ((low <= sigma_tr) & (sigma_tr <= high))[:, spread]
             best = bias if method == "photon_table" else best
-            limits |= _tier_limits(method, error, bias, inside, best)
-    return described(
-        "subsurface-fit",
-        points,
-        {} if toy else limits,
-        reference_error=float(np.median(errors / profiles)) / np.sqrt(FIBER_RADII_MM.size),
-        by_band=bands,
-    )
+            stage.limits |= _tier_limits(method, error, bias, inside, best)
+    relative_error = float(np.median(errors / profiles))
+    stage.reference_error = relative_error / np.sqrt(FIBER_RADII_MM.size)
 
 
 def _tier_limits(
@@ -175,10 +164,10 @@ def _absorbs_like(sigma_a: Float64Array, band: MelaninBand) -> BoolArray:
     return np.asarray(np.abs(np.log(sigma_a / band.sigma_a_per_mm)) < np.log(2.0))
 
 
-def batches(*, toy: bool) -> StageBenchmark:
+def batches(stage: Stage) -> None:
     """Fit batches of 28 fibres by diffusion; 30,000 beside a loop of SciPy's least_squares."""
     rng = np.random.default_rng(2)
-    count = 200 if toy else N_BATCH_PROFILES
+    count = 200 if stage.toy else N_BATCH_PROFILES
     k = np.exp(rng.uniform(np.log(0.3), np.log(3.0), count))
     s = np.exp(rng.uniform(np.log(0.7), np.log(4.0), count))
     a = 0.5 * (np.sqrt(s**2 + 4.0 / 3.0 * k**2) - s)
@@ -195,26 +184,24 @@ def batches(*, toy: bool) -> StageBenchmark:
             model_error=model_error,
         )
 
-    points = []
-    bands: dict[str, BandError] = {}
     drawn = np.abs(_least_error(a, s, variance) * rng.standard_normal(count))
     for model_error in (0.0, None):
         for n in (count // 10, count):
-            timing, made = measure_and_keep(lambda: ours(n, model_error), repeats=1 if toy else 3)
+            timing, made = stage.time(lambda: ours(n, model_error))
             error = np.abs(made.sigma_tr_per_mm / k[:n] - 1.0)
             # the bound is that of noise alone: an error that is allowed for is not in these data
             bound = float(np.median(drawn[:n])) if model_error == 0.0 else None
             own = "none" if model_error == 0.0 else "diffusion's"
             outcome = median_error(error, bound=bound)
-            points.append(Point.of({"profiles": n, "model error": own}, timing, outcome))
-            if not bands and n == count:
-                bands = {
-                    name: median_error(error[some], bound=float(np.median(drawn[some])))
-                    for name, band in MELANIN_BANDS.items()
-                    for some in (_absorbs_like(a, band),)
-                }
-    limits: Findings = {}
-    if not toy:
+            stage.add({"profiles": n, "model error": own}, timing, outcome)
+            if not stage.by_band and n == count:
+
+                def on_skin(band: MelaninBand) -> BandError:
+                    some = _absorbs_like(a, band)
+                    return median_error(error[some], float(np.median(drawn[some])))
+
+                stage.on_each_skin(on_skin)
+    if not stage.toy:
         found, above, apart = ours(), [], []
         start = np.log([0.1, 1.0])
 
@@ -236,9 +223,8 @@ def batches(*, toy: bool) -> StageBenchmark:
         theirs_s = processor_seconds(lambda: [peer(n) for n in range(N_PEER_FITS)], 2)
         theirs_s *= count / N_PEER_FITS
         ours_s = processor_seconds(ours, 3)
-        limits = {
+        stage.limits = {
             "speed_up": theirs_s / ours_s,
             "chi2": float(max(above)),
             "apart": float(np.median(apart)),
         }
-    return described("subsurface-batch", points, limits, by_band=bands)

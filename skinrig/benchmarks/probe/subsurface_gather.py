@@ -1,6 +1,5 @@
 """Benchmark of light gathered in skin, beside the direct sum in NumPy in the same run."""
 
-import time
 from dataclasses import dataclass
 from functools import partial
 
@@ -13,11 +12,11 @@ from model.dipole.direct_sum import Media, exitance_directly
 from model.dipole.gather import GATHER_TOL, SourceTree, gather
 from model.fresnel import ETA_SKIN
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import measure, measure_and_keep, measured, processor_seconds
-from skinrig.benchmarks.resampling import drawn_again
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark, Timing
-from skinrig.evaluating.skin_bands import MELANIN_BANDS
+from skinrig.benchmarks.measurement import measure, processor_seconds, spent
+from skinrig.benchmarks.resampling import drawn_rms
+from skinrig.benchmarks.results import BandError, Knobs, Timing
+from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.evaluating.skin_bands import MelaninBand
 
 FULL_SIDE_PX = 512
 MIN_RELATIVE_EXITANCE = 0.01
@@ -71,51 +70,43 @@ def edge_profile(x_mm: Float64Array, media: Media) -> Float64Array:
     return np.asarray(np.where(x_mm >= 0.0, beyond, 1.0 - beyond))
 
 
-def gathering(*, toy: bool) -> StageBenchmark:
+def gathering(stage: Stage) -> None:
     """Gather light over a face: tolerance of the tree; then a shadow's edge: number of sources."""
     rng = np.random.default_rng(0)
-    points = [*_tolerances(48 if toy else 256, 3 if toy else 6, rng), *_edges(toy, rng)]
-    return described(
-        "subsurface-gather", points, {} if toy else _full_size(rng), by_band=_bands(rng)
-    )
+    _tolerances(stage, rng)
+    _edges(stage, rng)
+    if not stage.toy:
+        stage.limits = _full_size(rng)
+    stage.on_each_skin(lambda band: _on_skin(band, rng))
 
 
-def _tolerances(side: int, steps: int, rng: np.random.Generator) -> list[Point]:
+def _tolerances(stage: Stage, rng: np.random.Generator) -> None:
+    side, steps = (48, 3) if stage.toy else (256, 6)
     scene = face(side)
-    at = rng.choice(len(scene.area), 40 if side < 100 else 100, replace=False)
+    at = rng.choice(len(scene.area), 40 if stage.toy else 100, replace=False)
     truth = _directly(scene, at)
-    points = []
     for tolerance in (10.0 ** (1.0 - k) for k in range(steps)):
         tree = SourceTree.of(scene.place, scene.area)
-        timing, found = measure_and_keep(lambda: _gathered(scene, tree, tolerance), repeats=1)
+        timing, found = stage.time(lambda: _gathered(scene, tree, tolerance), repeats=1)
         error = (found[at] - truth) / (scene.r_d[at] * scene.entered.max())
         knobs: Knobs = {"scene": "face", "texels": side**2, "tolerance": tolerance}
-        points.append(Point.of(knobs, timing, _rms(error, rng)))
+        stage.add(knobs, timing, _rms(error, rng))
     direct = measure(lambda: _directly(scene, at[:10]), repeats=1, memory=False)
     seconds = direct.seconds * side**2 / 10
     why = "its seconds are extrapolated from those of 10 points"
     timing = Timing(seconds, (seconds, seconds), direct.cold_s, None, no_memory=why)
     knobs = {"scene": "face", "texels": side**2, "sum": "direct, NumPy, extrapolated"}
-    points.append(Point.of(knobs, timing, BandError.around(0.0, 0.0)))
-    return points
+    stage.add(knobs, timing, BandError.around(0.0, 0.0))
 
 
-def _edges(toy: bool, rng: np.random.Generator) -> list[Point]:
+def _edges(stage: Stage, rng: np.random.Generator) -> None:
     truth = _edge_truth(MEAN_R_D, MEAN_TRANSLUCENCY_MM)
-    points = []
-    for step in (0.8, 0.4) if toy else (1.6, 0.8, 0.4, 0.2):
+    for step in (0.8, 0.4) if stage.toy else (1.6, 0.8, 0.4, 0.2):
         for known in (False, True):
             knobs: Knobs = {"scene": "a shadow's edge"}
             knobs |= {"edge": "own light" if known else "sources alone", "source mm": step}
-            points.append(
-                measured(
-                    knobs,
-                    lambda: _edge(step, known),
-                    lambda found: _rms(found - truth, rng),
-                    repeats=1,
-                )
-            )
-    return points
+            edge = partial(_edge, step, known)
+            stage.measure(knobs, edge, lambda found: _rms(found - truth, rng), repeats=1)
 
 
 def _edge_truth(r_d: Float64Array, translucency_mm: Float64Array) -> Float64Array:
@@ -124,16 +115,13 @@ def _edge_truth(r_d: Float64Array, translucency_mm: Float64Array) -> Float64Arra
     return np.stack([edge_profile(EDGE_POSITIONS_MM, medium) for medium in media], axis=-1)
 
 
-def _bands(rng: np.random.Generator) -> dict[str, BandError]:
-    """Return the error of a shadow's edge on skin from light to dark, over its own R_d."""
-    found = {}
-    for name, band in MELANIN_BANDS.items():
-        sigma_tr = np.sqrt(
-            3.0 * band.sigma_a_per_mm * (band.sigma_a_per_mm + band.sigma_s_prime_per_mm)
-        )
-        skin = band.reflectance(), MEAN_TRANSLUCENCY_MM / MEAN_TRANSLUCENCY_MM[0] / sigma_tr
-        found[name] = _rms(_edge(BAND_STEP_MM, True, skin=skin) - _edge_truth(*skin), rng)
-    return found
+def _on_skin(band: MelaninBand, rng: np.random.Generator) -> BandError:
+    """Return the error of a shadow's edge on skin, over its own R_d."""
+    sigma_tr = np.sqrt(
+        3.0 * band.sigma_a_per_mm * (band.sigma_a_per_mm + band.sigma_s_prime_per_mm)
+    )
+    skin = band.reflectance(), MEAN_TRANSLUCENCY_MM / MEAN_TRANSLUCENCY_MM[0] / sigma_tr
+    return _rms(_edge(BAND_STEP_MM, True, skin=skin) - _edge_truth(*skin), rng)
 
 
 def _edge(
@@ -180,9 +168,9 @@ def _directly(scene: Scene, at: NDArray[np.intp]) -> Float64Array:
 
 def _rms(error: Float64Array, rng: np.random.Generator) -> BandError:
     """Return the root mean square in percent with its 68 % bootstrap interval over points."""
-    square = (error**2).mean(axis=-1)
-    low, high = 100.0 * np.sqrt(drawn_again(square, np.mean, rng=rng))
-    return BandError(float(100.0 * np.sqrt(square.mean())), (float(low), float(high)))
+    found = drawn_rms((error**2).mean(axis=-1), rng=rng)
+    low, high = found.error_interval
+    return BandError(100.0 * found.error, (100.0 * low, 100.0 * high))
 
 
 def _full_size(rng: np.random.Generator) -> Findings:
@@ -193,9 +181,8 @@ def _full_size(rng: np.random.Generator) -> Findings:
     tree = SourceTree.of(scene.place, scene.area)
     found = gathered(tree)
     at = rng.choice(len(scene.area), 80, replace=False)
-    begin = time.process_time()
-    truth = _directly(scene, at)
-    peer_s = (time.process_time() - begin) / len(at) * len(scene.area)
+    peer_s, truth = spent(lambda: _directly(scene, at))
+    peer_s *= len(scene.area) / len(at)
     seen = truth > MIN_RELATIVE_EXITANCE * (scene.r_d * scene.entered.max())[at]
     relative = np.abs(found[at] / np.where(seen, truth, 1.0) - 1.0)[seen]
     even = gather(

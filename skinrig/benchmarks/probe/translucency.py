@@ -15,11 +15,11 @@ from reconstruction.subsurface import translucency
 from reconstruction.subsurface.probe_sites import SITE_UV
 from reconstruction.subsurface.translucency import TEXTURE_MM, TranslucencyPrior
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import measure, processor_seconds
+from skinrig.benchmarks.measurement import processor_seconds
 from skinrig.benchmarks.resampling import rms_of_draws
-from skinrig.benchmarks.results import BandError, Point, StageBenchmark
-from skinrig.evaluating.skin_bands import MELANIN_BANDS
+from skinrig.benchmarks.results import BandError
+from skinrig.benchmarks.stage import Stage
+from skinrig.evaluating.skin_bands import MelaninBand
 
 Way = Literal["sigma_tr", "profiles"]
 WAYS: tuple[Way, ...] = ("sigma_tr", "profiles")
@@ -113,34 +113,28 @@ def _bound(count: int, medium: Medium = MEDIUM_PER_MM) -> float:
     return 2.0 * of_one * math.sqrt(2.0 / count)
 
 
-def directions(*, toy: bool) -> StageBenchmark:
+def directions(stage: Stage) -> None:
     """Tell ratios from 5 to 64 directions, by fits of each and by comparing profiles."""
     rng = np.random.default_rng(0)
-    cases = 12 if toy else 200
-    points: list[Point] = []
-    errors: dict[tuple[Way, int], float] = {}
-    for count in (5, 16) if toy else (5, 8, 16, 32, 64):
+    cases = 12 if stage.toy else 200
+    for count in (5, 16) if stage.toy else (5, 8, 16, 32, 64):
         angle = _directions(count)
         profiles = _profiles(angle, TRUE_RATIO, cases, rng=rng)
         one = profiles[:, :3]  # three channels of one measurement
         for way in WAYS:
-            timing = measure(lambda: _told(way, angle, one), repeats=1 if toy else 3, memory=False)
+            timing, _ = stage.time(lambda: _told(way, angle, one), memory=False)
             outcome = _ratio_error(_told(way, angle, profiles), _bound(count))
-            errors[way, count] = outcome.error
-            points.append(Point.of({"way": way, "directions": count}, timing, outcome))
-    bands = {
-        name: _in_band((band.sigma_a_per_mm, band.sigma_s_prime_per_mm), 16, cases, rng=rng)
-        for name, band in MELANIN_BANDS.items()
-    }
-    limits = {} if toy else _direction_limits(errors, rng=rng)
-    return described("anisotropy", points, limits, by_band=bands)
+            stage.add({"way": way, "directions": count}, timing, outcome)
+    angle = _directions(16)
 
+    def on_skin(band: MelaninBand) -> BandError:
+        medium = band.sigma_a_per_mm, band.sigma_s_prime_per_mm
+        profiles = _profiles(angle, TRUE_RATIO, cases, medium=medium, rng=rng)
+        return _ratio_error(_told("profiles", angle, profiles, medium=medium), _bound(16, medium))
 
-def _in_band(medium: Medium, count: int, cases: int, *, rng: np.random.Generator) -> BandError:
-    """Return the error of comparing profiles of skin that absorbs like this."""
-    angle = _directions(count)
-    profiles = _profiles(angle, TRUE_RATIO, cases, medium=medium, rng=rng)
-    return _ratio_error(_told("profiles", angle, profiles, medium=medium), _bound(count, medium))
+    stage.on_each_skin(on_skin)
+    if not stage.toy:
+        _judge_directions(stage, rng)
 
 
 def _ratio_error(found: anisotropy.Anisotropy, bound: float) -> BandError:
@@ -149,23 +143,17 @@ def _ratio_error(found: anisotropy.Anisotropy, bound: float) -> BandError:
     return rms_of_draws(off, bound=bound, freedom=len(found.ratio) - 1)
 
 
-def _direction_limits(
-    errors: dict[tuple[Way, int], float], *, rng: np.random.Generator
-) -> Findings:
+def _judge_directions(stage: Stage, rng: np.random.Generator) -> None:
     cases = 1000
     angle = _directions(16)
     null = _profiles(angle, 1.0, cases, rng=rng)
-    limits: Findings = {}
     # an outlier left out by mistake may add its own rate
     most = float(stats.binom.isf(LIMIT_FALSE_ALARM_PROBABILITY, cases, FALSE_ALARM_RATE + 0.001))
     for way in WAYS:
         alarms = float((_told(way, angle, null).p_value < FALSE_ALARM_RATE).sum())
-        limits["alarms", str(cases), way] = (alarms, most)
-    return {
-        **limits,
-        "over_bound": errors["profiles", 16] / _bound(16),
-        "over_profiles": errors["sigma_tr", 16] / errors["profiles", 16],
-    }
+        stage.limits["alarms", str(cases), way] = (alarms, most)
+    fits, profiles = (stage.at(way=way, directions=16).error for way in WAYS)
+    stage.limits |= {"over_bound": profiles / _bound(16), "over_profiles": fits / profiles}
 
 
 def _root(prior: TranslucencyPrior, uv: Float64Array) -> Float64Array:
@@ -179,7 +167,7 @@ def _root(prior: TranslucencyPrior, uv: Float64Array) -> Float64Array:
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def sites(*, toy: bool) -> StageBenchmark:
+def sites(stage: Stage) -> None:
     """Map 1/sigma_tr from 1 to 16 sites, beside scikit-learn."""
     rng = np.random.default_rng(0)
     whole = translucency.population_prior()
@@ -189,15 +177,14 @@ def sites(*, toy: bool) -> StageBenchmark:
     named = np.array([SITE_UV[n] for n in ("forehead", "cheek left", "cheek right", "chin")])
     more = np.stack(np.meshgrid([0.25, 0.42, 0.58, 0.75], [0.25, 0.45, 0.65, 0.85]), axis=-1)
     layouts = {1: named[:1], 2: named[:2], 3: named[[0, 1, 3]], 4: named, 16: more.reshape(-1, 2)}
-    side, faces = (8, 6) if toy else (16, 150)
+    side, faces = (8, 6) if stage.toy else (16, 150)
     v, u = np.meshgrid(
         1 - (np.arange(side) + 0.5) / side, (np.arange(side) + 0.5) / side, indexing="ij"
     )
     pixels = np.stack([u, v], axis=-1).reshape(-1, 2)
-    points = []
-    size = 64 if toy else 1024
+    size = 64 if stage.toy else 1024
     for count, uv in layouts.items():
-        if toy and count == 16:
+        if stage.toy and count == 16:
             continue
         squares, stated, inside = [], [], []
         root = _root(prior, np.concatenate([uv, pixels]))
@@ -211,30 +198,27 @@ def sites(*, toy: bool) -> StageBenchmark:
             stated.append((deviation.astype(np.float64) ** 2).mean())
             inside.append((np.abs(off) < deviation).mean())
         three = np.repeat(seen, 3, axis=1)
-        timing = measure(
+        timing, _ = stage.time(
             lambda: translucency.interpolate(uv, three, SITE_ERROR * three, (size, size)),
-            repeats=1 if toy else 3,
-            memory=not toy,
+            memory=not stage.toy,
         )
         error, bound = (math.sqrt(float(np.mean(part))) for part in (squares, stated))
         spread = float(np.std(squares)) / math.sqrt(faces) / (2 * error)
         outcome = BandError.around(error, spread, bound)
-        points.append(Point.of({"sites": count, "side": size}, timing, outcome))
+        stage.add({"sites": count, "side": size}, timing, outcome)
         if count == 3:
             within, three_sites = float(np.mean(inside)), error
-    limits: Findings = {}
-    if not toy:
+    if not stage.toy:
         times, mismatch = _beside_scikit_learn(prior, named)
         # of a patch without sites nothing is known but the population
         alone = math.hypot(float(prior.person_deviation[0]), float(prior.place_deviation[0]))
-        limits = {
+        stage.limits = {
             "within": within,
             "within_least": within,
             "over_mean": three_sites / alone,
             "speed_up": times,
             "difference": mismatch,
         }
-    return described("translucency", points, limits)
 
 
 def _beside_scikit_learn(prior: TranslucencyPrior, uv: Float64Array) -> tuple[float, float]:

@@ -1,6 +1,5 @@
 """Benchmark of photon transport: what a fibre sees, and photons a second, beside their peers."""
 
-import time
 from contextlib import suppress
 from functools import partial
 from math import inf, log, pi, sqrt
@@ -14,10 +13,10 @@ from rigsim.fiber.profile import fibre_profile
 from rigsim.render import RenderError, look_at, radiance
 from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import LIMIT_CORES, measure_and_keep
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark
-from skinrig.evaluating.skin_bands import MELANIN_BANDS
+from skinrig.benchmarks.measurement import LIMIT_CORES, spent
+from skinrig.benchmarks.results import BandError, Knobs
+from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.evaluating.skin_bands import MelaninBand
 
 RED_MEDIUM_PER_MM = (
     0.04,
@@ -94,30 +93,29 @@ def plain_walk(sigma_a, sigma_s, g, eta, photons, seed, sine, edges2, rings):  #
     return total
 
 
-def photon_transport(*, toy: bool) -> StageBenchmark:
+def photon_transport(stage: Stage) -> None:
     """Trace the probe's fibres by next event and by photons that leave in the cone; then peers."""
     probe = load_rig("probe").probe
     if probe is None:
         raise ValueError("rig: the probe's rig has no probe")
     radii = np.array(probe.radius_mm)
     stack = _half_space(*RED_MEDIUM_PER_MM)
-    points: list[Point] = []
-    timed = partial(measure_and_keep, repeats=1, memory=None)
-    for photons in (1000, 2000) if toy else (5000, 20_000, 80_000, 320_000):
+    timed = partial(stage.time, repeats=1, memory=None)
+    for photons in (1000, 2000) if stage.toy else (5000, 20_000, 80_000, 320_000):
         timing, run = timed(lambda: _next_event(stack, radii, photons))
         knobs: Knobs = {"quantity": "fibres", "score": "next event", "photons": photons}
-        points.append(Point.of(knobs, timing, _worst(run.stderr / run.reflectance_per_mm2)))
-    for photons in (1000, 2000) if toy else (80_000, 320_000):
+        stage.add(knobs, timing, _worst(run.stderr / run.reflectance_per_mm2))
+    for photons in (1000, 2000) if stage.toy else (80_000, 320_000):
         timing, relative = timed(lambda: _in_the_cone(radii, photons))
         knobs = {"quantity": "fibres", "score": "leaves in the cone", "photons": photons}
-        points.append(Point.of(knobs, timing, _worst(relative)))
+        stage.add(knobs, timing, _worst(relative))
     medium = LayerStack((Layer(inf, SPEED_MEDIUM[0], *SPEED_MEDIUM[1:]),))
     for engine in ("numba", "drjit"):
         with suppress(ValueError):  # no LLVM on this machine
             timing, total = timed(
                 lambda: transport(
                     medium,
-                    photons=2000 if toy else 400_000,
+                    photons=2000 if stage.toy else 400_000,
                     rng=np.random.default_rng(2),
                     engine=engine,
                 )
@@ -125,24 +123,18 @@ def photon_transport(*, toy: bool) -> StageBenchmark:
             error = 100.0 * total.reflectance_stderr / total.reflectance
             knobs = {"quantity": "all that leaves", "engine": engine, "photons": total.photons}
             spread = error / sqrt(2.0 * (total.batches - 1))
-            points.append(Point.of(knobs, timing, BandError.around(error, spread)))
-    return described(
-        "photon-transport",
-        points,
-        {} if toy else _one_percent(radii, stack) | _against_volpath(radii) | _rates(medium),
-        by_band=_bands(radii, photons=2000 if toy else 20_000),
-    )
+            stage.add(knobs, timing, BandError.around(error, spread))
+    photons = 2000 if stage.toy else 20_000
+    stage.on_each_skin(lambda band: _on_skin(band, radii, photons))
+    if not stage.toy:
+        stage.limits = _one_percent(radii, stack) | _against_volpath(radii) | _rates(medium)
 
 
-def _bands(radii: Float64Array, *, photons: int) -> dict[str, BandError]:
-    """Return the error of as many photons in skin that absorbs little and much."""
-    found = {}
-    for name, band in MELANIN_BANDS.items():
-        run = _next_event(
-            _half_space(band.sigma_a_per_mm, band.sigma_s_prime_per_mm), radii, photons
-        )
-        found[name] = _worst(run.stderr / run.reflectance_per_mm2)
-    return found
+def _on_skin(band: MelaninBand, radii: Float64Array, photons: int) -> BandError:
+    """Return the error of as many photons in skin that absorbs little or much."""
+    stack = _half_space(band.sigma_a_per_mm, band.sigma_s_prime_per_mm)
+    run = _next_event(stack, radii, photons)
+    return _worst(run.stderr / run.reflectance_per_mm2)
 
 
 def _half_space(sigma_a: float, sigma_s_prime: float, eta: float = ETA) -> LayerStack:
@@ -184,18 +176,9 @@ def _in_the_cone(radii: Float64Array, photons: int) -> Float64Array:
     return np.divide(error, mean, out=np.full(len(mean), np.nan), where=mean > 0)
 
 
-def _spent(call: Any, repeats: int = 1) -> tuple[float, Any]:
-    seconds, value = [], None
-    for _ in range(repeats):
-        begin = time.process_time()
-        value = call()
-        seconds.append(time.process_time() - begin)
-    return min(seconds), value
-
-
 def _one_percent(radii: Float64Array, stack: Any) -> Findings:
 
-    seconds, run = _spent(
+    seconds, run = spent(
         lambda: fibre_profile(
             stack, radii_mm=radii, photons=200_000, rng=np.random.default_rng(3), batches=100
         )
@@ -211,7 +194,7 @@ def _against_volpath(radii: Float64Array) -> Findings:
         radiance(scene, kind="mono", samples=16)
     except (RenderError, RuntimeError):  # no variant with volumes here
         return {}
-    peer_s, runs = _spent(
+    peer_s, runs = spent(
         lambda: [
             radiance(scene, kind="mono", samples=PEER_SAMPLES, seed=seed)[0, :, 0]
             for seed in range(N_PEER_RUNS)
@@ -223,7 +206,7 @@ def _against_volpath(radii: Float64Array) -> Findings:
     # 100 %, which flatters the peer.
     relative = np.where(mean > 0.0, 100.0 * error / np.maximum(mean, 1e-30), 100.0)
     stack = _half_space(*RED_MEDIUM_PER_MM, eta=1.0)
-    ours_s, run = _spent(
+    ours_s, run = spent(
         lambda: fibre_profile(
             stack,
             radii_mm=radii,
@@ -298,11 +281,11 @@ def _rates(medium: Any) -> Findings:
     """Compare photons a processor second with the plain walk's; R_d with MCML's."""
     edges2, rings = np.array([0.0, 1.0]), np.zeros(1)
     plain_walk(*SPEED_MEDIUM, 10, 0, 1.0, edges2, rings)
-    plain_s, _ = _spent(lambda: plain_walk(*SPEED_MEDIUM, 40_000, 0, 1.0, edges2, rings), 3)
-    scalar_s, _ = _spent(lambda: transport(medium, photons=40_000, rng=np.random.default_rng(5)), 3)
+    plain_s, _ = spent(lambda: plain_walk(*SPEED_MEDIUM, 40_000, 0, 1.0, edges2, rings), 3)
+    scalar_s, _ = spent(lambda: transport(medium, photons=40_000, rng=np.random.default_rng(5)), 3)
     photons = 2_000_000
     try:
-        ours_s, run = _spent(
+        ours_s, run = spent(
             lambda: transport(
                 medium, photons=photons, rng=np.random.default_rng(6), engine="drjit", batches=40
             ),

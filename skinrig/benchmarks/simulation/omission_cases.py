@@ -2,9 +2,9 @@
 
 import dataclasses
 import math
-import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -23,6 +23,7 @@ from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.subject import make_subject
 from rigsim.targets import make_target
 from skinrig.arrays import Float32Array, Float64Array
+from skinrig.benchmarks.measurement import spent
 from skinrig.simulating.dome import small_dome
 from skinrig.simulating.gradient import make_scene
 
@@ -97,8 +98,8 @@ class ComparedScene:
                 continue
             # only of what is left out the seconds are a claim
             times = N_TIMED_PICTURES if effect.verdict == "negligible" else 1
-            (have, with_s), (lack, without_s) = (
-                _timed(lambda: render(**{effect.switch: how}), times)
+            (with_s, have), (without_s, lack) = (
+                spent(lambda: render(**{effect.switch: how}), times)
                 for how in switched[effect.switch]
             )
             yield self.changed(effect, have, lack, (with_s, without_s), full_scale=1.0)
@@ -135,30 +136,20 @@ class ComparedScene:
             Called with a subject; returns images.
         """
         face, needs = self.scene.subject, self.scene.needs
-        have, with_s = _timed(lambda: render(face))
+        with_s, have = spent(lambda: render(face))
         even = np.full_like(face.melanin, np.median(face.melanin[face.atlas.covered]))
         for name, plain in (
             (RELIEF_EFFECT, dataclasses.replace(face, normal=face.atlas.normal)),
             (PIGMENT_EFFECT, dataclasses.replace(face, melanin=even)),
         ):
-            lack, spent = _timed(lambda: render(plain))
-            yield self.changed(needs[name], have, lack, (with_s, spent))
+            without_s, lack = spent(lambda: render(plain))
+            yield self.changed(needs[name], have, lack, (with_s, without_s))
         rig = self.scene.rig
         white = spectra.camera_white(rig.views[0].spectral_sensitivity, rig.lights[0].illuminant)
         gray = np.asarray(white / white.mean(), np.float32)
-        one, spent = _timed(lambda: have.mean(axis=-1, keepdims=True) * gray)
+        mean_s, one = spent(lambda: have.mean(axis=-1, keepdims=True) * gray)
         # a band alone would be a third of the sums over colors, which are not timed apart
-        yield self.changed(needs[BAND_EFFECT], have, one, (spent, spent))
-
-
-def _timed(call: Callable[[], Images], times: int = 1) -> tuple[Images, float]:
-    """Return images, and the least processor time of making them, s."""
-    least = math.inf
-    for _ in range(times):
-        begin = time.process_time()
-        made = call()
-        least = min(least, time.process_time() - begin)
-    return made, least
+        yield self.changed(needs[BAND_EFFECT], have, one, (mean_s, mean_s))
 
 
 def flash_face(
@@ -210,43 +201,39 @@ def _lit_from(rig: Any, angle_deg: float) -> Any:
     return dataclasses.replace(rig, lights=(dataclasses.replace(light, position_mm=place),))
 
 
-def dome_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]:
-    """Compare pictures of a face in the dome under some lights, each exposed to full scale."""
+def dome_face(
+    preset: str, *, width_px: int, lights: int, state: str = "neutral"
+) -> Iterator[Omission]:
+    """Compare pictures of a face in the dome under some lights, each exposed to full scale.
+
+    A face that has moved is compared with and without shadows of its wrinkles.
+    """
     rig = small_dome(load_rig("dome"), lights=lights, views=1, width_px=width_px)
     face = make_subject(preset, seed=0, size=FACE_TEXELS)
-    scene = DomeScene(rig, face)
-    view = rig.views[0].name
+    rest, view = state == "neutral", rig.views[0].name
+    plain = {} if rest else {"interreflections": False, "subsurface": False}
+
+    def made(subject: Any = face, **settings: Any) -> DomeScene:
+        # what light goes from skin to skin is traced once for all scenes of the face
+        effects = SceneEffects.from_switches(plain | settings)
+        return DomeScene(rig, subject, state=state, effects=effects)
+
+    scene = made()
     brightest = scene.radiance(view).max(axis=(1, 2, 3), keepdims=True)
 
     def render(subject: Any = face, **settings: Any) -> Images:
-        # what light goes from skin to skin is traced once for all scenes of the face
-        made = DomeScene(rig, subject, effects=SceneEffects.from_switches(settings))
-        return np.asarray(made.radiance(view) / brightest)
+        return np.asarray(made(subject, **settings).radiance(view) / brightest)
 
-    names = ("subsurface", "interreflections", "spectral", "optics")
+    if not rest:
+        compared = ComparedScene("dome", f"{preset}, {state}", scene)
+        yield from compared.compare(render, {"relief_shadows": (True, False)})
+        return
     compared = ComparedScene("dome", preset, scene)
+    names = ("subsurface", "interreflections", "spectral", "optics")
     yield from compared.compare(
         render, {**dict.fromkeys(names, (True, False)), "last_bounce": (1e-7, None)}
     )
     yield from compared.plainer(render)
-
-
-def moved_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]:
-    """Compare a face that has moved in the dome with and without shadows of its wrinkles."""
-    rig = small_dome(load_rig("dome"), lights=lights, views=1, width_px=width_px)
-    face = make_subject(preset, seed=0, size=FACE_TEXELS)
-    plain = {"interreflections": False, "subsurface": False}
-    scene = DomeScene(rig, face, state="surprise", effects=SceneEffects.from_switches(plain))
-    view = rig.views[0].name
-    brightest = scene.radiance(view).max(axis=(1, 2, 3), keepdims=True)
-
-    def render(**settings: Any) -> Images:
-        effects = SceneEffects.from_switches(plain | settings)
-        made = DomeScene(rig, face, state="surprise", effects=effects)
-        return np.asarray(made.radiance(view) / brightest)
-
-    compared = ComparedScene("dome", f"{preset}, surprise", scene)
-    yield from compared.compare(render, {"relief_shadows": (True, False)})
 
 
 def gradient_skin(site: str, *, width_px: int) -> Iterator[Omission]:
@@ -277,29 +264,26 @@ def flat_targets() -> Iterator[Omission]:
     for rig, name, scene in scenes:
         noise = Noise.of(scene.sensor())
         caster = Caster(scene.subject.mesh)
-        begin = time.process_time()
-        flat = is_flat(caster.mesh)  # all that leaving it out costs
-        told_s = max(time.process_time() - begin, 1e-6)
-        begin = time.process_time()
-        bounce = Interreflection(caster, patches=24)
-        got = float(np.asarray(bounce.exchange.sum(axis=1)).max(initial=0.0))
-        seconds = time.process_time() - begin
+        told_s, flat = spent(lambda: is_flat(caster.mesh))  # all that leaving it out costs
+
+        def exchanged() -> tuple[Interreflection, float]:
+            bounce = Interreflection(caster, patches=24)
+            return bounce, float(np.asarray(bounce.exchange.sum(axis=1)).max(initial=0.0))
+
+        seconds, (bounce, got) = spent(exchanged)
         points, normals = (part[0] for part in bounce.surface())
-        begin = time.process_time()
-        seen = min(
-            float(
-                visibility(
-                    caster, points, normals, light.position_mm, radius_mm=light.radius_mm, samples=4
-                ).min()
+        cast = partial(visibility, caster, points, normals, samples=4)
+        shading_s, seen = spent(
+            lambda: min(
+                float(cast(light.position_mm, radius_mm=light.radius_mm).min())
+                for light in scene.rig.lights
+                if light.position_mm[2] > light.radius_mm
             )
-            for light in scene.rig.lights
-            if light.position_mm[2] > light.radius_mm
         )
-        shading_s = time.process_time() - begin
         for effect in scene.needs:
             if effect.verdict != "negligible" or not flat:
                 continue
-            lost, spent = (got, seconds) if effect.switch else (1.0 - seen, shading_s)
+            lost, with_s = (got, seconds) if effect.switch else (1.0 - seen, shading_s)
             yield Omission(
                 rig,
                 name,
@@ -308,6 +292,6 @@ def flat_targets() -> Iterator[Omission]:
                 effect.over_noise,
                 noise.share(lost),
                 noise.share(FLOAT32_ROUNDING),
-                spent,
-                told_s,
+                with_s,
+                max(told_s, 1e-6),
             )

@@ -1,12 +1,24 @@
 """Benchmark of what scenes leave out: how much pixels change by it, and the seconds it saves."""
 
+import dataclasses
 from collections.abc import Iterator
+from functools import partial
+from typing import Any
 
+import numpy as np
+
+from capture.rig import load_rig
+from rigsim.fiber.probe_tissue import HomogeneousTissue
 from rigsim.needs.face import LATERAL_EFFECT
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.results import BandError, Knobs, Point, StageBenchmark, Timing
-from skinrig.benchmarks.simulation import omission_cases, omission_probe
-from skinrig.benchmarks.simulation.omission_cases import Omission
+from rigsim.needs.probe import COLOR_EFFECT, CROSSTALK_EFFECT, DARK_CURRENT_EFFECT, WINGS_EFFECT
+from rigsim.scenes.probe.scene import MAX_USUAL_EXPOSURE_S, ProbeScene
+from rigsim.world.suction import HeadState
+from skinrig.arrays import Float32Array
+from skinrig.benchmarks.measurement import spent
+from skinrig.benchmarks.results import BandError, Knobs, Timing
+from skinrig.benchmarks.simulation import omission_cases
+from skinrig.benchmarks.simulation.omission_cases import ComparedScene, Omission
+from skinrig.benchmarks.stage import Stage
 
 WHY_NO_MEMORY = "scenes share what they trace: a picture's memory is not its own"
 FLASH_PX = 192
@@ -18,16 +30,14 @@ GRADIENT_PX = 128
 N_DOME_LIGHTS = 3
 
 
-def omissions(*, toy: bool) -> StageBenchmark:
+def omissions(stage: Stage) -> None:
     """Render scenes of each rig with and without what their rules decide on.
 
     A point is one effect of one scene: its seconds are those of the picture without the effect, its
     error the largest change of any pixel over that pixel's noise. All pictures but the probe's are
     sums without chance, so that what is uncertain is rounding; the probe's are of equal photons.
     """
-    found = list(_cases(toy))
-    points = []
-    limits: Findings = {}
+    found = list(_cases(stage.toy))
     for one in found:
         timing = Timing.single(one.without_s, no_memory=WHY_NO_MEMORY)
         knobs: Knobs = {"rig": one.rig, "subject": one.subject}
@@ -35,18 +45,15 @@ def omissions(*, toy: bool) -> StageBenchmark:
         also: Knobs = {"seconds saved": one.with_s - one.without_s}
         if one.told is not None:
             also["told by the rule"] = one.told
-        interval = (max(one.found - one.uncertain, 0.0), one.found + one.uncertain)
-        points.append(Point.of(knobs, timing, BandError(one.found, interval), also))
+        stage.add(knobs, timing, BandError.of_size(one.found, one.uncertain), also)
         if one.verdict == "negligible":
-            limits["change", one.rig, one.subject, one.effect] = one.at_most
+            stage.limits["change", one.rig, one.subject, one.effect] = one.at_most
     built = [one for one in found if one.verdict == "built"]
     told = [one for one in built if one.told is not None and not _other_shadows(one)]
-    limits["over_rule"] = max(
+    stage.limits["over_rule"] = max(
         ((one.found - one.uncertain) / (one.told or 1e-30) for one in told), default=0.0
     )
-    return described(
-        "omissions", points, limits, reference_error=max(one.uncertain for one in found)
-    )
+    stage.reference_error = max(one.uncertain for one in found)
 
 
 def _other_shadows(one: Omission) -> bool:
@@ -56,14 +63,68 @@ def _other_shadows(one: Omission) -> bool:
 
 def _cases(toy: bool) -> Iterator[Omission]:
     yield from omission_cases.flat_targets()
-    yield from omission_probe.gray_tissue()
+    yield from gray_tissue()
     if toy:
         yield from omission_cases.flash_face("darkest", width_px=64, texels=64)
         return
     for preset in ("II", "VI", "darkest"):
         yield from omission_cases.flash_face(preset, width_px=FLASH_PX)
     yield from omission_cases.flash_face("darkest", width_px=GRAZED_PX, light_deg=GRAZING_DEG)
+    dome_face = partial(omission_cases.dome_face, width_px=DOME_PX, lights=N_DOME_LIGHTS)
     for preset in ("II", "darkest"):
-        yield from omission_cases.dome_face(preset, width_px=DOME_PX, lights=N_DOME_LIGHTS)
-    yield from omission_cases.moved_face("II", width_px=DOME_PX, lights=N_DOME_LIGHTS)
+        yield from dome_face(preset)
+    yield from dome_face("II", state="surprise")
     yield from omission_cases.gradient_skin("forehead", width_px=GRADIENT_PX)
+
+
+def gray_tissue() -> Iterator[Omission]:
+    """Take a gray medium as one color, and as 31 of which bands are made, of the same photons."""
+    rig = load_rig("probe")
+    gray = HomogeneousTissue(0.05, 1.5)
+    bands = tuple(float(nm) for nm in range(400, 701, 10))
+    colored = dataclasses.replace(gray, sigma_a_per_mm=(0.05,) * len(bands), wavelength_nm=bands)
+    head = HeadState("forehead", 0.0, True, 0.0, 5.0)
+    images, seconds = [], []
+
+    def profiled(tissue: HomogeneousTissue) -> tuple[ProbeScene, Any]:
+        made = ProbeScene(rig, tissue)
+        return made, made.profile(head)
+
+    for tissue in (colored, gray):
+        spent_s, (made, profile) = spent(partial(profiled, tissue))
+        seconds.append(spent_s)
+        if profile is None:
+            raise ValueError("gray tissue: the head touches nothing")
+        images.append(made.image(made.through_fibres(profile.reflectance_per_mm2)))
+    brightest = np.float32(images[0].max())
+    scene = ProbeScene(rig, gray)
+    compared = ComparedScene("probe", "gray medium", scene)
+    have, lack = (part / brightest for part in images)  # of stored photons: the same for both
+    yield compared.changed(scene.needs[COLOR_EFFECT], have, lack, (seconds[0], seconds[1]))
+    yield from _probe_build(compared, head)
+
+
+def _probe_build(compared: ComparedScene, head: HeadState) -> Iterator[Omission]:
+    """Compare the probe as built with one without cross-talk, wings, or dark current."""
+    scene = compared.scene
+    profile, build = scene.profile(head), scene.build
+
+    def timed(made: ProbeScene) -> tuple[float, Float32Array]:
+        return spent(lambda: made.image(made.through_fibres(profile.reflectance_per_mm2)))
+
+    with_s, have = timed(scene)
+    unit = np.float32(have.max())
+    plain = {
+        CROSSTALK_EFFECT: dataclasses.replace(build, crosstalk=np.eye(len(build.crosstalk))),
+        WINGS_EFFECT: dataclasses.replace(build, wings=0.0),
+    }
+    for name, without in plain.items():
+        without_s, lack = timed(ProbeScene(scene.rig, scene.tissue, build=without))
+        yield compared.changed(scene.needs[name], have / unit, lack / unit, (with_s, without_s))
+    sensor = scene.sensor()
+    full_e = sensor.gain_e_per_dn * (sensor.white - sensor.black)
+    hot_s, hot = spent(
+        lambda: np.asarray(scene.hot_e_per_s * MAX_USUAL_EXPOSURE_S / full_e, np.float32)
+    )
+    none_s, none = spent(lambda: np.zeros_like(hot))
+    yield compared.changed(scene.needs[DARK_CURRENT_EFFECT], hot, none, (hot_s, none_s))

@@ -1,17 +1,16 @@
 """Benchmark of stretched skin: how far the equilibrium is from converged, against seconds."""
 
-import time
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from rigsim.skin_patch.microrelief import SITE_NAMES, MicroSkin, make_micro_skin
 from rigsim.skin_patch.stretch import FORCE_TOLERANCE, StretchedSkin, deform, size_for
 from skinrig.arrays import Float32Array
-from skinrig.benchmarks.description import Findings, described
-from skinrig.benchmarks.measurement import measure_and_keep
+from skinrig.benchmarks.measurement import processor_seconds, spent
 from skinrig.benchmarks.resampling import mean_error
-from skinrig.benchmarks.results import Point, StageBenchmark
+from skinrig.benchmarks.stage import Findings, Stage
 
 CALIPER_STRETCHES = (0.73, 0.8, 0.87, 0.94, 1.07, 1.14, 1.21, 1.28)
 """Stretches of a series as the caliper gives them."""
@@ -28,55 +27,49 @@ def _variance(state: StretchedSkin, half_mm: float) -> float:
     return float(np.var(along, dtype=np.float64))
 
 
-def stretched(*, toy: bool) -> StageBenchmark:
+def stretched(stage: Stage) -> None:
     """Stop the search for the equilibrium at forces of several sizes; then time whole series."""
-    size = 0.3 if toy else 1.6
+    size = 0.3 if stage.toy else 1.6
     half = 0.4 * size
-    seeds = range(2 if toy else 3)
+    seeds = range(2 if stage.toy else 3)
     skins = [make_micro_skin("forehead", seed=seed, size_mm=size) for seed in seeds]
-    points = []
-    tolerances = (0.1, FORCE_TOLERANCE) if toy else (0.3, 0.1, 0.03, 0.01, FORCE_TOLERANCE, 1e-3)
+    tolerances = (
+        (0.1, FORCE_TOLERANCE) if stage.toy else (0.3, 0.1, 0.03, 0.01, FORCE_TOLERANCE, 1e-3)
+    )
     for stretch in (0.8, 1.25):
         truth = [
             _variance(deform(s, stretch=stretch, angle_deg=90.0, tolerance=1e-5), half)
             for s in skins
         ]
         for tolerance in tolerances:
-            timing, states = measure_and_keep(
-                lambda: [
-                    deform(s, stretch=stretch, angle_deg=90.0, tolerance=tolerance) for s in skins
-                ],
-                repeats=1,
-                memory=not toy,
+            settle = partial(deform, stretch=stretch, angle_deg=90.0, tolerance=tolerance)
+            timing, states = stage.time(
+                lambda: list(map(settle, skins)), repeats=1, memory=not stage.toy
             )
             pairs = zip(states, truth, strict=True)
             outcome = mean_error([100.0 * abs(_variance(s, half) / t - 1.0) for s, t in pairs])
             evaluations = np.mean([s.convergence.evaluations for s in states])
             knobs = {"stretch": stretch, "force": tolerance, "evaluations": float(evaluations)}
-            points.append(Point.of(knobs, timing, outcome))
-    return described("skin-stretch", points, {} if toy else _limits())
+            stage.add(knobs, timing, outcome)
+    if not stage.toy:
+        stage.limits = _limits()
 
 
 def _limits() -> Findings:
     limits: Findings = {}
     for site in SITE_NAMES:
         skin = make_micro_skin(site, seed=1, size_mm=2.8)
-        begin = time.process_time()
-        states = {r: deform(skin, stretch=r, angle_deg=90.0) for r in CALIPER_STRETCHES}
-        spent = time.process_time() - begin
-        variance = np.array([_variance(states[r], 1.2) for r in CALIPER_STRETCHES])
-        limits["seconds", site] = spent
-        flatter = float((np.diff(variance) < 0.0).sum())
-        limits["flattening", site] = flatter
-        strain = max(abs(s.membrane_strain / (r - 1.0)) for r, s in states.items())
-        limits["strain", site] = strain
+        limits["seconds", site], states = spent(
+            lambda: {r: deform(skin, stretch=r, angle_deg=90.0) for r in CALIPER_STRETCHES}
+        )
+        variance = [_variance(state, 1.2) for state in states.values()]
+        limits["flattening", site] = float((np.diff(variance) < 0.0).sum())
+        strains = (abs(s.membrane_strain / (r - 1.0)) for r, s in states.items())
+        limits["strain", site] = max(strains)
     field = make_micro_skin("forehead", seed=1, size_mm=size_for(12.3, 1.0, angle_deg=0.0))
-    begin = time.process_time()
-    deform(field, stretch=1.2, angle_deg=90.0)
-    limits["field_s"] = time.process_time() - begin
-    flat = _flat(field)
-    worst = float(np.abs(deform(flat, stretch=0.8, angle_deg=0.0).height_um).max())
-    limits["flat"] = worst
+    limits["field_s"] = processor_seconds(lambda: deform(field, stretch=1.2, angle_deg=90.0))
+    flat = deform(_flat(field), stretch=0.8, angle_deg=0.0)
+    limits["flat"] = float(np.abs(flat.height_um).max())
     return limits
 
 

@@ -1,16 +1,16 @@
 """How a run spends its budget, on stages that take no time."""
 
 import csv
-import dataclasses
 import json
 from types import SimpleNamespace
 
 import pytest
 
 from skinrig.benchmarks import plan as bench_plan
+from skinrig.benchmarks import stage as bench_stage
 from skinrig.benchmarks import stages as bench_stages
 from skinrig.benchmarks import table as bench_table
-from skinrig.benchmarks.results import Limit, Point, StageBenchmark, Timing
+from skinrig.benchmarks.results import BandError, Timing
 from skinrig.console import Console
 from skinrig.errors import MissingExtra
 
@@ -18,19 +18,17 @@ NAMES = ("a", "b", "c")
 
 
 def stage(name, calls, seconds=0.0, error=None):
-    def made(*, toy):
-        clock.now += seconds * (0.01 if toy else 1.0)
-        calls.append((name, "small" if toy else "full"))
+    def run(stage):
+        clock.now += seconds * (0.01 if stage.toy else 1.0)
+        calls.append((name, "small" if stage.toy else "full"))
         if error is not None:
             raise error
-        points = tuple(
-            Point({"n": n}, Timing(n, (n, n), 3.0 * n, 1.0), 8 / n**2, (7 / n**2, 9 / n**2), 1 / n)
-            for n in (1.0, 2.0, 4.0, 8.0)
-        )
-        limits = (Limit("kept at full size", 2.0 if toy else 0.5, 1.0, "<="),)
-        return StageBenchmark(name, "rms, %", "truth", 0.0, points, limits)
+        for n in (1.0, 2.0, 4.0, 8.0):
+            outcome = BandError(8 / n**2, (7 / n**2, 9 / n**2), 1 / n)
+            stage.add({"n": n}, Timing(n, (n, n), 3.0 * n, 1.0), outcome)
+        stage.limits["kept at full size"] = 2.0 if stage.toy else 0.5
 
-    return made
+    return run
 
 
 clock = SimpleNamespace(now=0.0)
@@ -47,8 +45,11 @@ def calls(monkeypatch):
     monkeypatch.setattr(
         bench_stages,
         "import_module",
-        lambda _: SimpleNamespace(**{n: lambda n=n, **how: functions[n](**how) for n in NAMES}),
+        lambda _: SimpleNamespace(**{n: lambda stage, n=n: functions[n](stage) for n in NAMES}),
     )
+    limits = {"kept at full size": {"name": "kept", "at_most": 1.0}}
+    entry = {"error_name": "rms, %", "reference": "truth", "interval_of": "", "limits": limits}
+    monkeypatch.setattr(bench_stage, "descriptions", lambda: dict.fromkeys(NAMES, entry))
     monkeypatch.setattr(bench_plan, "FULL_S", costs)
     made.append(functions)
     return made
@@ -126,12 +127,14 @@ def test_a_run_that_is_interrupted_leaves_what_it_measured(calls, tmp_path, caps
 def test_a_long_stage_that_is_interrupted_leaves_what_it_measured_of_it(calls, tmp_path, capsys):
     whole = stage("b", calls)
 
-    def in_parts(*, toy):
-        made = whole(toy=toy)
-        yield dataclasses.replace(made, points=made.points[:2])
+    def in_parts(stage):
+        whole(stage)
+        kept = stage.points[2:]
+        del stage.points[2:]
+        yield
         if stopped:
             raise KeyboardInterrupt
-        yield made
+        stage.points += kept
 
     calls[0]["b"], stopped = in_parts, True
     with pytest.raises(KeyboardInterrupt):

@@ -4,26 +4,28 @@ import numpy as np
 import pytest
 
 from skinrig.benchmarks.dome import reflectance
+from skinrig.benchmarks.stage import Stage
 
 
 def test_points_of_the_benchmark_lie_above_their_horizon_and_keep_lights_apart(rng):
     p = reflectance.face_points("III", points=6, samples=40, rng=rng)
-    assert p.seen.mean() > 0.9
+    assert p.valid.mean() > 0.9
     assert 0.02 < p.left_out.mean() < 0.6
     np.testing.assert_allclose(np.linalg.norm(p.light, axis=-1), 1.0, atol=1e-6)
     # noise is what the variance says: 4 standard errors of the mean of squared deviates
     deviates = ((p.f - p.total) / np.sqrt(p.variance)) ** 2
     assert abs(deviates.mean() - 1.0) < 4 * np.sqrt(2.0 / deviates.size)
-    assert (p.surface[p.seen] > 0).all()
-    assert (p.total.min(axis=-1) > p.surface * (1 - 1e-5))[p.seen].all()
+    assert (p.surface[p.valid] > 0).all()
+    assert (p.total.min(axis=-1) > p.surface * (1 - 1e-5))[p.valid].all()
 
 
 @pytest.mark.long
 def test_more_lobes_predict_lights_that_were_left_out_better():
-    stage = reflectance.model(toy=True)
+    stage = Stage("reflectance", toy=True)
+    reflectance.model(stage)
     by_rank = {p.knobs["rank"]: p.error for p in stage.points if p.knobs["part"] == "lobes"}
     assert by_rank[1] > 1.5 * by_rank[4]
-    assert stage.limits[0].passed
+    assert stage.benchmark().limits[0].passed
     texture = [p.knobs for p in stage.points if p.knobs["part"] == "texture"]
     assert len({k["levels"] for k in texture}) > 1
     assert len({k["iterations"] for k in texture}) > 1

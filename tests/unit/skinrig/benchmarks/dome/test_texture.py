@@ -4,17 +4,18 @@ import numpy as np
 import pytest
 
 from model.texture_statistics.steerable_pyramid import analyze
-from skinrig.benchmarks.description import described
 from skinrig.benchmarks.dome import texture
+from skinrig.benchmarks.stage import Stage
 
 
 def test_a_missing_peer_is_said_and_no_limit_is_claimed(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyrtools", None)
     monkeypatch.setitem(sys.modules, "pyrtools.pyramids", None)
-    limits, left_out = texture.against_peer()
-    assert limits == {}
-    assert "10 x pyrtools" in left_out[0][0]
-    assert "skinrig[peers]" in left_out[0][1]
+    stage = Stage("texture-matching")
+    texture.against_peer(stage)
+    assert stage.limits == {}
+    assert "10 x pyrtools" in stage.left_out[0][0]
+    assert "skinrig[peers]" in stage.left_out[0][1]
 
 
 def test_our_responses_are_those_of_the_peer(rng):
@@ -28,10 +29,10 @@ def test_our_responses_are_those_of_the_peer(rng):
 @pytest.mark.long
 def test_our_matching_ends_as_near_as_the_peers():
     pytest.importorskip("pyrtools")
-    limits, left_out = texture.against_peer(512)
-    assert left_out == ()
-    stage = described("texture-matching", [], limits)
-    assert [limit.passed for limit in stage.limits[2:]] == [True, True]
+    stage = Stage("texture-matching")
+    texture.against_peer(stage, 512)
+    assert stage.left_out == []
+    assert [limit.passed for limit in stage.benchmark().limits[2:]] == [True, True]
 
 
 def test_a_made_texture_is_periodic_and_has_spots_of_their_own_color(rng):

@@ -6,11 +6,11 @@ import pytest
 from skinrig.benchmarks.intervals.coverage import (
     COVERAGE_RANGES,
     GAUSSIAN_95,
-    RAYLEIGH_95,
     Trial,
     by_band,
     pooled,
 )
+from skinrig.evaluating.surface import RAYLEIGH_68
 
 
 def trials_of(rng, *, shared, scale=1.0, subjects=12, band="any"):
@@ -63,12 +63,10 @@ def test_bands_are_told_beside_all_and_subjects_without_truths_are_left_out(rng)
         pooled(made, level=68)
 
 
-def test_angles_of_two_gaussian_components_reach_their_95_percent(rng):
+def test_angles_of_two_gaussian_components_reach_their_68_percent(rng):
     angle = np.hypot(*rng.standard_normal((2, 200_000)))
-    half_68 = np.sqrt(-2.0 * np.log(1.0 - 0.6827))
     # 4 sigma of the share
-    assert np.mean(angle <= half_68) == pytest.approx(0.6827, abs=0.0042)
-    assert np.mean(angle <= RAYLEIGH_95 * half_68) == pytest.approx(0.95, abs=0.002)
+    assert np.mean(angle <= RAYLEIGH_68) == pytest.approx(0.6827, abs=0.0042)
 
 
 def test_a_few_truths_that_all_lie_inside_leave_the_coverage_open():

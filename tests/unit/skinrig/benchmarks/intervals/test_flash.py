@@ -24,11 +24,11 @@ def test_each_subject_is_simulated_where_it_was_drawn_to_stand(tmp_path, monkeyp
     class Asked(Exception):
         """Stops before anything is rendered."""
 
-    def simulate(rig, out, **given):
+    def simulate(rig, folder, **given):
         raise Asked(given["seed"], given["nearer_mm"])
 
-    monkeypatch.setattr(trials, "calibrated", lambda *_, **__: None)
-    monkeypatch.setattr(trials, "simulate_session", simulate)
+    monkeypatch.setattr(trials, "calibrate_flash", lambda *_, **__: None)
+    monkeypatch.setattr(trials, "simulated", simulate)
     for seed in (520, 521):
         with pytest.raises(Asked) as asked:
             next(trials.flash(tmp_path, {seed: "III"}, width_px=64))

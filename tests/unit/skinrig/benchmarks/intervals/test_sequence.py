@@ -28,9 +28,7 @@ def fit_of(rng, *, noise, too_sure=1.0):
 
 def trials(rng, **more):
     return [
-        of_fits(
-            "x", [fit_of(rng, **more) for _ in range(5)], CONSTANT_S, subject=f"{k}", band="any"
-        )
+        of_fits("x", [fit_of(rng, **more) for _ in range(5)], CONSTANT_S, f"{k}", "any")
         for k in range(60)
     ]
 
@@ -70,7 +68,7 @@ def told(known, best, inner, outer):
 )
 def test_each_interval_counts_as_it_stands(inner, outer, held_68, held_95):
     fit = told("estimated", 35.0, inner, outer)
-    one = of_fits("x", [fit], CONSTANT_S, subject="a", band="any")
+    one = of_fits("x", [fit], CONSTANT_S, "a", "any")
     assert one.share(68) == held_68
     assert one.share(95) == held_95
 
@@ -98,7 +96,7 @@ def test_bounds_are_intervals_that_are_open_to_one_side(known, inner, outer, hel
 
 def test_what_tells_nothing_is_left_out():
     fit = told("unknown", 0.1, [0.0, None], [0.0, None])
-    assert of_fits("x", [fit], CONSTANT_S, subject="a", band="any").deviation.size == 0
+    assert of_fits("x", [fit], CONSTANT_S, "a", "any").deviation.size == 0
 
 
 def test_each_person_reacts_in_a_time_of_their_own():
@@ -122,6 +120,6 @@ def test_delays_count_by_their_own_interval(true_s, held_68, held_95):
         "stderr_delay_s": 0.14,
         "delay_interval_s": [0.01, 0.51],
     }
-    one = of_fits("x", [fit], true_s, subject="a", band="any", delay=True)
+    one = of_fits("x", [fit], true_s, "a", "any", delay=True)
     assert (one.share(68), one.share(95)) == (held_68, held_95)
     assert one.width == pytest.approx(100 * 0.14 / true_s)

@@ -9,7 +9,7 @@ from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline.probe.stages import ANISOTROPY_FILE, SUBSURFACE_FILE
 from skinrig.benchmarks.intervals import probe
 from skinrig.benchmarks.intervals.coverage import pooled
-from skinrig.benchmarks.intervals.trials import of_map
+from skinrig.benchmarks.intervals.trials import Subject
 
 PLACE = {"site": "cheek", "repeat": 0, "angle_deg": 0.0}
 CHANNELS = ("red", "green", "blue")
@@ -57,11 +57,11 @@ def medium(rng, *, stated=1.0, told=True):
 
 
 def decays(found, truth, subject):
-    return probe.of_decay("sigma_tr of media", found, truth, subject=subject, band="any")
+    return probe.of_decay("sigma_tr of media", found, truth, Subject(subject))
 
 
 def absorptions(found, truth, subject):
-    return probe.of_coefficient("sigma_a", found, truth, subject=subject)
+    return probe.of_coefficient("sigma_a", found, truth, Subject(subject))
 
 
 @pytest.mark.parametrize("trial", [decays, absorptions])
@@ -114,7 +114,7 @@ def test_axis_and_ratio_of_an_ellipse_are_judged_wherever_the_axis_lies(axis_deg
         made = [
             list(
                 probe.of_directions(
-                    *directed(rng, axis_deg=axis_deg, stated=stated), axis_deg, f"{k}"
+                    *directed(rng, axis_deg=axis_deg, stated=stated), axis_deg, Subject(f"{k}")
                 )
             )
             for k in range(100)
@@ -133,10 +133,10 @@ def test_widths_of_a_change_are_told_over_what_changes(rng):
         np.full(change.shape, 0.002, np.float32),
         np.ones(change.shape, bool),
     )
-    about = {"subject": "II 0", "band": "light"}
+    of_map = Subject("II 0", "light").of_map
     everywhere = np.ones(change.shape, bool)
-    alone = of_map("change", found, change, everywhere, **about)
-    over = of_map("change", found, change, everywhere, over=rest, **about)
+    alone = of_map("change", found, change, everywhere)
+    over = of_map("change", found, change, everywhere, over=rest)
     assert alone.width == np.inf
     assert over.width == pytest.approx(5.0)
     np.testing.assert_array_equal(alone.deviation, over.deviation)

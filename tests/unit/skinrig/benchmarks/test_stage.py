@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from skinrig.benchmarks.description import described, descriptions
+from skinrig.benchmarks.stage import Stage, descriptions
 
 
 @pytest.mark.parametrize("name", descriptions())
@@ -22,16 +22,20 @@ def test_a_stage_has_a_function_and_limits_that_its_module_names(name):
         assert ("at_most" in limit) != ("at_least" in limit)
 
 
+def limit(name, found):
+    (limit,) = Stage(name, limits=found).benchmark().limits
+    return limit
+
+
 def test_what_was_found_fills_the_names_and_bounds_of_limits():
-    found = {"over_own_walk": 5.0}
-    assert described("photon-transport", (), found).limits[0].passed
-    clean = described("gradient-normals", (), {("clean", "as it is"): 1.0}).limits[0]
+    assert limit("photon-transport", {"over_own_walk": 5.0}).passed
+    clean = limit("gradient-normals", {("clean", "as it is"): 1.0})
     assert clean.name == "mean error without noise on smooth relief, as it is"
     assert (clean.sense, clean.bound, clean.unit, clean.passed) == ("<=", 0.3, "degrees", False)
-    rms = described("light-order", (), {"rms": (0.1, 0.2)}).limits[0]
+    rms = limit("light-order", {"rms": (0.1, 0.2)})
     assert (rms.got, rms.bound, rms.passed) == (0.1, 0.2, True)
 
 
 def test_a_limit_that_the_table_lacks_is_an_error():
     with pytest.raises(KeyError, match="tea"):
-        described("hdr", (), {"tea": 1.0})
+        limit("hdr", {"tea": 1.0})

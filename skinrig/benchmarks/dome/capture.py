@@ -1,0 +1,264 @@
+"""Benchmarks of the dome's capture: order of lights, merging of brackets, calibration."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from capture import hdr
+from capture.calibration.geometry import CameraPose, bundle, nominal_cameras
+from capture.calibration.geometry.board import Board, Sighting, find_board
+from capture.calibration.lights import mirror_lights, mirror_sphere
+from capture.calibration.sensor.mosaic import channel_levels, neutral_mosaic
+from capture.plan.eye_light import eye_light
+from capture.plan.flicker import FlickerReport, flicker_of_rows
+from capture.plan.light_order import LIGHT_ORDERS, best_order
+from capture.plan.rows import LedRow
+from capture.raw import RawFrame, linear_rgb
+from capture.rig import LedLimits, Rig, load_rig
+from rigsim.as_built.dome import Tolerances, build, image_of
+from rigsim.boxes.dome import LedPulse
+from rigsim.scenes.dome.targets import target_scene
+from rigsim.sensor import sensor_of
+from skinrig.arrays import BoolArray, Float32Array, Float64Array, UInt16Array
+from skinrig.benchmarks.resampling import drawn_rms
+from skinrig.benchmarks.results import BandError, Timing
+from skinrig.benchmarks.stage import Stage
+
+if TYPE_CHECKING:
+    from rigsim.scenes.dome.targets import TargetScene
+
+
+DWELL_S = 1.0 / 12.0
+DARK_TIME_FRACTION = 0.3
+"""Share of each light's time that is dark where lights do not overlap."""
+
+
+def light_order(stage: Stage) -> None:
+    """Time each order of the lights and take the flicker of one pass at open eyes."""
+    rig = load_rig("dome")
+    rig = rig.subset(lights=[light.name for light in rig.lights[::3]]) if stage.toy else rig
+    limits = rig.leds or LedLimits()
+    found = {}
+    orders: dict[str, Callable[[Rig], list[int]]] = dict(LIGHT_ORDERS)
+    orders["chosen"] = partial(best_order, dwell_s=DWELL_S)
+    for name, order in orders.items():
+        timing, shown = stage.time(partial(order, rig), repeats=1)
+        for gaps in (False, True) if name == "spiral" else (False,):
+            found[name, gaps] = flicker = _flicker(rig, shown, gaps=gaps)
+            stage.add(
+                {"order": name, "gaps": "dark" if gaps else "none"},
+                timing,
+                BandError.around(100.0 * flicker.rms, 0.0),
+                {"flashes a second": flicker.flashes_per_s},
+            )
+    chosen, worst = found["chosen", False], found["spiral", True]
+    stage.limits = {
+        "flashes": (chosen.flashes_per_s, limits.max_flashes_per_s - 0.5),
+        "rms": (chosen.rms, limits.max_flicker_rms),
+        "reduction": worst.rms / chosen.rms,
+    }
+
+
+def _flicker(rig: Rig, shown: list[int], *, gaps: bool) -> FlickerReport:
+    rows = []
+    for light in shown:
+        lit_s = DWELL_S * (1.0 - DARK_TIME_FRACTION * gaps)
+        rows.append(LedRow((light,), 1.0, lit_s))
+        if gaps:
+            rows.append(LedRow((), 0.0, DWELL_S - lit_s))
+    overlap_s = rig.leds.overlap_s if rig.leds is not None and not gaps else 0.0
+    return flicker_of_rows(rows, eye_light(rig), overlap_s=overlap_s)
+
+
+GAIN_E_PER_DN, READ_NOISE_E, BLACK_DN, WHITE_DN = 2.0, 8.0, 512.0, 16383.0
+N_FRAMES, FULL_SIDE_PX = 23, 1024
+EXPOSURE_RANGE_S = (1e-3, 1.0)
+
+Frames = list[UInt16Array]
+
+
+def merging(stage: Stage) -> None:
+    """Merge brackets of 2 to 23 frames over three decades of exposure, four of radiance."""
+    side = 64 if stage.toy else FULL_SIDE_PX
+    rng = np.random.default_rng(0)
+    scene = np.geomspace(20.0, 2e5, side * side * 3)
+    scene = rng.permutation(scene).reshape(side, side, 3)  # DN per second
+    worst = 0.0
+    frames: Frames = []
+    times = np.ones(1)
+    for count in (2, 3, 5, 9, N_FRAMES):
+        times = np.geomspace(*EXPOSURE_RANGE_S, count)
+        frames = [_expose(scene, t, rng) for t in times]
+        timing, (radiance, _, valid) = stage.time(lambda: _merge(frames, times))
+        bound = _bound(scene, times)
+        # near a frame's saturation noise decides whether the frame counts
+        settled = valid & ~np.any(
+            [np.abs(scene * t / (WHITE_DN - BLACK_DN) - 1) < 0.05 for t in times], axis=0
+        )
+        squares = ((radiance - scene) / scene)[settled] ** 2
+        error = 100 * float(np.sqrt(squares.mean()))
+        spread = 50 * float(squares.std() / np.sqrt(squares.size) / np.sqrt(squares.mean()))
+        least = 100 * float(np.sqrt(((bound / scene**2)[settled]).mean()))
+        worst = max(worst, error / least)
+        outcome = BandError.around(error, spread, least)
+        stage.add({"frames": count}, timing, outcome)
+    ours, theirs, ratio = _beside_opencv(frames, times, rounds=1 if stage.toy else 15)
+    ours = replace(ours, peak_memory_mb=timing.peak_memory_mb)
+    stage.add({"frames": N_FRAMES, "way": "beside"}, ours, outcome)
+    stage.limits = {("speed_up", side, theirs): ratio, "over_bound": worst}
+
+
+def _merge(frames: Frames, times: Float64Array) -> tuple[Float32Array, Float32Array, BoolArray]:
+    return hdr.merge(
+        frames, times, gain=GAIN_E_PER_DN, read_noise=READ_NOISE_E, black=BLACK_DN, white=WHITE_DN
+    )
+
+
+def _expose(scene: Float64Array, time_s: float, rng: np.random.Generator) -> UInt16Array:
+    electrons = rng.poisson(np.minimum(scene * time_s * GAIN_E_PER_DN, 1e6)).astype(np.float32)
+    electrons += READ_NOISE_E * rng.standard_normal(scene.shape, np.float32)
+    return np.clip(np.rint(electrons / GAIN_E_PER_DN + BLACK_DN), 0, WHITE_DN).astype(np.uint16)
+
+
+def _bound(scene: Float64Array, times: Sequence[float] | Float64Array) -> Float64Array:
+    """Return the least variance of an unbiased estimate, from the frames that are not saturated."""
+    information = np.zeros_like(scene)
+    for t in times:
+        variance = scene * t / GAIN_E_PER_DN + (READ_NOISE_E / GAIN_E_PER_DN) ** 2 + 1 / 12
+        information += np.where(scene * t < WHITE_DN - BLACK_DN, t**2 / variance, 0.0)
+    return 1.0 / np.where(information > 0, information, np.nan)
+
+
+def _beside_opencv(
+    frames: Frames, times: Float64Array, *, rounds: int
+) -> tuple[Timing, float, float]:
+    """Time both in turn, so that both meet the same machine; return the ratio of the fastest."""
+    import cv2
+
+    eight_bits = [(frame >> 6).astype(np.uint8) for frame in frames]
+    peer = cv2.createMergeDebevec()
+    seconds = times.astype(np.float32)
+    _merge(frames, times)
+    peer.process(eight_bits, seconds)
+    ours, theirs = [], []
+    for _ in range(rounds):
+        start = time.perf_counter()
+        _merge(frames, times)
+        middle = time.perf_counter()
+        peer.process(eight_bits, seconds)
+        ours.append(middle - start)
+        theirs.append(time.perf_counter() - middle)
+    # the fastest of each: what neither the other nor the machine's other work slowed down
+    ratio = min(theirs) / min(ours)
+    timing = Timing(float(np.median(ours)), (min(ours), max(ours)), ours[0], None)
+    return timing, min(theirs), ratio
+
+
+CHARUCO_BOARD = Board.of(("charuco", 7, 5, "4X4_50"), square_mm=36.0)
+SPHERE_RADIUS_MM = 50.0
+DOME_SEED = 5
+
+
+def geometry(stage: Stage) -> None:
+    """Adjust cameras to 4 to 12 places of a simulated board."""
+    views = (
+        ["C03", "C07", "C11", "C14"] if stage.toy else ["C03", "C05", "C07", "C10", "C11", "C14"]
+    )
+    rig = load_rig("dome").subset(views=views).resized(324 if stage.toy else 650)
+    dome = build(rig, seed=DOME_SEED, tolerances=Tolerances(distortion=0.2))
+    scene = target_scene("charuco", rig, seed=DOME_SEED, dome=dome)
+    counts = (5, 6, 7, 8) if stage.toy else (6, 8, 10, 12)
+    sightings: dict[tuple[str, int], Sighting] = {}
+    for pose in range(counts[-1]):
+        scene.show(pose)
+        for name in views:
+            frame = _frame(scene, name, range(0, 150, 8), 0.02, 1.0, pose)
+            found = find_board(linear_rgb(frame, demosaic="bilinear").rgb, CHARUCO_BOARD)
+            if found is not None:
+                sightings[name, pose] = found
+    start = nominal_cameras(rig)
+    probes = np.random.default_rng(0).uniform(-70, 70, (300, 3))
+    for count in counts:
+        seen = {key: s for key, s in sightings.items() if key[1] < count}
+        result = bundle.adjust(seen, CHARUCO_BOARD, start)
+        gaps, variances, projected = [], [], []
+        for name, camera in result.cameras.items():
+            view = dome.rig.view(name)
+            gaps.append(np.mean((camera.center_mm - view.position_mm) ** 2))
+            variances.append(np.trace(result.center_covariance_mm2[name]) / 3)
+            truth = image_of(view, dome.distortion[name], probes)
+            projected.append(np.linalg.norm(camera.project(probes) - truth, axis=1).mean())
+        stage.limits["reprojection"] = float(max(projected))
+        timing, _ = stage.time(lambda: bundle.adjust(seen, CHARUCO_BOARD, start), repeats=3)
+        stage.add({"places": count}, timing, _rms(np.array(gaps), np.array(variances)))
+
+
+def lights(stage: Stage) -> None:
+    """Place lights by one to four places of a simulated mirror sphere."""
+    views = ["C05", "C07", "C14"] if stage.toy else ["C01", "C05", "C07", "C10", "C11", "C14"]
+    dome_rig = load_rig("dome")
+    every = [light.name for light in dome_rig.lights][:: 30 if stage.toy else 10]
+    rig = dome_rig.subset(views=views, lights=every).resized(324 if stage.toy else 1300)
+    dome = build(rig, seed=DOME_SEED)
+    scene = target_scene("mirror", rig, seed=DOME_SEED, dome=dome)
+    cameras = {view.name: CameraPose.nominal(view) for view in dome.rig.views}
+    spheres: dict[int, mirror_sphere.SpherePosition] = {}
+    seen: list[mirror_lights.Highlights] = []
+    most = 4
+    for number in range(most):
+        scene.show(number)
+        outlines, colors = {}, {}
+        for name, camera in cameras.items():
+            frame = _frame(scene, name, range(len(every)), 0.06, 1.0, number)
+            colors[name] = channel_levels(frame)
+            image = neutral_mosaic(frame, colors[name])
+            edges = mirror_sphere.find_outline(image, camera, SPHERE_RADIUS_MM)
+            if edges is not None:
+                outlines[name] = edges
+        spheres[number] = mirror_sphere.locate_sphere(outlines, cameras, SPHERE_RADIUS_MM)
+        for name, camera in cameras.items():
+            window = mirror_lights.SphereWindow.of(camera, spheres[number])
+            frame = _frame(scene, name, range(len(every)), 0.012, 0.002, number)
+            spots = mirror_lights.find_highlights(neutral_mosaic(frame, colors[name]), window)
+            seen.append(mirror_lights.Highlights(name, number, tuple(every), *spots))
+    nominal = {light.name: np.array(light.position_mm) for light in rig.lights}
+    truth = scene.truth()["position_mm"]
+    for count in range(1, most + 1):
+        rows = [row for row in seen if row.sphere < count]
+        some = {number: spheres[number] for number in range(count)}
+
+        locate = partial(mirror_lights.locate_lights, rows, cameras, some, nominal)
+        timing, result = stage.time(locate, repeats=3)
+        ok = result.valid
+        gaps = np.mean((result.position_mm - truth)[ok] ** 2, axis=1)
+        away = np.linalg.norm((result.position_mm - truth)[ok], axis=1)
+        stage.limits["distance"] = float(np.median(away))
+        variances = np.mean(result.stderr_mm[ok] ** 2, axis=1)
+        stage.add({"spheres": count}, timing, _rms(gaps, variances))
+
+
+def _frame(
+    scene: TargetScene, name: str, lit: Sequence[int], exposure_s: float, level: float, seed: int
+) -> RawFrame:
+
+    view = scene.rig.view(name)
+    pops = [LedPulse(k, level, 0.0, exposure_s) for k in lit]
+    cfa = scene.exposure(name, pops=pops, exposure_s=exposure_s, seed=seed)
+    return RawFrame(
+        cfa=cfa,
+        pattern=view.cfa,
+        black=(float(view.black_level),) * 4,
+        white=view.white_level,
+        noise_profile=sensor_of(view).noise_profile(exposure_s),
+    )
+
+
+def _rms(squares: Float64Array, variances: Float64Array) -> BandError:
+    """Return the root of squares' mean beside that of the variances that errors state."""
+    return drawn_rms(squares, float(np.sqrt(variances.mean())), draws=400)
