@@ -19,8 +19,7 @@ from model.skin import SkinAppearance
 from skinrig.arrays import BoolArray, FloatArray
 from skinrig.drawing import png
 from skinrig.exporting.options import FIRST_TILE, Delivery
-from skinrig.exporting.provenance import provenance
-from skinrig.exporting.sealing import write_json
+from skinrig.exporting.sealing import provenance, write_json
 
 SRGB_SPACE: Final = "linear sRGB"
 CAMERA_SPACE: Final = "camera RGB, linear, white balanced"
@@ -114,12 +113,19 @@ class ImageFolder:
         File name to what the file holds, JSON values.
     tiles
         UDIM tiles of the mesh; images are of the first.
+    left_out
+        What is not written, and why.
     """
 
     root: Path
     delivery: Delivery
     records: dict[str, dict[str, Any]] = field(default_factory=dict)
     tiles: tuple[int, ...] = (FIRST_TILE,)
+    left_out: list[tuple[str, str]] = field(default_factory=list)
+
+    def leave_out(self, what: str, why: str) -> None:
+        """Record what is not written, and why."""
+        self.left_out.append((what, why))
 
     def exr(self, image: Image, folder: str = "exr") -> str:
         """Write a float32 EXR a tile; return the first's name below the root."""

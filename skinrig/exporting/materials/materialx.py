@@ -11,7 +11,7 @@ from skinrig.drawing import templates
 from skinrig.exporting.images import Image, ImageFolder
 from skinrig.exporting.materials.material import MAP_NOTES, Material
 from skinrig.exporting.options import FIRST_TILE, M_PER_MM, TILE_SEPARATORS, UNITS_M, Delivery
-from skinrig.exporting.provenance import IMAGE_ORIENTATION
+from skinrig.exporting.sealing import IMAGE_ORIENTATION
 
 MATERIALX_FILE, DOCUMENT_FILE = "skin.mtlx", "material.json"
 SCHEMA: Final = "skinrig.export.material/1"

@@ -20,9 +20,8 @@ from model.skin import SkinAppearance
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 from skinrig.arrays import Float64Array
 from skinrig.exporting.images import write_channels
-from skinrig.exporting.options import Delivery
-from skinrig.exporting.provenance import IMAGE_ORIENTATION, provenance
-from skinrig.exporting.sealing import ExportError, write_json
+from skinrig.exporting.options import Delivery, ExportError
+from skinrig.exporting.sealing import IMAGE_ORIENTATION, provenance, write_json
 
 REFLECTANCE_FILE, STOKES_FILE, DOCUMENT_FILE = "reflectance.exr", "stokes.exr", "spectral.json"
 SCHEMA: Final = "skinrig.export.spectral/1"

@@ -12,8 +12,7 @@ Ma et al. 2007, Rapid Acquisition of Specular and Diffuse Normal Maps, EGSR.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from datetime import date, datetime
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,73 +26,15 @@ from reconstruction.pipeline.inputs import Inputs
 from reconstruction.pipeline.sensor_noise import SensorNoise
 from skinrig.arrays import BoolArray, Float32Array
 from skinrig.exporting.images import write_channels
-from skinrig.exporting.sealing import Exported, ExportError, fresh, sealed
-from skinrig.exporting.sessions.handing import allowed, write_session_document
+from skinrig.exporting.options import Delivery, ExportError
+from skinrig.exporting.sessions.copies import write_session_document
 from skinrig.exporting.sessions.spectral import channel, stokes_header
 
-STOKES_FORMAT: Final = "stokes"
 DOCUMENT_FILE: Final = "stokes.json"
 SCHEMA: Final = "skinrig.export.stokes/1"
 PARALLEL, CROSSED = "parallel", "crossed"
 S0, S1 = "S0", "S1"
 CHANNELS: Final = [channel(kind, 1e3 * WAVELENGTH_UM) for kind in (S0, S1)]
-
-
-def export_stokes(
-    session_path: str | Path,
-    out: str | Path,
-    *,
-    use: str,
-    only: Sequence[str] = (),
-    with_errors: bool = False,
-    calibration: str | Path | None = None,
-    today: date | None = None,
-    now: datetime | None = None,
-) -> Exported:
-    """Write a gradient-sphere session's pictures as Stokes images; all of them, or nothing.
-
-    Parameters
-    ----------
-    session_path
-        SESSION/ of the gradient sphere.
-    out
-        New folder.
-    use
-        What the copy is for; must lie within the consent's scope, on a day before it ends.
-    only
-        States such as "a000_n0"; empty: all.
-    with_errors
-        Whether standard errors are written beside each image, and the mask of each state.
-    calibration
-        CALIBRATION/ whose sensor tells how noisy frames are; None: as they say of themselves.
-    today, now
-        Day on which consent is judged, and time in the manifest; None: the present.
-
-    Returns
-    -------
-    Exported
-        Patterns that were not taken with both polarizations are left out and named.
-
-    Raises
-    ------
-    ConsentError
-        Where the subject has not agreed to the use, or not any more.
-    ExportError
-        For a session of another rig, a state that it lacks, or a folder that exists.
-    ValueError
-        Where the session is damaged.
-    """
-    target = fresh(out)
-    session = allowed(session_path, use, today=today)
-    if not session.frames("gradient"):
-        kinds = ", ".join(sorted({step.kind for step in session.plan.steps}))
-        raise ExportError(
-            f"{session_path}: shows {kinds}, expected patterns of the gradient sphere; of the "
-            "flash rig take `skinrig export APPEARANCE --to spectral`"
-        )
-    return sealed(
-        target, lambda part: _write(session, part, tuple(only), with_errors, calibration), now
-    )
 
 
 def components(parallel: Float32Array, crossed: Float32Array) -> dict[str, Float32Array]:
@@ -113,14 +54,37 @@ def components(parallel: Float32Array, crossed: Float32Array) -> dict[str, Float
     return {S0: parallel + crossed, S1: parallel - crossed}
 
 
-def _write(
-    session: Session,
-    folder: Path,
-    only: tuple[str, ...],
-    with_errors: bool,
-    calibration: str | Path | None,
-) -> list[tuple[str, str]]:
-    inputs = Inputs.of(session, calibration, state="neutral", on_date=None)
+def write(session: Session, folder: Path, delivery: Delivery) -> list[tuple[str, str]]:
+    """Write a gradient-sphere session's images as Stokes images.
+
+    Parameters
+    ----------
+    session
+        Of the gradient sphere.
+    folder
+        Existing folder.
+    delivery
+        Its ``only`` names states such as "a000_n0"; with errors, standard errors are written
+        beside each image, and the mask of each state; its calibration is of the sensor.
+
+    Returns
+    -------
+    list of (str, str)
+        Patterns that were not taken with both polarizations.
+
+    Raises
+    ------
+    ExportError
+        For a session of another rig, or a state that it lacks.
+    """
+    if not session.frames("gradient"):
+        kinds = ", ".join(sorted({step.kind for step in session.plan.steps}))
+        raise ExportError(
+            f"{session.path}: shows {kinds}, expected patterns of the gradient sphere; of the "
+            "flash rig take `skinrig export APPEARANCE --to spectral`"
+        )
+    only, with_errors = delivery.only, delivery.with_errors
+    inputs = Inputs.of(session, delivery.calibration, state="neutral", on_date=None)
     camera = session.frames("gradient")[0].camera
     images = GradientImages(session, noise=_noise(inputs, camera))
     names = [state.name for state in images.states]

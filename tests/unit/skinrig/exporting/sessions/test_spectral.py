@@ -10,8 +10,7 @@ import pytest
 from model import color_table, spectra
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN, two_layer_reflectance
-from skinrig.exporting.options import Delivery
-from skinrig.exporting.sealing import ExportError
+from skinrig.exporting.options import Delivery, ExportError
 from skinrig.exporting.sessions import spectral
 
 CAMERA, LIGHT = "Nikon 5100 (NPL)", "D55"
