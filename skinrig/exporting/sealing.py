@@ -2,8 +2,6 @@
 
 import json
 import os
-import shutil
-import uuid
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -14,6 +12,7 @@ from typing import Any, Final
 from capture.session.mhl import write_first_generation
 from model.skin import SkinAppearance
 from skinrig import consent
+from skinrig.workspace import whole_folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,20 +59,12 @@ def sealed(
         With what ``write`` returned as left out, where it returned anything.
     """
     moment = now or datetime.now(UTC)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    # of the final name, which the manifest bears, in a hidden folder beside it
-    shelter = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
-    part = shelter / target.name
-    try:
-        part.mkdir(parents=True)
+    with whole_folder(target) as part:  # of the final name, which the manifest bears
         left_out = tuple(write(part) or ())
         written = [path for path in part.rglob("*") if path.is_file()]
         for path in written:  # the manifest bears dates: one moment, one manifest
             os.utime(path, (moment.timestamp(), moment.timestamp()))
         manifest = write_first_generation(part, now=moment, version=version("skinrig"))
-        part.rename(target)
-    finally:
-        shutil.rmtree(shelter, ignore_errors=True)
     return Exported(target, target / manifest.relative_to(part), len(written), left_out)
 
 

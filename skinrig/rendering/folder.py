@@ -1,8 +1,6 @@
 """The folder that a rendering is written to: whole or not at all."""
 
 import json
-import shutil
-import uuid
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -12,6 +10,7 @@ import numpy as np
 from model import store
 from skinrig.arrays import Float32Array
 from skinrig.console import plain
+from skinrig.workspace import whole_folder
 
 DOCUMENT_FILE: Final = "render.json"
 SCHEMA: Final = "skinrig.render/1"
@@ -68,11 +67,7 @@ def write(
         See `check`.
     """
     check(out)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    fresh = out.with_name(f".{out.name}.{uuid.uuid4().hex}.part")
-    fresh.mkdir()
-    old = out.with_name(f".{out.name}.{uuid.uuid4().hex}.old")
-    try:
+    with whole_folder(out) as fresh:
         for name, image in images.items():
             store.write_exr(fresh / f"{name}.exr", np.asarray(image, np.float32))
         for name, data in pictures.items():
@@ -81,16 +76,4 @@ def write(
         record = plain({"schema": SCHEMA, **document, "out": out, "files": files})
         text = json.dumps(record, indent=1, sort_keys=True, allow_nan=False)
         (fresh / DOCUMENT_FILE).write_text(text + "\n", encoding="utf-8")
-        if out.exists():
-            out.rename(old)
-        try:
-            fresh.rename(out)
-        except OSError:
-            if old.exists():
-                old.rename(out)
-            raise
-    except BaseException:
-        shutil.rmtree(fresh, ignore_errors=True)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
     return dict(record)

@@ -1,6 +1,6 @@
 """What the viewer shows: a mesh that moves, textures, tables, parameters and what is left out.
 
-A scene is plain data. Its sources (`skinrig.viewer.procedural`, `skinrig.viewer.from_appearance`)
+A scene is plain data. Its sources (`skinrig.viewer.faces`, `skinrig.viewer.faces`)
 say what is known of a face; asset builders turn that into textures, tables and parameters; the
 packer (`skinrig.viewer.packing`) makes it small.
 """
@@ -147,9 +147,9 @@ class SceneSource:
     seed
         Of everything that is drawn, where something is.
     subject
-        The simulated person, where the face or its textures are simulated.
+        The simulated person who stands for what was not measured.
     skin
-        Its finest maps at `size`; None: those of the subject.
+        Its finest maps at `size`.
     appearances
         Fitted folders by kind: "dynamic" (facial color, wrinkles, microstructure), "dome", "model".
     paths
@@ -163,9 +163,9 @@ class SceneSource:
     kind: Kind
     mesh: ViewerMesh
     size: int
-    seed: int = 0
-    subject: SimulatedSubject | None = None
-    skin: FineSkin | None = None
+    seed: int
+    subject: SimulatedSubject
+    skin: FineSkin
     appearances: Mapping[str, SkinAppearance] = field(default_factory=dict)
     paths: Mapping[str, Path] = field(default_factory=dict)
     landmarks: Path | None = None

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from rigsim.subject import make_subject
-from skinrig.viewer import page, procedural
+from skinrig.viewer import faces as procedural
+from skinrig.viewer import page
 
 pytestmark = pytest.mark.long
 

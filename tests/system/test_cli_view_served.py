@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from skinrig.console import Console
-from skinrig.viewer import writing
+from skinrig.viewer import server
 from skinrig.viewer.microstructure.tiles import TileError
 from skinrig.viewer.scene import ViewerMesh, ViewerScene
 
@@ -48,7 +48,7 @@ def test_a_served_page_is_there_with_its_tiles_until_it_ends(plate, tmp_path, ca
         raise KeyboardInterrupt
 
     monkeypatch.setattr(server.Served, "wait", wait)
-    writing.serve(plate, 0, [], console=Console(True), displacement=path)
+    server.serve_scene(plate, 0, [], console=Console(True), displacement=path)
     document = json.loads(capsys.readouterr().out)
     assert document["schema"] == "skinrig.view-served/1"
     assert document["displacement_px"] == 1024
@@ -64,4 +64,4 @@ def test_a_file_that_is_no_displacement_is_named(plate, tmp_path):
     path = tmp_path / "height.npy"
     np.save(path, np.zeros((300, 300), np.float32))
     with pytest.raises(TileError, match=r"displacement: got shape \(300, 300\)"):
-        writing.serve(plate, 0, [], console=Console(True), displacement=path)
+        server.serve_scene(plate, 0, [], console=Console(True), displacement=path)

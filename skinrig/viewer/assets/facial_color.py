@@ -11,7 +11,6 @@ from model.facial_color.state_maps import NEUTRAL
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.perfusion import STATE_NAMES
-from skinrig.appearances import face_textures
 from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
 from skinrig.arrays import Float64Array
 from skinrig.viewer.assets import camera_color
@@ -26,7 +25,8 @@ TABLE_NODES: Final = 128
 RADIUS_PER_SIZE: Final = 24.0 / 512.0
 """Radius of the local statistics' disc, as a part of the map's side."""
 FINEST_STEP_WORDS: Final = 8
-"""Words of the finest octave's steps, of chromophores of 2048 texels a side and more."""
+"""Words of the finest octave's steps, of chromophores of 2048 texels a side and more: texels below
+0.2 mm hold noise."""
 ALBEDO_MAP: Final = "r_d"
 
 
@@ -39,7 +39,9 @@ def assets(source: SceneSource) -> Assets:
     )
     roots = np.cbrt(np.stack([found.melanin, found.hemoglobin], axis=-1))
     textures = {
-        "chromophores": Texture(roots.astype(np.float32), fine=_fine(roots.shape[0])),
+        "chromophores": Texture(
+            roots.astype(np.float32), fine=FINEST_STEP_WORDS if len(roots) >= 2048 else 1
+        ),
         "facial_states": Texture(np.stack(list(found.states.values())).astype(np.float32), "u8"),
     }
     names = list(found.states)
@@ -71,22 +73,12 @@ def assets(source: SceneSource) -> Assets:
     }
 
 
-def _fine(size: int) -> int:
-    """Return how coarsely the finest octave is kept: texels below 0.2 mm hold noise."""
-    return FINEST_STEP_WORDS if size >= 2048 else 1
-
-
 def _face(source: SceneSource, *, measured: bool) -> FaceColor:
     """Return the chromophores; beside a measured albedo, coarse: only their changes show."""
-    subject = source.subject
-    if subject is None:
-        raise ValueError("source: got no subject, expected one to stand for what was not measured")
-    dynamic = source.appearances.get("dynamic")
+    subject, dynamic = source.subject, source.appearances.get("dynamic")
     if dynamic is not None and FACIAL_COLOR in parts_of(dynamic):
-        return placed(source, subject)
-    if measured or source.skin is None:
-        return simulated(subject, FineSkin(subject, subject.size))
-    return simulated(subject, source.skin)
+        return placed(source)
+    return simulated(subject, FineSkin(subject, subject.size) if measured else source.skin)
 
 
 def simulated(person: SimulatedSubject, skin: FineSkin) -> FaceColor:
@@ -109,12 +101,11 @@ def simulated(person: SimulatedSubject, skin: FineSkin) -> FaceColor:
 
 def _stored_states(rig: HemoglobinRig) -> dict[str, Float64Array]:
     """Return a rig's scale and bias maps by state, (h, w, 2), filled where they are not valid."""
-    layers = {}
-    for name in (NEUTRAL, *rig.states):
-        valid = rig.neutral_mean_valid if name == NEUTRAL else rig.states[name].valid
-        pair = [filled(maps[name], valid) for maps in (rig.scale, rig.bias)]
-        layers[name] = np.stack(pair, axis=-1)
-    return layers
+    valid = {NEUTRAL: rig.neutral_mean_valid, **{name: m.valid for name, m in rig.states.items()}}
+    return {
+        name: filled(np.stack([rig.scale[name], rig.bias[name]], axis=-1), valid[name])
+        for name in (NEUTRAL, *rig.states)
+    }
 
 
 def _albedo(source: SceneSource) -> tuple[Texture, CameraColor] | None:
@@ -123,8 +114,7 @@ def _albedo(source: SceneSource) -> tuple[Texture, CameraColor] | None:
         if ALBEDO_MAP not in appearance.maps:
             continue
         found = appearance.maps[ALBEDO_MAP]
-        valid = face_textures.valid_of(found)
-        values = np.stack([filled(found.values[..., c], valid) for c in range(3)], axis=-1)
+        values = filled(found.values, found.mask)
         seen = camera_color.of(source)
         shown = np.clip(seen.convert(halved(values, source.size)), 0.0, 1.0)
         return Texture(shown.astype(np.float32), "u8"), seen

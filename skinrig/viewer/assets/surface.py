@@ -4,7 +4,6 @@ from typing import Final
 
 import numpy as np
 
-from skinrig.viewer.fine_skin import FineSkin
 from skinrig.viewer.map_filling import filled, halved
 from skinrig.viewer.scene import Assets, SceneSource, Texture
 
@@ -17,10 +16,8 @@ FINEST_STEP_WORDS: Final = 20
 def assets(source: SceneSource) -> Assets:
     """Return the relief at rest, um, and roughness (Beckmann m) and intensity by region."""
     subject = source.subject
-    if subject is None:
-        return {"left_out": (("relief", "nothing of the surface was measured"),)}
     covered = subject.atlas.covered
-    height = (source.skin or FineSkin(subject, subject.size)).height_um()[..., None]
+    height = source.skin.height_um()[..., None]
     # Beckmann's m and GGX's alpha give a peak of the same height, 1 / (pi m^2)
     roughness = halved(filled(subject.roughness, covered), MAPS_PX)
     # hair hides the skin's gloss, as the subject's own renderings have it

@@ -19,7 +19,7 @@ from rigsim.subject import SimulatedSubject, make_subject
 from rigsim.subject.expressions import EXPRESSION_STRENGTHS
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
 from skinrig.viewer.map_filling import filled
-from skinrig.viewer.scene import Assets, SceneSource, Texture
+from skinrig.viewer.scene import Assets, SceneError, SceneSource, Texture
 
 MAP_PX: Final = 512
 """Side of wrinkle maps, at most: half a millimeter of a face; the paper has 256."""
@@ -32,27 +32,14 @@ MAX_LAYERS: Final = 4
 """Wrinkle maps that the shader has room for."""
 
 
-class WrinkleAssetError(ValueError):
-    """Wrinkle maps that the page cannot show."""
-
-
 def assets(source: SceneSource) -> Assets:
-    """Return the wrinkles of a scene, or why there are none."""
-    model, origin = _model_of(source)
-    if model is None:
-        return Assets(left_out=(("wrinkles", origin),))
-    return from_model(model, source, origin=origin)
-
-
-def _model_of(source: SceneSource) -> tuple[WrinkleModel | None, str]:
-    """Return the wrinkles of a scene and where they come from; None and the reason without."""
+    """Return the wrinkles of a scene, fitted ones before those of the simulated person."""
     dynamic = source.appearances.get("dynamic")
     if dynamic is not None and WRINKLE_FILE in dynamic.files:
-        return WrinkleModel.from_maps(dynamic.maps, bytes(dynamic.files[WRINKLE_FILE])), "fitted"
-    if source.subject is None:
-        return None, "no wrinkle maps in the appearance; `skinrig fit wrinkles` adds them"
+        found = WrinkleModel.from_maps(dynamic.maps, bytes(dynamic.files[WRINKLE_FILE]))
+        return from_model(found, source, origin="fitted")
     found = simulated_model(source.subject, size=min(source.size, MAP_PX))
-    return found, "simulated: fitted to the person's own expressions"
+    return from_model(found, source, origin="simulated: fitted to the person's own expressions")
 
 
 def simulated_model(subject: SimulatedSubject, *, size: int) -> WrinkleModel:
@@ -95,11 +82,11 @@ def from_model(model: WrinkleModel, source: SceneSource, *, origin: str) -> Asse
 
     Raises
     ------
-    WrinkleAssetError
+    SceneError
         For more maps than the shader has room for.
     """
     if len(model.layers) > MAX_LAYERS:
-        raise WrinkleAssetError(
+        raise SceneError(
             f"layers: got {len(model.layers)} wrinkle maps, expected at most {MAX_LAYERS}"
         )
     tables = [as_table(layer.table) for layer in model.layers]
@@ -116,8 +103,7 @@ def from_model(model: WrinkleModel, source: SceneSource, *, origin: str) -> Asse
     }
     if origin == "fitted":
         valid = np.ones(model.base.shape[:2], bool) if model.valid is None else model.valid
-        base = np.stack([filled(model.base[..., c], valid) for c in range(2)], axis=-1)
-        textures["wrinkle_base"] = Texture(base.astype(np.float32), "u8")
+        textures["wrinkle_base"] = Texture(filled(model.base, valid).astype(np.float32), "u8")
     layers = [
         {"zones": list(table.zones), "rows": {n: list(table.rows[n]) for n in sorted(table.rows)}}
         for table in tables
@@ -183,7 +169,7 @@ def _masks(layers: tuple[Layer, ...]) -> Float32Array:
     out = []
     for layer in layers:
         if len(layer.masks) > ZONES_PER_LAYER:
-            raise WrinkleAssetError(
+            raise SceneError(
                 f"masks: got {len(layer.masks)} zones, expected at most {ZONES_PER_LAYER}"
             )
         planes = resampled(np.asarray(layer.masks, np.float32), (side, side))

@@ -194,10 +194,9 @@ def test_traits_bear_the_consent_of_the_people_they_were_learned_of(tmp_path, do
 
 @pytest.mark.long
 def test_a_page_of_a_measured_face_says_what_its_subject_agreed_to(dome, tmp_path):
-    from skinrig.viewer import writing
-    from skinrig.viewer.packing import arrays as packing
+    from skinrig.viewer import faces, packing
 
-    scene = writing.compose([dome("dome")], size=64)
+    scene = faces.scene([dome("dome")], size=64)
     assert scene.provenance[consent.CONSENT_KEY] == ["P042: research, until 2030-01-01"]
     assert packing.pack(scene).header["provenance"][consent.CONSENT_KEY] == list(
         scene.provenance[consent.CONSENT_KEY]
@@ -206,9 +205,9 @@ def test_a_page_of_a_measured_face_says_what_its_subject_agreed_to(dome, tmp_pat
 
 @pytest.mark.long
 def test_a_page_of_a_simulated_face_names_nobody(face_folder):
-    from skinrig.viewer import writing
+    from skinrig.viewer import faces
 
-    assert consent.CONSENT_KEY not in writing.compose([face_folder], size=64).provenance
+    assert consent.CONSENT_KEY not in faces.scene([face_folder], size=64).provenance
 
 
 def consent_of(html):

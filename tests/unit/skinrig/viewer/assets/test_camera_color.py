@@ -31,7 +31,7 @@ def _source(folder, **more):
         np.array([[0, 1, 2]], np.int32),
     )
     return SceneSource(
-        "dome", mesh, 64, appearances={"dome": appearance}, paths={"dome": folder / "appearance"}
+        "dome", mesh, 64, 0, None, None, {"dome": appearance}, {"dome": folder / "appearance"}
     )
 
 
