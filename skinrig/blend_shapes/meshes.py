@@ -12,7 +12,7 @@ import numpy as np
 from skinrig.arrays import Float32Array, Float64Array, Int32Array
 from skinrig.blend_shapes import gltf as blend_shape_gltf
 from skinrig.blend_shapes import obj as blend_shape_obj
-from skinrig.blend_shapes.errors import BlendShapeError, BlendShapeFileError
+from skinrig.blend_shapes.obj import BlendShapeError, BlendShapeFileError
 
 __all__ = ["BlendShapeError", "BlendShapeFileError", "BlendShapeMesh", "load"]
 
@@ -71,7 +71,7 @@ class BlendShapeMesh:
         if not low <= extent <= high:
             raise BlendShapeError(
                 f"vertices_mm: got an extent of {extent:g} mm, expected {low:g}...{high:g}; "
-                "say with unit_mm how many millimetres the file's unit has"
+                "scale it to millimetres, glTF to metres"
             )
 
     def deformed(self, weights: Mapping[str, float]) -> Float64Array:
@@ -102,31 +102,14 @@ class BlendShapeMesh:
         return moved
 
 
-def load(
-    path: Path | str,
-    *,
-    shapes: Mapping[str, Path] | None = None,
-    part: str | None = None,
-    unit_mm: float | None = None,
-) -> BlendShapeMesh:
+def load(path: Path | str) -> BlendShapeMesh:
     """Load a mesh with blend shapes.
 
     Parameters
     ----------
     path
-        A .npz with ``vertices_mm, uv, faces, shape_names, shape_deltas_mm``; a folder of .obj
-        files, one of them called neutral.obj; the neutral .obj itself, beside the others; a .gltf
-        or .glb with morph targets.
-    shapes
-        For OBJ: the files of the shapes by name, instead of the others of the folder.
-    part
-        For glTF: the name of the mesh, where several have morph targets.
-    unit_mm
-        Millimetres that the file's unit has; 1 by default, 1000 for glTF.
-
-    Returns
-    -------
-    BlendShapeMesh
+        .npz of `NPZ_KEYS` in mm; .obj, the neutral mesh in mm with one .obj for each shape beside
+        it, or the folder of these; .gltf or .glb in m, with one mesh that has morph targets.
 
     Raises
     ------
@@ -136,17 +119,14 @@ def load(
         For a mesh that contradicts itself.
     """
     source = Path(path)
-    kind = source.suffix.lower()
-    if unit_mm is not None and not (np.isfinite(unit_mm) and unit_mm > 0):
-        raise BlendShapeError(f"unit_mm: got {unit_mm}, expected a number above 0")
+    kind, scale = source.suffix.lower(), 1.0
     if not source.exists():
         raise BlendShapeFileError(f"{source}: no such file or folder")
-    scale = 1.0 if unit_mm is None else unit_mm
     if source.is_dir() or kind == ".obj":
-        vertices, uv, faces, deltas = blend_shape_obj.read(source, shapes)
+        vertices, uv, faces, deltas = blend_shape_obj.read(source)
     elif kind in (".gltf", ".glb"):
-        vertices, uv, faces, deltas = blend_shape_gltf.read(source, part)
-        scale = MM_PER_M if unit_mm is None else unit_mm
+        vertices, uv, faces, deltas = blend_shape_gltf.read(source)
+        scale = MM_PER_M
     elif kind == ".npz":
         vertices, uv, faces, deltas = _read_npz(source)
     else:

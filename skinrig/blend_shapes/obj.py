@@ -4,14 +4,21 @@ Polygons are cut into fans, and vertices split where a seam of the texture gives
 texture coordinates. Normals, materials, groups, points, lines and smoothing are passed over.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from skinrig.arrays import Float64Array, Int64Array
-from skinrig.blend_shapes.errors import BlendShapeFileError
+
+
+class BlendShapeError(ValueError):
+    """A mesh, or weights of its shapes, that contradict themselves."""
+
+
+class BlendShapeFileError(BlendShapeError, OSError):
+    """A file of a mesh that cannot be read."""
+
 
 MeshArrays = tuple[Float64Array, Float64Array, Int64Array, dict[str, Float64Array]]
 """Vertices (V, 3), texture coordinates (V, 2), triangles (F, 3), and shapes by name (V, 3)."""
@@ -29,7 +36,7 @@ class ObjMesh:
     """Triangles, (F, 3, 2): position and texture index of each corner."""
 
 
-def read(path: Path, shapes: Mapping[str, Path] | None) -> MeshArrays:
+def read(path: Path) -> MeshArrays:
     """Read a neutral OBJ and its shapes.
 
     Parameters
@@ -51,14 +58,14 @@ def read(path: Path, shapes: Mapping[str, Path] | None) -> MeshArrays:
     """
     neutral_path = path if path.is_file() else _neutral_of(path)
     neutral = parse(neutral_path)
-    if shapes is None:
-        others = sorted(p for p in neutral_path.parent.iterdir() if p.suffix.lower() == ".obj")
-        shapes = {p.stem: p for p in others if p != neutral_path}
+    others = sorted(p for p in neutral_path.parent.iterdir() if p.suffix.lower() == ".obj")
     pairs, split = np.unique(neutral.corners.reshape(-1, 2), axis=0, return_inverse=True)
     faces = split.reshape(-1, 3).astype(np.int64)
     deltas = {}
-    for name, file in shapes.items():
-        shape = parse(Path(file))
+    for file in others:
+        if file == neutral_path:
+            continue
+        shape = parse(file)
         if len(shape.positions) != len(neutral.positions):
             raise BlendShapeFileError(
                 f"{file}: got {len(shape.positions)} vertices, expected {len(neutral.positions)} "
@@ -67,7 +74,7 @@ def read(path: Path, shapes: Mapping[str, Path] | None) -> MeshArrays:
         # exporters may leave out or renumber texture coordinates of shapes: they are not used
         if not np.array_equal(shape.corners[..., 0], neutral.corners[..., 0]):
             raise BlendShapeFileError(f"{file}: its faces are not those of {neutral_path.name}")
-        deltas[name] = (shape.positions - neutral.positions)[pairs[:, 0]]
+        deltas[file.stem] = (shape.positions - neutral.positions)[pairs[:, 0]]
     if len(pairs) == 0:
         raise BlendShapeFileError(f"{neutral_path}: got no faces, expected triangles or polygons")
     if pairs[:, 1].min() < 0:

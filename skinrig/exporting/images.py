@@ -138,8 +138,8 @@ class ImageFolder:
             self._record(names[-1], one, {"encoding": "32-bit float, the value itself"})
         return names[0]
 
-    def png(self, image: Image, folder: str = "png", *, depth: int = 16) -> str:
-        """Write a PNG of 16 or 8 bits a tile; return the first's name below the root.
+    def png(self, image: Image, folder: str = "png") -> str:
+        """Write a PNG of 16 bits a tile; return the first's name below the root.
 
         Colors in `SRGB_SPACE` are coded by sRGB's curve, all else in proportion.
         """
@@ -147,7 +147,7 @@ class ImageFolder:
         names = []
         for tile, one in self._by_tile(replace(image, low=low, high=high)):
             names.append(self._place(folder, image.name, "png", tile))
-            codes, told = coded(one, depth=depth)
+            codes, told = coded(one)
             (self.root / names[-1]).write_bytes(png.encode(codes, quick=True))
             self._record(names[-1], one, told)
         return names[0]

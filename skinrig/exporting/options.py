@@ -140,9 +140,15 @@ class Delivery:
         """What growing green of a normal map means, for people."""
         return "+Y (OpenGL)" if self.y > 0 else "-Y (DirectX)"
 
-    def unit_or(self, default: str) -> str:
-        """Return the scene unit, or a format's own where none is asked for."""
-        return default if self.unit is None else self.unit
+    @property
+    def scene_unit(self) -> str:
+        """Scene unit; meters where none is asked for."""
+        return self.unit or "m"
+
+    @property
+    def per_mm(self) -> float:
+        """Scene units in a millimeter."""
+        return M_PER_MM / UNITS_M[self.scene_unit]
 
     def tiled(self, name: str, suffix: str, tile: int = FIRST_TILE) -> str:
         """Return the file name of a texture's tile.

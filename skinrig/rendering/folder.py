@@ -10,14 +10,11 @@ import numpy as np
 from model import store
 from skinrig.arrays import Float32Array
 from skinrig.console import plain
+from skinrig.rendering.camera import RenderingError
 from skinrig.workspace import whole_folder
 
 DOCUMENT_FILE: Final = "render.json"
 SCHEMA: Final = "skinrig.render/1"
-
-
-class RenderingFolderError(ValueError):
-    """A folder that renderings cannot be written to."""
 
 
 def check(out: Path) -> None:
@@ -25,13 +22,13 @@ def check(out: Path) -> None:
 
     Raises
     ------
-    RenderingFolderError
+    RenderingError
         ``out`` exists and is neither empty nor an older rendering.
     """
     if out.is_file() or (
         out.is_dir() and not (out / DOCUMENT_FILE).is_file() and any(out.iterdir())
     ):
-        raise RenderingFolderError(
+        raise RenderingError(
             f"{out}: exists and is no rendering; nothing was written: name another folder"
         )
 
@@ -63,7 +60,7 @@ def write(
 
     Raises
     ------
-    RenderingFolderError
+    RenderingError
         See `check`.
     """
     check(out)

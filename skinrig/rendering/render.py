@@ -20,18 +20,17 @@ from typing import Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from model.dipole.gather import GATHER_TOL
 from model.skin_reflectance import lobe_brdf, transmitted
 from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.render import Caster, GBuffer, trace
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.rendering import camera as rendering_camera
-from skinrig.rendering.camera import Camera
+from skinrig.rendering.camera import Camera, RenderingError
 from skinrig.rendering.geometry import FittedSurface, Rows
 from skinrig.rendering.interior import Interior, Lighting
 from skinrig.rendering.lights import Light
 
-__all__ = ["Camera", "Light", "Rendering", "RenderingError", "Subsurface", "render"]
+__all__ = ["Camera", "Light", "Rendering", "Subsurface", "render"]
 
 
 Subsurface = Literal["local", "dipole", "none"]
@@ -46,10 +45,6 @@ MIN_LIT_FRACTION: Final = 0.999
 """Share of a light that counts as all of it."""
 MIN_OUTSIDE_FRACTION: Final = 0.5
 """Least share of what a camera sees of the mesh that must be its outside."""
-
-
-class RenderingError(ValueError):
-    """What is asked for gives no picture."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,7 +98,6 @@ def render(
     blockers: Mesh | None = None,
     caster: Caster | None = None,
     interior: Interior | None = None,
-    tolerance: float = GATHER_TOL,
     progress: Callable[[str], None] | None = None,
 ) -> Rendering:
     """Render a fitted model.
@@ -129,8 +123,6 @@ def render(
         Of the mesh, where there is one already.
     interior
         Of the model on the mesh, where there is one already; for "dipole".
-    tolerance
-        For "dipole": aimed-at error of light from inside, over the brightest that entered.
     progress
         Called with a line of text now and then.
 
@@ -154,7 +146,7 @@ def render(
     shadows = rays if blockers is None else Caster(joined(laid.mesh, blockers), choice=rays.choice)
     columns, height = camera.image_size
     lighting = Lighting(lamps, shadows, shadow_samples)
-    inside = _inside(laid, subsurface, lighting, interior, tolerance)
+    inside = _inside(laid, subsurface, lighting, interior)
     film = _Film(height, columns)
     seen = _Sighting()
     band = max(1, BAND_RAYS // (columns * subpixels**2))
@@ -289,11 +281,7 @@ class _Film:
 
 
 def _inside(
-    laid: FittedSurface,
-    subsurface: Subsurface,
-    lighting: Lighting,
-    interior: Interior | None,
-    tolerance: float,
+    laid: FittedSurface, subsurface: Subsurface, lighting: Lighting, interior: Interior | None
 ) -> Callable[[_Points, Float64Array], Float64Array]:
     """Return what gives the light that comes from inside at points, of what enters there."""
     if subsurface == "none":
@@ -302,9 +290,7 @@ def _inside(
         return lambda points, entered: entered * points.rows.r_d
     below = Interior.of(laid) if interior is None else interior
     light = below.entered(lighting)
-    return lambda points, entered: below.leaving(
-        light, points.position_mm, points.rows, entered, tolerance=tolerance
-    )
+    return lambda points, entered: below.leaving(light, points.position_mm, points.rows, entered)
 
 
 def _lamps(lights: Light | Sequence[Light]) -> list[Light]:

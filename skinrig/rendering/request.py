@@ -19,8 +19,7 @@ from model.skin_reflectance import SkinReflectance, assemble
 from skinrig.errors import UnusableError, UsageError
 from skinrig.rendering import camera as rendering_camera
 from skinrig.rendering.camera import Camera
-from skinrig.rendering.environment import environment_lights, read_environment
-from skinrig.rendering.lights import Light, LightError, Vector
+from skinrig.rendering.lights import Light, LightError, Vector, environment_lights, read_environment
 
 POSITION_PREFIX: Final = "at:"
 LED_RADIUS_MM: Final = 10.0

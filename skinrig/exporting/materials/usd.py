@@ -21,7 +21,7 @@ from skinrig.errors import MissingExtra
 from skinrig.exporting.images import ImageFolder
 from skinrig.exporting.materials import blender, materialx
 from skinrig.exporting.materials.material import Material
-from skinrig.exporting.options import M_PER_MM, UNITS_M, Delivery
+from skinrig.exporting.options import UNITS_M, Delivery
 
 USD_FILE, DOCUMENT_FILE = "skin.usdc", "usd.json"
 SCHEMA: Final = "skinrig.export.usd/1"
@@ -58,13 +58,12 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     except ImportError as error:
         raise MissingExtra("export to USD", "usd") from error
     material = Material.of(appearance, delivery.mesh)
-    per_mm = M_PER_MM / UNITS_M[delivery.unit_or("m")]
     tiles = material.left_out_of_mesh(delivery)
     out = ImageFolder(folder, delivery, tiles=material.tiles)
     scale = materialx.write_textures(material, out)
     out.png(material.image("specular_roughness", delivery), materialx.TEXTURE_FOLDER)
     names = {name: Tf.MakeValidIdentifier(name) for name in material.shapes}
-    _write_stage(folder / USD_FILE, material, names, scale * per_mm, delivery)
+    _write_stage(folder / USD_FILE, material, names, scale * delivery.per_mm, delivery)
     textures = (
         ("Subsurface Radius", _place(delivery, "subsurface_radius_scale", "exr"), 1.0),
         # Blender's level of 0.5 is the reflection of a dielectric
@@ -88,12 +87,11 @@ def _write_stage(
     """Write the file; blend shapes bear their own names in it."""
     from pxr import Sdf, Vt
 
-    unit_m = UNITS_M[delivery.unit_or("m")]
-    mesh, per_mm = material.mesh, M_PER_MM / unit_m
+    mesh, per_mm = material.mesh, delivery.per_mm
     points = mesh.vertices_mm * per_mm
     text = templates.render(
         "exporting/templates/skin.usda",
-        unit_m=unit_m,
+        unit_m=UNITS_M[delivery.scene_unit],
         shapes=list(names.values()),
         sigma_tr=material.sigma_tr(),
         materialx=materialx.MATERIALX_FILE,

@@ -109,17 +109,15 @@ def distinct_from_chance(traits: Mapping[str, TraitVector]) -> tuple[str, ...]:
     )
 
 
-def surface_traits(found: PageLobes, space: TraitSpace | None = None) -> LobeTraits | None:
+def surface_traits(found: PageLobes) -> LobeTraits | None:
     """Return the surface traits of a page's lobes; None where the lobes are of other materials.
 
     Parameters
     ----------
     found
         Lobes with what they are mixtures of.
-    space
-        Traits of mean mixtures; None: those of the package.
     """
-    traits = trait_storage.default().spaces["surface"] if space is None else space
+    traits = trait_storage.default().spaces["surface"]
     materials = brdf_tables.default()
     if found.materials != materials.names or (traits.names and traits.names != materials.names):
         return None

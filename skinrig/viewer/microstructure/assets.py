@@ -70,8 +70,9 @@ def fitted_relief(appearance: SkinAppearance) -> MicroRelief | None:
     )
 
 
-def simulated_relief(seed: int, *, site: str = "forehead", pixel_um: float = 15.0) -> MicroRelief:
-    """Return relief of the simulated skin of a site, `PATCH_PX` a side."""
+def simulated_relief(seed: int) -> MicroRelief:
+    """Return relief of the simulated skin of a forehead, `PATCH_PX` a side."""
+    site, pixel_um = "forehead", 15.0
     skin = make_micro_skin(site, seed=seed, size_mm=1e-3 * pixel_um * PATCH_PX, texel_um=pixel_um)
     return MicroRelief(skin.height_um, pixel_um, FOREHEAD, f"simulated: {site}")
 
@@ -221,9 +222,7 @@ def reach_px(table: KernelTable, scale: Float64Array, virtual_px: int) -> int:
     return reach
 
 
-def with_displacement(
-    scene: ViewerScene, pyramid: Pyramid, *, table: KernelTable = FOREHEAD
-) -> ViewerScene:
+def with_displacement(scene: ViewerScene, pyramid: Pyramid) -> ViewerScene:
     """Return a scene that fetches its relief as tiles in place of growing it from a patch.
 
     Parameters
@@ -245,14 +244,14 @@ def with_displacement(
     source = pyramid.levels[0]
     first = (pyramid.size - SAMPLE_PX) // 2
     middle = np.asarray(source[first : first + SAMPLE_PX, first : first + SAMPLE_PX], np.float32)
-    made = from_relief(MicroRelief(middle, pixel_um, table, "displacement"), scene.mesh)
+    made = from_relief(MicroRelief(middle, pixel_um, FOREHEAD, "displacement"), scene.mesh)
     facts = dict(made["facts"]["microstructure"])
     for unused in ("patch_px", "cell_px", "choices", "seed"):
         del facts[unused]
     facts |= {
         "virtual_px": pyramid.size,
         "levels": len(pyramid.levels),
-        "reach_px": reach_px(table, scale, pyramid.size),
+        "reach_px": reach_px(FOREHEAD, scale, pyramid.size),
         "tiles": {"tile_px": TILE_PX, "low": pyramid.low, "high": pyramid.high},
     }
     bare = replace(

@@ -20,7 +20,7 @@ from skinrig.exporting.export import export
 from skinrig.fitting.microstructure import fit_microstructure
 from skinrig.fitting.reflectance import fit_reflectance
 from skinrig.fitting.wrinkles import fit_wrinkles
-from skinrig.reporting import consents
+from skinrig.reporting import provenance
 
 WIDTH_PX = 192
 DAY = date(2026, 1, 1)
@@ -250,7 +250,7 @@ def test_a_report_on_a_session_names_its_subject(tmp_path):
             json.dumps({"source": source, "subject": NARROW})
         )
     found = Findings(sessions=[tmp_path / "measured", tmp_path / "simulated"])
-    assert [(folder.name, one) for folder, one in consents.records_of(found)] == [
+    assert [(folder.name, one) for folder, one in provenance.records_of(found)] == [
         ("measured", NARROW)
     ]
 
