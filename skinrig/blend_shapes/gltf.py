@@ -23,8 +23,9 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
+from rigsim.geometry.mesh import MeshFileError
 from skinrig.arrays import Float64Array
-from skinrig.blend_shapes.obj import BlendShapeFileError, MeshArrays
+from skinrig.blend_shapes.obj import MeshArrays
 
 GLB_MAGIC, GLB_JSON, GLB_BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 COMPONENT_DTYPES: Final[dict[int, np.dtype[Any]]] = {
@@ -73,8 +74,8 @@ class _Gltf:
         self.document: dict[str, Any] = document
         self.buffers: dict[int, bytes] = {}
 
-    def wrong(self, what: str) -> BlendShapeFileError:
-        return BlendShapeFileError(f"{self.path}: {what}")
+    def wrong(self, what: str) -> MeshFileError:
+        return MeshFileError(f"{self.path}: {what}")
 
     def _unpacked(self, data: bytes) -> bytes:
         if len(data) < 20 or struct.unpack_from("<I", data)[0] != GLB_MAGIC:
@@ -180,13 +181,13 @@ def read(path: Path) -> MeshArrays:
 
     Raises
     ------
-    BlendShapeFileError
+    MeshFileError
         For a file that is damaged, compressed, or has no such mesh.
     """
     gltf = _Gltf(path)
     try:
         return _read(gltf)
-    except BlendShapeFileError:
+    except MeshFileError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
         raise gltf.wrong(f"a part is missing or of a wrong kind: {error!r}") from error

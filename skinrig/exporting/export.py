@@ -19,7 +19,7 @@ APPEARANCE_FORMATS: Final[Mapping[str, str]] = {
     "mtlx": "materials.materialx.write",
     "gltf": "materials.gltf.write",
     "usd": "materials.usd.write",
-    "spectral": "sessions.spectral.write",
+    "spectral": "sessions.spectral.write_spectra",
     "metahuman": "packs.delta_maps.write",
     "merl": "brdfs.write_merl",
     "rgl": "brdfs.write_rgl",
@@ -30,7 +30,7 @@ SESSION_FORMATS: Final[Mapping[str, str]] = {
     "frames": "sessions.copies.write_frames",
     "event-model": "sessions.copies.write_events",
     "lp": "sessions.light_lists.write",
-    "stokes": "sessions.stokes.write",
+    "stokes": "sessions.spectral.write_stokes",
 }
 """The same of a session: all of it, the DNG files alone, or other descriptions of them."""
 SURFACE_FORMATS: Final = ("mtlx", "gltf", "usd", "merl", "rgl")
@@ -45,7 +45,7 @@ def writer(to: str) -> Any:
     Examples
     --------
     >>> sorted({writer(to).__name__ for to in APPEARANCE_FORMATS})
-    ['write', 'write_merl', 'write_rgl']
+    ['write', 'write_merl', 'write_rgl', 'write_spectra']
     """
     module, _, name = {**APPEARANCE_FORMATS, **SESSION_FORMATS}[to].rpartition(".")
     return getattr(import_module(f"skinrig.exporting.{module}"), name)

@@ -19,8 +19,8 @@ from skinrig.errors import UnusableError, UsageError
 from skinrig.rendering import folder, shadow
 from skinrig.rendering.bases import reduced
 from skinrig.rendering.camera import Camera, RenderingError
+from skinrig.rendering.folder import Panel, exposure_of, sheet, tone
 from skinrig.rendering.geometry import FittedSurface, own_mesh, read_mesh
-from skinrig.rendering.images import Panel, exposure_of, sheet, tone
 from skinrig.rendering.interior import Interior
 from skinrig.rendering.lights import Light
 from skinrig.rendering.photographs.held_out import Photographs

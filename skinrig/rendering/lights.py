@@ -305,8 +305,8 @@ def environment_lights(
     return tuple(
         Light(
             name="environment",
-            direction=_color_vector(towards.reshape(-1, 3)[pixel[k]]),
-            intensity=_color_vector(color[k]),
+            direction=_three("environment", "direction", towards.reshape(-1, 3)[pixel[k]]),
+            intensity=_three("environment", "intensity", color[k]),
             radius=float(radius[k]),
             divisible=False,
         )
@@ -324,8 +324,3 @@ def read_environment(path: str | Path) -> Float32Array:
     """
     image = store.read_exr(path)
     return np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
-
-
-def _color_vector(values: Float64Array) -> tuple[float, float, float]:
-    x, y, z = (float(v) for v in values)
-    return x, y, z

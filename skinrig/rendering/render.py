@@ -135,7 +135,10 @@ def render(
     RenderingError
         No light, the camera sees nothing of the mesh, or its back.
     """
-    lamps = _lamps(lights)
+    given = [lights] if isinstance(lights, Light) else lights
+    if not given:
+        raise RenderingError("lights: got none, expected at least one")
+    lamps = [part for light in given for part in light.parts()]
     if subsurface not in get_args(Subsurface):
         raise RenderingError(
             f"subsurface: got {subsurface!r}, expected one of {', '.join(get_args(Subsurface))}"
@@ -148,18 +151,20 @@ def render(
     lighting = Lighting(lamps, shadows, shadow_samples)
     inside = _inside(laid, subsurface, lighting, interior)
     film = _Film(height, columns)
-    seen = _Sighting()
+    out = met = 0
     band = max(1, BAND_RAYS // (columns * subpixels**2))
     for top in range(0, height, band):
         part = (top, min(top + band, height))
         buffers = trace(rays, *rendering_camera.rays(camera, subpixels=subpixels, rows=part))
-        index = seen.outside(buffers)
+        facing = np.einsum("hwk,hwk->hw", buffers.face_normal, buffers.to_camera) > 0.0
+        index = np.flatnonzero(buffers.mask & facing)
+        out, met = out + len(index), met + int(np.count_nonzero(buffers.mask))
         points = _Points.of(laid, buffers, index)
         shaded = _shade(points, lighting, laid, inside)
         film.put(part, subpixels, index, points, shaded)
         if progress is not None and part[1] < height:
             progress(f"render: {100 * part[1] // height} %")
-    seen.require(camera)
+    _require_outside(out, met - out, camera)
     whole = film.coverage > 1.0 - 1e-6
     names = tuple(dict.fromkeys(lamp.name for lamp in lamps))
     light = film.diffuse + film.surface, film.diffuse, film.surface
@@ -209,34 +214,19 @@ class _Shaded:
     lit: BoolArray
 
 
-@dataclass(slots=True)
-class _Sighting:
-    """How much of the mesh's outside and inside a camera has met."""
-
-    out: int = 0
-    inside: int = 0
-
-    def outside(self, buffers: GBuffer) -> NDArray[np.intp]:
-        """Return which rays meet the mesh from outside, flat."""
-        facing = np.einsum("hwk,hwk->hw", buffers.face_normal, buffers.to_camera) > 0.0
-        found = buffers.mask & facing
-        self.out += int(np.count_nonzero(found))
-        self.inside += int(np.count_nonzero(buffers.mask & ~facing))
-        return np.flatnonzero(found)
-
-    def require(self, camera: Camera) -> None:
-        """Refuse a camera that misses the mesh or looks at its back."""
-        place = ", ".join(f"{x:.0f}" for x in camera.center_mm)
-        if self.out + self.inside == 0:
-            raise RenderingError(
-                f"view {camera.serial!r}: the camera at {place} mm sees nothing of the mesh; "
-                "turn it towards the face, which stands at the rig's origin and looks along +z"
-            )
-        if self.out < MIN_OUTSIDE_FRACTION * (self.out + self.inside):
-            raise RenderingError(
-                f"view {camera.serial!r}: the camera at {place} mm stands behind the head and sees "
-                "the inside of the mesh; move it to the front, z > 0"
-            )
+def _require_outside(out: int, inside: int, camera: Camera) -> None:
+    """Refuse a camera that misses the mesh or looks at its back, by rays that met its sides."""
+    place = ", ".join(f"{x:.0f}" for x in camera.center_mm)
+    if out + inside == 0:
+        raise RenderingError(
+            f"view {camera.serial!r}: the camera at {place} mm sees nothing of the mesh; "
+            "turn it towards the face, which stands at the rig's origin and looks along +z"
+        )
+    if out < MIN_OUTSIDE_FRACTION * (out + inside):
+        raise RenderingError(
+            f"view {camera.serial!r}: the camera at {place} mm stands behind the head and sees "
+            "the inside of the mesh; move it to the front, z > 0"
+        )
 
 
 class _Film:
@@ -291,13 +281,6 @@ def _inside(
     below = Interior.of(laid) if interior is None else interior
     light = below.entered(lighting)
     return lambda points, entered: below.leaving(light, points.position_mm, points.rows, entered)
-
-
-def _lamps(lights: Light | Sequence[Light]) -> list[Light]:
-    given = [lights] if isinstance(lights, Light) else list(lights)
-    if not given:
-        raise RenderingError("lights: got none, expected at least one")
-    return [part for light in given for part in light.parts()]
 
 
 def _shade(

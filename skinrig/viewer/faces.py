@@ -1,31 +1,123 @@
 """Faces to show: captured ones, the procedural head, or another mesh grown a skin."""
 
-import tempfile
-from collections.abc import Sequence
+import tomllib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from importlib import resources
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
 
 from model import skin_reflectance, store
 from model.skin import SkinAppearance
-from rigsim.geometry import mesh as mesh_files
 from rigsim.geometry.mesh import Mesh, build_mesh, centered
 from rigsim.subject import SimulatedSubject, make_subject
 from skinrig import consent
 from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.blend_shapes import meshes as blend_shapes
-from skinrig.viewer.assembling import assemble
+from skinrig.rendering.geometry import own_mesh
+from skinrig.viewer.assets import facial_color as facial_color_assets
+from skinrig.viewer.assets import fitted as fitted_assets
+from skinrig.viewer.assets import reflectance as reflectance_assets
+from skinrig.viewer.assets import surface as wrinkle_assets
 from skinrig.viewer.fine_skin import PERSON_PX, FineSkin
 from skinrig.viewer.holes import ClosedMesh, closed
-from skinrig.viewer.scene import (
-    MAX_TEXTURE_PX,
-    Kind,
-    SceneError,
-    SceneSource,
-    ViewerMesh,
-    ViewerScene,
+from skinrig.viewer.microstructure import assets as microstructure_assets
+from skinrig.viewer.scene import MAX_TEXTURE_PX, Assets, Kind, SceneError, SceneSource, ViewerScene
+
+Weights = Mapping[str, float]
+
+EMOTION_STATES: Final = ("happiness", "sadness", "surprise", "fear", "anger", "disgust")
+"""Ekman's six."""
+
+COMBINED_STATES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+    {
+        "sad smile": ("sadness", "smile"),
+        "anger and surprise": ("anger", "surprise"),
+        "after exercise": ("anger", "surprise", "exercise"),
+    }
 )
+"""Of Jimenez et al.: figure 1's sad smile, and the row of figure 11, each at full weight."""
+
+GLOBAL_STATES: Final = ("exercise", "alcohol")
+"""States of the whole face that no muscle makes."""
+
+ACTION_UNITS: Final[Mapping[str, Mapping[str, float]]] = tomllib.loads(
+    resources.files("skinrig").joinpath("data/action_units.toml").read_text(encoding="utf-8")
+)
+"""Shapes of ARKit, without left and right, and their weights."""
+
+
+def presets(names: Iterable[str]) -> dict[str, dict[str, float]]:
+    """Return weights by preset, in the order in which people look for them.
+
+    Parameters
+    ----------
+    names
+        Of blend shapes and states.
+
+    Examples
+    --------
+    >>> presets(["anger", "surprise"])["anger and surprise"]
+    {'anger': 1.0, 'surprise': 1.0}
+    >>> presets(["mouthSmile_L", "mouthSmile_R"])["smile"]
+    {'mouthSmile_L': 1.0, 'mouthSmile_R': 1.0}
+    """
+    known = tuple(dict.fromkeys(names))
+    basic = {name: _weights(name, known) for name in (*EMOTION_STATES, "smile", *GLOBAL_STATES)}
+    # a combination of which a part is missing would be another one's
+    combined = {
+        name: _joined(basic[part] for part in parts)
+        for name, parts in COMBINED_STATES.items()
+        if all(basic[part] for part in parts)
+    }
+    first = {name: basic[name] for name in (*EMOTION_STATES, "smile") if basic[name]}
+    last = {name: basic[name] for name in GLOBAL_STATES if basic[name]}
+    return {"neutral": {}, **first, **combined, **last}
+
+
+def _weights(name: str, known: tuple[str, ...]) -> dict[str, float]:
+    """Return the state of that name and, where there is no such shape, its action units."""
+    found = {name: 1.0} if name in known else {}
+    units = {
+        shape: weight
+        for unit, weight in ACTION_UNITS.get(name, {}).items()
+        for shape in known
+        if shape in (unit, f"{unit}_L", f"{unit}_R", f"{unit}Left", f"{unit}Right")
+    }
+    return {**found, **units}
+
+
+def _joined(parts: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    """Return weights added, no muscle beyond its full movement."""
+    total: dict[str, float] = {}
+    for part in parts:
+        for name, weight in part.items():
+            total[name] = min(total.get(name, 0.0) + weight, 1.0)
+    return total
+
+
+ASSET_BUILDERS: Final[tuple[Callable[[SceneSource], Assets], ...]] = (
+    facial_color_assets.assets,
+    reflectance_assets.default_scattering,
+    wrinkle_assets.surface_assets,
+    fitted_assets.assets,
+    wrinkle_assets.assets,
+    microstructure_assets.assets,
+)
+"""In the order in which their parts are listed; they do not see each other's."""
+
+
+def assemble(source: SceneSource, provenance: Mapping[str, Any]) -> ViewerScene:
+    """Return the scene of a source."""
+    scene = ViewerScene(mesh=source.mesh, provenance=provenance)
+    for build in ASSET_BUILDERS:
+        scene = scene.with_assets(build(source))
+    names = (*scene.mesh.shapes, *scene.params.get("weights", {}))
+    return scene.with_assets({"presets": {n: {"weights": w} for n, w in presets(names).items()}})
+
 
 DEFAULT_PRESET = "III"
 """Skin type of faces of whom nothing else is known."""
@@ -76,7 +168,7 @@ def scene(
     model.store.StoreError
         A folder that cannot be read.
     rigsim.subject.SubjectError, rigsim.geometry.mesh.MeshError,
-    skinrig.blend_shapes.meshes.BlendShapeError
+    rigsim.geometry.mesh.MeshError
         For a preset, seed or mesh that cannot be used.
     """
     if not MIN_TEXTURE_PX <= size <= MAX_TEXTURE_PX:
@@ -164,17 +256,12 @@ def load_mesh(path: Path) -> Mesh:
     return centered(build_mesh(loaded.vertices_mm, loaded.faces, loaded.uv, shapes=loaded.shapes))
 
 
-def viewer_mesh(subject: SimulatedSubject) -> ViewerMesh:
+def viewer_mesh(subject: SimulatedSubject) -> Mesh:
     """Return a person's mesh; its own blend shapes come behind those of the expressions."""
     rounded = np.round(subject.mesh.vertices_mm * POSITION_STEPS_PER_MM) / POSITION_STEPS_PER_MM
     own = {n: d for n, d in subject.mesh.shapes.items() if np.any(d)}
-    return ViewerMesh(
-        positions=np.asarray(rounded, np.float32),
-        normals=subject.mesh.normals,
-        uv=subject.mesh.uv,
-        faces=subject.mesh.faces.astype(np.int32),
-        shapes={**subject.blend_shapes(), **own},
-    )
+    shapes = {**subject.blend_shapes(), **own}
+    return replace(subject.mesh, vertices_mm=rounded.astype(np.float32), shapes=shapes)
 
 
 def kind_of(path: Path, appearance: SkinAppearance) -> str:
@@ -212,8 +299,5 @@ def _mesh(
     for kind in ("model", "dome"):
         appearance = appearances.get(kind)
         if appearance is not None and MESH_FILE in appearance.files:
-            with tempfile.TemporaryDirectory() as folder:
-                copy = Path(folder) / MESH_FILE
-                copy.write_bytes(appearance.files[MESH_FILE])
-                return closed(mesh_files.load_mesh(copy)), f"{MESH_FILE} of the {kind}"
+            return closed(own_mesh(appearance)), f"{MESH_FILE} of the {kind}"
     return None, "the procedural head stands for the face"

@@ -316,7 +316,9 @@ def closed(mesh: Mesh) -> ClosedMesh:
     if not found or mesh.shapes:
         return ClosedMesh(mesh, (), ())
     taken = unwrap(mesh, GRID_CELLS).covered
-    scale = _uv_per_mm(mesh)
+    flat = np.pad(mesh.uv.astype(np.float64), ((0, 0), (0, 1)))
+    surface = max(_area(mesh.vertices_mm, mesh.faces), 1e-9)
+    scale = float(np.sqrt(_area(flat, mesh.faces) / surface))  # texture over mm, by whole areas
     vertices, faces, uv = [mesh.vertices_mm], [mesh.faces], [mesh.uv]
     count = len(mesh.vertices_mm)
     charts: list[Chart] = []
@@ -341,13 +343,6 @@ def closed(mesh: Mesh) -> ClosedMesh:
 def _area(points: FloatArray, faces: NDArray[np.integer]) -> float:
     a, b, c = (points[faces[:, k]].astype(np.float64) for k in range(3))
     return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-
-
-def _uv_per_mm(mesh: Mesh) -> float:
-    """Return the texture's scale by whole areas."""
-    flat = np.concatenate([mesh.uv, np.zeros((len(mesh.uv), 1), np.float32)], axis=1)
-    in_texture = _area(flat.astype(np.float64), mesh.faces)
-    return float(np.sqrt(in_texture / max(_area(mesh.vertices_mm, mesh.faces), 1e-9)))
 
 
 def _placed(taken: BoolArray, radius: float) -> tuple[Float64Array, float] | None:

@@ -16,8 +16,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from rigsim.geometry.mesh import Mesh
 from skinrig.arrays import Float32Array, Float64Array, Int64Array, UInt8Array
-from skinrig.viewer.scene import Storage, Texture, ViewerMesh, ViewerScene
+from skinrig.viewer.scene import Storage, Texture, ViewerScene
 
 Words = NDArray[Any]
 """uint8, uint16, int16, float16 or float32."""
@@ -131,14 +132,14 @@ def pack(scene: ViewerScene) -> Packed:
         return entry
 
     mesh = scene.mesh
-    kind = np.uint16 if len(mesh.positions) <= 65536 else np.uint32
+    kind = np.uint16 if len(mesh.vertices_mm) <= 65536 else np.uint32
     header: dict[str, Any] = {
         "mesh": {
-            "positions": put(mesh.positions),
+            "positions": put(mesh.vertices_mm),
             "normals": put(np.rint(mesh.normals * NORMAL_STEPS).astype(np.int16)),
             "uv": put(mesh.uv),
             "faces": put(mesh.faces.astype(kind)),
-            "weld": put(welded(mesh.positions).astype(kind)[:, None]),
+            "weld": put(welded(mesh.vertices_mm).astype(kind)[:, None]),
             "shapes": {
                 name: {"step": float(np.float32(step)), "deltas": put(words)}
                 for name, (words, step) in shape_words(mesh).items()
@@ -162,7 +163,18 @@ def pack(scene: ViewerScene) -> Packed:
             coarse, steps = split(turned, texture.fine)
             data = {"predictor": "octaves", "fine": texture.fine}
             data |= {"coarse": put(coarse), "steps": put(steps)}
-        header["textures"][name] = _texture_entry(texture, low, high) | {"data": data}
+        *layers, height, width, channels = texture.values.shape
+        header["textures"][name] = {
+            "width": width,
+            "height": height,
+            "layers": layers[0] if layers else 0,
+            "channels": channels,
+            "storage": texture.storage,
+            "filter": texture.filter,
+            "low": low.tolist(),
+            "high": high.tolist(),
+            "data": data,
+        }
     header |= {
         "params": scene.params,
         "presets": scene.presets,
@@ -184,21 +196,7 @@ def welded(positions: Float32Array) -> NDArray[np.intp]:
     return np.asarray(first[inverse.reshape(-1)])
 
 
-def _texture_entry(texture: Texture, low: Float32Array, high: Float32Array) -> dict[str, Any]:
-    shape = texture.values.shape
-    return {
-        "width": shape[-2],
-        "height": shape[-3],
-        "layers": shape[0] if len(shape) == 4 else 0,
-        "channels": shape[-1],
-        "storage": texture.storage,
-        "filter": texture.filter,
-        "low": low.tolist(),
-        "high": high.tolist(),
-    }
-
-
-def shape_words(mesh: ViewerMesh) -> dict[str, tuple[NDArray[np.int16], np.float32]]:
+def shape_words(mesh: Mesh) -> dict[str, tuple[NDArray[np.int16], np.float32]]:
     """Return the words of each blend shape's movement, (V, 3), and the step of one, mm."""
     out = {}
     for name, deltas in mesh.shapes.items():

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from skinrig.console import Console
 from skinrig.viewer import page
@@ -74,20 +74,17 @@ def serve(html: bytes, *, pyramid: Pyramid | None = None, port: int = 0) -> Iter
     if not 0 <= port <= 65535:
         raise SceneError(f"port: got {port}, expected 0 to 65535")
     requests: list[str] = []
-
-    class Handler(_Handler):
-        pass
-
-    Handler.html, Handler.pyramid, Handler.requests = html, pyramid, requests
+    of_page = {"html": html, "pyramid": pyramid, "requests": requests}
+    handler: Any = type("Handler", (_Handler,), of_page)
     try:
-        server = ThreadingHTTPServer((LOOPBACK_HOST, port), Handler)
+        server = ThreadingHTTPServer((LOOPBACK_HOST, port), handler)
     except OSError as error:
         raise SceneError(
             f"port: {port} cannot be used ({error.strerror}); choose another, or 0 for a free one"
         ) from error
     server.daemon_threads = True
     number = int(server.server_address[1])
-    Handler.hosts = frozenset(f"{name}:{number}" for name in (LOOPBACK_HOST, "localhost"))
+    handler.hosts = frozenset(f"{name}:{number}" for name in (LOOPBACK_HOST, "localhost"))
     ended = threading.Event()
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1})
     thread.start()

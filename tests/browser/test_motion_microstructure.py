@@ -44,7 +44,7 @@ class WindowReference:
 def mesh_strain(scene: Any, weights: dict[str, float]) -> tuple[Any, MeshStrain]:
     """Return the mesh as the page holds it, and its strain."""
     mesh = as_packed(scene).mesh
-    rest = mesh.positions.astype(np.float64)
+    rest = mesh.vertices_mm.astype(np.float64)
     moved = rest + sum(w * mesh.shapes[n].astype(np.float64) for n, w in weights.items())
     return mesh, strain(rest, np.asarray(moved), mesh.faces, mesh.uv)
 

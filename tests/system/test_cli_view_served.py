@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from rigsim.geometry.mesh import Mesh
 from skinrig.console import Console
 from skinrig.viewer import server
 from skinrig.viewer.microstructure.tiles import TileError
-from skinrig.viewer.scene import ViewerMesh, ViewerScene
+from skinrig.viewer.scene import ViewerScene
 
 
 @pytest.fixture
@@ -21,7 +22,7 @@ def plate() -> ViewerScene:
     positions = np.concatenate([40.0 * uv, np.zeros((4, 1))], axis=1).astype(np.float32)
     normals = np.tile(np.array([0, 0, 1], np.float32), (4, 1))
     faces = np.array([[0, 1, 3], [0, 3, 2]], np.int32)
-    return ViewerScene(ViewerMesh(positions, normals, uv, faces))
+    return ViewerScene(Mesh(positions, faces, uv, normals))
 
 
 def test_a_displacement_without_a_server_is_a_mistake_in_use(tmp_path):

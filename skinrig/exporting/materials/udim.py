@@ -129,7 +129,7 @@ def read(path: Path) -> TiledMesh:
 
     Raises
     ------
-    rigsim.geometry.mesh.MeshError, skinrig.blend_shapes.obj.BlendShapeError
+    rigsim.geometry.mesh.MeshError, rigsim.geometry.mesh.MeshError
         The file is missing, damaged, or no mesh that maps can be laid on.
     ExportError
         See `tiles_of`.

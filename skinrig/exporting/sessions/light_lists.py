@@ -79,7 +79,7 @@ def write(session: Session, folder: Path, delivery: Delivery) -> list[tuple[str,
     def picture(light: int) -> tuple[Float32Array, BoolArray]:
         if "light_list" in session.manifest.extra:
             return _imported(session, images.views[view], images.lights[light])
-        found = dome.image(view, _capture(images, light))
+        found = dome.image(view, images.captures.index((images.lights[light], -1)))
         return found.rgb, found.valid
 
     # twice through the pictures instead of all of them in memory
@@ -136,10 +136,6 @@ def _view(names: tuple[str, ...], cameras: Any, wanted: str | None) -> int:
     if wanted not in names:
         raise ExportError(f"--camera: got {wanted!r}, expected one of {', '.join(names)}")
     return names.index(wanted)
-
-
-def _capture(images: Any, light: int) -> int:
-    return int(images.captures.index((images.lights[light], -1)))
 
 
 def _imported(session: Session, view: str, light: str) -> tuple[Float32Array, BoolArray]:

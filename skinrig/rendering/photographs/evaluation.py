@@ -22,8 +22,8 @@ from skinrig.arrays import Float32Array
 from skinrig.drawing import png
 from skinrig.evaluating.skin_bands import bands_of, typology_angle_deg
 from skinrig.rendering import folder
+from skinrig.rendering.folder import Panel, exposure_of, sheet, tone
 from skinrig.rendering.geometry import FittedSurface, own_mesh
-from skinrig.rendering.images import Panel, exposure_of, sheet, tone
 from skinrig.rendering.interior import Interior
 from skinrig.rendering.photographs.errors import (
     Comparison,

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from skinrig.appearances.front_view import FrontView
 from skinrig.reporting import map_images, page, provenance
-from skinrig.reporting.comparison import conditions
 from skinrig.reporting.comparison import images as image_comparison
 from skinrig.reporting.comparison import maps as comparison_maps
+from skinrig.reporting.comparison import runs
 from skinrig.reporting.comparison.maps import MapDifference
 from skinrig.reporting.comparison.runs import Pair, Run, alone
 from skinrig.reporting.map_names import heading, melanin_bands, words
@@ -85,9 +85,9 @@ def sections(a: Run, b: Run, found: Sequence[Pair]) -> Iterator[page.Block]:
     """Yield maps, errors against the truths, settings and times of both."""
     for pair in found:
         yield from _pair(a, b, pair)
-    yield from conditions.benchmarks(a, b)
-    yield from conditions.seconds(a, b)
-    yield from conditions.moved_calibrations(a, b)
+    yield from runs.benchmarks(a, b)
+    yield from runs.seconds(a, b)
+    yield from runs.moved_calibrations(a, b)
     yield from image_comparison.section(a, b)
     if missing := alone(a, b):
         yield page.Heading("Only in one", level=2)
@@ -114,7 +114,7 @@ def _pair(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
     yield from _images(a, b, pair)
     yield from _by_band(pair)
     yield from _errors(a, b, pair)
-    yield from conditions.settings(a, b, pair)
+    yield from runs.settings(a, b, pair)
 
 
 def _farthest_first(one: MapDifference) -> tuple[float, str]:

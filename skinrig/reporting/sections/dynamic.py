@@ -279,7 +279,6 @@ def _worst_band(state: str, banded: list[tuple[object, ...]]) -> str:
 
 
 def _mean_change(skin_map: SkinMap | None) -> float:
-    if skin_map is None:
+    if skin_map is None or not skin_map.mask.any():
         return float("nan")
-    good = skin_map.mask
-    return 100 * float(skin_map.values[good].mean()) if good.any() else float("nan")
+    return 100 * float(skin_map.values[skin_map.mask].mean())

@@ -58,9 +58,6 @@ def section(sessions: Mapping[str, SessionFacts]) -> Iterator[page.Block]:
     )
 
 
-VERDICT_ORDER = ("asked", "negligible", "unmodeled", "absent", "built")
-"""In which verdicts are listed, see `rigsim.needs.effects.VERDICT_MEANINGS`."""
-
 VERDICT_WORDS = {
     "asked": "left out as asked",
     "negligible": "left out, too small",
@@ -68,6 +65,7 @@ VERDICT_WORDS = {
     "absent": "not there",
     "built": "built",
 }
+"""In the order in which verdicts are listed, see `rigsim.needs.effects.VERDICT_MEANINGS`."""
 
 SESSION_FILE = "session.json"
 
@@ -110,11 +108,11 @@ def omissions(sessions: Sequence[Path]) -> Iterator[page.Block]:
         return
     yield page.Heading("What simulated scenes leave out", level=2)
     yield page.view("omissions")
+    order = list(VERDICT_WORDS.values())
     for text, names in alike.items():
         effects = json.loads(text)
-        rows = sorted(
-            (_effect_row(effect) for effect in effects), key=lambda row: _verdict_place(row[1])
-        )
+        rows = [_effect_row(effect) for effect in effects]
+        rows.sort(key=lambda row: (*order, row[1]).index(row[1]))
         out = sum(not effect["verdict"] == "built" for effect in effects)
         title = f"{', '.join(names)}: of {len(effects)} effects {len(effects) - out} built"
         head = ("effect", "what became of it", "why", "change over noise", "--leave-out")
@@ -131,8 +129,3 @@ def _effect_row(effect: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
         "" if over is None else f"{over:.3g}",
         switch if may_be_left_out(switch) else "",
     )
-
-
-def _verdict_place(words: str) -> int:
-    told = [VERDICT_WORDS[verdict] for verdict in VERDICT_ORDER]
-    return told.index(words) if words in told else len(told)

@@ -61,8 +61,12 @@ def section(subject: page.Subject) -> Iterator[page.Block]:
     best = next((key for key in FIRST_MAPS[1:] if key in appearance.maps), "")
     large = {"r_d", best}
     shown_truths: set[str] = set()
+    # what people look for first, then by name
+    keys = [key for key in FIRST_MAPS if key in appearance.maps]
+    keys += sorted(set(appearance.maps) - set(keys))
     minor = []
-    for key, skin_map in sorted(appearance.maps.items(), key=lambda item: _rank(item[0])):
+    for key in keys:
+        skin_map = appearance.maps[key]
         if key == "position" or key.startswith("_"):
             continue
         values = skin_map.values[rows, columns]
@@ -94,11 +98,6 @@ def section(subject: page.Subject) -> Iterator[page.Block]:
     if truth is not None:
         yield from _errors(subject, truth)
         yield from _reflection(subject, truth)
-
-
-def _rank(key: str) -> tuple[int, str]:
-    """Order maps: what people look for first, then by name."""
-    return (FIRST_MAPS.index(key) if key in FIRST_MAPS else len(FIRST_MAPS), key)
 
 
 def _shown(

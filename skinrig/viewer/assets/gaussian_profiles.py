@@ -115,7 +115,8 @@ def fit(r_d: ArrayLike, sigma_tr_per_mm: ArrayLike, count: int = N_GAUSSIANS) ->
     weights = _weights(_edges(found, at), lines)
     used = weights.max(axis=1) > 1e-6
     found, weights = found[used], weights[used] / weights[used].sum(axis=0)
-    sums = _gaussians(found, radii) @ weights
+    shapes = np.exp(-(radii[:, None] ** 2) / (2.0 * found)) / (2.0 * np.pi * found)
+    sums = shapes @ weights
     ring = radii[:, None] * np.gradient(radii)[:, None]
     radial = np.sqrt(np.sum(ring * (sums - profiles) ** 2, 0) / np.sum(ring * profiles**2, 0))
     miss = np.abs(_edges(found, at) @ weights - lines).max(axis=0)
@@ -150,10 +151,6 @@ def _edge_of(radii: Float64Array, profile: Float64Array, at: Float64Array) -> Fl
 
 def _edges(variances: Float64Array, at: Float64Array) -> Float64Array:
     return np.asarray(0.5 + 0.5 * erf(at[:, None] / np.sqrt(2.0 * variances)))
-
-
-def _gaussians(variances: Float64Array, radii: Float64Array) -> Float64Array:
-    return np.exp(-(radii[:, None] ** 2) / (2.0 * variances)) / (2.0 * np.pi * variances)
 
 
 def _weights(bases: Float64Array, wanted: Float64Array) -> Float64Array:

@@ -119,7 +119,8 @@ def place(
     at = (direct - low).T[::-1]
     shift = np.stack([ndimage.map_coordinates(moved[..., k], at, order=1) for k in range(2)], -1)
     pixel[covered] = direct + shift
-    eye = _center(camera)
+    far = np.linalg.svd(camera)[2][-1]  # where the camera stands is what it maps to nothing
+    eye = far[:3] / far[3]
     way = eye - position_mm
     way /= np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-12)
     facing = np.sum(way * normal, axis=-1)
@@ -157,13 +158,6 @@ def _camera(solid: Float64Array, flat: Float64Array) -> Float64Array:
 def _project(camera: Float64Array, points: Float64Array) -> Float64Array:
     seen = np.column_stack([points, np.ones(len(points))]) @ camera.T
     return np.asarray(seen[:, :2] / np.where(seen[:, 2:] > 1e-12, seen[:, 2:], np.inf))
-
-
-def _center(camera: Float64Array) -> Float64Array:
-    """Return where the camera stands: what it maps to nothing."""
-    _, _, vectors = np.linalg.svd(camera)
-    far = vectors[-1]
-    return np.asarray(far[:3] / far[3])
 
 
 MELANIN_MAP = "melanin"

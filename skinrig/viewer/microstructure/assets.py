@@ -16,6 +16,7 @@ import numpy as np
 from model.microstructure import ALPHA_LIMITS, FOREHEAD, KernelTable, kernel_parameters
 from model.microstructure.mesh_strain import strain
 from model.skin import SkinAppearance
+from rigsim.geometry.mesh import Mesh
 from rigsim.skin_patch.microrelief import make_micro_skin
 from skinrig.appearances.dynamic import MICROSTRUCTURE, parts_of
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
@@ -27,7 +28,7 @@ from skinrig.viewer.microstructure.relief_growth import (
     strained_variance,
 )
 from skinrig.viewer.microstructure.tiles import TILE_PX, Pyramid
-from skinrig.viewer.scene import Assets, SceneError, SceneSource, Texture, ViewerMesh, ViewerScene
+from skinrig.viewer.scene import Assets, SceneError, SceneSource, Texture, ViewerScene
 
 PATCH_PX: Final = 256
 """Side of the patch in the page: 3 to 4 mm of skin; some 80 kB."""
@@ -145,13 +146,13 @@ def grown(relief: MicroRelief, *, seed: int = 0) -> GrownRelief:
     return GrownRelief(part.astype(np.float32), relief.pixel_um, cell, seed % 2**32)
 
 
-def from_relief(relief: MicroRelief, mesh: ViewerMesh, *, seed: int = 0) -> Assets:
+def from_relief(relief: MicroRelief, mesh: Mesh, *, seed: int = 0) -> Assets:
     """Return textures, tables and parameters of a relief on a mesh.
 
     Parameters
     ----------
     relief : MicroRelief
-    mesh : ViewerMesh
+    mesh : Mesh
         Its texture's scale says how many pixels the grown displacement has.
     seed : int
 
@@ -213,7 +214,9 @@ def reach_px(table: KernelTable, scale: Float64Array, virtual_px: int) -> int:
     """
     # the finest 1 % of a texture is slivers: kernels there are held at the window's margin
     finest = float(np.percentile(scale, 99.0))
-    reach = math.ceil(4.0 * _largest_sigma_um(table) * 1e-3 * virtual_px * finest + 0.5) + 2
+    ends = np.array([*table.stretch_range, np.nextafter(1.0, 0.0), 1.0])
+    widest_um = float(kernel_parameters(ends, table)[1].max())
+    reach = math.ceil(4.0 * widest_um * 1e-3 * virtual_px * finest + 0.5) + 2
     if reach > MAX_REACH_PX:
         raise SceneError(
             f"mesh: got kernels of {reach} px at the texture's finest places, expected at most "
@@ -264,17 +267,11 @@ def with_displacement(scene: ViewerScene, pyramid: Pyramid) -> ViewerScene:
     return bare.with_assets(Assets(tables=made["tables"], facts={"microstructure": facts}))
 
 
-def px_per_mm(mesh: ViewerMesh) -> Float64Array:
+def px_per_mm(mesh: Mesh) -> Float64Array:
     """Return texture units per mm of skin at the vertices of a mesh, by the root of areas."""
-    rest = mesh.positions.astype(np.float64)
+    rest = mesh.vertices_mm.astype(np.float64)
     found = strain(rest, rest, mesh.faces, mesh.uv)
     if not found.valid.any():
         raise SceneError("mesh: got no triangle with an area in the texture")
     a, b, c = found.uv_metric[found.valid].T
     return np.asarray(np.sqrt(np.abs(a * c - b * b)))
-
-
-def _largest_sigma_um(table: KernelTable) -> float:
-    """Return the widest kernel of a table within its range, um."""
-    ends = np.array([*table.stretch_range, np.nextafter(1.0, 0.0), 1.0])
-    return float(kernel_parameters(ends, table)[1].max())

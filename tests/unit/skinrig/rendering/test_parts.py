@@ -10,8 +10,8 @@ from rigsim.geometry.mesh import build_mesh
 from skinrig.rendering import folder, shadow
 from skinrig.rendering.bases import nearest_shares, reduced
 from skinrig.rendering.camera import RenderingError
+from skinrig.rendering.folder import TONE_KNEE, Panel, sheet, tone
 from skinrig.rendering.geometry import FittedSurface
-from skinrig.rendering.images import TONE_KNEE, Panel, sheet, tone
 from skinrig.rendering.lookup_kernels import MAX_TEXEL_DISTANCE, look_up
 from skinrig.rendering.shadow import MAX_SIGMA_TR_PER_MM, MIN_SIGMA_TR_PER_MM, Boundary
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from fixtures.packed_scenes import as_packed
 
+from rigsim.geometry.mesh import Mesh
 from skinrig.viewer import packing, page
-from skinrig.viewer.scene import SceneError, Texture, ViewerMesh, ViewerScene
+from skinrig.viewer.scene import SceneError, Texture, ViewerScene
 
 
 def _bytes_of(text):
@@ -24,8 +25,8 @@ def _bytes_of(text):
 
 
 def _scene(**textures):
-    triangle = ViewerMesh(
-        positions=np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0]], np.float32),
+    triangle = Mesh(
+        vertices_mm=np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0]], np.float32),
         normals=np.tile(np.float32([0, 0, 1]), (3, 1)),
         uv=np.array([[0, 0], [1, 0], [0, 1]], np.float32),
         faces=np.array([[0, 1, 2]], np.int32),

@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 
 from model.skin import SkinAppearance, SkinMap
+from rigsim.geometry.mesh import Mesh
 from skinrig import workspace
 from skinrig.viewer import faces, page
-from skinrig.viewer.scene import SceneError, Texture, ViewerMesh, ViewerScene
+from skinrig.viewer.scene import SceneError, Texture, ViewerScene
 
 
 @pytest.fixture
 def scene():
-    mesh = ViewerMesh(
-        positions=np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0]], np.float32),
+    mesh = Mesh(
+        vertices_mm=np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0]], np.float32),
         normals=np.tile(np.float32([0, 0, 1]), (3, 1)),
         uv=np.array([[0, 0], [1, 0], [0, 1]], np.float32),
         faces=np.array([[0, 1, 2]], np.int32),

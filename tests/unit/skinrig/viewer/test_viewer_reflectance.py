@@ -11,7 +11,8 @@ from model import dipole, fresnel
 from model.brdf import tables as brdf_tables
 from model.traits import lobe_edits
 from model.traits import storage as trait_storage
-from skinrig.viewer import assembling
+from rigsim.geometry.mesh import build_mesh
+from skinrig.viewer import faces
 from skinrig.viewer.assets import fitted as trait_assets
 from skinrig.viewer.assets import gaussian_profiles
 from skinrig.viewer.assets import reflectance as reflectance_assets
@@ -213,14 +214,8 @@ def test_a_face_without_fits_shows_the_population_and_says_so(procedural_source)
 @pytest.fixture(scope="module")
 def procedural_source() -> SceneSource:
     """A source of which nothing was measured."""
-    from skinrig.viewer.scene import ViewerMesh
 
-    mesh = ViewerMesh(
-        np.eye(3, dtype=np.float32),
-        np.eye(3, dtype=np.float32),
-        np.zeros((3, 2), np.float32),
-        np.array([[0, 1, 2]], np.int32),
-    )
+    mesh = build_mesh(10.0 * np.eye(3), [[0, 1, 2]], np.zeros((3, 2)))
     return SceneSource("procedural", mesh, 64, 0, None, None)
 
 
@@ -235,7 +230,7 @@ def test_filling_keeps_what_is_known_and_continues_it():
 
 
 def test_presets_name_only_what_a_face_has():
-    found = assembling.presets(["anger", "surprise", "exercise"])
+    found = faces.presets(["anger", "surprise", "exercise"])
     assert list(found) == [
         "neutral",
         "surprise",
@@ -263,7 +258,7 @@ def test_shapes_of_single_muscles_make_the_six_emotions():
         )
         for side in "LR"
     ] + ["jawOpen", "mouthPucker"]
-    found = assembling.presets(names)
-    assert set(assembling.EMOTION_STATES) <= set(found)
+    found = faces.presets(names)
+    assert set(faces.EMOTION_STATES) <= set(found)
     assert all(0.0 < w <= 1.0 for weights in found.values() for w in weights.values())
     assert "after exercise" not in found  # no blood, no exercise

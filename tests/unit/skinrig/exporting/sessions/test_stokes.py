@@ -15,7 +15,7 @@ from capture.session import ConsentError, Session, Subject
 from skinrig.cli import main
 from skinrig.exporting.export import export
 from skinrig.exporting.options import Delivery, ExportError
-from skinrig.exporting.sessions.stokes import file_stem
+from skinrig.exporting.sessions.spectral import file_stem
 
 RIG = load_rig("gradient").resized(16)
 DAY = date(2030, 1, 1)

@@ -10,7 +10,7 @@ import pytest
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import ExpressionTable
 from model.wrinkles.partial_derivatives import Layer
-from skinrig.viewer.assets import wrinkles as wrinkle_assets
+from skinrig.viewer.assets import surface as wrinkle_assets
 from skinrig.viewer.scene import SceneError
 
 ROWS = {"anger": (1.0, -0.5), "joy": (0.0, 1.0)}

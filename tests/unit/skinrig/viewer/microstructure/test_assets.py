@@ -9,9 +9,10 @@ import pytest
 
 from model.microstructure.convolution import convolve
 from model.microstructure.kernel_table import FOREHEAD, KernelTable, kernel_parameters
+from rigsim.geometry.mesh import Mesh
 from skinrig.viewer.microstructure import assets, relief_growth
 from skinrig.viewer.microstructure.assets import MicroRelief
-from skinrig.viewer.scene import SceneError, ViewerMesh
+from skinrig.viewer.scene import SceneError
 
 
 @pytest.fixture(scope="module")
@@ -19,12 +20,12 @@ def relief() -> MicroRelief:
     return assets.simulated_relief(3)
 
 
-def plate(side_mm: float = 250.0) -> ViewerMesh:
+def plate(side_mm: float = 250.0) -> Mesh:
     uv = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float32)
     positions = np.concatenate([side_mm * uv, np.zeros((4, 1))], axis=1).astype(np.float32)
     normals = np.tile(np.array([0, 0, 1], np.float32), (4, 1))
     faces = np.array([[0, 1, 3], [0, 3, 2]], np.int32)
-    return ViewerMesh(positions, normals, uv, faces)
+    return Mesh(positions, faces, uv, normals)
 
 
 def slope_variance(height, pixel, stretch=(1.0, 1.0)):
