@@ -24,7 +24,7 @@ from skinrig.evaluating import facial_color, flash, microrelief, subsurface
 from skinrig.evaluating import surface as surface_evaluation
 from skinrig.fitting.facial_color import fit_facial_color
 from skinrig.fitting.microstructure import fit_microstructure
-from skinrig.rendering.photographs.comparison import FULL_MODEL
+from skinrig.rendering.photographs.errors import FULL_MODEL
 from skinrig.reporting.map_names import state_words
 from skinrig.simulating.orders import Simulated
 from skinrig.simulating.simulation import simulate_session
@@ -180,7 +180,7 @@ def _judge_moving(appearance: Path, found: Findings) -> None:
 def _dome(run: Run) -> None:
     """Capture targets and a face with the light dome, down to normals, albedo and lobes."""
     from skinrig.evaluating import reflection
-    from skinrig.rendering.photographs.evaluation import evaluate_folders
+    from skinrig.rendering.photographs.evaluation import Judging, evaluate_folders
 
     found = run.found
     width = DOME_WIDTH_PX if run.width_px is None else min(run.width_px, DOME_WIDTH_PX)
@@ -207,9 +207,8 @@ def _dome(run: Run) -> None:
             folder,
             capture.session,
             run.out / f"pictures-{name}",
+            Judging(count=DOME_COMPARED, seed=run.seed),
             calibration=run.out / "calibration-dome",
-            count=DOME_COMPARED,
-            seed=run.seed,
         )
     models = {FULL_MODEL: compared[FULL_MODEL], **compared["ablation"]}
     found.add_table(

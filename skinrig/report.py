@@ -9,7 +9,7 @@ from typing import Any
 from model import store
 from model.skin import SkinAppearance
 from skinrig.appearances.dynamic import parts_of
-from skinrig.reporting import consents, map_images, page, provenance, unjudged
+from skinrig.reporting import map_images, page, provenance
 from skinrig.reporting import verdict as verdict_section
 from skinrig.reporting.comparison import page as comparison
 from skinrig.reporting.comparison import runs as run_comparison
@@ -21,8 +21,6 @@ from skinrig.reporting.sections import (
     dynamic,
     extremes,
     microrelief,
-    omissions,
-    population,
     sequence,
     session,
     subsurface,
@@ -113,7 +111,7 @@ def _least_known(found: Findings) -> list[str]:
         parameters: Mapping[str, Any] = store.read_document(folder).parameters
         states = parameters.get("parts", {}).get("facial_color", {}).get("truth", {})
         if not found.truths.keys() & {parameters.get("truth"), *states.values()}:
-            told += unjudged.weaknesses(name, store.read(folder))
+            told += verdict_section.least_known(name, store.read(folder))
     return told
 
 
@@ -152,11 +150,11 @@ def sections(found: Findings, checks: list[page.Check]) -> list[page.Block]:
     return [
         *_maps(found, appearances, checks),
         *chromophore.identifiability(appearances.values()),
-        *population.section(appearances, found.truths),
+        *subsurface.over_people(appearances, found.truths),
         *_documents(found, checks),
         *calibration.section(found.calibrations, appearances, sessions, checks),
-        *omissions.section(found.sessions),
-        *consents.section([found]),
+        *session.omissions(found.sessions),
+        *provenance.consent_section([found]),
         *session.section(sessions),
     ]
 
@@ -166,9 +164,10 @@ def _maps(
 ) -> Iterator[page.Block]:
     for name, appearance in appearances.items():
         if dynamic.is_dynamic(appearance):
-            yield from _dynamic_section(name, appearance, found, checks)
+            yield from _dynamic_section(page.Subject(name, appearance, None, checks), found)
         else:
-            yield from _appearance_section(name, appearance, found.truth_of(appearance), checks)
+            truth = found.truth_of(appearance)
+            yield from _appearance_section(page.Subject(name, appearance, truth, checks))
     for folder in found.pictures:
         yield from image_section.section(folder, checks)
 
@@ -184,10 +183,9 @@ def _documents(found: Findings, checks: list[page.Check]) -> Iterator[page.Block
             yield from _document_section(document)
 
 
-def _appearance_section(
-    name: str, appearance: SkinAppearance, truth: SkinAppearance | None, checks: list[page.Check]
-) -> Iterator[page.Block]:
-    yield page.Heading(f"Maps: {name}", level=2)
+def _appearance_section(subject: page.Subject) -> Iterator[page.Block]:
+    appearance, truth = subject.appearance, subject.truth
+    yield page.Heading(f"Maps: {subject.name}", level=2)
     images = [
         map_images.color_image(f"{label}, linear sRGB", appearance.maps[key].values)
         for key, label in (("picture", "crossed polarizers"), ("specular_picture", "specular"))
@@ -196,35 +194,34 @@ def _appearance_section(
     if images:
         yield page.Images(images)
     if "position" in appearance.maps:
-        yield from surface_section.section(name, appearance, truth, checks)
+        yield from surface_section.section(subject)
     elif microrelief.is_microrelief(appearance):
-        yield from microrelief.section(name, appearance, truth, checks)
+        yield from microrelief.section(subject)
     else:
         if subsurface.is_probe(appearance):
-            yield from subsurface.section(name, appearance, truth, checks)
+            yield from subsurface.section(subject)
         elif sequence.is_sequence(appearance):
             yield from sequence.section(appearance)
         if truth is not None and "melanin" in truth.maps:
-            yield from chromophore.errors(name, appearance, truth, checks)
+            yield from chromophore.errors(subject, truth)
         yield from chromophore.panels(appearance, truth)
     if truth is None:
-        yield from unjudged.section(appearance)
+        yield from verdict_section.unjudged(appearance)
     yield from provenance.section(appearance)
 
 
-def _dynamic_section(
-    name: str, appearance: SkinAppearance, found: Findings, checks: list[page.Check]
-) -> Iterator[page.Block]:
+def _dynamic_section(subject: page.Subject, found: Findings) -> Iterator[page.Block]:
+    appearance = subject.appearance
     part = parts_of(appearance).get("facial_color", {})
     truths = {
         state: store.read(found.truths[folder])
         for state, folder in part.get("truth", {}).items()
         if folder in found.truths
     }
-    yield page.Heading(f"Moving face: {name}", level=2)
-    yield from dynamic.section(name, appearance, truths, checks)
+    yield page.Heading(f"Moving face: {subject.name}", level=2)
+    yield from dynamic.section(subject, truths)
     if not truths:
-        yield from unjudged.section(appearance)
+        yield from verdict_section.unjudged(appearance)
     yield from provenance.section(appearance)
 
 

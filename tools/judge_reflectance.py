@@ -20,8 +20,8 @@ from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.inputs import DomeOptions
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.fitting.reflectance import fit_reflectance
-from skinrig.rendering.photographs.comparison import FULL_MODEL
-from skinrig.rendering.photographs.evaluation import evaluate_folders
+from skinrig.rendering.photographs.errors import FULL_MODEL
+from skinrig.rendering.photographs.evaluation import Judging, evaluate_folders
 from skinrig.simulating.simulation import simulate_session
 
 SUBJECTS = ("palest", "II", "III", "V", "darkest")
@@ -69,8 +69,8 @@ def main(arguments: list[str]) -> int:
             out / f"model-{subject}",
             out / f"session-{subject}",
             out / f"judged-{subject}",
+            Judging(count=PHOTOGRAPHS),
             calibration=calibration,
-            count=PHOTOGRAPHS,
         )
         records.append(record)
         print(f"{subject}: {time.perf_counter() - begun:.0f} s", file=sys.stderr, flush=True)

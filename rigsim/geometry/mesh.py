@@ -40,34 +40,55 @@ class Mesh:
 
     def __post_init__(self) -> None:
         """Check shapes, ranges and finiteness."""
-        vertices, faces = self.vertices_mm, self.faces
-        count = len(vertices)
-        for name, array, shape in (
-            ("vertices_mm", vertices, (count, 3)),
-            ("uv", self.uv, (count, 2)),
-            ("normals", self.normals, (count, 3)),
-            ("faces", faces, (len(faces), 3)),
-            *((f"shapes[{name!r}]", deltas, (count, 3)) for name, deltas in self.shapes.items()),
-        ):
-            if array.shape != shape:
-                raise MeshError(f"{name}: got shape {array.shape}, expected {shape}")
-            if not np.isfinite(array).all():
-                raise MeshError(f"{name}: got values that are not finite, expected numbers only")
-        if count < 3 or len(faces) < 1:
-            raise MeshError(f"mesh: got {count} vertices, {len(faces)} faces, expected a triangle")
-        if faces.min() < 0 or faces.max() >= count:
-            raise MeshError(
-                f"faces: got indices {faces.min()} to {faces.max()}, expected 0 to {count - 1}"
-            )
+        check_triangles(self.vertices_mm, self.faces, self.uv, self.shapes, self.normals)
         if self.uv.min() < 0.0 or self.uv.max() > 1.0:
             raise MeshError(f"uv: got {self.uv.min()} to {self.uv.max()}, expected [0, 1]")
-        extent = float(np.ptp(vertices, axis=0).max())
-        low, high = EXTENT_RANGE_MM
-        if not low <= extent <= high:
-            raise MeshError(
-                f"vertices_mm: got an extent of {extent:g}, expected {low:g} to {high:g} mm; "
-                "scale the mesh to millimetres"
-            )
+
+
+def check_triangles(
+    vertices_mm: Float32Array,
+    faces: Int32Array,
+    uv: Float32Array,
+    shapes: Mapping[str, Float32Array],
+    normals: Float32Array | None = None,
+) -> None:
+    """Raise for shapes, indices, numbers or sizes that a mesh cannot have.
+
+    Parameters
+    ----------
+    vertices_mm, faces, uv, shapes, normals
+        As the fields of `Mesh`; texture coordinates in any range.
+
+    Raises
+    ------
+    MeshError
+        A field is wrong.
+    """
+    count = len(vertices_mm)
+    for name, array, shape in (
+        ("vertices_mm", vertices_mm, (count, 3)),
+        ("uv", uv, (count, 2)),
+        ("normals", vertices_mm if normals is None else normals, (count, 3)),
+        ("faces", faces, (len(faces), 3)),
+        *((f"shapes[{name!r}]", deltas, (count, 3)) for name, deltas in shapes.items()),
+    ):
+        if array.shape != shape:
+            raise MeshError(f"{name}: got shape {array.shape}, expected {shape}")
+        if not np.isfinite(array).all():
+            raise MeshError(f"{name}: got values that are not finite, expected numbers only")
+    if count < 3 or len(faces) < 1:
+        raise MeshError(f"mesh: got {count} vertices, {len(faces)} faces, expected a triangle")
+    if faces.min() < 0 or faces.max() >= count:
+        raise MeshError(
+            f"faces: got indices {faces.min()} to {faces.max()}, expected 0 to {count - 1}"
+        )
+    extent = float(np.ptp(vertices_mm, axis=0).max())
+    low, high = EXTENT_RANGE_MM
+    if not low <= extent <= high:
+        raise MeshError(
+            f"vertices_mm: got an extent of {extent:g}, expected {low:g} to {high:g} mm; "
+            "scale the mesh to millimetres"
+        )
 
 
 def build_mesh(

@@ -162,7 +162,7 @@ def apply_microstructure(
     ------
     ApplyMicrostructureError
         For heights that are no map, or an `out` that belongs to another job.
-    skinrig.blend_shapes.errors.BlendShapeError
+    rigsim.geometry.mesh.MeshError
         For shapes that the mesh lacks.
     """
     shape = tuple(int(side) for side in np.shape(neutral_height))

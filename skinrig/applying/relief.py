@@ -119,7 +119,7 @@ class Relief:
 
         Raises
         ------
-        ApplyError, BlendShapeError
+        ApplyError, MeshError
             For a size, a weight's name or a mesh that cannot be used.
         """
         if not MIN_PATCH_PX <= size_px <= 65_536:

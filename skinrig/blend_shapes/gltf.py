@@ -23,8 +23,8 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
+from rigsim.geometry.mesh import MeshFileError
 from skinrig.arrays import Float64Array
-from skinrig.blend_shapes.errors import BlendShapeFileError
 from skinrig.blend_shapes.obj import MeshArrays
 
 GLB_MAGIC, GLB_JSON, GLB_BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
@@ -74,8 +74,8 @@ class _Gltf:
         self.document: dict[str, Any] = document
         self.buffers: dict[int, bytes] = {}
 
-    def wrong(self, what: str) -> BlendShapeFileError:
-        return BlendShapeFileError(f"{self.path}: {what}")
+    def wrong(self, what: str) -> MeshFileError:
+        return MeshFileError(f"{self.path}: {what}")
 
     def _unpacked(self, data: bytes) -> bytes:
         if len(data) < 20 or struct.unpack_from("<I", data)[0] != GLB_MAGIC:
@@ -164,7 +164,7 @@ class _Gltf:
         return values
 
 
-def read(path: Path, part: str | None) -> MeshArrays:
+def read(path: Path) -> MeshArrays:
     """Read the mesh with morph targets of a glTF file.
 
     Parameters
@@ -181,20 +181,20 @@ def read(path: Path, part: str | None) -> MeshArrays:
 
     Raises
     ------
-    BlendShapeFileError
+    MeshFileError
         For a file that is damaged, compressed, or has no such mesh.
     """
     gltf = _Gltf(path)
     try:
-        return _read(gltf, part)
-    except BlendShapeFileError:
+        return _read(gltf)
+    except MeshFileError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
         raise gltf.wrong(f"a part is missing or of a wrong kind: {error!r}") from error
 
 
-def _read(gltf: _Gltf, part: str | None) -> MeshArrays:
-    number = _chosen(gltf, part)
+def _read(gltf: _Gltf) -> MeshArrays:
+    number = _chosen(gltf)
     mesh = gltf.document["meshes"][number]
     matrix = _transform(gltf, number)
     vertices, texture, faces, moved = [], [], [], []
@@ -240,21 +240,17 @@ def _read(gltf: _Gltf, part: str | None) -> MeshArrays:
     return np.concatenate(vertices), np.concatenate(texture), np.concatenate(faces), shapes
 
 
-def _chosen(gltf: _Gltf, part: str | None) -> int:
+def _chosen(gltf: _Gltf) -> int:
     meshes = gltf.document.get("meshes", [])
-    names = [str(mesh.get("name", number)) for number, mesh in enumerate(meshes)]
-    if part is not None:
-        if names.count(part) != 1:
-            raise gltf.wrong(f"part: got {part!r}, expected one of {', '.join(names)}")
-        return names.index(part)
-    able = [n for n, mesh in enumerate(meshes) if any(p.get("targets") for p in mesh["primitives"])]
+    able = {
+        number: str(mesh.get("name", number))
+        for number, mesh in enumerate(meshes)
+        if any(p.get("targets") for p in mesh["primitives"])
+    }
     if len(able) != 1:
-        listed = ", ".join(names[n] for n in able) or "none"
-        raise gltf.wrong(
-            f"got {len(able)} meshes with morph targets ({listed}), expected one"
-            + ("; say which with part" if able else "")
-        )
-    return able[0]
+        listed = ", ".join(able.values()) or "none"
+        raise gltf.wrong(f"got {len(able)} meshes with morph targets ({listed}), expected one")
+    return next(iter(able))
 
 
 def _transform(gltf: _Gltf, mesh: int) -> Float64Array:

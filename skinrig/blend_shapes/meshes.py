@@ -9,15 +9,11 @@ from typing import Final
 
 import numpy as np
 
+from rigsim.geometry.mesh import MeshError, MeshFileError, check_triangles
 from skinrig.arrays import Float32Array, Float64Array, Int32Array
 from skinrig.blend_shapes import gltf as blend_shape_gltf
 from skinrig.blend_shapes import obj as blend_shape_obj
-from skinrig.blend_shapes.errors import BlendShapeError, BlendShapeFileError
 
-__all__ = ["BlendShapeError", "BlendShapeFileError", "BlendShapeMesh", "load"]
-
-EXTENT_RANGE_MM: Final = (1.0, 5000.0)
-"""Longest side of a mesh that is believed to be in millimetres."""
 NPZ_KEYS: Final = ("vertices_mm", "uv", "faces", "shape_names", "shape_deltas_mm")
 MM_PER_M: Final = 1000.0
 """glTF files are in metres."""
@@ -45,34 +41,7 @@ class BlendShapeMesh:
 
     def __post_init__(self) -> None:
         """Check shapes, indices and sizes."""
-        count = len(self.vertices_mm)
-        arrays = [
-            ("vertices_mm", self.vertices_mm, (count, 3)),
-            ("uv", self.uv, (count, 2)),
-            ("faces", self.faces, (len(self.faces), 3)),
-            *((f"shape {name!r}", deltas, (count, 3)) for name, deltas in self.shapes.items()),
-        ]
-        for name, array, shape in arrays:
-            if array.shape != shape:
-                raise BlendShapeError(f"{name}: got shape {array.shape}, expected {shape}")
-            if not np.isfinite(array).all():
-                raise BlendShapeError(f"{name}: got NaN or infinity, expected numbers only")
-        if count < 3 or len(self.faces) < 1:
-            raise BlendShapeError(
-                f"mesh: got {count} vertices and {len(self.faces)} triangles, expected a triangle"
-            )
-        if self.faces.min() < 0 or self.faces.max() >= count:
-            raise BlendShapeError(
-                f"faces: got indices {self.faces.min()}...{self.faces.max()}, "
-                f"expected 0...{count - 1}"
-            )
-        low, high = EXTENT_RANGE_MM
-        extent = float(np.ptp(self.vertices_mm, axis=0).max())
-        if not low <= extent <= high:
-            raise BlendShapeError(
-                f"vertices_mm: got an extent of {extent:g} mm, expected {low:g}...{high:g}; "
-                "say with unit_mm how many millimetres the file's unit has"
-            )
+        check_triangles(self.vertices_mm, self.faces, self.uv, self.shapes)
 
     def deformed(self, weights: Mapping[str, float]) -> Float64Array:
         """Return the vertices under weights of shapes, mm, shape (V, 3).
@@ -84,7 +53,7 @@ class BlendShapeMesh:
 
         Raises
         ------
-        BlendShapeError
+        MeshError
             For a shape that the mesh lacks, or a weight that is not finite.
         """
         moved = self.vertices_mm.astype(np.float64)
@@ -92,65 +61,45 @@ class BlendShapeMesh:
             if name not in self.shapes:
                 near = difflib.get_close_matches(name, self.shapes, n=1)
                 hint = f"; did you mean {near[0]!r}?" if near else ""
-                raise BlendShapeError(
+                raise MeshError(
                     f"weights: got shape {name!r}, expected one of "
                     f"{', '.join(self.shapes) or 'none: the mesh has no shapes'}{hint}"
                 )
             if not np.isfinite(weight):
-                raise BlendShapeError(f"weights: got {weight} for {name!r}, expected a number")
+                raise MeshError(f"weights: got {weight} for {name!r}, expected a number")
             moved += float(weight) * self.shapes[name].astype(np.float64)
         return moved
 
 
-def load(
-    path: Path | str,
-    *,
-    shapes: Mapping[str, Path] | None = None,
-    part: str | None = None,
-    unit_mm: float | None = None,
-) -> BlendShapeMesh:
+def load(path: Path | str) -> BlendShapeMesh:
     """Load a mesh with blend shapes.
 
     Parameters
     ----------
     path
-        A .npz with ``vertices_mm, uv, faces, shape_names, shape_deltas_mm``; a folder of .obj
-        files, one of them called neutral.obj; the neutral .obj itself, beside the others; a .gltf
-        or .glb with morph targets.
-    shapes
-        For OBJ: the files of the shapes by name, instead of the others of the folder.
-    part
-        For glTF: the name of the mesh, where several have morph targets.
-    unit_mm
-        Millimetres that the file's unit has; 1 by default, 1000 for glTF.
-
-    Returns
-    -------
-    BlendShapeMesh
+        .npz of `NPZ_KEYS` in mm; .obj, the neutral mesh in mm with one .obj for each shape beside
+        it, or the folder of these; .gltf or .glb in m, with one mesh that has morph targets.
 
     Raises
     ------
-    BlendShapeFileError
+    MeshFileError
         For a file that cannot be read, with what and where.
-    BlendShapeError
+    MeshError
         For a mesh that contradicts itself.
     """
     source = Path(path)
-    kind = source.suffix.lower()
-    if unit_mm is not None and not (np.isfinite(unit_mm) and unit_mm > 0):
-        raise BlendShapeError(f"unit_mm: got {unit_mm}, expected a number above 0")
+    kind, scale = source.suffix.lower(), 1.0
     if not source.exists():
-        raise BlendShapeFileError(f"{source}: no such file or folder")
-    scale = 1.0 if unit_mm is None else unit_mm
+        raise MeshFileError(f"{source}: no such file or folder")
     if source.is_dir() or kind == ".obj":
-        vertices, uv, faces, deltas = blend_shape_obj.read(source, shapes)
+        vertices, uv, faces, deltas = blend_shape_obj.read(source)
     elif kind in (".gltf", ".glb"):
-        vertices, uv, faces, deltas = blend_shape_gltf.read(source, part)
-        scale = MM_PER_M if unit_mm is None else unit_mm
+        vertices, uv, faces, deltas = blend_shape_gltf.read(source)
+        scale = MM_PER_M
     elif kind == ".npz":
         vertices, uv, faces, deltas = _read_npz(source)
     else:
-        raise BlendShapeFileError(
+        raise MeshFileError(
             f"{source}: got {kind or 'no suffix'}, expected .npz, .obj, .gltf, .glb or a folder"
         )
     return BlendShapeMesh(
@@ -166,27 +115,27 @@ def _read_npz(path: Path) -> blend_shape_obj.MeshArrays:
         with np.load(path, allow_pickle=False) as archive:
             missing = [key for key in NPZ_KEYS if key not in archive]
             if missing:
-                raise BlendShapeFileError(f"{path}: lacks {', '.join(missing)}")
+                raise MeshFileError(f"{path}: lacks {', '.join(missing)}")
             arrays = {key: archive[key] for key in NPZ_KEYS}
-    except BlendShapeFileError:
+    except MeshFileError:
         raise
     except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise BlendShapeFileError(f"{path}: not a readable .npz: {error}") from error
+        raise MeshFileError(f"{path}: not a readable .npz: {error}") from error
     names = arrays["shape_names"]
     if names.ndim != 1 or names.dtype.kind != "U":
-        raise BlendShapeFileError(
+        raise MeshFileError(
             f"{path}: shape_names: got {names.dtype} {names.shape}, expected one row of text"
         )
     if len(set(names.tolist())) != names.size:
-        raise BlendShapeFileError(f"{path}: shape_names: got a name twice")
+        raise MeshFileError(f"{path}: shape_names: got a name twice")
     for key in ("vertices_mm", "uv", "shape_deltas_mm"):
         if arrays[key].dtype.kind != "f":
-            raise BlendShapeFileError(f"{path}: {key}: got {arrays[key].dtype}, expected floats")
+            raise MeshFileError(f"{path}: {key}: got {arrays[key].dtype}, expected floats")
     if arrays["faces"].dtype.kind not in "iu":
-        raise BlendShapeFileError(f"{path}: faces: got {arrays['faces'].dtype}, expected integers")
+        raise MeshFileError(f"{path}: faces: got {arrays['faces'].dtype}, expected integers")
     expected = (names.size, len(arrays["vertices_mm"]), 3)
     if arrays["shape_deltas_mm"].shape != expected:
-        raise BlendShapeFileError(
+        raise MeshFileError(
             f"{path}: shape_deltas_mm: got shape {arrays['shape_deltas_mm'].shape}, "
             f"expected {expected}"
         )

@@ -4,14 +4,13 @@ Polygons are cut into fans, and vertices split where a seam of the texture gives
 texture coordinates. Normals, materials, groups, points, lines and smoothing are passed over.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from rigsim.geometry.mesh import MeshFileError
 from skinrig.arrays import Float64Array, Int64Array
-from skinrig.blend_shapes.errors import BlendShapeFileError
 
 MeshArrays = tuple[Float64Array, Float64Array, Int64Array, dict[str, Float64Array]]
 """Vertices (V, 3), texture coordinates (V, 2), triangles (F, 3), and shapes by name (V, 3)."""
@@ -29,7 +28,7 @@ class ObjMesh:
     """Triangles, (F, 3, 2): position and texture index of each corner."""
 
 
-def read(path: Path, shapes: Mapping[str, Path] | None) -> MeshArrays:
+def read(path: Path) -> MeshArrays:
     """Read a neutral OBJ and its shapes.
 
     Parameters
@@ -46,32 +45,32 @@ def read(path: Path, shapes: Mapping[str, Path] | None) -> MeshArrays:
 
     Raises
     ------
-    BlendShapeFileError
+    MeshFileError
         For a folder without a neutral file, a line that cannot be read, or another topology.
     """
     neutral_path = path if path.is_file() else _neutral_of(path)
     neutral = parse(neutral_path)
-    if shapes is None:
-        others = sorted(p for p in neutral_path.parent.iterdir() if p.suffix.lower() == ".obj")
-        shapes = {p.stem: p for p in others if p != neutral_path}
+    others = sorted(p for p in neutral_path.parent.iterdir() if p.suffix.lower() == ".obj")
     pairs, split = np.unique(neutral.corners.reshape(-1, 2), axis=0, return_inverse=True)
     faces = split.reshape(-1, 3).astype(np.int64)
     deltas = {}
-    for name, file in shapes.items():
-        shape = parse(Path(file))
+    for file in others:
+        if file == neutral_path:
+            continue
+        shape = parse(file)
         if len(shape.positions) != len(neutral.positions):
-            raise BlendShapeFileError(
+            raise MeshFileError(
                 f"{file}: got {len(shape.positions)} vertices, expected {len(neutral.positions)} "
                 f"as in {neutral_path.name}"
             )
         # exporters may leave out or renumber texture coordinates of shapes: they are not used
         if not np.array_equal(shape.corners[..., 0], neutral.corners[..., 0]):
-            raise BlendShapeFileError(f"{file}: its faces are not those of {neutral_path.name}")
-        deltas[name] = (shape.positions - neutral.positions)[pairs[:, 0]]
+            raise MeshFileError(f"{file}: its faces are not those of {neutral_path.name}")
+        deltas[file.stem] = (shape.positions - neutral.positions)[pairs[:, 0]]
     if len(pairs) == 0:
-        raise BlendShapeFileError(f"{neutral_path}: got no faces, expected triangles or polygons")
+        raise MeshFileError(f"{neutral_path}: got no faces, expected triangles or polygons")
     if pairs[:, 1].min() < 0:
-        raise BlendShapeFileError(
+        raise MeshFileError(
             f"{neutral_path}: got faces without texture coordinates (f v/vt), expected a texture"
         )
     return neutral.positions[pairs[:, 0]], neutral.texture[pairs[:, 1]], faces, deltas
@@ -81,7 +80,7 @@ def _neutral_of(folder: Path) -> Path:
     found = [p for p in folder.iterdir() if p.suffix.lower() == ".obj"]
     named = [p for p in found if p.stem.lower() == NEUTRAL]
     if len(named) != 1:
-        raise BlendShapeFileError(
+        raise MeshFileError(
             f"{folder}: got {len(found)} .obj files, {len(named)} of them called {NEUTRAL}.obj, "
             "expected one of that name and one for each shape"
         )
@@ -103,7 +102,7 @@ def parse(path: Path) -> ObjMesh:
 
     Raises
     ------
-    BlendShapeFileError
+    MeshFileError
         With the number of the line that is wrong.
     """
     positions: list[tuple[float, ...]] = []
@@ -112,7 +111,7 @@ def parse(path: Path) -> ObjMesh:
     try:
         lines = path.read_text("utf-8", errors="replace").replace("\\\n", " ").splitlines()
     except OSError as error:
-        raise BlendShapeFileError(f"{path}: cannot be read: {error.strerror}") from error
+        raise MeshFileError(f"{path}: cannot be read: {error.strerror}") from error
     for number, line in enumerate(lines, 1):
         words = line.split("#", 1)[0].split()
         if not words:
@@ -128,7 +127,7 @@ def parse(path: Path) -> ObjMesh:
                 fan = [_corner(word, len(positions), len(texture)) for word in words[1:]]
                 corners.extend((fan[0], fan[i], fan[i + 1]) for i in range(1, len(fan) - 1))
         except ValueError as error:
-            raise BlendShapeFileError(f"{path}, line {number}: {error}") from error
+            raise MeshFileError(f"{path}, line {number}: {error}") from error
     return ObjMesh(
         np.array(positions, np.float64).reshape(-1, 3),
         np.array(texture, np.float64).reshape(-1, 2),

@@ -1,14 +1,14 @@
 """The command that hands captures and appearances to other programs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 from skinrig.commands.options import Json, Out, argument, expand, option
 from skinrig.console import Console, counted, picked
 from skinrig.errors import UnusableError, one_of
-from skinrig.exporting.options import Delivery
+from skinrig.exporting.options import Delivery, Place
 
 NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
     "maps": "read maps.json: units, ranges and frames; maps.mtlx holds the color spaces",
@@ -54,13 +54,10 @@ class DeliveryOptions:
         """Names of what is written; none: all that there are."""
         return () if self.only is None else tuple(name.strip() for name in self.only.split(","))
 
-    def delivery(self) -> Delivery:
-        """Return the same as an export of maps takes it."""
-        return Delivery(
-            only=self.names,
-            landmarks=tuple(self.landmarks or ()),
-            **picked(self, "unit", "normal_y", "udim", "with_errors", "mesh", "onto"),
-        )
+    def delivery(self, **more: Any) -> Delivery:
+        """Return the same as an export takes it, with what other options say."""
+        same = picked(self, "unit", "normal_y", "udim", "with_errors", "mesh", "onto")
+        return Delivery(only=self.names, landmarks=tuple(self.landmarks or ()), **same, **more)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +71,12 @@ class PlaceOptions:
     without_diffuse: Annotated[bool, option("The place's surface alone.", "--without-diffuse")] = (
         False
     )
+
+    def named(self) -> Place | None:
+        """Return the place; None without one."""
+        if self.at is None:
+            return None
+        return Place.named(self.at, radius_mm=self.radius, diffuse=not self.without_diffuse)
 
 
 @expand
@@ -106,40 +109,13 @@ def export(
 
     Example: skinrig export appearance --to gltf --out delivery
     """
-    from skinrig.exporting import appearances, brdfs
-    from skinrig.exporting.sessions import handing as sessions
-    from skinrig.exporting.sessions import light_lists, stokes
+    from skinrig.exporting import export as exporting
 
     console = Console(json)
-    of_maps = (*appearances.APPEARANCE_FORMATS, *brdfs.BRDF_SUFFIXES)
-    _check_format(
-        to,
-        source,
-        of_maps,
-        (*sessions.SESSION_FORMATS, light_lists.LIGHT_LIST_FORMAT, stokes.STOKES_FORMAT),
-    )
-    if to in brdfs.BRDF_SUFFIXES:
-        spot = brdfs.place_of(place.at, radius_mm=place.radius, diffuse=not place.without_diffuse)
-        done = appearances.export_brdfs(source, out, to=to, place=spot, use=use)
-    elif to in of_maps:
-        done = appearances.export_appearance(source, out, to=to, delivery=how.delivery(), use=use)
-    else:
-        needed = sessions.require_use(use)
-        if to == light_lists.LIGHT_LIST_FORMAT:
-            done = light_lists.export_light_list(
-                source, out, use=needed, camera=camera, calibration=calibration
-            )
-        elif to == stokes.STOKES_FORMAT:
-            done = stokes.export_stokes(
-                source,
-                out,
-                use=needed,
-                only=how.names,
-                with_errors=how.with_errors,
-                calibration=calibration,
-            )
-        else:
-            done = sessions.export_session(source, out, to=to, use=needed)
+    _check_format(to, source, exporting.APPEARANCE_FORMATS, exporting.SESSION_FORMATS)
+    of_session = {"camera": camera, "calibration": calibration}
+    delivery = how.delivery(place=place.named() if to in ("merl", "rgl") else None, **of_session)
+    done = exporting.export(source, out, to, delivery, use=use)
     after = NEXT_STEP_BY_FORMAT.get(
         to, "hand the folder on; `ascmhl verify` tells whether it is still whole"
     )
@@ -151,7 +127,7 @@ def export(
 
 
 def _check_format(
-    to: str, source: Path, of_maps: Sequence[str], of_sessions: Sequence[str]
+    to: str, source: Path, of_maps: Iterable[str], of_sessions: Iterable[str]
 ) -> None:
     """Raise for a format that there is not, or that is not of what the source holds."""
     one_of("--to", to, (*of_maps, *of_sessions))

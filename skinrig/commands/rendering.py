@@ -168,21 +168,24 @@ def _compare(
     console: Console,
 ) -> None:
     """Compare renderings with photographs of a session that no fit has seen."""
-    from skinrig.rendering.photographs import comparison, evaluation
+    from skinrig.rendering.photographs import errors as photographs_errors
+    from skinrig.rendering.photographs import evaluation
 
     found = evaluation.evaluate_folders(
         appearance,
         session,
         out,
+        evaluation.Judging(
+            subsurface=effort.subsurface,  # type: ignore[arg-type]
+            count=pictures.photographs,
+            ablation=pictures.ablation,
+            seed=pictures.seed,
+            progress=console.progress,
+        ),
         calibration=scene.calibration,
         translucency=effort.translucency,
-        subsurface=effort.subsurface,  # type: ignore[arg-type]
-        count=pictures.photographs,
-        ablation=pictures.ablation,
-        seed=pictures.seed,
-        progress=console.progress,
     )
-    comparison.print_comparison(console, found)
+    photographs_errors.print_comparison(console, found)
     if not found["passed"]:
         raise typer.Exit(errors.LIMIT_MISSED)
 

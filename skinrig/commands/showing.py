@@ -49,7 +49,7 @@ def report(
     Example: skinrig report monday tuesday -o difference.html
     """
     from skinrig.report import make
-    from skinrig.reporting.folders import write_page
+    from skinrig.workspace import write_whole
 
     piped = str(out) == STDOUT_MARK
     if piped and json:
@@ -60,7 +60,7 @@ def report(
     if piped:
         typer.echo(done.html, nl=False)
     else:
-        write_page(out, done.html)
+        write_whole(out, done.html)
     size = len(done.html.encode())
     if done.compared is None:
         talk.say(done.verdict)
@@ -148,7 +148,7 @@ def view(
 
     Example: skinrig view demo/appearance-dome-III --size 1024 --port 0
     """
-    from skinrig.viewer.writing import compose, serve, write
+    from skinrig.viewer import faces, page, server
 
     console = Console(json)
     if port is not None and not 0 <= port <= MAX_PORT:
@@ -157,10 +157,11 @@ def view(
         raise UsageError("displacement: a page in a file cannot fetch it; add --port 0")
     given = picked(face, "mesh", "landmarks", "calibration")
     given |= picked(head, "preset", "seed", "size")
-    scene = compose(appearance or [], progress=console.progress, **given)
+    console.progress("making textures and tables")
+    scene = faces.scene(appearance or [], **given)
     document: dict[str, Any]
     if port is None:
-        document = write(scene, out)
+        document = page.write(scene, out)
         console.say(
             f"{out}: {document['bytes'] / 1e6:.2f} MB, {document['textures']} textures, "
             f"{document['blend_shapes']} blend shapes; open it in a browser"
@@ -169,4 +170,6 @@ def view(
     if port is None:
         console.document("skinrig.view/1", document)
     else:
-        serve(scene, port, appearance or [], console=console, displacement=displacement)
+        server.serve_scene(
+            scene, port, appearance or [], console=console, displacement=displacement
+        )

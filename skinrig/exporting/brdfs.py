@@ -1,8 +1,6 @@
 """Fitted lobes, and the BRDF of a place on the skin, as files of other programs."""
 
-import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +10,8 @@ from model.brdf import rgl
 from model.brdf.tables import BrdfBasis
 from model.skin import SkinAppearance
 from skinrig.arrays import BoolArray, Float64Array
-from skinrig.errors import UsageError
+from skinrig.exporting.options import Delivery, ExportError, Place
+from skinrig.exporting.sealing import write_json
 
 Brdf = Callable[[Float64Array, Float64Array], Float64Array]
 """Takes light and view, unit vectors (n, 3) where +z is the normal; gives 1/sr, (n,) or (n, 3)."""
@@ -22,58 +21,17 @@ BRDF_SUFFIXES: Mapping[str, str] = {"merl": ".binary", "rgl": ".bsdf"}
 _SURFACE_NORMAL = np.array([0.0, 0.0, 1.0])
 
 
-class BrdfExportError(ValueError):
-    """A place on the skin, or an appearance, that has no BRDF to export."""
+def write_merl(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> None:
+    """Write tables of MERL, .binary of 35 MB each; see `write`."""
+    write(appearance, folder, delivery.place, "merl")
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
-    """Where on the texture the skin is looked at.
-
-    Attributes
-    ----------
-    u, v
-        Texture coordinates, 0 to 1; v = 1 at the top.
-    radius_mm
-        The BRDFs of all valid texels as near as this are averaged; 0: the nearest alone.
-    diffuse
-        Whether light from inside the skin is included.
-    """
-
-    u: float
-    v: float
-    radius_mm: float = 0.0
-    diffuse: bool = True
-
-    def __post_init__(self) -> None:
-        """Refuse a place off the texture."""
-        if not (0.0 <= self.u <= 1.0 and 0.0 <= self.v <= 1.0 and 0.0 <= self.radius_mm < np.inf):
-            raise BrdfExportError(
-                f"place: got u {self.u}, v {self.v}, radius {self.radius_mm} mm, expected u and v "
-                "in 0 to 1 and a radius of at least 0"
-            )
+def write_rgl(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> None:
+    """Write .bsdf files for Mitsuba's ``measured``, RGB; see `write`."""
+    write(appearance, folder, delivery.place, "rgl")
 
 
-def place_of(at: str | None, *, radius_mm: float, diffuse: bool) -> Place | None:
-    """Return the place that a command line names as U,V; None without one.
-
-    Raises
-    ------
-    skinrig.errors.UsageError
-        When it is not two numbers.
-    """
-    if at is None:
-        return None
-    try:
-        u, v = (float(part) for part in at.split(","))
-    except ValueError as error:
-        raise UsageError(f"--at: got {at!r}, expected U,V such as 0.5,0.4") from error
-    return Place(u, v, radius_mm, diffuse)
-
-
-def write_brdfs(
-    appearance: SkinAppearance, folder: Path, *, to: str, place: Place | None = None
-) -> None:
+def write(appearance: SkinAppearance, folder: Path, place: Place | None, to: str) -> None:
     """Write each lobe as lobe_K, and the BRDF of a place as place, with a document that tells all.
 
     Parameters
@@ -82,14 +40,14 @@ def write_brdfs(
         Of a dome, or a fitted model.
     folder
         Existing folder.
-    to
-        "merl" (.binary, 35 MB each) or "rgl" (.bsdf for Mitsuba's ``measured``, RGB).
     place
         Where on the skin; None: lobes alone.
+    to
+        "merl" or "rgl".
 
     Raises
     ------
-    BrdfExportError
+    ExportError
         Where the place has no valid texel, or a negative albedo.
     model.skin_reflectance.SkinReflectanceError
         Where the appearance has no lobes.
@@ -115,8 +73,7 @@ def write_brdfs(
         "unit": "1/sr, without the cosine, Fresnel's reflection included",
         "files": files,
     }
-    text = json.dumps(document, indent=1, allow_nan=False)
-    (folder / DOCUMENT_FILE).write_text(text + "\n", encoding="utf-8")
+    write_json(folder / DOCUMENT_FILE, document)
 
 
 def merl_table(brdf: Brdf) -> merl.MerlTable:
@@ -156,7 +113,7 @@ def _place(
         near = model.valid & (apart <= place.radius_mm)
     r_d = model.r_d[near].astype(np.float64).mean(axis=0)
     if place.diffuse and not np.all(r_d >= 0.0):
-        raise BrdfExportError(
+        raise ExportError(
             f"place: r_d is {r_d.tolist()} there, below 0; take another place, a wider radius, or "
             "--without-diffuse"
         )
@@ -187,7 +144,7 @@ def _nearest_valid(valid: BoolArray, place: Place) -> tuple[int, int]:
     row = min(int((1.0 - place.v) * height), height - 1)
     column = min(int(place.u * width), width - 1)
     if not valid[row, column]:
-        raise BrdfExportError(
+        raise ExportError(
             f"place: u {place.u}, v {place.v} is texel row {row}, column {column}, where the "
             f"reflectance is not known ({np.count_nonzero(valid)} of {valid.size} texels are)"
         )

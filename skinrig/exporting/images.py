@@ -19,8 +19,7 @@ from model.skin import SkinAppearance
 from skinrig.arrays import BoolArray, FloatArray
 from skinrig.drawing import png
 from skinrig.exporting.options import FIRST_TILE, Delivery
-from skinrig.exporting.provenance import provenance
-from skinrig.exporting.sealing import write_json
+from skinrig.exporting.sealing import provenance, write_json
 
 SRGB_SPACE: Final = "linear sRGB"
 CAMERA_SPACE: Final = "camera RGB, linear, white balanced"
@@ -114,12 +113,19 @@ class ImageFolder:
         File name to what the file holds, JSON values.
     tiles
         UDIM tiles of the mesh; images are of the first.
+    left_out
+        What is not written, and why.
     """
 
     root: Path
     delivery: Delivery
     records: dict[str, dict[str, Any]] = field(default_factory=dict)
     tiles: tuple[int, ...] = (FIRST_TILE,)
+    left_out: list[tuple[str, str]] = field(default_factory=list)
+
+    def leave_out(self, what: str, why: str) -> None:
+        """Record what is not written, and why."""
+        self.left_out.append((what, why))
 
     def exr(self, image: Image, folder: str = "exr") -> str:
         """Write a float32 EXR a tile; return the first's name below the root."""
@@ -132,8 +138,8 @@ class ImageFolder:
             self._record(names[-1], one, {"encoding": "32-bit float, the value itself"})
         return names[0]
 
-    def png(self, image: Image, folder: str = "png", *, depth: int = 16) -> str:
-        """Write a PNG of 16 or 8 bits a tile; return the first's name below the root.
+    def png(self, image: Image, folder: str = "png") -> str:
+        """Write a PNG of 16 bits a tile; return the first's name below the root.
 
         Colors in `SRGB_SPACE` are coded by sRGB's curve, all else in proportion.
         """
@@ -141,7 +147,7 @@ class ImageFolder:
         names = []
         for tile, one in self._by_tile(replace(image, low=low, high=high)):
             names.append(self._place(folder, image.name, "png", tile))
-            codes, told = coded(one, depth=depth)
+            codes, told = coded(one)
             (self.root / names[-1]).write_bytes(png.encode(codes, quick=True))
             self._record(names[-1], one, told)
         return names[0]

@@ -19,9 +19,8 @@ from skinrig.exporting.images import (
 )
 from skinrig.exporting.materials import materialx, tangents
 from skinrig.exporting.materials.tangents import FramedMesh
-from skinrig.exporting.options import Delivery
-from skinrig.exporting.provenance import IMAGE_ORIENTATION
-from skinrig.exporting.sealing import ExportError
+from skinrig.exporting.options import Delivery, ExportError
+from skinrig.exporting.sealing import IMAGE_ORIENTATION
 from skinrig.rendering.geometry import MESH_FILES, GeometryError, own_mesh
 
 DOCUMENT_FILE: Final = "maps.json"

@@ -1,5 +1,8 @@
-"""How the receiver of an export wants it: scene unit, green of normal maps, names of tiles."""
+"""How the receiver of an export wants it: scene unit, green of normal maps, tiles, a place."""
 
+from __future__ import annotations
+
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,9 +26,56 @@ UDIM_TOKENS: Final[Mapping[str, str]] = {"none": "", "dot": ".<UDIM>", "undersco
 _NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 
+class ExportError(ValueError):
+    """An export that cannot be made as asked."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where on the texture the skin is looked at.
+
+    Attributes
+    ----------
+    u, v
+        Texture coordinates, 0 to 1; v = 1 at the top.
+    radius_mm
+        The BRDFs of all valid texels as near as this are averaged; 0: the nearest alone.
+    diffuse
+        Whether light from inside the skin is included.
+    """
+
+    u: float
+    v: float
+    radius_mm: float = 0.0
+    diffuse: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuse a place off the texture."""
+        if not (0.0 <= self.u <= 1.0 and 0.0 <= self.v <= 1.0 and 0.0 <= self.radius_mm < math.inf):
+            raise ExportError(
+                f"place: got u {self.u}, v {self.v}, radius {self.radius_mm} mm, expected u and v "
+                "in 0 to 1 and a radius of at least 0"
+            )
+
+    @staticmethod
+    def named(at: str, *, radius_mm: float, diffuse: bool) -> Place:
+        """Return the place that a command line names as U,V.
+
+        Raises
+        ------
+        skinrig.errors.UsageError
+            When it is not two numbers.
+        """
+        try:
+            u, v = (float(part) for part in at.split(","))
+        except ValueError as error:
+            raise UsageError(f"--at: got {at!r}, expected U,V such as 0.5,0.4") from error
+        return Place(u, v, radius_mm, diffuse)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Delivery:
-    """How an appearance is to be delivered.
+    """How an appearance or a session is to be delivered.
 
     Attributes
     ----------
@@ -46,6 +96,13 @@ class Delivery:
         APPEARANCE/ of a dome whose texture facial color is put on.
     landmarks
         Tables ``name,x,y`` of the flash picture and of that texture, px.
+    place
+        Where on the skin its BRDF is exported, too; None: lobes alone.
+    camera
+        Name of the view whose images are exported; None: the one that looks most along -z.
+    calibration
+        CALIBRATION/ of a session's lights, cameras and sensor; None: as the rig was drawn, and
+        as noisy as frames say of themselves.
     """
 
     unit: str | None = None
@@ -56,6 +113,9 @@ class Delivery:
     mesh: Path | None = None
     onto: Path | None = None
     landmarks: tuple[Path, ...] = ()
+    place: Place | None = None
+    camera: str | None = None
+    calibration: Path | None = None
 
     def __post_init__(self) -> None:
         """Refuse words that mean nothing."""
@@ -80,9 +140,15 @@ class Delivery:
         """What growing green of a normal map means, for people."""
         return "+Y (OpenGL)" if self.y > 0 else "-Y (DirectX)"
 
-    def unit_or(self, default: str) -> str:
-        """Return the scene unit, or a format's own where none is asked for."""
-        return default if self.unit is None else self.unit
+    @property
+    def scene_unit(self) -> str:
+        """Scene unit; meters where none is asked for."""
+        return self.unit or "m"
+
+    @property
+    def per_mm(self) -> float:
+        """Scene units in a millimeter."""
+        return M_PER_MM / UNITS_M[self.scene_unit]
 
     def tiled(self, name: str, suffix: str, tile: int = FIRST_TILE) -> str:
         """Return the file name of a texture's tile.

@@ -2,20 +2,17 @@
 
 import json
 import os
-import shutil
-import uuid
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from capture.session.mhl import write_first_generation
-
-
-class ExportError(ValueError):
-    """An export that cannot be made as asked."""
+from model.skin import SkinAppearance
+from skinrig import consent
+from skinrig.workspace import whole_folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,20 +37,6 @@ class Exported:
     left_out: tuple[tuple[str, str], ...] = ()
 
 
-def fresh(out: str | Path) -> Path:
-    """Return a folder that does not exist yet.
-
-    Raises
-    ------
-    ExportError
-        When it does.
-    """
-    target = Path(out)
-    if target.exists():
-        raise ExportError(f"{target}: exists; choose a new folder")
-    return target
-
-
 def sealed(
     target: Path,
     write: Callable[[Path], Sequence[tuple[str, str]] | None],
@@ -64,7 +47,7 @@ def sealed(
     Parameters
     ----------
     target
-        A folder that does not exist, see :func:`fresh`.
+        A folder that does not exist.
     write
         Called with an empty folder.
     now
@@ -76,20 +59,12 @@ def sealed(
         With what ``write`` returned as left out, where it returned anything.
     """
     moment = now or datetime.now(UTC)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    # of the final name, which the manifest bears, in a hidden folder beside it
-    shelter = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
-    part = shelter / target.name
-    try:
-        part.mkdir(parents=True)
+    with whole_folder(target) as part:  # of the final name, which the manifest bears
         left_out = tuple(write(part) or ())
         written = [path for path in part.rglob("*") if path.is_file()]
         for path in written:  # the manifest bears dates: one moment, one manifest
             os.utime(path, (moment.timestamp(), moment.timestamp()))
         manifest = write_first_generation(part, now=moment, version=version("skinrig"))
-        part.rename(target)
-    finally:
-        shutil.rmtree(shelter, ignore_errors=True)
     return Exported(target, target / manifest.relative_to(part), len(written), left_out)
 
 
@@ -97,3 +72,37 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Write a document as people read it; the same bytes for the same content."""
     text = json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False)
     path.write_text(text + "\n", encoding="utf-8")
+
+
+IMAGE_ORIENTATION: Final = (
+    "row 0 of every image is its top; of a texture that is v = 1, with (0, 0) bottom left"
+)
+
+
+def provenance(appearance: SkinAppearance) -> dict[str, Any]:
+    """Return where an appearance is from, as JSON values.
+
+    Parameters
+    ----------
+    appearance
+        Any; of one that moves, what is told by its parts.
+
+    Examples
+    --------
+    >>> found = provenance(SkinAppearance({}, "simulated", {"assumed": ["a"]}, seed=7))
+    >>> found["source"], found["seed"], found["assumed"], found["consent"]
+    ('simulated', 7, ['a'], [])
+    """
+    told: list[Any] = [appearance.parameters.get("assumed")]
+    parts = appearance.parameters.get("parts")
+    if isinstance(parts, dict):
+        told += [part.get("assumed") for part in parts.values() if isinstance(part, dict)]
+    assumed = [str(text) for one in told if isinstance(one, list | tuple) for text in one]
+    return {
+        "source": appearance.source,
+        "inputs": dict(appearance.inputs),
+        "versions": dict(appearance.versions),
+        "seed": appearance.seed,
+        "assumed": list(dict.fromkeys(assumed)),
+        "consent": consent.recorded(appearance),
+    }

@@ -9,15 +9,12 @@ from model.brdf.tables import BrdfBasis
 from model.skin_reflectance import SkinReflectance
 from reconstruction import brdf_basis
 from skinrig.arrays import Float64Array
+from skinrig.rendering.camera import RenderingError
 
 FACTORIZED_TEXELS: Final = 5_000
 """Texels, drawn at random, that the mixtures are found on."""
 DESCENT_SWEEPS: Final = 60
 """Passes over the shares of all texels; each sets one share to its best while others stand."""
-
-
-class RankError(ValueError):
-    """More lobes than a model has."""
 
 
 def reduced(model: SkinReflectance, rank: int, *, rng: np.random.Generator) -> SkinReflectance:
@@ -38,11 +35,11 @@ def reduced(model: SkinReflectance, rank: int, *, rng: np.random.Generator) -> S
 
     Raises
     ------
-    RankError
+    RenderingError
         The model has fewer lobes.
     """
     if not 1 <= rank <= model.lobes.size:
-        raise RankError(
+        raise RenderingError(
             f"bases: got {rank}, but the model has {model.lobes.size} lobes; fit more with "
             f"`skinrig reconstruct SESSION --rank {rank} --want basis_weight_0,r_d,normals`"
         )

@@ -17,8 +17,8 @@ MAX_SIDE_PX: Final = 16_384
 """Longest side of a rendering."""
 
 
-class CameraError(ValueError):
-    """A camera that cannot be rendered by."""
+class RenderingError(ValueError):
+    """What is asked for gives no picture, or cannot be compared."""
 
 
 def looking_at(
@@ -49,7 +49,7 @@ def looking_at(
 
     Raises
     ------
-    CameraError
+    RenderingError
         For a place at the target, a view along `up`, or numbers that make no image.
 
     Examples
@@ -61,18 +61,20 @@ def looking_at(
     place, target, upward = (np.asarray(v, np.float64) for v in (place_mm, target_mm, up))
     for field, given in (("place", place), ("target", target), ("up", upward)):
         if given.shape != (3,) or not np.isfinite(given).all():
-            raise CameraError(f"view: got {field} {given.tolist()}, expected three finite numbers")
+            raise RenderingError(
+                f"view: got {field} {given.tolist()}, expected three finite numbers"
+            )
     if not 0.0 < fov_deg < 170.0:
-        raise CameraError(f"fov: got {fov_deg} degrees, expected above 0 and below 170")
+        raise RenderingError(f"fov: got {fov_deg} degrees, expected above 0 and below 170")
     columns, rows = size_px
     if not (2 <= columns <= MAX_SIDE_PX and 2 <= rows <= MAX_SIDE_PX):
-        raise CameraError(
+        raise RenderingError(
             f"size: got {columns} x {rows}, expected 2 to {MAX_SIDE_PX} pixels a side"
         )
     back = place - target
     right = np.cross(upward, back)
     if not np.linalg.norm(back) > 0.0 or not np.linalg.norm(right) > 1e-9 * np.linalg.norm(back):
-        raise CameraError(
+        raise RenderingError(
             f"view: from {place.tolist()} to {target.tolist()} with {upward.tolist()} up "
             "there is no image; move it, or name another target"
         )
@@ -102,13 +104,13 @@ def binned(camera: Camera, factor: float) -> Camera:
     ((100, 50), [[49.5, 24.5]])
     """
     if not 0.0 < factor < math.inf:
-        raise CameraError(f"size: got {factor} old pixels in a new one, expected above 0")
+        raise RenderingError(f"size: got {factor} old pixels in a new one, expected above 0")
     matrix = np.array(camera.matrix)
     matrix[:2] /= factor
     matrix[:2, 2] += 0.5 / factor - 0.5  # a pixel's centre is at a whole number
     columns, rows = (int(side / factor + 1e-6) for side in camera.image_size)
     if not (1 <= columns <= MAX_SIDE_PX and 1 <= rows <= MAX_SIDE_PX):
-        raise CameraError(
+        raise RenderingError(
             f"size: got {columns} x {rows}, expected 1 to {MAX_SIDE_PX} pixels a side"
         )
     return dataclasses.replace(camera, matrix=matrix, image_size=(columns, rows))
@@ -134,7 +136,7 @@ def rays(
         Shape (H k, W k, 3) each, rig frame in mm, directions of unit length.
     """
     if subpixels < 1:
-        raise CameraError(f"samples: got {subpixels} along a pixel's side, expected at least 1")
+        raise RenderingError(f"samples: got {subpixels} along a pixel's side, expected at least 1")
     columns, height = camera.image_size
     first, last = (0, height) if rows is None else rows
     x = (np.arange(columns * subpixels) + 0.5) / subpixels - 0.5

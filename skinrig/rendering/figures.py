@@ -17,10 +17,10 @@ from skinrig.arrays import BoolArray, Float32Array, FloatArray
 from skinrig.drawing import png
 from skinrig.errors import UnusableError, UsageError
 from skinrig.rendering import folder, shadow
-from skinrig.rendering.bases import RankError, reduced
-from skinrig.rendering.camera import Camera
+from skinrig.rendering.bases import reduced
+from skinrig.rendering.camera import Camera, RenderingError
+from skinrig.rendering.folder import Panel, exposure_of, sheet, tone
 from skinrig.rendering.geometry import FittedSurface, own_mesh, read_mesh
-from skinrig.rendering.images import Panel, exposure_of, sheet, tone
 from skinrig.rendering.interior import Interior
 from skinrig.rendering.lights import Light
 from skinrig.rendering.photographs.held_out import Photographs
@@ -141,6 +141,26 @@ class Asked:
         }
 
 
+class _Drawing:
+    """What is written to a folder, with the time that it took."""
+
+    def __init__(self, out: Path) -> None:
+        folder.check(out)
+        self._out, self._start = out, time.perf_counter()
+
+    def write(
+        self,
+        images: Mapping[str, Float32Array],
+        pictures: Mapping[str, bytes],
+        record: Mapping[str, Any],
+        **told: Any,
+    ) -> dict[str, Any]:
+        """Write the folder; see `skinrig.rendering.folder.write`."""
+        told["seconds"] = time.perf_counter() - self._start
+        document = {**record, **told}
+        return folder.write(self._out, images=images, pictures=pictures, document=document)
+
+
 def draw(subject: RenderModel, asked: Asked, *, components: bool = False) -> dict[str, Any]:
     """Render one picture into a folder; see `skinrig.rendering.folder.write`.
 
@@ -151,10 +171,8 @@ def draw(subject: RenderModel, asked: Asked, *, components: bool = False) -> dic
     components
         Write light from inside and from the surface, too, and a sheet of the paper's figure 12.
     """
-    folder.check(asked.out)
-    start = time.perf_counter()
+    drawing = _Drawing(asked.out)
     seen = asked.rendered(subject.laid)
-    seconds = time.perf_counter() - start
     exposure = asked.exposure(seen)
     images: dict[str, Float32Array] = {"radiance": seen.radiance}
     shown = {"radiance": seen.radiance}
@@ -164,9 +182,8 @@ def draw(subject: RenderModel, asked: Asked, *, components: bool = False) -> dic
     pictures = {name: png.encode(tone(image, exposure)) for name, image in shown.items()}
     if components:
         pictures["components"] = sheet([component_panels(seen, exposure)])
-    told = {"kind": "picture", "exposure": exposure, "seconds": seconds}
-    record = {**asked.record([subject], seen), **told}
-    return folder.write(asked.out, images=images, pictures=pictures, document=record)
+    record = asked.record([subject], seen)
+    return drawing.write(images, pictures, record, kind="picture", exposure=exposure)
 
 
 def draw_photograph(
@@ -199,7 +216,7 @@ def draw_photograph(
     UnusableError
         The session holds no such photograph that the model has not seen.
     """
-    folder.check(out)
+    drawing = _Drawing(out)
     photographs = Photographs.of(session, subject.appearance, calibration=calibration)
     shot = next((s for s in photographs.shots if (s.view, s.light) == (view, light)), None)
     if shot is None:
@@ -208,7 +225,6 @@ def draw_photograph(
             f"--view {view} --light {light}: the session holds no such photograph that the model "
             f"has not seen; there are {some}{' ...' if len(photographs.shots) > 8 else ''}"
         )
-    start = time.perf_counter()
     camera, lamp = photographs.camera(shot), photographs.light(shot)
     asked = Asked(camera, [lamp], out, effort, photographs.assumed)
     photo = photographs.photograph(shot).rgb.astype(np.float32)
@@ -223,16 +239,10 @@ def draw_photograph(
         "surface": seen.surface,
         "coverage": seen.coverage,
     }
-    told = {
-        "kind": "components",
-        "exposure": exposure,
-        "session": session,
-        "held_out": shot.held_out,
-        "seconds": time.perf_counter() - start,
-    }
     pictures = {"components": sheet([component_panels(seen, exposure, photo)])}
-    record = {**asked.record([subject], seen), **told}
-    return folder.write(out, images=images, pictures=pictures, document=record)
+    told = {"kind": "components", "exposure": exposure, "held_out": shot.held_out}
+    record = asked.record([subject], seen)
+    return drawing.write(images, pictures, record, session=session, **told)
 
 
 def component_panels(
@@ -280,10 +290,10 @@ def draw_bases(
 
     Raises
     ------
-    skinrig.rendering.bases.RankError
+    RenderingError
         No model has as many lobes as a rank.
     """
-    folder.check(asked.out)
+    drawing = _Drawing(asked.out)
     effort = asked.effort
     models = {rank: _of_rank(subjects, rank, effort) for rank in ranks}
     if not models:
@@ -291,7 +301,6 @@ def draw_bases(
     interiors: dict[int, Interior] = {}
     rows: tuple[list[Panel], list[Panel]] = ([], [])
     images: dict[str, Float32Array] = {}
-    start = time.perf_counter()
     against = max(ranks)
     exposure = 0.0
     pictures: dict[int, Rendering] = {}
@@ -317,10 +326,9 @@ def draw_bases(
         }
         for rank, (subject, laid) in models.items()
     ]
-    seconds = time.perf_counter() - start
-    told = {"kind": "bases", "exposure": exposure, "seconds": seconds, "bases": bases}
-    record = {**asked.record(subjects, seen), **told}
-    return folder.write(asked.out, images=images, pictures={"bases": sheet(rows)}, document=record)
+    told = {"kind": "bases", "exposure": exposure, "bases": bases}
+    record = asked.record(subjects, seen)
+    return drawing.write(images, {"bases": sheet(rows)}, record, **told)
 
 
 def draw_shadow_boundary(
@@ -339,11 +347,10 @@ def draw_shadow_boundary(
     size_px
         Columns of each picture.
     """
-    folder.check(out)
+    drawing = _Drawing(out)
     media = {"most_translucent": MIN_SIGMA_TR_PER_MM, "least_translucent": MAX_SIGMA_TR_PER_MM}
     rows, widths = [], []
     images: dict[str, Float32Array] = {}
-    start = time.perf_counter()
     for boundary in (
         Boundary.on_face(subject.laid, size_px=size_px),
         Boundary.on_plane(subject.model, size_px=size_px),
@@ -367,18 +374,16 @@ def draw_shadow_boundary(
         "Shadow boundary by sigma_tr of red, green, blue in 1/mm; the least sigma_tr is the most "
         f"translucent skin; {shadow.BOUNDARY_WIDTH_MM:g} mm across"
     )
-    record = {
-        **subject.record(),
+    told = {
         "kind": "shadow boundary",
         "unit": RADIANCE_UNIT,
         "boundaries": widths,
-        "seconds": time.perf_counter() - start,
         "samples": effort.subpixels**2,
         "labels": "the paper's figures 17 and 18 say translucency, 1/sigma_tr, and print "
         "sigma_tr: here everything is labelled by sigma_tr",
     }
     pictures = {"shadow_boundary": sheet(rows, title=title)}
-    return folder.write(out, images=images, pictures=pictures, document=record)
+    return drawing.write(images, pictures, subject.record(), **told)
 
 
 def _of_rank(
@@ -387,7 +392,7 @@ def _of_rank(
     enough = [s for s in subjects if s.model.lobes.size >= rank]
     if not enough:
         reduced(subjects[0].model, rank, rng=np.random.default_rng(effort.seed))
-        raise RankError(f"bases: got {rank}, which no given model has")
+        raise RenderingError(f"bases: got {rank}, which no given model has")
     subject = min(enough, key=lambda s: s.model.lobes.size)
     if subject.model.lobes.size == rank:
         return subject, subject.laid

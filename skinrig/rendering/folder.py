@@ -1,24 +1,137 @@
 """The folder that a rendering is written to: whole or not at all."""
 
+import io
 import json
-import shutil
-import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from model import store
-from skinrig.arrays import Float32Array
+from skinrig.arrays import Float32Array, UInt8Array
 from skinrig.console import plain
+from skinrig.drawing import png
+from skinrig.rendering.camera import RenderingError
+from skinrig.workspace import whole_folder
+
+BRIGHT_SKIN_LEVEL: Final = 0.75
+"""Linear value at which the brightest skin is shown."""
+BRIGHT_SKIN_PERCENTILE: Final = 99.0
+"""Share of skin, %, that stays below it: highlights are few."""
+TONE_KNEE: Final = 0.8
+"""Linear value up to which tones are shown as they are; above they are pressed below 1."""
+MARGIN_PX: Final = 8
+LABEL_PX: Final = 26
+
+
+def exposure_of(radiance: ArrayLike, coverage: ArrayLike) -> float:
+    """Return the factor that puts the brightest skin at `BRIGHT_SKIN_LEVEL`; 1 if it is dark.
+
+    Parameters
+    ----------
+    radiance
+        Shape (H, W, 3).
+    coverage
+        Share of skin in each pixel, shape (H, W).
+
+    Examples
+    --------
+    >>> exposure_of(np.full((4, 4, 3), 0.25), np.ones((4, 4)))
+    3.0
+    """
+    light = np.asarray(radiance, np.float64).max(axis=-1)[np.asarray(coverage) > 0.5]
+    top = float(np.percentile(light, BRIGHT_SKIN_PERCENTILE)) if light.size else 0.0
+    return BRIGHT_SKIN_LEVEL / top if top > 0.0 else 1.0
+
+
+def tone(radiance: ArrayLike, exposure: float) -> UInt8Array:
+    """Return a picture for a screen: linear up to `TONE_KNEE`, highlights pressed together above.
+
+    Parameters
+    ----------
+    radiance
+        Linear values of any shape.
+    exposure
+        What they are multiplied by first.
+
+    Returns
+    -------
+    ndarray of uint8
+        By the sRGB curve; channels are shown as if they were linear sRGB.
+    """
+    value = np.asarray(radiance, np.float64) * exposure
+    room = 1.0 - TONE_KNEE
+    above = TONE_KNEE + room * -np.expm1(-np.maximum(value - TONE_KNEE, 0.0) / room)
+    return png.srgb8(np.where(value > TONE_KNEE, above, value))
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """One picture of a sheet."""
+
+    label: str
+    """Below it, one line."""
+    image: UInt8Array
+    """(H, W, 3)."""
+
+
+def sheet(rows: Sequence[Sequence[Panel]], *, title: str = "") -> bytes:
+    """Return a PNG of labelled pictures beside each other, not resampled.
+
+    Parameters
+    ----------
+    rows
+        Panels, all of one size.
+    title
+        Above them.
+
+    Raises
+    ------
+    ValueError
+        Without panels, or of several sizes.
+    """
+    sizes = {panel.image.shape for row in rows for panel in row}
+    if len(sizes) != 1:
+        raise ValueError(f"panels: got sizes {sorted(sizes)}, expected one")
+    height, width, _ = next(iter(sizes))
+    top = LABEL_PX + MARGIN_PX if title else MARGIN_PX
+    columns = max(len(row) for row in rows)
+    total_width = MARGIN_PX + columns * (width + MARGIN_PX)
+    total_height = top + len(rows) * (height + LABEL_PX + MARGIN_PX)
+    dpi = 100
+    figure = _figure(total_width / dpi, total_height / dpi, dpi)
+    canvas = np.full((total_height, total_width, 3), 255, np.uint8)
+    small: dict[str, Any] = {"fontsize": 9, "color": "black", "family": "DejaVu Sans"}
+    small |= {"ha": "center", "va": "center"}
+    for i, row in enumerate(rows):
+        for k, panel in enumerate(row):
+            y, x = top + i * (height + LABEL_PX + MARGIN_PX), MARGIN_PX + k * (width + MARGIN_PX)
+            canvas[y : y + height, x : x + width] = panel.image
+            middle = (x + 0.5 * width) / total_width
+            below = 1.0 - (y + height + 0.5 * LABEL_PX) / total_height
+            figure.text(middle, below, panel.label, **small)
+    if title:
+        figure.text(0.5, 1.0 - 0.5 * top / total_height, title, **small)
+    figure.figimage(canvas, zorder=-1)
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=dpi, metadata={"Software": None})
+    return stream.getvalue()
+
+
+def _figure(width_in: float, height_in: float, dpi: int) -> Any:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_in, height_in), dpi=dpi)
+    FigureCanvasAgg(figure)
+    return figure
+
 
 DOCUMENT_FILE: Final = "render.json"
 SCHEMA: Final = "skinrig.render/1"
-
-
-class RenderingFolderError(ValueError):
-    """A folder that renderings cannot be written to."""
 
 
 def check(out: Path) -> None:
@@ -26,13 +139,13 @@ def check(out: Path) -> None:
 
     Raises
     ------
-    RenderingFolderError
+    RenderingError
         ``out`` exists and is neither empty nor an older rendering.
     """
     if out.is_file() or (
         out.is_dir() and not (out / DOCUMENT_FILE).is_file() and any(out.iterdir())
     ):
-        raise RenderingFolderError(
+        raise RenderingError(
             f"{out}: exists and is no rendering; nothing was written: name another folder"
         )
 
@@ -64,15 +177,11 @@ def write(
 
     Raises
     ------
-    RenderingFolderError
+    RenderingError
         See `check`.
     """
     check(out)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    fresh = out.with_name(f".{out.name}.{uuid.uuid4().hex}.part")
-    fresh.mkdir()
-    old = out.with_name(f".{out.name}.{uuid.uuid4().hex}.old")
-    try:
+    with whole_folder(out) as fresh:
         for name, image in images.items():
             store.write_exr(fresh / f"{name}.exr", np.asarray(image, np.float32))
         for name, data in pictures.items():
@@ -81,16 +190,4 @@ def write(
         record = plain({"schema": SCHEMA, **document, "out": out, "files": files})
         text = json.dumps(record, indent=1, sort_keys=True, allow_nan=False)
         (fresh / DOCUMENT_FILE).write_text(text + "\n", encoding="utf-8")
-        if out.exists():
-            out.rename(old)
-        try:
-            fresh.rename(out)
-        except OSError:
-            if old.exists():
-                old.rename(out)
-            raise
-    except BaseException:
-        shutil.rmtree(fresh, ignore_errors=True)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
     return dict(record)

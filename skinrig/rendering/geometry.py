@@ -126,7 +126,10 @@ class FittedSurface:
                 f"expected less than {MAX_LAYOUT_DISTANCE_MM:.0f} mm; its texture coordinates are "
                 "not those of the maps, or it stands elsewhere"
             )
-        moved = rest is not None and not _same(mesh, rest)
+        moved = rest is not None and (
+            mesh.vertices_mm.shape != rest.vertices_mm.shape
+            or bool(np.abs(mesh.vertices_mm - rest.vertices_mm).max() >= 1e-3)
+        )
         if rest is None and median > MAX_SAME_MESH_MM:
             raise GeometryError(
                 f"mesh: lies {median:.1f} mm (median) from the maps' own places; normals in the "
@@ -336,12 +339,6 @@ def _frames(atlas: Atlas) -> Float64Array:
     layers = np.concatenate([atlas.dp_du_mm, atlas.dp_dv_mm, atlas.normal], axis=-1)
     wide = dilate_texture(layers, atlas.covered, steps=FRAME_DILATION_STEPS)
     return wide.reshape(atlas.size, atlas.size, 3, 3).astype(np.float64)
-
-
-def _same(one: Mesh, other: Mesh) -> bool:
-    if one.vertices_mm.shape != other.vertices_mm.shape:
-        return False
-    return bool(np.abs(one.vertices_mm - other.vertices_mm).max() < 1e-3)
 
 
 def _rounding(uv: FloatArray) -> tuple[float, float]:

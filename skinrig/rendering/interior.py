@@ -151,13 +151,7 @@ class Interior:
         return total
 
     def leaving(
-        self,
-        entered: Float64Array,
-        position_mm: Float32Array,
-        rows: Rows,
-        entered_at: Float64Array,
-        *,
-        tolerance: float = dipole_gather.GATHER_TOL,
+        self, entered: Float64Array, position_mm: Float32Array, rows: Rows, entered_at: Float64Array
     ) -> Float64Array:
         """Return what comes back to the surface from inside at points, before it leaves, (n, 3).
 
@@ -169,8 +163,6 @@ class Interior:
             Points, shape (n, 3), and what the maps hold there.
         entered_at
             What enters at the points themselves, shape (n, 3).
-        tolerance
-            Aimed-at error over the brightest light that entered.
         """
         return dipole_gather.gather(
             self.tree,
@@ -179,7 +171,6 @@ class Interior:
             rows.r_d,
             rows.translucency_mm,
             eta=self.laid.model.eta,
-            tolerance=tolerance,
             entered_at=entered_at,
             workers=min(thread_count(), 4),
         ).exitance

@@ -20,18 +20,17 @@ from typing import Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from model.dipole.gather import GATHER_TOL
 from model.skin_reflectance import lobe_brdf, transmitted
 from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.render import Caster, GBuffer, trace
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.rendering import camera as rendering_camera
-from skinrig.rendering.camera import Camera
+from skinrig.rendering.camera import Camera, RenderingError
 from skinrig.rendering.geometry import FittedSurface, Rows
 from skinrig.rendering.interior import Interior, Lighting
 from skinrig.rendering.lights import Light
 
-__all__ = ["Camera", "Light", "Rendering", "RenderingError", "Subsurface", "render"]
+__all__ = ["Camera", "Light", "Rendering", "Subsurface", "render"]
 
 
 Subsurface = Literal["local", "dipole", "none"]
@@ -46,10 +45,6 @@ MIN_LIT_FRACTION: Final = 0.999
 """Share of a light that counts as all of it."""
 MIN_OUTSIDE_FRACTION: Final = 0.5
 """Least share of what a camera sees of the mesh that must be its outside."""
-
-
-class RenderingError(ValueError):
-    """What is asked for gives no picture."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,7 +98,6 @@ def render(
     blockers: Mesh | None = None,
     caster: Caster | None = None,
     interior: Interior | None = None,
-    tolerance: float = GATHER_TOL,
     progress: Callable[[str], None] | None = None,
 ) -> Rendering:
     """Render a fitted model.
@@ -129,8 +123,6 @@ def render(
         Of the mesh, where there is one already.
     interior
         Of the model on the mesh, where there is one already; for "dipole".
-    tolerance
-        For "dipole": aimed-at error of light from inside, over the brightest that entered.
     progress
         Called with a line of text now and then.
 
@@ -143,7 +135,10 @@ def render(
     RenderingError
         No light, the camera sees nothing of the mesh, or its back.
     """
-    lamps = _lamps(lights)
+    given = [lights] if isinstance(lights, Light) else lights
+    if not given:
+        raise RenderingError("lights: got none, expected at least one")
+    lamps = [part for light in given for part in light.parts()]
     if subsurface not in get_args(Subsurface):
         raise RenderingError(
             f"subsurface: got {subsurface!r}, expected one of {', '.join(get_args(Subsurface))}"
@@ -154,20 +149,22 @@ def render(
     shadows = rays if blockers is None else Caster(joined(laid.mesh, blockers), choice=rays.choice)
     columns, height = camera.image_size
     lighting = Lighting(lamps, shadows, shadow_samples)
-    inside = _inside(laid, subsurface, lighting, interior, tolerance)
+    inside = _inside(laid, subsurface, lighting, interior)
     film = _Film(height, columns)
-    seen = _Sighting()
+    out = met = 0
     band = max(1, BAND_RAYS // (columns * subpixels**2))
     for top in range(0, height, band):
         part = (top, min(top + band, height))
         buffers = trace(rays, *rendering_camera.rays(camera, subpixels=subpixels, rows=part))
-        index = seen.outside(buffers)
+        facing = np.einsum("hwk,hwk->hw", buffers.face_normal, buffers.to_camera) > 0.0
+        index = np.flatnonzero(buffers.mask & facing)
+        out, met = out + len(index), met + int(np.count_nonzero(buffers.mask))
         points = _Points.of(laid, buffers, index)
         shaded = _shade(points, lighting, laid, inside)
         film.put(part, subpixels, index, points, shaded)
         if progress is not None and part[1] < height:
             progress(f"render: {100 * part[1] // height} %")
-    seen.require(camera)
+    _require_outside(out, met - out, camera)
     whole = film.coverage > 1.0 - 1e-6
     names = tuple(dict.fromkeys(lamp.name for lamp in lamps))
     light = film.diffuse + film.surface, film.diffuse, film.surface
@@ -217,34 +214,19 @@ class _Shaded:
     lit: BoolArray
 
 
-@dataclass(slots=True)
-class _Sighting:
-    """How much of the mesh's outside and inside a camera has met."""
-
-    out: int = 0
-    inside: int = 0
-
-    def outside(self, buffers: GBuffer) -> NDArray[np.intp]:
-        """Return which rays meet the mesh from outside, flat."""
-        facing = np.einsum("hwk,hwk->hw", buffers.face_normal, buffers.to_camera) > 0.0
-        found = buffers.mask & facing
-        self.out += int(np.count_nonzero(found))
-        self.inside += int(np.count_nonzero(buffers.mask & ~facing))
-        return np.flatnonzero(found)
-
-    def require(self, camera: Camera) -> None:
-        """Refuse a camera that misses the mesh or looks at its back."""
-        place = ", ".join(f"{x:.0f}" for x in camera.center_mm)
-        if self.out + self.inside == 0:
-            raise RenderingError(
-                f"view {camera.serial!r}: the camera at {place} mm sees nothing of the mesh; "
-                "turn it towards the face, which stands at the rig's origin and looks along +z"
-            )
-        if self.out < MIN_OUTSIDE_FRACTION * (self.out + self.inside):
-            raise RenderingError(
-                f"view {camera.serial!r}: the camera at {place} mm stands behind the head and sees "
-                "the inside of the mesh; move it to the front, z > 0"
-            )
+def _require_outside(out: int, inside: int, camera: Camera) -> None:
+    """Refuse a camera that misses the mesh or looks at its back, by rays that met its sides."""
+    place = ", ".join(f"{x:.0f}" for x in camera.center_mm)
+    if out + inside == 0:
+        raise RenderingError(
+            f"view {camera.serial!r}: the camera at {place} mm sees nothing of the mesh; "
+            "turn it towards the face, which stands at the rig's origin and looks along +z"
+        )
+    if out < MIN_OUTSIDE_FRACTION * (out + inside):
+        raise RenderingError(
+            f"view {camera.serial!r}: the camera at {place} mm stands behind the head and sees "
+            "the inside of the mesh; move it to the front, z > 0"
+        )
 
 
 class _Film:
@@ -289,11 +271,7 @@ class _Film:
 
 
 def _inside(
-    laid: FittedSurface,
-    subsurface: Subsurface,
-    lighting: Lighting,
-    interior: Interior | None,
-    tolerance: float,
+    laid: FittedSurface, subsurface: Subsurface, lighting: Lighting, interior: Interior | None
 ) -> Callable[[_Points, Float64Array], Float64Array]:
     """Return what gives the light that comes from inside at points, of what enters there."""
     if subsurface == "none":
@@ -302,16 +280,7 @@ def _inside(
         return lambda points, entered: entered * points.rows.r_d
     below = Interior.of(laid) if interior is None else interior
     light = below.entered(lighting)
-    return lambda points, entered: below.leaving(
-        light, points.position_mm, points.rows, entered, tolerance=tolerance
-    )
-
-
-def _lamps(lights: Light | Sequence[Light]) -> list[Light]:
-    given = [lights] if isinstance(lights, Light) else list(lights)
-    if not given:
-        raise RenderingError("lights: got none, expected at least one")
-    return [part for light in given for part in light.parts()]
+    return lambda points, entered: below.leaving(light, points.position_mm, points.rows, entered)
 
 
 def _shade(

@@ -19,8 +19,7 @@ from model.skin_reflectance import SkinReflectance, assemble
 from skinrig.errors import UnusableError, UsageError
 from skinrig.rendering import camera as rendering_camera
 from skinrig.rendering.camera import Camera
-from skinrig.rendering.environment import environment_lights, read_environment
-from skinrig.rendering.lights import Light, LightError, Vector
+from skinrig.rendering.lights import Light, LightError, Vector, environment_lights, read_environment
 
 POSITION_PREFIX: Final = "at:"
 LED_RADIUS_MM: Final = 10.0
@@ -71,9 +70,9 @@ class RenderRig:
         UnusableError
             The rig has no view of that name.
         """
-        place = numbers(text, 3)
+        place = numbers(text)
         if place is not None:
-            target = numbers(target_mm, 3)
+            target = numbers(target_mm)
             if target is None:
                 raise UsageError(f"--target: got {target_mm!r}, expected three numbers, mm: 0,0,0")
             return rendering_camera.looking_at(
@@ -114,10 +113,10 @@ class RenderRig:
         strength = (1.0, 1.0, 1.0) if not factor else _color(text, factor)
         radius = LED_RADIUS_MM if radius_mm is None else radius_mm
         if what.startswith(POSITION_PREFIX):
-            place = numbers(what.removeprefix(POSITION_PREFIX), 3)
+            place = numbers(what.removeprefix(POSITION_PREFIX))
             if place is not None:
                 return Light(name=text, position_mm=place, intensity=strength, radius=radius)
-        direction = numbers(what, 3)
+        direction = numbers(what)
         if direction is not None:
             far = radius / LED_DISTANCE_MM
             return Light(name=text, direction=direction, intensity=strength, radius=far)
@@ -218,7 +217,7 @@ def sigma_of(text: str) -> Vector:
     >>> sigma_of("0.3558,0.7932,1.5173")
     (0.3558, 0.7932, 1.5173)
     """
-    found = numbers(text, 3)
+    found = numbers(text)
     if found is None or min(found) <= 0.0:
         raise UsageError(
             f"--translucency: got {text!r}, expected sigma_tr of red, green and blue in 1/mm, "
@@ -246,13 +245,13 @@ def subpixels_of(samples: int) -> int:
     return side
 
 
-def numbers(text: str, count: int) -> Vector | None:
-    """Return finite numbers joined by commas, or None where the text is something else."""
+def numbers(text: str) -> Vector | None:
+    """Return three finite numbers joined by commas, or None where the text is something else."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
         return None
-    if len(values) != count or not np.isfinite(values).all():
+    if len(values) != 3 or not np.isfinite(values).all():
         return None
     x, y, z = values
     return x, y, z
@@ -264,7 +263,7 @@ def _unread(text: str) -> type[UsageError] | type[UnusableError]:
 
 
 def _color(text: str, factor: str) -> Vector:
-    found = numbers(factor, 3) or numbers(",".join([factor] * 3), 3)
+    found = numbers(factor) or numbers(",".join([factor] * 3))
     if found is None or min(found) < 0.0:
         raise UsageError(
             f"--light: got {text!r}, expected after * one number or three, at least 0, as "

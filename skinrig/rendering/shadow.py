@@ -22,11 +22,11 @@ from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.render import Caster
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.rendering import camera as rendering_camera
-from skinrig.rendering.camera import Camera
+from skinrig.rendering.camera import Camera, RenderingError
 from skinrig.rendering.geometry import FittedSurface
 from skinrig.rendering.interior import Interior
 from skinrig.rendering.lights import Light, Vector
-from skinrig.rendering.render import Rendering, RenderingError, render
+from skinrig.rendering.render import Rendering, render
 
 MIN_SIGMA_TR_PER_MM: Final = (0.3558, 0.7932, 1.5173)
 MAX_SIGMA_TR_PER_MM: Final = (0.9171, 1.5682, 1.6569)

@@ -118,9 +118,9 @@ def plain_image(title: str, image: UInt8Array, *, alt: str = "") -> page.Image:
     return _stored(title, png.encode(image), alt or title, image.shape[:2])
 
 
-def stored_image(title: str, data: bytes, *, alt: str = "") -> page.Image:
+def stored_image(title: str, data: bytes) -> page.Image:
     """Return the bytes of a PNG file for the page as they are."""
-    return _stored(title, data, alt or title, None)
+    return _stored(title, data, title, None)
 
 
 def _stored(
@@ -148,7 +148,6 @@ def map_panel(
     standard_error: FloatArray | None = None,
     truth: FloatArray | None = None,
     valid: BoolArray | None = None,
-    width: int = 280,
 ) -> Iterator[page.Block]:
     """Yield truth | estimate | error | standard error of a map, truth and estimate to one scale.
 
@@ -160,8 +159,6 @@ def map_panel(
         (H, W); what is None is left out of the row.
     valid
         (H, W); other pixels are gray.
-    width
-        Pixels across; larger maps are thinned out.
     """
     mask = np.isfinite(estimate) if valid is None else np.asarray(valid, bool)
     of_scale = [estimate[mask & np.isfinite(estimate)]]
@@ -169,7 +166,7 @@ def map_panel(
         of_scale.append(truth[mask & np.isfinite(truth)])
     joined = np.concatenate(of_scale)
     low, high = np.percentile(joined, [1, 99]) if joined.size else (0.0, 1.0)
-    shown = MapDrawing(name, unit, mask, width)
+    shown = MapDrawing(name, unit, mask)
     parts = [shown.scalar("estimate", estimate, low, high)]
     if truth is not None:
         error = estimate - truth

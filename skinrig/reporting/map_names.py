@@ -1,7 +1,13 @@
 """What maps, states of skin and bands are called where people read of them."""
 
 import re
+from collections.abc import Iterator
 from typing import Final
+
+import numpy as np
+
+from skinrig.arrays import BoolArray, FloatArray
+from skinrig.evaluating.flash import MELANIN_RANGES
 
 MAP_WORDS: Final = {
     "r_d": "diffuse reflectance R_d",
@@ -15,6 +21,8 @@ MAP_WORDS: Final = {
     "specular_picture": "picture of gloss",
 }
 """Names in files to words; what is not here is a word already."""
+MIN_BAND_PIXELS: Final = 20
+"""Of a melanin band that is told."""
 _STATE_NAME: Final = re.compile(r"(?P<map>[a-z_]+)_(?P<state>a\d+_[nmp]\d+)")
 _NUMBERED_PREFIXES: Final = {"basis_weight_": "share of lobe "}
 _PART_PREFIXES: Final = {
@@ -70,6 +78,14 @@ def state_words(state: str) -> str:
     angle, step = state.split("_")
     kinds = {"n": "neutral", "m": f"compressed {step[1:]}", "p": f"stretched {step[1:]}"}
     return f"{int(angle[1:])}°, {kinds[step[0]]}"
+
+
+def melanin_bands(levels: FloatArray, good: BoolArray) -> Iterator[tuple[str, BoolArray]]:
+    """Yield the bands of melanin that hold enough good pixels: name, and pixels, (H, W)."""
+    for low, high in MELANIN_RANGES:
+        inside = good & (levels >= low) & (levels < high)
+        if np.count_nonzero(inside) >= MIN_BAND_PIXELS:
+            yield melanin_band(low, high), inside
 
 
 def melanin_band(low: float, high: float) -> str:

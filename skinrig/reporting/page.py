@@ -6,17 +6,20 @@ import base64
 import hashlib
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from markupsafe import Markup
 
+from model.skin import SkinAppearance
 from skinrig.drawing import png, templates
 from skinrig.reporting import map_names
 from skinrig.written_units import unit_sign, written
+
+Row = TypeVar("Row")
 
 PAGE_STYLE = resources.files("skinrig").joinpath("data/report.css").read_text(encoding="utf-8")
 MAX_UNBROKEN_CHARS = 22
@@ -60,6 +63,33 @@ class Check:
         if self.sense == ">=" or not self.bound > 0.0:
             return float("nan")
         return self.got / self.bound
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """An appearance that a section tells of and judges."""
+
+    name: str
+    appearance: SkinAppearance
+    truth: SkinAppearance | None
+    checks: list[Check]
+    """Judgements are added to it."""
+
+    def check(
+        self, what: str, got: float, bound: float, unit: str = "", note: str = "", **more: Any
+    ) -> None:
+        """Judge that a number stays within its limit."""
+        self.checks.append(Check(f"{self.name}: {what}", got, bound, "<=", unit, note, **more))
+
+    def check_share(self, what: str, got: float, bound: float, note: str = "", **more: Any) -> None:
+        """Judge that a share stays within its limit, both told in percent."""
+        self.check(what, 100 * got, 100 * bound, "%", note, **more)
+
+
+def worst_of(rows: Iterable[Row], size: Callable[[Row], float]) -> Row | None:
+    """Return the row of the largest finite size, where there are several."""
+    told = [row for row in rows if math.isfinite(size(row))]
+    return max(told, key=size) if len(told) > 1 else None
 
 
 class Block:

@@ -1,11 +1,16 @@
 """What a map was made of, by what, with which settings, and what was left out: as tables."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from model import store
 from model.skin import SkinAppearance
+from skinrig import consent
 from skinrig.reporting import page
+from skinrig.reporting.folders import Findings
+from skinrig.reporting.sections import images as image_section
 
 DIGEST_CHARS = 16
 """Characters of a digest that a table shows."""
@@ -65,3 +70,50 @@ def short(digest: str) -> str:
     '0123456789abcdef'
     """
     return digest.removeprefix("sha256:")[:DIGEST_CHARS]
+
+
+def records_of(found: Findings) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Yield folder and record of each subject that was measured, see :mod:`skinrig.consent`."""
+    for folder in found.appearances.values():
+        for record in consent.merge_consent(store.read_document(folder)):
+            yield folder, record
+    for folder in found.sessions:
+        document = json.loads((folder / "session.json").read_text(encoding="utf-8"))
+        if document.get("source") == "measured":
+            yield folder, dict(document["subject"])
+    for folder in found.pictures:
+        path = image_section.folder_document(folder)
+        if path is not None:
+            for record in (
+                json.loads(path.read_text(encoding="utf-8")).get(consent.CONSENT_KEY) or ()
+            ):
+                yield folder, dict(record)
+
+
+def consent_section(sides: Sequence[Findings]) -> Iterator[page.Block]:
+    """Yield the table of subjects and what they agreed to; empty where nobody was measured.
+
+    Parameters
+    ----------
+    sides
+        What a report is about; of a comparison, both runs.
+    """
+    rows: dict[str, list[str]] = {}
+    for found in sides:
+        for folder, record in records_of(found):
+            (line,) = consent.format_consent([record])
+            names = rows.setdefault(line, [])
+            if folder.name not in names:
+                names.append(folder.name)
+    if not rows:
+        return
+    table = [
+        (line.partition(": ")[0], line.partition(": ")[2], ", ".join(names))
+        for line, names in sorted(rows.items())
+    ]
+    yield page.Heading("Consent", level=2)
+    yield page.table(
+        ("subject", "agreed to", "shown from"),
+        table,
+        caption="This report shows these people: hand it on for nothing else, and not after",
+    )

@@ -158,30 +158,6 @@ class LobeChange:
         return float(shown @ self.radiance) / size if size > 0.0 else 0.0
 
 
-def lobe_change(
-    before: Sequence[Member],
-    after: Sequence[Member],
-    *,
-    points: int = 60,
-    pairs: int = 1000,
-    rng: np.random.Generator,
-) -> LobeChange:
-    """Return the mean change of the surface's light between the same people twice.
-
-    Parameters
-    ----------
-    before, after
-        The same people without the trait and with it.
-    points
-        Of each face.
-    pairs
-        Of light and view.
-    rng
-        Draws points and directions.
-    """
-    return lobe_changes(before, {"": after}, points=points, pairs=pairs, rng=rng)[""]
-
-
 def lobe_changes(
     before: Sequence[Member],
     after: Mapping[str, Sequence[Member]],
@@ -190,7 +166,19 @@ def lobe_changes(
     pairs: int = 1000,
     rng: np.random.Generator,
 ) -> dict[str, LobeChange]:
-    """Return the mean changes by several traits; see `lobe_change`."""
+    """Return the mean changes of the surface's light between the same people twice.
+
+    Parameters
+    ----------
+    before, after
+        The same people without any trait, and with each of several.
+    points
+        Of each face.
+    pairs
+        Of light and view.
+    rng
+        Draws points and directions.
+    """
     light, view = directions((pairs,), rng=rng), directions((pairs,), rng=rng)
     heights = zip(light[:, 2], view[:, 2], strict=True)
     through = np.array([surface_brdf.boundary_transmittance(*pair) for pair in heights])

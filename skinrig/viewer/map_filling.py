@@ -14,7 +14,7 @@ def filled(values: FloatArray, valid: BoolArray) -> Float64Array:
     Parameters
     ----------
     values
-        (H, W); what is not valid may be anything.
+        (H, W) or (H, W, C); what is not valid may be anything.
     valid
         (H, W); where nothing is, the result is 0.
 
@@ -23,6 +23,8 @@ def filled(values: FloatArray, valid: BoolArray) -> Float64Array:
     >>> filled(np.array([[1.0, 7.0], [1.0, 1.0]]), np.array([[True, False], [True, True]])).tolist()
     [[1.0, 1.0], [1.0, 1.0]]
     """
+    if values.ndim == 3:
+        return np.stack([filled(one, valid) for one in np.moveaxis(values, -1, 0)], axis=-1)
     out = np.where(valid, values, 0.0).astype(np.float64)
     missing = ~valid
     few = (values.shape[0], values.shape[1])

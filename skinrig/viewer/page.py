@@ -6,12 +6,15 @@ import json
 import re
 from importlib import resources
 from importlib.resources.abc import Traversable
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
 
 from skinrig.drawing import templates
-from skinrig.viewer.packing.arrays import Packed, pack
-from skinrig.viewer.packing.page_text import as_text
-from skinrig.viewer.scene import ViewerScene
+from skinrig.viewer.packing import Packed, pack
+from skinrig.viewer.scene import SceneError, ViewerScene
+from skinrig.workspace import write_whole
 
 SCRIPT_NAMES: Final = (
     "graph gl load mesh camera color shading shadow crowd strain wrinkles detail microstructure "
@@ -22,16 +25,12 @@ SCRIPT_NAMES: Final = (
 _CHUNK_LINE = re.compile(r"^//@chunk (\w+)[ \t]*$", re.MULTILINE)
 
 
-class PageError(ValueError):
-    """A piece of the page that is named twice."""
-
-
 def chunks() -> dict[str, str]:
     """Return the pieces of GLSL by name.
 
     Raises
     ------
-    PageError
+    SceneError
         Two pieces have one name.
     """
     found: dict[str, str] = {}
@@ -39,7 +38,7 @@ def chunks() -> dict[str, str]:
         parts = _CHUNK_LINE.split(entry.read_text(encoding="utf-8"))
         for name, text in zip(parts[1::2], parts[2::2], strict=True):
             if name in found:
-                raise PageError(f"glsl/{entry.name}: chunk {name!r} is there twice")
+                raise SceneError(f"glsl/{entry.name}: chunk {name!r} is there twice")
             found[name] = _bare(text.strip("\n") + "\n")
     return found
 
@@ -92,6 +91,37 @@ def render(packed: Packed, *, connect: bool = False) -> str:
     )
 
 
+def write(scene: ViewerScene, out: Path) -> dict[str, Any]:
+    """Write the page of a scene, whole or not at all, and return what it holds.
+
+    Parameters
+    ----------
+    scene
+        What it shows.
+    out
+        File to write or replace.
+
+    Returns
+    -------
+    dict
+        JSON values: path, bytes, textures, blend shapes, quantization errors, what is left out.
+    """
+    packed = pack(scene)
+    text = render(packed)
+    write_whole(out, text)
+    return {
+        "path": out,
+        "bytes": len(text.encode("utf-8")),
+        "payload_bytes": len(packed.payload),
+        "textures": len(scene.textures),
+        "blend_shapes": len(scene.mesh.shapes),
+        "triangles": len(scene.mesh.faces),
+        "quantization_error": packed.errors,
+        "provenance": dict(scene.provenance),
+        "left_out": [list(row) for row in scene.left_out],
+    }
+
+
 def _bare(text: str) -> str:
     """Return a script without lines that are comments, and without indentation."""
     return re.sub(r"^[ \t]+", "", re.sub(r"^[ \t]*//.*\n", "", text, flags=re.M), flags=re.M)
@@ -104,3 +134,43 @@ def _hash(text: str) -> str:
 def _files(folder: str, ending: str) -> list[Traversable]:
     here = resources.files("skinrig.viewer").joinpath(folder)
     return [entry for entry in here.iterdir() if entry.name.endswith(ending)]
+
+
+UNSAFE_CODES: Final = (0, 8, 9, 10, 11, 12, 13, 26, 27, 34, 38, 60, 127)
+"""Codes of characters that HTML, editors or transports may change: controls, line ends, and those
+with which markup begins."""
+
+
+def as_text(data: bytes) -> str:
+    """Return bytes as text of which UTF-8 holds seven bits a byte (base64: six).
+
+    A character below 128 is seven bits, the first the highest. Those that a page or an editor may
+    change (`UNSAFE_CODES`) become, with the seven bits behind them, one of two bytes:
+    ``(index in UNSAFE_CODES + 1) * 128 + next``.
+
+    Parameters
+    ----------
+    data
+        Any bytes.
+
+    Examples
+    --------
+    >>> [ord(one) for one in as_text(bytes([131, 6]))]
+    [65, 65, 64]
+    """
+    bits = np.unpackbits(np.frombuffer(data, np.uint8))
+    groups = np.concatenate([bits, np.zeros(-len(bits) % 7, np.uint8)]).reshape(-1, 7)
+    codes = (np.packbits(groups, axis=1)[:, 0] >> 1).astype(np.uint16)
+    unsafe = np.full(128, -1, np.int64)
+    unsafe[list(UNSAFE_CODES)] = np.arange(len(UNSAFE_CODES))
+    if len(codes) and unsafe[codes[-1]] >= 0:
+        codes = np.append(codes, np.uint16(32))  # something for the last to be joined with
+    found = np.flatnonzero(unsafe[codes] >= 0)
+    # of several behind each other every other one is joined to the one before it
+    begins = np.diff(found, prepend=-2) > 1
+    first = found[begins][np.cumsum(begins) - 1] if len(found) else found
+    joining = found[(found - first) % 2 == 0]
+    codes[joining] = (unsafe[codes[joining]] + 1) * 128 + codes[joining + 1]
+    keep = np.ones(len(codes), np.bool_)
+    keep[joining + 1] = False
+    return codes[keep].astype("<u2").tobytes().decode("utf-16-le")

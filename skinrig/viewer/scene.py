@@ -1,6 +1,6 @@
 """What the viewer shows: a mesh that moves, textures, tables, parameters and what is left out.
 
-A scene is plain data. Its sources (`skinrig.viewer.procedural`, `skinrig.viewer.from_appearance`)
+A scene is plain data. Its sources (`skinrig.viewer.faces`, `skinrig.viewer.faces`)
 say what is known of a face; asset builders turn that into textures, tables and parameters; the
 packer (`skinrig.viewer.packing`) makes it small.
 """
@@ -16,8 +16,9 @@ from typing import Any, Final, Literal, TypedDict, get_args
 import numpy as np
 
 from model.skin import SkinAppearance
+from rigsim.geometry.mesh import Mesh
 from rigsim.subject import SimulatedSubject
-from skinrig.arrays import Float32Array, Int32Array
+from skinrig.arrays import Float32Array
 from skinrig.viewer.fine_skin import FineSkin
 
 Storage = Literal["u8", "u16", "f16", "f32"]
@@ -80,47 +81,6 @@ class Texture:
             )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ViewerMesh:
-    """A triangle mesh with texture coordinates and any number of blend shapes.
-
-    Attributes
-    ----------
-    positions : ndarray of float32, shape (V, 3)
-        At rest, mm, +z towards the viewer.
-    normals : ndarray of float32, shape (V, 3)
-        Unit shading normals at rest.
-    uv : ndarray of float32, shape (V, 2)
-        (0, 0) is bottom left of the texture.
-    faces : ndarray of int32, shape (F, 3)
-        Counter-clockwise seen from outside.
-    shapes : mapping of str to ndarray of float32, shape (V, 3)
-        Movement at weight 1, mm.
-    """
-
-    positions: Float32Array
-    normals: Float32Array
-    uv: Float32Array
-    faces: Int32Array
-    shapes: Mapping[str, Float32Array] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        """Check shapes and indices."""
-        count = len(self.positions)
-        for name, array, width in (
-            ("positions", self.positions, 3),
-            ("normals", self.normals, 3),
-            ("uv", self.uv, 2),
-            *((f"shape {name!r}", deltas, 3) for name, deltas in self.shapes.items()),
-        ):
-            if array.shape != (count, width) or not np.isfinite(array).all():
-                raise SceneError(
-                    f"mesh: {name}: got shape {array.shape}, expected finite ({count}, {width})"
-                )
-        if not len(self.faces) or self.faces.min() < 0 or self.faces.max() >= count:
-            raise SceneError(f"mesh: faces: expected triangles of vertices 0 to {count - 1}")
-
-
 class Assets(TypedDict, total=False):
     """What an asset builder adds to a scene; every key may be missing."""
 
@@ -147,9 +107,9 @@ class SceneSource:
     seed
         Of everything that is drawn, where something is.
     subject
-        The simulated person, where the face or its textures are simulated.
+        The simulated person who stands for what was not measured.
     skin
-        Its finest maps at `size`; None: those of the subject.
+        Its finest maps at `size`.
     appearances
         Fitted folders by kind: "dynamic" (facial color, wrinkles, microstructure), "dome", "model".
     paths
@@ -161,11 +121,11 @@ class SceneSource:
     """
 
     kind: Kind
-    mesh: ViewerMesh
+    mesh: Mesh
     size: int
-    seed: int = 0
-    subject: SimulatedSubject | None = None
-    skin: FineSkin | None = None
+    seed: int
+    subject: SimulatedSubject
+    skin: FineSkin
     appearances: Mapping[str, SkinAppearance] = field(default_factory=dict)
     paths: Mapping[str, Path] = field(default_factory=dict)
     landmarks: Path | None = None
@@ -200,7 +160,7 @@ class ViewerScene:
         (what, why) of each feature that the page lacks.
     """
 
-    mesh: ViewerMesh
+    mesh: Mesh
     textures: Mapping[str, Texture] = field(default_factory=dict)
     tables: Mapping[str, Float32Array] = field(default_factory=dict)
     params: Mapping[str, Any] = field(default_factory=dict)

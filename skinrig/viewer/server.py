@@ -7,24 +7,26 @@ file.
 """
 
 import re
+import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
-from skinrig.viewer.microstructure.tiles import Pyramid, TileError
+from skinrig.console import Console
+from skinrig.viewer import page
+from skinrig.viewer.microstructure.assets import with_displacement
+from skinrig.viewer.microstructure.tiles import Pyramid, TileError, open_displacement
+from skinrig.viewer.scene import SceneError, ViewerScene
 
 LOOPBACK_HOST: Final = "127.0.0.1"
 TILE_PATH: Final = re.compile(r"/tiles/([0-9]{1,2})/([0-9]{1,4})/([0-9]{1,4})")
 CONNECTION_TIMEOUT_S: Final = 30.0
 """A connection that says nothing for so long is closed."""
-
-
-class ServerError(ValueError):
-    """A port that cannot be served on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,26 +68,23 @@ def serve(html: bytes, *, pyramid: Pyramid | None = None, port: int = 0) -> Iter
 
     Raises
     ------
-    ServerError
+    SceneError
         The port is no number of one, or taken.
     """
     if not 0 <= port <= 65535:
-        raise ServerError(f"port: got {port}, expected 0 to 65535")
+        raise SceneError(f"port: got {port}, expected 0 to 65535")
     requests: list[str] = []
-
-    class Handler(_Handler):
-        pass
-
-    Handler.html, Handler.pyramid, Handler.requests = html, pyramid, requests
+    of_page = {"html": html, "pyramid": pyramid, "requests": requests}
+    handler: Any = type("Handler", (_Handler,), of_page)
     try:
-        server = ThreadingHTTPServer((LOOPBACK_HOST, port), Handler)
+        server = ThreadingHTTPServer((LOOPBACK_HOST, port), handler)
     except OSError as error:
-        raise ServerError(
+        raise SceneError(
             f"port: {port} cannot be used ({error.strerror}); choose another, or 0 for a free one"
         ) from error
     server.daemon_threads = True
     number = int(server.server_address[1])
-    Handler.hosts = frozenset(f"{name}:{number}" for name in (LOOPBACK_HOST, "localhost"))
+    handler.hosts = frozenset(f"{name}:{number}" for name in (LOOPBACK_HOST, "localhost"))
     ended = threading.Event()
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1})
     thread.start()
@@ -96,6 +95,62 @@ def serve(html: bytes, *, pyramid: Pyramid | None = None, port: int = 0) -> Iter
         server.server_close()
         thread.join()
         ended.set()
+
+
+def serve_scene(
+    scene: ViewerScene,
+    port: int,
+    appearances: Sequence[Path],
+    *,
+    console: Console,
+    displacement: Path | None = None,
+    seconds: float | None = None,
+) -> None:
+    """Serve the page of a scene on this machine until it is interrupted.
+
+    Parameters
+    ----------
+    scene
+        What it shows.
+    port
+        0: any free one.
+    appearances
+        Folders that it was made of.
+    console
+        Is told the address.
+    displacement
+        A .npy file of heights, um, in the texture of the mesh: fetched as tiles, in place of relief
+        that is grown in the page.
+    seconds
+        How long; None serves until Ctrl-C.
+
+    Raises
+    ------
+    SceneError, TileError
+        A port that is taken; a file that is no displacement.
+    """
+    with tempfile.TemporaryDirectory(prefix="skinrig-view-") as name:
+        pyramid = None
+        if displacement is not None:
+            console.progress(f"cutting {displacement.name} into tiles")
+            pyramid = open_displacement(displacement, Path(name) / "levels")
+            scene = with_displacement(scene, pyramid)
+        text = page.build(scene, connect=pyramid is not None).encode("utf-8")
+        with serve(text, pyramid=pyramid, port=port) as served:
+            document = {
+                "url": served.url,
+                "bytes": len(text),
+                "appearances": [str(path) for path in appearances],
+                "displacement": None if displacement is None else str(displacement),
+                "displacement_px": None if pyramid is None else pyramid.size,
+                "left_out": [list(row) for row in scene.left_out],
+            }
+            console.say(f"{served.url}: open it in a browser on this machine; Ctrl-C ends it")
+            console.document("skinrig.view-served/1", document)
+            try:
+                served.wait(seconds)
+            except KeyboardInterrupt:
+                console.progress("no longer served")
 
 
 class _Handler(BaseHTTPRequestHandler):

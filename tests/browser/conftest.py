@@ -153,7 +153,7 @@ def open_page(
 @pytest.fixture(scope="session")
 def procedural_scene() -> Any:
     """The procedural head with textures of 256 texels."""
-    from skinrig.viewer import procedural
+    from skinrig.viewer import faces as procedural
 
     return procedural.scene(size=256)
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from fixtures.packed_scenes import as_packed
 from numpy.typing import NDArray
+from twins.relief_growth import window as grown_window
 
 from model.microstructure import FOREHEAD
 from model.microstructure.convolution import LineKernels, convolve
@@ -43,7 +44,7 @@ class WindowReference:
 def mesh_strain(scene: Any, weights: dict[str, float]) -> tuple[Any, MeshStrain]:
     """Return the mesh as the page holds it, and its strain."""
     mesh = as_packed(scene).mesh
-    rest = mesh.positions.astype(np.float64)
+    rest = mesh.vertices_mm.astype(np.float64)
     moved = rest + sum(w * mesh.shapes[n].astype(np.float64) for n, w in weights.items())
     return mesh, strain(rest, np.asarray(moved), mesh.faces, mesh.uv)
 
@@ -67,7 +68,7 @@ def window_reference(
     mesh, found = mesh_strain(scene, weights)
     fields = rasterize(found, mesh.faces, mesh.uv, (size, size), window=window)
     s, t = line_kernels(fields, FOREHEAD)
-    relief = growth(scene).window(window.top, window.left, (side, side), level=level)
+    relief = grown_window(growth(scene), window.top, window.left, (side, side), level=level)
     still = np.zeros_like(t.alpha)
     one = convolve(
         relief, s.axis, t.axis, s.alpha, s.sigma_px, still, t.sigma_px, sampling=sampling

@@ -15,7 +15,7 @@ from model.wrinkles import Layer
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import ExpressionTable
 from skinrig.viewer import page
-from skinrig.viewer.assets import wrinkles as wrinkle_assets
+from skinrig.viewer.assets import surface as wrinkle_assets
 
 ZONES = tuple("abcdefgh")
 TABLES = (

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from model import skin_reflectance
 from model.brdf import tables as brdf_tables
+from skinrig.viewer.assets import fitted as trait_assets
 from skinrig.viewer.assets import reflectance as reflectance_assets
-from skinrig.viewer.assets import traits as trait_assets
-from skinrig.viewer.assets.albedo_traits import AlbedoTraits
+from skinrig.viewer.assets.fitted import AlbedoTraits, LobeTraits
 from skinrig.viewer.assets.reflectance import PageLobes
-from skinrig.viewer.assets.traits import LobeTraits
 from skinrig.viewer.scene import SceneSource, Texture
 
 pytestmark = pytest.mark.long
@@ -73,7 +72,9 @@ def fitted_page(procedural_scene, open_page) -> FittedPage:
     face = PageLobes(materials.mixed(mix), shares, mix, materials.names, "fitted")
     traits = trait_assets.surface_traits(face)
     assert traits is not None
-    base = reflectance_assets.assemble(SceneSource("dome", procedural_scene.mesh, 64), traits.lobes)
+    base = reflectance_assets.assemble(
+        SceneSource("dome", procedural_scene.mesh, 64, 0, None, None), traits.lobes
+    )
     ends = (0.3 * smooth((16, 16, 12), rng)).astype(np.float32)
     albedo = AlbedoTraits(
         ("tan", "beard"),
@@ -254,12 +255,21 @@ def test_a_trait_changes_the_picture_as_its_shares_say(fitted):
     assert off < 0.05 * np.sqrt(np.mean((plain - wanted) ** 2))
 
 
+def factor(names, log_factor, amounts):
+    """The factor of the albedo under some traits, as the page computes it."""
+    total = np.zeros(log_factor.shape[1:], np.float32)
+    for i, name in enumerate(names):
+        amount = amounts.get(name, 0.0)
+        total += np.float32(abs(amount)) * log_factor[2 * i + (amount > 0.0)]
+    return np.exp(total)
+
+
 @pytest.mark.parametrize("amounts", [{"tan": 1.0}, {"tan": -0.5, "beard": 0.8}])
 def test_traits_of_the_albedo_multiply_it_along_the_logarithm(fitted, amounts):
     before = fitted.viewer.read("albedo")[..., :3]
     fitted.viewer.set(traits=amounts)
     packed = as_packed(fitted.scene).textures["albedo_traits"].values
-    wanted = replace(fitted.albedo, log_factor=packed).factor(amounts)
+    wanted = factor(fitted.albedo.names, packed, amounts)
     found = fitted.viewer.read("albedo_factor")[..., :3]
     np.testing.assert_allclose(found, wanted, rtol=4 * HALF)
     uv = fitted.viewer.read("inspect")[..., :2]

@@ -113,7 +113,7 @@ def test_the_page_moves_vertices_and_normals_as_the_simulation_does(viewer, scen
     positions, normals = viewer.mesh()
     mesh = scene.mesh
     deltas = sum(w * mesh.shapes[name] for name, w in weights.items())
-    rest = build_mesh(mesh.positions, mesh.faces, mesh.uv, mesh.normals)
+    rest = build_mesh(mesh.vertices_mm, mesh.faces, mesh.uv, mesh.normals)
     wanted = moved(rest, deltas.astype(np.float32))
     assert np.abs(positions - wanted.vertices_mm).max() < 1e-4
     away = np.degrees(np.arccos(np.clip(np.sum(normals * wanted.normals, -1), -1.0, 1.0)))

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from rigsim.subject import make_subject
-from skinrig.viewer import page, procedural
+from skinrig.viewer import faces as procedural
+from skinrig.viewer import page
 
 pytestmark = pytest.mark.long
 
@@ -40,11 +41,11 @@ def test_a_turn_of_the_light_draws_no_more_than_it_must(viewer):
 def test_any_number_of_blend_shapes_moves_a_mesh_of_a_file(open_page, tmp_path):
     mesh = procedural.viewer_mesh(make_subject("III", size=64))
     names = [f"own {k}" for k in range(20)]
-    shapes = np.zeros((20, *mesh.positions.shape), np.float32)
+    shapes = np.zeros((20, *mesh.vertices_mm.shape), np.float32)
     shapes[:, :, 2] = np.linspace(0.1, 2.0, 20)[:, None]
     np.savez(
         tmp_path / "face.npz",
-        vertices_mm=mesh.positions,
+        vertices_mm=mesh.vertices_mm,
         uv=mesh.uv,
         faces=mesh.faces,
         shape_names=np.array(names),

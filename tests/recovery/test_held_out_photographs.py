@@ -21,9 +21,10 @@ from reconstruction.pipeline.inputs import DomeOptions
 from rigsim.as_built import dome as dome_build
 from rigsim.light.led_light import lobe_exponent, white_intensity
 from rigsim.sensor import sensor_of, vignetting_map
+from skinrig.rendering.camera import RenderingError
 from skinrig.rendering.photographs import evaluation
 from skinrig.rendering.photographs.errors import MAX_MEDIAN_ERROR
-from skinrig.rendering.photographs.held_out import Photographs, PhotographsError
+from skinrig.rendering.photographs.held_out import Photographs
 from skinrig.simulating.dome import small_dome
 from skinrig.simulating.simulation import simulate_session
 
@@ -99,11 +100,8 @@ def test_photographs_that_no_fit_has_seen_are_predicted(fitted):
         return evaluation.evaluate(
             appearance,
             photographs,
+            evaluation.Judging("local", count=6, ablation=ablation),
             model=model,
-            subsurface="local",
-            count=6,
-            ablation=ablation,
-            rng=np.random.default_rng(0),
         )
 
     whole = assemble(appearance)
@@ -128,7 +126,7 @@ def test_photographs_that_were_all_fitted_to_judge_nothing(fitted):
     out, _, _ = fitted
     appearance = store.read(out / "appearance")
     seen = dataclasses.replace(appearance, parameters={"held_out": {"lights": [], "views": []}})
-    with pytest.raises(PhotographsError, match="--hold-out"):
+    with pytest.raises(RenderingError, match="--hold-out"):
         Photographs.of(out / "session-face", seen, calibration=out / "calibration")
 
 
@@ -145,12 +143,7 @@ def test_a_head_that_sits_elsewhere_in_another_session_is_found(fitted):
     assert len(photographs.shots) == DOME["lights"] * DOME["views"]
     assert "the head sits" in photographs.assumed[0]
     found, _ = evaluation.evaluate(
-        elsewhere,
-        photographs,
-        subsurface="local",
-        count=4,
-        ablation=False,
-        rng=np.random.default_rng(0),
+        elsewhere, photographs, evaluation.Judging("local", count=4, ablation=False)
     )
     assert found.passed
 

@@ -63,9 +63,9 @@ def test_lotion_is_learned_from_fitted_lobes():
         ]
     )
     worn = [dataclasses.replace(p, applied=(("lotion", 0.9),)) for p in people[:3]]
-    truth = trait_truth.lobe_change(
-        people[:3], worn, points=8, pairs=1000, rng=np.random.default_rng(2)
-    )
+    draws = np.random.default_rng(2)
+    found = trait_truth.lobe_changes(people[:3], {"lotion": worn}, points=8, pairs=1000, rng=draws)
+    truth = found["lotion"]
     strength = basis.strength()
     metric = basis.kinship() * np.outer(strength, strength)
     mix = brdf_basis.reduce(means, 6, basis=basis)[1]

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from rigsim.geometry.mesh import Mesh
 from skinrig.console import Console
-from skinrig.viewer import writing
+from skinrig.viewer import server
 from skinrig.viewer.microstructure.tiles import TileError
-from skinrig.viewer.scene import ViewerMesh, ViewerScene
+from skinrig.viewer.scene import ViewerScene
 
 
 @pytest.fixture
@@ -21,7 +22,7 @@ def plate() -> ViewerScene:
     positions = np.concatenate([40.0 * uv, np.zeros((4, 1))], axis=1).astype(np.float32)
     normals = np.tile(np.array([0, 0, 1], np.float32), (4, 1))
     faces = np.array([[0, 1, 3], [0, 3, 2]], np.int32)
-    return ViewerScene(ViewerMesh(positions, normals, uv, faces))
+    return ViewerScene(Mesh(positions, faces, uv, normals))
 
 
 def test_a_displacement_without_a_server_is_a_mistake_in_use(tmp_path):
@@ -48,7 +49,7 @@ def test_a_served_page_is_there_with_its_tiles_until_it_ends(plate, tmp_path, ca
         raise KeyboardInterrupt
 
     monkeypatch.setattr(server.Served, "wait", wait)
-    writing.serve(plate, 0, [], console=Console(True), displacement=path)
+    server.serve_scene(plate, 0, [], console=Console(True), displacement=path)
     document = json.loads(capsys.readouterr().out)
     assert document["schema"] == "skinrig.view-served/1"
     assert document["displacement_px"] == 1024
@@ -64,4 +65,4 @@ def test_a_file_that_is_no_displacement_is_named(plate, tmp_path):
     path = tmp_path / "height.npy"
     np.save(path, np.zeros((300, 300), np.float32))
     with pytest.raises(TileError, match=r"displacement: got shape \(300, 300\)"):
-        writing.serve(plate, 0, [], console=Console(True), displacement=path)
+        server.serve_scene(plate, 0, [], console=Console(True), displacement=path)

@@ -172,13 +172,10 @@ def _surface(stage: Stage, people: Sequence[Member]) -> None:
     )
     bare = [p for p in compared if not p.applied]
     worn = tuple(w for w, p in zip(worn, compared, strict=True) if not p.applied)
-    truth = trait_truth.lobe_change(
-        bare,
-        worn,
-        points=4 if stage.toy else 60,
-        pairs=500 if stage.toy else 1000,
-        rng=np.random.default_rng(2),
-    )
+    points, pairs = (4, 500) if stage.toy else (60, 1000)
+    rng = np.random.default_rng(2)
+    changes = trait_truth.lobe_changes(bare, {"worn": worn}, points=points, pairs=pairs, rng=rng)
+    truth = changes["worn"]
 
     def judged(space: TraitSpace) -> float:
         return truth.cosine(space.trait("trait").vector, basis)

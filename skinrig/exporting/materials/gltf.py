@@ -92,7 +92,7 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         See :meth:`skinrig.exporting.materials.material.Material.of`.
     """
     for option, value, only in (
-        ("--unit", delivery.unit_or("m"), "m"),
+        ("--unit", delivery.scene_unit, "m"),
         ("--normal-y", delivery.normal_y, "gl"),
         ("--udim", delivery.udim, "none"),
     ):

@@ -17,8 +17,7 @@ from skinrig.exporting.images import CAMERA_SPACE, DATA_SPACE, SRGB_SPACE, Image
 from skinrig.exporting.materials import subsurface_radius, surface_fit, tangents, udim
 from skinrig.exporting.materials.tangents import FramedMesh
 from skinrig.exporting.materials.udim import TiledMesh
-from skinrig.exporting.options import FIRST_TILE, Delivery
-from skinrig.exporting.sealing import ExportError
+from skinrig.exporting.options import FIRST_TILE, Delivery, ExportError
 from skinrig.rendering.geometry import FittedSurface, own_mesh
 
 COLOR_NOTE: Final = (

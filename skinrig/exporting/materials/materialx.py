@@ -10,8 +10,8 @@ from model.skin import SkinAppearance
 from skinrig.drawing import templates
 from skinrig.exporting.images import Image, ImageFolder
 from skinrig.exporting.materials.material import MAP_NOTES, Material
-from skinrig.exporting.options import FIRST_TILE, M_PER_MM, TILE_SEPARATORS, UNITS_M, Delivery
-from skinrig.exporting.provenance import IMAGE_ORIENTATION
+from skinrig.exporting.options import FIRST_TILE, TILE_SEPARATORS, Delivery
+from skinrig.exporting.sealing import IMAGE_ORIENTATION
 
 MATERIALX_FILE, DOCUMENT_FILE = "skin.mtlx", "material.json"
 SCHEMA: Final = "skinrig.export.material/1"
@@ -44,11 +44,11 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     """
     material = Material.of(appearance, delivery.mesh)
     left_out = material.left_out_of_mesh(delivery)
-    unit = delivery.unit_or("m")
-    per_mm = M_PER_MM / UNITS_M[unit]
     out = ImageFolder(folder, delivery, tiles=material.tiles)
     scale = write_textures(material, out)
-    (folder / "skin.obj").write_text(material.mesh.obj(per_mm, unit), encoding="utf-8")
+    (folder / "skin.obj").write_text(
+        material.mesh.obj(delivery.per_mm, delivery.scene_unit), encoding="utf-8"
+    )
     out.document(DOCUMENT_FILE, appearance, facts(material, appearance, delivery, SCHEMA, scale))
     return left_out
 
@@ -89,18 +89,16 @@ def facts(
     scale
         Radius of subsurface scattering, mm.
     """
-    unit = delivery.unit_or("m")
-    per_mm = M_PER_MM / UNITS_M[unit]
     told = material.facts(appearance)
     return {
         **told,
         "schema": schema,
-        "scene_unit": unit,
-        "mm_per_scene_unit": 1.0 / per_mm,
+        "scene_unit": delivery.scene_unit,
+        "mm_per_scene_unit": 1.0 / delivery.per_mm,
         "orientation": IMAGE_ORIENTATION,
         "udim": {"tiles": list(material.tiles), "measured": [material.tiles[0]]},
         "frame": "+x right, +y up, +z towards the main camera",
-        "subsurface": {**told["subsurface"], "radius_in_scene_units": scale * per_mm},
+        "subsurface": {**told["subsurface"], "radius_in_scene_units": scale * delivery.per_mm},
     }
 
 
@@ -116,13 +114,10 @@ def openpbr_document(material: Material, radius_mm: float, delivery: Delivery) -
     delivery
         Scene unit, names of tiles, green of the normal map.
     """
-    unit = delivery.unit_or("m")
-    per_mm = M_PER_MM / UNITS_M[unit]
     return templates.render(
         "exporting/templates/openpbr.mtlx",
         material=material,
-        unit=unit,
-        radius=f"{radius_mm * per_mm:.9g}",
+        radius=f"{radius_mm * delivery.per_mm:.9g}",
         eta=f"{material.eta:.9g}",
         delivery=delivery,
         folder=TEXTURE_FOLDER,

@@ -116,44 +116,34 @@ def _fit(
 
 def lobe_values(roughness: float, eta: float) -> Float64Array:
     """Return GGX of a roughness at the directions of the sums, 1/sr, shape (N,)."""
-    light, view, cos_h, cos_d, _ = _directions()
-    return microfacet.brdf(light, view, cos_h, cos_d, roughness=roughness**2, eta=eta, kind="ggx")
+    return microfacet.brdf(*_directions()[0], roughness=roughness**2, eta=eta, kind="ggx")
 
 
 def _products(lobes: BrdfBasis, eta: float) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return weighted products: lobes with lobes (K, K), with GGX (K, R), of GGX itself (R,)."""
-    keep = _directions()[-1]
+    _, solid, keep = _directions()
     table = lobes.table[::STRIDE_D, ::STRIDE_PHI, ::STRIDE_H, : lobes.size]
     values = table.reshape(-1, lobes.size)[keep].astype(np.float64)
     mean = values.mean(axis=1)
-    weight = _solid()[keep] / (mean + LOBE_FLOOR_FRACTION * mean.max(initial=1e-12))
+    weight = solid / (mean + LOBE_FLOOR_FRACTION * mean.max(initial=1e-12))
     model = np.stack([lobe_values(float(r), eta) for r in ROUGHNESS_NODES], axis=1)
     scaled = values * weight[:, None]
     return values.T @ scaled, scaled.T @ model, np.sum(weight[:, None] * model**2, axis=0)
 
 
 @lru_cache(maxsize=1)
-def _grid() -> tuple[Float64Array, Float64Array, Float64Array]:
+def _directions() -> tuple[tuple[Float64Array, ...], Float64Array, BoolArray]:
+    """Return cosines of light, view, half vector and difference angle where nodes count.
+
+    Beside them the solid angle of each node times both cosines, up to a factor, and which count.
+    """
     d, phi, h = brdf_tables.nodes()
     picked = np.meshgrid(d[::STRIDE_D], phi[::STRIDE_PHI], h[::STRIDE_H], indexing="ij")
     theta_d, phi_d, theta_h = (axis.reshape(-1) for axis in picked)
-    return theta_d, phi_d, theta_h
-
-
-@lru_cache(maxsize=1)
-def _directions() -> tuple[Float64Array, Float64Array, Float64Array, Float64Array, BoolArray]:
-    """Return cosines of light, view, half vector and difference angle, and which nodes count."""
-    theta_d, phi_d, theta_h = _grid()
-    light, view = merl.to_directions(theta_h, theta_d, phi_d)
-    keep = (light[:, 2] > MIN_FIT_COSINE) & (view[:, 2] > MIN_FIT_COSINE) & (theta_d <= MAX_THETA_D)
-    return light[keep, 2], view[keep, 2], np.cos(theta_h[keep]), np.cos(theta_d[keep]), keep
-
-
-@lru_cache(maxsize=1)
-def _solid() -> Float64Array:
-    """Return the solid angle of each node times both cosines, up to a factor."""
-    theta_d, phi_d, theta_h = _grid()
-    light, view = merl.to_directions(theta_h, theta_d, phi_d)
+    light, view = (w[:, 2] for w in merl.to_directions(theta_h, theta_d, phi_d))
+    keep = (light > MIN_FIT_COSINE) & (view > MIN_FIT_COSINE) & (theta_d <= MAX_THETA_D)
+    light, view, theta_d, theta_h = light[keep], view[keep], theta_d[keep], theta_h[keep]
     # d theta_h grows with theta_h's square root, whose nodes are even
     solid = np.sin(2.0 * theta_d) * np.sin(theta_h) * np.sqrt(np.maximum(theta_h, 0.0))
-    return solid * np.clip(light[:, 2], 0.0, 1.0) * np.clip(view[:, 2], 0.0, 1.0)
+    solid = solid * np.clip(light, 0.0, 1.0) * np.clip(view, 0.0, 1.0)
+    return (light, view, np.cos(theta_h), np.cos(theta_d)), solid, keep

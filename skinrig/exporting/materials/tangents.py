@@ -87,7 +87,8 @@ class FramedMesh:
             np.add.at(total, vertex, (angle * known)[:, None] * _across(along_u, normal))
         tangent = _unit(total)
         lost = np.linalg.norm(tangent, axis=1) < 0.5
-        tangent[lost] = _any_across(normals[lost])
+        axis = np.eye(3)[np.argmin(np.abs(normals[lost]), axis=1)]
+        tangent[lost] = _across(axis, normals[lost])  # some direction
         frames = np.column_stack([tangent, signs]).astype(np.float32)
         own = mesh.vertices_mm[source], normals.astype(np.float32), mesh.uv[source]
         return FramedMesh(*own, frames, faces.astype(np.int32), source)
@@ -252,13 +253,6 @@ def _face_tangents(points: Float64Array, uv: Float64Array) -> tuple[Float64Array
 def _across(vectors: Float64Array, normals: Float64Array) -> Float64Array:
     """Return unit vectors laid into the plane across normals; 0 for those along them."""
     return _unit(vectors - np.sum(vectors * normals, axis=1, keepdims=True) * normals)
-
-
-def _any_across(normals: Float64Array) -> Float64Array:
-    """Return some unit vector across each normal."""
-    axis = np.zeros_like(normals)
-    axis[np.arange(len(normals)), np.argmin(np.abs(normals), axis=1)] = 1.0
-    return _across(axis, normals)
 
 
 def _unit(vectors: Float64Array) -> Float64Array:

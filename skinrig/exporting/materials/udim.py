@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from rigsim.geometry.mesh import Mesh, MeshFileError, build_mesh, vertex_normals
 from skinrig.arrays import Float32Array, FloatArray, Int32Array
 from skinrig.blend_shapes import meshes as blend_shapes
-from skinrig.exporting.options import FIRST_TILE
-from skinrig.exporting.sealing import ExportError
+from skinrig.exporting.options import FIRST_TILE, ExportError
 from skinrig.rendering.geometry import read_mesh
 
 TILES_PER_ROW: Final = 10
@@ -130,7 +129,7 @@ def read(path: Path) -> TiledMesh:
 
     Raises
     ------
-    rigsim.geometry.mesh.MeshError, skinrig.blend_shapes.errors.BlendShapeError
+    rigsim.geometry.mesh.MeshError, rigsim.geometry.mesh.MeshError
         The file is missing, damaged, or no mesh that maps can be laid on.
     ExportError
         See `tiles_of`.

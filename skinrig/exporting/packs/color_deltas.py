@@ -14,8 +14,7 @@ from reconstruction.surface.texture_fill import push_pull
 from skinrig.applying import expression
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.exporting.images import CAMERA_SPACE, DATA_SPACE, SRGB_SPACE, Image, ImageFolder
-from skinrig.exporting.options import Delivery
-from skinrig.exporting.sealing import ExportError
+from skinrig.exporting.options import Delivery, ExportError
 
 COLOR_SIZE, MAX_STATES = 512, 3
 NEUTRAL: Final = "neutral"
@@ -49,12 +48,7 @@ class Colors:
     space: str
 
 
-def write(
-    appearance: SkinAppearance,
-    out: ImageFolder,
-    delivery: Delivery,
-    left_out: list[tuple[str, str]],
-) -> tuple[dict[str, Any], list[str]]:
+def write(appearance: SkinAppearance, out: ImageFolder) -> tuple[dict[str, Any], list[str]]:
     """Write base color and color deltas.
 
     Parameters
@@ -77,11 +71,11 @@ def write(
     """
     rig = expression.hemoglobin_rig(appearance)
     have = sorted(rig.states)
-    states = chosen(have, delivery, "color", left_out)
-    colors = _colors(appearance, rig, states, delivery, left_out)
+    states = chosen(have, "color", out)
+    colors = _colors(appearance, rig, states, out)
     names = {f"cm{k}": state for k, state in enumerate(states, start=1)}
     what = f"neutral base color on {colors.layout}; {colors.space}; holes filled"
-    filled = _filled(colors.base, colors.valid)
+    filled = push_pull(colors.base, colors.valid.astype(np.float32)).values.astype(np.float64)
     out.both(Image("base_color", filled, space=SRGB_SPACE, what=what, valid=colors.valid))
     largest = {}
     for name, state in names.items():
@@ -95,18 +89,7 @@ def write(
     return {"size": COLOR_SIZE, **told, "valid_share": float(colors.valid.mean())}, have
 
 
-def _filled(base: Float64Array, valid: BoolArray) -> Float64Array:
-    """Return colors with the holes filled from around, as a texture must have them."""
-    return np.asarray(push_pull(base, valid.astype(np.float32)).values, np.float64)
-
-
-def _colors(
-    appearance: SkinAppearance,
-    rig: Any,
-    states: list[str],
-    delivery: Delivery,
-    left_out: list[tuple[str, str]],
-) -> Colors:
+def _colors(appearance: SkinAppearance, rig: Any, states: list[str], out: ImageFolder) -> Colors:
     melanin = appearance.maps["melanin"]
     seen = melanin.mask.copy()
     blends = {}
@@ -118,18 +101,18 @@ def _colors(
         for state, blend in blends.items()
     }
     neutral = shown[NEUTRAL]
-    if delivery.onto is None:
+    if out.delivery.onto is None:
         why = (
             "they lie on the flash camera's picture; name the "
             "dome's maps with --onto, and two tables of landmarks"
         )
-        left_out.append(("colors on the face's texture", why))
+        out.leave_out("colors on the face's texture", why)
         base, valid = sized(neutral, seen, COLOR_SIZE)
         deltas = {s: sized(shown[s] - neutral, seen, COLOR_SIZE)[0] for s in states}
         height, width = seen.shape
         layout = f"the flash camera's picture, {width} x {height}, stretched to a square"
         return Colors(base, deltas, valid, layout, SRGB_SPACE)
-    return _on_texture(delivery, shown, seen, states)
+    return _on_texture(out.delivery, shown, seen, states)
 
 
 def _on_texture(
@@ -148,11 +131,8 @@ def _on_texture(
             f"{delivery.onto}: got maps {', '.join(sorted(other.maps)) or 'none'}, expected r_d "
             "among them"
         )
-    known = np.asarray(np.isfinite(albedo.values).all(axis=-1), np.bool_)
-    if albedo.valid is not None:
-        known &= albedo.valid
     inside = 1.0 - fresnel.diffuse_external(fresnel.ETA_SKIN)
-    base, valid = sized(inside * albedo.values.astype(np.float64), known, COLOR_SIZE)
+    base, valid = sized(inside * albedo.values.astype(np.float64), albedo.mask, COLOR_SIZE)
     source = _places(delivery, albedo.values.shape[:2])
     neutral = shown[NEUTRAL]
     deltas: dict[str, Float64Array] = {}
@@ -214,12 +194,12 @@ def _looked_up(
     return np.stack(layers, axis=-1) / np.where(told, share, 1.0)[..., None], told
 
 
-def chosen(have: list[str], delivery: Delivery, what: str, left_out: Any) -> list[str]:
+def chosen(have: list[str], what: str, out: ImageFolder) -> list[str]:
     """Return up to three states, those asked for first of all."""
-    asked = [name for name in delivery.only if name in have]
-    names = asked if delivery.only else have
+    only = out.delivery.only
+    names = [name for name in only if name in have] if only else have
     for name in names[MAX_STATES:]:
-        left_out.append((f"{what} of {name}", f"a face has {MAX_STATES}; choose with --only"))
+        out.leave_out(f"{what} of {name}", f"a face has {MAX_STATES}; choose with --only")
     return names[:MAX_STATES]
 
 

@@ -25,10 +25,9 @@ from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.appearances.dynamic import FACIAL_COLOR, MICROSTRUCTURE, WRINKLES
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.exporting.images import DATA_SPACE, Image, ImageFolder
-from skinrig.exporting.options import Delivery
+from skinrig.exporting.options import Delivery, ExportError
 from skinrig.exporting.packs import color_deltas, detail_maps
-from skinrig.exporting.provenance import IMAGE_ORIENTATION
-from skinrig.exporting.sealing import ExportError
+from skinrig.exporting.sealing import IMAGE_ORIENTATION
 
 DOCUMENT_FILE: Final = "delta_maps.json"
 SCHEMA: Final = "skinrig.export.delta-maps/1"
@@ -77,26 +76,21 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
             "wrinkles` and `skinrig fit microstructure` make them"
         )
     out = ImageFolder(folder, delivery)
-    left_out: list[tuple[str, str]] = []
     told: dict[str, Any] = {}
     known: set[str] = set()
     if FACIAL_COLOR in parts:
-        told["color"], states = color_deltas.write(appearance, out, delivery, left_out)
+        told["color"], states = color_deltas.write(appearance, out)
         known |= set(states)
     if WRINKLES in parts:
-        told["wrinkles"], rows = _write_wrinkles(appearance, parts, out, delivery, left_out)
+        told["wrinkles"], rows = _write_wrinkles(appearance, parts, out)
         known |= set(rows)
     if MICROSTRUCTURE in parts:
-        details, rest = detail_maps.micro_normals(appearance, parts[MICROSTRUCTURE], out, delivery)
-        told |= details
-        left_out += rest
+        told |= detail_maps.micro_normals(appearance, parts[MICROSTRUCTURE], out)
     for part, what in PART_MAPS.items():
         if part not in parts:
             fit = f"skinrig fit {part.replace('_', '-')}"
-            left_out.append((what, f"the folder holds no {part}: run `{fit}`"))
-    details, rest = detail_maps.scatter(delivery, out)
-    told |= details
-    left_out += rest
+            out.leave_out(what, f"the folder holds no {part}: run `{fit}`")
+    told |= detail_maps.scatter(out)
     unknown = [name for name in delivery.only if name not in known]
     if unknown:
         raise ExportError(
@@ -112,28 +106,24 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
             "color_coding": COLOR_CODING,
             "normal_coding": NORMAL_CODING,
             **told,
-            "left_out": [list(row) for row in left_out],
+            "left_out": [list(row) for row in out.left_out],
         },
     )
-    return left_out
+    return out.left_out
 
 
 def _write_wrinkles(
-    appearance: SkinAppearance,
-    parts: Mapping[str, Any],
-    out: ImageFolder,
-    delivery: Delivery,
-    left_out: list[tuple[str, str]],
+    appearance: SkinAppearance, parts: Mapping[str, Any], out: ImageFolder
 ) -> tuple[dict[str, Any], list[str]]:
     model = WrinkleModel.from_maps(appearance.maps, appearance.files[WRINKLE_FILE])
     rows = sorted({str(row) for layer in model.layers for row in layer.table.rows})  # type: ignore[union-attr]
     fitted = [str(n) for n in parts[WRINKLES].get("expressions", [])]
     have = [name for name in fitted if name in rows] + [n for n in rows if n not in fitted]
-    chosen = color_deltas.chosen(have, delivery, "wrinkles", left_out)
+    chosen = color_deltas.chosen(have, "wrinkles", out)
     names = {f"wm{k}": row for k, row in enumerate(chosen, start=1)}
     known = np.ones(model.base.shape[:2], bool) if model.valid is None else model.valid
     slopes, valid = color_deltas.sized(np.asarray(model.base, np.float64), known, NORMAL_SIZE)
-    sign = np.array([1.0, delivery.y])
+    sign = np.array([1.0, out.delivery.y])
     _write_normal("normal", slopes, valid, out, "neutral normals")
     clipped = {}
     for name, row in names.items():
@@ -154,8 +144,7 @@ def _write_wrinkles(
             told = zones[zone] if zone < len(zones) else str(zone)
             out.png(Image(name, sized, low=0.0, high=1.0, what=f"zone {told}"))
             masks[name] = told
-    hollows, rest = detail_maps.cavity(np.asarray(model.base, np.float64), known, NORMAL_SIZE, out)
-    left_out += rest
+    hollows = detail_maps.cavity(np.asarray(model.base, np.float64), known, NORMAL_SIZE, out)
     out.errors([Image("normal_mask", valid.astype(float))])
     return {
         "size": NORMAL_SIZE,

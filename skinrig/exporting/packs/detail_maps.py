@@ -18,11 +18,66 @@ from model import store, wrinkles
 from model.skin import SkinAppearance
 from reconstruction.normal_integration import integrate_map
 from reconstruction.surface.texture_fill import push_pull
+from skinrig.appearances.contents import assumed_by
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.exporting.images import DATA_SPACE, Image, ImageFolder
-from skinrig.exporting.options import Delivery
 from skinrig.exporting.packs import color_deltas
-from skinrig.exporting.packs.seamless import FADE_DIVISOR, periodic, periodic_normals
+
+FADE_DIVISOR: Final = 8
+"""One part of so many of a tile is faded into what lies beyond its other end."""
+
+
+def periodic(image: ArrayLike) -> Float64Array:
+    """Return an image that repeats without a seam: what is beyond its end fades into its beginning.
+
+    By weights whose squares sum to 1, so that relief of independent places keeps its variance.
+
+    Parameters
+    ----------
+    image
+        (H, W), finite, mean 0; 8 pixels and more a side.
+
+    Returns
+    -------
+    ndarray
+        Smaller by an eighth along each axis; beyond the faded eighth its values are the image's.
+
+    Examples
+    --------
+    >>> image = np.random.default_rng(0).normal(size=(64, 80))
+    >>> tile = periodic(image)
+    >>> tile.shape, np.array_equal(tile[8:, 10:], image[8:56, 10:70])
+    ((56, 70), True)
+    """
+    found = np.asarray(image, np.float64)
+    for axis in (0, 1):
+        found = np.moveaxis(found, axis, 0)
+        band = len(found) // FADE_DIVISOR
+        size = len(found) - band
+        # 0 with a slope of 0 at the beginning, 1 with a slope of 0 at the end
+        share = np.sin(0.5 * np.pi * np.sin(0.5 * np.pi * np.arange(band) / band) ** 2)
+        rise, fall = share[:, None], np.sqrt(1.0 - share**2)[:, None]
+        faded = rise * found[:band] + fall * found[size:]
+        found = np.moveaxis(np.concatenate([faded, found[band:size]]), 0, axis)
+    return found
+
+
+def periodic_normals(height_um: Float64Array, pixel_um: float) -> Float64Array:
+    """Return unit normals of relief that repeats, (H, W, 3), +Y up, row 0 at the top.
+
+    Examples
+    --------
+    >>> x = np.arange(64)
+    >>> relief = np.sin(2 * np.pi * x / 64) * np.ones((4, 1))
+    >>> normals = periodic_normals(relief, 1.0)
+    >>> round(float(-normals[0, 0, 0] / normals[0, 0, 2]), 3), float(normals[0, 16, 0].round(6))
+    (0.098, -0.0)
+    """
+    along_x = (np.roll(height_um, -1, 1) - np.roll(height_um, 1, 1)) / (2.0 * pixel_um)
+    along_y = (np.roll(height_um, 1, 0) - np.roll(height_um, -1, 0)) / (2.0 * pixel_um)
+    normals = np.stack([-along_x, -along_y, np.ones(height_um.shape)], axis=-1)
+    return np.asarray(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
+
 
 HORIZON_DIRECTIONS: Final = 16
 HORIZON_REACH_PX: Final = 16
@@ -33,9 +88,7 @@ MAX_SCATTER_MM: Final = 16.0
 MM_PER_UM: Final = 0.001
 
 
-def cavity(
-    slopes: Float64Array, valid: BoolArray, size: int, out: ImageFolder
-) -> tuple[dict[str, Any], list[tuple[str, str]]]:
+def cavity(slopes: Float64Array, valid: BoolArray, size: int, out: ImageFolder) -> dict[str, Any]:
     """Write the share of light from all around that relief leaves to its own hollows.
 
     Parameters
@@ -51,15 +104,16 @@ def cavity(
 
     Returns
     -------
-    told : dict
-        JSON values.
-    left_out : list of (str, str)
+    dict
+        JSON values; empty where it is left out.
     """
     if not valid.any():
-        return {}, [("cavity", "no wrinkle normal is valid")]
+        out.leave_out("cavity", "no wrinkle normal is valid")
+        return {}
     found = integrate_map(wrinkles.decode(slopes), valid=valid)
     if not found.convergence.converged:
-        return {}, [("cavity", "the normals could not be integrated to heights")]
+        out.leave_out("cavity", "the normals could not be integrated to heights")
+        return {}
     seen = visible_share(found.height, found.part)
     shown, known = color_deltas.sized(seen[..., None], found.valid, size)
     values = np.where(known, shown[..., 0], 1.0)
@@ -77,7 +131,7 @@ def cavity(
             "least": float(values[known].min()),
             "median": float(np.median(values[known])),
         }
-    }, []
+    }
 
 
 def visible_share(height: ArrayLike, part: ArrayLike) -> Float64Array:
@@ -133,7 +187,7 @@ def _among(number: NDArray[Any], at: Float64Array) -> BoolArray:
     return np.asarray(same)
 
 
-def scatter(delivery: Delivery, out: ImageFolder) -> tuple[dict[str, Any], list[tuple[str, str]]]:
+def scatter(out: ImageFolder) -> dict[str, Any]:
     """Write how far light spreads below the surface, of the model that colors are put on.
 
     Parameters
@@ -145,47 +199,42 @@ def scatter(delivery: Delivery, out: ImageFolder) -> tuple[dict[str, Any], list[
 
     Returns
     -------
-    told : dict
-        JSON values.
-    left_out : list of (str, str)
+    dict
+        JSON values; empty where it is left out.
     """
-
-    def without(why: str) -> tuple[dict[str, Any], list[tuple[str, str]]]:
-        return {}, [("scatter", why)]
-
-    if delivery.onto is None:
-        return without("it is of a model: name one of `skinrig fit reflectance` by --onto")
-    other = store.read(delivery.onto)
+    onto = out.delivery.onto
+    if onto is None:
+        why = "it is of a model: name one of `skinrig fit reflectance` by --onto"
+        out.leave_out("scatter", why)
+        return {}
+    other = store.read(onto)
     depth = other.maps.get("translucency")
     if depth is None:
         makes = "`skinrig fit reflectance` makes it"
-        return without(f"{delivery.onto.name} holds no translucency: {makes}")
+        out.leave_out("scatter", f"{onto.name} holds no translucency: {makes}")
+        return {}
     values = np.asarray(depth.values, np.float64)
-    known: BoolArray = np.asarray(np.isfinite(values).all(axis=-1), np.bool_)
-    if depth.valid is not None:
-        known &= depth.valid
-    if not known.any():
-        return without(f"no translucency of {delivery.onto.name} is known")
-    shown, valid = color_deltas.sized(values, known, SCATTER_SIZE)
-    usual = np.median(values[known], axis=0)
+    if not depth.mask.any():
+        out.leave_out("scatter", f"no translucency of {onto.name} is known")
+        return {}
+    shown, valid = color_deltas.sized(values, depth.mask, SCATTER_SIZE)
+    usual = np.median(values[depth.mask], axis=0)
     what = "1/sigma_tr in red, green and blue; the median where it is not known"
     shown = np.where(valid[..., None], shown, usual)
     out.both(Image("scatter", shown, "mm", DATA_SPACE, what, 0.0, MAX_SCATTER_MM, valid))
-    assumed = other.parameters.get("assumed", [])
-    texts = [str(text) for text in assumed] if isinstance(assumed, list | tuple) else []
     return {
         "scatter": {
             "size": SCATTER_SIZE,
-            "layout": f"the texture of {delivery.onto.name}",
+            "layout": f"the texture of {onto.name}",
             "median_mm": usual.tolist(),
-            "assumed": [t for t in texts if "translucency" in t],
+            "assumed": [t for t in assumed_by(other) if "translucency" in t],
         }
-    }, []
+    }
 
 
 def micro_normals(
-    appearance: SkinAppearance, part: Mapping[str, Any], out: ImageFolder, delivery: Delivery
-) -> tuple[dict[str, Any], list[tuple[str, str]]]:
+    appearance: SkinAppearance, part: Mapping[str, Any], out: ImageFolder
+) -> dict[str, Any]:
     """Write the neutral relief of each site as a normal map that repeats without a seam.
 
     Parameters
@@ -201,18 +250,16 @@ def micro_normals(
 
     Returns
     -------
-    told : dict
-        JSON values.
-    left_out : list of (str, str)
-        Sites whose relief is not known.
+    dict
+        JSON values; sites whose relief is not known are left out.
     """
     told: dict[str, Any] = {}
-    left_out = []
+    green = out.delivery.green
     for site, entry in sorted(part.get("sites", {}).items()):
         relief = appearance.maps[entry["map"]]
-        valid = np.isfinite(relief.values) & relief.mask
+        valid = relief.mask
         if not valid.any():
-            left_out.append((f"micro normals of {site}", "no height is valid"))
+            out.leave_out(f"micro normals of {site}", "no height is valid")
             continue
         filled = push_pull(np.nan_to_num(relief.values), valid.astype(np.float32)).values
         height = np.asarray(filled, np.float64).reshape(relief.values.shape)
@@ -220,8 +267,8 @@ def micro_normals(
         tile = periodic(height - height.mean())
         normals = periodic_normals(tile, pixel_um)
         name = f"micro_normal_{site}"
-        what = f"relief of {site} at rest, tangent space, {delivery.green}, repeats without a seam"
-        out.both(Image.of_normals(name, normals, delivery, what))
+        what = f"relief of {site} at rest, tangent space, {green}, repeats without a seam"
+        out.both(Image.of_normals(name, normals, out.delivery, what))
         slope = normals[..., :2] / normals[..., 2:]
         told[name] = {
             "site": site,
@@ -233,7 +280,7 @@ def micro_normals(
             "faded_share": 1.0 - (1.0 - 1.0 / FADE_DIVISOR) ** 2,  # so that it repeats
             "valid_share": float(valid.mean()),
         }
-    return ({"micro": told} if told else {}), left_out
+    return {"micro": told} if told else {}
 
 
 def _size_mm(height: Float64Array, pixel_um: float) -> list[float]:

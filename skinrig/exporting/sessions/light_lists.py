@@ -4,7 +4,6 @@ One camera's pictures as linear 16-bit TIFF on one common scale, and ``lights.lp
 a file name and a unit vector towards the light in each line; x right, y up, z to the camera.
 """
 
-from datetime import date, datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,10 +15,9 @@ from reconstruction.pipeline.dome.calibrated import calibrated
 from reconstruction.pipeline.dome.images import DomeImages
 from reconstruction.pipeline.inputs import Inputs
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray, UInt16Array
-from skinrig.exporting.sealing import Exported, ExportError, fresh, sealed
-from skinrig.exporting.sessions.handing import allowed, write_session_document
+from skinrig.exporting.options import Delivery, ExportError
+from skinrig.exporting.sessions.copies import write_session_document
 
-LIGHT_LIST_FORMAT: Final = "lp"
 LIST_FILE, POSITIONS_FILE, DOCUMENT_FILE = "lights.lp", "positions_mm.txt", "lights.json"
 SCHEMA: Final = "skinrig.export.lights/1"
 SATURATED_CODE: Final = 65535
@@ -29,67 +27,42 @@ MAX_BRIGHT_FRACTION: Final = 1e-4
 _CAMERA_TO_LIST_SIGNS = np.array([1.0, -1.0, -1.0])  # from camera axes, x right, y down, z forward
 
 
-def export_light_list(
-    session_path: str | Path,
-    out: str | Path,
-    *,
-    use: str,
-    camera: str | None = None,
-    calibration: str | Path | None = None,
-    today: date | None = None,
-    now: datetime | None = None,
-) -> Exported:
-    """Write one camera's pictures of a session with their light list; all of it, or nothing.
+def write(session: Session, folder: Path, delivery: Delivery) -> list[tuple[str, str]]:
+    """Write one camera's images of a session with their light list.
 
     Parameters
     ----------
-    session_path
-        SESSION/ of a dome, or of pictures that were imported with a list.
-    out
-        New folder.
-    use
-        What the copy is for; must lie within the consent's scope, on a day before it ends.
-    camera
-        Name of the view; None: the one that looks most along -z.
-    calibration
-        CALIBRATION/ whose lights and cameras are used; None: they stand as the rig was drawn.
-    today, now
-        Day on which consent is judged, and time in the manifest; None: the present.
+    session
+        Of a dome, or of images that were imported with a list.
+    folder
+        Existing folder.
+    delivery
+        Its camera and calibration count.
 
     Returns
     -------
-    Exported
-        Lights that are dead, or whose place is not known, are left out and named.
+    list of (str, str)
+        Lights that are dead, or whose place is not known.
 
     Raises
     ------
-    ConsentError
-        Where the subject has not agreed to the use, or not any more.
     ExportError
-        For a session without single lights, a camera that it lacks, or a folder that exists.
+        For a session without single lights, or a camera that it lacks.
     ValueError
-        Where the session is damaged, or the calibration is not of its rig.
+        Where the calibration is not of its rig.
     """
-    target = fresh(out)
-    session = allowed(session_path, use, today=today)
+    import tifffile
+
     if not any(step.kind == "olat" for step in session.plan.steps):
         kinds = ", ".join(sorted({step.kind for step in session.plan.steps}))
         raise ExportError(
-            f"{session_path}: shows {kinds}, expected one light a picture: a session of the dome, "
+            f"{session.path}: shows {kinds}, expected one light a picture: a session of the dome, "
             "or of `skinrig import lp`"
         )
-    return sealed(target, lambda part: _write(session, part, camera, calibration), now)
-
-
-def _write(
-    session: Session, folder: Path, camera: str | None, calibration: str | Path | None
-) -> list[tuple[str, str]]:
-    import tifffile
-
-    inputs = Inputs.of(session, calibration, state="neutral", on_date=None)
+    inputs = Inputs.of(session, delivery.calibration, state="neutral", on_date=None)
     images = DomeImages(session)
     dome = calibrated(inputs, images)
-    view = _view(images.views, dome.cameras, camera)
+    view = _view(images.views, dome.cameras, delivery.camera)
     pose = dome.cameras[view]
     good = [k for k in range(len(images.lights)) if dome.table.valid[k]]
     left_out = [
@@ -106,7 +79,7 @@ def _write(
     def picture(light: int) -> tuple[Float32Array, BoolArray]:
         if "light_list" in session.manifest.extra:
             return _imported(session, images.views[view], images.lights[light])
-        found = dome.image(view, _capture(images, light))
+        found = dome.image(view, images.captures.index((images.lights[light], -1)))
         return found.rgb, found.valid
 
     # twice through the pictures instead of all of them in memory
@@ -163,10 +136,6 @@ def _view(names: tuple[str, ...], cameras: Any, wanted: str | None) -> int:
     if wanted not in names:
         raise ExportError(f"--camera: got {wanted!r}, expected one of {', '.join(names)}")
     return names.index(wanted)
-
-
-def _capture(images: Any, light: int) -> int:
-    return int(images.captures.index((images.lights[light], -1)))
 
 
 def _imported(session: Session, view: str, light: str) -> tuple[Float32Array, BoolArray]:

@@ -1,36 +1,48 @@
-"""Spectral and polarized images in the layout of Fichet et al.: what is measured, what is modelled.
+"""Spectral and polarized images in the layout of Fichet et al.: of maps, and as they were taken.
 
-``reflectance.exr`` is modelled: the two-layer skin whose melanin and hemoglobin were estimated,
-evaluated at 31 wavelengths. ``stokes.exr`` is measured, in the three bands of the camera: all
-light (S0), and what keeps the flash's polarization (S1). A band has no single wavelength:
-channels bear the mean of the band, and the header says so.
+Of the gradient sphere each state and pattern is a Stokes image: it is shown with the analyser along
+the light's polarization, and across it. Their sum is all light, S0; their difference is S1, along
+the analyser's axis: light that the surface reflected. S2 and S3 need an analyser at 45 degrees and
+a retarder, which the rig does not have. The sensor is monochrome: its one band bears the mean
+wavelength of the LEDs' light behind it.
 
 References
 ----------
 Fichet, Pacanowski, Wilkie 2021, An OpenEXR Layout for Spectral Images, JCGT 10(3).
+Ma et al. 2007, Rapid Acquisition of Specular and Diffuse Normal Maps, EGSR.
 """
 
+import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
+from capture.calibration.sensor import SensorCalibration
+from capture.session import Session
 from model import color_table, spectra
 from model.skin import SkinAppearance
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
-from skinrig.arrays import Float64Array
+from reconstruction.pipeline.gradient.images import GradientImages, Patterns
+from reconstruction.pipeline.gradient.stages import WAVELENGTH_UM
+from reconstruction.pipeline.inputs import Inputs
+from reconstruction.pipeline.sensor_noise import SensorNoise
+from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.exporting.images import write_channels
-from skinrig.exporting.options import Delivery
-from skinrig.exporting.provenance import IMAGE_ORIENTATION, provenance
-from skinrig.exporting.sealing import ExportError, write_json
+from skinrig.exporting.options import Delivery, ExportError
+from skinrig.exporting.sealing import IMAGE_ORIENTATION, provenance, write_json
+from skinrig.exporting.sessions.copies import write_session_document
 
-REFLECTANCE_FILE, STOKES_FILE, DOCUMENT_FILE = "reflectance.exr", "stokes.exr", "spectral.json"
-SCHEMA: Final = "skinrig.export.spectral/1"
+REFLECTANCE_FILE, STOKES_FILE, SPECTRAL_DOCUMENT = "reflectance.exr", "stokes.exr", "spectral.json"
+SPECTRAL_SCHEMA: Final = "skinrig.export.spectral/1"
 LAYOUT_VERSION: Final = "1.0"
 """Version of the published layout."""
 
 
-def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[tuple[str, str]]:
+def write_spectra(
+    appearance: SkinAppearance, folder: Path, delivery: Delivery
+) -> list[tuple[str, str]]:
     """Write what an appearance of the flash rig holds of spectra and polarization.
 
     Parameters
@@ -73,9 +85,13 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
             if name in maps and maps[name].valid is not None:
                 mask = np.asarray(maps[name].valid, np.float32)
                 write_channels(folder / f"{name}_valid.exr", {"Y": mask}, {"unit": "1"})
-    told: dict[str, Any] = {"schema": SCHEMA, "orientation": IMAGE_ORIENTATION, "files": files}
+    told: dict[str, Any] = {
+        "schema": SPECTRAL_SCHEMA,
+        "orientation": IMAGE_ORIENTATION,
+        "files": files,
+    }
     told["left_out"] = [list(row) for row in left_out]
-    write_json(folder / DOCUMENT_FILE, {**provenance(appearance), **told})
+    write_json(folder / SPECTRAL_DOCUMENT, {**provenance(appearance), **told})
     return left_out
 
 
@@ -176,4 +192,167 @@ def stokes_header(what: str) -> dict[str, str]:
         "emissiveUnits": "1",
         "polarisationHandedness": "right",
         "comments": what,
+    }
+
+
+DOCUMENT_FILE: Final = "stokes.json"
+SCHEMA: Final = "skinrig.export.stokes/1"
+PARALLEL, CROSSED = "parallel", "crossed"
+S0, S1 = "S0", "S1"
+CHANNELS: Final = [channel(kind, 1e3 * WAVELENGTH_UM) for kind in (S0, S1)]
+
+
+def components(parallel: Float32Array, crossed: Float32Array) -> dict[str, Float32Array]:
+    """Return S0 and S1 of pictures behind an analyser along an axis, and across it.
+
+    Parameters
+    ----------
+    parallel, crossed
+        Of one shape, any unit. Through an analyser half of the light that is not polarized passes.
+
+    Examples
+    --------
+    >>> found = components(np.array([0.5, 0.25]), np.array([0.5, 0.0]))
+    >>> found["S0"].tolist(), found["S1"].tolist()
+    ([1.0, 0.25], [0.0, 0.25])
+    """
+    return {S0: parallel + crossed, S1: parallel - crossed}
+
+
+def write_stokes(session: Session, folder: Path, delivery: Delivery) -> list[tuple[str, str]]:
+    """Write a gradient-sphere session's images as Stokes images.
+
+    Parameters
+    ----------
+    session
+        Of the gradient sphere.
+    folder
+        Existing folder.
+    delivery
+        Its ``only`` names states such as "a000_n0"; with errors, standard errors are written
+        beside each image, and the mask of each state; its calibration is of the sensor.
+
+    Returns
+    -------
+    list of (str, str)
+        Patterns that were not taken with both polarizations.
+
+    Raises
+    ------
+    ExportError
+        For a session of another rig, or a state that it lacks.
+    """
+    if not session.frames("gradient"):
+        kinds = ", ".join(sorted({step.kind for step in session.plan.steps}))
+        raise ExportError(
+            f"{session.path}: shows {kinds}, expected patterns of the gradient sphere; of the "
+            "flash rig take `skinrig export APPEARANCE --to spectral`"
+        )
+    only, with_errors = delivery.only, delivery.with_errors
+    inputs = Inputs.of(session, delivery.calibration, state="neutral", on_date=None)
+    camera = session.frames("gradient")[0].camera
+    images = GradientImages(session, noise=_noise(inputs, camera))
+    names = [state.name for state in images.states]
+    unknown = [name for name in only if name not in names]
+    if unknown:
+        raise ExportError(f"--only: got {unknown[0]!r}, expected of {', '.join(names)}")
+    axis = session.rig.view(camera).analyser_axis_deg
+    if axis is None:
+        raise ExportError(
+            f"{session.path}: the rig does not say how its analyser lies; give the view "
+            "analyser_axis_deg"
+        )
+    what = (
+        "measured, by a picture along the analyser's axis and one across: S0 all light, S1 along "
+        f"the axis less across it; the axis lies {axis:g} degrees from x right towards y up; S2 "
+        "and S3 were not measured. A band of the sensor at its mean wavelength, not a narrow line"
+    )
+    files: dict[str, Any] = {}
+    left_out: list[tuple[str, str]] = []
+    for state in images.states:
+        if not only or state.name in only:
+            entries, missing = _write_state(state.name, images.of(state), folder, what, with_errors)
+            files |= entries
+            left_out += missing
+    if not files:
+        raise ExportError(
+            f"{session.path}: no pattern was taken both along and across the analyser's axis, "
+            "expected `skinrig plan gradient` with both polarizations"
+        )
+    told = {
+        "schema": SCHEMA,
+        "what": what,
+        "unit": "fraction of the sensor's full scale, darks subtracted, exposure as taken",
+        "channels": CHANNELS,
+        "reference_axis_deg": axis,
+        "image_frame": "against the picture's x axis S1 is "
+        f"{math.cos(math.radians(2 * axis)):.9g} of what was measured along the analyser",
+        "orientation": "as the camera sees it, row 0 is the top",
+        "leakage": "not taken off: what crossed films let through is in S0 and lowers S1",
+        "files": files,
+    }
+    write_session_document(folder / DOCUMENT_FILE, inputs, told, left_out)
+    return left_out
+
+
+def _write_state(
+    state: str, patterns: Patterns, folder: Path, what: str, with_errors: bool
+) -> tuple[dict[str, Any], list[tuple[str, str]]]:
+    """Write the images of one state; return what is in each file, and patterns left out."""
+    files: dict[str, Any] = {}
+    left_out = []
+    for pattern in sorted({pattern for pattern, _ in patterns.values}):
+        along, across = (pattern, PARALLEL), (pattern, CROSSED)
+        if not {along, across} <= set(patterns.values):
+            left_out.append((f"{state} {pattern}", "was taken with one polarization only"))
+            continue
+        stem = file_stem(state, pattern)
+        found = components(patterns.values[along], patterns.values[across])
+        channels = dict(zip(CHANNELS, found.values(), strict=True))
+        write_channels(folder / f"{stem}.exr", channels, stokes_header(what))
+        stderr = np.sqrt(patterns.variance[along] + patterns.variance[across])
+        figures = _figures(found, stderr, patterns.valid)
+        files[f"{stem}.exr"] = {"state": state, "pattern": pattern, **figures}
+        if with_errors:
+            told = {"unit": "1", "comments": "standard error of S0 and of S1, 68 %"}
+            write_channels(folder / f"{stem}.stderr.exr", {"Y": stderr}, told)
+    if with_errors:
+        mask = patterns.valid.astype(np.float32)
+        write_channels(folder / f"stokes_{state}.valid.exr", {"Y": mask}, {"unit": "1"})
+    return files, left_out
+
+
+def _noise(inputs: Any, camera: str) -> Any:
+
+    serial = inputs.session.rig.view(camera).serial
+    found = inputs.load("sensor", [serial], "the frames are as noisy as they say of themselves")
+    if found is None:
+        return None
+    known = SensorCalibration.from_calibration(found, serial)
+    return SensorNoise(float(known.gain_e_per_dn.value[0]), float(known.read_noise_e.value[0]))
+
+
+def file_stem(state: str, pattern: str) -> str:
+    """Return a Stokes image's name without suffix.
+
+    Examples
+    --------
+    >>> file_stem("a000_n0", "-x")
+    'stokes_a000_n0_minus_x'
+    """
+    return f"stokes_{state}_{pattern.replace('-', 'minus_')}"
+
+
+def _figures(
+    found: Mapping[str, Float32Array], stderr: Float32Array, valid: BoolArray
+) -> dict[str, float]:
+    """Return what is worth knowing of an image before it is opened, as JSON values."""
+    if not valid.any():
+        return {"valid_share": 0.0}
+    total, along = found[S0][valid].astype(np.float64), found[S1][valid].astype(np.float64)
+    return {
+        "valid_share": float(valid.mean()),
+        "degree_of_polarization": float(along.sum() / total.sum()) if total.sum() > 0.0 else 0.0,
+        # noise alone makes a difference exceed its sum, or fall below 0
+        "beyond_s0_by_3_stderr_share": float(np.mean(np.abs(along) - total > 3.0 * stderr[valid])),
     }

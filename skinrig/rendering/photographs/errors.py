@@ -11,16 +11,21 @@ two agree has no part in it. Everything else on the skin, shadows and their bord
 `total_error` only.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from skinrig.arrays import BoolArray, Float64Array
+from skinrig.console import Console
 from skinrig.drawing import png
+from skinrig.evaluating.skin_bands import bands_of
+from skinrig.rendering.camera import RenderingError
+from skinrig.rendering.render import Subsurface
 
 LUMINANCE_WEIGHTS: Final = (0.2126, 0.7152, 0.0722)
 MIN_SIGNAL_SIGMAS: Final = 10.0
@@ -30,10 +35,6 @@ MAX_MEDIAN_ERROR: Final = 0.05
 ERROR_PERCENTILES: Final = (50.0, 68.0, 90.0, 95.0)
 WHITE_PERCENTILE: Final = 99.0
 """Luminance of a photograph's skin that is shown as white before structures are compared."""
-
-
-class PhotographError(ValueError):
-    """Images that cannot be compared."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,12 +56,12 @@ class Photograph:
     def __post_init__(self) -> None:
         shape = np.shape(self.rgb)
         if len(shape) != 3 or shape[2] != 3 or np.shape(self.variance) != shape:
-            raise PhotographError(
+            raise RenderingError(
                 f"photograph: got rgb {shape} and variance {np.shape(self.variance)}, "
                 "expected (H, W, 3) both"
             )
         if np.shape(self.valid) != shape[:2]:
-            raise PhotographError(f"valid: got {np.shape(self.valid)}, expected {shape[:2]}")
+            raise RenderingError(f"valid: got {np.shape(self.valid)}, expected {shape[:2]}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,17 +145,17 @@ def compare(
 
     Raises
     ------
-    PhotographError
+    RenderingError
         When shapes differ or no pixel is covered.
     """
     image = np.asarray(rendering, np.float64)
     skin = np.asarray(covered, bool) & photograph.valid
     if image.shape != photograph.rgb.shape or skin.shape != image.shape[:2]:
-        raise PhotographError(
+        raise RenderingError(
             f"rendering: got {image.shape}, covered {skin.shape}, expected {photograph.rgb.shape}"
         )
     if not skin.any():
-        raise PhotographError("covered: got no pixel of measured skin that is not saturated")
+        raise RenderingError("covered: got no pixel of measured skin that is not saturated")
     chosen = lit_pixels(photograph, covered=covered, lit=lit)
     real, made = luminance(photograph.rgb), luminance(image)
     signed = np.full(real.shape, np.nan)
@@ -189,7 +190,7 @@ def similarity(photograph: ArrayLike, rendering: ArrayLike, skin: BoolArray) -> 
     white = max(float(np.percentile(light, WHITE_PERCENTILE)), 1e-30)
     pair = [tone_mapped(image, white) * skin[..., None] for image in (photograph, rendering)]
     if min(skin.shape) < 11:
-        raise PhotographError(f"image: got {skin.shape}, expected at least 11 x 11 pixels")
+        raise RenderingError(f"image: got {skin.shape}, expected at least 11 x 11 pixels")
     windows = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     _, full = structural_similarity(*pair, data_range=1.0, channel_axis=-1, full=True, **windows)
     return float(np.mean(np.asarray(full)[skin]))
@@ -233,12 +234,12 @@ def summarize(pairs: Sequence[PairError], *, rng: np.random.Generator) -> Summar
 
     Raises
     ------
-    PhotographError
+    RenderingError
         When they have no lit pixel.
     """
     values = [pair.relative[pair.lit] for pair in pairs]
     if not sum(len(v) for v in values):
-        raise PhotographError("photographs: got no lit pixel; are they underexposed?")
+        raise RenderingError("photographs: got no lit pixel; are they underexposed?")
     every = np.concatenate(values)
     again = [
         float(np.median(np.concatenate(drawn)))
@@ -289,3 +290,100 @@ def _sigma(photograph: Photograph) -> Float64Array:
     return np.asarray(
         np.sqrt(np.asarray(photograph.variance, np.float64) @ np.square(LUMINANCE_WEIGHTS))
     )
+
+
+FULL_MODEL: Final = "full model"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """What the photographs say of a model.
+
+    Attributes
+    ----------
+    subject
+        Pseudonym of the face.
+    full
+        Errors of the whole model.
+    by_kind
+        The same by why the photographs were not in the fit: "light", "view", ...
+    ablation
+        The same without parts; the key says what stands in.
+    by_band
+        Lit pixels and median error by band of skin color, see `skinrig.evaluating.skin_bands`.
+    typology_angle_deg
+        Median over the face, of the truth where there is one, else of R_d.
+    typology_of
+        "truth" or "r_d".
+    shots
+        What each photograph says: view, light, held_out, median, lit pixels, noise, ssim.
+    assumed
+        What was taken for granted.
+    subsurface
+        How the whole model treats light from inside.
+    seconds
+        Of rendering and comparing.
+    """
+
+    subject: str
+    full: Summary
+    by_kind: Mapping[str, Summary]
+    ablation: Mapping[str, Summary]
+    by_band: Mapping[str, tuple[int, float]]
+    typology_angle_deg: float
+    typology_of: str
+    shots: tuple[dict[str, Any], ...]
+    assumed: tuple[str, ...]
+    subsurface: Subsurface
+    seconds: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether the median relative error keeps to the limit."""
+        return self.full.median < MAX_MEDIAN_ERROR
+
+    def document(self) -> dict[str, Any]:
+        """Return this as JSON values."""
+        told = dataclasses.asdict(self)
+        told[FULL_MODEL], told["photographs"] = told.pop("full"), told.pop("shots")
+        told["by_band"] = {
+            band: {"pixels": pixels, "median": median}
+            for band, (pixels, median) in self.by_band.items()
+        }
+        return {
+            **told,
+            "band": str(bands_of(self.typology_angle_deg)),
+            "lit_pixels": (
+                "pixel and neighbors wholly on measured skin, every ray sees the whole light, not "
+                f"saturated, at least {MIN_SIGNAL_SIGMAS:g} times its noise"
+            ),
+            "limit": MAX_MEDIAN_ERROR,
+            "passed": self.passed,
+        }
+
+
+def print_comparison(console: Console, record: Mapping[str, Any]) -> None:
+    """Print a record of `evaluate_folders`."""
+    for assumption in record["assumed"]:
+        console.say(f"assumed: {assumption}")
+    full = record[FULL_MODEL]
+    held_out = {f"{name} held out": row for name, row in record["by_kind"].items()}
+    rows = {FULL_MODEL: full, **held_out, **record["ablation"]}
+    shares = ("median", "p68", "p95", "bias", "total_error")
+    console.rows(
+        ("model", "photographs", "median error, %", "68 %", "95 %", "bias", "all skin, %", "SSIM"),
+        [
+            (name, row["pairs"], *(round(100 * row[k], 2) for k in shares), round(row["ssim"], 4))
+            for name, row in rows.items()
+        ],
+    )
+    for band, row in record["by_band"].items():
+        console.say(f"{band} skin: {100 * row['median']:.2f} %, {row['pixels']} pixels")
+    word = "kept" if record["passed"] else "MISSED"
+    console.say(
+        f"{word}: median relative error of the luminance on lit pixels: "
+        f"{100 * full['median']:.2f} % (< {100 * record['limit']:g}); noise alone makes "
+        f"{100 * full['noise']:.2f} %"
+    )
+    console.say(f"{record['out']}: {', '.join(record['files'])}, {record['seconds']:.1f} s")
+    console.document(record["schema"], {k: v for k, v in record.items() if k != "schema"})

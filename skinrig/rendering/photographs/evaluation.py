@@ -1,9 +1,11 @@
 """Renderings of a fitted model against photographs under lights and views that it has not seen."""
 
+from __future__ import annotations
+
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,19 +15,24 @@ from numpy.typing import NDArray
 from model import fresnel, store
 from model.skin import SkinAppearance
 from model.skin_reflectance import SkinReflectance, assemble
-from rigsim.geometry.atlas import sample
+from rigsim.geometry.atlas import sample, unwrap
+from rigsim.geometry.mesh import Mesh
 from rigsim.render import Caster
 from skinrig.arrays import Float32Array
 from skinrig.drawing import png
 from skinrig.evaluating.skin_bands import bands_of, typology_angle_deg
 from skinrig.rendering import folder
+from skinrig.rendering.folder import Panel, exposure_of, sheet, tone
 from skinrig.rendering.geometry import FittedSurface, own_mesh
-from skinrig.rendering.images import Panel, exposure_of, sheet, tone
 from skinrig.rendering.interior import Interior
-from skinrig.rendering.photographs import errors as photograph_errors
-from skinrig.rendering.photographs.ablation import without_parts
-from skinrig.rendering.photographs.comparison import Comparison
-from skinrig.rendering.photographs.errors import PairError, Photograph, Summary
+from skinrig.rendering.photographs.errors import (
+    Comparison,
+    PairError,
+    Photograph,
+    by_band,
+    compare,
+    summarize,
+)
 from skinrig.rendering.photographs.held_out import Photographs, Shot
 from skinrig.rendering.render import Rendering, Subsurface, render
 from skinrig.rendering.request import read_model
@@ -35,7 +42,20 @@ N_PICTURES: Final = 6
 MAX_SHOWN_ERROR: Final = 0.2
 """Relative error at the end of the pictures' scale."""
 
-Tell = Callable[[str], None]
+
+@dataclass(frozen=True, slots=True)
+class Judging:
+    """How photographs are compared with renderings."""
+
+    subsurface: Subsurface = "dipole"
+    """How the whole model treats light from inside."""
+    count: int | None = None
+    """So many of the photographs, even over them; None: all."""
+    ablation: bool = True
+    """Whether the model is rendered without each of its parts, too."""
+    seed: int = 0
+    """Of intervals."""
+    progress: Callable[[str], None] = field(default=lambda _: None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,24 +65,35 @@ class _Surface:
     laid: FittedSurface
     caster: Caster
     interior: Interior | None
+    photographs: Photographs
 
-    def render(self, photographs: Photographs, shot: Shot, subsurface: Subsurface) -> Rendering:
-        shown = photographs.camera(shot), photographs.light(shot)
+    def render(self, shot: Shot, subsurface: Subsurface) -> Rendering:
+        shown = self.photographs.camera(shot), self.photographs.light(shot)
         below = self.interior
         return render(self.laid, *shown, subsurface=subsurface, caster=self.caster, interior=below)
+
+    def without(
+        self, made: Rendering, shot: Shot, fewer: Mapping[str, _Surface]
+    ) -> Iterator[tuple[str, Float32Array]]:
+        """Yield renderings without parts, beside that of the whole."""
+        yield "without the surface", made.diffuse
+        yield "without light from inside", made.surface
+        if made.subsurface == "dipole":
+            yield "light that does not spread", self.render(shot, "local").radiance
+        for name, less in fewer.items():
+            if name == "one lobe":  # nothing changes inside
+                yield name, made.diffuse + less.render(shot, "none").surface
+            else:
+                yield name, less.render(shot, made.subsurface).radiance
 
 
 def evaluate(
     appearance: SkinAppearance,
     photographs: Photographs,
+    how: Judging,
     *,
     truth: SkinAppearance | None = None,
-    subsurface: Subsurface = "dipole",
-    count: int | None = None,
-    ablation: bool = True,
     model: SkinReflectance | None = None,
-    rng: np.random.Generator,
-    progress: Tell | None = None,
 ) -> tuple[Comparison, dict[str, bytes]]:
     """Render what the photographs show, and compare.
 
@@ -72,20 +103,12 @@ def evaluate(
         Fitted, with its mesh.
     photographs
         Those it was not fitted to.
+    how
+        Light from inside, number of photographs, whether parts are left out.
     truth
         Of the face, where it is simulated; tells its skin color only.
-    subsurface
-        How the whole model treats light from inside.
-    count
-        So many of the photographs, even over them; None: all.
-    ablation
-        Whether the model is rendered without each of its parts, too.
     model
         The appearance's model, where something of it is to be another; None: as it is.
-    rng
-        For intervals.
-    progress
-        Called with a line of text now and then.
 
     Returns
     -------
@@ -95,54 +118,56 @@ def evaluate(
 
     Raises
     ------
-    PhotographError, PhotographsError, RenderingError, GeometryError, SkinReflectanceError
+    RenderingError, GeometryError, SkinReflectanceError
         Where there is nothing to compare, or the model lacks a part.
     """
     begun = time.perf_counter()
+    rng = np.random.default_rng(how.seed)
     whole = assemble(appearance) if model is None else model
     mesh = own_mesh(appearance)
-    caster = Caster(mesh)
     laid = FittedSurface.of(whole, mesh)
-    interior = Interior.of(laid) if subsurface == "dipole" else None
-    surface = _Surface(laid, caster, interior)
+    below = Caster(mesh), Interior.of(laid) if how.subsurface == "dipole" else None, photographs
+    surface = _Surface(laid, *below)
     fewer = {
-        name: _Surface(FittedSurface.of(less, mesh), caster, interior)
-        for name, less in (without_parts(whole, mesh) if ablation else {}).items()
+        name: _Surface(FittedSurface.of(less, mesh), *below)
+        for name, less in (without_parts(whole, mesh) if how.ablation else {}).items()
     }
-    chosen = photographs.chosen(count)
+    chosen = photographs.chosen(how.count)
     drawn = {chosen[int(k)] for k in np.linspace(0, len(chosen) - 1, min(N_PICTURES, len(chosen)))}
     pairs: list[PairError] = []
     bands: list[NDArray[np.str_]] = []
     parts: dict[str, list[PairError]] = {}
+    kinds: dict[str, list[PairError]] = {}
     pictures: dict[str, bytes] = {}
     rows: list[dict[str, Any]] = []
     for number, shot in enumerate(chosen):
-        if progress is not None:
-            progress(f"{number + 1}/{len(chosen)} {shot.view} {shot.light}")
+        how.progress(f"{number + 1}/{len(chosen)} {shot.view} {shot.light}")
         photo = photographs.photograph(shot)
-        made = surface.render(photographs, shot, subsurface)
+        made = surface.render(shot, how.subsurface)
         pair = _compare(photo, made, made.radiance)
         pairs.append(pair)
+        if pair.lit.any():
+            kinds.setdefault(shot.held_out, []).append(pair)
         bands.append(_bands(whole, made))
         told = {name: getattr(pair, name) for name in ("median", "noise", "ssim", "total_error")}
         lit = int(np.count_nonzero(pair.lit))
         rows.append({**dataclasses.asdict(shot), **told, "lit_pixels": lit})
-        for name, image in _without(surface, fewer, photographs, shot, subsurface, made, ablation):
+        for name, image in surface.without(made, shot, fewer) if how.ablation else ():
             parts.setdefault(name, []).append(_compare(photo, made, image))
         if shot in drawn:
             pictures[f"{shot.view}-{shot.light}"] = _sheet(photo, made, pair, shot)
     angle, of = _angle(whole, truth)
     comparison = Comparison(
         subject=photographs.subject,
-        full=photograph_errors.summarize(pairs, rng=rng),
-        by_kind=_by_kind(pairs, chosen, rng),
-        ablation={name: photograph_errors.summarize(some, rng=rng) for name, some in parts.items()},
-        by_band=photograph_errors.by_band(pairs, bands),
+        full=summarize(pairs, rng=rng),
+        by_kind={kind: summarize(some, rng=rng) for kind, some in kinds.items()},
+        ablation={name: summarize(some, rng=rng) for name, some in parts.items()},
+        by_band=by_band(pairs, bands),
         typology_angle_deg=angle,
         typology_of=of,
         shots=tuple(rows),
         assumed=(*photographs.assumed, *whole.assumed),
-        subsurface=subsurface,
+        subsurface=how.subsurface,
         seconds=time.perf_counter() - begun,
     )
     return comparison, pictures
@@ -152,18 +177,14 @@ def evaluate_folders(
     appearance: Path,
     session: Path,
     out: Path,
+    how: Judging,
     *,
     calibration: Path | None = None,
-    subsurface: Subsurface = "dipole",
     translucency: str | None = None,
-    count: int | None = None,
-    ablation: bool = True,
-    seed: int = 0,
-    progress: Tell | None = None,
 ) -> dict[str, Any]:
     """Compare an APPEARANCE/ with a SESSION/ and write pictures and record to ``out``.
 
-    Parameters are those of `evaluate`; the truth is found beside the appearance where it names one.
+    The truth is found beside the appearance where it names one.
 
     Returns
     -------
@@ -176,17 +197,7 @@ def evaluate_folders(
     named = str(read.parameters.get("truth", "") or "")
     beside = appearance.resolve().parent / named
     found = store.read(beside) if named and (beside / store.DOCUMENT_FILE).is_file() else None
-    comparison, pictures = evaluate(
-        read,
-        photographs,
-        truth=found,
-        subsurface=subsurface,
-        count=count,
-        ablation=ablation,
-        model=model,
-        rng=np.random.default_rng(seed),
-        progress=progress,
-    )
+    comparison, pictures = evaluate(read, photographs, how, truth=found, model=model)
     document = {
         "kind": "comparison with photographs",
         "appearance": appearance,
@@ -198,42 +209,7 @@ def evaluate_folders(
 
 
 def _compare(photo: Photograph, made: Rendering, image: Float32Array) -> PairError:
-    return photograph_errors.compare(photo, image, covered=made.covered, lit=made.lit)
-
-
-def _by_kind(
-    pairs: list[PairError], shots: tuple[Shot, ...], rng: np.random.Generator
-) -> dict[str, Summary]:
-    found: dict[str, list[PairError]] = {}
-    for pair, shot in zip(pairs, shots, strict=True):
-        if pair.lit.any():
-            found.setdefault(shot.held_out, []).append(pair)
-    return {kind: photograph_errors.summarize(some, rng=rng) for kind, some in found.items()}
-
-
-def _without(
-    surface: _Surface,
-    fewer: Mapping[str, _Surface],
-    photographs: Photographs,
-    shot: Shot,
-    subsurface: Subsurface,
-    made: Rendering,
-    ablation: bool,
-) -> list[tuple[str, Float32Array]]:
-    """Return renderings without parts."""
-    if not ablation:
-        return []
-    out = [("without the surface", made.diffuse), ("without light from inside", made.surface)]
-    if subsurface == "dipole":
-        local = surface.render(photographs, shot, "local")
-        out.append(("light that does not spread", local.radiance))
-    for name, less in fewer.items():
-        if name == "one lobe":  # nothing changes inside
-            only = less.render(photographs, shot, "none")
-            out.append((name, made.diffuse + only.surface))
-        else:
-            out.append((name, less.render(photographs, shot, subsurface).radiance))
-    return out
+    return compare(photo, image, covered=made.covered, lit=made.lit)
 
 
 def _bands(model: SkinReflectance, made: Rendering) -> NDArray[np.str_]:
@@ -277,3 +253,49 @@ def _sheet(photo: Photograph, made: Rendering, pair: PairError, shot: Shot) -> b
     ]
     held_out = f"{shot.view} {shot.light} ({shot.held_out} held out)"
     return sheet([panels], title=f"{held_out}: median {100 * pair.median:.1f} %")
+
+
+def without_parts(model: SkinReflectance, mesh: Mesh) -> Mapping[str, SkinReflectance]:
+    """Return the models that have less, by what they have instead.
+
+    Parameters
+    ----------
+    model
+        The whole.
+    mesh
+        That it lies on; its own normals are those of the scan.
+
+    Returns
+    -------
+    mapping
+        "one lobe": the mixture of lobes that the face has on average, of each texel's own strength;
+        "scanned normals": those of the mesh; "even albedo": the face's mean R_d everywhere.
+    """
+    flat = unwrap(mesh, model.valid.shape[0]).normal
+    length = np.linalg.norm(flat, axis=-1, keepdims=True)
+    normals = np.where(length > 0.5, flat / np.maximum(length, 1e-9), model.normals)
+    mean = model.r_d[model.valid].mean(axis=0, dtype=np.float64)
+    return {
+        "one lobe": dataclasses.replace(model, weights=one_lobe(model)),
+        "scanned normals": dataclasses.replace(model, normals=normals.astype(np.float32)),
+        "even albedo": dataclasses.replace(
+            model, r_d=np.broadcast_to(mean, model.r_d.shape).astype(np.float32), r_d_stderr=None
+        ),
+    }
+
+
+def one_lobe(model: SkinReflectance) -> Float32Array:
+    """Return weights of one common mixture, scaled at each texel to reflect most like its own.
+
+    Returns
+    -------
+    ndarray of float32, shape (H, W, K)
+        The least squares over the lobes' grid, directions counting by solid angle.
+    """
+    strength = model.lobes.strength()
+    gram = model.lobes.kinship() * np.outer(strength, strength)
+    shares = model.weights.astype(np.float64)
+    common = shares[model.valid].mean(axis=0)
+    size = float(common @ gram @ common)
+    scale = shares @ gram @ common / size if size > 0 else np.zeros(shares.shape[:2])
+    return (scale[..., None] * common).astype(np.float32)

@@ -18,14 +18,10 @@ from reconstruction.pipeline.hold_out import HoldOut
 from reconstruction.pipeline.inputs import Inputs
 from reconstruction.scan.repair import TriangleMesh
 from reconstruction.surface.estimates import MIN_LIGHTS
-from skinrig.rendering.camera import Camera, binned
+from skinrig.rendering.camera import Camera, RenderingError, binned
 from skinrig.rendering.geometry import own_mesh
 from skinrig.rendering.lights import Light
 from skinrig.rendering.photographs.errors import Photograph
-
-
-class PhotographsError(ValueError):
-    """A session without photographs to compare with."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,14 +72,14 @@ class Photographs:
 
         Raises
         ------
-        PhotographsError
+        RenderingError
             The session was fitted to whole, or is none of the dome.
         InputsError, CalibrationError
             It lacks frames, or a calibration is damaged or of another rig.
         """
         opened = Session.open(session)
         if not any(step.kind == "olat" for step in opened.plan.steps):
-            raise PhotographsError(
+            raise RenderingError(
                 f"{opened.path}: has no photographs under one light each; give one of the "
                 "dome with a face"
             )
@@ -92,7 +88,7 @@ class Photographs:
         same = appearance.inputs.get("session") == opened.content_hash
         held = _held_out(appearance) if same else HoldOut()
         if same and not held:
-            raise PhotographsError(
+            raise RenderingError(
                 f"{opened.path}: the model was fitted to all of its photographs; fit again "
                 "with `skinrig reconstruct --hold-out lights=NAMES,views=NAMES`, or compare with "
                 "another session of the same face"
@@ -105,7 +101,7 @@ class Photographs:
             if light in good and (not same or held.holds(light, view))
         ]
         if not shots:
-            raise PhotographsError(f"{opened.path}: none of its lights is calibrated")
+            raise RenderingError(f"{opened.path}: none of its lights is calibrated")
         assumed = list(inputs.assumed)
         away = tuple(float(r) for r in np.linalg.norm(dome.table.position_mm, axis=1))
         if not same:
@@ -201,6 +197,6 @@ def _evenly(shots: Sequence[Shot], count: int | None) -> tuple[Shot, ...]:
     if count is None or count >= len(shots):
         return tuple(shots)
     if count < 1:
-        raise PhotographsError(f"photographs: got {count}, expected at least 1")
+        raise RenderingError(f"photographs: got {count}, expected at least 1")
     places = np.floor((np.arange(count) + 0.5) * len(shots) / count).astype(int)
     return tuple(shots[k] for k in places)

@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model import store
 from skinrig.arrays import Float64Array
 from skinrig.reporting import map_images, page, provenance
-from skinrig.reporting.comparison import conditions
+from skinrig.reporting.comparison import runs
 from skinrig.reporting.comparison.runs import Run, paired
 from skinrig.reporting.sections import images as image_section
 
@@ -166,7 +165,7 @@ def _drawn(a: Run, b: Run, one: ImageDifference) -> Iterator[page.Image]:
 
 def _records(a: Run, b: Run, path_a: Path, path_b: Path) -> page.Block:
     sides = [provenance.flattened(_document(path)) for path in (path_a, path_b)]
-    rows = conditions.unequal(*sides)
+    rows = runs.unequal(*sides)
     if not rows:
         return page.note("What was asked for, and all that the records say, is the same.")
     return page.table(
@@ -181,7 +180,7 @@ def _document(folder: Path) -> Mapping[str, Any]:
 
 
 def _linear(path: Path) -> Float64Array:
-    return _layers(store.read_exr(path))
+    return np.atleast_3d(store.read_exr(path).astype(np.float64))
 
 
 def _codes(path: Path) -> Float64Array:
@@ -191,13 +190,8 @@ def _codes(path: Path) -> Float64Array:
     if read is None:
         raise ValueError("is no picture")
     top = float(np.iinfo(read.dtype).max)
-    layers = _layers(read)
+    layers = np.atleast_3d(read.astype(np.float64))
     return layers[..., [2, 1, 0]] / top if layers.shape[-1] >= 3 else layers / top
-
-
-def _layers(values: NDArray[Any]) -> Float64Array:
-    image = np.asarray(values, np.float64)
-    return image if image.ndim == 3 else image[..., None]
 
 
 def _size(image: Float64Array) -> str:

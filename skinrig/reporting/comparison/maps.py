@@ -1,13 +1,18 @@
 """Two estimates of one map: how far apart they are, in the unit and in their standard errors."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from model import metrics
-from model.skin import SkinMap
+from model.skin import SkinAppearance, SkinMap
 from skinrig.arrays import BoolArray, Float64Array
+from skinrig.evaluating import flash, microrelief, subsurface
+from skinrig.evaluating import surface as surface_evaluation
+from skinrig.evaluating.surface import errors_by_band
 from skinrig.reporting.page import short_unit
+from skinrig.written_units import unit_sign
 
 SIGMA_LEVELS = (1.0, 2.0, 3.0)
 """Combined standard errors that shares of pixels beyond are told for."""
@@ -103,61 +108,14 @@ def compare(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
         )
     if a.unit != b.unit:
         raise ValueError(f"{name}: got units {a.unit!r} and {b.unit!r}, expected the same")
-    if "normals" in name and a.values.ndim == 3:
-        return _of_normals(name, a, b)
-    return _of_values(name, a, b)
-
-
-def _of_values(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
-    va, vb = a.values.astype(np.float64), b.values.astype(np.float64)
-    both = _known(a) & _known(b)
-    difference = vb - va
-    sigmas = spread = None
-    if a.stderr is not None and b.stderr is not None:
-        spread = np.hypot(a.stderr.astype(np.float64), b.stderr.astype(np.float64))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            sigmas = np.where(difference == 0.0, 0.0, difference / spread)
-    medians = _median(va[both]), _median(vb[both]), _median(difference[both])
-    return _difference(name, short_unit(a.unit), a, b, medians, difference, spread, sigmas)
-
-
-def _of_normals(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
-    from scipy.special import ndtri
-
-    both = _known(a) & _known(b)
-    angle = np.full(both.shape, np.nan)
-    angle[both] = metrics.angular_error_rad(
-        a.values[both].astype(np.float64), b.values[both].astype(np.float64)
-    )
-    sigmas = spread = None
-    if a.stderr is not None and b.stderr is not None:
-        spread = np.hypot(a.stderr[..., 0].astype(np.float64), b.stderr[..., 0].astype(np.float64))
-        # an angle is the length of errors in two directions: as many standard errors as a number
-        # would be off by with the same chance, exp(-angle^2 / 2 spread^2)
-        with np.errstate(divide="ignore", invalid="ignore", under="ignore"):
-            chance = np.exp(-0.5 * np.square(angle / spread))
-        chance = np.where(angle == 0.0, 1.0, chance)
-        sigmas = np.fmin(-ndtri(np.maximum(0.5 * chance, 1e-300)), MAX_SIGMAS)
-        spread = np.degrees(spread)
-    return _difference(name, "°", a, b, (np.nan, np.nan, np.nan), np.degrees(angle), spread, sigmas)
-
-
-def _difference(
-    name: str,
-    unit: str,
-    a: SkinMap,
-    b: SkinMap,
-    medians: tuple[float, float, float],
-    difference: Float64Array,
-    spread: Float64Array | None,
-    sigmas: Float64Array | None,
-) -> MapDifference:
-    """Summarize a difference in its unit, and over the combined standard error."""
-    good_a, good_b = _known(a), _known(b)
-    both = good_a & good_b
-    only = int((good_a & ~good_b).sum()), int((good_b & ~good_a).sum())
+    both = a.mask & b.mask
+    normals = "normals" in name and a.values.ndim == 3
+    difference, spread, sigmas = (_of_normals if normals else _of_values)(a, b, both)
+    medians = np.nan, np.nan, np.nan
+    if not normals:
+        va, vb = (one.values[both].astype(np.float64) for one in (a, b))
+        medians = _median(va), _median(vb), _median(difference[both])
     told = np.abs(difference[both])
-    high = float(np.percentile(told, 95)) if told.size else float("nan")
     combined = float("nan")
     beyond: tuple[float, ...] = ()
     if spread is not None and sigmas is not None:
@@ -167,16 +125,52 @@ def _difference(
             sigmas = np.take_along_axis(sigmas, farthest, axis=2)[..., 0]
         sigmas = np.where(both, np.clip(sigmas, -MAX_SIGMAS, MAX_SIGMAS), np.nan)
     flat = difference if difference.ndim == 2 else difference.mean(axis=2)
-    middle = *medians, _median(told)
-    drawn = np.where(both, flat, np.nan)
-    pixels = int(both.sum()), *only
-    return MapDifference(name, unit, *pixels, *middle, high, combined, beyond, drawn, sigmas)
+    return MapDifference(
+        name,
+        "°" if normals else short_unit(a.unit),
+        int(both.sum()),
+        int((a.mask & ~b.mask).sum()),
+        int((b.mask & ~a.mask).sum()),
+        *medians,
+        _median(told),
+        float(np.percentile(told, 95)) if told.size else float("nan"),
+        combined,
+        beyond,
+        np.where(both, flat, np.nan),
+        sigmas,
+    )
 
 
-def _known(one: SkinMap) -> BoolArray:
-    finite = np.isfinite(one.values)
-    good = finite if finite.ndim == 2 else finite.all(axis=2)
-    return np.asarray(good & one.mask, bool)
+Differing = tuple[Float64Array, Float64Array | None, Float64Array | None]
+"""Difference, combined standard error, and the one over the other; None without errors."""
+
+
+def _of_values(a: SkinMap, b: SkinMap, both: BoolArray) -> Differing:
+    difference = b.values.astype(np.float64) - a.values
+    if a.stderr is None or b.stderr is None:
+        return difference, None, None
+    spread = np.hypot(a.stderr.astype(np.float64), b.stderr.astype(np.float64))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return difference, spread, np.where(difference == 0.0, 0.0, difference / spread)
+
+
+def _of_normals(a: SkinMap, b: SkinMap, both: BoolArray) -> Differing:
+    from scipy.special import ndtri
+
+    angle = np.full(both.shape, np.nan)
+    angle[both] = metrics.angular_error_rad(
+        a.values[both].astype(np.float64), b.values[both].astype(np.float64)
+    )
+    if a.stderr is None or b.stderr is None:
+        return np.degrees(angle), None, None
+    spread = np.hypot(a.stderr[..., 0].astype(np.float64), b.stderr[..., 0].astype(np.float64))
+    # an angle is the length of errors in two directions: as many standard errors as a number
+    # would be off by with the same chance, exp(-angle^2 / 2 spread^2)
+    with np.errstate(divide="ignore", invalid="ignore", under="ignore"):
+        chance = np.exp(-0.5 * np.square(angle / spread))
+    chance = np.where(angle == 0.0, 1.0, chance)
+    sigmas = np.fmin(-ndtri(np.maximum(0.5 * chance, 1e-300)), MAX_SIGMAS)
+    return np.degrees(angle), np.degrees(spread), sigmas
 
 
 def _beyond(sigmas: Float64Array) -> tuple[float, ...]:
@@ -189,3 +183,84 @@ def _beyond(sigmas: Float64Array) -> tuple[float, ...]:
 def _median(values: Float64Array) -> float:
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if finite.size else float("nan")
+
+
+@dataclass(frozen=True, slots=True)
+class TruthError:
+    """One error against the truth.
+
+    Attributes
+    ----------
+    quantity, skin
+        What is in error, and on which skin: a band, a state, or "all".
+    unit
+        Of the error.
+    error
+        Median, or what the quantity names.
+    interval
+        68 % bootstrap interval; NaN where none is known.
+    coverage
+        Share of truths inside the 68 % intervals; NaN where it is not told.
+    """
+
+    quantity: str
+    skin: str
+    unit: str
+    error: float
+    interval: tuple[float, float] = (float("nan"), float("nan"))
+    coverage: float = float("nan")
+
+
+def truth_errors(appearance: SkinAppearance, truth: SkinAppearance) -> list[TruthError]:
+    """Return the errors of an appearance by quantity and skin.
+
+    Parameters
+    ----------
+    appearance
+        Of a flash camera, a dome, a gradient sphere or a fibre probe.
+    truth
+        Of the same session.
+    """
+    rows: list[TruthError] = []
+    if "position" in appearance.maps:
+        rows += _surface_errors(appearance, truth)
+    elif microrelief.states_of(appearance):
+        rows += _microrelief_errors(appearance, truth)
+    elif "melanin" in truth.maps:
+        rows += _chromophore_errors(appearance, truth)
+    if subsurface.true_profiles(truth):
+        rows += _subsurface_errors(appearance, truth)
+    return rows
+
+
+def _chromophore_errors(appearance: SkinAppearance, truth: SkinAppearance) -> Iterator[TruthError]:
+    for row in flash.compare(appearance, truth, rng=np.random.default_rng(0)):
+        name = f"{row.name}, median relative error against the {row.against} truth"
+        interval = 100 * row.interval[0], 100 * row.interval[1]
+        got = 100 * row.median_relative
+        yield TruthError(name, row.band_name, "%", got, interval, row.coverage.share)
+
+
+def _surface_errors(appearance: SkinAppearance, truth: SkinAppearance) -> Iterator[TruthError]:
+    for row in surface_evaluation.compare(appearance, truth, rng=np.random.default_rng(0)):
+        name, unit = f"{row.name}, median error", unit_sign(row.unit)
+        yield TruthError(name, "all", unit, row.median, row.interval, row.coverage.share)
+    for name, unit, band, _, _, middle, _ in errors_by_band(appearance, truth):
+        yield TruthError(f"{name}, median error", f"{band} skin", unit, middle)
+
+
+def _microrelief_errors(appearance: SkinAppearance, truth: SkinAppearance) -> Iterator[TruthError]:
+    for one in microrelief.compare(appearance, truth, rng=np.random.default_rng(0)):
+        angles = one.median_deg, one.interval_deg, one.coverage
+        yield TruthError("normals, median error", one.state, "°", *angles)
+        if np.isfinite(one.height_um):
+            name, got = "height, rms error of relief", 100 * one.height_relative
+            yield TruthError(name, one.state, "%", got, coverage=one.height_coverage)
+
+
+def _subsurface_errors(appearance: SkinAppearance, truth: SkinAppearance) -> Iterator[TruthError]:
+    fits = subsurface.compare_fits(appearance, truth)
+    for kind in dict.fromkeys(row.kind for row in fits):
+        for one in subsurface.by_method([row for row in fits if row.kind == kind]):
+            name, skin = f"sigma_tr by {one.method}, median relative error", f"{kind} tissue"
+            yield TruthError(name, skin, "%", 100 * one.median, coverage=one.coverage)

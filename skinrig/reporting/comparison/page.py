@@ -1,20 +1,20 @@
 """The report on two runs: what changed, where estimates disagree, and what made the difference."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skinrig.appearances.front_view import FrontView
-from skinrig.evaluating.flash import MELANIN_RANGES
-from skinrig.reporting import consents, map_images, page
-from skinrig.reporting.comparison import checks as check_comparison
-from skinrig.reporting.comparison import conditions, truth_errors
+from skinrig.reporting import map_images, page, provenance
 from skinrig.reporting.comparison import images as image_comparison
+from skinrig.reporting.comparison import maps as comparison_maps
+from skinrig.reporting.comparison import runs
 from skinrig.reporting.comparison.maps import MapDifference
 from skinrig.reporting.comparison.runs import Pair, Run, alone
-from skinrig.reporting.map_names import heading, melanin_band, words
+from skinrig.reporting.map_names import heading, melanin_bands, words
 from skinrig.written_units import written
 
 IMAGE_WIDTH_PX = 200
@@ -28,7 +28,7 @@ MAX_SHOWN_SIGMAS = 5.0
 
 def lead(a: Run, b: Run, found: Sequence[Pair]) -> Iterator[page.Block]:
     """Yield what changed in sentences, and the checks of both."""
-    rows = check_comparison.rows_of(a, b)
+    rows = rows_of(a, b)
     changed = [row for row in rows if row.changed]
     disagree = [(pair.name, one) for pair in found for one in pair.differences if one.disagree]
     told = sum(bool(one.beyond) for pair in found for one in pair.differences)
@@ -65,7 +65,7 @@ def lead(a: Run, b: Run, found: Sequence[Pair]) -> Iterator[page.Block]:
             f"leaves 0.27 %. The {min(len(worst), MAX_NAMED_MAPS)} farthest of {len(worst)}."
         )
         yield page.Bullets([f"{name}: {_in_words(one)}" for name, one in worst[:MAX_NAMED_MAPS]])
-    yield from check_comparison.table(a, b, rows)
+    yield from check_table(a, b, rows)
 
 
 def _in_words(one: MapDifference) -> str:
@@ -85,9 +85,9 @@ def sections(a: Run, b: Run, found: Sequence[Pair]) -> Iterator[page.Block]:
     """Yield maps, errors against the truths, settings and times of both."""
     for pair in found:
         yield from _pair(a, b, pair)
-    yield from conditions.benchmarks(a, b)
-    yield from conditions.seconds(a, b)
-    yield from conditions.moved_calibrations(a, b)
+    yield from runs.benchmarks(a, b)
+    yield from runs.seconds(a, b)
+    yield from runs.moved_calibrations(a, b)
     yield from image_comparison.section(a, b)
     if missing := alone(a, b):
         yield page.Heading("Only in one", level=2)
@@ -96,7 +96,7 @@ def sections(a: Run, b: Run, found: Sequence[Pair]) -> Iterator[page.Block]:
             missing,
             caption="Folders of maps or pictures without one of the same name",
         )
-    yield from consents.section([a.found, b.found])
+    yield from provenance.consent_section([a.found, b.found])
 
 
 def _pair(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
@@ -114,7 +114,7 @@ def _pair(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
     yield from _images(a, b, pair)
     yield from _by_band(pair)
     yield from _errors(a, b, pair)
-    yield from conditions.settings(a, b, pair)
+    yield from runs.settings(a, b, pair)
 
 
 def _farthest_first(one: MapDifference) -> tuple[float, str]:
@@ -188,13 +188,10 @@ def _by_band(pair: Pair) -> Iterator[page.Block]:
     for one in pair.differences:
         if one.sigmas is None or one.difference.shape != level.shape:
             continue
-        for low, high in MELANIN_RANGES:
-            inside = (level >= low) & (level < high) & ~np.isnan(one.difference)
-            inside &= ~np.isnan(one.sigmas)
-            if np.count_nonzero(inside) < 20:
-                continue
+        known = ~np.isnan(one.difference) & ~np.isnan(one.sigmas)
+        for band, inside in melanin_bands(level, known):
             off, sigmas = one.difference[inside], np.abs(one.sigmas[inside])
-            rows.append((words(one.name), melanin_band(low, high), one.unit, off, sigmas))
+            rows.append((words(one.name), band, one.unit, off, sigmas))
     if rows:
         yield page.view("compared_bands", bands=rows)
 
@@ -211,7 +208,7 @@ def _errors(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
         )
         return
     found_a, found_b = (
-        {(row.quantity, row.skin): row for row in truth_errors.of(side, truth)}
+        {(row.quantity, row.skin): row for row in comparison_maps.truth_errors(side, truth)}
         for side, truth in ((pair.a, truths[0]), (pair.b, truths[1]))
     )
     rows = [(one, found_b[key]) for key, one in found_a.items() if key in found_b]
@@ -223,3 +220,78 @@ def _errors(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
         if key in truths[1].maps
     )
     yield page.view("compared_errors", errors=rows, truths_differ=differ)
+
+
+@dataclass(frozen=True, slots=True)
+class CheckRow:
+    """A check of one or both runs."""
+
+    name: str
+    a: page.Check | None
+    b: page.Check | None
+
+    @property
+    def changed(self) -> str:
+        """Return "better" or "worse" where the verdict changed."""
+        if self.a is None or self.b is None or self.a.passed == self.b.passed:
+            return ""
+        return "better" if self.b.passed else "worse"
+
+    @property
+    def outcome(self) -> str:
+        """What became of the verdict, in words."""
+        return self.changed or ("no" if self.a and self.b else "only in one")
+
+    @property
+    def difference(self) -> float:
+        """What B measured less what A did; NaN where one did not."""
+        return float("nan") if self.a is None or self.b is None else self.b.got - self.a.got
+
+
+def rows_of(a: Run, b: Run) -> list[CheckRow]:
+    """Return the checks of two runs by name, verdicts that changed first."""
+    by_a = {_common_name(check, a, b): check for check in a.checks}
+    by_b = {_common_name(check, b, a): check for check in b.checks}
+    rows = [CheckRow(name, by_a.get(name), by_b.get(name)) for name in {**by_a, **by_b}]
+    return sorted(rows, key=lambda row: (row.changed != "worse", row.changed != "better"))
+
+
+def _common_name(check: page.Check, run: Run, other: Run) -> str:
+    """Return a check's name without the folder's where the two folders are named differently."""
+    name = check.name
+    if len(run.appearances) == len(other.appearances) == 1:
+        name = name.removeprefix(f"{next(iter(run.appearances))}: ")
+    if len(run.found.pictures) == len(other.found.pictures) == 1:
+        name = name.removeprefix(f"{run.found.pictures[0].name}: ")
+    return name
+
+
+def check_table(a: Run, b: Run, rows: Sequence[CheckRow]) -> Iterator[page.Block]:
+    """Yield the section on checks of both; empty without any."""
+    if not rows:
+        return
+
+    def told(check: page.Check | None) -> str:
+        if check is None:
+            return "not checked"
+        return written(page.number(check.got), check.unit) + (
+            ", kept" if check.passed else ", missed"
+        )
+
+    def limit(row: CheckRow) -> str:
+        bounds = [
+            f"{'≤' if c.sense == '<=' else '≥'} {written(page.number(c.bound), c.unit)}"
+            for c in (row.a, row.b)
+            if c is not None
+        ]
+        return " and ".join(dict.fromkeys(bounds))
+
+    yield page.Heading("Checks of both", level=2)
+    yield page.table(
+        ("check", a.label, b.label, "difference", "limit", "changed"),
+        [
+            (row.name, told(row.a), told(row.b), row.difference, limit(row), row.outcome)
+            for row in rows
+        ],
+        caption="Verdicts that changed stand first; limits that follow a bound may differ",
+    )

@@ -118,7 +118,9 @@ def _age(
     """Return the days that were left at each capture, and the table's row."""
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     users = sorted(
-        name for name, one in appearances.items() if digest in _plain(one.inputs.values())
+        name
+        for name, one in appearances.items()
+        if digest in {str(d).removeprefix("sha256:") for d in one.inputs.values()}
     )
     captured = sorted(
         {
@@ -144,10 +146,6 @@ def _age(
         ", ".join(map(str, ages)),
         f"{verdict}; {found.source}",
     )
-
-
-def _plain(digests: object) -> set[str]:
-    return {str(one).removeprefix("sha256:") for one in digests}  # type: ignore[attr-defined]
 
 
 def _left(found: Calibration, day: date) -> int:

@@ -63,9 +63,7 @@ def _shown(estimate: SkinMap, truth: SkinMap | None) -> BoolArray | None:
     return np.logical_and.reduce(masks) if masks else None
 
 
-def errors(
-    name: str, appearance: SkinAppearance, truth: SkinAppearance, checks: list[page.Check]
-) -> Iterator[page.Block]:
+def errors(subject: page.Subject, truth: SkinAppearance) -> Iterator[page.Block]:
     """Yield the errors of melanin and hemoglobin against their truth, by melanin band.
 
     Parameters
@@ -77,22 +75,20 @@ def errors(
     checks
         A judgement of each map is added to it.
     """
-    rows = flash.compare(appearance, truth, rng=np.random.default_rng(0))
+    rows = flash.compare(subject.appearance, truth, rng=np.random.default_rng(0))
     blurred = [row for row in rows if row.against == "blurred"]
     for row in blurred:
         if row.band is None:
             worst, worst_got = _worst([r for r in blurred if r.name == row.name and r.band])
-            checks.append(
-                page.Check.of_shares(
-                    f"{name}: {row.name}, median error",
-                    row.median_relative,
-                    flash.limit(row),
-                    f"Cramér-Rao bound {100 * flash.bound(row):.1f} %",
-                    masked=row.masked,
-                    coverage=row.coverage.share,
-                    worst=worst,
-                    worst_got=worst_got,
-                )
+            subject.check_share(
+                f"{row.name}, median error",
+                row.median_relative,
+                flash.limit(row),
+                f"Cramér-Rao bound {100 * flash.bound(row):.1f} %",
+                masked=row.masked,
+                coverage=row.coverage.share,
+                worst=worst,
+                worst_got=worst_got,
             )
     yield page.view("chromophore_errors", errors=rows)
     limits = {row.name: 100 * flash.limit(row) for row in blurred if row.band is None}
@@ -101,10 +97,9 @@ def errors(
 
 def _worst(banded: Iterable[flash.MapError]) -> tuple[str, float]:
     """Return the melanin band of the largest error and its lower end, where there are several."""
-    told = [row for row in banded if np.isfinite(row.median_relative)]
-    if len(told) < 2:
+    worst = page.worst_of(banded, lambda row: row.median_relative)
+    if worst is None:
         return "", float("nan")
-    worst = max(told, key=lambda row: row.median_relative)
     low, high = (100 * end for end in worst.interval)
     text = f"{worst.band_name}: {100 * worst.median_relative:.3g} % ({low:.3g} – {high:.3g} %)"
     return text, low

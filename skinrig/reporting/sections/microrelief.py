@@ -1,21 +1,20 @@
 """The report's section on microrelief: states of strain beside their truths, and their trends."""
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import TypeVar
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 
 from model import metrics
 from model.skin import SkinAppearance, SkinMap
-from reconstruction.pipeline.gradient.stages import HISTOGRAM_FILE, STRAIN_FILE
+from reconstruction.pipeline.gradient.stages import HISTOGRAM_FILE, KERNEL_FILE, STRAIN_FILE
 from skinrig.arrays import BoolArray, FloatArray
 from skinrig.drawing import figures
 from skinrig.evaluating import microrelief as evaluation
-from skinrig.evaluating.subsurface import document_of
+from skinrig.evaluating.subsurface import document_of, number
 from skinrig.reporting import map_images, page
 from skinrig.reporting.map_names import state_words
-from skinrig.reporting.sections import kernel
 
 T = TypeVar("T")
 WIDTH_PX = 200
@@ -30,9 +29,7 @@ def is_microrelief(appearance: SkinAppearance) -> bool:
     return bool(evaluation.states_of(appearance))
 
 
-def section(
-    name: str, appearance: SkinAppearance, truth: SkinAppearance | None, checks: list[page.Check]
-) -> Iterator[page.Block]:
+def section(subject: page.Subject) -> Iterator[page.Block]:
     """Yield the states of stretched skin, their histograms, kernels and errors.
 
     Parameters
@@ -46,13 +43,12 @@ def section(
     checks
         Judgements are added to it.
     """
-    yield from _images(appearance, truth)
-    if truth is not None:
-        yield from _relief_errors(name, appearance, truth, checks)
-    yield from _strain(name, appearance, truth, checks)
-    yield from _histograms(appearance)
-    yield from _variances(appearance)
-    yield from kernel.section(name, appearance, checks)
+    yield from _images(subject.appearance, subject.truth)
+    yield from _relief_errors(subject)
+    yield from _strain(subject)
+    yield from _histograms(subject.appearance)
+    yield from _variances(subject.appearance)
+    yield from kernels(subject)
 
 
 def _images(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator[page.Block]:
@@ -126,45 +122,35 @@ def _angle_image(title: str, degrees: FloatArray, valid: BoolArray, words: str) 
     return drawing.size(title, degrees, map_images.reach_of(degrees, valid, 98))
 
 
-def _relief_errors(
-    name: str, appearance: SkinAppearance, truth: SkinAppearance, checks: list[page.Check]
-) -> Iterator[page.Block]:
-    rows = evaluation.compare(appearance, truth, rng=np.random.default_rng(0))
+def _relief_errors(subject: page.Subject) -> Iterator[page.Block]:
+    truth = subject.truth
+    if truth is None:
+        return
+    rows = evaluation.compare(subject.appearance, truth, rng=np.random.default_rng(0))
     if not rows:
         return
     neutral = [row for row in rows if row.state.endswith("_n0")]
-    where, worst_got = _worst(rows)
+    where, worst_got = "", math.nan
+    if worst := page.worst_of(rows, lambda row: row.mean_deg):
+        where, worst_got = f"{state_words(worst.state)}: {worst.mean_deg:.3g}°", worst.mean_deg
     for row in neutral:
-        checks.append(
-            page.Check(
-                f"{name}: specular normals at the lens's resolution, mean error",
-                row.mean_deg,
-                evaluation.MAX_NORMAL_ERROR_DEG,
-                "<=",
-                "°",
-                state_words(row.state),
-                masked=row.masked,
-                coverage=row.coverage,
-                worst=where,
-                worst_got=worst_got,
-            )
+        subject.check(
+            "specular normals at the lens's resolution, mean error",
+            row.mean_deg,
+            evaluation.MAX_NORMAL_ERROR_DEG,
+            "°",
+            state_words(row.state),
+            masked=row.masked,
+            coverage=row.coverage,
+            worst=where,
+            worst_got=worst_got,
         )
     limit, skin = 100 * evaluation.MAX_HEIGHT_ERROR, page.one_skin(truth.parameters)
     yield page.view("relief_errors", states=rows, limit=limit, skin=skin)
 
 
-def _worst(rows: Sequence[evaluation.ReliefError]) -> tuple[str, float]:
-    """Return the state whose normals are worst and their error, where there are several."""
-    told = [row for row in rows if math.isfinite(row.mean_deg)]
-    if len(told) < 2:
-        return "", math.nan
-    worst = max(told, key=lambda row: row.mean_deg)
-    return f"{state_words(worst.state)}: {worst.mean_deg:.3g}°", worst.mean_deg
-
-
-def _strain(
-    name: str, appearance: SkinAppearance, truth: SkinAppearance | None, checks: list[page.Check]
-) -> Iterator[page.Block]:
+def _strain(subject: page.Subject) -> Iterator[page.Block]:
+    appearance, truth = subject.appearance, subject.truth
     document = document_of(appearance, STRAIN_FILE)
     if document is None:
         return
@@ -173,8 +159,8 @@ def _strain(
     if errors:
         worst = max(errors, key=lambda row: abs(row.error))
         got, where = abs(worst.error), state_words(worst.state)
-        text = f"{name}: stretch of the skin, largest error"
-        checks.append(page.Check(text, got, evaluation.MAX_STRAIN_ERROR, "<=", worst=where))
+        text = "stretch of the skin, largest error"
+        subject.check(text, got, evaluation.MAX_STRAIN_ERROR, worst=where)
     yield page.view("strain", states=document["states"], truths=true, degrees=math.degrees)
 
 
@@ -233,3 +219,69 @@ def _spread_over(states: Sequence[T]) -> list[T]:
 def _by_step(state: str) -> tuple[str, int]:
     angle, step = state.split("_")
     return angle, int(step[1:]) * (-1 if step[0] == "m" else 1)
+
+
+def kernels(subject: page.Subject) -> Iterator[page.Block]:
+    """Yield kernels by state and direction, and judge the distances that they leave.
+
+    Parameters
+    ----------
+    name
+        For headings.
+    appearance
+        With the kernel document; without it nothing is returned.
+    checks
+        A judgement is added to it.
+    """
+    document = document_of(subject.appearance, KERNEL_FILE)
+    if document is None or not document["fits"]:
+        return
+    fits: Sequence[Mapping[str, Any]] = sorted(document["fits"], key=lambda fit: fit["stretch_s"])
+    judged = [fit for fit in fits if fit["valid"] and _tells(fit)]
+    if judged:
+        worst = max(judged, key=lambda fit: fit["distance"] / fit["distance_before"])
+        got = worst["distance"] / worst["distance_before"]
+        where = state_words(worst["name"])
+        text = "histogram distance after the kernel over that before, worst state"
+        subject.check(text, got, evaluation.MAX_HISTOGRAM_DISTANCE, worst=where)
+    untold = [state_words(fit["name"]) for fit in fits if fit["valid"] and not _tells(fit)]
+    yield page.view("kernels", fits=fits, untold=untold)
+    yield page.Plots(_kernel_plots(fits, document.get("tables", [])))
+    if direction := document.get("direction"):
+        yield page.view("kernel_directions", found=direction)
+
+
+def _kernel_plots(
+    fits: Sequence[Mapping[str, Any]], tables: Sequence[Mapping[str, Any]]
+) -> list[str]:
+    """Draw strength and width of kernels over the stretch of the skin."""
+    plots = []
+    for key, error, title in (
+        ("alpha", "alpha_stderr", "kernel strength alpha"),
+        ("sigma_um", "sigma_stderr_um", "kernel width sigma, um"),
+    ):
+        points: dict[float, list[tuple[float, float, float]]] = {}
+        for fit in fits:
+            if fit["valid"]:
+                points.setdefault(fit["angle_deg"], []).append(
+                    (fit["stretch_s"], number(fit[key]), number(fit[error]))
+                )
+        series = []
+        for angle, rows in points.items():
+            stretch, values, errors = (list(column) for column in zip(*rows, strict=True))
+            name = f"jaws at {angle:.0f}°"
+            series.append(figures.Curve(name, stretch, values, errors, line=False))
+        for table in tables:
+            line = table["lines"]
+            drawn = [number(v) for v in line[key]]
+            series.append(
+                figures.Curve(f"lines, {table['name']}", line["stretch"], drawn, marks=False)
+            )
+        if series:
+            plots.append(figures.curves(title, "stretch ratio r of the skin", title, series))
+    return plots
+
+
+def _tells(fit: Mapping[str, Any]) -> bool:
+    """Return whether a strain changes the histogram by more than twice what chance does."""
+    return number(fit["distance_before"]) > 2.0 * number(fit["noise_floor"])

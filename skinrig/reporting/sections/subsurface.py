@@ -2,11 +2,20 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from model import store
 from model.skin import SkinAppearance
+from model.translucency_population import (
+    PopulationTable,
+    SiteMeasurement,
+    summarize,
+    table,
+    weyrich_2005,
+)
 from reconstruction.pipeline.probe.stages import (
     ANISOTROPY_FILE,
     CHANNEL_NAMES,
@@ -15,7 +24,7 @@ from reconstruction.pipeline.probe.stages import (
 )
 from skinrig.drawing import figures
 from skinrig.evaluating import subsurface as evaluation
-from skinrig.evaluating.subsurface import numbers
+from skinrig.evaluating.subsurface import document_of, number, numbers
 from skinrig.reporting import map_images, page
 
 WIDTH_PX = 200
@@ -32,9 +41,7 @@ def is_probe(appearance: SkinAppearance) -> bool:
     return PROFILE_FILE in appearance.files or SUBSURFACE_FILE in appearance.files
 
 
-def section(
-    name: str, appearance: SkinAppearance, truth: SkinAppearance | None, checks: list[page.Check]
-) -> Iterator[page.Block]:
+def section(subject: page.Subject) -> Iterator[page.Block]:
     """Yield profiles with fits and residuals, sigma_tr by method, and their errors.
 
     Parameters
@@ -48,10 +55,10 @@ def section(
     checks
         Judgements are added to it.
     """
+    appearance = subject.appearance
     yield from _plots(appearance)
-    yield from _fits(appearance, truth)
-    if truth is not None:
-        yield from _errors(name, appearance, truth, checks)
+    yield from _fits(appearance, subject.truth)
+    yield from _errors(subject)
     anisotropy = evaluation.document_of(appearance, ANISOTROPY_FILE)
     if anisotropy is not None and anisotropy["sites"]:
         yield page.view("anisotropy", sites=anisotropy["sites"])
@@ -127,9 +134,10 @@ def _fits(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator[
     yield page.view("fits", fits=fits, truths=true, methods=METHOD_NAMES)
 
 
-def _errors(
-    name: str, appearance: SkinAppearance, truth: SkinAppearance, checks: list[page.Check]
-) -> Iterator[page.Block]:
+def _errors(subject: page.Subject) -> Iterator[page.Block]:
+    appearance, truth = subject.appearance, subject.truth
+    if truth is None:
+        return
     rows = evaluation.compare_fits(appearance, truth)
     yield page.one_skin(truth.parameters)
     for kind in dict.fromkeys(row.kind for row in rows):
@@ -143,7 +151,7 @@ def _errors(
                 ("median", best.median, evaluation.MAX_MEDIAN_ERROR),
                 ("worst", best.worst, evaluation.MAX_WORST_ERROR),
             ):
-                checks.append(page.Check.of_shares(f"{name}: sigma_tr, {word} error", got, bound))
+                subject.check_share(f"sigma_tr, {word} error", got, bound)
     if profiles := evaluation.compare_profiles(appearance, truth):
         yield page.view("profiles", errors=profiles, measurement=_words_of_name)
 
@@ -224,3 +232,102 @@ def _words(entry: Mapping[str, Any]) -> str:
     if entry["angle_deg"]:
         words += f", {entry['angle_deg']:g}°"
     return words
+
+
+POPULATION_SIZE = 87
+"""As many as Weyrich et al. 2005 measured."""
+MEDIUM_PREFIXES = ("homogeneous:", "anisotropic:")
+"""How simulated subjects that are media are named."""
+
+
+def over_people(
+    appearances: Mapping[str, SkinAppearance], truths: Mapping[str, Path] | None = None
+) -> Iterator[page.Block]:
+    """Yield the tables of sigma_tr over people; empty where nobody's skin was probed.
+
+    Parameters
+    ----------
+    appearances
+        By name; each that holds fits of a fibre probe counts as a person, unless its truth says
+        that it is a medium.
+    truths
+        Folders of truths by name.
+    """
+    people = {
+        name: fits
+        for name, appearance in appearances.items()
+        if (fits := document_of(appearance, SUBSURFACE_FILE)) is not None
+        and not _is_medium(appearance, truths or {})
+    }
+    if not people:
+        return
+    published = weyrich_2005()
+    drawn = table(
+        published.sample(POPULATION_SIZE, rng=np.random.default_rng(0)), sites=published.sites
+    )
+    yield page.Heading("sigma_tr over people, 1/mm", level=2)
+    yield page.note(
+        "Deviations are over people. The publication heads its second column "
+        "“Var.”; as variances its numbers would contradict the extremes that it shows, so that "
+        "they are read as standard deviations. The smallest sigma_tr is the most translucent "
+        "skin."
+    )
+    rows: list[tuple[object, ...]] = []
+    for c, channel in enumerate(CHANNEL_NAMES):
+        pairs = zip(published.mean_per_mm[:, c], published.deviation_per_mm[:, c], strict=True)
+        cells = (float(one) for pair in pairs for one in pair)
+        rows.append(("published (Weyrich et al. 2005, table 2)", channel, *cells))
+    rows += _people_rows(
+        f"simulated, {POPULATION_SIZE} people drawn from it", drawn, published.sites
+    )
+    measured = [one for name, fits in people.items() for one in _measured(name, fits)]
+    if measured:
+        found = summarize(measured)
+        many = "session" if len(people) == 1 else "sessions"
+        rows += _people_rows(f"measured here, {len(people)} {many}", found, published.sites)
+    columns = [f"{site}, {word}" for site in published.sites for word in ("mean", "deviation")]
+    head = ("who", "channel", *columns)
+    yield page.table(
+        head, rows, caption="Mean and standard deviation over people, red, green and blue light"
+    )
+
+
+def _is_medium(appearance: SkinAppearance, truths: Mapping[str, Path]) -> bool:
+    """Tell a simulated medium of given coefficients, which is nobody's skin."""
+    folder = truths.get(str(appearance.parameters.get("truth", "")))
+    if folder is None:
+        return False
+    subject = str(store.read_document(folder).parameters.get("subject", ""))
+    return subject.startswith(MEDIUM_PREFIXES)
+
+
+def _people_rows(
+    who: str, found: PopulationTable, sites: tuple[str, ...]
+) -> list[tuple[object, ...]]:
+    rows: list[tuple[object, ...]] = []
+    for c, channel in enumerate(found.channels):
+        row: list[object] = [who, channel]
+        for site in sites:
+            s = found.sites.index(site) if site in found.sites else None
+            count = 0 if s is None else int(found.count[s, c])
+            row.append(float(found.mean_per_mm[s, c]) if count else float("nan"))
+            row.append(float(found.deviation_per_mm[s, c]) if count > 1 else float("nan"))
+        rows.append(tuple(row))
+    return rows
+
+
+def _measured(name: str, fits: Mapping[str, Any]) -> list[SiteMeasurement]:
+    """Return the sites of a person that are known in every channel."""
+    by_site: dict[str, list[Mapping[str, Any]]] = {}
+    for entry in fits["sites"]:
+        by_site.setdefault(entry["site"], []).append(entry)
+    return [
+        SiteMeasurement(
+            name,
+            site,
+            tuple(number(entry["sigma_tr_per_mm"]) for entry in own),
+            tuple(number(entry["sigma_tr_stderr"]) for entry in own),
+        )
+        for site, own in by_site.items()
+        if all(entry["sigma_tr_stderr"] is not None for entry in own)
+    ]

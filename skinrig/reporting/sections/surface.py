@@ -1,6 +1,7 @@
 """The report's section on a surface: maps seen from the front beside their truth."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +26,7 @@ RELATIVE_ERROR_MAPS = ("r_d",)
 FIRST_MAPS = ("r_d", "normals_refined", "normals", "half_vector_normals")
 
 
-def section(
-    name: str, appearance: SkinAppearance, truth: SkinAppearance | None, checks: list[page.Check]
-) -> Iterator[page.Block]:
+def section(subject: page.Subject) -> Iterator[page.Block]:
     """Yield the maps of an appearance on a mesh, beside their truth where there is one.
 
     Parameters
@@ -41,6 +40,7 @@ def section(
     checks
         Judgements are added to it.
     """
+    appearance, truth = subject.appearance, subject.truth
     place = appearance.maps["position"]
     rows, columns = np.nonzero(place.mask)
     points = place.values[rows, columns].astype(np.float64)
@@ -61,8 +61,12 @@ def section(
     best = next((key for key in FIRST_MAPS[1:] if key in appearance.maps), "")
     large = {"r_d", best}
     shown_truths: set[str] = set()
+    # what people look for first, then by name
+    keys = [key for key in FIRST_MAPS if key in appearance.maps]
+    keys += sorted(set(appearance.maps) - set(keys))
     minor = []
-    for key, skin_map in sorted(appearance.maps.items(), key=lambda item: _rank(item[0])):
+    for key in keys:
+        skin_map = appearance.maps[key]
         if key == "position" or key.startswith("_"):
             continue
         values = skin_map.values[rows, columns]
@@ -92,13 +96,8 @@ def section(
         yield page.Heading("Lobes, samples and residuals")
         yield page.Images(minor, small=True)
     if truth is not None:
-        yield from _errors(name, appearance, truth, checks)
-        yield from _reflection(name, appearance, truth, checks)
-
-
-def _rank(key: str) -> tuple[int, str]:
-    """Order maps: what people look for first, then by name."""
-    return (FIRST_MAPS.index(key) if key in FIRST_MAPS else len(FIRST_MAPS), key)
+        yield from _errors(subject, truth)
+        yield from _reflection(subject, truth)
 
 
 def _shown(
@@ -162,9 +161,8 @@ def _spread(
     return drawing.size(_title("standard error", key), image, reach)
 
 
-def _errors(
-    name: str, appearance: SkinAppearance, truth: SkinAppearance, checks: list[page.Check]
-) -> Iterator[page.Block]:
+def _errors(subject: page.Subject, truth: SkinAppearance) -> Iterator[page.Block]:
+    appearance = subject.appearance
     found = evaluation.compare(appearance, truth, rng=np.random.default_rng(0))
     banded = errors_by_band(appearance, truth)
     registration = appearance.parameters.get("registration")
@@ -178,19 +176,13 @@ def _errors(
         what, got, bound = row.judged
         unit = unit_sign(row.unit)
         where, worst_got = _worst(row.name, banded)
-        checks.append(
-            page.Check(
-                f"{name}: {words(row.name)}, {what}",
-                got,
-                bound,
-                "<=",
-                unit,
-                masked=row.masked,
-                coverage=row.coverage.share,
-                worst=where,
-                worst_got=worst_got,
-            )
-        )
+        told: dict[str, Any] = {
+            "masked": row.masked,
+            "coverage": row.coverage.share,
+            "worst": where,
+        }
+        name = f"{words(row.name)}, {what}"
+        subject.check(name, got, bound, unit, worst_got=worst_got, **told)
     bounds = evaluation.MAX_NORMAL_ERROR_DEG, evaluation.MAX_EVALUATED_PIXEL_MM
     pixel = pixel_mm if coarse else None
     yield page.view("surface_errors", errors=found, banded=banded, pixel_mm=pixel, bounds=bounds)
@@ -199,30 +191,26 @@ def _errors(
 def _worst(name: str, banded: list[Banded]) -> tuple[str, float]:
     """Return the skin color of the largest error and that error, where there are several."""
     own = [row for row in banded if row[0] == name.split()[0]]
-    if len(own) < 2:
+    worst = page.worst_of(own, lambda row: row[5])
+    if worst is None:
         return "", float("nan")
-    worst = max(own, key=lambda row: row[5])
     return f"{worst[2]} skin: {worst[5]:.3g} {worst[1]}", worst[5]
 
 
-def _reflection(
-    name: str, appearance: SkinAppearance, truth: SkinAppearance, checks: list[page.Check]
-) -> Iterator[page.Block]:
+def _reflection(subject: page.Subject, truth: SkinAppearance) -> Iterator[page.Block]:
     """Compare the fitted reflection with the true one, in held-out directions and on spheres."""
-    held_out = reflection.compare(appearance, truth, rng=np.random.default_rng(0))
+    held_out = reflection.compare(subject.appearance, truth, rng=np.random.default_rng(0))
     if held_out is None:
         return
-    checks.append(
-        page.Check.of_shares(
-            f"{name}: reflection in held-out directions, median error",
-            held_out.median,
-            reflection.MAX_HELD_OUT_ERROR,
-            f"{held_out.points} points × {held_out.directions} directions",
-        )
+    subject.check_share(
+        "reflection in held-out directions, median error",
+        held_out.median,
+        reflection.MAX_HELD_OUT_ERROR,
+        f"{held_out.points} points × {held_out.directions} directions",
     )
     yield page.view("reflection", found=held_out)
     figures = []
-    for site, true_image, image in reflection.spheres(appearance, truth):
+    for site, true_image, image in reflection.spheres(subject.appearance, truth):
         bright = float(np.percentile(true_image.max(axis=-1), 99.5)) or 1.0
         figures.append(map_images.color_image(f"{site}: truth", true_image / bright))
         if image is not None:

@@ -1,32 +1,147 @@
 """Textures and tables of Jimenez 2010: chromophores, the hemoglobin rig, the color of skin."""
 
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
+from capture.calibration import store
+from capture.calibration.color import matrix as color
+from capture.session import Session, SessionError
 from model import color_table, spectra
 from model.facial_color import HemoglobinRig
 from model.facial_color.rig import GLOBAL_GAINS
 from model.facial_color.state_maps import NEUTRAL
+from model.skin import SkinAppearance
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.perfusion import STATE_NAMES
-from skinrig.appearances import face_textures
 from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
 from skinrig.arrays import Float64Array
-from skinrig.viewer.assets import camera_color
-from skinrig.viewer.assets.camera_color import CameraColor
 from skinrig.viewer.assets.placed_color import RIG_PX, FaceColor, placed
 from skinrig.viewer.fine_skin import FineSkin
 from skinrig.viewer.map_filling import filled, halved
 from skinrig.viewer.scene import Assets, SceneSource, Texture
+
+COLOR_KIND: Final = "color"
+CALIBRATION_INPUT_PREFIX: Final = "calibration "
+"""Inputs of an appearance that are files of a calibration begin like this."""
+MATRIX_NODES: Final = 24
+"""Nodes a side of the table of skin colors that a matrix is fitted to."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraColor:
+    """How camera RGB over that of a white becomes linear sRGB.
+
+    Attributes
+    ----------
+    convert
+        From (..., 3) to (..., 3).
+    provenance
+        Where it comes from, for people.
+    known
+        False: nothing is known, and camera RGB is taken for linear sRGB.
+    """
+
+    convert: Callable[[Float64Array], Float64Array]
+    provenance: str
+    known: bool = True
+
+
+def camera_color_of(source: SceneSource) -> CameraColor:
+    """Return the color of the camera that measured a scene's albedo.
+
+    Raises
+    ------
+    capture.calibration.record.CalibrationError
+        A color calibration that is damaged, or missing in a folder that was named.
+    """
+    kind = next(name for name in ("model", "dome") if name in source.appearances)
+    appearance, path = source.appearances[kind], source.paths.get(kind)
+    folder = source.calibration or (None if path is None else _beside(appearance, path))
+    if folder is not None:
+        return _calibrated(folder)
+    found = None if path is None else _tabulated(appearance, path)
+    shown = (
+        "its camera RGB is shown as if it were linear sRGB; --calibration names a folder with a "
+        "color calibration"
+    )
+    return found or CameraColor(lambda rgb: rgb, shown, known=False)
+
+
+def _beside(appearance: SkinAppearance, path: Path) -> Path | None:
+    """Return the calibration that an appearance was made with, if it lies beside and has color."""
+    digests = {
+        name.removeprefix(CALIBRATION_INPUT_PREFIX): digest
+        for name, digest in appearance.inputs.items()
+        if name.startswith(CALIBRATION_INPUT_PREFIX)
+    }
+    for folder in sorted(path.resolve().parent.iterdir()):
+        if not (folder / f"{COLOR_KIND}.json").is_file():
+            continue
+        for kind, digest in digests.items():
+            file = folder / f"{kind}.json"
+            if file.is_file() and hashlib.sha256(file.read_bytes()).hexdigest() == digest:
+                return folder
+    return None
+
+
+def _calibrated(folder: Path) -> CameraColor:
+
+    found = store.load(folder, COLOR_KIND)
+    cameras = [
+        (color.from_calibration(found, serial), found.quantity(serial, "white_rgb").value)
+        for serial in found.serials
+    ]
+    error = float(np.mean([one.mean_delta_e for one, _ in cameras]))
+
+    def convert(rgb: Float64Array) -> Float64Array:
+        # maps merge all cameras: so are their colors
+        seen = [one.to_linear_srgb(rgb * white) for one, white in cameras]
+        return np.asarray(np.mean(seen, axis=0))
+
+    several = f" of {len(cameras)} cameras" if len(cameras) > 1 else ""
+    quality = f"{error:.1f} dE2000 on held-out patches"
+    return CameraColor(convert, f"{folder.name}/{COLOR_KIND}.json{several}, {quality}")
+
+
+def _tabulated(appearance: SkinAppearance, path: Path) -> CameraColor | None:
+    """Return a matrix between colors of skin, where a session beside names sensor and light."""
+    name: Any = appearance.parameters.get("session")
+    if not isinstance(name, str):
+        return None
+    folder = path.resolve().parent / Path(name).name
+    try:
+        rig = Session.open(folder).rig
+    except (SessionError, OSError):
+        return None
+    camera, light = rig.views[0].spectral_sensitivity, rig.lights[0].illuminant
+    if camera not in spectra.camera_names() or light not in spectra.illuminant_names():
+        return None
+    measured, shown = (
+        color_table.build(*pair, size=MATRIX_NODES, anisotropy=ANISOTROPY_SKIN).rgb.reshape(-1, 3)
+        for pair in ((camera, light), (spectra.LINEAR_SRGB, "D65"))
+    )
+    matrix = np.linalg.lstsq(measured, shown, rcond=None)[0]
+    error = float(np.sqrt(np.mean((measured @ matrix - shown) ** 2)))
+    return CameraColor(
+        lambda rgb: np.asarray(rgb @ matrix),
+        f"a matrix between the colors of skin that the tabulated sensor {camera} and {light} and "
+        f"linear sRGB see, {error:.4f} RMS; no color calibration was found",
+    )
+
 
 TABLE_NODES: Final = 128
 """Nodes along each axis of the color table."""
 RADIUS_PER_SIZE: Final = 24.0 / 512.0
 """Radius of the local statistics' disc, as a part of the map's side."""
 FINEST_STEP_WORDS: Final = 8
-"""Words of the finest octave's steps, of chromophores of 2048 texels a side and more."""
+"""Words of the finest octave's steps, of chromophores of 2048 texels a side and more: texels below
+0.2 mm hold noise."""
 ALBEDO_MAP: Final = "r_d"
 
 
@@ -39,7 +154,9 @@ def assets(source: SceneSource) -> Assets:
     )
     roots = np.cbrt(np.stack([found.melanin, found.hemoglobin], axis=-1))
     textures = {
-        "chromophores": Texture(roots.astype(np.float32), fine=_fine(roots.shape[0])),
+        "chromophores": Texture(
+            roots.astype(np.float32), fine=FINEST_STEP_WORDS if len(roots) >= 2048 else 1
+        ),
         "facial_states": Texture(np.stack(list(found.states.values())).astype(np.float32), "u8"),
     }
     names = list(found.states)
@@ -71,22 +188,12 @@ def assets(source: SceneSource) -> Assets:
     }
 
 
-def _fine(size: int) -> int:
-    """Return how coarsely the finest octave is kept: texels below 0.2 mm hold noise."""
-    return FINEST_STEP_WORDS if size >= 2048 else 1
-
-
 def _face(source: SceneSource, *, measured: bool) -> FaceColor:
     """Return the chromophores; beside a measured albedo, coarse: only their changes show."""
-    subject = source.subject
-    if subject is None:
-        raise ValueError("source: got no subject, expected one to stand for what was not measured")
-    dynamic = source.appearances.get("dynamic")
+    subject, dynamic = source.subject, source.appearances.get("dynamic")
     if dynamic is not None and FACIAL_COLOR in parts_of(dynamic):
-        return placed(source, subject)
-    if measured or source.skin is None:
-        return simulated(subject, FineSkin(subject, subject.size))
-    return simulated(subject, source.skin)
+        return placed(source)
+    return simulated(subject, FineSkin(subject, subject.size) if measured else source.skin)
 
 
 def simulated(person: SimulatedSubject, skin: FineSkin) -> FaceColor:
@@ -109,12 +216,11 @@ def simulated(person: SimulatedSubject, skin: FineSkin) -> FaceColor:
 
 def _stored_states(rig: HemoglobinRig) -> dict[str, Float64Array]:
     """Return a rig's scale and bias maps by state, (h, w, 2), filled where they are not valid."""
-    layers = {}
-    for name in (NEUTRAL, *rig.states):
-        valid = rig.neutral_mean_valid if name == NEUTRAL else rig.states[name].valid
-        pair = [filled(maps[name], valid) for maps in (rig.scale, rig.bias)]
-        layers[name] = np.stack(pair, axis=-1)
-    return layers
+    valid = {NEUTRAL: rig.neutral_mean_valid, **{name: m.valid for name, m in rig.states.items()}}
+    return {
+        name: filled(np.stack([rig.scale[name], rig.bias[name]], axis=-1), valid[name])
+        for name in (NEUTRAL, *rig.states)
+    }
 
 
 def _albedo(source: SceneSource) -> tuple[Texture, CameraColor] | None:
@@ -123,9 +229,8 @@ def _albedo(source: SceneSource) -> tuple[Texture, CameraColor] | None:
         if ALBEDO_MAP not in appearance.maps:
             continue
         found = appearance.maps[ALBEDO_MAP]
-        valid = face_textures.valid_of(found)
-        values = np.stack([filled(found.values[..., c], valid) for c in range(3)], axis=-1)
-        seen = camera_color.of(source)
+        values = filled(found.values, found.mask)
+        seen = camera_color_of(source)
         shown = np.clip(seen.convert(halved(values, source.size)), 0.0, 1.0)
         return Texture(shown.astype(np.float32), "u8"), seen
     return None

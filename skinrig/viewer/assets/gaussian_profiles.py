@@ -20,15 +20,12 @@ from scipy.special import erf
 
 from model import dipole, fresnel
 from skinrig.arrays import Float64Array
+from skinrig.viewer.scene import SceneError
 
 N_GAUSSIANS: Final = 4
 """Spread an edge of light within 0.1 % (three: 0.4 %; six: 0.01 %) and are two passes each."""
 _RADIUS_NODES: Final = 240
 _MAX_RELATIVE_RADIUS: Final = 12.0  # radii reach so many times 1/sigma_tr, where e^-12 is left
-
-
-class ProfileError(ValueError):
-    """Albedo or translucency that no diffusion profile has."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,25 +55,8 @@ class GaussianProfile:
         names = ("variances_mm2", "weights", "edge_error", "radial_error")
         return {**{name: getattr(self, name).tolist() for name in names}, "told": told}
 
-    def edge(self, distance_mm: ArrayLike) -> Float64Array:
-        """Return the light at distances from an edge, (..., 3): lit where the distance is > 0.
 
-        Examples
-        --------
-        >>> fit([0.5] * 3, [1.0] * 3).edge([0.0]).round(6).tolist()
-        [[0.5, 0.5, 0.5]]
-        """
-        x = np.asarray(distance_mm, np.float64)[..., None] / np.sqrt(2.0 * self.variances_mm2)
-        return np.asarray((0.5 + 0.5 * erf(x)) @ self.weights)
-
-
-def fit(
-    r_d: ArrayLike,
-    sigma_tr_per_mm: ArrayLike,
-    *,
-    eta: float = fresnel.ETA_SKIN,
-    count: int = N_GAUSSIANS,
-) -> GaussianProfile:
+def fit(r_d: ArrayLike, sigma_tr_per_mm: ArrayLike, count: int = N_GAUSSIANS) -> GaussianProfile:
     """Fit Gaussians to the dipoles of three channels.
 
     Parameters
@@ -85,8 +65,6 @@ def fit(
         Total diffuse reflectance, (3,), above 0 and below 1.
     sigma_tr_per_mm
         Effective transport coefficient, (3,), 1/mm, above 0.
-    eta
-        Refractive index of the skin over that of air.
     count
         Gaussians, at least 1.
 
@@ -98,7 +76,7 @@ def fit(
 
     Raises
     ------
-    ProfileError
+    SceneError
         For values out of range.
 
     Examples
@@ -110,12 +88,12 @@ def fit(
     albedo = np.asarray(r_d, np.float64)
     transport = np.asarray(sigma_tr_per_mm, np.float64)
     if albedo.shape != (3,) or not np.all((albedo > 0.0) & (albedo < 1.0)):
-        raise ProfileError(f"r_d: got {albedo.tolist()}, expected three values above 0, below 1")
+        raise SceneError(f"r_d: got {albedo.tolist()}, expected three values above 0, below 1")
     if transport.shape != (3,) or not np.all((transport > 0.0) & np.isfinite(transport)):
-        raise ProfileError(f"sigma_tr_per_mm: got {transport.tolist()}, expected three above 0")
+        raise SceneError(f"sigma_tr_per_mm: got {transport.tolist()}, expected three above 0")
     if count < 1:
-        raise ProfileError(f"count: got {count}, expected at least 1")
-    radii, profiles = _dipoles(albedo, transport, eta)
+        raise SceneError(f"count: got {count}, expected at least 1")
+    radii, profiles = _dipoles(albedo, transport)
     at = np.concatenate([[0.0], np.geomspace(0.02, 8.0, 80)]) / float(np.median(transport))
     lines = np.stack([_edge_of(radii, one, at) for one in profiles.T], axis=-1)
     middle = 1.0 / float(np.median(transport))
@@ -137,22 +115,23 @@ def fit(
     weights = _weights(_edges(found, at), lines)
     used = weights.max(axis=1) > 1e-6
     found, weights = found[used], weights[used] / weights[used].sum(axis=0)
-    sums = _gaussians(found, radii) @ weights
+    shapes = np.exp(-(radii[:, None] ** 2) / (2.0 * found)) / (2.0 * np.pi * found)
+    sums = shapes @ weights
     ring = radii[:, None] * np.gradient(radii)[:, None]
     radial = np.sqrt(np.sum(ring * (sums - profiles) ** 2, 0) / np.sum(ring * profiles**2, 0))
     miss = np.abs(_edges(found, at) @ weights - lines).max(axis=0)
     return GaussianProfile(found, weights, miss, radial)
 
 
-def _dipoles(
-    albedo: Float64Array, transport: Float64Array, eta: float
-) -> tuple[Float64Array, Float64Array]:
+def _dipoles(albedo: Float64Array, transport: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return radii, mm, and the normalized profiles at them, (n, 3), 1/mm^2."""
-    sigma_a, sigma_s = dipole.coefficients(dipole.invert_to_deficit(albedo, eta), transport)
+    sigma_a, sigma_s = dipole.coefficients(
+        dipole.invert_to_deficit(albedo, fresnel.ETA_SKIN), transport
+    )
     radii = np.geomspace(
         1e-4 / transport.max(), _MAX_RELATIVE_RADIUS / transport.min(), _RADIUS_NODES
     )
-    values = dipole.reflectance(radii[:, None], sigma_a, sigma_s, eta)
+    values = dipole.reflectance(radii[:, None], sigma_a, sigma_s, fresnel.ETA_SKIN)
     return radii, values / albedo
 
 
@@ -172,10 +151,6 @@ def _edge_of(radii: Float64Array, profile: Float64Array, at: Float64Array) -> Fl
 
 def _edges(variances: Float64Array, at: Float64Array) -> Float64Array:
     return np.asarray(0.5 + 0.5 * erf(at[:, None] / np.sqrt(2.0 * variances)))
-
-
-def _gaussians(variances: Float64Array, radii: Float64Array) -> Float64Array:
-    return np.exp(-(radii[:, None] ** 2) / (2.0 * variances)) / (2.0 * np.pi * variances)
 
 
 def _weights(bases: Float64Array, wanted: Float64Array) -> Float64Array:

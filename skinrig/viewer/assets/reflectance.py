@@ -10,9 +10,9 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from model import color_table, skin_reflectance, spectra
+from model import color_table, merl, skin_reflectance, spectra
 from model.brdf import tables as brdf_tables
-from model.brdf.tables import BrdfBasis
+from model.brdf.tables import NODES_D, NODES_H, NODES_PHI, BrdfBasis
 from model.skin import SkinAppearance
 from model.skin_reflectance import TRANSLUCENCY_MAP
 from model.tissue_optics.layers import ANISOTROPY_SKIN
@@ -20,10 +20,137 @@ from model.traits import storage as trait_storage
 from reconstruction.surface import texture_fill
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.editing import surface_mixtures
-from skinrig.viewer.assets import compact_brdf, gaussian_profiles
-from skinrig.viewer.assets.compact_brdf import CompactBrdf
+from skinrig.viewer.assets import gaussian_profiles
 from skinrig.viewer.assets.gaussian_profiles import GaussianProfile
 from skinrig.viewer.scene import Assets, SceneSource, Texture
+
+TRIED_SLABS: Final = (1, 2, 3, 4, 6, 12)
+MIN_STRONG_FRACTION: Final = 0.01
+"""Values above this share of a lobe's peak count for the error of single values."""
+MAX_FORM_ERROR: Final = 0.01
+"""Bound on both errors of a table that is chosen, relative."""
+LOBES_PER_LOOKUP: Final = 4
+"""Lobes that one look-up reads."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CompactBrdf:
+    """Lobes in a table, and what that costs.
+
+    Attributes
+    ----------
+    slabs : int
+        Of phi_d.
+    table : ndarray of float64, shape (32, 12, 90, K)
+        1/sr, what a page reads back at the nodes of `model.brdf.tables`.
+    rms_error, strong_error : float
+        See `table_errors`.
+    """
+
+    slabs: int
+    table: Float64Array
+    rms_error: float
+    strong_error: float
+
+    @property
+    def lookups(self) -> int:
+        """Filtered look-ups for one light, all lobes together."""
+        return -(-self.table.shape[-1] // LOBES_PER_LOOKUP)
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes before compression: values of 16 bits."""
+        return 2 * self.slabs * NODES_D * NODES_H * self.lookups * LOBES_PER_LOOKUP
+
+
+def chosen_table(lobes: BrdfBasis) -> CompactBrdf:
+    """Return the table with the fewest slabs whose errors are within `MAX_FORM_ERROR`.
+
+    The finest table is off by its 16 bits only, so that one always fits.
+    """
+    table = lobes.table[..., : lobes.size].astype(np.float64)
+    for slabs in TRIED_SLABS:
+        back = in_slabs(table, slabs)
+        found = CompactBrdf(slabs, back, *table_errors(back, table))
+        if max(found.rms_error, found.strong_error) <= MAX_FORM_ERROR:
+            break
+    return found
+
+
+def in_slabs(table: Float64Array, slabs: int) -> Float64Array:
+    """Return (32, 12, 90, K) with runs of phi_d nodes at their mean over the visible half-space."""
+    if slabs not in TRIED_SLABS:
+        raise ValueError(f"slabs: got {slabs}, expected one of {', '.join(map(str, TRIED_SLABS))}")
+    weight = _cosines()[..., None] + 1e-9
+    width = NODES_PHI // slabs
+    parts = table.reshape(NODES_D, slabs, width, NODES_H, -1)
+    share = weight.reshape(NODES_D, slabs, width, NODES_H, 1)
+    mean = (parts * share).sum(axis=2, keepdims=True) / share.sum(axis=2, keepdims=True)
+    held = np.asarray(mean, np.float16).astype(np.float64)
+    return np.broadcast_to(held, parts.shape).reshape(table.shape)
+
+
+def atlas(found: CompactBrdf) -> Float32Array:
+    """Return a table as an image for one bilinear look-up, (G * slabs * 32, 90, 4).
+
+    Group g of four lobes, slab s, node i of theta_d is row (g * slabs + s) * 32 + i, theta_h goes
+    along columns, lobe 4 g + c is channel c. Lobes that fill a group up are 0.
+    """
+    kept = found.table[:, :: NODES_PHI // found.slabs].astype(np.float32)
+    layers = in_fours(kept)
+    return np.ascontiguousarray(layers.transpose(0, 2, 1, 3, 4)).reshape(
+        -1, NODES_H, LOBES_PER_LOOKUP
+    )
+
+
+def in_fours(values: Float32Array) -> Float32Array:
+    """Return values (..., K) of lobes as layers of four, (L, ..., 4); what fills them up is 0."""
+    groups = -(-values.shape[-1] // LOBES_PER_LOOKUP)
+    missing = groups * LOBES_PER_LOOKUP - values.shape[-1]
+    padded = np.pad(values, (*[(0, 0)] * (values.ndim - 1), (0, missing)))
+    split = padded.reshape(*values.shape[:-1], groups, LOBES_PER_LOOKUP)
+    return np.ascontiguousarray(np.moveaxis(split, -2, 0))
+
+
+def table_errors(back: Float64Array, table: Float64Array) -> tuple[float, float]:
+    """Return how far (32, 12, 90, K) values are from a table's, both of the worst lobe.
+
+    Returns
+    -------
+    rms : float
+        RMS difference over that of the lobe, nodes counting by solid angle and both cosines.
+    strong : float
+        95th percentile of the relative difference where a lobe exceeds `MIN_STRONG_FRACTION` of
+        its peak.
+    """
+    weight = (solid_weight() * _cosines())[..., None]
+    off = np.sum(weight * (back - table) ** 2, axis=(0, 1, 2))
+    own = np.sum(weight * table**2, axis=(0, 1, 2))
+    rms = float(np.sqrt(np.max(np.where(own > 0.0, off / np.maximum(own, 1e-300), 0.0))))
+    worst = 0.0
+    for k in range(table.shape[-1]):
+        one = table[..., k]
+        strong = (one > MIN_STRONG_FRACTION * one.max()) & (_cosines() > 0.0)
+        if strong.any():
+            relative = np.abs(back[..., k] - one)[strong] / one[strong]
+            worst = max(worst, float(np.percentile(relative, 95.0)))
+    return rms, worst
+
+
+def solid_weight() -> Float64Array:
+    """Return the solid angle of each node up to a factor, (32, 12, 90)."""
+    d, _, h = brdf_tables.nodes()
+    solid = np.sin(2.0 * d)[:, None, None] * (np.sin(h) * np.gradient(h))
+    return np.asarray(np.broadcast_to(solid, (NODES_D, NODES_PHI, NODES_H)))
+
+
+def _cosines() -> Float64Array:
+    """Return the product of the cosines of light and view at the nodes, 0 below the horizon."""
+    d, phi, h = np.meshgrid(*brdf_tables.nodes(), indexing="ij")
+    light, view = merl.to_directions(h, d, phi)
+    mu_l, mu_v = light[..., 2], view[..., 2]
+    return np.asarray(np.where((mu_l > 0.0) & (mu_v > 0.0), mu_l * mu_v, 0.0))
+
 
 SHARES_PX: Final = 256
 """Most texels a side of the maps of shares; finer ones are averaged."""
@@ -69,13 +196,13 @@ class PageLobes:
 
 def assemble(source: SceneSource, found: PageLobes) -> Assets:
     """Return the assets of some lobes, which may hold those of traits too."""
-    compact = compact_brdf.chosen(found.lobes)
+    compact = chosen_table(found.lobes)
     profile, widths, told = _diffusion_of(source)
     # the packer turns pictures over; this one's rows stand as the shader counts them
-    rows = np.ascontiguousarray(compact_brdf.atlas(compact)[::-1])
+    rows = np.ascontiguousarray(atlas(compact)[::-1])
     textures = {
         "lobe_atlas": Texture(rows, "f16"),
-        "lobe_shares": Texture(rounded(compact_brdf.in_fours(found.shares)), "f16"),
+        "lobe_shares": Texture(rounded(in_fours(found.shares)), "f16"),
     }
     if widths is not None:
         textures["translucency"] = Texture(widths[..., None], "u8")
@@ -164,45 +291,36 @@ def _diffusion_of(source: SceneSource) -> tuple[GaussianProfile, Float32Array | 
     told
         Where the translucency comes from, for people.
     """
-    for appearance in source.fitted:
-        r_d = _mean_albedo(appearance)
-        if TRANSLUCENCY_MAP in appearance.maps:
-            depth = appearance.maps[TRANSLUCENCY_MAP]
-            known = depth.mask & np.isfinite(depth.values).all(-1) & (depth.values > 0).all(-1)
-            if known.any():
-                logs = np.log(np.where(known[..., None], depth.values, 1.0)).astype(np.float32)
-                mean = logs[known].astype(np.float64).mean(axis=0)
-                off = (logs - mean.astype(np.float32)).mean(axis=-1, keepdims=True)
-                widths = np.exp(filled(off, known, TRANSLUCENCY_PX)[..., 0])
-                even = float(np.ptp(widths)) < 1e-3
-                profile = gaussian_profiles.fit(r_d, np.exp(-mean))
-                return profile, None if even else widths, _told(appearance)
-        mean_mm, told = skin_reflectance.population_mean_mm()
-        return gaussian_profiles.fit(r_d, 1.0 / mean_mm), None, told
     mean_mm, told = skin_reflectance.population_mean_mm()
-    return gaussian_profiles.fit(_typical_r_d(), 1.0 / mean_mm), None, told
+    if not source.fitted:
+        return gaussian_profiles.fit(_typical_r_d(), 1.0 / mean_mm), None, told
+    appearance = source.fitted[0]
+    r_d = _mean_albedo(appearance)
+    depth = appearance.maps.get(TRANSLUCENCY_MAP)
+    if depth is None or not (known := depth.mask & (depth.values > 0).all(-1)).any():
+        return gaussian_profiles.fit(r_d, 1.0 / mean_mm), None, told
+    logs = np.log(np.where(known[..., None], depth.values, 1.0)).astype(np.float32)
+    mean = logs[known].astype(np.float64).mean(axis=0)
+    off = (logs - mean.astype(np.float32)).mean(axis=-1, keepdims=True)
+    widths = np.exp(filled(off, known, TRANSLUCENCY_PX)[..., 0])
+    record: Any = appearance.parameters.get("reflectance_model")
+    if isinstance(record, dict) and record.get("translucency") == "measured":
+        told = "a fibre probe on this face"
+    even = float(np.ptp(widths)) < 1e-3
+    return gaussian_profiles.fit(r_d, np.exp(-mean)), None if even else widths, told
 
 
 def _mean_albedo(appearance: SkinAppearance) -> Float64Array:
-    if "r_d" not in appearance.maps:
+    r_d = appearance.maps.get("r_d")
+    if r_d is None or not r_d.mask.any():
         return _typical_r_d()
-    r_d = appearance.maps["r_d"]
-    good = r_d.mask & np.isfinite(r_d.values).all(-1)
-    if not good.any():
-        return _typical_r_d()
-    return np.asarray(np.clip(np.median(r_d.values[good].astype(np.float64), axis=0), 0.01, 0.98))
+    middle = np.median(r_d.values[r_d.mask].astype(np.float64), axis=0)
+    return np.asarray(np.clip(middle, 0.01, 0.98))
 
 
 def _typical_r_d() -> Float64Array:
     table = color_table.build(spectra.LINEAR_SRGB, "D65", size=32, anisotropy=ANISOTROPY_SKIN)
     return np.asarray(table.lookup(*TYPICAL_CHROMOPHORES))
-
-
-def _told(appearance: SkinAppearance) -> str:
-    record: Any = appearance.parameters.get("reflectance_model")
-    if isinstance(record, dict) and record.get("translucency") == "measured":
-        return "a fibre probe on this face"
-    return skin_reflectance.population_mean_mm()[1]
 
 
 def _blocks(values: Float32Array, step: int) -> Float32Array:
@@ -214,14 +332,12 @@ def _blocks(values: Float32Array, step: int) -> Float32Array:
 
 
 def _facts(found: PageLobes, compact: CompactBrdf) -> dict[str, Any]:
+    of_table = ("slabs", "lookups", "rms_error", "strong_error")
     return {
         "origin": found.origin,
         "lobes": found.lobes.size,
-        "slabs": compact.slabs,
         "table_bytes": compact.size_bytes,
-        "lookups": compact.lookups,
-        "rms_error": compact.rms_error,
-        "strong_error": compact.strong_error,
+        **{name: getattr(compact, name) for name in of_table},
         "light_radius_rad": found.lobes.light_radius_rad,
     }
 

@@ -8,30 +8,94 @@ variance changes with the stretch of the skin.
 """
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from model.microstructure import ALPHA_LIMITS, FOREHEAD, KernelTable, kernel_parameters
 from model.microstructure.mesh_strain import strain
-from skinrig.arrays import Float64Array
+from model.skin import SkinAppearance
+from rigsim.geometry.mesh import Mesh
+from rigsim.skin_patch.microrelief import make_micro_skin
+from skinrig.appearances.dynamic import MICROSTRUCTURE, parts_of
+from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.viewer.microstructure import relief_growth
-from skinrig.viewer.microstructure.micro_relief import (
-    PATCH_PX,
-    MicroRelief,
-    MicrostructureAssetError,
-    fitted_relief,
-    simulated_relief,
-)
-from skinrig.viewer.microstructure.relief_growth import GrownRelief
-from skinrig.viewer.microstructure.slope_variances import (
+from skinrig.viewer.microstructure.relief_growth import (
     STRETCH_RANGE,
+    GrownRelief,
     slope_rms,
     strained_variance,
 )
 from skinrig.viewer.microstructure.tiles import TILE_PX, Pyramid
-from skinrig.viewer.scene import Assets, SceneSource, Texture, ViewerMesh, ViewerScene
+from skinrig.viewer.scene import Assets, SceneError, SceneSource, Texture, ViewerScene
+
+PATCH_PX: Final = 256
+"""Side of the patch in the page: 3 to 4 mm of skin; some 80 kB."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MicroRelief:
+    """A measured or simulated neutral relief with the kernels of that skin.
+
+    Attributes
+    ----------
+    height_um : ndarray of float32, shape (h, w)
+        Finite; row 0 is the top.
+    pixel_um : float
+        Length of skin that a pixel has.
+    table : KernelTable
+    source : str
+        "measured" or "simulated", and from where; shown in the page.
+    """
+
+    height_um: Float32Array
+    pixel_um: float
+    table: KernelTable = FOREHEAD
+    source: str = "simulated"
+
+
+def fitted_relief(appearance: SkinAppearance) -> MicroRelief | None:
+    """Return the first site's relief of `skinrig fit microstructure`; None without that part."""
+    part = parts_of(appearance).get(MICROSTRUCTURE)
+    if part is None:
+        return None
+    site, entry = sorted(part["sites"].items())[0]
+    found = appearance.maps[entry["map"]]
+    text = bytes(appearance.files[entry["table"]]).decode("utf-8")
+    return MicroRelief(
+        largest_square(np.squeeze(found.values).astype(np.float32), found.mask),
+        float(entry["pixel_um"]),
+        KernelTable.from_json(text),
+        f"{part['source']}: {site}",
+    )
+
+
+def simulated_relief(seed: int) -> MicroRelief:
+    """Return relief of the simulated skin of a forehead, `PATCH_PX` a side."""
+    site, pixel_um = "forehead", 15.0
+    skin = make_micro_skin(site, seed=seed, size_mm=1e-3 * pixel_um * PATCH_PX, texel_um=pixel_um)
+    return MicroRelief(skin.height_um, pixel_um, FOREHEAD, f"simulated: {site}")
+
+
+def largest_square(height: Float32Array, valid: BoolArray) -> Float32Array:
+    """Return the largest square without holes; the first one in reading order of several.
+
+    Examples
+    --------
+    >>> holes = np.array([[0, 1, 1], [1, 1, 1]], bool)
+    >>> largest_square(np.arange(6, dtype=np.float32).reshape(2, 3), holes).tolist()
+    [[1.0, 2.0], [4.0, 5.0]]
+    """
+    good = np.asarray(valid, bool) & np.isfinite(height)
+    total = np.pad(good.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    for n in range(min(good.shape), 0, -1):
+        inside = total[n:, n:] - total[:-n, n:] - total[n:, :-n] + total[:-n, :-n]
+        if (inside == n * n).any():
+            top, left = np.argwhere(inside == n * n)[0]
+            return np.ascontiguousarray(height[top : top + n, left : left + n])
+    raise SceneError("relief: got no valid pixel, expected some millimetres")
+
 
 SAMPLE_PX: Final = 512
 """Side of the part of a displacement that its slopes are known from."""
@@ -51,12 +115,10 @@ def assets(source: SceneSource) -> Assets:
     relief = None if dynamic is None else fitted_relief(dynamic)
     if relief is not None:
         return from_relief(relief, source.mesh, seed=source.seed)
-    add = "`skinrig fit microstructure` adds its own"
-    if source.subject is None:
-        return Assets(left_out=(("microstructure", f"none was measured; {add}"),))
     made = from_relief(simulated_relief(source.seed), source.mesh, seed=source.seed)
     if source.kind in ("dynamic", "dome", "model"):
-        told = f"what is drawn of it is simulated, its kernels are the paper's forehead; {add}"
+        told = "what is drawn of it is simulated, its kernels are the paper's forehead; "
+        told += "`skinrig fit microstructure` adds its own"
         made["left_out"] = (("microstructure of this face", told),)
     return made
 
@@ -66,13 +128,13 @@ def grown(relief: MicroRelief, *, seed: int = 0) -> GrownRelief:
 
     Raises
     ------
-    MicrostructureAssetError
+    SceneError
         For a relief too small to choose places from.
     """
     side = min(*relief.height_um.shape, PATCH_PX) // relief_growth.STEP_PX * relief_growth.STEP_PX
     cell = min(CELL_PX, relief_growth.largest_cell_px(side))
     if cell < 2 * relief_growth.STEP_PX:
-        raise MicrostructureAssetError(
+        raise SceneError(
             f"relief: got {relief.height_um.shape}, expected at least 96 pixels a side"
         )
     top, left = ((n - side) // 2 for n in relief.height_um.shape)
@@ -84,26 +146,26 @@ def grown(relief: MicroRelief, *, seed: int = 0) -> GrownRelief:
     return GrownRelief(part.astype(np.float32), relief.pixel_um, cell, seed % 2**32)
 
 
-def from_relief(relief: MicroRelief, mesh: ViewerMesh, *, seed: int = 0) -> Assets:
+def from_relief(relief: MicroRelief, mesh: Mesh, *, seed: int = 0) -> Assets:
     """Return textures, tables and parameters of a relief on a mesh.
 
     Parameters
     ----------
     relief : MicroRelief
-    mesh : ViewerMesh
+    mesh : Mesh
         Its texture's scale says how many pixels the grown displacement has.
     seed : int
 
     Raises
     ------
-    MicrostructureAssetError
+    SceneError
         For a table of more lines than the shader holds, or a texture whose scale is so uneven
         that kernels reach too far.
     """
     growth = grown(relief, seed=seed)
     table = relief.table
     if len(table.alpha_breaks) > MAX_BREAKS:
-        raise MicrostructureAssetError(
+        raise SceneError(
             f"table: got {len(table.alpha_breaks)} breaks, expected at most {MAX_BREAKS}"
         )
     scale = px_per_mm(mesh)
@@ -147,23 +209,23 @@ def reach_px(table: KernelTable, scale: Float64Array, virtual_px: int) -> int:
 
     Raises
     ------
-    MicrostructureAssetError
+    SceneError
         For more than `MAX_REACH_PX`.
     """
     # the finest 1 % of a texture is slivers: kernels there are held at the window's margin
     finest = float(np.percentile(scale, 99.0))
-    reach = math.ceil(4.0 * _largest_sigma_um(table) * 1e-3 * virtual_px * finest + 0.5) + 2
+    ends = np.array([*table.stretch_range, np.nextafter(1.0, 0.0), 1.0])
+    widest_um = float(kernel_parameters(ends, table)[1].max())
+    reach = math.ceil(4.0 * widest_um * 1e-3 * virtual_px * finest + 0.5) + 2
     if reach > MAX_REACH_PX:
-        raise MicrostructureAssetError(
+        raise SceneError(
             f"mesh: got kernels of {reach} px at the texture's finest places, expected at most "
             f"{MAX_REACH_PX}: lengths differ too much over its texture"
         )
     return reach
 
 
-def with_displacement(
-    scene: ViewerScene, pyramid: Pyramid, *, table: KernelTable = FOREHEAD
-) -> ViewerScene:
+def with_displacement(scene: ViewerScene, pyramid: Pyramid) -> ViewerScene:
     """Return a scene that fetches its relief as tiles in place of growing it from a patch.
 
     Parameters
@@ -177,7 +239,7 @@ def with_displacement(
 
     Raises
     ------
-    MicrostructureAssetError
+    SceneError
         As of `from_relief`.
     """
     scale = px_per_mm(scene.mesh)
@@ -185,14 +247,14 @@ def with_displacement(
     source = pyramid.levels[0]
     first = (pyramid.size - SAMPLE_PX) // 2
     middle = np.asarray(source[first : first + SAMPLE_PX, first : first + SAMPLE_PX], np.float32)
-    made = from_relief(MicroRelief(middle, pixel_um, table, "displacement"), scene.mesh)
+    made = from_relief(MicroRelief(middle, pixel_um, FOREHEAD, "displacement"), scene.mesh)
     facts = dict(made["facts"]["microstructure"])
     for unused in ("patch_px", "cell_px", "choices", "seed"):
         del facts[unused]
     facts |= {
         "virtual_px": pyramid.size,
         "levels": len(pyramid.levels),
-        "reach_px": reach_px(table, scale, pyramid.size),
+        "reach_px": reach_px(FOREHEAD, scale, pyramid.size),
         "tiles": {"tile_px": TILE_PX, "low": pyramid.low, "high": pyramid.high},
     }
     bare = replace(
@@ -205,17 +267,11 @@ def with_displacement(
     return bare.with_assets(Assets(tables=made["tables"], facts={"microstructure": facts}))
 
 
-def px_per_mm(mesh: ViewerMesh) -> Float64Array:
+def px_per_mm(mesh: Mesh) -> Float64Array:
     """Return texture units per mm of skin at the vertices of a mesh, by the root of areas."""
-    rest = mesh.positions.astype(np.float64)
+    rest = mesh.vertices_mm.astype(np.float64)
     found = strain(rest, rest, mesh.faces, mesh.uv)
     if not found.valid.any():
-        raise MicrostructureAssetError("mesh: got no triangle with an area in the texture")
+        raise SceneError("mesh: got no triangle with an area in the texture")
     a, b, c = found.uv_metric[found.valid].T
     return np.asarray(np.sqrt(np.abs(a * c - b * b)))
-
-
-def _largest_sigma_um(table: KernelTable) -> float:
-    """Return the widest kernel of a table within its range, um."""
-    ends = np.array([*table.stretch_range, np.nextafter(1.0, 0.0), 1.0])
-    return float(kernel_parameters(ends, table)[1].max())

@@ -31,22 +31,17 @@ from typing import Final
 
 import numpy as np
 
-from skinrig.arrays import Float32Array, Float64Array, Int64Array, UInt32Array
+from model.microstructure import KernelTable, gaussian_weights, kernel_parameters
+from skinrig.arrays import Float32Array, Float64Array
+from skinrig.viewer.scene import SceneError
 
 GROWN_LEVELS: Final = 4
 """Levels of a pyramid that can be grown: 0 (the patch's pixels) to GROWN_LEVELS - 1."""
 STEP_PX: Final = 2 ** (GROWN_LEVELS - 1)
-WEIGHT_POWER: Final = 4
-"""Power of the barycentric weights: the share of skin where places mix is small, but not so small
-that the blend's own slopes show."""
 MAX_LATTICE_PX: Final = 2**17
 """Farther out the lattice's integers leave 32 bits."""
 MIN_MOVES: Final = 4
 """Moves to choose from along each side; below, repetition would be seen at once."""
-
-
-class ReliefGrowthError(ValueError):
-    """A patch that nothing can be grown from, or pixels that no level has."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,17 +69,17 @@ class GrownRelief:
         """Refuse patches that a cell does not fit into."""
         shape = self.patch.shape
         if len(shape) != 2 or shape[0] != shape[1] or shape[0] % STEP_PX:
-            raise ReliefGrowthError(
+            raise SceneError(
                 f"patch: got shape {shape}, expected a square with sides of a multiple of {STEP_PX}"
             )
         if not np.isfinite(self.patch).all():
-            raise ReliefGrowthError("patch: got NaN or infinity, expected heights in um")
+            raise SceneError("patch: got NaN or infinity, expected heights in um")
         if not (math.isfinite(self.pixel_um) and self.pixel_um > 0):
-            raise ReliefGrowthError(f"pixel_um: got {self.pixel_um}, expected above 0")
+            raise SceneError(f"pixel_um: got {self.pixel_um}, expected above 0")
         if not 0 <= self.seed < 2**32:
-            raise ReliefGrowthError(f"seed: got {self.seed}, expected 0 to 2^32 - 1")
+            raise SceneError(f"seed: got {self.seed}, expected 0 to 2^32 - 1")
         if self.cell_px < 2 * STEP_PX or self.choices < MIN_MOVES:
-            raise ReliefGrowthError(
+            raise SceneError(
                 f"cell_px: got {self.cell_px} for a patch of {shape[0]} px, expected at least "
                 f"{2 * STEP_PX} and at most {largest_cell_px(shape[0])}"
             )
@@ -93,58 +88,6 @@ class GrownRelief:
     def choices(self) -> int:
         """Moves to choose from along each side."""
         return _choices(self.patch.shape[0], self.cell_px)
-
-    def level(self, level: int) -> Float32Array:
-        """Return the patch's means over 2^level pixels a side, shape (P / 2^level,) * 2."""
-        if not 0 <= level < GROWN_LEVELS:
-            raise ReliefGrowthError(f"level: got {level}, expected 0 to {GROWN_LEVELS - 1}")
-        side = self.patch.shape[0] >> level
-        blocks = self.patch.reshape(side, 1 << level, side, 1 << level).astype(np.float64)
-        return blocks.mean(axis=(1, 3)).astype(np.float32)
-
-    def window(
-        self, top: int, left: int, shape: tuple[int, int], *, level: int = 0
-    ) -> Float32Array:
-        """Return heights, um, of a window of the grown relief.
-
-        Parameters
-        ----------
-        top, left : int
-            First row and column, px of that level; any integer within +-2^17 px of level 0.
-        shape : (int, int)
-            Rows and columns.
-        level : int
-            0 is the patch's own pixels, each level halves both sides.
-
-        Returns
-        -------
-        ndarray of float32, shape `shape`
-        """
-        patch = self.level(level)
-        if (max(abs(top), abs(left)) + max(shape)) << level > MAX_LATTICE_PX:
-            raise ReliefGrowthError(
-                f"window: got ({top}, {left}) {shape} at level {level}, expected within "
-                f"{MAX_LATTICE_PX} px of level 0"
-            )
-        y, x = np.meshgrid(
-            np.arange(top, top + shape[0]), np.arange(left, left + shape[1]), indexing="ij"
-        )
-        corners, weights = _corners_at(x, y, self.cell_px, level)
-        total = np.zeros(shape)
-        for (i, j), weight in zip(corners, weights, strict=True):
-            move_x, move_y = self._moves(i, j)
-            total += weight * patch[y + (move_y >> level), x + (move_x >> level)]
-        return total.astype(np.float32)
-
-    def _moves(self, i: Int64Array, j: Int64Array) -> tuple[Int64Array, Int64Array]:
-        """Return by how many pixels of level 0 the patch's places are from the relief's."""
-        at_x, at_y = _corner_px(i, j, self.cell_px)
-        drawn = hashed(i, j, self.seed)
-        # the hexagon's first pixel becomes one of the first pixels that keep its last inside
-        free_x = STEP_PX * ((drawn & np.uint32(0xFFFF)) % np.uint32(self.choices)).astype(np.int64)
-        free_y = STEP_PX * ((drawn >> np.uint32(16)) % np.uint32(self.choices)).astype(np.int64)
-        reach = reach_px(self.cell_px)
-        return free_x + reach - at_x, free_y + reach - at_y
 
 
 def reach_px(cell_px: int) -> int:
@@ -166,48 +109,64 @@ def largest_cell_px(side_px: int) -> int:
     return max(fits, default=0)
 
 
-def hashed(i: Int64Array, j: Int64Array, seed: int) -> UInt32Array:
-    """Return 32 mixed bits for lattice corners; integer arithmetic modulo 2^32 throughout.
+STRETCH_NODES: Final = 33
+"""Stretch ratios a side of the table of variances, evenly from 0.5 to 1.5."""
+STRETCH_RANGE: Final = (0.5, 1.5)
+MIN_LEVEL_PX: Final = 6
+"""Pixels a side of the coarsest level whose slopes are counted."""
 
-    Examples
-    --------
-    >>> hashed(np.array([0, 1]), np.array([0, 0]), 0).tolist() != [0, 0]
-    True
+
+def slope_rms(growth: GrownRelief) -> list[float]:
+    """Return the rms of slopes that pixels of 2^level px still show, by level of a relief.
+
+    A slope is the gradient by central differences over two pixels of the level, as the page's
+    normals are; levels end where less than six pixels a side are left.
     """
-    with np.errstate(over="ignore"):
-        h = np.asarray(i).astype(np.uint32) * np.uint32(0x9E3779B1)
-        h = h ^ (np.asarray(j).astype(np.uint32) * np.uint32(0x85EBCA77)) ^ np.uint32(seed)
-        # finalizer of MurmurHash3: every input bit reaches every output bit
-        h = (h ^ (h >> np.uint32(16))) * np.uint32(0x85EBCA6B)
-        h = (h ^ (h >> np.uint32(13))) * np.uint32(0xC2B2AE35)
-        h = h ^ (h >> np.uint32(16))
-    return np.asarray(h, np.uint32)
+    found = []
+    height = growth.patch.astype(np.float64)
+    step = growth.pixel_um
+    while height.shape[0] >= MIN_LEVEL_PX:
+        dx = (height[1:-1, 2:] - height[1:-1, :-2]) / (2.0 * step)
+        dy = (height[2:, 1:-1] - height[:-2, 1:-1]) / (2.0 * step)
+        found.append(float(np.sqrt(np.mean(dx**2 + dy**2))))
+        side = height.shape[0] // 2
+        height = height[: 2 * side, : 2 * side].reshape(side, 2, side, 2).mean(axis=(1, 3))
+        step *= 2.0
+    return found
 
 
-def _corner_px(i: Int64Array, j: Int64Array, cell_px: int) -> tuple[Int64Array, Int64Array]:
-    """Return columns and rows of lattice corners, on whole steps of `STEP_PX`."""
-    # half the cell a row to the side, and sqrt(3)/2 of it down; in integers: 14189 / 16384
-    x = (2 * i + j) * cell_px // 2
-    y = (j * cell_px * 14189) >> 14
-    return (x // STEP_PX) * STEP_PX, (y // STEP_PX) * STEP_PX
+def strained_variance(growth: GrownRelief, table: KernelTable) -> Float64Array:
+    """Return how the variance of slopes changes under strain, relative to neutral skin.
 
+    The kernels' transfer functions on the patch's power spectrum, averaged with that of the
+    patch turned by 90 degrees: what direction the relief has of its own is not followed. Slopes
+    are those of the deformed surface: heights over lengths that are stretched too.
 
-def _corners_at(
-    x: Int64Array, y: Int64Array, cell_px: int, level: int
-) -> tuple[list[tuple[Int64Array, Int64Array]], list[Float64Array]]:
-    """Return the three corners around pixels of a level, and their weights (squares sum to 1)."""
-    scale = float(1 << level)
-    u = (x + 0.5) * scale / cell_px
-    v = (y + 0.5) * scale / cell_px
-    down = v * (2.0 / math.sqrt(3.0))
-    right = u - 0.5 * down
-    i, j = np.floor(right).astype(np.int64), np.floor(down).astype(np.int64)
-    p, q = right - i, down - j
-    rest = 1.0 - p - q
-    upper = rest > 0.0
-    one = np.where(upper, 0, 1)
-    corners = [(i + one, j + one), (i, j + 1), (i + 1, j)]
-    raw = [np.abs(rest), np.where(upper, q, 1.0 - p), np.where(upper, p, 1.0 - q)]
-    power = [w**WEIGHT_POWER for w in raw]
-    length = np.sqrt(sum(w * w for w in power))
-    return corners, [w / length for w in power]
+    Parameters
+    ----------
+    growth : GrownRelief
+    table : KernelTable
+
+    Returns
+    -------
+    ndarray, shape (STRETCH_NODES, STRETCH_NODES, 2)
+        Variance along s and along t by r_s (rows) and r_t (columns), over `STRETCH_RANGE`.
+    """
+    side = growth.patch.shape[0]
+    window = np.hanning(side + 2)[1:-1]
+    spectrum = np.abs(np.fft.fft2(growth.patch * window[:, None] * window)) ** 2
+    spectrum = 0.5 * (spectrum + spectrum.T)
+    turn = 2.0 * np.pi * np.fft.fftfreq(side)
+    slope = np.sin(turn) ** 2
+    ratios = np.linspace(*STRETCH_RANGE, STRETCH_NODES)
+    alpha, sigma_um = kernel_parameters(ratios, table)
+    transfer = np.empty((STRETCH_NODES, side))
+    for row, (a, s) in enumerate(zip(alpha, sigma_um / growth.pixel_um, strict=True)):
+        weights = gaussian_weights(s)
+        wave = np.cos(turn[:, None] * np.arange(weights.size)) @ (
+            weights * np.where(np.arange(weights.size) > 0, 2.0, 1.0)
+        )
+        transfer[row] = (1.0 - a + a * wave) ** 2
+    neutral = float(slope @ spectrum.sum(axis=1))
+    along = (transfer * slope) @ spectrum @ transfer.T / neutral
+    return np.stack([along / ratios[:, None] ** 2, along.T / ratios[None, :] ** 2], axis=2)

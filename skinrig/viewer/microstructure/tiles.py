@@ -5,13 +5,13 @@ written once into a folder of their own. A tile is 16-bit words over the range o
 that its error is known before it is fetched.
 """
 
-import os
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+
+from skinrig.workspace import whole_folder
 
 TILE_PX: Final = 256
 MIN_SIDE_PX: Final = 512
@@ -117,18 +117,11 @@ def build(source: Any, folder: Path) -> Pyramid:
             "times a power of two (such as 4096 or 16384)"
         )
     low, high = _range(source)
-    part = folder.with_name(f".{folder.name}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
-    try:
+    with whole_folder(folder) as part:
         level, number = source, 1
         while level.shape[0] > MIN_SIDE_PX and number < MAX_LEVELS:
             level = _halved(level, part / f"level_{number}.npy")
             number += 1
-        shutil.rmtree(folder, ignore_errors=True)
-        os.replace(part, folder)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
     coarser = [
         np.load(folder / f"level_{k}.npy", mmap_mode="r", allow_pickle=False)
         for k in range(1, number)

@@ -12,9 +12,9 @@ from model.skin import SkinAppearance, SkinMap
 from model.skin_reflectance import BASIS_FILE
 from reconstruction.pipeline.dome.lobes import _basis_bytes
 from skinrig.cli import main
-from skinrig.exporting.appearances import export_brdfs
-from skinrig.exporting.brdfs import BrdfExportError, Place, write_brdfs
-from skinrig.exporting.sealing import ExportError
+from skinrig.exporting.brdfs import write
+from skinrig.exporting.export import export
+from skinrig.exporting.options import Delivery, ExportError, Place
 
 UP = np.array([0.0, 0.0, 1.0])
 R_D = np.array([0.5, 0.35, 0.25])
@@ -68,7 +68,7 @@ def looked_up(path, light, view):
 def exported(appearance, tmp_path_factory):
     folder = tmp_path_factory.mktemp("exports")
     for to in ("merl", "rgl"):
-        export_brdfs(appearance, folder / to, to=to, place=Place(0.2, 0.5, 0.9))
+        export(appearance, folder / to, to=to, delivery=Delivery(place=Place(0.2, 0.5, 0.9)))
     return folder
 
 
@@ -122,7 +122,7 @@ def test_below_the_horizon_nothing_was_measured(exported):
 
 def test_a_region_is_the_mean_over_its_texels(appearance, tmp_path, lobes, rng):
     place = Place(0.5, 0.5, radius_mm=100.0, diffuse=False)
-    done = export_brdfs(appearance, tmp_path / "all", to="rgl", place=place)
+    done = export(appearance, tmp_path / "all", to="rgl", delivery=Delivery(place=place))
     light, view = directions(rng, 500), directions(rng, 500)
     found = rgl.read(done.path / "place.bsdf").evaluate(light, view)[:, 0]
     true = lobes[2].evaluate(light, view, UP) @ [0.4, 0.5]
@@ -130,17 +130,17 @@ def test_a_region_is_the_mean_over_its_texels(appearance, tmp_path, lobes, rng):
 
 
 def test_places_without_reflectance_are_named(appearance, tmp_path):
-    with pytest.raises(BrdfExportError, match="row 0, column 4"):
-        write_brdfs(store.read(appearance), tmp_path, to="rgl", place=Place(0.5, 1.0))
-    with pytest.raises(BrdfExportError, match=r"u 1\.5"):
+    with pytest.raises(ExportError, match="row 0, column 4"):
+        write(store.read(appearance), tmp_path, Place(0.5, 1.0), "rgl")
+    with pytest.raises(ExportError, match=r"u 1\.5"):
         Place(1.5, 0.0)
-    with pytest.raises(ExportError, match="expected one of merl, rgl"):
-        export_brdfs(appearance, tmp_path / "x", to="mhl")
+    with pytest.raises(ExportError, match=r"expected one of .*merl, rgl"):
+        export(appearance, tmp_path / "x", to="bsdf")
     read = store.read(appearance)
     dark = read.maps | {"r_d": SkinMap(np.full((SIDE, SIDE, 3), -0.01), "1")}
     store.write(tmp_path / "dark", SkinAppearance(dark, "simulated", files=read.files))
-    with pytest.raises(BrdfExportError, match="r_d is"):
-        write_brdfs(store.read(tmp_path / "dark"), tmp_path, to="rgl", place=Place(0.5, 0.5))
+    with pytest.raises(ExportError, match="r_d is"):
+        write(store.read(tmp_path / "dark"), tmp_path, Place(0.5, 0.5), "rgl")
 
 
 def test_the_command_line_exports_and_says_what_is_wrong(appearance, tmp_path, capsys):

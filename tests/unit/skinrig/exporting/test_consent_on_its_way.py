@@ -16,11 +16,11 @@ from skinrig.appearances.dynamic import parts_of
 from skinrig.cli import main
 from skinrig.editing import edit as editing
 from skinrig.editing.spots import SpotOrder
-from skinrig.exporting.appearances import export_appearance
+from skinrig.exporting.export import export
 from skinrig.fitting.microstructure import fit_microstructure
 from skinrig.fitting.reflectance import fit_reflectance
 from skinrig.fitting.wrinkles import fit_wrinkles
-from skinrig.reporting import consents
+from skinrig.reporting import provenance
 
 WIDTH_PX = 192
 DAY = date(2026, 1, 1)
@@ -45,9 +45,9 @@ def refused_beyond(folder, tmp_path, to):
     """Assert that a folder leaves for research alone, and not after the last day."""
     for use, day in (("film", DAY), ("research", date(2030, 1, 2))):
         with pytest.raises(ConsentError, match="P042 has not agreed"):
-            export_appearance(folder, tmp_path / "out", to=to, use=use, today=day)
+            export(folder, tmp_path / "out", to=to, use=use, today=day)
     assert not (tmp_path / "out").exists()
-    export_appearance(folder, tmp_path / "out", to=to, use="research", today=DAY)
+    export(folder, tmp_path / "out", to=to, use="research", today=DAY)
     told = next((tmp_path / "out").glob("*.json"))
     assert json.loads(told.read_text())[consent.CONSENT_KEY] == [NARROW]
 
@@ -98,7 +98,7 @@ def test_wrinkles_of_one_silent_session_leave_for_nothing(dome, smiling, tmp_pat
     faces = [dome("n", state="neutral"), smiling("s", None)]
     fit_wrinkles(faces, out=tmp_path / "moving", size=32, mask_size=16)
     with pytest.raises(ConsentError, match="unknown has not agreed"):
-        export_appearance(tmp_path / "moving", tmp_path / "out", to="maps", use="research")
+        export(tmp_path / "moving", tmp_path / "out", to="maps", use="research")
 
 
 def test_fitted_microstructure_leaves_within_the_consent_alone(tmp_path, rng):
@@ -186,7 +186,7 @@ def test_traits_bear_the_consent_of_the_people_they_were_learned_of(tmp_path, do
     assert main([*edit, str(tmp_path / "tanned"), "--trait", "tan=0.5"]) == 0
     assert consent.recorded(store.read(tmp_path / "tanned")) == learned
     with pytest.raises(ConsentError, match="P000 has not agreed"):
-        export_appearance(tmp_path / "tanned", tmp_path / "out", to="maps", use="film", today=DAY)
+        export(tmp_path / "tanned", tmp_path / "out", to="maps", use="film", today=DAY)
     # an edit that takes nothing of them owes them nothing
     assert main([*edit, str(tmp_path / "same"), "--trait", "tan=0"]) == 0
     assert consent.recorded(store.read(tmp_path / "same")) == []
@@ -194,10 +194,9 @@ def test_traits_bear_the_consent_of_the_people_they_were_learned_of(tmp_path, do
 
 @pytest.mark.long
 def test_a_page_of_a_measured_face_says_what_its_subject_agreed_to(dome, tmp_path):
-    from skinrig.viewer import writing
-    from skinrig.viewer.packing import arrays as packing
+    from skinrig.viewer import faces, packing
 
-    scene = writing.compose([dome("dome")], size=64)
+    scene = faces.scene([dome("dome")], size=64)
     assert scene.provenance[consent.CONSENT_KEY] == ["P042: research, until 2030-01-01"]
     assert packing.pack(scene).header["provenance"][consent.CONSENT_KEY] == list(
         scene.provenance[consent.CONSENT_KEY]
@@ -206,9 +205,9 @@ def test_a_page_of_a_measured_face_says_what_its_subject_agreed_to(dome, tmp_pat
 
 @pytest.mark.long
 def test_a_page_of_a_simulated_face_names_nobody(face_folder):
-    from skinrig.viewer import writing
+    from skinrig.viewer import faces
 
-    assert consent.CONSENT_KEY not in writing.compose([face_folder], size=64).provenance
+    assert consent.CONSENT_KEY not in faces.scene([face_folder], size=64).provenance
 
 
 def consent_of(html):
@@ -251,7 +250,7 @@ def test_a_report_on_a_session_names_its_subject(tmp_path):
             json.dumps({"source": source, "subject": NARROW})
         )
     found = Findings(sessions=[tmp_path / "measured", tmp_path / "simulated"])
-    assert [(folder.name, one) for folder, one in consents.records_of(found)] == [
+    assert [(folder.name, one) for folder, one in provenance.records_of(found)] == [
         ("measured", NARROW)
     ]
 

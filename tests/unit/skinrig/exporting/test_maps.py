@@ -10,8 +10,7 @@ import pytest
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from skinrig.exporting import maps
 from skinrig.exporting.materials.tangents import FramedMesh, from_tangent
-from skinrig.exporting.options import Delivery
-from skinrig.exporting.sealing import ExportError
+from skinrig.exporting.options import Delivery, ExportError
 
 
 def read(path):

@@ -7,8 +7,13 @@ from capture.calibration.lights.light_list import LightTable
 from capture.rig import load_rig
 from model import store
 from skinrig.errors import UnusableError, UsageError
-from skinrig.rendering.environment import directions, environment_lights, read_environment
-from skinrig.rendering.lights import Light, LightError
+from skinrig.rendering.lights import (
+    Light,
+    LightError,
+    directions,
+    environment_lights,
+    read_environment,
+)
 from skinrig.rendering.request import RenderRig, lights_of, subpixels_of
 
 

@@ -8,9 +8,10 @@ from model.brdf import tables as brdf_tables
 from model.skin_reflectance import SkinReflectance
 from rigsim.geometry.mesh import build_mesh
 from skinrig.rendering import folder, shadow
-from skinrig.rendering.bases import RankError, nearest_shares, reduced
+from skinrig.rendering.bases import nearest_shares, reduced
+from skinrig.rendering.camera import RenderingError
+from skinrig.rendering.folder import TONE_KNEE, Panel, sheet, tone
 from skinrig.rendering.geometry import FittedSurface
-from skinrig.rendering.images import TONE_KNEE, Panel, sheet, tone
 from skinrig.rendering.lookup_kernels import MAX_TEXEL_DISTANCE, look_up
 from skinrig.rendering.shadow import MAX_SIGMA_TR_PER_MM, MIN_SIGMA_TR_PER_MM, Boundary
 
@@ -110,7 +111,7 @@ def test_nearest_shares_are_not_negative_and_keep_what_mixtures_hold(model):
 
 
 def test_more_lobes_than_a_model_has_are_refused(model):
-    with pytest.raises(RankError, match="reconstruct SESSION --rank 24"):
+    with pytest.raises(RenderingError, match="reconstruct SESSION --rank 24"):
         reduced(model, 24, rng=np.random.default_rng(0))
 
 
@@ -175,7 +176,7 @@ def test_a_rendering_replaces_an_older_one_and_nothing_else(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["picture"]
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "letter.txt").write_text("dear")
-    with pytest.raises(folder.RenderingFolderError, match="no rendering"):
+    with pytest.raises(RenderingError, match="no rendering"):
         folder.write(tmp_path / "other", images={}, pictures={}, document={})
     assert (tmp_path / "other" / "letter.txt").read_text() == "dear"
 

@@ -11,8 +11,9 @@ from model.skin_reflectance import SkinReflectance, transmitted
 from rigsim.geometry.atlas import dilate_texture, unwrap
 from rigsim.geometry.mesh import build_mesh
 from skinrig.rendering import camera as rendering_camera
+from skinrig.rendering.camera import RenderingError
 from skinrig.rendering.geometry import FittedSurface, GeometryError, own_mesh, parse_mesh, read_mesh
-from skinrig.rendering.render import Light, RenderingError
+from skinrig.rendering.render import Light
 from skinrig.rendering.render import render as render_laid
 
 FRONT = (0.0, 0.0, 700.0)

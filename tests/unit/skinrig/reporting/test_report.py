@@ -11,7 +11,7 @@ from skinrig.benchmarks.document import to_document
 from skinrig.benchmarks.results import Limit, Point, StageBenchmark, Timing
 from skinrig.reporting import page
 from skinrig.reporting.folders import discover
-from skinrig.reporting.sections import population
+from skinrig.reporting.sections import subsurface
 from skinrig.reporting.sections.chromophore import panels
 
 
@@ -121,8 +121,8 @@ def test_a_medium_is_not_counted_as_a_person(tmp_path):
         appearances[subject] = SkinAppearance(
             {}, "simulated", parameters={"truth": name}, files=files
         )
-    assert "measured here, 1 session<" in page.fragment(population.section(appearances, truths))
-    no_truth_tells = page.fragment(population.section(appearances))
+    assert "measured here, 1 session<" in page.fragment(subsurface.over_people(appearances, truths))
+    no_truth_tells = page.fragment(subsurface.over_people(appearances))
     assert "measured here, 2 sessions<" in no_truth_tells
     del appearances["III"]
-    assert not list(population.section(appearances, truths))
+    assert not list(subsurface.over_people(appearances, truths))

@@ -32,16 +32,16 @@ def test_directions_are_even_over_the_cap_above_the_horizon():
 def test_a_trait_that_is_none_changes_no_light():
     people = [dataclasses.replace(PEOPLE[0], applied=())]
     rng = np.random.default_rng(0)
-    same = trait_truth.lobe_change(people, people, points=3, pairs=50, rng=rng)
+    same = trait_truth.lobe_changes(people, {"worn": people}, points=3, pairs=50, rng=rng)["worn"]
     assert np.abs(same.radiance).max() < 1e-12
 
 
 def test_lotion_sharpens_what_the_surface_reflects():
     people = [dataclasses.replace(PEOPLE[0], applied=())]
     worn = [dataclasses.replace(PEOPLE[0], applied=(("lotion", 1.0),))]
-    change = trait_truth.lobe_change(
-        people, worn, points=5, pairs=2000, rng=np.random.default_rng(0)
-    )
+    change = trait_truth.lobe_changes(
+        people, {"worn": worn}, points=5, pairs=2000, rng=np.random.default_rng(0)
+    )["worn"]
     half = change.light + change.view
     cos_h = half[:, 2] / np.linalg.norm(half, axis=1)
     assert change.radiance[cos_h > 0.99].mean() > 0.0

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from rigsim.subject.person import make_subject
+from skinrig.viewer import packing as arrays
 from skinrig.viewer.fine_skin import FineSkin
-from skinrig.viewer.packing import deflating
 
 
 def test_fine_maps_are_those_of_the_person_at_that_size():
@@ -32,9 +32,9 @@ def test_parts_come_out_of_one_member_as_they_went_in(count, rng):
     noise = rng.integers(0, 256, count, dtype=np.uint8).tobytes()
     steps = rng.choice(np.array([0, 0, 0, 1, 255], np.uint8), 3 * count).tobytes()
     text = b"vertex of a face, " * count
-    packed = deflating.gzipped([noise, b"", steps, text])
+    packed = arrays.gzipped([noise, b"", steps, text])
     assert gzip.decompress(packed) == noise + steps + text
-    assert packed == deflating.gzipped([noise, b"", steps, text])
+    assert packed == arrays.gzipped([noise, b"", steps, text])
     assert len(packed) < len(noise) + 0.3 * len(steps) + 0.1 * len(text) + 100
     # one member: what a browser's stream takes, which ends at the first
     reader = zlib.decompressobj(zlib.MAX_WBITS | 16)
@@ -45,6 +45,6 @@ def test_parts_come_out_of_one_member_as_they_went_in(count, rng):
 
 def test_noise_packs_no_larger_than_by_searching_for_repetitions(rng):
     noise = np.clip(rng.normal(128.0, 6.0, 300_000), 0, 255).astype(np.uint8).tobytes()
-    assert len(deflating.gzipped([noise])) <= len(gzip.compress(noise, 9))
+    assert len(arrays.gzipped([noise])) <= len(gzip.compress(noise, 9))
     repeated = noise[:1000] * 300
-    assert len(deflating.gzipped([repeated])) <= 1.01 * len(gzip.compress(repeated, 9)) + 16
+    assert len(arrays.gzipped([repeated])) <= 1.01 * len(gzip.compress(repeated, 9)) + 16

@@ -10,14 +10,16 @@ import numpy as np
 import pytest
 
 from model.skin import SkinAppearance, SkinMap
-from skinrig.viewer import page, writing
-from skinrig.viewer.scene import SceneError, Texture, ViewerMesh, ViewerScene
+from rigsim.geometry.mesh import Mesh
+from skinrig import workspace
+from skinrig.viewer import faces, page
+from skinrig.viewer.scene import SceneError, Texture, ViewerScene
 
 
 @pytest.fixture
 def scene():
-    mesh = ViewerMesh(
-        positions=np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0]], np.float32),
+    mesh = Mesh(
+        vertices_mm=np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0]], np.float32),
         normals=np.tile(np.float32([0, 0, 1]), (3, 1)),
         uv=np.array([[0, 0], [1, 0], [0, 1]], np.float32),
         faces=np.array([[0, 1, 2]], np.int32),
@@ -74,9 +76,9 @@ def test_comments_are_left_out_of_the_page_and_code_is_not():
 
 def test_a_page_replaces_an_older_one_whole(scene, tmp_path):
     out = tmp_path / "deep" / "face.html"
-    first = writing.write(scene, out)
+    first = page.write(scene, out)
     assert out.stat().st_size == first["bytes"]
-    writing.write(scene, out)
+    page.write(scene, out)
     assert sorted(p.name for p in out.parent.iterdir()) == ["face.html"]
 
 
@@ -87,9 +89,9 @@ def test_a_page_that_cannot_be_packed_leaves_the_older_one(scene, tmp_path, monk
     def full(*_):
         raise OSError(28, "No space left on device", "face.html")
 
-    monkeypatch.setattr(writing.os, "replace", full)
+    monkeypatch.setattr(workspace.os, "replace", full)
     with pytest.raises(OSError, match="No space"):
-        writing.write(scene, out)
+        page.write(scene, out)
     assert [p.name for p in tmp_path.iterdir()] == ["face.html"]
     assert out.read_text() == "older"
 
@@ -97,12 +99,12 @@ def test_a_page_that_cannot_be_packed_leaves_the_older_one(scene, tmp_path, monk
 @pytest.mark.parametrize("size", [32, 8192])
 def test_a_size_that_no_page_can_hold_is_refused(size):
     with pytest.raises(SceneError, match="expected 64 to 4096"):
-        writing.compose([], size=size)
+        faces.scene(size=size)
 
 
 def test_landmarks_without_a_picture_are_refused(tmp_path):
     with pytest.raises(SceneError, match="name the folder"):
-        writing.compose([], landmarks=tmp_path / "landmarks.csv")
+        faces.scene(landmarks=tmp_path / "landmarks.csv")
 
 
 def test_maps_that_no_face_can_wear_are_refused_with_what_makes_them(tmp_path):
@@ -117,4 +119,4 @@ def test_maps_that_no_face_can_wear_are_refused_with_what_makes_them(tmp_path):
     )
     store.write(tmp_path / "appearance", flat)
     with pytest.raises(SceneError, match="skinrig fit facial-color"):
-        writing.compose([tmp_path / "appearance"], size=64)
+        faces.scene([tmp_path / "appearance"], size=64)

@@ -13,7 +13,7 @@ from model.skin import MAP_UNITS, SkinMap
 from rigsim.subject.landmarks import find
 from rigsim.subject.person import make_subject
 from skinrig.appearances import dynamic as dynamic_appearance
-from skinrig.viewer import from_appearance, procedural
+from skinrig.viewer import faces as procedural
 from skinrig.viewer.assets import facial_color as facial_color_assets
 from skinrig.viewer.assets import placed_color
 from skinrig.viewer.scene import SceneError, SceneSource
@@ -86,12 +86,14 @@ def test_blood_drawn_on_a_picture_comes_to_lie_where_it_was_on_the_face(subject,
         "dynamic",
         procedural.viewer_mesh(subject),
         SIZE,
-        subject=subject,
+        0,
+        subject,
+        None,
         appearances={"dynamic": appearance},
         paths={"dynamic": folder / "appearance"},
         landmarks=folder / "landmarks.csv",
     )
-    found = placed_color.placed(source, subject)
+    found = placed_color.placed(source)
     front = subject.atlas.covered & (subject.atlas.normal[..., 2] > 0.6)
     wanted = subject.hemoglobin()
     off = np.abs(found.hemoglobin / wanted - 1.0)[front]
@@ -115,12 +117,12 @@ def test_blood_drawn_on_a_picture_comes_to_lie_where_it_was_on_the_face(subject,
 
 def test_a_picture_that_nothing_places_is_refused_with_what_to_give(folder):
     with pytest.raises(SceneError, match="--landmarks FILE"):
-        from_appearance.scene([folder / "appearance"], size=64)
+        procedural.scene([folder / "appearance"], size=64)
 
 
 def test_two_folders_of_one_kind_are_refused(folder):
     with pytest.raises(SceneError, match="same kind"):
-        from_appearance.scene([folder / "appearance", folder / "appearance"], size=64)
+        procedural.scene([folder / "appearance", folder / "appearance"], size=64)
 
 
 def test_a_mesh_that_reaches_out_of_its_texture_is_refused(tmp_path):

@@ -5,17 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from fixtures.factored_lobes import factored
+from scipy.special import erf
 
 from model import dipole, fresnel
 from model.brdf import tables as brdf_tables
 from model.traits import lobe_edits
 from model.traits import storage as trait_storage
-from skinrig.viewer import presets
-from skinrig.viewer.assets import compact_brdf, gaussian_profiles
+from rigsim.geometry.mesh import build_mesh
+from skinrig.viewer import faces
+from skinrig.viewer.assets import fitted as trait_assets
+from skinrig.viewer.assets import gaussian_profiles
 from skinrig.viewer.assets import reflectance as reflectance_assets
-from skinrig.viewer.assets import traits as trait_assets
 from skinrig.viewer.assets.reflectance import PageLobes
-from skinrig.viewer.scene import SceneSource
+from skinrig.viewer.scene import SceneError, SceneSource
 
 
 @pytest.fixture(scope="module")
@@ -46,16 +48,16 @@ def traits(face):
 
 
 def test_the_chosen_table_is_within_its_bound_and_the_next_coarser_one_is_not(face):
-    found = compact_brdf.chosen(face.lobes)
-    assert max(found.rms_error, found.strong_error) <= compact_brdf.MAX_FORM_ERROR
-    coarser = compact_brdf.TRIED_SLABS[compact_brdf.TRIED_SLABS.index(found.slabs) - 1]
+    found = reflectance_assets.chosen_table(face.lobes)
+    assert max(found.rms_error, found.strong_error) <= reflectance_assets.MAX_FORM_ERROR
+    coarser = reflectance_assets.TRIED_SLABS[reflectance_assets.TRIED_SLABS.index(found.slabs) - 1]
     table = face.lobes.table[..., :3].astype(np.float64)
-    back = compact_brdf.in_slabs(table, coarser)
-    assert max(compact_brdf.errors(back, table)) > compact_brdf.MAX_FORM_ERROR
+    back = reflectance_assets.in_slabs(table, coarser)
+    assert max(reflectance_assets.table_errors(back, table)) > reflectance_assets.MAX_FORM_ERROR
 
 
 def test_factors_as_good_as_the_table_need_more_look_ups(face, forms):
-    found = compact_brdf.chosen(face.lobes)
+    found = reflectance_assets.chosen_table(face.lobes)
     factors = [one for one in forms if one.lookups <= found.lookups]
     assert all(one.rms_error > found.rms_error for one in factors)
     more = [one for one in forms if one.form == "factors"]
@@ -68,8 +70,8 @@ def test_errors_of_factors_fall_with_their_rank(forms):
 
 
 def test_an_atlas_holds_each_lobe_at_its_place(face):
-    found = compact_brdf.chosen(face.lobes)
-    image = compact_brdf.atlas(found)
+    found = reflectance_assets.chosen_table(face.lobes)
+    image = reflectance_assets.atlas(found)
     assert image.shape == (found.slabs * 32, 90, 4)
     slab, d, h = 5, 17, 40
     expected = face.lobes.table[d, slab * 12 // found.slabs, h, :3]
@@ -79,12 +81,12 @@ def test_an_atlas_holds_each_lobe_at_its_place(face):
 
 def test_lambertian_lobes_need_no_slabs():
     flat = brdf_tables.tabulate({"flat": lambda light, view: 0.25 + 0.0 * light[..., 2]})
-    assert compact_brdf.chosen(flat).slabs == 1
+    assert reflectance_assets.chosen_table(flat).slabs == 1
 
 
 def test_slabs_that_do_not_divide_the_nodes_are_refused(face):
     with pytest.raises(ValueError, match="slabs: got 5"):
-        compact_brdf.in_slabs(face.lobes.table.astype(np.float64), 5)
+        reflectance_assets.in_slabs(face.lobes.table.astype(np.float64), 5)
 
 
 R_D = np.array([0.45, 0.30, 0.20])
@@ -108,10 +110,12 @@ def _dipole_edge(x_mm: float, channel: int) -> float:
 
 def test_gaussians_spread_an_edge_of_light_as_the_dipole_does():
     found = gaussian_profiles.fit(R_D, SIGMA_TR)
+    spread = np.sqrt(2.0 * found.variances_mm2)
     for x in (0.0, 0.3, 1.0, 3.0):
         for channel in range(3):
             expected = _dipole_edge(x, channel)
-            assert abs(found.edge([x])[0, channel] - expected) < 0.004, (x, channel)
+            edge = (0.5 + 0.5 * erf(x / spread)) @ found.weights[:, channel]
+            assert abs(edge - expected) < 0.004, (x, channel)
 
 
 def test_one_gaussian_misses_the_edge_by_far_more_than_four():
@@ -138,7 +142,7 @@ def test_a_profile_scales_with_the_translucency():
     ("r_d", "sigma_tr"), [([0.0, 0.3, 0.3], [1, 1, 1]), ([0.3, 0.3, 0.3], [1, 0, 1])]
 )
 def test_skin_that_cannot_be_is_refused(r_d, sigma_tr):
-    with pytest.raises(gaussian_profiles.ProfileError, match="above 0"):
+    with pytest.raises(SceneError, match="above 0"):
         gaussian_profiles.fit(r_d, sigma_tr)
 
 
@@ -210,15 +214,9 @@ def test_a_face_without_fits_shows_the_population_and_says_so(procedural_source)
 @pytest.fixture(scope="module")
 def procedural_source() -> SceneSource:
     """A source of which nothing was measured."""
-    from skinrig.viewer.scene import ViewerMesh
 
-    mesh = ViewerMesh(
-        np.eye(3, dtype=np.float32),
-        np.eye(3, dtype=np.float32),
-        np.zeros((3, 2), np.float32),
-        np.array([[0, 1, 2]], np.int32),
-    )
-    return SceneSource("procedural", mesh, 64)
+    mesh = build_mesh(10.0 * np.eye(3), [[0, 1, 2]], np.zeros((3, 2)))
+    return SceneSource("procedural", mesh, 64, 0, None, None)
 
 
 def test_filling_keeps_what_is_known_and_continues_it():
@@ -232,7 +230,7 @@ def test_filling_keeps_what_is_known_and_continues_it():
 
 
 def test_presets_name_only_what_a_face_has():
-    found = presets.presets(["anger", "surprise", "exercise"])
+    found = faces.presets(["anger", "surprise", "exercise"])
     assert list(found) == [
         "neutral",
         "surprise",
@@ -260,7 +258,7 @@ def test_shapes_of_single_muscles_make_the_six_emotions():
         )
         for side in "LR"
     ] + ["jawOpen", "mouthPucker"]
-    found = presets.presets(names)
-    assert set(presets.EMOTION_STATES) <= set(found)
+    found = faces.presets(names)
+    assert set(faces.EMOTION_STATES) <= set(found)
     assert all(0.0 < w <= 1.0 for weights in found.values() for w in weights.values())
     assert "after exercise" not in found  # no blood, no exercise

@@ -10,8 +10,7 @@ from rigsim.geometry.mesh import Mesh, MeshError
 from skinrig.errors import UnusableError, UsageError
 from skinrig.exporting.materials import gltf, materialx, udim, usd
 from skinrig.exporting.materials.material import Material
-from skinrig.exporting.options import Delivery
-from skinrig.exporting.sealing import ExportError
+from skinrig.exporting.options import Delivery, ExportError
 
 
 def two_tiles(patch, tile=(1.0, 0.0)):

@@ -15,9 +15,8 @@ from model.texture_resampling import resampled
 from model.wrinkles.evaluation import WRINKLE_FILE, WrinkleModel
 from model.wrinkles.expressions import ExpressionTable
 from skinrig.applying import expression
-from skinrig.exporting.options import Delivery
+from skinrig.exporting.options import Delivery, ExportError
 from skinrig.exporting.packs import color_deltas, delta_maps
-from skinrig.exporting.sealing import ExportError
 
 SIDE = 64
 STATES = ("smile", "anger", "fear", "sadness")

@@ -13,8 +13,7 @@ from model.skin import SkinAppearance, SkinMap
 from skinrig.exporting.images import ImageFolder
 from skinrig.exporting.options import Delivery
 from skinrig.exporting.packs import color_deltas, delta_maps, detail_maps
-from skinrig.exporting.packs.detail_maps import visible_share
-from skinrig.exporting.packs.seamless import periodic, periodic_normals
+from skinrig.exporting.packs.detail_maps import periodic, periodic_normals, visible_share
 
 SIDE = 48
 
@@ -62,7 +61,7 @@ def test_a_crease_in_wrinkle_normals_is_dark_in_the_cavity_map_and_nothing_else_
     valid = np.ones((SIDE, SIDE), bool)
     valid[:4] = False
     out = ImageFolder(tmp_path, Delivery())
-    told, left_out = detail_maps.cavity(slopes, valid, 2 * SIDE, out)
+    told = detail_maps.cavity(slopes, valid, 2 * SIDE, out)
     seen = read(tmp_path / "exr/cavity.exr")
     assert seen.shape == (2 * SIDE, 2 * SIDE)
     # its steepest way out rises by 0.85 at 3.4 texels, all along: 0.76 in closed form, and the
@@ -71,15 +70,15 @@ def test_a_crease_in_wrinkle_normals_is_dark_in_the_cavity_map_and_nothing_else_
     assert seen[60, [4, -5]].min() > 0.95
     assert np.array_equal(seen[:4], np.ones((4, 2 * SIDE)))  # nothing is known there
     assert told["cavity"]["least"] == pytest.approx(seen[12:].min(), abs=1e-6)
-    assert left_out == []
+    assert out.left_out == []
     codes = cv2.imread(str(tmp_path / "png/cavity.png"), cv2.IMREAD_UNCHANGED)
     np.testing.assert_allclose(codes / 65535.0, seen, atol=0.51 / 65535)
 
 
 def test_without_any_valid_normal_no_cavity_is_made_up(tmp_path):
     out = ImageFolder(tmp_path, Delivery())
-    told, left_out = detail_maps.cavity(np.zeros((8, 8, 2)), np.zeros((8, 8), bool), 8, out)
-    assert (told, left_out) == ({}, [("cavity", "no wrinkle normal is valid")])
+    told = detail_maps.cavity(np.zeros((8, 8, 2)), np.zeros((8, 8), bool), 8, out)
+    assert (told, out.left_out) == ({}, [("cavity", "no wrinkle normal is valid")])
     assert list(tmp_path.iterdir()) == []
 
 
@@ -177,16 +176,16 @@ def test_scatter_is_the_models_translucency_at_the_size_of_packs(patch, tmp_path
     face = patch.face(parameters={"assumed": ["translucency is the population's", "other"]})
     onto = store.write(tmp_path / "model", face)
     out = ImageFolder(tmp_path, Delivery(onto=onto))
-    told, left_out = detail_maps.scatter(Delivery(onto=onto), out)
+    told = detail_maps.scatter(out)
     shown, depth = read(tmp_path / "exr/scatter.exr"), face.maps["translucency"]
     np.testing.assert_allclose(shown[depth.valid], depth.values[depth.valid], rtol=1e-6)
     assert told["scatter"]["assumed"] == ["translucency is the population's"]
-    assert left_out == []
+    assert out.left_out == []
     without = {n: m for n, m in face.maps.items() if n != "translucency"}
     bare = store.write(tmp_path / "bare", dataclasses.replace(face, maps=without))
-    told, left_out = detail_maps.scatter(Delivery(onto=bare), out)
-    assert told == {}
-    assert "skinrig fit reflectance" in left_out[0][1]
+    out = ImageFolder(tmp_path, Delivery(onto=bare))
+    assert detail_maps.scatter(out) == {}
+    assert "skinrig fit reflectance" in out.left_out[0][1]
 
 
 def test_sizes_of_packs():

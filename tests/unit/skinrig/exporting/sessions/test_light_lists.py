@@ -11,8 +11,9 @@ from capture import raw
 from capture.importers import import_light_list
 from capture.importers.light_lists import find
 from capture.session import ConsentError, Subject
-from skinrig.exporting.sealing import ExportError
-from skinrig.exporting.sessions.light_lists import export_light_list, in_camera_frame
+from skinrig.exporting import export as exporting
+from skinrig.exporting.options import Delivery, ExportError
+from skinrig.exporting.sessions.light_lists import in_camera_frame
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 SHAPE = (12, 16)
@@ -51,9 +52,8 @@ def session(lights, rng, tmp_path):
 
 
 def export(session, out, **more):
-    return export_light_list(
-        session.path, out, **{"use": "research", "today": date(2026, 1, 1), "now": NOW, **more}
-    )
+    told = {"use": "research", "today": date(2026, 1, 1), "now": NOW, **more}
+    return exporting.export(session.path, out, "lp", **told)
 
 
 def test_directions_and_pictures_come_back_through_an_import(session, lights, tmp_path):
@@ -119,5 +119,5 @@ def test_pictures_leave_only_within_the_consent(session, tmp_path):
 
 def test_a_camera_that_is_not_there_is_named_with_those_that_are(session, tmp_path):
     with pytest.raises(ExportError, match="got 'C9', expected one of cam"):
-        export(session, tmp_path / "out", camera="C9")
+        export(session, tmp_path / "out", delivery=Delivery(camera="C9"))
     assert not (tmp_path / "out").exists()

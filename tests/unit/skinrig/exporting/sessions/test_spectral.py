@@ -10,9 +10,8 @@ import pytest
 from model import color_table, spectra
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN, two_layer_reflectance
-from skinrig.exporting.options import Delivery
-from skinrig.exporting.sealing import ExportError
-from skinrig.exporting.sessions import spectral
+from skinrig.exporting.options import Delivery, ExportError
+from skinrig.exporting.sessions import spectral as stokes
 
 CAMERA, LIGHT = "Nikon 5100 (NPL)", "D55"
 
@@ -53,7 +52,7 @@ def wavelengths(names, kind):
 
 
 def test_reflectance_is_the_two_layer_models_at_each_wavelength(flash, tmp_path):
-    spectral.write(flash, tmp_path, Delivery())
+    stokes.write_spectra(flash, tmp_path, Delivery())
     header, found = channels(tmp_path / "reflectance.exr")
     named = wavelengths(found, "T")
     assert sorted(named.values()) == spectra.WAVELENGTH_NM.tolist()
@@ -88,7 +87,7 @@ def test_fractions_outside_the_table_have_no_spectrum():
 
 def test_stokes_components_give_the_parallel_and_the_crossed_picture(flash, tmp_path):
     """An analyser along (across) the polarizer passes (S0 + S1) / 2 and (S0 - S1) / 2."""
-    spectral.write(flash, tmp_path, Delivery())
+    stokes.write_spectra(flash, tmp_path, Delivery())
     header, found = channels(tmp_path / "stokes.exr")
     assert header["comments"].startswith("measured")
     assert header["polarisationHandedness"] == "right"
@@ -103,7 +102,7 @@ def test_stokes_components_give_the_parallel_and_the_crossed_picture(flash, tmp_
 
 
 def test_the_document_says_what_is_measured_and_what_is_not(flash, tmp_path):
-    left_out = spectral.write(
+    left_out = stokes.write_spectra(
         SkinAppearance({n: flash.maps[n] for n in ("melanin", "hemoglobin")}, "simulated"),
         tmp_path,
         Delivery(),
@@ -117,6 +116,6 @@ def test_the_document_says_what_is_measured_and_what_is_not(flash, tmp_path):
 def test_bands_without_a_camera_have_no_wavelength(flash, tmp_path):
     nameless = SkinAppearance(dict(flash.maps), "simulated")
     with pytest.raises(ExportError, match="which camera and light"):
-        spectral.write(nameless, tmp_path, Delivery())
+        stokes.write_spectra(nameless, tmp_path, Delivery())
     with pytest.raises(ExportError, match="expected melanin and hemoglobin"):
-        spectral.write(SkinAppearance({}, "simulated"), tmp_path, Delivery())
+        stokes.write_spectra(SkinAppearance({}, "simulated"), tmp_path, Delivery())

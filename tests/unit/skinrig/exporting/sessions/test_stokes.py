@@ -13,8 +13,9 @@ from capture.plan.gradient import gradient_plan
 from capture.rig import load_rig
 from capture.session import ConsentError, Session, Subject
 from skinrig.cli import main
-from skinrig.exporting.sealing import ExportError
-from skinrig.exporting.sessions.stokes import export_stokes, file_stem
+from skinrig.exporting.export import export
+from skinrig.exporting.options import Delivery, ExportError
+from skinrig.exporting.sessions.spectral import file_stem
 
 RIG = load_rig("gradient").resized(16)
 DAY = date(2030, 1, 1)
@@ -68,7 +69,7 @@ def read(path):
 
 def test_the_two_polarizations_come_back_from_s0_and_s1(tmp_path):
     session = made(tmp_path)
-    export_stokes(session, tmp_path / "out", use="research", today=DAY)
+    export(session, tmp_path / "out", to="stokes", use="research", today=DAY)
     told = json.loads((tmp_path / "out/stokes.json").read_text())
     assert len(told["files"]) == 4  # two states, two patterns
     for step in Session.open(session).plan.steps:
@@ -87,7 +88,7 @@ def test_the_two_polarizations_come_back_from_s0_and_s1(tmp_path):
 
 def test_channels_are_named_as_the_published_layout_has_them(tmp_path):
     fichet = pytest.importorskip("colour.io.fichet2021")
-    export_stokes(made(tmp_path), tmp_path / "out", use="research", today=DAY)
+    export(made(tmp_path), tmp_path / "out", to="stokes", use="research", today=DAY)
     _, found = read(tmp_path / "out/stokes_a000_n0_full.exr")
     assert sorted(found) == ["S0.535nm", "S1.535nm"]
     for name in found:
@@ -96,13 +97,13 @@ def test_channels_are_named_as_the_published_layout_has_them(tmp_path):
 
 
 def test_the_document_says_along_which_axis_and_what_was_not_measured(tmp_path):
-    done = export_stokes(
+    done = export(
         made(tmp_path, patterns=("full", "dark")),
         tmp_path / "out",
+        to="stokes",
         use="research",
         today=DAY,
-        only=("a000_n0",),
-        with_errors=True,
+        delivery=Delivery(only=("a000_n0",), with_errors=True),
     )
     told = json.loads((tmp_path / "out/stokes.json").read_text())
     assert told["reference_axis_deg"] == RIG.views[0].analyser_axis_deg == 90.0
@@ -120,9 +121,16 @@ def test_the_document_says_along_which_axis_and_what_was_not_measured(tmp_path):
 def test_use_beyond_the_consent_other_rigs_and_unknown_states_are_refused(tmp_path, capsys):
     session = made(tmp_path)
     with pytest.raises(ConsentError, match="has not agreed"):
-        export_stokes(session, tmp_path / "out", use="film", today=DAY)
+        export(session, tmp_path / "out", to="stokes", use="film", today=DAY)
     with pytest.raises(ExportError, match="got 'a090_p3', expected of a000_n0, a000_p1"):
-        export_stokes(session, tmp_path / "out", use="research", today=DAY, only=("a090_p3",))
+        export(
+            session,
+            tmp_path / "out",
+            to="stokes",
+            use="research",
+            today=DAY,
+            delivery=Delivery(only=("a090_p3",)),
+        )
     assert not (tmp_path / "out").exists()
     argv = ["export", str(session), "--to", "stokes", "--out", str(tmp_path / "out")]
     assert main(argv) == 2
@@ -158,4 +166,4 @@ def test_a_session_of_another_rig_is_sent_where_it_belongs(tmp_path):
             )
         session.close()
     with pytest.raises(ExportError, match="--to spectral"):
-        export_stokes(tmp_path / "f", tmp_path / "out", use="research", today=DAY)
+        export(tmp_path / "f", tmp_path / "out", to="stokes", use="research", today=DAY)

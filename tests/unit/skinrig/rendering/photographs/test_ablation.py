@@ -7,8 +7,9 @@ from model.brdf import tables as brdf_tables
 from model.skin_reflectance import SkinReflectance, lobe_brdf
 from rigsim.geometry.mesh import build_mesh
 from skinrig.evaluating import skin_bands
-from skinrig.rendering.photographs.ablation import one_lobe, without_parts
-from skinrig.rendering.photographs.held_out import PhotographsError, Shot, _evenly
+from skinrig.rendering.camera import RenderingError
+from skinrig.rendering.photographs.evaluation import one_lobe, without_parts
+from skinrig.rendering.photographs.held_out import Shot, _evenly
 
 SIDE = 8
 
@@ -86,5 +87,5 @@ def test_photographs_are_chosen_evenly_or_all():
     assert _evenly(shots, None) == shots
     chosen = [int(shot.light[1:]) for shot in _evenly(shots, 8)]
     assert set(np.diff(chosen)) == {5}
-    with pytest.raises(PhotographsError, match="at least 1"):
+    with pytest.raises(RenderingError, match="at least 1"):
         _evenly(shots, 0)

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from skinrig.rendering.camera import RenderingError
 from skinrig.rendering.photographs import errors
-from skinrig.rendering.photographs.errors import Photograph, PhotographError
+from skinrig.rendering.photographs.errors import Photograph
 
 SIDE = 24
 
@@ -106,13 +107,13 @@ def test_errors_by_band_are_those_of_the_pixels_in_it(rng):
 
 def test_images_that_cannot_be_compared_are_refused(rng):
     rgb, photo, covered, lit = scene(rng)
-    with pytest.raises(PhotographError, match="expected"):
+    with pytest.raises(RenderingError, match="expected"):
         errors.compare(photo, rgb[:5], covered=covered, lit=lit)
-    with pytest.raises(PhotographError, match="no pixel"):
+    with pytest.raises(RenderingError, match="no pixel"):
         errors.compare(photo, rgb, covered=covered & False, lit=lit)
     dark = errors.compare(photo, rgb, covered=covered, lit=lit & False)
     assert np.isnan(dark.median)
-    with pytest.raises(PhotographError, match="no lit pixel"):
+    with pytest.raises(RenderingError, match="no lit pixel"):
         errors.summarize([dark], rng=rng)
-    with pytest.raises(PhotographError, match="variance"):
+    with pytest.raises(RenderingError, match="variance"):
         Photograph(rgb, np.zeros((2, 2)), photo.valid)

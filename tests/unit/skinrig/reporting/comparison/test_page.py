@@ -14,7 +14,6 @@ from skinrig.benchmarks.results import Limit, Point, StageBenchmark, Timing
 from skinrig.report import ReportError
 from skinrig.reporting.comparison import maps as map_comparison
 from skinrig.reporting.comparison import runs as run_comparison
-from skinrig.reporting.comparison import truth_errors
 from skinrig.reporting.comparison.maps import CHANCE_FRACTIONS, compare
 
 SIDE = 200
@@ -246,7 +245,7 @@ def test_meshes_of_other_places_are_not_subtracted(tmp_path, rng):
 
 
 def test_errors_against_the_truth_come_with_their_band(folders):
-    rows = truth_errors.of(store.read(folders["b"]), store.read(folders["truth"]))
+    rows = map_comparison.truth_errors(store.read(folders["b"]), store.read(folders["truth"]))
     assert {row.skin for row in rows} == {"all", "melanin 0.05–0.1"}
     assert all(row.error == pytest.approx(30.0, abs=0.3) for row in rows)
     assert map_comparison.MAX_FRACTION_BEYOND > CHANCE_FRACTIONS[-1]

@@ -8,7 +8,7 @@ import pytest
 from model.skin import SkinAppearance
 from reconstruction.pipeline.gradient.stages import KERNEL_FILE
 from skinrig.reporting import page
-from skinrig.reporting.sections import kernel
+from skinrig.reporting.sections import microrelief
 
 FIT = {
     "name": "a000_m1",
@@ -31,7 +31,7 @@ FIT = {
 def table_of(fit):
     text = json.dumps({"fits": [fit], "tables": []}).encode()
     appearance = SkinAppearance({}, "simulated", files={KERNEL_FILE: text})
-    html = page.fragment(kernel.section("gradient", appearance, []))
+    html = page.fragment(microrelief.kernels(page.Subject("gradient", appearance, None, [])))
     head = re.findall(r"<th scope=\"col\"[^>]*>(.*?)</th>", html)
     cells = re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", html.split("<tbody>")[1])
     return list(zip(head, cells, strict=False))

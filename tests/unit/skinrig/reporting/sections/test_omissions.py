@@ -5,7 +5,7 @@ import json
 import pytest
 
 from skinrig.reporting import page
-from skinrig.reporting.sections import omissions
+from skinrig.reporting.sections import session as sections_session
 
 EFFECTS = [
     {"name": "shadows", "verdict": "built", "reason": "a face", "over_noise": 55.0, "switch": ""},
@@ -32,7 +32,7 @@ def session(tmp_path):
 
 
 def test_what_is_left_out_comes_before_what_is_built(session):
-    html = page.fragment(omissions.section([session("session-a", {"effects": EFFECTS})]))
+    html = page.fragment(sections_session.omissions([session("session-a", {"effects": EFFECTS})]))
     places = [html.index(word) for word in ("bounces", "lens", "shadows")]
     assert places == sorted(places)
     assert "of 3 effects 1 built" in html
@@ -43,11 +43,11 @@ def test_what_is_left_out_comes_before_what_is_built(session):
 def test_sessions_of_like_scenes_share_a_table_in_any_order(session):
     two = [session(name, {"effects": EFFECTS}) for name in ("session-b", "session-a")]
     other = session("session-c", {"effects": EFFECTS[:1]})
-    html = page.fragment(omissions.section([*two, other]))
+    html = page.fragment(sections_session.omissions([*two, other]))
     assert html.count("<table") == 2
     assert "session-a, session-b" in html
-    assert html == page.fragment(omissions.section([other, *reversed(two)]))
+    assert html == page.fragment(sections_session.omissions([other, *reversed(two)]))
 
 
 def test_measured_sessions_and_folders_that_are_none_say_nothing(session, tmp_path):
-    assert not list(omissions.section([session("session-real", {}), tmp_path / "nowhere"]))
+    assert not list(sections_session.omissions([session("session-real", {}), tmp_path / "nowhere"]))

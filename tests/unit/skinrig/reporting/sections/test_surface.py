@@ -60,7 +60,7 @@ def test_the_section_checks_normals_and_albedo_and_shows_the_baseline_unchecked(
     }
     checks: list[page.Check] = []
     both = (SkinAppearance(one, "simulated") for one in (maps, truth))
-    body = page.fragment(section("head", *both, checks))
+    body = page.fragment(section(page.Subject("head", *both, checks)))
     assert [check.name for check in checks] == [
         "head: normals, mean error",
         "head: diffuse reflectance R_d, red, median error",
@@ -81,7 +81,9 @@ def test_without_a_truth_the_section_shows_standard_errors_and_checks_nothing(sp
         "normals": SkinMap(normals, "1", np.full((60, 60, 3), 0.01), inside),
     }
     checks: list[page.Check] = []
-    body = page.fragment(section("head", SkinAppearance(maps, "simulated"), None, checks))
+    body = page.fragment(
+        section(page.Subject("head", SkinAppearance(maps, "simulated"), None, checks))
+    )
     assert checks == []
     assert "standard error" in body
     assert "truth" not in body

@@ -13,8 +13,9 @@ from capture.calibration.record import Quantity
 from model import color_table, spectra
 from model.skin import SkinAppearance, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from skinrig.viewer.assets import camera_color
-from skinrig.viewer.scene import SceneSource, ViewerMesh
+from rigsim.geometry.mesh import build_mesh
+from skinrig.viewer.assets import facial_color
+from skinrig.viewer.scene import SceneSource
 
 CAMERA, LIGHT = "Nikon 5100 (NPL)", "LED-B3"
 MATRIX = np.array([[1.5, 0.2, 0.1], [0.6, 1.2, -0.4], [0.1, -0.4, 1.9]])
@@ -24,14 +25,9 @@ WHITE = np.array([0.48, 0.77, 0.6])
 def _source(folder, **more):
     values = np.full((4, 4, 3), 0.4, np.float32)
     appearance = SkinAppearance(maps={"r_d": SkinMap(values, "1")}, source="simulated", **more)
-    mesh = ViewerMesh(
-        np.eye(3, dtype=np.float32),
-        np.eye(3, dtype=np.float32),
-        np.zeros((3, 2), np.float32),
-        np.array([[0, 1, 2]], np.int32),
-    )
+    mesh = build_mesh(10.0 * np.eye(3), [[0, 1, 2]], np.zeros((3, 2)))
     return SceneSource(
-        "dome", mesh, 64, appearances={"dome": appearance}, paths={"dome": folder / "appearance"}
+        "dome", mesh, 64, 0, None, None, {"dome": appearance}, {"dome": folder / "appearance"}
     )
 
 
@@ -62,7 +58,7 @@ def test_a_color_calibration_brings_camera_colors_to_srgb(tmp_path, named):
     source = _source(tmp_path, inputs={} if named else {"calibration color": digest})
     if named:
         source = dataclasses.replace(source, calibration=tmp_path / "calibration")
-    found = camera_color.of(source)
+    found = facial_color.camera_color_of(source)
     rgb = np.array([[0.5, 0.4, 0.3], [1.0, 1.0, 1.0]])
     np.testing.assert_allclose(found.convert(rgb), fit.to_linear_srgb(rgb * WHITE), rtol=1e-12)
     assert found.known
@@ -72,7 +68,7 @@ def test_a_color_calibration_brings_camera_colors_to_srgb(tmp_path, named):
 
 def test_a_calibration_of_another_session_beside_is_not_taken(tmp_path):
     _calibration(tmp_path / "calibration")
-    found = camera_color.of(_source(tmp_path, inputs={"calibration color": "0" * 64}))
+    found = facial_color.camera_color_of(_source(tmp_path, inputs={"calibration color": "0" * 64}))
     assert not found.known
     rgb = np.array([0.5, 0.4, 0.3])
     np.testing.assert_array_equal(found.convert(rgb), rgb)
@@ -89,7 +85,7 @@ def test_a_tabulated_sensor_sees_skin_as_srgb_does(tmp_path, monkeypatch):
             lights = (type("Light", (), {"illuminant": LIGHT}),)
 
     monkeypatch.setattr("capture.session.Session.open", lambda _: Named)
-    found = camera_color.of(source)
+    found = facial_color.camera_color_of(source)
     assert found.known
     assert "no color calibration" in found.provenance
     table = color_table.build(CAMERA, LIGHT, size=9, anisotropy=ANISOTROPY_SKIN)

@@ -10,8 +10,8 @@ import pytest
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import ExpressionTable
 from model.wrinkles.partial_derivatives import Layer
-from skinrig.viewer.assets import wrinkles as wrinkle_assets
-from skinrig.viewer.assets.wrinkles import WrinkleAssetError
+from skinrig.viewer.assets import surface as wrinkle_assets
+from skinrig.viewer.scene import SceneError
 
 ROWS = {"anger": (1.0, -0.5), "joy": (0.0, 1.0)}
 
@@ -75,19 +75,13 @@ def test_expressions_that_the_mesh_cannot_make_leave_wrinkles_out():
     )
 
 
-def test_a_scene_without_a_face_to_wrinkle_says_what_adds_it():
-    made = wrinkle_assets.assets(source("anger"))
-    assert made["left_out"][0][0] == "wrinkles"
-    assert "skinrig fit wrinkles" in made["left_out"][0][1]
-
-
 def test_more_maps_or_zones_than_the_shader_holds_are_refused():
     base = np.zeros((16, 16, 2), np.float32)
-    with pytest.raises(WrinkleAssetError, match="got 5 wrinkle maps, expected at most 4"):
+    with pytest.raises(SceneError, match="got 5 wrinkle maps, expected at most 4"):
         wrinkle_assets.from_model(
             WrinkleModel(base, tuple(layer(seed=i) for i in range(5))), source("anger"), origin=""
         )
-    with pytest.raises(WrinkleAssetError, match="got 9 zones, expected at most 8"):
+    with pytest.raises(SceneError, match="got 9 zones, expected at most 8"):
         wrinkle_assets.from_model(WrinkleModel(base, (layer(zones=9),)), source("anger"), origin="")
 
 

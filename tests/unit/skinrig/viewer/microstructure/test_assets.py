@@ -9,22 +9,23 @@ import pytest
 
 from model.microstructure.convolution import convolve
 from model.microstructure.kernel_table import FOREHEAD, KernelTable, kernel_parameters
-from skinrig.viewer.microstructure import assets, micro_relief, slope_variances
-from skinrig.viewer.microstructure.micro_relief import MicroRelief, MicrostructureAssetError
-from skinrig.viewer.scene import ViewerMesh
+from rigsim.geometry.mesh import Mesh
+from skinrig.viewer.microstructure import assets, relief_growth
+from skinrig.viewer.microstructure.assets import MicroRelief
+from skinrig.viewer.scene import SceneError
 
 
 @pytest.fixture(scope="module")
 def relief() -> MicroRelief:
-    return micro_relief.simulated_relief(3)
+    return assets.simulated_relief(3)
 
 
-def plate(side_mm: float = 250.0) -> ViewerMesh:
+def plate(side_mm: float = 250.0) -> Mesh:
     uv = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float32)
     positions = np.concatenate([side_mm * uv, np.zeros((4, 1))], axis=1).astype(np.float32)
     normals = np.tile(np.array([0, 0, 1], np.float32), (4, 1))
     faces = np.array([[0, 1, 3], [0, 3, 2]], np.int32)
-    return ViewerMesh(positions, normals, uv, faces)
+    return Mesh(positions, faces, uv, normals)
 
 
 def slope_variance(height, pixel, stretch=(1.0, 1.0)):
@@ -36,8 +37,8 @@ def slope_variance(height, pixel, stretch=(1.0, 1.0)):
 @pytest.mark.parametrize(("r_s", "r_t"), [(1.25, 0.8125), (1.125, 1.0), (1.0, 0.75)])
 def test_the_variance_of_slopes_under_strain_is_that_of_convolved_relief(relief, r_s, r_t):
     growth = assets.grown(relief)
-    table = slope_variances.strained_variance(growth, relief.table)
-    ratios = np.linspace(*slope_variances.STRETCH_RANGE, slope_variances.STRETCH_NODES)
+    table = relief_growth.strained_variance(growth, relief.table)
+    ratios = np.linspace(*relief_growth.STRETCH_RANGE, relief_growth.STRETCH_NODES)
     found = table[np.searchsorted(ratios, r_s), np.searchsorted(ratios, r_t)]
     alpha, sigma_um = kernel_parameters([r_s, r_t], relief.table)
     sigma = sigma_um / growth.pixel_um
@@ -58,21 +59,21 @@ def test_the_variance_of_slopes_under_strain_is_that_of_convolved_relief(relief,
 
 
 def test_neutral_skin_keeps_its_variance(relief):
-    table = slope_variances.strained_variance(assets.grown(relief), relief.table)
-    middle = slope_variances.STRETCH_NODES // 2
+    table = relief_growth.strained_variance(assets.grown(relief), relief.table)
+    middle = relief_growth.STRETCH_NODES // 2
     np.testing.assert_allclose(table[middle, middle], 1.0, rtol=1e-9)
 
 
 def test_compressed_skin_is_rougher_and_stretched_skin_smoother(relief):
-    table = slope_variances.strained_variance(assets.grown(relief), relief.table)
-    middle = slope_variances.STRETCH_NODES // 2
+    table = relief_growth.strained_variance(assets.grown(relief), relief.table)
+    middle = relief_growth.STRETCH_NODES // 2
     along = table[:, middle, 0]
     assert along[middle - 6] > 1.5
     assert along[middle + 6] < 0.75
 
 
 def test_larger_pixels_show_less_of_the_slopes(relief):
-    rms = slope_variances.slope_rms(assets.grown(relief))
+    rms = relief_growth.slope_rms(assets.grown(relief))
     assert len(rms) >= 5
     assert all(b < a for a, b in pairwise(rms))
     assert rms[5] < 0.1 * rms[0]
@@ -87,19 +88,19 @@ def test_a_displacement_has_as_many_pixels_as_the_skin_has_lengths_of_the_patch(
 
 def test_kernels_that_reach_over_the_window_are_refused(relief):
     wide = KernelTable((), ((1.0, -1.0),), (0.0, 900.0), (0.0, 900.0), (0.7, 1.3), "wide")
-    with pytest.raises(MicrostructureAssetError, match="mesh: got kernels of 243 px"):
+    with pytest.raises(SceneError, match="mesh: got kernels of 243 px"):
         assets.from_relief(MicroRelief(relief.height_um, 15.0, wide), plate())
 
 
 def test_a_relief_of_few_pixels_is_refused():
     small = MicroRelief(np.zeros((40, 40), np.float32), 15.0, FOREHEAD)
-    with pytest.raises(MicrostructureAssetError, match="at least 96 pixels"):
+    with pytest.raises(SceneError, match="at least 96 pixels"):
         assets.grown(small)
 
 
 def test_a_relief_without_a_valid_pixel_is_refused():
-    with pytest.raises(MicrostructureAssetError, match="no valid pixel"):
-        micro_relief.largest_square(np.zeros((4, 4), np.float32), np.zeros((4, 4), bool))
+    with pytest.raises(SceneError, match="no valid pixel"):
+        assets.largest_square(np.zeros((4, 4), np.float32), np.zeros((4, 4), bool))
 
 
 def test_the_patch_has_no_tilt_of_its_own(relief):
@@ -107,13 +108,3 @@ def test_the_patch_has_no_tilt_of_its_own(relief):
     a = assets.grown(MicroRelief(tilted, 15.0))
     b = assets.grown(MicroRelief(relief.height_um, 15.0))
     np.testing.assert_allclose(a.patch, b.patch, atol=1e-3)
-
-
-def test_a_face_of_which_nothing_is_known_says_what_adds_its_microstructure():
-    class Source:
-        appearances: dict[str, object] = {}  # noqa: RUF012
-        subject = None
-
-    made = assets.assets(Source)  # type: ignore[arg-type]
-    assert made["left_out"][0][0] == "microstructure"
-    assert "skinrig fit microstructure" in made["left_out"][0][1]

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import ndimage
+from twins.relief_growth import window
 
 from skinrig.viewer.microstructure import relief_growth
-from skinrig.viewer.microstructure.relief_growth import GROWN_LEVELS, GrownRelief, ReliefGrowthError
+from skinrig.viewer.microstructure.relief_growth import GROWN_LEVELS, GrownRelief
+from skinrig.viewer.scene import SceneError
 
 
 def gaussian_patch(side: int = 192, sigma: float = 3.0) -> np.ndarray:
@@ -22,12 +24,12 @@ def growth() -> GrownRelief:
 
 
 def test_a_window_is_a_part_of_every_larger_one(growth):
-    large = growth.window(-100, 50, (300, 280))
-    np.testing.assert_array_equal(growth.window(-30, 90, (64, 48)), large[70:134, 40:88])
+    large = window(growth, -100, 50, (300, 280))
+    np.testing.assert_array_equal(window(growth, -30, 90, (64, 48)), large[70:134, 40:88])
 
 
 def test_grown_relief_has_the_mean_and_variance_of_its_patch(growth):
-    grown = growth.window(0, 0, (1200, 1200))
+    grown = window(growth, 0, 0, (1200, 1200))
     # some 1200^2 / (2 pi (2 * 3)^2) independent places, drawn from a patch that has 160 itself:
     # 20 % is four standard errors of its variance
     assert abs(grown.std() / growth.patch.std() - 1.0) < 0.2
@@ -39,18 +41,18 @@ def test_grown_relief_has_no_seams(growth):
         return max(np.abs(np.diff(height, axis=axis)).max() for axis in (0, 1))
 
     # blending adds slopes of its own, but nothing like two unrelated heights side by side
-    grown = growth.window(0, 0, (800, 800))
+    grown = window(growth, 0, 0, (800, 800))
     assert largest_step(grown) < 2.0 * largest_step(growth.patch)
     tiled = np.tile(growth.patch[:40, :40], (4, 4))
     assert largest_step(tiled) > 3.0 * largest_step(growth.patch)
 
 
 def test_a_coarser_level_is_the_mean_of_the_finer_one_but_for_changing_weights(growth):
-    fine = growth.window(160, 320, (512, 512)).astype(np.float64)
+    fine = window(growth, 160, 320, (512, 512)).astype(np.float64)
     for level in range(1, GROWN_LEVELS):
         side = 512 >> level
         mean = fine.reshape(side, 1 << level, side, 1 << level).mean(axis=(1, 3))
-        coarse = growth.window(160 >> level, 320 >> level, (side, side), level=level)
+        coarse = window(growth, 160 >> level, 320 >> level, (side, side), level=level)
         # weights change by a pixel's share of a cell over it
         assert np.std(coarse - mean) < 0.02 * 2.0**level * np.std(mean)
         # one pixel beside: no level agrees by its smoothness alone
@@ -63,15 +65,14 @@ def test_every_place_that_is_shown_lies_in_the_patch():
     largest = relief_growth.largest_cell_px(96)
     growth = GrownRelief(patch, 10.0, largest, 1)
     for level in range(GROWN_LEVELS):
-        window = growth.window(-37, -11, (200, 200), level=level)
-        assert np.isfinite(window).all()
-    with pytest.raises(ReliefGrowthError, match="cell_px: got"):
+        assert np.isfinite(window(growth, -37, -11, (200, 200), level=level)).all()
+    with pytest.raises(SceneError, match="cell_px: got"):
         GrownRelief(patch, 10.0, largest + 1, 1)
 
 
 def test_another_seed_shows_other_places(growth):
     other = GrownRelief(growth.patch, growth.pixel_um, growth.cell_px, growth.seed + 1)
-    a, b = (one.window(0, 0, (400, 400)) for one in (growth, other))
+    a, b = (window(one, 0, 0, (400, 400)) for one in (growth, other))
     assert abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 0.3
 
 
@@ -86,10 +87,10 @@ def test_another_seed_shows_other_places(growth):
 )
 def test_what_cannot_be_grown_from_is_refused(change, message):
     settings = {"patch": np.zeros((96, 96), np.float32), "pixel_um": 1.0, "cell_px": 17, "seed": 0}
-    with pytest.raises(ReliefGrowthError, match=message):
+    with pytest.raises(SceneError, match=message):
         GrownRelief(**(settings | change))
 
 
 def test_places_beyond_32_bits_are_refused(growth):
-    with pytest.raises(ReliefGrowthError, match="window: got"):
-        growth.window(relief_growth.MAX_LATTICE_PX, 0, (8, 8))
+    with pytest.raises(ValueError, match="window: got"):
+        window(growth, relief_growth.MAX_LATTICE_PX, 0, (8, 8))

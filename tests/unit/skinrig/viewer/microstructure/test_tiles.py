@@ -11,7 +11,7 @@ import pytest
 from skinrig.viewer import server
 from skinrig.viewer.microstructure import tiles
 from skinrig.viewer.microstructure.tiles import TILE_PX, TileError
-from skinrig.viewer.server import ServerError
+from skinrig.viewer.scene import SceneError
 
 
 @pytest.fixture(scope="module")
@@ -141,10 +141,10 @@ def test_only_the_loopback_address_listens(served):
 
 
 def test_a_taken_port_is_named(served):
-    with pytest.raises(ServerError, match=f"port: {served.port} cannot be used"):
+    with pytest.raises(SceneError, match=f"port: {served.port} cannot be used"):
         with server.serve(b"", port=served.port):
             pass
-    with pytest.raises(ServerError, match="port: got 70000"):
+    with pytest.raises(SceneError, match="port: got 70000"):
         with server.serve(b"", port=70000):
             pass
 

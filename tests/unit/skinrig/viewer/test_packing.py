@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from fixtures.packed_scenes import as_packed
 
-from skinrig.viewer.packing import arrays as packing
-from skinrig.viewer.packing import page_text
-from skinrig.viewer.scene import SceneError, Texture, ViewerMesh, ViewerScene
+from rigsim.geometry.mesh import Mesh
+from skinrig.viewer import packing, page
+from skinrig.viewer.scene import SceneError, Texture, ViewerScene
 
 
 def _bytes_of(text):
@@ -18,15 +18,15 @@ def _bytes_of(text):
     codes = []
     for one in map(ord, text):
         if one >= 128:
-            codes.append(page_text.UNSAFE_CODES[(one >> 7) - 1])
+            codes.append(page.UNSAFE_CODES[(one >> 7) - 1])
         codes.append(one & 127)
     bits = np.array([[(code >> k) & 1 for k in range(6, -1, -1)] for code in codes], np.uint8)
     return np.packbits(bits.reshape(-1)).tobytes()
 
 
 def _scene(**textures):
-    triangle = ViewerMesh(
-        positions=np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0]], np.float32),
+    triangle = Mesh(
+        vertices_mm=np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0]], np.float32),
         normals=np.tile(np.float32([0, 0, 1]), (3, 1)),
         uv=np.array([[0, 0], [1, 0], [0, 1]], np.float32),
         faces=np.array([[0, 1, 2]], np.int32),
@@ -38,22 +38,22 @@ def _scene(**textures):
 @pytest.mark.parametrize("count", [1, 2, 6, 7, 8, 1000, 1001])
 def test_text_gives_its_bytes_back(count, rng):
     data = rng.integers(0, 256, count, dtype=np.uint8).tobytes()
-    text = page_text.as_text(data)
+    text = page.as_text(data)
     assert _bytes_of(text)[: len(data)] == data
-    assert not {chr(code) for code in page_text.UNSAFE_CODES} & set(text)
+    assert not {chr(code) for code in page.UNSAFE_CODES} & set(text)
 
 
 def test_text_of_bytes_that_are_all_unsafe_is_safe_and_small():
     for fill in (0, 255):
-        text = page_text.as_text(bytes([fill]) * 7001)
-        assert not {chr(code) for code in page_text.UNSAFE_CODES} & set(text)
+        text = page.as_text(bytes([fill]) * 7001)
+        assert not {chr(code) for code in page.UNSAFE_CODES} & set(text)
         assert len(text.encode("utf-8")) <= 8 / 7 * 7001 + 2
         assert _bytes_of(text)[:7001] == bytes([fill]) * 7001
 
 
 def test_text_holds_seven_bits_a_byte(rng):
     data = rng.integers(0, 256, 70_000, dtype=np.uint8).tobytes()
-    assert len(page_text.as_text(data).encode("utf-8")) == pytest.approx(80_000, rel=1e-3)
+    assert len(page.as_text(data).encode("utf-8")) == pytest.approx(80_000, rel=1e-3)
 
 
 @pytest.mark.parametrize(("storage", "top"), [("u8", 255.0), ("u16", 65535.0)])

@@ -12,9 +12,9 @@ from model.facial_color.document import to_maps
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from skinrig import consent
 from skinrig.errors import UsageError
-from skinrig.exporting.appearances import APPEARANCE_FORMATS, export_appearance, export_brdfs
-from skinrig.exporting.options import Delivery
-from skinrig.exporting.sealing import ExportError
+from skinrig.exporting import export as exporting
+from skinrig.exporting.export import APPEARANCE_FORMATS
+from skinrig.exporting.options import Delivery, ExportError
 
 NOW, DAY = datetime(2029, 5, 1, tzinfo=UTC), date(2029, 5, 1)
 LAST = date(2030, 1, 1)
@@ -29,8 +29,7 @@ def measured(patch, tmp_path):
 @pytest.mark.parametrize("to", ["maps", "mtlx", "gltf", "merl"])
 def test_maps_of_a_person_leave_only_as_agreed_and_only_in_time(measured, tmp_path, to):
     def export(**more):
-        one = export_brdfs if to == "merl" else export_appearance
-        return one(measured, tmp_path / "out", to=to, now=NOW, **more)
+        return exporting.export(measured, tmp_path / "out", to=to, now=NOW, **more)
 
     with pytest.raises(UsageError, match="--use: got none"):
         export(today=DAY)
@@ -48,19 +47,19 @@ def test_a_photographs_maps_are_told_that_they_are_no_surface(tmp_path, to):
     flat = SkinMap(values, MAP_UNITS["melanin"], valid=valid)
     maps = store.write(tmp_path / "flash", SkinAppearance({"melanin": flat}, "simulated"))
     with pytest.raises(ExportError, match="holds melanin; expected maps, spectral, metahuman"):
-        export_appearance(maps, tmp_path / "out", to=to)
+        exporting.export(maps, tmp_path / "out", to=to)
     assert not (tmp_path / "out").exists()
-    assert export_appearance(maps, tmp_path / "out", to="maps").files > 1
+    assert exporting.export(maps, tmp_path / "out", to="maps").files > 1
 
 
 def test_what_was_simulated_needs_no_consent(face_folder, tmp_path):
-    assert export_appearance(face_folder, tmp_path / "out", to="mtlx").files > 5
+    assert exporting.export(face_folder, tmp_path / "out", to="mtlx").files > 5
 
 
 def test_measured_maps_that_do_not_tell_the_consent_do_not_leave(patch, tmp_path):
     silent = store.write(tmp_path / "old", patch.face(source="measured"))
     with pytest.raises(ConsentError, match="does not record") as error:
-        export_appearance(silent, tmp_path / "out", to="maps", use="research")
+        exporting.export(silent, tmp_path / "out", to="maps", use="research")
     assert "skinrig reconstruct" in str(error.value)
 
 
@@ -104,7 +103,7 @@ def test_a_damaged_date_is_no_consent(patch):
 def test_the_texture_that_colors_are_put_on_must_be_free_too(measured, face_folder, tmp_path):
     order = Delivery(onto=measured)
     with pytest.raises(ConsentError, match="P042"):
-        export_appearance(
+        exporting.export(
             face_folder, tmp_path / "out", to="maps", delivery=order, use="film", today=DAY
         )
 
@@ -115,7 +114,7 @@ def test_the_same_appearance_gives_the_same_bytes(face_folder, tmp_path, to):
         pytest.importorskip("pxr")
     for name in ("a", "b"):
         order = Delivery(with_errors=True)
-        export_appearance(face_folder, tmp_path / name / "out", to=to, delivery=order, now=NOW)
+        exporting.export(face_folder, tmp_path / name / "out", to=to, delivery=order, now=NOW)
     files = [p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*") if p.is_file()]
     assert len(files) > 4
     for file in files:
@@ -129,19 +128,19 @@ def test_a_failure_on_the_way_leaves_nothing(patch, tmp_path):
     )
     folder = store.write(tmp_path / "face", without)
     with pytest.raises(ValueError, match=r"holds no mesh\.obj"):
-        export_appearance(folder, tmp_path / "out", to="mtlx")
+        exporting.export(folder, tmp_path / "out", to="mtlx")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["face"]
 
 
 def test_an_existing_folder_and_an_unknown_format_are_refused(face_folder, tmp_path):
     with pytest.raises(ExportError, match="exists"):
-        export_appearance(face_folder, tmp_path, to="maps")
+        exporting.export(face_folder, tmp_path, to="maps")
     with pytest.raises(ExportError, match=", ".join(APPEARANCE_FORMATS)):
-        export_appearance(face_folder, tmp_path / "out", to="fbx")
+        exporting.export(face_folder, tmp_path / "out", to="fbx")
 
 
 def test_the_manifest_lists_every_file(face_folder, tmp_path):
-    done = export_appearance(face_folder, tmp_path / "out", to="mtlx", now=NOW)
+    done = exporting.export(face_folder, tmp_path / "out", to="mtlx", now=NOW)
     text = done.manifest.read_text()
     listed = [p for p in done.path.rglob("*") if p.is_file() and "ascmhl" not in p.parts]
     assert done.files == len(listed)

@@ -7,16 +7,18 @@ compresses best.
 """
 
 import json
-from collections.abc import Mapping
+import struct
+import zlib
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skinrig.arrays import Float32Array, Float64Array
-from skinrig.viewer.packing import deflating, octaves
-from skinrig.viewer.scene import Storage, Texture, ViewerMesh, ViewerScene
+from rigsim.geometry.mesh import Mesh
+from skinrig.arrays import Float32Array, Float64Array, Int64Array, UInt8Array
+from skinrig.viewer.scene import Storage, Texture, ViewerScene
 
 Words = NDArray[Any]
 """uint8, uint16, int16, float16 or float32."""
@@ -96,8 +98,8 @@ def stored(texture: Texture) -> tuple[Words, Float32Array, Float32Array]:
     if texture.fine == 1:
         return _quantize(texture.values, texture.storage)
     _, low, high = _quantize(texture.values, "u8")
-    coarse, steps = octaves.split(_unrounded(texture.values, low, high), texture.fine)
-    return octaves.joined(coarse, steps, texture.fine).reshape(texture.values.shape), low, high
+    coarse, steps = split(_unrounded(texture.values, low, high), texture.fine)
+    return joined(coarse, steps, texture.fine).reshape(texture.values.shape), low, high
 
 
 def _unrounded(values: Float32Array, low: Float32Array, high: Float32Array) -> Float64Array:
@@ -130,14 +132,14 @@ def pack(scene: ViewerScene) -> Packed:
         return entry
 
     mesh = scene.mesh
-    kind = np.uint16 if len(mesh.positions) <= 65536 else np.uint32
+    kind = np.uint16 if len(mesh.vertices_mm) <= 65536 else np.uint32
     header: dict[str, Any] = {
         "mesh": {
-            "positions": put(mesh.positions),
+            "positions": put(mesh.vertices_mm),
             "normals": put(np.rint(mesh.normals * NORMAL_STEPS).astype(np.int16)),
             "uv": put(mesh.uv),
             "faces": put(mesh.faces.astype(kind)),
-            "weld": put(welded(mesh.positions).astype(kind)[:, None]),
+            "weld": put(welded(mesh.vertices_mm).astype(kind)[:, None]),
             "shapes": {
                 name: {"step": float(np.float32(step)), "deltas": put(words)}
                 for name, (words, step) in shape_words(mesh).items()
@@ -158,10 +160,21 @@ def pack(scene: ViewerScene) -> Packed:
         else:
             errors[f"{name} rms"] = float(np.sqrt(np.mean(off.astype(np.float64) ** 2)))
             turned = np.ascontiguousarray(_unrounded(texture.values, low, high)[:, ::-1])
-            coarse, steps = octaves.split(turned, texture.fine)
+            coarse, steps = split(turned, texture.fine)
             data = {"predictor": "octaves", "fine": texture.fine}
             data |= {"coarse": put(coarse), "steps": put(steps)}
-        header["textures"][name] = _texture_entry(texture, low, high) | {"data": data}
+        *layers, height, width, channels = texture.values.shape
+        header["textures"][name] = {
+            "width": width,
+            "height": height,
+            "layers": layers[0] if layers else 0,
+            "channels": channels,
+            "storage": texture.storage,
+            "filter": texture.filter,
+            "low": low.tolist(),
+            "high": high.tolist(),
+            "data": data,
+        }
     header |= {
         "params": scene.params,
         "presets": scene.presets,
@@ -171,7 +184,7 @@ def pack(scene: ViewerScene) -> Packed:
         "quantization_error": errors,
         "bytes": offset,
     }
-    payload = deflating.gzipped(chunks)
+    payload = gzipped(chunks)
     header["packed_bytes"] = len(payload)
     plain = json.loads(json.dumps(header, allow_nan=False, default=dict))
     return Packed(plain, payload, errors)
@@ -183,21 +196,7 @@ def welded(positions: Float32Array) -> NDArray[np.intp]:
     return np.asarray(first[inverse.reshape(-1)])
 
 
-def _texture_entry(texture: Texture, low: Float32Array, high: Float32Array) -> dict[str, Any]:
-    shape = texture.values.shape
-    return {
-        "width": shape[-2],
-        "height": shape[-3],
-        "layers": shape[0] if len(shape) == 4 else 0,
-        "channels": shape[-1],
-        "storage": texture.storage,
-        "filter": texture.filter,
-        "low": low.tolist(),
-        "high": high.tolist(),
-    }
-
-
-def shape_words(mesh: ViewerMesh) -> dict[str, tuple[NDArray[np.int16], np.float32]]:
+def shape_words(mesh: Mesh) -> dict[str, tuple[NDArray[np.int16], np.float32]]:
     """Return the words of each blend shape's movement, (V, 3), and the step of one, mm."""
     out = {}
     for name, deltas in mesh.shapes.items():
@@ -215,7 +214,7 @@ def _predicted(words: Words) -> tuple[str, bytes]:
     little = np.ascontiguousarray(little).view(np.dtype(f"<u{words.dtype.itemsize}"))
     flat = little.reshape(-1, *words.shape[-3:]) if words.ndim >= 3 else little[None, :, None, :]
     tried = {name: _bytes_of(_differences(flat, name)) for name in PREDICTOR_NAMES}
-    return min(tried.items(), key=lambda one: deflating.guessed_size(one[1]))
+    return min(tried.items(), key=lambda one: guessed_size(one[1]))
 
 
 def _differences(words: NDArray[Any], predictor: str) -> NDArray[Any]:
@@ -232,3 +231,104 @@ def _bytes_of(words: NDArray[Any]) -> bytes:
     """Return all low bytes, then all high ones: each compresses better by itself."""
     size = words.dtype.itemsize
     return words.reshape(-1).view(np.uint8).reshape(-1, size).T.tobytes()
+
+
+_GZIP_HEADER: Final = b"\x1f\x8b\x08\x00\x00\x00\x00\x00\x02\xff"
+"""gzip, deflate, no name, no time, slowest, unknown system (RFC 1952): the same everywhere."""
+_EMPTY_LAST_BLOCK: Final = b"\x03\x00"
+"""An empty last block of deflate."""
+_MEMORY_LEVEL: Final = 9
+MAX_QUICK_RATIO: Final = 0.9
+"""Repetitions are searched for thoroughly where a quick search makes this much of the size."""
+MAX_MEASURED_BYTES: Final = 1 << 20
+"""Bytes above which a size is guessed from codes and runs alone."""
+
+
+def gzipped(parts: Iterable[bytes]) -> bytes:
+    """Return parts behind each other as one gzip member, the same bytes for the same parts.
+
+    Parameters
+    ----------
+    parts
+        Each is compressed without a look at the others.
+
+    Examples
+    --------
+    >>> import gzip
+    >>> gzip.decompress(gzipped([b"one " * 9, b"", b"two"])) == b"one " * 9 + b"two"
+    True
+    """
+    out = [_GZIP_HEADER]
+    check, size = 0, 0
+    for part in parts:
+        check = zlib.crc32(part, check)
+        size += len(part)
+        if part:
+            out.append(_smallest(part))
+    return b"".join([*out, _EMPTY_LAST_BLOCK, struct.pack("<II", check, size & 0xFFFFFFFF)])
+
+
+def guessed_size(data: bytes) -> int:
+    """Return about how many bytes `gzipped` makes of data, quickly: to compare orders of it."""
+    if len(data) < MAX_MEASURED_BYTES:
+        return len(zlib.compress(data, 1))
+    return min(len(_deflated(data, 1, strategy)) for strategy in _WITHOUT_SEARCH)
+
+
+_WITHOUT_SEARCH: Final = (zlib.Z_HUFFMAN_ONLY, zlib.Z_RLE)
+
+
+def _smallest(part: bytes) -> bytes:
+    plain = min((_deflated(part, 1, strategy) for strategy in _WITHOUT_SEARCH), key=len)
+    quick = _deflated(part, 6, zlib.Z_DEFAULT_STRATEGY)
+    if len(quick) > MAX_QUICK_RATIO * len(plain):
+        return min(plain, quick, key=len)
+    return _deflated(part, 9, zlib.Z_DEFAULT_STRATEGY)
+
+
+def _deflated(part: bytes, level: int, strategy: int) -> bytes:
+    """Return blocks of deflate that end at a whole byte, none of them the last (RFC 1951)."""
+    packer = zlib.compressobj(level, zlib.DEFLATED, -zlib.MAX_WBITS, _MEMORY_LEVEL, strategy)
+    return packer.compress(part) + packer.flush(zlib.Z_SYNC_FLUSH)
+
+
+def split(values: Float64Array, fine: int) -> tuple[UInt8Array, UInt8Array]:
+    """Return words of half as many texels a side, and the steps that the finest octave adds.
+
+    Parameters
+    ----------
+    values
+        Words before they are rounded, 0 to 255, shape (L, H, W, C), H and W even.
+    fine
+        Words a step.
+
+    Returns
+    -------
+    coarse, steps : ndarray of uint8
+        (L, H/2, W/2, C), and (L, H, W, C) modulo 256; `joined` makes words of them.
+    """
+    L, H, W, C = values.shape
+    means = values.reshape(L, H // 2, 2, W // 2, 2, C).mean(axis=(2, 4))
+    coarse = np.rint(means).astype(np.uint8)
+    steps = np.rint((values - _doubled(coarse)) / fine).astype(np.int64)
+    return coarse, (steps % 256).astype(np.uint8)
+
+
+def joined(coarse: UInt8Array, steps: UInt8Array, fine: int) -> UInt8Array:
+    """Return the words of `split`, (L, H, W, C)."""
+    words = _doubled(coarse) + fine * steps.view(np.int8).astype(np.int64)
+    return np.clip(words, 0, 255).astype(np.uint8)
+
+
+def _doubled(coarse: UInt8Array) -> Int64Array:
+    """Return twice as many texels a side, interpolated linearly and rounded half up, (L, H, W, C).
+
+    Whole numbers throughout, so that the page comes to the same words.
+    """
+    c = coarse.astype(np.int64)
+    for axis in (1, 2):
+        ahead = np.concatenate([c.take([0], axis), c.take(range(c.shape[axis] - 1), axis)], axis)
+        behind = np.concatenate([c.take(range(1, c.shape[axis]), axis), c.take([-1], axis)], axis)
+        pair = np.stack([3 * c + ahead, 3 * c + behind], axis=axis + 1)
+        c = pair.reshape(*(n * (2 if k == axis else 1) for k, n in enumerate(c.shape)))
+    return (c + 8) >> 4

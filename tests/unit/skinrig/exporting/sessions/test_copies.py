@@ -14,9 +14,8 @@ from capture.rig import load_rig
 from capture.session import ConsentError, Session, SessionDamage, Subject, verify
 from capture.session.mhl import c4_id
 from skinrig.cli import main
-from skinrig.exporting.sealing import ExportError
-from skinrig.exporting.sessions.handing import SESSION_FORMATS
-from skinrig.exporting.sessions.handing import export_session as export
+from skinrig.exporting.export import export
+from skinrig.exporting.options import ExportError
 
 RIG = load_rig("flash").resized(16)
 DAY = date(2030, 1, 1)
@@ -58,7 +57,7 @@ def session(tmp_path):
     return tmp_path / "s"
 
 
-@pytest.mark.parametrize("to", SESSION_FORMATS)
+@pytest.mark.parametrize("to", ["mhl", "frames", "event-model"])
 def test_only_what_the_subject_agreed_to_leaves_and_only_in_time(session, tmp_path, to):
     out = tmp_path / "out"
     for use, today in (("publication", DAY), ("research", date(2030, 1, 2)), ("any", DAY)):

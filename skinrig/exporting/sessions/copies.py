@@ -1,20 +1,63 @@
-"""A session in the words of Bluesky's event model: run start, descriptors, resource, events, stop.
+"""Sessions copied, their frames alone, or these in the words of Bluesky's event model."""
 
-Documents are plain dictionaries; no library is needed to make or to read them. Frames of one kind
-and camera that bear the same settings are one stream; the picture is an external datum, the file
-inside the exported folder.
-
-References
-----------
-Event model 1.x, https://blueskyproject.io/event-model (schemas of each document).
-"""
-
+import json
+import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from capture.plan import Value
 from capture.session import FrameRecord, Session
+from capture.session.contents import undamaged_contents
+from capture.session.frames import check_file
+from reconstruction.pipeline.inputs import Inputs
+from skinrig.exporting.options import Delivery
+from skinrig.exporting.sealing import write_json
+
+FRAMES_FOLDER, DOCUMENTS_FILE = "frames", "documents.jsonl"
+
+
+def write_session_document(
+    path: Path, inputs: Inputs, told: Mapping[str, Any], left_out: Sequence[tuple[str, str]]
+) -> None:
+    """Write what a document beside a session's images says, and of whom and what they are."""
+    session = inputs.session
+    origin = {
+        "source": session.source,
+        "inputs": inputs.hashes,
+        "assumed": list(inputs.assumed),
+        "consent": [session.manifest.to_json()["subject"]],
+    }
+    write_json(path, {**told, **origin, "left_out": [list(row) for row in left_out]})
+
+
+def write_session(session: Session, out: Path, delivery: Delivery) -> None:
+    """Copy all of a session."""
+    for name in ("session.json", "journal.jsonl"):
+        shutil.copyfile(session.path / name, out / name)
+    for folder in ("frames", "attachments"):
+        if (session.path / folder).is_dir():
+            (out / folder).mkdir()
+    # all attempts, not the last alone: the journal names them
+    for line in undamaged_contents(session.path).file_lines:
+        (out / line.file).write_bytes(check_file(session.path / line.file, line))
+
+
+def write_frames(session: Session, out: Path, delivery: Delivery) -> None:
+    """Copy the DNG files alone."""
+    (out / FRAMES_FOLDER).mkdir()
+    for record in session.frames():
+        (out / record.file).write_bytes(check_file(session.path / record.file, record.line))
+
+
+def write_events(session: Session, out: Path, delivery: Delivery) -> None:
+    """Copy the frames, and write documents.jsonl as Bluesky's event model describes a run."""
+    write_frames(session, out, delivery)
+    with (out / DOCUMENTS_FILE).open("w", encoding="utf-8") as stream:
+        for name, document in documents(session):
+            stream.write(json.dumps([name, document], allow_nan=False) + "\n")
+
 
 HANDLER_SPEC = "SKINRIG_DNG"
 """Name of the handler that opens a datum: ``handler(resource_path)(file=...)`` reads a DNG."""

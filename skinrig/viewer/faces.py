@@ -1,0 +1,303 @@
+"""Faces to show: captured ones, the procedural head, or another mesh grown a skin."""
+
+import tomllib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final
+
+import numpy as np
+
+from model import skin_reflectance, store
+from model.skin import SkinAppearance
+from rigsim.geometry.mesh import Mesh, build_mesh, centered
+from rigsim.subject import SimulatedSubject, make_subject
+from skinrig import consent
+from skinrig.appearances import dynamic as dynamic_appearance
+from skinrig.blend_shapes import meshes as blend_shapes
+from skinrig.rendering.geometry import own_mesh
+from skinrig.viewer.assets import facial_color as facial_color_assets
+from skinrig.viewer.assets import fitted as fitted_assets
+from skinrig.viewer.assets import reflectance as reflectance_assets
+from skinrig.viewer.assets import surface as wrinkle_assets
+from skinrig.viewer.fine_skin import PERSON_PX, FineSkin
+from skinrig.viewer.holes import ClosedMesh, closed
+from skinrig.viewer.microstructure import assets as microstructure_assets
+from skinrig.viewer.scene import MAX_TEXTURE_PX, Assets, Kind, SceneError, SceneSource, ViewerScene
+
+Weights = Mapping[str, float]
+
+EMOTION_STATES: Final = ("happiness", "sadness", "surprise", "fear", "anger", "disgust")
+"""Ekman's six."""
+
+COMBINED_STATES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+    {
+        "sad smile": ("sadness", "smile"),
+        "anger and surprise": ("anger", "surprise"),
+        "after exercise": ("anger", "surprise", "exercise"),
+    }
+)
+"""Of Jimenez et al.: figure 1's sad smile, and the row of figure 11, each at full weight."""
+
+GLOBAL_STATES: Final = ("exercise", "alcohol")
+"""States of the whole face that no muscle makes."""
+
+ACTION_UNITS: Final[Mapping[str, Mapping[str, float]]] = tomllib.loads(
+    resources.files("skinrig").joinpath("data/action_units.toml").read_text(encoding="utf-8")
+)
+"""Shapes of ARKit, without left and right, and their weights."""
+
+
+def presets(names: Iterable[str]) -> dict[str, dict[str, float]]:
+    """Return weights by preset, in the order in which people look for them.
+
+    Parameters
+    ----------
+    names
+        Of blend shapes and states.
+
+    Examples
+    --------
+    >>> presets(["anger", "surprise"])["anger and surprise"]
+    {'anger': 1.0, 'surprise': 1.0}
+    >>> presets(["mouthSmile_L", "mouthSmile_R"])["smile"]
+    {'mouthSmile_L': 1.0, 'mouthSmile_R': 1.0}
+    """
+    known = tuple(dict.fromkeys(names))
+    basic = {name: _weights(name, known) for name in (*EMOTION_STATES, "smile", *GLOBAL_STATES)}
+    # a combination of which a part is missing would be another one's
+    combined = {
+        name: _joined(basic[part] for part in parts)
+        for name, parts in COMBINED_STATES.items()
+        if all(basic[part] for part in parts)
+    }
+    first = {name: basic[name] for name in (*EMOTION_STATES, "smile") if basic[name]}
+    last = {name: basic[name] for name in GLOBAL_STATES if basic[name]}
+    return {"neutral": {}, **first, **combined, **last}
+
+
+def _weights(name: str, known: tuple[str, ...]) -> dict[str, float]:
+    """Return the state of that name and, where there is no such shape, its action units."""
+    found = {name: 1.0} if name in known else {}
+    units = {
+        shape: weight
+        for unit, weight in ACTION_UNITS.get(name, {}).items()
+        for shape in known
+        if shape in (unit, f"{unit}_L", f"{unit}_R", f"{unit}Left", f"{unit}Right")
+    }
+    return {**found, **units}
+
+
+def _joined(parts: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    """Return weights added, no muscle beyond its full movement."""
+    total: dict[str, float] = {}
+    for part in parts:
+        for name, weight in part.items():
+            total[name] = min(total.get(name, 0.0) + weight, 1.0)
+    return total
+
+
+ASSET_BUILDERS: Final[tuple[Callable[[SceneSource], Assets], ...]] = (
+    facial_color_assets.assets,
+    reflectance_assets.default_scattering,
+    wrinkle_assets.surface_assets,
+    fitted_assets.assets,
+    wrinkle_assets.assets,
+    microstructure_assets.assets,
+)
+"""In the order in which their parts are listed; they do not see each other's."""
+
+
+def assemble(source: SceneSource, provenance: Mapping[str, Any]) -> ViewerScene:
+    """Return the scene of a source."""
+    scene = ViewerScene(mesh=source.mesh, provenance=provenance)
+    for build in ASSET_BUILDERS:
+        scene = scene.with_assets(build(source))
+    names = (*scene.mesh.shapes, *scene.params.get("weights", {}))
+    return scene.with_assets({"presets": {n: {"weights": w} for n, w in presets(names).items()}})
+
+
+DEFAULT_PRESET = "III"
+"""Skin type of faces of whom nothing else is known."""
+MESH_FILE: Final = "mesh.obj"
+ALBEDO_MAP: Final = "r_d"
+CAPTURED_KINDS: Final[tuple[Kind, ...]] = ("model", "dome", "dynamic")
+"""What is shown of several folders: the first."""
+MIN_TEXTURE_PX = 64
+POSITION_STEPS_PER_MM = np.float32(1024.0)
+"""Steps of a millimetre that positions are rounded to; strain is of the rounded mesh throughout."""
+
+
+def scene(
+    paths: Sequence[Path] = (),
+    *,
+    mesh: Path | None = None,
+    landmarks: Path | None = None,
+    calibration: Path | None = None,
+    preset: str = DEFAULT_PRESET,
+    seed: int = 0,
+    size: int = 2048,
+) -> ViewerScene:
+    """Return the scene of fitted folders, or of a simulated person without any.
+
+    Parameters
+    ----------
+    paths
+        Folders of `skinrig reconstruct` (dome) or `skinrig fit`, one of a kind.
+    mesh
+        The face they belong to, or to grow the skin on, see `load_mesh`; None: the mesh that a
+        folder holds, else the procedural head.
+    landmarks
+        Table ``name,x,y`` of the neutral picture that the flash rig's maps are drawn on; None: a
+        simulation's own, from its TRUTH/ folder beside.
+    calibration
+        Folder with the color calibration of the dome's cameras; None: the one that the maps were
+        made with, where it lies beside and has color, else what is known of the sensor.
+    preset, seed
+        Of a simulated person, one of `rigsim.subject.PRESET_NAMES`; folders have their own seed.
+    size
+        Texels a side of the large textures, 64 to 4096.
+
+    Raises
+    ------
+    SceneError
+        A size out of range, a folder of a kind that cannot be shown, two of one kind, no
+        landmarks, or landmarks or a calibration of nothing.
+    model.store.StoreError
+        A folder that cannot be read.
+    rigsim.subject.SubjectError, rigsim.geometry.mesh.MeshError,
+    rigsim.geometry.mesh.MeshError
+        For a preset, seed or mesh that cannot be used.
+    """
+    if not MIN_TEXTURE_PX <= size <= MAX_TEXTURE_PX:
+        raise SceneError(f"size: got {size}, expected {MIN_TEXTURE_PX} to {MAX_TEXTURE_PX} texels")
+    if landmarks is not None and not paths:
+        raise SceneError(
+            "landmarks: got a table but no appearance whose picture it belongs to; name the folder"
+        )
+    if calibration is not None and not paths:
+        raise SceneError(
+            "calibration: got a folder but no dome's appearance whose colors it is of; name one"
+        )
+    folders, appearances = _read(paths)
+    whole, told = _mesh(appearances, mesh)
+    kind: Kind = "procedural" if mesh is None else "mesh"
+    if paths:
+        first = next(iter(appearances.values())).seed
+        preset, seed = DEFAULT_PRESET, first if isinstance(first, int) and first >= 0 else 0
+        kind = next(name for name in CAPTURED_KINDS if name in appearances)
+    surface = None if whole is None else whole.mesh
+    subject = make_subject(preset, seed=seed, size=min(size, PERSON_PX), mesh=surface)
+    skin = FineSkin(subject, size)
+    of = viewer_mesh(subject), size, seed, subject, skin, appearances, folders
+    source = SceneSource(kind, *of, landmarks, calibration)
+    if not paths:
+        provenance = {"source": "simulated", "kind": kind, "preset": preset, "seed": seed}
+        return assemble(source, provenance | ({} if mesh is None else {"mesh": mesh.name}))
+    found = assemble(source, _provenance(source, paths, whole, told))
+    movement = (
+        "its movement was not captured: the blend shapes are those of the file, or simulated "
+        "action units"
+    )
+    holes = () if whole is None else whole.summary()
+    left_out = [*holes, ("expressions of this face", movement)]
+    if whole is None:
+        left_out.insert(0, ("geometry of this face", f"{told}; --mesh FILE shows another"))
+    found = found.with_assets({"left_out": tuple(left_out)})
+    return found if whole is None else whole.painted(found)
+
+
+def _read(paths: Sequence[Path]) -> tuple[dict[str, Path], dict[str, SkinAppearance]]:
+    """Return folders and what they hold by kind."""
+    folders: dict[str, Path] = {}
+    appearances: dict[str, SkinAppearance] = {}
+    for path in paths:
+        appearance = store.read(path)
+        kind = kind_of(path, appearance)
+        if kind in folders:
+            raise SceneError(f"{path}: {folders[kind]} is of the same kind ({kind}); show one")
+        appearances[kind], folders[kind] = appearance, path
+    return folders, appearances
+
+
+def _provenance(
+    source: SceneSource, paths: Sequence[Path], whole: ClosedMesh | None, mesh: str
+) -> dict[str, Any]:
+    """Return where a captured scene is from, and what its people agreed to."""
+    found: dict[str, Any] = {
+        "source": " and ".join(sorted({one.source for one in source.appearances.values()})),
+        "kind": source.kind,
+        "appearances": [path.name for path in paths],
+        "mesh": mesh,
+    }
+    if whole is not None and whole.charts:
+        found["closed_holes"] = len(whole.charts)
+    agreed = consent.merge_consent(*source.appearances.values())
+    return found | ({consent.CONSENT_KEY: consent.format_consent(agreed)} if agreed else {})
+
+
+def load_mesh(path: Path) -> Mesh:
+    """Return a face mesh of a file with or without blend shapes, in place of the procedural head.
+
+    Parameters
+    ----------
+    path
+        .npz, .obj (or a folder of them), .gltf or .glb, see `skinrig.blend_shapes.meshes.load`. The
+        face looks towards +z, and its foremost vertex is the tip of the nose.
+    """
+    loaded = blend_shapes.load(path)
+    if loaded.uv.min() < 0.0 or loaded.uv.max() > 1.0:
+        raise SceneError(
+            f"{path}: texture coordinates reach from {loaded.uv.min():g} to {loaded.uv.max():g}, "
+            "expected 0 to 1; export the tile of the face alone"
+        )
+    return centered(build_mesh(loaded.vertices_mm, loaded.faces, loaded.uv, shapes=loaded.shapes))
+
+
+def viewer_mesh(subject: SimulatedSubject) -> Mesh:
+    """Return a person's mesh; its own blend shapes come behind those of the expressions."""
+    rounded = np.round(subject.mesh.vertices_mm * POSITION_STEPS_PER_MM) / POSITION_STEPS_PER_MM
+    own = {n: d for n, d in subject.mesh.shapes.items() if np.any(d)}
+    shapes = {**subject.blend_shapes(), **own}
+    return replace(subject.mesh, vertices_mm=rounded.astype(np.float32), shapes=shapes)
+
+
+def kind_of(path: Path, appearance: SkinAppearance) -> str:
+    """Return "dynamic", "dome" or "model".
+
+    Raises
+    ------
+    SceneError
+        Nothing of it can be drawn on a face.
+    """
+    if dynamic_appearance.parts_of(appearance):
+        return "dynamic"
+    if skin_reflectance.BASIS_FILE in appearance.files and "reflectance_model" in (
+        appearance.parameters
+    ):
+        return "model"
+    if MESH_FILE in appearance.files and ALBEDO_MAP in appearance.maps:
+        return "dome"
+    raise SceneError(
+        f"{path}: holds {', '.join(sorted(appearance.maps)) or 'no maps'}, expected a moving face "
+        "(`skinrig fit facial-color`, `wrinkles` or `microstructure`), or a dome's maps with "
+        f"{ALBEDO_MAP} and {MESH_FILE}"
+    )
+
+
+def _mesh(
+    appearances: dict[str, SkinAppearance], asked: Path | None
+) -> tuple[ClosedMesh | None, str]:
+    """Return the mesh to show, None for the procedural head, and words for it.
+
+    Holes of a scan are closed; another mesh may have them for a reason.
+    """
+    if asked is not None:
+        return ClosedMesh(load_mesh(asked), (), ()), asked.name
+    for kind in ("model", "dome"):
+        appearance = appearances.get(kind)
+        if appearance is not None and MESH_FILE in appearance.files:
+            return closed(own_mesh(appearance)), f"{MESH_FILE} of the {kind}"
+    return None, "the procedural head stands for the face"

@@ -1,1 +1,0 @@
-"""Closing of holes in scans."""

@@ -1,1 +1,0 @@
-"""Packing of arrays and text into the page."""
