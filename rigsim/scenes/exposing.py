@@ -43,7 +43,7 @@ def full_power_s(light: SwitchedLight, name: str) -> float:
 
     Examples
     --------
-    >>> from rigsim.boxes.dome import LedPulse
+    >>> from rigsim.boxes.led_table import LedPulse
     >>> full_power_s(LedPulse(led=3, level=0.5, t_on_s=1.0, t_off_s=1.5), "LED 3")
     0.25
     """

@@ -63,7 +63,7 @@ def test_a_host_that_dies_leaves_the_sphere_dark_and_the_skin_free_within_the_le
         served.wait(0.01)
     for box in (sphere, caliper):
         assert (box.armed, box.tripped) == (False, True)
-    dark_s, (free_s, state) = world.patterns[-1].t_off_s, world.grips[-1]
+    dark_s, (free_s, state) = world.switched[-1].t_off_s, world.grips[-1]
     print(f"dark {1e3 * (dark_s - struck_s):.0f} ms after, free {free_s - struck_s:.3f} s")
     assert dark_s - last_heard(sphere) <= LEASE_S + EXACT_S
     assert free_s - last_heard(caliper) <= LEASE_S + EXACT_S

@@ -49,7 +49,7 @@ def test_a_host_that_dies_leaves_the_head_dark_and_vented_within_the_lease(
         assert world.now < struck_s + GIVE_UP_S
         served.wait(0.01)
     assert (box.armed, box.tripped) == (False, True)
-    (light,) = world.sources
+    (light,) = world.switched
     vented_s = [t_s for t_s, _ in world.heads][-1]
     dark_s = light.t_off_s
     print(f"dark {1e3 * (dark_s - struck_s):.0f} ms after, vented {vented_s - struck_s:.3f} s")
@@ -57,4 +57,4 @@ def test_a_host_that_dies_leaves_the_head_dark_and_vented_within_the_lease(
     assert not world.head_at(world.now).placed
     served.wait(0.3)
     assert world.head_at(world.now).suction_mbar < 1.0
-    assert len(world.sources) == 1
+    assert len(world.switched) == 1

@@ -39,7 +39,7 @@ def test_bash_asks_and_is_refused_a_bare_command(served, name):
         script += 'read -r -t 5 -u 3 line; echo "$line"\n' * answers
     run = subprocess.run([bash, "-c", script], capture_output=True, text=True, timeout=120)
     assert run.stdout.splitlines() == [IDN[name], '203,"Unframed command"', answer], run.stderr
-    assert served.world.patterns == []
+    assert served.world.switched == []
     assert served.world.box("caliper").device.moves == []
 
 
@@ -106,7 +106,7 @@ def test_both_boxes_are_driven_at_once_and_neither_disturbs_the_other(served):
         assert sphere.is_armed()
         assert not caliper.is_armed()
         sphere.listen(0.2)
-    assert [light.pattern for light in served.world.patterns] == ["x"] * len(lit)
+    assert [light.pattern for light in served.world.switched] == ["x"] * len(lit)
 
 
 def test_exchanged_addresses_are_noticed(served):

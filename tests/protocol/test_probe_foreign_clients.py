@@ -45,7 +45,7 @@ def test_bash_asks_and_is_refused_a_bare_command(served):
     unframed = '203,"Unframed command"'
     expected = [IDN, unframed, unframed, '0,"No error"', "NONE"]
     assert run.stdout.splitlines() == expected, run.stderr
-    assert served.world.sources == []
+    assert served.world.switched == []
     assert served.world.box("probe").device.pump.count == 0
 
 

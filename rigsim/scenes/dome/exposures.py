@@ -9,7 +9,7 @@ import numpy as np
 from capture.rig import View
 from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.as_built.dome import BuiltDome
-from rigsim.boxes.dome import LedPulse
+from rigsim.boxes.led_table import LedPulse
 from rigsim.scenes.exposing import Kept, full_power_s
 from rigsim.sensor import Sensor, expose
 

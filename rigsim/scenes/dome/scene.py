@@ -25,7 +25,7 @@ from model import spectra
 from model.skin import SkinAppearance
 from rigsim.arrays import Float32Array, Float64Array, UInt16Array
 from rigsim.as_built.dome import BuiltDome
-from rigsim.boxes.dome import LedPulse
+from rigsim.boxes.led_table import LedPulse
 from rigsim.geometry.atlas import dilate_texture, sample
 from rigsim.light import olat, surface_brdf
 from rigsim.light.interreflection import interreflection_for

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from capture.rig import Rig, RigError, View
 from rigsim.arrays import Float32Array, Float64Array, Int64Array, UInt16Array
 from rigsim.as_built.dome import BuiltDome, build, image_of, pixel_corner_rays
-from rigsim.boxes.dome import LedPulse
+from rigsim.boxes.led_table import LedPulse
 from rigsim.light.led_light import lobe_exponent, white_intensity
 from rigsim.needs.effects import Effect, EffectSelection, Noise, absent, decide, unmodeled
 from rigsim.package_data import package_table
