@@ -1,20 +1,26 @@
 """What scenes share: views, sensors, the light of their exposures, and what is kept of it."""
 
 from collections import OrderedDict
-from collections.abc import Callable
-from typing import Generic, TypeVar
+from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
+
+import numpy as np
 
 from capture.rig import Rig, RigError, View
+from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.needs.effects import EffectSelection, Noise, SceneEffects
 from rigsim.needs.face import INTERREFLECTION_EFFECT, Scenery, last_bounce
 from rigsim.render import Caster
-from rigsim.sensor import Sensor, sensor_of
+from rigsim.sensor import Sensor, expose, sensor_of
 from rigsim.subject import SimulatedSubject
 from rigsim.targets import Target
 from rigsim.world.light_record import SwitchedLight
 
 KeyT = TypeVar("KeyT")
 ValueT = TypeVar("ValueT")
+PopT = TypeVar("PopT")
+Key = ParamSpec("Key")
 
 
 class SceneError(ValueError):
@@ -85,10 +91,29 @@ class Kept(Generic[KeyT, ValueT]):
         self._values.clear()
 
 
+def kept(make: Callable[Concatenate[Any, Key], ValueT]) -> Callable[Concatenate[Any, Key], ValueT]:
+    """Have a method's result made once for the same arguments, and kept as long as its object."""
+    name = f"_kept_{make.__name__}"
+
+    @wraps(make)
+    def get(owner: Any, /, *key: Key.args, **named: Key.kwargs) -> ValueT:
+        values: dict[object, ValueT] = owner.__dict__.setdefault(name, {})
+        asked = (key, *named.items())
+        if asked not in values:
+            values[asked] = make(owner, *key, **named)
+        return values[asked]
+
+    return get
+
+
 class RigScene:
     """What scenes of every rig have."""
 
     rig: Rig
+    seed: int
+    """Seeds what differs from exposure to exposure."""
+    channels: tuple[int, ...] = (3,)
+    """Shape of the light on a pixel: camera RGB, or () for the one band of a camera."""
     needs: EffectSelection
     """What is built, what is not, and why."""
 
@@ -105,6 +130,44 @@ class RigScene:
             return self.rig.view(name)
         except RigError as error:
             raise SceneError(str(error)) from error
+
+    def sensor(self, view_name: str | None = None) -> Sensor:
+        """Return the sensor of a view; None takes the first."""
+        raise NotImplementedError
+
+    def _expose(
+        self,
+        view: View,
+        pops: Sequence[PopT],
+        energy_of: Callable[[PopT], float],
+        image_of: Callable[[PopT], Float32Array],
+        *,
+        deviation: float,
+        exposure_s: float,
+        seed: int,
+    ) -> UInt16Array:
+        """Return the DN, (H, W), of a camera on which lights shone, each a little off its energy.
+
+        Parameters
+        ----------
+        view, pops
+            The camera and the lights.
+        energy_of
+            Energy of a light relative to that of its image.
+        image_of
+            What a light sends to the camera, shape (H, W, *channels).
+        deviation
+            Relative standard deviation of the energy.
+        exposure_s, seed
+            Exposure time in s, and seed of its noise.
+        """
+        rng = np.random.default_rng([self.seed, seed])
+        light = np.zeros((view.height_px, view.width_px, *self.channels), np.float32)
+        for pop in pops:
+            energy = energy_of(pop) * (1.0 + deviation * rng.standard_normal())
+            if energy > 0.0:
+                light += np.float32(energy) * image_of(pop)
+        return expose(light, sensor=self.sensor(view.name), rng=rng, exposure_s=exposure_s)
 
 
 class FaceScene(RigScene):

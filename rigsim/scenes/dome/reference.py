@@ -88,9 +88,8 @@ class DirectScene(DomeScene):
 class PlainScene(DirectScene):
     """A dome whose skin has no vellus hair and no brows."""
 
-    def surface(self, view: View) -> SkinSurface:
-        """Return how the face reflects for a camera."""
-        surface = super().surface(view)
+    def _surface(self, camera: str) -> SkinSurface:
+        surface = super()._surface(camera)
         none = np.zeros_like(surface.fuzz)
         return dataclasses.replace(surface, fuzz=none, bare=np.ones_like(none))
 

@@ -20,7 +20,7 @@ from rigsim.boxes.led_table import LedPulse
 from rigsim.light.led_light import lobe_exponent, white_intensity
 from rigsim.needs.effects import Effect, EffectSelection, Noise, absent, decide, unmodeled
 from rigsim.package_data import package_table
-from rigsim.scenes.dome.exposures import LED_POWER_DEVIATION
+from rigsim.scenes.dome.scene import LED_POWER_DEVIATION
 from rigsim.scenes.exposing import RigScene
 from rigsim.sensor import expose, sensor_of
 from rigsim.targets import mirror_ball, printed_plate

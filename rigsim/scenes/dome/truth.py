@@ -11,7 +11,7 @@ from rigsim.light import olat, surface_brdf
 from rigsim.light.olat import Hits
 from rigsim.light.surface_brdf import SkinSurface
 from rigsim.population.population import MAX_SKIN_HAIR
-from rigsim.scenes.dome.views import unit
+from rigsim.scenes.dome.rows import unit
 from rigsim.subject import SimulatedSubject
 
 COATING_MAPS: Final = ("film", "film_alpha", "film_eta", "powder")

@@ -30,7 +30,7 @@ from rigsim.scenes.gradient.analyser import GridAnalyser
 from rigsim.scenes.gradient.lighting import Lighting, light_skin
 from rigsim.scenes.gradient.patch import SHADOW_MARGIN_PX, PatchSurface, sample_grid, stand
 from rigsim.scenes.gradient.target import target_moments
-from rigsim.sensor import Sensor, expose, sensor_of
+from rigsim.sensor import Sensor, sensor_of
 from rigsim.skin_patch.microrelief import MicroSkin
 from rigsim.skin_patch.motion import PatchMotion, Pose, shifted
 from rigsim.skin_patch.stretch import StretchedSkin, deform
@@ -96,6 +96,8 @@ class GradientScene(RigScene):
     table_size
         Nodes of the table of moments along each axis of the normals; None chooses by roughness.
     """
+
+    channels = ()
 
     def __init__(
         self,
@@ -288,21 +290,21 @@ class GradientScene(RigScene):
         ndarray of uint16
             Raw DN, shape (H, W).
         """
-        self._camera(view_name)
-        rng = np.random.default_rng([self.seed, seed])
-        light = np.zeros((self._view.height_px, self._view.width_px), np.float32)
-        for pop in pops:
-            energy = full_power_s(pop, f"pattern {pop.pattern!r}")
-            energy *= 1.0 + PATTERN_POWER_DEVIATION * rng.standard_normal()
-            if energy > 0.0 and any(_weights(pop.pattern)):
-                light += np.float32(energy) * self.radiance(
-                    pop.pattern,
-                    grip=grip,
-                    analyser_deg=pop.analyser_deg,
-                    t_s=0.5 * (pop.t_on_s + pop.t_off_s),
-                    led_shares=pop.led_shares,
-                )
-        return expose(light, sensor=self._sensor, rng=rng, exposure_s=exposure_s)
+        return self._expose(
+            self._camera(view_name),
+            pops,
+            lambda pop: full_power_s(pop, f"pattern {pop.pattern!r}"),
+            lambda pop: self.radiance(
+                pop.pattern,
+                grip=grip,
+                analyser_deg=pop.analyser_deg,
+                t_s=0.5 * (pop.t_on_s + pop.t_off_s),
+                led_shares=pop.led_shares,
+            ),
+            deviation=PATTERN_POWER_DEVIATION,
+            exposure_s=exposure_s,
+            seed=seed,
+        )
 
     def forget(self) -> None:
         """Drop the pictures that are kept, which the subject's states are made again from."""
