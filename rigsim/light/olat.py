@@ -382,7 +382,7 @@ def light_up(
     faded = np.ones(0, np.float32) if relief is None else relief
     samples = (hits.position_mm, hits.normal, hits.surface, hits.camera_mm, hits.kind)
     light = (center, axis, float(lamp.exponent))
-    kernels.shade(*samples, *light, visible, extra, diffuse, faded, rows)
+    kernels.shade(samples, light, visible, extra, diffuse, faded, rows)
     return sum_rows(hits, rows[0], rows[1], rows[2], color)
 
 

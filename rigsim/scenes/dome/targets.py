@@ -18,7 +18,7 @@ from rigsim.arrays import Float32Array, Float64Array, Int64Array, UInt16Array
 from rigsim.as_built.dome import BuiltDome, build, image_of, pixel_corner_rays
 from rigsim.boxes.led_table import LedPulse
 from rigsim.light.led_light import lobe_exponent, white_intensity
-from rigsim.needs.effects import Effect, EffectSelection, Noise, absent, decide, unmodeled
+from rigsim.needs.effects import Effect, EffectSelection, Noise, decide, left_out_of
 from rigsim.package_data import package_table
 from rigsim.scenes.dome.scene import LED_POWER_DEVIATION
 from rigsim.scenes.exposing import RigScene
@@ -117,18 +117,7 @@ class TargetScene(RigScene):
                 switch="",
                 because=f"{100 * LED_SIZES:g} % of the light",
             ),
-            *absent(
-                [
-                    ("the stand of the ball", "the ball floats"),
-                    ("LEDs seen past boards and plates", "the dome behind them is dark"),
-                ]
-            ),
-            *unmodeled(
-                [
-                    ("light from the cloth on boards and plates", "0.1 % of the direct light"),
-                    ("blur of the lenses", "every pixel averages over its own square"),
-                ]
-            ),
+            *left_out_of("dome_target"),
         ]
         return EffectSelection(tuple(effects))
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from capture.rig import Rig
 from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.boxes.flash import FlashPop
-from rigsim.needs.effects import EffectSelection, unmodeled
+from rigsim.needs.effects import EffectSelection, left_out_of
 from rigsim.scenes.exposing import RigScene, SceneError, kept
 from rigsim.scenes.flash.scene import POP_ENERGY_DEVIATION, FlashScene, pop_energy
 from rigsim.sensor import Sensor
@@ -85,9 +85,8 @@ class FlashCourseScene(RigScene):
     @cached_property
     def needs(self) -> EffectSelection:  # type: ignore[override]
         """What is built, what is not, and why."""
-        name = "the movement between two expressions"
-        between = unmodeled([(name, "the face is in one or the other")])
-        return EffectSelection((*self.at(self.course.state, 1.0).needs, *between))
+        whole = self.at(self.course.state, 1.0).needs
+        return EffectSelection((*whole, *left_out_of("course")))
 
     def sensor(self, view_name: str | None = None) -> Sensor:
         """Return the sensor of a view; None takes the first."""
