@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from rigsim.fiber.walk import MAX_COPIES, MAX_DEPTH_GAIN, STACK_DEPTH
-from rigsim.tissue.photon_walk import draw, fresnel, scatter
+from rigsim.tissue.photon_walk import disc_point, draw, fresnel, scatter
 
 
 @njit(inline="always")
@@ -61,13 +61,7 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
     by_ring = rings.shape[0] > 0
     waiting = np.empty((STACK_DEPTH, 7))
     for _ in range(photons):
-        while True:
-            s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
-            ux = 2.0 * u - 1.0
-            s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
-            uy = 2.0 * u - 1.0
-            if ux * ux + uy * uy <= 1.0:
-                break
+        s0, s1, s2, s3, ux, uy = disc_point(s0, s1, s2, s3)
         ux *= source_sine
         uy *= source_sine
         reflected, uz = fresnel(sqrt(1.0 - ux * ux - uy * uy), 1.0, eta)
@@ -106,13 +100,7 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
                 visited[1, cell] += weight / deeper
                 s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
                 if u <= chance:
-                    while True:
-                        s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
-                        p = 2.0 * u - 1.0
-                        s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
-                        q = 2.0 * u - 1.0
-                        if p * p + q * q <= 1.0:
-                            break
+                    s0, s1, s2, s3, p, q = disc_point(s0, s1, s2, s3)
                     p *= fibre_sine / eta
                     q *= fibre_sine / eta
                     mu = sqrt(1.0 - p * p - q * q)

@@ -13,7 +13,7 @@ from math import copysign, exp, log, sqrt
 import numpy as np
 from numba import njit
 
-from rigsim.tissue.photon_walk import draw, fresnel, scatter
+from rigsim.tissue.photon_walk import disc_point, draw, fresnel, scatter
 
 TABLE_COLUMNS = 8
 """Columns of the layer table: top, bottom (mm), sigma_t (1/mm), albedo, g, eta, optical depth of
@@ -155,14 +155,8 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
                         s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
                         if u <= chance:
                             # A direction within the cone outside, uniform in projected angle.
-                            while True:
-                                s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
-                                p = 2.0 * u - 1.0
-                                s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
-                                q = 2.0 * u - 1.0
-                                norm = p * p + q * q
-                                if norm <= 1.0:
-                                    break
+                            s0, s1, s2, s3, p, q = disc_point(s0, s1, s2, s3)
+                            norm = p * p + q * q
                             eta = table[layer, 5]
                             p *= fibre_sine
                             q *= fibre_sine

@@ -21,7 +21,6 @@ def dome_needs(
     subject: SimulatedSubject | Target,
     state: str,
     scenery: face.Scenery,
-    *,
     white_rgb: FloatArray | None,
     movement: bool,
     motion: HeadMotion | None,

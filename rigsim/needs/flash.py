@@ -15,7 +15,6 @@ def flash_needs(
     subject: SimulatedSubject | Target,
     state: str,
     scenery: face.Scenery,
-    *,
     white_rgb: FloatArray,
     weights_mm2: FloatArray,
     movement: bool,

@@ -34,7 +34,6 @@ def gradient_needs(
     subject: MicroSkin | str,
     sphere: BuiltSphere,
     lens: Lens,
-    *,
     noise: Noise,
     white: float,
     moving: bool,

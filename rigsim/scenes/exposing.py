@@ -1,9 +1,7 @@
 """What scenes share: views, sensors, the light of their exposures, and what is kept of it."""
 
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from functools import wraps
-from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -17,10 +15,7 @@ from rigsim.subject import SimulatedSubject
 from rigsim.targets import Target
 from rigsim.world.light_record import SwitchedLight
 
-KeyT = TypeVar("KeyT")
-ValueT = TypeVar("ValueT")
 PopT = TypeVar("PopT")
-Key = ParamSpec("Key")
 
 
 class SceneError(ValueError):
@@ -61,49 +56,6 @@ def full_power_s(light: SwitchedLight, name: str) -> float:
             "expected an end after its beginning"
         )
     return light.level * (light.t_off_s - light.t_on_s)
-
-
-class Kept(Generic[KeyT, ValueT]):
-    """The latest of what is slow to make.
-
-    Parameters
-    ----------
-    most
-        How many values like a given one are kept, at least 1.
-    """
-
-    def __init__(self, most: Callable[[ValueT], int]) -> None:
-        self._most = most
-        self._values: OrderedDict[KeyT, ValueT] = OrderedDict()
-
-    def get(self, key: KeyT, make: Callable[[], ValueT]) -> ValueT:
-        """Return what is kept under a key, or make it."""
-        if key not in self._values:
-            value = make()
-            while self._values and len(self._values) >= self._most(value):
-                self._values.popitem(last=False)
-            self._values[key] = value
-        self._values.move_to_end(key)
-        return self._values[key]
-
-    def clear(self) -> None:
-        """Forget everything."""
-        self._values.clear()
-
-
-def kept(make: Callable[Concatenate[Any, Key], ValueT]) -> Callable[Concatenate[Any, Key], ValueT]:
-    """Have a method's result made once for the same arguments, and kept as long as its object."""
-    name = f"_kept_{make.__name__}"
-
-    @wraps(make)
-    def get(owner: Any, /, *key: Key.args, **named: Key.kwargs) -> ValueT:
-        values: dict[object, ValueT] = owner.__dict__.setdefault(name, {})
-        asked = (key, *named.items())
-        if asked not in values:
-            values[asked] = make(owner, *key, **named)
-        return values[asked]
-
-    return get
 
 
 class RigScene:
@@ -177,7 +129,6 @@ class FaceScene(RigScene):
         self,
         rig: Rig,
         subject: SimulatedSubject | Target,
-        *,
         state: str,
         movement: bool,
         sensor: Sensor | None,

@@ -11,13 +11,14 @@ from capture.rig import View
 from rigsim.arrays import Float32Array, Float64Array, Int32Array
 from rigsim.as_built.dome import BuiltDome
 from rigsim.geometry.atlas import dilate_texture, sample, unwrap
+from rigsim.kept import Kept
 from rigsim.light.lateral_scattering import LateralScattering
 from rigsim.light.led_light import lobe_exponent
 from rigsim.light.olat import Hits, Lamp, Looking, find_hits
 from rigsim.light.olat_kernels import MATT_ROWS, METAL_ROWS, SKIN_ROWS
 from rigsim.light.olat_vector import VectorLight
 from rigsim.render import Caster, GBuffer
-from rigsim.scenes.exposing import Kept, SceneError
+from rigsim.scenes.exposing import SceneError
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.head_motion import HeadMotion
 from rigsim.targets import Target
@@ -54,7 +55,6 @@ class DomeRows:
         dome: BuiltDome,
         subject: SimulatedSubject | Target,
         caster: Caster,
-        *,
         motion: HeadMotion | None,
         how: Looking,
     ) -> None:

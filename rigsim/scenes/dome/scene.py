@@ -29,6 +29,7 @@ from rigsim.arrays import Float32Array, Float64Array, UInt16Array
 from rigsim.as_built.dome import BuiltDome
 from rigsim.boxes.led_table import LedPulse
 from rigsim.geometry.atlas import dilate_texture, sample
+from rigsim.kept import Kept, kept
 from rigsim.light import olat, surface_brdf
 from rigsim.light.interreflection import interreflection_for
 from rigsim.light.interreflection_color import Bounces
@@ -48,7 +49,7 @@ from rigsim.render import Caster
 from rigsim.render.variant import VariantChoice
 from rigsim.scenes.dome import truth as dome_truth
 from rigsim.scenes.dome.rows import DomeRows, DomeSubsurfaceRadiance, unit
-from rigsim.scenes.exposing import FaceScene, Kept, SceneError, full_power_s, kept
+from rigsim.scenes.exposing import FaceScene, SceneError, full_power_s
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.head_motion import HeadMotion
 from rigsim.targets import Target
@@ -124,29 +125,15 @@ class DomeScene(FaceScene):
             subject = skin_conditions.conditioned_subject(subject, self.conditions)
         elif self.conditions:
             raise SceneError(f"conditions: got {', '.join(self.conditions)}, but a target has none")
-        super().__init__(
-            dome.rig,
-            subject,
-            state=state,
-            movement=movement,
-            sensor=None,
-            seed=seed,
-            subpixels=subpixels,
-        )
+        super().__init__(dome.rig, subject, state, movement, None, seed, subpixels)
         self.motion = motion
         self._effects = effects
         self._caster = Caster(self.subject.mesh, choice=choice)
         noise = least_noise([Noise.of(sensor) for sensor in self._sensors.values()])
         share = exchange_share(self._caster)
-        self.needs = dome_needs(
-            rig,
-            self.subject,
-            state,
-            self._scenery(rig.views[0], self._caster, share, noise, effects),
-            white_rgb=None if on_s is None else on_s * self._white_in_origin(),
-            movement=movement,
-            motion=motion,
-        )
+        scenery = self._scenery(rig.views[0], self._caster, share, noise, effects)
+        white = None if on_s is None else on_s * self._white_in_origin()
+        self.needs = dome_needs(rig, self.subject, state, scenery, white, movement, motion)
         self.interreflections = self.needs.builds(face_needs.INTERREFLECTION_EFFECT)
         self.subsurface = self.needs.builds(face_needs.LATERAL_EFFECT)
         self.optics = self.needs.builds(face_needs.LENS_EFFECT)
@@ -158,7 +145,7 @@ class DomeScene(FaceScene):
             if self.subsurface or self.interreflections:
                 self._glow = DomeSubsurfaceRadiance(self._scattering)
         how = Looking(subpixels, self._illuminant, self.optics)
-        self._rows = DomeRows(dome, self.subject, self._caster, motion=motion, how=how)
+        self._rows = DomeRows(dome, self.subject, self._caster, motion, how)
         # a capture comes back to each light in its next pass
         self._frames: Kept[tuple[str, int, float], Float32Array] = Kept(
             lambda frame: max(KEPT_FRAMES, KEPT_FRAME_BYTES // frame.nbytes)
@@ -173,14 +160,8 @@ class DomeScene(FaceScene):
             spectral = self.needs.builds(face_needs.SPECTRAL_EFFECT)
             enough = self._last_bounce(self._effects)
             bounces = Bounces(interreflection_for(self._caster), spectral, enough=enough)
-        return LateralScattering(
-            skin,
-            self._surface(camera),
-            self._caster,
-            subsurface=self.subsurface,
-            bounces=bounces,
-            relief=self._relief,
-        )
+        surface, spread = self._surface(camera), self.subsurface
+        return LateralScattering(skin, surface, self._caster, spread, bounces, self._relief)
 
     def white_rgb(self, view_name: str | None = None) -> Float32Array:
         """Return the camera RGB of white under the LEDs, shape (3,), the strongest channel 1."""
@@ -326,12 +307,10 @@ class DomeScene(FaceScene):
             ``position_at_rest``, of one under conditions its coating (`Coating`); valid on bare
             skin. All is that of the skin under its conditions.
         """
+        surface = self.surface(self._camera(view_name))
+        left_out = tuple(self.left_out)
         return dome_truth.appearance_of(
-            self._face(),
-            self.surface(self._camera(view_name)),
-            conditions=self.conditions,
-            left_out=tuple(self.left_out),
-            seed=self.seed,
+            self._face(), surface, self.conditions, left_out=left_out, seed=self.seed
         )
 
     def brdf(

@@ -44,8 +44,8 @@ def maps_of(hits: Hits) -> dict[str, NDArray[np.generic]]:
 def appearance_of(
     subject: SimulatedSubject,
     surface: SkinSurface,
-    *,
     conditions: Mapping[str, float],
+    *,
     left_out: tuple[tuple[str, str], ...],
     seed: int,
 ) -> SkinAppearance:

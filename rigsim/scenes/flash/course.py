@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from capture.rig import Rig
 from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.boxes.flash import FlashPop
+from rigsim.kept import kept
 from rigsim.needs.effects import EffectSelection, left_out_of
-from rigsim.scenes.exposing import RigScene, SceneError, kept
+from rigsim.scenes.exposing import RigScene, SceneError
 from rigsim.scenes.flash.scene import POP_ENERGY_DEVIATION, FlashScene, pop_energy
 from rigsim.sensor import Sensor
 from rigsim.subject import SimulatedSubject, landmarks

@@ -22,6 +22,7 @@ from rigsim.arrays import Float32Array, Float64Array, UInt16Array
 from rigsim.as_built.polarizers import Polarizers, draw_polarizers
 from rigsim.boxes.flash import FlashPop
 from rigsim.geometry.mesh import Mesh
+from rigsim.kept import kept
 from rigsim.light.interreflection_color import Bounces
 from rigsim.light.lateral import line_spread_mm
 from rigsim.light.relief_shadow import ReliefShadow
@@ -44,7 +45,7 @@ from rigsim.needs.flash import flash_needs
 from rigsim.render import camera_rays
 from rigsim.render.depth_of_field import facing_depths, lens_spread
 from rigsim.render.variant import VariantChoice
-from rigsim.scenes.exposing import FaceScene, SceneError, kept
+from rigsim.scenes.exposing import FaceScene, SceneError
 from rigsim.scenes.flash import truth as flash_truth
 from rigsim.scenes.flash.image import Look, Picture
 from rigsim.scenes.flash.stage import flash_geometry
@@ -113,15 +114,7 @@ class FlashScene(FaceScene):
     ) -> None:
         if not 0.0 < power <= 1.0:
             raise SceneError(f"power: got {power}, expected above 0 to 1")
-        super().__init__(
-            rig,
-            subject,
-            state=state,
-            movement=movement,
-            sensor=sensor,
-            seed=seed,
-            subpixels=subpixels,
-        )
+        super().__init__(rig, subject, state, movement, sensor, seed, subpixels)
         self.films = draw_polarizers(rig) if films is None else films
         self._weights = _light_weights(rig)
         self._choice = choice
@@ -135,15 +128,10 @@ class FlashScene(FaceScene):
 
     def _needs_of(self, view: View, power: float) -> EffectSelection:
         noise, share = Noise.of(self._sensors[view.name]), self._stage.share
-        return flash_needs(
-            self.rig,
-            self.subject,
-            self.state,
-            self._scenery(view, self._caster, share, noise, self._effects),
-            white_rgb=np.asarray(self.white_rgb(view.name), np.float64) * power,
-            weights_mm2=self._weights,
-            movement=self.movement,
-        )
+        scenery = self._scenery(view, self._caster, share, noise, self._effects)
+        white = np.asarray(self.white_rgb(view.name), np.float64) * power
+        seen = (scenery, white, self._weights, self.movement)
+        return flash_needs(self.rig, self.subject, self.state, *seen)
 
     def white_rgb(self, view_name: str | None = None) -> Float32Array:
         """Return the camera RGB of the white reference at power 1, fraction of full scale, (3,)."""
