@@ -1,6 +1,5 @@
 """A sphere of polarized LEDs as it was built: near the drawing, never on it."""
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Final
@@ -32,22 +31,12 @@ class SphereError(ValueError):
     """A sphere is described wrongly."""
 
 
-@dataclass(frozen=True, slots=True)
-class SphereTolerances:
-    """Standard deviations of what a workshop leaves; 0 builds to the drawing."""
+INTENSITY_DEVIATION: Final = 0.05
+"""Standard deviation of the logarithm of an LED's intensity."""
 
-    intensity: float = 0.05
-    """Relative, of an LED's intensity."""
-    place_mm: float = 1.0
-    """Place of an LED, mm, per axis."""
-    axis_deg: float = 1.0
-    """Turn of an LED's polarizing film, degrees."""
-
-    def __post_init__(self) -> None:
-        """Check signs."""
-        for name, value in dataclasses.asdict(self).items():
-            if not 0.0 <= value < math.inf:
-                raise SphereError(f"SphereTolerances.{name}: got {value}, expected >= 0")
+PLACE_DEVIATION_MM: Final = 1.0
+AXIS_DEVIATION_DEG: Final = 1.0
+"""Standard deviations of an LED's place along each axis, and of its film's turn."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,12 +115,7 @@ def nominal_sphere(rig: Rig) -> BuiltSphere:
 
 
 def build_sphere(
-    rig: Rig,
-    *,
-    seed: int,
-    tolerances: SphereTolerances | None = None,
-    dead: tuple[str, ...] = (),
-    weak: tuple[str, ...] = (),
+    rig: Rig, *, seed: int, dead: tuple[str, ...] = (), weak: tuple[str, ...] = ()
 ) -> BuiltSphere:
     """Draw a sphere as built; the same seed builds each LED the same in any subset.
 
@@ -141,8 +125,6 @@ def build_sphere(
         The drawing.
     seed
         Seed of what the workshop left.
-    tolerances
-        Standard deviations; None takes the usual ones.
     dead, weak
         Names of LEDs that give nothing, and a third of their light.
 
@@ -150,18 +132,19 @@ def build_sphere(
     -------
     BuiltSphere
     """
-    size = tolerances or SphereTolerances()
     drawn = nominal_sphere(rig)
     for name in (*dead, *weak):
         rig.light(name)
     position, intensity, absorbs = [], [], []
     for light, power in zip(rig.lights, drawn.intensity, strict=True):
         rng = np.random.default_rng([seed, *light.name.encode()])
-        place = np.asarray(light.position_mm) + size.place_mm * rng.standard_normal(3)
+        place = np.asarray(light.position_mm) + PLACE_DEVIATION_MM * rng.standard_normal(3)
         share = 0.0 if light.name in dead else 1.0 / 3.0 if light.name in weak else 1.0
-        turn_deg = size.axis_deg * float(rng.standard_normal())
+        turn_deg = AXIS_DEVIATION_DEG * float(rng.standard_normal())
         position.append(place)
-        intensity.append(power * share * math.exp(size.intensity * float(rng.standard_normal())))
+        intensity.append(
+            power * share * math.exp(INTENSITY_DEVIATION * float(rng.standard_normal()))
+        )
         axis_deg = 0.0 if light.polarizer_axis_deg is None else light.polarizer_axis_deg
         absorbs.append(axis_in_plane(axis_deg + 90.0 + turn_deg, place, (0.0, 1.0, 0.0)))
     return BuiltSphere(

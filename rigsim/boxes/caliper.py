@@ -16,17 +16,13 @@ The box does not know what is between its jaws: it moves a `JawLoad` and feels i
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
-
-import numpy as np
+from typing import Any
 
 from capture.devices.wire import Code
-from capture.rig import Rig
 from rigsim.boxes.command import Act, Command, Refused, command_table, number
-from rigsim.boxes.device import Device
-from rigsim.boxes.faults import NO_FAULTS, Faults
+from rigsim.boxes.device import Device, Wiring
 
 CALIPER_CONTROL_PERIOD_S = 5e-3
 """Period in which position and force are looked at while the motor runs, s."""
@@ -47,26 +43,6 @@ LET_GO_S = 0.25
 """Force that is still beyond the limit so long after the jaws have turned back: let go."""
 
 _STEP_PATTERN = re.compile(r"-?[0-9]{1,3}")
-
-
-class JawLoad(Protocol):
-    """What the jaws act upon."""
-
-    @property
-    def force_n(self) -> float:
-        """Force on the jaws, N; > 0 pulls them together."""
-
-    def attach(self, angle_deg: float) -> None:
-        """Be held, at the jaws' present distance, from now on."""
-
-    def turn(self, angle_deg: float) -> None:
-        """Have the jaws turned while they hold nothing."""
-
-    def move(self, aperture_mm: float) -> None:
-        """Have the jaws moved to a distance."""
-
-    def release(self) -> None:
-        """Be let go."""
 
 
 @dataclass(slots=True)
@@ -108,36 +84,22 @@ class CaliperUnit(Device):
 
     Parameters
     ----------
-    rig, faults
-        Its caliper's travel, of which at most 15 steps either way, angles and speed; what is wrong.
-    load
-        What is between its jaws.
-    on_change
-        Called with the world time in s after whatever has changed what the jaws hold.
-    rng
-        Where the jaws stand at first, and stalls.
+    wiring
+        Its caliper's travel, of which at most 15 steps either way, angles and speed; the skin.
     """
 
     kind = "caliper"
     model = "CALIPER1"
 
-    def __init__(
-        self,
-        rig: Rig,
-        load: JawLoad | None,
-        faults: Faults = NO_FAULTS,
-        *,
-        on_change: Callable[[float], None],
-        rng: np.random.Generator,
-    ) -> None:
-        super().__init__(rig, faults)
+    def __init__(self, wiring: Wiring) -> None:
+        super().__init__(wiring)
+        rig, load, rng = wiring.rig, wiring.skin, wiring.rng
         if rig.caliper is None or load is None:
             raise ValueError(f"caliper: got none in rig {rig.name!r}, expected its description")
         self._caliper = caliper = rig.caliper
         self._load = load
-        self._on_change = on_change
-        self._stall = faults.jaw_stall
-        self._rng = rng
+        self._on_change = wiring.on_grip
+        self._stall = self.faults.jaw_stall
         self.step_min = max(caliper.first_step, -MAX_CAPTURE_STEPS)
         self.step_max = min(caliper.last_step, MAX_CAPTURE_STEPS)
         half = 0.5 * caliper.step_mm
@@ -330,18 +292,15 @@ class CaliperUnit(Device):
     def _require_fit(self, now: float) -> None:
         """Refuse to move with the stop open, a dead sensor, no limit, or on the move."""
         self._require_closed_stop()
-        if self.faults.force_dead:
-            raise Refused(Code.HARDWARE, "the force sensor is dead")
-        if self.busy(now):
-            raise Refused(Code.IGNORED, "on the move")
+        Refused.when(self.faults.force_dead, Code.HARDWARE, "the force sensor is dead")
+        Refused.when(self.busy(now), Code.IGNORED, "on the move")
 
     def _require_limit(self) -> None:
         if self.limit_n is None:
             raise Refused(Code.IGNORED, "CAL:FORC:LIM first; there is no default")
 
     def _require_free(self) -> None:
-        if self.attached:
-            raise Refused(Code.IGNORED, "skin is held; CAL:REL first")
+        Refused.when(self.attached, Code.IGNORED, "skin is held; CAL:REL first")
 
     def _begin(self, to_mm: float, now: float, *, homing: bool) -> str:
         caliper = self._caliper
@@ -379,8 +338,7 @@ class CaliperUnit(Device):
             raise Refused(Code.OUT_OF_RANGE, f"expected {self.step_min} to {self.step_max} steps")
         self._require_fit(now)
         self._require_limit()
-        if not self.homed:
-            raise Refused(Code.IGNORED, "CAL:HOME first")
+        Refused.when(not self.homed, Code.IGNORED, "CAL:HOME first")
         to_mm = self._caliper.reading_mm(step)
         if self._barred is not None:
             direction, reading_mm = self._barred
@@ -414,8 +372,7 @@ class CaliperUnit(Device):
         self._on_change(now)
 
     def _get_force(self, _: str, now: float) -> str:
-        if self.faults.force_dead:
-            raise Refused(Code.HARDWARE, "the force sensor is dead")
+        Refused.when(self.faults.force_dead, Code.HARDWARE, "the force sensor is dead")
         return f"{self.felt_n:.3f}"
 
     def _set_limit(self, arguments: str, now: float) -> None:

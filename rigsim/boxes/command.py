@@ -42,6 +42,12 @@ class Refused(Exception):
         self.code = code
         self.reason = _CODE_TEXTS[code] + (f"; {detail}" if detail else "")
 
+    @classmethod
+    def when(cls, wrong: object, code: Code, detail: str = "") -> None:
+        """Refuse the command when something is wrong."""
+        if wrong:
+            raise cls(code, detail)
+
 
 @dataclass(frozen=True, slots=True)
 class Later:
@@ -115,6 +121,5 @@ def whole(text: str, low: int, high: int) -> int:
     if not (text.isascii() and text.isdecimal() and len(text) <= 9):
         raise Refused(Code.SYNTAX, "expected a whole number")
     value = int(text)
-    if not low <= value <= high:
-        raise Refused(Code.OUT_OF_RANGE, f"expected {low} to {high}")
+    Refused.when(not low <= value <= high, Code.OUT_OF_RANGE, f"expected {low} to {high}")
     return value

@@ -18,6 +18,7 @@ from capture.devices.wire import Code, Event, Reply, Request
 from rigsim.boxes.command import Act, Command, Later, Refused, command_table, number
 from rigsim.boxes.device import Device
 
+FIRMWARE = "1.0"
 CACHED_REPLIES = 8
 ERROR_QUEUE = 16
 CAPABILITY_PART = 48
@@ -33,35 +34,21 @@ class Controller:
     ----------
     device
         What it controls.
-    serial, firmware
-        Identity; the serial number is the box, whatever its port is called.
-    protocol
-        Version of the wire protocol that the firmware speaks.
+    serial
+        The serial number is the box, whatever its port is called.
     rng
         Draws the boot epochs.
-    now
-        Time of power-up on the world's clock, in s.
     """
 
-    def __init__(
-        self,
-        device: Device,
-        *,
-        serial: str,
-        firmware: str = "1.0",
-        protocol: int = wire.PROTOCOL_VERSION,
-        rng: np.random.Generator,
-        now: float = 0.0,
-    ) -> None:
+    def __init__(self, device: Device, *, serial: str, rng: np.random.Generator) -> None:
         self.device = device
         self.serial = serial
         self.boot = wire.UNKNOWN_BOOT
-        self._firmware = firmware
-        self._protocol = protocol
+        self._protocol = device.faults.protocol
         self._rng = rng
         self._announce = False
         self.commands: dict[str, Command] = {**self._own_commands(), **device.commands()}
-        self._forget(now, boot_s=0.0)
+        self._forget(0.0, boot_s=0.0)
 
     # power ------------------------------------------------------------------------------------
 
@@ -108,7 +95,7 @@ class Controller:
             output += self._device_events()
             if self._announce and due >= self._ready_at:
                 self._announce = False
-                output += f"{self.device.model} {self._firmware} ready\n".encode()
+                output += f"{self.device.model} {FIRMWARE} ready\n".encode()
                 output += self._event("BOOT", "POWER")
             if self._under_way is not None and due >= self._under_way[1].at_s:
                 (request, later), self._under_way = self._under_way, None
@@ -190,8 +177,7 @@ class Controller:
         try:
             if command is not None:
                 dark = command.bare or arguments.upper() in command.harmless
-                if not (header.endswith("?") or dark):
-                    raise Refused(Code.UNFRAMED)
+                Refused.when(not (header.endswith("?") or dark), Code.UNFRAMED)
             payload = self._execute(text, now)
         except Refused as refused:
             self._remember(refused)
@@ -239,7 +225,7 @@ class Controller:
 
     def _own_commands(self) -> dict[str, Command]:
         acts: dict[str, Act] = {
-            "*IDN?": lambda *_: f"RIGSIM,{self.device.model},{self.serial},{self._firmware}",
+            "*IDN?": lambda *_: f"RIGSIM,{self.device.model},{self.serial},{FIRMWARE}",
             "*RST": self._reset,
             "*CLS": lambda *_: self._errors.clear(),
             "*OPC?": lambda _, now: "0" if self.device.busy(now) else "1",
@@ -259,7 +245,7 @@ class Controller:
         return command_table("any", acts)
 
     def _hello(self) -> str:
-        return f"{self._protocol},{self.device.kind},{self.serial},{self._firmware}"
+        return f"{self._protocol},{self.device.kind},{self.serial},{FIRMWARE}"
 
     def _reset(self, _: str, now: float) -> None:
         self._disarm(now)

@@ -10,33 +10,16 @@ that open eyes may see (105). Light carries its own end; LEDs that draw no curre
 -240, or reported as ``LED:FAIL`` in a sequence. Heat, dose and duty survive a reset.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 from capture.devices.wire import Code
-from capture.rig import Rig
 from rigsim.boxes import led_table
 from rigsim.boxes.command import Act, Command, Refused, command_table, number, whole
-from rigsim.boxes.eye_guard import Lit
-from rigsim.boxes.faults import Faults
+from rigsim.boxes.device import Wiring
 from rigsim.boxes.led_sequencer import LED_MS, LedSequencer, Run
-from rigsim.boxes.led_table import LEVEL_STEPS, Row, Switch
+from rigsim.boxes.led_table import LEVEL_STEPS, LedPulse, Row, Switch
 
 DEFAULT_LED_MS = 100.0
-
-
-@dataclass(frozen=True, slots=True)
-class LedPulse:
-    """Light of one LED from one switching to the next."""
-
-    led: int
-    """Number of the LED, an index into the rig's lights."""
-    level: float
-    """Light given relative to full, 0 to 1; a weak LED gives less than it was asked for."""
-    t_on_s: float
-    """World time when it came on, s."""
-    t_off_s: float
-    """World time when it went off, s."""
 
 
 class DomeUnit(LedSequencer[Row]):
@@ -44,29 +27,15 @@ class DomeUnit(LedSequencer[Row]):
 
     Parameters
     ----------
-    rig, faults
-        Its LEDs, what they may do, and its cameras; what is wrong with it.
-    on_pulse
-        Called with each stretch of light when it has ended.
-    on_trigger
-        Called with the world time in s and the mask of each release of cameras.
+    wiring
+        Its LEDs, what they may do, and its cameras; each stretch of light is a `LedPulse`.
     """
 
     kind = "dome"
     model = "DOME1"
 
-    def __init__(
-        self,
-        rig: Rig,
-        faults: Faults,
-        *,
-        on_pulse: Callable[[LedPulse], None],
-        on_trigger: Callable[[float, int], None],
-    ) -> None:
-        def pass_on(lit: Lit) -> None:
-            on_pulse(LedPulse(lit.led, lit.level, lit.on_s, lit.off_s))
-
-        super().__init__(rig, faults, on_light=pass_on, on_trigger=on_trigger)
+    def __init__(self, wiring: Wiring) -> None:
+        super().__init__(wiring, wiring.on_light)
         self.reset(0.0, power_up=True)
 
     def commands(self) -> dict[str, Command]:
@@ -90,7 +59,7 @@ class DomeUnit(LedSequencer[Row]):
             most_us=self._row_max_us,
         )
 
-    def _lit_by(self, rows: Sequence[Row], now: float) -> list[Lit]:
+    def _lit_by(self, rows: Sequence[Row], now: float) -> list[LedPulse]:
         return led_table.lit_by(rows, now, overlap_s=self._limits.overlap_s)
 
     def _schedule(self, rows: Sequence[Row]) -> list[Switch]:
@@ -119,7 +88,7 @@ class DomeUnit(LedSequencer[Row]):
 
     def light_now(self, now: float) -> list[LedPulse]:
         """Return the stretches of light that are going on, as given so far."""
-        return [LedPulse(p.led, p.level, p.on_s, p.off_s) for p in self.bank.going_on(now)]
+        return self.bank.going_on(now)
 
     # single LEDs ------------------------------------------------------------------------------
 
@@ -129,8 +98,7 @@ class DomeUnit(LedSequencer[Row]):
     def _light(self, arguments: str, now: float) -> None:
         self._require_still()
         parts = arguments.split(",")
-        if len(parts) > 3:
-            raise Refused(Code.SYNTAX, "expected LEDS,MS,LEVEL")
+        Refused.when(len(parts) > 3, Code.SYNTAX, "expected LEDS,MS,LEVEL")
         leds = self._leds(parts[0])
         longest_ms = min(LED_MS[1], self._limits.max_on_s * 1e3)
         span_ms = (
@@ -144,7 +112,7 @@ class DomeUnit(LedSequencer[Row]):
         if dead:
             raise Refused(Code.HARDWARE, f"LED {dead[0]} draws no current")
         end_s = now + span_ms / 1e3
-        wanted = [Lit(led, level, now, end_s) for led in leds]
+        wanted = [LedPulse(led, level, now, end_s) for led in leds]
         self.bank.require(wanted, now)
         self._require_calm(wanted, now)
         self._sequence_armed = False

@@ -7,12 +7,12 @@ Fourier sums instead of a transform.
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from capture.rig import Light
 from rigsim.arrays import Float64Array
+from rigsim.boxes.led_table import LedPulse
 
 EYE_MM = (0.0, 25.0, 80.0)
 """Between the eyes of a nominal head, rig frame; it looks along +z."""
@@ -24,20 +24,6 @@ FLASH_SHARE = 0.1
 """Least change of a flash, of the brightest light."""
 RMS_FROM_S = 2.0
 """Shorter light is judged by its flashes alone."""
-
-
-@dataclass(frozen=True, slots=True)
-class Lit:
-    """Light of one LED from one time to another, past or to come."""
-
-    led: int
-    """Number of the LED."""
-    level: float
-    """0 to 1."""
-    on_s: float
-    """World time, s."""
-    off_s: float
-    """World time, s."""
 
 
 class EyeGuard:
@@ -52,7 +38,7 @@ class EyeGuard:
     def __init__(self, lights: Sequence[Light]) -> None:
         self.weights = np.array([_at_eye(light) for light in lights])
 
-    def flashes_per_s(self, light: Iterable[Lit]) -> float:
+    def flashes_per_s(self, light: Iterable[LedPulse]) -> float:
         """Return the flashes in the worst second: half the turns of a tenth of the brightest."""
         times, integral = self._integral(light)
         if times.size == 0:
@@ -68,13 +54,13 @@ class EyeGuard:
         within = np.searchsorted(turns, turns + 1.0 - 0.5 * GRID_S) - np.arange(turns.size)
         return float(within.max()) / 2.0
 
-    def rms(self, light: Iterable[Lit]) -> float:
+    def rms(self, light: Iterable[LedPulse]) -> float:
         """Return the rms of the 3 to 65 Hz part over the mean, from first light to last; or 0."""
         # LEDs that are lit together are one light to the eye
         lit: dict[tuple[float, float], float] = {}
         for pulse in light:
-            if pulse.off_s > pulse.on_s:
-                when = (pulse.on_s, pulse.off_s)
+            if pulse.t_off_s > pulse.t_on_s:
+                when = (pulse.t_on_s, pulse.t_off_s)
                 lit[when] = lit.get(when, 0.0) + float(self.weights[pulse.led]) * pulse.level
         if not lit:
             return 0.0
@@ -96,13 +82,13 @@ class EyeGuard:
             power += float((np.abs((turn @ weight) / (part * span)) ** 2).sum())
         return math.sqrt(2.0 * power) / mean
 
-    def _integral(self, light: Iterable[Lit]) -> tuple[Float64Array, Float64Array]:
+    def _integral(self, light: Iterable[LedPulse]) -> tuple[Float64Array, Float64Array]:
         """Return times at which light is switched, and the light until then, W s/m^2."""
         changes: dict[float, float] = {}
         for pulse in light:
             step = float(self.weights[pulse.led]) * pulse.level
-            changes[pulse.on_s] = changes.get(pulse.on_s, 0.0) + step
-            changes[pulse.off_s] = changes.get(pulse.off_s, 0.0) - step
+            changes[pulse.t_on_s] = changes.get(pulse.t_on_s, 0.0) + step
+            changes[pulse.t_off_s] = changes.get(pulse.t_off_s, 0.0) - step
         times = np.array(sorted(changes))
         rate = np.cumsum([changes[t] for t in times])
         total = np.concatenate([[0.0], np.cumsum(rate[:-1] * np.diff(times))])

@@ -13,17 +13,13 @@ go out before a pop, and their driver trips when too hot (102).
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import numpy as np
-
 from capture.devices.wire import Code
-from capture.rig import Rig
 from rigsim.boxes.command import Act, Command, Later, Refused, choice, command_table, number, word
-from rigsim.boxes.device import Device
-from rigsim.boxes.faults import NO_FAULTS, Faults
+from rigsim.boxes.device import Device, Wiring
 
 Polarizer = Literal["parallel", "crossed"]
 
@@ -74,36 +70,20 @@ class FlashUnit(Device):
 
     Parameters
     ----------
-    rig, faults
-        Its recycling, pops per minute and analyser; what is wrong with it.
-    on_pop
-        Called with each pop.
-    on_trigger
-        Called with the world time in s of each pulse on the camera line.
-    rng
-        Decides misfires.
+    wiring
+        Its recycling, pops per minute and analyser; each pop is passed on as a `FlashPop`.
     """
 
     kind = "flash"
     model = "FLASH2"
 
-    def __init__(
-        self,
-        rig: Rig,
-        faults: Faults = NO_FAULTS,
-        *,
-        on_pop: Callable[[FlashPop], None],
-        on_trigger: Callable[[float], None],
-        rng: np.random.Generator,
-    ) -> None:
-        super().__init__(rig, faults)
-        self._on_pop = on_pop
-        self._on_trigger = on_trigger
+    def __init__(self, wiring: Wiring) -> None:
+        super().__init__(wiring)
+        rig, faults = self.rig, self.faults
         self._pops_per_min = math.floor(rig.max_pops_per_min)
         self._s_per_deg = rig.polarizer_move_s / 90.0
         headroom = math.log(CHARGER_HEADROOM / (CHARGER_HEADROOM - 1.0))
         self._charge_tau_s = faults.slow_charge * CHARGE_SHARE * rig.recycle_s / headroom
-        self._rng = rng
         self._now = 0.0
         # what the box keeps without power: the count, heat, charge and the last pops
         self.count = 0
@@ -166,7 +146,7 @@ class FlashUnit(Device):
             "FLAS:COUN?": lambda *_: str(self.count),
             "FLAS:LAMP": self._set_lamp,
             "FLAS:LAMP?": lambda *_: str(int(self._lamp.lit)),
-            "CAM:TRIG": self._trigger,
+            "CAM:TRIG": self._trigger_camera,
         }
         return command_table("flash", acts)
 
@@ -325,7 +305,7 @@ class FlashUnit(Device):
         self._last_power = self.power
         self._pops.append(now)
         self.count += 1
-        self._on_pop(FlashPop(token, now, self.power, self.polarizer, self.analyser_deg))
+        self._on_light(FlashPop(token, now, self.power, self.polarizer, self.analyser_deg))
         self.last_report = ",".join(
             (
                 token,
@@ -338,26 +318,18 @@ class FlashUnit(Device):
         )
         self._outcome = self.last_report
 
-    def _trigger(self, arguments: str, now: float) -> str:
-        token = word(arguments)
-        self._on_trigger(now)
-        return f"{token},{self.clock_us(now)}"
-
     # lamps ------------------------------------------------------------------------------------
 
     def _set_lamp(self, arguments: str, now: float) -> None:
         what, _, length = arguments.partition(",")
         if choice(what, ("ON", "OFF")) == "OFF":
-            if length:
-                raise Refused(Code.SYNTAX, "expected OFF")
+            Refused.when(length, Code.SYNTAX, "expected OFF")
             self._lamps_out(now)
             return
         span_ms = number(length, *LAMP_MS, "ms")
         self._require_closed_stop()
-        if self._lamp.hot:
-            raise Refused(Code.THERMAL, f"wait until below {HEAT_CLEAR:g}")
-        if self.faults.lamp_dead:
-            raise Refused(Code.HARDWARE, "the lamp draws no current")
+        Refused.when(self._lamp.hot, Code.THERMAL, f"wait until below {HEAT_CLEAR:g}")
+        Refused.when(self.faults.lamp_dead, Code.HARDWARE, "the lamp draws no current")
         if not self._lamp.lit:
             self._lamp.lit = True
             self._lamp_since = now

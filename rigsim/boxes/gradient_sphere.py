@@ -13,20 +13,18 @@ does not notice.
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from capture.devices.wire import Code
-from capture.rig import Rig
 from rigsim.boxes import led_table
 from rigsim.boxes.command import Act, Command, Refused, choice, command_table, number, whole
-from rigsim.boxes.eye_guard import Lit
-from rigsim.boxes.faults import Faults
+from rigsim.boxes.device import Wiring
 from rigsim.boxes.led_sequencer import LED_MS, LedSequencer, Run
-from rigsim.boxes.led_table import LEVEL_STEPS, Switch, table_crc
+from rigsim.boxes.led_table import LEVEL_STEPS, LedPulse, Switch, table_crc
 
 DEFAULT_LED_MS = 100.0
 _GAINS_PATTERN = re.compile(r"[0-9]{1,4}(\+[0-9]{1,4})*")
@@ -56,26 +54,15 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
 
     Parameters
     ----------
-    rig, faults
-        Its LEDs, what they may do, its analyser and cameras; what is wrong with it.
-    on_pattern
-        Called with each stretch of light when it has ended.
-    on_trigger
-        Called with the world time in s and the mask of each release of cameras.
+    wiring
+        Its LEDs, what they may do, analyser and cameras; each stretch of light is a `PatternLight`.
     """
 
     kind = "gradient_sphere"
     model = "SPHERE1"
 
-    def __init__(
-        self,
-        rig: Rig,
-        faults: Faults,
-        *,
-        on_pattern: Callable[[PatternLight], None],
-        on_trigger: Callable[[float, int], None],
-    ) -> None:
-        self._on_pattern = on_pattern
+    def __init__(self, wiring: Wiring) -> None:
+        rig, faults = wiring.rig, wiring.faults
         self._s_per_deg = rig.polarizer_move_s / 90.0
         self._shares = led_table.pattern_shares(rig.lights)
         health = np.ones(len(rig.lights))
@@ -86,7 +73,7 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         self._shining: PatternLight | None = None  # what is on; its end is not known yet
         self.analyser_deg = 0.0
         self._settled_at = 0.0
-        super().__init__(rig, faults, on_light=self._ended, on_trigger=on_trigger)
+        super().__init__(wiring, self._ended)
         self.reset(0.0, power_up=True)
 
     def reset(self, now: float, *, power_up: bool) -> None:
@@ -146,8 +133,7 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
     def _set_angle(self, arguments: str, now: float) -> None:
         reading_deg = round(number(arguments, *led_table.ANALYZER_RANGE_DEG, "degrees"), 3)
         self._require_still()
-        if self.lit:
-            raise Refused(Code.IGNORED, "a light is on; PATT DARK first")
+        Refused.when(self.lit, Code.IGNORED, "a light is on; PATT DARK first")
         self._sequence_armed = False
         self._turn(reading_deg, now)
 
@@ -166,15 +152,13 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         return [self._until(shining, max(now, shining.t_on_s))]
 
     def _until(self, light: PatternLight, t_off_s: float) -> PatternLight:
-        return PatternLight(
-            light.pattern, light.level, light.t_on_s, t_off_s, light.analyser_deg, light.led_shares
-        )
+        return replace(light, t_off_s=t_off_s)
 
-    def _ended(self, lit: Lit) -> None:
+    def _ended(self, lit: LedPulse) -> None:
         """Pass on a pattern when the first of its LEDs goes out: all of them do at once."""
         shining, self._shining = self._shining, None
         if shining is not None:
-            self._on_pattern(self._until(shining, lit.off_s))
+            self._on_light(self._until(shining, lit.t_off_s))
 
     def _levels(self, pattern: str, level: float) -> list[float]:
         """Return what each LED is driven for."""
@@ -195,19 +179,19 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         given = () if (shares == 1.0).all() else tuple(shares.tolist())
         self._shining = PatternLight(pattern, level, now, now, self.analyser_deg, given)
 
-    def _wanted(self, pattern: str, level: float, on_s: float, off_s: float) -> list[Lit]:
+    def _wanted(self, pattern: str, level: float, on_s: float, off_s: float) -> list[LedPulse]:
         levels = self._levels(pattern, level)
-        return [Lit(led, driven, on_s, off_s) for led, driven in enumerate(levels) if driven > 0.0]
+        return [
+            LedPulse(led, driven, on_s, off_s) for led, driven in enumerate(levels) if driven > 0.0
+        ]
 
     def _light(self, arguments: str, now: float) -> None:
         self._require_still()
         name, *more = arguments.split(",")
-        if len(more) > 2:
-            raise Refused(Code.SYNTAX, "expected PATTERN,MS,LEVEL")
+        Refused.when(len(more) > 2, Code.SYNTAX, "expected PATTERN,MS,LEVEL")
         pattern = led_table.pattern_name(name)
         if pattern == "dark":
-            if more:
-                raise Refused(Code.SYNTAX, "expected DARK")
+            Refused.when(more, Code.SYNTAX, "expected DARK")
             self.bank.all_off(now)
             return
         longest_ms = min(LED_MS[1], self._limits.max_on_s * 1e3)
@@ -232,10 +216,10 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
     def _parse_rows(self, text: str) -> list[led_table.PatternRow]:
         return led_table.parse_patterns(text, cameras=self._cameras, most_us=self._row_max_us)
 
-    def _lit_by(self, rows: Sequence[led_table.PatternRow], now: float) -> list[Lit]:
+    def _lit_by(self, rows: Sequence[led_table.PatternRow], now: float) -> list[LedPulse]:
         self._require_settled(now)
         times = led_table.starts(rows, reading_deg=self.analyser_deg, s_per_deg=self._s_per_deg)
-        found: list[Lit] = []
+        found: list[LedPulse] = []
         for row, (_, lit_s) in zip(rows, times, strict=True):
             start_s = now + lit_s
             found += self._wanted(row.pattern, row.level, start_s, start_s + row.dwell_us * 1e-6)

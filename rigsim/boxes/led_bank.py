@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from capture.devices.wire import Code
-from capture.rig import LedLimits, Light
+from capture.rig import LedLimits, Rig
 from rigsim.boxes.command import Refused
-from rigsim.boxes.eye_guard import Lit
 from rigsim.boxes.faults import Faults
+from rigsim.boxes.led_table import LedPulse
 
 CLEAR_SHARE = 0.5
 """Temperature, of the trip's, below which a hot LED may be lit again."""
@@ -21,22 +21,16 @@ class LedBank:
 
     Parameters
     ----------
-    lights, limits
-        What they are, and what they may do.
+    rig
+        Whose they are, and what they may do.
     on_light
         Called with each stretch of light when it ends: LED, level, start and end in s.
     faults
         Dead LEDs, weak ones, which the driver does not notice, and the heat of all at power-up.
     """
 
-    def __init__(
-        self,
-        lights: Sequence[Light],
-        limits: LedLimits,
-        faults: Faults,
-        *,
-        on_light: Callable[[Lit], None],
-    ) -> None:
+    def __init__(self, rig: Rig, faults: Faults, on_light: Callable[[LedPulse], None]) -> None:
+        lights, limits = rig.lights, rig.leds or LedLimits()
         self.limits = limits
         self.dead = faults.dead_leds
         self.count = len(lights)
@@ -45,7 +39,7 @@ class LedBank:
         self._on_light = on_light
         # number -> (level, since, end); a stretch of light that is still going on
         self._lit: dict[int, tuple[float, float, float]] = {}
-        self._past: dict[int, deque[Lit]] = {}
+        self._past: dict[int, deque[LedPulse]] = {}
         self._heat = np.full(self.count, faults.heat)
         self._hot = self._heat >= limits.thermal_trip
         self._heat_at = 0.0
@@ -126,47 +120,46 @@ class LedBank:
         if now <= since:
             return
         self._dose_ws[led] += self._power_w[led] * level * (now - since)
-        self._past.setdefault(led, deque(maxlen=256)).append(Lit(led, level, since, now))
-        self._on_light(Lit(led, level * self._weak.get(led, 1.0), since, now))
+        self._past.setdefault(led, deque(maxlen=256)).append(LedPulse(led, level, since, now))
+        self._on_light(LedPulse(led, level * self._weak.get(led, 1.0), since, now))
 
     def all_off(self, now: float) -> None:
         """Put every LED out."""
         for led in list(self._lit):
             self.switch_off(led, now)
 
-    def going_on(self, now: float) -> list[Lit]:
+    def going_on(self, now: float) -> list[LedPulse]:
         """Return the stretches of light that have not ended, as given so far."""
         return [
-            Lit(led, level * self._weak.get(led, 1.0), since, max(now, since))
+            LedPulse(led, level * self._weak.get(led, 1.0), since, max(now, since))
             for led, (level, since, _) in self._lit.items()
         ]
 
     # what is asked for ------------------------------------------------------------------------
 
-    def since(self, start_s: float) -> list[Lit]:
+    def since(self, start_s: float) -> list[LedPulse]:
         """Return light driven after `start_s` and, to its end, what is still going on."""
-        past = [pulse for row in self._past.values() for pulse in row if pulse.off_s > start_s]
-        still = [Lit(led, level, on, end) for led, (level, on, end) in self._lit.items()]
-        return past + [pulse for pulse in still if math.isfinite(pulse.off_s)]
+        past = [pulse for row in self._past.values() for pulse in row if pulse.t_off_s > start_s]
+        still = [LedPulse(led, level, on, end) for led, (level, on, end) in self._lit.items()]
+        return past + [pulse for pulse in still if math.isfinite(pulse.t_off_s)]
 
-    def require(self, wanted: Iterable[Lit], now: float) -> tuple[float, float, float]:
+    def require(self, wanted: Iterable[LedPulse], now: float) -> tuple[float, float, float]:
         """Return most duty, heat and dose (Ws) with `wanted` light; refuse what is too much."""
         limits = self.limits
-        rows: dict[int, list[Lit]] = {}
+        rows: dict[int, list[LedPulse]] = {}
         for pulse in wanted:
             rows.setdefault(pulse.led, []).append(pulse)
         most_duty = most_heat = most_dose = 0.0
         self._heat_until(now)
         for led, new in rows.items():
-            if self._hot[led]:
-                raise Refused(Code.THERMAL, f"LED {led}, wait until it has cooled")
+            Refused.when(self._hot[led], Code.THERMAL, f"LED {led}, wait until it has cooled")
             duty = self._duty(led, new, now)
             if duty > limits.max_duty + 1e-9:
                 raise Refused(Code.DUTY, f"LED {led}, {duty:.3f} over {limits.duty_window_s:g} s")
             heat = self._heat_after(led, new, now)
             if heat >= limits.thermal_trip:
                 raise Refused(Code.THERMAL, f"LED {led} would reach {heat:.2f}")
-            give = sum(pulse.level * (pulse.off_s - pulse.on_s) for pulse in new)
+            give = sum(pulse.level * (pulse.t_off_s - pulse.t_on_s) for pulse in new)
             dose = float(self._dose_ws[led] + self._power_w[led] * give)
             if dose > limits.dose_ws:
                 raise Refused(Code.LIGHT_DOSE, f"LED {led}, {dose:.2f} of {limits.dose_ws:g} Ws")
@@ -174,16 +167,16 @@ class LedBank:
             most_dose = max(most_dose, dose)
         return most_duty, most_heat, most_dose
 
-    def _duty(self, led: int, new: Sequence[Lit], now: float) -> float:
+    def _duty(self, led: int, new: Sequence[LedPulse], now: float) -> float:
         """Return the most mean level of an LED in any window that ends in `new` light."""
         window = self.limits.duty_window_s
-        past = [pulse for pulse in self._past.get(led, ()) if pulse.off_s > now - window]
+        past = [pulse for pulse in self._past.get(led, ()) if pulse.t_off_s > now - window]
         if led in self._lit and self._lit[led][1] < now:
             # what goes on is replaced by what is asked for, but what it has given counts
-            past.append(Lit(led, self._lit[led][0], self._lit[led][1], now))
+            past.append(LedPulse(led, self._lit[led][0], self._lit[led][1], now))
         pulses = [*past, *new]
-        on = np.array([pulse.on_s for pulse in pulses])
-        off = np.array([pulse.off_s for pulse in pulses])
+        on = np.array([pulse.t_on_s for pulse in pulses])
+        off = np.array([pulse.t_off_s for pulse in pulses])
         level = np.array([pulse.level for pulse in pulses])
         times = np.concatenate([on, off])
         order = np.argsort(times, kind="stable")
@@ -195,12 +188,12 @@ class LedBank:
         mean = np.interp(ends, times, given) - np.interp(ends - window, times, given)
         return float(mean.max()) / window
 
-    def _heat_after(self, led: int, new: Sequence[Lit], now: float) -> float:
+    def _heat_after(self, led: int, new: Sequence[LedPulse], now: float) -> float:
         """Return the highest temperature that an LED will reach."""
         heat, at, most = float(self._heat[led]), now, 0.0
-        for pulse in sorted(new, key=lambda pulse: pulse.on_s):
-            heat *= math.exp(-max(0.0, pulse.on_s - at) / self.limits.thermal_tau_s)
-            fade = math.exp(-(pulse.off_s - pulse.on_s) / self.limits.thermal_tau_s)
+        for pulse in sorted(new, key=lambda pulse: pulse.t_on_s):
+            heat *= math.exp(-max(0.0, pulse.t_on_s - at) / self.limits.thermal_tau_s)
+            fade = math.exp(-(pulse.t_off_s - pulse.t_on_s) / self.limits.thermal_tau_s)
             heat = pulse.level + (heat - pulse.level) * fade
-            at, most = pulse.off_s, max(most, heat)
+            at, most = pulse.t_off_s, max(most, heat)
         return most

@@ -14,13 +14,11 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from capture.devices.wire import Code
-from capture.rig import LedLimits, Rig
 from rigsim.boxes.command import Act, Command, Refused, choice, command_table, whole, word
-from rigsim.boxes.device import Device
-from rigsim.boxes.eye_guard import EyeGuard, Lit
-from rigsim.boxes.faults import Faults
+from rigsim.boxes.device import Device, Wiring
+from rigsim.boxes.eye_guard import EyeGuard
 from rigsim.boxes.led_bank import LedBank
-from rigsim.boxes.led_table import LEVEL_STEPS, ROW_US, Switch, TableRow, table_crc
+from rigsim.boxes.led_table import LEVEL_STEPS, ROW_US, LedPulse, Switch, TableRow, table_crc
 
 _MASK_PATTERN = re.compile(r"[0-9A-Fa-f]{1,8}")
 LED_MS = (1.0, 500.0)
@@ -49,27 +47,18 @@ class LedSequencer(Device, Generic[RowT]):
 
     Parameters
     ----------
-    rig, faults
-        Its LEDs, what they may do, and its cameras; what is wrong with it.
+    wiring
+        Its LEDs, what they may do, and its cameras.
     on_light
         Called with each stretch of light of an LED when it has ended.
-    on_trigger
-        Called with the world time in s and the mask of each release of cameras.
     """
 
-    def __init__(
-        self,
-        rig: Rig,
-        faults: Faults,
-        *,
-        on_light: Callable[[Lit], None],
-        on_trigger: Callable[[float, int], None],
-    ) -> None:
-        super().__init__(rig, faults)
-        self._limits = rig.leds or LedLimits()
+    def __init__(self, wiring: Wiring, on_light: Callable[[LedPulse], None]) -> None:
+        super().__init__(wiring)
+        rig = self.rig
         self._cameras = len(rig.views)
-        self._on_trigger = on_trigger
-        self.bank = LedBank(rig.lights, self._limits, faults, on_light=on_light)
+        self.bank = LedBank(rig, self.faults, on_light)
+        self._limits = self.bank.limits
         self._guard = EyeGuard(rig.lights)
         self._run: Run[RowT] | None = None
         # tokens and times of all sequences since the box was made
@@ -82,7 +71,7 @@ class LedSequencer(Device, Generic[RowT]):
         """Return the rows that ``SEQ:DEF`` gives, or refuse."""
 
     @abstractmethod
-    def _lit_by(self, rows: Sequence[RowT], now: float) -> list[Lit]:
+    def _lit_by(self, rows: Sequence[RowT], now: float) -> list[LedPulse]:
         """Return the light of a sequence that would begin at `now`."""
 
     @abstractmethod
@@ -221,8 +210,7 @@ class LedSequencer(Device, Generic[RowT]):
     # sequence ---------------------------------------------------------------------------------
 
     def _require_still(self) -> None:
-        if self.running:
-            raise Refused(Code.IGNORED, "a sequence is running")
+        Refused.when(self.running, Code.IGNORED, "a sequence is running")
 
     def _clear_table(self, _: str, now: float) -> None:
         self._require_still()
@@ -232,8 +220,7 @@ class LedSequencer(Device, Generic[RowT]):
     def _define_rows(self, arguments: str, now: float) -> None:
         self._require_still()
         first_text, comma, rest = arguments.partition(",")
-        if not comma:
-            raise Refused(Code.SYNTAX, "expected FIRST,ROW;...")
+        Refused.when(not comma, Code.SYNTAX, "expected FIRST,ROW;...")
         # a gap in the table would be a row that nobody described
         first = whole(first_text, 0, len(self.table))
         rows = self._parse_rows(rest)
@@ -257,13 +244,13 @@ class LedSequencer(Device, Generic[RowT]):
         self._sequence_armed = True
         return f"{flashes:.2f},{rms:.4f},{duty:.4f},{heat:.4f},{dose_ws:.4f}"
 
-    def _require_calm(self, wanted: Sequence[Lit], now: float) -> tuple[float, float]:
+    def _require_calm(self, wanted: Sequence[LedPulse], now: float) -> tuple[float, float]:
         """Return flashes per second and rms of what is wanted; refuse what open eyes must not see.
 
         Flashes are counted together with those of the last second.
         """
         limits = self._limits
-        past = [pulse for pulse in self.bank.since(now - HISTORY_S) if pulse.on_s < now]
+        past = [pulse for pulse in self.bank.since(now - HISTORY_S) if pulse.t_on_s < now]
         flashes, rms = self._guard.flashes_per_s([*past, *wanted]), self._guard.rms(wanted)
         if self.eyes == "OPEN":
             if flashes >= limits.max_flashes_per_s:
@@ -276,8 +263,7 @@ class LedSequencer(Device, Generic[RowT]):
         token = word(arguments)
         self._require_still()
         self._require_closed_stop()
-        if not self._sequence_armed:
-            raise Refused(Code.NOT_ARMED, "SEQ:ARM judges the table first")
+        Refused.when(not self._sequence_armed, Code.NOT_ARMED, "SEQ:ARM judges the table first")
         # light that was under way at SEQ:ARM, or came after it, has been given by now
         self.bank.require(self._lit_by(self.table, now), now)
         self._sequence_armed = False

@@ -14,7 +14,6 @@ from capture.plan.steps import LIGHT_PATTERNS
 from capture.rig import Light
 from rigsim.arrays import Float64Array
 from rigsim.boxes.command import Refused, number
-from rigsim.boxes.eye_guard import Lit
 
 LEVEL_STEPS = 1000
 ROW_US = (2_000, 500_000)
@@ -23,6 +22,20 @@ _PATTERN_ROW_PATTERN = re.compile(
     r"([A-Za-z-]{1,4}):([0-9]{1,3}(?:\.[0-9]{1,3})?):([0-9]{1,4}):([0-9]{1,7}):([0-9A-Fa-f]{1,8})"
 )
 _ROW_PATTERN = re.compile(r"(-|[0-9+]{1,400}):([0-9]{1,4}):([0-9]{1,7}):([0-9A-Fa-f]{1,8})")
+
+
+@dataclass(frozen=True, slots=True)
+class LedPulse:
+    """Light of one LED from one switching to the next, past or to come."""
+
+    led: int
+    """Number of the LED, an index into the rig's lights."""
+    level: float
+    """Light given relative to full, 0 to 1; a weak LED gives less than it was asked for."""
+    t_on_s: float
+    """World time when it came on, s."""
+    t_off_s: float
+    """World time when it went off, s."""
 
 
 class TableRow:
@@ -82,10 +95,8 @@ def parse_leds(text: str, *, count: int, at_once: int) -> tuple[int, ...]:
     if not all(part.isdecimal() and len(part) <= 4 for part in parts):
         raise Refused(Code.SYNTAX, "expected LED numbers joined by +")
     numbers = tuple(sorted({int(part) for part in parts}))
-    if len(numbers) != len(parts):
-        raise Refused(Code.SYNTAX, "an LED stands twice")
-    if numbers[-1] >= count:
-        raise Refused(Code.OUT_OF_RANGE, f"expected LED 0 to {count - 1}")
+    Refused.when(len(numbers) != len(parts), Code.SYNTAX, "an LED stands twice")
+    Refused.when(numbers[-1] >= count, Code.OUT_OF_RANGE, f"expected LED 0 to {count - 1}")
     if len(numbers) > at_once:
         raise Refused(Code.OUT_OF_RANGE, f"expected at most {at_once} LEDs at once")
     return numbers
@@ -140,21 +151,21 @@ def switches(rows: Sequence[Row], *, overlap_s: float, settle_s: float) -> list[
     return sorted(found, key=lambda switch: switch.t_s)
 
 
-def lit_by(rows: Sequence[Row], start_s: float, *, overlap_s: float) -> list[Lit]:
+def lit_by(rows: Sequence[Row], start_s: float, *, overlap_s: float) -> list[LedPulse]:
     """Return the light of a sequence that begins at `start_s`, per LED without gaps or overlap."""
-    found: list[Lit] = []
+    found: list[LedPulse] = []
     going: dict[int, tuple[float, float]] = {}  # LED -> level, since
     t_s = start_s
     for place, row in enumerate(rows):
         for led in [k for k in going if k not in row.leds or going[k][0] != row.level]:
             level, since = going.pop(led)
-            found.append(Lit(led, level, since, t_s))
+            found.append(LedPulse(led, level, since, t_s))
         before = rows[place - 1].leds if place else ()
         for led in row.leds:
             early = overlap_s if place and led not in before else 0.0
             going.setdefault(led, (row.level, t_s - early))
         t_s += row.dwell_s
-    return found + [Lit(led, level, since, t_s) for led, (level, since) in going.items()]
+    return found + [LedPulse(led, level, since, t_s) for led, (level, since) in going.items()]
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,16 +15,12 @@ The box does not know what it sits on: it draws at a `SuctionLoad` and has a gau
 """
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from capture.devices.wire import Code
-from capture.rig import Rig
 from rigsim.boxes.command import Act, Command, Later, Refused, command_table, number, word
-from rigsim.boxes.device import Device
-from rigsim.boxes.faults import Faults
+from rigsim.boxes.device import Device, Wiring
 from rigsim.boxes.source_shutter import COVER_S, LEVEL_STEPS, SHUTTER_MS, SourceLight, SourceShutter
 from rigsim.boxes.suction_pump import (
     MAX_PUMPING_S,
@@ -32,7 +28,6 @@ from rigsim.boxes.suction_pump import (
     MIN_SUCTION_MS,
     PUMP_CONTROL_PERIOD_S,
     Gauge,
-    SuctionLoad,
     SuctionPump,
 )
 
@@ -48,43 +43,23 @@ class ProbeUnit(Device):
 
     Parameters
     ----------
-    rig, faults
-        Its probe, the LED at the source fibre and what that may do; what is wrong with it.
-    load
-        What the head sits on.
-    on_light
-        Called with each stretch of light when it ends.
-    on_trigger
-        Called with the world time in s when the camera's line is pulsed.
-    rng
-        Noise of gauge and thermometer, and what sticks.
+    wiring
+        Its probe, the LED at the source fibre, the head; each stretch of light is a `SourceLight`.
     """
 
     kind = "probe"
     model = "PROBE1"
 
-    def __init__(
-        self,
-        rig: Rig,
-        load: SuctionLoad | None,
-        faults: Faults,
-        *,
-        on_light: Callable[[SourceLight], None],
-        on_trigger: Callable[[float], None],
-        rng: np.random.Generator,
-    ) -> None:
-        super().__init__(rig, faults)
+    def __init__(self, wiring: Wiring) -> None:
+        super().__init__(wiring)
+        rig, load = wiring.rig, wiring.head
         if rig.probe is None or load is None:
             raise ValueError(f"probe: got none in rig {rig.name!r}, expected its description")
         self._probe = rig.probe
         self._load = load
-        self._on_trigger = on_trigger
-        self._rng = rng
-        self.shutter = SourceShutter(self, on_light=on_light, on_open=on_trigger, rng=rng)
-        gauge = Gauge(rng=rng, dead_after_s=faults.gauge_dead_after)
-        self.pump = SuctionPump(
-            self, rig.probe, load, gauge, on_end=lambda now: self.shutter.shut(now, "PUMP")
-        )
+        self.shutter = SourceShutter(self, wiring)
+        gauge = Gauge(rng=wiring.rng, dead_after_s=self.faults.gauge_dead_after)
+        self.pump = SuctionPump(self, rig.probe, load, gauge, self.shutter)
 
     # settings ---------------------------------------------------------------------------------
 
@@ -135,7 +110,7 @@ class ProbeUnit(Device):
             "SHUT:COUN?": lambda *_: str(self.shutter.count),
             "FIB": self._cover,
             "FIB?": lambda *_: "ALL" if self.shutter.fibre is None else str(self.shutter.fibre),
-            "CAM:TRIG": self._trigger,
+            "CAM:TRIG": self._trigger_camera,
             "CAM:TEMP?": lambda _, now: (
                 f"{self._load.camera_c(now) + float(self._rng.normal(0.0, THERMOMETER_C)):.2f}"
             ),
@@ -193,8 +168,7 @@ class ProbeUnit(Device):
         label, _, angle = arguments.partition(",")
         site = word(label)
         angle_deg = number(angle, 0.0, 360.0, "degrees, less than 360")
-        if angle_deg == 360.0:
-            raise Refused(Code.OUT_OF_RANGE, "expected 0 to less than 360 degrees")
+        Refused.when(angle_deg == 360.0, Code.OUT_OF_RANGE, "expected 0 to less than 360 degrees")
         self.shutter.require_closed(now)
         self.pump.place(site, angle_deg, now)
 
@@ -239,8 +213,7 @@ class ProbeUnit(Device):
             self.shutter.close(now)
             return ""
         what, _, length = arguments.partition(",")
-        if what.upper() != "OPEN":
-            raise Refused(Code.SYNTAX, "expected OPEN,<ms> or CLOSE")
+        Refused.when(what.upper() != "OPEN", Code.SYNTAX, "expected OPEN,<ms> or CLOSE")
         span_ms = number(length, SHUTTER_MS, self._probe.max_open_s * 1e3, "ms")
         self._require_closed_stop()
         if self.shutter.level > 0 and not self.pump.holds:
@@ -266,10 +239,3 @@ class ProbeUnit(Device):
     def _new_subject(self, arguments: str, now: float) -> None:
         word(arguments)
         self.shutter.dose_ws = 0.0
-
-    # camera -----------------------------------------------------------------------------------
-
-    def _trigger(self, arguments: str, now: float) -> str:
-        token = word(arguments)
-        self._on_trigger(now)
-        return f"{token},{self.clock_us(now)}"

@@ -8,12 +8,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
 from capture.devices.wire import Code
 from capture.rig import LedLimits
 from rigsim.boxes.command import Refused
-from rigsim.boxes.device import Device
+from rigsim.boxes.device import Device, Wiring
 
 LEVEL_STEPS = 1000
 SHUTTER_MS = 1.0
@@ -56,34 +54,22 @@ class SourceShutter:
     Parameters
     ----------
     box
-        Whose rig has the fibres and the LED, whose faults say what sticks, and who sends events.
-    on_light
-        Called with each stretch of light when it ends.
-    on_open
-        Called with the world time in s when the blades have cleared the fibre.
-    rng
-        Decides what sticks.
+        Who sends events.
+    wiring
+        Whose rig has the fibres and the LED, whose faults say what sticks, and who notices light;
+        the camera line is pulsed when the blades have cleared the fibre.
     """
 
-    def __init__(
-        self,
-        box: Device,
-        *,
-        on_light: Callable[[SourceLight], None],
-        on_open: Callable[[float], None],
-        rng: np.random.Generator,
-    ) -> None:
-        rig, faults = box.rig, box.faults
+    def __init__(self, box: Device, wiring: Wiring) -> None:
+        rig, faults, self._rng = wiring.rig, wiring.faults, wiring.rng
         self._box = box
         self.fibres = 0 if rig.probe is None else len(rig.probe.fibres)
         self._power_w = rig.lights[0].power_w or 0.0
         self.dose_limit_ws = (rig.leds or LedLimits()).dose_ws
-        self._on_light = on_light
-        self._on_open = on_open
+        self._on_light, self._on_open = wiring.on_light, wiring.on_trigger
         self._stuck, self._jam = faults.shutter_stuck, faults.shutter_jam
         self._dead = 0 in faults.dead_leds
         self._weak = faults.weak_leds.get(0, 1.0)
-        self._rng = rng
         self._opening: _Opening | None = None
         self._light_since: float | None = None
         self._settled_s = -math.inf
@@ -197,8 +183,7 @@ class SourceShutter:
 
     def open(self, seconds: float, now: float) -> tuple[float, Callable[[], str | Refused]]:
         """Begin an opening; return when it is known how that went, and what tells it."""
-        if self.jammed:
-            raise Refused(Code.HARDWARE, "the shutter is stuck open; SHUT CLOSE")
+        Refused.when(self.jammed, Code.HARDWARE, "the shutter is stuck open; SHUT CLOSE")
         self.require_closed(now)
         give_ws = self._power_w * self.level / LEVEL_STEPS * seconds
         if self.dose_ws + give_ws > self.dose_limit_ws:
@@ -218,8 +203,7 @@ class SourceShutter:
         """Let the blades fall because the host says so; try it again where they are stuck."""
         if self.jammed:
             self.jammed = self._rng.random() < self._jam
-            if self.jammed:
-                raise Refused(Code.HARDWARE, "the shutter is stuck open")
+            Refused.when(self.jammed, Code.HARDWARE, "the shutter is stuck open")
         elif self._opening is not None and not self._opening.open:
             self._opening = None
         elif self._opening is not None and math.isinf(self._opening.jams_s):
@@ -244,17 +228,14 @@ class SourceShutter:
         """Refuse while the shutter is open, or opens, or the cover moves."""
         if self._opening is not None:
             raise Refused(Code.IGNORED, "the shutter is open")
-        if now < self._settled_s:
-            raise Refused(Code.IGNORED, "the cover moves")
+        Refused.when(now < self._settled_s, Code.IGNORED, "the cover moves")
 
     def set_level(self, level: int, now: float) -> None:
         """Drive the LED behind the closed shutter, 0 to 1000 thousandths of full."""
         if level > 0:
             self.require_closed(now)
-            if self.jammed:
-                raise Refused(Code.HARDWARE, "the shutter is stuck open; SHUT CLOSE")
-            if self._dead:
-                raise Refused(Code.HARDWARE, "the LED draws no current")
+            Refused.when(self.jammed, Code.HARDWARE, "the shutter is stuck open; SHUT CLOSE")
+            Refused.when(self._dead, Code.HARDWARE, "the LED draws no current")
             self.level = level
         else:
             self._put_out(now)

@@ -7,16 +7,15 @@ head where it was placed: after anything else nobody knows whether it is still t
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from capture.devices.wire import Code
 from capture.rig import Probe
 from rigsim.boxes.command import Refused
-from rigsim.boxes.device import Device
+from rigsim.boxes.device import Device, SuctionLoad
+from rigsim.boxes.source_shutter import SourceShutter
 
 PUMP_CONTROL_PERIOD_S = 0.05
 """Period in which the gauge is looked at while the pump runs, s."""
@@ -32,28 +31,6 @@ MIN_SUCTION_MS = 100.0
 GAUGE_NOISE_MBAR = 0.3
 GAUGE_ZERO_MBAR = 0.7
 """Standard deviations of one reading of the gauge, and of its zero from box to box."""
-
-
-class SuctionLoad(Protocol):
-    """What the pump acts upon."""
-
-    def place(self, site: str, angle_deg: float, now: float) -> None:
-        """Be put somewhere by a person."""
-
-    def take_away(self, now: float) -> None:
-        """Be taken off."""
-
-    def draw(self, wanted_mbar: float, now: float) -> None:
-        """Have the vent closed and the pump switched on."""
-
-    def vent(self, now: float) -> None:
-        """Have the pump switched off and the vent opened."""
-
-    def suction_mbar(self, now: float) -> float:
-        """Return the suction now, mbar."""
-
-    def camera_c(self, now: float) -> float:
-        """Return the temperature of the camera behind it, degrees Celsius."""
 
 
 class Gauge:
@@ -109,24 +86,15 @@ class SuctionPump:
         The head on the skin.
     gauge
         Of the suction under it.
-    on_end
-        Called with the world time in s when the suction has ended, whatever the reason.
+    shutter
+        Shuts when the suction has ended, whatever the reason.
     """
 
     def __init__(
-        self,
-        box: Device,
-        probe: Probe,
-        load: SuctionLoad,
-        gauge: Gauge,
-        *,
-        on_end: Callable[[float], None],
+        self, box: Device, probe: Probe, load: SuctionLoad, gauge: Gauge, shutter: SourceShutter
     ) -> None:
-        self._probe = probe
-        self._load = load
-        self._gauge = gauge
-        self._on_end = on_end
-        self._box = box
+        self._box, self._probe, self._load, self._gauge = box, probe, load, gauge
+        self._shutter = shutter
         self._draw: _Draw | None = None
         # a clock of its own keeps the skin's rest through a reset of the box
         self._rested_s = -math.inf
@@ -200,7 +168,7 @@ class SuctionPump:
         self._rested_s = now + self._probe.rest_s
         self.last_report = f"{draw.number},{how},{draw.mbar:.1f},{self._box.clock_us(now)}"
         self._box.say("PUMP:END", self.last_report)
-        self._on_end(now)
+        self._shutter.shut(now, "PUMP")
 
     def _fail(self, draw: _Draw, how: str, now: float) -> None:
         self._end(draw, how, now)

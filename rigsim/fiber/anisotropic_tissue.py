@@ -147,13 +147,11 @@ def anisotropic_profile(
         tally = np.zeros(shape)
         visited = np.zeros((2, window.size))
         bins = starts.astype(np.int64), counts.astype(np.int64), bins_per_mm
-        walk_anisotropic(
-            *(medium, fibres.source_numerical_aperture, fibres.numerical_aperture),
-            *(places, overlap, per_mm, *bins, rings, window),
-            *(splitting.WINDOW_CELLS / reach, deeper, traced, seed.copy(), tally, visited),
-        )
+        how = (bins, rings, window, (splitting.WINDOW_CELLS / reach, deeper), traced, seed.copy())
+        walk_anisotropic(medium, sines, (places, overlap, per_mm), *how, (tally, visited))
         return tally / traced, visited
 
+    sines = fibres.source_numerical_aperture, fibres.numerical_aperture
     window = splitting.flat_window(reach, farthest)
     for seed in seeds[batches:]:
         pilot = max(200, round(profiles.PILOT_SHARE * count * batches))

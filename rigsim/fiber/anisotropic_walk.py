@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from rigsim.fiber.walk import MAX_COPIES, MAX_DEPTH_GAIN, STACK_DEPTH
-from rigsim.tissue.photon_walk import draw, fresnel, scatter
+from rigsim.tissue.photon_walk import disc_point, draw, fresnel, scatter
 
 
 @njit(inline="always")
@@ -21,23 +21,7 @@ def _turn(s0, s1, s2, s3, ux, uy, uz, g, strength, most):  # type: ignore[no-unt
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def walk_anisotropic(  # type: ignore[no-untyped-def]
-    medium,
-    source_sine,
-    fibre_sine,
-    places,
-    overlap,
-    overlap_per_mm,
-    starts,
-    counts,
-    bins_per_mm,
-    rings,
-    window,
-    per_mm,
-    deeper_per_mm,
-    photons,
-    seed,
-    tally,
-    visited,
+    medium, sines, spots, bins, rings, window, per_mm, photons, seed, found
 ):
     """Trace photons from a point source in a cone and score fibres where they stand.
 
@@ -45,26 +29,31 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
     ----------
     medium
         sigma_a, sigma_s (1/mm), g, eta, strength; the preferred axis is x. float64, shape (5,).
-    source_sine, fibre_sine
-        Numerical apertures.
-    places
-        x and y of the fibres in mm, by growing distance. float64, shape (F, 2).
-    overlap
-        Density of (point in one core - point in the other) in 1/mm^2 by distance from the mean,
-        the last node 0, shape (nodes,).
-    overlap_per_mm
-        Nodes of `overlap` per mm.
-    starts, counts, bins_per_mm
+    sines
+        Numerical apertures of the source and of the fibres.
+    spots
+        Places, x and y of the fibres in mm, by growing distance, float64, shape (F, 2); density of
+        (point in one core - point in the other) in 1/mm^2 by distance from the mean, the last node
+        0, shape (nodes,); and its nodes per mm.
+    bins
         First fibre and number of fibres that reach each bin of exit radius, and bins per mm.
     rings
         For each of some distances: first exit radius (mm), nodes per mm and, by node, the density's
-        even harmonics over the direction; then light is scored by harmonics, and `starts` and
-        `counts` tell distances. float64, shape (R, 1 + nodes, H); R = 0 for light scored in places.
-    tally
-        Light by fibre, shape (F, 1), or by distance and harmonic, shape (R, H), added to.
-    window, per_mm, deeper_per_mm, photons, seed, visited
+        even harmonics over the direction; then light is scored by harmonics, and `bins`
+        tell distances. float64, shape (R, 1 + nodes, H); R = 0 for light scored in places.
+    window, photons, seed
         As in `rigsim.fiber.walk.walk_to_fibres`.
+    per_mm
+        Cells of `window` per mm, and growth of the kept weight per mm of depth.
+    found
+        What is added to: light by fibre, shape (F, 1), or by distance and harmonic, shape (R, H);
+        and the weight that visited each distance, see there.
     """
+    source_sine, fibre_sine = sines
+    places, overlap, overlap_per_mm = spots
+    starts, counts, bins_per_mm = bins
+    cells_per_mm, deeper_per_mm = per_mm
+    tally, visited = found
     s0, s1, s2, s3 = seed[0], seed[1], seed[2], seed[3]
     sigma_a, sigma_s, g, eta, strength = medium[0], medium[1], medium[2], medium[3], medium[4]
     most = max(1.0 + strength * 2.0 / 3.0, 1.0 - strength / 3.0)
@@ -72,13 +61,7 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
     by_ring = rings.shape[0] > 0
     waiting = np.empty((STACK_DEPTH, 7))
     for _ in range(photons):
-        while True:
-            s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
-            ux = 2.0 * u - 1.0
-            s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
-            uy = 2.0 * u - 1.0
-            if ux * ux + uy * uy <= 1.0:
-                break
+        s0, s1, s2, s3, ux, uy = disc_point(s0, s1, s2, s3)
         ux *= source_sine
         uy *= source_sine
         reflected, uz = fresnel(sqrt(1.0 - ux * ux - uy * uy), 1.0, eta)
@@ -110,20 +93,14 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
                 y += step * uy
                 z += step * uz
                 weight *= scattering / sigma_t
-                cell = min(int(sqrt(x * x + y * y + z * z) * per_mm), cells)
+                cell = min(int(sqrt(x * x + y * y + z * z) * cells_per_mm), cells)
                 chance = min(exp(1.5 - sigma_s * z), 1.0)
                 deeper = min(1.0 + z * deeper_per_mm, MAX_DEPTH_GAIN)
                 visited[0, cell] += weight * chance
                 visited[1, cell] += weight / deeper
                 s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
                 if u <= chance:
-                    while True:
-                        s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
-                        p = 2.0 * u - 1.0
-                        s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
-                        q = 2.0 * u - 1.0
-                        if p * p + q * q <= 1.0:
-                            break
+                    s0, s1, s2, s3, p, q = disc_point(s0, s1, s2, s3)
                     p *= fibre_sine / eta
                     q *= fibre_sine / eta
                     mu = sqrt(1.0 - p * p - q * q)

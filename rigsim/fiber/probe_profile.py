@@ -2,7 +2,6 @@
 
 import dataclasses
 import zlib
-from collections import OrderedDict
 from dataclasses import dataclass
 from typing import Final
 
@@ -16,6 +15,7 @@ from rigsim.fiber.probe_tissue import FibrousTissue, ProbedTissue, TissueError, 
 from rigsim.fiber.profile import FibrePaths, Fibres, SpectralStack, fibre_paths, fibre_profile
 from rigsim.fiber.profile_smoothing import smooth_profile
 from rigsim.fiber.white_fiber import ETA, HENYEY_GREENSTEIN_G, WhiteFibre
+from rigsim.kept import Kept
 
 MAX_KEPT_PROFILES: Final = 64
 """Profiles and runs of photons that are kept."""
@@ -64,9 +64,10 @@ class Profiles:
         self.rig, self.tissue = rig, tissue
         self.photons, self.seed, self.threads = photons, seed, threads
         self.probe: Probe = rig.probe
-        self._runs: OrderedDict[tuple[object, ...], FibrePaths | Profile] = OrderedDict()
+        most = MAX_KEPT_PROFILES
+        self._runs: Kept[tuple[object, ...], FibrePaths | Profile] = Kept(lambda _: most)
         self._by_turn: Float64Array | None = None
-        self._profiles: OrderedDict[tuple[object, ...], Profile] = OrderedDict()
+        self._profiles: Kept[tuple[object, ...], Profile] = Kept(lambda _: most)
 
     def profile(self, site: str, angle_deg: float = 0.0, suction_mbar: float = 0.0) -> Profile:
         """Return what the fibres take at a site.
@@ -91,16 +92,13 @@ class Profiles:
             The tissue has no such site.
         """
         suction = SUCTION_STEP_MBAR * round(suction_mbar / SUCTION_STEP_MBAR)
-        key = (site, angle_deg, suction)
-        if key not in self._profiles:
-            while len(self._profiles) >= MAX_KEPT_PROFILES:
-                self._profiles.popitem(last=False)
+
+        def make() -> Profile:
             if isinstance(self.tissue, FibrousTissue):
-                self._profiles[key] = self._turned(self.tissue, angle_deg)
-            else:
-                self._profiles[key] = self._made(self.tissue.optics(site, angle_deg, suction))
-        self._profiles.move_to_end(key)
-        return self._profiles[key]
+                return self._turned(self.tissue, angle_deg)
+            return self._made(self.tissue.optics(site, angle_deg, suction))
+
+        return self._profiles.get((site, angle_deg, suction), make)
 
     def _turned(self, tissue: FibrousTissue, angle_deg: float) -> Profile:
         """Return the profile along one direction, by the Fourier series of those traced."""
@@ -125,21 +123,13 @@ class Profiles:
         return Profile(np.repeat(value, 3, axis=1), np.repeat(error, 3, axis=1))
 
     def _made(self, optics: TissueOptics) -> Profile:
-        run = self._run(optics)
+        key = (optics.wavelength_nm, optics.stacks)
+        run = self._runs.get(key, lambda: self._traced(optics))
         if isinstance(run, Profile):
             return run
         made = run.profile(optics.amount)
         value, error = smooth_profile(made.radii_mm, made.batch_reflectance_per_mm2)
         return Profile(value, error)
-
-    def _run(self, optics: TissueOptics) -> FibrePaths | Profile:
-        key = (optics.wavelength_nm, optics.stacks)
-        if key not in self._runs:
-            while len(self._runs) >= MAX_KEPT_PROFILES:
-                self._runs.popitem(last=False)
-            self._runs[key] = self._traced(optics)
-        self._runs.move_to_end(key)
-        return self._runs[key]
 
     def _traced(self, optics: TissueOptics) -> FibrePaths | Profile:
         words = repr((optics.wavelength_nm, optics.stacks)).encode()

@@ -330,7 +330,7 @@ def _trace(
     spectral = _spectral(stack)
     tissue_mc.photons_per_batch(photons, batches, threads)
     order = np.argsort(fibres.radii_mm, kind="stable")
-    kernels, starts, counts = ring_kernels(
+    rings = ring_kernels(
         np.array(fibres.radii_mm)[order], 0.5 * fibres.core_mm, 0.5 * fibres.source_core_mm
     )
     shares = spectral.band_weights.max(axis=1)
@@ -345,22 +345,9 @@ def _trace(
             continue
         count = -(-round(photons * float(shares[index])) // batches) or 1
         traced += count * batches
-        plan = _Plan(layers, fibres, kernels, starts, counts, absorber, index)
-        window = flat_window(plan.reach_mm, plan.farthest_mm)
-        pilot = max(200, round(PILOT_SHARE * count * batches))
-        for seed in seeds[batches:]:
-            window = plan.learned(window, pilot, seed)
-
-        def run(
-            batch: int,
-            plan: _Plan = plan,
-            window: Float64Array = window,
-            count: int = count,
-            seeds: NDArray[np.uint64] = seeds,
-        ) -> Float64Array:
-            return plan.run(window, count, seeds[batch])[0]
-
-        for batch, score in enumerate(tissue_mc.in_threads(run, batches, threads)):
+        row = None if absorber is None else absorber[index]
+        plan = _Plan(layers, fibres, rings, row)
+        for batch, score in enumerate(plan.traced(count, batches, seeds, threads)):
             for band in range(bands[0]):
                 weight = spectral.band_weights[index, band]
                 total[batch, ..., band] += weight / count * score
@@ -369,21 +356,16 @@ def _trace(
     return (back if isinstance(stack, SpectralStack) else back[..., 0]), traced
 
 
+Rings = tuple[Float64Array, Int64Array, Int64Array]
+
+
 class _Plan:
     """What the walk needs of one stack and its fibres."""
 
     def __init__(
-        self,
-        stack: LayerStack,
-        fibres: Fibres,
-        kernels: Float64Array,
-        starts: Int64Array,
-        counts: Int64Array,
-        absorber: Float64Array | None,
-        index: int,
+        self, stack: LayerStack, fibres: Fibres, rings: Rings, absorber: Float64Array | None
     ) -> None:
-        self.fibres = fibres
-        self.kernels, self.starts, self.counts = kernels, starts, counts
+        self.fibres, self.rings = fibres, rings
         table = tissue_mc.layer_table(stack)
         depth = np.zeros(len(table))
         share = np.zeros(len(table))
@@ -392,7 +374,7 @@ class _Plan:
             optical = np.where(table[1:-1, 2] > 0.0, thickness * table[1:-1, 2], 0.0)
         depth[2:] = np.cumsum(optical)
         if absorber is not None:
-            share[1:-1] = absorber[index]
+            share[1:-1] = absorber
         self.table = np.column_stack([table, depth, share])
         self.counts_paths = absorber is not None
         farthest = max(fibres.radii_mm) + 0.5 * (fibres.core_mm + fibres.source_core_mm)
@@ -401,36 +383,32 @@ class _Plan:
         self.chances, self.chances_per_mm = scoring_chances(self.table)
         self.deeper_per_mm = 1.0 / transport_depth_mm(self.table)
 
-    def learned(self, window: Float64Array, photons: int, seed: NDArray[np.uint64]) -> Float64Array:
-        """Return weights at which every distance is visited alike, learned from some photons."""
-        visited = self.run(window, photons, seed)[1]
-        return learned_window(visited, window, self.reach_mm, self.farthest_mm)
+    def traced(
+        self, count: int, batches: int, seeds: NDArray[np.uint64], threads: int
+    ) -> list[Float64Array]:
+        """Return the sums of each batch's scores, its photons split as pilots have learned."""
+        window = flat_window(self.reach_mm, self.farthest_mm)
+        pilot = max(200, round(PILOT_SHARE * count * batches))
+        for seed in seeds[batches:]:
+            visited = self._run(window, pilot, seed)[1]
+            window = learned_window(visited, window, self.reach_mm, self.farthest_mm)
+        return tissue_mc.in_threads(
+            lambda batch: self._run(window, count, seeds[batch])[0], batches, threads
+        )
 
-    def run(
+    def _run(
         self, window: Float64Array, photons: int, seed: NDArray[np.uint64]
     ) -> tuple[Float64Array, Float64Array]:
         """Return the sums of the fibres' scores and of the weights that visited each distance."""
-        fibres = len(self.kernels)
+        fibres = len(self.rings[0])
         tally = np.zeros(fibres)
         histogram = np.zeros((fibres, _path_nodes()) if self.counts_paths else (0, 0))
         visited = np.zeros((2, len(window)))
         sines = self.fibres.source_numerical_aperture, self.fibres.numerical_aperture
-        rings = self.kernels, self.starts, self.counts
         per_mm = WINDOW_CELLS / self.reach_mm, self.deeper_per_mm, self.chances_per_mm
-        paths = PATH_STEP, PATH_SCALE_MM
-        found = tally, histogram, visited
-        walk_to_fibres(
-            self.table,
-            *sines,
-            *rings,
-            window,
-            self.chances,
-            *per_mm,
-            *paths,
-            photons,
-            seed.copy(),
-            *found,
-        )
+        paths, found = (PATH_STEP, PATH_SCALE_MM), (tally, histogram, visited)
+        how = (self.rings, window, self.chances, per_mm, paths, photons, seed.copy())
+        walk_to_fibres(self.table, sines, *how, found)
         return (histogram if self.counts_paths else tally), visited
 
 

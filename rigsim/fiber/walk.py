@@ -13,7 +13,7 @@ from math import copysign, exp, log, sqrt
 import numpy as np
 from numba import njit
 
-from rigsim.tissue.photon_walk import draw, fresnel, scatter
+from rigsim.tissue.photon_walk import disc_point, draw, fresnel, scatter
 
 TABLE_COLUMNS = 8
 """Columns of the layer table: top, bottom (mm), sigma_t (1/mm), albedo, g, eta, optical depth of
@@ -26,8 +26,10 @@ _STATE_SIZE = 9  # x, y, z, ux, uy, uz, weight, path, layer
 
 
 @njit(inline="always")
-def _on_fibres(rho, value, path, kernels, starts, counts, log_step, path_scale, tally, histogram):  # type: ignore[no-untyped-def]
+def _on_fibres(rho, value, path, rings, paths, tally, histogram):  # type: ignore[no-untyped-def]
     """Add light that leaves at a distance to the fibres that reach there."""
+    kernels, starts, counts = rings
+    log_step, path_scale = paths
     bin_ = int(rho * kernels[0, 2])
     if bin_ >= starts.shape[0]:
         return
@@ -54,32 +56,15 @@ def _on_fibres(rho, value, path, kernels, starts, counts, log_step, path_scale, 
 
 
 @njit(
-    "void(float64[:,::1], float64, float64, float64[:,::1], int64[::1], int64[::1], float64[::1],"
-    " float64[::1], float64, float64, float64, float64, float64, int64, uint64[::1], float64[::1],"
-    " float64[:,::1], float64[:,::1])",
+    "void(float64[:,::1], UniTuple(float64, 2), Tuple((float64[:,::1], int64[::1], int64[::1])),"
+    " float64[::1], float64[::1], UniTuple(float64, 3), UniTuple(float64, 2), int64, uint64[::1],"
+    " Tuple((float64[::1], float64[:,::1], float64[:,::1])))",
     cache=True,
     nogil=True,
     error_model="numpy",
 )
 def walk_to_fibres(  # type: ignore[no-untyped-def]
-    table,
-    source_sine,
-    fibre_sine,
-    kernels,
-    starts,
-    counts,
-    window,
-    chances,
-    per_mm,
-    deeper_per_mm,
-    chances_per_mm,
-    log_step,
-    path_scale,
-    photons,
-    seed,
-    tally,
-    histogram,
-    visited,
+    table, sines, rings, window, chances, per_mm, paths, photons, seed, found
 ):
     """Trace photons from a point source in a cone and score what fibres take.
 
@@ -88,40 +73,38 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
     table
         Row 0 the medium above, rows 1 to n the layers, row n + 1 the medium below; see
         `TABLE_COLUMNS`. float64, shape (n + 2, 8).
-    source_sine, fibre_sine
+    sines
         Numerical apertures of the source and of the fibres.
-    kernels
-        One row a fibre, in the order of their distance: smallest exit radius it takes (mm), nodes
-        per mm, bins of `starts` per mm, then its density (1/mm^2) at the nodes.
-        float64, shape (F, 3 + nodes + 1), the last value 0.
-    starts, counts
-        First fibre and number of fibres that reach each bin of exit radius, int64, shape (bins,).
+    rings
+        Kernels, one row a fibre, in the order of their distance: smallest exit radius it takes
+        (mm), nodes per mm, bins of `starts` per mm, then its density (1/mm^2) at the nodes.
+        float64, shape (F, 3 + nodes + 1), the last value 0; first fibre and number of fibres that
+        reach each bin of exit radius, int64, shape (bins,).
     window
         Weight at which photons are kept, by their distance from the entry; lighter ones play,
         heavier ones are split. float64, shape (cells,); the last holds for all farther ones.
     chances
         Probability to score a collision, by its depth; 0 where no light comes up.
         float64, shape (levels,).
-    per_mm, chances_per_mm
-        Cells of `window` and of `chances` per mm.
-    deeper_per_mm
-        Growth of the kept weight per mm of depth, in units of that at the surface.
-    log_step, path_scale
-        Nodes of `histogram` lie at ``path_scale * (exp(log_step * k) - 1)`` mm.
+    per_mm
+        Cells of `window` per mm, growth of the kept weight per mm of depth in units of that at the
+        surface, cells of `chances` per mm.
+    paths
+        Step and scale of paths: nodes of the histogram lie at ``scale * (exp(step * k) - 1)`` mm.
     photons
         Photons to trace.
     seed
         State of the generator, not all zero, uint64, shape (4,).
-    tally
-        Light in each fibre per area, aperture^2 and photon in 1/mm^2, float64, shape (F,), added
-        to when `histogram` is empty.
-    histogram
-        The same by the path in the counted absorber, each score shared by the two nodes around it
-        so that its mean path is kept. float64, shape (F, nodes) or (0, 0), added to.
-    visited
-        Weight of scored collisions by distance from the entry; of all, in units of the weight kept
-        at their depth. float64, shape (2, cells), added to.
+    found
+        What is added to. Light in each fibre per area, aperture^2 and photon in 1/mm^2, float64,
+        shape (F,), when the histogram is empty; the histogram, the same by the path in the counted
+        absorber, each score shared by the two nodes around it so that its mean path is kept.
+        float64, shape (F, nodes) or (0, 0); the weight of scored collisions by distance from the
+        entry; of all, in units of the weight kept at their depth. float64, shape (2, cells).
     """
+    source_sine, fibre_sine = sines
+    cells_per_mm, deeper_per_mm, chances_per_mm = per_mm
+    tally, histogram, visited = found
     s0, s1, s2, s3 = seed[0], seed[1], seed[2], seed[3]
     last = table.shape[0] - 1
     eta_above = table[0, 5]
@@ -164,7 +147,7 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
                     path += step * table[layer, 7]
                     weight *= table[layer, 3]
                     r2 = x * x + y * y
-                    cell = min(int(sqrt(r2 + z * z) * per_mm), cells)
+                    cell = min(int(sqrt(r2 + z * z) * cells_per_mm), cells)
 
                     level = int(z * chances_per_mm)
                     chance = chances[level] if level < levels else 0.0
@@ -172,14 +155,8 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
                         s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
                         if u <= chance:
                             # A direction within the cone outside, uniform in projected angle.
-                            while True:
-                                s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
-                                p = 2.0 * u - 1.0
-                                s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
-                                q = 2.0 * u - 1.0
-                                norm = p * p + q * q
-                                if norm <= 1.0:
-                                    break
+                            s0, s1, s2, s3, p, q = disc_point(s0, s1, s2, s3)
+                            norm = p * p + q * q
                             eta = table[layer, 5]
                             p *= fibre_sine
                             q *= fibre_sine
@@ -209,18 +186,8 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
                                     reflected, _mu = fresnel(mu, eta, table[k - 1, 5])
                                     value *= 1.0 - reflected
                             value *= exp(-tau)
-                            _on_fibres(
-                                sqrt(x_out * x_out + y_out * y_out),
-                                value,
-                                out_path,
-                                kernels,
-                                starts,
-                                counts,
-                                log_step,
-                                path_scale,
-                                tally,
-                                histogram,
-                            )
+                            rho = sqrt(x_out * x_out + y_out * y_out)
+                            _on_fibres(rho, value, out_path, rings, paths, tally, histogram)
 
                     deeper = min(1.0 + z * deeper_per_mm, MAX_DEPTH_GAIN)
                     target = window[cell] * deeper
@@ -282,18 +249,9 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
                             phase = (1.0 - g * g) / (4.0 * spread * sqrt(spread))
                             drawn = chance * eta * eta * abs(now_z) / (fibre_sine * fibre_sine)
                             share = phase / (drawn + phase)
-                        _on_fibres(
-                            sqrt(x * x + y * y),
-                            share * weight * eta_above * eta_above / (fibre_sine * fibre_sine),
-                            path,
-                            kernels,
-                            starts,
-                            counts,
-                            log_step,
-                            path_scale,
-                            tally,
-                            histogram,
-                        )
+                        value = share * weight * eta_above * eta_above / (fibre_sine * fibre_sine)
+                        rho = sqrt(x * x + y * y)
+                        _on_fibres(rho, value, path, rings, paths, tally, histogram)
                     break
                 if beyond == last:
                     break

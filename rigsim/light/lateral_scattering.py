@@ -17,7 +17,7 @@ from rigsim.light.interreflection_color import Bounces, InterreflectionColor
 from rigsim.light.olat import Lamp
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.seen_skin import SeenSkin
-from rigsim.light.subsurface_radiance import PIGMENT_BLUR_MM
+from rigsim.light.subsurface_radiance import pigment_filter
 from rigsim.light.surface_brdf import HAIR_REFLECTANCE, SkinSurface
 from rigsim.render import Caster, visibility
 from rigsim.tissue.skin_layers import ETA
@@ -50,7 +50,6 @@ class LateralScattering:
         skin: SeenSkin,
         surface: SkinSurface,
         caster: Caster,
-        *,
         subsurface: bool,
         bounces: Bounces | None,
         relief: ReliefShadow | None,
@@ -61,12 +60,8 @@ class LateralScattering:
             self._color = InterreflectionColor(bounces, skin, surface.r_d, surface.reflectance)
         if subsurface:
             clear = skin.without_melanin()
-            log_m = np.log(surface.reflectance / clear) * np.float32(0.5)
-            blurred = lateral.scatter_laterally(
-                log_m, skin.subject.atlas, [PIGMENT_BLUR_MM], np.ones((3, 1))
-            )
             self._kernels = skin.kernels()
-            self._pigment = np.exp(blurred)
+            self._pigment = pigment_filter(surface.reflectance, clear, skin.subject.atlas)
             self._inside = self._pigment * clear
 
     def glow(self, lamp: Lamp) -> Float32Array:

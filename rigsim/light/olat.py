@@ -149,15 +149,25 @@ def unpack_surface(surface: UInt16Array) -> Float32Array:
     return unit
 
 
+@dataclass(frozen=True, slots=True)
+class Looking:
+    """How cameras look."""
+
+    subpixels: int
+    """Rays along each side of a pixel."""
+    illuminant: str
+    """Spectrum of the lights."""
+    optics: bool
+    """Whether the lens blurs."""
+
+
 def find_hits(
     caster: Caster,
     view: View,
     look_up: LookUp,
-    *,
-    subpixels: int,
+    how: Looking,
     kind: int = SKIN_ROWS,
     distortion: ArrayLike | None = None,
-    illuminant: str | None = None,
 ) -> Hits:
     """Trace a camera's rays and keep what they meet.
 
@@ -169,21 +179,19 @@ def find_hits(
         The camera, in the frame of the mesh.
     look_up
         Gives shading normals (n, 3) and surfaces, (n, 7) or (n, 11), for a G-buffer's rows.
-    subpixels
-        Rays along each side of a pixel.
+    how
+        How the camera looks.
     kind
         How rows reflect.
     distortion
         Of the lens, see `rigsim.render.camera_rays`.
-    illuminant
-        Spectrum of the light that the lens spreads; None: the lens is sharp everywhere.
 
     Returns
     -------
     Hits
         Rows sorted by pixel.
     """
-    k, width, height = subpixels, view.width_px, view.height_px
+    k, width, height = how.subpixels, view.width_px, view.height_px
     band = max(1, RAYS_PER_BAND // (width * k * k))
     parts: list[tuple[Any, ...]] = []
     begin, end = _rows_of(caster, view, bent=distortion is not None and bool(np.any(distortion)))
@@ -210,12 +218,11 @@ def find_hits(
     starts = np.flatnonzero(np.diff(owner, prepend=-1))
     pixels, begins = owner[starts], np.append(starts, len(owner)).astype(np.int32)
     lens = None
-    if illuminant is not None:
+    if how.optics:
         toward = before_focus(view, position)
         depths = float(toward.min(initial=0.0)), float(toward.max(initial=0.0))
-        spread = lens_spread(view, illuminant, subpixels=k, depths_mm=depths)
+        spread = lens_spread(view, how.illuminant, subpixels=k, depths_mm=depths)
         lens = LensPicture(spread, (height, width), pixels, begins, slots, toward)
-    eye = np.asarray(view.position_mm, np.float64)
     shape, eye = (height, width), np.asarray(view.position_mm, np.float64)
     return Hits(
         shape, k, pixels, begins, position, normals, prim, slots, uv, packed, eye, kind, lens
@@ -375,7 +382,7 @@ def light_up(
     faded = np.ones(0, np.float32) if relief is None else relief
     samples = (hits.position_mm, hits.normal, hits.surface, hits.camera_mm, hits.kind)
     light = (center, axis, float(lamp.exponent))
-    kernels.shade(*samples, *light, visible, extra, diffuse, faded, rows)
+    kernels.shade(samples, light, visible, extra, diffuse, faded, rows)
     return sum_rows(hits, rows[0], rows[1], rows[2], color)
 
 

@@ -107,22 +107,20 @@ def aim(  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True, cache=True)
-def shade(  # type: ignore[no-untyped-def]
-    position,
-    normal,
-    surface,
-    camera,
-    kind,
-    center,
-    axis,
-    exponent,
-    visible,
-    glow,
-    diffuse,
-    relief,
-    out,
-):
-    """Add what rows send to a camera under one light."""
+def shade(samples, light, visible, glow, diffuse, relief, out):  # type: ignore[no-untyped-def]
+    """Add what rows send to a camera under one light.
+
+    Parameters
+    ----------
+    samples
+        Position in mm, normal, surface, place of the camera and kind of the rows.
+    light
+        Middle of the light in mm, its axis, and the exponent of its lobe.
+    visible, glow, diffuse, relief, out
+        As in `rigsim.light.olat.light_up`; ``glow`` and ``relief`` without a row are none.
+    """
+    position, normal, surface, camera, kind = samples
+    center, axis, exponent = light
     has_glow = glow.shape[0] > 0
     for i in prange(position.shape[0]):
         if not visible[i] and not has_glow:

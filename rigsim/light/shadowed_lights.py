@@ -75,37 +75,19 @@ def remove_hidden(
     look = (np.array(surface.eye_mm, np.float64), np.array(surface.image_right, np.float64))
     _remove(
         packed.reshape(len(packed), -1),
-        elements.normals.reshape(-1, 3),
-        *(part.reshape(-1) for part in flat),
-        *(np.float32(between), low, elevation, radius, place, sphere.absorbs[led]),
-        *(*lobe, *look, surface.eta, 1.0 / surface.extinction),
+        (elements.normals.reshape(-1, 3), *(part.reshape(-1) for part in flat)),
+        (np.float32(between), low, elevation, radius),
+        (place, sphere.absorbs[led], *lobe),
+        (*look, surface.eta, 1.0 / surface.extinction),
     )
 
 
 @njit(parallel=True, cache=True)
-def _remove(  # type: ignore[no-untyped-def]
-    packed,
-    normals,
-    x,
-    y,
-    alpha,
-    skin,
-    first,
-    second,
-    between,
-    low,
-    elevation,
-    radius,
-    place,
-    absorbs,
-    intensity,
-    exponent,
-    weights,
-    eye,
-    right,
-    eta,
-    leak,
-):
+def _remove(packed, elements, edge, led, look):  # type: ignore[no-untyped-def]
+    normals, x, y, alpha, skin, first, second = elements
+    between, low, elevation, radius = edge
+    place, absorbs, intensity, exponent, weights = led
+    eye, right, eta, leak = look
     distance = math.sqrt(place[0] ** 2 + place[1] ** 2 + place[2] ** 2)
     for i in prange(normals.shape[0]):
         tangent = first[i] + between * (second[i] - first[i])

@@ -241,14 +241,22 @@ def spread_pattern(
     edges and spots, to which the width was fitted, and by 3 to 4 % on stripes of 0.75 mm, to which
     it was not; leaving transport out errs by 6.3 % on the six, blurring the reflectance by 3.7 %.
     """
-    channels = reflectance.shape[-1]
-    log_m = np.log(reflectance / without_melanin) * np.float32(0.5)
-    pigment = np.exp(
-        lateral.scatter_laterally(log_m, atlas, [PIGMENT_BLUR_MM], np.ones((channels, 1)))
-    )
+    pigment = pigment_filter(reflectance, without_melanin, atlas)
     light = entered if entered.ndim == 3 else entered[..., None]
     inside = np.ascontiguousarray(pigment * without_melanin * light, np.float32)
     return pigment * lateral.scatter_laterally(inside, atlas, kernels.sigmas_mm, kernels.weights)
+
+
+def pigment_filter(
+    reflectance: Float32Array, without_melanin: Float32Array, atlas: Atlas
+) -> Float32Array:
+    """Return which part of light the pigment above the place where it enters or leaves lets pass.
+
+    Light crosses the epidermis twice, each time where it is a little blurred; shape (N, N, C).
+    """
+    log_m = np.log(reflectance / without_melanin) * np.float32(0.5)
+    channels = np.ones((reflectance.shape[-1], 1))
+    return np.exp(lateral.scatter_laterally(log_m, atlas, [PIGMENT_BLUR_MM], channels))
 
 
 def toward(light: Light, position_mm: Float32Array) -> tuple[Float32Array, Float32Array]:

@@ -9,7 +9,7 @@ from model import spectra
 from rigsim.arrays import FloatArray
 from rigsim.needs import face
 from rigsim.needs.effect_sizes import most_irradiance
-from rigsim.needs.effects import Effect, EffectSelection, Noise, absent, decide, unmodeled
+from rigsim.needs.effects import Effect, EffectSelection, Noise, decide, left_out_of
 from rigsim.render import Caster
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.head_motion import HeadMotion
@@ -21,7 +21,6 @@ def dome_needs(
     subject: SimulatedSubject | Target,
     state: str,
     scenery: face.Scenery,
-    *,
     white_rgb: FloatArray | None,
     movement: bool,
     motion: HeadMotion | None,
@@ -44,10 +43,6 @@ def dome_needs(
     """
     view = scenery.view
     made = [face.polarization(rig, view), face.bands(view)]
-    world = [
-        ("ambient light", "the room is dark"),
-        ("light from the dome's frame and from other LEDs' lenses", "they are black"),
-    ]
     if isinstance(subject, Target):
         size, because = face.hollows(scenery)
         made += [
@@ -56,10 +51,8 @@ def dome_needs(
             ),
             face.lens(scenery, 1.0),
         ]
-        opaque = [(face.LATERAL_EFFECT, f"{subject.name} is opaque")]
-        return EffectSelection(
-            (*made, *absent([*opaque, *world]), *unmodeled(face.UNMODELED_GLARE))
-        )
+        made.append(Effect(face.LATERAL_EFFECT, "absent", f"{subject.name} is opaque"))
+        return EffectSelection((*made, *left_out_of("dome", "glare")))
     skin = scenery.skin(subject, state)
     brightest = face.brightest_rgb(skin)
     if white_rgb is None:
@@ -72,55 +65,32 @@ def dome_needs(
         skin, scenery, brightest, level=level, peak=1.0, finer=False, lateral_switch="subsurface"
     )
     made += _movement(subject, movement, motion, view)
-    made += absent(
-        [*world, ("open eyes, teeth and hair on the head", "the subject has brows alone")]
-    )
-    return EffectSelection((*made, *_limits(made)))
+    made += left_out_of("dome", "dome_face")
+    built = {effect.name for effect in made if effect.built}
+    if face.INTERREFLECTION_EFFECT in built:
+        made += left_out_of("dome_bounces")
+    if face.LATERAL_EFFECT in built:
+        made += left_out_of("dome_lateral")
+    return EffectSelection(tuple(made))
 
 
 def _movement(
     subject: SimulatedSubject, movement: bool, motion: HeadMotion | None, view: View
 ) -> list[Effect]:
-    name = "movement of the face with the state"
-    made = []
-    if not movement:
-        made.append(Effect(name, "asked", "movement=False asks for it", switch="movement"))
-    elif subject.pose is None:
-        made.append(Effect(name, "absent", "at rest nothing moves", switch="movement"))
-    else:
-        made.append(Effect(name, "built", "the state moves the face", switch="movement"))
+    made = face.movement(subject, movement, "movement of the face with the state")
     head = "movement of the head"
     if motion is None:
-        return [*made, Effect(head, "absent", "motion=None: the head is held", switch="motion")]
-    pixel_mm = view.distance_mm / view.focal_px
-    blur = (
-        "blur by movement within an exposure",
-        f"0.06 s move 0.05 mm, a pixel {pixel_mm:.2f} mm",
-    )
-    made.append(Effect(head, "built", "the head drifts and twitches", switch="motion"))
-    return [
-        *made,
-        *unmodeled([("the twitch in light from inside", "it stays that of the still mouth"), blur]),
-    ]
+        return [made, Effect(head, "absent", "motion=None: the head is held", switch="motion")]
+    moved = Effect(head, "built", "the head drifts and twitches", switch="motion")
+    small = f"0.06 s move 0.05 mm, a pixel {view.distance_mm / view.focal_px:.2f} mm"
+    blur = Effect("blur by movement within an exposure", "unmodeled", small)
+    return [made, moved, *left_out_of("dome_motion"), blur]
 
 
 def _nearness(caster: Caster, place_mm: Vector) -> float:
     """Return how much brighter a light shines on a mesh than in the origin at most, >= 1."""
     squared = math.hypot(*place_mm) ** 2
     return max(most_irradiance(caster.mesh, [place_mm], [squared]), 1.0)
-
-
-def _limits(made: list[Effect]) -> list[Effect]:
-    out = [
-        *face.UNMODELED_GLARE,
-        ("dependence of the boundary on its roughness", "light enters a smooth boundary"),
-    ]
-    built = {effect.name for effect in made if effect.built}
-    if face.INTERREFLECTION_EFFECT in built:
-        out.append(("highlights of skin on skin", "only light from inside goes on"))
-    if face.LATERAL_EFFECT in built:
-        out.append(("lateral kernels that vary over the face", "one, of its median skin"))
-    return unmodeled(out)
 
 
 def least_noise(sensors: list[Noise]) -> Noise:

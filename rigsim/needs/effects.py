@@ -18,6 +18,7 @@ import numpy as np
 from capture.plan import Plan
 from capture.plan.rows import lights_of
 from rigsim.arrays import Float64Array, FloatArray
+from rigsim.package_data import package_table
 from rigsim.sensor import Sensor
 
 Verdict: TypeAlias = Literal["built", "negligible", "absent", "asked", "unmodeled"]
@@ -336,11 +337,13 @@ def longest_on_s(plan: Plan) -> float | None:
     return max(lit, default=0.0) or None
 
 
-def absent(reasons: Sequence[tuple[str, str]]) -> list[Effect]:
-    """Return effects that the simulated world has not, by name and reason."""
-    return [Effect(name, "absent", reason) for name, reason in reasons]
-
-
-def unmodeled(reasons: Sequence[tuple[str, str]]) -> list[Effect]:
-    """Return effects that the simulator cannot build, by name and reason."""
-    return [Effect(name, "unmodeled", reason) for name, reason in reasons]
+def left_out_of(*images: str) -> list[Effect]:
+    """Return effects that images leave out in every case, by the tables of ``left_out.toml``."""
+    tables = package_table("left_out")
+    verdicts: tuple[Verdict, ...] = ("absent", "unmodeled")
+    return [
+        Effect(name, verdict, reason)
+        for image in images
+        for verdict in verdicts
+        for name, reason in tables[image].get(verdict, {}).items()
+    ]

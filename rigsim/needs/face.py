@@ -42,8 +42,6 @@ some thousand times its noise, of which a tenth counts."""
 MAX_REMAINING_NOISE_RATIO = 0.05
 """Of the noise: what further bounces may add at most, about."""
 
-UNMODELED_GLARE = [("glare and far rings of the lens", "light goes as far as the nearest rings")]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scenery:
@@ -132,6 +130,15 @@ def face_effects(
         lens(scenery, peak),
         wrinkles(skin.subject, scenery, peak),
     ]
+
+
+def movement(subject: SimulatedSubject, asked: bool, name: str) -> Effect:
+    """Return whether the face moves with its state."""
+    if not asked:
+        return Effect(name, "asked", "movement=False asks for it", switch="movement")
+    if subject.pose is None:
+        return Effect(name, "absent", "at rest nothing moves", switch="movement")
+    return Effect(name, "built", "the state moves the face", switch="movement")
 
 
 def wrinkles(subject: SimulatedSubject, scenery: Scenery, level: float) -> Effect:

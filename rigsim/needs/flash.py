@@ -5,7 +5,7 @@ from rigsim import shading
 from rigsim.arrays import FloatArray
 from rigsim.needs import face
 from rigsim.needs.effect_sizes import highlight, most_irradiance
-from rigsim.needs.effects import Effect, EffectSelection, absent, decide, unmodeled
+from rigsim.needs.effects import Effect, EffectSelection, decide, left_out_of
 from rigsim.subject import SimulatedSubject
 from rigsim.targets import Target
 
@@ -15,7 +15,6 @@ def flash_needs(
     subject: SimulatedSubject | Target,
     state: str,
     scenery: face.Scenery,
-    *,
     white_rgb: FloatArray,
     weights_mm2: FloatArray,
     movement: bool,
@@ -39,17 +38,16 @@ def flash_needs(
     """
     view, mesh = scenery.view, scenery.caster.mesh
     made = [face.polarization(rig, view), face.bands(view)]
-    dark = [("ambient light", "the room is dark and the flash is short")]
     if isinstance(subject, Target):
         made += _of_target(subject, scenery)
         if subject.kind not in ("source", "cap"):
-            made += [face.lens(scenery, float(white_rgb.max())), *unmodeled(face.UNMODELED_GLARE)]
+            made += [face.lens(scenery, float(white_rgb.max())), *left_out_of("glare")]
         else:
             made.append(
                 Effect(face.LENS_EFFECT, "negligible", "all of the picture is alike", 0.0, "optics")
             )
         made.append(Effect(face.WRINKLE_SHADOW_EFFECT, "absent", f"{subject.name} has none"))
-        return EffectSelection((*made, *absent(dark)))
+        return EffectSelection((*made, *left_out_of("flash")))
     skin = scenery.skin(subject, state)
     brightest = face.brightest_rgb(skin)
     places = [light.position_mm for light in rig.lights]
@@ -59,7 +57,8 @@ def flash_needs(
     shine = highlight(mesh, places, weights_mm2, view.position_mm, rough)
     peak = float((level + white_rgb * shine).max())
     made += face.face_effects(skin, scenery, brightest, level=level, peak=peak, finer=True)
-    return EffectSelection((*made, *_movement(subject, movement), *absent(dark), *_limits()))
+    made += _movement(subject, movement)
+    return EffectSelection((*made, *left_out_of("flash", "flash_face")))
 
 
 def _of_target(target: Target, scenery: face.Scenery) -> list[Effect]:
@@ -73,30 +72,9 @@ def _of_target(target: Target, scenery: face.Scenery) -> list[Effect]:
 
 
 def _movement(subject: SimulatedSubject, movement: bool) -> list[Effect]:
-    name = "movement of the face with the states"
-    if not movement:
-        return [Effect(name, "asked", "movement=False asks for it", switch="movement")]
-    if subject.pose is None:
-        return [Effect(name, "absent", "at rest nothing moves", switch="movement")]
-    out = [Effect(name, "built", "the state moves the face", switch="movement")]
-    out += unmodeled([("parted lips and open eyes", "a mesh without an opening stretches instead")])
-    if subject.pose.wrinkles.left_out:
-        zones = ", ".join(subject.pose.wrinkles.left_out)
-        out += unmodeled([(f"fine wrinkles ({zones})", "the texture's texels are too coarse")])
-    return out
-
-
-def _limits() -> list[Effect]:
-    return [
-        *absent(
-            [("open eyes, teeth and hair on the head", "the subject has none; brows are matt")]
-        ),
-        *unmodeled(
-            [
-                *face.UNMODELED_GLARE,
-                ("highlights of skin on skin", "only light from inside goes on to other skin"),
-                ("lateral kernels that vary over the face", "one profile, of its median skin"),
-                ("polarized single scattering", "light from inside is taken as depolarized"),
-            ]
-        ),
-    ]
+    made = face.movement(subject, movement, "movement of the face with the states")
+    if subject.pose is None or not made.built:
+        return [made]
+    zones = ", ".join(subject.pose.wrinkles.left_out)
+    coarse = Effect(f"fine wrinkles ({zones})", "unmodeled", "the texture's texels are too coarse")
+    return [made, *left_out_of("moving_face"), *([coarse] if zones else [])]

@@ -13,15 +13,7 @@ from rigsim.as_built.sphere import BuiltSphere
 from rigsim.light.relief_interreflection import hidden_share
 from rigsim.needs import face
 from rigsim.needs.effect_sizes import bounced, edge_loss, steepest_slope
-from rigsim.needs.effects import (
-    Effect,
-    EffectSelection,
-    Noise,
-    SceneEffects,
-    absent,
-    decide,
-    unmodeled,
-)
+from rigsim.needs.effects import Effect, EffectSelection, Noise, SceneEffects, decide, left_out_of
 from rigsim.render.lens_blur import Lens
 from rigsim.skin_patch.microrelief import MicroSkin, lateral_kernel
 from rigsim.tissue.skin_layers import ETA
@@ -42,7 +34,6 @@ def gradient_needs(
     subject: MicroSkin | str,
     sphere: BuiltSphere,
     lens: Lens,
-    *,
     noise: Noise,
     white: float,
     moving: bool,
@@ -67,12 +58,7 @@ def gradient_needs(
         What is asked for.
     """
     view = rig.views[0]
-    world = [
-        ("ambient light", "the room is dark"),
-        ("light from the sphere's frame and between its LEDs", "they are black"),
-    ]
     made = [face.polarization(rig, view), face.bands(view), _optics(lens, effects.optics, noise)]
-    limits = [("aberrations of the lens", "a macro lens at f/16 is near diffraction's limit")]
     if not isinstance(subject, MicroSkin):
         flat = "a ball bulges" if subject == "ball" else "the target is flat"
         for name, switch in (
@@ -81,27 +67,16 @@ def gradient_needs(
         ):
             made.append(decide(name, 0.0, None, switch=switch, because=flat))
         made.append(Effect(face.LATERAL_EFFECT, "absent", f"{subject} is glass, gray or nothing"))
-        return EffectSelection((*made, *absent(world), *unmodeled(limits)))
+        return EffectSelection((*made, *left_out_of("gradient")))
     made += _of_skin(subject, sphere, lens, noise, white, effects)
-    if moving:
-        made.append(Effect("movement of the patch", "built", "it drifts and jumps", None, "motion"))
-        pixel_um = lens.pixel_on_subject_um
-        limits.append(
-            (
-                "blur by movement within an exposure",
-                f"30 ms move 0.1 um; a pixel: {pixel_um:.1f} um",
-            )
-        )
-    else:
-        made.append(Effect("movement of the patch", "absent", "motion=None", switch="motion"))
-    limits += [
-        ("shadows of the caliper's jaws", "they are thin"),
-        ("hidden views", "the camera looks down within 1.2 degrees of the vertical"),
-        ("highlights of skin on skin", "only light from inside goes on to other walls"),
-        ("polarized single scattering", "light from inside is taken as depolarized"),
-        ("a lateral kernel that varies over the patch", "one, of its mean pigment"),
-    ]
-    return EffectSelection((*made, *absent(world), *unmodeled(limits)))
+    still = Effect("movement of the patch", "absent", "motion=None", switch="motion")
+    if not moving:
+        return EffectSelection((*made, still, *left_out_of("gradient", "gradient_skin")))
+    moved = Effect("movement of the patch", "built", "it drifts and jumps", None, "motion")
+    small = f"30 ms move 0.1 um; a pixel: {lens.pixel_on_subject_um:.1f} um"
+    blur = Effect("blur by movement within an exposure", "unmodeled", small)
+    world, limits = left_out_of("gradient"), left_out_of("gradient_skin")
+    return EffectSelection((*made, moved, *world, blur, *limits))
 
 
 def _optics(lens: Lens, asked: bool | None, noise: Noise) -> Effect:

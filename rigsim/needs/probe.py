@@ -7,7 +7,7 @@ import numpy as np
 from capture.rig import Rig
 from rigsim.as_built.probe import ProbeBuild
 from rigsim.fiber.probe_tissue import HomogeneousTissue, ProbedTissue
-from rigsim.needs.effects import Effect, EffectSelection, Noise, absent, unmodeled
+from rigsim.needs.effects import Effect, EffectSelection, Noise, left_out_of
 from rigsim.needs.face import bands, polarization
 
 TRANSPORT_EFFECT: Final = "paths of photons between source and fibres"
@@ -60,30 +60,13 @@ def probe_needs(
         ),
         _color(tissue),
     ]
-    if tissue.kind == "homogeneous":
-        made += absent([(LAYERS_EFFECT, "the tissue was asked for as homogeneous")])
-    elif tissue.kind == "layered":
-        made.append(Effect(LAYERS_EFFECT, "built", "epidermis above dermis, thinned by suction"))
-    else:
-        made += absent([(LAYERS_EFFECT, "fibrous tissue has one layer")])
-    world = [
-        ("bends and drift of the fibres' transmission", "they lie still in one head"),
-        ("movement of the head on the skin", "suction holds it; its coming off is told"),
-        ("reflections between the head's face and the skin", "the head is black"),
-        ("light that fibres pass on at angles of their own", "the camera takes all of it"),
-        ("pulse and breath in the skin's blood", "the simulated subject's blood rests"),
-    ]
-    limits = [
-        ("warming of the skin by light and contact", "1 mW for seconds"),
-        ("a lens's color error", "spots are summed"),
-    ]
     if tissue.kind == "layered":
-        limits += [
-            ("another spot of skin at each repeat", "where a head lands again is not known"),
-            ("pressure's effect on scattering and oxygen", "blood's outweighs them"),
-            ("hair, pores and veins under the head", "layers are even within a centimeter"),
-        ]
-    return EffectSelection((*made, *absent(world), *unmodeled(limits)))
+        made.append(Effect(LAYERS_EFFECT, "built", "epidermis above dermis, thinned by suction"))
+        return EffectSelection((*made, *left_out_of("probe", "probe_layered")))
+    asked = tissue.kind == "homogeneous"
+    why = "the tissue was asked for as homogeneous" if asked else "fibrous tissue has one layer"
+    made.append(Effect(LAYERS_EFFECT, "absent", why))
+    return EffectSelection((*made, *left_out_of("probe")))
 
 
 def _sized(name: str, change: float, noise: Noise, because: str) -> Effect:

@@ -221,12 +221,7 @@ def conditioned(
 
 
 def conditioned_surface(
-    subject: SimulatedSubject,
-    camera: str,
-    light: str,
-    conditions: Mapping[str, float],
-    *,
-    state: str = "neutral",
+    subject: SimulatedSubject, camera: str, light: str, conditions: Mapping[str, float]
 ) -> SkinSurface:
     """Return how a face reflects under conditions: its vessels, its surface, what lies on it.
 
@@ -238,11 +233,9 @@ def conditioned_surface(
         Names known to `model.spectra`.
     conditions
         Name to amount, 0 to 1.
-    state
-        State of the face's blood.
     """
     changed = conditioned_subject(subject, conditions)
-    return coated(changed, skin_surface(changed, camera, light, state=state), conditions)
+    return coated(changed, skin_surface(changed, camera, light), conditions)
 
 
 def coated(

@@ -3,7 +3,7 @@
 Mitsuba's LLVM variants trace where they work, else Embree through embreex, which needs no LLVM.
 """
 
-from typing import Any, Final, Protocol
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,16 +17,8 @@ RAYS_PER_CALL: Final = 1 << 22
 """Rays traced in one call; bounds the memory that a ray batch takes."""
 
 
-class _Tracer(Protocol):
-    scene: Any
-
-    def first_hit(
-        self, origins: Float32Array, directions: Float32Array
-    ) -> tuple[Int32Array, Float32Array]: ...
-
-    def blocked(
-        self, origins: Float32Array, directions: Float32Array, length: Float32Array
-    ) -> BoolArray: ...
+Hits: TypeAlias = tuple[Int32Array, Float32Array]
+"""The triangle that each ray meets, -1 for none, and weights of its corners 1 and 2, (N, 2)."""
 
 
 class Caster:
@@ -45,11 +37,8 @@ class Caster:
         self.choice = choose_variant("rgb") if choice is None else choice
         self.attributes = np.concatenate([mesh.vertices_mm, mesh.normals, mesh.uv], axis=1)
         self._face_normals: Float32Array | None = None
-        self._tracer: _Tracer
-        if self.choice.is_vectorized:
-            self._tracer = _MitsubaTracer(mesh, self.choice)
-        else:
-            self._tracer = _EmbreeTracer(mesh)
+        vectorized = self.choice.is_vectorized
+        self._tracer = _MitsubaTracer(mesh, self.choice) if vectorized else _EmbreeTracer(mesh)
 
     @property
     def face_normals(self) -> Float32Array:
@@ -65,9 +54,7 @@ class Caster:
         """Mitsuba's scene of the mesh, for kernels that trace and shade at once, or None."""
         return self._tracer.scene
 
-    def first_hit(
-        self, origins: ArrayLike, directions: ArrayLike
-    ) -> tuple[Int32Array, Float32Array]:
+    def first_hit(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
         """Find the first triangle on each ray.
 
         Parameters
@@ -137,14 +124,13 @@ class _MitsubaTracer:
             ray.maxt = mi.Float(with_slack(length))
         return ray
 
-    def first_hit(
-        self, origins: Float32Array, directions: Float32Array
-    ) -> tuple[Int32Array, Float32Array]:
+    def first_hit(self, origins: Float32Array, directions: Float32Array) -> Hits:
         mi = load(self._choice)
-        hit = self.scene.ray_intersect_preliminary(
-            self._ray(mi, origins, directions), coherent=True
-        )
-        _evaluate(hit)  # else each of the reads below would trace anew
+        import drjit as dr
+
+        ray = self._ray(mi, origins, directions)
+        hit = self.scene.ray_intersect_preliminary(ray, coherent=True)
+        dr.eval(hit)  # else each of the reads below would trace anew
         valid = np.array(hit.is_valid())
         prim = np.where(valid, np.array(hit.prim_index).astype(np.int64), -1).astype(np.int32)
         weight = np.stack([np.array(hit.prim_uv.x), np.array(hit.prim_uv.y)], axis=-1)
@@ -167,9 +153,7 @@ class _EmbreeTracer:
         self._scene = rtcore_scene.EmbreeScene()
         TriangleMesh(self._scene, mesh.vertices_mm, mesh.faces)
 
-    def first_hit(
-        self, origins: Float32Array, directions: Float32Array
-    ) -> tuple[Int32Array, Float32Array]:
+    def first_hit(self, origins: Float32Array, directions: Float32Array) -> Hits:
         if not len(origins):
             return np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
         hit = self._scene.run(origins, directions, output=True)
@@ -184,12 +168,6 @@ class _EmbreeTracer:
             return np.zeros(0, np.bool_)
         hit = self._scene.run(origins, directions, dists=length.copy(), query="OCCLUDED")
         return np.asarray(hit) != -1
-
-
-def _evaluate(result: Any) -> None:
-    import drjit as dr
-
-    dr.eval(result)
 
 
 def _ray_arrays(origins: ArrayLike, directions: ArrayLike) -> tuple[Float32Array, Float32Array]:

@@ -1,20 +1,21 @@
 """What scenes share: views, sensors, the light of their exposures, and what is kept of it."""
 
-from collections import OrderedDict
-from collections.abc import Callable
-from typing import Generic, TypeVar
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+import numpy as np
 
 from capture.rig import Rig, RigError, View
+from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.needs.effects import EffectSelection, Noise, SceneEffects
 from rigsim.needs.face import INTERREFLECTION_EFFECT, Scenery, last_bounce
 from rigsim.render import Caster
-from rigsim.sensor import Sensor, sensor_of
+from rigsim.sensor import Sensor, expose, sensor_of
 from rigsim.subject import SimulatedSubject
 from rigsim.targets import Target
 from rigsim.world.light_record import SwitchedLight
 
-KeyT = TypeVar("KeyT")
-ValueT = TypeVar("ValueT")
+PopT = TypeVar("PopT")
 
 
 class SceneError(ValueError):
@@ -43,7 +44,7 @@ def full_power_s(light: SwitchedLight, name: str) -> float:
 
     Examples
     --------
-    >>> from rigsim.boxes.dome import LedPulse
+    >>> from rigsim.boxes.led_table import LedPulse
     >>> full_power_s(LedPulse(led=3, level=0.5, t_on_s=1.0, t_off_s=1.5), "LED 3")
     0.25
     """
@@ -57,38 +58,14 @@ def full_power_s(light: SwitchedLight, name: str) -> float:
     return light.level * (light.t_off_s - light.t_on_s)
 
 
-class Kept(Generic[KeyT, ValueT]):
-    """The latest of what is slow to make.
-
-    Parameters
-    ----------
-    most
-        How many values like a given one are kept, at least 1.
-    """
-
-    def __init__(self, most: Callable[[ValueT], int]) -> None:
-        self._most = most
-        self._values: OrderedDict[KeyT, ValueT] = OrderedDict()
-
-    def get(self, key: KeyT, make: Callable[[], ValueT]) -> ValueT:
-        """Return what is kept under a key, or make it."""
-        if key not in self._values:
-            value = make()
-            while self._values and len(self._values) >= self._most(value):
-                self._values.popitem(last=False)
-            self._values[key] = value
-        self._values.move_to_end(key)
-        return self._values[key]
-
-    def clear(self) -> None:
-        """Forget everything."""
-        self._values.clear()
-
-
 class RigScene:
     """What scenes of every rig have."""
 
     rig: Rig
+    seed: int
+    """Seeds what differs from exposure to exposure."""
+    channels: tuple[int, ...] = (3,)
+    """Shape of the light on a pixel: camera RGB, or () for the one band of a camera."""
     needs: EffectSelection
     """What is built, what is not, and why."""
 
@@ -106,6 +83,44 @@ class RigScene:
         except RigError as error:
             raise SceneError(str(error)) from error
 
+    def sensor(self, view_name: str | None = None) -> Sensor:
+        """Return the sensor of a view; None takes the first."""
+        raise NotImplementedError
+
+    def _expose(
+        self,
+        view: View,
+        pops: Sequence[PopT],
+        energy_of: Callable[[PopT], float],
+        image_of: Callable[[PopT], Float32Array],
+        *,
+        deviation: float,
+        exposure_s: float,
+        seed: int,
+    ) -> UInt16Array:
+        """Return the DN, (H, W), of a camera on which lights shone, each a little off its energy.
+
+        Parameters
+        ----------
+        view, pops
+            The camera and the lights.
+        energy_of
+            Energy of a light relative to that of its image.
+        image_of
+            What a light sends to the camera, shape (H, W, *channels).
+        deviation
+            Relative standard deviation of the energy.
+        exposure_s, seed
+            Exposure time in s, and seed of its noise.
+        """
+        rng = np.random.default_rng([self.seed, seed])
+        light = np.zeros((view.height_px, view.width_px, *self.channels), np.float32)
+        for pop in pops:
+            energy = energy_of(pop) * (1.0 + deviation * rng.standard_normal())
+            if energy > 0.0:
+                light += np.float32(energy) * image_of(pop)
+        return expose(light, sensor=self.sensor(view.name), rng=rng, exposure_s=exposure_s)
+
 
 class FaceScene(RigScene):
     """A face or a target, lit by lights of one spectrum, before cameras."""
@@ -114,7 +129,6 @@ class FaceScene(RigScene):
         self,
         rig: Rig,
         subject: SimulatedSubject | Target,
-        *,
         state: str,
         movement: bool,
         sensor: Sensor | None,

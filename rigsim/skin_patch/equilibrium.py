@@ -90,7 +90,7 @@ class Convergence:
     residuals: tuple[float, ...] = field(repr=False)
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(eq=False)
 class LayerProblem:
     """Energy of a layer on a periodic patch, rows growing with y."""
 
@@ -105,16 +105,6 @@ class LayerProblem:
     """Mean deformation gradient F, (2, 2)."""
     poisson: float
     """Of the tissue, 0 to 0.5."""
-    rise: float = field(init=False)
-    """Factor z of a relief without a layer."""
-    _scale: Float64Array = field(init=False, repr=False)
-    _elastic: Float64Array = field(init=False, repr=False)
-    _unit: Float64Array = field(init=False, repr=False)
-    _weight: Float64Array = field(init=False, repr=False)
-    _traction: Float64Array = field(init=False, repr=False)
-    _moment: Float64Array = field(init=False, repr=False)
-    _bulk: float = field(init=False, repr=False)
-    _workers: int = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         shape = self.neutral_um.shape
@@ -126,6 +116,7 @@ class LayerProblem:
         # Small patches are quicker without waiting for other threads.
         self._workers = 1 if self.neutral_um.size < PARALLEL_NODES else min(2, get_num_threads())
         left, stretches, right = np.linalg.svd(self.gradient)
+        # factor of a relief without a layer
         self.rise = surface_rise(float(stretches[0]), float(stretches[1]), self.poisson)
         shear = 0.5 / (1.0 + self.poisson)
         self._bulk = shear * SQUEEZED_UM

@@ -186,7 +186,6 @@ def size_for(
     stretch: float | Sequence[float],
     *,
     angle_deg: float | None = None,
-    compensation: Compensation = "volume",
     shift_mm: float = 0.0,
 ) -> float:
     """Return how large a patch must be to fill a square field of view, mm.
@@ -199,8 +198,6 @@ def size_for(
         The stretch, or all that occur; the smallest one asks for most skin.
     angle_deg
         Of the jaws; None allows any.
-    compensation
-        As in `deform`.
     shift_mm
         How far the skin's middle may be off the field's.
 
@@ -215,13 +212,8 @@ def size_for(
     angles = np.arange(0.0, 180.0, 5.0) if angle_deg is None else [angle_deg]
     half = 0.5 * field_mm + shift_mm
     corners = np.array([[half, half], [half, -half]])
-    reach = max(
-        float(
-            np.abs(corners @ np.linalg.inv(mean_gradient(value, float(angle), compensation))).max()
-        )
-        for value in values
-        for angle in angles
-    )
+    inverses = [np.linalg.inv(mean_gradient(s, float(a))) for s in values for a in angles]
+    reach = max(float(np.abs(corners @ inverse).max()) for inverse in inverses)
     return round(2.0 * reach + 0.04, 6)
 
 

@@ -269,6 +269,19 @@ def gather(hat, scale, unit, weight, out):  # type: ignore[no-untyped-def]
             out[2, i, j] = w * scale[2, i, j] * hat[2, i, j]
 
 
+@njit(cache=True, inline="always")
+def _basis(k, t):  # type: ignore[no-untyped-def]
+    """Return the k-th of the four weights of a cubic B-spline in a cell, and its slope."""
+    if k == 0:
+        return (1.0 - t) ** 3 / 6.0, -0.5 * (1.0 - t) ** 2
+    if k == 1:
+        return (4.0 - 6.0 * t * t + 3.0 * t**3) / 6.0, -2.0 * t + 1.5 * t * t
+    if k == 2:
+        r = 1.0 - t
+        return (4.0 - 6.0 * r * r + 3.0 * r**3) / 6.0, 2.0 * r - 1.5 * r * r
+    return t**3 / 6.0, 0.5 * t * t
+
+
 @njit(parallel=True, cache=True)
 def spline(coefficients, row, column, want_slope, value, along_row, along_column):  # type: ignore[no-untyped-def]
     """Evaluate a cubic B-spline and its derivatives at points inside the grid.
@@ -296,28 +309,12 @@ def spline(coefficients, row, column, want_slope, value, along_row, along_column
         s, t = y - i, x - j
         total, by_row, by_column = 0.0, 0.0, 0.0
         for a in range(4):
-            if a == 0:
-                wy, dy = (1.0 - s) ** 3 / 6.0, -0.5 * (1.0 - s) ** 2
-            elif a == 1:
-                wy, dy = (4.0 - 6.0 * s * s + 3.0 * s**3) / 6.0, -2.0 * s + 1.5 * s * s
-            elif a == 2:
-                r = 1.0 - s
-                wy, dy = (4.0 - 6.0 * r * r + 3.0 * r**3) / 6.0, 2.0 * r - 1.5 * r * r
-            else:
-                wy, dy = s**3 / 6.0, 0.5 * s * s
+            wy, dy = _basis(a, s)
             k = i + a - 1
             k = -k if k < 0 else (2 * rows - 2 - k if k >= rows else k)
             line, slope = 0.0, 0.0
             for b in range(4):
-                if b == 0:
-                    wx, dx = (1.0 - t) ** 3 / 6.0, -0.5 * (1.0 - t) ** 2
-                elif b == 1:
-                    wx, dx = (4.0 - 6.0 * t * t + 3.0 * t**3) / 6.0, -2.0 * t + 1.5 * t * t
-                elif b == 2:
-                    r = 1.0 - t
-                    wx, dx = (4.0 - 6.0 * r * r + 3.0 * r**3) / 6.0, 2.0 * r - 1.5 * r * r
-                else:
-                    wx, dx = t**3 / 6.0, 0.5 * t * t
+                wx, dx = _basis(b, t)
                 m = j + b - 1
                 m = -m if m < 0 else (2 * columns - 2 - m if m >= columns else m)
                 line += wx * coefficients[k, m]

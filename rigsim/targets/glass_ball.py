@@ -39,12 +39,7 @@ def ball_center_mm(seed: int) -> Float64Array:
 
 
 def ball_stokes(
-    view: View,
-    sphere: BuiltSphere,
-    *,
-    extinction: float,
-    center_mm: Float64Array,
-    radius_mm: float = GLASS_BALL_RADIUS_MM,
+    view: View, sphere: BuiltSphere, *, extinction: float, center_mm: Float64Array
 ) -> Float32Array:
     """Return the picture of the ball for each moment of the light, each pixel averaged.
 
@@ -56,8 +51,8 @@ def ball_stokes(
         The LEDs.
     extinction
         Of the LEDs' films, > 1.
-    center_mm, radius_mm
-        The ball.
+    center_mm
+        Middle of the ball.
 
     Returns
     -------
@@ -65,8 +60,7 @@ def ball_stokes(
         Shape (12, H, W): Stokes vectors of the moments in the order of
         `rigsim.as_built.sphere.MOMENT_NAMES`, radiance in the unit of `rigsim.light.lobe_moments`.
     """
-    eye = np.array(view.position_mm, np.float64)
-    pupil = eye + _pupil(view)
+    pupil = np.array(view.position_mm, np.float64) + _pupil(view)
     pitch = view.distance_mm / view.focal_px
     shape = (view.height_px, view.width_px)
     out = np.zeros((12, *shape), np.float32)
@@ -77,12 +71,13 @@ def ball_stokes(
         radius = float(sphere.radius_mm[led])
         distance = float(np.linalg.norm(place))
         beam = -place / distance
-        box = _box(pupil, place, beam, radius, center_mm, radius_mm, pitch, shape)
+        box = _box(pupil, (place, beam, radius), center_mm, pitch, shape)
         if box is None:
             continue
         part = np.zeros((box[1] - box[0], box[3] - box[2]))
-        _add_spot(part, box, pitch, shape, pupil, center_mm, radius_mm, place, beam, radius)
-        stokes = _mirrored(eye, place, center_mm, radius_mm, sphere.absorbs[led], view, extinction)
+        ball = (center_mm, GLASS_BALL_RADIUS_MM)
+        _add_spot(part, box, pitch, shape, pupil, ball, (place, beam, radius))
+        stokes = _mirrored(view, place, center_mm, sphere.absorbs[led], extinction)
         # unit of rigsim.light.lobe_moments: intensity 1 gives irradiance 1 at 600 mm
         brightness = sphere.intensity[led] * 600.0**2 / (math.pi * radius**2)
         for m in range(4):
@@ -107,16 +102,11 @@ def _pupil(view: View) -> Float64Array:
 
 
 def _mirrored(
-    eye: Float64Array,
-    place: Float64Array,
-    center: Float64Array,
-    radius: float,
-    absorbs: Float64Array,
-    view: View,
-    extinction: float,
+    view: View, place: Float64Array, center: Float64Array, absorbs: Float64Array, extinction: float
 ) -> Float64Array:
     """Return the Stokes vector of an LED's reflection over the radiance before its film."""
-    point = reflection_point(eye, place, center, radius)
+    eye = np.array(view.position_mm, np.float64)
+    point = reflection_point(eye, place, center, GLASS_BALL_RADIUS_MM)
     to_light, to_camera = place - point, eye - point
     to_light /= np.linalg.norm(to_light)
     to_camera /= np.linalg.norm(to_camera)
@@ -142,15 +132,13 @@ def _mirrored(
 
 def _box(
     pupil: Float64Array,
-    place: Float64Array,
-    beam: Float64Array,
-    lamp_radius: float,
+    lamp: tuple[Float64Array, Float64Array, float],
     center: Float64Array,
-    radius: float,
     pitch: float,
     shape: tuple[int, int],
 ) -> tuple[int, int, int, int] | None:
     """Return first and past-the-last row and column of a spot, or None outside the image."""
+    place, beam, lamp_radius = lamp
     side = np.cross(beam, [0.0, 1.0, 0.0] if abs(beam[1]) < 0.9 else [1.0, 0.0, 0.0])
     side /= np.linalg.norm(side)
     across = np.cross(beam, side)
@@ -158,7 +146,7 @@ def _box(
     seen = []
     for eye in (pupil[0], *pupil[-8:]):
         for spot in rim:
-            point = reflection_point(eye, spot, center, radius)
+            point = reflection_point(eye, spot, center, GLASS_BALL_RADIUS_MM)
             t = eye[2] / (eye[2] - point[2])
             seen.append((eye + t * (point - eye))[:2])
     low, high = np.min(seen, axis=0) / pitch, np.max(seen, axis=0) / pitch
@@ -170,10 +158,10 @@ def _box(
 
 
 @njit(cache=True, nogil=True)
-def _add_spot(  # type: ignore[no-untyped-def]
-    part, box, pitch, shape, pupil, center, radius, lamp, beam, lamp_radius
-):
+def _add_spot(part, box, pitch, shape, pupil, ball, light):  # type: ignore[no-untyped-def]
     """Add which part of each pixel's rays, over pixel and pupil, ends on a lamp's disc."""
+    center, radius = ball
+    lamp, beam, lamp_radius = light
     share = 1.0 / (RAYS_PER_SIDE * RAYS_PER_SIDE * pupil.shape[0])
     ray, place = np.empty(3), np.empty(3)
     for i in range(box[0], box[1]):

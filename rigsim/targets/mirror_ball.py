@@ -4,12 +4,12 @@ The cloth is a sphere around the rig; it is lit by the LEDs themselves, once, an
 the gap beside it show it. An LED is a flat disc of even radiance.
 """
 
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from numba import njit
 
-from rigsim.arrays import Float32Array, Float64Array, Int64Array
+from rigsim.arrays import Float32Array, Float64Array
 
 CHROMIUM_REFLECTANCE: Final = 0.62
 """Of polished chromium in the visible, at all angles (Fresnel's rise near the rim is left out)."""
@@ -21,18 +21,24 @@ CLOTH_ROWS: Final = 48
 """Rows of the map of light on the cloth; it has twice as many columns."""
 
 
+Lamps: TypeAlias = tuple[Float64Array, Float64Array, Float64Array, Float64Array]
+"""Lights that are on: places in mm (L, 3), axes (L, 3), exponents (L,) and strengths (L,)."""
+
+Ball: TypeAlias = tuple[Float64Array, float, float]
+"""Middle in mm, shape (3,), radius in mm and reflectance of a ball."""
+
+Led: TypeAlias = tuple[Float64Array, Float64Array, float, float, float]
+"""Place in mm, axis, exponent, radius in mm and strength of one of the lights."""
+
+
 @njit(cache=True, nogil=True)
-def light_on_cloth(
-    lamp_mm: Float64Array,
-    lamp_axis: Float64Array,
-    lamp_exponent: Float64Array,
-    strength: Float64Array,
-) -> Float64Array:
+def light_on_cloth(lamps: Lamps) -> Float64Array:
     """Return the light that the cloth sends back, shape (`CLOTH_ROWS`, 2 `CLOTH_ROWS`).
 
     In the unit of a white's signal; rows by elevation from +y down, columns by azimuth
     atan2(x, z) from -pi.
     """
+    lamp_mm, lamp_axis, lamp_exponent, strength = lamps
     out = np.zeros((CLOTH_ROWS, 2 * CLOTH_ROWS))
     for row in range(CLOTH_ROWS):
         elevation = np.pi / 2 - (row + 0.5) * np.pi / CLOTH_ROWS
@@ -106,9 +112,7 @@ def _cloth_at(place: Float64Array, direction: Float64Array, cloth: Float64Array)
 
 
 @njit(cache=True, nogil=True)
-def _ball_distance(
-    eye: Float64Array, ray: Float64Array, ball: Float64Array, radius: float
-) -> float:
+def _ball_distance(eye, ray, ball, radius):  # type: ignore[no-untyped-def]
     """Return the distance in lengths of ``ray`` to the ball; negative: the ray passes it."""
     ox, oy, oz = eye[0] - ball[0], eye[1] - ball[1], eye[2] - ball[2]
     a = ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2]
@@ -121,14 +125,7 @@ def _ball_distance(
 
 
 @njit(cache=True, nogil=True)
-def _bounce(
-    eye: Float64Array,
-    ray: Float64Array,
-    t: float,
-    ball: Float64Array,
-    place: Float64Array,
-    out: Float64Array,
-) -> None:
+def _bounce(eye, ray, t, ball, place, out):  # type: ignore[no-untyped-def]
     """Write where a ray meets the ball and where it goes from there."""
     n0, n1, n2 = 0.0, 0.0, 0.0
     for k in range(3):
@@ -142,14 +139,17 @@ def _bounce(
 
 
 @njit(cache=True, nogil=True)
+def _inside(rays, i, j, y, x, ray):  # type: ignore[no-untyped-def]
+    """Write the ray at a place in a pixel, between those of its corners."""
+    for k in range(3):
+        ray[k] = (1 - y) * ((1 - x) * rays[i, j, k] + x * rays[i, j + 1, k]) + y * (
+            (1 - x) * rays[i + 1, j, k] + x * rays[i + 1, j + 1, k]
+        )
+
+
+@njit(cache=True, nogil=True)
 def surroundings(
-    rays: Float64Array,
-    eye_mm: Float64Array,
-    ball_mm: Float64Array,
-    radius_mm: float,
-    reflectance: float,
-    cloth: Float64Array,
-    subpixels: int,
+    rays: Float64Array, eye_mm: Float64Array, ball: Ball, cloth: Float64Array, subpixels: int
 ) -> Float32Array:
     """Return the cloth as each pixel sees it, past the ball and in it; without the LEDs.
 
@@ -157,17 +157,16 @@ def surroundings(
     ----------
     rays
         Directions through the corners of pixels, shape (H + 1, W + 1, 3).
-    eye_mm, ball_mm
-        Centres of projection and of the ball, shape (3,).
-    radius_mm
-        Of the ball; 0 shows the cloth alone.
-    reflectance
-        Of the ball.
+    eye_mm
+        Centre of projection, shape (3,).
+    ball
+        The ball; a radius of 0 shows the cloth alone.
     cloth
         From `light_on_cloth`.
     subpixels
         Rays along each side of pixels on the ball's outline.
     """
+    ball_mm, radius_mm, reflectance = ball
     height, width = rays.shape[0] - 1, rays.shape[1] - 1
     out = np.zeros((height, width), np.float32)
     place, away, ray = np.empty(3), np.empty(3), np.empty(3)
@@ -184,10 +183,7 @@ def surroundings(
             for a in range(fine):
                 for b in range(fine):
                     y, x = (a + 0.5) / fine, (b + 0.5) / fine
-                    for k in range(3):
-                        ray[k] = (1 - y) * ((1 - x) * rays[i, j, k] + x * rays[i, j + 1, k]) + y * (
-                            (1 - x) * rays[i + 1, j, k] + x * rays[i + 1, j + 1, k]
-                        )
+                    _inside(rays, i, j, y, x, ray)
                     t = _ball_distance(eye_mm, ray, ball_mm, radius_mm)
                     if t > 0.0:
                         _bounce(eye_mm, ray, t, ball_mm, place, away)
@@ -199,22 +195,9 @@ def surroundings(
 
 
 @njit(cache=True, nogil=True)
-def add_lamp(
-    image: Float32Array,
-    rays: Float64Array,
-    box: Int64Array,
-    eye_mm: Float64Array,
-    ball_mm: Float64Array,
-    radius_mm: float,
-    reflectance: float,
-    lamp_mm: Float64Array,
-    lamp_axis: Float64Array,
-    lamp_exponent: float,
-    lamp_radius_mm: float,
-    strength: float,
-    reflected: bool,
-    subpixels: int,
-) -> None:
+def add_lamp(  # type: ignore[no-untyped-def]
+    image, rays, box, eye_mm, ball, led, reflected, subpixels
+):
     """Add one LED to an image, in place: its reflection in the ball, or the LED itself.
 
     Parameters
@@ -225,18 +208,19 @@ def add_lamp(
         As of `surroundings`.
     box
         First and past-the-last row and column that the LED can cover, shape (4,).
-    eye_mm, ball_mm, radius_mm, reflectance
+    eye_mm, ball
         As of `surroundings`.
-    lamp_mm, lamp_axis, lamp_exponent, lamp_radius_mm
-        The LED.
-    strength
-        Intensity on its axis in the unit of a white's signal x mm^2.
+    led
+        Place in mm, axis, exponent of the lobe, radius in mm, and intensity on the axis in the unit
+        of a white's signal x mm^2.
     reflected
         True for the reflection, False for the LED past the ball.
     subpixels
         Rays along each side of a pixel.
     """
     place, away, ray = np.empty(3), np.empty(3), np.empty(3)
+    ball_mm, radius_mm, reflectance = ball
+    lamp_mm, lamp_axis, lamp_exponent, lamp_radius_mm, strength = led
     area = lamp_radius_mm * lamp_radius_mm  # of the disc over pi: a white's signal is E, not E/pi
     for i in range(box[0], box[1]):
         for j in range(box[2], box[3]):
@@ -244,10 +228,7 @@ def add_lamp(
             for a in range(subpixels):
                 for b in range(subpixels):
                     y, x = (a + 0.5) / subpixels, (b + 0.5) / subpixels
-                    for k in range(3):
-                        ray[k] = (1 - y) * ((1 - x) * rays[i, j, k] + x * rays[i, j + 1, k]) + y * (
-                            (1 - x) * rays[i + 1, j, k] + x * rays[i + 1, j + 1, k]
-                        )
+                    _inside(rays, i, j, y, x, ray)
                     t = _ball_distance(eye_mm, ray, ball_mm, radius_mm)
                     if (t > 0.0) != reflected:
                         continue

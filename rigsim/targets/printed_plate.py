@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numba import njit
 
-from rigsim.arrays import BoolArray, Float32Array, Float64Array
+from rigsim.arrays import BoolArray, Float64Array
 from rigsim.package_data import package_table
 from rigsim.targets.flat import WHITE_REFLECTANCE
 
@@ -116,20 +116,9 @@ def _stamp(light: BoolArray, number: int, top: int, left: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def plate_light(
-    rays: Float64Array,
-    eye_mm: Float64Array,
-    rotation: Float64Array,
-    place_mm: Float64Array,
-    reflectance: Float64Array,
-    cell_mm: float,
-    waviness: Float64Array,
-    lamp_mm: Float64Array,
-    lamp_axis: Float64Array,
-    lamp_exponent: Float64Array,
-    lamp_strength: Float64Array,
-    subpixels: int,
-) -> Float32Array:
+def plate_light(  # type: ignore[no-untyped-def]
+    rays, eye_mm, rotation, place_mm, paper, lights, subpixels
+):
     """Return what each pixel sees of a plate: sum of ``strength lobe cos / d^2`` x reflectance.
 
     Parameters
@@ -140,10 +129,10 @@ def plate_light(
         Centre of projection, shape (3,).
     rotation, place_mm
         From the plate's axes to the rig frame, and where its top left corner is.
-    reflectance, cell_mm, waviness
-        As of `Plate`.
-    lamp_mm, lamp_axis, lamp_exponent, lamp_strength
-        Lights that are on, shapes (L, 3), (L, 3), (L,), (L,).
+    paper
+        Reflectance, side of its cells in mm, and waviness, as of `Plate`.
+    lights
+        Lights that are on: places in mm (L, 3), axes (L, 3), exponents (L,) and strengths (L,).
     subpixels
         Rays along each side of pixels that an edge of print crosses.
 
@@ -152,6 +141,8 @@ def plate_light(
     ndarray of float32
         Shape (H, W); 0 beside the plate and behind it.
     """
+    reflectance, cell_mm, waviness = paper
+    lamp_mm, lamp_axis, lamp_exponent, lamp_strength = lights
     height, width = rays.shape[0] - 1, rays.shape[1] - 1
     out = np.zeros((height, width), np.float32)
     eye = rotation.T @ (eye_mm - place_mm)

@@ -32,6 +32,18 @@ def draw(s0, s1, s2, s3):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
+def disc_point(s0, s1, s2, s3):  # type: ignore[no-untyped-def]
+    """Draw a point in the unit disc, evenly."""
+    while True:
+        s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+        p = 2.0 * u - 1.0
+        s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+        q = 2.0 * u - 1.0
+        if p * p + q * q <= 1.0:
+            return s0, s1, s2, s3, p, q
+
+
+@njit(inline="always")
 def fresnel(mu_i, eta_i, eta_t):  # type: ignore[no-untyped-def]
     """Unpolarized reflectance and cosine of the refracted ray; (1, 0) at total reflection."""
     ratio = eta_i / eta_t

@@ -7,8 +7,8 @@ import pty
 import selectors
 import socket
 import tty
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Protocol
 
 from rigsim.world.link import Link, LinkStalled, Unplugged
 from rigsim.world.world import World
@@ -18,27 +18,10 @@ log = logging.getLogger(__name__)
 CHUNK_BYTES = 4096
 
 
-class BoxEnd(Protocol):
-    """Where the bytes of one box go in and out."""
+class BoxEnd(ABC):
+    """Where the bytes of one box go in and out; those that it would not take yet wait here."""
 
     address: str
-
-    @property
-    def stalled(self) -> bool:
-        """Whether bytes wait that could not be passed on."""
-
-    def start(self, selector: selectors.BaseSelector) -> None:
-        """Begin to serve; `selector` calls back when bytes come."""
-
-    def pump(self) -> None:
-        """Pass on what the box has said."""
-
-    def stop(self) -> None:
-        """Stop serving; doing so twice is allowed."""
-
-
-class _Line:
-    """One end of a link: bytes that the box would not take yet wait here."""
 
     def __init__(self, world: World, link: Link) -> None:
         self._world = world
@@ -50,17 +33,29 @@ class _Line:
         """Whether bytes wait that could not be passed on."""
         return bool(self._unsent)
 
-    def forget(self) -> None:
+    @abstractmethod
+    def start(self, selector: selectors.BaseSelector) -> None:
+        """Begin to serve; `selector` calls back when bytes come."""
+
+    @abstractmethod
+    def pump(self) -> None:
+        """Pass on what the box has said."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Stop serving; doing so twice is allowed."""
+
+    def _forget(self) -> None:
         self._unsent = b""
         with self._world.lock:
             self._link.detach()
 
-    def attach(self) -> None:
+    def _attach(self) -> None:
         with self._world.lock:
             self._world.advance(self._world.now)
             self._link.attach(self._world.now)
 
-    def send(self, data: bytes) -> None:
+    def _send(self, data: bytes) -> None:
         """Pass bytes on; raise `Unplugged`."""
         self._unsent += data
         with self._world.lock:
@@ -72,20 +67,20 @@ class _Line:
                     self._unsent = b""
                     self._world.advance(now)
 
-    def take(self) -> bytes:
+    def _take(self) -> bytes:
         """Return what the box said; raise `Unplugged`."""
         if self._unsent:
-            self.send(b"")
+            self._send(b"")
         with self._world.lock:
             self._link.check(self._world.now)
             return self._link.take(self._link.waiting)
 
 
-class PtyEnd:
+class PtyEnd(BoxEnd):
     """A box behind a pseudo-terminal."""
 
     def __init__(self, world: World, link: Link) -> None:
-        self._line = _Line(world, link)
+        super().__init__(world, link)
         # the slave stays open here: else the master fails when a client closes
         self._master, self._slave = pty.openpty()
         tty.setraw(self._slave)
@@ -93,27 +88,22 @@ class PtyEnd:
         self.address = os.ttyname(self._slave)
         self._open = True
 
-    @property
-    def stalled(self) -> bool:
-        """Whether bytes wait that could not be passed on."""
-        return self._line.stalled
-
     def start(self, selector: selectors.BaseSelector) -> None:
         """Begin to serve; `selector` calls back when bytes come."""
         self._selector = selector
         selector.register(self._master, selectors.EVENT_READ, self._readable)
-        self._line.attach()
+        self._attach()
 
     def _readable(self) -> None:
-        if not self._line.stalled:
+        if not self.stalled:
             with contextlib.suppress(BlockingIOError):
-                self._guarded(lambda: self._line.send(os.read(self._master, CHUNK_BYTES)))
+                self._guarded(lambda: self._send(os.read(self._master, CHUNK_BYTES)))
 
     def pump(self) -> None:
         """Pass on what the box has said."""
 
         def write() -> None:
-            data = self._line.take()
+            data = self._take()
             # nobody reads and the terminal is full: what the box says is lost, as on a real line
             with contextlib.suppress(BlockingIOError):
                 while data:
@@ -135,14 +125,14 @@ class PtyEnd:
             self._selector.unregister(self._master)
             os.close(self._master)
             os.close(self._slave)
-            self._line.forget()
+            self._forget()
 
 
-class TcpEnd:
+class TcpEnd(BoxEnd):
     """A box behind a TCP port, for one client at a time."""
 
     def __init__(self, world: World, link: Link, host: str, port: int) -> None:
-        self._line = _Line(world, link)
+        super().__init__(world, link)
         self._listener = socket.create_server((host, port), backlog=4)
         self._listener.setblocking(False)
         self._client: socket.socket | None = None
@@ -153,7 +143,7 @@ class TcpEnd:
     @property
     def stalled(self) -> bool:
         """Whether bytes wait that could not be passed on."""
-        return self._line.stalled or bool(self._unwritten)
+        return super().stalled or bool(self._unwritten)
 
     def start(self, selector: selectors.BaseSelector) -> None:
         """Begin to serve; `selector` calls back when bytes come."""
@@ -171,7 +161,7 @@ class TcpEnd:
             self._see_out(client)
             return
         try:
-            self._line.attach()
+            self._attach()
         except Unplugged:
             self._see_out(client)
             return
@@ -181,13 +171,13 @@ class TcpEnd:
         self._selector.register(client, selectors.EVENT_READ, self._readable)
 
     def _readable(self) -> None:
-        if self._client is None or self._line.stalled:
+        if self._client is None or super().stalled:
             return
         try:
             data = self._client.recv(CHUNK_BYTES)
             if not data:
                 raise ConnectionResetError
-            self._line.send(data)
+            self._send(data)
         except BlockingIOError:
             return
         except (OSError, Unplugged):
@@ -199,7 +189,7 @@ class TcpEnd:
             return
         try:
             # a client that never reads loses what does not fit, as on a real line
-            self._unwritten = (self._unwritten + self._line.take())[-(2**20) :]
+            self._unwritten = (self._unwritten + self._take())[-(2**20) :]
             if self._unwritten:
                 self._unwritten = self._unwritten[self._client.send(self._unwritten) :]
         except BlockingIOError:
@@ -213,7 +203,7 @@ class TcpEnd:
             self._selector.unregister(client)
             self._see_out(client)
             self._unwritten = b""
-            self._line.forget()
+            self._forget()
 
     def _see_out(self, client: socket.socket) -> None:
         """Tell a client that it is over, and wait for its own end: closing at once is a reset."""

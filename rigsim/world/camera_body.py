@@ -1,4 +1,9 @@
-"""The body of a simulated camera: shots, exposures and sensor."""
+"""A simulated camera: shots, exposures and sensor.
+
+It opens its shutter when it is fired, or on the edge that the flash box puts on the camera line. It
+sees the light that pops while the shutter is open, is busy until the frame is read out, and misses
+edges meanwhile. Its pixels are made when somebody asks for the frame.
+"""
 
 import dataclasses
 import math
@@ -10,7 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
-from capture.devices.camera import CameraError, Exposure, Frame, FrameTimeout, Trigger
+from capture.devices.camera import CameraError, CameraInfo, Exposure, Frame, FrameTimeout, Trigger
 from capture.rig import View
 from rigsim.arrays import UInt16Array
 from rigsim.boxes.faults import Faults
@@ -96,6 +101,16 @@ class CameraBody:
     def __init__(self, world: CameraWorld, view: View, *, first_shot: int = 0) -> None:
         self.world = world
         self.view = view
+        self.info = CameraInfo(
+            serial=view.serial,
+            model=view.camera_model,
+            width_px=view.width_px,
+            height_px=view.height_px,
+            pattern=view.cfa,
+            black=(float(view.black_level),) * (1 if view.cfa == "MONO" else 4),
+            white=view.white_level,
+            triggers=(Trigger.SOFTWARE, Trigger.EDGE),
+        )
         self.exposure = Exposure(0.01, 100)
         self.missed_edges = 0
         self._rng = world.rng_for("camera", view.name)
@@ -114,19 +129,35 @@ class CameraBody:
     def _stamp(self, now: float) -> float:
         return now * (1.0 + self.world.faults.drift_ppm * 1e-6)
 
+    def configure(self, want: Exposure) -> Exposure:
+        """Set an exposure within what the camera can do, and return it."""
+        self.exposure = Exposure(
+            min(max(want.exposure_s, EXPOSURE_RANGE_S[0]), EXPOSURE_RANGE_S[1]),
+            min(max(want.iso, ISO[0]), ISO[1]),
+        )
+        return self.exposure
+
     def arm(self, count: int, trigger: Trigger) -> None:
         """Make ready for `count` exposures and drop what waits."""
+        if count < 1:
+            raise CameraError(f"count: got {count}, expected 1 or more")
+        if trigger not in self.info.triggers:
+            raise CameraError(f"camera {self.info.serial}: knows no {trigger} trigger")
         with self.world.lock:
             self._waiting.clear()
             if self._previous is not None and self._rng.random() < self.world.faults.stale:
                 self._waiting.append(self._previous)
             self._armed, self._trigger, self._seq = count, trigger, 0
 
-    def disarm(self) -> None:
+    def abort(self) -> None:
         """Give up what was armed; an exposure that has begun is dropped."""
         with self.world.lock:
             self._armed = 0
             self._waiting.clear()
+
+    def close(self) -> None:
+        """Let go of the camera, which lives on."""
+        self.abort()
 
     def edge(self, now: float) -> None:
         """Notice a pulse on the camera line."""
@@ -177,6 +208,10 @@ class CameraBody:
             # an edge from another thread may begin an exposure meanwhile
             pause = min(ready, until) if world.virtual else min(ready, until, now + 0.01)
             world.wait(pause)
+
+    def frame(self, timeout_s: float) -> Frame:
+        """Return the next frame, or raise `FrameTimeout`."""
+        return self.develop(self.next_shot(timeout_s))
 
     def develop(self, shot: _Shot) -> Frame:
         """Make the pixels of an exposure and say what the camera says of it."""

@@ -12,7 +12,6 @@ from typing import Any
 from capture.devices.camera import CameraError, Exposure, FrameTimeout, Trigger
 from capture.devices.cameras import camera_wire
 from capture.devices.cameras.camera_wire import BadMessage
-from rigsim.world.camera import SimCamera
 from rigsim.world.camera_body import CameraBody
 from rigsim.world.world import World
 
@@ -96,7 +95,7 @@ class CameraService:
                 held = view is not None and self._holders.get(view) is connection
                 if view is not None and held:
                     # still locked: nobody may have armed it meanwhile
-                    self.world.camera(view).disarm()
+                    self.world.camera(view).abort()
                     del self._holders[view]
 
     def _open(
@@ -123,7 +122,7 @@ class CameraService:
             _send(connection, request, ok=False, error=error, text=fault)
             return current
         with self._waits[name]:  # a wait of that client's has ended: it takes no frame of ours
-            camera = SimCamera(self.world.camera(name))
+            camera = self.world.camera(name)
             if holder is not None:
                 camera.abort()
         _send(connection, request, ok=True, info=camera_wire.info_to_json(camera.info))
@@ -138,7 +137,7 @@ class CameraService:
             with self._lock:
                 if self._holders.get(view) is not connection:
                     raise ConnectionResetError("the camera has gone to another client")
-            fields, blob = self._do(connection, SimCamera(self.world.camera(view)), request)
+            fields, blob = self._do(connection, self.world.camera(view), request)
         except (CameraError, KeyError, TypeError, ValueError) as exc:
             kind = "FrameTimeout" if isinstance(exc, FrameTimeout) else "CameraError"
             _send(connection, request, ok=False, error=kind, text=str(exc))
@@ -146,7 +145,7 @@ class CameraService:
             _send(connection, request, blob=blob, ok=True, **fields)
 
     def _do(
-        self, connection: socket.socket, camera: SimCamera, request: Mapping[str, Any]
+        self, connection: socket.socket, camera: CameraBody, request: Mapping[str, Any]
     ) -> tuple[dict[str, Any], bytes | None]:
         match request.get("do"):
             case "clock":
@@ -163,9 +162,9 @@ class CameraService:
                 return {}, None
             case "frame":
                 timeout_s = min(max(float(request["timeout_s"]), 0.0), MAX_WAIT_S)
-                shot = self._next_shot(connection, camera.body, timeout_s)
+                shot = self._next_shot(connection, camera, timeout_s)
                 _send(connection, request, developing=True)
-                table, blob = camera_wire.frame_to_message(camera.body.develop(shot))
+                table, blob = camera_wire.frame_to_message(camera.develop(shot))
                 return {"frame": table}, blob
             case "abort":
                 camera.abort()

@@ -1,80 +1,60 @@
 """Light that came out of a world's boxes: what has ended, and what still shines."""
 
-import dataclasses
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
-from typing import TypeVar
+from collections.abc import Sequence
+from dataclasses import replace
 
-from rigsim.boxes.dome import LedPulse
 from rigsim.boxes.flash import FlashPop
 from rigsim.boxes.gradient_sphere import PatternLight
-from rigsim.boxes.probe import SourceLight
+from rigsim.boxes.led_table import LedPulse
+from rigsim.boxes.source_shutter import SourceLight
 
 SwitchedLight = LedPulse | PatternLight | SourceLight
-"""A stretch of steady light: of an LED, of a pattern, or out of a fibre."""
-
 Light = FlashPop | SwitchedLight
-"""Light out of a box: a pop of the flash, or a stretch of an LED's, a pattern's or a fibre's."""
-
-_Switched = TypeVar("_Switched", bound=SwitchedLight)
-
-
-def _none(now: float) -> list[_Switched]:
-    return []
 
 
 class LightRecord:
-    """All light so far, of each kind in the order in which it ended.
+    """All light so far, in the order in which it ended.
 
     Attributes
     ----------
     pops : list of FlashPop
         All pops.
-    pulses, patterns, sources : list of LedPulse, PatternLight, SourceLight
-        Stretches of light that have ended.
-    pulses_now, patterns_now, sources_now : callable
-        Given the world's time in s, the stretches that have not, as given so far; the boxes that
-        switch them put them here.
+    switched : list of SwitchedLight
+        Stretches of light that have ended; a rig has one kind of box that switches light.
     """
 
     def __init__(self) -> None:
         self.pops: list[FlashPop] = []
-        self.pulses: list[LedPulse] = []
-        self.patterns: list[PatternLight] = []
-        self.sources: list[SourceLight] = []
-        self.pulses_now: Callable[[float], Sequence[LedPulse]] = _none
-        self.patterns_now: Callable[[float], Sequence[PatternLight]] = _none
-        self.sources_now: Callable[[float], Sequence[SourceLight]] = _none
+        self.switched: list[SwitchedLight] = []
 
-    def between(self, start: float, end: float, *, now: float) -> tuple[Light, ...]:
+    def keep(self, light: Light) -> None:
+        """Keep a pop, or a stretch of light that has ended."""
+        if isinstance(light, FlashPop):
+            self.pops.append(light)
+        else:
+            self.switched.append(light)
+
+    def between(
+        self, start: float, end: float, going_on: Sequence[SwitchedLight]
+    ) -> tuple[Light, ...]:
         """Return pops from `start` to `end`, both included, and other light clipped to them, s.
 
         Parameters
         ----------
         start, end
             World times, s.
-        now
-            The world's time, s: up to then what still shines has shone.
+        going_on
+            Stretches of light that have not ended, as given so far.
         """
-        return (
-            *self.pops_between(start, end),
-            *_clipped(self.pulses, self.pulses_now(now), start, end),
-            *_clipped(self.patterns, self.patterns_now(now), start, end),
-            *_clipped(self.sources, self.sources_now(now), start, end),
+        first = bisect_right(self.switched, start, key=lambda light: light.t_off_s)
+        clipped = (
+            replace(light, t_on_s=max(light.t_on_s, start), t_off_s=min(light.t_off_s, end))
+            for light in [*self.switched[first:], *going_on]
+            if light.t_on_s < end and light.t_off_s > start
         )
+        return (*self.pops_between(start, end), *clipped)
 
     def pops_between(self, start: float, end: float) -> tuple[FlashPop, ...]:
         """Return the pops from `start` to `end`, both included, in s."""
         return tuple(pop for pop in self.pops if start <= pop.t_s <= end)
-
-
-def _clipped(
-    ended: Sequence[_Switched], going_on: Sequence[_Switched], start: float, end: float
-) -> list[_Switched]:
-    """Return light, in the order in which it ended, clipped to what lies from start to end."""
-    first = bisect_right(ended, start, key=lambda light: light.t_off_s)
-    return [
-        dataclasses.replace(light, t_on_s=max(light.t_on_s, start), t_off_s=min(light.t_off_s, end))
-        for light in [*ended[first:], *going_on]
-        if light.t_on_s < end and light.t_off_s > start
-    ]

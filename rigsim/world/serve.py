@@ -135,11 +135,8 @@ class Served:
         host, port = host_port
         try:
             for name in world.rig.boxes:
-                end: BoxEnd = (
-                    PtyEnd(world, world.link(name))
-                    if pty
-                    else TcpEnd(world, world.link(name), host, port)
-                )
+                link = world.link(name)
+                end = PtyEnd(world, link) if pty else TcpEnd(world, link, host, port)
                 self._ends.append(end)
                 end.start(self._selector)
                 self.addresses[name] = end.address

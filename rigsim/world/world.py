@@ -23,12 +23,13 @@ from capture.devices.camera import Exposure
 from capture.rig import Rig, View, load_rig
 from rigsim.arrays import UInt16Array
 from rigsim.boxes.controller import Controller
+from rigsim.boxes.device import Wiring
 from rigsim.boxes.faults import NO_FAULTS, Faults
 from rigsim.boxes.flash import FlashPop
 from rigsim.world.camera_body import CameraBody
 from rigsim.world.light_record import Light, LightRecord
 from rigsim.world.link import Link
-from rigsim.world.rig_boxes import Wiring, make_box
+from rigsim.world.rig_boxes import make_box
 from rigsim.world.suction import CameraCooler, HeadState, SuckedHead
 from rigsim.world.taped_skin import GripState, TapedSkin
 
@@ -88,12 +89,8 @@ class World:
         May be exchanged between exposures.
     pops : list of FlashPop
         All pops so far.
-    pulses : list of LedPulse
-        All light of LEDs that has ended, in the order in which it did.
-    patterns : list of PatternLight
-        The same of the patterns of a gradient sphere.
-    sources : list of SourceLight
-        The same of the source fibre of a contact probe.
+    switched : list of LedPulse, PatternLight or SourceLight
+        All other light that has ended, in the order in which it did.
     grips : list of (float, GripState)
         What the caliper has held, from each world time in s on; empty where the rig has none.
     skin : TapedSkin or None
@@ -120,8 +117,7 @@ class World:
         self.scene = scene
         self.faults = NO_FAULTS if faults is None else faults
         self._light = light = LightRecord()
-        self.pops, self.pulses = light.pops, light.pulses
-        self.patterns, self.sources = light.patterns, light.sources
+        self.pops, self.switched = light.pops, light.switched
         self.grips: list[tuple[float, GripState]] = []
         self.skin: TapedSkin | None = None
         if self.rig.caliper is not None:
@@ -147,15 +143,24 @@ class World:
         self._name = ""
         self._shots_made = dict(shots_made or {})
         self._cameras: dict[str, CameraBody] = {}
-        wiring = Wiring(
-            self.rig, self.faults, light, self._trigger, self._note_grip, self.skin, self.head
-        )
-        self._links = {name: self._make_link(name, wiring) for name in self.rig.boxes}
+        self._links = {name: self._make_link(name) for name in self.rig.boxes}
 
-    def _make_link(self, name: str, wiring: Wiring) -> Link:
-        box = make_box(name, wiring, rng=self.rng_for("box", name))
+    def _make_link(self, name: str) -> Link:
+        wiring = Wiring(
+            rig=self.rig,
+            rng=self.rng_for("box", name),
+            faults=self.faults,
+            on_light=self._light.keep,
+            on_trigger=self._trigger,
+            on_grip=self._note_grip,
+            skin=self.skin,
+            head=self.head,
+        )
         return Link(
-            box, faults=self.faults, rng=self.rng_for("link", name), record=self._record_bytes
+            make_box(name, wiring),
+            faults=self.faults,
+            rng=self.rng_for("link", name),
+            record=self._record_bytes,
         )
 
     def rng_for(self, *names: str) -> np.random.Generator:
@@ -242,7 +247,9 @@ class World:
     def light_between(self, start: float, end: float) -> tuple[Light, ...]:
         """Return pops from `start` to `end`, both included, and LEDs' light clipped to them."""
         with self.lock:
-            return self._light.between(start, end, now=self.now)
+            now, boxes = self.now, [link.box.device for link in self._links.values()]
+            going_on = [light for box in boxes for light in box.light_now(now)]
+            return self._light.between(start, end, going_on)
 
     def pops_between(self, start: float, end: float) -> tuple[FlashPop, ...]:
         """Return the pops from `start` to `end`, both included, in s."""

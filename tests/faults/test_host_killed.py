@@ -77,7 +77,7 @@ while True:
     at_work=lambda world: world.box("dome").device.running,
     # between two lights it is dark while it runs
     over=lambda world: not (world.box("dome").device.running or world.box("dome").device.lit),
-    ended_s=lambda world: {"dome": world.pulses[-1].t_off_s},
+    ended_s=lambda world: {"dome": world.switched[-1].t_off_s},
 )
 
 GRADIENT = Work(
@@ -107,7 +107,7 @@ while True:
     at_work=lambda world: world.box("gradient_sphere").device.running and world.skin.state.attached,
     over=lambda world: not (world.box("gradient_sphere").device.lit or world.skin.state.attached),
     ended_s=lambda world: {
-        "gradient_sphere": world.patterns[-1].t_off_s,
+        "gradient_sphere": world.switched[-1].t_off_s,
         "caliper": world.grips[-1][0],
     },
     rests=lambda world: (world.grips[-1][1].attached, world.grips[-1][1].stretch) == (False, 1.0),
@@ -135,7 +135,7 @@ while True:
     over=lambda world: (
         not (world.box("probe").device.lit or world.box("probe").device.pump.drawing)
     ),
-    ended_s=lambda world: {"probe": max(world.sources[-1].t_off_s, world.heads[-1][0])},
+    ended_s=lambda world: {"probe": max(world.switched[-1].t_off_s, world.heads[-1][0])},
 )
 
 WORK = {"flash": FLASH, "dome": DOME, "gradient": GRADIENT, "probe": PROBE}

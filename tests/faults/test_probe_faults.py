@@ -143,9 +143,9 @@ def test_a_probe_lights_once_for_each_accepted_opening_and_says_how_all_ended(
         span_s = {"timed": 0.1, "jam": 0.12}.get(ended.ended)
         if span_s is not None:
             assert ended.t_shut_s - ended.t_open_s == pytest.approx(span_s, abs=3e-6)
-    for light in world.sources:
+    for light in world.switched:
         assert light.t_off_s - light.t_on_s <= 0.12 + 1e-9
-    assert len(world.sources) <= host.unit.shutter.count
+    assert len(world.switched) <= host.unit.shutter.count
     host.box.port.close()
     world.unregister()
 
@@ -159,7 +159,7 @@ def test_a_box_that_reset_in_mid_suction_has_vented_and_says_nothing_of_it():
     host.box.open_shutter(20.0)
     with pytest.raises(BoxRebooted):
         host.box.listen(5.0)
-    (light,) = world.sources
+    (light,) = world.switched
     assert light.t_off_s == pytest.approx(4.0)
     assert not world.head_at(world.now).placed
     host.box.hello()

@@ -19,6 +19,7 @@ with atheris.instrument_imports(include=["rigsim.boxes", "capture.devices.wire"]
     from capture.devices import wire
     from capture.devices.wire import Reply, Request
     from rigsim.boxes.controller import Controller
+    from rigsim.boxes.device import Wiring
     from rigsim.boxes.flash import FlashUnit
 
 from capture.rig import load_rig
@@ -29,9 +30,7 @@ RIG = dataclasses.replace(
 
 
 def one_input(data):
-    unit = FlashUnit(
-        RIG, on_pop=lambda pop: None, on_trigger=lambda t_s: None, rng=np.random.default_rng(0)
-    )
+    unit = FlashUnit(Wiring(rig=RIG, rng=np.random.default_rng(0)))
     box = Controller(unit, serial="FL-0001", rng=np.random.default_rng(1))
     now_s = 0.0
     for seq, act in enumerate(data.split(b"\n")[:200]):

@@ -44,7 +44,7 @@ def test_both_boxes_are_driven_at_once_and_neither_disturbs_the_other(served):
         assert sphere.is_armed()
         assert not caliper.is_armed()
         sphere.listen(0.2)
-    assert [light.pattern for light in served.world.patterns] == ["x"] * len(lit)
+    assert [light.pattern for light in served.world.switched] == ["x"] * len(lit)
 
 
 def test_exchanged_addresses_are_noticed(served):

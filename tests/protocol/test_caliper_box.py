@@ -40,12 +40,8 @@ def test_the_data_dictionary_holds_the_rigs_limits(bench):
 
 def test_no_caliper_goes_further_than_fifteen_steps():
     long = dataclasses.replace(RIG.caliper, step_mm=0.1, first_step=-40, last_step=60)
-    unit = CaliperUnit(
-        dataclasses.replace(RIG, caliper=long),
-        TapedSkin(long),
-        on_change=lambda now: None,
-        rng=np.random.default_rng(0),
-    )
+    rig, rng = dataclasses.replace(RIG, caliper=long), np.random.default_rng(0)
+    unit = CaliperUnit(Wiring(rig=rig, rng=rng, skin=TapedSkin(long)))
     assert (unit.step_min, unit.step_max) == (-15, 15)
 
 

@@ -218,7 +218,7 @@ def test_a_foreign_or_wrongly_exposed_frame_is_refused(faulty, fault, error):
 @pytest.mark.parametrize("drift_ppm", [-500.0, 500.0])
 def test_a_drifting_clock_neither_hides_stale_frames_nor_refuses_good_ones(faulty, drift_ppm):
     camera = faulty(drift_ppm=drift_ppm)
-    camera.body.world.clock.sleep(3600.0)
+    camera.world.clock.sleep(3600.0)
     kept = []
     for _ in range(5):
         before = shoot(camera)
@@ -239,7 +239,7 @@ def test_of_two_hundred_exposures_no_bad_frame_is_accepted(faulty):
         except (FrameRefused, FrameTimeout):
             refused += 1
             camera.abort()
-            camera.body.world.clock.sleep(0.1)
+            camera.world.clock.sleep(0.1)
             continue
         accepted += 1
         assert frame.serial == camera.info.serial

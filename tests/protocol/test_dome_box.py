@@ -85,7 +85,7 @@ def test_the_next_led_is_on_before_the_last_goes_off_and_alone_when_cameras_are_
     rows = rows_of(behind(6), ms=40)
     bench.run(rows)
     bench.wait(0.4)
-    pulses = sorted(bench.world.pulses, key=lambda pulse: pulse.t_on_s)
+    pulses = sorted(bench.world.switched, key=lambda pulse: pulse.t_on_s)
     assert [pulse.led for pulse in pulses] == [row.leds[0] for row in rows]
     for before, after in itertools.pairwise(pulses):
         assert before.t_off_s - after.t_on_s == pytest.approx(RIG.leds.overlap_s, abs=1e-9)
@@ -99,8 +99,8 @@ def test_an_led_of_two_rows_that_follow_stays_on(bench):
     rows = [Row(tuple(sorted(leds)), 300, 50_000, 7) for leds in ((a, b), (b, c), (b, c))]
     bench.run(rows)
     bench.wait(0.3)
-    spans = {pulse.led: pulse.t_off_s - pulse.t_on_s for pulse in bench.world.pulses}
-    assert len(bench.world.pulses) == 3
+    spans = {pulse.led: pulse.t_off_s - pulse.t_on_s for pulse in bench.world.switched}
+    assert len(bench.world.switched) == 3
     assert spans[b] == pytest.approx(0.15)
     assert spans[c] == pytest.approx(0.1 + RIG.leds.overlap_s)
 
@@ -159,7 +159,7 @@ def test_a_sequence_of_a_silent_host_ends_dark_within_the_lease(bench):
     fell_silent = bench.now
     bench.silence(2.0)
     assert not bench.unit.lit
-    assert max(p.t_off_s for p in bench.world.pulses) <= fell_silent + 0.3 + 1e-9
+    assert max(p.t_off_s for p in bench.world.switched) <= fell_silent + 0.3 + 1e-9
     names = [name for name, _ in bench.said]
     assert names[-2:] == ["WDOG:TRIP", "SEQ:STOP"] or names[-2:] == ["SEQ:STOP", "WDOG:TRIP"]
     assert bench.ask("SEQ:POS?").startswith("STOP,")
@@ -173,7 +173,7 @@ def test_one_big_step_equals_many_small_ones():
         bench.run(rows_of(behind(20)))
         while bench.now < 4.0:
             bench.silence(step_s)
-        return bench.world.pulses, bench.edges, bench.said
+        return bench.world.switched, bench.edges, bench.said
 
     assert play(3.0)[0] == pytest.approx(play(0.013)[0])
     assert play(3.0)[2] == play(0.013)[2]
@@ -188,8 +188,8 @@ def test_light_carries_its_own_end(bench):
     assert bench.ask("LED?") == "3+17"
     bench.wait(0.1)
     assert bench.ask("LED?") == "-"
-    assert {(p.led, p.level) for p in bench.world.pulses} == {(3, 0.5), (17, 0.5)}
-    assert all(p.t_off_s - p.t_on_s == pytest.approx(0.08) for p in bench.world.pulses)
+    assert {(p.led, p.level) for p in bench.world.switched} == {(3, 0.5), (17, 0.5)}
+    assert all(p.t_off_s - p.t_on_s == pytest.approx(0.08) for p in bench.world.switched)
 
 
 def test_leds_are_put_out_one_by_one_or_all(bench):
@@ -366,7 +366,7 @@ def test_a_dead_led_is_refused_alone_and_named_in_a_sequence():
     bench.run(rows_of([a, b]))
     bench.wait(0.3)
     assert ("LED:FAIL", str(b)) in bench.said
-    assert [pulse.led for pulse in bench.world.pulses] == [a]
+    assert [pulse.led for pulse in bench.world.switched] == [a]
     assert len(bench.edges) == 2
 
 
@@ -375,7 +375,7 @@ def test_a_weak_led_gives_less_than_it_is_driven_for_and_nobody_notices():
     bench = DOME.bench(led_weak=f"{b}=0.25")
     bench.run(rows_of([a, b]))
     bench.wait(0.3)
-    assert [(p.led, p.level) for p in bench.world.pulses] == [(a, 1.0), (b, 0.25)]
+    assert [(p.led, p.level) for p in bench.world.switched] == [(a, 1.0), (b, 0.25)]
     assert not [name for name, _ in bench.said if name.startswith("LED:")]
 
 

@@ -74,7 +74,7 @@ def test_a_table_runs_once_armed_and_every_release_is_timed(bench):
     assert box.step_time(8) is None
     position = box.position()
     assert (position.state, position.row, position.rows, position.token) == ("DONE", 7, 8, "run-1")
-    assert [pulse.led for pulse in bench.world.pulses] == UNSEEN[:8]
+    assert [pulse.led for pulse in bench.world.switched] == UNSEEN[:8]
 
 
 def test_a_long_table_is_loaded_in_short_lines_and_its_checksum_compared(bench):
@@ -141,7 +141,7 @@ def test_cameras_are_masked_and_released_without_light(bench):
     box.set_cameras(2)
     assert box.cameras() == 2
     assert 0.0 <= box.trigger_cameras("dark-1") <= box.ping()
-    assert bench.world.pulses == []
+    assert bench.world.switched == []
 
 
 def test_silence_stops_the_sequence_within_the_lease_and_arming_again_is_deliberate(bench):

@@ -68,7 +68,7 @@ def test_a_pattern_weighs_each_led_by_its_place(bench, name):
     bench.wait(0.2)
     given = [float(bench.ask(f"DOSE? {led}")) for led in range(LEDS)]
     np.testing.assert_allclose(given, 0.4 * 0.05 * wanted, atol=1e-6)
-    lights = [(p.pattern, p.level) for p in bench.world.patterns]
+    lights = [(p.pattern, p.level) for p in bench.world.switched]
     assert lights == ([] if name == "dark" else [(name, 0.4)])
 
 
@@ -85,7 +85,7 @@ def test_light_carries_its_own_end(bench):
     assert int(bench.ask("STAT?")) & 64
     bench.wait(0.1)
     assert bench.ask("PATT?") == "DARK"
-    (light,) = bench.world.patterns
+    (light,) = bench.world.switched
     assert (light.pattern, light.level, light.analyser_deg) == ("-y", 0.3, 0.0)
     assert light.t_off_s - light.t_on_s == pytest.approx(0.08)
     assert light.led_shares == ()
@@ -98,7 +98,7 @@ def test_a_pattern_replaces_the_last_and_dark_ends_it(bench):
     bench.ask("PATT X,300,100")
     bench.wait(0.05)
     bench.ask("PATT DARK")
-    spans = [(p.pattern, round(p.t_off_s - p.t_on_s, 9)) for p in bench.world.patterns]
+    spans = [(p.pattern, round(p.t_off_s - p.t_on_s, 9)) for p in bench.world.switched]
     assert spans == [("full", 0.05), ("x", 0.05)]
     assert not bench.unit.lit
 
@@ -142,7 +142,7 @@ def test_no_light_while_the_analyser_turns_and_no_turning_in_the_light(bench):
     assert bench.unit.analyser_deg == 90.0
     bench.wait(0.2)
     bench.ask("POL 0")
-    assert bench.world.patterns[0].analyser_deg == 90.0
+    assert bench.world.switched[0].analyser_deg == 90.0
 
 
 def test_turning_after_a_table_was_judged_means_judging_it_again(bench):
@@ -168,7 +168,7 @@ def test_a_scan_steps_by_itself_turns_in_the_dark_and_reports_each_release(bench
     assert [int(row) for row, _ in steps] == [0, 1, 2, 3]
     np.testing.assert_allclose([1e-6 * int(t) for _, t in steps], wanted, atol=1e-6)
     np.testing.assert_allclose([t for t, _ in bench.edges], wanted, atol=1e-6)
-    full, x, minus_x = bench.world.patterns
+    full, x, minus_x = bench.world.switched
     assert (full.pattern, x.pattern, minus_x.pattern) == ("full", "x", "-x")
     assert full.t_off_s == x.t_on_s
     assert minus_x.t_on_s - x.t_off_s == pytest.approx(TURN_S)
@@ -191,7 +191,7 @@ def test_the_paper_s_sixteen_conditions_are_one_scan_of_half_a_second_of_light(b
     bench.ask("TRIG s")
     bench.wait(0.8)
     assert len(bench.edges) == 16
-    lit_s = sum(p.t_off_s - p.t_on_s for p in bench.world.patterns)
+    lit_s = sum(p.t_off_s - p.t_on_s for p in bench.world.switched)
     assert lit_s == pytest.approx(14 * 0.03)
 
 
@@ -248,7 +248,7 @@ def test_a_scan_can_be_stopped_at_once(bench, text):
     edges = len(bench.edges)
     bench.silence(1.0)
     assert len(bench.edges) == edges
-    assert bench.world.patterns[-1].t_off_s == pytest.approx(1.15)
+    assert bench.world.switched[-1].t_off_s == pytest.approx(1.15)
 
 
 def test_a_scan_of_a_silent_host_ends_dark_within_the_lease(bench):
@@ -257,7 +257,7 @@ def test_a_scan_of_a_silent_host_ends_dark_within_the_lease(bench):
     fell_silent = bench.now
     bench.silence(2.0)
     assert not bench.unit.lit
-    assert bench.world.patterns[-1].t_off_s <= fell_silent + 0.3 + 1e-9
+    assert bench.world.switched[-1].t_off_s <= fell_silent + 0.3 + 1e-9
     assert {"WDOG:TRIP", "SEQ:STOP"} <= {name for name, _ in bench.said}
     assert bench.code("TRIG r2") == Code.WATCHDOG_TRIPPED
 
@@ -269,7 +269,7 @@ def test_one_big_step_of_time_equals_many_small_ones():
         bench.run(rows_of(["x", "z"]) + rows_of(["z", "y"], reading_deg=90.0))
         while bench.now < 2.0:
             bench.silence(step_s)
-        return bench.world.patterns, bench.edges, bench.said
+        return bench.world.switched, bench.edges, bench.said
 
     assert play(1.0) == play(0.0131)
 
@@ -335,7 +335,7 @@ def test_gains_dim_their_leds_in_every_pattern(bench):
     bench.ask("SYST:ARM")
     bench.ask("PATT X,50")
     bench.wait(0.1)
-    (light,) = bench.world.patterns
+    (light,) = bench.world.switched
     np.testing.assert_allclose(light.led_shares, 1e-3 * np.array(gains))
     given = [float(bench.ask(f"DOSE? {led}")) for led in (0, 100)]
     shares = 0.5 * (1.0 + WAYS[[0, 100], 0])
@@ -344,7 +344,7 @@ def test_gains_dim_their_leds_in_every_pattern(bench):
     assert bench.ask("GAIN:CRC?") == "0,FFFF"
     bench.ask("PATT X,50")
     bench.wait(0.1)
-    assert bench.world.patterns[-1].led_shares == ()
+    assert bench.world.switched[-1].led_shares == ()
 
 
 @pytest.mark.parametrize("forget", ["*RST", "power"])
@@ -367,8 +367,8 @@ def test_a_dead_led_is_named_once_and_a_weak_one_is_not_but_the_scene_learns_of_
     bench.run(rows_of(["x", "-x"]))
     bench.wait(0.3)
     assert bench.events("LED:FAIL") == ["5"]
-    assert len(bench.world.patterns) == 2
-    for light in bench.world.patterns:
+    assert len(bench.world.switched) == 2
+    for light in bench.world.switched:
         assert len(light.led_shares) == LEDS
         assert {k: s for k, s in enumerate(light.led_shares) if s != 1.0} == {5: 0.0, 9: 0.25}
     bench.run(rows_of(["y"]), "r2")

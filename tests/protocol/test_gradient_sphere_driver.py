@@ -103,7 +103,7 @@ def test_sixteen_conditions_are_scanned_once_armed_and_every_release_is_timed(be
     assert box.step_time(16) is None
     position = box.position()
     assert (position.state, position.row, position.rows, position.token) == ("DONE", 15, 16, "r")
-    patterns = [(p.pattern, p.analyser_deg) for p in bench.world.patterns]
+    patterns = [(p.pattern, p.analyser_deg) for p in bench.world.switched]
     assert patterns == [(n, 0.0) for n in CALM[:7]] + [(n, 90.0) for n in CALM[6::-1]]
     assert box.analyser_deg() == 90.0
 
@@ -180,12 +180,12 @@ def test_gains_are_sent_whole_and_forgotten(bench):
     box.arm()
     box.light("full", 0.02)
     box.listen(0.1)
-    (light,) = bench.world.patterns
+    (light,) = bench.world.switched
     np.testing.assert_allclose(light.led_shares, gains, atol=5.1e-4)
     box.clear_gains()
     box.light("full", 0.02)
     box.listen(0.1)
-    assert bench.world.patterns[-1].led_shares == ()
+    assert bench.world.switched[-1].led_shares == ()
     with pytest.raises(ValueError, match=r"gains\[1\]"):
         box.set_gains([1.0, 1.1])
 

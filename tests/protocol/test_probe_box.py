@@ -100,7 +100,7 @@ def test_the_shutter_opens_pulses_the_camera_line_and_closes_by_itself(bench):
     assert bench.ask("*OPC?") == "1"
     assert bench.events("SHUT:END") == [f"1,TIMED,{opened_us},{opened_us + 500_000}"]
     assert bench.ask("SHUT:LAST?") == f"1,TIMED,{opened_us},{opened_us + 500_000}"
-    (seen,) = bench.world.sources
+    (seen,) = bench.world.switched
     assert (seen.level, seen.fibre) == (0.8, None)
     assert (seen.t_on_s, seen.t_off_s) == pytest.approx((begin_s + 0.001, begin_s + 0.501))
 
@@ -112,13 +112,13 @@ def test_an_opening_ends_on_time_although_the_host_is_silent(bench, ms):
     open_for(bench, ms)
     bench.silence(4.9)
     if ms < 4000:
-        (seen,) = bench.world.sources
+        (seen,) = bench.world.switched
         assert seen.t_off_s - seen.t_on_s == pytest.approx(ms / 1e3, abs=1e-9)
         assert bench.box.armed
     else:
         # a host that stays silent for the lease loses the light before
         bench.silence(30.0)
-        (seen,) = bench.world.sources
+        (seen,) = bench.world.switched
         assert seen.t_off_s == pytest.approx(seen.t_on_s + 5.0)
 
 
@@ -126,7 +126,7 @@ def test_thirty_seconds_of_light_are_the_most_while_the_host_lives(bench):
     light(bench, ms=60_000)
     open_for(bench, 30_000)
     bench.wait(31.0)
-    (seen,) = bench.world.sources
+    (seen,) = bench.world.switched
     assert seen.t_off_s - seen.t_on_s == pytest.approx(30.0, abs=1e-9)
 
 
@@ -136,7 +136,7 @@ def test_a_shutter_that_opens_in_the_dark_gives_no_light_but_a_pulse(bench):
     assert not bench.unit.lit
     bench.wait(0.2)
     assert len(bench.edges) == 1
-    assert bench.world.sources == []
+    assert bench.world.switched == []
 
 
 @pytest.mark.parametrize(
@@ -147,12 +147,12 @@ def test_nothing_is_changed_while_the_shutter_is_open(bench, text):
     open_for(bench, 400)
     assert bench.code(text) == Code.IGNORED
     bench.wait(0.5)
-    assert bench.world.sources == [SourceLight(0.8, *_span(bench), None)]
+    assert bench.world.switched == [SourceLight(0.8, *_span(bench), None)]
     assert bench.unit.shutter.count == 1
 
 
 def _span(bench):
-    (seen,) = bench.world.sources
+    (seen,) = bench.world.switched
     return seen.t_on_s, seen.t_off_s
 
 
@@ -162,7 +162,7 @@ def test_light_that_goes_on_is_told_so_far(bench):
     bench.wait(0.1)
     (seen,) = bench.unit.light_now(bench.now)
     assert seen.t_off_s == bench.now
-    assert bench.world.sources == []
+    assert bench.world.switched == []
 
 
 def test_the_led_is_put_out_under_an_open_shutter(bench):
@@ -171,7 +171,7 @@ def test_the_led_is_put_out_under_an_open_shutter(bench):
     bench.wait(0.1)
     bench.ask("LED 0")
     bench.wait(0.5)
-    (seen,) = bench.world.sources
+    (seen,) = bench.world.switched
     assert seen.t_off_s - seen.t_on_s == pytest.approx(0.1, abs=1e-9)
 
 
@@ -188,13 +188,15 @@ def test_no_light_leaves_a_head_that_is_not_held(bench):
     # the pump's own end ends a light that was to be longer
     assert open_for(bench, 10_000)[0] == 2
     bench.wait(2.0)
-    assert [light.t_off_s for light in bench.world.sources] == pytest.approx([2.102, 4.0], abs=2e-3)
+    assert [light.t_off_s for light in bench.world.switched] == pytest.approx(
+        [2.102, 4.0], abs=2e-3
+    )
     assert bench.events("SHUT:END")[-1].split(",")[1] == "PUMP"
     assert bench.code("SHUT OPEN,100") == Code.IGNORED
     assert bench.ask("HEAD:SITE?") == "cheek,0"
     bench.ask("LED 0")
     assert open_for(bench, 100)[0] == 3
-    assert len(bench.world.sources) == 2
+    assert len(bench.world.switched) == 2
 
 
 def test_a_light_ends_with_the_suction_that_is_vented(bench):
@@ -202,7 +204,7 @@ def test_a_light_ends_with_the_suction_that_is_vented(bench):
     open_for(bench, 10_000)
     bench.wait(0.2)
     bench.ask("PUMP VENT")
-    (seen,) = bench.world.sources
+    (seen,) = bench.world.switched
     assert seen.t_off_s == bench.now
 
 
@@ -218,7 +220,7 @@ def test_the_cover_takes_its_time_and_leaves_one_fibre(bench):
     assert bench.ask("*OPC?") == "1"  # it is there
     open_for(bench, 100)
     bench.wait(0.2)
-    assert bench.world.sources[0].fibre == 12
+    assert bench.world.switched[0].fibre == 12
     bench.ask("*RST")
     assert bench.ask("FIB?") == "ALL"
 
@@ -236,7 +238,7 @@ def test_a_retry_of_an_opening_opens_once_and_is_answered_alike(bench):
     bench.silence(1.0)
     assert bench.raw(frame) == first
     assert bench.ask("SHUT?") == "CLOSED"
-    assert (bench.unit.shutter.count, len(bench.edges), len(bench.world.sources)) == (1, 1, 1)
+    assert (bench.unit.shutter.count, len(bench.edges), len(bench.world.switched)) == (1, 1, 1)
 
 
 def test_a_retry_of_a_suction_sucks_once(bench):
@@ -254,7 +256,7 @@ def test_a_shutter_that_does_not_open_says_so_and_pulses_nothing():
     light(bench)
     assert open_for(bench, 100) == Code.HARDWARE
     bench.wait(0.5)
-    assert (bench.edges, bench.world.sources) == ([], [])
+    assert (bench.edges, bench.world.switched) == ([], [])
     assert bench.ask("SHUT:LAST?") == "NONE"
     assert bench.ask("SHUT:COUN?") == "1"
 
@@ -272,7 +274,7 @@ def test_blades_that_do_not_close_put_the_led_out(end):
     else:
         bench.ask(end)
         bench.wait(0.5)
-    (seen,) = bench.world.sources
+    (seen,) = bench.world.switched
     spent_s = {"own": 0.12, "SHUT CLOSE": 0.07, "SAFE": 0.05, "silence": 1.05}[end]
     assert seen.t_off_s - seen.t_on_s == pytest.approx(spent_s, abs=1e-9)
     assert bench.ask("SHUT?") == "JAM"
@@ -295,7 +297,7 @@ def test_a_dead_led_is_refused_and_a_weak_one_is_not_noticed():
     light(weak, 500)
     open_for(weak, 100)
     weak.wait(0.2)
-    assert weak.world.sources[0].level == pytest.approx(0.25)
+    assert weak.world.switched[0].level == pytest.approx(0.25)
 
 
 def test_the_dose_of_a_subject_is_counted_and_limited(bench):
@@ -404,7 +406,7 @@ def test_a_head_that_was_let_go_must_be_placed_again(bench, let_go):
     else:
         bench.ask(let_go)
     assert not bench.unit.lit
-    assert len(bench.world.sources) == 1
+    assert len(bench.world.switched) == 1
     assert not bench.unit.pump.drawing
     state = bench.world.head_at(bench.now)
     assert (state.site, state.placed) == ("", False)
@@ -423,7 +425,7 @@ def test_a_silent_host_is_dark_and_vented_within_the_lease(bench):
     bench.ask("SYST:PING?")
     silent_s = bench.now
     bench.silence(2.0)
-    (seen,) = bench.world.sources
+    (seen,) = bench.world.switched
     assert seen.t_off_s <= silent_s + 0.3 + 0.010
     vented_s = [t for t, _ in bench.world.heads][-1]
     assert vented_s <= silent_s + 0.3 + 0.010
@@ -465,7 +467,7 @@ def test_a_head_that_comes_off_is_vented_and_dark_at_once():
     bench.ask("LED 1000")
     open_for(bench, 10_000)
     bench.wait(1.5)
-    (seen,) = bench.world.sources
+    (seen,) = bench.world.switched
     assert 4.0 < seen.t_off_s <= 4.0 + 2.0 * PUMP_CONTROL_PERIOD_S
     assert bench.events("PUMP:END")[0].split(",")[1] == "LOST"
     assert bench.events("SHUT:END")[0].split(",")[1] == "PUMP"
@@ -507,7 +509,7 @@ def test_the_emergency_stop_lets_go_and_bars_light_and_suction():
     bench.ask("LED 1000")
     open_for(bench, 20_000)
     bench.wait(6.1 - bench.now)
-    (seen,) = bench.world.sources
+    (seen,) = bench.world.switched
     assert seen.t_off_s == 6.0
     assert bench.events("PUMP:END")[0].split(",")[1] == "INTERLOCK"
     assert int(bench.ask("STAT?")) & 256
@@ -536,7 +538,7 @@ def test_one_big_step_of_time_equals_many_small_ones():
         until = bench.now + 4.9
         while bench.now < until - 1e-9:
             bench.silence(min(step_s, until - bench.now))
-        return bench.said, bench.world.sources, bench.world.heads
+        return bench.said, bench.world.switched, bench.world.heads
 
     (said, lights, heads), (said_finely, lights_finely, heads_finely) = play(4.9), play(0.0031)
     assert said == said_finely

@@ -170,7 +170,7 @@ def test_nothing_shines_or_sucks_unarmed_or_unplaced(bench):
     assert refused(box.suck, 150.5, 5.0) == Code.OUT_OF_RANGE
     assert refused(box.suck, 60.0, 60.1) == Code.OUT_OF_RANGE
     assert refused(box.open_shutter, 30.1) == Code.OUT_OF_RANGE
-    assert bench.world.sources == []
+    assert bench.world.switched == []
 
 
 def test_no_light_leaves_a_head_that_is_not_held(bench):
@@ -182,7 +182,7 @@ def test_no_light_leaves_a_head_that_is_not_held(bench):
     box.open_shutter(20.0)
     box.vent()
     assert box.last_opening().ended == "pump"
-    assert len(bench.world.sources) == 1
+    assert len(bench.world.switched) == 1
     assert refused(box.open_shutter, 0.1) == Code.IGNORED
 
 
@@ -211,7 +211,7 @@ def test_one_fibre_is_left_uncovered_and_the_light_tells(bench):
         assert box.uncovered() == fibre
         box.open_shutter(0.05)
         box.listen(0.1)
-    assert [seen.fibre for seen in bench.world.sources] == [3, 27, None]
+    assert [seen.fibre for seen in bench.world.switched] == [3, 27, None]
     assert refused(box.cover, 28) == Code.OUT_OF_RANGE
 
 
@@ -224,7 +224,7 @@ def test_the_shutter_is_closed_before_its_end(bench):
     box.close_shutter()
     assert box.last_opening().ended == "asked"
     assert not box.status().busy
-    (seen,) = bench.world.sources
+    (seen,) = bench.world.switched
     assert seen.t_off_s - seen.t_on_s < 2.0
 
 
@@ -249,7 +249,7 @@ def test_what_lets_go_ends_light_and_suction(bench, end):
     light(bench.box)
     bench.box.open_shutter(20.0)
     getattr(bench.box, end)()
-    assert len(bench.world.sources) == 1
+    assert len(bench.world.switched) == 1
     unit = bench.world.box("probe").device
     assert (unit.lit, unit.pump.drawing) == (False, False)
     assert not bench.world.head_at(bench.world.now).placed
@@ -295,7 +295,7 @@ def test_a_stuck_shutter_is_refused_and_a_jammed_one_is_told(alone):
     world, box = alone(shutter_stuck=1.0)
     light(box)
     assert refused(box.open_shutter, 0.1) == Code.HARDWARE
-    assert (box.openings(), box.last_opening(), world.sources) == (1, None, [])
+    assert (box.openings(), box.last_opening(), world.switched) == (1, None, [])
     box.close()
     world, box = alone(shutter_jam=1.0)
     light(box)

@@ -27,9 +27,8 @@ LIGHT = 45
 class MattScene(DirectScene):
     """A dome whose skin does not shine: the diffuse term behind the boundary alone."""
 
-    def surface(self, view: View) -> SkinSurface:
-        """Return how the face reflects for a camera."""
-        surface = super().surface(view)
+    def _surface(self, camera: str) -> SkinSurface:
+        surface = super()._surface(camera)
         return dataclasses.replace(surface, bare=np.zeros_like(surface.bare))
 
 

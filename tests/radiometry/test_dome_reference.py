@@ -91,14 +91,14 @@ def test_each_light_of_a_view_is_mitsubas_image_under_that_light(rig, face, view
 
 
 class Rougher(PlainScene):
-    def surface(self, view):
-        surface = super().surface(view)
+    def _surface(self, camera):
+        surface = super()._surface(camera)
         return dataclasses.replace(surface, roughness=surface.roughness * np.float32(1.03))
 
 
 class Paler(PlainScene):
-    def surface(self, view):
-        surface = super().surface(view)
+    def _surface(self, camera):
+        surface = super()._surface(camera)
         return dataclasses.replace(surface, r_d=surface.r_d * np.float32(1.01))
 
 

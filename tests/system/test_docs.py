@@ -17,6 +17,7 @@ from fixtures.product_code import PACKAGES, modules, tree_of
 from capture.devices import wire
 from capture.rig import load_rig
 from rigsim.boxes.controller import Controller
+from rigsim.boxes.device import Wiring
 from rigsim.boxes.flash import FlashUnit
 from skinrig.cli import app
 from skinrig.commands.help import RigFileGroup, RigGroup
@@ -51,12 +52,7 @@ def rows(page, heading):
 
 
 def flash_box():
-    unit = FlashUnit(
-        load_rig("flash"),
-        on_pop=lambda pop: None,
-        on_trigger=lambda t_s: None,
-        rng=np.random.default_rng(0),
-    )
+    unit = FlashUnit(Wiring(rig=load_rig("flash"), rng=np.random.default_rng(0)))
     return Controller(unit, serial="FL-0001", rng=np.random.default_rng(1))
 
 

@@ -62,9 +62,9 @@ class Comparison:
         return way.seconds / self.ours.seconds * min(1.0, (way.error / self.ours.error) ** 2)
 
 
-def plain_face(preset: str = "III", *, seed: int = 0, size: int = 512) -> SimulatedSubject:
+def plain_face(preset: str = "III", *, size: int = 512) -> SimulatedSubject:
     """Return a face whose normals are those of its mesh: without pores and wrinkles."""
-    face = make_subject(preset, seed=seed, size=size)
+    face = make_subject(preset, size=size)
     return dataclasses.replace(face, normal=face.atlas.normal)
 
 
@@ -74,23 +74,15 @@ DIRECT_LIGHT: Final = SceneEffects(lateral=False, interreflections=False)
 class DirectScene(DomeScene):
     """A dome where light goes from an LED to the skin and to the camera, unless asked otherwise."""
 
-    def __init__(
-        self,
-        rig: Rig,
-        subject: SimulatedSubject,
-        *,
-        effects: SceneEffects = DIRECT_LIGHT,
-        **settings: Any,
-    ) -> None:
-        super().__init__(rig, subject, effects=effects, **settings)
+    def __init__(self, rig: Rig, subject: SimulatedSubject, **settings: Any) -> None:
+        super().__init__(rig, subject, **({"effects": DIRECT_LIGHT} | settings))
 
 
 class PlainScene(DirectScene):
     """A dome whose skin has no vellus hair and no brows."""
 
-    def surface(self, view: View) -> SkinSurface:
-        """Return how the face reflects for a camera."""
-        surface = super().surface(view)
+    def _surface(self, camera: str) -> SkinSurface:
+        surface = super()._surface(camera)
         none = np.zeros_like(surface.fuzz)
         return dataclasses.replace(surface, fuzz=none, bare=np.ones_like(none))
 

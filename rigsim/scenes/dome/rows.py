@@ -2,22 +2,35 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from capture.rig import View
-from rigsim.arrays import Float32Array, Float64Array
+from rigsim.arrays import Float32Array, Float64Array, Int32Array
 from rigsim.as_built.dome import BuiltDome
-from rigsim.geometry.atlas import dilate_texture, unwrap
+from rigsim.geometry.atlas import dilate_texture, sample, unwrap
+from rigsim.kept import Kept
+from rigsim.light.lateral_scattering import LateralScattering
 from rigsim.light.led_light import lobe_exponent
-from rigsim.light.olat import Hits, Lamp
+from rigsim.light.olat import Hits, Lamp, Looking, find_hits
+from rigsim.light.olat_kernels import MATT_ROWS, METAL_ROWS, SKIN_ROWS
 from rigsim.light.olat_vector import VectorLight
-from rigsim.render import Caster
-from rigsim.scenes.dome.views import Looking, at_skin, at_target
-from rigsim.scenes.exposing import Kept, SceneError
+from rigsim.render import Caster, GBuffer
+from rigsim.scenes.exposing import SceneError
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.head_motion import HeadMotion
 from rigsim.targets import Target
+
+Float16Array = NDArray[np.float16]
+
+KEPT_GLOW_BYTES: Final = 2**29
+"""Latest light from inside that is kept: it is the same for all cameras, which ask one after the
+other for many lights."""
+
+HALF_RANGE: Final = 1000.0
+"""Its greatest value where it is kept with 11 bits, which resolve 1e-10 of that."""
 
 
 class DomeRows:
@@ -42,7 +55,6 @@ class DomeRows:
         dome: BuiltDome,
         subject: SimulatedSubject | Target,
         caster: Caster,
-        *,
         motion: HeadMotion | None,
         how: Looking,
     ) -> None:
@@ -69,7 +81,7 @@ class DomeRows:
         )
 
     def seen(
-        self, view: View, t_s: float, texture: Callable[[View], Float32Array]
+        self, view: View, t_s: float, texture: Callable[[str], Float32Array]
     ) -> tuple[Hits, Caster]:
         """Return a camera's rows and the mesh that casts shadows on them.
 
@@ -80,7 +92,8 @@ class DomeRows:
         t_s
             World time, s.
         texture
-            How the face reflects for a camera, with its normals, (N, N, C); of a target not asked.
+            How the face reflects for a camera's colors, with its normals, (N, N, C); not asked of a
+            target.
         """
         return self._hits.get((view.name, t_s), lambda: self._look(view, t_s, texture))
 
@@ -92,7 +105,7 @@ class DomeRows:
         return (np.eye(3), np.zeros(3)) if self._motion is None else self._motion.pose(t_s)
 
     def _look(
-        self, view: View, t_s: float, texture_of: Callable[[View], Float32Array]
+        self, view: View, t_s: float, texture_of: Callable[[str], Float32Array]
     ) -> tuple[Hits, Caster]:
         rotation, shift = self._pose(t_s)
         moved = dataclasses.replace(
@@ -108,7 +121,7 @@ class DomeRows:
                 raise SceneError(f"target {subject.name!r}: shines itself, no dome holds it")
             return at_target(caster, moved, subject, how, distortion), caster
         amount = 0.0 if self._motion is None else self._motion.twitch(t_s)
-        texture = texture_of(view)
+        texture = texture_of(view.spectral_sensitivity)
         if amount > 0.0 and self._motion is not None:
             mesh, atlas = self._motion.twitched(subject.mesh, amount), subject.atlas
             caster = Caster(mesh, choice=caster.choice)
@@ -121,3 +134,100 @@ class DomeRows:
 def _vector(values: Float64Array) -> tuple[float, float, float]:
     x, y, z = (float(v) for v in values)
     return x, y, z
+
+
+class DomeSubsurfaceRadiance:
+    """What leaves the interior of one face besides what its own points send back.
+
+    Parameters
+    ----------
+    scattering
+        Returns the face, ready to be lit from within, for a camera's colors.
+    """
+
+    def __init__(self, scattering: Callable[[str], LateralScattering]) -> None:
+        self._scattering = scattering
+        self._kept: Kept[tuple[str, int, float], tuple[np.float32, Float16Array]] = Kept(
+            lambda glow: KEPT_GLOW_BYTES // glow[1].nbytes
+        )
+
+    def on_rows(self, hits: Hits, lamp: Lamp, view: View, light: int, t_s: float) -> Float32Array:
+        """Return the light from inside at a camera's rows.
+
+        Parameters
+        ----------
+        hits
+            The rows.
+        lamp
+            The light, in the frame of the mesh.
+        view
+            The camera; its colors count.
+        light, t_s
+            Number of the light and world time in s, by which it is kept.
+
+        Returns
+        -------
+        ndarray of float32
+            pi times radiance before the boundary, (n, 3), see `rigsim.light.lateral_scattering`.
+        """
+        camera = view.spectral_sensitivity
+
+        def lit() -> tuple[np.float32, Float16Array]:
+            glow = self._scattering(camera).glow(lamp)
+            unit = np.float32(max(float(glow.max()), 1e-30) / HALF_RANGE)
+            return unit, np.asarray(glow / unit, np.float16)
+
+        unit, kept = self._kept.get((camera, light, t_s), lit)
+        uv = hits.texture_uv()
+        return unit * sample(kept.astype(np.float32), uv, np.ones(len(uv), np.bool_))
+
+
+def at_skin(
+    caster: Caster, view: View, texture: Float32Array, how: Looking, distortion: ArrayLike | None
+) -> Hits:
+    """Look at a face.
+
+    Parameters
+    ----------
+    caster
+        Its mesh.
+    view
+        The camera, in the frame of the mesh.
+    texture
+        Surface and normals with relief in the last three, shape (N, N, 10) or (N, N, 14).
+    how, distortion
+        Rays and lens; its distortion, see `rigsim.render.camera_rays`.
+    """
+
+    def look_up(buffers: GBuffer, rows: Int32Array) -> tuple[Float32Array, Float32Array]:
+        uv = buffers.uv.reshape(-1, 2)[rows]
+        values = sample(texture, uv, np.ones(len(rows), np.bool_))
+        return unit(values[:, -3:]), np.maximum(values[:, :-3], 0.0)
+
+    return find_hits(caster, view, look_up, how, SKIN_ROWS, distortion)
+
+
+def at_target(
+    caster: Caster, view: View, target: Target, how: Looking, distortion: ArrayLike | None
+) -> Hits:
+    """Look at a target that reflects."""
+    rgb = target.rgb(view.spectral_sensitivity, how.illuminant)
+
+    def look_up(buffers: GBuffer, rows: Int32Array) -> tuple[Float32Array, Float32Array]:
+        uv = buffers.uv.reshape(-1, 2)[rows]
+        surface = np.zeros((len(rows), 7), np.float32)
+        size = rgb.shape[0]
+        column = np.clip((uv[:, 0] * size).astype(np.int64), 0, size - 1)
+        row = np.clip(((1.0 - uv[:, 1]) * size).astype(np.int64), 0, size - 1)
+        surface[:, :3] = rgb[row, column]
+        surface[:, 3] = target.alpha
+        return buffers.normal.reshape(-1, 3)[rows], surface
+
+    kind = METAL_ROWS if target.kind == "metal" else MATT_ROWS
+    return find_hits(caster, view, look_up, how, kind, distortion)
+
+
+def unit(vectors: Float32Array) -> Float32Array:
+    """Return vectors of length 1, shape (..., 3); those of length 0 stay."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.maximum(length, np.float32(1e-6)), np.float32)

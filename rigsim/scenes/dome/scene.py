@@ -16,6 +16,8 @@ images, responses that differ, dead LEDs and crossed wires.
 """
 
 from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,14 +27,15 @@ from model import spectra
 from model.skin import SkinAppearance
 from rigsim.arrays import Float32Array, Float64Array, UInt16Array
 from rigsim.as_built.dome import BuiltDome
-from rigsim.boxes.dome import LedPulse
+from rigsim.boxes.led_table import LedPulse
 from rigsim.geometry.atlas import dilate_texture, sample
+from rigsim.kept import Kept, kept
 from rigsim.light import olat, surface_brdf
 from rigsim.light.interreflection import interreflection_for
 from rigsim.light.interreflection_color import Bounces
 from rigsim.light.lateral_scattering import LateralScattering
 from rigsim.light.led_light import white_intensity
-from rigsim.light.olat import Hits, Lamp
+from rigsim.light.olat import Hits, Lamp, Looking
 from rigsim.light.olat_kernels import SKIN_ROWS
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.seen_skin import SeenSkin
@@ -45,14 +48,18 @@ from rigsim.population import conditions as skin_conditions
 from rigsim.render import Caster
 from rigsim.render.variant import VariantChoice
 from rigsim.scenes.dome import truth as dome_truth
-from rigsim.scenes.dome.exposures import Exposures
-from rigsim.scenes.dome.rows import DomeRows
-from rigsim.scenes.dome.subsurface_radiance import DomeSubsurfaceRadiance
-from rigsim.scenes.dome.views import Looking, unit
-from rigsim.scenes.exposing import FaceScene, SceneError
+from rigsim.scenes.dome.rows import DomeRows, DomeSubsurfaceRadiance, unit
+from rigsim.scenes.exposing import FaceScene, SceneError, full_power_s
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.head_motion import HeadMotion
 from rigsim.targets import Target
+
+LED_POWER_DEVIATION: Final = 0.001
+"""Relative standard deviation of an LED's energy from pulse to pulse."""
+
+KEPT_FRAMES: Final = 16
+KEPT_FRAME_BYTES: Final = 2**28
+"""Latest frames that are kept, the more of the two, so that a second exposure costs nothing."""
 
 
 class DomeScene(FaceScene):
@@ -118,31 +125,15 @@ class DomeScene(FaceScene):
             subject = skin_conditions.conditioned_subject(subject, self.conditions)
         elif self.conditions:
             raise SceneError(f"conditions: got {', '.join(self.conditions)}, but a target has none")
-        super().__init__(
-            dome.rig,
-            subject,
-            state=state,
-            movement=movement,
-            sensor=None,
-            seed=seed,
-            subpixels=subpixels,
-        )
+        super().__init__(dome.rig, subject, state, movement, None, seed, subpixels)
         self.motion = motion
         self._effects = effects
         self._caster = Caster(self.subject.mesh, choice=choice)
-        self._surfaces: dict[str, SkinSurface] = {}
-        self._textures: dict[str, Float32Array] = {}
         noise = least_noise([Noise.of(sensor) for sensor in self._sensors.values()])
         share = exchange_share(self._caster)
-        self.needs = dome_needs(
-            rig,
-            self.subject,
-            state,
-            self._scenery(rig.views[0], self._caster, share, noise, effects),
-            white_rgb=None if on_s is None else on_s * self._white_in_origin(),
-            movement=movement,
-            motion=motion,
-        )
+        scenery = self._scenery(rig.views[0], self._caster, share, noise, effects)
+        white = None if on_s is None else on_s * self._white_in_origin()
+        self.needs = dome_needs(rig, self.subject, state, scenery, white, movement, motion)
         self.interreflections = self.needs.builds(face_needs.INTERREFLECTION_EFFECT)
         self.subsurface = self.needs.builds(face_needs.LATERAL_EFFECT)
         self.optics = self.needs.builds(face_needs.LENS_EFFECT)
@@ -154,27 +145,23 @@ class DomeScene(FaceScene):
             if self.subsurface or self.interreflections:
                 self._glow = DomeSubsurfaceRadiance(self._scattering)
         how = Looking(subpixels, self._illuminant, self.optics)
-        self._rows = DomeRows(dome, self.subject, self._caster, motion=motion, how=how)
-        self._exposures = Exposures(dome, self._render, self._rows.instant, seed=seed)
+        self._rows = DomeRows(dome, self.subject, self._caster, motion, how)
+        # a capture comes back to each light in its next pass
+        self._frames: Kept[tuple[str, int, float], Float32Array] = Kept(
+            lambda frame: max(KEPT_FRAMES, KEPT_FRAME_BYTES // frame.nbytes)
+        )
 
-    def _scattering(self, view: View) -> LateralScattering:
-        """Return the face, ready to be lit from within for a camera."""
-        skin = SeenSkin(self._face(), "neutral", view.spectral_sensitivity, self._illuminant)
+    @kept
+    def _scattering(self, camera: str) -> LateralScattering:
+        """Return the face, ready to be lit from within for a camera's colors."""
+        skin = SeenSkin(self._face(), "neutral", camera, self._illuminant)
         bounces = None
         if self.interreflections:
-            spectral, enough = (
-                self.needs.builds(face_needs.SPECTRAL_EFFECT),
-                self._last_bounce(self._effects),
-            )
+            spectral = self.needs.builds(face_needs.SPECTRAL_EFFECT)
+            enough = self._last_bounce(self._effects)
             bounces = Bounces(interreflection_for(self._caster), spectral, enough=enough)
-        return LateralScattering(
-            skin,
-            self.surface(view),
-            self._caster,
-            subsurface=self.subsurface,
-            bounces=bounces,
-            relief=self._relief,
-        )
+        surface, spread = self._surface(camera), self.subsurface
+        return LateralScattering(skin, surface, self._caster, spread, bounces, self._relief)
 
     def white_rgb(self, view_name: str | None = None) -> Float32Array:
         """Return the camera RGB of white under the LEDs, shape (3,), the strongest channel 1."""
@@ -253,8 +240,22 @@ class DomeScene(FaceScene):
             Raw DN, shape (H, W).
         """
         view = self._camera(view_name)
-        sensor = self._sensors[view.name]
-        return self._exposures.expose(view, sensor, pops=pops, exposure_s=exposure_s, seed=seed)
+
+        def frame(pulse: LedPulse) -> Float32Array:
+            middle = self._rows.instant(0.5 * (pulse.t_on_s + pulse.t_off_s))
+            led = self.dome.answering(pulse.led)
+            render = partial(self._render, view, led, middle)
+            return self._frames.get((view.name, led, middle), render)
+
+        return self._expose(
+            view,
+            pops,
+            lambda pulse: full_power_s(pulse, f"LED {pulse.led}"),
+            frame,
+            deviation=LED_POWER_DEVIATION,
+            exposure_s=exposure_s,
+            seed=seed,
+        )
 
     # truth ------------------------------------------------------------------------------------
 
@@ -306,12 +307,10 @@ class DomeScene(FaceScene):
             ``position_at_rest``, of one under conditions its coating (`Coating`); valid on bare
             skin. All is that of the skin under its conditions.
         """
+        surface = self.surface(self._camera(view_name))
+        left_out = tuple(self.left_out)
         return dome_truth.appearance_of(
-            self._face(),
-            self.surface(self._camera(view_name)),
-            conditions=self.conditions,
-            left_out=tuple(self.left_out),
-            seed=self.seed,
+            self._face(), surface, self.conditions, left_out=left_out, seed=self.seed
         )
 
     def brdf(
@@ -342,7 +341,7 @@ class DomeScene(FaceScene):
             Its surface terms, shape (n,).
         """
         self._face()
-        texture = self._texture(self._camera(view_name))
+        texture = self._texture(self._camera(view_name).spectral_sensitivity)
         points = np.atleast_2d(np.asarray(uv, np.float32))
         values = sample(texture, points, np.ones(len(points), np.bool_))
         return surface_brdf.evaluate(values[:, :-3], unit(values[:, -3:]), to_light, to_camera)
@@ -351,21 +350,20 @@ class DomeScene(FaceScene):
 
     def surface(self, view: View) -> SkinSurface:
         """Return how the face reflects for a camera, under its conditions."""
-        camera = view.spectral_sensitivity
-        if camera not in self._surfaces:
-            face = self._face()
-            bare = skin_surface(face, camera, self._illuminant, state=self.state)
-            self._surfaces[camera] = skin_conditions.coated(face, bare, self.conditions)
-        return self._surfaces[camera]
+        return self._surface(view.spectral_sensitivity)
 
-    def _texture(self, view: View) -> Float32Array:
+    @kept
+    def _surface(self, camera: str) -> SkinSurface:
+        face = self._face()
+        bare = skin_surface(face, camera, self._illuminant, state=self.state)
+        return skin_conditions.coated(face, bare, self.conditions)
+
+    @kept
+    def _texture(self, camera: str) -> Float32Array:
         """Return the surface and its normals with relief, shape (N, N, 10) or (N, N, 14)."""
-        camera = view.spectral_sensitivity
-        if camera not in self._textures:
-            atlas, surface = self._face().atlas, self.surface(view)
-            layers = np.concatenate([surface.packed(), surface.normal], axis=-1)
-            self._textures[camera] = dilate_texture(layers, atlas.covered)
-        return self._textures[camera]
+        surface = self._surface(camera)
+        layers = np.concatenate([surface.packed(), surface.normal], axis=-1)
+        return dilate_texture(layers, self._face().atlas.covered)
 
     def _render(self, view: View, light: int, t_s: float) -> Float32Array:
         if not 0 <= light < len(self.rig.lights):

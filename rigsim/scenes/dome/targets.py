@@ -13,15 +13,16 @@ from typing import Any, Final, Literal, TypeAlias, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from capture.rig import Rig, RigError, View
+from capture.rig import Rig, View
 from rigsim.arrays import Float32Array, Float64Array, Int64Array, UInt16Array
 from rigsim.as_built.dome import BuiltDome, build, image_of, pixel_corner_rays
-from rigsim.boxes.dome import LedPulse
+from rigsim.boxes.led_table import LedPulse
+from rigsim.kept import kept
 from rigsim.light.led_light import lobe_exponent, white_intensity
-from rigsim.needs.effects import Effect, EffectSelection, Noise, absent, decide, unmodeled
+from rigsim.needs.effects import Effect, EffectSelection, Noise, decide, left_out_of
 from rigsim.package_data import package_table
-from rigsim.scenes.dome.exposures import LED_POWER_DEVIATION
-from rigsim.scenes.exposing import RigScene
+from rigsim.scenes.dome.scene import LED_POWER_DEVIATION
+from rigsim.scenes.exposing import RigScene, SceneError, full_power_s
 from rigsim.sensor import expose, sensor_of
 from rigsim.targets import mirror_ball, printed_plate
 from rigsim.targets.printed_plate import CELL_MM, Plate
@@ -58,10 +59,6 @@ PLACEMENT_DEVIATION_DEG: Final = 2.0
 """Standard deviations of where an operator puts a target."""
 
 
-class TargetError(ValueError):
-    """A target is asked for something that it is not."""
-
-
 class TargetScene(RigScene):
     """A calibration target in the middle of a dome that was built near its drawing.
 
@@ -81,7 +78,7 @@ class TargetScene(RigScene):
         self, kind: Kind, dome: BuiltDome, *, seed: int, slope_deg: float = WHITE_SLOPE_DEG
     ) -> None:
         if kind not in get_args(Kind):
-            raise TargetError(f"target: got {kind!r}, expected one of {', '.join(get_args(Kind))}")
+            raise SceneError(f"target: got {kind!r}, expected one of {', '.join(get_args(Kind))}")
         self.kind = kind
         self.dome = dome
         self.rig = dome.rig
@@ -94,7 +91,6 @@ class TargetScene(RigScene):
             else printed_plate.charuco_board()
         )
         self._hand = rng.standard_normal((max(TARGET_POSES.values()), 6))
-        self._rays: dict[str, Float64Array] = {}
         self.needs = self._needs()
         lights = self.rig.lights
         self._lamp_mm = np.array([light.position_mm for light in lights])
@@ -117,25 +113,14 @@ class TargetScene(RigScene):
                 switch="",
                 because=f"{100 * LED_SIZES:g} % of the light",
             ),
-            *absent(
-                [
-                    ("the stand of the ball", "the ball floats"),
-                    ("LEDs seen past boards and plates", "the dome behind them is dark"),
-                ]
-            ),
-            *unmodeled(
-                [
-                    ("light from the cloth on boards and plates", "0.1 % of the direct light"),
-                    ("blur of the lenses", "every pixel averages over its own square"),
-                ]
-            ),
+            *left_out_of("dome_target"),
         ]
         return EffectSelection(tuple(effects))
 
     def show(self, pose: int) -> None:
         """Put the target into its place number ``pose``."""
         if not 0 <= pose < TARGET_POSES[self.kind]:
-            raise TargetError(f"pose: got {pose}, expected 0 to {TARGET_POSES[self.kind] - 1}")
+            raise SceneError(f"pose: got {pose}, expected 0 to {TARGET_POSES[self.kind] - 1}")
         self.pose = pose
 
     def exposure(
@@ -159,15 +144,13 @@ class TargetScene(RigScene):
         ndarray of uint16
             Raw DN, shape (H, W).
         """
-        view = self._view(view_name)
+        view = self._camera(view_name)
         rng = np.random.default_rng([self.seed, seed])
         on_s = np.zeros(len(self.rig.lights))
         for pulse in pops:
-            if not 0.0 <= pulse.level <= 1.0:
-                raise TargetError(f"level of LED {pulse.led}: got {pulse.level}, expected 0 to 1")
+            energy = full_power_s(pulse, f"LED {pulse.led}")
             light = self.dome.answering(pulse.led)
             if self.rig.lights[light].name not in self.dome.dead:
-                energy = pulse.level * (pulse.t_off_s - pulse.t_on_s)
                 on_s[light] += energy * (1.0 + LED_POWER_DEVIATION * rng.standard_normal())
         return expose(
             self.light(view_name, on_s), sensor=sensor_of(view), rng=rng, exposure_s=exposure_s
@@ -183,8 +166,7 @@ class TargetScene(RigScene):
         on_s
             Seconds that each light was on, times its level, shape (L,).
         """
-        view = self._view(view_name)
-        rays = self._corner_rays(view)
+        view = self._camera(view_name)
         seconds = np.asarray(on_s, np.float64)
         lit = np.nonzero(seconds > 0)[0]
         if not lit.size:
@@ -193,16 +175,13 @@ class TargetScene(RigScene):
         color = rgb[0] / rgb[0].max()
         strength = seconds[lit] * rgb.max(axis=1) * self.dome.gain.get(view_name, 1.0)
         lamps = (self._lamp_mm[lit], self.dome.axis[lit], self._exponent[lit], strength)
-        eye = np.array(view.position_mm)
         if self.kind == "mirror":
-            gray = self._ball(view, rays, eye, lit, lamps)
+            gray = self._ball(view, lit, lamps)
         else:
-            rotation, place = self.plate_pose()
-            plate = self._plate
-            paper = (plate.reflectance, CELL_MM, plate.waviness)
-            gray = printed_plate.plate_light(
-                rays, eye, rotation, place, *paper, *lamps, EDGE_SUBPIXELS
-            )
+            rays, eye = self._corner_rays(view), np.array(view.position_mm)
+            paper = (self._plate.reflectance, CELL_MM, self._plate.waviness)
+            how = (paper, lamps, EDGE_SUBPIXELS)
+            gray = printed_plate.plate_light(rays, eye, *self.plate_pose(), *how)
         return np.asarray(gray[..., None] * color.astype(np.float32))
 
     def plate_pose(self, pose: int | None = None) -> tuple[Float64Array, Float64Array]:
@@ -258,52 +237,32 @@ class TargetScene(RigScene):
             out["plate_pose"] = [self.plate_pose(k) for k in places]
         return out
 
-    def _view(self, name: str) -> View:
-        try:
-            return self.rig.view(name)
-        except RigError as error:
-            raise TargetError(str(error)) from error
-
+    @kept
     def _corner_rays(self, view: View) -> Float64Array:
-        if view.name not in self._rays:
-            distortion = self.dome.distortion.get(view.name, np.zeros(5))
-            self._rays[view.name] = pixel_corner_rays(view, distortion)
-        return self._rays[view.name]
+        return pixel_corner_rays(view, self.dome.distortion.get(view.name, np.zeros(5)))
 
-    def _ball(
-        self,
-        view: View,
-        rays: Float64Array,
-        eye: Float64Array,
-        lit: NDArray[np.intp],
-        lamps: tuple[Float64Array, Float64Array, Float64Array, Float64Array],
-    ) -> Float32Array:
+    def _ball(self, view: View, lit: NDArray[np.intp], lamps: mirror_ball.Lamps) -> Float32Array:
+        rays, eye = self._corner_rays(view), np.array(view.position_mm)
         place = self.ball_mm()
         ball = (place, BALL_RADIUS_MM, mirror_ball.CHROMIUM_REFLECTANCE)
-        cloth = mirror_ball.light_on_cloth(*lamps)
-        image = mirror_ball.surroundings(rays, eye, *ball, cloth, EDGE_SUBPIXELS)
+        cloth = mirror_ball.light_on_cloth(lamps)
+        image = mirror_ball.surroundings(rays, eye, ball, cloth, EDGE_SUBPIXELS)
         for index, lamp, axis, exponent, strength in zip(lit, *lamps, strict=True):
             radius = self.rig.lights[index].radius_mm
+            led = (lamp, axis, float(exponent), radius, float(strength))
             for reflected in (True, False):
-                box = self._box(view, eye, place, lamp, axis, radius, reflected=reflected)
-                if box is None:
-                    continue
-                led = (lamp, axis, float(exponent), radius, float(strength))
-                mirror_ball.add_lamp(image, rays, box, eye, *ball, *led, reflected, SPOT_SUBPIXELS)
+                box = self._box(view, place, led, reflected)
+                if box is not None:
+                    how = (reflected, SPOT_SUBPIXELS)
+                    mirror_ball.add_lamp(image, rays, box, eye, ball, led, *how)
         return np.asarray(image)
 
     def _box(
-        self,
-        view: View,
-        eye: Float64Array,
-        ball: Float64Array,
-        lamp: Float64Array,
-        axis: Float64Array,
-        radius: float,
-        *,
-        reflected: bool,
+        self, view: View, ball: Float64Array, led: mirror_ball.Led, reflected: bool
     ) -> Int64Array | None:
         """Return rows and columns that an LED can cover, or None outside the image."""
+        lamp, axis, _, radius, _ = led
+        eye = np.array(view.position_mm)
         if not reflected and (eye - lamp) @ axis <= 0.0:
             return None
         side = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])

@@ -11,7 +11,7 @@ from rigsim.light import olat, surface_brdf
 from rigsim.light.olat import Hits
 from rigsim.light.surface_brdf import SkinSurface
 from rigsim.population.population import MAX_SKIN_HAIR
-from rigsim.scenes.dome.views import unit
+from rigsim.scenes.dome.rows import unit
 from rigsim.subject import SimulatedSubject
 
 COATING_MAPS: Final = ("film", "film_alpha", "film_eta", "powder")
@@ -44,8 +44,8 @@ def maps_of(hits: Hits) -> dict[str, NDArray[np.generic]]:
 def appearance_of(
     subject: SimulatedSubject,
     surface: SkinSurface,
-    *,
     conditions: Mapping[str, float],
+    *,
     left_out: tuple[tuple[str, str], ...],
     seed: int,
 ) -> SkinAppearance:

@@ -7,6 +7,7 @@ number of pictures costs three renders, six where the face moves.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -15,10 +16,11 @@ from numpy.typing import NDArray
 from capture.rig import Rig
 from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.boxes.flash import FlashPop
-from rigsim.needs.effects import EFFECTS_BY_SIZE, EffectSelection, SceneEffects, unmodeled
-from rigsim.scenes.exposing import SceneError
-from rigsim.scenes.flash.scene import POP_ENERGY_DEVIATION, FlashScene
-from rigsim.sensor import expose
+from rigsim.kept import kept
+from rigsim.needs.effects import EffectSelection, left_out_of
+from rigsim.scenes.exposing import RigScene, SceneError
+from rigsim.scenes.flash.scene import POP_ENERGY_DEVIATION, FlashScene, pop_energy
+from rigsim.sensor import Sensor
 from rigsim.subject import SimulatedSubject, landmarks
 from rigsim.subject.perfusion_course import Course, with_blood
 
@@ -40,7 +42,7 @@ class FlashTime:
     """State that the face showed by its movement."""
 
 
-class FlashCourseScene:
+class FlashCourseScene(RigScene):
     """A face before the flash rig; see `rigsim.scenes.flash.scene.FlashScene`.
 
     Parameters
@@ -55,10 +57,6 @@ class FlashCourseScene:
         Seeds what differs from pop to pop.
     movement
         Whether the face moves with the expression, or only its blood changes.
-    effects
-        Effects of light that are asked for.
-    subpixels
-        Rays along each side of a pixel.
     on_flash
         Called with each flash that a camera saw.
     """
@@ -71,46 +69,29 @@ class FlashCourseScene:
         *,
         seed: int = 0,
         movement: bool = True,
-        effects: SceneEffects = EFFECTS_BY_SIZE,
-        subpixels: int = 2,
         on_flash: Callable[[FlashTime], None] | None = None,
     ) -> None:
-        self.rig = rig
-        self.subject = subject
-        self.course = course
-        self.seed = seed
-        self.movement = movement
-        self._on_flash = on_flash
-        self._effects, self._subpixels = effects, subpixels
-        self._scenes: dict[tuple[str, float], FlashScene] = {}
-        self._images: dict[tuple[object, ...], Float32Array] = {}
+        self.rig, self.subject, self.course = rig, subject, course
+        self.seed, self.movement, self._on_flash = seed, movement, on_flash
 
     def at(self, pose: str, level: float) -> FlashScene:
         """Return the scene of a pose and one of `BLOOD_LEVELS`; those of a pose share rays."""
-        shown = pose if self.movement else "neutral"
-        key = (shown, level)
-        if key not in self._scenes:
-            self._scenes[key] = FlashScene(
-                self.rig,
-                with_blood(self.subject, self.course.state, level),
-                state=shown,
-                seed=self.seed,
-                effects=self._effects,
-                subpixels=self._subpixels,
-            )
-        return self._scenes[key]
+        return self._scene(pose if self.movement else "neutral", level)
 
-    @property
-    def needs(self) -> EffectSelection:
+    @kept
+    def _scene(self, pose: str, level: float) -> FlashScene:
+        subject = with_blood(self.subject, self.course.state, level)
+        return FlashScene(self.rig, subject, state=pose, seed=self.seed)
+
+    @cached_property
+    def needs(self) -> EffectSelection:  # type: ignore[override]
         """What is built, what is not, and why."""
-        name = "the movement between two expressions"
-        between = unmodeled([(name, "the face is in one or the other")])
-        return EffectSelection((*self.at(self.course.state, 1.0).needs, *between))
+        whole = self.at(self.course.state, 1.0).needs
+        return EffectSelection((*whole, *left_out_of("course")))
 
-    @property
-    def left_out(self) -> list[tuple[str, str]]:
-        """What the scene does not build, with the reason."""
-        return self.needs.left_out
+    def sensor(self, view_name: str | None = None) -> Sensor:
+        """Return the sensor of a view; None takes the first."""
+        return self.at("neutral", BLOOD_LEVELS[0]).sensor(view_name)
 
     def radiance(
         self,
@@ -126,11 +107,9 @@ class FlashCourseScene:
         for node, weight in zip(BLOOD_LEVELS, parabola_weights(level), strict=True):
             if weight == 0.0:
                 continue
-            key = (pose if self.movement else "", node, polarizer, analyser_deg, view_name)
-            if key not in self._images:
-                scene = self.at(pose, node)
-                self._images[key] = scene.radiance(polarizer, analyser_deg, view_name=view_name)
-            part = np.float32(weight) * self._images[key]
+            shown = pose if self.movement else "neutral"
+            image = self._image(shown, node, polarizer, analyser_deg, view_name)
+            part = np.float32(weight) * image
             total = part if total is None else total + part
         if total is None:  # the weights sum to one
             raise SceneError(f"level: got {level}, expected 0 to 1")
@@ -140,22 +119,28 @@ class FlashCourseScene:
         self, view_name: str, *, pops: Sequence[FlashPop], exposure_s: float, seed: int
     ) -> UInt16Array:
         """Expose a camera once, with the blood of the time of each pop; see `FlashScene`."""
-        view = self.rig.view(view_name)
-        rng = np.random.default_rng([self.seed, seed])
-        light = np.zeros((view.height_px, view.width_px, 3), np.float32)
-        for pop in pops:
-            power, t_s = pop.power, pop.t_s
-            if not 0.0 <= power <= 1.0:
-                raise SceneError(f"power: got {power}, expected 0 to 1")
-            level, pose = self.course.level(t_s), self.course.pose(t_s)
-            energy = power * (1.0 + POP_ENERGY_DEVIATION * rng.standard_normal())
-            light += np.float32(energy) * self.radiance(
-                pose, level, pop.polarizer, pop.analyser_deg, view_name=view_name
-            )
+
+        def image(pop: FlashPop) -> Float32Array:
+            level, pose = self.course.level(pop.t_s), self.course.pose(pop.t_s)
             if self._on_flash is not None:
-                self._on_flash(FlashTime(pop.token, t_s, level, pose))
-        sensor = self.at("neutral", BLOOD_LEVELS[0]).sensor(view_name)
-        return expose(light, sensor=sensor, rng=rng, exposure_s=exposure_s)
+                self._on_flash(FlashTime(pop.token, pop.t_s, level, pose))
+            return self.radiance(pose, level, pop.polarizer, pop.analyser_deg, view_name=view_name)
+
+        return self._expose(
+            self._camera(view_name),
+            pops,
+            pop_energy,
+            image,
+            deviation=POP_ENERGY_DEVIATION,
+            exposure_s=exposure_s,
+            seed=seed,
+        )
+
+    @kept
+    def _image(
+        self, pose: str, level: float, polarizer: str, analyser_deg: float | None, view: str | None
+    ) -> Float32Array:
+        return self.at(pose, level).radiance(polarizer, analyser_deg, view_name=view)
 
     def landmarks_px(self, pose: str = "neutral") -> dict[str, tuple[float, float]]:
         """Return where named points of the skin are in the first camera's image of a pose.

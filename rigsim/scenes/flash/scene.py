@@ -22,6 +22,7 @@ from rigsim.arrays import Float32Array, Float64Array, UInt16Array
 from rigsim.as_built.polarizers import Polarizers, draw_polarizers
 from rigsim.boxes.flash import FlashPop
 from rigsim.geometry.mesh import Mesh
+from rigsim.kept import kept
 from rigsim.light.interreflection_color import Bounces
 from rigsim.light.lateral import line_spread_mm
 from rigsim.light.relief_shadow import ReliefShadow
@@ -48,7 +49,7 @@ from rigsim.scenes.exposing import FaceScene, SceneError
 from rigsim.scenes.flash import truth as flash_truth
 from rigsim.scenes.flash.image import Look, Picture
 from rigsim.scenes.flash.stage import flash_geometry
-from rigsim.sensor import Sensor, expose
+from rigsim.sensor import Sensor
 from rigsim.subject import SimulatedSubject, landmarks
 from rigsim.targets import Target
 
@@ -113,24 +114,12 @@ class FlashScene(FaceScene):
     ) -> None:
         if not 0.0 < power <= 1.0:
             raise SceneError(f"power: got {power}, expected above 0 to 1")
-        super().__init__(
-            rig,
-            subject,
-            state=state,
-            movement=movement,
-            sensor=sensor,
-            seed=seed,
-            subpixels=subpixels,
-        )
+        super().__init__(rig, subject, state, movement, sensor, seed, subpixels)
         self.films = draw_polarizers(rig) if films is None else films
         self._weights = _light_weights(rig)
         self._choice = choice
         self._stage = flash_geometry(self.subject, choice)
         self._caster = self._stage.caster
-        self._glow: dict[str, SubsurfaceRadiance] = {}
-        self._pictures: dict[str, Picture] = {}
-        self._blurs: dict[str, Mapping[str, Float32Array]] = {}
-        self._spreads: dict[str, Mapping[str, Float32Array]] = {}
         self._effects = effects
         self.needs = merge_selections([self._needs_of(view, power) for view in rig.views])
         self.lateral = self.needs.builds(face_needs.LATERAL_EFFECT)
@@ -138,16 +127,11 @@ class FlashScene(FaceScene):
         self.optics = self.needs.builds(face_needs.LENS_EFFECT)
 
     def _needs_of(self, view: View, power: float) -> EffectSelection:
-        noise, share = Noise.of(self._sensors[view.name]), self._stage.share()
-        return flash_needs(
-            self.rig,
-            self.subject,
-            self.state,
-            self._scenery(view, self._caster, share, noise, self._effects),
-            white_rgb=np.asarray(self.white_rgb(view.name), np.float64) * power,
-            weights_mm2=self._weights,
-            movement=self.movement,
-        )
+        noise, share = Noise.of(self._sensors[view.name]), self._stage.share
+        scenery = self._scenery(view, self._caster, share, noise, self._effects)
+        white = np.asarray(self.white_rgb(view.name), np.float64) * power
+        seen = (scenery, white, self._weights, self.movement)
+        return flash_needs(self.rig, self.subject, self.state, *seen)
 
     def white_rgb(self, view_name: str | None = None) -> Float32Array:
         """Return the camera RGB of the white reference at power 1, fraction of full scale, (3,)."""
@@ -213,17 +197,15 @@ class FlashScene(FaceScene):
         ndarray of uint16
             Raw DN, shape (H, W).
         """
-        view = self._camera(view_name)
-        rng = np.random.default_rng([self.seed, seed])
-        light = np.zeros((view.height_px, view.width_px, 3), np.float32)
-        for pop in pops:
-            if not 0.0 <= pop.power <= 1.0:
-                raise SceneError(f"power of pop {pop.token!r}: got {pop.power}, expected 0 to 1")
-            energy = pop.power * (1.0 + POP_ENERGY_DEVIATION * rng.standard_normal())
-            image = self.radiance(pop.polarizer, pop.analyser_deg, view_name=view.name)
-            light += np.float32(energy) * image
-        sensor = self._sensors[view.name]
-        return expose(light, sensor=sensor, rng=rng, exposure_s=exposure_s)
+        return self._expose(
+            self._camera(view_name),
+            pops,
+            pop_energy,
+            lambda pop: self.radiance(pop.polarizer, pop.analyser_deg, view_name=view_name),
+            deviation=POP_ENERGY_DEVIATION,
+            exposure_s=exposure_s,
+            seed=seed,
+        )
 
     def truth(self, view_name: str | None = None) -> dict[str, NDArray[np.generic]]:
         """Return what an estimator should find, at the sensor's resolution.
@@ -272,7 +254,7 @@ class FlashScene(FaceScene):
         passes_deg = self.films.passes_deg(view, "crossed", None)
         truth = flash_truth.maps_of(
             picture,
-            self._blurred(view, picture),
+            self._blurred(view),
             shading=self._analysed(picture.shading, view, passes_deg),
             white_rgb=self.white_rgb(view.name),
         )
@@ -313,7 +295,7 @@ class FlashScene(FaceScene):
 
     def resolution_mm(self, view_name: str | None = None) -> Float64Array:
         """Return the widths from 10 to 90 % of an edge that lateral transport blurs, mm, (3,)."""
-        glow = self._skin_glow(self._camera(view_name))
+        glow = self._skin_glow(self._camera(view_name).spectral_sensitivity)
         return line_spread_mm(glow.kernels.sigmas_mm, glow.kernels.weights)
 
     def _analysed(self, stokes: Float32Array, view: View, passes_deg: float) -> Float32Array:
@@ -331,16 +313,12 @@ class FlashScene(FaceScene):
             extinction=self.films.analyser_extinction,
         )
 
-    def _skin_glow(self, view: View) -> SubsurfaceRadiance:
-        camera = view.spectral_sensitivity
-        if camera not in self._glow:
-            face = self._face("skin")
-            skin = SeenSkin(face, self.state, camera, self._illuminant)
-            surface, bounces = self._surface_light(face), self._bounces(skin)
-            self._glow[camera] = light_skin(
-                skin, surface, lateral_transport=self.lateral, bounces=bounces
-            )
-        return self._glow[camera]
+    @kept
+    def _skin_glow(self, camera: str) -> SubsurfaceRadiance:
+        face = self._face("skin")
+        skin = SeenSkin(face, self.state, camera, self._illuminant)
+        surface, bounces = self._surface_light(face), self._bounces(skin)
+        return light_skin(skin, surface, lateral_transport=self.lateral, bounces=bounces)
 
     def _bounces(self, skin: SeenSkin) -> Bounces | None:
         if not self.interreflections:
@@ -348,7 +326,7 @@ class FlashScene(FaceScene):
         step, spectral = self._effects.spectral_step, self.needs.builds(face_needs.SPECTRAL_EFFECT)
         if step is None:
             step, _ = face_needs.spectral_step(skin, self.needs[face_needs.INTERREFLECTION_EFFECT])
-        return Bounces(self._stage.exchange(), spectral, step, self._last_bounce(self._effects))
+        return Bounces(self._stage.exchange, spectral, step, self._last_bounce(self._effects))
 
     def _surface_light(self, subject: SimulatedSubject) -> SurfaceLight:
         wrinkled = self.needs.builds(face_needs.WRINKLE_SHADOW_EFFECT)
@@ -365,34 +343,30 @@ class FlashScene(FaceScene):
             )
         return known[key]
 
-    def _blurred(self, view: View, picture: Picture) -> Mapping[str, Float32Array]:
+    @kept
+    def _blurred(self, view: View) -> Mapping[str, Float32Array]:
         """Return the maps that are blurred as the light is; nothing but the truth needs them."""
-        subject = self.subject
-        if not self.lateral or not isinstance(subject, SimulatedSubject):
-            return flash_truth.unblurred_maps(picture)
-        if view.name not in self._blurs:
-            look = Look(self.rig, view, self.films, self._weights, self.subpixels)
-            seen = look.at_maps(self._stage.caster, subject, self._spread(view, subject))
-            self._blurs[view.name] = seen.maps
-        return self._blurs[view.name]
+        if not self.lateral:
+            return flash_truth.unblurred_maps(self._picture(view))
+        look = Look(self.rig, view, self.films, self._weights, self.subpixels)
+        return look.at_maps(self._stage.caster, self._face(), self._spread(view)).maps
 
-    def _spread(self, view: View, subject: SimulatedSubject) -> Mapping[str, Float32Array]:
+    @kept
+    def _spread(self, view: View) -> Mapping[str, Float32Array]:
         """Return the textures of those maps, of the face as it has moved."""
-        if view.name not in self._spreads:
-            look = Look(self.rig, view, self.films, self._weights, self.subpixels)
-            self._spreads[view.name] = look.blurred_maps(subject, self.state, self._skin_glow(view))
-        return self._spreads[view.name]
+        look = Look(self.rig, view, self.films, self._weights, self.subpixels)
+        glow = self._skin_glow(view.spectral_sensitivity)
+        return look.blurred_maps(self._face(), self.state, glow)
 
     def _at_rest(
         self, view: View, moved: dict[str, NDArray[np.generic]]
     ) -> dict[str, NDArray[np.generic]]:
         """Return the fractions of this state as seen on the face at rest."""
-        subject = self.subject
-        if not isinstance(subject, SimulatedSubject) or subject.rest is None:
+        rest = self._face().rest
+        if rest is None:
             return flash_truth.unmoved_maps(moved)
-        rest = subject.rest
         caster = flash_geometry(rest, self._choice).caster
-        spread = self._spread(view, subject) if self.lateral else None
+        spread = self._spread(view) if self.lateral else None
         look = self._look(view, rest.mesh)
         return flash_truth.maps_at_rest(look, caster, rest, self.state, spread)
 
@@ -403,17 +377,20 @@ class FlashScene(FaceScene):
             spread = lens_spread(view, self._illuminant, subpixels=self.subpixels, depths_mm=depths)
         return Look(self.rig, view, self.films, self._weights, self.subpixels, spread)
 
+    @kept
     def _picture(self, view: View) -> Picture:
-        if view.name not in self._pictures:
-            look = self._look(view, self.subject.mesh)
-            if isinstance(self.subject, SimulatedSubject):
-                picture = look.at_skin(
-                    self._caster, self.subject, self.state, self._skin_glow(view)
-                )
-            else:
-                picture = look.at_target(self._caster, self.subject)
-            self._pictures[view.name] = picture
-        return self._pictures[view.name]
+        look, subject = self._look(view, self.subject.mesh), self.subject
+        if isinstance(subject, SimulatedSubject):
+            glow = self._skin_glow(view.spectral_sensitivity)
+            return look.at_skin(self._caster, subject, self.state, glow)
+        return look.at_target(self._caster, subject)
+
+
+def pop_energy(pop: FlashPop) -> float:
+    """Return the energy of a pop, 0 to 1 of a full one."""
+    if not 0.0 <= pop.power <= 1.0:
+        raise SceneError(f"power of pop {pop.token!r}: got {pop.power}, expected 0 to 1")
+    return pop.power
 
 
 def _light_weights(rig: Rig) -> Float64Array:

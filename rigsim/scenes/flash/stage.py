@@ -1,6 +1,6 @@
 """What scenes of one geometry before the flash rig have in common, whatever the blood does."""
 
-from dataclasses import dataclass, field
+from functools import cached_property
 from weakref import WeakValueDictionary
 
 from rigsim.geometry.mesh import Mesh
@@ -13,31 +13,30 @@ from rigsim.subject import SimulatedSubject
 from rigsim.targets import Target
 
 
-@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class FlashGeometry:
-    """One geometry, and what has been traced on it."""
+    """One geometry, and what has been traced on it.
 
-    held: tuple[Mesh, object]
-    """The mesh and the normals; while they are held their ids are theirs."""
-    caster: Caster
-    light: dict[object, SurfaceLight] = field(default_factory=dict)
-    """Light on the face, by what it comes from."""
-    hollows: dict[str, float] = field(default_factory=dict)
-    """`exchange_share` of the mesh, once it was asked for."""
-    bounce: dict[str, Interreflection] = field(default_factory=dict)
-    """How light goes from skin to skin, once a scene needed it."""
+    Parameters
+    ----------
+    held
+        The mesh and the normals; while they are held their ids are theirs.
+    caster
+        Traces rays against the mesh.
+    """
 
+    def __init__(self, held: tuple[Mesh, object], caster: Caster) -> None:
+        self.held, self.caster = held, caster
+        self.light: dict[object, SurfaceLight] = {}  # on the face, by what it comes from
+
+    @cached_property
     def share(self) -> float:
-        """Return `exchange_share` of the mesh."""
-        if not self.hollows:
-            self.hollows["share"] = exchange_share(self.caster)
-        return self.hollows["share"]
+        """`exchange_share` of the mesh."""
+        return exchange_share(self.caster)
 
+    @cached_property
     def exchange(self) -> Interreflection:
-        """Return how light goes from skin to skin."""
-        if not self.bounce:
-            self.bounce["skin"] = interreflection_for(self.caster)
-        return self.bounce["skin"]
+        """How light goes from skin to skin."""
+        return interreflection_for(self.caster)
 
 
 _stages: WeakValueDictionary[tuple[object, ...], FlashGeometry] = WeakValueDictionary()

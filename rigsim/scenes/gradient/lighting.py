@@ -79,13 +79,9 @@ class Lighting:
         packed[:12, ~patch.skin] = 0.0
         entering = self._spread(packed[12:], patch.skin, 1e-3 * pitch_um)
         if self.furrow_sectors:
+            grid = {"margin": margin, "sectors": self.furrow_sectors}
             hidden = hidden_share(
-                height_um,
-                patch.normals,
-                margin=margin,
-                pixel_um=pitch_um,
-                sectors=self.furrow_sectors,
-                boundaries=True,
+                height_um, patch.normals, pixel_um=pitch_um, boundaries=True, **grid
             )
             entering += self._from_furrows(hidden, entering, patch, 1e-3 * pitch_um)
         right = self.surface.image_right

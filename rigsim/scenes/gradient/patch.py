@@ -85,7 +85,10 @@ class PatchSurface:
         return PatchSurface(*cut)
 
 
-def sample_grid(view: View, *, subpixels: int, border_px: int) -> tuple[Float64Array, Float64Array]:
+Grid = tuple[Float64Array, Float64Array]
+
+
+def sample_grid(view: View, *, subpixels: int, border_px: int) -> Grid:
     """Return x (W s,) and y (H s,) of the camera's samples in the plane z = 0, mm."""
     pitch = view.distance_mm / view.focal_px
     places = []
@@ -96,14 +99,7 @@ def sample_grid(view: View, *, subpixels: int, border_px: int) -> tuple[Float64A
 
 
 def stand(
-    relief: Relief,
-    grip: GripState,
-    pose: Pose,
-    x_mm: Float64Array,
-    y_mm: Float64Array,
-    *,
-    eye_mm: float,
-    alpha: float,
+    relief: Relief, grip: GripState, pose: Pose, grid: Grid, *, eye_mm: float, alpha: float
 ) -> PatchSurface:
     """Return what the camera's samples meet.
 
@@ -115,14 +111,14 @@ def stand(
         The caliper, which moves with the skin.
     pose
         Where the skin lies.
-    x_mm, y_mm
-        The samples, as `sample_grid` gives them.
+    grid
+        x and y of the samples, as `sample_grid` gives them.
     eye_mm
         Distance of the camera, mm.
     alpha
         Roughness where the relief states none.
     """
-    ideal_x, ideal_y = np.meshgrid(x_mm, y_mm)
+    ideal_x, ideal_y = np.meshgrid(*grid)
     cosine, sine = math.cos(pose.turn_rad), math.sin(pose.turn_rad)
     x, y = ideal_x, ideal_y
     # tilts and view angles shrink the step to the surface's point 30-fold: once is enough

@@ -17,11 +17,10 @@ from numpy.typing import ArrayLike
 from capture.rig import load_rig
 from rigsim.arrays import Float64Array
 from rigsim.needs.effects import SceneEffects
-from rigsim.scenes.gradient.patch import PatchSurface, sample_grid, stand
+from rigsim.scenes.gradient.patch import Relief
 from rigsim.scenes.gradient.reference import NEUTRAL
 from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.skin_patch.microrelief import make_micro_skin
-from rigsim.skin_patch.motion import Pose
 from rigsim.skin_patch.stretch import SurfaceSample
 from rigsim.world.taped_skin import GripState
 
@@ -77,19 +76,8 @@ class WavyScene(GradientScene):
         self.waves = waves
         self.forget()
 
-    def surface(
-        self,
-        grip: GripState,
-        *,
-        subpixels: int = 1,
-        border_px: int = 0,
-        jump_mm: tuple[float, float] = (0.0, 0.0),
-    ) -> PatchSurface:
-        """Return the waves at the camera's samples."""
-        view = self.rig.views[0]
-        x, y = sample_grid(view, subpixels=subpixels, border_px=border_px)
-        pose = Pose(*jump_mm, 0.0)
-        return stand(self.waves, grip, pose, x, y, eye_mm=view.distance_mm, alpha=WAVE_ALPHA)
+    def _relief_at(self, grip: GripState) -> Relief:
+        return self.waves
 
 
 def wavy_scene(*, optics: bool = True) -> WavyScene:

@@ -20,17 +20,18 @@ from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.as_built.polarizers import Polarizers, draw_polarizers
 from rigsim.as_built.sphere import PATTERN_WEIGHTS, BuiltSphere, diffuser_radiance, nominal_sphere
 from rigsim.boxes.gradient_sphere import PatternLight
+from rigsim.kept import Kept
 from rigsim.light.lobe_moments import Surface
 from rigsim.needs.effects import EFFECTS_BY_SIZE, Noise, SceneEffects
 from rigsim.needs.face import INTERREFLECTION_EFFECT, LATERAL_EFFECT, SHADOW_EFFECT
 from rigsim.needs.gradient import OPTICS_EFFECT, gradient_needs
 from rigsim.render.lens_blur import Lens, blur, lens_of
-from rigsim.scenes.exposing import Kept, RigScene, SceneError, full_power_s
+from rigsim.scenes.exposing import RigScene, SceneError, full_power_s
 from rigsim.scenes.gradient.analyser import GridAnalyser
 from rigsim.scenes.gradient.lighting import Lighting, light_skin
-from rigsim.scenes.gradient.patch import SHADOW_MARGIN_PX, PatchSurface, sample_grid, stand
+from rigsim.scenes.gradient.patch import SHADOW_MARGIN_PX, PatchSurface, Relief, sample_grid, stand
 from rigsim.scenes.gradient.target import target_moments
-from rigsim.sensor import Sensor, expose, sensor_of
+from rigsim.sensor import Sensor, sensor_of
 from rigsim.skin_patch.microrelief import MicroSkin
 from rigsim.skin_patch.motion import PatchMotion, Pose, shifted
 from rigsim.skin_patch.stretch import StretchedSkin, deform
@@ -79,8 +80,6 @@ class GradientScene(RigScene):
         The LEDs as they stand; None: as drawn.
     motion
         How the patch moves; None holds it still.
-    sensor
-        The camera's sensor; None takes what the rig states.
     seed
         Seeds what differs from exposure to exposure.
     effects
@@ -97,6 +96,8 @@ class GradientScene(RigScene):
         Nodes of the table of moments along each axis of the normals; None chooses by roughness.
     """
 
+    channels = ()
+
     def __init__(
         self,
         rig: Rig,
@@ -105,7 +106,6 @@ class GradientScene(RigScene):
         films: Polarizers | None = None,
         sphere: BuiltSphere | None = None,
         motion: PatchMotion | None = None,
-        sensor: Sensor | None = None,
         seed: int = 0,
         effects: SceneEffects = EFFECTS_BY_SIZE,
         on_s: float | None = None,
@@ -127,7 +127,7 @@ class GradientScene(RigScene):
         self.motion, self.seed = motion, seed
         self.sectors, self.subpixels, self.table_size = sectors, subpixels, table_size
         self._view = rig.views[0]
-        self._sensor = sensor_of(self._view) if sensor is None else sensor
+        self._sensor = sensor_of(self._view)
         self._lighting: Kept[tuple[float, ...], Lighting] = Kept(lambda _: KEPT_LIGHTINGS)
         # behind two ideal films, one of which the unit of radiance holds already
         white = float(diffuser_radiance(nominal_sphere(rig), np.zeros(1), np.zeros(1))[0, 0])
@@ -138,16 +138,9 @@ class GradientScene(RigScene):
         )
         self._reliefs: Kept[tuple[float, float], StretchedSkin] = Kept(lambda _: KEPT_RELIEFS)
         self._analyser = GridAnalyser(self.films, self._view)
-        self.needs = gradient_needs(
-            rig,
-            subject,
-            self.sphere,
-            self.lens,
-            noise=Noise.of(self._sensor),
-            white=math.inf if on_s is None else GRADIENT_METER_RATE_PER_S * on_s,
-            moving=motion is not None,
-            effects=effects,
-        )
+        level = math.inf if on_s is None else GRADIENT_METER_RATE_PER_S * on_s
+        seen = (self.sphere, self.lens, Noise.of(self._sensor), level)
+        self.needs = gradient_needs(rig, subject, *seen, motion is not None, effects)
         """What is built, what is not, and why."""
         self.shadows = self.needs.builds(SHADOW_EFFECT)
         self.optics = self.needs.builds(OPTICS_EFFECT)
@@ -288,21 +281,21 @@ class GradientScene(RigScene):
         ndarray of uint16
             Raw DN, shape (H, W).
         """
-        self._camera(view_name)
-        rng = np.random.default_rng([self.seed, seed])
-        light = np.zeros((self._view.height_px, self._view.width_px), np.float32)
-        for pop in pops:
-            energy = full_power_s(pop, f"pattern {pop.pattern!r}")
-            energy *= 1.0 + PATTERN_POWER_DEVIATION * rng.standard_normal()
-            if energy > 0.0 and any(_weights(pop.pattern)):
-                light += np.float32(energy) * self.radiance(
-                    pop.pattern,
-                    grip=grip,
-                    analyser_deg=pop.analyser_deg,
-                    t_s=0.5 * (pop.t_on_s + pop.t_off_s),
-                    led_shares=pop.led_shares,
-                )
-        return expose(light, sensor=self._sensor, rng=rng, exposure_s=exposure_s)
+        return self._expose(
+            self._camera(view_name),
+            pops,
+            lambda pop: full_power_s(pop, f"pattern {pop.pattern!r}"),
+            lambda pop: self.radiance(
+                pop.pattern,
+                grip=grip,
+                analyser_deg=pop.analyser_deg,
+                t_s=0.5 * (pop.t_on_s + pop.t_off_s),
+                led_shares=pop.led_shares,
+            ),
+            deviation=PATTERN_POWER_DEVIATION,
+            exposure_s=exposure_s,
+            seed=seed,
+        )
 
     def forget(self) -> None:
         """Drop the pictures that are kept, which the subject's states are made again from."""
@@ -319,25 +312,20 @@ class GradientScene(RigScene):
         jump_mm: tuple[float, float] = (0.0, 0.0),
     ) -> PatchSurface:
         """Return what stands at the camera's samples in a state, without drift."""
-        skin = self.skin
-        x, y = sample_grid(self._view, subpixels=subpixels, border_px=border_px)
-        pose = self.pose(grip)
+        grid = sample_grid(self._view, subpixels=subpixels, border_px=border_px)
+        pose, alpha = self.pose(grip), float(np.median(self.skin.alpha))
         moved = Pose(pose.x_mm + jump_mm[0], pose.y_mm + jump_mm[1], pose.turn_rad)
-        return stand(
-            self.relief(grip),
-            grip,
-            moved,
-            x,
-            y,
-            eye_mm=self._view.distance_mm,
-            alpha=float(np.median(skin.alpha)),
-        )
+        eye_mm = self._view.distance_mm
+        return stand(self._relief_at(grip), grip, moved, grid, eye_mm=eye_mm, alpha=alpha)
 
     def relief(self, grip: GripState) -> StretchedSkin:
         """Return the skin in a state, in its own frame."""
         skin = self.skin
         key = (grip.stretch, grip.angle_deg if grip.stretch != 1.0 else 0.0)
         return self._reliefs.get(key, lambda: deform(skin, stretch=key[0], angle_deg=key[1]))
+
+    def _relief_at(self, grip: GripState) -> Relief:
+        return self.relief(grip)
 
     def pose(self, grip: GripState) -> Pose:
         """Return where the skin lies in a state, drift and jumps aside."""

@@ -18,7 +18,7 @@ from capture.rig import Rig
 from model import spectra
 from rigsim.arrays import Float32Array, Float64Array, UInt16Array
 from rigsim.as_built.probe import ProbeBuild, build_probe, unit_images
-from rigsim.boxes.probe import SourceLight
+from rigsim.boxes.source_shutter import SourceLight
 from rigsim.fiber.probe_profile import Profile, Profiles
 from rigsim.fiber.probe_tissue import ProbedTissue, TissueError
 from rigsim.needs.effects import Noise

@@ -22,7 +22,7 @@ from capture.plan.rows import LedRow
 from capture.raw import RawFrame, linear_rgb
 from capture.rig import LedLimits, Rig, load_rig
 from rigsim.as_built.dome import Tolerances, build, image_of
-from rigsim.boxes.dome import LedPulse
+from rigsim.boxes.led_table import LedPulse
 from rigsim.scenes.dome.targets import target_scene
 from rigsim.sensor import sensor_of
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, UInt16Array

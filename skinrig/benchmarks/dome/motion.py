@@ -9,7 +9,7 @@ import numpy as np
 from capture.calibration.geometry import CameraPose
 from capture.rig import load_rig
 from reconstruction.registration import head_motion
-from rigsim.boxes.dome import LedPulse
+from rigsim.boxes.led_table import LedPulse
 from rigsim.needs.effects import SceneEffects
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import make_subject

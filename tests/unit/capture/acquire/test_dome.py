@@ -319,7 +319,7 @@ def test_a_plan_beyond_the_box_is_refused_before_anything_is_lit(make, change, m
     bench.box._limits = {**bench.box.limits, **change}
     with pytest.raises(AcquisitionError, match=match):
         bench.run()
-    assert bench.world.pulses == []
+    assert bench.world.switched == []
 
 
 def test_a_camera_that_cannot_be_released_is_refused_before_anything_is_lit(make):
@@ -328,7 +328,7 @@ def test_a_camera_that_cannot_be_released_is_refused_before_anything_is_lit(make
     object.__setattr__(camera._info, "triggers", (Trigger.SOFTWARE,))
     with pytest.raises(CameraError, match="cannot be released"):
         bench.run()
-    assert bench.world.pulses == []
+    assert bench.world.switched == []
 
 
 def test_a_camera_whose_clock_cannot_be_compared_is_refused(make):
@@ -394,6 +394,6 @@ def test_what_flickers_when_taken_again_alone_is_taken_in_single_flashes(make, m
     monkeypatch.setattr("capture.acquire.dome.check_safety", lambda *plan, **eyes: None)
     done = bench.run(eyes="open")
     assert done.frames == 2 * len(missing)
-    onsets = sorted(p.t_on_s for p in bench.world.pulses)
+    onsets = sorted(p.t_on_s for p in bench.world.switched)
     assert np.diff(onsets).min() > 1.0
     check_frames(bench)

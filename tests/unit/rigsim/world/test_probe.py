@@ -11,7 +11,7 @@ from capture.devices.port import Port
 from capture.devices.probe import ProbeBox
 from capture.rig import load_rig
 from rigsim.boxes.faults import Faults
-from rigsim.boxes.probe import SourceLight
+from rigsim.boxes.source_shutter import SourceLight
 from rigsim.world.suction import HeadState
 from rigsim.world.world import World
 
@@ -63,7 +63,7 @@ def test_light_is_clipped_to_the_exposure(make):
     (still,) = world.light_between(0.0, world.now)
     assert still.t_off_s == world.now
     box.listen(0.2)
-    (ended,) = world.sources
+    (ended,) = world.switched
     assert world.light_between(0.0, ended.t_on_s) == ()
     assert world.light_between(ended.t_off_s, world.now) == ()
     (seen,) = world.light_between(middle_s, world.now)
@@ -155,7 +155,7 @@ def test_a_camera_that_warms_is_part_of_what_a_scene_is_told(make):
 
 def test_a_world_without_a_probe_has_no_head():
     world = World(load_rig("dome").subset(views=["C00"]).resized(16))
-    assert (world.heads, world.head, world.sources) == ([], None, [])
+    assert (world.heads, world.head, world.switched) == ([], None, [])
     with pytest.raises(ValueError, match="has none"):
         world.head_at(0.0)
 

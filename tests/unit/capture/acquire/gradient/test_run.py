@@ -545,7 +545,7 @@ def test_an_emergency_stop_ends_the_capture_dark_and_released(make):
 
 
 def untouched(bench):
-    return bench.world.patterns == [] and bench.world.box("caliper").device.moves == []
+    return bench.world.switched == [] and bench.world.box("caliper").device.moves == []
 
 
 @pytest.mark.parametrize("limit", [None, 0.0, -1.0, 50.0, float("nan")])

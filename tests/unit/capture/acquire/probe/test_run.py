@@ -235,7 +235,7 @@ def test_a_whole_series_rests_once_and_takes_the_time_that_its_plan_says(make):
     assert len(bench.session.frames("fibres")) == 23
     check_frames(bench.session)
     assert bench.world.box("probe").device.pump.count == 2
-    lit = [source for source in bench.world.sources if source.level > 0]
+    lit = [source for source in bench.world.switched if source.level > 0]
     gaps = [b.t_on_s - a.t_off_s for a, b in itertools.pairwise(lit)]
     assert int(np.argmax(gaps)) == 20  # the rest stands between brackets 20 and 21
     assert gaps[20] > PROBE.rest_s
@@ -327,7 +327,7 @@ def test_a_leak_is_refused_in_one_sentence_with_what_was_reached_and_what_to_do(
     assert len(bench.placings) == 3
     assert "again: the suction reached only" in bench.placings[1]
     assert bench.session.frames() == []
-    assert not any(source.level > 0 for source in bench.world.sources)
+    assert not any(source.level > 0 for source in bench.world.switched)
     assert bench.at_rest
 
 
@@ -660,7 +660,7 @@ def test_darks_need_a_capped_head_and_no_light(make):
     assert bench.asked == [CAPPED]
     assert len(bench.session.frames("dark")) == 6
     check_frames(bench.session)
-    assert bench.world.sources == []
+    assert bench.world.switched == []
     record = bench.session.frames("dark", bracket=22, repeat=0)[0]
     assert record.settings["exposure_s"] == 30.0
     assert abs(record.actual["camera_c"] - PROBE.camera_c) <= PROBE.camera_tolerance_c

@@ -7,13 +7,8 @@ import pytest
 from capture.rig import load_rig
 from rigsim.as_built.dome import Tolerances, bend, build, image_of, pixel_corner_rays, unbend
 from rigsim.light.led_light import white_intensity
-from rigsim.scenes.dome.targets import (
-    TARGET_POSES,
-    TargetError,
-    TargetScene,
-    plate_normals,
-    target_scene,
-)
+from rigsim.scenes.dome.targets import TARGET_POSES, TargetScene, plate_normals, target_scene
+from rigsim.scenes.exposing import SceneError
 from rigsim.sensor import vignetting_map
 from rigsim.targets import mirror_ball, printed_plate
 
@@ -194,13 +189,13 @@ def test_dead_lights_are_dark_and_crossed_wires_light_another():
 
 
 def test_targets_that_do_not_exist_are_refused():
-    with pytest.raises(TargetError, match="charuco, mirror, white"):
+    with pytest.raises(SceneError, match="charuco, mirror, white"):
         target_scene("cube", RIG, seed=0)
     scene = target_scene("mirror", RIG, seed=0)
-    with pytest.raises(TargetError, match="expected 0 to 3"):
+    with pytest.raises(SceneError, match="expected 0 to 3"):
         scene.show(4)
-    with pytest.raises(TargetError, match="level"):
+    with pytest.raises(SceneError, match="level"):
         scene.exposure("C07", pops=[Pulse(0, 1.5, 0, 1)], exposure_s=1.0, seed=0)
-    with pytest.raises(TargetError, match="no view 'C00'"):
+    with pytest.raises(SceneError, match="no view 'C00'"):
         scene.light("C00", lit(0))
     assert len(plate_normals()) == TARGET_POSES["white"]

@@ -17,7 +17,7 @@ from rigsim.as_built.probe import (
     build_probe,
     unit_images,
 )
-from rigsim.boxes.probe import SourceLight
+from rigsim.boxes.source_shutter import SourceLight
 from rigsim.fiber.probe_tissue import HomogeneousTissue
 from rigsim.scenes.exposing import SceneError
 from rigsim.scenes.probe.scene import DARK_E_PER_S, PROBE_METER_RATE_PER_S, ProbeScene
