@@ -81,9 +81,9 @@ NOT_DRIVEN = {
             RENDERED,
             {
                 "reconstruction.correspondence.common_parameterization": (
-                    "chart correspond find_cylinder frame_around"
+                    "correspond find_cylinder frame_around"
                 ),
-                "reconstruction.correspondence.splatting": "closed outermost splat",
+                "reconstruction.correspondence.charts": "chart closed outermost splat",
                 "reconstruction.correspondence.common_regions": "region standard_frame",
                 "reconstruction.correspondence.expression_alignment": "align",
                 "reconstruction.registration.feature_matches": "match",
@@ -93,7 +93,6 @@ NOT_DRIVEN = {
                 "reconstruction.registration.head_motion": "estimate",
                 "reconstruction.lumitexels.samples": "visibility",
                 "reconstruction.surface.model_normals": "estimate",
-                "reconstruction.photometric_stereo.refinement": "refine",
                 "reconstruction.facial_color.rig_transfer": "transfer_rig",
                 "reconstruction.scan.registration": "align register",
                 "reconstruction.scan.rough_normals": "photometric_normals",
@@ -133,7 +132,7 @@ NOT_DRIVEN = {
         (
             WHOLE,
             {
-                "model.skin_reflectance": "assemble lobes_of surface_brdf",
+                "model.skin_reflectance": "assemble lobes_of",
                 "reconstruction.scan.repair": "repair",
                 "reconstruction.scan.mesh": "prepare refine unwrap",
             },

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from reconstruction.correspondence.common_parameterization import Chart
+from reconstruction.correspondence.charts import Chart
 from rigsim.population.population import Member, table_1
 from skinrig.arrays import BoolArray, Float32Array, FloatArray
 from skinrig.benchmarks.description import described
