@@ -10,6 +10,7 @@ from scipy.interpolate import CubicSpline, RectBivariateSpline
 
 from model import spectra
 from model.arrays import Float64Array
+from model.checks import Checks
 from model.fresnel import ETA_SKIN
 from model.tissue_optics import two_layer_reflectance
 from model.tissue_optics.layers import BETA_M, C_HD_MAX, C_HE_PER_C_HD, C_M_MAX, OXYGEN_SATURATION
@@ -61,8 +62,7 @@ class ColorTable:
             raise ColorTableError(
                 f"rgb: expected (size, size, 3) with size >= {_MIN_SIZE}, got {rgb.shape}"
             )
-        if not (np.isfinite(rgb).all() and (rgb > 0.0).all()):
-            raise ColorTableError("rgb: expected finite positive colors at every node")
+        Checks(ColorTableError).within("rgb", rgb, "(0, inf)")
         rgb = rgb.copy()
         rgb.setflags(write=False)
         cells = _spline_cells(rgb)
@@ -115,8 +115,8 @@ class ColorTable:
             When a fraction lies outside the table or is 0.
         """
         melanin, blood = np.asarray(c_m, dtype=np.float64), np.asarray(c_hd, dtype=np.float64)
-        if not ((melanin > 0.0).all() and (blood > 0.0).all()):
-            raise ColorTableError("c_m, c_hd: expected fractions above 0 for derivatives, got 0")
+        for name, fraction in (("c_m", melanin), ("c_hd", blood)):
+            Checks(ColorTableError).within(name, fraction, "(0, inf)")
         _, by_i, by_j = self._evaluate(melanin, blood)
         # i = (size - 1) cbrt(c / c_max), so di/dc = i / (3 c)
         last = self.size - 1
@@ -130,9 +130,9 @@ class ColorTable:
         self, c_m: ArrayLike, c_hd: ArrayLike
     ) -> tuple[Float64Array, Float64Array, Float64Array]:
         """Return the color and its derivatives by the two node indices."""
-        i, j = _paired(
-            _node_index("c_m", c_m, self.c_m_max, self.size),
-            _node_index("c_hd", c_hd, self.c_hd_max, self.size),
+        i, j = Checks(ColorTableError).together(
+            c_m=_node_index("c_m", c_m, self.c_m_max, self.size),
+            c_hd=_node_index("c_hd", c_hd, self.c_hd_max, self.size),
         )
         shape = i.shape
         i, j = i.ravel(), j.ravel()
@@ -243,12 +243,9 @@ def spectral_reflectance(
     >>> spectral_reflectance(0.02, 0.02)[[5, 15, 25]].round(2).tolist()
     [0.17, 0.2, 0.34]
     """
-    melanin, blood = _paired(np.asarray(c_m, float), np.asarray(c_hd, float))
+    melanin, blood = Checks(ColorTableError).together(c_m=c_m, c_hd=c_hd)
     for name, values, most in (("c_m", melanin, C_M_MAX), ("c_hd", blood, C_HD_MAX)):
-        if values.size and not (values.min() >= 0.0 and values.max() <= most):
-            raise ColorTableError(
-                f"{name}: got {values.min():g} to {values.max():g}, expected 0 to {most:g}"
-            )
+        Checks(ColorTableError).within(name, values, f"[0, {most}]")
     log_reflectance = _log_spectra(anisotropy, BETA_M, OXYGEN_SATURATION, ETA_SKIN)
     axes = spectral_axes(log_reflectance.shape[0])
     place = np.cbrt(melanin).reshape(-1), np.cbrt(blood).reshape(-1)
@@ -296,21 +293,8 @@ def _spline_cells(rgb: Float64Array) -> Float64Array:
 
 def _node_index(name: str, fraction: ArrayLike, largest: float, size: int) -> Float64Array:
     values = np.asarray(fraction, dtype=np.float64)
-    within = (values >= 0.0) & (values <= largest * (1.0 + 1e-12))
-    if not within.all():
-        raise ColorTableError(
-            f"{name}: the table spans 0 to {largest:g}, got {values[~within].flat[0]:g}"
-        )
+    Checks(ColorTableError).within(name, values, f"[0, {largest * (1.0 + 1e-12)}]")
     return np.asarray((size - 1) * np.cbrt(values / largest))
-
-
-def _paired(melanin: Float64Array, blood: Float64Array) -> tuple[Float64Array, ...]:
-    try:
-        return np.broadcast_arrays(melanin, blood)
-    except ValueError:
-        raise ColorTableError(
-            f"c_m, c_hd: expected shapes that broadcast, got {melanin.shape} and {blood.shape}"
-        ) from None
 
 
 def _powers(x: Float64Array) -> tuple[Float64Array, Float64Array]:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import Float64Array
+from model.checks import Checks
 
 ETA_SKIN = 1.4
 """Refractive index of skin relative to air, the value used where a paper does not give its own.
@@ -44,7 +45,7 @@ def reflectance(cos_incident: ArrayLike, eta: float) -> Float64Array:
     >>> round(float(reflectance(1.0, 1.5)), 6)
     0.04
     """
-    _require_index(eta)
+    Checks().within("eta", eta, "(0, inf)")
     mu_i = np.asarray(cos_incident, dtype=np.float64)
     with np.errstate(over="ignore"):  # beyond any number it is beyond the critical angle, too
         sin2_t = (1.0 - mu_i**2) / eta / eta  # the square of a huge index overflows
@@ -67,7 +68,7 @@ def normal_reflectance(eta: float) -> float:
     >>> round(normal_reflectance(1.4), 6)
     0.027778
     """
-    _require_index(eta)
+    Checks().within("eta", eta, "(0, inf)")
     return float(((eta - 1.0) / (eta + 1.0)) ** 2)
 
 
@@ -132,17 +133,8 @@ def boundary_factor(eta: float) -> float:
     return (1.0 + f_dr) / (1.0 - f_dr)
 
 
-def _require_index(eta: float) -> None:
-    if not 0.0 < eta < np.inf:
-        raise ValueError(f"eta: expected a positive, finite relative refractive index, got {eta}")
-
-
 def _denser(eta: float) -> float:
-    if not 1.0 <= eta <= MAX_INDEX:
-        raise ValueError(
-            f"eta: expected a relative refractive index of at least 1, up to {MAX_INDEX:g}, "
-            f"got {eta}"
-        )
+    Checks().within("eta", eta, f"[1, {MAX_INDEX}]")
     return float(eta)
 
 

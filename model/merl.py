@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import BoolArray, Float64Array
+from model.checks import Checks
 
 TABLE_SHAPE = (90, 90, 180)
 """Bins over theta_h, theta_d and phi_d."""
@@ -48,10 +49,7 @@ class MerlTable:
 
     def __post_init__(self) -> None:
         """Check the shape."""
-        if self.stored.shape != (3, *TABLE_SHAPE):
-            raise ValueError(
-                f"MerlTable.stored: got {self.stored.shape}, expected {(3, *TABLE_SHAPE)}"
-            )
+        Checks().shape("MerlTable.stored", self.stored, (3, *TABLE_SHAPE))
 
     @classmethod
     def of_values(cls, values: ArrayLike) -> MerlTable:
@@ -88,14 +86,7 @@ class MerlTable:
         ValueError
             For angles out of range or not finite, and shapes that do not broadcast.
         """
-        h, d, phi = bins(theta_h, theta_d, phi_d)
-        try:
-            h, d, phi = np.broadcast_arrays(h, d, phi)
-        except ValueError:
-            raise ValueError(
-                f"theta_h, theta_d, phi_d: got shapes {h.shape}, {d.shape} and {phi.shape}, "
-                f"expected ones that broadcast"
-            ) from None
+        h, d, phi = bins(*Checks().together(theta_h=theta_h, theta_d=theta_d, phi_d=phi_d))
         return np.asarray(np.moveaxis(self.stored[:, h, d, phi], 0, -1) * BRDF_SCALE)
 
     @property
@@ -118,10 +109,8 @@ def bins(
     d = np.asarray(theta_d, dtype=np.float64)
     azimuth = np.asarray(phi_d, dtype=np.float64)
     for name, angle in (("theta_h", h), ("theta_d", d)):
-        if not np.all((angle >= 0.0) & (angle <= _HALF_PI + 1e-6)):
-            raise ValueError(f"{name}: got angles outside [0, pi/2], expected rad within it")
-    if not np.all(np.isfinite(azimuth)):
-        raise ValueError("phi_d: got a value that is not finite, expected rad")
+        Checks().within(f"{name}, rad", angle, f"[0, {_HALF_PI + 1e-6}]")
+    Checks().within("phi_d", azimuth)
     phi = np.mod(azimuth, np.pi)
     index_h = np.minimum(
         (TABLE_SHAPE[0] * np.sqrt(h / _HALF_PI)).astype(np.intp), TABLE_SHAPE[0] - 1
@@ -271,8 +260,7 @@ def write(path: str | os.PathLike[str], table: MerlTable) -> None:
     ValueError
         When the table holds values that are not finite.
     """
-    if not np.all(np.isfinite(table.stored)):
-        raise ValueError("MerlTable.stored: got values that are not finite")
+    Checks().within("MerlTable.stored", table.stored)
     with Path(path).open("wb") as stream:
         stream.write(np.array(TABLE_SHAPE, dtype="<i4").tobytes())
         table.stored.astype("<f8", copy=False).tofile(stream)

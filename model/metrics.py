@@ -7,6 +7,9 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from model.arrays import Float64Array
+from model.checks import Checks
+
+N_MEDIAN_DRAWS = 200
 
 
 def angular_error_rad(a: ArrayLike, b: ArrayLike) -> Float64Array:
@@ -99,8 +102,7 @@ def coverage(
     >>> coverage([0.0, 0.0], [1.0, 1.0], [0.5, 3.0]).share
     0.5
     """
-    if not 0 < level < 1:
-        raise ValueError(f"level: got {level}, expected between 0 and 1")
+    Checks().within("level", level, "(0, 1)")
     deviation = np.abs(np.asarray(estimate, np.float64) - np.asarray(truth, np.float64))
     error = np.broadcast_to(np.asarray(stderr, np.float64), deviation.shape)
     counted = np.isfinite(deviation) & np.isfinite(error)
@@ -116,9 +118,9 @@ def coverage(
 
 
 def median_with_interval(
-    values: ArrayLike, *, rng: np.random.Generator, level: float = 0.68, draws: int = 200
+    values: ArrayLike, *, rng: np.random.Generator
 ) -> tuple[float, tuple[float, float]]:
-    """Return the median and its bootstrap interval.
+    """Return the median and its bootstrap interval of 68 %.
 
     Parameters
     ----------
@@ -126,10 +128,6 @@ def median_with_interval(
         Any shape; NaN are dropped. More than 20,000 are thinned by a random choice.
     rng
         Draws the bootstrap samples.
-    level
-        Of the interval.
-    draws
-        Bootstrap samples.
 
     Returns
     -------
@@ -142,6 +140,6 @@ def median_with_interval(
         return float("nan"), (float("nan"), float("nan"))
     if kept.size > 20_000:
         kept = rng.choice(kept, 20_000, replace=False)
-    medians = np.median(kept[rng.integers(0, kept.size, (draws, kept.size))], axis=1)
-    low, high = np.quantile(medians, [0.5 - level / 2, 0.5 + level / 2])
+    medians = np.median(kept[rng.integers(0, kept.size, (N_MEDIAN_DRAWS, kept.size))], axis=1)
+    low, high = np.quantile(medians, [0.5 - 0.68 / 2, 0.5 + 0.68 / 2])
     return float(np.median(kept)), (float(low), float(high))

@@ -8,6 +8,7 @@ from types import MappingProxyType
 import numpy as np
 
 from model.arrays import BoolArray, Float32Array
+from model.checks import Checks
 
 _FILE_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,63}\.[a-z0-9]{1,8}")
 
@@ -56,26 +57,20 @@ class SkinMap:
     def __post_init__(self) -> None:
         """Refuse shapes that do not fit and valid pixels that are not finite."""
         values = np.asarray(self.values, np.float32)
-        if values.ndim not in (2, 3) or (values.ndim == 3 and values.shape[2] != 3):
-            raise ValueError(f"values: got shape {values.shape}, expected (H, W) or (H, W, 3)")
+        Checks().shape("values", values, (None, None), (None, None, 3))
         object.__setattr__(self, "values", values)
         if not self.unit:
             raise ValueError('unit: got an empty text, expected a unit or "1"')
         if self.stderr is not None:
             stderr = np.asarray(self.stderr, np.float32)
-            if stderr.shape != values.shape:
-                raise ValueError(f"stderr: got shape {stderr.shape}, expected {values.shape}")
+            Checks().shape("stderr", stderr, values.shape)
             object.__setattr__(self, "stderr", stderr)
         if self.valid is not None:
             valid = np.asarray(self.valid)
-            if valid.dtype != np.bool_ or valid.shape != values.shape[:2]:
-                raise ValueError(
-                    f"valid: got {valid.dtype} {valid.shape}, expected bool {values.shape[:2]}"
-                )
+            Checks().mask("valid", valid, values.shape[:2])
             object.__setattr__(self, "valid", valid)
         shown = values if self.valid is None else values[self.valid]
-        if not np.isfinite(shown).all():
-            raise ValueError("values: got NaN or infinity at a valid pixel, expected finite values")
+        Checks().within("values at valid pixels", shown)
 
     @property
     def mask(self) -> BoolArray:
@@ -120,8 +115,7 @@ class SkinAppearance:
 
     def __post_init__(self) -> None:
         """Refuse an unknown source and a unit that contradicts the map's name."""
-        if self.source not in ("measured", "simulated"):
-            raise ValueError(f"source: got {self.source!r}, expected 'measured' or 'simulated'")
+        Checks().choice("source", self.source, ("measured", "simulated"))
         for name in self.files:
             if _FILE_PATTERN.fullmatch(name) is None or name.endswith((".exr", "appearance.json")):
                 raise ValueError(

@@ -15,12 +15,13 @@ import zipfile
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model import fresnel, translucency_population
 from model.arrays import BoolArray, Float32Array, Float64Array
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
+from model.checks import Checks
 from model.dipole.maps import DipoleMaps
 from model.skin import SkinAppearance, SkinMap
 
@@ -84,28 +85,15 @@ class SkinReflectance:
     def __post_init__(self) -> None:
         """Refuse shapes that do not fit, and valid texels with values that no skin has."""
         shape = np.shape(self.valid)
-        if len(shape) != 2 or np.asarray(self.valid).dtype != np.bool_:
-            raise SkinReflectanceError(
-                f"valid: got {np.asarray(self.valid).dtype} {shape}, expected bool (H, W)"
-            )
-        fields = {
-            "r_d": 3,
-            "weights": self.lobes.size,
-            "translucency_mm": 3,
-            "normals": 3,
-            "position_mm": 3,
-            "r_d_stderr": 3,
-            "translucency_stderr_mm": 3,
-        }
-        for name, channels in fields.items():
+        Checks(SkinReflectanceError).mask("valid", self.valid, ("H", "W"))
+        known = ("r_d", "weights", "translucency_mm", "normals", "position_mm")
+        for name in (*known, "r_d_stderr", "translucency_stderr_mm"):
+            channels = self.lobes.size if name == "weights" else 3
             if (given := getattr(self, name)) is None:
                 continue
             values = np.asarray(given, np.float32)
-            if values.shape != (*shape, channels):
-                raise SkinReflectanceError(
-                    f"{name}: got shape {values.shape}, expected {(*shape, channels)}"
-                )
-            if name not in ("r_d_stderr", "translucency_stderr_mm"):
+            Checks(SkinReflectanceError).shape(name, values, (*shape, channels))
+            if name in known:
                 _require(name, np.isfinite(values).all(-1) | ~self.valid, "finite values")
             object.__setattr__(self, name, values)
         _require("weights", (self.weights >= 0).all(-1) | ~self.valid, "values of at least 0")
@@ -114,8 +102,7 @@ class SkinReflectance:
         )
         length = np.linalg.norm(self.normals, axis=-1)
         _require("normals", (np.abs(length - 1.0) < 1e-3) | ~self.valid, "unit vectors")
-        if not 1.0 <= self.eta < np.inf:
-            raise SkinReflectanceError(f"eta: got {self.eta}, expected at least 1, finite")
+        Checks(SkinReflectanceError).within("eta", self.eta, "[1, inf)")
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -125,14 +112,7 @@ class SkinReflectance:
 
     def dipole(self) -> DipoleMaps:
         """Return the coefficients of the diffusion dipole, section 9; R_d > 1 is masked there."""
-        return DipoleMaps.of(
-            self.r_d,
-            self.translucency_mm,
-            eta=self.eta,
-            valid=self.valid,
-            r_d_stderr=self.r_d_stderr,
-            translucency_stderr_mm=self.translucency_stderr_mm,
-        )
+        return DipoleMaps.of(self.r_d, self.translucency_mm, eta=self.eta, valid=self.valid)
 
 
 def assemble(
@@ -251,35 +231,6 @@ def lobes_of(appearance: SkinAppearance) -> BrdfBasis:
     return brdf_tables.of_columns(table, names, light_radius_rad=radius)
 
 
-def surface_brdf(
-    model: SkinReflectance,
-    rows: ArrayLike,
-    light_dir: ArrayLike,
-    view_dir: ArrayLike,
-    normals: ArrayLike,
-) -> Float64Array:
-    """Return what the surface reflects, without the cosine of the light.
-
-    Parameters
-    ----------
-    model
-        With weights and lobes.
-    rows
-        Flat indices of texels, (n,), row-major in the texture.
-    light_dir, view_dir, normals
-        Unit vectors (n, 3) or (3,), one frame, away from the surface.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        1/sr, the same for all channels; 0 below the horizon.
-    """
-    at = _rows(model, rows)
-    return lobe_brdf(
-        model.lobes, model.weights.reshape(-1, model.lobes.size)[at], light_dir, view_dir, normals
-    )
-
-
 def lobe_brdf(
     lobes: BrdfBasis,
     weights: ArrayLike,
@@ -342,40 +293,18 @@ def _normals(appearance: SkinAppearance) -> SkinMap:
     )
 
 
-def _rows(model: SkinReflectance, rows: ArrayLike) -> NDArray[np.intp]:
-    at = np.asarray(rows)
-    if at.ndim != 1 or not np.issubdtype(at.dtype, np.integer):
-        raise SkinReflectanceError(f"rows: got {at.dtype} {at.shape}, expected integers (n,)")
-    size = model.valid.size
-    if len(at) and not (at.min() >= 0 and at.max() < size):
-        raise SkinReflectanceError(
-            f"rows: got {at.min()} to {at.max()}, expected 0 to {size - 1}, flat indices"
-        )
-    return at.astype(np.intp)
-
-
 def _over_texture(
     given: ArrayLike | SkinMap, shape: tuple[int, ...]
 ) -> tuple[Float32Array, Float32Array | None, BoolArray]:
     """Return a translucency on a texture of a shape, its standard error, and where it is known."""
     if isinstance(given, SkinMap):
-        if given.values.ndim != 3:
-            raise SkinReflectanceError(
-                f"translucency: got shape {given.values.shape}, expected (H, W, 3)"
-            )
+        Checks(SkinReflectanceError).shape("translucency", given.values, ("H", "W", 3))
         known = _resampled(given.mask.astype(np.float32)[..., None], shape)[..., 0] > 0.999
         stderr = None if given.stderr is None else _resampled(given.stderr, shape)
         return _resampled(given.values, shape), stderr, known
     values = np.asarray(given, np.float32)
-    try:
-        even = np.broadcast_to(values, (*shape, 3))
-    except ValueError as error:
-        raise SkinReflectanceError(
-            f"translucency: got shape {values.shape}, expected one that broadcasts to "
-            f"{(*shape, 3)}, or a map"
-        ) from error
-    if not (np.isfinite(values).all() and (values > 0).all()):
-        raise SkinReflectanceError("translucency: got values that are not finite, above 0 mm")
+    even = Checks(SkinReflectanceError).spread("translucency", values, (*shape, 3))
+    Checks(SkinReflectanceError).within("translucency", values, "(0, inf)")
     return even.copy(), None, np.ones(shape, bool)
 
 

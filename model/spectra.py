@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import Float64Array
+from model.checks import Checks
 
 MAX_WAVELENGTH_NM = 1e6
 """Longest wavelength that is one of light, nm."""
@@ -318,11 +319,7 @@ def band_average(
     """
     values = np.asarray(spectra, dtype=np.float64)
     weights = band_weights(camera, illuminant_name, wavelength_nm)
-    if values.shape[-1:] != weights.shape[:1]:
-        raise ValueError(
-            f"spectra: last axis must have {weights.shape[0]} samples (one a wavelength), "
-            f"got shape {values.shape}"
-        )
+    Checks().shape("spectra", values, ("...", weights.shape[0]))
     return np.asarray(values @ weights)
 
 
@@ -349,11 +346,9 @@ def _sampled(file_name: str, wavelength_nm: ArrayLike, *, outside: float | None)
     """Interpolate a table linearly; `outside` is the value beyond it, None forbids going there."""
     nodes, values = _table(file_name)
     wavelength = _wavelengths(wavelength_nm)
-    if outside is None and not np.all((wavelength >= nodes[0]) & (wavelength <= nodes[-1])):
-        raise ValueError(
-            f"wavelength_nm: the table {file_name} spans {nodes[0]:.0f} to {nodes[-1]:.0f} nm, "
-            f"got {np.min(wavelength):g} to {np.max(wavelength):g}"
-        )
+    if outside is None:
+        what = f"wavelength_nm in the table {file_name}"
+        Checks().within(what, wavelength, f"[{nodes[0]}, {nodes[-1]}]")
     columns = [
         np.interp(wavelength, nodes, values[:, k], left=outside, right=outside)
         for k in range(values.shape[1])
@@ -378,11 +373,7 @@ def _band_weights(camera: str, light_name: str, grid: tuple[float, ...]) -> Floa
 
 def _wavelengths(wavelength_nm: ArrayLike) -> Float64Array:
     wavelength = np.asarray(wavelength_nm, dtype=np.float64)
-    if not np.all((wavelength > 0.0) & (wavelength <= MAX_WAVELENGTH_NM)):
-        raise ValueError(
-            f"wavelength_nm: got a smallest of {np.min(wavelength):g} and a largest of "
-            f"{np.max(wavelength):g}, expected above 0, up to {MAX_WAVELENGTH_NM:g} nm"
-        )
+    Checks().within("wavelength_nm", wavelength, f"(0, {MAX_WAVELENGTH_NM}]")
     return wavelength
 
 

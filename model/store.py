@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
 from model.arrays import Float32Array
+from model.checks import Checks
 from model.skin import SkinAppearance, SkinMap
 
 SCHEMA = "skinrig.appearance/1"
@@ -265,8 +266,7 @@ def _read_map(folder: Path, entry: _MapEntry) -> SkinMap:
         if _digest(path) != file.sha256:
             raise StoreError(f"{path}: was changed after it was written (its hash does not fit)")
         image = read_exr(path)
-        if image.shape != shape:
-            raise StoreError(f"{path}: got shape {image.shape}, expected {shape}")
+        Checks(StoreError).shape(str(path), image, shape)
         return image
 
     shape = tuple(entry.shape)

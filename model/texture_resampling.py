@@ -10,6 +10,7 @@ import numpy as np
 from scipy import sparse
 
 from model.arrays import Float64Array, FloatArray, Int64Array
+from model.checks import Checks
 
 
 def taps(texels: int, pixels: int) -> tuple[Int64Array, Float64Array]:
@@ -26,8 +27,7 @@ def taps(texels: int, pixels: int) -> tuple[Int64Array, Float64Array]:
     >>> first.tolist(), part.tolist()
     ([0, 0, 0, 1], [0.0, 0.25, 0.75, 0.0])
     """
-    if texels < 1 or pixels < 1:
-        raise ValueError(f"texels, pixels: got {texels}, {pixels}, expected at least 1")
+    Checks().within("texels, pixels", (texels, pixels), "[1, inf)")
     place = np.clip((np.arange(pixels) + 0.5) * texels / pixels - 0.5, 0.0, texels - 1.0)
     first = np.floor(place).astype(np.int64)
     return first, place - first
@@ -45,8 +45,7 @@ def reading_matrix(texels: int, pixels: int) -> Any:
 
 def averaging_matrix(pixels: int, texels: int) -> Any:
     """Return the sparse matrix that averages `pixels` over each of `texels`; rows sum to 1."""
-    if pixels < 1 or texels < 1:
-        raise ValueError(f"pixels, texels: got {pixels}, {texels}, expected at least 1")
+    Checks().within("pixels, texels", (pixels, texels), "[1, inf)")
     edges = np.arange(texels + 1) * (pixels / texels)
     values, rows, columns = [], [], []
     for i in range(texels):
@@ -86,13 +85,9 @@ def resampled(texture: FloatArray, shape: tuple[int, int]) -> FloatArray:
     """
     given = np.asarray(texture)
     real = np.issubdtype(given.dtype, np.floating)
-    if given.ndim < 2 or min(given.shape[-2:]) < 1 or not real:
-        raise ValueError(
-            f"texture: got shape {given.shape} of {given.dtype}, expected (..., h, w) of floating "
-            "point numbers, h and w at least 1"
-        )
-    if len(shape) != 2 or min(shape) < 1:
-        raise ValueError(f"shape: got {tuple(shape)}, expected rows and columns, each at least 1")
+    Checks().require(real, "texture", given.dtype, "floating point numbers")
+    Checks().shape("texture", given, ("...", "h", "w"))
+    Checks().numbers("shape", shape, (2,), interval="[1, inf)")
     # sparse matrices know no halves: those are summed in single precision
     out = given.astype(np.promote_types(given.dtype, np.float32), copy=False)
     for axis, pixels in ((-2, shape[0]), (-1, shape[1])):

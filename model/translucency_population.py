@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float64Array, Int64Array
+from model.checks import Checks
 
 Reading: TypeAlias = Literal["deviation", "variance"]
 
@@ -81,16 +82,10 @@ class TranslucencyPopulation:
         shape = (len(self.sites), len(self.channels))
         for name in ("mean_per_mm", "deviation_per_mm"):
             values = np.array(getattr(self, name), np.float64)
-            if values.shape != shape:
-                raise PopulationError(f"{name}: got shape {values.shape}, expected {shape}")
-            if not (np.isfinite(values).all() and (values > 0).all()):
-                raise PopulationError(f"{name}: got {values.tolist()}, expected finite, above 0")
+            Checks(PopulationError).numbers(name, values, shape, interval="(0, inf)")
             values.setflags(write=False)
             object.__setattr__(self, name, values)
-        if not 0 <= self.site_correlation < 1:
-            raise PopulationError(
-                f"site_correlation: got {self.site_correlation}, expected 0 or more, below 1"
-            )
+        Checks(PopulationError).within("site_correlation", self.site_correlation, "[0, 1)")
         matrix = np.array(self.channel_correlation, np.float64)
         if matrix.shape != (shape[1], shape[1]) or not np.array_equal(matrix, matrix.T):
             raise PopulationError(
@@ -143,8 +138,7 @@ class TranslucencyPopulation:
         >>> people.shape, bool((people > 0).all()), round(float(people[:, 1, 0].mean()), 2)
         ((1000, 3, 3), True, 0.54)
         """
-        if n < 1:
-            raise PopulationError(f"n: got {n}, expected at least 1")
+        Checks(PopulationError).within("n", n, "[1, inf)")
         normal = rng.standard_normal((n, self.log_mean.size))
         logs = self.log_mean.reshape(-1) + normal @ np.linalg.cholesky(self.log_covariance()).T
         return np.asarray(np.exp(logs).reshape(n, *self.log_mean.shape))
@@ -166,8 +160,7 @@ def weyrich_2005(*, reading: Reading = "deviation") -> TranslucencyPopulation:
     >>> weyrich_2005(reading="variance").deviation_per_mm[:, 0].round(3).tolist()
     [0.416, 0.275, 0.485]
     """
-    if reading not in ("deviation", "variance"):
-        raise PopulationError(f'reading: got {reading!r}, expected "deviation" or "variance"')
+    Checks(PopulationError).choice("reading", reading, ("deviation", "variance"))
     text = resources.files("model").joinpath("data/weyrich2005_table2.csv").read_text("utf-8")
     rows = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
     mean, printed = np.zeros((2, len(SITE_NAMES), len(CHANNEL_NAMES)))
@@ -330,22 +323,16 @@ def table(
         For shapes that do not fit, or a counted value that is not finite and above 0.
     """
     values = np.asarray(sigma_tr_per_mm, np.float64)
-    expected = (len(sites), len(channels))
-    if values.ndim != 3 or values.shape[1:] != expected:
-        raise PopulationError(
-            f"sigma_tr_per_mm: got shape {values.shape}, expected (n, {expected[0]}, {expected[1]})"
-        )
+    check = Checks(PopulationError)
+    check.shape("sigma_tr_per_mm", values, ("n", len(sites), len(channels)))
     good = np.ones(values.shape, bool) if valid is None else np.array(valid, bool)
     noise = np.zeros(values.shape)
     if stderr_per_mm is not None:
         noise = np.asarray(stderr_per_mm, np.float64)
-    for name, shape in (("valid", good.shape), ("stderr_per_mm", noise.shape)):
-        if shape != values.shape:
-            raise PopulationError(f"{name}: got shape {shape}, expected {values.shape}")
-    if not (np.isfinite(values[good]).all() and (values[good] > 0).all()):
-        raise PopulationError("sigma_tr_per_mm: got a counted value that is not finite, above 0")
-    if not (np.isfinite(noise[good]).all() and (noise[good] >= 0).all()):
-        raise PopulationError("stderr_per_mm: got a counted value that is not finite, 0 or above")
+    check.shape("valid", good, values.shape)
+    check.shape("stderr_per_mm", noise, values.shape)
+    check.within("sigma_tr_per_mm, counted", values[good], "(0, inf)")
+    check.within("stderr_per_mm, counted", noise[good], "[0, inf)")
     n = good.sum(axis=0)
     some = np.maximum(n, 1)
     # squares and fourth powers in a unit that keeps them from vanishing and from overflowing
@@ -435,10 +422,8 @@ def _averaged(repeats: list[SiteMeasurement]) -> tuple[Float64Array, Float64Arra
     errors = np.array([one.stderr_per_mm for one in repeats])
     told = np.array([one.valid or (True,) * values.shape[1] for one in repeats])
     told &= np.isfinite(values) & (values > 0)
-    if not (np.isfinite(errors[told]).all() and (errors[told] > 0).all()):
-        raise PopulationError(
-            f"stderr_per_mm: got one of {repeats[0].subject!r} that is not finite and above 0"
-        )
+    whose = f"stderr_per_mm of {repeats[0].subject!r}"
+    Checks(PopulationError).within(whose, errors[told], "(0, inf)")
     some = np.asarray(told.any(axis=0), np.bool_)
     # relative to the least error: squares of errors in a small unit vanish
     least = np.where(some, np.where(told, errors, np.inf).min(axis=0), 1.0)

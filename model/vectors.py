@@ -5,7 +5,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import FloatArray
+from model.arrays import Float64Array, FloatArray
+
+
+def nearest_shares(rows: Float64Array) -> Float64Array:
+    """Return the nearest shares of at least 0 that sum to 1, row by row (n, d)."""
+    falling = -np.sort(-rows, axis=1)
+    excess = (np.cumsum(falling, axis=1) - 1.0) / np.arange(1, rows.shape[1] + 1)
+    kept = np.count_nonzero(falling > excess, axis=1)
+    return np.maximum(rows - excess[np.arange(len(rows)), kept - 1, None], 0.0)
 
 
 def unit_vectors(

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from model.checks import Checks
 from model.fresnel import ETA_SKIN
 from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
@@ -152,8 +153,7 @@ def separate(
     w_p = w_c = np.ones(1, dtype=kind)
     if normals is not None and view_dir is None:
         raise ValueError("normals: got them without view_dir, expected both or neither")
-    if not 1.0 < eta < 4.0:
-        raise ValueError(f"eta: got {eta}, expected 1 < eta < 4")
+    Checks().within("eta", eta, "(1, 4)")
     if view_dir is not None:
         v = _unit("view_dir", view_dir, kind)
         if light_dir is not None:
@@ -210,10 +210,8 @@ def separate(
 
 def _images(parallel: FloatArray, crossed: FloatArray) -> tuple[FloatArray, FloatArray]:
     p, c = np.asarray(parallel), np.asarray(crossed)
-    if p.shape != c.shape or p.ndim < 1:
-        raise ValueError(
-            f"parallel, crossed: got shapes {p.shape} and {c.shape}, expected one shape (..., C)"
-        )
+    Checks().within("axes of parallel (..., C)", p.ndim, "[1, inf)")
+    Checks().shape("crossed", c, p.shape)
     kind = np.result_type(p.dtype, c.dtype)
     if not np.issubdtype(kind, np.floating):
         raise ValueError(f"parallel, crossed: got {kind}, expected linear images of floating type")
@@ -224,10 +222,7 @@ def _leak(extinction: ArrayLike | None, shape: tuple[int, ...]) -> Float64Array:
     if extinction is None:
         return np.zeros(1)
     ratio = np.asarray(extinction, dtype=np.float64)
-    if np.isnan(ratio).any() or not (ratio > 1).all():
-        raise ValueError(
-            f"extinction: got {ratio.tolist()}, expected > 1 (parallel over crossed; inf if ideal)"
-        )
+    Checks().within("extinction (parallel over crossed; inf if ideal)", ratio, "(1, inf]")
     leak = np.atleast_1d(1.0 / ratio)
     if np.broadcast_shapes(leak.shape, shape) != shape:
         raise ValueError(f"extinction: got shape {ratio.shape} for images of shape {shape}")
@@ -241,16 +236,14 @@ def _variances(
     out = []
     for one in pair:
         array = np.broadcast_to(np.asarray(one, dtype=kind), shape)
-        if (array < 0).any():
-            raise ValueError("variance: got negative values, expected >= 0")
+        Checks().require(not (array < 0).any(), "variance", "negative values", ">= 0")
         out.append(array)
     return out[0], out[1]
 
 
 def _unit(name: str, vectors: ArrayLike, kind: np.dtype) -> FloatArray:
     array = np.asarray(vectors, dtype=kind)
-    if array.shape[-1:] != (3,):
-        raise ValueError(f"{name}: got shape {array.shape}, expected (..., 3)")
+    Checks().shape(name, array, ("...", 3))
     length = np.linalg.norm(array, axis=-1)
     known = np.isfinite(length)
     if not known.any() or np.abs(length[known] - 1.0).max() > 0.01:

@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import TypeVar
 
+from model.checks import Checks
+
 Tile = TypeVar("Tile")
 Result = TypeVar("Result")
 
@@ -50,8 +52,7 @@ def map_tiles(
     >>> list(map_tiles(abs, [-1, 2, -3]))
     [1, 2, 3]
     """
-    if window < 1:
-        raise ValueError(f"window: got {window}, expected at least 1")
+    Checks().within("window", window, "[1, inf)")
     if executor is None:
         for tile in tiles:
             yield fn(tile)

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from model import fresnel
 from model.arrays import Float64Array
+from model.checks import Checks
 
 Distribution = Literal["ggx", "beckmann", "blinn"]
 
@@ -53,8 +54,7 @@ def facet_density(cos_h: ArrayLike, roughness: float, kind: Distribution = "ggx"
     1.27324
     """
     least, most = ROUGHNESS_RANGE
-    if not least <= roughness <= most:
-        raise ValueError(f"roughness: got {roughness}, expected {least:g} to {most:g}")
+    Checks().within("roughness", roughness, f"[{least}, {most}]")
     c = np.clip(np.asarray(cos_h, dtype=np.float64), 0.0, 1.0)
     a2 = roughness**2
     if kind == "ggx":

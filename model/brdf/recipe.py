@@ -13,6 +13,7 @@ from model.arrays import Float64Array
 from model.brdf import microfacet
 
 Brdf = Callable[[Float64Array, Float64Array], Float64Array]
+"""Takes light and view, unit vectors (..., 3) where +z is the normal; gives 1/sr, NaN: unknown."""
 
 GGX_ROUGHNESS = (0.05, 0.07, 0.1, 0.14, 0.18, 0.22, 0.27, 0.33, 0.4, 0.48, 0.58, 0.7)
 GGX_ETA = (1.3, 1.4, 1.55)

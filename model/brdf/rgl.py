@@ -17,7 +17,6 @@ Dupuy and Jakob 2018, doi:10.1145/3272127.3275059.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import Float32Array, Float64Array
 from model.brdf import tensor_file
+from model.brdf.recipe import Brdf
+from model.checks import Checks
 from model.vectors import unit_vectors
 
 N_ELEVATIONS = 45
@@ -76,23 +77,16 @@ class RglTable:
         """Check the shapes, and the densities."""
         count = len(self.theta_i)
         channels = len(self.wavelengths_nm) or 3
-        side = self.values.shape[-1]
-        for name, got, expected in (
-            ("values", self.values.shape, (count, channels, side, side)),
-            ("luminance", self.luminance.shape, (count, side, side)),
-            ("vndf", self.vndf.shape, (count, *self.vndf.shape[-2:])),
-        ):
-            if got != expected:
-                raise RglFileError(f"{name}: got shape {got}, expected {expected}")
+        check = Checks(RglFileError)
+        check.shape("values", self.values, (count, channels, *self.values.shape[-1:] * 2))
+        check.shape("luminance", self.luminance, (count, *self.values.shape[-1:] * 2))
+        check.shape("vndf", self.vndf, (count, *self.vndf.shape[-2:]))
         if not (np.all(np.diff(self.theta_i) > 0) and np.all(np.isfinite(self.theta_i))):
             raise RglFileError("theta_i: got elevations that do not grow")
         for name in ("ndf", "sigma", "vndf", "luminance"):
             grid = getattr(self, name)
-            if min(grid.shape[-2:]) < 2 or not np.all((grid >= 0.0) & np.isfinite(grid)):
-                raise RglFileError(
-                    f"{name}: got shape {grid.shape} or values below 0, expected densities on at "
-                    "least 2 x 2 nodes"
-                )
+            check.require(min(grid.shape[-2:]) >= 2, name, grid.shape, "at least 2 x 2 nodes")
+            check.within(name, grid, "[0, inf)")
         if not np.all(self.vndf.sum((1, 2)) > 0.0):
             raise RglFileError("vndf: got an elevation without any density")
 
@@ -133,12 +127,7 @@ class RglTable:
         return out
 
 
-def of_brdf(
-    brdf: Callable[[Float64Array, Float64Array], Float64Array],
-    *,
-    description: str,
-    side: int = TABLE_SIDE,
-) -> RglTable:
+def of_brdf(brdf: Brdf, *, description: str) -> RglTable:
     """Tabulate a BRDF.
 
     Parameters
@@ -158,11 +147,11 @@ def of_brdf(
         When the BRDF is negative or not finite somewhere.
     """
     theta_i = np.linspace(0.0, MAX_ELEVATION_RAD, N_ELEVATIONS)
-    u, v = np.meshgrid(np.linspace(0.0, 1.0, side), np.linspace(0.0, 1.0, side))
+    u, v = np.meshgrid(np.linspace(0.0, 1.0, TABLE_SIDE), np.linspace(0.0, 1.0, TABLE_SIDE))
     theta, phi = u**2 * (np.pi / 2.0), (2.0 * v - 1.0) * np.pi
     half = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
-    values = np.zeros((N_ELEVATIONS, 3, side, side), np.float32)
-    luminance = np.zeros((N_ELEVATIONS, side, side), np.float32)
+    values = np.zeros((N_ELEVATIONS, 3, TABLE_SIDE, TABLE_SIDE), np.float32)
+    luminance = np.zeros((N_ELEVATIONS, TABLE_SIDE, TABLE_SIDE), np.float32)
     for k, elevation in enumerate(theta_i):
         view = np.array([np.sin(elevation), 0.0, np.cos(elevation)])
         along = half @ view
@@ -170,8 +159,7 @@ def of_brdf(
         seen = (along > 0.0) & (light[..., 2] > 0.0)
         to = unit_vectors(light[seen])
         found = np.asarray(brdf(to, np.broadcast_to(view, to.shape)), np.float64)
-        if not np.all((found >= 0.0) & (found < np.inf)):
-            raise ValueError("brdf: got negative or non-finite values, expected 1/sr")
+        Checks().within("brdf", found, "[0, inf)")
         rgb = np.broadcast_to(found.reshape(len(to), -1), (len(to), 3)) * to[:, 2:]
         values[k][:, seen] = rgb.T
         jacobian = np.maximum(2.0 * np.pi**2 * u * np.sin(theta), _MIN_JACOBIAN) * 4.0 * along
@@ -203,11 +191,8 @@ def read(path: str | os.PathLike[str]) -> RglTable:
     fields = tensor_file.read(path)
     spectral = "wavelengths" in fields
     data = "spectra" if spectral else "rgb"
-    missing = [
-        name
-        for name in ("theta_i", "phi_i", "ndf", "sigma", "vndf", "luminance", data)
-        if name not in fields
-    ]
+    needed = ("theta_i", "phi_i", "ndf", "sigma", "vndf", "luminance", data)
+    missing = [name for name in needed if name not in fields]
     if missing:
         raise RglFileError(
             f"{path}: has no field {missing[0]}; it has {', '.join(fields) or 'none'}"
@@ -217,18 +202,12 @@ def read(path: str | os.PathLike[str]) -> RglTable:
         raise RglFileError(
             f"{path}: got an anisotropic material ({azimuths} azimuths), expected an isotropic one"
         )
-    for name, dimensions in (
-        ("theta_i", 1),
-        ("ndf", 2),
-        ("sigma", 2),
-        ("vndf", 4),
-        ("luminance", 4),
-        (data, 5),
-    ):
-        if fields[name].ndim != dimensions:
-            raise RglFileError(
-                f"{path}: {name}: got {fields[name].ndim} dimensions, expected {dimensions}"
-            )
+    axes = {"theta_i": 1, "ndf": 2, "sigma": 2, "vndf": 4, "luminance": 4, data: 5}
+    for name, dimensions in axes.items():
+        got = f"{fields[name].ndim} dimensions"
+        Checks(RglFileError).require(
+            fields[name].ndim == dimensions, f"{path}: {name}", got, str(dimensions)
+        )
     grids = {name: np.asarray(array, np.float32) for name, array in fields.items() if array.size}
     scaled = bool(fields["jacobian"][0]) if "jacobian" in fields else True
     text = fields.get("description", np.zeros(0, np.uint8))

@@ -12,7 +12,7 @@ Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 7.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -24,10 +24,9 @@ from scipy.ndimage import distance_transform_edt
 from model import merl
 from model.arrays import Float32Array, Float64Array
 from model.brdf import recipe as brdf_recipe
+from model.brdf.recipe import Brdf
+from model.checks import Checks
 from model.vectors import unit_vectors
-
-Brdf = Callable[[Float64Array, Float64Array], Float64Array]
-"""Takes light and view, unit vectors (..., 3) where +z is the normal; gives 1/sr, NaN: unknown."""
 
 NODES_D, NODES_PHI, NODES_H = 32, 12, 90
 VECTOR_LANES = 16  # materials are padded to full vectors of float32
@@ -66,13 +65,11 @@ class BrdfBasis:
         """Check shapes and values."""
         lanes = -(-len(self.names) // VECTOR_LANES) * VECTOR_LANES
         expected = (NODES_D, NODES_PHI, NODES_H, lanes)
-        if not self.names or self.table.shape != expected or self.table.dtype != np.float32:
-            raise BasisError(
-                f"BrdfBasis.table: got {self.table.dtype} {self.table.shape} for "
-                f"{len(self.names)} names, expected float32 {expected} and at least one name"
-            )
-        if not np.all((self.table >= 0.0) & (self.table < np.inf)):
-            raise BasisError("BrdfBasis.table: got negative or non-finite values")
+        check = Checks(BasisError)
+        check.within("names", len(self.names), "[1, inf)")
+        check.choice("BrdfBasis.table", self.table.dtype, (np.dtype(np.float32),))
+        check.shape("BrdfBasis.table", self.table, expected)
+        check.within("BrdfBasis.table", self.table, "[0, inf)")
 
     @property
     def size(self) -> int:
@@ -117,11 +114,7 @@ class BrdfBasis:
 
     def mixed(self, mix: ArrayLike) -> BrdfBasis:
         """Return the basis whose R materials are the rows of `mix`, (R, K), at least 0."""
-        rows = np.asarray(mix, dtype=np.float64)
-        if rows.ndim != 2 or rows.shape[1] != self.size or not np.all(rows >= 0.0):
-            raise BasisError(
-                f"mix: got shape {rows.shape}, expected (R, {self.size}) of values at least 0"
-            )
+        rows = Checks(BasisError).numbers("mix", mix, ("R", self.size), interval="[0, inf]")
         table = self.table[..., : self.size].astype(np.float64) @ rows.T
         return _padded(table, [f"mix {i}" for i in range(len(rows))], self.light_radius_rad)
 
@@ -240,8 +233,7 @@ def _gram(basis: BrdfBasis) -> Float64Array:
 
 def _convolved(brdf: Brdf, radius_rad: float) -> Float64Array:
     """Return a BRDF at the nodes, averaged with the cosine over a disc of light directions."""
-    if not 0.0 <= radius_rad <= 0.5:
-        raise BasisError(f"light_radius_rad: got {radius_rad}, expected 0 to 0.5 rad")
+    Checks(BasisError).within("light_radius_rad", radius_rad, "[0, 0.5]")
     d, phi, h = np.meshgrid(*nodes(), indexing="ij")
     light, view = merl.to_directions(h, d, phi)
     if radius_rad == 0.0:

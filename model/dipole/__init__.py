@@ -2,7 +2,6 @@
 
 from model.dipole.profile import ReflectanceOutlierError as ReflectanceOutlierError
 from model.dipole.profile import absorbed_fraction as absorbed_fraction
-from model.dipole.profile import albedo_slope as albedo_slope
 from model.dipole.profile import coefficients as coefficients
 from model.dipole.profile import effective_transport as effective_transport
 from model.dipole.profile import invert_to_deficit as invert_to_deficit

@@ -28,6 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from model import fresnel
 from model.arrays import Float32Array, Float64Array, Int32Array
+from model.checks import FINITE, Checks
 from model.dipole import gather_kernels as dipole_gather_kernels
 from model.dipole import source_tree_kernels
 from model.dipole.direct_sum import SOURCE_RADIUS_PER_SIDE, Media
@@ -92,9 +93,7 @@ class SourceTree:
         place = np.asarray(source_mm, np.float64)
         area = np.asarray(source_area_mm2, np.float64)
         _expect("source_mm", place, (len(place), 3))
-        _expect("source_area_mm2", area, (len(place),))
-        if np.any(area < 0.0):
-            raise GatherError("source_area_mm2: got negative values, expected at least 0")
+        _expect("source_area_mm2", area, (len(place),), "[0, inf)")
         # an area that float32 does not hold sends nothing
         size, some = len(place), np.flatnonzero(area.astype(np.float32) > 0.0)
         place, area = place[some], area[some]
@@ -227,12 +226,9 @@ def gather(
     if entered_at is not None:
         own = np.asarray(entered_at, np.float64)
         _expect("entered_at", own, at.shape)
-    if not tolerance > 0.0:
-        raise GatherError(f"tolerance: got {tolerance}, expected above 0")
-    if np.any(length <= 0.0):
-        raise GatherError("translucency_mm: got values of 0 or below, expected above 0")
-    if workers < 1:
-        raise GatherError(f"workers: got {workers}, expected at least 1")
+    Checks(GatherError).within("tolerance", tolerance, "(0, inf)")
+    Checks(GatherError).within("translucency_mm", length, "(0, inf)")
+    Checks(GatherError).within("workers", workers, "[1, inf)")
     found = np.zeros((len(at), 3))
     bound, work = np.zeros(len(at), np.float32), np.zeros(len(at), np.int32)
     if not len(tree.order):
@@ -282,21 +278,14 @@ def gather(
     return Gathered(found, bound, work)
 
 
-def _expect(name: str, values: Float64Array, shape: tuple[int, ...]) -> None:
-    if values.shape != shape:
-        raise GatherError(f"{name}: got shape {values.shape}, expected {shape}")
-    if not np.isfinite(values).all():
-        raise GatherError(f"{name}: got NaN or infinity, expected finite; leave such points out")
+def _expect(
+    name: str, values: Float64Array, shape: tuple[int, ...], interval: str = FINITE
+) -> None:
+    Checks(GatherError).shape(name, values, shape)
+    Checks(GatherError).within(f"{name} (leave points without it out)", values, interval)
 
 
 def _spread(name: str, given: ArrayLike, count: int) -> Float64Array:
     values = np.asarray(given, np.float64)
-    try:
-        spread = np.broadcast_to(values, (count, 3))
-    except ValueError as error:
-        raise GatherError(
-            f"{name}: got shape {values.shape}, expected one that broadcasts to ({count}, 3)"
-        ) from error
-    if not np.isfinite(values).all():
-        raise GatherError(f"{name}: got NaN or infinity, expected finite; leave such points out")
-    return spread
+    _expect(name, values, values.shape)
+    return Checks(GatherError).spread(name, values, (count, 3))

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from model import fresnel
 from model.arrays import Float64Array
+from model.checks import Checks
 
 MAX_COEFFICIENT = 1e100
 """Most of a coefficient, 1/mm, or a distance, mm: its cube is still a number."""
@@ -85,10 +86,11 @@ def derivatives(
     >>> bool(np.all(slopes.by_sigma_a < 0.0))
     True
     """
-    radius, absorption, scattering = np.broadcast_arrays(
-        _not_negative("radius_mm", radius_mm),
-        _not_negative("sigma_a_per_mm", sigma_a_per_mm),
-        _not_negative("sigma_s_prime_per_mm", sigma_s_prime_per_mm),
+    radius, absorption, scattering = Checks().together(
+        f"[0, {MAX_COEFFICIENT}]",
+        radius_mm=radius_mm,
+        sigma_a_per_mm=sigma_a_per_mm,
+        sigma_s_prime_per_mm=sigma_s_prime_per_mm,
     )
     c_phi, c_flux = exit_coefficients(eta)
     scatters = scattering > 0.0
@@ -159,13 +161,3 @@ def image_depth(eta: float) -> float:
     """
     effective = effective_reflection(eta)
     return 1.0 + 4.0 / 3.0 * (1.0 + effective) / (1.0 - effective)
-
-
-def _not_negative(name: str, value: ArrayLike) -> Float64Array:
-    array = np.asarray(value, dtype=np.float64)
-    if not np.all((array >= 0.0) & (array <= MAX_COEFFICIENT)):
-        raise ValueError(
-            f"{name}: got negative, non-finite or too large values, expected 0 to "
-            f"{MAX_COEFFICIENT:g}"
-        )
-    return array

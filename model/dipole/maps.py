@@ -22,21 +22,16 @@ class DipoleMaps:
     ----------
     deficit : ndarray
         1 - alpha', in (0, 1], with all its digits near alpha' = 1; NaN where not `valid`.
-    sigma_t_prime_per_mm, sigma_s_prime_per_mm, sigma_a_per_mm : ndarray
+    sigma_s_prime_per_mm, sigma_a_per_mm : ndarray
         1/mm; NaN where not `valid`.
-    deficit_stderr, sigma_t_prime_stderr : ndarray
-        Standard errors to first order; NaN where not `valid` or not known.
     outlier : ndarray of bool
         R_d is known and outside [0, 1]: no medium has it.
     valid : ndarray of bool
     """
 
     deficit: Float64Array
-    sigma_t_prime_per_mm: Float64Array
     sigma_s_prime_per_mm: Float64Array
     sigma_a_per_mm: Float64Array
-    deficit_stderr: Float64Array
-    sigma_t_prime_stderr: Float64Array
     outlier: BoolArray
     valid: BoolArray
 
@@ -47,13 +42,7 @@ class DipoleMaps:
 
     @staticmethod
     def of(
-        r_d: ArrayLike,
-        translucency_mm: ArrayLike,
-        *,
-        eta: float,
-        valid: ArrayLike | None = None,
-        r_d_stderr: ArrayLike | None = None,
-        translucency_stderr_mm: ArrayLike | None = None,
+        r_d: ArrayLike, translucency_mm: ArrayLike, *, eta: float, valid: ArrayLike | None = None
     ) -> DipoleMaps:
         """Return the coefficients for R_d and 1/sigma_tr (section 9 of Weyrich et al.).
 
@@ -65,8 +54,6 @@ class DipoleMaps:
             Refractive index of the medium over that of air.
         valid
             Texels that count, (...); None: all.
-        r_d_stderr, translucency_stderr_mm
-            Standard errors, as their values; None: not known.
 
         Examples
         --------
@@ -87,30 +74,9 @@ class DipoleMaps:
         safe = np.where(good, deficit, 1.0)
         sigma_tr = 1.0 / np.where(good, depth, 1.0)
         # Section 9: sigma_t' = sigma_tr / sqrt(3 (1 - alpha'))
-        total = sigma_tr / np.sqrt(3.0 * safe)
         absorbed, scattered = dipole.coefficients(safe, sigma_tr)
-        error = _stderr(r_d_stderr, albedo.shape) * dipole.albedo_slope(safe, eta)
-        relative = np.hypot(
-            0.5 * error / safe,
-            _stderr(translucency_stderr_mm, depth.shape) / np.where(good, depth, 1.0),
-        )
 
         def masked(values: Float64Array) -> Float64Array:
             return np.asarray(np.where(good, values, np.nan))
 
-        return DipoleMaps(
-            masked(deficit),
-            masked(total),
-            masked(scattered),
-            masked(absorbed),
-            masked(error),
-            masked(total * relative),
-            outlier,
-            good,
-        )
-
-
-def _stderr(given: ArrayLike | None, shape: tuple[int, ...]) -> Float64Array:
-    if given is None:
-        return np.full(shape, np.nan)
-    return np.broadcast_to(np.asarray(given, np.float64), shape)
+        return DipoleMaps(masked(deficit), masked(scattered), masked(absorbed), outlier, good)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from model import fresnel
 from model.arrays import BoolArray, Float64Array
+from model.checks import Checks
 
 MAX_COEFFICIENT = 1e100
 """Most of a coefficient, 1/mm, or a distance, mm, of a profile: its cube is still a number."""
@@ -55,19 +56,12 @@ def reflectance(
     >>> float(reflectance(1.0, 0.032, 0.74, 1.3).round(5))
     0.02202
     """
-    given = {
-        "radius_mm": radius_mm,
-        "sigma_a_per_mm": sigma_a_per_mm,
-        "sigma_s_prime_per_mm": sigma_s_prime_per_mm,
-    }
-    arrays = [_not_negative(name, value, most=MAX_COEFFICIENT) for name, value in given.items()]
-    try:
-        r, sigma_a, sigma_s = np.broadcast_arrays(*arrays)
-    except ValueError:
-        raise ValueError(
-            f"{', '.join(given)}: got shapes {', '.join(str(a.shape) for a in arrays)}, "
-            f"expected ones that broadcast"
-        ) from None
+    r, sigma_a, sigma_s = Checks().together(
+        f"[0, {MAX_COEFFICIENT}]",
+        radius_mm=radius_mm,
+        sigma_a_per_mm=sigma_a_per_mm,
+        sigma_s_prime_per_mm=sigma_s_prime_per_mm,
+    )
     A = fresnel.boundary_factor(eta)
     scatters = sigma_s > 0.0
     sigma_t = np.where(scatters, sigma_a + sigma_s, 1.0)
@@ -102,7 +96,7 @@ def total_reflectance(albedo_prime: ArrayLike, eta: float) -> Float64Array:
     >>> float(total_reflectance(0.74 / (0.74 + 0.032), 1.3).round(4))
     0.436
     """
-    alpha = _in_unit("albedo_prime", albedo_prime)
+    alpha = Checks().numbers("albedo_prime", albedo_prime, interval="[0, 1]")
     return np.asarray(alpha * _survival(np.sqrt(3.0 * (1.0 - alpha)), eta))
 
 
@@ -116,7 +110,7 @@ def absorbed_fraction(deficit: ArrayLike, eta: float) -> Float64Array:
     >>> 1e-10 < float(absorbed_fraction(1e-20, 1.4)) < 1e-9
     True
     """
-    delta = _in_unit("deficit", deficit)
+    delta = Checks().numbers("deficit", deficit, interval="[0, 1]")
     lost, _ = _lost(np.sqrt(3.0 * delta), eta)
     return np.asarray(lost)
 
@@ -183,19 +177,6 @@ def invert_to_deficit(r_d: ArrayLike, eta: float) -> Float64Array:
     return np.asarray(_solve(np.asarray(r_d, dtype=np.float64), eta) ** 2 / 3.0)
 
 
-def albedo_slope(deficit: ArrayLike, eta: float) -> Float64Array:
-    """Return d alpha' / d R_d at a deficit 1 - alpha', which carries standard errors over.
-
-    Examples
-    --------
-    >>> float(albedo_slope(0.0, 1.4))
-    0.0
-    """
-    q = np.sqrt(3.0 * _in_unit("deficit", deficit))
-    _, slope = _lost(q, eta)
-    return np.asarray(2.0 / 3.0 * q / slope)
-
-
 def coefficients(
     deficit: ArrayLike, sigma_tr_per_mm: ArrayLike
 ) -> tuple[Float64Array, Float64Array]:
@@ -224,10 +205,11 @@ def coefficients(
     >>> float(a.round(6)), float(s.round(6))
     (0.032, 0.74)
     """
-    delta = _in_unit("deficit", deficit)
+    delta = Checks().numbers("deficit", deficit, interval="[0, 1]")
     if np.any(delta == 0.0):
         raise ValueError("deficit: got 0, expected more: without absorption sigma_t' is undefined")
-    sigma_t = _not_negative("sigma_tr_per_mm", sigma_tr_per_mm) / np.sqrt(3.0 * delta)
+    sigma_tr = Checks().numbers("sigma_tr_per_mm", sigma_tr_per_mm, interval="[0, inf)")
+    sigma_t = sigma_tr / np.sqrt(3.0 * delta)
     return np.asarray(delta * sigma_t), np.asarray((1.0 - delta) * sigma_t)
 
 
@@ -239,8 +221,8 @@ def effective_transport(sigma_a_per_mm: ArrayLike, sigma_s_prime_per_mm: ArrayLi
     >>> float(effective_transport(0.032, 0.74).round(4))
     0.2722
     """
-    sigma_a = _not_negative("sigma_a_per_mm", sigma_a_per_mm)
-    sigma_s = _not_negative("sigma_s_prime_per_mm", sigma_s_prime_per_mm)
+    sigma_a = Checks().numbers("sigma_a_per_mm", sigma_a_per_mm, interval="[0, inf)")
+    sigma_s = Checks().numbers("sigma_s_prime_per_mm", sigma_s_prime_per_mm, interval="[0, inf)")
     return np.asarray(np.sqrt(3.0 * sigma_a) * np.sqrt(sigma_a + sigma_s))
 
 
@@ -279,20 +261,3 @@ def _solve(r_d: Float64Array, eta: float) -> Float64Array:
             break
     q = np.where(r_d >= 1.0, 0.0, np.where(r_d <= 0.0, np.sqrt(3.0), q))
     return np.asarray(np.where(outlier, np.nan, q))
-
-
-def _in_unit(name: str, value: ArrayLike) -> Float64Array:
-    array = np.asarray(value, dtype=np.float64)
-    if not np.all((array >= 0.0) & (array <= 1.0)):
-        raise ValueError(f"{name}: got values outside [0, 1], expected a fraction")
-    return array
-
-
-def _not_negative(name: str, value: ArrayLike, *, most: float = np.inf) -> Float64Array:
-    array = np.asarray(value, dtype=np.float64)
-    if not np.all((array >= 0.0) & (array <= most) & (array < np.inf)):
-        limit = "" if most == np.inf else f" and at most {most:g}"
-        raise ValueError(
-            f"{name}: got negative, non-finite or too large values, expected at least 0{limit}"
-        )
-    return array

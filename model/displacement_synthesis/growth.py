@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float32Array, Float64Array, Int64Array
+from model.checks import Checks
 from model.displacement_synthesis import cut_kernels, kernels
 from model.displacement_synthesis.layout import CellGrid, Layout, SiteLayout
 from model.displacement_synthesis.regions import coarse_weights, interpolated
@@ -99,10 +100,9 @@ def grow(
     """
     layout = lay_out(patches, size_px, rng=rng, regions=regions, threads=threads, **knobs)
     target = np.empty(layout.shape, np.float32) if out is None else out
-    if target.shape != layout.shape or target.dtype != np.float32:
-        raise SynthesisError(
-            f"out: got {target.dtype} {target.shape}, expected float32 {layout.shape}"
-        )
+    check = Checks(SynthesisError)
+    check.choice("out", target.dtype, (np.dtype(np.float32),))
+    check.shape("out", target, layout.shape)
 
     def draw(place: tuple[int, int]) -> None:
         tile = layout.tile(*place)
@@ -167,28 +167,22 @@ def lay_out(
         As of :func:`grow`.
     """
     shape = _shape(size_px)
-    if wrap not in ("none", "u", "both"):
-        raise SynthesisError(f'wrap: got {wrap!r}, expected "none", "u" or "both"')
-    if candidates < 1 or not 1 <= threads <= 64:
-        raise SynthesisError(
-            f"candidates, threads: got {candidates}, {threads}, expected >= 1 and 1...64"
-        )
+    check = Checks(SynthesisError)
+    check.choice("wrap", wrap, ("none", "u", "both"))
+    check.within("candidates", candidates, "[1, inf)")
+    check.within("threads", threads, "[1, 64]")
     for name, value in (("patch_pixel_um", patch_pixel_um), ("transition_px", transition_px)):
-        if not (math.isfinite(value) and value > 0):
-            raise SynthesisError(f"{name}: got {value}, expected a finite number above 0")
+        check.within(name, value, "(0, inf)")
     by_site = dict(patches) if isinstance(patches, Mapping) else {"patches": patches}
     if not by_site:
         raise SynthesisError("patches: got no site")
-    scales = np.asarray(pixel_um, np.float64)
-    if scales.ndim not in (0, 2) or not (np.isfinite(scales).all() and (scales > 0).all()):
-        raise SynthesisError("pixel_um: expected one number or a map, finite and above 0")
+    scales = check.numbers("pixel_um", pixel_um, (), ("h", "w"), interval="(0, inf)")
     sides = [min(np.shape(p), default=0) for each in by_site.values() for p in each]
     smallest = int(min(sides, default=0) * patch_pixel_um / scales.max())
     grid = _grid(shape, smallest, cell_px, overlap_px, wrap)
     levels, zooms = _levels(scales, patch_pixel_um, grid)
     range_px = 0.375 * grid.overlap if range_px is None else float(range_px)
-    if not 0.5 <= range_px <= 512.0:
-        raise SynthesisError(f"range_px: got {range_px}, expected 0.5...512")
+    check.within("range_px", range_px, "[0.5, 512]")
     if regions is None and len(by_site) > 1:
         raise SynthesisError(f"regions: got None, expected where each of {len(by_site)} sites is")
     weights = None
@@ -337,7 +331,6 @@ def _allowance(sources: Sources, window: int) -> int:
         raise SynthesisError(
             f"patches: got holes of {100 * most / window**2:.0f} % of a window of {window} px even "
             f"in its best places, expected at most {100 * MAX_FILLED_FRACTION:.0f} %: give "
-            "patches with "
-            "larger whole parts, or smaller cell_px, overlap_px"
+            "patches with larger whole parts, or smaller cell_px, overlap_px"
         )
     return most

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import distance_transform_edt
 
 from model.arrays import Float64Array
+from model.checks import Checks
 from model.displacement_synthesis.sources import SynthesisError
 
 
@@ -39,15 +40,11 @@ def coarse_weights(
     """
     given = np.asarray(regions)
     if given.ndim == 2 and np.issubdtype(given.dtype, np.integer):
-        if given.min() < -1 or given.max() >= count:
-            raise SynthesisError(
-                f"regions: got {given.min()}...{given.max()}, expected -1...{count - 1}"
-            )
+        Checks(SynthesisError).within("regions", given, f"[-1, {count})")
         weights = np.stack([given == n for n in range(count)]).astype(np.float64)
     elif given.ndim == 3 and given.shape[0] == count and np.issubdtype(given.dtype, np.floating):
         weights = given.astype(np.float64)
-        if not (np.isfinite(weights).all() and (weights >= 0).all()):
-            raise SynthesisError("regions: expected finite weights >= 0")
+        Checks(SynthesisError).within("regions", weights, "[0, inf)")
     else:
         raise SynthesisError(
             f"regions: got {given.dtype} {given.shape}, expected integers (h, w) or "

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from model.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int32Array, Int64Array
+from model.checks import Checks
 
 MAX_SOURCE_PX = 150_000_000
 """Pixels of all patches at all scales, 12 bytes each with their transposes and tables."""
@@ -73,8 +74,7 @@ def leveled(
     """
     height, known = _checked(height_um, valid, "height_um")
     for name, value in (("pixel_um", pixel_um), ("cutoff_um", cutoff_um)):
-        if not (math.isfinite(value) and value > 0):
-            raise SynthesisError(f"{name}: got {value}, expected a finite number above 0")
+        Checks(SynthesisError).within(name, value, "(0, inf)")
     sigma_px = math.sqrt(0.5 * math.log(2.0)) / math.pi * cutoff_um / pixel_um
     mean = height[known].mean()
     about = np.where(known, height - mean, 0.0)
@@ -87,21 +87,18 @@ def _checked(
     height: ArrayLike, valid: ArrayLike | None, name: str
 ) -> tuple[Float64Array, BoolArray]:
     values = np.asarray(height, np.float64)
-    if values.ndim != 2 or min(values.shape) < 2:
-        raise SynthesisError(f"{name}: got shape {values.shape}, expected (H, W)")
+    Checks(SynthesisError).shape(name, values, ("H", "W"))
+    Checks(SynthesisError).within(f"side of {name}", min(values.shape), "[2, inf)")
     known = np.isfinite(values)
     if valid is not None:
         mask = np.asarray(valid)
-        if mask.dtype != np.bool_ or mask.shape != values.shape:
-            raise SynthesisError(f"valid: got {mask.dtype} {mask.shape}, expected {values.shape}")
+        Checks(SynthesisError).mask("valid", mask, values.shape)
         known &= mask
     if not known.any():
         raise SynthesisError(f"{name}: got no valid height")
-    most = float(np.abs(values[known]).max())
-    if most > MAX_HEIGHT_UM:
-        raise SynthesisError(
-            f"{name}: got a height of {most:g} um, expected up to {MAX_HEIGHT_UM:g}"
-        )
+    Checks(SynthesisError).within(
+        f"heights of {name}", values[known], f"[-{MAX_HEIGHT_UM}, {MAX_HEIGHT_UM}]"
+    )
     return values, known
 
 

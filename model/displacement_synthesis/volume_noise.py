@@ -21,6 +21,7 @@ from numba import njit
 from numpy.typing import ArrayLike
 
 from model.arrays import Float64Array
+from model.checks import Checks
 
 CHUNK_POINTS = 512
 """Points whose sums stay in the cache while all waves pass over them."""
@@ -139,16 +140,12 @@ class VolumeNoise:
         (4, 2)
         """
         low, high = (float(v) for v in band_per_mm)
-        if not (math.isfinite(high) and 0 < low < high):
-            raise VolumeNoiseError(
-                f"band_per_mm: got {band_per_mm}, expected 0 < least < largest wave number"
-            )
-        if not (math.isfinite(rms_um) and rms_um >= 0):
-            raise VolumeNoiseError(f"rms_um: got {rms_um}, expected a finite number >= 0")
-        if not math.isfinite(slope) or abs(slope) > 20:
-            raise VolumeNoiseError(f"slope: got {slope}, expected -20...20")
-        if not 8 <= waves <= 65_536:
-            raise VolumeNoiseError(f"waves: got {waves}, expected 8...65536")
+        check = Checks(VolumeNoiseError).within
+        check("least of band_per_mm", low, "(0, inf)")
+        check("largest of band_per_mm", high, f"({low}, inf)")
+        check("rms_um", rms_um, "[0, inf)")
+        check("slope", slope, "[-20, 20]")
+        check("waves", waves, "[8, 65536]")
         # One wave in each of M equal parts of the power, each direction by itself: every part of
         # the spectrum is there in each draw, and each wave is uniform over directions.
         share = (np.arange(waves) + rng.random(waves)) / waves
@@ -189,10 +186,8 @@ class VolumeNoise:
             For places that are not finite or have no 3 coordinates.
         """
         points = np.ascontiguousarray(points_mm, np.float64)
-        if points.ndim < 1 or points.shape[-1] != 3:
-            raise VolumeNoiseError(f"points_mm: got shape {points.shape}, expected (..., 3)")
-        if not np.isfinite(points).all():
-            raise VolumeNoiseError("points_mm: got NaN or infinity")
+        Checks(VolumeNoiseError).shape("points_mm", points, ("...", 3))
+        Checks(VolumeNoiseError).within("points_mm", points)
         out = np.empty(points.shape[:-1])
         amplitude = self.rms_um * math.sqrt(2.0 / self.phases.size)
         flat = points.reshape(-1, 3)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float64Array, FloatArray
+from model.checks import Checks
 from model.facial_color import coarse_maps, deviation_ratio, disc_statistics
 from model.facial_color.deviation_ratio import ROUNDING_ERROR
 from model.facial_color.disc_statistics import DiscStatistics
@@ -228,8 +229,7 @@ def transferred(
     transfer: str,
 ) -> RigMaps:
     """Do the work of `HemoglobinRig.applied_to`."""
-    if transfer not in TRANSFER_METHODS:
-        raise FacialColorError(f"transfer: got {transfer!r}, expected one of {TRANSFER_METHODS}")
+    Checks(FacialColorError).choice("transfer", transfer, TRANSFER_METHODS)
     base = _image(NEUTRAL, neutral)
     images = {NEUTRAL: base}
     masks = _masks(valid, images)
@@ -289,10 +289,7 @@ def _image(name: str, image: ArrayLike, shape: tuple[int, ...] | None = None) ->
     values = np.asarray(image)
     if values.dtype != np.float32:
         values = values.astype(np.float64)
-    if values.ndim != 2 or not values.size:
-        raise FacialColorError(f"{name}: got shape {values.shape}, expected (H, W) with pixels")
-    if shape is not None and values.shape != shape:
-        raise FacialColorError(f"{name}: got shape {values.shape}, expected {shape} as the neutral")
+    Checks(FacialColorError).shape(name, values, shape or ("H", "W"))
     return values
 
 
@@ -301,18 +298,14 @@ def _masks(
 ) -> dict[str, BoolArray]:
     given = valid if isinstance(valid, Mapping) else dict.fromkeys(images, valid)
     for name in given:
-        if name not in images:
-            raise FacialColorError(f"valid: {name!r} is none of the maps {', '.join(images)}")
+        Checks(FacialColorError).choice("valid", name, images)
     masks = {}
     for name, image in images.items():
         mask = given.get(name)
         finite = np.isfinite(image)
         if mask is not None:
             mask = np.asarray(mask)
-            if mask.dtype != np.bool_ or mask.shape != image.shape:
-                raise FacialColorError(
-                    f"valid of {name}: got {mask.dtype} {mask.shape}, expected bool {image.shape}"
-                )
+            Checks(FacialColorError).mask(f"valid of {name}", mask, image.shape)
             finite &= mask
         masks[name] = finite
     return masks
@@ -322,17 +315,12 @@ def _errors(
     stderr: Mapping[str, ArrayLike], images: Mapping[str, FloatArray]
 ) -> dict[str, Float64Array]:
     for name in stderr:
-        if name not in images:
-            raise FacialColorError(f"stderr: {name!r} is none of the maps {', '.join(images)}")
+        Checks(FacialColorError).choice("stderr", name, images)
     errors = {}
     for name, image in images.items():
         error = np.asarray(stderr.get(name, np.zeros(image.shape)), np.float64)
-        if error.shape != image.shape:
-            raise FacialColorError(
-                f"stderr of {name}: got shape {error.shape}, expected {image.shape}"
-            )
+        Checks(FacialColorError).shape(f"stderr of {name}", error, image.shape)
         known = np.isfinite(error)
-        if (error[known] < 0.0).any():
-            raise FacialColorError(f"stderr of {name}: got negative values, expected >= 0")
+        Checks(FacialColorError).within(f"stderr of {name}", error[known], "[0, inf)")
         errors[name] = np.where(known, error, 0.0)
     return errors

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float64Array
+from model.checks import Checks
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +54,8 @@ def compare(
     (0.0, 1.5, 0.015811)
     """
     h, t, n = (np.asarray(image, np.float64) for image in (predicted, truth, neutral))
-    if not h.shape == t.shape == n.shape:
-        raise ValueError(
-            f"predicted, truth, neutral: got shapes {h.shape}, {t.shape}, {n.shape}, expected one"
-        )
+    Checks().shape("predicted", h, n.shape)
+    Checks().shape("truth", t, n.shape)
     used = np.isfinite(h) & np.isfinite(t) & np.isfinite(n)
     if valid is not None:
         used &= valid

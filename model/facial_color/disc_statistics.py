@@ -14,6 +14,7 @@ from numba import get_num_threads
 from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import BoolArray, Float64Array, Int32Array, Int64Array
+from model.checks import Checks
 from model.facial_color import disc_kernels
 
 MAX_VARIANCE_ERROR: Final = {np.dtype(np.float32): 2.0e-4, np.dtype(np.float64): 2.0e-7}
@@ -64,10 +65,7 @@ def half_widths(radius_px: float, rows: int, columns: int) -> Int64Array:
     >>> half_widths(2.3, 100, 100).tolist()
     [2, 2, 1]
     """
-    if not (math.isfinite(radius_px) and radius_px >= 0.0):
-        raise DiscStatisticsError(
-            f"radius_px: got {radius_px}, expected a finite number of pixels, 0 or more"
-        )
+    Checks(DiscStatisticsError).within("radius_px", radius_px, "[0, inf)")
     # a disc that holds the whole map grows no more; the square of a huge radius overflows
     square = math.floor(min(float(radius_px), math.hypot(rows, columns) + 1.0) ** 2)
     return np.array(
@@ -119,8 +117,7 @@ def measure(h: ArrayLike, radius_px: float, *, valid: BoolArray | None = None) -
     ([3, 4, 3], [0.333, 0.5, 0.0])
     """
     h = np.asarray(h)
-    if h.ndim < 2 or 0 in h.shape[-2:]:
-        raise DiscStatisticsError(f"h: got shape {h.shape}, expected (..., H, W) with pixels")
+    Checks(DiscStatisticsError).shape("h", h, ("...", "H", "W"))
     if h.dtype != np.float32 or radius_px < _MIN_SUM_RADIUS_PX:
         h = np.asarray(h, np.float64)
     if valid is not None:

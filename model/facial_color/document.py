@@ -7,6 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from model.arrays import BoolArray, Float32Array, Float64Array, FloatArray
+from model.checks import Checks
 from model.facial_color.rig import HemoglobinRig
 from model.facial_color.state_maps import NEUTRAL, FacialColorError, StateMaps
 from model.skin import MAP_UNITS, SkinMap
@@ -15,50 +16,34 @@ SCHEMA: Final = "skinrig.facial-color/1"
 RIG_DOCUMENT: Final = "facial_color.json"
 _BLOOD_UNIT: Final = MAP_UNITS["hemoglobin"]
 _DOCUMENT_KEYS: Final = {"schema", "radius_px", "shape", "stored", "global_states", "states"}
+_NEUTRAL_TEXT: Final = "neutral state; linear volume fraction"
+_NEUTRAL_MEAN_TEXT: Final = "mean of the neutral state in a disc"
+_STATE_MAPS: Final = {
+    "scale": ("1", "deviation in a disc over that of the neutral state"),
+    "bias": (_BLOOD_UNIT, "mean in a disc"),
+    "misfit": (_BLOOD_UNIT, "deviation in a disc of the measured state from scale and bias"),
+}
+"""Units and descriptions of the maps that each state has."""
 _STATE_KEYS: Final = ("prior", "storage_rms", "storage_largest")
 
 
 def to_maps(rig: HemoglobinRig) -> tuple[dict[str, SkinMap], bytes]:
     """Return a rig's maps by name, and its document."""
     maps = {
-        "hemoglobin": SkinMap(
-            _single(rig.neutral),
-            _BLOOD_UNIT,
-            _single(rig.neutral_stderr),
-            rig.valid,
-            "neutral state; linear volume fraction",
+        "hemoglobin": _skin_map(
+            rig.neutral, _BLOOD_UNIT, rig.neutral_stderr, rig.valid, _NEUTRAL_TEXT
         ),
-        f"bias_{NEUTRAL}": SkinMap(
-            _single(rig.neutral_mean),
-            _BLOOD_UNIT,
-            None,
-            rig.neutral_mean_valid,
-            "mean of the neutral state in a disc",
+        f"bias_{NEUTRAL}": _skin_map(
+            rig.neutral_mean, _BLOOD_UNIT, None, rig.neutral_mean_valid, _NEUTRAL_MEAN_TEXT
         ),
     }
     states: dict[str, Any] = {}
     for name, state in rig.states.items():
-        maps[f"scale_{name}"] = SkinMap(
-            _single(state.scale),
-            "1",
-            _single(state.scale_stderr),
-            state.valid,
-            "deviation in a disc over that of the neutral state",
-        )
-        maps[f"bias_{name}"] = SkinMap(
-            _single(state.bias),
-            _BLOOD_UNIT,
-            _single(state.bias_stderr),
-            state.valid,
-            "mean in a disc",
-        )
-        maps[f"misfit_{name}"] = SkinMap(
-            _single(state.misfit),
-            _BLOOD_UNIT,
-            None,
-            state.valid,
-            "deviation in a disc of the measured state from scale and bias",
-        )
+        for kind, (unit, text) in _STATE_MAPS.items():
+            stderr = getattr(state, f"{kind}_stderr", None)
+            maps[f"{kind}_{name}"] = _skin_map(
+                getattr(state, kind), unit, stderr, state.valid, text
+            )
         states[name] = {key: getattr(state, key) for key in _STATE_KEYS}
     document = {
         "schema": SCHEMA,
@@ -102,8 +87,7 @@ def from_maps_and_document(maps: Mapping[str, SkinMap], document: bytes) -> Hemo
         _exactly(f"states.{name}.", entry, set(_STATE_KEYS))
         number = {key: _number(f"states.{name}.{key}", entry[key]) for key in _STATE_KEYS}
         scale, bias, misfit = (
-            _map(maps, f"{kind}_{name}", stored, unit)
-            for kind, unit in (("scale", "1"), ("bias", _BLOOD_UNIT), ("misfit", _BLOOD_UNIT))
+            _map(maps, f"{kind}_{name}", stored, unit) for kind, (unit, _) in _STATE_MAPS.items()
         )
         valid = scale.mask
         states[name] = StateMaps(
@@ -128,8 +112,11 @@ def from_maps_and_document(maps: Mapping[str, SkinMap], document: bytes) -> Hemo
     )
 
 
-def _single(values: FloatArray) -> Float32Array:
-    return values.astype(np.float32)
+def _skin_map(
+    values: FloatArray, unit: str, stderr: FloatArray | None, valid: BoolArray, text: str
+) -> SkinMap:
+    error = None if stderr is None else stderr.astype(np.float32)
+    return SkinMap(values.astype(np.float32), unit, error, valid, text)
 
 
 def _double(values: Float32Array, valid: BoolArray) -> Float64Array:
@@ -146,10 +133,8 @@ def _map(maps: Mapping[str, SkinMap], name: str, shape: tuple[int, int], unit: s
     if name not in maps:
         raise FacialColorError(f"maps: {name!r} is missing, which {RIG_DOCUMENT} needs")
     found = maps[name]
-    if found.values.shape != shape:
-        raise FacialColorError(f"{name}: got shape {found.values.shape}, expected {shape}")
-    if found.unit != unit:
-        raise FacialColorError(f"{name}: got unit {found.unit!r}, expected {unit!r}")
+    Checks(FacialColorError).shape(name, found.values, shape)
+    Checks(FacialColorError).choice(f"unit of {name}", found.unit, (unit,))
     return found
 
 

@@ -14,6 +14,7 @@ from numba import njit, prange
 from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float64Array
+from model.checks import Checks
 from model.facial_color.disc_statistics import DiscStatisticsError, half_widths
 
 
@@ -70,14 +71,10 @@ def match(
     0.0
     """
     a, b, va, vb = _checked(neutral, target, valid, valid_target)
-    if not (math.isfinite(radius_px) and radius_px >= 1.5):
-        raise DiscStatisticsError(f"radius_px: got {radius_px}, expected at least 1.5 px")
+    Checks(DiscStatisticsError).within("radius_px", radius_px, "[1.5, inf)")
     largest = int(radius_px / math.sqrt(2.0))
     spacing = max(int(radius_px / 2.0), 1) if spacing_px is None else int(spacing_px)
-    if not 1 <= spacing <= largest:
-        raise DiscStatisticsError(
-            f"spacing_px: got {spacing_px}, expected 1 to {largest} (radius / sqrt 2)"
-        )
+    Checks(DiscStatisticsError).within("spacing_px", spacing, f"[1, {largest}]")
     # the last nodes may lie outside the map
     half = half_widths(radius_px, a.shape[0] + spacing, a.shape[1] + spacing)
     total, weight = np.zeros(a.shape), np.zeros(a.shape)
@@ -92,19 +89,15 @@ def _checked(
 ) -> tuple[Float64Array, Float64Array, BoolArray, BoolArray]:
     # copies: compiled loops are declared for arrays that may be written
     a, b = (np.array(x, np.float64, order="C") for x in (neutral, target))
-    if a.ndim != 2 or not a.size or b.shape != a.shape:
-        raise DiscStatisticsError(
-            f"neutral, target: got shapes {a.shape}, {b.shape}, expected (H, W) for both"
-        )
+    check = Checks(DiscStatisticsError)
+    check.shape("neutral", a, ("H", "W"))
+    check.shape("target", b, a.shape)
     masks = []
     for name, image, mask in (("valid", a, valid), ("valid_target", b, valid_target)):
         found = np.isfinite(image)
         if mask is not None:
             mask = np.asarray(mask)
-            if mask.dtype != np.bool_ or mask.shape != a.shape:
-                raise DiscStatisticsError(
-                    f"{name}: got {mask.dtype} {mask.shape}, expected bool {a.shape}"
-                )
+            check.mask(name, mask, a.shape)
             found &= mask
         masks.append(found)
     return a, b, masks[0], masks[1]

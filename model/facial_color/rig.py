@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float64Array, FloatArray
+from model.checks import Checks
 from model.facial_color import basis, disc_statistics
 from model.facial_color.deviation_ratio import ROUNDING_ERROR
 from model.facial_color.state_maps import NEUTRAL, FacialColorError, RigMaps
@@ -206,8 +207,7 @@ class HemoglobinRig(RigMaps):
                 raise FacialColorError(
                     f"weights: got state {name!r}, expected one of {', '.join(names)}{hint}"
                 )
-            if not math.isfinite(weight):
-                raise FacialColorError(f"weights: got {name} = {weight}, expected a finite number")
+            Checks(FacialColorError).within(f"weights: {name}", weight)
         total = math.fsum(weights.values())
         if normalize:
             if abs(total) < _SUM_ERROR:

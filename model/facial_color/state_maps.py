@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from model.arrays import BoolArray, Float64Array, FloatArray
+from model.checks import Checks
 from model.facial_color.coarse_maps import Cells
 
 NEUTRAL: Final = "neutral"
@@ -54,11 +55,7 @@ class StateMaps:
         """Refuse shapes that differ and numbers that are none."""
         shape = self.valid.shape
         for name in ("scale", "bias", "scale_stderr", "bias_stderr", "misfit"):
-            values = getattr(self, name)
-            if values.shape != shape:
-                raise FacialColorError(f"{name}: got shape {values.shape}, expected {shape}")
-            if not np.isfinite(values).all():
-                raise FacialColorError(f"{name}: got NaN or infinity, expected finite values")
+            Checks(FacialColorError).numbers(name, getattr(self, name), shape)
 
 
 def check_name(name: str) -> None:
@@ -91,21 +88,15 @@ class RigMaps:
     def __post_init__(self) -> None:
         """Refuse what does not fit together."""
         shape = self.neutral.shape
-        if self.neutral.ndim != 2 or self.valid.shape != shape:
-            raise FacialColorError(
-                f"neutral: got {shape}, valid {self.valid.shape}, expected (H, W)"
-            )
-        if self.neutral_stderr.shape != shape:
-            raise FacialColorError(f"neutral_stderr: got {self.neutral_stderr.shape}, not {shape}")
+        check = Checks(FacialColorError)
+        check.shape("neutral", self.neutral, ("H", "W"))
+        check.shape("valid", self.valid, shape)
+        check.shape("neutral_stderr", self.neutral_stderr, shape)
         for name, state in self.states.items():
             check_name(name)
-            if state.valid.shape != self.neutral_mean.shape:
-                raise FacialColorError(
-                    f"{name}: got shape {state.valid.shape}, expected {self.neutral_mean.shape}"
-                )
+            check.shape(name, state.valid, self.neutral_mean.shape)
         for name in self.global_states:
-            if name not in self.states:
-                raise FacialColorError(f"global_states: {name!r} is no state of this rig")
+            check.choice("global_states", name, self.states)
         object.__setattr__(self, "states", MappingProxyType(dict(self.states)))
 
     @property

@@ -33,6 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float32Array, FloatArray, UInt8Array
+from model.checks import Checks
 from model.microstructure import convolution_kernels as kernels
 from model.microstructure.map_windows import Window
 
@@ -126,10 +127,8 @@ def reach_of(lines: LineKernels, shape: tuple[int, int], sampling: Sampling = "c
 
 
 def _settings(sampling: str, border: str) -> None:
-    if sampling not in _INTERPOLATION_CODES:
-        raise ConvolutionError(f'sampling: got {sampling!r}, expected "cubic" or "linear"')
-    if border not in _BORDER_CODES:
-        raise ConvolutionError(f'border: got {border!r}, expected "mirror" or "open"')
+    Checks(ConvolutionError).choice("sampling", sampling, _INTERPOLATION_CODES)
+    Checks(ConvolutionError).choice("border", border, _BORDER_CODES)
 
 
 def _usable(height: FloatArray, valid: ArrayLike | None) -> UInt8Array:
@@ -137,10 +136,7 @@ def _usable(height: FloatArray, valid: ArrayLike | None) -> UInt8Array:
     good: BoolArray = np.isfinite(height)
     if valid is not None:
         mask = np.asarray(valid)
-        if mask.shape != height.shape or mask.dtype != np.bool_:
-            raise ConvolutionError(
-                f"valid: got {mask.dtype} {mask.shape}, expected bool {height.shape}"
-            )
+        Checks(ConvolutionError).mask("valid", mask, height.shape)
         good &= mask
     if good.all():
         return np.zeros((0, 0), np.uint8)
@@ -219,8 +215,7 @@ def convolve(
     """
     _settings(sampling, border)
     given = np.asarray(height)
-    if given.ndim < 2 or 0 in given.shape[-2:]:
-        raise ConvolutionError(f"height: got shape {given.shape}, expected (..., H, W)")
+    Checks(ConvolutionError).shape("height", given, ("...", "H", "W"))
     shape = (given.shape[-2], given.shape[-1])
     first = LineKernels.of(axis_s, alpha_s, sigma_s, shape)
     second = LineKernels.of(axis_t, alpha_t, sigma_t, shape)
@@ -251,8 +246,7 @@ def _mask(valid: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray | None:
     if valid is None:
         return None
     mask = np.asarray(valid)
-    if mask.dtype != np.bool_ or mask.shape not in (shape, shape[-2:]):
-        raise ConvolutionError(f"valid: got {mask.dtype} {mask.shape}, expected bool {shape}")
+    Checks(ConvolutionError).mask("valid", mask, shape, shape[-2:])
     return np.broadcast_to(mask, shape)
 
 
@@ -264,8 +258,7 @@ def tiles_of(shape: tuple[int, int], tile: int) -> list[Window]:
     >>> [t.shape for t in tiles_of((5, 3), 3)]
     [(3, 3), (2, 3)]
     """
-    if tile < 1:
-        raise ConvolutionError(f"tile: got {tile}, expected at least 1 px")
+    Checks(ConvolutionError).within("tile", tile, "[1, inf)")
     return [
         Window(top, min(top + tile, shape[0]), left, min(left + tile, shape[1]))
         for top in range(0, shape[0], tile)
@@ -313,12 +306,10 @@ def convolve_tiled(
     """
     _settings(sampling, border)
     shape = tuple(source.shape)
-    if len(shape) != 2 or 0 in shape or tuple(target.shape) != shape:
-        raise ConvolutionError(
-            f"source, target: got shapes {shape} and {tuple(target.shape)}, expected one (H, W)"
-        )
-    if target.dtype != np.float32:
-        raise ConvolutionError(f"target: got {target.dtype}, expected float32")
+    check = Checks(ConvolutionError)
+    check.shape("source", source, ("H", "W"))
+    check.shape("target", target, shape)
+    check.choice("target", target.dtype, (np.dtype(np.float32),))
     if isinstance(source, np.ndarray) and isinstance(target, np.ndarray):
         if np.may_share_memory(source, target):
             raise ConvolutionError("target: got the source's memory, expected another array")
@@ -357,8 +348,7 @@ def convolve_tiled(
 
 def _fits(lines: LineKernels, window: Window) -> None:
     for name, values in lines._asdict().items():
-        if values.shape[:2] not in (window.shape, (1, 1)) or values.dtype != np.float32:
-            raise ConvolutionError(
-                f"fields_at: got {name} {values.dtype} {values.shape}, expected float32 "
-                f"{window.shape}"
-            )
+        check = Checks(ConvolutionError)
+        check.choice(f"{name} of fields_at", values.dtype, (np.dtype(np.float32),))
+        ends = values.shape[2:]
+        check.shape(f"{name} of fields_at", values, (*window.shape, *ends), (1, 1, *ends))

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float64Array
+from model.checks import Checks
 from model.microstructure.convolution_kernels import TRUNCATE_SIGMAS
 
 Line: TypeAlias = tuple[float, float]
@@ -68,8 +69,7 @@ def gaussian_weights(sigma_px: float) -> Float64Array:
     >>> gaussian_weights(0.1).tolist()
     [1.0]
     """
-    if not 0 < sigma_px <= MAX_WIDTH_PX:
-        raise ValueError(f"sigma_px: got {sigma_px}, expected above 0, up to {MAX_WIDTH_PX:g}")
+    Checks().within("sigma_px", sigma_px, f"(0, {MAX_WIDTH_PX}]")
     k = np.arange(int(TRUNCATE_SIGMAS * sigma_px + 0.5) + 1)
     w = np.exp(-0.5 * (k / sigma_px) ** 2)
     return w / (w[0] + 2.0 * w[1:].sum())
@@ -286,13 +286,9 @@ def kernel_parameters(
     >>> alpha.round(3).tolist(), sigma_um.round(2).tolist()
     ([-2.0, -1.48, 0.0, 0.618], [4.56, 9.5, 11.7, 19.34])
     """
-    if extrapolate not in ("hold", "formula", "refuse"):
-        raise ValueError(
-            f'extrapolate: got {extrapolate!r}, expected "hold", "formula" or "refuse"'
-        )
+    Checks().choice("extrapolate", extrapolate, ("hold", "formula", "refuse"))
     r = np.asarray(stretch, np.float64)
-    if not (np.isfinite(r).all() and (r > 0).all()):
-        raise KernelTableError("stretch: got NaN, infinity or a ratio <= 0")
+    Checks(KernelTableError).within("stretch", r, "(0, inf)")
     low, high = table.stretch_range
     if extrapolate == "refuse" and not table.inside(r).all():
         raise KernelTableError(

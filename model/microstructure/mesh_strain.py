@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float64Array, Int64Array
+from model.checks import Checks
 from model.microstructure import strain_kernels as kernels
 
 
@@ -88,11 +89,7 @@ class MeshStrain:
 
 def _numbers(name: str, values: ArrayLike, columns: int) -> Float64Array:
     given = np.ascontiguousarray(values, np.float64)
-    if given.ndim != 2 or given.shape[1] != columns:
-        raise StrainError(f"{name}: got shape {given.shape}, expected (V, {columns})")
-    if not np.isfinite(given).all():
-        raise StrainError(f"{name}: got NaN or infinity")
-    return given
+    return Checks(StrainError).numbers(name, given, (None, columns))
 
 
 def places_of(*positions: Float64Array) -> Int64Array:
@@ -161,11 +158,7 @@ def strain(
     if given.ndim != 2 or given.shape[1] != 3 or given.dtype.kind not in "iu":
         raise StrainError(f"faces: got {given.dtype} {given.shape}, expected integers (F, 3)")
     triangles = np.ascontiguousarray(given, np.int64)
-    if triangles.size and not (triangles.min() >= 0 and triangles.max() < len(rest)):
-        raise StrainError(
-            f"faces: got indices {triangles.min()}...{triangles.max()}, "
-            f"expected 0...{len(rest) - 1}"
-        )
+    Checks(StrainError).within("faces", triangles, f"[0, {len(rest)})")
     place = places_of(rest, moved)
     triangle = kernels.triangle_strain(rest, moved, triangles, texture)
     places = int(place.max(initial=-1)) + 1

@@ -15,7 +15,6 @@ Nagano et al. 2015, Skin Microstructure Deformation with Displacement Map Convol
 Graph. 34(4), 109, section 3. doi:10.1145/2766894
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -25,6 +24,7 @@ from scipy.ndimage import correlate1d
 from scipy.optimize import brentq
 
 from model.arrays import Float64Array
+from model.checks import Checks
 from model.microstructure.kernel_table import ALPHA_LIMITS, gaussian_weights
 
 MAX_ALPHA = 1e3
@@ -64,13 +64,9 @@ def surface_length(height_um: ArrayLike, *, spacing_um: float) -> Float64Array:
 
 
 def _heights(height_um: ArrayLike, spacing_um: float) -> Float64Array:
-    height = np.asarray(height_um, np.float64)
-    if height.ndim < 1 or height.shape[-1] < 2 or not np.isfinite(height).all():
-        raise ProfileError(
-            f"height_um: got shape {height.shape}, expected at least 2 finite heights (..., N)"
-        )
-    if not (math.isfinite(spacing_um) and spacing_um > 0):
-        raise ProfileError(f"spacing_um: got {spacing_um}, expected a finite number above 0")
+    height = Checks(ProfileError).numbers("height_um", height_um, ("...", "N"))
+    Checks(ProfileError).within("heights of height_um", height.shape[-1], "[2, inf)")
+    Checks(ProfileError).within("spacing_um", spacing_um, "(0, inf)")
     return height
 
 
@@ -96,15 +92,13 @@ def convolved(
         For heights, a strength or lengths that are not finite, or lengths that are not above 0.
     """
     height = _heights(height_um, spacing_um)
-    if not math.isfinite(alpha):
-        raise ProfileError(f"alpha: got {alpha}, expected a finite strength")
+    Checks(ProfileError).within("alpha", alpha)
     return height + alpha * _change(height, sigma_um, spacing_um)
 
 
 def _change(height: Float64Array, sigma_um: float, spacing_um: float) -> Float64Array:
     """Return the blurred profile less itself: what one of alpha adds."""
-    if not (math.isfinite(sigma_um) and sigma_um > 0):
-        raise ProfileError(f"sigma_um: got {sigma_um}, expected a finite number above 0")
+    Checks(ProfileError).within("sigma_um", sigma_um, "(0, inf)")
     half = gaussian_weights(sigma_um / spacing_um)
     weights = np.concatenate([half[:0:-1], half])
     return np.asarray(correlate1d(height, weights, axis=-1, mode="reflect") - height)
@@ -182,12 +176,9 @@ def length_change(
 
 
 def _profile(height_um: ArrayLike, spacing_um: float, stretch: float) -> Float64Array:
-    height = np.asarray(height_um, np.float64)
-    if height.ndim != 1:
-        raise ProfileError(f"height_um: got shape {height.shape}, expected (N,)")
+    height = Checks(ProfileError).numbers("height_um", height_um, ("N",))
     surface_length(height, spacing_um=spacing_um)
-    if not (math.isfinite(stretch) and stretch > 0):
-        raise ProfileError(f"stretch: got {stretch}, expected a finite number above 0")
+    Checks(ProfileError).within("stretch", stretch, "(0, inf)")
     return height
 
 

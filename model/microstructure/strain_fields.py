@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import BoolArray, Float32Array, FloatArray
+from model.checks import Checks
 from model.microstructure import texture_kernels
 from model.microstructure.convolution import LineKernels
 from model.microstructure.kernel_table import ALPHA_LIMITS, FOREHEAD, KernelTable
@@ -76,8 +77,7 @@ def rasterize(
     """
     triangles = np.ascontiguousarray(faces, np.int64)
     texture = np.asarray(uv, np.float64)
-    if texture.shape != (strain.valid.size, 2):
-        raise StrainError(f"uv: got shape {texture.shape}, expected ({strain.valid.size}, 2)")
+    Checks(StrainError).shape("uv", texture, (strain.valid.size, 2))
     height, width = size
     if height < 1 or width < 1 or pad_px < 0:
         raise StrainError(f"size, pad_px: got {size}, {pad_px}, expected at least 1 px and 0 px")
@@ -128,11 +128,10 @@ class KernelRegions:
     def __post_init__(self) -> None:
         """Refuse weights that do not fit the tables."""
         object.__setattr__(self, "tables", tuple(self.tables))
-        shape, count = self.weights.shape, len(self.tables)
-        if count < 1 or len(shape) != 3 or shape[0] != count or min(shape) < 1:
-            raise StrainError(f"weights: got shape {shape} for {count} tables, expected (N, h, w)")
-        if not (np.isfinite(self.weights).all() and (self.weights >= 0).all()):
-            raise StrainError("weights: got NaN, infinity or a number below 0")
+        count = len(self.tables)
+        Checks(StrainError).within("tables", count, "[1, inf)")
+        Checks(StrainError).shape("weights", self.weights, (count, "h", "w"))
+        Checks(StrainError).within("weights", self.weights, "[0, inf)")
 
     def shares_at(self, u: FloatArray, v: FloatArray) -> Float32Array:
         """Return shares at rows of v and columns of u, shape (N, len(v), len(u))."""
@@ -221,8 +220,7 @@ def line_kernels(
     LineKernels, LineKernels
         Along s and along t; alpha is 0 where nothing is known.
     """
-    if extrapolate not in ("hold", "formula"):
-        raise ValueError(f'extrapolate: got {extrapolate!r}, expected "hold" or "formula"')
+    Checks().choice("extrapolate", extrapolate, ("hold", "formula"))
     shape = strain.covered.shape
     alpha, sigma = np.empty((2, *shape), np.float32), np.empty((2, *shape), np.float32)
     ends = table.stretch_range if extrapolate == "hold" else (0.0, math.inf)

@@ -10,12 +10,11 @@ from functools import lru_cache
 import numpy as np
 
 from model.arrays import Float64Array, Int64Array
+from model.checks import Checks
 
 _MIN_CORE_RATIO = 1e-6  # cores below this part of the largest length are points
-_NEAR_RATIO, _FAR_RATIO = (
-    3.0,
-    10.0,
-)  # centre distances over the sum of core radii at which fewer nodes do
+# centre distances over the sum of core radii at which fewer nodes do
+_NEAR_RATIO, _FAR_RATIO = 3.0, 10.0
 _NODE_COUNTS = (8, 5, 3)  # relative error below 1e-5 for the profiles of tissue: see the tests
 _RINGS, _ANGLES = 48, 96
 
@@ -47,13 +46,9 @@ def distance_rule(
     >>> [values.tolist() for values in distance_rule(1.0, 0.0, 0.0)]  # two points
     [[1.0], [1.0]]
     """
-    for name, value in (
-        ("radius_mm", radius_mm),
-        ("core_mm", core_mm),
-        ("source_core_mm", source_core_mm),
-    ):
-        if not 0.0 <= value < np.inf:
-            raise ValueError(f"{name}: got {value}, expected a finite length of at least 0")
+    Checks().together(
+        "[0, inf)", radius_mm=radius_mm, core_mm=core_mm, source_core_mm=source_core_mm
+    )
     # squares of lengths in a unit near the largest neither vanish nor overflow; by a power of two
     # no digit changes
     exponent = int(np.frexp(max(radius_mm, core_mm, source_core_mm))[1])

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh_tridiagonal
 
 from model.arrays import Float64Array
+from model.checks import Checks
 from model.photon_table import kernels
 
 Collection = Literal["all", "fibre"]
@@ -57,8 +58,7 @@ def prepare(eta: float, g: float, collection: Collection) -> Medium:
         For an eta, g or collection that the table does not hold.
     """
     stored = _stored()
-    if collection not in ("all", "fibre"):
-        raise TableDomainError(f'collection: got {collection!r}, expected "all" or "fibre"')
+    Checks(TableDomainError).choice("collection", collection, ("all", "fibre"))
     weight_g = _lagrange("g", stored["g"], float(g))
     weight_eta = _lagrange("eta", stored["eta"], float(eta))
     which = ("all", "fibre").index(collection)
@@ -104,10 +104,8 @@ def asymptotic_decay(absorption_ratio: float, g: float) -> float:
     ValueError
         For a ratio outside 1e-100 to 1e100, or a g outside [0, 1).
     """
-    if not 1e-100 <= absorption_ratio <= 1e100:
-        raise ValueError(f"absorption_ratio: got {absorption_ratio}, expected 1e-100 to 1e100")
-    if not 0.0 <= g < 1.0:
-        raise ValueError(f"g: got {g}, expected in [0, 1)")
+    Checks().within("absorption_ratio", absorption_ratio, "[1e-100, 1e+100]")
+    Checks().within("g", g, "[0, 1)")
     order = np.arange(_LEGENDRE_ORDERS)
     removed = absorption_ratio + (1.0 - g**order) / (1.0 - g)
     ell = order[1:]

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import RectBivariateSpline
 
 from model.arrays import BoolArray, Float64Array
+from model.checks import Checks
 from model.dipole.kienle_patterson import Slopes
 from model.photon_table import kernels
 from model.photon_table.disc_distances import distance_rules
@@ -120,11 +121,10 @@ def derivatives(
     True
     """
     medium = prepare(eta, g, collection)
-    radius = _not_negative("radius_mm", radius_mm)
-    sigma_a = _not_negative("sigma_a_per_mm", sigma_a_per_mm)
-    sigma_s = _not_negative("sigma_s_prime_per_mm", sigma_s_prime_per_mm)
-    cores = (_not_negative("core_mm", core_mm), _not_negative("source_core_mm", source_core_mm))
-    if not any(cores) and np.any(radius < 1.0 / MAX_QUANTITY):
+    radius, sigma_a, sigma_s = _not_negative(radius_mm, sigma_a_per_mm, sigma_s_prime_per_mm)
+    for name, length in (("core_mm", core_mm), ("source_core_mm", source_core_mm)):
+        Checks().within(name, length, f"[0, {MAX_QUANTITY}]")
+    if not (core_mm or source_core_mm) and np.any(radius < 1.0 / MAX_QUANTITY):
         raise ValueError(
             f"radius_mm: got {radius.min():g} between points, where R is infinite; "
             f"expected {1.0 / MAX_QUANTITY:g} and more"
@@ -185,11 +185,8 @@ def relative_error(
     True
     """
     medium = prepare(eta, g, collection)
-    radius, sigma_a, sigma_s = np.broadcast_arrays(
-        _not_negative("radius_mm", radius_mm),
-        _not_negative("sigma_a_per_mm", sigma_a_per_mm),
-        _not_negative("sigma_s_prime_per_mm", sigma_s_prime_per_mm),
-    )
+    given = (radius_mm, sigma_a_per_mm, sigma_s_prime_per_mm)
+    radius, sigma_a, sigma_s = np.broadcast_arrays(*_not_negative(*given))
     scatters = (sigma_s >= np.finfo(np.float64).tiny) & (radius > 0.0)
     s = np.where(scatters, sigma_s, 1.0)
     rho = np.where(scatters, radius * s, 1.0)
@@ -232,12 +229,12 @@ def domain(
     )
 
 
-def _not_negative(name: str, value: ArrayLike) -> Float64Array:
-    array = np.asarray(value, dtype=np.float64)
-    # only the ratio of absorption to scattering counts, and what is black beyond its range is 0
-    most = np.finfo(np.float64).max if name == "sigma_a_per_mm" else MAX_QUANTITY
-    outside = ~((array >= 0.0) & (array <= most))
-    if np.any(outside):
-        got = float(array[outside].flat[0])
-        raise ValueError(f"{name}: got {got:g}, expected at least 0, up to {most:.3g}")
-    return array
+def _not_negative(
+    radius_mm: ArrayLike, sigma_a_per_mm: ArrayLike, sigma_s_prime_per_mm: ArrayLike
+) -> tuple[Float64Array, Float64Array, Float64Array]:
+    some = f"[0, {MAX_QUANTITY}]"
+    return (
+        Checks().numbers("radius_mm", radius_mm, interval=some),
+        Checks().numbers("sigma_a_per_mm", sigma_a_per_mm, interval="[0, inf)"),
+        Checks().numbers("sigma_s_prime_per_mm", sigma_s_prime_per_mm, interval=some),
+    )

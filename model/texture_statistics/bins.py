@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import Float64Array
+from model.checks import Checks
 from model.texture_statistics.histograms import HISTOGRAM_BINS
 
 OPPONENT_AXES = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 0.0], [1.0, 1.0, -2.0]])
@@ -37,11 +38,8 @@ def principal_axes(covariance: Float64Array, unit: float) -> Float64Array:
         For a covariance that is not square, or not finite.
     """
     C = len(covariance)
-    if covariance.shape != (C, C) or C < 1 or not np.isfinite(covariance).all():
-        raise ValueError(
-            f"covariance: got shape {covariance.shape}, expected (C, C) of finite values, C at "
-            "least 1"
-        )
+    Checks().within("colors of covariance", C, "[1, inf)")
+    Checks().numbers("covariance", covariance, (C, C))
     preferred = OPPONENT_AXES if C == 3 else np.eye(C)
     # orders directions without variance; about that of the rounding of float32
     least = 1e-9 * np.trace(covariance) + 1e-13 * unit**2
@@ -74,13 +72,8 @@ def uneven_edges(quantiles: ArrayLike, unit: float) -> Float64Array:
     [-0.05, 0.5, 1.05]
     """
     values = np.sort(np.asarray(quantiles, np.float64), axis=None)
-    if not (values.size and np.isfinite(values).all()):
-        raise ValueError(
-            f"quantiles: got {np.count_nonzero(~np.isfinite(values))} of {values.size} values that "
-            "are not finite, expected finite ones, at least one"
-        )
-    if not 0.0 < unit < np.inf:
-        raise ValueError(f"unit: got {unit}, expected a finite value above 0")
+    Checks().numbers("quantiles", values, ("n",))
+    Checks().within("unit", unit, "(0, inf)")
     low, high = values[0], values[-1]
     room = max(_RANGE_MARGIN * (high - low), 0.5e-4 * unit)
     low, high = low - room, high + room

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float64Array, FloatArray
+from model.checks import Checks
 from model.texture_statistics import steerable_pyramid
 from model.texture_statistics.histograms import Bins, Counted, distance
 from model.texture_statistics.masks import fill_smoothly, response_weights
@@ -211,10 +212,9 @@ def match(
     True
     """
     colors, mask = checked_image(image, valid)
-    if iterations < 0 or not (np.isfinite(noise) and noise >= 0.0):
-        raise TextureError(f"iterations, noise: got {iterations}, {noise}, expected at least 0")
-    if start not in ("image", "noise"):
-        raise TextureError(f'start: got {start!r}, expected "image" or "noise"')
+    Checks(TextureError).within("iterations", iterations, "[0, inf)")
+    Checks(TextureError).within("noise", noise, "[0, inf)")
+    Checks(TextureError).choice("start", start, ("image", "noise"))
     if (noise > 0.0 or start == "noise") and rng is None:
         raise TextureError("rng: got None, expected a generator: noise is drawn from it")
     if np.ndim(target) == 1:
@@ -278,12 +278,7 @@ def _check_channels(colors: FloatArray, space: TextureSpace) -> None:
 def _weights(mask: BoolArray, region: ArrayLike | None, levels: int) -> Weights:
     """Return the weights of texels and samples; None: all count fully."""
     if region is not None:
-        wanted = np.asarray(region)
-        fits = wanted.shape == mask.shape and np.isfinite(wanted).all()
-        if not fits or wanted.min() < 0.0 or wanted.max() > 1.0:
-            raise TextureError(
-                f"region: got {wanted.dtype} {wanted.shape}, expected bool or 0...1 {mask.shape}"
-            )
+        wanted = Checks(TextureError).numbers("region", region, mask.shape, interval="[0, 1]")
         if not (wanted[mask] > 0.0).any():
             raise TextureError("region: got no valid texel, expected at least one")
     elif mask.all():

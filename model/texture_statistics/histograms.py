@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import BoolArray, Float64Array, FloatArray, Int64Array
+from model.checks import Checks
 from model.texture_statistics import histogram_kernels
+from model.vectors import nearest_shares
 
 HISTOGRAM_BINS = 256
 """Bins of every histogram (Weyrich et al. 2006, section 10.2)."""
@@ -51,14 +53,7 @@ class Bins:
     def over(cls, edges: ArrayLike) -> Bins:
         """Make the table of some edges."""
         e = np.ascontiguousarray(edges, np.float64)
-        if (
-            e.shape != (HISTOGRAM_BINS + 1,)
-            or not np.isfinite(e).all()
-            or not (np.diff(e) > 0.0).all()
-        ):
-            raise HistogramError(
-                f"edges: got shape {e.shape}, expected {HISTOGRAM_BINS + 1} rising numbers"
-            )
+        _check_edges(e, (HISTOGRAM_BINS + 1,))
         scale = histogram_kernels.TABLE_CELLS / float(e[-1] - e[0])
         least = np.empty(histogram_kernels.TABLE_CELLS, np.int16)
         most = np.empty_like(least)
@@ -131,12 +126,7 @@ class Bins:
         """
         flat = np.ascontiguousarray(values).reshape(-1)
         _check_shares("target", target, HISTOGRAM_BINS)
-        wrong = flat.size - np.count_nonzero(np.isfinite(flat))
-        if wrong:
-            raise HistogramError(
-                f"values: got {wrong} of {flat.size} that are NaN or infinite, expected finite "
-                "ones: leave out what is masked"
-            )
+        Checks(HistogramError).within("values (leave out what is masked)", flat)
         own, wanted = cumulated(source.shares), cumulated(target)
         edges = self.edges.copy()
         edges[0], edges[-1] = min(edges[0], source.least), max(edges[-1], source.most)
@@ -146,17 +136,15 @@ class Bins:
 
 
 def _check_shares(name: str, shares: ArrayLike, bins: int | None = None) -> Float64Array:
-    h = np.asarray(shares, np.float64)
-    if h.ndim < 1 or not h.shape[-1] or (bins is not None and h.shape[-1] != bins):
-        raise HistogramError(
-            f"{name}: got shape {h.shape}, expected (..., {bins or HISTOGRAM_BINS})"
-        )
-    if not (np.isfinite(h).all() and (h >= 0.0).all() and (h.sum(axis=-1) > 0.0).all()):
-        raise HistogramError(
-            f"{name}: got NaN, infinite or negative shares, or none above 0, expected shares that "
-            "sum to 1"
-        )
+    check = Checks(HistogramError)
+    h = check.numbers(name, shares, ("...", bins or "bins"), interval="[0, inf)")
+    check.within(f"sum of {name}", h.sum(axis=-1), "(0, inf)")
     return h
+
+
+def _check_edges(edges: Float64Array, shape: tuple[int | str, ...]) -> None:
+    Checks(HistogramError).numbers("edges", edges, shape)
+    Checks(HistogramError).within("steps of edges", np.diff(edges, axis=-1), "(0, inf)")
 
 
 def cumulated(shares: ArrayLike) -> Float64Array:
@@ -200,10 +188,7 @@ def distance(a: ArrayLike, b: ArrayLike, edges: ArrayLike) -> Float64Array:
     """
     e = np.asarray(edges, np.float64)
     first, second = _check_shares("a", a, HISTOGRAM_BINS), _check_shares("b", b, HISTOGRAM_BINS)
-    if e.ndim < 1 or e.shape[-1] != HISTOGRAM_BINS + 1:
-        raise HistogramError(f"edges: got shape {e.shape}, expected (..., {HISTOGRAM_BINS + 1})")
-    if not (np.isfinite(e).all() and (np.diff(e, axis=-1) > 0.0).all()):
-        raise HistogramError("edges: got some that do not rise, expected finite rising edges")
+    _check_edges(e, ("...", HISTOGRAM_BINS + 1))
     apart = np.abs(cumulated(first) - cumulated(second))
     moved = np.sum(0.5 * (apart[..., 1:] + apart[..., :-1]) * np.diff(e, axis=-1), axis=-1)
     quarter = HISTOGRAM_BINS // 4
@@ -235,18 +220,10 @@ def project_to_histograms(vectors: ArrayLike) -> Float64Array:
     >>> project_to_histograms(edited)[:3].round(6).tolist()
     [0.8, 0.2, 0.0]
     """
-    v = np.asarray(vectors, np.float64)
-    if not v.ndim or v.shape[-1] % HISTOGRAM_BINS or not v.size or not np.isfinite(v).all():
-        raise HistogramError(
-            f"vectors: got shape {v.shape}, expected finite (..., n x {HISTOGRAM_BINS}), n "
-            "at least 1"
-        )
-    h = v.reshape(-1, HISTOGRAM_BINS)
-    falling = -np.sort(-h, axis=1)
-    excess = (np.cumsum(falling, axis=1) - 1.0) / np.arange(1, HISTOGRAM_BINS + 1)
-    kept = np.count_nonzero(falling > excess, axis=1)
-    taken = excess[np.arange(len(h)), kept - 1]
-    return np.maximum(h - taken[:, None], 0.0).reshape(v.shape)
+    v = Checks(HistogramError).numbers("vectors", vectors, ("...", "n"))
+    whole = v.size and v.shape[-1] % HISTOGRAM_BINS == 0
+    Checks(HistogramError).require(whole, "vectors", v.shape, f"(..., n x {HISTOGRAM_BINS})")
+    return nearest_shares(v.reshape(-1, HISTOGRAM_BINS)).reshape(v.shape)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -298,20 +275,17 @@ def rgb_histograms(
     ([[0.5, 0.5], [0.5, 0.5], [0.5, 0.5]], [2])
     """
     low, high = reach
-    if bins < 2 or not (np.isfinite([low, high]).all() and low < high):
-        raise HistogramError(f"reach, bins: got {reach}, {bins}, expected low < high and 2 bins")
-    if valid is not None and len(valid) != len(images):
-        raise HistogramError(f"valid: got {len(valid)} masks for {len(images)} images")
+    check = Checks(HistogramError)
+    check.within("bins", bins, "[2, inf)")
+    check.within("reach", high, f"({low}, inf)")
+    check.require(valid is None or len(valid) == len(images), "valid", valid, "a mask an image")
     edges = np.linspace(low, high, bins + 1)
     found, outside = [], []
     for number, image in enumerate(images):
         pixels = np.asarray(image)
         mask = None if valid is None else valid[number]
-        if pixels.ndim != 3 or (mask is not None and np.shape(mask) != pixels.shape[:2]):
-            raise HistogramError(
-                f"images[{number}]: got shape {pixels.shape}, mask "
-                f"{None if mask is None else mask.shape}, expected (H, W, C) and (H, W)"
-            )
+        check.shape(f"images[{number}]", pixels, ("H", "W", "C"))
+        check.shape(f"valid[{number}]", mask, pixels.shape[:2])
         rows = pixels.reshape(-1, pixels.shape[2]) if mask is None else pixels[mask]
         if not len(rows) or not np.isfinite(rows).all():
             raise HistogramError(f"images[{number}]: got no valid texel, or one that is not finite")
@@ -322,12 +296,9 @@ def rgb_histograms(
     mean, stderr, clipped, members = [], [], [], []
     for name, flags in groups.items():
         chosen = np.asarray(flags)
-        if chosen.shape != (len(images),) or chosen.dtype != np.bool_ or not chosen.any():
-            raise HistogramError(
-                f"groups[{name!r}]: got {chosen.dtype} {chosen.shape}, expected bool "
-                f"({len(images)},) with at least one member"
-            )
+        check.mask(f"groups[{name!r}]", chosen, (len(images),))
         n = int(chosen.sum())
+        check.within(f"members of groups[{name!r}]", n, "[1, inf)")
         mean.append(each[chosen].mean(axis=0))
         spread = each[chosen].std(axis=0, ddof=1) if n > 1 else np.full(each.shape[1:], np.nan)
         stderr.append(spread / np.sqrt(n))

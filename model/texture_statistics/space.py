@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float64Array, FloatArray
+from model.checks import Checks
 from model.texture_statistics import steerable_pyramid
 from model.texture_statistics.bins import OPPONENT_AXES, principal_axes, uneven_edges
 from model.texture_statistics.histograms import HISTOGRAM_BINS
@@ -58,18 +59,13 @@ class TextureSpace:
         """Check shapes, axes and edges."""
         C = len(self.mean)
         R = self.levels * self.orientations + 3
-        if min(self.levels, self.orientations, C) < 1 or self.axes.shape != (C, C):
-            raise TextureError(
-                f"TextureSpace: got {self.levels} levels, {self.orientations} orientations, mean "
-                f"{self.mean.shape}, axes {self.axes.shape}, expected at least 1, (C,), (C, C)"
-            )
-        if self.edges.shape != (C, R, HISTOGRAM_BINS + 1):
-            raise TextureError(
-                f"TextureSpace.edges: got {self.edges.shape}, expected {(C, R, HISTOGRAM_BINS + 1)}"
-            )
-        arrays = (self.mean, self.axes, self.edges)
-        if any(a.dtype != np.float64 or not np.isfinite(a).all() for a in arrays):
-            raise TextureError("TextureSpace: got arrays that are not finite float64")
+        check = Checks(TextureError)
+        check.settings(self, levels="[1, inf)", orientations="[1, inf)")
+        shapes = (("mean", (C,)), ("axes", (C, C)), ("edges", (C, R, HISTOGRAM_BINS + 1)))
+        for name, shape in shapes:
+            array = getattr(self, name)
+            check.choice(f"TextureSpace.{name}", array.dtype, (np.dtype(np.float64),))
+            check.numbers(f"TextureSpace.{name}", array, shape)
         if np.abs(self.axes @ self.axes.T - np.eye(C)).max() > 1e-9:
             raise TextureError("TextureSpace.axes: got rows that are not orthonormal")
         if not (np.diff(self.edges, axis=-1) > 0.0).all():
@@ -125,8 +121,7 @@ class TextureSpace:
     def histograms(self, vector: ArrayLike) -> Float64Array:
         """Return vectors (..., n) as histograms (..., C, responses, 256)."""
         v = np.asarray(vector, np.float64)
-        if not v.ndim or v.shape[-1] != self.size:
-            raise TextureError(f"vector: got shape {v.shape}, expected (..., {self.size})")
+        Checks(TextureError).shape("vector", v, ("...", self.size))
         return v.reshape(*v.shape[:-1], self.channels, len(self.responses), HISTOGRAM_BINS)
 
     def check(self, vector: ArrayLike) -> Float64Array:
@@ -139,12 +134,9 @@ class TextureSpace:
             `model.texture_statistics.histograms.project_to_histograms` makes valid ones of edited
             ones.
         """
+        Checks(TextureError).shape("vector", vector, (self.size,))
         h = self.histograms(vector)
-        if h.ndim != 3 or not np.isfinite(h).all() or h.min() < 0.0:
-            raise TextureError(
-                f"vector: got shape {np.shape(vector)} or negative or non-finite shares, expected "
-                f"({self.size},) of shares at least 0; see project_to_histograms"
-            )
+        Checks(TextureError).within("vector (see project_to_histograms)", h, "[0, inf)")
         off = np.abs(h.sum(axis=-1) - 1.0)
         if off.max() > 1e-6:
             c, r = np.unravel_index(int(off.argmax()), off.shape)
@@ -253,21 +245,11 @@ class TextureSpace:
         spread = np.mean([c for _, c in moments], axis=0)
         spread = spread + (centers - mean).T @ (centers - mean) / count
         axes = principal_axes(spread, unit or 1.0)
-        plain = cls(
-            mean,
-            axes,
-            np.tile(
-                np.linspace(0.0, 1.0, HISTOGRAM_BINS + 1), (len(mean), levels * orientations + 3, 1)
-            ),
-            levels,
-            orientations,
-            count,
-        )
-        found = [
-            _quantiles(plain, image, mask, workers)
-            for image, mask in zip(images, masks, strict=True)
-        ]
-        pooled = np.stack(found)  # (images, C, R, quantiles)
+        even = np.linspace(0.0, 1.0, HISTOGRAM_BINS + 1)
+        even = np.tile(even, (len(mean), levels * orientations + 3, 1))
+        plain = cls(mean, axes, even, levels, orientations, count)
+        pairs = zip(images, masks, strict=True)
+        pooled = np.stack([_quantiles(plain, *pair, workers) for pair in pairs])
         edges = np.empty_like(plain.edges)
         for c in range(pooled.shape[1]):
             for r in range(pooled.shape[2]):
@@ -303,22 +285,12 @@ def checked_image(image: ArrayLike, valid: ArrayLike | None) -> tuple[FloatArray
     values = values.astype(np.float64 if values.dtype == np.float64 else np.float32, copy=False)
     if values.ndim == 2:
         values = values[..., None]
-    if values.ndim != 3 or not values.size:
-        raise TextureError(
-            f"image: got shape {np.shape(image)}, expected (H, W) or (H, W, C), not empty"
-        )
+    Checks(TextureError).shape("image", image, ("H", "W"), ("H", "W", "C"))
     mask = np.ones(values.shape[:2], bool) if valid is None else np.asarray(valid)
-    if mask.dtype != np.bool_ or mask.shape != values.shape[:2]:
-        raise TextureError(
-            f"valid: got {mask.dtype} {mask.shape}, expected bool {values.shape[:2]}"
-        )
+    Checks(TextureError).mask("valid", mask, values.shape[:2])
     if not mask.any():
         raise TextureError(f"valid: got no valid texel of {mask.size}, expected at least one")
-    wrong = int(np.count_nonzero(~np.isfinite(values).all(axis=-1) & mask))
-    if wrong:
-        raise TextureError(
-            f"image: got {wrong} valid texels that are not finite; mark them in valid"
-        )
+    Checks(TextureError).within("image (mark others in valid)", values[mask])
     return values, mask
 
 

@@ -28,6 +28,7 @@ from numpy.typing import ArrayLike
 from scipy import fft
 
 from model.arrays import Float64Array, FloatArray, Int64Array
+from model.checks import Checks
 from model.texture_statistics import pyramid_kernels
 
 LEVELS, ORIENTATIONS = 7, 4
@@ -133,14 +134,10 @@ def analyze(
     """
     values = np.asarray(image)
     values = np.ascontiguousarray(values, np.float64 if values.dtype == np.float64 else np.float32)
-    if values.ndim != 2 or not values.size:
-        raise PyramidError(f"image: got shape {values.shape}, expected (H, W), not empty")
-    if levels < 1 or orientations < 1:
-        raise PyramidError(
-            f"levels, orientations: got {levels}, {orientations}, expected at least 1 each"
-        )
-    if not np.isfinite(values).all():
-        raise PyramidError("image: got values that are not finite; fill them first")
+    Checks(PyramidError).shape("image", values, ("H", "W"))
+    Checks(PyramidError).within("levels", levels, "[1, inf)")
+    Checks(PyramidError).within("orientations", orientations, "[1, inf)")
+    Checks(PyramidError).within("image (fill others first)", values)
     shape = (values.shape[0], values.shape[1])
     threads = thread_count(workers)
     filters = _filters(shape, levels, orientations, values.dtype.str)
@@ -206,8 +203,7 @@ def thread_count(workers: int | None) -> int:
     """Return how many threads to use: what was asked for, or one a core and 4 at most."""
     if workers is None:
         return min(4, os.cpu_count() or 1)
-    if workers < 1:
-        raise PyramidError(f"workers: got {workers}, expected at least 1")
+    Checks(PyramidError).within("workers", workers, "[1, inf)")
     return workers
 
 

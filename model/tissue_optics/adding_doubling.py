@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from model import fresnel
 from model.arrays import Float64Array
+from model.checks import Checks
 
 _SERIES_TERMS = 9  # cosh(1) to 1e-16
 _CHUNK_LAYERS = 2048  # layers per batch: a few MB
@@ -98,17 +99,12 @@ def reflectance(
             "sigma_a_per_mm, sigma_s_prime_per_mm, thickness_mm: got shapes "
             f"{', '.join(map(str, shapes))}, expected one (n, layers)"
         )
-    for name, values, most in (
-        ("sigma_a_per_mm", sigma_a_per_mm, False),
-        ("thickness_mm", thickness_mm, True),
-        ("sigma_s_prime_per_mm", sigma_s_prime_per_mm, False),
-    ):
-        if not np.all((values >= 0.0) & ((values < np.inf) | most)):
-            raise ValueError(f"{name}: got negative values or NaN, expected at least 0")
+    Checks().within("sigma_a_per_mm", sigma_a_per_mm, "[0, inf)")
+    Checks().within("thickness_mm", thickness_mm, "[0, inf]")
+    Checks().within("sigma_s_prime_per_mm", sigma_s_prime_per_mm, "[0, inf)")
     layers = sigma_a_per_mm.shape[1]
     g = np.broadcast_to(np.asarray(anisotropy, dtype=np.float64), (layers,))
-    if not np.all((g >= 0.0) & (g < 1.0)):
-        raise ValueError(f"anisotropy: got {anisotropy}, expected in [0, 1)")
+    Checks().within("anisotropy", g, "[0, 1)")
     stack = np.stack([sigma_a_per_mm, sigma_s_prime_per_mm, thickness_mm], axis=-1)
     stack = stack.reshape(stack.shape[0], 3 * layers)
     below: Float64Array | None = None  # reflection matrices of what lies below, one a unique row
@@ -135,11 +131,7 @@ def quadrature(eta: float, directions: int) -> Quadrature:
     """Return the directions for an index of refraction: half of them beyond the critical angle."""
     if directions < 4 or directions % 2:
         raise ValueError(f"directions: expected an even number of at least 4, got {directions}")
-    if not 1.0 <= eta <= fresnel.MAX_INDEX:
-        raise ValueError(
-            f"eta: expected a relative refractive index of at least 1, up to "
-            f"{fresnel.MAX_INDEX:g}, got {eta}"
-        )
+    Checks().within("eta", eta, f"[1, {fresnel.MAX_INDEX}]")
     mu_c = np.sqrt(1.0 - 1.0 / eta**2)
     if mu_c < 1e-3:  # matched: a single range
         mu, weight = _radau(directions)

@@ -4,6 +4,7 @@ import numpy as np
 
 from model import fresnel
 from model.arrays import Float64Array
+from model.checks import Checks
 
 _MIN_EXTINCTION_PER_MM = 1e-9  # extinction below which a layer is empty for every purpose here
 _MIN_DECAY = 1e-4  # kappa d below which a term's limit for kappa = 0 is reached to 1e-9
@@ -63,12 +64,8 @@ def reflectance(
         ("thickness_mm", thickness_mm, True),
         ("sigma_s_prime_per_mm", sigma_s_prime_per_mm, False),
     ):
-        if not np.all((values >= 0.0) & ((values < np.inf) | endless)):
-            raise ValueError(f"{name}: got negative values or NaN, expected at least 0")
-        if np.ndim(values) < 1 or np.shape(values)[-1] < 1:
-            raise ValueError(
-                f"{name}: got shape {np.shape(values)}, expected (..., layers), at least one layer"
-            )
+        Checks().within(name, values, "[0, inf]" if endless else "[0, inf)")
+        Checks().shape(name, values, ("...", "layers"))
     sigma_t = np.maximum(sigma_a_per_mm + sigma_s_prime_per_mm, _MIN_EXTINCTION_PER_MM)
     diffusion = 1.0 / (3.0 * sigma_t)
     kappa = np.sqrt(sigma_a_per_mm / diffusion)

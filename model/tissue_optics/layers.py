@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from model import spectra
 from model.arrays import Float64Array
+from model.checks import Checks
 from model.fresnel import ETA_SKIN
 from model.tissue_optics import adding_doubling, layered_diffusion
 
@@ -39,6 +40,9 @@ class TissueError(ValueError):
     """A chromophore or an optical property lies outside what tissue can be."""
 
 
+_check = Checks(TissueError).within
+
+
 def blood_absorption(
     wavelength_nm: ArrayLike, *, oxygenation: float = OXYGEN_SATURATION
 ) -> Float64Array:
@@ -61,7 +65,7 @@ def blood_absorption(
     >>> round(float(blood_absorption(540.0)), 3)
     27.618
     """
-    _check_range("oxygenation", np.asarray(oxygenation, dtype=np.float64), 0.0, 1.0)
+    _check("oxygenation", oxygenation, "[0, 1]")
     oxy, deoxy = spectra.hemoglobin_extinction(wavelength_nm)
     molar = spectra.HEMOGLOBIN_IN_BLOOD_G_PER_L / spectra.HEMOGLOBIN_MOLAR_MASS_G_PER_MOL
     per_cm = np.log(10.0) * molar * (oxygenation * oxy + (1.0 - oxygenation) * deoxy)
@@ -109,12 +113,15 @@ def skin_layers(
     """
     melanin, dermal = np.asarray(c_m, dtype=np.float64), np.asarray(c_hd, dtype=np.float64)
     epidermal = C_HE_PER_C_HD * dermal if c_he is None else np.asarray(c_he, dtype=np.float64)
-    _check_range("beta_m", np.asarray(beta_m, dtype=np.float64), 0.0, 1.0)
-    _check_range("c_m", melanin, 0.0, 1.0)
-    _check_range("c_hd", dermal, 0.0, 1.0)
-    _check_range("c_he", epidermal, 0.0, 1.0)
+    for name, share in (
+        ("beta_m", beta_m),
+        ("c_m", melanin),
+        ("c_hd", dermal),
+        ("c_he", epidermal),
+    ):
+        _check(name, share, "[0, 1]")
     melanin, dermal, epidermal = np.broadcast_arrays(melanin, dermal, epidermal)
-    _check_range("c_m + c_he", melanin + epidermal, 0.0, 1.0)
+    _check("c_m + c_he", melanin + epidermal, "[0, 1]")
     wavelength = np.asarray(wavelength_nm, dtype=np.float64)
     spread = melanin.shape + (1,) * wavelength.ndim
     melanin, dermal, epidermal = (x.reshape(spread) for x in (melanin, dermal, epidermal))
@@ -256,26 +263,20 @@ def layer_stack_reflectance(
     >>> round(float(layer_stack_reflectance([0.17], [0.88], [np.inf], eta=1.3)), 3)
     0.21
     """
-    if tier not in TIER_NAMES:
-        raise TissueError(f"tier: got {tier!r}, expected one of {', '.join(TIER_NAMES)}")
-    given = (sigma_a_per_mm, sigma_s_prime_per_mm, thickness_mm)
-    arrays = [np.asarray(x, dtype=np.float64) for x in given]
-    try:
-        sigma_a, sigma_s, thickness = np.broadcast_arrays(*arrays)
-    except ValueError:
-        raise TissueError(
-            f"sigma_a_per_mm, sigma_s_prime_per_mm, thickness_mm: expected shapes that broadcast, "
-            f"got {', '.join(str(a.shape) for a in arrays)}"
-        ) from None
-    if sigma_a.ndim == 0 or sigma_a.shape[-1] == 0:
-        raise TissueError(f"layers: expected at least one on the last axis, got {sigma_a.shape}")
-    _check_range("sigma_a_per_mm", sigma_a, 0.0, np.inf, open_end=True)
-    _check_range("sigma_s_prime_per_mm", sigma_s, 0.0, np.inf, open_end=True)
-    _check_range("thickness_mm", thickness, 0.0, np.inf)
+    Checks(TissueError).choice("tier", tier, TIER_NAMES)
+    sigma_a, sigma_s, thickness = Checks(TissueError).together(
+        sigma_a_per_mm=sigma_a_per_mm,
+        sigma_s_prime_per_mm=sigma_s_prime_per_mm,
+        thickness_mm=thickness_mm,
+    )
+    Checks(TissueError).shape("layers", sigma_a, ("...", "layers"))
+    _check("sigma_a_per_mm", sigma_a, "[0, inf)")
+    _check("sigma_s_prime_per_mm", sigma_s, "[0, inf)")
+    _check("thickness_mm", thickness, "[0, inf]")
     if np.isinf(thickness[..., :-1]).any():
         raise TissueError("thickness_mm: only the last layer may be infinite")
     g = np.asarray(anisotropy, dtype=np.float64)
-    _check_range("anisotropy", g, 0.0, 1.0, open_end=True)
+    _check("anisotropy", g, "[0, 1)")
     if tier == "diffusion":
         return layered_diffusion.reflectance(sigma_a, sigma_s, thickness, eta=eta)
     layers = sigma_a.shape[-1]
@@ -290,13 +291,3 @@ def layer_stack_reflectance(
         directions=directions,
     )
     return result.reshape(sigma_a.shape[:-1])
-
-
-def _check_range(
-    name: str, values: Float64Array, low: float, high: float, *, open_end: bool = False
-) -> None:
-    within = (values >= low) & ((values < high) if open_end else (values <= high))
-    if not within.all():
-        bad = values[~within].flat[0]
-        end = ")" if open_end else "]"
-        raise TissueError(f"{name}: expected values in [{low:g}, {high:g}{end}, got {bad:g}")

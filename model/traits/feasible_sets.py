@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float64Array
+from model.checks import Checks
 from model.traits import nonnegative_kernels
+from model.vectors import nearest_shares
 
 FEASIBLE_TOL = 1e-5
 """What float32 leaves of a sum of one, and of a share of zero."""
@@ -98,8 +100,7 @@ class Histograms:
 
     def __post_init__(self) -> None:
         """Refuse histograms without bins."""
-        if self.block < 1:
-            raise FeasibleError(f"block: got {self.block}, expected at least 1 bin")
+        Checks(FeasibleError).within("block", self.block, "[1, inf)")
 
     def contains(self, samples: ArrayLike) -> BoolArray:
         """Return whether each sample (..., d) lies in the set, (...)."""
@@ -136,12 +137,8 @@ class Histograms:
         """
         if metric is not None:
             raise FeasibleError("metric: got weights, expected none for histograms")
-        s = self._blocks(samples)
-        u = -np.sort(-s, axis=-1)
-        loss = (np.cumsum(u, axis=-1) - 1.0) / np.arange(1, self.block + 1)
-        last = np.count_nonzero(u > loss, axis=-1, keepdims=True) - 1
-        found = np.maximum(s - np.take_along_axis(loss, last, axis=-1), 0.0)
-        return found.reshape(np.shape(samples))
+        rows = self._blocks(samples).reshape(-1, self.block)
+        return nearest_shares(rows).reshape(np.shape(samples))
 
     def tangent(self, vector: ArrayLike) -> Float64Array:
         """Return the part of a direction (d,) along the set: each histogram keeps its sum."""

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import Float64Array
+from model.checks import Checks
 
 N_QUANTILES = 256
 """Quantiles of a histogram, at even shares (k + 1/2) / 256."""
@@ -135,18 +136,15 @@ def moved(
 def _change(histograms: ArrayLike, change: ArrayLike) -> Float64Array:
     shape = (*np.shape(histograms)[:-1], N_QUANTILES)
     by = np.broadcast_to(np.asarray(change, np.float64), shape).reshape(-1, N_QUANTILES)
-    if not np.isfinite(by).all():
-        raise TransportError("change: got values that are not finite")
+    Checks(TransportError).within("change", by)
     return by
 
 
 def _checked(histograms: ArrayLike, edges: ArrayLike) -> tuple[Float64Array, Float64Array]:
     given = np.asarray(histograms, np.float64)
     over = np.asarray(edges, np.float64)
-    if given.ndim < 1 or over.shape != (*given.shape[:-1], given.shape[-1] + 1):
-        raise TransportError(
-            f"edges: got shape {over.shape} for histograms {given.shape}, expected one more"
-        )
+    Checks(TransportError).shape("histograms", given, ("...", "bins"))
+    Checks(TransportError).shape("edges", over, (*given.shape[:-1], given.shape[-1] + 1))
     h = given.reshape(-1, given.shape[-1])
     if not np.isfinite(h).all() or h.min() < 0 or not np.allclose(h.sum(axis=1), 1.0, atol=1e-5):
         raise TransportError("histograms: got negative shares or a sum that is not 1")

@@ -30,6 +30,7 @@ from scipy.optimize import nnls
 from threadpoolctl import threadpool_limits
 
 from model.arrays import Float64Array, FloatArray
+from model.checks import Checks
 from model.traits import nonnegative_kernels, reduced_spaces
 from model.traits.space import TraitSpace
 from model.traits.vectors import TraitError
@@ -159,16 +160,10 @@ def edit_weights(
 def _checked(
     given: NDArray[np.generic], mix: ArrayLike, space: TraitSpace, materials: tuple[str, ...]
 ) -> tuple[Float64Array, Float64Array]:
-    t, lobes = np.asarray(given, np.float64), np.array(mix, np.float64)
-    d = len(space.center)
-    if lobes.ndim != 2 or lobes.shape[1] != d or not (lobes >= 0.0).all():
-        raise TraitError(f"mix: got shape {lobes.shape}, expected (K, {d}) of values at least 0")
-    if not np.isfinite(lobes).all():
-        raise TraitError("mix: got values that are not finite")
-    if t.ndim != 2 or t.shape[1] != len(lobes):
-        raise TraitError(f"weights: got shape {t.shape}, expected (T, {len(lobes)})")
-    if not (np.isfinite(t).all() and (t >= 0.0).all()):
-        raise TraitError("weights: got values that are negative or not finite")
+    check = Checks(TraitError)
+    lobes = check.numbers("mix", np.array(mix), ("K", len(space.center)), interval="[0, inf)")
+    t = np.asarray(given, np.float64)
+    check.numbers("weights", t, (None, len(lobes)), interval="[0, inf)")
     if materials and space.names and tuple(materials) != space.names:
         raise TraitError(
             f"materials: got {', '.join(materials[:3])}, ... ({len(materials)}), expected those of "
@@ -178,11 +173,7 @@ def _checked(
 
 
 def _amount(name: str, amount: ArrayLike, count: int) -> Float64Array:
-    a = np.asarray(amount, np.float64)
-    if a.shape not in ((), (count,)) or not np.isfinite(a).all():
-        raise TraitError(
-            f"amount of {name}: got shape {a.shape}, expected one or {count} finite numbers"
-        )
+    a = Checks(TraitError).numbers(f"amount of {name}", amount, (), (count,))
     return np.array(np.broadcast_to(a, (count,)))
 
 

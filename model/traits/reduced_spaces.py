@@ -14,6 +14,7 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 
 from model.arrays import Float64Array
+from model.checks import Checks
 from model.traits import nonnegative_kernels
 from model.traits.vectors import Trait, TraitError, exponent_of
 
@@ -61,14 +62,9 @@ def check_metric(metric: ArrayLike | None, length: int) -> Float64Array | None:
     """Return a metric as float64; refuse one that is none of samples of this length."""
     if metric is None:
         return None
-    g = np.asarray(metric, np.float64)
-    if g.shape not in ((length,), (length, length)) or not np.isfinite(g).all():
-        raise TraitError(
-            f"metric: got shape {g.shape}, expected ({length},) or ({length}, {length}), finite"
-        )
+    g = Checks(TraitError).numbers("metric", metric, (length,), (length, length))
     if g.ndim == 1:
-        if not (g > 0.0).all():
-            raise TraitError(f"metric: got a weight of {g.min():g}, expected all above 0")
+        Checks(TraitError).within("metric", g, "(0, inf)")
         return g
     size = np.diag(g)
     if not np.allclose(g, g.T, rtol=1e-9, atol=1e-12 * float(np.abs(g).max())):
@@ -145,10 +141,9 @@ def principal(
     rank = int(np.count_nonzero(s > floor))
     if rank == 0:
         raise TraitError(f"samples: all {n} are the same, nothing can be learned from them")
-    if components is not None and not 1 <= components <= rank:
-        raise TraitError(
-            f"components: got {components}, expected 1 to {rank}, as many as {n} samples differ in"
-        )
+    if components is not None:
+        what = f"components (the {n} samples differ in {rank})"
+        Checks(TraitError).within(what, components, f"[1, {rank}]")
     scores = u[:, :rank] * s[:rank]
     kept = choose(scores, traits, rng=rng) if components is None else components
     # A basis as sums of the samples needs no inverse of the metric.
@@ -239,13 +234,8 @@ def mixtures(
             "basis: got none, expected (K, d) non-negative mixtures for space='nmf', such as "
             "reconstruction.brdf_basis.reduce(weights, K)[1]"
         )
-    b = np.asarray(basis, np.float64)
-    fits = b.ndim == 2 and b.shape[1] == samples.shape[1] and len(b) > 0
-    if not fits or not ((b >= 0.0) & (b < np.inf)).all():
-        raise TraitError(
-            f"basis: got shape {b.shape}, expected (K, {samples.shape[1]}) of finite values, at "
-            "least 0"
-        )
+    d = samples.shape[1]
+    b = Checks(TraitError).numbers("basis", basis, ("K", d), interval="[0, inf)")
     if not (b.max(axis=1) > 0.0).all():
         raise TraitError("basis: got a mixture of nothing")
     exponent = exponent_of(samples)
@@ -283,10 +273,7 @@ def mixture_coordinates(
     unit, own = exponent_of(samples), exponent_of(basis)
     d = basis.shape[1]
     if metric is not None:
-        if metric.shape not in ((d,), (d, d)) or not np.isfinite(metric).all():
-            raise TraitError(
-                f"metric: got shape {metric.shape}, expected ({d},) or ({d}, {d}), finite"
-            )
+        Checks(TraitError).numbers("metric", metric, (d,), (d, d))
     materials = np.ldexp(basis, -own)
     products = times_metric(materials, metric)
     gram = products @ materials.T

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from model.arrays import Float64Array, FloatArray
+from model.checks import Checks
 from model.traits import feasible_sets, reduced_spaces
 from model.traits import vectors as trait_vectors
 from model.traits.feasible_sets import FeasibleSet
@@ -106,14 +107,11 @@ class TraitSpace:
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit each other."""
         d = len(self.center)
-        if self.basis.ndim != 2 or self.basis.shape[1] != d:
-            raise TraitError(f"basis: got shape {self.basis.shape}, expected (K, {d})")
+        check = Checks(TraitError).shape
+        check("basis", self.basis, (None, d))
         for name, trait in self.traits.items():
-            if trait.vector.shape != (d,) or trait.coordinates.shape != (len(self.basis),):
-                raise TraitError(
-                    f"trait {name!r}: got shapes {trait.vector.shape}, {trait.coordinates.shape}, "
-                    f"expected ({d},), ({len(self.basis)},)"
-                )
+            check(f"vector of {name!r}", trait.vector, (d,))
+            check(f"coordinates of {name!r}", trait.coordinates, (len(self.basis),))
         if self.names and len(self.names) != d:
             raise TraitError(f"names: got {len(self.names)}, expected {d} or none")
 
@@ -179,11 +177,8 @@ class TraitSpace:
         >>> space.edit([2.0, 0.5], {"oily": 0.5}).round(6).tolist()
         [3.0, 0.55]
         """
-        x = np.asarray(samples, np.float64)
-        if x.ndim != 2 or not x.size or not np.isfinite(x).all():
-            raise TraitError(f"samples: got shape {x.shape}, expected (n, d) of finite values")
-        if space not in ("pca", "nmf"):
-            raise TraitError(f"space: got {space!r}, expected 'pca' or 'nmf'")
+        x = Checks(TraitError).numbers("samples", samples, ("n", "d"))
+        Checks(TraitError).choice("space", space, ("pca", "nmf"))
         traits = trait_vectors.traits_of(labels, continuous, len(x), contrast=contrast)
         g = reduced_spaces.check_metric(metric, x.shape[1])
         inside = feasible_sets.smallest(x) if feasible is None else feasible
@@ -297,8 +292,7 @@ class TraitSpace:
             For traits that are not there, amounts that are not finite or make no convex
             combination, and samples outside the feasible set.
         """
-        if mode not in ("linear", "convex"):
-            raise TraitError(f"mode: got {mode!r}, expected 'linear' or 'convex'")
+        Checks(TraitError).choice("mode", mode, ("linear", "convex"))
         given = np.asarray(sample)
         dtype = given.dtype if np.issubdtype(given.dtype, np.floating) else np.dtype(np.float64)
         s = self._checked(given)
@@ -306,8 +300,7 @@ class TraitSpace:
             raise TraitError(f"sample: is not in the set {self.feasible} where samples must stay")
         for name, amount in amounts.items():
             self.trait(name)
-            if not np.isfinite(amount):
-                raise TraitError(f"amount of {name}: got {amount}, expected a finite number")
+            Checks(TraitError).within(f"amount of {name}", amount)
         if mode == "convex":
             wanted = self._mixed(s, amounts)
         else:
@@ -338,12 +331,7 @@ class TraitSpace:
         return np.asarray(mixed)
 
     def _checked(self, samples: ArrayLike) -> Float64Array:
-        s = np.asarray(samples, np.float64)
-        if not s.ndim or s.shape[-1] != len(self.center) or not np.isfinite(s).all():
-            raise TraitError(
-                f"sample: got shape {s.shape}, expected (..., {len(self.center)}) of finite values"
-            )
-        return s
+        return Checks(TraitError).numbers("sample", samples, ("...", len(self.center)))
 
 
 def cosine(a: ArrayLike, b: ArrayLike, metric: Float64Array | None = None) -> float:
@@ -355,8 +343,8 @@ def cosine(a: ArrayLike, b: ArrayLike, metric: Float64Array | None = None) -> fl
     0.7071067811865475
     """
     x, y = np.asarray(a, np.float64), np.asarray(b, np.float64)
-    if x.shape != y.shape or x.ndim != 1:
-        raise TraitError(f"directions: got shapes {x.shape}, {y.shape}, expected (d,) twice")
+    Checks(TraitError).shape("directions", x, ("d",))
+    Checks(TraitError).shape("directions", y, x.shape)
     size = float(reduced_spaces.lengths(x, metric) * reduced_spaces.lengths(y, metric))
     return float(x @ reduced_spaces.times_metric(y, metric)) / size if size > 0.0 else 0.0
 

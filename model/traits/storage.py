@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Float64Array
+from model.checks import Checks
 from model.traits import feasible_sets, reduced_spaces
 from model.traits.space import TraitSpace
 from model.traits.vectors import Confidence, TraitError, TraitVector
@@ -61,8 +62,7 @@ class TraitLibrary:
 
     def __post_init__(self) -> None:
         """Refuse another source."""
-        if self.source not in ("simulated", "measured"):
-            raise TraitError(f"source: got {self.source!r}, expected 'simulated' or 'measured'")
+        Checks(TraitError).choice("source", self.source, ("simulated", "measured"))
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import Float64Array
+from model.checks import Checks
 
 Kind = Literal["binary", "continuous"]
 Contrast = Literal["means", "regression"]
@@ -175,8 +176,7 @@ def traits_of(
     >>> traits_of({"lotion": [True, False, False]}, {}, 3)[0].contrast.round(6).tolist()
     [1.0, -0.5, -0.5]
     """
-    if contrast not in ("means", "regression"):
-        raise TraitError(f"contrast: got {contrast!r}, expected 'means' or 'regression'")
+    Checks(TraitError).choice("contrast", contrast, ("means", "regression"))
     both = set(labels) & set(continuous)
     if both or not (labels or continuous):
         raise TraitError(
@@ -184,8 +184,7 @@ def traits_of(
             if both
             else "traits: got none, expected at least one label or continuous value"
         )
-    if count < 2:
-        raise TraitError(f"samples: got {count}, expected at least 2")
+    Checks(TraitError).within("samples", count, "[2, inf)")
     values: list[tuple[str, Kind, Float64Array]] = []
     for name, given in labels.items():
         values.append((name, "binary", _label(name, given, count)))
@@ -214,8 +213,7 @@ def traits_of(
 
 def _label(name: str, given: ArrayLike, count: int) -> Float64Array:
     label = np.asarray(given)
-    if label.shape != (count,):
-        raise TraitError(f"label {name!r}: got shape {label.shape}, expected ({count},)")
+    Checks(TraitError).shape(f"label {name!r}", label, (count,))
     if label.dtype != np.bool_ and not np.isin(label, (0, 1)).all():
         raise TraitError(f"label {name!r}: got {label.dtype} values, expected True and False")
     value = label.astype(np.float64)
@@ -229,12 +227,7 @@ def _label(name: str, given: ArrayLike, count: int) -> Float64Array:
 
 
 def _value(name: str, given: ArrayLike, count: int) -> Float64Array:
-    value = np.asarray(given, np.float64)
-    if value.shape != (count,):
-        raise TraitError(f"{name}: got shape {value.shape}, expected ({count},)")
-    if not np.isfinite(value).all():
-        bad = int(np.count_nonzero(~np.isfinite(value)))
-        raise TraitError(f"{name}: got {bad} of {count} values that are not finite")
+    value = Checks(TraitError).numbers(name, given, (count,))
     spread = value - value.mean()
     if not spread @ spread > (1e-12 * np.abs(value).max()) ** 2 * count:
         raise TraitError(f"{name}: got {value[0]:g} for all of {count}, expected values that vary")
@@ -262,8 +255,8 @@ def exponent_of(*values: Float64Array) -> int:
     >>> exponent_of(np.array([0.3, -5.0])), exponent_of(np.zeros(3))
     (3, 0)
     """
-    if not all(np.isfinite(v).all() for v in values):
-        raise TraitError("samples: got NaN or infinity, expected finite numbers")
+    for each in values:
+        Checks(TraitError).within("samples", each)
     largest = max((float(np.abs(v).max()) for v in values if v.size), default=0.0)
     return int(np.frexp(largest)[1])
 

@@ -12,6 +12,7 @@ Khronos Data Format Specification 1.3, chapters "S3TC" (BC1, BC3) and "RGTC" (BC
 import numpy as np
 
 from model.arrays import Float64Array, FloatArray, Int64Array, UInt8Array
+from model.checks import Checks
 
 BLOCK_SIDE = 4
 """Texels a side of a block."""
@@ -266,11 +267,7 @@ def _from_565(packed: Int64Array) -> Float64Array:
 
 def _cut(values: FloatArray) -> Float64Array:
     """Return blocks (rows, columns, 16, channels) of (h, w, channels), edges repeated."""
-    v = np.asarray(values, np.float64)
-    if v.ndim != 3 or 0 in v.shape:
-        raise BlockError(f"texture: got shape {np.shape(values)}, expected rows and columns")
-    if not (np.isfinite(v).all() and v.min() >= 0.0 and v.max() <= 1.0):
-        raise BlockError("texture: got values beyond [0, 1] or not finite")
+    v = Checks(BlockError).numbers("texture", values, ("h", "w", "channels"), interval="[0, 1]")
     h, w, channels = v.shape
     rows, columns = blocks_of((h, w))
     v = np.pad(v, ((0, rows * BLOCK_SIDE - h), (0, columns * BLOCK_SIDE - w), (0, 0)), mode="edge")
@@ -285,13 +282,12 @@ def _joined(texels: Float64Array, shape: tuple[int, int]) -> Float64Array:
 
 
 def _channels(values: FloatArray, wanted: int) -> None:
-    if values.ndim != 3 or values.shape[2] != wanted:
-        raise BlockError(f"texture: got shape {values.shape}, expected (h, w, {wanted})")
+    Checks(BlockError).shape("texture", values, ("h", "w", wanted))
 
 
 def _checked(blocks: UInt8Array, size: int, shape: tuple[int, int]) -> UInt8Array:
     data = np.asarray(blocks)
     expected = (*blocks_of(shape), size)
-    if data.dtype != np.uint8 or data.shape != expected:
-        raise BlockError(f"blocks: got {data.dtype} {data.shape}, expected uint8 {expected}")
+    Checks(BlockError).choice("blocks", data.dtype, (np.dtype(np.uint8),))
+    Checks(BlockError).shape("blocks", data, expected)
     return data

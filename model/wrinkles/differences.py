@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, FloatArray
+from model.checks import Checks
 from model.wrinkles import kernels
 from model.wrinkles import partial_derivatives as wrinkles
 from model.wrinkles.expressions import (
@@ -64,8 +65,7 @@ def difference_map(base: ArrayLike, wrinkled: ArrayLike) -> NormalDifference:
     [[[0.8, 0.5, 0.4]]]
     """
     b, w = _normals("base", base), _normals("wrinkled", wrinkled)
-    if b.shape != w.shape:
-        raise WrinkleError(f"wrinkled: got shape {w.shape}, expected that of base, {b.shape}")
+    Checks(WrinkleError).shape("wrinkled", w, b.shape)
     valid = np.asarray(np.isfinite(b).all(axis=2) & np.isfinite(w).all(axis=2))
     valid &= (b != 0).any(axis=2) & (w != 0).any(axis=2)
     with np.errstate(invalid="ignore"):
@@ -108,8 +108,7 @@ def combine(
     normals = np.ascontiguousarray(_normals("base", base))
     given = difference.values if isinstance(difference, NormalDifference) else difference
     d = wrinkles.from_unit(_normals("difference", given))
-    if not np.isfinite(d).all():
-        raise WrinkleError("difference: got NaN or infinity, expected values in [0, 1]")
+    Checks(WrinkleError).within("difference", d)
     stack = mask_stack(masks)
     sums = clamped(zone_sums(weights, table), clamp)
     shape = (normals.shape[0], normals.shape[1])
@@ -128,6 +127,5 @@ def combine(
 def _normals(name: str, values: ArrayLike) -> FloatArray:
     n = np.asarray(values)
     n = n if n.dtype in (np.float32, np.float64) else n.astype(np.float64)
-    if n.ndim != 3 or n.shape[2] != 3 or 0 in n.shape:
-        raise WrinkleError(f"{name}: got shape {n.shape}, expected (H, W, 3)")
+    Checks(WrinkleError).shape(name, n, ("H", "W", 3))
     return n

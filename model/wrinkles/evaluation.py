@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from model.arrays import BoolArray, Float32Array, Float64Array, FloatArray
+from model.checks import Checks
 from model.skin import SkinMap
 from model.wrinkles import partial_derivatives as wrinkles
 from model.wrinkles.expressions import (
@@ -92,24 +93,13 @@ class WrinkleModel:
     def __post_init__(self) -> None:
         """Refuse shapes that do not fit; put 0 where nothing was measured."""
         base = np.asarray(self.base)
-        if base.ndim != 3 or base.shape[2] != 2:
-            raise WrinkleError(f"base: got shape {base.shape}, expected (H, W, 2)")
+        Checks(WrinkleError).shape("base", base, ("H", "W", 2))
         finite = np.asarray(np.isfinite(base).all(axis=2))
         valid = finite if self.valid is None else np.asarray(self.valid)
-        if valid.dtype != np.bool_ or valid.shape != base.shape[:2]:
-            raise WrinkleError(
-                f"valid: got {valid.dtype} {valid.shape}, expected bool {base.shape[:2]}"
-            )
-        if (valid & ~finite).any():
-            raise WrinkleError("base: got NaN or infinity at a valid pixel")
-        if self.base_stderr is not None and np.shape(self.base_stderr) != base.shape:
-            raise WrinkleError(
-                f"base_stderr: got shape {np.shape(self.base_stderr)}, expected {base.shape}"
-            )
-        if self.clamp not in ZONE_SUM_LIMITS:
-            raise WrinkleError(
-                f"clamp: got {self.clamp!r}, expected one of {', '.join(ZONE_SUM_LIMITS)}"
-            )
+        Checks(WrinkleError).mask("valid", valid, base.shape[:2])
+        Checks(WrinkleError).within("base at valid pixels", base[valid])
+        Checks(WrinkleError).shape("base_stderr", self.base_stderr, base.shape)
+        Checks(WrinkleError).choice("clamp", self.clamp, ZONE_SUM_LIMITS)
         object.__setattr__(self, "base", np.where(valid[..., None], base, base.dtype.type(0)))
         object.__setattr__(self, "valid", valid)
         object.__setattr__(self, "layers", tuple(self.layers))

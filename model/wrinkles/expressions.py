@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import Float64Array
+from model.checks import Checks
 
 Clamp: TypeAlias = Literal["unit", "signed"]
 
@@ -173,16 +174,11 @@ def zone_sums(weights: Weights, table: Table = JIMENEZ2011_TABLE) -> Float64Arra
         rows = as_table(table)
         total = np.zeros(len(rows.zones))
         for name, weight in weights.items():
-            if not math.isfinite(weight):
-                raise WrinkleError(f"weights[{name!r}]: got {weight}, expected a finite number")
+            Checks(WrinkleError).within(f"weights[{name!r}]", weight)
             total += float(weight) * rows.row(name)
         return total
     sums = np.array(weights, np.float64)
-    if sums.ndim != 1 or not np.isfinite(sums).all():
-        raise WrinkleError(
-            f"weights: got {sums}, expected blend shapes by name or a finite number a zone"
-        )
-    return sums
+    return Checks(WrinkleError).numbers("weights (blend shapes by name, or by zone)", sums, ("Z",))
 
 
 def clamped(sums: ArrayLike, clamp: Clamp = "unit") -> Float64Array:
@@ -193,6 +189,5 @@ def clamped(sums: ArrayLike, clamp: Clamp = "unit") -> Float64Array:
     >>> clamped([-0.6, 0.2, 1.7]).tolist(), clamped([-0.6, 0.2, 1.7], "signed").tolist()
     ([0.0, 0.2, 1.0], [-0.6, 0.2, 1.0])
     """
-    if clamp not in ZONE_SUM_LIMITS:
-        raise WrinkleError(f"clamp: got {clamp!r}, expected one of {', '.join(ZONE_SUM_LIMITS)}")
+    Checks(WrinkleError).choice("clamp", clamp, ZONE_SUM_LIMITS)
     return np.clip(np.asarray(sums, np.float64), *ZONE_SUM_LIMITS[clamp])

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import FloatArray
+from model.checks import Checks
 from model.wrinkles.expressions import WrinkleError
 
 Masks: TypeAlias = FloatArray | Sequence[FloatArray]
@@ -32,12 +33,8 @@ def mask_stack(masks: Masks) -> FloatArray:
         raise WrinkleError(f"masks: got arrays of different shapes: {error}") from error
     if stack.ndim == 4 and stack.shape[3] == 4:
         stack = np.moveaxis(stack, 3, 1).reshape(-1, *stack.shape[1:3])
-    if stack.ndim != 3 or 0 in stack.shape:
-        raise WrinkleError(
-            f"masks: got shape {stack.shape}, expected (zones, h, w) or textures (h, w, 4)"
-        )
-    if not np.isfinite(stack).all():
-        raise WrinkleError("masks: got NaN or infinity, expected finite values")
+    Checks(WrinkleError).shape("masks", stack, ("zones", "h", "w"), ("textures", "h", "w", 4))
+    Checks(WrinkleError).within("masks", stack)
     return stack
 
 

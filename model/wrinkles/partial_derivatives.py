@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike
 
 from model import texture_resampling as resampling
 from model.arrays import BoolArray, FloatArray
+from model.checks import Checks
 from model.vectors import unit_vectors
 from model.wrinkles import kernels
 from model.wrinkles.expressions import (
@@ -105,10 +106,9 @@ def encoding_report(normals: ArrayLike, *, limit: float | None = MAX_DERIVATIVE)
     ([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]], 0.5, [True, True, False])
     """
     n = real_array(normals)
-    if n.ndim == 0 or n.shape[-1] != 3:
-        raise WrinkleError(f"normals: got shape {n.shape}, expected (..., 3)")
-    if limit is not None and not limit > 0:
-        raise WrinkleError(f"limit: got {limit}, expected above 0 or None")
+    Checks(WrinkleError).shape("normals", n, ("...", 3))
+    if limit is not None:
+        Checks(WrinkleError).within("limit", limit, "(0, inf]")
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         d = n[..., :2] / n[..., 2:]
         # an infinite quotient is a slope beyond any limit; without one nothing represents it
@@ -138,8 +138,7 @@ def decode(derivatives: ArrayLike) -> FloatArray:
         Unit vectors with n_z > 0; (0, 0, 0) where a derivative is not finite.
     """
     d = real_array(derivatives)
-    if d.ndim == 0 or d.shape[-1] != 2:
-        raise WrinkleError(f"derivatives: got shape {d.shape}, expected (..., 2)")
+    Checks(WrinkleError).shape("derivatives", d, ("...", 2))
     out = np.empty((*d.shape[:-1], 3), d.dtype)
     with np.errstate(over="ignore", invalid="ignore"):
         squares = np.square(d[..., 0]) + np.square(d[..., 1])
@@ -163,11 +162,7 @@ def _decoded_huge(d: FloatArray) -> FloatArray:
 def to_unit(derivatives: ArrayLike, *, limit: float = MAX_DERIVATIVE) -> FloatArray:
     """Return derivatives in [-limit, limit] as texture values in [0, 1]; 0 becomes 0.5."""
     d = real_array(derivatives)
-    if not np.isfinite(d).all() or (d.size and float(np.abs(d).max()) > limit):
-        raise WrinkleError(
-            f"derivatives: got values beyond {limit:g} or not finite, expected encode's with "
-            f"that limit"
-        )
+    Checks(WrinkleError).within("derivatives (of encode)", d, f"[-{limit}, {limit}]")
     return d * d.dtype.type(0.5 / limit) + d.dtype.type(0.5)
 
 
@@ -207,10 +202,8 @@ class Layer:
         object.__setattr__(self, "wrinkle", _derivative_map("wrinkle", self.wrinkle, finite=True))
         object.__setattr__(self, "masks", mask_stack(self.masks))
         shape = self.wrinkle.shape
-        if self.stderr is not None and np.shape(self.stderr) != shape:
-            raise WrinkleError(f"stderr: got shape {np.shape(self.stderr)}, expected {shape}")
-        if self.valid is not None and np.shape(self.valid) != shape[:2]:
-            raise WrinkleError(f"valid: got shape {np.shape(self.valid)}, expected {shape[:2]}")
+        Checks(WrinkleError).shape("stderr", self.stderr, shape)
+        Checks(WrinkleError).shape("valid", self.valid, shape[:2])
 
 
 def combine(
@@ -345,10 +338,7 @@ def widened(planes: FloatArray, shape: tuple[int, int], dtype: Any) -> tuple[Any
 def _derivatives(name: str, values: ArrayLike) -> FloatArray:
     """Return maps of derivatives as they are, and those of normals encoded."""
     d = real_array(values)
-    if d.ndim < 3 or d.shape[-1] not in (2, 3) or 0 in d.shape[-3:]:
-        raise WrinkleError(
-            f"{name}: got shape {d.shape}, expected (..., H, W, 2) or normals (..., H, W, 3)"
-        )
+    Checks(WrinkleError).shape(name, d, ("...", "H", "W", 2), ("...", "H", "W", 3))
     return encode(d, limit=None) if d.shape[-1] == 3 else d
 
 

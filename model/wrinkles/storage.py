@@ -22,6 +22,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from model.arrays import FloatArray
+from model.checks import Checks
 from model.wrinkles import block_compression as blocks
 from model.wrinkles import partial_derivatives as wrinkles
 from model.wrinkles.expressions import WrinkleError
@@ -100,13 +101,9 @@ def footprint(
         For an encoding that does not exist, or a size or number below 1.
     """
     for name, encoding, known in (("maps", maps, MAP_BYTES), ("masks", masks, MASK_BYTES)):
-        if encoding not in known:
-            raise WrinkleError(f"{name}: got {encoding!r}, expected one of {', '.join(known)}")
-    if min(*wrinkle_shape, *mask_shape, zones) < 1:
-        raise WrinkleError(
-            f"wrinkle_shape, mask_shape, zones: got {wrinkle_shape}, {mask_shape}, {zones}, "
-            "expected at least 1 each"
-        )
+        Checks(WrinkleError).choice(name, encoding, known)
+    sizes = (*wrinkle_shape, *mask_shape, zones)
+    Checks(WrinkleError).within("wrinkle_shape, mask_shape, zones", sizes, "[1, inf)")
     textures = -(-zones // 4)
     return Footprint(
         texture_bytes(wrinkle_shape, MAP_BYTES[maps], in_blocks=maps == "bc5"),
@@ -134,13 +131,11 @@ def stored_map(derivatives: FloatArray, encoding: MapEncoding) -> FloatArray:
     -------
     ndarray, shape (h, w, 2), float32
     """
-    if encoding not in MAP_BYTES:
-        raise WrinkleError(f"maps: got {encoding!r}, expected one of {', '.join(MAP_BYTES)}")
+    Checks(WrinkleError).choice("maps", encoding, MAP_BYTES)
     d = np.asarray(derivatives)
     if encoding == "float16":
         limit = float(np.finfo(np.float16).max)
-        if d.size and not float(np.abs(d).max()) <= limit:
-            raise WrinkleError(f"derivatives: got values beyond {limit:g} or not finite")
+        Checks(WrinkleError).within("derivatives", d, f"[-{limit}, {limit}]")
         d = d.astype(np.float16)
     elif encoding == "unit8":
         d = wrinkles.from_unit(_eight_bits(wrinkles.to_unit(d)))
@@ -160,17 +155,13 @@ def stored_masks(masks: Masks, encoding: MaskEncoding) -> FloatArray:
     WrinkleError
         For an encoding that does not exist, and masks that it does not hold.
     """
-    if encoding not in MASK_BYTES:
-        raise WrinkleError(f"masks: got {encoding!r}, expected one of {', '.join(MASK_BYTES)}")
+    Checks(WrinkleError).choice("masks", encoding, MASK_BYTES)
     stack = mask_stack(masks)
-    if encoding in ("unit8", "bc3") and not (stack.min() >= 0.0 and stack.max() <= 1.0):
-        raise WrinkleError(
-            f"masks: got {stack.min():.3g}...{stack.max():.3g}, expected [0, 1] for {encoding}"
-        )
+    some = "[0, 1]"
     if encoding in ("float16", "float32"):
         limit = float(np.finfo(encoding).max)
-        if float(np.abs(stack).max()) > limit:
-            raise WrinkleError(f"masks: got values beyond {limit:g}, expected less for {encoding}")
+        some = f"[-{limit}, {limit}]"
+    Checks(WrinkleError).within(f"masks as {encoding}", stack, some)
     if encoding == "float16":
         stack = stack.astype(np.float16)
     elif encoding == "unit8":

@@ -25,8 +25,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special, stats
 
+from model.checks import Checks
 from reconstruction.anisotropy import diffusion_ellipse, direction_harmonics
-from reconstruction.anisotropy.direction_harmonics import MIN_DIRECTIONS
+from reconstruction.anisotropy.direction_harmonics import MIN_DIRECTIONS, HarmonicFit
 from reconstruction.anisotropy.plane_vectors import (
     UNKNOWN_AXIS_RAD,
     axis_stderr,
@@ -35,7 +36,6 @@ from reconstruction.anisotropy.plane_vectors import (
     within_period,
 )
 from reconstruction.arrays import BoolArray, Float64Array, Int64Array
-from reconstruction.checks import require_shapes
 
 Errors: TypeAlias = Literal["relative", "absolute"]
 
@@ -169,45 +169,13 @@ def estimate(
         angle_rad, sigma_tr_per_mm, stderr_per_mm, valid, errors
     )
     # sums and squares of values at the ends of the range would leave it
-    exponent = _far_exponent(np.where(good, values, 0.0).max(axis=0, initial=0.0))
-    with np.errstate(over="ignore"):
-        values, stderr = np.ldexp(values, -exponent), np.ldexp(stderr, -exponent)
-    scale = np.where(good, values, 0.0).sum(axis=0) / np.maximum(good.sum(axis=0), 1)
-    scale = np.where(scale > 0, scale, 1.0)
-    y = np.where(good, values / scale, 0.0)
-    with np.errstate(over="ignore"):
-        relative = np.clip(stderr / scale, MIN_DIRECTION_ERROR, MAX_DIRECTION_ERROR)
-    relative = np.where(good, relative, math.inf)
-    least = relative.min(axis=0, initial=math.inf)
-    least = np.where(np.isfinite(least), least, 1.0)
-    # weights of 1 at most: errors of any size keep within range
-    weight = np.where(good & (relative <= MAX_ERROR_RATIO * least), (least / relative) ** 2, 0.0)
-    outlier = np.zeros(weight.shape, bool)
-    if outliers:
-        weight, outlier = direction_harmonics.without_outliers(angle, y, weight)
-        # others beside one far above them were next to nothing of the mean
-        kept = np.where(weight > 0, y, 0.0)
-        closer = _far_exponent(kept.max(axis=0, initial=0.0))
-        y = np.ldexp(np.where(closer == 0, y, kept), -closer)
-        least, exponent = np.ldexp(least, -closer), exponent + closer
+    y, weight, outlier, least, scale, exponent = _near_one(angle, values, stderr, good, outliers)
     linear = direction_harmonics.fit(angle, y, weight)
     p, inverse, residual = diffusion_ellipse.fit(angle, y, weight, linear)
     # what rounding leaves is neither a residual nor a harmonic
     rounding = (16 * np.finfo(np.float64).eps) ** 2 * (weight * y * y).sum(axis=0)
     residual = np.maximum(residual, rounding)
-    dof = np.maximum(linear.dof, 1)
-    if errors == "relative":
-        # as wide as needed to hold 68 % with few degrees of freedom, too
-        factor = np.sqrt(residual / dof) * stats.t.ppf(special.ndtr(1.0), dof)
-        linear_residual = np.maximum(linear.residual, rounding)
-        log_p = direction_harmonics.log_tail(linear.axial_power, linear_residual, linear.dof)
-        log_odd = direction_harmonics.log_tail(linear.odd_power, linear_residual, linear.dof)
-    else:
-        factor = least
-        with np.errstate(over="ignore"):
-            log_p, log_odd = (
-                -0.5 * power / least / least for power in (linear.axial_power, linear.odd_power)
-            )
+    factor, log_p, log_odd = _chances(linear, residual, least, rounding, errors)
     covariance = inverse * (factor**2)[:, None, None]
     covariance[:, 1:3, 1:3] += log_ratio_error**2 * p[:, 1:3, None] * p[:, None, 1:3]
     with np.errstate(over="ignore"):
@@ -253,6 +221,54 @@ def estimate(
     )
 
 
+def _near_one(
+    angle: Float64Array, values: Float64Array, stderr: Float64Array, good: BoolArray, outliers: bool
+) -> tuple[Float64Array, Float64Array, BoolArray, Float64Array, Float64Array, Int64Array]:
+    """Return values about 1 and their weights, outliers, least errors, scale, power of two."""
+    exponent = _far_exponent(np.where(good, values, 0.0).max(axis=0, initial=0.0))
+    with np.errstate(over="ignore"):
+        values, stderr = np.ldexp(values, -exponent), np.ldexp(stderr, -exponent)
+    scale = np.where(good, values, 0.0).sum(axis=0) / np.maximum(good.sum(axis=0), 1)
+    scale = np.where(scale > 0, scale, 1.0)
+    y = np.where(good, values / scale, 0.0)
+    with np.errstate(over="ignore"):
+        relative = np.clip(stderr / scale, MIN_DIRECTION_ERROR, MAX_DIRECTION_ERROR)
+    relative = np.where(good, relative, math.inf)
+    least = relative.min(axis=0, initial=math.inf)
+    least = np.where(np.isfinite(least), least, 1.0)
+    # weights of 1 at most: errors of any size keep within range
+    weight = np.where(good & (relative <= MAX_ERROR_RATIO * least), (least / relative) ** 2, 0.0)
+    outlier = np.zeros(weight.shape, bool)
+    if outliers:
+        weight, outlier = direction_harmonics.without_outliers(angle, y, weight)
+        # others beside one far above them were next to nothing of the mean
+        kept = np.where(weight > 0, y, 0.0)
+        closer = _far_exponent(kept.max(axis=0, initial=0.0))
+        y = np.ldexp(np.where(closer == 0, y, kept), -closer)
+        least, exponent = np.ldexp(least, -closer), exponent + closer
+    return y, weight, outlier, least, scale, exponent
+
+
+def _chances(
+    linear: HarmonicFit, residual: Float64Array, least: Float64Array, rounding: Any, errors: Errors
+) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Return what standard errors are multiplied by, and log P of both harmonics by chance."""
+    dof = np.maximum(linear.dof, 1)
+    if errors == "relative":
+        # as wide as needed to hold 68 % with few degrees of freedom, too
+        factor = np.sqrt(residual / dof) * stats.t.ppf(special.ndtr(1.0), dof)
+        linear_residual = np.maximum(linear.residual, rounding)
+        log_p = direction_harmonics.log_tail(linear.axial_power, linear_residual, linear.dof)
+        log_odd = direction_harmonics.log_tail(linear.odd_power, linear_residual, linear.dof)
+    else:
+        factor = least
+        with np.errstate(over="ignore"):
+            log_p, log_odd = (
+                -0.5 * power / least / least for power in (linear.axial_power, linear.odd_power)
+            )
+    return factor, log_p, log_odd
+
+
 def _checked(
     angle_rad: ArrayLike,
     sigma_tr_per_mm: ArrayLike,
@@ -261,33 +277,23 @@ def _checked(
     errors: Errors,
 ) -> tuple[Float64Array, Float64Array, Float64Array, BoolArray, tuple[int, ...]]:
     """Return angles (N,), values, standard errors and what counts (N, B), and the shape of B."""
-    angle = np.asarray(angle_rad, np.float64)
+    check = Checks(AnisotropyError)
+    angle = check.numbers("angle_rad", angle_rad, ("N",))
     given = np.asarray(sigma_tr_per_mm, np.float64)
-    if angle.ndim != 1 or not np.isfinite(angle).all():
-        raise AnisotropyError(f"angle_rad: got shape {angle.shape}, expected (N,), all finite")
-    if given.shape[:1] != angle.shape:
-        raise AnisotropyError(
-            f"sigma_tr_per_mm: got shape {given.shape}, expected ({angle.size}, ...)"
-        )
-    if errors not in ("relative", "absolute"):
-        raise AnisotropyError(f'errors: got {errors!r}, expected "relative" or "absolute"')
+    check.shape("sigma_tr_per_mm", given, (angle.size, *given.shape[1:]))
+    check.choice("errors", errors, ("relative", "absolute"))
     several = direction_harmonics.different_directions(angle, np.ones((angle.size, 1), bool))[0]
-    if several < MIN_DIRECTIONS:
-        raise AnisotropyError(
-            f"angle_rad: got {several} different directions, expected {MIN_DIRECTIONS} or more"
-        )
+    check.within("different directions of angle_rad", several, f"[{MIN_DIRECTIONS}, inf)")
     stderr: Float64Array = np.zeros_like(given)
     if stderr_per_mm is not None:
         stderr = np.asarray(stderr_per_mm, np.float64)
     good = np.ones(given.shape, bool) if valid is None else np.array(valid, bool)
-    require_shapes(
-        AnisotropyError, ("stderr_per_mm", stderr, given.shape), ("valid", good, given.shape)
-    )
+    check.shape("stderr_per_mm", stderr, given.shape)
+    check.shape("valid", good, given.shape)
     shape = given.shape[1:]
     values, stderr, good = (a.reshape(angle.size, -1) for a in (given, stderr, good))
     good = good & np.isfinite(values) & (values > 0) & np.isfinite(stderr)
-    if (stderr[good] < 0).any():
-        raise AnisotropyError(f"stderr_per_mm: got {stderr[good].min()}, expected 0 or above")
+    check.within("stderr_per_mm", stderr[good], "[0, inf)")
     zero = good & (stderr == 0)
     whole = (zero == good).all(axis=0)
     if (zero.any(axis=0) & ~whole).any():
@@ -368,8 +374,7 @@ def one_direction_bias(found: Anisotropy, angle_rad: ArrayLike) -> OneDirectionB
     ([-0.093, 0.089], 0.064)
     """
     angle = np.atleast_1d(np.asarray(angle_rad, np.float64))
-    if angle.ndim != 1 or not np.isfinite(angle).all():
-        raise AnisotropyError(f"angle_rad: got shape {angle.shape}, expected (K,), all finite")
+    Checks(AnisotropyError).numbers("angle_rad", angle, ("K",))
     shape = found.valid.shape
     valid = found.valid.reshape(-1)
     p = found.parameters.reshape(-1, 3)

@@ -13,7 +13,6 @@ mistaken for coupling. Readings are compared as they are, not as logarithms: tho
 even negative ones, count without bias.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -22,9 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model import photon_table
+from model.checks import Checks
 from reconstruction.anisotropy.estimation import Anisotropy, AnisotropyError, Errors, estimate
 from reconstruction.arrays import BoolArray, Float64Array
-from reconstruction.checks import require_shapes
 
 Table: TypeAlias = Callable[[Float64Array, Float64Array], tuple[Float64Array, Float64Array]]
 """sigma_a (B, 1, 1) and sigma_s' (B, N, 1) to T and dT / d sigma_s', (B, N, F)."""
@@ -221,40 +220,25 @@ def estimate_from_profiles(
     (1.22, 0.3)
     """
     angle = np.asarray(angle_rad, np.float64)
-    r = np.asarray(radius_mm, np.float64)
+    check = Checks(AnisotropyError)
+    r = check.numbers("radius_mm", radius_mm, ("F",), interval="[0, inf)")
     profiles = np.asarray(reflectance_per_mm2, np.float64)
-    if r.ndim != 1 or not (np.isfinite(r).all() and (r >= 0).all()):
-        raise AnisotropyError(f"radius_mm: got shape {r.shape}, expected (F,), finite, 0 or above")
-    if profiles.ndim < 2 or (profiles.shape[0], profiles.shape[-1]) != (angle.size, r.size):
-        raise AnisotropyError(
-            f"reflectance_per_mm2: got shape {profiles.shape}, expected ({angle.size}, ..., "
-            f"{r.size})"
-        )
-    if not (math.isfinite(floor) and floor >= 0):
-        raise AnisotropyError(f"floor: got {floor}, expected 0 or above, finite")
+    check.shape("reflectance_per_mm2", profiles, (angle.size, *profiles.shape[1:-1], r.size))
+    check.within("floor", floor, "[0, inf)")
     if errors == "absolute" and variance is None:
         raise AnisotropyError('variance: got none, expected one for "absolute" errors')
     of_each: Float64Array = np.zeros_like(profiles)
     if variance is not None:
         of_each = np.asarray(variance, np.float64)
     good = np.ones(profiles.shape, bool) if valid is None else np.array(valid, bool)
-    require_shapes(
-        AnisotropyError, ("variance", of_each, profiles.shape), ("valid", good, profiles.shape)
-    )
+    check.shape("variance", of_each, profiles.shape)
+    check.shape("valid", good, profiles.shape)
     good = good & np.isfinite(profiles) & np.isfinite(of_each)
-    if (of_each[good] < 0).any():
-        raise AnisotropyError(f"variance: got {of_each[good].min()}, expected 0 or above")
+    check.within("variance", of_each[good], "[0, inf)")
     shape = profiles.shape[1:-1]
-    try:
-        a, s = (
-            np.broadcast_to(np.asarray(x, np.float64), shape).reshape(-1)
-            for x in (sigma_a_per_mm, sigma_s_prime_per_mm)
-        )
-    except ValueError as error:
-        raise AnisotropyError(
-            f"sigma_a_per_mm, sigma_s_prime_per_mm: got shapes {np.shape(sigma_a_per_mm)}, "
-            f"{np.shape(sigma_s_prime_per_mm)}, expected {shape}"
-        ) from error
+    a = check.spread("sigma_a_per_mm", np.asarray(sigma_a_per_mm, np.float64), shape).reshape(-1)
+    s = np.asarray(sigma_s_prime_per_mm, np.float64)
+    s = check.spread("sigma_s_prime_per_mm", s, shape).reshape(-1)
 
     def table(
         absorption: Float64Array, scattering: Float64Array

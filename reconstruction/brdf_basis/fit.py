@@ -25,9 +25,9 @@ from sklearn.decomposition import NMF
 from sklearn.exceptions import ConvergenceWarning
 
 from model.brdf.tables import BrdfBasis
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.brdf_basis.nnls_kernels import fit_points
-from reconstruction.checks import require_shapes
 from reconstruction.lumitexels import boundary_kernels
 
 MIN_SAMPLE_COSINE = 0.1
@@ -68,17 +68,14 @@ class SurfaceSamples:
 
     def __post_init__(self) -> None:
         """Check the shapes."""
-        if self.value.ndim != 2:
-            raise SampleError(f"value: got shape {self.value.shape}, expected (P, M)")
-        points, samples = self.value.shape
-        require_shapes(
-            SampleError,
-            ("variance", self.variance, (points, samples)),
-            ("light_dir", self.light_dir, (points, samples, 3)),
-            ("view_dir", self.view_dir, (points, samples, 3)),
-            ("normals", self.normals, (points, 3)),
-            ("valid", self.valid, (points, samples)),
-        )
+        check = Checks(SampleError).shape
+        check("value", self.value, (None, None))
+        shape = self.value.shape
+        check("variance", self.variance, shape)
+        check("light_dir", self.light_dir, (*shape, 3))
+        check("view_dir", self.view_dir, (*shape, 3))
+        check("normals", self.normals, (shape[0], 3))
+        check("valid", self.valid, shape)
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,8 +138,7 @@ def surface_samples(
     SurfaceSamples
     """
     f = np.asarray(brdf_samples, dtype=np.float32)
-    if f.ndim != 3:
-        raise SampleError(f"brdf_samples: got shape {f.shape}, expected (P, M, C)")
+    Checks(SampleError).shape("brdf_samples", f, (None, None, None))
     points, samples, channels = f.shape
     light, view = (
         np.broadcast_to(np.asarray(v, dtype=np.float32), (points, samples, 3))
@@ -150,11 +146,8 @@ def surface_samples(
     )
     n = np.asarray(normals, dtype=np.float32)
     albedo = np.asarray(r_d, dtype=np.float64)
-    if n.shape != (points, 3) or albedo.shape != (points, channels):
-        raise SampleError(
-            f"normals, r_d: got shapes {n.shape}, {albedo.shape}, "
-            f"expected {(points, 3)}, {(points, channels)}"
-        )
+    Checks(SampleError).shape("normals", n, (points, 3))
+    Checks(SampleError).shape("r_d", albedo, (points, channels))
     cos_l = np.einsum("pmc,pc->pm", light, n)
     cos_v = np.einsum("pmc,pc->pm", view, n)
     through = boundary_kernels.transmitted(np.nan_to_num(cos_l), np.nan_to_num(cos_v), eta)
@@ -210,24 +203,15 @@ def fit_weights(
     negative by noise, are never rooted themselves: that would bias dark ones. Residuals beyond
     3 standard deviations pull with constant force.
     """
-    if compress not in ("cbrt", "none"):
-        raise ValueError(f"compress: got {compress!r}, expected 'cbrt' or 'none'")
+    Checks().choice("compress", compress, ("cbrt", "none"))
     points = len(samples.value)
     weights = np.zeros((points, basis.size))
+    given = (samples.value, samples.variance, samples.light_dir, samples.view_dir, samples.normals)
     residual, stderr = fit_points(
         basis.table,
         basis.size,
         basis.kinship(),
-        *(
-            np.ascontiguousarray(a, dtype=np.float32)
-            for a in (
-                samples.value,
-                samples.variance,
-                samples.light_dir,
-                samples.view_dir,
-                samples.normals,
-            )
-        ),
+        *(np.ascontiguousarray(array, dtype=np.float32) for array in given),
         np.ascontiguousarray(samples.valid),
         N_REWEIGHTINGS if compress == "cbrt" else 0,
         POINTS_PER_BLOCK,
@@ -287,15 +271,9 @@ def reduce(
     relative_error : float
         Root of the squared misfit over the square of what is factored.
     """
-    shares = np.asarray(
-        weights.weights if isinstance(weights, BasisWeights) else weights, dtype=np.float64
-    )
-    if shares.ndim != 2 or not np.all((shares >= 0.0) & (shares < np.inf)):
-        raise ValueError(
-            f"weights: got shape {shares.shape}, expected (P, K) of finite values at least 0"
-        )
-    if not 1 <= rank <= min(shares.shape):
-        raise ValueError(f"rank: got {rank}, expected 1 to {min(shares.shape)}")
+    found = weights.weights if isinstance(weights, BasisWeights) else weights
+    shares = Checks().numbers("weights", found, ("P", "K"), interval="[0, inf)")
+    Checks().within("rank", rank, f"[1, {min(shares.shape)}]")
     top = float(shares.max())
     if top > 0.0 and not 1e-100 < top < 1e100:  # squares would under- or overflow
         found, mix, error = reduce(shares / top, rank, basis=basis, seed=seed)

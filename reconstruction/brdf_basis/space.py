@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.brdf.tables import BrdfBasis
+from model.checks import Checks
 from model.traits.reduced_spaces import mixture_coordinates
 from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.brdf_basis import fit as brdf_basis
@@ -161,8 +162,7 @@ def curve(
     shares = _checked(weights, basis)
     if list(ranks) != sorted(set(ranks)) or not len(ranks) or ranks[0] < 1:
         raise SpaceError(f"ranks: got {list(ranks)}, expected growing numbers from 1")
-    if method not in ("shares", "brdf"):
-        raise ValueError(f"method: got {method!r}, expected 'shares' or 'brdf'")
+    Checks().choice("method", method, ("shares", "brdf"))
     gram = metric(basis)
     if not np.any(shares):
         raise SpaceError(f"weights: all {len(shares)} points are 0, none shows how it reflects")
@@ -177,8 +177,7 @@ def curve(
     )
     others = np.zeros((0, basis.size)) if held_out is None else _checked(held_out, basis)
     whose = np.arange(len(others)) if groups is None else np.asarray(groups)
-    if whose.shape != (len(others),):
-        raise SpaceError(f"groups: got shape {whose.shape}, expected {(len(others),)}")
+    Checks(SpaceError).shape("groups", whose, (len(others),))
     errors: list[float] = []
     outside, spread = [], []
     mixes: list[Float64Array] = []
@@ -267,8 +266,7 @@ def repeatability(first: ArrayLike, second: ArrayLike, basis: BrdfBasis) -> floa
     what no number of mixtures should explain.
     """
     a, b = _checked(first, basis), _checked(second, basis)
-    if a.shape != b.shape:
-        raise SpaceError(f"second: got shape {b.shape}, expected {a.shape}")
+    Checks(SpaceError).shape("second", b, a.shape)
     gram = metric(basis)
     size = 0.5 * (_squares(a, gram).sum() + _squares(b, gram).sum())
     if size == 0.0:
@@ -284,13 +282,7 @@ def metric(basis: BrdfBasis) -> Float64Array:
 
 def _checked(weights: ArrayLike, basis: BrdfBasis) -> Float64Array:
     values = np.asarray(weights, dtype=np.float64)
-    good = values.ndim == 2 and values.shape[1] == basis.size
-    if not good or not np.all((values >= 0.0) & (values < np.inf)):
-        raise ValueError(
-            f"weights: got shape {values.shape}, expected (P, {basis.size}) of finite values at "
-            "least 0"
-        )
-    return values
+    return Checks().numbers("weights", values, (None, basis.size), interval="[0, inf)")
 
 
 def _squares(rows: Float64Array, gram: Float64Array) -> Float64Array:

@@ -21,13 +21,11 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.ndimage import map_coordinates
 
-from model.texture_statistics.masks import fill_smoothly
-from reconstruction.arrays import BoolArray, Float32Array, Float64Array
+from model.checks import Checks
+from reconstruction.arrays import Float64Array
 from reconstruction.correspondence import landmark_field
 from reconstruction.correspondence.landmark_field import LandmarkField, LandmarkFieldError
-from reconstruction.correspondence.splatting import closed, outermost, splat
 
 Point = tuple[float, float, float]
 
@@ -37,7 +35,7 @@ MIN_SHARED_LANDMARKS: Final = 6
 """Named landmarks that two faces need in common: three for the affine part, as many again."""
 NOSE_TIP_FRACTION: Final = 1e-3
 """Foremost texels that stand for the tip of the nose where no landmark names it."""
-CHART_SIZE_RANGE_PX: Final = (16, 4096)
+MIN_CHART_PX, MAX_CHART_PX = 16, 4096
 _TEXELS_PER_BATCH: Final = 40_000
 NOSE_LANDMARK: Final = "nose tip"
 
@@ -103,16 +101,10 @@ class CommonFrame:
 
     def __post_init__(self) -> None:
         """Check shapes and ranges."""
-        if self.landmarks_mm.shape != (len(self.names), 2):
-            shape, expected = self.landmarks_mm.shape, (len(self.names), 2)
-            raise ParameterizationError(f"landmarks_mm: got shape {shape}, expected {expected}")
-        if not np.isfinite(self.landmarks_mm).all() or not np.isfinite(self.center_mm).all():
-            raise ParameterizationError("landmarks_mm: got a place that is not finite")
-        if not (math.isfinite(self.side_mm) and self.side_mm > 0):
-            raise ParameterizationError(f"side_mm: got {self.side_mm}, expected above 0")
-        low, high = CHART_SIZE_RANGE_PX
-        if not low <= self.size <= high:
-            raise ParameterizationError(f"size: got {self.size}, expected {low} to {high} pixels")
+        check = Checks(ParameterizationError)
+        check.numbers("landmarks_mm", self.landmarks_mm, (len(self.names), 2))
+        check.within("center_mm", self.center_mm)
+        check.settings(self, side_mm="(0, inf)", size=f"[{MIN_CHART_PX}, {MAX_CHART_PX}]")
 
     @property
     def pixel_mm(self) -> float:
@@ -133,10 +125,7 @@ class CommonFrame:
 
     def landmark(self, name: str) -> Float64Array:
         """Return where a landmark lies, (2,), mm."""
-        if name not in self.names:
-            raise ParameterizationError(
-                f"landmark {name!r}: is not one of {', '.join(sorted(self.names))}"
-            )
+        Checks(ParameterizationError).choice("landmark", name, sorted(self.names))
         return self.landmarks_mm[self.names.index(name)]
 
     def document(self) -> dict[str, object]:
@@ -168,10 +157,7 @@ class CommonFrame:
             side_mm, size = float(values["side_mm"]), int(values["size"])
         except (KeyError, TypeError, ValueError) as error:
             raise ParameterizationError(f"common parameterization: {error}") from error
-        if radius_mm != CYLINDER_RADIUS_MM:
-            raise ParameterizationError(
-                f"radius_mm: got {radius_mm}, expected {CYLINDER_RADIUS_MM}"
-            )
+        Checks(ParameterizationError).choice("radius_mm", radius_mm, (CYLINDER_RADIUS_MM,))
         return CommonFrame(names, places, (u, v), side_mm, size)
 
 
@@ -214,92 +200,6 @@ class Correspondence:
             by, off = self.field.at(flat[part])
             moved[part], error[part] = flat[part] + by, np.hypot(off, self.field.stderr_px)
         return moved.reshape(*shape, 2), error.reshape(shape)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Chart:
-    """Where each texel of a face's texture lies in the common map.
-
-    Attributes
-    ----------
-    size
-        Pixels a side of the map.
-    place_px
-        (H, W, 2), column and row; may lie outside the map.
-    on_surface
-        (H, W): texels that show the surface.
-    outermost
-        (H, W): those that no other part of the face covers.
-    stderr_mm
-        (H, W): of the place; NaN where nothing says it.
-    """
-
-    size: int
-    place_px: Float64Array
-    on_surface: BoolArray
-    outermost: BoolArray
-    stderr_mm: Float32Array
-
-    def gather(
-        self, texture: ArrayLike, valid: ArrayLike | None = None
-    ) -> tuple[Float32Array, BoolArray]:
-        """Average a texture into the common map.
-
-        Parameters
-        ----------
-        texture
-            (H, W) or (H, W, C).
-        valid
-            (H, W), texels that count; by default all of the surface.
-
-        Returns
-        -------
-        values : ndarray of float32, shape (N, N) or (N, N, C)
-            Filled from around where no texel lies.
-        valid : ndarray of bool, shape (N, N)
-            Pixels that texels say something about: at most half a texel's distance from one.
-        """
-        image = np.asarray(texture, np.float64)
-        use = self.on_surface & self.outermost
-        if valid is not None:
-            use = use & np.asarray(valid, np.bool_)
-        total, weight = splat(self.place_px[use], _layers(image)[use], self.size)
-        mean = total / np.maximum(weight, 1e-12)[..., None]
-        known = weight > 0.0
-        filled = fill_smoothly(mean, known) if known.any() else np.zeros_like(mean)
-        near = closed(known) if known.any() else known
-        return filled.astype(np.float32).reshape(known.shape + image.shape[2:]), near
-
-    def read(self, common: ArrayLike) -> tuple[Float32Array, BoolArray]:
-        """Read a common map at the texels, linearly.
-
-        Parameters
-        ----------
-        common
-            (N, N) or (N, N, C).
-
-        Returns
-        -------
-        values : ndarray of float32, shape (H, W) or (H, W, C)
-            The nearest pixel's where a texel lies outside the map.
-        inside : ndarray of bool, shape (H, W)
-            Texels of the surface inside the map.
-        """
-        image = np.asarray(common, np.float64)
-        at = [self.place_px[..., 1], self.place_px[..., 0]]
-        out = [
-            map_coordinates(layer, at, order=1, mode="nearest")
-            for layer in np.moveaxis(_layers(image), 2, 0)
-        ]
-        values = np.stack(out, axis=-1).astype(np.float32)
-        last = self.size - 0.5
-        inside = self.on_surface & np.all((self.place_px >= -0.5) & (self.place_px <= last), axis=2)
-        return values.reshape(self.on_surface.shape + image.shape[2:]), inside
-
-
-def _layers(image: Float64Array) -> Float64Array:
-    """Return an image (H, W) or (H, W, C) as (H, W, C)."""
-    return image if image.ndim == 3 else image[..., None]
 
 
 def find_cylinder(position_mm: ArrayLike, valid: ArrayLike) -> Cylinder:
@@ -417,43 +317,6 @@ def correspond(
             "them exchanged, or left and right (as seen in the image)?"
         )
     return Correspondence(cylinder, field)
-
-
-def chart(
-    position_mm: ArrayLike, valid: ArrayLike, correspondence: Correspondence, frame: CommonFrame
-) -> Chart:
-    """Lay a face's texels out in the common map.
-
-    Parameters
-    ----------
-    position_mm
-        (H, W, 3), rig frame.
-    valid
-        (H, W), texels that show the surface; values elsewhere mean nothing.
-    correspondence
-        Of this face.
-    frame
-        The common map.
-    """
-    position = np.asarray(position_mm, np.float64)
-    shown = np.asarray(valid, np.bool_)
-    if position.ndim != 3 or position.shape[2] != 3 or shown.shape != position.shape[:2]:
-        raise ParameterizationError(
-            f"position: got shapes {position.shape} and {shown.shape}, expected (H, W, 3), (H, W)"
-        )
-    if not shown.any():
-        raise ParameterizationError("position: no texel is valid")
-    place = np.full((*shown.shape, 2), -2.0)
-    error = np.full(shown.shape, np.nan, np.float32)
-    uv, off = correspondence.at(position[shown])
-    place[shown], error[shown] = frame.pixel(uv), off
-    tip = np.asarray(correspondence.cylinder.tip_mm)
-    reach = np.zeros(shown.shape)
-    reach[shown] = np.hypot(
-        position[shown, 0] - tip[0], position[shown, 2] - tip[2] + CYLINDER_RADIUS_MM
-    )
-    visible = shown & outermost(place, reach, shown, frame.side_mm, frame.size)
-    return Chart(frame.size, place, shown, visible, error)
 
 
 def frame_around(

@@ -10,6 +10,7 @@ from typing import Final
 
 import numpy as np
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.correspondence.common_parameterization import CommonFrame
 
@@ -71,8 +72,7 @@ def region(name: str, frame: CommonFrame) -> BoolArray:
     RegionError
         For another name.
     """
-    if name not in REGION_NAMES:
-        raise RegionError(f"region: got {name!r}, expected one of {', '.join(REGION_NAMES)}")
+    Checks(RegionError).choice("region", name, REGION_NAMES)
     grid = frame.grid_mm()
     if name == "face":
         return np.ones(grid.shape[:2], np.bool_)

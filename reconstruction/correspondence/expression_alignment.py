@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.checks import Checks
 from model.skin import SkinMap
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.correspondence import landmark_field
@@ -86,10 +87,8 @@ class Alignment:
     def __post_init__(self) -> None:
         """Refuse shapes that do not fit."""
         shape = self.valid.shape
-        if self.source_px.shape != (*shape, 2) or self.error_px.shape != shape:
-            raise AlignmentError(
-                f"source_px: got shape {self.source_px.shape}, expected {(*shape, 2)}"
-            )
+        Checks(AlignmentError).shape("source_px", self.source_px, (*shape, 2))
+        Checks(AlignmentError).shape("error_px", self.error_px, shape)
 
     def warp(
         self, values: ArrayLike, valid: ArrayLike | None = None
@@ -175,13 +174,10 @@ class Alignment:
         self, values: ArrayLike, valid: ArrayLike | None
     ) -> tuple[Float32Array, BoolArray]:
         image = np.asarray(values, np.float32)
-        if image.ndim not in (2, 3) or image.shape[:2] != self.moving_shape:
-            raise AlignmentError(
-                f"values: got shape {image.shape}, expected {self.moving_shape} or with channels"
-            )
+        check = Checks(AlignmentError).shape
+        check("values", image, self.moving_shape, (*self.moving_shape, "C"))
         good = np.ones(self.moving_shape, bool) if valid is None else np.asarray(valid, bool)
-        if good.shape != self.moving_shape:
-            raise AlignmentError(f"valid: got shape {good.shape}, expected {self.moving_shape}")
+        check("valid", good, self.moving_shape)
         return image, good & _everywhere(np.isfinite(image))
 
 
@@ -246,8 +242,7 @@ def align(
     if (landmarks_moving is None) != (landmarks_neutral is None):
         missing = "landmarks_moving" if landmarks_moving is None else "landmarks_neutral"
         raise AlignmentError(f"{missing}: got None, expected landmarks of both pictures or neither")
-    if rounds < 0:
-        raise AlignmentError(f"rounds: got {rounds}, expected 0 or more")
+    Checks(AlignmentError).within("rounds", rounds, "[0, inf)")
     second, mask_second = _structure("moving", moving, valid_moving)
     first, mask = _structure("neutral", neutral, valid_neutral)
     by: Literal["landmarks", "features"]
@@ -300,8 +295,7 @@ def _structure(name: str, picture: ArrayLike, valid: ArrayLike | None) -> tuple[
             f"{MIN_ALIGNED_SIDE_PX} x {MIN_ALIGNED_SIDE_PX} or more"
         )
     good = np.ones(image.shape[:2], bool) if valid is None else np.asarray(valid, bool)
-    if good.shape != image.shape[:2]:
-        raise AlignmentError(f"valid_{name}: got shape {good.shape}, expected {image.shape[:2]}")
+    Checks(AlignmentError).shape(f"valid_{name}", good, image.shape[:2])
     good = good & _everywhere(np.isfinite(image) & (image > 0.0))
     if not good.any():
         raise AlignmentError(f"{name}: has no valid pixel with light")

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import RBFInterpolator
 from scipy.optimize import minimize_scalar
 
+from model.checks import Checks
 from reconstruction.arrays import Float64Array
 from reconstruction.registration import RegistrationError
 
@@ -155,20 +156,11 @@ def fit(points_px: ArrayLike, moved_px: ArrayLike, *, stderr_px: float) -> Landm
     >>> field.at([[45, 45]])[0].round(2).tolist()
     [[7.5, 7.5]]
     """
-    first = np.array(points_px, np.float64)
-    second = np.array(moved_px, np.float64)
-    if first.ndim != 2 or first.shape[1:] != (2,) or first.shape != second.shape:
-        raise LandmarkFieldError(
-            f"landmarks: got shapes {first.shape} and {second.shape}, expected (K, 2) twice"
-        )
-    if len(first) < MIN_FIELD_POINTS:
-        raise LandmarkFieldError(
-            f"landmarks: got {len(first)}, expected at least {MIN_FIELD_POINTS}"
-        )
-    if not (np.isfinite(first).all() and np.isfinite(second).all()):
-        raise LandmarkFieldError("landmarks: got a place that is not finite")
-    if not (math.isfinite(stderr_px) and stderr_px > 0):
-        raise LandmarkFieldError(f"stderr_px: got {stderr_px}, expected above 0")
+    check = Checks(LandmarkFieldError)
+    first = check.numbers("landmarks", np.array(points_px, np.float64), ("K", 2))
+    second = check.numbers("landmarks", np.array(moved_px, np.float64), first.shape)
+    check.within("landmarks", len(first), f"[{MIN_FIELD_POINTS}, inf)")
+    check.within("stderr_px", stderr_px, "(0, inf)")
     noise = max(stderr_px, MIN_LANDMARK_STDERR_PX)
     middle = first.mean(axis=0)
     scale = float(np.sqrt(((first - middle) ** 2).sum(axis=1).mean()))

@@ -12,11 +12,12 @@ Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 6.
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from reconstruction.diffuse_albedo.kernels import MIN_FACTOR_COSINE, fit_envelope
 from reconstruction.lumitexels import boundary_kernels
@@ -113,66 +114,29 @@ def estimate(
     >>> found.r_d.shape, round(float(found.r_d), 4)
     ((), 0.6283)
     """
-    f = np.asarray(brdf_samples, dtype=np.float32)
-    n = np.asarray(normals, dtype=np.float32)
-    gray = f.ndim > 0 and n.shape == (*f.shape[:-1], 3)
-    f = f[..., None] if gray else f
-    if f.ndim < 2:
-        raise ValueError(
-            f"brdf_samples: got shape {f.shape}, expected (..., M, C), or (..., M) with "
-            f"normals (..., 3)"
-        )
-    lead, (samples, channels) = f.shape[:-2], f.shape[-2:]
-    if not channels:
-        raise ValueError(f"brdf_samples: got shape {f.shape}, expected at least one channel")
-    points = math.prod(lead)
-    n = np.ascontiguousarray(_spread("normals", n, (*lead, 3)))
-    f = np.ascontiguousarray(f)
-    if discard is not None and discard < 0:
-        raise ValueError(f"discard: got {discard}, expected at least 0 or None")
-    if method not in ("envelope", "stable_minimum", "minimum"):
-        raise ValueError(f"method: got {method!r}, expected envelope, stable_minimum or minimum")
-    f = f.reshape(points, samples, channels)
-    n = n.reshape(-1, 3)
-    light, view = (
-        np.ascontiguousarray(_spread(name, np.asarray(v, np.float32), (*lead, samples, 3))).reshape(
-            points, samples, 3
-        )
-        for name, v in (("light_dirs", light_dirs), ("view_dirs", view_dirs))
-    )
-    usable: BoolArray = np.asarray(np.isfinite(f))
-    if valid is not None:
-        given = np.asarray(valid, dtype=bool)
-        given = given[..., None] if given.ndim == len(lead) + 1 else given
-        usable &= _spread("valid", given, (*lead, samples, channels)).reshape(f.shape)
-    usable &= np.asarray(np.isfinite(n).all(axis=-1))[:, None, None]
-    if variance is None:
-        var = np.ones_like(f)
-    else:
-        told = np.asarray(variance, np.float32)
-        told = told[..., None] if gray and told.ndim else told
-        var = _spread("variance", told, (*lead, samples, channels))
-        var = np.ascontiguousarray(var).reshape(f.shape)
-        usable &= (var > 0.0) & np.isfinite(var)
-    shape = lead if gray else (*lead, channels)
-    if not samples:
+    if discard is not None:
+        Checks().within("discard", discard, "[0, inf)")
+    Checks().choice("method", method, ("envelope", "stable_minimum", "minimum"))
+    samples, lead, gray = _checked(brdf_samples, light_dirs, view_dirs, normals, variance, valid)
+    shape = lead if gray else (*lead, samples.f.shape[2])
+    if not samples.f.shape[1]:
         nothing = np.full(shape, np.nan)
         count = np.zeros(lead, np.int64)
         return DiffuseAlbedo(nothing, nothing.copy(), np.zeros(lead, np.bool_), count)
-    ratio, cos_l, cos_v = _ratios(f, light, view, n, usable, eta)
-    usable &= np.isfinite(ratio)
+    ratio, cos_l, cos_v = _ratios(samples, eta)
+    usable = samples.usable & np.isfinite(ratio)
     if method == "envelope":
         if discard:
             usable &= _ranks(ratio) >= discard
         start = _lower(ratio, usable)
         r_d, stderr = np.empty(start.shape), np.empty(start.shape)
-        counts = np.zeros((len(f), 2), dtype=np.int64)
+        counts = np.zeros((len(start), 2), dtype=np.int64)
         fit_envelope(
-            np.where(usable, f, np.float32(0.0)),
-            np.where(usable, var, np.float32(1.0)),
-            light,
-            view,
-            n,
+            np.where(usable, samples.f, np.float32(0.0)),
+            np.where(usable, samples.variance, np.float32(1.0)),
+            samples.light,
+            samples.view,
+            samples.normals,
             usable,
             start,
             float(eta),
@@ -196,31 +160,76 @@ def estimate(
     )
 
 
-def _spread(name: str, values: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return an array broadcast to a shape, or refuse it by its name."""
-    try:
-        return np.broadcast_to(values, shape)
-    except ValueError:
-        raise ValueError(f"{name}: got shape {values.shape}, expected {shape}") from None
+class _Samples(NamedTuple):
+    """P points, contiguous."""
+
+    f: Float32Array
+    """(P, M, C)."""
+    variance: Float32Array
+    """(P, M, C); 1 where none is known."""
+    light: Float32Array
+    """(P, M, 3)."""
+    view: Float32Array
+    """(P, M, 3)."""
+    normals: Float32Array
+    """(P, 3)."""
+    usable: BoolArray
+    """(P, M, C)."""
 
 
-def _ratios(
-    f: Float32Array,
-    light: Float32Array,
-    view: Float32Array,
-    n: Float32Array,
-    usable: BoolArray,
-    eta: float,
-) -> tuple[Float64Array, Float64Array, Float64Array]:
+def _checked(
+    brdf_samples: ArrayLike,
+    light_dirs: ArrayLike,
+    view_dirs: ArrayLike,
+    normals: ArrayLike,
+    variance: ArrayLike | None,
+    valid: ArrayLike | None,
+) -> tuple[_Samples, tuple[int, ...], bool]:
+    """Return the samples, the points' shape, and whether they have no axis of channels."""
+    f = np.asarray(brdf_samples, dtype=np.float32)
+    n = np.asarray(normals, dtype=np.float32)
+    gray = f.ndim > 0 and n.shape == (*f.shape[:-1], 3)
+    f = f[..., None] if gray else f
+    what = "brdf_samples ((..., M) with normals (..., 3), or with channels)"
+    Checks().shape(what, f, ("...", None, "C"))
+    lead, (samples, channels) = f.shape[:-2], f.shape[-2:]
+    points = math.prod(lead)
+
+    def whole(name: str, array: NDArray[Any], *axes: int) -> NDArray[Any]:
+        spread = np.ascontiguousarray(Checks().spread(name, array, (*lead, *axes)))
+        return spread.reshape(points, *axes)
+
+    f = np.ascontiguousarray(f).reshape(points, samples, channels)
+    n = whole("normals", n, 3)
+    light = whole("light_dirs", np.asarray(light_dirs, np.float32), samples, 3)
+    view = whole("view_dirs", np.asarray(view_dirs, np.float32), samples, 3)
+    usable: BoolArray = np.asarray(np.isfinite(f))
+    if valid is not None:
+        given = np.asarray(valid, dtype=bool)
+        given = given[..., None] if given.ndim == len(lead) + 1 else given
+        usable &= whole("valid", given, samples, channels)
+    usable &= np.asarray(np.isfinite(n).all(axis=-1))[:, None, None]
+    var = np.ones_like(f)
+    if variance is not None:
+        told = np.asarray(variance, np.float32)
+        told = told[..., None] if gray and told.ndim else told
+        var = whole("variance", told, samples, channels)
+        usable &= (var > 0.0) & np.isfinite(var)
+    return _Samples(f, var, light, view, n, usable), lead, gray
+
+
+def _ratios(samples: _Samples, eta: float) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return pi f / (F_t F_t), infinite where unusable, and the cosines of light and view."""
-    cosines = [np.einsum("pmc,pc->pm", v, n, dtype=np.float64) for v in (light, view)]
+    cosines = [
+        np.einsum("pmc,pc->pm", way, samples.normals, dtype=np.float64) for way in samples[2:4]
+    ]
     above = (cosines[0] >= MIN_FACTOR_COSINE) & (cosines[1] >= MIN_FACTOR_COSINE)
     above &= np.isfinite(cosines[0]) & np.isfinite(cosines[1])
     cos_light, cos_view = (np.where(above, cosine, 1.0) for cosine in cosines)
     through = boundary_kernels.transmitted(cos_light, cos_view, eta)
-    good = usable & above[..., None]
+    good = samples.usable & above[..., None]
     with np.errstate(divide="ignore", invalid="ignore"):  # nothing is let through below eta = 1
-        ratio = np.pi * np.where(good, f, 0.0) / through[..., None]
+        ratio = np.pi * np.where(good, samples.f, 0.0) / through[..., None]
     return np.where(good, ratio, np.inf), cosines[0], cosines[1]
 
 

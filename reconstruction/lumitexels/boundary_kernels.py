@@ -9,6 +9,7 @@ import math
 import numpy as np
 from numba import njit
 
+from model.checks import Checks
 from model.fresnel import ETA_SKIN
 from reconstruction.arrays import Float64Array, FloatArray
 
@@ -38,13 +39,8 @@ def transmitted(cos_light: FloatArray, cos_view: FloatArray, eta: float = ETA_SK
     >>> transmitted(np.array([1.0, 0.0]), np.array([1.0, 1.0])).round(4).tolist()
     [0.9452, 0.0]
     """
-    if np.shape(cos_light) != np.shape(cos_view):
-        raise ValueError(
-            f"cos_light, cos_view: got shapes {np.shape(cos_light)} and {np.shape(cos_view)}, "
-            "expected the same"
-        )
-    if not (math.isfinite(eta) and eta > 0.0):
-        raise ValueError(f"eta: got {eta}, expected a finite number above 0")
+    Checks().shape("cos_light", cos_light, np.shape(cos_view))
+    Checks().within("eta", eta, "(0, inf)")
     out = np.empty(np.shape(cos_light), np.float64)
     _transmitted(
         np.ascontiguousarray(cos_light).reshape(-1),

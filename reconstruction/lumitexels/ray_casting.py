@@ -5,6 +5,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 
 RAYS_PER_CALL: Final = 1 << 20
@@ -36,17 +37,9 @@ class RayCaster:
     def __init__(self, vertices_mm: ArrayLike, faces: ArrayLike) -> None:
         vertices = np.ascontiguousarray(vertices_mm, np.float32)
         triangles = np.ascontiguousarray(faces, np.int32)
-        if triangles.ndim != 2 or triangles.shape[-1] != 3 or not len(triangles):
-            raise ValueError(f"faces: got shape {triangles.shape}, expected (F, 3) with F > 0")
-        if vertices.ndim != 2 or vertices.shape[-1] != 3 or not np.isfinite(vertices).all():
-            raise ValueError(
-                f"vertices_mm: got shape {vertices.shape}, expected (V, 3) finite numbers"
-            )
-        if triangles.min() < 0 or triangles.max() >= len(vertices):
-            raise ValueError(
-                f"faces: got indices {triangles.min()} to {triangles.max()}, "
-                f"expected 0 to {len(vertices) - 1}"
-            )
+        Checks().shape("faces", triangles, ("F", 3))
+        Checks().numbers("vertices_mm", vertices, ("V", 3))
+        Checks().within("faces", triangles, f"[0, {len(vertices)})")
         from embreex import rtcore_scene
         from embreex.mesh_construction import TriangleMesh
 
@@ -107,6 +100,6 @@ class RayCaster:
 def _pair(origins: ArrayLike, directions: ArrayLike) -> tuple[FloatArray, FloatArray]:
     start = np.ascontiguousarray(origins, np.float32)
     way = np.ascontiguousarray(directions, np.float32)
-    if start.shape != way.shape or start.ndim != 2 or start.shape[1] != 3:
-        raise ValueError(f"rays: got shapes {start.shape} and {way.shape}, expected (N, 3) twice")
+    Checks().shape("rays' origins", start, (None, 3))
+    Checks().shape("rays' directions", way, start.shape)
     return start, way

@@ -10,6 +10,7 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int32Array
 from reconstruction.lumitexels.ray_casting import RayCaster
 
@@ -57,18 +58,11 @@ class Surface:
     def __post_init__(self) -> None:
         for name in ("points_mm", "normals"):
             array = np.ascontiguousarray(getattr(self, name), np.float32)
-            if array.ndim != 2 or array.shape[1] != 3 or not np.isfinite(array).all():
-                raise ValueError(f"{name}: got shape {array.shape}, expected (P, 3) finite numbers")
+            Checks().numbers(name, array, (None, 3))
             object.__setattr__(self, name, array)
-        if len(self.points_mm) != len(self.normals):
-            raise ValueError(
-                f"normals: got {len(self.normals)}, expected one a point, {len(self.points_mm)}"
-            )
+        Checks().shape("normals", self.normals, self.points_mm.shape)
         length = np.linalg.norm(self.normals, axis=1)
-        if len(length) and np.abs(length - 1).max() > 1e-3:
-            raise ValueError(
-                f"normals: got lengths {length.min():g} to {length.max():g}, expected 1"
-            )
+        Checks().within("lengths of normals", length, "[0.999, 1.001]")
 
     def __len__(self) -> int:
         """Return the number of points."""

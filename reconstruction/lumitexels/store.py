@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.lumitexels.ray_casting import RayCaster
 from reconstruction.lumitexels.samples import (
@@ -78,8 +79,7 @@ class LumitexelStore:
         self.light_count = len(lights.position_mm)
         self._cameras, self._lights, self._binning = tuple(cameras), lights, binning
         self._poses = _checked_poses(poses, len(cameras), self.light_count)
-        if binning < 1:
-            raise ValueError(f"binning: got {binning}, expected at least 1")
+        Checks().within("binning", binning, "[1, inf)")
         seen = visibility(
             surface,
             caster,
@@ -127,12 +127,9 @@ class LumitexelStore:
             Returns the camera's own gain, shape (N, 3), at camera pixels, shape (N, 2); the
             signal is divided by it.
         """
-        if signal.shape != variance.shape or signal.ndim != 3 or signal.shape[-1] != 3:
-            raise ValueError(
-                f"signal: got shapes {signal.shape} and {variance.shape}, expected (H, W, 3) twice"
-            )
-        if good is not None and good.shape != signal.shape[:2]:
-            raise ValueError(f"good: got shape {good.shape}, expected {signal.shape[:2]}")
+        Checks().shape("signal", signal, ("H", "W", 3))
+        Checks().shape("variance", variance, signal.shape)
+        Checks().shape("good", good, signal.shape[:2])
         self._kept.clear()
         points = self.surface.points_mm[self._rows[view]]
         pose = self._pose(view, light)
@@ -159,8 +156,7 @@ class LumitexelStore:
 
     def chunks(self, size: int) -> Iterator[tuple[slice, Lumitexels]]:
         """Yield the lumitexels of all points, at most `size` at a time (about 60 B a sample)."""
-        if size < 1:
-            raise ValueError(f"size: got {size}, expected at least 1")
+        Checks().within("size", size, "[1, inf)")
         for start in range(0, len(self.surface), size):
             stop = min(start + size, len(self.surface))
             yield slice(start, stop), self.chunk(start, stop)

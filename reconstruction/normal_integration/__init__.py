@@ -1,21 +1,9 @@
 """Normal integration: height from normals, with errors."""
 
-from reconstruction.normal_integration.integration import (
-    HeightMap,
-    NotConverged,
-    Settings,
-    integrate,
-    integrate_map,
-)
-from reconstruction.normal_integration.slope_fields import Perspective
-from reconstruction.normal_integration.weighted_poisson import IntegrationError
-
-__all__ = [
-    "HeightMap",
-    "IntegrationError",
-    "NotConverged",
-    "Perspective",
-    "Settings",
-    "integrate",
-    "integrate_map",
-]
+from reconstruction.normal_integration.integration import HeightMap as HeightMap
+from reconstruction.normal_integration.integration import NotConverged as NotConverged
+from reconstruction.normal_integration.integration import Settings as Settings
+from reconstruction.normal_integration.integration import integrate as integrate
+from reconstruction.normal_integration.integration import integrate_map as integrate_map
+from reconstruction.normal_integration.slope_fields import Perspective as Perspective
+from reconstruction.normal_integration.weighted_poisson import IntegrationError as IntegrationError

@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float32Array, FloatArray, Int32Array
-from reconstruction.checks import require_settings
 from reconstruction.normal_integration import slope_fields
 from reconstruction.normal_integration.integration import parts, to_height
 from reconstruction.normal_integration.slope_fields import Perspective, SlopeField
@@ -99,13 +99,9 @@ class Bilateral:
 
     def __post_init__(self) -> None:
         """Refuse settings out of range."""
-        require_settings(
-            self,
-            IntegrationError,
-            ("sharpness", 0.0 < self.sharpness < np.inf, "above 0 and finite"),
-            ("rounds", self.rounds >= 1, "at least 1"),
-            ("stop", 0.0 <= self.stop < 1.0, "in [0, 1)"),
-            ("inner", self.inner >= 1, "at least 1"),
+        check = Checks(IntegrationError)
+        check.settings(
+            self, sharpness="(0, inf)", rounds="[1, inf)", stop="[0, 1)", inner="[1, inf)"
         )
 
 
@@ -183,8 +179,7 @@ def integrate_broken(
     >>> float(np.ptp(found.height)), found.settled
     (0.0, True)
     """
-    if not 0.0 < pixel < np.inf:
-        raise IntegrationError(f"pixel: got {pixel}, expected above 0 and finite")
+    Checks(IntegrationError).within("pixel", pixel, "(0, inf)")
     chosen = settings or Bilateral()
     slopes = slope_fields.from_normals(
         normals, valid=valid, stderr_rad=stderr_rad, y_up=y_up, camera=camera

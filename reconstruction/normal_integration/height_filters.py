@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit, prange
 from scipy import fft, ndimage
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.normal_integration.slope_fields import SlopeField
 from reconstruction.normal_integration.weighted_poisson import IntegrationError
@@ -59,13 +60,10 @@ def high_pass(
     values = np.asarray(height)
     if values.dtype not in (np.float32, np.float64):
         values = values.astype(np.float64)
-    if values.ndim != 2 or values.size == 0:
-        raise IntegrationError(f"height: got shape {values.shape}, expected (H, W)")
-    if not (0.0 < cutoff < np.inf and 0.0 < pixel < np.inf):
-        raise IntegrationError(f"cutoff, pixel: got {cutoff}, {pixel}, expected above 0")
+    Checks(IntegrationError).shape("height", values, ("H", "W"))
+    Checks(IntegrationError).within("cutoff, pixel", (cutoff, pixel), "(0, inf)")
     good = np.ones(values.shape, bool) if valid is None else np.asarray(valid, bool)
-    if good.shape != values.shape:
-        raise IntegrationError(f"valid: got shape {good.shape}, expected {values.shape}")
+    Checks(IntegrationError).shape("valid", good, values.shape)
     out = np.zeros_like(values)
     sigma = SIGMA_OF_CUTOFF * cutoff / pixel
     if good.all():
@@ -194,10 +192,8 @@ def denoise_slopes(
     """
     if not slopes.scale > 0.0:
         raise IntegrationError("stderr_rad: got none, expected the noise that is to be removed")
-    if not (0.0 <= strength < np.inf and 0.0 < sigma_px <= 3.0):
-        raise IntegrationError(
-            f"strength, sigma_px: got {strength}, {sigma_px}, expected >= 0 and in (0, 3]"
-        )
+    Checks(IntegrationError).within("strength", strength, "[0, inf)")
+    Checks(IntegrationError).within("sigma_px", sigma_px, "(0, 3]")
     if strength == 0.0:
         return slopes
     reach = int(np.ceil(3.0 * sigma_px))

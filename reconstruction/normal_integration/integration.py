@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray, Int32Array
-from reconstruction.checks import require_settings
 from reconstruction.normal_integration import slope_fields
 from reconstruction.normal_integration.height_filters import denoise_slopes
 from reconstruction.normal_integration.slope_fields import Perspective, SlopeField
@@ -54,13 +54,8 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Refuse settings out of range."""
-        require_settings(
-            self,
-            IntegrationError,
-            ("tolerance", 0.0 < self.tolerance < 1.0, "in (0, 1)"),
-            ("iterations", self.iterations >= 1, "at least 1"),
-            ("order", self.order in (2, 4), "2 or 4"),
-        )
+        Checks(IntegrationError).settings(self, tolerance="(0, 1)", iterations="[1, inf)")
+        Checks(IntegrationError).choice("Settings.order", self.order, (2, 4))
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,10 +188,7 @@ def _for_each(
     given = np.asarray(values)
     if not given.ndim:
         return lambda at: given
-    try:
-        spread = np.broadcast_to(given, shape)
-    except ValueError:
-        raise IntegrationError(f"{name}: got shape {given.shape}, expected {shape}") from None
+    spread = Checks(IntegrationError).spread(name, given, shape)
     return lambda at: spread[at]
 
 
@@ -228,8 +220,7 @@ def integrate_map(
     IntegrationError
         As of `integrate`; equations that were not solved are told by `convergence` instead.
     """
-    if not 0.0 < pixel < np.inf:
-        raise IntegrationError(f"pixel: got {pixel}, expected above 0 and finite")
+    Checks(IntegrationError).within("pixel", pixel, "(0, inf)")
     chosen = settings or Settings()
     slopes = slope_fields.from_normals(
         normals, valid=valid, stderr_rad=stderr_rad, y_up=y_up, camera=camera
@@ -241,8 +232,7 @@ def integrate_map(
         raise IntegrationError(
             'method: got "dct" with a mask or standard errors, expected "multigrid"'
         )
-    if method not in ("auto", "multigrid", "dct"):
-        raise IntegrationError(f"method: got {method!r}, expected auto, multigrid or dct")
+    Checks(IntegrationError).choice("method", method, ("auto", "multigrid", "dct"))
     if plain and method != "multigrid":
         relief, convergence = _by_cosines(slopes, chosen), Convergence(0, 0.0, True)
     else:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft, ndimage
 
+from model.checks import Checks
 from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 
@@ -49,10 +50,7 @@ class Aperture:
 
     def __post_init__(self) -> None:
         """Refuse what is no lens."""
-        for name in ("cutoff_um", "pixel_um"):
-            value = getattr(self, name)
-            if not 0.0 < value < math.inf:
-                raise RestorationError(f"Aperture.{name}: got {value}, expected above 0")
+        Checks(RestorationError).settings(self, cutoff_um="(0, inf)", pixel_um="(0, inf)")
 
     @staticmethod
     def of(

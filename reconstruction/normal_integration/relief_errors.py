@@ -75,12 +75,7 @@ def of_normals(normals: FloatArray, stderr: Float32Array, valid: BoolArray) -> F
 
 
 def expected_rms(
-    shape: tuple[int, int],
-    slope_stderr: float,
-    *,
-    pixel: float = 1.0,
-    cutoff: float | None = None,
-    order: int = 4,
+    shape: tuple[int, int], slope_stderr: float, *, pixel: float = 1.0, cutoff: float | None = None
 ) -> float:
     """Return the height's RMS error over a rectangle whose slopes have white noise.
 
@@ -96,8 +91,6 @@ def expected_rms(
     pixel : float
     cutoff : float, optional
         Of `high_pass`, same unit as `pixel`.
-    order : int
-        Of the quadrature, see `normal_integration.Settings`.
 
     Returns
     -------
@@ -116,7 +109,7 @@ def expected_rms(
     squared = np.zeros(shape)
     for axis, theta in enumerate(waves):
         half = 0.5 * theta
-        mean = np.cos(half) if order == 2 else (13 * np.cos(half) - np.cos(3 * half)) / 12
+        mean = (13 * np.cos(half) - np.cos(3 * half)) / 12
         along = (-1, 1) if axis == 0 else (1, -1)
         laplacian += (4 * np.sin(half) ** 2).reshape(along)
         power += ((2 * np.sin(half) * mean) ** 2).reshape(along)

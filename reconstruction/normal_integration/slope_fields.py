@@ -12,8 +12,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from reconstruction.checks import require_settings
 from reconstruction.normal_integration.weighted_poisson import IntegrationError
 from reconstruction.normal_maps import NormalMaps
 
@@ -42,13 +42,8 @@ class Perspective:
 
     def __post_init__(self) -> None:
         """Refuse what is no camera."""
-        center = len(self.center_px) == 2 and bool(np.isfinite(self.center_px).all())
-        require_settings(
-            self,
-            IntegrationError,
-            ("focal_px", 0.0 < self.focal_px < np.inf, "above 0 and finite"),
-            ("center_px", center, "two finite numbers"),
-        )
+        Checks(IntegrationError).settings(self, focal_px="(0, inf)")
+        Checks(IntegrationError).numbers("Perspective.center_px", self.center_px, (2,))
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,17 +131,12 @@ def from_normals(
             stderr_rad = normals.stderr_rad
     else:
         n = np.asarray(normals)
-    if n.ndim != 3 or n.shape[2] != 3 or n.size == 0:
-        raise IntegrationError(f"normals: got shape {n.shape}, expected (H, W, 3)")
+    Checks(IntegrationError).shape("normals", n, ("H", "W", 3))
     if n.dtype not in (np.float32, np.float64):
         n = n.astype(np.float64)
     shape = n.shape[:2]
-    if valid is None:
-        good = np.ones(shape, bool)
-    else:
-        if np.shape(valid) != shape:
-            raise IntegrationError(f"valid: got shape {np.shape(valid)}, expected {shape}")
-        good = np.array(valid, bool)
+    Checks(IntegrationError).shape("valid", valid, shape)
+    good = np.ones(shape, bool) if valid is None else np.array(valid, bool)
     relative, scale = _relative_variance(stderr_rad, good)
     small = (1, 1) if relative is None else shape
     gx, gy = np.empty(shape), np.empty(shape)
@@ -181,13 +171,9 @@ def _relative_variance(
     if stderr_rad is None:
         return None, 0.0
     sigma = np.asarray(stderr_rad, np.float64)
-    if sigma.shape not in ((), good.shape):
-        raise IntegrationError(
-            f"stderr_rad: got shape {sigma.shape}, expected a number or {good.shape}"
-        )
+    Checks(IntegrationError).shape("stderr_rad", sigma, (), good.shape)
     some = sigma[good] if sigma.ndim else sigma.reshape(1)
-    if np.isnan(some).any() or (some < 0.0).any():
-        raise IntegrationError("stderr_rad: got NaN or below 0 at valid pixels, expected >= 0")
+    Checks(IntegrationError).within("stderr_rad at valid pixels", some, "[0, inf]")
     positive = some[(some > 0.0) & (some < np.inf)]
     if positive.size == 0:  # nothing told apart
         return None, 0.0

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, FloatArray
-from reconstruction.checks import require_settings
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
 from reconstruction.photometric_stereo import kernels
 from reconstruction.photometric_stereo.solver_kernels import Settings
@@ -66,16 +66,9 @@ class Robustness:
 
     def __post_init__(self) -> None:
         """Refuse settings out of range."""
-        require_settings(
-            self,
-            PhotometricStereoError,
-            ("l1_iterations", self.l1_iterations >= 0, "at least 0"),
-            ("iterations", self.iterations >= 1, "at least 1"),
-            ("shadow", 0.0 <= self.shadow < 1.0, "in [0, 1)"),
-            ("grazing", 0.0 <= self.grazing < 1.0, "in [0, 1)"),
-            ("few", self.few >= 0, "at least 0"),
-            ("tuning", 1.0 <= self.tuning < np.inf, "1 or more"),
-        )
+        check = Checks(PhotometricStereoError)
+        check.settings(self, l1_iterations="[0, inf)", iterations="[1, inf)", few="[0, inf)")
+        check.settings(self, shadow="[0, 1)", grazing="[0, 1)", tuning="[1, inf)")
 
     def settings(self, kind: Any) -> Settings:
         """Return the limits of a fit in the data's type."""
@@ -185,15 +178,11 @@ def estimate_normals(
     ([0.0, 0.0, 1.0], 0.5)
     """
     samples = np.asarray(intensity_nhw)
-    if samples.ndim < 2 or samples.dtype.kind not in "fui":
-        raise PhotometricStereoError(
-            f"intensity: got {samples.dtype} of shape {samples.shape}, expected numbers (N, ...)"
-        )
+    check = Checks(PhotometricStereoError)
+    check.choice("intensity", samples.dtype.kind, "fui")
+    check.within("axes of intensity (N, ...)", samples.ndim, "[2, inf)")
     lights, shape = samples.shape[0], samples.shape[1:]
-    if lights < 3:
-        raise PhotometricStereoError(
-            f"intensity: got {lights} light(s), expected at least 3 to tell a normal"
-        )
+    check.within("lights of intensity", lights, "[3, inf)")
     kind: Any = np.float64 if samples.dtype == np.float64 else np.float32
     lit = _geometry(light_directions_n3, light_positions_mm, points_mm, lights, shape)
     strength = _strength(light_intensity, lit, lights, shape)
@@ -209,18 +198,17 @@ def estimate_normals(
     shared, positions, points = (
         array.astype(kind, order="C") for array in (lit.shared, lit.positions, lit.points)
     )
-    fit_points = kernels.fit_points(kind)
+    fit_points, near = kernels.fit_points(kind), lit.way == kernels.NEAR
 
     def solve(span: slice) -> None:
         each = lit.per_point[:, span] if lit.way == kernels.PER_POINT else lit.per_point
         fit_points(
-            *(_of_kind(array[:, span], kind) for array in (flat, noise)),
-            mask[:, span],
-            _of_kind(strength[:, span], kind),
-            shared,
-            _of_kind(each, kind),
-            positions,
-            points[span] if lit.way == kernels.NEAR else points,
+            (
+                *(_of_kind(array[:, span], kind) for array in (flat, noise)),
+                mask[:, span],
+                _of_kind(strength[:, span], kind),
+            ),
+            (shared, _of_kind(each, kind), positions, points[span] if near else points),
             lit.way,
             robust,
             variance is not None,
@@ -278,26 +266,18 @@ def _geometry(
             "light_positions_mm, points_mm: got one of the two, expected both or neither"
         )
     if positions is not None and points is not None:
-        where = np.asarray(positions, np.float64)
+        check = Checks(PhotometricStereoError)
+        where = check.numbers("light_positions_mm", positions, (lights, 3))
         surface = np.asarray(points, np.float64)
-        if where.shape != (lights, 3) or not np.isfinite(where).all():
-            raise PhotometricStereoError(
-                f"light_positions_mm: got shape {where.shape}, expected finite ({lights}, 3)"
-            )
-        if surface.shape != (*shape, 3):
-            raise PhotometricStereoError(
-                f"points_mm: got shape {surface.shape}, expected {(*shape, 3)}"
-            )
+        Checks(PhotometricStereoError).shape("points_mm", surface, (*shape, 3))
         return _Geometry(kernels.NEAR, positions=where, points=surface.reshape(-1, 3))
     towards = np.asarray(directions)
     if towards.shape == (lights, *shape, 3):
         return _Geometry(kernels.PER_POINT, per_point=towards.reshape(lights, -1, 3))
     towards = towards.astype(np.float64)
-    if towards.shape != (lights, 3):
-        raise PhotometricStereoError(
-            f"light_directions: got shape {towards.shape}, expected ({lights}, 3) or"
-            f" {(lights, *shape, 3)}"
-        )
+    Checks(PhotometricStereoError).shape(
+        "light_directions", towards, (lights, 3), (lights, *shape, 3)
+    )
     length = np.linalg.norm(towards, axis=1)
     wrong = np.flatnonzero(~np.isfinite(length) | (length == 0))
     if wrong.size:
@@ -369,11 +349,7 @@ def _usable(valid: BoolArray | None, lights: int, shape: tuple[int, ...]) -> Boo
     if valid is None:
         return np.broadcast_to(np.True_, (lights, count))
     mask = np.asarray(valid)
-    if mask.dtype != np.bool_ or mask.shape not in ((lights, *shape), shape):
-        raise PhotometricStereoError(
-            f"valid: got {mask.dtype} of shape {mask.shape}, expected bool {(lights, *shape)} or"
-            f" {shape}"
-        )
+    Checks(PhotometricStereoError).mask("valid", mask, (lights, *shape), shape)
     if mask.shape == shape:
         return np.broadcast_to(mask.reshape(1, count), (lights, count))
     return mask.reshape(lights, count)

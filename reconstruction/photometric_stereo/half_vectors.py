@@ -12,8 +12,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, FloatArray, Int32Array
-from reconstruction.checks import require_shapes
 from reconstruction.tiles import map_on_threads
 
 TILE_POINTS = 2048
@@ -101,24 +101,20 @@ def estimate(
     ([[0.0, 0.0, 1.0]], [2])
     """
     samples = np.asarray(values)
-    if samples.ndim != 2 or samples.dtype.kind != "f":
-        raise HalfVectorError(
-            f"values: got {samples.dtype} of shape {samples.shape}, expected floats (P, M)"
-        )
+    check = Checks(HalfVectorError)
+    check.choice("values", samples.dtype.kind, "f")
+    check.within("axes of values (P, M)", samples.ndim, "[2, 2]")
     kind: Any = np.float64 if samples.dtype == np.float64 else np.float32  # of the machine's order
     samples = samples.astype(kind, copy=False)
     points, count = samples.shape
     cameras = np.asarray(view)
     mask = np.broadcast_to(np.True_, samples.shape) if valid is None else np.asarray(valid)
-    require_shapes(
-        HalfVectorError,
-        ("light_dir", light_dir, (points, count, 3)),
-        ("view_dir", view_dir, (points, count, 3)),
-        ("view", cameras, (count,)),
-        ("valid", mask, (points, count)),
-    )
-    if cameras.dtype.kind not in "iu" or (count and int(cameras.min()) < 0):
-        raise HalfVectorError("view: expected whole numbers, 0 or more")
+    check.shape("light_dir", light_dir, (points, count, 3))
+    check.shape("view_dir", view_dir, (points, count, 3))
+    check.shape("view", cameras, (count,))
+    check.shape("valid", mask, (points, count))
+    check.choice("view (whole numbers)", cameras.dtype.kind, "iu")
+    check.within("view", cameras, "[0, inf)")
     cameras = cameras.astype(np.int64)
     normals = np.zeros((points, 3), samples.dtype)
     stderr = np.full(points, np.pi, samples.dtype)

@@ -306,44 +306,80 @@ def _fit_point(  # type: ignore[no-untyped-def]
     return _finish(x, y, z, v, s, e, m, p0, p1, p2, one, zero, known, False, settings, sums, out)
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def _gather(samples, start, size, known, v, s):  # type: ignore[no-untyped-def]
+    """Write samples and strengths of a block of points in units of noise; 0 what is not usable."""
+    intensity, variance, usable, strength = samples
+    kind = v.dtype.type
+    zero, one = kind(0.0), kind(1.0)
+    for k in range(intensity.shape[0]):
+        for p in range(size):
+            value = kind(intensity[k, start + p])
+            power = kind(strength[k, start + p])
+            good = usable[k, start + p] and value - value == zero
+            good = good and power > zero and power - power == zero
+            weight = one
+            if known:
+                noise = kind(variance[k, start + p])
+                good = good and noise > zero and noise - noise == zero
+                if good:
+                    weight = one / math.sqrt(noise)
+            v[p, k] = value * weight if good else zero
+            s[p, k] = power * weight if good else zero
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _direct(geometry, way, lights, place, v, s, x, y, z):  # type: ignore[no-untyped-def]
+    """Write one point's light vectors, as long as their strength; drop lights without one."""
+    directions, per_point, positions, points = geometry
+    kind = v.dtype.type
+    zero = kind(0.0)
+    for k in range(lights):
+        if way == SHARED:
+            x[k] = directions[k, 0] * s[k]
+            y[k] = directions[k, 1] * s[k]
+            z[k] = directions[k, 2] * s[k]
+            continue
+        if way == PER_POINT:
+            x[k] = kind(per_point[k, place, 0])
+            y[k] = kind(per_point[k, place, 1])
+            z[k] = kind(per_point[k, place, 2])
+            length = x[k] * x[k] + y[k] * y[k] + z[k] * z[k]
+            there = length > kind(0.25) and length < kind(4.0)
+        else:
+            x[k] = positions[k, 0] - points[place, 0]
+            y[k] = positions[k, 1] - points[place, 1]
+            z[k] = positions[k, 2] - points[place, 2]
+            length = x[k] * x[k] + y[k] * y[k] + z[k] * z[k]
+            there = length > zero and length - length == zero
+            if there:
+                s[k] = s[k] / length
+        if there:
+            scale = s[k] / kind(math.sqrt(length))
+            x[k], y[k], z[k] = x[k] * scale, y[k] * scale, z[k] * scale
+        else:  # no direction: an occluded light
+            x[k], y[k], z[k], v[k], s[k] = zero, zero, zero, zero, zero
+
+
 def _fit_points(  # type: ignore[no-untyped-def]
-    intensity,
-    variance,
-    usable,
-    strength,
-    directions,
-    per_point,
-    positions,
-    points,
-    way,
-    robust,
-    known,
-    l1_steps,
-    steps,
-    settings,
-    out,
-    valid,
+    samples, geometry, way, robust, known, l1_steps, steps, settings, out, valid
 ):
-    """Fit every point of a tile.
+    """Fit many points.
 
     Parameters
     ----------
-    intensity, variance, usable, strength
-        (N, P); any layout, broadcast views too.
-    directions
-        (N, 3) unit vectors; read when ``way`` is `SHARED`.
-    per_point
-        (N, P, 3) unit vectors; read when ``way`` is `PER_POINT`.
-    positions, points
-        (N, 3) and (P, 3) mm; read when ``way`` is `NEAR`, where strength falls as 1 / d^2.
+    samples
+        Intensity, variance, usable and strength, (N, P); any layout, broadcast views too.
+    geometry
+        Directions (N, 3), unit vectors, read when ``way`` is `SHARED`; directions (N, P, 3), unit
+        vectors, read when it is `PER_POINT`; positions (N, 3) and points (P, 3), mm, read when it
+        is `NEAR`, where strength falls as 1 / d^2.
     settings
         Numbers in the data's type.
     out, valid
         (P, RESULT_ROWS) and (P,), written.
     """
-    kind = out.dtype.type
-    lights, count = intensity.shape
-    zero, one = kind(0.0), kind(1.0)
+    lights, count = samples[0].shape
     lanes = (lights + LIGHT_LANES - 1) // LIGHT_LANES * LIGHT_LANES
     v = np.zeros((BLOCK_POINTS, lanes), out.dtype)
     s = np.zeros((BLOCK_POINTS, lanes), out.dtype)
@@ -352,52 +388,11 @@ def _fit_points(  # type: ignore[no-untyped-def]
     sums = np.empty(25, np.float64)
     for start in range(0, count, BLOCK_POINTS):
         size = min(BLOCK_POINTS, count - start)
-        for k in range(lights):
-            for p in range(size):
-                value = kind(intensity[k, start + p])
-                power = kind(strength[k, start + p])
-                good = usable[k, start + p] and value - value == zero
-                good = good and power > zero and power - power == zero
-                weight = one
-                if known:
-                    noise = kind(variance[k, start + p])
-                    good = good and noise > zero and noise - noise == zero
-                    if good:
-                        weight = one / math.sqrt(noise)
-                v[p, k] = value * weight if good else zero
-                s[p, k] = power * weight if good else zero
+        _gather(samples, start, size, known, v, s)
         for p in range(size):
             place = start + p
-            if way == SHARED:
-                for k in range(lights):
-                    x[k] = directions[k, 0] * s[p, k]
-                    y[k] = directions[k, 1] * s[p, k]
-                    z[k] = directions[k, 2] * s[p, k]
-            elif way == PER_POINT:
-                for k in range(lights):
-                    x[k] = kind(per_point[k, place, 0])
-                    y[k] = kind(per_point[k, place, 1])
-                    z[k] = kind(per_point[k, place, 2])
-                    length = x[k] * x[k] + y[k] * y[k] + z[k] * z[k]
-                    if length > kind(0.25) and length < kind(4.0):
-                        scale = s[p, k] / kind(math.sqrt(length))
-                        x[k], y[k], z[k] = x[k] * scale, y[k] * scale, z[k] * scale
-                    else:  # no direction: an occluded light
-                        x[k], y[k], z[k], v[p, k], s[p, k] = zero, zero, zero, zero, zero
-            else:
-                for k in range(lights):
-                    dx = positions[k, 0] - points[place, 0]
-                    dy = positions[k, 1] - points[place, 1]
-                    dz = positions[k, 2] - points[place, 2]
-                    d2 = dx * dx + dy * dy + dz * dz
-                    if d2 > zero and d2 - d2 == zero:
-                        s[p, k] = s[p, k] / d2
-                        scale = s[p, k] / kind(math.sqrt(d2))
-                        x[k], y[k], z[k] = dx * scale, dy * scale, dz * scale
-                    else:
-                        x[k], y[k], z[k], v[p, k], s[p, k] = zero, zero, zero, zero, zero
-            for row in range(RESULT_ROWS):
-                out[place, row] = zero
+            _direct(geometry, way, lights, place, v[p], s[p], x, y, z)
+            out[place] = out.dtype.type(0.0)
             valid[place] = _fit_point(
                 x,
                 y,
@@ -425,22 +420,9 @@ def fit_points(kind: type[np.floating]) -> Any:
     def given(dtype: Any, axes: int) -> Any:
         return types.Array(dtype, axes, "A", readonly=True)
 
-    signature = void(
-        given(real, 2),
-        given(real, 2),
-        given(boolean, 2),
-        given(real, 2),
-        real[:, ::1],
-        given(real, 3),
-        real[:, ::1],
-        given(real, 2),
-        int64,
-        boolean,
-        boolean,
-        int64,
-        int64,
-        types.NamedUniTuple(real, len(Settings._fields), Settings),
-        real[:, ::1],
-        boolean[::1],
-    )
+    samples = types.Tuple([given(real, 2), given(real, 2), given(boolean, 2), given(real, 2)])
+    geometry = types.Tuple([real[:, ::1], given(real, 3), real[:, ::1], given(real, 2)])
+    limits = types.NamedUniTuple(real, len(Settings._fields), Settings)
+    counts = (int64, boolean, boolean, int64, int64)
+    signature = void(samples, geometry, *counts, limits, real[:, ::1], boolean[::1])
     return njit(signature, cache=True, nogil=True, error_model="numpy")(_fit_points)

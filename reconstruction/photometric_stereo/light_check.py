@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.checks import Checks
 from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.normal_maps import PhotometricStereoError
@@ -89,10 +90,7 @@ def check(
     stack = np.asarray(intensity)
     lights = stack.shape[0]
     directions = np.asarray(light_directions, np.float64)
-    if directions.shape != (lights, 3):
-        raise PhotometricStereoError(
-            f"light_directions: got shape {directions.shape}, expected ({lights}, 3)"
-        )
+    Checks(PhotometricStereoError).shape("light_directions", directions, (lights, 3))
     samples, usable = _chosen(stack, valid, rng)
     # a light from the side leaves most points dark, a dead one all of them
     top = np.array(

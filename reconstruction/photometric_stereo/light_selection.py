@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.checks import Checks
 from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array
 
@@ -59,22 +60,19 @@ class Information:
 
     def __post_init__(self) -> None:
         """Check shapes and values."""
-        points, lights = self.weight.shape if self.weight.ndim == 2 else (0, 0)
+        Checks(SelectionError).shape("weight", self.weight, ("P", "L"))
+        points, lights = self.weight.shape
         for name, shape in (
             ("tilt", (points, lights, 2)),
             ("reaches", (points, lights)),
             ("importance", (points,)),
             ("systematic_rad", (points,)),
         ):
-            if getattr(self, name).shape != shape:
-                raise SelectionError(f"{name}: got {getattr(self, name).shape}, expected {shape}")
-        if not points or not lights:
-            raise SelectionError(f"weight: got shape {self.weight.shape}, expected (P, L)")
-        for name in ("tilt", "weight", "importance", "systematic_rad"):
-            if not np.isfinite(getattr(self, name)).all():
-                raise SelectionError(f"{name}: got NaN or infinity, expected finite values")
-        if (self.weight < 0).any() or (self.importance < 0).any():
-            raise SelectionError("weight, importance: got a negative value, expected 0 or more")
+            Checks(SelectionError).shape(name, getattr(self, name), shape)
+        for name in ("tilt", "systematic_rad"):
+            Checks(SelectionError).within(name, getattr(self, name))
+        for name in ("weight", "importance"):
+            Checks(SelectionError).within(name, getattr(self, name), "[0, inf)")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,8 +225,7 @@ def select(
         `reached` says whether what is wanted is predicted; if not, the selection holds the `most`
         best lights.
     """
-    if least < 3:
-        raise SelectionError(f"least: got {least}, expected at least 3 lights a point")
+    Checks(SelectionError).within("least", least, "[3, inf)")
     lights = found.weight.shape[1]
     most = lights if most is None else min(most, lights)
     chosen = list(fixed)

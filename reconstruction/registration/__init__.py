@@ -1,11 +1,9 @@
 """Registration of images: tracks, dense flow, strain and head motion."""
 
+from reconstruction.registration.tracking import RegistrationError as RegistrationError
+from reconstruction.registration.tracking import Tracks as Tracks
 from reconstruction.registration.tracking import (
-    RegistrationError,
-    Tracks,
-    normalize_local_contrast,
-    textured,
-    track,
+    normalize_local_contrast as normalize_local_contrast,
 )
-
-__all__ = ["RegistrationError", "Tracks", "normalize_local_contrast", "textured", "track"]
+from reconstruction.registration.tracking import textured as textured
+from reconstruction.registration.tracking import track as track

@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 from reconstruction.registration import tracking as registration
 
@@ -73,10 +74,6 @@ class HeadMotion:
         Enough tracks, and the face moved as a whole.
     residual_px : ndarray, shape (T,)
         Scale of what the rigid motion leaves of the tracks.
-    nonrigid : ndarray, shape (T,)
-        Share of the tracks that do not move with the head.
-    worst_part_px : ndarray, shape (T,)
-        Largest median residual of a part of the face, 15 mm across, seen by three tracks or more.
     tracks : ndarray of int, shape (T,)
     """
 
@@ -86,8 +83,6 @@ class HeadMotion:
     stderr: Float64Array
     usable: BoolArray
     residual_px: Float64Array
-    nonrigid: Float64Array
-    worst_part_px: Float64Array
     tracks: NDArray[np.intp]
 
     def at(self, times_s: ArrayLike) -> tuple[Float64Array, Float64Array]:
@@ -247,19 +242,14 @@ def _checked(
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     points, outward = np.asarray(points_mm, np.float64), np.asarray(normals, np.float64)
     times = np.asarray(times_s, np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or outward.shape != points.shape:
-        raise HeadMotionError(
-            f"points_mm, normals: got shapes {points.shape} and {outward.shape}, expected (P, 3)"
-        )
-    if times.shape != (len(frames),) or (np.diff(times) <= 0).any():
-        raise HeadMotionError(
-            f"times_s: got shape {times.shape} for {len(frames)} frames, expected one rising time"
-            " each"
-        )
+    check = Checks(HeadMotionError)
+    check.shape("points_mm", points, (None, 3))
+    check.shape("normals", outward, points.shape)
+    check.shape("times_s", times, (len(frames),))
+    check.within("steps of times_s", np.diff(times), "(0, inf)")
     if any(len(pictures) != len(cameras) for pictures in frames) or not len(cameras):
         raise HeadMotionError(f"frames: expected one picture of each of {len(cameras)} cameras")
-    if not 0 <= reference < len(frames):
-        raise HeadMotionError(f"reference: got {reference}, expected 0 to {len(frames) - 1}")
+    check.within("reference", reference, f"[0, {len(frames)})")
     good = np.isfinite(points).all(axis=1) & np.isfinite(outward).all(axis=1)
     return points[good], outward[good], times
 
@@ -433,8 +423,6 @@ def _judged(
         stderr=np.array([f.stderr for f in found]),
         usable=usable,
         residual_px=scales,
-        nonrigid=share,
-        worst_part_px=worst,
         tracks=np.count_nonzero(known, axis=1),
     )
 

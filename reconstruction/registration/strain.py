@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 from reconstruction.registration.affine_fit import fit_affine
 from reconstruction.registration.tracking import (
@@ -28,6 +29,7 @@ MIN_STRAIN_SIDE_PX = 64
 MIN_TOP_SIDE_PX = 48
 """Shortest side of the pyramid's top."""
 STRAIN_WINDOW_PX = 25
+MAX_WINDOWS = 600
 MIN_WINDOWS = 12
 """Fewer windows tell nothing of their own scatter: six numbers are fitted to them."""
 WINDOW_OUTLIER_SIGMAS = 4.0
@@ -134,10 +136,8 @@ def measure_strain(
     second: FloatArray,
     *,
     start: Float64Array | None = None,
-    start_shift_px: Float64Array | None = None,
     valid: BoolArray | None = None,
     valid_second: BoolArray | None = None,
-    count: int = 600,
 ) -> Strain:
     """Measure the affine deformation that took the skin of one picture to that of another.
 
@@ -150,12 +150,8 @@ def measure_strain(
         Deformation gradient to begin with, as from the state before or from the caliper's reading;
         by default the identity, and where that leads nowhere a grid of stretches. It decides where
         the search begins, not the result.
-    start_shift_px : ndarray, shape (2,), optional
-        Shift to begin with, px, +y up; by default the best one by phase correlation.
     valid, valid_second : ndarray of bool, shape (H, W), optional
         What is skin in each picture.
-    count : int
-        Most windows to follow.
 
     Returns
     -------
@@ -166,16 +162,11 @@ def measure_strain(
     RegistrationError
         When pictures differ in shape or are too small.
     """
-    if np.ndim(first) != 2 or np.shape(first) != np.shape(second):
-        raise RegistrationError(
-            f"second: got shape {np.shape(second)}, expected that of first, {np.shape(first)}"
-        )
+    Checks(RegistrationError).shape("first", first, ("H", "W"))
+    Checks(RegistrationError).shape("second", second, np.shape(first))
     height, width = np.shape(first)
-    if min(height, width) < MIN_STRAIN_SIDE_PX:
-        raise RegistrationError(
-            f"first: got {width} x {height} px, expected "
-            f"{MIN_STRAIN_SIDE_PX} x {MIN_STRAIN_SIDE_PX} or more"
-        )
+    least = f"[{MIN_STRAIN_SIDE_PX}, inf)"
+    Checks(RegistrationError).within("sides of first, px", (height, width), least)
     shape = (height, width)
     one = normalize_local_contrast(_filled(first, valid))
     two = normalize_local_contrast(_filled(second, valid_second))
@@ -184,12 +175,9 @@ def measure_strain(
     guesses = [np.eye(2), *STRAIN_GUESSES] if start is None else [np.asarray(start, np.float64)]
     for gradient in guesses:
         affine = _to_pixels(gradient, np.zeros(2), shape)
-        if start_shift_px is not None:
-            affine = _to_pixels(gradient, np.asarray(start_shift_px, np.float64), shape)
-        else:
-            affine[:, 2] += _phase_shift(one, two, affine, mask)
+        affine[:, 2] += _phase_shift(one, two, affine, mask)
         affine = _pyramid(one, two, affine, mask)
-        found = _by_windows(one, two, affine, mask, other, count)
+        found = _by_windows(one, two, affine, mask, other)
         if found.valid:
             break
     return found
@@ -275,12 +263,7 @@ def _pyramid(
 
 
 def _by_windows(
-    one: UInt8Array,
-    two: UInt8Array,
-    affine: Float64Array,
-    mask: BoolArray,
-    other: BoolArray,
-    count: int,
+    one: UInt8Array, two: UInt8Array, affine: Float64Array, mask: BoolArray, other: BoolArray
 ) -> Strain:
     """Follow windows of the first picture into the second, warped back, and fit all of them."""
     shape = one.shape[0], one.shape[1]
@@ -289,9 +272,8 @@ def _by_windows(
     window = np.ones((STRAIN_WINDOW_PX, STRAIN_WINDOW_PX), np.uint8)
     eroded = cv2.erode(mask.astype(np.uint8), window)
     candidates = candidates[eroded[candidates[:, 1].astype(int), candidates[:, 0].astype(int)] > 0]
-    chosen = textured(
-        one, candidates, count=count, cell_px=STRAIN_WINDOW_PX, margin_px=STRAIN_WINDOW_PX // 2 + 1
-    )
+    cell, margin = STRAIN_WINDOW_PX, STRAIN_WINDOW_PX // 2 + 1
+    chosen = textured(one, candidates, count=MAX_WINDOWS, cell_px=cell, margin_px=margin)
     start = candidates[chosen]
     for number in range(N_STRAIN_ROUNDS):
         back = _warped_back(two, affine, cv2.INTER_CUBIC)

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 
 
@@ -14,6 +15,9 @@ class RegistrationError(ValueError):
     """Images or points that cannot be registered."""
 
 
+CONTRAST_SIGMA_PX = 8.0
+MAX_BACK_PX = 0.3
+"""Farthest a point may end from where it began after the way back."""
 MIN_PEAK = 1e-12
 """Brightest value below which, or above one over which, a picture's unit is not kept: local spreads
 would fall below the floor that stands for no texture at all, or overflow."""
@@ -35,7 +39,7 @@ class Tracks:
     valid: BoolArray
 
 
-def normalize_local_contrast(image: FloatArray, *, sigma_px: float = 8.0) -> UInt8Array:
+def normalize_local_contrast(image: FloatArray) -> UInt8Array:
     """Return the local contrast of an image as 8-bit values: mean and brightness of light are gone.
 
     Parameters
@@ -55,19 +59,17 @@ def normalize_local_contrast(image: FloatArray, *, sigma_px: float = 8.0) -> UIn
     RegistrationError
         When `image` is no (H, W) of at least 16 x 16.
     """
-    if np.ndim(image) != 2 or min(np.shape(image)) < 16:
-        raise RegistrationError(
-            f"image: got shape {np.shape(image)}, expected (H, W), 16 x 16 or more"
-        )
+    Checks(RegistrationError).shape("image", image, ("H", "W"))
+    Checks(RegistrationError).within("sides of image, px", np.shape(image), "[16, inf)")
     known = np.isfinite(image)
     values = np.maximum(np.where(known, image, 0.0), 0.0)
     top = float(values.max())
     if top > 0.0 and not MIN_PEAK < top < 1.0 / MIN_PEAK:
         values = values / top  # squares in single precision hold no more
     values = np.sqrt(values).astype(np.float32)
-    mean = cv2.GaussianBlur(values, (0, 0), sigma_px)
+    mean = cv2.GaussianBlur(values, (0, 0), CONTRAST_SIGMA_PX)
     rest = values - mean
-    spread = np.sqrt(cv2.GaussianBlur(rest * rest, (0, 0), 2 * sigma_px))
+    spread = np.sqrt(cv2.GaussianBlur(rest * rest, (0, 0), 2 * CONTRAST_SIGMA_PX))
     floor = 1e-2 * float(spread.max(initial=0.0)) + 1e-12
     return np.clip(np.rint(128 + 32 * rest / np.maximum(spread, floor)), 0, 255).astype(np.uint8)
 
@@ -120,7 +122,6 @@ def track(
     *,
     window_px: int = 17,
     levels: int = 3,
-    most_back_px: float = 0.3,
 ) -> Tracks:
     """Follow points from one image to another by pyramidal Lucas-Kanade, forth and back.
 
@@ -134,15 +135,12 @@ def track(
         Side of the window, px.
     levels : int
         Levels of the pyramid above the image.
-    most_back_px : float
-        Farthest a point may end from where it began after the way back.
 
     Returns
     -------
     Tracks
     """
-    if first.shape != second.shape:
-        raise RegistrationError(f"images: got shapes {first.shape} and {second.shape}")
+    Checks(RegistrationError).shape("second", second, first.shape)
     start: Any = np.ascontiguousarray(points_px, np.float32).reshape(-1, 1, 2)
     if not len(start):
         return Tracks(np.zeros((0, 2)), np.zeros(0, bool))
@@ -159,5 +157,5 @@ def track(
     there = there.reshape(-1, 2).astype(np.float64)
     height, width = first.shape
     inside = (there >= 0).all(axis=1) & (there <= [width - 1, height - 1]).all(axis=1)
-    good = (found.reshape(-1) == 1) & (returned.reshape(-1) == 1) & inside & (gap <= most_back_px)
+    good = (found.reshape(-1) == 1) & (returned.reshape(-1) == 1) & inside & (gap <= MAX_BACK_PX)
     return Tracks(np.where(good[:, None], there, start.reshape(-1, 2)), good)

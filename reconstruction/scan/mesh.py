@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from model.checks import Checks
 from reconstruction.arrays import Float32Array, Float64Array, Int32Array, Int64Array
 from reconstruction.scan.repair import (
     RepairReport,
@@ -80,13 +81,7 @@ def load_ply(data: bytes) -> TriangleMesh:
     return TriangleMesh(vertices, faces, np.asarray(uv, np.float64)[faces] if given else None)
 
 
-def prepare(
-    scan: bytes | TriangleMesh,
-    *,
-    points: int = 500_000,
-    box_mm: tuple[tuple[float, float, float], tuple[float, float, float]] | None = FACE_BOX_MM,
-    max_hole_mm: float = 40.0,
-) -> RefinedScan:
+def prepare(scan: bytes | TriangleMesh, *, points: int = 500_000) -> RefinedScan:
     """Crop, repair, lay out and refine a scan.
 
     Parameters
@@ -95,10 +90,6 @@ def prepare(
         A PLY in mm, or what `load_ply` returned.
     points : int
         About so many points: Loop subdivision multiplies them by four, the nearest step is taken.
-    box_mm : pair of corners, or None
-        What is outside is no face.
-    max_hole_mm : float
-        Holes with a longer rim stay open.
 
     Returns
     -------
@@ -111,9 +102,7 @@ def prepare(
         Where nothing of the scan can be used.
     """
     mesh = load_ply(scan) if isinstance(scan, bytes) else scan
-    if box_mm is not None:
-        mesh = crop(mesh, box_mm=box_mm)
-    mesh, report = repair(mesh, max_hole_mm=max_hole_mm)
+    mesh, report = repair(crop(mesh, box_mm=FACE_BOX_MM))
     if mesh.corner_uv is None:
         mesh = unwrap(mesh)
     return refine(mesh, points=points, report=report)
@@ -143,8 +132,7 @@ def refine(mesh: TriangleMesh, *, points: int, report: RepairReport | None = Non
     """
     from trimesh.remesh import subdivide_loop
 
-    if not 3 <= points <= MAX_POINTS:
-        raise ScanMeshError(f"points: got {points}, expected 3 to {MAX_POINTS}")
+    Checks(ScanMeshError).within("points", points, f"[3, {MAX_POINTS}]")
     if mesh.corner_uv is None:
         raise ScanMeshError("mesh: got no texture coordinates, expected some; see unwrap")
     steps = max(round(float(np.log(points / len(mesh.vertices_mm)) / np.log(4.0))), 0)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int64Array
 from reconstruction.lumitexels import Lights, Surface, visibility
 from reconstruction.lumitexels.ray_casting import RayCaster
@@ -28,6 +29,8 @@ from reconstruction.scan.rough_normals import (
 
 MAX_IMAGE_WIDTH_PX: Final = 320
 """Larger images are binned 2 x 2 until they are no wider."""
+MAX_BLUR_STEPS: Final = 12
+"""Gauss-Newton steps for each blur."""
 MIN_SCAN_COSINE: Final = 0.35
 """Points seen at a flatter angle say nothing: 70 degrees."""
 ERROR_CELL_MM: Final = 20.0
@@ -67,7 +70,6 @@ def register(
     visible: BoolArray | None = None,
     start: tuple[ArrayLike, ArrayLike] | None = None,
     blurs_px: Sequence[float] = (8.0, 3.0, 1.5, 0.5),
-    steps: int = 12,
 ) -> RigidFit:
     """Find the rigid motion of a scan that makes its normals those of the views.
 
@@ -83,8 +85,6 @@ def register(
         First guess; no motion by default.
     blurs_px : sequence of float
         The normal maps are blurred by these deviations, one after the other: far first.
-    steps : int
-        Most Gauss-Newton steps for each blur.
 
     Returns
     -------
@@ -97,8 +97,8 @@ def register(
     """
     p = np.asarray(points_mm, np.float64)
     n = np.asarray(normals, np.float64)
-    if p.ndim != 2 or p.shape[1] != 3 or p.shape != n.shape:
-        raise RegistrationError(f"points_mm: got shapes {p.shape} and {n.shape}, expected (P, 3)")
+    Checks(RegistrationError).shape("points_mm", p, ("P", 3))
+    Checks(RegistrationError).shape("normals", n, p.shape)
     if visible is None:
         visible = np.ones((len(evidence), len(p)), np.bool_)
     turn = np.eye(3) if start is None else np.asarray(start[0], np.float64)
@@ -109,7 +109,7 @@ def register(
     at_blur: list[tuple[Float64Array, Float64Array]] = []
     for blur in blurs_px:
         maps = [_blurred(view, blur) for view in evidence]
-        for _ in range(steps):
+        for _ in range(MAX_BLUR_STEPS):
             center = turn @ middle + shift
             system = _gauss_newton(p, n, turn, shift, center, maps, evidence, visible)
             if system.samples < 200:
@@ -321,8 +321,7 @@ def _clustered(system: _System, p: Float64Array) -> Float64Array:
     cell = cell.reshape(-1)
     sums = np.stack([np.bincount(cell, system.by_point[:, j]) for j in range(6)], axis=-1)
     used = np.count_nonzero(np.abs(sums).sum(axis=1))
-    if used <= 6:
-        raise RegistrationError(f"cells: got {used} with points, expected more than 6")
+    Checks(RegistrationError).within("cells with points", used, "(6, inf)")
     inverse = np.linalg.inv(system.matrix)
     spread = inverse @ (sums.T @ sums) @ inverse * used / (used - 6)
     return np.sqrt(np.diag(spread))

@@ -15,6 +15,8 @@ COS_HIGHLIGHT: Final = float(np.cos(np.radians(45.0)))
 """Half vectors closer to the normal than 45 degrees may be those of a highlight."""
 MIN_SCAN_LIGHTS: Final = 9
 """So many lights take part at a pixel even where some are nearer to the highlight."""
+N_SHADOW_ROUNDS: Final = 4
+"""Of least squares that leave out shadows further."""
 MIN_COS_LIGHT: Final = 0.3
 MIN_COS_VIEW: Final = 0.2
 
@@ -51,7 +53,6 @@ def photometric_normals(
     *,
     surface_normals: FloatArray,
     binning: int = 1,
-    rounds: int = 4,
 ) -> NormalEvidence:
     """Return the normals that one view's images under single lights tell.
 
@@ -69,8 +70,6 @@ def photometric_normals(
         highlights are.
     binning : int
         Camera pixels along each side of an image pixel.
-    rounds : int
-        Of least squares that leave out shadows further.
 
     Notes
     -----
@@ -106,9 +105,7 @@ def photometric_normals(
         edge = np.maximum(ordered[min(MIN_SCAN_LIGHTS, count) - 1], COS_HIGHLIGHT)
         diffuse = facing_light & (cos_half <= edge) & (cos_view > MIN_COS_VIEW)
         passed = _passed(cos_light) * _passed(cos_view)
-        found, share = _robust_normals(
-            direction, np.where(diffuse, values / passed, np.nan), rounds
-        )
+        found, share = _robust_normals(direction, np.where(diffuse, values / passed, np.nan))
         facing = np.einsum("pk,pk->p", found, ways[part]) < 0
         normals[part] = np.where(facing[:, None], found, 0.0)
         weight[part] = np.where(facing, share, 0.0)
@@ -125,7 +122,7 @@ def _passed(cosine: Float64Array) -> Float64Array:
 
 
 def _robust_normals(
-    direction: Float64Array, values: FloatArray, rounds: int
+    direction: Float64Array, values: FloatArray
 ) -> tuple[Float64Array, Float64Array]:
     """Return unit normals, shape (P, 3), and the share of the lights that fit them."""
     good = np.isfinite(values)
@@ -133,7 +130,7 @@ def _robust_normals(
     top = np.max(y, axis=0)
     w = (good & (y > 0.1 * top)).astype(np.float64)
     n = np.zeros((y.shape[1], 3))
-    for _ in range(rounds):
+    for _ in range(N_SHADOW_ROUNDS):
         a = np.einsum("lp,lpi,lpj->pij", w, direction, direction)
         b = np.einsum("lp,lp,lpi->pi", w, y, direction)
         a += 1e-6 * np.trace(a, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)

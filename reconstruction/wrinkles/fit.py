@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model import texture_resampling as resampling
+from model.checks import Checks
 from model.wrinkles import Layer, Masks, WrinkleError, mask_stack
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import JIMENEZ2011_TABLE, ZONE_SUM_LIMITS, Clamp, ExpressionTable
@@ -108,8 +109,7 @@ def fit_weights(
     -------
     ZoneWeights
     """
-    if clamp not in ZONE_SUM_LIMITS:
-        raise WrinkleError(f"clamp: got {clamp!r}, expected one of {', '.join(ZONE_SUM_LIMITS)}")
+    Checks(WrinkleError).choice("clamp", clamp, ZONE_SUM_LIMITS)
     difference = differences(derivatives_of(neutral), {"expression": expression})["expression"]
     wrinkle = _read(np.asarray(layer.wrinkle, np.float64), difference.weight.shape)
     return zone_weights(
@@ -156,8 +156,7 @@ def fit(
     WrinkleError
         For sizes that do not fit, or no expression.
     """
-    if clamp not in ZONE_SUM_LIMITS:
-        raise WrinkleError(f"clamp: got {clamp!r}, expected one of {', '.join(ZONE_SUM_LIMITS)}")
+    Checks(WrinkleError).choice("clamp", clamp, ZONE_SUM_LIMITS)
     if not expressions:
         raise WrinkleError("expressions: got none, expected at least one")
     stack = mask_stack(masks).astype(np.float64)
@@ -170,8 +169,7 @@ def fit(
     if table is not None:
         rows = {name: table.row(name) for name in data}
         for name, row in rows.items():
-            if len(row) != len(stack):
-                raise WrinkleError(f"table[{name!r}]: got {len(row)} zones, expected {len(stack)}")
+            Checks(WrinkleError).shape(f"table[{name!r}]", row, (len(stack),))
     else:
         rows, rounds, settled = _in_turn(stack, data, base, size, clamp)
     texels = _shown_by(stack, rows, data, size)
@@ -261,11 +259,7 @@ def differences(base: Derivatives, expressions: Mapping[str, Measured]) -> dict[
     data = {}
     for name, given in expressions.items():
         one = derivatives_of(given)
-        if one.values.shape != base.values.shape:
-            raise WrinkleError(
-                f"{name}: got shape {one.values.shape[:2]}, expected that of neutral, "
-                f"{base.values.shape[:2]}"
-            )
+        Checks(WrinkleError).shape(name, one.values, base.values.shape)
         good = base.valid & one.valid
         kept = good[..., None]
         variance = np.where(kept, base.variance + one.variance, 0.0).astype(np.float32)

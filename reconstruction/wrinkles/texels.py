@@ -17,9 +17,9 @@ from scipy.sparse.linalg import cg
 
 from model import texture_resampling as resampling
 from model import wrinkles
+from model.checks import Checks
 from model.wrinkles import WrinkleError
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from reconstruction.checks import require_shapes
 from reconstruction.normal_maps import NormalMaps
 
 MAX_DERIVATIVE = 4.0
@@ -84,12 +84,12 @@ def derivatives_of(
         valid = mask if valid is None else mask & np.asarray(valid, bool)
         normals = normals.normals
     n = np.asarray(normals, np.float64)
-    if n.ndim != 3 or n.shape[2] != 3:
-        raise WrinkleError(f"normals: got shape {n.shape}, expected (H, W, 3)")
+    Checks(WrinkleError).shape("normals", n, ("H", "W", 3))
     report = wrinkles.encoding_report(n, limit=None)
     good = report.valid.copy()
     shape = n.shape[:2]
-    require_shapes(WrinkleError, ("valid", valid, shape), ("stderr_rad", stderr_rad, shape))
+    Checks(WrinkleError).shape("valid", valid, shape)
+    Checks(WrinkleError).shape("stderr_rad", stderr_rad, shape)
     if valid is not None:
         good &= np.asarray(valid, bool)
     steep = good & (np.abs(report.derivatives) > MAX_DERIVATIVE).any(axis=2)

@@ -60,9 +60,7 @@ class ZoneWeights:
         Of the normals' stated errors alone; 0 for weights that are not determined.
     explained : float
         1 - |misfit|^2 / |difference from neutral|^2 over the valid pixels; 0 where there is no
-        difference. Noise is not explained: see `noise_fraction`.
-    noise_fraction : float
-        Part of |difference|^2 that the normals' stated errors account for.
+        difference. Noise is not explained.
     """
 
     weights: Float64Array
@@ -71,7 +69,6 @@ class ZoneWeights:
     at_bound: BoolArray
     covariance: Float64Array
     explained: float
-    noise_fraction: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,15 +80,14 @@ class ZoneEquations:
     matrix, vector : ndarray, shapes (Z, Z) and (Z,)
     noise : ndarray, shape (Z, Z)
         Covariance of `vector` by the stated errors.
-    total, expected : float
-        Weighted sum of squared differences, and the part that stated errors add to it.
+    total : float
+        Weighted sum of squared differences.
     """
 
     matrix: Float64Array
     vector: Float64Array
     noise: Float64Array
     total: float
-    expected: float
 
     def misfit(self, weights: Float64Array) -> float:
         """Return the weighted sum of squares that weights leave, at least 0."""
@@ -189,11 +185,7 @@ def equations_of(
             scatter = np.einsum("hwc,hwc,hwc->hw", wrinkle, wrinkle, one.variance)
             noise = squares(scatter * v * v)
         found[name] = ZoneEquations(
-            matrix,
-            flat @ gathered(by, bx, agreement).ravel(),
-            noise,
-            float((v * total).sum()),
-            float((v * one.variance.sum(axis=2)).sum()),
+            matrix, flat @ gathered(by, bx, agreement).ravel(), noise, float((v * total).sum())
         )
     return found
 
@@ -230,7 +222,6 @@ def zone_weights(
         valid & np.isin(weights, bounds),
         covariance,
         1.0 - equations.misfit(weights) / total if total > 0 else 0.0,
-        equations.expected / total if total > 0 else 0.0,
     )
 
 

@@ -20,6 +20,7 @@ from scipy.cluster.vq import kmeans2
 from scipy.ndimage import distance_transform_edt
 
 from model.texture_resampling import averaging_matrix
+from model.vectors import nearest_shares
 from model.wrinkles import Masks, WrinkleError, mask_stack
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.wrinkles.fit import Measured, differences
@@ -140,12 +141,7 @@ def amplitudes(
 
 
 def fit_zones(
-    found: Amplitudes,
-    *,
-    zones: int = 8,
-    layout: Masks | None = None,
-    place_weight: float = 1.0,
-    rng: np.random.Generator,
+    found: Amplitudes, *, zones: int = 8, layout: Masks | None = None, rng: np.random.Generator
 ) -> ZoneFit:
     """Return masks of zones, from a first layout or from amplitudes and places alone.
 
@@ -157,9 +153,6 @@ def fit_zones(
     layout : array_like, shape (Z, h, w), optional
         Rough regions at the resolution of the amplitudes, e.g. an artist's; they are refined, and
         kept where the data are silent.
-    place_weight : float
-        Without a layout: how much a way across the whole face counts against opposite
-        amplitudes. 0 joins left and right.
     rng
         Draws the first centres, without a layout.
     """
@@ -167,7 +160,7 @@ def fit_zones(
     if not found.valid.any():
         raise WrinkleError("amplitudes: got no texel with a wrinkle, expected some")
     if layout is None:
-        start = _clustered(found, zones, place_weight, rng)
+        start = _clustered(found, zones, rng)
     else:
         start = mask_stack(layout).astype(np.float64)
         if start.shape[1:] != shape:
@@ -203,9 +196,7 @@ def fit_zones(
     )
 
 
-def _clustered(
-    found: Amplitudes, zones: int, place_weight: float, rng: np.random.Generator
-) -> Float64Array:
+def _clustered(found: Amplitudes, zones: int, rng: np.random.Generator) -> Float64Array:
     """Return regions (Z, h, w) by k-means of amplitudes and places; silent texels go to the near.
 
     The best of several seeded starts is taken.
@@ -218,7 +209,7 @@ def _clustered(
         raise WrinkleError(
             f"zones: got {zones}, expected 1 to {np.count_nonzero(good)} texels with a wrinkle"
         )
-    features = np.concatenate([found.values[:, good].T, 2.0 * place_weight * places[good]], axis=1)
+    features = np.concatenate([found.values[:, good].T, 2.0 * places[good]], axis=1)
     best, least = None, np.inf
     for _ in range(8):
         centres, label = kmeans2(features, zones, iter=30, minit="++", seed=rng, missing="warn")
@@ -260,18 +251,8 @@ def _on_simplex_fit(
     pull = target @ weights.T
     for _ in range(GRADIENT_STEPS):
         slope = trust[:, None] * (masks @ gram - pull) + LAYOUT_WEIGHT * (masks - prior)
-        masks = _projected(masks - scale * slope)
+        masks = nearest_shares(masks - scale * slope)
     return masks
-
-
-def _projected(v: Float64Array) -> Float64Array:
-    """Return the nearest points of the simplex, row by row (Held, Wolfe and Crowder 1974)."""
-    ordered = -np.sort(-v, axis=1)
-    sums = np.cumsum(ordered, axis=1) - 1.0
-    ranks = np.arange(1, v.shape[1] + 1)
-    last = (ordered - sums / ranks > 0).sum(axis=1)
-    shift = np.take_along_axis(sums, last[:, None] - 1, axis=1) / last[:, None]
-    return np.maximum(v - shift, 0.0)
 
 
 def _distinct(weights: Float64Array) -> int:

@@ -11,9 +11,9 @@ import numpy as np
 
 from model import store
 from model.skin import SkinAppearance, SkinMap
-from reconstruction.correspondence import common_parameterization, landmark_table
+from reconstruction.correspondence import charts, common_parameterization, landmark_table
+from reconstruction.correspondence.charts import Chart
 from reconstruction.correspondence.common_parameterization import (
-    Chart,
     CommonFrame,
     Correspondence,
     ParameterizationError,
@@ -103,9 +103,7 @@ class Face:
 
     def chart(self, frame: CommonFrame) -> Chart:
         """Return where each texel lies in a common map."""
-        return common_parameterization.chart(
-            self.position, self.surface, self.correspondence(frame), frame
-        )
+        return charts.chart(self.position, self.surface, self.correspondence(frame), frame)
 
 
 def read(path: Path, landmarks: Path | None = None) -> Face:

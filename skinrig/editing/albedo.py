@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model import texture_statistics
-from reconstruction.correspondence.common_parameterization import Chart
+from reconstruction.correspondence.charts import Chart
 from reconstruction.surface import texture_fill
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.traits import albedo_vectors

@@ -7,7 +7,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from model import store
 from reconstruction.correspondence import common_regions
-from reconstruction.correspondence.common_parameterization import Chart, CommonFrame
+from reconstruction.correspondence.charts import Chart
+from reconstruction.correspondence.common_parameterization import CommonFrame
 from skinrig.arrays import Float32Array, Float64Array
 
 FEATHER_MM = 6.0

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from reconstruction.correspondence.common_parameterization import Chart
+from reconstruction.correspondence.charts import Chart
 from reconstruction.surface import texture_fill
 from skinrig.arrays import BoolArray, Float32Array
 

@@ -9,7 +9,8 @@ from scipy import ndimage
 
 from model.skin import SkinMap
 from reconstruction.correspondence import common_parameterization
-from reconstruction.correspondence.common_parameterization import Chart, CommonFrame
+from reconstruction.correspondence.charts import Chart
+from reconstruction.correspondence.common_parameterization import CommonFrame
 from reconstruction.surface import texture_fill
 from skinrig.appearances import face_textures
 from skinrig.appearances.face_textures import Face

@@ -22,8 +22,10 @@ from numpy.typing import ArrayLike
 
 from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis, diffuse_albedo
+from reconstruction.correspondence import charts
 from reconstruction.correspondence import common_parameterization as parameterization
-from reconstruction.correspondence.common_parameterization import Chart, CommonFrame
+from reconstruction.correspondence.charts import Chart
+from reconstruction.correspondence.common_parameterization import CommonFrame
 from rigsim.light import surface_brdf
 from rigsim.population import conditions as skin_conditions
 from rigsim.population.population import Member
@@ -239,7 +241,7 @@ class CommonFaces:
         ]
         frame = parameterization.frame_around(names, places, unrolled, size=common)
         charts = {
-            head: parameterization.chart(
+            head: charts.chart(
                 face.atlas.position_mm,
                 face.atlas.covered,
                 parameterization.correspond(marks[head], frame),

@@ -10,6 +10,7 @@ from fixtures.box_manuals import CALIPER, CALIPER_READY
 from capture.devices import wire
 from capture.devices.wire import Code, Request
 from rigsim.boxes.caliper import CALIPER_CONTROL_PERIOD_S, CaliperUnit
+from rigsim.boxes.device import Wiring
 from rigsim.world.taped_skin import TapedSkin
 
 RIG = CALIPER.rig

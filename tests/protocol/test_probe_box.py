@@ -9,7 +9,7 @@ from fixtures.box_manuals import PROBE as PROBE_BOX
 
 from capture.devices import wire
 from capture.devices.wire import Code, Request
-from rigsim.boxes.probe import SourceLight
+from rigsim.boxes.source_shutter import SourceLight
 from rigsim.boxes.suction_pump import MAX_PUMPING_S, PUMP_CONTROL_PERIOD_S
 
 PROBE = PROBE_BOX.rig.probe

@@ -14,7 +14,7 @@ from model.traits import TraitSpace, cosine, lobe_edits, reduced_spaces
 from model.traits.reduced_spaces import SpaceKind
 from reconstruction import brdf_basis
 from reconstruction.correspondence import common_regions
-from reconstruction.correspondence.common_parameterization import Chart
+from reconstruction.correspondence.charts import Chart
 from rigsim.population.population import Member, shifted, table_1
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.benchmarks import resident_memory

@@ -90,13 +90,13 @@ def test_the_nodes_cannot_be_modified(table):
 
 
 def test_fractions_outside_the_table_are_refused_not_clamped(table):
-    with pytest.raises(ColorTableError, match=r"c_m: the table spans 0 to 0\.5, got 0\.6"):
+    with pytest.raises(ColorTableError, match=r"c_m: got"):
         table.lookup(0.6, 0.1)
     with pytest.raises(ColorTableError, match="c_hd"):
         table.lookup(0.1, -1e-6)
     with pytest.raises(ColorTableError, match="nan"):
         table.lookup(np.nan, 0.1)
-    with pytest.raises(ColorTableError, match="above 0"):
+    with pytest.raises(ColorTableError, match="c_m: got"):
         table.jacobian(0.0, 0.1)
 
 
@@ -105,7 +105,7 @@ def test_fractions_outside_the_table_are_refused_not_clamped(table):
     [
         (np.ones((4, 4, 3)), ">= 8"),
         (np.ones((9, 8, 3)), "size, size"),
-        (np.zeros((9, 9, 3)), "pos"),
+        (np.zeros((9, 9, 3)), "rgb: got"),
     ],
 )
 def test_an_array_that_is_no_table_is_refused(rgb, message):
@@ -122,7 +122,7 @@ def test_a_size_too_small_for_a_spline_is_refused():
 def test_fractions_whose_shapes_do_not_fit_are_named():
     table = color_table.build("Nikon 5100 (NPL)", "D65", size=8)
     for asked in (table.lookup, table.jacobian, color_table.spectral_reflectance):
-        with pytest.raises(ColorTableError, match=r"broadcast, got \(3,\) and \(4,\)"):
+        with pytest.raises(ColorTableError, match=r"c_m, c_hd: got"):
             asked(np.full(3, 0.1), np.full(4, 0.1))
 
 

@@ -52,7 +52,7 @@ def test_a_matched_surface_reflects_nothing_at_any_angle():
 
 
 def test_an_index_below_one_is_refused():
-    with pytest.raises(ValueError, match="at least 1"):
+    with pytest.raises(ValueError, match="eta: got"):
         fresnel.diffuse_internal(0.7)
-    with pytest.raises(ValueError, match="positive"):
+    with pytest.raises(ValueError, match="eta: got"):
         fresnel.reflectance(1.0, -1.0)

@@ -105,7 +105,9 @@ def test_an_unknown_name_is_refused_with_the_known_ones():
 
 
 def test_wavelengths_outside_the_hemoglobin_table_are_refused():
-    with pytest.raises(ValueError, match="380 to 780"):
+    with pytest.raises(
+        ValueError, match=r"wavelength_nm in the table hemoglobin_extinction\.csv: got"
+    ):
         spectra.hemoglobin_extinction([300.0])
 
 
@@ -115,7 +117,7 @@ def test_the_default_wavelengths_cannot_be_modified():
 
 
 def test_spectra_that_do_not_match_the_wavelengths_are_refused():
-    with pytest.raises(ValueError, match="31 samples"):
+    with pytest.raises(ValueError, match="spectra: got"):
         spectra.band_average(np.ones(30), "Nikon 5100 (NPL)", "D55")
 
 

@@ -131,7 +131,7 @@ def test_a_folder_that_is_none_is_named(tmp_path):
         ({"stderr": np.zeros((1, 2))}, "stderr: got shape"),
         ({"valid": np.zeros((2, 2))}, "valid: got float64"),
         ({"unit": ""}, "unit"),
-        ({"values": np.full((2, 2), np.nan)}, "NaN"),
+        ({"values": np.full((2, 2), np.nan)}, "got nan"),
     ],
 )
 def test_a_map_that_does_not_fit_itself_is_refused(change, message):

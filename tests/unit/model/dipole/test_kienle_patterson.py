@@ -85,9 +85,9 @@ def test_strong_absorption_no_scattering_and_no_distance_have_clear_outcomes():
     assert np.all(dark.reflectance_per_mm2 > 0.0)
     far = diffusion.reflectance(1e4, 1.0, 1.0, 1.4)
     assert far == 0.0  # exp(-24495) is no float64
-    with pytest.raises(ValueError, match="radius_mm: got negative"):
+    with pytest.raises(ValueError, match="radius_mm: got -"):
         diffusion.reflectance(-1.0, 0.1, 1.0, 1.4)
-    with pytest.raises(ValueError, match="eta: expected"):
+    with pytest.raises(ValueError, match="eta: got"):
         diffusion.reflectance(1.0, 0.1, 1.0, 0.9)
 
 

@@ -94,15 +94,6 @@ def test_a_reflectance_outside_the_unit_interval_is_a_flagged_outlier():
         dipole.invert_total_reflectance(1.1, 1.3)
 
 
-def test_the_slope_is_the_derivative_of_the_inverse():
-    r_d, step = np.array([0.01, 0.2, 0.6, 0.95]), 1e-6
-    difference = dipole.invert_total_reflectance(r_d + step, 1.4) - dipole.invert_total_reflectance(
-        r_d - step, 1.4
-    )
-    slope = dipole.albedo_slope(dipole.invert_to_deficit(r_d, 1.4), 1.4)
-    np.testing.assert_allclose(slope, difference / (2 * step), rtol=1e-7)
-
-
 def test_albedo_and_translucency_give_back_the_coefficients():
     sigma_a, sigma_s = np.array([1e-9, 0.032, 5.0]), np.array([3.0, 0.74, 1e-3])
     sigma_tr = dipole.effective_transport(sigma_a, sigma_s)
@@ -135,5 +126,5 @@ def test_profiles_broadcast_and_refuse_negative_coefficients():
 
 
 def test_shapes_that_do_not_broadcast_are_named():
-    with pytest.raises(ValueError, match=r"radius_mm, .*got shapes \(4,\), \(3,\), \(\), expected"):
+    with pytest.raises(ValueError, match=r"radius_mm, sigma_a_per_mm, sigma_s_prime_per_mm: got"):
         dipole.reflectance(np.ones(4), np.ones(3), 1.0, 1.4)

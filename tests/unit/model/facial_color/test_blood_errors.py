@@ -26,5 +26,5 @@ def test_what_is_masked_or_missing_does_not_count(rng):
     assert found.predicted == 0.0
     with pytest.raises(ValueError, match="no pixel"):
         compare(predicted * np.nan, neutral, neutral)
-    with pytest.raises(ValueError, match="shapes"):
+    with pytest.raises(ValueError, match="predicted: got"):
         compare(predicted[1:], neutral, neutral)

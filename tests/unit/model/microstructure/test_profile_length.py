@@ -138,7 +138,7 @@ WAVE = np.sin(np.arange(50.0))
 @pytest.mark.parametrize(
     ("height", "changes", "message"),
     [
-        (WAVE[:1], {}, "at least 2"),
+        (WAVE[:1], {}, "heights of height_um: got"),
         (np.append(WAVE, np.nan), {}, "finite"),
         (WAVE.reshape(5, 10), {}, r"expected \(N,\)"),
         (WAVE, {"spacing_um": 0.0}, "spacing_um"),

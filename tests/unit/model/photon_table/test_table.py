@@ -323,7 +323,7 @@ def test_media_that_the_table_does_not_hold_are_refused(options, message):
 
 @pytest.mark.parametrize("arguments", [(-1.0, 0.1, 1.0), (1.0, np.nan, 1.0), (1.0, 0.1, np.inf)])
 def test_negative_and_unbounded_arguments_are_refused(arguments):
-    with pytest.raises(ValueError, match="expected at least 0"):
+    with pytest.raises(ValueError, match="_mm: got"):
         photon_table.reflectance(*arguments)
 
 

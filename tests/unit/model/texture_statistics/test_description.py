@@ -283,7 +283,7 @@ def test_what_fits_nothing_is_named(rng):
     broken[2, 3] = np.nan
     some = np.ones((8, 8), bool)
     cases = [
-        ("not finite", lambda: describe(broken)),
+        (r"image \(mark others in valid\): got", lambda: describe(broken)),
         ("shape", lambda: describe(np.zeros(5))),
         ("channels", lambda: describe(np.zeros((4, 4, 2)))),
         ("valid", lambda: describe(image, valid=some[:3])),

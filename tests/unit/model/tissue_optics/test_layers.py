@@ -99,5 +99,7 @@ def test_impossible_fractions_are_refused_by_name(arguments, message):
 
 
 def test_layers_whose_shapes_do_not_broadcast_are_named():
-    with pytest.raises(TissueError, match=r"thickness_mm: .* got \(3,\), \(2,\), \(2,\)"):
+    with pytest.raises(
+        TissueError, match=r"sigma_a_per_mm, sigma_s_prime_per_mm, thickness_mm: got"
+    ):
         layer_stack_reflectance(np.ones(3), np.ones(2), np.ones(2))

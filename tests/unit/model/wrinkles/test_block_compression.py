@@ -109,12 +109,12 @@ def test_four_channels_cost_a_byte_a_texel_and_hold_smooth_masks_to_a_few_hundre
 
 @pytest.mark.parametrize("bad", [-0.01, 1.01, np.nan])
 def test_values_that_a_texture_does_not_hold_are_refused(bad):
-    with pytest.raises(bc.BlockError, match=r"beyond \[0, 1\]"):
+    with pytest.raises(bc.BlockError, match=r"texture: got"):
         bc.encode_bc4(np.full((4, 4), bad))
 
 
 def test_blocks_of_another_size_are_refused():
-    with pytest.raises(bc.BlockError, match="expected uint8"):
+    with pytest.raises(bc.BlockError, match="blocks: got"):
         bc.decode_bc4(np.zeros((1, 1, 8), np.uint8), (5, 4))
     with pytest.raises(bc.BlockError, match=r"expected \(h, w, 2\)"):
         bc.encode_bc5(np.zeros((4, 4, 3)))

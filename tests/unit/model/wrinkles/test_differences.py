@@ -87,9 +87,9 @@ def test_missing_normals_add_nothing_and_holes_of_the_base_are_zero(rng):
 
 def test_maps_that_do_not_fit_are_refused():
     n = np.zeros((4, 4, 3))
-    with pytest.raises(WrinkleError, match="expected that of base"):
+    with pytest.raises(WrinkleError, match="wrinkled: got shape"):
         wrinkle_differences.difference_map(n, n[:2])
     with pytest.raises(WrinkleError, match=r"expected \(H, W, 3\)"):
         wrinkle_differences.difference_map(n[..., :2], n[..., :2])
-    with pytest.raises(WrinkleError, match="difference: got NaN"):
+    with pytest.raises(WrinkleError, match="difference: got"):
         wrinkle_differences.combine(n, n * np.nan, ONE, np.ones(1))

@@ -53,11 +53,11 @@ def test_eight_bits_cannot_store_flat_skin_and_blocks_nearly_can():
 
 
 def test_steeper_maps_than_the_encoding_holds_are_refused():
-    with pytest.raises(WrinkleError, match="expected encode's"):
+    with pytest.raises(WrinkleError, match=r"derivatives \(of encode\): got"):
         storage.stored_map(np.full((4, 4, 2), 1.5), "unit8")
-    with pytest.raises(WrinkleError, match="beyond 65504"):
+    with pytest.raises(WrinkleError, match="derivatives: got"):
         storage.stored_map(np.full((4, 4, 2), 1e6), "float16")
-    with pytest.raises(WrinkleError, match=r"expected \[0, 1\] for bc3"):
+    with pytest.raises(WrinkleError, match="masks as bc3: got"):
         storage.stored_masks(np.full((8, 4, 4), 1.2), "bc3")
 
 

@@ -164,7 +164,7 @@ def test_profiles_that_do_not_fit_are_refused():
         ("floor", {"floor": -1.0}),
         ("variance: got none", {"errors": "absolute"}),
         ("variance: got shape", {"variance": np.ones(28)}),
-        ("expected 0 or above", {"variance": -truth}),
+        ("variance: got", {"variance": -truth}),
         ("sigma_a_per_mm", {"sigma_a_per_mm": [0.1, 0.2]}),
     ):
         given = {"radius_mm": RADIUS_MM, "reflectance_per_mm2": truth} | MEDIUM | wrong

@@ -235,7 +235,7 @@ def test_four_mixtures_of_a_face_fit_nearly_as_well_as_all_materials(face, basis
 
 
 def test_ranks_beyond_the_data_and_empty_weights_have_clear_outcomes():
-    with pytest.raises(ValueError, match="rank: got 5, expected 1 to 3"):
+    with pytest.raises(ValueError, match="rank: got 5, expected a number in"):
         brdf_basis.reduce(np.ones((3, 59)), 5)
     found, mix, error = brdf_basis.reduce(np.zeros((10, 59)), 2)
     assert error == 0.0

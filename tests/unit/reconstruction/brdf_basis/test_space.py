@@ -154,7 +154,7 @@ def test_people_count_as_one_each_in_the_standard_error(three, many, basis):
         ({"method": "pca"}, "method"),
         ({"groups": [1, 2]}, "groups"),
         ({"held_out": np.ones((2, 5))}, "expected"),
-        ({"weights": -np.ones((5, 59))}, "at least 0"),
+        ({"weights": -np.ones((5, 59))}, "weights: got"),
     ],
 )
 def test_what_makes_no_space_is_refused(change, match, three, basis):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from reconstruction.correspondence import charts, common_regions
 from reconstruction.correspondence import common_parameterization as common
-from reconstruction.correspondence import common_regions
 from reconstruction.correspondence.common_parameterization import Cylinder, ParameterizationError
 
 SIZE = 96
@@ -82,7 +82,7 @@ def test_a_texture_goes_to_the_common_map_and_back(faces, frame):
     texture = np.stack([np.sin(face[..., 0] / 15), face[..., 1] / 90, face[..., 2] / 90], axis=-1)
     valid = np.ones(texture.shape[:2], bool)
     valid[40:50, 60:70] = False
-    chart = common.chart(face, np.ones_like(valid), common.correspond(marks(face), frame), frame)
+    chart = charts.chart(face, np.ones_like(valid), common.correspond(marks(face), frame), frame)
     image, known = chart.gather(np.where(valid[..., None], texture, 50.0), valid)
     assert known.mean() > 0.75
     assert np.abs(image[known]).max() < 1.5  # nothing of what is not valid
@@ -96,7 +96,7 @@ def test_what_lies_in_the_shadow_of_an_ear_does_not_mix_with_it(frame, faces):
     behind = front * [0.7, 1.0, 1.0] - [0.0, 0.0, 25.0]
     position = np.concatenate([front, behind])
     texture = np.concatenate([np.ones((SIZE, SIZE)), np.zeros((SIZE, SIZE))])
-    chart = common.chart(
+    chart = charts.chart(
         position, np.ones(texture.shape, bool), common.correspond(marks(front), frame), frame
     )
     image, known = chart.gather(texture)

@@ -176,8 +176,6 @@ def test_matrices_take_points_to_where_they_were():
         stderr=np.zeros((2, 6)),
         usable=np.ones(2, bool),
         residual_px=np.zeros(2),
-        nonrigid=np.zeros(2),
-        worst_part_px=np.zeros(2),
         tracks=np.zeros(2, np.intp),
     )
     half = motion.matrices([0.5])[0]

@@ -349,9 +349,9 @@ def test_names_sizes_and_tables_that_do_not_fit_are_refused(face):
     n = wrinkles.decode(base)
     with pytest.raises(WrinkleError, match="expected at least one"):
         wrinkle_fit.fit(n, {}, layer.masks, size=(8, 8))
-    with pytest.raises(WrinkleError, match="expected that of neutral"):
+    with pytest.raises(WrinkleError, match="got shape"):
         wrinkle_fit.fit(n, {"joy": n[:64]}, layer.masks, size=(8, 8))
-    with pytest.raises(WrinkleError, match="8 zones, expected 5"):
+    with pytest.raises(WrinkleError, match=r"table\['joy'\]: got"):
         wrinkle_fit.fit(n, {"joy": n}, layer.masks[:5], size=(8, 8), table=JIMENEZ2011_TABLE)
     with pytest.raises(WrinkleError, match="got 1 names"):
         wrinkle_fit.fit(n, {"joy": n}, layer.masks, size=(8, 8), zones=("a",))

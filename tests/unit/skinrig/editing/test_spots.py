@@ -5,7 +5,7 @@ import pytest
 
 from model.color_table import build
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction.correspondence import common_parameterization, common_regions
+from reconstruction.correspondence import charts, common_regions
 from reconstruction.correspondence.common_parameterization import Correspondence, Cylinder
 from skinrig.editing import pigment_spots, spot_removal
 from skinrig.editing.pigment_spots import SPOT_KINDS, SpotError
@@ -88,7 +88,7 @@ def test_spots_smaller_than_a_texel_darken_by_their_area(cheek):
 def chart_of(position, on):
     frame = common_regions.standard_frame(side_mm=60.0, center_mm=(0.0, 0.0), size=SIDE)
     cylinder = Cylinder((0.0, 0.0, 0.0))
-    return common_parameterization.chart(position, on, Correspondence(cylinder), frame), frame
+    return charts.chart(position, on, Correspondence(cylinder), frame), frame
 
 
 @pytest.mark.parametrize(("kind", "density"), [("freckles", 1.5), ("moles", 0.3)])

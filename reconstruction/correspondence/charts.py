@@ -1,0 +1,196 @@
+"""Where a face's texels lie in the common map: added to its pixels, covered by others."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.ndimage import binary_closing, map_coordinates, maximum_filter
+
+from model.checks import Checks
+from model.texture_statistics.masks import fill_smoothly
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array
+from reconstruction.correspondence.common_parameterization import (
+    CYLINDER_RADIUS_MM,
+    CommonFrame,
+    Correspondence,
+    ParameterizationError,
+)
+
+SHADOW_DEPTH_MM: Final = 10.0
+"""Texels this far under the outermost at their place lie in its shadow (under ear or chin)."""
+
+
+def splat(at: Float64Array, values: Float64Array, size: int) -> tuple[Float64Array, Float64Array]:
+    """Add values to the four pixels around each place; return sums (N, N, C) and weights."""
+    total = np.zeros((size * size, values.shape[1]))
+    weight = np.zeros(size * size)
+    low = np.floor(at).astype(np.int64)
+    part = at - low
+    for dx in (0, 1):
+        for dy in (0, 1):
+            share = np.abs(1 - dx - part[:, 0]) * np.abs(1 - dy - part[:, 1])
+            x, y = low[:, 0] + dx, low[:, 1] + dy
+            use = (x >= 0) & (x < size) & (y >= 0) & (y < size) & (share > 1e-6)
+            index = y[use] * size + x[use]
+            weight += np.bincount(index, share[use], minlength=size * size)
+            for c, layer in enumerate(values[use].T):
+                total[:, c] += np.bincount(index, share[use] * layer, minlength=size * size)
+    return total.reshape(size, size, -1), weight.reshape(size, size)
+
+
+def closed(known: BoolArray) -> BoolArray:
+    """Close gaps of up to two pixels, as between texels that lie wider than the map's pixels."""
+    padded = np.pad(known, 3, mode="edge")
+    closed = binary_closing(padded, structure=np.ones((3, 3)), iterations=2)
+    return np.asarray(closed[3:-3, 3:-3] | known, np.bool_)
+
+
+def outermost(
+    place: Float64Array, reach: Float64Array, shown: BoolArray, side_mm: float, size: int
+) -> BoolArray:
+    """Return the texels that lie about as far out as any near their place, on cells of 2 mm.
+
+    Parameters
+    ----------
+    place
+        (H, W, 2): column and row in a map of ``size`` pixels and ``side_mm`` a side.
+    reach
+        (H, W): how far out texels lie, mm.
+    shown
+        (H, W): those that there are.
+    """
+    cells = max(1, math.ceil(side_mm / 2.0))
+    at = np.floor((place + 0.5) * (cells / size)).astype(np.int64)
+    inside = shown & np.all((at >= 0) & (at < cells), axis=2)
+    index = at[..., 1] * cells + at[..., 0]
+    highest = np.zeros(cells * cells)
+    np.maximum.at(highest, index[inside], reach[inside])
+    highest = maximum_filter(highest.reshape(cells, cells), size=3, mode="nearest").ravel()
+    out = shown & ~inside
+    out[inside] = reach[inside] >= highest[index[inside]] - SHADOW_DEPTH_MM
+    return np.asarray(out, np.bool_)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chart:
+    """Where each texel of a face's texture lies in the common map.
+
+    Attributes
+    ----------
+    size
+        Pixels a side of the map.
+    place_px
+        (H, W, 2), column and row; may lie outside the map.
+    on_surface
+        (H, W): texels that show the surface.
+    outermost
+        (H, W): those that no other part of the face covers.
+    stderr_mm
+        (H, W): of the place; NaN where nothing says it.
+    """
+
+    size: int
+    place_px: Float64Array
+    on_surface: BoolArray
+    outermost: BoolArray
+    stderr_mm: Float32Array
+
+    def gather(
+        self, texture: ArrayLike, valid: ArrayLike | None = None
+    ) -> tuple[Float32Array, BoolArray]:
+        """Average a texture into the common map.
+
+        Parameters
+        ----------
+        texture
+            (H, W) or (H, W, C).
+        valid
+            (H, W), texels that count; by default all of the surface.
+
+        Returns
+        -------
+        values : ndarray of float32, shape (N, N) or (N, N, C)
+            Filled from around where no texel lies.
+        valid : ndarray of bool, shape (N, N)
+            Pixels that texels say something about: at most half a texel's distance from one.
+        """
+        image = np.asarray(texture, np.float64)
+        use = self.on_surface & self.outermost
+        if valid is not None:
+            use = use & np.asarray(valid, np.bool_)
+        total, weight = splat(self.place_px[use], _layers(image)[use], self.size)
+        mean = total / np.maximum(weight, 1e-12)[..., None]
+        known = weight > 0.0
+        filled = fill_smoothly(mean, known) if known.any() else np.zeros_like(mean)
+        near = closed(known) if known.any() else known
+        return filled.astype(np.float32).reshape(known.shape + image.shape[2:]), near
+
+    def read(self, common: ArrayLike) -> tuple[Float32Array, BoolArray]:
+        """Read a common map at the texels, linearly.
+
+        Parameters
+        ----------
+        common
+            (N, N) or (N, N, C).
+
+        Returns
+        -------
+        values : ndarray of float32, shape (H, W) or (H, W, C)
+            The nearest pixel's where a texel lies outside the map.
+        inside : ndarray of bool, shape (H, W)
+            Texels of the surface inside the map.
+        """
+        image = np.asarray(common, np.float64)
+        at = [self.place_px[..., 1], self.place_px[..., 0]]
+        out = [
+            map_coordinates(layer, at, order=1, mode="nearest")
+            for layer in np.moveaxis(_layers(image), 2, 0)
+        ]
+        values = np.stack(out, axis=-1).astype(np.float32)
+        last = self.size - 0.5
+        inside = self.on_surface & np.all((self.place_px >= -0.5) & (self.place_px <= last), axis=2)
+        return values.reshape(self.on_surface.shape + image.shape[2:]), inside
+
+
+def _layers(image: Float64Array) -> Float64Array:
+    """Return an image (H, W) or (H, W, C) as (H, W, C)."""
+    return image if image.ndim == 3 else image[..., None]
+
+
+def chart(
+    position_mm: ArrayLike, valid: ArrayLike, correspondence: Correspondence, frame: CommonFrame
+) -> Chart:
+    """Lay a face's texels out in the common map.
+
+    Parameters
+    ----------
+    position_mm
+        (H, W, 3), rig frame.
+    valid
+        (H, W), texels that show the surface; values elsewhere mean nothing.
+    correspondence
+        Of this face.
+    frame
+        The common map.
+    """
+    position = np.asarray(position_mm, np.float64)
+    shown = np.asarray(valid, np.bool_)
+    Checks(ParameterizationError).shape("position", position, ("H", "W", 3))
+    Checks(ParameterizationError).shape("valid", shown, position.shape[:2])
+    if not shown.any():
+        raise ParameterizationError("position: no texel is valid")
+    place = np.full((*shown.shape, 2), -2.0)
+    error = np.full(shown.shape, np.nan, np.float32)
+    uv, off = correspondence.at(position[shown])
+    place[shown], error[shown] = frame.pixel(uv), off
+    tip = np.asarray(correspondence.cylinder.tip_mm)
+    reach = np.zeros(shown.shape)
+    reach[shown] = np.hypot(
+        position[shown, 0] - tip[0], position[shown, 2] - tip[2] + CYLINDER_RADIUS_MM
+    )
+    visible = shown & outermost(place, reach, shown, frame.side_mm, frame.size)
+    return Chart(frame.size, place, shown, visible, error)
