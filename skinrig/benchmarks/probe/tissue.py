@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from model import color_table, metrics, spectra
+from capture.calibration.color.colorimetry import delta_e_2000
+from model import color_table, spectra
 from model.tissue_optics import layers as tissue_optics
 from rigsim.tissue.skin_table import SkinTable
 from skinrig.arrays import Float64Array
@@ -72,7 +73,7 @@ def table(stage: Stage) -> None:
             ("spline", made.lookup(c_m, c_hd)),
             ("bilinear", _bilinear(made, c_m, c_hd)),
         ):
-            difference = metrics.delta_e_2000(_lab(color), reference)
+            difference = delta_e_2000(_lab(color), reference)
             outcome = _largest(difference)
             stage.add({"size": size, "between nodes": between}, timing, outcome)
             if (size, between) == (BAND_TABLE_SIZE, "spline"):
