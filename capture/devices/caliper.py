@@ -10,7 +10,7 @@ because the tape gives way.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal, get_args
+from typing import ClassVar, Final, Literal, get_args
 
 from capture.devices.box import Box, BoxStatus, StatusBit, decimal
 
@@ -183,3 +183,6 @@ def _report(payload: str) -> MoveReport:
     number, ended, step, mm, newton, t_us = payload.split(",")
     end, t_s = _END_WORDS[ended], int(t_us) / 1e6
     return MoveReport(int(number), end, int(step), float(mm), float(newton), t_s)
+
+
+DRIVER: Final = CaliperBox

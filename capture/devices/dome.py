@@ -7,7 +7,7 @@ runs meanwhile: `DomeBox.listen` renews it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Final
 
 from capture.devices.led_box import LEVEL_STEPS, Judgment, LedBox, LedStatus
 
@@ -88,3 +88,6 @@ class DomeBox(LedBox):
             return () if payload == "-" else tuple(int(part) for part in payload.split("+"))
 
         return self._read("LED?", numbers, "numbers joined by +, or -")
+
+
+DRIVER: Final = DomeBox

@@ -7,7 +7,7 @@ forgotten it.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 from capture.devices.box import Box, BoxStatus, StatusBit, decimal
 from capture.devices.port import PortTimeout
@@ -195,3 +195,6 @@ def _report(payload: str) -> FlashReport:
     token, t_us, power, stop, angle_deg, count = payload.split(",")
     polarizer, t_s = _POLARIZER_WORDS[stop], int(t_us) / 1e6
     return FlashReport(token, t_s, float(power), polarizer, float(angle_deg), int(count))
+
+
+DRIVER: Final = FlashBox

@@ -9,7 +9,7 @@ light is steady, and reports each release. The lease runs meanwhile: `listen` re
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Final, Literal
 
 from capture.devices.box import StatusBit, decimal
 from capture.devices.led_box import LEVEL_STEPS, Judgment, LedBox, LedStatus
@@ -183,3 +183,6 @@ def _pattern(name: str) -> str:
     if name not in LIGHT_PATTERNS:
         raise ValueError(f"pattern: got {name!r}, expected one of {', '.join(LIGHT_PATTERNS)}")
     return name
+
+
+DRIVER: Final = GradientSphereBox

@@ -10,7 +10,7 @@ where the head sits: a person has to look, and `ProbeBox.place` has to say it an
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal, get_args
+from typing import ClassVar, Final, Literal, get_args
 
 from capture.devices.box import Box, BoxStatus, StatusBit, decimal
 
@@ -297,3 +297,6 @@ def _opening(payload: str) -> Opening:
     number, ended, open_us, shut_us = payload.split(",")
     shut_s = math.inf if shut_us == "-" else int(shut_us) / 1e6
     return Opening(int(number), int(open_us) / 1e6, _SHUTTER_WORDS[ended], shut_s)
+
+
+DRIVER: Final = ProbeBox

@@ -23,7 +23,7 @@ from rigsim import world as worlds
 from rigsim.boxes.faults import Faults
 from rigsim.world import World
 from rigsim.world.link import Link, LinkStalled, Unplugged
-from rigsim.world.rig_boxes import RIG_OF_BOX
+from rigsim.world.rig_boxes import BOXES
 
 REAL_POLL_S = 0.002
 """How often a port on the real clock looks whether another thread did something."""
@@ -59,7 +59,7 @@ def world_of_url(url: str) -> tuple[World, str]:
         faults = Faults.from_text(settings)
     except ValueError as exc:
         raise ValueError(f"{url}: {exc}") from exc
-    rig = load_rig(RIG_OF_BOX.get(box, "flash"))
+    rig = load_rig(BOXES[box].rig if box in BOXES else "flash")
     made = World(rig, seed=int(seed), clock="real" if clock == "real" else "virtual", faults=faults)
     _with_box(made, box, url).register(name)
     return made, box

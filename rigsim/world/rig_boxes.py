@@ -1,7 +1,7 @@
 """The boxes of a rig, made as its drawing says, with what is wrong with them."""
 
 from collections.abc import Callable
-from typing import Final
+from typing import Final, NamedTuple
 
 from rigsim.boxes.caliper import CaliperUnit
 from rigsim.boxes.controller import Controller
@@ -11,23 +11,22 @@ from rigsim.boxes.flash import FlashUnit
 from rigsim.boxes.gradient_sphere import GradientSphereUnit
 from rigsim.boxes.probe import ProbeUnit
 
-_UNITS: Final[dict[str, tuple[Callable[[Wiring], Device], str]]] = {
-    "flash": (FlashUnit, "FL-0001"),
-    "dome": (DomeUnit, "DM-0001"),
-    "gradient_sphere": (GradientSphereUnit, "GS-0001"),
-    "caliper": (CaliperUnit, "CA-0001"),
-    "probe": (ProbeUnit, "PR-0001"),
-}
-"""What each kind of box is, and its serial number."""
 
-RIG_OF_BOX: Final = {
-    "flash": "flash",
-    "dome": "dome",
-    "gradient_sphere": "gradient",
-    "caliper": "gradient",
-    "probe": "probe",
+class BoxKind(NamedTuple):
+    """An emulated controller, its serial number, and which rig that ships has it."""
+
+    unit: Callable[[Wiring], Device]
+    serial: str
+    rig: str
+
+
+BOXES: Final = {
+    "flash": BoxKind(FlashUnit, "FL-0001", "flash"),
+    "dome": BoxKind(DomeUnit, "DM-0001", "dome"),
+    "gradient_sphere": BoxKind(GradientSphereUnit, "GS-0001", "gradient"),
+    "caliper": BoxKind(CaliperUnit, "CA-0001", "gradient"),
+    "probe": BoxKind(ProbeUnit, "PR-0001", "probe"),
 }
-"""Which rig that ships has a box."""
 
 
 def make_box(name: str, wiring: Wiring) -> Controller:
@@ -36,7 +35,7 @@ def make_box(name: str, wiring: Wiring) -> Controller:
     Parameters
     ----------
     name
-        Which: flash, dome, gradient_sphere, caliper or probe.
+        Which: one of `BOXES`.
     wiring
         What it is wired to.
 
@@ -45,7 +44,8 @@ def make_box(name: str, wiring: Wiring) -> Controller:
     ValueError
         Unknown name, or the rig does not describe what the box moves.
     """
-    if name not in _UNITS:
-        raise ValueError(f"boxes: got {name!r}, expected one of {', '.join(_UNITS)}")
-    unit, serial = _UNITS[name]
-    return Controller(unit(wiring), serial=wiring.faults.serial or serial, rng=wiring.rng)
+    if name not in BOXES:
+        raise ValueError(f"boxes: got {name!r}, expected one of {', '.join(BOXES)}")
+    kind = BOXES[name]
+    serial = wiring.faults.serial or kind.serial
+    return Controller(kind.unit(wiring), serial=serial, rng=wiring.rng)

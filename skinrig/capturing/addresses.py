@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from capture.rig import Rig
@@ -76,22 +77,21 @@ def require_addresses(
 
 
 def open_box(kind: str, address: str, **settings: Any) -> Box:
-    """Return the driver of a box at an address; `settings` are its port's."""
-    from capture.devices.caliper import CaliperBox
-    from capture.devices.dome import DomeBox
-    from capture.devices.flash import FlashBox
-    from capture.devices.gradient_sphere import GradientSphereBox
-    from capture.devices.port import Port
-    from capture.devices.probe import ProbeBox
+    """Return the driver of a box at an address: its module's ``DRIVER``.
 
-    drivers: Mapping[str, type[Box]] = {
-        "flash": FlashBox,
-        "dome": DomeBox,
-        "gradient_sphere": GradientSphereBox,
-        "caliper": CaliperBox,
-        "probe": ProbeBox,
-    }
-    return drivers[kind](Port(address, **settings))
+    Parameters
+    ----------
+    kind
+        Module of `capture.devices`, such as "flash".
+    address
+        URL or name of its port.
+    **settings
+        Of the port.
+    """
+    from capture.devices.port import Port
+
+    driver: type[Box] = import_module(f"capture.devices.{kind}").DRIVER
+    return driver(Port(address, **settings))
 
 
 def open_with_retry(

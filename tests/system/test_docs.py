@@ -140,11 +140,11 @@ def test_the_manual_lists_every_command_of_the_domes_box():
 def test_the_manual_lists_every_command_of_a_later_rigs_boxes(box_name, heading):
     from capture.rig import load_rig
     from rigsim.world import World
-    from rigsim.world.rig_boxes import RIG_OF_BOX
+    from rigsim.world.rig_boxes import BOXES
 
     dome = World(load_rig("dome")).box("dome").device.commands()
     shared = dome if box_name == "gradient_sphere" else {}
-    box = World(load_rig(RIG_OF_BOX[box_name])).box(box_name)
+    box = World(load_rig(BOXES[box_name].rig)).box(box_name)
     expected = {}
     for name, command in box.device.commands().items():
         needs = "bare" if command.bare else "" if name.endswith("?") else "frame"

@@ -13,7 +13,7 @@ from capture.devices.port import Port
 from capture.rig import load_rig
 from rigsim.boxes.faults import Faults
 from rigsim.boxes.gradient_sphere import PatternLight
-from rigsim.world.rig_boxes import RIG_OF_BOX
+from rigsim.world.rig_boxes import BOXES
 from rigsim.world.taped_skin import GripState
 from rigsim.world.world import World
 
@@ -48,7 +48,7 @@ def test_each_box_of_a_shipped_rig_has_its_serial_number_and_its_rig():
     serials = set()
     for name in ("flash", "dome", "gradient", "probe"):
         for box in load_rig(name).boxes:
-            assert RIG_OF_BOX[box] == name
+            assert BOXES[box].rig == name
             serials.add(World(load_rig(name)).box(box).serial)
     assert serials == {"FL-0001", "DM-0001", "GS-0001", "CA-0001", "PR-0001"}
 
