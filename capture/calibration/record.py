@@ -13,6 +13,26 @@ from numpy.typing import NDArray
 from capture.arrays import Float32Array, Float64Array
 from capture.documents import InputError
 
+
+def freeze_arrays(
+    row: Any, shape: tuple[int, ...], *names: str, kind: Any = np.float64, of: str = ""
+) -> None:
+    """Replace fields by read-only copies of the type; refuse another shape or infinite numbers.
+
+    A field that is None becomes zeros.
+    """
+    for name in names:
+        given = getattr(row, name)
+        array = np.array(np.zeros(shape) if given is None else given, dtype=kind)
+        if array.shape != shape or not np.isfinite(array).all():
+            raise ValueError(
+                f"{type(row).__name__}.{name}: got shape {array.shape}, expected finite numbers of"
+                f" shape {shape}{of}"
+            )
+        array.setflags(write=False)
+        object.__setattr__(row, name, array)
+
+
 CALIBRATION_KINDS = ("sensor", "color", "polarization", "white", "geometry", "lights", "fibre")
 DEFAULT_VALIDITY_DAYS = 90
 

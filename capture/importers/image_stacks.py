@@ -92,9 +92,7 @@ def import_light_list(
     """
     clock = now or (lambda: datetime.now(UTC))
     if encoding not in ("auto", "sRGB", "linear"):
-        raise LightListError(
-            "cannot be read so", faults=[Fault("encoding", encoding, "auto, sRGB or linear")]
-        )
+        raise LightListError.at("cannot be read so", "encoding", encoding, "auto, sRGB or linear")
     found = light_lists.find(Path(directory), lights=Path(lights) if lights else None)
     if len(found.pictures) < 3:
         raise LightListError(
@@ -104,9 +102,7 @@ def import_light_list(
         )
     near = mm_per_px is not None
     if mm_per_px is not None and not 0 < mm_per_px < 1e3:
-        raise LightListError(
-            "has no such scale", faults=[Fault("mm_per_px", str(mm_per_px), "0 < mm < 1000")]
-        )
+        raise LightListError.at("has no such scale", "mm_per_px", str(mm_per_px), "0 < mm < 1000")
     where_mask = Path(mask) if mask else light_lists.mask_of(found.pictures[0].parent)
     sampled, first, notes = _sample(found, where_mask)
     as_linear = first.encoding == "sRGB" and (

@@ -39,8 +39,7 @@ def radiant_intensity(light: Light) -> float:
     power_w = light.power_w or 0.0
     if light.half_intensity_deg is None:
         return power_w / (4.0 * math.pi)
-    exponent = math.log(0.5) / math.log(math.cos(math.radians(light.half_intensity_deg)))
-    return power_w * (exponent + 1.0) / (2.0 * math.pi)
+    return power_w * (light.lobe_exponent + 1.0) / (2.0 * math.pi)
 
 
 def eye_light(

@@ -143,7 +143,7 @@ def probe_calibration_plan(
     target : {"phantom", "dark"}
         "phantom": darks; the series of exposures on a block of known optics; then per fibre some
         exposures with all other fibres covered, `MASK_INTERVAL` brackets apart. Of those only two
-        that serve are taken unless all are asked for, see `capture.acquire.probe.mask_choice`;
+        that serve are taken unless all are asked for, see `capture.acquire.probe.fiber_signal`;
         "dark": the darks only.
     repeats : int
         Placements on the phantom, >= 1; fibres are covered at the first.

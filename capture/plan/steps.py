@@ -6,20 +6,17 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, get_args
-
-from pydantic import ConfigDict
+from typing import Any, Literal, get_args
 
 from capture.documents import (
-    STRICT_CONFIG,
     Checks,
+    Document,
     Fault,
     InputError,
     near_miss,
     parse,
     read_json,
     shown,
-    table_of,
 )
 from capture.plan.suction import held_s
 from capture.rig import ID_RULE, Rig, is_id
@@ -75,7 +72,7 @@ class PlanError(InputError):
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class Step(Document):
     """One thing to capture.
 
     Parameters
@@ -110,8 +107,6 @@ class Step:
       settings.exposure: got 0.1, expected a known setting; did you mean exposure_s? (in s)
     """
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
-
     id: str
     kind: Kind
     index: Index
@@ -142,10 +137,6 @@ class Step:
         parts = (self.id, self.kind, dict(self.index), dict(self.settings), self.cameras)
         return (Step, parts)
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the step as JSON values."""
-        return table_of(self)
-
 
 def _check_settings(settings: Mapping[str, Value]) -> list[Fault]:
     """Return the faults of known settings, and of names that are a near miss of a known one."""
@@ -161,7 +152,7 @@ def _check_settings(settings: Mapping[str, Value]) -> list[Fault]:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class Plan(Document):
     """Steps in the order of capture, for one rig, with the limits they were planned within.
 
     Parameters
@@ -173,8 +164,6 @@ class Plan:
     limits : mapping of str to float
         What the planner kept to, e.g. ``{"max_pops_per_min": 20.0, "recycle_s": 1.5}``.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     rig: str
     steps: tuple[Step, ...]
@@ -261,10 +250,6 @@ class Plan:
         return (
             total + last_s + (0.0 if rig.probe is None else held_s(self.steps, each_s, rig.probe))
         )
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the plan as JSON values."""
-        return table_of(self)
 
     @staticmethod
     def from_json(data: Mapping[str, Any] | str | bytes, *, where: str = "plan") -> Plan:

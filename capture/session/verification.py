@@ -16,8 +16,8 @@ from capture.session.contents import (
     read_contents,
 )
 from capture.session.errors import NotASession, SessionError
-from capture.session.frames import check_file
 from capture.session.journal import FrameLine
+from capture.session.view import check_file
 
 _KNOWN_NAMES = {
     MANIFEST_FILE,

@@ -14,7 +14,6 @@ from capture.arrays import BoolArray, Float64Array
 from capture.calibration.fiber.crosstalk import CrossTalk
 from capture.calibration.fiber.readings import FiberReadings
 from capture.calibration.fiber.spots import FiberSpots
-from capture.calibration.frozen_arrays import freeze_array
 from capture.calibration.record import (
     Calibration,
     CalibrationError,
@@ -23,6 +22,7 @@ from capture.calibration.record import (
     Origin,
     Quantity,
     device_rows,
+    freeze_arrays,
     of_devices,
 )
 from capture.calibration.store import load
@@ -117,16 +117,11 @@ class FiberCalibration:
     def __post_init__(self) -> None:
         """Convert and check the arrays against each other."""
         count, colors = np.shape(self.gain)
-        for name, shape, kind in (
-            ("radius_mm", (count,), np.float64),
-            ("gain", (count, colors), np.float64),
-            ("gain_stderr", (count, colors), np.float64),
-            ("light", (count, colors), np.float64),
-            ("common", (len(self.common), count, colors), np.float64),
-            ("valid", (count, colors), np.bool_),
-            ("dead", (count,), np.bool_),
-        ):
-            freeze_array(self, name, shape, kind)
+        freeze_arrays(self, (count,), "radius_mm")
+        freeze_arrays(self, (count, colors), "gain", "gain_stderr", "light")
+        freeze_arrays(self, (len(self.common), count, colors), "common")
+        freeze_arrays(self, (count, colors), "valid", kind=np.bool_)
+        freeze_arrays(self, (count,), "dead", kind=np.bool_)
         if len(self.spots.names) != count or self.crosstalk.offset.shape != (count, colors):
             raise ValueError(
                 f"FibreCalibration: got {len(self.spots.names)} spots and cross-talk of"

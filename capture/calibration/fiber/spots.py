@@ -11,8 +11,7 @@ import numpy as np
 from capture.arrays import BoolArray, Float64Array, FloatArray, Int64Array
 from capture.calibration.fiber.discs import DiscFit, candidates, distinct, fit_disc, gray_image
 from capture.calibration.fiber.merge import MergedSeries
-from capture.calibration.frozen_arrays import freeze_array
-from capture.calibration.record import CalibrationError
+from capture.calibration.record import CalibrationError, freeze_arrays
 
 MAX_SPOT_OFFSET_PITCH: Final = 0.35
 """How far a spot may lie from its place in the row."""
@@ -69,11 +68,9 @@ class FiberSpots:
     def __post_init__(self) -> None:
         """Convert and check the arrays against each other."""
         count = len(self.names)
-        for name in ("center_px", "center_stderr_px"):
-            freeze_array(self, name, (count, 2))
-        for name in ("radius_px", "radius_stderr_px", "edge_px"):
-            freeze_array(self, name, (count,))
-        freeze_array(self, "found", (count,), np.bool_)
+        freeze_arrays(self, (count, 2), "center_px", "center_stderr_px")
+        freeze_arrays(self, (count,), "radius_px", "radius_stderr_px", "edge_px")
+        freeze_arrays(self, (count,), "found", kind=np.bool_)
         if not (self.aperture_px > 0 and (self.radius_px > 0).all()):
             raise ValueError("FibreSpots: got a radius or an aperture <= 0, expected pixels > 0")
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from capture.arrays import Float64Array
-from capture.calibration.record import Calibration, Origin, Quantity, of_devices
+from capture.calibration.record import Calibration, Origin, Quantity, freeze_arrays, of_devices
 from capture.rig import Rig, View
 
 _LEFT_OUT: Any = None  # __post_init__ puts an array in its place
@@ -60,26 +60,9 @@ class CameraPose:
 
     def __post_init__(self) -> None:
         """Convert to float64 and refuse what is no camera."""
-        shapes = {
-            "matrix": (3, 3),
-            "distortion": (5,),
-            "rotation": (3, 3),
-            "translation_mm": (3,),
-            "matrix_stderr": (3, 3),
-            "distortion_stderr": (5,),
-            "rotation_stderr_rad": (3,),
-            "translation_stderr_mm": (3,),
-        }
-        for name, shape in shapes.items():
-            given = getattr(self, name)
-            array = np.array(np.zeros(shape) if given is None else given, dtype=np.float64)
-            if array.shape != shape or not np.isfinite(array).all():
-                raise ValueError(
-                    f"CameraPose.{name}: got {array.tolist()}, expected finite numbers of shape"
-                    f" {shape}"
-                )
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+        freeze_arrays(self, (3, 3), "matrix", "matrix_stderr", "rotation")
+        freeze_arrays(self, (5,), "distortion", "distortion_stderr")
+        freeze_arrays(self, (3,), "translation_mm", "translation_stderr_mm", "rotation_stderr_rad")
         K, R = self.matrix, self.rotation
         if not (K[0, 0] > 0 and K[1, 1] > 0 and np.array_equal(K[2], [0.0, 0.0, 1.0])):
             raise ValueError(

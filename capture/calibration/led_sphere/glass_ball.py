@@ -15,9 +15,13 @@ from scipy.spatial import cKDTree
 
 from capture.arrays import BoolArray, Float64Array, Int64Array
 from capture.calibration.geometry import CameraPose
-from capture.calibration.led_sphere.mirrored_lights import DERIVATIVE_STEP_MM, mirror_lights
-from capture.calibration.lights.reflection import reflect, reflection_pixels
-from capture.calibration.record import CalibrationError
+from capture.calibration.lights.reflection import (
+    DERIVATIVE_STEP_MM,
+    mirror_lights,
+    reflect,
+    reflection_pixels,
+)
+from capture.calibration.record import CalibrationError, freeze_arrays
 from capture.calibration.robust import HUBER_SIGMAS, mad_sigma
 
 SPOT_DETECTION_SIGMAS = 7.0  # of the smoothed image: none of 4 million pixels of noise gets there
@@ -80,16 +84,10 @@ class Ball:
 
     def __post_init__(self) -> None:
         """Convert to float64 and refuse what is no ball."""
-        center = np.array(self.center_mm, np.float64)
-        covariance = np.array(self.covariance_mm2, np.float64)
-        if center.shape != (3,) or not np.isfinite(center).all():
-            raise ValueError(f"Ball.center_mm: got {center.tolist()}, expected three numbers")
+        freeze_arrays(self, (3,), "center_mm")
+        freeze_arrays(self, (4, 4), "covariance_mm2")
         if not 0 < self.radius_mm < np.inf:
             raise ValueError(f"Ball.radius_mm: got {self.radius_mm}, expected > 0")
-        if covariance.shape != (4, 4) or not np.isfinite(covariance).all():
-            raise ValueError(f"Ball.covariance_mm2: got shape {covariance.shape}, expected (4, 4)")
-        object.__setattr__(self, "center_mm", center)
-        object.__setattr__(self, "covariance_mm2", covariance)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,8 +11,8 @@ from capture.calibration.fiber.spot_photometry import Shot, measure_flux
 from capture.calibration.geometry import CameraPose
 from capture.calibration.led_sphere.glass_ball import Ball
 from capture.calibration.led_sphere.lights import SphereFilms, SphereLightTable
-from capture.calibration.led_sphere.mirrored_lights import Mirrored, mirror_lights
 from capture.calibration.led_sphere.polarization import FilmFit, leakage
+from capture.calibration.lights.reflection import Mirrored, mirror_lights
 from capture.calibration.polarization.polarized_reflection import Reflection
 from capture.rig import Rig
 

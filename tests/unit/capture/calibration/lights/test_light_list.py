@@ -141,11 +141,7 @@ def lights_and_highlights(rng, sigma_px, *, views=tuple(CAMERAS), count=20):
             good = np.isfinite(pixels).all(axis=1)
             pixels = pixels[good] + sigma_px * rng.standard_normal((good.sum(), 2))
             order = rng.permutation(len(pixels))
-            seen.append(
-                mirror_lights.Highlights(
-                    view, number, tuple(lights), pixels[order], np.ones(len(order))
-                )
-            )
+            seen.append(mirror_lights.Highlights(view, number, tuple(lights), pixels[order]))
     return lights, true, spheres, seen
 
 
