@@ -291,6 +291,11 @@ class StepSeries:
         return Plan(self._rig.name, tuple(self._steps), limits)
 
 
+def whole(angle_deg: float) -> int | float:
+    """Return an angle as a whole number where it is one."""
+    return int(angle_deg) if float(angle_deg).is_integer() else float(angle_deg)
+
+
 def require(good: bool, name: str, got: object, expected: str) -> None:
     """Raise `PlanError` where an argument of a generator of plans is not as expected."""
     if not good:
