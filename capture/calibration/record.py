@@ -270,13 +270,9 @@ def device_rows(names: Sequence[str], **columns: Column) -> dict[str, dict[str, 
     >>> device_rows(["a", "b"], gain=np.array([1.0, 2.0]))["b"]["gain"].value.tolist()
     2.0
     """
+    parts = {key: c if isinstance(c, tuple) else (c,) for key, c in columns.items()}
     return {
-        name: {
-            key: Quantity(column[0][k], column[1][k])
-            if isinstance(column, tuple)
-            else Quantity(column[k])
-            for key, column in columns.items()
-        }
+        name: {key: Quantity(*(part[k] for part in column)) for key, column in parts.items()}
         for k, name in enumerate(names)
     }
 

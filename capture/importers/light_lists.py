@@ -115,19 +115,9 @@ def _images_in(directory: Path) -> tuple[Path, ...]:
     if listed.is_file():
         names = [line.strip() for line in _text(listed).splitlines() if line.strip()]
         return tuple(_named(name, directory, listed) for name in names)
-    return tuple(
-        sorted(
-            (
-                file
-                for file in directory.iterdir()
-                if file.is_file()
-                and file.suffix.lower() in IMAGE_SUFFIXES
-                and not file.name.startswith(".")
-                and not _is_mask(file)
-            ),
-            key=lambda file: natural(file.name),
-        )
-    )
+    files = (f for f in directory.iterdir() if f.is_file() and not f.name.startswith("."))
+    images = (f for f in files if f.suffix.lower() in IMAGE_SUFFIXES and not _is_mask(f))
+    return tuple(sorted(images, key=lambda file: natural(file.name)))
 
 
 def _is_mask(file: Path) -> bool:

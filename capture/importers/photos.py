@@ -1,6 +1,5 @@
 """A folder of photographs into a closed SESSION/, with everything that had to be assumed."""
 
-import hashlib
 import logging
 import re
 from collections import Counter
@@ -12,9 +11,16 @@ from pathlib import Path
 from capture import raw
 from capture.documents import Fault, InputError
 from capture.importers.images import Encoding, Photo, PhotoError, read_photo
-from capture.importers.imported_session import DISTANCE_MM, imported_session, stand_in_view
+from capture.importers.imported_session import (
+    DISTANCE_MM,
+    imported_session,
+    sha256_of,
+    stand_in_light,
+    stand_in_rig,
+    stand_in_view,
+)
 from capture.plan import Kind, Plan, Step, Value
-from capture.rig import Light, Rig, View
+from capture.rig import Rig, View
 from capture.session import Session, Subject
 
 logger = logging.getLogger(__name__)
@@ -196,9 +202,10 @@ def _inspect(files: Sequence[Path]) -> list[_Entry]:
 
 def _entry(file: Path, photo: Photo) -> _Entry:
     frame = photo.frame
-    sha256 = f"sha256:{hashlib.sha256(file.read_bytes()).hexdigest()}"
     view = stand_in_view(frame, analyser_axis_deg=0.0)
-    return _Entry(file, sha256, photo.encoding, view, frame.exposure_s, frame.iso, photo.notes)
+    return _Entry(
+        file, sha256_of(file), photo.encoding, view, frame.exposure_s, frame.iso, photo.notes
+    )
 
 
 def _rig(
@@ -236,22 +243,9 @@ def _rig(
         )
         for camera, name in names.items()
     )
-    made = Rig(
-        name=IMPORTED_RIG_NAME,
-        lights=(
-            Light(
-                name="unknown",
-                position_mm=(0.0, 0.0, DISTANCE_MM),
-                illuminant=illuminant,
-                polarizer_axis_deg=0.0,
-                energy_ws=1.0,
-                radius_mm=1.0,
-            ),
-        ),
-        views=views,
-        boxes=(),
-        recycle_s=0.0,
-    )
+    place = (0.0, 0.0, DISTANCE_MM)
+    light = stand_in_light("unknown", place, illuminant, polarizer_axis_deg=0.0)
+    made = stand_in_rig(IMPORTED_RIG_NAME, [light], *views)
     return made, [names[entry.camera] for entry in entries]
 
 

@@ -209,9 +209,8 @@ class _Series(StepSeries):
         # the box counts microseconds
         self.dwell_s = round(1e6 / frames_per_s) / 1e6
         most_s = self._limits.max_on_s
-        require(
-            self.dwell_s <= most_s, "frames_per_s", frames_per_s, f"at least {1.0 / most_s:g} 1/s"
-        )
+        slowest = f"at least {1.0 / most_s:g} 1/s"
+        require(self.dwell_s <= most_s, "frames_per_s", frames_per_s, slowest)
         super().__init__(rig, iso=iso, dwell_s=self.dwell_s)
         self._tracking = tracking_lights(rig)
         self._eye = eye_light(rig)
@@ -227,12 +226,9 @@ class _Series(StepSeries):
         require(level * self.dwell_s <= on_s, "level x dwell", level * self.dwell_s, f"<= {on_s}")
         readout_s = max(view.readout_s for view in self._rig.views)
         room_s = self.dwell_s - limits.settle_s - limits.overlap_s
-        require(
-            exposure_s <= room_s and exposure_s + readout_s <= self.dwell_s,
-            "exposure_s",
-            exposure_s,
-            f"to fit with read-out {readout_s:g} s into {self.dwell_s:g} s a light",
-        )
+        fits = exposure_s <= room_s and exposure_s + readout_s <= self.dwell_s
+        expected = f"to fit with read-out {readout_s:g} s into {self.dwell_s:g} s a light"
+        require(fits, "exposure_s", exposure_s, expected)
         self.add(identity, kind, index, exposure_s=float(exposure_s), **settings)
 
     def darks(self, count: int, exposure_s: float, number: int) -> None:

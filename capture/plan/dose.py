@@ -57,12 +57,8 @@ def dose_report(plan: Plan, rig: Rig) -> DoseReport:
     for row in led_rows(plan.steps, rig):
         on_s += row.given(len(rig.lights)) * row.dwell_s
     power_w = np.array([light.power_w or 0.0 for light in rig.lights])
-    radiance = np.array(
-        [
-            radiant_intensity(light) / (math.pi * (light.radius_mm * 1e-3) ** 2)
-            for light in rig.lights
-        ]
-    )
+    area_m2 = [math.pi * (light.radius_mm * 1e-3) ** 2 for light in rig.lights]
+    radiance = np.array([radiant_intensity(light) for light in rig.lights]) / area_m2
     most = int(np.argmax(on_s * power_w))
     return DoseReport(
         led=rig.lights[most].name,

@@ -81,12 +81,8 @@ def eye_light(
         distance_mm = np.linalg.norm(towards, axis=1)
         towards /= distance_mm[:, None]
         off_axis_rad = np.arccos(np.clip((towards * axes).sum(axis=1), -1.0, 1.0))
-        lobe = np.array(
-            [
-                light.intensity(float(angle))
-                for light, angle in zip(rig.lights, off_axis_rad, strict=True)
-            ]
-        )
+        pairs = zip(rig.lights, off_axis_rad, strict=True)
+        lobe = np.array([light.intensity(float(angle)) for light, angle in pairs])
         cosine = np.clip(-(towards @ np.asarray(facing, np.float64)), 0.0, None)
         total += on_axis * lobe * cosine / (distance_mm * 1e-3) ** 2
     return total / len(eyes_mm)

@@ -292,12 +292,9 @@ class _Series(StepSeries):
         readout_s = max(view.readout_s for view in rig.views)
         lag_s = max(view.shutter_lag_s for view in rig.views)
         room_s = dwell_s - limits.settle_s - limits.overlap_s - lag_s
-        require(
-            0 < exposure_s <= room_s and exposure_s + readout_s + lag_s <= dwell_s,
-            "exposure_s",
-            exposure_s,
-            f"to fit with read-out {readout_s:g} s into {dwell_s:g} s a pattern",
-        )
+        fits = 0 < exposure_s <= room_s and exposure_s + readout_s + lag_s <= dwell_s
+        expected = f"to fit with read-out {readout_s:g} s into {dwell_s:g} s a pattern"
+        require(fits, "exposure_s", exposure_s, expected)
         super().__init__(rig, exposure_s=float(exposure_s), dwell_s=float(dwell_s), iso=iso)
         self._limits = limits
 
@@ -315,12 +312,9 @@ class _Series(StepSeries):
             if key not in judged:
                 judged[key] = scan_duty(piece, self._rig)
         most = max(judged.values(), default=0.0)
-        require(
-            most <= limits.max_duty,
-            "duty",
-            f"{most:.3f} over {limits.duty_window_s:g} s",
-            f"at most {limits.max_duty:g}: less level, shorter light or fewer patterns",
-        )
+        got = f"{most:.3f} over {limits.duty_window_s:g} s"
+        expected = f"at most {limits.max_duty:g}: less level, shorter light or fewer patterns"
+        require(most <= limits.max_duty, "duty", got, expected)
         return self.plan_within(
             max_duty=limits.max_duty, max_on_s=limits.max_on_s, dose_ws=limits.dose_ws
         )

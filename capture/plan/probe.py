@@ -226,12 +226,8 @@ class _Series(StepSeries):
         require(step_ev > 0, "step_ev", step_ev, "stops > 0")
         readout_s = max(view.readout_s for view in rig.views)
         most_s = min(probe.max_open_s, probe.max_suction_s - probe.settle_s - readout_s)
-        require(
-            0 < longest_s <= most_s,
-            "longest_s",
-            longest_s,
-            f"<= {most_s:g}, which one suction of {probe.max_suction_s:g} s has room for",
-        )
+        room = f"<= {most_s:g}, which one suction of {probe.max_suction_s:g} s has room for"
+        require(0 < longest_s <= most_s, "longest_s", longest_s, room)
         require(0 < level <= 1, "level", level, "0 < level <= 1")
         self._exposures_s = exposure_series_s(brackets, longest_s=longest_s, step_ev=step_ev)
         super().__init__(rig, level=float(level), iso=iso)

@@ -23,23 +23,9 @@ from capture.rig import ID_RULE, Rig, is_id
 
 Value = str | int | float | bool
 Index = Mapping[str, str | int | float]
-Kind = Literal[
-    "dark",
-    "flat",
-    "chart",
-    "malus",
-    "subject",
-    "olat",
-    "tracking",
-    "charuco",
-    "mirror",
-    "white",
-    "gradient",
-    "ball",
-    "fibres",
-    "phantom",
-    "mask",
-]
+FlashKind = Literal["dark", "flat", "chart", "malus", "subject"]
+DomeKind = Literal["olat", "tracking", "charuco", "mirror", "white"]
+Kind = Literal[FlashKind, DomeKind, "gradient", "ball", "fibres", "phantom", "mask"]
 Polarizer = Literal["parallel", "crossed"]
 
 Pattern = Literal["full", "x", "y", "z", "-x", "-y", "-z", "dark"]

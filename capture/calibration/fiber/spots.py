@@ -247,20 +247,13 @@ def _table(
     found = np.array([fit is not None for fit in best])
     fits = [fit for fit in best if fit is not None]
     size, edge = (float(np.median([fit[0][k] for fit in fits])) for k in (2, 3))
-    scatter = float(
-        np.median(
-            [np.hypot(*(fit[0][:2] - model[i])) for i, fit in enumerate(best) if fit is not None]
-        )
-    )
+    off = [np.hypot(*(fit[0][:2] - model[i])) for i, fit in enumerate(best) if fit is not None]
+    scatter = max(float(np.median(off)), 0.1)
     value = np.array(
         [[*model[i], size, edge] if fit is None else fit[0] for i, fit in enumerate(best)]
     )
-    error = np.array(
-        [
-            [max(scatter, 0.1), max(scatter, 0.1), 0.1 * size, 0.0] if fit is None else fit[1]
-            for fit in best
-        ]
-    )
+    unknown = [scatter, scatter, 0.1 * size, 0.0]
+    error = np.array([unknown if fit is None else fit[1] for fit in best])
     radius = np.where(found, value[:, 2], size)
     pitch = _pitch(value[:, :2])
     reach = size + APERTURE_EDGE_WIDTHS * edge
@@ -275,17 +268,11 @@ def _table(
         )
     shift = (value[found, :2] - nominal[found]).mean(axis=0)
     turn = np.polyfit(value[found, 0], value[found, 1] - nominal[found, 1], 1)[0]
+    centers, radii = (value[:, :2], error[:, :2]), (radius, error[:, 2])
+    moved = float(shift[0]), float(shift[1])
+    turned = float(np.arctan(turn))
     table = FiberSpots(
-        tuple(names),
-        value[:, :2],
-        error[:, :2],
-        radius,
-        error[:, 2],
-        value[:, 3],
-        found,
-        float(aperture),
-        (float(shift[0]), float(shift[1])),
-        float(np.arctan(turn)),
+        tuple(names), *centers, *radii, value[:, 3], found, float(aperture), moved, turned
     )
     for i in np.flatnonzero(table.overlapping).tolist():
         gaps = np.linalg.norm(table.center_px - table.center_px[i], axis=1)

@@ -125,14 +125,8 @@ def place_board(
                 camera.rotation.T @ local,
                 camera.rotation.T @ (np.ravel(shift) - camera.translation_mm),
             )
-            misfit = np.concatenate(
-                [
-                    np.minimum(
-                        np.nan_to_num(gaps_px(cameras[other], place, board, s), nan=1e3), 100.0
-                    )
-                    for other, s in seen.items()
-                ]
-            )
+            gaps = [gaps_px(cameras[other], place, board, s) for other, s in seen.items()]
+            misfit = np.minimum(np.nan_to_num(np.concatenate(gaps), nan=1e3), 100.0)
             if best is None or misfit.sum() < best[0]:
                 best = float(misfit.sum()), place
     if best is None:

@@ -92,21 +92,10 @@ class CameraPose:
         """
         right, up, back = (np.array(axis) for axis in view.axes)
         rotation = np.stack([right, -up, -back])
-        matrix = np.array(
-            [
-                [view.focal_px, 0.0, (view.width_px - 1) / 2],
-                [0.0, view.focal_px, (view.height_px - 1) / 2],
-                [0.0, 0.0, 1.0],
-            ]
-        )
-        return cls(
-            view.serial,
-            matrix,
-            np.zeros(5),
-            rotation,
-            -rotation @ np.array(view.position_mm),
-            (view.width_px, view.height_px),
-        )
+        matrix = np.diag([view.focal_px, view.focal_px, 1.0])
+        matrix[:2, 2] = (view.width_px - 1) / 2, (view.height_px - 1) / 2
+        shift, size = -rotation @ np.array(view.position_mm), (view.width_px, view.height_px)
+        return cls(view.serial, matrix, np.zeros(5), rotation, shift, size)
 
     @property
     def center_mm(self) -> Float64Array:
@@ -195,13 +184,9 @@ def distort(xy: ArrayLike, distortion: ArrayLike) -> Float64Array:
     x, y = points[..., 0], points[..., 1]
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return np.stack(
-        [
-            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-        ],
-        axis=-1,
-    )
+    bent_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    bent_y = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    return np.stack([bent_x, bent_y], axis=-1)
 
 
 def nominal_cameras(rig: Rig) -> dict[str, CameraPose]:

@@ -266,17 +266,10 @@ def light_directions(
 
     place = np.append(ball.center_mm, ball.radius_mm)
     direction = direct(pixels, place)
-    by_pixel = np.stack(
-        [(direct(pixels + h, place) - direct(pixels - h, place)) / 0.02 for h in 0.01 * np.eye(2)],
-        axis=-1,
-    )
-    by_place = np.stack(
-        [
-            (direct(pixels, place + h) - direct(pixels, place - h)) / 0.002
-            for h in 0.001 * np.eye(4)
-        ],
-        axis=-1,
-    )
+    moved = [direct(pixels + h, place) - direct(pixels - h, place) for h in 0.01 * np.eye(2)]
+    by_pixel = np.stack(moved, axis=-1) / 0.02
+    moved = [direct(pixels, place + h) - direct(pixels, place - h) for h in 0.001 * np.eye(4)]
+    by_place = np.stack(moved, axis=-1) / 0.002
     covariance = pixel_stderr[:, None, None] ** 2 * (by_pixel @ by_pixel.transpose(0, 2, 1))
     covariance = covariance + by_place @ ball.covariance_mm2 @ by_place.transpose(0, 2, 1)
     return LightDirections(direction, covariance)
@@ -346,14 +339,11 @@ def _refine(
                 f"ball: only {len(used)} spots fit the lights' pattern, expected {MIN_SPOTS} or"
                 " more; check the target, its radius and the exposure"
             )
-        slopes = []
-        for h in DERIVATIVE_STEP_MM * np.eye(4):
-            ends = [
-                reflection_pixels(camera, at[:3], float(at[3]), lights[used])
-                for at in (place + h, place - h)
-            ]
-            slopes.append((ends[0] - ends[1]) / (2 * DERIVATIVE_STEP_MM))
-        slope = np.stack(slopes, axis=-1)
+        steps = DERIVATIVE_STEP_MM * np.eye(4)
+        at = np.concatenate([place + steps, place - steps])
+        ends = [reflection_pixels(camera, x[:3], float(x[3]), lights[used]) for x in at]
+        slope = np.stack(ends[:4], axis=-1) - np.stack(ends[4:], axis=-1)
+        slope /= 2 * DERIVATIVE_STEP_MM
         miss = found[spot[used]] - seen.pixels[used]
         moved = seen.px_per_mm[used]
         noise = noise_px**2 * np.eye(2)

@@ -86,16 +86,11 @@ class SphereLightTable:
         strength = np.array([light.power_w or 0.0 for light in rig.lights])
         strength = strength / np.sum(place**2, axis=1)
         n = len(rig.lights)
-        return cls(
-            tuple(light.name for light in rig.lights),
-            place / np.linalg.norm(place, axis=1, keepdims=True),
-            np.zeros((n, 3)),
-            strength / strength.mean(),
-            np.zeros(n),
-            np.zeros(n, bool),
-            np.zeros(n, bool),
-            np.zeros(n, bool),
-        )
+        names = tuple(light.name for light in rig.lights)
+        directions = place / np.linalg.norm(place, axis=1, keepdims=True)
+        flags = [np.zeros(n, bool)] * 3
+        strengths = strength / strength.mean()
+        return cls(names, directions, np.zeros((n, 3)), strengths, np.zeros(n), *flags)
 
     def to_calibration(
         self, *, ball: Mapping[str, Quantity] | None = None, **about: Unpack[Origin]

@@ -153,15 +153,8 @@ def leakage(fit: FilmFit, reflection: Reflection) -> tuple[Float64Array, Float64
         it is a square, and errors of angles of either sign add to it.
     """
     count = len(fit.turn_rad)
-    at = np.stack(
-        [
-            fit.turn_rad,
-            np.full(count, fit.zero_rad),
-            np.full(count, np.log(fit.light_leak)),
-            np.full(count, np.log(fit.analyser_leak)),
-        ],
-        axis=-1,
-    )
+    shared = (fit.zero_rad, np.log(fit.light_leak), np.log(fit.analyser_leak))
+    at = np.stack([fit.turn_rad, *(np.full(count, x) for x in shared)], axis=-1)
     root = np.linalg.cholesky(fit.covariance + 1e-18 * np.eye(4))
     values = []
     # cubature of third degree: 2 n points at sqrt(n) standard deviations

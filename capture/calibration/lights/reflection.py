@@ -170,14 +170,9 @@ def mirror_lights(
         step = DERIVATIVE_STEP_MM * across[:, j]
         ends = [reflection_pixels(camera, center_mm, radius_mm, lights + s * step) for s in (1, -1)]
         columns.append((ends[0] - ends[1]) / (2 * DERIVATIVE_STEP_MM))
-    return Mirrored(
-        np.where(seen[:, None], camera.project(point), np.nan),
-        to_light,
-        to_camera,
-        (point - centers) / radius_mm,
-        np.stack(columns, axis=-1),
-        across,
-    )
+    pixels = np.where(seen[:, None], camera.project(point), np.nan)
+    normal, by_mm = (point - centers) / radius_mm, np.stack(columns, axis=-1)
+    return Mirrored(pixels, to_light, to_camera, normal, by_mm, across)
 
 
 def _unit(vectors: Float64Array) -> Float64Array:

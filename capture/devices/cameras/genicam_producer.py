@@ -21,17 +21,11 @@ PRODUCER_PATH_VARIABLE = "GENICAM_GENTL64_PATH"
 """Variable that lists the folders of producers (GenTL 1.6, section 3.3)."""
 
 # what a camera answers to a wrong request; anything else means that it does not answer
-_REFUSAL_ERRORS = (
-    "AccessException",
-    "OutOfRangeException",
-    "InvalidArgumentException",
-    "LogicalErrorException",
-    "PropertyException",
-    "InvalidParameterException",
-    "InvalidValueException",
-    "NotImplementedException",
-    "NotAvailableException",
+_REFUSALS = (
+    "Access OutOfRange InvalidArgument LogicalError Property InvalidParameter InvalidValue"
+    " NotImplemented NotAvailable"
 )
+_REFUSAL_ERRORS = tuple(f"{name}Exception" for name in _REFUSALS.split())
 _BUSY_ERRORS = ("AccessDeniedException", "ResourceInUseException", "BusyException")
 
 # the library logs what it then raises, with a traceback; the error says it once
