@@ -138,14 +138,8 @@ def import_light_list(
             session.attach("mask.png", _mask_png(where_mask, first.frame))
         for step, file in zip(steps, found.pictures, strict=True):
             _commit(session, step, file, clock, as_linear=as_linear)
-    return ImportedStack(
-        str(target),
-        len(steps),
-        f"{found.file} ({found.kind})",
-        shown,
-        where_mask.name if where_mask else "",
-        assumed,
-    )
+    listed, masked = f"{found.file} ({found.kind})", where_mask.name if where_mask else ""
+    return ImportedStack(str(target), len(steps), listed, shown, masked, assumed)
 
 
 def _pixels_of(frame: raw.RawFrame) -> tuple[int, int]:

@@ -132,27 +132,16 @@ def import_photos(
     steps = _steps(entries, views, kind)
     assumed = _assumptions(entries, made_up=rig is None, light=light, camera=used.views[0])
     plan = Plan(used.name, tuple(step for step, _ in steps))
-    extra = {
-        "assumed": assumed,
-        "photographs": [
-            {"step": step.id, "sha256": entry.sha256, "encoding": entry.encoding}
-            for step, entry in steps
-        ],
-    }
+    listed = [{"step": s.id, "sha256": e.sha256, "encoding": e.encoding} for s, e in steps]
+    extra = {"assumed": assumed, "photographs": listed}
     target = Path(out)
     with imported_session(target, plan, used, subject, extra, clock) as session:
         for step, entry in steps:
             _commit(session, step, entry, clock)
     states = tuple(dict.fromkeys(str(step.index["state"]) for step, _ in steps))
     color = {str(step.index["state"]) for step, entry in steps if entry.view.cfa != "MONO"}
-    return Imported(
-        str(target),
-        len(steps),
-        assumed,
-        states,
-        tuple(ignored),
-        tuple(state for state in states if state in color),
-    )
+    colored = tuple(state for state in states if state in color)
+    return Imported(str(target), len(steps), assumed, states, tuple(ignored), colored)
 
 
 def _files(directory: Path) -> tuple[list[Path], list[str]]:

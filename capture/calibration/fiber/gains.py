@@ -90,14 +90,7 @@ def calibrate_fibers(
     )
     offsets = ("offset", "offset_stderr", "offset_common")
     mixed = replace(mixed, **{name: getattr(mixed, name) / level for name in offsets})
-    return FiberCalibration(
-        spots,
-        np.asarray(radius_mm, np.float64),
-        np.where(valid, gain / level, 0.0),
-        np.where(valid, relative * gain / level, 0.0),
-        expected.common,
-        light / level,
-        mixed,
-        valid,
-        dead,
-    )
+    errors = np.where(valid, relative * gain / level, 0.0), expected.common
+    gain = np.where(valid, gain / level, 0.0)
+    radius = np.asarray(radius_mm, np.float64)
+    return FiberCalibration(spots, radius, gain, *errors, light / level, mixed, valid, dead)

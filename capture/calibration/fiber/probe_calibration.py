@@ -270,32 +270,17 @@ class FiberCalibration:
             return calibration.quantity(serial, name).value
 
         shift, leak = camera("row_shift_px"), calibration.quantity(serial, "cover_leak")
-        return cls(
-            FiberSpots(
-                table.names,
-                *table.both("spot_px"),
-                *table.both("spot_radius_px"),
-                table.values("spot_edge_px"),
-                table.flags("found"),
-                float(camera("aperture_px")),
-                (float(shift[0]), float(shift[1])),
-                float(camera("row_rotation_rad")),
-            ),
-            table.values("radius_mm"),
-            *table.both("gain"),
-            table.values("gain_common").transpose(1, 0, 2),
-            table.values("phantom_light"),
-            CrossTalk(
-                *table.both("crosstalk"),
-                *table.both("stray"),
-                table.values("stray_common"),
-                bool(camera("crosstalk_measured")),
-                float(leak.value),
-                float(leak.known_stderr),
-            ),
-            table.flags("valid"),
-            table.flags("dead"),
-        )
+        discs = *table.both("spot_px"), *table.both("spot_radius_px"), table.values("spot_edge_px")
+        moved = float(shift[0]), float(shift[1])
+        aperture_px, turned = float(camera("aperture_px")), float(camera("row_rotation_rad"))
+        spots = FiberSpots(table.names, *discs, table.flags("found"), aperture_px, moved, turned)
+        mixing = *table.both("crosstalk"), *table.both("stray"), table.values("stray_common")
+        leaks = float(leak.value), float(leak.known_stderr)
+        mixed = CrossTalk(*mixing, bool(camera("crosstalk_measured")), *leaks)
+        gains = *table.both("gain"), table.values("gain_common").transpose(1, 0, 2)
+        flags = table.flags("valid"), table.flags("dead")
+        light = table.values("phantom_light")
+        return cls(spots, table.values("radius_mm"), *gains, light, mixed, *flags)
 
     @classmethod
     def load(

@@ -153,7 +153,6 @@ def film_table(
     lights: SphereLightTable, films: FilmFit, skin: Reflection, rates: Rates, eta: float
 ) -> SphereFilms:
     """Return the films of the lights, with their leakage and the ratio of crossed to parallel."""
-    leaked, leaked_stderr = leakage(films, skin)
     usable = rates.good & rates.fluxed
     weight = np.where(usable, 1.0 / np.where(rates.variance > 0, rates.variance, 1.0), 0.0)
     states = []
@@ -172,20 +171,9 @@ def film_table(
     upward = lights.directions[:, 1]
     horizon = np.linalg.norm(lights.directions_stderr, axis=1) / np.sqrt(2)
     horizon = horizon * np.abs(upward) / np.sqrt(np.maximum(1.0 - upward**2, 1e-6))
+    turns = films.turn_rad, np.hypot(films.turn_stderr_rad, horizon)
+    zero = films.zero_rad, films.zero_stderr_rad
+    leaks = films.light_leak, light_error, films.analyser_leak, analyser_error
     return SphereFilms(
-        lights.names,
-        leaked,
-        leaked_stderr,
-        ratio,
-        ratio_stderr,
-        films.turn_rad,
-        np.hypot(films.turn_stderr_rad, horizon),
-        seen,
-        films.zero_rad,
-        films.zero_stderr_rad,
-        films.light_leak,
-        light_error,
-        films.analyser_leak,
-        analyser_error,
-        eta,
+        lights.names, *leakage(films, skin), ratio, ratio_stderr, *turns, seen, *zero, *leaks, eta
     )

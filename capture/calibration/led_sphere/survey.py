@@ -212,15 +212,10 @@ def survey_sphere(
     lights = _light_table(rig, seen, rates.fluxed, strength)
     toward = np.tile(camera.center_mm / np.linalg.norm(camera.center_mm), (len(place), 1))
     skin = scene.reflection(eta, direction, toward, direction)
-    result = SphereSurvey(
-        lights,
-        film_table(lights, films, skin, rates, eta),
-        fit.ball,
-        fit.light_scatter_mm,
-        films.turn_scatter_rad,
-        tuple(sorted(set(rates.readings_deg.tolist()))),
-        (),
-    )
+    table = film_table(lights, films, skin, rates, eta)
+    scatters = fit.light_scatter_mm, films.turn_scatter_rad
+    readings = tuple(sorted(set(rates.readings_deg.tolist())))
+    result = SphereSurvey(lights, table, fit.ball, *scatters, readings, ())
     in_field = fit.in_field & (rates.good.any(axis=0) | rates.saturated)
     stray = _bright_strays(seen, scene.pixel_mm)
     told = describe_findings(result, place, in_field, rates.saturated, films, stray)
@@ -332,16 +327,10 @@ def _light_table(
     certain = stderr < MAX_INTENSITY_STDERR * np.maximum(intensity, MAX_DEAD_INTENSITY)
     dead = fluxed & (intensity + 2 * stderr < MAX_DEAD_INTENSITY)
     valid = dead | (fluxed & seen.measured & certain)
-    return SphereLightTable(
-        tuple(light.name for light in rig.lights),
-        seen.direction,
-        seen.stderr,
-        np.where(valid, intensity, 1.0),
-        np.where(valid, stderr, np.std(intensity[lit])),
-        seen.measured,
-        valid,
-        dead,
-    )
+    names = tuple(light.name for light in rig.lights)
+    shown = np.where(valid, intensity, 1.0), np.where(valid, stderr, np.std(intensity[lit]))
+    flags = seen.measured, valid, dead
+    return SphereLightTable(names, seen.direction, seen.stderr, *shown, *flags)
 
 
 def _bright_strays(seen: _SeenLights, pixel_mm: float) -> int:

@@ -232,20 +232,12 @@ class _Fit:
         size = np.array(self.cameras[row.view].image_size, float)
         r2 = np.sum((row.pixels - (size - 1) / 2) ** 2, axis=1) / np.sum((size / 2) ** 2)
         toward = to_light[good] / distance[good, None]
-        self.frames.append(
-            _Frame(
-                light,
-                row.view,
-                pose,
-                row.part[good],
-                toward @ row.rotation[:, :2] / cosine[good, None],
-                np.log(self.plate.reflectance * cosine[good] / distance[good] ** 2),
-                -toward,
-                r2[good],
-                np.log((row.signal / row.on_s)[good]),
-                row.variance[good] / row.signal[good] ** 2 + PART_STDERR**2,
-            )
-        )
+        turns = toward @ row.rotation[:, :2] / cosine[good, None]
+        known = np.log(self.plate.reflectance * cosine[good] / distance[good] ** 2)
+        relative = row.variance[good] / row.signal[good] ** 2 + PART_STDERR**2
+        place = turns, known, -toward, r2[good]
+        seen = np.log((row.signal / row.on_s)[good]), relative
+        self.frames.append(_Frame(light, row.view, pose, row.part[good], *place, *seen))
 
     def solve(self, dead: tuple[str, ...], answers: dict[str, str]) -> LightFit:
         """Return the fit; `dead` and `answers` are of `check_order`."""
@@ -363,19 +355,13 @@ class _Fit:
                 responses[self.cameras[view].serial] = CameraResponse(
                     gain, mine[3:].copy(), gain * error[:3], error[3:].copy()
                 )
-        found = LightTable(
-            table.position_mm,
-            intensity,
-            np.clip(np.where(seen, rows[:, 3], table.exponent), 0.0, None),
-            table.names,
-            np.array([self._tilted(k, tilts[k])[0] for k in range(lights)]),
-            table.valid & seen,
-            table.position_stderr_mm,
-            intensity * row_errors[:, :3],
-            np.where(seen, row_errors[:, 3], 0.0),
-            responses,
-        )
-        return found, seen
+        exponent = np.clip(np.where(seen, rows[:, 3], table.exponent), 0.0, None)
+        axis = np.array([self._tilted(k, tilts[k])[0] for k in range(lights)])
+        found = table.position_mm, intensity, exponent
+        own_errors = intensity * row_errors[:, :3], np.where(seen, row_errors[:, 3], 0.0)
+        stderrs = table.position_stderr_mm, *own_errors
+        valid = table.valid & seen
+        return LightTable(*found, table.names, axis, valid, *stderrs, responses), seen
 
 
 def _shapes(table: LightTable, points: Float64Array, normals: Float64Array) -> Float64Array:

@@ -5,7 +5,7 @@ color, with standard errors; see `capture.calibration.sensor.transfer_curve` for
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Unpack
 
 import numpy as np
@@ -167,17 +167,7 @@ class SensorCalibration:
         )
 
 
-_PER_COLOR = (
-    "black_dn",
-    "gain_e_per_dn",
-    "read_noise_e",
-    "saturation_dn",
-    "full_well_e",
-    "nonlinearity",
-    "linearity_deviation",
-    "prnu",
-    "dsnu_dn",
-)
+_PER_COLOR = tuple(field.name for field in fields(SensorCalibration) if field.type is Quantity)
 
 
 def photon_transfer(
