@@ -6,7 +6,6 @@ with analytic derivatives; what the workshop guarantees of a lens enters as a we
 camera that saw few boards keeps a sensible lens.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import cv2
@@ -27,8 +26,10 @@ from capture.calibration.geometry.bundle_equations import (
     Bundle,
     BundleError,
     BundleProblem,
+    Cameras,
     Gauge,
     LensPrior,
+    Places,
     Sightings,
 )
 from capture.calibration.geometry.intrinsics import CameraPose
@@ -42,7 +43,7 @@ MIN_SHARED_POSES = 2  # places that a camera must share with others
 def adjust(
     sightings: Sightings,
     board: Board,
-    start: Mapping[str, CameraPose],
+    start: Cameras,
     *,
     gauge: Gauge = "board",
     prior: LensPrior | None = None,
@@ -99,9 +100,7 @@ def adjust(
     return problem.judged(cameras, places)
 
 
-def place_board(
-    sightings: Sightings, board: Target, cameras: Mapping[str, CameraPose], pose: int
-) -> BoardPose:
+def place_board(sightings: Sightings, board: Target, cameras: Cameras, pose: int) -> BoardPose:
     """Return where the board stood, from all its images, with the cameras as given.
 
     Each image alone gives a guess; the one that suits all images best is refined on all of them.
@@ -138,7 +137,7 @@ def place_board(
     return places[pose]
 
 
-def _check_shared(sightings: Sightings, cameras: Mapping[str, CameraPose], gauge: Gauge) -> None:
+def _check_shared(sightings: Sightings, cameras: Cameras, gauge: Gauge) -> None:
     """Refuse cameras that nothing ties to the others."""
     poses = {name: {p for n, p in sightings if n == name} for name in cameras}
     unknown = sorted({name for name, _ in sightings} - set(cameras))
@@ -217,7 +216,7 @@ class MovedCamera:
 def find_moved(
     sightings: Sightings,
     board: Board,
-    previous: Mapping[str, CameraPose],
+    previous: Cameras,
     *,
     ratio: float = 4.0,
     least_px: float = 0.3,
@@ -275,12 +274,7 @@ def find_moved(
 
 
 def _agreement(
-    sightings: Sightings,
-    board: Board,
-    cameras: Mapping[str, CameraPose],
-    names: list[str],
-    *,
-    without: str,
+    sightings: Sightings, board: Board, cameras: Cameras, names: list[str], *, without: str
 ) -> tuple[float, float, dict[int, BoardPose]]:
     """Return the residual of all cameras but one, that one's own, and the boards' places."""
     rest = {k: s for k, s in sightings.items() if k[0] in names and k[0] != without}
@@ -302,9 +296,7 @@ def _agreement(
     )
 
 
-def _resection(
-    images: Sightings, board: Board, camera: CameraPose, places: Mapping[int, BoardPose]
-) -> CameraPose:
+def _resection(images: Sightings, board: Board, camera: CameraPose, places: Places) -> CameraPose:
     """Return a camera's new place from boards whose places are known; the lens is kept."""
     points = np.concatenate(
         [places[p].to_rig(board.points_mm[s.ids]) for (_, p), s in images.items()]
