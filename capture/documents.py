@@ -16,7 +16,7 @@ from dataclasses import fields as dataclass_fields
 from datetime import date
 from functools import cache
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, ClassVar, NoReturn, Self, TypeVar
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
@@ -31,6 +31,17 @@ _SI_UNITS: tuple[dict[str, float], ...] = (
     {"deg": math.pi / 180.0, "rad": 1.0},
     {"mws": 1e-3, "ws": 1.0, "j": 1.0, "kj": 1e3},
 )
+
+
+class Document:
+    """Base of dataclasses that stand in files: no unknown keys, no conversions, finite numbers."""
+
+    __slots__ = ()
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields as `json` writes them; see `table_of`."""
+        return table_of(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +85,13 @@ class InputError(ValueError):
         head = f"{where}: {what}" if where else what
         listed = "".join(f"\n  {fault}" for fault in self.faults)
         super().__init__(head + listed + (f"\n  {advice}" if advice else ""))
+
+    @classmethod
+    def at(
+        cls, what: str, path: str, got: str, expected: str, *, where: object = "", advice: str = ""
+    ) -> Self:
+        """Return the error of one fault, at a path in a document or file."""
+        return cls(what, where=str(where), faults=[Fault(path, got, expected)], advice=advice)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Keep the parts when the error travels between processes."""

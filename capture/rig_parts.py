@@ -3,11 +3,8 @@
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
-from pydantic import ConfigDict
-
-from capture.documents import STRICT_CONFIG, Checks, InputError
+from capture.documents import Checks, Document, InputError
 
 Vector = tuple[float, float, float]
 
@@ -33,14 +30,12 @@ def is_id(text: str) -> bool:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Light:
+class Light(Document):
     """One light of the rig: a flash, which gives its energy in one pop, or an LED.
 
     Angles of axes are measured in the plane across the light's beam from the horizontal (+x of a
     camera at +z) towards +y, in degrees. A light points at the rig's origin.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     name: str
     position_mm: Vector
@@ -76,6 +71,13 @@ class Light:
         checks.positive(radius_mm=self.radius_mm, **given)
         checks.close()
 
+    @property
+    def lobe_exponent(self) -> float:
+        """Power of the cosine off its axis by which the light falls off; 0 where even."""
+        if self.half_intensity_deg is None:
+            return 0.0
+        return math.log(0.5) / math.log(math.cos(math.radians(self.half_intensity_deg)))
+
     def intensity(self, off_axis_rad: float) -> float:
         """Return the intensity ``off_axis_rad`` off the light's axis over that on it, 0 to 1.
 
@@ -88,18 +90,15 @@ class Light:
         """
         if self.half_intensity_deg is None:
             return 1.0
-        exponent = math.log(0.5) / math.log(math.cos(math.radians(self.half_intensity_deg)))
-        return max(math.cos(off_axis_rad), 0.0) ** exponent
+        return max(math.cos(off_axis_rad), 0.0) ** self.lobe_exponent
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LedLimits:
+class LedLimits(Document):
     """What LEDs may do near eyes and skin, and what their driver can; a box may allow less.
 
     The numbers are this project's nominal ones, not a certificate: an assembled dome is measured.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     max_on_s: float = 0.5
     """Longest time an LED stays on for one command or row, s, > 0."""
@@ -141,13 +140,11 @@ class LedLimits:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Caliper:
+class Caliper(Document):
     """A caliper whose jaws are taped to the skin, and stretch or compress what lies between.
 
     How much force it may use is no property of the rig: who captures must say it.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     aperture_mm: float
     """Distance of the jaws at step 0, mm, > 0."""
@@ -193,10 +190,8 @@ class Caliper:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fiber:
+class Fiber(Document):
     """One detection fibre of a contact probe, from the head's face to its end before the camera."""
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     name: str
     position_mm: tuple[float, float]
@@ -224,14 +219,12 @@ class Fiber:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Probe:
+class Probe(Document):
     """A contact probe: one source fibre and a line of detection fibres, held on by suction.
 
     The rig's one light is what comes out of the source fibre, at the origin of the rig's frame;
     +x is along the line of fibres and +z out of the skin.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     fibres: tuple[Fiber, ...]
     """By growing distance from the source."""

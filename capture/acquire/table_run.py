@@ -5,14 +5,177 @@ asked for it. Afterwards the frames are gathered and matched to rows by time.
 """
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
-from capture.acquire.frame_stream import FrameStream, compare_clocks
+import numpy as np
+
 from capture.acquire.frames import frame_timeout_s, wanted_exposure
 from capture.acquire.outcome import CaptureRun
-from capture.devices.camera import Frame, Trigger
+from capture.devices.camera import (
+    Camera,
+    CameraError,
+    Exposure,
+    Frame,
+    FrameRefused,
+    FrameTimeout,
+    Trigger,
+    check_frame,
+)
 from capture.devices.led_box import LedBox
 from capture.plan import Step
+
+N_CLOCK_READINGS = 8
+CLOCK_DRIFT_S_PER_S = 2e-4
+"""How far a camera's clock may run away, s per s."""
+MAX_ROW_TIME_DEVIATION = 0.25
+"""Most deviation of a frame from its row's time, of the shortest row."""
+
+
+@dataclass(frozen=True, slots=True)
+class _ClockOffset:
+    """A camera's clock against the box's."""
+
+    offset_s: float
+    """Camera time less box time, s."""
+    uncertainty_s: float
+    """Half the time that the comparison took, s."""
+    box_s: float
+    """Box time of the comparison, s."""
+
+
+def compare_clocks(camera: Camera, box_clock_s: Callable[[], float]) -> _ClockOffset:
+    """Return a camera's clock against the box's: the best of a few comparisons."""
+    best = _ClockOffset(0.0, float("inf"), 0.0)
+    for _ in range(N_CLOCK_READINGS):
+        before = camera.clock_s()
+        box_s = box_clock_s()
+        after = camera.clock_s()
+        half = 0.5 * (after - before)
+        if half < best.uncertainty_s:
+            best = _ClockOffset(0.5 * (before + after) - box_s, half, box_s)
+        if best.uncertainty_s < 2e-3:
+            break
+    return best
+
+
+class FrameStream:
+    """Frames of one camera as they come from a sequence, each given to its row.
+
+    Parameters
+    ----------
+    name
+        Of the view.
+    camera
+        Armed for the sequence, which is over.
+    row_times_s
+        Box time at which each row released the cameras, by row.
+    dwell_s
+        Length of the shortest row, s.
+    clock
+        The camera's clock against the box's.
+    want
+        The exposure that was asked for.
+    lag_s
+        From release to open shutter, s.
+    timeout_s
+        How long the next frame may take, s.
+
+    Raises
+    ------
+    CameraError
+        When the clocks could not be compared well enough to tell rows apart.
+
+    Attributes
+    ----------
+    stale : int
+        Frames dropped because no row of the sequence made them.
+    refused : list of str
+        Why frames were not accepted.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        camera: Camera,
+        *,
+        row_times_s: Mapping[int, float],
+        dwell_s: float,
+        clock: _ClockOffset,
+        want: Exposure,
+        lag_s: float,
+        timeout_s: float,
+    ) -> None:
+        if clock.uncertainty_s > MAX_ROW_TIME_DEVIATION * dwell_s:
+            raise CameraError(
+                f"view {name!r}: the clocks of camera and box could be compared to "
+                f"{1e3 * clock.uncertainty_s:.1f} ms only, too coarse for rows of "
+                f"{1e3 * dwell_s:.1f} ms; take load off this machine, or use slower rows"
+            )
+        self._camera = camera
+        self._rows = sorted(row_times_s)
+        self._times = np.array([row_times_s[row] + lag_s for row in self._rows])
+        self._dwell_s = dwell_s
+        self._clock = clock
+        self._want = want
+        self._timeout_s = timeout_s
+        self._next: tuple[int, Frame] | None = None
+        self._ended = not self._rows
+        self._last_row = -1
+        self.stale = 0
+        self.refused: list[str] = []
+
+    def until(self, row: int) -> dict[int, Frame]:
+        """Return the frames of all rows up to `row` that were not asked for before."""
+        found: dict[int, Frame] = {}
+        while not self._ended:
+            if self._next is None and not self._fetch():
+                continue
+            if self._next is None or self._next[0] > row:
+                break
+            found[self._next[0]] = self._next[1]
+            self._ended = self._next[0] == self._rows[-1]
+            self._next = None
+        return found
+
+    def _fetch(self) -> bool:
+        """Get one more frame; return whether it belongs to a row still to come."""
+        try:
+            frame = self._camera.frame(self._timeout_s)
+        except FrameTimeout as error:
+            self._ended = True
+            self.refused.append(str(error))
+            return False
+        except FrameRefused as error:
+            self.refused.append(str(error))
+            return False
+        row = self._row_of(frame)
+        if row is None or row <= self._last_row:
+            self.stale += 1
+            return False
+        self._last_row = row
+        try:
+            # the row is known by its time; what is left to check is who took it, and how
+            check_frame(
+                frame,
+                self._camera.info,
+                seq=frame.seq,
+                not_before_s=frame.t_start_s,
+                want=self._want,
+            )
+        except FrameRefused as error:
+            self.refused.append(str(error))
+            return False
+        self._next = (row, frame)
+        return True
+
+    def _row_of(self, frame: Frame) -> int | None:
+        box_s = frame.t_start_s - self._clock.offset_s
+        place = int(np.argmin(np.abs(self._times - box_s)))
+        allowed_s = self._clock.uncertainty_s + CLOCK_DRIFT_S_PER_S * abs(box_s - self._clock.box_s)
+        allowed_s = min(allowed_s + 1e-3, MAX_ROW_TIME_DEVIATION * self._dwell_s + 1e-3)
+        return self._rows[place] if abs(self._times[place] - box_s) <= allowed_s else None
+
 
 log = logging.getLogger(__name__)
 

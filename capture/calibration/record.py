@@ -13,6 +13,26 @@ from numpy.typing import NDArray
 from capture.arrays import Float32Array, Float64Array
 from capture.documents import InputError
 
+
+def freeze_arrays(
+    row: Any, shape: tuple[int, ...], *names: str, kind: Any = np.float64, of: str = ""
+) -> None:
+    """Replace fields by read-only copies of the type; refuse another shape or infinite numbers.
+
+    A field that is None becomes zeros.
+    """
+    for name in names:
+        given = getattr(row, name)
+        array = np.array(np.zeros(shape) if given is None else given, dtype=kind)
+        if array.shape != shape or not np.isfinite(array).all():
+            raise ValueError(
+                f"{type(row).__name__}.{name}: got shape {array.shape}, expected finite numbers of"
+                f" shape {shape}{of}"
+            )
+        array.setflags(write=False)
+        object.__setattr__(row, name, array)
+
+
 CALIBRATION_KINDS = ("sensor", "color", "polarization", "white", "geometry", "lights", "fibre")
 DEFAULT_VALIDITY_DAYS = 90
 
@@ -250,13 +270,9 @@ def device_rows(names: Sequence[str], **columns: Column) -> dict[str, dict[str, 
     >>> device_rows(["a", "b"], gain=np.array([1.0, 2.0]))["b"]["gain"].value.tolist()
     2.0
     """
+    parts = {key: c if isinstance(c, tuple) else (c,) for key, c in columns.items()}
     return {
-        name: {
-            key: Quantity(column[0][k], column[1][k])
-            if isinstance(column, tuple)
-            else Quantity(column[k])
-            for key, column in columns.items()
-        }
+        name: {key: Quantity(*(part[k] for part in column)) for key, column in parts.items()}
         for k, name in enumerate(names)
     }
 

@@ -1,6 +1,5 @@
 """Pictures of one object under many lights into a closed SESSION/."""
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -15,10 +14,17 @@ from capture.arrays import Float64Array, FloatArray
 from capture.documents import Fault
 from capture.importers import light_lists
 from capture.importers.images import Photo, PhotoError, read_photo
-from capture.importers.imported_session import DISTANCE_MM, imported_session, stand_in_view
+from capture.importers.imported_session import (
+    DISTANCE_MM,
+    imported_session,
+    sha256_of,
+    stand_in_light,
+    stand_in_rig,
+    stand_in_view,
+)
 from capture.importers.light_lists import LightList, LightListError
 from capture.plan import Plan, Step, Value
-from capture.rig import Light, Rig
+from capture.rig import Rig
 from capture.session import Session, Subject
 
 Encoding = Literal["auto", "sRGB", "linear"]
@@ -92,9 +98,7 @@ def import_light_list(
     """
     clock = now or (lambda: datetime.now(UTC))
     if encoding not in ("auto", "sRGB", "linear"):
-        raise LightListError(
-            "cannot be read so", faults=[Fault("encoding", encoding, "auto, sRGB or linear")]
-        )
+        raise LightListError.at("cannot be read so", "encoding", encoding, "auto, sRGB or linear")
     found = light_lists.find(Path(directory), lights=Path(lights) if lights else None)
     if len(found.pictures) < 3:
         raise LightListError(
@@ -104,9 +108,7 @@ def import_light_list(
         )
     near = mm_per_px is not None
     if mm_per_px is not None and not 0 < mm_per_px < 1e3:
-        raise LightListError(
-            "has no such scale", faults=[Fault("mm_per_px", str(mm_per_px), "0 < mm < 1000")]
-        )
+        raise LightListError.at("has no such scale", "mm_per_px", str(mm_per_px), "0 < mm < 1000")
     where_mask = Path(mask) if mask else light_lists.mask_of(found.pictures[0].parent)
     sampled, first, notes = _sample(found, where_mask)
     as_linear = first.encoding == "sRGB" and (
@@ -126,7 +128,7 @@ def import_light_list(
             "intensity": None if found.intensity is None else found.intensity.tolist(),
         },
         "photographs": [
-            {"step": step.id, "sha256": _sha256(file), "encoding": shown}
+            {"step": step.id, "sha256": sha256_of(file), "encoding": shown}
             for step, file in zip(steps, found.pictures, strict=True)
         ],
     }
@@ -136,14 +138,8 @@ def import_light_list(
             session.attach("mask.png", _mask_png(where_mask, first.frame))
         for step, file in zip(steps, found.pictures, strict=True):
             _commit(session, step, file, clock, as_linear=as_linear)
-    return ImportedStack(
-        str(target),
-        len(steps),
-        f"{found.file} ({found.kind})",
-        shown,
-        where_mask.name if where_mask else "",
-        assumed,
-    )
+    listed, masked = f"{found.file} ({found.kind})", where_mask.name if where_mask else ""
+    return ImportedStack(str(target), len(steps), listed, shown, masked, assumed)
 
 
 def _pixels_of(frame: raw.RawFrame) -> tuple[int, int]:
@@ -161,10 +157,6 @@ def _encode_srgb(linear: FloatArray) -> FloatArray:
     [0.0, 0.5, 1.0]
     """
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-
-
-def _sha256(file: Path) -> str:
-    return f"sha256:{hashlib.sha256(file.read_bytes()).hexdigest()}"
 
 
 def _sample(found: LightList, mask: Path | None) -> tuple[Float64Array, Photo, dict[str, None]]:
@@ -243,21 +235,12 @@ def _assumed(
 
 def _rig(found: LightList, frame: raw.RawFrame, *, near: bool) -> Rig:
     positions = found.vectors if near else DISTANCE_MM * found.directions
-    return Rig(
-        name=LIGHT_LIST_RIG_NAME,
-        lights=tuple(
-            Light(
-                name=f"L{k:03d}",
-                position_mm=tuple(map(float, position)),  # type: ignore[arg-type]
-                illuminant="D65",
-                energy_ws=1.0,
-                radius_mm=1.0,
-            )
-            for k, position in enumerate(positions)
-        ),
-        views=(stand_in_view(frame, spectral_sensitivity="linear sRGB"),),
-        boxes=(),
-        recycle_s=0.0,
+    lights = [
+        stand_in_light(f"L{k:03d}", (float(x), float(y), float(z)), "D65")
+        for k, (x, y, z) in enumerate(positions)
+    ]
+    return stand_in_rig(
+        LIGHT_LIST_RIG_NAME, lights, stand_in_view(frame, spectral_sensitivity="linear sRGB")
     )
 
 

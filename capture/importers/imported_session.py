@@ -1,8 +1,9 @@
 """The session of imported pictures: appears whole or not at all; its camera is a stand-in."""
 
+import hashlib
 import shutil
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -12,7 +13,7 @@ from capture.documents import Fault
 from capture.importers.images import PhotoError
 from capture.plan import Plan
 from capture.raw import RawFrame
-from capture.rig import Rig, View
+from capture.rig import Light, Rig, Vector, View
 from capture.session import Session, SessionDiskError, Subject
 
 SENSOR_MM = 36.0
@@ -53,6 +54,22 @@ def stand_in_view(frame: RawFrame, **known: Any) -> View:
         "read_noise_e": 10.0,
     }
     return View(**{**about, **known})
+
+
+def stand_in_light(name: str, position_mm: Vector, illuminant: str, **known: Any) -> Light:
+    """Return a light of which nothing but its place and color is known."""
+    about = {"illuminant": illuminant, "energy_ws": 1.0, "radius_mm": 1.0, **known}
+    return Light(name=name, position_mm=position_mm, **about)
+
+
+def stand_in_rig(name: str, lights: Sequence[Light], *views: View) -> Rig:
+    """Return a rig without boxes."""
+    return Rig(name=name, lights=tuple(lights), views=views, boxes=(), recycle_s=0.0)
+
+
+def sha256_of(file: Path) -> str:
+    """Return the digest of a file's bytes, with its algorithm's name before it."""
+    return f"sha256:{hashlib.sha256(file.read_bytes()).hexdigest()}"
 
 
 @contextmanager

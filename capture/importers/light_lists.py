@@ -115,19 +115,9 @@ def _images_in(directory: Path) -> tuple[Path, ...]:
     if listed.is_file():
         names = [line.strip() for line in _text(listed).splitlines() if line.strip()]
         return tuple(_named(name, directory, listed) for name in names)
-    return tuple(
-        sorted(
-            (
-                file
-                for file in directory.iterdir()
-                if file.is_file()
-                and file.suffix.lower() in IMAGE_SUFFIXES
-                and not file.name.startswith(".")
-                and not _is_mask(file)
-            ),
-            key=lambda file: natural(file.name),
-        )
-    )
+    files = (f for f in directory.iterdir() if f.is_file() and not f.name.startswith("."))
+    images = (f for f in files if f.suffix.lower() in IMAGE_SUFFIXES and not _is_mask(f))
+    return tuple(sorted(images, key=lambda file: natural(file.name)))
 
 
 def _is_mask(file: Path) -> bool:
@@ -158,9 +148,7 @@ def read_mask(path: Path, shape: tuple[int, int]) -> BoolArray:
     values = gray(read_photo(path).frame)
     if values.shape != shape:
         got, wanted = f"{values.shape[1]} x {values.shape[0]}", f"{shape[1]} x {shape[0]}"
-        raise LightListError(
-            "does not fit the pictures", where=str(path), faults=[Fault("mask", got, wanted)]
-        )
+        raise LightListError.at("does not fit the pictures", "mask", got, wanted, where=path)
     top = float(values.max())
     if top <= 0:
         raise LightListError("is black", where=str(path), faults=[Fault("mask", "no pixel", "one")])
@@ -256,10 +244,8 @@ def _from_lp(path: Path, directory: Path) -> LightList:
     rows = lines[1:] if count is not None else lines
     if not rows or (count is not None and count != len(rows)) or len(rows) > MAX_LIGHTS:
         expected = "one line a picture" if count is None else f"{count}, as its first line says"
-        raise LightListError(
-            "is no complete light list",
-            where=str(path),
-            faults=[Fault("lines", str(len(rows)), expected)],
+        raise LightListError.at(
+            "is no complete light list", "lines", str(len(rows)), expected, where=path
         )
     pictures, vectors = [], []
     for number, row in enumerate(rows, start=1 if count is None else 2):
@@ -336,10 +322,8 @@ def _from_ball(folder: Path, count: int) -> Float64Array:
     pictures, mask = _images_in(folder), mask_of(folder)
     if len(pictures) != count or mask is None:
         got = f"{len(pictures)} pictures, {'a' if mask else 'no'} mask"
-        raise LightListError(
-            "does not fit the pictures",
-            where=str(folder),
-            faults=[Fault("ball", got, f"{count} pictures and one mask")],
+        raise LightListError.at(
+            "does not fit the pictures", "ball", got, f"{count} pictures and one mask", where=folder
         )
     grays = [gray(read_photo(picture).frame) for picture in pictures]
     try:

@@ -173,14 +173,9 @@ def import_mesh(
         with Session.resume(session) as opened:
             opened.attach(SCAN_FILE, mesh.to_ply(), about=mesh.about)
     width, height, depth = (float(x) for x in np.ptp(mesh.vertices_mm, axis=0))
-    return ImportedMesh(
-        str(out if out is not None else session),
-        len(mesh.vertices_mm),
-        len(mesh.faces),
-        mesh.uv is not None,
-        (width, height, depth),
-        out is not None,
-    )
+    counts, size_mm = (len(mesh.vertices_mm), len(mesh.faces)), (width, height, depth)
+    written = str(out if out is not None else session)
+    return ImportedMesh(written, *counts, mesh.uv is not None, size_mm, out is not None)
 
 
 _Arrays = tuple[Float64Array, Int64Array, Float64Array | None]

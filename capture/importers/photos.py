@@ -1,6 +1,5 @@
 """A folder of photographs into a closed SESSION/, with everything that had to be assumed."""
 
-import hashlib
 import logging
 import re
 from collections import Counter
@@ -12,9 +11,16 @@ from pathlib import Path
 from capture import raw
 from capture.documents import Fault, InputError
 from capture.importers.images import Encoding, Photo, PhotoError, read_photo
-from capture.importers.imported_session import DISTANCE_MM, imported_session, stand_in_view
+from capture.importers.imported_session import (
+    DISTANCE_MM,
+    imported_session,
+    sha256_of,
+    stand_in_light,
+    stand_in_rig,
+    stand_in_view,
+)
 from capture.plan import Kind, Plan, Step, Value
-from capture.rig import Light, Rig, View
+from capture.rig import Rig, View
 from capture.session import Session, Subject
 
 logger = logging.getLogger(__name__)
@@ -126,27 +132,16 @@ def import_photos(
     steps = _steps(entries, views, kind)
     assumed = _assumptions(entries, made_up=rig is None, light=light, camera=used.views[0])
     plan = Plan(used.name, tuple(step for step, _ in steps))
-    extra = {
-        "assumed": assumed,
-        "photographs": [
-            {"step": step.id, "sha256": entry.sha256, "encoding": entry.encoding}
-            for step, entry in steps
-        ],
-    }
+    listed = [{"step": s.id, "sha256": e.sha256, "encoding": e.encoding} for s, e in steps]
+    extra = {"assumed": assumed, "photographs": listed}
     target = Path(out)
     with imported_session(target, plan, used, subject, extra, clock) as session:
         for step, entry in steps:
             _commit(session, step, entry, clock)
     states = tuple(dict.fromkeys(str(step.index["state"]) for step, _ in steps))
     color = {str(step.index["state"]) for step, entry in steps if entry.view.cfa != "MONO"}
-    return Imported(
-        str(target),
-        len(steps),
-        assumed,
-        states,
-        tuple(ignored),
-        tuple(state for state in states if state in color),
-    )
+    colored = tuple(state for state in states if state in color)
+    return Imported(str(target), len(steps), assumed, states, tuple(ignored), colored)
 
 
 def _files(directory: Path) -> tuple[list[Path], list[str]]:
@@ -196,9 +191,10 @@ def _inspect(files: Sequence[Path]) -> list[_Entry]:
 
 def _entry(file: Path, photo: Photo) -> _Entry:
     frame = photo.frame
-    sha256 = f"sha256:{hashlib.sha256(file.read_bytes()).hexdigest()}"
     view = stand_in_view(frame, analyser_axis_deg=0.0)
-    return _Entry(file, sha256, photo.encoding, view, frame.exposure_s, frame.iso, photo.notes)
+    return _Entry(
+        file, sha256_of(file), photo.encoding, view, frame.exposure_s, frame.iso, photo.notes
+    )
 
 
 def _rig(
@@ -236,22 +232,9 @@ def _rig(
         )
         for camera, name in names.items()
     )
-    made = Rig(
-        name=IMPORTED_RIG_NAME,
-        lights=(
-            Light(
-                name="unknown",
-                position_mm=(0.0, 0.0, DISTANCE_MM),
-                illuminant=illuminant,
-                polarizer_axis_deg=0.0,
-                energy_ws=1.0,
-                radius_mm=1.0,
-            ),
-        ),
-        views=views,
-        boxes=(),
-        recycle_s=0.0,
-    )
+    place = (0.0, 0.0, DISTANCE_MM)
+    light = stand_in_light("unknown", place, illuminant, polarizer_axis_deg=0.0)
+    made = stand_in_rig(IMPORTED_RIG_NAME, [light], *views)
     return made, [names[entry.camera] for entry in entries]
 
 

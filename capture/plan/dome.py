@@ -95,14 +95,8 @@ def dome_plan(
             if tracking_every and place % tracking_every == 0:
                 series.tracking(number, place, exposure_s, shown[max(place - 1, 0)], level)
             name = rig.lights[light].name
-            series.expose(
-                f"{name}-{number}",
-                "olat",
-                {"light": name, "exposure": number, "pass": number},
-                exposure_s,
-                light=name,
-                level=level,
-            )
+            index: Index = {"light": name, "exposure": number, "pass": number}
+            series.expose(f"{name}-{number}", "olat", index, exposure_s, light=name, level=level)
         if tracking_every:
             series.tracking(number, len(shown), exposure_s, shown[-1], level)
     return series.plan()
@@ -175,21 +169,14 @@ def dome_calibration_plan(
         return series.plan()
     series.darks(darks, exposures_s[0], 0)
     for pose in range(plates):
-        series.several(
-            f"W{pose}-markers", "white", {"pose": pose, "light": "several"}, exposures_s[0], level
-        )
+        index: Index = {"pose": pose, "light": "several"}
+        series.several(f"W{pose}-markers", "white", index, exposures_s[0], level)
         normal = None if plate_normals is None else plate_normals[pose]
         for light in order:
             name = rig.lights[light].name
             if normal is None or _cosine(rig.lights[light].position_mm, normal) > MIN_PLATE_COSINE:
-                series.expose(
-                    f"W{pose}-{name}",
-                    "white",
-                    {"pose": pose, "light": name},
-                    exposures_s[0],
-                    light=name,
-                    level=level,
-                )
+                index, at = {"pose": pose, "light": name}, f"W{pose}-{name}"
+                series.expose(at, "white", index, exposures_s[0], light=name, level=level)
     return series.plan()
 
 
@@ -222,9 +209,8 @@ class _Series(StepSeries):
         # the box counts microseconds
         self.dwell_s = round(1e6 / frames_per_s) / 1e6
         most_s = self._limits.max_on_s
-        require(
-            self.dwell_s <= most_s, "frames_per_s", frames_per_s, f"at least {1.0 / most_s:g} 1/s"
-        )
+        slowest = f"at least {1.0 / most_s:g} 1/s"
+        require(self.dwell_s <= most_s, "frames_per_s", frames_per_s, slowest)
         super().__init__(rig, iso=iso, dwell_s=self.dwell_s)
         self._tracking = tracking_lights(rig)
         self._eye = eye_light(rig)
@@ -240,12 +226,9 @@ class _Series(StepSeries):
         require(level * self.dwell_s <= on_s, "level x dwell", level * self.dwell_s, f"<= {on_s}")
         readout_s = max(view.readout_s for view in self._rig.views)
         room_s = self.dwell_s - limits.settle_s - limits.overlap_s
-        require(
-            exposure_s <= room_s and exposure_s + readout_s <= self.dwell_s,
-            "exposure_s",
-            exposure_s,
-            f"to fit with read-out {readout_s:g} s into {self.dwell_s:g} s a light",
-        )
+        fits = exposure_s <= room_s and exposure_s + readout_s <= self.dwell_s
+        expected = f"to fit with read-out {readout_s:g} s into {self.dwell_s:g} s a light"
+        require(fits, "exposure_s", exposure_s, expected)
         self.add(identity, kind, index, exposure_s=float(exposure_s), **settings)
 
     def darks(self, count: int, exposure_s: float, number: int) -> None:
@@ -263,23 +246,12 @@ class _Series(StepSeries):
         """
         brightest = level * float(self._eye.max())
         wanted = max(level * float(self._eye[before]), MIN_TRACKING_LIGHT * brightest)
-        self.several(
-            f"T{number}-{after:03d}",
-            "tracking",
-            {"after": after, "exposure": number},
-            exposure_s,
-            wanted / max(float(self._eye[self._tracking].sum()), 1e-12),
-            number=number,
-        )
+        each = wanted / max(float(self._eye[self._tracking].sum()), 1e-12)
+        index: Index = {"after": after, "exposure": number, "pass": number}
+        self.several(f"T{number}-{after:03d}", "tracking", index, exposure_s, each)
 
     def several(
-        self,
-        identity: str,
-        kind: Kind,
-        index: Index,
-        exposure_s: float,
-        level: float,
-        number: int | None = None,
+        self, identity: str, kind: Kind, index: Index, exposure_s: float, level: float
     ) -> None:
         """Add a step lit by the tracking lights together; ``level`` is cut to what one may give."""
         limits = self._limits
@@ -288,7 +260,6 @@ class _Series(StepSeries):
             level = level / len(self._tracking)
         level = min(most, max(1.0, np.ceil(LEVEL_STEPS * level)) / LEVEL_STEPS)
         names = "+".join(self._rig.lights[k].name for k in self._tracking)
-        index = index if number is None else {**index, "pass": number}
         self.expose(identity, kind, index, exposure_s, leds=names, level=float(level))
 
     def mirrors(self, count: int, order: Sequence[int], exposures_s: Sequence[float]) -> None:
@@ -299,21 +270,12 @@ class _Series(StepSeries):
         some = max(1, math.ceil(len(order) / min(N_OUTLINE_LIGHTS, self._limits.max_at_once)))
         groups = math.ceil(len(order) / min(N_MIRROR_LIGHTS, self._limits.max_at_once))
         for sphere in range(count):
-            self._lit(
-                f"M{sphere}-outline",
-                {"sphere": sphere, "light": "outline"},
-                order[::some],
-                exposures_s[0],
-                1.0,
-            )
+            index: Index = {"sphere": sphere, "light": "outline"}
+            self._lit(f"M{sphere}-outline", index, order[::some], exposures_s[0], 1.0)
             for group in range(groups):
-                self._lit(
-                    f"M{sphere}-{group:02d}",
-                    {"sphere": sphere, "light": f"group {group}"},
-                    order[group::groups],
-                    exposures_s[-1],
-                    MIRROR_LEVEL,
-                )
+                index = {"sphere": sphere, "light": f"group {group}"}
+                lights, exposure_s = order[group::groups], exposures_s[-1]
+                self._lit(f"M{sphere}-{group:02d}", index, lights, exposure_s, MIRROR_LEVEL)
 
     def _lit(
         self, identity: str, index: Index, lights: Sequence[int], exposure_s: float, level: float

@@ -39,8 +39,7 @@ def radiant_intensity(light: Light) -> float:
     power_w = light.power_w or 0.0
     if light.half_intensity_deg is None:
         return power_w / (4.0 * math.pi)
-    exponent = math.log(0.5) / math.log(math.cos(math.radians(light.half_intensity_deg)))
-    return power_w * (exponent + 1.0) / (2.0 * math.pi)
+    return power_w * (light.lobe_exponent + 1.0) / (2.0 * math.pi)
 
 
 def eye_light(
@@ -82,12 +81,8 @@ def eye_light(
         distance_mm = np.linalg.norm(towards, axis=1)
         towards /= distance_mm[:, None]
         off_axis_rad = np.arccos(np.clip((towards * axes).sum(axis=1), -1.0, 1.0))
-        lobe = np.array(
-            [
-                light.intensity(float(angle))
-                for light, angle in zip(rig.lights, off_axis_rad, strict=True)
-            ]
-        )
+        pairs = zip(rig.lights, off_axis_rad, strict=True)
+        lobe = np.array([light.intensity(float(angle)) for light, angle in pairs])
         cosine = np.clip(-(towards @ np.asarray(facing, np.float64)), 0.0, None)
         total += on_axis * lobe * cosine / (distance_mm * 1e-3) ** 2
     return total / len(eyes_mm)

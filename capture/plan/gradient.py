@@ -16,11 +16,13 @@ from capture.plan.rows import led_rows, passes
 from capture.plan.steps import (
     LIGHT_PATTERNS,
     POLARIZER_STATES,
+    Index,
     Plan,
     Step,
     StepSeries,
     Value,
     require,
+    whole,
 )
 from capture.rig import Caliper, LedLimits, Rig
 
@@ -149,19 +151,10 @@ def gradient_plan(
             name = state_name(angle, position).replace("_", "-")
             for polarizer in POLARIZER_STATES:
                 for pattern in ordered:
-                    series.add(
-                        f"{name}-{polarizer[:3]}-{pattern}",
-                        "gradient",
-                        {
-                            "angle": _whole(angle),
-                            "caliper": position,
-                            "pattern": pattern,
-                            "polarizer": polarizer,
-                        },
-                        pattern=pattern,
-                        polarizer=polarizer,
-                        level=level,
-                    )
+                    light = {"pattern": pattern, "polarizer": polarizer}
+                    index: Index = {"angle": whole(angle), "caliper": position, **light}
+                    identity = f"{name}-{polarizer[:3]}-{pattern}"
+                    series.add(identity, "gradient", index, **light, level=level)
     return series.plan()
 
 
@@ -218,36 +211,21 @@ def gradient_calibration_plan(
         series.darks(darks)
         for repeat in range(count):
             for number, power in enumerate(FLAT_LEVELS):
-                series.add(
-                    f"F{number}-{repeat:02d}",
-                    "flat",
-                    {"level": power, "repeat": repeat, "pass": repeat},
-                    pattern="full",
-                    polarizer="parallel",
-                    level=power,
-                )
+                index: Index = {"level": power, "repeat": repeat, "pass": repeat}
+                light = {"pattern": "full", "polarizer": "parallel"}
+                series.add(f"F{number}-{repeat:02d}", "flat", index, **light, level=power)
     else:
         for reading, levels in BALL_SERIES.items():
             polarizer = POLARIZER_STATES[round(reading / 90)]
             every: dict[str, Value] = {} if reading in (0, 90) else {"analyser_deg": reading}
             for number, share in enumerate((*levels, 0.0)):
                 pattern = "full" if share else "dark"
+                light = {"pattern": pattern, "polarizer": polarizer}
                 more = every if share else {**every, "dwell_s": max(dwell_s, BALL_DARK_S)}
                 for repeat in range(count):
-                    series.add(
-                        f"B{reading:03d}-{pattern}{number}-{repeat:02d}",
-                        "ball",
-                        {
-                            "pattern": pattern,
-                            "polarizer": polarizer,
-                            "reading": reading,
-                            "repeat": repeat,
-                        },
-                        pattern=pattern,
-                        polarizer=polarizer,
-                        level=level * share,
-                        **more,
-                    )
+                    index = {**light, "reading": reading, "repeat": repeat}
+                    identity = f"B{reading:03d}-{pattern}{number}-{repeat:02d}"
+                    series.add(identity, "ball", index, **light, level=level * share, **more)
     return series.plan()
 
 
@@ -296,10 +274,6 @@ def _caliper(rig: Rig) -> Caliper:
     return rig.caliper  # type: ignore[return-value]
 
 
-def _whole(angle_deg: float) -> int | float:
-    return int(angle_deg) if float(angle_deg).is_integer() else float(angle_deg)
-
-
 def _ordered(patterns: Sequence[str]) -> list[str]:
     chosen = list(patterns)
     for pattern in chosen:
@@ -318,12 +292,9 @@ class _Series(StepSeries):
         readout_s = max(view.readout_s for view in rig.views)
         lag_s = max(view.shutter_lag_s for view in rig.views)
         room_s = dwell_s - limits.settle_s - limits.overlap_s - lag_s
-        require(
-            0 < exposure_s <= room_s and exposure_s + readout_s + lag_s <= dwell_s,
-            "exposure_s",
-            exposure_s,
-            f"to fit with read-out {readout_s:g} s into {dwell_s:g} s a pattern",
-        )
+        fits = 0 < exposure_s <= room_s and exposure_s + readout_s + lag_s <= dwell_s
+        expected = f"to fit with read-out {readout_s:g} s into {dwell_s:g} s a pattern"
+        require(fits, "exposure_s", exposure_s, expected)
         super().__init__(rig, exposure_s=float(exposure_s), dwell_s=float(dwell_s), iso=iso)
         self._limits = limits
 
@@ -341,12 +312,9 @@ class _Series(StepSeries):
             if key not in judged:
                 judged[key] = scan_duty(piece, self._rig)
         most = max(judged.values(), default=0.0)
-        require(
-            most <= limits.max_duty,
-            "duty",
-            f"{most:.3f} over {limits.duty_window_s:g} s",
-            f"at most {limits.max_duty:g}: less level, shorter light or fewer patterns",
-        )
+        got = f"{most:.3f} over {limits.duty_window_s:g} s"
+        expected = f"at most {limits.max_duty:g}: less level, shorter light or fewer patterns"
+        require(most <= limits.max_duty, "duty", got, expected)
         return self.plan_within(
             max_duty=limits.max_duty, max_on_s=limits.max_on_s, dose_ws=limits.dose_ws
         )

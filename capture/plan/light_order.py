@@ -84,12 +84,11 @@ def compare_orders(rig: Rig, *, dwell_s: float) -> dict[str, FlickerReport]:
     """
     weights = eye_light(rig)
     overlap_s = rig.leds.overlap_s if rig.leds is not None else 0.0
-    return {
-        name: flicker_of_rows(
-            [LedRow((k,), 1.0, dwell_s) for k in order(rig)], weights, overlap_s=overlap_s
-        )
-        for name, order in LIGHT_ORDERS.items()
-    }
+    found = {}
+    for name, order in LIGHT_ORDERS.items():
+        rows = [LedRow((k,), 1.0, dwell_s) for k in order(rig)]
+        found[name] = flicker_of_rows(rows, weights, overlap_s=overlap_s)
+    return found
 
 
 def best_order(rig: Rig, *, dwell_s: float) -> list[int]:

@@ -250,12 +250,8 @@ def _too_slow(grid: PhaseGrid, shortest: Fraction) -> ReadOutError:
 def _check_flash(rig: Rig, period: Fraction, power: float) -> None:
     require(0 < power <= 1, "power", power, "0 < power <= 1")
     slowest = max(rig.recycle_s * power, 60.0 / rig.max_pops_per_min)
-    require(
-        period >= exact(slowest),
-        "shot_period_s",
-        f"{float(period):g}",
-        f">= {slowest:g} s, what the flash needs to recycle",
-    )
+    expected = f">= {slowest:g} s, what the flash needs to recycle"
+    require(period >= exact(slowest), "shot_period_s", f"{float(period):g}", expected)
 
 
 def _settings(power: float) -> dict[str, Value]:

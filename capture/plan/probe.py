@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from itertools import groupby
 from typing import Literal, get_args
 
-from capture.plan.steps import Kind, Plan, Step, StepSeries, require
+from capture.plan.steps import Index, Kind, Plan, Step, StepSeries, require, whole
 from capture.plan.suction import Placement, placement_of
 from capture.rig import Probe, Rig, is_id
 
@@ -143,7 +143,7 @@ def probe_calibration_plan(
     target : {"phantom", "dark"}
         "phantom": darks; the series of exposures on a block of known optics; then per fibre some
         exposures with all other fibres covered, `MASK_INTERVAL` brackets apart. Of those only two
-        that serve are taken unless all are asked for, see `capture.acquire.probe.mask_choice`;
+        that serve are taken unless all are asked for, see `capture.acquire.probe.fiber_signal`;
         "dark": the darks only.
     repeats : int
         Placements on the phantom, >= 1; fibres are covered at the first.
@@ -226,12 +226,8 @@ class _Series(StepSeries):
         require(step_ev > 0, "step_ev", step_ev, "stops > 0")
         readout_s = max(view.readout_s for view in rig.views)
         most_s = min(probe.max_open_s, probe.max_suction_s - probe.settle_s - readout_s)
-        require(
-            0 < longest_s <= most_s,
-            "longest_s",
-            longest_s,
-            f"<= {most_s:g}, which one suction of {probe.max_suction_s:g} s has room for",
-        )
+        room = f"<= {most_s:g}, which one suction of {probe.max_suction_s:g} s has room for"
+        require(0 < longest_s <= most_s, "longest_s", longest_s, room)
         require(0 < level <= 1, "level", level, "0 < level <= 1")
         self._exposures_s = exposure_series_s(brackets, longest_s=longest_s, step_ev=step_ev)
         super().__init__(rig, level=float(level), iso=iso)
@@ -241,37 +237,25 @@ class _Series(StepSeries):
         last = len(self._exposures_s) - 1
         for bracket in dict.fromkeys(round(share * last) for share in DARK_POSITIONS):
             for repeat in range(count):
-                self.add(
-                    f"dark-b{bracket:02d}-r{repeat}",
-                    "dark",
-                    {"bracket": bracket, "repeat": repeat},
-                    exposure_s=self._exposures_s[bracket],
-                    level=0.0,
-                )
+                index: Index = {"bracket": bracket, "repeat": repeat}
+                exposure = {"exposure_s": self._exposures_s[bracket], "level": 0.0}
+                self.add(f"dark-b{bracket:02d}-r{repeat}", "dark", index, **exposure)
 
     def measure(self, kind: Kind, site: str, repeat: int, angle_deg: float) -> None:
         for bracket, exposure_s in enumerate(self._exposures_s):
-            self.add(
-                f"{site}-r{repeat}-a{_angle_text(angle_deg)}-b{bracket:02d}",
-                kind,
-                {"site": site, "repeat": repeat, "angle": _whole(angle_deg), "bracket": bracket},
-                exposure_s=exposure_s,
-                suction_mbar=self._probe.suction_mbar,
-            )
+            index: Index = {"site": site, "repeat": repeat, "angle": whole(angle_deg)}
+            held = {"exposure_s": exposure_s, "suction_mbar": self._probe.suction_mbar}
+            identity = f"{site}-r{repeat}-a{_angle_text(angle_deg)}-b{bracket:02d}"
+            self.add(identity, kind, {**index, "bracket": bracket}, **held)
 
     def masks(self) -> None:
         longest_s = max(MAX_MASK_EXPOSURE_S, self._exposures_s[0])
         exposures_s = [t for t in self._exposures_s if t <= longest_s][::-MASK_INTERVAL][::-1]
         for fibre in range(len(self._probe.fibres)):
             for bracket, exposure_s in enumerate(exposures_s):
-                self.add(
-                    f"mask-f{fibre:02d}-b{bracket}",
-                    "mask",
-                    {"fibre": fibre, "bracket": bracket},
-                    exposure_s=exposure_s,
-                    suction_mbar=self._probe.suction_mbar,
-                    fibre=fibre,
-                )
+                index: Index = {"fibre": fibre, "bracket": bracket}
+                held = {"exposure_s": exposure_s, "suction_mbar": self._probe.suction_mbar}
+                self.add(f"mask-f{fibre:02d}-b{bracket}", "mask", index, **held, fibre=fibre)
 
     def plan(self) -> Plan:
         require(len(self._steps) > 0, "darks", 0, "something to capture")
@@ -284,10 +268,6 @@ class _Series(StepSeries):
         if self._rig.leds is not None:
             limits["dose_ws"] = self._rig.leds.dose_ws
         return Plan(self._rig.name, tuple(self._steps), limits)
-
-
-def _whole(angle_deg: float) -> int | float:
-    return int(angle_deg) if float(angle_deg).is_integer() else float(angle_deg)
 
 
 def _angle_text(angle_deg: float) -> str:

@@ -6,43 +6,26 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, get_args
-
-from pydantic import ConfigDict
+from typing import Any, Literal, get_args
 
 from capture.documents import (
-    STRICT_CONFIG,
     Checks,
+    Document,
     Fault,
     InputError,
     near_miss,
     parse,
     read_json,
     shown,
-    table_of,
 )
 from capture.plan.suction import held_s
 from capture.rig import ID_RULE, Rig, is_id
 
 Value = str | int | float | bool
 Index = Mapping[str, str | int | float]
-Kind = Literal[
-    "dark",
-    "flat",
-    "chart",
-    "malus",
-    "subject",
-    "olat",
-    "tracking",
-    "charuco",
-    "mirror",
-    "white",
-    "gradient",
-    "ball",
-    "fibres",
-    "phantom",
-    "mask",
-]
+FlashKind = Literal["dark", "flat", "chart", "malus", "subject"]
+DomeKind = Literal["olat", "tracking", "charuco", "mirror", "white"]
+Kind = Literal[FlashKind, DomeKind, "gradient", "ball", "fibres", "phantom", "mask"]
 Polarizer = Literal["parallel", "crossed"]
 
 Pattern = Literal["full", "x", "y", "z", "-x", "-y", "-z", "dark"]
@@ -75,7 +58,7 @@ class PlanError(InputError):
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class Step(Document):
     """One thing to capture.
 
     Parameters
@@ -110,8 +93,6 @@ class Step:
       settings.exposure: got 0.1, expected a known setting; did you mean exposure_s? (in s)
     """
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
-
     id: str
     kind: Kind
     index: Index
@@ -142,10 +123,6 @@ class Step:
         parts = (self.id, self.kind, dict(self.index), dict(self.settings), self.cameras)
         return (Step, parts)
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the step as JSON values."""
-        return table_of(self)
-
 
 def _check_settings(settings: Mapping[str, Value]) -> list[Fault]:
     """Return the faults of known settings, and of names that are a near miss of a known one."""
@@ -161,7 +138,7 @@ def _check_settings(settings: Mapping[str, Value]) -> list[Fault]:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class Plan(Document):
     """Steps in the order of capture, for one rig, with the limits they were planned within.
 
     Parameters
@@ -173,8 +150,6 @@ class Plan:
     limits : mapping of str to float
         What the planner kept to, e.g. ``{"max_pops_per_min": 20.0, "recycle_s": 1.5}``.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     rig: str
     steps: tuple[Step, ...]
@@ -262,10 +237,6 @@ class Plan:
             total + last_s + (0.0 if rig.probe is None else held_s(self.steps, each_s, rig.probe))
         )
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the plan as JSON values."""
-        return table_of(self)
-
     @staticmethod
     def from_json(data: Mapping[str, Any] | str | bytes, *, where: str = "plan") -> Plan:
         """Build a plan from JSON text or decoded JSON, listing all faults at once.
@@ -304,6 +275,11 @@ class StepSeries:
     def plan_within(self, **limits: float) -> Plan:
         """Return the plan of the steps."""
         return Plan(self._rig.name, tuple(self._steps), limits)
+
+
+def whole(angle_deg: float) -> int | float:
+    """Return an angle as a whole number where it is one."""
+    return int(angle_deg) if float(angle_deg).is_integer() else float(angle_deg)
 
 
 def require(good: bool, name: str, got: object, expected: str) -> None:

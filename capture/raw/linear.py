@@ -1,7 +1,7 @@
 """From DN to linear camera RGB with the variance that shot and read noise leave in it."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -77,12 +77,8 @@ def linear_rgb(
     ([0.10000000149011612, 0.10000000149011612, 0.10000000149011612], [54.0, 27.0, 54.0])
     """
     checks = Checks("linear_rgb", RawError)
-    checks.that(
-        "demosaic",
-        demosaic,
-        demosaic in ("superpixel", "centered", "bilinear"),
-        "superpixel, centered, bilinear",
-    )
+    known = get_args(Demosaic)
+    checks.that("demosaic", demosaic, demosaic in known, ", ".join(known))
     pair = (gain is None) == (read_noise is None)
     checks.that("gain, read_noise", (gain, read_noise), pair, "both or neither")
     checks.close()

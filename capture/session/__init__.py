@@ -9,12 +9,12 @@ from capture.session.errors import (
     SessionError,
     SessionLocked,
 )
-from capture.session.frames import FrameRecord
 from capture.session.journal import AttachmentLine, FrameLine
 from capture.session.manifest import SCHEMA, CalibrationRef, Manifest, Subject
 from capture.session.reopening import reopen_copy
 from capture.session.store import Session
 from capture.session.verification import VerifyReport, verify
+from capture.session.view import FrameRecord
 
 __all__ = [
     "SCHEMA",

@@ -11,13 +11,8 @@ from capture.session.errors import NotASession, SessionDamage, SessionError
 from capture.session.journal import AttachmentLine, CloseLine, FrameLine, LeftOutLine, Walk, walk
 from capture.session.manifest import Manifest, decode
 
-MANIFEST_FILE, JOURNAL_FILE, FRAMES_FOLDER, ORPHANS_FOLDER = (
-    "session.json",
-    "journal.jsonl",
-    "frames",
-    "orphans",
-)
-ATTACHMENTS_FOLDER = "attachments"
+MANIFEST_FILE, JOURNAL_FILE = "session.json", "journal.jsonl"
+FRAMES_FOLDER, ORPHANS_FOLDER, ATTACHMENTS_FOLDER = "frames", "orphans", "attachments"
 MAX_MANIFEST_BYTES = 2**26
 MAX_JOURNAL_BYTES = 2**30
 

@@ -9,13 +9,11 @@ import hashlib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
-
-from pydantic import ConfigDict
+from typing import Any
 
 from capture.documents import (
-    STRICT_CONFIG,
     Checks,
+    Document,
     Fault,
     canonical_json,
     parse,
@@ -33,10 +31,8 @@ _XXH128_PATTERN = re.compile(r"[0-9a-f]{32}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FrameLine:
+class FrameLine(Document):
     """One committed frame, as the journal holds it."""
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     step: str
     camera: str
@@ -67,10 +63,8 @@ class FrameLine:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AttachmentLine:
+class AttachmentLine(Document):
     """One file that belongs to the capture and is no frame, as the journal holds it."""
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     name: str
     file: str
@@ -92,10 +86,8 @@ class AttachmentLine:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LeftOutLine:
+class LeftOutLine(Document):
     """Steps of the plan that will not be captured, as the journal holds them."""
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     steps: tuple[str, ...]
     reason: str
@@ -115,10 +107,8 @@ class LeftOutLine:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CloseLine:
+class CloseLine(Document):
     """The end of a session: nothing may follow."""
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     frames: int
     missing: tuple[str, ...]

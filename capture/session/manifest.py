@@ -8,12 +8,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date, datetime
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict
 
-from capture.documents import STRICT_CONFIG, Checks, Fault, parse, read_json, table_of
+from capture.documents import Checks, Document, Fault, parse, read_json, table_of
 from capture.plan import Plan
 from capture.rig import ID_RULE, Rig, is_id
 from capture.session.errors import SessionDamage, SessionError
@@ -28,7 +27,7 @@ _PSEUDONYM_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
 
 @dataclass(frozen=True, slots=True)
-class Subject:
+class Subject(Document):
     """Who was captured, never by name, and what the person agreed to.
 
     Parameters
@@ -47,8 +46,6 @@ class Subject:
     'P042'
     """
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
-
     pseudonym: str
     consent_scope: tuple[str, ...] = ()
     consent_expires: date | None = None
@@ -63,10 +60,8 @@ class Subject:
 
 
 @dataclass(frozen=True, slots=True)
-class CalibrationRef:
+class CalibrationRef(Document):
     """A calibration that was in force, by the hash of its file."""
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     kind: str
     sha256: str
@@ -83,10 +78,8 @@ class CalibrationRef:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Manifest:
+class Manifest(Document):
     """The content of session.json."""
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     id: str
     created_at: datetime

@@ -16,9 +16,9 @@ from capture.session.contents import (
 from capture.session.disk import Disk, read_file
 from capture.session.errors import SessionError
 from capture.session.folder import DiskErrors, require_free, write_manifest, write_new
-from capture.session.frames import check_file
 from capture.session.journal import CloseLine
 from capture.session.store import Session
+from capture.session.view import check_file
 
 
 def reopen_copy(

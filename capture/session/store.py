@@ -19,7 +19,6 @@ from capture.session.contents import ATTACHMENTS_FOLDER, JOURNAL_FILE, Contents,
 from capture.session.disk import Disk
 from capture.session.errors import SessionDiskError, SessionError, SessionLocked
 from capture.session.folder import DiskErrors, make_folder, set_orphans_aside, write_new
-from capture.session.frames import MAX_FRAME_BYTES, check_blob
 from capture.session.journal import (
     ATTACHMENT_RULE,
     MAX_LINE_BYTES,
@@ -34,7 +33,7 @@ from capture.session.journal import (
     seal_line,
 )
 from capture.session.manifest import CalibrationRef, Manifest, Subject, calibration_refs, versions
-from capture.session.view import SessionView
+from capture.session.view import MAX_FRAME_BYTES, SessionView, check_blob
 
 _log = logging.getLogger(__name__)
 

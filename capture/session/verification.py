@@ -16,18 +16,11 @@ from capture.session.contents import (
     read_contents,
 )
 from capture.session.errors import NotASession, SessionError
-from capture.session.frames import check_file
 from capture.session.journal import FrameLine
+from capture.session.view import check_file
 
-_KNOWN_NAMES = {
-    MANIFEST_FILE,
-    JOURNAL_FILE,
-    FRAMES_FOLDER,
-    ATTACHMENTS_FOLDER,
-    ORPHANS_FOLDER,
-    "index.sqlite",
-    "ascmhl",
-}
+_KNOWN_NAMES = {MANIFEST_FILE, JOURNAL_FILE, FRAMES_FOLDER, ATTACHMENTS_FOLDER, ORPHANS_FOLDER}
+_KNOWN_NAMES |= {"index.sqlite", "ascmhl"}
 
 
 @dataclass(frozen=True, slots=True)

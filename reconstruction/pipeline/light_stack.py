@@ -11,7 +11,7 @@ import numpy as np
 
 from capture import raw
 from capture.session import Session
-from capture.session.frames import FrameRecord
+from capture.session.view import FrameRecord
 from model.skin import MAP_UNITS, SkinMap
 from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array

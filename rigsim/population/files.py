@@ -31,7 +31,7 @@ from typing import Any, Final, cast
 
 import numpy as np
 
-from capture.documents import STRICT_CONFIG, Checks, Fault, parse, read_toml
+from capture.documents import Checks, Document, Fault, parse, read_toml
 from rigsim.fiber.probe_tissue import ProbedTissue, SkinTissue, TissueError, parse_subject
 from rigsim.geometry.mesh import Mesh, MeshError, load_mesh
 from rigsim.population.textures import MAP_RANGES, SubjectFileError, load, texture
@@ -52,10 +52,8 @@ _UNUSED_KEYS: Final[Mapping[str, tuple[str, ...]]] = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SubjectFile:
+class SubjectFile(Document):
     """What a simulated person is made of, but for the seed; see the module's text."""
-
-    __pydantic_config__ = STRICT_CONFIG
 
     schema: str = SCHEMA
     preset: str = "III"

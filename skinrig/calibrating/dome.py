@@ -9,7 +9,7 @@ import numpy as np
 
 from capture import raw
 from capture.calibration import geometry, store
-from capture.calibration.geometry import bundle, moved_camera
+from capture.calibration.geometry import bundle
 from capture.calibration.geometry.board import Board, Sighting, find_board
 from capture.calibration.lights import LightTable, light_fit, mirror_lights, mirror_sphere
 from capture.calibration.lights.white_plate import PlateSamples, PlateWindow, WhitePlate
@@ -135,7 +135,7 @@ def _moved(
     """Return what moved since the geometry in a folder; nothing without one."""
     try:
         previous = geometry.poses_from(store.load(folder, "geometry"), rig)
-        return tuple(str(moved) for moved in moved_camera.find_moved(sightings, board, previous))
+        return tuple(str(moved) for moved in bundle.find_moved(sightings, board, previous))
     except (store.CalibrationMissing, store.CalibrationMismatch, bundle.BundleError):
         return ()
 
@@ -242,8 +242,8 @@ def _mirror(
         if key not in windows:
             windows[key] = mirror_lights.SphereWindow.of(cameras[record.camera], spheres[sphere])
         image = neutral_mosaic(session.read(record), colors[record.camera])
-        pixels, flux = mirror_lights.find_highlights(image, windows[key])
-        seen.append(mirror_lights.Highlights(record.camera, sphere, _lit(record), pixels, flux))
+        pixels = mirror_lights.find_highlights(image, windows[key])
+        seen.append(mirror_lights.Highlights(record.camera, sphere, _lit(record), pixels))
     return mirror_lights.locate_lights(
         seen,
         cameras,

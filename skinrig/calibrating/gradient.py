@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from capture.calibration.fiber.spot_photometry import Shot, shot
-from capture.calibration.led_sphere.findings import SphereSurvey
 from capture.calibration.led_sphere.glass_ball import GlassBall
-from capture.calibration.led_sphere.survey import survey_sphere
+from capture.calibration.led_sphere.survey import SphereSurvey, survey_sphere
 from capture.calibration.record import Quantity
 from capture.raw import RawFrame
 from capture.session import FrameRecord, Session

@@ -4,8 +4,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from capture.plan import Plan
-from capture.plan.dose import dose_report
-from capture.plan.fiber_light import SKIN_APERTURE_MM, fiber_light
+from capture.plan.dose import SKIN_APERTURE_MM, dose_report, fiber_light
 from capture.plan.flicker import flicker_report
 from capture.plan.gradient import scan_duty, states
 from capture.rig import LedLimits, Rig

@@ -29,8 +29,8 @@ from capture.devices.camera import (
 )
 from capture.devices.cameras import genicam as backend
 from capture.devices.cameras import genicam_producer
-from capture.devices.cameras.genicam_address import parse_address
-from capture.devices.cameras.genicam_features import Features
+from capture.devices.cameras.genicam_producer import Features
+from capture.devices.cameras.genicam_readout import parse_address
 
 package = pytest.importorskip("genicam")
 pytest.importorskip("harvesters")

@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import chi2
 
 from capture.calibration import geometry, store
-from capture.calibration.geometry import CameraPose, bundle, moved_camera
+from capture.calibration.geometry import CameraPose, bundle
 from capture.calibration.geometry.board import Board, find_board
 from capture.calibration.geometry.bundle_equations import LensPrior
 from capture.calibration.lights import LightTable, light_fit, mirror_lights, mirror_sphere
@@ -134,9 +134,9 @@ def test_a_moved_camera_is_named_from_new_images(geometry_of_dome):
     after = dataclasses.replace(dome, rig=dataclasses.replace(dome.rig, views=views))
     poses = (0, 1, 2, 4, 5)
     seen = boards_seen(target_scene("charuco", rig, seed=12, dome=after), poses)
-    assert [m.name for m in moved_camera.find_moved(seen, BOARD, found.cameras)] == ["C07"]
+    assert [m.name for m in bundle.find_moved(seen, BOARD, found.cameras)] == ["C07"]
     same = boards_seen(target_scene("charuco", rig, seed=13, dome=dome), poses)
-    assert moved_camera.find_moved(same, BOARD, found.cameras) == ()
+    assert bundle.find_moved(same, BOARD, found.cameras) == ()
 
 
 def mirrors_seen(dome, rig, spheres, *, groups, radius_mm=50.0):
@@ -164,7 +164,7 @@ def mirrors_seen(dome, rig, spheres, *, groups, radius_mm=50.0):
                 frame = shot(scene, name, lit, exposure_s=0.012, level=0.002, seed=group)
                 spots = mirror_lights.find_highlights(neutral_mosaic(frame, colors[name]), window)
                 names = tuple(rig.lights[i].name for i in lit)
-                seen.append(mirror_lights.Highlights(name, number, names, *spots))
+                seen.append(mirror_lights.Highlights(name, number, names, spots))
     return scene, cameras, places, seen
 
 

@@ -1,20 +1,266 @@
 """Run a plan on the flash rig: one pop a step, its frame believed or the step shot again."""
 
-from collections.abc import Mapping
+import logging
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from capture.acquire.flash.sequence import run_sequence
-from capture.acquire.flash.shot import Moment, shoot
+from capture.acquire.flash.shot import Moment, power_of, set_light, shoot
 from capture.acquire.outcome import (
     MAX_ATTEMPTS,
     Acquired,
     AcquisitionError,
     CaptureRun,
+    Operator,
     refuse_step,
 )
-from capture.devices.flash import FlashBox
-from capture.plan import Plan, Step
+from capture.devices.flash import FlashBox, FlashReport
+from capture.plan import Plan, Step, Value
 from capture.rig import Rig
+
+log = logging.getLogger(__name__)
+
+MAX_SLEEP_S = 1.0
+"""Longest sleep, after which the operator is asked whether to stop."""
+PROMPT_LEAD_S = 0.05
+"""Prompts are given by the clock up to here before a frame is due; then it is waited for."""
+COMMAND_LEAD_S = 0.1
+"""No prompt is due so soon after the commands that set the light begin."""
+TIME_ROUNDING_S = 1e-6
+"""Rounding of times that are sums of periods."""
+
+
+def run_sequence(run: CaptureRun, box: FlashBox, steps: Sequence[Step]) -> None:
+    """Capture the timed steps that a session still lacks; see `run_flash`.
+
+    Each frame's ``actual`` gets ``time_s`` (s, when the flash popped, in the sequence's time),
+    ``late_s`` (s after its planned time), ``time_error_s`` (s, how well the clocks of host and box
+    could be compared), ``block`` (0, and one more each time that the sequence is resumed); and of
+    a prompted one ``phase_s`` (s since the last prompt of the expression was given), ``prompt``
+    (what was asked for last).
+    """
+    limits = run.plan.limits
+    period_s = float(limits.get("prompt_period_s", 0.0))
+    if period_s > 0:
+        rhythm: _Rhythm = _Prompted(run, steps, period_s)
+    else:
+        rhythm = _Once(run, steps)
+    spacing_s = float(limits.get("shot_period_s", 0.0))
+    waiting = deque((step, 1) for step in rhythm.possible(steps))
+    free_s = -math.inf
+    if waiting:
+        set_light(waiting[0][0], box)
+        rhythm.begin()
+    number = 0
+    while waiting:
+        run.operator.stop_if_asked()
+        step, attempt = waiting.popleft()
+        number += 1
+        due_s = rhythm.due_s(step, free_s)
+        free_s = due_s + spacing_s
+        count = f"{number}/{number + len(waiting)}"
+        run.operator.progress(f"{count} {step.id} {step.kind} t={due_s:g} s")
+        moment = _Timed(run, box, step, rhythm, due_s, waiting[0][0] if waiting else None)
+        why = shoot(run, moment, f"{run.operator.run_id}.t{number}", attempt)
+        if why:
+            if attempt == MAX_ATTEMPTS:
+                raise run.given_up(f"step {step.id}", why)
+            waiting.extend(rhythm.again(step, attempt, why))
+            if waiting:
+                set_light(waiting[0][0], box)
+
+
+class _Rhythm:
+    """The time of a sequence, and what happens in it beside the shots."""
+
+    block = 0
+    """How often the sequence was begun before."""
+
+    def __init__(self, run: CaptureRun) -> None:
+        self._run = run
+        self.operator: Operator = run.operator
+        self._zero = 0.0
+
+    def possible(self, steps: Sequence[Step]) -> list[Step]:
+        """Return the steps that can still be taken."""
+        return list(steps)
+
+    def begin(self) -> None:
+        """Start the clock."""
+
+    def now_s(self) -> float:
+        """Return the sequence's time, s."""
+        return self.operator.timer.monotonic() - self._zero
+
+    def since_zero(self, timer_s: float) -> float:
+        """Return the sequence's time at a reading of the timer, s."""
+        return timer_s - self._zero
+
+    def due_s(self, step: Step, free_s: float) -> float:
+        """Return when a step is to be taken, s; not before ``free_s`` where that can be helped."""
+        return float(step.settings["start_s"])
+
+    def again(self, step: Step, attempt: int, why: str) -> list[tuple[Step, int]]:
+        """Return the step and its next attempt where it can be taken later, else nothing."""
+        raise NotImplementedError
+
+    def wait(self, until_s: float) -> None:
+        """Let time pass; stop in good order where that is asked for."""
+        while (rest_s := until_s - self.now_s()) > TIME_ROUNDING_S:
+            self.operator.timer.sleep(min(rest_s, MAX_SLEEP_S))
+            self.operator.stop_if_asked()
+
+    def find_quiet(self, span_s: float) -> None:
+        """Let time pass until nothing is due for a while, s."""
+
+    def noted_at(self, time_s: float) -> dict[str, Value]:
+        """Return what is to be noted of a shot at a time, s."""
+        return {"time_s": time_s, "block": self.block}
+
+
+class _Prompted(_Rhythm):
+    """A subject who changes with every prompt."""
+
+    def __init__(self, run: CaptureRun, steps: Sequence[Step], period_s: float) -> None:
+        super().__init__(run)
+        plan, session = run.plan, run.session
+        self._period_s = period_s
+        shown = {
+            float(s.index["phase_s"]) < period_s: str(s.index["state"])
+            for s in plan.steps
+            if "start_s" in s.settings
+        }
+        self._states = (shown.get(True, "expression"), shown.get(False, "neutral"))
+        first_s = min(float(step.settings["start_s"]) for step in steps)
+        cycle_s = 2 * period_s
+        # a resumed run begins with the cycle of its first shot
+        self._first_s = cycle_s * math.floor(first_s / cycle_s + TIME_ROUNDING_S)
+        self._lead_s = float(plan.limits.get("lead_s", 0.0))
+        self._next = 0
+        self._given: list[tuple[float, str]] = []
+        blocks = [int(r.line.actual["block"]) for r in session.frames() if "block" in r.line.actual]
+        self.block = max(blocks, default=-1) + 1
+
+    def begin(self) -> None:
+        self.operator.prompt(f"{self._states[1]}, then change at each sound")
+        start_s = self._first_s - self._lead_s
+        self._zero = self.operator.timer.monotonic() - start_s
+        self._next = round(start_s / self._period_s)
+        self.wait(start_s)
+
+    def due_s(self, step: Step, free_s: float) -> float:
+        due_s = float(step.settings["start_s"])
+        cycle_s = 2 * self._period_s
+        behind_s = max(free_s, self._first_s) - due_s
+        return due_s + cycle_s * max(0, math.ceil(behind_s / cycle_s - TIME_ROUNDING_S))
+
+    def again(self, step: Step, attempt: int, why: str) -> list[tuple[Step, int]]:
+        return [(step, attempt + 1)]
+
+    def wait(self, until_s: float) -> None:
+        while (prompt_s := self._next * self._period_s) <= until_s + TIME_ROUNDING_S:
+            super().wait(prompt_s)
+            state = self._states[self._next % 2]
+            self.operator.signal(state)
+            self._given.append((self.now_s(), state))
+            self._next += 1
+        super().wait(until_s)
+
+    def find_quiet(self, span_s: float) -> None:
+        if (prompt_s := self._next * self._period_s) <= self.now_s() + span_s:
+            self.wait(prompt_s)
+
+    def noted_at(self, time_s: float) -> dict[str, Value]:
+        before = [entry for entry in self._given if entry[0] <= time_s]
+        onsets = [given_s for given_s, state in before if state == self._states[0]]
+        noted = super().noted_at(time_s)
+        if onsets:
+            noted |= {"phase_s": time_s - onsets[-1], "prompt": before[-1][1]}
+        return noted
+
+
+class _Once(_Rhythm):
+    """What follows an event, which happens once."""
+
+    def __init__(self, run: CaptureRun, steps: Sequence[Step]) -> None:
+        super().__init__(run)
+        self._state = str(steps[0].index.get("state", "event"))
+        self._elapsed_s = 0.0
+        # the host's clock alone knows how long a run was interrupted
+        for record in run.session.frames("subject"):
+            if "time_s" in record.line.actual:
+                zero = record.line.t_host_s - float(record.line.actual["time_s"])
+                self._elapsed_s = self.operator.clock() - zero
+                self.block = max(self.block, int(record.line.actual["block"]) + 1)
+
+    def possible(self, steps: Sequence[Step]) -> list[Step]:
+        if self.block == 0:
+            return list(steps)
+        passed = [s.id for s in steps if float(s.settings["start_s"]) < self._elapsed_s]
+        self._leave_out(passed, "its time passed while the capture was interrupted")
+        return [step for step in steps if step.id not in passed]
+
+    def begin(self) -> None:
+        if self.block == 0:
+            self.operator.prompt(self._state)
+        self._zero = self.operator.timer.monotonic() - self._elapsed_s
+
+    def again(self, step: Step, attempt: int, why: str) -> list[tuple[Step, int]]:
+        self._leave_out([step.id], f"failed at its time, which does not come again: {why}")
+        return []
+
+    def _leave_out(self, ids: Sequence[str], why: str) -> None:
+        if ids:
+            log.warning("steps %s: %s", ", ".join(ids), why)
+            self._run.leave_out(ids, why, {})
+
+
+class _Timed(Moment):
+    """One shot's time: waited for, kept, and compared with the box's."""
+
+    def __init__(
+        self,
+        run: CaptureRun,
+        box: FlashBox,
+        step: Step,
+        rhythm: _Rhythm,
+        due_s: float,
+        then: Step | None,
+    ) -> None:
+        super().__init__(step, box)
+        self._rhythm, self._due_s, self._then = rhythm, due_s, then
+        views = [run.rig.view(name) for name in step.cameras]
+        self._charged_s = run.rig.recycle_s * power_of(step)
+        self._busy_s = float(step.settings["exposure_s"])
+        self._busy_s += max(view.shutter_lag_s + view.readout_s for view in views)
+
+    def prepare(self) -> None:
+        """Do nothing: the light was set while the shot before was read out."""
+
+    def wait(self) -> None:
+        """Wait until the shot is due."""
+        self._rhythm.wait(self._due_s)
+
+    def look(self, report: FlashReport | None) -> None:
+        """Find out when the flash popped; make the light ready for the next shot; go on in time."""
+        timer = self._rhythm.operator.timer
+        before = timer.monotonic()
+        box_s = self.box.ping()
+        after = timer.monotonic()
+        popped_s = before if report is None else 0.5 * (before + after) - box_s + report.t_box_s
+        time_s = self._rhythm.since_zero(popped_s)
+        self.noted = {
+            **self._rhythm.noted_at(time_s),
+            "late_s": time_s - self._due_s,
+            "time_error_s": 0.5 * (after - before),
+        }
+        if self._then is not None:
+            # waiting for the charge would keep a prompt waiting, and so would the commands
+            self._rhythm.wait(time_s + self._charged_s)
+            self._rhythm.find_quiet(COMMAND_LEAD_S)
+            set_light(self._then, self.box)
+        self._rhythm.wait(time_s + self._busy_s - PROMPT_LEAD_S)
 
 
 def run_flash(run: CaptureRun, box: FlashBox) -> Acquired:

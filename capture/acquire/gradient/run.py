@@ -3,15 +3,103 @@
 from collections.abc import Mapping
 from typing import Any
 
-from capture.acquire.dome import begin_lit_run
-from capture.acquire.gradient.checks import check_caliper, check_eyes, check_force, check_sphere
+from capture.acquire.dome import begin_lit_run, check_dwell, check_safety, too_long
 from capture.acquire.gradient.skin_states import SkinStates, let_go
-from capture.acquire.outcome import Acquired, AcquisitionError, CaptureRun, require_trigger_line
-from capture.acquire.pattern_scan import Scanner
+from capture.acquire.outcome import (
+    Acquired,
+    AcquisitionError,
+    CaptureRun,
+    refuse_step,
+    require_trigger_line,
+)
+from capture.acquire.pattern_scan import Scanner, reading_deg
 from capture.devices.caliper import CaliperBox
 from capture.devices.gradient_sphere import GradientSphereBox
+from capture.plan import Plan
 from capture.plan.gradient import state_of
 from capture.plan.rows import passes
+from capture.rig import Rig
+
+
+def check_eyes(run: CaptureRun, *, skin: bool) -> None:
+    """Raise where light would be too much; patterns on skin may come close to an eye."""
+    check_safety(run.plan, run.rig, eyes=run.eyes)
+    if skin and run.eyes == "open":
+        raise AcquisitionError(
+            "eyes: patterns change many times a second, and the patch may lie beside an eye; "
+            "nothing was lit: have the eyes closed or shielded and say so with --eyes"
+        )
+
+
+def check_sphere(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
+    """Raise where the sphere's box is another one, or is asked for more than it allows."""
+    counts = {"leds": ("lights", len(rig.lights)), "cameras": ("cameras", len(rig.views))}
+    for name, (what, count) in counts.items():
+        if int(limits.get(name, 0)) != count:
+            raise AcquisitionError(
+                f"{what}: the sphere's box has {limits.get(name)}, the rig {count}; nothing was "
+                "lit: use the rig file of this box"
+            )
+    settle_s = float(limits["settle_us"]) / 1e6
+    low_deg, high_deg = float(limits["analyser_min_deg"]), float(limits["analyser_max_deg"])
+    for step in plan.steps:
+        dwell_s, exposure_s = float(step.settings["dwell_s"]), float(step.settings["exposure_s"])
+        check_dwell(step, dwell_s, limits)
+        views = [rig.view(name) for name in step.cameras]
+        over_s = max(view.shutter_lag_s + view.readout_s for view in views) + exposure_s
+        if settle_s + exposure_s > dwell_s or over_s > dwell_s:
+            raise too_long(step, dwell_s)
+        angle_deg = reading_deg(step)
+        if not low_deg <= angle_deg <= high_deg:
+            what = f"got analyser_deg {angle_deg:g}, the box turns from {low_deg:g} to {high_deg:g}"
+            raise refuse_step(step, what)
+    longest = max(len(piece) for piece in passes(plan.steps))
+    if longest > int(limits["max_rows"]):
+        raise AcquisitionError(
+            f"plan: a scan has {longest} patterns, the box holds {limits['max_rows']}; nothing "
+            "was lit: change the plan"
+        )
+
+
+def check_caliper(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
+    """Raise where the caliper is another one than the rig file's, or is sent beyond its travel."""
+    drawn = rig.caliper
+    if drawn is None:
+        raise AcquisitionError("caliper: the rig file has none; use that of this rig")
+    for name, expected in (("aperture_mm", drawn.aperture_mm), ("step_mm", drawn.step_mm)):
+        if abs(float(limits.get(name, 0.0)) - expected) > 1e-6:
+            raise AcquisitionError(
+                f"caliper: its box says {name} {limits.get(name)}, the rig file {expected:g}; "
+                "nothing has moved: use the rig file of this box"
+            )
+    known = [float(angle) for angle in limits["angles_deg"]]
+    low, high = int(limits["step_min"]), int(limits["step_max"])
+    for step in plan.steps:
+        if state_of(step) is None:
+            continue
+        angle, position = float(step.index["angle"]), int(step.index["caliper"])
+        if angle not in known or not low <= position <= high:
+            raise AcquisitionError(
+                f"step {step.id}: got position {position} at {angle:g} degrees, the caliper has "
+                f"{low} to {high} at {', '.join(f'{a:g}' for a in known)}; nothing has moved: "
+                "change the plan, or use the rig file of this box"
+            )
+
+
+def check_force(limit_n: float | None, limits: Mapping[str, Any]) -> None:
+    """Raise where no force limit is given, or one that the caliper's sensor cannot tell."""
+    low, high = float(limits["force_limit_min_n"]), float(limits["force_limit_max_n"])
+    if limit_n is None:
+        raise AcquisitionError(
+            "force limit: none was given, and there is no default: decide what this skin may "
+            f"bear and say it with --force-limit N ({low:g} to {high:g} newton); nothing has moved"
+        )
+    if not low <= limit_n <= high:
+        raise AcquisitionError(
+            f"force limit: got {limit_n:g} N, the caliper's sensor tells {low:g} to {high:g} N; "
+            "nothing has moved"
+        )
+
 
 SPHERE_LEASE_S = 2.0
 

@@ -14,9 +14,13 @@ import numpy as np
 
 from capture import raw
 from capture.acquire.outcome import MAX_ATTEMPTS, CaptureRun
-from capture.acquire.probe.fiber_signal import FiberSignal, describe_fibers, why_enough
+from capture.acquire.probe.fiber_signal import (
+    FiberSignal,
+    describe_fibers,
+    masks_not_needed,
+    why_enough,
+)
 from capture.acquire.probe.head import Head, HeadLost, NotHeld
-from capture.acquire.probe.mask_choice import masks_not_needed
 from capture.acquire.probe.source_exposure import (
     Exposed,
     ShutterFault,

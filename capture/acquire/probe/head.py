@@ -160,12 +160,9 @@ class Head:
 
     def refusal(self, place: Placement, why: str, *, captured: bool) -> AcquisitionError:
         """Return the error of a placement at which the measurement cannot be made."""
-        after = (
-            "what was captured before is safe: mend the cause and run the same command with "
-            "--resume"
-            if captured
-            else "nothing was captured: mend the cause and start again"
-        )
+        before = "what was captured before is safe: mend the cause and run the same command with "
+        again = "nothing was captured: mend the cause and start again"
+        after = f"{before}--resume" if captured else again
         return AcquisitionError(
             f"measurement of {place}: refused, {why}, {MAX_ATTEMPTS} times; no frame of it is "
             "kept. Check that the membrane is whole and the tube is on, and that no fold and no "

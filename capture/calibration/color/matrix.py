@@ -223,14 +223,9 @@ def from_calibration(calibration: Calibration, serial: str) -> ColorMatrix:
     method: Method = "linear" if matrix.value.shape == (3, 3) else "root_polynomial"
     mean = calibration.quantity(serial, "delta_e_mean").value
     fitted = calibration.quantity(serial, "delta_e_fitted_mean").value
-    return ColorMatrix(
-        matrix.value,
-        mean.reshape(1),
-        matrix.known_stderr,
-        method,
-        calibration.notes["illuminant"],
-        fitted.reshape(1),
-    )
+    held_out, illuminant = mean.reshape(1), calibration.notes["illuminant"]
+    errors = matrix.known_stderr
+    return ColorMatrix(matrix.value, held_out, errors, method, illuminant, fitted.reshape(1))
 
 
 def _terms(rgb: Float64Array, method: Method) -> Float64Array:

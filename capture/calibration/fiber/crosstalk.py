@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from capture.arrays import Float64Array
 from capture.calibration.fiber.readings import FiberReadings
-from capture.calibration.frozen_arrays import freeze_array
-from capture.calibration.record import CalibrationError
+from capture.calibration.record import CalibrationError, freeze_arrays
 
 DISTANCE_EDGES: Final = (1, 2, 3, 4, 6, 9, 14, 21)
 """First distance, in fibres, of each group that is taken to be alike."""
@@ -61,14 +60,8 @@ class CrossTalk:
     def __post_init__(self) -> None:
         count = len(np.asarray(self.matrix))
         colors = np.shape(self.offset)[-1]
-        for name, shape in (
-            ("matrix", (count, count)),
-            ("stderr", (count, count)),
-            ("offset", (count, colors)),
-            ("offset_stderr", (count, colors)),
-            ("offset_common", (count, colors)),
-        ):
-            freeze_array(self, name, shape)
+        freeze_arrays(self, (count, count), "matrix", "stderr")
+        freeze_arrays(self, (count, colors), "offset", "offset_stderr", "offset_common")
         if not (np.diagonal(self.matrix) == 1.0).all():
             raise ValueError("CrossTalk.matrix: got a diagonal other than 1")
         away = np.abs(self.matrix).sum(axis=0) - 1.0

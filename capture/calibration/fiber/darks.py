@@ -68,26 +68,16 @@ class CameraNoise:
     @classmethod
     def of_view(cls, view: View) -> CameraNoise:
         """Return what the rig's file says of a camera."""
-        return cls(
-            view.gain_e_per_dn,
-            view.read_noise_e,
-            float(view.black_level),
-            float(view.white_level),
-            view.cfa,
-            "nominal",
-        )
+        levels = float(view.black_level), float(view.white_level)
+        return cls(view.gain_e_per_dn, view.read_noise_e, *levels, view.cfa, "nominal")
 
     @classmethod
     def of_sensor(cls, sensor: SensorCalibration) -> CameraNoise:
         """Return what a calibration of the sensor measured, averaged over its colors."""
-        return cls(
-            float(sensor.mean_gain_e_per_dn().value),
-            float(sensor.mean_read_noise_e().value),
-            float(sensor.black_dn.value.mean()),
-            float(sensor.white_dn),
-            sensor.pattern,
-            "calibrated",
-        )
+        means = sensor.mean_gain_e_per_dn(), sensor.mean_read_noise_e()
+        gain, read_noise = (float(mean.value) for mean in means)
+        levels = float(sensor.black_dn.value.mean()), float(sensor.white_dn)
+        return cls(gain, read_noise, *levels, sensor.pattern, "calibrated")
 
     @property
     def span_dn(self) -> float:

@@ -1,12 +1,13 @@
 """A fibre probe as calibrated: from light in the spots to reflectance in the fibres."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from capture.arrays import FloatArray
-from capture.calibration.fiber.crosstalk import CrossTalk, measure_crosstalk, no_crosstalk
+from capture.calibration.fiber.crosstalk import measure_crosstalk, no_crosstalk
 from capture.calibration.fiber.phantom import ExpectedReflectance
 from capture.calibration.fiber.probe_calibration import FiberCalibration, FiberError, fill_invalid
 from capture.calibration.fiber.readings import FiberReadings
@@ -87,24 +88,9 @@ def calibrate_fibers(
     relative = np.hypot(
         np.sqrt(spread) / np.where(valid, light, 1.0), expected.stderr / expected.per_mm2
     )
-    mixed = CrossTalk(
-        mixed.matrix,
-        mixed.stderr,
-        mixed.offset / level,
-        mixed.offset_stderr / level,
-        mixed.offset_common / level,
-        mixed.measured,
-        mixed.cover_leak,
-        mixed.cover_leak_stderr,
-    )
-    return FiberCalibration(
-        spots,
-        np.asarray(radius_mm, np.float64),
-        np.where(valid, gain / level, 0.0),
-        np.where(valid, relative * gain / level, 0.0),
-        expected.common,
-        light / level,
-        mixed,
-        valid,
-        dead,
-    )
+    offsets = ("offset", "offset_stderr", "offset_common")
+    mixed = replace(mixed, **{name: getattr(mixed, name) / level for name in offsets})
+    errors = np.where(valid, relative * gain / level, 0.0), expected.common
+    gain = np.where(valid, gain / level, 0.0)
+    radius = np.asarray(radius_mm, np.float64)
+    return FiberCalibration(spots, radius, gain, *errors, light / level, mixed, valid, dead)

@@ -130,16 +130,9 @@ def merge_series(
     valid = seen & ~hot
     rate, variance = np.where(valid, rate, 0.0), np.where(valid, variance, 0.0)
     span = noise.span_dn
-    return MergedSeries(
-        rate / span,
-        variance / span**2,
-        _smooth(rate, valid, noise.pattern) / span,
-        valid,
-        ~seen & ~hot,
-        tuple(float(t) for t in times),
-        tuple(float(f) for f in scale),
-        tuple(float(e) for e in scale_stderr),
-    )
+    light = _smooth(rate, valid, noise.pattern) / span
+    of_frames = (tuple(row.tolist()) for row in (times, scale, scale_stderr))
+    return MergedSeries(rate / span, variance / span**2, light, valid, ~seen & ~hot, *of_frames)
 
 
 def color_masks(shape: tuple[int, ...], pattern: str) -> list[BoolArray]:

@@ -2,14 +2,13 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
 import numpy as np
-from pydantic import ConfigDict
 
 from capture.arrays import Float64Array
 from capture.calibration.record import CalibrationError
-from capture.documents import STRICT_CONFIG, Checks, Fault, parse, read_json, shown
+from capture.documents import Checks, Document, parse, read_json, shown
 
 SCHEMA: Final = "skinrig.phantom/1"
 
@@ -19,10 +18,8 @@ class CertificateError(CalibrationError):
 
 
 @dataclass(frozen=True, slots=True)
-class CertificateUncertainty:
+class CertificateUncertainty(Document):
     """Relative standard uncertainties (68 %), each common to all wavelengths."""
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     sigma_a: float
     """Of the absorption coefficients, 0 <= u < 0.5."""
@@ -38,7 +35,7 @@ class CertificateUncertainty:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PhantomCertificate:
+class PhantomCertificate(Document):
     """Optics of a homogeneous block, large and thick beside the probe, as its maker states them.
 
     Examples
@@ -50,8 +47,6 @@ class PhantomCertificate:
     >>> paper.at([550.0])[1].round(3).tolist()
     [1.429]
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     eta: float
     """Refractive index, 1 to 2."""
@@ -99,15 +94,11 @@ class PhantomCertificate:
         wanted = np.asarray(wavelength_nm, np.float64)
         known = np.array(self.wavelength_nm)
         if len(known) > 1 and ((wanted < known[0] - 1e-9) | (wanted > known[-1] + 1e-9)).any():
-            raise CertificateError(
+            raise CertificateError.at(
                 "phantom's certificate does not reach far enough",
-                faults=[
-                    Fault(
-                        "wavelength_nm",
-                        f"{known[0]:g} to {known[-1]:g} nm",
-                        f"{wanted.min():g} to {wanted.max():g} nm, the light that the camera sees",
-                    )
-                ],
+                "wavelength_nm",
+                f"{known[0]:g} to {known[-1]:g} nm",
+                f"{wanted.min():g} to {wanted.max():g} nm, the light that the camera sees",
             )
         x = np.log(np.clip(wanted, known[0], known[-1]))
         sigma_a, sigma_s = (
@@ -180,10 +171,8 @@ def read_certificate(path: str | Path) -> PhantomCertificate:
     data = read_json(text, where=where, error=CertificateError)
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         found = data.get("schema") if isinstance(data, dict) else type(data).__name__
-        raise CertificateError(
-            "is not a phantom's certificate",
-            where=where,
-            faults=[Fault("schema", shown(found), repr(SCHEMA))],
+        raise CertificateError.at(
+            "is not a phantom's certificate", "schema", shown(found), repr(SCHEMA), where=where
         )
     body = {key: value for key, value in data.items() if key != "schema"}
     return parse(PhantomCertificate, body, where=where, error=CertificateError)

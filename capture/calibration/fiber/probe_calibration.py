@@ -14,7 +14,6 @@ from capture.arrays import BoolArray, Float64Array
 from capture.calibration.fiber.crosstalk import CrossTalk
 from capture.calibration.fiber.readings import FiberReadings
 from capture.calibration.fiber.spots import FiberSpots
-from capture.calibration.frozen_arrays import freeze_array
 from capture.calibration.record import (
     Calibration,
     CalibrationError,
@@ -23,6 +22,7 @@ from capture.calibration.record import (
     Origin,
     Quantity,
     device_rows,
+    freeze_arrays,
     of_devices,
 )
 from capture.calibration.store import load
@@ -117,16 +117,11 @@ class FiberCalibration:
     def __post_init__(self) -> None:
         """Convert and check the arrays against each other."""
         count, colors = np.shape(self.gain)
-        for name, shape, kind in (
-            ("radius_mm", (count,), np.float64),
-            ("gain", (count, colors), np.float64),
-            ("gain_stderr", (count, colors), np.float64),
-            ("light", (count, colors), np.float64),
-            ("common", (len(self.common), count, colors), np.float64),
-            ("valid", (count, colors), np.bool_),
-            ("dead", (count,), np.bool_),
-        ):
-            freeze_array(self, name, shape, kind)
+        freeze_arrays(self, (count,), "radius_mm")
+        freeze_arrays(self, (count, colors), "gain", "gain_stderr", "light")
+        freeze_arrays(self, (len(self.common), count, colors), "common")
+        freeze_arrays(self, (count, colors), "valid", kind=np.bool_)
+        freeze_arrays(self, (count,), "dead", kind=np.bool_)
         if len(self.spots.names) != count or self.crosstalk.offset.shape != (count, colors):
             raise ValueError(
                 f"FibreCalibration: got {len(self.spots.names)} spots and cross-talk of"
@@ -275,32 +270,17 @@ class FiberCalibration:
             return calibration.quantity(serial, name).value
 
         shift, leak = camera("row_shift_px"), calibration.quantity(serial, "cover_leak")
-        return cls(
-            FiberSpots(
-                table.names,
-                *table.both("spot_px"),
-                *table.both("spot_radius_px"),
-                table.values("spot_edge_px"),
-                table.flags("found"),
-                float(camera("aperture_px")),
-                (float(shift[0]), float(shift[1])),
-                float(camera("row_rotation_rad")),
-            ),
-            table.values("radius_mm"),
-            *table.both("gain"),
-            table.values("gain_common").transpose(1, 0, 2),
-            table.values("phantom_light"),
-            CrossTalk(
-                *table.both("crosstalk"),
-                *table.both("stray"),
-                table.values("stray_common"),
-                bool(camera("crosstalk_measured")),
-                float(leak.value),
-                float(leak.known_stderr),
-            ),
-            table.flags("valid"),
-            table.flags("dead"),
-        )
+        discs = *table.both("spot_px"), *table.both("spot_radius_px"), table.values("spot_edge_px")
+        moved = float(shift[0]), float(shift[1])
+        aperture_px, turned = float(camera("aperture_px")), float(camera("row_rotation_rad"))
+        spots = FiberSpots(table.names, *discs, table.flags("found"), aperture_px, moved, turned)
+        mixing = *table.both("crosstalk"), *table.both("stray"), table.values("stray_common")
+        leaks = float(leak.value), float(leak.known_stderr)
+        mixed = CrossTalk(*mixing, bool(camera("crosstalk_measured")), *leaks)
+        gains = *table.both("gain"), table.values("gain_common").transpose(1, 0, 2)
+        flags = table.flags("valid"), table.flags("dead")
+        light = table.values("phantom_light")
+        return cls(spots, table.values("radius_mm"), *gains, light, mixed, *flags)
 
     @classmethod
     def load(

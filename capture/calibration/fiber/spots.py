@@ -11,8 +11,7 @@ import numpy as np
 from capture.arrays import BoolArray, Float64Array, FloatArray, Int64Array
 from capture.calibration.fiber.discs import DiscFit, candidates, distinct, fit_disc, gray_image
 from capture.calibration.fiber.merge import MergedSeries
-from capture.calibration.frozen_arrays import freeze_array
-from capture.calibration.record import CalibrationError
+from capture.calibration.record import CalibrationError, freeze_arrays
 
 MAX_SPOT_OFFSET_PITCH: Final = 0.35
 """How far a spot may lie from its place in the row."""
@@ -69,11 +68,9 @@ class FiberSpots:
     def __post_init__(self) -> None:
         """Convert and check the arrays against each other."""
         count = len(self.names)
-        for name in ("center_px", "center_stderr_px"):
-            freeze_array(self, name, (count, 2))
-        for name in ("radius_px", "radius_stderr_px", "edge_px"):
-            freeze_array(self, name, (count,))
-        freeze_array(self, "found", (count,), np.bool_)
+        freeze_arrays(self, (count, 2), "center_px", "center_stderr_px")
+        freeze_arrays(self, (count,), "radius_px", "radius_stderr_px", "edge_px")
+        freeze_arrays(self, (count,), "found", kind=np.bool_)
         if not (self.aperture_px > 0 and (self.radius_px > 0).all()):
             raise ValueError("FibreSpots: got a radius or an aperture <= 0, expected pixels > 0")
 
@@ -250,20 +247,13 @@ def _table(
     found = np.array([fit is not None for fit in best])
     fits = [fit for fit in best if fit is not None]
     size, edge = (float(np.median([fit[0][k] for fit in fits])) for k in (2, 3))
-    scatter = float(
-        np.median(
-            [np.hypot(*(fit[0][:2] - model[i])) for i, fit in enumerate(best) if fit is not None]
-        )
-    )
+    off = [np.hypot(*(fit[0][:2] - model[i])) for i, fit in enumerate(best) if fit is not None]
+    scatter = max(float(np.median(off)), 0.1)
     value = np.array(
         [[*model[i], size, edge] if fit is None else fit[0] for i, fit in enumerate(best)]
     )
-    error = np.array(
-        [
-            [max(scatter, 0.1), max(scatter, 0.1), 0.1 * size, 0.0] if fit is None else fit[1]
-            for fit in best
-        ]
-    )
+    unknown = [scatter, scatter, 0.1 * size, 0.0]
+    error = np.array([unknown if fit is None else fit[1] for fit in best])
     radius = np.where(found, value[:, 2], size)
     pitch = _pitch(value[:, :2])
     reach = size + APERTURE_EDGE_WIDTHS * edge
@@ -278,17 +268,11 @@ def _table(
         )
     shift = (value[found, :2] - nominal[found]).mean(axis=0)
     turn = np.polyfit(value[found, 0], value[found, 1] - nominal[found, 1], 1)[0]
+    centers, radii = (value[:, :2], error[:, :2]), (radius, error[:, 2])
+    moved = float(shift[0]), float(shift[1])
+    turned = float(np.arctan(turn))
     table = FiberSpots(
-        tuple(names),
-        value[:, :2],
-        error[:, :2],
-        radius,
-        error[:, 2],
-        value[:, 3],
-        found,
-        float(aperture),
-        (float(shift[0]), float(shift[1])),
-        float(np.arctan(turn)),
+        tuple(names), *centers, *radii, value[:, 3], found, float(aperture), moved, turned
     )
     for i in np.flatnonzero(table.overlapping).tolist():
         gaps = np.linalg.norm(table.center_px - table.center_px[i], axis=1)

@@ -26,6 +26,9 @@ Gauge: TypeAlias = Literal["board", "cameras"]
 Sightings: TypeAlias = Mapping[tuple[str, int], Sighting]
 
 
+Cameras: TypeAlias = Mapping[str, CameraPose]
+Places: TypeAlias = Mapping[int, BoardPose]
+Residuals: TypeAlias = Mapping[tuple[str, int], Float64Array]
 N_CAMERA, N_LENS, N_POSE = 15, 9, 6  # numbers of a camera, of these its lens, of a place
 
 
@@ -109,7 +112,7 @@ class BundleProblem:
         self,
         sightings: Sightings,
         board: Target,
-        start: Mapping[str, CameraPose],
+        start: Cameras,
         prior: LensPrior,
         gauge: Gauge,
         *,
@@ -124,20 +127,22 @@ class BundleProblem:
         self.start = start
         self.gauge = gauge
         self.sigmas = {name: prior.sigmas(start[name]) for name in self.names}
-        free = np.zeros(len(self.names) * N_CAMERA + len(self.poses) * N_POSE, bool)
+        self.first = len(self.names) * N_CAMERA  # where the places' numbers begin
+        self.total = self.first + len(self.poses) * N_POSE
+        free = np.zeros(self.total, bool)
         if not cameras_fixed:
             for i, name in enumerate(self.names):
                 free[i * N_CAMERA : i * N_CAMERA + N_LENS] = self.sigmas[name] > 0
                 free[i * N_CAMERA + N_LENS : (i + 1) * N_CAMERA] = True
-        free[len(self.names) * N_CAMERA :] = True
+        free[self.first :] = True
         if gauge == "board":
-            at = len(self.names) * N_CAMERA + self.poses.index(0) * N_POSE
+            at = self.first + self.poses.index(0) * N_POSE
             free[at : at + N_POSE] = False
         self.free = np.nonzero(free)[0]
         self.cameras_fixed = cameras_fixed
 
     def solve(
-        self, cameras: Mapping[str, CameraPose], places: Mapping[int, BoardPose]
+        self, cameras: Cameras, places: Places
     ) -> tuple[dict[str, CameraPose], dict[int, BoardPose]]:
         """Run Levenberg's method with Huber's weights; the scale is taken anew at each step."""
         cameras, places = dict(cameras), dict(places)
@@ -148,7 +153,7 @@ class BundleProblem:
             cost = self._cost(residuals, cameras, sigma)
             H, g = self._equations(cameras, places, residuals, sigma)
             while True:
-                step = np.zeros(len(self.names) * N_CAMERA + len(self.poses) * N_POSE)
+                step = np.zeros(self.total)
                 damped = H + damping * np.diag(np.diag(H))
                 step[self.free] = cho_solve(cho_factor(damped), -g)
                 trial = self._stepped(cameras, places, step)
@@ -180,7 +185,7 @@ class BundleProblem:
         unknown = len(self.free) - (N_POSE if self.gauge == "cameras" else 0)
         noise = float(np.sqrt(square / max(count - unknown, 1.0)))
         H, _ = self._equations(cameras, places, residuals, max(noise, MIN_SIGMA_PX))
-        covariance = np.zeros((len(self.names) * N_CAMERA + len(self.poses) * N_POSE,) * 2)
+        covariance = np.zeros((self.total,) * 2)
         covariance[np.ix_(self.free, self.free)] = self._inverse(H, cameras)
         found, centers = {}, {}
         for i, name in enumerate(self.names):
@@ -210,12 +215,11 @@ class BundleProblem:
         outliers = {key: n for key, n in far.items() if n}
         return Bundle(found, places, rms, noise, corners, outliers, centers)
 
-    def _inverse(self, H: Float64Array, cameras: Mapping[str, CameraPose]) -> Float64Array:
+    def _inverse(self, H: Float64Array, cameras: Cameras) -> Float64Array:
         """Return the covariance; with free frame, that of the frame fixed by the centres."""
         if self.gauge == "board" or self.cameras_fixed:
             return np.asarray(np.linalg.inv(H))
-        total = len(self.names) * N_CAMERA + len(self.poses) * N_POSE
-        B = np.zeros((N_POSE, total))  # sum of shifts, sum of moments of the centres
+        B = np.zeros((N_POSE, self.total))  # sum of shifts, sum of moments of the centres
         middle = np.mean([cameras[name].center_mm for name in self.names], axis=0)
         for i, name in enumerate(self.names):
             to_center = np.hstack(_center_derivative(cameras[name]))
@@ -233,9 +237,7 @@ class BundleProblem:
         inverse = np.linalg.inv(bordered)[:n, :n]
         return np.asarray(inverse / np.outer(scale, scale))
 
-    def _residuals(
-        self, cameras: Mapping[str, CameraPose], places: Mapping[int, BoardPose]
-    ) -> dict[tuple[str, int], Float64Array]:
+    def _residuals(self, cameras: Cameras, places: Places) -> Residuals:
         out = {}
         for (name, pose), s in self.images.items():
             r = cameras[name].project(places[pose].to_rig(self.board.points_mm[s.ids])) - s.pixels
@@ -243,16 +245,11 @@ class BundleProblem:
         return out
 
     @staticmethod
-    def _sigma(residuals: Mapping[tuple[str, int], Float64Array]) -> float:
+    def _sigma(residuals: Residuals) -> float:
         """Return the noise by the median of the absolute residuals."""
         return max(mad_sigma(np.concatenate(list(residuals.values())).ravel()), MIN_SIGMA_PX)
 
-    def _cost(
-        self,
-        residuals: Mapping[tuple[str, int], Float64Array],
-        cameras: Mapping[str, CameraPose],
-        sigma: float,
-    ) -> float:
+    def _cost(self, residuals: Residuals, cameras: Cameras, sigma: float) -> float:
         total = 0.0
         for r in residuals.values():
             z = np.linalg.norm(r, axis=1) / sigma
@@ -270,23 +267,17 @@ class BundleProblem:
         return np.divide(gap, sigmas, out=np.zeros(N_LENS), where=sigmas > 0)
 
     def _equations(
-        self,
-        cameras: Mapping[str, CameraPose],
-        places: Mapping[int, BoardPose],
-        residuals: Mapping[tuple[str, int], Float64Array],
-        sigma: float,
+        self, cameras: Cameras, places: Places, residuals: Residuals, sigma: float
     ) -> tuple[Float64Array, Float64Array]:
         """Return the normal matrix and the gradient of half the cost, free numbers only."""
-        first = len(self.names) * N_CAMERA
-        total = first + len(self.poses) * N_POSE
-        H, g = np.zeros((total, total)), np.zeros(total)
+        H, g = np.zeros((self.total, self.total)), np.zeros(self.total)
         for (name, pose), sighting in self.images.items():
             of_camera, of_place = _derivatives(
                 cameras[name], places[pose], self.board.points_mm[sighting.ids]
             )
             r = residuals[name, pose]
             w = np.repeat(_huber(r, sigma), 2) / sigma**2
-            i, j = self.names.index(name) * N_CAMERA, first + self.poses.index(pose) * N_POSE
+            i, j = self.names.index(name) * N_CAMERA, self.first + self.poses.index(pose) * N_POSE
             A, B, rows = of_camera.reshape(-1, N_CAMERA), of_place.reshape(-1, N_POSE), r.ravel()
             at, to = slice(i, i + N_CAMERA), slice(j, j + N_POSE)
             H[to, to] += (B * w[:, None]).T @ B
@@ -301,11 +292,11 @@ class BundleProblem:
             inverse = np.divide(1.0, sigmas, out=np.zeros(N_LENS), where=sigmas > 0)
             H[lens, lens] += inverse**2
             g[lens] += inverse * self._lens_pull(name, cameras[name])
-        H[first:, :first] = H[:first, first:].T
+        H[self.first :, : self.first] = H[: self.first, self.first :].T
         return H[np.ix_(self.free, self.free)], g[self.free]
 
     def _stepped(
-        self, cameras: Mapping[str, CameraPose], places: Mapping[int, BoardPose], step: Float64Array
+        self, cameras: Cameras, places: Places, step: Float64Array
     ) -> tuple[dict[str, CameraPose], dict[int, BoardPose]]:
         new_cameras, new_places = dict(cameras), dict(places)
         for i, name in enumerate(() if self.cameras_fixed else self.names):
@@ -323,9 +314,8 @@ class BundleProblem:
                 rotation=_turned(camera.rotation, d[9:12]),
                 translation_mm=camera.translation_mm + d[12:15],
             )
-        first = len(self.names) * N_CAMERA
         for j, pose in enumerate(self.poses):
-            d = step[first + j * N_POSE : first + (j + 1) * N_POSE]
+            d = step[self.first + j * N_POSE : self.first + (j + 1) * N_POSE]
             new_places[pose] = BoardPose(
                 _turned(places[pose].rotation, d[:3]), places[pose].translation_mm + d[3:]
             )

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from capture.arrays import Float64Array
-from capture.calibration.record import Calibration, Origin, Quantity, of_devices
+from capture.calibration.record import Calibration, Origin, Quantity, freeze_arrays, of_devices
 from capture.rig import Rig, View
 
 _LEFT_OUT: Any = None  # __post_init__ puts an array in its place
@@ -60,26 +60,9 @@ class CameraPose:
 
     def __post_init__(self) -> None:
         """Convert to float64 and refuse what is no camera."""
-        shapes = {
-            "matrix": (3, 3),
-            "distortion": (5,),
-            "rotation": (3, 3),
-            "translation_mm": (3,),
-            "matrix_stderr": (3, 3),
-            "distortion_stderr": (5,),
-            "rotation_stderr_rad": (3,),
-            "translation_stderr_mm": (3,),
-        }
-        for name, shape in shapes.items():
-            given = getattr(self, name)
-            array = np.array(np.zeros(shape) if given is None else given, dtype=np.float64)
-            if array.shape != shape or not np.isfinite(array).all():
-                raise ValueError(
-                    f"CameraPose.{name}: got {array.tolist()}, expected finite numbers of shape"
-                    f" {shape}"
-                )
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+        freeze_arrays(self, (3, 3), "matrix", "matrix_stderr", "rotation")
+        freeze_arrays(self, (5,), "distortion", "distortion_stderr")
+        freeze_arrays(self, (3,), "translation_mm", "translation_stderr_mm", "rotation_stderr_rad")
         K, R = self.matrix, self.rotation
         if not (K[0, 0] > 0 and K[1, 1] > 0 and np.array_equal(K[2], [0.0, 0.0, 1.0])):
             raise ValueError(
@@ -109,21 +92,10 @@ class CameraPose:
         """
         right, up, back = (np.array(axis) for axis in view.axes)
         rotation = np.stack([right, -up, -back])
-        matrix = np.array(
-            [
-                [view.focal_px, 0.0, (view.width_px - 1) / 2],
-                [0.0, view.focal_px, (view.height_px - 1) / 2],
-                [0.0, 0.0, 1.0],
-            ]
-        )
-        return cls(
-            view.serial,
-            matrix,
-            np.zeros(5),
-            rotation,
-            -rotation @ np.array(view.position_mm),
-            (view.width_px, view.height_px),
-        )
+        matrix = np.diag([view.focal_px, view.focal_px, 1.0])
+        matrix[:2, 2] = (view.width_px - 1) / 2, (view.height_px - 1) / 2
+        shift, size = -rotation @ np.array(view.position_mm), (view.width_px, view.height_px)
+        return cls(view.serial, matrix, np.zeros(5), rotation, shift, size)
 
     @property
     def center_mm(self) -> Float64Array:
@@ -212,13 +184,9 @@ def distort(xy: ArrayLike, distortion: ArrayLike) -> Float64Array:
     x, y = points[..., 0], points[..., 1]
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return np.stack(
-        [
-            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-        ],
-        axis=-1,
-    )
+    bent_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    bent_y = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    return np.stack([bent_x, bent_y], axis=-1)
 
 
 def nominal_cameras(rig: Rig) -> dict[str, CameraPose]:

@@ -15,9 +15,13 @@ from scipy.spatial import cKDTree
 
 from capture.arrays import BoolArray, Float64Array, Int64Array
 from capture.calibration.geometry import CameraPose
-from capture.calibration.led_sphere.mirrored_lights import DERIVATIVE_STEP_MM, mirror_lights
-from capture.calibration.lights.reflection import reflect, reflection_pixels
-from capture.calibration.record import CalibrationError
+from capture.calibration.lights.reflection import (
+    DERIVATIVE_STEP_MM,
+    mirror_lights,
+    reflect,
+    reflection_pixels,
+)
+from capture.calibration.record import CalibrationError, freeze_arrays
 from capture.calibration.robust import HUBER_SIGMAS, mad_sigma
 
 SPOT_DETECTION_SIGMAS = 7.0  # of the smoothed image: none of 4 million pixels of noise gets there
@@ -80,16 +84,10 @@ class Ball:
 
     def __post_init__(self) -> None:
         """Convert to float64 and refuse what is no ball."""
-        center = np.array(self.center_mm, np.float64)
-        covariance = np.array(self.covariance_mm2, np.float64)
-        if center.shape != (3,) or not np.isfinite(center).all():
-            raise ValueError(f"Ball.center_mm: got {center.tolist()}, expected three numbers")
+        freeze_arrays(self, (3,), "center_mm")
+        freeze_arrays(self, (4, 4), "covariance_mm2")
         if not 0 < self.radius_mm < np.inf:
             raise ValueError(f"Ball.radius_mm: got {self.radius_mm}, expected > 0")
-        if covariance.shape != (4, 4) or not np.isfinite(covariance).all():
-            raise ValueError(f"Ball.covariance_mm2: got shape {covariance.shape}, expected (4, 4)")
-        object.__setattr__(self, "center_mm", center)
-        object.__setattr__(self, "covariance_mm2", covariance)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -268,17 +266,10 @@ def light_directions(
 
     place = np.append(ball.center_mm, ball.radius_mm)
     direction = direct(pixels, place)
-    by_pixel = np.stack(
-        [(direct(pixels + h, place) - direct(pixels - h, place)) / 0.02 for h in 0.01 * np.eye(2)],
-        axis=-1,
-    )
-    by_place = np.stack(
-        [
-            (direct(pixels, place + h) - direct(pixels, place - h)) / 0.002
-            for h in 0.001 * np.eye(4)
-        ],
-        axis=-1,
-    )
+    moved = [direct(pixels + h, place) - direct(pixels - h, place) for h in 0.01 * np.eye(2)]
+    by_pixel = np.stack(moved, axis=-1) / 0.02
+    moved = [direct(pixels, place + h) - direct(pixels, place - h) for h in 0.001 * np.eye(4)]
+    by_place = np.stack(moved, axis=-1) / 0.002
     covariance = pixel_stderr[:, None, None] ** 2 * (by_pixel @ by_pixel.transpose(0, 2, 1))
     covariance = covariance + by_place @ ball.covariance_mm2 @ by_place.transpose(0, 2, 1)
     return LightDirections(direction, covariance)
@@ -348,14 +339,11 @@ def _refine(
                 f"ball: only {len(used)} spots fit the lights' pattern, expected {MIN_SPOTS} or"
                 " more; check the target, its radius and the exposure"
             )
-        slopes = []
-        for h in DERIVATIVE_STEP_MM * np.eye(4):
-            ends = [
-                reflection_pixels(camera, at[:3], float(at[3]), lights[used])
-                for at in (place + h, place - h)
-            ]
-            slopes.append((ends[0] - ends[1]) / (2 * DERIVATIVE_STEP_MM))
-        slope = np.stack(slopes, axis=-1)
+        steps = DERIVATIVE_STEP_MM * np.eye(4)
+        at = np.concatenate([place + steps, place - steps])
+        ends = [reflection_pixels(camera, x[:3], float(x[3]), lights[used]) for x in at]
+        slope = np.stack(ends[:4], axis=-1) - np.stack(ends[4:], axis=-1)
+        slope /= 2 * DERIVATIVE_STEP_MM
         miss = found[spot[used]] - seen.pixels[used]
         moved = seen.px_per_mm[used]
         noise = noise_px**2 * np.eye(2)

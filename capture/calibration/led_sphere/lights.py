@@ -11,7 +11,6 @@ from typing import Unpack
 import numpy as np
 
 from capture.arrays import BoolArray, Float64Array
-from capture.calibration.frozen_arrays import freeze_array
 from capture.calibration.record import (
     Calibration,
     CalibrationMismatch,
@@ -19,6 +18,7 @@ from capture.calibration.record import (
     Origin,
     Quantity,
     device_rows,
+    freeze_arrays,
     of_devices,
 )
 from capture.calibration.store import load
@@ -60,12 +60,10 @@ class SphereLightTable:
     def __post_init__(self) -> None:
         """Convert and check the arrays against each other."""
         n = len(self.names)
-        for name in ("directions", "directions_stderr"):
-            freeze_array(self, name, (n, 3), of=f" for {n} lights")
-        for name in ("intensities", "intensities_stderr"):
-            freeze_array(self, name, (n,), of=f" for {n} lights")
-        for name in ("seen", "valid", "dead"):
-            freeze_array(self, name, (n,), np.bool_, of=f" for {n} lights")
+        of = f" for {n} lights"
+        freeze_arrays(self, (n, 3), "directions", "directions_stderr", of=of)
+        freeze_arrays(self, (n,), "intensities", "intensities_stderr", of=of)
+        freeze_arrays(self, (n,), "seen", "valid", "dead", kind=np.bool_, of=of)
         length = np.linalg.norm(self.directions, axis=1)
         if (np.abs(length - 1) > 1e-6).any():
             raise ValueError("SphereLightTable.directions: expected unit vectors")
@@ -88,16 +86,11 @@ class SphereLightTable:
         strength = np.array([light.power_w or 0.0 for light in rig.lights])
         strength = strength / np.sum(place**2, axis=1)
         n = len(rig.lights)
-        return cls(
-            tuple(light.name for light in rig.lights),
-            place / np.linalg.norm(place, axis=1, keepdims=True),
-            np.zeros((n, 3)),
-            strength / strength.mean(),
-            np.zeros(n),
-            np.zeros(n, bool),
-            np.zeros(n, bool),
-            np.zeros(n, bool),
-        )
+        names = tuple(light.name for light in rig.lights)
+        directions = place / np.linalg.norm(place, axis=1, keepdims=True)
+        flags = [np.zeros(n, bool)] * 3
+        strengths = strength / strength.mean()
+        return cls(names, directions, np.zeros((n, 3)), strengths, np.zeros(n), *flags)
 
     def to_calibration(
         self, *, ball: Mapping[str, Quantity] | None = None, **about: Unpack[Origin]
@@ -190,9 +183,9 @@ class SphereFilms:
         """Convert and check the arrays against each other."""
         n = len(self.names)
         arrays = (*_LEAKAGE_FIELDS, *(f"{name}_stderr" for name in _LEAKAGE_FIELDS[:2]))
-        for name in (*arrays, "axis_error_stderr_rad"):
-            freeze_array(self, name, (n,), of=f" for {n} lights")
-        freeze_array(self, "valid", (n,), np.bool_, of=f" for {n} lights")
+        of = f" for {n} lights"
+        freeze_arrays(self, (n,), *arrays, "axis_error_stderr_rad", of=of)
+        freeze_arrays(self, (n,), "valid", kind=np.bool_, of=of)
         if (self.leakage < 0).any() or not self.eta > 1:
             raise ValueError("SphereFilms: got a leakage < 0 or eta <= 1, expected >= 0 and > 1")
 

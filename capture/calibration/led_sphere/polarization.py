@@ -153,15 +153,8 @@ def leakage(fit: FilmFit, reflection: Reflection) -> tuple[Float64Array, Float64
         it is a square, and errors of angles of either sign add to it.
     """
     count = len(fit.turn_rad)
-    at = np.stack(
-        [
-            fit.turn_rad,
-            np.full(count, fit.zero_rad),
-            np.full(count, np.log(fit.light_leak)),
-            np.full(count, np.log(fit.analyser_leak)),
-        ],
-        axis=-1,
-    )
+    shared = (fit.zero_rad, np.log(fit.light_leak), np.log(fit.analyser_leak))
+    at = np.stack([fit.turn_rad, *(np.full(count, x) for x in shared)], axis=-1)
     root = np.linalg.cholesky(fit.covariance + 1e-18 * np.eye(4))
     values = []
     # cubature of third degree: 2 n points at sqrt(n) standard deviations
@@ -193,6 +186,37 @@ def _starts(
     padded = np.pad(cost, 1, constant_values=np.inf)
     least = [i for i in range(len(cost)) if padded[i] > cost[i] <= padded[i + 2]]
     return [float(zeros[i]) for i in sorted(least, key=lambda i: cost[i])[:2]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Arrow:
+    """Normal equations of two numbers of each light, and of three that all lights share."""
+
+    block: Float64Array  # of each light's own, (L, 2, 2)
+    border: Float64Array  # (L, 2, 3)
+    corner: Float64Array  # (3, 3)
+    one: Float64Array  # right sides, (L, 2)
+    other: Float64Array  # (3,)
+
+    def solve(self, damping: float) -> tuple[Float64Array, Float64Array]:
+        """Return the numbers, with a damped diagonal."""
+        damped = self.block + damping * self.block * np.eye(2)
+        inverse = np.linalg.inv(damped)
+        through = inverse @ self.border
+        schur = self.corner + damping * np.diag(np.diag(self.corner))
+        schur = schur - np.einsum("kia,kib->ab", self.border, through)
+        local = np.einsum("kij,kj->ki", inverse, self.one)
+        right = self.other - np.einsum("kia,ki->a", self.border, local)
+        shared = np.linalg.solve(schur, right)
+        return local - through @ shared, shared
+
+    def covariance(self) -> tuple[Float64Array, Float64Array, Float64Array]:
+        """Return covariances of each light's two numbers, with the shared ones, and of those."""
+        inverse = np.linalg.inv(self.block)
+        through = inverse @ self.border
+        shared = np.linalg.inv(self.corner - np.einsum("kia,kib->ab", self.border, through))
+        both = -through @ shared
+        return inverse - both @ through.transpose(0, 2, 1), both, shared
 
 
 class _Films:
@@ -246,9 +270,7 @@ class _Films:
             (DEGREES_OF_FREEDOM + 1) * tails.sum() + 2 * self.lit.sum() * np.log(self.scatter)
         )
 
-    def _normal(
-        self,
-    ) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array, Float64Array]:
+    def _normal(self) -> _Arrow:
         """Return blocks (L, 2, 2), borders (L, 2, 3), corner (3, 3), and both right sides."""
         h = POLARIZER_DERIVATIVE_STEP
         u = self._through(self.turn, self.shared)
@@ -273,16 +295,16 @@ class _Films:
         block[~self.lit, 0, 0] = 1.0
         corner[1:, 1:] += np.eye(2) / LOG_LEAK_SCATTER**2
         other[1:] -= (self.shared[1:] - np.log(TYPICAL_LEAK)) / LOG_LEAK_SCATTER**2
-        return block, border, corner, one, other
+        return _Arrow(block, border, corner, one, other)
 
     def solve(self) -> _Films:
         """Descend, with Marquardt's damping; between steps fit the scatter of the axes."""
         damping = 1e-3
         now = self._objective(self.strength, self.turn, self.shared)
         for _ in range(MAX_POLARIZER_STEPS):
-            block, border, corner, one, other = self._normal()
+            arrow = self._normal()
             while True:
-                local, shared = _solve_arrow(block, border, corner, one, other, damping)
+                local, shared = arrow.solve(damping)
                 trial = (
                     self.strength + local[:, 0],
                     self.turn + np.clip(local[:, 1], -0.1, 0.1),
@@ -296,7 +318,7 @@ class _Films:
             if gain >= 0:
                 self.strength, self.turn, self.shared = trial
             damping = max(damping / 10, 1e-9)
-            wider = self._scatter(_solve_arrow_covariance(block, border, corner)[0][:, 1, 1])
+            wider = self._scatter(arrow.covariance()[0][:, 1, 1])
             self.pull = np.where(
                 self.lit,
                 (DEGREES_OF_FREEDOM + 1) / (DEGREES_OF_FREEDOM + (self.turn / wider) ** 2),
@@ -379,8 +401,7 @@ class _Films:
         spread = ((self.pull[self.lit] * z) ** 2).sum()
         known = np.clip(slope**2 / max(spread, 1e-9) / len(z), 0.2, 1.0)
         self.pull = np.full_like(self.pull, known)
-        block, border, corner, *_ = self._normal()
-        local, both, shared = _solve_arrow_covariance(block, border, corner)
+        local, both, shared = self._normal().covariance()
         u = self._through(self.turn, self.shared)
         chi2 = float(np.sum(self.weight * (self.values - self.strength * u) ** 2))
         told = 1.0 - self.pull * local[:, 1, 1] / self.scatter**2  # share that the data tell
@@ -414,33 +435,3 @@ class _Films:
             turn_scatter_rad=self.scatter,
             chi2_per_dof=per_dof,
         )
-
-
-def _solve_arrow(
-    block: Float64Array,
-    border: Float64Array,
-    corner: Float64Array,
-    one: Float64Array,
-    other: Float64Array,
-    damping: float,
-) -> tuple[Float64Array, Float64Array]:
-    """Solve arrow-shaped normal equations with a damped diagonal."""
-    damped = block + damping * block * np.eye(2)
-    inverse = np.linalg.inv(damped)
-    through = inverse @ border
-    schur = corner + damping * np.diag(np.diag(corner))
-    schur = schur - np.einsum("kia,kib->ab", border, through)
-    local = np.einsum("kij,kj->ki", inverse, one)
-    shared = np.linalg.solve(schur, other - np.einsum("kia,ki->a", border, local))
-    return local - through @ shared, shared
-
-
-def _solve_arrow_covariance(
-    block: Float64Array, border: Float64Array, corner: Float64Array
-) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Return covariances of each light's two numbers, with the shared ones, and of those."""
-    inverse = np.linalg.inv(block)
-    through = inverse @ border
-    shared = np.linalg.inv(corner - np.einsum("kia,kib->ab", border, through))
-    both = -through @ shared
-    return inverse - both @ through.transpose(0, 2, 1), both, shared

@@ -1,7 +1,7 @@
 """Intensities and films of the lights, from what their spots in the ball give in each exposure."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,8 @@ from capture.calibration.fiber.spot_photometry import Shot, measure_flux
 from capture.calibration.geometry import CameraPose
 from capture.calibration.led_sphere.glass_ball import Ball
 from capture.calibration.led_sphere.lights import SphereFilms, SphereLightTable
-from capture.calibration.led_sphere.mirrored_lights import Mirrored, mirror_lights
 from capture.calibration.led_sphere.polarization import FilmFit, leakage
+from capture.calibration.lights.reflection import Mirrored, mirror_lights
 from capture.calibration.polarization.polarized_reflection import Reflection
 from capture.rig import Rig
 
@@ -22,26 +22,47 @@ EXPOSURE_REPEATABILITY = 1e-3  # how well an exposure's light repeats
 PIXEL_RESPONSE_STDERR = 1e-3  # how well pixels' responses are known over a spot
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Rates:
+    """Light per second of each light's spot in each exposure, with what may be used of it.
+
+    Attributes
+    ----------
+    readings_deg : ndarray of float64, shape (E,)
+        Of the analyser.
+    rate, variance : ndarray of float64, shape (E, L)
+    good : ndarray of bool, shape (E, L)
+        Whole and not saturated.
+    saturated : ndarray of bool, shape (L,)
+        In every exposure.
+    """
+
+    readings_deg: Float64Array
+    rate: Float64Array
+    variance: Float64Array
+    good: BoolArray
+    saturated: BoolArray
+
+    @property
+    def fluxed(self) -> BoolArray:
+        """Which lights have usable rates at two or more readings, shape (L,)."""
+        return np.array([len(set(self.readings_deg[ok] % 180.0)) >= 2 for ok in self.good.T])
+
+
 def measure_rates(
     shots: Sequence[Shot], at: Float64Array, aperture_px: Float64Array, within: Float64Array
-) -> tuple[Float64Array, Float64Array, BoolArray, BoolArray]:
-    """Return rates, variances, whether they may be used, (E, L), and always saturated, (L,)."""
+) -> Rates:
+    """Return the rates of spots at places (L, 2), of which apertures hold a share `within`."""
     rows = []
-    saturated = np.ones(len(at), bool)
     for shot in shots:
         flux = measure_flux(shot, at, aperture_px=aperture_px)
         scale = 1.0 / (within * shot.amount_s)
         rate = flux.value * scale
         variance = flux.variance * scale**2 + (EXPOSURE_REPEATABILITY * rate) ** 2
-        rows.append((rate, variance, flux.whole & ~flux.saturated))
-        saturated &= flux.saturated
-    rates, variances, good = (np.array(part) for part in zip(*rows, strict=True))
-    return rates, variances, good, saturated
-
-
-def has_two_readings(readings: Float64Array, good: BoolArray) -> BoolArray:
-    """Return which lights have usable rates at two or more readings, shape (L,)."""
-    return np.array([len(set(readings[ok] % 180.0)) >= 2 for ok in good.T])
+        rows.append((rate, variance, flux.whole & ~flux.saturated, flux.saturated))
+    rates, variances, good, saturated = (np.array(part) for part in zip(*rows, strict=True))
+    readings = np.array([shot.reading_deg for shot in shots])
+    return Rates(readings, rates, variances, good, np.logical_and.reduce(saturated))
 
 
 def add_geometry_errors(
@@ -129,23 +150,16 @@ def measure_intensities(
 
 
 def film_table(
-    lights: SphereLightTable,
-    films: FilmFit,
-    skin: Reflection,
-    rates: Float64Array,
-    variance: Float64Array,
-    good: BoolArray,
-    readings: Float64Array,
-    eta: float,
+    lights: SphereLightTable, films: FilmFit, skin: Reflection, rates: Rates, eta: float
 ) -> SphereFilms:
     """Return the films of the lights, with their leakage and the ratio of crossed to parallel."""
-    leaked, leaked_stderr = leakage(films, skin)
-    weight = np.where(good, 1.0 / np.where(variance > 0, variance, 1.0), 0.0)
+    usable = rates.good & rates.fluxed
+    weight = np.where(usable, 1.0 / np.where(rates.variance > 0, rates.variance, 1.0), 0.0)
     states = []
     for state in (0.0, 90.0):
-        rows = np.isclose(readings % 180.0, state, atol=0.01)
+        rows = np.isclose(rates.readings_deg % 180.0, state, atol=0.01)
         whole = weight[rows].sum(axis=0)
-        mean = (weight * rates)[rows].sum(axis=0) / np.where(whole > 0, whole, 1.0)
+        mean = (weight * rates.rate)[rows].sum(axis=0) / np.where(whole > 0, whole, 1.0)
         states.append((mean, 1.0 / np.where(whole > 0, whole, np.inf), whole > 0))
     (parallel, p_var, p_seen), (crossed, c_var, c_seen) = states
     seen = p_seen & c_seen & (parallel > 3 * np.sqrt(p_var)) & ~lights.dead
@@ -157,20 +171,9 @@ def film_table(
     upward = lights.directions[:, 1]
     horizon = np.linalg.norm(lights.directions_stderr, axis=1) / np.sqrt(2)
     horizon = horizon * np.abs(upward) / np.sqrt(np.maximum(1.0 - upward**2, 1e-6))
+    turns = films.turn_rad, np.hypot(films.turn_stderr_rad, horizon)
+    zero = films.zero_rad, films.zero_stderr_rad
+    leaks = films.light_leak, light_error, films.analyser_leak, analyser_error
     return SphereFilms(
-        lights.names,
-        leaked,
-        leaked_stderr,
-        ratio,
-        ratio_stderr,
-        films.turn_rad,
-        np.hypot(films.turn_stderr_rad, horizon),
-        seen,
-        films.zero_rad,
-        films.zero_stderr_rad,
-        films.light_leak,
-        light_error,
-        films.analyser_leak,
-        analyser_error,
-        eta,
+        lights.names, *leakage(films, skin), ratio, ratio_stderr, *turns, seen, *zero, *leaks, eta
     )

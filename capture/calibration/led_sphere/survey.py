@@ -15,8 +15,8 @@ from capture.calibration.fiber.spot_photometry import (
     share_within,
 )
 from capture.calibration.geometry import CameraPose
-from capture.calibration.led_sphere.findings import SphereSurvey, describe_findings
 from capture.calibration.led_sphere.glass_ball import (
+    Ball,
     BallError,
     BallFit,
     GlassBall,
@@ -24,19 +24,22 @@ from capture.calibration.led_sphere.glass_ball import (
     light_directions,
     locate_ball,
 )
-from capture.calibration.led_sphere.lights import SphereLightTable
-from capture.calibration.led_sphere.mirrored_lights import Mirrored, mirror_lights
-from capture.calibration.led_sphere.polarization import fit_films
+from capture.calibration.led_sphere.lights import SphereFilms, SphereLightTable
+from capture.calibration.led_sphere.polarization import FilmFit, fit_films
 from capture.calibration.led_sphere.strengths import (
     add_geometry_errors,
     film_table,
-    has_two_readings,
     measure_intensities,
     measure_rates,
 )
+from capture.calibration.lights.reflection import mirror_lights
 from capture.calibration.polarization.polarized_reflection import Reflection
-from capture.rig import Rig, View
+from capture.rig import Rig
 
+MAX_ANALYZER_OFFSET_DEG = 2.0
+MAX_POLARIZER_TURN_DEG = 3.0
+MAX_LIGHT_OFFSET_SIGMAS = 5.0
+MAX_LIGHT_OFFSET_DEG = 0.5
 SPOT_MARGIN_MM = 0.06  # around a spot as geometry draws it, for what the lens and the pixels blur
 WAVELENGTH_MM = 5.5e-4
 # of a spot's middle, whatever its light: the pixels' own responses, the polish
@@ -48,6 +51,103 @@ MAX_INTENSITY_STDERR = 0.3  # relative error above which an intensity is not cal
 STRAY_PEAK_RATIO = 0.2
 STRAY_MM = 0.4
 SKIN_ETA = 1.4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SphereSurvey:
+    """What photographs of the ball said.
+
+    Attributes
+    ----------
+    lights : SphereLightTable
+    films : SphereFilms
+    ball : Ball
+        As found.
+    light_scatter_mm : float
+        Of the lights about their nominal places, along an axis.
+    turn_scatter_rad : float
+        Of the lights' polarizers about their nominal axes.
+    readings_deg : tuple of float
+        Of the analyser.
+    findings : tuple of str
+        What is wrong with the rig.
+    """
+
+    lights: SphereLightTable
+    films: SphereFilms
+    ball: Ball
+    light_scatter_mm: float
+    turn_scatter_rad: float
+    readings_deg: tuple[float, ...]
+    findings: tuple[str, ...]
+
+
+def describe_findings(
+    survey: SphereSurvey,
+    place: Float64Array,
+    in_field: BoolArray,
+    saturated: BoolArray,
+    films: FilmFit,
+    strays: int,
+) -> tuple[str, ...]:
+    """Return what is wrong with the rig, one sentence each.
+
+    Parameters
+    ----------
+    survey : SphereSurvey
+    place : ndarray of float64, shape (L, 3)
+        Nominal places of the lights, mm.
+    in_field, saturated : ndarray of bool, shape (L,)
+        Lights mirrored within the image, and saturated in every exposure.
+    films : FilmFit
+    strays : int
+        Number of bright spots that are no light's.
+    """
+    lights, table = survey.lights, survey.films
+    names = np.array(lights.names)
+    told = []
+
+    def listed(chosen: BoolArray) -> str:
+        return ", ".join(names[chosen])
+
+    if lights.dead.any():
+        told.append(f"dead, or hidden from the ball: {listed(lights.dead)}")
+    outside = ~in_field
+    if outside.any():
+        told.append(f"mirrored outside the image, left nominal: {listed(outside)}")
+    if saturated.any():
+        told.append(f"saturated in every exposure, no intensity: {listed(saturated)}")
+    dim = ~lights.valid & ~outside & ~saturated
+    if dim.any():
+        told.append(f"too dim in the ball to be measured: {listed(dim)}")
+    nominal = place / np.linalg.norm(place, axis=1, keepdims=True)
+    off = np.linalg.norm(lights.directions - nominal, axis=1)
+    usual = np.sqrt(2) * survey.light_scatter_mm / np.linalg.norm(place, axis=1)
+    far = lights.seen & (
+        off > np.maximum(MAX_LIGHT_OFFSET_SIGMAS * usual, np.radians(MAX_LIGHT_OFFSET_DEG))
+    )
+    for k in np.flatnonzero(far):
+        told.append(f"light {names[k]} stands {np.degrees(off[k]):.2f} degrees from its place")
+    zero, error = np.degrees([films.zero_rad, films.zero_stderr_rad])
+    if abs(zero) > MAX_ANALYZER_OFFSET_DEG:
+        told.append(
+            f"the analyser stands {zero:+.2f} ± {error:.2f} degrees off its reading: crossed leaks"
+            f" {100 * np.median(table.leakage):.1f} % of reflections; turn it back"
+        )
+    turn = np.degrees(table.axis_error_rad)
+    turned = table.valid & (
+        np.abs(turn) > MAX_POLARIZER_TURN_DEG + 3 * np.degrees(table.axis_error_stderr_rad)
+    )
+    for k in np.flatnonzero(turned):
+        told.append(f"the polarizer of light {names[k]} is turned by {turn[k]:+.1f} degrees")
+    if not any(1.0 < abs(r % 180.0 - 90.0) < 89.0 for r in survey.readings_deg):
+        told.append(
+            "only parallel and crossed were photographed: which way single lights' polarizers are"
+            " turned stays open, and errors are larger; add readings 80 and 100"
+        )
+    if strays:
+        told.append(f"{strays} bright spots are no light's; keep other light away")
+    return tuple(told)
 
 
 def survey_sphere(
@@ -85,8 +185,8 @@ def survey_sphere(
     PolarizationError
         If the readings do not tell the films.
     """
-    what = target or GlassBall()
-    camera = CameraPose.nominal(rig.view(view))
+    scene = _Scene(rig, view, target or GlassBall())
+    camera, place = scene.camera, scene.place
     size = camera.image_size[::-1]
     for shot in shots:
         if shot.signal.shape != size:
@@ -94,46 +194,32 @@ def survey_sphere(
                 f"frames: got {shot.signal.shape} pixels, expected {size} of view {view!r}; is it"
                 " a session of this rig?"
             )
-    pixel_mm = float(np.linalg.norm(camera.center_mm)) / float(camera.matrix[0, 0])
-    place = np.array([light.position_mm for light in rig.lights], np.float64)
-    distance = np.linalg.norm(place, axis=1)
-    about = mirror_lights(camera, np.array(what.center_mm), what.radius_mm, place)
-    spot_mm = _spot_radius(about, camera, what, rig, view)
-    aperture_px = np.maximum(spot_mm / pixel_mm, 2.5)
-    seen = _find_lights(shots, camera, place, what, pixel_mm, aperture_px)
+    aperture_px = np.maximum(scene.spot_radius_mm() / scene.pixel_mm, 2.5)
+    seen = scene.find_lights(shots, aperture_px)
     fit, direction, measured = seen.fit, seen.direction, seen.measured
-    shown = mirror_lights(
-        camera, fit.ball.center_mm, fit.ball.radius_mm, direction * distance[:, None]
-    )
+    lights_mm = direction * scene.distance[:, None]
+    shown = mirror_lights(camera, fit.ball.center_mm, fit.ball.radius_mm, lights_mm)
     at = np.where(measured[:, None], seen.middle, shown.pixels)
 
-    glass = _reflection(rig, camera, view, what.eta, shown.to_light, shown.to_camera, direction)
-    readings = np.array([shot.reading_deg for shot in shots])
-    airy_px = WAVELENGTH_MM * float(camera.matrix[0, 0]) / _pupil_mm(rig.view(view))
-    within = share_within(aperture_px, airy_px)
-    rates, variance, good, saturated = measure_rates(shots, at, aperture_px, within)
-    films = fit_films(np.radians(readings), rates, variance, good, glass)
+    glass = scene.reflection(scene.target.eta, shown.to_light, shown.to_camera, direction)
+    airy_px = WAVELENGTH_MM * float(camera.matrix[0, 0]) / scene.pupil_mm
+    rates = measure_rates(shots, at, aperture_px, share_within(aperture_px, airy_px))
+    readings_rad = np.radians(rates.readings_deg)
+    films = fit_films(readings_rad, rates.rate, rates.variance, rates.good, glass)
     angle_rad = np.linalg.norm(seen.stderr, axis=1) / np.sqrt(2)
-    films = add_geometry_errors(films, glass, what.eta_stderr, angle_rad)
-    fluxed = has_two_readings(readings, good)
+    films = add_geometry_errors(films, glass, scene.target.eta_stderr, angle_rad)
     strength = measure_intensities(rig, camera, fit.ball, films, shown, direction)
-    lights = _light_table(rig, seen, fluxed, *strength)
+    lights = _light_table(rig, seen, rates.fluxed, strength)
     toward = np.tile(camera.center_mm / np.linalg.norm(camera.center_mm), (len(place), 1))
-    skin = _reflection(rig, camera, view, eta, direction, toward, direction)
-    result = SphereSurvey(
-        lights,
-        film_table(lights, films, skin, rates, variance, good & fluxed, readings, eta),
-        fit.ball,
-        fit.light_scatter_mm,
-        films.turn_scatter_rad,
-        tuple(sorted(set(readings.tolist()))),
-        (),
-    )
-    in_field = fit.in_field & (good.any(axis=0) | saturated)
-    stray = _bright_strays(seen, pixel_mm)
-    return replace(
-        result, findings=describe_findings(result, place, in_field, saturated, films, stray)
-    )
+    skin = scene.reflection(eta, direction, toward, direction)
+    table = film_table(lights, films, skin, rates, eta)
+    scatters = fit.light_scatter_mm, films.turn_scatter_rad
+    readings = tuple(sorted(set(rates.readings_deg.tolist())))
+    result = SphereSurvey(lights, table, fit.ball, *scatters, readings, ())
+    in_field = fit.in_field & (rates.good.any(axis=0) | rates.saturated)
+    stray = _bright_strays(seen, scene.pixel_mm)
+    told = describe_findings(result, place, in_field, rates.saturated, films, stray)
+    return replace(result, findings=told)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,71 +235,102 @@ class _SeenLights:
     stderr: Float64Array
 
 
-def _find_lights(
-    shots: Sequence[Shot],
-    camera: CameraPose,
-    place: Float64Array,
-    what: GlassBall,
-    pixel_mm: float,
-    aperture_px: Float64Array,
-) -> _SeenLights:
-    """Return the lights' directions by their spots; nominal ones where a spot is not measured."""
-    total = _both_states(shots)
-    spots = find_spots(total.rate, pixel_mm=pixel_mm)
-    margin_mm = RING_RADII[1] * SPOT_MARGIN_MM
-    fit = locate_ball(spots, camera, place, what, margin_mm=margin_mm)
-    start = np.where((fit.spot >= 0)[:, None], spots[fit.spot], np.nan)
-    middle, noise_px, clipped = measure_middles(total, start, aperture_px=aperture_px)
-    measured = np.asarray(np.isfinite(middle).all(axis=1), bool)
-    if not measured.any():
-        raise BallError("ball: no spot lies whole within the image; centre the ball")
-    # the ball by the spots' middles instead of their brightest pixels
-    sharp = locate_ball(
-        middle[measured],
-        camera,
-        place,
-        what,
-        margin_mm=margin_mm,
-        noise_px=TYPICAL_CENTER_STDERR_PX,
-        lit=measured,
-    )
-    fit = replace(fit, ball=sharp.ball, light_scatter_mm=sharp.light_scatter_mm)
-    errors = np.hypot(
-        np.where(measured, noise_px, 0.0), np.where(clipped, 0.5, MIN_CENTER_STDERR_PX)
-    )
-    distance = np.linalg.norm(place, axis=1)
-    found = light_directions(camera, fit.ball, middle, errors, distance)
-    direction = np.where(measured[:, None], found.direction, place / distance[:, None])
-    stderr = np.where(measured[:, None], found.stderr, fit.light_scatter_mm / distance[:, None])
-    return _SeenLights(fit, spots, total, middle, measured, direction, stderr)
+class _Scene:
+    """A ball before the camera of a rig with a sphere of lights."""
+
+    def __init__(self, rig: Rig, view: str, target: GlassBall) -> None:
+        self.rig, self.view, self.target = rig, rig.view(view), target
+        self.camera = CameraPose.nominal(self.view)
+        self.pixel_mm = float(np.linalg.norm(self.camera.center_mm) / self.camera.matrix[0, 0])
+        self.place = np.array([light.position_mm for light in rig.lights], np.float64)
+        self.distance = np.linalg.norm(self.place, axis=1)
+
+    @property
+    def pupil_mm(self) -> float:
+        """Diameter of the lens's pupil, mm."""
+        view = self.view
+        return view.focal_mm / (view.f_number * (1.0 + view.focal_mm / view.distance_mm))
+
+    def spot_radius_mm(self) -> Float64Array:
+        """Return the radius of a disc that holds each spot, mm at the plane in focus, shape (L,).
+
+        A ball shows a distant light where its rays seem to cross, R cos / 2 behind its surface in
+        the plane of incidence and R / (2 cos) across it: far from the axis both lie out of focus,
+        one far.
+        """
+        ball, view = self.target, self.view
+        shown = mirror_lights(self.camera, np.array(ball.center_mm), ball.radius_mm, self.place)
+        cosine = np.sum(shown.normal * shown.to_light, axis=1)
+        back = np.asarray(view.axes[2])
+        surface = float(np.dot(ball.center_mm, back)) + ball.radius_mm * (shown.normal @ back)
+        cone = self.pupil_mm / view.distance_mm
+        defocus = [np.abs(surface - ball.radius_mm * f) for f in (0.5 * cosine, 0.5 / cosine)]
+        lamps = np.array([2 * light.radius_mm for light in self.rig.lights])
+        lamp_px = lamps * np.linalg.norm(shown.px_per_mm, ord=2, axis=(1, 2))
+        pixel_mm = view.distance_mm / float(self.camera.matrix[0, 0])
+        wide = lamp_px * pixel_mm + cone * np.maximum(*defocus)
+        return np.asarray(0.5 * wide + SPOT_MARGIN_MM)
+
+    def find_lights(self, shots: Sequence[Shot], aperture_px: Float64Array) -> _SeenLights:
+        """Return the lights' directions by their spots; nominal ones where none is measured."""
+        total = _both_states(shots)
+        spots = find_spots(total.rate, pixel_mm=self.pixel_mm)
+        margin_mm = RING_RADII[1] * SPOT_MARGIN_MM
+        fit = locate_ball(spots, self.camera, self.place, self.target, margin_mm=margin_mm)
+        start = np.where((fit.spot >= 0)[:, None], spots[fit.spot], np.nan)
+        middle, noise_px, clipped = measure_middles(total, start, aperture_px=aperture_px)
+        measured = np.asarray(np.isfinite(middle).all(axis=1), bool)
+        if not measured.any():
+            raise BallError("ball: no spot lies whole within the image; centre the ball")
+        # the ball by the spots' middles instead of their brightest pixels
+        sharp = locate_ball(
+            middle[measured],
+            self.camera,
+            self.place,
+            self.target,
+            margin_mm=margin_mm,
+            noise_px=TYPICAL_CENTER_STDERR_PX,
+            lit=measured,
+        )
+        fit = replace(fit, ball=sharp.ball, light_scatter_mm=sharp.light_scatter_mm)
+        errors = np.hypot(
+            np.where(measured, noise_px, 0.0), np.where(clipped, 0.5, MIN_CENTER_STDERR_PX)
+        )
+        distance = self.distance
+        found = light_directions(self.camera, fit.ball, middle, errors, distance)
+        direction = np.where(measured[:, None], found.direction, self.place / distance[:, None])
+        stderr = np.where(measured[:, None], found.stderr, fit.light_scatter_mm / distance[:, None])
+        return _SeenLights(fit, spots, total, middle, measured, direction, stderr)
+
+    def reflection(
+        self, eta: float, to_light: Float64Array, to_camera: Float64Array, facing: Float64Array
+    ) -> Reflection:
+        """Return the lights as facets of an index mirror them into the camera."""
+        axis, name = self.view.analyser_axis_deg, self.view.name
+        if axis is None:
+            text = f"view {name!r}: has no analyser; this rig's films cannot be calibrated"
+            raise BallError(text)
+        toward = {"to_light": to_light, "to_camera": to_camera, "facing": facing}
+        return Reflection.of(self.rig.lights, self.camera, axis, eta, **toward)
 
 
 def _light_table(
-    rig: Rig,
-    seen: _SeenLights,
-    fluxed: BoolArray,
-    intensity: Float64Array,
-    intensity_stderr: Float64Array,
+    rig: Rig, seen: _SeenLights, fluxed: BoolArray, strength: tuple[Float64Array, Float64Array]
 ) -> SphereLightTable:
     """Return the lights with intensities over their mean, and which are dead."""
+    intensity, stderr = strength
     lit = fluxed & seen.measured & (intensity > MAX_DEAD_INTENSITY)
     if not lit.any():
         raise BallError("ball: no light's spot could be measured; check exposures and focus")
     scale = float(intensity[lit].mean())
-    intensity, intensity_stderr = intensity / scale, intensity_stderr / scale
-    certain = intensity_stderr < MAX_INTENSITY_STDERR * np.maximum(intensity, MAX_DEAD_INTENSITY)
-    dead = fluxed & (intensity + 2 * intensity_stderr < MAX_DEAD_INTENSITY)
+    intensity, stderr = intensity / scale, stderr / scale
+    certain = stderr < MAX_INTENSITY_STDERR * np.maximum(intensity, MAX_DEAD_INTENSITY)
+    dead = fluxed & (intensity + 2 * stderr < MAX_DEAD_INTENSITY)
     valid = dead | (fluxed & seen.measured & certain)
-    return SphereLightTable(
-        tuple(light.name for light in rig.lights),
-        seen.direction,
-        seen.stderr,
-        np.where(valid, intensity, 1.0),
-        np.where(valid, intensity_stderr, np.std(intensity[lit])),
-        seen.measured,
-        valid,
-        dead,
-    )
+    names = tuple(light.name for light in rig.lights)
+    shown = np.where(valid, intensity, 1.0), np.where(valid, stderr, np.std(intensity[lit]))
+    flags = seen.measured, valid, dead
+    return SphereLightTable(names, seen.direction, seen.stderr, *shown, *flags)
 
 
 def _bright_strays(seen: _SeenLights, pixel_mm: float) -> int:
@@ -229,33 +346,6 @@ def _bright_strays(seen: _SeenLights, pixel_mm: float) -> int:
         and np.linalg.norm(own - spots[k], axis=1).min() > STRAY_MM / pixel_mm
         for k in fit.stray
     )
-
-
-def _pupil_mm(view: View) -> float:
-    """Return the diameter of the lens's pupil, mm."""
-    magnification = view.focal_mm / view.distance_mm
-    return view.focal_mm / (view.f_number * (1.0 + magnification))
-
-
-def _spot_radius(
-    shown: Mirrored, camera: CameraPose, what: GlassBall, rig: Rig, view: str
-) -> Float64Array:
-    """Return the radius of a disc that holds each spot, mm at the plane in focus, shape (L,).
-
-    A ball shows a distant light where its rays seem to cross, R cos / 2 behind its surface in the
-    plane of incidence and R / (2 cos) across it: far from the axis both lie out of focus, one
-    far.
-    """
-    cosine = np.sum(shown.normal * shown.to_light, axis=1)
-    back = np.asarray(rig.view(view).axes[2])
-    surface = float(np.dot(what.center_mm, back)) + what.radius_mm * (shown.normal @ back)
-    cone = _pupil_mm(rig.view(view)) / rig.view(view).distance_mm
-    defocus = [np.abs(surface - what.radius_mm * f) for f in (0.5 * cosine, 0.5 / cosine)]
-    lamps = np.array([2 * light.radius_mm for light in rig.lights])
-    lamp_px = lamps * np.linalg.norm(shown.px_per_mm, ord=2, axis=(1, 2))
-    pixel_mm = rig.view(view).distance_mm / float(camera.matrix[0, 0])
-    wide = lamp_px * pixel_mm + cone * np.maximum(*defocus)
-    return np.asarray(0.5 * wide + SPOT_MARGIN_MM)
 
 
 def _both_states(shots: Sequence[Shot]) -> RateImage:
@@ -274,21 +364,4 @@ def _both_states(shots: Sequence[Shot]) -> RateImage:
         parallel.rate + crossed.rate,
         parallel.variance + crossed.variance,
         parallel.valid & crossed.valid,
-    )
-
-
-def _reflection(
-    rig: Rig,
-    camera: CameraPose,
-    view: str,
-    eta: float,
-    to_light: Float64Array,
-    to_camera: Float64Array,
-    facing: Float64Array,
-) -> Reflection:
-    axis = rig.view(view).analyser_axis_deg
-    if axis is None:
-        raise BallError(f"view {view!r}: has no analyser; this rig's films cannot be calibrated")
-    return Reflection.of(
-        rig.lights, camera, axis, eta, to_light=to_light, to_camera=to_camera, facing=facing
     )

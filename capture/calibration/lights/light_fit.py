@@ -14,17 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from capture.arrays import Float64Array, Int64Array
+from capture.arrays import BoolArray, Float64Array, Int64Array
 from capture.calibration.geometry import CameraPose
 from capture.calibration.lights.light_list import CameraResponse, LightTable
 from capture.calibration.lights.white_plate import PlateSamples, WhitePlate
 from capture.calibration.record import CalibrationError
 
-N_LIGHT, N_RESPONSE, N_TILT = (
-    6,
-    5,
-    2,
-)  # numbers of a light (intensities, exponent, tilt), camera, pose
+# numbers of a light (intensities, exponent, tilt), of a camera, of a pose or a part
+N_LIGHT, N_RESPONSE, N_TILT = 6, 5, 2
 MIN_INCIDENCE_COSINE = 0.25  # of incidence: flatter light shows the plate's waves
 N_LIGHT_FIT_STEPS = 6
 TILT_PRIOR_RAD = 0.05  # how far an LED may point past the rig's origin
@@ -170,27 +167,18 @@ def fit_lights(
     LightFitError
         If no frame is usable.
     """
-    target = plate or WhitePlate()
     answers, dead = check_order(samples, table)
-    skipped = set(dead) | set(answers)
-    frames = []
-    poses: dict[bytes, int] = {}
+    fit = _Fit(table, cameras, plate or WhitePlate())
     for row in samples:
-        if row.light not in skipped and row.light in table.names:
-            pose = poses.setdefault(row.normal.tobytes(), len(poses))
-            frame = _frame(row, table, cameras, target, pose)
-            if frame is not None:
-                frames.append(frame)
-    if not frames:
+        if row.light in table.names and row.light not in dead and row.light not in answers:
+            fit.add(row)
+    if not fit.frames:
         raise LightFitError(
             f"samples: none of {len(samples)} frames shows the plate lit from its front, neither"
             " dark nor saturated; check exposure, order of the lights and the plate's places"
         )
     with threadpool_limits(limits=1, user_api="blas"):  # many small matrices
-        numbers, covariance, residual = _solve(frames, table, sorted(cameras), target.slope_rad)
-    return _result(
-        numbers, covariance, residual, frames, table, cameras, dead=dead, answers=answers
-    )
+        return fit.solve(dead, answers)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -209,163 +197,171 @@ class _Frame:
     relative: Float64Array  # relative variance, (n, 3)
 
 
-def _frame(
-    row: PlateSamples,
-    table: LightTable,
-    cameras: Mapping[str, CameraPose],
-    plate: WhitePlate,
-    pose: int,
-) -> _Frame | None:
-    light = table.names.index(row.light)
-    to_light = table.position_mm[light] - row.points_mm
-    distance = np.linalg.norm(to_light, axis=1)
-    cosine = to_light @ row.normal / distance
-    signal = row.signal / row.on_s
-    good = (cosine > MIN_INCIDENCE_COSINE) & (row.signal > 20 * np.sqrt(row.variance)).all(axis=1)
-    if np.count_nonzero(good) < 4:
-        return None
-    size = np.array(cameras[row.view].image_size, float)
-    r2 = np.sum((row.pixels - (size - 1) / 2) ** 2, axis=1) / np.sum((size / 2) ** 2)
-    known = np.log(plate.reflectance * cosine[good] / distance[good] ** 2)
-    toward = to_light[good] / distance[good, None]
-    turns = toward @ row.rotation[:, :2] / cosine[good, None]
-    return _Frame(
-        light,
-        row.view,
-        pose,
-        row.part[good],
-        turns,
-        known,
-        -toward,
-        r2[good],
-        np.log(signal[good]),
-        row.variance[good] / row.signal[good] ** 2 + PART_STDERR**2,
-    )
+class _Fit:
+    """Frames of a plate, and the numbers that explain them.
 
+    The numbers are in this order: those of each light, of each camera's response, the turn of the
+    plate at each pose, and the slope of each of its parts.
+    """
 
-def _solve(
-    frames: Sequence[_Frame], table: LightTable, views: list[str], slope_rad: float
-) -> tuple[Float64Array, Float64Array, float]:
-    """Return all numbers, their covariance and the rms residual."""
-    lights = len(table.names)
-    poses = 1 + max(f.pose for f in frames)
-    last = N_LIGHT * lights + N_RESPONSE * len(views)
-    relief = last + N_TILT * poses
-    parts = 1 + max(int(f.part.max()) for f in frames)
-    total = relief + N_TILT * parts
-    numbers = np.zeros(total)
-    numbers[3 : N_LIGHT * lights : N_LIGHT] = table.exponent
-    side, across = _sides(table.axis)
-    prior = np.zeros(total)
-    for offset, sigma in ((3, EXPONENT_PRIOR), (4, TILT_PRIOR_RAD), (5, TILT_PRIOR_RAD)):
-        prior[offset : N_LIGHT * lights : N_LIGHT] = 1 / sigma**2
-    prior[last:relief] = 1 / NORMAL_PRIOR_RAD**2
-    prior[relief:] = 1 / slope_rad**2
-    prior[N_LIGHT * lights : last] = np.tile(
-        [1 / GAIN_PRIOR**2] * 3 + [1 / VIGNETTING_PRIOR**2] * 2, len(views)
-    )
-    middle = np.zeros(total)
-    middle[3 : N_LIGHT * lights : N_LIGHT] = table.exponent
-    used = np.zeros(total, bool)
-    gauge = np.zeros((3, total))
-    for c in range(len(views)):
-        first = N_LIGHT * lights + N_RESPONSE * c
-        gauge[np.arange(3), first + np.arange(3)] = 1.0
-    # start each intensity at the mean of its frames: the lobe is near 1
-    for k in range(lights):
-        mine = [f.log_signal - f.known[:, None] for f in frames if f.light == k]
-        if mine:
-            numbers[N_LIGHT * k : N_LIGHT * k + 3] = np.concatenate(mine).mean(axis=0)
-    covariance, square, count = np.eye(total), 0.0, 1
-    for _ in range(N_LIGHT_FIT_STEPS):
-        H, g = np.diag(prior) + 1e6 * gauge.T @ gauge, prior * (numbers - middle)
-        g += 1e6 * gauge.T @ (gauge @ numbers)
-        square, count = 0.0, 0
-        for f in frames:
-            at = slice(N_LIGHT * f.light, N_LIGHT * (f.light + 1))
-            c = N_LIGHT * lights + N_RESPONSE * views.index(f.view)
-            to = slice(c, c + N_RESPONSE)
-            by = slice(last + N_TILT * f.pose, last + N_TILT * (f.pose + 1))
-            r, A, B = _rows(f, table, numbers[at], numbers[to], side, across)
-            turns = np.repeat(f.turns, 3, axis=0)
-            bumps = np.zeros((len(r), N_TILT * len(f.part)))
-            row = np.arange(len(r))[:, None]
-            bumps[row, N_TILT * (row // 3) + [0, 1]] = turns
-            bump_at = (relief + N_TILT * f.part[:, None] + [0, 1]).ravel()
-            r = r + turns @ numbers[by] + bumps @ numbers[bump_at]
-            J = np.concatenate([A, B, turns, bumps], axis=1)
-            w = 1 / f.relative.ravel()
-            JW = J * w[:, None]
-            # parts of a frame share an error: Woodbury's formula
-            ones = JW.sum(axis=0)
-            share = FRAME_STDERR**2 / (1 + FRAME_STDERR**2 * w.sum())
-            block = JW.T @ J - share * np.outer(ones, ones)
-            slope = JW.T @ r - share * ones * (w @ r)
-            columns = np.r_[at, to, by, bump_at]
-            H[np.ix_(columns, columns)] += block
-            g[columns] += slope
-            used[columns] = True
-            square += float(r @ r)
-            count += len(r)
-        free = np.ix_(used, used)
-        covariance = np.zeros((total, total))
-        covariance[free] = np.linalg.inv(H[free])
-        step = -covariance @ np.where(used, g, 0.0)
-        numbers = numbers + step
-        if np.abs(step).max() < 1e-8:
-            break
-    return numbers, covariance, float(np.sqrt(square / max(count, 1)))
+    def __init__(
+        self, table: LightTable, cameras: Mapping[str, CameraPose], plate: WhitePlate
+    ) -> None:
+        self.table, self.cameras, self.plate = table, cameras, plate
+        self.views = sorted(cameras)
+        self.frames: list[_Frame] = []
+        self._poses: dict[bytes, int] = {}
+        self._responses = N_LIGHT * len(table.names)  # where the cameras' numbers begin
+        self._turns = self._responses + N_RESPONSE * len(cameras)
+        up = np.where(np.abs(table.axis[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
+        side = np.cross(table.axis, up)
+        self._side = side / np.linalg.norm(side, axis=1, keepdims=True)
+        self._across = np.cross(table.axis, self._side)
 
+    def add(self, row: PlateSamples) -> None:
+        """Add a frame's parts that are lit from their front, if there are enough."""
+        pose = self._poses.setdefault(row.normal.tobytes(), len(self._poses))
+        light = self.table.names.index(row.light)
+        to_light = self.table.position_mm[light] - row.points_mm
+        distance = np.linalg.norm(to_light, axis=1)
+        cosine = to_light @ row.normal / distance
+        clear = (row.signal > 20 * np.sqrt(row.variance)).all(axis=1)
+        good = (cosine > MIN_INCIDENCE_COSINE) & clear
+        if np.count_nonzero(good) < 4:
+            return
+        size = np.array(self.cameras[row.view].image_size, float)
+        r2 = np.sum((row.pixels - (size - 1) / 2) ** 2, axis=1) / np.sum((size / 2) ** 2)
+        toward = to_light[good] / distance[good, None]
+        turns = toward @ row.rotation[:, :2] / cosine[good, None]
+        known = np.log(self.plate.reflectance * cosine[good] / distance[good] ** 2)
+        relative = row.variance[good] / row.signal[good] ** 2 + PART_STDERR**2
+        place = turns, known, -toward, r2[good]
+        seen = np.log((row.signal / row.on_s)[good]), relative
+        self.frames.append(_Frame(light, row.view, pose, row.part[good], *place, *seen))
 
-def _rows(
-    f: _Frame,
-    table: LightTable,
-    light: Float64Array,
-    camera: Float64Array,
-    side: Float64Array,
-    across: Float64Array,
-) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Return model minus data (3 n,), and derivatives by the light (6) and the camera (5)."""
-    n = len(f.known)
-    axis, by_side, by_across = _tilted(table, f.light, light[4:6], side, across)
-    cosine = np.clip(f.direction @ axis, 1e-6, None)
-    lobe = light[3] * np.log(cosine)
-    vignetting = 1 + camera[3] * f.r2 + camera[4] * f.r2**2
-    vignetting = np.clip(vignetting, 0.05, None)
-    common = f.known + lobe + np.log(vignetting)
-    model = common[:, None] + light[:3] + camera[:3]
-    A = np.zeros((n, 3, N_LIGHT))
-    A[:, np.arange(3), np.arange(3)] = 1.0
-    A[:, :, 3] = np.log(cosine)[:, None]
-    A[:, :, 4] = (light[3] * (f.direction @ by_side) / cosine)[:, None]
-    A[:, :, 5] = (light[3] * (f.direction @ by_across) / cosine)[:, None]
-    B = np.zeros((n, 3, N_RESPONSE))
-    B[:, np.arange(3), np.arange(3)] = 1.0
-    B[:, :, 3] = (f.r2 / vignetting)[:, None]
-    B[:, :, 4] = (f.r2**2 / vignetting)[:, None]
-    return (model - f.log_signal).ravel(), A.reshape(-1, N_LIGHT), B.reshape(-1, N_RESPONSE)
+    def solve(self, dead: tuple[str, ...], answers: dict[str, str]) -> LightFit:
+        """Return the fit; `dead` and `answers` are of `check_order`."""
+        lights, last = len(self.table.names), self._turns
+        relief = last + N_TILT * (1 + max(f.pose for f in self.frames))
+        total = relief + N_TILT * (1 + max(int(f.part.max()) for f in self.frames))
+        middle, prior = np.zeros(total), np.zeros(total)
+        middle[3 : self._responses : N_LIGHT] = self.table.exponent
+        of_light = [0.0] * 3 + [1 / EXPONENT_PRIOR**2] + [1 / TILT_PRIOR_RAD**2] * 2
+        of_response = [1 / GAIN_PRIOR**2] * 3 + [1 / VIGNETTING_PRIOR**2] * 2
+        prior[: self._responses] = np.tile(of_light, lights)
+        prior[self._responses : last] = np.tile(of_response, len(self.views))
+        prior[last:relief] = 1 / NORMAL_PRIOR_RAD**2
+        prior[relief:] = 1 / self.plate.slope_rad**2
+        used = np.zeros(total, bool)
+        gauge = np.zeros((3, total))
+        gauge[:, self._responses : last] = np.tile(np.eye(3, N_RESPONSE), len(self.views))
+        numbers = middle.copy()
+        # start each intensity at the mean of its frames: the lobe is near 1
+        for k in range(lights):
+            mine = [f.log_signal - f.known[:, None] for f in self.frames if f.light == k]
+            if mine:
+                numbers[N_LIGHT * k : N_LIGHT * k + 3] = np.concatenate(mine).mean(axis=0)
+        covariance, square, count = np.eye(total), 0.0, 1
+        for _ in range(N_LIGHT_FIT_STEPS):
+            H, g = np.diag(prior) + 1e6 * gauge.T @ gauge, prior * (numbers - middle)
+            g += 1e6 * gauge.T @ (gauge @ numbers)
+            square, count = 0.0, 0
+            for f in self.frames:
+                bump_at = (relief + N_TILT * f.part[:, None] + [0, 1]).ravel()
+                columns = np.r_[self._columns(f), bump_at]
+                r, J = self._rows(f, numbers, columns)
+                w = 1 / f.relative.ravel()
+                JW = J * w[:, None]
+                # parts of a frame share an error: Woodbury's formula
+                ones = JW.sum(axis=0)
+                share = FRAME_STDERR**2 / (1 + FRAME_STDERR**2 * w.sum())
+                H[np.ix_(columns, columns)] += JW.T @ J - share * np.outer(ones, ones)
+                g[columns] += JW.T @ r - share * ones * (w @ r)
+                used[columns] = True
+                square += float(r @ r)
+                count += len(r)
+            free = np.ix_(used, used)
+            covariance = np.zeros((total, total))
+            covariance[free] = np.linalg.inv(H[free])
+            step = -covariance @ np.where(used, g, 0.0)
+            numbers = numbers + step
+            if np.abs(step).max() < 1e-8:
+                break
+        errors = np.sqrt(np.clip(np.diag(covariance), 0, None))
+        table, seen = self._table(numbers, errors)
+        silent = [name for name, ok in zip(table.names, seen, strict=True) if not ok]
+        unseen = tuple(name for name in silent if name not in dead and name not in answers)
+        rms = float(np.sqrt(square / max(count, 1)))
+        return LightFit(table, dead, answers, unseen, rms, len(self.frames))
 
+    def _columns(self, f: _Frame) -> Int64Array:
+        """Return where the numbers of a frame's light, camera and pose are."""
+        camera = self._responses + N_RESPONSE * self.views.index(f.view)
+        starts = (N_LIGHT * f.light, camera, self._turns + N_TILT * f.pose)
+        sizes = (N_LIGHT, N_RESPONSE, N_TILT)
+        return np.concatenate([at + np.arange(n) for at, n in zip(starts, sizes, strict=True)])
 
-def _tilted(
-    table: LightTable, light: int, tilt: Float64Array, side: Float64Array, across: Float64Array
-) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Return a light's tilted axis and how it follows the two tilts."""
-    raw = table.axis[light] + tilt[0] * side[light] + tilt[1] * across[light]
-    length = np.linalg.norm(raw)
-    axis = raw / length
-    return (
-        axis,
-        (side[light] - (side[light] @ axis) * axis) / length,
-        (across[light] - (across[light] @ axis) * axis) / length,
-    )
+    def _rows(
+        self, f: _Frame, numbers: Float64Array, columns: Int64Array
+    ) -> tuple[Float64Array, Float64Array]:
+        """Return residuals, model minus seen, shape (3 n,), and how they follow the columns."""
+        n = len(f.known)
+        mine = numbers[columns]
+        light, camera = mine[:N_LIGHT], mine[N_LIGHT : N_LIGHT + N_RESPONSE]
+        axis, by_side, by_across = self._tilted(f.light, light[4:6])
+        cosine = np.clip(f.direction @ axis, 1e-6, None)
+        lobe = light[3] * np.log(cosine)
+        vignetting = np.clip(1 + camera[3] * f.r2 + camera[4] * f.r2**2, 0.05, None)
+        common = f.known + lobe + np.log(vignetting)
+        model = common[:, None] + light[:3] + camera[:3]
+        A = np.zeros((n, 3, N_LIGHT + N_RESPONSE))
+        A[:, :, :3] = A[:, :, N_LIGHT : N_LIGHT + 3] = np.eye(3)
+        A[:, :, 3] = np.log(cosine)[:, None]
+        A[:, :, 4] = (light[3] * (f.direction @ by_side) / cosine)[:, None]
+        A[:, :, 5] = (light[3] * (f.direction @ by_across) / cosine)[:, None]
+        A[:, :, N_LIGHT + 3] = (f.r2 / vignetting)[:, None]
+        A[:, :, N_LIGHT + 4] = (f.r2**2 / vignetting)[:, None]
+        turns = np.repeat(f.turns, 3, axis=0)
+        bumps = np.zeros((3 * n, N_TILT * n))
+        row = np.arange(3 * n)[:, None]
+        bumps[row, N_TILT * (row // 3) + [0, 1]] = turns
+        turn, slopes = np.split(mine[N_LIGHT + N_RESPONSE :], [N_TILT])
+        residual = (model - f.log_signal).ravel() + turns @ turn + bumps @ slopes
+        return residual, np.concatenate([A.reshape(3 * n, -1), turns, bumps], axis=1)
 
+    def _tilted(self, light: int, tilt: Float64Array) -> tuple[Float64Array, ...]:
+        """Return a light's axis, and its derivatives by the tilt to each side."""
+        side, across = self._side[light], self._across[light]
+        raw = self.table.axis[light] + tilt[0] * side + tilt[1] * across
+        length = np.linalg.norm(raw)
+        axis = raw / length
+        return axis, *((way - (way @ axis) * axis) / length for way in (side, across))
 
-def _sides(axis: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Return two unit vectors across each axis."""
-    helper = np.where(np.abs(axis[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
-    side = np.cross(axis, helper)
-    side /= np.linalg.norm(side, axis=1, keepdims=True)
-    return side, np.cross(axis, side)
+    def _table(self, numbers: Float64Array, errors: Float64Array) -> tuple[LightTable, BoolArray]:
+        """Return what the numbers say of lights and cameras, and which lights were seen."""
+        table, lights = self.table, len(self.table.names)
+        rows = numbers[: self._responses].reshape(lights, N_LIGHT)
+        row_errors = errors[: self._responses].reshape(lights, N_LIGHT)
+        seen = np.zeros(lights, bool)
+        seen[[f.light for f in self.frames]] = True
+        tilts = np.where(seen[:, None], rows[:, 4:6], 0.0)
+        intensity = np.where(seen[:, None], np.exp(rows[:, :3]), 0.0)
+        responses = {}
+        for c, view in enumerate(self.views):
+            if any(f.view == view for f in self.frames):
+                at = slice(self._responses + N_RESPONSE * c, self._responses + N_RESPONSE * (c + 1))
+                mine, error = numbers[at], errors[at]
+                gain = np.exp(mine[:3])
+                responses[self.cameras[view].serial] = CameraResponse(
+                    gain, mine[3:].copy(), gain * error[:3], error[3:].copy()
+                )
+        exponent = np.clip(np.where(seen, rows[:, 3], table.exponent), 0.0, None)
+        axis = np.array([self._tilted(k, tilts[k])[0] for k in range(lights)])
+        found = table.position_mm, intensity, exponent
+        own_errors = intensity * row_errors[:, :3], np.where(seen, row_errors[:, 3], 0.0)
+        stderrs = table.position_stderr_mm, *own_errors
+        valid = table.valid & seen
+        return LightTable(*found, table.names, axis, valid, *stderrs, responses), seen
 
 
 def _shapes(table: LightTable, points: Float64Array, normals: Float64Array) -> Float64Array:
@@ -375,63 +371,3 @@ def _shapes(table: LightTable, points: Float64Array, normals: Float64Array) -> F
     cosine = np.clip(np.sum(to_light * normals, axis=-1) / distance, 0.0, None)
     off = np.clip(-np.einsum("lnk,lk->ln", to_light, table.axis) / distance, 1e-9, None)
     return np.asarray(off ** table.exponent[:, None] * cosine / distance**2)
-
-
-def _result(
-    numbers: Float64Array,
-    covariance: Float64Array,
-    residual: float,
-    frames: Sequence[_Frame],
-    table: LightTable,
-    cameras: Mapping[str, CameraPose],
-    *,
-    dead: tuple[str, ...],
-    answers: dict[str, str],
-) -> LightFit:
-    lights = len(table.names)
-    rows = numbers[: N_LIGHT * lights].reshape(lights, N_LIGHT)
-    errors = np.sqrt(np.clip(np.diag(covariance), 0, None))
-    light_errors = errors[: N_LIGHT * lights].reshape(lights, N_LIGHT)
-    seen = np.zeros(lights, bool)
-    seen[[f.light for f in frames]] = True
-    unseen = tuple(
-        name
-        for k, name in enumerate(table.names)
-        if not seen[k] and name not in dead and name not in answers
-    )
-    side, across = _sides(table.axis)
-    axis = np.array(
-        [
-            _tilted(table, k, rows[k, 4:6] if seen[k] else np.zeros(2), side, across)[0]
-            for k in range(lights)
-        ]
-    )
-    intensity = np.where(seen[:, None], np.exp(rows[:, :3]), 0.0)
-    responses = {}
-    for c, view in enumerate(sorted(cameras)):
-        first = N_LIGHT * lights + N_RESPONSE * c
-        mine, error = numbers[first : first + N_RESPONSE], errors[first : first + N_RESPONSE]
-        if any(f.view == view for f in frames):
-            gain = np.exp(mine[:3])
-            responses[cameras[view].serial] = CameraResponse(
-                gain, mine[3:].copy(), gain * error[:3], error[3:].copy()
-            )
-    return LightFit(
-        LightTable(
-            table.position_mm,
-            intensity,
-            np.clip(np.where(seen, rows[:, 3], table.exponent), 0.0, None),
-            table.names,
-            axis,
-            table.valid & seen,
-            table.position_stderr_mm,
-            intensity * light_errors[:, :3],
-            np.where(seen, light_errors[:, 3], 0.0),
-            responses,
-        ),
-        dead,
-        answers,
-        unseen,
-        residual,
-        len(frames),
-    )

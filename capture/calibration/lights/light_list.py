@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Unpack
@@ -11,13 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from capture.arrays import BoolArray, Float64Array
-from capture.calibration.frozen_arrays import freeze_array
 from capture.calibration.record import (
     Calibration,
     DeviceColumns,
     Origin,
     Quantity,
     device_rows,
+    freeze_arrays,
     of_devices,
 )
 from capture.rig import Rig
@@ -47,9 +46,8 @@ class CameraResponse:
 
     def __post_init__(self) -> None:
         """Convert to float64 and refuse what is no response."""
-        for name, n in (("gain", 3), ("vignetting", 2)):
-            for full in (name, f"{name}_stderr"):
-                freeze_array(self, full, (n,))
+        freeze_arrays(self, (3,), "gain", "gain_stderr")
+        freeze_arrays(self, (2,), "vignetting", "vignetting_stderr")
         if (self.gain <= 0).any() or 1 + self.vignetting.sum() <= 0:
             raise ValueError(
                 f"CameraResponse: got gain {self.gain.tolist()} and vignetting"
@@ -124,26 +122,19 @@ class LightTable:
         n = len(self.names)
         if len(set(self.names)) != n or not n:
             raise ValueError(f"LightTable.names: got {self.names}, expected names that differ")
-        shapes = {
-            "position_mm": (n, 3),
-            "intensity": (n, 3),
-            "exponent": (n,),
-            "position_stderr_mm": (n, 3),
-            "intensity_stderr": (n, 3),
-            "exponent_stderr": (n,),
-        }
-        for name, shape in shapes.items():
-            freeze_array(self, name, shape)
+        freeze_arrays(self, (n, 3), "position_mm", "position_stderr_mm")
+        freeze_arrays(self, (n, 3), "intensity", "intensity_stderr")
+        freeze_arrays(self, (n,), "exponent", "exponent_stderr")
         if (self.intensity < 0).any() or (self.exponent < 0).any():
             raise ValueError("LightTable: got a negative intensity or exponent, expected >= 0")
         axis = self.axis if self.axis is not None else -self.position_mm
         object.__setattr__(self, "axis", axis)
-        freeze_array(self, "axis", (n, 3))
+        freeze_arrays(self, (n, 3), "axis")
         length = np.linalg.norm(self.axis, axis=-1, keepdims=True)
         if (length == 0).any():
             raise ValueError("LightTable.axis: got a zero vector, expected directions")
         object.__setattr__(self, "axis", self.axis / length)
-        freeze_array(self, "axis", (n, 3))
+        freeze_arrays(self, (n, 3), "axis")
         valid = np.ones(n, bool) if self.valid is None else np.array(self.valid)
         if valid.shape != (n,) or valid.dtype != bool:
             raise ValueError(
@@ -178,16 +169,10 @@ class LightTable:
         position = np.array([light.position_mm for light in rig.lights])
         strength = np.array([light.power_w or light.energy_ws for light in rig.lights], np.float64)
         intensity = white_per_s * strength * np.sum(position**2, axis=-1)
-        exponent = [
-            0.0
-            if light.half_intensity_deg is None
-            else math.log(0.5) / math.log(math.cos(math.radians(light.half_intensity_deg)))
-            for light in rig.lights
-        ]
         return cls(
             position,
             np.repeat(intensity[:, None], 3, axis=1),
-            np.array(exponent),
+            np.array([light.lobe_exponent for light in rig.lights]),
             tuple(light.name for light in rig.lights),
         )
 

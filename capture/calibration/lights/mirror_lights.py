@@ -89,15 +89,12 @@ class Highlights:
         Names of the lights that were on.
     pixels : ndarray of float64, shape (n, 2)
         Column and row of each spot, px.
-    flux : ndarray of float64, shape (n,)
-        Sum of its pixels above the background, unit of the image.
     """
 
     view: str
     sphere: int
     lit: tuple[str, ...]
     pixels: Float64Array
-    flux: Float64Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,9 +106,8 @@ class LightPositions:
     names : tuple of str
     position_mm : ndarray of float64, shape (L, 3)
         Rig frame; the nominal place where not `valid`.
-    stderr_mm : ndarray of float64, shape (L, 3)
-        Standard errors; 0 where not `valid`.
     covariance_mm2 : ndarray of float64, shape (L, 3, 3)
+        0 where not `valid`.
     cameras, highlights : ndarray of int64, shape (L,)
         How many cameras and highlights placed each light.
     valid : ndarray of bool, shape (L,)
@@ -121,26 +117,27 @@ class LightPositions:
     answers : dict of str to str
         Lights at whose place another one shone: by the name that was switched on, the name of the
         light whose nominal place was seen. Their positions are those seen.
-    spheres_mm : ndarray of float64, shape (S, 3)
-        The spheres' centres after the adjustment.
     sigma_px : float
         Noise of a highlight's coordinate that the residuals show.
     """
 
     names: tuple[str, ...]
     position_mm: Float64Array
-    stderr_mm: Float64Array
     covariance_mm2: Float64Array
     cameras: Int64Array
     highlights: Int64Array
     valid: BoolArray
     unseen: tuple[str, ...]
     answers: dict[str, str]
-    spheres_mm: Float64Array
     sigma_px: float
 
+    @property
+    def stderr_mm(self) -> Float64Array:
+        """Standard errors, shape (L, 3); 0 where not `valid`."""
+        return np.sqrt(np.clip(np.diagonal(self.covariance_mm2, axis1=1, axis2=2), 0, None))
 
-def find_highlights(image: NDArray, window: SphereWindow) -> tuple[Float64Array, Float64Array]:
+
+def find_highlights(image: NDArray, window: SphereWindow) -> Float64Array:
     """Find the bright spots in a sphere.
 
     Parameters
@@ -151,14 +148,13 @@ def find_highlights(image: NDArray, window: SphereWindow) -> tuple[Float64Array,
 
     Returns
     -------
-    pixels : ndarray of float64, shape (n, 2)
-        Intensity-weighted middle of each spot, brightest first.
-    flux : ndarray of float64, shape (n,)
+    ndarray of float64, shape (n, 2)
+        Intensity-weighted middle of each spot, px, brightest first.
     """
     part = np.asarray(image[window.rows, window.columns], np.float64)
     values = part[window.inside]
     if values.size < 9:
-        return np.zeros((0, 2)), np.zeros(0)
+        return np.zeros((0, 2))
     usual = float(np.median(values))
     # the median deviation of a few levels of the converter may be 0
     quiet = values[np.abs(values - usual) <= np.quantile(np.abs(values - usual), 0.98)]
@@ -174,10 +170,9 @@ def find_highlights(image: NDArray, window: SphereWindow) -> tuple[Float64Array,
         weight = np.clip(above[rows, columns], 0.0, None)
         flux.append(weight.sum())
         pixels.append([columns @ weight / weight.sum(), rows @ weight / weight.sum()])
-    order = np.argsort(flux)[::-1]
     corner = np.array([window.columns.start, window.rows.start])
     found = np.array(pixels).reshape(-1, 2) + corner
-    return found[order], np.array(flux)[order]
+    return found[np.argsort(flux)[::-1]]
 
 
 def locate_lights(
@@ -188,7 +183,6 @@ def locate_lights(
     *,
     light_radius_mm: float = 10.0,
     nominal_stderr_mm: float | None = None,
-    gate_mm: float = LIGHT_GATE_MM,
 ) -> LightPositions:
     """Place lights by their highlights.
 
@@ -206,8 +200,6 @@ def locate_lights(
     nominal_stderr_mm : float, optional
         Standard deviation of the lights about their nominal places, mm: what few highlights leave
         open follows the drawing. None takes nothing from the drawing.
-    gate_mm : float
-        A light farther than this from a reflected ray did not make it.
 
     Returns
     -------
@@ -218,9 +210,9 @@ def locate_lights(
     SphereError
         If no highlight belongs to any light.
     """
-    names = tuple(nominal)
-    start = np.array([np.asarray(nominal[name], float) for name in names])
-    matched, answers, unseen = _match(seen, cameras, spheres, names, start, gate_mm)
+    scene = _Scene(cameras, spheres, nominal)
+    names, start = scene.names, scene.nominal_mm.copy()
+    matched, answers, unseen = scene.match(seen)
     if not matched:
         raise SphereError(
             f"highlights: none of {sum(len(s.pixels) for s in seen)} spots lies where one of the"
@@ -228,12 +220,9 @@ def locate_lights(
         )
     for name, other in answers.items():
         start[names.index(name)] = nominal[other]
-    count = np.zeros(len(names), np.int64)
-    views: list[set[str]] = [set() for _ in names]
-    for light, view, _, _ in matched:
-        count[light] += 1
-        views[light].add(view)
-    by = np.array([len(v) for v in views], np.int64)
+    count = np.bincount([m[0] for m in matched], minlength=len(names))
+    pairs = {(light, view) for light, view, _, _ in matched}
+    by = np.bincount([light for light, _ in pairs], minlength=len(names))
     valid = (count >= MIN_HIGHLIGHTS) & (by >= MIN_HIGHLIGHT_CAMERAS)
     used = [m for m in matched if valid[m[0]]]
     if not used:
@@ -242,81 +231,159 @@ def locate_lights(
             " images; show the sphere at more places, to more cameras"
         )
     with threadpool_limits(limits=1, user_api="blas"):  # many small matrices
-        position, centers, covariance, sigma = _adjust(
-            used, cameras, spheres, start, valid, light_radius_mm, nominal_stderr_mm
-        )
-    position[~valid] = np.array([np.asarray(nominal[name], float) for name in names])[~valid]
-    return LightPositions(
-        names,
-        position,
-        np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0, None)),
-        covariance,
-        by,
-        count,
-        valid,
-        unseen,
-        answers,
-        centers,
-        sigma,
-    )
+        position, covariance, sigma = scene.adjust(used, start, light_radius_mm, nominal_stderr_mm)
+    position[~valid] = scene.nominal_mm[~valid]
+    return LightPositions(names, position, covariance, by, count, valid, unseen, answers, sigma)
 
 
 _Matched = tuple[int, str, int, Float64Array]  # light, view, sphere, pixel
 
 
-def _match(
-    seen: Sequence[Highlights],
-    cameras: Mapping[str, CameraPose],
-    spheres: Mapping[int, SpherePosition],
-    names: tuple[str, ...],
-    start: Float64Array,
-    gate_mm: float,
-) -> tuple[list[_Matched], dict[str, str], tuple[str, ...]]:
-    """Say which light made which spot; lights that answer for others; lights never seen."""
-    matched: list[_Matched] = []
-    expected: Counter[int] = Counter()
-    found: Counter[int] = Counter()
-    instead: Counter[tuple[int, int]] = Counter()
-    strange: list[tuple[int, int, str, int, Float64Array]] = []
-    for shot in seen:
-        camera, sphere = cameras[shot.view], spheres[shot.sphere]
-        lit = [names.index(name) for name in shot.lit]
-        where = reflection_pixels(camera, sphere.center_mm, sphere.radius_mm, start[lit])
-        # lights well in view: their highlight is not squeezed at the rim
-        visible = _clear_of_rim(camera, sphere, where) if len(lit) else np.zeros(0, bool)
-        expected.update(k for k, ok in zip(lit, visible, strict=True) if ok)
-        if not len(shot.pixels):
-            continue
-        miss = _miss_mm(camera, sphere, shot.pixels, start)
-        rows, columns = linear_sum_assignment(np.minimum(miss[:, lit], 10 * gate_mm))
-        free_spots = set(range(len(shot.pixels)))
-        free_lights = set(lit)
-        for spot, column in zip(rows, columns, strict=True):
-            if miss[spot, lit[column]] < gate_mm:
-                matched.append((lit[column], shot.view, shot.sphere, shot.pixels[spot]))
-                found[lit[column]] += 1
-                free_spots.discard(spot)
-                free_lights.discard(lit[column])
-        missing = [k for k in free_lights if visible[lit.index(k)]]
-        if len(missing) == 1:
-            for spot in free_spots:
-                other = int(np.argmin(miss[spot]))
-                if miss[spot, other] < gate_mm and other not in lit:
-                    instead[missing[0], other] += 1
-                    strange.append((missing[0], other, shot.view, shot.sphere, shot.pixels[spot]))
-    answers: dict[str, str] = {}
-    for (light, other), times in instead.most_common():
-        if times > found[light] and times > 0.5 * expected[light]:
-            answers.setdefault(names[light], names[other])
-    for light, other, view, number, pixel in strange:
-        if answers.get(names[light]) == names[other]:
-            matched.append((light, view, number, pixel))
-    unseen = tuple(
-        names[k]
-        for k in range(len(names))
-        if expected[k] >= MIN_HIGHLIGHTS and not found[k] and names[k] not in answers
-    )
-    return matched, answers, unseen
+class _Scene:
+    """Cameras, spheres and lights, whose spots are matched and whose places are adjusted."""
+
+    def __init__(
+        self,
+        cameras: Mapping[str, CameraPose],
+        spheres: Mapping[int, SpherePosition],
+        nominal: Mapping[str, Float64Array],
+    ) -> None:
+        self.cameras, self.spheres, self.names = cameras, spheres, tuple(nominal)
+        self.nominal_mm = np.array([np.asarray(place, float) for place in nominal.values()])
+
+    def match(
+        self, seen: Sequence[Highlights]
+    ) -> tuple[list[_Matched], dict[str, str], tuple[str, ...]]:
+        """Say which light made which spot; lights that answer for others; lights never seen."""
+        names, matched = self.names, list[_Matched]()
+        expected: Counter[int] = Counter()
+        found: Counter[int] = Counter()
+        instead: Counter[tuple[int, int]] = Counter()
+        strange: list[tuple[int, _Matched]] = []
+        for shot in seen:
+            camera, sphere = self.cameras[shot.view], self.spheres[shot.sphere]
+            lit = [names.index(name) for name in shot.lit]
+            places = self.nominal_mm[lit]
+            where = reflection_pixels(camera, sphere.center_mm, sphere.radius_mm, places)
+            # lights well in view: their highlight is not squeezed at the rim
+            visible = _clear_of_rim(camera, sphere, where) if len(lit) else np.zeros(0, bool)
+            expected.update(k for k, ok in zip(lit, visible, strict=True) if ok)
+            if not len(shot.pixels):
+                continue
+            miss = _miss_mm(camera, sphere, shot.pixels, self.nominal_mm)
+            rows, columns = linear_sum_assignment(np.minimum(miss[:, lit], 10 * LIGHT_GATE_MM))
+            free_spots = set(range(len(shot.pixels)))
+            free_lights = set(lit)
+            for spot, column in zip(rows, columns, strict=True):
+                if miss[spot, lit[column]] < LIGHT_GATE_MM:
+                    matched.append((lit[column], shot.view, shot.sphere, shot.pixels[spot]))
+                    found[lit[column]] += 1
+                    free_spots.discard(spot)
+                    free_lights.discard(lit[column])
+            missing = [k for k in free_lights if visible[lit.index(k)]]
+            if len(missing) == 1:
+                for spot in free_spots:
+                    other = int(np.argmin(miss[spot]))
+                    if miss[spot, other] < LIGHT_GATE_MM and other not in lit:
+                        instead[missing[0], other] += 1
+                        shown = (missing[0], shot.view, shot.sphere, shot.pixels[spot])
+                        strange.append((other, shown))
+        answers: dict[str, str] = {}
+        for (light, other), times in instead.most_common():
+            if times > found[light] and times > 0.5 * expected[light]:
+                answers.setdefault(names[light], names[other])
+        matched += [m for other, m in strange if answers.get(names[m[0]]) == names[other]]
+        unseen = tuple(
+            names[k]
+            for k in range(len(names))
+            if expected[k] >= MIN_HIGHLIGHTS and not found[k] and names[k] not in answers
+        )
+        return matched, answers, unseen
+
+    def adjust(
+        self,
+        matched: Sequence[_Matched],
+        start: Float64Array,
+        light_radius_mm: float,
+        nominal_stderr_mm: float | None,
+    ) -> tuple[Float64Array, Float64Array, float]:
+        """Return all lights' places and covariances and the rms of a coordinate.
+
+        Newton's method on the lights and the spheres' centres, which also the outlines hold.
+        """
+        numbers = sorted(self.spheres)
+        lights, light_of = np.unique([m[0] for m in matched], return_inverse=True)
+        base = 3 * len(lights)
+        total = base + 3 * len(numbers)
+        position = start.copy()
+        outlines = [self.spheres[n] for n in numbers]
+        centers = np.array([sphere.center_mm for sphere in outlines])
+        stiffness = [np.linalg.inv(s.covariance_mm2 + 1e-12 * np.eye(3)) for s in outlines]
+        sphere_of = np.array([numbers.index(m[2]) for m in matched])
+        columns = np.stack([3 * light_of, base + 3 * sphere_of], axis=1)[..., None] + np.arange(3)
+        columns = columns.reshape(-1, 6)
+        H, r, robust, count = np.eye(total), np.zeros((1, 2)), np.ones(1), 1.0
+        for _ in range(MAX_MIRROR_STEPS):
+            r, J = self._rows(matched, centers[sphere_of], position[lights][light_of])
+            # a spot narrower than a pixel hides where in the pixel it is
+            width = 2 * light_radius_mm * np.linalg.norm(J[:, :, :3], axis=2)
+            usual = np.sqrt(MIN_HIGHLIGHT_STDERR_PX**2 + np.clip(1 - width, 0, None) ** 3 / 12)
+            z = r / usual
+            sigma = max(mad_sigma(z), 1e-6)
+            robust = huber_weights(np.linalg.norm(z, axis=1) / sigma)
+            count = 2 * robust.sum() - total
+            scale = np.sqrt((robust[:, None] * z**2).sum() / max(float(count), 1.0))
+            w = robust[:, None] / (scale * usual) ** 2
+            H, g = np.zeros((total, total)), np.zeros(total)
+            blocks = np.einsum("ni,nij,nik->njk", w, J, J)
+            np.add.at(H, (columns[:, :, None], columns[:, None, :]), blocks)
+            np.add.at(g, columns, np.einsum("ni,nij,ni->nj", w, J, r))
+            for s, sphere in enumerate(outlines):
+                at = slice(base + 3 * s, base + 3 * s + 3)
+                H[at, at] += stiffness[s]
+                g[at] += stiffness[s] @ (centers[s] - sphere.center_mm)
+            if nominal_stderr_mm is not None:
+                H[np.arange(base), np.arange(base)] += 1 / nominal_stderr_mm**2
+                g[:base] += (position - start)[lights].ravel() / nominal_stderr_mm**2
+            step = -np.linalg.solve(H, g)
+            position[lights] += step[:base].reshape(-1, 3)
+            centers += step[base:].reshape(-1, 3)
+            if step @ H @ step < MIRROR_STEP_TOL:
+                break
+        inverse = np.linalg.inv(H)
+        covariance = np.zeros((len(start), 3, 3))
+        for k, light in enumerate(lights):
+            covariance[light] = inverse[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
+        rms = float(np.sqrt((robust[:, None] * r**2).sum() / max(float(count), 1.0)))
+        return position, covariance, rms
+
+    def _rows(
+        self, matched: Sequence[_Matched], centers_mm: Float64Array, lights_mm: Float64Array
+    ) -> tuple[Float64Array, Float64Array]:
+        """Return residuals, px, shape (n, 2), and their derivatives, shape (n, 2, 6)."""
+        views = np.array([m[1] for m in matched])
+        radius_mm = next(iter(self.spheres.values())).radius_mm
+        each = np.concatenate([np.zeros((1, 6)), np.eye(6), -np.eye(6)])
+        steps = DERIVATIVE_STEP_MM * each[:, None]
+        names = sorted(set(views))
+        eyes = np.array([self.cameras[view].center_mm for view in views])
+        lights, centers = lights_mm + steps[..., :3], centers_mm + steps[..., 3:]
+        point, seen = reflection_points(
+            np.broadcast_to(eyes, lights.shape).reshape(-1, 3),
+            centers.reshape(-1, 3),
+            radius_mm,
+            lights.reshape(-1, 3),
+        )
+        point, seen = point.reshape(lights.shape), seen.reshape(lights.shape[:2])
+        found = np.empty((*lights.shape[:2], 2))
+        for name in names:
+            mine = views == name
+            found[:, mine] = self.cameras[name].project(point[:, mine])
+        residual = found[0] - np.array([m[3] for m in matched])
+        J = np.moveaxis((found[1:7] - found[7:]) / (2 * DERIVATIVE_STEP_MM), 0, -1)
+        lost = ~(seen.all(axis=0) & np.isfinite(found).all(axis=(0, 2)))
+        residual[lost], J[lost] = 0.0, 0.0
+        return residual, J
 
 
 def _clear_of_rim(camera: CameraPose, sphere: SpherePosition, pixels: Float64Array) -> BoolArray:
@@ -342,103 +409,3 @@ def _miss_mm(
     along = np.einsum("slk,sk->sl", to_light, direction)
     gap = np.linalg.norm(to_light - along[..., None] * direction[:, None], axis=-1)
     return np.asarray(np.where(hit[:, None] & (along > 0), gap, np.inf).clip(max=1e9))
-
-
-def _adjust(
-    matched: Sequence[_Matched],
-    cameras: Mapping[str, CameraPose],
-    spheres: Mapping[int, SpherePosition],
-    start: Float64Array,
-    valid: BoolArray,
-    light_radius_mm: float,
-    nominal_stderr_mm: float | None,
-) -> tuple[Float64Array, Float64Array, Float64Array, float]:
-    """Return lights, centres, the lights' covariances and the noise, by Gauss-Newton steps."""
-    numbers = sorted(spheres)
-    lights = np.nonzero(valid)[0]
-    place_of = {int(light): 3 * k for k, light in enumerate(lights)}
-    base = 3 * len(lights)
-    total = base + 3 * len(numbers)
-    position = start.copy()
-    centers = np.array([spheres[n].center_mm for n in numbers])
-    outline = [np.linalg.inv(spheres[n].covariance_mm2 + 1e-12 * np.eye(3)) for n in numbers]
-    light_of = np.array([m[0] for m in matched])
-    pixels = np.array([m[3] for m in matched])
-    sphere_of = np.array([numbers.index(m[2]) for m in matched])
-    views = np.array([m[1] for m in matched])
-    radius = next(iter(spheres.values())).radius_mm
-    to = 3 * np.array([place_of[int(light)] // 3 for light in light_of])
-    H, r, robust, count = np.eye(total), np.zeros((1, 2)), np.ones(1), 1.0
-    for _ in range(MAX_MIRROR_STEPS):
-        r, J = _highlight_rows(
-            cameras, views, centers[sphere_of], radius, position[light_of], pixels
-        )
-        # a spot narrower than a pixel hides where in the pixel it is
-        width = 2 * light_radius_mm * np.linalg.norm(J[:, :, :3], axis=2)
-        usual = np.sqrt(MIN_HIGHLIGHT_STDERR_PX**2 + np.clip(1 - width, 0, None) ** 3 / 12)
-        z = r / usual
-        sigma = max(mad_sigma(z), 1e-6)
-        size = np.linalg.norm(z, axis=1) / sigma
-        robust = huber_weights(size)
-        count = 2 * robust.sum() - total
-        scale = np.sqrt((robust[:, None] * z**2).sum() / max(float(count), 1.0))
-        w = robust[:, None] / (scale * usual) ** 2
-        columns = np.concatenate(
-            [to[:, None] + np.arange(3), base + 3 * sphere_of[:, None] + np.arange(3)], axis=1
-        )
-        H, g = np.zeros((total, total)), np.zeros(total)
-        blocks = np.einsum("ni,nij,nik->njk", w, J, J)
-        np.add.at(H, (columns[:, :, None], columns[:, None, :]), blocks)
-        np.add.at(g, columns, np.einsum("ni,nij,ni->nj", w, J, r))
-        for s, number in enumerate(numbers):
-            at = slice(base + 3 * s, base + 3 * s + 3)
-            H[at, at] += outline[s]
-            g[at] += outline[s] @ (centers[s] - spheres[number].center_mm)
-        if nominal_stderr_mm is not None:
-            H[np.arange(base), np.arange(base)] += 1 / nominal_stderr_mm**2
-            g[:base] += (position - start)[lights].ravel() / nominal_stderr_mm**2
-        step = -np.linalg.solve(H, g)
-        position[lights] += step[:base].reshape(-1, 3)
-        centers += step[base:].reshape(-1, 3)
-        if step @ H @ step < MIRROR_STEP_TOL:
-            break
-    inverse = np.linalg.inv(H)
-    covariance = np.zeros((len(start), 3, 3))
-    for light, k in place_of.items():
-        covariance[light] = inverse[k : k + 3, k : k + 3]
-    rms = float(np.sqrt((robust[:, None] * r**2).sum() / max(float(count), 1.0)))
-    return position, centers, covariance, rms
-
-
-def _highlight_rows(
-    cameras: Mapping[str, CameraPose],
-    views: NDArray,
-    centers_mm: Float64Array,
-    radius_mm: float,
-    lights_mm: Float64Array,
-    pixels: Float64Array,
-) -> tuple[Float64Array, Float64Array]:
-    """Return residuals (n, 2) and their derivatives (n, 2, 6) by light and by centre.
-
-    A light that the sphere cannot show any more (beyond its rim) has residual and derivative 0.
-    """
-    steps = DERIVATIVE_STEP_MM * np.concatenate([np.zeros((1, 6)), np.eye(6), -np.eye(6)])[:, None]
-    names = sorted(set(views))
-    eyes = np.array([cameras[name].center_mm for name in names])[np.searchsorted(names, views)]
-    lights, centers = lights_mm + steps[..., :3], centers_mm + steps[..., 3:]
-    point, seen = reflection_points(
-        np.broadcast_to(eyes, lights.shape).reshape(-1, 3),
-        centers.reshape(-1, 3),
-        radius_mm,
-        lights.reshape(-1, 3),
-    )
-    point, seen = point.reshape(lights.shape), seen.reshape(lights.shape[:2])
-    found = np.empty((*lights.shape[:2], 2))
-    for name in names:
-        mine = views == name
-        found[:, mine] = cameras[name].project(point[:, mine])
-    residual = found[0] - pixels
-    J = np.moveaxis((found[1:7] - found[7:]) / (2 * DERIVATIVE_STEP_MM), 0, -1)
-    lost = ~(seen.all(axis=0) & np.isfinite(found).all(axis=(0, 2)))
-    residual[lost], J[lost] = 0.0, 0.0
-    return residual, J

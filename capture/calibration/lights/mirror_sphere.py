@@ -160,15 +160,9 @@ def locate_sphere(
     residual = np.concatenate(
         [_outline_px(cameras[n], edges, center, radius_mm) for n, edges in outlines.items()]
     )
-    return SpherePosition(
-        center[:3],
-        radius_mm,
-        np.asarray(sigma**2 * np.linalg.inv(H)),
-        float(np.sqrt(np.mean(residual**2))),
-        free_radius,
-        free_stderr,
-        tuple(outlines),
-    )
+    covariance, rms = np.asarray(sigma**2 * np.linalg.inv(H)), float(np.sqrt(np.mean(residual**2)))
+    free_fit = free_radius, free_stderr
+    return SpherePosition(center[:3], radius_mm, covariance, rms, *free_fit, tuple(outlines))
 
 
 def contour(

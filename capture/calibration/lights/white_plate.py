@@ -178,15 +178,9 @@ class PlateWindow:
             for values in (hit[..., 0], hit[..., 1], pixels[..., 0], pixels[..., 1])
         ]
         flat = np.column_stack([means[0], means[1], np.zeros(len(count))])
-        return cls(
-            slice(int(first[1]), int(last[1])),
-            slice(int(first[0]), int(last[0])),
-            part,
-            place.to_rig(flat),
-            np.column_stack(means[2:]),
-            count,
-            place.rotation,
-        )
+        box = slice(int(first[1]), int(last[1])), slice(int(first[0]), int(last[0]))
+        middles = place.to_rig(flat), np.column_stack(means[2:])
+        return cls(*box, part, *middles, count, place.rotation)
 
     def sample(
         self,
@@ -219,14 +213,6 @@ class PlateWindow:
         mean = np.stack([np.bincount(number, weights=v, minlength=n) for v in values.T], axis=1)
         noise = np.stack([np.bincount(number, weights=v, minlength=n) for v in spread.T], axis=1)
         kept = (count >= MIN_CELL_PIXELS) & (count >= MIN_CELL_FILL * self.count)
-        return PlateSamples(
-            view,
-            light,
-            on_s,
-            self.rotation,
-            np.nonzero(kept)[0],
-            self.points_mm[kept],
-            self.pixels[kept],
-            (mean / safe)[kept],
-            (noise / safe**2)[kept],
-        )
+        parts = np.nonzero(kept)[0], self.points_mm[kept], self.pixels[kept]
+        seen = (mean / safe)[kept], (noise / safe**2)[kept]
+        return PlateSamples(view, light, on_s, self.rotation, *parts, *seen)

@@ -117,18 +117,11 @@ class Reflection:
         right = np.cross([0.0, 1.0, 0.0], beam)
         right /= np.linalg.norm(right, axis=1, keepdims=True)
         half = to_light + to_camera
-        return cls(
-            to_light,
-            to_camera,
-            half / np.linalg.norm(half, axis=1, keepdims=True),
-            right,
-            np.cross(beam, right),
-            np.radians([light.polarizer_axis_deg or 0.0 for light in lights]),
-            camera.rotation[0],
-            -camera.rotation[1],
-            float(np.radians(analyser_deg)),
-            eta,
-        )
+        normal = half / np.linalg.norm(half, axis=1, keepdims=True)
+        axis_rad = np.radians([light.polarizer_axis_deg or 0.0 for light in lights])
+        film, image = (right, np.cross(beam, right)), (camera.rotation[0], -camera.rotation[1])
+        analyser_rad = float(np.radians(analyser_deg))
+        return cls(to_light, to_camera, normal, *film, axis_rad, *image, analyser_rad, eta)
 
     def moved(self, to_light: Float64Array, eta: float) -> Self:
         """Return the reflection with lights in other directions, and of another index.

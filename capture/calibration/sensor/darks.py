@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from capture.arrays import BoolArray, Float64Array, UInt16Array
 from capture.calibration.robust import mad_sigma
@@ -30,6 +31,10 @@ class Darks:
         Growth with exposure time and its standard error; None where all times are the same.
     good : tuple of ndarray of bool
         Pixels that are not hot, per CFA position.
+    positions : tuple of (row, column)
+        The CFA positions, in the 2 x 2 cell.
+    pattern : str
+        CFA pattern or "MONO".
     """
 
     black_dn: tuple[float, ...]
@@ -39,6 +44,22 @@ class Darks:
     dsnu_dn: tuple[float, float]
     slope_dn_per_s: tuple[float, float] | None
     good: tuple[BoolArray, ...]
+    positions: tuple[tuple[int, int], ...]
+    pattern: str
+
+    @property
+    def mean_black_dn(self) -> float:
+        """Mean of the positions' black levels."""
+        return float(np.mean(self.black_dn))
+
+    @property
+    def levels(self) -> tuple[tuple[float, ...], tuple[BoolArray, ...]]:
+        """Black level and good pixels of each position."""
+        return self.black_dn, self.good
+
+    def planes(self, frame: NDArray) -> list[Float64Array]:
+        """Return the pixels of a frame at each position."""
+        return [plane(frame, position, self.pattern) for position in self.positions]
 
 
 def reduce_darks(
@@ -101,6 +122,8 @@ def reduce_darks(
         dsnu_dn=pool(spreads),
         slope_dn_per_s=slope,
         good=tuple(good),
+        positions=positions,
+        pattern=pattern,
     )
 
 

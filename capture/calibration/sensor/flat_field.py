@@ -70,12 +70,8 @@ class SmoothField:
     def evaluate(self, height: int, width: int) -> Float64Array:
         """Return the field on every pixel of an image, shape (H, W)."""
         degree = _count(self.coefficients.size)
-        p, q = _basis(
-            np.arange(height, dtype=np.float64),
-            np.arange(width, dtype=np.float64),
-            (height, width),
-            degree,
-        )
+        rows, columns = np.arange(height, dtype=np.float64), np.arange(width, dtype=np.float64)
+        p, q = _basis(rows, columns, (height, width), degree)
         grid = np.zeros((degree + 1, degree + 1))
         for (i, j), c in zip(_terms(degree), self.coefficients, strict=True):
             grid[i, j] = c

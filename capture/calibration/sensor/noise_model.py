@@ -5,7 +5,7 @@ color, with standard errors; see `capture.calibration.sensor.transfer_curve` for
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Unpack
 
 import numpy as np
@@ -14,7 +14,6 @@ from capture.arrays import Float64Array, UInt16Array
 from capture.calibration.record import Calibration, Provenance, Quantity, of_one_device
 from capture.calibration.sensor.darks import Darks, pool, reduce_darks
 from capture.calibration.sensor.flat_field import SmoothField, fit_smooth_field, pixel_response
-from capture.calibration.sensor.linearity import fit_linearity
 from capture.calibration.sensor.transfer_curve import (
     CurveFit,
     FlatPair,
@@ -168,17 +167,7 @@ class SensorCalibration:
         )
 
 
-_PER_COLOR = (
-    "black_dn",
-    "gain_e_per_dn",
-    "read_noise_e",
-    "saturation_dn",
-    "full_well_e",
-    "nonlinearity",
-    "linearity_deviation",
-    "prnu",
-    "dsnu_dn",
-)
+_PER_COLOR = tuple(field.name for field in fields(SensorCalibration) if field.type is Quantity)
 
 
 def photon_transfer(
@@ -225,34 +214,24 @@ def photon_transfer(
     Janesick, Photon Transfer, SPIE Press 2007, doi 10.1117/3.725073.
     """
     shape = _check_frames(pairs, darks, dark_exposures_s)
-    colors = cfa_planes(pattern)
-    fits: list[CurveFit] = []
-    dark_fits: list[Darks] = []
-    linear: list[tuple[float, float, float, float]] = []
-    prnu: list[tuple[float, float]] = []
-    flats: list[SmoothField] = []
-    for positions in colors.values():
+    planes = cfa_planes(pattern)
+    colors = []
+    for positions in planes.values():
         dark = reduce_darks(darks, dark_exposures_s, positions, pattern)
         levels = [
             [
-                block_statistics(
-                    plane(pair.first, position, pattern),
-                    plane(pair.second, position, pattern),
-                    black_dn=black,
-                    white_dn=white_dn,
-                    good=good,
-                    block=block,
+                block_statistics(a, b, black_dn=black, white_dn=white_dn, good=good, block=block)
+                for a, b, black, good in zip(
+                    dark.planes(pair.first), dark.planes(pair.second), *dark.levels, strict=True
                 )
-                for position, black, good in zip(positions, dark.black_dn, dark.good, strict=True)
             ]
             for pair in pairs
         ]
-        black = float(np.mean(dark.black_dn))
         fit = fit_curve(
             [blocks for level in levels for blocks in level],
             dark_variance_dn2=dark.variance_dn2,
             dark_dof=dark.dof,
-            range_dn=white_dn - black,
+            range_dn=white_dn - dark.mean_black_dn,
         )
         room = 6.0 * np.sqrt(fit.offset_dn2 + fit.slope_dn * fit.saturation_dn)
         unsaturated = [
@@ -266,15 +245,21 @@ def photon_transfer(
                 f"photon transfer: {len(usable)} pairs lie below saturation everywhere, expected at"
                 " least three amounts of light; take darker flats"
             )
-        fits.append(fit)
-        dark_fits.append(dark)
-        linear.append(fit_linearity(usable, positions, pattern, dark))
-        spread, field = _fixed_pattern(
-            usable, positions, pattern, dark, block=block, degree=flat_degree, shape=shape
-        )
-        prnu.append(spread)
-        flats.append(field)
-    return _assemble(pattern, tuple(colors), white_dn, fits, dark_fits, linear, prnu, tuple(flats))
+        spread, field = _fixed_pattern(usable, dark, block=block, degree=flat_degree, shape=shape)
+        colors.append(_Color(fit, dark, fit_linearity(usable, dark), spread, field))
+    rows = [color.numbers() for color in colors]
+    numbers = {name: _quantity([row[name] for row in rows]) for name in rows[0]}
+    return SensorCalibration(
+        pattern=pattern,
+        colors=tuple(planes),
+        white_dn=white_dn,
+        saturated_by=tuple(color.fit.saturated_by for color in colors),
+        dark_e_per_s=numbers.pop("dark_e_per_s", None),
+        flat=tuple(color.flat for color in colors),
+        chi2_per_dof=tuple(color.fit.chi2_per_dof for color in colors),
+        hot_pixels=sum(int((~ok).sum()) for color in colors for ok in color.dark.good),
+        **numbers,
+    )
 
 
 def _check_frames(
@@ -303,25 +288,16 @@ def _check_frames(
 
 
 def _fixed_pattern(
-    pairs: Sequence[FlatPair],
-    positions: tuple[tuple[int, int], ...],
-    pattern: str,
-    dark: Darks,
-    *,
-    block: int,
-    degree: int,
-    shape: tuple[int, int],
+    pairs: Sequence[FlatPair], dark: Darks, *, block: int, degree: int, shape: tuple[int, int]
 ) -> tuple[tuple[float, float], SmoothField]:
     """Pixel response and flat field from the sums of all first and all second frames."""
-    step = 1 if pattern == "MONO" else 2
+    step = 1 if dark.pattern == "MONO" else 2
     spreads, values, rows, columns = [], [], [], []
-    for position, black, good in zip(positions, dark.black_dn, dark.good, strict=True):
-        sums = [
-            np.where(
-                good, np.sum([plane(f, position, pattern) - black for f in frames], axis=0), np.nan
-            )
-            for frames in ([p.first for p in pairs], [p.second for p in pairs])
-        ]
+    for position, black, good in zip(dark.positions, *dark.levels, strict=True):
+        sums = []
+        for frames in ([p.first for p in pairs], [p.second for p in pairs]):
+            total = np.sum([plane(f, position, dark.pattern) - black for f in frames], axis=0)
+            sums.append(np.where(good, total, np.nan))
         spreads.append(pixel_response(sums[0], sums[1], block=block))
         total = np.where(good, sums[0] + sums[1], 0.0)
         side = max(min(total.shape) // N_FLAT_BLOCKS, 1)
@@ -330,63 +306,42 @@ def _fixed_pattern(
         values.append(block_sums(total, side)[r, c] / count[r, c])
         rows.append(position[0] + step * (r * side + (side - 1) / 2))
         columns.append(position[1] + step * (c * side + (side - 1) / 2))
-    field = fit_smooth_field(
-        np.concatenate(values),
-        np.concatenate(rows),
-        np.concatenate(columns),
-        shape=shape,
-        degree=degree,
-    )
-    return pool(spreads), field
+    samples = (np.concatenate(part) for part in (values, rows, columns))
+    return pool(spreads), fit_smooth_field(*samples, shape=shape, degree=degree)
 
 
-def _assemble(
-    pattern: str,
-    colors: tuple[str, ...],
-    white_dn: int,
-    fits: Sequence[CurveFit],
-    darks: Sequence[Darks],
-    linear: Sequence[tuple[float, float, float, float]],
-    prnu: Sequence[tuple[float, float]],
-    flats: tuple[SmoothField, ...],
-) -> SensorCalibration:
-    gain, read, well, saturation, current = [], [], [], [], []
-    for fit, dark in zip(fits, darks, strict=True):
+@dataclass(frozen=True, slots=True, eq=False)
+class _Color:
+    """What the frames say of the pixels of one color."""
+
+    fit: CurveFit
+    dark: Darks
+    linear: tuple[float, float, float, float]
+    prnu: tuple[float, float]
+    flat: SmoothField
+
+    def numbers(self) -> dict[str, tuple[float, float]]:
+        """Return the quantities of `SensorCalibration`, each with its standard error."""
+        fit, dark = self.fit, self.dark
         g = 1.0 / fit.slope_dn
         g_error = float(np.sqrt(fit.covariance[1, 1])) * g**2
-        gain.append((g, g_error))
-        read.append(_read_noise(fit))
-        black = float(np.mean(dark.black_dn))
-        saturation_error = float(np.sqrt(fit.offset_dn2))  # pixels differ; of the order of noise
-        saturation.append((black + fit.saturation_dn, saturation_error))
-        well.append(
-            (
-                fit.saturation_dn * g,
-                float(np.hypot(fit.saturation_dn * g_error, saturation_error * g)),
-            )
-        )
+        top = fit.saturation_dn
+        top_error = float(np.sqrt(fit.offset_dn2))  # pixels differ; of the order of noise
+        found = {
+            "black_dn": (dark.mean_black_dn, dark.black_stderr),
+            "gain_e_per_dn": (g, g_error),
+            "read_noise_e": _read_noise(fit),
+            "saturation_dn": (dark.mean_black_dn + top, top_error),
+            "full_well_e": (top * g, float(np.hypot(top * g_error, top_error * g))),
+            "nonlinearity": self.linear[:2],
+            "linearity_deviation": self.linear[2:],
+            "prnu": self.prnu,
+            "dsnu_dn": dark.dsnu_dn,
+        }
         if dark.slope_dn_per_s is not None:
             rate, rate_error = dark.slope_dn_per_s
-            current.append((rate * g, float(np.hypot(rate_error * g, rate * g_error))))
-    return SensorCalibration(
-        pattern=pattern,
-        colors=colors,
-        white_dn=white_dn,
-        black_dn=_quantity([(float(np.mean(d.black_dn)), d.black_stderr) for d in darks]),
-        gain_e_per_dn=_quantity(gain),
-        read_noise_e=_quantity(read),
-        saturation_dn=_quantity(saturation),
-        full_well_e=_quantity(well),
-        saturated_by=tuple(fit.saturated_by for fit in fits),
-        nonlinearity=_quantity([(row[0], row[1]) for row in linear]),
-        linearity_deviation=_quantity([(row[2], row[3]) for row in linear]),
-        prnu=_quantity(prnu),
-        dsnu_dn=_quantity([d.dsnu_dn for d in darks]),
-        dark_e_per_s=_quantity(current) if current else None,
-        flat=flats,
-        chi2_per_dof=tuple(fit.chi2_per_dof for fit in fits),
-        hot_pixels=sum(int((~ok).sum()) for d in darks for ok in d.good),
-    )
+            found["dark_e_per_s"] = (rate * g, float(np.hypot(rate_error * g, rate * g_error)))
+        return found
 
 
 def _read_noise(fit: CurveFit) -> tuple[float, float]:
@@ -412,3 +367,53 @@ def _combine(quantity: Quantity) -> Quantity:
     return Quantity(
         np.array((weight * quantity.value).sum() / weight.sum()), np.array(weight.sum() ** -0.5)
     )
+
+
+def fit_linearity(pairs: Sequence[FlatPair], dark: Darks) -> tuple[float, float, float, float]:
+    """Fit the response of one color to the amount of light.
+
+    ``signal / light = a (1 + q light / light_max)``; the scatter is taken from the two frames of
+    the pairs and from the residuals, so that a light source that does not repeat well is honest.
+
+    Parameters
+    ----------
+    pairs : sequence of FlatPair
+        Unsaturated flats.
+    dark : Darks
+        Of the same color.
+
+    Returns
+    -------
+    nonlinearity, stderr : float
+        q and its standard error, relative.
+    deviation, deviation_stderr : float
+        Largest relative deviation of one level from a straight line through zero, and the
+        scatter of one level.
+    """
+    light = np.array([pair.light for pair in pairs])
+
+    def level(frame: UInt16Array) -> float:
+        cells = zip(dark.planes(frame), *dark.levels, strict=True)
+        parts = [pixels[ok].mean() - black for pixels, black, ok in cells]
+        return float(np.mean(parts))
+
+    signals = np.array([[level(pair.first), level(pair.second)] for pair in pairs])
+    response = signals.mean(axis=1) / light
+    half_difference = (signals[:, 0] - signals[:, 1]) / (2.0 * signals.mean(axis=1))
+    design = np.stack([np.ones_like(light), light / light.max()], axis=1)
+    # an error of the black level weighs on the dark levels most
+    weight = 1.0 / (
+        1.0 + (dark.black_stderr / (signals.mean(axis=1) * max(half_difference.std(), 1e-6))) ** 2
+    )
+    normal = design.T @ (design * weight[:, None])
+    coefficients = np.linalg.solve(normal, design.T @ (weight * response))
+    misfit = response / (design @ coefficients) - 1.0
+    dof = (len(pairs) - 2) + len(pairs)
+    scatter = float((weight * misfit**2).sum() + (half_difference**2).sum()) / dof
+    a, q = float(coefficients[0]), float(coefficients[1] / coefficients[0])
+    covariance = np.linalg.inv(normal) * scatter * a**2
+    gradient = np.array([-q / a, 1.0 / a])
+    q_error = float(np.sqrt(gradient @ covariance @ gradient))
+    straight = float((weight * response).sum() / weight.sum())
+    deviation = float(np.abs(response / straight - 1.0).max())
+    return q, q_error, deviation, float(np.sqrt(scatter))

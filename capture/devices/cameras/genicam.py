@@ -24,16 +24,15 @@ from capture.devices.camera import (
     Trigger,
     WrongCamera,
 )
-from capture.devices.cameras.genicam_address import Address, parse_address
-from capture.devices.cameras.genicam_features import Features
 from capture.devices.cameras.genicam_producer import (
     Connection,
+    Features,
     Library,
     connect,
     load_library,
     producer_files,
 )
-from capture.devices.cameras.genicam_readout import prepare
+from capture.devices.cameras.genicam_readout import Address, parse_address, prepare
 
 MAX_BUFFER_BYTES = 2**32
 """Most memory for the frames of a sequence, which are fetched when it is over."""

@@ -24,6 +24,7 @@ from capture.devices.camera import (
     FrameTimeout,
     Trigger,
 )
+from capture.devices.cameras.hot_folder import info_of
 
 EVENT_DRAIN_MS = 50
 """How long old events are waited for when the camera is armed, ms."""
@@ -101,16 +102,7 @@ class GphotoCamera:
         """What the camera is; takes one test picture the first time it is asked."""
         if self._info is None:
             picture = raw.decode(memoryview(self._capture()), where=f"gphoto2:{self._serial}")
-            self._info = CameraInfo(
-                serial=self._serial,
-                model=picture.camera_model,
-                width_px=picture.cfa.shape[1],
-                height_px=picture.cfa.shape[0],
-                pattern=picture.pattern,
-                black=picture.black,
-                white=picture.white,
-                triggers=(Trigger.SOFTWARE, Trigger.EDGE),
-            )
+            self._info = info_of(picture, self._serial, Trigger.SOFTWARE, Trigger.EDGE)
         return self._info
 
     def clock_s(self) -> float:

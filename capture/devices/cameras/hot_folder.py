@@ -43,6 +43,13 @@ def open_camera(rest: str) -> HotFolder:
     return HotFolder(Path(path), serial=serial, by_hand=release == "hand")
 
 
+def info_of(frame: raw.RawFrame, serial: str, *triggers: Trigger) -> CameraInfo:
+    """Return what a raw file says of the camera that took it."""
+    height, width = frame.cfa.shape
+    levels = (frame.pattern, frame.black, frame.white)
+    return CameraInfo(serial, frame.camera_model, width, height, *levels, triggers)
+
+
 class HotFolder:
     """Camera over a folder that another program fills.
 
@@ -80,7 +87,6 @@ class HotFolder:
         self._sleep = sleep
         self._seen = set(self._files())
         self._seq = 0
-        self._armed = 0
         self._want = Exposure(0.01, 100)
         sample = next(iter(sorted(self._seen)), None)
         if sample is None:
@@ -89,16 +95,8 @@ class HotFolder:
                 "is known"
             )
         frame = raw.read(sample)
-        self._info = CameraInfo(
-            serial=serial or frame.camera_serial or frame.camera_model,
-            model=frame.camera_model,
-            width_px=frame.cfa.shape[1],
-            height_px=frame.cfa.shape[0],
-            pattern=frame.pattern,
-            black=frame.black,
-            white=frame.white,
-            triggers=(Trigger.HAND,) if by_hand else (Trigger.EDGE,),
-        )
+        known = serial or frame.camera_serial or frame.camera_model
+        self._info = info_of(frame, known, Trigger.HAND if by_hand else Trigger.EDGE)
 
     @property
     def info(self) -> CameraInfo:
@@ -122,7 +120,6 @@ class HotFolder:
             raise CameraError(f"hotfolder:{self._path}: cannot be released by {trigger}")
         self._seen |= set(self._files())
         self._seq = 0
-        self._armed = count
 
     def fire(self) -> None:
         """Refuse: a folder takes no picture.
@@ -162,7 +159,6 @@ class HotFolder:
     def abort(self) -> None:
         """Ignore what is in the folder."""
         self._seen |= set(self._files())
-        self._armed = 0
 
     def close(self) -> None:
         """Nothing to let go of."""

@@ -226,7 +226,7 @@ def lights(stage: Stage) -> None:
             window = mirror_lights.SphereWindow.of(camera, spheres[number])
             frame = _frame(scene, name, range(len(every)), 0.012, 0.002, number)
             spots = mirror_lights.find_highlights(neutral_mosaic(frame, colors[name]), window)
-            seen.append(mirror_lights.Highlights(name, number, tuple(every), *spots))
+            seen.append(mirror_lights.Highlights(name, number, tuple(every), spots))
     nominal = {light.name: np.array(light.position_mm) for light in rig.lights}
     truth = scene.truth()["position_mm"]
     for count in range(1, most + 1):

@@ -10,7 +10,7 @@ from typing import Any
 from capture.plan import Value
 from capture.session import FrameRecord, Session
 from capture.session.contents import undamaged_contents
-from capture.session.frames import check_file
+from capture.session.view import check_file
 from reconstruction.pipeline.inputs import Inputs
 from skinrig.exporting.options import Delivery
 from skinrig.exporting.sealing import write_json

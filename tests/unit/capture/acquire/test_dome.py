@@ -199,7 +199,7 @@ def test_counting_instead_of_times_would_give_frames_to_the_wrong_light(make, mo
     honest, count = body.edge, itertools.count()
     body.edge = lambda now: None if next(count) == 4 else honest(now)
     monkeypatch.setattr(
-        "capture.acquire.frame_stream.FrameStream._row_of", lambda self, frame: frame.seq
+        "capture.acquire.table_run.FrameStream._row_of", lambda self, frame: frame.seq
     )
 
     def run_and_check():

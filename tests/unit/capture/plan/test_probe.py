@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from capture.plan import Plan, PlanError, Step
-from capture.plan.fiber_light import fiber_light
+from capture.plan.dose import fiber_light
 from capture.plan.probe import (
     MAX_MASK_EXPOSURE_S,
     all_series,

@@ -9,7 +9,7 @@ from fixtures.operators import by_operator
 
 from capture import raw
 from capture.acquire import AcquisitionError, Interrupted, run_plan
-from capture.acquire.gradient.travel_limit import EndOfSkin, ForceWatch
+from capture.acquire.gradient.skin_states import EndOfSkin, ForceWatch
 from capture.acquire.pattern_scan import reading_deg
 from capture.devices.caliper import CaliperBox, MoveReport
 from capture.devices.camera import CameraError, Trigger, open_camera

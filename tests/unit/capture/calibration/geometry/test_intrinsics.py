@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from capture.calibration import geometry, store
-from capture.calibration.geometry import board, bundle, bundle_equations, moved_camera
+from capture.calibration.geometry import board, bundle, bundle_equations
 from capture.calibration.geometry.board import Board, BoardError, Sighting, calibrate_intrinsics
 from capture.calibration.geometry.board_pose import BoardPose
 from capture.calibration.geometry.bundle_equations import LensPrior
@@ -234,15 +234,13 @@ def test_a_camera_that_moved_is_named_and_no_other(rng, culprit):
     before = geometry.nominal_cameras(DOME.subset(views=["C05", "C06", "C07", "C08"]))
     now = {**before, culprit: shifted(before[culprit], np.array([1.5, 0, 0]), [0, 0.004, 0])}
     seen = sightings_of(now, boards_in_view(rng, 6), rng, 0.1)
-    (moved,) = moved_camera.find_moved(seen, BOARD, before)
+    (moved,) = bundle.find_moved(seen, BOARD, before)
     assert moved.name == culprit
     assert moved.shift_mm == pytest.approx(1.5, abs=0.3)
     assert moved.turn_rad == pytest.approx(0.004, abs=0.0005)
     assert culprit in str(moved)
     assert (
-        moved_camera.find_moved(
-            sightings_of(before, boards_in_view(rng, 6), rng, 0.1), BOARD, before
-        )
+        bundle.find_moved(sightings_of(before, boards_in_view(rng, 6), rng, 0.1), BOARD, before)
         == ()
     )
 

@@ -14,7 +14,7 @@ from capture.calibration.led_sphere.glass_ball import (
     light_directions,
     locate_ball,
 )
-from capture.calibration.led_sphere.mirrored_lights import mirror_lights
+from capture.calibration.lights.reflection import mirror_lights
 from capture.rig import load_rig
 
 RIG = load_rig("gradient")

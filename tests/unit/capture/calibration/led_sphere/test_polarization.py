@@ -5,8 +5,8 @@ import pytest
 from scipy.stats import chi2
 
 from capture.calibration.geometry.intrinsics import CameraPose
-from capture.calibration.led_sphere.mirrored_lights import mirror_lights
 from capture.calibration.led_sphere.polarization import fit_films, leakage
+from capture.calibration.lights.reflection import mirror_lights
 from capture.calibration.polarization.malus import PolarizationError
 from capture.calibration.polarization.polarized_reflection import Reflection
 from capture.rig import load_rig

@@ -141,11 +141,7 @@ def lights_and_highlights(rng, sigma_px, *, views=tuple(CAMERAS), count=20):
             good = np.isfinite(pixels).all(axis=1)
             pixels = pixels[good] + sigma_px * rng.standard_normal((good.sum(), 2))
             order = rng.permutation(len(pixels))
-            seen.append(
-                mirror_lights.Highlights(
-                    view, number, tuple(lights), pixels[order], np.ones(len(order))
-                )
-            )
+            seen.append(mirror_lights.Highlights(view, number, tuple(lights), pixels[order]))
     return lights, true, spheres, seen
 
 
@@ -177,7 +173,7 @@ def test_lights_seen_by_one_camera_only_are_flagged_and_keep_their_drawing(rng):
             CAMERAS[shot.view], spheres[shot.sphere], shot.pixels, np.array([lights[name]])
         )[:, 0]
         pixels = shot.pixels if shot.view == "C07" else shot.pixels[miss > 40.0]
-        kept.append(dataclasses.replace(shot, pixels=pixels, flux=np.ones(len(pixels))))
+        kept.append(dataclasses.replace(shot, pixels=pixels))
     found = mirror_lights.locate_lights(kept, CAMERAS, spheres, lights)
     assert not found.valid[0]
     assert found.cameras[0] == 1

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from capture.calibration.geometry.intrinsics import CameraPose
-from capture.calibration.led_sphere.mirrored_lights import mirror_lights
+from capture.calibration.lights.reflection import mirror_lights
 from capture.calibration.polarization import polarized_reflection
 from capture.calibration.polarization.malus import PolarizationError
 from capture.calibration.polarization.polarized_reflection import Reflection, fresnel_amplitudes

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from capture.acquire.frame_stream import FrameStream, compare_clocks
+from capture.acquire.table_run import FrameStream, compare_clocks
 from capture.devices.camera import (
     CameraBusy,
     CameraError,
