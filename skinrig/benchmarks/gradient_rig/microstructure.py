@@ -33,6 +33,7 @@ from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds
 from skinrig.benchmarks.resampling import mean_error
 from skinrig.benchmarks.results import Knobs
 from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.extremes.inputs import sheet_faces
 
 TEXEL_UM = 10.0
 FITTED_STRETCHES = (0.76, 0.82, 0.88, 0.94, 1.06, 1.12, 1.18, 1.25)
@@ -265,10 +266,7 @@ def _rasterized(side: int) -> Callable[[], object]:
     at = np.linspace(0.0, 1.0, n)
     u, v = np.meshgrid(at, at)
     points = 200.0 * np.stack([u, v, 0.2 * np.sin(6.0 * u)], axis=-1).reshape(-1, 3)
-    number = np.arange(n * n).reshape(n, n)
-    a, b = number[:-1, :-1].ravel(), number[:-1, 1:].ravel()
-    c, d = number[1:, :-1].ravel(), number[1:, 1:].ravel()
-    faces = np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])
+    faces = sheet_faces(n)
     uv = np.stack([u, v], axis=-1).reshape(-1, 2)
     moved = points + 4.0 * np.sin(points[:, [1, 2, 0]] / 20.0)
     found = strain(points, moved, faces, uv)
