@@ -96,6 +96,23 @@ def drawn_median(values: ArrayLike, bound: float | None = None, **draws: Any) ->
     return BandError(middle, drawn_again(values, **draws), bound)
 
 
+def drawn_columns_median(
+    values: ArrayLike, bound: float | None = None, *, draws: int = N_BOOTSTRAP_DRAWS
+) -> BandError:
+    """Return the median of errors (draws, n) of which the n columns are independent.
+
+    Examples
+    --------
+    >>> drawn_columns_median([[2.0, 2.0], [2.0, 2.0]]).error_interval
+    (2.0, 2.0)
+    """
+    errors = np.asarray(values)
+    interval = drawn_again(
+        errors.T, lambda again, axis: np.median(again, axis=(axis, 2)), draws=draws
+    )
+    return BandError(float(np.median(errors)), interval, bound)
+
+
 def drawn_rms(squared: ArrayLike, bound: float | None = None, **draws: Any) -> BandError:
     """Return the root of the mean of independent squares with the bootstrap's 68 % interval.
 
@@ -145,9 +162,7 @@ def rms_of_draws(
     return BandError.around(error, error / float(np.sqrt(2 * (freedom or sizes.size))), bound)
 
 
-def tiled_rms(
-    difference: FloatArray, where: BoolArray, *, tile_px: int = TILE_PX, seed: int = 0
-) -> BandError:
+def tiled_rms(difference: FloatArray, where: BoolArray, *, tile_px: int = TILE_PX) -> BandError:
     """Return the root mean square of a picture's errors; the interval is over its tiles.
 
     Neighboring pixels err alike, so that tiles are drawn again, not pixels.
@@ -160,8 +175,6 @@ def tiled_rms(
         (H, W), pixels that count; at least one.
     tile_px
         Side of the tiles.
-    seed
-        Of the bootstrap.
 
     Returns
     -------
@@ -179,7 +192,7 @@ def tiled_rms(
     rows, columns = np.nonzero(where)
     _, which = np.unique(np.stack([rows, columns]) // tile_px, axis=1, return_inverse=True)
     sums, counts = np.bincount(which, squared[where]), np.bincount(which)
-    drawn = np.random.default_rng(seed).integers(len(sums), size=(N_BOOTSTRAP_DRAWS, len(sums)))
+    drawn = np.random.default_rng(0).integers(len(sums), size=(N_BOOTSTRAP_DRAWS, len(sums)))
     roots = np.sqrt(sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1))
     low, high = np.percentile(roots, [16, 84])
     return BandError(float(np.sqrt(squared[where].mean())), (float(low), float(high)))

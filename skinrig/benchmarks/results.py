@@ -109,7 +109,7 @@ class BandError:
         return cls(error, (error - half, error + half), bound)
 
     @classmethod
-    def of_size(cls, size: float, half: float, bound: float | None = None) -> BandError:
+    def of_size(cls, size: float, half: float) -> BandError:
         """Return the same of a size, which is never below 0.
 
         Examples
@@ -117,7 +117,7 @@ class BandError:
         >>> BandError.of_size(2.0, 2.5).error_interval
         (0.0, 4.5)
         """
-        return cls(size, (max(size - half, 0.0), size + half), bound)
+        return cls(size, (max(size - half, 0.0), size + half))
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,18 +23,18 @@ def _samples(value, real: Real, *, points: int = 3, count: int = 40):  # type: i
     )
 
 
+def _fitted_to(value: float, real: Real) -> brdf_basis.BasisWeights:
+    """Return the weights of surface samples that are all of a value."""
+    samples = _samples(lambda light, view: np.full(light.shape[:-1], value), real)
+    return brdf_basis.fit_weights(samples, brdf_tables.default())
+
+
 def _dark_surface(real: Real) -> str:
-    found = brdf_basis.fit_weights(
-        _samples(lambda light, view: np.zeros(light.shape[:-1]), real), brdf_tables.default()
-    )
-    return within(found.weights, 0.0, 0.0, what="weights")
+    return within(_fitted_to(0.0, real).weights, 0.0, 0.0, what="weights")
 
 
 def _negative_surface(real: Real) -> str:
-    found = brdf_basis.fit_weights(
-        _samples(lambda light, view: np.full(light.shape[:-1], -0.01), real), brdf_tables.default()
-    )
-    return within(found.weights, 0.0, 1e-6, what="weights")
+    return within(_fitted_to(-0.01, real).weights, 0.0, 1e-6, what="weights")
 
 
 def _twins(real: Real) -> str:
@@ -69,8 +69,7 @@ def _ill_conditioned(real: Real) -> str:
 
 
 def _no_samples(real: Real) -> str:
-    samples = _samples(lambda light, view: np.full(light.shape[:-1], np.nan), real)
-    found = brdf_basis.fit_weights(samples, brdf_tables.default())
+    found = _fitted_to(np.nan, real)
     within(found.weights, 0.0, 0.0, what="weights")
     return masked(found.valid)
 

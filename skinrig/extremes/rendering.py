@@ -140,14 +140,11 @@ def _grazing(real: Real) -> str:
 
 
 def _roughness_ends(real: Real) -> str:
-    sharp = microfacet.brdf(
-        real(1.0), real(1.0), real(1.0), real(1.0), roughness=0.01, eta=1.4, kind="ggx"
-    )
+    along = [real(1.0)] * 4
+    sharp = microfacet.brdf(*along, roughness=0.01, eta=1.4, kind="ggx")
     # at the peak D = 1 / (pi a^2), G = 1: F0 / (4 pi a^2)
     near(sharp, (0.4 / 2.4) ** 2 / (4 * math.pi * 0.01**2), relative=1e-3)
-    flat = microfacet.brdf(
-        real(1.0), real(1.0), real(1.0), real(1.0), roughness=1.0, eta=1.4, kind="ggx"
-    )
+    flat = microfacet.brdf(*along, roughness=1.0, eta=1.4, kind="ggx")
     # D = 1 / pi everywhere
     return f"peak {float(sharp):.4g}; at 1 " + near(
         flat, (0.4 / 2.4) ** 2 / (4 * math.pi), relative=1e-4

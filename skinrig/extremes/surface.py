@@ -1,5 +1,6 @@
 """Extremes of the surface: normals from light, heights, histograms, albedo, filled textures."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,10 @@ from skinrig.extremes.inputs import Real, ring
 UP_NORMAL = np.array([0.0, 0.0, 1.0])
 
 
+def _upward(side: int) -> Float64Array:
+    return np.broadcast_to(UP_NORMAL, (side, side, 3)).copy()
+
+
 def _degrees_off(normals: FloatArray, truth: FloatArray) -> float:
 
     return float(np.degrees(np.max(angular_error_rad(normals, truth))))
@@ -25,24 +30,19 @@ def _lit(lights: Float64Array, normal: Float64Array, real: Real) -> NDArray[Any]
     return real(np.clip(lights @ normal, 0.0, None)[:, None, None])
 
 
+def _refused_under(lights: Float64Array, real: Real, *words: str) -> str:
+    estimate = partial(stereo.estimate_normals, _lit(lights, UP_NORMAL, real), lights)
+    return refused(estimate, stereo.PhotometricStereoError, *words)
+
+
 def _coplanar(real: Real) -> str:
     lights = np.array([[np.sin(t), 0.0, np.cos(t)] for t in np.linspace(-0.6, 0.6, 9)])
-    return refused(
-        lambda: stereo.estimate_normals(_lit(lights, UP_NORMAL, real), lights),
-        stereo.PhotometricStereoError,
-        "plane",
-        "along (0.0, -1.0, 0.0);",
-    )
+    return _refused_under(lights, real, "plane", "along (0.0, -1.0, 0.0);")
 
 
 def _collinear(real: Real) -> str:
     lights = np.repeat(UP_NORMAL[None], 5, axis=0)
-    return refused(
-        lambda: stereo.estimate_normals(_lit(lights, UP_NORMAL, real), lights),
-        stereo.PhotometricStereoError,
-        "line",
-        "(0.0, -1.0, 0.0) and (-1.0, 0.0, 0.0)",
-    )
+    return _refused_under(lights, real, "line", "(0.0, -1.0, 0.0) and (-1.0, 0.0, 0.0)")
 
 
 def _all_shadowed(real: Real) -> str:
@@ -61,12 +61,8 @@ def _two_lights_left(real: Real) -> str:
 
 
 def _nearly_coplanar(real: Real) -> str:
-    lights = np.array(
-        [
-            [np.sin(t), 1e-3 * (-1.0) ** k, np.cos(t)]
-            for k, t in enumerate(np.linspace(-0.6, 0.6, 9))
-        ]
-    )
+    t, k = np.linspace(-0.6, 0.6, 9), np.arange(9)
+    lights = np.stack([np.sin(t), 1e-3 * (-1.0) ** k, np.cos(t)], axis=-1)
     lights /= np.linalg.norm(lights, axis=-1, keepdims=True)
     rng = np.random.default_rng(2)
     noisy = _lit(lights, UP_NORMAL, real) + real(rng.normal(0, 1e-3, (9, 1, 1)))
@@ -86,9 +82,8 @@ def _nearly_coplanar(real: Real) -> str:
 
 def _grazing(real: Real) -> str:
     lights = ring(12, np.radians(89.9))
-    found = stereo.estimate_normals(
-        _lit(np.vstack([lights, UP_NORMAL]), UP_NORMAL, real), np.vstack([lights, UP_NORMAL])
-    )
+    every = np.vstack([lights, UP_NORMAL])
+    found = stereo.estimate_normals(_lit(every, UP_NORMAL, real), every)
     clean(found.normals, found.valid, what="normals")
     if not np.all(found.valid):
         return masked(found.valid)
@@ -147,8 +142,7 @@ def _cliff(real: Real) -> str:
 
 
 def _horizontal_normals(real: Real) -> str:
-    normals = np.zeros((8, 8, 3))
-    normals[..., 2] = 1.0
+    normals = _upward(8)
     normals[4, 4] = (1.0, 0.0, 0.0)
     try:
         height = normal_integration.integrate(real(normals))
@@ -158,22 +152,16 @@ def _horizontal_normals(real: Real) -> str:
 
 
 def _islands(real: Real) -> str:
-    normals = np.zeros((16, 16, 3))
-    normals[..., 2] = 1.0
     valid = np.zeros((16, 16), bool)
     valid[2:5, 2:5] = valid[10:14, 9:15] = valid[0, 15] = True
-    height = normal_integration.integrate(real(normals), valid=valid)
+    height = normal_integration.integrate(real(_upward(16)), valid=valid)
     return near(height[valid], np.zeros(int(valid.sum())), absolute=1e-4)
 
 
 def _empty_mask(real: Real) -> str:
-    normals = np.zeros((4, 4, 3))
-    normals[..., 2] = 1.0
-    return refused(
-        lambda: normal_integration.integrate(real(normals), valid=np.zeros((4, 4), bool)),
-        normal_integration.IntegrationError,
-        "valid",
-    )
+    normals, nowhere = real(_upward(4)), np.zeros((4, 4), bool)
+    integrate = partial(normal_integration.integrate, normals, valid=nowhere)
+    return refused(integrate, normal_integration.IntegrationError, "valid")
 
 
 def _flat_height(real: Real) -> str:
@@ -214,11 +202,9 @@ def _no_diffuse(real: Real) -> str:
         real(samples), lights[None], views[None], UP_NORMAL[None], eta=1.4
     )
     clean(found.r_d, found.valid, what="R_d")
-    return (
-        within(np.asarray(found.r_d)[np.asarray(found.valid)], -1e-6, 1e-6, what="R_d")
-        if (np.any(found.valid))
-        else masked(found.valid)
-    )
+    if not np.any(found.valid):
+        return masked(found.valid)
+    return within(found.r_d[found.valid], -1e-6, 1e-6, what="R_d")
 
 
 def _nothing_to_fill(real: Real) -> str:

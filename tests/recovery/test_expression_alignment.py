@@ -13,9 +13,9 @@ from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.chromophores import shading_prior
 from reconstruction.correspondence import expression_alignment
 from reconstruction.facial_color import shared_melanin
+from rigsim.subject import make_subject
 from skinrig.benchmarks.flash_rig.alignment import (
     displaced,
-    face_of,
     moved_face,
     oval,
     smooth_displacement,
@@ -27,7 +27,7 @@ SIDE = 256
 
 @pytest.fixture(scope="module")
 def face():
-    return face_of("III", SIDE, seed=11)
+    return make_subject("III", seed=11, size=SIDE)
 
 
 @pytest.fixture(scope="module")

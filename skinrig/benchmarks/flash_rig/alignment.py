@@ -201,16 +201,11 @@ def spread_points(mask: BoolArray, count: int) -> NDArray[np.intp]:
     return places[chosen]
 
 
-def face_of(preset: str, side: int, *, seed: int = 0) -> SimulatedSubject:
-    """Return a simulated face with a texture of so many pixels a side."""
-    return make_subject(preset, seed=seed, size=side)
-
-
 def aligned(stage: Stage) -> None:
     """Align moved faces by landmarks few and many, by features, with and without dense flow."""
     side = 128 if stage.toy else 512
     rng = np.random.default_rng(1)
-    face = face_of("III", side, seed=2)
+    face = make_subject("III", seed=2, size=side)
     away = smooth_displacement(side, bend_px=side / 10, rms_px=side / 50, rng=rng)
     seen = moved_face(face, away, state="exercise", noise=0.005, landmarks=48, rng=rng)
     still = moved_face(face, np.zeros_like(away), state="exercise", noise=0.005, rng=rng)
@@ -243,7 +238,7 @@ def _on_skin(preset: str, side: int) -> BandError:
     """Return the error on skin of a preset: 24 landmarks and dense flow, 1 % of noise."""
     rng = np.random.default_rng(4)
     away = smooth_displacement(side, bend_px=side / 10, rms_px=side / 50, rng=rng)
-    seen = moved_face(face_of(preset, side, seed=2), away, state="exercise", rng=rng)
+    seen = moved_face(make_subject(preset, seed=2, size=side), away, state="exercise", rng=rng)
     return _rms(seen.errors_px(seen.align(24, 2)), side)
 
 
@@ -257,7 +252,7 @@ def misaligned(stage: Stage) -> None:
     that are not perfect, and interpolated maps do not.
     """
     side = 128 if stage.toy else 512
-    face = face_of("III", side, seed=2)
+    face = make_subject("III", seed=2, size=side)
     mask = oval(side)
     neutral = face.hemoglobin().astype(np.float64)
     for state in ("exercise",) if stage.toy else ("exercise", "smile"):

@@ -19,8 +19,9 @@ from reconstruction.chromophores import model_error, shading_prior
 from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.facial_color import shared_melanin
+from rigsim.subject import make_subject
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.flash_rig.alignment import face_of, oval, table
+from skinrig.benchmarks.flash_rig.alignment import oval, table
 from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds
 from skinrig.benchmarks.resampling import median_error
 from skinrig.benchmarks.results import BandError, Knobs
@@ -223,7 +224,7 @@ class _States:
 
     @classmethod
     def of(cls, preset: str, side: int, names: Sequence[str], model: _Model) -> _States:
-        face = face_of(preset, side, seed=3)
+        face = make_subject(preset, seed=3, size=side)
         blood = np.stack([face.hemoglobin(name) for name in names]).astype(np.float64)
         rng = np.random.default_rng(0)
         seen = pictures(model.colors, face.melanin, blood, model.covariance, rng=rng)

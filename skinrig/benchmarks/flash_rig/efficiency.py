@@ -131,7 +131,7 @@ def _chromophores(
     for number, (subject, skin) in enumerate(SUBJECTS.items()):
         truth = skin.melanin, skin.hemoglobin
         color = table.lookup(*truth).reshape(3)
-        slopes = _differences(lambda p: table.lookup(p[0], p[1]).reshape(3), np.array(truth))
+        slopes = differences(lambda p: table.lookup(p[0], p[1]).reshape(3), np.array(truth))
         if shading == "free":
             slopes = np.column_stack([slopes, color])
         relative = slopes / color[:, None]
@@ -217,9 +217,9 @@ def _subsurface(draws: int) -> Iterator[tuple[str, Trial]]:
         truth = np.array([skin.sigma_a_per_mm, skin.sigma_s_per_mm])
         profile = photon_table.reflectance(radius, *truth)
         sigma = FIBER_NOISE * profile + 1e-3 * profile.max() * FIBER_NOISE
-        slopes = _differences(lambda p: photon_table.reflectance(radius, p[0], p[1]), truth)
+        slopes = differences(lambda p: photon_table.reflectance(radius, p[0], p[1]), truth)
         covariance = np.linalg.inv((slopes / sigma[:, None]).T @ (slopes / sigma[:, None]))
-        along = _differences(lambda p: np.atleast_1d(_sigma_tr(p)), truth)[0]
+        along = differences(lambda p: np.atleast_1d(_sigma_tr(p)), truth)[0]
         rng = np.random.default_rng([4, number])
         noisy = profile + sigma * rng.standard_normal((count, 28))
 
@@ -242,7 +242,7 @@ def _sigma_tr(coefficients: Float64Array) -> float:
     return float(np.sqrt(3.0 * sigma_a * (sigma_a + sigma_s)))
 
 
-def _differences(value: Callable[[Float64Array], Float64Array], at: Float64Array) -> Float64Array:
+def differences(value: Callable[[Float64Array], Float64Array], at: Float64Array) -> Float64Array:
     """Return derivatives of a vector by each parameter, by central differences."""
     columns = []
     for k in range(len(at)):

@@ -15,6 +15,7 @@ from reconstruction.facial_color.perfusion_curves import TRANSITION_FALSE_ALARM_
 from reconstruction.facial_color.perfusion_fit import RelaxationFit, fit_cycle
 from rigsim.subject.perfusion_course import PromptedCourse
 from skinrig.arrays import Float64Array
+from skinrig.benchmarks.flash_rig.efficiency import differences
 from skinrig.benchmarks.measurement import processor_seconds
 from skinrig.benchmarks.resampling import rms_of_draws
 from skinrig.benchmarks.results import BandError
@@ -143,11 +144,7 @@ def noise_by_band() -> dict[str, float]:
     for name, band in MELANIN_BANDS.items():
         at = np.array([band.melanin, band.hemoglobin])
         color = table.lookup(*at)
-        step = np.diag(1e-3 * at)
-        slopes = np.stack(
-            [(table.lookup(*(at + d)) - table.lookup(*(at - d))) / (2.0 * d.sum()) for d in step],
-            axis=-1,
-        ).reshape(3, 2)
+        slopes = differences(lambda p: table.lookup(*p).reshape(3), at)
         # shot noise: the variance goes with the light
         information = slopes.T @ (slopes / color.reshape(3, 1))
         found[name] = float(np.sqrt(np.linalg.inv(information)[1, 1]))

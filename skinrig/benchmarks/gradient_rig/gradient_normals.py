@@ -81,11 +81,11 @@ def pixel_geometry(rig: Rig) -> dict[str, Any]:
     return {"points_mm": points, "view": way / np.linalg.norm(way, axis=-1, keepdims=True)}
 
 
-def skin_patch(side: int, *, smooth: bool, seed: int = 5) -> Patch:
+def skin_patch(side: int, *, smooth: bool) -> Patch:
     """Picture a patch of cheek, as it is or smoothed, by all sixteen conditions."""
     rig = load_rig("gradient").cropped(side)
     size_mm = max(0.006 * side + 0.8, 1.2)
-    skin = make_micro_skin("cheek", seed=seed, size_mm=size_mm, preset=MELANIN_PRESET)
+    skin = make_micro_skin("cheek", seed=5, size_mm=size_mm, preset=MELANIN_PRESET)
     if smooth:
         height = gaussian_filter(skin.height_um, RELIEF_BLUR_PX, mode="wrap").astype(np.float32)
         skin = replace(skin, height_um=height)

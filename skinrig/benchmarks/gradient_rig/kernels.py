@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import numba
 import numpy as np
@@ -74,6 +74,14 @@ def numpy_histogram(dx: Float64Array, dy: Float64Array) -> Float64Array:
     return np.asarray(counts / counts.sum())
 
 
+def _histogram(height: Float64Array) -> Float64Array:
+    """Return the histogram of normals of a relief that was stretched."""
+    return normal_histogram.histogram(height, pixel=(PIXEL_UM, PIXEL_UM * STRETCH_RATIO))
+
+
+_fitted = partial(kernel_fit.fit_kernel, stretch=STRETCH_RATIO, axis="x", pixel_um=PIXEL_UM)
+
+
 def _spent(call: Callable[[], object], repeats: int = 1) -> float:
     """Return the least processor time of some calls on one thread, s.
 
@@ -93,25 +101,14 @@ def search(stage: Stage) -> None:
     rng = np.random.default_rng(0)
     side = 64 if stage.toy else 256
     height = relief(side, rng=rng)
-    target = normal_histogram.histogram(
-        strained(height, rng=rng), pixel=(PIXEL_UM, PIXEL_UM * STRETCH_RATIO)
-    )
+    target = _histogram(strained(height, rng=rng))
     alphas, sigmas = (ALPHA_GRID[::50], SIGMAS_UM[::20]) if stage.toy else (ALPHA_GRID, SIGMAS_UM)
 
     def fit(
         way: Literal["hierarchical", "exhaustive"], part: int, first: int, thin: int = 1
     ) -> kernel_outcome.KernelFit:
-        return kernel_fit.fit_kernel(
-            height[:part, :part],
-            target,
-            stretch=STRETCH_RATIO,
-            axis="x",
-            pixel_um=PIXEL_UM,
-            search=way,
-            first_sample=first,
-            alphas=alphas[::thin],
-            sigmas_um=sigmas[::thin],
-        )
+        grid: dict[str, Any] = {"alphas": alphas[::thin], "sigmas_um": sigmas[::thin]}
+        return _fitted(height[:part, :part], target, search=way, first_sample=first, **grid)
 
     best = fit("exhaustive", side, 2)
     whole = _grid_of(height, target)
@@ -148,9 +145,7 @@ def _grid_of(
 def _full_size(rng: np.random.Generator) -> Findings:
     """Measure 2000 x 2000: the default search, and the exhaustive ones by some candidates."""
     height = relief(FULL_SIDE_PX, rng=rng)
-    target = normal_histogram.histogram(
-        strained(height, rng=rng), pixel=(PIXEL_UM, PIXEL_UM * STRETCH_RATIO)
-    )
+    target = _histogram(strained(height, rng=rng))
     few = SIGMAS_UM[[10, 60, 150]]
     whole = _grid_of(height, target, few)
     ours_s = _spent(lambda: kernel_search.exhaustive(whole))
@@ -169,15 +164,9 @@ def _full_size(rng: np.random.Generator) -> Findings:
     for made in ("no kernel", "a kernel"):
         if made == "a kernel":
             moved = neutral_relief.convolved(height, -0.63, 17.5, axis="x", pixel_um=PIXEL_UM)
-            target = normal_histogram.histogram(
-                np.asarray(moved, np.float64), pixel=(PIXEL_UM, PIXEL_UM * STRETCH_RATIO)
-            )
+            target = _histogram(np.asarray(moved, np.float64))
 
-        def run(target: Float64Array = target) -> kernel_outcome.KernelFit:
-            return kernel_fit.fit_kernel(
-                height, target, stretch=STRETCH_RATIO, axis="x", pixel_um=PIXEL_UM
-            )
-
+        run = partial(_fitted, height, target)
         default_s.append(_spent(run, repeats=2 if made == "no kernel" else 1) / LIMIT_CORES)
     found = run()
     return {

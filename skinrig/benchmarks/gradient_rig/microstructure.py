@@ -33,6 +33,7 @@ from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds
 from skinrig.benchmarks.resampling import mean_error
 from skinrig.benchmarks.results import Knobs
 from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.extremes.inputs import sheet_faces
 
 TEXEL_UM = 10.0
 FITTED_STRETCHES = (0.76, 0.82, 0.88, 0.94, 1.06, 1.12, 1.18, 1.25)
@@ -179,17 +180,13 @@ def truth(stage: Stage) -> None:
     stage.limits |= _full_size()
 
 
-def varying_fields(
-    side: int, rows: int, *, first_row: int = 0, mean_px: float = 1.5
-) -> tuple[Float32Array, ...]:
+def varying_fields(side: int, rows: int, *, first_row: int = 0) -> tuple[Float32Array, ...]:
     """Return axes, strengths and sigmas as a face has them: they turn, blur here, sharpen there.
 
     Parameters
     ----------
     side, rows, first_row : int
         Size of the whole map, and the rows that are returned.
-    mean_px : float
-        Mean sigma, px.
 
     Returns
     -------
@@ -201,7 +198,7 @@ def varying_fields(
     angle = 1.3 * np.sin(x) + 0.8 * np.cos(y)
     c, s = np.cos(angle), np.sin(angle)
     alpha = np.clip(1.2 * np.sin(x + 1.0) * np.cos(y), -2.0, 1.0)
-    sigma = mean_px * (1.0 + 0.6 * np.sin(x + y))
+    sigma = 1.5 * (1.0 + 0.6 * np.sin(x + y))
     return tuple(
         np.ascontiguousarray(values, np.float32)
         for values in (
@@ -269,10 +266,7 @@ def _rasterized(side: int) -> Callable[[], object]:
     at = np.linspace(0.0, 1.0, n)
     u, v = np.meshgrid(at, at)
     points = 200.0 * np.stack([u, v, 0.2 * np.sin(6.0 * u)], axis=-1).reshape(-1, 3)
-    number = np.arange(n * n).reshape(n, n)
-    a, b = number[:-1, :-1].ravel(), number[:-1, 1:].ravel()
-    c, d = number[1:, :-1].ravel(), number[1:, 1:].ravel()
-    faces = np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])
+    faces = sheet_faces(n)
     uv = np.stack([u, v], axis=-1).reshape(-1, 2)
     moved = points + 4.0 * np.sin(points[:, [1, 2, 0]] / 20.0)
     found = strain(points, moved, faces, uv)
@@ -332,7 +326,6 @@ def two_passes_error(
     turn: float,
     growth: float,
     sigma_px: float = 3.0,
-    alpha: tuple[float, float] = (0.8, -1.2),
     side: int = 160,
     sampling: Sampling = "cubic",
     rng: np.random.Generator,
@@ -348,8 +341,6 @@ def two_passes_error(
         Turn of the axes, rad, and largest relative change of sigma, over one sigma.
     sigma_px : float
         Sigma in the middle of the map, px.
-    alpha : (float, float)
-        Strengths along s and t.
     side : int
         Pixels a side.
     sampling : {"cubic", "linear"}
@@ -363,6 +354,7 @@ def two_passes_error(
     call : callable
         The convolution, for timing.
     """
+    alpha = (0.8, -1.2)  # strengths along s and t
     margin = round(10.0 * sigma_px)
     whole = side + 2 * margin
     y, x = np.mgrid[:whole, :whole].astype(np.float64) - 0.5 * (whole - 1)

@@ -146,11 +146,8 @@ def by_band(trials: Sequence[Trial], *, level: int, confidence: float) -> list[C
     counted = [trial for trial in trials if trial.deviation.size]
     for quantity in dict.fromkeys(trial.quantity for trial in counted):
         of_it = [trial for trial in counted if trial.quantity == quantity]
-        rows.append(pooled(of_it, level=level, confidence=confidence))
         bands = dict.fromkeys(trial.band for trial in of_it)
-        if len(bands) > 1:
-            rows += [
-                pooled([t for t in of_it if t.band == band], level=level, confidence=confidence)
-                for band in bands
-            ]
+        of_bands = [[trial for trial in of_it if trial.band == band] for band in bands]
+        groups = [of_it, *of_bands] if len(bands) > 1 else [of_it]
+        rows += [pooled(group, level=level, confidence=confidence) for group in groups]
     return rows

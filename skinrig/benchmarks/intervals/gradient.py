@@ -97,8 +97,7 @@ def _kernels(
     known = truth.parameters["states"]
     states = {str(s["name"]): s for s in known} if isinstance(known, list) else {}
     pixel_um = float(str(found.parameters["pixel_um"]))
-    off: dict[str, list[float]] = {"alpha": [], "sigma_um": []}
-    widths: dict[str, list[float]] = {"alpha": [], "sigma_um": []}
+    rows: dict[str, list[tuple[float, float]]] = {"alpha": [], "sigma_um": []}
     for fit in fits:
         gradient = np.asarray(states[str(fit["name"])]["gradient"], np.float64)
         true = kernel_of_skin(
@@ -109,16 +108,12 @@ def _kernels(
             ("sigma_um", "sigma_stderr_um", "sigma_95_um"),
         ):
             error = abs(float(fit[key]) - getattr(true, key))
-            off[key].append(deviation(error, float(fit[half]), float(fit[half_95])))
-            widths[key].append(float(fit[half]))
+            width = float(fit[half])
+            rows[key].append((deviation(error, width, float(fit[half_95])), width))
     for key, unit in (("alpha", ""), ("sigma_um", "um")):
-        yield subject.of_errors(
-            f"{key.removesuffix('_um')} of kernels",
-            np.array(off[key]),
-            np.ones(len(off[key])),
-            unit=unit,
-            widths=np.array(widths[key]),
-        )
+        off, widths = np.array(rows[key], np.float64).reshape(-1, 2).T
+        quantity = f"{key.removesuffix('_um')} of kernels"
+        yield subject.of_errors(quantity, off, np.ones(len(off)), unit=unit, widths=widths)
 
 
 def deviation(error: float, half: float, half_95: float) -> float:

@@ -14,8 +14,7 @@ from capture.rig import load_rig
 from rigsim.as_built.probe import ProbeTolerances, build_probe, unit_images
 from rigsim.sensor import expose, fixed_pattern, sensor_of
 from skinrig.arrays import Float64Array, UInt16Array
-from skinrig.benchmarks.resampling import drawn_again
-from skinrig.benchmarks.results import BandError
+from skinrig.benchmarks.resampling import drawn_columns_median
 from skinrig.benchmarks.stage import Stage
 
 PROBE_SEED = 5
@@ -62,7 +61,7 @@ def fibre_readings(stage: Stage) -> None:
             "exposed_s": round(float(bench.times[chosen].sum()), 1),
             "measured_percent": round(float(100 * valid.mean()), 1),
         }
-        outcome = BandError(float(np.median(miss)), _interval(miss.reshape(len(miss), -1)), least)
+        outcome = drawn_columns_median(miss.reshape(len(miss), -1), least, draws=400)
         stage.add({"exposures": count}, timing, outcome, also)
         away = ((signal - bench.truth) / np.where(valid, stderr, np.inf))[valid]
         relative = (signal / bench.truth - 1).reshape(-1, bench.truth.size)
@@ -163,8 +162,3 @@ def _spread(total: int, count: int) -> list[int]:
     if count == 1:
         return [total - 1]
     return [round(k) for k in np.linspace(0, total - 1, count)]
-
-
-def _interval(sizes: Float64Array) -> tuple[float, float]:
-    """Return a bootstrap interval over fibres of the median of all draws (draws, F), 68 %."""
-    return drawn_again(sizes.T, lambda again, axis: np.median(again, axis=(axis, 2)), draws=400)

@@ -13,7 +13,7 @@ from rigsim.fiber.profile import fibre_profile
 from rigsim.tissue.tissue_mc import Layer, LayerStack
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.benchmarks.measurement import processor_seconds
-from skinrig.benchmarks.resampling import drawn_again, median_error
+from skinrig.benchmarks.resampling import drawn_columns_median, median_error
 from skinrig.benchmarks.results import BandError, Knobs
 from skinrig.benchmarks.stage import Findings, Stage
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, MelaninBand
@@ -95,11 +95,10 @@ def tiers(stage: Stage) -> None:
             own = np.abs(relative[:, -len(MELANIN_BANDS) :].T)
             stage.by_band |= dict(zip(MELANIN_BANDS, map(median_error, own), strict=True))
         error = np.abs(relative[:, spread])
-        outcome = BandError(float(np.median(error)), _over_media(error))
         radius = FIBER_RADII_MM[part]
         knobs: Knobs = {"model": method, "fibres": radius.size}
         knobs |= {"from mm": float(radius[0]), "to mm": float(radius[-1])}
-        stage.add(knobs, timing, outcome)
+        stage.add(knobs, timing, drawn_columns_median(error))
         if part == slice(None):
             bias = np.median(relative[:, spread], axis=0)
             low, high = np.moveaxis(found.interval_per_mm, -1, 0)
@@ -131,11 +130,6 @@ def _tier_limits(
         "inside": share,
         "inside_most": share,
     }
-
-
-def _over_media(error: Float64Array) -> tuple[float, float]:
-    """Return a 68 % interval of the median of errors (draws, media), of other media."""
-    return drawn_again(error.T, lambda again, axis: np.median(again, axis=(axis, 2)))
 
 
 def _least_error(
