@@ -54,7 +54,7 @@ def test_a_profile_under_suction_is_that_of_its_own_blood():
     skin = SkinTissue("II", seed=4)
     profiles = Profiles(RIG, skin, photons=12_000, seed=2, threads=1)
     optics = skin.optics("cheek", 0.0, 10.0)
-    run = profiles._run(optics)
+    run = profiles._traced(optics)
     weighed = run.profile(optics.amount)
     stacks = [
         skin_layers.skin(nm, skin.melanin("cheek"), skin.blood("cheek", 10.0))
