@@ -13,7 +13,7 @@ from rigsim import shading
 from rigsim.arrays import Float32Array
 from rigsim.geometry.atlas import dilate_texture
 from rigsim.light import lateral
-from rigsim.light.interreflection_color import Bounces, InterreflectionColor
+from rigsim.light.interreflection import Bounces, InterreflectionColor
 from rigsim.light.olat import Lamp
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.seen_skin import SeenSkin

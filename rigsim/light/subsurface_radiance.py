@@ -11,7 +11,7 @@ from rigsim.arrays import Float32Array, Float64Array
 from rigsim.as_built.polarizers import Polarizers, absorbing_axis
 from rigsim.geometry.atlas import Atlas
 from rigsim.light import lateral
-from rigsim.light.interreflection_color import Bounces, InterreflectionColor
+from rigsim.light.interreflection import Bounces, InterreflectionColor
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.seen_skin import SeenSkin
 from rigsim.light.surface_brdf import HAIR_REFLECTANCE

@@ -7,7 +7,7 @@ import numpy as np
 
 from capture.rig import Rig, View
 from rigsim.arrays import Float64Array, FloatArray
-from rigsim.light.interreflection_color import WAVELENGTH_STEPS, color_error, step_error
+from rigsim.light.interreflection import WAVELENGTH_STEPS, color_error, step_error
 from rigsim.light.seen_skin import SeenSkin
 from rigsim.needs.effect_sizes import bounced, edge_loss, spread_over_noise
 from rigsim.needs.effects import NEGLIGIBLE_NOISE_RATIO, Effect, Noise, SceneEffects, decide

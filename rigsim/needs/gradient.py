@@ -10,7 +10,7 @@ from capture.rig import Rig
 from rigsim import shading
 from rigsim.arrays import Float64Array, FloatArray
 from rigsim.as_built.sphere import BuiltSphere
-from rigsim.light.relief_interreflection import hidden_share
+from rigsim.light.relief_shadow import hidden_share
 from rigsim.needs import face
 from rigsim.needs.effect_sizes import bounced, edge_loss, steepest_slope
 from rigsim.needs.effects import Effect, EffectSelection, Noise, SceneEffects, decide, left_out_of

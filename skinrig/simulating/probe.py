@@ -19,7 +19,7 @@ from rigsim.fiber.probe_tissue import PHANTOM_BLOCK as BLOCK
 from rigsim.fiber.probe_tissue import TissueError
 from rigsim.population import files as subject_file
 from rigsim.scenes.probe.scene import ProbeScene, Probing
-from rigsim.scenes.probe.truth import appearance as ground_truth
+from rigsim.scenes.probe.scene import appearance as ground_truth
 from skinrig.capturing.plan_choice import directions_of
 from skinrig.simulating import driving
 from skinrig.simulating.exposure_log import SceneLog

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rigsim import shading
-from rigsim.light.relief_interreflection import hidden_share
+from rigsim.light.relief_shadow import hidden_share
 from rigsim.scenes.gradient.reference import NEUTRAL, picture, plain_scene, plain_skin, rendered
 from rigsim.tissue.skin_layers import ETA
 

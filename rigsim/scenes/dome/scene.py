@@ -31,8 +31,7 @@ from rigsim.boxes.led_table import LedPulse
 from rigsim.geometry.atlas import dilate_texture, sample
 from rigsim.kept import Kept, kept
 from rigsim.light import olat, surface_brdf
-from rigsim.light.interreflection import interreflection_for
-from rigsim.light.interreflection_color import Bounces
+from rigsim.light.interreflection import Bounces, interreflection_for
 from rigsim.light.lateral_scattering import LateralScattering
 from rigsim.light.led_light import white_intensity
 from rigsim.light.olat import Hits, Lamp, Looking

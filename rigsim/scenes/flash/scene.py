@@ -23,7 +23,7 @@ from rigsim.as_built.polarizers import Polarizers, draw_polarizers
 from rigsim.boxes.flash import FlashPop
 from rigsim.geometry.mesh import Mesh
 from rigsim.kept import kept
-from rigsim.light.interreflection_color import Bounces
+from rigsim.light.interreflection import Bounces
 from rigsim.light.lateral import line_spread_mm
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.seen_skin import SeenSkin

@@ -15,8 +15,7 @@ from rigsim import shading
 from rigsim.arrays import BoolArray, Float32Array, Float64Array
 from rigsim.as_built.sphere import BuiltSphere
 from rigsim.light.lobe_moments import MomentTable, Surface, build_table, direct_moments
-from rigsim.light.relief_interreflection import hidden_share
-from rigsim.light.relief_shadow import horizon_tangent
+from rigsim.light.relief_shadow import hidden_share, horizon_tangent
 from rigsim.light.shadowed_lights import remove_hidden
 from rigsim.scenes.gradient.patch import PatchSurface
 from rigsim.skin_patch.microrelief import MicroSkin, lateral_kernel

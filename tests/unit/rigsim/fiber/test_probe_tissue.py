@@ -11,7 +11,7 @@ import pytest
 from capture.calibration.fiber.phantom import read_certificate
 from capture.rig import load_rig
 from rigsim.fiber import probe_tissue
-from rigsim.fiber.probe_profile import Profiles, fibres_of
+from rigsim.fiber.probe_profile import Profiles, fibres_of, smooth_profile
 from rigsim.fiber.probe_tissue import (
     PHANTOM_BLOCK,
     FibrousTissue,
@@ -23,7 +23,6 @@ from rigsim.fiber.probe_tissue import (
     phantom_certificate,
 )
 from rigsim.fiber.profile import fibre_profile
-from rigsim.fiber.profile_smoothing import smooth_profile
 from rigsim.tissue import skin_layers
 
 RIG = load_rig("probe")
@@ -55,7 +54,7 @@ def test_a_profile_under_suction_is_that_of_its_own_blood():
     skin = SkinTissue("II", seed=4)
     profiles = Profiles(RIG, skin, photons=12_000, seed=2, threads=1)
     optics = skin.optics("cheek", 0.0, 10.0)
-    run = profiles._run(optics)
+    run = profiles._traced(optics)
     weighed = run.profile(optics.amount)
     stacks = [
         skin_layers.skin(nm, skin.melanin("cheek"), skin.blood("cheek", 10.0))

@@ -9,9 +9,9 @@ import pytest
 from capture.rig import load_rig
 from rigsim.fiber.probe_tissue import HomogeneousTissue, parse_subject
 from rigsim.geometry.mesh import build_mesh
-from rigsim.light.interreflection_color import WAVELENGTH_STEPS, step_error
+from rigsim.light.interreflection import WAVELENGTH_STEPS, step_error
 from rigsim.light.lateral import scatter_laterally
-from rigsim.light.relief_interreflection import hidden_share
+from rigsim.light.relief_shadow import hidden_share
 from rigsim.light.seen_skin import SeenSkin
 from rigsim.needs import effect_sizes
 from rigsim.needs import face as face_needs

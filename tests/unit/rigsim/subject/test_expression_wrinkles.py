@@ -13,6 +13,7 @@ from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.subject import face_regions, relief
 from rigsim.subject.expression_wrinkles import (
     GROOVE_NARROWING,
+    WRINKLE_ZONES,
     WrinkleLines,
     Wrinkles,
     depth_of,
@@ -20,7 +21,6 @@ from rigsim.subject.expression_wrinkles import (
     wrinkle_lines,
 )
 from rigsim.subject.person import SimulatedSubject, make_subject
-from rigsim.subject.wrinkle_zones import WRINKLE_ZONES
 
 SIZE = 320
 PLATE = 256

@@ -16,7 +16,7 @@ from rigsim.fiber.probe_tissue import PHANTOM_BLOCK, HomogeneousTissue
 from rigsim.fiber.profile import Fibres, fibre_profile
 from rigsim.fiber.white_fiber import WhiteFibre, WhiteFibreError
 from rigsim.scenes.probe.scene import ProbeScene, Probing
-from rigsim.scenes.probe.truth import appearance as ground_truth
+from rigsim.scenes.probe.scene import appearance as ground_truth
 from rigsim.tissue.tissue_mc import Layer, LayerStack
 
 RIG = load_rig("probe")
