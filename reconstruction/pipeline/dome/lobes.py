@@ -22,6 +22,7 @@ from reconstruction.scan.mesh import RefinedScan
 from reconstruction.surface import errors as surface_errors
 from reconstruction.surface import estimates
 from reconstruction.surface.estimates import PointValues
+from reconstruction.surface.model_normals import PointLobes
 from reconstruction.surface.texture import SurfaceTexture
 
 BASIS_RANK: Final = 4
@@ -185,10 +186,11 @@ def refine_normals(
     texture: SurfaceTexture,
 ) -> Mapping[str, SkinMap | bytes]:
     """Refine normals and lobe weights in turn, and return them as maps with the basis's file."""
+    lobes = PointLobes(weights, basis)
     started = lumitexels.collect(
         "normals by what lobes leave",
         lambda part, samples: estimates.normals_from_remainder(
-            samples, point_normals[part], point_r_d[part], weights[part], basis
+            samples, point_normals[part], point_r_d[part], lobes[part]
         ),
     )
     known = point_normals.valid & point_r_d.valid
@@ -202,8 +204,8 @@ def refine_normals(
         of_turn = f"{turn + 1} of {N_REFINEMENTS}"
         found = lumitexels.collect(
             f"normals by all light, {of_turn}",
-            lambda part, samples, n=found.values, w=weights: estimates.normals_from_all_light(  # type: ignore[misc]
-                samples, inside[part], point_r_d[part], w[part], basis, now=n[part]
+            lambda part, samples, n=found.values, own=lobes: estimates.normals_from_all_light(  # type: ignore[misc]
+                samples, inside[part], point_r_d[part], own[part], now=n[part]
             ),
         )
         fitted = lumitexels.collect(
@@ -212,7 +214,7 @@ def refine_normals(
                 samples, n[part], point_r_d[part], basis
             ),
         )
-        weights = fitted.values[:, :rank]
+        lobes = PointLobes(fitted.values[:, :rank], basis)
     maps = {
         name: texture.map(
             fitted.values[:, k], fitted.stderr[:, k], fitted.valid, "1", "share of a common mixture"
