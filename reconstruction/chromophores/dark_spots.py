@@ -20,10 +20,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float32Array
 from reconstruction.chromophores.pixel_checks import (
     ChromophoreError,
-    broadcast_variance,
+    broadcast,
     checked_mask,
     usable_colors,
 )
@@ -77,12 +78,13 @@ def is_locally_dark(
     [[9, 9], [9, 10], [10, 9], [10, 10]]
     """
     light = np.asarray(colors)
-    if light.ndim != 3 or light.shape[-1] == 0:
-        raise ChromophoreError(f"colors: expected shape (rows, columns, 3), got {light.shape}")
+    got = f"shape {light.shape}"
+    check = Checks(ChromophoreError)
+    check.require(light.ndim == 3 and light.shape[-1], "colors", got, "(rows, columns, 3)")
     good = usable_colors(light)
     if valid is not None:
         good &= checked_mask(valid, good.shape)
-    whole = None if variance is None else broadcast_variance(variance, light.shape)
+    whole = None if variance is None else broadcast("variance", variance, light.shape)
     log_light = np.full(good.shape, np.nan, dtype=np.float32)
     least = np.full(good.shape, MIN_LOG_CONTRAST, dtype=np.float32)
     for start in range(0, len(good), _BAND_ROWS):  # copies of a whole picture need gigabytes
@@ -119,11 +121,7 @@ def is_lighter_than_face_prior(
     reconstruction.chromophores.ChromophoreError
         When shapes differ.
     """
-    if by_face.melanin.shape != alone.melanin.shape:
-        raise ChromophoreError(
-            f"alone: expected the shape {by_face.melanin.shape} of by_face, got "
-            f"{alone.melanin.shape}"
-        )
+    Checks(ChromophoreError).shape("alone", alone.melanin, by_face.melanin.shape)
     with np.errstate(invalid="ignore"):
         return np.asarray(by_face.melanin - alone.melanin > alone.stderr_melanin)
 
@@ -152,11 +150,8 @@ def average_hypotheses(
         When shapes differ.
     """
     doubtful = np.asarray(where, dtype=np.bool_)
-    if not by_face.melanin.shape == alone.melanin.shape == doubtful.shape:
-        raise ChromophoreError(
-            f"where: expected the estimates' shapes {by_face.melanin.shape} and "
-            f"{alone.melanin.shape} to be its own, got {doubtful.shape}"
-        )
+    for estimate in (by_face, alone):
+        Checks(ChromophoreError).shape("where", doubtful, estimate.melanin.shape)
     mixed = {}
     for name in ("melanin", "hemoglobin"):
         first, second = getattr(by_face, name), getattr(alone, name)

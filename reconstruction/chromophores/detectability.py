@@ -7,6 +7,7 @@ large and drops the others: what is kept is then far too high, with errors that 
 import numpy as np
 from scipy import ndimage
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 
 NEIGHBORHOOD_PX = 15
@@ -40,8 +41,7 @@ def detectable(
     >>> bool(detectable(one, 0.2 * one, one > 0).all())
     True
     """
-    if size_px < 1 or size_px % 2 == 0:
-        raise ValueError(f"size_px: got {size_px}, expected an odd number of 1 or more")
+    Checks().require(size_px >= 1 and size_px % 2, "size_px", size_px, "an odd number, at least 1")
     good = valid & np.isfinite(estimate) & np.isfinite(stderr)
 
     def total(values: FloatArray) -> Float64Array:

@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from model.checks import Checks
 from model.color_table import ColorTable
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.chromophores import dark_spots, shading_prior
@@ -21,7 +22,12 @@ from reconstruction.chromophores import model_error as color_errors
 from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.chromophores.face_distribution import FaceDistribution, fit, with_common_errors
 from reconstruction.chromophores.inversion import without_brightness
-from reconstruction.chromophores.pixel_checks import ChromophoreError, usable_colors
+from reconstruction.chromophores.pixel_checks import (
+    ChromophoreError,
+    broadcast,
+    colors_of,
+    usable_colors,
+)
 from reconstruction.chromophores.posterior import ChromophorePosterior
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION, evaluate
@@ -96,8 +102,7 @@ def fit_face_distribution(
     >>> bool(abs(np.exp(found.mean) - 0.05) < 0.003), bool(0.1 < found.spread < 0.2)
     (True, True)
     """
-    if not (math.isfinite(common_light) and common_light > 0.0):
-        raise ChromophoreError(f"common_light: expected above 0, got {common_light}")
+    Checks(ChromophoreError).within("common_light", common_light, "(0, inf)")
     colors, noise, errors = _sampled(rgb, variance, model_error, valid)
     if len(colors) < MIN_FACE_PIXELS:
         return None
@@ -111,44 +116,27 @@ def fit_face_distribution(
     weights, mean = _weights(noise / np.square(colors), errors)
     melanin_ends = math.log(table.c_m_max * MIN_AXIS_FRACTION**3), math.log(table.c_m_max)
     low, high = np.quantile(np.log(alone.melanin[alone.valid]), [0.01, 0.99])
-    low, high = (
-        max(low - LOG_MELANIN_MARGIN, melanin_ends[0]),
-        min(high + LOG_MELANIN_MARGIN, melanin_ends[1]),
-    )
+    low = max(low - LOG_MELANIN_MARGIN, melanin_ends[0])
+    high = min(high + LOG_MELANIN_MARGIN, melanin_ends[1])
     rows = max(math.ceil((high - low) / LOG_MELANIN_STEP), 2)
     log_melanin = low + (np.arange(rows) + 0.5) * (high - low) / rows
-    blood = (
-        MIN_AXIS_FRACTION
-        + (np.arange(N_BLOOD_NODES) + 0.5) * (1.0 - MIN_AXIS_FRACTION) / N_BLOOD_NODES
-    )
+    blood = (np.arange(N_BLOOD_NODES) + 0.5) * (1.0 - MIN_AXIS_FRACTION) / N_BLOOD_NODES
+    blood += MIN_AXIS_FRACTION
     axis = np.cbrt(np.exp(log_melanin) / table.c_m_max)
     plane = np.log(evaluate(table, *np.meshgrid(axis, blood, indexing="ij"))[0])
+
+    places = log_melanin, blood.reshape(-1, _N_BLOOD_NODES_SUMMED).mean(axis=1)
+    ends = melanin_ends, (MIN_AXIS_FRACTION, 1.0)
+    cost = -2.0 * np.log(prior.density)
 
     def fitted(
         light: float, color: Float64Array, begin: FaceDistribution | None = None
     ) -> FaceDistribution:
-
-        shape = (len(colors), rows, N_BLOOD_NODES // _N_BLOOD_NODES_SUMMED)
-        probability = np.zeros(shape, dtype=np.float32)
-        kernels.plane_probability(
-            np.log(colors) + color,
-            weights,
-            mean,
-            plane,
-            -2.0 * np.log(prior.density),
-            prior.low + light,
-            prior.step,
-            _N_BLOOD_NODES_SUMMED,
-            probability,
-        )
-        return fit(
-            probability,
-            log_melanin,
-            blood.reshape(-1, _N_BLOOD_NODES_SUMMED).mean(axis=1),
-            melanin_ends=melanin_ends,
-            blood_ends=(MIN_AXIS_FRACTION, 1.0),
-            begin=begin,
-        )
+        probability = np.zeros((len(colors), rows, places[1].size), dtype=np.float32)
+        seen = np.log(colors) + color, weights, mean, plane
+        by_light = cost, prior.low + light, prior.step
+        kernels.plane_probability(*seen, *by_light, _N_BLOOD_NODES_SUMMED, probability)
+        return fit(probability, places, ends, begin=begin)
 
     still = np.zeros(3)
     usual = fitted(0.0, still)
@@ -239,27 +227,20 @@ def _sampled(
     valid: ArrayLike | None,
 ) -> tuple[Float32Array, Float64Array, Float64Array]:
     """Return colors (n, 3), noise (n, 3) and model errors (n, 3, 3) or (3, 3) of some pixels."""
-    colors = np.asarray(rgb, dtype=np.float32)
-    if colors.ndim == 0 or colors.shape[-1] != 3:
-        raise ChromophoreError(f"rgb: expected shape (..., 3), got {colors.shape}")
+    colors = colors_of(rgb)
     good = usable_colors(colors)
     if valid is not None:
         good &= np.asarray(valid, dtype=np.bool_)
     places = np.flatnonzero(good)
-    places = places[
-        np.linspace(0, places.size, min(N_SAMPLE_PIXELS, places.size), False).astype(np.intp)
-    ]
+    count = min(N_SAMPLE_PIXELS, places.size)
+    places = places[np.linspace(0, places.size, count, False).astype(np.intp)]
     chosen = colors.reshape(-1, 3)[places]
-    if variance is None:
-        noise = np.square(0.01 * chosen.astype(np.float64))
-    else:
-        whole = np.broadcast_to(np.asarray(variance), colors.shape)
+    noise = np.square(0.01 * chosen.astype(np.float64))
+    if variance is not None:
+        whole = broadcast("variance", variance, colors.shape)
         noise = whole.reshape(-1, 3)[places].astype(np.float64)
     errors = np.zeros((3, 3)) if model_error is None else np.asarray(model_error, np.float64)
-    if errors.shape not in ((3, 3), (*colors.shape, 3)):
-        raise ChromophoreError(
-            f"model_error: expected shape (3, 3) or {(*colors.shape, 3)}, got {errors.shape}"
-        )
+    Checks(ChromophoreError).shape("model_error", errors, (3, 3), (*colors.shape, 3))
     return chosen, noise, errors if errors.ndim == 2 else errors.reshape(-1, 3, 3)[places]
 
 
@@ -277,13 +258,7 @@ def _independent(covariance: ArrayLike | None) -> list[Float64Array]:
     """Return vectors whose outer products sum up to a covariance."""
     if covariance is None:
         return []
-    given = np.asarray(covariance, dtype=np.float64)
-    if given.shape != (3, 3) or not np.isfinite(given).all():
-        raise ChromophoreError(f"common_color: expected (3, 3) finite numbers, got {given!r}")
+    given = Checks(ChromophoreError).numbers("common_color", covariance, (3, 3))
     variances, axes = np.linalg.eigh(given)
-    largest = max(float(variances[-1]), 0.0)
-    return [
-        np.asarray(math.sqrt(variances[k]) * axes[:, k])
-        for k in range(3)
-        if variances[k] > 1e-3 * largest
-    ]
+    known = np.flatnonzero(variances > 1e-3 * max(float(variances[-1]), 0.0))
+    return [np.asarray(math.sqrt(variances[k]) * axes[:, k]) for k in known]

@@ -18,13 +18,13 @@ at all, for all skin that lives has some: any is then as probable.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from operator import attrgetter
 from typing import Final
 
 import numpy as np
 from scipy.optimize import minimize
 from scipy.special import ndtr
 
+from model.checks import FINITE, Checks
 from reconstruction.arrays import Float32Array, Float64Array, FloatArray
 
 MIN_CONTAMINATION: Final = 0.01
@@ -64,18 +64,9 @@ class ContaminatedNormal:
 
     def __post_init__(self) -> None:
         """Refuse what is no distribution."""
-        numbers = (self.mean, self.spread, self.unexpected, self.low, self.high, self.stderr)
-        if not (
-            all(map(math.isfinite, numbers))
-            and self.spread > 0.0
-            and 0.0 < self.unexpected <= 1.0
-            and self.low < self.high
-            and self.stderr >= 0.0
-        ):
-            raise ValueError(
-                "expected finite numbers, spread above 0, unexpected above 0 and up to 1, low "
-                f"below high, stderr not negative, got {self}"
-            )
+        check = Checks()
+        check.settings(self, mean=FINITE, spread="(0, inf)", unexpected="(0, 1]", low=FINITE)
+        check.settings(self, high=f"({self.low}, inf)", stderr="[0, inf)")
 
     @property
     def width(self) -> float:
@@ -124,14 +115,12 @@ class FaceDistribution:
     """Of the cube root of the volume fraction in the dermis, as a part of the table's end."""
 
 
+Places = tuple[Float64Array, Float64Array]
+Ends = tuple[tuple[float, float], tuple[float, float]]
+
+
 def fit(
-    probability: FloatArray,
-    log_melanin: Float64Array,
-    blood: Float64Array,
-    *,
-    melanin_ends: tuple[float, float],
-    blood_ends: tuple[float, float],
-    begin: FaceDistribution | None = None,
+    probability: FloatArray, places: Places, ends: Ends, *, begin: FaceDistribution | None = None
 ) -> FaceDistribution:
     """Return the distribution under which the colors of many pixels are the most probable.
 
@@ -139,9 +128,9 @@ def fit(
     ----------
     probability
         (pixels, m, b): of each pixel's color, over log melanin and blood's cube root; to any scale.
-    log_melanin, blood
-        (m,) and (b,): places, equally spaced.
-    melanin_ends, blood_ends
+    places
+        (m,) of log melanin and (b,) of blood, equally spaced.
+    ends
         All that there may be of either; the places need not reach as far.
     begin
         A distribution near by, if one is known.
@@ -163,32 +152,22 @@ def fit(
     >>> seen = rng.normal(-3.0, 0.2, (2000, 1, 1)) + 0.3 * rng.standard_normal((2000, 1, 1))
     >>> of_melanin = np.exp(-0.5 * ((melanin[:, None] - seen) / 0.3) ** 2)
     >>> of_blood = np.exp(-0.5 * ((blood - 0.4) / 0.1) ** 2)
-    >>> found = fit(of_melanin * of_blood, melanin, blood, melanin_ends=(-9.0, -0.7),
-    ...             blood_ends=(0.04, 1.0)).melanin
+    >>> ends = (-9.0, -0.7), (0.04, 1.0)
+    >>> found = fit(of_melanin * of_blood, (melanin, blood), ends).melanin
     >>> bool(abs(found.mean + 3.0) < 0.03), bool(abs(found.spread - 0.2) < 0.03)
     (True, True)
     """
-    shape = (log_melanin.size, blood.size)
-    if probability.ndim != 3 or probability.shape[1:] != shape or not len(probability):
-        raise ValueError(f"probability: expected shape (pixels, *{shape}), got {probability.shape}")
+    Checks().shape("probability", probability, ("pixels", places[0].size, places[1].size))
     flat = probability.reshape(len(probability), -1)
     total = flat.sum(axis=1, dtype=np.float64)
-    if not (np.isfinite(total).all() and (total > 0.0).all()):
-        raise ValueError("probability: expected finite positive sums of each pixel")
-    search = _Search(
-        (flat / total[:, None]).astype(np.float32), (log_melanin, blood), (melanin_ends, blood_ends)
-    )
+    Checks().within("sum of each pixel's probability", total, "(0, inf)")
+    search = _Search((flat / total[:, None]).astype(np.float32), places, ends)
     bells = search.start() if begin is None else (begin.melanin, begin.blood)
     start = [(bell.mean, math.log(bell.spread), math.log(bell.unexpected)) for bell in bells]
-    bounds = [
-        bound
-        for k in range(2)
-        for bound in (
-            (float(search.places[k][0]), float(search.places[k][-1])),
-            (math.log(MIN_SIGMAS[k]), math.log(MAX_SIGMAS[k])),
-            (math.log(MIN_CONTAMINATION), math.log(MAX_CONTAMINATION)),
-        )
-    ]
+    parts = math.log(MIN_CONTAMINATION), math.log(MAX_CONTAMINATION)
+    bounds = []
+    for at, least, most in zip(places, MIN_SIGMAS, MAX_SIGMAS, strict=True):
+        bounds += [(at[0], at[-1]), (math.log(least), math.log(most)), parts]
     low, high = np.array(bounds).T / _SEARCH_SCALE
     found = minimize(
         search.misfit,
@@ -210,12 +189,7 @@ class _Search:
     Of six unknowns over `_SEARCH_SCALE`: means, logs of spreads and of parts.
     """
 
-    def __init__(
-        self,
-        share: Float32Array,
-        places: tuple[Float64Array, Float64Array],
-        ends: tuple[tuple[float, float], tuple[float, float]],
-    ) -> None:
+    def __init__(self, share: Float32Array, places: Places, ends: Ends) -> None:
         self.share, self.places, self.ends = share, places, ends
         self.shape = places[0].size, places[1].size
         self.edges = [
@@ -282,19 +256,16 @@ def with_common_errors(
     >>> round(known.melanin.stderr, 6), known.blood.stderr
     (0.5, 0.0)
     """
-    errors = [
-        math.sqrt(
-            sum(
-                _moves_by(pick(usual), pick(minus).mean, pick(plus).mean) ** 2
-                for minus, plus in moved
-            )
-        )
-        for pick in (attrgetter("melanin"), attrgetter("blood"))
-    ]
-    blood = replace(usual.blood, stderr=errors[1])
+
+    def with_error(name: str) -> ContaminatedNormal:
+        own = getattr(usual, name)
+        means = [(getattr(minus, name).mean, getattr(plus, name).mean) for minus, plus in moved]
+        return replace(own, stderr=math.sqrt(sum(_moves_by(own, *pair) ** 2 for pair in means)))
+
+    blood = with_error("blood")
     if blood.mean - blood.low < END_DISTANCE:
         blood = replace(blood, unexpected=1.0)
-    return FaceDistribution(replace(usual.melanin, stderr=errors[0]), blood)
+    return FaceDistribution(with_error("melanin"), blood)
 
 
 def _moves_by(usual: ContaminatedNormal, minus: float, plus: float) -> float:

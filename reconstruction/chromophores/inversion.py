@@ -11,13 +11,15 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from model.checks import Checks
 from model.color_table import ColorTable
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import inversion_kernels as kernels
 from reconstruction.chromophores.pixel_checks import (
     ChromophoreError,
-    broadcast_variance,
+    broadcast,
     checked_mask,
+    colors_of,
 )
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION, Start, evaluate, start_for
 
@@ -139,9 +141,7 @@ def invert(
     >>> [f"{value:.3f}" for value in maps.shading[0]]
     ['0.800', '0.800']
     """
-    colors = np.asarray(rgb, dtype=np.float32)
-    if colors.ndim == 0 or colors.shape[-1] != 3:
-        raise ChromophoreError(f"rgb: expected shape (..., 3), got {colors.shape}")
+    colors = colors_of(rgb)
     shape = colors.shape[:-1]
     free, known = _shading(shading, shape)
     pixels = int(np.prod(shape, dtype=np.int64))
@@ -150,8 +150,8 @@ def invert(
     covariance = model_covariance(model_error, variance is None)
     covariance = without_brightness(covariance) if free else covariance
     start = start_for(table, free)
-    if shading_max is not None and not shading_max > 0.0:
-        raise ChromophoreError(f"shading_max: expected a positive factor, got {shading_max}")
+    brightest = np.inf if shading_max is None else shading_max
+    Checks(ChromophoreError).within("shading_max", brightest, "(0, inf]")
     kernels.fit_pixels(
         np.ascontiguousarray(colors).reshape(-1, 3),
         _variance(variance, shape),
@@ -164,15 +164,15 @@ def invert(
         np.ascontiguousarray(start.projection, dtype=np.float32),
         start.axes,
         start.twin_log,
-        np.float32(np.inf if shading_max is None else np.log(shading_max)),
+        np.float32(np.log(brightest)),
         np.float32(start.side),
         np.float32(limit),
         maps,
         masks,
         _TASK_PIXELS,
     )
-    named = {name: maps[k].reshape(shape) for k, name in enumerate(kernels.INVERSION_MAPS)}
-    flags = {name: masks[k].reshape(shape) for k, name in enumerate(kernels.INVERSION_MASKS)}
+    named = dict(zip(kernels.INVERSION_MAPS, maps.reshape(len(maps), *shape), strict=True))
+    flags = dict(zip(kernels.INVERSION_MASKS, masks.reshape(len(masks), *shape), strict=True))
     return ChromophoreMaps(**named, **flags)
 
 
@@ -240,8 +240,7 @@ def identifiability(
     >>> bool(bounds.stderr_melanin[darker] < 0.1), bool(bounds.hemoglobin_identifiable[darker])
     (True, False)
     """
-    if size < 2:
-        raise ChromophoreError(f"size: expected at least 2 points, got {size}")
+    Checks(ChromophoreError).require(size >= 2, "size", size, "at least 2 points")
     level = shading if isinstance(shading, int | float) else 1.0
     fraction = np.linspace(MIN_AXIS_FRACTION, 1.0, size)
     a, b = np.meshgrid(fraction, fraction, indexing="ij")
@@ -282,20 +281,15 @@ def model_covariance(model_error: ArrayLike | None, default_noise: bool) -> Floa
         Whether the 1 percent that stands for an unknown variance is added.
     """
     error = np.zeros(3) if model_error is None else np.asarray(model_error, dtype=np.float64)
-    if not np.isfinite(error).all():
-        raise ChromophoreError("model_error: expected finite numbers")
-    if error.shape in ((), (3,)):
-        if (error < 0.0).any():
-            raise ChromophoreError(f"model_error: expected no negative standard error, got {error}")
+    check = Checks(ChromophoreError)
+    check.numbers("model_error", error, (), (3,), (3, 3))
+    covariance = error
+    if error.ndim < 2:
+        check.within("model_error", error, "[0, inf)")
         covariance = np.diag(np.broadcast_to(error, (3,)) ** 2)
-    elif error.shape == (3, 3):
-        if not np.allclose(error, error.T) or np.linalg.eigvalsh(error).min() < -1e-12:
-            raise ChromophoreError("model_error: expected a symmetric covariance without negatives")
-        covariance = error.copy()
-    else:
-        raise ChromophoreError(
-            f"model_error: expected a number, shape (3,) or (3, 3), got {error.shape}"
-        )
+    least = np.linalg.eigvalsh(covariance).min()
+    good = np.allclose(covariance, covariance.T) and least >= -1e-12
+    check.require(good, "model_error", covariance, "a symmetric covariance without negatives")
     # Single precision of the colors themselves keeps the weights finite.
     floor = DEFAULT_RELATIVE_NOISE**2 if default_noise else 1e-12
     return np.asarray(covariance + floor * np.eye(3))
@@ -323,9 +317,8 @@ def _weights(
     weights = np.linalg.inv(total)
     if free:
         row = weights.sum(axis=-1)
-        weights = (
-            weights - row[..., :, None] * row[..., None, :] / row.sum(axis=-1)[..., None, None]
-        )
+        common = row[..., :, None] * row[..., None, :] / row.sum(axis=-1)[..., None, None]
+        weights = weights - common
     return np.asarray(weights)
 
 
@@ -340,20 +333,13 @@ def _second_solution(start: Start, color: Float64Array, gradient: Float64Array) 
 
 
 def _shading(shading: Shading, shape: tuple[int, ...]) -> tuple[bool, Float32Array]:
-    if shading is None:
-        return True, np.ones(1, dtype=np.float32)
     if isinstance(shading, str):
-        if shading != "known":
-            raise ChromophoreError(f'shading: expected None, "known" or an array, got {shading!r}')
-        return False, np.ones(1, dtype=np.float32)
+        Checks(ChromophoreError).choice("shading", shading, ("known", "None", "an array"))
+    if shading is None or isinstance(shading, str):
+        return shading is None, np.ones(1, dtype=np.float32)
     known = np.asarray(shading, dtype=np.float32)
     if known.ndim:
-        try:
-            known = np.broadcast_to(known, shape)
-        except ValueError:
-            raise ChromophoreError(
-                f"shading: expected shape {shape} or a number, got {known.shape}"
-            ) from None
+        known = broadcast("shading", known, shape)
     return False, np.ascontiguousarray(known).reshape(-1)
 
 
@@ -361,7 +347,7 @@ def _variance(variance: ArrayLike | None, shape: tuple[int, ...]) -> Float32Arra
     """Return the variance of each pixel (n, 3), or of all (1, 3)."""
     values = np.zeros(3) if variance is None else np.asarray(variance)
     if values.shape != (3,):
-        values = broadcast_variance(values, (*shape, 3))
+        values = broadcast("variance", values, (*shape, 3))
     return np.ascontiguousarray(values, np.float32).reshape(-1, 3)
 
 

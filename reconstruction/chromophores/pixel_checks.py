@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reconstruction.arrays import BoolArray, FloatArray
+from model.checks import Checks
+from reconstruction.arrays import BoolArray, Float32Array, FloatArray
 
 
 class ChromophoreError(ValueError):
@@ -19,19 +20,30 @@ def usable_colors(colors: FloatArray) -> BoolArray:
 def checked_mask(valid: ArrayLike, shape: tuple[int, ...]) -> BoolArray:
     """Return a mask of bool of a shape, or raise `ChromophoreError`."""
     given = np.asarray(valid)
-    if given.dtype != np.bool_ or given.shape != shape:
-        raise ChromophoreError(
-            f"valid: expected bool of shape {shape}, got {given.dtype} of {given.shape}"
-        )
+    Checks(ChromophoreError).mask("valid", given, shape)
     return given
 
 
-def broadcast_variance(variance: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    """Return a variance broadcast to the shape of the colors, or raise `ChromophoreError`."""
-    values = np.asarray(variance)
+def broadcast(name: str, given: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    """Return what goes along with pixels broadcast to a shape, or raise `ChromophoreError`."""
+    values = np.asarray(given)
     try:
         return np.broadcast_to(values, shape)
     except ValueError as error:
-        raise ChromophoreError(
-            f"variance: expected a shape that broadcasts to {shape}, got {values.shape}"
-        ) from error
+        expected = f"a number or a shape that broadcasts to {shape}"
+        raise ChromophoreError(f"{name}: got {values.shape}, expected {expected}") from error
+
+
+def colors_of(rgb: ArrayLike, *leading: str) -> Float32Array:
+    """Return colors as float32, or raise `ChromophoreError` for a shape other than (..., 3).
+
+    Parameters
+    ----------
+    rgb
+        Colors of pixels.
+    leading
+        Names of the axes before the channels; any by default.
+    """
+    colors = np.asarray(rgb, dtype=np.float32)
+    Checks(ChromophoreError).shape("rgb", colors, (*(leading or ("...",)), 3))
+    return colors

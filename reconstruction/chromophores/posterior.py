@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from model.checks import Checks
 from model.color_table import ColorTable
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import posterior_kernels as ridge
@@ -155,7 +156,7 @@ def estimate(
         maps,
         _TASK_PIXELS,
     )
-    named = {name: maps[k].reshape(shape) for k, name in enumerate(ridge.POSTERIOR_MAPS)}
+    named = dict(zip(ridge.POSTERIOR_MAPS, maps.reshape(len(maps), *shape), strict=True))
     # the rough fit knew the usual model error alone: of a picture with much else than skin it is
     # far too large
     outside = fitted.outside | (
@@ -196,18 +197,16 @@ def _covariances(
         usual = model_covariance(model_error, default_noise)
         covariances = without_brightness(usual + MIN_RELATIVE_NOISE**2 * np.eye(3))[None]
         return model_error, covariances[(..., *_UPPER_TRIANGLE)]
-    if each.shape != (*shape, 3, 3):
-        raise ChromophoreError(
-            f"model_error: expected shape {(*shape, 3, 3)} for the pixels, got {each.shape}"
-        )
+    check = Checks(ChromophoreError)
+    check.shape("model_error", each, (*shape, 3, 3))
     each = each.reshape(-1, 3, 3)
     floor = (DEFAULT_RELATIVE_NOISE**2 if default_noise else 1e-12) + MIN_RELATIVE_NOISE**2
     triangles = np.empty((len(each), 6))
     for start in range(0, len(each), _BAND_PIXELS):  # copies of a whole picture need gigabytes
         band = each[start : start + _BAND_PIXELS]
         diagonal = np.einsum("nii->ni", band)
-        if not (np.isfinite(band).all() and (diagonal >= 0.0).all()):
-            raise ChromophoreError("model_error: expected finite covariances without negatives")
+        check.within("model_error", band)
+        check.within("diagonal of model_error", diagonal, "[0, inf)")
         brightness = diagonal.mean(axis=1) + floor + 1e-6
         part = band[(slice(None), *_UPPER_TRIANGLE)] + brightness[:, None]
         part[:, [0, 3, 5]] += floor

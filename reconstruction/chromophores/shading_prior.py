@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from model.checks import Checks
 from reconstruction.arrays import Float64Array
 from reconstruction.chromophores import model_error
 
@@ -50,13 +51,10 @@ class ShadingPrior:
 
     def __post_init__(self) -> None:
         """Refuse what is no density."""
-        density = np.asarray(self.density, dtype=np.float64)
-        if density.ndim != 1 or density.size < 2:
-            raise ShadingPriorError(f"density: expected shape (n,), n >= 2, got {density.shape}")
-        if not (np.isfinite(density).all() and (density > 0.0).all()):
-            raise ShadingPriorError("density: expected finite positive numbers")
-        if not (math.isfinite(self.low) and 0.0 < self.step < math.inf):
-            raise ShadingPriorError(f"low, step: got {self.low}, {self.step}")
+        check, size = Checks(ShadingPriorError), max(np.size(self.density), 2)
+        density = check.numbers("density", self.density, (size,), interval="(0, inf)")
+        check.within("low", self.low)
+        check.within("step", self.step, "(0, inf)")
         density = density / (density.sum() * self.step)
         density.setflags(write=False)
         object.__setattr__(self, "density", density)
@@ -85,8 +83,7 @@ class ShadingPrior:
         >>> round(prior.spread, 3)
         0.5
         """
-        if not 0.0 < spread < 2.0:
-            raise ShadingPriorError(f"spread: got {spread}, expected above 0 and below 2")
+        Checks(ShadingPriorError).within("spread", spread, "(0, 2)")
         reach = np.arange(-math.ceil(4 * spread / self.step), math.ceil(4 * spread / self.step) + 1)
         kernel = np.exp(-0.5 * (reach * self.step / spread) ** 2)
         wide = np.convolve(self.density, kernel / kernel.sum())
@@ -103,8 +100,7 @@ def lognormal(center: float, spread: float) -> ShadingPrior:
     >>> round(lognormal(0.7, 0.6).mean, 3) == round(float(np.log(0.7)), 3)
     True
     """
-    if not (center > 0.0 and spread > 0.0):
-        raise ShadingPriorError(f"center, spread: got {center}, {spread}, expected positive")
+    Checks(ShadingPriorError).within("center, spread", (center, spread), "(0, inf]")
     step = spread / 12.0
     reach = np.arange(-96, 97)  # 8 spreads
     return ShadingPrior(
@@ -126,15 +122,13 @@ def from_samples(
     softness
         Spread of log shading that is added, 0.05 or more: the nodes stand that far apart.
     """
-    if not _LOG_STEP <= softness < 2.0:
-        raise ShadingPriorError(f"softness: got {softness}, expected {_LOG_STEP} up to 2")
-    heights = np.asarray(counts, dtype=np.float64)
-    if heights.ndim != 1 or (heights < 0.0).any() or not heights.sum() > 0.0:
-        raise ShadingPriorError("counts: expected a list of numbers, not negative, not all zero")
+    check = Checks(ShadingPriorError)
+    check.within("softness", softness, f"[{_LOG_STEP}, 2)")
+    heights = check.numbers("counts", counts, ("n",), interval="[0, inf]")
+    check.within("sum of counts", heights.sum(), "(0, inf]")
     places = low + step * (np.arange(heights.size) + 0.5)
     nodes = np.arange(_LOG_LOW, _LOG_HIGH + 0.5 * _LOG_STEP, _LOG_STEP)
-    if places[0] < _LOG_LOW + 1.0 or places[-1] > _LOG_HIGH - 1.0:
-        raise ShadingPriorError(f"bins: got {places[0]:.2f} to {places[-1]:.2f}, expected -7 to 4")
+    check.within("bins", places, f"[{_LOG_LOW + 1.0}, {_LOG_HIGH - 1.0}]")
     share = heights / heights.sum()
     density = (share * _normal(nodes[:, None] - places, softness)).sum(axis=1)
     mean = float((share * places).sum())

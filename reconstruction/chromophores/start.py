@@ -153,13 +153,9 @@ def _polish(
         j_a, j_b = (by_a / rgb) @ projection.T, (by_b / rgb) @ projection.T
         det = j_a[:, 0] * j_b[:, 1] - j_a[:, 1] * j_b[:, 0]
         det = np.where(np.abs(det) > 1e-9, det, 1e-9)
-        step = np.stack(
-            [
-                (miss[:, 0] * j_b[:, 1] - miss[:, 1] * j_b[:, 0]) / det,
-                (j_a[:, 0] * miss[:, 1] - j_a[:, 1] * miss[:, 0]) / det,
-            ],
-            axis=-1,
-        )
+        step_a = (miss[:, 0] * j_b[:, 1] - miss[:, 1] * j_b[:, 0]) / det
+        step_b = (j_a[:, 0] * miss[:, 1] - j_a[:, 1] * miss[:, 0]) / det
+        step = np.stack([step_a, step_b], axis=-1)
         reach = 2.0 / _SAMPLES_PER_AXIS
         axes = np.clip(best + np.clip(step, -reach, reach), MIN_AXIS_FRACTION, 1.0)
     return best

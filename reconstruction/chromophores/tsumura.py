@@ -11,6 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from model import color_table, spectra
+from model.checks import Checks
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 
@@ -76,23 +77,18 @@ def tsumura_ica(rgb: FloatArray, valid: BoolArray) -> PigmentMaps:
     from sklearn.decomposition import FastICA
 
     image = np.asarray(rgb, np.float64)
-    if image.ndim != 3 or image.shape[2] != 3 or valid.shape != image.shape[:2]:
-        raise ValueError(
-            f"rgb, valid: got shapes {image.shape} and {valid.shape}, expected (H, W, 3) and (H, W)"
-        )
+    Checks().shape("rgb", image, (*valid.shape[:2], 3))
     good = valid & np.isfinite(image).all(axis=-1) & (image > 0).all(axis=-1)
     count = int(np.count_nonzero(good))
-    if count < MIN_SAMPLES:
-        raise UnmixingError(f"valid: got {count} usable pixels, expected at least {MIN_SAMPLES}")
+    check = Checks(UnmixingError)
+    check.within("number of usable pixels", count, f"[{MIN_SAMPLES}, inf)")
     density = -np.log(image[good])
     chroma = density @ _CHROMA_BASIS.T  # (N, 2)
     center = chroma.mean(axis=0)
-    spread = np.linalg.svd(
-        (chroma - center)[:: max(1, count // MAX_SAMPLES)], compute_uv=False, full_matrices=False
-    )
-    if not spread[1] > 1e-6 * max(spread[0], 1e-12):
-        raise UnmixingError("rgb: the colors vary in brightness or along one direction only")
     samples = chroma[:: max(1, count // MAX_SAMPLES)]
+    spread = np.linalg.svd(samples - center, compute_uv=False, full_matrices=False)
+    several = spread[1] > 1e-6 * max(spread[0], 1e-12)
+    check.require(several, "rgb", "colors along one direction", "some that vary beside brightness")
     with threadpool_limits(1):
         unmix = FastICA(2, whiten="unit-variance", random_state=0, max_iter=1000, tol=1e-3)
         unmix.fit(samples)

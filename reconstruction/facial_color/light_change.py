@@ -54,29 +54,23 @@ def smooth(
 
     def around(values: Float64Array, reach_px: float) -> Float64Array:
         stack = values.reshape(-1, *shape)
-        return np.stack([gaussian_filter(v, reach_px, mode="constant") for v in stack]).reshape(
-            values.shape
-        )
+        smoothed = gaussian_filter(stack, reach_px, mode="constant", axes=(1, 2))
+        return np.asarray(smoothed.reshape(values.shape))
 
     total = np.maximum(around(weight, window_px), 1e-9)
     smooth = around(weight * change, window_px) / total
-    smooth_variance = around(weight, window_px / math.sqrt(2.0)) / (
-        4.0 * math.pi * window_px**2 * total**2
-    )
+    area = 4.0 * math.pi * window_px**2
+    smooth_variance = around(weight, window_px / math.sqrt(2.0)) / (area * total**2)
     rest = weight * (np.square(change - smooth) - scatter)
     wide = 3.0 * window_px
     squares = np.maximum(around(weight**2, wide), 1e-9)
     excess = around(weight * rest, wide) / squares
     # by chance alone it is 0 within this
-    chance = np.sqrt(2.0 * around(weight**2, wide / math.sqrt(2.0)) / (4.0 * math.pi)) / (
-        wide * squares
-    )
+    chance = np.sqrt(2.0 * around(weight**2, wide / math.sqrt(2.0)) / (4.0 * math.pi))
+    chance /= wide * squares
     # a wrinkle's shadow is narrower than that: a pixel that is clearly off is off by so much
     apart = np.square(change - smooth)
     alone = np.where(apart > OUTLIER_SIGMAS**2 * scatter, apart, 0.0)
-    loose = (
-        np.maximum(np.maximum(excess, alone), 0.0) + chance + smooth_variance + MIN_LIGHT_CHANGE**2
-    )
-    return smooth.astype(np.float32), (1.0 / np.minimum(loose, MAX_LIGHT_CHANGE**2)).astype(
-        np.float32
-    )
+    loose = np.maximum(np.maximum(excess, alone), 0.0) + chance + smooth_variance
+    stiffness = 1.0 / np.minimum(loose + MIN_LIGHT_CHANGE**2, MAX_LIGHT_CHANGE**2)
+    return smooth.astype(np.float32), stiffness.astype(np.float32)

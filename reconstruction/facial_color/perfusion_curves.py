@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float64Array, Int64Array
 
 FACE_PLACES = ("forehead", "cheek", "nose", "chin", "temple")
@@ -97,10 +98,8 @@ def disc_means(
     [[12.0]]
     """
     values = np.asarray(maps, np.float64)
-    if values.ndim != 3:
-        raise CurveError(f"maps: got shape {values.shape}, expected (N, H, W)")
-    if not (np.isfinite(radius_px) and radius_px > 0):
-        raise CurveError(f"radius_px: got {radius_px}, expected px > 0")
+    Checks(CurveError).require(values.ndim == 3, "maps", f"shape {values.shape}", "(N, H, W)")
+    Checks(CurveError).within("radius_px", radius_px, "(0, inf)")
     good = np.isfinite(values)
     if valid is not None:
         good &= _like(valid, values, "valid").astype(bool)
@@ -140,12 +139,12 @@ def disc_pixels(
     """
     height, width = shape
     x, y = place
-    if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
-        raise CurveError(f"{name}: got ({x:g}, {y:g}) px, expected within {width} x {height} px")
+    inside = -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5
+    expected = f"within {width} x {height} px"
+    Checks(CurveError).require(inside, name, f"({x:g}, {y:g}) px", expected)
     rows, columns = np.indices((height, width))
     squared = (columns - x) ** 2 + (rows - y) ** 2
-    inside = squared <= max(radius_px**2, float(squared.min()))
-    found_rows, found_columns = np.nonzero(inside)
+    found_rows, found_columns = np.nonzero(squared <= max(radius_px**2, float(squared.min())))
     return found_rows, found_columns
 
 
@@ -168,11 +167,9 @@ def usual_places(skin: ArrayLike) -> dict[str, tuple[float, float]]:
         When there is no skin, or no picture.
     """
     shown = np.asarray(skin, bool)
-    if shown.ndim != 2:
-        raise CurveError(f"skin: got shape {shown.shape}, expected (H, W)")
+    Checks(CurveError).require(shown.ndim == 2, "skin", f"shape {shown.shape}", "(H, W)")
     rows, columns = np.nonzero(shown)
-    if rows.size == 0:
-        raise CurveError("skin: got none, expected a face")
+    Checks(CurveError).require(rows.size != 0, "skin", "none", "a face")
     left, right = np.percentile(columns, (2, 98))
     top, bottom = np.percentile(rows, (2, 98))
     return {
@@ -308,8 +305,7 @@ def transition(
     of them together below ``false_alarm`` (Sidak). A shot at one of the levels is an alarm only if
     it seems off it, so the rate is kept whichever level each shot has.
     """
-    if not 0 < false_alarm < 1:
-        raise CurveError(f"false_alarm: got {false_alarm}, expected 0 to 1")
+    Checks(CurveError).within("false_alarm", false_alarm, "(0, 1)")
     phase = np.asarray(phase_s, np.float64) % cycle_s
     value = np.asarray(values, np.float64)
     middle = 0.5 * cycle_s
@@ -317,10 +313,8 @@ def transition(
         _between(phase, value, 0.5 * middle, middle),
         _between(phase, value, 0.5 * (middle + cycle_s), cycle_s),
     ]
-    if min(part.size for part in settled) < 3:
-        raise CurveError(
-            "phases: got fewer than 3 shots late in a state, expected more to know its level"
-        )
+    few, enough = "fewer than 3 shots late in a state", all(part.size >= 3 for part in settled)
+    Checks(CurveError).require(enough, "phases", few, "more to know its level")
     steps = np.concatenate([np.diff(value[part]) for part in settled])
     noise2 = float((steps**2).mean() / 2)
     own2 = np.full(value.size, noise2)
@@ -346,11 +340,9 @@ def transition(
     half = 0.5 * (means[upper] + means[lower])
     noise = float(np.sqrt(usual2))
     least, most = (float(end[0]) for end in window(np.array([usual2])))
-    inside = 0.0
+    inside = float(most > least)
     if noise > 0:
         inside = float(stats.norm.cdf(most, half, noise) - stats.norm.cdf(least, half, noise))
-    elif most > least:
-        inside = 1.0
     return Transition(
         seen=bool(hit.size),
         where=hit,
@@ -372,6 +364,5 @@ def _between(phase: Float64Array, value: Float64Array, begin: float, end: float)
 
 def _like(part: ArrayLike, values: Float64Array, name: str) -> NDArray[np.generic]:
     array = np.asarray(part)
-    if array.shape != values.shape:
-        raise CurveError(f"{name}: got shape {array.shape}, expected {values.shape}")
+    Checks(CurveError).shape(name, array, values.shape)
     return array

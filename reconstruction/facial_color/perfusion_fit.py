@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
+from model.checks import Checks
 from reconstruction.arrays import Float64Array
 from reconstruction.facial_color.perfusion_curves import CurveError
-from reconstruction.facial_color.perfusion_likelihood import ProfileLikelihood, Shape
+from reconstruction.facial_color.perfusion_likelihood import ProfileLikelihood, Search
 from reconstruction.facial_color.perfusion_samples import PoseStep, Samples
 
 Known = Literal["estimated", "only below", "only above", "unknown"]
@@ -142,11 +143,10 @@ def fit_cycle(
     """
     middle = 0.5 * cycle_s if change_s is None else change_s
     phase = np.asarray(phase_s, np.float64)
-    _check_bend(bend)
-    if not (0.0 < middle < cycle_s < np.inf):
-        raise CurveError(
-            f"cycle_s, change_s: got {cycle_s}, {middle} s, expected 0 < change_s < cycle_s"
-        )
+    check = Checks(CurveError)
+    check.within("bend", bend, "[0, 1)")
+    check.within("cycle_s", cycle_s, "(0, inf)")
+    check.within("change_s", middle, f"(0, {cycle_s})")
     data = Samples.of(phase, values, stderr, pose)
     phase = np.where(np.isfinite(phase), phase, 0.0)  # of weight 0, but a number
 
@@ -170,7 +170,7 @@ def fit_cycle(
         between = data.moves_between(phase % cycle_s, middle, longest)
         delays = np.linspace(*between, _POSE_DELAY_NODES)
     changes = np.concatenate([phase % cycle_s, (phase - middle) % cycle_s])
-    return _fit_bent(data, straight, delays, constants, changes, bend)
+    return _fit_bent(data, Search(straight, delays, constants, changes), bend)
 
 
 def fit_course(time_s: ArrayLike, values: ArrayLike, *, bend: float = 0.0) -> RelaxationFit:
@@ -197,7 +197,7 @@ def fit_course(time_s: ArrayLike, values: ArrayLike, *, bend: float = 0.0) -> Re
     CurveError
         For fewer than 5 samples after the event, a shape that does not fit, or a bend outside.
     """
-    _check_bend(bend)
+    Checks(CurveError).within("bend", bend, "[0, 1)")
     time = np.asarray(time_s, np.float64)
     after = (time >= 0) & np.isfinite(time)
     time = time[after]
@@ -210,31 +210,19 @@ def fit_course(time_s: ArrayLike, values: ArrayLike, *, bend: float = 0.0) -> Re
     span = float(np.ptp(time))
     spacing = span / max(1, time.size - 1)
     constants = np.geomspace(spacing / 50, 50 * span, _GRID_NODES)
-    return _fit_bent(data, course, np.zeros(1), constants, np.zeros(0), bend)
+    return _fit_bent(data, Search(course, np.zeros(1), constants, np.zeros(0)), bend)
 
 
-def _check_bend(bend: float) -> None:
-    if not 0.0 <= bend < 1.0:
-        raise CurveError(f"bend: got {bend}, expected 0 to 1, 1 not among them")
-
-
-def _fit_bent(
-    data: Samples,
-    curve: Shape,
-    delays: Float64Array,
-    constants: Float64Array,
-    at: Float64Array,
-    bend: float,
-) -> RelaxationFit:
+def _fit_bent(data: Samples, search: Search, bend: float) -> RelaxationFit:
     """Return a fit whose time constant is as uncertain as what may have bent the values."""
 
     def fit(amount: float) -> RelaxationFit:
         def shape(delay: Float64Array, constant: Float64Array) -> Float64Array:
             """Return the shape as it shows where values are bent over their change."""
-            part = curve(delay, constant)
+            part = search.curve(delay, constant)
             return np.asarray(part + amount * part * (1.0 - part)) if amount else part
 
-        return _fit(data, shape, delays, constants, at)
+        return _fit(data, replace(search, curve=shape))
 
     straight, *bent = (fit(amount) for amount in ((0.0, -bend, bend) if bend else (0.0,)))
     if not bent or straight.known == "unknown":
@@ -299,27 +287,20 @@ def of_vessels(fit: RelaxationFit) -> RelaxationFit:
     )
 
 
-def _fit(
-    given: Samples, curve: Shape, delays: Float64Array, constants: Float64Array, at: Float64Array
-) -> RelaxationFit:
+def _fit(given: Samples, search: Search) -> RelaxationFit:
     data = given.with_free_step()
     for _ in range(1 + data.stepped):
-        fit = _fit_once(data, curve, delays, constants, at)
+        fit = _fit_once(data, search)
         # how much a step is held by its prior depends on the noise, which a free step leaves
         data = given.with_prior(np.square(fit.noise))
     return fit
 
 
-def _fit_once(
-    data: Samples, curve: Shape, delays: Float64Array, constants: Float64Array, at: Float64Array
-) -> RelaxationFit:
-    landscape = ProfileLikelihood.of(data, curve, delays, constants, at)
+def _fit_once(data: Samples, search: Search) -> RelaxationFit:
+    landscape = ProfileLikelihood.of(data, search)
+    curve, delays = search.curve, search.delays
     delay, constant, noise2 = landscape.delay_s, landscape.time_constant_s, landscape.noise2
-    interval, inner = (
-        (low if low is not None else 0.0, high if high is not None else np.inf)
-        for low, high in map(landscape.constant_interval, (BOUND_LEVEL, ONE_SIGMA_LEVEL))
-    )
-
+    interval, inner = map(landscape.constant_interval, (BOUND_LEVEL, ONE_SIGMA_LEVEL))
     delay_interval, stderr_delay = (0.0, 0.0), 0.0
     if delays.size > 1:
         delay_interval = landscape.delay_interval(BOUND_LEVEL)
@@ -363,9 +344,7 @@ def _fit_once(
         step=step,
         stderr_step=errors[3],
         time_constant_s=constant,
-        stderr_time_constant_s=(
-            0.5 * (inner[1] - inner[0]) if known == "estimated" else float("nan")
-        ),
+        stderr_time_constant_s=0.5 * (inner[1] - inner[0]) if known == "estimated" else np.nan,
         interval_s=interval,
         interval_68_s=inner,
         known=known,

@@ -19,7 +19,7 @@ from scipy import optimize, stats
 from reconstruction.arrays import Float64Array
 from reconstruction.facial_color.perfusion_samples import Samples
 
-Ends = tuple[float | None, float | None]
+Ends = tuple[float, float]
 Shape = Callable[[Float64Array, Float64Array], Float64Array]
 """Delays and constants of shape (..., 1) to the part of the way, (..., N)."""
 
@@ -29,16 +29,26 @@ _MIN_DELAY_STEPS = 3.0
 """Constants below so many steps of the delay need delays between them."""
 
 
+@dataclass(frozen=True, slots=True)
+class Search:
+    """What is tried for a curve."""
+
+    curve: Shape
+    """Part of the way that blood has gone."""
+    delays: Float64Array
+    """(D,): delays that are tried with each constant, s, ascending; one where none is fitted."""
+    constants: Float64Array
+    """(C,): time constants that are tried, s, ascending; their logarithms in equal steps."""
+    at: Float64Array
+    """(M,): how long after a prompt samples are, s; () where there are no prompts."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ProfileLikelihood:
     """Square sums of curves over their noise, at delays and time constants."""
 
     data: Samples
-    curve: Shape
-    delays: Float64Array
-    """(D,): delays that are tried with each constant, s; one where none is fitted."""
-    constants: Float64Array
-    """(C,): time constants that are tried, s."""
+    search: Search
     total: Float64Array
     """(C, D or more): square sums of the best levels; beyond D are delays of each constant's
     own."""
@@ -56,39 +66,29 @@ class ProfileLikelihood:
     """Weighted square sum over the degrees of freedom by the given standard errors; NaN without."""
 
     @staticmethod
-    def of(
-        data: Samples, curve: Shape, delays: Float64Array, constants: Float64Array, at: Float64Array
-    ) -> ProfileLikelihood:
+    def of(data: Samples, search: Search) -> ProfileLikelihood:
         """Look at all delays and constants, and refine the best.
 
         Parameters
         ----------
         data
             Samples of P curves.
-        curve
-            Part of the way that blood has gone.
-        delays, constants : ndarray, shape (D,), (C,)
-            What is tried, s, ascending; logarithms of the constants in equal steps.
-        at : ndarray, shape (M,)
-            How long after a prompt samples are, s; () where there are no prompts.
+        search
+            What is tried.
         """
+        delays, constants = search.delays, search.constants
 
         def residuals(delay: Float64Array, constant: Float64Array) -> Float64Array:
             """(..., P) square sums for delays and constants that broadcast to (...)."""
-            return data.residual(curve(delay[..., None], constant[..., None]))
+            return data.residual(search.curve(delay[..., None], constant[..., None]))
 
         # by constant: the common delays, and where those are too coarse some that put a sample on a
         # slope
-        quick = (
-            constants < _MIN_DELAY_STEPS * (delays[1] - delays[0])
-            if delays.size > 1
-            else constants < 0.0
-        )
-        near = np.array([_near(at, constant, delays) for constant in constants[quick]])
-        by_curve = np.full(
-            (constants.size, delays.size + (near.shape[1] if quick.any() else 0), len(data.values)),
-            np.inf,
-        )
+        least = _MIN_DELAY_STEPS * (delays[1] - delays[0]) if delays.size > 1 else 0.0
+        quick = constants < least
+        near = np.array([_near(search.at, constant, delays) for constant in constants[quick]])
+        tried = delays.size + (near.shape[1] if quick.any() else 0)
+        by_curve = np.full((constants.size, tried, len(data.values)), np.inf)
         # one constant after the other: all at once would take hundreds of megabytes
         for row, constant in enumerate(constants):
             by_curve[row, : delays.size] = residuals(delays, np.full(delays.size, constant))
@@ -110,49 +110,37 @@ class ProfileLikelihood:
             sums = residuals(np.array([delay]), np.exp(np.array([log_constant])))
             return float((sums[0] / noise2).sum())
 
-        common = best[1] < delays.size
-        begin = (
-            delays[best[1]] if common else near[int(quick[: best[0]].sum()), best[1] - delays.size]
-        )
+        begin = np.append(delays, near[int(quick[: best[0]].sum())] if quick[best[0]] else [])
+        begin = begin[best[1]]
         start = np.array([begin, np.log(constants[best[0]])])
         found = _refined(landscape, start, delays, np.log(constants), float(total[best]))
         delay, constant, least = float(found[0]), float(np.exp(found[1])), found[2]
         nu = float(freedom.sum())
-        usual = data.variance
-        chi2 = (
-            float((by_curve[best] / usual).sum() / nu) if np.isfinite(usual).all() else float("nan")
-        )
+        known = np.isfinite(data.variance).all()
         return ProfileLikelihood(
-            data=data,
-            curve=curve,
-            delays=delays,
-            constants=constants,
+            data,
+            search,
             total=total,
             noise2=noise2,
             freedom=nu,
             delay_s=delay,
             time_constant_s=constant,
             least=min(least, float(total.min())),
-            chi2=chi2,
+            chi2=float((by_curve[best] / data.variance).sum() / nu) if known else float("nan"),
         )
 
     def constant_interval(self, level: float) -> Ends:
-        """Return the ends of the time constant's interval of a confidence, s; None: there is none.
+        """Return the ends of the time constant's interval of a confidence, s; 0, inf: none.
 
         Parameters
         ----------
         level
             Confidence, in (0, 1).
         """
-        logs = np.log(self.constants)
+        logs, best = np.log(self.search.constants), float(np.log(self.time_constant_s))
         profile = self.total.min(axis=1) - self.least
-        low, high = _crossings(
-            logs, profile, float(np.log(self.time_constant_s)), self._excess(level)
-        )
-        return (
-            float(np.exp(low)) if low is not None else None,
-            float(np.exp(high)) if high is not None else None,
-        )
+        low, high = _crossings(logs, profile, best, self._excess(level))
+        return float(np.exp(low)), float(np.exp(high))
 
     def delay_interval(self, level: float) -> tuple[float, float]:
         """Return the ends of the delay's interval of a confidence, s, within what is tried.
@@ -162,11 +150,9 @@ class ProfileLikelihood:
         level
             Confidence, in (0, 1).
         """
-        low, high = _crossings(self.delays, self._along(), self.delay_s, self._excess(level))
-        return (
-            low if low is not None else float(self.delays[0]),
-            high if high is not None else float(self.delays[-1]),
-        )
+        delays = self.search.delays
+        low, high = _crossings(delays, self._along(), self.delay_s, self._excess(level))
+        return max(low, float(delays[0])), min(high, float(delays[-1]))
 
     def delay_weights(self) -> Float64Array:
         """Return the probability of each delay, (D,), all alike before; with its best constant."""
@@ -175,8 +161,8 @@ class ProfileLikelihood:
 
     def constant_at_delays(self) -> Float64Array:
         """Return the best time constant for each delay, (D,), s."""
-        best = np.argmin(self.total[:, : self.delays.size], axis=0)
-        return np.asarray(self.constants[best])
+        best = np.argmin(self.total[:, : self.search.delays.size], axis=0)
+        return np.asarray(self.search.constants[best])
 
     def level_errors(
         self, gap: Float64Array, *, with_constant: bool, with_delay: bool
@@ -200,7 +186,8 @@ class ProfileLikelihood:
         delay, constant = self.delay_s, self.time_constant_s
 
         def at(d: float, c: float) -> Float64Array:
-            return np.asarray(self.curve(np.array([[d]]), np.array([[c]]))[0], np.float64)
+            shape = self.search.curve(np.array([[d]]), np.array([[c]]))
+            return np.asarray(shape[0], np.float64)
 
         base = at(delay, constant)
         slopes = []
@@ -238,7 +225,7 @@ class ProfileLikelihood:
 
     def _along(self) -> Float64Array:
         """Return the excess of the square sum over its least, by delay, (D,)."""
-        least = self.total[:, : self.delays.size].min(axis=0)
+        least = self.total[:, : self.search.delays.size].min(axis=0)
         return np.asarray(least - self.least)
 
     def _excess(self, level: float) -> float:
@@ -262,20 +249,20 @@ def _refined(
     at_start: float,
 ) -> tuple[float, float, float]:
     """Return delay, logarithm of the constant, and height of the lowest point near the start."""
-    step = float(logs[1] - logs[0])
+
+    def around(grid: Float64Array, at: float) -> tuple[float, float]:
+        step = float(grid[1] - grid[0])
+        return max(grid[0], at - step), min(grid[-1], at + step)
+
     if delays.size == 1:
         found = optimize.minimize_scalar(
             lambda log: landscape(float(delays[0]), log),
-            bounds=(max(logs[0], start[1] - step), min(logs[-1], start[1] + step)),
+            bounds=around(logs, start[1]),
             method="bounded",
         )
         point, height = (float(delays[0]), float(found.x)), float(found.fun)
     else:
-        width = float(delays[1] - delays[0])
-        bounds = [
-            (max(delays[0], start[0] - width), min(delays[-1], start[0] + width)),
-            (max(logs[0], start[1] - step), min(logs[-1], start[1] + step)),
-        ]
+        bounds = [around(delays, start[0]), around(logs, start[1])]
         simplex = optimize.minimize(
             lambda v: landscape(v[0], v[1]),
             start,
@@ -289,17 +276,15 @@ def _refined(
     return float(start[0]), float(start[1]), at_start
 
 
-def _crossings(
-    grid: Float64Array, profile: Float64Array, best: float, excess: float
-) -> tuple[float | None, float | None]:
-    """Return where a profile first rises by ``excess`` on both sides of its best; None: nowhere."""
-    ends: list[float | None] = []
+def _crossings(grid: Float64Array, profile: Float64Array, best: float, excess: float) -> Ends:
+    """Return where a profile first rises by ``excess`` on both sides of its best; inf: nowhere."""
+    ends: list[float] = []
     for sign in (-1, 1):
         side = grid[sign * (grid - best) > 0][::sign]
         height = profile[sign * (grid - best) > 0][::sign]
         above = np.flatnonzero(height > excess)
         if above.size == 0:
-            ends.append(None)
+            ends.append(sign * np.inf)
             continue
         k = int(above[0])
         inner, level = (best, 0.0) if k == 0 else (float(side[k - 1]), float(height[k - 1]))

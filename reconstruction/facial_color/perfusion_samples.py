@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.facial_color.perfusion_curves import CurveError
 
@@ -64,17 +65,16 @@ class Samples:
             For fewer than 5 samples of a curve, or a shape that does not fit.
         """
         shown = np.atleast_2d(np.asarray(values, np.float64))
-        if shown.ndim != 2 or at.shape != shown.shape[1:]:
-            raise CurveError(f"values: got shape {shown.shape}, expected (P, {at.size})")
+        check = Checks(CurveError)
+        check.shape("values", shown, (len(shown), at.size))
         good = np.isfinite(shown) & np.isfinite(at)
         variance = np.full(shown.shape, np.nan)
         if stderr is not None:
             variance = np.square(np.atleast_2d(np.asarray(stderr, np.float64)))
-            if variance.shape != shown.shape:
-                raise CurveError(f"stderr: got shape {variance.shape}, expected {shown.shape}")
+            check.shape("stderr", variance, shown.shape)
             good &= np.isfinite(variance) & (variance > 0)
-        if at.size < 5 or (good.sum(axis=1) < 5).any():
-            raise CurveError(f"values: got {int(good.sum(axis=1).min())} usable, expected >= 5")
+        usable = int(good.sum(axis=1).min(initial=at.size))
+        check.require(usable >= 5, "values", f"{usable} usable", ">= 5")
         inverse = np.where(good, 1.0 if stderr is None else 1.0 / variance, 0.0)
         count = good.sum(axis=1, keepdims=True)
         scale = count / inverse.sum(axis=1, keepdims=True)
@@ -174,12 +174,8 @@ def _steps(pose: PoseStep | None, good: BoolArray) -> tuple[Float64Array, Float6
         return np.zeros(samples), np.zeros(curves)
     moved = np.asarray(pose.moved, bool)
     stderr = np.atleast_1d(np.asarray(pose.stderr, np.float64))
-    if moved.shape != (samples,) or stderr.shape != (curves,):
-        raise CurveError(
-            f"pose: got shapes {moved.shape} and {stderr.shape}, expected ({samples},) samples "
-            f"that have moved or not and ({curves},) standard errors"
-        )
-    if not (np.isfinite(stderr) & (stderr >= 0)).all():
-        raise CurveError(f"pose: got standard errors {stderr.tolist()}, expected finite, >= 0")
+    check = Checks(CurveError)
+    check.shape("pose, samples that have moved", moved, (samples,))
+    check.numbers("pose, standard errors", stderr, (curves,), interval="[0, inf)")
     both = (good & moved).any(axis=1) & (good & ~moved).any(axis=1)
     return moved.astype(np.float64), np.where(both, stderr, 0.0)

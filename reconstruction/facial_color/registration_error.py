@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.chromophores import model_error
 from reconstruction.correspondence.expression_alignment import Alignment
@@ -78,8 +79,8 @@ def registration_covariance(
     >>> float(registration_covariance(skin, 0.0 * skin, np.ones((40, 40), bool), still).max())
     0.0
     """
-    if light_window_px is not None and not 0.0 < light_window_px < np.inf:
-        raise ValueError(f"light_window_px: got {light_window_px}, expected above 0, or None")
+    if light_window_px is not None:
+        Checks().within("light_window_px", light_window_px, "(0, inf)")
     good = model_error.usable_pixels(rgb, valid, variance)
     safe = np.where(good[..., None], rgb, 1.0).astype(np.float64)
     noise = np.where(good[..., None], variance / safe**2, 0.0)

@@ -9,6 +9,7 @@ darker, and how bright a pixel is is left open by those who take chromophores fr
 import numpy as np
 from scipy.stats import chi2
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float32Array, FloatArray
 
 _MAX_MEDIAN_PIXELS = 200_000
@@ -51,14 +52,11 @@ def average(
     >>> bool(abs(mean.mean() - 0.5) < 1e-3), bool(abs(variance.mean() / 2.5e-5 - 1.0) < 0.1)
     (True, True)
     """
-    if rgb.ndim != 4 or rgb.shape[-1] != 3 or variance.shape != rgb.shape:
-        raise ValueError(
-            f"rgb, variance: expected shape (R, H, W, 3), got {rgb.shape} and {variance.shape}"
-        )
-    if valid.shape != rgb.shape[:-1] or valid.dtype != np.bool_:
-        raise ValueError(
-            f"valid: expected bool of {rgb.shape[:-1]}, got {valid.dtype} of {valid.shape}"
-        )
+    check = Checks()
+    good = rgb.ndim == 4 and rgb.shape[-1] == 3
+    check.require(good, "rgb", f"shape {rgb.shape}", "(R, H, W, 3)")
+    check.shape("variance", variance, rgb.shape)
+    check.mask("valid", valid, rgb.shape[:-1])
     kept = valid[..., None]
     count = valid.sum(axis=0)
     many = np.maximum(count, 1)[..., None]

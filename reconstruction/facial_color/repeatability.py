@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float64Array
 
 SCATTER_FALSE_ALARM_RATE = 0.01
@@ -185,8 +186,9 @@ def compare(
     (True, False)
     """
     captured = _Captures.of(maps, states, stderr, valid)
-    if len(captured.states) == len(captured.groups):
-        raise RepeatabilityError("states: got each once, expected at least one that is repeated")
+    repeated = len(captured.states) > len(captured.groups)
+    expected = "at least one that is repeated"
+    Checks(RepeatabilityError).require(repeated, "states", "each once", expected)
     chosen, left_out, limit = captured.regions(regions, correlated_px, false_alarm)
     found = tuple(_compared(region, captured.groups, reference, limit) for region in chosen)
     return Repeatability(captured.states, found, false_alarm, left_out)
@@ -235,9 +237,7 @@ def drift(
     """
     captured = _Captures.of(maps, states, stderr, valid)
     names, groups = captured.states, captured.groups
-    times = np.asarray(times_s, np.float64)
-    if times.shape != (len(names),) or not np.isfinite(times).all():
-        raise RepeatabilityError(f"times_s: got shape {times.shape}, expected ({len(names)},)")
+    times = Checks(RepeatabilityError).numbers("times_s", times_s, (len(names),))
     degrees = len(names) - len(groups) - 1
     apart = captured.within_states(times / 60.0)
     square = float((apart**2).sum())
@@ -288,18 +288,14 @@ class _Captures:
         maps: ArrayLike, states: Sequence[str], stderr: ArrayLike, valid: ArrayLike | None
     ) -> _Captures:
         values, error = np.asarray(maps, np.float64), np.asarray(stderr, np.float64)
-        if values.ndim != 3:
-            raise RepeatabilityError(f"maps: got shape {values.shape}, expected (N, H, W)")
-        if error.shape != values.shape:
-            raise RepeatabilityError(f"stderr: got shape {error.shape}, expected {values.shape}")
-        if len(states) != len(values):
-            raise RepeatabilityError(f"states: got {len(states)}, expected {len(values)}")
+        check = Checks(RepeatabilityError)
+        check.require(values.ndim == 3, "maps", f"shape {values.shape}", "(N, H, W)")
+        check.shape("stderr", error, values.shape)
+        check.shape("states", states, (len(values),))
         good = np.ones(values.shape, bool) if valid is None else np.asarray(valid, bool)
-        if good.shape != values.shape:
-            raise RepeatabilityError(f"valid: got shape {good.shape}, expected {values.shape}")
+        check.shape("valid", good, values.shape)
         known = np.asarray((good & np.isfinite(values) & np.isfinite(error)).all(axis=0))
-        if (error[:, known] < 0).any():
-            raise RepeatabilityError("stderr: got a negative one, expected 0 or above")
+        check.within("stderr", error[:, known], "[0, inf)")
         groups = {
             state: np.flatnonzero([other == state for other in states])
             for state in dict.fromkeys(states)
@@ -317,18 +313,14 @@ class _Captures:
         self, regions: Mapping[str, ArrayLike] | None, correlated_px: float, false_alarm: float
     ) -> tuple[list[_Region], tuple[tuple[str, str], ...], float]:
         """Return the regions with pixels, those without, and the p-value of an alarm of one."""
-        if not 0.0 < false_alarm < 1.0:
-            raise RepeatabilityError(f"false_alarm: got {false_alarm}, expected between 0 and 1")
-        if not correlated_px >= 1.0:
-            raise RepeatabilityError(f"correlated_px: got {correlated_px}, expected at least 1")
+        check = Checks(RepeatabilityError)
+        check.within("false_alarm", false_alarm, "(0, 1)")
+        check.within("correlated_px", correlated_px, "[1, inf]")
         given = _grid(self.known) if regions is None else regions
         wanted = {name: np.asarray(mask, bool) for name, mask in given.items()}
         chosen, left_out = [], []
         for name, mask in {**wanted, WHOLE_REGION: np.ones_like(self.known)}.items():
-            if mask.shape != self.known.shape:
-                raise RepeatabilityError(
-                    f"regions: {name!r} has shape {mask.shape}, expected {self.known.shape}"
-                )
+            check.shape(f"regions, {name!r}", mask, self.known.shape)
             seen = mask & self.known
             count = int(seen.sum())
             if count < MIN_REGION_PIXELS:
@@ -340,8 +332,8 @@ class _Captures:
             # rounding of float32 maps is noise too
             noise = np.maximum(noise, 1e-9 * np.abs(means) + 1e-30)
             chosen.append(_Region(name, count, means, noise))
-        if not chosen:
-            raise RepeatabilityError("valid: no region has pixels that are valid in all captures")
+        got = "no region with pixels that are valid in all captures"
+        check.require(chosen, "valid", got, "some")
         # Sidak: all of them together alarm at the stated rate
         return chosen, tuple(left_out), 1.0 - (1.0 - false_alarm) ** (1.0 / len(chosen))
 

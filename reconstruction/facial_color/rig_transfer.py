@@ -9,6 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy import ndimage
 
+from model.checks import Checks
 from model.facial_color import HemoglobinRig, StateMaps
 from model.facial_color.coarse_maps import Cells
 from reconstruction.arrays import BoolArray, Float64Array
@@ -54,11 +55,8 @@ def transfer_rig(
         For fewer than `MIN_TRANSFER_LANDMARKS` common names, or points on one line.
     """
     names = sorted(set(landmarks_rig) & set(landmarks_onto))
-    if len(names) < MIN_TRANSFER_LANDMARKS:
-        raise RigTransferError(
-            f"landmarks: {len(names)} names are in both tables, expected at least "
-            f"{MIN_TRANSFER_LANDMARKS}"
-        )
+    got, least = f"{len(names)} names in both tables", MIN_TRANSFER_LANDMARKS
+    Checks(RigTransferError).require(len(names) >= least, "landmarks", got, f"at least {least}")
     onto = np.array([landmarks_onto[name] for name in names], np.float64)
     own = np.array([landmarks_rig[name] for name in names], np.float64)
     try:
@@ -70,12 +68,10 @@ def transfer_rig(
     moved, unsure_px = field.at(place.reshape(-1, 2))
     source = place + moved.reshape(place.shape)
     told = unsure_px.reshape(stored) <= rig.radius_px
-    cell = np.stack(
-        [
-            (source[..., k] + 0.5) * rig.neutral_mean.shape[1 - k] / rig.neutral.shape[1 - k] - 0.5
-            for k in (1, 0)
-        ]
+    sides = zip(
+        rig.neutral_mean.shape, rig.neutral.shape, (source[..., 1], source[..., 0]), strict=True
     )
+    cell = np.stack([(at + 0.5) * few / full - 0.5 for few, full, at in sides])
     mean, seen = _sampled(rig.neutral_mean, rig.neutral_mean_valid, cell)
     here = seen & told
     states: dict[str, StateMaps] = {}

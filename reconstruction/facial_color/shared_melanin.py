@@ -26,6 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from model.checks import Checks
 from model.color_table import ColorTable
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.chromophores import (
@@ -36,7 +37,7 @@ from reconstruction.chromophores import (
 )
 from reconstruction.chromophores.face import estimate_face
 from reconstruction.chromophores.inversion import DEFAULT_RELATIVE_NOISE
-from reconstruction.chromophores.pixel_checks import broadcast_variance, checked_mask, usable_colors
+from reconstruction.chromophores.pixel_checks import broadcast, checked_mask, usable_colors
 from reconstruction.chromophores.posterior import MIN_RELATIVE_NOISE, ChromophorePosterior
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION
@@ -163,18 +164,15 @@ def estimate_shared_melanin(
     ('0.020', '0.020')
     """
     colors = np.asarray(rgb, np.float32)
-    if colors.ndim < 2 or colors.shape[-1] != 3 or not colors.shape[0]:
-        raise ChromophoreError(f"rgb: expected shape (S, ..., 3), got {colors.shape}")
+    check = Checks(ChromophoreError)
+    good = colors.ndim >= 2 and colors.shape[-1] == 3 and colors.shape[0]
+    check.require(good, "rgb", f"shape {colors.shape}", "(S, ..., 3)")
     states, shape = colors.shape[0], colors.shape[1:-1]
-    if not -states <= reference < states:
-        raise ChromophoreError(f"reference: expected a state 0 to {states - 1}, got {reference}")
-    if shading_window_px is not None and (len(shape) != 2 or not shading_window_px > 0.0):
-        raise ChromophoreError(
-            f"shading_window_px: expected above 0 and rgb (S, H, W, 3), got {shading_window_px} "
-            f"and {colors.shape}"
-        )
-    if not 0.0 <= own_share <= 1.0:
-        raise ChromophoreError(f"own_share: expected 0 to 1, got {own_share}")
+    check.within("reference", reference, f"[{-states}, {states})")
+    if shading_window_px is not None:
+        check.within("shading_window_px", shading_window_px, "(0, inf]")
+        check.require(len(shape) == 2, "shading_window_px", f"rgb {colors.shape}", "(S, H, W, 3)")
+    check.within("own_share", own_share, "[0, 1]")
     seen = _States.of(colors, variance, valid)
     each_error, usual = _model_errors(model_error, shape, seen.usable)
     common = each_error * (1.0 - own_share)
@@ -192,18 +190,13 @@ def estimate_shared_melanin(
         has_white=one_face,
     ).found
 
-    fit = _BloodFit(seen, mean, found, table, common, owns, reference % states)
+    fit = _BloodFit(seen, mean, found, table, (common, owns), reference % states)
     free = np.zeros(seen.usable.shape, np.float32)
     of_pixels, of_states = fit(free, free)
     if shading_window_px is not None and states > 1:
         good = fit.good & (of_states["residual"] < MISFIT_SIGMAS)
-        log_change, stiffness = light_change.smooth(
-            of_states["log_shading"],
-            of_states["log_shading_variance"],
-            good,
-            shape,
-            shading_window_px,
-        )
+        light = of_states["log_shading"], of_states["log_shading_variance"]
+        log_change, stiffness = light_change.smooth(*light, good, shape, shading_window_px)
         stiffness = np.where(fit.good, stiffness, 0.0).astype(np.float32)
         of_pixels, of_states = fit(log_change, stiffness)
     named = {name: values.reshape(states, *shape) for name, values in of_states.items()}
@@ -239,10 +232,9 @@ class _States:
             usable &= checked_mask(valid, usable.shape)
         relative: FloatArray = np.full(colors.shape, DEFAULT_RELATIVE_NOISE**2, np.float32)
         if variance is not None:
-            values = broadcast_variance(np.asarray(variance, np.float32), colors.shape)
-            with np.errstate(invalid="ignore"):
-                if (values[usable] < 0.0).any():
-                    raise ChromophoreError("variance: got a negative one")
+            values = broadcast("variance", np.asarray(variance, np.float32), colors.shape)
+            negative = np.nan_to_num(values[usable]).min(initial=0.0) < 0.0
+            Checks(ChromophoreError).require(not negative, "variance", "a negative one", ">= 0")
             relative = values / np.square(np.where(usable[..., None], colors, 1.0))
         usable &= np.isfinite(relative).all(axis=-1)
         keep = usable[..., None]
@@ -261,8 +253,7 @@ class _BloodFit:
         mean: Float32Array,
         found: ChromophorePosterior,
         table: ColorTable,
-        common: Float64Array,
-        owns: Float64Array,
+        errors: tuple[Float64Array, Float64Array],
         reference: int,
     ) -> None:
         melanin, stderr = found.melanin.reshape(-1), found.stderr_melanin.reshape(-1)
@@ -275,11 +266,10 @@ class _BloodFit:
         self._fixed = (
             np.ascontiguousarray(begin, np.float32),
             np.where(np.isfinite(stderr), stderr, 0.0).astype(np.float32),
-            np.ascontiguousarray(without_brightness(common)),
-            owns,
+            np.ascontiguousarray(without_brightness(errors[0])),
+            errors[1],
             np.ascontiguousarray(table.cells, np.float64),
-            float(ends[0]),
-            float(ends[1]),
+            *ends.tolist(),
         )
 
     def __call__(
@@ -295,19 +285,9 @@ class _BloodFit:
         states, pixels = self.good.shape
         of_pixels = np.empty((len(kernels.PIXEL_MAPS), pixels), np.float32)
         of_states = np.empty((len(kernels.STATE_MAPS), states, pixels), np.float32)
-        kernels.blood_of_states(
-            self._seen.log_rgb,
-            self._seen.relative,
-            self.good,
-            self._mean,
-            log_change,
-            stiffness,
-            *self._fixed,
-            self._reference,
-            of_pixels,
-            of_states,
-            _TASK_PIXELS,
-        )
+        seen = self._seen.log_rgb, self._seen.relative, self.good, self._mean
+        maps = of_pixels, of_states, _TASK_PIXELS
+        kernels.blood_of_states(*seen, log_change, stiffness, *self._fixed, self._reference, *maps)
         return of_pixels, dict(zip(kernels.STATE_MAPS, of_states, strict=True))
 
 
@@ -322,10 +302,7 @@ def _model_errors(
     if given.ndim < 3:
         one = model_covariance(model_error, default_noise=False)
         return one[None], np.diag(one)
-    if given.shape != (*shape, 3, 3):
-        raise ChromophoreError(
-            f"model_error: expected shape {(*shape, 3, 3)} for the pixels, got {given.shape}"
-        )
+    Checks(ChromophoreError).shape("model_error", given, (*shape, 3, 3))
     flat = given.reshape(-1, 3, 3)
     seen = flat[usable.any(axis=0)]
     usual = np.median(np.einsum("nii->ni", seen), axis=0) if len(seen) else np.zeros(3)
@@ -343,13 +320,12 @@ def _own_errors(
     if own_error is None:
         return np.ascontiguousarray(np.broadcast_to(diagonal, (shape[0], 1, 6)))
     given = np.asarray(own_error, np.float64)
-    if given.shape != (*shape, 3, 3):
-        raise ChromophoreError(
-            f"own_error: expected shape {(*shape, 3, 3)} for states and pixels, got {given.shape}"
-        )
+    Checks(ChromophoreError).shape("own_error", given, (*shape, 3, 3))
     flat = given.reshape(shape[0], -1, 3, 3)[..., _UPPER_TRIANGLE[0], _UPPER_TRIANGLE[1]]
-    if not (np.isfinite(flat[usable]).all() and (flat[usable][:, [0, 3, 5]] >= 0.0).all()):
-        raise ChromophoreError("own_error: expected finite covariances without negative variances")
+    Checks(ChromophoreError).within("own_error", flat[usable])
+    Checks(ChromophoreError).within(
+        "variances of own_error", flat[usable][:, [0, 3, 5]], "[0, inf)"
+    )
     return np.ascontiguousarray(np.where(usable[..., None], flat, 0.0) + diagonal)
 
 
@@ -384,17 +360,9 @@ def _mean_color(
     ends = np.array([table.c_m_max, table.c_hd_max])
     begin = _fractions(np.stack([first.melanin, first.hemoglobin], axis=-1), ends)
     mean, variance = np.empty((2, *plain.shape), np.float32)
-    kernels.mean_color(
-        seen.log_rgb,
-        seen.relative,
-        seen.usable,
-        begin.astype(np.float32),
-        owns,
-        np.ascontiguousarray(table.cells, np.float64),
-        mean,
-        variance,
-        _TASK_PIXELS,
-    )
+    given = seen.log_rgb, seen.relative, seen.usable, begin.astype(np.float32), owns
+    cells = np.ascontiguousarray(table.cells, np.float64)
+    kernels.mean_color(*given, cells, mean, variance, _TASK_PIXELS)
     return mean, variance
 
 

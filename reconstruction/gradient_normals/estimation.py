@@ -14,16 +14,23 @@ from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
+from model.checks import Checks
 from model.fresnel import ETA_SKIN
-from reconstruction.arrays import BoolArray, FloatArray
+from reconstruction.arrays import FloatArray
 from reconstruction.gradient_normals import kernels, lobe_response, moment_kernels
-from reconstruction.gradient_normals.channels import channel_count, joined, sliced, summed
+from reconstruction.gradient_normals.channels import (
+    PatternSamples,
+    Valid,
+    Variance,
+    collect,
+    joined,
+)
 from reconstruction.gradient_normals.inversion import Inversion, places_of, views_of
 from reconstruction.gradient_normals.lobe_response import Response
 from reconstruction.gradient_normals.moments import (
@@ -33,15 +40,12 @@ from reconstruction.gradient_normals.moments import (
     with_shared_dark,
 )
 from reconstruction.gradient_normals.noise import SensorNoise
-from reconstruction.gradient_normals.patterns import GradientError, Key, collect
+from reconstruction.gradient_normals.patterns import GradientError, Key
 from reconstruction.gradient_normals.sphere_lights import SphereLights, frame_of
 from reconstruction.normal_maps import NormalMaps
 from reconstruction.tiles import map_on_threads
 
 _log = logging.getLogger(__name__)
-
-Variance = float | SensorNoise | Mapping[Key, ArrayLike] | None
-Valid = BoolArray | Mapping[Key, BoolArray] | None
 
 MAX_MEDIAN_LEAKAGE = 0.02
 """Median leakage from which polarizers do not cross well: 8 degrees off."""
@@ -170,48 +174,39 @@ def from_patterns(
     >>> bool(np.allclose(from_patterns(pictures).normals[0, 0], n))
     True
     """
-    if component not in ("specular", "diffuse"):
-        raise GradientError(f"component: got {component!r}, expected 'specular' or 'diffuse'")
-    settings: dict[str, Any] = {
-        "component": component,
-        "view": view,
-        "lights": lights,
-        "alpha": alpha,
-        "eta": eta,
-        "points_mm": points_mm,
-        "smooth_px": smooth_px,
-        "smooth_crossed_px": smooth_crossed_px,
-        "wiener": wiener,
-        "executor": executor,
-    }
-    channels = channel_count(patterns)
-    if channels is not None and component == "specular":
-        whole = summed(patterns, variance=variance, valid=valid, saturation=saturation)
-        return from_patterns(whole[0], variance=whole[1], **settings)
-    if channels is not None:
-        return joined(
-            [
-                from_patterns(
-                    sliced(patterns, k),
-                    variance=sliced(variance, k),
-                    valid=sliced(valid, k),
-                    saturation=saturation,
-                    **settings,
-                )
-                for k in range(channels)
-            ]
-        )
-    reflection = _reflection_of(
-        patterns, component, variance, valid, saturation, lights, smooth_px, smooth_crossed_px
-    )
+    Checks(GradientError).choice("component", component, ("specular", "diffuse"))
+    smooth = smooth_px, smooth_px if smooth_crossed_px is None else smooth_crossed_px
+    samples = PatternSamples(patterns, variance, valid, saturation)
+
+    def normals_of(flat: PatternSamples) -> NormalMaps:
+        reflection = _reflection_of(flat, component, lights, smooth)
+        return _normals(reflection, view, lights, alpha, eta, points_mm, wiener, executor)
+
+    if samples.channels is None:
+        return normals_of(samples)
+    if component == "specular":
+        return normals_of(samples.summed())
+    return joined([normals_of(samples.channel(k)) for k in range(samples.channels)])
+
+
+def _normals(
+    reflection: Reflection,
+    view: ArrayLike,
+    lights: SphereLights | None,
+    alpha: float | Roughness | None,
+    eta: float,
+    points_mm: ArrayLike | None,
+    wiener: bool,
+    executor: Executor | None,
+) -> NormalMaps:
     shape = reflection.shape
     middle, each_view = views_of(view, shape)
     places = places_of(points_mm, shape, middle, lights)
     if lights is None:
-        if alpha is not None:
-            raise GradientError("alpha: got it without lights, expected both or neither")
+        got = "it without lights"
+        Checks(GradientError).require(alpha is None, "alpha", got, "both or neither")
         table = Response(np.zeros((0, 0, 0)), 0.0, 1.0, frame_of(middle))
-    elif component == "diffuse":
+    elif reflection.component == "diffuse":
         table = lobe_response.diffuse(lights, view=middle, eta=eta, near=places is not None)
     else:
         if alpha is None:
@@ -258,12 +253,11 @@ def estimate_roughness(
     GradientError
         Where no pixel has a specular signal.
     """
-    if channel_count(patterns) is not None:
-        patterns, variance = summed(patterns, variance=variance, valid=valid, saturation=saturation)
-        valid = saturation = None
-    reflection = _reflection_of(
-        patterns, "specular", variance, valid, saturation, lights, smooth_px, smooth_crossed_px
-    )
+    samples = PatternSamples(patterns, variance, valid, saturation)
+    if samples.channels is not None:
+        samples = samples.summed()
+    smooth = smooth_px, smooth_px if smooth_crossed_px is None else smooth_crossed_px
+    reflection = _reflection_of(samples, "specular", lights, smooth)
     found = _roughness(reflection, lights, views_of(view, reflection.shape)[0], eta)
     if found.pixels == 0:
         raise GradientError("patterns: no pixel has a specular signal above its noise")
@@ -271,37 +265,21 @@ def estimate_roughness(
 
 
 def _reflection_of(
-    patterns: Mapping[Key, ArrayLike],
+    samples: PatternSamples,
     component: Literal["specular", "diffuse"],
-    variance: Variance,
-    valid: Valid,
-    saturation: float | None,
     lights: SphereLights | None,
-    smooth_px: float,
-    smooth_crossed_px: float | None,
+    smooth_px: tuple[float, float],
 ) -> Reflection:
     """Return the moments of one component's reflection, corrected for leaking polarizers."""
-    noise = variance if isinstance(variance, SensorNoise) else None
-    stacks = collect(
-        patterns,
-        variance=None if isinstance(variance, SensorNoise) else variance,
-        valid=valid,
-        saturation=saturation,
-    )
     leakage = 0.0
     if lights is not None:
         # lights near Brewster's angle reflect next to nothing, most of it crossed: not a mean
         leakage = float(np.median(lights.leakage[lights.intensities > 0]))
         if leakage > MAX_MEDIAN_LEAKAGE:
             _warn_of_leakage(round(leakage, 4))
-    return prepare(
-        with_shared_dark(stacks),
-        component,
-        noise=noise,
-        leakage=leakage,
-        smooth_px=smooth_px,
-        smooth_crossed_px=smooth_crossed_px,
-    )
+    noise = samples.variance if isinstance(samples.variance, SensorNoise) else None
+    stacks = with_shared_dark(collect(samples))
+    return prepare(stacks, component, noise=noise, leakage=leakage, smooth_px=smooth_px)
 
 
 @lru_cache(maxsize=64)
@@ -329,10 +307,8 @@ def _roughness(
         good = np.flatnonzero(np.isfinite(parallel[0]) & np.isfinite(crossed[0]))
         good = good[:: min(columns, 8)]
         picked.append((parallel[:, good], crossed[:, good]))
-    moments = (
-        np.ascontiguousarray(np.concatenate([a for a, _ in picked], axis=1)),
-        np.ascontiguousarray(np.concatenate([b for _, b in picked], axis=1)),
-    )
+    first, second = (np.concatenate(parts, axis=1) for parts in zip(*picked, strict=True))
+    moments = np.ascontiguousarray(first), np.ascontiguousarray(second)
 
     def excess(log_alpha: float) -> tuple[float, FloatArray]:
         """Return how much longer the vectors are than this roughness makes them, each and all."""
@@ -344,10 +320,9 @@ def _roughness(
         if not good.any():
             return float("nan"), np.zeros(0)
         light = found[good, kernels.ALBEDO]
-        each = light * (
-            found[good, kernels.CONCENTRATION_SEEN] - found[good, kernels.CONCENTRATION]
-        )
-        return float(each.sum() / max(light.sum(), 1e-300)), each / max(light.sum(), 1e-300)
+        each = light * (found[good, kernels.CONCENTRATION_SEEN] - length[good])
+        whole = max(light.sum(), 1e-300)
+        return float(each.sum() / whole), each / whole
 
     ladder = np.log(ROUGHNESS_LADDER)
     steps = [excess(a) for a in ladder]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from model.checks import Checks
 from reconstruction.arrays import Float64Array, FloatArray
 from reconstruction.gradient_normals import kernels
 from reconstruction.gradient_normals.lobe_response import Response
@@ -21,11 +22,9 @@ MIN_MOMENT_SIGMAS = 3.0
 def views_of(view: ArrayLike, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray | None]:
     """Return the mean view (3,), and every pixel's (P, 3) or none (0, 3)."""
     v = np.asarray(view, np.float64)
-    if v.shape not in ((3,), (*shape, 3)):
-        raise GradientError(f"view: got shape {v.shape}, expected (3,) or {(*shape, 3)}")
+    Checks(GradientError).shape("view", v, (3,), (*shape, 3))
     length = np.linalg.norm(v, axis=-1, keepdims=True)
-    if not (np.abs(length - 1.0) < 0.01).all():
-        raise GradientError("view: expected unit vectors, got lengths other than 1")
+    Checks(GradientError).within("length of view", length, "(0.99, 1.01)")
     v = v / length
     if v.ndim == 1:
         return v, None
@@ -45,10 +44,7 @@ def places_of(
     if lights is None or not np.isfinite(lights.distance_mm):
         raise GradientError("points_mm: got them without lights of finite distance_mm")
     points = np.asarray(points_mm, np.float64)
-    if points.shape not in ((*shape, 2), (*shape, 3)) or not np.isfinite(points).all():
-        raise GradientError(
-            f"points_mm: got shape {points.shape}, expected finite {(*shape, 2)} or {(*shape, 3)}"
-        )
+    points = Checks(GradientError).numbers("points_mm", points, (*shape, 2), (*shape, 3))
     flat = points.reshape(-1, points.shape[-1])
     if points.shape[-1] == 2:
         flat = np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)

@@ -19,6 +19,7 @@ from scipy.ndimage import spline_filter
 
 from model import fresnel
 from model.brdf import microfacet
+from model.checks import Checks
 from model.vectors import unit_vectors
 from reconstruction.arrays import Float64Array
 from reconstruction.gradient_normals.sphere_lights import (
@@ -27,7 +28,6 @@ from reconstruction.gradient_normals.sphere_lights import (
     frame_of,
     normal_at,
     place_of,
-    require_finite,
     require_unit_vectors,
 )
 from reconstruction.polarization import fresnel_amplitudes
@@ -141,10 +141,8 @@ def specular(
     SphereLightsError
         For a roughness or index that no such surface has.
     """
-    if not 0.02 <= alpha <= 1.0:
-        raise SphereLightsError(f"alpha: got {alpha}, expected a roughness in [0.02, 1]")
-    if not 0.0 <= alpha_stderr < np.inf:
-        raise SphereLightsError(f"alpha_stderr: got {alpha_stderr}, expected 0 or more, finite")
+    Checks(SphereLightsError).within("alpha", alpha, "[0.02, 1]")
+    Checks(SphereLightsError).within("alpha_stderr", alpha_stderr, "[0, inf)")
     way = _direction(view)
     return _cached(lights, way, float(alpha), _index(eta), near, float(alpha_stderr))
 
@@ -155,14 +153,11 @@ def diffuse(lights: SphereLights, *, view: ArrayLike, eta: float, near: bool = F
 
 
 def _direction(view: ArrayLike) -> tuple[float, ...]:
-    return tuple(
-        float(x) for x in require_unit_vectors("view", np.asarray(view, np.float64)[None])[0]
-    )
+    return tuple(require_unit_vectors("view", np.asarray(view, np.float64)[None])[0].tolist())
 
 
 def _index(eta: float) -> float:
-    if not 1.0 < eta < 4.0:
-        raise SphereLightsError(f"eta: got {eta}, expected 1 < eta < 4")
+    Checks(SphereLightsError).within("eta", eta, "(1, 4)")
     return float(eta)
 
 
@@ -321,13 +316,12 @@ def direction_from_moments(vector: Float64Array, mirror: bool) -> tuple[Float64A
     SphereLightsError
         For vectors that are not finite.
     """
-    require_finite("vector", vector)
+    Checks(SphereLightsError).within("vector", vector)
     largest = np.maximum(np.abs(vector).max(axis=1), 1e-300)
-    size = np.linalg.norm(vector, axis=1)
     # squares of vectors shorter than this are subnormal or zero
-    size = np.where(
-        size > 1e-150, size, largest * np.linalg.norm(vector / largest[:, None], axis=1)
-    )
+    short = largest * np.linalg.norm(vector / largest[:, None], axis=1)
+    size = np.linalg.norm(vector, axis=1)
+    size = np.where(size > 1e-150, size, short)
     size = np.maximum(size, 1e-300)[:, None]
     n = vector / size
     turn = (np.eye(3) - n[:, :, None] * n[:, None, :]) / size[:, :, None]

@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from model.checks import Checks
 from reconstruction.arrays import Float64Array, FloatArray
 from reconstruction.gradient_normals import moment_kernels
 from reconstruction.gradient_normals.noise import SensorNoise, estimate_noise
@@ -98,11 +99,9 @@ class Reflection:
                 self._replace(parallel, crossed, rows)
             return parallel, crossed
         k = self.leakage / (1.0 - self.leakage)
-        cleaned = crossed.copy()
-        cleaned[_VALUE_ROWS] -= k * (parallel[_VALUE_ROWS] - crossed[_VALUE_ROWS])
-        cleaned[_VARIANCE_ROWS] = (1.0 + k) ** 2 * crossed[_VARIANCE_ROWS] + k**2 * parallel[
-            _VARIANCE_ROWS
-        ]
+        cleaned, values, variances = crossed.copy(), _VALUE_ROWS, _VARIANCE_ROWS
+        cleaned[values] -= k * (parallel[values] - crossed[values])
+        cleaned[variances] = (1.0 + k) ** 2 * crossed[variances] + k**2 * parallel[variances]
         if self.clean is not None:
             self._replace(cleaned, cleaned, rows)
         return cleaned, crossed[:, :0]
@@ -131,11 +130,9 @@ class Reflection:
         height, width = y.shape[1:]
         out = np.empty((moment_kernels.MOMENT_ROWS, height * width), self.kind)
         # a view that repeats itself keeps doing so
-        flat = (
-            np.broadcast_to(noise[:, :1, 0], (len(y), height * width))
-            if noise.strides[2] == 0
-            else noise.reshape(len(y), -1)
-        )
+        flat = noise.reshape(len(y), -1)
+        if noise.strides[2] == 0:
+            flat = np.broadcast_to(noise[:, :1, 0], flat.shape)
         gain, read = (self.noise.gain, self.noise.read_variance) if self.noise else (0.0, 1.0)
         moment_kernels.moments(y.reshape(len(y), -1), flat, gain, read, self.told, stack.dark, out)
         if reach:
@@ -176,8 +173,7 @@ def prepare(
     *,
     noise: SensorNoise | None,
     leakage: float,
-    smooth_px: float,
-    smooth_crossed_px: float | None,
+    smooth_px: tuple[float, float],
 ) -> Reflection:
     """Check that the pictures tell the component, and what is known of their noise.
 
@@ -185,31 +181,24 @@ def prepare(
     ----------
     stacks
         By polarization; with variances, or with `noise`, or neither.
-    component, noise, leakage
+    component, noise, leakage, smooth_px
         See :class:`Reflection`.
-    smooth_px, smooth_crossed_px
-        Standard deviations of the Gaussians.
 
     Raises
     ------
     MissingPatterns
         Where a polarization, or patterns of it, are missing.
     """
-    for name, sigma in (("smooth_px", smooth_px), ("smooth_crossed_px", smooth_crossed_px or 0.0)):
-        if not 0.0 <= sigma <= 100.0:
-            raise GradientError(f"{name}: got {sigma}, expected pixels in [0, 100]")
+    Checks(GradientError).within("smooth_px, smooth_crossed_px", smooth_px, "[0, 100]")
     wanted = ("parallel", "crossed") if component == "specular" else ("crossed",)
     for polarizer in wanted:
         if polarizer not in stacks:
-            raise MissingPatterns(
+            text = (
                 f"patterns: got no {polarizer} pictures; {component} normals need"
                 f" {' and '.join(wanted)} ones, full, x, y, z at least"
-                + (
-                    ": parallel pictures hold both reflections, and crossed ones tell the diffuse"
-                    if component == "specular"
-                    else ""
-                )
             )
+            why = ": parallel pictures hold both reflections, and crossed ones tell the diffuse"
+            raise MissingPatterns(text + why if component == "specular" else text)
         require(stacks[polarizer].pictures, polarizer=polarizer, purpose=f"{component} normals")
     used = {name: stacks[name] for name in wanted}
     parallel = stacks.get("parallel")
@@ -231,7 +220,7 @@ def prepare(
         told,
         judged,
         leakage,
-        (smooth_px, smooth_px if smooth_crossed_px is None else smooth_crossed_px),
+        smooth_px,
         np.float64 if np.dtype(np.float64) in kinds else np.float32,
     )
 
@@ -260,9 +249,8 @@ def with_filter(reflection: Reflection) -> Reflection:
         for number, moments in enumerate(reflection.moments(rows)[: len(raw)]):
             raw[number][:, rows] = moments[_VALUE_ROWS].reshape(4, -1, width)
             good = np.isfinite(moments[0])
-            noise[number] += moments[moment_kernels.V_0 : moment_kernels.V_ZZ + 1][:, good].sum(
-                axis=1
-            )
+            variances = moments[moment_kernels.V_0 : moment_kernels.V_ZZ + 1]
+            noise[number] += variances[:, good].sum(axis=1)
             count += int(good.sum()) if number == 0 else 0
     noise /= max(count, 1)
     valid = np.isfinite(raw[0][0]) & np.isfinite(raw[-1][0])
@@ -297,10 +285,6 @@ def with_shared_dark(stacks: Mapping[str, Stack]) -> dict[str, Stack]:
         valid = dict(stack.valid)
         if "dark" in source.valid:
             valid["dark"] = source.valid["dark"]
-        out[other] = replace(
-            stack,
-            pictures={**stack.pictures, "dark": source.pictures["dark"]},
-            variance=variance,
-            valid=valid,
-        )
+        pictures = {**stack.pictures, "dark": source.pictures["dark"]}
+        out[other] = Stack(pictures, variance, valid)
     return out

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from model.checks import Checks
 from reconstruction.arrays import Float64Array, FloatArray
 from reconstruction.gradient_normals.patterns import PATTERN_NAMES, GradientError, Stack, design
 
@@ -28,12 +29,10 @@ class SensorNoise:
 
     def __post_init__(self) -> None:
         """Refuse what is no variance."""
-        for name in ("gain", "read_variance"):
-            value = getattr(self, name)
-            if not 0.0 <= value < np.inf:
-                raise GradientError(f"SensorNoise.{name}: got {value}, expected finite, >= 0")
-        if self.gain == 0.0 and self.read_variance == 0.0:
-            raise GradientError("SensorNoise: got no noise at all, expected gain or read_variance")
+        check = Checks(GradientError)
+        check.settings(self, gain="[0, inf)", read_variance="[0, inf)")
+        some = self.gain or self.read_variance
+        check.require(some, "SensorNoise", "no noise at all", "gain or read_variance")
 
 
 def estimate_noise(stacks: Mapping[str, Stack]) -> SensorNoise | None:
@@ -84,14 +83,9 @@ def _contrasts(stack: Stack) -> list[Float64Array]:
         return []
     A = design(names, dark=stack.dark)
     left = np.linalg.svd(A)[0][:, A.shape[1] :]
-    out = []
-    for column in left.T:
-        weights = np.zeros(len(PATTERN_NAMES))
-        weights[[PATTERN_NAMES.index(name) for name in names]] = np.where(
-            np.abs(column) > 1e-9, column, 0.0
-        )
-        out.append(weights)
-    return out
+    weights = np.zeros((left.shape[1], len(PATTERN_NAMES)))
+    weights[:, [PATTERN_NAMES.index(name) for name in names]] = left.T
+    return list(np.where(np.abs(weights) > 1e-9, weights, 0.0))
 
 
 def _line(signal: FloatArray, square: FloatArray) -> tuple[float, float]:

@@ -4,13 +4,11 @@ Four numbers a polarization are asked for, the full light and its moments along 
 picture is a weighted sum of them: the full light itself, or half of it plus or less half a moment.
 """
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 
@@ -137,113 +135,3 @@ def require(names: Mapping[str, Any], *, polarizer: str, purpose: str) -> None:
         f" gradients; got {', '.join(lit) or 'none'}; missing {', '.join(missing)};"
         f" {' and '.join(needs)} would do"
     )
-
-
-def collect(
-    patterns: Mapping[Key, ArrayLike],
-    *,
-    variance: float | Mapping[Key, ArrayLike] | None,
-    valid: BoolArray | Mapping[Key, BoolArray] | None,
-    saturation: float | None,
-) -> dict[str, Stack]:
-    """Check the pictures and sort them by polarization.
-
-    Returns
-    -------
-    dict of str to Stack
-        By polarization, of those that pictures were given of.
-    """
-    if not patterns:
-        raise GradientError("patterns: got none, expected pictures keyed (pattern, polarizer)")
-    shape: tuple[int, ...] = ()
-    stacks: dict[str, Stack] = {}
-    for key, given in patterns.items():
-        name, polarizer = _known_key(key)
-        image = np.asarray(given)
-        if image.dtype.kind not in "fui" or image.ndim != 2 or image.size == 0:
-            raise GradientError(
-                f"patterns[{name!r}, {polarizer!r}]: got {image.dtype} of shape {image.shape},"
-                " expected linear numbers (H, W) or (H, W, C)"
-            )
-        shape = shape or image.shape
-        if image.shape != shape:
-            raise GradientError(
-                f"patterns[{name!r}, {polarizer!r}]: got shape {image.shape}, expected {shape} as"
-                " the others"
-            )
-        stack = stacks.setdefault(polarizer, Stack({}, None, {}))
-        stack.pictures[name] = image
-        mask = _mask(valid, (name, polarizer), shape)
-        if saturation is not None:
-            with np.errstate(invalid="ignore"):
-                clear = ~(image >= saturation)
-            mask = clear if mask is None else mask & clear
-        if mask is not None and not mask.all():
-            stack.valid[name] = mask
-    if variance is None:
-        return stacks
-    return {
-        polarizer: _with_variance(stack, polarizer, variance, shape)
-        for polarizer, stack in stacks.items()
-    }
-
-
-def _known_key(key: Any) -> Key:
-    if not (isinstance(key, tuple) and len(key) == 2 and all(isinstance(k, str) for k in key)):
-        raise GradientError(f"patterns: got key {key!r}, expected (pattern, polarizer)")
-    for word, known, kind in (
-        (key[0], PATTERN_NAMES, "pattern"),
-        (key[1], POLARIZER_NAMES, "polarizer"),
-    ):
-        if word not in known:
-            near = difflib.get_close_matches(word, known, 1)
-            hint = f"; did you mean {near[0]}?" if near else ""
-            raise GradientError(
-                f"patterns: got {kind} {word!r}, expected one of {', '.join(known)}{hint}"
-            )
-    return key[0], key[1]
-
-
-def _mask(
-    valid: BoolArray | Mapping[Key, BoolArray] | None, key: Key, shape: tuple[int, ...]
-) -> BoolArray | None:
-    if valid is None or (isinstance(valid, Mapping) and key not in valid):
-        return None
-    mask = np.asarray(valid[key] if isinstance(valid, Mapping) else valid)
-    if mask.dtype != np.bool_ or mask.shape != shape:
-        raise GradientError(
-            f"valid: got {mask.dtype} of shape {mask.shape}, expected bool {shape}, or a mapping of"
-            " the same keys to such"
-        )
-    return mask
-
-
-def _with_variance(stack: Stack, polarizer: str, variance: Any, shape: tuple[int, ...]) -> Stack:
-    found: dict[str, FloatArray] = {}
-    for name in stack.pictures:
-        if isinstance(variance, Mapping):
-            if (name, polarizer) not in variance:
-                raise GradientError(
-                    f"variance: got none of {(name, polarizer)}, expected one of every picture"
-                )
-            values = np.asarray(variance[name, polarizer], np.float64)
-        else:
-            values = np.asarray(variance, np.float64)
-        if values.shape not in ((), shape):
-            raise GradientError(
-                f"variance[{name!r}, {polarizer!r}]: got shape {values.shape}, expected () or"
-                f" {shape}"
-            )
-        with np.errstate(invalid="ignore"):
-            good = np.isfinite(values) & (values > 0)
-        if values.ndim == 0 and not good:
-            raise GradientError(
-                f"variance[{name!r}, {polarizer!r}]: got {values}, expected a finite number above 0"
-            )
-        if values.ndim:
-            if not good.all():  # of an unknown variance: as if the sample were not there
-                before = stack.valid.get(name)
-                stack.valid[name] = good if before is None else before & good
-                values = np.where(good, values, 1.0)
-        found[name] = values
-    return Stack(stack.pictures, found, stack.valid)

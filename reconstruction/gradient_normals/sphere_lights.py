@@ -1,10 +1,12 @@
 """Lights of a gradient sphere, and the disc that normals are looked up on."""
 
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from model.checks import Checks
 from reconstruction.arrays import Float64Array
 
 
@@ -12,8 +14,7 @@ class SphereLightsError(ValueError):
     """Lights that no gradient sphere has."""
 
 
-def _none() -> Float64Array:
-    return np.zeros(0)
+_none = partial(np.zeros, 0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,50 +63,33 @@ class SphereLights:
 
     def __post_init__(self) -> None:
         """Check shapes and ranges, and keep copies that cannot be written to."""
+        check = Checks(SphereLightsError)
         ways = require_unit_vectors("directions", self.directions)
         count = len(ways)
-        if count < 4:
-            raise SphereLightsError(f"directions: got {count} light(s), expected at least 4")
+        check.require(count >= 4, "directions", f"{count} light(s)", "at least 4")
         axis = require_unit_vectors("analyser", np.asarray(self.analyser, np.float64)[None])[0]
         # not given: stay empty, so that a later replace() of directions does not meet old ones
-        for name, default in (
-            ("intensities", 1.0),
-            ("leakage", 0.0),
-            ("intensity_stderr", 0.0),
-            ("leakage_stderr", 0.0),
-        ):
+        for name in ("intensities", "leakage", "intensity_stderr", "leakage_stderr"):
             given = np.asarray(getattr(self, name), np.float64)
-            values = np.full(count, default) if given.size == 0 else given.copy()
-            if values.shape != (count,) or not np.isfinite(values).all() or (values < 0).any():
-                raise SphereLightsError(
-                    f"{name}: got shape {values.shape}, expected finite numbers >= 0, ({count},)"
-                )
-            _keep(self, name, values)
-        if not self.intensities.any():
-            raise SphereLightsError("intensities: got 0 for every light, expected some light")
+            values = given.copy() if given.size else np.full(count, float(name == "intensities"))
+            _keep(self, name, check.numbers(name, values, (count,), interval="[0, inf)"))
+        check.require(self.intensities.any(), "intensities", "0 for every light", "some light")
         # a few may exceed 1, by a film mounted across or where the surface hardly reflects the
         # parallel state: what they give parallel less crossed is negative, and counts as such
         middle = float(np.median(self.leakage[self.intensities > 0]))
-        if middle >= 1.0:
-            raise SphereLightsError(
-                f"leakage: got {middle:g} in the middle of the lights, expected crossed over"
-                " parallel below 1; are the two states exchanged?"
-            )
+        got = f"{middle:g} in the middle of the lights"
+        expected = "crossed over parallel below 1; are the two states exchanged?"
+        check.require(middle < 1.0, "leakage", got, expected)
         for name in ("polarizers", "programmed"):
             given = np.asarray(getattr(self, name), np.float64)
             vectors = np.zeros((0, 3)) if given.size == 0 else require_unit_vectors(name, given)
-            if len(vectors) not in (0, count):
-                raise SphereLightsError(f"{name}: got {len(vectors)} vectors, expected {count}")
+            check.shape(name, vectors, (0, 3), (count, 3))
             _keep(self, name, vectors)
         if len(self.polarizers):
             along = np.abs(np.sum(self.polarizers * ways, axis=1))
-            if along.max() > 0.05:
-                raise SphereLightsError(
-                    f"polarizers[{along.argmax()}]: got a field along its own ray, expected one"
-                    " across it"
-                )
-        if not self.distance_mm > 0:
-            raise SphereLightsError(f"distance_mm: got {self.distance_mm}, expected more than 0")
+            where = f"polarizers[{along.argmax()}]"
+            check.require(along.max() <= 0.05, where, "a field along its own ray", "one across it")
+        check.within("distance_mm", self.distance_mm, "(0, inf]")
         _keep(self, "directions", ways)
         object.__setattr__(self, "analyser", tuple(float(a) for a in axis))
 
@@ -130,25 +114,13 @@ def _keep(lights: SphereLights, name: str, values: Float64Array) -> None:
 def require_unit_vectors(name: str, vectors: ArrayLike) -> Float64Array:
     """Return vectors as unit vectors (L, 3); refuse lengths more than 1 % off."""
     array = np.array(vectors, np.float64)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise SphereLightsError(f"{name}: got shape {array.shape}, expected (L, 3)")
+    Checks(SphereLightsError).shape(name, array, ("L", 3))
     length = np.linalg.norm(array, axis=1)
-    wrong = np.flatnonzero(~(np.abs(length - 1.0) < 0.01))
-    if wrong.size:
-        raise SphereLightsError(
-            f"{name}[{wrong[0]}]: got {array[wrong[0]].tolist()}, expected a unit vector"
-        )
+    good = np.abs(length - 1.0) < 0.01
+    first = int(np.argmin(good))
+    where, got = f"{name}[{first}]", array[first].tolist()
+    Checks(SphereLightsError).require(good.all(), where, got, "a unit vector")
     return np.asarray(array / length[:, None])
-
-
-def require_finite(name: str, values: Float64Array) -> None:
-    """Refuse NaN and infinity."""
-    wrong = int(np.size(values) - np.count_nonzero(np.isfinite(values)))
-    if wrong:
-        raise SphereLightsError(
-            f"{name}: got {wrong} of {np.size(values)} numbers that are NaN or infinite, expected "
-            "finite ones: leave out what is masked"
-        )
 
 
 def frame_of(view: ArrayLike) -> Float64Array:
@@ -166,8 +138,7 @@ def frame_of(view: ArrayLike) -> Float64Array:
     """
     v = np.asarray(view, np.float64)
     most = float(np.abs(v).max()) if v.shape == (3,) else np.nan
-    if not 0.0 < most < np.inf:
-        raise SphereLightsError(f"view: got {v.tolist()}, expected a finite vector of 3, not 0")
+    Checks(SphereLightsError).within("view", most, "(0, inf)")
     v = v / most
     v /= np.linalg.norm(v)
     up = np.array([0.0, 1.0, 0.0]) if abs(v[1]) < 0.99 else np.array([0.0, 0.0, -1.0])
@@ -191,7 +162,7 @@ def normal_at(place: Float64Array) -> Float64Array:
     >>> normal_at(np.array([1.0, 0.0])).round(4).tolist()
     [0.866, 0.0, 0.5]
     """
-    require_finite("place", place)
+    Checks(SphereLightsError).within("place", place)
     length = np.hypot(place[..., :1], place[..., 1:])
     seen = place * np.minimum(1.0, np.sqrt(2.0) / np.maximum(length, 1e-9))
     square = np.minimum(length, np.sqrt(2.0)) ** 2
@@ -206,5 +177,5 @@ def place_of(normal: Float64Array) -> Float64Array:
     SphereLightsError
         For normals that are not finite.
     """
-    require_finite("normal", normal)
+    Checks(SphereLightsError).within("normal", normal)
     return np.asarray(normal[..., :2] * np.sqrt(2.0 / np.maximum(1.0 + normal[..., 2:], 1e-9)))

@@ -79,10 +79,8 @@ class BlockCounts:
         """
         sizes = self.counts.sum(axis=1)
         counts = self.counts[sizes > 0]
-        n = len(counts)
-        return np.asarray(
-            normal_blocks.residuals_of(counts) * math.sqrt(n / max(n - 1, 1) * self.growth)
-        )
+        scale = math.sqrt(len(counts) / max(len(counts) - 1, 1) * self.growth)
+        return np.asarray(normal_blocks.residuals_of(counts) * scale)
 
     def noise(self, target: Float64Array, target_samples: float) -> float:
         """Return the standard error of the distance to a target of so many effective samples."""
@@ -108,15 +106,14 @@ def of_kernel(grid: KernelGrid, alpha: float, sigma_um: float) -> BlockCounts:
         The kernel; sigma in um.
     """
     relief, buckets = grid.relief, grid.buckets
-    shape = (relief.code.shape[0], relief.code.shape[1])
-    blocks = normal_blocks.BLOCKS_PER_SIDE
-    group, groups = normal_blocks.block_of(relief.places, shape, blocks)
+    group, groups = normal_blocks.block_of(relief.places, relief.code.shape)
     da, db = relief.change(sigma_um)
     a, b = relief.along + np.float32(alpha) * da, relief.across + np.float32(alpha) * db
     counts = kernels.count_in_groups(-a, -b, group, groups, buckets.bins, buckets.limit)
     steep = 1.0 + a * a + b * b
     growth = [
-        normal_blocks.block_error(m * m / steep, group, groups, shape, blocks)[1] for m in (a, b)
+        normal_blocks.block_error(m * m / steep, group, groups, relief.code.shape)[1]
+        for m in (a, b)
     ]
     return BlockCounts(np.asarray(counts, np.float64), 0.5 * (growth[0] + growth[1]))
 
@@ -157,104 +154,101 @@ class HalfWidths:
     sigma_um: tuple[float, float]
 
 
-def widths_of_best(
-    grid: KernelGrid, found: Found, *, noise: float, scatter: Float64Array, rng: np.random.Generator
-) -> HalfWidths:
-    """Return ways of the best kernel that most drawn histograms of other skin stay within.
+@dataclass(frozen=True, slots=True)
+class Draws:
+    """Histograms drawn anew, and how far they move the best kernel of a search.
 
-    Not their root mean square: a long valley leads few of them far away.
-
-    Parameters
+    Attributes
     ----------
     grid, found
         Of the search.
     noise : float
         Standard error of the distance.
-    scatter : ndarray, shape (blocks, buckets)
-        Of `BlockCounts.scatter`.
     rng
         Draws the histograms.
     """
-    near = nearly_as_good(grid, found, DRAWN_SIGMAS * noise)
-    some = near[np.unique(np.linspace(0, len(near) - 1, MAX_DRAWN).round().astype(int))]
-    gap = found.shares(grid, some) - grid.buckets.target
-    used = np.flatnonzero(gap.any(axis=0) | scatter.any(axis=0))
-    gap, scatter = gap[:, used], scatter[:, used]
-    best = np.empty(N_DRAWS, int)
-    for draw in range(N_DRAWS):
-        moved = rng.standard_normal(len(scatter)) @ scatter
-        best[draw] = int(np.argmin(np.abs(gap + moved).sum(axis=1)))
-    return _widths(grid, some, best)
 
+    grid: KernelGrid
+    found: Found
+    noise: float
+    rng: np.random.Generator
 
-def widths_of_pair(
-    grid: KernelGrid,
-    found: Found,
-    *,
-    noise: float,
-    target_blocks: Float64Array,
-    growth: float,
-    rng: np.random.Generator,
-) -> HalfWidths | None:
-    """Return ways of the best kernel that most drawn pairs of histograms of one skin stay within.
+    def widths_of_best(self, scatter: Float64Array) -> HalfWidths:
+        """Return ways of the best kernel that most drawn histograms of other skin stay within.
 
-    Parameters
-    ----------
-    grid, found, noise, rng
-        As of `widths_of_best`.
-    target_blocks : ndarray, shape (blocks, buckets)
-        Counts behind the target in the skin of each block of the relief, of `of_kernel`.
-    growth : float
-        Of `BlockCounts`. Of the relief's roughness, not of its difference from the target's: how
-        many furrows a patch has is what the next patch differs by.
+        Not their root mean square: a long valley leads few of them far away.
 
-    Returns
-    -------
-    HalfWidths or None
-        None where fewer than `MIN_BLOCKS` blocks are in both maps.
-    """
-    relief, buckets = grid.relief, grid.buckets
-    shape = (relief.code.shape[0], relief.code.shape[1])
-    group, groups = normal_blocks.block_of(relief.places, shape, normal_blocks.BLOCKS_PER_SIDE)
-    ours = np.bincount(group, minlength=groups)
-    both = np.flatnonzero((ours > 0) & (target_blocks.sum(axis=1) > 0))
-    if len(both) < MIN_BLOCKS:
-        return None
-    theirs = normal_blocks.residuals_of(target_blocks[both])
-    factors = rng.standard_normal((N_DRAWS, len(both)))
-    factors = np.float32(math.sqrt(len(both) / (len(both) - 1) * growth)) * factors
-    factors = factors.astype(np.float32)
-    near = nearly_as_good(grid, found, PAIRED_SIGMAS * noise)
-    # dense about the best, sparse where hardly a draw comes
-    most = max(MAX_DRAWN, min(MAX_PAIRED, MAX_PAIRED * PAIRED_PX // relief.places.size))
-    steps = np.linspace(0.0, 1.0, most) ** 1.5 * (len(near) - 1)
-    some = near[np.unique(steps.round().astype(int))]
-    distance = np.empty((N_DRAWS, len(some)), np.float32)
-    for i in np.unique(some[:, 0]).tolist():
-        da, db = relief.change(float(grid.sigmas_um[i]))
-        for column in np.flatnonzero(some[:, 0] == i).tolist():
-            alpha = np.float32(grid.alphas[some[column, 1]])
-            a, b = -(relief.along + alpha * da), -(relief.across + alpha * db)
-            counts = kernels.count_in_groups(a, b, group, groups, buckets.bins, buckets.limit)
-            gap = counts.sum(axis=0) / relief.places.size - buckets.target
-            apart = normal_blocks.residuals_of(np.asarray(counts[both], np.float64)) - theirs
-            used = np.flatnonzero((gap != 0.0) | apart.any(axis=0))
-            moved = factors @ apart[:, used].astype(np.float32)
-            distance[:, column] = np.abs(gap[used].astype(np.float32) + moved).sum(axis=1)
-    return _widths(grid, some, distance.argmin(axis=1))
+        Parameters
+        ----------
+        scatter : ndarray, shape (blocks, buckets)
+            Of `BlockCounts.scatter`.
+        """
+        near = nearly_as_good(self.grid, self.found, DRAWN_SIGMAS * self.noise)
+        some = near[np.unique(np.linspace(0, len(near) - 1, MAX_DRAWN).round().astype(int))]
+        gap = self.found.shares(self.grid, some) - self.grid.buckets.target
+        used = np.flatnonzero(gap.any(axis=0) | scatter.any(axis=0))
+        gap, scatter = gap[:, used], scatter[:, used]
+        best = np.empty(N_DRAWS, int)
+        for draw in range(N_DRAWS):
+            moved = self.rng.standard_normal(len(scatter)) @ scatter
+            best[draw] = int(np.argmin(np.abs(gap + moved).sum(axis=1)))
+        return _widths(self.grid, some, best)
+
+    def widths_of_pair(self, target_blocks: Float64Array, growth: float) -> HalfWidths | None:
+        """Return ways of the best that most drawn pairs of histograms of one skin stay within.
+
+        Parameters
+        ----------
+        target_blocks : ndarray, shape (blocks, buckets)
+            Counts behind the target in the skin of each block of the relief, of `of_kernel`.
+        growth : float
+            Of `BlockCounts`. Of the relief's roughness, not of its difference from the target's:
+            how many furrows a patch has is what the next patch differs by.
+
+        Returns
+        -------
+        HalfWidths or None
+            None where fewer than `MIN_BLOCKS` blocks are in both maps.
+        """
+        grid, relief, buckets = self.grid, self.grid.relief, self.grid.buckets
+        group, groups = normal_blocks.block_of(relief.places, relief.code.shape)
+        ours = np.bincount(group, minlength=groups)
+        both = np.flatnonzero((ours > 0) & (target_blocks.sum(axis=1) > 0))
+        if len(both) < MIN_BLOCKS:
+            return None
+        theirs = normal_blocks.residuals_of(target_blocks[both])
+        factors = self.rng.standard_normal((N_DRAWS, len(both)))
+        factors = np.float32(math.sqrt(len(both) / (len(both) - 1) * growth)) * factors
+        factors = factors.astype(np.float32)
+        near = nearly_as_good(grid, self.found, PAIRED_SIGMAS * self.noise)
+        # dense about the best, sparse where hardly a draw comes
+        most = max(MAX_DRAWN, min(MAX_PAIRED, MAX_PAIRED * PAIRED_PX // relief.places.size))
+        steps = np.linspace(0.0, 1.0, most) ** 1.5 * (len(near) - 1)
+        some = near[np.unique(steps.round().astype(int))]
+        distance = np.empty((N_DRAWS, len(some)), np.float32)
+        for i in np.unique(some[:, 0]).tolist():
+            da, db = relief.change(float(grid.sigmas_um[i]))
+            for column in np.flatnonzero(some[:, 0] == i).tolist():
+                alpha = np.float32(grid.alphas[some[column, 1]])
+                a, b = -(relief.along + alpha * da), -(relief.across + alpha * db)
+                counts = kernels.count_in_groups(a, b, group, groups, buckets.bins, buckets.limit)
+                gap = counts.sum(axis=0) / relief.places.size - buckets.target
+                apart = normal_blocks.residuals_of(np.asarray(counts[both], np.float64)) - theirs
+                used = np.flatnonzero((gap != 0.0) | apart.any(axis=0))
+                moved = factors @ apart[:, used].astype(np.float32)
+                distance[:, column] = np.abs(gap[used].astype(np.float32) + moved).sum(axis=1)
+        return _widths(grid, some, distance.argmin(axis=1))
 
 
 def of_grid(widths: HalfWidths, grid: KernelGrid) -> HalfWidths:
     """Return half widths with the grid's own: a step over sqrt(12), as of an even error."""
     step = [float(np.diff(g).min()) if g.size > 1 else 0.0 for g in (grid.alphas, grid.sigmas_um)]
-    (alpha, alpha_95), (sigma, sigma_95) = (
-        tuple(
-            math.hypot(w, factor * s / math.sqrt(12.0))
-            for w, factor in zip(told, (1.0, GAUSSIAN_95), strict=True)
-        )
-        for told, s in zip((widths.alpha, widths.sigma_um), step, strict=True)
-    )
-    return HalfWidths((alpha, alpha_95), (sigma, sigma_95))
+
+    def widened(width: tuple[float, float], even: float) -> tuple[float, float]:
+        own = even / math.sqrt(12.0)
+        return math.hypot(width[0], own), math.hypot(width[1], GAUSSIAN_95 * even / math.sqrt(12.0))
+
+    return HalfWidths(widened(widths.alpha, step[0]), widened(widths.sigma_um, step[1]))
 
 
 def _widths(grid: KernelGrid, some: Int64Array, best: NDArray[np.intp]) -> HalfWidths:

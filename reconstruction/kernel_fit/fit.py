@@ -10,12 +10,12 @@ References
 Nagano et al. 2015, ACM Trans. Graph. 34(4), 109. doi:10.1145/2766894
 """
 
-import math
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.checks import Checks
 from model.microstructure import ALPHA_LIMITS
 from reconstruction import normal_histogram
 from reconstruction.arrays import Float64Array, FloatArray
@@ -30,6 +30,8 @@ ALPHA_GRID = np.round(np.linspace(*ALPHA_LIMITS, 301), 2)
 """The paper's grid of strengths, by 0.01."""
 SIGMAS_UM = np.linspace(1.0, 100.0, 199)
 """The paper's grid of standard deviations, by 0.5 um."""
+BUCKET_LIMIT = 1.0
+"""Buckets span all components of normals."""
 
 
 def fit_kernel(
@@ -40,11 +42,9 @@ def fit_kernel(
     axis: Axis,
     pixel_um: float | tuple[float, float],
     bins: int = 64,
-    limit: float = 1.0,
     search: Literal["hierarchical", "exhaustive"] = "hierarchical",
     stretch_across: float = 1.0,
     valid: ArrayLike | None = None,
-    y_up: bool = True,
     target_samples: float | None = None,
     target_blocks: NDArray[np.integer] | None = None,
     alphas: ArrayLike | None = None,
@@ -57,8 +57,8 @@ def fit_kernel(
     Parameters
     ----------
     neutral_height_um : array_like, shape (H, W)
-        Displacement map of the neutral skin, um; row 0 is the top when ``y_up``. Heights that are
-        not finite count as not valid.
+        Displacement map of the neutral skin, um; row 0 is the top. Heights that are not finite
+        count as not valid.
     target_histogram : ndarray, shape (bins, bins)
         Of the strained skin's normals, axes (n_y, n_x), as of `normal_histogram.histogram`; sums
         to 1, or to less where normals beyond the limit are counted in the whole.
@@ -68,7 +68,7 @@ def fit_kernel(
         Of the jaws: columns (x, 1) or rows (y, 0).
     pixel_um : float or (float, float)
         Side of a neutral pixel, or its height and width, um.
-    bins, limit
+    bins : int
         As of `normal_histogram.histogram`.
     search : {"hierarchical", "exhaustive"}
         The first returns what the second does, but for a chance of 1e-6 (`kernel_search`), in a
@@ -76,8 +76,6 @@ def fit_kernel(
     stretch_across : float
         Ratio of lengths across the axis; 1 as in the paper.
     valid : ndarray of bool, shape (H, W), optional
-    y_up : bool
-        True: y points to row 0, as in the target.
     target_samples : float, optional
         Effective number of samples behind the target (`NormalStatistics.effective_samples`); as
         many as behind the neutral relief by default. For `noise` and standard errors only.
@@ -102,9 +100,10 @@ def fit_kernel(
     KernelFitError
         For shapes, ranges or sums that do not fit, or a relief without slopes.
     HistogramError
-        For numbers of buckets and limits that make no histogram.
+        For numbers of buckets that make no histogram.
     """
-    normal_histogram.check_buckets(bins, limit)
+    check = Checks(KernelFitError)
+    normal_histogram.check_buckets(bins, BUCKET_LIMIT)
     target = _target(target_histogram, bins, transposed=axis in ("y", 0))
     relief = relief_of(
         neutral_height_um,
@@ -113,20 +112,16 @@ def fit_kernel(
         pixel_um=pixel_um,
         stretch_across=stretch_across,
         valid=valid,
-        y_up=y_up,
     )
     grid = KernelGrid(
         relief,
-        Buckets(target, bins, float(limit)),
-        _grid("alphas", ALPHA_GRID if alphas is None else alphas, *ALPHA_LIMITS),
-        _grid("sigmas_um", SIGMAS_UM if sigmas_um is None else sigmas_um, 1e-9, math.inf),
+        Buckets(target, bins, BUCKET_LIMIT),
+        _grid("alphas", ALPHA_GRID if alphas is None else alphas, str(list(ALPHA_LIMITS))),
+        _grid("sigmas_um", SIGMAS_UM if sigmas_um is None else sigmas_um, "[1e-9, inf)"),
     )
-    if search not in ("hierarchical", "exhaustive"):
-        raise KernelFitError(f'search: got {search!r}, expected "hierarchical" or "exhaustive"')
-    if first_sample < 2:
-        raise KernelFitError(f"first_sample: got {first_sample}, expected at least 2")
-    if not (target_samples is None or target_samples > 0):
-        raise KernelFitError(f"target_samples: got {target_samples}, expected above 0")
+    check.choice("search", search, ("hierarchical", "exhaustive"))
+    check.within("first_sample", first_sample, "[2, inf)")
+    check.within("target_samples", 1 if target_samples is None else target_samples, "(0, inf]")
     blocks = _blocks(target_blocks, relief, bins, transposed=axis in ("y", 0))
     rng = np.random.default_rng(seed)
     if search == "exhaustive":
@@ -139,22 +134,19 @@ def fit_kernel(
         )
 
 
-def _grid(name: str, values: ArrayLike, low: float, high: float) -> Float64Array:
+def _grid(name: str, values: ArrayLike, interval: str) -> Float64Array:
     grid = np.array(values, np.float64).reshape(-1)
-    if grid.size == 0 or not np.isfinite(grid).all() or (np.diff(grid) <= 0).any():
-        raise KernelFitError(f"{name}: got {grid}, expected finite increasing values")
-    if grid[0] < low or grid[-1] > high:
-        raise KernelFitError(f"{name}: got {grid[0]}...{grid[-1]}, expected {low}...{high}")
+    check = Checks(KernelFitError)
+    check.within(name, grid, interval)
+    check.require(grid.size and (np.diff(grid) > 0).all(), name, grid, "increasing values")
     return grid
 
 
 def _target(histogram: FloatArray, bins: int, *, transposed: bool) -> Float64Array:
-    shares = np.asarray(histogram, np.float64)
-    if shares.shape != (bins, bins):
-        raise KernelFitError(f"target_histogram: got shape {shares.shape}, expected {(bins, bins)}")
+    check = Checks(KernelFitError)
+    shares = check.numbers("target_histogram", histogram, (bins, bins), interval="[0, inf)")
     total = float(shares.sum())
-    if not np.isfinite(shares).all() or (shares < 0).any() or not 1e-6 < total < 1 + 1e-6:
-        raise KernelFitError(f"target_histogram: got a sum of {total:g}, expected shares up to 1")
+    check.within("sum of target_histogram", total, "(1e-6, 1.000001)")
     shares = shares.T if transposed else shares
     return np.append(shares.reshape(-1), max(1.0 - total, 0.0) if total < 1 - 1e-6 else 0.0)
 
@@ -166,14 +158,11 @@ def _blocks(
     if counts is None:
         return None
     parts = np.asarray(counts, np.float64)
-    shape = (relief.code.shape[0], relief.code.shape[1])
-    expected = (*normal_blocks.grid_of(shape, normal_blocks.BLOCKS_PER_SIDE), bins, bins)
+    grid = normal_blocks.grid_of(relief.code.shape)
     if transposed and parts.ndim == 4:
         parts = parts.transpose(1, 0, 3, 2)
-    if parts.shape != expected:
-        raise KernelFitError(f"target_blocks: got shape {np.shape(counts)}, expected {expected}")
-    if not np.isfinite(parts).all() or (parts < 0).any():
-        raise KernelFitError("target_blocks: got counts that are not finite or below 0")
-    flat = parts.reshape(expected[0] * expected[1], bins * bins)
+    check = Checks(KernelFitError)
+    flat = check.numbers("target_blocks", parts, (*grid, bins, bins), interval="[0, inf)")
+    flat = flat.reshape(grid[0] * grid[1], bins * bins)
     # beyond the limit nothing is in the target, either
     return np.append(flat, np.zeros((len(flat), 1)), axis=1)

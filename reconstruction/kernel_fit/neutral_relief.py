@@ -12,17 +12,17 @@ What is fixed, here and in `model.microstructure`:
   another bucket than in double precision.
 """
 
-import math
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from model.checks import Checks
 from model.microstructure import gaussian_weights
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
 from reconstruction.normal_histogram import kernels
-from reconstruction.normal_histogram.relief_slopes import SlopeError, pixel_sides, stencil
+from reconstruction.normal_histogram.relief_slopes import HistogramError, pixel_sides, stencil
 
 Axis = Literal["x", "y", 0, 1]
 
@@ -66,9 +66,8 @@ class Relief:
         in_row = known.sum(axis=1)
         object.__setattr__(self, "places", np.flatnonzero(known))
         object.__setattr__(self, "starts", (np.cumsum(in_row) - in_row).astype(np.int64))
-        along, across = self._leans(self.height_um)
-        object.__setattr__(self, "along", along)
-        object.__setattr__(self, "across", across)
+        for name, leans in zip(("along", "across"), self._leans(self.height_um), strict=True):
+            object.__setattr__(self, name, leans)
 
     def _leans(self, height: Float32Array) -> tuple[Float32Array, Float32Array]:
         """Return minus the slopes of heights at the samples, along and across: (N,), (N,)."""
@@ -96,13 +95,12 @@ def relief_of(
     pixel_um: float | tuple[float, float],
     stretch_across: float = 1.0,
     valid: ArrayLike | None = None,
-    y_up: bool = True,
 ) -> Relief:
     """Return a neutral relief, its axis of strain turned into rows, with its samples.
 
     Parameters
     ----------
-    neutral_height_um, stretch, axis, pixel_um, stretch_across, valid, y_up
+    neutral_height_um, stretch, axis, pixel_um, stretch_across, valid
         As of `kernel_fit.fit_kernel`.
 
     Raises
@@ -111,29 +109,26 @@ def relief_of(
         Without a single slope, for what is no map, mask or pixel, a stretch that is not finite
         and positive, or another axis.
     """
-    for name, r in (("stretch", stretch), ("stretch_across", stretch_across)):
-        if not (math.isfinite(r) and r > 0):
-            raise KernelFitError(f"{name}: got {r}, expected a finite ratio above 0")
-    if axis not in ("x", "y", 0, 1):
-        raise KernelFitError(f'axis: got {axis!r}, expected "x", "y", 1 or 0')
+    check = Checks(KernelFitError)
+    check.within("stretch", stretch, "(0, inf)")
+    check.within("stretch_across", stretch_across, "(0, inf)")
+    check.choice("axis", axis, ("x", "y", 1, 0))
     along_y = axis in ("y", 0)
     try:
         code = stencil(neutral_height_um, valid)
         down, right = pixel_sides(pixel_um)
-    except SlopeError as error:
+    except HistogramError as error:
         raise KernelFitError(f"of the neutral relief, {error}") from error
-    if not code.any():
-        raise KernelFitError("neutral_height_um: got no pixel with a slope, expected at least one")
+    check.require(code.any(), "neutral_height_um", "no pixel with a slope", "at least one")
     height = np.asarray(neutral_height_um, np.float64)
     good = _usable(height, valid)
     if along_y:
         height, good = height.T, good.T
         code = stencil(np.ascontiguousarray(height), good)
     filled = _filled(height, good).astype(np.float32)
-    to_top = -1.0 if y_up else 1.0
     if along_y:
-        return Relief(filled, code, to_top * down * stretch, right * stretch_across, down)
-    return Relief(filled, code, right * stretch, to_top * down * stretch_across, right)
+        return Relief(filled, code, -down * stretch, right * stretch_across, down)
+    return Relief(filled, code, right * stretch, -down * stretch_across, right)
 
 
 def _usable(height: Float64Array, valid: ArrayLike | None) -> BoolArray:

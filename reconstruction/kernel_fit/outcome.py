@@ -150,12 +150,9 @@ def summarize_search(
         told = kernel_errors.HalfWidths((math.inf, math.inf), (math.inf, math.inf))
     else:
         refined = _refined(grid, (i, j), distance)
-        pair = target_blocks is not None and kernel_errors.widths_of_pair(
-            grid, found, noise=noise, target_blocks=target_blocks, growth=blocks.growth, rng=rng
-        )
-        told = pair or kernel_errors.widths_of_best(
-            grid, found, noise=noise, scatter=blocks.scatter(theirs), rng=rng
-        )
+        draws = kernel_errors.Draws(grid, found, noise, rng)
+        pair = target_blocks is not None and draws.widths_of_pair(target_blocks, blocks.growth)
+        told = pair or draws.widths_of_best(blocks.scatter(theirs))
         told = kernel_errors.of_grid(told, grid)
     return KernelFit(
         alpha=alpha,

@@ -25,8 +25,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
-from reconstruction.kernel_fit.neutral_relief import Relief
+from reconstruction.kernel_fit.neutral_relief import KernelFitError, Relief
 from reconstruction.normal_histogram import kernels
 
 MAX_MISS_PROBABILITY = 1e-6
@@ -47,10 +48,6 @@ N_ANCHORS = 6
 """Kernels evaluated on all pixels between two samples."""
 KEPT_BYTES = 100_000_000
 """Most memory for counts of kernels evaluated on all pixels, which standard errors need again."""
-
-
-class KernelSearchError(ValueError):
-    """A search for kernels without anything to search."""
 
 
 Slopes = tuple[Float32Array, Float32Array]
@@ -144,14 +141,10 @@ class Found:
             Indices (sigma, alpha).
         """
         out = np.empty((len(wanted), grid.buckets.target.size))
-        missing = []
-        for row, (i, j) in enumerate(wanted.tolist()):
-            kept = self.counts.get((i, j))
-            if kept is None:
-                missing.append(row)
-            else:
-                out[row] = kept
-        rows = np.array(missing, int)
+        kept = np.array([(i, j) in self.counts for i, j in wanted.tolist()], bool)
+        for row in np.flatnonzero(kept):
+            out[row] = self.counts[wanted[row, 0], wanted[row, 1]]
+        rows = np.flatnonzero(~kept)
         for i in np.unique(wanted[rows, 0]):
             some = rows[wanted[rows, 0] == i]
             out[some] = grid.count(grid.sigmas_um[i], grid.alphas[wanted[some, 1]]).sum(axis=0)
@@ -165,14 +158,13 @@ def gentlest(
 
     Raises
     ------
-    KernelSearchError
+    KernelFitError
         Where the grid is empty, or there is not one distance a kernel.
     """
-    if not distance.size or distance.shape != (sigmas_um.size, alphas.size):
-        raise KernelSearchError(
-            f"distance: got shape {distance.shape} for {sigmas_um.size} sigmas and {alphas.size} "
-            "alphas, expected one distance a kernel, of one kernel at least"
-        )
+    shape = sigmas_um.size, alphas.size
+    good = distance.size and distance.shape == shape
+    expected = f"{shape} for sigmas and alphas, at least one of each"
+    Checks(KernelFitError).require(good, "distance", f"shape {distance.shape}", expected)
     i, j = np.nonzero(distance <= distance.min() + TIE_TOL)
     order = np.lexsort((-alphas[j], sigmas_um[i], np.abs(alphas[j])))
     return int(i[order[0]]), int(j[order[0]])
@@ -337,15 +329,8 @@ class _SampledChange:
             self.along = np.zeros((blocks, reach, self.SIZE), np.float32)
             self.across = np.zeros_like(self.along)
             right, down = np.float32(relief.right_um), np.float32(relief.down_um)
-            kernels.windows(
-                relief.height_um,
-                relief.code,
-                relief.places[chosen],
-                right,
-                down,
-                self.along,
-                self.across,
-            )
+            given = relief.height_um, relief.code, relief.places[chosen], right, down
+            kernels.windows(*given, self.along, self.across)
 
     def at(self, sigma_um: float) -> tuple[Float32Array, Float32Array]:
         """Return both changes, in the order of the chosen pixels."""

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import lsq_linear
 from scipy.special import fdtrc
 
+from model.checks import Checks
 from model.microstructure import ALPHA_LIMITS, KernelTable, kernel_parameters
 from reconstruction.arrays import BoolArray, Float64Array
 
@@ -121,32 +122,26 @@ def fit_table(
     KernelTableFitError
         For fewer than two points on a side that has any, or values beyond their ranges.
     """
+    check = Checks(KernelTableFitError)
     r, a, s = (np.asarray(v, np.float64).reshape(-1) for v in (stretch, alpha, sigma_um))
-    if not r.size == a.size == s.size:
-        raise KernelTableFitError(f"alpha, sigma_um: got {a.size}, {s.size}, expected {r.size}")
+    for name, values in (("alpha", a), ("sigma_um", s)):
+        check.shape(name, values, r.shape)
     w = np.ones((r.size, 2)) if weights is None else np.asarray(weights, np.float64)
     w = np.broadcast_to(w[:, None] if w.ndim == 1 else w, (w.shape[0], 2))
-    if w.shape != (r.size, 2) or not np.isfinite(w).all() or (w < 0).any():
-        raise KernelTableFitError(f"weights: got shape {w.shape}, expected {r.size} numbers >= 0")
-    if not 1 <= max_segments <= 4 or least_points < 1:
-        raise KernelTableFitError(
-            f"max_segments, least_points: got {max_segments}, {least_points}, expected 1...4, >= 1"
-        )
-    good = np.isfinite(np.stack([r, a, s])).all(axis=0) & (r > 0) & (s > 0)
-    good &= (a >= ALPHA_LIMITS[0]) & (a <= ALPHA_LIMITS[1])
-    if not good.all():
-        raise KernelTableFitError(
-            f"point {int(np.argmin(good))}: got NaN, or a value beyond r > 0, "
-            f"{ALPHA_LIMITS[0]} <= alpha <= {ALPHA_LIMITS[1]}, sigma > 0"
-        )
+    w = check.numbers("weights", w, (r.size, 2), interval="[0, inf)")
+    check.within("max_segments", max_segments, "[1, 4]")
+    check.within("least_points", least_points, "[1, inf)")
+    for point, (stretched, strength, width) in enumerate(zip(r, a, s, strict=True)):
+        check.within(f"point {point}, stretch", stretched, "(0, inf)")
+        check.within(f"point {point}, alpha", strength, str(list(ALPHA_LIMITS)))
+        check.within(f"point {point}, sigma_um", width, "(0, inf)")
     told = (np.abs(r - 1.0) > NEUTRAL_STRETCH_TOL) & (w > 0).all(axis=1)
     r, a, s, w = r[told], a[told], s[told], w[told]
     low, high = r < 1.0, r > 1.0
     for name, side in (("compression", low), ("stretching", high)):
-        if side.any() and np.unique(r[side]).size < 2:
-            raise KernelTableFitError(f"{name}: got one stretch ratio, expected at least two")
-    if r.size == 0:
-        raise KernelTableFitError("stretch: got no point beside the neutral one")
+        ratios = np.unique(r[side]).size
+        check.require(ratios != 1, name, "one stretch ratio", "at least two")
+    check.require(r.size, "stretch", "no point beside the neutral one", "some")
     order = np.argsort(r)
     r, a, s, w, low, high = r[order], a[order], s[order], w[order], low[order], high[order]
     points = _Points(r, a, w[:, 0])
@@ -161,8 +156,7 @@ def fit_table(
         # mean of the squares, with a floor for points that lie on lines
         mean = max(fit.rss / points.w.sum(), 1e-12)
         criterion[segments] = n * math.log(mean) + (2 * segments - 1) * math.log(n)
-    if not fits:
-        raise KernelTableFitError(f"alpha: got {n} points, expected more than a line's one slope")
+    check.require(fits, "alpha", f"{n} points", "more than a line's one slope")
     segments = min(criterion, key=lambda k: criterion[k])
     lines = fits[segments]
     covariance = lines.covariance()
@@ -202,16 +196,13 @@ def _design(r: Float64Array, breaks: Float64Array) -> Float64Array:
 def _lines(slopes: Float64Array, breaks: Float64Array) -> tuple[tuple[float, float], ...]:
     """Return (slope, intercept) of each line."""
     values = _design(breaks, breaks) @ slopes if breaks.size else np.zeros(0)
+    edges = np.concatenate([[-np.inf], breaks, [np.inf]])
     lines = []
     for k, m in enumerate(slopes):
-        if breaks.size == 0:
-            r0, v0 = 1.0, 0.0
-        else:
-            r0, v0 = breaks[max(k - 1, 0)], values[max(k - 1, 0)]
         # the line that holds the neutral kernel goes through it to the last digit
-        edges = np.concatenate([[-np.inf], breaks, [np.inf]])
-        if edges[k] < 1.0 <= edges[k + 1]:
-            r0, v0 = 1.0, 0.0
+        r0, v0 = 1.0, 0.0
+        if not edges[k] < 1.0 <= edges[k + 1]:
+            r0, v0 = breaks[max(k - 1, 0)], values[max(k - 1, 0)]
         lines.append((float(m), float(v0 - m * r0)))
     return tuple(lines)
 
@@ -400,20 +391,15 @@ def direction_dependence(
     KernelTableFitError
         For fewer than two directions, not more states than directions, or what is not finite.
     """
+    check = Checks(KernelTableFitError)
+    given = {"stretch": stretch, "alpha": alpha, "sigma_um": sigma_um, "angle_rad": angle_rad}
     r, a, s, angle = (
-        np.asarray(v, np.float64).reshape(-1) for v in (stretch, alpha, sigma_um, angle_rad)
+        check.numbers(name, np.ravel(values), (np.size(stretch),)) for name, values in given.items()
     )
-    if not r.size == a.size == s.size == angle.size:
-        raise KernelTableFitError(f"angle_rad: got {angle.size} entries, expected {r.size}")
-    for name, values in (("stretch", r), ("alpha", a), ("sigma_um", s), ("angle_rad", angle)):
-        if not np.isfinite(values).all():
-            raise KernelTableFitError(f"{name}: got NaN or infinity, expected finite numbers")
     directions, group = np.unique(angle, return_inverse=True)
     k = directions.size
-    if k < 2 or r.size <= k:
-        raise KernelTableFitError(
-            f"angle_rad: got {k} directions of {r.size} states, expected 2 or more, and more states"
-        )
+    got = f"{k} directions of {r.size} states"
+    check.require(2 <= k < r.size, "angle_rad", got, "2 or more, and more states")
     count = np.bincount(group, minlength=k)
     offsets, errors, chances = [], [], []
     for value, told in zip((a, s), kernel_parameters(r, table, extrapolate="refuse"), strict=True):

@@ -1,7 +1,6 @@
 """Normal histograms: counts, distances and their standard errors."""
 
 from reconstruction.normal_histogram.counting import (
-    HistogramError,
     bucket_counts,
     check_buckets,
     distance,
@@ -12,6 +11,7 @@ from reconstruction.normal_histogram.counting import (
     noise_floor,
     shares_of,
 )
+from reconstruction.normal_histogram.relief_slopes import HistogramError
 
 __all__ = [
     "HistogramError",

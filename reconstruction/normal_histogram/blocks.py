@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular
 
+from model.checks import Checks
 from reconstruction.arrays import Float64Array, FloatArray, Int64Array
 from reconstruction.normal_histogram import kernels
-from reconstruction.normal_histogram.counting import HistogramError, check_buckets
-from reconstruction.normal_histogram.relief_slopes import slopes, turned
+from reconstruction.normal_histogram.counting import check_buckets
+from reconstruction.normal_histogram.relief_slopes import HistogramError, slopes, turned
 
 BLOCKS_PER_SIDE = 8
 """A map is cut into so many blocks a side."""
@@ -29,7 +30,7 @@ MIN_BLOCKS = 5
 """Fewer tell neither how they scatter nor how they are alike."""
 
 
-def grid_of(shape: tuple[int, int], blocks: int) -> tuple[int, int]:
+def grid_of(shape: tuple[int, ...], blocks: int = BLOCKS_PER_SIDE) -> tuple[int, int]:
     """Return into how many rows and columns of blocks `block_of` cuts a map of (H, W) pixels.
 
     Examples
@@ -40,7 +41,9 @@ def grid_of(shape: tuple[int, int], blocks: int) -> tuple[int, int]:
     return max(1, min(blocks, shape[0] // 4)), max(1, min(blocks, shape[1] // 4))
 
 
-def block_of(places: Int64Array, shape: tuple[int, int], blocks: int) -> tuple[Int64Array, int]:
+def block_of(
+    places: Int64Array, shape: tuple[int, ...], blocks: int = BLOCKS_PER_SIDE
+) -> tuple[Int64Array, int]:
     """Return the block of pixels ``y * W + x``, and how many blocks there are.
 
     A map is cut into ``blocks`` along each axis, fewer where they would be below 4 pixels.
@@ -58,7 +61,6 @@ def block_counts(
     pixel: float | tuple[float, float],
     bins: int = 64,
     limit: float = 1.0,
-    y_up: bool = True,
     valid: ArrayLike | None = None,
     angle_rad: float = 0.0,
 ) -> Int64Array:
@@ -66,7 +68,7 @@ def block_counts(
 
     Parameters
     ----------
-    height, pixel, bins, limit, y_up, valid, angle_rad
+    height, pixel, bins, limit, valid, angle_rad
         As of `normal_histogram.histogram`.
     block : ndarray of int, shape (H, W)
         Of each pixel, 0 to `blocks` - 1; pixels with another number are left out.
@@ -84,12 +86,9 @@ def block_counts(
         For a map of blocks of another shape, and as of `normal_histogram.histogram`.
     """
     check_buckets(bins, limit)
-    if block.shape != np.shape(height) or blocks < 1:
-        raise HistogramError(
-            f"block: got shape {block.shape} and {blocks} blocks, expected {np.shape(height)} and "
-            "at least 1"
-        )
-    a, b, known = slopes(height, pixel=pixel, y_up=y_up, valid=valid)
+    Checks(HistogramError).shape("block", block, np.shape(height))
+    Checks(HistogramError).within("blocks", blocks, "[1, inf)")
+    a, b, known = slopes(height, pixel=pixel, valid=valid)
     known = known & (block >= 0) & (block < blocks)
     a, b = turned(a[known], b[known], angle_rad)
     group = np.asarray(block[known], np.int64)
@@ -213,7 +212,11 @@ def stderr_of_mean(
 
 
 def block_error(
-    values: FloatArray, group: Int64Array, groups: int, shape: tuple[int, int], blocks: int
+    values: FloatArray,
+    group: Int64Array,
+    groups: int,
+    shape: tuple[int, ...],
+    blocks: int = BLOCKS_PER_SIDE,
 ) -> tuple[float, float]:
     """Return the standard error of a mean of samples of a map, by its blocks.
 

@@ -9,24 +9,19 @@ References
 Nagano et al. 2015, ACM Trans. Graph. 34(4), 109. doi:10.1145/2766894
 """
 
-import math
-
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ive
 
+from model.checks import Checks
 from reconstruction.arrays import Float64Array, Int64Array
 from reconstruction.normal_histogram import kernels
 from reconstruction.normal_histogram.relief_slopes import (
-    SlopeError,
+    HistogramError,
     slopes,
     slopes_of_normals,
     turned,
 )
-
-
-class HistogramError(SlopeError):
-    """Normals, shares or settings that no histogram can be made of."""
 
 
 def bucket_counts(
@@ -59,8 +54,7 @@ def bucket_counts(
     check_buckets(bins, limit)
     p = np.ascontiguousarray(slope_x, np.float64).reshape(-1)
     q = np.ascontiguousarray(slope_y, np.float64).reshape(-1)
-    if p.shape != q.shape:
-        raise HistogramError(f"slope_y: got {q.size} slopes, expected {p.size}")
+    Checks(HistogramError).require(p.shape == q.shape, "slope_y", f"{q.size} slopes", f"{p.size}")
     with kernels.threads_for(100 * p.size):
         counts = kernels.count_slopes(p, q, bins, float(limit), kernels.threads()).sum(axis=0)
     return counts[:-1].reshape(bins, bins), int(counts[-1])
@@ -68,10 +62,8 @@ def bucket_counts(
 
 def check_buckets(bins: int, limit: float) -> None:
     """Refuse numbers of buckets and limits that make no histogram."""
-    if not 1 <= bins <= 4096:
-        raise HistogramError(f"bins: got {bins}, expected 1...4096")
-    if not 0 < limit <= 1:
-        raise HistogramError(f"limit: got {limit}, expected above 0 and at most 1")
+    Checks(HistogramError).within("bins", bins, "[1, 4096]")
+    Checks(HistogramError).within("limit", limit, "(0, 1]")
 
 
 def histogram(
@@ -115,7 +107,7 @@ def histogram(
     ------
     HistogramError
         Without a single slope or sample within the limit, and for buckets that are none.
-    SlopeError
+    HistogramError
         Of which it is one: for heights that are no map of real numbers, or a mask of another
         shape or type.
 
@@ -138,12 +130,8 @@ def from_slopes(
     angle_rad: float = 0.0,
 ) -> Float64Array:
     """Return the histogram of normals given as slopes dh/dx, dh/dy; see :func:`histogram`."""
-    given = np.asarray(slope_x, np.float64), np.asarray(slope_y, np.float64)
-    if not (np.isfinite(given[0]).all() and np.isfinite(given[1]).all()):
-        raise HistogramError("slope_x, slope_y: got NaN or infinity, expected finite slopes")
-    p, q = turned(*given, angle_rad)
-    counts, _ = bucket_counts(p, q, bins=bins, limit=limit)
-    return shares_of(counts)
+    p, q = turned(np.asarray(slope_x, np.float64), np.asarray(slope_y, np.float64), angle_rad)
+    return shares_of(bucket_counts(p, q, bins=bins, limit=limit)[0])
 
 
 def from_normals(
@@ -165,8 +153,7 @@ def from_normals(
 def shares_of(counts: Int64Array) -> Float64Array:
     """Return counts over their sum, of at least one sample."""
     total = int(counts.sum())
-    if total == 0:
-        raise HistogramError("height: got no sample within the limit, expected at least one")
+    Checks(HistogramError).require(total, "height", "no sample within the limit", "at least one")
     return counts / total
 
 
@@ -192,11 +179,9 @@ def distance(a: ArrayLike, b: ArrayLike) -> float:
     2.0
     """
     ours, theirs = np.asarray(a, np.float64), np.asarray(b, np.float64)
-    if ours.shape != theirs.shape:
-        raise HistogramError(f"b: got shape {theirs.shape}, expected {ours.shape}")
+    Checks(HistogramError).shape("b", theirs, ours.shape)
     apart = float(np.abs(ours - theirs).sum())
-    if not math.isfinite(apart):
-        raise HistogramError(f"a, b: got a sum of differences of {apart}, expected finite shares")
+    Checks(HistogramError).within("sum of differences of a and b", apart)
     return apart
 
 
@@ -233,11 +218,9 @@ def noise_floor(histogram: ArrayLike, samples: float, other_samples: float | Non
     (0.1128, 0.1128)
     """
     other = samples if other_samples is None else other_samples
-    if not (samples > 0 and other > 0):
-        raise HistogramError(f"samples: got {samples}, {other}, expected above 0")
+    Checks(HistogramError).within("samples", (samples, other), "(0, inf]")
     shares = np.asarray(histogram, np.float64)
-    if not (np.isfinite(shares).all() and (shares >= 0).all()):
-        raise HistogramError("histogram: got NaN, infinite or negative shares, expected 0...1")
+    Checks(HistogramError).within("histogram", shares, "[0, inf)")
     both = 1.0 / samples + 1.0 / other
     if both < np.finfo(np.float64).tiny:
         return 0.0

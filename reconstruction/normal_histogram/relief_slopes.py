@@ -10,12 +10,13 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 from reconstruction.normal_histogram import kernels
 
 
-class SlopeError(ValueError):
-    """A relief, normals or settings that no slopes can be taken of."""
+class HistogramError(ValueError):
+    """A relief, normals, shares or settings that no histogram can be made of."""
 
 
 def stencil(height: ArrayLike, valid: ArrayLike | None = None) -> UInt8Array:
@@ -36,7 +37,7 @@ def stencil(height: ArrayLike, valid: ArrayLike | None = None) -> UInt8Array:
 
     Raises
     ------
-    SlopeError
+    HistogramError
         For heights that are no map of real numbers, and a mask of another shape or type.
 
     Examples
@@ -61,9 +62,9 @@ def _map_of(height: ArrayLike) -> FloatArray:
     try:
         given = np.asarray(height)
     except ValueError as error:  # rows of a list that differ in length
-        raise SlopeError(f"height: got no array ({error}), expected a map (H, W)") from error
+        raise HistogramError(f"height: got no array ({error}), expected a map (H, W)") from error
     if given.ndim != 2 or given.dtype.kind not in "biuf":
-        raise SlopeError(
+        raise HistogramError(
             f"height: got {given.dtype} of shape {given.shape}, expected real numbers of shape "
             "(H, W); give the maps of a stack one by one"
         )
@@ -75,8 +76,7 @@ def _mask(valid: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray:
     if valid is None:
         return np.ones(shape, bool)
     mask = np.asarray(valid)
-    if mask.dtype != np.bool_ or mask.shape != shape:
-        raise SlopeError(f"valid: got {mask.dtype} {mask.shape}, expected bool {shape}")
+    Checks(HistogramError).mask("valid", mask, shape)
     return mask
 
 
@@ -85,7 +85,7 @@ def pixel_sides(pixel: float | tuple[float, float]) -> tuple[float, float]:
 
     Raises
     ------
-    SlopeError
+    HistogramError
         For other than one or two finite numbers above 0.
 
     Examples
@@ -94,8 +94,7 @@ def pixel_sides(pixel: float | tuple[float, float]) -> tuple[float, float]:
     ((6.0, 6.0), (6.0, 5.1))
     """
     sides = np.broadcast_to(np.asarray(pixel, np.float64), 2) if np.size(pixel) < 3 else np.zeros(2)
-    if not (np.isfinite(sides).all() and (sides > 0).all()):
-        raise SlopeError(f"pixel: got {pixel}, expected one or two finite numbers above 0")
+    Checks(HistogramError).within("pixel", sides, "(0, inf)")
     return float(sides[0]), float(sides[1])
 
 
@@ -128,7 +127,7 @@ def slopes(
 
     Raises
     ------
-    SlopeError
+    HistogramError
         As of :func:`stencil` and :func:`pixel_sides`.
 
     Examples
@@ -166,7 +165,7 @@ def slopes_of_normals(
 
     Raises
     ------
-    SlopeError
+    HistogramError
         For another shape, and a mask of another shape or type.
 
     Examples
@@ -176,8 +175,7 @@ def slopes_of_normals(
     ([0.5, 0.0], [True, False])
     """
     n = np.asarray(normals, np.float64)
-    if n.ndim < 1 or n.shape[-1] != 3:
-        raise SlopeError(f"normals: got shape {n.shape}, expected (..., 3)")
+    Checks(HistogramError).shape("normals", n, ("...", 3))
     known = np.isfinite(n).all(axis=-1) & (n[..., 2] > 0) & _mask(valid, n.shape[:-1])
     z = np.where(known, n[..., 2], 1.0)
     a, b = (np.where(known, -n[..., i] / z, 0.0) for i in (0, 1))
@@ -201,7 +199,7 @@ def turned(a: FloatArray, b: FloatArray, angle_rad: float) -> tuple[Float64Array
 
     Raises
     ------
-    SlopeError
+    HistogramError
         For vectors or an angle that are not finite.
 
     Examples
@@ -210,15 +208,11 @@ def turned(a: FloatArray, b: FloatArray, angle_rad: float) -> tuple[Float64Array
     >>> x.round(6).tolist(), y.round(6).tolist()
     ([0.0], [-1.0])
     """
-    if not math.isfinite(angle_rad):
-        raise SlopeError(f"angle_rad: got {angle_rad}, expected a finite angle")
+    Checks(HistogramError).require(
+        math.isfinite(angle_rad), "angle_rad", angle_rad, "a finite angle"
+    )
     for name, part in (("a", a), ("b", b)):
-        wrong = int(np.size(part) - np.count_nonzero(np.isfinite(part)))
-        if wrong:
-            raise SlopeError(
-                f"{name}: got {wrong} of {np.size(part)} values that are NaN or infinite, expected "
-                "finite ones: leave out what is masked"
-            )
+        Checks(HistogramError).within(name, part)
     if angle_rad == 0.0:
         return np.asarray(a, np.float64), np.asarray(b, np.float64)
     c, s = math.cos(angle_rad), math.sin(angle_rad)

@@ -72,7 +72,6 @@ def measure(
     pixel: float | tuple[float, float],
     bins: int = 64,
     limit: float = 1.0,
-    y_up: bool = True,
     valid: ArrayLike | None = None,
     angle_rad: float = 0.0,
     blocks: int = BLOCKS_PER_SIDE,
@@ -81,7 +80,7 @@ def measure(
 
     Parameters
     ----------
-    height, pixel, bins, limit, y_up, valid, angle_rad
+    height, pixel, bins, limit, valid, angle_rad
         As of `normal_histogram.histogram`.
     blocks : int
         The map is cut into ``blocks ** 2`` parts, whose scatter gives the standard errors; they
@@ -95,7 +94,7 @@ def measure(
     ------
     HistogramError
         Without a single sample within the limit, and for buckets that are none.
-    SlopeError
+    HistogramError
         For what is no map of real numbers, no mask or no pixel.
 
     Examples
@@ -106,10 +105,9 @@ def measure(
     (1600, 4, 0.0458, 0.0)
     """
     check_buckets(bins, limit)
-    a, b, known = slopes(height, pixel=pixel, y_up=y_up, valid=valid)
+    a, b, known = slopes(height, pixel=pixel, valid=valid)
     a, b = turned(a, b, angle_rad)
-    shape = (known.shape[0], known.shape[1])
-    group, groups = block_of(np.flatnonzero(known), shape, blocks)
+    group, groups = block_of(np.flatnonzero(known), known.shape, blocks)
     p, q = a[known], b[known]
     counts = kernels.count_in_groups(p, q, group, groups, bins, float(limit))
     outside = int(counts[:, -1].sum())
@@ -117,7 +115,7 @@ def measure(
     shares = shares_of(counts.sum(axis=0)).reshape(bins, bins)
     w = 1.0 / np.sqrt(1.0 + p * p + q * q)
     x, y = -p * w, -q * w
-    errors = [block_error((m - m.mean()) ** 2, group, groups, shape, blocks) for m in (x, y)]
+    errors = [block_error((m - m.mean()) ** 2, group, groups, known.shape, blocks) for m in (x, y)]
     growth = 0.5 * (errors[0][1] + errors[1][1])
     samples = int(counts.sum())
     occupied = int(np.count_nonzero(shares))

@@ -116,9 +116,8 @@ def order(stages: Sequence[Stage], want: Iterable[str]) -> list[Stage]:
     for stage in stages:
         for product in stage.makes:
             if product in maker:
-                raise StageError(
-                    f"product {product!r}: made by {maker[product].name!r} and {stage.name!r}"
-                )
+                both = f"{maker[product].name!r} and {stage.name!r}"
+                raise StageError(f"product {product!r}: made by {both}")
             maker[product] = stage
     ordered: list[Stage] = []
     visiting: list[str] = []
@@ -217,9 +216,8 @@ def run(
             progress(stage.name)
         made = stage.run(**{product: products[product] for product in stage.needs})
         if set(made) != set(stage.makes):
-            raise StageError(
-                f"stage {stage.name}: made {sorted(made)}, expected {sorted(stage.makes)}"
-            )
+            both = f"made {sorted(made)}, expected {sorted(stage.makes)}"
+            raise StageError(f"stage {stage.name}: {both}")
         products.update(made)
         ran.append(stage.name)
         if stage.name in reused:  # its maps were at hand, but not what only other stages need
@@ -263,26 +261,19 @@ def record(
     'its inputs have changed'
     """
     skipped = dict(outcome.left_out)
-    return tuple(_entry(stage.name, outcome, before, skipped) for stage in graph)
 
-
-def _entry(
-    name: str, outcome: Outcome, before: Mapping[str, str], skipped: Mapping[str, str]
-) -> dict[str, str]:
-    key = outcome.keys.get(name, "")
-    if name in outcome.reused:
-        done, why = "reused", "its inputs are the same"
-    elif name in outcome.ran:
-        done = "run"
-        if name not in before:
-            why = "it was not made before"
-        elif before[name] != key:
-            why = "its inputs have changed"
-        else:
-            why = "what it made is not kept, or not all of it"
-    else:
+    def entry(name: str) -> dict[str, str]:
+        key = outcome.keys.get(name, "")
         done, why = "skipped", skipped.get(name, "nothing wanted depends on it")
-    return {"stage": name, "done": done, "why": why, "inputs": key}
+        if name in outcome.reused:
+            done, why = "reused", "its inputs are the same"
+        elif name in outcome.ran:
+            done, why = "run", "what it made is not kept, or not all of it"
+            if before.get(name) != key:
+                why = "its inputs have changed" if name in before else "it was not made before"
+        return {"stage": name, "done": done, "why": why, "inputs": key}
+
+    return tuple(entry(stage.name) for stage in graph)
 
 
 def attributes_of(record: Any, names: str) -> dict[str, Any]:
@@ -308,14 +299,12 @@ def document_bytes(document: Mapping[str, Any]) -> bytes:
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
     if isinstance(value, Mapping):
         return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
     if isinstance(value, list | tuple):
         return [_plain(entry) for entry in value]
-    if isinstance(value, np.generic):
-        return _plain(value.item())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

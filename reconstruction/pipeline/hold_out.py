@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from model.checks import Checks
+
 FIELD_NAMES = ("lights", "views")
 
 
@@ -40,22 +42,16 @@ class HoldOut:
         HoldOut(lights=('L007', '23'), views=('C03',))
         """
         lists: dict[str, list[str]] = {}
-        field = ""
+        field, check = "", Checks(HoldOutError)
+        expected = "lights=NAMES,views=NAMES, each at most once, names or numbers joined by commas"
         for word in text.split(","):
             name, equals, first = word.partition("=")
             if equals:
                 field, word = name.strip(), first
-                if field not in FIELD_NAMES or field in lists:
-                    raise HoldOutError(
-                        f"hold-out: got {name.strip()!r} in {text!r}, expected "
-                        "lights=NAMES,views=NAMES, each at most once"
-                    )
+                known = field in FIELD_NAMES and field not in lists
+                check.require(known, "hold-out", f"{field!r} in {text!r}", expected)
                 lists[field] = []
-            if not field or not word.strip():
-                raise HoldOutError(
-                    f"hold-out: got {text!r}, expected lights=NAMES,views=NAMES with names or "
-                    "numbers joined by commas"
-                )
+            check.require(field and word.strip(), "hold-out", repr(text), expected)
             lists[field].append(word.strip())
         return HoldOut(tuple(lists.get("lights", ())), tuple(lists.get("views", ())))
 
@@ -92,15 +88,11 @@ NO_HOLD_OUT = HoldOut()
 
 
 def _found(field: str, asked: Sequence[str], there: Sequence[str]) -> tuple[str, ...]:
+    expected = f"names out of {', '.join(there)} or numbers from 0 to {len(there) - 1}"
     chosen = set()
     for word in asked:
-        if word in there:
-            chosen.add(word)
-        elif word.isascii() and word.isdigit() and int(word) < len(there):
-            chosen.add(there[int(word)])
-        else:
-            raise HoldOutError(
-                f"hold-out: got {word!r} among the {field}, expected names out of "
-                f"{', '.join(there)} or numbers from 0 to {len(there) - 1}"
-            )
+        number = int(word) if word.isascii() and word.isdigit() else len(there)
+        known = word in there or number < len(there)
+        Checks(HoldOutError).require(known, "hold-out", f"{word!r} among the {field}", expected)
+        chosen.add(word if word in there else there[number])
     return tuple(name for name in there if name in chosen)

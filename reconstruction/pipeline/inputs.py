@@ -128,10 +128,8 @@ class Inputs:
         if dome.scan is not None:
             found.scan = Path(dome.scan).read_bytes()
             if not found.scan.startswith(b"ply"):
-                raise InputsError(
-                    f"scan: got no PLY mesh in {dome.scan}; `skinrig import mesh` takes .obj and "
-                    ".ply"
-                )
+                hint = "`skinrig import mesh` takes .obj and .ply"
+                raise InputsError(f"scan: got no PLY mesh in {dome.scan}; {hint}")
             found.hashes["scan"] = hashlib.sha256(found.scan).hexdigest()
         if dome.basis is not None:
             found.basis = Path(dome.basis)
@@ -176,12 +174,9 @@ class Inputs:
         if self.calibration is not None:
             with suppress(calibration_store.CalibrationMissing):
                 found = calibration_store.load(self.calibration, kind)
+                rig, day = self.session.rig.name, self.on_date
                 calibration_store.require(
-                    found,
-                    rig=self.session.rig.name,
-                    serials=list(serials),
-                    on_date=self.on_date,
-                    kind=kind,
+                    found, rig=rig, serials=list(serials), on_date=day, kind=kind
                 )
                 content = (self.calibration / f"{kind}.json").read_bytes()
                 self.hashes[f"calibration {kind}"] = hashlib.sha256(content).hexdigest()

@@ -12,6 +12,7 @@ import numpy as np
 from capture import raw
 from capture.session import Session
 from capture.session.view import FrameRecord
+from model.checks import Checks
 from model.skin import MAP_UNITS, SkinMap
 from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
@@ -86,10 +87,8 @@ def _linear(frame: raw.RawFrame) -> tuple[Float32Array, BoolArray]:
 
 def _stack(session: Session) -> Stack:
     records = tuple(session.frames("olat"))
-    if len(records) < 3:
-        raise InputsError(
-            f"{session.path}: has {len(records)} frames under a light each, expected 3"
-        )
+    got = f"{len(records)} frames under a light each"
+    Checks(InputsError).require(len(records) >= 3, f"{session.path}", got, "3")
     exposures = [
         float(r.settings.get("exposure_s", 0.0)) * float(r.settings.get("iso", 100.0))
         for r in records
@@ -189,22 +188,14 @@ def _points_mm(shape: tuple[int, int], mm_per_px: float) -> Float64Array:
 
 
 def _estimate(stack: Stack, lights: Lights, *, robust: bool) -> NormalMaps:
-    alive = lights.alive
+    alive = slice(None) if lights.alive.all() else lights.alive
+    vectors = lights.vectors[alive]
     near: dict[str, Any] = {}
     if lights.near:
-        near = {
-            "light_positions_mm": lights.vectors[alive],
-            "points_mm": _points_mm(stack.inside.shape, lights.mm_per_px),
-        }
-    usable = stack.usable & stack.inside
-    everything = bool(alive.all())
-    return estimate_normals(
-        stack.gray if everything else stack.gray[alive],
-        lights.vectors[alive],
-        valid=usable if everything else usable[alive],
-        robust=robust,
-        **near,
-    )
+        points_mm = _points_mm(stack.inside.shape, lights.mm_per_px)
+        near = {"light_positions_mm": vectors, "points_mm": points_mm}
+    usable = (stack.usable & stack.inside)[alive]
+    return estimate_normals(stack.gray[alive], vectors, valid=usable, robust=robust, **near)
 
 
 def _roughness_of_field(found: NormalMaps, both: BoolArray) -> float:
@@ -246,8 +237,7 @@ def _albedo(
 ) -> SkinMap:
     """Fit each channel's albedo to the samples that agree with the gray fit."""
     n, gray = normals.values, gray_albedo
-    above = np.zeros((), np.float64)
-    below = np.zeros(stack.inside.shape)
+    above, below = np.zeros((), np.float64), np.zeros(stack.inside.shape)
     spread = OUTLIER_SIGMAS * gray.residual + 1e-6 * gray.albedo
     points = _points_mm(stack.inside.shape, lights.mm_per_px) if lights.near else None
     level = 1.0

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from capture.session import Session
 from model import store
+from model.checks import Checks
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.inputs import DomeOptions, Inputs, InputsError
@@ -40,25 +41,22 @@ class Recipe:
 def _flash() -> Recipe:
     from reconstruction.pipeline.flash import sequence
 
-    return Recipe(
-        sequence.MAP_NAMES, sequence.graph, sequence.FILE_NAMES, products=sequence.products
-    )
+    names = sequence.MAP_NAMES, sequence.graph, sequence.FILE_NAMES
+    return Recipe(*names, products=sequence.products)
 
 
 def _dome() -> Recipe:
     from reconstruction.pipeline.dome import stages as dome
 
-    return Recipe(
-        dome.MAP_NAMES, dome.graph, dome.FILE_NAMES, ("position",), maps_of_rank=dome.maps_of
-    )
+    names = dome.MAP_NAMES, dome.graph, dome.FILE_NAMES
+    return Recipe(*names, ("position",), maps_of_rank=dome.maps_of)
 
 
 def _gradient() -> Recipe:
     from reconstruction.pipeline.gradient import stages as gradient
 
-    return Recipe(
-        gradient.MAP_NAMES, gradient.graph, gradient.FILE_NAMES, products=gradient.products
-    )
+    names = gradient.MAP_NAMES, gradient.graph, gradient.FILE_NAMES
+    return Recipe(*names, products=gradient.products)
 
 
 def _probe() -> Recipe:
@@ -183,14 +181,11 @@ def reconstruct(
     current = previous.exists and previous.parameters.get("consent", []) == consent
     if not outcome.ran and current and set(products) <= set(previous.contents):
         return outcome
-    parameters = {
-        "kind": "appearance",
-        "session": Path(session).name,
-        "state": state,
-        "truth": truth,
-        "consent": consent,
-    }
-    store.write(out, _appearance(inputs, graph, outcome, products, previous, parameters))
+    named = {"kind": "appearance", "session": Path(session).name, "state": state, "truth": truth}
+    made = {name: outcome.products[name] for name in products}
+    store.write(
+        out, _appearance(inputs, graph, outcome, made, previous, {**named, "consent": consent})
+    )
     return outcome
 
 
@@ -198,21 +193,16 @@ def _require_fitting_options(session: Session, recipe: Recipe, dome: DomeOptions
     options = {"hold-out": dome.hold_out, "rank": dome.rank, "scan": dome.scan, "basis": dome.basis}
     given = [name for name, value in options.items() if value is not None]
     if given and recipe.maps_of_rank is None:
-        raise InputsError(
-            f"{', '.join(given)}: {session.path} is no session of the dome; leave out what only it "
-            "takes"
-        )
-    if dome.rank is not None and dome.rank < 1:
-        raise InputsError(f"rank: got {dome.rank}, expected 1 or more")
+        hint = "leave out what only it takes"
+        raise InputsError(f"{', '.join(given)}: {session.path} is no session of the dome; {hint}")
+    Checks(InputsError).within("rank", 1 if dome.rank is None else dome.rank, "[1, inf)")
 
 
 def _require_known(want: Sequence[str], maps: Sequence[str]) -> None:
-    known = ", ".join(maps)
-    if not want:
-        raise InputsError(f"want: got nothing, expected names out of {known}")
-    unknown = [name for name in want if name not in maps]
-    if unknown:
-        raise InputsError(f"want: got {unknown[0]!r}, expected names out of {known}")
+    check = Checks(InputsError)
+    check.require(want, "want", "nothing", f"names out of {', '.join(maps)}")
+    for name in want:
+        check.choice("want", name, maps)
 
 
 def _planned_products(
@@ -224,26 +214,21 @@ def _planned_products(
     """
     kept_names = recipe.expand(session, (*recipe.maps, *recipe.files))
     wanted = set(recipe.expand(session, (*want, *recipe.always)))
-    return [
-        name
-        for stage in graph
-        if wanted.intersection(stage.makes)
-        for name in stage.makes
-        if name in kept_names
-    ]
+    made = [name for stage in graph if wanted.intersection(stage.makes) for name in stage.makes]
+    return [name for name in made if name in kept_names]
 
 
 def _appearance(
     inputs: Inputs,
     graph: Sequence[stages.Stage],
     outcome: stages.Outcome,
-    products: Sequence[str],
+    made: Mapping[str, SkinMap | bytes],
     previous: _Previous,
     parameters: Mapping[str, object],
 ) -> SkinAppearance:
     """Return what was made, with what an older folder holds that is still current."""
     keys = stages.input_hashes(stages.order(graph, [p for s in graph for p in s.makes]))
-    kept = {name: outcome.products[name] for name in products}
+    kept = dict(made)
     for stage, held in previous.held(graph).items():
         if previous.keys[stage] == keys[stage]:
             kept |= {name: value for name, value in held.items() if name not in kept}
@@ -305,8 +290,9 @@ class _Previous:
 
     def held(self, graph: Sequence[stages.Stage]) -> dict[str, Mapping[str, SkinMap | bytes]]:
         """Return what the folder holds of each stage that it has the input hash of."""
-        of_stages = {
-            stage.name: {n: self.contents[n] for n in stage.makes if n in self.contents}
-            for stage in graph
-        }
-        return {name: held for name, held in of_stages.items() if held and name in self.keys}
+        of_stages: dict[str, Mapping[str, SkinMap | bytes]] = {}
+        for stage in graph:
+            held = {name: self.contents[name] for name in stage.makes if name in self.contents}
+            if held and stage.name in self.keys:
+                of_stages[stage.name] = held
+        return of_stages

@@ -27,9 +27,8 @@ class SensorNoise:
             Where the frame has none.
         """
         if frame.noise_profile is None:
-            raise InputsError(
-                f"{frame.path}: does not say how noisy the sensor is; calibrate the sensor"
-            )
+            what = "does not say how noisy the sensor is; calibrate the sensor"
+            raise InputsError(f"{frame.path}: {what}")
         scale, offset = frame.noise_profile
         span = frame.white - float(np.mean(frame.black))
         gain = 1.0 / max(scale * span, 1e-12)

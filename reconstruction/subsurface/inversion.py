@@ -35,13 +35,15 @@ doi:10.1145/383259.383319. Kienle and Patterson 1997, doi:10.1364/JOSAA.14.00024
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.checks import Checks
 from model.fresnel import ETA_SKIN
 from reconstruction.arrays import BoolArray, Float64Array, UInt8Array
 from reconstruction.subsurface import kernels, nearest
@@ -135,7 +137,7 @@ def invert(
             model = replace(model, error=error, bias=(0.0, 0.0))
         return fit_profiles(batch, model)
 
-    fits = layout.fit(batch, method, light, fit, PROFILES_PER_BATCH)
+    fits = layout.fit(batch, partial(profile_model, method, light), fit, PROFILES_PER_BATCH)
     return evaluate_fits(batch, fits, layout.shape, method)
 
 
@@ -185,7 +187,7 @@ def nearest_medium(
     _check_settings("photon_table", light)
     layout = _lay_out(radius_mm, reflectance_per_mm2, variance, valid)
     batch = layout.batch(_prior(nearest.LOG_FACTOR_SIGMA, nearest.NEAREST_MEDIUM_G, 0.0))
-    fits = layout.fit(batch, "photon_table", light, nearest.fit_nearest)
+    fits = layout.fit(batch, partial(profile_model, "photon_table", light), nearest.fit_nearest)
     return evaluate_fits(batch, fits, layout.shape, "photon_table", by_definition=True)
 
 
@@ -239,27 +241,21 @@ class _Layout:
     def fit(
         self,
         batch: ProfileBatch,
-        method: Method,
-        optics: Optics,
+        model_at: Callable[[Float64Array], ProfileModel],
         fit: Callable[[ProfileBatch, ProfileModel], Fits],
         most: int | None = None,
     ) -> Fits:
         """Fit all profiles, those of equal radii by one model, at most so many at a time."""
         parts = []
-        for radius_mm, rows in self._by_radius():
-            model = profile_model(method, np.ascontiguousarray(radius_mm), optics)
+        distinct, which = np.unique(self.radius_mm, axis=0, return_inverse=True)
+        which = np.broadcast_to(which.reshape(-1), self.y.shape[:1])
+        for number, radius_mm in enumerate(distinct):
+            rows, model = np.flatnonzero(which == number), model_at(np.ascontiguousarray(radius_mm))
             step = most or max(rows.size, 1)
             for begin in range(0, max(rows.size, 1), step):
                 some = rows[begin : begin + step]
                 parts.append((some, fit(batch.select(some), model)))
         return Fits.join(parts)
-
-    def _by_radius(self) -> Iterator[tuple[Float64Array, NDArray[np.intp]]]:
-        """Yield each set of radii with the rows that have it."""
-        distinct, which = np.unique(self.radius_mm, axis=0, return_inverse=True)
-        which = np.broadcast_to(which.reshape(-1), self.y.shape[:1])
-        for number, own in enumerate(distinct):
-            yield own, np.flatnonzero(which == number)
 
 
 def _prior(common_error: float, g: float, g_error: float) -> Float64Array:
@@ -278,15 +274,14 @@ def _lay_out(
     valid: ArrayLike | None,
 ) -> _Layout:
     """Check profiles and lay them out, see `invert`."""
+    check = Checks(SubsurfaceError)
     y = np.asarray(reflectance_per_mm2, np.float64)
-    if y.ndim == 0 or y.shape[-1] == 0:
-        raise SubsurfaceError(f"reflectance_per_mm2: got shape {y.shape}, expected (..., fibres)")
+    check.shape("reflectance_per_mm2", y, ("...", "fibres"))
     shape, full = y.shape[:-1], y.shape
     radius = np.asarray(radius_mm, np.float64)
     if radius.shape != full[-1:]:
         radius = _broadcast("radius_mm", radius, full)
-    if not np.all((radius >= 0.0) & np.isfinite(radius)):
-        raise SubsurfaceError("radius_mm: got negative or not finite values, expected at least 0")
+    check.within("radius_mm", radius, "[0, inf)")
     y = y.reshape(-1, full[-1])
     left_out = np.full(y.shape, LeftOut.USED, np.uint8)
 
@@ -318,14 +313,11 @@ def _broadcast(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArra
 
 
 def _check_settings(method: str, optics: Optics, **not_negative: float) -> None:
-    if method not in FIT_METHODS:
-        raise SubsurfaceError(f"method: got {method!r}, expected one of {', '.join(FIT_METHODS)}")
-    if optics.collection not in ("all", "fibre"):
-        raise SubsurfaceError(f'collection: got {optics.collection!r}, expected "all" or "fibre"')
-    if not 1.0 <= optics.eta < math.inf:
-        raise SubsurfaceError(f"eta: got {optics.eta}, expected a relative refractive index >= 1")
+    check = Checks(SubsurfaceError)
+    check.choice("method", method, FIT_METHODS)
+    check.choice("collection", optics.collection, ("all", "fibre"))
+    check.within("eta", optics.eta, "[1, inf)")
     for name in ("core_mm", "source_core_mm", "g", "g_error"):
         not_negative[name] = getattr(optics, name)
     for name, value in not_negative.items():
-        if not 0.0 <= value < math.inf:
-            raise SubsurfaceError(f"{name}: got {value}, expected a number of at least 0")
+        check.within(name, value, "[0, inf)")

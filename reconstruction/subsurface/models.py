@@ -181,7 +181,7 @@ class ProfileModel:
             part = slice(begin, begin + PROFILES_PER_BLOCK)
             given = weight[part].astype(np.float32)
             off = (log_reflectance[part] - middle).astype(np.float32)
-            with _blas().limit(limits=1):  # threads would wait for one another
+            with blas_threads().limit(limits=1):  # threads would wait for one another
                 score = np.concatenate([given * off, given], axis=1) @ grid
                 if common_error > 0.0:
                     left = (given * off).sum(axis=1, keepdims=True) - given @ curves.T
@@ -208,7 +208,8 @@ class ProfileModel:
 
 
 @lru_cache(maxsize=1)
-def _blas() -> ThreadpoolController:
+def blas_threads() -> ThreadpoolController:
+    """Return what limits the threads of products of matrices."""
     return ThreadpoolController().select(user_api="blas")
 
 
@@ -218,7 +219,7 @@ def _log_absorption(log_sigma_tr: Float64Array, log_sigma_s: Float64Array) -> Fl
     return np.asarray(log_sigma_s + np.log(x) - np.log1p(np.sqrt(1.0 + 2.0 * x)))
 
 
-def profile_model(method: Method, radius_mm: Float64Array, optics: Optics) -> ProfileModel:
+def profile_model(method: Method, optics: Optics, radius_mm: Float64Array) -> ProfileModel:
     """Return a method's model at some radii (F,)."""
     if method == "photon_table":
         return _tabled(radius_mm.tobytes(), optics)

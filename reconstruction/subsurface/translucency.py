@@ -20,16 +20,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
-from threadpoolctl import ThreadpoolController
 
+from model.checks import FINITE, Checks
 from model.translucency_population import weyrich_2005
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
+from reconstruction.subsurface.models import blas_threads
 
 TEXTURE_MM: Final = (200.0, 330.0)
 """What the width and the height of that texture measure on the skin near the middle of the face;
@@ -76,19 +76,16 @@ class TranslucencyPrior:
 
     def __post_init__(self) -> None:
         """Refuse deviations and lengths that are not positive."""
-        shape = np.shape(self.log_mean)
+        shape, check = np.shape(self.log_mean), Checks(TranslucencyError)
         for name in ("log_mean", "person_deviation", "place_deviation"):
             values = np.array(getattr(self, name), np.float64)
-            if values.ndim != 1 or values.shape != shape or not np.isfinite(values).all():
-                raise TranslucencyError(
-                    f"{name}: got shape {values.shape}, expected (C,), finite, as of log_mean"
-                )
-            if name != "log_mean" and not (values > 0).all():
-                raise TranslucencyError(f"{name}: got {values.tolist()}, expected above 0")
+            interval = FINITE if name == "log_mean" else "(0, inf)"
+            check.require(values.ndim == 1, name, f"shape {values.shape}", "(C,)")
+            check.shape(name, values, shape)
+            check.within(name, values, interval)
             values.setflags(write=False)
             object.__setattr__(self, name, values)
-        if not (math.isfinite(self.length_mm) and self.length_mm > 0):
-            raise TranslucencyError(f"length_mm: got {self.length_mm}, expected above 0, finite")
+        check.within("length_mm", self.length_mm, "(0, inf)")
 
 
 def population_prior() -> TranslucencyPrior:
@@ -214,15 +211,12 @@ def interpolate(
     at, sigma, stderr, good, labels = _checked(
         sites_uv, sigma_tr_per_mm, stderr_per_mm, valid, names, prior
     )
+    check = Checks(TranslucencyError)
+    check.within("shape", shape, "[1, inf)")
     rows, columns = shape
-    if rows < 1 or columns < 1:
-        raise TranslucencyError(f"shape: got {shape}, expected at least (1, 1)")
-    size = np.array(texture_mm, np.float64)
-    if size.shape != (2,) or not (np.isfinite(size).all() and (size > 0).all()):
-        raise TranslucencyError(f"texture_mm: got {texture_mm}, expected two lengths above 0")
+    size = check.numbers("texture_mm", texture_mm, (2,), interval="(0, inf)")
     skin = np.ones(shape, bool) if mask is None else np.asarray(mask, bool)
-    if skin.shape != tuple(shape):
-        raise TranslucencyError(f"mask: got shape {skin.shape}, expected {tuple(shape)}")
+    check.shape("mask", skin, tuple(shape))
     usable, left_out = _usable(sigma, stderr, good, labels)
     if not usable.any():
         why = "; ".join(f"{where}: {reason}" for where, reason in left_out)
@@ -248,7 +242,7 @@ def interpolate(
         posterior = _Posterior.of(places, prior, c)
         p_value[c] = posterior.p_value
         # products this small take longer on several threads than on one
-        with _blas().limit(limits=1):
+        with blas_threads().limit(limits=1):
             median, deviation = (a.astype(np.float32) for a in posterior.over(u_mm, v_mm))
         np.exp(median, out=values[..., c])
         np.multiply(values[..., c], np.sinh(deviation), out=half[..., c])
@@ -267,11 +261,6 @@ def interpolate(
     )
 
 
-@lru_cache(maxsize=1)
-def _blas() -> ThreadpoolController:
-    return ThreadpoolController().select(user_api="blas")
-
-
 def _checked(
     sites_uv: ArrayLike,
     sigma_tr_per_mm: ArrayLike,
@@ -280,26 +269,20 @@ def _checked(
     names: Sequence[str] | None,
     prior: TranslucencyPrior,
 ) -> tuple[Float64Array, Float64Array, Float64Array, BoolArray, list[str]]:
-    at = np.asarray(sites_uv, np.float64)
+    check = Checks(TranslucencyError)
+    at = check.numbers("sites_uv", sites_uv, ("S", 2), interval="[0, 1]")
     sigma = np.asarray(sigma_tr_per_mm, np.float64)
     stderr = np.asarray(stderr_per_mm, np.float64)
-    if at.ndim != 2 or at.shape[1] != 2 or not len(at):
-        raise TranslucencyError(f"sites_uv: got shape {at.shape}, expected (S, 2), S at least 1")
-    if not ((at >= 0) & (at <= 1)).all():
-        raise TranslucencyError(f"sites_uv: got {at.tolist()}, expected coordinates 0...1")
     expected = (len(at), prior.log_mean.size)
     good = np.ones(expected, bool)
     if valid is not None:
         good = np.array(valid, bool)
         good = np.repeat(good[:, None], expected[1], axis=1) if good.ndim == 1 else good
     for name, array in (("sigma_tr_per_mm", sigma), ("stderr_per_mm", stderr), ("valid", good)):
-        if array.shape != expected:
-            raise TranslucencyError(f"{name}: got shape {array.shape}, expected {expected}")
-    if (stderr[good] < 0).any():
-        raise TranslucencyError(f"stderr_per_mm: got {stderr[good].min()}, expected 0 or above")
+        check.shape(name, array, expected)
+    check.within("stderr_per_mm", np.nan_to_num(stderr[good]), "[0, inf]")
     labels = [str(k) for k in range(len(at))] if names is None else list(names)
-    if len(labels) != len(at):
-        raise TranslucencyError(f"names: got {len(labels)}, expected {len(at)}")
+    check.require(len(labels) == len(at), "names", len(labels), f"{len(at)}")
     return at, sigma, stderr, good, labels
 
 

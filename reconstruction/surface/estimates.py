@@ -13,17 +13,19 @@ from model import fresnel
 from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis, diffuse_albedo, photometric_stereo
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
-from reconstruction.brdf_basis import mixture_kernels
 from reconstruction.lumitexels import Lumitexels, boundary_kernels
 from reconstruction.photometric_stereo import half_vectors as half_vector_normals
 from reconstruction.surface import model_normals
+from reconstruction.surface.model_normals import (
+    LOBE_RELATIVE_ERROR,
+    MIN_NORMAL_COS_LIGHT,
+    MIN_NORMAL_COS_VIEW,
+    PointLobes,
+)
 
 MIN_LIGHTS: Final = 10
 MIN_VIEWS: Final = 2
 """A point lit or seen by fewer has no estimate."""
-MIN_NORMAL_COS_LIGHT: Final = 0.15
-MIN_NORMAL_COS_VIEW: Final = 0.2
-"""Normals are not estimated from flatter samples: the boundary's transmittance bends there."""
 GRAZING_COS: Final = 0.05
 """Light lower than this over the estimated surface is as good as none."""
 MIN_STRIP_COSINE: Final = 0.05
@@ -33,8 +35,6 @@ HIGHLIGHT_HALF_ANGLE_RAD: Final = np.radians(35.0)
 facets have a Beckmann slope of about 0.3 (Weyrich et al. 2005), of which 98 % lie below this."""
 PEAK_HALF_ANGLE_RAD: Final = np.radians(25.0)
 """The same where the lobes are known and taken off: only their peaks are left out."""
-LOBE_RELATIVE_ERROR: Final = 0.1
-"""Relative error of a fitted lobe, for the weight of samples in it."""
 LOBE_SCALE_ERROR_RATIO: Final = 3.8
 """Standard error of lobes' scale over what it were if every sample erred by itself. Samples of a
 point err alike: by the lobes' shape, the normal and the light from inside that was taken off. On
@@ -72,11 +72,6 @@ class PointValues:
         return PointValues(self.values[rows], self.stderr[rows], self.valid[rows])
 
 
-def transmitted(cos_light: FloatArray, cos_view: FloatArray) -> Float64Array:
-    """Return F_t(light) F_t(view), the share that the skin's boundary lets in and out again."""
-    return boundary_kernels.transmitted(np.asarray(cos_light), np.asarray(cos_view))
-
-
 def seen_enough(samples: Lumitexels) -> BoolArray:
     """Return which points have samples of enough lights and views, shape (P,)."""
 
@@ -91,13 +86,8 @@ def seen_enough(samples: Lumitexels) -> BoolArray:
 
 def normals_from_half_vectors(samples: Lumitexels) -> PointValues:
     """Return the published estimate: half vectors of each view's four brightest samples."""
-    found = half_vector_normals.estimate(
-        samples.f.mean(axis=-1),
-        samples.light_dir,
-        samples.view_dir,
-        samples.view,
-        valid=samples.valid,
-    )
+    ways = samples.light_dir, samples.view_dir, samples.view
+    found = half_vector_normals.estimate(samples.f.mean(axis=-1), *ways, valid=samples.valid)
     good = seen_enough(samples) & found.valid
     return _of_normals(found.normals, found.stderr_rad / np.sqrt(2.0), good)
 
@@ -147,7 +137,8 @@ def normals_from_shading(
             & (np.einsum("pmk,pk->pm", half, start) < np.cos(highlight_rad))
         )
         # the cosine that made f from the radiance is the scan's, not that of this round
-        scale = np.pi * samples.cos_light / np.maximum(transmitted(cos_light, cos_view), 1e-3)
+        passed = boundary_kernels.transmitted(cos_light, cos_view)
+        scale = np.pi * samples.cos_light / np.maximum(passed, 1e-3)
         found = photometric_stereo.estimate_normals(
             np.where(use, gray * scale, 0.0).T.astype(np.float32),
             light_dir,
@@ -267,11 +258,7 @@ def lobe_weights(
 
 
 def normals_from_remainder(
-    samples: Lumitexels,
-    normals: PointValues,
-    r_d: PointValues,
-    weights: Float64Array,
-    basis: BrdfBasis,
+    samples: Lumitexels, normals: PointValues, r_d: PointValues, lobes: PointLobes
 ) -> PointValues:
     """Return normals by photometric stereo of what fitted lobes leave of the samples.
 
@@ -281,25 +268,17 @@ def normals_from_remainder(
     ----------
     samples, normals, r_d
         Of P points.
-    weights
-        Shares of the basis, (P, K).
-    basis
-        The reduced basis.
+    lobes
+        Of the same points.
     """
     known = normals.valid & r_d.valid
     samples = at_normals(samples, normals)
-    lobes = mixture_kernels.evaluate(
-        basis.table,
-        np.where(known[:, None], weights, 0.0),
-        samples.light_dir,
-        samples.view_dir,
-        normals.values,
-    )
+    shine = lobes.where(known).evaluate(samples, normals.values)
     # a lobe is known no better than a few percent: where it is strong a sample says less
     bare = dataclasses.replace(
         samples,
-        f=samples.f - lobes[..., None],
-        variance=samples.variance + np.square(LOBE_RELATIVE_ERROR * lobes)[..., None],
+        f=samples.f - shine[..., None],
+        variance=samples.variance + np.square(LOBE_RELATIVE_ERROR * shine)[..., None],
     )
     start = np.where(known[:, None], normals.values, (0.0, 0.0, 1.0))
     found = normals_from_shading(bare, start, rounds=1, highlight_rad=PEAK_HALF_ANGLE_RAD)
@@ -310,8 +289,7 @@ def normals_from_all_light(
     samples: Lumitexels,
     normals: PointValues,
     r_d: PointValues,
-    weights: Float64Array,
-    basis: BrdfBasis,
+    lobes: PointLobes,
     *,
     now: Float64Array | None = None,
 ) -> PointValues:
@@ -322,7 +300,7 @@ def normals_from_all_light(
 
     Parameters
     ----------
-    samples, r_d, weights, basis
+    samples, r_d, lobes
         As in `normals_from_remainder`.
     normals
         By the light from inside alone.
@@ -333,17 +311,8 @@ def normals_from_all_light(
     if not len(rows):
         return normals
     start = normals.values if now is None else now
-    found = model_normals.estimate(
-        rows_of(samples, rows),
-        start[rows],
-        np.ones(len(rows), np.bool_),
-        r_d.values[rows].mean(axis=-1),
-        weights[rows],
-        basis,
-        lobe_error=LOBE_RELATIVE_ERROR,
-        least_cos_light=MIN_NORMAL_COS_LIGHT,
-        least_cos_view=MIN_NORMAL_COS_VIEW,
-    )
+    r_d_gray = r_d.values[rows].mean(axis=-1)
+    found = model_normals.estimate(rows_of(samples, rows), start[rows], r_d_gray, lobes[rows])
     ours = np.square(np.hypot(found.stderr_rad, LOBE_TILT_RAD))
     theirs = np.square(normals.stderr[rows, 0])
     share = np.where(found.valid, theirs / (theirs + ours), 0.0)[:, None]

@@ -7,13 +7,16 @@ Gauss and Newton on two tilts, with weights that hold how well lobes are known a
 outliers pull with constant force, halved while they do not lower the misfit.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model.brdf.tables import BrdfBasis
-from reconstruction.arrays import BoolArray, Float64Array
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.brdf_basis import mixture_kernels
 from reconstruction.lumitexels import Lumitexels, boundary_kernels
 
@@ -27,6 +30,32 @@ MAX_STEP_RAD: Final = np.radians(3.0)
 HUBER_SIGMAS: Final = 3.0
 SAMPLE_RELATIVE_ERROR: Final = 0.02
 """Relative error that every sample of the model has, for its weight."""
+LOBE_RELATIVE_ERROR: Final = 0.1
+"""Relative error of a fitted lobe, for the weight of samples in it."""
+MIN_NORMAL_COS_LIGHT: Final = 0.15
+MIN_NORMAL_COS_VIEW: Final = 0.2
+"""Normals are not estimated from flatter samples: the boundary's transmittance bends there."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointLobes:
+    """What the surface at each point reflects: shares of a basis, (P, K)."""
+
+    weights: Float64Array
+    basis: BrdfBasis
+
+    def __getitem__(self, rows: slice | NDArray[np.integer]) -> PointLobes:
+        """Return the lobes of some of the points."""
+        return PointLobes(self.weights[rows], self.basis)
+
+    def where(self, known: BoolArray) -> PointLobes:
+        """Return these lobes with none at points that are not known, (P,)."""
+        return PointLobes(np.where(known[:, None], self.weights, 0.0), self.basis)
+
+    def evaluate(self, samples: Lumitexels, normals: Float64Array) -> Float32Array:
+        """Return f_r of the lobes for samples at normals (P, 3)."""
+        ways = samples.light_dir, samples.view_dir
+        return mixture_kernels.evaluate(self.basis.table, self.weights, *ways, normals)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,17 +81,7 @@ class ModelNormals:
 
 
 def estimate(
-    samples: Lumitexels,
-    normals: Float64Array,
-    valid: BoolArray,
-    r_d: Float64Array,
-    weights: Float64Array,
-    basis: BrdfBasis,
-    *,
-    lobe_error: float,
-    least_cos_light: float,
-    least_cos_view: float,
-    steps: int = N_GAUSS_NEWTON_STEPS,
+    samples: Lumitexels, normals: Float64Array, r_d: Float64Array, lobes: PointLobes
 ) -> ModelNormals:
     """Move normals to where the model's samples fit the measured ones best.
 
@@ -72,49 +91,32 @@ def estimate(
         Of P points; f is that of the scan's cosine.
     normals : ndarray, shape (P, 3)
         Unit normals to begin from.
-    valid : ndarray of bool, shape (P,)
-        Points to move.
     r_d : ndarray, shape (P,)
         Mean of the channels.
-    weights : ndarray, shape (P, K)
-        Shares of the basis.
-    basis : BrdfBasis
-    lobe_error : float
-        Relative error of a fitted lobe, for the weight of samples in it.
-    least_cos_light, least_cos_view : float
-        Flatter samples are not used.
-    steps : int
-        Of Gauss and Newton.
+    lobes : PointLobes
+        Of the same points.
     """
     fit = _Fit(
         samples,
-        np.where(valid, r_d, 0.0),
-        np.where(valid[:, None], weights, 0.0),
-        basis,
-        lobe_error,
-        (least_cos_light, least_cos_view),
+        r_d,
+        lobes,
         gray=samples.f.mean(axis=-1).astype(np.float64),
         noise=np.where(samples.valid, samples.variance.mean(axis=-1), 1.0) / 3.0,
     )
-    n = np.where(valid[:, None], normals, (0.0, 0.0, 1.0)).astype(np.float64)
-    start = n
+    valid = np.ones(len(normals), np.bool_)
+    start = n = normals.astype(np.float64)
     state = fit.at(n)
     normal_matrix = np.broadcast_to(np.eye(2), (len(n), 2, 2))
-    for _ in range(steps):
+    for _ in range(N_GAUSS_NEWTON_STEPS):
         first, second = _tangents(n)
         slope = np.stack([fit.slope(n, axis) for axis in (first, second)], axis=-1)
-        pull = np.where(
-            state.misfit2 < HUBER_SIGMAS**2,
-            1.0,
-            HUBER_SIGMAS / np.sqrt(np.maximum(state.misfit2, 1)),
-        )
+        far = HUBER_SIGMAS / np.sqrt(np.maximum(state.misfit2, 1))
+        pull = np.where(state.misfit2 < HUBER_SIGMAS**2, 1.0, far)
         weight = np.where(state.use, pull / state.variance, 0.0)
         normal_matrix = np.einsum("pm,pmi,pmj->pij", weight, slope, slope)
         gradient = np.einsum("pm,pmi,pm->pi", weight, slope, fit.gray - state.value)
-        told = np.linalg.det(normal_matrix) > 1e-12 * np.square(
-            np.trace(normal_matrix, axis1=1, axis2=2)
-        )
-        told &= valid
+        size = np.trace(normal_matrix, axis1=1, axis2=2)
+        told = (np.linalg.det(normal_matrix) > 1e-12 * np.square(size)) & valid
         safe = np.where(told[:, None, None], normal_matrix, np.eye(2))
         step = np.where(told[:, None], np.linalg.solve(safe, gradient[..., None])[..., 0], 0.0)
         length = np.linalg.norm(step, axis=-1, keepdims=True)
@@ -159,28 +161,19 @@ class _Fit:
 
     samples: Lumitexels
     r_d: Float64Array
-    weights: Float64Array
-    basis: BrdfBasis
-    lobe_error: float
-    least_cos: tuple[float, float]
-    """Of light and view."""
+    lobes: PointLobes
     gray: Float64Array
     noise: Float64Array
 
     def at(self, normals: Float64Array) -> _State:
         value, lobes, cos_light, cos_view = self._predicted(normals)
-        use = self.samples.valid & (cos_light > self.least_cos[0]) & (cos_view > self.least_cos[1])
-        variance = (
-            self.noise
-            + np.square(self.lobe_error * lobes)
-            + np.square(SAMPLE_RELATIVE_ERROR * value)
-        )
+        use = self.samples.valid & (cos_light > MIN_NORMAL_COS_LIGHT)
+        use &= cos_view > MIN_NORMAL_COS_VIEW
+        variance = self.noise + np.square(LOBE_RELATIVE_ERROR * lobes)
+        variance += np.square(SAMPLE_RELATIVE_ERROR * value)
         misfit2 = np.square(self.gray - value) / variance
-        huber = np.where(
-            misfit2 < HUBER_SIGMAS**2,
-            misfit2,
-            2 * HUBER_SIGMAS * np.sqrt(misfit2) - HUBER_SIGMAS**2,
-        )
+        far = 2 * HUBER_SIGMAS * np.sqrt(misfit2) - HUBER_SIGMAS**2
+        huber = np.where(misfit2 < HUBER_SIGMAS**2, misfit2, far)
         # the weights move with the model: without their logarithm brighter lobes would cost less
         cost = np.where(use, huber + np.log(variance), 0.0).sum(axis=1)
         return _State(value, variance, misfit2, use, cost / np.maximum(use.sum(axis=1), 1))
@@ -198,9 +191,7 @@ class _Fit:
         s = self.samples
         cos_light = np.einsum("pmk,pk->pm", s.light_dir, normals)
         cos_view = np.einsum("pmk,pk->pm", s.view_dir, normals)
-        lobes = mixture_kernels.evaluate(
-            self.basis.table, self.weights, s.light_dir, s.view_dir, normals
-        )
+        lobes = self.lobes.evaluate(s, normals)
         through = boundary_kernels.transmitted(cos_light, cos_view)
         # the cosine that made f from the radiance is the scan's
         ratio = np.clip(cos_light, 0.0, None) / s.cos_light

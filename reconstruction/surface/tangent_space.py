@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 
 SMOOTHING_MM = 6.0
@@ -69,21 +70,17 @@ def frames(
     """
     points = np.asarray(position_mm, np.float64)
     good = np.asarray(valid, bool)
-    if points.ndim != 3 or points.shape[2] != 3 or good.shape != points.shape[:2]:
-        raise TangentSpaceError(
-            f"position_mm: got shape {points.shape} with valid {good.shape}, expected (H, W, 3)"
-        )
-    if not good.any():
-        raise TangentSpaceError("valid: got no texel with a surface")
-    if not (np.isfinite(smoothing_mm) and smoothing_mm >= 0):
-        raise TangentSpaceError(f"smoothing_mm: got {smoothing_mm}, expected 0 or more")
+    check = Checks(TangentSpaceError)
+    check.shape("position_mm", points, (*good.shape[:2], 3))
+    check.require(good.any(), "valid", "no texel with a surface", "some")
+    check.within("smoothing_mm", smoothing_mm, "[0, inf)")
     along_u, known_u = _slope(points, good, 1)
     along_v, known_v = _slope(points, good, 0)
     known = known_u & known_v
     if smoothing_mm > 0.0:
         texel = np.median(np.linalg.norm(along_u[known], axis=1)) if known.any() else 0.0
-        if not texel > 0.0:
-            raise TangentSpaceError("position_mm: neighboring texels lie on the same point")
+        got = "neighboring texels on the same point"
+        check.require(texel > 0.0, "position_mm", got, "a surface")
         sigma_px = smoothing_mm / float(texel)
         # slopes are smoothed, not points: a smoothed point is drawn inwards at the rim
         along_u, along_v = (_smoothed(s, known, sigma_px) for s in (along_u, along_v))
@@ -132,16 +129,14 @@ def tangent_normals(
     """
     given = np.asarray(normals, np.float64)
     axes, known = frames(position_mm, valid, smoothing_mm=smoothing_mm)
-    if given.shape != (*known.shape, 3):
-        raise TangentSpaceError(f"normals: got shape {given.shape}, expected {(*known.shape, 3)}")
+    Checks(TangentSpaceError).shape("normals", given, (*known.shape, 3))
     good = np.asarray(valid, bool) & known & np.isfinite(given).all(axis=2)
     turned = _unit(np.einsum("hwij,hwj->hwi", axes, np.where(good[..., None], given, 0.0)))
     turned[~good] = (0.0, 0.0, 1.0)
     error = None
     if stderr is not None:
         own = np.asarray(stderr, np.float64)
-        if own.shape != given.shape:
-            raise TangentSpaceError(f"stderr: got shape {own.shape}, expected {given.shape}")
+        Checks(TangentSpaceError).shape("stderr", own, given.shape)
         variance = np.einsum("hwij,hwj->hwi", axes**2, np.where(good[..., None], own**2, 0.0))
         error = np.sqrt(variance).astype(np.float32)
     return TangentNormals(turned.astype(np.float32), error, good)
@@ -149,26 +144,21 @@ def tangent_normals(
 
 def _slope(points: Float64Array, good: BoolArray, axis: int) -> tuple[Float64Array, BoolArray]:
     """Return the difference to the next texel along an axis, by both sides where both are there."""
-    step = np.diff(np.where(good[..., None], points, 0.0), axis=axis)
-    pair = np.logical_and(*(np.moveaxis(good, axis, 0)[s] for s in (slice(1, None), slice(-1))))
-    pair = np.moveaxis(pair, 0, axis)
-    step = np.where(pair[..., None], step, 0.0)
+    sides = [(slice(None),) * axis + (part,) for part in (slice(-1), slice(1, None))]
+    pair = good[sides[0]] & good[sides[1]]
+    step = np.where(pair[..., None], points[sides[1]] - points[sides[0]], 0.0)
     total, count = np.zeros(points.shape), np.zeros(good.shape)
-    for part in (slice(-1), slice(1, None)):
-        where = (part,) if axis == 0 else (slice(None), part)
-        total[where] += step
-        count[where] += pair
+    for side in sides:
+        total[side] += step
+        count[side] += pair
     return total / np.maximum(count, 1.0)[..., None], count > 0
 
 
 def _smoothed(values: Float64Array, known: BoolArray, sigma_px: float) -> Float64Array:
     weight = ndimage.gaussian_filter(known.astype(np.float64), sigma_px, truncate=3.0)
-    out = np.empty_like(values)
-    for k in range(values.shape[2]):
-        out[..., k] = ndimage.gaussian_filter(
-            np.where(known, values[..., k], 0.0), sigma_px, truncate=3.0
-        )
-    return out / np.maximum(weight, 1e-12)[..., None]
+    safe = np.where(known[..., None], values, 0.0)
+    out = ndimage.gaussian_filter(safe, sigma_px, truncate=3.0, axes=(0, 1))
+    return np.asarray(out / np.maximum(weight, 1e-12)[..., None])
 
 
 def _unit(vectors: Float64Array) -> Float64Array:

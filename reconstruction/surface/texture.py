@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -64,15 +65,10 @@ class SurfaceTexture:
             Texels that are not valid are filled from those around them.
         """
         trust = np.asarray(valid, np.float32)
+        drawn = partial(texture_fill.texels_from_points, self.texels, self.surface.faces)
         filled = texture_fill.densify(self.texels, self.surface.faces, values, trust)
-        _, weight = texture_fill.texels_from_points(
-            self.texels, self.surface.faces, np.ones(len(trust), np.float32), trust
-        )
-        spread = None
-        if stderr is not None:
-            spread, _ = texture_fill.texels_from_points(
-                self.texels, self.surface.faces, stderr, trust
-            )
+        _, weight = drawn(np.ones(len(trust), np.float32), trust)
+        spread = None if stderr is None else drawn(stderr, trust)[0]
         shape = filled.values.shape[:2] + (() if np.ndim(values) == 1 else (3,))
         return SkinMap(
             filled.values.reshape(shape),

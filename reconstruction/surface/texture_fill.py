@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float32Array, Int32Array
 
 FILL_SIZE_RANGE_PX: Final = (8, 8192)
@@ -68,11 +69,8 @@ def rasterize(corner_uv: ArrayLike, size: int) -> TexelMap:
         Where triangles overlap in the texture, the one of the lowest index counts.
     """
     uv = np.ascontiguousarray(corner_uv, np.float64)
-    if uv.ndim != 3 or uv.shape[1:] != (3, 2) or not np.isfinite(uv).all():
-        raise ValueError(f"corner_uv: got shape {uv.shape}, expected (F, 3, 2) finite numbers")
-    least, most = FILL_SIZE_RANGE_PX
-    if not least <= size <= most:
-        raise ValueError(f"size: got {size}, expected {least} to {most} texels")
+    Checks().numbers("corner_uv", uv.reshape(-1, *uv.shape[-2:]), (len(uv), 3, 2))
+    Checks().within("size", size, str(list(FILL_SIZE_RANGE_PX)))
     return TexelMap(*_rasterize(uv, size))
 
 
@@ -101,14 +99,11 @@ def texels_from_points(
     at = np.ascontiguousarray(at[:, None] if at.ndim == 1 else at)
     corners = np.ascontiguousarray(faces, np.int32)
     trust = np.ones(len(at), np.float32) if weight is None else np.asarray(weight, np.float32)
-    if at.ndim != 2 or trust.shape != (len(at),):
-        raise ValueError(
-            f"values: got shapes {at.shape} and {trust.shape}, expected (P, C) and (P,)"
-        )
-    if corners.ndim != 2 or corners.shape[1] != 3 or int(texels.face.max()) >= len(corners):
-        raise ValueError(f"faces: got shape {corners.shape}, expected those that were rasterized")
-    if corners.size and (corners.min() < 0 or corners.max() >= len(at)):
-        raise ValueError(f"faces: got points {corners.min()} to {corners.max()} of {len(at)}")
+    check = Checks()
+    check.require(at.ndim == 2, "values", f"shape {at.shape}", "(P, C)")
+    check.shape("weight", trust, (len(at),))
+    check.shape("faces", corners, (max(len(corners), int(texels.face.max()) + 1), 3))
+    check.within("faces", corners, f"[0, {len(at)})")
     trust = _checked_weight(trust, np.asarray(np.isfinite(at).all(axis=1)))
     safe = np.where(trust[:, None] > 0, at, np.float32(0.0))
     return _interpolate(texels.face, texels.weight, corners, safe, trust)
@@ -136,13 +131,10 @@ def push_pull(
     image = np.asarray(values, np.float32)
     layers = image if image.ndim == 3 else image[..., None]
     trust = np.asarray(weight, np.float32)
-    if layers.ndim != 3 or trust.shape != layers.shape[:2]:
-        raise ValueError(
-            f"weight: got shape {trust.shape} for values of shape {image.shape}, expected (H, W)"
-        )
+    Checks().require(layers.ndim == 3, "values", f"shape {image.shape}", "(H, W) or (H, W, C)")
+    Checks().shape("weight", trust, layers.shape[:2])
     wanted = np.ones(trust.shape, np.bool_) if mask is None else np.asarray(mask, np.bool_)
-    if wanted.shape != trust.shape:
-        raise ValueError(f"mask: got shape {wanted.shape}, expected {trust.shape}")
+    Checks().shape("mask", wanted, trust.shape)
     trust = _checked_weight(trust, np.isfinite(layers).all(axis=2) & wanted)
     safe = np.ascontiguousarray(np.where(trust[..., None] > 0, layers, np.float32(0.0)))
     levels = [(safe, trust)]
@@ -174,8 +166,7 @@ def _checked_weight(weight: Float32Array, usable: BoolArray) -> Float32Array:
     good = np.isfinite(weight) & usable
     # laid out by rows, however the weight was: the kernels are compiled for one layout
     known = np.where(good, weight, np.float32(0.0)).astype(np.float32, order="C")
-    if known.size and (known.min() < 0 or known.max() > 1):
-        raise ValueError(f"weight: got {known.min():g} to {known.max():g}, expected 0 to 1")
+    Checks().within("weight", known, "[0, 1]")
     return known
 
 

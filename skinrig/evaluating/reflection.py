@@ -13,8 +13,8 @@ from model.brdf.tables import BrdfBasis
 from model.skin import SkinAppearance
 from model.skin_reflectance import BASIS_FILE
 from reconstruction import brdf_basis
+from reconstruction.lumitexels.boundary_kernels import transmitted
 from reconstruction.pipeline.dome.lobes import weight_names
-from reconstruction.surface.estimates import transmitted
 from skinrig.appearances.contents import jointly_valid
 from skinrig.arrays import Float64Array
 from skinrig.evaluating.reflection_truth import TEST_FILE, sphere

@@ -14,6 +14,7 @@ from reconstruction.photometric_stereo import light_selection
 from reconstruction.photometric_stereo.light_selection import Information
 from reconstruction.surface import errors as surface_errors
 from reconstruction.surface import estimates as surface_estimates
+from reconstruction.surface import model_normals
 from rigsim.light.lateral import scatter_laterally
 from rigsim.light.led_light import white_intensity
 from rigsim.light.surface_brdf import skin_surface
@@ -114,8 +115,8 @@ def simulate_observation(
     to_view, _, seen = _toward(caster, start, normal, views)
     cos_light = np.einsum("plk,pk->pl", to_light, normal)
     cos_view = np.einsum("pvk,pk->pv", to_view, normal)
-    steep = cos_light > surface_estimates.MIN_NORMAL_COS_LIGHT
-    facing = cos_view > surface_estimates.MIN_NORMAL_COS_VIEW
+    steep = cos_light > model_normals.MIN_NORMAL_COS_LIGHT
+    facing = cos_view > model_normals.MIN_NORMAL_COS_VIEW
     half = to_light[:, :, None] + to_view[:, None]
     half /= np.linalg.norm(half, axis=-1, keepdims=True)
     matte = np.einsum("plvk,pk->plv", half, normal) < math.cos(

@@ -42,9 +42,12 @@ def test_channels_are_added_up_where_all_of_them_are_known(seed, sides, channels
     kept = images["x"].copy()
     valid = rng.random((*sides, channels)) < 0.8
     variance = rng.random((*sides, channels))
-    assert gradient_channels.channel_count(images) == channels
-    assert gradient_channels.channel_count({"x": np.zeros(sides)}) is None
-    found, noise = gradient_channels.summed(images, variance=variance, valid=valid, saturation=0.95)
+    samples = gradient_channels.PatternSamples(images, variance, valid, 0.95)
+    assert samples.channels == channels
+    flat = gradient_channels.PatternSamples({"x": np.zeros(sides)}, None, None, None)
+    assert flat.channels is None
+    whole = samples.summed()
+    found, noise = whole.patterns, whole.variance
     np.testing.assert_array_equal(images["x"], kept)
     for key, image in images.items():
         with np.errstate(invalid="ignore"):
@@ -52,9 +55,8 @@ def test_channels_are_added_up_where_all_of_them_are_known(seed, sides, channels
         np.testing.assert_array_equal(found[key][known], image.sum(axis=-1)[known])
         assert np.isnan(found[key][~known]).all()
     np.testing.assert_allclose(noise, variance.sum(axis=-1))
-    sensor = gradient_channels.summed(
-        images, variance=SensorNoise(2.0, 3.0), valid=None, saturation=None
-    )[1]
+    noisy = gradient_channels.PatternSamples(images, SensorNoise(2.0, 3.0), None, None)
+    sensor = noisy.summed().variance
     assert sensor.read_variance == 3.0 * channels
 
 
@@ -67,7 +69,8 @@ def test_maps_of_channels_are_told_apart_again(seed, sides, channels):
     whole = gradient_channels.joined(maps)
     for k, one in enumerate(maps):
         np.testing.assert_array_equal(whole.normals[..., k, :], one.normals)
-        albedo = gradient_channels.sliced({"albedo": whole.albedo}, k)["albedo"]
+        of_all = gradient_channels.PatternSamples({"albedo": whole.albedo}, None, None, None)
+        albedo = of_all.channel(k).patterns["albedo"]
         np.testing.assert_array_equal(albedo, one.albedo)
 
 

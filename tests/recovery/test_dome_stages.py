@@ -443,7 +443,7 @@ def test_as_many_lobes_are_made_as_are_asked_for(found):
 
 @pytest.mark.parametrize(
     ("rank", "want", "named"),
-    [(2, "basis_weight_2", "basis_weight_1"), (0, "normals", "1 or more")],
+    [(2, "basis_weight_2", "basis_weight_1"), (0, "normals", "rank: got 0")],
 )
 def test_lobes_beyond_those_asked_for_are_refused(found, rank, want, named):
     folder, _ = found

@@ -63,23 +63,16 @@ def seen_from(dome: Dome, rotation: Float64Array, shift_mm: Float64Array) -> Dom
     """
 
     def table(lights: LightTable) -> LightTable:
-        return dataclasses.replace(
-            lights,
-            position_mm=(lights.position_mm - shift_mm) @ rotation,
-            axis=lights.axis @ rotation,
-        )
+        place = (lights.position_mm - shift_mm) @ rotation
+        return dataclasses.replace(lights, position_mm=place, axis=lights.axis @ rotation)
 
-    cameras = tuple(
-        dataclasses.replace(
-            camera,
-            rotation=camera.rotation @ rotation,
-            translation_mm=camera.translation_mm + camera.rotation @ shift_mm,
-        )
-        for camera in dome.cameras
-    )
-    return dataclasses.replace(
-        dome, cameras=cameras, table=table(dome.table), lights=table(dome.lights)
-    )
+    def turned(camera: CameraPose) -> CameraPose:
+        shift = camera.translation_mm + camera.rotation @ shift_mm
+        rotated = camera.rotation @ rotation
+        return dataclasses.replace(camera, rotation=rotated, translation_mm=shift)
+
+    cameras, lights = tuple(map(turned, dome.cameras)), table(dome.lights)
+    return dataclasses.replace(dome, cameras=cameras, table=table(dome.table), lights=lights)
 
 
 def calibrated(inputs: Inputs, images: DomeImages) -> Dome:
@@ -106,11 +99,8 @@ def calibrated(inputs: Inputs, images: DomeImages) -> Dome:
     else:
         poses = geometry.poses_from(found, rig.subset(views=images.views))
         cameras = tuple(poses[view.name] for view in views)
-    lit = inputs.load(
-        "lights",
-        images.lights,
-        "the lights stand and shine as the rig's file draws them; the albedo has no absolute scale",
-    )
+    drawn = "the lights stand and shine as the rig's file draws them"
+    lit = inputs.load("lights", images.lights, f"{drawn}; the albedo has no absolute scale")
     lights_rig = rig.subset(lights=images.lights)
     lights = LightTable.nominal(lights_rig)
     # a calibration from spheres alone says nothing of strengths, one from the plate none of places

@@ -94,19 +94,17 @@ class DomeImages:
         self._kind, self._without = kind, without
         self._shots: dict[tuple[str, str], list[FrameRecord]] = {}
         for record in session.frames(kind):
-            key = record.camera, str(record.index["light"])
-            if without.holds(key[1], key[0]):
-                continue
-            self._shots.setdefault(key, []).append(record)
+            view, light = record.camera, str(record.index["light"])
+            if not without.holds(light, view):
+                self._shots.setdefault((view, light), []).append(record)
         if not self._shots:
             raise InputsError(f"{session.path}: has no frames of kind {kind!r}")
         views = {view for view, _ in self._shots}
         lights = {light for _, light in self._shots}
         self.views = tuple(v.name for v in session.rig.views if v.name in views)
         self.lights = tuple(x.name for x in session.rig.lights if x.name in lights)
-        exposures = sorted(
-            {int(r.index.get("exposure", 0)) for s in self._shots.values() for r in s}
-        )
+        shots = [record for records in self._shots.values() for record in records]
+        exposures = sorted({int(record.index.get("exposure", 0)) for record in shots})
         kept = [-1] if merge else exposures
         self.captures = tuple((light, exposure) for exposure in kept for light in self.lights)
         self._darks: dict[str, tuple[Float32Array, Float32Array] | None] = {}

@@ -10,6 +10,7 @@ import numpy as np
 
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
+from model.checks import Checks
 from model.skin import SkinMap
 from model.skin_reflectance import BASIS_FILE
 from reconstruction import brdf_basis
@@ -22,6 +23,7 @@ from reconstruction.scan.mesh import RefinedScan
 from reconstruction.surface import errors as surface_errors
 from reconstruction.surface import estimates
 from reconstruction.surface.estimates import PointValues
+from reconstruction.surface.model_normals import PointLobes
 from reconstruction.surface.texture import SurfaceTexture
 
 BASIS_RANK: Final = 4
@@ -88,11 +90,8 @@ class Samples:
             by_light = dataclasses.replace(samples, light=samples.light % self.lights)
             parts.append(estimate(part, by_light))
             self.tell(stage, part.stop / max(len(self.store.surface), 1))
-        return PointValues(
-            np.concatenate([p.values for p in parts]),
-            np.concatenate([p.stderr for p in parts]),
-            np.concatenate([p.valid for p in parts]),
-        )
+        arrays = zip(*((p.values, p.stderr, p.valid) for p in parts), strict=True)
+        return PointValues(*map(np.concatenate, arrays))
 
 
 def fit_lobes(
@@ -146,11 +145,9 @@ def _comparable(shares: Float64Array, materials: BrdfBasis, *, least: int) -> Fl
     some = total[total > 0]
     usual = float(np.median(some)) if len(some) else 0.0
     kept = (total > 0) & (total < MAX_RELATIVE_STRENGTH * usual)
-    if np.count_nonzero(kept) < least:
-        raise InputsError(
-            f"lobes: {np.count_nonzero(kept)} of {len(shares)} points show how the surface "
-            f"reflects, expected at least {least}; more lights or views would show it"
-        )
+    got = f"{np.count_nonzero(kept)} of {len(shares)} points that show how the surface reflects"
+    expected = f"at least {least}; more lights or views would show it"
+    Checks(InputsError).require(np.count_nonzero(kept) >= least, "lobes", got, expected)
     return shares[kept] / total[kept, None]
 
 
@@ -185,25 +182,24 @@ def refine_normals(
     texture: SurfaceTexture,
 ) -> Mapping[str, SkinMap | bytes]:
     """Refine normals and lobe weights in turn, and return them as maps with the basis's file."""
+    lobes = PointLobes(weights, basis)
     started = lumitexels.collect(
         "normals by what lobes leave",
         lambda part, samples: estimates.normals_from_remainder(
-            samples, point_normals[part], point_r_d[part], weights[part], basis
+            samples, point_normals[part], point_r_d[part], lobes[part]
         ),
     )
     known = point_normals.valid & point_r_d.valid
-    inside = PointValues(
-        np.where(started.valid[:, None], started.values, point_normals.values),
-        np.where(started.valid[:, None], started.stderr, point_normals.stderr),
-        known,
-    )
+    moved = started.valid[:, None]
+    values = np.where(moved, started.values, point_normals.values)
+    inside = PointValues(values, np.where(moved, started.stderr, point_normals.stderr), known)
     found, rank = inside, weights.shape[1]
     for turn in range(N_REFINEMENTS):
         of_turn = f"{turn + 1} of {N_REFINEMENTS}"
         found = lumitexels.collect(
             f"normals by all light, {of_turn}",
-            lambda part, samples, n=found.values, w=weights: estimates.normals_from_all_light(  # type: ignore[misc]
-                samples, inside[part], point_r_d[part], w[part], basis, now=n[part]
+            lambda part, samples, n=found.values, own=lobes: estimates.normals_from_all_light(  # type: ignore[misc]
+                samples, inside[part], point_r_d[part], own[part], now=n[part]
             ),
         )
         fitted = lumitexels.collect(
@@ -212,16 +208,12 @@ def refine_normals(
                 samples, n[part], point_r_d[part], basis
             ),
         )
-        weights = fitted.values[:, :rank]
-    maps = {
-        name: texture.map(
-            fitted.values[:, k], fitted.stderr[:, k], fitted.valid, "1", "share of a common mixture"
-        )
-        for k, name in enumerate(weight_names(rank))
-    }
-    maps["lobe_residual"] = texture.map(
-        fitted.values[:, rank], None, fitted.valid, "1/sr", "weighted RMS of samples - model"
-    )
+        lobes = PointLobes(fitted.values[:, :rank], basis)
+    maps, good, what = {}, fitted.valid, "share of a common mixture"
+    for k, name in enumerate(weight_names(rank)):
+        maps[name] = texture.map(fitted.values[:, k], fitted.stderr[:, k], good, "1", what)
+    what = "weighted RMS of samples - model"
+    maps["lobe_residual"] = texture.map(fitted.values[:, rank], None, good, "1/sr", what)
     found = surface_errors.of_normals(found, surface, dome.pixel_mm)
     refined = texture.normals(found, "by the whole model, world frame")
     return {BASIS_FILE: basis_file, "normals_refined": refined, **maps}

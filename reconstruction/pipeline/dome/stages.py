@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from model.checks import Checks
 from model.skin import SkinMap
 from model.skin_reflectance import BASIS_FILE
 from model.vectors import unit_vectors
@@ -52,16 +53,8 @@ TEXTURE_LIMITS: Final = (128, 2048)
 
 def maps_of(rank: int = BASIS_RANK) -> tuple[str, ...]:
     """Return the names of the maps that can be made of a dome session."""
-    return (
-        "position",
-        "half_vector_normals",
-        "normals",
-        "r_d",
-        *weight_names(rank),
-        "lobe_residual",
-        "normals_refined",
-        "samples",
-    )
+    first = ("position", "half_vector_normals", "normals", "r_d")
+    return (*first, *weight_names(rank), "lobe_residual", "normals_refined", "samples")
 
 
 WEIGHT_NAMES = weight_names()
@@ -84,7 +77,9 @@ def graph(inputs: Inputs) -> list[stages.Stage]:
         "`skinrig calibrate lights` on sessions of the mirror spheres and the white target"
     )
     refused = "" if dome.absolute else unscaled
-    known = "surface lumitexels point_normals point_r_d"
+    seen, turned = "surface lumitexels texture", "surface lumitexels point_normals texture"
+    lit, lobes = "lumitexels point_normals point_r_d", "basis weights basis_file"
+    refined = f"normals_refined {weights} lobe_residual {BASIS_FILE}"
     return [
         stage("surface", "", "surface", partial(_surface, inputs, dome)),
         stage("texture", "surface", f"texture position {MESH_FILE}", _texture),
@@ -92,30 +87,13 @@ def graph(inputs: Inputs) -> list[stages.Stage]:
         stage("lumitexels", "surface motion", "lumitexels", partial(_lumitexels, dome)),
         stage("sample counts", "lumitexels texture", "samples", _counts),
         stage("half-vector normals", "lumitexels texture", "half_vector_normals", _half_vectors),
-        stage(
-            "normals",
-            "surface lumitexels texture",
-            "point_normals normals",
-            partial(_normals, dome),
-        ),
-        stage(
-            "albedo",
-            "surface lumitexels point_normals texture",
-            "point_r_d r_d",
-            partial(_albedo, dome),
-            refused,
-        ),
-        stage(
-            "lobes",
-            "lumitexels point_normals point_r_d",
-            "basis weights basis_file",
-            partial(fit_lobes, inputs),
-            ranks=list(RECORDED_RANKS),
-        ),
+        stage("normals", seen, "point_normals normals", partial(_normals, dome)),
+        stage("albedo", turned, "point_r_d r_d", partial(_albedo, dome), refused),
+        stage("lobes", lit, lobes, partial(fit_lobes, inputs), ranks=list(RECORDED_RANKS)),
         stage(
             "refined normals",
-            f"{known} basis weights basis_file texture",
-            f"normals_refined {weights} lobe_residual {BASIS_FILE}",
+            f"surface {lit} {lobes} texture",
+            refined,
             partial(refine_normals, dome),
         ),
     ]
@@ -145,9 +123,8 @@ def _surface(inputs: Inputs, dome: Dome) -> RefinedScan:
     """Clean and refine the scan, and lay it onto the dome."""
     session = inputs.session
     if inputs.scan is None and SCAN_FILE not in session.attachments():
-        raise InputsError(
-            f"session {session.id}: holds no scan; add one with `skinrig import mesh FILE`"
-        )
+        hint = "add one with `skinrig import mesh FILE`"
+        raise InputsError(f"session {session.id}: holds no scan; {hint}")
     _require(dome)
     footprint = dome.pixel_mm
     points = int(np.clip(FACE_MM2 / footprint**2, *POINT_LIMITS))
@@ -169,12 +146,11 @@ def _surface(inputs: Inputs, dome: Dome) -> RefinedScan:
 def _require(dome: Dome) -> None:
     """Refuse fewer views or lights than any point needs, and lights that lie in a plane."""
     views, lights = len(dome.cameras), int(np.count_nonzero(dome.lights.valid))
-    if views < estimates.MIN_VIEWS:
-        raise InputsError(f"views: got images of {views}, expected at least {estimates.MIN_VIEWS}")
-    if lights < estimates.MIN_LIGHTS:
-        raise InputsError(
-            f"lights: got {lights} that can be used, expected at least {estimates.MIN_LIGHTS}"
-        )
+    check = Checks(InputsError)
+    least = estimates.MIN_VIEWS
+    check.require(views >= least, "views", f"images of {views}", f"at least {least}")
+    least = estimates.MIN_LIGHTS
+    check.require(lights >= least, "lights", f"{lights} that can be used", f"at least {least}")
     place = dome.lights.position_mm[dome.lights.valid]
     photometric_stereo.require_spread(unit_vectors(place))
 
@@ -211,13 +187,10 @@ def _lumitexels(dome: Dome, surface: RefinedScan, motion: Motion | None) -> Samp
         binning=2,
         folder=None if folder is None else Path(folder.name),
     )
+    usable = dome.lights.valid if motion is None else dome.lights.valid & motion.usable
     for view in range(len(dome.cameras)):
         dome.tell("lumitexels", view / len(dome.cameras))
-        for capture in range(len(dome.images.captures)):
-            if not dome.lights.valid[capture]:
-                continue
-            if motion is not None and not motion.usable[capture]:
-                continue
+        for capture in np.flatnonzero(usable).tolist():
             image = dome.image(view, capture)
             store.add(view, capture, image.rgb, image.variance, image.valid)
     return Samples(store, folder, len(dome.table.names), dome.tell)

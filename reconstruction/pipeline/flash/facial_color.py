@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from model.checks import Checks
 from model.facial_color import HemoglobinRig
 from model.skin import MAP_UNITS, SkinMap
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
@@ -152,10 +153,8 @@ def fit(
         When there is no state beside the neutral, or none that can be laid over it.
     """
     states = subject.states
-    if len(states) < 2:
-        raise FacialColorFitError(
-            "sessions: show the neutral state alone, expected at least one other to make a rig of"
-        )
+    alone, expected = "the neutral state alone", "at least one other to make a rig of"
+    Checks(FacialColorFitError).require(len(states) > 1, "sessions", alone, expected)
     tell = progress or (lambda _: None)
     base = subject.of(NEUTRAL)[0]
     shape = base.maps["diffuse"].values.shape[:2]
@@ -206,14 +205,12 @@ def fit(
 
 def _one_melanin(subject: Subject, of_states: list[list[AlignedImage]]) -> SharedMelanin:
     """Average the images of each state, and fit one melanin to all."""
-    averages = [
-        repeat_average.average(
-            np.stack([one.rgb for one in images]),
-            np.stack([one.variance for one in images]),
-            np.stack([one.valid for one in images]),
-        )
-        for images in of_states
-    ]
+
+    def average(images: list[AlignedImage]) -> tuple[Float32Array, Float32Array, BoolArray]:
+        parts = zip(*((one.rgb, one.variance, one.valid) for one in images), strict=True)
+        return repeat_average.average(*map(np.stack, parts))
+
+    averages = [average(images) for images in of_states]
     rgb, variance, valid = (np.stack(parts) for parts in zip(*averages, strict=True))
     table, prior = colors_of_skin(subject.camera, subject.illuminant, has_white=subject.has_white)
     return shared_melanin.estimate_shared_melanin(
@@ -269,24 +266,17 @@ def _repeats(aligned: list[AlignedImage], *, timed: bool) -> Repeats | None:
     if len(set(states)) == len(states) or "hemoglobin" not in aligned[0].image.maps:
         return None
 
+    def laid(one: AlignedImage, name: str) -> tuple[Any, Any, Any]:
+        found, noise = one.image.maps[name], one.image.maps[name + NOISE_STDERR]
+        if one.alignment is None:
+            return found.values, noise.values, found.mask
+        values, good = one.alignment.warp(found.values, found.mask)
+        return values, one.alignment.warp_stderr(found.values, noise.values, found.mask), good
+
     def over(name: str) -> dict[str, Any]:
-        values, errors, good = [], [], []
-        for one in aligned:
-            found, noise = one.image.maps[name], one.image.maps[name + NOISE_STDERR]
-            both, error = (found.values, found.mask), noise.values
-            if one.alignment is not None:
-                error = one.alignment.warp_stderr(found.values, noise.values, found.mask)
-                both = one.alignment.warp(*both)
-            values.append(both[0])
-            errors.append(error)
-            good.append(both[1])
-        return {
-            "maps": np.stack(values),
-            "states": states,
-            "stderr": np.stack(errors),
-            "valid": np.stack(good),
-            "correlated_px": NOISE_CORRELATION_PX,
-        }
+        parts = zip(*(laid(one, name) for one in aligned), strict=True)
+        of_maps = zip(("maps", "stderr", "valid"), map(np.stack, parts), strict=True)
+        return dict(of_maps, states=states, correlated_px=NOISE_CORRELATION_PX)
 
     try:
         compared = repeatability.compare(**over("hemoglobin"))
@@ -396,17 +386,16 @@ def repeats_document(fit: FacialColorFit) -> dict[str, Any] | None:
         return None
 
     def rows(found: Sequence[Any], names: str) -> list[dict[str, Any]]:
-        values = (stages.attributes_of(one, names) for one in found)
         return [
-            {"region": one.name} | {name: _number(value) for name, value in row.items()}
-            for one, row in zip(found, values, strict=True)
+            {"region": one.name}
+            | {name: _number(value) for name, value in stages.attributes_of(one, names).items()}
+            for one in found
         ]
 
     of_regions = "pixels within between correlation correlation_stderr p_value scatters"
+    of_drifts, found = "slope_per_minute slope_stderr p_value drifts", fit.repeats.hemoglobin
     return {
-        "false_alarm": fit.repeats.hemoglobin.false_alarm,
-        "hemoglobin": rows(fit.repeats.hemoglobin.regions, f"{of_regions} change_to_scatter"),
-        "melanin_drift": rows(
-            fit.repeats.melanin_drift, "slope_per_minute slope_stderr p_value drifts"
-        ),
+        "false_alarm": found.false_alarm,
+        "hemoglobin": rows(found.regions, f"{of_regions} change_to_scatter"),
+        "melanin_drift": rows(fit.repeats.melanin_drift, of_drifts),
     }

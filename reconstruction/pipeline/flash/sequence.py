@@ -6,6 +6,7 @@ moved are laid over the face at rest. The curves take the times at which the fla
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from capture.plan.phases import phase_grid
 from capture.session import FrameRecord, Session
+from model.checks import Checks
 from model.skin import SkinMap
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from reconstruction.chromophores import model_error
@@ -51,25 +53,17 @@ def products(session: Session) -> Mapping[str, tuple[str, ...]]:
 def graph(inputs: Inputs) -> list[stages.Stage]:
     """Return the stages that a flash session can go through; see `stages.run`."""
     session = inputs.session
-    refused = ""
-    if not _timed(session):
-        refused = (
-            f"{session.path}: has no frames with a time, expected a sequence, such as "
-            "`skinrig capture flash --sequence smile` makes"
-        )
-
+    crossed = session.frames("subject", polarizer="crossed")
+    refused = (
+        f"{session.path}: has no frames with a time, expected a sequence, such as "
+        "`skinrig capture flash --sequence smile` makes"
+    )
+    if any("time_s" in record.line.actual for record in crossed):
+        refused = ""
     of_images = flash_stages.graph(inputs)
     stage = inputs.stage_maker(STAGE_REVISION)
     curves, identity = partial(_curves, inputs), model_error.identity()
     return [*of_images, stage(CURVES_NAME, "", CURVES_FILE, curves, refused, **identity)]
-
-
-def _timed(session: Session) -> list[FrameRecord]:
-    return [
-        record
-        for record in session.frames("subject", polarizer="crossed")
-        if "time_s" in record.line.actual
-    ]
 
 
 def _curves(inputs: Inputs) -> bytes:
@@ -93,11 +87,9 @@ def _curves(inputs: Inputs) -> bytes:
     blood = sequence_blood.blood_of_discs(warped, places, radius_px, light, moved=moved)
     means = blood.means
     if not means.valid.any():
-        raise InputsError(
-            f"{session.path}: no place of {', '.join(places)} shows a color of skin in "
-            "enough frames; "
-            + ("check the landmarks" if rig.white else "give it a calibration of white")
-        )
+        hint = "check the landmarks" if rig.white else "give it a calibration of white"
+        what = f"no place of {', '.join(places)} shows a color of skin in enough frames"
+        raise InputsError(f"{session.path}: {what}; {hint}")
     curves = zip(means.mean, means.stderr, means.pixels, blood.stderr_of_pose, strict=True)
     columns = ("hemoglobin", "stderr", "pixels", "stderr_of_pose")
     document: dict[str, Any] = {
@@ -137,21 +129,15 @@ def _places(
     """Return where the places lie on the face at rest, px."""
     skin = np.mean([m.mask for m, rest in zip(maps, at_rest, strict=True) if rest], axis=0) > 0.5
     if inputs.landmarks is None:
-        inputs.assumed.append(
-            "places: by the face's outline; a table of landmarks says where they are"
-        )
+        outline = "places: by the face's outline; a table of landmarks says where they are"
+        inputs.assumed.append(outline)
         return perfusion_curves.usual_places(skin)
-    table = landmark_table.read(inputs.landmarks)
-    found = {}
-    for name in perfusion_curves.FACE_PLACES:
-        named = name if name in table else LANDMARK_ALIASES.get(name, name)
-        if named in table:
-            found[name] = table[named]
-    if not found:
-        raise InputsError(
-            f"{inputs.landmarks}: names {', '.join(table) or 'nothing'}, expected one of "
-            f"{', '.join((*perfusion_curves.FACE_PLACES, *LANDMARK_ALIASES.values()))}"
-        )
+    table, names = landmark_table.read(inputs.landmarks), perfusion_curves.FACE_PLACES
+    named = {name: name if name in table else LANDMARK_ALIASES.get(name, name) for name in names}
+    found = {name: table[place] for name, place in named.items() if place in table}
+    got = ", ".join(table) or "nothing"
+    expected = f"one of {', '.join((*names, *LANDMARK_ALIASES.values()))}"
+    Checks(InputsError).require(found, f"names in {inputs.landmarks}", got, expected)
     return found
 
 
@@ -237,7 +223,9 @@ def _of_cycle(
         again[names[k]] = perfusion_curves.reproducibility(
             time[known][good], phase[known][good], value[good], cycle_s=cycle_s
         )
-    together = _fit_prompts(phase[known], known, blood, usable, cycle_s) if usable else None
+    of_all = None
+    if usable:
+        of_all = _of_fit(_fit_prompts(phase[known], known, blood, usable, cycle_s), None)
     return {
         "cycle_s": cycle_s,
         "order": np.flatnonzero(known)[np.argsort(phase[known], kind="stable")],
@@ -248,13 +236,10 @@ def _of_cycle(
             "largest_gap_s": float(gaps.max()),
             "aliased": grid.aliased,
         },
-        "reproducibility": {
-            name: {"sd": one.sd, "repeats": one.repeats, "longest_s": one.longest_s}
-            for name, one in again.items()
-        },
+        "reproducibility": {name: asdict(one) for name, one in again.items()},
         "transition": seen,
         "fits": fits,
-        "fit_of_all": None if together is None else _of_fit(together, None),
+        "fit_of_all": of_all,
     }
 
 
@@ -304,12 +289,8 @@ def _of_event(
 
     fits = {names[k]: _of_fit(fit(k), 0) for k in usable}
     before = {names[k]: float(np.nanmean(means.mean[k][~known])) for k in usable if (~known).any()}
-    together = fit(usable) if usable else None
-    return {
-        "before": before,
-        "fits": fits,
-        "fit_of_all": None if together is None else _of_fit(together, None),
-    }
+    of_all = _of_fit(fit(usable), None) if usable else None
+    return {"before": before, "fits": fits, "fit_of_all": of_all}
 
 
 def _of_fit(fit: perfusion_fit.RelaxationFit, curve: int | None) -> dict[str, Any]:
@@ -328,10 +309,5 @@ def _of_fit(fit: perfusion_fit.RelaxationFit, curve: int | None) -> dict[str, An
 
 
 def _of_transition(found: perfusion_curves.Transition, indices: Int64Array) -> dict[str, Any]:
-    names = "seen decided where tested false_alarm power high low noise"
-    document = stages.attributes_of(found, names)
-    return {
-        "seen": found.seen,
-        "decided": found.decided,
-        "frames": indices[document.pop("where")],
-    } | document
+    document = stages.attributes_of(found, "seen decided") | {"frames": indices[found.where]}
+    return document | stages.attributes_of(found, "tested false_alarm power high low noise")

@@ -90,11 +90,8 @@ def blood_of_discs(
     found = [
         _of_place(maps, name, place, radius_px, light, moved) for name, place in places.items()
     ]
-    joined = DiscMeans(
-        np.concatenate([one.mean for one, _ in found]),
-        np.concatenate([one.stderr for one, _ in found]),
-        np.concatenate([one.pixels for one, _ in found]),
-    )
+    parts = zip(*((one.mean, one.stderr, one.pixels) for one, _ in found), strict=True)
+    joined = DiscMeans(*map(np.concatenate, parts))
     return PlaceBlood(joined, np.array([of_pose for _, of_pose in found]), moved)
 
 

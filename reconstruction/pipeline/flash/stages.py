@@ -18,6 +18,7 @@ from capture.calibration.sensor.noise_model import QUANTIZATION_DN2
 from capture.calibration.store import Calibration
 from capture.session import FrameRecord, Session
 from model import color_table
+from model.checks import Checks
 from model.color_table import ColorTable
 from model.skin import MAP_UNITS, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
@@ -35,20 +36,9 @@ from reconstruction.pipeline.masked_map import masked_map
 STAGE_REVISION = 7
 """Grows when the code of a stage changes its result, so that older maps are computed again."""
 
-MAP_NAMES = (
-    "melanin",
-    "hemoglobin",
-    "shading",
-    "residual",
-    "gamut_distance",
-    "diffuse",
-    "specular",
-    "picture",
-    "specular_picture",
-    "tsumura_melanin",
-    "tsumura_hemoglobin",
-    "melanin_noise_stderr",
-    "hemoglobin_noise_stderr",
+MAP_NAMES = tuple(
+    "melanin hemoglobin shading residual gamut_distance diffuse specular picture specular_picture "
+    "tsumura_melanin tsumura_hemoglobin melanin_noise_stderr hemoglobin_noise_stderr".split()
 )
 """Maps that can be made of a flash session."""
 
@@ -93,33 +83,17 @@ def graph(inputs: Inputs) -> list[stages.Stage]:
     rig = rig_of(inputs)
     stage = inputs.stage_maker(STAGE_REVISION)
     table = {"camera": rig.camera, "illuminant": rig.illuminant}
+    which = {"state": inputs.state, "repeat": inputs.repeat}
+    by_color = table | model_error.identity()
+    of_skin = "melanin hemoglobin shading residual gamut_distance"
+    of_skin += " melanin_noise_stderr hemoglobin_noise_stderr"
+    both, shown = "diffuse specular", "picture specular_picture"
     return [
-        stage(
-            "frames",
-            "",
-            "parallel crossed",
-            partial(_frames, rig),
-            state=inputs.state,
-            repeat=inputs.repeat,
-        ),
-        stage("separation", "parallel crossed", "diffuse specular", partial(_separate, rig)),
-        stage(
-            "chromophores",
-            "diffuse",
-            "melanin hemoglobin shading residual gamut_distance melanin_noise_stderr "
-            "hemoglobin_noise_stderr",
-            partial(_chromophores, rig),
-            **table,
-            **model_error.identity(),
-        ),
+        stage("frames", "", "parallel crossed", partial(_frames, rig), **which),
+        stage("separation", "parallel crossed", both, partial(_separate, rig)),
+        stage("chromophores", "diffuse", of_skin, partial(_chromophores, rig), **by_color),
         stage("tsumura", "diffuse", "tsumura_melanin tsumura_hemoglobin", _tsumura),
-        stage(
-            "pictures",
-            "diffuse specular",
-            "picture specular_picture",
-            partial(_pictures, rig),
-            **table,
-        ),
+        stage("pictures", both, shown, partial(_pictures, rig), **table),
     ]
 
 
@@ -133,12 +107,10 @@ def rig_of(inputs: Inputs) -> FlashRig:
         return inputs.load(kind, [view.serial], otherwise)
 
     sensor = load("sensor", "the frames are as noisy as they say of themselves")
-    white = load(
-        "white",
-        "the light is even and white is what the file's own white balance says"
-        if "photographs" in session.manifest.extra
-        else "the light is even and a white tile would fill 80 % of the range",
-    )
+    balance = "a white tile would fill 80 % of the range"
+    if "photographs" in session.manifest.extra:
+        balance = "white is what the file's own white balance says"
+    white = load("white", f"the light is even and {balance}")
     malus = load("polarization", "the polarizers are perfect")
     matrix = load("color", "pictures show balanced camera RGB as if it were linear sRGB")
     illuminant = session.rig.lights[0].illuminant
@@ -203,11 +175,8 @@ def _image_reader(rig: FlashRig) -> Callable[[Sequence[FrameRecord]], Image]:
     gain, read_noise = _noise(rig.sensor)
 
     def linear_light(records: Sequence[FrameRecord]) -> list[raw.LinearImage]:
-        frames = (session.read(record) for record in records)
-        return [
-            raw.linear_rgb(frame, demosaic=demosaic, gain=gain, read_noise=read_noise)
-            for frame in frames
-        ]
+        known: dict[str, Any] = {"demosaic": demosaic, "gain": gain, "read_noise": read_noise}
+        return [raw.linear_rgb(session.read(record), **known) for record in records]
 
     def total(images: list[raw.LinearImage], name: str) -> NDArray[Any]:
         parts = [getattr(image, name) for image in images]
@@ -215,19 +184,14 @@ def _image_reader(rig: FlashRig) -> Callable[[Sequence[FrameRecord]], Image]:
 
     darks = linear_light(session.frames("dark"))
     count = max(len(darks), 1)
-    dark, dark_variance = (
-        (total(darks, "rgb") / count, total(darks, "variance") / count / count)
-        if darks
-        else (0.0, 0.0)
-    )
+    dark = total(darks, "rgb") / count
+    dark_variance = total(darks, "variance") / count / count
 
     def mean_image(records: Sequence[FrameRecord]) -> Image:
         linear = linear_light(records)
-        if any(image.rgb.shape != linear[0].rgb.shape for image in linear):
-            raise InputsError(
-                f"{records[0].index['polarizer']} frames: differ in size, expected one camera "
-                "setting"
-            )
+        sizes, name = {image.rgb.shape for image in linear}, f"{records[0].index['polarizer']}"
+        expected = "one camera setting"
+        Checks(InputsError).require(len(sizes) == 1, f"{name} frames", f"sizes {sizes}", expected)
         power = sum(float(record.settings.get("power", 1.0)) for record in records)
         rgb = total(linear, "rgb") - len(linear) * dark
         variance = total(linear, "variance") + len(linear) ** 2 * dark_variance
@@ -262,12 +226,10 @@ def _noise(sensor: SensorCalibration | None) -> tuple[float, float] | tuple[None
 def _separate(rig: FlashRig, parallel: Image | None, crossed: Image) -> Mapping[str, SkinMap]:
     """Split into diffuse and specular light, relative to a white tile in the same place."""
     white = rig.white
-    if parallel is None:
-        diffuse = Image(2 * crossed.rgb, 4 * crossed.variance, crossed.valid)
-        specular = np.zeros_like(crossed.rgb)
-        specular_error = np.zeros_like(crossed.rgb)
-        specular_valid = np.zeros(crossed.valid.shape, bool)
-    else:
+    diffuse = Image(2 * crossed.rgb, 4 * crossed.variance, crossed.valid)
+    specular = specular_error = np.zeros_like(crossed.rgb)
+    specular_valid = np.zeros(crossed.valid.shape, bool)
+    if parallel is not None:
         leak = rig.polarization.crossed_leak() if rig.polarization is not None else None
         separated = polarization.separate(
             np.where(parallel.valid[..., None], parallel.rgb, np.nan),
@@ -281,9 +243,9 @@ def _separate(rig: FlashRig, parallel: Image | None, crossed: Image) -> Mapping[
         specular_error = separated.stderr_specular.astype(np.float32)
         specular_valid = np.asarray(separated.valid)
         # a highlight that saturates the parallel image leaves the crossed one usable
-        alone = crossed.valid & ~specular_valid
-        rgb = np.where(alone[..., None], 2 * crossed.rgb, separated.diffuse)
-        variance = np.where(alone[..., None], 4 * crossed.variance, np.square(separated.stderr))
+        alone = (crossed.valid & ~specular_valid)[..., None]
+        rgb = np.where(alone, diffuse.rgb, separated.diffuse)
+        variance = np.where(alone, diffuse.variance, np.square(separated.stderr))
         diffuse = Image(rgb, variance, crossed.valid)
     if white is not None:
         reflectance, variance, valid = white.balance(diffuse.rgb, variance=diffuse.variance)
@@ -294,14 +256,10 @@ def _separate(rig: FlashRig, parallel: Image | None, crossed: Image) -> Mapping[
         valid = np.ones(diffuse.valid.shape, bool)
     dim = (reflectance < MIN_SIGNAL_SIGMAS * np.sqrt(variance)).any(axis=-1)
     valid = valid & diffuse.valid & ~dim
+    over, shines = "specular light over that of a white tile", specular_valid & valid
     return {
         "diffuse": _map3(reflectance, np.sqrt(variance), valid, "white tile in its place = 1"),
-        "specular": _map3(
-            specular / level,
-            specular_error / level,
-            specular_valid & valid,
-            "specular light over that of a white tile",
-        ),
+        "specular": _map3(specular / level, specular_error / level, shines, over),
     }
 
 
@@ -351,13 +309,12 @@ def _chromophores(rig: FlashRig, diffuse: SkinMap) -> Mapping[str, SkinMap]:
     usable = found.valid
 
     def chromophore(name: str) -> dict[str, SkinMap]:
-        error = f"stderr_{name}"
+        error, unit = f"stderr_{name}", MAP_UNITS[name]
         noise = getattr(noise_alone, error)
         # spots are wide on purpose; they say nothing of what is known of the skin around them
-        good = detectable(
-            getattr(by_face, name), getattr(by_face, error), usable & np.isfinite(noise)
-        )
-        values, stderr, unit = getattr(found, name), getattr(found, error), MAP_UNITS[name]
+        usual, usual_error = getattr(by_face, name), getattr(by_face, error)
+        good = detectable(usual, usual_error, usable & np.isfinite(noise))
+        values, stderr = getattr(found, name), getattr(found, error)
         why = "invalid where noise and model error leave it unknown"
         alone = "standard error that noise alone would leave, without model error"
         return {

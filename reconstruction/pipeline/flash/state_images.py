@@ -6,9 +6,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
-
 from capture.session import Session
+from model.checks import Checks
 from model.skin import SkinMap
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.flash import stages as flash_stages
@@ -16,12 +15,11 @@ from reconstruction.pipeline.inputs import Inputs, InputsError
 
 NEUTRAL = "neutral"
 SINGLE_MAPS = ("diffuse",)
+CHROMOPHORE_NAMES = ("melanin", "hemoglobin")
 REPEATED_MAPS = (
     *SINGLE_MAPS,
-    "melanin",
-    "hemoglobin",
-    "melanin_noise_stderr",
-    "hemoglobin_noise_stderr",
+    *CHROMOPHORE_NAMES,
+    *(name + flash_stages.NOISE_STDERR for name in CHROMOPHORE_NAMES),
 )
 """Where states are repeated each image's own chromophores tell how far they repeat."""
 
@@ -127,8 +125,8 @@ def read(
     InputsError
         When a session shows no subject, no state is neutral, or sizes or cameras differ.
     """
-    if not sessions:
-        raise InputsError("sessions: got none, expected at least one of the flash rig")
+    check = Checks(InputsError)
+    check.require(sessions, "sessions", "none", "at least one of the flash rig")
     opened = [Session.open(path) for path in sessions]
     start = min(session.manifest.created_at for session in opened)
     images: list[StateImage] = []
@@ -138,11 +136,9 @@ def read(
     has_white = True
     pairs = [_pairs(session, path) for path, session in zip(sessions, opened, strict=True)]
     named = [state for group in pairs for state, _, _ in group]
-    if NEUTRAL not in named:  # told before minutes are spent on images
-        raise InputsError(
-            f"sessions: show {', '.join(sorted(set(named)))}, expected a state {NEUTRAL!r} that "
-            "the others are laid over"
-        )
+    # told before minutes are spent on images
+    shown, expected = ", ".join(sorted(set(named))), f"{NEUTRAL!r}, which others are laid over"
+    check.require(NEUTRAL in named, "states of sessions", shown, expected)
     maps = REPEATED_MAPS if len(set(named)) < len(named) else SINGLE_MAPS
     for number, (path, session) in enumerate(zip(sessions, opened, strict=True)):
         began_s = (session.manifest.created_at - start).total_seconds()
@@ -161,11 +157,9 @@ def read(
             spectra = inputs.noted["color_table"]
             table.add((str(spectra["camera"]), str(spectra["illuminant"])))
             has_white = has_white and "calibration white" in inputs.hashes
-    if len(table) > 1:
-        raise InputsError(f"sessions: of {len(table)} cameras or lights, expected one of each")
+    check.require(len(table) == 1, "sessions", f"{len(table)} cameras or lights", "one of each")
     shapes = {image.maps["diffuse"].values.shape for image in images}
-    if len(shapes) > 1:
-        raise InputsError(f"sessions: images of sizes {sorted(shapes)}, expected one size")
+    check.require(len(shapes) == 1, "sessions", f"images of sizes {sorted(shapes)}", "one size")
     ((camera, illuminant),) = table
     simulated = any(session.source == "simulated" for session in opened)
     return Subject(
@@ -185,16 +179,10 @@ def read(
 def _pairs(session: Session, path: Path) -> list[tuple[str, int, float]]:
     """Return state, repeat and seconds since the first frame of each crossed image."""
     crossed = session.frames("subject", polarizer="crossed")
-    if not crossed:
-        raise InputsError(
-            f"{path}: has no crossed frame of a subject, expected a session of the flash rig"
-        )
+    got = "no crossed frame of a subject"
+    Checks(InputsError).require(crossed, f"{path}", got, "a session of the flash rig")
     first = min(record.line.t_host_s for record in session.frames())
     return [
-        (
-            str(record.index["state"]),
-            int(record.index.get("repeat", 0)),
-            float(np.float64(record.line.t_host_s - first)),
-        )
-        for record in crossed
+        (str(at["state"]), int(at.get("repeat", 0)), float(line.t_host_s - first))
+        for at, line in ((record.index, record.line) for record in crossed)
     ]

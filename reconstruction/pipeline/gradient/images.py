@@ -66,11 +66,8 @@ class Patterns:
         InputsError
             When there is none.
         """
-        lit = [
-            picture
-            for (pattern, polarizer), picture in self.values.items()
-            if polarizer == "crossed" and pattern != "dark"
-        ]
+        crossed = {key[0]: image for key, image in self.values.items() if key[1] == "crossed"}
+        lit = [image for pattern, image in crossed.items() if pattern != "dark"]
         if not lit:
             raise InputsError("state: has no lit picture with crossed polarizers")
         return np.mean(lit, axis=0, dtype=np.float32)
@@ -173,12 +170,9 @@ class GradientImages:
     def _darkness(self) -> Float32Array | None:
         """Return the mean of all frames without light, with the fixed pattern of the sensor."""
         if self._dark is None:
+            taken = [item for by_key in self._records.values() for item in by_key.items()]
             records = [
-                record
-                for by_key in self._records.values()
-                for (pattern, _), some in by_key.items()
-                if pattern == "dark"
-                for record in some
+                record for (pattern, _), some in taken if pattern == "dark" for record in some
             ]
             records += self._session.frames("dark")
             if not records:

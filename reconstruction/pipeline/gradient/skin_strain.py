@@ -113,13 +113,8 @@ def _starts(
     state: SkinState, ratio: float, found: Mapping[str, StateStrain]
 ) -> list[Float64Array | None]:
     axis = np.array([math.cos(state.angle_rad), math.sin(state.angle_rad)])
-    before = [
-        other
-        for other in found.values()
-        if other.usable
-        and other.state.angle_deg == state.angle_deg
-        and other.state.step * state.step >= 0
-    ]
+    along = [one for one in found.values() if one.state.angle_deg == state.angle_deg]
+    before = [one for one in along if one.usable and one.state.step * state.step >= 0]
     starts: list[Float64Array | None] = []
     if before:
         nearest = min(before, key=lambda other: abs(other.state.step - state.step))

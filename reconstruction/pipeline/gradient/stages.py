@@ -109,41 +109,22 @@ def graph(inputs: Inputs) -> list[stages.Stage]:
     stage = inputs.stage_maker(STAGE_REVISION)
     neutral = rig.images.neutral.name
     heights = " ".join(f"height_{state.name}" for state in rig.images.states)
+    diffuse, counted = f"diffuse_normals_{neutral}", f"{HISTOGRAM_FILE} _histograms"
+    kernels = partial(_kernels, inputs, rig)
     made = [
         stage("strain", "", f"_strains {STRAIN_FILE}", partial(_strain, inputs, rig)),
         stage("facets", "", "_facets", partial(_facets, inputs, rig)),
-        stage(
-            f"diffuse normals {neutral}", "", f"diffuse_normals_{neutral}", partial(_diffuse, rig)
-        ),
-        stage(
-            "histograms",
-            f"_strains {heights}",
-            f"{HISTOGRAM_FILE} _histograms",
-            partial(_histograms, rig),
-        ),
-        stage(
-            "kernels",
-            f"_strains _histograms {heights}",
-            KERNEL_FILE,
-            partial(_kernels, inputs, rig),
-        ),
+        stage(f"diffuse normals {neutral}", "", diffuse, partial(_diffuse, rig)),
+        stage("histograms", f"_strains {heights}", counted, partial(_histograms, rig)),
+        stage("kernels", f"_strains _histograms {heights}", KERNEL_FILE, kernels),
     ]
     for state in rig.images.states:
-        name = state.name
+        name, restored = state.name, f"_restored_{state.name}"
+        normals, height = partial(_normals, rig, state), partial(_height, rig, state)
         made += [
             stage(f"crossed {name}", "", f"crossed_{name}", partial(_crossed, rig, state)),
-            stage(
-                f"normals {name}",
-                "_facets",
-                f"normals_{name} _restored_{name}",
-                partial(_normals, rig, state),
-            ),
-            stage(
-                f"height {name}",
-                f"_restored_{name}",
-                f"height_{name}",
-                partial(_height, rig, state),
-            ),
+            stage(f"normals {name}", "_facets", f"normals_{name} {restored}", normals),
+            stage(f"height {name}", restored, f"height_{name}", height),
         ]
     return made
 
@@ -213,10 +194,8 @@ def _strain(inputs: Inputs, rig: Rig) -> Mapping[str, Any]:
     found = measure_states(rig.images)
     lost = [each.state.name for each in found if not each.usable]
     if lost:
-        inputs.assumed.append(
-            f"strain of {', '.join(lost)}: no texture could be followed; these states are left out "
-            "of histograms and kernels"
-        )
+        what = "no texture could be followed; these states are left out of histograms and kernels"
+        inputs.assumed.append(f"strain of {', '.join(lost)}: {what}")
     document = {
         "schema": "skinrig.strain/1",
         "neutral": rig.images.neutral.name,

@@ -162,13 +162,9 @@ def _skin_blocks(
     )
     inside = (down >= 0) & (down < grid[0]) & (right >= 0) & (right < grid[1])
     block = np.where(inside, down * grid[1] + right, -1)
+    angle_rad, blocks = each.state.angle_rad, grid[0] * grid[1]
     counts = block_counts(
-        height.values,
-        block,
-        grid[0] * grid[1],
-        pixel=pixel_um,
-        valid=there,
-        angle_rad=each.state.angle_rad,
+        height.values, block, blocks, pixel=pixel_um, valid=there, angle_rad=angle_rad
     )
     return counts.reshape(*grid, *counts.shape[1:])
 
@@ -221,13 +217,8 @@ def fit_kernels(
     """
     neutral = strains[0]
     height = heights[neutral.state.name]
-    todo = [
-        each
-        for each in strains[1:]
-        if each.usable
-        and each.state.name in statistics
-        and abs(each.stretch_s[0] - 1.0) >= MIN_STRAIN
-    ]
+    counted = [each for each in strains[1:] if each.usable and each.state.name in statistics]
+    todo = [each for each in counted if abs(each.stretch_s[0] - 1.0) >= MIN_STRAIN]
     fits = []
     for number, each in enumerate(todo):
         tell(number / len(todo))
@@ -254,12 +245,8 @@ def fit_kernels(
         fits.append(_entry(each, fit))
     angles = sorted({fit["angle_deg"] for fit in fits})
     tables = [table for angle in (None, *angles) if (table := _table(fits, angle)) is not None]
-    return {
-        "schema": "skinrig.kernels/1",
-        "fits": fits,
-        "tables": tables,
-        "direction": _direction(fits),
-    }
+    found = {"fits": fits, "tables": tables, "direction": _direction(fits)}
+    return {"schema": "skinrig.kernels/1", **found}
 
 
 def _entry(each: StateStrain, fit: KernelFit) -> dict[str, Any]:
@@ -287,11 +274,8 @@ def _table(fits: Sequence[Mapping[str, Any]], angle: float | None) -> dict[str, 
     if angle is not None and len({fit["angle_deg"] for fit in fits}) < 2:
         return None
     try:
-        found = fit_table(
-            [fit["stretch_s"] for fit in chosen],
-            [fit["alpha"] for fit in chosen],
-            [fit["sigma_um"] for fit in chosen],
-        )
+        columns = ("stretch_s", "alpha", "sigma_um")
+        found = fit_table(*([fit[name] for fit in chosen] for name in columns))
     except (KernelTableFitError, KernelTableError):  # too few points, or lines that reach sigma 0
         return None
     table = found.table
@@ -301,17 +285,14 @@ def _table(fits: Sequence[Mapping[str, Any]], angle: float | None) -> dict[str, 
     for line, part in ((table.sigma_compression_um, r < 1.0), (table.sigma_stretch_um, r >= 1.0)):
         if line is not None:
             sigma[part] = line[0] * r[part] + line[1]
+    alpha = np.clip(table.unlimited_alpha(r), -2.0, 1.0)
     lines = "alpha_breaks alpha_lines sigma_compression_um sigma_stretch_um"
     return {
         "name": "all angles" if angle is None else f"{angle:.0f} degrees",
         **attributes_of(table, lines),
         "stretch_range": (low, high),
         **attributes_of(found, "alpha_rms sigma_rms_um"),
-        "lines": {
-            "stretch": r,
-            "alpha": np.clip(table.unlimited_alpha(r), -2.0, 1.0),
-            "sigma_um": sigma,
-        },
+        "lines": {"stretch": r, "alpha": alpha, "sigma_um": sigma},
     }
 
 

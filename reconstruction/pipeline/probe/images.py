@@ -10,6 +10,7 @@ from capture.calibration.fiber.darks import CameraNoise, DarkModel, measure_dark
 from capture.calibration.fiber.merge import MergedSeries, merge_series
 from capture.plan.suction import Placement, placement_of
 from capture.session import FrameRecord, Session
+from model.checks import Checks
 from reconstruction.pipeline.inputs import InputsError
 
 
@@ -77,16 +78,12 @@ class ProbeImages:
                 self._records.setdefault(placement, []).append(record)
         if not self._records:
             raise InputsError(f"{session.path}: has no frames of kind {kind!r}")
-        self.measurements = tuple(
-            Measurement(
-                placement,
-                len(records),
-                _level(records),
-                _mean(records, "suction_mbar"),
-                _mean(records, "camera_c"),
-            )
-            for placement, records in self._records.items()
-        )
+
+        def measured(placement: Placement, records: list[FrameRecord]) -> Measurement:
+            means = _mean(records, "suction_mbar"), _mean(records, "camera_c")
+            return Measurement(placement, len(records), _level(records), *means)
+
+        self.measurements = tuple(measured(*taken) for taken in self._records.items())
         self._darks: DarkModel | None = None
 
     @property
@@ -101,10 +98,8 @@ class ProbeImages:
         if self._darks is None:
             records = self._session.frames("dark")
             if not records:
-                raise InputsError(
-                    f"{self._session.path}: has no frames of kind 'dark'; the camera's dark "
-                    "current is not known: capture with darks"
-                )
+                hint = "the camera's dark current is not known: capture with darks"
+                raise InputsError(f"{self._session.path}: has no frames of kind 'dark'; {hint}")
             temperature = _mean(records, "camera_c")
             self._darks = measure_darks(
                 [self._session.read(record).cfa for record in records],
@@ -140,10 +135,8 @@ def _light_s(record: FrameRecord) -> float:
 
 def _level(records: list[FrameRecord]) -> float:
     levels = {float(record.settings.get("level", 1.0)) for record in records}
-    if len(levels) > 1:
-        raise InputsError(
-            f"step {records[0].step_id}: got levels {sorted(levels)} in one series, expected one"
-        )
+    where, got = f"step {records[0].step_id}", f"levels {sorted(levels)} in one series"
+    Checks(InputsError).require(len(levels) == 1, where, got, "one")
     return levels.pop()
 
 

@@ -104,13 +104,8 @@ def fit_profiles(
         if method == METHOD_NAMES[0]:
             other = subsurface.nearest_medium(first.radius_mm, every, **told)
         else:
-            other = subsurface.invert(
-                first.radius_mm,
-                every,
-                method=method,
-                common_error=nearest_medium.LOG_FACTOR_SIGMA,
-                **told,
-            )
+            told |= {"method": method, "common_error": nearest_medium.LOG_FACTOR_SIGMA}
+            other = subsurface.invert(first.radius_mm, every, **told)
         unlike = _layered(profiles, unlike, other.scale[0])
         fit = _either(fit, other, np.broadcast_to(unlike, fit.valid.shape))
 
@@ -122,16 +117,11 @@ def fit_profiles(
     pair = [change_of(fit.sigma_a_per_mm), change_of(fit.sigma_s_prime_per_mm)]
     shared = np.sqrt(np.square(pair).sum(axis=1))  # (2, M, C)
     log_stderr = fit.sigma_tr_stderr[0] / fit.sigma_tr_per_mm[0]
-    return [
-        ProfileFit(
-            profile,
-            _one(fit, (0, number)),
-            log_stderr[number],
-            change[:, number].reshape(causes, -1),
-            shared[:, number],
-        )
-        for number, profile in enumerate(profiles)
-    ]
+    found = []
+    for number, profile in enumerate(profiles):
+        changes = change[:, number].reshape(causes, -1), shared[:, number]
+        found.append(ProfileFit(profile, _one(fit, (0, number)), log_stderr[number], *changes))
+    return found
 
 
 def _layered(profiles: Sequence[Profile], unlike: BoolArray, factor: Float64Array) -> BoolArray:

@@ -13,6 +13,7 @@ from capture.calibration.fiber.readings import sum_spots
 from capture.calibration.sensor import SensorCalibration
 from capture.rig import Probe
 from capture.session import Session
+from model.checks import Checks
 from model.fresnel import ETA_SKIN
 from model.skin import SkinMap
 from reconstruction.anisotropy import estimation as anisotropy
@@ -81,20 +82,12 @@ def graph(inputs: Inputs) -> list[stages.Stage]:
         "the fibres are not calibrated: capture a phantom of known optics (`--target phantom`), "
         "and give the folder that `skinrig calibrate fibre` makes of it as --calibration"
     )
+    profiles = partial(_profiles, inputs, fibres, noise)
+    refused = "" if fibres is not None else uncalibrated
+    fitted = f"_fits _sites {SUBSURFACE_FILE}"
     return [
-        stage(
-            "profiles",
-            "",
-            f"_profiles {PROFILE_FILE}",
-            partial(_profiles, inputs, fibres, noise),
-            "" if fibres is not None else uncalibrated,
-        ),
-        stage(
-            "subsurface",
-            "_profiles",
-            f"_fits _sites {SUBSURFACE_FILE}",
-            partial(_subsurface, probe),
-        ),
+        stage("profiles", "", f"_profiles {PROFILE_FILE}", profiles, refused),
+        stage("subsurface", "_profiles", fitted, partial(_subsurface, probe)),
         stage("anisotropy", "_fits", ANISOTROPY_FILE, _anisotropy),
         stage("translucency", "_sites", "translucency", partial(_translucency, places, inputs)),
     ]
@@ -175,17 +168,16 @@ def _subsurface(probe: Probe, _profiles: Sequence[Profile]) -> Mapping[str, Any]
         ],
         "sites": [_site_document(site, c) for site in sites for c in range(len(CHANNEL_NAMES))],
     }
-    return {
-        "_fits": fits[METHOD_NAMES[0]],
-        "_sites": sites,
-        SUBSURFACE_FILE: stages.document_bytes(document),
-    }
+    made = {"_fits": fits[METHOD_NAMES[0]], "_sites": sites}
+    return made | {SUBSURFACE_FILE: stages.document_bytes(document)}
 
 
 def _fit_document(one: ProfileFit, c: int) -> dict[str, Any]:
     fit = one.fit
     sigma_tr, total = float(fit.sigma_tr_per_mm[c]), float(one.log_total[c])
     shared = one.log_coefficients[:, c]
+    names = "correlation coefficients_identified chi2 dof p_value inflation used"
+    names += " predicted_per_mm2 residual valid"
     # the interval of the readings, widened by what all fibres share
     widen = total / float(one.log_stderr[c]) if one.log_stderr[c] > 0 else 1.0
     with np.errstate(invalid="ignore"):
@@ -205,12 +197,7 @@ def _fit_document(one: ProfileFit, c: int) -> dict[str, Any]:
         "sigma_s_prime_stderr": np.hypot(
             fit.sigma_s_prime_stderr[c], shared[1] * fit.sigma_s_prime_per_mm[c]
         ),
-        **_of_channel(
-            fit,
-            "correlation coefficients_identified chi2 dof p_value inflation used "
-            "predicted_per_mm2 residual valid",
-            c,
-        ),
+        **_of_channel(fit, names, c),
         "reason": fit.reason(c),
     }
 
@@ -240,10 +227,8 @@ def _anisotropy(_fits: Sequence[ProfileFit]) -> bytes:
     for (site, repeat), group in profile_groups([fit.profile for fit in _fits]).items():
         own = [_fits[number] for number in group]
         if len(own) < MIN_DIRECTIONS:
-            skipped.append(
-                f"{site}, repeat {repeat}: {len(own)} directions, expected at least "
-                f"{MIN_DIRECTIONS}"
-            )
+            why = f"{len(own)} directions, expected at least {MIN_DIRECTIONS}"
+            skipped.append(f"{site}, repeat {repeat}: {why}")
             continue
         angle = np.radians([fit.profile.measurement.placement.angle_deg for fit in own])
         sigma_tr = np.stack([fit.fit.sigma_tr_per_mm for fit in own])
@@ -272,14 +257,8 @@ def _anisotropy(_fits: Sequence[ProfileFit]) -> bytes:
                     "reason": str(found.reason[c]),
                 }
             )
-    return stages.document_bytes(
-        {
-            "schema": "skinrig.anisotropy/1",
-            "false_alarm_rate": FALSE_ALARMS,
-            "sites": rows,
-            "left_out": skipped,
-        }
-    )
+    document = {"schema": "skinrig.anisotropy/1", "false_alarm_rate": FALSE_ALARMS}
+    return stages.document_bytes(document | {"sites": rows, "left_out": skipped})
 
 
 def _places(inputs: Inputs) -> Mapping[str, tuple[float, float]]:
@@ -299,12 +278,10 @@ def _translucency(
     """Spread 1/sigma_tr over a face's texture from the sites whose place is known."""
     placed = [site for site in _sites if site.site in places]
     unplaced = [site.site for site in _sites if site.site not in places]
-    if not placed:
-        raise InputsError(
-            f"translucency: got measurements of {', '.join(unplaced)}, expected some of "
-            f"{', '.join(places)}, whose places on a face are known; a table of landmarks may "
-            "name others"
-        )
+    got = f"measurements of {', '.join(unplaced)}"
+    known = f"some of {', '.join(places)}, whose places on a face are known"
+    expected = f"{known}; a table of landmarks may name others"
+    Checks(InputsError).require(placed, "translucency", got, expected)
     found = translucency.interpolate(
         [places[site.site] for site in placed],
         np.stack([np.nan_to_num(site.sigma_tr_per_mm, nan=1.0) for site in placed]),

@@ -29,7 +29,7 @@ def seen(melanin, melanin_errors, blood, blood_errors, rng):
 
 
 def fitted(probability):
-    return fit(probability, MELANIN, BLOOD, melanin_ends=MELANIN_ENDS, blood_ends=BLOOD_ENDS)
+    return fit(probability, (MELANIN, BLOOD), (MELANIN_ENDS, BLOOD_ENDS))
 
 
 @pytest.mark.parametrize("spread", [0.1, 0.3])
@@ -135,7 +135,7 @@ def test_blood_that_ends_at_none_may_be_any(mean, told):
 def test_what_is_no_probability_or_no_bell_is_refused():
     with pytest.raises(ValueError, match="shape"):
         fitted(np.ones((3, 5, 2)))
-    with pytest.raises(ValueError, match="finite positive"):
+    with pytest.raises(ValueError, match="probability: got"):
         fitted(np.zeros((3, MELANIN.size, BLOOD.size)))
     with pytest.raises(ValueError, match="spread"):
         ContaminatedNormal(0.0, 0.0, 0.1, -1.0, 1.0)

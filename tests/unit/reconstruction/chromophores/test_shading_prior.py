@@ -46,7 +46,7 @@ def test_an_unknown_exposure_adds_its_spread():
         (lambda: lognormal(0.0, 0.5), "center, spread"),
         (lambda: lognormal(0.7, 0.5).broadened(0.0), "spread"),
         (lambda: ShadingPrior(0.0, 0.1, np.array([1.0, 0.0])), "density"),
-        (lambda: ShadingPrior(0.0, -0.1, np.ones(3)), "low, step"),
+        (lambda: ShadingPrior(0.0, -0.1, np.ones(3)), "step"),
         (lambda: from_samples(-1.0, 0.1, [0, 0]), "counts"),
         (lambda: from_samples(-9.0, 0.1, [1, 1]), "bins"),
     ],

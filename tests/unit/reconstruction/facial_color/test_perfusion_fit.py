@@ -341,8 +341,8 @@ def test_a_prior_as_a_covariance_of_the_samples_gives_the_same_squares():
 @pytest.mark.parametrize(
     ("pose", "named"),
     [
-        (PoseStep(MOVED[:5], np.array([1e-3])), "shapes"),
-        (PoseStep(MOVED, np.array([1e-3, 1e-3])), "shapes"),
+        (PoseStep(MOVED[:5], np.array([1e-3])), "shape"),
+        (PoseStep(MOVED, np.array([1e-3, 1e-3])), "shape"),
         (PoseStep(MOVED, np.array([np.nan])), "standard errors"),
     ],
 )

@@ -46,10 +46,10 @@ def test_errors_are_the_same_from_kept_counts_and_from_new_ones(rng):
     i, j = found.best
     blocks = kernel_errors.of_kernel(grid, float(ALPHAS[j]), float(SIGMAS_UM[i]))
     noise, scatter = blocks.noise(grid.buckets.target, 1e4), blocks.scatter(1e4)
-    told = {"noise": noise, "scatter": scatter}
-    with_counts = kernel_errors.widths_of_best(grid, found, **told, rng=np.random.default_rng(5))
+    drawn = [kernel_errors.Draws(grid, found, noise, np.random.default_rng(5)) for _ in range(2)]
+    with_counts = drawn[0].widths_of_best(scatter)
     found.counts.clear()
-    without = kernel_errors.widths_of_best(grid, found, **told, rng=np.random.default_rng(5))
+    without = drawn[1].widths_of_best(scatter)
     assert with_counts == without
     assert with_counts.alpha[0] > 0.0
 

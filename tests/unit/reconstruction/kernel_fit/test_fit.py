@@ -353,5 +353,5 @@ def test_settings_that_do_not_fit_are_refused(rng):
 def test_a_grid_that_is_empty_or_of_another_shape_is_named(shape):
     alphas, sigmas_um = np.linspace(0.0, 1.0, min(shape[1], 3)), np.arange(1.0, 1.0 + shape[0])
     distance = np.zeros(shape if shape != (3, 2) else (2, 3))
-    with pytest.raises(ks.KernelSearchError, match=r"distance: got shape"):
+    with pytest.raises(ks.KernelFitError, match=r"distance: got shape"):
         ks.gentlest(distance, alphas, sigmas_um)

@@ -83,7 +83,7 @@ def test_maps_without_slopes_are_refused():
             nh.histogram(height, pixel=1.0)
     with pytest.raises(nh.HistogramError, match="no sample"):
         nh.histogram(np.zeros((9, 9)), pixel=1.0, valid=np.eye(9, dtype=bool))
-    with pytest.raises(relief_slopes.SlopeError, match="pixel"):
+    with pytest.raises(relief_slopes.HistogramError, match="pixel"):
         nh.histogram(np.zeros((9, 9)), pixel=0.0)
     with pytest.raises(nh.HistogramError, match="limit"):
         nh.histogram(np.zeros((9, 9)), pixel=1.0, limit=1.5)
@@ -111,5 +111,5 @@ def test_a_list_of_rows_is_a_relief_and_a_stack_is_none():
     rows = [[0.0, 0.2, 0.5], [0.1, 0.2, 0.9]]
     of_list = nh.histogram(rows, pixel=1.0, bins=8)
     np.testing.assert_array_equal(of_list, nh.histogram(np.array(rows), pixel=1.0, bins=8))
-    with pytest.raises(relief_slopes.SlopeError, match=r"\(1, 2, 3\), expected .*one by one"):
+    with pytest.raises(relief_slopes.HistogramError, match=r"\(1, 2, 3\), expected .*one by one"):
         nh.histogram([rows], pixel=1.0)

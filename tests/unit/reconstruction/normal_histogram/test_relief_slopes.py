@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from reconstruction.normal_histogram.relief_slopes import (
-    SlopeError,
+    HistogramError,
     slopes,
     slopes_of_normals,
     stencil,
@@ -52,16 +52,16 @@ def test_a_list_of_rows_is_a_map():
     ],
 )
 def test_what_is_no_map_of_real_numbers_is_refused(height, told):
-    with pytest.raises(SlopeError, match=f"height: got {told}" if told[0] != "s" else told):
+    with pytest.raises(HistogramError, match=f"height: got {told}" if told[0] != "s" else told):
         stencil(height)
 
 
 @pytest.mark.parametrize("valid", [np.ones((4, 4)), np.ones((4, 1), bool), True, [[1, 0]]])
 def test_masks_of_another_shape_or_type_are_refused(valid):
-    with pytest.raises(SlopeError, match="valid: got"):
+    with pytest.raises(HistogramError, match="valid: got"):
         stencil(np.zeros((4, 4)), valid)
     normals = np.broadcast_to([0.0, 0.0, 1.0], (4, 4, 3))
-    with pytest.raises(SlopeError, match="valid: got"):
+    with pytest.raises(HistogramError, match="valid: got"):
         slopes_of_normals(normals, valid=valid)
 
 
@@ -73,5 +73,5 @@ def test_normals_that_face_away_or_are_not_finite_have_no_slope():
     np.testing.assert_allclose(a, [-0.3, 0, 0, 0], atol=1e-15)
     np.testing.assert_allclose(b, [0.4, 0, 0, 0], atol=1e-15)
     np.testing.assert_array_equal(normals, kept)
-    with pytest.raises(SlopeError, match="normals: got shape"):
+    with pytest.raises(HistogramError, match="normals: got shape"):
         slopes_of_normals(np.zeros((3, 4)))

@@ -20,7 +20,7 @@ RADIUS = 0.3 + 0.25 * np.arange(28)
 
 
 def closed(method, eta=1.4):
-    return profile_model(method, RADIUS, Optics(eta, g=0.8, g_error=0.0))
+    return profile_model(method, Optics(eta, g=0.8, g_error=0.0), RADIUS)
 
 
 @pytest.mark.parametrize("eta", [1.0, 1.4, 1.6])
@@ -121,7 +121,7 @@ def fit_table(profile, variance, **settings):
 @pytest.mark.parametrize(("g_error", "limit"), [(0.0, 5e-3), (0.07, 1.5e-2)])
 def test_the_tables_layout_is_the_table(g_error, limit):
     """Within the table's domain, but for diffused light; between its g its noise is larger."""
-    model = profile_model("photon_table", RADIUS, Optics(g=0.825, g_error=g_error, **FIBRES))
+    model = profile_model("photon_table", Optics(g=0.825, g_error=g_error, **FIBRES), RADIUS)
     rng = np.random.default_rng(5)
     theta = np.full((100, 4), [0.0, 0.0, 0.0, 0.825])
     theta[:, 1] = rng.uniform(np.log(0.1), np.log(7.0), 100)
@@ -145,7 +145,7 @@ def test_the_tables_layout_is_the_table(g_error, limit):
 @pytest.mark.parametrize("ratio", [1e-4, 3e-4, 2e-3])
 def test_far_from_the_source_of_weakly_absorbed_light_the_model_is_diffusion_up_to_a_factor(ratio):
     """At up to 350 transport lengths, where no table reaches; the factor is the fibre's, 5 %."""
-    model = profile_model("photon_table", RADIUS, Optics(g=0.8, g_error=0.0, **FIBRES))
+    model = profile_model("photon_table", Optics(g=0.8, g_error=0.0, **FIBRES), RADIUS)
     for scattering in (8.0, 20.0, 50.0):
         theta = np.array([[np.log(ratio * scattering), np.log(scattering), 0.0, 0.8]])
         exact = diffusion.reflectance(RADIUS, ratio * scattering, scattering, 1.4)

@@ -255,11 +255,11 @@ def test_shapes_and_ranges_that_do_not_fit_are_refused():
 
     for match, wrong in (
         ("sites_uv: got shape", {"uv": np.zeros((0, 2))}),
-        ("coordinates 0...1", {"uv": np.array([[0.5, 1.5]])}),
-        ("coordinates 0...1", {"uv": np.array([[0.5, np.nan]])}),
+        ("sites_uv: got .* numbers in", {"uv": np.array([[0.5, 1.5]])}),
+        ("sites_uv: got .* numbers in", {"uv": np.array([[0.5, np.nan]])}),
         ("sigma_tr_per_mm: got shape", {"sigma": np.ones((1, 3))}),
         ("stderr_per_mm: got shape", {"stderr": np.ones(1)}),
-        ("expected 0 or above", {"stderr": -np.ones((1, 1))}),
+        ("stderr_per_mm: got -1.0", {"stderr": -np.ones((1, 1))}),
         ("shape: got", {"shape": (0, 4)}),
         ("mask: got shape", {"mask": np.ones((2, 2), bool)}),
         ("texture_mm", {"texture_mm": (0.0, 1.0)}),

@@ -12,6 +12,7 @@ from model.brdf import tables as brdf_tables
 from reconstruction import diffuse_albedo
 from reconstruction.lumitexels.samples import Lumitexels
 from reconstruction.surface import estimates
+from reconstruction.surface.model_normals import PointLobes
 
 R_D = np.array([0.6, 0.35, 0.2])
 VIEWS = np.array([[0.0, 0.1, 1.0], [0.5, 0.0, 1.0], [-0.5, 0.2, 1.0], [0.1, -0.5, 1.0]])
@@ -291,10 +292,12 @@ def test_lobes_taken_off_the_samples_leave_normals_that_highlights_do_not_bend()
         weights[:, None], one, samples.light_dir, samples.view_dir, truth[:, None]
     )
     shiny = dataclasses.replace(samples, f=samples.f + np.asarray(lobes, np.float32)[..., None])
-    found = estimates.normals_from_remainder(shiny, known(truth), albedo_of(truth), weights, one)
+    found = estimates.normals_from_remainder(
+        shiny, known(truth), albedo_of(truth), PointLobes(weights, one)
+    )
     assert angle_deg(found, truth).max() < 0.2
     none = estimates.normals_from_remainder(
-        shiny, known(truth), albedo_of(truth), 0.0 * weights, one
+        shiny, known(truth), albedo_of(truth), PointLobes(0.0 * weights, one)
     )
     assert np.median(angle_deg(none, truth)) > 1.5 * np.median(angle_deg(found, truth))
 
@@ -322,7 +325,7 @@ def test_highlights_move_only_normals_that_light_from_inside_leaves_in_doubt():
     stderr[::2] = np.radians(0.1)
     start = dataclasses.replace(start, stderr=stderr)
     r_d = dataclasses.replace(albedo_of(truth), values=np.full((40, 3), 0.02))
-    found = estimates.normals_from_all_light(samples, start, r_d, weights, one)
+    found = estimates.normals_from_all_light(samples, start, r_d, PointLobes(weights, one))
     np.testing.assert_array_equal(found.values[::2], start.values[::2])
     np.testing.assert_array_equal(found.stderr[::2], start.stderr[::2])
     assert np.median(angle_deg(found, truth)[1::2]) < 0.3 * 1.5
@@ -330,7 +333,7 @@ def test_highlights_move_only_normals_that_light_from_inside_leaves_in_doubt():
     assert (found.stderr[1::2] < start.stderr[1::2]).all()
     assert (found.stderr[1::2] > 0.9 * estimates.LOBE_TILT_RAD).all()
     # the same without the lobe: highlights then pull where nothing is
-    bare = estimates.normals_from_all_light(samples, start, r_d, 0.0 * weights, one)
+    bare = estimates.normals_from_all_light(samples, start, r_d, PointLobes(0.0 * weights, one))
     assert np.median(angle_deg(bare, truth)[1::2]) > 2 * np.median(angle_deg(found, truth)[1::2])
 
 
@@ -411,7 +414,7 @@ def test_no_estimate_of_spoiled_samples_holds_a_nan(spoil):
         lobes,
         estimates.normals_from_half_vectors(samples),
         estimates.normals_from_remainder(
-            samples, known(truth), albedo_of(truth), lobes.values[:, :2], few
+            samples, known(truth), albedo_of(truth), PointLobes(lobes.values[:, :2], few)
         ),
     ]
     for found in made:

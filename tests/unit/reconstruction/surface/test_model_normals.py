@@ -1,6 +1,7 @@
 """Normals by the whole fitted model: on dark and glossy skin the highlight says where it looks."""
 
 import dataclasses
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -63,19 +64,9 @@ def scene(lobe, r_d, *, points=30, lights=24, seed=1, noise=NOISE):
 
 def estimated(lobe, r_d, *, weight=0.8, steps=6, **more):
     samples, truth, scan = scene(lobe, r_d, **more)
-    known = np.ones(len(truth), bool)
-    found = model_normals.estimate(
-        samples,
-        scan,
-        known,
-        np.full(len(truth), r_d),
-        np.full((len(truth), 1), weight),
-        lobe,
-        lobe_error=0.04,
-        least_cos_light=0.15,
-        least_cos_view=0.2,
-        steps=steps,
-    )
+    lobes = model_normals.PointLobes(np.full((len(truth), 1), weight), lobe)
+    with mock.patch.multiple(model_normals, N_GAUSS_NEWTON_STEPS=steps, LOBE_RELATIVE_ERROR=0.04):
+        found = model_normals.estimate(samples, scan, np.full(len(truth), r_d), lobes)
     return found, truth, scan
 
 
@@ -111,21 +102,10 @@ def test_points_that_say_nothing_stay_and_are_not_valid(lobe):
     nothing[:3] = False
     nothing[3, 4:] = False
     samples = dataclasses.replace(samples, valid=nothing)
-    known = np.ones(len(truth), bool)
-    known[5] = False
-    found = model_normals.estimate(
-        samples,
-        scan,
-        known,
-        np.full(len(truth), 0.3),
-        np.full((len(truth), 1), 0.8),
-        lobe,
-        lobe_error=0.04,
-        least_cos_light=0.15,
-        least_cos_view=0.2,
-    )
-    assert not found.valid[[0, 1, 2, 5]].any()
-    np.testing.assert_array_equal(found.normals[[0, 1, 2, 5]], scan[[0, 1, 2, 5]])
+    lobes = model_normals.PointLobes(np.full((len(truth), 1), 0.8), lobe)
+    found = model_normals.estimate(samples, scan, np.full(len(truth), 0.3), lobes)
+    assert not found.valid[:3].any()
+    np.testing.assert_array_equal(found.normals[:3], scan[:3])
     assert np.isfinite(found.normals).all()
     assert (found.stderr_rad[~found.valid] == np.pi).all()
     assert (found.moved_rad[~found.valid] == 0).all()
@@ -133,15 +113,6 @@ def test_points_that_say_nothing_stay_and_are_not_valid(lobe):
 
 def test_a_start_at_the_truth_is_not_left(lobe):
     samples, truth, _ = scene(lobe, 0.3, noise=1e-6)
-    found = model_normals.estimate(
-        samples,
-        truth,
-        np.ones(len(truth), bool),
-        np.full(len(truth), 0.3),
-        np.full((len(truth), 1), 0.8),
-        lobe,
-        lobe_error=0.04,
-        least_cos_light=0.15,
-        least_cos_view=0.2,
-    )
+    lobes = model_normals.PointLobes(np.full((len(truth), 1), 0.8), lobe)
+    found = model_normals.estimate(samples, truth, np.full(len(truth), 0.3), lobes)
     assert np.degrees(found.moved_rad).max() < 0.2  # tables are interpolated otherwise in places
