@@ -92,18 +92,3 @@ def _fits(got: tuple[int, ...], shape: tuple[int | str, ...]) -> bool:
         length >= 1 if isinstance(axis, str) else length == axis
         for length, axis in zip(got, shape, strict=True)
     )
-
-
-def require_settings(
-    settings: object, error: type[ValueError], *rules: tuple[str, bool, str]
-) -> None:
-    """Refuse the first setting whose rule (name, whether it holds, what is expected) is broken."""
-    for name, holds, expected in rules:
-        got = getattr(settings, name)
-        Checks(error).require(holds, f"{type(settings).__name__}.{name}", got, expected)
-
-
-def require_shapes(error: type[ValueError], *rules: tuple[str, Any, tuple[int, ...]]) -> None:
-    """Refuse the first array (name, array, shape expected) of another shape; None fits any."""
-    for name, array, shape in rules:
-        Checks(error).shape(name, array, shape)
