@@ -137,7 +137,7 @@ def edit_weights(
         for name, vector in vectors.items():
             some = np.flatnonzero(asked[name])
             tried = some[:: -(-len(some) // TRIAL_TEXELS)]
-            lobes = _with_lobe(t[tried], lobes, vector, asked[name][tried], space.metric)
+            lobes = _Trial(t[tried], vector, asked[name][tried], space.metric).with_lobe(lobes)
     if len(lobes) > max(MAX_LOBES, t.shape[1]):
         raise TraitError(f"lobes: got {len(lobes)} with those of traits, expected {MAX_LOBES}")
     gram = reduced_spaces.times_metric(lobes, space.metric) @ lobes.T
@@ -192,44 +192,41 @@ def _on_lobes(
     return np.asarray(np.linalg.lstsq(gram / np.outer(size, size), scaled, rcond=1e-10)[0] / size)
 
 
-def _with_lobe(
-    t: Float64Array,
-    lobes: Float64Array,
-    vector: Float64Array,
-    amount: Float64Array,
-    metric: Float64Array | None,
-) -> Float64Array:
-    """Return the lobes and, where it is worth it, one more for a trait."""
-    mean = float(amount.mean())
-    strength = float(np.sqrt(np.mean(amount**2)))
-    size = strength * float(reduced_spaces.lengths(vector, metric))
-    if size == 0.0:
-        return lobes
-    way = vector if mean >= 0.0 else -vector
-    found = [np.maximum(way, 0.0)]
-    frame = reduced_spaces.framed(np.eye(len(vector)), metric)
-    columns = np.vstack([lobes, np.eye(len(vector))]) @ frame
-    usual = _padded(t, len(lobes)).mean(axis=0)
-    for given in CANDIDATE_SHARES:
-        wanted = given * usual @ lobes + strength * way
-        found.append(nnls(columns.T, wanted @ frame, maxiter=50 * len(columns))[0][len(lobes) :])
-    sets = [lobes] + [np.vstack([lobes, one / one.sum()]) for one in found if one.sum() > 0.0]
-    errors = [_error(t, s, vector, amount, metric) / size for s in sets]
-    best = int(np.argmin(errors))
-    return sets[best] if errors[0] - errors[best] > MIN_ERROR_GAIN else lobes
+@dataclass(frozen=True, slots=True, eq=False)
+class _Trial:
+    """A trait to be added by some amounts to some texels' shares."""
 
+    shares: Float64Array
+    vector: Float64Array
+    amount: Float64Array
+    metric: Float64Array | None
 
-def _error(
-    t: Float64Array,
-    lobes: Float64Array,
-    vector: Float64Array,
-    amount: Float64Array,
-    metric: Float64Array | None,
-) -> float:
-    """Return the RMS length by which edits on some lobes miss what was asked."""
-    z = _on_lobes(lobes, vector, metric)
-    source = _padded(t, len(lobes))
-    gram = reduced_spaces.times_metric(lobes, metric) @ lobes.T
-    done = nonnegative_kernels.nearest(gram, source + amount[:, None] * z) - source
-    off = reduced_spaces.lengths(done @ lobes - amount[:, None] * vector, metric)
-    return float(np.sqrt(np.mean(off**2)))
+    def with_lobe(self, lobes: Float64Array) -> Float64Array:
+        """Return the lobes and, where it is worth it, one more for the trait."""
+        vector, metric = self.vector, self.metric
+        strength = float(np.sqrt(np.mean(self.amount**2)))
+        size = strength * float(reduced_spaces.lengths(vector, metric))
+        if size == 0.0:
+            return lobes
+        way = vector if float(self.amount.mean()) >= 0.0 else -vector
+        found = [np.maximum(way, 0.0)]
+        frame = reduced_spaces.framed(np.eye(len(vector)), metric)
+        columns = np.vstack([lobes, np.eye(len(vector))]) @ frame
+        usual = _padded(self.shares, len(lobes)).mean(axis=0)
+        for given in CANDIDATE_SHARES:
+            wanted = given * usual @ lobes + strength * way
+            most = 50 * len(columns)
+            found.append(nnls(columns.T, wanted @ frame, maxiter=most)[0][len(lobes) :])
+        sets = [lobes] + [np.vstack([lobes, one / one.sum()]) for one in found if one.sum() > 0.0]
+        errors = [self._error(some) / size for some in sets]
+        best = int(np.argmin(errors))
+        return sets[best] if errors[0] - errors[best] > MIN_ERROR_GAIN else lobes
+
+    def _error(self, lobes: Float64Array) -> float:
+        """Return the RMS length by which edits on some lobes miss what was asked."""
+        z = _on_lobes(lobes, self.vector, self.metric)
+        source, amount = _padded(self.shares, len(lobes)), self.amount[:, None]
+        gram = reduced_spaces.times_metric(lobes, self.metric) @ lobes.T
+        done = nonnegative_kernels.nearest(gram, source + amount * z) - source
+        off = reduced_spaces.lengths(done @ lobes - amount * self.vector, self.metric)
+        return float(np.sqrt(np.mean(off**2)))

@@ -26,6 +26,7 @@ from reconstruction.registration import (
     dense_flow,
     feature_matches,
     normalize_local_contrast,
+    within,
 )
 
 Points = Mapping[str, tuple[float, float]]
@@ -336,11 +337,8 @@ def _common(moving: Points, neutral: Points) -> tuple[list[str], Float64Array, F
 
 def _within(source_px: Float32Array, mask: BoolArray) -> BoolArray:
     """Return which places are inside a picture, and all pixels around them in its mask."""
-    height, width = mask.shape
-    inside = (source_px >= 0).all(axis=-1)
-    inside &= (source_px[..., 0] <= width - 1) & (source_px[..., 1] <= height - 1)
     missing = dense_flow.bilinear((~mask).astype(np.float32), source_px)
-    return np.asarray(inside & (missing <= 0.0))
+    return np.asarray(within(source_px, mask.shape) & (missing <= 0.0))
 
 
 def _folded(source_px: Float32Array) -> BoolArray:
@@ -360,8 +358,7 @@ def _folded(source_px: Float32Array) -> BoolArray:
 
 
 def _landmark_rms(source_px: Float32Array, points: Float64Array, moved: Float64Array) -> float:
-    height, width = source_px.shape[:2]
-    inside = (points >= 0).all(axis=1) & (points <= [width - 1, height - 1]).all(axis=1)
+    inside = within(points, source_px.shape)
     if not inside.any():
         return math.nan
     at = points[inside].astype(np.float32)[None]

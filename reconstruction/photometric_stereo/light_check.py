@@ -5,7 +5,6 @@ explain it. Whatever turns all directions alike (a mirrored axis) explains the s
 is not seen here.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,7 +58,6 @@ def check(
     light_directions: ArrayLike,
     *,
     valid: BoolArray | None = None,
-    names: Sequence[str] | None = None,
     rng: np.random.Generator,
 ) -> LightCheck:
     """Compare a list of directions with the shading it should explain.
@@ -72,9 +70,6 @@ def check(
         In the order to be checked.
     valid : ndarray of bool, shape (N, ...) or (...), optional
         Samples or points to use.
-    names : sequence of str, optional
-        Of the images, in their order here: then the order that sorting these as plain text gives
-        (1, 10, 11, 2) is tried too.
     rng : Generator
         Chooses the points that are looked at.
 
@@ -106,7 +101,7 @@ def check(
             " least 4 to compare an order with the shading"
         )
     evidence = _Evidence(samples, usable, dead)
-    orders = _orders(lights, names)
+    orders = _orders(lights)
     misfit = {name: evidence.misfit(directions[order]) for name, order in orders.items()}
     best = min(misfit, key=lambda name: misfit[name])
     listed = misfit["as listed"]
@@ -155,7 +150,7 @@ def _chosen(
     return np.where(usable, samples, 0.0), usable
 
 
-def _orders(lights: int, names: Sequence[str] | None) -> dict[str, NDArray[np.intp]]:
+def _orders(lights: int) -> dict[str, NDArray[np.intp]]:
     """Return what lists are mistaken for, each the list's row for every image."""
     index = np.arange(lights, dtype=np.intp)
     text = np.array(sorted(range(lights), key=str), np.intp)
@@ -171,11 +166,6 @@ def _orders(lights: int, names: Sequence[str] | None) -> dict[str, NDArray[np.in
         "every second one first": np.concatenate([index[::2], index[1::2]]),
         "the halves exchanged": np.roll(index, lights // 2),
     }
-    if names is not None:
-        by_name = np.array(sorted(range(lights), key=lambda k: names[k]), np.intp)
-        ranks = np.empty_like(by_name)
-        ranks[by_name] = index
-        orders["sorted by file name"] = ranks
     distinct: dict[str, NDArray[np.intp]] = {}
     for name, order in orders.items():
         if not any(np.array_equal(order, known) for known in distinct.values()):

@@ -7,3 +7,4 @@ from reconstruction.registration.tracking import (
 )
 from reconstruction.registration.tracking import textured as textured
 from reconstruction.registration.tracking import track as track
+from reconstruction.registration.tracking import within as within

@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 
 from reconstruction.arrays import BoolArray, Float32Array, FloatArray, UInt8Array
+from reconstruction.registration.tracking import within
 
 N_WARP_ROUNDS = 2
 """How often the second picture is warped and the rest followed."""
@@ -107,7 +108,7 @@ def refine(
         back = _follow(two, one)
         gap = np.linalg.norm(there + bilinear(back, here + there), axis=-1)
         moved = here + there
-        known = both & (gap <= MAX_GAP_PX) & _inside(moved, valid.shape)
+        known = both & (gap <= MAX_GAP_PX) & within(moved, valid.shape)
         known &= bilinear(both.astype(np.float32), moved) > 0.999
         noise = _noise_variance(one, bilinear(two, moved))
         weight = known.astype(np.float32)
@@ -195,11 +196,3 @@ def _windowed(image: Float32Array) -> Float32Array:
 
 def _blurred(image: Float32Array) -> Float32Array:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), GAP_WINDOW_PX))
-
-
-def _inside(at_px: Float32Array, shape: tuple[int, ...]) -> BoolArray:
-    return np.asarray(
-        (at_px >= 0).all(axis=-1)
-        & (at_px[..., 0] <= shape[1] - 1)
-        & (at_px[..., 1] <= shape[0] - 1)
-    )

@@ -74,6 +74,12 @@ def normalize_local_contrast(image: FloatArray) -> UInt8Array:
     return np.clip(np.rint(128 + 32 * rest / np.maximum(spread, floor)), 0, 255).astype(np.uint8)
 
 
+def within(at_px: FloatArray, shape: tuple[int, ...], margin_px: int = 0) -> BoolArray:
+    """Return which places (..., 2), column and row, lie in an image, so far from its border."""
+    last = [shape[1] - 1 - margin_px, shape[0] - 1 - margin_px]
+    return np.asarray(((at_px >= margin_px) & (at_px <= last)).all(axis=-1))
+
+
 def textured(
     even: UInt8Array, points_px: Float64Array, *, count: int, cell_px: int = 12, margin_px: int = 12
 ) -> NDArray[np.intp]:
@@ -95,12 +101,9 @@ def textured(
     ndarray of int
         Indices into `points_px`.
     """
-    height, width = even.shape
+    width = even.shape[1]
     with np.errstate(invalid="ignore"):
-        inside = np.isfinite(points_px).all(axis=-1)
-        inside &= (points_px >= margin_px).all(axis=-1)
-        inside &= (points_px <= [width - 1 - margin_px, height - 1 - margin_px]).all(axis=-1)
-    chosen = np.flatnonzero(inside)
+        chosen = np.flatnonzero(within(points_px, even.shape, margin_px))
     if not chosen.size:
         return chosen
     places = np.rint(points_px[chosen]).astype(int)
@@ -155,7 +158,6 @@ def track(
     back, returned, _ = cv2.calcOpticalFlowPyrLK(two, one, there, None, **settings)
     gap = np.linalg.norm(back - start, axis=-1).reshape(-1)
     there = there.reshape(-1, 2).astype(np.float64)
-    height, width = first.shape
-    inside = (there >= 0).all(axis=1) & (there <= [width - 1, height - 1]).all(axis=1)
+    inside = within(there, first.shape)
     good = (found.reshape(-1) == 1) & (returned.reshape(-1) == 1) & inside & (gap <= MAX_BACK_PX)
     return Tracks(np.where(good[:, None], there, start.reshape(-1, 2)), good)

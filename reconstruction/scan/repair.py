@@ -130,38 +130,24 @@ def weld(mesh: TriangleMesh) -> TriangleMesh:
 
 
 def crop(
-    mesh: TriangleMesh,
-    *,
-    box_mm: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None,
-    facing: tuple[float, float, float] | None = None,
-    min_cosine: float = -0.3,
+    mesh: TriangleMesh, *, box_mm: tuple[tuple[float, float, float], tuple[float, float, float]]
 ) -> TriangleMesh:
     """Leave out what is no face.
 
     Parameters
     ----------
     mesh : TriangleMesh
-    box_mm : pair of corners, optional
+    box_mm : pair of corners
         Least and greatest coordinates of what stays; a triangle stays whole.
-    facing : vector, optional
-        Direction that the face looks in; triangles whose normal is turned away further than
-        `min_cosine` are left out.
 
     Raises
     ------
     ScanMeshError
         Where nothing is left.
     """
-    keep = np.ones(len(mesh.faces), np.bool_)
     centers = mesh.vertices_mm[mesh.faces].mean(axis=1)
-    if box_mm is not None:
-        low, high = np.array(box_mm)
-        keep &= ((centers >= low) & (centers <= high)).all(axis=1)
-    if facing is not None:
-        vectors = mesh.face_vectors()
-        length = np.maximum(np.linalg.norm(vectors, axis=1), 1e-300)
-        way = np.asarray(facing) / np.linalg.norm(facing)
-        keep &= vectors @ way / length >= min_cosine
+    low, high = np.array(box_mm)
+    keep = np.asarray(((centers >= low) & (centers <= high)).all(axis=1))
     if not keep.any():
         raise ScanMeshError(
             f"crop: got no triangle of {len(keep)} in the box {box_mm}, expected the face; "

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis, diffuse_albedo
-from reconstruction.correspondence import charts
+from reconstruction.correspondence import charts as common_charts
 from reconstruction.correspondence import common_parameterization as parameterization
 from reconstruction.correspondence.charts import Chart
 from reconstruction.correspondence.common_parameterization import CommonFrame
@@ -241,7 +241,7 @@ class CommonFaces:
         ]
         frame = parameterization.frame_around(names, places, unrolled, size=common)
         charts = {
-            head: charts.chart(
+            head: common_charts.chart(
                 face.atlas.position_mm,
                 face.atlas.covered,
                 parameterization.correspond(marks[head], frame),

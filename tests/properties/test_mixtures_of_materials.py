@@ -230,7 +230,7 @@ def test_images_of_textures_are_finite_where_they_are_valid(seed, sides, channel
     np.testing.assert_array_equal(mask, valid)
     if image.dtype.kind == "f":
         image[0, 0] = bad
-        with pytest.raises(texture_space.TextureError, match="not finite"):
+        with pytest.raises(texture_space.TextureError, match=r": got (nan|-?inf)"):
             texture_space.checked_image(image, valid)
 
 

@@ -12,6 +12,7 @@ from model import (
     texture_statistics,
     traits,
     translucency_population,
+    vectors,
     wrinkles,
 )
 from model.displacement_synthesis import regions as synthesis_regions
@@ -181,6 +182,8 @@ def test_the_nearest_histogram_is_one_and_its_own(vector, scale):
     found = texture_histograms.project_to_histograms(scale * vector)
     assert np.all(found >= 0.0)
     assert found.sum() == pytest.approx(1.0)
+    rows = np.stack([vector[::-1], vector])
+    np.testing.assert_array_equal(vectors.nearest_shares(scale * rows)[1], found)
     again = texture_histograms.project_to_histograms(found)
     np.testing.assert_allclose(again, found, atol=1e-9)
     cumulated = texture_histograms.cumulated(found)

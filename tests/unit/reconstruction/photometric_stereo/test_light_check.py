@@ -38,7 +38,7 @@ def test_the_right_order_is_left_alone(rng):
 )
 def test_a_wrong_order_is_named_and_mended(name, rng):
     samples, direction = scene(rng)
-    order = light_check._orders(24, None)[name]
+    order = light_check._orders(24)[name]
     listed = np.empty_like(direction)
     listed[order] = direction
     found = light_check.check(samples, listed, rng=rng)
@@ -51,15 +51,6 @@ def test_an_order_that_nobody_would_write_is_called_unknown(rng):
     samples, direction = scene(rng)
     found = light_check.check(samples, rng.permutation(direction), rng=rng)
     assert found.order == "unknown"
-
-
-def test_the_order_of_file_names_is_tried(rng):
-    samples, direction = scene(rng, lights=12)
-    names = [f"img{k}.png" for k in (5, 3, 11, 0, 1, 8, 7, 2, 10, 4, 6, 9)]
-    listed = direction[np.argsort(names)]
-    found = light_check.check(samples, listed, names=names, rng=rng)
-    assert found.order == "sorted by file name"
-    np.testing.assert_array_equal(listed[found.permutation], direction)
 
 
 def test_a_dead_light_is_found_and_weak_ones_are_measured(rng):

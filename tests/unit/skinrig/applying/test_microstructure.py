@@ -107,7 +107,7 @@ def test_two_kinds_of_skin_each_have_their_own_kernels_and_are_blended_between(r
     np.testing.assert_array_equal(tiled.height, done.height)
     with pytest.raises(StrainError, match="weights"):
         KernelRegions((FOREHEAD, softer), left[:1])
-    with pytest.raises(StrainError, match="NaN"):
+    with pytest.raises(StrainError, match="weights: got"):
         KernelRegions((FOREHEAD, softer), left - 1.0)
 
 
