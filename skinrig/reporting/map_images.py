@@ -55,7 +55,7 @@ class MapDrawing:
         """
         small = shrink(values, self.width).astype(float)
         mask = None if self.valid is None else shrink(self.valid, self.width).astype(bool)
-        data = png.encode_scalar(small, low, high, scale=scale, valid=mask, levels=SCALE_COLORS)
+        data = png.Scale(low, high, scale).encode(small, mask, levels=SCALE_COLORS)
         named = f"{self.of}, {title}" if self.of else title
         scale_words = f"color scale {number(low)} to {written(number(high), self.unit)}"
         alt = f"{named}: {_told(small, mask, self.unit)}; {scale_words}"
