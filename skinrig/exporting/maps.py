@@ -76,7 +76,10 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
             out.leave_out(CHROMOPHORE_PACK, "melanin and hemoglobin are of different sizes")
         else:
             out.exr(packed)
-            _packed_png(packed, out)
+            # with the ranges of its channels: values times 2 and 4, blue 0
+            scaled = packed.values * np.array([2.0, 4.0, 1.0], np.float32)
+            what = f"{packed.what}; R is 2 times melanin, G is 4 times hemoglobin"
+            out.png(replace(packed, values=scaled, what=what, low=0.0, high=1.0))
     normal = None
     if on_mesh:
         normal, why = _tangent_normals(appearance, names, out)
@@ -143,13 +146,6 @@ def _packed(appearance: SkinAppearance) -> Image | None:
     layers = [melanin.values, blood.values, np.zeros_like(blood.values)]
     what = "R melanin (epidermis), G hemoglobin (dermis), volume fractions; B is empty, 0"
     return Image(CHROMOPHORE_PACK, np.stack(layers, axis=-1), what=what, valid=valid)
-
-
-def _packed_png(packed: Image, out: ImageFolder) -> None:
-    """Write the pack with the ranges of its channels: values times 2 and 4, blue 0."""
-    scale = np.array([2.0, 4.0, 1.0], np.float32)
-    what = f"{packed.what}; R is 2 times melanin, G is 4 times hemoglobin"
-    out.png(replace(packed, values=packed.values * scale, what=what, low=0.0, high=1.0))
 
 
 def _tangent_normals(

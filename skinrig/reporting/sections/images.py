@@ -5,7 +5,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from skinrig.reporting import map_images, page
+from skinrig.drawing import png
+from skinrig.reporting import page
 
 DOCUMENT_FILES = ("render.json", "analysis.json")
 """Files that tell a folder of pictures."""
@@ -102,7 +103,8 @@ def _images(folder: Path) -> Iterator[page.Block]:
         if len(data) > MAX_IMAGE_BYTES:
             kept.append(path.name)
             continue
-        figures.append(map_images.stored_image(path.stem.replace("-", " "), data))
+        title = path.stem.replace("-", " ")
+        figures.append(page.Image(title, png.address(data), title))
     yield page.Images(figures)
     if kept:
         yield page.note(f"Too large for here: {', '.join(kept)}.")
