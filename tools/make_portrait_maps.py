@@ -41,7 +41,7 @@ def main() -> None:
     for name, high in SCALES.items():
         part = maps[name]
         mask = None if part.valid is None else part.valid[FACE]
-        panels.append(png.colorize(part.values[FACE], 0.0, high, valid=mask))
+        panels.append(png.Scale(0.0, high).colors(part.values[FACE], mask))
         inside = part.values[FACE][mask] if mask is not None else part.values[FACE]
         print(f"{name}: median {np.median(inside):.4f}", file=sys.stderr)
     joined = np.concatenate(panels, axis=1).repeat(3, axis=0).repeat(3, axis=1)

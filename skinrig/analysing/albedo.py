@@ -122,7 +122,7 @@ def analyse_measured(
 
     Raises
     ------
-    TraitFitError, FaceError, LabelError, ParameterizationError
+    TraitFitError, FaceError, UnusableError, ParameterizationError
         Naming what is missing or does not fit.
     """
     tell = progress or (lambda text: None)

@@ -226,7 +226,7 @@ def analyse_measured(
     ------
     AnalysisError
         A folder has no lobes, or of other materials.
-    skinrig.traits.labels.LabelError
+    skinrig.errors.UnusableError
         The table does not fit.
 
     Notes

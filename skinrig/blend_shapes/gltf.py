@@ -171,8 +171,6 @@ def read(path: Path) -> MeshArrays:
     ----------
     path
         .gltf or .glb.
-    part
-        Name of the mesh, needed where several have targets.
 
     Returns
     -------

@@ -35,8 +35,6 @@ def read(path: Path) -> MeshArrays:
     ----------
     path
         A folder with neutral.obj, or the neutral file.
-    shapes
-        Files by name; None takes the other .obj files of the folder, by their stems.
 
     Returns
     -------

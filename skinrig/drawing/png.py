@@ -2,6 +2,7 @@
 
 import base64
 import io
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,56 +58,6 @@ def encode(image: NDArray[np.generic], *, quick: bool = False) -> bytes:
     return cv2.imencode(".png", stored, [cv2.IMWRITE_PNG_COMPRESSION, level])[1].tobytes()
 
 
-def encode_indexed(index: UInt8Array, palette: UInt8Array) -> bytes:
-    r"""Encode an image of a color scale as PNG with a palette.
-
-    Parameters
-    ----------
-    index
-        (H, W), uint8: which color each pixel has.
-    palette
-        (N, 3), uint8, at most 256 colors.
-
-    Returns
-    -------
-    bytes
-        A third of what the same picture takes as RGB, before compression.
-
-    Raises
-    ------
-    ValueError
-        When a shape or dtype is another, or an index has no color.
-
-    Examples
-    --------
-    >>> black_and_white = np.array([[0, 0, 0], [255, 255, 255]], np.uint8)
-    >>> encode_indexed(np.eye(4, dtype=np.uint8), black_and_white)[:8]
-    b'\x89PNG\r\n\x1a\n'
-    """
-    index, palette = np.asarray(index), np.asarray(palette)
-    if index.dtype != np.uint8 or index.ndim != 2 or not index.size:
-        raise ValueError(
-            f"index: got dtype {index.dtype}, shape {index.shape}, expected uint8 (H, W) of at "
-            "least one pixel"
-        )
-    if palette.dtype != np.uint8 or palette.ndim != 2 or palette.shape[1] != 3:
-        raise ValueError(
-            f"palette: got dtype {palette.dtype}, shape {palette.shape}, expected uint8 (N, 3)"
-        )
-    if len(palette) > 256 or int(index.max()) >= len(palette):
-        raise ValueError(
-            f"palette: got {len(palette)} colors for indices up to {int(index.max())}, expected "
-            "one for each index and at most 256"
-        )
-    from PIL import Image
-
-    image = Image.frombytes("P", index.shape[::-1], index.tobytes())
-    image.putpalette(palette.tobytes())
-    file = io.BytesIO()
-    image.save(file, "PNG", optimize=True)
-    return file.getvalue()
-
-
 def address(file: bytes) -> str:
     """Return a PNG file's bytes as a ``data:`` address."""
     return "data:image/png;base64," + base64.b64encode(file).decode("ascii")
@@ -143,37 +94,63 @@ def srgb_curve(linear: FloatArray) -> Float64Array:
     return np.where(value <= 0.0031308, 12.92 * value, power)
 
 
-def colorize(
-    values: FloatArray,
-    low: float,
-    high: float,
-    *,
-    scale: str = "viridis",
-    valid: BoolArray | None = None,
-) -> UInt8Array:
-    """Map values to a perceptually uniform color scale.
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """A perceptually uniform color scale.
 
-    Parameters
+    Attributes
     ----------
-    values
-        (H, W).
     low, high
-        The ends of the scale, in the unit of ``values``; beyond them the end's color shows.
-    scale
+        Its ends, in the unit of the values; beyond them the end's color shows.
+    name
         A matplotlib color map, such as "viridis" or the diverging "RdBu_r".
-    valid
-        (H, W); other pixels, and NaN, become mid gray.
-
-    Returns
-    -------
-    ndarray of uint8
-        (H, W, 3).
     """
-    table = palette(scale, 256)
-    position, shown = _position(values, low, high, valid)
-    image = table[np.round(255 * position).astype(np.intp)]
-    image[~shown] = INVALID_GRAY
-    return image
+
+    low: float
+    high: float
+    name: str = "viridis"
+
+    def colors(self, values: FloatArray, valid: BoolArray | None = None) -> UInt8Array:
+        """Return the colors of values, (H, W, 3); of what is NaN or not valid mid gray."""
+        position, shown = self._position(values, valid)
+        image = palette(self.name, 256)[np.round(255 * position).astype(np.intp)]
+        image[~shown] = INVALID_GRAY
+        return image
+
+    def encode(
+        self, values: FloatArray, valid: BoolArray | None = None, *, levels: int = 128
+    ) -> bytes:
+        """Return a map by few colors as a PNG file with a palette.
+
+        Parameters
+        ----------
+        values, valid
+            (H, W); as for `colors`.
+        levels
+            Colors of the scale, 2 to 255: the picture tells values to one part in so many of the
+            scale; its own color is for pixels without a value.
+        """
+        from PIL import Image
+
+        position, shown = self._position(values, valid)
+        index = np.round((levels - 1) * position).astype(np.uint8)
+        index[~shown] = levels
+        gray = np.full((1, 3), INVALID_GRAY, np.uint8)
+        image = Image.frombytes("P", index.shape[::-1], index.tobytes())
+        image.putpalette(np.concatenate([palette(self.name, levels), gray]).tobytes())
+        file = io.BytesIO()
+        image.save(file, "PNG", optimize=True)
+        return file.getvalue()
+
+    def _position(
+        self, values: FloatArray, valid: BoolArray | None
+    ) -> tuple[Float64Array, BoolArray]:
+        """Return where values lie on the scale, in [0, 1], and which are shown."""
+        values = np.asarray(values, np.float64)
+        span = self.high - self.low if self.high > self.low else 1.0
+        finite = np.isfinite(values)
+        position = np.clip((np.where(finite, values, self.low) - self.low) / span, 0.0, 1.0)
+        return position, finite if valid is None else finite & np.asarray(valid, bool)
 
 
 def palette(scale: str, colors: int) -> UInt8Array:
@@ -181,45 +158,3 @@ def palette(scale: str, colors: int) -> UInt8Array:
     from matplotlib import colormaps
 
     return np.round(255 * colormaps[scale](np.linspace(0.0, 1.0, colors))[:, :3]).astype(np.uint8)
-
-
-def encode_scalar(
-    values: FloatArray,
-    low: float,
-    high: float,
-    *,
-    scale: str = "viridis",
-    valid: BoolArray | None = None,
-    levels: int = 128,
-) -> bytes:
-    """Encode a map by a color scale of few colors as PNG with a palette.
-
-    Parameters
-    ----------
-    values, low, high, scale, valid
-        As for `colorize`.
-    levels
-        Colors of the scale, 2 to 255: the picture tells values to one part in so many of the
-        scale; its own color is for pixels without a value.
-
-    Returns
-    -------
-    bytes
-        A PNG file.
-    """
-    position, shown = _position(values, low, high, valid)
-    index = np.round((levels - 1) * position).astype(np.uint8)
-    index[~shown] = levels
-    gray = np.full((1, 3), INVALID_GRAY, np.uint8)
-    return encode_indexed(index, np.concatenate([palette(scale, levels), gray]))
-
-
-def _position(
-    values: FloatArray, low: float, high: float, valid: BoolArray | None
-) -> tuple[Float64Array, BoolArray]:
-    """Return where values lie on a scale, in [0, 1], and which are shown."""
-    values = np.asarray(values, np.float64)
-    span = high - low if high > low else 1.0
-    finite = np.isfinite(values)
-    position = np.clip((np.where(finite, values, low) - low) / span, 0.0, 1.0)
-    return position, finite if valid is None else finite & np.asarray(valid, bool)

@@ -166,7 +166,7 @@ def edit(
 
     Raises
     ------
-    EditError, FaceError, MaskError, SpotError, StoreError, TraitLibraryError
+    EditError, FaceError, MaskError, SpotError, StoreError, UnusableError
         Naming what is missing or does not fit; nothing is written.
     """
     if out.resolve() == path.resolve():

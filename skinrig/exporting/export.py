@@ -10,7 +10,7 @@ from capture.session import Session, verify
 from model import store
 from model.skin import SkinAppearance
 from skinrig import consent
-from skinrig.errors import UsageError
+from skinrig.errors import UsageError, one_of
 from skinrig.exporting.options import Delivery, ExportError
 from skinrig.exporting.sealing import Exported, sealed
 
@@ -98,9 +98,7 @@ def export(
     ValueError
         Of the format, for a source that it cannot be made of.
     """
-    known = (*APPEARANCE_FORMATS, *SESSION_FORMATS)
-    if to not in known:
-        raise ExportError(f"to: got {to!r}, expected one of {', '.join(known)}")
+    one_of("to", to, (*APPEARANCE_FORMATS, *SESSION_FORMATS), ExportError)
     if Path(out).exists():
         raise ExportError(f"{out}: exists; choose a new folder")
     order = delivery or Delivery()

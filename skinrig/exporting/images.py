@@ -6,8 +6,7 @@ above 1: its record says how codes become values again, and which share of the p
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.skin import SkinAppearance
+from skinrig.appearances.contents import digest
 from skinrig.arrays import BoolArray, FloatArray
 from skinrig.drawing import png
 from skinrig.exporting.options import FIRST_TILE, Delivery
@@ -74,17 +74,11 @@ class Image:
 
     @staticmethod
     def of_normals(
-        name: str,
-        normals: FloatArray,
-        delivery: Delivery,
-        what: str,
-        *,
-        valid: BoolArray | None = None,
-        filler: tuple[float, ...] | None = None,
+        name: str, normals: FloatArray, delivery: Delivery, what: str, **more: Any
     ) -> Image:
         """Return a map of normals, +Y up, with the green that is asked for."""
         turned = normals * np.array([1.0, delivery.y, 1.0], np.float32)
-        return Image(name, turned, "1", DATA_SPACE, what, -1.0, 1.0, valid, filler)
+        return Image(name, turned, "1", DATA_SPACE, what, -1.0, 1.0, **more)
 
     def on_empty_tile(self) -> Image:
         """Return the image of a tile where nothing was measured, of one value."""
@@ -129,28 +123,28 @@ class ImageFolder:
 
     def exr(self, image: Image, folder: str = "exr") -> str:
         """Write a float32 EXR a tile; return the first's name below the root."""
-        names = []
-        for tile, one in self._by_tile(image):
-            names.append(self._place(folder, image.name, "exr", tile))
+
+        def put(path: Path, one: Image) -> dict[str, Any]:
             channels = {"Y" if one.values.ndim == 2 else "RGB": one.values}
             header = {"unit": one.unit, "colorSpace": one.space, "comments": one.what}
-            write_channels(self.root / names[-1], channels, header, rec709=one.space == SRGB_SPACE)
-            self._record(names[-1], one, {"encoding": "32-bit float, the value itself"})
-        return names[0]
+            write_channels(path, channels, header, rec709=one.space == SRGB_SPACE)
+            return {"encoding": "32-bit float, the value itself"}
+
+        return self._tiled(image, folder, "exr", put)
 
     def png(self, image: Image, folder: str = "png") -> str:
         """Write a PNG of 16 bits a tile; return the first's name below the root.
 
         Colors in `SRGB_SPACE` are coded by sRGB's curve, all else in proportion.
         """
-        low, high = coded_range(image)
-        names = []
-        for tile, one in self._by_tile(replace(image, low=low, high=high)):
-            names.append(self._place(folder, image.name, "png", tile))
+
+        def put(path: Path, one: Image) -> dict[str, Any]:
             codes, told = coded(one)
-            (self.root / names[-1]).write_bytes(png.encode(codes, quick=True))
-            self._record(names[-1], one, told)
-        return names[0]
+            path.write_bytes(png.encode(codes, quick=True))
+            return told
+
+        low, high = coded_range(image)
+        return self._tiled(replace(image, low=low, high=high), folder, "png", put)
 
     def both(self, image: Image) -> str:
         """Write a float EXR and a 16-bit PNG a tile; return the first PNG's name."""
@@ -168,26 +162,25 @@ class ImageFolder:
         files = dict(sorted(self.records.items()))
         write_json(self.root / file, {**provenance(appearance), **told, "files": files})
 
-    def _by_tile(self, image: Image) -> list[tuple[int, Image]]:
-        empty = [(tile, image.on_empty_tile()) for tile in self.tiles[1:]]
-        return [(self.tiles[0], image), *empty]
-
-    def _place(self, folder: str, name: str, suffix: str, tile: int) -> str:
+    def _tiled(
+        self, image: Image, folder: str, suffix: str, put: Callable[[Path, Image], dict[str, Any]]
+    ) -> str:
+        """Write an image of each tile and keep its record; return the first's name."""
         (self.root / folder).mkdir(exist_ok=True)
-        return f"{folder}/{self.delivery.tiled(name, suffix, tile)}"
-
-    def _record(self, file: str, image: Image, told: Mapping[str, Any]) -> None:
-        with open(self.root / file, "rb") as stream:
-            digest = hashlib.file_digest(stream, "sha256").hexdigest()
-        self.records[file] = {
-            "what": image.what,
-            "unit": image.unit,
-            "color_space": image.space,
-            "shape": list(image.values.shape),
-            "valid_share": 1.0 if image.valid is None else float(image.valid.mean()),
-            **told,
-            "sha256": digest,
-        }
+        names = []
+        for tile in self.tiles:
+            one = image if tile == self.tiles[0] else image.on_empty_tile()
+            names.append(f"{folder}/{self.delivery.tiled(image.name, suffix, tile)}")
+            self.records[names[-1]] = {
+                "what": one.what,
+                "unit": one.unit,
+                "color_space": one.space,
+                "shape": list(one.values.shape),
+                "valid_share": 1.0 if one.valid is None else float(one.valid.mean()),
+                **put(self.root / names[-1], one),
+                "sha256": digest(self.root / names[-1]),
+            }
+        return names[0]
 
 
 def coded(image: Image, *, depth: int = 16) -> tuple[NDArray[Any], dict[str, Any]]:

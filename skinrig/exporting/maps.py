@@ -61,11 +61,10 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
             f"{', '.join(sorted(appearance.maps)) or 'a reconstruction that has some'}"
         )
     out = ImageFolder(folder, delivery)
-    left_out: list[tuple[str, str]] = []
     on_mesh = any(name in appearance.files for name in MESH_FILES)
     shown: dict[str, tuple[str, str]] = {}  # what a material file names: file and its type
     for name in names:
-        image = _image(name, appearance.maps[name], delivery, on_mesh=on_mesh)
+        image = _image(name, appearance.maps[name], delivery, on_mesh)
         exr = out.exr(image)
         out.png(image)
         colored = "color3" if image.space == SRGB_SPACE else "vector3"
@@ -74,15 +73,18 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     if {"melanin", "hemoglobin"} <= set(names):
         packed = _packed(appearance)
         if packed is None:
-            left_out.append((CHROMOPHORE_PACK, "melanin and hemoglobin are of different sizes"))
+            out.leave_out(CHROMOPHORE_PACK, "melanin and hemoglobin are of different sizes")
         else:
             out.exr(packed)
-            _packed_png(packed, out)
+            # with the ranges of its channels: values times 2 and 4, blue 0
+            scaled = packed.values * np.array([2.0, 4.0, 1.0], np.float32)
+            what = f"{packed.what}; R is 2 times melanin, G is 4 times hemoglobin"
+            out.png(replace(packed, values=scaled, what=what, low=0.0, high=1.0))
     normal = None
     if on_mesh:
-        normal, why = _tangent_normals(appearance, names, out, delivery)
+        normal, why = _tangent_normals(appearance, names, out)
         if why:
-            left_out.append(("normal", why))
+            out.leave_out("normal", why)
     text = materialx.images_document(shown, delivery, tangent_normal=normal)
     (folder / "maps.mtlx").write_text(text, encoding="utf-8")
     for name, data in sorted(appearance.files.items()):
@@ -97,13 +99,13 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
             "normal_y": delivery.green,
             "udim": "none" if delivery.udim == "none" else "tile 1001",
             "rig_frame": "mm, +x right, +y up, +z towards the main camera",
-            "left_out": [list(row) for row in left_out],
+            "left_out": [list(row) for row in out.left_out],
         },
     )
-    return left_out
+    return out.left_out
 
 
-def _image(name: str, one: SkinMap, delivery: Delivery, *, on_mesh: bool) -> Image:
+def _image(name: str, one: SkinMap, delivery: Delivery, on_mesh: bool) -> Image:
     """Return a map as an image: normals seen by a camera get the green that is asked for."""
     values, what = one.values, one.description
     low, high = png_range(name)
@@ -146,15 +148,8 @@ def _packed(appearance: SkinAppearance) -> Image | None:
     return Image(CHROMOPHORE_PACK, np.stack(layers, axis=-1), what=what, valid=valid)
 
 
-def _packed_png(packed: Image, out: ImageFolder) -> None:
-    """Write the pack with the ranges of its channels: values times 2 and 4, blue 0."""
-    scale = np.array([2.0, 4.0, 1.0], np.float32)
-    what = f"{packed.what}; R is 2 times melanin, G is 4 times hemoglobin"
-    out.png(replace(packed, values=packed.values * scale, what=what, low=0.0, high=1.0))
-
-
 def _tangent_normals(
-    appearance: SkinAppearance, names: list[str], out: ImageFolder, delivery: Delivery
+    appearance: SkinAppearance, names: list[str], out: ImageFolder
 ) -> tuple[str | None, str]:
     """Write normals in the mesh's frames; return the PNG's name, and why there is none."""
     found = next((n for n in ("normals_refined", "normals") if n in names), None)
@@ -172,6 +167,6 @@ def _tangent_normals(
     valid = covered & one.mask
     turned = tangents.filled(tangents.to_tangent(one.values, axes, covered), valid)
     what = f"{found} in the tangent frames of the mesh's vertices (MikkTSpace's rules)"
-    what = f"{what}, {delivery.green}"
-    image = Image.of_normals("normal_tangent", turned, delivery, what, valid=valid)
+    what = f"{what}, {out.delivery.green}"
+    image = Image.of_normals("normal_tangent", turned, out.delivery, what, valid=valid)
     return out.both(image), ""

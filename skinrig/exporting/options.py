@@ -20,8 +20,6 @@ FIRST_TILE: Final = 1001
 """UDIM tile of texture coordinates 0 to 1, which maps are of."""
 TILE_SEPARATORS: Final[Mapping[str, str]] = {"none": "", "dot": ".", "underscore": "_"}
 """What stands between a texture's name and the number of its tile."""
-UDIM_TOKENS: Final[Mapping[str, str]] = {"none": "", "dot": ".<UDIM>", "underscore": "_<UDIM>"}
-"""The same in a material file."""
 
 _NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
@@ -150,7 +148,7 @@ class Delivery:
         """Scene units in a millimeter."""
         return M_PER_MM / UNITS_M[self.scene_unit]
 
-    def tiled(self, name: str, suffix: str, tile: int = FIRST_TILE) -> str:
+    def tiled(self, name: str, suffix: str, tile: int | str = FIRST_TILE) -> str:
         """Return the file name of a texture's tile.
 
         Examples
@@ -158,9 +156,9 @@ class Delivery:
         >>> Delivery(udim="underscore").tiled("normal", "png")
         'normal_1001.png'
         """
-        number = "" if self.udim == "none" else str(tile)
+        number = "" if self.udim == "none" else tile
         return f"{name}{TILE_SEPARATORS[self.udim]}{number}.{suffix}"
 
     def referred(self, name: str, suffix: str) -> str:
         """Return a texture's name as a material file refers to all its tiles."""
-        return f"{name}{UDIM_TOKENS[self.udim]}.{suffix}"
+        return self.tiled(name, suffix, "<UDIM>")

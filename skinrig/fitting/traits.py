@@ -104,7 +104,7 @@ def fit_traits(
 
     Raises
     ------
-    TraitFitError, FaceError, LabelError, TraitError, ParameterizationError
+    TraitFitError, FaceError, UnusableError, TraitError, ParameterizationError
         Naming what is missing or does not fit.
     """
     tell = progress or (lambda text: None)

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from capture.calibration.lights import LightTable
 from model import store
 from skinrig.arrays import Float32Array, Float64Array
+from skinrig.errors import one_of
 
 Vector = tuple[float, float, float]
 
@@ -108,9 +109,7 @@ class Light:
         LightError
             There is no such light, or its calibration is not valid.
         """
-        if name not in table.names:
-            raise LightError(f"light: got {name!r}, expected one of {', '.join(table.names)}")
-        row = table.names.index(name)
+        row = table.names.index(one_of("light", name, table.names, LightError))
         if not table.valid[row]:
             raise LightError(f"light {name!r}: is dead, or its calibration is not valid")
         place = _three(name, "position_mm", table.position_mm[row])

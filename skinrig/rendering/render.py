@@ -24,14 +24,12 @@ from model.skin_reflectance import lobe_brdf, transmitted
 from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.render import Caster, GBuffer, trace
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
+from skinrig.errors import one_of
 from skinrig.rendering import camera as rendering_camera
 from skinrig.rendering.camera import Camera, RenderingError
 from skinrig.rendering.geometry import FittedSurface, Rows
 from skinrig.rendering.interior import Interior, Lighting
 from skinrig.rendering.lights import Light
-
-__all__ = ["Camera", "Light", "Rendering", "Subsurface", "render"]
-
 
 Subsurface = Literal["local", "dipole", "none"]
 """Light from inside leaves where it entered, spreads by the dipole, or is left out."""
@@ -67,10 +65,6 @@ class Rendering:
         Covered pixels of which every ray sees the whole of a light that it faces.
     uv
         Mean texture coordinates, (H, W, 2); (0, 0) beside the skin.
-    camera
-        By which it was rendered.
-    lights
-        Names.
     subsurface
         How light from inside was treated.
     """
@@ -82,8 +76,6 @@ class Rendering:
     covered: BoolArray
     lit: BoolArray
     uv: Float32Array
-    camera: Camera
-    lights: tuple[str, ...]
     subsurface: Subsurface
 
 
@@ -139,10 +131,7 @@ def render(
     if not given:
         raise RenderingError("lights: got none, expected at least one")
     lamps = [part for light in given for part in light.parts()]
-    if subsurface not in get_args(Subsurface):
-        raise RenderingError(
-            f"subsurface: got {subsurface!r}, expected one of {', '.join(get_args(Subsurface))}"
-        )
+    one_of("subsurface", subsurface, get_args(Subsurface), RenderingError)
     if shadow_samples < 1:
         raise RenderingError(f"shadow samples: got {shadow_samples}, expected at least 1")
     rays = Caster(laid.mesh) if caster is None else caster
@@ -166,10 +155,9 @@ def render(
             progress(f"render: {100 * part[1] // height} %")
     _require_outside(out, met - out, camera)
     whole = film.coverage > 1.0 - 1e-6
-    names = tuple(dict.fromkeys(lamp.name for lamp in lamps))
     light = film.diffuse + film.surface, film.diffuse, film.surface
     masks = film.measured & whole, film.lit & whole
-    return Rendering(*light, film.coverage, *masks, film.uv, camera, names, subsurface)
+    return Rendering(*light, film.coverage, *masks, film.uv, subsurface)
 
 
 def joined(*meshes: Mesh) -> Mesh:

@@ -55,7 +55,7 @@ class MapDrawing:
         """
         small = shrink(values, self.width).astype(float)
         mask = None if self.valid is None else shrink(self.valid, self.width).astype(bool)
-        data = png.encode_scalar(small, low, high, scale=scale, valid=mask, levels=SCALE_COLORS)
+        data = png.Scale(low, high, scale).encode(small, mask, levels=SCALE_COLORS)
         named = f"{self.of}, {title}" if self.of else title
         scale_words = f"color scale {number(low)} to {written(number(high), self.unit)}"
         alt = f"{named}: {_told(small, mask, self.unit)}; {scale_words}"
@@ -118,20 +118,10 @@ def plain_image(title: str, image: UInt8Array, *, alt: str = "") -> page.Image:
     return _stored(title, png.encode(image), alt or title, image.shape[:2])
 
 
-def stored_image(title: str, data: bytes) -> page.Image:
-    """Return the bytes of a PNG file for the page as they are."""
-    return _stored(title, data, title, None)
-
-
 def _stored(
-    title: str,
-    data: bytes,
-    alt: str,
-    shape: tuple[int, ...] | None,
-    scale: page.ColorScale | None = None,
+    title: str, data: bytes, alt: str, shape: tuple[int, ...], scale: page.ColorScale | None = None
 ) -> page.Image:
-    size = None if shape is None else (shape[1], shape[0])
-    return page.Image(title, png.address(data), alt, size, scale)
+    return page.Image(title, png.address(data), alt, (shape[1], shape[0]), scale)
 
 
 def reach_of(values: FloatArray, shown: BoolArray, percentile: float) -> float:

@@ -47,11 +47,6 @@ class Check:
     worst_got: float = float("nan")
     """As large as it surely is there, in ``unit``; NaN where that is no number like ``got``."""
 
-    @staticmethod
-    def of_shares(name: str, got: float, bound: float, note: str = "", **more: Any) -> Check:
-        """Return a check that a share stays within its limit, both told in percent."""
-        return Check(name, 100 * got, 100 * bound, "<=", "%", note, **more)
-
     @property
     def passed(self) -> bool:
         """Whether ``got`` keeps to ``bound``; NaN does not."""

@@ -163,7 +163,7 @@ def least_known(name: str, appearance: SkinAppearance) -> list[str]:
     Examples
     --------
     >>> thickness = SkinMap(np.full((2, 2), 2.0), "mm", np.full((2, 2), 0.1))
-    >>> weaknesses("cheek", SkinAppearance({"thickness": thickness}, "measured"))
+    >>> least_known("cheek", SkinAppearance({"thickness": thickness}, "measured"))
     ['cheek: thickness, median standard error 5 % of its value']
     """
     told: list[tuple[float, str]] = []

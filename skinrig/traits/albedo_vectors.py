@@ -19,7 +19,7 @@ from model.traits import TraitSpace, histogram_transport
 from model.traits.feasible_sets import Free, Histograms
 from model.traits.vectors import Contrast
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
-from skinrig.errors import one_of
+from skinrig.errors import UnusableError, one_of
 
 VectorKind = Literal["quantiles", "histograms"]
 
@@ -28,10 +28,6 @@ MIN_RELATIVE_SCALE: Final = 1e-3
 """Spread of a response, over that of the first channel of the image, that tells nothing."""
 MIN_REFLECTANCE: Final = 1e-3
 """Reflectance below which a logarithm is taken of this; no skin is as dark."""
-
-
-class AlbedoVectorError(ValueError):
-    """Vectors of a kind that there is not."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,9 +50,9 @@ class AlbedoTraits:
 
     def __post_init__(self) -> None:
         """Refuse another kind, and vectors of another length."""
-        one_of("vectors", self.kind, VECTOR_KINDS, AlbedoVectorError)
+        one_of("vectors", self.kind, VECTOR_KINDS)
         if len(self.traits.center) != self.texture.size:
-            raise AlbedoVectorError(
+            raise UnusableError(
                 f"vectors: got {len(self.traits.center)} numbers, expected {self.texture.size}"
             )
 
@@ -109,7 +105,7 @@ class AlbedoTraits:
 def encoded(r_d: ArrayLike, kind: VectorKind) -> Float64Array:
     """Return what statistics are taken of: R_d for histograms, its logarithm for quantiles."""
     given = np.asarray(r_d, np.float64)
-    if one_of("vectors", kind, VECTOR_KINDS, AlbedoVectorError) == "histograms":
+    if one_of("vectors", kind, VECTOR_KINDS) == "histograms":
         return given
     return np.asarray(np.log(np.maximum(given, MIN_REFLECTANCE)))
 

@@ -9,10 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from skinrig.arrays import BoolArray, Float64Array
-
-
-class LabelError(ValueError):
-    """A table of labels that cannot be used."""
+from skinrig.errors import UnusableError
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,44 +48,44 @@ def read(path: Path, faces: Sequence[str]) -> Labels:
 
     Raises
     ------
-    LabelError
+    UnusableError
         Naming line and column.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise LabelError(f"{path}: is no UTF-8 text") from error
+        raise UnusableError(f"{path}: is no UTF-8 text") from error
     rows = [
         (number, [cell.strip() for cell in next(csv.reader([line]))])
         for number, line in enumerate(text.splitlines(), start=1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
     if not rows:
-        raise LabelError(f"{path}: is empty, expected a line name,TRAIT,...")
+        raise UnusableError(f"{path}: is empty, expected a line name,TRAIT,...")
     header = rows[0][1]
     traits = header[1:]
     if header[0] != "name" or not traits:
-        raise LabelError(
+        raise UnusableError(
             f"{path}, line {rows[0][0]}: got columns {header}, expected name,TRAIT,..."
         )
     if len(set(header)) < len(header) or not all(header):
         twice = next(c for c in header if header.count(c) > 1 or not c)
-        raise LabelError(f"{path}: column {twice!r} is there twice or has no name")
+        raise UnusableError(f"{path}: column {twice!r} is there twice or has no name")
     values: dict[str, list[float]] = {}
     for number, cells in rows[1:]:
         where = f"{path}, line {number}"
         if len(cells) != len(header):
-            raise LabelError(f"{where}: got {len(cells)} cells, expected {len(header)}")
+            raise UnusableError(f"{where}: got {len(cells)} cells, expected {len(header)}")
         cells[0] = cells[0].removeprefix("appearance-")
         if cells[0] in values:
-            raise LabelError(f"{where}: {cells[0]!r} is there twice")
+            raise UnusableError(f"{where}: {cells[0]!r} is there twice")
         values[cells[0]] = [
             _number(cell, f"{where}, column {trait}")
             for cell, trait in zip(cells[1:], traits, strict=True)
         ]
     missing = [name for name in faces if name not in values]
     if missing:
-        raise LabelError(
+        raise UnusableError(
             f"{path}: has no line for {', '.join(missing)}; its names are those of the folders, "
             f"with or without appearance-: {', '.join(list(values)[:5])}, ..."
         )
@@ -107,7 +104,7 @@ def _number(cell: str, where: str) -> float:
     try:
         value = float(cell)
     except ValueError as error:
-        raise LabelError(f"{where}: got {cell!r}, expected 0, 1 or a number") from error
+        raise UnusableError(f"{where}: got {cell!r}, expected 0, 1 or a number") from error
     if not math.isfinite(value):
-        raise LabelError(f"{where}: got {cell!r}, expected a finite number")
+        raise UnusableError(f"{where}: got {cell!r}, expected a finite number")
     return value

@@ -17,7 +17,7 @@ from model.traits.storage import TraitLibrary
 from reconstruction.correspondence import common_regions
 from reconstruction.correspondence.common_parameterization import CommonFrame
 from skinrig.appearances.contents import digest
-from skinrig.errors import one_of
+from skinrig.errors import UnusableError, one_of
 from skinrig.traits.albedo_vectors import AlbedoTraits, VectorKind
 
 SURFACE_SPACE: Final = "surface"
@@ -25,10 +25,6 @@ ALBEDO_SPACE: Final = "albedo"
 TEXTURE_SPACE_FILE: Final = "texture_space.npz"
 DEFAULT_SIDE_MM, DEFAULT_SIZE_PX = 240.0, 256
 """Of the common map of a library that does not tell its own."""
-
-
-class TraitLibraryError(ValueError):
-    """A library that lacks what an edit needs."""
 
 
 def space_name(region: str) -> str:
@@ -91,12 +87,12 @@ def parts_of(library: TraitLibrary) -> LibraryParts:
 
     Raises
     ------
-    TraitLibraryError
+    UnusableError
         When its albedo traits come without the texture space that they are of.
     """
     told = library.parameters
     stated = told.get("vectors", "histograms")
-    kind = one_of("vectors", stated, get_args(VectorKind), TraitLibraryError)
+    kind = one_of("vectors", stated, get_args(VectorKind))
     frame = (
         CommonFrame.from_document(told["frame"])
         if isinstance(told.get("frame"), dict)
@@ -116,7 +112,7 @@ def parts_of(library: TraitLibrary) -> LibraryParts:
 def _texture(library: TraitLibrary) -> TextureSpace:
     content = library.files.get(TEXTURE_SPACE_FILE)
     if content is None:
-        raise TraitLibraryError(
+        raise UnusableError(
             f"files: got {json.dumps(sorted(library.files))}, expected {TEXTURE_SPACE_FILE}: "
             "traits of the albedo mean nothing without the texture space they are of"
         )
@@ -126,7 +122,7 @@ def _texture(library: TraitLibrary) -> TextureSpace:
             levels, orientations, images = (int(n) for n in stored["counts"])
         return TextureSpace(mean, axes, edges, levels, orientations, images)
     except (OSError, KeyError, ValueError, EOFError, TextureError) as error:
-        raise TraitLibraryError(f"{TEXTURE_SPACE_FILE}: cannot be read: {error}") from error
+        raise UnusableError(f"{TEXTURE_SPACE_FILE}: cannot be read: {error}") from error
 
 
 def load(path: Path | None) -> tuple[TraitLibrary, str]:
@@ -134,14 +130,14 @@ def load(path: Path | None) -> tuple[TraitLibrary, str]:
 
     Raises
     ------
-    TraitLibraryError
+    UnusableError
         When none comes with it.
     """
     if path is not None:
         return trait_storage.load(path), digest(path)
     packaged = resources.files("model").joinpath("data", trait_storage.PACKAGED_FILE)
     if not packaged.is_file():
-        raise TraitLibraryError(
+        raise UnusableError(
             "traits: no library comes with this package; name one with --space FILE "
             "(`skinrig fit traits` learns one)"
         )

@@ -48,9 +48,9 @@ class Served:
     requests: list[str]
     _ended: threading.Event
 
-    def wait(self, seconds: float | None = None) -> None:
-        """Wait until the server is closed, or for so long."""
-        self._ended.wait(seconds)
+    def wait(self) -> None:
+        """Wait until the server is closed."""
+        self._ended.wait()
 
 
 @contextmanager
@@ -104,7 +104,6 @@ def serve_scene(
     *,
     console: Console,
     displacement: Path | None = None,
-    seconds: float | None = None,
 ) -> None:
     """Serve the page of a scene on this machine until it is interrupted.
 
@@ -121,8 +120,6 @@ def serve_scene(
     displacement
         A .npy file of heights, um, in the texture of the mesh: fetched as tiles, in place of relief
         that is grown in the page.
-    seconds
-        How long; None serves until Ctrl-C.
 
     Raises
     ------
@@ -148,7 +145,7 @@ def serve_scene(
             console.say(f"{served.url}: open it in a browser on this machine; Ctrl-C ends it")
             console.document("skinrig.view-served/1", document)
             try:
-                served.wait(seconds)
+                served.wait()
             except KeyboardInterrupt:
                 console.progress("no longer served")
 

@@ -12,7 +12,7 @@ from model import dipole, fresnel, skin_reflectance
 from model.skin import SkinAppearance
 from skinrig.appearances.contents import assumed_by
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from skinrig.errors import UsageError
+from skinrig.errors import UsageError, one_of
 from skinrig.exporting.images import CAMERA_SPACE, DATA_SPACE, SRGB_SPACE, Image
 from skinrig.exporting.materials import subsurface_radius, surface_fit, tangents, udim
 from skinrig.exporting.materials.tangents import FramedMesh
@@ -243,9 +243,7 @@ class Material:
             "translucency": (self.translucency_mm, "mm", DATA_SPACE, 16.0),
             "mask": (self.valid.astype(np.float32), "1", DATA_SPACE, 1.0),
         }
-        if name not in simple:
-            raise ExportError(f"texture: got {name!r}, expected one of {', '.join(simple)}")
-        values, unit, space, high = simple[name]
+        values, unit, space, high = simple[one_of("texture", name, simple, ExportError)]
         what = MAP_NOTES.get(name, "1 where all was measured")
         if name == "base_color":
             what = f"{what}; {COLOR_NOTE}"

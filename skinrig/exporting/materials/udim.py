@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rigsim.geometry.mesh import Mesh, MeshFileError, build_mesh, vertex_normals
+from rigsim.geometry.mesh import Mesh, build_mesh, vertex_normals
 from skinrig.arrays import Float32Array, FloatArray, Int32Array
 from skinrig.blend_shapes import meshes as blend_shapes
 from skinrig.exporting.options import FIRST_TILE, ExportError
@@ -157,8 +157,6 @@ def _contents(path: Path) -> Contents:
         return read.vertices_mm, read.faces, read.uv, dict(read.shapes)
     try:
         mesh = read_mesh(path)
-    except MeshFileError:
-        raise
     except ValueError as error:
         # texture coordinates over more than one tile are the one thing that is allowed here
         if "uv: got" not in str(error):

@@ -57,10 +57,6 @@ def write(appearance: SkinAppearance, out: ImageFolder) -> tuple[dict[str, Any],
         With the part facial_color.
     out
         Where to.
-    delivery
-        States by `only`; `onto` and `landmarks`.
-    left_out
-        Grows by what is left out, and why.
 
     Returns
     -------

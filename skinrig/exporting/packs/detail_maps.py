@@ -192,8 +192,6 @@ def scatter(out: ImageFolder) -> dict[str, Any]:
 
     Parameters
     ----------
-    delivery
-        `onto`: a fitted model with a map ``translucency``.
     out
         Where to.
 
@@ -245,8 +243,6 @@ def micro_normals(
         What it says of its sites.
     out
         Where to.
-    delivery
-        Green of normals.
 
     Returns
     -------

@@ -15,6 +15,7 @@ from reconstruction.pipeline.dome.calibrated import calibrated
 from reconstruction.pipeline.dome.images import DomeImages
 from reconstruction.pipeline.inputs import Inputs
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray, UInt16Array
+from skinrig.errors import one_of
 from skinrig.exporting.options import Delivery, ExportError
 from skinrig.exporting.sessions.copies import write_session_document
 
@@ -133,9 +134,7 @@ def in_camera_frame(position_mm: FloatArray, rotation: FloatArray) -> Float64Arr
 def _view(names: tuple[str, ...], cameras: Any, wanted: str | None) -> int:
     if wanted is None:
         return int(np.argmin([camera.rotation[2, 2] for camera in cameras]))
-    if wanted not in names:
-        raise ExportError(f"--camera: got {wanted!r}, expected one of {', '.join(names)}")
-    return names.index(wanted)
+    return names.index(one_of("--camera", wanted, names, ExportError))
 
 
 def _imported(session: Session, view: str, light: str) -> tuple[Float32Array, BoolArray]:

@@ -13,7 +13,6 @@ Ma et al. 2007, Rapid Acquisition of Specular and Diffuse Normal Maps, EGSR.
 """
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,6 +28,7 @@ from reconstruction.pipeline.gradient.stages import WAVELENGTH_UM
 from reconstruction.pipeline.inputs import Inputs
 from reconstruction.pipeline.sensor_noise import SensorNoise
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
+from skinrig.errors import one_of
 from skinrig.exporting.images import write_channels
 from skinrig.exporting.options import Delivery, ExportError
 from skinrig.exporting.sealing import IMAGE_ORIENTATION, provenance, write_json
@@ -198,25 +198,7 @@ def stokes_header(what: str) -> dict[str, str]:
 DOCUMENT_FILE: Final = "stokes.json"
 SCHEMA: Final = "skinrig.export.stokes/1"
 PARALLEL, CROSSED = "parallel", "crossed"
-S0, S1 = "S0", "S1"
-CHANNELS: Final = [channel(kind, 1e3 * WAVELENGTH_UM) for kind in (S0, S1)]
-
-
-def components(parallel: Float32Array, crossed: Float32Array) -> dict[str, Float32Array]:
-    """Return S0 and S1 of pictures behind an analyser along an axis, and across it.
-
-    Parameters
-    ----------
-    parallel, crossed
-        Of one shape, any unit. Through an analyser half of the light that is not polarized passes.
-
-    Examples
-    --------
-    >>> found = components(np.array([0.5, 0.25]), np.array([0.5, 0.0]))
-    >>> found["S0"].tolist(), found["S1"].tolist()
-    ([1.0, 0.25], [0.0, 0.25])
-    """
-    return {S0: parallel + crossed, S1: parallel - crossed}
+CHANNELS: Final = [channel(kind, 1e3 * WAVELENGTH_UM) for kind in ("S0", "S1")]
 
 
 def write_stokes(session: Session, folder: Path, delivery: Delivery) -> list[tuple[str, str]]:
@@ -253,9 +235,8 @@ def write_stokes(session: Session, folder: Path, delivery: Delivery) -> list[tup
     camera = session.frames("gradient")[0].camera
     images = GradientImages(session, noise=_noise(inputs, camera))
     names = [state.name for state in images.states]
-    unknown = [name for name in only if name not in names]
-    if unknown:
-        raise ExportError(f"--only: got {unknown[0]!r}, expected of {', '.join(names)}")
+    for name in only:
+        one_of("--only", name, names, ExportError)
     axis = session.rig.view(camera).analyser_axis_deg
     if axis is None:
         raise ExportError(
@@ -307,11 +288,12 @@ def _write_state(
             left_out.append((f"{state} {pattern}", "was taken with one polarization only"))
             continue
         stem = file_stem(state, pattern)
-        found = components(patterns.values[along], patterns.values[across])
-        channels = dict(zip(CHANNELS, found.values(), strict=True))
+        one, other = patterns.values[along], patterns.values[across]
+        found = one + other, one - other
+        channels = dict(zip(CHANNELS, found, strict=True))
         write_channels(folder / f"{stem}.exr", channels, stokes_header(what))
         stderr = np.sqrt(patterns.variance[along] + patterns.variance[across])
-        figures = _figures(found, stderr, patterns.valid)
+        figures = _figures(*found, stderr, patterns.valid)
         files[f"{stem}.exr"] = {"state": state, "pattern": pattern, **figures}
         if with_errors:
             told = {"unit": "1", "comments": "standard error of S0 and of S1, 68 %"}
@@ -344,12 +326,12 @@ def file_stem(state: str, pattern: str) -> str:
 
 
 def _figures(
-    found: Mapping[str, Float32Array], stderr: Float32Array, valid: BoolArray
+    s0: Float32Array, s1: Float32Array, stderr: Float32Array, valid: BoolArray
 ) -> dict[str, float]:
     """Return what is worth knowing of an image before it is opened, as JSON values."""
     if not valid.any():
         return {"valid_share": 0.0}
-    total, along = found[S0][valid].astype(np.float64), found[S1][valid].astype(np.float64)
+    total, along = s0[valid].astype(np.float64), s1[valid].astype(np.float64)
     return {
         "valid_share": float(valid.mean()),
         "degree_of_polarization": float(along.sum() / total.sum()) if total.sum() > 0.0 else 0.0,

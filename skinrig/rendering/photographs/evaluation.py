@@ -243,9 +243,8 @@ def _sheet(photo: Photograph, made: Rendering, pair: PairError, shot: Shot) -> b
     exposure = exposure_of(np.where(made.covered[..., None], photo.rgb, 0.0), made.coverage)
     on = made.coverage[..., None] > 0.5
     shown = [tone(np.where(on, image, 0.0), exposure) for image in (photo.rgb, made.radiance)]
-    error = png.colorize(
-        pair.signed, -MAX_SHOWN_ERROR, MAX_SHOWN_ERROR, scale="RdBu_r", valid=pair.lit
-    )
+    scale = png.Scale(-MAX_SHOWN_ERROR, MAX_SHOWN_ERROR, "RdBu_r")
+    error = scale.colors(pair.signed, pair.lit)
     panels = [
         Panel("photograph", shown[0]),
         Panel("rendering", shown[1]),

@@ -86,29 +86,30 @@ def compared(a: Path, b: Path) -> tuple[list[ImageDifference], list[tuple[str, s
         {p.stem for p in folder.glob("*.*") if p.suffix in (".exr", ".png")} for folder in (a, b)
     ]
     for name in sorted(names[0] | names[1]):
-        if name not in names[0] or name not in names[1]:
-            refused.append((name, f"only in {'A' if name in names[0] else 'B'}"))
-            continue
-        linear = all((folder / f"{name}.exr").is_file() for folder in (a, b))
-        plain = all((folder / f"{name}.png").is_file() for folder in (a, b))
-        if not linear and not plain:
-            refused.append((name, "one is OpenEXR, the other PNG"))
-            continue
-        read = _linear if linear else _codes
-        suffix = "exr" if linear else "png"
         try:
-            one, other = (read(folder / f"{name}.{suffix}") for folder in (a, b))
-        except (OSError, ValueError) as error:
-            refused.append((name, f"cannot be read: {error}"))
-            continue
-        if one.shape != other.shape:
-            refused.append((name, f"sizes {_size(one)} and {_size(other)}"))
-            continue
-        if not (np.isfinite(one).all() and np.isfinite(other).all()):
-            refused.append((name, "holds values that are not finite"))
-            continue
-        found.append(ImageDifference(name, "linear" if linear else "8-bit codes", one, other))
+            if name not in names[0] & names[1]:
+                raise ValueError(f"only in {'A' if name in names[0] else 'B'}")
+            found.append(_difference(name, a, b))
+        except ValueError as error:
+            refused.append((name, str(error)))
     return found, refused
+
+
+def _difference(name: str, a: Path, b: Path) -> ImageDifference:
+    """Return a picture of two folders; raise a ValueError why it cannot be subtracted."""
+    both = [s for s in ("exr", "png") if all((f / f"{name}.{s}").is_file() for f in (a, b))]
+    if not both:
+        raise ValueError("one is OpenEXR, the other PNG")
+    read = _linear if both[0] == "exr" else _codes
+    try:
+        one, other = (read(folder / f"{name}.{both[0]}") for folder in (a, b))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"cannot be read: {error}") from error
+    if one.shape != other.shape:
+        raise ValueError(f"sizes {_size(one)} and {_size(other)}")
+    if not (np.isfinite(one).all() and np.isfinite(other).all()):
+        raise ValueError("holds values that are not finite")
+    return ImageDifference(name, "linear" if both[0] == "exr" else "8-bit codes", one, other)
 
 
 def sentence(a: Run, b: Run) -> str:

@@ -182,13 +182,11 @@ def compared(a: Run, b: Run) -> list[Pair]:
         for key in sorted(set(one.maps) | set(other.maps)):
             if key.startswith("_"):
                 continue
-            if key not in one.maps or key not in other.maps:
-                refused.append((key, f"only in {a.label if key in one.maps else b.label}"))
-                continue
-            if apart > MAX_SAME_POINT_MM:
-                refused.append((key, f"texels of the two meshes lie {apart:.1f} mm apart"))
-                continue
             try:
+                if key not in one.maps or key not in other.maps:
+                    raise ValueError(f"only in {a.label if key in one.maps else b.label}")
+                if apart > MAX_SAME_POINT_MM:
+                    raise ValueError(f"texels of the two meshes lie {apart:.1f} mm apart")
                 differences.append(map_comparison.compare(key, one.maps[key], other.maps[key]))
             except ValueError as error:
                 refused.append((key, str(error)))

@@ -1,7 +1,6 @@
 """The report's section on calibrations: how good they are, and whether they were in force."""
 
 import csv
-import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
@@ -13,6 +12,7 @@ import numpy as np
 from capture.calibration import store
 from capture.calibration.record import Calibration, CalibrationError
 from model.skin import SkinAppearance
+from skinrig.appearances.contents import digest
 from skinrig.arrays import Float64Array
 from skinrig.reporting import page
 from skinrig.reporting.sections.session import SessionFacts
@@ -116,11 +116,11 @@ def _age(
     sessions: Mapping[str, SessionFacts],
 ) -> tuple[list[float], tuple[object, ...]]:
     """Return the days that were left at each capture, and the table's row."""
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    made_of = digest(path)
     users = sorted(
         name
         for name, one in appearances.items()
-        if digest in {str(d).removeprefix("sha256:") for d in one.inputs.values()}
+        if made_of in {str(d).removeprefix("sha256:") for d in one.inputs.values()}
     )
     captured = sorted(
         {

@@ -68,12 +68,8 @@ def errors(subject: page.Subject, truth: SkinAppearance) -> Iterator[page.Block]
 
     Parameters
     ----------
-    name
-        For headings.
-    appearance, truth
+    subject, truth
         Maps of the same size.
-    checks
-        A judgement of each map is added to it.
     """
     rows = flash.compare(subject.appearance, truth, rng=np.random.default_rng(0))
     blurred = [row for row in rows if row.against == "blurred"]

@@ -53,14 +53,10 @@ def section(subject: page.Subject, truths: Mapping[str, SkinAppearance]) -> Iter
 
     Parameters
     ----------
-    name
-        For headings.
-    appearance
+    subject
         Folder of `skinrig.appearances.dynamic`.
     truths
         True blood of each state, as far as it is there.
-    checks
-        Judgements are added to it.
     """
     appearance = subject.appearance
     parts = parts_of(appearance)
@@ -143,16 +139,12 @@ def facial_color(
 
     Parameters
     ----------
-    name
-        For headings.
-    appearance
+    subject
         Folder of `skinrig.appearances.dynamic`.
     part
         What it records of the blood's fit.
     truths
         True blood of each state, as far as it is there.
-    checks
-        Judgements are added to it.
     """
     appearance = subject.appearance
     rig = hemoglobin_rig(appearance)

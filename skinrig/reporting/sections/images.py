@@ -5,7 +5,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from skinrig.reporting import map_images, page
+from skinrig.drawing import png
+from skinrig.reporting import page
 
 DOCUMENT_FILES = ("render.json", "analysis.json")
 """Files that tell a folder of pictures."""
@@ -72,14 +73,10 @@ def _comparison(
     name: str, document: Mapping[str, Any], checks: list[page.Check]
 ) -> Iterator[page.Block]:
     full = document[FULL_MODEL]
-    checks.append(
-        page.Check.of_shares(
-            f"{name}: luminance of held-out photographs, median error on lit pixels",
-            full["median"],
-            document["limit"],
-            f"noise alone makes {100 * full['noise']:.2f} %",
-        )
-    )
+    what = f"{name}: luminance of held-out photographs, median error on lit pixels"
+    note = f"noise alone makes {100 * full['noise']:.2f} %"
+    judged = 100 * full["median"], 100 * document["limit"]
+    checks.append(page.Check(what, *judged, "<=", "%", note))
     kinds = {f"{kind} held out": row for kind, row in document["by_kind"].items()}
     models = {FULL_MODEL: full, **kinds, **document["ablation"]}
     yield page.view("photographs", models=models, bands=document["by_band"])
@@ -106,7 +103,8 @@ def _images(folder: Path) -> Iterator[page.Block]:
         if len(data) > MAX_IMAGE_BYTES:
             kept.append(path.name)
             continue
-        figures.append(map_images.stored_image(path.stem.replace("-", " "), data))
+        title = path.stem.replace("-", " ")
+        figures.append(page.Image(title, png.address(data), title))
     yield page.Images(figures)
     if kept:
         yield page.note(f"Too large for here: {', '.join(kept)}.")

@@ -34,14 +34,9 @@ def section(subject: page.Subject) -> Iterator[page.Block]:
 
     Parameters
     ----------
-    name
-        For headings.
-    appearance
+    subject
         With maps "normals_<state>" and "height_<state>".
-    truth
-        Of the same session; None: standard errors only.
-    checks
-        Judgements are added to it.
+        Its truth is of the same session; None: standard errors only.
     """
     yield from _images(subject.appearance, subject.truth)
     yield from _relief_errors(subject)
@@ -226,12 +221,8 @@ def kernels(subject: page.Subject) -> Iterator[page.Block]:
 
     Parameters
     ----------
-    name
-        For headings.
-    appearance
+    subject
         With the kernel document; without it nothing is returned.
-    checks
-        A judgement is added to it.
     """
     document = document_of(subject.appearance, KERNEL_FILE)
     if document is None or not document["fits"]:

@@ -46,14 +46,9 @@ def section(subject: page.Subject) -> Iterator[page.Block]:
 
     Parameters
     ----------
-    name
-        For headings.
-    appearance
+    subject
         With the documents of `reconstruction.pipeline.probe.stages`.
-    truth
-        Of the same session; None: standard errors only.
-    checks
-        Judgements are added to it.
+        Its truth is of the same session; None: standard errors only.
     """
     appearance = subject.appearance
     yield from _plots(appearance)

@@ -31,14 +31,9 @@ def section(subject: page.Subject) -> Iterator[page.Block]:
 
     Parameters
     ----------
-    name
-        For headings.
-    appearance
+    subject
         With a map "position".
-    truth
-        Of the same subject, on an atlas of its own; None: standard errors only.
-    checks
-        Judgements are added to it.
+        Its truth is of the same subject, on an atlas of its own; None: standard errors only.
     """
     appearance, truth = subject.appearance, subject.truth
     place = appearance.maps["position"]

@@ -1,6 +1,5 @@
 """Textures and tables of Jimenez 2010: chromophores, the hemoglobin rig, the color of skin."""
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from model.skin import SkinAppearance
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.perfusion import STATE_NAMES
+from skinrig.appearances.contents import digest as sha256_of
 from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
 from skinrig.arrays import Float64Array
 from skinrig.viewer.assets.placed_color import RIG_PX, FaceColor, placed
@@ -85,7 +85,7 @@ def _beside(appearance: SkinAppearance, path: Path) -> Path | None:
             continue
         for kind, digest in digests.items():
             file = folder / f"{kind}.json"
-            if file.is_file() and hashlib.sha256(file.read_bytes()).hexdigest() == digest:
+            if file.is_file() and sha256_of(file) == digest:
                 return folder
     return None
 

@@ -22,7 +22,7 @@ from model.traits import TraitSpace, lobe_edits, reduced_spaces
 from model.traits import storage as trait_storage
 from model.traits.vectors import MAX_P_VALUE, TraitVector
 from skinrig.appearances import face_textures
-from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
+from skinrig.arrays import Float32Array, Float64Array, FloatArray
 from skinrig.editing import albedo as editing_albedo
 from skinrig.editing import masks
 from skinrig.traits import regions
@@ -286,15 +286,11 @@ def albedo_traits(source: SceneSource) -> AlbedoTraits | str:
     for name in names:
         less, more = (log_factor(name, float(end)) for end in END_AMOUNTS)
         half = np.exp(log_factor(name, CHECKED_AMOUNT))
-        layers += [_coarse(less, valid), _coarse(more, valid)]
+        layers += [filled(one, valid, MAX_FACTOR_PX) for one in (less, more)]
         change[name] = _rms(np.exp(more[valid]) - 1.0)
         shown = _refined(np.exp(CHECKED_AMOUNT * layers[-1]), valid.shape)
         between[name] = _rms((shown - half)[valid])
     return AlbedoTraits(names, np.stack(layers), change, between)
-
-
-def _coarse(values: Float32Array, valid: BoolArray) -> Float32Array:
-    return filled(values, valid, MAX_FACTOR_PX)
 
 
 def _refined(values: Float32Array, shape: tuple[int, ...]) -> Float32Array:

@@ -198,15 +198,11 @@ def placed(source: SceneSource) -> FaceColor:
     ----------
     source
         With a dynamic appearance that holds facial color.
-    subject
-        Who wears the mesh; gives landmarks, and melanin where none was measured.
 
     Raises
     ------
-    skinrig.viewer.scene.SceneError
-        Nothing says where the picture lies on the mesh.
     SceneError
-        The landmarks do not.
+        Nothing says where the picture lies on the mesh, or the landmarks do not.
     """
     appearance, subject = source.appearances["dynamic"], source.subject
     rig = from_maps_and_document(appearance.maps, appearance.files[RIG_DOCUMENT])

@@ -234,8 +234,6 @@ def with_displacement(scene: ViewerScene, pyramid: Pyramid) -> ViewerScene:
         Its own relief, where it has one, is left out.
     pyramid : Pyramid
         Of the displacement, in the texture of the scene's mesh.
-    table : KernelTable
-        Of that skin.
 
     Raises
     ------

@@ -111,7 +111,8 @@ def build(source: Any, folder: Path) -> Pyramid:
     (1024, 2, 131072)
     """
     shape = tuple(int(side) for side in np.shape(source))
-    if len(shape) != 2 or shape[0] != shape[1] or not _fits(shape[0]):
+    sides = [MIN_SIDE_PX << k for k in range(16)]
+    if len(shape) != 2 or shape[0] != shape[1] or shape[0] not in sides:
         raise TileError(
             f"displacement: got shape {shape}, expected a square with sides of {MIN_SIDE_PX} px "
             "times a power of two (such as 4096 or 16384)"
@@ -152,10 +153,6 @@ def open_displacement(path: Path, folder: Path) -> Pyramid:
         kind = getattr(source, "dtype", type(source).__name__)
         raise TileError(f"{path}: got {kind}, expected an array of float32 heights, um")
     return build(source, folder)
-
-
-def _fits(side: int) -> bool:
-    return side >= MIN_SIDE_PX and side % MIN_SIDE_PX == 0 and (side & (side - 1)) == 0
 
 
 def _range(source: Any) -> tuple[float, float]:

@@ -45,32 +45,11 @@ def test_an_image_that_png_cannot_hold_is_refused(image):
 def test_invalid_pixels_are_gray_and_ends_have_the_ends_colors():
     values = np.array([[0.0, 1.0, np.nan, 2.0, 0.5]])
     valid = np.array([[True, True, True, True, False]])
-    image = png.colorize(values, 0.0, 1.0, valid=valid)
+    image = png.Scale(0.0, 1.0).colors(values, valid)
     np.testing.assert_array_equal(image[0, 2], 128)
     np.testing.assert_array_equal(image[0, 4], 128)
     np.testing.assert_array_equal(image[0, 1], image[0, 3])
     assert (image[0, 0] != image[0, 1]).any()
-
-
-def test_an_indexed_image_reads_back_with_the_palette_s_colors(rng):
-    palette = rng.integers(0, 256, (100, 3), dtype=np.uint8)
-    index = rng.integers(0, 100, (9, 7), dtype=np.uint8)
-    seen = Image.open(io.BytesIO(png.encode_indexed(index, palette))).convert("RGB")
-    np.testing.assert_array_equal(np.asarray(seen), palette[index])
-
-
-@pytest.mark.parametrize(
-    ("index", "palette", "word"),
-    [
-        (np.full((2, 2), 3, np.uint8), np.zeros((3, 3), np.uint8), "3 colors for indices up to 3"),
-        (np.zeros((2, 2)), np.zeros((3, 3), np.uint8), "index: got dtype float64"),
-        (np.zeros((2, 2), np.uint8), np.zeros((3, 4), np.uint8), "palette: got dtype uint8"),
-        (np.zeros((2, 2), np.uint8), np.zeros((300, 3), np.uint8), "at most 256"),
-    ],
-)
-def test_an_index_without_a_color_is_refused(index, palette, word):
-    with pytest.raises(ValueError, match=word):
-        png.encode_indexed(index, palette)
 
 
 @pytest.mark.parametrize("shape", [(37, 41, 3), (37, 41)])

@@ -137,23 +137,23 @@ def test_a_picture_tells_in_words_what_it_shows_in_colors():
 def test_a_map_s_picture_has_the_scale_s_colors_to_a_128th_and_gray_without_a_value(rng):
     values = rng.random((40, 50))
     values[3, 4] = np.nan
-    data = png.encode_scalar(values, 0.0, 1.0, scale="viridis", levels=map_images.SCALE_COLORS)
+    data = png.Scale(0.0, 1.0).encode(values, levels=map_images.SCALE_COLORS)
     seen = np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(int)
     assert seen[3, 4].tolist() == [png.INVALID_GRAY] * 3
-    fine = png.colorize(values, 0.0, 1.0).astype(int)
+    fine = png.Scale(0.0, 1.0).colors(values).astype(int)
     step = np.abs(np.diff(png.palette("viridis", 128).astype(int), axis=0)).max()
     assert np.abs(seen - fine).max() <= step
-    coarse = png.encode_scalar(values, 0.0, 1.0, levels=8)
+    coarse = png.Scale(0.0, 1.0).encode(values, levels=8)
     eighth = np.asarray(Image.open(io.BytesIO(coarse)).convert("RGB")).astype(int)
     assert np.abs(eighth - fine).max() > step
 
 
 def test_a_picture_of_noise_takes_its_seven_bits_a_pixel_and_one_of_a_slope_far_fewer(rng):
     bits = 7 * 128 * 128 / 8
-    noise = png.encode_scalar(rng.random((128, 128)), 0.0, 1.0, levels=128)
+    noise = png.Scale(0.0, 1.0).encode(rng.random((128, 128)))
     assert bits < len(noise) < 1.1 * bits
     slope = np.add.outer(np.linspace(0.0, 0.5, 128), np.linspace(0.0, 0.5, 128))
-    assert len(png.encode_scalar(slope, 0.0, 1.0, levels=128)) < 0.2 * bits
+    assert len(png.Scale(0.0, 1.0).encode(slope)) < 0.2 * bits
 
 
 def test_the_bar_beside_a_picture_runs_through_the_picture_s_colors(html):

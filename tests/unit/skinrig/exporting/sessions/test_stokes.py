@@ -122,7 +122,7 @@ def test_use_beyond_the_consent_other_rigs_and_unknown_states_are_refused(tmp_pa
     session = made(tmp_path)
     with pytest.raises(ConsentError, match="has not agreed"):
         export(session, tmp_path / "out", to="stokes", use="film", today=DAY)
-    with pytest.raises(ExportError, match="got 'a090_p3', expected of a000_n0, a000_p1"):
+    with pytest.raises(ExportError, match="got 'a090_p3', expected one of a000_n0, a000_p1"):
         export(
             session,
             tmp_path / "out",
