@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from model.microstructure.mesh_strain import MeshStrain, strain
 from model.microstructure.strain_fields import KernelRegions, rasterize, regional_kernels
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.blend_shapes.meshes import BlendShapeMesh
+from skinrig.whole_file import write_whole
 
 TILE_PX: Final = 2048
 JOURNAL_SCHEMA: Final = "skinrig.microstructure-tiles/1"
@@ -376,10 +376,8 @@ class _Journal(_Tiles):
         self._write()
 
     def _write(self) -> None:
-        fresh = self.path.with_name(self.path.name + ".new")
         told = {"schema": JOURNAL_SCHEMA, "job": self.job, "finished": self.finished}
-        fresh.write_text(json.dumps(told), encoding="utf-8")
-        os.replace(fresh, self.path)
+        write_whole(self.path, json.dumps(told))
 
     def close(self) -> None:
         self.target.flush()

@@ -15,6 +15,7 @@ from skinrig.benchmarks.document import to_document
 from skinrig.benchmarks.results import StageBenchmark
 from skinrig.console import Console, plain
 from skinrig.errors import EXTRA_MISSING, exit_code, sentence
+from skinrig.whole_file import write_whole
 
 STAGES: dict[str, str] = {name: entry["run"] for name, entry in descriptions().items()}
 """Module and function of each; a module is imported, and its kernels compiled, when it is run."""
@@ -121,7 +122,7 @@ class _Run:
         """Write what there is: a run that is interrupted leaves what it measured."""
         if self.out is not None:
             text = json.dumps(plain(self.document()), indent=1, sort_keys=True)
-            bench_table.write_whole(self.out / "bench.json", text + "\n")
+            write_whole(self.out / "bench.json", text + "\n")
 
     def _measure(self, name: str, size: Size, began: float) -> None:
         if began > self.until_s:

@@ -2,12 +2,12 @@
 
 import csv
 import io
-import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from skinrig.console import Console
+from skinrig.whole_file import write_whole
 
 _POINT_COLUMNS = (
     "seconds",
@@ -141,13 +141,6 @@ def write(document: Mapping[str, Any], out: Path) -> None:
         if stage["points"]:
             plot = bench_figures.error_against_seconds(name, stage)
             write_whole(out / f"{name}.svg", plot + "\n")
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a file that is there whole or not at all."""
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(text, encoding="utf-8", newline="")
-    os.replace(part, path)
 
 
 def _csv(head: Iterable[object], rows: Iterable[Iterable[object]]) -> str:

@@ -1,7 +1,7 @@
 """`skinrig analyse`: what fitted faces have in common."""
 
 from pathlib import Path
-from typing import Annotated, Any, cast, get_args
+from typing import Annotated, Any, get_args
 
 import typer
 
@@ -73,17 +73,7 @@ def analyse_brdf(
     documents = [one.document() for one in found]
     console.rows(
         ("points of", "needs", "by 2 %", "by 10 %", "to noise", "error", "others", "noise"),
-        [
-            (
-                d["name"],
-                str(d["plateau"]),
-                str(d["plateau_by_share"]["0.02"]),
-                str(d["plateau_by_share"]["0.1"]),
-                str(d["rank_at_noise"] or "-"),
-                *_at_plateau(d),
-            )
-            for d in documents
-        ],
+        ((d["name"], *_plateaus(d), *_at_plateau(d)) for d in documents),
     )
     for document in documents:
         left_out = document["left_out"]
@@ -94,13 +84,14 @@ def analyse_brdf(
     console.document("skinrig.analyse-brdf/1", {"out": out, "datasets": documents})
 
 
-def _at_plateau(document: dict[str, object]) -> tuple[str, str, str]:
+def _plateaus(document: dict[str, Any]) -> list[object]:
+    """Return the plateau, by the usual and two other shares of the fall, and the rank at noise."""
+    by_share, at_noise = document["plateau_by_share"], document["rank_at_noise"]
+    return [document["plateau"], by_share["0.02"], by_share["0.1"], at_noise or "-"]
+
+
+def _at_plateau(document: dict[str, Any]) -> list[str]:
     """Return the errors at the plateau, in and out of sample, and what noise leaves."""
-    ranks = cast(list[int], document["ranks"])
-    at = ranks.index(cast(int, document["plateau"]))
-    inside = cast(list[float], document["error"])[at]
-    outside = cast(list[float | None], document["held_out_error"])[at]
-    noise = cast(float | None, document["noise"])
-    return tuple(  # type: ignore[return-value]
-        "-" if value is None else f"{100.0 * value:.1f} %" for value in (inside, outside, noise)
-    )
+    at = document["ranks"].index(document["plateau"])
+    errors = (document["error"][at], document["held_out_error"][at], document["noise"])
+    return ["-" if value is None else f"{100.0 * value:.1f} %" for value in errors]

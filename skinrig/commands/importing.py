@@ -127,8 +127,3 @@ def import_lp(
     console.document(
         "skinrig.import/1", picked(done, "path", "frames", "lights", "encoding", "mask", "assumed")
     )
-
-
-def _document(console: Console, done: object, *names: str) -> None:
-    """Print the document of an import: its path, and figures by their names."""
-    console.document("skinrig.import/1", picked(done, "path", *names))

@@ -12,6 +12,7 @@ from skinrig.commands.help import RigCommand, RigGroup
 from skinrig.commands.options import Json, Subject, expand, file_to_write, option
 from skinrig.console import Console, picked
 from skinrig.next_steps import shell_quote
+from skinrig.whole_file import write_whole
 from skinrig.written_units import written
 
 plan_app = typer.Typer(
@@ -146,10 +147,7 @@ def _plan(
                 f"{'within' if row['within'] else 'OUTSIDE'} the forecast's interval"
             )
     if (out := common.out) is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        part = out.with_name(f".{out.name}.part")
-        part.write_text(json_text.dumps(choice.plan.to_json(), indent=1) + "\n", encoding="utf-8")
-        part.replace(out)
+        write_whole(out, json_text.dumps(choice.plan.to_json(), indent=1) + "\n")
         console.say(f"next: skinrig capture {rig} --plan {shell_quote(out)} --out session")
     console.document(document.pop("schema"), document)
     if not reached:

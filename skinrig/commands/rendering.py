@@ -10,7 +10,7 @@ import typer
 
 from skinrig import errors
 from skinrig.commands.options import Json, Out, argument, expand, option
-from skinrig.console import Console
+from skinrig.console import Console, picked
 from skinrig.errors import UnusableError, UsageError
 
 if TYPE_CHECKING:
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class SceneOptions:
-    """What is seen, from where, and under which light."""
+class RenderOptions:
+    """What is seen, under which light, how much is computed, and which pictures are made."""
 
     view: Annotated[
         str, option("View of the rig, such as C03, or the camera's place in mm: 0,0,700.")
@@ -45,12 +45,6 @@ class SceneOptions:
     size: Annotated[int, option("Columns of the picture.")] = 512
     fov: Annotated[float, option("Of a camera given by its place: degrees across.")] = 25.0
     target: Annotated[str, option("What that camera looks at, mm.")] = "0,0,0"
-
-
-@dataclass(frozen=True, slots=True)
-class EffortOptions:
-    """How much is computed, and what light does in the skin."""
-
     samples: Annotated[int, option("Rays a pixel: 1, 4, 9, 16 ...")] = 4
     shadow_samples: Annotated[int, option("Points of each light's disc that a ray looks for.")] = 4
     light_radius: Annotated[
@@ -66,12 +60,6 @@ class EffortOptions:
     translucency: Annotated[
         str | None, option("sigma_tr of red, green, blue everywhere, 1/mm: 0.3558,0.7932,1.5173.")
     ] = None
-
-
-@dataclass(frozen=True, slots=True)
-class PictureOptions:
-    """Which pictures are made."""
-
     components: Annotated[
         bool, option("Light from inside and surface apart, too.", "--components")
     ] = False
@@ -116,9 +104,7 @@ def render(
         list[Path], argument("Fitted maps of the dome, with lobes; several for --bases.")
     ],
     out: Out,
-    scene: SceneOptions,
-    effort: EffortOptions,
-    pictures: PictureOptions,
+    asked: RenderOptions,
     json: Json = False,
 ) -> None:
     """Render a fitted skin model: radiance as OpenEXR, and a picture of it.
@@ -131,56 +117,40 @@ def render(
     from skinrig.rendering.request import subpixels_of
 
     console = Console(json)
-    if effort.subsurface not in get_args(Subsurface):
+    if asked.subsurface not in get_args(Subsurface):
         raise UnusableError(
-            f"--subsurface: got {effort.subsurface!r}, expected {', '.join(get_args(Subsurface))}"
+            f"--subsurface: got {asked.subsurface!r}, expected {', '.join(get_args(Subsurface))}"
         )
-    exposure = pictures.exposure
-    if exposure is not None and not exposure > 0.0:
-        raise UnusableError(f"--exposure: got {exposure}, expected a factor above 0")
-    if len(appearance) > 1 and pictures.bases is None:
+    if asked.exposure is not None and not asked.exposure > 0.0:
+        raise UnusableError(f"--exposure: got {asked.exposure}, expected a factor above 0")
+    if len(appearance) > 1 and asked.bases is None:
         raise UsageError("appearance: got several, expected one; several are for --bases")
-    costs = figures.Effort(
-        subsurface=effort.subsurface,  # type: ignore[arg-type]
-        subpixels=subpixels_of(effort.samples),
-        shadow_samples=effort.shadow_samples,
-        exposure=exposure,
-        seed=pictures.seed,
+    effort = figures.Effort(
+        subpixels=subpixels_of(asked.samples),
         progress=console.progress,
+        **picked(asked, "subsurface", "shadow_samples", "exposure", "seed"),
     )
     console.progress(f"read {', '.join(str(path) for path in appearance)}")
-    if pictures.against is not None and not pictures.components:
-        _compare(appearance[0], pictures.against, out, scene, effort, pictures, console)
-    elif pictures.shadow_boundary:
-        subject = figures.RenderModel.of(appearance[0], mesh=scene.mesh)
-        _report(console, figures.draw_shadow_boundary(subject, out, costs, size_px=scene.size))
+    if asked.against is not None and not asked.components:
+        _compare(appearance[0], asked.against, out, asked, console)
+    elif asked.shadow_boundary:
+        subject = figures.RenderModel.of(appearance[0], mesh=asked.mesh)
+        _report(console, figures.draw_shadow_boundary(subject, out, effort, size_px=asked.size))
     else:
-        _report(console, _draw(appearance, out, scene, effort, pictures, costs))
+        _report(console, _draw(appearance, out, asked, effort))
 
 
 def _compare(
-    appearance: Path,
-    session: Path,
-    out: Path,
-    scene: SceneOptions,
-    effort: EffortOptions,
-    pictures: PictureOptions,
-    console: Console,
+    appearance: Path, session: Path, out: Path, asked: RenderOptions, console: Console
 ) -> None:
     """Compare renderings with photographs of a session that no fit has seen."""
     from skinrig.rendering.photographs import comparison, evaluation
 
+    given: dict[str, Any] = picked(
+        asked, "calibration", "translucency", "subsurface", "ablation", "seed"
+    )
     found = evaluation.evaluate_folders(
-        appearance,
-        session,
-        out,
-        calibration=scene.calibration,
-        translucency=effort.translucency,
-        subsurface=effort.subsurface,  # type: ignore[arg-type]
-        count=pictures.photographs,
-        ablation=pictures.ablation,
-        seed=pictures.seed,
-        progress=console.progress,
+        appearance, session, out, count=asked.photographs, progress=console.progress, **given
     )
     comparison.print_comparison(console, found)
     if not found["passed"]:
@@ -188,40 +158,35 @@ def _compare(
 
 
 def _draw(
-    appearance: list[Path],
-    out: Path,
-    scene: SceneOptions,
-    effort: EffortOptions,
-    pictures: PictureOptions,
-    costs: Effort,
+    appearance: list[Path], out: Path, asked: RenderOptions, effort: Effort
 ) -> dict[str, Any]:
     """Draw a picture, a photograph beside its rendering, or one for each number of lobes."""
     from skinrig.rendering import figures
     from skinrig.rendering.request import RenderRig, lights_of
 
-    stage = RenderRig.of(scene.rig, scene.calibration)
-    camera = stage.camera(scene.view, size_px=scene.size, target_mm=scene.target, fov_deg=scene.fov)
+    stage = RenderRig.of(asked.rig, asked.calibration)
+    camera = stage.camera(asked.view, size_px=asked.size, target_mm=asked.target, fov_deg=asked.fov)
     lights = lights_of(
         stage,
-        scene.light or (),
-        radius_mm=effort.light_radius,
-        environment=scene.environment,
-        environment_count=scene.environment_lights,
-        seed=pictures.seed,
+        asked.light or (),
+        radius_mm=asked.light_radius,
+        environment=asked.environment,
+        environment_count=asked.environment_lights,
+        seed=asked.seed,
     )
     subjects = [
-        figures.RenderModel.of(path, mesh=scene.mesh, translucency=effort.translucency)
+        figures.RenderModel.of(path, mesh=asked.mesh, translucency=asked.translucency)
         for path in appearance
     ]
-    if pictures.against is not None:
-        name, calibration = lights[0].name, scene.calibration
+    if asked.against is not None:
+        name, calibration = lights[0].name, asked.calibration
         return figures.draw_photograph(
-            subjects[0], pictures.against, scene.view, name, out, costs, calibration=calibration
+            subjects[0], asked.against, asked.view, name, out, effort, calibration=calibration
         )
-    asked = figures.Asked(camera, lights, out, costs, stage.assumed)
-    if pictures.bases is None:
-        return figures.draw(subjects[0], asked, components=pictures.components)
-    return figures.draw_bases(subjects, _ranks(pictures.bases), asked)
+    picture = figures.Asked(camera, lights, out, effort, stage.assumed)
+    if asked.bases is None:
+        return figures.draw(subjects[0], picture, components=asked.components)
+    return figures.draw_bases(subjects, _ranks(asked.bases), picture)
 
 
 def _ranks(text: str) -> list[int]:
@@ -232,6 +197,12 @@ def _ranks(text: str) -> list[int]:
     if not found or min(found) < 1 or len(set(found)) < len(found):
         raise UsageError(f"--bases: got {text!r}, expected numbers of lobes that differ, as 1,2,4")
     return found
+
+
+def _sigma_tr(row: dict[str, Any]) -> str:
+    if row["sigma_tr_per_mm"] is None:
+        return str(row["name"]).replace("_", " ")
+    return ", ".join(f"{value:.4g}" for value in row["sigma_tr_per_mm"])
 
 
 def _report(console: Console, done: dict[str, Any]) -> None:
@@ -245,16 +216,7 @@ def _report(console: Console, done: dict[str, Any]) -> None:
     if "boundaries" in done:
         console.rows(
             ("skin", "sigma_tr, 1/mm", "90 to 10 % red, mm", "green", "blue"),
-            [
-                (
-                    row["skin"],
-                    row["name"].replace("_", " ")
-                    if row["sigma_tr_per_mm"] is None
-                    else ", ".join(f"{value:.4g}" for value in row["sigma_tr_per_mm"]),
-                    *row["rise_mm"],
-                )
-                for row in done["boundaries"]
-            ],
+            ((row["skin"], _sigma_tr(row), *row["rise_mm"]) for row in done["boundaries"]),
         )
     console.say(f"{done['out']}: {', '.join(done['files'])}, {done['seconds']:.1f} s")
     console.document(done["schema"], {k: v for k, v in done.items() if k != "schema"})

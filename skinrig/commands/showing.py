@@ -49,7 +49,7 @@ def report(
     Example: skinrig report monday tuesday -o difference.html
     """
     from skinrig.report import make
-    from skinrig.reporting.folders import write_page
+    from skinrig.whole_file import write_whole
 
     piped = str(out) == STDOUT_MARK
     if piped and json:
@@ -60,7 +60,7 @@ def report(
     if piped:
         typer.echo(done.html, nl=False)
     else:
-        write_page(out, done.html)
+        write_whole(out, done.html)
     size = len(done.html.encode())
     if done.compared is None:
         talk.say(done.verdict)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import zipfile
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -100,7 +101,7 @@ def read(appearance: SkinAppearance) -> SurfaceMixtures:
         mix = np.asarray(stored["mix"], np.float64)
         names = tuple(str(name) for name in stored["materials"])
         stored["light_radius_rad"], stored["table"]
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise SurfaceMixtureError(f"{BASIS_FILE}: cannot be read: {error}") from error
     if mix.ndim != 2 or mix.shape[1] != len(names) or not np.all(mix >= 0):
         raise SurfaceMixtureError(
@@ -110,9 +111,8 @@ def read(appearance: SkinAppearance) -> SurfaceMixtures:
     for k in range(len(mix)):
         if f"{WEIGHT_PREFIX}{k}" not in appearance.maps:
             raise SurfaceMixtureError(
-                f"{WEIGHT_PREFIX}{k}: is missing, {BASIS_FILE} has {len(mix)} lobes; "
-                "reconstruct all of "
-                "them"
+                f"{WEIGHT_PREFIX}{k}: is missing, {BASIS_FILE} has {len(mix)} lobes; reconstruct "
+                "all of them"
             )
         maps.append(appearance.maps[f"{WEIGHT_PREFIX}{k}"])
     return SurfaceMixtures(tuple(maps), mix, names, stored)

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -152,16 +151,3 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(document, dict) or not isinstance(document.get("schema"), str):
         raise ReportError(f'{path}: got no "schema", expected a document of a skinrig command')
     return document
-
-
-def write_page(path: Path, text: str) -> None:
-    """Write a page that is there whole or not at all; its folder is made."""
-    part = path.with_name(f".{path.name}.part")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        part.write_text(text, encoding="utf-8")
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        # the page was asked for, of the part beside it nobody knows
-        raise type(error)(error.errno, error.strerror, str(path)) from error

@@ -1,7 +1,6 @@
 """From what a user names to a page on disk or on a port of this machine."""
 
 import dataclasses
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from skinrig.viewer.microstructure import assets as microstructure_assets
 from skinrig.viewer.microstructure import tiles
 from skinrig.viewer.packing import arrays as packing
 from skinrig.viewer.scene import SceneError, ViewerScene
+from skinrig.whole_file import write_whole
 
 
 def compose(
@@ -83,13 +83,7 @@ def write(scene: ViewerScene, out: Path) -> dict[str, Any]:
     """
     packed = packing.pack(scene)
     text = page.render(packed).encode("utf-8")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    part = out.with_name(f".{out.name}.part")
-    try:
-        part.write_bytes(text)
-        os.replace(part, out)
-    finally:
-        part.unlink(missing_ok=True)
+    write_whole(out, text)
     return {
         "path": out,
         "bytes": len(text),

@@ -5,10 +5,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from skinrig.benchmarks.table import write_whole
 from skinrig.console import Console, plain
 from skinrig.extremes.cases import INPUT_PRECISIONS, SCHEMA, run_cases, to_document
 from skinrig.reporting import page
+from skinrig.whole_file import write_whole
 
 __all__ = ["SCHEMA", "run_extremes", "section"]
 

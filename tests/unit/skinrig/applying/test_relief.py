@@ -5,7 +5,7 @@ import pytest
 
 from model import store
 from model.microstructure.kernel_table import FOREHEAD
-from model.skin import SkinMap
+from model.skin import SkinAppearance, SkinMap
 from skinrig.appearances import dynamic
 from skinrig.applying.expression import ApplyError, Expression, apply_expression
 from skinrig.applying.relief import Relief
@@ -32,7 +32,7 @@ def folder(tmp_path):
             "map": f"microrelief_{site}",
             "table": f"kernel_table_{site}.json",
         }
-    part = dynamic.Part(maps, files, {"sites": sites}, {}, "measured")
+    part = SkinAppearance(maps, "measured", {"sites": sites}, {}, files=files)
     dynamic.add(tmp_path / "moving", dynamic.MICROSTRUCTURE, part)
     return tmp_path / "moving"
 
