@@ -6,7 +6,7 @@ from typing import Annotated, Any, get_args
 import typer
 
 from skinrig.commands.help import Command, Subcommands
-from skinrig.commands.options import Json, Out, argument, option
+from skinrig.commands.options import Json, Out, command, option
 from skinrig.console import Console
 from skinrig.errors import UnusableError, UsageError, one_of
 
@@ -21,26 +21,17 @@ def analyse() -> None:
 
 
 @analyse_app.command("brdf", cls=Command)
+@command
 def analyse_brdf(
+    appearances: list[Path] | None = None,
+    /,
+    *,
     out: Out,
-    appearances: Annotated[
-        list[Path] | None, argument("Maps of dome sessions, with lobes; none: simulated faces.")
-    ] = None,
     labels: Labels = None,
-    basis: Annotated[
-        Path | None, option("Folder of the MERL files the lobes were fitted with.")
-    ] = None,
-    points: Annotated[
-        int | None,
-        option(
-            "Texels of each face, default 2000; simulated: points of the one person and of "
-            "the seven conditions, default 5000, each of the 87 people having two fifths of it."
-        ),
-    ] = None,
-    method: Annotated[
-        str, option("How lobes are joined: as shares of materials, or as brdf.")
-    ] = "shares",
-    seed: Annotated[int, option("Of everything random.")] = 0,
+    basis: Path | None = None,
+    points: int | None = None,
+    method: str = "shares",
+    seed: int = 0,
     json: Json = False,
 ) -> None:
     """Tell how many lobes the surfaces of faces need, and draw their mean reflection.
@@ -50,6 +41,20 @@ def analyse_brdf(
     below what noise alone leaves.
 
     Example: skinrig analyse brdf appearance-a appearance-b --labels labels.csv --out analysis
+
+    Parameters
+    ----------
+    appearances
+        Maps of dome sessions, with lobes; none: simulated faces.
+    basis
+        Folder of the MERL files the lobes were fitted with.
+    points
+        Texels of each face, default 2000; simulated: points of the one person and of the seven
+        conditions, default 5000, each of the 87 people having two fifths of it.
+    method
+        How lobes are joined: as shares of materials, or as brdf.
+    seed
+        Of everything random.
     """
     from reconstruction.brdf_basis.space import Method
     from skinrig.analysing import brdf as analysing_brdf

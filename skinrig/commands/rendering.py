@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 import typer
 
 from skinrig import errors
-from skinrig.commands.options import Json, Out, argument, expand, option
+from skinrig.commands.options import Json, Out, command
 from skinrig.console import Console, picked
 from skinrig.errors import UnusableError, UsageError
 
@@ -19,98 +19,97 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class RenderOptions:
-    """What is seen, under which light, how much is computed, and which pictures are made."""
+    """What is seen, under which light, how much is computed, and which pictures are made.
 
-    view: Annotated[
-        str, option("View of the rig, such as C03, or the camera's place in mm: 0,0,700.")
-    ] = "0,0,700"
-    light: Annotated[
-        list[str] | None,
-        option(
-            "Light of the rig (L017), direction towards it (1,1,2) or place in mm "
-            "(at:300,200,600), with *FACTOR or *R,G,B for its intensity; repeatable."
-        ),
-    ] = None
-    environment: Annotated[
-        Path | None, option("Light from everywhere: latitude-longitude OpenEXR map.")
-    ] = None
-    environment_lights: Annotated[int, option("Lights that are drawn from the environment.")] = 64
-    mesh: Annotated[
-        Path | None, option("Another mesh with the maps' texture coordinates: OBJ, PLY or .npz.")
-    ] = None
-    rig: Annotated[str, option("Rig whose views and lights are named.")] = "dome"
-    calibration: Annotated[
-        Path | None, option("CALIBRATION/ folder; default: the rig as drawn.")
-    ] = None
-    size: Annotated[int, option("Columns of the picture.")] = 512
-    fov: Annotated[float, option("Of a camera given by its place: degrees across.")] = 25.0
-    target: Annotated[str, option("What that camera looks at, mm.")] = "0,0,0"
-    samples: Annotated[int, option("Rays a pixel: 1, 4, 9, 16 ...")] = 4
-    shadow_samples: Annotated[int, option("Points of each light's disc that a ray looks for.")] = 4
-    light_radius: Annotated[
-        float | None, option("Of lights' discs, mm (far ones at 700 mm); default: the rig's, 10.")
-    ] = None
-    subsurface: Annotated[
-        str,
-        option(
-            "dipole: light spreads in skin; local: it leaves where it entered; none: the "
-            "surface alone."
-        ),
-    ] = "dipole"
-    translucency: Annotated[
-        str | None, option("sigma_tr of red, green, blue everywhere, 1/mm: 0.3558,0.7932,1.5173.")
-    ] = None
-    components: Annotated[
-        bool, option("Light from inside and surface apart, too.", "--components")
-    ] = False
-    bases: Annotated[
-        str | None, option("Compare numbers of lobes: 1,2,4; more than were fitted cannot be had.")
-    ] = None
-    shadow_boundary: Annotated[
-        bool,
-        typer.Option(
-            "--shadow-boundary",
-            help="A card's shadow on the forehead and on a flat patch, by least and greatest "
-            "sigma_tr; brings its own view and light.",
-        ),
-    ] = False
-    exposure: Annotated[
-        float | None, option("Factor of the PNGs; default: skin is shown well.")
-    ] = None
-    against: Annotated[
-        Path | None,
-        option(
-            "Session whose photographs the model was not fitted to (reconstruct --hold-out): "
-            "render what they show, and compare; with --components take the photograph of --view "
-            "and --light apart."
-        ),
-    ] = None
-    photographs: Annotated[
-        int, option("With --against: most photographs, even over those held out.")
-    ] = 24
-    ablation: Annotated[
-        bool,
-        typer.Option(
-            "--ablation/--no-ablation",
-            help="With --against: also compare without each part of the model.",
-        ),
-    ] = True
-    seed: Annotated[int, option("Of the environment's lights, and of --bases.")] = 0
+    Attributes
+    ----------
+    view
+        View of the rig, such as C03, or the camera's place in mm: 0,0,700.
+    light
+        Light of the rig (L017), direction towards it (1,1,2) or place in mm (at:300,200,600), with
+        *FACTOR or *R,G,B for its intensity; repeatable.
+    environment
+        Light from everywhere: latitude-longitude OpenEXR map.
+    environment_lights
+        Lights that are drawn from the environment.
+    mesh
+        Another mesh with the maps' texture coordinates: OBJ, PLY or .npz.
+    rig
+        Rig whose views and lights are named.
+    calibration
+        CALIBRATION/ folder; default: the rig as drawn.
+    size
+        Columns of the picture.
+    fov
+        Of a camera given by its place: degrees across.
+    target
+        What that camera looks at, mm.
+    samples
+        Rays a pixel: 1, 4, 9, 16 ...
+    shadow_samples
+        Points of each light's disc that a ray looks for.
+    light_radius
+        Of lights' discs, mm (far ones at 700 mm); default: the rig's, 10.
+    subsurface
+        dipole: light spreads in skin; local: it leaves where it entered; none: the surface alone.
+    translucency
+        sigma_tr of red, green, blue everywhere, 1/mm: 0.3558,0.7932,1.5173.
+    components
+        Light from inside and surface apart, too.
+    bases
+        Compare numbers of lobes: 1,2,4; more than were fitted cannot be had.
+    exposure
+        Factor of the PNGs; default: skin is shown well.
+    against
+        Session whose photographs the model was not fitted to (reconstruct --hold-out): render what
+        they show, and compare; with --components take the photograph of --view and --light apart.
+    photographs
+        With --against: most photographs, even over those held out.
+    seed
+        Of the environment's lights, and of --bases.
+    shadow_boundary
+        A card's shadow on the forehead and on a flat patch, by least and greatest sigma_tr; brings
+        its own view and light.
+    ablation
+        With --against: also compare without each part of the model.
+    """
+
+    view: str = "0,0,700"
+    light: list[str] | None = None
+    environment: Path | None = None
+    environment_lights: int = 64
+    mesh: Path | None = None
+    rig: str = "dome"
+    calibration: Path | None = None
+    size: int = 512
+    fov: float = 25.0
+    target: str = "0,0,0"
+    samples: int = 4
+    shadow_samples: int = 4
+    light_radius: float | None = None
+    subsurface: str = "dipole"
+    translucency: str | None = None
+    components: bool = False
+    bases: str | None = None
+    shadow_boundary: bool = False
+    exposure: float | None = None
+    against: Path | None = None
+    photographs: int = 24
+    ablation: Annotated[bool, typer.Option("--ablation/--no-ablation")] = True
+    seed: int = 0
 
 
-@expand
-def render(
-    appearance: Annotated[
-        list[Path], argument("Fitted maps of the dome, with lobes; several for --bases.")
-    ],
-    out: Out,
-    asked: RenderOptions,
-    json: Json = False,
-) -> None:
+@command
+def render(appearance: list[Path], /, out: Out, asked: RenderOptions, json: Json = False) -> None:
     """Render a fitted skin model: radiance as OpenEXR, and a picture of it.
 
     Example: skinrig render appearance --view C03 --light L017 --calibration calibration --out
     picture --components
+
+    Parameters
+    ----------
+    appearance
+        Fitted maps of the dome, with lobes; several for --bases.
     """
     from skinrig.rendering import figures
     from skinrig.rendering.render import Subsurface
