@@ -19,7 +19,7 @@ from skinrig.next_steps import shell_quote
 
 if TYPE_CHECKING:
     from skinrig.applying.expression import Applied, Expression, OtherFace
-    from skinrig.applying.relief import Relief
+    from skinrig.applying.relief import Relief, ReliefRequest
 
 fit_app = typer.Typer(cls=Subcommands, help="Fit models to captured data.", no_args_is_help=True)
 apply_app = typer.Typer(
@@ -189,9 +189,14 @@ class ReliefOptions:
         """Return what evaluates the relief on a mesh under weights of its shapes."""
         from skinrig.applying.relief import Relief
 
+        return Relief.of(mesh, weights, self.request(), out=out, progress=console.progress)
+
+    def request(self) -> ReliefRequest:
+        """Return the relief that is asked for."""
+        from skinrig.applying.relief import ReliefRequest
+
         given = picked(self, "site", "extrapolate", "seed")
-        given |= {"size_px": self.size, "source": self.synthesize}
-        return Relief.of(mesh, weights, out=out, progress=console.progress, **given)
+        return ReliefRequest(size_px=self.size, source=self.synthesize, **given)
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,15 +271,13 @@ def apply_expression(
     """
     from skinrig.appearances.dynamic import DYNAMIC_PARTS
     from skinrig.applying import expression as applying
-    from skinrig.applying.relief import EXTRAPOLATION_MODES, RELIEF_SOURCES
     from skinrig.capturing.option_values import parse_names
 
     console = Console(json)
     given = chosen.expression(applying.parse_weights(weights))
     parts = parse_names(chosen.parts) or DYNAMIC_PARTS
     relief = None
-    one_of("--synthesize", moving.synthesize, RELIEF_SOURCES)
-    one_of("--extrapolate", moving.extrapolate, EXTRAPOLATION_MODES)
+    moving.request()  # checked even where no mesh is given
     if mesh is not None:
         relief = moving.relief(mesh, applying.normalized(given).weights, out, console)
     done = applying.apply_expression(
