@@ -19,6 +19,9 @@ from skinrig.arrays import Float64Array
 from skinrig.calibrating.outcome import CalibratingError, Made, TargetSessions, numbered
 
 DOME_CALIBRATION_KINDS = ("geometry", "lights")
+LIGHT_TOLERANCE_MM = 5.0
+"""Standard deviation of the lights about the drawing: it matters only where few highlights were
+seen."""
 SESSION_STEP = 1000  # poses of the k-th session are numbered from k times this
 
 
@@ -31,9 +34,6 @@ class DomeTargets:
     )
     sphere_radius_mm: float = 50.0
     plate: WhitePlate = field(default_factory=WhitePlate)
-    light_tolerance_mm: float = 5.0
-    """Standard deviation of the lights about the drawing, mm, > 0: it matters only where few
-    highlights were seen."""
 
 
 def dome_targets(square_mm: float, sphere_radius_mm: float) -> DomeTargets:
@@ -232,7 +232,7 @@ def _mirror(
         spheres,
         {light.name: np.array(light.position_mm) for light in lights},
         light_radius_mm=lights[0].radius_mm,
-        nominal_stderr_mm=what.light_tolerance_mm,
+        nominal_stderr_mm=LIGHT_TOLERANCE_MM,
     )
 
 

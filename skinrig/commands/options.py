@@ -162,7 +162,8 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             name: kind(**{one.name: given.pop(one.name) for one in fields(kind)})
             for name, kind in groups.items()
         }
-        function(*(given.pop(name) for name in positional), **made, **given)
+        arguments = [given.pop(name) for name in positional]
+        function(*arguments, **made, **given)
 
     run.__name__, run.__doc__ = function.__name__, text
     run.__signature__ = Signature(shown)  # type: ignore[attr-defined]

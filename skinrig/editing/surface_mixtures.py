@@ -59,8 +59,8 @@ class SurfaceMixtures:
         """Return the shares at least 0, (H, W, K)."""
         return np.maximum(np.stack([m.values for m in self.maps], axis=-1).astype(np.float64), 0.0)
 
-    def mean_shares(self, strength: Float64Array) -> Float64Array:
-        """Return the mean share of each lobe over texels of no unusual strength, (K,).
+    def mean(self, strength: Float64Array) -> Float64Array:
+        """Return the mean mixture of materials over texels of no unusual strength, (M,).
 
         Parameters
         ----------
@@ -73,14 +73,9 @@ class SurfaceMixtures:
         total = rows @ (self.mix @ strength)
         some = total[total > 0]
         if not len(some):
-            return np.zeros(len(self.mix))
-        return np.asarray(
-            rows[total < OUTLIER_STRENGTH_RATIO * float(np.median(some))].mean(axis=0)
-        )
-
-    def mean(self, strength: Float64Array) -> Float64Array:
-        """Return the mean mixture of materials, (M,)."""
-        return self.mean_shares(strength) @ self.mix
+            return np.zeros(len(self.materials))
+        usual = total < OUTLIER_STRENGTH_RATIO * float(np.median(some))
+        return np.asarray(rows[usual].mean(axis=0) @ self.mix)
 
 
 def read(appearance: SkinAppearance) -> SurfaceMixtures:
