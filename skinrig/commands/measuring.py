@@ -12,7 +12,7 @@ from skinrig.commands import completion
 from skinrig.commands.options import Json, command
 from skinrig.console import Console, picked
 from skinrig.doctor import examine
-from skinrig.waiting_threads import wait_asleep
+from skinrig.kernel_cache import wait_asleep
 
 BUDGET_S = 600.0
 """Seconds of a benchmark that names none."""
