@@ -19,6 +19,7 @@ from skinrig.commands import (
     export,
     importing,
     measuring,
+    options,
     planning,
     reconstructing,
     rendering,
@@ -68,14 +69,11 @@ def _root(
 
 
 @app.command(cls=Command)
+@options.command
 def demo(
     out: Out = Path("demo"),
     rigs: Annotated[
-        str,
-        option(
-            "Rigs, joined by commas: flash, dome, gradient, probe; default all.",
-            autocompletion=completion.several_rigs,
-        ),
+        str, typer.Option(autocompletion=completion.several_rigs)
     ] = "flash,dome,gradient,probe",
     seed: Seed = 0,
     json: Json = False,
@@ -83,6 +81,11 @@ def demo(
     """Simulate, capture, calibrate, reconstruct and report, small; the place to begin.
 
     Example: skinrig demo --out demo
+
+    Parameters
+    ----------
+    rigs
+        Rigs, joined by commas: flash, dome, gradient, probe; default all.
     """
     from skinrig.demo import run_demo
 

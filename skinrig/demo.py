@@ -15,8 +15,8 @@ from typing import Any
 from skinrig.benchmarks.stages import run_stages
 from skinrig.console import Console, plain
 from skinrig.demo_rigs import RIGS, Findings, Run
+from skinrig.kernel_cache import WAITING_ASLEEP
 from skinrig.next_steps import suggest
-from skinrig.waiting_threads import WAITING_ASLEEP
 from skinrig.workspace import scan
 from skinrig.written_units import unit_sign
 

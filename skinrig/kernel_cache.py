@@ -1,4 +1,4 @@
-"""Where compiled kernels are kept when neither the installation nor the home can be written."""
+"""The environment of numerical libraries: where compiled kernels are kept, how threads wait."""
 
 import os
 import sys
@@ -7,6 +7,9 @@ from pathlib import Path
 
 PACKAGES_FOLDER = Path(__file__).parent.parent
 """The folder that the packages are installed in."""
+WAITING_ASLEEP = {"OMP_WAIT_POLICY": "PASSIVE"}
+"""Threads that spin as they wait hold a core that other work of the machine could have. OpenMP
+reads it when it is loaded, which is before the first parallel loop."""
 
 
 def user_cache(environment: Mapping[str, str]) -> Path:
@@ -75,3 +78,25 @@ def provide(environment: MutableMapping[str, str], packages: Path = PACKAGES_FOL
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     environment["NUMBA_CACHE_DIR"] = str(folder)
     return folder
+
+
+def wait_asleep(environment: MutableMapping[str, str]) -> None:
+    """Let threads sleep as they wait, unless the user has said how they shall.
+
+    Parameters
+    ----------
+    environment
+        Variables of this process, before a numerical library is loaded; what is set stays.
+
+    Examples
+    --------
+    >>> environment = {"HOME": "/home/me"}
+    >>> wait_asleep(environment)
+    >>> environment["OMP_WAIT_POLICY"]
+    'PASSIVE'
+    >>> wait_asleep(asked := {"OMP_WAIT_POLICY": "ACTIVE"})
+    >>> asked
+    {'OMP_WAIT_POLICY': 'ACTIVE'}
+    """
+    for name, value in WAITING_ASLEEP.items():
+        environment.setdefault(name, value)

@@ -5,11 +5,7 @@ answers at once.
 """
 
 import json
-import os
-import shutil
-import uuid
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -93,46 +89,3 @@ def _is_report(path: Path) -> bool:
     except OSError:
         return False
     return REPORT_HEAD in head
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a text file in place of an older one; its folder is made.
-
-    Raises
-    ------
-    OSError
-        Of the file itself, never of the part beside it; an older file stays.
-    """
-    part = path.with_name(f".{path.name}.part")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        part.write_text(text, encoding="utf-8", newline="")
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        # the file was asked for, of the part beside it nobody knows
-        raise type(error)(error.errno, error.strerror, str(path)) from error
-
-
-@contextmanager
-def whole_folder(path: Path) -> Iterator[Path]:
-    """Yield an empty folder of that name, hidden beside, that replaces the older one in the end.
-
-    Where the block or the replacement fails, the older folder stays as it was.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    shelter = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
-    part, old = shelter / path.name, shelter / "older"
-    try:
-        part.mkdir(parents=True)
-        yield part
-        if path.exists():
-            path.rename(old)
-        try:
-            part.rename(path)
-        except OSError:
-            if old.exists():
-                old.rename(path)
-            raise
-    finally:
-        shutil.rmtree(shelter, ignore_errors=True)

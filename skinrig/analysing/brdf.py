@@ -2,9 +2,7 @@
 
 import csv
 import dataclasses
-import io
 import json
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +13,6 @@ import numpy as np
 from model import store
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
-from model.skin import SkinMap
 from reconstruction.brdf_basis import space as brdf_space
 from reconstruction.brdf_basis.space import SpaceCurve
 from skinrig import consent
@@ -23,12 +20,13 @@ from skinrig.analysing import brdf_space_datasets, brdf_space_figures
 from skinrig.analysing.brdf_space_datasets import Dataset
 from skinrig.appearances.face_textures import valid_of
 from skinrig.arrays import BoolArray, Float64Array
+from skinrig.editing import surface_mixtures
+from skinrig.editing.surface_mixtures import SurfaceMixtureError
 from skinrig.errors import UnusableError
 from skinrig.next_steps import shell_quote
 from skinrig.traits import labels as trait_labels
 
 SCHEMA: Final = "skinrig.analyse-brdf/1"
-BASIS_FILE: Final = "brdf_basis.npz"
 N_POINTS_PER_DATASET: Final = 5_000
 N_POINTS_PER_FACE: Final = 2_000
 MAX_TRAINING_POINTS: Final = 5_000
@@ -280,35 +278,25 @@ def _measured(
 ) -> tuple[Float64Array, int, int]:
     """Return shares of the materials at random texels, how many are no use, and its lobes."""
     appearance = store.read(folder)
-    weights: list[SkinMap] = []
-    while (name := f"basis_weight_{len(weights)}") in appearance.maps:
-        weights.append(appearance.maps[name])
-    want = "--want r_d,basis_weight_0 --rank 24"
-    how = f"skinrig reconstruct SESSION {want} --out {shell_quote(folder)}"
-    if not weights or BASIS_FILE not in appearance.files:
-        raise AnalysisError(f"{folder}: holds no lobes; make them by `{how}`")
     try:
-        with np.load(io.BytesIO(appearance.files[BASIS_FILE]), allow_pickle=False) as kept:
-            mix = np.asarray(kept["mix"], np.float64)
-            names = tuple(str(name) for name in kept["materials"])
-    except (KeyError, ValueError, zipfile.BadZipFile) as error:
+        lobes = surface_mixtures.read(appearance)
+    except SurfaceMixtureError as error:
+        want = "--want r_d,basis_weight_0 --rank 24"
+        how = f"skinrig reconstruct SESSION {want} --out {shell_quote(folder)}"
+        raise AnalysisError(f"{folder}: holds no lobes ({error}); make them by `{how}`") from error
+    if lobes.materials != materials.names:
         raise AnalysisError(
-            f"{folder}: {BASIS_FILE} does not say of which materials the lobes are; `{how}`"
-        ) from error
-    if names != materials.names or mix.shape != (len(weights), materials.size):
-        raise AnalysisError(
-            f"{folder}: its {len(weights)} lobes are of {len(names)} materials ({names[0]}, ...), "
-            f"expected {materials.size} ({materials.names[0]}, ...); say --basis DIR where they "
-            "were fitted with other files than the built-in ones"
+            f"{folder}: its {len(lobes.mix)} lobes are of {len(lobes.materials)} materials "
+            f"({lobes.materials[0]}, ...), expected {materials.size} ({materials.names[0]}, ...); "
+            "say --basis DIR where they were fitted with other files than the built-in ones"
         )
-    known = np.logical_and.reduce([valid_of(one) for one in weights])
+    known = np.logical_and.reduce([valid_of(one) for one in lobes.maps])
     at = rng.permutation(np.flatnonzero(known))[:count]
     if not len(at):
         raise AnalysisError(f"{folder}: none of its texels has valid lobes")
-    shares = np.stack([one.values.reshape(-1)[at] for one in weights], axis=-1).astype(np.float64)
-    mixed = np.maximum(shares, 0.0) @ mix
+    mixed = lobes.weights().reshape(-1, len(lobes.mix))[at] @ lobes.mix
     kept_rows = brdf_space.usable(mixed, materials)
-    return mixed[kept_rows], int(np.count_nonzero(~kept_rows)), len(weights)
+    return mixed[kept_rows], int(np.count_nonzero(~kept_rows)), len(lobes.mix)
 
 
 def _write(

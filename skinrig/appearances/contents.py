@@ -1,13 +1,16 @@
 """What several readers take from an appearance: valid texels, assumptions, digest, versions."""
 
 import hashlib
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from model import store
 from model.skin import SkinAppearance, SkinMap
+from skinrig import consent
 from skinrig.arrays import BoolArray
 
 
@@ -44,9 +47,30 @@ def digest(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def source_of(*parts: SkinAppearance) -> str:
-    """Return "simulated" where any part of what is made of appearances is, else "measured"."""
-    return "simulated" if any(part.source == "simulated" for part in parts) else "measured"
+def made_of(
+    *sources: SkinAppearance,
+    maps: Mapping[str, SkinMap],
+    parameters: Mapping[str, object],
+    **more: Any,
+) -> SkinAppearance:
+    """Return an appearance with the provenance of those that it is made of.
+
+    Parameters
+    ----------
+    sources
+        One or more. The result is simulated where one of them is, records what all their subjects
+        agreed to, and has the seed of the first.
+    maps, parameters, more
+        Fields of the appearance.
+    """
+    agreed = {consent.CONSENT_KEY: consent.merge_consent(*sources)}
+    return SkinAppearance(
+        maps,
+        "simulated" if any(one.source == "simulated" for one in sources) else "measured",
+        {**parameters, **agreed},
+        versions=versions(),
+        **{"seed": sources[0].seed, **more},
+    )
 
 
 def versions() -> dict[str, str]:

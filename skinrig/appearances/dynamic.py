@@ -4,12 +4,11 @@ Each fit adds its part to the folder and replaces an older one of its kind; the 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from model import store
-from model.skin import SkinAppearance, SkinMap
+from model.skin import SkinAppearance
 from skinrig.appearances.contents import versions
 
 DYNAMIC_KIND = "dynamic"
@@ -26,35 +25,6 @@ class DynamicAppearanceError(ValueError):
     """A folder that holds no part that can be evaluated, or another kind of maps."""
 
 
-@dataclass(frozen=True, slots=True)
-class Part:
-    """One fitted model, as it goes into the folder.
-
-    Attributes
-    ----------
-    maps, files
-        What it is stored as, by name.
-    parameters
-        JSON values: settings and figures of the fit.
-    inputs
-        SHA-256 of what was read.
-    source
-        "measured" or "simulated".
-    left_out
-        What was not fitted, and why.
-    seed
-        Of a simulation; None: measured.
-    """
-
-    maps: Mapping[str, SkinMap]
-    files: Mapping[str, bytes]
-    parameters: Mapping[str, Any]
-    inputs: Mapping[str, str]
-    source: str
-    left_out: tuple[tuple[str, str], ...] = ()
-    seed: int | None = None
-
-
 def check_target(out: Path) -> None:
     """Raise where a fit could not be written, before it is computed.
 
@@ -66,7 +36,7 @@ def check_target(out: Path) -> None:
     _previous(out)
 
 
-def add(out: Path, name: str, part: Part) -> SkinAppearance:
+def add(out: Path, name: str, part: SkinAppearance) -> SkinAppearance:
     """Write a part beside those that the folder holds already.
 
     Parameters
@@ -76,7 +46,7 @@ def add(out: Path, name: str, part: Part) -> SkinAppearance:
     name
         Of `DYNAMIC_PARTS`.
     part
-        What was fitted.
+        What was fitted: one model with its maps, files, settings and figures.
 
     Raises
     ------

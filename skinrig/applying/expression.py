@@ -18,11 +18,11 @@ from model.wrinkles.evaluation import WRINKLE_FILE as WRINKLE_FILE
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import ROW_OF_STATE, Clamp
 from reconstruction.facial_color.rig_transfer import transfer_rig
-from skinrig import consent
 from skinrig.appearances import dynamic as dynamic_appearance
-from skinrig.appearances.contents import document_digest, jointly_valid, source_of, versions
+from skinrig.appearances.contents import document_digest, jointly_valid, made_of
 from skinrig.appearances.dynamic import DYNAMIC_PARTS, FACIAL_COLOR, WRINKLES
 from skinrig.capturing.option_values import parse_amounts
+from skinrig.console import picked
 from skinrig.errors import UsageError, one_of
 
 EXPRESSION_KIND = "expression"
@@ -193,34 +193,29 @@ def apply_expression(
     if not done.maps:
         reasons = "; ".join(f"{what}: {why}" for what, why in done.left_out)
         raise ApplyError(f"{path}: nothing was left to evaluate ({reasons})")
-    store.write(
-        out,
-        SkinAppearance(
-            maps=done.maps,
-            source=source_of(*_faces(appearance, expression)),
-            parameters={
-                "kind": EXPRESSION_KIND,
-                "weights": dict(expression.weights),
-                "clamp": expression.clamp,
-                "emotional": expression.emotional,
-                "gain": expression.gain,
-                consent.CONSENT_KEY: consent.merge_consent(*_faces(appearance, expression)),
-                # seconds differ from run to run: the same input gives the same bytes
-                "figures": {
-                    name: {key: value for key, value in part.items() if "seconds" not in key}
-                    for name, part in done.figures.items()
-                },
-            },
-            inputs={
-                "appearance": document_digest(path),
-                **({} if expression.onto is None else expression.onto.hashes),
-                **done.inputs,
-            },
-            versions=versions(),
-            left_out=tuple(done.left_out),
-            seed=appearance.seed,
-        ),
+    # seconds differ from run to run: the same input gives the same bytes
+    figures = {
+        name: {key: value for key, value in part.items() if "seconds" not in key}
+        for name, part in done.figures.items()
+    }
+    other = expression.onto
+    made = made_of(
+        *((appearance,) if other is None else (appearance, other.appearance)),
+        maps=done.maps,
+        parameters={
+            "kind": EXPRESSION_KIND,
+            "weights": dict(expression.weights),
+            "figures": figures,
+            **picked(expression, "clamp", "emotional", "gain"),
+        },
+        inputs={
+            "appearance": document_digest(path),
+            **({} if other is None else other.hashes),
+            **done.inputs,
+        },
+        left_out=tuple(done.left_out),
     )
+    store.write(out, made)
     return done
 
 
@@ -246,12 +241,6 @@ def normalized(expression: Expression) -> Expression:
         raise ApplyError(f"weights: their sum is {total:g}: it cannot be made 1")
     weights = {name: weight / total for name, weight in expression.weights.items()}
     return replace(expression, weights=weights, normalize=False)
-
-
-def _faces(appearance: SkinAppearance, expression: Expression) -> tuple[SkinAppearance, ...]:
-    """Return the appearances that a result is made of."""
-    other = expression.onto
-    return (appearance,) if other is None else (appearance, other.appearance)
 
 
 def hemoglobin_rig(appearance: SkinAppearance) -> HemoglobinRig:

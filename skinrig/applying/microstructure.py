@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,12 +14,26 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from model.microstructure import ALPHA_LIMITS, FOREHEAD, KernelTable
-from model.microstructure.convolution import LineKernels, Sampling, convolve_tiled, tiles_of
+from model.microstructure.convolution import (
+    LineKernels,
+    Sampling,
+    convolve,
+    convolve_tiled,
+    tiles_of,
+)
 from model.microstructure.map_windows import Window
 from model.microstructure.mesh_strain import MeshStrain, strain
-from model.microstructure.strain_fields import KernelRegions, rasterize, regional_kernels
-from skinrig.arrays import BoolArray, Float32Array, Float64Array
+from model.microstructure.strain_fields import (
+    KernelRegions,
+    TextureStrain,
+    line_kernels,
+    rasterize,
+    regional_kernels,
+)
+from skinrig.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from skinrig.blend_shapes.meshes import BlendShapeMesh
+from skinrig.console import picked
+from skinrig.whole_file import write_whole
 
 TILE_PX: Final = 2048
 JOURNAL_SCHEMA: Final = "skinrig.microstructure-tiles/1"
@@ -106,12 +119,10 @@ class AppliedMicrostructure:
     ----------
     height : ndarray of float32, shape (H, W)
         In the neutral relief's unit; a memory map where a file was asked for.
-    strain : MeshStrain
     report : MicrostructureReport
     """
 
     height: Float32Array
-    strain: MeshStrain
     report: MicrostructureReport
 
 
@@ -177,11 +188,8 @@ def apply_microstructure(
     begin = time.perf_counter()
     moved = mesh.deformed(weights)
     found = strain(mesh.vertices_mm, moved, mesh.faces, mesh.uv)
+    pose = _Pose(mesh, found, regions, size, extrapolate)
     strain_s = time.perf_counter() - begin
-
-    def fields_at(window: Window) -> tuple[LineKernels, LineKernels]:
-        shown = rasterize(found, mesh.faces, mesh.uv, size, window=window)
-        return regional_kernels(shown, regions, size, window=window, extrapolate=extrapolate)
 
     def valid_at(window: Window) -> BoolArray:
         return np.asarray(valid[window.rows, window.columns], bool)
@@ -202,7 +210,7 @@ def apply_microstructure(
     convolve_tiled(
         neutral_height,
         journal.target,
-        fields_at,
+        pose.kernels,
         tile=tile,
         sampling=sampling,
         valid_at=None if valid is None else valid_at,
@@ -211,94 +219,98 @@ def apply_microstructure(
     )
     journal.close()
     convolution_s = time.perf_counter() - begin
-    covered, changed, unresolved = _shares(found, mesh, regions, size, extrapolate)
     report = MicrostructureReport(
         size_px=size,
         fitted_range=regions.tables[0].stretch_range,
         extrapolate=extrapolate,
-        degenerate_share=found.degenerate_share,
-        uv_degenerate_share=found.uv_degenerate_share,
-        uv_turned_share=found.uv_turned_share,
-        covered_share=covered,
-        changed_share=changed,
-        unresolved_share=unresolved,
         strain_s=strain_s,
         convolution_s=convolution_s,
         tiles=len(tiles_of(size, tile)),
         tiles_before=len(before),
-        **_stretches(found, regions, mesh, size, extrapolate),
+        **picked(found, "degenerate_share", "uv_degenerate_share", "uv_turned_share"),
+        **pose.shares(),
+        **pose.stretches(),
     )
-    return AppliedMicrostructure(journal.target, found, report)
+    return AppliedMicrostructure(journal.target, report)
 
 
-def _shares(
-    found: MeshStrain,
-    mesh: BlendShapeMesh,
-    regions: KernelRegions,
-    size: tuple[int, int],
-    extrapolate: Literal["hold", "formula"],
-) -> tuple[float, float, float]:
-    """Return shares of pixels: covered; of these, changed, and asked for but unresolved."""
-    coarser = math.ceil(max(size) / COUNTING_SIDE_PX)
-    few = (math.ceil(size[0] / coarser), math.ceil(size[1] / coarser))
-    shown = rasterize(found, mesh.faces, mesh.uv, few, pad_px=0)
-    changed, narrow = np.zeros((2, *few), bool)
-    for lines in regional_kernels(shown, regions, few, extrapolate=extrapolate):
-        sigma_px = coarser * lines.sigma_px[shown.covered]
-        asked = (lines.alpha[shown.covered] != 0.0) & (sigma_px > 0.0)
-        wide = sigma_px >= MIN_SIGMA_PX
-        changed[shown.covered] |= asked & wide
-        narrow[shown.covered] |= asked & ~wide
-    covered = max(int(shown.covered.sum()), 1)
-    return (
-        float(shown.covered.mean()),
-        float(changed.sum() / covered),
-        float((narrow & ~changed).sum() / covered),
-    )
+def under_strain(
+    height: Float32Array, found: MeshStrain, faces: Int64Array, uv: Float64Array, table: KernelTable
+) -> tuple[Float32Array, TextureStrain]:
+    """Return a map in memory convolved by the strain of its mesh, and the strain at its pixels."""
+    field = rasterize(found, faces, uv, (height.shape[0], height.shape[1]))
+    s, t = line_kernels(field, table)
+    return convolve(height, s.axis, t.axis, s.alpha, s.sigma_px, t.alpha, t.sigma_px), field
 
 
-def _stretches(
-    found: MeshStrain,
-    regions: KernelRegions,
-    mesh: BlendShapeMesh,
-    size: tuple[int, int],
-    extrapolate: str,
-) -> dict[str, Any]:
-    """Return what of a report is of the vertices: stretch, range, pixels."""
-    good = found.valid
-    if not good.any():
-        raise ApplyMicrostructureError("mesh: no vertex has a triangle with an area and a texture")
-    both = np.stack([found.r_s[good], found.r_t[good]])
-    own = regions.table_at(mesh.uv[good])
-    below, above, clipped = np.zeros((3, *both.shape), bool)
-    for number, table in enumerate(regions.tables):
-        (low, high), there = table.stretch_range, own == number
-        below[:, there], above[:, there] = both[:, there] < low, both[:, there] > high
-        held = np.clip(both[:, there], low, high) if extrapolate == "hold" else both[:, there]
-        alpha = table.unlimited_alpha(held)
-        clipped[:, there] = (alpha < ALPHA_LIMITS[0]) | (alpha > ALPHA_LIMITS[1])
-    pixels = np.concatenate(
-        [
-            np.hypot(axis[good, 0] * size[1], axis[good, 1] * size[0]) * per_mm[good]
-            for axis, per_mm in (
-                (found.axis_s, found.uv_per_mm_s),
-                (found.axis_t, found.uv_per_mm_t),
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pose:
+    """A mesh under strain, and the kernels of its skin."""
+
+    mesh: BlendShapeMesh
+    strain: MeshStrain
+    regions: KernelRegions
+    size: tuple[int, int]
+    """Rows and columns of the map."""
+    extrapolate: Literal["hold", "formula"]
+
+    def kernels(self, window: Window) -> tuple[LineKernels, LineKernels]:
+        """Return the kernels at the pixels of a window."""
+        shown = rasterize(self.strain, self.mesh.faces, self.mesh.uv, self.size, window=window)
+        how: dict[str, Any] = {"window": window, "extrapolate": self.extrapolate}
+        return regional_kernels(shown, self.regions, self.size, **how)
+
+    def shares(self) -> dict[str, Any]:
+        """Return shares of pixels: covered; of these, changed, and asked for but unresolved."""
+        coarser = math.ceil(max(self.size) / COUNTING_SIDE_PX)
+        few = (math.ceil(self.size[0] / coarser), math.ceil(self.size[1] / coarser))
+        shown = rasterize(self.strain, self.mesh.faces, self.mesh.uv, few, pad_px=0)
+        changed, narrow = np.zeros((2, *few), bool)
+        for lines in regional_kernels(shown, self.regions, few, extrapolate=self.extrapolate):
+            sigma_px = coarser * lines.sigma_px[shown.covered]
+            asked = (lines.alpha[shown.covered] != 0.0) & (sigma_px > 0.0)
+            wide = sigma_px >= MIN_SIGMA_PX
+            changed[shown.covered] |= asked & wide
+            narrow[shown.covered] |= asked & ~wide
+        covered = max(int(shown.covered.sum()), 1)
+        return {
+            "covered_share": float(shown.covered.mean()),
+            "changed_share": float(changed.sum() / covered),
+            "unresolved_share": float((narrow & ~changed).sum() / covered),
+        }
+
+    def stretches(self) -> dict[str, Any]:
+        """Return what of a report is of the vertices: stretch, range, pixels."""
+        found, good = self.strain, self.strain.valid
+        if not good.any():
+            raise ApplyMicrostructureError(
+                "mesh: no vertex has a triangle with an area and a texture"
             )
+        both = np.stack([found.r_s[good], found.r_t[good]])
+        own = self.regions.table_at(self.mesh.uv[good])
+        below, above, clipped = np.zeros((3, *both.shape), bool)
+        for number, table in enumerate(self.regions.tables):
+            (low, high), there = table.stretch_range, own == number
+            ratios = both[:, there]
+            below[:, there], above[:, there] = ratios < low, ratios > high
+            held = np.clip(ratios, low, high) if self.extrapolate == "hold" else ratios
+            alpha = table.unlimited_alpha(held)
+            clipped[:, there] = (alpha < ALPHA_LIMITS[0]) | (alpha > ALPHA_LIMITS[1])
+        height, width = self.size
+        scales = ((found.axis_s, found.uv_per_mm_s), (found.axis_t, found.uv_per_mm_t))
+        px_per_mm = [
+            np.hypot(axis[good, 0] * width, axis[good, 1] * height) * uv_per_mm[good]
+            for axis, uv_per_mm in scales
         ]
-    )
-    outside, low, high, limited = (
-        float(each.any(axis=0).mean()) for each in (below | above, below, above, clipped)
-    )
-    return {
-        "stretch_s": (float(both[0].min()), float(both[0].max())),
-        "stretch_t": (float(both[1].min()), float(both[1].max())),
-        "outside_share": outside,
-        "below_share": low,
-        "above_share": high,
-        "clipped_share": limited,
-        "invalid_share": float(1.0 - good.mean()),
-        "pixel_um": float(1e3 / np.median(pixels)),
-    }
+        counted = {"outside": below | above, "below": below, "above": above, "clipped": clipped}
+        shares = {f"{name}_share": float(v.any(axis=0).mean()) for name, v in counted.items()}
+        return {
+            "stretch_s": (float(both[0].min()), float(both[0].max())),
+            "stretch_t": (float(both[1].min()), float(both[1].max())),
+            "invalid_share": float(1.0 - good.mean()),
+            "pixel_um": float(1e3 / np.median(px_per_mm)),
+            **shares,
+        }
 
 
 def _job(
@@ -376,10 +388,8 @@ class _Journal(_Tiles):
         self._write()
 
     def _write(self) -> None:
-        fresh = self.path.with_name(self.path.name + ".new")
         told = {"schema": JOURNAL_SCHEMA, "job": self.job, "finished": self.finished}
-        fresh.write_text(json.dumps(told), encoding="utf-8")
-        os.replace(fresh, self.path)
+        write_whole(self.path, json.dumps(told))
 
     def close(self) -> None:
         self.target.flush()

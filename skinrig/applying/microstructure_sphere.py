@@ -26,6 +26,7 @@ from model import microstructure
 from model.displacement_synthesis import growth as displacement_synthesis
 from model.displacement_synthesis.volume_noise import VolumeNoise
 from model.microstructure import FOREHEAD, KernelTable, strain_fields
+from skinrig.applying.microstructure import under_strain
 from skinrig.arrays import Float32Array, Float64Array, Int64Array
 from skinrig.errors import one_of
 
@@ -260,10 +261,6 @@ def deform(
         raise SphereError(f"ratios: got {ratios}, expected three finite numbers above 0")
     vertices, faces, uv = sphere.mesh()
     found = microstructure.strain(vertices, vertices * scale, faces, uv)
-    field = strain_fields.rasterize(found, faces, uv, height.shape)
-    if dynamic:
-        s, t = strain_fields.line_kernels(field, table)
-        height = microstructure.convolve(
-            height, s.axis, t.axis, s.alpha, s.sigma_px, t.alpha, t.sigma_px
-        )
-    return DeformedSphere(sphere, (scale[0], scale[1], scale[2]), height, field)
+    moved, field = under_strain(height, found, faces, uv, table)
+    shown = moved if dynamic else height
+    return DeformedSphere(sphere, (scale[0], scale[1], scale[2]), shown, field)

@@ -26,6 +26,7 @@ from scipy.sparse.linalg import splu
 
 from model import microstructure
 from model.microstructure import FOREHEAD, KernelTable, MeshStrain, strain_fields
+from skinrig.applying.microstructure import under_strain
 from skinrig.arrays import Float32Array, Float64Array, Int64Array
 from skinrig.errors import MissingExtra
 
@@ -156,12 +157,7 @@ class PushedPatch:
         height = np.asarray(height_um, np.float32)
         if height.ndim != 2 or height.shape[0] != height.shape[1]:
             raise PushError(f"height_um: got shape {height.shape}, expected (N, N)")
-        field = strain_fields.rasterize(self.strain(), self.surface, self.uv, height.shape)
-        s, t = strain_fields.line_kernels(field, table)
-        moved = microstructure.convolve(
-            height, s.axis, t.axis, s.alpha, s.sigma_px, t.alpha, t.sigma_px
-        )
-        return moved, field
+        return under_strain(height, self.strain(), self.surface, self.uv, table)
 
 
 def push(block: SkinBlock, probe: Push, *, steps: int = 2) -> PushedPatch:

@@ -30,6 +30,7 @@ from skinrig.applying.microstructure import apply_microstructure
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.blend_shapes import meshes as blend_shapes
 from skinrig.blend_shapes.meshes import BlendShapeMesh
+from skinrig.console import picked
 from skinrig.errors import one_of
 
 REGION_ATLAS_PX: Final = 256
@@ -58,28 +59,45 @@ MAX_EXR_SIDE_PX: Final = 8192
 
 
 @dataclass(frozen=True, slots=True)
+class ReliefRequest:
+    """What relief is asked for."""
+
+    size_px: int
+    """Pixels a side of the map."""
+    site: str | None = None
+    """Whose relief covers the whole mesh; None: of several each site its own region."""
+    source: str = "patches"
+    """"patches": the measured ones, grown; "noise": noise in space as high as they are, which has
+    no seams between islands of the texture."""
+    extrapolate: Extrapolation = "hold"
+    """Beyond the table's range: "hold" or "formula"."""
+    seed: int = 0
+    """Of the growth."""
+
+    def __post_init__(self) -> None:
+        one_of("synthesize", self.source, RELIEF_SOURCES, ApplyError)
+        one_of("extrapolate", self.extrapolate, EXTRAPOLATION_MODES, ApplyError)
+
+    @property
+    def large(self) -> bool:
+        """Whether the maps are too large for EXR."""
+        return self.size_px > MAX_EXR_SIDE_PX
+
+
+@dataclass(frozen=True, slots=True)
 class Relief:
     """Evaluates the microstructure part of a dynamic appearance on a mesh.
 
     Attributes
     ----------
+    asked
+        Which relief.
     mesh
         With a shape for each name in ``weights``.
     weights
         Of the mesh's shapes.
     own_shapes
         Which of the names the mesh file has itself; the others are moved as the simulated head.
-    size_px
-        Pixels a side of the map.
-    site
-        Whose relief covers the whole mesh; None: each site its own region, where there are several.
-    source
-        "patches": the measured ones, grown; "noise": noise in space as high as they are, which has
-        no seams between islands of the texture.
-    extrapolate
-        "hold" or "formula", beyond the table's range.
-    seed
-        Of the growth.
     aside
         Folder for maps that are too large for EXR.
     mesh_sha256
@@ -88,14 +106,10 @@ class Relief:
         Called with one line now and then.
     """
 
+    asked: ReliefRequest
     mesh: BlendShapeMesh
     weights: Mapping[str, float]
     own_shapes: tuple[str, ...]
-    size_px: int
-    site: str | None
-    source: str
-    extrapolate: Extrapolation
-    seed: int
     aside: Path
     mesh_sha256: str
     progress: Callable[[str], None]
@@ -104,12 +118,8 @@ class Relief:
     def of(
         path: Path,
         weights: Mapping[str, float],
+        asked: ReliefRequest,
         *,
-        size_px: int,
-        site: str | None,
-        source: str = "patches",
-        extrapolate: str,
-        seed: int,
         out: Path,
         progress: Callable[[str], None],
     ) -> Relief:
@@ -122,30 +132,20 @@ class Relief:
         ApplyError, MeshError
             For a size, a weight's name or a mesh that cannot be used.
         """
-        if not MIN_PATCH_PX <= size_px <= 65_536:
-            raise ApplyError(f"size: got {size_px}, expected {MIN_PATCH_PX} to 65536 px")
+        if not MIN_PATCH_PX <= asked.size_px <= 65_536:
+            raise ApplyError(f"size: got {asked.size_px}, expected {MIN_PATCH_PX} to 65536 px")
         used = {name: weight for name, weight in weights.items() if name != "neutral"}
-        shaped, own = _with_states(blend_shapes.load(path), list(used))
-        return Relief(
-            shaped,
-            {name: weight for name, weight in used.items() if name in shaped.shapes},
-            own,
-            size_px,
-            site,
-            one_of("synthesize", source, RELIEF_SOURCES, ApplyError),
-            one_of("extrapolate", extrapolate, EXTRAPOLATION_MODES, ApplyError),
-            seed,
-            out.with_name(f"{out.name}-large"),
-            _sha256(path),
-            progress,
-        )
+        mesh, own = _with_states(blend_shapes.load(path), list(used))
+        kept = {name: weight for name, weight in used.items() if name in mesh.shapes}
+        aside = out.with_name(f"{out.name}-large")
+        return Relief(asked, mesh, kept, own, aside, _sha256(path), progress)
 
     def __call__(self, appearance: SkinAppearance, part: dict[str, Any], done: Applied) -> None:
         """Grow the neutral relief, move it, and put the maps into ``done``."""
-        sites = dict(part["sites"])
-        if self.site is not None:
-            one_of("site", self.site, sites, ApplyError)
-        names = [self.site] if self.site is not None else list(sites)
+        sites, asked = dict(part["sites"]), self.asked
+        if asked.site is not None:
+            one_of("site", asked.site, sites, ApplyError)
+        names = [asked.site] if asked.site is not None else list(sites)
         regions = _regions(self.mesh, names)
         neutral = self._neutral(appearance, {name: sites[name] for name in names}, regions)
         tables = tuple(
@@ -157,49 +157,44 @@ class Relief:
             self.weights,
             neutral,
             tables[0] if regions is None else KernelRegions(tables, regions),
-            extrapolate=self.extrapolate,
-            out=self.aside / "displacement.npy" if self.large else None,
+            extrapolate=asked.extrapolate,
+            out=self.aside / "displacement.npy" if asked.large else None,
             progress=lambda at, of: self.progress(f"tile {at} of {of}"),
         )
-        made = "noise as high as" if self.source == "noise" else "grown from"
+        made = "noise as high as" if asked.source == "noise" else "grown from"
         note = f"um, {made} measured patches; texture of the mesh"
-        step = -(-self.size_px // MAX_EXR_SIDE_PX) if self.large else 1
-        if self.large:
-            why = f"EXR of {self.size_px} px: written to {self.aside.name} as .npy"
+        step = -(-asked.size_px // MAX_EXR_SIDE_PX) if asked.large else 1
+        if asked.large:
+            why = f"EXR of {asked.size_px} px: written to {self.aside.name} as .npy"
             done.left_out.append((MICROSTRUCTURE, why))
             note += f"; every {step}. pixel"
         for name, height, more in (
             ("displacement_neutral", neutral, ""),
             ("displacement", moved.height, ", under strain"),
         ):
-            shown = np.array(height[::step, ::step]) if self.large else np.asarray(height)
+            shown = np.array(height[::step, ::step]) if asked.large else np.asarray(height)
             done.maps[name] = SkinMap(shown, "um", None, None, note + more)
         figures = asdict(moved.report)
         seconds = {f"{key[:-2]}_seconds": figures.pop(key) for key in SECONDS_KEYS}
         done.figures[MICROSTRUCTURE] = {
             "sites": names,
-            "source": self.source,
+            **picked(asked, "source", "seed"),
             "tables": [table.source for table in tables],
             "own_shapes": list(self.own_shapes),
             **figures,
             **seconds,
-            "seed": self.seed,
         }
         done.inputs["mesh"] = self.mesh_sha256
-        if self.large:
+        if asked.large:
             done.figures[MICROSTRUCTURE]["files"] = {
                 path.name: _sha256(path) for path in sorted(self.aside.glob("displacement*.npy"))
             }
-
-    @property
-    def large(self) -> bool:
-        """Whether the maps are too large for EXR."""
-        return self.size_px > MAX_EXR_SIDE_PX
 
     def _neutral(
         self, appearance: SkinAppearance, sites: Mapping[str, Any], regions: Float64Array | None
     ) -> Any:
         """Return the neutral relief on the mesh's texture, um: grown patches, or noise."""
+        asked = self.asked
         patches = {name: [_patch(name, appearance, entry)] for name, entry in sites.items()}
         pixels_um = [float(entry["pixel_um"]) for entry in sites.values()]
         if max(pixels_um) > (1.0 + PIXEL_SIZE_TOL) * min(pixels_um):
@@ -207,30 +202,30 @@ class Relief:
                 f"sites: reliefs with pixels of {sorted(pixels_um)} um, expected one size; "
                 "choose one with --site"
             )
-        rng, scale = np.random.default_rng(self.seed), _scale(self.mesh)
-        shape = f"{self.size_px} x {self.size_px}"
+        rng, scale = np.random.default_rng(asked.seed), _scale(self.mesh)
+        shape = f"{asked.size_px} x {asked.size_px}"
         neutral: Any = None
-        if self.large:
+        if asked.large:
             self.aside.mkdir(parents=True, exist_ok=True)
             growing = self.aside / "displacement_neutral.npy.part"
-            neutral = np.lib.format.open_memmap(growing, "w+", np.float32, (self.size_px,) * 2)
-        if self.source == "noise":
+            neutral = np.lib.format.open_memmap(growing, "w+", np.float32, (asked.size_px,) * 2)
+        if asked.source == "noise":
             self.progress(f"draw noise on {shape} pixels")
             rms_um = float(np.sqrt(np.mean([np.nanvar(one) for (one,) in patches.values()])))
-            neutral = _noise(self.mesh, self.size_px, rms_um, scale, rng=rng, out=neutral)
+            neutral = _noise(self.mesh, asked.size_px, rms_um, scale, rng=rng, out=neutral)
         else:
             self.progress(f"grow the relief of {', '.join(sites)} to {shape}")
             neutral = displacement_synthesis.grow(
                 patches,
-                self.size_px,
+                asked.size_px,
                 rng=rng,
                 regions=regions,
                 out=neutral,
-                pixel_um=scale / self.size_px,
+                pixel_um=scale / asked.size_px,
                 patch_pixel_um=float(np.mean(pixels_um)),
                 threads=2,
             )
-        if self.large:
+        if asked.large:
             neutral.flush()
             os.replace(growing, self.aside / "displacement_neutral.npy")
         return neutral

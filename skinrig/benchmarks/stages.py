@@ -15,7 +15,7 @@ from skinrig.benchmarks.results import StageBenchmark
 from skinrig.benchmarks.stage import Stage, descriptions
 from skinrig.console import Console, plain
 from skinrig.errors import EXTRA_MISSING, exit_code, sentence
-from skinrig.workspace import write_whole
+from skinrig.whole_file import write_whole
 
 STAGES: dict[str, str] = {name: entry["run"] for name, entry in descriptions().items()}
 """Module and function of each; a module is imported, and its kernels compiled, when it is run."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from skinrig.console import Console
-from skinrig.workspace import write_whole
+from skinrig.whole_file import write_whole
 
 _POINT_COLUMNS = (
     "seconds",

@@ -15,7 +15,7 @@ from capture.calibration.fiber.phantom import read_certificate
 from capture.session import FrameRecord, Session
 from skinrig.arrays import Float32Array
 from skinrig.calibrating import dome, gradient, probe, white_tile
-from skinrig.calibrating.outcome import CalibratingError, Made, photon_transfer, provenance
+from skinrig.calibrating.outcome import CalibratingError, Made, TargetSessions, photon_transfer
 from skinrig.console import picked
 from skinrig.errors import one_of
 
@@ -77,15 +77,16 @@ def calibrate(
     if not opened:
         raise CalibratingError("sessions: got none, expected at least one folder")
     made_on = created or max(s.manifest.created_at.date() for s in opened)
+    given = TargetSessions(opened, Path(out), made_on)
     if kind == probe.FIBER_CALIBRATION_KIND:
         paper = None if phantom is None else read_certificate(phantom)
-        made = probe.calibrate_probe(opened, out, made_on, certificate=paper)
+        made = probe.calibrate_probe(given, certificate=paper)
     elif gradient.of_a_gradient_sphere(opened):
-        made = gradient.calibrate_gradient(kind, opened, out, made_on)
+        made = gradient.calibrate_gradient(kind, given)
     elif kind in dome.DOME_CALIBRATION_KINDS:
-        made = dome.calibrate_dome(kind, opened, out, made_on, targets=targets)
+        made = dome.calibrate_dome(kind, given, targets=targets)
     else:
-        frames = _Frames(opened, made_on)
+        frames = _Frames(given)
         calibration = _CALIBRATION_MAKERS[kind](frames)
         made = Made(calibration, tuple(_summary(calibration)), tuple(frames.findings))
     drift: tuple[store.Drift, ...] = ()
@@ -98,40 +99,29 @@ def calibrate(
     return Outcome(**picked(made, "calibration", "summary", "findings"), path=path, drift=drift)
 
 
+Shots = list[tuple[FrameRecord, raw.RawFrame]]
+
+
 class _Frames:
     """The frames of one camera in several sessions."""
 
-    def __init__(self, sessions: Sequence[Session], created: date) -> None:
-        self.sessions = sessions
-        self.rig = sessions[0].rig
-        serials = {view.serial for session in sessions for view in session.rig.views}
+    def __init__(self, targets: TargetSessions) -> None:
+        self._targets = targets
+        self.rig = targets.rig
+        serials = sorted(targets.serials)
         if len(serials) != 1:
-            named = sorted(serials)
-            some = ", ".join(named[:3]) + (", ..." if len(named) > 3 else "")
+            some = ", ".join(serials[:3]) + (", ..." if len(serials) > 3 else "")
             raise CalibratingError(
-                f"cameras: got {len(named)} ({some}), expected one: give sessions of one camera; "
+                f"cameras: got {len(serials)} ({some}), expected one: give sessions of one camera; "
                 "a dome needs `calibrate geometry` and `calibrate lights` only"
             )
-        self.about = {"serial": serials.pop(), **provenance(sessions, created)}
+        self.about = {"serial": serials[0], **targets.provenance()}
         self.findings: list[str] = []
 
-    def of(self, kind: str, **index: str | int | float) -> list[tuple[FrameRecord, raw.RawFrame]]:
-        """Return records with their frames; an empty list when there are none."""
-        return [
-            (record, session.read(record))
-            for session in self.sessions
-            for record in session.frames(kind, **index)
-        ]
-
-    def need(self, kind: str, **index: str | int | float) -> list[tuple[FrameRecord, raw.RawFrame]]:
-        found = self.of(kind, **index)
-        if not found:
-            wanted = " ".join([kind, *(f"{k}={v}" for k, v in index.items())])
-            raise CalibratingError(
-                f"sessions: hold no frames of kind {wanted!r}; capture that target first "
-                "(`skinrig simulate flash --target ...` or `skinrig capture flash`)"
-            )
-        return found
+    def need(self, kind: str, **index: str | int | float) -> Shots:
+        """Return records with their frames, or raise where there are none."""
+        found = self._targets.need("flash", kind, **index)
+        return [(record, session.read(record)) for record, session in found]
 
     def setting(self, record: FrameRecord, name: str) -> float:
         """Return a number that a frame was taken with."""
@@ -146,11 +136,12 @@ class _Frames:
 
     def dark_level(self) -> Float32Array | float:
         """Return what a frame without light shows above its black level, (h, w, 3)."""
-        darks = [image.rgb for image in _linear(self.of("dark"))]
+        found = self._targets.frames("dark")
+        darks = [image.rgb for image in _linear([(r, session.read(r)) for r, session in found])]
         return np.mean(darks, axis=0, dtype=np.float32) if darks else 0.0
 
 
-def _linear(shots: Sequence[tuple[FrameRecord, raw.RawFrame]]) -> list[raw.LinearImage]:
+def _linear(shots: Shots) -> list[raw.LinearImage]:
     """Return camera RGB of frames at half their resolution."""
     return [raw.linear_rgb(frame, demosaic="centered") for _, frame in shots]
 

@@ -1,8 +1,7 @@
 """Sessions of the dome's targets to its calibrations: geometry, and lights."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +16,12 @@ from capture.calibration.sensor.mosaic import channel_levels, neutral_mosaic
 from capture.rig import Rig
 from capture.session import FrameRecord, Session
 from skinrig.arrays import Float64Array
-from skinrig.calibrating.outcome import CalibratingError, Made, numbered, provenance
+from skinrig.calibrating.outcome import CalibratingError, Made, TargetSessions, numbered
 
 DOME_CALIBRATION_KINDS = ("geometry", "lights")
+LIGHT_TOLERANCE_MM = 5.0
+"""Standard deviation of the lights about the drawing: it matters only where few highlights were
+seen."""
 SESSION_STEP = 1000  # poses of the k-th session are numbered from k times this
 
 
@@ -32,9 +34,6 @@ class DomeTargets:
     )
     sphere_radius_mm: float = 50.0
     plate: WhitePlate = field(default_factory=WhitePlate)
-    light_tolerance_mm: float = 5.0
-    """Standard deviation of the lights about the drawing, mm, > 0: it matters only where few
-    highlights were seen."""
 
 
 def dome_targets(square_mm: float, sphere_radius_mm: float) -> DomeTargets:
@@ -43,27 +42,16 @@ def dome_targets(square_mm: float, sphere_radius_mm: float) -> DomeTargets:
     return DomeTargets(board, sphere_radius_mm)
 
 
-def calibrate_dome(
-    kind: str,
-    sessions: Sequence[Session],
-    folder: str | Path,
-    created: date,
-    *,
-    targets: DomeTargets | None = None,
-) -> Made:
+def calibrate_dome(kind: str, given: TargetSessions, targets: DomeTargets | None = None) -> Made:
     """Make the calibration "geometry" or "lights" of a dome.
 
     Parameters
     ----------
     kind
         One of :data:`DOME_CALIBRATION_KINDS`.
-    sessions
-        For "geometry" of the board; for "lights" of the mirror sphere, the white plate, or both.
-    folder
-        The CALIBRATION/ folder: lights need its geometry, and what moved is told from its last
-        geometry.
-    created
-        Date of the calibration.
+    given
+        For "geometry" sessions of the board; for "lights" of the mirror sphere, the white plate,
+        or both. Lights need the folder's geometry; what moved is told from its last geometry.
     targets
         Sizes of the targets.
 
@@ -72,31 +60,30 @@ def calibrate_dome(
     CalibratingError
         When the frames that are needed are missing.
     """
-    rigs = {session.rig.name for session in sessions}
+    rigs = {session.rig.name for session in given.sessions}
     if len(rigs) != 1:
         raise CalibratingError(f"sessions: got rigs {sorted(rigs)}, expected one")
-    if "dome" not in sessions[0].rig.boxes:
+    if "dome" not in given.rig.boxes:
         raise CalibratingError(
             f"kind {kind!r}: got a session of rig {rigs.pop()!r}, expected one of a dome"
         )
-    make = _geometry if kind == "geometry" else _lights
-    return make(sessions, Path(folder), created, targets or DomeTargets())
+    return (_geometry if kind == "geometry" else _lights)(given, targets or DomeTargets())
 
 
 def _frames(
-    sessions: Sequence[Session], kind: str, place: str
+    given: TargetSessions, kind: str, place: str
 ) -> Iterator[tuple[int, Session, FrameRecord]]:
     """Yield frames with the number of their place, over all sessions."""
-    for number, session in enumerate(sessions):
+    for number, session in enumerate(given.sessions):
         for record in session.frames(kind):
             yield SESSION_STEP * number + int(record.index[place]), session, record
 
 
-def _geometry(sessions: Sequence[Session], folder: Path, created: date, what: DomeTargets) -> Made:
-    rig = sessions[0].rig
+def _geometry(given: TargetSessions, what: DomeTargets) -> Made:
+    rig = given.rig
     sightings: dict[tuple[str, int], Sighting] = {}
     without = 0
-    for pose, session, record in _frames(sessions, "charuco", "pose"):
+    for pose, session, record in _frames(given, "charuco", "pose"):
         image = raw.linear_rgb(session.read(record), demosaic="bilinear").rgb
         sighting = find_board(image, what.board)
         if sighting is None:
@@ -109,7 +96,7 @@ def _geometry(sessions: Sequence[Session], folder: Path, created: date, what: Do
             " it (`skinrig simulate dome --target charuco`), or say its squares"
         )
     start = geometry.nominal_cameras(rig)
-    findings = _moved(sightings, what.board, folder, rig)
+    findings = _moved(sightings, what.board, given.folder, rig)
     in_jig = any(pose == 0 for _, pose in sightings)
     found = bundle.adjust(sightings, what.board, start, gauge="board" if in_jig else "cameras")
     summary = [
@@ -124,7 +111,7 @@ def _geometry(sessions: Sequence[Session], folder: Path, created: date, what: Do
         told = f"centre {place} mm; f {focal:.1f} ± {focal_error:.1f} px"
         summary.append((f"{name} ({camera.serial})", f"{found.rms_px[name]:.3f} px; {told}"))
     calibration = geometry.to_calibration(
-        found.cameras, reprojection_px=found.rms_px, **provenance(sessions, created)
+        found.cameras, reprojection_px=found.rms_px, **given.provenance()
     )
     return Made(calibration, tuple(summary), findings)
 
@@ -140,21 +127,21 @@ def _moved(
         return ()
 
 
-def _lights(sessions: Sequence[Session], folder: Path, created: date, what: DomeTargets) -> Made:
-    rig = sessions[0].rig
-    cameras = geometry.poses_from(store.load(folder, "geometry"), rig)
+def _lights(given: TargetSessions, what: DomeTargets) -> Made:
+    rig = given.rig
+    cameras = geometry.poses_from(store.load(given.folder, "geometry"), rig)
     table = LightTable.nominal(rig)
     findings: list[str] = []
     summary: list[tuple[str, str]] = []
     notes = {}
-    kinds = {record.kind for session in sessions for record in session.frames()}
+    kinds = {record.kind for session in given.sessions for record in session.frames()}
     if not kinds & {"mirror", "white"}:
         raise CalibratingError(
             "sessions: hold no frames of kind 'mirror' or 'white'; capture a target (`skinrig"
             " simulate dome --target mirror`, `--target white`)"
         )
     if "mirror" in kinds:
-        places = _mirror(sessions, rig, cameras, what)
+        places = _mirror(given, cameras, what)
         table = replace(
             table,
             position_mm=places.position_mm,
@@ -176,7 +163,7 @@ def _lights(sessions: Sequence[Session], folder: Path, created: date, what: Dome
     else:
         notes["positions"] = "nominal: no session of the mirror sphere was given"
     if "white" in kinds:
-        samples = _white(sessions, cameras, what)
+        samples = _white(given, cameras, what)
         fit = light_fit.fit_lights(samples, table, cameras, plate=what.plate)
         table = fit.table
         lit = table.intensity[table.valid]
@@ -198,22 +185,18 @@ def _lights(sessions: Sequence[Session], folder: Path, created: date, what: Dome
             findings.append(f"the plate never faced {', '.join(fit.unseen)}: left out")
     else:
         notes["intensities"] = "nominal and relative: no session of the white plate was given"
-    calibration = table.to_calibration(
-        notes={**notes, **numbered(findings)}, **provenance(sessions, created)
-    )
+    calibration = table.to_calibration(notes={**notes, **numbered(findings)}, **given.provenance())
     return Made(calibration, tuple(summary), tuple(findings))
 
 
 def _mirror(
-    sessions: Sequence[Session],
-    rig: Rig,
-    cameras: Mapping[str, geometry.CameraPose],
-    what: DomeTargets,
+    given: TargetSessions, cameras: Mapping[str, geometry.CameraPose], what: DomeTargets
 ) -> mirror_lights.LightPositions:
     """Return the lights' places from the frames of mirror spheres."""
+    lights = given.rig.lights
     outlines: dict[int, dict[str, Float64Array]] = {}
     colors: dict[str, Float64Array] = {}
-    for sphere, session, record in _frames(sessions, "mirror", "sphere"):
+    for sphere, session, record in _frames(given, "mirror", "sphere"):
         if record.index.get("light") != "outline":
             continue
         frame = session.read(record)
@@ -233,10 +216,9 @@ def _mirror(
     }
     windows: dict[tuple[str, int], mirror_lights.SphereWindow] = {}
     seen = []
-    for sphere, session, record in _frames(sessions, "mirror", "sphere"):
-        if record.index.get("light") == "outline" or sphere not in spheres:
-            continue
-        if record.camera not in colors:
+    for sphere, session, record in _frames(given, "mirror", "sphere"):
+        lit_dome = record.index.get("light") == "outline"
+        if lit_dome or sphere not in spheres or record.camera not in colors:
             continue
         key = (record.camera, sphere)
         if key not in windows:
@@ -248,9 +230,9 @@ def _mirror(
         seen,
         cameras,
         spheres,
-        {light.name: np.array(light.position_mm) for light in rig.lights},
-        light_radius_mm=rig.lights[0].radius_mm,
-        nominal_stderr_mm=what.light_tolerance_mm,
+        {light.name: np.array(light.position_mm) for light in lights},
+        light_radius_mm=lights[0].radius_mm,
+        nominal_stderr_mm=LIGHT_TOLERANCE_MM,
     )
 
 
@@ -261,11 +243,11 @@ def _lit(record: FrameRecord) -> tuple[str, ...]:
 
 
 def _white(
-    sessions: Sequence[Session], cameras: Mapping[str, geometry.CameraPose], what: DomeTargets
+    given: TargetSessions, cameras: Mapping[str, geometry.CameraPose], what: DomeTargets
 ) -> list[PlateSamples]:
     """Return the parts of the white plate in all frames lit by one light."""
     markers: dict[tuple[str, int], Sighting] = {}
-    for pose, session, record in _frames(sessions, "white", "pose"):
+    for pose, session, record in _frames(given, "white", "pose"):
         if record.index.get("light") == "several":
             image = raw.linear_rgb(session.read(record), demosaic="bilinear").rgb
             sighting = what.plate.find(image)
@@ -282,7 +264,7 @@ def _white(
     }
     windows: dict[tuple[str, int], PlateWindow | None] = {}
     samples = []
-    for pose, session, record in _frames(sessions, "white", "pose"):
+    for pose, session, record in _frames(given, "white", "pose"):
         if record.index.get("light") == "several" or pose not in places:
             continue
         key = (record.camera, pose)

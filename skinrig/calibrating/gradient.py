@@ -2,8 +2,6 @@
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from datetime import date
-from pathlib import Path
 
 import numpy as np
 
@@ -17,10 +15,9 @@ from skinrig.arrays import Float32Array, Float64Array
 from skinrig.calibrating.outcome import (
     CalibratingError,
     Made,
+    TargetSessions,
     numbered,
     photon_transfer,
-    provenance,
-    sensor_in,
 )
 
 GRADIENT_CALIBRATION_KINDS = ("sensor", "lights", "polarization")
@@ -33,28 +30,16 @@ def of_a_gradient_sphere(sessions: Sequence[Session]) -> bool:
     return any("gradient_sphere" in session.rig.boxes for session in sessions)
 
 
-def calibrate_gradient(
-    kind: str,
-    sessions: Sequence[Session],
-    folder: str | Path,
-    created: date,
-    *,
-    target: GlassBall | None = None,
-) -> Made:
+def calibrate_gradient(kind: str, given: TargetSessions) -> Made:
     """Make the calibration "sensor", "lights" or "polarization" of a gradient sphere.
 
     Parameters
     ----------
     kind
         One of :data:`GRADIENT_CALIBRATION_KINDS`.
-    sessions
-        For "sensor" of the flat field; for the others of the ball of black glass, one session.
-    folder
-        The CALIBRATION/ folder: lights are corrected by its sensor's flat field.
-    created
-        Date of the calibration.
-    target
-        The ball; None: the usual one.
+    given
+        For "sensor" sessions of the flat field; for the others of the ball of black glass, one
+        session. Lights are corrected by the flat field of the folder's sensor.
 
     Raises
     ------
@@ -63,62 +48,49 @@ def calibrate_gradient(
     BallError, PolarizationError
         When the ball's frames do not tell what is wanted.
     """
-    rigs = {session.rig.name for session in sessions}
-    serials = {view.serial for session in sessions for view in session.rig.views}
-    if len(rigs) != 1 or len(serials) != 1:
+    rigs = {session.rig.name for session in given.sessions}
+    if len(rigs) != 1 or len(given.serials) != 1:
         raise CalibratingError(
-            f"sessions: got rigs {sorted(rigs)} with cameras {sorted(serials)}, expected one rig"
-            " with one camera"
+            f"sessions: got rigs {sorted(rigs)} with cameras {sorted(given.serials)}, expected one"
+            " rig with one camera"
         )
     if kind not in GRADIENT_CALIBRATION_KINDS:
         known = ", ".join(GRADIENT_CALIBRATION_KINDS)
         raise CalibratingError(f"kind: got {kind!r}, expected one of {known} of rig {rigs.pop()!r}")
     if kind == "sensor":
-        return _sensor(sessions, created)
-    survey, notes = _survey(sessions, Path(folder), created, target or GlassBall())
+        return _sensor(given)
+    survey, notes = _survey(given)
     findings = (*survey.findings, *notes)
-    about = {"notes": numbered(findings), **provenance(sessions, created)}
+    about = {"notes": numbered(findings), **given.provenance()}
     if kind == "lights":
         made = survey.lights.to_calibration(ball=_ball_quantities(survey), **about)
         return Made(made, _lights_summary(survey), findings)
-    made = survey.films.to_calibration(serial=sessions[0].rig.views[0].serial, **about)
+    made = survey.films.to_calibration(serial=given.rig.views[0].serial, **about)
     return Made(made, _films_summary(survey), findings)
 
 
-def _frames(sessions: Sequence[Session], kind: str) -> list[tuple[FrameRecord, Session]]:
-    found = [(record, session) for session in sessions for record in session.frames(kind)]
-    if not found:
-        raise CalibratingError(
-            f"sessions: hold no frames of kind {kind!r}; capture that target (`skinrig simulate"
-            f" gradient --target {kind}`, or `skinrig capture gradient --target {kind}`)"
-        )
-    return found
-
-
-def _survey(
-    sessions: Sequence[Session], folder: Path, created: date, target: GlassBall
-) -> tuple[SphereSurvey, tuple[str, ...]]:
-    with_ball = {session.id for _, session in _frames(sessions, "ball")}
+def _survey(given: TargetSessions) -> tuple[SphereSurvey, tuple[str, ...]]:
+    with_ball = {session.id for _, session in given.need("gradient", "ball")}
     if len(with_ball) > 1:
         raise CalibratingError(
             f"sessions: got {len(with_ball)} of the ball, expected one; between two the ball has"
             " moved, so calibrate from each alone"
         )
-    rig = sessions[0].rig
-    flat, notes = _flat_field(folder, sessions[0], created)
-    shots = tuple(_shots(sessions, flat))
+    flat, notes = _flat_field(given)
+    shots = tuple(_shots(given, flat))
     if not shots:
         raise CalibratingError(
             "sessions: hold no frames of the ball under pattern 'full' at a level above 0"
         )
-    return survey_sphere(shots, rig, view=rig.views[0].name, target=target), notes
+    view = given.rig.views[0].name
+    return survey_sphere(shots, given.rig, view=view, target=GlassBall()), notes
 
 
-def _shots(sessions: Sequence[Session], flat: Float64Array | float) -> Iterator[Shot]:
+def _shots(given: TargetSessions, flat: Float64Array | float) -> Iterator[Shot]:
     """Yield the exposures of the lit ball, the dark of their own exposure time taken off."""
     darks: dict[float, list[Float32Array]] = defaultdict(list)
     lit: list[tuple[FrameRecord, Session]] = []
-    for record, session in _frames(sessions, "ball"):
+    for record, session in given.need("gradient", "ball"):
         if record.settings.get("pattern") == "dark":
             darks[float(record.settings["exposure_s"])].append(_above_black(session.read(record)))
         elif record.settings.get("pattern") == "full" and float(record.settings["level"]) > 0:
@@ -159,31 +131,26 @@ def _reading_deg(record: FrameRecord) -> float:
     return ANALYZER_READING_DEG[str(record.settings["polarizer"])]
 
 
-def _flat_field(
-    folder: Path, session: Session, created: date
-) -> tuple[Float64Array | float, tuple[str, ...]]:
+def _flat_field(given: TargetSessions) -> tuple[Float64Array | float, tuple[str, ...]]:
     """Return the camera's flat field, from the folder's sensor calibration where there is one."""
-    known = sensor_in(folder, session, created)
+    known = given.sensor()
     if known is None:
         return 1.0, (
             "the folder holds no sensor calibration: intensities hold the lens's own shading;"
             " calibrate sensor first",
         )
-    view = session.rig.views[0]
+    view = given.rig.views[0]
     return known.flat_mosaic(view.height_px, view.width_px), ()
 
 
-def _sensor(sessions: Sequence[Session], created: date) -> Made:
-    flats = [
-        (_light_s(record), session.read(record)) for record, session in _frames(sessions, "flat")
-    ]
+def _sensor(given: TargetSessions) -> Made:
+    flats = [(_light_s(record), of.read(record)) for record, of in given.need("gradient", "flat")]
     darks = [
-        (float(record.settings["exposure_s"]), session.read(record))
-        for record, session in _frames(sessions, "dark")
+        (float(record.settings["exposure_s"]), of.read(record))
+        for record, of in given.need("gradient", "dark")
     ]
     result = photon_transfer(flats, darks)
-    serial = sessions[0].rig.views[0].serial
-    made = result.to_calibration(serial=serial, **provenance(sessions, created))
+    made = result.to_calibration(serial=given.rig.views[0].serial, **given.provenance())
     rows = []
     for name, quantity, scale, unit in (
         ("gain", result.gain_e_per_dn, 1.0, "e/DN"),

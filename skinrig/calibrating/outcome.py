@@ -11,7 +11,8 @@ from capture.calibration import sensor, store
 from capture.calibration.sensor.noise_model import SensorCalibration
 from capture.calibration.sensor.transfer_curve import FlatPair
 from capture.raw import RawFrame
-from capture.session import Session
+from capture.rig import Rig
+from capture.session import FrameRecord, Session
 from skinrig.arrays import UInt16Array
 
 
@@ -30,14 +31,68 @@ class Made:
     """What is wrong with the rig."""
 
 
-def provenance(sessions: Sequence[Session], created: date) -> dict[str, Any]:
-    """Return rig, source, date and inputs of a calibration from sessions of one rig."""
-    return {
-        "rig": sessions[0].rig.name,
-        "source": sessions[0].source,
-        "created": created,
-        "inputs": {session.id: session.content_hash for session in sessions},
-    }
+@dataclass(frozen=True, slots=True)
+class TargetSessions:
+    """Sessions of targets that a calibration is made of."""
+
+    sessions: Sequence[Session]
+    """One or more, of one rig."""
+    folder: Path
+    """CALIBRATION/, with what was calibrated before."""
+    created: date
+    """Date of the calibration."""
+
+    @property
+    def rig(self) -> Rig:
+        """The rig, as of the first session."""
+        return self.sessions[0].rig
+
+    @property
+    def serials(self) -> set[str]:
+        """Serial numbers of all cameras."""
+        return {view.serial for session in self.sessions for view in session.rig.views}
+
+    def provenance(self) -> dict[str, Any]:
+        """Return rig, source, date and inputs of the calibration."""
+        return {
+            "rig": self.rig.name,
+            "source": self.sessions[0].source,
+            "created": self.created,
+            "inputs": {session.id: session.content_hash for session in self.sessions},
+        }
+
+    def frames(self, kind: str, **index: str | int | float) -> list[tuple[FrameRecord, Session]]:
+        """Return the frames of a kind, of all sessions."""
+        return [
+            (record, session)
+            for session in self.sessions
+            for record in session.frames(kind, **index)
+        ]
+
+    def need(
+        self, rig: str, kind: str, **index: str | int | float
+    ) -> list[tuple[FrameRecord, Session]]:
+        """Return the frames of a kind, or raise where there are none and say how to get them."""
+        found = self.frames(kind, **index)
+        if not found:
+            wanted = " ".join([kind, *(f"{k}={v}" for k, v in index.items())])
+            target = kind if kind != "subject" else "white"
+            raise CalibratingError(
+                f"sessions: hold no frames of kind {wanted!r}; capture that target first (`skinrig"
+                f" simulate {rig} --target {target}`, or `skinrig capture {rig} --target {target}`)"
+            )
+        return found
+
+    def sensor(self) -> SensorCalibration | None:
+        """Return the folder's sensor calibration of the first camera; None: it has none."""
+        serial = self.rig.views[0].serial
+        try:
+            found = store.load(self.folder, "sensor")
+            how: dict[str, Any] = {"serials": [serial], "on_date": self.created}
+            store.require(found, rig=self.rig.name, kind="sensor", **how)
+        except store.CalibrationMissing:
+            return None
+        return SensorCalibration.from_calibration(found, serial)
 
 
 def numbered(findings: Iterable[str]) -> Mapping[str, str]:
@@ -49,17 +104,6 @@ def numbered(findings: Iterable[str]) -> Mapping[str, str]:
     {'finding 0': 'light L007 is dead'}
     """
     return {f"finding {k}": text for k, text in enumerate(findings)}
-
-
-def sensor_in(folder: Path, session: Session, created: date) -> SensorCalibration | None:
-    """Return the sensor calibration in a folder of a session's first camera; None: it has none."""
-    serial = session.rig.views[0].serial
-    try:
-        found = store.load(folder, "sensor")
-        store.require(found, rig=session.rig.name, serials=[serial], on_date=created, kind="sensor")
-    except store.CalibrationMissing:
-        return None
-    return SensorCalibration.from_calibration(found, serial)
 
 
 def photon_transfer(

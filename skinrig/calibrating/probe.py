@@ -2,8 +2,6 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from datetime import date
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -16,7 +14,7 @@ from capture.calibration.fiber.probe_calibration import FiberCalibration
 from capture.calibration.fiber.readings import FiberReadings, sum_spots
 from capture.calibration.fiber.spots import find_fiber_spots
 from capture.session import FrameRecord, Session
-from skinrig.calibrating.outcome import CalibratingError, Made, numbered, provenance, sensor_in
+from skinrig.calibrating.outcome import CalibratingError, Made, TargetSessions, numbered
 from skinrig.calibrating.phantom_reflectance import expected_reflectance, packaged_certificate
 
 FIBER_CALIBRATION_KIND: Final = "fibre"
@@ -24,23 +22,14 @@ MIN_HEALTHY_GAIN: Final = 0.5
 """Of the usual gain: a fibre below it is told of."""
 
 
-def calibrate_probe(
-    sessions: Sequence[Session],
-    folder: str | Path,
-    created: date,
-    *,
-    certificate: PhantomCertificate | None = None,
-) -> Made:
+def calibrate_probe(given: TargetSessions, certificate: PhantomCertificate | None = None) -> Made:
     """Make the calibration "fibre" of a probe from a session of target "phantom".
 
     Parameters
     ----------
-    sessions
-        One, with frames of the kinds dark and phantom, and better also mask.
-    folder
-        The CALIBRATION/ folder: gain and read noise are its sensor's, where it holds one.
-    created
-        Date of the calibration.
+    given
+        One session, with frames of the kinds dark and phantom, and better also mask. Gain and read
+        noise are those of the folder's sensor, where it holds one.
     certificate
         Of the phantom; None: for simulated sessions that of the simulated phantom.
 
@@ -51,19 +40,19 @@ def calibrate_probe(
     CalibrationError
         When the frames do not tell what is wanted.
     """
-    if len(sessions) != 1:
+    if len(given.sessions) != 1:
         raise CalibratingError(
-            f"sessions: got {len(sessions)}, expected one; between two the light may have changed,"
-            " so calibrate from each alone"
+            f"sessions: got {len(given.sessions)}, expected one; between two the light may have"
+            " changed, so calibrate from each alone"
         )
-    session = sessions[0]
+    session = given.sessions[0]
     rig = session.rig
     if rig.probe is None:
         raise CalibratingError(
             f"kind 'fibre': got a session of rig {rig.name!r}, expected one with a fibre probe"
         )
     paper = certificate or _packaged_certificate(session)
-    noise, notes = _noise(Path(folder), session, created)
+    noise, notes = _noise(given)
     series = _Series(session, noise)
     phantoms = series.phantoms()
     level = series.level()
@@ -90,7 +79,7 @@ def calibrate_probe(
     made = fibres.to_calibration(
         serial=rig.views[0].serial,
         notes={**numbered(findings), "phantom": paper.name or "not named", "noise": noise.origin},
-        **provenance(sessions, created),
+        **given.provenance(),
     )
     return Made(made, _summary(fibres, series, paper), findings)
 
@@ -197,10 +186,10 @@ def _temperature(records: Sequence[FrameRecord]) -> float | None:
     return float(np.mean(told)) if told else None
 
 
-def _noise(folder: Path, session: Session, created: date) -> tuple[CameraNoise, tuple[str, ...]]:
-    known = sensor_in(folder, session, created)
+def _noise(given: TargetSessions) -> tuple[CameraNoise, tuple[str, ...]]:
+    known = given.sensor()
     if known is None:
-        return CameraNoise.of_view(session.rig.views[0]), (
+        return CameraNoise.of_view(given.rig.views[0]), (
             "the folder holds no sensor calibration: gain and read noise are the camera's nominal"
             " ones",
         )

@@ -2,8 +2,9 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 from capture.plan import Plan, flash_calibration_plan, flash_plan
 from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
@@ -25,17 +26,65 @@ def read_plan(file: Path) -> Plan:
     return Plan.from_json(file.read_bytes(), where=str(file))
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OwnPlan:
+    """What a rig's own plan is of.
+
+    Raises
+    ------
+    CaptureError
+        For a target that the rig has not, when the plan is made.
+    """
+
+    target: str | None = None
+    """What stands in the rig; None: a subject."""
+    angles: Sequence[float] | None = None
+    """Of a caliper; None: all. Of a probe one number, of directions."""
+    steps: tuple[int, int] | None = None
+    """Of a caliper: first and last; None: all."""
+    sites: Sequence[str] | None = None
+    """Of a probe; None: the usual ones."""
+    repeats: int = 1
+    """Of a probe's placements, or of a subject's states before the flash rig, all in turn."""
+    states: Sequence[str] = ()
+    """Of a subject before the flash rig; none: neutral."""
+
+    def of(self, rig: Rig) -> Plan:
+        """Return the plan of a rig."""
+        if "gradient_sphere" in rig.boxes:
+            if self.target is None:
+                return gradient_plan(rig, angles=self.angles, steps=self.steps)
+            return gradient_calibration_plan(rig, self._target_of(get_args(GradientTarget)))
+        if "dome" in rig.boxes:
+            if self.target is None:
+                return dome_plan(rig)
+            return dome_calibration_plan(rig, self._target_of(get_args(DomeTarget)))
+        repeats = self.repeats
+        if rig.probe is not None:
+            if self.target is None:
+                sites, angles = self.sites or PROBE_SITES, directions_of(self.angles)
+                return probe_plan(rig, sites=sites, repeats=repeats, angles=angles)
+            target = self._target_of(get_args(ProbeTarget))
+            return probe_calibration_plan(rig, target, repeats=repeats)
+        if self.target is None:
+            states = self.states or ("neutral",)
+            return flash_plan(rig, states=states, repeats=repeats, interleave=True)
+        if self.target == "white":
+            return flash_plan(rig, states=("white",), repeats=max(4, repeats))
+        target = self._target_of(("white", *FLASH_CALIBRATION_TARGETS))
+        return flash_calibration_plan(rig, target)
+
+    def _target_of(self, known: Sequence[str]) -> Any:
+        return one_of("target", str(self.target), known, CaptureError)
+
+
 def choose_plan(
     rig: Rig,
     file: Path | None,
     target: str | None,
     *,
-    angles: Sequence[float] | None = None,
-    steps: tuple[int, int] | None = None,
-    sites: Sequence[str] | None = None,
-    repeats: int = 1,
     sequence: SequenceOrder | None = None,
-    states: Sequence[str] = (),
+    **details: Any,
 ) -> Plan:
     """Return the plan in ``file``, or the rig's own for a target, or for a subject.
 
@@ -46,14 +95,10 @@ def choose_plan(
         A plan, JSON.
     target
         What stands in the rig; None: a subject.
-    angles, steps
-        Of a caliper; None: all. Of a probe one number, of directions.
-    sites, repeats
-        Of a probe; repeats also of a subject's states before the flash rig.
     sequence
         In time, of the flash rig.
-    states
-        Of a subject before the flash rig; none: neutral. Repeats go through all of them in turn.
+    details
+        Further fields of `OwnPlan`.
 
     Raises
     ------
@@ -62,48 +107,26 @@ def choose_plan(
     UsageError
         For what the rig does not know, or that a plan in a file has already.
     """
+    asked = OwnPlan(target=target, **details)
     own = file is None and target is None
     if sequence is not None:
         if not own or "flash" not in rig.boxes:
             raise UsageError("--sequence: is for the flash rig's own plan of a subject")
         return sequence_plan(rig, sequence)
-    if (angles or steps) and not (own and (rig.caliper or (rig.probe and not steps))):
+    turns = rig.caliper or (rig.probe and not asked.steps)
+    if (asked.angles or asked.steps) and not (own and turns):
         raise UsageError(
             "--angles, --steps: are for the gradient rig's own plan of skin, --angles for the "
             "probe's, too"
         )
-    if sites and not (own and rig.probe):
+    if asked.sites and not (own and rig.probe):
         raise UsageError("--sites: is for the probe's own plan of skin")
     flash = own and "flash" in rig.boxes
-    if states and not flash:
+    if asked.states and not flash:
         raise UsageError("--state: is for the flash rig's own plan of a subject")
-    if repeats != 1 and not flash and (file is not None or rig.probe is None):
+    if asked.repeats != 1 and not flash and (file is not None or rig.probe is None):
         raise UsageError("--repeats: is for the probe's own plans and the flash rig's states")
-    if file is not None:
-        return read_plan(file)
-    if "gradient_sphere" in rig.boxes:
-        if target is None:
-            return gradient_plan(rig, angles=angles, steps=steps)
-        known = get_args(GradientTarget)
-        return gradient_calibration_plan(rig, one_of("target", target, known, CaptureError))
-    if "dome" in rig.boxes:
-        if target is None:
-            return dome_plan(rig)
-        known = get_args(DomeTarget)
-        return dome_calibration_plan(rig, one_of("target", target, known, CaptureError))
-    if rig.probe is not None:
-        if target is None:
-            return probe_plan(
-                rig, sites=sites or PROBE_SITES, repeats=repeats, angles=directions_of(angles)
-            )
-        shown = one_of("target", target, get_args(ProbeTarget), CaptureError)
-        return probe_calibration_plan(rig, shown, repeats=repeats)
-    if target is None:
-        return flash_plan(rig, states=states or ("neutral",), repeats=repeats, interleave=True)
-    if target == "white":
-        return flash_plan(rig, states=("white",), repeats=4)
-    one_of("target", target, ("white", *FLASH_CALIBRATION_TARGETS), CaptureError)
-    return flash_calibration_plan(rig, target)  # type: ignore[arg-type]
+    return asked.of(rig) if file is None else read_plan(file)
 
 
 def directions_of(angles: Sequence[float] | None) -> int:

@@ -1,12 +1,12 @@
 """`skinrig analyse`: what fitted faces have in common."""
 
 from pathlib import Path
-from typing import Annotated, Any, cast, get_args
+from typing import Annotated, Any, get_args
 
 import typer
 
 from skinrig.commands.help import Command, Subcommands
-from skinrig.commands.options import Json, Out, argument, option
+from skinrig.commands.options import Json, Out, command, option
 from skinrig.console import Console
 from skinrig.errors import UnusableError, UsageError, one_of
 
@@ -21,26 +21,17 @@ def analyse() -> None:
 
 
 @analyse_app.command("brdf", cls=Command)
+@command
 def analyse_brdf(
+    appearances: list[Path] | None = None,
+    /,
+    *,
     out: Out,
-    appearances: Annotated[
-        list[Path] | None, argument("Maps of dome sessions, with lobes; none: simulated faces.")
-    ] = None,
     labels: Labels = None,
-    basis: Annotated[
-        Path | None, option("Folder of the MERL files the lobes were fitted with.")
-    ] = None,
-    points: Annotated[
-        int | None,
-        option(
-            "Texels of each face, default 2000; simulated: points of the one person and of "
-            "the seven conditions, default 5000, each of the 87 people having two fifths of it."
-        ),
-    ] = None,
-    method: Annotated[
-        str, option("How lobes are joined: as shares of materials, or as brdf.")
-    ] = "shares",
-    seed: Annotated[int, option("Of everything random.")] = 0,
+    basis: Path | None = None,
+    points: int | None = None,
+    method: str = "shares",
+    seed: int = 0,
     json: Json = False,
 ) -> None:
     """Tell how many lobes the surfaces of faces need, and draw their mean reflection.
@@ -50,6 +41,20 @@ def analyse_brdf(
     below what noise alone leaves.
 
     Example: skinrig analyse brdf appearance-a appearance-b --labels labels.csv --out analysis
+
+    Parameters
+    ----------
+    appearances
+        Maps of dome sessions, with lobes; none: simulated faces.
+    basis
+        Folder of the MERL files the lobes were fitted with.
+    points
+        Texels of each face, default 2000; simulated: points of the one person and of the seven
+        conditions, default 5000, each of the 87 people having two fifths of it.
+    method
+        How lobes are joined: as shares of materials, or as brdf.
+    seed
+        Of everything random.
     """
     from reconstruction.brdf_basis.space import Method
     from skinrig.analysing import brdf as analysing_brdf
@@ -73,17 +78,7 @@ def analyse_brdf(
     documents = [one.document() for one in found]
     console.rows(
         ("points of", "needs", "by 2 %", "by 10 %", "to noise", "error", "others", "noise"),
-        [
-            (
-                d["name"],
-                str(d["plateau"]),
-                str(d["plateau_by_share"]["0.02"]),
-                str(d["plateau_by_share"]["0.1"]),
-                str(d["rank_at_noise"] or "-"),
-                *_at_plateau(d),
-            )
-            for d in documents
-        ],
+        ((d["name"], *_plateaus(d), *_at_plateau(d)) for d in documents),
     )
     for document in documents:
         left_out = document["left_out"]
@@ -94,13 +89,14 @@ def analyse_brdf(
     console.document("skinrig.analyse-brdf/1", {"out": out, "datasets": documents})
 
 
-def _at_plateau(document: dict[str, object]) -> tuple[str, str, str]:
+def _plateaus(document: dict[str, Any]) -> list[object]:
+    """Return the plateau, by the usual and two other shares of the fall, and the rank at noise."""
+    by_share, at_noise = document["plateau_by_share"], document["rank_at_noise"]
+    return [document["plateau"], by_share["0.02"], by_share["0.1"], at_noise or "-"]
+
+
+def _at_plateau(document: dict[str, Any]) -> list[str]:
     """Return the errors at the plateau, in and out of sample, and what noise leaves."""
-    ranks = cast(list[int], document["ranks"])
-    at = ranks.index(cast(int, document["plateau"]))
-    inside = cast(list[float], document["error"])[at]
-    outside = cast(list[float | None], document["held_out_error"])[at]
-    noise = cast(float | None, document["noise"])
-    return tuple(  # type: ignore[return-value]
-        "-" if value is None else f"{100.0 * value:.1f} %" for value in (inside, outside, noise)
-    )
+    at = document["ranks"].index(document["plateau"])
+    errors = (document["error"][at], document["held_out_error"][at], document["noise"])
+    return ["-" if value is None else f"{100.0 * value:.1f} %" for value in errors]

@@ -11,7 +11,7 @@ import typer
 from skinrig import errors
 from skinrig.commands import options
 from skinrig.commands.help import RigCommand, RigFileGroup
-from skinrig.commands.options import argument, expand, option, target_of
+from skinrig.commands.options import command, option, target_of
 from skinrig.console import Console, counted, picked
 
 if TYPE_CHECKING:
@@ -33,21 +33,35 @@ Eyes = Annotated[str, option("The subject's eyes among LEDs: open, closed or shi
 
 @dataclass(frozen=True, slots=True)
 class CaptureOptions:
-    """Options of every capture."""
+    """Options of every capture.
 
-    out: Annotated[Path | None, option("Folder of the session.", "--out")] = None
-    port: Annotated[
-        list[str] | None, typer.Option(metavar="NAME=URL", help="Address of a box; repeatable.")
-    ] = None
-    camera: Annotated[
-        list[str] | None, typer.Option(metavar="VIEW=URL", help="Address of a camera; repeatable.")
-    ] = None
-    plan: Annotated[Path | None, option("Plan, JSON; default: the rig's own.")] = None
-    subject: Annotated[str, option("Pseudonym of the subject.")] = "anonymous"
+    Attributes
+    ----------
+    out
+        Folder of the session.
+    plan
+        Plan, JSON; default: the rig's own.
+    subject
+        Pseudonym of the subject.
+    dry_run
+        Only print the plan.
+    plan_out
+        New file for the plan, JSON.
+    port
+        Address of a box; repeatable.
+    camera
+        Address of a camera; repeatable.
+    """
+
+    out: Path | None = None
+    port: Annotated[list[str] | None, typer.Option(metavar="NAME=URL")] = None
+    camera: Annotated[list[str] | None, typer.Option(metavar="VIEW=URL")] = None
+    plan: Path | None = None
+    subject: str = "anonymous"
     consent: options.Consent = None
     consent_expires: options.ConsentExpires = None
-    dry_run: Annotated[bool, option("Only print the plan.", "--dry-run")] = False
-    plan_out: Annotated[Path | None, option("New file for the plan, JSON.")] = None
+    dry_run: bool = False
+    plan_out: Path | None = None
     resume: options.Resume = False
     json: options.Json = False
 
@@ -68,28 +82,31 @@ class CaptureOptions:
 
 
 @capture_app.command("flash", cls=RigCommand)
-@expand
+@command
 def capture_flash(
     context: typer.Context,
     common: CaptureOptions,
     sequence: options.SequenceOptions,
     target: Annotated[str | None, target_of("flash")] = None,
-    state: Annotated[
-        list[str] | None, option("State of the face, such as smile; repeatable.")
-    ] = None,
+    state: list[str] | None = None,
     repeats: options.Pairs = 1,
 ) -> None:
     """Run a plan on a flash rig: states of a face, a sequence in time, or a target.
 
     Example: skinrig capture flash --port flash=/dev/ttyUSB0 --camera cam=hotfolder:incoming
     --out session
+
+    Parameters
+    ----------
+    state
+        State of the face, such as smile; repeatable.
     """
     chosen = {"repeats": repeats, "sequence": sequence.order(), "states": tuple(state or ())}
     _capture(context, common, common.order(), target, **chosen)
 
 
 @capture_app.command("dome", cls=RigCommand)
-@expand
+@command
 def capture_dome(
     context: typer.Context,
     common: CaptureOptions,
@@ -106,21 +123,24 @@ def capture_dome(
 
 
 @capture_app.command("gradient", cls=RigCommand)
-@expand
+@command
 def capture_gradient(
     context: typer.Context,
     common: CaptureOptions,
     target: Annotated[str | None, target_of("gradient")] = None,
     eyes: Eyes = "open",
-    force_limit: Annotated[
-        float | None, option("Greatest force of the caliper on this skin, newton; no default.")
-    ] = None,
+    force_limit: float | None = None,
     angles: options.Angles = None,
     steps: options.Steps = None,
 ) -> None:
     """Run a plan on a gradient sphere: a patch of skin in a caliper, or a target.
 
     Example: skinrig capture gradient --angles 0,90 --dry-run
+
+    Parameters
+    ----------
+    force_limit
+        Greatest force of the caliper on this skin, newton; no default.
     """
     from skinrig.capturing.option_values import parse_eye_state, parse_floats, parse_range
 
@@ -130,7 +150,7 @@ def capture_gradient(
 
 
 @capture_app.command("probe", cls=RigCommand)
-@expand
+@command
 def capture_probe(
     context: typer.Context,
     common: CaptureOptions,
@@ -174,28 +194,33 @@ def _capture(
 
 @dataclass(frozen=True, slots=True)
 class ServeOptions:
-    """Options of every served rig."""
+    """Options of every served rig.
 
-    pty: Annotated[bool, option("Boxes on a pseudo terminal.", "--pty")] = False
-    tcp: Annotated[
-        str, option("Address for cameras and, without --pty, boxes; port 0: a free one.")
-    ] = "127.0.0.1:0"
-    allow_remote: Annotated[bool, option("Let other machines connect.", "--allow-remote")] = False
+    Attributes
+    ----------
+    pty
+        Boxes on a pseudo terminal.
+    tcp
+        Address for cameras and, without --pty, boxes; port 0: a free one.
+    allow_remote
+        Let other machines connect.
+    resume
+        Session that was captured from an earlier server of this rig and seed and is to be gone on
+        with: noise of its shots does not come again.
+    """
+
+    pty: bool = False
+    tcp: str = "127.0.0.1:0"
+    allow_remote: bool = False
     subject: options.Subject = "III"
     size: options.Size = "small"
     seed: options.Seed = 0
-    resume: Annotated[
-        Path | None,
-        option(
-            "Session that was captured from an earlier server of this rig and seed and is to "
-            "be gone on with: noise of its shots does not come again."
-        ),
-    ] = None
+    resume: Path | None = None
     json: options.Json = False
 
 
 @serve_app.command("flash", cls=RigCommand)
-@expand
+@command
 def serve_flash(context: typer.Context, common: ServeOptions) -> None:
     """Serve a simulated flash rig; the first lines are the addresses.
 
@@ -208,7 +233,7 @@ def serve_flash(context: typer.Context, common: ServeOptions) -> None:
 
 
 @serve_app.command("dome", cls=RigCommand)
-@expand
+@command
 def serve_dome(context: typer.Context, common: ServeOptions) -> None:
     """Serve a simulated dome with all its lights and cameras; the first lines are the addresses.
 
@@ -218,7 +243,7 @@ def serve_dome(context: typer.Context, common: ServeOptions) -> None:
 
 
 @serve_app.command("gradient", cls=RigCommand)
-@expand
+@command
 def serve_gradient(context: typer.Context, common: ServeOptions, site: options.Site = None) -> None:
     """Serve a simulated gradient sphere, small only; the first lines are the addresses.
 
@@ -228,7 +253,7 @@ def serve_gradient(context: typer.Context, common: ServeOptions, site: options.S
 
 
 @serve_app.command("probe", cls=RigCommand)
-@expand
+@command
 def serve_probe(context: typer.Context, common: ServeOptions) -> None:
     """Serve a simulated fibre probe on skin; the first lines are the addresses.
 
@@ -246,12 +271,16 @@ def _serve(context: typer.Context, common: ServeOptions, site: str | None = None
     serve_rig(str(context.info_name), order, Console(common.json))
 
 
-def verify(
-    session: Annotated[Path, argument("SESSION/ folder.")], json: options.Json = False
-) -> None:
+@command
+def verify(session: Path, /, json: options.Json = False) -> None:
     """Check every byte of a session; exit code 3 names what is damaged.
 
     Example: skinrig verify session
+
+    Parameters
+    ----------
+    session
+        SESSION/ folder.
     """
     from capture.session import verify as check
 

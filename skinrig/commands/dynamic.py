@@ -12,14 +12,14 @@ import typer
 
 from reconstruction.correspondence import landmark_table
 from skinrig.commands.help import Command, Subcommands
-from skinrig.commands.options import Json, NewMaps, argument, expand, option
+from skinrig.commands.options import Json, NewMaps, command
 from skinrig.console import Console, picked
 from skinrig.errors import UsageError, one_of
 from skinrig.next_steps import shell_quote
 
 if TYPE_CHECKING:
     from skinrig.applying.expression import Applied, Expression, OtherFace
-    from skinrig.applying.relief import Relief
+    from skinrig.applying.relief import Relief, ReliefRequest
 
 fit_app = typer.Typer(cls=Subcommands, help="Fit models to captured data.", no_args_is_help=True)
 apply_app = typer.Typer(
@@ -28,17 +28,15 @@ apply_app = typer.Typer(
 
 
 @fit_app.command("facial-color", cls=Command)
+@command
 def fit_facial_color(
-    sessions: Annotated[list[Path], argument("Flash sessions of one subject.")],
+    sessions: list[Path],
+    /,
     out: NewMaps,
-    calibration: Annotated[Path | None, option("CALIBRATION/ folder.")] = None,
-    landmarks: Annotated[
-        Path | None, option("Folder with STATE.csv (name,x,y) for each state.")
-    ] = None,
-    radius: Annotated[
-        float | None, option("Radius of the local statistics, px; default: side / 32.")
-    ] = None,
-    stored_size: Annotated[int, option("Cells a side of scale and bias maps.")] = 256,
+    calibration: Path | None = None,
+    landmarks: Path | None = None,
+    radius: float | None = None,
+    stored_size: int = 256,
     json: Json = False,
 ) -> None:
     """Fit the hemoglobin rig: blood of each state as scale and bias of the neutral.
@@ -46,6 +44,19 @@ def fit_facial_color(
     Nothing is left to chance: there is no --seed.
 
     Example: skinrig fit facial-color session-flash --calibration calibration --out moving
+
+    Parameters
+    ----------
+    sessions
+        Flash sessions of one subject.
+    calibration
+        CALIBRATION/ folder.
+    landmarks
+        Folder with STATE.csv (name,x,y) for each state.
+    radius
+        Radius of the local statistics, px; default: side / 32.
+    stored_size
+        Cells a side of scale and bias maps.
     """
     from skinrig.fitting.facial_color import fit_facial_color as fit
     from skinrig.fitting.facial_color import summary
@@ -76,20 +87,33 @@ def fit_facial_color(
 
 
 @fit_app.command("wrinkles", cls=Command)
+@command
 def fit_wrinkles(
-    appearances: Annotated[list[Path], argument("Maps of dome sessions: neutral and expressions.")],
+    appearances: list[Path],
+    /,
     out: NewMaps,
-    mask: Annotated[
-        list[Path] | None, option("RGBA picture of four zones; twice for eight.")
-    ] = None,
-    size: Annotated[int, option("Texels a side of the wrinkle map.")] = 256,
-    mask_size: Annotated[int, option("Texels a side of masks that are found.")] = 64,
-    seed: Annotated[int, option("Seed of the search for zones.")] = 0,
+    mask: list[Path] | None = None,
+    size: int = 256,
+    mask_size: int = 64,
+    seed: int = 0,
     json: Json = False,
 ) -> None:
     """Fit a wrinkle map, its zones and their weights to normals of expressions.
 
     Example: skinrig fit wrinkles appearance-neutral surprise=appearance-surprise --out moving
+
+    Parameters
+    ----------
+    appearances
+        Maps of dome sessions: neutral and expressions.
+    mask
+        RGBA picture of four zones; twice for eight.
+    size
+        Texels a side of the wrinkle map.
+    mask_size
+        Texels a side of masks that are found.
+    seed
+        Seed of the search for zones.
     """
     from skinrig.fitting.wrinkles import fit_wrinkles as fit
     from skinrig.fitting.wrinkles import summary, zone_names
@@ -102,21 +126,22 @@ def fit_wrinkles(
 
 
 @fit_app.command("microstructure", cls=Command)
+@command
 def fit_microstructure(
-    appearances: Annotated[
-        list[Path], argument("Maps of caliper sessions with heights and kernels.")
-    ],
-    out: NewMaps,
-    paper_table: Annotated[
-        bool, option("The paper's forehead where kernels are too few.", "--paper-table")
-    ] = False,
-    json: Json = False,
+    appearances: list[Path], /, out: NewMaps, paper_table: bool = False, json: Json = False
 ) -> None:
     """Fit neutral microrelief and its table of kernels, site by site.
 
     Nothing is left to chance: there is no --seed.
 
     Example: skinrig fit microstructure forehead=appearance-gradient --out moving
+
+    Parameters
+    ----------
+    appearances
+        Maps of caliper sessions with heights and kernels.
+    paper_table
+        The paper's forehead where kernels are too few.
     """
     from skinrig.fitting.microstructure import fit_microstructure as fit
 
@@ -136,17 +161,27 @@ def fit_microstructure(
 
 @dataclass(frozen=True, slots=True)
 class ReliefOptions:
-    """Options of the relief that moves with a mesh."""
+    """Options of the relief that moves with a mesh.
 
-    size: Annotated[int, option("Pixels a side of the displacement map.")] = 4096
-    site: Annotated[str | None, option("Whose microrelief; default: the first.", "--site")] = None
-    synthesize: Annotated[
-        str, option("Neutral relief: patches (measured ones, grown) or noise (in space).")
-    ] = "patches"
-    extrapolate: Annotated[
-        str, option("Beyond the table's stretch range: hold its ends, or formula.")
-    ] = "hold"
-    seed: Annotated[int, option("Seed of the grown relief.")] = 0
+    Attributes
+    ----------
+    size
+        Pixels a side of the displacement map.
+    site
+        Whose microrelief; default: the first.
+    synthesize
+        Neutral relief: patches (measured ones, grown) or noise (in space).
+    extrapolate
+        Beyond the table's stretch range: hold its ends, or formula.
+    seed
+        Seed of the grown relief.
+    """
+
+    size: int = 4096
+    site: str | None = None
+    synthesize: str = "patches"
+    extrapolate: str = "hold"
+    seed: int = 0
 
     def relief(
         self, mesh: Path, weights: Mapping[str, float], out: Path, console: Console
@@ -154,34 +189,45 @@ class ReliefOptions:
         """Return what evaluates the relief on a mesh under weights of its shapes."""
         from skinrig.applying.relief import Relief
 
+        return Relief.of(mesh, weights, self.request(), out=out, progress=console.progress)
+
+    def request(self) -> ReliefRequest:
+        """Return the relief that is asked for."""
+        from skinrig.applying.relief import ReliefRequest
+
         given = picked(self, "site", "extrapolate", "seed")
-        given |= {"size_px": self.size, "source": self.synthesize}
-        return Relief.of(mesh, weights, out=out, progress=console.progress, **given)
+        return ReliefRequest(size_px=self.size, source=self.synthesize, **given)
 
 
 @dataclass(frozen=True, slots=True)
 class ExpressionOptions:
-    """Options of blood, color and wrinkles of an expression."""
+    """Options of blood, color and wrinkles of an expression.
 
-    parts: Annotated[
-        str | None, option("Of facial_color,wrinkles,microstructure; default: all.")
-    ] = None
-    normalize: Annotated[bool, option("Divide the weights by their sum.", "--normalize")] = False
-    clamp: Annotated[
-        str, option("Range of a wrinkle zone's sum: unit is 0...1, signed -1...1.")
-    ] = "unit"
-    emotional: Annotated[
-        bool, option("Anger reddens, fear pales the whole face.", "--emotional")
-    ] = False
-    gain: Annotated[float, option("One more factor of all blood.")] = 1.0
-    onto: Annotated[
-        Path | None,
-        option("Maps of another face (hemoglobin, melanin) that the rig is applied to."),
-    ] = None
-    landmarks: Annotated[
-        list[Path] | None,
-        option("Table name,x,y of the rig's face; a second one of the other face."),
-    ] = None
+    Attributes
+    ----------
+    parts
+        Of facial_color,wrinkles,microstructure; default: all.
+    normalize
+        Divide the weights by their sum.
+    clamp
+        Range of a wrinkle zone's sum: unit is 0...1, signed -1...1.
+    emotional
+        Anger reddens, fear pales the whole face.
+    gain
+        One more factor of all blood.
+    onto
+        Maps of another face (hemoglobin, melanin) that the rig is applied to.
+    landmarks
+        Table name,x,y of the rig's face; a second one of the other face.
+    """
+
+    parts: str | None = None
+    normalize: bool = False
+    clamp: str = "unit"
+    emotional: bool = False
+    gain: float = 1.0
+    onto: Path | None = None
+    landmarks: list[Path] | None = None
 
     def expression(self, weights: Mapping[str, float]) -> Expression:
         """Return the expression that is asked for."""
@@ -198,17 +244,14 @@ class ExpressionOptions:
 
 
 @apply_app.command("expression", cls=Command)
-@expand
+@command
 def apply_expression(
-    appearance: Annotated[Path, argument("Folder that `skinrig fit` made.")],
-    weights: Annotated[
-        str, option("States and their weights: smile=0.7,anger=0.3; they sum to one.")
-    ],
-    out: NewMaps,
+    appearance: Path,
+    /,
     *,
-    mesh: Annotated[
-        Path | None, option("Mesh with blend shapes: .npz, OBJ or glTF; strain comes from it.")
-    ] = None,
+    weights: str,
+    out: NewMaps,
+    mesh: Path | None = None,
     chosen: ExpressionOptions,
     moving: ReliefOptions,
     json: Json = False,
@@ -216,18 +259,25 @@ def apply_expression(
     """Evaluate blood, color, normals and displacement of an expression.
 
     Example: skinrig apply expression moving --weights smile=0.7,anger=0.3 --out expression
+
+    Parameters
+    ----------
+    appearance
+        Folder that `skinrig fit` made.
+    weights
+        States and their weights: smile=0.7,anger=0.3; they sum to one.
+    mesh
+        Mesh with blend shapes: .npz, OBJ or glTF; strain comes from it.
     """
     from skinrig.appearances.dynamic import DYNAMIC_PARTS
     from skinrig.applying import expression as applying
-    from skinrig.applying.relief import EXTRAPOLATION_MODES, RELIEF_SOURCES
     from skinrig.capturing.option_values import parse_names
 
     console = Console(json)
     given = chosen.expression(applying.parse_weights(weights))
     parts = parse_names(chosen.parts) or DYNAMIC_PARTS
     relief = None
-    one_of("--synthesize", moving.synthesize, RELIEF_SOURCES)
-    one_of("--extrapolate", moving.extrapolate, EXTRAPOLATION_MODES)
+    moving.request()  # checked even where no mesh is given
     if mesh is not None:
         relief = moving.relief(mesh, applying.normalized(given).weights, out, console)
     done = applying.apply_expression(
@@ -237,11 +287,12 @@ def apply_expression(
 
 
 @apply_app.command("microstructure", cls=Command)
-@expand
+@command
 def apply_microstructure(
-    appearance: Annotated[Path, argument("Folder that `skinrig fit` made.")],
-    mesh: Annotated[Path, option("Mesh with blend shapes: .npz, OBJ or glTF.")],
-    weights: Annotated[str, option("Blend shapes or states: jawOpen=0.5,smile=1.")],
+    appearance: Path,
+    /,
+    mesh: Path,
+    weights: str,
     out: NewMaps,
     moving: ReliefOptions,
     json: Json = False,
@@ -249,6 +300,15 @@ def apply_microstructure(
     """Grow the measured relief over a mesh and let it follow the mesh's strain.
 
     Example: skinrig apply microstructure moving --mesh head.npz --weights smile=1 --out relief
+
+    Parameters
+    ----------
+    appearance
+        Folder that `skinrig fit` made.
+    mesh
+        Mesh with blend shapes: .npz, OBJ or glTF.
+    weights
+        Blend shapes or states: jawOpen=0.5,smile=1.
     """
     from skinrig.appearances.dynamic import MICROSTRUCTURE
     from skinrig.applying import expression as applying
@@ -301,25 +361,28 @@ def fitted(console: Console, model: str, out: Path, found: Mapping[str, Any]) ->
 
 
 @fit_app.command("reflectance", cls=Command)
+@command
 def fit_reflectance(
-    dome: Annotated[Path, argument("Maps of a dome session: normals, r_d, lobes.")],
+    dome: Path,
+    probe: Path | None = None,
+    /,
+    *,
     out: NewMaps,
-    probe: Annotated[
-        Path | None, argument("Maps of a fibre probe session on the same subject.")
-    ] = None,
-    landmarks: Annotated[
-        Path | None,
-        typer.Option(
-            "--landmarks",
-            "--sites",
-            help="Table name,x,y of the probe's sites in texels of the dome's maps.",
-        ),
-    ] = None,
+    landmarks: Annotated[Path | None, typer.Option("--landmarks", "--sites")] = None,
     json: Json = False,
 ) -> None:
     """Put lobes, albedo, normals and translucency of a subject together as one model.
 
     Example: skinrig fit reflectance appearance-dome appearance-probe --out model
+
+    Parameters
+    ----------
+    dome
+        Maps of a dome session: normals, r_d, lobes.
+    probe
+        Maps of a fibre probe session on the same subject.
+    landmarks
+        Table name,x,y of the probe's sites in texels of the dome's maps.
     """
     from skinrig.fitting.reflectance import fit_reflectance as fit
     from skinrig.fitting.reflectance import summary

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 from skinrig.commands.analysing import Labels
 from skinrig.commands.dynamic import fitted
-from skinrig.commands.options import Json, NewMaps, Out, Seed, argument, expand, option
+from skinrig.commands.options import Json, NewMaps, Out, Seed, command, option
 from skinrig.console import Console, picked
 from skinrig.errors import UsageError, one_of
 from skinrig.next_steps import shell_quote
@@ -29,33 +29,38 @@ CommonSize = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class EditOptions:
-    """What is done to a face."""
+    """What is done to a face.
 
-    trait: Annotated[
-        str | None, option("Amounts, joined by commas: lotion=0.6,tan=-1; 1 is all of a trait.")
-    ] = None
-    space: Annotated[
-        Path | None, option("Traits that `skinrig fit traits` learned; default: the package's.")
-    ] = None
-    region: Annotated[str, option("Where: face, beard or no-beard; of spots also skin.")] = "face"
-    mask: Annotated[
-        Path | None, option("Where and how much: .png or .exr over the texture, 0 for nothing.")
-    ] = None
-    spots: Annotated[
-        str | None,
-        option(
-            "freckles, moles or follicles to add, KIND=PIGMENT[:NUMBER PER CM2], or with -1 "
-            "to take away: freckles=1:3,moles=-1."
-        ),
-    ] = None
-    parts: Annotated[
-        str | None, option("Of albedo,surface; default: those that a trait is known to change.")
-    ] = None
-    landmarks: Annotated[
-        Path | None, option("Table name,x,y (texels) or name,x,y,z (mm) of the face's points.")
-    ] = None
+    Attributes
+    ----------
+    trait
+        Amounts, joined by commas: lotion=0.6,tan=-1; 1 is all of a trait.
+    space
+        Traits that `skinrig fit traits` learned; default: the package's.
+    region
+        Where: face, beard or no-beard; of spots also skin.
+    mask
+        Where and how much: .png or .exr over the texture, 0 for nothing.
+    spots
+        freckles, moles or follicles to add, KIND=PIGMENT[:NUMBER PER CM2], or with -1 to take away:
+        freckles=1:3,moles=-1.
+    parts
+        Of albedo,surface; default: those that a trait is known to change.
+    landmarks
+        Table name,x,y (texels) or name,x,y,z (mm) of the face's points.
+    iterations
+        Of matching the albedo's statistics.
+    """
+
+    trait: str | None = None
+    space: Path | None = None
+    region: str = "face"
+    mask: Path | None = None
+    spots: str | None = None
+    parts: str | None = None
+    landmarks: Path | None = None
     basis: MerlFolder = None
-    iterations: Annotated[int, option("Of matching the albedo's statistics.")] = 5
+    iterations: int = 5
     seed: Seed = 0
 
     def request(self) -> EditRequest:
@@ -71,16 +76,16 @@ class EditOptions:
         )
 
 
-@expand
-def edit(
-    appearance: Annotated[Path, argument("Fitted maps of the dome.")],
-    out: NewMaps,
-    chosen: EditOptions,
-    json: Json = False,
-) -> None:
+@command
+def edit(appearance: Path, /, out: NewMaps, chosen: EditOptions, json: Json = False) -> None:
     """Give a face more or less of some traits, or spots; other maps stay as they are.
 
     Example: skinrig edit appearance-dome --trait lotion=0.6,tan=1 --out appearance-tanned
+
+    Parameters
+    ----------
+    appearance
+        Fitted maps of the dome.
     """
     from skinrig.editing import edit as editing
     from skinrig.traits import regions
@@ -102,19 +107,15 @@ def edit(
     console.document("skinrig.edit/1", {"out": out, **done.record})
 
 
+@command
 def fit_traits(
-    appearances: Annotated[list[Path], argument("Fitted maps of the dome, a face each.")],
-    labels: Annotated[
-        Path, option("Table name,TRAIT,...: 0 or 1 whether a face has it, or a value.")
-    ],
-    out: Annotated[Path, option("File to write, such as traits.npz.", "--out")],
+    appearances: list[Path],
+    /,
+    labels: Path,
+    out: Path,
     landmarks: LandmarkFolder = None,
-    vectors: Annotated[
-        str, option("What stands for an albedo: quantiles, or histograms as published.")
-    ] = "quantiles",
-    contrast: Annotated[
-        str, option("means of faces with and without, or regression on all traits.")
-    ] = "means",
+    vectors: str = "quantiles",
+    contrast: str = "means",
     size: CommonSize = None,
     basis: MerlFolder = None,
     seed: Seed = 0,
@@ -123,6 +124,19 @@ def fit_traits(
     """Learn what traits change, from faces labelled by you.
 
     Example: skinrig fit traits appearance-a appearance-b --labels labels.csv --out traits.npz
+
+    Parameters
+    ----------
+    appearances
+        Fitted maps of the dome, a face each.
+    labels
+        Table name,TRAIT,...: 0 or 1 whether a face has it, or a value.
+    out
+        File to write, such as traits.npz.
+    vectors
+        What stands for an albedo: quantiles, or histograms as published.
+    contrast
+        means of faces with and without, or regression on all traits.
     """
     from model.traits.vectors import Contrast
     from skinrig.fitting.traits import fit_traits as fit
@@ -159,14 +173,15 @@ def fit_traits(
     fitted(console, "traits", out, learned | picked(found, "warnings", "left_out"))
 
 
+@command
 def analyse_albedo(
+    appearances: list[Path] | None = None,
+    /,
+    *,
     out: Out,
-    appearances: Annotated[
-        list[Path] | None, argument("Fitted maps of the dome, a face each; none: simulated faces.")
-    ] = None,
     labels: Labels = None,
     landmarks: LandmarkFolder = None,
-    people: Annotated[int, option("Simulated faces, of 87.")] = 87,
+    people: int = 87,
     size: CommonSize = None,
     seed: Seed = 0,
     json: Json = False,
@@ -174,6 +189,13 @@ def analyse_albedo(
     """Average the color histograms of groups of faces, and tell the components they differ by.
 
     Example: skinrig analyse albedo appearance-a appearance-b --labels labels.csv --out analysis
+
+    Parameters
+    ----------
+    appearances
+        Fitted maps of the dome, a face each; none: simulated faces.
+    people
+        Simulated faces, of 87.
     """
     from skinrig.analysing import albedo as analysing_albedo
 

@@ -3,9 +3,9 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
-from skinrig.commands.options import Json, Out, argument, expand, option
+from skinrig.commands.options import Json, Out, command
 from skinrig.console import Console, counted, picked
 from skinrig.errors import UnusableError, one_of
 from skinrig.exporting.options import Delivery, Place
@@ -25,29 +25,36 @@ NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class DeliveryOptions:
-    """How an appearance is delivered."""
+    """How an appearance is delivered.
 
-    unit: Annotated[str | None, option("Scene unit: m (default), cm or mm (mtlx, usd).")] = None
-    normal_y: Annotated[str, option("Green of normal maps: gl is +Y up, dx is -Y (Unreal).")] = "gl"
-    udim: Annotated[str, option("Names of textures: none, dot (.1001) or underscore (_1001).")] = (
-        "none"
-    )
-    with_errors: Annotated[
-        bool, option("Standard errors and masks beside the values.", "--with-errors")
-    ] = False
-    only: Annotated[
-        str | None,
-        option("Names of maps (maps), of up to three states (metahuman), of states (stokes)."),
-    ] = None
-    mesh: Annotated[
-        Path | None, option("Mesh with the maps' texture coordinates and blend shapes, in mm.")
-    ] = None
-    onto: Annotated[
-        Path | None, option("Dome's maps whose texture gets the colors (metahuman).")
-    ] = None
-    landmarks: Annotated[
-        list[Path] | None, option("Tables name,x,y of the flash picture, then of that texture.")
-    ] = None
+    Attributes
+    ----------
+    unit
+        Scene unit: m (default), cm or mm (mtlx, usd).
+    normal_y
+        Green of normal maps: gl is +Y up, dx is -Y (Unreal).
+    udim
+        Names of textures: none, dot (.1001) or underscore (_1001).
+    with_errors
+        Standard errors and masks beside the values.
+    only
+        Names of maps (maps), of up to three states (metahuman), of states (stokes).
+    mesh
+        Mesh with the maps' texture coordinates and blend shapes, in mm.
+    onto
+        Dome's maps whose texture gets the colors (metahuman).
+    landmarks
+        Tables name,x,y of the flash picture, then of that texture.
+    """
+
+    unit: str | None = None
+    normal_y: str = "gl"
+    udim: str = "none"
+    with_errors: bool = False
+    only: str | None = None
+    mesh: Path | None = None
+    onto: Path | None = None
+    landmarks: list[Path] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -62,15 +69,21 @@ class DeliveryOptions:
 
 @dataclass(frozen=True, slots=True)
 class PlaceOptions:
-    """The place on the skin whose BRDF is exported."""
+    """The place on the skin whose BRDF is exported.
 
-    at: Annotated[
-        str | None, option("Place on the skin, U,V in 0 to 1: its BRDF too (merl, rgl).")
-    ] = None
-    radius: Annotated[float, option("Average around the place, mm.")] = 0.0
-    without_diffuse: Annotated[bool, option("The place's surface alone.", "--without-diffuse")] = (
-        False
-    )
+    Attributes
+    ----------
+    at
+        Place on the skin, U,V in 0 to 1: its BRDF too (merl, rgl).
+    radius
+        Average around the place, mm.
+    without_diffuse
+        The place's surface alone.
+    """
+
+    at: str | None = None
+    radius: float = 0.0
+    without_diffuse: bool = False
 
     def named(self) -> Place | None:
         """Return the place; None without one."""
@@ -79,28 +92,18 @@ class PlaceOptions:
         return Place.named(self.at, radius_mm=self.radius, diffuse=not self.without_diffuse)
 
 
-@expand
+@command
 def export(
-    source: Annotated[Path, argument("APPEARANCE/ or SESSION/ folder.")],
-    to: Annotated[
-        str,
-        option(
-            "Of an appearance: maps, mtlx, gltf, usd, spectral, metahuman, merl, rgl. "
-            "Of a session: mhl, frames, lp, stokes, event-model."
-        ),
-    ],
-    out: Out,
+    source: Path,
+    /,
     *,
-    use: Annotated[
-        str | None, option("What the copy is for; the subjects' consent must cover it.")
-    ] = None,
+    to: str,
+    out: Out,
+    use: str | None = None,
     how: DeliveryOptions,
     place: PlaceOptions,
-    camera: Annotated[str | None, option("Whose pictures (lp); default: the one in front.")] = None,
-    calibration: Annotated[
-        Path | None,
-        option("CALIBRATION/ folder of lights and cameras (lp), of the sensor (stokes)."),
-    ] = None,
+    camera: str | None = None,
+    calibration: Path | None = None,
     json: Json = False,
 ) -> None:
     """Hand a session or an appearance on to other programs, within the subject's consent.
@@ -108,6 +111,20 @@ def export(
     All files are listed in an ASC MHL manifest.
 
     Example: skinrig export appearance --to gltf --out delivery
+
+    Parameters
+    ----------
+    source
+        APPEARANCE/ or SESSION/ folder.
+    to
+        Of an appearance: maps, mtlx, gltf, usd, spectral, metahuman, merl, rgl. Of a session: mhl,
+        frames, lp, stokes, event-model.
+    use
+        What the copy is for; the subjects' consent must cover it.
+    camera
+        Whose pictures (lp); default: the one in front.
+    calibration
+        CALIBRATION/ folder of lights and cameras (lp), of the sensor (stokes).
     """
     from skinrig.exporting import export as exporting
 

@@ -1,12 +1,11 @@
 """The commands below `skinrig import`."""
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from skinrig.commands.help import Command, Subcommands
-from skinrig.commands.options import Consent, ConsentExpires, Json, Out, argument, option
+from skinrig.commands.options import Consent, ConsentExpires, Json, Out, command
 from skinrig.console import Console, counted, picked
 from skinrig.next_steps import shell_quote
 
@@ -16,13 +15,13 @@ import_app = typer.Typer(
 
 
 @import_app.command("photos", cls=Command)
+@command
 def import_photos(
-    directory: Annotated[Path, argument("Folder of photographs, or one file.")],
+    directory: Path,
+    /,
     out: Out,
-    rig: Annotated[
-        str | None, option("Rig whose camera took them, so that its calibrations hold.")
-    ] = None,
-    subject: Annotated[str, option("Pseudonym of the subject.")] = "unnamed",
+    rig: str | None = None,
+    subject: str = "unnamed",
     consent: Consent = None,
     consent_expires: ConsentExpires = None,
     json: Json = False,
@@ -30,6 +29,15 @@ def import_photos(
     """Turn RAW, TIFF, EXR, PNG or JPEG photographs into a session.
 
     Example: skinrig import photos portraits --out session-portraits
+
+    Parameters
+    ----------
+    directory
+        Folder of photographs, or one file.
+    rig
+        Rig whose camera took them, so that its calibrations hold.
+    subject
+        Pseudonym of the subject.
     """
     from capture.importers import import_photos as bring_in
     from capture.rig import load_rig
@@ -58,18 +66,24 @@ def import_photos(
 
 
 @import_app.command("mesh", cls=Command)
+@command
 def import_mesh(
-    file: Annotated[Path, argument("Scanned mesh: .obj or .ply.")],
-    session: Annotated[Path, option("Session that gets the mesh.")],
-    out: Annotated[
-        Path | None, option("New folder for a copy, where it is closed.", "--out")
-    ] = None,
-    unit: Annotated[str, option("Unit of the file: mm, cm, m or inch.")] = "mm",
-    json: Json = False,
+    file: Path, /, session: Path, out: Path | None = None, unit: str = "mm", json: Json = False
 ) -> None:
     """Attach a scanned mesh to a session.
 
     Example: skinrig import mesh scan.obj --unit m --session session
+
+    Parameters
+    ----------
+    file
+        Scanned mesh: .obj or .ply.
+    session
+        Session that gets the mesh.
+    out
+        New folder for a copy, where it is closed.
+    unit
+        Unit of the file: mm, cm, m or inch.
     """
     from capture.importers.meshes import import_mesh as bring_in
 
@@ -89,24 +103,33 @@ def import_mesh(
 
 
 @import_app.command("lp", cls=Command)
+@command
 def import_lp(
-    directory: Annotated[Path, argument("Folder of pictures, one a light.")],
+    directory: Path,
+    /,
     out: Out,
-    lights: Annotated[
-        Path | None, option(".lp, list of directions, or folder of a chrome ball.")
-    ] = None,
-    mask: Annotated[Path | None, option("Picture that is bright at the object.")] = None,
-    encoding: Annotated[
-        str, option("How 8-bit and PNG values code light: auto, sRGB or linear.")
-    ] = "auto",
-    mm_per_px: Annotated[
-        float | None, option("Size of a pixel; then the list's rows are positions in mm.")
-    ] = None,
+    lights: Path | None = None,
+    mask: Path | None = None,
+    encoding: str = "auto",
+    mm_per_px: float | None = None,
     json: Json = False,
 ) -> None:
     """Turn pictures of one object under many lights, with their light list, into a session.
 
     Example: skinrig import lp rti-folder --out session-rti
+
+    Parameters
+    ----------
+    directory
+        Folder of pictures, one a light.
+    lights
+        .lp, list of directions, or folder of a chrome ball.
+    mask
+        Picture that is bright at the object.
+    encoding
+        How 8-bit and PNG values code light: auto, sRGB or linear.
+    mm_per_px
+        Size of a pixel; then the list's rows are positions in mm.
     """
     from capture.importers import import_light_list
 
@@ -127,8 +150,3 @@ def import_lp(
     console.document(
         "skinrig.import/1", picked(done, "path", "frames", "lights", "encoding", "mask", "assumed")
     )
-
-
-def _document(console: Console, done: object, *names: str) -> None:
-    """Print the document of an import: its path, and figures by their names."""
-    console.document("skinrig.import/1", picked(done, "path", *names))

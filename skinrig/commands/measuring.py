@@ -9,36 +9,27 @@ import typer
 from skinrig import errors
 from skinrig.benchmarks import table as bench_table
 from skinrig.commands import completion
-from skinrig.commands.options import Json, option
+from skinrig.commands.options import Json, command
 from skinrig.console import Console, picked
 from skinrig.doctor import examine
-from skinrig.waiting_threads import wait_asleep
+from skinrig.kernel_cache import wait_asleep
 
 BUDGET_S = 600.0
 """Seconds of a benchmark that names none."""
 
 
+@command
 def bench(
     more: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="NAME",
-            help="Stages, like those of --stage; default all.",
-            show_default=False,
-            autocompletion=completion.stages,
-        ),
+        typer.Argument(metavar="NAME", show_default=False, autocompletion=completion.stages),
     ] = None,
-    stage: Annotated[
-        list[str] | None, option("Stage, or several; repeatable.", autocompletion=completion.stages)
-    ] = None,
-    budget: Annotated[
-        float | None, option("Seconds to spend, about; default 600.", show_default=False)
-    ] = None,
-    toy: Annotated[bool, option("Smallest sizes, no limits judged.", "--toy")] = False,
-    extremes: Annotated[bool, option("Try stiff and extreme cases instead.", "--extremes")] = False,
-    out: Annotated[
-        Path | None, option("Folder for bench.json, a table and plots; or extremes.json.", "--out")
-    ] = None,
+    /,
+    stage: Annotated[list[str] | None, typer.Option(autocompletion=completion.stages)] = None,
+    budget: Annotated[float | None, typer.Option(show_default=False)] = None,
+    toy: bool = False,
+    extremes: bool = False,
+    out: Path | None = None,
     json: Json = False,
 ) -> None:
     """Measure error against run time; exit code 1 when a limit is missed.
@@ -52,6 +43,21 @@ def bench(
     Example: skinrig bench --stage chromophores wrinkles --json
 
     Example: skinrig bench --extremes
+
+    Parameters
+    ----------
+    toy
+        Smallest sizes, no limits judged.
+    extremes
+        Try stiff and extreme cases instead.
+    out
+        Folder for bench.json, a table and plots; or extremes.json.
+    more
+        Stages, like those of --stage; default all.
+    stage
+        Stage, or several; repeatable.
+    budget
+        Seconds to spend, about; default 600.
     """
     console = Console(json)
     # one --stage takes one word, so that what follows it comes as arguments

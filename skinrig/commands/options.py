@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from copy import copy
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from datetime import datetime
-from inspect import Parameter, Signature, signature
+from inspect import Parameter, Signature, cleandoc, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
 
@@ -21,11 +22,6 @@ if TYPE_CHECKING:
 def option(text: str, *names: str, **settings: Any) -> Any:
     """Return an option: its help, its names unless they are the parameter's, settings of Typer."""
     return typer.Option(*names, help=text, **settings)
-
-
-def argument(text: str, **settings: Any) -> Any:
-    """Return an argument by its help and settings of Typer."""
-    return typer.Argument(help=text, **settings)
 
 
 Json = Annotated[bool, option("Print exactly one JSON document on stdout.", "--json")]
@@ -106,28 +102,28 @@ def target_of(rig: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class SequenceOptions:
-    """Options of a sequence in time before the flash rig."""
+    """Options of a sequence in time before the flash rig.
 
-    sequence: Annotated[
-        str | None,
-        option(
-            "A sequence in time: an expression made and dropped by a sound, such as smile, or "
-            "exercise or alcohol, followed after the event."
-        ),
-    ] = None
-    prompt_period: Annotated[
-        str | None, option("Of a sequence: seconds from sound to sound; default 5.")
-    ] = None
-    shot_period: Annotated[
-        str | None, option("Of a sequence: seconds from shot to shot; default 5.5, of alcohol 300.")
-    ] = None
-    captures: Annotated[
-        int | None, option("Shots of a sequence by sounds; default: each phase, a tenth twice.")
-    ] = None
-    duration: Annotated[
-        str | None,
-        option("Seconds an event is followed; default 60 for exercise, 3600 for alcohol."),
-    ] = None
+    Attributes
+    ----------
+    sequence
+        A sequence in time: an expression made and dropped by a sound, such as smile, or exercise or
+        alcohol, followed after the event.
+    prompt_period
+        Of a sequence: seconds from sound to sound; default 5.
+    shot_period
+        Of a sequence: seconds from shot to shot; default 5.5, of alcohol 300.
+    captures
+        Shots of a sequence by sounds; default: each phase, a tenth twice.
+    duration
+        Seconds an event is followed; default 60 for exercise, 3600 for alcohol.
+    """
+
+    sequence: str | None = None
+    prompt_period: str | None = None
+    shot_period: str | None = None
+    captures: int | None = None
+    duration: str | None = None
 
     def order(self) -> SequenceOrder | None:
         """Return the sequence that is asked for; None without one."""
@@ -138,41 +134,86 @@ class SequenceOptions:
         )
 
 
-def expand(function: Callable[..., None]) -> Callable[..., None]:
-    """Return a command that takes the fields of its dataclass parameters as options.
+def command(function: Callable[..., None]) -> Callable[..., None]:
+    """Return a function as Typer takes a command: its docstring says what its options are.
 
-    Parameters
-    ----------
-    function
-        Each parameter that is annotated with a dataclass gets an object of it. The fields of the
-        dataclass are options of the command, in its place.
+    A parameter that is positional only becomes an argument, any other an option, unless it is
+    annotated with one of Typer's; its help is what the section of parameters says of it.
+    A parameter that is annotated with a dataclass gets an object of it: the fields of the
+    dataclass, described in its section of attributes, are options in its place.
     """
     types = get_type_hints(function, include_extras=True)
     groups: dict[str, Any] = {name: kind for name, kind in types.items() if is_dataclass(kind)}
+    text, helps = split_docstring(function.__doc__)
     shown: list[Parameter] = []
+    positional = []
     for name, one in signature(function).parameters.items():
-        if name not in groups:
-            shown.append(one.replace(annotation=types[name], kind=Parameter.KEYWORD_ONLY))
+        if name in groups:
+            shown += _options_of(groups[name])
             continue
-        hints = get_type_hints(groups[name], include_extras=True)
-        for option in fields(groups[name]):
-            default = Parameter.empty if option.default is MISSING else option.default
-            shown.append(
-                Parameter(
-                    option.name,
-                    Parameter.KEYWORD_ONLY,
-                    default=default,
-                    annotation=hints[option.name],
-                )
-            )
+        is_argument = one.kind is Parameter.POSITIONAL_ONLY
+        if is_argument:
+            positional.append(name)
+        kind = _described(name, types[name], helps, argument=is_argument)
+        shown.append(one.replace(annotation=kind, kind=Parameter.KEYWORD_ONLY))
 
-    def command(**given: Any) -> None:
+    def run(**given: Any) -> None:
         made = {
             name: kind(**{one.name: given.pop(one.name) for one in fields(kind)})
             for name, kind in groups.items()
         }
-        function(**made, **given)
+        arguments = [given.pop(name) for name in positional]
+        function(*arguments, **made, **given)
 
-    command.__name__, command.__doc__ = function.__name__, function.__doc__
-    command.__signature__ = Signature(shown)  # type: ignore[attr-defined]
-    return command
+    run.__name__, run.__doc__ = function.__name__, text
+    run.__signature__ = Signature(shown)  # type: ignore[attr-defined]
+    return run
+
+
+def _options_of(group: Any) -> Iterator[Parameter]:
+    """Yield the fields of a dataclass as parameters of a command."""
+    hints = get_type_hints(group, include_extras=True)
+    _, helps = split_docstring(group.__doc__)
+    for one in fields(group):
+        yield Parameter(
+            one.name,
+            Parameter.KEYWORD_ONLY,
+            default=Parameter.empty if one.default is MISSING else one.default,
+            annotation=_described(one.name, hints[one.name], helps),
+        )
+
+
+def _described(name: str, kind: Any, helps: Mapping[str, str], *, argument: bool = False) -> Any:
+    """Return a parameter's type with its option or argument; flags have no opposite."""
+    if name not in helps:
+        return kind
+    if get_origin(kind) is Annotated:
+        base, info = get_args(kind)
+        info = copy(info)
+        info.help = helps[name]
+        return Annotated[base, info]
+    if argument:
+        return Annotated[kind, typer.Argument(help=helps[name])]
+    names = [f"--{name.replace('_', '-')}"] if kind is bool else []
+    return Annotated[kind, option(helps[name], *names)]
+
+
+def split_docstring(docstring: str | None) -> tuple[str, dict[str, str]]:
+    r"""Return what a docstring says before its parameters or attributes, and of each of them.
+
+    Examples
+    --------
+    >>> split_docstring("Fit.\n\nParameters\n----------\nseed\n    Of the\n    search.")
+    ('Fit.', {'seed': 'Of the search.'})
+    """
+    text, _, section = cleandoc(docstring or "").partition("\nParameters\n----------\n")
+    if not section:
+        text, _, section = text.partition("\nAttributes\n----------\n")
+    helps: dict[str, str] = {}
+    name = ""
+    for line in section.splitlines():
+        if line.startswith(" "):
+            helps[name] = f"{helps.get(name, '')} {line.strip()}".lstrip()
+        else:
+            name = line.strip()
+    return text.rstrip(), helps

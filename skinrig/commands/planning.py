@@ -9,9 +9,10 @@ import typer
 
 from skinrig import errors
 from skinrig.commands.help import RigCommand, RigGroup
-from skinrig.commands.options import Json, Subject, expand, file_to_write, option
+from skinrig.commands.options import Json, Subject, command, file_to_write, option
 from skinrig.console import Console, picked
 from skinrig.next_steps import shell_quote
+from skinrig.whole_file import write_whole
 from skinrig.written_units import written
 
 plan_app = typer.Typer(
@@ -36,43 +37,55 @@ PlanWidth = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class PlanOptions:
-    """Options of every choice of a plan."""
+    """Options of every choice of a plan.
+
+    Attributes
+    ----------
+    valid_share
+        Of what the whole rig gives an estimate, so much must keep it.
+    forecast
+        A plan, JSON: say what it will give instead.
+    confirm
+        Folder: simulate the plan, reconstruct, and compare with the forecast.
+    seed
+        Seed of the face.
+    out
+        File for the plan, JSON.
+    """
 
     subject: Subject = "III"
-    valid_share: Annotated[
-        float, option("Of what the whole rig gives an estimate, so much must keep it.")
-    ] = 0.9
-    forecast: Annotated[Path | None, option("A plan, JSON: say what it will give instead.")] = None
-    out: Annotated[
-        Path | None, typer.Option("--out", callback=file_to_write, help="File for the plan, JSON.")
-    ] = None
-    confirm: Annotated[
-        Path | None,
-        option("Folder: simulate the plan, reconstruct, and compare with the forecast."),
-    ] = None
-    seed: Annotated[int, option("Seed of the face.")] = 0
+    valid_share: float = 0.9
+    forecast: Path | None = None
+    out: Annotated[Path | None, typer.Option("--out", callback=file_to_write)] = None
+    confirm: Path | None = None
+    seed: int = 0
     json: Json = False
 
 
 @plan_app.command("dome", cls=RigCommand)
-@expand
+@command
 def plan_dome(
     common: PlanOptions,
     want: Annotated[str, _want("normals<=1deg,r_d<=3%")] = "",
     width: PlanWidth = None,
-    most_lights: Annotated[int | None, option("No more lights than these.")] = None,
+    most_lights: int | None = None,
 ) -> None:
     """Choose the dome's lights and cameras that reach an error, and say what is left out.
 
     Example: skinrig plan dome --want "normals<=1deg,r_d<=3%" --out plan.json
 
     Example: skinrig plan dome --forecast plan.json
+
+    Parameters
+    ----------
+    most_lights
+        No more lights than these.
     """
     _plan("dome", common, want, width, most_lights)
 
 
 @plan_app.command("flash", cls=RigCommand)
-@expand
+@command
 def plan_flash(
     common: PlanOptions,
     want: Annotated[str, _want("melanin<=12%,hemoglobin<=25%")] = "",
@@ -86,7 +99,7 @@ def plan_flash(
 
 
 @plan_app.command("gradient", cls=RigCommand)
-@expand
+@command
 def plan_gradient(
     common: PlanOptions, want: Annotated[str, _want("normals<=2deg")] = "", width: PlanWidth = None
 ) -> None:
@@ -98,7 +111,7 @@ def plan_gradient(
 
 
 @plan_app.command("probe", cls=RigCommand)
-@expand
+@command
 def plan_probe(common: PlanOptions, want: Annotated[str, _want("sigma_tr<=3%")] = "") -> None:
     """Choose the probe's sites, placements and brackets that reach an error.
 
@@ -146,10 +159,7 @@ def _plan(
                 f"{'within' if row['within'] else 'OUTSIDE'} the forecast's interval"
             )
     if (out := common.out) is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        part = out.with_name(f".{out.name}.part")
-        part.write_text(json_text.dumps(choice.plan.to_json(), indent=1) + "\n", encoding="utf-8")
-        part.replace(out)
+        write_whole(out, json_text.dumps(choice.plan.to_json(), indent=1) + "\n")
         console.say(f"next: skinrig capture {rig} --plan {shell_quote(out)} --out session")
     console.document(document.pop("schema"), document)
     if not reached:

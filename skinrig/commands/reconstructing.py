@@ -7,33 +7,40 @@ from typing import Annotated
 import typer
 
 from skinrig.commands import completion
-from skinrig.commands.options import Json, Out, argument, option
+from skinrig.commands.options import Json, Out, command
 from skinrig.console import Console, counted, picked
 from skinrig.errors import UnusableError
 from skinrig.next_steps import shell_quote
 
 
+@command
 def calibrate(
-    kind: Annotated[
-        str,
-        argument(
-            "Of the flash rig sensor, color, polarization, white; of the dome geometry, "
-            "lights; of the gradient sphere sensor, lights, polarization; of the probe fibre.",
-            autocompletion=completion.calibrations,
-        ),
-    ],
-    sessions: Annotated[list[Path], argument("Sessions of the target.")],
+    kind: Annotated[str, typer.Argument(autocompletion=completion.calibrations)],
+    sessions: list[Path],
+    /,
     out: Out = Path("calibration"),
-    square_mm: Annotated[float, option("Side of the squares of geometry's board, mm.")] = 36.0,
-    sphere_mm: Annotated[float, option("Radius of the mirror sphere of lights, mm.")] = 50.0,
-    phantom: Annotated[
-        Path | None, option("Certificate (JSON) of the block fibre was measured on.")
-    ] = None,
+    square_mm: float = 36.0,
+    sphere_mm: float = 50.0,
+    phantom: Path | None = None,
     json: Json = False,
 ) -> None:
     """Make a calibration from sessions of a target and say how it drifted.
 
     Example: skinrig calibrate sensor session-flat --out calibration
+
+    Parameters
+    ----------
+    sessions
+        Sessions of the target.
+    square_mm
+        Side of the squares of geometry's board, mm.
+    sphere_mm
+        Radius of the mirror sphere of lights, mm.
+    phantom
+        Certificate (JSON) of the block fibre was measured on.
+    kind
+        Of the flash rig sensor, color, polarization, white; of the dome geometry, lights; of the
+        gradient sphere sensor, lights, polarization; of the probe fibre.
     """
     from skinrig.calibrating.calibrate import calibrate as make
     from skinrig.calibrating.dome import dome_targets
@@ -81,31 +88,19 @@ def check_rank(rank: int | None, basis: Path | None) -> None:
         )
 
 
+@command
 def reconstruct(
-    sessions: Annotated[list[Path], typer.Argument(metavar="SESSION", help="SESSION/ folder.")],
-    want: Annotated[
-        str,
-        option(
-            "Maps, separated by commas; a wrong name lists those there are.",
-            autocompletion=completion.wants,
-        ),
-    ],
+    sessions: Annotated[list[Path], typer.Argument(metavar="SESSION")],
+    /,
+    want: Annotated[str, typer.Option(autocompletion=completion.wants)],
     out: Out,
-    calibration: Annotated[Path | None, option("CALIBRATION/ folder.")] = None,
-    state: Annotated[str, option("State of the subject.")] = "neutral",
-    scan: Annotated[
-        Path | None, option("Mesh of the face, PLY in mm, instead of a dome session's.")
-    ] = None,
-    basis: Annotated[
-        Path | None, option("Folder of MERL tables to fit a dome's lobes with.")
-    ] = None,
-    landmarks: Annotated[
-        Path | None, option("Table name,x,y of a probe's sites in pixels of its 256 x 256 map.")
-    ] = None,
-    hold_out: Annotated[
-        str | None, option("A dome's frames that no fit sees: lights=L007,L023,views=C03.")
-    ] = None,
-    rank: Annotated[int | None, option("Lobes that a dome's points share; default 4.")] = None,
+    calibration: Path | None = None,
+    state: str = "neutral",
+    scan: Path | None = None,
+    basis: Path | None = None,
+    landmarks: Path | None = None,
+    hold_out: str | None = None,
+    rank: int | None = None,
     json: Json = False,
 ) -> None:
     """Make maps of a session; computes only what is wanted and not there yet.
@@ -115,6 +110,27 @@ def reconstruct(
     Example: skinrig reconstruct session --want melanin,hemoglobin --out appearance
 
     Example: skinrig reconstruct monday tuesday --want melanin --out appearances
+
+    Parameters
+    ----------
+    calibration
+        CALIBRATION/ folder.
+    state
+        State of the subject.
+    scan
+        Mesh of the face, PLY in mm, instead of a dome session's.
+    basis
+        Folder of MERL tables to fit a dome's lobes with.
+    landmarks
+        Table name,x,y of a probe's sites in pixels of its 256 x 256 map.
+    hold_out
+        A dome's frames that no fit sees: lights=L007,L023,views=C03.
+    rank
+        Lobes that a dome's points share; default 4.
+    sessions
+        SESSION/ folder.
+    want
+        Maps, separated by commas; a wrong name lists those there are.
     """
     from reconstruction.pipeline import recipes as pipeline
     from reconstruction.pipeline.inputs import DomeOptions

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 import typer
 
 from skinrig import errors
-from skinrig.commands.options import Json, Out, argument, expand, option
-from skinrig.console import Console
+from skinrig.commands.options import Json, Out, command
+from skinrig.console import Console, picked
 from skinrig.errors import UnusableError, UsageError
 
 if TYPE_CHECKING:
@@ -18,154 +18,129 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class SceneOptions:
-    """What is seen, from where, and under which light."""
+class RenderOptions:
+    """What is seen, under which light, how much is computed, and which pictures are made.
 
-    view: Annotated[
-        str, option("View of the rig, such as C03, or the camera's place in mm: 0,0,700.")
-    ] = "0,0,700"
-    light: Annotated[
-        list[str] | None,
-        option(
-            "Light of the rig (L017), direction towards it (1,1,2) or place in mm "
-            "(at:300,200,600), with *FACTOR or *R,G,B for its intensity; repeatable."
-        ),
-    ] = None
-    environment: Annotated[
-        Path | None, option("Light from everywhere: latitude-longitude OpenEXR map.")
-    ] = None
-    environment_lights: Annotated[int, option("Lights that are drawn from the environment.")] = 64
-    mesh: Annotated[
-        Path | None, option("Another mesh with the maps' texture coordinates: OBJ, PLY or .npz.")
-    ] = None
-    rig: Annotated[str, option("Rig whose views and lights are named.")] = "dome"
-    calibration: Annotated[
-        Path | None, option("CALIBRATION/ folder; default: the rig as drawn.")
-    ] = None
-    size: Annotated[int, option("Columns of the picture.")] = 512
-    fov: Annotated[float, option("Of a camera given by its place: degrees across.")] = 25.0
-    target: Annotated[str, option("What that camera looks at, mm.")] = "0,0,0"
+    Attributes
+    ----------
+    view
+        View of the rig, such as C03, or the camera's place in mm: 0,0,700.
+    light
+        Light of the rig (L017), direction towards it (1,1,2) or place in mm (at:300,200,600), with
+        *FACTOR or *R,G,B for its intensity; repeatable.
+    environment
+        Light from everywhere: latitude-longitude OpenEXR map.
+    environment_lights
+        Lights that are drawn from the environment.
+    mesh
+        Another mesh with the maps' texture coordinates: OBJ, PLY or .npz.
+    rig
+        Rig whose views and lights are named.
+    calibration
+        CALIBRATION/ folder; default: the rig as drawn.
+    size
+        Columns of the picture.
+    fov
+        Of a camera given by its place: degrees across.
+    target
+        What that camera looks at, mm.
+    samples
+        Rays a pixel: 1, 4, 9, 16 ...
+    shadow_samples
+        Points of each light's disc that a ray looks for.
+    light_radius
+        Of lights' discs, mm (far ones at 700 mm); default: the rig's, 10.
+    subsurface
+        dipole: light spreads in skin; local: it leaves where it entered; none: the surface alone.
+    translucency
+        sigma_tr of red, green, blue everywhere, 1/mm: 0.3558,0.7932,1.5173.
+    components
+        Light from inside and surface apart, too.
+    bases
+        Compare numbers of lobes: 1,2,4; more than were fitted cannot be had.
+    exposure
+        Factor of the PNGs; default: skin is shown well.
+    against
+        Session whose photographs the model was not fitted to (reconstruct --hold-out): render what
+        they show, and compare; with --components take the photograph of --view and --light apart.
+    photographs
+        With --against: most photographs, even over those held out.
+    seed
+        Of the environment's lights, and of --bases.
+    shadow_boundary
+        A card's shadow on the forehead and on a flat patch, by least and greatest sigma_tr; brings
+        its own view and light.
+    ablation
+        With --against: also compare without each part of the model.
+    """
 
-
-@dataclass(frozen=True, slots=True)
-class EffortOptions:
-    """How much is computed, and what light does in the skin."""
-
-    samples: Annotated[int, option("Rays a pixel: 1, 4, 9, 16 ...")] = 4
-    shadow_samples: Annotated[int, option("Points of each light's disc that a ray looks for.")] = 4
-    light_radius: Annotated[
-        float | None, option("Of lights' discs, mm (far ones at 700 mm); default: the rig's, 10.")
-    ] = None
-    subsurface: Annotated[
-        str,
-        option(
-            "dipole: light spreads in skin; local: it leaves where it entered; none: the "
-            "surface alone."
-        ),
-    ] = "dipole"
-    translucency: Annotated[
-        str | None, option("sigma_tr of red, green, blue everywhere, 1/mm: 0.3558,0.7932,1.5173.")
-    ] = None
-
-
-@dataclass(frozen=True, slots=True)
-class PictureOptions:
-    """Which pictures are made."""
-
-    components: Annotated[
-        bool, option("Light from inside and surface apart, too.", "--components")
-    ] = False
-    bases: Annotated[
-        str | None, option("Compare numbers of lobes: 1,2,4; more than were fitted cannot be had.")
-    ] = None
-    shadow_boundary: Annotated[
-        bool,
-        typer.Option(
-            "--shadow-boundary",
-            help="A card's shadow on the forehead and on a flat patch, by least and greatest "
-            "sigma_tr; brings its own view and light.",
-        ),
-    ] = False
-    exposure: Annotated[
-        float | None, option("Factor of the PNGs; default: skin is shown well.")
-    ] = None
-    against: Annotated[
-        Path | None,
-        option(
-            "Session whose photographs the model was not fitted to (reconstruct --hold-out): "
-            "render what they show, and compare; with --components take the photograph of --view "
-            "and --light apart."
-        ),
-    ] = None
-    photographs: Annotated[
-        int, option("With --against: most photographs, even over those held out.")
-    ] = 24
-    ablation: Annotated[
-        bool,
-        typer.Option(
-            "--ablation/--no-ablation",
-            help="With --against: also compare without each part of the model.",
-        ),
-    ] = True
-    seed: Annotated[int, option("Of the environment's lights, and of --bases.")] = 0
+    view: str = "0,0,700"
+    light: list[str] | None = None
+    environment: Path | None = None
+    environment_lights: int = 64
+    mesh: Path | None = None
+    rig: str = "dome"
+    calibration: Path | None = None
+    size: int = 512
+    fov: float = 25.0
+    target: str = "0,0,0"
+    samples: int = 4
+    shadow_samples: int = 4
+    light_radius: float | None = None
+    subsurface: str = "dipole"
+    translucency: str | None = None
+    components: bool = False
+    bases: str | None = None
+    shadow_boundary: bool = False
+    exposure: float | None = None
+    against: Path | None = None
+    photographs: int = 24
+    ablation: Annotated[bool, typer.Option("--ablation/--no-ablation")] = True
+    seed: int = 0
 
 
-@expand
-def render(
-    appearance: Annotated[
-        list[Path], argument("Fitted maps of the dome, with lobes; several for --bases.")
-    ],
-    out: Out,
-    scene: SceneOptions,
-    effort: EffortOptions,
-    pictures: PictureOptions,
-    json: Json = False,
-) -> None:
+@command
+def render(appearance: list[Path], /, out: Out, asked: RenderOptions, json: Json = False) -> None:
     """Render a fitted skin model: radiance as OpenEXR, and a picture of it.
 
     Example: skinrig render appearance --view C03 --light L017 --calibration calibration --out
     picture --components
+
+    Parameters
+    ----------
+    appearance
+        Fitted maps of the dome, with lobes; several for --bases.
     """
     from skinrig.rendering import figures
     from skinrig.rendering.render import Subsurface
     from skinrig.rendering.request import subpixels_of
 
     console = Console(json)
-    if effort.subsurface not in get_args(Subsurface):
+    if asked.subsurface not in get_args(Subsurface):
         raise UnusableError(
-            f"--subsurface: got {effort.subsurface!r}, expected {', '.join(get_args(Subsurface))}"
+            f"--subsurface: got {asked.subsurface!r}, expected {', '.join(get_args(Subsurface))}"
         )
-    exposure = pictures.exposure
-    if exposure is not None and not exposure > 0.0:
-        raise UnusableError(f"--exposure: got {exposure}, expected a factor above 0")
-    if len(appearance) > 1 and pictures.bases is None:
+    if asked.exposure is not None and not asked.exposure > 0.0:
+        raise UnusableError(f"--exposure: got {asked.exposure}, expected a factor above 0")
+    if len(appearance) > 1 and asked.bases is None:
         raise UsageError("appearance: got several, expected one; several are for --bases")
-    costs = figures.Effort(
-        subsurface=effort.subsurface,  # type: ignore[arg-type]
-        subpixels=subpixels_of(effort.samples),
-        shadow_samples=effort.shadow_samples,
-        exposure=exposure,
-        seed=pictures.seed,
+    effort = figures.Effort(
+        subpixels=subpixels_of(asked.samples),
         progress=console.progress,
+        **picked(asked, "subsurface", "shadow_samples", "exposure", "seed"),
     )
     console.progress(f"read {', '.join(str(path) for path in appearance)}")
-    if pictures.against is not None and not pictures.components:
-        _compare(appearance[0], pictures.against, out, scene, effort, pictures, console)
-    elif pictures.shadow_boundary:
-        subject = figures.RenderModel.of(appearance[0], mesh=scene.mesh)
-        _report(console, figures.draw_shadow_boundary(subject, out, costs, size_px=scene.size))
+    if asked.against is not None and not asked.components:
+        _compare(appearance[0], asked.against, out, asked, console)
+    elif asked.shadow_boundary:
+        subject = figures.RenderModel.of(appearance[0], mesh=asked.mesh)
+        _report(console, figures.draw_shadow_boundary(subject, out, effort, size_px=asked.size))
     else:
-        _report(console, _draw(appearance, out, scene, effort, pictures, costs))
+        _report(console, _draw(appearance, out, asked, effort))
 
 
 def _compare(
-    appearance: Path,
-    session: Path,
-    out: Path,
-    scene: SceneOptions,
-    effort: EffortOptions,
-    pictures: PictureOptions,
-    console: Console,
+    appearance: Path, session: Path, out: Path, asked: RenderOptions, console: Console
 ) -> None:
     """Compare renderings with photographs of a session that no fit has seen."""
     from skinrig.rendering.photographs import errors as photographs_errors
@@ -176,14 +151,11 @@ def _compare(
         session,
         out,
         evaluation.Judging(
-            subsurface=effort.subsurface,  # type: ignore[arg-type]
-            count=pictures.photographs,
-            ablation=pictures.ablation,
-            seed=pictures.seed,
+            count=asked.photographs,
             progress=console.progress,
+            **picked(asked, "subsurface", "ablation", "seed"),
         ),
-        calibration=scene.calibration,
-        translucency=effort.translucency,
+        **picked(asked, "calibration", "translucency"),
     )
     photographs_errors.print_comparison(console, found)
     if not found["passed"]:
@@ -191,40 +163,35 @@ def _compare(
 
 
 def _draw(
-    appearance: list[Path],
-    out: Path,
-    scene: SceneOptions,
-    effort: EffortOptions,
-    pictures: PictureOptions,
-    costs: Effort,
+    appearance: list[Path], out: Path, asked: RenderOptions, effort: Effort
 ) -> dict[str, Any]:
     """Draw a picture, a photograph beside its rendering, or one for each number of lobes."""
     from skinrig.rendering import figures
     from skinrig.rendering.request import RenderRig, lights_of
 
-    stage = RenderRig.of(scene.rig, scene.calibration)
-    camera = stage.camera(scene.view, size_px=scene.size, target_mm=scene.target, fov_deg=scene.fov)
+    stage = RenderRig.of(asked.rig, asked.calibration)
+    camera = stage.camera(asked.view, size_px=asked.size, target_mm=asked.target, fov_deg=asked.fov)
     lights = lights_of(
         stage,
-        scene.light or (),
-        radius_mm=effort.light_radius,
-        environment=scene.environment,
-        environment_count=scene.environment_lights,
-        seed=pictures.seed,
+        asked.light or (),
+        radius_mm=asked.light_radius,
+        environment=asked.environment,
+        environment_count=asked.environment_lights,
+        seed=asked.seed,
     )
     subjects = [
-        figures.RenderModel.of(path, mesh=scene.mesh, translucency=effort.translucency)
+        figures.RenderModel.of(path, mesh=asked.mesh, translucency=asked.translucency)
         for path in appearance
     ]
-    if pictures.against is not None:
-        name, calibration = lights[0].name, scene.calibration
+    if asked.against is not None:
+        name, calibration = lights[0].name, asked.calibration
         return figures.draw_photograph(
-            subjects[0], pictures.against, scene.view, name, out, costs, calibration=calibration
+            subjects[0], asked.against, asked.view, name, out, effort, calibration=calibration
         )
-    asked = figures.Asked(camera, lights, out, costs, stage.assumed)
-    if pictures.bases is None:
-        return figures.draw(subjects[0], asked, components=pictures.components)
-    return figures.draw_bases(subjects, _ranks(pictures.bases), asked)
+    picture = figures.Asked(camera, lights, out, effort, stage.assumed)
+    if asked.bases is None:
+        return figures.draw(subjects[0], picture, components=asked.components)
+    return figures.draw_bases(subjects, _ranks(asked.bases), picture)
 
 
 def _ranks(text: str) -> list[int]:
@@ -235,6 +202,12 @@ def _ranks(text: str) -> list[int]:
     if not found or min(found) < 1 or len(set(found)) < len(found):
         raise UsageError(f"--bases: got {text!r}, expected numbers of lobes that differ, as 1,2,4")
     return found
+
+
+def _sigma_tr(row: dict[str, Any]) -> str:
+    if row["sigma_tr_per_mm"] is None:
+        return str(row["name"]).replace("_", " ")
+    return ", ".join(f"{value:.4g}" for value in row["sigma_tr_per_mm"])
 
 
 def _report(console: Console, done: dict[str, Any]) -> None:
@@ -248,16 +221,7 @@ def _report(console: Console, done: dict[str, Any]) -> None:
     if "boundaries" in done:
         console.rows(
             ("skin", "sigma_tr, 1/mm", "90 to 10 % red, mm", "green", "blue"),
-            [
-                (
-                    row["skin"],
-                    row["name"].replace("_", " ")
-                    if row["sigma_tr_per_mm"] is None
-                    else ", ".join(f"{value:.4g}" for value in row["sigma_tr_per_mm"]),
-                    *row["rise_mm"],
-                )
-                for row in done["boundaries"]
-            ],
+            ((row["skin"], _sigma_tr(row), *row["rise_mm"]) for row in done["boundaries"]),
         )
     console.say(f"{done['out']}: {', '.join(done['files'])}, {done['seconds']:.1f} s")
     console.document(done["schema"], {k: v for k, v in done.items() if k != "schema"})

@@ -6,36 +6,20 @@ from typing import Annotated, Any
 
 import typer
 
-from skinrig.commands.options import (
-    STDOUT_MARK,
-    Json,
-    Page,
-    argument,
-    expand,
-    file_to_write,
-    option,
-)
+from skinrig.commands.options import STDOUT_MARK, Json, Page, command, file_to_write
 from skinrig.console import Console, picked
 from skinrig.errors import UnusableError, UsageError
 
 MAX_PORT = 65_535
 
 
+@command
 def report(
-    paths: Annotated[list[Path], argument("Folders that skinrig wrote.")],
-    out: Annotated[
-        Path,
-        typer.Option(
-            "-o", "--out", callback=file_to_write, help="The page; - is the standard output."
-        ),
-    ] = Path("report.html"),
+    paths: list[Path],
+    /,
+    out: Annotated[Path, typer.Option("-o", "--out", callback=file_to_write)] = Path("report.html"),
     compare: Annotated[
-        bool | None,
-        typer.Option(
-            "--compare/--no-compare",
-            help="Put two runs side by side; default: where PATHS are exactly two of one kind.",
-            show_default=False,
-        ),
+        bool | None, typer.Option("--compare/--no-compare", show_default=False)
     ] = None,
     json: Json = False,
 ) -> None:
@@ -47,9 +31,18 @@ def report(
     Example: skinrig report demo -o report.html
 
     Example: skinrig report monday tuesday -o difference.html
+
+    Parameters
+    ----------
+    paths
+        Folders that skinrig wrote.
+    out
+        The page; - is the standard output.
+    compare
+        Put two runs side by side; default: where PATHS are exactly two of one kind.
     """
     from skinrig.report import make
-    from skinrig.workspace import write_whole
+    from skinrig.whole_file import write_whole
 
     piped = str(out) == STDOUT_MARK
     if piped and json:
@@ -75,68 +68,54 @@ def report(
 
 @dataclass(frozen=True, slots=True)
 class FaceOptions:
-    """Geometry and color of the face that is drawn."""
+    """Geometry and color of the face that is drawn.
 
-    mesh: Annotated[
-        Path | None,
-        option(
-            "The face's geometry: .npz, .obj (or a folder of them), .gltf or .glb, with "
-            "blend shapes or without."
-        ),
-    ] = None
-    landmarks: Annotated[
-        Path | None,
-        option(
-            "Table name,x,y of the flash rig's neutral picture, to lay its maps on the mesh; "
-            "a simulation has its own."
-        ),
-    ] = None
-    calibration: Annotated[
-        Path | None,
-        option(
-            "CALIBRATION/ folder with the color of a dome's cameras; else the one its maps "
-            "were made with, or what its session says of the sensor."
-        ),
-    ] = None
+    Attributes
+    ----------
+    mesh
+        The face's geometry: .npz, .obj (or a folder of them), .gltf or .glb, with blend shapes or
+        without.
+    landmarks
+        Table name,x,y of the flash rig's neutral picture, to lay its maps on the mesh; a simulation
+        has its own.
+    calibration
+        CALIBRATION/ folder with the color of a dome's cameras; else the one its maps were made
+        with, or what its session says of the sensor.
+    """
+
+    mesh: Path | None = None
+    landmarks: Path | None = None
+    calibration: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class HeadOptions:
-    """The simulated head, and the size of all textures."""
+    """The simulated head, and the size of all textures.
 
-    preset: Annotated[str, option("Skin type of a simulated head: I to VI, palest or darkest.")] = (
-        "III"
-    )
-    seed: Annotated[int, option("Seed of a simulated head.")] = 0
-    size: Annotated[int, option("Texels a side of the textures, 64 to 4096.")] = 2048
+    Attributes
+    ----------
+    preset
+        Skin type of a simulated head: I to VI, palest or darkest.
+    seed
+        Seed of a simulated head.
+    size
+        Texels a side of the textures, 64 to 4096.
+    """
+
+    preset: str = "III"
+    seed: int = 0
+    size: int = 2048
 
 
-@expand
+@command
 def view(
+    appearance: list[Path] | None = None,
+    /,
     *,
-    appearance: Annotated[
-        list[Path] | None,
-        argument(
-            "Folders of one face: what `skinrig fit` wrote, or a dome's maps; none: a "
-            "simulated head."
-        ),
-    ] = None,
     out: Page = Path("page.html"),
     face: FaceOptions,
-    port: Annotated[
-        int | None,
-        option(
-            "Serve the page and its large displacement on this port of this machine alone, 0: "
-            "any free one, in place of writing it."
-        ),
-    ] = None,
-    displacement: Annotated[
-        Path | None,
-        option(
-            "With --port: heights of microstructure, um, in the mesh's texture: a .npy file, "
-            "4096 or 16384 px a side, as `skinrig apply microstructure` writes."
-        ),
-    ] = None,
+    port: int | None = None,
+    displacement: Path | None = None,
     head: HeadOptions,
     json: Json = False,
 ) -> None:
@@ -147,6 +126,17 @@ def view(
     Example: skinrig view demo/appearance-flash-moving-II -o face.html
 
     Example: skinrig view demo/appearance-dome-III --size 1024 --port 0
+
+    Parameters
+    ----------
+    appearance
+        Folders of one face: what `skinrig fit` wrote, or a dome's maps; none: a simulated head.
+    port
+        Serve the page and its large displacement on this port of this machine alone, 0: any free
+        one, in place of writing it.
+    displacement
+        With --port: heights of microstructure, um, in the mesh's texture: a .npy file, 4096 or
+        16384 px a side, as `skinrig apply microstructure` writes.
     """
     from skinrig.viewer import faces, page, server
 

@@ -10,7 +10,7 @@ import typer
 
 from skinrig.commands import completion, options
 from skinrig.commands.help import RigCommand, RigGroup
-from skinrig.commands.options import expand, option, target_of
+from skinrig.commands.options import command, option, target_of
 from skinrig.console import Console, counted, picked
 from skinrig.next_steps import after_session
 
@@ -38,14 +38,18 @@ OneState = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class SimulateOptions:
-    """Options of every simulation."""
+    """Options of every simulation.
+
+    Attributes
+    ----------
+    plan
+        What is captured of the subject, by `skinrig plan`.
+    """
 
     out: options.Out
     size: options.Size = "small"
     seed: options.Seed = 0
-    plan: Annotated[Path | None, option("What is captured of the subject, by `skinrig plan`.")] = (
-        None
-    )
+    plan: Path | None = None
     consent: options.Consent = None
     consent_expires: options.ConsentExpires = None
     resume: options.Resume = False
@@ -70,24 +74,25 @@ class SimulateOptions:
 
 @dataclass(frozen=True, slots=True)
 class FaceOptions:
-    """Options of a simulated face."""
+    """Options of a simulated face.
 
-    width: Annotated[int | None, option("Pixels across, instead of the size; even.")] = None
-    mesh: Annotated[Path | None, option("Face mesh, .npz or .obj.")] = None
-    movement: Annotated[
-        bool,
-        typer.Option(
-            "--movement/--no-movement",
-            help="Whether the face moves and wrinkles with its states, or its blood changes only.",
-        ),
-    ] = True
-    leave_out: Annotated[
-        str | None,
-        option(
-            "What of skin is not built although it changes pixels, joined by commas: lateral "
-            "(or subsurface), interreflections, spectral, optics, relief_shadows."
-        ),
-    ] = None
+    Attributes
+    ----------
+    width
+        Pixels across, instead of the size; even.
+    mesh
+        Face mesh, .npz or .obj.
+    leave_out
+        What of skin is not built although it changes pixels, joined by commas: lateral (or
+        subsurface), interreflections, spectral, optics, relief_shadows.
+    movement
+        Whether the face moves and wrinkles with its states, or its blood changes only.
+    """
+
+    width: int | None = None
+    mesh: Path | None = None
+    movement: Annotated[bool, typer.Option("--movement/--no-movement")] = True
+    leave_out: str | None = None
 
     def ordered(self) -> dict[str, Any]:
         """Return what orders of faces have, by name."""
@@ -99,7 +104,7 @@ class FaceOptions:
 
 
 @simulate_app.command("flash", cls=RigCommand)
-@expand
+@command
 def simulate_flash(
     common: SimulateOptions,
     face: FaceOptions,
@@ -108,24 +113,19 @@ def simulate_flash(
     target: Annotated[str | None, target_of("flash")] = None,
     repeats: options.Pairs = 1,
     state: States = None,
-    nearer: Annotated[
-        float,
-        typer.Option(
-            metavar="MM",
-            help="How much nearer to the camera than the white tile the face stands, mm; below 0 "
-            "farther.",
-        ),
-    ] = 0.0,
-    relaxation: Annotated[
-        float | None,
-        option(
-            "Time constant of a sequence's blood, s; default 0.02, of exercise 40, of alcohol 1200."
-        ),
-    ] = None,
+    nearer: Annotated[float, typer.Option(metavar="MM")] = 0.0,
+    relaxation: float | None = None,
 ) -> None:
     """Simulate the flash rig: a face in one or more states, a sequence in time, or a target.
 
     Example: skinrig simulate flash --out session-flash --subject IV
+
+    Parameters
+    ----------
+    relaxation
+        Time constant of a sequence's blood, s; default 0.02, of exercise 40, of alcohol 1200.
+    nearer
+        How much nearer to the camera than the white tile the face stands, mm; below 0 farther.
     """
     from skinrig.simulating.orders import FlashOrder
 
@@ -144,50 +144,22 @@ def simulate_flash(
 
 
 @simulate_app.command("dome", cls=RigCommand)
-@expand
+@command
 def simulate_dome(
     common: SimulateOptions,
     face: FaceOptions,
-    subject: Annotated[
-        str,
-        option(
-            "Preset, I to VI, palest or darkest, a file NAME.toml, or P01 to P87 of the "
-            "simulated population.",
-            autocompletion=completion.subjects,
-        ),
-    ] = "III",
+    subject: Annotated[str, typer.Option(autocompletion=completion.subjects)] = "III",
     target: Annotated[str | None, target_of("dome")] = None,
-    lights: Annotated[int | None, option("How many lights; default 48, full all 150.")] = None,
-    views: Annotated[int | None, option("How many cameras; default 6, full all 16.")] = None,
-    move: Annotated[bool, option("The face moves.", "--move")] = False,
+    lights: int | None = None,
+    views: int | None = None,
+    move: bool = False,
     state: OneState = None,
-    wrapped: Annotated[
-        bool,
-        typer.Option(
-            "--wrapped",
-            help="The scan is a template wrapped onto the face: one texture for all states.",
-        ),
-    ] = False,
-    subsurface: Annotated[
-        bool,
-        typer.Option(
-            "--subsurface", help="Light spreads sideways in the skin, even where no pixel shows it."
-        ),
-    ] = False,
-    interreflections: Annotated[
-        bool,
-        typer.Option(
-            "--interreflections", help="Light goes from skin to skin, even where no pixel shows it."
-        ),
-    ] = False,
+    wrapped: bool = False,
+    subsurface: bool = False,
+    interreflections: bool = False,
     condition: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME[=AMOUNT]",
-            help="Condition of the face, by up to 1 of it: cold, hot, sweat, lotion, makeup, "
-            "powder; repeatable.",
-            autocompletion=completion.conditions,
-        ),
+        typer.Option(metavar="NAME[=AMOUNT]", autocompletion=completion.conditions),
     ] = None,
 ) -> None:
     """Simulate the dome: a face in one state, with a scan of it, or a target.
@@ -195,6 +167,27 @@ def simulate_dome(
     Lights and cameras of a plan are those of targets, too.
 
     Example: skinrig simulate dome --out session-dome --subject IV --condition sweat=0.5
+
+    Parameters
+    ----------
+    lights
+        How many lights; default 48, full all 150.
+    views
+        How many cameras; default 6, full all 16.
+    move
+        The face moves.
+    wrapped
+        The scan is a template wrapped onto the face: one texture for all states.
+    subsurface
+        Light spreads sideways in the skin, even where no pixel shows it.
+    interreflections
+        Light goes from skin to skin, even where no pixel shows it.
+    subject
+        Preset, I to VI, palest or darkest, a file NAME.toml, or P01 to P87 of the simulated
+        population.
+    condition
+        Condition of the face, by up to 1 of it: cold, hot, sweat, lotion, makeup, powder;
+        repeatable.
     """
     from skinrig.capturing.option_values import parse_amounts
     from skinrig.simulating.orders import DomeOrder
@@ -217,7 +210,7 @@ def simulate_dome(
 
 
 @simulate_app.command("gradient", cls=RigCommand)
-@expand
+@command
 def simulate_gradient(
     common: SimulateOptions,
     subject: options.Subject = "III",
@@ -226,17 +219,17 @@ def simulate_gradient(
     site: options.Site = None,
     angles: options.Angles = None,
     steps: options.Steps = None,
-    leave_out: Annotated[
-        str | None,
-        option(
-            "What of skin is not built although it changes pixels, joined by commas: shadows, "
-            "lateral, interreflections, optics."
-        ),
-    ] = None,
+    leave_out: str | None = None,
 ) -> None:
     """Simulate the gradient sphere: a patch of skin in a caliper, or a target.
 
     Example: skinrig simulate gradient --out session-gradient --site cheek --angles 0,90
+
+    Parameters
+    ----------
+    leave_out
+        What of skin is not built although it changes pixels, joined by commas: shadows, lateral,
+        interreflections, optics.
     """
     from skinrig.capturing.option_values import parse_floats, parse_names, parse_range
     from skinrig.simulating.orders import GradientOrder
@@ -255,18 +248,10 @@ def simulate_gradient(
 
 
 @simulate_app.command("probe", cls=RigCommand)
-@expand
+@command
 def simulate_probe(
     common: SimulateOptions,
-    subject: Annotated[
-        str,
-        option(
-            "Preset, I to VI, palest or darkest, a file NAME.toml, or a medium, "
-            "homogeneous:A,S[,G] or anisotropic:A,S[,STRENGTH[,AXIS]] with A sigma_a and S "
-            "sigma_s', 1/mm, and AXIS in degrees.",
-            autocompletion=completion.subjects,
-        ),
-    ] = "III",
+    subject: Annotated[str, typer.Option(autocompletion=completion.subjects)] = "III",
     target: Annotated[str | None, target_of("probe")] = None,
     sites: options.Sites = None,
     repeats: options.Placements = 1,
@@ -276,6 +261,12 @@ def simulate_probe(
     """Simulate the fibre probe: tissue at some sites, or a target.
 
     Example: skinrig simulate probe --out session-probe --sites cheek
+
+    Parameters
+    ----------
+    subject
+        Preset, I to VI, palest or darkest, a file NAME.toml, or a medium, homogeneous:A,S[,G] or
+        anisotropic:A,S[,STRENGTH[,AXIS]] with A sigma_a and S sigma_s', 1/mm, and AXIS in degrees.
     """
     from skinrig.capturing.option_values import parse_floats, parse_names
     from skinrig.simulating.orders import ProbeOrder

@@ -20,6 +20,7 @@ from skinrig.appearances import face_textures
 from skinrig.appearances.contents import digest, document_digest
 from skinrig.appearances.face_textures import Face
 from skinrig.arrays import BoolArray, Float32Array
+from skinrig.console import picked
 from skinrig.editing import albedo as editing_albedo
 from skinrig.editing import masks, pigment_spots, surface_mixtures
 from skinrig.editing import spots as editing_spots
@@ -221,11 +222,9 @@ def edited(
     record = {
         "of": face.path.resolve().name,
         "traits": dict(order.traits),
-        "region": order.region,
         "mask": None if order.mask is None else order.mask.name,
         "spots": [dataclasses.asdict(spot) for spot in order.spots],
-        "seed": order.seed,
-        "iterations": order.iterations,
+        **picked(order, "region", "seed", "iterations"),
         "landmarks": face.marked_by,
         "changed": changed,
         "warnings": list(work.warnings),
@@ -324,12 +323,10 @@ def _edit_albedo(work: _Work, parts: LibraryParts, amounts: Mapping[str, float])
     share = masks.feathered(order.region, parts.frame)
 
     def one(values: Float32Array, given: Mapping[str, float], stream: int) -> AlbedoEdit:
+        how: dict[str, Any] = {"region": region, "share": share, "iterations": order.iterations}
         rng = np.random.default_rng([order.seed, stream])
-        how: dict[str, Any] = {"iterations": order.iterations, "rng": rng}
-        valid = face_textures.valid_of(source)
-        return editing_albedo.edit_albedo(
-            values, valid, chart, space, given, region=region, share=share, **how
-        )
+        known = face_textures.valid_of(source)
+        return editing_albedo.edit_albedo(values, known, chart, space, given, **how, rng=rng)
 
     found = one(source.values, amounts, 0)
     values, held = found.apply(source.values, mask)
@@ -433,16 +430,17 @@ def _say_unmarked(work: _Work) -> None:
 
 
 def _relative(a: Float32Array, b: Float32Array, good: BoolArray) -> float:
-    if not good.any():
-        return 0.0
-    x, y = a[good].astype(np.float64), b[good].astype(np.float64)
-    return float(np.sqrt(np.mean((x - y) ** 2)) / max(float(np.sqrt(np.mean(y**2))), 1e-12))
+    return _rms_apart(a[good].astype(np.float64), b[good].astype(np.float64))
 
 
 def _strengths_apart(a: SurfaceMixtures, b: SurfaceMixtures, strength: NDArray[Any]) -> float:
     """Return how far two faces' mixtures differ over the texels, RMS, relative to the second's."""
     good = b.valid
-    x = a.weights()[good] @ (a.mix * strength)
-    y = b.weights()[good] @ (b.mix * strength)
-    size = float(np.sqrt(np.mean(y**2)))
-    return float(np.sqrt(np.mean((x - y) ** 2))) / size if size > 0 else 0.0
+    x, y = (one.weights()[good] @ (one.mix * strength) for one in (a, b))
+    return _rms_apart(x, y)
+
+
+def _rms_apart(a: NDArray[Any], b: NDArray[Any]) -> float:
+    """Return how far some values are from others, RMS, relative to the others; 0 without any."""
+    size = float(np.sqrt(np.mean(b**2))) if b.size else 0.0
+    return float(np.sqrt(np.mean((a - b) ** 2))) / size if size > 0 else 0.0

@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import zipfile
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -58,8 +59,8 @@ class SurfaceMixtures:
         """Return the shares at least 0, (H, W, K)."""
         return np.maximum(np.stack([m.values for m in self.maps], axis=-1).astype(np.float64), 0.0)
 
-    def mean_shares(self, strength: Float64Array) -> Float64Array:
-        """Return the mean share of each lobe over texels of no unusual strength, (K,).
+    def mean(self, strength: Float64Array) -> Float64Array:
+        """Return the mean mixture of materials over texels of no unusual strength, (M,).
 
         Parameters
         ----------
@@ -72,14 +73,9 @@ class SurfaceMixtures:
         total = rows @ (self.mix @ strength)
         some = total[total > 0]
         if not len(some):
-            return np.zeros(len(self.mix))
-        return np.asarray(
-            rows[total < OUTLIER_STRENGTH_RATIO * float(np.median(some))].mean(axis=0)
-        )
-
-    def mean(self, strength: Float64Array) -> Float64Array:
-        """Return the mean mixture of materials, (M,)."""
-        return self.mean_shares(strength) @ self.mix
+            return np.zeros(len(self.materials))
+        usual = total < OUTLIER_STRENGTH_RATIO * float(np.median(some))
+        return np.asarray(rows[usual].mean(axis=0) @ self.mix)
 
 
 def read(appearance: SkinAppearance) -> SurfaceMixtures:
@@ -100,7 +96,7 @@ def read(appearance: SkinAppearance) -> SurfaceMixtures:
         mix = np.asarray(stored["mix"], np.float64)
         names = tuple(str(name) for name in stored["materials"])
         stored["light_radius_rad"], stored["table"]
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise SurfaceMixtureError(f"{BASIS_FILE}: cannot be read: {error}") from error
     if mix.ndim != 2 or mix.shape[1] != len(names) or not np.all(mix >= 0):
         raise SurfaceMixtureError(
@@ -110,9 +106,8 @@ def read(appearance: SkinAppearance) -> SurfaceMixtures:
     for k in range(len(mix)):
         if f"{WEIGHT_PREFIX}{k}" not in appearance.maps:
             raise SurfaceMixtureError(
-                f"{WEIGHT_PREFIX}{k}: is missing, {BASIS_FILE} has {len(mix)} lobes; "
-                "reconstruct all of "
-                "them"
+                f"{WEIGHT_PREFIX}{k}: is missing, {BASIS_FILE} has {len(mix)} lobes; reconstruct "
+                "all of them"
             )
         maps.append(appearance.maps[f"{WEIGHT_PREFIX}{k}"])
     return SurfaceMixtures(tuple(maps), mix, names, stored)

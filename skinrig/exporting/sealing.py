@@ -12,7 +12,7 @@ from typing import Any, Final
 from capture.session.mhl import write_first_generation
 from model.skin import SkinAppearance
 from skinrig import consent
-from skinrig.workspace import whole_folder
+from skinrig.whole_file import whole_folder
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ import numpy as np
 from model import store
 from model.facial_color import FacialColorError
 from model.facial_color import document as facial_color_document
+from model.skin import SkinAppearance
 from reconstruction.correspondence import landmark_table
 from reconstruction.pipeline.flash import facial_color as facial_color_fit
 from reconstruction.pipeline.flash import state_images
@@ -18,7 +19,7 @@ from reconstruction.pipeline.flash.facial_color import FacialColorFit, UnknownBl
 from reconstruction.pipeline.flash.state_images import Landmarks, Subject
 from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.appearances.contents import jointly_valid
-from skinrig.appearances.dynamic import FACIAL_COLOR, Part
+from skinrig.appearances.dynamic import FACIAL_COLOR
 from skinrig.appearances.state_truth import truth_of_state
 from skinrig.console import picked
 
@@ -88,7 +89,7 @@ def fit_facial_color(
     dynamic_appearance.add(
         out,
         FACIAL_COLOR,
-        Part(
+        SkinAppearance(
             maps=maps,
             files={facial_color_document.RIG_DOCUMENT: document},
             parameters={

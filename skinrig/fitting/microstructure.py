@@ -14,10 +14,9 @@ from model.microstructure import FOREHEAD, KernelTable, KernelTableError
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.kernel_fit.table import KernelTableFitError, fit_table
 from reconstruction.pipeline.gradient.stages import KERNEL_FILE
-from skinrig import consent
 from skinrig.appearances import dynamic as dynamic_appearance
-from skinrig.appearances.contents import document_digest, source_of
-from skinrig.appearances.dynamic import MICROSTRUCTURE, Part
+from skinrig.appearances.contents import document_digest, made_of
+from skinrig.appearances.dynamic import MICROSTRUCTURE
 
 SITE_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,31}")
 
@@ -98,37 +97,20 @@ def fit_microstructure(
         site, path = _site_of(given)
         by_site.setdefault(site, []).append((path, store.read(path)))
     fits = {site: _fit_site(site, group, paper_table) for site, group in by_site.items()}
-    maps = {f"microrelief_{site}": fit.height for site, fit in fits.items()}
-    files = {
-        f"kernel_table_{site}.json": fit.table.to_json().encode() for site, fit in fits.items()
-    }
-    everything = [one for group in by_site.values() for _, one in group]
-    inputs = {
-        f"{site} {number}": document_digest(path)
-        for site, group in by_site.items()
-        for number, (path, _) in enumerate(group)
-    }
-    left_out = tuple(
-        (site, "its table of kernels is the paper's forehead: too few kernels were fitted")
-        for site, fit in fits.items()
-        if fit.kernels == 0
+    why = "its table of kernels is the paper's forehead: too few kernels were fitted"
+    part = made_of(
+        *(one for group in by_site.values() for _, one in group),
+        maps={f"microrelief_{site}": fit.height for site, fit in fits.items()},
+        files={f"kernel_table_{site}.json": f.table.to_json().encode() for site, f in fits.items()},
+        parameters={"sites": {site: fit.document() for site, fit in fits.items()}},
+        inputs={
+            f"{site} {number}": document_digest(path)
+            for site, group in by_site.items()
+            for number, (path, _) in enumerate(group)
+        },
+        left_out=tuple((site, why) for site, fit in fits.items() if fit.kernels == 0),
     )
-    dynamic_appearance.add(
-        out,
-        MICROSTRUCTURE,
-        Part(
-            maps=maps,
-            files=files,
-            parameters={
-                "sites": {site: fit.document() for site, fit in fits.items()},
-                "consent": consent.merge_consent(*everything),
-            },
-            inputs=inputs,
-            source=source_of(*everything),
-            left_out=left_out,
-            seed=everything[0].seed,
-        ),
-    )
+    dynamic_appearance.add(out, MICROSTRUCTURE, part)
     return fits
 
 

@@ -10,8 +10,7 @@ from model.skin import SkinAppearance, SkinMap
 from model.skin_reflectance import TRANSLUCENCY_MAP, SkinReflectance
 from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
 from reconstruction.subsurface.translucency import population_prior
-from skinrig import consent
-from skinrig.appearances.contents import assumed_by, digest, document_digest, source_of, versions
+from skinrig.appearances.contents import assumed_by, digest, document_digest, made_of
 from skinrig.errors import UsageError
 from skinrig.fitting import probe_sites
 from skinrig.fitting.probe_sites import PlacedTranslucency
@@ -77,11 +76,11 @@ def fit_reflectance(
     assumed = assumed_by(surface)
     left_out = list(surface.left_out)
     files = dict(surface.files)
-    made_of = [surface]
+    sources = [surface]
     if probe is not None:
         measured = store.read(probe)
         inputs["probe"] = document_digest(probe)
-        made_of.append(measured)
+        sources.append(measured)
         try:
             placed = probe_sites.place(measured, _position(surface), landmarks=landmarks)
         except ValueError as error:
@@ -96,21 +95,18 @@ def fit_reflectance(
         depth, what = _of_people(_position(surface))
         assumed.append(what)
     model = skin_reflectance.assemble(surface, translucency=depth)
-    appearance = SkinAppearance(
+    own: dict[str, object] = {
+        "assumed": assumed,
+        "appearances": [path.name for path in (dome, probe) if path is not None],
+        REFLECTANCE_KEY: _record(placed),
+    }
+    appearance = made_of(
+        *sources,
         maps={**surface.maps, TRANSLUCENCY_MAP: depth},
-        source=source_of(*made_of),
-        parameters={
-            **surface.parameters,
-            "assumed": assumed,
-            consent.CONSENT_KEY: consent.merge_consent(*made_of),
-            "appearances": [path.name for path in (dome, probe) if path is not None],
-            REFLECTANCE_KEY: _record(placed),
-        },
+        parameters={**surface.parameters, **own},
         inputs={**surface.inputs, **inputs},
-        versions=versions(),
         left_out=tuple(left_out),
         files=files,
-        seed=surface.seed,
     )
     store.write(out, appearance)
     return FittedReflectance(model, placed, tuple(assumed), tuple(left_out))

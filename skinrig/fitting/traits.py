@@ -1,7 +1,5 @@
 """From labelled appearances to trait spaces: `skinrig fit traits`."""
 
-import os
-import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +25,7 @@ from skinrig.traits import albedo_vectors, regions
 from skinrig.traits import labels as trait_labels
 from skinrig.traits.albedo_vectors import AlbedoSample, VectorKind
 from skinrig.traits.labels import Labels
+from skinrig.whole_file import write_whole
 
 MAX_SURFACE_RANK: Final = 8
 """Lobes of a population's surface (Weyrich et al. 2005, figure 15)."""
@@ -143,7 +142,9 @@ def fit_traits(
         ),
         {regions.TEXTURE_SPACE_FILE: regions.texture_bytes(texture)},
     )
-    _write(out, library)
+    if out.is_dir():
+        raise TraitFitError(f"{out}: is a folder, expected the name of a file such as traits.npz")
+    write_whole(out, library.to_bytes())
     rows, warnings = summary(library)
     return TraitFit(
         library, tuple(f.name for f in faces), table.ignored, rows, warnings, tuple(left_out)
@@ -294,16 +295,3 @@ def _surface(
         names=first.materials,
         seed=seed,
     )
-
-
-def _write(out: Path, library: TraitLibrary) -> None:
-    """Write a file whole or not at all."""
-    if out.is_dir():
-        raise TraitFitError(f"{out}: is a folder, expected the name of a file such as traits.npz")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    part = out.with_name(f".{out.name}.{uuid.uuid4().hex}.part")
-    try:
-        part.write_bytes(library.to_bytes())
-        os.replace(part, out)
-    finally:
-        part.unlink(missing_ok=True)

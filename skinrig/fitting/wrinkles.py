@@ -16,11 +16,11 @@ from reconstruction.pipeline.dome.stages import MESH_FILE
 from reconstruction.surface.tangent_space import SMOOTHING_MM, tangent_normals
 from reconstruction.wrinkles.fit import WrinkleFit, fit
 from reconstruction.wrinkles.zones import ZoneFit, amplitudes, fit_zones
-from skinrig import consent
 from skinrig.appearances import dynamic as dynamic_appearance
-from skinrig.appearances.contents import document_digest, jointly_valid, source_of
-from skinrig.appearances.dynamic import WRINKLES, Part
+from skinrig.appearances.contents import document_digest, jointly_valid, made_of
+from skinrig.appearances.dynamic import WRINKLES
 from skinrig.arrays import BoolArray, Float32Array
+from skinrig.console import picked
 
 STATE_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,31}")
 NORMAL_MAPS = ("normals_refined", "normals")
@@ -96,46 +96,33 @@ def fit_wrinkles(
     stack: Any
     if masks is None:
         small = min(mask_size, side)
-        rng, height = (
-            np.random.default_rng(seed),
-            amplitudes(neutral, measured, size=(small, small)),
-        )
-        zones = fit_zones(height, zones=N_ZONES, rng=rng)
+        height = amplitudes(neutral, measured, size=(small, small))
+        zones = fit_zones(height, zones=N_ZONES, rng=np.random.default_rng(seed))
         stack = zones.masks
     else:
         stack = _read_masks(masks)
     found = fit(neutral, measured, stack, size=(min(size, side), min(size, side)))
     maps, document = found.model().to_maps()
-    folders = [folder for folder, _ in read.values()]
-    dynamic_appearance.add(
-        out,
-        WRINKLES,
-        Part(
-            maps=maps,
-            files={WRINKLE_FILE: document},
-            parameters={
-                "expressions": list(measured),
-                "appearances": [folder.name for folder in folders],
-                "explained": found.explained,
-                "rounds": found.rounds,
-                "zones": "given" if zones is None else "found in the data",
-                "rank_one_share": None if zones is None else zones.rank_one_share,
-                "distinct_zones": None if zones is None else zones.distinct,
-                "smoothing_mm": SMOOTHING_MM,
-                "consent": consent.merge_consent(*(one for _, one in read.values())),
-                "truth": {
-                    state: one.parameters.get("truth", "") for state, (_, one) in read.items()
-                },
-            },
-            inputs={state: document_digest(folder) for state, (folder, _) in read.items()},
-            source=source_of(*(one for _, one in read.values())),
-            left_out=tuple(
-                (state, "whether its texture is that of the others: no mesh lies beside its maps")
-                for state in unchecked
-            ),
-            seed=read["neutral"][1].seed,
-        ),
+    why = "whether its texture is that of the others: no mesh lies beside its maps"
+    part = made_of(
+        *(one for _, one in read.values()),
+        maps=maps,
+        files={WRINKLE_FILE: document},
+        parameters={
+            "expressions": list(measured),
+            "appearances": [folder.name for folder, _ in read.values()],
+            **picked(found, "explained", "rounds"),
+            "zones": "given" if zones is None else "found in the data",
+            "rank_one_share": None if zones is None else zones.rank_one_share,
+            "distinct_zones": None if zones is None else zones.distinct,
+            "smoothing_mm": SMOOTHING_MM,
+            "truth": {state: one.parameters.get("truth", "") for state, (_, one) in read.items()},
+        },
+        inputs={state: document_digest(folder) for state, (folder, _) in read.items()},
+        left_out=tuple((state, why) for state in unchecked),
+        seed=read["neutral"][1].seed,
     )
+    dynamic_appearance.add(out, WRINKLES, part)
     return FittedWrinkles(found, zones)
 
 

@@ -15,7 +15,7 @@ from skinrig.arrays import Float32Array, UInt8Array
 from skinrig.console import plain
 from skinrig.drawing import png
 from skinrig.rendering.camera import RenderingError
-from skinrig.workspace import whole_folder
+from skinrig.whole_file import whole_folder
 
 BRIGHT_SKIN_LEVEL: Final = 0.75
 """Linear value at which the brightest skin is shown."""

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from capture.plan import Plan, flash_calibration_plan, flash_plan
+from capture.plan import Plan
 from capture.rig import Rig, load_rig
 from model import store
 from rigsim import targets
@@ -10,6 +10,7 @@ from rigsim.needs.effects import SceneEffects
 from rigsim.population import files as subject_file
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject.perfusion import STATE_NAMES
+from skinrig.capturing.plan_choice import OwnPlan
 from skinrig.console import picked
 from skinrig.errors import one_of
 from skinrig.simulating import subject_records
@@ -37,7 +38,7 @@ def simulate_flash(order: FlashOrder) -> Simulated:
         **picked(order, "repeats", "movement", *(["nearer_mm"] if order.nearer_mm else [])),
     )
     # what cannot be built must fail before a folder is made
-    plan = order.plan or _plan(rig, order)
+    plan = order.plan or OwnPlan(**picked(order, "target", "states", "repeats")).of(rig)
     scenes = _scenes(rig, order, plan)
     first = next(iter(scenes.values()))
     session = open_session(order, plan, rig, asked, first)
@@ -56,14 +57,6 @@ def simulate_flash(order: FlashOrder) -> Simulated:
         store.write(folder, appearance)
     blur_mm = tuple(float(width) for width in first.resolution_mm())
     return finish(order, session, first, rig_seconds, truth, blur_mm=blur_mm)
-
-
-def _plan(rig: Rig, order: FlashOrder) -> Plan:
-    if order.target is None:
-        return flash_plan(rig, states=order.states, repeats=order.repeats, interleave=True)
-    if order.target == "white":
-        return flash_plan(rig, states=("white",), repeats=max(4, order.repeats))
-    return flash_calibration_plan(rig, order.target)  # type: ignore[arg-type]
 
 
 def _scenes(rig: Rig, order: FlashOrder, plan: Plan) -> dict[str, Any]:

@@ -5,13 +5,7 @@ from collections.abc import Mapping
 from typing import Any, cast
 
 from capture.plan import Plan
-from capture.plan.gradient import (
-    GradientTarget,
-    gradient_calibration_plan,
-    gradient_plan,
-    state_of,
-    states,
-)
+from capture.plan.gradient import state_of, states
 from capture.rig import Rig, load_rig
 from capture.session import Session
 from rigsim.as_built.sphere import build_sphere
@@ -22,6 +16,8 @@ from rigsim.scenes.gradient.truth import appearance as ground_truth
 from rigsim.skin_patch.motion import PatchMotion
 from rigsim.skin_patch.stretch import size_for
 from rigsim.world.taped_skin import GripState
+from skinrig.capturing.plan_choice import OwnPlan
+from skinrig.console import picked
 from skinrig.simulating import driving
 from skinrig.simulating.exposure_log import SceneLog
 from skinrig.simulating.orders import GradientOrder, Simulated, truth_folder
@@ -42,7 +38,8 @@ def simulate_gradient(order: GradientOrder) -> Simulated:
     # a ball of 12 mm fills the whole sensor, however small all else is kept
     width_px = WIDTHS_PX["full" if order.target == "ball" else order.size]
     rig = load_rig("gradient").cropped(order.width_px or width_px)
-    plan = _plan(rig, order)
+    angles = ANGLES_DEG[order.size] if order.angles is None else order.angles
+    plan = order.plan or OwnPlan(angles=angles, **picked(order, "target", "steps")).of(rig)
     light = driving.announce_light(plan, rig, order)
     asked = driving.asked_of(
         order,
@@ -70,15 +67,6 @@ def simulate_gradient(order: GradientOrder) -> Simulated:
         driving.write_truth(truth, order, session, ground_truth(scene, log.grips(session)))
     log.remove()
     return driving.finish(order, session, scene, rig_seconds, truth, light=light)
-
-
-def _plan(rig: Rig, order: GradientOrder) -> Plan:
-    if order.target is not None:
-        return gradient_calibration_plan(rig, cast(GradientTarget, order.target))
-    if order.plan is not None:
-        return order.plan
-    angles = ANGLES_DEG[order.size] if order.angles is None else order.angles
-    return gradient_plan(rig, angles=angles, steps=order.steps)
 
 
 def make_scene(

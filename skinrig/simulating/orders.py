@@ -175,22 +175,29 @@ class Order:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FlashOrder(Order):
+class FaceOrder(Order):
+    """A face before a rig."""
+
+    width_px: int | None = None
+    """Pixels across each camera, instead of ``size``."""
+    mesh: str | Path | None = None
+    """A face mesh to wear the skin instead of the procedural head."""
+    states: tuple[str, ...] = ("neutral",)
+    """Expressions and physiological states: one after the other before the flash rig, one alone in
+    the dome."""
+    movement: bool = True
+    """Whether the face moves and wrinkles with its states; else they change the blood only."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlashOrder(FaceOrder):
     """A face or a target before the flash rig; "small" is 768 pixels across, "full" 3024."""
 
     rig: ClassVar[str] = "flash"
     targets: ClassVar[tuple[str, ...]] = ("white", "chart", "flat", "dark", "malus")
 
-    width_px: int | None = None
-    """Pixels across, instead of ``size``."""
-    mesh: str | Path | None = None
-    """A face mesh to wear the skin instead of the procedural head."""
-    states: tuple[str, ...] = ("neutral",)
-    """Expressions and physiological states, captured one after the other."""
     repeats: int = 1
     """Image pairs a state."""
-    movement: bool = True
-    """Whether the face moves and wrinkles with its states; else they change the blood only."""
     nearer_mm: float = 0.0
     """How much nearer to the camera than the white tile's place the face stands, mm; below 0
     farther. The flashes are then as much nearer, and the lens is focused on the tile."""
@@ -222,7 +229,7 @@ class FlashOrder(Order):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DomeOrder(Order):
+class DomeOrder(FaceOrder):
     """A face or a target in the dome.
 
     "small" is 6 cameras, 320 pixels across, and 48 lights; "full" is all that it has. The subject
@@ -234,20 +241,12 @@ class DomeOrder(Order):
     rig: ClassVar[str] = "dome"
     targets: ClassVar[tuple[str, ...]] = get_args(DomeTarget)
 
-    width_px: int | None = None
-    """Pixels across each camera, instead of ``size``."""
-    mesh: str | Path | None = None
-    """A face mesh to wear the skin instead of the procedural head."""
     lights: int | None = None
     """So many lights, spread evenly; None: as many as ``size`` says."""
     views: int | None = None
     """So many cameras, spread evenly; None: as many as ``size`` says."""
-    states: tuple[str, ...] = ("neutral",)
-    """The one state of the face."""
     move: bool = False
     """Whether the face drifts and twitches during the capture."""
-    movement: bool = True
-    """Whether the face moves and wrinkles with its state; else that changes the blood only."""
     wrapped: bool = False
     """Whether the scan of the face is a template wrapped onto it, of the same triangles and texture
     coordinates in every state, so that maps of states share one texture."""

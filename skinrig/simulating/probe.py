@@ -1,17 +1,9 @@
 """The fibre probe simulated: tissue at several sites, or a target, and the truth."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import Any
 
-from capture.plan import Plan
-from capture.plan.probe import (
-    PHANTOM_SITE,
-    PROBE_SITES,
-    ProbeTarget,
-    all_series,
-    probe_calibration_plan,
-    probe_plan,
-)
+from capture.plan.probe import PHANTOM_SITE, PROBE_SITES, all_series
 from capture.plan.suction import Placement
 from capture.rig import Rig, load_rig
 from capture.session import Session
@@ -20,7 +12,8 @@ from rigsim.fiber.probe_tissue import TissueError
 from rigsim.population import files as subject_file
 from rigsim.scenes.probe.scene import ProbeScene, Probing
 from rigsim.scenes.probe.scene import appearance as ground_truth
-from skinrig.capturing.plan_choice import directions_of
+from skinrig.capturing.plan_choice import OwnPlan, directions_of
+from skinrig.console import picked
 from skinrig.simulating import driving
 from skinrig.simulating.exposure_log import SceneLog
 from skinrig.simulating.orders import ProbeOrder, Simulated, SimulationError, truth_folder
@@ -36,16 +29,16 @@ def simulate_probe(order: ProbeOrder) -> Simulated:
     the photons of the truth.
     """
     rig = load_rig("probe")
-    plan = _plan(rig, order)
+    asked_plan = OwnPlan(**picked(order, "target", "sites", "repeats", "angles"))
+    plan = order.plan or asked_plan.of(rig)
     asked = driving.asked_of(
         order,
-        size=order.size,
         sites=",".join(order.sites or PROBE_SITES),
-        repeats=order.repeats,
         angles=directions_of(order.angles),
-        all_brackets=order.all_brackets,
+        **picked(order, "size", "repeats", "all_brackets"),
     )
-    scene = make_scene(rig, order.target, subject=order.subject, seed=order.seed, size=order.size)
+    photons = TRUTH_PHOTONS[order.size]
+    scene = make_scene(rig, order.target, **picked(order, "subject", "seed"), photons=photons)
     if order.target is None:
         _check_sites(scene.tissue, order.sites or PROBE_SITES, rig)
     light = driving.announce_light(plan, rig, order)
@@ -73,36 +66,21 @@ def _check_sites(tissue: Any, sites: Sequence[str], rig: Rig) -> None:
             raise SimulationError(str(error)) from error
 
 
-def _plan(rig: Rig, order: ProbeOrder) -> Plan:
-    if order.target is not None:
-        return probe_calibration_plan(rig, cast(ProbeTarget, order.target), repeats=order.repeats)
-    if order.plan is not None:
-        return order.plan
-    return probe_plan(
-        rig,
-        sites=order.sites or PROBE_SITES,
-        repeats=order.repeats,
-        angles=directions_of(order.angles),
-    )
-
-
-def make_scene(
-    rig: Rig, target: str | None = None, *, subject: str = "III", seed: int = 0, size: str = "small"
-) -> Any:
+def make_scene(rig: Rig, target: str | None, *, subject: str, seed: int, photons: int) -> Any:
     """Return what the head is placed on, before fibres as they were built.
 
     Parameters
     ----------
     rig : Rig
         The probe's.
-    target : str, optional
-        "phantom" or "dark"; skin, or another tissue, by default.
+    target : str or None
+        "phantom" or "dark"; None: skin, or another tissue.
     subject : str
         Preset of the skin, or "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G]" in 1/mm.
     seed : int
         Of the subject, the photons and the sensor's noise; the probe itself is the same for all.
-    size : str
-        "small" or "full": how many photons.
+    photons : int
+        Of each site and angle.
 
     Raises
     ------
@@ -113,7 +91,7 @@ def make_scene(
         tissue = BLOCK if target == "phantom" else subject_file.tissue(subject, seed=seed)
     except TissueError as error:
         raise SimulationError(str(error)) from error
-    return ProbeScene(rig, tissue, seed=seed, photons=TRUTH_PHOTONS[size])
+    return ProbeScene(rig, tissue, seed=seed, photons=photons)
 
 
 class HeadLog(SceneLog):

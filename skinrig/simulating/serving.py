@@ -13,11 +13,9 @@ from capture.plan.probe import PHANTOM_SITE, PROBE_SITES
 from capture.rig import Probe, Rig, load_rig
 from capture.session import Session
 from rigsim.as_built.dome import build
-from rigsim.fiber import probe_tissue
 from rigsim.population import files as subject_file
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene
-from rigsim.scenes.probe.scene import ProbeScene
 from rigsim.world.serve import serve
 from rigsim.world.suction import HeadState
 from skinrig.arrays import UInt16Array
@@ -26,13 +24,13 @@ from skinrig.errors import EXIT_INTERRUPTED, UsageError
 from skinrig.next_steps import shell_quote
 from skinrig.simulating import dome as simulating_dome
 from skinrig.simulating import flash, gradient
+from skinrig.simulating import probe as simulating_probe
 from skinrig.simulating.orders import OptionsError, SimulationError, require_size
 from skinrig.simulating.resumption import shots_made
 from skinrig.simulating.subject_records import unused_subject_keys
 
 if TYPE_CHECKING:
     from rigsim.scenes.probe.scene import ProbeScene
-    from rigsim.world.suction import HeadState
 
 GRADIENT_WIDTH_PX = 96
 """Pixels across the served camera of the gradient rig."""
@@ -166,12 +164,10 @@ def _dome_scene(rig: Rig, subject: str, seed: int) -> Any:
 
 
 def _probe_scene(rig: Rig, probe: Probe, subject: str, seed: int) -> Any:
-    try:
-        tissue = subject_file.tissue(subject, seed=seed)
-    except probe_tissue.TissueError as error:
-        raise SimulationError(str(error)) from error
-    skin = ProbeScene(rig, tissue, seed=seed, photons=PROBE_PHOTONS)
-    block = ProbeScene(rig, probe_tissue.PHANTOM_BLOCK, seed=seed, photons=PROBE_PHOTONS)
+    skin, block = (
+        simulating_probe.make_scene(rig, of, subject=subject, seed=seed, photons=PROBE_PHOTONS)
+        for of in (None, "phantom")
+    )
     # the photons of the usual places are traced before anybody asks: the box holds the head on the
     # skin meanwhile, and waits for its host for some seconds only
     for site in (*PROBE_SITES, PHANTOM_SITE):

@@ -14,7 +14,7 @@ import numpy as np
 from skinrig.drawing import templates
 from skinrig.viewer.packing import Packed, pack
 from skinrig.viewer.scene import SceneError, ViewerScene
-from skinrig.workspace import write_whole
+from skinrig.whole_file import write_whole
 
 SCRIPT_NAMES: Final = (
     "graph gl load mesh camera color shading shadow crowd strain wrinkles detail microstructure "

@@ -24,7 +24,9 @@ def moving(tmp_path):
     maps["melanin"] = SkinMap(np.full((SIDE, SIDE), 0.03, np.float32), MAP_UNITS["melanin"])
     files = {facial_color_document.RIG_DOCUMENT: document}
     dynamic.add(
-        tmp_path / "moving", dynamic.FACIAL_COLOR, dynamic.Part(maps, files, {}, {}, "simulated")
+        tmp_path / "moving",
+        dynamic.FACIAL_COLOR,
+        SkinAppearance(maps, "simulated", {}, {}, files=files),
     )
     return tmp_path / "moving"
 

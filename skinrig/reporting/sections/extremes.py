@@ -8,7 +8,7 @@ from typing import Any
 from skinrig.console import Console, plain
 from skinrig.extremes.cases import INPUT_PRECISIONS, SCHEMA, run_cases, to_document
 from skinrig.reporting import page
-from skinrig.workspace import write_whole
+from skinrig.whole_file import write_whole
 
 __all__ = ["SCHEMA", "run_extremes", "section"]
 

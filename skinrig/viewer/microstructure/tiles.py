@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from skinrig.workspace import whole_folder
+from skinrig.whole_file import whole_folder
 
 TILE_PX: Final = 256
 MIN_SIDE_PX: Final = 512

@@ -136,7 +136,8 @@ def appearance(basis, rank, rng, *, names=None):
     mix[:, 0] += 1e-3
     mix /= (mix @ basis.strength())[:, None]
     stream = io.BytesIO()
-    np.savez(stream, mix=mix, materials=np.array(names or basis.names))
+    made = {"light_radius_rad": basis.light_radius_rad, "table": basis.table}
+    np.savez(stream, mix=mix, materials=np.array(names or basis.names), **made)
     valid = np.ones((24, 24), np.bool_)
     valid[0] = False
     maps = {

@@ -8,17 +8,17 @@ import pytest
 from model import store
 from model.skin import SkinAppearance, SkinMap
 from skinrig.appearances import dynamic
-from skinrig.appearances.dynamic import FACIAL_COLOR, MICROSTRUCTURE, DynamicAppearanceError, Part
+from skinrig.appearances.dynamic import FACIAL_COLOR, MICROSTRUCTURE, DynamicAppearanceError
 
 
-def part(value: float, name: str = "a", source: str = "measured") -> Part:
+def part(value: float, name: str = "a", source: str = "measured") -> SkinAppearance:
     maps = {f"map_{name}": SkinMap(np.full((4, 4), value, np.float32), "1")}
-    return Part(
+    return SkinAppearance(
         maps,
-        {f"{name}.json": b"{}"},
+        source,
         {"value": value},
         {"session": name},
-        source,
+        files={f"{name}.json": b"{}"},
         left_out=((name, "because"),),
     )
 

@@ -39,12 +39,16 @@ def face(tmp_path):
     dynamic.add(
         out,
         dynamic.FACIAL_COLOR,
-        dynamic.Part(maps, {facial_color_document.RIG_DOCUMENT: document}, {}, {}, "simulated"),
+        SkinAppearance(
+            maps, "simulated", {}, {}, files={facial_color_document.RIG_DOCUMENT: document}
+        ),
     )
     layer = Layer(np.full((8, 8, 2), 0.3), np.ones((8, 4, 4)) / 8.0)
     maps, document = WrinkleModel(np.zeros((16, 16, 2)), (layer,)).to_maps()
     dynamic.add(
-        out, dynamic.WRINKLES, dynamic.Part(maps, {WRINKLE_FILE: document}, {}, {}, "simulated")
+        out,
+        dynamic.WRINKLES,
+        SkinAppearance(maps, "simulated", {}, {}, files={WRINKLE_FILE: document}),
     )
     return out, neutral
 

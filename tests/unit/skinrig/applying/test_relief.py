@@ -5,10 +5,10 @@ import pytest
 
 from model import store
 from model.microstructure.kernel_table import FOREHEAD
-from model.skin import SkinMap
+from model.skin import SkinAppearance, SkinMap
 from skinrig.appearances import dynamic
 from skinrig.applying.expression import ApplyError, Expression, apply_expression
-from skinrig.applying.relief import Relief
+from skinrig.applying.relief import Relief, ReliefRequest
 
 MICRO = (dynamic.MICROSTRUCTURE,)
 
@@ -32,7 +32,7 @@ def folder(tmp_path):
             "map": f"microrelief_{site}",
             "table": f"kernel_table_{site}.json",
         }
-    part = dynamic.Part(maps, files, {"sites": sites}, {}, "measured")
+    part = SkinAppearance(maps, "measured", {"sites": sites}, {}, files=files)
     dynamic.add(tmp_path / "moving", dynamic.MICROSTRUCTURE, part)
     return tmp_path / "moving"
 
@@ -61,7 +61,7 @@ def sheet(tmp_path):
 
 def applied(folder, sheet, out, weights, **other):
     options = {"size_px": 300, "site": "forehead", "extrapolate": "hold", "seed": 1} | other
-    relief = Relief.of(sheet, weights, out=out, progress=lambda _: None, **options)
+    relief = Relief.of(sheet, weights, ReliefRequest(**options), out=out, progress=lambda _: None)
     return apply_expression(folder, Expression(weights), out=out, parts=MICRO, relief=relief)
 
 

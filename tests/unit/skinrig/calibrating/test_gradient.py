@@ -12,7 +12,7 @@ from capture.calibration.sensor.noise_model import SensorCalibration
 from capture.raw import RawFrame
 from capture.rig import load_rig
 from skinrig.calibrating.gradient import calibrate_gradient, of_a_gradient_sphere
-from skinrig.calibrating.outcome import CalibratingError
+from skinrig.calibrating.outcome import CalibratingError, TargetSessions
 
 RIG = load_rig("gradient").cropped(128)
 MADE = date(2026, 11, 21)
@@ -54,7 +54,7 @@ def flats(rng):
 
 
 def test_a_monochrome_sensor_is_calibrated_by_levels_instead_of_a_flashs_power(tmp_path, rng):
-    made = calibrate_gradient("sensor", [Shelf(frames=flats(rng))], tmp_path, MADE)
+    made = calibrate_gradient("sensor", TargetSessions([Shelf(frames=flats(rng))], tmp_path, MADE))
     found = SensorCalibration.from_calibration(made.calibration, "SG-0001")
     for quantity, true in ((found.gain_e_per_dn, GAIN), (found.read_noise_e, READ_E)):
         assert abs(quantity.value[0] - true) < 4 * quantity.stderr[0]
@@ -66,14 +66,14 @@ def test_a_monochrome_sensor_is_calibrated_by_levels_instead_of_a_flashs_power(t
 def test_sessions_without_the_target_are_told_how_to_make_one(tmp_path):
     for kind, target in (("lights", "ball"), ("polarization", "ball"), ("sensor", "flat")):
         with pytest.raises(CalibratingError, match=f"--target {target}"):
-            calibrate_gradient(kind, [Shelf()], tmp_path, MADE)
+            calibrate_gradient(kind, TargetSessions([Shelf()], tmp_path, MADE))
 
 
 def test_a_ball_that_was_never_lit_is_no_ball(tmp_path):
     dark = {"pattern": "dark", "level": 0.0, "exposure_s": 0.018, "polarizer": "parallel"}
     frames = [("ball", dark, np.full((128, 128), 64, np.uint16))]
     with pytest.raises(CalibratingError, match="level above 0"):
-        calibrate_gradient("lights", [Shelf(frames=frames)], tmp_path, MADE)
+        calibrate_gradient("lights", TargetSessions([Shelf(frames=frames)], tmp_path, MADE))
 
 
 def test_two_balls_two_rigs_and_other_kinds_are_refused(tmp_path):
@@ -81,12 +81,12 @@ def test_two_balls_two_rigs_and_other_kinds_are_refused(tmp_path):
     frames = [("ball", lit, np.full((128, 128), 64, np.uint16))]
     two = [Shelf(frames=frames, name="A"), Shelf(frames=frames, name="B")]
     with pytest.raises(CalibratingError, match="has moved"):
-        calibrate_gradient("lights", two, tmp_path, MADE)
+        calibrate_gradient("lights", TargetSessions(two, tmp_path, MADE))
     other = Shelf(dataclasses.replace(RIG, name="other"))
     with pytest.raises(CalibratingError, match="expected one rig"):
-        calibrate_gradient("lights", [Shelf(), other], tmp_path, MADE)
+        calibrate_gradient("lights", TargetSessions([Shelf(), other], tmp_path, MADE))
     with pytest.raises(CalibratingError, match="white"):
-        calibrate_gradient("white", [Shelf()], tmp_path, MADE)
+        calibrate_gradient("white", TargetSessions([Shelf()], tmp_path, MADE))
 
 
 def test_a_rig_is_told_by_its_box():

@@ -9,7 +9,7 @@ import pytest
 
 from model import store
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
-from skinrig import workspace
+from skinrig import whole_file
 from skinrig.appearances.front_view import FRONT_VIEW_WIDTH_PX
 from skinrig.cli import main
 from skinrig.reporting import map_images, verdict
@@ -69,7 +69,7 @@ def test_a_page_that_cannot_be_written_leaves_the_old_one_and_no_part(maps, monk
     def full(*_):
         raise OSError(28, "No space left on device", str(out))
 
-    monkeypatch.setattr(workspace.os, "replace", full)
+    monkeypatch.setattr(whole_file.os, "replace", full)
     assert main(["report", str(maps / "monday"), "-o", str(out)]) == 3
     assert out.read_text() == "old"
     assert [p.name for p in maps.iterdir() if p.name.startswith(".")] == []

@@ -9,7 +9,7 @@ from scipy.interpolate import griddata
 from model import store
 from model.facial_color.document import to_maps
 from model.facial_color.rig import HemoglobinRig
-from model.skin import MAP_UNITS, SkinMap
+from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from rigsim.subject.landmarks import find
 from rigsim.subject.person import make_subject
 from skinrig.appearances import dynamic as dynamic_appearance
@@ -71,7 +71,7 @@ def folder(subject, tmp_path_factory):
     dynamic_appearance.add(
         root / "appearance",
         dynamic_appearance.FACIAL_COLOR,
-        dynamic_appearance.Part(maps, {"facial_color.json": document}, {}, {}, "simulated", seed=3),
+        SkinAppearance(maps, "simulated", {}, {}, files={"facial_color.json": document}, seed=3),
     )
     marks = find(subject.mesh)
     places = _pixel(marks.on(subject.mesh))

@@ -36,8 +36,8 @@ def moving(folder, truths):
     dynamic.add(
         folder,
         dynamic.FACIAL_COLOR,
-        dynamic.Part(
-            maps, {facial_color_document.RIG_DOCUMENT: document}, parameters, {}, "simulated"
+        SkinAppearance(
+            maps, "simulated", parameters, {}, files={facial_color_document.RIG_DOCUMENT: document}
         ),
     )
     layer = Layer(np.full((8, 8, 2), 0.3), np.ones((8, 4, 4)) / 8.0)
@@ -45,12 +45,12 @@ def moving(folder, truths):
     dynamic.add(
         folder,
         dynamic.WRINKLES,
-        dynamic.Part(
+        SkinAppearance(
             maps,
-            {WRINKLE_FILE: document},
+            "simulated",
             {"expressions": ["surprise"], "explained": 0.9},
             {},
-            "simulated",
+            files={WRINKLE_FILE: document},
         ),
     )
     return neutral
