@@ -214,7 +214,7 @@ def noise_floor(histogram: ArrayLike, samples: float, other_samples: float | Non
     Examples
     --------
     >>> flat = np.full(100, 0.01)
-    >>> round(noise_floor(flat, 10_000.0), 4), round(math.sqrt(4 / math.pi / 100), 4)
+    >>> round(noise_floor(flat, 10_000.0), 4), round((4 / np.pi / 100) ** 0.5, 4)
     (0.1128, 0.1128)
     """
     other = samples if other_samples is None else other_samples

@@ -213,7 +213,7 @@ def test_a_session_without_a_neutral_state_is_refused_before_its_images_are_made
     out = tmp_path / "moving"
     assert main(["fit", "facial-color", str(made.session), "--out", str(out)]) == 3
     err = capsys.readouterr().err
-    assert "sessions: show white, expected a state 'neutral'" in err
+    assert "states of sessions: got white, expected 'neutral'" in err
     assert "repeat" not in err
     assert not out.exists()
 

@@ -13,6 +13,7 @@ import pytest
 from capture.session import Session, verify
 from model import store
 from skinrig import errors
+from skinrig.capturing import plan_choice
 from skinrig.cli import main
 from skinrig.simulating import probe
 
@@ -26,8 +27,8 @@ def small(monkeypatch):
     short = {"brackets": 8, "longest_s": 0.5, "darks": 1}
     monkeypatch.setattr(probe, "TRUTH_PHOTONS", FEW_PHOTONS)
     for name in ("probe_plan", "probe_calibration_plan"):
-        honest = getattr(probe, name)
-        monkeypatch.setattr(probe, name, functools.partial(honest, **short))
+        honest = getattr(plan_choice, name)
+        monkeypatch.setattr(plan_choice, name, functools.partial(honest, **short))
 
 
 def simulate(out, *more):
@@ -193,6 +194,7 @@ def test_the_next_command_is_named_and_a_closed_session_is_not_gone_on_with(caps
 HOST = """
 import sys
 from skinrig.simulating import probe
+from skinrig.capturing import plan_choice
 from skinrig.cli import main
 probe.PHOTONS = {"small": 2000}
 sys.exit(main(sys.argv[1:]))

@@ -156,7 +156,7 @@ def test_a_sample_without_a_time_is_left_out():
 
 @pytest.mark.parametrize(("cycle_s", "change_s"), [(0.0, None), (np.nan, None), (10.0, 10.0)])
 def test_a_cycle_without_both_changes_is_refused_by_name(cycle_s, change_s):
-    with pytest.raises(CurveError, match="cycle_s"):
+    with pytest.raises(CurveError, match=r"c(ycle|hange)_s"):
         perfusion_fit.fit_cycle(*cycle(), cycle_s=cycle_s, change_s=change_s)
 
 

@@ -325,7 +325,7 @@ def test_a_plan_beyond_the_box_is_refused_before_anything_is_lit(make, change, m
 def test_a_camera_that_cannot_be_released_is_refused_before_anything_is_lit(make):
     bench = make()
     camera = bench.cameras["C05"]
-    object.__setattr__(camera._info, "triggers", (Trigger.SOFTWARE,))
+    object.__setattr__(camera.info, "triggers", (Trigger.SOFTWARE,))
     with pytest.raises(CameraError, match="cannot be released"):
         bench.run()
     assert bench.world.switched == []

@@ -612,7 +612,7 @@ def test_a_plan_of_another_rig_is_refused(make):
 
 def test_a_camera_that_cannot_be_released_is_refused(make):
     bench = make()
-    object.__setattr__(bench.cameras["cam"]._info, "triggers", (Trigger.SOFTWARE,))
+    object.__setattr__(bench.cameras["cam"].info, "triggers", (Trigger.SOFTWARE,))
     with pytest.raises(CameraError, match="cannot be released"):
         bench.run()
     assert untouched(bench)

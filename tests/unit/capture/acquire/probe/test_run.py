@@ -477,17 +477,7 @@ def test_what_never_works_ends_the_capture_with_its_reason(make, faults, match):
 
 def test_a_camera_without_a_trigger_line_is_refused_before_anything_is_lit(make):
     bench = make()
-    info = bench.cameras["cam"].info
-    bench.cameras["cam"]._info = type(info)(
-        info.serial,
-        info.model,
-        info.width_px,
-        info.height_px,
-        info.pattern,
-        info.black,
-        info.white,
-        (Trigger.SOFTWARE,),
-    )
+    object.__setattr__(bench.cameras["cam"].info, "triggers", (Trigger.SOFTWARE,))
     with pytest.raises(CameraError, match="trigger line"):
         bench.run()
     assert bench.placings == []
