@@ -18,6 +18,7 @@ import hypothesis
 import numpy as np
 import pytest
 import real_time
+from fixtures.stale_kernels import remove_stale_kernels
 
 # Tests draw the same examples in each run, as slowly as a busy machine likes; nothing is kept
 # from one run for the next. Later releases of Hypothesis than the pinned one also draw numbers from
@@ -42,6 +43,17 @@ def pytest_addoption(parser):
     parser.addoption(
         "--record-durations", action="store_true", help=f"write {DURATIONS.name} from this run"
     )
+
+
+@hypothesis.settings(max_examples=1)
+@hypothesis.given(hypothesis.strategies.none())
+def draw_once(nothing):
+    """Have Hypothesis register its generator: it asks the collector who refers to that."""
+
+
+def pytest_configure(config):
+    if not hasattr(config, "workerinput"):  # before any process of several compiles
+        remove_stale_kernels()
 
 
 @cache
@@ -75,12 +87,6 @@ def recorded_durations_s():
     """Seconds by file; a file that no run has recorded yet counts as quick."""
     with DURATIONS.open(newline="", encoding="utf-8") as file:
         return {ROOT / row["file"]: float(row["seconds"]) for row in csv.DictReader(file)}
-
-
-@hypothesis.settings(max_examples=1)
-@hypothesis.given(hypothesis.strategies.none())
-def draw_once(nothing):
-    """Have Hypothesis register its generator: it asks the collector who refers to that."""
 
 
 def pytest_collection():

@@ -11,13 +11,22 @@ Lawson and Hanson 1974, Solving Least Squares Problems, chapter 23.
 """
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
-from numba import boolean, float32, float64, int64, njit, prange, types, uint64
+from numba import boolean, float32, float64, int64, njit, prange, types
 
-NODES_D, NODES_PHI, NODES_H = 32, 12, 90  # of model.brdf.tables; its tests hold them equal
+from reconstruction.brdf_basis.row_kernels import (
+    FAST_MATH,
+    dot,
+    fill_16,
+    fill_64,
+    fill_any,
+    find_nodes,
+    gather_column,
+    pull_of_columns,
+    squares_of_columns,
+)
+
 MAX_ACTIVE_COLUMNS = 32
 """Most columns in a working set; when it is full, the unused ones leave it."""
 MAX_JOINING_COLUMNS = 4
@@ -30,155 +39,14 @@ the Gram matrix, summed in float32, knows no more."""
 HUBER_SIGMAS = 3.0
 """Residuals beyond so many standard deviations pull with constant force."""
 
-_HALF_PI = 0.5 * math.pi
-_FAST_MATH = {"contract", "reassoc", "nsz"}
-
-
-@njit(inline="always")
-def _angle(c):  # type: ignore[no-untyped-def]
-    """Return acos(c) / (pi/2) for c in [0, 1] within 2e-8 rad (Abramowitz and Stegun 4.4.46)."""
-    p = -0.0012624911
-    p = p * c + 0.0066700901
-    p = p * c - 0.0170881256
-    p = p * c + 0.0308918810
-    p = p * c - 0.0501743046
-    p = p * c + 0.0889789874
-    p = p * c - 0.2145988016
-    p = p * c + 1.5707963050
-    return math.sqrt(max(1.0 - c, 0.0)) * p / _HALF_PI
-
-
-@njit(nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp", "nnan"})
-def _places(light, view, normal, picked, count, cos_l, place):  # type: ignore[no-untyped-def]
-    """Fill the cosine of the light and the place on the table's axes of the picked samples."""
-    n0, n1, n2 = float64(normal[0]), float64(normal[1]), float64(normal[2])
-    on_d, on_phi, on_h = place[0], place[1], place[2]
-    for j in range(count):
-        i = picked[j]
-        l0, l1, l2 = float64(light[i, 0]), float64(light[i, 1]), float64(light[i, 2])
-        v0, v1, v2 = float64(view[i, 0]), float64(view[i, 1]), float64(view[i, 2])
-        cos_l[j] = l0 * n0 + l1 * n1 + l2 * n2
-        on_d[j] = l0 * v0 + l1 * v1 + l2 * v2
-        on_phi[j] = v0 * n0 + v1 * n1 + v2 * n2
-    for j in range(count):  # apart from the first loop, this one runs in whole vectors
-        mu_l, mu_v = cos_l[j], on_phi[j]
-        between = max(min(on_d[j], 1.0), -1.0)
-        cos_d = math.sqrt(0.5 * (1.0 + between))
-        sin_d = math.sqrt(0.5 * (1.0 - between))
-        cos_h = max(min((mu_l + mu_v) / max(2.0 * cos_d, 1e-9), 1.0), 0.0)
-        sin_h = math.sqrt(1.0 - cos_h * cos_h)
-        cos_phi = min(abs(mu_v - mu_l) / max(2.0 * sin_d * sin_h, 1e-9), 1.0)
-        on_d[j] = _angle(min(cos_d, 1.0)) * (NODES_D - 1)
-        on_phi[j] = _angle(cos_phi) * (NODES_PHI - 1)
-        on_h[j] = math.sqrt(_angle(cos_h)) * (NODES_H - 1)
-
-
-def _row_filler(fixed: int) -> Callable[..., Any]:
-    """Return the kernel that fills a matrix; one of fixed width runs in unrolled vectors."""
-
-    @njit(nogil=True, fastmath=_FAST_MATH)
-    def fill(flat, cos_l, place, weight, count, rows, square):  # type: ignore[no-untyped-def]
-        """Fill the matrix and the weighted squares of its columns."""
-        lanes = uint64(fixed) if fixed > 0 else uint64(rows.shape[1])
-        out = rows.reshape(-1)
-        block = np.zeros(rows.shape[1], dtype=np.float32)
-        square[:] = 0.0
-        for i in range(count):
-            d, h = place[0, i], place[2, i]
-            i_d = min(int64(d), NODES_D - 2)
-            i_phi = int64(place[1, i] + 0.5)
-            i_h = min(int64(h), NODES_H - 2)
-            d, h = d - i_d, h - i_h
-            # Unsigned offsets into a flat table: no test for negative ones keeps the loop whole.
-            a = uint64((i_d * NODES_PHI + i_phi) * NODES_H + i_h) * lanes
-            b = a + uint64(NODES_H * NODES_PHI) * lanes
-            w_a = float32(cos_l[i] * (1.0 - d) * (1.0 - h))
-            w_b = float32(cos_l[i] * (1.0 - d) * h)
-            w_e = float32(cos_l[i] * d * (1.0 - h))
-            w_f = float32(cos_l[i] * d * h)
-            w = weight[i]
-            o = uint64(i) * lanes
-            for k in range(lanes):
-                element = (w_a * flat[a + k] + w_b * flat[a + lanes + k]) + (
-                    w_e * flat[b + k] + w_f * flat[b + lanes + k]
-                )
-                out[o + k] = element
-                block[k] += (w * element) * element
-            if i % 64 == 63 or i == count - 1:
-                for k in range(lanes):
-                    square[k] += block[k]
-                    block[k] = float32(0.0)
-
-    return fill
-
-
-_fill_64 = _row_filler(64)
-_fill_16 = _row_filler(16)
-_fill_any = _row_filler(0)
-
-
-@njit(nogil=True, fastmath=_FAST_MATH)
-def _pull(rows, force, count, total):  # type: ignore[no-untyped-def]
-    """Fill the matrix' transpose times ``force``, in blocks of float32 added up in float64."""
-    lanes = rows.shape[1]
-    block = np.empty(lanes, dtype=np.float32)
-    total[:] = 0.0
-    for begin in range(0, count, 64):
-        block[:] = float32(0.0)
-        i = begin
-        while i + 4 <= min(begin + 64, count):
-            f0, f1, f2, f3 = force[i], force[i + 1], force[i + 2], force[i + 3]
-            r0, r1, r2, r3 = rows[i], rows[i + 1], rows[i + 2], rows[i + 3]
-            for k in range(lanes):
-                block[k] += (f0 * r0[k] + f1 * r1[k]) + (f2 * r2[k] + f3 * r3[k])
-            i += 4
-        while i < min(begin + 64, count):
-            f0, r0 = force[i], rows[i]
-            for k in range(lanes):
-                block[k] += f0 * r0[k]
-            i += 1
-        for k in range(lanes):
-            total[k] += block[k]
-
-
-@njit(nogil=True, fastmath=_FAST_MATH)
-def _squares(rows, weight, count, total):  # type: ignore[no-untyped-def]
-    """Fill the weighted square of each column."""
-    lanes = rows.shape[1]
-    block = np.empty(lanes, dtype=np.float32)
-    total[:] = 0.0
-    for begin in range(0, count, 64):
-        block[:] = float32(0.0)
-        for i in range(begin, min(begin + 64, count)):
-            w, row = weight[i], rows[i]
-            for k in range(lanes):
-                block[k] += (w * row[k]) * row[k]
-        for k in range(lanes):
-            total[k] += block[k]
-
-
-@njit(nogil=True, fastmath=_FAST_MATH)
-def _dot(a, b, count):  # type: ignore[no-untyped-def]
-    total = float32(0.0)
-    for i in range(count):
-        total += a[i] * b[i]
-    return float64(total)
-
-
-@njit(nogil=True, fastmath=_FAST_MATH)
-def _gather(rows, root, material, count, column):  # type: ignore[no-untyped-def]
-    """Copy a column of the matrix, times the roots of the weights."""
-    for i in range(count):
-        column[i] = root[i] * rows[i, material]
-
 
 @njit(nogil=True)
 def _join(begin, end, column, target, count, gram, rhs):  # type: ignore[no-untyped-def]
     """Fill the Gram matrix and the right-hand side of columns ``begin`` to ``end``."""
     for p in range(begin, end):
         for q in range(p + 1):
-            gram[p, q] = gram[q, p] = _dot(column[p], column[q], count)
-        rhs[p] = _dot(column[p], target, count)
+            gram[p, q] = gram[q, p] = dot(column[p], column[q], count)
+        rhs[p] = dot(column[p], target, count)
 
 
 @njit(nogil=True)
@@ -263,7 +131,7 @@ def _small(gram, rhs, size, norm, x, active, low, trial, refused):  # type: igno
         used += 1
 
 
-@njit(nogil=True, fastmath=_FAST_MATH)
+@njit(nogil=True, fastmath=FAST_MATH)
 def _misfit(column, x, size, target, count, residual):  # type: ignore[no-untyped-def]
     """Fill target - columns x, return its norm."""
     for i in range(count):
@@ -273,7 +141,7 @@ def _misfit(column, x, size, target, count, residual):  # type: ignore[no-untype
             share, one = float32(x[p]), column[p]
             for i in range(count):
                 residual[i] -= share * one[i]
-    return math.sqrt(_dot(residual, residual, count))
+    return math.sqrt(dot(residual, residual, count))
 
 
 @njit(nogil=True)
@@ -306,16 +174,16 @@ def _solve(  # type: ignore[no-untyped-def]
         root[i] = math.sqrt(weight[i])
         target[i] = root[i] * value[i]
     for p in range(size):
-        _gather(rows, root, working[p], count, column[p])
+        gather_column(rows, root, working[p], count, column[p])
     _join(0, size, column, target, count, gram, rhs)
-    norm = math.sqrt(_dot(target, target, count))
+    norm = math.sqrt(dot(target, target, count))
     for step in range(materials + 2):
         # The first round's misfit is that of what the set explains at best
         _small(gram, rhs, size, 1e-3 * norm if step == 0 else norm, x, active, low, trial, refused)
         norm = _misfit(column, x, size, target, count, residual)
         for i in range(count):
             force[i] = root[i] * residual[i]
-        _pull(rows, force, count, pull)
+        pull_of_columns(rows, force, count, pull)
         for p in range(size):
             pull[working[p]] = 0.0
         if size + MAX_JOINING_COLUMNS > MAX_ACTIVE_COLUMNS:
@@ -346,7 +214,7 @@ def _solve(  # type: ignore[no-untyped-def]
             pull[joining] = 0.0
             working[size] = joining
             x[size] = 0.0
-            _gather(rows, root, joining, count, column[size])
+            gather_column(rows, root, joining, count, column[size])
             size += 1
         if size == before:
             break
@@ -481,13 +349,13 @@ def fit_points(  # type: ignore[no-untyped-def]
                     weight[i] = 1.0 / (var[i] + 1e-3 * top + 1e-30)
                 else:
                     weight[i] = 1.0 / var[i] if known else 1.0
-            _places(light[point], view[point], normal[point], picked, count, cos_l, place)
+            find_nodes(light[point], view[point], normal[point], picked, count, cos_l, place)
             if lanes == 64:
-                _fill_64(flat, cos_l, place, weight, count, rows, square)
+                fill_64(flat, cos_l, place, weight, count, rows, square)
             elif lanes == 16:
-                _fill_16(flat, cos_l, place, weight, count, rows, square)
+                fill_16(flat, cos_l, place, weight, count, rows, square)
             else:
-                _fill_any(flat, cos_l, place, weight, count, rows, square)
+                fill_any(flat, cos_l, place, weight, count, rows, square)
             kept = 0
             for p in range(size):  # the neighbour's columns in use
                 if x[p] > 0.0:
@@ -524,7 +392,7 @@ def fit_points(  # type: ignore[no-untyped-def]
                 for i in range(count):
                     model[i] = y[i] - residual[i] / root[i]
                 scatter = _reweigh(y, var, model, count, weight, scatter)
-                _squares(rows, weight, count, square)
+                squares_of_columns(rows, weight, count, square)
                 size = _solve(
                     rows,
                     y,

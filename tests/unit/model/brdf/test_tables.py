@@ -8,7 +8,7 @@ import pytest
 from model import fresnel, merl
 from model.brdf import recipe as brdf_recipe
 from model.brdf import tables as brdf_tables
-from reconstruction.brdf_basis import nnls_kernels
+from reconstruction.brdf_basis import row_kernels
 
 
 @pytest.fixture(scope="module")
@@ -25,9 +25,9 @@ def directions(rng, n, least=0.3):
 def test_the_basis_has_59_materials_on_the_grid_that_the_kernels_know(point_basis):
     assert point_basis.size == len(set(point_basis.names)) == 59
     assert point_basis.table.shape[:3] == (
-        nnls_kernels.NODES_D,
-        nnls_kernels.NODES_PHI,
-        nnls_kernels.NODES_H,
+        row_kernels.NODES_D,
+        row_kernels.NODES_PHI,
+        row_kernels.NODES_H,
     )
     assert np.all(point_basis.table[..., 59:] == 0.0)
     tiny = point_basis.table[(point_basis.table > 0.0)].min()

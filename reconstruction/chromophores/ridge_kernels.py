@@ -1,0 +1,237 @@
+"""Follows, for one pixel, the blood that fits best along the grid of melanin.
+
+The arguments are those of `reconstruction.chromophores.posterior_kernels`.
+"""
+
+import math
+from typing import NamedTuple
+
+from numba import float64, njit
+
+from reconstruction.arrays import Float64Array
+from reconstruction.chromophores.lines import N_LINE_NODES, N_LINES, NODES_PER_LINE
+from reconstruction.chromophores.start import MIN_AXIS_FRACTION
+from reconstruction.compiled import CONTRACT
+
+N_NEWTON_STEPS = 4
+MAX_RIDGE_STEP = 0.12
+"""Longest step in blood, as a fraction of its axis."""
+STEP_TOL = 0.02
+"""Step, in standard errors of blood, after which the next one would not matter."""
+ACCEPT_TOL = 1.0
+"""The same up to which the last step is taken for granted."""
+RIDGE_JUMP_COST = 2.0
+"""Cost below the ridge's from which on a place beside it is taken for the ridge."""
+TAIL_COST = 8.0
+"""Cost above the lowest where the ends are set."""
+AXIS_BEGIN = float(MIN_AXIS_FRACTION)
+MELANIN_STEP = (1.0 - AXIS_BEGIN) / (N_LINES - 1)
+BLOOD_STEP = (1.0 - AXIS_BEGIN) / (N_LINE_NODES - 1)
+
+
+class Ridge(NamedTuple):
+    """What is found on each line, (LINES,) each: the ridge, where blood fits the color best."""
+
+    cost: Float64Array
+    """-2 log of the likelihood and of the face's blood there."""
+    slope: Float64Array
+    """Its derivative by the fraction of the melanin axis, along the ridge."""
+    shade: Float64Array
+    """Log shading."""
+    face_cost: Float64Array
+    """The face's part of the cost."""
+    blood: Float64Array
+    blood_slope: Float64Array
+    second: Float64Array
+    """Blood of another place on the line that matters, else that of the ridge."""
+    spread: Float64Array
+    """Standard deviation of blood by the curvature."""
+    pull: Float64Array
+    """Step that would be left where an end of the axis holds the ridge; else 0."""
+
+
+@njit(fastmath=CONTRACT)
+def quadratic_form(w, p0, p1, p2, q0, q1, q2):  # type: ignore[no-untyped-def]
+    """Return p' W q."""
+    return (
+        w[0] * p0 * q0
+        + w[3] * p1 * q1
+        + w[5] * p2 * q2
+        + w[1] * (p0 * q1 + p1 * q0)
+        + w[2] * (p0 * q2 + p2 * q0)
+        + w[4] * (p1 * q2 + p2 * q1)
+    )
+
+
+@njit(fastmath=CONTRACT)
+def hermite(v0, v1, d0, d1, x, step):  # type: ignore[no-untyped-def]
+    """Return the cubic with these values and derivatives at the ends, and its derivative."""
+    rise = v1 - v0
+    p, q = d0 * step - rise, rise - d1 * step
+    y = 1.0 - x
+    value = v0 + x * (rise + y * (p * y + q * x))
+    slope = (rise + (y - x) * (p * y + q * x) + x * y * (q - p)) / step
+    return value, slope
+
+
+@njit(fastmath=CONTRACT)
+def color_at(log_rgb, by_b, k, b):  # type: ignore[no-untyped-def]
+    """Return the log color and its derivative by blood on line k, the node and the way past it."""
+    y = (b - AXIS_BEGIN) / BLOOD_STEP
+    j = min(int(y), N_LINE_NODES - 2)
+    x = y - j
+    v, w, d, e = log_rgb[k, j], log_rgb[k, j + 1], by_b[k, j], by_b[k, j + 1]
+    f0, g0 = hermite(v[0], w[0], d[0], e[0], x, BLOOD_STEP)
+    f1, g1 = hermite(v[1], w[1], d[1], e[1], x, BLOOD_STEP)
+    f2, g2 = hermite(v[2], w[2], d[2], e[2], x, BLOOD_STEP)
+    return f0, f1, f2, g0, g1, g2, j, x
+
+
+@njit(fastmath=CONTRACT)
+def prior_cost(light, t):  # type: ignore[no-untyped-def]
+    """Return -2 log p of a log shading; beyond the table its ends go on straight."""
+    prior, low, step = light
+    y = (t - low) / step
+    i = min(max(math.floor(y), 0), prior.shape[0] - 2)
+    return prior[i] + (y - i) * (prior[i + 1] - prior[i])
+
+
+@njit(fastmath=CONTRACT)
+def blood_cost(of_face, b):  # type: ignore[no-untyped-def]
+    """Return -2 log p of blood over the greatest p, its force on b, and its stiffness, >= 0.
+
+    `of_face`: mean, spread, height of the bell over that of any blood, part of the skin with any;
+    1 if there is no face.
+    """
+    away = (b - of_face[0]) / of_face[1]
+    bell = (1.0 - of_face[3]) * of_face[2] * math.exp(-0.5 * away * away)
+    whole = bell + of_face[3]
+    share = bell / whole
+    cost = 2.0 * math.log(((1.0 - of_face[3]) * of_face[2] + of_face[3]) / whole)
+    return cost, -share * away / of_face[1], share / (of_face[1] * of_face[1])
+
+
+@njit(fastmath=CONTRACT)
+def melanin_cost(of_face, k, x):  # type: ignore[no-untyped-def]
+    """Return -2 log p of melanin over the greatest p, a part x of the way past line k."""
+    y = x * NODES_PER_LINE
+    i = min(int(y), NODES_PER_LINE - 1)
+    i0 = k * NODES_PER_LINE + i
+    return of_face[i0] + (y - i) * (of_face[i0 + 1] - of_face[i0])
+
+
+@njit(fastmath=CONTRACT)
+def descend(log_rgb, by_b, k, b, seen, w, of_face):  # type: ignore[no-untyped-def]
+    """Return the blood on line k near which color and face are the most probable.
+
+    Also the last step that would be left, by how much blood is stiff there by the color and in
+    all, the residuals' products with the color's derivative and themselves, and residuals.
+    """
+    for turn in range(N_NEWTON_STEPS + 1):
+        f0, f1, f2, g0, g1, g2, j, x = color_at(log_rgb, by_b, k, b)
+        e0, e1, e2 = seen[0] - f0, seen[1] - f1, seen[2] - f2
+        by_color = quadratic_form(w, g0, g1, g2, g0, g1, g2) + 1e-9
+        pushed = quadratic_form(w, g0, g1, g2, e0, e1, e2)
+        _, force, stiff = blood_cost(of_face, b)
+        step = (pushed + force) / (by_color + stiff)
+        moved = min(max(b + min(max(step, -MAX_RIDGE_STEP), MAX_RIDGE_STEP), AXIS_BEGIN), 1.0) - b
+        if turn == N_NEWTON_STEPS or moved * moved * (by_color + stiff) < STEP_TOL * STEP_TOL:
+            break
+        b += moved
+    if step * step * (by_color + stiff) > ACCEPT_TOL * ACCEPT_TOL:
+        step = 0.0  # not found: what a parabola says of places that far off is worth nothing
+    return b, step, by_color, by_color + stiff, pushed, e0, e1, e2, g0, g1, g2, j, x
+
+
+@njit(fastmath=CONTRACT)
+def cost_after(w, s, found, of_face):  # type: ignore[no-untyped-def]
+    """Return blood, cost, the face's part of it and shading after the last step of `descend`.
+
+    Also whether it is held: a place at an end of the axis that would go on stays there.
+    """
+    b, step, by_color, _, pushed, e0, e1, e2, g0, g1, g2 = found[:11]
+    held = (b <= AXIS_BEGIN and step < 0.0) or (b >= 1.0 and step > 0.0)
+    square = quadratic_form(w, e0, e1, e2, e0, e1, e2)
+    after = b
+    if not held:
+        after = min(max(b + step, AXIS_BEGIN), 1.0)
+        square += step * (step * by_color - 2.0 * pushed)
+    more, _, _ = blood_cost(of_face, after)
+    shade = s[0] * e0 + s[1] * e1 + s[2] * e2
+    shade -= (s[0] * g0 + s[1] * g1 + s[2] * g2) * (after - b)
+    return after, max(square, 0.0) + more, more, shade, held
+
+
+@njit(fastmath=CONTRACT, error_model="numpy")
+def weights_of(d0, d1, d2, noise, model):  # type: ignore[no-untyped-def]
+    """Return the weights of relative errors of a color, brightness projected out, and its own.
+
+    The first is the upper triangle of a matrix of rank 2; the second tells a log brightness from
+    log residuals.
+    """
+    a00 = noise[0] / (d0 * d0) + model[0]
+    a11 = noise[1] / (d1 * d1) + model[3]
+    a22 = noise[2] / (d2 * d2) + model[5]
+    a01, a02, a12 = model[1], model[2], model[4]
+    c00, c01, c02 = a11 * a22 - a12 * a12, a02 * a12 - a01 * a22, a01 * a12 - a02 * a11
+    scale = 1.0 / (a00 * c00 + a01 * c01 + a02 * c02)
+    w0, w1, w2 = c00 * scale, c01 * scale, c02 * scale
+    w3 = (a00 * a22 - a02 * a02) * scale
+    w4 = (a01 * a02 - a00 * a12) * scale
+    w5 = (a00 * a11 - a01 * a01) * scale
+    s0, s1, s2 = w0 + w1 + w2, w1 + w3 + w4, w2 + w4 + w5
+    whole = s0 + s1 + s2
+    s0, s1, s2 = s0 / whole, s1 / whole, s2 / whole
+    w = (
+        w0 - s0 * s0 * whole,
+        w1 - s0 * s1 * whole,
+        w2 - s0 * s2 * whole,
+        w3 - s1 * s1 * whole,
+        w4 - s1 * s2 * whole,
+        w5 - s2 * s2 * whole,
+    )
+    return w, (s0, s1, s2)
+
+
+@njit(fastmath=CONTRACT, error_model="numpy")
+def follow(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, begin, ridge):  # type: ignore[no-untyped-def]
+    """Write the ridge, followed to both sides of where the fit ended."""
+    cost, slope, shade, face_cost = ridge.cost, ridge.slope, ridge.shade, ridge.face_cost
+    blood, blood_slope, second = ridge.blood, ridge.blood_slope, ridge.second
+    spread, pull = ridge.spread, ridge.pull
+    first = min(max(int((begin[0] - AXIS_BEGIN) / MELANIN_STEP + 0.5), 0), N_LINES - 1)
+    for side in range(2):
+        b = float64(begin[1])
+        if side == 1:
+            b = blood[first]
+        count = N_LINES - first if side == 0 else first
+        for index in range(count):
+            k = first + index if side == 0 else first - 1 - index
+            found = descend(log_rgb, by_b, k, b, seen, w, blood_of_face)
+            after, least, more, t, held = cost_after(w, s, found, blood_of_face)
+            b, second[k] = found[0], after
+            if abs(after - blood_of_face[0]) > 2.0 * blood_of_face[1]:
+                # the same melanin may have the color with blood that the face has
+                other = descend(log_rgb, by_b, k, blood_of_face[0], seen, w, blood_of_face)
+                o_after, o_least, o_more, o_t, o_held = cost_after(w, s, other, blood_of_face)
+                better = least + prior_cost(light, t)
+                better -= o_least + prior_cost(light, o_t)
+                if better > 0.0:
+                    second[k] = after if better < TAIL_COST else o_after
+                    found, after, least = other, o_after, o_least
+                    more, t, held = o_more, o_t, o_held
+                elif better > -TAIL_COST:
+                    second[k] = o_after
+            _, step, _, stiff, _, e0, e1, e2, g0, g1, g2, j, x = found
+            h0 = by_a[k, j, 0] + x * (by_a[k, j + 1, 0] - by_a[k, j, 0])
+            h1 = by_a[k, j, 1] + x * (by_a[k, j + 1, 1] - by_a[k, j, 1])
+            h2 = by_a[k, j, 2] + x * (by_a[k, j + 1, 2] - by_a[k, j, 2])
+            blood_slope[k] = 0.0 if held else -quadratic_form(w, h0, h1, h2, g0, g1, g2) / stiff
+            spread[k] = 1.0 / math.sqrt(stiff)
+            pull[k] = step if held else 0.0
+            cost[k], face_cost[k], blood[k] = least, more, after
+            o0, o1, o2 = e0, e1, e2
+            if not held:
+                o0, o1, o2 = e0 - g0 * step, e1 - g1 * step, e2 - g2 * step
+            slope[k] = -2.0 * quadratic_form(w, h0, h1, h2, o0, o1, o2)
+            shade[k] = t
