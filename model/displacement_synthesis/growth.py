@@ -73,8 +73,8 @@ def grow(
     threads : int
         Threads to use, 1 to 64; they do not change the result.
     **knobs
-        Of :func:`lay_out`: ``pixel_um``, ``patch_pixel_um``, ``wrap``, ``cell_px``,
-        ``overlap_px``, ``candidates``, ``range_px``, ``transition_px``.
+        Of :func:`lay_out`: ``pixel_um``, ``patch_pixel_um``, ``wrap``, ``cells_px``,
+        ``candidates``, ``range_px``, ``transition_px``.
 
     Returns
     -------
@@ -126,8 +126,7 @@ def lay_out(
     pixel_um: float | ArrayLike = 10.0,
     patch_pixel_um: float = 10.0,
     wrap: Wrap = "none",
-    cell_px: int | None = None,
-    overlap_px: int | None = None,
+    cells_px: tuple[int, int] | None = None,
     candidates: int = 16,
     range_px: float | None = None,
     transition_px: float = 256.0,
@@ -147,8 +146,8 @@ def lay_out(
         Side of the patches' pixels, um.
     wrap : {"none", "u", "both"}
         Where the map goes on at its other side: nowhere, left and right, or also above and below.
-    cell_px, overlap_px : int, optional
-        Distance of cells, and how much neighbours share, even, at most ``cell_px``, px of the
+    cells_px : (int, int), optional
+        Distance of cells, and how much neighbours share, even, at most the distance, px of the
         map. By default a quarter and a twelfth of the smallest patch, at most 192 and 64.
     candidates : int
         Windows tried a cell, >= 1. More make better cuts, and a map of what is cut best.
@@ -179,7 +178,7 @@ def lay_out(
     scales = check.numbers("pixel_um", pixel_um, (), ("h", "w"), interval="(0, inf)")
     sides = [min(np.shape(p), default=0) for each in by_site.values() for p in each]
     smallest = int(min(sides, default=0) * patch_pixel_um / scales.max())
-    grid = _grid(shape, smallest, cell_px, overlap_px, wrap)
+    grid = _grid(shape, smallest, cells_px, wrap)
     levels, zooms = _levels(scales, patch_pixel_um, grid)
     range_px = 0.375 * grid.overlap if range_px is None else float(range_px)
     check.within("range_px", range_px, "[0.5, 512]")
@@ -206,13 +205,13 @@ def _shape(size_px: int | tuple[int, int]) -> tuple[int, int]:
 
 
 def _grid(
-    shape: tuple[int, int], smallest: int, cell_px: int | None, overlap_px: int | None, wrap: Wrap
+    shape: tuple[int, int], smallest: int, cells_px: tuple[int, int] | None, wrap: Wrap
 ) -> CellGrid:
-    cell = max(8, min(192, smallest // 4)) if cell_px is None else int(cell_px)
-    overlap = max(4, min(64, cell // 3 // 2 * 2)) if overlap_px is None else int(overlap_px)
+    cell = max(8, min(192, smallest // 4))
+    cell, overlap = cells_px or (cell, max(4, min(64, cell // 3 // 2 * 2)))
     if not (4 <= overlap <= cell and overlap % 2 == 0):
         raise SynthesisError(
-            f"overlap_px: got {overlap}, expected an even number from 4 to cell_px = {cell}"
+            f"cells_px: got an overlap of {overlap}, expected an even number from 4 to {cell}"
         )
     wraps = (wrap == "both", wrap != "none")
     lines = []
@@ -331,6 +330,6 @@ def _allowance(sources: Sources, window: int) -> int:
         raise SynthesisError(
             f"patches: got holes of {100 * most / window**2:.0f} % of a window of {window} px even "
             f"in its best places, expected at most {100 * MAX_FILLED_FRACTION:.0f} %: give "
-            "patches with larger whole parts, or smaller cell_px, overlap_px"
+            "patches with larger whole parts, or smaller cells_px"
         )
     return most

@@ -179,7 +179,7 @@ def gather(
             largest = max(min(_scaled_shape(h.shape, zoom)) for h, _ in whole)
             raise SynthesisError(
                 f"{name}: got at most {largest} px a side at the result's scale, "
-                f"expected at least {window}: give larger patches or smaller cell_px, overlap_px"
+                f"expected at least {window}: give larger patches or smaller cells_px"
             )
         firsts.append(len(rows))
     heights, turned = np.empty(pixel, np.float32), np.empty(pixel, np.float32)

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -77,6 +77,10 @@ class Roughness:
     pixels: int
 
 
+Smoothing: TypeAlias = float | tuple[float, float] | Literal["wiener"]
+"""How moments are filtered, see :func:`from_patterns`."""
+
+
 def from_patterns(
     patterns: Mapping[Key, ArrayLike],
     *,
@@ -89,9 +93,7 @@ def from_patterns(
     alpha: float | Roughness | None = None,
     eta: float = ETA_SKIN,
     points_mm: ArrayLike | None = None,
-    smooth_px: float = 0.0,
-    smooth_crossed_px: float | None = None,
-    wiener: bool = False,
+    smoothing: Smoothing = 0.0,
     executor: Executor | None = None,
 ) -> NormalMaps:
     """Compute normals from pictures under a sphere's patterns.
@@ -126,16 +128,13 @@ def from_patterns(
     points_mm : array_like, shape (H, W, 2) or (H, W, 3), optional
         Where the pixels are on the patch, rig frame, with lights at a finite distance: directions
         to the lights then follow. Give `view` by pixel, too.
-    smooth_px : float
+    smoothing : float, (float, float) or "wiener"
         Standard deviation of a Gaussian that the moments are smoothed by before anything that is
-        not linear is done to them, px. The optics' own blur is a good choice; noise falls about
-        as 1 / (3.5 smooth_px).
-    smooth_crossed_px : float, optional
-        The same of the crossed pictures, where skin glows with less detail; default `smooth_px`.
-    wiener : bool
-        Filter the moments, instead, by what share of each spatial frequency is signal
-        (:mod:`reconstruction.gradient_normals.wiener`): as much as noise and optics ask for.
-        Standard errors then hold the detail that is lost, too.
+        not linear is done to them, px; of two numbers the second is that of the crossed images,
+        where skin glows with less detail. The optics' own blur is a good choice; noise falls about
+        as 1 / (3.5 px). "wiener" filters the moments by what share of each spatial frequency is
+        signal (:mod:`reconstruction.gradient_normals.wiener`): as much as noise and optics ask
+        for. Standard errors then hold the detail that is lost, too.
     executor : Executor, optional
         Threads to map tiles of rows over; default one thread a core, at most 8.
 
@@ -175,7 +174,8 @@ def from_patterns(
     True
     """
     Checks(GradientError).choice("component", component, ("specular", "diffuse"))
-    smooth = smooth_px, smooth_px if smooth_crossed_px is None else smooth_crossed_px
+    wiener = smoothing == "wiener"
+    smooth = (0.0, 0.0) if isinstance(smoothing, str) else tuple(np.broadcast_to(smoothing, 2))
     samples = PatternSamples(patterns, variance, valid, saturation)
 
     def normals_of(flat: PatternSamples) -> NormalMaps:

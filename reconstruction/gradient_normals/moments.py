@@ -189,7 +189,7 @@ def prepare(
     MissingPatterns
         Where a polarization, or patterns of it, are missing.
     """
-    Checks(GradientError).within("smooth_px, smooth_crossed_px", smooth_px, "[0, 100]")
+    Checks(GradientError).within("smoothing", smooth_px, "[0, 100]")
     wanted = ("parallel", "crossed") if component == "specular" else ("crossed",)
     for polarizer in wanted:
         if polarizer not in stacks:
@@ -238,7 +238,8 @@ def with_filter(reflection: Reflection) -> Reflection:
     """
     if not reflection.told:
         raise GradientError(
-            "wiener: noise is unknown, as no patterns are redundant; give variance, or smooth_px"
+            "wiener: noise is unknown, as no patterns are redundant; give variance, or a smoothing"
+            " in px"
         )
     height, width = reflection.shape
     two = reflection.component == "specular"

@@ -10,7 +10,8 @@ References
 Nagano et al. 2015, ACM Trans. Graph. 34(4), 109. doi:10.1145/2766894
 """
 
-from typing import Literal
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,6 +35,26 @@ BUCKET_LIMIT = 1.0
 """Buckets span all components of normals."""
 
 
+@dataclass(frozen=True, slots=True)
+class KernelSearch:
+    """How the grid is searched.
+
+    Attributes
+    ----------
+    method : {"hierarchical", "exhaustive"}
+        The first returns what the second does, but for a chance of 1e-6 (`kernel_fit.search`), in
+        a fraction of the time.
+    first_sample : int
+        Pixels that the hierarchical search begins with.
+    seed : int
+        Of its samples, and of the draws for the standard errors.
+    """
+
+    method: Literal["hierarchical", "exhaustive"] = "hierarchical"
+    first_sample: int = kernel_search.FIRST_SAMPLE
+    seed: int = 0
+
+
 def fit_kernel(
     neutral_height_um: ArrayLike,
     target_histogram: FloatArray,
@@ -42,15 +63,12 @@ def fit_kernel(
     axis: Axis,
     pixel_um: float | tuple[float, float],
     bins: int = 64,
-    search: Literal["hierarchical", "exhaustive"] = "hierarchical",
+    search: KernelSearch = KernelSearch(),
     stretch_across: float = 1.0,
     valid: ArrayLike | None = None,
     target_samples: float | None = None,
     target_blocks: NDArray[np.integer] | None = None,
-    alphas: ArrayLike | None = None,
-    sigmas_um: ArrayLike | None = None,
-    first_sample: int = kernel_search.FIRST_SAMPLE,
-    seed: int = 0,
+    grid: tuple[ArrayLike, ArrayLike] = (ALPHA_GRID, SIGMAS_UM),
 ) -> KernelFit:
     """Fit the kernel of one axis and stretch ratio: eq. (7).
 
@@ -70,9 +88,8 @@ def fit_kernel(
         Side of a neutral pixel, or its height and width, um.
     bins : int
         As of `normal_histogram.histogram`.
-    search : {"hierarchical", "exhaustive"}
-        The first returns what the second does, but for a chance of 1e-6 (`kernel_search`), in a
-        fraction of the time.
+    search : KernelSearch
+        How the grid is searched.
     stretch_across : float
         Ratio of lengths across the axis; 1 as in the paper.
     valid : ndarray of bool, shape (H, W), optional
@@ -83,12 +100,9 @@ def fit_kernel(
         Where the target is of the same piece of skin: its counts in the skin of each block of the
         neutral map (`normal_blocks.grid_of`, `normal_blocks.block_counts`), for standard errors
         only.
-    alphas, sigmas_um : array_like, optional
-        Another grid than the paper's, increasing; alphas within [-2, 1], sigmas > 0.
-    first_sample : int
-        Pixels that the hierarchical search begins with.
-    seed : int
-        Of its samples, and of the draws for the standard errors.
+    grid : (array_like, array_like)
+        Strengths alpha, increasing, within [-2, 1], and standard deviations, um, increasing, > 0;
+        the paper's by default.
 
     Returns
     -------
@@ -113,25 +127,24 @@ def fit_kernel(
         stretch_across=stretch_across,
         valid=valid,
     )
-    grid = KernelGrid(
+    tried = KernelGrid(
         relief,
         Buckets(target, bins, BUCKET_LIMIT),
-        _grid("alphas", ALPHA_GRID if alphas is None else alphas, str(list(ALPHA_LIMITS))),
-        _grid("sigmas_um", SIGMAS_UM if sigmas_um is None else sigmas_um, "[1e-9, inf)"),
+        _grid("alphas", grid[0], str(list(ALPHA_LIMITS))),
+        _grid("sigmas_um", grid[1], "[1e-9, inf)"),
     )
-    check.choice("search", search, ("hierarchical", "exhaustive"))
-    check.within("first_sample", first_sample, "[2, inf)")
+    check.choice("search", search.method, ("hierarchical", "exhaustive"))
+    check.within("first_sample", search.first_sample, "[2, inf)")
     check.within("target_samples", 1 if target_samples is None else target_samples, "(0, inf]")
     blocks = _blocks(target_blocks, relief, bins, transposed=axis in ("y", 0))
-    rng = np.random.default_rng(seed)
-    if search == "exhaustive":
-        found = kernel_search.exhaustive(grid)
+    rng = np.random.default_rng(search.seed)
+    if search.method == "exhaustive":
+        found = kernel_search.exhaustive(tried)
     else:
-        found = kernel_search.hierarchical(grid, first_sample=first_sample, rng=rng)
+        found = kernel_search.hierarchical(tried, first_sample=search.first_sample, rng=rng)
+    behind: dict[str, Any] = {"target_samples": target_samples, "target_blocks": blocks}
     with kernels.threads_for(500 * relief.places.size):
-        return summarize_search(
-            grid, found, search=search, target_samples=target_samples, target_blocks=blocks, rng=rng
-        )
+        return summarize_search(tried, found, search=search.method, **behind, rng=rng)
 
 
 def _grid(name: str, values: ArrayLike, interval: str) -> Float64Array:

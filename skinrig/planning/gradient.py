@@ -96,7 +96,7 @@ def predict(observation: Observation, setting: Setting) -> Prediction:
     alpha = estimate_roughness(
         values, lights=known["lights"], view=known["view"], variance=variance, smooth_px=SMOOTH_PX
     )
-    found = from_patterns(values, variance=variance, wiener=True, alpha=alpha, **known)
+    found = from_patterns(values, variance=variance, smoothing="wiener", alpha=alpha, **known)
     inner = (slice(BORDER_PX, -BORDER_PX),) * 2
     valid = np.asarray(found.valid)[inner]
     tilt = np.asarray(found.stderr_rad, np.float64)[inner][valid] / math.sqrt(2.0)

@@ -104,7 +104,7 @@ def test_normals_of_skin_at_the_rigs_noise_are_within_one_and_a_half_degrees():
     view = scene.rig.views[0]
     noise = SensorNoise(1.0 / view.full_well_e, (view.read_noise_e / view.full_well_e) ** 2)
     options = {"lights": lights_of(sphere), "variance": noise, **geometry(side)}
-    found = from_patterns(images, wiener=True, **options)
+    found = from_patterns(images, smoothing="wiener", **options)
     error = mean_error_deg(found, seen)
     assert error <= 1.5
     # as announced: the root mean square of an error is 1.13 times its mean where it is Gaussian;
@@ -116,4 +116,4 @@ def test_normals_of_skin_at_the_rigs_noise_are_within_one_and_a_half_degrees():
     assert mean_error_deg(found, sharp) < np.hypot(1.5, blurred) + 0.5
     # it can fail: pixel by pixel, and with a sphere as nobody built it
     assert mean_error_deg(from_patterns(images, **options), seen) > 1.5
-    assert mean_error_deg(from_patterns(images, wiener=True), seen) > 1.5
+    assert mean_error_deg(from_patterns(images, smoothing="wiener"), seen) > 1.5

@@ -113,8 +113,8 @@ def test_a_state_without_a_pattern_still_has_normals(captured, tmp_path):
     from reconstruction.gradient_normals import from_patterns
 
     some = {key: value for key, value in patterns.values.items() if key[0] != "-x"}
-    found = from_patterns(some, variance=dict(patterns.variance), smooth_px=1.0)
-    whole = from_patterns(patterns.values, variance=dict(patterns.variance), smooth_px=1.0)
+    found = from_patterns(some, variance=dict(patterns.variance), smoothing=1.0)
+    whole = from_patterns(patterns.values, variance=dict(patterns.variance), smoothing=1.0)
     assert found.valid.mean() > 0.95
     assert np.median(found.stderr_rad) > np.median(whole.stderr_rad)
 
@@ -167,8 +167,7 @@ def test_a_kernel_halves_the_distance_of_the_true_histograms_at_every_step():
             axis="x",
             pixel_um=pixel_um,
             stretch_across=state.stretch_t,
-            alphas=ALPHA_GRID[::5],
-            sigmas_um=SIGMAS_UM[::5],
+            grid=(ALPHA_GRID[::5], SIGMAS_UM[::5]),
         )
         assert fit.distance <= 0.5 * fit.distance_before, (r, fit.distance, fit.distance_before)
         assert (fit.alpha > 0) == (r > 1)

@@ -47,12 +47,7 @@ def test_kernels_of_small_patches_hold_those_of_the_skin_they_are_of():
     if both maps were taken for different skin.
     Tolerance: two deviations of 24 independent pieces; pieces and states of a skin are alike.
     """
-    grid = {
-        "alphas": ALPHA_GRID[::3],
-        "sigmas_um": SIGMAS_UM[::3],
-        "axis": "x",
-        "pixel_um": PIXEL_UM,
-    }
+    grid = {"grid": (ALPHA_GRID[::3], SIGMAS_UM[::3]), "axis": "x", "pixel_um": PIXEL_UM}
     held, held_95, narrower = [], [], []
     for seed in range(520, 532):
         skin = make_micro_skin(SITES[seed % 3], seed=seed, size_mm=3.4)

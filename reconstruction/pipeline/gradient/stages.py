@@ -17,6 +17,7 @@ from model.skin import MAP_UNITS, SkinMap
 from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.gradient_normals import Roughness, estimate_roughness, from_patterns
+from reconstruction.gradient_normals.estimation import Smoothing
 from reconstruction.gradient_normals.sphere_lights import SphereLights
 from reconstruction.normal_histogram.statistics import NormalStatistics
 from reconstruction.normal_integration import HeightMap, integrate_map, relief_errors
@@ -218,8 +219,7 @@ def _patterns_normals(
     patterns: Patterns,
     component: Literal["specular", "diffuse"],
     *,
-    smooth_px: float = 0.0,
-    wiener: bool = False,
+    smoothing: Smoothing = (0.0, CROSSED_SMOOTH_PX),
     alpha: Roughness | None = None,
 ) -> NormalMaps:
     shape = patterns.shape
@@ -231,9 +231,7 @@ def _patterns_normals(
         valid=patterns.valid,
         lights=rig.lights,
         points_mm=rig.points_mm(shape),
-        smooth_px=smooth_px,
-        smooth_crossed_px=None if wiener or component == "diffuse" else CROSSED_SMOOTH_PX,
-        wiener=wiener,
+        smoothing=smoothing,
         alpha=alpha,
     )
 
@@ -257,7 +255,7 @@ def _normals(rig: Rig, state: SkinState, _facets: Roughness) -> Mapping[str, Any
     """Return normals as the lens shows them, and the slopes of the surface before the lens."""
     patterns = rig.images.of(state)
     skin = skin_mask(patterns.crossed())
-    smooth = _patterns_normals(rig, patterns, "specular", wiener=True, alpha=_facets)
+    smooth = _patterns_normals(rig, patterns, "specular", smoothing="wiener", alpha=_facets)
     sharp = _patterns_normals(rig, patterns, "specular", alpha=_facets)
     # noise takes single pixels of steep furrows beyond what a lobe can tell; a hole there would cut
     # the height, so that the filtered normal stands in
@@ -273,7 +271,7 @@ def _normals(rig: Rig, state: SkinState, _facets: Roughness) -> Mapping[str, Any
 
 def _diffuse(rig: Rig) -> SkinMap:
     patterns = rig.images.of(rig.images.neutral)
-    found = _patterns_normals(rig, patterns, "diffuse", smooth_px=DIFFUSE_SMOOTH_PX)
+    found = _patterns_normals(rig, patterns, "diffuse", smoothing=DIFFUSE_SMOOTH_PX)
     what = "of the light from inside the skin, which spreads over tenths of a millimetre"
     return _normal_map(found, skin_mask(patterns.crossed()), what)
 

@@ -237,8 +237,7 @@ def fit_kernels(
             pixel_um=pixel_um,
             valid=inside,
             stretch_across=each.stretch_t[0],
-            alphas=ALPHA_GRID[::every],
-            sigmas_um=SIGMAS_UM[::every],
+            grid=(ALPHA_GRID[::every], SIGMAS_UM[::every]),
             target_samples=target.effective_samples,
             target_blocks=_skin_blocks(each, strained, pixel_um=pixel_um, there=there),
         )

@@ -153,7 +153,7 @@ def normals(stage: Stage) -> None:
     def add(knobs: Knobs, images: Images, **options: Any) -> float:
         def error(found: NormalMaps) -> BandError:
             outcome = _judged(found.normals, found.valid, patch.seen)
-            if "variance" not in options or {"wiener", "smooth_px"} & set(options):
+            if "variance" not in options or "smoothing" in options:
                 return outcome
             # weighted least squares reaches it; the mean of a Rayleigh error over its RMS is 0.886
             rms = float(np.degrees(np.sqrt(np.pi) / 2 * found.stderr_rad[found.valid].mean()))
@@ -169,7 +169,7 @@ def normals(stage: Stage) -> None:
         "8": ("full", "x", "y", "z"),
         "8, x and -x": ("x", "-x", "y", "z"),
     }
-    base = {**corrections, "variance": patch.noise, "wiener": True}
+    base = {**corrections, "variance": patch.noise, "smoothing": "wiener"}
     worst = 0.0
     for label, names in subsets.items():
         some = {key: image for key, image in noisy.items() if key[0] in names}
@@ -180,9 +180,9 @@ def normals(stage: Stage) -> None:
     plain = {**corrections, "variance": patch.noise}
     add({"patterns": "16", "filter": "none"}, noisy, **plain)
     for sigma in (1.0,) if stage.toy else (0.7, 1.0, 1.5):
-        add({"patterns": "16", "filter": "Gaussian", "px": sigma}, noisy, smooth_px=sigma, **plain)
+        add({"patterns": "16", "filter": "Gaussian", "px": sigma}, noisy, smoothing=sigma, **plain)
     knobs: Knobs = {"patterns": "16", "filter": "Wiener", "lights": "ideal"}
-    add(knobs, noisy, variance=patch.noise, wiener=True)
+    add(knobs, noisy, variance=patch.noise, smoothing="wiener")
     add({"patterns": "16", "noise": "none"}, patch.images, **corrections)
     add({"patterns": "16", "noise": "none", "lights": "ideal"}, patch.images)
     stage.on_each_skin(lambda band: _on_skin(patch, band))
@@ -207,7 +207,7 @@ def _on_skin(patch: Patch, band: MelaninBand) -> BandError:
         exposed(seen, np.random.default_rng(0)),
         lights=patch.lights,
         variance=patch.noise,
-        wiener=True,
+        smoothing="wiener",
         **patch.geometry,
     )
     return _judged(found.normals, found.valid, patch.seen)

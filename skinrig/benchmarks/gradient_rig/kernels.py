@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import numba
 import numpy as np
@@ -107,8 +107,9 @@ def search(stage: Stage) -> None:
     def fit(
         way: Literal["hierarchical", "exhaustive"], part: int, first: int, thin: int = 1
     ) -> kernel_outcome.KernelFit:
-        grid: dict[str, Any] = {"alphas": alphas[::thin], "sigmas_um": sigmas[::thin]}
-        return _fitted(height[:part, :part], target, search=way, first_sample=first, **grid)
+        asked = kernel_fit.KernelSearch(way, first)
+        grid = alphas[::thin], sigmas[::thin]
+        return _fitted(height[:part, :part], target, search=asked, grid=grid)
 
     best = fit("exhaustive", side, 2)
     whole = _grid_of(height, target)

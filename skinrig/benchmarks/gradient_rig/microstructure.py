@@ -91,8 +91,7 @@ def fitted_table(
                 stretch=r,
                 axis="x",
                 pixel_um=TEXEL_UM,
-                alphas=SEARCHED_ALPHAS[::every],
-                sigmas_um=SEARCHED_SIGMAS_UM[::every],
+                grid=(SEARCHED_ALPHAS[::every], SEARCHED_SIGMAS_UM[::every]),
             )
             found.append((r, fit.alpha, fit.sigma_um))
     r, alpha, sigma = np.array(found).T

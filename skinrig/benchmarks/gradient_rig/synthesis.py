@@ -120,9 +120,7 @@ def growth(stage: Stage) -> None:
         efforts = [(64, 32, 16), (96, 32, 16), (128, 64, 16), *((192, 64, n) for n in (1, 16, 64))]
         efforts += [(256, 64, 16), (256, 128, 16)]
     for cell, overlap, tried in efforts:
-        grow = partial(
-            displacement_synthesis.grow, cell_px=cell, overlap_px=overlap, candidates=tried
-        )
+        grow = partial(displacement_synthesis.grow, cells_px=(cell, overlap), candidates=tried)
         timing, grown = stage.time(
             lambda: grow(patches, side, rng=np.random.default_rng(1)),
             repeats=1,

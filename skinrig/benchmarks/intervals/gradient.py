@@ -165,7 +165,6 @@ def kernel_of_skin(site: str, *, seed: int, stretch: float, pixel_um: float) -> 
         stretch_across=float(strained.gradient[1, 1]),
         axis="x",
         pixel_um=pixel_um,
-        alphas=ALPHA_GRID[::COARSE_GRID_STEP],
-        sigmas_um=SIGMAS_UM[::COARSE_GRID_STEP],
+        grid=(ALPHA_GRID[::COARSE_GRID_STEP], SIGMAS_UM[::COARSE_GRID_STEP]),
         target_samples=target.effective_samples,
     )

@@ -505,7 +505,7 @@ def test_saturated_samples_are_left_out_and_the_others_tell_the_normal(scene):
         np.testing.assert_array_equal(clipped[key], image)
 
 
-@pytest.mark.parametrize("options", [{}, {"smooth_px": 1.5}, {"wiener": True}])
+@pytest.mark.parametrize("options", [{}, {"smoothing": 1.5}, {"smoothing": "wiener"}])
 def test_a_mask_of_one_pixel_and_pictures_full_of_nan_are_survived(scene, options):
     lights, normals, images = scene
     valid = np.zeros((48, 48), bool)
@@ -538,7 +538,7 @@ def test_lobes_beyond_the_horizon_are_no_normals():
     assert_clean(found)
 
 
-@pytest.mark.parametrize("options", [{"smooth_px": 1.5}, {"wiener": True}])
+@pytest.mark.parametrize("options", [{"smoothing": 1.5}, {"smoothing": "wiener"}])
 def test_filters_lower_noise_as_they_say_and_keep_smooth_relief(rng, options):
     lights = sphere()
     h = gaussian_filter(rng.standard_normal((96, 96)), 18.0, mode="wrap")
@@ -563,7 +563,7 @@ def test_filters_lower_noise_as_they_say_and_keep_smooth_relief(rng, options):
 
 def test_tiles_of_rows_make_no_seams(scene, monkeypatch):
     lights, _, images = scene
-    kwargs = {"lights": SphereLights(lights), "alpha": 0.2, "smooth_px": 1.0, "variance": 1e-8}
+    kwargs = {"lights": SphereLights(lights), "alpha": 0.2, "smoothing": 1.0, "variance": 1e-8}
     whole = from_patterns(images, **kwargs)
     monkeypatch.setattr("reconstruction.gradient_normals.moments.TILE_PIXELS", 48 * 7)
     tiled = from_patterns(images, **kwargs)
@@ -608,7 +608,7 @@ def test_what_does_not_fit_is_refused_by_name(scene):
     with pytest.raises(GradientError, match="finite distance"):
         from_patterns(images, lights=told, points_mm=np.zeros((48, 48, 2)))
     with pytest.raises(GradientError, match="noise is unknown"):
-        from_patterns(only(images, ("full", "x", "y", "z")), wiener=True)
+        from_patterns(only(images, ("full", "x", "y", "z")), smoothing="wiener")
     with pytest.raises(SphereLightsError, match="exchanged"):
         SphereLights(lights, leakage=np.full(len(lights), 1.2))
     with pytest.raises(SphereLightsError, match=r"directions\[2\]"):

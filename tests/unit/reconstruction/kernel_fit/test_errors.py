@@ -106,9 +106,8 @@ def strained_pair(rng, side=96):
 TOLD = {
     "stretch": 1.0,
     "pixel_um": 6.0,
-    "alphas": ALPHAS,
-    "sigmas_um": SIGMAS_UM,
-    "search": "exhaustive",
+    "grid": (ALPHAS, SIGMAS_UM),
+    "search": kernel_fit.KernelSearch("exhaustive"),
 }
 
 

@@ -5,12 +5,13 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from model.microstructure.kernel_table import gaussian_weights
 from reconstruction import normal_histogram as nh
 from reconstruction.kernel_fit import search as ks
-from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM, fit_kernel
+from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM, KernelSearch, fit_kernel
 from reconstruction.kernel_fit.neutral_relief import KernelFitError, convolved, relief_of
 from reconstruction.normal_histogram import kernels
 
 PIXEL_UM = 6.0
-COARSE = {"alphas": np.round(np.arange(-2, 1.01, 0.1), 2), "sigmas_um": np.arange(2.0, 81.0, 3.0)}
+COARSE_GRID = np.round(np.arange(-2, 1.01, 0.1), 2), np.arange(2.0, 81.0, 3.0)
+COARSE = {"grid": COARSE_GRID}
 
 
 def skin(side, rng, *, slope=0.3):
@@ -65,10 +66,8 @@ def test_a_known_kernel_comes_back_to_the_grid_point(rng, alpha, sigma_um, stret
     target = scipy_target(
         height, alpha, sigma_um, stretch=stretch, axis=1 if axis in ("x", 1) else 0
     )
-    near = {
-        "alphas": ALPHA_GRID[(np.abs(ALPHA_GRID - alpha) < 0.25)],
-        "sigmas_um": SIGMAS_UM[np.abs(SIGMAS_UM - sigma_um) < 10],
-    }
+    alphas = ALPHA_GRID[(np.abs(ALPHA_GRID - alpha) < 0.25)]
+    near = {"grid": (alphas, SIGMAS_UM[np.abs(SIGMAS_UM - sigma_um) < 10])}
     fit = fit_kernel(height, target, stretch=stretch, axis=axis, pixel_um=PIXEL_UM, **near)
     assert (fit.alpha, fit.sigma_um) == (alpha, sigma_um)
     assert fit.valid
@@ -88,7 +87,7 @@ def unlike(height, rng):
     return blurred + rng.uniform(0.05, 0.3) * rng.standard_normal(height.shape)
 
 
-def compared(rng, side, first_sample, **grid):
+def compared(rng, side, first_sample, grid=(ALPHA_GRID, SIGMAS_UM)):
     """Return the results of both searches for one random case."""
     height = skin(side, rng, slope=rng.uniform(0.1, 0.4))
     stretch, axis = rng.uniform(0.73, 1.28), ("x", "y")[int(rng.integers(2))]
@@ -102,8 +101,7 @@ def compared(rng, side, first_sample, **grid):
     relief = relief_of(height, stretch=stretch, axis=axis, pixel_um=PIXEL_UM)
     flat = (target.T if axis == "y" else target).reshape(-1)
     buckets = ks.Buckets(np.append(flat, 0.0), 64, 1.0)
-    alphas, sigmas = grid.get("alphas", ALPHA_GRID), grid.get("sigmas_um", SIGMAS_UM)
-    kernels_tried = ks.KernelGrid(relief, buckets, alphas, sigmas)
+    kernels_tried = ks.KernelGrid(relief, buckets, *grid)
     full = ks.exhaustive(kernels_tried)
     part = ks.hierarchical(kernels_tried, first_sample=first_sample, rng=rng)
     return full, part
@@ -130,8 +128,8 @@ def test_ten_random_cases_agree_with_the_exhaustive_search():
     rng = np.random.default_rng(7)
     for case in range(11):
         i, j, step = (*rng.integers(4, size=2), 4) if case else (0, 0, 1)
-        grid = {"alphas": ALPHA_GRID[i::step], "sigmas_um": SIGMAS_UM[j::step]}
-        full, part = compared(rng, 200, 4096, **grid)
+        grid = ALPHA_GRID[i::step], SIGMAS_UM[j::step]
+        full, part = compared(rng, 200, 4096, grid)
         assert part.best == full.best
         assert not part.exact.all()
 
@@ -142,7 +140,7 @@ def test_no_kernel_is_dropped_that_is_better_than_its_bound(rng):
     target = nh.histogram(unlike(height, rng), pixel=PIXEL_UM)
     relief = relief_of(height, stretch=1.0, axis="x", pixel_um=PIXEL_UM)
     buckets = ks.Buckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
-    grid = ks.KernelGrid(relief, buckets, COARSE["alphas"], COARSE["sigmas_um"])
+    grid = ks.KernelGrid(relief, buckets, *COARSE_GRID)
     full = ks.exhaustive(grid)
     race = ks._Race(grid)
     race.run([2048, 8192], rng)
@@ -157,7 +155,13 @@ def test_results_do_not_depend_on_the_number_of_threads(rng, monkeypatch):
     for parts in (1, 2, 7):
         monkeypatch.setattr(kernels, "threads", lambda parts=parts: parts)
         fit = fit_kernel(
-            height, target, stretch=0.9, axis="x", pixel_um=PIXEL_UM, first_sample=1024, **COARSE
+            height,
+            target,
+            stretch=0.9,
+            axis="x",
+            pixel_um=PIXEL_UM,
+            search=KernelSearch(first_sample=1024),
+            **COARSE,
         )
         found.append((fit.alpha, fit.sigma_um, fit.distance, fit.alpha_stderr, fit.passes))
     assert found[0] == found[1] == found[2]
@@ -222,7 +226,7 @@ def test_a_flat_patch_has_no_kernel():
     assert fit.alpha == 0.0
     assert fit.distance == 0.0
     assert np.isinf([fit.alpha_stderr, fit.sigma_stderr_um]).all()
-    assert len(fit.near_best) == COARSE["alphas"].size * COARSE["sigmas_um"].size
+    assert len(fit.near_best) == COARSE_GRID[0].size * COARSE_GRID[1].size
 
 
 def test_one_bucket_that_holds_everything_tells_nothing(rng):
@@ -253,8 +257,7 @@ def test_sigma_far_below_a_pixel_is_a_tie_that_goes_to_the_gentlest_kernel(rng):
         stretch=1.0,
         axis="x",
         pixel_um=PIXEL_UM,
-        alphas=np.array([-2.0, -0.5, 0.3, 1.0]),
-        sigmas_um=np.array([0.2, 0.4, 30.0]),
+        grid=([-2.0, -0.5, 0.3, 1.0], [0.2, 0.4, 30.0]),
     )
     assert (fit.alpha, fit.sigma_um, fit.distance) == (0.3, 0.2, 0.0)
     ties = fit.near_best[fit.near_best[:, 2] == 0.0]
@@ -292,7 +295,7 @@ def test_tiny_maps_are_fitted_but_called_aliased(rng):
 def test_a_finer_minimum_than_the_grid_is_refined(rng):
     height = skin(128, rng)
     target = scipy_target(height, -0.843, 18.2, stretch=0.9, axis=1)
-    near = {"alphas": ALPHA_GRID[100:140], "sigmas_um": SIGMAS_UM[28:42]}
+    near = {"grid": (ALPHA_GRID[100:140], SIGMAS_UM[28:42])}
     fit = fit_kernel(height, target, stretch=0.9, axis="x", pixel_um=PIXEL_UM, **near)
     assert fit.distance_refined < fit.distance
     assert abs(fit.alpha_refined + 0.843) <= 0.006
@@ -307,7 +310,7 @@ def test_standard_errors_tell_how_far_another_patch_is_off(rng):
     0.2...2.6 in 99.7 % when the standard errors are right; the factor of 2 beyond it is for
     their own scatter.
     """
-    grid = {"alphas": np.round(np.arange(-1.6, 0.01, 0.05), 2), "sigmas_um": np.arange(8.0, 41, 2)}
+    grid = {"grid": (np.round(np.arange(-1.6, 0.01, 0.05), 2), np.arange(8.0, 41, 2))}
     pulls = []
     for _ in range(10):
         other = convolved(skin(128, rng), -0.8, 20.0, axis="x", pixel_um=PIXEL_UM)
@@ -330,10 +333,10 @@ def test_settings_that_do_not_fit_are_refused(rng):
         ({"stretch": 0.0}, "stretch"),
         ({"stretch": np.nan}, "stretch"),
         ({"axis": "z"}, "axis"),
-        ({"search": "fast"}, "search"),
+        ({"search": KernelSearch("fast")}, "search"),
         ({"bins": 32}, "target_histogram"),
-        ({"alphas": [0.5, 0.2]}, "alphas"),
-        ({"sigmas_um": [0.0, 2.0]}, "sigmas_um"),
+        ({"grid": ([0.5, 0.2], [2.0])}, "alphas"),
+        ({"grid": ([0.5], [0.0, 2.0])}, "sigmas_um"),
     ):
         with pytest.raises(KernelFitError, match=word):
             fit_kernel(height, target, **{**good, **change})

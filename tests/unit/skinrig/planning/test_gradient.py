@@ -106,7 +106,7 @@ def test_normals_are_reconstructed_from_four_patterns_as_well_as_is_forecast(rig
         variance=variance,
         smooth_px=1.0,
     )
-    made = from_patterns(values, variance=variance, wiener=True, alpha=alpha, **look.known)
+    made = from_patterns(values, variance=variance, smoothing="wiener", alpha=alpha, **look.known)
     inner = (slice(6, -6),) * 2
     cosine = np.sum(made.normals[inner] * look.seen[inner], axis=-1)
     error = np.arccos(np.clip(cosine, -1.0, 1.0))[made.valid[inner]]
