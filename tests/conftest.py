@@ -51,6 +51,11 @@ def draw_once(nothing):
     """Have Hypothesis register its generator: it asks the collector who refers to that."""
 
 
+def pytest_xdist_auto_num_workers():
+    """One process more than there are cores: tests on real lines and of other processes wait."""
+    return (os.cpu_count() or 1) + 1
+
+
 def pytest_configure(config):
     if not hasattr(config, "workerinput"):  # before any process of several compiles
         remove_stale_kernels()

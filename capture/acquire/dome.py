@@ -40,8 +40,9 @@ MIN_DARK_GAP_S = 1.1
 DOME_LEASE_S = 2.0
 
 
-def run_dome(run: CaptureRun, box: DomeBox) -> Acquired:
+def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> Acquired:
     """Capture what the session still lacks of a plan of the dome; see `run_plan`."""
+    box: DomeBox = boxes["dome"]
     check_safety(run.plan, run.rig, eyes=run.eyes)
     _check_box(run.plan, run.rig, box.limits)
     for name, camera in run.cameras.items():

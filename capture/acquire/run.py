@@ -1,21 +1,16 @@
 """Run a plan on the rig that it is for."""
 
 from collections.abc import Callable, Mapping
+from importlib import import_module
 from typing import Any
 
-from capture.acquire.dome import run_dome
-from capture.acquire.flash.run import run_flash
-from capture.acquire.gradient.run import run_gradient
 from capture.acquire.outcome import Acquired, AcquisitionError, CaptureRun, Operator
-from capture.acquire.probe.run import run_probe
 from capture.devices.camera import Camera, check_serials
 from capture.devices.led_box import Eyes
 from capture.plan import Plan
+from capture.plan.rig_kinds import RIG_KINDS, kind_of
 from capture.rig import Rig
 from capture.session import Session
-
-RIG_KINDS = ("gradient_sphere", "dome", "probe", "flash")
-"""Boxes by which a rig is known."""
 
 
 def run_plan(
@@ -69,25 +64,15 @@ def run_plan(
         When the operator said so.
     """
     plan.check(rig)
-    kind = next(name for name in RIG_KINDS if name in rig.boxes or name == "flash")
-    if kind not in boxes:
-        raise AcquisitionError(f"box {kind!r}: no port was given; add --port {kind}=URL")
+    kind = kind_of(rig)
+    if (box := RIG_KINDS[kind].box) not in boxes:
+        raise AcquisitionError(f"box {box!r}: no port was given; add --port {box}=URL")
     check_serials(cameras, [(view.name, view.serial) for view in rig.views])
-    run = CaptureRun(
-        plan,
-        rig,
-        cameras,
-        session,
-        operator or Operator(),
-        eyes=eyes,
-        force_limit_n=force_limit_n,
-        all_brackets=all_brackets,
-    )
-    if kind == "gradient_sphere":
-        return run_gradient(run, boxes)
-    runners: dict[str, Callable[[CaptureRun, Any], Acquired]] = {
-        "dome": run_dome,
-        "probe": run_probe,
-        "flash": run_flash,
+    asked: dict[str, Any] = {
+        "eyes": eyes,
+        "force_limit_n": force_limit_n,
+        "all_brackets": all_brackets,
     }
-    return runners[kind](run, boxes[kind])
+    run = CaptureRun(plan, rig, cameras, session, operator or Operator(), **asked)
+    acquire: Callable[..., Acquired] = import_module(f"capture.acquire.{kind}").acquire
+    return acquire(run, boxes)

@@ -5,64 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
-from importlib import metadata
+from importlib import import_module, metadata
 from pathlib import Path
 
+from capture.plan.rig_kinds import RIG_KINDS
 from capture.session import Session
 from model import store
 from model.checks import Checks
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.inputs import DomeOptions, Inputs, InputsError
-
-
-@dataclass(frozen=True, slots=True)
-class Recipe:
-    """What sessions of one kind can be made into."""
-
-    maps: tuple[str, ...]
-    """Names of the maps."""
-    graph: Callable[[Inputs], list[stages.Stage]]
-    files: tuple[str, ...] = ()
-    """Names of what is no map and goes along: meshes, tables."""
-    always: tuple[str, ...] = ()
-    """What the other maps mean nothing without."""
-    products: Callable[[Session], Mapping[str, tuple[str, ...]]] | None = None
-    """Where a name stands for more than itself, as for a map of each state: what for, by name."""
-    maps_of_rank: Callable[[int], tuple[str, ...]] | None = None
-    """Names of the maps where the number of lobes is chosen; None: this kind fits none."""
-
-    def expand(self, session: Session, want: Sequence[str]) -> list[str]:
-        """Return the maps and files that the wanted names stand for."""
-        meant = {} if self.products is None else self.products(session)
-        return [product for name in want for product in meant.get(name, (name,))]
-
-
-def _flash() -> Recipe:
-    from reconstruction.pipeline.flash import sequence
-
-    names = sequence.MAP_NAMES, sequence.graph, sequence.FILE_NAMES
-    return Recipe(*names, products=sequence.products)
-
-
-def _dome() -> Recipe:
-    from reconstruction.pipeline.dome import stages as dome
-
-    names = dome.MAP_NAMES, dome.graph, dome.FILE_NAMES
-    return Recipe(*names, ("position",), maps_of_rank=dome.maps_of)
-
-
-def _gradient() -> Recipe:
-    from reconstruction.pipeline.gradient import stages as gradient
-
-    names = gradient.MAP_NAMES, gradient.graph, gradient.FILE_NAMES
-    return Recipe(*names, products=gradient.products)
-
-
-def _probe() -> Recipe:
-    from reconstruction.pipeline.probe import stages as probe
-
-    return Recipe(probe.MAP_NAMES, probe.graph, probe.FILE_NAMES, products=probe.products)
+from reconstruction.pipeline.recipe import Recipe
 
 
 def light_list() -> Recipe:
@@ -70,16 +23,6 @@ def light_list() -> Recipe:
     from reconstruction.pipeline import light_stack
 
     return Recipe(light_stack.MAP_NAMES, light_stack.graph)
-
-
-# kernels are compiled when a module is first imported: each rig imports its own only
-RECIPE_OF_STEP: Mapping[str, Callable[[], Recipe]] = {
-    "subject": _flash,
-    "olat": _dome,
-    "gradient": _gradient,
-    "fibres": _probe,
-}
-"""By the kind of step that shows the subject."""
 
 
 def recipe_of(session: Session) -> Recipe:
@@ -93,12 +36,15 @@ def recipe_of(session: Session) -> Recipe:
     if "light_list" in session.manifest.extra:
         return light_list()
     kinds = {step.kind for step in session.plan.steps}
-    for kind, recipe in RECIPE_OF_STEP.items():
-        if kind in kinds:
-            return recipe()
+    for rig, kind in RIG_KINDS.items():
+        if kind.subject_step in kinds:
+            # kernels are compiled when a module is first imported: each rig imports its own only
+            recipe: Recipe = import_module(f"reconstruction.pipeline.{rig}.recipe").RECIPE
+            return recipe
+    shown = " or ".join(kind.subject_step for kind in RIG_KINDS.values())
     raise InputsError(
         f"{session.path}: shows {', '.join(sorted(kinds))}, expected steps of kind "
-        f"{' or '.join(RECIPE_OF_STEP)}; `skinrig calibrate` takes sessions of targets"
+        f"{shown}; `skinrig calibrate` takes sessions of targets"
     )
 
 
@@ -122,7 +68,7 @@ def reconstruct(
     session
         SESSION/ folder.
     want
-        Names of maps; which there are depends on the rig, see :data:`RECIPE_OF_STEP`.
+        Names of maps; which there are depends on the rig, see docs/maps.md.
     out
         The folder. Maps in it that are still current, by the hash of all that they depend on,
         are kept and not computed again.

@@ -14,7 +14,7 @@ import numpy as np
 from capture.plan import Plan, flash_plan
 from capture.rig import Rig
 from model.skin import SkinAppearance
-from reconstruction.chromophores.detectability import detectable
+from reconstruction.chromophores.pixel_checks import detectable
 from reconstruction.pipeline.flash.stages import MIN_SIGNAL_SIGMAS
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.evaluating import flash

@@ -89,6 +89,8 @@ class Interior:
         Its triangle, shape (S,).
     tree
         Places and areas of the pieces.
+    tolerance
+        Aimed-at error of what leaves, over the brightest light that entered.
     """
 
     laid: FittedSurface
@@ -98,6 +100,7 @@ class Interior:
     normals: Float32Array
     prim: Int32Array
     tree: SourceTree
+    tolerance: float = dipole_gather.GATHER_TOL
 
     @staticmethod
     def of(
@@ -171,6 +174,7 @@ class Interior:
             rows.r_d,
             rows.translucency_mm,
             eta=self.laid.model.eta,
+            tolerance=self.tolerance,
             entered_at=entered_at,
             workers=min(thread_count(), 4),
         ).exitance

@@ -10,7 +10,7 @@ from model import color_table, merl, metrics, skin_reflectance, spectra
 from model.brdf import microfacet
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import chromophores, polarization
-from reconstruction.chromophores import detectability, shading_prior, tsumura
+from reconstruction.chromophores import pixel_checks, shading_prior, tsumura
 from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.gradient_normals import lobe_response, sphere_lights
 from reconstruction.normal_integration import relief_errors
@@ -301,8 +301,8 @@ def test_what_is_detectable_knows_no_unit(seed, size, scale):
     rng = np.random.default_rng(seed)
     estimate, stderr = rng.standard_normal((12, 10)), rng.uniform(0.1, 3.0, (12, 10))
     valid = rng.uniform(size=(12, 10)) > 0.2
-    first = detectability.detectable(estimate, stderr, valid, size_px=size)
-    scaled = detectability.detectable(scale * estimate, scale * stderr, valid, size_px=size)
+    first = pixel_checks.detectable(estimate, stderr, valid, size_px=size)
+    scaled = pixel_checks.detectable(scale * estimate, scale * stderr, valid, size_px=size)
     np.testing.assert_array_equal(first, scaled)
     assert first.dtype == bool
 

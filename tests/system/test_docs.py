@@ -2,6 +2,7 @@
 
 import ast
 import doctest
+import importlib
 import re
 import shlex
 import shutil
@@ -15,6 +16,7 @@ import typer
 from fixtures.product_code import PACKAGES, modules, tree_of
 
 from capture.devices import wire
+from capture.plan.rig_kinds import RIG_KINDS
 from capture.rig import load_rig
 from rigsim.boxes.controller import Controller
 from rigsim.boxes.device import Wiring
@@ -272,12 +274,16 @@ def recipes():
     from reconstruction.pipeline import recipes as pipeline
 
     headings = {
-        "subject": "Maps of the flash rig",
-        "olat": "Maps of the dome",
+        "flash": "Maps of the flash rig",
+        "dome": "Maps of the dome",
         "gradient": "Maps of the gradient rig",
-        "fibres": "Maps of the fibre probe",
+        "probe": "Maps of the fibre probe",
     }
-    found = {headings[kind]: recipe() for kind, recipe in pipeline.RECIPE_OF_STEP.items()}
+    assert headings.keys() == RIG_KINDS.keys()
+    found = {
+        heading: importlib.import_module(f"reconstruction.pipeline.{kind}.recipe").RECIPE
+        for kind, heading in headings.items()
+    }
     return {**found, "Maps of pictures under listed lights": pipeline.light_list()}
 
 

@@ -1,1 +1,5 @@
 """Run plans on the flash rig."""
+
+from capture.acquire.flash.run import acquire
+
+__all__ = ["acquire"]

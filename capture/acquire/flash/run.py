@@ -32,7 +32,7 @@ TIME_ROUNDING_S = 1e-6
 
 
 def run_sequence(run: CaptureRun, box: FlashBox, steps: Sequence[Step]) -> None:
-    """Capture the timed steps that a session still lacks; see `run_flash`.
+    """Capture the timed steps that a session still lacks; see `acquire`.
 
     Each frame's ``actual`` gets ``time_s`` (s, when the flash popped, in the sequence's time),
     ``late_s`` (s after its planned time), ``time_error_s`` (s, how well the clocks of host and box
@@ -263,8 +263,9 @@ class _Timed(Moment):
         self._rhythm.wait(time_s + self._busy_s - PROMPT_LEAD_S)
 
 
-def run_flash(run: CaptureRun, box: FlashBox) -> Acquired:
+def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> Acquired:
     """Capture what the session still lacks of a plan of the flash rig; see `run_plan`."""
+    box: FlashBox = boxes["flash"]
     operator = run.operator
     _check_limits(run.plan, box.limits)
     lag_s = _sync_delay_s(run.rig, box.limits)

@@ -104,7 +104,7 @@ def check_force(limit_n: float | None, limits: Mapping[str, Any]) -> None:
 SPHERE_LEASE_S = 2.0
 
 
-def run_gradient(run: CaptureRun, boxes: Mapping[str, Any]) -> Acquired:
+def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> Acquired:
     """Capture what the session still lacks of a plan of the gradient sphere; see `run_plan`.
 
     Everything that can be refused is, before anything is lit or moves.

@@ -1,1 +1,5 @@
 """Run plans on the fiber probe."""
+
+from capture.acquire.probe.run import acquire
+
+__all__ = ["acquire"]

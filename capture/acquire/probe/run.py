@@ -87,7 +87,7 @@ PROBE_LEASE_S = 5.0
 """A frame may keep the host busy for a while; after this silence the box lets go."""
 
 
-def run_probe(run: CaptureRun, box: ProbeBox) -> Acquired:
+def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> Acquired:
     """Capture what the session still lacks of a plan of the fibre probe; see `run_plan`.
 
     Everything that can be refused is, before anything is lit or sucked at. The dark frames come
@@ -100,6 +100,7 @@ def run_probe(run: CaptureRun, box: ProbeBox) -> Acquired:
         Where the suction cannot be held at a placement, three times; where the camera does not come
         to its temperature; or where a frame fails three times.
     """
+    box: ProbeBox = boxes["probe"]
     check_probe(run.plan, run.rig, box.limits)
     check_cameras(run)
     series = BracketSeries(run, box)

@@ -20,7 +20,7 @@ from model.facial_color import HemoglobinRig
 from model.skin import MAP_UNITS, SkinMap
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import model_error
-from reconstruction.chromophores.detectability import detectable
+from reconstruction.chromophores.pixel_checks import detectable
 from reconstruction.correspondence import expression_alignment
 from reconstruction.correspondence.expression_alignment import Alignment
 from reconstruction.facial_color import registration_error as misplacement

@@ -26,8 +26,8 @@ from reconstruction import polarization
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import dark_spots, model_error, shading_prior, tsumura
 from reconstruction.chromophores import posterior as chromophore_posterior
-from reconstruction.chromophores.detectability import detectable
 from reconstruction.chromophores.face import estimate_face
+from reconstruction.chromophores.pixel_checks import detectable
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.inputs import Inputs, InputsError

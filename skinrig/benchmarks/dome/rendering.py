@@ -57,11 +57,16 @@ def model(stage: Stage) -> None:
         knobs = {"vary": "texture", "texels": size // k}
         add(knobs, lambda: seen.shown(laid[k]).radiance, seen.true, 2)
     skin = laid[1].of_medium(MEAN_SIGMA_TR_PER_MM)
-    spread = partial(seen.shown, skin, subsurface="dipole", interior=Interior.of(skin), subpixels=1)
-    best = spread(tolerance=0.001).diffuse
+    inside = Interior.of(skin)
+
+    def spread(tolerance: float) -> FloatArray:
+        aimed = dataclasses.replace(inside, tolerance=tolerance)
+        return seen.shown(skin, subsurface="dipole", interior=aimed, subpixels=1).diffuse
+
+    best = spread(0.001)
     for tolerance in (0.1, 0.01) if stage.toy else (3.0, 1.0, 0.3, 0.1, 0.01):
         knobs = {"vary": "spreading", "tolerance": tolerance}
-        add(knobs, lambda: spread(tolerance=tolerance).diffuse, best, 1)
+        add(knobs, lambda: spread(tolerance), best, 1)
     usual, true = seen.shown(laid[1]), seen.true
     lit = usual.lit & usual.covered & (true.mean(axis=-1) > 0.0)
     gap = np.abs(usual.radiance - true).mean(axis=-1)[lit] / true.mean(axis=-1)[lit]

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from reconstruction.chromophores.detectability import detectable
+from reconstruction.chromophores.pixel_checks import detectable
 
 SHAPE = (80, 80)
 WHOLE = np.ones(SHAPE, bool)

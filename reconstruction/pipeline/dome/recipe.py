@@ -1,0 +1,8 @@
+"""What sessions of the dome can be made into."""
+
+from reconstruction.pipeline.dome import stages
+from reconstruction.pipeline.recipe import Recipe
+
+RECIPE = Recipe(
+    stages.MAP_NAMES, stages.graph, stages.FILE_NAMES, ("position",), maps_of_rank=stages.maps_of
+)

@@ -1,0 +1,6 @@
+"""What sessions of the fiber probe can be made into."""
+
+from reconstruction.pipeline.probe import stages
+from reconstruction.pipeline.recipe import Recipe
+
+RECIPE = Recipe(stages.MAP_NAMES, stages.graph, stages.FILE_NAMES, products=stages.products)
