@@ -118,9 +118,13 @@ def test_histograms_and_kernels_of_what_is_not_finite_are_an_error(bad):
         relief_slopes.turned(np.ones(1), np.ones(1), bad)
     height = np.random.default_rng(0).standard_normal((12, 12))
     fit = partial(kernel_fit.fit_kernel, height, shares, stretch=1.0, axis="x", pixel_um=10.0)
-    for name, values in (("alphas", [-1.0, bad]), ("sigmas_um", [bad]), ("target_samples", np.nan)):
+    for name, wrong in (
+        ("alphas", {"grid": ([-1.0, bad], [1.0])}),
+        ("sigmas_um", {"grid": ([-1.0], [bad])}),
+        ("target_samples", {"target_samples": np.nan}),
+    ):
         with pytest.raises(neutral_relief.KernelFitError, match=name):
-            fit(bins=4, **{name: values})
+            fit(bins=4, **wrong)
     with pytest.raises(profile_length.ProfileError, match="height_um"):
         profile_length.convolved([0.0, bad, 1.0], 0.5, 10.0, spacing_um=5.0)
     with pytest.raises(profile_length.ProfileError, match="alpha"):
