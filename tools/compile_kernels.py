@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import types
+from numba import config, types
 from numba.core.dispatcher import Dispatcher
 from numba.core.errors import NumbaError
 
@@ -96,7 +96,7 @@ def compile_all(processes: int) -> int:
 
 def record() -> None:
     """Run the demo in this process, and list the module-level kernels it compiled anew."""
-    os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp()
+    config.CACHE_DIR = tempfile.mkdtemp()  # what is compiled already would not be listed
     from numba.core import event
 
     from skinrig.console import Console
