@@ -99,10 +99,6 @@ def record() -> None:
     config.CACHE_DIR = tempfile.mkdtemp()  # what is compiled already would not be listed
     from numba.core import event
 
-    from skinrig.console import Console
-    from skinrig.demo import run_demo
-    from skinrig.demo_rigs import RIGS
-
     class Recorder(event.Listener):  # type: ignore[misc]
         def __init__(self) -> None:
             self.began: list[float] = []
@@ -120,6 +116,10 @@ def record() -> None:
 
     recorder = Recorder()
     with event.install_listener("numba:compile", recorder), tempfile.TemporaryDirectory() as out:
+        from skinrig.console import Console  # here: some kernels are compiled as they are imported
+        from skinrig.demo import run_demo
+        from skinrig.demo_rigs import RIGS
+
         run_demo(Path(out) / "demo", list(RIGS), console=Console(False), jobs=1)
     rows = []
     for function, seconds, given in recorder.found:  # all modules are whole by now
