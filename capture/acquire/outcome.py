@@ -208,9 +208,7 @@ class CaptureRun:
 
     def given_up(self, what: str, why: str) -> AcquisitionError:
         """Return the error of a step that failed too often, with what to do about it."""
-        safe = "what was captured is safe: mend the cause and run the same command with --resume"
-        again = "nothing was captured: mend the cause and start again"
-        advice = safe if self.session.frames() else again
+        advice = next_attempt(captured=bool(self.session.frames()))
         return AcquisitionError(f"{what}: failed {MAX_ATTEMPTS} times ({why}); {advice}")
 
     def account(self, dead_leds: Iterable[int] = ()) -> Acquired:
@@ -228,6 +226,13 @@ class CaptureRun:
         for camera in self.cameras.values():
             with contextlib.suppress(DeviceError):
                 camera.abort()
+
+
+def next_attempt(*, captured: bool) -> str:
+    """Return what to do after a capture failed, by whether the session has frames."""
+    if captured:
+        return "the session keeps its frames: remove the cause, then add --resume to the command"
+    return "no frame was recorded: remove the cause, then run the command again"
 
 
 def refuse_step(step: Step, what: str, *, done: str = "lit") -> AcquisitionError:

@@ -179,7 +179,7 @@ def test_an_analyser_ten_degrees_off_is_measured_and_reported(ball):
     zero = np.degrees(survey.films.misalignment_rad)
     assert abs(zero - 10.0) < 4 * np.degrees(survey.films.misalignment_stderr_rad)
     assert abs(zero - 10.0) < 0.4
-    assert any("analyser stands +" in text for text in survey.findings)
+    assert any("analyzer is +" in text for text in survey.findings)
     leaked = survey.films.leakage[survey.films.valid]
     assert np.median(leaked) == pytest.approx(np.median(true[survey.films.valid]), rel=0.03)
     assert np.median(leaked) > 0.03

@@ -87,17 +87,17 @@ def check_caliper(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
 
 
 def check_force(limit_n: float | None, limits: Mapping[str, Any]) -> None:
-    """Raise where no force limit is given, or one that the caliper's sensor cannot tell."""
+    """Raise where no force limit is given, or one beyond the sensor's range."""
     low, high = float(limits["force_limit_min_n"]), float(limits["force_limit_max_n"])
     if limit_n is None:
         raise AcquisitionError(
-            "force limit: none was given, and there is no default: decide what this skin may "
-            f"bear and say it with --force-limit N ({low:g} to {high:g} newton); nothing has moved"
+            "force limit: got none, expected the greatest force that this skin may bear; give "
+            f"--force-limit N ({low:g} to {high:g} newton), it has no default; nothing has moved"
         )
     if not low <= limit_n <= high:
         raise AcquisitionError(
-            f"force limit: got {limit_n:g} N, the caliper's sensor tells {low:g} to {high:g} N; "
-            "nothing has moved"
+            f"force limit: got {limit_n:g} N, expected {low:g} to {high:g} N, the range of the "
+            "caliper's sensor; nothing has moved"
         )
 
 

@@ -7,7 +7,7 @@ anew, and all exposures of the series are taken again.
 
 import logging
 
-from capture.acquire.outcome import MAX_ATTEMPTS, AcquisitionError, Operator
+from capture.acquire.outcome import MAX_ATTEMPTS, AcquisitionError, Operator, next_attempt
 from capture.devices.port import CommandRefused
 from capture.devices.probe import ProbeBox
 from capture.devices.wire import Code
@@ -160,13 +160,10 @@ class Head:
 
     def refusal(self, place: Placement, why: str, *, captured: bool) -> AcquisitionError:
         """Return the error of a placement at which the measurement cannot be made."""
-        before = "what was captured before is safe: mend the cause and run the same command with "
-        again = "nothing was captured: mend the cause and start again"
-        after = f"{before}--resume" if captured else again
         return AcquisitionError(
             f"measurement of {place}: refused, {why}, {MAX_ATTEMPTS} times; no frame of it is "
             "kept. Check that the membrane is whole and the tube is on, and that no fold and no "
-            f"hair lies under the rim; {after}"
+            f"hair lies under the rim; {next_attempt(captured=captured)}"
         )
 
     # what is waited for -----------------------------------------------------------------------

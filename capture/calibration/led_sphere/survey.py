@@ -101,25 +101,25 @@ def describe_findings(
         Lights mirrored within the image, and saturated in every exposure.
     films : FilmFit
     strays : int
-        Number of bright spots that are no light's.
+        Number of bright spots that are not reflections of lights.
     """
     lights, table = survey.lights, survey.films
     names = np.array(lights.names)
-    told = []
+    findings = []
 
     def listed(chosen: BoolArray) -> str:
         return ", ".join(names[chosen])
 
     if lights.dead.any():
-        told.append(f"dead, or hidden from the ball: {listed(lights.dead)}")
+        findings.append(f"dead, or hidden from the ball: {listed(lights.dead)}")
     outside = ~in_field
     if outside.any():
-        told.append(f"mirrored outside the image, left nominal: {listed(outside)}")
+        findings.append(f"mirrored outside the image, left nominal: {listed(outside)}")
     if saturated.any():
-        told.append(f"saturated in every exposure, no intensity: {listed(saturated)}")
+        findings.append(f"saturated in every exposure, no intensity: {listed(saturated)}")
     dim = ~lights.valid & ~outside & ~saturated
     if dim.any():
-        told.append(f"too dim in the ball to be measured: {listed(dim)}")
+        findings.append(f"too dim in the ball to be measured: {listed(dim)}")
     nominal = place / np.linalg.norm(place, axis=1, keepdims=True)
     off = np.linalg.norm(lights.directions - nominal, axis=1)
     usual = np.sqrt(2) * survey.light_scatter_mm / np.linalg.norm(place, axis=1)
@@ -127,11 +127,13 @@ def describe_findings(
         off > np.maximum(MAX_LIGHT_OFFSET_SIGMAS * usual, np.radians(MAX_LIGHT_OFFSET_DEG))
     )
     for k in np.flatnonzero(far):
-        told.append(f"light {names[k]} stands {np.degrees(off[k]):.2f} degrees from its place")
+        findings.append(
+            f"light {names[k]} is {np.degrees(off[k]):.2f} degrees off its nominal direction"
+        )
     zero, error = np.degrees([films.zero_rad, films.zero_stderr_rad])
     if abs(zero) > MAX_ANALYZER_OFFSET_DEG:
-        told.append(
-            f"the analyser stands {zero:+.2f} ± {error:.2f} degrees off its reading: crossed leaks"
+        findings.append(
+            f"the analyzer is {zero:+.2f} ± {error:.2f} degrees off its reading: crossed leaks"
             f" {100 * np.median(table.leakage):.1f} % of reflections; turn it back"
         )
     turn = np.degrees(table.axis_error_rad)
@@ -139,15 +141,17 @@ def describe_findings(
         np.abs(turn) > MAX_POLARIZER_TURN_DEG + 3 * np.degrees(table.axis_error_stderr_rad)
     )
     for k in np.flatnonzero(turned):
-        told.append(f"the polarizer of light {names[k]} is turned by {turn[k]:+.1f} degrees")
+        findings.append(f"the polarizer of light {names[k]} is turned by {turn[k]:+.1f} degrees")
     if not any(1.0 < abs(r % 180.0 - 90.0) < 89.0 for r in survey.readings_deg):
-        told.append(
+        findings.append(
             "only parallel and crossed were photographed: which way single lights' polarizers are"
-            " turned stays open, and errors are larger; add readings 80 and 100"
+            " turned is unknown, and their standard errors are larger; add readings 80 and 100"
         )
     if strays:
-        told.append(f"{strays} bright spots are no light's; keep other light away")
-    return tuple(told)
+        findings.append(
+            f"{strays} bright spots are not reflections of lights; keep other light away"
+        )
+    return tuple(findings)
 
 
 def survey_sphere(

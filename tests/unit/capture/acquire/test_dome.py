@@ -270,7 +270,7 @@ def test_the_subjects_dose_begins_with_the_session_and_goes_on_with_its_resumpti
 def test_a_row_that_one_camera_loses_three_times_ends_the_capture_dark(make):
     bench = make()
     bench.world.camera("C05").edge = lambda now: None
-    with pytest.raises(AcquisitionError, match=r"failed 3 times.*nothing was captured"):
+    with pytest.raises(AcquisitionError, match=r"failed 3 times.*no frame was recorded"):
         bench.run()
     assert not bench.unit.lit
     assert bench.session.frames() == []

@@ -492,7 +492,7 @@ def test_a_missed_pulse_does_not_give_frames_to_the_wrong_pattern(make):
 def test_a_camera_that_loses_everything_ends_the_capture_dark_and_released(make):
     bench = make(short(steps=(0, 0)))
     bench.world.camera("cam").edge = lambda now: None
-    with pytest.raises(AcquisitionError, match=r"failed 3 times.*nothing was captured"):
+    with pytest.raises(AcquisitionError, match=r"failed 3 times.*no frame was recorded"):
         bench.run()
     assert bench.at_rest
     assert bench.session.frames() == []
