@@ -193,7 +193,7 @@ def _unless_used(session: Session, fresh: bool, console: Console) -> Iterator[No
         if not session.frames():
             session.release()
             remove_unused(session.path, with_folder=fresh)
-            console.progress(f"nothing was captured: {session.path} was taken away again")
+            console.progress(f"no frame was recorded: {session.path} was removed")
         raise
 
 

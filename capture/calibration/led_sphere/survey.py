@@ -148,9 +148,7 @@ def describe_findings(
             " turned is unknown, and their standard errors are larger; add readings 80 and 100"
         )
     if strays:
-        findings.append(
-            f"{strays} bright spots are not reflections of lights; keep other light away"
-        )
+        findings.append(f"{strays} bright spots reflect none of the lights; keep other light away")
     return tuple(findings)
 
 

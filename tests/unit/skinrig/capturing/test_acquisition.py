@@ -112,7 +112,7 @@ def test_a_first_step_that_fails_does_not_speak_of_resuming(tmp_path, sim, capsy
     out = tmp_path / "s"
     assert main(["capture", "flash", "--out", str(out), *sim("w6", drop_frame=1.0)]) == 4
     err = capsys.readouterr().err
-    assert "nothing was captured" in err
+    assert "no frame was recorded" in err
     assert "--resume" not in err
     assert not out.exists()
 
