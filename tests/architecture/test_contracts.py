@@ -146,7 +146,7 @@ def test_a_package_works_without_the_application(package):
 
 
 @pytest.mark.parametrize("module", ["capture", "capture.session", "capture.devices.flash"])
-def test_capture_loads_no_renderer_no_vision_library_and_no_simulator(module):
+def test_capture_loads_neither_renderer_nor_vision_nor_simulator(module):
     heavy = ("mitsuba", "cv2", "matplotlib", "rigsim", "skimage", "numba")
     code = f"import sys, {module}; print([m for m in {heavy!r} if m in sys.modules])"
     run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
@@ -164,7 +164,7 @@ def test_capture_has_no_branch_for_simulation():
     assert not found
 
 
-def test_tracked_files_name_no_machine_path_and_no_package_index():
+def test_tracked_files_omit_machine_paths_and_package_index():
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True)
     if listed.returncode:
         pytest.skip("not a git checkout")
@@ -184,7 +184,7 @@ def test_tracked_files_name_no_machine_path_and_no_package_index():
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_no_module_has_a_name_that_says_nothing(package):
+def test_module_names_are_descriptive(package):
     empty_names = {"utils", "util", "helpers", "helper", "common", "core", "manager", "misc"}
     assert not [p for p in modules(package) if p.stem.strip("_") in empty_names]
 

@@ -19,7 +19,7 @@ def drawn():
     return seen
 
 
-def test_numbers_of_a_module_imported_meanwhile_are_not_drawn(tmp_path, monkeypatch):
+def test_numbers_of_module_imported_meanwhile_are_not_drawn(tmp_path, monkeypatch):
     before = drawn()
     path = tmp_path / "numbers_of_its_own.py"
     path.write_text("\n".join(f"N{k} = {3.0 + 1e-3 * k}" for k in range(1, 100)))

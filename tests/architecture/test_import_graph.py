@@ -155,12 +155,12 @@ def test_a_breach_breaks_its_contract(contract, product_copy):
         ("layers inside rigsim", "rigsim"),
     ],
 )
-def test_a_module_in_no_layer_breaks_the_contract_of_its_package(contract, package, product_copy):
+def test_module_outside_layers_breaks_package_contract(contract, package, product_copy):
     (product_copy / package / "helpers.py").write_text('"""In no layer."""\n')
     assert [line.startswith(contract) for line in lint(product_copy)] == [True]
 
 
-def test_a_new_folder_of_the_model_is_forbidden_to_the_simulator(product_copy):
+def test_new_model_folder_is_forbidden_to_simulator(product_copy):
     """Deny by default: the contract lists what is allowed, not what is forbidden."""
     (product_copy / "model" / "new_equation").mkdir()
     (product_copy / "model" / "new_equation" / "__init__.py").write_text('"""New."""\n')

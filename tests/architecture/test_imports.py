@@ -56,7 +56,7 @@ def test_a_package_alone_loads_nothing_heavy(module):
     assert loaded_by(f"import {module}") == []
 
 
-def test_capture_and_its_devices_load_neither_renderer_nor_vision_nor_science():
+def test_capture_and_devices_load_neither_renderer_nor_science():
     """A capture computer drives a rig without the libraries that calibrate and reconstruct."""
     every = [
         name for name in packages("capture") if "calibration" not in name and name != "capture.hdr"
@@ -100,7 +100,7 @@ def least_start_s(arguments, runs=RUNS):
 
 
 @pytest.mark.skipif(not COMMAND.exists(), reason="the command is not installed beside Python")
-def test_the_version_is_told_in_under_a_third_of_a_second():
+def test_version_is_printed_within_third_of_second():
     """Rationale: people and shells ask often. Expected: 0.13 s on a quiet core. Tolerance: the
     requirement.
 

@@ -21,7 +21,7 @@ def ignored(request):
 
 
 @pytest.mark.parametrize(("text", "expected"), [(MARK, None), ("def test_it(): pass\n", True)])
-def test_a_file_is_read_by_whether_it_has_long_tests(text, expected, tmp_path, ignored):
+def test_file_collection_depends_on_long_tests(text, expected, tmp_path, ignored):
     path = tmp_path / "test_skin.py"
     path.write_text(text)
     assert ignored(path) is expected
@@ -30,14 +30,14 @@ def test_a_file_is_read_by_whether_it_has_long_tests(text, expected, tmp_path, i
 
 
 @pytest.mark.parametrize("shared", ["conftest.py", "box_harness.py"])
-def test_a_file_is_read_where_what_it_shares_may_make_its_tests_long(shared, tmp_path, ignored):
+def test_file_is_collected_when_shared_code_marks_long(shared, tmp_path, ignored):
     path = tmp_path / "test_skin.py"
     path.write_text("def test_it(): pass\n")
     (tmp_path / shared).write_text(f"LONG = {MARK!r}")
     assert ignored(path) is None
 
 
-def test_folders_and_shared_files_are_always_read(tmp_path, ignored):
+def test_folders_and_common_files_are_always_read(tmp_path, ignored):
     (tmp_path / "test_folder").mkdir()
     (tmp_path / "conftest.py").write_text("")
     assert ignored(tmp_path / "conftest.py") is None

@@ -69,7 +69,7 @@ def found_at(name):
 
 
 @pytest.mark.parametrize("line", PUBLIC.strip().splitlines(), ids=lambda line: line.split()[0])
-def test_a_public_function_is_found_and_takes_what_it_took(line):
+def test_public_function_is_found_with_unchanged_parameters(line):
     name, *wanted = line.split()
     parameters = inspect.signature(found_at(name)).parameters.values()
     free = [p.name for p in parameters if p.kind is not inspect.Parameter.KEYWORD_ONLY]

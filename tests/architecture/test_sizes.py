@@ -69,7 +69,7 @@ def test_no_function_takes_too_many_parameters():
     assert large_functions(ROOT, parameters_of, MAX_PARAMETERS) == {}
 
 
-def test_what_is_too_large_would_be_found(tmp_path):
+def test_size_check_finds_oversized_modules_and_functions(tmp_path):
     (tmp_path / "model").mkdir()
     arguments = ", ".join(f"a{n}" for n in range(MAX_PARAMETERS + 1))
     body = "".join(f"    x = {n}\n" for n in range(MAX_LINES))

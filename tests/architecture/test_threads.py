@@ -6,7 +6,7 @@ import scipy.linalg  # noqa: F401  (loads its own BLAS beside NumPy's)
 from threadpoolctl import threadpool_info
 
 
-def test_small_matrices_have_the_threads_that_were_asked_for():
+def test_small_matrices_use_requested_threads():
     """The libraries read the environment when they are loaded: before that it must be set."""
     asked = int(os.environ["OPENBLAS_NUM_THREADS"])
     found = [row["num_threads"] for row in threadpool_info() if row["internal_api"] == "openblas"]

@@ -101,7 +101,7 @@ def problems(stage):
 @pytest.mark.parametrize(
     "stage", [pytest.param(s, marks=pytest.mark.long if s in HEAVY else ()) for s in STAGES]
 )
-def test_a_stage_holds_what_the_schema_promises(stage, tmp_path, capsys):
+def test_stage_result_satisfies_schema(stage, tmp_path, capsys):
     document = run_stages([stage], budget_s=60.0, toy=True, out=tmp_path, console=Console(True))
     written = json.loads((tmp_path / "bench.json").read_text())
     assert written == plain(document)
@@ -141,19 +141,19 @@ def slower_and_worse(stage):
         (lambda s: s["points"][0].update(efficiency=None), "efficiency without bound"),
     ],
 )
-def test_the_check_finds_what_is_spoiled(sound, spoil, expected):
+def test_check_finds_corrupted_results(sound, spoil, expected):
     assert problems(sound) == []
     broken = copy.deepcopy(sound)
     spoil(broken)
     assert any(expected in problem for problem in problems(broken))
 
 
-def test_an_unknown_stage_is_named_with_the_known_ones():
+def test_unknown_stage_error_lists_valid_stages():
     with pytest.raises(BenchError, match="color-table"):
         run_stages(["tea"], budget_s=1.0, toy=True, out=None, console=Console(True))
 
 
-def test_a_spent_budget_leaves_stages_out_and_says_so(capsys):
+def test_spent_budget_skips_stages_and_reports_them(capsys):
     document = run_stages(None, budget_s=0.0, toy=True, out=None, console=Console(True))
     assert len(document["left_out"]) == len(STAGES)
     assert document["stages"] == {}

@@ -61,7 +61,7 @@ def picture(table, side, rng):
 
 @pytest.mark.long
 @pytest.mark.parametrize("shading", [None, "known"])
-def test_the_fit_is_a_thousand_times_faster_than_scipy_and_agrees(shading, rng):
+def test_chromophore_fit_thousandfold_faster_than_scipy_and_agrees(shading, rng):
     # Processor seconds, so that a busy machine does not change the ratio.
     table = color_table.build("Nikon 5100 (NPL)", "xenon flash", anisotropy=ANISOTROPY_SKIN)
     rgb, _, _ = picture(table, 1024, rng)

@@ -71,7 +71,7 @@ def test_axe_would_find_a_label_that_is_missing(still, axe):
     still.page.evaluate(label % kept)
 
 
-def test_every_control_is_reached_by_tab_and_shows_its_focus(still):
+def test_tab_reaches_every_control_and_shows_focus(still):
     viewer = still
     wanted = viewer.page.evaluate(
         """() => [...document.querySelectorAll("button, input, select, summary, #port, a")]
@@ -96,7 +96,7 @@ def test_every_control_is_reached_by_tab_and_shows_its_focus(still):
     assert unseen_focus == []
 
 
-def test_every_control_has_a_name_and_sliders_a_spoken_value(still):
+def test_controls_have_names_and_sliders_spoken_values(still):
     viewer = still
     nameless = viewer.page.evaluate(
         """() => [...document.querySelectorAll("#panel input, #panel select")]
@@ -115,7 +115,7 @@ def test_every_control_has_a_name_and_sliders_a_spoken_value(still):
     assert helped
 
 
-def test_nothing_moves_by_itself_where_less_motion_is_asked_for(still):
+def test_reduced_motion_disables_automatic_movement(still):
     viewer = still
     draws = "() => window.viewer.statistics.draws"
     before = viewer.page.evaluate(draws)

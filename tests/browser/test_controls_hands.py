@@ -52,7 +52,7 @@ def viewer(viewer):
     viewer.page.locator("button[data-tool=orbit]").click()
 
 
-def test_dragging_with_the_tool_light_moves_the_highlight_and_not_the_camera(viewer):
+def test_light_tool_drag_moves_highlight_not_camera(viewer):
     viewer.page.locator("button[data-tool=light]").click()
     before, specular = params(viewer), viewer.read("specular")[..., 0]
     drag(viewer, 60, 0)
@@ -70,14 +70,14 @@ def frontal(viewer: Any) -> float:
     return float(np.nonzero(normal[..., 2] > 0.97)[1].mean())
 
 
-def test_dragging_to_the_right_turns_the_face_to_the_right(viewer):
+def test_drag_right_rotates_face_right(viewer):
     before = frontal(viewer)
     drag(viewer, 20, 0)
     assert params(viewer)["camera_yaw_deg"] < -5
     assert frontal(viewer) > before + 3
 
 
-def test_keys_turn_the_camera_move_the_light_and_zoom(viewer):
+def test_keys_rotate_camera_move_light_and_zoom(viewer):
     port = viewer.page.locator("#port")
     port.focus()
     start = params(viewer)
@@ -97,7 +97,7 @@ def test_keys_turn_the_camera_move_the_light_and_zoom(viewer):
     assert again["light_azimuth_deg"] == 35
 
 
-def test_a_probe_reads_what_the_buffers_hold(viewer):
+def test_pixel_probe_reads_buffer_values(viewer):
     viewer.page.locator("button[data-tool=probe]").click()
     viewer.page.locator("#port").focus()
     viewer.page.keyboard.press("Shift+ArrowUp")
@@ -119,7 +119,7 @@ def test_a_probe_reads_what_the_buffers_hold(viewer):
     assert float(changed.split()[0]) == pytest.approx(2 * 100 * inspect[2], abs=0.02)
 
 
-def test_a_click_beside_the_face_says_so(viewer):
+def test_click_outside_face_is_reported(viewer):
     viewer.page.locator("button[data-tool=probe]").click()
     x, y = center(viewer)
     box = viewer.page.locator("#port").bounding_box()
@@ -140,7 +140,7 @@ def test_sliders_follow_keys_and_speak_their_value(viewer):
     assert "1 changed" in group.locator("summary").text_content()
 
 
-def test_presets_set_every_weight_and_show_which_is_on(viewer):
+def test_presets_set_every_weight_and_show_active_preset(viewer):
     group = opened(viewer, "expression")
     viewer.set(weights={"fear": 0.7})
     group.get_by_role("button", name="Anger and surprise").click()
@@ -162,7 +162,7 @@ def test_each_kind_of_preset_changes_the_blood(viewer, preset):
         assert after.mean() > before.mean()
 
 
-def test_a_comparison_shows_a_on_the_left_and_b_on_the_right(viewer):
+def test_comparison_shows_a_left_and_b_right(viewer):
     viewer.set(melanin_gain=3)
     dark = screen(viewer)
     opened(viewer, "view").get_by_role("button", name="Keep this as B").click()
@@ -203,7 +203,7 @@ def screen(viewer: Any, *, alone: bool = False) -> np.ndarray[Any, Any]:
     return np.frombuffer(base64.b64decode(data), np.uint8).reshape(256, 256, 4)
 
 
-def test_every_buffer_can_be_viewed_and_none_is_blank_where_the_face_shows(viewer):
+def test_every_buffer_view_is_nonblank_on_face(viewer):
     options = viewer.page.locator("#group-view select option").all_text_contents()
     select = opened(viewer, "view").get_by_label("Buffer")
     assert len(options) >= len(viewer.buffers())
@@ -215,7 +215,7 @@ def test_every_buffer_can_be_viewed_and_none_is_blank_where_the_face_shows(viewe
         assert shown[..., :3].std() > 8, name
 
 
-def test_the_address_holds_the_settings_and_gives_them_back(viewer, procedural_html, open_page):
+def test_address_stores_and_restores_settings(viewer, procedural_html, open_page):
     viewer.set(weights={"anger": 0.4}, roughness=1.25, specular_model="fitted", filmic=False)
     viewer.page.locator("#share").click()
     address = viewer.page.evaluate("() => location.hash")
@@ -234,7 +234,7 @@ def test_the_address_holds_the_settings_and_gives_them_back(viewer, procedural_h
     assert viewer.page.evaluate("() => location.hash") in ("", "#relief=1")
 
 
-def test_an_address_with_nonsense_is_taken_for_what_of_it_makes_sense(viewer):
+def test_address_with_invalid_parts_keeps_valid_parts(viewer):
     url = viewer.page.url.split("#")[0]
     bad = (
         "#roughness=%22rough%22&nothing=3&weights.anger=0.2&camera_target_mm=[1]&f0=&%%%=1"
@@ -254,7 +254,7 @@ def test_an_address_with_nonsense_is_taken_for_what_of_it_makes_sense(viewer):
     assert viewer.problems == []
 
 
-def test_costs_count_the_passes_that_were_drawn_and_five_heads_cost_more(viewer):
+def test_costs_count_drawn_passes_and_grow_with_heads(viewer):
     group = opened(viewer, "cost")
     group.get_by_role("button", name="Measure a frame").click()
     group.locator("table").wait_for(timeout=60_000)
@@ -314,7 +314,7 @@ def test_touch_drags_and_pinches(open_page, procedural_html):
     assert phone.problems == []
 
 
-def test_the_canvas_follows_its_place_and_a_chosen_resolution(viewer):
+def test_canvas_follows_its_container_and_chosen_resolution(viewer):
     viewer.set(resolution=384)
     size = viewer.page.evaluate("() => [view.width, view.height]")
     assert max(size) == 384
@@ -334,9 +334,7 @@ def test_the_canvas_follows_its_place_and_a_chosen_resolution(viewer):
         ("WebGL2RenderingContext.prototype.getExtension = () => null", "EXT_color_buffer_float"),
     ],
 )
-def test_a_device_that_cannot_draw_is_told_what_to_do(
-    browser, tmp_path, procedural_html, missing, said
-):
+def test_device_without_webgl_gets_instructions(browser, tmp_path, procedural_html, missing, said):
     path = tmp_path / "page.html"
     path.write_text(procedural_html, encoding="utf-8")
     context = browser.new_context(viewport={"width": 720, "height": 560})

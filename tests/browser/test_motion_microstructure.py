@@ -195,9 +195,7 @@ def inner(reach_px: int) -> NDArray[np.bool_]:
     ],
     ids=["forehead", "forehead bilinear", "cheek", "coarse"],
 )
-def test_each_buffer_of_a_strained_window_is_the_models(
-    viewer, procedural_scene, weights, at, sampling
-):
+def test_strained_window_buffers_match_model(viewer, procedural_scene, weights, at, sampling):
     number = {"linear": 0, "cubic": 1}[sampling]
     place = show(viewer, procedural_scene, weights, at, microstructure_sampling=number)
     assert place[2:] == [at[2], 1]
@@ -241,9 +239,7 @@ def test_each_buffer_of_a_strained_window_is_the_models(
 
 
 @pytest.mark.long
-def test_strain_is_carried_on_around_the_border_of_an_island_as_the_model_does(
-    open_page, procedural_scene
-):
+def test_strain_continues_around_island_border_as_in_model(open_page, procedural_scene):
     from skinrig.viewer import page
 
     mesh = procedural_scene.mesh
@@ -273,7 +269,7 @@ def test_strain_is_carried_on_around_the_border_of_an_island_as_the_model_does(
 
 
 @pytest.mark.long
-def test_the_strain_of_the_whole_texture_is_the_models(viewer, procedural_scene):
+def test_whole_texture_strain_matches_model(viewer, procedural_scene):
     weights = {"disgust": 1.0}
     show(viewer, procedural_scene, weights, None)
     found = viewer.read("strain")
@@ -290,7 +286,7 @@ def test_the_strain_of_the_whole_texture_is_the_models(viewer, procedural_scene)
 
 
 @pytest.mark.long
-def test_a_pose_is_convolved_once_though_light_and_camera_move(viewer, procedural_scene):
+def test_pose_convolution_runs_once_despite_light_camera_motion(viewer, procedural_scene):
     show(viewer, procedural_scene, {"anger": 1.0}, [0.5, 0.75, 0])
 
     def draws() -> dict[str, int]:
@@ -310,9 +306,7 @@ def test_a_pose_is_convolved_once_though_light_and_camera_move(viewer, procedura
 
 
 @pytest.mark.long
-def test_a_split_view_shows_no_static_and_moved_microstructure_side_by_side(
-    viewer, procedural_scene
-):
+def test_split_view_shows_static_and_moved_microstructure(viewer, procedural_scene):
     rest = dict.fromkeys(procedural_scene.mesh.shapes, 0.0)
     viewer.set(
         weights=rest | {"anger": 1.0},

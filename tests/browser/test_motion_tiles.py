@@ -23,7 +23,7 @@ def displacement():
 
 
 @pytest.mark.long
-def test_a_window_shows_the_displacement_and_fetches_only_its_own_tiles(
+def test_window_shows_displacement_and_fetches_only_own_tiles(
     open_page, procedural_scene, displacement, tmp_path
 ):
     pyramid = tiles.build(displacement, tmp_path / "levels")

@@ -108,7 +108,7 @@ def test_derivatives_of_a_wrinkled_face_are_the_models(painted, painted_page, we
 
 
 @pytest.mark.long
-def test_the_two_clamps_differ_where_an_expression_only_flattens(painted, painted_page):
+def test_clamps_differ_where_expression_only_flattens(painted, painted_page):
     scene, _ = painted
     rest = dict.fromkeys(scene.mesh.shapes, 0.0)
     pictures = []
@@ -137,7 +137,7 @@ def face(viewer: Any) -> Any:
 
 @pytest.mark.long
 @pytest.mark.parametrize("azimuth", [-50.0, 35.0])
-def test_wrinkles_left_out_at_a_distance_change_pixels_less_than_is_told(
+def test_distant_wrinkle_omission_changes_pixels_below_reported_bound(
     viewer, procedural_scene, azimuth
 ):
     rest = dict.fromkeys(procedural_scene.mesh.shapes, 0.0)
@@ -167,7 +167,7 @@ def test_wrinkles_left_out_at_a_distance_change_pixels_less_than_is_told(
 
 
 @pytest.mark.long
-def test_microstructure_left_out_at_a_distance_changes_pixels_less_than_is_told(
+def test_distant_microstructure_omission_changes_pixels_below_reported_bound(
     viewer, procedural_scene
 ):
     rest = dict.fromkeys(procedural_scene.mesh.shapes, 0.0)
@@ -198,7 +198,7 @@ def test_microstructure_left_out_at_a_distance_changes_pixels_less_than_is_told(
 
 
 @pytest.mark.long
-def test_hybrid_normals_are_softest_in_red_and_sharp_in_the_highlight(viewer, procedural_scene):
+def test_hybrid_normals_softest_in_red_sharpest_in_highlight(viewer, procedural_scene):
     rest = dict.fromkeys(procedural_scene.mesh.shapes, 0.0)
     viewer.set(weights=rest | {"surprise": 1.0}, hybrid_normals=1)
     source = viewer.read("hybrid_source").astype(np.float64)

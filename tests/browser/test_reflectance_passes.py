@@ -176,7 +176,7 @@ def expected_specular(
 
 
 @pytest.mark.parametrize("azimuth", [0.0, 35.0, -70.0])
-def test_the_page_reflects_what_the_fitted_lobes_reflect(fitted, azimuth):
+def test_page_reflection_matches_fitted_basis_brdfs(fitted, azimuth):
     params = fitted.viewer.set(specular_model="fitted", light_azimuth_deg=azimuth)
     shares = reflectance_assets.rounded(fitted.traits.lobes.shares)  # shaders, not storage
     wanted = expected_specular(fitted, shares, params)
@@ -190,7 +190,7 @@ def test_the_page_reflects_what_the_fitted_lobes_reflect(fitted, azimuth):
     assert np.abs(found[..., 0] - wanted).max() < 0.05 * wanted.max()
 
 
-def test_slopes_that_no_pixel_shows_widen_the_fitted_lobes(fitted):
+def test_subpixel_slopes_widen_fitted_basis_brdfs(fitted):
     """The mean over normals, by 11 x 11 Gauss-Hermite nodes; the page takes seven."""
     rms = 0.1
     params = fitted.viewer.set(specular_model="fitted", lobe_slope_rms=rms)
@@ -215,7 +215,7 @@ def test_slopes_that_no_pixel_shows_widen_the_fitted_lobes(fitted):
     assert np.median(np.abs(plain[lit] - wanted[lit]) / wanted[lit]) > 2.0 * np.median(relative)
 
 
-def test_the_analytic_formula_is_not_taken_for_the_fitted_lobes(fitted):
+def test_analytic_formula_differs_from_fitted_basis_brdfs(fitted):
     params = fitted.viewer.set(specular_model="analytic")
     wanted = expected_specular(fitted, fitted.traits.lobes.shares, params)
     found = fitted.viewer.read("specular")[..., 0]
@@ -226,7 +226,7 @@ def test_the_analytic_formula_is_not_taken_for_the_fitted_lobes(fitted):
 @pytest.mark.parametrize(
     "amounts", [{}, {"lotion": 1.0}, {"powder": -0.7}, {"sweat": 0.5, "cold": 0.5}]
 )
-def test_traits_of_the_surface_move_the_shares_as_their_twin_says(fitted, amounts):
+def test_surface_traits_change_weights_as_reference_does(fitted, amounts):
     fitted.viewer.set(traits=amounts)
     rows = as_packed(fitted.scene).textures["lobe_shares"].values
     rows = np.moveaxis(rows, 0, 2).reshape(16 * 16, -1)[:, : len(fitted.traits.scale)]
@@ -244,7 +244,7 @@ def test_traits_of_the_surface_move_the_shares_as_their_twin_says(fitted, amount
         np.testing.assert_array_equal(found, rows)
 
 
-def test_a_trait_changes_the_picture_as_its_shares_say(fitted):
+def test_trait_changes_image_according_to_its_weights(fitted):
     params = fitted.viewer.set(specular_model="fitted", traits={"lotion": 1.0})
     rows = fitted.traits.lobes.shares
     moved = fitted.traits.projected(rows.reshape(256, -1).astype(np.float64), {"lotion": 1.0})
@@ -265,7 +265,7 @@ def factor(names, log_factor, amounts):
 
 
 @pytest.mark.parametrize("amounts", [{"tan": 1.0}, {"tan": -0.5, "beard": 0.8}])
-def test_traits_of_the_albedo_multiply_it_along_the_logarithm(fitted, amounts):
+def test_albedo_traits_multiply_albedo_along_logarithm(fitted, amounts):
     before = fitted.viewer.read("albedo")[..., :3]
     fitted.viewer.set(traits=amounts)
     packed = as_packed(fitted.scene).textures["albedo_traits"].values
@@ -280,7 +280,7 @@ def test_traits_of_the_albedo_multiply_it_along_the_logarithm(fitted, amounts):
     assert np.abs(after[..., :3][on] / before[on] - 1.0).max() > 0.1
 
 
-def test_translucency_widens_the_profile_where_it_is_switched_on(fitted):
+def test_translucency_trait_widens_profile_where_enabled(fitted):
     uv = fitted.viewer.read("inspect")[..., :2]
     on = fitted.viewer.read("albedo")[..., 3] > 0
     np.testing.assert_array_equal(fitted.viewer.read("specular")[..., 3][on], 1.0)
@@ -292,7 +292,7 @@ def test_translucency_widens_the_profile_where_it_is_switched_on(fitted):
     assert np.abs(fitted.viewer.read("radiance") - before).max() > 1e-3
 
 
-def test_passes_of_traits_are_drawn_only_when_traits_change(fitted):
+def test_trait_passes_are_drawn_only_when_traits_change(fitted):
     count = "() => window.viewer.statistics.passes.surface_traits.draws"
     fitted.viewer.set(traits={"lotion": 0.3})
     before = fitted.viewer.page.evaluate(count)

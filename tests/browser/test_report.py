@@ -98,7 +98,7 @@ def serious(page, axe):
     )
 
 
-def test_a_report_asks_for_nothing_and_its_policy_refuses_nothing_of_it(browser, pages):
+def test_report_makes_no_requests_and_policy_blocks_nothing(browser, pages):
     for path in pages:
         context, page, problems = opened(browser, path)
         assert problems == []
@@ -111,7 +111,7 @@ def test_a_report_asks_for_nothing_and_its_policy_refuses_nothing_of_it(browser,
         context.close()
 
 
-def test_the_policy_refuses_what_is_not_the_page_s_own(browser, pages, tmp_path):
+def test_policy_refuses_foreign_content(browser, pages, tmp_path):
     path = tmp_path / "changed.html"
     text = pages[0].read_text(encoding="utf-8")
     path.write_text(text.replace("<main", "<script>document.title='ran'</script><main", 1))
@@ -132,7 +132,7 @@ def test_axe_finds_nothing_serious(browser, pages, axe, scheme, width):
         context.close()
 
 
-def test_axe_would_find_a_picture_without_a_text_and_pale_words(browser, pages, axe, tmp_path):
+def test_axe_finds_image_without_text_and_low_contrast(browser, pages, axe, tmp_path):
     path = tmp_path / "changed.html"
     text = pages[0].read_text(encoding="utf-8").replace(' alt="', ' data-alt="', 1)
     path.write_text(text.replace("--soft-fg:#4a525b", "--soft-fg:#c4c8cc"), encoding="utf-8")
@@ -145,7 +145,7 @@ def test_axe_would_find_a_picture_without_a_text_and_pale_words(browser, pages, 
 
 
 @pytest.mark.parametrize("width", WIDTHS)
-def test_only_tables_scroll_sideways_and_a_keyboard_reaches_them(browser, pages, width):
+def test_only_tables_scroll_sideways_and_keyboard_reaches_them(browser, pages, width):
     context, page, _ = opened(browser, pages[0], width=width)
     wide = page.evaluate("document.documentElement.scrollWidth")
     assert wide <= width
@@ -159,7 +159,7 @@ def test_only_tables_scroll_sideways_and_a_keyboard_reaches_them(browser, pages,
     context.close()
 
 
-def test_words_of_plots_have_the_color_of_the_page_s_words(browser, pages):
+def test_plot_text_has_page_text_color(browser, pages):
     for scheme in ("light", "dark"):
         context, page, _ = opened(browser, pages[0], scheme=scheme)
         colors = page.evaluate(
@@ -170,7 +170,7 @@ def test_words_of_plots_have_the_color_of_the_page_s_words(browser, pages):
         context.close()
 
 
-def test_printed_pages_are_white_and_show_what_is_folded(browser, pages):
+def test_printed_pages_are_white_and_show_folded_content(browser, pages):
     context, page, _ = opened(browser, pages[0], scheme="dark")
     dark = page.evaluate("getComputedStyle(document.body).backgroundColor")
     page.emulate_media(media="print", color_scheme="dark")
@@ -185,7 +185,7 @@ def test_printed_pages_are_white_and_show_what_is_folded(browser, pages):
     context.close()
 
 
-def test_the_skip_link_and_the_contents_lead_to_their_places(browser, pages):
+def test_skip_link_and_contents_lead_to_targets(browser, pages):
     context, page, _ = opened(browser, pages[0])
     page.keyboard.press("Tab")
     assert page.evaluate("document.activeElement.className") == "skip"

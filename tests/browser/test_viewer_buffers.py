@@ -104,7 +104,7 @@ def test_the_page_colors_skin_as_the_table_does(viewer):
     assert np.ptp(wanted[..., 0]) > 0.05
 
 
-def test_the_page_moves_vertices_and_normals_as_the_simulation_does(viewer, scene):
+def test_page_moves_vertices_and_normals_like_simulation(viewer, scene):
     from rigsim.geometry.mesh import build_mesh
     from rigsim.subject.expressions import moved
 
@@ -134,7 +134,7 @@ def _camera(params, size):
     return eye, at[None, :, None] * right - at[:, None, None] * up - back, focal
 
 
-def test_the_page_lights_a_smooth_face_as_lambert_and_kelemen_say(viewer, scene):
+def test_page_shades_smooth_face_by_lambert_and_kelemen(viewer, scene):
     params = viewer.set(ambient=0.0, camera_yaw_deg=25.0, shadows=0)
     eye, way, _ = _camera(params, 256)
     normal = viewer.read("normal").astype(np.float64)
@@ -188,7 +188,7 @@ def _bilinear(values, uv):
 
 
 @pytest.mark.parametrize("texturing", ["post", "pre", "both"])
-def test_light_spreads_on_the_screen_as_the_model_says(viewer, scene, texturing):
+def test_screen_space_scattering_matches_model(viewer, scene, texturing):
     # so close that a millimetre is three pixels, and light visibly spreads
     params = viewer.set(camera_distance_mm=220.0, texturing=texturing, camera_yaw_deg=20.0)
     source = viewer.read("irradiance").astype(np.float64)
@@ -229,7 +229,7 @@ def test_the_display_follows_the_tone_curve(viewer, filmic):
     assert np.abs(got - wanted).max() < 0.75 / 255.0  # rounded to 8 bits
 
 
-def test_only_what_a_change_touches_is_drawn_again(viewer):
+def test_change_redraws_only_affected_passes(viewer):
     viewer.set(light_azimuth_deg=10.0)
     before = viewer.draws()
     viewer.set(light_azimuth_deg=12.0)

@@ -18,14 +18,14 @@ FRAME_MS = 5000.0
 counted beside it is what holds the frame small."""
 
 
-def test_a_page_of_2048_texels_stays_below_5_mb():
+def test_page_of_2048_texels_stays_below_5_mb():
     # the largest texture work of the suite: 45 s of a quiet core
     text = page.build(procedural.scene(size=2048))
     assert len(text.encode("utf-8")) < LARGEST_PAGE
     assert '"width":2048' in text
 
 
-def test_a_turn_of_the_light_draws_no_more_than_it_must(viewer):
+def test_light_rotation_redraws_only_required_passes(viewer):
     found = viewer.bench(4, light=True)
     drawn = found["draws"]
     # shadow, surface, source, eight blurs, radiance, display; what hangs on the skin alone stays
@@ -38,7 +38,7 @@ def test_a_turn_of_the_light_draws_no_more_than_it_must(viewer):
     assert min(found["frames_ms"]) < FRAME_MS
 
 
-def test_any_number_of_blend_shapes_moves_a_mesh_of_a_file(open_page, tmp_path):
+def test_mesh_file_accepts_any_number_of_blend_shapes(open_page, tmp_path):
     mesh = procedural.viewer_mesh(make_subject("III", size=64))
     names = [f"own {k}" for k in range(20)]
     shapes = np.zeros((20, *mesh.vertices_mm.shape), np.float32)
@@ -61,7 +61,7 @@ def test_any_number_of_blend_shapes_moves_a_mesh_of_a_file(open_page, tmp_path):
     assert viewer.problems == []
 
 
-def test_five_heads_alike_share_what_hangs_on_the_skin(viewer):
+def test_five_equal_heads_reuse_skin_resources(viewer):
     one = viewer.read("albedo")[..., 3].mean()
     before = viewer.draws()
     viewer.set(heads=5, crowd=0, camera_distance_mm=1800.0)
@@ -74,7 +74,7 @@ def test_five_heads_alike_share_what_hangs_on_the_skin(viewer):
     assert five.mean() > 3.5 * alone
 
 
-def test_two_sides_are_compared_with_buffers_of_their_own(viewer):
+def test_comparison_sides_use_separate_buffers(viewer):
     viewer.set(hemoglobin_gain=3.0)
     more = _canvas(viewer)
     viewer.set(hemoglobin_gain=1.0)
@@ -98,7 +98,7 @@ def _canvas(viewer):
     return np.array(shown, int).reshape(256, 256, 4)[..., :3]
 
 
-def test_a_page_without_webgl2_says_what_to_do(browser, procedural_html, tmp_path):
+def test_page_without_webgl2_shows_instructions(browser, procedural_html, tmp_path):
     path = tmp_path / "page.html"
     path.write_text(procedural_html, encoding="utf-8")
     context = browser.new_context()
@@ -110,7 +110,7 @@ def test_a_page_without_webgl2_says_what_to_do(browser, procedural_html, tmp_pat
     context.close()
 
 
-def test_two_pages_draw_the_same_picture(open_page, procedural_html, viewer):
+def test_two_pages_draw_identical_images(open_page, procedural_html, viewer):
     viewer.set(camera_yaw_deg=10.0)
     other = open_page(procedural_html)
     other.set(camera_yaw_deg=10.0)

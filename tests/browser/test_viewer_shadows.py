@@ -72,7 +72,7 @@ def _turn(a, b, c):
     ("azimuth", "elevation", "weights"),
     [(35.0, 30.0, {}), (-60.0, 10.0, {"surprise": 1.0}), (5.0, 70.0, {})],
 )
-def test_shadows_lie_where_rays_to_the_light_are_blocked(
+def test_shadows_cover_points_with_blocked_light_rays(
     viewer, procedural_scene, azimuth, elevation, weights
 ):
     params = viewer.set(
@@ -102,7 +102,7 @@ def test_shadows_lie_where_rays_to_the_light_are_blocked(
     assert away.sum() > 0.6 * facing.sum()
 
 
-def test_shadows_dim_light_and_gloss_and_can_be_switched_off(viewer):
+def test_shadows_dim_light_and_specular_and_are_switchable(viewer):
     viewer.set(**FLAT, ambient=0.0, light_elevation_deg=50.0)
     lit = viewer.read("lit")[..., 0]
     dim = {name: viewer.read(name)[..., 0] for name in ("irradiance", "specular")}
@@ -116,7 +116,7 @@ def test_shadows_dim_light_and_gloss_and_can_be_switched_off(viewer):
     assert "shadow_depth" not in viewer.buffers()
 
 
-def test_the_depth_pass_is_drawn_when_mesh_or_light_change_alone(viewer):
+def test_depth_pass_runs_when_mesh_or_light_changes(viewer):
     def drawn(**change):
         before = viewer.draws().get("shadow", 0)
         viewer.set(**change)
@@ -138,7 +138,7 @@ def _bilinear(values, uv):
     return ndimage.map_coordinates(values.astype(np.float64), [y, x], order=1)
 
 
-def test_each_head_of_a_crowd_has_the_blood_of_its_own_expression(viewer, procedural_scene):
+def test_crowd_heads_have_blood_of_own_expression(viewer, procedural_scene):
     table = ("happiness", None, "anger and surprise")
     zero = dict.fromkeys(procedural_scene.params["weights"], 0.0)
     blood = []
@@ -165,7 +165,7 @@ def test_each_head_of_a_crowd_has_the_blood_of_its_own_expression(viewer, proced
     assert np.median(np.abs(alike[here][:, 3] / wanted - 1.0)) < 5e-3
 
 
-def test_a_crowd_costs_what_its_heads_cost_and_keeps_what_did_not_change(viewer):
+def test_crowd_costs_sum_heads_and_reuse_unchanged_passes(viewer):
     one = viewer.bench(1)
     viewer.set(heads=5, camera_distance_mm=1600)
     five = viewer.bench(1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 
-def test_a_page_draws_a_face_without_errors_or_requests(viewer):
+def test_page_draws_face_without_errors_or_requests(viewer):
     picture = viewer.read("display")
     assert picture.shape == (256, 256, 4)
     assert viewer.read("albedo")[..., 3].mean() > 0.2
@@ -14,7 +14,7 @@ def test_a_page_draws_a_face_without_errors_or_requests(viewer):
     assert viewer.problems == []
 
 
-def test_the_first_picture_is_the_one_that_is_drawn_again(open_page, procedural_html):
+def test_first_image_equals_redrawn_image(open_page, procedural_html):
     """Textures reach the device while the first frame is drawn, and keep their own places.
 
     Others have drawn on the page that all share.

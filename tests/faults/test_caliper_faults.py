@@ -95,9 +95,7 @@ class Host:
 
 
 @pytest.mark.parametrize(("number", "faults", "expected"), ON_THE_LINE)
-def test_a_caliper_moves_once_for_each_accepted_move_and_says_how_it_ended(
-    number, faults, expected
-):
+def test_caliper_moves_once_per_accepted_move_reports_end(number, faults, expected):
     world = World(RIG, seed=number, faults=Faults(**faults))
     name = world.register(next(NAMES))
     host = Host(world, f"sim://caliper?world={name}")
@@ -114,7 +112,7 @@ def test_a_caliper_moves_once_for_each_accepted_move_and_says_how_it_ended(
     world.unregister()
 
 
-def test_a_box_that_reset_in_mid_move_has_let_go_and_says_nothing_of_the_move():
+def test_controller_reset_mid_move_releases_without_move_report():
     world = World(SLOW, seed=3, faults=Faults(reset_after=16.0, boot_s=0.2))
     name = world.register(next(NAMES))
     host = Host(world, f"sim://caliper?world={name}")
@@ -136,7 +134,7 @@ def test_a_box_that_reset_in_mid_move_has_let_go_and_says_nothing_of_the_move():
     world.unregister()
 
 
-def test_the_same_seed_gives_the_same_bytes_at_the_same_times():
+def test_same_seed_gives_same_bytes_at_same_times():
     def transcript(seed):
         world = World(RIG, seed=seed, faults=Faults(drop=0.001, flip=0.001, jaw_stall=0.1))
         name = world.register(next(NAMES))

@@ -27,9 +27,7 @@ sys.exit(main(sys.argv[1:]))
 
 
 @pytest.mark.parametrize("transport", ["pty", "tcp"])
-def test_a_capture_killed_while_its_frame_is_awaited_is_resumed_at_once(
-    tmp_path, transport, capsys
-):
+def test_capture_killed_awaiting_frame_resumes_at_once(tmp_path, transport, capsys):
     """The kill falls into a read-out of 1 s; served devices notice that their client is gone."""
     rig = load_rig("flash").resized(16)
     slow = dataclasses.replace(

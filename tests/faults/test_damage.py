@@ -67,7 +67,7 @@ def flip(file, byte, bit):
 @pytest.mark.parametrize(
     "flips_per_file", [30, pytest.param(500, marks=pytest.mark.long, id="500")]
 )
-def test_one_flipped_bit_in_any_file_is_named(request, rng, kind, flips_per_file):
+def test_flipped_bit_in_any_file_is_reported(request, rng, kind, flips_per_file):
     path = request.getfixturevalue(kind)
     assert verify(path).ok
     for name in parts(path):
@@ -103,7 +103,7 @@ def test_every_bit_of_the_last_acknowledged_line_counts(request, kind, stride):
         file.write_bytes(whole)
 
 
-def test_damage_of_a_middle_line_is_named_by_its_first_byte(interrupted):
+def test_damaged_middle_line_is_reported_by_first_byte(interrupted):
     file = interrupted / "journal.jsonl"
     first = file.read_bytes().index(b"\n") + 1
     flip(file, first + 100, 0)
@@ -133,7 +133,7 @@ def test_all_damaged_frames_are_listed_at_once(closed):
 
 
 @pytest.mark.parametrize("cut", [1, 20, 200])
-def test_a_line_cut_off_by_a_crash_is_a_warning_and_goes(interrupted, cut):
+def test_line_truncated_by_crash_warns_and_is_dropped(interrupted, cut):
     file = interrupted / "journal.jsonl"
     whole = file.read_bytes()
     file.write_bytes(whole[:-cut])
@@ -147,7 +147,7 @@ def test_a_line_cut_off_by_a_crash_is_a_warning_and_goes(interrupted, cut):
 
 
 @pytest.mark.parametrize("cut", [1, 20])
-def test_a_closed_session_cut_short_is_never_taken_for_whole(closed, cut):
+def test_truncated_closed_session_is_never_accepted(closed, cut):
     """What can be cut without a trace is the whole closing line: the session is open again."""
     file = closed / "journal.jsonl"
     file.write_bytes(file.read_bytes()[:-cut])
@@ -331,7 +331,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_broken_session_gives_one_clear_error(closed, name):
+def test_broken_session_gives_single_clear_error(closed, name):
     """`verify` returns it, opening or reading raises it, and nothing else ever comes out."""
     breaking, expected = BROKEN[name]
     breaking(closed)
@@ -354,26 +354,26 @@ def test_the_list_of_broken_inputs_is_long_enough():
     assert len(BROKEN) >= 20
 
 
-def test_a_forged_session_with_nothing_wrong_in_it_is_accepted(closed):
+def test_forged_session_without_faults_is_accepted(closed):
     """The forger's tool alone breaks nothing: what the tests above see is the content."""
     reseal(closed)
     assert verify(closed).ok
 
 
 @pytest.mark.parametrize("file", ["frames/S009+cam.dng", "attachments/notes.txt"])
-def test_a_stray_file_in_a_closed_session_is_a_problem(closed, file):
+def test_stray_file_in_closed_session_is_problem(closed, file):
     (closed / file).write_bytes(b"x")
     assert file in verify(closed).problems[0]
 
 
-def test_an_unknown_file_beside_the_frames_is_a_warning(closed):
+def test_unknown_file_among_frames_is_warning(closed):
     (closed / "notes.txt").write_text("x")
     report = verify(closed)
     assert report.ok
     assert any("notes.txt" in warning for warning in report.warnings)
 
 
-def test_a_folder_that_is_no_session_is_named(tmp_path):
+def test_folder_that_is_not_session_is_reported(tmp_path):
     for path in (tmp_path, tmp_path / "none"):
         for read in (verify, Session.open):
             with pytest.raises(NotASession, match=f"{path}: is not a session"):
@@ -382,7 +382,7 @@ def test_a_folder_that_is_no_session_is_named(tmp_path):
 
 @pytest.mark.parametrize("field", ["width_px", "height_px", "bit_depth", "black_level"])
 @pytest.mark.parametrize("value", [-1, 0.5, 1e300, "16", None, [], 2**63])
-def test_no_value_of_a_rig_escapes_as_a_foreign_error(field, value):
+def test_rig_values_never_raise_foreign_errors(field, value):
     data = json.loads(json.dumps(RIG.to_json()))
     data["views"][0][field] = value
     with pytest.raises(InputError, match=rf"views\[0\]\.({field}|white_level)"):

@@ -151,7 +151,7 @@ SLOW = ("gradient", "probe")
         for transport, way_is_slow in (("pty", False), ("tcp", True))
     ],
 )
-def test_a_host_that_dies_leaves_its_boxes_safe_within_the_lease(
+def test_dead_host_leaves_controllers_safe_within_lease(
     host_at_work, last_heard, rig, transport, blow
 ):
     work = WORK[rig]

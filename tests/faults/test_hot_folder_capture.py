@@ -99,7 +99,7 @@ def capture(tmp_path, monkeypatch):
     return capture
 
 
-def test_a_plan_with_darks_runs_by_the_boxs_line_alone(capture):
+def test_plan_with_darks_runs_by_controller_line_alone(capture):
     assert capture(lag_s=0.0, told_s=0.0) == {
         "D000": LEVEL_DARK,
         "D001": LEVEL_DARK,
@@ -108,6 +108,6 @@ def test_a_plan_with_darks_runs_by_the_boxs_line_alone(capture):
     }
 
 
-def test_a_slow_shutter_is_met_when_the_rig_file_tells_of_it_and_missed_when_not(capture):
+def test_slow_shutter_is_met_only_when_rig_declares(capture):
     assert capture(lag_s=0.03, told_s=0.03)["S000"] == LEVEL_LIT
     assert capture(lag_s=0.03, told_s=0.0)["S000"] == LEVEL_DARK

@@ -133,7 +133,7 @@ def frames_of(session):
 
 
 @pytest.mark.parametrize("kills", [6, pytest.param(60, marks=pytest.mark.long)])
-def test_a_killed_writer_loses_nothing_it_acknowledged(nursery, tmp_path, rng, kills):
+def test_killed_writer_keeps_all_acknowledged_data(nursery, tmp_path, rng, kills):
     """Every instant is drawn uniformly over the time of about 15 commits."""
     tally = Counter()
     acknowledged: set[str] = set()

@@ -125,9 +125,7 @@ class Host:
 
 
 @pytest.mark.parametrize(("number", "faults", "expected"), ON_THE_LINE)
-def test_a_probe_lights_once_for_each_accepted_opening_and_says_how_all_ended(
-    number, faults, expected
-):
+def test_probe_lights_once_per_accepted_opening_reports_end(number, faults, expected):
     world = World(RIG, seed=number, faults=Faults(**faults))
     name = world.register(next(NAMES))
     host = Host(world, f"sim://probe?world={name}")
@@ -150,7 +148,7 @@ def test_a_probe_lights_once_for_each_accepted_opening_and_says_how_all_ended(
     world.unregister()
 
 
-def test_a_box_that_reset_in_mid_suction_has_vented_and_says_nothing_of_it():
+def test_controller_reset_mid_suction_vents_without_report():
     world = World(RIG, seed=3, faults=Faults(reset_after=4.0, boot_s=0.2))
     name = world.register(next(NAMES))
     host = Host(world, f"sim://probe?world={name}")
@@ -173,7 +171,7 @@ def test_a_box_that_reset_in_mid_suction_has_vented_and_says_nothing_of_it():
     world.unregister()
 
 
-def test_leaks_that_sag_are_told_by_the_gauge_alone():
+def test_sagging_leaks_show_only_in_gauge():
     """The box vents what is not reached; whether 50 mbar will do for 60 is the host's to say."""
     readings = {}
     for leak in (0.0, 0.2):

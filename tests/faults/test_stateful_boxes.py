@@ -28,7 +28,7 @@ LEFT_OUT = [
 
 
 @pytest.mark.parametrize("box", HOSTS)
-def test_a_box_keeps_its_rules_on_a_noisy_line(box):
+def test_controller_obeys_rules_on_noisy_line(box):
     _, host, steps = HOSTS[box]
     explore(host, 40 if box == "flash" else 25, steps=steps)
 
@@ -36,13 +36,13 @@ def test_a_box_keeps_its_rules_on_a_noisy_line(box):
 @pytest.mark.long
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("box", HOSTS)
-def test_a_box_keeps_its_rules_on_a_noisy_line_for_long(box):
+def test_controller_obeys_rules_on_noisy_line_long_run(box):
     _, host, steps = HOSTS[box]
     explore(host, 600 if box == "flash" else 500, steps=steps)
 
 
 @pytest.mark.parametrize(("box", "leave_out", "caught_by"), LEFT_OUT)
-def test_a_box_with_one_rule_left_out_is_caught(monkeypatch, box, leave_out, caught_by):
+def test_controller_missing_any_rule_is_detected(monkeypatch, box, leave_out, caught_by):
     leave_out(monkeypatch)
     _, host, steps = HOSTS[box]
     with pytest.raises(AssertionError) as caught:
@@ -50,7 +50,7 @@ def test_a_box_with_one_rule_left_out_is_caught(monkeypatch, box, leave_out, cau
     assert {entry.name for entry in caught.traceback} & set(caught_by)
 
 
-def test_the_cache_of_answers_is_a_queue_of_eight():
+def test_answer_cache_is_queue_of_eight():
     controller = World(flash.RIG).box("flash")
     assert isinstance(controller._replies, deque)
     assert controller._replies.maxlen == 8

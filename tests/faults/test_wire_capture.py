@@ -110,7 +110,7 @@ def check(world, session):
     ],
     ids=lambda faults: "+".join(faults) or "none",
 )
-def test_every_frame_that_is_kept_shows_the_pop_that_it_names(world, session, faults):
+def test_kept_frames_show_the_pop_they_name(world, session, faults):
     simulated = world(seed=4, **faults)
     done = capture(simulated, session)
     assert done.steps == 14
@@ -124,7 +124,7 @@ def test_every_frame_that_is_kept_shows_the_pop_that_it_names(world, session, fa
     ("faults", "error"),
     [({"reset_after": 20.0}, BoxRebooted), ({"unplug_after": 20.0, "replug_after": 0.5}, LinkLost)],
 )
-def test_an_interrupted_capture_goes_on_where_it_was(world, session, faults, error):
+def test_interrupted_capture_continues_from_same_step(world, session, faults, error):
     simulated = world(seed=1, **faults)
     with pytest.raises(error):
         capture(simulated, session)
@@ -138,7 +138,7 @@ def test_an_interrupted_capture_goes_on_where_it_was(world, session, faults, err
 @pytest.mark.parametrize(
     "faults", [{"wrong_camera": 1.0}, {"misfire": 1.0}, {"interlock": True}, {"drop_frame": 1.0}]
 )
-def test_what_does_not_heal_ends_dark_with_one_error(world, session, faults):
+def test_persistent_fault_ends_dark_with_single_error(world, session, faults):
     simulated = world(**faults)
     with pytest.raises(DeviceError):
         capture(simulated, session)
@@ -146,7 +146,7 @@ def test_what_does_not_heal_ends_dark_with_one_error(world, session, faults):
 
 
 @pytest.mark.parametrize("settings", [{"power": 0.001}, {"power": 1.0, "analyser_deg": 270.0}])
-def test_a_plan_beyond_the_limits_of_the_box_moves_and_lights_nothing(world, session, settings):
+def test_plan_beyond_controller_limits_moves_and_lights_nothing(world, session, settings):
     simulated = world()
     more = {"polarizer": "parallel", "exposure_s": 0.008, "iso": 100, **settings}
     plan = Plan("flash", (Step("S1", "subject", {}, more, ("cam",)),))
@@ -156,7 +156,7 @@ def test_a_plan_beyond_the_limits_of_the_box_moves_and_lights_nothing(world, ses
     assert not any("FLAS:PO" in line or "ARM" in line for line in simulated.transcript)
 
 
-def test_the_box_is_armed_only_for_its_pops(world, session):
+def test_controller_is_armed_only_during_its_pops(world, session):
     simulated = world()
     capture(simulated, session)
     sent = [line.split("FLAS:FIRE")[0] for line in simulated.transcript if " > " in line]

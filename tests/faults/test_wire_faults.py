@@ -72,7 +72,7 @@ def test_nothing_is_done_twice_or_wrongly_acknowledged(world, ledger, number, fa
         ({"brownout": 0.03, "boot_s": 0.1}, "BoxRebooted"),
     ],
 )
-def test_the_same_holds_in_real_time_on_real_lines(ledger, transport, faults, error):
+def test_fault_rules_hold_in_real_time_real_lines(ledger, transport, faults, error):
     world = World(RIG, seed=2, clock="real", faults=Faults(baud=0.0, **faults))
     with serve(RIG, world=world, pty=transport == "pty") as served:
         host = ledger(world, served.addresses["flash"])
@@ -87,7 +87,7 @@ def test_the_same_holds_in_real_time_on_real_lines(ledger, transport, faults, er
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 @pytest.mark.parametrize("transport", ["pty", "tcp"])
-def test_a_pulled_cable_is_a_lost_link_on_real_lines(transport):
+def test_pulled_cable_is_lost_link_on_real_lines(transport):
     faults = Faults(baud=0.0, unplug_after=0.3)
     world = World(RIG, clock="real", faults=faults)
     with serve(RIG, world=world, pty=transport == "pty") as served:
@@ -99,7 +99,7 @@ def test_a_pulled_cable_is_a_lost_link_on_real_lines(transport):
             port.reopen()
 
 
-def test_a_stalled_box_fills_the_line_and_is_a_timeout(world):
+def test_stalled_controller_fills_line_and_times_out(world):
     _, url = world(stall_after=0.5, stall_s=60.0)
     box = FlashBox(Port(url, retries=20))
     box.port.listen(1.0)
@@ -112,14 +112,14 @@ def test_a_stalled_box_fills_the_line_and_is_a_timeout(world):
     ("faults", "match"),
     [({"serial": "FL-0666"}, "got the flash box FL-0666"), ({"protocol": 2}, "protocol 2")],
 )
-def test_a_wrong_box_or_firmware_is_refused_before_anything_is_sent(world, faults, match):
+def test_wrong_controller_or_firmware_is_refused_before_sending(world, faults, match):
     simulated, url = world(**faults)
     with pytest.raises(WrongDevice, match=match):
         FlashBox(Port(url), serial="FL-0001")
     assert not simulated.link("flash").attached
 
 
-def test_a_box_whose_cable_was_put_back_is_found_again_under_another_name(world):
+def test_reconnected_controller_is_found_under_new_name(world):
     simulated, url = world(unplug_after=1.0, replug_after=2.0)
     box = FlashBox(Port(url))
     box.port.listen(0.5)
@@ -134,7 +134,7 @@ def test_a_box_whose_cable_was_put_back_is_found_again_under_another_name(world)
     box.close()
 
 
-def test_every_fault_of_a_flash_box_or_camera_has_its_switch():
+def test_flash_and_camera_faults_each_have_a_switch():
     assert [kind.number for kind in FAULT_CATALOG] == list(range(1, 21))
     fields = {"latency", "baud", *(name for kind in FAULT_CATALOG for name in kind.switches)}
     assert fields | {"interlock"} == set(Faults.__dataclass_fields__)
@@ -199,7 +199,7 @@ def test_a_noisy_line_does_nothing_wrong_for_long(world, ledger, seed):
     noisy_run(ledger, simulated, url, requests=10_000)
 
 
-def test_the_same_seed_gives_the_same_bytes_at_the_same_times(world, ledger):
+def test_same_seed_gives_same_bytes_at_same_times(world, ledger):
     def transcript(seed):
         simulated, url = world(seed=seed, drop=0.001, flip=0.001, late=0.01, duplicate=0.01)
         noisy_run(ledger, simulated, url, requests=400)

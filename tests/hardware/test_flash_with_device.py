@@ -17,7 +17,7 @@ def box(device_port):
         yield box
 
 
-def test_the_box_states_its_limits(box):
+def test_controller_reports_its_limits(box):
     limits = box.limits
     assert limits["kind"] == "flash"
     assert 0.0 < limits["power_min"] < limits["power_max"] <= 1.0
@@ -27,7 +27,7 @@ def test_the_box_states_its_limits(box):
     assert limits["lamp_max_ms"] <= 500
 
 
-def test_the_box_lights_nothing_unless_armed(box):
+def test_controller_lights_nothing_unless_armed(box):
     count = box.count()
     with pytest.raises(CommandRefused) as caught:
         box.fire("unarmed")
@@ -35,7 +35,7 @@ def test_the_box_lights_nothing_unless_armed(box):
     assert box.count() == count
 
 
-def test_one_pop_is_made_and_counted_once(box):
+def test_single_pop_is_made_and_counted_once(box):
     count = box.count()
     box.set_polarizer("crossed")
     box.set_power(box.limits["power_min"])
@@ -47,7 +47,7 @@ def test_one_pop_is_made_and_counted_once(box):
     assert box.last_pop() == report
 
 
-def test_a_silent_host_finds_the_box_dark_and_disarmed(box):
+def test_silent_host_leaves_controller_dark_and_disarmed(box):
     box.set_lease(0.3)
     box.arm()
     box.lamp_on(0.5)
@@ -57,7 +57,7 @@ def test_a_silent_host_finds_the_box_dark_and_disarmed(box):
     assert not box.is_armed()
 
 
-def test_the_clock_of_the_box_runs_as_ours_does(box):
+def test_controller_clock_runs_at_host_rate(box):
     before = box.ping()
     box.port.listen(1.0)
     assert box.ping() - before == pytest.approx(1.0, abs=0.1)

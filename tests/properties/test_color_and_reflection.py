@@ -37,7 +37,7 @@ def unit(vector):
 
 @CHEAP
 @given(a=VECTOR, b=VECTOR, scale=st.floats(1e-100, 1e100))
-def test_an_angle_knows_no_length_and_no_order(a, b, scale):
+def test_angle_ignores_length_and_order(a, b, scale):
     assume(np.linalg.norm(a) > 1e-3)
     assume(np.linalg.norm(b) > 1e-3)
     found = metrics.angular_error_rad(a, b)
@@ -53,7 +53,7 @@ def test_an_angle_knows_no_length_and_no_order(a, b, scale):
     first=st.tuples(st.floats(0, 100), *[st.floats(-120, 120)] * 2),
     second=st.tuples(st.floats(0, 100), *[st.floats(-120, 120)] * 2),
 )
-def test_a_color_difference_is_none_to_itself_and_alike_both_ways(first, second):
+def test_color_difference_is_symmetric_and_zero_to_itself(first, second):
     there = colorimetry.delta_e_2000(first, second)
     assert np.isfinite(there)
     assert there >= 0.0
@@ -73,7 +73,7 @@ def test_the_typology_angle_rises_with_lightness(lightness, b_star):
 
 @CHEAP
 @given(values=st.lists(ANY_FLOAT, max_size=30), level=st.floats(0.01, 0.99))
-def test_coverage_counts_finite_trials_only_and_lies_in_its_interval(values, level):
+def test_coverage_counts_finite_trials_and_is_within_interval(values, level):
     found = metrics.coverage(values, 1.0, 0.0, level=level)
     assert found.count == int(np.isfinite(values).sum())
     if found.count:
@@ -84,7 +84,7 @@ def test_coverage_counts_finite_trials_only_and_lies_in_its_interval(values, lev
 
 @CHEAP
 @given(values=st.lists(ANY_FLOAT, max_size=30), seed=st.integers(0, 99))
-def test_a_median_lies_in_its_interval_and_among_the_values(values, seed):
+def test_median_is_within_its_interval_and_values(values, seed):
     values = np.clip(values, -1e300, 1e300).tolist()
     finite = [v for v in values if np.isfinite(v)]
     rng = np.random.default_rng(seed)
@@ -110,7 +110,7 @@ def test_a_median_lies_in_its_interval_and_among_the_values(values, seed):
         spectra.color_matching_functions,
     ],
 )
-def test_a_spectrum_is_not_negative_and_takes_wavelengths_one_by_one(spectrum, wavelength):
+def test_spectrum_is_nonnegative_and_evaluates_wavelengths_independently(spectrum, wavelength):
     found = np.asarray(spectrum(wavelength))
     assert np.all(np.isfinite(found) & (found >= 0.0))
     one = np.asarray(spectrum([wavelength[0]]))
@@ -124,7 +124,7 @@ def test_a_spectrum_is_not_negative_and_takes_wavelengths_one_by_one(spectrum, w
     light=st.sampled_from(spectra.illuminant_names()),
     level=SHARE,
 )
-def test_an_even_reflectance_has_no_color_under_any_light(camera, light, level):
+def test_flat_reflectance_has_zero_chroma_under_any_light(camera, light, level):
     found = spectra.band_average(np.full(31, level), camera, light)
     np.testing.assert_allclose(found, level, atol=1e-9)
     weights = spectra.band_weights(camera, light)
@@ -201,7 +201,7 @@ def test_more_noise_leaves_chromophores_less_identifiable(table, noise):
 
 @CHEAP
 @given(values=st.lists(st.floats(-1.0, 1.0), min_size=9, max_size=9))
-def test_an_error_common_to_the_channels_weighs_no_color(values):
+def test_error_common_to_channels_has_no_color_weight(values):
     root = np.array(values).reshape(3, 3)
     plane = np.eye(3) - 1.0 / 3.0
     covariance = plane @ root @ root.T @ plane + 1e-4 * plane
@@ -215,7 +215,7 @@ def test_an_error_common_to_the_channels_weighs_no_color(values):
 
 @CHEAP
 @given(center=st.floats(-2.0, 0.5), spread=st.floats(0.05, 1.0))
-def test_a_lognormal_prior_has_its_mean_and_spread(center, spread):
+def test_lognormal_prior_has_its_mean_and_deviation(center, spread):
     prior = shading_prior.lognormal(np.exp(center), spread)
     assert prior.spread == pytest.approx(spread, rel=0.05)
     assert prior.broadened(1.5).spread >= prior.spread * (1.0 - 1e-9)
@@ -225,7 +225,7 @@ def test_a_lognormal_prior_has_its_mean_and_spread(center, spread):
 
 @CHEAP
 @given(counts=st.lists(st.integers(0, 1000), min_size=3, max_size=40), low=st.floats(-3.0, 0.0))
-def test_a_prior_of_samples_lies_where_they_do(counts, low):
+def test_shading_prior_mean_is_within_sample_nodes(counts, low):
     assume(sum(counts) > 0)
     prior = shading_prior.from_samples(low, 0.05, counts)
     assert prior.nodes[0] <= prior.mean <= prior.nodes[-1]
@@ -233,7 +233,7 @@ def test_a_prior_of_samples_lies_where_they_do(counts, low):
 
 @CHEAP
 @given(cosine=st.floats(-1.0, 1.0))
-def test_the_surface_lets_through_a_share_of_the_light(cosine):
+def test_surface_transmittance_is_between_zero_and_all(cosine):
     share = skin_reflectance.transmitted(cosine)
     assert 0.0 <= share <= 1.0
 
@@ -262,9 +262,7 @@ def test_facets_cover_the_surface_once(roughness, kind):
     eta=st.floats(1.01, 2.0),
     kind=KIND,
 )
-def test_a_lobe_is_the_same_both_ways_and_never_negative(
-    light, view, half, turn, roughness, eta, kind
-):
+def test_lobe_is_reciprocal_and_nonnegative(light, view, half, turn, roughness, eta, kind):
     there, back = (
         microfacet.brdf(a, b, half, turn, roughness=roughness, eta=eta, kind=kind)
         for a, b in ((light, view), (view, light))
@@ -297,7 +295,7 @@ def test_half_and_difference_angles_come_back_as_directions(light, view):
     size=st.sampled_from([1, 3, 5, 9]),
     scale=st.sampled_from([1e-30, 1.0, 1e30]),
 )
-def test_what_is_detectable_knows_no_unit(seed, size, scale):
+def test_detectability_is_unit_invariant(seed, size, scale):
     rng = np.random.default_rng(seed)
     estimate, stderr = rng.standard_normal((12, 10)), rng.uniform(0.1, 3.0, (12, 10))
     valid = rng.uniform(size=(12, 10)) > 0.2
@@ -309,7 +307,7 @@ def test_what_is_detectable_knows_no_unit(seed, size, scale):
 
 @CHEAP
 @given(diffuse=st.floats(0.0, 1e6), specular=st.floats(0.0, 1e6))
-def test_polarized_pictures_are_parted_into_what_they_were_made_of(diffuse, specular):
+def test_polarized_images_are_separated_into_their_components(diffuse, specular):
     parallel = np.full((2, 3, 3), specular + 0.5 * diffuse)
     crossed = np.full((2, 3, 3), 0.5 * diffuse)
     found = polarization.separate(parallel, crossed)
@@ -320,7 +318,7 @@ def test_polarized_pictures_are_parted_into_what_they_were_made_of(diffuse, spec
 
 @FEW
 @given(seed=st.integers(0, 99), scale=st.floats(0.1, 10.0))
-def test_independent_components_of_a_picture_know_no_exposure(seed, scale):
+def test_independent_components_of_image_are_exposure_invariant(seed, scale):
     rng = np.random.default_rng(seed)
     pigment = rng.uniform(0.1, 1.0, (2, 24, 24))
     absorb = np.array([[0.2, 0.6, 1.1], [0.1, 0.9, 0.4]])
@@ -336,7 +334,7 @@ def test_independent_components_of_a_picture_know_no_exposure(seed, scale):
 
 @CHEAP
 @given(place=st.tuples(st.floats(-1.2, 1.2), st.floats(-1.2, 1.2)), view=VECTOR)
-def test_places_of_normals_come_back(place, view):
+def test_normal_positions_round_trip(place, view):
     at = np.array(place)
     normal = sphere_lights.normal_at(at)
     assert np.linalg.norm(normal) == pytest.approx(1.0)
@@ -357,7 +355,7 @@ RING = sphere_lights.SphereLights(np.concatenate([np.eye(3), -np.eye(3)]))
     mirror=st.booleans(),
 )
 @example(view=(0.0, 0.0, 1.0), eta=2.0, vector=(0.0, 0.0, 2.7e-204), mirror=False)
-def test_what_lights_show_of_a_lobe_is_finite_in_its_domain(view, eta, vector, mirror):
+def test_lobe_response_to_lights_is_finite_in_domain(view, eta, vector, mirror):
     across = 1.0 - unit(view)[1] ** 2  # of the analyser, squared: 1 where it faces the view
     if abs(unit(view)[1]) > 0.9999995:
         with pytest.raises(sphere_lights.SphereLightsError, match="analyser"):
@@ -373,7 +371,7 @@ def test_what_lights_show_of_a_lobe_is_finite_in_its_domain(view, eta, vector, m
 
 @FEW
 @given(bad=st.sampled_from([np.nan, np.inf, -np.inf]))
-def test_lobes_of_what_is_not_finite_are_an_error(bad):
+def test_lobes_of_nonfinite_values_raise_error(bad):
     up = np.array([0.0, 0.0, 1.0])
     with pytest.raises(sphere_lights.SphereLightsError, match="place"):
         sphere_lights.normal_at(np.array([0.1, bad]))
@@ -399,7 +397,7 @@ def test_lobes_of_what_is_not_finite_are_an_error(bad):
 
 @CHEAP
 @given(seed=st.integers(0, 999), scale=st.sampled_from([1e-30, 1.0, 1e30]))
-def test_model_errors_of_a_relief_only_widen_and_scale_with_it(seed, scale):
+def test_topography_model_errors_only_widen_and_scale(seed, scale):
     rng = np.random.default_rng(seed)
     height = (scale * rng.standard_normal((6, 5))).astype(np.float32)
     stderr = (scale * rng.uniform(0.01, 1.0, (6, 5))).astype(np.float32)

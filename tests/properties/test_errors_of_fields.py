@@ -25,7 +25,7 @@ def grid(side):
 @CHEAP
 # the fit takes 1e-9 px for the least that windows scatter
 @given(seed=SEEDS, side=st.integers(3, 7), unit=st.floats(0.1, 1e3), noise=st.floats(1e-4, 0.1))
-def test_an_affine_map_comes_back_with_an_error_in_the_unit_of_the_places(seed, side, unit, noise):
+def test_affine_map_returns_with_error_in_position_units(seed, side, unit, noise):
     rng = np.random.default_rng(seed)
     places = grid(side) - (side - 1) / 2
     linear, shift = np.eye(2) + 0.2 * rng.normal(size=(2, 2)), rng.normal(size=2)
@@ -52,7 +52,7 @@ def test_points_on_a_line_make_no_map(count, seed):
 
 @CHEAP
 @given(seed=SEEDS, side=st.integers(3, 8), unit=UNIT, shift=st.floats(-10.0, 10.0))
-def test_the_error_of_a_mean_has_the_unit_of_values_and_no_place_of_zero(seed, side, unit, shift):
+def test_mean_error_has_value_units_and_ignores_origin(seed, side, unit, shift):
     rng = np.random.default_rng(seed)
     values, sizes = rng.normal(size=side**2), rng.integers(1, 50, side**2).astype(float)
     error, growth = blocks.stderr_of_mean(values, sizes, grid(side))
@@ -72,7 +72,7 @@ def test_too_few_blocks_have_an_endless_error(count):
 
 @CHEAP
 @given(x=st.floats(0.0, 1e4), y=st.floats(0.0, 1e4))
-def test_interpolation_leaves_noise_between_half_of_it_and_all(x, y):
+def test_interpolation_leaves_half_to_all_of_noise(x, y):
     left = dense_flow.noise_left(np.array([[[x, y], [np.floor(x), np.floor(y)]]], np.float32))
     assert 0.3 < left[0, 0] <= 1.0 + 1e-5
     assert left[0, 1] == pytest.approx(1.0, abs=1e-6)
@@ -80,7 +80,7 @@ def test_interpolation_leaves_noise_between_half_of_it_and_all(x, y):
 
 @CHEAP
 @given(start=st.floats(0.1, 0.5), end=st.floats(0.1, 0.5), tau=st.floats(5.0, 40.0), seed=SEEDS)
-def test_blood_of_vessels_is_the_square_of_its_root_with_its_error(start, end, tau, seed):
+def test_vessel_blood_is_square_of_root_with_error(start, end, tau, seed):
     time = np.linspace(0.0, 90.0, 20)
     course = end + (start - end) * np.exp(-time / tau)
     noisy = course + 1e-3 * np.random.default_rng(seed).normal(size=20)
@@ -94,7 +94,7 @@ def test_blood_of_vessels_is_the_square_of_its_root_with_its_error(start, end, t
 
 @CHEAP
 @given(seed=SEEDS, side=st.integers(24, 64), blocks=st.integers(3, 8))
-def test_blocks_of_a_map_have_the_error_of_their_means(seed, side, blocks):
+def test_map_blocks_have_error_of_their_means(seed, side, blocks):
     values = np.random.default_rng(seed).normal(size=side * side)
     group, groups = normal_blocks.block_of(np.arange(side * side), (side, side), blocks)
     error, growth = normal_blocks.block_error(values, group, groups, (side, side), blocks)
@@ -105,7 +105,7 @@ def test_blocks_of_a_map_have_the_error_of_their_means(seed, side, blocks):
 
 @CHEAP
 @given(seed=SEEDS, off=st.floats(0.0, 3.0), light=st.floats(1e-3, 1e3))
-def test_a_misplaced_picture_errs_with_the_square_of_its_place_whatever_the_light(seed, off, light):
+def test_misplaced_image_error_is_quadratic_under_any_light(seed, off, light):
     skin = 0.3 + 0.1 * np.random.default_rng(seed).random((24, 24, 3))
     valid = np.ones((24, 24), bool)
     valid[:4] = False
@@ -140,7 +140,7 @@ def test_a_misplaced_picture_errs_with_the_square_of_its_place_whatever_the_ligh
     noise=st.floats(1e-3, 0.3),
     bad=st.sampled_from([np.nan, np.inf, 0.0, -1.0]),
 )
-def test_light_that_changes_alike_everywhere_is_told_whatever_pixels_lack(seed, step, noise, bad):
+def test_uniform_light_change_is_detected_despite_missing_pixels(seed, step, noise, bad):
     rng = np.random.default_rng(seed)
     side = 32
     light = np.array([[0.0], [step]]) + noise * rng.normal(size=(2, side * side))
@@ -168,7 +168,7 @@ def test_light_that_changes_alike_everywhere_is_told_whatever_pixels_lack(seed, 
     noise=st.floats(1e-6, 0.2),
     bad=st.sampled_from([np.nan, np.inf, -np.inf, 0.0]),
 )
-def test_means_of_repeats_follow_their_unit_whatever_is_masked(seed, count, unit, noise, bad):
+def test_repeat_means_scale_with_unit_under_any_mask(seed, count, unit, noise, bad):
     rng = np.random.default_rng(seed)
     rgb = 0.4 * np.exp(noise * rng.normal(size=(count, 8, 9, 3)))
     variance = np.square(noise * rgb)

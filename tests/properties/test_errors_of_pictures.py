@@ -14,7 +14,7 @@ from reconstruction.chromophores import model_error
     gain=st.floats(1e-3, 1e3),
     spread=st.floats(0.0, 2.0),
 )
-def test_fine_structure_is_finite_not_negative_and_the_same_in_any_light(seed, shape, gain, spread):
+def test_fine_structure_is_finite_nonnegative_and_light_invariant(seed, shape, gain, spread):
     rng = np.random.default_rng(seed)
     rgb = np.exp(spread * rng.standard_normal((*shape, 3)))
     rgb[rng.random(shape) < 0.1] = np.nan
@@ -31,7 +31,7 @@ def test_fine_structure_is_finite_not_negative_and_the_same_in_any_light(seed, s
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**31), factor=st.floats(0.1, 10.0), spread=st.floats(0.0, 1.0))
-def test_errors_of_a_picture_are_covariances_that_scale_with_their_terms(seed, factor, spread):
+def test_image_errors_are_covariances_scaling_with_terms(seed, factor, spread):
     rng = np.random.default_rng(seed)
     rgb = 0.3 * np.exp(spread * rng.standard_normal((9, 8, 3)))
     valid = rng.random((9, 8)) < 0.9

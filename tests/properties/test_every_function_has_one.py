@@ -151,17 +151,17 @@ def unjudged(public, known):
     return sorted(silent)
 
 
-def test_every_public_function_is_driven_over_its_domain_or_judged_by_name():
+def test_public_functions_are_driven_over_domain_or_exempt():
     assert unjudged(public_functions(), driven() | named_by_tests()) == []
 
 
-def test_a_function_that_no_test_reaches_would_be_found():
+def test_function_without_test_is_found():
     lonely = "model.fresnel.nobody_calls_it"
     assert unjudged({lonely}, driven() | named_by_tests()) == [lonely]
 
 
 @pytest.mark.parametrize("name", ["model.dipole.profile.reflectance", "model.fresnel.reflectance"])
-def test_a_function_that_a_test_is_parametrized_with_counts_as_driven(name):
+def test_parametrized_function_counts_as_driven(name):
     assert name in driven()
 
 

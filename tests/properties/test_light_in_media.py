@@ -40,7 +40,7 @@ def test_a_surface_reflects_between_nothing_and_all(cosine, eta):
 
 @CHEAP
 @given(eta=st.floats(1.0, 3.0))
-def test_diffuse_light_meets_one_surface_from_both_sides(eta):
+def test_diffuse_light_meets_same_surface_from_both_sides(eta):
     inside, outside = fresnel.diffuse_internal(eta), fresnel.diffuse_external(eta)
     assert -1e-12 <= outside <= inside + 1e-12 < 1.0
     assert 1.0 - inside == pytest.approx((1.0 - outside) / eta**2, rel=1e-9)
@@ -56,9 +56,7 @@ def test_diffuse_light_meets_one_surface_from_both_sides(eta):
 @CHEAP
 @given(radius=ANY_SIZE, sigma_a=ANY_SIZE, sigma_s=ANY_SIZE, eta=ETA)
 @pytest.mark.parametrize("model", [dipole.reflectance, diffusion.reflectance])
-def test_a_profile_is_finite_and_not_negative_whatever_the_sizes(
-    model, radius, sigma_a, sigma_s, eta
-):
+def test_profile_is_finite_nonnegative_for_any_size(model, radius, sigma_a, sigma_s, eta):
     found = model(radius, sigma_a, sigma_s, eta)
     assert np.isfinite(found)
     assert found >= 0.0
@@ -94,7 +92,7 @@ def test_a_profile_falls_with_the_distance_and_broadcasts(model, sigma_a, sigma_
     "model",
     [dipole.reflectance, diffusion.reflectance, diffusion.derivatives, photon_table.reflectance],
 )
-def test_a_profile_of_numbers_that_no_medium_has_is_an_error(model, bad, place):
+def test_profile_of_impossible_medium_raises_error(model, bad, place):
     # the table's media may be as black as they like: nothing comes back
     assume(not (bad == 1e301 and place == 1 and model is photon_table.reflectance))
     values = [1.0, 0.1, 1.0]
@@ -136,7 +134,7 @@ def test_total_reflectance_comes_back_from_its_inverse(albedo, eta):
 
 @CHEAP
 @given(r_d=st.floats(allow_nan=True, allow_infinity=True), eta=ETA)
-def test_the_inverse_is_masked_exactly_where_no_medium_reflects_so(r_d, eta):
+def test_inverse_is_masked_exactly_where_unreachable(r_d, eta):
     outlier = dipole.is_outlier([r_d])
     for invert in (dipole.invert_total_reflectance, dipole.invert_to_deficit):
         found = invert(np.array([r_d]), eta)
@@ -175,9 +173,7 @@ def test_effective_transport_of_any_medium_is_a_number(sigma_a, sigma_s):
     collection=st.sampled_from(["all", "fibre"]),
 )
 @example(radius=1.0, sigma_a=1.0, sigma_s=2.2e-311, eta=1.4, g=0.0, collection="all")
-def test_the_photon_table_is_finite_and_says_where_it_holds(
-    radius, sigma_a, sigma_s, eta, g, collection
-):
+def test_photon_table_is_finite_and_reports_validity(radius, sigma_a, sigma_s, eta, g, collection):
     told = {"eta": eta, "g": g, "collection": collection}
     value = photon_table.reflectance(radius, sigma_a, sigma_s, **told)
     assert np.isfinite(value)
@@ -217,7 +213,7 @@ def test_the_photon_table_scales_with_the_length(radius, sigma_a, sigma_s, scale
 @example(radius=1e-50, sigma_a=1e50, sigma_s=1e50, core=0.0)
 @example(radius=1.0, sigma_a=5e-324, sigma_s=5e-324, core=1e50)
 @example(radius=1.0, sigma_a=0.0, sigma_s=5e-324, core=0.0)
-def test_the_photon_table_is_a_number_far_beyond_its_rings(radius, sigma_a, sigma_s, core):
+def test_photon_table_is_finite_far_beyond_rings(radius, sigma_a, sigma_s, core):
     slopes = photon_table.derivatives(radius, sigma_a, sigma_s, core_mm=core)
     assert slopes.reflectance_per_mm2 >= 0.0
     assert np.isfinite(slopes).all()
@@ -232,7 +228,7 @@ def test_no_table_has_the_pole_of_a_point(bad):
 
 @CHEAP
 @given(bad=st.sampled_from([np.nan, -1.0, -5e-324, np.inf]), place=st.integers(0, 2))
-def test_layers_of_numbers_that_no_medium_has_are_an_error(bad, place):
+def test_layers_of_impossible_medium_raise_error(bad, place):
     values = [np.array([[0.1, 0.2]]), np.array([[1.0, 2.0]]), np.array([[1.0, 2.0]])]
     values[place][0, 0] = bad
     assume(place != 2 or bad != np.inf)
@@ -256,14 +252,14 @@ def test_layers_of_numbers_that_no_medium_has_are_an_error(bad, place):
         lambda nm: spectra.camera_sensitivity("Nikon 5100 (NPL)", nm),
     ],
 )
-def test_a_wavelength_that_no_light_has_is_an_error(of, bad):
+def test_impossible_wavelength_raises_error(of, bad):
     with pytest.raises(ValueError, match="wavelength_nm"):
         of(np.array([500.0, bad]))
 
 
 @FEW
 @given(tiny=st.sampled_from([5e-324, 1e-300, 1e-46]))
-def test_areas_too_small_for_a_number_send_no_light(tiny):
+def test_dipole_gather_of_negligible_areas_sends_no_light(tiny):
     place = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     light, at = np.ones((3, 3)), np.array([[0.5, 0.5, 0.0]])
     told = dipole_gather.exitance(place, np.array([1.0, tiny, 1.0]), light, at, 0.5, 1.0)
@@ -287,7 +283,7 @@ def test_areas_too_small_for_a_number_send_no_light(tiny):
         lambda eta: adding_doubling.quadrature(eta, 4),
     ],
 )
-def test_an_index_that_no_matter_has_is_an_error(average, eta):
+def test_impossible_refractive_index_raises_error(average, eta):
     with pytest.raises(ValueError, match="eta"):
         average(eta)
 
@@ -306,7 +302,7 @@ def test_averages_of_any_index_are_finite_or_refused(eta):
 
 @FEW
 @given(eta=st.one_of(st.floats(-1.0, 0.99), st.floats(1.61, 5.0), st.just(np.nan)))
-def test_the_photon_table_refuses_an_index_that_it_does_not_hold(eta):
+def test_photon_table_refuses_index_outside_table(eta):
     with pytest.raises(photon_medium.TableDomainError):
         photon_medium.prepare(eta, 0.8, "all")
     with pytest.raises(photon_medium.TableDomainError):
@@ -315,7 +311,7 @@ def test_the_photon_table_refuses_an_index_that_it_does_not_hold(eta):
 
 @CHEAP
 @given(bad=st.sampled_from([0.0, 5e-324, -1.0, 1e301, np.nan, np.inf]))
-def test_no_light_decays_in_a_medium_that_is_none(bad):
+def test_asymptotic_decay_in_invalid_medium_is_refused(bad):
     with pytest.raises(ValueError, match="absorption_ratio"):
         photon_medium.asymptotic_decay(bad, 0.8)
     with pytest.raises(ValueError, match="g: "):
@@ -324,7 +320,7 @@ def test_no_light_decays_in_a_medium_that_is_none(bad):
 
 @CHEAP
 @given(ratio=st.floats(1e-8, 1e3), g=TABLE_G)
-def test_light_far_from_its_source_decays_between_absorption_and_diffusion(ratio, g):
+def test_distant_light_decays_between_absorption_and_diffusion(ratio, g):
     decay = float(photon_medium.asymptotic_decay(ratio, g))
     # in units of sigma_s': never faster than a straight ray is attenuated
     assert 0.0 < decay <= (ratio + 1.0 / (1.0 - g)) * (1.0 + 1e-4)
@@ -335,7 +331,7 @@ def test_light_far_from_its_source_decays_between_absorption_and_diffusion(ratio
 @CHEAP
 @given(radius=st.floats(0.0, 1e3), core=st.floats(0.0, 5.0), source=st.floats(0.0, 5.0))
 @example(radius=0.0, core=1.0, source=1e-5)
-def test_averages_over_two_cores_are_exact_for_the_mean_square_distance(radius, core, source):
+def test_two_core_averages_match_mean_square_distance_exactly(radius, core, source):
     distance, weight = disc_distances.distance_rule(radius, core, source)
     assert np.all(distance >= 0.0)
     assert np.all(distance <= radius + 0.5 * (core + source) + 1e-9)
@@ -379,9 +375,7 @@ def test_layers_reflect_between_nothing_and_all(layers, eta, deep):
     cut=st.floats(0.1, 0.9),
     scale=st.floats(0.1, 10.0),
 )
-def test_a_layer_may_be_cut_in_two_and_scaled_without_a_change(
-    sigma_a, sigma_s, thickness, cut, scale
-):
+def test_layer_split_or_scaled_leaves_result_unchanged(sigma_a, sigma_s, thickness, cut, scale):
     def reflect(a, s, d):
         return tissue_optics.layer_stack_reflectance(a, s, d, eta=1.4)
 
@@ -414,7 +408,7 @@ def test_directions_of_layers_integrate_half_a_sphere(eta, directions):
     oxygenation=SHARE,
     tier=st.sampled_from(["diffusion", "adding_doubling"]),
 )
-def test_skin_is_darker_with_more_melanin_at_every_wavelength(c_m, c_hd, oxygenation, tier):
+def test_skin_darkens_with_melanin_at_every_wavelength(c_m, c_hd, oxygenation, tier):
     wavelength = np.array([420.0, 550.0, 700.0])
     reflect = [
         tissue_optics.two_layer_reflectance(
@@ -446,7 +440,7 @@ MEDIUM = st.tuples(st.floats(0.0, 1.0), st.floats(1e-3, 1e3), ETA)
 
 @CHEAP
 @given(medium=MEDIUM, radius=st.floats(0.0, 1e4), reach=st.floats(0.0, 100.0))
-def test_shares_of_spread_light_grow_from_nothing_to_all(medium, radius, reach):
+def test_scattered_light_fractions_grow_from_zero_to_all(medium, radius, reach):
     media = dipole_sum.Media.of(medium[0], medium[1], eta=medium[2])
     radii = np.array([0.0, 0.5 * radius, radius])
     share = dipole_sum.share_within(radii, media)
@@ -468,7 +462,7 @@ def test_shares_of_spread_light_grow_from_nothing_to_all(medium, radius, reach):
     level=st.one_of(st.just(0.0), st.floats(1e-30, 1e6)),
     seed=st.integers(0, 99),
 )
-def test_even_light_comes_back_as_albedo_and_sums_agree(r_d, length, level, seed):
+def test_uniform_light_returns_albedo_and_sums_agree(r_d, length, level, seed):
     rng = np.random.default_rng(seed)
     points = np.column_stack([rng.uniform(0.0, 10.0, (40, 2)), np.zeros(40)])
     area, light = np.full(40, 2.5), np.full((40, 3), level)

@@ -50,7 +50,7 @@ def directions(rng, count):
 
 @CHEAP
 @given(seed=SEED, factor=st.sampled_from([1e-30, 0.5, 1e30]))
-def test_a_mixture_is_linear_reciprocal_and_dark_below_the_horizon(seed, factor):
+def test_mixture_is_linear_reciprocal_and_dark_below_horizon(seed, factor):
     rng = np.random.default_rng(seed)
     basis, up = three(), np.array([0.0, 0.0, 1.0])
     light, view, share = directions(rng, 20), directions(rng, 20), rng.random((20, 3))
@@ -71,7 +71,7 @@ def test_a_mixture_is_linear_reciprocal_and_dark_below_the_horizon(seed, factor)
 
 @FEW
 @given(seed=SEED, bad=st.sampled_from([np.nan, np.inf]))
-def test_tables_keep_their_columns_and_refuse_those_of_no_numbers(seed, bad):
+def test_tables_keep_columns_and_refuse_nonfinite_ones(seed, bad):
     basis = three()
     columns = basis.table[..., : basis.size].copy()
     again = brdf_tables.of_columns(columns, basis.names, light_radius_rad=0.0)
@@ -87,7 +87,7 @@ def test_tables_keep_their_columns_and_refuse_those_of_no_numbers(seed, bad):
 
 @FEW
 @given(seed=SEED, compress=st.sampled_from(["cbrt", "none"]), bad=NO_NUMBER)
-def test_a_point_of_no_numbers_is_masked_and_spoils_no_others(seed, compress, bad):
+def test_nonfinite_point_is_masked_without_affecting_others(seed, compress, bad):
     rng = np.random.default_rng(seed)
     basis, up = three(), np.broadcast_to([0.0, 0.0, 1.0], (3, 3))
     light, view = (np.abs(directions(rng, 3 * 40)).reshape(3, 40, 3) for _ in range(2))
@@ -118,7 +118,7 @@ def test_a_point_of_no_numbers_is_masked_and_spoils_no_others(seed, compress, ba
 
 @FEW
 @given(seed=SEED, rank=st.integers(1, 3), bad=st.sampled_from([np.nan, np.inf, -1e-9]))
-def test_common_mixtures_have_sum_one_and_refining_them_is_never_worse(seed, rank, bad):
+def test_common_mixtures_sum_to_unity_refining_never_worsens(seed, rank, bad):
     rng = np.random.default_rng(seed)
     basis, shares = three(), rng.random((12, 3)) ** 3
     found, mix, error = brdf_basis.reduce(shares, rank, basis=basis)
@@ -158,9 +158,7 @@ def _left(shares, mix, gram):
 
 @CHEAP
 @given(seed=SEED, amount=st.floats(-3.0, 3.0), bad=NO_NUMBER)
-def test_edited_lobes_are_no_less_than_nothing_and_an_edit_of_nothing_changes_nothing(
-    seed, amount, bad
-):
+def test_edited_lobes_are_nonnegative_null_edit_is_identity(seed, amount, bad):
     rng = np.random.default_rng(seed)
     people, weights, mix = rng.random((8, 4)), rng.random((5, 2)), rng.random((2, 4))
     space = traits.TraitSpace.fit(people, {"oil": [False, True] * 4})
@@ -176,7 +174,7 @@ def test_edited_lobes_are_no_less_than_nothing_and_an_edit_of_nothing_changes_no
 
 @CHEAP
 @given(seed=SEED, rows=st.integers(2, 5), far=st.floats(10.0, 1e3))
-def test_the_largest_surface_stays_and_what_lies_outside_a_box_goes(seed, rows, far):
+def test_largest_surface_stays_and_points_outside_bounds_go(seed, rows, far):
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[: rows + 1, : rows + 1].astype(float)
     large = np.stack([x.ravel(), y.ravel(), 0.01 * rng.random(x.size)], -1)
@@ -200,7 +198,7 @@ def test_the_largest_surface_stays_and_what_lies_outside_a_box_goes(seed, rows, 
 
 @CHEAP
 @given(seed=SEED, sides=SIDES, unit=st.sampled_from([1e-100, 1e-3, 1e3, 1e100]), bad=NO_NUMBER)
-def test_the_area_of_a_texture_knows_no_unit_and_is_at_least_a_pixel(seed, sides, unit, bad):
+def test_texture_area_is_unit_invariant_at_least_pixel(seed, sides, unit, bad):
     rng = np.random.default_rng(seed)
     base, valid = rng.standard_normal(sides), rng.random(sides) < 0.8
     found = facial_color_basis.texture_area_px(base, valid)
@@ -218,7 +216,7 @@ def test_the_area_of_a_texture_knows_no_unit_and_is_at_least_a_pixel(seed, sides
     bad=NO_NUMBER,
     kind=st.sampled_from(["<f2", "<f4", "<f8", ">f8", "i8"]),
 )
-def test_images_of_textures_are_finite_where_they_are_valid(seed, sides, channels, bad, kind):
+def test_texture_images_are_finite_where_valid(seed, sides, channels, bad, kind):
     rng = np.random.default_rng(seed)
     shape = (*sides, channels) if channels else sides
     image = (100 * rng.random(shape)).astype(kind)
@@ -241,7 +239,7 @@ def colors():
 
 @CHEAP
 @given(seed=SEED, step=st.floats(1e-7, 1e-6))
-def test_colors_between_nodes_are_finite_and_change_as_their_derivatives_say(seed, step):
+def test_interpolated_colors_are_finite_and_match_derivatives(seed, step):
     rng = np.random.default_rng(seed)
     a, b = rng.uniform(0.05, 0.95, (2, 9))
     color, by_a, by_b = chromophore_start.evaluate(colors(), a, b)
@@ -255,7 +253,7 @@ def test_colors_between_nodes_are_finite_and_change_as_their_derivatives_say(see
 
 @CHEAP
 @given(steps=st.lists(st.tuples(*[st.floats(-2.0, 2.0)] * 2), max_size=5))
-def test_errors_that_all_pixels_share_add_in_squares_in_either_sense(steps):
+def test_common_pixel_errors_add_in_squares_either_sign(steps):
     def face(melanin, blood):
         return face_distribution.FaceDistribution(
             face_distribution.ContaminatedNormal(melanin, 0.3, 0.01, -9.0, 0.0),
@@ -281,7 +279,7 @@ def test_errors_that_all_pixels_share_add_in_squares_in_either_sense(steps):
     unit=st.floats(-300, 300),
     bad=st.sampled_from([np.nan, np.inf, -np.inf, -1.0, 0.0, 5e-324]),
 )
-def test_spots_are_those_of_any_unit_and_nothing_else_than_skin(seed, size, unit, bad):
+def test_spots_are_unit_invariant_and_only_on_skin(seed, size, unit, bad):
     rng = np.random.default_rng(seed)
     light = 10.0**unit * np.exp(0.3 * rng.standard_normal((*size, 3)))
     dropped = rng.random(size) < 0.1
@@ -305,7 +303,7 @@ def test_spots_are_those_of_any_unit_and_nothing_else_than_skin(seed, size, unit
     errors=st.tuples(*[st.floats(0.0, 1e3, width=32)] * 2),
     where=st.booleans(),
 )
-def test_a_mixture_lies_halfway_and_holds_both(pair, errors, where):
+def test_mixture_is_midway_and_contains_both(pair, errors, where):
     def weighed(value, error):
         each = np.full(1, value, np.float32), np.full(1, error, np.float32)
         one, yes = np.ones(1, np.float32), np.ones(1, bool)

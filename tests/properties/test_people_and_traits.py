@@ -57,7 +57,7 @@ def test_principal_components_hold_the_samples_in_any_unit(seed, unit, n, d, met
 
 @CHEAP
 @given(seed=SEED, unit=st.floats(5e-324, 1e308))
-def test_a_power_of_two_brings_numbers_to_one_exactly(seed, unit):
+def test_power_of_two_scales_numbers_to_unity_exactly(seed, unit):
     values = unit * np.random.default_rng(seed).uniform(-1.0, 1.0, 5)
     exponent = trait_vectors.exponent_of(values, np.zeros(2))
     scaled = np.ldexp(values, -exponent)
@@ -69,7 +69,7 @@ def test_a_power_of_two_brings_numbers_to_one_exactly(seed, unit):
 
 @FEW
 @given(seed=SEED, unit=UNIT)
-def test_how_many_components_help_does_not_hang_on_the_unit(seed, unit):
+def test_useful_component_count_is_unit_invariant(seed, unit):
     _, samples, trait = people(seed, count=14, numbers=8)
     off = samples - samples.mean(axis=0)
     u, s, _ = np.linalg.svd(off, full_matrices=False)
@@ -85,7 +85,7 @@ def test_how_many_components_help_does_not_hang_on_the_unit(seed, unit):
 
 @CHEAP
 @given(seed=SEED, unit=UNIT, n=st.integers(2, 8), size=st.integers(1, 4))
-def test_mixtures_of_a_basis_are_its_own_shares(seed, unit, n, size):
+def test_basis_mixtures_recover_their_weights(seed, unit, n, size):
     rng = np.random.default_rng(seed)
     basis = unit * rng.uniform(size=(size, 6))
     shares = rng.uniform(size=(n, size)) * (rng.uniform(size=(n, size)) < 0.7)
@@ -107,7 +107,7 @@ def test_mixtures_of_a_basis_are_its_own_shares(seed, unit, n, size):
 
 @CHEAP
 @given(seed=SEED, kind=st.sampled_from([np.float16, np.float32, np.int64]))
-def test_mixtures_of_narrow_numbers_are_those_of_wide_ones(seed, kind):
+def test_mixtures_of_narrow_numbers_equal_wide_ones(seed, kind):
     rng = np.random.default_rng(seed)
     samples, basis = (rng.integers(0, 9, (n, 6)).astype(kind) for n in (4, 2))
     found = reduced_spaces.mixture_coordinates(samples, basis, None)
@@ -120,7 +120,7 @@ def test_mixtures_of_narrow_numbers_are_those_of_wide_ones(seed, kind):
 
 @CHEAP
 @given(bad=st.sampled_from([np.nan, np.inf, -np.inf]), where=st.sampled_from(["s", "b", "m"]))
-def test_mixtures_of_what_is_not_finite_are_refused(bad, where):
+def test_mixtures_of_nonfinite_values_are_refused(bad, where):
     samples, basis, metric = np.ones((3, 4)), np.eye(2, 4), np.eye(4)
     {"s": samples, "b": basis, "m": metric}[where][1, 1] = bad
     with pytest.raises(trait_vectors.TraitError):
@@ -131,7 +131,7 @@ def test_mixtures_of_what_is_not_finite_are_refused(bad, where):
 
 @CHEAP
 @given(bad=st.sampled_from([np.nan, np.inf, -1.0]))
-def test_what_is_no_basis_and_no_sample_is_refused(bad):
+def test_invalid_basis_and_sample_are_refused(bad):
     basis, samples = np.eye(2, 3), np.arange(6.0).reshape(2, 3)
     wrong = basis.copy()
     wrong[0, 1] = bad
@@ -151,7 +151,7 @@ def test_what_is_no_basis_and_no_sample_is_refused(bad):
 
 @FEW
 @given(seed=SEED, unit=UNIT)
-def test_how_sure_a_trait_is_does_not_hang_on_the_unit(seed, unit):
+def test_trait_certainty_is_unit_invariant(seed, unit):
     _, samples, trait = people(seed)
     told = {"permutations": 39, "resamples": 20}
     plain = trait_vectors.confidence(trait, samples, rng=np.random.default_rng(5), **told)
@@ -177,7 +177,7 @@ def test_how_sure_a_trait_is_does_not_hang_on_the_unit(seed, unit):
     lost=st.booleans(),
     people=st.integers(1, 6),
 )
-def test_a_table_of_people_counts_each_once_in_any_unit(seed, unit, lost, people):
+def test_people_table_counts_each_once_in_any_unit(seed, unit, lost, people):
     rng = np.random.default_rng(seed)
     value = rng.uniform(0.5, 2.0, (people, 3))
     made = []
@@ -212,7 +212,7 @@ def test_a_table_of_people_counts_each_once_in_any_unit(seed, unit, lost, people
 
 @CHEAP
 @given(bad=st.sampled_from([0.0, -0.1, np.nan, np.inf]))
-def test_a_measurement_without_an_error_is_refused_by_the_person(bad):
+def test_measurement_without_error_is_refused_by_person(bad):
     one = translucency_population.SiteMeasurement("Ada", "chin", (1.0, 1.0, 1.0), (0.1, bad, 0.1))
     with pytest.raises(translucency_population.PopulationError, match="Ada"):
         translucency_population.summarize([one])

@@ -35,7 +35,7 @@ def unit_normals(rng, shape, spread=0.3):
 
 @CHEAP
 @given(seed=SEED, sides=SIDES, channels=st.integers(1, 4), bad=NO_NUMBER)
-def test_channels_are_added_up_where_all_of_them_are_known(seed, sides, channels, bad):
+def test_channels_are_summed_where_all_are_known(seed, sides, channels, bad):
     rng = np.random.default_rng(seed)
     images = {key: rng.random((*sides, channels)) for key in ("x", "y")}
     images["x"].flat[0] = bad
@@ -62,7 +62,7 @@ def test_channels_are_added_up_where_all_of_them_are_known(seed, sides, channels
 
 @FEW
 @given(seed=SEED, sides=SIDES, channels=st.integers(1, 3))
-def test_maps_of_channels_are_told_apart_again(seed, sides, channels):
+def test_channel_maps_are_separated_again(seed, sides, channels):
     rng = np.random.default_rng(seed)
     lights = unit_normals(rng, (5,))
     maps = [estimate_normals(rng.random((5, *sides)), lights) for _ in range(channels)]
@@ -79,9 +79,7 @@ def test_maps_of_channels_are_told_apart_again(seed, sides, channels):
 
 @FEW
 @given(seed=SEED, spread=st.floats(0.0, 2.0), smooth=st.floats(0.0, 2.0), bad=NO_NUMBER)
-def test_restored_normals_are_unit_vectors_and_what_is_not_valid_is_not_read(
-    seed, spread, smooth, bad
-):
+def test_restored_normals_are_unit_and_ignore_invalid_input(seed, spread, smooth, bad):
     rng = np.random.default_rng(seed)
     normals, valid = unit_normals(rng, (21, 17), spread), rng.random((21, 17)) < 0.9
     lens = lens_restoration.Aperture(18.0, 6.0)
@@ -103,7 +101,7 @@ def test_restored_normals_are_unit_vectors_and_what_is_not_valid_is_not_read(
 
 @CHEAP
 @given(seed=SEED, sides=SIDES, factor=st.floats(-1e6, 1e6))
-def test_waves_are_filtered_linearly_and_all_of_them_leave_a_picture_as_it_is(seed, sides, factor):
+def test_waves_are_filtered_linearly_and_all_preserve_image(seed, sides, factor):
     rng = np.random.default_rng(seed)
     sides = tuple(side + 31 for side in sides)
     values = rng.standard_normal(sides)
@@ -130,7 +128,7 @@ def test_waves_are_filtered_linearly_and_all_of_them_leave_a_picture_as_it_is(se
     dead=st.integers(0, 1),
     bad=NO_NUMBER,
 )
-def test_a_list_in_its_order_is_found_to_be_so_in_any_unit(seed, lights, gain, dead, bad):
+def test_sorted_list_is_recognized_in_any_unit(seed, lights, gain, dead, bad):
     rng = np.random.default_rng(seed)
     ways = unit_normals(rng, (lights,), 0.5)
     normals = unit_normals(rng, (120,), 0.3)
@@ -154,7 +152,7 @@ def test_a_list_in_its_order_is_found_to_be_so_in_any_unit(seed, lights, gain, d
 
 @CHEAP
 @given(seed=SEED, sides=SIDES, unit=st.sampled_from([1e-40, 0.25, 4.0, 1e40, 1e300]), bad=NO_NUMBER)
-def test_local_contrast_knows_no_unit_and_no_number_that_is_none(seed, sides, unit, bad):
+def test_local_contrast_is_unit_invariant_and_ignores_nan(seed, sides, unit, bad):
     rng = np.random.default_rng(seed)
     image = rng.random([side + 15 for side in sides])
     plain = registration.normalize_local_contrast(image)
@@ -171,7 +169,7 @@ def test_local_contrast_knows_no_unit_and_no_number_that_is_none(seed, sides, un
 
 @FEW
 @given(seed=SEED, count=st.integers(0, 30), bad=NO_NUMBER)
-def test_points_are_chosen_inside_once_a_cell_and_followed_onto_themselves(seed, count, bad):
+def test_points_are_chosen_once_per_cell_track_themselves(seed, count, bad):
     rng = np.random.default_rng(seed)
     even = registration.normalize_local_contrast(rng.random((64, 72)))
     points = rng.uniform(-5.0, 80.0, (60, 2))
@@ -188,7 +186,7 @@ def test_points_are_chosen_inside_once_a_cell_and_followed_onto_themselves(seed,
 
 @FEW
 @given(seed=SEED, error=st.floats(0.0, 5.0))
-def test_a_picture_is_where_it_is(seed, error):
+def test_dense_flow_maps_image_onto_itself(seed, error):
     rng = np.random.default_rng(seed)
     even = registration.normalize_local_contrast(rng.random((40, 48)))
     here, there = dense_flow.grid(even.shape), np.ones(even.shape, bool)
@@ -214,9 +212,7 @@ def test_a_picture_is_where_it_is(seed, error):
     rings=st.integers(0, 3),
     bad=NO_NUMBER,
 )
-def test_change_over_a_surface_goes_with_the_values_and_not_with_those_not_valid(
-    seed, unit, rings, bad
-):
+def test_surface_gradient_scales_with_values_and_ignores_invalid(seed, unit, rings, bad):
     rng = np.random.default_rng(seed)
     points, values = rng.random((12, 3)), rng.standard_normal((12, 2))
     faces = rng.integers(0, 12, (15, 3))
@@ -235,7 +231,7 @@ def test_change_over_a_surface_goes_with_the_values_and_not_with_those_not_valid
 
 @CHEAP
 @given(seed=SEED, sides=SIDES, bad=NO_NUMBER)
-def test_texels_of_derivatives_leave_out_what_is_not_valid(seed, sides, bad):
+def test_derivative_texels_omit_invalid_values(seed, sides, bad):
     rng = np.random.default_rng(seed)
     sides = tuple(side + 1 for side in sides)
     normals, valid = unit_normals(rng, sides), rng.random(sides) < 0.8
@@ -250,9 +246,7 @@ def test_texels_of_derivatives_leave_out_what_is_not_valid(seed, sides, bad):
 
 @CHEAP
 @given(seed=SEED, sides=SIDES, level=st.floats(-10.0, 10.0))
-def test_even_derivatives_are_even_texels_and_gathering_is_the_transpose_of_reading(
-    seed, sides, level
-):
+def test_uniform_derivatives_give_uniform_texels_gathering_is_transpose(seed, sides, level):
     rng = np.random.default_rng(seed)
     sides = tuple(side + 1 for side in sides)
     shape = tuple(int(rng.integers(1, side + 1)) for side in sides)
@@ -276,7 +270,7 @@ def test_even_derivatives_are_even_texels_and_gathering_is_the_transpose_of_read
 
 @FEW
 @given(seed=SEED, sides=SIDES, slope=st.tuples(*[st.floats(-2.0, 2.0)] * 2), bad=NO_NUMBER)
-def test_a_plane_has_no_jump_and_what_is_not_valid_is_not_read(seed, sides, slope, bad):
+def test_plane_has_no_jump_invalid_values_are_unread(seed, sides, slope, bad):
     rng = np.random.default_rng(seed)
     sides = tuple(side + 1 for side in sides)
     normals = np.broadcast_to([-slope[0], -slope[1], 1.0], (*sides, 3)).copy()
@@ -295,7 +289,7 @@ def test_a_plane_has_no_jump_and_what_is_not_valid_is_not_read(seed, sides, slop
 
 @FEW
 @given(seed=SEED, faces=st.integers(1, 4), size=st.floats(0.5, 2.0))
-def test_landmarks_that_all_faces_have_are_placed_about_the_nose(seed, faces, size):
+def test_landmarks_common_to_faces_are_centered_on_nose(seed, faces, size):
     rng = np.random.default_rng(seed)
     names = [
         "nose tip",

@@ -49,7 +49,7 @@ def test_coefficients_of_a_clean_profile_come_back(sigma_a, sigma_s, gain):
     values=st.lists(ANY, min_size=18, max_size=18),
     method=st.sampled_from(["photon_table", "diffusion", "dipole"]),
 )
-def test_a_fit_of_any_readings_is_a_number_or_not_valid(values, method):
+def test_fit_of_any_readings_is_finite_or_invalid(values, method):
     readings = np.array(values)
     # beyond these sizes no unit of length makes a reflectance per area
     readings[np.abs(readings) > 1e30] = np.inf
@@ -72,7 +72,7 @@ ANGLES = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
     level=st.floats(1e-6, 1e6),
     turn=st.floats(0.0, 3.0),
 )
-def test_anisotropy_knows_no_unit_and_turns_with_the_skin(ratio, axis, level, turn):
+def test_anisotropy_is_unit_invariant_and_rotates_with_skin(ratio, axis, level, turn):
     uv = 0.5 * np.log(ratio) * np.array([[np.cos(2 * axis), np.sin(2 * axis)]])
     values, slopes = diffusion_ellipse.relative_sigma_tr(ANGLES, uv)
     assert np.all(values > 0.0)
@@ -95,7 +95,7 @@ def test_anisotropy_knows_no_unit_and_turns_with_the_skin(ratio, axis, level, tu
 
 @CHEAP
 @given(seed=SEED, unit=st.floats(1e-6, 1e6), turn=st.floats(-20.0, 20.0))
-def test_lengths_and_directions_know_no_unit_and_turn_with_their_axes(seed, unit, turn):
+def test_lengths_and_directions_rotate_with_axes_unit_invariant(seed, unit, turn):
     rng = np.random.default_rng(seed)
     pair, root = rng.standard_normal((7, 2)), rng.standard_normal((7, 2, 2))
     covariance = root @ root.transpose(0, 2, 1)
@@ -145,7 +145,7 @@ def test_harmonics_come_back_from_enough_directions(coefficients):
 
 @CHEAP
 @given(power=st.floats(1e-12, 1e12), residual=st.floats(1e-12, 1e12), dof=st.integers(1, 40))
-def test_a_tail_is_a_probability_that_falls_with_the_power(power, residual, dof):
+def test_tail_is_probability_decreasing_with_power(power, residual, dof):
     tail = direction_harmonics.log_tail(
         np.array([power, 2.0 * power]), np.full(2, residual), np.full(2, dof)
     )
@@ -156,7 +156,7 @@ def test_a_tail_is_a_probability_that_falls_with_the_power(power, residual, dof)
 
 @FEW
 @given(seed=SEED, constant=st.floats(0.5, 3.0), scale=st.sampled_from([1e-3, 1.0, 1e3]))
-def test_a_course_knows_no_unit(seed, constant, scale):
+def test_time_course_is_unit_invariant(seed, constant, scale):
     rng = np.random.default_rng(seed)
     time_s = np.linspace(0.0, 12.0, 40)
     course = 1.0 + 2.0 * (1.0 - np.exp(-time_s / constant)) + 0.01 * rng.standard_normal(40)
@@ -175,7 +175,7 @@ def test_a_course_knows_no_unit(seed, constant, scale):
 
 @CHEAP
 @given(seed=SEED, scale=st.sampled_from([1e-6, 1.0, 1e6]), radius=st.floats(0.1, 4.0))
-def test_means_over_discs_scale_and_lie_among_the_pixels(seed, scale, radius):
+def test_disc_means_scale_and_stay_within_pixel_range(seed, scale, radius):
     rng = np.random.default_rng(seed)
     maps, places = rng.uniform(1.0, 2.0, (2, 12, 12)), {"cheek": (5.0, 6.0)}
     found = perfusion_curves.disc_means(scale * maps, places, radius)
@@ -186,7 +186,7 @@ def test_means_over_discs_scale_and_lie_among_the_pixels(seed, scale, radius):
 
 @CHEAP
 @given(seed=SEED, cycle=st.floats(1.0, 100.0))
-def test_levels_that_never_change_have_no_transition_and_repeat(seed, cycle):
+def test_periodic_levels_have_no_transition_and_repeat(seed, cycle):
     rng = np.random.default_rng(seed)
     phase = np.sort(rng.uniform(0.0, cycle, 30))
     values = np.where(phase < cycle / 2, 1.0, 2.0) + 1e-6 * rng.standard_normal(30)
@@ -226,7 +226,7 @@ def test_repeats_are_judged_the_same_in_any_unit(seed, scale):
 
 @FEW
 @given(seed=SEED, level=st.floats(0.2, 3.0))
-def test_a_map_between_equal_sites_is_that_value_nearly(seed, level):
+def test_map_between_equal_sites_is_nearly_their_value(seed, level):
     places = np.random.default_rng(seed).uniform(0.1, 0.9, (6, 2))
     sigma_tr = np.full((6, 3), level)
     found = translucency.interpolate(places, sigma_tr, 1e-3 * sigma_tr, (10, 9))
@@ -261,7 +261,7 @@ def test_the_albedo_of_matte_points_comes_back(albedo, seed, scale):
 
 @CHEAP
 @given(errors=st.lists(st.floats(0.0, 1e6), min_size=1, max_size=20), share=st.floats(0.0, 1.0))
-def test_the_plateau_is_one_of_the_ranks(errors, share):
+def test_plateau_is_within_valid_ranks(errors, share):
     rank = brdf_basis.plateau(errors, share=share)
     assert 1 <= rank <= len(errors)
 
@@ -285,9 +285,7 @@ TURNS = np.arange(12) * (np.pi / 6)
     unit=st.sampled_from([1e-20, 1.0, 1e20]),
     lost=st.integers(0, 3),
 )
-def test_the_axis_of_profiles_is_found_with_fibres_lost_and_in_any_unit(
-    seed, ratio, axis, unit, lost
-):
+def test_profile_axis_found_with_lost_fibers_any_unit(seed, ratio, axis, unit, lost):
     rng = np.random.default_rng(seed)
     scattering = 1.5 * (1.0 - (ratio - 1.0) * np.cos(2 * (TURNS - axis)))
     profiles = unit * photon_table.reflectance(RADIUS, 0.04, scattering[:, None])
@@ -322,7 +320,7 @@ def test_the_axis_of_profiles_is_found_with_fibres_lost_and_in_any_unit(
 
 @CHEAP
 @given(h=st.floats(0.0, 3.0), axis=st.floats(0.0, np.pi), level=st.floats(-0.5, 0.5), drawn=SEED)
-def test_an_ellipse_fitted_to_its_own_values_is_itself(h, axis, level, drawn):
+def test_ellipse_fit_recovers_its_own_values(h, axis, level, drawn):
     uv = h * np.array([[np.cos(2 * axis), np.sin(2 * axis)]])
     shape, _ = diffusion_ellipse.relative_sigma_tr(TURNS, uv)
     values = np.exp(0.5 * level) * shape.T
@@ -345,7 +343,7 @@ def test_an_ellipse_fitted_to_its_own_values_is_itself(h, axis, level, drawn):
 
 @CHEAP
 @given(seed=SEED, sides=st.tuples(st.integers(1, 40), st.integers(1, 40)))
-def test_usual_places_lie_on_the_face_s_own_rectangle(seed, sides):
+def test_usual_positions_are_within_face_rectangle(seed, sides):
     rng = np.random.default_rng(seed)
     skin = rng.uniform(size=sides) < 0.5
     skin[rng.integers(sides[0]), rng.integers(sides[1])] = True
@@ -360,9 +358,7 @@ def test_usual_places_lie_on_the_face_s_own_rectangle(seed, sides):
 
 @CHEAP
 @given(seed=SEED, line=st.tuples(*[st.floats(-1.0, 1.0)] * 2), lost=st.integers(0, 10))
-def test_what_is_straight_in_the_root_of_the_distance_is_kept_whatever_fibres_are_lost(
-    seed, line, lost
-):
+def test_misfit_keeps_root_distance_line_with_lost_fibers(seed, line, lost):
     rng = np.random.default_rng(seed)
     radius = rng.permutation(RADIUS)
     straight = line[0] + line[1] * np.sqrt(radius)
@@ -389,7 +385,7 @@ def test_what_is_straight_in_the_root_of_the_distance_is_kept_whatever_fibres_ar
     level=st.floats(-10.0, 10.0),
     slope=st.floats(-10.0, 10.0),
 )
-def test_level_and_slope_tell_nothing_of_how_much_a_misfit_bends(seed, fibres, least, level, slope):
+def test_misfit_bend_posterior_ignores_level_and_slope(seed, fibres, least, level, slope):
     rng = np.random.default_rng(seed)
     place = np.cumsum(rng.uniform(0.02, 0.3, fibres))
     bend, mass = smooth_misfit._bends(place)

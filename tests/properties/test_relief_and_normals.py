@@ -52,7 +52,7 @@ def unit_normals(rng, shape):
 
 @CHEAP
 @given(seed=SEED, sides=SIDES, scale=SCALE)
-def test_slopes_know_no_unit_and_no_constant(seed, sides, scale):
+def test_slopes_are_invariant_to_unit_and_constant(seed, sides, scale):
     rng = np.random.default_rng(seed)
     height, valid = rng.standard_normal(sides), masked(rng, sides)
     kept = height.copy()
@@ -98,7 +98,7 @@ def test_every_normal_is_in_a_bucket_or_outside(slope, bins, limit, turn):
 
 @FEW
 @given(bad=st.sampled_from([np.nan, np.inf, -np.inf]))
-def test_histograms_and_kernels_of_what_is_not_finite_are_an_error(bad):
+def test_histograms_and_kernels_of_nonfinite_input_raise_error(bad):
     shares = np.full((4, 4), 1.0 / 16.0)
     wrong = shares.copy()
     wrong[1, 2] = bad
@@ -135,7 +135,7 @@ def test_histograms_and_kernels_of_what_is_not_finite_are_an_error(bad):
 
 @CHEAP
 @given(seed=SEED, bins=st.integers(2, 30), angle=st.floats(-3.2, 3.2))
-def test_histograms_of_a_relief_and_of_its_normals_agree(seed, bins, angle):
+def test_histograms_of_topography_and_its_normals_agree(seed, bins, angle):
     rng = np.random.default_rng(seed)
     height = 0.3 * rng.standard_normal((14, 11))
     x, y, known = relief_slopes.slopes(height, pixel=1.0)
@@ -156,7 +156,7 @@ def test_histograms_of_a_relief_and_of_its_normals_agree(seed, bins, angle):
 
 @CHEAP
 @given(rows=st.integers(1, 40), columns=st.integers(1, 40), blocks=st.integers(1, 9))
-def test_every_pixel_is_in_one_block(rows, columns, blocks):
+def test_every_pixel_belongs_to_a_single_block(rows, columns, blocks):
     number, count = normal_blocks.block_of(np.arange(rows * columns), (rows, columns), blocks)
     assert set(number.tolist()) == set(range(count))
     down, right = normal_blocks.grid_of((rows, columns), blocks)
@@ -186,7 +186,7 @@ def test_counts_of_blocks_are_those_of_the_whole(seed, bins, angle, sides):
 
 @CHEAP
 @given(seed=SEED, sides=SIDES)
-def test_parts_are_connected_and_cover_what_is_valid(seed, sides):
+def test_parts_are_connected_and_cover_valid_area(seed, sides):
     valid = masked(np.random.default_rng(seed), sides, 0.6)
     part = normal_integration.parts(valid)
     np.testing.assert_array_equal(part > 0, valid)
@@ -207,7 +207,7 @@ def test_parts_are_connected_and_cover_what_is_valid(seed, sides):
     seed=SEED,
     kind=st.sampled_from([np.float32, np.float64]),
 )
-def test_a_plane_is_integrated_exactly_whatever_the_mask_and_unit(tilt, pixel, seed, kind):
+def test_plane_is_integrated_exactly_any_mask_and_unit(tilt, pixel, seed, kind):
     valid = masked(np.random.default_rng(seed), (12, 9), 0.9)
     normals = np.broadcast_to(np.array([-tilt[0], -tilt[1], 1.0], kind), (12, 9, 3))
     found = normal_integration.integrate_map(normals, pixel=pixel, valid=valid)
@@ -224,7 +224,7 @@ def test_a_plane_is_integrated_exactly_whatever_the_mask_and_unit(tilt, pixel, s
 
 @FEW
 @given(bad=st.sampled_from([np.nan, np.inf, -np.inf, 0.0]), seed=SEED)
-def test_normals_that_are_none_are_left_out(bad, seed):
+def test_invalid_normals_are_omitted(bad, seed):
     rng = np.random.default_rng(seed)
     normals = unit_normals(rng, (8, 8))
     normals[3, 4] = bad
@@ -277,7 +277,7 @@ def test_smoothed_slopes_are_numbers_within_those_given(seed, strength):
 
 @FEW
 @given(sides=st.tuples(st.integers(4, 40), st.integers(4, 40)), slope=st.floats(1e-6, 0.5))
-def test_the_expected_error_of_a_height_grows_with_the_noise(sides, slope):
+def test_expected_height_error_grows_with_noise(sides, slope):
     first = relief_errors.expected_rms(sides, slope)
     assert first > 0.0
     assert relief_errors.expected_rms(sides, 2.0 * slope) == pytest.approx(2.0 * first)
@@ -290,7 +290,7 @@ LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.6, 0, 0.8], [0, 
 
 @CHEAP
 @given(seed=SEED, scale=st.sampled_from([1e-20, 1e-3, 1.0, 1e20]), robust=st.booleans())
-def test_normals_of_matte_points_are_exact_and_know_no_exposure(seed, scale, robust):
+def test_matte_normals_are_exact_and_exposure_invariant(seed, scale, robust):
     normals = unit_normals(np.random.default_rng(seed), (3, 2))
     shade = np.clip(LIGHTS @ normals.reshape(-1, 3).T, 0.0, None).reshape(5, 3, 2)
     image = scale * 0.4 * shade
@@ -319,7 +319,7 @@ def test_normals_of_any_samples_are_numbers_or_masked(pixel, robust):
 
 @FEW
 @given(angle=st.floats(0.0, np.pi), flat=st.booleans())
-def test_lights_in_a_plane_with_the_point_are_refused(angle, flat):
+def test_lights_coplanar_with_point_are_refused(angle, flat):
     turn = np.array(
         [[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]]
     )
@@ -334,7 +334,7 @@ def test_lights_in_a_plane_with_the_point_are_refused(angle, flat):
 
 @FEW
 @given(seed=SEED, noise=st.floats(1e-6, 0.1))
-def test_more_lights_never_tell_less_of_normals(seed, noise):
+def test_more_lights_never_worsen_normals(seed, noise):
     rng = np.random.default_rng(seed)
     normals = unit_normals(rng, (6,))
     found = light_selection.information(normals, LIGHTS, np.full((6, 5), noise))
@@ -347,7 +347,7 @@ def test_more_lights_never_tell_less_of_normals(seed, noise):
 
 @CHEAP
 @given(vector=st.tuples(*[st.floats(-10.0, 10.0)] * 3))
-def test_a_rotation_keeps_lengths_and_is_undone_by_its_opposite(vector):
+def test_rotation_keeps_lengths_and_inverse_reverts_rotation(vector):
     turn = head_motion.rotation_matrix(vector)
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-9)
     assert np.linalg.det(turn) == pytest.approx(1.0)
@@ -356,7 +356,7 @@ def test_a_rotation_keeps_lengths_and_is_undone_by_its_opposite(vector):
 
 @FEW
 @given(seed=SEED, noise=st.floats(1e-6, 10.0))
-def test_a_filtered_picture_is_no_noisier_than_before(seed, noise):
+def test_filtered_image_is_not_noisier_than_input(seed, noise):
     rng = np.random.default_rng(seed)
     image, valid = rng.standard_normal((20, 18)), masked(rng, (20, 18), 0.9)
     found, share = gradient_wiener.filtered(image, noise, valid)
@@ -366,7 +366,7 @@ def test_a_filtered_picture_is_no_noisier_than_before(seed, noise):
 
 @CHEAP
 @given(names=st.sets(st.sampled_from(["full", "x", "y", "z", "-x", "-y", "-z", "dark"])))
-def test_patterns_tell_everything_or_say_what_is_missing(names):
+def test_patterns_give_finite_design_or_report_missing(names):
     given_names = dict.fromkeys(sorted(names))
     if gradient_patterns.redundancy(given_names) < 0:
         with pytest.raises(gradient_patterns.MissingPatterns):
@@ -378,7 +378,7 @@ def test_patterns_tell_everything_or_say_what_is_missing(names):
 
 @FEW
 @given(seed=SEED, stretch=st.floats(0.2, 5.0), turn=st.floats(-3.0, 3.0))
-def test_a_stretched_mesh_tells_its_stretch_whatever_way_it_lies(seed, stretch, turn):
+def test_stretched_mesh_reports_stretch_in_any_orientation(seed, stretch, turn):
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[0:4, 0:4] * 10.0
     rest = np.column_stack([x.ravel(), y.ravel(), np.zeros(16)])
@@ -407,7 +407,7 @@ def test_weights_of_a_gaussian_add_up_and_fall(sigma):
 
 @CHEAP
 @given(stretch=st.floats(1e-300, 1e300), how=st.sampled_from(["hold", "formula"]))
-def test_a_kernel_of_any_stretch_is_within_its_ranges(stretch, how):
+def test_kernel_at_any_stretch_stays_within_ranges(stretch, how):
     alpha, sigma = microstructure.kernel_parameters(stretch, extrapolate=how)
     assert -2.0 <= alpha <= 1.0
     assert np.isfinite(sigma)
@@ -417,7 +417,7 @@ def test_a_kernel_of_any_stretch_is_within_its_ranges(stretch, how):
 
 @FEW
 @given(bad=st.sampled_from([0.0, -1.0, np.nan, np.inf]))
-def test_a_stretch_that_is_none_is_an_error(bad):
+def test_invalid_stretch_raises_error(bad):
     with pytest.raises(microstructure.KernelTableError):
         microstructure.kernel_parameters(bad)
 
@@ -453,7 +453,7 @@ def test_a_surface_is_never_shorter_than_its_ground(heights, spacing, alpha, sig
 
 @FEW
 @given(seed=SEED, shift=st.tuples(*[st.floats(-50.0, 50.0)] * 2))
-def test_a_field_through_shifted_landmarks_is_the_shift_everywhere(seed, shift):
+def test_field_through_shifted_landmarks_is_uniform_shift(seed, shift):
     points = np.random.default_rng(seed).uniform(0.0, 100.0, (8, 2))
     field = landmark_field.fit(points, points + shift, stderr_px=0.5)
     found, _ = field.at([[10.0, 80.0], [55.0, 5.0]])[:2]
@@ -462,7 +462,7 @@ def test_a_field_through_shifted_landmarks_is_the_shift_everywhere(seed, shift):
 
 @FEW
 @given(seed=SEED, share=st.floats(0.0, 1.0))
-def test_filled_texels_lie_among_the_measured_ones(seed, share):
+def test_filled_texels_stay_within_measured_range(seed, share):
     rng = np.random.default_rng(seed)
     values = rng.uniform(-3.0, 5.0, (13, 9, 2))
     weight = (rng.uniform(size=(13, 9)) < share).astype(float)
@@ -480,7 +480,7 @@ def test_filled_texels_lie_among_the_measured_ones(seed, share):
 
 @FEW
 @given(seed=SEED, level=st.floats(-5.0, 5.0))
-def test_an_even_value_stays_even_in_a_texture_and_back(seed, level):
+def test_uniform_value_round_trips_through_texture(seed, level):
     uv = np.array([[[0.1, 0.1], [0.9, 0.1], [0.1, 0.9]], [[0.9, 0.1], [0.9, 0.9], [0.1, 0.9]]])
     faces = np.array([[0, 1, 2], [1, 3, 2]])
     texels = texture_fill.rasterize(uv, 16)
@@ -494,7 +494,7 @@ def test_an_even_value_stays_even_in_a_texture_and_back(seed, level):
 
 @FEW
 @given(seed=SEED, turn=st.floats(-3.0, 3.0))
-def test_axes_of_a_texture_are_orthonormal_and_turn_with_it(seed, turn):
+def test_texture_axes_are_orthonormal_and_rotate_with_texture(seed, turn):
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[0:14, 0:12] * 1.0
     place = np.stack([x, -y, 0.5 * np.sin(0.4 * x + rng.uniform(0, 6))], axis=-1)
@@ -514,7 +514,7 @@ def test_axes_of_a_texture_are_orthonormal_and_turn_with_it(seed, turn):
 
 @FEW
 @given(seed=SEED, slope=st.floats(0.5, 3.0))
-def test_a_table_through_points_on_a_line_is_the_line(seed, slope):
+def test_table_through_collinear_points_is_the_line(seed, slope):
     rng = np.random.default_rng(seed)
     stretch = np.linspace(0.75, 1.3, 12)
     alpha = np.clip(slope * (stretch - 1.0), -2.0, 1.0)
@@ -525,7 +525,7 @@ def test_a_table_through_points_on_a_line_is_the_line(seed, slope):
 
 @FEW
 @given(seed=SEED, scale=st.sampled_from([1e-10, 1.0, 1e10]))
-def test_half_vectors_of_a_highlight_give_its_normal_at_any_exposure(seed, scale):
+def test_highlight_half_vectors_give_normal_at_any_exposure(seed, scale):
     rng = np.random.default_rng(seed)
     light = rng.standard_normal((1, 60, 3)) * [1.0, 1.0, 0.3] + [0, 0, 1.5]
     light /= np.linalg.norm(light, axis=-1, keepdims=True)

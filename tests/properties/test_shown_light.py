@@ -36,7 +36,7 @@ def test_more_light_is_never_shown_darker(light, infinite):
 
 @CHEAP
 @given(light=st.floats(0.0, 1.0))
-def test_the_display_gives_back_the_light_that_it_was_sent(light):
+def test_display_returns_the_emitted_light(light):
     shown = float(tone_mapping.srgb_encoded(light))
     back = shown / 12.92 if shown <= 0.04045 else ((shown + 0.055) / 1.055) ** 2.4
     assert back == pytest.approx(light, rel=1e-4, abs=1e-300)
@@ -44,7 +44,7 @@ def test_the_display_gives_back_the_light_that_it_was_sent(light):
 
 @CHEAP
 @given(cosine=st.floats(-2.0, 2.0), f0=SHARE)
-def test_a_facet_reflects_at_least_what_it_does_head_on_and_at_most_all(cosine, f0):
+def test_facet_reflectance_is_between_normal_incidence_and_all(cosine, f0):
     found = facial_specular.schlick(cosine, f0)
     assert f0 * (1.0 - 1e-12) <= found <= 1.0 + 1e-12
     assert facial_specular.schlick(1.0, f0) == f0
@@ -57,7 +57,7 @@ def test_a_facet_reflects_at_least_what_it_does_head_on_and_at_most_all(cosine, 
     f0=SHARE,
     roughness=st.floats(1e-6, 1e6),
 )
-def test_gloss_is_the_same_for_light_and_eye_exchanged(polar, turn, f0, roughness):
+def test_specular_is_reciprocal_in_light_and_eye(polar, turn, f0, roughness):
     z = [0.0, 0.0, 1.0]
     to_light, to_eye = (direction(p, t) for p, t in zip(polar, turn, strict=True))
     assume(to_light[2] > 0.0)
@@ -81,7 +81,7 @@ def test_a_surface_without_roughness_is_refused(roughness):
 
 @CHEAP
 @given(wide=st.lists(st.floats(0.0, 1e308), min_size=2, max_size=9))
-def test_a_wider_blur_asks_for_wider_taps_and_for_no_more_than_itself(wide):
+def test_wider_blur_needs_wider_taps_within_its_width(wide):
     wanted = np.sort(wide)
     asked = screen_scattering.narrowed(wanted)
     assert np.isfinite(asked).all()
@@ -100,7 +100,7 @@ def test_a_wider_blur_asks_for_wider_taps_and_for_no_more_than_itself(wide):
     level=st.floats(1e-300, 1e100),
     focal=st.floats(1e-3, 1e6),
 )
-def test_light_that_spreads_stays_between_the_darkest_and_the_brightest(
+def test_scattered_light_stays_between_darkest_and_brightest(
     seed, sides, depth, width, level, focal
 ):
     rng = np.random.default_rng(seed)
@@ -130,7 +130,7 @@ def test_light_that_spreads_stays_between_the_darkest_and_the_brightest(
     what=st.sampled_from(["light", "depth", "width", "weights", "focal_px"]),
     bad=st.sampled_from([np.nan, np.inf, -1.0, 0.0]),
 )
-def test_what_no_light_spreads_in_is_refused_by_name(what, bad):
+def test_nonscattering_medium_is_refused_by_name(what, bad):
     told = {
         "light": np.ones((2, 3, 3)),
         "depth": np.full((2, 3), 400.0),
@@ -156,7 +156,7 @@ def test_what_no_light_spreads_in_is_refused_by_name(what, bad):
 @given(
     fractions=st.lists(st.tuples(st.floats(0.0, 0.5), st.floats(0.0, 0.32)), min_size=1, max_size=4)
 )
-def test_a_spectrum_of_skin_is_a_share_and_falls_with_pigment(fractions):
+def test_skin_spectrum_is_fraction_and_falls_with_pigment(fractions):
     c_m, c_hd = np.array(fractions).T
     found = color_table.spectral_reflectance(c_m, c_hd)
     assert found.shape == (c_m.size, 31)

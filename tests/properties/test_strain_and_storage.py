@@ -41,7 +41,7 @@ def stretched(stretch, scale=1.0):
     size=SIDES,
     window=st.tuples(SIDES, SIDES),
 )
-def test_a_texture_of_strain_is_the_same_in_every_window(stretch, scale, size, window):
+def test_strain_texture_is_the_same_in_every_window(stretch, scale, size, window):
     strain, faces, uv = stretched(stretch, scale)
     whole = strain_fields.rasterize(strain, faces, uv, size)
     assert whole.covered.all()
@@ -71,7 +71,7 @@ def test_a_texture_of_strain_is_the_same_in_every_window(stretch, scale, size, w
     size=SIDES,
     share=st.floats(0.0, 1.0),
 )
-def test_kernels_of_a_strain_are_those_of_its_table(stretch, extrapolate, size, share):
+def test_strain_kernels_match_their_table(stretch, extrapolate, size, share):
     strain, faces, uv = stretched(stretch, 40.0)
     field = strain_fields.rasterize(strain, faces, uv, size)
     lines = strain_fields.line_kernels(field, extrapolate=extrapolate)
@@ -103,9 +103,7 @@ def test_kernels_of_a_strain_are_those_of_its_table(stretch, extrapolate, size, 
     window=st.integers(1, 6),
     holes=st.booleans(),
 )
-def test_sources_hold_each_patch_at_each_scale_that_is_large_enough(
-    seed, sides, zooms, window, holes
-):
+def test_sources_contain_each_large_enough_patch_per_scale(seed, sides, zooms, window, holes):
     rng = np.random.default_rng(seed)
     patches = [rng.standard_normal(side) for side in sides]
     if holes:
@@ -193,7 +191,7 @@ def test_stored_masks_come_back_or_are_refused(seed, sides, zones, huge, encodin
     kind=st.sampled_from([np.float32, np.float64]),
     level=st.floats(-1e30, 1e30),
 )
-def test_widened_planes_read_back_what_they_hold(seed, texels, pixels, kind, level):
+def test_widened_planes_read_back_their_values(seed, texels, pixels, kind, level):
     planes = np.random.default_rng(seed).standard_normal((2, *texels))
     *wide, first, part = wrinkles.widened(planes, pixels, kind)
     assert first.shape == part.shape == (pixels[0],)
@@ -218,7 +216,7 @@ def test_widened_planes_read_back_what_they_hold(seed, texels, pixels, kind, lev
     kind=st.sampled_from([np.uint16, np.float32]),
     level=st.sampled_from([None, 0.5]),
 )
-def test_collected_pictures_keep_their_samples_and_mask_what_is_none(seed, sides, bad, kind, level):
+def test_collected_images_keep_samples_and_mask_invalid_ones(seed, sides, bad, kind, level):
     rng = np.random.default_rng(seed)
     keys = [(name, "parallel") for name in ("full", "x", "y", "z")]
     pictures = {key: (1000.0 * rng.uniform(size=sides)).astype(kind) for key in keys}
@@ -247,7 +245,7 @@ def test_collected_pictures_keep_their_samples_and_mask_what_is_none(seed, sides
 
 @CHEAP
 @given(seed=SEED, unit=st.sampled_from([1e-200, 1e-20, 1.0, 1e20, 1e200]), bad=NO_NUMBER)
-def test_whether_kernels_hang_on_the_direction_does_not_hang_on_the_unit(seed, unit, bad):
+def test_kernel_direction_dependence_is_unit_invariant(seed, unit, bad):
     rng = np.random.default_rng(seed)
     table = microstructure.FOREHEAD
     stretch = np.linspace(*table.stretch_range, 12)

@@ -80,7 +80,7 @@ def test_blocks_hold_a_texture_to_their_precision(seed, sides, kind):
 @CHEAP
 @given(bad=st.sampled_from([np.nan, -0.5, 1.5, np.inf]))
 @pytest.mark.parametrize("encode", [block_compression.encode_bc4, block_compression.encode_bc5])
-def test_values_that_blocks_do_not_hold_are_an_error(encode, bad):
+def test_values_missing_from_blocks_raise_error(encode, bad):
     shape = (4, 4) if encode is block_compression.encode_bc4 else (4, 4, 2)
     values = np.full(shape, 0.3)
     values[0, 0] = bad
@@ -96,7 +96,7 @@ def test_values_that_blocks_do_not_hold_are_an_error(encode, bad):
     scale=st.sampled_from([1e-12, 1.0, 1e12]),
     hole=ANY,
 )
-def test_statistics_of_discs_scale_and_leave_out_what_is_missing(seed, sides, radius, scale, hole):
+def test_disc_statistics_scale_and_omit_missing_values(seed, sides, radius, scale, hole):
     rng = np.random.default_rng(seed)
     h, valid = rng.uniform(1.0, 2.0, sides), rng.uniform(size=sides) > 0.2
     first = disc_statistics.measure(h, radius, valid=valid)
@@ -153,7 +153,7 @@ HISTOGRAM = st.lists(st.floats(0.0, 1.0), min_size=4, max_size=12)
 
 @CHEAP
 @given(counts=HISTOGRAM, shift=st.floats(-3.0, 3.0))
-def test_moved_histograms_keep_their_sum_and_move_by_the_change(counts, shift):
+def test_moved_histograms_keep_sum_and_move_by_change(counts, shift):
     shares = np.array(counts)
     assume(shares.sum() > 1e-3)
     shares /= shares.sum()
@@ -178,7 +178,7 @@ VECTOR_256 = st.integers(0, 9999).map(lambda seed: np.random.default_rng(seed).n
 
 @CHEAP
 @given(vector=VECTOR_256, scale=st.sampled_from([1e-6, 1.0, 1e6]))
-def test_the_nearest_histogram_is_one_and_its_own(vector, scale):
+def test_nearest_histogram_is_a_histogram_and_idempotent(vector, scale):
     found = texture_histograms.project_to_histograms(scale * vector)
     assert np.all(found >= 0.0)
     assert found.sum() == pytest.approx(1.0)
@@ -199,7 +199,7 @@ def test_the_nearest_histogram_is_one_and_its_own(vector, scale):
 
 @FEW
 @given(bad=st.sampled_from([np.nan, np.inf, -np.inf]))
-def test_histograms_of_textures_that_are_not_finite_are_an_error(bad):
+def test_histograms_of_nonfinite_textures_raise_error(bad):
     error = texture_histograms.HistogramError
     even, edges = np.full(256, 1.0 / 256.0), np.arange(257.0)
     wrong, bent = even.copy(), edges.copy()
@@ -223,7 +223,7 @@ def test_histograms_of_textures_that_are_not_finite_are_an_error(bad):
 
 @FEW
 @given(far=st.floats(1e31, 1e300), bad=st.sampled_from([np.nan, np.inf]))
-def test_heights_that_no_patch_holds_are_holes_or_an_error(far, bad):
+def test_leveled_heights_nonfinite_are_holes_extreme_raise_error(far, bad):
     height = np.zeros((6, 7))
     height[2, 3] = bad
     found = synthesis_sources.leveled(height, pixel_um=10.0, cutoff_um=30.0)
@@ -259,7 +259,7 @@ def test_uneven_edges_rise_and_hold_all_values(values, unit):
 
 @CHEAP
 @given(seed=SEED, sides=SIDES, share=st.floats(0.05, 1.0), levels=st.integers(1, 4))
-def test_a_filled_texture_keeps_what_is_valid_and_stays_within_it(seed, sides, share, levels):
+def test_filled_texture_keeps_valid_values_and_their_range(seed, sides, share, levels):
     rng = np.random.default_rng(seed)
     image, valid = rng.uniform(size=(*sides, 2)), rng.uniform(size=sides) < share
     valid[0, 0] = True
@@ -289,7 +289,7 @@ def test_an_even_texture_is_even_at_every_resolution(sides, onto, level):
 
 @FEW
 @given(seed=SEED)
-def test_a_texture_that_has_the_statistics_already_comes_back(seed):
+def test_texture_already_matching_statistics_is_returned(seed):
     image = np.random.default_rng(seed).uniform(0.2, 0.8, (16, 16))
     vector = texture_statistics.describe(image, space=None, workers=1)
     told = texture_statistics.statistics(image, workers=1)
@@ -307,9 +307,7 @@ def test_a_texture_that_has_the_statistics_already_comes_back(seed):
     level=st.floats(-100.0, 100.0),
     turn=st.floats(-3.0, 3.0),
 )
-def test_a_kernel_leaves_an_even_height_and_scales_any_other(
-    seed, sides, alpha, sigma, level, turn
-):
+def test_kernel_keeps_uniform_height_and_scales_others(seed, sides, alpha, sigma, level, turn):
     axis = (np.cos(turn), np.sin(turn))
     across = (-np.sin(turn), np.cos(turn))
     kernel = (axis, across, alpha, sigma, 0.0, 1.0)
@@ -352,7 +350,7 @@ def test_derivatives_of_normals_come_back(pair, kind):
 
 @CHEAP
 @given(normal=st.tuples(ANY, ANY, ANY), limit=st.floats(0.1, 10.0))
-def test_any_normal_is_encoded_within_the_limit_or_masked(normal, limit):
+def test_normal_is_encoded_within_limit_or_masked(normal, limit):
     report = wrinkles.encoding_report([normal], limit=limit)
     assert np.isfinite(report.derivatives).all()
     assert np.abs(report.derivatives).max() <= limit
@@ -372,7 +370,7 @@ def test_any_normal_is_encoded_within_the_limit_or_masked(normal, limit):
     weights=st.lists(st.floats(-3.0, 3.0), min_size=8, max_size=8),
     clamp=st.sampled_from(["unit", "signed"]),
 )
-def test_wrinkles_by_any_weights_are_unit_normals_and_none_at_rest(seed, weights, clamp):
+def test_wrinkle_weights_give_unit_normals_none_at_rest(seed, weights, clamp):
     rng = np.random.default_rng(seed)
     base, wrinkle = rng.normal(size=(6, 5, 2)), rng.uniform(-1.0, 1.0, (3, 4, 2))
     masks = rng.uniform(size=(8, 2, 3))
@@ -391,7 +389,7 @@ def test_wrinkles_by_any_weights_are_unit_normals_and_none_at_rest(seed, weights
 
 @CHEAP
 @given(seed=SEED, zones=st.integers(1, 9), dtype=st.sampled_from(["f2", "f4", "f8", "u1", "?"]))
-def test_masks_are_the_same_as_planes_and_as_textures(seed, zones, dtype):
+def test_masks_are_equal_as_planes_and_textures(seed, zones, dtype):
     planes = np.random.default_rng(seed).uniform(0, 2, (zones, 2, 3)).astype(dtype)
     stack = wrinkle_masks.mask_stack(planes)
     np.testing.assert_array_equal(stack, planes)
@@ -406,7 +404,7 @@ def test_masks_are_the_same_as_planes_and_as_textures(seed, zones, dtype):
 
 @CHEAP
 @given(seed=SEED, strength=st.floats(0.0, 1.0))
-def test_a_difference_of_normals_at_full_strength_is_the_other_map(seed, strength):
+def test_normal_difference_at_full_strength_is_other_map(seed, strength):
     rng = np.random.default_rng(seed)
     base, other = (wrinkles.decode(0.5 * rng.standard_normal((4, 3, 2))) for _ in range(2))
     difference = wrinkle_differences.difference_map(base, other)
@@ -427,7 +425,7 @@ def test_a_difference_of_normals_at_full_strength_is_the_other_map(seed, strengt
 
 @CHEAP
 @given(sides=st.tuples(*[st.integers(1, 4096)] * 2), texel=st.integers(1, 16), blocks=st.booleans())
-def test_a_stored_map_takes_no_less_than_its_texels(sides, texel, blocks):
+def test_stored_map_takes_at_least_its_texels(sides, texel, blocks):
     one = wrinkle_storage.texture_bytes(sides, texel, in_blocks=blocks)
     assert one >= sides[0] * sides[1] * texel
 
@@ -443,7 +441,7 @@ def test_stored_derivatives_come_back_to_their_encoding(seed, encoding):
 
 @CHEAP
 @given(seed=SEED, d=st.integers(1, 6), scale=st.floats(1e-6, 1e6))
-def test_lengths_under_a_metric_are_those_in_its_frame(seed, d, scale):
+def test_lengths_under_metric_match_those_in_frame(seed, d, scale):
     rng = np.random.default_rng(seed)
     root = rng.standard_normal((d, d)) + 2.0 * np.eye(d)
     metric = reduced_spaces.check_metric(scale * root @ root.T, d)
@@ -496,7 +494,7 @@ def test_the_smallest_set_of_samples_holds_them(seed, n):
 
 @CHEAP
 @given(seed=SEED, people=st.integers(1, 6))
-def test_a_table_of_people_lies_among_them(seed, people):
+def test_people_table_stays_within_their_range(seed, people):
     values = np.random.default_rng(seed).uniform(0.2, 3.0, (people, 3, 3))
     found = translucency_population.table(values)
     assert np.all(found.count == people)
@@ -506,7 +504,7 @@ def test_a_table_of_people_lies_among_them(seed, people):
 
 @CHEAP
 @given(seed=SEED, gain=st.floats(0.1, 5.0), scale=st.sampled_from([1e-6, 1.0, 1e6]))
-def test_a_ratio_of_maps_is_found_whatever_their_unit(seed, gain, scale):
+def test_map_ratio_is_found_in_any_unit(seed, gain, scale):
     seen = np.random.default_rng(seed).uniform(1.0, 2.0, 50)
     assert deviation_ratio.overall(gain * scale * seen, scale * seen) == pytest.approx(gain)
     found = deviation_ratio.estimate(
@@ -518,7 +516,7 @@ def test_a_ratio_of_maps_is_found_whatever_their_unit(seed, gain, scale):
 
 @CHEAP
 @given(seed=SEED, scale=st.sampled_from([1e-6, 1.0, 1e6]), gain=st.floats(0.2, 5.0))
-def test_errors_of_blood_scale_with_it_and_are_none_for_the_truth(seed, scale, gain):
+def test_blood_errors_scale_and_vanish_for_truth(seed, scale, gain):
     rng = np.random.default_rng(seed)
     neutral, truth, predicted = scale * rng.uniform(0.1, 1.0, (3, 6, 5))
     found = blood_errors.compare(predicted, truth, neutral)
@@ -530,7 +528,7 @@ def test_errors_of_blood_scale_with_it_and_are_none_for_the_truth(seed, scale, g
 
 @CHEAP
 @given(shape=st.tuples(*[st.integers(1, 4000)] * 2), size=st.one_of(st.none(), st.integers(1, 512)))
-def test_cells_of_a_map_are_no_finer_than_it(shape, size):
+def test_map_cells_are_not_finer_than_map(shape, size):
     cells = coarse_maps.fitting(shape, size)
     assert all(1 <= kept <= own for kept, own in zip(cells.stored, shape, strict=True))
 
@@ -551,7 +549,7 @@ def test_weights_of_regions_add_up_everywhere(seed, transition):
 
 @FEW
 @given(seed=SEED, level=st.floats(-1e3, 1e3))
-def test_a_leveled_patch_knows_no_constant_and_fills_its_holes(seed, level):
+def test_leveled_patch_is_constant_invariant_and_fills_holes(seed, level):
     rng = np.random.default_rng(seed)
     height, valid = rng.standard_normal((12, 11)), rng.uniform(size=(12, 11)) > 0.1
     first = synthesis_sources.leveled(height, pixel_um=10.0, valid=valid, cutoff_um=60.0)
@@ -565,7 +563,7 @@ def test_a_leveled_patch_knows_no_constant_and_fills_its_holes(seed, level):
 
 @CHEAP
 @given(bad=st.sampled_from([np.nan, np.inf, -np.inf, None]), size=st.integers(1, 9))
-def test_a_texture_without_anything_to_fill_from_is_an_error(bad, size):
+def test_texture_without_fill_source_raises_error(bad, size):
     image = np.full((size, 5, 3), 0.5)
     valid = np.zeros((size, 5), bool)
     if bad is not None:
@@ -578,14 +576,14 @@ def test_a_texture_without_anything_to_fill_from_is_an_error(bad, size):
 
 @CHEAP
 @given(radius=st.floats(12.0, 1.79e308))
-def test_a_disc_of_any_radius_beyond_the_map_holds_all_of_it(radius):
+def test_disc_larger_than_map_contains_whole_map(radius):
     found = disc_statistics.measure(np.arange(48.0).reshape(6, 8), radius)
     np.testing.assert_allclose(found.mean, 23.5, rtol=1e-9)
 
 
 @CHEAP
 @given(bad=st.sampled_from([np.nan, np.inf, -np.inf]), count=st.integers(0, 3))
-def test_bins_and_axes_of_nothing_or_of_no_numbers_are_refused(bad, count):
+def test_bins_and_axes_from_empty_or_nonfinite_refused(bad, count):
     with pytest.raises(ValueError, match="quantiles"):
         texture_bins.uneven_edges([], 1.0)
     with pytest.raises(ValueError, match="quantiles"):
@@ -614,7 +612,7 @@ def test_halves_are_resampled_as_singles_are(seed, sides, onto):
 
 @CHEAP
 @given(kind=st.sampled_from([np.int64, np.bool_, np.complex64, object]))
-def test_textures_of_other_numbers_or_without_texels_are_refused(kind):
+def test_textures_of_invalid_numbers_or_size_are_refused(kind):
     with pytest.raises(ValueError, match="texture"):
         texture_resampling.resampled(np.ones((2, 4, 4)).astype(kind), (2, 2))
     for shape in ((4,), (2, 0, 4), (2, 4, 0)):

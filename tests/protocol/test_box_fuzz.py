@@ -60,7 +60,7 @@ def test_raw_bytes_light_and_move_nothing(manual, rng):
 
 
 @each_box
-def test_nearly_right_lines_without_a_frame_light_and_move_nothing(manual, rng):
+def test_nearly_valid_unframed_lines_light_and_move_nothing(manual, rng):
     bench, texts = manual.bench(), commands_of(manual)
     for k in range(3000):
         bench.box.feed(any_of(texts, rng).encode() + b"\n", 0.01 * k)
@@ -70,7 +70,7 @@ def test_nearly_right_lines_without_a_frame_light_and_move_nothing(manual, rng):
 
 
 @each_box
-def test_framed_nonsense_is_answered_once_and_acts_only_on_an_armed_box(manual, rng):
+def test_framed_nonsense_is_answered_once_acts_only_armed(manual, rng):
     """Half of the lines are good ones and obeyed: a box that refuses all would not pass."""
     bench, texts = manual.bench(), [text for text in commands_of(manual) if text != "home"]
     box, unit = bench.box, bench.unit

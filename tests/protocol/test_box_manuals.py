@@ -30,7 +30,7 @@ def test_the_manual_is_complete(manual):
 
 
 @rows(lambda manual, header: header not in manual.late)
-def test_a_framed_command_is_answered_as_its_manual_says(manual, header):
+def test_framed_command_is_answered_as_in_manual(manual, header):
     text, before, expected = manual.all_answers[header]
     bench = manual.bench()
     bench.say(before)
@@ -74,7 +74,7 @@ def test_a_bare_command_is_refused_and_changes_nothing(manual, header):
         for text in (*HARMLESS, *manual.unframed)
     ],
 )
-def test_what_makes_a_box_safe_needs_neither_frame_nor_arming(manual, text):
+def test_safety_commands_need_neither_frame_nor_arming(manual, text):
     bench = manual.bench()
     assert bench.code(text) == Code.OK
     bench.bare(text)
@@ -106,7 +106,7 @@ def test_missing_or_surplus_arguments_are_a_syntax_error(manual, text):
         for text, code in (*SHARED_REFUSALS, *manual.refusals)
     ],
 )
-def test_what_makes_no_sense_is_refused_and_does_nothing(manual, text, code):
+def test_invalid_command_is_refused_and_changes_nothing(manual, text, code):
     bench = manual.bench()
     bench.say(manual.ready)
     was = manual.state(bench)
@@ -137,7 +137,7 @@ def test_nothing_lights_or_moves_unless_armed(manual, text):
 
 
 @each_box
-def test_a_box_says_what_it_is(manual):
+def test_controller_reports_its_identity(manual):
     bench = manual.bench()
     _, _, serial, firmware = manual.identity.split(",")
     assert bench.ask("*IDN?") == manual.identity
@@ -152,7 +152,7 @@ def test_the_data_dictionary_carries_its_own_checksum(manual):
 
 
 @each_box
-def test_the_parts_of_the_data_dictionary_make_the_whole_in_short_lines(manual):
+def test_data_dictionary_parts_join_into_whole_short_lines(manual):
     bench = manual.bench()
     parts, last = [], "0"
     while last == "0":
@@ -164,6 +164,6 @@ def test_the_parts_of_the_data_dictionary_make_the_whole_in_short_lines(manual):
     assert len(parts) > 3
 
 
-def test_every_manual_has_the_shared_commands_once():
+def test_manuals_list_common_commands_only_once():
     for manual in BOXES.values():
         assert not SHARED_ANSWERS.keys() & manual.answers.keys()

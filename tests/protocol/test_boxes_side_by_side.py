@@ -21,7 +21,7 @@ def served(request):
         yield served
 
 
-def test_both_boxes_are_driven_at_once_and_neither_disturbs_the_other(served):
+def test_both_controllers_run_at_once_without_interference(served):
     assert list(served.addresses) == ["gradient_sphere", "caliper", "cam"]
     with (
         GradientSphereBox(Port(served.addresses["gradient_sphere"])) as sphere,
@@ -52,7 +52,7 @@ def test_exchanged_addresses_are_noticed(served):
         CaliperBox(Port(served.addresses["gradient_sphere"]))
 
 
-def test_a_box_that_is_held_is_busy_while_the_other_is_free():
+def test_held_controller_is_busy_while_other_is_free():
     with (
         serve(RIG, pty=True) as served,
         CaliperBox(Port(served.addresses["caliper"])),
@@ -62,21 +62,21 @@ def test_a_box_that_is_held_is_busy_while_the_other_is_free():
         Port(served.addresses["caliper"])
 
 
-def test_the_addresses_of_box_and_camera_are_wanted():
+def test_controller_and_camera_addresses_are_required():
     probe = load_rig("probe")
     with pytest.raises(UsageError, match="--port probe=URL --camera cam=URL"):
         require_addresses(probe, {}, {})
     require_addresses(probe, {"probe": "/dev/b"}, {"cam": "sim://x/cam"})
 
 
-def test_the_addresses_of_both_boxes_are_wanted():
+def test_addresses_of_both_controllers_are_required():
     given = addresses(["gradient_sphere=/dev/a"], "--port")
     with pytest.raises(UsageError, match="--port caliper=URL --camera cam=URL"):
         require_addresses(RIG, given, {})
     require_addresses(RIG, {**given, "caliper": "/dev/b"}, {"cam": "sim://x/cam"})
 
 
-def test_ports_follow_one_another_in_the_order_of_the_rig():
+def test_ports_are_consecutive_in_rig_order():
     for _ in range(5):  # another program may take a port meanwhile
         with serve(RIG) as probe:
             base = int(probe.addresses["gradient_sphere"].rpartition(":")[2])

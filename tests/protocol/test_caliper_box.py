@@ -49,7 +49,7 @@ def test_no_caliper_goes_further_than_fifteen_steps():
 # what must come before a move ------------------------------------------------------------------
 
 
-def test_nothing_moves_before_a_person_has_set_a_force_limit(bench):
+def test_nothing_moves_before_operator_sets_force_limit(bench):
     bench.ask("SYST:ARM")
     assert bench.code("CAL:HOME") == Code.IGNORED
     assert bench.code("CAL:STEP:ABS 1") == Code.IGNORED
@@ -73,7 +73,7 @@ def test_skin_is_taped_at_step_zero_only(bench):
     assert bench.code("CAL:ATT") == Code.OK
 
 
-def test_jaws_that_hold_skin_neither_turn_nor_seek_home(bench):
+def test_jaws_holding_skin_neither_rotate_nor_seek_home(bench):
     bench.hold()
     assert bench.code("CAL:ANG 45") == Code.IGNORED
     assert bench.code("CAL:HOME") == Code.IGNORED
@@ -97,7 +97,7 @@ def test_limit_and_home_do_not_outlive_a_reset(bench, forget):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_home_is_found_from_wherever_the_jaws_stand(seed):
+def test_home_is_found_from_any_jaw_position(seed):
     bench = CALIPER.bench(seed=seed)
     start_mm = bench.unit.aperture_mm
     assert abs(start_mm - 8.0) > 1e-3
@@ -106,7 +106,7 @@ def test_home_is_found_from_wherever_the_jaws_stand(seed):
     assert bench.ask("CAL:POS?") == "8.000"
 
 
-def test_a_move_is_accepted_at_once_and_over_after_its_time(bench):
+def test_move_is_accepted_at_once_ends_on_time(bench):
     bench.say(CALIPER_READY)
     begin = bench.now
     assert bench.ask("CAL:STEP:ABS 3") == "2"
@@ -140,7 +140,7 @@ def test_a_move_under_way_is_not_meddled_with(bench):
     assert bench.finish()[2] == "4"
 
 
-def test_turning_takes_its_time_and_is_what_the_skin_is_taped_at(bench):
+def test_rotation_takes_time_and_sets_taping_angle(bench):
     bench.say(CALIPER_READY)
     bench.ask("CAL:ANG 135")
     assert bench.ask("CAL:ANG?") == "135"
@@ -178,7 +178,7 @@ def test_a_retry_of_a_move_moves_once(bench):
     assert len(bench.unit.moves) == 2
 
 
-def test_one_big_step_of_time_equals_many_small_ones():
+def test_large_time_step_equals_many_small_steps():
     def play(step_s):
         bench = CALIPER.bench()
         bench.ask("SYST:WDOG 5000")
@@ -199,7 +199,7 @@ def test_one_big_step_of_time_equals_many_small_ones():
 
 
 @pytest.mark.parametrize(("step", "limit_n"), [(4, 0.3), (-3, 0.12)])
-def test_a_force_at_its_limit_turns_the_jaws_back(bench, step, limit_n):
+def test_force_at_limit_reverses_jaws(bench, step, limit_n):
     bench.hold(limit_n)
     before = [t for t, _ in bench.world.grips]
     _, end, stands, mm, newton, _ = bench.move(step)
@@ -221,7 +221,7 @@ def test_a_force_at_its_limit_turns_the_jaws_back(bench, step, limit_n):
     assert furthest == pytest.approx(float(mm), abs=1e-3)
 
 
-def test_the_way_on_which_the_limit_was_met_stays_barred(bench):
+def test_direction_that_met_limit_stays_barred(bench):
     bench.hold(0.3)
     bench.move(4)
     assert bench.code("CAL:STEP:ABS 4") == Code.FORCE
@@ -239,7 +239,7 @@ def test_a_limit_below_the_present_force_is_refused(bench):
     assert bench.ask("CAL:FORC:LIM?") == "5"
 
 
-def test_skin_that_comes_off_ends_the_move_where_it_did(bench):
+def test_detached_skin_ends_move_at_that_point(bench):
     bench.hold()
     assert bench.move(3)[1] == "REACHED"
     _, end, step, mm, newton, _ = bench.move(8)
@@ -253,14 +253,14 @@ def test_skin_that_comes_off_ends_the_move_where_it_did(bench):
     assert bench.world.skin.state.attached
 
 
-def test_buckling_is_no_end_but_the_force_grows_no_more(bench):
+def test_buckling_continues_move_but_force_stops_growing(bench):
     bench.hold()
     forces = [float(bench.move(step)[4]) for step in (-1, -2, -3, -4)]
     assert forces[1] < 1.8 * forces[0] < 0.0
     assert forces[3] == forces[2]
 
 
-def test_a_motor_that_stalls_is_noticed_and_must_be_homed():
+def test_stalled_motor_is_detected_and_requires_homing():
     bench = CALIPER.bench(jaw_stall=1.0)
     bench.unit._stall = 0.0
     bench.hold()
@@ -290,7 +290,7 @@ def test_a_stall_is_noticed_within_its_lag():
     )
 
 
-def test_a_home_mark_that_is_never_seen_ends_at_the_end_of_the_travel():
+def test_undetected_home_mark_ends_at_travel_limit():
     bench = CALIPER.bench(home_missed=True)
     bench.say(CALIPER_READY[:2])
     bench.ask("CAL:HOME")
@@ -311,7 +311,7 @@ def test_nothing_moves_with_a_dead_force_sensor():
 
 
 @pytest.mark.parametrize("text", ["CAL:REL", "SAFE", "ABOR", "*RST"])
-def test_skin_is_let_go_at_once_also_on_the_move(bench, text):
+def test_skin_release_is_immediate_even_during_move(bench, text):
     bench.hold()
     bench.ask("CAL:STEP:ABS 3")
     bench.wait(0.5)
@@ -326,7 +326,7 @@ def test_skin_is_let_go_at_once_also_on_the_move(bench, text):
     assert bench.unit.aperture_mm == stands_mm
 
 
-def test_a_silent_host_loses_the_skin_within_the_lease(bench):
+def test_silent_host_releases_skin_within_lease(bench):
     bench.ask("SYST:WDOG 300")
     bench.hold()
     bench.move(2)
@@ -342,7 +342,7 @@ def test_a_silent_host_loses_the_skin_within_the_lease(bench):
     assert not bench.world.skin.state.attached
 
 
-def test_a_reset_in_mid_move_lets_go_and_forgets_the_move(bench):
+def test_reset_mid_move_releases_and_forgets_move(bench):
     bench.hold()
     bench.ask("CAL:STEP:ABS 3")
     bench.wait(0.5)
@@ -355,7 +355,7 @@ def test_a_reset_in_mid_move_lets_go_and_forgets_the_move(bench):
     assert bench.ask("CAL:FORC:LIM?") == "NONE"
 
 
-def test_the_emergency_stop_lets_go_and_bars_all_moves():
+def test_emergency_stop_releases_and_bars_all_moves():
     bench = CALIPER.bench(interlock_after=12.0)
     bench.hold()
     bench.move(2)
@@ -371,7 +371,7 @@ def test_the_emergency_stop_lets_go_and_bars_all_moves():
     assert closed.code("CAL:HOME") == Code.INTERLOCK
 
 
-def test_force_that_stays_beyond_its_limit_in_spite_of_all_is_let_go(monkeypatch):
+def test_force_persistently_beyond_limit_releases_skin(monkeypatch):
     bench = CALIPER.bench()
     bench.hold(0.3)
 

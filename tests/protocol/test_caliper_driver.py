@@ -72,7 +72,7 @@ def hold(box, limit_n=5.0, angle_deg=0.0):
     box.attach()
 
 
-def test_the_box_says_who_it_is_and_what_it_allows(bench):
+def test_controller_reports_identity_and_limits(bench):
     assert bench.box.identify() == "RIGSIM,CALIPER1,CA-0001,1.0"
     assert (bench.box.identity.kind, bench.box.identity.serial) == ("caliper", "CA-0001")
     assert (bench.box.limits["step_min"], bench.box.limits["step_max"]) == (-4, 8)
@@ -97,7 +97,7 @@ def test_nothing_moves_unarmed_unlimited_or_unhomed(bench):
     assert len(bench.world.box("caliper").device.moves) == 2
 
 
-def test_an_angle_is_stretched_and_pressed_and_each_move_reported(bench):
+def test_angle_is_stretched_and_compressed_moves_reported(bench):
     box = bench.box
     hold(box, angle_deg=45.0)
     assert (box.angle_deg(), box.attached(), box.status().homed) == (45.0, True, True)
@@ -130,7 +130,7 @@ def test_stretching_ends_where_the_skin_comes_off(bench):
     assert box.move_to(0).ended == "reached"
 
 
-def test_a_met_limit_brings_the_jaws_back_and_bars_the_way(bench):
+def test_reached_limit_returns_jaws_and_bars_direction(bench):
     box = bench.box
     hold(box, limit_n=0.15)
     box.move_to(1)
@@ -150,7 +150,7 @@ def test_a_met_limit_brings_the_jaws_back_and_bars_the_way(bench):
     assert box.move_to(3).ended == "reached"
 
 
-def test_listening_keeps_the_skin_held_and_silence_lets_it_go(bench):
+def test_listening_keeps_skin_held_and_silence_releases(bench):
     box = bench.box
     box.set_lease(0.3)
     hold(box)
@@ -167,7 +167,7 @@ def test_listening_keeps_the_skin_held_and_silence_lets_it_go(bench):
 
 
 @pytest.mark.parametrize("end", ["dark", "close", "reset"])
-def test_what_makes_dark_lets_the_skin_go(bench, end):
+def test_dark_commands_release_skin(bench, end):
     hold(bench.box)
     bench.box.move_to(1)
     getattr(bench.box, end)()
@@ -175,13 +175,13 @@ def test_what_makes_dark_lets_the_skin_go(bench, end):
     assert (state.attached, state.stretch) == (False, 1.0)
 
 
-def test_numbers_that_are_none_are_refused_before_anything_is_sent(bench):
+def test_nonfinite_numbers_are_refused_before_sending(bench):
     for call in (bench.box.set_force_limit, bench.box.set_angle):
         with pytest.raises(ValueError, match="finite"):
             call(float("nan"))
 
 
-def test_a_stall_is_reported_and_home_is_wanted_again(alone):
+def test_stall_is_reported_and_requires_homing(alone):
     world, box = alone()
     hold(box)
     world.box("caliper").device._stall = 1.0
@@ -211,7 +211,7 @@ def test_a_dead_force_sensor_is_reported(alone):
     box.close()
 
 
-def test_stiff_skin_meets_the_limit_that_usual_skin_does_not(alone):
+def test_stiff_skin_reaches_limit_but_typical_skin_not(alone):
     ends = []
     for stiff in (1.0, 20.0):
         _, box = alone(skin_stiff=stiff)
@@ -221,7 +221,7 @@ def test_stiff_skin_meets_the_limit_that_usual_skin_does_not(alone):
     assert ends == ["reached", "force"]
 
 
-def test_a_move_that_was_stopped_by_the_emergency_stop_says_so(alone):
+def test_move_report_names_emergency_stop_as_end(alone):
     world, box = alone(rig=SLOW, interlock_after=15.0)
     hold(box)
     while world.now < 14.6:
@@ -244,7 +244,7 @@ def test_a_caliper_that_never_arrives_is_given_up(alone, monkeypatch):
     box.port.close()
 
 
-def test_an_end_of_another_move_is_no_answer(alone):
+def test_end_report_of_different_move_is_refused(alone):
     _, box = alone()
     ready(box)
     said, ask = {"CAL:HOME": "7"}, box._port.ask

@@ -41,7 +41,7 @@ def pop(box, token="a"):
     return box.fire(token)
 
 
-def test_a_camera_says_what_it_is(bench):
+def test_camera_reports_its_identity(bench):
     info = bench.camera().info
     view = bench.world.rig.view("cam")
     assert (info.serial, info.model) == (view.serial, view.camera_model)
@@ -50,7 +50,7 @@ def test_a_camera_says_what_it_is(bench):
     assert set(info.triggers) == {Trigger.SOFTWARE, Trigger.EDGE}
 
 
-def test_an_edge_exposes_with_the_light_of_its_pop(bench):
+def test_edge_trigger_exposes_with_its_pop_light(bench):
     camera, box = bench.camera(), bench.box()
     assert camera.configure(WANT) == WANT
     camera.arm(1, Trigger.EDGE)
@@ -74,7 +74,7 @@ def test_a_software_trigger_without_a_pop_is_dark(bench):
     np.testing.assert_array_equal(frame.image, np.full((10, 16), DARK))
 
 
-def test_a_dark_trigger_of_the_box_exposes_without_light(bench):
+def test_controller_dark_trigger_exposes_without_light(bench):
     camera, box = bench.camera(), bench.box()
     camera.configure(WANT)
     camera.arm(1, Trigger.EDGE)
@@ -82,7 +82,7 @@ def test_a_dark_trigger_of_the_box_exposes_without_light(bench):
     assert camera.frame(5.0).image.max() == DARK
 
 
-def test_a_pop_before_the_shutter_opens_is_not_seen(bench):
+def test_pop_before_shutter_opens_is_not_recorded(bench):
     camera, box = bench.camera(), bench.box()
     pop(box)
     camera.configure(WANT)
@@ -92,7 +92,7 @@ def test_a_pop_before_the_shutter_opens_is_not_seen(bench):
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.020, 0.030, 0.034, 0.045])
-def test_a_shutter_with_a_lag_sees_the_pop_that_waits_for_it(bench, delay_s):
+def test_lagging_shutter_records_the_delayed_pop(bench, delay_s):
     """The shutter is open from 30 to 38 ms after the edge: earlier and later pops are missed."""
     view = dataclasses.replace(bench.world.rig.views[0], shutter_lag_s=0.030)
     camera, box = bench.camera(), bench.box()
@@ -138,7 +138,7 @@ def test_an_aborted_frame_never_comes(bench):
         camera.frame(0.2)
 
 
-def test_a_camera_that_is_not_armed_or_reads_out_is_not_fired(bench):
+def test_unarmed_or_reading_camera_is_not_fired(bench):
     camera = bench.camera()
     with pytest.raises(CameraError, match="not armed"):
         camera.fire()
@@ -152,12 +152,12 @@ def test_a_camera_that_is_not_armed_or_reads_out_is_not_fired(bench):
         camera.fire()
 
 
-def test_a_camera_sets_the_nearest_exposure_it_has(bench):
+def test_camera_sets_nearest_available_exposure(bench):
     assert bench.camera().configure(Exposure(100.0, 1)) == Exposure(30.0, 50)
 
 
 @pytest.mark.parametrize(("count", "trigger"), [(0, Trigger.EDGE), (1, Trigger.LEVEL)])
-def test_what_a_camera_cannot_do_is_refused(bench, count, trigger):
+def test_camera_refuses_unsupported_arming(bench, count, trigger):
     with pytest.raises(CameraError):
         bench.camera().arm(count, trigger)
 
@@ -216,7 +216,7 @@ def test_a_foreign_or_wrongly_exposed_frame_is_refused(faulty, fault, error):
 
 
 @pytest.mark.parametrize("drift_ppm", [-500.0, 500.0])
-def test_a_drifting_clock_neither_hides_stale_frames_nor_refuses_good_ones(faulty, drift_ppm):
+def test_clock_drift_still_detects_stale_accepts_good_frames(faulty, drift_ppm):
     camera = faulty(drift_ppm=drift_ppm)
     camera.world.clock.sleep(3600.0)
     kept = []
@@ -229,7 +229,7 @@ def test_a_drifting_clock_neither_hides_stale_frames_nor_refuses_good_ones(fault
         check_frame(kept[-2], camera.info, seq=0, not_before_s=before, want=WANT)
 
 
-def test_of_two_hundred_exposures_no_bad_frame_is_accepted(faulty):
+def test_two_hundred_exposures_accept_only_good_frames(faulty):
     camera = faulty(stale=0.3, drop_frame=0.2, wrong_camera=0.2, wrong_exposure=0.2)
     accepted = refused = 0
     for _ in range(200):
@@ -270,7 +270,7 @@ def test_an_address_of_no_camera_is_named(url):
         open_camera(url)
 
 
-def test_an_unknown_view_of_a_known_world_is_named(rig):
+def test_unknown_view_of_world_is_reported(rig):
     world = World(rig)
     world.register("conformance-views")
     with pytest.raises(CameraUrlError, match="no view 'cma'"):
@@ -281,7 +281,7 @@ def test_an_unknown_view_of_a_known_world_is_named(rig):
 # over TCP -------------------------------------------------------------------------------------
 
 
-def test_a_served_camera_has_one_client_and_known_views(rig):
+def test_served_camera_has_single_client_and_known_views(rig):
     with serve(rig) as served:
         url = served.addresses["cam"]
         camera = open_camera(url)
@@ -300,7 +300,7 @@ def test_nobody_listening_is_a_lost_link():
             open_camera(f"tcp://127.0.0.1:{taken.getsockname()[1]}/cam")
 
 
-def test_a_server_that_goes_away_is_a_lost_link(rig):
+def test_vanished_server_is_lost_link(rig):
     with serve(rig) as served:
         camera = open_camera(served.addresses["cam"])
     with pytest.raises(LinkLost):
@@ -320,7 +320,7 @@ def test_a_server_that_goes_away_is_a_lost_link(rig):
         b'{"id":1,"do":"clock"}*0000\n',
     ],
 )
-def test_garbage_ends_one_connection_and_leaves_the_service(rig, garbage):
+def test_garbage_ends_own_connection_but_not_service(rig, garbage):
     with serve(rig) as served:
         host, _, port = served.addresses["cam"][6:].partition("/")[0].rpartition(":")
         with socket.create_connection((host, int(port)), timeout=5.0) as connection:
@@ -343,7 +343,7 @@ def test_garbage_ends_one_connection_and_leaves_the_service(rig, garbage):
         {"do": "configure", "exposure_s": -1, "iso": 1},
     ],
 )
-def test_a_request_that_makes_no_sense_is_answered_with_an_error(rig, request_):
+def test_invalid_request_is_answered_with_error(rig, request_):
     with serve(rig) as served:
         camera = open_camera(served.addresses["cam"])
         with pytest.raises(CameraError):
@@ -419,7 +419,7 @@ def frame_answer(**changes):
     return message, pixels
 
 
-def test_a_frame_arrives_as_it_was_sent(impostor):
+def test_frame_arrives_as_sent(impostor):
     message, _ = frame_answer(light={"lamp": "left"})
     busy = camera_wire.encode_message({"id": 2, "developing": True})
     camera = impostor(busy + message)
@@ -457,7 +457,7 @@ def test_a_frame_that_contradicts_itself_is_refused(impostor, changes):
         camera_wire.encode_message({"id": 2, "ok": True, "blob_bytes": -1}),
     ],
 )
-def test_an_answer_that_is_no_message_is_a_lost_link(impostor, answer):
+def test_answer_without_message_is_lost_link(impostor, answer):
     camera = impostor(answer)
     with pytest.raises(LinkLost):
         camera.clock_s()
@@ -479,12 +479,12 @@ def test_every_flipped_bit_of_a_header_is_noticed():
             camera_wire.decode_header(bytes(flipped))
 
 
-def test_a_full_frame_of_the_real_camera_fits_a_message():
+def test_real_camera_full_frame_fits_message():
     view = load_rig("flash").view("cam")
     assert 2 * view.width_px * view.height_px < camera_wire.MAX_BLOB_BYTES
 
 
-def test_a_camera_whose_library_is_missing_names_the_extra(monkeypatch):
+def test_missing_camera_library_error_names_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "gphoto2", None)  # as if it were not installed
     with pytest.raises(ImportError, match=r"skinrig\[gphoto\]") as caught:
         open_camera("gphoto2:1234")

@@ -51,7 +51,7 @@ def test_the_data_dictionary_holds_the_rigs_limits(bench):
 # tables and sequences -------------------------------------------------------------------------
 
 
-def test_a_tables_checksum_is_that_of_its_rows_in_one_spelling(bench):
+def test_table_checksum_covers_rows_in_canonical_spelling(bench):
     rows = [Row((3, 17), 500, 83333, 7), Row((), 0, 50000, 0), Row((149,), 1000, 2000, 1)]
     bench.load(rows)
     text = "3+17:500:83333:7\n-:0:50000:0\n149:1000:2000:1"
@@ -64,7 +64,7 @@ def test_a_tables_checksum_is_that_of_its_rows_in_one_spelling(bench):
     assert bench.ask("SEQ:CRC?") == "0,FFFF"
 
 
-def test_a_sequence_steps_by_itself_and_reports_each_release(bench):
+def test_sequence_steps_autonomously_and_reports_each_release(bench):
     rows = rows_of(behind(5), ms=50)
     bench.run(rows)
     start = bench.now
@@ -81,7 +81,7 @@ def test_a_sequence_steps_by_itself_and_reports_each_release(bench):
     assert not bench.unit.lit
 
 
-def test_the_next_led_is_on_before_the_last_goes_off_and_alone_when_cameras_are_released(bench):
+def test_leds_overlap_between_rows_but_not_during_release(bench):
     rows = rows_of(behind(6), ms=40)
     bench.run(rows)
     bench.wait(0.4)
@@ -94,7 +94,7 @@ def test_the_next_led_is_on_before_the_last_goes_off_and_alone_when_cameras_are_
         assert lit == [pulse.led]
 
 
-def test_an_led_of_two_rows_that_follow_stays_on(bench):
+def test_led_in_consecutive_rows_stays_on(bench):
     a, b, c = behind(3)
     rows = [Row(tuple(sorted(leds)), 300, 50_000, 7) for leds in ((a, b), (b, c), (b, c))]
     bench.run(rows)
@@ -105,7 +105,7 @@ def test_an_led_of_two_rows_that_follow_stays_on(bench):
     assert spans[c] == pytest.approx(0.1 + RIG.leds.overlap_s)
 
 
-def test_only_the_cameras_of_the_row_and_of_the_mask_are_released(bench):
+def test_only_cameras_in_row_and_mask_are_released(bench):
     rows = [Row((led,), 1000, 50_000, mask) for led, mask in zip(behind(3), (7, 2, 5), strict=True)]
     bench.ask("CAM:MASK 3")
     bench.run(rows)
@@ -153,7 +153,7 @@ def test_a_sequence_can_be_stopped_at_once(bench, text):
     assert len(bench.edges) == edges
 
 
-def test_a_sequence_of_a_silent_host_ends_dark_within_the_lease(bench):
+def test_silent_host_ends_sequence_dark_within_lease(bench):
     bench.ask("SYST:WDOG 300")
     bench.run(rows_of(behind(40)))
     fell_silent = bench.now
@@ -166,7 +166,7 @@ def test_a_sequence_of_a_silent_host_ends_dark_within_the_lease(bench):
     assert bench.code("TRIG r2") == Code.WATCHDOG_TRIPPED
 
 
-def test_one_big_step_equals_many_small_ones():
+def test_large_time_step_equals_many_small_steps():
     def play(step_s):
         bench = DOME.bench()
         bench.ask("SYST:WDOG 5000")
@@ -192,7 +192,7 @@ def test_light_carries_its_own_end(bench):
     assert all(p.t_off_s - p.t_on_s == pytest.approx(0.08) for p in bench.world.switched)
 
 
-def test_leds_are_put_out_one_by_one_or_all(bench):
+def test_leds_switch_off_individually_or_all(bench):
     bench.ask("SYST:ARM")
     bench.ask("LED:ON 3+17+20,80,500")
     bench.ask("LED:OFF 17")
@@ -201,7 +201,7 @@ def test_leds_are_put_out_one_by_one_or_all(bench):
     assert bench.ask("LED?") == "-"
 
 
-def test_an_led_gives_no_more_than_a_quarter_of_any_second(bench):
+def test_led_duty_is_at_most_quarter_per_second(bench):
     led = behind(1)[0]
     bench.ask("SYST:ARM")
     bench.ask(f"LED:ON {led},200")
@@ -234,7 +234,7 @@ def test_duty_counts_light_of_before_the_table(bench):
     assert bench.code("SEQ:ARM 1") == Code.DUTY
 
 
-def test_light_under_way_at_arming_counts_when_the_table_runs(bench):
+def test_light_running_at_arming_counts_toward_table(bench):
     bench.ask("SAFE:EYES CLOSED")
     bench.ask("SYST:ARM")
     bench.ask("SEQ:DEF 0,17:1000:40000:7")
@@ -246,7 +246,7 @@ def test_light_under_way_at_arming_counts_when_the_table_runs(bench):
     bench.ask("TRIG r2")
 
 
-def test_an_led_warms_as_a_resistor_and_a_capacitor_and_trips():
+def test_led_warms_as_rc_circuit_and_trips():
     bench = DOME.bench(heat=0.55)
     led = behind(1)[0]
     tau, trip = RIG.leds.thermal_tau_s, RIG.leds.thermal_trip
@@ -266,7 +266,7 @@ def test_an_led_warms_as_a_resistor_and_a_capacitor_and_trips():
     assert hot.code(f"LED:ON {led},5") == Code.OK
 
 
-def test_an_led_that_gets_too_hot_in_spite_of_all_goes_out(bench, monkeypatch):
+def test_overheated_led_goes_out_despite_all_limits(bench, monkeypatch):
     monkeypatch.setattr(bench.unit.bank, "require", lambda wanted, now: (0.0, 0.0, 0.0))
     led = behind(1)[0]
     bench.ask("SYST:ARM")
@@ -277,7 +277,7 @@ def test_an_led_that_gets_too_hot_in_spite_of_all_goes_out(bench, monkeypatch):
     assert ("LED:HOT", str(led)) in bench.said
 
 
-def test_the_dose_of_an_led_adds_up_and_its_limit_holds(bench):
+def test_led_dose_accumulates_and_its_limit_applies(bench):
     led = behind(1)[0]
     bench.ask("SYST:ARM")
     bench.ask(f"LED:ON {led},200,500")
@@ -293,7 +293,7 @@ def test_the_dose_of_an_led_adds_up_and_its_limit_holds(bench):
     assert float(bench.ask(f"DOSE? {led}")) == 0.0
 
 
-def test_a_table_that_flickers_is_refused_unless_a_person_says_the_eyes_are_safe(bench):
+def test_flickering_table_is_refused_without_eye_safety_confirmation(bench):
     on, off = front(1)[0], behind(1)[0]
     rows = rows_of([on, off] * 6, ms=40, level=300)
     bench.ask("SYST:ARM")
@@ -308,13 +308,13 @@ def test_a_table_that_flickers_is_refused_unless_a_person_says_the_eyes_are_safe
 
 
 @pytest.mark.parametrize("forget", ["*RST", "DOSE:NEW p2"])
-def test_what_was_said_of_the_eyes_does_not_outlive_the_subject_or_a_reset(bench, forget):
+def test_eye_state_is_cleared_by_subject_or_reset(bench, forget):
     bench.ask("SAFE:EYES CLOSED")
     bench.ask(forget)
     assert bench.ask("SAFE:EYES?") == "OPEN"
 
 
-def test_what_was_said_of_the_eyes_does_not_outlive_a_brown_out(bench):
+def test_eye_state_is_cleared_by_brown_out(bench):
     bench.ask("SAFE:EYES CLOSED")
     bench.box.power_cycle(bench.now, boot_s=0.0, announce=False)
     assert bench.ask("SAFE:EYES?") == "OPEN"
@@ -336,7 +336,7 @@ def test_single_leds_cannot_be_made_to_flicker_either(bench):
     assert [bench.code(f"LED:ON {led},5") for led in leds[1:]] == [Code.OK] * 3
 
 
-def test_the_planned_order_is_accepted_and_a_bad_one_refused():
+def test_planned_order_is_accepted_and_bad_order_refused():
     bench = DOME.bench(rig=WHOLE.resized(16))
     rig, plan = bench.world.rig, dome_plan(WHOLE)
     steps = [step for step in plan.steps if step.index.get("pass") == 0]
@@ -358,7 +358,7 @@ def test_the_planned_order_is_accepted_and_a_bad_one_refused():
 # faults ---------------------------------------------------------------------------------------
 
 
-def test_a_dead_led_is_refused_alone_and_named_in_a_sequence():
+def test_dead_led_is_refused_singly_reported_in_sequence():
     a, b = behind(2)
     bench = DOME.bench(led_dead=str(b))
     bench.ask("SYST:ARM")
@@ -370,7 +370,7 @@ def test_a_dead_led_is_refused_alone_and_named_in_a_sequence():
     assert len(bench.edges) == 2
 
 
-def test_a_weak_led_gives_less_than_it_is_driven_for_and_nobody_notices():
+def test_weak_led_emits_less_than_driven_without_detection():
     a, b = behind(2)
     bench = DOME.bench(led_weak=f"{b}=0.25")
     bench.run(rows_of([a, b]))
@@ -388,7 +388,7 @@ def test_the_emergency_stop_is_reported_and_nothing_lights():
     assert bench.code("SEQ:ARM 2") == Code.INTERLOCK
 
 
-def test_a_retry_of_the_trigger_runs_the_table_once(bench):
+def test_retried_trigger_runs_table_once(bench):
     bench.ask("SYST:ARM")
     bench.load(rows_of(behind(2)))
     bench.ask("SEQ:ARM 2")
@@ -401,7 +401,7 @@ def test_a_retry_of_the_trigger_runs_the_table_once(bench):
     assert [token for token, _ in bench.unit.runs] == ["once"]
 
 
-def test_an_event_of_the_sequence_is_a_frame_with_its_own_number(bench):
+def test_sequence_event_is_frame_with_own_number(bench):
     bench.run(rows_of(behind(1)))
     bench.now += 0.2
     events = [wire.decode(line) for line in bench.box.advance(bench.now).splitlines()]

@@ -43,14 +43,14 @@ def rows(leds, *, dwell_s=0.03, level=1.0, mask=3):
     return [TableRow((led,), level, dwell_s, mask) for led in leds]
 
 
-def test_the_box_says_who_it_is_and_what_it_allows(bench):
+def test_controller_reports_identity_and_limits(bench):
     assert bench.box.identify() == "RIGSIM,DOME1,DM-0001,1.0"
     assert (bench.box.identity.kind, bench.box.identity.serial) == ("dome", "DM-0001")
     assert bench.box.limits["leds"] == 150
     assert bench.box.limits["max_duty"] == RIG.leds.max_duty
 
 
-def test_a_table_runs_once_armed_and_every_release_is_timed(bench):
+def test_armed_table_runs_once_with_every_release_timed(bench):
     box = bench.box
     box.load(rows(UNSEEN[:8]))
     with pytest.raises(CommandRefused) as caught:
@@ -77,7 +77,7 @@ def test_a_table_runs_once_armed_and_every_release_is_timed(bench):
     assert [pulse.led for pulse in bench.world.switched] == UNSEEN[:8]
 
 
-def test_a_long_table_is_loaded_in_short_lines_and_its_checksum_compared(bench):
+def test_long_table_loads_in_short_lines_with_checksum(bench):
     many = [TableRow(tuple(UNSEEN[:5]), 0.1, 0.05, 3)] * 60
     bench.box.load(many)
     assert len(bench.world.box("dome").device.table) == 60
@@ -107,7 +107,7 @@ def test_leds_go_out_by_themselves_and_by_command(bench):
     assert not box.status().lit
 
 
-def test_flicker_is_refused_until_a_person_says_the_eyes_are_safe(bench):
+def test_flicker_is_refused_until_eye_safety_confirmation(bench):
     box = bench.box
     box.arm()
     flicker = rows([SEEN, UNSEEN[0]] * 8, level=0.4)
@@ -144,7 +144,7 @@ def test_cameras_are_masked_and_released_without_light(bench):
     assert bench.world.switched == []
 
 
-def test_silence_stops_the_sequence_within_the_lease_and_arming_again_is_deliberate(bench):
+def test_silence_stops_sequence_within_lease_until_rearmed(bench):
     box = bench.box
     box.set_lease(0.3)
     box.load(rows(UNSEEN * 3, dwell_s=0.05))
@@ -175,7 +175,7 @@ def test_a_dead_led_is_named():
     world.unregister()
 
 
-def test_a_flash_box_is_not_taken_for_a_domes():
+def test_flash_controller_is_not_accepted_as_dome():
     world = World(seed=5)
     name = world.register(next(NAMES))
     with pytest.raises(WrongDevice, match="expected a 'dome' box"):

@@ -65,7 +65,7 @@ def test_the_data_dictionary_carries_its_own_checksum(bench):
 # protocol -------------------------------------------------------------------------------------
 
 
-def test_a_repeated_frame_is_answered_again_and_not_done_again(bench):
+def test_repeated_frame_is_answered_again_without_repeating_action(bench):
     bench.ask("SYST:ARM")
     frame = bench.frame("FLAS:FIRE a1")
     assert bench.raw(frame) == bench.raw(frame) == bench.raw(b"\n" + frame)
@@ -96,19 +96,19 @@ def test_a_refusal_is_repeated_too(bench):
     assert bench.unit.count == 0
 
 
-def test_a_frame_of_another_epoch_is_refused_with_the_new_one(bench):
+def test_frame_of_old_epoch_is_refused_with_new(bench):
     reply = bench.reply("FLAS:POW 0.5", boot=bench.box.boot ^ 1)
     assert (reply.code, reply.boot) == (Code.BOOT_CHANGED, bench.box.boot)
     assert bench.unit.power == 1.0
 
 
-def test_hello_needs_no_epoch_and_nothing_else_goes_without(bench):
+def test_hello_alone_needs_no_epoch(bench):
     assert bench.reply("SYST:HELLO?", boot=0).code == Code.OK
     assert bench.reply("*IDN?", boot=0).code == Code.BOOT_CHANGED
 
 
 @pytest.mark.parametrize("damage", [b"@9", b"=1:0001 0*0000", b"FLAS:FIRE a*0000", b"@" * 600])
-def test_a_damaged_frame_is_answered_by_an_event_without_a_number(bench, damage):
+def test_damaged_frame_is_answered_by_unnumbered_event(bench, damage):
     event = wire.decode(bench.raw(damage + b"\n").rstrip())
     assert isinstance(event, Event)
     assert (event.name, event.payload) == ("NAK", "204")
@@ -128,7 +128,7 @@ def test_errors_queue_up_to_sixteen_and_then_overflow(bench):
     assert codes == [Code.UNDEFINED_HEADER] * 15 + [Code.QUEUE_OVERFLOW, 0]
 
 
-def test_cls_empties_the_queue_and_the_status_shows_it(bench):
+def test_cls_empties_queue_and_status_shows_empty(bench):
     bench.code("NONSENSE")
     assert bench.ask("STAT?") == "4"
     bench.ask("*CLS")
@@ -176,7 +176,7 @@ def test_valid_frames_renew_the_lease(bench):
 
 
 @pytest.mark.parametrize("power", [1.0, 0.5, 0.125])
-def test_a_tube_recycles_in_proportion_to_its_last_power(bench, power):
+def test_tube_recycle_time_is_proportional_to_last_power(bench, power):
     bench.ask("SYST:ARM")
     bench.ask(f"FLAS:POW {power}")
     bench.ask("FLAS:FIRE a")
@@ -187,7 +187,7 @@ def test_a_tube_recycles_in_proportion_to_its_last_power(bench, power):
     assert bench.code("FLAS:FIRE c") == Code.OK
 
 
-def test_no_minute_sees_more_pops_than_allowed(bench):
+def test_pops_per_minute_never_exceed_limit(bench):
     bench.ask("FLAS:POW 0.01")
     pops = []
     while bench.now < 130.0:
@@ -200,7 +200,7 @@ def test_no_minute_sees_more_pops_than_allowed(bench):
     assert max(windows) == RIG.max_pops_per_min
 
 
-def test_charge_falls_by_the_power_and_comes_back_in_less_than_the_recycle_time(bench):
+def test_charge_falls_by_power_recovers_within_recycle_time(bench):
     bench.ask("SYST:ARM")
     bench.ask("FLAS:POW 0.4")
     bench.ask("FLAS:FIRE a")
@@ -210,7 +210,7 @@ def test_charge_falls_by_the_power_and_comes_back_in_less_than_the_recycle_time(
     assert rising[-1] == 1.0
 
 
-def test_the_charge_answer_tells_when_a_pop_is_possible(bench):
+def test_charge_answer_reports_time_to_next_pop(bench):
     bench.ask("SYST:ARM")
     bench.ask("FLAS:FIRE a")
     _, ready, wait_ms = bench.ask("FLAS:CHAR?").split(",")
@@ -221,7 +221,7 @@ def test_the_charge_answer_tells_when_a_pop_is_possible(bench):
     bench.ask("FLAS:FIRE b")
 
 
-def test_a_slow_charger_delays_the_pop_beyond_the_recycle_time():
+def test_slow_charger_delays_pop_beyond_recycle_time():
     bench = FLASH.bench(slow_charge=4.0)
     bench.ask("SYST:ARM")
     bench.ask("FLAS:FIRE a")
@@ -233,7 +233,7 @@ def test_a_slow_charger_delays_the_pop_beyond_the_recycle_time():
     assert bench.code("FLAS:FIRE c") == Code.OK
 
 
-def test_no_pop_while_the_analyser_turns(bench):
+def test_pop_is_ignored_while_analyzer_rotates(bench):
     bench.ask("SYST:ARM")
     bench.ask("FLAS:POL CROS")
     assert bench.ask("*OPC?") == "0"
@@ -252,7 +252,7 @@ def test_turning_time_is_in_proportion_to_the_angle(bench):
     assert bench.ask("*OPC?") == "1"
 
 
-def test_a_pop_tells_the_world_what_the_box_reports(bench):
+def test_pop_informs_world_as_controller_reports(bench):
     bench.ask("SYST:ARM")
     bench.ask("FLAS:POL:ANG 30")
     bench.ask("FLAS:POW 0.25")
@@ -265,7 +265,7 @@ def test_a_pop_tells_the_world_what_the_box_reports(bench):
     assert pop.polarizer == "parallel"
 
 
-def test_a_misfire_is_a_hardware_error_and_no_light(bench):
+def test_misfire_is_hardware_error_without_light(bench):
     bench = FLASH.bench(misfire=1.0)
     bench.ask("SYST:ARM")
     assert bench.code("FLAS:FIRE a") == Code.HARDWARE
@@ -299,9 +299,7 @@ def later(bench, text, seconds):
 
 
 @pytest.mark.parametrize("delay_us", [1, 12_500, 50_000])
-def test_the_pop_comes_the_set_time_after_the_camera_line_and_is_reported_then(
-    bench, edges, delay_us
-):
+def test_pop_follows_camera_line_by_set_time(bench, edges, delay_us):
     bench.ask(f"FLAS:SYNC {delay_us}")
     bench.ask("SYST:ARM")
     assert bench.raw(bench.frame("FLAS:FIRE a")) == b""
@@ -312,7 +310,7 @@ def test_the_pop_comes_the_set_time_after_the_camera_line_and_is_reported_then(
     assert [pop.t_s for pop in bench.world.pops] == [pytest.approx(1.0 + 1e-6 * delay_us)]
 
 
-def test_a_retry_before_a_delayed_pop_is_answered_once_after_it(bench, edges):
+def test_retry_before_delayed_pop_is_answered_once_after(bench, edges):
     bench.ask("FLAS:SYNC 40000")
     bench.ask("SYST:ARM")
     frame = bench.frame("FLAS:FIRE a")
@@ -325,7 +323,7 @@ def test_a_retry_before_a_delayed_pop_is_answered_once_after_it(bench, edges):
 
 
 @pytest.mark.parametrize("word", ["SAFE", "*RST"])
-def test_what_makes_dark_before_a_delayed_pop_prevents_it(bench, edges, word):
+def test_dark_command_prevents_delayed_pop(bench, edges, word):
     bench.ask("FLAS:SYNC 40000")
     bench.ask("SYST:ARM")
     fire = bench.frame("FLAS:FIRE a")
@@ -339,7 +337,7 @@ def test_what_makes_dark_before_a_delayed_pop_prevents_it(bench, edges, word):
     assert wire.decode(bench.raw(fire).rstrip()) == reply
 
 
-def test_no_second_pop_begins_while_one_is_coming(bench, edges):
+def test_second_pop_is_ignored_while_first_is_pending(bench, edges):
     bench.ask("FLAS:SYNC 40000")
     bench.ask("SYST:ARM")
     bench.raw(bench.frame("FLAS:FIRE a"))
@@ -350,7 +348,7 @@ def test_no_second_pop_begins_while_one_is_coming(bench, edges):
     assert edges == [1.0]
 
 
-def test_a_delayed_misfire_is_told_when_it_is_known():
+def test_delayed_misfire_is_reported_when_detected():
     bench = FLASH.bench(misfire=1.0)
     bench.ask("FLAS:SYNC 30000")
     bench.ask("SYST:ARM")
@@ -358,7 +356,7 @@ def test_a_delayed_misfire_is_told_when_it_is_known():
     assert (reply.code, bench.world.pops) == (Code.HARDWARE, [])
 
 
-def test_a_lamp_lit_before_a_delayed_pop_is_out_when_it_comes(bench):
+def test_lamp_lit_before_delayed_pop_is_out_then(bench):
     bench.ask("FLAS:SYNC 40000")
     bench.ask("SYST:ARM")
     bench.raw(bench.frame("FLAS:FIRE a"))
@@ -382,7 +380,7 @@ def test_a_lamp_carries_its_own_end(bench):
     assert not bench.unit.lit
 
 
-def test_a_lamp_is_renewed_put_out_and_goes_out_before_a_pop(bench):
+def test_lamp_renews_switches_off_and_ends_before_pop(bench):
     bench.ask("SYST:ARM")
     bench.ask("FLAS:LAMP ON,200")
     bench.now = 1.1
@@ -397,7 +395,7 @@ def test_a_lamp_is_renewed_put_out_and_goes_out_before_a_pop(bench):
     assert bench.ask("FLAS:LAMP?") == "0"
 
 
-def test_a_lamp_kept_on_trips_on_heat_and_recovers(bench):
+def test_lamp_kept_on_trips_on_heat_and_recovers(bench):
     bench.ask("SYST:ARM")
     start = bench.now
     while bench.code("FLAS:LAMP ON,500") == Code.OK:
@@ -426,7 +424,7 @@ def test_a_dead_or_hot_lamp_is_named(fault, code):
 # power ----------------------------------------------------------------------------------------
 
 
-def test_a_reset_draws_another_epoch_forgets_settings_and_keeps_the_count(bench):
+def test_reset_changes_epoch_clears_settings_and_keeps_count(bench):
     bench.ask("SYST:ARM")
     bench.ask("FLAS:FIRE a")
     bench.ask("FLAS:POW 0.5")
@@ -444,7 +442,7 @@ def test_a_reset_draws_another_epoch_forgets_settings_and_keeps_the_count(bench)
     assert bench.ask("SYST:PING?") == "800000"
 
 
-def test_a_reset_that_is_announced_prints_a_banner_and_an_event(bench):
+def test_announced_reset_prints_banner_and_event(bench):
     bench.box.power_cycle(bench.now, boot_s=0.8, announce=True)
     banner, line = bench.box.advance(1.8).splitlines()
     assert banner == b"FLASH2 1.0 ready"

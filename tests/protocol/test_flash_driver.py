@@ -18,7 +18,7 @@ from rigsim.boxes.faults import Faults
 from rigsim.world import World
 
 
-def test_the_box_says_who_it_is_and_what_it_allows(bench):
+def test_controller_reports_identity_and_limits(bench):
     box = bench.box()
     assert box.identify() == "RIGSIM,FLASH2,FL-0001,1.0"
     assert (box.identity.kind, box.identity.serial) == ("flash", "FL-0001")
@@ -40,7 +40,7 @@ def test_settings_come_back_as_they_were_set(bench):
     assert (box.polarizer(), box.power()) == ("parallel", 1.0)
 
 
-def test_a_pop_is_made_once_armed_and_reported_with_its_light(bench):
+def test_armed_pop_is_made_and_reported_with_light(bench):
     box = bench.box()
     with pytest.raises(CommandRefused) as caught:
         box.fire("early")
@@ -58,7 +58,7 @@ def test_a_pop_is_made_once_armed_and_reported_with_its_light(bench):
     assert [pop.token for pop in bench.world.pops] == ["shot-1"]
 
 
-def test_waiting_for_the_charge_is_enough_to_pop_again(bench):
+def test_waiting_for_charge_suffices_to_pop_again(bench):
     box = bench.box()
     box.arm()
     box.set_power(0.2)
@@ -70,7 +70,7 @@ def test_waiting_for_the_charge_is_enough_to_pop_again(bench):
     assert second.t_box_s - first.t_box_s >= 0.3
 
 
-def test_waiting_for_a_charge_that_never_comes_is_a_timeout(bench):
+def test_missing_charge_ends_wait_with_timeout(bench):
     box = bench.box()
     box.arm()
     box.fire("a")
@@ -101,7 +101,7 @@ def test_dark_disarms(bench):
     assert not box.lamp_lit()
 
 
-def test_silence_trips_the_lease_and_arming_again_is_deliberate(bench):
+def test_silence_trips_lease_until_deliberate_rearming(bench):
     box = bench.box()
     box.set_lease(0.3)
     box.arm()
@@ -132,7 +132,7 @@ def test_refusals_are_queued_read_and_cleared(bench):
     assert box.errors() == []
 
 
-def test_the_analyser_turns_and_settles(bench):
+def test_analyzer_rotates_and_settles(bench):
     box = bench.box()
     for way in ("crossed", "parallel") * 8:  # on a real line a busy machine may ask when it is over
         box.set_polarizer(way)
@@ -151,7 +151,7 @@ def test_the_cameras_can_be_triggered_without_light(bench):
     assert bench.world.pops == []
 
 
-def test_a_box_outlives_its_port(bench):
+def test_controller_outlives_its_port(bench):
     box = bench.box()
     box.set_power(0.5)
     boot = box.identity.boot
@@ -180,13 +180,13 @@ def test_a_second_host_is_turned_away(bench):
             bench.box()
 
 
-def test_another_serial_number_is_another_box(bench):
+def test_other_serial_number_is_other_controller(bench):
     with pytest.raises(WrongDevice, match=r"FL-0001.*expected FL-0002"):
         bench.box(serial="FL-0002")
     assert bench.box(serial="FL-0001").identity.serial == "FL-0001"
 
 
-def test_a_reset_box_is_not_driven_on_old_assumptions(bench):
+def test_reset_controller_is_not_driven_on_old_assumptions(bench):
     box = bench.box()
     box.set_power(0.5)
     with bench.world.lock:
@@ -249,7 +249,7 @@ def test_an_answer_that_makes_no_sense_is_named(liar, method, arguments, payload
         getattr(liar(payload), method)(*arguments)
 
 
-def test_a_box_of_another_kind_is_refused(rig, monkeypatch):
+def test_controller_of_other_kind_is_refused(rig, monkeypatch):
     monkeypatch.setattr("rigsim.boxes.flash.FlashUnit.kind", "dome")
     world = World(rig, faults=Faults())
     name = world.register("protocol-dome")
@@ -260,7 +260,7 @@ def test_a_box_of_another_kind_is_refused(rig, monkeypatch):
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_no_number_that_is_none_is_sent(liar, value):
+def test_nonfinite_numbers_are_never_sent(liar, value):
     box = liar("")
     for send in (box.set_power, box.set_analyser, box.lamp_on):
         with pytest.raises(ValueError, match="finite"):

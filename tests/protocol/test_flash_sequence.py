@@ -83,7 +83,7 @@ def planned(session):
     return np.array([r.step.settings["start_s"] for r in session.frames("subject")], float)
 
 
-def test_shots_and_prompts_keep_their_periods_at_the_papers_rate(tmp_path):
+def test_shots_and_prompts_keep_periods_at_published_rate(tmp_path):
     session, heard, world = run(tmp_path / "s", multiplexed_plan(RIG, darks=1))
     assert len(session.frames("subject")) == 22
     late = noted(session, "time_s") - planned(session)
@@ -111,7 +111,7 @@ def test_no_period_stops_the_clock(tmp_path, period):
     assert np.diff([t for t, _ in heard]) == pytest.approx(5.0, abs=0.12)
 
 
-def test_a_late_shot_is_recorded_with_its_true_time(tmp_path):
+def test_late_shot_is_recorded_with_true_time(tmp_path):
     # packs that charge four times as slowly hold shots up
     plan = multiplexed_plan(RIG, captures=8, darks=0)
     session, _, world = run(tmp_path / "s", plan, faults=Faults(slow_charge=4.5))
@@ -139,7 +139,7 @@ def test_a_misfire_is_taken_again_whole_cycles_later(tmp_path):
     assert noted(session, "phase_s") == pytest.approx(planned(session) % 10, abs=0.15)
 
 
-def test_a_resumed_sequence_leads_in_again_and_meets_the_missing_phases(tmp_path):
+def test_resumed_sequence_leads_in_and_meets_missing_phases(tmp_path):
     plan = multiplexed_plan(RIG, captures=12, darks=1)
     broken, _, _ = run(tmp_path / "s", plan, stop_after=6)
     assert 0 < len(broken.frames("subject")) < 12
@@ -153,7 +153,7 @@ def test_a_resumed_sequence_leads_in_again_and_meets_the_missing_phases(tmp_path
     assert first - heard[0][0] >= 10.0
 
 
-def test_what_follows_an_event_is_left_out_when_its_time_has_passed(tmp_path):
+def test_steps_after_event_are_skipped_once_time_passed(tmp_path):
     plan = course_plan(RIG, before=1, darks=0)
     broken, heard, _ = run(tmp_path / "s", plan, stop_after=4)
     assert heard == []
@@ -168,7 +168,7 @@ def test_what_follows_an_event_is_left_out_when_its_time_has_passed(tmp_path):
     assert all("passed" in why for why in session.left_out().values())
 
 
-def test_shots_before_an_event_have_no_time_and_come_first(tmp_path):
+def test_shots_before_event_have_no_time_come_first(tmp_path):
     session, _, world = run(tmp_path / "s", course_plan(RIG, before=2, darks=1))
     records = session.frames("subject")
     assert ["time_s" in r.line.actual for r in records] == [False, False] + [True] * 11

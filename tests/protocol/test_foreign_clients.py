@@ -99,7 +99,7 @@ def test_serialx_asks_and_is_refused_a_bare_command(url_of, manual):
 
 
 @each_box
-def test_a_box_that_is_held_is_busy(manual):
+def test_held_controller_is_busy(manual):
     with serve(manual.rig, pty=True) as served:
         url = served.addresses[manual.name]
         with contextlib.closing(Port(url)), pytest.raises(PortBusy):
@@ -112,7 +112,7 @@ def served(request, rig):
         yield served
 
 
-def test_the_driver_works_on_serialx_in_place_of_pyserial(served, monkeypatch):
+def test_driver_works_on_serialx_instead_of_pyserial(served, monkeypatch):
     """The six methods that a port uses are the same there, so that a change is one file's."""
     serialx = pytest.importorskip("serialx")
 
@@ -131,7 +131,7 @@ def test_the_driver_works_on_serialx_in_place_of_pyserial(served, monkeypatch):
     assert [pop.token for pop in served.world.pops] == ["serialx"]
 
 
-def test_served_addresses_name_boxes_first(rig):
+def test_served_addresses_name_controllers_first(rig):
     with serve(rig) as served:
         assert list(served.addresses) == ["flash", "cam"]
         assert served.addresses["flash"].startswith("socket://127.0.0.1:")
@@ -150,7 +150,7 @@ def test_a_permitted_address_is_warned_about(rig, caplog):
 
 
 @pytest.mark.parametrize("tcp", ["127.0.0.1", ":5", "127.0.0.1:x", "127.0.0.1:99999"])
-def test_what_is_no_address_is_named(rig, tcp):
+def test_invalid_serve_address_is_refused_with_expected_form(rig, tcp):
     with pytest.raises(ServeError, match="expected HOST:PORT"):
         serve(rig, tcp=tcp)
 
@@ -162,6 +162,6 @@ def test_a_taken_port_is_named(rig):
             serve(rig, tcp=taken)
 
 
-def test_a_world_on_a_virtual_clock_is_not_served(rig):
+def test_world_on_virtual_clock_is_not_served(rig):
     with pytest.raises(ServeError, match="clock"):
         serve(rig, world=World(rig))

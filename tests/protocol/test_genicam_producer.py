@@ -55,19 +55,19 @@ def connection():
     assert not genicam_producer._opened
 
 
-def test_a_serial_that_no_camera_has_is_named_with_those_found():
+def test_unknown_camera_serial_error_lists_found_serials():
     with pytest.raises(CameraUrlError, match=r"genicam:77: no such camera; found Viky 0, Viky 1, "):
         open_camera("genicam:77")
 
 
-def test_a_camera_without_exposure_is_refused_and_let_go_again():
+def test_camera_without_exposure_is_refused_and_released():
     for _ in range(2):  # one that were held would be busy
         with pytest.raises(CameraError, match="genicam:1: has no feature ExposureTime"):
             open_camera(f"genicam:1?producer={PRODUCER}&black=0")
     assert not genicam_producer._opened
 
 
-def test_a_camera_that_is_open_is_busy_and_its_neighbour_is_not(connection):
+def test_open_camera_is_busy_but_neighbor_is_not(connection):
     files = (PRODUCER.resolve(),)
     with pytest.raises(CameraBusy, match="close the other program"):
         genicam_producer.connect(connection.library, "genicam:1", "1", files)
@@ -76,7 +76,7 @@ def test_a_camera_that_is_open_is_busy_and_its_neighbour_is_not(connection):
     other.close()
 
 
-def test_a_file_that_is_no_library_says_so(tmp_path):
+def test_file_that_is_not_library_cannot_be_loaded(tmp_path):
     (tmp_path / "broken.cti").write_bytes(b"no library")
     with pytest.raises(CameraUrlError, match=r"broken\.cti cannot be loaded"):
         open_camera(f"genicam:1?producer={tmp_path}")
@@ -86,7 +86,7 @@ def test_interrupting_stays_with_the_program(connection):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_features_are_read_set_and_refused_as_the_library_says(connection):
+def test_library_features_are_read_set_and_refused(connection):
     nodes = connection.acquirer.remote_device.node_map
     features = Features(nodes, connection.library, "genicam:1")
     # an entry that cannot be chosen now (Coord3D_ABC32f_Planar) is none
@@ -193,13 +193,13 @@ def camera(connection):
     camera.close()
 
 
-def test_a_camera_is_what_its_producer_says(camera):
+def test_camera_properties_match_its_producer(camera):
     info = camera.info
     assert (info.serial, info.model, info.pattern) == ("1", "Viky", "MONO")
     assert (info.width_px, info.height_px, info.black, info.white) == (400, 400, (0.0,), 255)
 
 
-def test_frames_stream_are_counted_and_show_what_moves(camera):
+def test_frames_stream_in_order_and_show_motion(camera):
     assert camera.configure(WANT) == WANT
     for _ in range(2):  # stopping frees what starting again needs
         camera.arm(8, Trigger.EDGE)
@@ -219,7 +219,7 @@ def test_frames_stream_are_counted_and_show_what_moves(camera):
         camera.abort()
 
 
-def test_the_first_frame_after_arming_is_accepted_as_the_one_asked_for(camera):
+def test_first_frame_after_arming_is_the_requested_frame(camera):
     camera.configure(WANT)
     camera.arm(1, Trigger.EDGE)
     before = camera.clock_s()
@@ -234,7 +234,7 @@ def test_no_frame_in_time_is_a_timeout(camera):
         deque(iter(lambda: camera.frame(0.2), None), maxlen=0)  # those that were on their way
 
 
-def test_a_closed_camera_can_be_opened_by_another_process(camera):
+def test_closed_camera_can_be_opened_by_other_process(camera):
     code = (
         "from capture.devices.camera import CameraError, open_camera\n"
         "try: open_camera('genicam:1?black=0')\n"

@@ -32,7 +32,7 @@ def rows_of(names, *, reading_deg=0.0, ms=30, level=1000, mask=1):
     ]
 
 
-def test_a_table_longer_than_the_box_holds_is_refused(bench):
+def test_table_longer_than_controller_capacity_is_refused(bench):
     bench.load(rows_of(["x"] * 60))
     many = ";".join(map(str, rows_of(["y"] * 5)))
     assert bench.code(f"SEQ:DEF 60,{many}") == Code.OUT_OF_RANGE
@@ -47,7 +47,7 @@ def test_the_data_dictionary_holds_the_rigs_limits(bench):
     assert 90.0 * limits["move_s_per_deg"] == pytest.approx(TURN_S)
 
 
-def test_host_and_box_spell_a_row_alike(bench):
+def test_host_and_controller_spell_rows_identically(bench):
     every = itertools.product(LIGHT_PATTERNS, (0.0, 90.0, 7.25), (1.0, 0.3333))
     for name, angle_deg, level in every:
         row = HostRow(name, angle_deg, level, 0.0301235, 1)
@@ -59,7 +59,7 @@ def test_host_and_box_spell_a_row_alike(bench):
 
 
 @pytest.mark.parametrize("name", LIGHT_PATTERNS)
-def test_a_pattern_weighs_each_led_by_its_place(bench, name):
+def test_pattern_weights_each_led_by_its_position(bench, name):
     axis = "xyz".find(name[-1])
     sign = -1.0 if name[0] == "-" else 1.0
     wanted = 0.5 * (1.0 + sign * WAYS[:, axis]) if axis >= 0 else np.ones(LEDS)
@@ -72,7 +72,7 @@ def test_a_pattern_weighs_each_led_by_its_place(bench, name):
     assert lights == ([] if name == "dark" else [(name, 0.4)])
 
 
-def test_a_pattern_and_its_complement_add_up_to_full(bench):
+def test_pattern_and_its_complement_sum_to_full(bench):
     for axis in "xyz":
         both = bench.unit._shares[axis] + bench.unit._shares["-" + axis]
         np.testing.assert_allclose(both, bench.unit._shares["full"], atol=1e-12)
@@ -91,7 +91,7 @@ def test_light_carries_its_own_end(bench):
     assert light.led_shares == ()
 
 
-def test_a_pattern_replaces_the_last_and_dark_ends_it(bench):
+def test_pattern_replaces_last_and_dark_ends_light(bench):
     bench.ask("SYST:ARM")
     bench.ask("PATT FULL,300,100")
     bench.wait(0.05)
@@ -103,7 +103,7 @@ def test_a_pattern_replaces_the_last_and_dark_ends_it(bench):
     assert not bench.unit.lit
 
 
-def test_light_that_goes_on_is_seen_as_given_so_far(bench):
+def test_ongoing_light_is_recorded_up_to_now(bench):
     world = bench.world
     bench.ask("SYST:ARM")
     bench.ask("PATT Z,300,100")
@@ -116,7 +116,7 @@ def test_light_that_goes_on_is_seen_as_given_so_far(bench):
 # analyser --------------------------------------------------------------------------------------
 
 
-def test_the_analyser_takes_its_time(bench):
+def test_analyzer_rotation_takes_time(bench):
     bench.ask("POL 90")
     assert bench.ask("POL?") == "90.000"
     assert bench.ask("*OPC?") == "0"
@@ -130,7 +130,7 @@ def test_the_analyser_takes_its_time(bench):
     assert bench.ask("*OPC?") == "1"
 
 
-def test_no_light_while_the_analyser_turns_and_no_turning_in_the_light(bench):
+def test_light_and_analyzer_rotation_exclude_each_other(bench):
     bench.ask("SYST:ARM")
     bench.ask(f"SEQ:DEF 0,{SPHERE_ROW}")
     bench.ask("POL 90")
@@ -145,7 +145,7 @@ def test_no_light_while_the_analyser_turns_and_no_turning_in_the_light(bench):
     assert bench.world.switched[0].analyser_deg == 90.0
 
 
-def test_turning_after_a_table_was_judged_means_judging_it_again(bench):
+def test_rotation_after_table_check_requires_new_check(bench):
     bench.ask("SYST:ARM")
     bench.ask(f"SEQ:DEF 0,{SPHERE_ROW}")
     bench.ask("SEQ:ARM 1")
@@ -157,7 +157,7 @@ def test_turning_after_a_table_was_judged_means_judging_it_again(bench):
 # scans -----------------------------------------------------------------------------------------
 
 
-def test_a_scan_steps_by_itself_turns_in_the_dark_and_reports_each_release(bench):
+def test_scan_rotates_in_dark_and_reports_each_release(bench):
     rows = rows_of(["full", "x"]) + rows_of(["-x", "dark"], reading_deg=90.0)
     bench.run(rows)
     start = bench.now
@@ -178,7 +178,7 @@ def test_a_scan_steps_by_itself_turns_in_the_dark_and_reports_each_release(bench
     assert not bench.unit.lit
 
 
-def test_the_paper_s_sixteen_conditions_are_one_scan_of_half_a_second_of_light(bench):
+def test_published_sixteen_conditions_form_half_second_scan(bench):
     calm = ["full", "z", "x", "y", "-x", "-y", "-z", "dark"]
     rows = rows_of(calm) + rows_of(calm[::-1], reading_deg=90.0)
     bench.ask("SYST:ARM")
@@ -195,13 +195,13 @@ def test_the_paper_s_sixteen_conditions_are_one_scan_of_half_a_second_of_light(b
     assert lit_s == pytest.approx(14 * 0.03)
 
 
-def test_a_scan_begins_with_turning_where_it_must(bench):
+def test_scan_begins_with_rotation_where_required(bench):
     bench.run(rows_of(["x"], reading_deg=45.0))
     bench.wait(0.3)
     assert bench.edges[0][0] == pytest.approx(1.0 + TURN_S / 2.0 + RIG.leds.settle_s)
 
 
-def test_a_scan_runs_once_for_each_arming_also_when_the_trigger_is_repeated(bench):
+def test_scan_runs_once_per_arming_despite_repeated_trigger(bench):
     bench.ask("SYST:ARM")
     bench.load(rows_of(["x", "y"]))
     bench.ask("SEQ:ARM 2")
@@ -251,7 +251,7 @@ def test_a_scan_can_be_stopped_at_once(bench, text):
     assert bench.world.switched[-1].t_off_s == pytest.approx(1.15)
 
 
-def test_a_scan_of_a_silent_host_ends_dark_within_the_lease(bench):
+def test_silent_host_ends_scan_dark_within_lease(bench):
     bench.ask("SYST:WDOG 300")
     bench.run(rows_of(["x", "y"] * 10, ms=50, level=200))
     fell_silent = bench.now
@@ -262,7 +262,7 @@ def test_a_scan_of_a_silent_host_ends_dark_within_the_lease(bench):
     assert bench.code("TRIG r2") == Code.WATCHDOG_TRIPPED
 
 
-def test_one_big_step_of_time_equals_many_small_ones():
+def test_large_time_step_equals_many_small_steps():
     def play(step_s):
         bench = GRADIENT_SPHERE.bench()
         bench.ask("SYST:WDOG 5000")
@@ -287,7 +287,7 @@ def test_a_scan_beyond_the_duty_is_refused_whole(bench):
     assert bench.code("SEQ:ARM 12") == Code.OK
 
 
-def test_heat_and_dose_are_limited_as_in_all_boxes_with_leds():
+def test_heat_and_dose_limits_match_other_led_controllers():
     hot = GRADIENT_SPHERE.bench(heat=0.9)
     hot.ask("SYST:ARM")
     assert hot.code("PATT X,5") == Code.THERMAL
@@ -299,7 +299,7 @@ def test_heat_and_dose_are_limited_as_in_all_boxes_with_leds():
     assert bench.code("SEQ:ARM 1") == Code.LIGHT_DOSE
 
 
-def test_a_scan_that_flickers_is_refused_unless_a_person_says_the_eyes_are_safe(bench):
+def test_flickering_scan_is_refused_without_eye_safety_confirmation(bench):
     flicker = rows_of(["full", "dark"] * 5)
     bench.ask("SYST:ARM")
     bench.load(flicker)
@@ -348,7 +348,7 @@ def test_gains_dim_their_leds_in_every_pattern(bench):
 
 
 @pytest.mark.parametrize("forget", ["*RST", "power"])
-def test_table_gains_and_eyes_do_not_outlive_a_reset(bench, forget):
+def test_reset_clears_table_gains_and_eye_state(bench, forget):
     for line in (f"SEQ:DEF 0,{SPHERE_ROW}", "GAIN:DEF 0,5", "SAFE:EYES CLOSED", "POL 90"):
         bench.ask(line)
     if forget == "power":
@@ -362,7 +362,7 @@ def test_table_gains_and_eyes_do_not_outlive_a_reset(bench, forget):
     assert bench.ask("*OPC?") == "0"  # on its way back
 
 
-def test_a_dead_led_is_named_once_and_a_weak_one_is_not_but_the_scene_learns_of_both():
+def test_dead_led_is_reported_once_weak_led_never():
     bench = GRADIENT_SPHERE.bench(led_dead="5", led_weak="9=0.25")
     bench.run(rows_of(["x", "-x"]))
     bench.wait(0.3)

@@ -74,7 +74,7 @@ def run(box, table, token="r"):
     return start_s, times | box.listen(0.05)
 
 
-def test_the_box_says_who_it_is_and_what_it_allows(bench):
+def test_controller_reports_identity_and_limits(bench):
     assert bench.box.identify() == "RIGSIM,SPHERE1,GS-0001,1.0"
     identity = bench.box.identity
     assert (identity.kind, identity.serial) == ("gradient_sphere", "GS-0001")
@@ -82,7 +82,7 @@ def test_the_box_says_who_it_is_and_what_it_allows(bench):
     assert 90.0 * bench.box.limits["move_s_per_deg"] == pytest.approx(RIG.polarizer_move_s)
 
 
-def test_sixteen_conditions_are_scanned_once_armed_and_every_release_is_timed(bench):
+def test_armed_scan_of_sixteen_conditions_times_every_release(bench):
     box = bench.box
     table = rows(CALM) + rows(CALM[::-1], reading_deg=90.0)
     box.load(table)
@@ -108,7 +108,7 @@ def test_sixteen_conditions_are_scanned_once_armed_and_every_release_is_timed(be
     assert box.analyser_deg() == 90.0
 
 
-def test_a_camera_sees_each_pattern_alone_under_its_analyser_and_what_was_held(bench):
+def test_camera_records_each_pattern_separately_under_its_analyzer(bench):
     box = bench.box
     clock = bench.world.clock if bench.world.virtual else None
     with CaliperBox(Port(bench.addresses["caliper"], clock=clock)) as caliper:
@@ -155,7 +155,7 @@ def test_patterns_go_out_by_themselves_and_by_command(bench):
         box.light("w", 0.1)
 
 
-def test_the_analyser_turns_to_stops_and_to_any_reading(bench):
+def test_analyzer_rotates_to_stops_and_any_reading(bench):
     box = bench.box
     box.set_polarizer("crossed")
     assert not box.settled() or not bench.world.virtual
@@ -199,7 +199,7 @@ def test_another_table_than_was_sent_is_noticed(bench, monkeypatch):
         bench.box.set_gains([1.0] * len(RIG.lights))
 
 
-def test_flicker_is_refused_until_a_person_says_the_eyes_are_safe(bench):
+def test_flicker_is_refused_until_eye_safety_confirmation(bench):
     box = bench.box
     box.arm()
     box.load(rows(("full", "dark") * 4))
@@ -234,7 +234,7 @@ def test_a_dead_led_is_named():
     world.unregister()
 
 
-def test_an_analyser_that_never_arrives_is_given_up(monkeypatch):
+def test_analyzer_that_never_arrives_is_abandoned(monkeypatch):
     with GradientSphereBox(Port("sim://gradient_sphere?seed=8")) as box:
         monkeypatch.setattr(
             "rigsim.boxes.gradient_sphere.GradientSphereUnit.busy", lambda self, now: True

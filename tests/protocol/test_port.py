@@ -103,13 +103,13 @@ def say(seq, payload="", *, boot=0x9F3A, code=0):
     return encode(Reply(seq, boot, code, payload))
 
 
-def test_hello_is_knocked_with_a_newline_and_teaches_the_epoch(open_port):
+def test_hello_after_newline_learns_the_epoch(open_port):
     port = open_port()
     assert port.boot == 0x9F3A
     assert port.statistics.requests == 1
 
 
-def test_a_port_is_opened_exclusively_and_with_both_timeouts(open_port):
+def test_port_opens_exclusively_with_both_timeouts(open_port):
     options = open_port().line.options
     assert options["exclusive"] is True
     assert options["timeout"] > 0.0
@@ -123,7 +123,7 @@ def test_requests_are_numbered_and_answered(open_port):
     assert port.statistics.retries == 0
 
 
-def test_a_retry_is_the_same_bytes_after_a_newline(open_port):
+def test_retry_sends_same_bytes_after_newline(open_port):
     port = open_port(
         (ask(8, "FLAS:FIRE a"), b""),
         (ask(8, "FLAS:FIRE a", retry=True), b""),
@@ -133,7 +133,7 @@ def test_a_retry_is_the_same_bytes_after_a_newline(open_port):
     assert port.statistics.retries == 2
 
 
-def test_a_nak_is_followed_by_a_retry_at_once(open_port):
+def test_nak_triggers_immediate_retry(open_port):
     port = open_port(
         (ask(8, "SAFE"), encode(Event(0, 0x9F3A, "NAK", "204"))),
         (ask(8, "SAFE", retry=True), say(8)),
@@ -142,14 +142,14 @@ def test_a_nak_is_followed_by_a_retry_at_once(open_port):
     assert port.statistics.naks == 1
 
 
-def test_silence_ends_in_a_timeout_that_is_a_timeout_error(open_port):
+def test_silence_raises_timeout_error_subclass(open_port):
     port = open_port(*[(ask(8, "SAFE", retry=k > 0), b"") for k in range(3)])
     with pytest.raises(PortTimeout, match="after 3 attempts") as caught:
         port.ask("SAFE")
     assert isinstance(caught.value, TimeoutError)
 
 
-def test_an_answer_to_an_earlier_request_is_thrown_away(open_port):
+def test_answer_to_earlier_request_is_discarded(open_port):
     port = open_port((ask(8, "STAT?"), say(7, "old") + say(8, "new")))
     assert port.ask("STAT?") == "new"
     assert port.statistics.stale == 1
@@ -162,7 +162,7 @@ def test_babble_and_damaged_answers_are_thrown_away(open_port):
     assert port.statistics.bad_lines == 2
 
 
-def test_endless_noise_ends_an_attempt_although_no_clock_runs(open_port):
+def test_endless_noise_ends_attempt_with_stopped_clock(open_port):
     noise = b"x" * 100_000
     port = open_port(*[(ask(8, "STAT?", retry=k > 0), noise) for k in range(3)])
     with pytest.raises(PortTimeout):
@@ -192,7 +192,7 @@ def test_another_epoch_is_a_reboot_until_hello(open_port, answer):
     assert port.statistics.reboots == 1
 
 
-def test_events_are_kept_and_gaps_in_their_numbers_counted(open_port):
+def test_events_are_kept_and_number_gaps_counted(open_port):
     trips = [encode(Event(n, 0x9F3A, "WDOG:TRIP", "300")) for n in (0, 3)]
     port = open_port((ask(8, "STAT?"), b"".join(trips) + say(8, "2")))
     assert port.ask("STAT?") == "2"
@@ -212,7 +212,7 @@ FAILURES = [
 
 @pytest.mark.parametrize("failure", FAILURES, ids=lambda f: type(f).__name__)
 @pytest.mark.parametrize("where", ["write", "read", "in_waiting", "reset_input_buffer"])
-def test_whatever_a_lost_device_raises_is_one_error(open_port, monkeypatch, failure, where):
+def test_lost_device_exceptions_map_to_same_error(open_port, monkeypatch, failure, where):
     port = open_port()
     line = port.line
 
@@ -231,7 +231,7 @@ def test_whatever_a_lost_device_raises_is_one_error(open_port, monkeypatch, fail
         port.hello()
 
 
-def test_a_box_that_takes_no_bytes_is_tried_again_and_then_a_timeout(open_port):
+def test_controller_accepting_no_bytes_is_retried_then_timeout(open_port):
     stalled = serial.SerialTimeoutException("Write timeout")
     port = open_port(*[(ask(8, "SAFE", retry=k > 0), stalled) for k in range(3)])
     with pytest.raises(PortTimeout):
@@ -250,7 +250,7 @@ def test_a_greeting_that_is_not_understood_is_refused(monkeypatch, payload, erro
         Port("/dev/box", clock=StillClock(), first_seq=7).hello()
 
 
-def test_a_box_that_never_answers_hello_is_a_timeout(monkeypatch):
+def test_controller_ignoring_hello_is_timeout(monkeypatch):
     greeting = b"\n" + encode(Request(7, 0, "SYST:HELLO?"))
     line = Line([(greeting, b"")] * 4)
     monkeypatch.setattr(serial, "serial_for_url", lambda url, **_: line)
@@ -259,7 +259,7 @@ def test_a_box_that_never_answers_hello_is_a_timeout(monkeypatch):
     assert not line.script
 
 
-def test_a_port_that_is_not_there_is_a_lost_link(tmp_path):
+def test_missing_port_is_lost_link(tmp_path):
     with pytest.raises(LinkLost, match="cannot open"):
         Port(str(tmp_path / "ttyUSB0"))
 
@@ -274,7 +274,7 @@ def test_a_port_that_another_program_holds_is_busy(monkeypatch):
 
 
 @pytest.mark.parametrize("url", ["nonsense://box", "sim://flash?dorp=1", "sim://toaster"])
-def test_a_url_that_nobody_knows_is_named(url):
+def test_unknown_port_url_is_reported_with_suggestion(url):
     with pytest.raises(PortUrlError, match=r"nonsense|did you mean drop|expected 'flash'|flash"):
         Port(url)
 
@@ -295,7 +295,7 @@ def test_an_import_error_inside_a_url_handler_shows(monkeypatch, tmp_path):
     sys.modules.pop("broken_handlers", None)
 
 
-def test_a_port_belongs_to_the_thread_that_made_it(open_port):
+def test_port_belongs_to_its_creating_thread(open_port):
     port = open_port()
     caught = []
 

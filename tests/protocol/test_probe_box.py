@@ -49,7 +49,7 @@ def light(bench, level=1000, **more):
 
 
 @pytest.mark.parametrize("text", PROBE_BOX.unframed)
-def test_what_makes_dark_needs_neither_frame_nor_arming(bench, text):
+def test_dark_commands_need_neither_frame_nor_arming(bench, text):
     assert bench.code(text) == Code.OK
     suck(bench)
     bench.ask("LED 500")
@@ -85,7 +85,7 @@ def test_the_data_dictionary_holds_the_rigs_limits(bench):
 # light -----------------------------------------------------------------------------------------
 
 
-def test_the_shutter_opens_pulses_the_camera_line_and_closes_by_itself(bench):
+def test_shutter_opens_pulses_camera_line_and_closes_autonomously(bench):
     light(bench, 800)
     begin_s = bench.now
     assert open_for(bench, 500) == (1, round(1e6 * (begin_s + ProbeBench.LAG_S)))
@@ -106,7 +106,7 @@ def test_the_shutter_opens_pulses_the_camera_line_and_closes_by_itself(bench):
 
 
 @pytest.mark.parametrize("ms", [1, 1.15, 30_000])
-def test_an_opening_ends_on_time_although_the_host_is_silent(bench, ms):
+def test_opening_ends_on_time_despite_silent_host(bench, ms):
     bench.ask("SYST:WDOG 5000")
     light(bench, ms=60_000)
     open_for(bench, ms)
@@ -122,7 +122,7 @@ def test_an_opening_ends_on_time_although_the_host_is_silent(bench, ms):
         assert seen.t_off_s == pytest.approx(seen.t_on_s + 5.0)
 
 
-def test_thirty_seconds_of_light_are_the_most_while_the_host_lives(bench):
+def test_light_is_limited_to_thirty_seconds_with_host(bench):
     light(bench, ms=60_000)
     open_for(bench, 30_000)
     bench.wait(31.0)
@@ -130,7 +130,7 @@ def test_thirty_seconds_of_light_are_the_most_while_the_host_lives(bench):
     assert seen.t_off_s - seen.t_on_s == pytest.approx(30.0, abs=1e-9)
 
 
-def test_a_shutter_that_opens_in_the_dark_gives_no_light_but_a_pulse(bench):
+def test_shutter_opening_in_dark_gives_pulse_without_light(bench):
     bench.ask("SYST:ARM")
     open_for(bench, 100)
     assert not bench.unit.lit
@@ -156,7 +156,7 @@ def _span(bench):
     return seen.t_on_s, seen.t_off_s
 
 
-def test_light_that_goes_on_is_told_so_far(bench):
+def test_ongoing_light_is_reported_up_to_now(bench):
     light(bench, 800)
     open_for(bench, 400)
     bench.wait(0.1)
@@ -165,7 +165,7 @@ def test_light_that_goes_on_is_told_so_far(bench):
     assert bench.world.switched == []
 
 
-def test_the_led_is_put_out_under_an_open_shutter(bench):
+def test_led_switches_off_under_open_shutter(bench):
     light(bench, 800)
     open_for(bench, 400)
     bench.wait(0.1)
@@ -175,7 +175,7 @@ def test_the_led_is_put_out_under_an_open_shutter(bench):
     assert seen.t_off_s - seen.t_on_s == pytest.approx(0.1, abs=1e-9)
 
 
-def test_no_light_leaves_a_head_that_is_not_held(bench):
+def test_unheld_head_emits_no_light(bench):
     bench.say(("SYST:ARM", "LED 1000"))
     assert bench.code("SHUT OPEN,100") == Code.IGNORED
     bench.ask("HEAD:SITE cheek,0")
@@ -199,7 +199,7 @@ def test_no_light_leaves_a_head_that_is_not_held(bench):
     assert len(bench.world.switched) == 2
 
 
-def test_a_light_ends_with_the_suction_that_is_vented(bench):
+def test_light_ends_when_suction_is_vented(bench):
     light(bench)
     open_for(bench, 10_000)
     bench.wait(0.2)
@@ -208,7 +208,7 @@ def test_a_light_ends_with_the_suction_that_is_vented(bench):
     assert seen.t_off_s == bench.now
 
 
-def test_the_cover_takes_its_time_and_leaves_one_fibre(bench):
+def test_cover_takes_time_and_leaves_single_fiber(bench):
     light(bench)
     bench.ask("FIB 12")
     assert bench.ask("FIB?") == "12"
@@ -225,7 +225,7 @@ def test_the_cover_takes_its_time_and_leaves_one_fibre(bench):
     assert bench.ask("FIB?") == "ALL"
 
 
-def test_a_retry_of_an_opening_opens_once_and_is_answered_alike(bench):
+def test_retried_opening_opens_once_and_answers_alike(bench):
     bench.ask("SYST:WDOG 5000")
     light(bench)
     bench.seq += 1
@@ -251,7 +251,7 @@ def test_a_retry_of_a_suction_sucks_once(bench):
     assert (bench.unit.pump.count, bench.unit.pump.drawing) == (1, False)
 
 
-def test_a_shutter_that_does_not_open_says_so_and_pulses_nothing():
+def test_stuck_shutter_is_reported_and_pulses_nothing():
     bench = PROBE_BOX.bench(shutter_stuck=1.0)
     light(bench)
     assert open_for(bench, 100) == Code.HARDWARE
@@ -262,7 +262,7 @@ def test_a_shutter_that_does_not_open_says_so_and_pulses_nothing():
 
 
 @pytest.mark.parametrize("end", ["own", "SHUT CLOSE", "SAFE", "silence"])
-def test_blades_that_do_not_close_put_the_led_out(end):
+def test_blades_failing_to_close_switch_led_off(end):
     bench = PROBE_BOX.bench(shutter_jam=1.0)
     light(bench)
     open_for(bench, 100 if end == "own" else 5000)
@@ -289,7 +289,7 @@ def test_blades_that_do_not_close_put_the_led_out(end):
     assert open_for(bench, 100)[0] == 2
 
 
-def test_a_dead_led_is_refused_and_a_weak_one_is_not_noticed():
+def test_dead_led_is_refused_and_weak_led_undetected():
     dead = PROBE_BOX.bench(led_dead="0")
     dead.ask("SYST:ARM")
     assert dead.code("LED 500") == Code.HARDWARE
@@ -300,7 +300,7 @@ def test_a_dead_led_is_refused_and_a_weak_one_is_not_noticed():
     assert weak.world.switched[0].level == pytest.approx(0.25)
 
 
-def test_the_dose_of_a_subject_is_counted_and_limited(bench):
+def test_subject_dose_is_counted_and_limited(bench):
     light(bench, 500)
     open_for(bench, 2000)
     bench.wait(2.5)
@@ -320,7 +320,7 @@ def test_a_dark_frame_is_pulsed_without_opening(bench):
 # suction ---------------------------------------------------------------------------------------
 
 
-def test_suction_comes_within_its_tolerance_and_ends_by_itself(bench):
+def test_suction_reaches_tolerance_and_ends_autonomously(bench):
     suck(bench, ms=5000)
     readings = []
     for _ in range(10):
@@ -338,7 +338,7 @@ def test_suction_comes_within_its_tolerance_and_ends_by_itself(bench):
     assert bench.ask("PUMP:LAST?") == ",".join((number, how, mbar, t_us))
 
 
-def test_suction_ends_on_time_although_the_host_is_silent(bench):
+def test_suction_ends_on_time_despite_silent_host(bench):
     bench.say(("SYST:WDOG 5000", *HEAD))
     bench.ask("PUMP ON,3000,60")
     bench.silence(4.9)
@@ -348,7 +348,7 @@ def test_suction_ends_on_time_although_the_host_is_silent(bench):
     assert bench.world.head_at(bench.now).suction_mbar < 0.1
 
 
-def test_the_gauge_has_a_zero_and_noise_of_its_own():
+def test_gauge_has_own_zero_and_noise():
     zeros = []
     for seed in range(12):
         bench = PROBE_BOX.bench(seed=seed)
@@ -358,7 +358,7 @@ def test_the_gauge_has_a_zero_and_noise_of_its_own():
     assert 0.2 < np.std(zeros) < 2.0
 
 
-def test_skin_has_its_rest_and_keeps_its_place(bench):
+def test_skin_rests_after_suction_and_head_stays_placed(bench):
     suck(bench)
     assert bench.code("PUMP ON,5000,60") == Code.IGNORED
     bench.ask("PUMP VENT")
@@ -372,14 +372,14 @@ def test_skin_has_its_rest_and_keeps_its_place(bench):
     assert bench.code("PUMP ON,5000,60") == Code.OK
 
 
-def test_the_rest_survives_a_reset_of_the_box(bench):
+def test_rest_period_survives_controller_reset(bench):
     suck(bench)
     bench.box.power_cycle(bench.now, boot_s=0.0, announce=False)
     bench.say(HEAD)
     assert bench.code("PUMP ON,5000,60") == Code.RECYCLE
 
 
-def test_the_pump_waits_for_a_person_to_say_where_the_head_sits(bench):
+def test_pump_waits_for_operator_to_report_head_site(bench):
     bench.ask("SYST:ARM")
     assert bench.code("PUMP ON,5000,60") == Code.IGNORED
     bench.ask("HEAD:SITE forehead,90")
@@ -394,7 +394,7 @@ def test_the_pump_waits_for_a_person_to_say_where_the_head_sits(bench):
 
 
 @pytest.mark.parametrize("let_go", ["SAFE", "ABOR", "*RST", "silence", "power", "HEAD:FREE"])
-def test_a_head_that_was_let_go_must_be_placed_again(bench, let_go):
+def test_released_head_must_be_placed_again(bench, let_go):
     suck(bench)
     bench.ask("LED 1000")
     open_for(bench, 10_000)
@@ -417,7 +417,7 @@ def test_a_head_that_was_let_go_must_be_placed_again(bench, let_go):
     assert bench.code("PUMP ON,5000,60") == Code.IGNORED
 
 
-def test_a_silent_host_is_dark_and_vented_within_the_lease(bench):
+def test_silent_host_means_dark_and_vented_within_lease(bench):
     bench.ask("SYST:WDOG 300")
     suck(bench)
     bench.ask("LED 1000")
@@ -451,7 +451,7 @@ def test_suction_that_is_not_reached_is_given_up(fault):
 
 
 @pytest.mark.parametrize(("leak", "mbar"), [(0.05, 57.0), (0.2, 50.0), (0.35, 44.4)])
-def test_a_smaller_leak_sags_and_only_the_gauge_tells(leak, mbar):
+def test_small_leak_sags_and_only_gauge_shows(leak, mbar):
     bench = PROBE_BOX.bench(pump_leak=leak)
     suck(bench)
     bench.wait(3.0)
@@ -461,7 +461,7 @@ def test_a_smaller_leak_sags_and_only_the_gauge_tells(leak, mbar):
     assert 0.975 * mbar - 2.8 < np.mean(readings) < mbar + 2.8
 
 
-def test_a_head_that_comes_off_is_vented_and_dark_at_once():
+def test_detached_head_is_vented_and_dark_at_once():
     bench = PROBE_BOX.bench(head_lifts_after=3.0)
     suck(bench)
     bench.ask("LED 1000")
@@ -481,7 +481,7 @@ def test_a_head_that_comes_off_is_vented_and_dark_at_once():
     assert bench.unit.pump.drawing
 
 
-def test_a_dead_gauge_bars_the_pump_and_ends_a_suction():
+def test_dead_gauge_bars_pump_and_ends_suction():
     bench = PROBE_BOX.bench(gauge_dead_after=4.0)
     suck(bench)
     assert bench.now < 4.0
@@ -503,7 +503,7 @@ def test_a_regulator_that_does_not_hold_is_vented(monkeypatch):
     assert bench.events("PUMP:END")[0].split(",")[1] == "HIGH"
 
 
-def test_the_emergency_stop_lets_go_and_bars_light_and_suction():
+def test_emergency_stop_releases_and_bars_light_and_suction():
     bench = PROBE_BOX.bench(interlock_after=6.0)
     suck(bench)
     bench.ask("LED 1000")
@@ -522,14 +522,14 @@ def test_the_emergency_stop_lets_go_and_bars_light_and_suction():
     assert closed.code("PUMP ON,5000,60") == Code.INTERLOCK
 
 
-def test_the_thermometer_tells_of_a_camera_that_warms():
+def test_thermometer_reports_warming_camera():
     bench = PROBE_BOX.bench(camera_warms_after=2.0)
     assert float(bench.ask("CAM:TEMP?")) == pytest.approx(5.0, abs=0.2)
     bench.wait(121.0, ping_s=0.9)
     assert float(bench.ask("CAM:TEMP?")) == pytest.approx(24.0 - 19.0 / np.e, abs=0.2)
 
 
-def test_one_big_step_of_time_equals_many_small_ones():
+def test_large_time_step_equals_many_small_steps():
     def play(step_s):
         bench = PROBE_BOX.bench(head_lifts_after=4.0, shutter_jam=0.5)
         bench.ask("SYST:WDOG 5000")

@@ -97,7 +97,7 @@ def refused(call, *arguments):
     return caught.value.code
 
 
-def test_the_box_says_who_it_is_and_what_it_allows(bench):
+def test_controller_reports_identity_and_limits(bench):
     box = bench.box
     assert box.identify() == "RIGSIM,PROBE1,PR-0001,1.0"
     assert (box.identity.kind, box.identity.serial) == ("probe", "PR-0001")
@@ -109,7 +109,7 @@ def test_the_box_says_who_it_is_and_what_it_allows(bench):
     assert box.camera_c() == pytest.approx(5.0, abs=0.2)
 
 
-def test_a_measurement_is_what_camera_and_shutter_make_of_it(bench):
+def test_measurement_follows_from_camera_and_shutter(bench):
     box, camera = bench.box, bench.camera()
     assert hold(box) == 1
     box.set_level(0.5)
@@ -142,7 +142,7 @@ def test_a_measurement_is_what_camera_and_shutter_make_of_it(bench):
     camera.close()
 
 
-def test_a_dark_frame_needs_no_head_and_no_light(bench):
+def test_dark_frame_needs_neither_head_nor_light(bench):
     box, camera = bench.box, bench.camera()
     camera.configure(Exposure(0.05, 100))
     camera.arm(1, Trigger.EDGE)
@@ -173,7 +173,7 @@ def test_nothing_shines_or_sucks_unarmed_or_unplaced(bench):
     assert bench.world.switched == []
 
 
-def test_no_light_leaves_a_head_that_is_not_held(bench):
+def test_unheld_head_emits_no_light(bench):
     box = bench.box
     box.arm()
     box.set_level(1.0)
@@ -203,7 +203,7 @@ def test_skin_rests_between_two_times_of_suction(bench):
     assert refused(box.place, "chin", 0.0) == Code.IGNORED
 
 
-def test_one_fibre_is_left_uncovered_and_the_light_tells(bench):
+def test_single_uncovered_fiber_is_revealed_by_light(bench):
     box = bench.box
     light(box)
     for fibre in (3, 27, None):
@@ -228,7 +228,7 @@ def test_the_shutter_is_closed_before_its_end(bench):
     assert seen.t_off_s - seen.t_on_s < 2.0
 
 
-def test_listening_keeps_head_and_light_and_silence_loses_both(bench):
+def test_listening_keeps_head_and_light_silence_loses_both(bench):
     box = bench.box
     box.set_lease(0.3)
     light(box)
@@ -245,7 +245,7 @@ def test_listening_keeps_head_and_light_and_silence_loses_both(bench):
 
 
 @pytest.mark.parametrize("end", ["dark", "close", "reset", "take_away"])
-def test_what_lets_go_ends_light_and_suction(bench, end):
+def test_release_commands_end_light_and_suction(bench, end):
     light(bench.box)
     bench.box.open_shutter(20.0)
     getattr(bench.box, end)()
@@ -255,7 +255,7 @@ def test_what_lets_go_ends_light_and_suction(bench, end):
     assert not bench.world.head_at(bench.world.now).placed
 
 
-def test_numbers_that_are_none_are_refused_before_anything_is_sent(bench):
+def test_nonfinite_numbers_are_refused_before_sending(bench):
     box = bench.box
     for call in (
         lambda: box.place("cheek", math.nan),
@@ -280,7 +280,7 @@ def test_numbers_that_are_none_are_refused_before_anything_is_sent(bench):
         ({"interlock_after": 1.0}, "interlock"),
     ],
 )
-def test_each_end_of_a_suction_is_told(alone, faults, ended):
+def test_each_suction_ending_is_reported(alone, faults, ended):
     world, box = alone(**faults)
     hold(box)
     box.listen(3.0)
@@ -291,7 +291,7 @@ def test_each_end_of_a_suction_is_told(alone, faults, ended):
     box.close()
 
 
-def test_a_stuck_shutter_is_refused_and_a_jammed_one_is_told(alone):
+def test_stuck_shutter_is_refused_and_jammed_shutter_reported(alone):
     world, box = alone(shutter_stuck=1.0)
     light(box)
     assert refused(box.open_shutter, 0.1) == Code.HARDWARE
@@ -330,7 +330,7 @@ def test_a_cover_that_never_arrives_is_given_up(alone, monkeypatch):
         ("CAM:TRIG", "other,5", lambda box: box.trigger_camera("d1"), "token,us"),
     ],
 )
-def test_an_answer_that_is_none_is_named(alone, header, payload, call, match):
+def test_invalid_answer_is_reported(alone, header, payload, call, match):
     world, box = alone()
     box.arm()
     command = world.box("probe").commands[header]

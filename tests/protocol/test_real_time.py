@@ -38,15 +38,13 @@ def test_of_a_lease(bench):
         ("sim", True, 2, False),  # virtual time does not run on
     ],
 )
-def test_a_failure_while_the_machine_stood_still_is_tried_again(
-    line, stands_still, passes_at, passed, tmp_path
-):
+def test_failure_during_machine_stall_is_retried(line, stands_still, passes_at, passed, tmp_path):
     run = trial(tmp_path, line=line, stands_still=stands_still, passes_at=passes_at)
     assert run.returncode == (0 if passed else 1), run.stdout
     assert ("1 passed" if passed else "1 failed") in run.stdout
 
 
-def test_a_failure_says_how_long_the_machine_stood_still(tmp_path):
+def test_failure_reports_duration_of_machine_stall(tmp_path):
     """Whether it does in a test that is quick is chance: what never passes fails in any case."""
     run = trial(tmp_path, line="pty", stands_still=False, passes_at=0)
     assert run.returncode == 1, run.stdout

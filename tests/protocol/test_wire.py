@@ -35,7 +35,7 @@ def test_each_frame_has_its_bytes(frame, line):
     assert decode(line[:-1]) == frame
 
 
-def test_the_checksum_is_the_ibm_3740_one_bit_by_bit():
+def test_checksum_is_ibm_3740_bit_by_bit():
     data = b"@17:9f3a SEQ:ARM 150"
     register = 0xFFFF
     for byte in data:
@@ -48,12 +48,12 @@ def test_the_checksum_is_the_ibm_3740_one_bit_by_bit():
 
 
 @given(frames)
-def test_decoding_returns_what_was_encoded(frame):
+def test_decode_returns_encoded_frame(frame):
     assert decode(encode(frame)[:-1]) == frame
 
 
 @given(st.binary(max_size=80))
-def test_a_line_that_decodes_is_the_one_that_encodes(line):
+def test_line_that_decodes_encodes_identically(line):
     try:
         frame = decode(line)
     except BadFrame:
@@ -62,7 +62,7 @@ def test_a_line_that_decodes_is_the_one_that_encodes(line):
 
 
 @given(printable)
-def test_a_sealed_line_that_decodes_is_the_one_that_encodes(body):
+def test_sealed_line_that_decodes_encodes_identically(body):
     line = wire.seal(body).encode()
     try:
         frame = decode(line)
@@ -118,7 +118,7 @@ def test_a_lower_case_checksum_is_refused():
         decode(b"@17:9f3a FLAS:FIRE a1*68ab")
 
 
-def test_the_longest_line_passes_and_one_byte_more_does_not():
+def test_longest_line_passes_and_longer_is_refused():
     room = wire.MAX_LINE_BYTES - len(encode(Request(1, 1, "x"))) + 1
     longest = encode(Request(1, 1, "x" * room))
     assert len(longest) == wire.MAX_LINE_BYTES
@@ -146,7 +146,7 @@ def test_the_sequence_number_starts_again_after_32_bits():
 
 
 @given(st.lists(st.binary(max_size=12).map(lambda b: b.replace(b"\r", b"")), max_size=8))
-def test_lines_do_not_depend_on_how_the_stream_is_cut(pieces):
+def test_lines_are_independent_of_stream_splitting(pieces):
     whole = b"".join(pieces)
     splitter = wire.LineSplitter()
     in_pieces = [line for piece in pieces for line in splitter.feed(piece)]
@@ -154,7 +154,7 @@ def test_lines_do_not_depend_on_how_the_stream_is_cut(pieces):
     assert in_pieces == [line for line in whole.split(b"\n")[:-1] if line]
 
 
-def test_overlong_garbage_is_dropped_up_to_the_next_newline():
+def test_overlong_garbage_is_dropped_up_to_newline():
     splitter = wire.LineSplitter()
     assert splitter.feed(b"x" * 1023) == []
     assert splitter.feed(b"x") == []
@@ -170,5 +170,5 @@ def test_a_terminal_may_send_carriage_returns():
     ("line", "meant"),
     [(b"@17:9f3a FLAS", True), (b"7:9f3a FLAS:FIRE a*68AB", True), (b"*IDN?", False)],
 )
-def test_a_damaged_frame_is_told_from_a_bare_line(line, meant):
+def test_damaged_frame_differs_from_bare_line(line, meant):
     assert wire.looks_framed(line) is meant

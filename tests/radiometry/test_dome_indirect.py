@@ -94,7 +94,7 @@ def test_light_by_way_of_other_skin_is_mitsubas(rig):
     assert (0.002 < mean / np.array([f.sum(axis=(0, 1)) for _, f in runs]).mean(axis=0)).all()
 
 
-def test_patches_of_a_flat_plate_exchange_nothing_and_of_a_groove_no_more_than_all():
+def test_flat_plate_exchanges_nothing_groove_at_most_all():
     """Two squares of 40 mm that meet at a right angle: each gets 0.2 of what the other sends.
 
     The view factor of adjacent equal squares is 0.20004; the boundary takes away T T, which
@@ -126,7 +126,7 @@ def face():
 
 
 @pytest.mark.long
-def test_bounced_light_adds_a_little_and_most_in_hollows(small, face):
+def test_interreflection_adds_little_and_most_in_concavities(small, face):
     plain = DomeScene(small, face, effects=SceneEffects(lateral=False, interreflections=False))
     bounced = DomeScene(small, face, effects=SceneEffects(lateral=False, interreflections=True))
     one, two = plain.radiance("C02", [0])[0], bounced.radiance("C02", [0])[0]
@@ -138,7 +138,7 @@ def test_bounced_light_adds_a_little_and_most_in_hollows(small, face):
     assert "highlights of skin on skin" in names
 
 
-def test_light_bleeds_into_shadow_redder_than_it_came(small, face):
+def test_subsurface_scattering_reddens_hard_shadow(small, face):
     """The sum of light changes little, pixels in hard shadow get some, and red more than blue."""
     plain = DomeScene(small, face, effects=SceneEffects(lateral=False, interreflections=False))
     soft = DomeScene(small, face, effects=SceneEffects(lateral=True, interreflections=False))
@@ -151,7 +151,7 @@ def test_light_bleeds_into_shadow_redder_than_it_came(small, face):
     assert "light spreading sideways in skin" not in {name for name, _ in soft.left_out}
 
 
-def test_the_plain_kernel_adds_the_same_light_from_inside(small, face):
+def test_plain_kernel_adds_the_same_subsurface_light(small, face):
     from rigsim.render.variant import VariantChoice
 
     plain = VariantChoice("scalar_rgb", "asked for by the test", "")

@@ -83,7 +83,7 @@ def point(rig, light):
 
 
 @pytest.mark.parametrize(("view", "light"), [("C02", 45), ("C06", 20), ("C02", 100)])
-def test_each_light_of_a_view_is_mitsubas_image_under_that_light(rig, face, view, light):
+def test_each_light_of_view_matches_mitsuba_image(rig, face, view, light):
     scene = PlainScene(rig, face, subpixels=1)
     runs = theirs(scene, rig.view(view), point(rig, light))
     worst, limit = worst_z(*ours(rig, face, view, light), runs)
@@ -103,7 +103,7 @@ class Paler(PlainScene):
 
 
 @pytest.mark.parametrize("scene_class", [Rougher, Paler])
-def test_three_percent_of_roughness_or_one_of_albedo_would_be_seen(rig, face, scene_class):
+def test_three_percent_roughness_or_albedo_error_is_detectable(rig, face, scene_class):
     scene = PlainScene(rig, face, subpixels=1)
     runs = theirs(scene, rig.view("C02"), point(rig, 45))
     worst, limit = worst_z(*ours(rig, face, "C02", 45, scene_class), runs)

@@ -77,7 +77,7 @@ def test_sixteen_full_views_stream_within_four_gigabytes():
 
 
 @pytest.mark.timeout(900)
-def test_sixteen_full_views_of_a_moving_face_have_room_in_four_gigabytes():
+def test_sixteen_full_moving_views_fit_in_four_gigabytes():
     """One light and exposure show what motion adds.
 
     The first camera's peak holds what is made once and what one frame takes while it is made; each

@@ -21,7 +21,7 @@ FALSE_ALARM = 1e-4  # per test
 @pytest.mark.parametrize(
     ("wavelength_nm", "c_m", "c_hd"), [(560.0, 0.02, 0.02), (630.0, 0.01, 0.04), (450.0, 0.1, 0.05)]
 )
-def test_an_even_patch_reflects_what_the_table_says(wavelength_nm, c_m, c_hd):
+def test_uniform_patch_reflectance_matches_table(wavelength_nm, c_m, c_hd):
     """Rationale: walk and table are separate codes of the same optics (analog weights at collisions
     there, attenuation along flights here). Expected: equal within both standard errors."""
     side = 8
@@ -45,7 +45,7 @@ def test_an_even_patch_reflects_what_the_table_says(wavelength_nm, c_m, c_hd):
 @pytest.mark.long
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("wavelength_nm", [560.0, 620.0])
-def test_stripes_look_as_the_full_walk_says_within_5_percent(wavelength_nm):
+def test_stripe_reflectance_matches_full_walk_within_5_percent(wavelength_nm):
     """Rationale: the scene replaces a walk through patterned skin by two blurs.
 
     Expected: the profile across stripes of melanin and, shifted, of blood, that took no part in

@@ -65,7 +65,7 @@ def twice_the_angle(
 
 
 @pytest.mark.parametrize("alpha", [0.1, 0.25, 0.5])
-def test_the_closed_form_equals_the_mueller_matrices_of_polarized_plastic(mitsuba, alpha):
+def test_closed_form_equals_mueller_matrices_of_polarized_plastic(mitsuba, alpha):
     """Rationale: two independent derivations of the same optics.
 
     Expected: equal Stokes vectors for light polarized along any axis. Tolerance: float32 on both

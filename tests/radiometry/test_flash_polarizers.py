@@ -21,7 +21,7 @@ def _needs_a_fast_polarized_variant() -> None:
 
 
 @pytest.mark.parametrize("name", ["parallel", "crossed"])
-def test_blocks_of_the_image_agree_with_the_path_tracer_but_for_its_noise(name):
+def test_image_blocks_match_path_tracer_within_noise(name):
     """Rationale: filters, Fresnel, GGX, both lights, geometry and units at once.
 
     Expected: block means of ours within the path tracer's standard error, which comes from 12
@@ -52,7 +52,7 @@ def test_blocks_of_the_image_agree_with_the_path_tracer_but_for_its_noise(name):
 
 
 @pytest.mark.long
-def test_both_images_are_8_times_faster_and_20_times_less_noisy_than_the_path_tracer():
+def test_image_pair_beats_path_tracer_speed_and_noise():
     result = reference.polarizer_reference(width_px=256, samples=64)
     assert result.speed_up >= 8.0
     assert result.noise_ratio >= 20.0

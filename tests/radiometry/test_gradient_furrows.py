@@ -46,7 +46,7 @@ def traced(skin):
 
 
 @pytest.mark.long
-def test_walls_of_skin_get_as_much_light_from_others_as_paths_bring(ours, traced):
+def test_groove_wall_irradiance_matches_path_tracing(ours, traced):
     """Expected: Mitsuba's mean over a patch of cheek. Tolerance: 10 %, the model's own, which takes
     one transmittance for two walls (measured 6 to 7 % high), and 4 standard errors of the mean."""
     means = traced.mean(axis=(1, 2))
@@ -56,14 +56,14 @@ def test_walls_of_skin_get_as_much_light_from_others_as_paths_bring(ours, traced
 
 
 @pytest.mark.long
-def test_light_from_other_walls_falls_where_paths_bring_it(ours, traced):
+def test_groove_wall_interreflection_distribution_matches_path_tracing(ours, traced):
     def blocks(image):
         return image.reshape(WIDTH // BLOCK, BLOCK, -1, BLOCK).mean(axis=(1, 3)).ravel()
 
     assert np.corrcoef(blocks(ours), blocks(traced.mean(axis=0)))[0, 1] > 0.95
 
 
-def test_walls_at_all_angles_alike_would_get_far_too_much(skin):
+def test_angle_independent_walls_receive_far_too_much_light(skin):
     """What goes along the surface passes the boundary badly: an average over all angles, which the
     test above refuses, is 1.5 times as much or more."""
     patch = plain_scene(skin, width_px=WIDTH).surface(NEUTRAL, subpixels=1, border_px=40)

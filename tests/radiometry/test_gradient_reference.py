@@ -33,7 +33,7 @@ def reference(skin, pixels):
     return traced(plain_scene(skin, width_px=WIDTH), pixels, subpixels=3)[0]
 
 
-def test_moments_with_horizons_are_what_shadow_rays_say(skin, pixels, reference):
+def test_horizon_moments_match_shadow_rays(skin, pixels, reference):
     """All four moments; horizons in 32 directions, table and samples err by less than 1 %."""
     scene = plain_scene(skin, width_px=WIDTH)
     for moment in range(4):

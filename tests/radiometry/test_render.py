@@ -68,7 +68,7 @@ def test_positions_and_normals_of_a_sphere_are_exact(choice, view):
     assert (np.sum(buffers.face_normal * buffers.to_camera, axis=-1)[buffers.mask] > 0).all()
 
 
-def test_the_area_seen_of_a_sphere_is_that_of_its_tangent_cone(choice, view):
+def test_visible_sphere_area_is_that_of_tangent_cone(choice, view):
     buffers = render.g_buffer(render.Caster(sphere(60.0), choice=choice), view, subpixels=2)
     distance, radius = 1000.0, 60.0
     tangent = radius / math.sqrt(distance**2 - radius**2)
@@ -76,7 +76,7 @@ def test_the_area_seen_of_a_sphere_is_that_of_its_tangent_cone(choice, view):
     assert buffers.mask.sum() == pytest.approx(expected, rel=2e-3)
 
 
-def test_row_0_is_the_top_and_x_runs_to_the_right(choice, view):
+def test_row_0_is_top_and_x_runs_right(choice, view):
     caster = render.Caster(plate(40.0, 0.0, center=(50.0, 30.0)), choice=choice)
     buffers = render.g_buffer(caster, view)
     rows, columns = np.nonzero(buffers.mask)
@@ -86,7 +86,7 @@ def test_row_0_is_the_top_and_x_runs_to_the_right(choice, view):
     assert buffers.uv[rows.min(), columns.max(), 1] > 0.9
 
 
-def test_pixel_size_on_the_subject_is_the_field_of_view_over_the_width(choice, view):
+def test_subject_pixel_size_is_field_over_image_width(choice, view):
     buffers = render.g_buffer(render.Caster(plate(200.0, 0.0), choice=choice), view)
     assert buffers.mask.all()
     step = np.diff(buffers.position_mm[:, :, 0], axis=1)
@@ -95,7 +95,7 @@ def test_pixel_size_on_the_subject_is_the_field_of_view_over_the_width(choice, v
     np.testing.assert_allclose(middle, 0.0, atol=1e-3)
 
 
-def test_a_plate_casts_its_shadow_where_geometry_says(choice):
+def test_plate_shadow_matches_geometry(choice):
     """A light at height 500 over a plate at height 50 magnifies its shadow by 500 / 450."""
     screen, blocker = plate(200.0, 0.0), plate(20.0, 50.0)
     caster = render.Caster(joined(screen, blocker), choice=choice)
@@ -107,7 +107,7 @@ def test_a_plate_casts_its_shadow_where_geometry_says(choice):
     np.testing.assert_array_equal(seen, np.where(np.abs(x) < edge, 0.0, 1.0))
 
 
-def test_the_penumbra_of_a_round_light_is_as_wide_as_geometry_says(choice):
+def test_round_light_penumbra_width_matches_geometry(choice):
     """Expected width: disc diameter times 50 / 450, and half the light at the edge."""
     screen, blocker = plate(200.0, 0.0), plate(20.0, 50.0)
     caster = render.Caster(joined(screen, blocker), choice=choice)
@@ -143,7 +143,7 @@ def test_both_ray_tracers_agree(view):
     assert np.abs(one.position_mm - other.position_mm)[both].max() < 5e-3
 
 
-def test_no_single_ray_slips_between_the_triangles_of_a_closed_surface(choice, view):
+def test_rays_never_slip_between_closed_surface_triangles(choice, view):
     fine = render.g_buffer(
         render.Caster(sphere(60.0, columns=720, rows=360), choice=choice), view, subpixels=4
     )
@@ -153,7 +153,7 @@ def test_no_single_ray_slips_between_the_triangles_of_a_closed_surface(choice, v
     assert not ((around == 8) & ~fine.mask).any()
 
 
-def test_a_white_plate_under_constant_light_renders_to_its_albedo():
+def test_white_plate_under_constant_light_renders_albedo():
     """Mitsuba itself, by a described scene: radiance = albedo times the sky's radiance."""
     image = render.radiance(
         {

@@ -49,7 +49,7 @@ def evaluated(mi, material, light, view):
 
 
 @pytest.mark.parametrize("name", ["diffuse", "ggx 0.1 eta 1.4", "sheen 0.4"])
-def test_mitsuba_evaluates_a_written_material_to_the_same_values(name, mi, rng, tmp_path):
+def test_mitsuba_evaluates_written_material_to_same_values(name, mi, rng, tmp_path):
     """Rationale: the file must mean the same there.
 
     Expected: f_r times the light's cosine. Tolerance: single precision against double, 1e-4 of the
@@ -88,7 +88,7 @@ def test_an_uneven_density_is_flattened_as_mitsuba_does(mi, rng, tmp_path):
     np.testing.assert_allclose(found, own, rtol=2e-3, atol=1e-4 * own.max())
 
 
-def test_mitsuba_s_samples_of_a_white_matt_material_bring_back_all_light(mi, rng, tmp_path):
+def test_mitsuba_samples_of_white_matte_material_conserve_light(mi, rng, tmp_path):
     """Rationale: weights f cos / pdf of sampled lights average to the albedo.
 
     Expected: 0.8 within 5 standard errors (false alarms: 1 in 1.7 million), which are under 0.01,

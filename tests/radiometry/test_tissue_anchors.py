@@ -75,7 +75,7 @@ def test_slab_matches_van_de_hulst():
 
 
 @pytest.mark.parametrize("wrong", [{"g": 0.74}, {"thickness_mm": 0.205}, {"sigma_a_per_mm": 1.05}])
-def test_slab_with_a_wrong_property_misses_van_de_hulst(wrong):
+def test_slab_with_wrong_property_misses_van_de_hulst(wrong):
     run = traced(with_layer(VAN_DE_HULST, 0, **wrong), 2_000_000)
     assert not (
         agrees(run.reflectance, run.reflectance_stderr, 0.09739)
@@ -130,7 +130,7 @@ def test_three_layers_match_the_sample_output_of_mcml():
         assert agrees(value, np.hypot(stderr, mcml_noise), published)
 
 
-def test_three_layers_in_another_order_miss_the_sample_output():
+def test_layers_in_wrong_order_miss_sample_output():
     reversed_ = LayerStack(MCML_SAMPLE.layers[::-1])
     run = traced(reversed_, 1_000_000)
     assert not agrees(run.reflectance, np.hypot(run.reflectance_stderr, 5e-4), 0.237544)
@@ -154,7 +154,7 @@ def test_radial_profile_matches_the_sample_output_of_mcml():
     assert radial_p_value(MCML_SAMPLE) > 1e-3
 
 
-def test_radial_profile_of_less_forward_scattering_misses_it():
+def test_reduced_forward_scattering_misses_radial_profile():
     assert radial_p_value(with_layer(MCML_SAMPLE, 0, g=0.88)) < 1e-3
 
 

@@ -66,7 +66,7 @@ def h_at_one(albedo, order=200):
 
 
 @NEEDS_LANES
-def test_slab_in_lanes_matches_van_de_hulst_and_another_does_not():
+def test_slab_lanes_match_van_de_hulst_uniquely():
     """Expected: van de Hulst 1980, table 35, R .09739, T .66096 (direct light included)."""
 
     def agree(stack):
@@ -90,7 +90,7 @@ def test_mismatched_half_space_in_lanes_matches_giovanelli():
 
 @NEEDS_LANES
 @pytest.mark.parametrize("albedo", [0.5, 0.9, 0.99])
-def test_matched_half_space_in_lanes_matches_the_exact_h_function(albedo):
+def test_matched_half_space_lanes_match_exact_h_function(albedo):
     exact = 1.0 - h_at_one(albedo) * np.sqrt(1.0 - albedo)
     run = traced(half_space(albedo, 1.0), 500_000, "drjit")
     assert agrees(run.reflectance, run.reflectance_stderr, exact)
@@ -124,7 +124,7 @@ def test_radial_profile_matches_all_rings_of_mcmls_sample(engine, test_data):
     assert p_value(replace(MCML_SAMPLE, layers=MCML_SAMPLE.layers[::-1])) < 1e-3
 
 
-def test_fibres_that_take_all_angles_match_the_rings_of_mcmls_sample(test_data):
+def test_all_angle_fibers_match_mcml_sample_rings(test_data):
     """Rationale: scoring at collisions, splitting, three layers. The mean over a disc .1 mm wide
     and over a ring .1 mm wide differ by less than .2 % from .5 mm on; 1 % is added for MCML."""
     mcml = np.array([float(x) for x in rows(test_data, "sample_mco_Rr.csv")[0]])[5:40] / 100.0
@@ -171,7 +171,7 @@ def all_light_in_a_cone(stack, photons, seed=1):
     return run.reflectance_per_mm2[0] * area, run.stderr[0] * area
 
 
-def test_light_in_a_narrow_cone_matches_van_de_hulst_along_the_normal():
+def test_narrow_cone_light_matches_van_de_hulst_normal():
     """Expected: I_R(mu = 1) = .06180 of the slab; within the cone I differs by 1e-4."""
     assert agrees(*all_light_in_a_cone(VAN_DE_HULST, 200_000), 0.06180)
     assert not agrees(
@@ -181,7 +181,7 @@ def test_light_in_a_narrow_cone_matches_van_de_hulst_along_the_normal():
 
 
 @pytest.mark.parametrize("albedo", [0.5, 0.9, 0.99])
-def test_light_in_a_narrow_cone_matches_the_h_function(albedo):
+def test_narrow_cone_light_matches_h_function(albedo):
     """Expected: reflected radiance a / 4 H(1)^2 / 2 per incident flux / pi (Chandrasekhar)."""
     exact = albedo * h_at_one(albedo) ** 2 / 8.0
     assert agrees(*all_light_in_a_cone(half_space(albedo, 1.0), 50_000), exact)
@@ -234,7 +234,7 @@ def test_half_space_that_does_not_absorb_is_refused(test_data):
 
 
 @pytest.mark.parametrize(("channel", "published"), [(0, 0.4316), (1, 0.2098), (2, 0.1138)])
-def test_jensens_first_skin_reflects_as_transport_says(channel, published, test_data):
+def test_jensen_skin1_reflectance_matches_transport(channel, published, test_data):
     """Expected: R_d of skin1 by transport, g = 0, n = 1.3, four digits."""
     skin = [m for m in materials(test_data) if m[0] == "Skin1"][channel]
     run = traced(half_space(skin[1] / (skin[1] + skin[2]), 1.3), 200_000, "numba")

@@ -79,7 +79,7 @@ def measured(b, photons, rng):
 
 
 @pytest.mark.long
-def test_directed_scattering_is_told_by_fits_and_by_profiles_alike(rng):
+def test_directed_scattering_is_detected_by_fits_and_profiles(rng):
     settings = {"eta": 1.0, "g": 0.0}
     profiles, variance = measured(0.6, 1_500_000, rng)
     whole = subsurface.invert(
@@ -137,7 +137,7 @@ def test_isotropic_walks_are_not_flagged(rng):
     assert np.count_nonzero(np.array(p_values) < 0.01) <= 4
 
 
-def test_the_eigenvalue_is_that_of_isotropic_scattering_where_nothing_depends_on_direction():
+def test_direction_independent_eigenvalue_is_isotropic_scattering():
     # albedo a: 1 = a / (2 k) ln((1 + k) / (1 - k)), k in units of the total (Case and Zweifel)
     total = SIGMA_A + SCATTERING
     k = decay(0.0, 0) / total

@@ -80,7 +80,7 @@ def inside_is_credible(inside, count, share=0.6827, false_alarm=1e-3):
 
 
 @pytest.mark.parametrize("name", ["gain_e_per_dn", "read_noise_e", "prnu"])
-def test_sensor_truth_lies_within_the_stated_errors(sensor_calibrations, name):
+def test_sensor_truth_is_within_stated_errors(sensor_calibrations, name):
     """24 sensors x 3 colors, one standard error, false-alarm rate 1e-3 per quantity."""
     z = np.array(
         [
@@ -136,7 +136,7 @@ def chart_patches():
     return centers, measure_patches(image.rgb, centers, valid=image.valid)
 
 
-def test_the_simulated_chart_is_found_where_it_stands(chart_patches):
+def test_simulated_chart_is_found_at_true_position(chart_patches):
     """Expected: centers to half a pixel of a superpixel image, 0.52 mm a pixel."""
     centers, patches = chart_patches
     pixel_mm = 200.0 / 384
@@ -176,7 +176,7 @@ def published_error():
     return difference(colorimetry.chart_reference("D55"), chart_xyz())
 
 
-def test_colors_by_the_patches_own_spectra_are_as_true_as_the_held_out_error_says(chart_patches):
+def test_colors_by_patch_spectra_match_held_out_error(chart_patches):
     """With a reference free of error what remains is the camera's: 0.9 mean, 2.8 at most.
 
     A patch held out of the fit is a harder test than one in it, so that the stated errors (1.4 and
@@ -191,7 +191,7 @@ def test_colors_by_the_patches_own_spectra_are_as_true_as_the_held_out_error_say
     assert error.max() < fit.max_delta_e
 
 
-def test_colors_by_the_published_chart_are_true_within_stated_and_reference_error(chart_patches):
+def test_colors_by_published_chart_err_within_stated_bounds(chart_patches):
     """As `skinrig calibrate color` does it, which does not know the spectra of its chart.
 
     Expected: 1.1 mean, 3.0 at most, against limits of 1.7 and 6.0. The
@@ -225,7 +225,7 @@ def test_colors_by_the_published_chart_are_true_within_stated_and_reference_erro
         assert wrong.max() > max_limit
 
 
-def test_skin_that_was_never_on_the_chart_gets_its_color(chart_patches):
+def test_skin_absent_from_chart_gets_correct_color(chart_patches):
     """Expected: Monte Carlo spectra of skin from pale to dark, mean Delta E below 2.5."""
     _, patches = chart_patches
     white = color.neutral_white(patches.rgb, reference=chart_xyz())
@@ -300,7 +300,7 @@ def malus_fit(seed, **films):
     return polarization.fit_malus(angles, mean, variance=variance)
 
 
-def test_analyser_zero_and_extinction_lie_within_their_errors():
+def test_analyzer_zero_and_extinction_are_within_errors():
     """20 series with films of 1:800 and 1:1200; false-alarm rate 1e-3.
 
     What leaks is least over most of the noise-free light: 1/1200 of the analyser and 1/800 of the
@@ -365,7 +365,7 @@ def seen_by(stokes, degrees, extinction):
 
 
 @pytest.mark.parametrize("extinction", [np.inf, 1000.0, 100.0])
-def test_a_ball_is_separated_into_its_diffuse_and_specular_light(extinction):
+def test_ball_separates_into_diffuse_and_specular(extinction):
     """Rationale: independent polarized shading, films of finite extinction, angles up to 68 deg.
 
     Expected: diffuse to 0.1 % for ideal films (float32 and the turn of the plane by each light
@@ -395,7 +395,7 @@ def test_a_ball_is_separated_into_its_diffuse_and_specular_light(extinction):
     )
 
 
-def test_ignoring_exit_polarization_fails_the_bound_that_the_correction_meets():
+def test_uncorrected_exit_polarization_fails_bound_met_when_corrected():
     n, _, diffuse, specular = ball(extinction=np.inf)
     parallel, crossed = (seen_by(diffuse + specular, a, np.inf) for a in (90.0, 0.0))
     truth = diffuse[:, :1].astype(np.float64)
@@ -408,7 +408,7 @@ def test_ignoring_exit_polarization_fails_the_bound_that_the_correction_meets():
 
 @pytest.mark.render
 @pytest.mark.parametrize("kind", ["sensor", "polarization", "color"])
-def test_targets_captured_by_the_whole_rig_calibrate_to_the_truth(kind, tmp_path):
+def test_targets_captured_by_full_rig_calibrate_to_truth(kind, tmp_path):
     """Through boxes, camera, session and disk at 384 pixels: the truth within 5 stated errors."""
     from rigsim.as_built.polarizers import draw_polarizers
     from skinrig.calibrating.calibrate import calibrate

@@ -96,7 +96,7 @@ def geometry_of_dome():
     return rig, dome, sightings, bundle.adjust(sightings, BOARD, geometry.nominal_cameras(rig))
 
 
-def test_cameras_are_found_to_a_third_of_a_pixel_with_a_lens_that_nobody_knew(geometry_of_dome):
+def test_cameras_found_within_third_pixel_with_unknown_lens(geometry_of_dome):
     rig, dome, sightings, found = geometry_of_dome
     errors = {name: reprojection_px(c, dome, name) for name, c in found.cameras.items()}
     assert max(errors.values()) < 0.3
@@ -110,7 +110,7 @@ def test_cameras_are_found_to_a_third_of_a_pixel_with_a_lens_that_nobody_knew(ge
     assert without.sigma_px > 1.2 * found.sigma_px
 
 
-def test_the_errors_of_the_cameras_are_as_large_as_stated(geometry_of_dome):
+def test_camera_errors_are_as_large_as_stated(geometry_of_dome):
     _, dome, _, found = geometry_of_dome
     squares = []
     for name, camera in found.cameras.items():
@@ -188,7 +188,7 @@ def test_balls_are_found_by_their_perspective_outlines(mirrors):
         assert place.fitted_radius_mm == pytest.approx(50.0, abs=0.03)
 
 
-def test_lights_are_placed_to_two_millimetres_with_their_errors(mirrors):
+def test_lights_are_located_within_two_millimeters_with_errors(mirrors):
     rig, _, (scene, cameras, places, seen) = mirrors
     found = mirror_lights.locate_lights(seen, cameras, places, nominal_places(rig))
     gap = found.position_mm - scene.truth()["position_mm"]
@@ -206,7 +206,7 @@ def test_lights_are_placed_to_two_millimetres_with_their_errors(mirrors):
     assert np.median(np.linalg.norm(drawn, axis=1)) > 2.5
 
 
-def test_a_radius_wrong_by_one_percent_is_refused_and_would_misplace_lights(mirrors):
+def test_radius_error_of_percent_is_refused_misplaces_lights(mirrors):
     rig, dome, _ = mirrors
     scene, cameras, places, seen = mirrors_seen(dome, rig, 2, groups=3, radius_mm=50.5)
     found = mirror_lights.locate_lights(seen, cameras, places, nominal_places(rig))
@@ -223,7 +223,7 @@ def test_a_radius_wrong_by_one_percent_is_refused_and_would_misplace_lights(mirr
         mirror_sphere.locate_sphere(edges, cameras, 50.5)
 
 
-def test_swapped_lights_and_a_dead_one_are_named_by_the_balls():
+def test_swapped_and_dead_lights_are_identified_by_balls():
     rig = small(["C05", "C07", "C14"], lights=12)
     straight = build(rig, seed=6)
     wiring = list(range(len(rig.lights)))
@@ -287,7 +287,7 @@ def plates():
     return rig, dome, plates_seen(dome, rig, (0, 1, 2))
 
 
-def test_intensities_gains_and_lobes_are_found_within_their_errors(plates):
+def test_intensities_gains_and_lobes_match_within_errors(plates):
     rig, dome, (scene, cameras, samples) = plates
     fit = light_fit.fit_lights(samples, at_true_places(rig, scene), cameras)
     truth = scene.truth()
@@ -326,7 +326,7 @@ def test_intensities_gains_and_lobes_are_found_within_their_errors(plates):
     assert np.sqrt(np.mean((flat - 1) ** 2)) > 0.02
 
 
-def test_dead_and_swapped_lights_are_named_by_their_shading(plates):
+def test_dead_and_swapped_lights_are_identified_by_shading(plates):
     rig, straight, _ = plates
     names = [light.name for light in rig.lights]
     front = [k for k, light in enumerate(rig.lights) if light.position_mm[2] > 100]

@@ -105,7 +105,7 @@ def scan_error_deg(dome, judged):
     return row.median
 
 
-def test_the_scan_is_laid_where_the_face_is(judged):
+def test_scan_is_registered_to_true_face_pose(judged):
     degrees, off_mm = judged.registration()
     assert judged.maps.parameters["registration"]["converged"]
     assert degrees < 0.3
@@ -115,7 +115,7 @@ def test_the_scan_is_laid_where_the_face_is(judged):
     assert np.linalg.norm(true[:3, 3]) > 1.0
 
 
-def test_normals_are_better_than_those_of_the_scan_and_than_the_published_estimate(dome, judged):
+def test_normals_beat_scan_and_published_estimate(dome, judged):
     normals, refined = judged.errors["normals"], judged.errors["normals_refined"]
     assert normals.median < 1.5
     assert refined.median < 1.5
@@ -129,7 +129,7 @@ def test_normals_are_better_than_those_of_the_scan_and_than_the_published_estima
     assert 0.6 < refined.coverage.share < 0.9
 
 
-def test_albedo_is_right_but_for_what_pixels_of_this_size_average(judged):
+def test_albedo_is_correct_except_for_pixel_averaging(judged):
     for channel in ("red", "green", "blue"):
         row = judged.errors[f"r_d {channel}"]
         assert row.median < 5.0
@@ -151,7 +151,7 @@ def test_reflection_in_directions_of_no_light_is_predicted(judged):
     assert wrong.median > 0.06
 
 
-def test_cameras_as_drawn_miss_what_calibrated_ones_keep(dome, judged):
+def test_nominal_cameras_fail_bounds_met_by_calibrated_cameras(dome, judged):
     folder = dome / "lights-alone"
     folder.mkdir()
     shutil.copy(dome / "calibration" / "lights.json", folder)
@@ -167,9 +167,7 @@ def test_cameras_as_drawn_miss_what_calibrated_ones_keep(dome, judged):
     assert drawn.errors[red].median > 1.2 * judged.errors[red].median
 
 
-def test_a_head_that_moved_is_followed_and_errs_less_than_one_whose_motion_is_ignored(
-    dome, monkeypatch
-):
+def test_tracked_head_errs_less_than_ignored_motion(dome, monkeypatch):
     from rigsim.subject import head_motion
 
     # far enough to show at this size of a pixel
@@ -247,7 +245,7 @@ def faulty(dome):
     return out, findings, names[dead], (names[a], names[b]), camera
 
 
-def test_a_dead_led_swapped_cables_and_a_moved_camera_are_named_by_calibration(faulty):
+def test_dome_calibration_identifies_dead_swapped_led_moved_camera(faulty):
     _, findings, dead, (a, b), camera = faulty
     said = "\n".join(findings)
     assert any(camera in text and "moved" in text for text in findings), said

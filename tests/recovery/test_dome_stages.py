@@ -308,7 +308,7 @@ def registration_error(maps):
     return degrees, np.linalg.norm(shift), record
 
 
-def test_normals_of_the_ellipsoid_are_those_of_its_equation(found):
+def test_ellipsoid_normals_match_its_equation(found):
     """No relief and no errors of calibration: what is left is noise, pixels and highlights."""
     result = found[1]
     assert result.share > 0.5
@@ -320,13 +320,13 @@ def test_normals_of_the_ellipsoid_are_those_of_its_equation(found):
     assert np.median(half.normals_deg) > 4 * np.median(result.normals_deg)
 
 
-def test_albedo_is_absolute_and_the_highlight_is_not_in_it(found):
+def test_albedo_is_absolute_and_excludes_highlight(found):
     result = found[1]
     assert np.abs(np.median(result.r_d, axis=0)).max() < 0.01
     assert np.median(np.abs(result.r_d), axis=0).max() < 0.02
 
 
-def test_the_scan_is_laid_onto_the_ellipsoid(found):
+def test_scan_is_registered_to_ellipsoid(found):
     """Turned about itself an ellipsoid looks nearly the same: its place is what is known well."""
     degrees, off_mm, record = registration_error(found[1].maps)
     stderr = np.array(record["stderr_rad_mm"])
@@ -337,7 +337,7 @@ def test_the_scan_is_laid_onto_the_ellipsoid(found):
     assert np.linalg.norm(away) > 3.0
 
 
-def test_what_was_made_once_is_not_made_again(found):
+def test_existing_results_are_not_recomputed(found):
     folder, first = found
     assert first.outcome.assumed == ()
     document = folder / "appearance" / store.DOCUMENT_FILE
@@ -353,7 +353,7 @@ def test_what_was_made_once_is_not_made_again(found):
     assert store.read(folder / "appearance").files.keys() == {"mesh.obj"}
 
 
-def test_no_frame_of_what_is_held_out_is_read(found, monkeypatch):
+def test_held_out_frames_are_not_read(found, monkeypatch):
     folder, first = found
     read = []
     plain = Session.read
@@ -405,7 +405,7 @@ def _frames(folder):
         ("lights=L999", "L999"),
     ],
 )
-def test_holding_out_too_much_or_nothing_that_is_there_is_refused(found, hold_out, named):
+def test_excessive_or_unmatched_hold_out_is_refused(found, hold_out, named):
     folder, _ = found
     with pytest.raises(HoldOutError, match=named):
         pipeline.reconstruct(
@@ -418,7 +418,7 @@ def test_holding_out_too_much_or_nothing_that_is_there_is_refused(found, hold_ou
 
 
 @pytest.mark.long
-def test_as_many_lobes_are_made_as_are_asked_for(found):
+def test_requested_number_of_lobes_is_made(found):
     folder, _ = found
     pipeline.reconstruct(
         folder / "session-ellipsoid",
@@ -456,12 +456,12 @@ def test_lobes_beyond_those_asked_for_are_refused(found, rank, want, named):
         )
 
 
-def test_without_tracking_frames_the_record_says_that_nobody_followed_the_head(found):
+def test_missing_tracking_frames_record_untracked_head(found):
     assert found[1].maps.parameters["motion"] == {"tracking_frames": 0}
 
 
 @pytest.mark.long
-def test_without_calibrated_lights_there_is_no_albedo_and_the_error_says_what_to_do(found):
+def test_albedo_without_calibrated_lights_raises_instructive_error(found):
     folder, _ = found
     with pytest.raises(StageError, match="skinrig calibrate lights"):
         pipeline.reconstruct(folder / "session-ellipsoid", want=["r_d"], out=folder / "without")
@@ -497,7 +497,7 @@ FEW = Shoot(lights=10, views=2, width_px=60)
         "black",
     ],
 )
-def test_what_cannot_be_reconstructed_is_refused_with_its_reason(shoot, says, tmp_path):
+def test_unreconstructable_session_is_refused_with_reason(shoot, says, tmp_path):
     with pytest.raises(ValueError, match=says):
         reconstruct(tmp_path, shoot, want=["normals"])
     assert not (tmp_path / "appearance").exists()
@@ -539,7 +539,7 @@ class Limits:
         "partly saturated",
     ],
 )
-def test_spoiled_captures_give_maps_that_hold_or_are_masked(shoot, limits, tmp_path):
+def test_spoiled_captures_give_valid_or_masked_maps(shoot, limits, tmp_path):
     result = reconstruct(tmp_path, shoot, want=["normals", "r_d"])
     assert np.median(result.normals_deg) < limits.normals_deg
     assert np.abs(np.median(result.r_d, axis=0)).max() < limits.r_d
@@ -550,9 +550,7 @@ def test_spoiled_captures_give_maps_that_hold_or_are_masked(shoot, limits, tmp_p
 
 
 @pytest.mark.long
-def test_a_subject_that_moved_three_millimetres_unnoticed_errs_more_than_one_at_rest(
-    found, tmp_path
-):
+def test_unnoticed_three_millimeter_motion_errs_more_than_rest(found, tmp_path):
     moved = reconstruct(tmp_path, Shoot(moved_mm=(3.0, 0.0, 0.0)), want=["normals", "r_d"])
     rest = found[1]
     # 3 mm over the ellipsoid's least radius of curvature, 52 mm, are 3.3 degrees

@@ -58,7 +58,7 @@ def off(found, seen):
     return np.linalg.norm(found.source_px - seen.source_px, axis=-1)[found.valid]
 
 
-def test_a_smile_that_moves_by_five_pixels_is_found_to_half_a_pixel(smiling, aligned):
+def test_smile_motion_of_five_pixels_found_within_half(smiling, aligned):
     """Landmarks to 1 px leave more than that between them; not to align leaves all of it."""
     assert aligned.valid[smiling.valid].mean() > 0.93
     assert np.sqrt(np.mean(off(aligned, smiling) ** 2)) < 0.5
@@ -69,7 +69,7 @@ def test_a_smile_that_moves_by_five_pixels_is_found_to_half_a_pixel(smiling, ali
     assert np.sqrt(np.mean(moved[smiling.valid] ** 2)) > 4.0
 
 
-def test_the_stated_error_of_the_place_covers_the_true_one(smiling, aligned):
+def test_stated_position_error_covers_the_true_error(smiling, aligned):
     """Within twice the root mean square: 98 % for a normal error, 90 % asked; a quarter fails."""
     error, stated = off(aligned, smiling), aligned.error_px[aligned.valid]
     assert np.mean(error < 2.0 * stated) > 0.9
@@ -81,7 +81,7 @@ def test_the_stated_error_of_the_place_covers_the_true_one(smiling, aligned):
 
 
 @pytest.mark.parametrize("state", ["exercise", "fear"])
-def test_blood_that_comes_and_goes_is_not_read_as_motion(face, state):
+def test_varying_blood_is_not_read_as_motion(face, state):
     rng = np.random.default_rng(3)
     seen = moved_face(face, np.zeros((SIDE, SIDE, 2)), state=state, noise=0.004, rng=rng)
     change = np.abs(seen.hemoglobin_at_rest - seen.hemoglobin)[seen.valid]
@@ -103,7 +103,7 @@ def test_features_alone_find_the_motion_too(smiling):
     assert np.sqrt(np.mean(off(found, smiling) ** 2)) < 0.5
 
 
-def test_blood_of_a_state_is_seen_on_the_neutral_face(smiling, aligned):
+def test_state_blood_is_mapped_onto_neutral_face(smiling, aligned):
     """Warped blood against the state's blood at rest: interpolation leaves less than the change."""
     blood, seen = aligned.warp(smiling.hemoglobin_moving, smiling.valid_moving)
     error = (blood - smiling.hemoglobin_at_rest)[seen]
@@ -112,7 +112,7 @@ def test_blood_of_a_state_is_seen_on_the_neutral_face(smiling, aligned):
 
 
 @pytest.mark.long
-def test_joint_inversion_of_aligned_states_tells_changes_better_than_each_alone(smiling, aligned):
+def test_joint_inversion_of_aligned_states_improves_changes(smiling, aligned):
     colors, prior = table(), shading_prior.of_faces()
     rgb, seen = aligned.warp(smiling.moving, smiling.valid_moving)
     variance, _ = aligned.warp(smiling.variance_moving, smiling.valid_moving)
@@ -148,7 +148,7 @@ def test_joint_inversion_of_aligned_states_tells_changes_better_than_each_alone(
 
 
 @pytest.mark.parametrize("state", ["smile", "exercise"])
-def test_blends_bear_misaligned_maps_and_interpolated_maps_do_not(face, state):
+def test_blends_tolerate_misaligned_maps_but_interpolated_maps_fail(face, state):
     """Jimenez et al. 2010, section 4.2: good results even with imperfect alignment.
 
     At full weight interpolation is the misplaced map itself. Measured against the change of the

@@ -56,7 +56,7 @@ def errors(folder, truths):
     return compare(appearance, hemoglobin_rig(appearance), truths, rng=np.random.default_rng(0))
 
 
-def test_the_rig_gives_each_states_blood_nearer_than_the_neutral_map_does(fitted, folder, truths):
+def test_rig_estimates_state_blood_closer_than_neutral_map(fitted, folder, truths):
     """Vessels dilate unevenly by compartment: eq. (6) did not make the truth."""
     rows, _ = errors(folder, truths)
     error = {(row.state, row.way): row.median_relative for row in rows}
@@ -83,7 +83,7 @@ def test_the_mean_change_of_blood_is_found(fitted, folder, truths):
     assert abs(found["smile"].found) < 0.1 * level  # a smile moves blood, it brings little
 
 
-def test_melanin_that_all_states_share_has_less_noise_than_that_of_one(fitted, folder, tmp_path):
+def test_melanin_common_to_states_has_less_noise(fitted, folder, tmp_path):
     """Four pictures of one melanin: about half the noise."""
     pipeline.reconstruct(
         folder / "session-face",
@@ -111,7 +111,7 @@ def test_a_face_without_any_expression_is_refused(folder, tmp_path):
     assert not (tmp_path / "moving").exists()
 
 
-def test_skin_whose_blood_no_color_tells_is_refused_with_what_can_be_had(folder, tmp_path):
+def test_skin_without_blood_color_is_refused_with_alternatives(folder, tmp_path):
     """Such a face states no interval of blood either: the trial of intervals goes on."""
     done = simulate_session(
         "flash",
@@ -131,7 +131,7 @@ def test_skin_whose_blood_no_color_tells_is_refused_with_what_can_be_had(folder,
     assert not list(trials)
 
 
-def test_features_stand_in_for_landmarks_and_say_so(folder, tmp_path):
+def test_features_substitute_for_landmarks_and_report_this(folder, tmp_path):
     """A measured session has no truth beside it: the same frames in another place."""
     import shutil
 

@@ -27,7 +27,7 @@ def errors(face, radius_px, moved_px=0):
     return [blood_errors.compare(rig.blend({n: 1.0}), truth[n], neutral) for n in STATES]
 
 
-def test_scale_and_bias_beat_one_gain_and_the_neutral_map_in_every_state(face):
+def test_scale_and_bias_beat_gain_and_neutral_map(face):
     for found in errors(face, RADIUS_PX):
         assert found.predicted < 0.6 * found.one_gain < 0.6 * found.neutral_kept
 
@@ -38,7 +38,7 @@ def test_error_falls_with_the_radius_of_the_discs(face):
     assert by_radius[-1] < 0.5 * by_radius[0]
 
 
-def test_misalignment_of_an_eighth_of_the_radius_costs_little_and_of_a_radius_much(face):
+def test_small_misalignment_costs_little_large_costs_much(face):
     aligned, near, far = (
         np.mean([e.predicted for e in errors(face, RADIUS_PX, moved)]) for moved in (0, 1, 8)
     )
@@ -46,7 +46,7 @@ def test_misalignment_of_an_eighth_of_the_radius_costs_little_and_of_a_radius_mu
     assert far > 2.0 * aligned
 
 
-def test_ratios_of_the_mean_transfer_to_another_person_and_absolute_means_do_not(face):
+def test_mean_ratios_transfer_between_persons_absolute_means_fail(face):
     other = subject.make_subject("II", seed=7, size=128, mesh=face.mesh)
     rig = HemoglobinRig.from_maps(
         face.hemoglobin(), {"smile": face.hemoglobin("smile")}, radius_px=RADIUS_PX

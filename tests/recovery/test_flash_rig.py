@@ -84,7 +84,7 @@ def test_chromophores_are_recovered_within_their_bounds(
 
 
 @pytest.mark.long
-def test_a_white_balance_5_percent_off_breaks_the_bounds(tmp_path, calibration, captured, rng):
+def test_white_balance_error_of_5_percent_breaks_bounds(tmp_path, calibration, captured, rng):
     """Shows that the test above can fail."""
     white = calibration_store.load(calibration, "white")
     tinted = dataclasses.replace(
@@ -100,7 +100,7 @@ def test_a_white_balance_5_percent_off_breaks_the_bounds(tmp_path, calibration, 
     assert broken
 
 
-def test_a_subject_is_reconstructed_only_as_far_as_wanted(tmp_path, narrow):
+def test_subject_is_reconstructed_only_as_far_as_requested(tmp_path, narrow):
     first = pipeline.reconstruct(narrow.session, want=["melanin"], out=tmp_path / "maps")
     assert first.ran == ("frames", "separation", "chromophores")
     assert "tsumura" in {name for name, _ in first.left_out}
@@ -118,9 +118,7 @@ def test_a_subject_is_reconstructed_only_as_far_as_wanted(tmp_path, narrow):
     assert (maps["melanin"].stderr[valid] > 0).all()
 
 
-def test_a_wrong_noise_profile_does_not_matter_where_the_sensor_is_calibrated(
-    tmp_path, monkeypatch, narrow
-):
+def test_wrong_noise_profile_is_harmless_with_calibrated_sensor(tmp_path, monkeypatch, narrow):
     simulate_session("flash", tmp_path / "session-flat", target="flat", seed=3, width_px=96)
     calibrate("sensor", [tmp_path / "session-flat"], tmp_path / "store", created=TODAY)
 
@@ -157,7 +155,7 @@ def test_reconstruction_needs_no_truth(tmp_path, narrow):
     assert "chromophores" in outcome.ran
 
 
-def test_a_calibration_of_another_day_is_refused_by_name(tmp_path, narrow):
+def test_calibration_of_other_day_is_refused_by_name(tmp_path, narrow):
     from capture.calibration.store import CalibrationError
 
     simulate_session("flash", tmp_path / "session-white", target="white", seed=3, width_px=96)

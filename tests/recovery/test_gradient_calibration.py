@@ -105,7 +105,7 @@ def usable(survey):
     return survey.lights.valid & ~survey.lights.dead
 
 
-def test_directions_are_found_to_a_fiftieth_of_a_degree_and_drawings_are_not(ball):
+def test_calibrated_directions_err_below_fiftieth_degree_nominal_more(ball):
     scene, _, survey = ball
     seen, true = survey.lights.seen, true_directions(scene)
     error = np.degrees(np.linalg.norm(survey.lights.directions - true, axis=1))[seen]
@@ -137,7 +137,7 @@ def test_dead_lights_are_named_and_no_other(ball):
     assert any("dead" in text for text in survey.findings)
 
 
-def test_intensities_are_found_to_a_percent_and_as_well_as_stated(ball):
+def test_intensities_err_below_percent_and_as_stated(ball):
     scene, _, survey = ball
     good = usable(survey)
     true = true_intensities(scene, good)
@@ -155,7 +155,7 @@ def test_intensities_are_found_to_a_percent_and_as_well_as_stated(ball):
     assert np.quantile(np.abs(other - np.median(other)), 0.9) > 0.03
 
 
-def test_the_analyser_and_the_films_are_found(ball):
+def test_analyzer_and_polarizers_are_found(ball):
     scene, _, survey = ball
     films = survey.films
     zero = np.degrees(films.misalignment_rad) - FILMS.analyser_zero_deg
@@ -172,7 +172,7 @@ def test_the_analyser_and_the_films_are_found(ball):
     assert np.median(np.abs(films.glass_leakage - true)[films.valid]) > 10 * np.median(error)
 
 
-def test_an_analyser_ten_degrees_off_is_measured_and_reported(ball):
+def test_analyzer_offset_of_ten_degrees_is_measured_reported(ball):
     scene, _, _ = ball
     survey = survey_sphere(shots_of(scene, seed=200, turned_deg=9.4), RIG)
     true = true_leakage(scene, 10.0)
@@ -195,7 +195,7 @@ def test_saturated_spots_are_named_and_still_give_directions(ball):
     assert np.median(error[survey.lights.seen]) < 0.1
 
 
-def test_dark_frames_and_frames_of_another_size_are_refused_by_name(ball):
+def test_dark_and_wrong_size_frames_are_refused(ball):
     _, shots, _ = ball
     dark = [
         dataclasses.replace(
@@ -213,7 +213,7 @@ def rng_like(image, seed):
     return np.random.default_rng(seed).standard_normal(image.shape).astype(np.float32)
 
 
-def test_a_ball_of_another_radius_is_noticed_by_its_fit(ball):
+def test_wrong_ball_radius_is_detected_by_fit(ball):
     _, shots, survey = ball
     wrong = survey_sphere(shots, RIG, target=GlassBall(radius_mm=6.3, radius_stderr_mm=0.02))
     assert abs(wrong.ball.radius_mm - 6.3) > 5 * 0.02 or wrong.light_scatter_mm > (

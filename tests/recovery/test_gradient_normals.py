@@ -74,7 +74,7 @@ def mean_error_deg(found, truth):
 
 
 @pytest.mark.long
-def test_normals_of_smooth_skin_without_noise_are_within_a_third_of_a_degree():
+def test_noise_free_smooth_normals_err_below_third_degree():
     scene, sphere, seen, sharp = patch(96, smooth=True)
     images = {
         (name, state): scene.radiance(name, grip=NEUTRAL, analyser_deg=angle)
@@ -89,7 +89,7 @@ def test_normals_of_smooth_skin_without_noise_are_within_a_third_of_a_degree():
 
 
 @pytest.mark.long
-def test_normals_of_skin_at_the_rigs_noise_are_within_one_and_a_half_degrees():
+def test_rig_noise_normals_err_below_1_5_degrees():
     side = 256
     scene, sphere, seen, sharp = patch(side, smooth=False)
     sensor = scene.sensor("cam")

@@ -36,7 +36,7 @@ def mean_dn(session, name, **index):
     raise AssertionError(name)
 
 
-def test_a_session_of_skin_is_sound_and_its_truth_names_the_states_that_it_has(made):
+def test_skin_session_is_sound_and_truth_lists_states(made):
     session = Session.open(made.session)
     assert session.closed
     assert verify(made.session).ok
@@ -52,7 +52,7 @@ def test_a_session_of_skin_is_sound_and_its_truth_names_the_states_that_it_has(m
     assert not list(made.session.parent.glob(".*grips*"))
 
 
-def test_the_skin_follows_the_jaws_by_less_than_they_move(made):
+def test_skin_displacement_is_smaller_than_jaw_displacement(made):
     rows = {row["name"]: row for row in store.read(made.truth).parameters["states"]}
     session = Session.open(made.session)
     assert rows["a000_n0"]["stretch_s"] == pytest.approx(1.0)
@@ -64,7 +64,7 @@ def test_the_skin_follows_the_jaws_by_less_than_they_move(made):
             assert 0.3 < (row["stretch_s"] - 1.0) / (reading - 1.0) < 0.999
 
 
-def test_patterns_that_complete_each_other_give_the_light_of_full(made):
+def test_complementary_patterns_sum_to_full_light(made):
     """Of one state, dark subtracted: x + -x = full, within what energy and noise differ by."""
     session = Session.open(made.session)
     for name, polarizer in itertools.product(("a000_n0", "a000_p1"), ("parallel", "crossed")):
@@ -91,7 +91,7 @@ def test_a_wrong_pattern_would_not_add_up(made):
     assert x + z - 2 * dark != pytest.approx(full - dark, rel=0.01)
 
 
-def test_crossed_pictures_lack_the_surface_reflection(made):
+def test_crossed_images_lack_surface_reflection(made):
     session = Session.open(made.session)
     dark, parallel, crossed = (
         mean_dn(session, "a000_n0", pattern=p, polarizer=q)
@@ -101,7 +101,7 @@ def test_crossed_pictures_lack_the_surface_reflection(made):
 
 
 @pytest.mark.parametrize("commits", [3, 20])
-def test_an_interrupted_simulation_resumes_with_the_same_settings_to_a_whole_truth(
+def test_interrupted_simulation_resumes_same_settings_and_complete_truth(
     made, tmp_path, monkeypatch, commits
 ):
     out = tmp_path / "session-cut"
@@ -133,13 +133,13 @@ def test_an_interrupted_simulation_resumes_with_the_same_settings_to_a_whole_tru
     assert tapings["a000_p1"] == 2
 
 
-def test_a_truth_whose_log_is_lost_is_not_made_up(made, tmp_path):
+def test_truth_with_lost_log_is_not_invented(made, tmp_path):
     session = Session.open(made.session)
     with pytest.raises(SimulationError, match="simulate the session anew"):
         GripLog(None, tmp_path / "truth-skin", resume=True, session=session)
 
 
-def test_a_log_of_other_times_tells_nothing(made, tmp_path):
+def test_log_of_other_times_is_refused(made, tmp_path):
     session = Session.open(made.session)
     truth = tmp_path / "truth-skin"
     (tmp_path / ".truth-skin.grips.jsonl").write_text('{"run": 1, "t_s": -5.0, "grip": {}}\n')

@@ -48,7 +48,7 @@ def test_every_state_that_was_captured_is_there(made):
     assert {"strain.json", "histograms.json", "kernels.json"} <= set(found.files)
 
 
-def test_the_skins_stretch_is_measured_to_half_a_percent(made):
+def test_skin_stretch_is_measured_within_half_percent(made):
     rows = evaluation.compare_stretch(*made)
     assert [row.state for row in rows]
     assert all(abs(row.error) <= 0.005 for row in rows)
@@ -57,13 +57,13 @@ def test_the_skins_stretch_is_measured_to_half_a_percent(made):
     assert all(abs(row.error) < 5 * row.stderr for row in strained)
 
 
-def test_the_caliper_alone_would_be_off_where_the_tape_slips(made):
+def test_caliper_reading_alone_errs_where_tape_slips(made):
     rows = {row.state: row for row in evaluation.compare_stretch(*made)}
     slipped = rows["a000_p2"]
     assert abs(slipped.reading - slipped.truth) > 3 * abs(slipped.error)
 
 
-def test_normals_are_right_at_the_lens_resolution_and_cannot_be_beyond(made):
+def test_normals_are_correct_only_up_to_lens_resolution(made):
     rows = evaluation.compare(*made, rng=np.random.default_rng(0))
     for row in rows:
         assert row.mean_deg < 2.5, row
@@ -71,7 +71,7 @@ def test_normals_are_right_at_the_lens_resolution_and_cannot_be_beyond(made):
         assert row.masked < 0.02
 
 
-def test_heights_follow_the_true_relief(made):
+def test_heights_follow_true_topography(made):
     found, true = made
     for row in evaluation.compare(found, true, rng=np.random.default_rng(0)):
         assert row.height_relative < 0.25, row
@@ -95,7 +95,7 @@ def test_nothing_is_made_twice(captured, made):
     assert again.ran == ()
 
 
-def test_what_is_not_wanted_is_left_out(captured, tmp_path):
+def test_unrequested_results_are_omitted(captured, tmp_path):
     outcome = pipeline.reconstruct(captured.session, want=["strain"], out=tmp_path / "maps")
     assert outcome.ran == ("strain",)
     assert "kernels" in {name for name, _ in outcome.left_out}
@@ -119,7 +119,7 @@ def test_a_state_without_a_pattern_still_has_normals(captured, tmp_path):
     assert np.median(found.stderr_rad) > np.median(whole.stderr_rad)
 
 
-def test_states_without_a_neutral_one_are_refused(captured, tmp_path):
+def test_states_without_neutral_are_refused(captured, tmp_path):
     plan_only = tmp_path / "session"
     shutil.copytree(captured.session, plan_only)
     session = Session.open(plan_only)
@@ -143,7 +143,7 @@ def test_documents_are_strict_json(made):
         assert document["schema"].startswith("skinrig.")
 
 
-def test_a_kernel_halves_the_distance_of_the_true_histograms_at_every_step():
+def test_kernel_halves_histogram_distance_at_every_step():
     """On 7 mm of true relief, without camera: eq. (7) at the caliper's steps."""
     from rigsim.skin_patch.microrelief import make_micro_skin
     from rigsim.skin_patch.stretch import deform, size_for

@@ -10,7 +10,7 @@ from skinrig.benchmarks.dome.motion import simulate
 @pytest.mark.long
 @pytest.mark.render
 @pytest.mark.timeout(600)
-def test_drift_is_followed_and_the_twitch_is_not_used():
+def test_drift_is_tracked_and_twitch_is_discarded():
     seen = simulate(
         width_px=650, views=3, drift_mm=1.5, times_s=(0.0, 2.5, 5.0, 10.0, 12.5), twitch=True
     )

@@ -88,7 +88,7 @@ def fitted(tmp_path_factory):
     return out, lights, view
 
 
-def test_photographs_that_no_fit_has_seen_are_predicted(fitted):
+def test_held_out_photographs_are_predicted(fitted):
     out, lights, view = fitted
     appearance = store.read(out / "appearance")
     photographs = Photographs.of(out / "session-face", appearance, calibration=out / "calibration")
@@ -130,7 +130,7 @@ def test_photographs_that_were_all_fitted_to_judge_nothing(fitted):
         Photographs.of(out / "session-face", seen, calibration=out / "calibration")
 
 
-def test_a_head_that_sits_elsewhere_in_another_session_is_found(fitted):
+def test_head_repositioned_in_other_session_is_found(fitted):
     """The maps are moved instead of the head, and the session is told to be another."""
     out, _, _ = fitted
     appearance = store.read(out / "appearance")

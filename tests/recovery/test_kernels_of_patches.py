@@ -39,7 +39,7 @@ def blocks_of(rest, strained, sides):
 
 @pytest.mark.long
 @pytest.mark.timeout(1800)
-def test_kernels_of_small_patches_hold_those_of_the_skin_they_are_of():
+def test_small_patch_kernel_errors_have_nominal_coverage():
     """Pieces of 0.8 mm against 2.4 mm, compressed and stretched, the same skin in both maps.
 
     Rationale: standard errors say what another patch of the same skin and size would show.

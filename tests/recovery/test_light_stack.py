@@ -54,7 +54,7 @@ def error_deg(appearance, n, inside):
     return np.degrees(angular_error_rad(normals.values[seen], n[seen]))
 
 
-def test_a_ball_comes_out_round_and_of_its_color(tmp_path, capsys):
+def test_ball_is_reconstructed_round_and_in_color(tmp_path, capsys):
     images, lights, n, inside = ball()
     write(tmp_path / "f", images, lights, inside)
     found = made(tmp_path, tmp_path / "f", capsys)
@@ -64,7 +64,7 @@ def test_a_ball_comes_out_round_and_of_its_color(tmp_path, capsys):
     assert not (found.maps["normals"].valid & ~inside).any()
 
 
-def test_a_reversed_list_is_named_and_mended(tmp_path, capsys):
+def test_reversed_light_list_is_reported_and_corrected(tmp_path, capsys):
     images, lights, n, inside = ball()
     write(tmp_path / "f", images, lights[::-1], inside)
     found = made(tmp_path, tmp_path / "f", capsys)
@@ -73,7 +73,7 @@ def test_a_reversed_list_is_named_and_mended(tmp_path, capsys):
     assert error_deg(found, n, inside).mean() < 0.5
 
 
-def test_a_dead_light_is_named_and_left_out(tmp_path, capsys):
+def test_dead_light_is_reported_and_omitted(tmp_path, capsys):
     images, lights, n, inside = ball()
     images[4] = 0.0
     write(tmp_path / "f", images, lights, inside)
@@ -96,7 +96,7 @@ def test_the_real_buddha_agrees_with_its_reference(tmp_path, capsys, test_data):
     assert np.degrees(np.nanmean(upside_down)) > 5.0
 
 
-def test_normals_of_the_real_buddha_with_nothing_said_agree_with_its_reference(test_data):
+def test_real_buddha_normals_without_options_match_reference(test_data):
     folder = test_data / "photometric_stereo"
     rows = (folder / "lights.txt").read_text().split("\n")
     lights = np.array([row.split()[-3:] for row in rows if len(row.split()) >= 3], np.float64)
@@ -121,7 +121,7 @@ def test_normals_of_the_real_buddha_with_nothing_said_agree_with_its_reference(t
     assert error_deg(gray, robustness=Robustness(few=0)) > 2.0
 
 
-def test_what_a_stack_cannot_be_made_into_is_refused(tmp_path, capsys):
+def test_stack_unsuitable_for_melanin_is_refused(tmp_path, capsys):
     images, lights, _, inside = ball()
     write(tmp_path / "f", images, lights, inside)
     assert main(["import", "lp", str(tmp_path / "f"), "--out", str(tmp_path / "s")]) == 0

@@ -40,7 +40,7 @@ def table():
 @pytest.mark.long
 @pytest.mark.parametrize("angle_deg", [0.0, 35.0])
 @pytest.mark.parametrize("stretch", [0.84, 1.18])
-def test_fitted_kernels_bring_normals_nearer_to_those_of_settled_skin(table, stretch, angle_deg):
+def test_fitted_kernels_bring_normals_nearer_settled_skin(table, stretch, angle_deg):
     unseen = skin(5)
     state = deform(unseen, stretch=stretch, angle_deg=angle_deg, compensation="none")
     static = off(state.height_um, unseen.height_um, state)
@@ -54,7 +54,7 @@ def test_fitted_kernels_bring_normals_nearer_to_those_of_settled_skin(table, str
 
 
 @pytest.mark.long
-def test_stretched_skin_is_smoother_and_compressed_rougher_along_the_jaws_only(table):
+def test_stretch_smooths_and_compression_roughens_along_jaws_only(table):
     unseen = skin(6)
     before = slopes_under(unseen.height_um, deform(unseen, stretch=1.0, angle_deg=0.0))
     for stretch in (0.84, 1.18):
@@ -67,13 +67,13 @@ def test_stretched_skin_is_smoother_and_compressed_rougher_along_the_jaws_only(t
         assert abs(np.log(after[0].var() / truth[0].var())) < 0.5 * abs(along)
 
 
-def test_where_nothing_varies_two_passes_are_the_two_dimensional_convolution(rng):
+def test_constant_kernels_make_two_passes_exact_convolution(rng):
     for sigma_px, limit in ((1.5, 0.008), (3.0, 0.002)):
         error, _ = two_passes_error(turn=0.0, growth=0.0, sigma_px=sigma_px, rng=rng)
         assert error < limit
 
 
-def test_the_error_of_two_passes_grows_as_fast_as_kernels_vary():
+def test_two_pass_error_grows_with_kernel_variation():
     def error(turn, growth):
         rng = np.random.default_rng(3)  # the same waves for all
         return two_passes_error(turn=turn, growth=growth, side=120, rng=rng)[0]

@@ -55,9 +55,7 @@ def simulate(tmp_path, order, **more):
 @pytest.mark.long
 @pytest.mark.render
 @pytest.mark.parametrize("movement", [False, True])
-def test_the_papers_sequence_shows_the_blood_of_each_frame_and_no_transition(
-    tmp_path, calibration, movement
-):
+def test_published_sequence_shows_frame_blood_without_transition(tmp_path, calibration, movement):
     session = simulate(tmp_path, SequenceOrder(state="smile"), movement=movement)
     found, known = curves(session, calibration, tmp_path / "a")
     phases = found["phases"]
@@ -92,7 +90,7 @@ def fitted_slope(true, estimated):
 
 @pytest.mark.long
 @pytest.mark.render
-def test_a_course_of_two_seconds_is_recovered_within_its_errors(tmp_path, calibration):
+def test_two_second_course_is_recovered_within_errors(tmp_path, calibration):
     order = SequenceOrder(state="anger", shot_period_s="10.25")
     session = simulate(tmp_path, order, movement=False, relaxation_s=2.0)
     found, known = curves(session, calibration, tmp_path / "a")
@@ -108,7 +106,7 @@ def test_a_course_of_two_seconds_is_recovered_within_its_errors(tmp_path, calibr
 
 @pytest.mark.long
 @pytest.mark.render
-def test_a_smile_that_moves_the_face_has_its_own_time_constant(tmp_path, calibration):
+def test_smile_that_moves_face_has_own_time_constant(tmp_path, calibration):
     """Whose cheek seemed to follow in half the time when its pose's step passed for blood."""
     order = SequenceOrder(state="smile", reaction_s=0.3)
     session = simulate(tmp_path, order, subject="I", seed=1, relaxation_s=2.0)
@@ -138,7 +136,7 @@ def test_exercise_and_alcohol_show_their_courses(tmp_path, calibration, state, c
 
 @pytest.mark.long
 @pytest.mark.render
-def test_an_interrupted_simulation_keeps_the_truth_of_all_its_frames(tmp_path):
+def test_interrupted_simulation_keeps_truth_of_all_frames(tmp_path):
     class Off(Exception):
         pass
 
@@ -159,14 +157,14 @@ def test_an_interrupted_simulation_keeps_the_truth_of_all_its_frames(tmp_path):
 
 
 @pytest.mark.render
-def test_what_is_no_sequence_has_no_curves(tmp_path):
+def test_non_sequence_gives_no_perfusion_curves(tmp_path):
     plain = ("lateral", "interreflections", "spectral", "optics", "relief_shadows")
     simulate_session("flash", tmp_path / "s", width_px=64, leave_out=plain)
     with pytest.raises(ValueError, match="expected a sequence"):
         pipeline.reconstruct(tmp_path / "s", want=["perfusion_curves"], out=tmp_path / "a")
 
 
-def test_sequences_that_cannot_be_are_refused_before_a_folder_is_made(tmp_path):
+def test_impossible_sequences_are_refused_before_folder_creation(tmp_path):
     for order in (
         SequenceOrder(state="bliss"),
         SequenceOrder(state="smile", shot_period_s="5.25"),

@@ -29,7 +29,7 @@ def bench(tmp_path_factory):
     return out
 
 
-def test_sigma_tr_comes_back_through_the_whole_session_and_the_dipole_misses_it(bench):
+def test_full_session_recovers_sigma_tr_and_dipole_misses(bench):
     pipeline.reconstruct(
         bench / "session",
         want=("profiles", "subsurface", "translucency", "anisotropy"),
@@ -55,7 +55,7 @@ def test_sigma_tr_comes_back_through_the_whole_session_and_the_dipole_misses_it(
     assert "Traceback" not in report
 
 
-def test_without_calibrated_fibres_the_way_on_is_told(bench, capsys):
+def test_uncalibrated_fibers_error_gives_next_command(bench, capsys):
     with pytest.raises((InputsError, StageError), match="calibrate fibre"):
         pipeline.reconstruct(bench / "session", want=("subsurface",), out=bench / "bare")
     assert not (bench / "bare").exists()

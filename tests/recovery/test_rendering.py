@@ -42,7 +42,7 @@ def error(scene, model, view, light, *, shown=None, **options):
 
 @pytest.mark.long
 @pytest.mark.render
-def test_true_maps_render_to_the_simulators_pictures(scene, model):
+def test_true_maps_render_to_simulated_images(scene, model):
     """The tables' grid, bilinear maps and the LED's width leave less than a percent."""
     for view, light in (("C03", LIGHTS[0]), ("C07", LIGHTS[1])):
         found, pixels = error(scene, model, view, light)
@@ -52,7 +52,7 @@ def test_true_maps_render_to_the_simulators_pictures(scene, model):
 
 @pytest.mark.long
 @pytest.mark.render
-def test_wrong_normals_light_or_lobes_show_in_the_picture(scene, model):
+def test_wrong_normals_light_or_lobes_appear_in_image(scene, model):
     view, light = "C03", LIGHTS[0]
     right, _ = error(scene, model, view, light)
     mirrored = dataclasses.replace(model, normals=model.normals * np.float32([-1, 1, 1]))
@@ -65,7 +65,7 @@ def test_wrong_normals_light_or_lobes_show_in_the_picture(scene, model):
 
 @pytest.mark.long
 @pytest.mark.render
-def test_a_face_that_smiles_is_rendered_with_its_neutral_normals_carried_along(scene, model):
+def test_smiling_face_renders_with_carried_neutral_normals(scene, model):
     """The simulator moves mesh and relief by code of its own; blood and wrinkles change a little.
 
     Expected: nine in ten lit pixels within 2 %; with normals left as they were, three times as far

@@ -98,7 +98,7 @@ def test_a_scan_outside_all_views_is_named(head, maps):
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_flawed_scan_is_laid_onto_the_dome_within_its_standard_errors(seed):
+def test_flawed_scan_registers_to_dome_within_standard_errors(seed):
     """16 views x 38 lights of a head of glossy skin with cast shadows, 1 % noise, 130 px wide.
 
     Offset 6 mm and 2.5 degrees. Each of six errors within four standard errors: 0.04 % of false

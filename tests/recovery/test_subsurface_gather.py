@@ -53,7 +53,7 @@ def gathered(r_d, translucency_mm):
 
 
 @pytest.mark.parametrize(("sigma_a", "sigma_s_prime"), MEDIA)
-def test_a_shadows_edge_is_as_photons_draw_it_within_the_dipoles_own_error(sigma_a, sigma_s_prime):
+def test_shadow_edge_matches_photons_within_dipole_error(sigma_a, sigma_s_prime):
     profile, error, r_d = traced(sigma_a, sigma_s_prime, np.random.default_rng(11))
     length = 1.0 / dipole.effective_transport(sigma_a, sigma_s_prime)
     off = np.abs(gathered(r_d, length) / r_d - profile)

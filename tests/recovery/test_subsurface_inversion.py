@@ -52,7 +52,7 @@ def fit(profiles, variance, method="photon_table", **settings):
 @pytest.mark.parametrize(
     ("sigma_a", "sigma_s", "g"), [(0.04, 1.0, 0.8), (0.25, 1.5, 0.73), (1.0, 1.5, 0.8)]
 )
-def test_sigma_tr_comes_back_and_the_dipoles_does_not(sigma_a, sigma_s, g, rng):
+def test_transport_inversion_recovers_sigma_tr_but_dipole_fails(sigma_a, sigma_s, g, rng):
     """Within 3 % and four standard errors; the dipole is low by 4...25 % on the same readings."""
     profiles, variance = readings(truth(medium(sigma_a, sigma_s, g), photons=60_000), rng, 20)
     expected = effective_transport(sigma_a, sigma_s)
@@ -66,7 +66,7 @@ def test_sigma_tr_comes_back_and_the_dipoles_does_not(sigma_a, sigma_s, g, rng):
     assert -0.25 < np.median(low) < -0.04
 
 
-def test_layers_are_a_misfit_and_homogeneous_skin_is_not(rng):
+def test_layers_misfit_but_homogeneous_skin_fits(rng):
     layered = truth(medium(1.5, 2.5, 0.8, thickness=0.1), medium(0.05, 1.5, 0.8), photons=30_000)
     profiles, variance = readings(layered, rng, 10)
     found = fit(profiles, variance)
@@ -78,7 +78,7 @@ def test_layers_are_a_misfit_and_homogeneous_skin_is_not(rng):
 
 @pytest.mark.long
 @pytest.mark.parametrize("eta", [1.0, 1.6])
-def test_sigma_tr_comes_back_at_other_indices_of_refraction(eta, rng):
+def test_sigma_tr_is_recovered_at_other_refractive_indices(eta, rng):
     profiles, variance = readings(truth(medium(0.1, 1.2, 0.8, eta), photons=200_000), rng, 20)
     expected = effective_transport(0.1, 1.2)
     found = fit(profiles, variance, eta=eta)
@@ -88,7 +88,7 @@ def test_sigma_tr_comes_back_at_other_indices_of_refraction(eta, rng):
 
 
 @pytest.mark.long
-def test_scattering_almost_straight_on_is_told_all_the_same(rng):
+def test_nearly_forward_scattering_is_recovered(rng):
     """g = 0.99 lies outside the prior and the table; beyond a millimetre it looks like 0.95."""
     edges = np.linspace(0.175, 7.175, 29)
     stack = LayerStack((medium(0.1, 0.7, 0.99),))

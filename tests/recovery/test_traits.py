@@ -37,7 +37,7 @@ def mean_cosine(*, shift, noise, per_group, seed):
     return float(np.mean(found))
 
 
-def test_the_cosine_with_the_truth_falls_with_fewer_faces_and_more_noise():
+def test_cosine_with_truth_falls_with_fewer_noisier_faces():
     # Errors of a difference of means: its length squared is (8 + noise^2) 2 / per_group.
     for noise in (1.0, 6.0):
         row = [mean_cosine(shift=4.0, noise=noise, per_group=n, seed=1) for n in (4, 12, 40)]

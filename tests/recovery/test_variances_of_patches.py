@@ -14,7 +14,7 @@ PIXEL_UM, SIDE, PART = 6.0, 448, 128
 
 @pytest.mark.long
 @pytest.mark.timeout(600)
-def test_variances_of_small_patches_hold_those_of_the_skin_they_are_of():
+def test_small_patch_variance_errors_have_nominal_coverage():
     """Pieces of 0.8 mm against 2.7 mm, at rest, compressed and stretched.
 
     Rationale: standard errors say what another patch of the same skin and size would show.

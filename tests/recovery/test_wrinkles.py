@@ -29,7 +29,7 @@ def part_of_neutral_s_error(model, neutral, states, covered):
     return np.sqrt(ours / theirs)
 
 
-def test_furrows_that_deepen_and_narrow_are_mostly_one_map_times_weights():
+def test_deepening_narrowing_grooves_follow_weighted_single_map():
     rng = np.random.default_rng(0)
     neutral, states = bench_wrinkles.furrowed_face(192, rng=rng)
     masks = bench_wrinkles.zone_masks(32)
@@ -49,7 +49,7 @@ def test_furrows_that_deepen_and_narrow_are_mostly_one_map_times_weights():
     assert part_of_neutral_s_error(wrong.model(), neutral, states, covered) > 1.5 * left
 
 
-def test_an_expression_that_was_not_fitted_is_shown_by_bounded_weights():
+def test_unfitted_expression_is_represented_by_bounded_weights():
     neutral, states = bench_wrinkles.furrowed_face(192, rng=np.random.default_rng(1))
     fear = states.pop("fear")
     masks = bench_wrinkles.zone_masks(32)
@@ -65,7 +65,7 @@ def test_an_expression_that_was_not_fitted_is_shown_by_bounded_weights():
 
 @pytest.mark.long
 @pytest.mark.timeout(900)
-def test_buckled_wrinkles_of_a_simulated_face_come_back_as_one_map_with_zones_from_the_data():
+def test_buckled_wrinkles_return_as_map_with_data_zones():
     """Rationale: buckling amplitude goes with the root of the shortening, and lines are fixed.
 
     Expected: the lines being fixed, each texel's expressions are one pattern to a few per cent;

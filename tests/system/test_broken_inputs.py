@@ -159,7 +159,7 @@ def test_verify_finds_the_damage(session, damage, capsys):
 
 
 @pytest.mark.parametrize("damage", BREAKS, ids=lambda f: f.__name__)
-def test_reconstruct_refuses_or_is_not_touched_by_the_damage(session, damage, capsys, tmp_path):
+def test_reconstruct_refuses_damage_or_is_unaffected(session, damage, capsys, tmp_path):
     damage(session)
     code = main(["reconstruct", str(session), "--want", "melanin", "--out", str(tmp_path / "maps")])
     out, err = capsys.readouterr()
@@ -183,9 +183,7 @@ def test_reconstruct_refuses_or_is_not_touched_by_the_damage(session, damage, ca
         ),
     ],
 )
-def test_what_an_option_cannot_mean_is_refused_before_images_are_made(
-    words, says, sound, tmp_path, capsys
-):
+def test_impossible_option_is_refused_before_image_processing(words, says, sound, tmp_path, capsys):
     argv = [str(sound) if word == "SESSION" else word for word in words]
     assert main([*argv, "--out", str(tmp_path / "out")]) == 3
     err = capsys.readouterr().err
@@ -194,7 +192,7 @@ def test_what_an_option_cannot_mean_is_refused_before_images_are_made(
     assert not (tmp_path / "out").exists()
 
 
-def test_blood_that_cannot_be_told_without_a_white_tile_says_what_would(
+def test_blood_undetermined_without_white_reference_error_names_remedy(
     sound, tmp_path, monkeypatch, capsys
 ):
     def untold(*args, **kwargs):
@@ -208,7 +206,7 @@ def test_blood_that_cannot_be_told_without_a_white_tile_says_what_would(
     assert "a white calibration, which --calibration would bring" in err
 
 
-def test_a_session_without_a_neutral_state_is_refused_before_its_images_are_made(tmp_path, capsys):
+def test_session_without_neutral_state_is_refused_before_images(tmp_path, capsys):
     made = simulate_session("flash", tmp_path / "session-white", target="white", width_px=64)
     out = tmp_path / "moving"
     assert main(["fit", "facial-color", str(made.session), "--out", str(out)]) == 3
@@ -232,7 +230,7 @@ def test_a_sound_session_passes(session, capsys):
         ("", "name"),
     ],
 )
-def test_a_broken_rig_file_is_refused_with_its_faults(text, says, tmp_path, capsys):
+def test_broken_rig_file_is_refused_with_all_faults(text, says, tmp_path, capsys):
     path = tmp_path / "rig.toml"
     path.write_text(text)
     assert main(["capture", str(path), "--out", str(tmp_path / "x"), "--dry-run"]) == 3
@@ -241,9 +239,7 @@ def test_a_broken_rig_file_is_refused_with_its_faults(text, says, tmp_path, caps
     assert "traceback" not in err
 
 
-def test_a_calibration_folder_without_calibrations_of_this_rig_is_refused(
-    session, tmp_path, capsys
-):
+def test_calibration_folder_without_rig_calibrations_is_refused(session, tmp_path, capsys):
     order = ["reconstruct", str(session), "--want", "melanin", "--out", str(tmp_path / "maps")]
     assert main([*order, "--calibration", str(session)]) == 3
     assert f"{session} holds none, expected sensor, color" in capsys.readouterr().err
@@ -265,9 +261,7 @@ def test_a_calibration_folder_without_calibrations_of_this_rig_is_refused(
     ],
     ids=lambda order: " ".join(order[:2]),
 )
-def test_a_folder_that_maps_cannot_go_to_is_refused_before_anything_is_computed(
-    order, session, tmp_path, capsys
-):
+def test_unwritable_output_folder_is_refused_before_computation(order, session, tmp_path, capsys):
     taken = tmp_path / "notes.txt"
     taken.write_text("mine")
     for out in (taken, taken / "below"):
@@ -279,7 +273,7 @@ def test_a_folder_that_maps_cannot_go_to_is_refused_before_anything_is_computed(
     assert taken.read_text() == "mine"
 
 
-def test_a_plan_that_is_no_text_is_named(tmp_path, capsys):
+def test_plan_that_is_not_text_is_reported(tmp_path, capsys):
     plan = tmp_path / "plan.json"
     plan.write_bytes(b"\xff\xfe\x00")
     assert main(["capture", "flash", "--plan", str(plan), "--dry-run"]) == 3
@@ -287,7 +281,7 @@ def test_a_plan_that_is_no_text_is_named(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("option", ["--lights", "--views", "--width"])
-def test_none_of_something_is_not_taken_for_the_default(option, tmp_path, capsys):
+def test_zero_count_is_refused_not_replaced_by_default(option, tmp_path, capsys):
     out = tmp_path / "session"
     assert main(["simulate", "dome", option, "0", "--out", str(out)]) == 3
     assert f"{option[2:]}: got 0, expected a number above 0" in capsys.readouterr().err
@@ -315,7 +309,7 @@ def test_none_of_something_is_not_taken_for_the_default(option, tmp_path, capsys
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_wrong_numbers_and_places_are_refused_before_the_work(order, code, words, tmp_path, capsys):
+def test_wrong_numbers_and_positions_are_refused_before_work(order, code, words, tmp_path, capsys):
     (tmp_path / "notes.txt").write_text("mine")
     known = {"FILE": str(tmp_path / "notes.txt"), "FOLDER": str(tmp_path)}
     assert main([known.get(word, word) for word in order]) == code
@@ -325,7 +319,7 @@ def test_wrong_numbers_and_places_are_refused_before_the_work(order, code, words
     assert [entry.name for entry in tmp_path.iterdir()] == ["notes.txt"]
 
 
-def test_a_text_that_calls_itself_a_photograph_is_told_in_one_sentence(tmp_path, capsys):
+def test_text_disguised_as_photograph_gives_single_error_sentence(tmp_path, capsys):
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "a.jpg").write_text("no photograph")
     assert main(["import", "photos", str(tmp_path / "in"), "--out", str(tmp_path / "s")]) == 3
@@ -341,7 +335,7 @@ def test_a_text_that_calls_itself_a_photograph_is_told_in_one_sentence(tmp_path,
         ("socket://127.0.0.1:9", "does a server listen there?"),
     ],
 )
-def test_a_port_that_does_not_open_is_named_once_with_what_to_look_at(url, words, tmp_path, capsys):
+def test_unopenable_port_is_reported_once_with_hints(url, words, tmp_path, capsys):
     order = ["capture", "flash", "--camera", f"cam=hotfolder:{tmp_path}", "--out"]
     assert main([*order, str(tmp_path / "s"), "--port", f"flash={url}"]) == 4
     told = capsys.readouterr().err

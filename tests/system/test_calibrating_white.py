@@ -22,7 +22,7 @@ def test_a_face_makes_no_white_reference(subject, tmp_path, capsys):
     assert not calibration.exists()
 
 
-def test_a_small_simulated_tile_is_taken_and_a_part_of_one_told(tmp_path, capsys, monkeypatch):
+def test_small_simulated_white_reference_works_partial_is_reported(tmp_path, capsys, monkeypatch):
     simulate_session("flash", tmp_path / "tile", target="white", width_px=96)
     calibration = tmp_path / "calibration"
     command = ["calibrate", "white", str(tmp_path / "tile"), "--out", str(calibration)]
@@ -39,7 +39,7 @@ def test_a_small_simulated_tile_is_taken_and_a_part_of_one_told(tmp_path, capsys
     assert "shows no white tile: 30 %" in capsys.readouterr().err
 
 
-def test_imported_photographs_lack_the_power_that_a_white_reference_needs(tmp_path, capsys):
+def test_imported_photographs_lack_power_required_for_white_reference(tmp_path, capsys):
     (tmp_path / "photos").mkdir()
     Image.fromarray(np.full((32, 48, 3), 128, np.uint8)).save(tmp_path / "photos" / "tile.jpg")
     session, calibration = tmp_path / "session", tmp_path / "calibration"

@@ -48,7 +48,7 @@ def test_help_lists_each_command_with_its_whole_summary(group, capsys):
             assert f" {words[len(group)]} " in printed
 
 
-def test_commands_stand_under_the_heading_of_what_they_are_for(capsys):
+def test_commands_are_listed_under_their_purpose(capsys):
     assert main(["--help"]) == 0
     assert "More:" not in capsys.readouterr().out
 
@@ -71,7 +71,7 @@ def test_the_promised_commands_are_there():
 
 
 @pytest.mark.parametrize("verb", RIG_GROUPS)
-def test_help_of_a_rig_lists_its_own_options_only(verb, capsys):
+def test_rig_help_lists_its_own_options_only(verb, capsys):
     shown = {}
     for rig in ("flash", "dome", "gradient", "probe"):
         assert main([verb, rig, "--help"]) == 0
@@ -101,7 +101,7 @@ def test_help_of_a_rig_lists_its_own_options_only(verb, capsys):
         (["serve", "dome", "--site", "cheek"], "gradient"),
     ],
 )
-def test_an_option_of_another_rig_names_option_and_rigs(argv, rigs, capsys, tmp_path, monkeypatch):
+def test_option_of_other_rig_error_names_option_rigs(argv, rigs, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(argv) == 2
     rig = next(word for word in argv if word in ("flash", "dome", "gradient", "probe"))
@@ -121,13 +121,13 @@ def test_an_option_of_another_rig_names_option_and_rigs(argv, rigs, capsys, tmp_
         ["capture", "flash", "--dry-run"],
     ],
 )
-def test_options_may_stand_before_the_rig(argv, capsys, tmp_path, monkeypatch):
+def test_options_may_precede_rig(argv, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main([*argv, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["plan"]["rig"] == "flash"
 
 
-def test_a_rigs_own_file_is_captured_by_the_command_of_its_kind(capsys, tmp_path, monkeypatch):
+def test_own_rig_file_is_captured_by_kind_command(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shipped = ROOT / "capture" / "rigs" / "probe.toml"
     (tmp_path / "mine.toml").write_text(shipped.read_text("utf-8"), encoding="utf-8")
@@ -176,7 +176,7 @@ def test_a_rigs_own_file_is_captured_by_the_command_of_its_kind(capsys, tmp_path
         (["import", "photos", "nothing", "--out", "x"], 3, "nothing"),
     ],
 )
-def test_bad_input_gives_one_clear_error_and_its_exit_code(
+def test_bad_input_gives_single_error_and_exit_code(
     argv, code, says, capsys, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
@@ -190,7 +190,7 @@ def test_bad_input_gives_one_clear_error_and_its_exit_code(
     assert not (tmp_path / "x").exists()
 
 
-def test_a_box_that_is_not_there_is_a_device_failure(capsys, tmp_path, monkeypatch):
+def test_missing_controller_is_device_failure(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     argv = ["capture", "flash", "--out", "x", "--port", "flash=/dev/no-such-port"]
     assert main([*argv, "--camera", "cam=hotfolder:none"]) == 4
@@ -198,7 +198,7 @@ def test_a_box_that_is_not_there_is_a_device_failure(capsys, tmp_path, monkeypat
     assert not (tmp_path / "x").exists()
 
 
-def test_a_dry_run_prints_the_plan_and_opens_nothing(capsys):
+def test_dry_run_prints_plan_and_opens_nothing(capsys):
     assert main(["capture", "flash", "--out", "x", "--dry-run", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["schema"] == "skinrig.capture/1"
@@ -228,7 +228,7 @@ def test_a_dry_run_prints_the_plan_and_opens_nothing(capsys):
         ),
     ],
 )
-def test_with_json_an_error_too_is_one_document(argv, code, says, capsys, tmp_path, monkeypatch):
+def test_json_error_is_single_document(argv, code, says, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main([*argv, "--json"]) == code
     out, err = capsys.readouterr()
@@ -240,7 +240,7 @@ def test_with_json_an_error_too_is_one_document(argv, code, says, capsys, tmp_pa
     assert "skinrig.error" not in capsys.readouterr().out
 
 
-def test_an_interrupted_command_says_so(monkeypatch, capsys):
+def test_interrupted_command_is_reported(monkeypatch, capsys):
     def interrupted(path):
         raise KeyboardInterrupt
 
@@ -251,7 +251,7 @@ def test_an_interrupted_command_says_so(monkeypatch, capsys):
     assert json.loads(out)["exit_code"] == 130
 
 
-def test_an_interrupted_command_is_told_of_resuming_where_it_can():
+def test_interrupted_command_suggests_resuming_where_possible():
     """Those with the option, and no others, are told of it."""
     commands = get_command(app).commands
     resumable = {
@@ -274,7 +274,7 @@ def test_an_interrupted_command_is_told_of_resuming_where_it_can():
         (["--extremes", "--out", "b"], False),
     ],
 )
-def test_an_interrupted_benchmark_is_told_where_its_measurements_are(
+def test_interrupted_benchmark_reports_location_of_measurements(
     argv, kept, capsys, tmp_path, monkeypatch
 ):
     """Extremes write theirs at the end alone."""
@@ -290,7 +290,7 @@ def test_an_interrupted_benchmark_is_told_where_its_measurements_are(
 
 
 @pytest.mark.parametrize(("own", "expected"), [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])
-def test_threads_of_a_benchmark_wait_asleep_but_as_the_user_has_set(own, expected, monkeypatch):
+def test_benchmark_threads_sleep_unless_user_sets_wait_policy(own, expected, monkeypatch):
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     if own is not None:
         monkeypatch.setenv("OMP_WAIT_POLICY", own)
@@ -305,7 +305,7 @@ def test_threads_of_a_benchmark_wait_asleep_but_as_the_user_has_set(own, expecte
     assert found == [expected]
 
 
-def test_a_benchmark_sets_how_threads_wait_before_the_library_is_loaded():
+def test_benchmark_sets_thread_wait_policy_before_library_loads():
     """OpenMP reads its environment once: a fresh process has not loaded it by then."""
     code = (
         "import sys\n"
@@ -346,7 +346,7 @@ def test_the_readme_names_commands_that_exist(command):
     assert command in COMMANDS
 
 
-def test_a_simulated_world_is_captured_by_the_urls_of_its_box_and_camera(tmp_path, monkeypatch):
+def test_simulated_world_is_captured_by_controller_camera_urls(tmp_path, monkeypatch):
     monkeypatch.setattr("rigsim.world.world._BENCH", {})
     out = tmp_path / "session"
     where = ["--port", "flash=sim://flash?seed=1&clock=virtual", "--camera", "cam=sim://flash/cam"]
@@ -354,7 +354,7 @@ def test_a_simulated_world_is_captured_by_the_urls_of_its_box_and_camera(tmp_pat
     assert main(["verify", str(out)]) == 0
 
 
-def test_a_benchmark_takes_several_stages_after_one_option_or_many(monkeypatch):
+def test_benchmark_accepts_stages_in_single_or_repeated_options(monkeypatch):
     asked = []
 
     def measured(stages, **settings):

@@ -31,7 +31,7 @@ def moving(tmp_path):
     return tmp_path / "moving"
 
 
-def test_an_expression_is_evaluated_and_told_in_one_document(moving, tmp_path, capsys):
+def test_expression_is_evaluated_and_reported_in_single_document(moving, tmp_path, capsys):
     out = tmp_path / "out"
     code = main(
         [
@@ -65,7 +65,7 @@ def test_an_expression_is_evaluated_and_told_in_one_document(moving, tmp_path, c
         (["--weights", "smile=1", "--mesh", "nowhere.npz"], "nowhere.npz"),
     ],
 )
-def test_what_cannot_be_evaluated_is_one_sentence_and_writes_nothing(
+def test_unevaluable_expression_gives_single_sentence_and_no_output(
     moving, tmp_path, capsys, arguments, words
 ):
     out = tmp_path / "out"
@@ -78,7 +78,7 @@ def test_what_cannot_be_evaluated_is_one_sentence_and_writes_nothing(
     assert not out.exists()
 
 
-def test_fits_refuse_folders_without_what_they_need(moving, tmp_path, capsys):
+def test_fits_refuse_folders_without_required_inputs(moving, tmp_path, capsys):
     plain = tmp_path / "plain"
     store.write(plain, SkinAppearance({}, "measured", parameters={"kind": "appearance"}))
     for command, words in (
@@ -95,7 +95,7 @@ def test_fits_refuse_folders_without_what_they_need(moving, tmp_path, capsys):
     assert "nothing was touched" in capsys.readouterr().err
 
 
-def test_repeats_of_states_are_captured_in_turn(tmp_path, capsys):
+def test_state_repeats_are_captured_in_alternation(tmp_path, capsys):
     """Each expression several times, with the others in between (Jimenez2010, section 3)."""
     plan = tmp_path / "plan.json"
     code = main(

@@ -60,7 +60,7 @@ def run(capsys, *argv):
 
 
 @pytest.mark.parametrize("to", ["maps", "mtlx", "gltf", "usd"])
-def test_each_format_ends_with_the_next_step_and_a_sealed_folder(dome, tmp_path, capsys, to):
+def test_export_format_ends_with_next_step_sealed_folder(dome, tmp_path, capsys, to):
     if to == "usd":
         pytest.importorskip("pxr")
     out = tmp_path / "out"
@@ -70,7 +70,7 @@ def test_each_format_ends_with_the_next_step_and_a_sealed_folder(dome, tmp_path,
     assert list(out.glob("ascmhl/*.mhl"))
 
 
-def test_one_json_document_says_what_was_written_and_left_out(dome, tmp_path, capsys):
+def test_export_json_lists_written_and_omitted_items(dome, tmp_path, capsys):
     out = tmp_path / "out"
     argv = ["export", dome, "--to", "gltf", "--use", "research", "--out", out, "--json"]
     code, said = run(capsys, *argv)
@@ -94,7 +94,7 @@ def test_one_json_document_says_what_was_written_and_left_out(dome, tmp_path, ca
         (["--to", "lp"], 3, "dome holds maps; expected one of maps, mtlx"),
     ],
 )
-def test_what_cannot_be_exported_says_why_and_leaves_nothing(
+def test_impossible_export_gives_reason_and_writes_nothing(
     dome, tmp_path, capsys, arguments, code, says
 ):
     out = tmp_path / "out"

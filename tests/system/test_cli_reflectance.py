@@ -47,7 +47,7 @@ def folders(tmp_path):
     return tmp_path
 
 
-def test_a_model_holds_the_domes_maps_and_the_probes_translucency_with_its_error(folders, capsys):
+def test_model_contains_dome_maps_and_probe_translucency_error(folders, capsys):
     out = folders / "model"
     argv = ["fit", "reflectance", str(folders / "dome"), str(folders / "probe"), "--out", str(out)]
     assert main([*argv, "--json"]) == 0
@@ -72,7 +72,7 @@ def test_a_model_holds_the_domes_maps_and_the_probes_translucency_with_its_error
     assert (model.translucency_stderr_mm > 0).all()
 
 
-def test_without_a_probe_people_stand_in_and_it_is_said(folders, capsys):
+def test_missing_probe_uses_population_and_reports_substitution(folders, capsys):
     out = folders / "model"
     assert main(["fit", "reflectance", str(folders / "dome"), "--out", str(out)]) == 0
     assert "assumed: translucency is the population's" in capsys.readouterr().out
@@ -93,7 +93,9 @@ def test_without_a_probe_people_stand_in_and_it_is_said(folders, capsys):
         (["dome", "--landmarks", "none.csv"], 2, "no probe"),
     ],
 )
-def test_what_makes_no_model_is_one_sentence(folders, capsys, monkeypatch, argv, code, says):
+def test_reflectance_fit_failure_gives_single_sentence(
+    folders, capsys, monkeypatch, argv, code, says
+):
     monkeypatch.chdir(folders)
     assert main(["fit", "reflectance", *argv, "--out", "model"]) == code
     told = capsys.readouterr().err

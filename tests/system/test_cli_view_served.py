@@ -25,7 +25,7 @@ def plate() -> ViewerScene:
     return ViewerScene(Mesh(positions, faces, uv, normals))
 
 
-def test_a_displacement_without_a_server_is_a_mistake_in_use(tmp_path):
+def test_displacement_without_server_is_usage_error(tmp_path):
     from skinrig.cli import app
 
     found = CliRunner().invoke(app, ["view", "--displacement", str(tmp_path / "d.npy")])
@@ -33,7 +33,7 @@ def test_a_displacement_without_a_server_is_a_mistake_in_use(tmp_path):
     assert "add --port 0" in (found.output + str(found.exception))
 
 
-def test_a_served_page_is_there_with_its_tiles_until_it_ends(plate, tmp_path, capsys, monkeypatch):
+def test_served_page_and_tiles_exist_until_end(plate, tmp_path, capsys, monkeypatch):
     from skinrig.viewer import server
 
     path = tmp_path / "height.npy"
@@ -61,7 +61,7 @@ def test_a_served_page_is_there_with_its_tiles_until_it_ends(plate, tmp_path, ca
         urllib.request.urlopen(document["url"], timeout=5)
 
 
-def test_a_file_that_is_no_displacement_is_named(plate, tmp_path):
+def test_file_that_is_not_displacement_is_reported(plate, tmp_path):
     path = tmp_path / "height.npy"
     np.save(path, np.zeros((300, 300), np.float32))
     with pytest.raises(TileError, match=r"displacement: got shape \(300, 300\)"):

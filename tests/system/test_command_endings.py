@@ -41,9 +41,7 @@ def test_a_gray_photograph_is_not_offered_for_melanin(photos, tmp_path, capsys, 
     assert "skinrig reconstruct" not in capsys.readouterr().out
 
 
-def test_of_gray_and_colored_photographs_a_colored_one_is_offered(
-    photos, tmp_path, capsys, monkeypatch
-):
+def test_colored_photograph_is_offered_before_gray(photos, tmp_path, capsys, monkeypatch):
     photograph(photos / "a.png", color=False)
     photograph(photos / "b.png")
     assert bring(photos, tmp_path / "session") == 0
@@ -65,7 +63,7 @@ def test_of_several_photographs_the_states_there_are_named(photos, tmp_path, cap
     assert "crossed frame" not in said
 
 
-def test_a_full_disk_at_an_import_speaks_of_importing_again(photos, tmp_path, capsys, monkeypatch):
+def test_full_disk_during_import_suggests_reimport(photos, tmp_path, capsys, monkeypatch):
     photograph(photos / "a.png")
 
     def full(self, descriptor, data):
@@ -82,9 +80,7 @@ def test_a_full_disk_at_an_import_speaks_of_importing_again(photos, tmp_path, ca
 
 
 @pytest.mark.parametrize(("name", "kind"), [("a.jpg", "JPEG"), ("a.PNG", "PNG")])
-def test_text_named_as_a_picture_is_told_by_the_picture_it_is_not(
-    name, kind, photos, tmp_path, capsys
-):
+def test_text_disguised_as_image_error_names_image_format(name, kind, photos, tmp_path, capsys):
     (photos / name).write_bytes(b"text")
     assert bring(photos, tmp_path / "session") == 3
     said = capsys.readouterr().err
@@ -93,7 +89,7 @@ def test_text_named_as_a_picture_is_told_by_the_picture_it_is_not(
     assert "LibRaw" not in said
 
 
-def test_a_page_that_cannot_be_written_is_called_by_its_own_name(photos, tmp_path, capsys):
+def test_unwritable_page_is_reported_by_its_name(photos, tmp_path, capsys):
     photograph(photos / "a.png")
     assert bring(photos, tmp_path / "session") == 0
     capsys.readouterr()
@@ -119,7 +115,7 @@ def test_a_report_goes_to_the_standard_output_alone(photos, tmp_path, capsys, mo
     assert not (tmp_path / "-").exists()
 
 
-def test_a_script_reads_the_whole_plan_of_a_dry_run(capsys):
+def test_script_reads_whole_dry_run_plan(capsys):
     assert main(["capture", "flash", "--dry-run", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert len(told["plan"]["steps"]) == told["steps"] > 0
@@ -127,7 +123,7 @@ def test_a_script_reads_the_whole_plan_of_a_dry_run(capsys):
 
 
 @pytest.mark.parametrize("kind", ["lights", "geometry"])
-def test_a_dome_is_not_calibrated_by_sessions_of_another_rig(kind, photos, tmp_path, capsys):
+def test_dome_is_not_calibrated_by_other_rig_sessions(kind, photos, tmp_path, capsys):
     photograph(photos / "a.png")
     session = tmp_path / "session"
     assert bring(photos, session) == 0
@@ -135,7 +131,7 @@ def test_a_dome_is_not_calibrated_by_sessions_of_another_rig(kind, photos, tmp_p
     assert "session of rig 'imported', expected one of a dome" in capsys.readouterr().err
 
 
-def test_a_served_rig_prints_one_document_and_ends_without_another(monkeypatch, capsys):
+def test_served_rig_prints_single_document_and_ends(monkeypatch, capsys):
     rig = load_rig("flash")
     addresses = {name: f"tcp://127.0.0.1:1/{name}" for name in (*rig.boxes, "cam")}
 
@@ -162,9 +158,7 @@ def test_a_served_rig_prints_one_document_and_ends_without_another(monkeypatch, 
     assert capsys.readouterr().out.splitlines() == [f"{n} {url}" for n, url in addresses.items()]
 
 
-def test_several_sessions_are_reconstructed_into_folders_of_their_names(
-    tmp_path, capsys, monkeypatch
-):
+def test_several_sessions_are_reconstructed_into_folders_by_name(tmp_path, capsys, monkeypatch):
     asked = []
 
     def reconstruct(session, *, want, out, **settings):
@@ -190,7 +184,7 @@ def test_several_sessions_are_reconstructed_into_folders_of_their_names(
     assert len(asked) == 3
 
 
-def test_what_a_rig_does_not_plan_is_told_with_the_rigs_that_do(capsys):
+def test_quantity_unplanned_for_rig_lists_rigs_planning(capsys):
     assert main(["plan", "flash", "--want", "normals<=1deg,hemoglobin<=5%"]) == 3
     said = capsys.readouterr().err
     assert "got 'normals' of rig 'flash'" in said

@@ -18,7 +18,7 @@ def tool():
     return module
 
 
-def test_most_listed_kernels_are_in_the_code_with_as_many_arguments(tool):
+def test_most_listed_kernels_match_code_and_argument_count(tool):
     """A tenth may be out of date; `python tools/compile_kernels.py --record` lists them anew."""
     rows = [row for rows in tool.listed() for row in rows]
     fit = 0
@@ -34,7 +34,7 @@ def test_most_listed_kernels_are_in_the_code_with_as_many_arguments(tool):
     assert fit >= 0.9 * len(rows)
 
 
-def test_a_kernel_that_does_not_fit_is_counted_and_left_to_its_first_call(tool):
+def test_unmatched_kernel_is_counted_and_compiled_on_call(tool):
     text = "(unicode_type,)"
     good = "(Array(float64, 2, 'C', False, aligned=True),)"
     for row in [
@@ -72,7 +72,7 @@ def test_a_listed_kernel_compiles_for_its_types(module, function, tool):
     assert tool.compile_module(rows) == 0
 
 
-def test_kernels_are_listed_under_the_name_that_compiles_them(tool):
+def test_kernels_are_listed_under_name_that_compiles_them(tool):
     """A kernel's function may stand under another name, or be compiled by a function's call."""
     from reconstruction.photometric_stereo import kernels as photometric_kernels
     from rigsim.geometry import atlas
@@ -86,7 +86,7 @@ def test_kernels_are_listed_under_the_name_that_compiles_them(tool):
     assert tool.compile_module([(photometric_kernels.__name__, *named)]) == 0
 
 
-def test_arrays_that_cannot_be_written_or_lie_otherwise_cost_no_compilation(rng):
+def test_readonly_or_noncontiguous_arrays_need_no_compilation(rng):
     """Statistics in discs and filled textures: 10 s and 13 s each time, before."""
     from model.facial_color import disc_kernels, disc_statistics
     from reconstruction.surface import texture_fill

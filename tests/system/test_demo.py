@@ -21,7 +21,7 @@ def without_benchmarks(monkeypatch):
 
 
 @pytest.mark.parametrize("rigs", ["submarine", "dome,submarine", "", "flash,"])
-def test_an_unknown_rig_is_named_with_those_that_there_are(rigs, tmp_path, capsys):
+def test_unknown_rig_error_lists_available_rigs(rigs, tmp_path, capsys):
     out = tmp_path / "demo"
     assert main(["demo", "--rigs", rigs, "--out", str(out)]) == 3
     said = capsys.readouterr().err
@@ -30,7 +30,7 @@ def test_an_unknown_rig_is_named_with_those_that_there_are(rigs, tmp_path, capsy
     assert not out.exists()
 
 
-def test_a_folder_that_is_not_a_demos_is_left_as_it_was(tmp_path):
+def test_folder_not_from_demo_is_left_unchanged(tmp_path):
     kept = tmp_path / "thesis.txt"
     kept.write_text("three years of work")
     with pytest.raises(DemoError, match="name another folder with --out"):
@@ -39,7 +39,7 @@ def test_a_folder_that_is_not_a_demos_is_left_as_it_was(tmp_path):
     assert list(tmp_path.iterdir()) == [kept]
 
 
-def test_each_rig_that_is_named_runs_and_no_other(tmp_path, monkeypatch, without_benchmarks):
+def test_only_requested_rigs_run(tmp_path, monkeypatch, without_benchmarks):
     ran = []
     for rig in list(RIGS):
         monkeypatch.setitem(RIGS, rig, lambda *_, rig=rig: ran.append(rig))
@@ -54,16 +54,14 @@ def test_each_rig_that_is_named_runs_and_no_other(tmp_path, monkeypatch, without
         assert ran == expected
 
 
-def test_an_error_in_one_of_two_rigs_side_by_side_is_that_rigs_own(tmp_path):
+def test_error_in_single_parallel_rig_stays_its_own(tmp_path):
     with pytest.raises(SimulationError, match="width"):
         run_demo(tmp_path / "demo", ["flash", "dome"], console=Console(False), width_px=4, jobs=2)
     assert not multiprocessing.active_children()
 
 
 @pytest.mark.parametrize(("own", "expected"), [(None, "1"), ("3", "3")])
-def test_threads_of_rigs_side_by_side_wait_asleep_but_as_the_user_has_set(
-    own, expected, monkeypatch
-):
+def test_parallel_rig_threads_sleep_unless_user_sets_policy(own, expected, monkeypatch):
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
     if own is not None:
@@ -85,7 +83,7 @@ def shown(out, capsys):
 
 @pytest.mark.long
 @pytest.mark.timeout(600)
-def test_the_dome_alone_goes_from_targets_to_a_report(
+def test_dome_runs_standalone_from_targets_to_report(
     tmp_path, capsys, monkeypatch, without_benchmarks
 ):
     monkeypatch.setattr("skinrig.demo_rigs.DOME_WIDTH_PX", 200)
@@ -111,7 +109,7 @@ def test_the_dome_alone_goes_from_targets_to_a_report(
 
 @pytest.mark.long
 @pytest.mark.timeout(600)
-def test_the_flash_rig_alone_goes_from_targets_to_a_report(tmp_path, capsys, without_benchmarks):
+def test_flash_rig_runs_standalone_from_targets_to_report(tmp_path, capsys, without_benchmarks):
     out = tmp_path / "demo"
     document = run_demo(out, ["flash"], console=Console(True), width_px=192)
     assert all("flash" in subject for subject, *_ in document["errors"])

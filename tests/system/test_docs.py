@@ -65,7 +65,7 @@ WIRE = ROOT / "docs" / "wire-protocol.md"
 
 
 @named([page for page in PAGES if ">>> " in page.read_text("utf-8")])
-def test_python_examples_give_what_the_page_says(page, tmp_path, monkeypatch):
+def test_python_examples_produce_documented_output(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     source = "\n".join(blocks(page, "python"))
     test = doctest.DocTestParser().get_doctest(source, {}, page.name, str(page), 0)
@@ -83,13 +83,13 @@ def test_every_python_block_is_an_example_that_runs():
 # wire --------------------------------------------------------------------------------------------
 
 
-def test_the_manuals_frames_are_the_one_spelling_of_what_they_say():
+def test_manual_frames_have_canonical_spelling():
     lines = [line.encode() for body in blocks(WIRE, "wire") for line in body.splitlines()]
     assert len(lines) >= 5
     assert [wire.encode(wire.decode(line)) for line in lines] == [line + b"\n" for line in lines]
 
 
-def test_the_manuals_conversation_is_what_the_emulated_box_says_byte_for_byte():
+def test_manual_conversation_matches_emulated_controller_byte_for_byte():
     (text,) = blocks(WIRE, "dialogue")
     box, heard, printed = flash_box(), [], []
     for line in text.splitlines():
@@ -103,7 +103,7 @@ def test_the_manuals_conversation_is_what_the_emulated_box_says_byte_for_byte():
     assert heard == printed
 
 
-def test_the_manual_lists_every_command_with_its_arguments_and_what_it_needs():
+def test_manual_lists_every_command_with_arguments_and_requirements():
     listed = {}
     for name, arguments, needs, _ in rows(WIRE, "Commands of the flash box"):
         listed[name.strip("`")] = (arguments.strip("`"), needs)
@@ -115,7 +115,7 @@ def test_the_manual_lists_every_command_with_its_arguments_and_what_it_needs():
     assert listed == expected
 
 
-def test_the_manual_lists_every_command_of_the_domes_box():
+def test_manual_lists_every_dome_controller_command():
     from capture.rig import load_rig
     from rigsim.world import World
 
@@ -139,7 +139,7 @@ def test_the_manual_lists_every_command_of_the_domes_box():
         ("probe", "Commands of the probe's box"),
     ],
 )
-def test_the_manual_lists_every_command_of_a_later_rigs_boxes(box_name, heading):
+def test_manual_lists_every_later_rig_controller_command(box_name, heading):
     from capture.rig import load_rig
     from rigsim.world import World
     from rigsim.world.rig_boxes import BOXES
@@ -166,7 +166,7 @@ def test_the_manual_lists_every_code():
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
-def test_the_shell_example_fires_a_served_box():
+def test_shell_example_fires_served_controller():
     from capture.rig import load_rig
     from rigsim.world.serve import serve
 
@@ -234,7 +234,7 @@ def test_commands_in_shell_blocks_parse_with_nothing_missing(page):
 
 
 @named([page for page in GUIDES if inline_commands(page)])
-def test_commands_in_the_text_exist_and_have_the_options_named(page):
+def test_commands_in_text_exist_with_named_options(page):
     for argv in inline_commands(page):
         group = command_line().commands.get(argv[0])
         if isinstance(group, RigGroup) and (len(argv) == 1 or argv[1].startswith("-")):
@@ -287,7 +287,7 @@ def recipes():
     return {**found, "Maps of pictures under listed lights": pipeline.light_list()}
 
 
-def test_the_maps_page_lists_every_map_of_every_recipe():
+def test_maps_page_lists_every_map_of_every_recipe():
     listed = {
         heading: sorted(name for row in rows(MAPS_PAGE, heading) for name in SPAN.findall(row[0]))
         for heading in recipes()
@@ -295,7 +295,7 @@ def test_the_maps_page_lists_every_map_of_every_recipe():
     assert listed == {heading: sorted(recipe.maps) for heading, recipe in recipes().items()}
 
 
-def test_the_maps_page_lists_the_files_that_go_along():
+def test_maps_page_lists_accompanying_files():
     listed = {
         SPAN.findall(row[0])[0]
         for heading in (
@@ -309,7 +309,7 @@ def test_the_maps_page_lists_the_files_that_go_along():
     assert listed == {name for recipe in recipes().values() for name in recipe.files}
 
 
-def test_the_figures_of_the_domes_light_are_those_of_its_plan():
+def test_dome_light_figures_match_its_plan():
     from capture.plan.dome import dome_plan
     from capture.rig import load_rig
     from skinrig.capturing.light_safety import light_figures
@@ -332,7 +332,7 @@ def test_the_figures_of_the_domes_light_are_those_of_its_plan():
         assert claim in text, claim
 
 
-def test_the_limits_of_the_domes_light_are_those_of_its_rig_file():
+def test_dome_light_limits_match_its_rig_file():
     from capture.rig import LedLimits, load_rig
 
     limits = load_rig("dome").leds or LedLimits()

@@ -213,20 +213,20 @@ def test_the_words_of_every_command_are_checked_alike(name, here, capsys):
 
 
 @pytest.mark.parametrize("argv", cases(UNREADABLE))
-def test_words_that_no_file_could_make_right_end_with_2(argv, here, capsys):
+def test_uncorrectable_words_exit_with_2(argv, here, capsys):
     assert main(argv if "--json" in argv else [*argv, "--json"]) == errors.EXIT_USAGE
     assert told(capsys) == errors.EXIT_USAGE
     assert sorted(path.name for path in here.iterdir()) == ["file.txt", "folder"]
 
 
 @pytest.mark.parametrize("argv", cases(UNUSABLE))
-def test_names_numbers_and_files_of_no_use_end_with_3(argv, here, capsys):
+def test_invalid_names_numbers_and_files_exit_with_3(argv, here, capsys):
     assert main([*argv, "--json"]) == errors.BAD_INPUT
     assert told(capsys) == errors.BAD_INPUT
     assert sorted(path.name for path in here.iterdir()) == ["file.txt", "folder"]
 
 
-def test_the_help_tells_every_exit_code(capsys):
+def test_help_lists_every_exit_code(capsys):
     assert main(["--help"]) == errors.EXIT_DONE
     said = " ".join(capsys.readouterr().out.split())
     assert errors.EXIT_CODE_HELP in said

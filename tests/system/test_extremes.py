@@ -24,7 +24,7 @@ def test_an_extreme_holds_in_float32_and_float64(case):
     assert [one.got for one in outcomes.values() if not one.passed] == []
 
 
-def test_there_are_60_extremes_with_names_of_their_own():
+def test_sixty_extremes_have_unique_names():
     assert len(CASES) >= 60
     assert len({(case.stage, case.name) for case in CASES}) == len(CASES)
 
@@ -49,13 +49,13 @@ def broken(_):
         (broken, "ZeroDivisionError"),
     ],
 )
-def test_what_does_not_hold_is_told(run, word):
+def test_failed_extreme_case_is_reported(run, word):
     result = extremes.try_case(a_case(run))
     assert not result.passed
     assert all(word in one.got for one in result.outcomes.values())
 
 
-def test_the_command_writes_the_table_and_the_report_shows_it(tmp_path, capsys):
+def test_extremes_command_writes_table_and_report_includes_table(tmp_path, capsys):
     assert main(["bench", "--extremes", "--stage", "hdr", "--out", str(tmp_path), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["schema"] == extremes.SCHEMA
@@ -64,6 +64,6 @@ def test_the_command_writes_the_table_and_the_report_shows_it(tmp_path, capsys):
     assert "Stiff and extreme cases" in build([tmp_path])
 
 
-def test_an_unknown_stage_names_the_known_ones(capsys):
+def test_unknown_stage_error_lists_valid_stages(capsys):
     assert main(["bench", "--extremes", "--stage", "hrd"]) == 3
     assert "hdr" in capsys.readouterr().err

@@ -22,7 +22,7 @@ PORTS = [
 ]
 
 
-def test_a_dry_run_prints_plan_and_light_and_needs_neither_address_nor_force(capsys):
+def test_dry_run_prints_plan_light_without_address_force(capsys):
     arguments = ["capture", "gradient", "--dry-run", "--angles", "0,90", "--steps", "-1..2"]
     assert main([*arguments, "--json"]) == errors.EXIT_DONE
     document = json.loads(capsys.readouterr().out)
@@ -34,14 +34,14 @@ def test_a_dry_run_prints_plan_and_light_and_needs_neither_address_nor_force(cap
     assert "must be closed or shielded" in printed.out + printed.err
 
 
-def test_a_capture_of_skin_without_a_force_limit_is_a_usage_error(capsys, tmp_path):
+def test_skin_capture_without_force_limit_is_usage_error(capsys, tmp_path):
     code = main(["capture", "gradient", *PORTS, "--out", str(tmp_path / "s")])
     assert code == errors.EXIT_USAGE
     assert re.search(r"--force-limit N.*no default", capsys.readouterr().err)
     assert not (tmp_path / "s").exists()
 
 
-def test_a_missing_address_is_named_and_a_target_needs_no_caliper(capsys, tmp_path):
+def test_missing_address_is_reported_target_needs_no_caliper(capsys, tmp_path):
     out = ["--out", str(tmp_path / "s")]
     assert main(["capture", "gradient", "--force-limit", "1", *out]) == errors.EXIT_USAGE
     assert "--port caliper=URL" in capsys.readouterr().err
@@ -66,7 +66,7 @@ def test_a_wrong_option_is_named(capsys, arguments, code, match):
     assert match in capsys.readouterr().err
 
 
-def test_a_target_is_simulated_and_the_next_step_named(capsys, tmp_path):
+def test_target_is_simulated_and_next_step_printed(capsys, tmp_path):
     out = tmp_path / "session-dark"
     assert main(["simulate", "gradient", "--out", str(out), "--target", "dark"]) == errors.EXIT_DONE
     assert verify(out).ok
@@ -80,7 +80,7 @@ def test_a_large_rig_is_not_served(capsys):
 
 
 @pytest.mark.long
-def test_a_served_rig_is_captured_by_the_command_that_it_names(tmp_path):
+def test_served_rig_is_captured_by_printed_command(tmp_path):
     with subprocess.Popen(
         [*SERVE, "--seed", "2"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     ) as server:

@@ -52,7 +52,7 @@ def test_a_probe_is_calibrated_from_its_phantom(phantom, tmp_path, capsys):
     assert known.crosstalk.cover_leak == pytest.approx(built.cover_leak, rel=0.2)
 
 
-def test_a_wrong_certificate_and_a_wrong_session_are_named(phantom, tmp_path, capsys):
+def test_wrong_certificate_and_wrong_session_are_reported(phantom, tmp_path, capsys):
     paper = tmp_path / "block.json"
     paper.write_text('{"schema": "skinrig.phantom/1", "eta": 1.4}')
     arguments = ["calibrate", "fibre", str(phantom), "--out", str(tmp_path / "c")]

@@ -17,7 +17,7 @@ RIG = load_rig("probe")
 
 @pytest.mark.long
 @pytest.mark.timeout(180)
-def test_a_served_probe_is_captured_by_the_command_that_it_names(tmp_path):
+def test_served_probe_is_captured_by_printed_command(tmp_path):
     plan = probe_plan(RIG, sites=("cheek",), brackets=5, longest_s=0.3, step_ev=1.0, darks=1)
     (tmp_path / "plan.json").write_text(json.dumps(plan.to_json()), encoding="utf-8")
     with subprocess.Popen(

@@ -38,7 +38,7 @@ def simulate(out, *more):
 # plans ----------------------------------------------------------------------------------------
 
 
-def test_a_dry_run_prints_plan_time_and_light_and_needs_no_address(capsys):
+def test_dry_run_prints_plan_time_light_without_address(capsys):
     arguments = ["capture", "probe", "--dry-run", "--sites", "cheek", "--json"]
     assert main(arguments) == errors.EXIT_DONE
     document = json.loads(capsys.readouterr().out)
@@ -67,7 +67,7 @@ def test_a_wrong_option_is_named(capsys, arguments, code, match):
 
 
 @pytest.mark.parametrize("option", [["--sites", "cheek"], ["--all-brackets"]])
-def test_other_rigs_know_nothing_of_the_probe_s_options(capsys, tmp_path, option):
+def test_other_rigs_reject_probe_options(capsys, tmp_path, option):
     assert main(["simulate", "gradient", "--out", str(tmp_path / "s"), *option]) != errors.EXIT_DONE
     assert "knows nothing of it" in capsys.readouterr().err
 
@@ -82,9 +82,7 @@ def test_other_rigs_know_nothing_of_the_probe_s_options(capsys, tmp_path, option
         (["--target", "dark", "--sites", "cheek"], "sites: the target of the probe rig"),
     ],
 )
-def test_what_cannot_be_simulated_is_named_and_nothing_is_written(
-    capsys, tmp_path, arguments, match
-):
+def test_unsimulatable_request_is_reported_and_nothing_written(capsys, tmp_path, arguments, match):
     out = tmp_path / "session"
     assert main([*simulate(out), *arguments]) != errors.EXIT_DONE
     assert match in capsys.readouterr().err
@@ -95,7 +93,7 @@ def test_what_cannot_be_simulated_is_named_and_nothing_is_written(
 
 
 @pytest.mark.usefixtures("small")
-def test_tissue_is_captured_with_its_truth_beside_it(capsys, tmp_path):
+def test_tissue_is_captured_with_ground_truth_alongside(capsys, tmp_path):
     out = tmp_path / "session-probe"
     assert main([*simulate(out, "--sites", "cheek", "--seed", "3"), "--json"]) == errors.EXIT_DONE
     document = json.loads(capsys.readouterr().out)
@@ -132,7 +130,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
 
 @pytest.mark.long
 @pytest.mark.usefixtures("small")
-def test_the_phantom_is_captured_with_each_fibre_uncovered(capsys, tmp_path):
+def test_phantom_is_captured_with_each_fiber_uncovered(capsys, tmp_path):
     out = tmp_path / "session-phantom"
     assert main(simulate(out, "--target", "phantom")) == errors.EXIT_DONE
     printed = capsys.readouterr()
@@ -150,9 +148,7 @@ class Killed(BaseException):
 
 
 @pytest.mark.usefixtures("small")
-def test_a_simulation_is_resumed_in_the_middle_of_a_series_with_the_truth_of_all(
-    tmp_path, monkeypatch
-):
+def test_simulation_resumed_mid_series_has_complete_truth(tmp_path, monkeypatch):
     out = tmp_path / "session-probe"
     words = simulate(out, "--sites", "forehead,cheek", "--seed", "2")
     honest = probe.HeadLog.exposure
@@ -181,7 +177,7 @@ def test_a_simulation_is_resumed_in_the_middle_of_a_series_with_the_truth_of_all
 
 
 @pytest.mark.usefixtures("small")
-def test_the_next_command_is_named_and_a_closed_session_is_not_gone_on_with(capsys, tmp_path):
+def test_next_command_is_printed_closed_session_not_continued(capsys, tmp_path):
     out = tmp_path / "session-dark"
     words = simulate(out, "--target", "dark")
     assert main(words) == errors.EXIT_DONE
@@ -202,7 +198,7 @@ sys.exit(main(sys.argv[1:]))
 
 
 @pytest.mark.long
-def test_a_simulation_that_is_killed_in_a_series_is_resumed(tmp_path):
+def test_simulation_killed_mid_series_is_resumed(tmp_path):
     out = tmp_path / "session-probe"
     words = simulate(out, "--sites", "forehead,cheek", "--seed", "2")
     command = [sys.executable, "-c", HOST, *words]
@@ -233,7 +229,7 @@ def test_a_simulation_that_is_killed_in_a_series_is_resumed(tmp_path):
 
 
 @pytest.mark.long
-def test_a_served_probe_is_captured_by_the_command_that_it_names(tmp_path):
+def test_served_probe_is_captured_by_printed_command(tmp_path):
     command = [sys.executable, "-m", "skinrig.cli"]
     server = [*command, "serve", "probe", "--subject", SUBJECT, "--seed", "2"]
     with subprocess.Popen(

@@ -85,7 +85,7 @@ def run(folder, monkeypatch, *words):
     return main(["render", *words, "--size", "40"])
 
 
-def test_a_picture_its_components_and_one_document_are_written(folder, monkeypatch, capsys):
+def test_image_components_and_single_document_are_written(folder, monkeypatch, capsys):
     words = ("face", "--light", "1,0.5,2", "--components", "--out", "picture", "--json")
     assert run(folder, monkeypatch, *words) == 0
     out, err = capsys.readouterr()
@@ -108,9 +108,7 @@ def test_a_picture_its_components_and_one_document_are_written(folder, monkeypat
     assert not list(folder.glob(".*.part"))
 
 
-def test_a_view_of_the_rig_an_environment_and_two_lights_shine_together(
-    folder, monkeypatch, capsys
-):
+def test_rig_view_environment_and_two_lights_combine(folder, monkeypatch, capsys):
     words = (
         "face",
         "--view",
@@ -138,7 +136,7 @@ def test_a_view_of_the_rig_an_environment_and_two_lights_shine_together(
     assert any("view C03" in text or "camera C03" in text for text in document["assumed"])
 
 
-def test_another_mesh_of_the_same_layout_carries_the_normals_along(folder, monkeypatch, capsys):
+def test_other_mesh_with_same_layout_carries_normals_along(folder, monkeypatch, capsys):
     words = (
         "face",
         "--mesh",
@@ -218,7 +216,7 @@ def test_translucency_that_is_asked_for_is_used(folder, monkeypatch, capsys):
         (["face", "--light", "1,1,1", "--rig", "tent"], 3, "tent"),
     ],
 )
-def test_what_cannot_be_rendered_is_refused_with_one_clear_message(
+def test_unrenderable_request_is_refused_with_single_clear_message(
     words, code, says, folder, monkeypatch, capfd
 ):
     assert run(folder, monkeypatch, *words, "--out", "refused") == code
@@ -252,7 +250,7 @@ class OnePhotograph:
         return Photograph(np.full((30, 40, 3), 0.7), np.ones((30, 40, 3)), np.ones((30, 40), bool))
 
 
-def test_a_photograph_is_taken_apart_beside_its_rendering(folder, monkeypatch, capsys):
+def test_photograph_is_decomposed_alongside_its_rendering(folder, monkeypatch, capsys):
     monkeypatch.setattr(photographs.Photographs, "of", lambda *_, **__: OnePhotograph())
     words = ("face", "--against", "session", "--components", "--subsurface", "local", "--json")
     lit = ("--view", "C03", "--light", "L017", "--out", "apart")

@@ -26,7 +26,7 @@ def truth_of(here, melanin):
     return store.read(here / f"truth-{melanin}")
 
 
-def test_a_files_melanin_is_that_of_the_truth_which_tells_of_the_file(here, capsys):
+def test_subject_file_melanin_is_truth_citing_file(here, capsys):
     light, dark = (truth_of(here, melanin) for melanin in (0.02, 0.08))
     medians = [
         float(np.median(one.maps["melanin"].values[one.maps["melanin"].valid]))
@@ -63,7 +63,7 @@ def killed(here, capsys, monkeypatch):
     return argv
 
 
-def test_a_session_is_not_resumed_with_a_file_that_was_changed(here, capsys, killed):
+def test_session_is_not_resumed_with_changed_subject_file(here, capsys, killed):
     (here / "ann.toml").write_text(FILE.format(melanin=0.03), encoding="utf-8")
     assert main([*killed, "--resume", "--nearer", "5", "--seed", "1"]) == 3
     said = capsys.readouterr().err
@@ -102,7 +102,7 @@ def test_a_consent_is_the_same_in_any_order(killed):
 
 
 @pytest.mark.parametrize("command", ["plan", "serve"])
-def test_what_a_rig_sees_nothing_of_is_said_before_the_work(here, capsys, monkeypatch, command):
+def test_effects_invisible_to_rig_are_reported_before_work(here, capsys, monkeypatch, command):
     (here / "ann.toml").write_text(FILE.format(melanin=0.02) + "oil = 2.0\n", encoding="utf-8")
 
     def stopped(*args, **settings):
@@ -117,7 +117,7 @@ def test_what_a_rig_sees_nothing_of_is_said_before_the_work(here, capsys, monkey
         assert "the same command" not in said
 
 
-def test_a_forecast_is_of_the_skin_that_the_file_tells_of(here, capsys):
+def test_forecast_uses_skin_from_subject_file(here, capsys):
     found = []
     for melanin in (0.01, 0.2):
         (here / "ann.toml").write_text(FILE.format(melanin=melanin), encoding="utf-8")

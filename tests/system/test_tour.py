@@ -24,7 +24,7 @@ def leaves(words):
 
 
 @pytest.mark.long
-def test_the_tour_of_the_readme_runs_to_its_end(tmp_path, monkeypatch, capsys):
+def test_readme_tour_runs_to_its_end(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     lines = tour()
     assert len(lines) >= 8
@@ -37,7 +37,7 @@ def test_the_tour_of_the_readme_runs_to_its_end(tmp_path, monkeypatch, capsys):
             assert Path(leaves(words)).exists(), shlex.join(words)
 
 
-def test_each_line_of_the_tour_uses_what_earlier_lines_made():
+def test_tour_lines_use_results_of_earlier_lines():
     made = {"truth-face"}  # beside its session
     for words in tour():
         for word in words[2:]:

@@ -23,7 +23,7 @@ def scene():
     return np.broadcast_to(np.geomspace(10.0, 1.2e6, 40)[:, None], (40, 500)).copy()
 
 
-def test_radiance_over_five_decades_is_unbiased_and_its_variance_honest(scene):
+def test_radiance_over_five_decades_is_unbiased_variance_correct(scene):
     """Z-scores of 20,000 pixels: mean 0 to 0.03 (4 sigma) and spread 1 to 0.03.
 
     Rows within 5 % of a frame's saturation are left out: there noise decides which frame counts.
@@ -90,7 +90,7 @@ def test_brackets_that_do_not_fit_are_named(frames, times, change, says):
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 5, 3), (40, 61), (1025,)])
 @pytest.mark.parametrize("count", [1, 2, 7])
-def test_the_compiled_loop_and_its_plain_twin_agree(rng, shape, count):
+def test_compiled_loop_matches_plain_implementation(rng, shape, count):
     """float32 against float64: within 1e-3 of a standard error and 1e-5 of the variance."""
     times = np.geomspace(1e-4, 2.0, count)
     frames = [rng.integers(400, 18_000, shape).astype(np.uint16) for _ in times]
@@ -106,7 +106,7 @@ def test_the_compiled_loop_and_its_plain_twin_agree(rng, shape, count):
     np.testing.assert_array_equal(frames, before)
 
 
-def test_frames_that_are_views_or_other_integers_give_the_same(rng):
+def test_frame_views_and_other_integers_give_same_result(rng):
     wide = [rng.integers(500, 9000, (20, 30)).astype(np.uint16) for _ in TIMES]
     cut = [frame[::2, 1::3] for frame in wide]
     whole = [np.ascontiguousarray(frame) for frame in cut]
@@ -117,7 +117,7 @@ def test_frames_that_are_views_or_other_integers_give_the_same(rng):
 
 
 @pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64])
-def test_whole_numbers_of_a_floating_type_are_raw_frames_too(rng, kind):
+def test_integer_valued_float_frames_are_raw_frames(rng, kind):
     frames = rng.integers(400, 2000, (2, 5, 6)).astype(np.uint16)
     frames[:, 0, 0] = 2048  # exact in half precision, saturated below
     sensor = {**SENSOR, "white": 2048}
@@ -133,7 +133,7 @@ def test_whole_numbers_of_a_floating_type_are_raw_frames_too(rng, kind):
     np.testing.assert_allclose(below, -3.0 - SENSOR["black"])
 
 
-def test_single_frames_of_one_time_merge_as_their_average_would(rng):
+def test_equal_time_frames_merge_like_their_average(rng):
     frames = rng.integers(900, 1100, (4, 50, 50)).astype(np.uint16)
     radiance, variance, _ = merge(frames, [0.5] * 4, **SENSOR)
     mean = frames.mean(axis=0) - SENSOR["black"]
@@ -142,7 +142,7 @@ def test_single_frames_of_one_time_merge_as_their_average_would(rng):
     assert np.median(variance / alone) == pytest.approx(0.25, rel=0.01)
 
 
-def test_the_variance_is_that_of_the_best_unbiased_estimate(scene):
+def test_variance_is_that_of_best_unbiased_estimate(scene):
     """Cramer-Rao: one over the sum of t^2 / (radiance t / gain + floor) over unsaturated frames.
 
     Rows within 5 % of a frame's saturation are left out. 5 % for the estimate inside the weights.
@@ -162,7 +162,7 @@ def test_the_variance_is_that_of_the_best_unbiased_estimate(scene):
 
 @pytest.mark.parametrize("level", [0, 512, 16_382, 16_383, 65_535])
 @pytest.mark.parametrize("time", [1e-9, 1.0, 1e6])
-def test_extreme_values_and_times_give_numbers_or_a_mask(level, time):
+def test_extreme_values_and_times_give_numbers_or_mask(level, time):
     radiance, variance, valid = merge(
         np.full((2, 3, 3), level, np.uint16), (time, 2 * time), **SENSOR
     )
@@ -188,7 +188,7 @@ def gradient():
     )
 
 
-def test_a_known_response_is_recovered_from_a_bracket(gradient, rng):
+def test_known_response_is_recovered_from_bracket(gradient, rng):
     times = (0.25, 1.0, 4.0)
     images = [encode(gradient * t) for t in times]
     found = recover_response(images, times, rng=rng)
@@ -203,7 +203,7 @@ def test_a_known_response_is_recovered_from_a_bracket(gradient, rng):
     assert np.median(np.abs(level / 128 / true.clip(1e-9) - 1)[inner.any(axis=1)]) > 0.2
 
 
-def test_linearized_pictures_of_a_bracket_tell_one_radiance(gradient, rng):
+def test_linearized_bracket_images_agree_on_radiance(gradient, rng):
     times = (0.25, 1.0, 4.0)
     images = [encode(gradient * t) for t in times]
     found = recover_response(images, times, rng=rng)
@@ -248,7 +248,7 @@ def test_a_real_bracket_becomes_consistent():
         ({"smoothness": 0.0}, "smoothness"),
     ],
 )
-def test_pictures_that_do_not_fit_are_named(change, says, rng):
+def test_inconsistent_bracket_images_are_refused(change, says, rng):
     words = {"images": [np.zeros((9, 9, 3), np.uint8)] * 2, "exposures_s": (1.0, 2.0)} | change
     with pytest.raises(BracketError, match=says):
         recover_response(words.pop("images"), words.pop("exposures_s"), rng=rng, **words)

@@ -19,7 +19,7 @@ def flash_json(flash):
     return json.loads(json.dumps(flash.to_json()))
 
 
-def test_the_flashes_stand_fourteen_degrees_beside_the_camera(flash):
+def test_flashes_are_fourteen_degrees_from_camera(flash):
     camera = np.array(flash.view("cam").position_mm)
     for light in flash.lights:
         position = np.array(light.position_mm)
@@ -28,7 +28,7 @@ def test_the_flashes_stand_fourteen_degrees_beside_the_camera(flash):
         assert np.linalg.norm(position) == pytest.approx(1000.0, rel=1e-3)
 
 
-def test_the_camera_sees_a_face_with_six_megapixels(flash):
+def test_camera_images_face_with_six_megapixels(flash):
     view = flash.view("cam")
     width_mm, height_mm = view.field_mm
     assert (view.width_px, view.height_px) == (3024, 2016)
@@ -36,7 +36,7 @@ def test_the_camera_sees_a_face_with_six_megapixels(flash):
     assert height_mm == pytest.approx(width_mm * 2016 / 3024)
 
 
-def test_image_axes_are_right_handed_with_x_right_y_up_and_z_to_the_camera(flash):
+def test_image_axes_are_right_handed_with_y_up(flash):
     right, up, back = map(np.array, flash.view("cam").axes)
     np.testing.assert_allclose((right, up, back), np.eye(3), atol=1e-15)
 
@@ -60,7 +60,7 @@ def test_a_rig_is_frozen(flash):
         flash.recycle_s = 0.0
 
 
-def test_all_faults_of_a_file_are_listed_with_their_paths(tmp_path, flash):
+def test_all_file_faults_are_listed_with_paths(tmp_path, flash):
     file = tmp_path / "broken.toml"
     text = (
         'name = "flash"\nboxes = []\nwavelength = 3\n'
@@ -129,14 +129,14 @@ def test_a_value_out_of_range_is_named(flash_json, field, value, expected):
     ("content", "reason"),
     [(b"name = [", "is not TOML"), (b"\xff\xfe", "is not TOML"), (b"", "faults")],
 )
-def test_a_file_that_is_not_a_rig_gives_one_error(tmp_path, content, reason):
+def test_file_that_is_not_rig_gives_single_error(tmp_path, content, reason):
     file = tmp_path / "rig.toml"
     file.write_bytes(content)
     with pytest.raises(RigError, match=reason):
         load_rig(file)
 
 
-def test_unknown_names_are_answered_with_the_known_ones(flash):
+def test_unknown_name_errors_list_valid_names(flash):
     with pytest.raises(RigError, match="did you mean flash"):
         load_rig("flahs")
     with pytest.raises(RigError, match="no such file"):
@@ -147,7 +147,7 @@ def test_unknown_names_are_answered_with_the_known_ones(flash):
         flash.light("top")
 
 
-def test_two_lights_of_one_name_are_refused(flash_json):
+def test_two_lights_of_same_name_are_refused(flash_json):
     flash_json["lights"][1]["name"] = "LEFT"
     with pytest.raises(RigError, match="names that differ"):
         rig_from_json(flash_json)
@@ -158,7 +158,7 @@ def test_an_id_can_never_leave_its_folder(text):
     assert not is_id(text)
 
 
-def test_the_dome_holds_150_leds_and_16_cameras_none_behind_an_led():
+def test_dome_has_150_leds_16_cameras_none_occluded():
     dome = load_rig("dome")
     leds = np.array([light.position_mm for light in dome.lights])
     cameras = np.array([view.position_mm for view in dome.views])
@@ -171,7 +171,7 @@ def test_the_dome_holds_150_leds_and_16_cameras_none_behind_an_led():
     assert np.degrees(apart.min()) > 4.0
 
 
-def test_a_light_is_a_flash_or_an_led_and_not_both():
+def test_light_is_flash_or_led_not_both():
     with pytest.raises(RigError, match="one of the two"):
         Light(name="a", position_mm=(0, 0, 1), energy_ws=1.0, power_w=1.0, radius_mm=1.0)
     with pytest.raises(RigError, match="one of the two"):
@@ -183,7 +183,7 @@ def test_an_led_without_lobe_shines_the_same_everywhere():
     assert led.intensity(3.0) == 1.0
 
 
-def test_a_subset_keeps_the_rigs_order_and_refuses_a_foreign_name():
+def test_subset_keeps_rig_order_and_refuses_foreign_name():
     dome = load_rig("dome")
     few = dome.subset(lights=["L007", "L003"], views=["C01"])
     assert [light.name for light in few.lights] == ["L003", "L007"]

@@ -22,7 +22,7 @@ def fractions(rng, count, lowest=0.0):
 
 @pytest.mark.parametrize("camera", spectra.camera_names())
 @pytest.mark.parametrize("anisotropy", color_table.STORED_ANISOTROPIES)
-def test_lookup_is_the_band_average_of_the_accurate_tier(camera, anisotropy, rng):
+def test_lookup_is_band_average_of_accurate_tier(camera, anisotropy, rng):
     c_m, c_hd = fractions(rng, 60)
     table = color_table.build(camera, "D65", anisotropy=anisotropy)
     reflectance = two_layer_reflectance(
@@ -32,7 +32,7 @@ def test_lookup_is_the_band_average_of_the_accurate_tier(camera, anisotropy, rng
     np.testing.assert_allclose(table.lookup(c_m, c_hd), direct, rtol=1e-4)
 
 
-def test_nodes_lie_on_cube_root_axes(table):
+def test_nodes_are_on_cube_root_axes(table):
     i, j = 40, 90
     c_m, c_hd = C_M_MAX * (i / 127) ** 3, C_HD_MAX * (j / 127) ** 3
     np.testing.assert_allclose(table.lookup(c_m, c_hd), table.rgb[i, j], rtol=1e-10)
@@ -40,7 +40,7 @@ def test_nodes_lie_on_cube_root_axes(table):
     np.testing.assert_allclose(table.lookup(C_M_MAX, C_HD_MAX), table.rgb[-1, -1], rtol=1e-10)
 
 
-def test_every_channel_darkens_with_melanin_and_the_green_most_with_blood(table):
+def test_channels_darken_with_melanin_green_most_with_blood(table):
     rgb = table.rgb
     assert np.all(np.diff(rgb, axis=0) < 0.0)
     # At the very first nodes blood changes less than the stored digits.
@@ -108,12 +108,12 @@ def test_fractions_outside_the_table_are_refused_not_clamped(table):
         (np.zeros((9, 9, 3)), "rgb: got"),
     ],
 )
-def test_an_array_that_is_no_table_is_refused(rgb, message):
+def test_invalid_table_array_is_refused(rgb, message):
     with pytest.raises(ColorTableError, match=message):
         ColorTable("camera", "light", rgb)
 
 
-def test_a_size_too_small_for_a_spline_is_refused():
+def test_size_too_small_for_spline_is_refused():
     for size in (4, 7, 8.5, "16"):
         with pytest.raises(ColorTableError, match=f"at least 8, got {size}"):
             color_table.build("Nikon 5100 (NPL)", "D65", size=size)
@@ -127,7 +127,7 @@ def test_fractions_whose_shapes_do_not_fit_are_named():
 
 
 @pytest.mark.parametrize(("size", "told"), [(8, 0.04), (16, 3e-3), (32, 4e-5)])
-def test_the_color_between_nodes_is_as_near_as_told(size, told, rng):
+def test_color_between_nodes_is_within_reported_error(size, told, rng):
     melanin, blood = 0.5 * rng.random(5000) ** 3, 0.32 * rng.random(5000) ** 3
     fine, coarse = (
         color_table.build("Nikon 5100 (NPL)", "D65", size=n).lookup(melanin, blood)

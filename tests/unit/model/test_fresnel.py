@@ -33,7 +33,7 @@ def test_internal_average_agrees_with_direct_integration_inside():
     assert fresnel.diffuse_internal(1.4) == pytest.approx(inside, abs=1e-8)
 
 
-def test_reflectance_is_the_same_from_both_sides_of_a_ray():
+def test_reflectance_is_equal_from_both_ray_sides():
     mu_out = np.linspace(0.01, 1.0, 50)
     mu_in = np.sqrt(1.0 - (1.0 - mu_out**2) / 1.4**2)
     np.testing.assert_allclose(
@@ -41,7 +41,7 @@ def test_reflectance_is_the_same_from_both_sides_of_a_ray():
     )
 
 
-def test_everything_is_reflected_beyond_the_critical_angle_and_at_grazing_incidence():
+def test_reflection_is_total_beyond_critical_angle_and_grazing():
     np.testing.assert_array_equal(fresnel.reflectance([0.0, 0.3, 0.69], 1.0 / 1.4), 1.0)
     assert fresnel.reflectance(0.0, 1.4) == pytest.approx(1.0)
 
@@ -51,7 +51,7 @@ def test_a_matched_surface_reflects_nothing_at_any_angle():
     assert fresnel.diffuse_internal(1.0) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_an_index_below_one_is_refused():
+def test_index_below_unity_is_refused():
     with pytest.raises(ValueError, match="eta: got"):
         fresnel.diffuse_internal(0.7)
     with pytest.raises(ValueError, match="eta: got"):

@@ -16,7 +16,7 @@ def table():
     return merl.MerlTable(stored)
 
 
-def test_a_file_has_the_published_layout_to_the_byte(table, tmp_path):
+def test_file_matches_published_layout_to_the_byte(table, tmp_path):
     path = tmp_path / "some.binary"
     merl.write(path, table)
     content = path.read_bytes()
@@ -31,7 +31,7 @@ def test_a_file_has_the_published_layout_to_the_byte(table, tmp_path):
         assert found[channel] == pytest.approx(value * scale, rel=1e-15)
 
 
-def test_reading_gives_back_what_was_written(table, tmp_path):
+def test_written_table_reads_back_unchanged(table, tmp_path):
     merl.write(tmp_path / "a.binary", table)
     back = merl.read(tmp_path / "a.binary")
     np.testing.assert_array_equal(back.stored, table.stored)
@@ -39,7 +39,7 @@ def test_reading_gives_back_what_was_written(table, tmp_path):
     assert (tmp_path / "a.binary").read_bytes() == (tmp_path / "b.binary").read_bytes()
 
 
-def test_a_foreign_file_s_unmeasured_entries_come_back_to_the_byte(tmp_path, rng):
+def test_foreign_file_unmeasured_entries_round_trip_byte_exact(tmp_path, rng):
     # -1 and other negative numbers, -0.0, denormal and huge values, as measured files hold them
     values = rng.choice([-1.0, -1500.0, -1e-9, -0.0, 5e-324, 0.0, 1.0, 3e7], 3 * 1_458_000)
     content = struct.pack("<3i", 90, 90, 180) + values.astype("<f8").tobytes()
@@ -48,7 +48,7 @@ def test_a_foreign_file_s_unmeasured_entries_come_back_to_the_byte(tmp_path, rng
     assert (tmp_path / "b.binary").read_bytes() == content
 
 
-def test_the_mean_of_the_channels_is_known_where_all_are(table, tmp_path):
+def test_channel_mean_is_known_where_all_are(table, tmp_path):
     stored = table.stored.copy()
     stored[1, 3, 4, 5] = -1e-3
     merl.write(tmp_path / "a.binary", merl.MerlTable(stored))
@@ -60,7 +60,7 @@ def test_the_mean_of_the_channels_is_known_where_all_are(table, tmp_path):
     np.testing.assert_allclose(mean[known], expected, rtol=1e-14)
 
 
-def test_what_has_no_value_in_one_channel_is_stored_as_not_measured_in_all():
+def test_entry_missing_any_channel_is_stored_as_unmeasured():
     values = np.ones((*merl.TABLE_SHAPE, 3))
     values[1, 2, 3, 2] = -0.5
     stored = merl.MerlTable.of_values(values).stored
@@ -83,7 +83,7 @@ def test_truncated_and_foreign_files_are_named(table, tmp_path):
             merl.read(tmp_path / name)
 
 
-def test_what_was_not_measured_stays_negative(table):
+def test_unmeasured_entries_stay_negative(table):
     found = table.lookup(np.pi / 2, np.pi / 2, 0.001)
     assert np.all(found < 0.0)
     assert not table.measured[89, 89, 0]
@@ -137,7 +137,7 @@ def test_angles_follow_rusinkiewicz_by_two_rotations(rng):
     np.testing.assert_allclose(phi_d, np.arctan2(y, x), atol=1e-10)
 
 
-def test_directions_of_angles_have_these_angles_and_swapping_turns_by_half_a_circle(rng):
+def test_angle_directions_round_trip_swapping_rotates_half_circle(rng):
     angles = merl.to_angles(directions(rng, 300), directions(rng, 300), [0.0, 0.0, 1.0])
     light, view = merl.to_directions(*angles)
     for back, angle in zip(merl.to_angles(light, view, [0.0, 0.0, 1.0]), angles, strict=True):

@@ -5,7 +5,7 @@ from model import metrics
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-10, 1e-4, 1.0, np.pi - 1e-7, np.pi])
-def test_angles_are_exact_from_the_smallest_to_the_largest(angle):
+def test_angles_are_exact_from_smallest_to_largest(angle):
     turned = [np.sin(angle), 0.0, np.cos(angle)]
     assert metrics.angular_error_rad([0, 0, 2.0], turned) == pytest.approx(
         angle, rel=1e-9, abs=1e-15
@@ -16,7 +16,7 @@ def test_a_vector_without_direction_has_no_angle():
     assert np.isnan(metrics.angular_error_rad([0, 0, 0], [0, 0, 1]))
 
 
-def test_honest_intervals_cover_what_they_say_and_halved_ones_do_not(rng):
+def test_correct_intervals_reach_coverage_and_halved_ones_fail(rng):
     truth = np.zeros(4000)
     estimate = rng.normal(0.0, 2.0, 4000)
     honest = metrics.coverage(estimate, np.full(4000, 2.0), truth)
@@ -31,7 +31,7 @@ def test_masked_and_undefined_trials_do_not_count():
     assert np.isnan(metrics.coverage([np.nan], [1.0], [0.0]).share)
 
 
-def test_the_interval_of_a_median_shrinks_with_the_root_of_the_count(rng):
+def test_median_interval_shrinks_with_root_of_count(rng):
     def width(n):
         low, high = metrics.median_with_interval(rng.normal(size=n), rng=rng)[1]
         return high - low

@@ -56,7 +56,7 @@ def dome(lobes, *, without=(), normals=("normals", "normals_refined"), file=None
     )
 
 
-def test_maps_of_a_dome_make_a_model_with_what_was_not_measured_named(lobes):
+def test_dome_maps_make_model_listing_unmeasured_parts(lobes):
     given = dome(lobes)
     model = assemble(given)
     assert model.shape == (SIDE, SIDE)
@@ -69,7 +69,7 @@ def test_maps_of_a_dome_make_a_model_with_what_was_not_measured_named(lobes):
     assert np.array_equal(model.lobes.table, lobes.table)
 
 
-def test_translucency_is_taken_from_values_from_maps_of_any_size_and_from_the_maps(lobes):
+def test_translucency_comes_from_values_or_maps_any_size(lobes):
     assert assemble(dome(lobes), translucency=(2.0, 1.0, 0.5)).assumed == ()
     # a ramp over the texture stays one, between the centres of the outermost texels
     ramp = np.broadcast_to((np.arange(6)[:, None, None] + 0.5) / 6 + 1.0, (6, 3, 3))
@@ -93,7 +93,7 @@ def test_translucency_is_taken_from_values_from_maps_of_any_size_and_from_the_ma
         ({"r_d": SkinMap(np.ones((3, 3, 3)), "1")}, r"got shape \(3, 3\), expected \(12, 12\)"),
     ],
 )
-def test_what_is_missing_or_does_not_fit_is_named(lobes, change, says):
+def test_missing_or_mismatched_input_is_reported(lobes, change, says):
     with pytest.raises(SkinReflectanceError, match=says):
         assemble(dome(lobes, **change))
     with pytest.raises(SkinReflectanceError, match="older version"):
@@ -155,7 +155,7 @@ def local_diffuse(model, rows, light, view):
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 40.0, 70.0, 85.0])
-def test_skin_gives_back_no_more_light_than_falls_on_it(lobes, angle_deg):
+def test_skin_never_reflects_more_than_incident_light(lobes, angle_deg):
     view, weight = hemisphere()
     light = [np.sin(np.radians(angle_deg)), 0.0, np.cos(np.radians(angle_deg))]
     model, rows = even_model(lobes, r_d=1.0), np.zeros(len(view), int)
@@ -171,7 +171,7 @@ def test_skin_gives_back_no_more_light_than_falls_on_it(lobes, angle_deg):
     assert surface + inside.max() / passed / 0.923 > 1.0
 
 
-def test_the_surface_is_its_lobes_and_fresnel_is_in_them_alone(lobes):
+def test_surface_is_its_lobes_containing_all_fresnel(lobes):
     model = assemble(dome(lobes))
     rng = np.random.default_rng(4)
     light, view = (v / np.linalg.norm(v, axis=1)[:, None] for v in rng.normal(size=(2, 40, 3)))
@@ -190,7 +190,7 @@ def test_the_surface_is_its_lobes_and_fresnel_is_in_them_alone(lobes):
 
 
 @pytest.mark.parametrize("eta", [1.3, 1.4, 1.5])
-def test_the_albedo_of_scattering_rises_with_r_d_over_fifteen_decades_of_its_deficit(eta):
+def test_scattering_albedo_rises_with_r_d_over_decades(eta):
     r_d = np.concatenate([np.geomspace(1e-6, 0.5, 40), 1.0 - np.geomspace(0.4, 1e-9, 60)])
     found = DipoleMaps.of(r_d[:, None], np.ones((100, 1)), eta=eta)
     deficit = found.deficit[:, 0]
@@ -203,7 +203,7 @@ def test_the_albedo_of_scattering_rises_with_r_d_over_fifteen_decades_of_its_def
     np.testing.assert_allclose(found.albedo_prime, 1.0 - found.deficit)
 
 
-def test_r_d_above_one_is_an_outlier_and_masked_and_zero_is_no_scattering(lobes):
+def test_r_d_above_unity_is_outlier_zero_unscattered(lobes):
     found = DipoleMaps.of([[1.2, -0.1, np.nan], [0.0, 1.0, 0.5]], 2.0, eta=1.4)
     assert found.outlier.tolist() == [[True, True, False], [False, False, False]]
     assert found.valid.tolist() == [[False, False, False], [True, False, True]]

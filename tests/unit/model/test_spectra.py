@@ -13,14 +13,14 @@ FINE_NM = np.arange(400.0, 701.0, 5.0)
     ("wavelength_nm", "blood_per_mm"),
     [(500.0, 11.200), (540.0, 27.618), (600.0, 3.250), (700.0, 0.3567)],
 )
-def test_whole_blood_at_three_quarters_saturation_absorbs_as_published(wavelength_nm, blood_per_mm):
+def test_whole_blood_at_75_percent_saturation_matches_literature(wavelength_nm, blood_per_mm):
     oxy, deoxy = spectra.hemoglobin_extinction(wavelength_nm)
     molar = spectra.HEMOGLOBIN_IN_BLOOD_G_PER_L / spectra.HEMOGLOBIN_MOLAR_MASS_G_PER_MOL
     absorption = np.log(10.0) * molar * (0.75 * oxy + 0.25 * deoxy) / 10.0
     assert absorption == pytest.approx(blood_per_mm, rel=2e-4)
 
 
-def test_hemoglobin_is_isosbestic_near_500_nm_and_oxy_dips_at_560_nm():
+def test_hemoglobin_isosbestic_near_500_nm_oxy_dips_560():
     oxy, deoxy = spectra.hemoglobin_extinction([500.0, 542.5, 560.0, 577.5])
     assert oxy[0] == pytest.approx(deoxy[0], rel=0.02)
     assert oxy[2] < oxy[1]
@@ -49,7 +49,7 @@ def test_illuminants_agree_with_the_cie_tables(name):
     )
 
 
-def test_the_flash_has_a_color_temperature_between_5500_and_6100_k():
+def test_flash_color_temperature_is_5500_to_6100_k():
     wavelength = np.arange(380.0, 781.0, 5.0)
     xyz = spectra.illuminant("xenon flash", wavelength) @ spectra.color_matching_functions(
         wavelength
@@ -78,26 +78,26 @@ def test_the_standard_observer_agrees_with_the_cie_table():
 
 @pytest.mark.parametrize("name", spectra.illuminant_names())
 @pytest.mark.parametrize("camera", spectra.camera_names())
-def test_a_gray_reflectance_gives_equal_channels_in_every_light(camera, name):
+def test_gray_reflectance_gives_equal_channels_any_light(camera, name):
     rgb = spectra.band_average(np.full((2, 31), 0.3), camera, name)
     np.testing.assert_allclose(rgb, 0.3, rtol=1e-12)
 
 
-def test_band_averages_do_not_depend_on_the_sampling_of_a_linear_reflectance():
+def test_band_averages_are_independent_of_linear_reflectance_sampling():
     coarse = spectra.band_average(spectra.WAVELENGTH_NM / 700.0, "Nikon 5100 (NPL)", "D55")
     fine = spectra.band_average(FINE_NM / 700.0, "Nikon 5100 (NPL)", "D55", wavelength_nm=FINE_NM)
     np.testing.assert_allclose(coarse, fine, rtol=1e-12)
     assert coarse[0] > coarse[1] > coarse[2]
 
 
-def test_camera_white_turns_reddish_from_daylight_to_incandescent_light():
+def test_camera_white_reddens_from_daylight_to_incandescent():
     day = spectra.camera_white("Nikon 5100 (NPL)", "D65")
     bulb = spectra.camera_white("Nikon 5100 (NPL)", "A")
     assert day.max() == 1.0
     assert bulb[0] / bulb[2] > 2.0 * day[0] / day[2]
 
 
-def test_an_unknown_name_is_refused_with_the_known_ones():
+def test_unknown_name_error_lists_valid_names():
     with pytest.raises(spectra.SpectrumNameError, match="Nikon 5100"):
         spectra.camera_sensitivity("Nikon 5100")
     with pytest.raises(spectra.SpectrumNameError, match="D55"):
@@ -116,12 +116,12 @@ def test_the_default_wavelengths_cannot_be_modified():
         spectra.WAVELENGTH_NM[0] = 0.0
 
 
-def test_spectra_that_do_not_match_the_wavelengths_are_refused():
+def test_spectra_mismatching_wavelengths_are_refused():
     with pytest.raises(ValueError, match="spectra: got"):
         spectra.band_average(np.ones(30), "Nikon 5100 (NPL)", "D55")
 
 
-def test_linear_srgb_of_a_reflectance_is_that_of_its_xyz_under_d65():
+def test_linear_srgb_of_reflectance_matches_xyz_under_d65():
     wavelength = np.arange(400.0, 701.0, 10.0)
     reflectance = 0.2 + 0.5 / (1.0 + np.exp(-(wavelength - 590.0) / 12.0))
     rgb = spectra.band_average(reflectance, spectra.LINEAR_SRGB, "D65", wavelength_nm=wavelength)

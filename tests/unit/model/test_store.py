@@ -26,7 +26,7 @@ def appearance(rng):
     )
 
 
-def test_what_is_written_reads_back_equal(tmp_path, appearance):
+def test_written_appearance_reads_back_equal(tmp_path, appearance):
     back = store.read(store.write(tmp_path / "a", appearance))
     for name, written in appearance.maps.items():
         np.testing.assert_array_equal(back.maps[name].values, written.values)
@@ -39,7 +39,7 @@ def test_what_is_written_reads_back_equal(tmp_path, appearance):
     assert back.files == appearance.files
 
 
-def test_a_folder_is_replaced_whole_and_nothing_stays_behind(tmp_path, appearance):
+def test_folder_is_replaced_whole_without_leftovers(tmp_path, appearance):
     store.write(tmp_path / "a", appearance)
     store.write(tmp_path / "a", SkinAppearance({}, "measured"))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a"]
@@ -63,7 +63,7 @@ def test_somebody_elses_folder_is_not_replaced(tmp_path, appearance):
     assert (tmp_path / "a" / "thesis.txt").read_text() == "years of work"
 
 
-def test_one_flipped_bit_in_any_file_is_named(tmp_path, appearance, rng):
+def test_flipped_bit_in_any_file_is_reported(tmp_path, appearance, rng):
     folder = store.write(tmp_path / "a", appearance)
     for path in sorted(folder.iterdir()):
         whole = path.read_bytes()
@@ -96,7 +96,7 @@ def test_a_path_trick_in_the_document_is_refused(tmp_path, appearance):
         store.read(folder)
 
 
-def test_a_path_trick_in_the_name_of_a_file_is_refused(tmp_path, appearance):
+def test_file_name_with_path_traversal_is_refused(tmp_path, appearance):
     folder = store.write(tmp_path / "a", appearance)
     document = json.loads((folder / store.DOCUMENT_FILE).read_text())
     document["files"] = {"../secret.ply": document["files"].pop("mesh.ply")}
@@ -108,18 +108,18 @@ def test_a_path_trick_in_the_name_of_a_file_is_refused(tmp_path, appearance):
 
 
 @pytest.mark.parametrize("name", ["../mesh.ply", "Mesh.ply", "melanin.exr", "mesh", ".mesh.ply"])
-def test_a_file_name_that_could_hide_or_clash_is_refused(name):
+def test_hidden_or_clashing_file_name_is_refused(name):
     with pytest.raises(ValueError, match="files: got name"):
         SkinAppearance({}, "simulated", files={name: b""})
 
 
-def test_a_missing_map_is_named_with_those_there_are(tmp_path, appearance):
+def test_missing_map_error_lists_available_maps(tmp_path, appearance):
     folder = store.write(tmp_path / "a", appearance)
     with pytest.raises(store.StoreError, match=r"no map 'normals'; it has diffuse, melanin"):
         store.read(folder, only=("normals",))
 
 
-def test_a_folder_that_is_none_is_named(tmp_path):
+def test_folder_that_is_not_appearance_is_reported(tmp_path):
     with pytest.raises(store.StoreError, match=r"is no APPEARANCE/ folder"):
         store.read(tmp_path)
 
@@ -134,7 +134,7 @@ def test_a_folder_that_is_none_is_named(tmp_path):
         ({"values": np.full((2, 2), np.nan)}, "got nan"),
     ],
 )
-def test_a_map_that_does_not_fit_itself_is_refused(change, message):
+def test_inconsistent_map_is_refused(change, message):
     arguments = {"values": np.zeros((2, 2)), "unit": "1"} | change
     with pytest.raises(ValueError, match=message):
         SkinMap(**arguments)
@@ -151,7 +151,7 @@ def test_a_map_that_the_disk_refuses_is_named(tmp_path):
         store.write_exr(tmp_path / "nothing" / "a.exr", pixels)
 
 
-def test_a_folder_that_cannot_be_replaced_is_refused_beforehand(tmp_path):
+def test_irreplaceable_folder_is_refused_beforehand(tmp_path):
     store.require_free(tmp_path / "new" / "deep")
     (tmp_path / "notes.txt").write_text("mine")
     for taken in (tmp_path, tmp_path / "notes.txt", tmp_path / "notes.txt" / "below"):

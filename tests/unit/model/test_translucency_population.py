@@ -26,7 +26,7 @@ def test_moments_of_the_lognormal_are_those_printed_exactly(reading):
     np.testing.assert_allclose(deviation, population.deviation_per_mm, rtol=1e-12)
 
 
-def test_the_printed_column_is_taken_for_deviations_or_by_the_letter():
+def test_printed_column_is_read_as_deviations_or_variances():
     read, literal = weyrich_2005(), weyrich_2005(reading="variance")
     np.testing.assert_allclose(literal.deviation_per_mm**2, read.deviation_per_mm, rtol=1e-15)
     assert read.deviation_per_mm[0, 0] == 0.1727
@@ -46,7 +46,7 @@ def test_extremes_of_figure_17_contradict_the_printed_variances():
     assert (weyrich_2005(reading="variance").deviation_per_mm[:, 1] ** 2 > green).all()
 
 
-def test_faces_reach_as_far_as_figure_17_only_when_the_column_holds_deviations(rng):
+def test_faces_span_figure_17_only_if_column_deviations(rng):
     faces = {
         reading: weyrich_2005(reading=reading).sample(87 * 400, rng=rng).mean(axis=1)
         for reading in ("deviation", "variance")
@@ -66,7 +66,7 @@ def test_faces_reach_as_far_as_figure_17_only_when_the_column_holds_deviations(r
         assert inside["variance"] ** 87 < 1e-11
 
 
-def test_a_drawn_population_has_the_moments_of_the_table(rng):
+def test_sampled_population_has_table_moments(rng):
     population = weyrich_2005()
     people = population.sample(40_000, rng=rng)
     found = table(people)
@@ -82,7 +82,7 @@ def test_a_drawn_population_has_the_moments_of_the_table(rng):
     assert (np.abs(off_literal / found.deviation_stderr_per_mm) > SIDAK_5_SIGMA).all()
 
 
-def test_logarithms_of_a_drawn_population_are_normal_and_correlated_as_stated(rng):
+def test_sampled_population_logarithms_are_normal_and_correlated(rng):
     n = 40_000
     population = weyrich_2005()
     logs = np.log(population.sample(n, rng=rng)).reshape(n, -1)
@@ -96,7 +96,7 @@ def test_logarithms_of_a_drawn_population_are_normal_and_correlated_as_stated(rn
     assert np.abs(fisher * np.sqrt(n - 3)).max() < SIDAK_5_SIGMA
 
 
-def test_standard_errors_of_the_table_are_those_of_repeated_populations(rng):
+def test_table_standard_errors_match_repeated_populations(rng):
     population = weyrich_2005(reading="variance")  # skewed: a normal formula would be wrong
     people = population.sample(500 * 400, rng=rng).reshape(400, 500, 3, 3)
     tables = [table(sample) for sample in people]
@@ -111,7 +111,7 @@ def test_standard_errors_of_the_table_are_those_of_repeated_populations(rng):
     assert (normal / deviations.std(axis=0) < 0.75)[0, 0]
 
 
-def test_measurement_noise_is_told_apart_from_differences_between_people(rng):
+def test_measurement_noise_is_separated_from_population_differences(rng):
     population = weyrich_2005()
     people = population.sample(5_000, rng=rng)
     noise = 0.05
@@ -136,7 +136,7 @@ def test_rows_have_the_papers_layout():
     assert rows[1][1] == ((0.9751, 0.0), (0.9831, 0.0), (1.2488, 0.0))
 
 
-def test_each_person_counts_once_whatever_the_number_of_repeats():
+def test_person_counts_once_for_any_number_of_repeats():
     made = [
         SiteMeasurement("a", "cheek", (0.5, 1.0, 1.5), (0.01, 0.01, 0.01)),
         *[SiteMeasurement("b", "cheek", (0.7, 1.2, 1.7), (0.01, 0.01, 0.01))] * 3,
@@ -179,7 +179,7 @@ def test_measurements_that_make_no_table_are_refused():
         table(np.ones((2, 3)))
 
 
-def test_moments_and_correlations_that_make_no_population_are_refused():
+def test_impossible_moments_and_correlations_are_refused():
     ones = np.ones((1, 2))
     with pytest.raises(PopulationError, match="mean_per_mm: got 0"):
         TranslucencyPopulation(0 * ones, ones, ("a",), ("x", "y"))

@@ -5,7 +5,7 @@ import numpy as np
 from model.vectors import unit_vectors
 
 
-def test_unit_vectors_keep_type_and_have_length_one():
+def test_unit_vectors_keep_type_and_unit_length():
     found = unit_vectors(np.array([[3.0, 0.0, 4.0], [0.0, 0.0, 1e-3]], np.float32))
     assert found.dtype == np.float32
     np.testing.assert_allclose(np.linalg.norm(found, axis=-1), 1.0, rtol=1e-6)

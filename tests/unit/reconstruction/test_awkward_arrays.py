@@ -98,7 +98,7 @@ def skin(rng):
 
 
 @pytest.mark.parametrize(("color", "noise"), [(None, np.nan), (None, np.inf), (5e-324, None)])
-def test_a_pixel_whose_noise_is_no_number_spoils_no_others_error(skin, color, noise):
+def test_pixel_with_nan_noise_keeps_other_errors(skin, color, noise):
     variance, valid = np.full(skin.shape, 1e-5), np.ones(skin.shape[:2], bool)
     without = valid.copy()
     without[20, 20] = False
@@ -111,7 +111,7 @@ def test_a_pixel_whose_noise_is_no_number_spoils_no_others_error(skin, color, no
 
 
 @pytest.mark.parametrize("noise", [np.nan, np.inf])
-def test_a_pixel_whose_noise_is_no_number_spoils_no_others_misplacement(skin, noise):
+def test_pixel_with_nan_noise_keeps_other_misplacements(skin, noise):
     rows, columns = np.indices(skin.shape[:2])
     place = np.stack([columns, rows], axis=-1).astype(np.float32)
     off, there = np.full(skin.shape[:2], 0.2, np.float32), np.ones(skin.shape[:2], bool)
@@ -127,7 +127,7 @@ def test_a_pixel_whose_noise_is_no_number_spoils_no_others_misplacement(skin, no
     assert found[10, 10, 0, 0] > 0.0
 
 
-def test_places_that_are_no_numbers_are_refused_by_name(rng):
+def test_nan_positions_are_refused_by_name(rng):
     grid = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0)), -1).reshape(-1, 2)
     for place in range(2):
         given = [grid.copy(), grid + 0.1 * rng.normal(size=grid.shape)]
@@ -155,14 +155,14 @@ def test_a_sample_without_a_time_is_left_out():
 
 
 @pytest.mark.parametrize(("cycle_s", "change_s"), [(0.0, None), (np.nan, None), (10.0, 10.0)])
-def test_a_cycle_without_both_changes_is_refused_by_name(cycle_s, change_s):
+def test_cycle_without_both_changes_is_refused_by_name(cycle_s, change_s):
     with pytest.raises(CurveError, match=r"c(ycle|hange)_s"):
         perfusion_fit.fit_cycle(*cycle(), cycle_s=cycle_s, change_s=change_s)
 
 
 @pytest.mark.parametrize("part", [0, 1, 2])
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_a_place_that_is_no_number_has_the_ratio_of_the_others(rng, part, bad):
+def test_nan_position_gets_ratio_of_others(rng, part, bad):
     given = [1.5 * rng.random(30), rng.random(30), np.full(30, 1e-4)]
     held = np.ones(30, bool)
     without = held.copy()

@@ -29,7 +29,7 @@ def scene():
 
 
 @pytest.mark.parametrize("extinction", [None, np.inf, 1000.0, 20.0, (50.0, 200.0, 10.0)])
-def test_parts_are_recovered_exactly_whatever_the_films_leak(scene, extinction):
+def test_polarization_separation_is_exact_for_any_polarizer_leakage(scene, extinction):
     diffuse, specular = scene
     leak = 0.0 if extinction is None else 1.0 / np.asarray(extinction)
     out = separate(specular + diffuse / 2, leak * specular + diffuse / 2, extinction=extinction)
@@ -68,7 +68,7 @@ def test_partly_polarized_diffuse_light_is_taken_into_account(angle_deg, towards
     np.testing.assert_allclose(out.specular, specular, rtol=1e-9)
 
 
-def test_without_normals_the_specular_part_is_wrong_off_axis():
+def test_specular_without_normals_is_wrong_off_axis():
     """The test above can fail: at 60 degrees, parallel minus crossed is far from specular."""
     normal = tilted(np.deg2rad(60.0), VERTICAL)
     t_s, t_p = fresnel_transmittance(normal[2], 1.4)
@@ -78,7 +78,7 @@ def test_without_normals_the_specular_part_is_wrong_off_axis():
     assert out.specular[0, 0, 0] > 0.02
 
 
-def test_polarized_light_that_enters_is_corrected_to_unpolarized_light():
+def test_incident_polarized_light_is_corrected_to_unpolarized():
     """A surface tilted sideways under vertically polarized light receives the s part only."""
     normal = tilted(np.deg2rad(50.0), HORIZONTAL)
     t_s, t_p = fresnel_transmittance(normal[2], 1.4)
@@ -95,7 +95,7 @@ def test_polarized_light_that_enters_is_corrected_to_unpolarized_light():
     np.testing.assert_allclose(out.specular, 0.1, rtol=1e-9)
 
 
-def test_two_lights_share_the_correction_by_their_cosines():
+def test_two_lights_are_corrected_weighted_by_cosines():
     angle = np.deg2rad(14.0)
     lights = np.array([tilted(angle, HORIZONTAL), tilted(angle, -HORIZONTAL)])
     normal = tilted(np.deg2rad(40.0), HORIZONTAL).reshape(1, 1, 3)
@@ -111,7 +111,7 @@ def test_two_lights_share_the_correction_by_their_cosines():
 @pytest.mark.parametrize(
     ("half_angle_deg", "leak"), [(7.5, 1.5e-4), (15.0, 2.5e-3), (20.0, 8e-3), (30.0, 4.6e-2)]
 )
-def test_specular_light_out_of_the_planes_of_symmetry_leaks_into_crossed(half_angle_deg, leak):
+def test_specular_outside_symmetry_planes_leaks_into_crossed_image(half_angle_deg, leak):
     """Rationale: light polarized at 45 degrees to the plane of incidence comes back turned.
 
     Expected: leaks of the polarized reference renderings at these half angles, to 7 %.
@@ -130,7 +130,7 @@ def test_specular_light_out_of_the_planes_of_symmetry_leaks_into_crossed(half_an
     np.testing.assert_allclose(found, leak, rtol=0.07)
 
 
-def test_lights_in_the_plane_of_the_axes_do_not_leak():
+def test_lights_in_axis_planes_do_not_leak():
     flat = np.full((1, 1, 3), 0.5)
     out = separate(flat, 0.01 * flat, light_dir=tilted(0.5, HORIZONTAL), view_dir=(0, 0, 1))
     np.testing.assert_allclose(out.diffuse, 0.01, rtol=1e-9)
@@ -156,7 +156,7 @@ def test_stated_errors_are_those_of_repeated_images(scene):
         assert ratio.mean() == pytest.approx(1.0, abs=0.01)
 
 
-def test_the_error_of_the_leak_enters_as_its_derivative(scene):
+def test_leak_error_propagates_by_its_derivative(scene):
     diffuse, specular = scene
     parallel, crossed = specular + diffuse / 2, specular / 30 + diffuse / 2
     step = 1e-6
@@ -175,7 +175,7 @@ def test_the_error_of_the_leak_enters_as_its_derivative(scene):
     )
 
 
-def test_saturated_masked_and_undefined_pixels_are_masked_and_not_a_number(scene):
+def test_saturated_masked_or_undefined_pixels_are_masked_nan(scene):
     diffuse, specular = (part.copy() for part in scene)
     parallel, crossed = specular + diffuse / 2, diffuse / 2
     parallel[0, 0, 1] = 5.0
@@ -195,7 +195,7 @@ def test_saturated_masked_and_undefined_pixels_are_masked_and_not_a_number(scene
     np.testing.assert_array_equal(parallel, before)
 
 
-def test_a_surface_turned_away_is_masked():
+def test_surface_facing_away_is_masked():
     normals = np.array([[[0, 0, 1.0], [0, 0, -1.0], [1.0, 0, 0]]])
     flat = np.full((1, 3, 3), 0.3)
     out = separate(flat, flat / 2, normals=normals, view_dir=(0, 0, 1))
@@ -261,7 +261,7 @@ def test_images_that_do_not_fit_are_refused():
         PolarizerAxes(crossed=(0.0, 1.0, 0.0))
 
 
-def test_a_variance_without_bounds_masks_its_pixel_and_warns_nobody():
+def test_infinite_variance_masks_its_pixel_without_warning():
     parallel, crossed = np.full((2, 2, 3), 0.5), np.full((2, 2, 3), 0.25)
     parallel[0, 0] = crossed[0, 0]  # no specular part
     for bad in (np.inf, np.nan):

@@ -15,7 +15,7 @@ def test_results_come_in_the_order_of_the_tiles(threads):
     assert results == [n * n for n in range(20)]
 
 
-def test_no_more_tiles_are_taken_than_the_window_allows():
+def test_tile_queue_never_exceeds_its_window():
     taken = []
 
     def tiles():
@@ -29,7 +29,7 @@ def test_no_more_tiles_are_taken_than_the_window_allows():
         assert len(taken) <= 3
 
 
-def test_an_error_in_one_tile_is_passed_on():
+def test_error_in_a_tile_is_propagated():
     with ThreadPoolExecutor(1) as pool, pytest.raises(ZeroDivisionError):
         list(map_tiles(lambda n: 1 // n, [1, 0, 1], executor=pool))
 

@@ -51,7 +51,7 @@ def test_the_mean_is_linear_in_the_light(ideal, rng, level):
 
 
 @pytest.mark.parametrize("level", [0.0, 0.003, 0.05, 0.3, 0.9])
-def test_the_variance_lies_on_the_photon_transfer_line(ideal, rng, level):
+def test_variance_follows_photon_transfer_line(ideal, rng, level):
     dn = expose(gray(level), sensor=ideal, rng=rng).astype(np.float64)
     scale, offset = ideal.noise_profile()
     expected = (scale * level + offset) * 16_000.0**2
@@ -61,7 +61,7 @@ def test_the_variance_lies_on_the_photon_transfer_line(ideal, rng, level):
     assert low < chi2 < high
 
 
-def test_the_line_is_missed_when_the_gain_is_wrong_by_a_tenth(ideal, rng):
+def test_gain_error_of_a_tenth_misses_transfer_line(ideal, rng):
     dn = expose(gray(0.3), sensor=ideal, rng=rng).astype(np.float64)
     wrong = dataclasses.replace(ideal, gain_e_per_dn=2.75)
     scale, offset = wrong.noise_profile()
@@ -84,7 +84,7 @@ def test_saturated_pixels_all_read_the_white_level(ideal, rng):
     assert (expose(gray(1e6), sensor=ideal, rng=rng) == 16_383).all()
 
 
-def test_the_black_level_keeps_the_lower_half_of_the_read_noise(ideal, rng):
+def test_black_level_keeps_lower_half_of_read_noise(ideal, rng):
     dn = expose(gray(0.0), sensor=ideal, rng=rng)
     assert dn.min() < 383 < dn.max()
     # A clipped or rectified sensor has no symmetric noise about its black level.
@@ -99,7 +99,7 @@ def test_the_converter_never_leaves_its_range(ideal, rng):
     assert dn.max() <= 16_383
 
 
-def test_pixel_responses_differ_by_the_prnu_and_are_the_same_in_every_frame(ideal, rng):
+def test_pixel_responses_differ_by_prnu_equally_every_frame(ideal, rng):
     uneven = dataclasses.replace(ideal, prnu=0.02, read_noise_e=0.0)
     frames = [
         expose(gray(0.9, (64, 64)), sensor=uneven, rng=rng).astype(np.float64) for _ in range(64)
@@ -113,7 +113,7 @@ def test_pixel_responses_differ_by_the_prnu_and_are_the_same_in_every_frame(idea
     assert abs(unlike) < stats.norm.isf(FALSE_ALARM / 2) / 64.0
 
 
-def test_vignetting_takes_the_stated_part_in_the_corner_and_none_in_the_middle(ideal, rng):
+def test_vignetting_dims_corner_as_stated_and_not_center(ideal, rng):
     dark_corners = dataclasses.replace(ideal, vignetting=0.3)
     dn = expose(gray(0.8, (201, 301)), sensor=dark_corners, rng=rng).astype(np.float64) - 383.0
     corner = np.mean([dn[:4, :4], dn[-4:, :4], dn[:4, -4:], dn[-4:, -4:]])
@@ -130,12 +130,12 @@ def test_vignetting_takes_the_stated_part_in_the_corner_and_none_in_the_middle(i
         ("GBRG", [[2, 3], [1, 2]]),
     ],
 )
-def test_the_mosaic_repeats_the_cell_from_the_top_left(cfa, cell):
+def test_mosaic_repeats_cell_from_top_left(cfa, cell):
     flat = np.broadcast_to(np.array([1.0, 2.0, 3.0], np.float32), (4, 6, 3))
     np.testing.assert_array_equal(mosaic(flat, cfa), np.tile(cell, (2, 3)))
 
 
-def test_the_same_seed_gives_the_same_frame_and_another_seed_another(ideal):
+def test_same_seed_gives_same_frame_another_seed_another(ideal):
     light = gray(0.4)
     before = light.copy()
     frames = [expose(light, sensor=ideal, rng=np.random.default_rng(seed)) for seed in (1, 1, 2)]
@@ -144,7 +144,7 @@ def test_the_same_seed_gives_the_same_frame_and_another_seed_another(ideal):
     np.testing.assert_array_equal(light, before)
 
 
-def test_the_sensor_of_a_view_saturates_at_its_full_well():
+def test_view_sensor_saturates_at_full_well():
     view = load_rig("flash").view("cam")
     sensor = sensor_of(view)
     electrons = sensor.gain_e_per_dn * (sensor.white - sensor.black)

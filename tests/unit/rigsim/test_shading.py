@@ -42,7 +42,7 @@ def test_average_transmittance_equals_the_exact_external_fresnel_averages():
     np.testing.assert_allclose(got, expected, atol=1e-6)
 
 
-def test_light_polarized_in_the_plane_of_incidence_enters_fully_at_brewsters_angle():
+def test_p_polarized_light_enters_fully_at_brewster_angle():
     angle = math.atan(1.4)
     light = unit(math.sin(angle), 0.0, math.cos(angle))
     # The plane of incidence is y = 0: a film that absorbs along y passes only light in it.
@@ -50,7 +50,7 @@ def test_light_polarized_in_the_plane_of_incidence_enters_fully_at_brewsters_ang
     np.testing.assert_allclose(entry, 0.5, rtol=1e-6)
 
 
-def test_reflection_at_brewsters_angle_is_polarized_across_the_plane_of_incidence():
+def test_reflection_at_brewster_angle_is_s_polarized():
     angle = math.atan(1.4)
     light = unit(math.sin(angle), 0.0, math.cos(angle))
     camera = unit(-math.sin(angle), 0.0, math.cos(angle))
@@ -61,7 +61,7 @@ def test_reflection_at_brewsters_angle_is_polarized_across_the_plane_of_incidenc
     np.testing.assert_allclose(stokes[1:] / stokes[0], [-1.0, 0.0], atol=1e-5)
 
 
-def test_the_highlight_at_normal_incidence_is_the_closed_form_and_keeps_its_polarization():
+def test_highlight_at_normal_incidence_keeps_closed_form_polarization():
     alpha, eta = 0.3, 1.4
     stokes = shading.specular_stokes(
         Z, Z, Z, alpha, eta=eta, light_absorbs=HORIZONTAL, image_right=RIGHT
@@ -72,7 +72,7 @@ def test_the_highlight_at_normal_incidence_is_the_closed_form_and_keeps_its_pola
     np.testing.assert_allclose(stokes, [expected, -expected, 0.0], rtol=1e-5, atol=1e-9)
 
 
-def test_a_highlight_vanishes_behind_the_crossed_analyser_but_for_what_the_films_leak():
+def test_highlight_behind_crossed_analyzer_is_only_polarizer_leak():
     stokes = shading.specular_stokes(
         Z, Z, Z, 0.3, eta=1.4, light_absorbs=HORIZONTAL, image_right=RIGHT, extinction=2000.0
     )
@@ -89,7 +89,7 @@ def test_a_highlight_vanishes_behind_the_crossed_analyser_but_for_what_the_films
     assert passed[0.0] / passed[90.0] == pytest.approx(2.0 * leak / (1.0 + leak**2), rel=1e-3)
 
 
-def test_the_analyser_follows_malus_law():
+def test_analyzer_follows_malus_law():
     stokes = np.array([[1.0, -1.0, 0.0]], np.float32)  # fully polarized along the vertical
     angles = np.linspace(0.0, 180.0, 13)
     got = [
@@ -99,7 +99,7 @@ def test_the_analyser_follows_malus_law():
     np.testing.assert_allclose(got, np.sin(np.deg2rad(angles)) ** 2, atol=1e-6)
 
 
-def test_mirror_image_of_the_setup_gives_the_mirrored_stokes_vector():
+def test_mirrored_setup_gives_mirrored_stokes_vector():
     normal, light, camera = unit(0.1, 0.2, 1.0), unit(0.5, -0.1, 0.9), unit(-0.2, 0.3, 0.9)
     flip = np.array([-1.0, 1.0, 1.0], np.float32)
     kwargs = {"eta": 1.4, "light_absorbs": VERTICAL, "image_right": RIGHT}
@@ -129,7 +129,7 @@ def rng_directions() -> np.ndarray:
 
 
 @pytest.mark.parametrize("alpha", [0.1, 0.3, 0.6])
-def test_the_rough_surface_reflects_no_more_than_it_gets(alpha):
+def test_rough_surface_reflects_no_more_than_received(alpha):
     light = unit(0.6, 0.2, 0.7)
     camera = hemisphere(256)
     stokes = shading.specular_stokes(
@@ -140,7 +140,7 @@ def test_the_rough_surface_reflects_no_more_than_it_gets(alpha):
     assert 0.005 * received < reflected < 0.2 * received
 
 
-def test_a_white_interior_scaled_for_normal_incidence_returns_all_of_it():
+def test_white_interior_scaled_for_normal_incidence_returns_everything():
     """Furnace: kd = interior_scale gives total diffuse reflectance 1 for normal incidence."""
     camera = hemisphere(256)
     leaving = shading.exit_stokes(Z, camera, eta=1.4, image_right=RIGHT)[:, 0]

@@ -52,12 +52,12 @@ def test_tab_completes_names(words, expected):
         (completion.sizes, "f", "full"),
     ],
 )
-def test_what_is_offered_begins_with_what_is_typed(complete, typed, one):
+def test_completions_begin_with_typed_text(complete, typed, one):
     found = complete(typed)
     assert one in found
     assert all(name.startswith(typed) for name in found)
     assert complete("zz") == []
 
 
-def test_a_name_is_not_offered_twice_in_a_list():
+def test_name_is_completed_once_per_list():
     assert "flash,flash" not in completion.several_rigs("flash,")

@@ -17,13 +17,13 @@ def test_json_is_the_only_thing_on_stdout(capsys):
     assert "working" in err
 
 
-def test_a_person_reads_results_on_stdout_and_no_json(capsys):
+def test_results_on_stdout_are_readable_without_json(capsys):
     console = Console()
     console.say("done")
     console.document("skinrig.x/1", {})
     assert capsys.readouterr().out == "done\n"
 
 
-def test_a_table_has_a_dash_where_there_is_no_number(capsys):
+def test_table_has_dash_for_missing_number(capsys):
     Console().rows(("what", "share, %"), [("known", 71.239), ("unknown", float("nan"))])
     assert capsys.readouterr().out.splitlines()[1:] == ["known    71.24", "unknown  –"]

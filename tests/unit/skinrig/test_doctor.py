@@ -23,14 +23,14 @@ def producers():
     ]
 
 
-def test_the_producers_of_industrial_cameras_are_told(with_harvesters, tmp_path, monkeypatch):
+def test_producers_of_industrial_cameras_are_reported(with_harvesters, tmp_path, monkeypatch):
     (tmp_path / "maker.cti").touch()
     monkeypatch.setenv("GENICAM_GENTL64_PATH", str(tmp_path))
     (finding,) = producers()
     assert (finding.state, finding.mend) == ("maker.cti", "")
 
 
-def test_where_there_are_none_it_says_what_to_set(with_harvesters, monkeypatch):
+def test_missing_producers_report_variable_to_set(with_harvesters, monkeypatch):
     monkeypatch.delenv("GENICAM_GENTL64_PATH", raising=False)
     (finding,) = producers()
     assert finding.state == "none"

@@ -26,7 +26,7 @@ def test_each_kind_of_failure_has_its_exit_code(error, code):
     assert errors.exit_code(error) == code
 
 
-def test_a_fault_of_ours_is_owned_up_to_in_one_line():
+def test_internal_fault_is_admitted_in_single_line():
     text = errors.sentence(ZeroDivisionError("division by zero"))
     assert "fault of skinrig" in text
     assert "\n" not in text
@@ -44,13 +44,13 @@ def test_a_fault_of_ours_is_owned_up_to_in_one_line():
         (OSError(28, "No space left on device", "out"), "free space"),
     ],
 )
-def test_what_the_system_refuses_is_told_with_the_file_and_what_to_do(error, words):
+def test_system_refusal_is_reported_with_file_and_remedy(error, words):
     text = errors.sentence(error)
     assert text.startswith(f"{error.filename}: {error.strerror}")
     assert words in text
 
 
-def test_a_file_that_is_no_text_is_told_without_the_words_of_a_codec():
+def test_non_text_file_is_reported_without_codec_terms():
     with pytest.raises(UnicodeDecodeError) as caught:
         b"ok\xff".decode()
     assert errors.sentence(caught.value) == (
@@ -58,6 +58,6 @@ def test_a_file_that_is_no_text_is_told_without_the_words_of_a_codec():
     )
 
 
-def test_a_full_disk_that_names_no_file_is_told_without_a_number():
+def test_full_disk_without_file_is_reported_without_errno():
     text = errors.sentence(OSError(28, "No space left on device"))
     assert text.startswith("No space left on device; free space")

@@ -39,7 +39,7 @@ def read_only(monkeypatch):
     return make
 
 
-def test_nothing_is_changed_where_the_installation_or_the_home_can_be_written(tmp_path, read_only):
+def test_cache_is_unchanged_with_writable_installation_or_home(tmp_path, read_only):
     home, packages = tmp_path / "home", tmp_path / "packages"
     home.mkdir()
     packages.mkdir()
@@ -50,14 +50,14 @@ def test_nothing_is_changed_where_the_installation_or_the_home_can_be_written(tm
     assert told == {"HOME": str(home)}
 
 
-def test_a_place_that_was_named_is_kept(read_only):
+def test_named_cache_folder_is_kept(read_only):
     read_only("/")
     told = {"HOME": "/nowhere", "NUMBA_CACHE_DIR": "/kernels"}
     assert kernel_cache.provide(told) is None
     assert told["NUMBA_CACHE_DIR"] == "/kernels"
 
 
-def test_no_other_user_can_write_the_place(tmp_path, read_only):
+def test_cache_folder_is_not_writable_by_other_users(tmp_path, read_only):
     read_only(tmp_path)
     told = {"HOME": str(tmp_path)}
     place = kernel_cache.provide(told, tmp_path)
@@ -66,7 +66,7 @@ def test_no_other_user_can_write_the_place(tmp_path, read_only):
     assert kernel_cache.provide({"HOME": str(tmp_path)}, tmp_path) != place
 
 
-def test_kernels_compile_and_are_kept_there_until_the_process_ends(tmp_path):
+def test_kernels_are_cached_until_process_ends(tmp_path):
     told = {**os.environ, "HOME": "/proc", "XDG_CACHE_HOME": "/proc/none"}
     told.pop("NUMBA_CACHE_DIR", None)
     script = tmp_path / "script.py"

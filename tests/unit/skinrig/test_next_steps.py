@@ -55,7 +55,7 @@ def test_photographs_are_imported():
     assert commands()[0].startswith("skinrig import photos .")
 
 
-def test_a_session_of_skin_is_reconstructed_with_its_own_calibration():
+def test_skin_session_is_reconstructed_with_own_calibration():
     session(Path("session-a"), "dome", ("dark", "olat"))
     Path("calibration-dome").mkdir()
     Path("calibration-flash").mkdir()
@@ -65,26 +65,26 @@ def test_a_session_of_skin_is_reconstructed_with_its_own_calibration():
     )
 
 
-def test_a_target_is_not_reconstructed_as_if_it_were_skin():
+def test_target_is_not_reconstructed_as_skin():
     session(Path("session-white"), "dome", ("dark", "white"))
     session(Path("session-tile"), "flash", target="white")
     assert not any("reconstruct" in command for command in commands())
 
 
-def test_what_has_maps_already_is_looked_at():
+def test_session_with_maps_is_viewed_next():
     session(Path("session-a"))
     appearance(Path("appearance"), "session-a")
     assert [command.split()[1] for command in commands()] == ["report", "view", "export"]
 
 
-def test_a_whole_face_is_viewed_before_a_patch_and_never_a_truth():
+def test_whole_face_is_viewed_before_patch_never_truth():
     appearance(Path("truth-a"), kind="truth", files=("mesh.obj",))
     appearance(Path("a-patch"))
     appearance(Path("b-face"), files=("mesh.obj",))
     assert "skinrig view b-face" in commands()
 
 
-def test_a_face_whose_blood_moves_is_viewed_and_one_with_a_mesh_exported():
+def test_dynamic_face_is_viewed_and_mesh_face_exported():
     appearance(Path("a-face"), files=("mesh.obj",))
     appearance(Path("b-moving"), kind="dynamic", files=("facial_color.json",))
     assert "skinrig view b-moving" in commands()
@@ -107,7 +107,7 @@ def test_a_demo_below_is_found():
     assert f"{OPEN_COMMAND} {Path('demo/report.html')}" in text
 
 
-def test_a_live_page_and_a_page_of_others_are_no_reports():
+def test_live_or_foreign_pages_are_not_reports():
     session(Path("session-a"))
     live = report_page().replace("img-src data:;", "script-src 'sha256-x'; img-src data:;")
     Path("face.html").write_text(live)
@@ -117,7 +117,7 @@ def test_a_live_page_and_a_page_of_others_are_no_reports():
     assert scan(Path()).reports == (Path("zone.html"),)
 
 
-def test_damaged_documents_do_not_stop_it():
+def test_damaged_documents_do_not_stop_next_steps():
     Path("session-a").mkdir()
     Path("session-a/session.json").write_bytes(b"\xff{")
     Path("appearance").mkdir()
@@ -141,7 +141,7 @@ def test_nothing_typed_prints_the_next_steps(capsys):
     assert "skinrig demo" in capsys.readouterr().out
 
 
-def test_a_path_with_spaces_is_quoted_so_that_the_command_can_be_pasted():
+def test_path_with_spaces_is_quoted_for_pasting():
     folder = Path("an o'clock")
     folder.mkdir()
     session(folder / "my face")
@@ -159,7 +159,7 @@ def test_a_path_with_spaces_is_quoted_so_that_the_command_can_be_pasted():
         assert not {"my", "o'clock"} & set(words), command
 
 
-def test_a_photograph_of_a_captured_tile_is_no_skin():
+def test_photograph_of_captured_tile_is_not_skin():
     session(Path("session-tile"))
     document = json.loads(Path("session-tile/session.json").read_text())
     document["plan"]["steps"] = [{"kind": "subject", "index": {"state": "white"}}]

@@ -26,11 +26,11 @@ def product(tmp_path):
     return tmp_path
 
 
-def test_kernels_that_are_newer_than_all_they_call_stay(product):
+def test_kernels_newer_than_all_callees_are_kept(product):
     assert remove_stale_kernels(product) == []
 
 
-def test_a_changed_part_takes_its_own_kernels_and_its_callers_away(product):
+def test_changed_part_removes_own_and_caller_kernels(product):
     os.utime(product / "model" / "part.py", (3000, 3000))
     removed = {path.name.partition(".")[0] for path in remove_stale_kernels(product)}
     assert removed == {"part", "whole"}

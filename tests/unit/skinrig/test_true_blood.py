@@ -22,7 +22,7 @@ SPREAD = ("hemoglobin_blurred", "hemoglobin_blurred_at_rest")
         ("smile", ("hemoglobin",), None),
     ],
 )
-def test_blood_is_taken_as_light_spreads_in_all_states_or_in_none(state, names, taken):
+def test_true_blood_is_scattered_consistently_across_states(state, names, taken):
     maps = {
         name: SkinMap(np.full((2, 2), number, np.float32), MAP_UNITS["hemoglobin"])
         for number, name in enumerate(names)

@@ -51,7 +51,7 @@ def test_less_light_is_reflected_than_falls_in(roughness, angle):
         assert total == pytest.approx(F0, rel=0.25)
 
 
-def test_a_smooth_surface_reflects_fresnels_share_from_the_front():
+def test_smooth_surface_has_fresnel_reflectance_at_normal_incidence():
     way, weight = _hemisphere(400, 16)
     total = float(np.sum(weight * kelemen([0.0, 0.0, 1.0], way, [0.0, 0.0, 1.0], 0.05)))
     assert total == pytest.approx(F0, rel=0.02)

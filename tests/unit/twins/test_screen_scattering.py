@@ -37,7 +37,7 @@ def _largest_error_at_an_edge(px_per_mm, slope):
 
 @pytest.mark.parametrize("px_per_mm", [0.5, 1.0, 2.0, 4.0, 8.0])
 @pytest.mark.parametrize("slope", [0.0, 1.0])
-def test_an_edge_of_light_spreads_as_the_gaussians_say_at_any_size(px_per_mm, slope):
+def test_light_edge_spreads_as_gaussians_at_any_size(px_per_mm, slope):
     # 2 %: the narrowest Gaussian is a quarter of a pixel to two pixels wide
     assert _largest_error_at_an_edge(px_per_mm, slope) < 0.02
 
@@ -47,7 +47,7 @@ def test_the_edge_shows_when_interpolation_is_not_undone(monkeypatch):
     assert _largest_error_at_an_edge(1.0, 0.0) > 0.04
 
 
-def test_even_light_stays_as_it_is_up_to_the_outline():
+def test_uniform_light_is_unchanged_up_to_outline():
     depth = np.zeros((40, 40))
     depth[8:32, 5:30] = DEPTH_MM + np.arange(25)
     out = scatter(
@@ -61,7 +61,7 @@ def test_even_light_stays_as_it_is_up_to_the_outline():
     assert np.all(out[depth == 0.0] == 0.0)
 
 
-def test_light_does_not_leak_across_a_step_of_depth():
+def test_light_does_not_leak_across_depth_step():
     depth = np.full((9, 60), DEPTH_MM)
     light = np.zeros((9, 60, 3))
     light[:, :30] = 1.0
@@ -88,7 +88,7 @@ def test_a_wider_skin_spreads_light_further():
     assert widths[0] < widths[1] < widths[2]
 
 
-def test_a_measured_albedo_is_blurred_twice_by_all_but_post_scatter_texturing():
+def test_measured_albedo_blurs_twice_except_post_scatter_texturing():
     x = np.arange(81)
     albedo = np.repeat((0.4 + 0.1 * np.sin(0.6 * x))[None, :, None], 3, axis=2).repeat(5, axis=0)
     depth = np.full((5, 81), DEPTH_MM)

@@ -12,14 +12,14 @@ def test_srgb_is_continuous_where_its_pieces_meet():
     assert high - low == pytest.approx(0.0, abs=1e-6)
 
 
-def test_srgb_decodes_to_what_was_encoded():
+def test_srgb_decodes_to_encoded_value():
     linear = np.linspace(0.0, 1.0, 101)
     code = srgb_encoded(linear)
     back = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
     np.testing.assert_allclose(back, linear, atol=2e-6)  # the standard's own rounding
 
 
-def test_filmic_keeps_black_and_order_and_rolls_highlights_off():
+def test_filmic_keeps_black_and_order_rolling_off_highlights():
     x = np.linspace(0.0, 20.0, 2001)
     y = filmic(x)
     assert y[0] == pytest.approx(0.0, abs=1e-15)

@@ -111,7 +111,7 @@ def check_frames(bench):
         assert bench.session.read(record).cfa[3, 0] == view
 
 
-def test_every_frame_is_lit_by_its_own_light_and_says_so(make):
+def test_frames_are_lit_by_their_recorded_light(make):
     bench = make()
     done = bench.run()
     assert (done.steps, done.frames) == (len(bench.plan.steps), 2 * len(bench.plan.steps))
@@ -127,7 +127,7 @@ def test_every_frame_is_lit_by_its_own_light_and_says_so(make):
     assert verify(bench.session.path).ok
 
 
-def test_a_frame_is_exposed_in_the_steady_part_of_its_row(make):
+def test_frame_is_exposed_in_steady_part_of_row(make):
     bench = make()
     seen = []
     bench.world.scene.exposure = lambda view, *, pops, exposure_s, seed: (
@@ -141,7 +141,7 @@ def test_a_frame_is_exposed_in_the_steady_part_of_its_row(make):
 
 
 @pytest.mark.long
-def test_a_full_plan_takes_about_25_seconds_of_the_rig(make):
+def test_full_plan_takes_about_25_seconds_of_rig(make):
     rig = DOME.subset(views=["C00"]).resized(16)
     bench = make(plan=dome_plan(rig), rig=rig)
     bench.run(eyes="open")
@@ -160,7 +160,7 @@ def test_a_full_plan_takes_about_25_seconds_of_the_rig(make):
     ],
     ids=lambda faults: next(iter(faults)),
 )
-def test_whatever_goes_wrong_every_kept_frame_is_the_right_one(make, faults):
+def test_kept_frames_are_correct_under_any_fault(make, faults):
     bench = make(**faults)
     done = bench.run()
     assert bench.session.todo() == []
@@ -171,7 +171,7 @@ def test_whatever_goes_wrong_every_kept_frame_is_the_right_one(make, faults):
         assert done.stale > 0
 
 
-def test_a_row_is_kept_with_all_its_cameras_or_taken_again(make):
+def test_row_is_kept_with_all_cameras_or_retaken(make):
     bench = make(drop_frame=0.06)
     bench.run()
     tries = {}
@@ -182,7 +182,7 @@ def test_a_row_is_kept_with_all_its_cameras_or_taken_again(make):
     assert {max(one) for one in tries.values()} > {1}
 
 
-def test_a_missed_pulse_does_not_give_frames_to_the_wrong_light(make):
+def test_missed_pulse_never_assigns_frames_to_wrong_light(make):
     bench = make()
     body = bench.world.camera("C05")
     honest, count = body.edge, itertools.count()
@@ -192,7 +192,7 @@ def test_a_missed_pulse_does_not_give_frames_to_the_wrong_light(make):
     check_frames(bench)
 
 
-def test_counting_instead_of_times_would_give_frames_to_the_wrong_light(make, monkeypatch):
+def test_frame_counting_would_assign_frames_to_wrong_light(make, monkeypatch):
     """The test above can fail: with rows told by counting it does."""
     bench = make()
     body = bench.world.camera("C05")
@@ -210,7 +210,7 @@ def test_counting_instead_of_times_would_give_frames_to_the_wrong_light(make, mo
         run_and_check()
 
 
-def test_a_dead_light_is_named_and_the_capture_goes_on(make):
+def test_dead_light_is_reported_and_capture_continues(make):
     number = 9
     bench = make(led_dead=str(number), led_weak="4=0.5")
     done = bench.run()
@@ -221,7 +221,7 @@ def test_a_dead_light_is_named_and_the_capture_goes_on(make):
         assert lit_in(bench.session, record)[0] == 0
 
 
-def test_the_rig_ends_dark_and_disarmed_and_a_second_run_takes_what_is_missing(make):
+def test_rig_ends_dark_disarmed_second_run_takes_missing(make):
     bench = make()
     asked = []
 
@@ -244,7 +244,7 @@ def test_the_rig_ends_dark_and_disarmed_and_a_second_run_takes_what_is_missing(m
     check_frames(bench)
 
 
-def test_a_lost_box_ends_dark_and_what_was_kept_is_safe(make):
+def test_lost_controller_ends_dark_keeps_captured_frames(make):
     bench = make(unplug_after=3.0)
     with pytest.raises(LinkLost):
         bench.run()
@@ -255,7 +255,7 @@ def test_a_lost_box_ends_dark_and_what_was_kept_is_safe(make):
     check_frames(bench)
 
 
-def test_the_subjects_dose_begins_with_the_session_and_goes_on_with_its_resumption(make):
+def test_subject_dose_starts_with_session_and_continues_resumed(make):
     bench = make()
     bench.unit.bank._dose_ws[:] = 7.0
     stops = iter([False, False, True, True])
@@ -267,7 +267,7 @@ def test_the_subjects_dose_begins_with_the_session_and_goes_on_with_its_resumpti
     assert bench.unit.bank.dose_ws(0) > after_first
 
 
-def test_a_row_that_one_camera_loses_three_times_ends_the_capture_dark(make):
+def test_row_lost_three_times_by_camera_ends_dark(make):
     bench = make()
     bench.world.camera("C05").edge = lambda now: None
     with pytest.raises(AcquisitionError, match=r"failed 3 times.*no frame was recorded"):
@@ -282,14 +282,14 @@ def flickering():
     return Plan("dome", plan.steps, plan.limits)
 
 
-def test_a_plan_that_flickers_is_refused_before_anything_is_sent_unless_eyes_are_safe():
+def test_flickering_plan_is_refused_beforehand_unless_eyes_safe():
     with pytest.raises(AcquisitionError, match=r"flicker.*nothing was lit"):
         check_safety(flickering(), DOME)
     check_safety(flickering(), DOME, eyes="closed")
     check_safety(dome_plan(DOME), DOME)
 
 
-def test_a_plan_beyond_the_dose_is_refused_before_anything_is_sent():
+def test_plan_beyond_dose_is_refused_before_sending():
     steps = [
         Step(
             f"S{k}",
@@ -314,7 +314,7 @@ def test_a_plan_beyond_the_dose_is_refused_before_anything_is_sent():
         ({"max_at_once": 5}, "6 lights at once"),
     ],
 )
-def test_a_plan_beyond_the_box_is_refused_before_anything_is_lit(make, change, match):
+def test_plan_beyond_controller_is_refused_before_light(make, change, match):
     bench = make()
     bench.box._limits = {**bench.box.limits, **change}
     with pytest.raises(AcquisitionError, match=match):
@@ -322,7 +322,7 @@ def test_a_plan_beyond_the_box_is_refused_before_anything_is_lit(make, change, m
     assert bench.world.switched == []
 
 
-def test_a_camera_that_cannot_be_released_is_refused_before_anything_is_lit(make):
+def test_camera_without_release_is_refused_before_light(make):
     bench = make()
     camera = bench.cameras["C05"]
     object.__setattr__(camera.info, "triggers", (Trigger.SOFTWARE,))
@@ -331,7 +331,7 @@ def test_a_camera_that_cannot_be_released_is_refused_before_anything_is_lit(make
     assert bench.world.switched == []
 
 
-def test_a_camera_whose_clock_cannot_be_compared_is_refused(make):
+def test_camera_with_incomparable_clock_is_refused(make):
     bench = make()
     camera = bench.cameras["C05"]
     honest = camera.clock_s
@@ -346,7 +346,7 @@ def test_a_camera_whose_clock_cannot_be_compared_is_refused(make):
     assert not bench.unit.lit
 
 
-def test_targets_are_put_into_their_places_one_after_the_other(make):
+def test_targets_are_positioned_in_succession(make):
     plan = dome_calibration_plan(RIG, "charuco", poses=3, darks=1)
     bench = make(plan=plan)
     asked = []
@@ -355,7 +355,7 @@ def test_targets_are_put_into_their_places_one_after_the_other(make):
     check_frames(bench)
 
 
-def test_targets_that_are_moved_at_once_are_not_lit_faster_than_open_eyes_may_see(make):
+def test_quickly_moved_targets_keep_light_safe_for_eyes(make):
     bench = make(dome_calibration_plan(RIG, "charuco", poses=6))
     refused = []
     judge = bench.box.arm_sequence
@@ -373,7 +373,7 @@ def test_targets_that_are_moved_at_once_are_not_lit_faster_than_open_eyes_may_se
     assert Code.FLICKER in refused  # else the poses came too slowly to show anything
 
 
-def test_what_flickers_when_taken_again_alone_is_taken_in_single_flashes(make, monkeypatch):
+def test_steps_flickering_when_retaken_use_single_flashes(make, monkeypatch):
     bench = make(plan=dome_plan(RIG, tracking_every=0, darks=0))
     kept = [step for step in bench.plan.steps if step.index["exposure"] == 0]
     eye = {light.name: light.position_mm[2] for light in RIG.lights}

@@ -149,7 +149,7 @@ def run(plan, session, box, camera, **more):
     )
 
 
-def test_every_step_is_committed_with_the_light_that_made_it(plan, session):
+def test_steps_are_committed_with_their_own_light(plan, session):
     log = []
     done = run(plan, session, Box(log), Camera())
     assert (done.steps, done.frames, done.retakes) == (5, 5, 0)
@@ -170,7 +170,7 @@ def test_the_subject_is_asked_once_for_each_state(plan, session):
 
 
 @pytest.mark.parametrize("fault", ["dropped", {"seq": 5}, {"t_start_s": -1.0}])
-def test_a_step_without_its_frame_is_shot_again_with_a_new_token(plan, session, fault):
+def test_step_without_frame_is_reshot_with_new_token(plan, session, fault):
     log = []
     done = run(plan, session, Box(log), Camera(spoil=[{}, fault]))
     assert (done.frames, done.retakes) == (5, 1)
@@ -178,7 +178,7 @@ def test_a_step_without_its_frame_is_shot_again_with_a_new_token(plan, session, 
     assert len(shots) == len(set(shots)) == 5
 
 
-def test_no_two_flashes_bear_one_token_though_steps_are_named_alike(plan, session, tmp_path):
+def test_flashes_never_reuse_token_despite_equal_step_names(plan, session, tmp_path):
     log = []
     with pytest.raises(LinkLost):
         run(plan, session, Box(log, fail_at=3), Camera())
@@ -188,7 +188,7 @@ def test_no_two_flashes_bear_one_token_though_steps_are_named_alike(plan, sessio
     assert all(len(token) <= 48 for token in tokens)
 
 
-def test_a_token_fits_the_box_however_long_the_steps_name_is(tmp_path):
+def test_token_fits_controller_for_any_step_name_length(tmp_path):
     steps = tuple(
         dataclasses.replace(step, id="S" * 63 + str(k))
         for k, step in enumerate(flash_plan(RIG, darks=0).steps)
@@ -203,7 +203,7 @@ def test_a_token_fits_the_box_however_long_the_steps_name_is(tmp_path):
     assert len(set(tokens)) == len(tokens) == 2
 
 
-def test_a_step_that_keeps_failing_ends_dark_with_what_was_captured(plan, session):
+def test_step_failing_repeatedly_ends_dark_keeps_captured_frames(plan, session):
     log = []
     with pytest.raises(AcquisitionError, match=r"failed 3 times.*--resume"):
         run(plan, session, Box(log), Camera(spoil=[{}, {}, *["dropped"] * 9]))
@@ -211,7 +211,7 @@ def test_a_step_that_keeps_failing_ends_dark_with_what_was_captured(plan, sessio
     assert len(session.frames()) == 2
 
 
-def test_a_lost_link_ends_dark_and_a_second_run_takes_only_what_is_missing(plan, session):
+def test_lost_link_ends_dark_second_run_takes_missing(plan, session):
     log = []
     with pytest.raises(LinkLost):
         run(plan, session, Box(log, fail_at=3), Camera())
@@ -233,7 +233,7 @@ def with_lag(seconds):
 
 
 @pytest.mark.parametrize("lag_s", [0.0, 0.025])
-def test_the_flash_waits_for_the_shutter_that_the_rig_file_describes(plan, session, lag_s):
+def test_flash_waits_for_shutter_described_in_rig_file(plan, session, lag_s):
     box = Box([])
     box.limits = {"power_max": 1.0, "sync_max_us": 50_000}
     camera = Camera()
@@ -244,9 +244,7 @@ def test_the_flash_waits_for_the_shutter_that_the_rig_file_describes(plan, sessi
 
 
 @pytest.mark.parametrize("limits", [{}, {"sync_max_us": 20_000}])
-def test_a_shutter_slower_than_the_box_waits_is_refused_before_a_frame_is_dark(
-    plan, session, limits
-):
+def test_shutter_slower_than_controller_wait_is_refused_first(plan, session, limits):
     box = Box([])
     box.limits = {"power_max": 1.0, **limits}
     with pytest.raises(AcquisitionError, match=r"shutter_lag_s.*nothing was fired"):
@@ -256,7 +254,7 @@ def test_a_shutter_slower_than_the_box_waits_is_refused_before_a_frame_is_dark(
     assert box.log == []
 
 
-def test_a_plan_beyond_the_boxs_limits_is_refused_before_anything_flashes(plan, session):
+def test_plan_beyond_controller_limits_is_refused_before_flash(plan, session):
     box = Box([])
     box.limits = {"power_max": 0.5}
     with pytest.raises(AcquisitionError, match="nothing was fired"):
@@ -264,7 +262,7 @@ def test_a_plan_beyond_the_boxs_limits_is_refused_before_anything_flashes(plan, 
     assert box.log == []
 
 
-def test_a_camera_that_is_not_the_rigs_is_refused_before_anything_flashes(plan, session):
+def test_camera_foreign_to_rig_is_refused_before_flash(plan, session):
     camera, log = Camera(), []
     camera.info = dataclasses.replace(camera.info, serial="ZZ")
     with pytest.raises(WrongCamera, match=r"got the camera ZZ, expected"):
@@ -272,7 +270,7 @@ def test_a_camera_that_is_not_the_rigs_is_refused_before_anything_flashes(plan, 
     assert log == []
 
 
-def test_a_missing_box_is_named_with_what_to_type(plan, session):
+def test_missing_controller_error_names_option_to_type(plan, session):
     with pytest.raises(AcquisitionError, match="--port flash=URL"):
         run_plan(plan, RIG, boxes={}, cameras={"cam": Camera()}, session=session)
 
@@ -283,7 +281,7 @@ def released_by(*triggers):
     return camera
 
 
-def test_a_camera_on_the_boxs_line_is_released_by_it_for_darks_too(plan, session):
+def test_camera_on_controller_line_is_released_for_darks(plan, session):
     camera, log = released_by(Trigger.EDGE), []
     camera.fire = lambda: pytest.fail("is not released by the computer")
     done = run(plan, session, Box(log), camera)
@@ -294,7 +292,7 @@ def test_a_camera_on_the_boxs_line_is_released_by_it_for_darks_too(plan, session
     assert "arm" not in log[: log.index(dark)]
 
 
-def test_a_camera_that_only_a_hand_releases_is_asked_for_clearly_and_waited_for(session, plan):
+def test_manually_released_camera_is_requested_clearly_and_awaited(session, plan):
     camera, asked, waited = released_by(Trigger.HAND), [], []
 
     def press(text):
@@ -315,7 +313,7 @@ def test_a_camera_that_only_a_hand_releases_is_asked_for_clearly_and_waited_for(
     assert [record.step_id for record in session.frames()] == ["D000"]
 
 
-def test_a_try_after_a_misfire_bears_the_runs_name_too(plan, session):
+def test_retry_after_misfire_carries_run_name(plan, session):
     log = []
     run(plan, session, Box(log), Camera(spoil=[{}, "dropped"]), run_id="run1")
     tokens = [entry.split()[1] for entry in log if entry.startswith("fire")]
@@ -323,7 +321,7 @@ def test_a_try_after_a_misfire_bears_the_runs_name_too(plan, session):
     assert tokens[:2] == ["run1.2.1.S000", "run1.2.2.S000"]
 
 
-def test_a_camera_that_the_box_cannot_release_is_refused_before_a_flash_is_lost(plan, session):
+def test_camera_unreleasable_by_controller_is_refused_before_flash(plan, session):
     camera, log = Camera(), []
     camera.info = dataclasses.replace(camera.info, triggers=(Trigger.SOFTWARE,))
     with pytest.raises(CameraError, match="hot folder"):

@@ -44,7 +44,7 @@ def _rewrite(path, change, *, reseal=True):
     path.write_text(json.dumps(document))
 
 
-def test_what_is_saved_is_loaded_again_number_for_number(calibration, tmp_path):
+def test_saved_calibration_is_loaded_exactly(calibration, tmp_path):
     store.save(calibration, tmp_path)
     loaded = store.load(tmp_path, "sensor")
     for name, quantity in calibration.values["N5100-1"].items():
@@ -59,7 +59,7 @@ def test_what_is_saved_is_loaded_again_number_for_number(calibration, tmp_path):
     assert loaded.notes == calibration.notes
 
 
-def test_saving_again_replaces_the_file_and_leaves_no_stale_map(calibration, tmp_path):
+def test_saving_again_replaces_file_without_stale_maps(calibration, tmp_path):
     store.save(calibration, tmp_path)
     second = Calibration(
         **{
@@ -88,7 +88,7 @@ def test_a_failed_write_keeps_the_old_calibration(calibration, tmp_path, monkeyp
     assert not list(tmp_path.glob("*.part*"))
 
 
-def test_a_calibration_of_another_rig_or_device_is_refused(calibration):
+def test_calibration_of_other_rig_or_device_is_refused(calibration):
     today = date(2026, 11, 21)
     assert store.require(calibration, rig="flash", serials=["N5100-1"], on_date=today)
     with pytest.raises(store.CalibrationMismatch, match="rig 'dome'"):
@@ -106,12 +106,12 @@ def test_a_calibration_outside_its_dates_is_refused(calibration, day):
     assert issubclass(store.CalibrationExpired, ValueError)
 
 
-def test_a_missing_kind_says_how_to_make_it(tmp_path):
+def test_missing_kind_error_names_calibration_command(tmp_path):
     with pytest.raises(store.CalibrationMissing, match="skinrig calibrate color"):
         store.load(tmp_path, "color")
 
 
-def test_one_altered_number_is_noticed(calibration, tmp_path):
+def test_single_altered_number_is_detected(calibration, tmp_path):
     path = store.save(calibration, tmp_path)
 
     def nudge(document):
@@ -122,7 +122,7 @@ def test_one_altered_number_is_noticed(calibration, tmp_path):
         store.load(tmp_path, "sensor")
 
 
-def test_one_altered_pixel_is_noticed(calibration, tmp_path):
+def test_single_altered_pixel_is_detected(calibration, tmp_path):
     store.save(calibration, tmp_path)
     exr = next(tmp_path.glob("*.exr"))
     other = Calibration(
@@ -152,7 +152,7 @@ def test_one_altered_pixel_is_noticed(calibration, tmp_path):
         (lambda d: d.update(source="guessed"), "measured"),
     ],
 )
-def test_a_broken_file_gives_one_named_error(calibration, tmp_path, change, says):
+def test_broken_file_gives_single_named_error(calibration, tmp_path, change, says):
     path = store.save(calibration, tmp_path)
     _rewrite(path, change)
     with pytest.raises(store.CalibrationDamaged, match=says):
@@ -160,7 +160,7 @@ def test_a_broken_file_gives_one_named_error(calibration, tmp_path, change, says
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[]", b"{}", b"[" * 100_000])
-def test_what_is_no_calibration_gives_a_named_error(tmp_path, content):
+def test_content_that_is_not_calibration_gives_named_error(tmp_path, content):
     (tmp_path / "color.json").write_bytes(content)
     with pytest.raises(store.CalibrationDamaged, match=r"color\.json"):
         store.load(tmp_path, "color")

@@ -69,7 +69,7 @@ def test_nothing_but_stale_frames_ends_in_a_timeout():
         next_frame(Queue([old] * 20), seq=0, not_before_s=10.0, want=WANT, timeout_s=1.0)
 
 
-def test_a_frame_of_another_camera_is_no_matter_of_waiting():
+def test_frame_of_other_camera_fails_without_waiting():
     with pytest.raises(cameras.WrongCamera):
         next_frame(
             Queue([dataclasses.replace(GOOD, serial="B2"), GOOD]),
@@ -81,7 +81,7 @@ def test_a_frame_of_another_camera_is_no_matter_of_waiting():
 
 
 @pytest.mark.parametrize("url", ["nonsense", "floppy:1", ""])
-def test_an_unknown_address_is_named_with_the_known_kinds(url):
+def test_unknown_address_error_lists_valid_kinds(url):
     with pytest.raises(cameras.CameraUrlError, match="hotfolder"):
         cameras.open_camera(url)
 
@@ -126,7 +126,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_a_file_counts_once_it_has_stopped_growing(folder):
+def test_file_counts_only_after_growth_stops(folder):
     whole = dng(200)
 
     def grow(now):
@@ -142,7 +142,7 @@ def test_a_file_counts_once_it_has_stopped_growing(folder):
     assert (frame.serial, frame.exposure) == ("A1", Exposure(0.01, 100))
 
 
-def test_files_from_before_arming_are_no_frames(folder):
+def test_files_from_before_arming_are_not_frames(folder):
     clock = Clock(lambda now: None)
     camera = HotFolder(folder, clock=clock, sleep=clock.sleep)
     (folder / "between.dng").write_bytes(dng(300))
@@ -151,7 +151,7 @@ def test_files_from_before_arming_are_no_frames(folder):
         camera.frame(5.0)
 
 
-def test_a_folder_is_released_by_the_box_or_by_hand_as_its_address_says(folder):
+def test_folder_address_selects_release_by_controller_or_hand(folder):
     for query, known in (
         ("", Trigger.EDGE),
         ("?serial=A1", Trigger.EDGE),
@@ -171,7 +171,7 @@ def test_a_folder_is_released_by_the_box_or_by_hand_as_its_address_says(folder):
             cameras.open_camera(f"hotfolder:{folder}{query}")
 
 
-def test_a_folder_without_a_test_picture_tells_what_to_do(tmp_path):
+def test_folder_without_test_image_error_names_remedy(tmp_path):
     with pytest.raises(cameras.CameraUrlError, match="test picture"):
         HotFolder(tmp_path)
     with pytest.raises(cameras.CameraUrlError, match="is no folder"):

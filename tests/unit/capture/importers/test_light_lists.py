@@ -54,7 +54,7 @@ def rti(tmp_path):
     return tmp_path / "rti", lights, n, inside
 
 
-def test_an_lp_file_pairs_pictures_by_name_whatever_their_order(rti):
+def test_lp_file_pairs_images_by_name_any_order(rti):
     folder, lights, _, _ = rti
     found = light_lists.find(folder)
     numbers = [int(p.stem[3:]) for p in found.pictures]
@@ -63,7 +63,7 @@ def test_an_lp_file_pairs_pictures_by_name_whatever_their_order(rti):
     assert found.kind == "lp"
 
 
-def test_pictures_without_names_follow_the_order_in_which_people_count(tmp_path):
+def test_unnamed_images_follow_natural_counting_order(tmp_path):
     images, _, _ = sphere(directions(12))
     write(tmp_path, images)
     rows = "\n".join(f"{x} {y} {z}" for x, y, z in directions(12))
@@ -73,7 +73,7 @@ def test_pictures_without_names_follow_the_order_in_which_people_count(tmp_path)
     np.testing.assert_allclose(found.directions, directions(12))
 
 
-def test_an_imported_stack_is_a_sound_session_that_says_what_it_assumed(rti, tmp_path):
+def test_imported_stack_is_sound_session_reporting_assumptions(rti, tmp_path):
     folder, _, _, inside = rti
     done = import_light_list(folder, out=tmp_path / "s")
     assert (done.frames, done.encoding, done.mask) == (12, "linear", "ball_mask.png")
@@ -86,7 +86,7 @@ def test_an_imported_stack_is_a_sound_session_that_says_what_it_assumed(rti, tmp
     assert any("shading adds up" in text for text in done.assumed)
 
 
-def test_display_values_are_decoded_where_light_adds_up_so(tmp_path):
+def test_display_values_are_decoded_when_light_then_adds(tmp_path):
     images, _, inside = sphere(directions(16))
     write(tmp_path / "p", images, linear=False)
     write_lp(tmp_path / "p" / "a.lp", [f"img{k}.png" for k in range(16)], directions(16))
@@ -98,7 +98,7 @@ def test_display_values_are_decoded_where_light_adds_up_so(tmp_path):
         import_light_list(tmp_path / "p", out=tmp_path / "u", encoding="log")
 
 
-def test_values_taken_as_linear_are_those_of_the_file(rti, tmp_path):
+def test_values_assumed_linear_equal_file_values(rti, tmp_path):
     folder, _, _, _ = rti
     import_light_list(folder, out=tmp_path / "s", encoding="linear")
     session = Session.open(tmp_path / "s")
@@ -154,7 +154,7 @@ def test_a_broken_list_is_refused_by_name(rti, tmp_path, text, expected):
     assert not (tmp_path / "s").exists()
 
 
-def test_what_does_not_fit_is_refused_by_name(rti, tmp_path):
+def test_invalid_light_list_input_is_refused_by_name(rti, tmp_path):
     folder, _, _, _ = rti
     with pytest.raises(LightListError, match="no such folder"):
         import_light_list(folder / "x", out=tmp_path / "s")
@@ -178,7 +178,7 @@ def test_what_does_not_fit_is_refused_by_name(rti, tmp_path):
     assert not (tmp_path / "s").exists()
 
 
-def test_the_chrome_ball_stands_in_for_a_list(test_data):
+def test_chrome_ball_substitutes_for_light_list(test_data):
     folder = test_data / "photometric_stereo"
     listed = light_lists.find(folder / "buddha")
     ball = light_lists.find(folder / "buddha", lights=folder / "chrome")

@@ -56,7 +56,7 @@ def test_positions_triangles_and_texture_coordinates_survive_any_file(tmp_path, 
         np.testing.assert_allclose(mesh.uv[mesh.faces], UV[HEAD.faces], atol=1e-6)
 
 
-def test_a_mesh_written_as_scan_ply_is_the_same_mesh(tmp_path):
+def test_mesh_written_as_scan_ply_is_unchanged(tmp_path):
     (tmp_path / "uv.obj").write_bytes(FILES["uv.obj"]())
     mesh = read_mesh(tmp_path / "uv.obj")
     (tmp_path / "scan.ply").write_bytes(mesh.to_ply())
@@ -66,7 +66,7 @@ def test_a_mesh_written_as_scan_ply_is_the_same_mesh(tmp_path):
     assert again.to_ply() == mesh.to_ply()
 
 
-def test_quads_polygons_and_groups_with_missing_materials_become_triangles(tmp_path):
+def test_quads_polygons_and_missing_materials_become_triangles(tmp_path):
     text = (
         "mtllib nowhere.mtl\n" + CORNERS + "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
         "g one\nusemtl a\nf 1/1 2/2 3/3 4/4\ng two\nusemtl b\nf 5/1 6/2 7/3\nf 1/4 2/2 6/3\n"
@@ -82,7 +82,7 @@ def test_quads_polygons_and_groups_with_missing_materials_become_triangles(tmp_p
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("mm", 1.0), ("cm", 10), ("m", 1e3), ("inch", 25.4)])
-def test_a_unit_scales_to_millimetres(tmp_path, unit, factor):
+def test_mesh_unit_scales_to_millimeters(tmp_path, unit, factor):
     scaled = HEAD.copy().apply_scale(1 / factor)
     (tmp_path / "head.ply").write_bytes(scaled.export(file_type="ply"))
     mesh = read_mesh(tmp_path / "head.ply", unit=unit)
@@ -117,7 +117,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_mesh_that_cannot_be_used_gives_one_clear_error(tmp_path, name):
+def test_unusable_mesh_gives_single_clear_error(tmp_path, name):
     content, says = BROKEN[name]
     (tmp_path / name).write_bytes(content)
     with pytest.raises(MeshImportError, match=says) as caught:
@@ -125,7 +125,7 @@ def test_a_mesh_that_cannot_be_used_gives_one_clear_error(tmp_path, name):
     assert name in str(caught.value)
 
 
-def test_a_missing_file_and_an_unknown_unit_are_named(tmp_path):
+def test_missing_file_and_unknown_unit_are_reported(tmp_path):
     with pytest.raises(MeshImportError, match="No such file"):
         read_mesh(tmp_path / "none.ply")
     with pytest.raises(MeshImportError, match="unit: got 'yard'"):
@@ -168,7 +168,7 @@ def scan(tmp_path):
     return tmp_path / "ada lovelace.obj"
 
 
-def test_an_open_session_takes_a_mesh_stays_open_and_names_no_person(session, scan):
+def test_open_session_accepts_mesh_stays_open_without_names(session, scan):
     assert main(["import", "mesh", str(scan), "--session", str(session)]) == 0
     opened = Session.open(session)
     assert not opened.closed
@@ -181,7 +181,7 @@ def test_an_open_session_takes_a_mesh_stays_open_and_names_no_person(session, sc
         import_mesh(scan, session=session)
 
 
-def test_a_closed_session_stays_as_it_is_and_its_copy_gets_the_mesh(session, scan, tmp_path):
+def test_closed_session_is_unchanged_and_copy_gets_mesh(session, scan, tmp_path):
     with Session.resume(session) as made:
         made.close(missing_because="the subject left")
     before = {file: file.read_bytes() for file in session.rglob("*") if file.is_file()}

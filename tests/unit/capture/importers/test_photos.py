@@ -81,7 +81,7 @@ def test_linear_tiff_keeps_its_numbers(tmp_path):
     np.testing.assert_allclose(linear(photo.frame).rgb, values / 65535, atol=1e-6)
 
 
-def test_of_several_pages_only_the_first_is_taken_and_it_is_said(tmp_path):
+def test_multipage_file_uses_first_page_and_reports_this(tmp_path):
     pages = np.random.default_rng(2).integers(1, 60000, (3, 8, 10), dtype=np.uint16)
     tifffile.imwrite(tmp_path / "a.tif", pages, photometric="minisblack")
     photo = read_photo(tmp_path / "a.tif")
@@ -156,7 +156,7 @@ def exif_with_place():
     return b"\xff\xe1" + struct.pack(">H", len(payload) + 2) + payload
 
 
-def test_place_and_owner_stay_behind(picture, tmp_path):
+def test_import_removes_location_and_owner(picture, tmp_path):
     plain = cv2.imencode(".jpg", picture)[1].tobytes()
     folder = tmp_path / "in"
     folder.mkdir()
@@ -168,7 +168,7 @@ def test_place_and_owner_stay_behind(picture, tmp_path):
     assert b"Example" not in written
 
 
-def test_an_imported_session_is_whole_closed_and_says_what_was_assumed(picture, tmp_path):
+def test_imported_session_is_complete_closed_and_reports_assumptions(picture, tmp_path):
     folder = tmp_path / "in"
     folder.mkdir()
     save_png(folder / "portrait.png", picture)
@@ -204,7 +204,7 @@ def test_names_tell_states_and_polarizers(picture, tmp_path):
     assert not any("no polarizers" in text for text in done.assumed)
 
 
-def test_two_formats_of_one_shot_are_never_averaged(picture, tmp_path):
+def test_two_formats_of_shot_are_never_averaged(picture, tmp_path):
     folder = tmp_path / "in"
     folder.mkdir()
     save_png(folder / "x.png", picture)
@@ -213,7 +213,7 @@ def test_two_formats_of_one_shot_are_never_averaged(picture, tmp_path):
     assert len(done.states) == 2
 
 
-def test_pictures_of_two_sizes_are_two_cameras(picture, tmp_path):
+def test_images_of_two_sizes_become_two_cameras(picture, tmp_path):
     folder = tmp_path / "in"
     folder.mkdir()
     save_png(folder / "a.png", picture)
@@ -223,7 +223,7 @@ def test_pictures_of_two_sizes_are_two_cameras(picture, tmp_path):
     assert [view.name for view in session.rig.views] == ["cam", "cam2"]
 
 
-def test_frames_of_a_known_rig_keep_it(tmp_path):
+def test_frames_of_known_rig_keep_that_rig(tmp_path):
     rig = load_rig("flash").resized(48)
     view = rig.views[0]
     folder = tmp_path / "in"
@@ -329,7 +329,7 @@ def bad_file(kind, folder, picture):
         "pipe",
     ],
 )
-def test_one_bad_file_gives_one_clear_error_and_nothing_is_written(kind, picture, tmp_path):
+def test_single_bad_file_gives_clear_error_writes_nothing(kind, picture, tmp_path):
     folder = tmp_path / "in"
     folder.mkdir()
     bad_file(kind, folder, picture)
@@ -350,7 +350,7 @@ def test_every_bad_file_is_named_at_once(picture, tmp_path):
     assert [fault.path for fault in caught.value.faults] == ["a.jpg", "b.jpg", "c.jpg"]
 
 
-def test_a_folder_without_photographs_and_a_missing_one_are_named(tmp_path):
+def test_empty_and_missing_photograph_folders_are_reported(tmp_path):
     (tmp_path / "notes.txt").write_text("x")
     with pytest.raises(PhotoError, match="holds no photographs"):
         import_photos(tmp_path, out=tmp_path / "s")
@@ -394,7 +394,7 @@ def test_a_real_camera_raw_file_is_imported(tmp_path):
 
 
 @needs_data
-def test_a_foreign_dng_of_known_content_is_exact(tmp_path):
+def test_foreign_dng_imports_exact_content(tmp_path):
     import_photos(DATA / "raw" / "synth_pidng.dng", out=tmp_path / "s", now=clock)
     session = Session.open(tmp_path / "s")
     frame = session.read(session.frames()[0])
@@ -406,7 +406,7 @@ def test_a_foreign_dng_of_known_content_is_exact(tmp_path):
 
 
 @needs_data
-def test_a_real_chart_photograph_is_imported_as_a_chart(tmp_path):
+def test_real_chart_photograph_is_imported_as_chart(tmp_path):
     path = DATA / "colorchecker" / "colorchecker_classic_photo.png"
     import_photos(path, out=tmp_path / "s", kind="chart", now=clock)
     session = Session.open(tmp_path / "s")
@@ -426,7 +426,7 @@ def test_a_public_domain_portrait_is_imported(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg", "tif", "exr", "dng"])
-def test_random_damage_gives_our_error_or_a_picture_and_never_another_error(suffix, tmp_path):
+def test_random_damage_gives_own_error_or_image_only(suffix, tmp_path):
     """60 seeded files each with up to five wrong bytes near the head, or cut short."""
     rng = np.random.default_rng([9, len(suffix), ord(suffix[0])])
     rgb = rng.integers(0, 255, (24, 32, 3), dtype=np.uint8)

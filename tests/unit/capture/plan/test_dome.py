@@ -40,7 +40,7 @@ def test_intensity_over_the_hemisphere_is_the_power():
         assert total == pytest.approx(1.0, rel=1e-4)
 
 
-def test_a_light_straight_ahead_gives_inverse_square_and_one_behind_gives_nothing():
+def test_light_ahead_follows_inverse_square_behind_gives_nothing():
     def at(z_mm):
         light = dataclasses.replace(LED, position_mm=(0.0, 25.0, z_mm), half_intensity_deg=None)
         rig = dataclasses.replace(DOME, lights=(light,))
@@ -72,7 +72,7 @@ def alternating(hz, seconds=4.0):
 
 
 @pytest.mark.parametrize("hz", [4.0, 8.0, 12.5, 20.0])
-def test_alternating_light_flashes_at_its_rate_with_the_rms_of_a_square_wave(hz):
+def test_alternating_light_flashes_at_rate_with_square_rms(hz):
     rows, weights = alternating(hz)
     report = flicker_of_rows(rows, weights)
     assert report.flashes_per_s == pytest.approx(hz, abs=1.0)
@@ -89,7 +89,7 @@ def test_steady_light_does_not_flicker():
     assert report.rms < 0.02
 
 
-def test_light_faster_than_fusion_is_not_counted_as_flashes():
+def test_light_above_fusion_rate_is_not_flashing():
     signal = np.tile([0.0, 2.0], 4000)  # 500 Hz
     seen = average_over_flicker_fusion(signal)
     assert np.ptp(seen[100:-100]) < 0.2 * 2.0
@@ -97,7 +97,7 @@ def test_light_faster_than_fusion_is_not_counted_as_flashes():
     assert band_rms(signal) < 1e-6
 
 
-def test_the_light_at_the_eyes_integrates_to_what_the_rows_give():
+def test_light_at_eyes_integrates_to_row_output():
     rng = np.random.default_rng(3)
     weights = rng.random(20)
     rows = [
@@ -112,7 +112,7 @@ def test_the_light_at_the_eyes_integrates_to_what_the_rows_give():
     assert longer - given == pytest.approx(extra, rel=1e-6)
 
 
-def test_dark_gaps_and_bad_orders_flicker_and_the_chosen_order_does_not():
+def test_dark_gaps_and_bad_orders_flicker_chosen_not():
     dwell_s = 1.0 / 12.0
     found = compare_orders(DOME, dwell_s=dwell_s)
     gaps = []
@@ -134,7 +134,7 @@ def test_an_order_shows_every_light_once(name):
         assert sorted(LIGHT_ORDERS[name](rig)) == list(range(len(rig.lights)))
 
 
-def test_going_slower_by_itself_does_not_cure_a_bad_order():
+def test_slower_rate_alone_leaves_bad_order_flickering():
     slow = compare_orders(DOME, dwell_s=0.25)["name"]
     assert slow.rms > 0.25
 
@@ -142,7 +142,7 @@ def test_going_slower_by_itself_does_not_cure_a_bad_order():
 # plans ----------------------------------------------------------------------------------------
 
 
-def test_the_plan_shows_each_light_at_both_exposures_in_25_seconds():
+def test_plan_gives_lights_both_exposures_within_25_s():
     plan = dome_plan(DOME)
     seen = Counter((s.index["light"], s.index["exposure"]) for s in plan.steps if s.kind == "olat")
     assert len(seen) == 300
@@ -154,7 +154,7 @@ def test_the_plan_shows_each_light_at_both_exposures_in_25_seconds():
     assert all(s.cameras == tuple(v.name for v in DOME.views) for s in plan.steps)
 
 
-def test_a_light_comes_at_the_same_place_of_every_pass():
+def test_light_keeps_same_position_in_every_pass():
     plan = dome_plan(DOME)
     order: dict[int, list[str]] = {0: [], 1: []}
     for step in plan.steps:
@@ -163,7 +163,7 @@ def test_a_light_comes_at_the_same_place_of_every_pass():
     assert order[0] == order[1]
 
 
-def test_tracking_frames_come_every_so_many_lights_and_are_no_flashes():
+def test_tracking_frames_recur_regularly_and_are_not_flashes():
     plan = dome_plan(DOME, tracking_every=25)
     after = [s.index["after"] for s in plan.steps if s.kind == "tracking"]
     assert after == [0, 25, 50, 75, 100, 125, 150] * 2
@@ -187,7 +187,7 @@ def test_tracking_lights_are_spread_in_front():
     assert angles[~np.eye(len(lights), dtype=bool)].min() > 40.0
 
 
-def test_a_piece_of_a_plan_ends_where_the_camera_or_the_target_changes():
+def test_plan_piece_ends_where_camera_or_target_changes():
     assert [len(piece) for piece in passes(dome_plan(DOME).steps)] == [2, 157, 2, 157]
     board = dome_calibration_plan(DOME, "charuco", poses=3, darks=1)
     assert [len(piece) for piece in passes(board.steps)] == [1, 1, 1, 1]
@@ -211,7 +211,7 @@ def test_a_plan_survives_its_file():
         ("dark", 32, {"dark"}),
     ],
 )
-def test_a_calibration_plan_holds_what_its_target_needs(target, steps, kinds):
+def test_calibration_plan_contains_steps_required_by_target(target, steps, kinds):
     plan = dome_calibration_plan(DOME, target)
     assert len(plan.steps) == steps
     assert {step.kind for step in plan.steps} == kinds
@@ -233,7 +233,7 @@ def test_a_calibration_plan_holds_what_its_target_needs(target, steps, kinds):
         ({"frames_per_s": 3.0}, "level x dwell"),
     ],
 )
-def test_a_plan_that_cannot_be_carried_out_is_refused(more, match):
+def test_infeasible_plan_is_refused(more, match):
     with pytest.raises(PlanError, match=match):
         dome_plan(DOME, **more)
 
@@ -249,7 +249,7 @@ def test_an_unknown_light_in_a_plan_is_named():
         led_rows(plan.steps, DOME.subset(lights=["L001"]))
 
 
-def test_rows_are_counted_as_the_box_counts_them():
+def test_rows_are_counted_as_by_controller():
     step = dome_plan(DOME).steps[2]
     ((leds, level, dwell_us),) = as_table(led_rows([step], DOME))
     assert leds == tuple(tracking_lights(DOME))
@@ -260,7 +260,7 @@ def test_rows_are_counted_as_the_box_counts_them():
 # dose and limits ------------------------------------------------------------------------------
 
 
-def test_the_dose_is_the_time_of_each_light_at_its_level():
+def test_dose_is_light_time_multiplied_by_level():
     plan = dome_plan(DOME, tracking_every=0)
     report = dose_report(plan, DOME)
     assert report.led_ws == pytest.approx(2 * 83_333e-6)

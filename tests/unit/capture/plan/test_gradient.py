@@ -31,14 +31,14 @@ PLACES = [light.position_mm for light in RIG.lights]
 # patterns -------------------------------------------------------------------------------------
 
 
-def test_patterns_that_complete_each_other_add_up_to_full():
+def test_complementary_patterns_sum_to_full():
     for axis in "xyz":
         both = pattern_shares(PLACES, axis) + pattern_shares(PLACES, f"-{axis}")
         np.testing.assert_allclose(both, pattern_shares(PLACES, "full"), atol=1e-15)
     assert not pattern_shares(PLACES, "dark").any()
 
 
-def test_a_pattern_is_brightest_on_the_side_that_it_is_named_after():
+def test_pattern_is_brightest_on_side_in_its_name():
     way = np.array(PLACES) / np.linalg.norm(PLACES, axis=1)[:, None]
     for axis, pattern in enumerate("xyz"):
         light = int(np.argmax(way[:, axis]))
@@ -47,7 +47,7 @@ def test_a_pattern_is_brightest_on_the_side_that_it_is_named_after():
     assert pattern_shares([(0.0, 7.0, 0.0)], "y").tolist() == [1.0]  # +y is up
 
 
-def test_the_mean_way_to_the_light_comes_back_from_four_patterns():
+def test_mean_light_direction_is_recovered_from_four_patterns():
     """Sums over LEDs of x, y, z and full give the first moments: 2 x - full weighs with the way."""
     way = np.array(PLACES) / np.linalg.norm(PLACES, axis=1)[:, None]
     response = np.random.default_rng(1).random(len(way))
@@ -64,7 +64,7 @@ def test_an_unknown_pattern_is_refused():
 # order ----------------------------------------------------------------------------------------
 
 
-def test_each_angle_is_neutral_then_compressed_then_stretched_step_by_step():
+def test_angle_runs_neutral_then_compressed_then_stretched_stepwise():
     plan = gradient_plan(RIG)
     names = [name for name, _ in states(plan)]
     assert len(names) == 4 * 13
@@ -85,7 +85,7 @@ def test_each_angle_is_neutral_then_compressed_then_stretched_step_by_step():
     ]
 
 
-def test_a_state_is_eight_patterns_parallel_and_the_same_crossed():
+def test_state_is_eight_parallel_and_eight_crossed_patterns():
     plan = gradient_plan(RIG, angles=[45], steps=(-2, 3))
     for name, steps in states(plan):
         assert [s.settings["polarizer"] for s in steps] == ["parallel"] * 8 + ["crossed"] * 8
@@ -114,7 +114,7 @@ def test_a_plan_survives_its_file():
 # light ----------------------------------------------------------------------------------------
 
 
-def test_a_state_takes_half_a_second_of_light_within_the_duty():
+def test_state_takes_half_second_of_light_within_duty():
     plan = gradient_plan(RIG, angles=[0], steps=(-1, 1), darks=0)
     for _, steps in states(plan):
         assert sum(s.settings["dwell_s"] for s in steps) == pytest.approx(0.5, rel=0.02)
@@ -122,7 +122,7 @@ def test_a_state_takes_half_a_second_of_light_within_the_duty():
 
 
 @pytest.mark.parametrize("led", [0, 60, 131])
-def test_the_duty_is_that_of_light_summed_in_small_steps_of_time(led):
+def test_duty_matches_light_summed_in_small_time_steps(led):
     steps = next(iter(states(gradient_plan(RIG, angles=[0], steps=(0, 0)))))[1]
     one = dataclasses.replace(RIG, lights=(RIG.lights[led],))
     signal = []
@@ -134,7 +134,7 @@ def test_the_duty_is_that_of_light_summed_in_small_steps_of_time(led):
     assert scan_duty(steps, one) == pytest.approx((total[10_000:] - total[:-10_000]).max() / 1e4)
 
 
-def test_light_flickers_less_from_bright_to_dark_than_by_name():
+def test_brightness_order_flickers_less_than_name_order():
     plan = gradient_plan(RIG, angles=[0], steps=(0, 0), darks=0)
     halves = [plan.steps[:8], plan.steps[8:]]
     by_name = [
@@ -150,7 +150,7 @@ def test_states_are_pieces_of_their_own():
     assert [len(piece) for piece in passes(plan.steps)] == [1] + [16] * 6
 
 
-def test_the_dose_of_a_led_is_its_share_of_the_light_of_all_states():
+def test_led_dose_is_its_fraction_of_state_light():
     plan = gradient_plan(RIG, angles=[0], darks=0)
     report = dose_report(plan, RIG)
     # of 16 patterns 2 are full and 12 complete each other in pairs
@@ -179,7 +179,7 @@ def test_the_dose_of_a_led_is_its_share_of_the_light_of_all_states():
         ({"dwell_s": 0.6}, "dwell_s"),
     ],
 )
-def test_what_the_rig_may_not_do_is_refused(more, match):
+def test_plan_beyond_rig_limits_is_refused(more, match):
     with pytest.raises(PlanError, match=match):
         gradient_plan(RIG, **more)
 
@@ -189,7 +189,7 @@ def test_a_rig_without_a_caliper_is_refused():
         gradient_plan(load_rig("dome"))
 
 
-def test_the_time_of_a_plan_is_that_of_light_turns_and_moves():
+def test_plan_time_is_sum_of_light_rotations_moves():
     plan = gradient_plan(RIG, angles=[0], steps=(-2, 1), darks=0)
     light = 4 * 16 * 0.031 + 4 * 0.15
     # 0.4 s a step of the jaws: one, one, three back across neutral; the analyser turns meanwhile
@@ -207,7 +207,7 @@ def test_flats_are_pairs_at_levels_up_to_full():
     assert sum(s.kind == "dark" for s in plan.steps) == 2
 
 
-def test_the_ball_is_lit_from_faintly_to_brightly_on_both_sides_of_crossed():
+def test_ball_is_lit_faint_to_bright_around_crossed():
     plan = gradient_calibration_plan(RIG, "ball", repeats=3)
     lit = [s for s in plan.steps if s.index["pattern"] == "full"]
     seen = Counter((s.index["reading"], s.settings["level"]) for s in lit)

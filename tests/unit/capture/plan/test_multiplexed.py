@@ -25,14 +25,14 @@ def fast_camera(readout_s: float):
     return dataclasses.replace(FLASH, views=views)
 
 
-def test_22_captures_meet_20_distinct_phases_half_a_second_apart():
+def test_captures_22_meet_20_phases_half_second_apart():
     found = phases(multiplexed_plan(FLASH, prompt_period_s=5.0, shot_period_s=5.5))
     assert (found.captures, found.distinct, found.interval_s) == (22, 20, 0.5)
     assert found.largest_gap_s == 0.5
     assert sorted(found.repeats) == [1] * 18 + [2, 2]
 
 
-def test_44_captures_meet_40_distinct_phases_a_quarter_of_a_second_apart():
+def test_captures_44_meet_40_phases_quarter_second_apart():
     found = phases(multiplexed_plan(FLASH, prompt_period_s=5.0, shot_period_s=10.25))
     assert (found.captures, found.distinct, found.interval_s) == (44, 40, 0.25)
     # the paper's own period, on a camera that could keep it
@@ -40,7 +40,7 @@ def test_44_captures_meet_40_distinct_phases_a_quarter_of_a_second_apart():
     assert (found.captures, found.distinct, found.interval_s) == (44, 40, 0.25)
 
 
-def test_a_period_below_the_read_out_is_refused_with_the_equivalent():
+def test_period_below_read_out_is_refused_with_equivalent():
     with pytest.raises(ReadOutError, match=r"10\.25 s meets the same 40 phases") as caught:
         multiplexed_plan(FLASH, shot_period_s=5.25)
     assert caught.value.equivalent_s == 10.25
@@ -51,13 +51,13 @@ def test_a_period_below_the_read_out_is_refused_with_the_equivalent():
     assert isinstance(pickle.loads(pickle.dumps(caught.value)), ReadOutError)
 
 
-def test_the_read_out_can_be_stated_where_the_rig_does_not_know_it():
+def test_read_out_can_be_stated_if_rig_lacks():
     with pytest.raises(ReadOutError):
         multiplexed_plan(FLASH, shot_period_s=6.5, read_out_s=7)
     assert len(multiplexed_plan(FLASH, shot_period_s=5.25, read_out_s=5.25, darks=0).steps) == 44
 
 
-def test_the_rigs_camera_needs_five_and_a_half_seconds_an_image():
+def test_rig_camera_needs_5_5_seconds_per_image():
     assert 5.49 < image_s(FLASH, 0.008) <= Fraction("5.5")
     with pytest.raises(ReadOutError):
         multiplexed_plan(FLASH, shot_period_s=5.49)
@@ -68,7 +68,7 @@ def test_the_rigs_camera_needs_five_and_a_half_seconds_an_image():
     shot=st.fractions(Fraction(1, 10), 40, max_denominator=20),
     read_out=st.fractions(0, 60, max_denominator=20),
 )
-def test_the_equivalent_period_meets_as_many_phases_and_is_the_shortest(prompt, shot, read_out):
+def test_equivalent_period_meets_same_phase_count_and_shortest(prompt, shot, read_out):
     grid = phase_grid(prompt, shot)
     instead = equivalent_period_s(prompt, shot, read_out)
     assert instead >= read_out
@@ -83,7 +83,7 @@ def test_the_equivalent_period_meets_as_many_phases_and_is_the_shortest(prompt, 
     prompt=st.fractions(Fraction(1, 2), 20, max_denominator=12),
     shot=st.fractions(Fraction(1, 2), 20, max_denominator=12),
 )
-def test_the_grid_is_what_counting_finds(prompt, shot):
+def test_phase_grid_matches_counting(prompt, shot):
     grid = phase_grid(prompt, shot)
     met = sorted({k * shot % (2 * prompt) for k in range(grid.distinct + 3)})
     assert len(met) == grid.distinct
@@ -94,7 +94,7 @@ def test_the_grid_is_what_counting_finds(prompt, shot):
 @pytest.mark.parametrize(
     ("shot_period_s", "distinct"), [(10, 1), (20, 1), (15, 2), (12.5, 4), (6, 5)]
 )
-def test_periods_with_much_in_common_alias_and_it_is_said(shot_period_s, distinct):
+def test_periods_with_large_common_divisor_alias_and_report(shot_period_s, distinct):
     found = phases(multiplexed_plan(FLASH, shot_period_s=shot_period_s, captures=30))
     assert found.distinct == found.possible == distinct
     assert found.aliased
@@ -115,7 +115,7 @@ def test_cycles_or_captures_set_the_length():
         multiplexed_plan(FLASH, cycles=2, captures=3)
 
 
-def test_each_shot_knows_its_state_and_its_phase():
+def test_shots_record_state_and_phase():
     plan = multiplexed_plan(FLASH, state="anger", shot_period_s=5.5)
     for step in timed_steps(plan):
         start = float(step.settings["start_s"])
@@ -124,7 +124,7 @@ def test_each_shot_knows_its_state_and_its_phase():
     assert Plan.from_json(plan.to_json()) == plan
 
 
-def test_a_flash_that_recycles_slower_than_the_shots_is_refused():
+def test_flash_recycling_slower_than_shots_is_refused():
     slow = dataclasses.replace(fast_camera(0.1), recycle_s=4.0)
     with pytest.raises(PlanError, match="recycle"):
         multiplexed_plan(slow, shot_period_s=3.5)
@@ -145,12 +145,12 @@ def test_a_flash_that_recycles_slower_than_the_shots_is_refused():
         {"lead_cycles": -1},
     ],
 )
-def test_what_cannot_be_planned_is_refused_by_name(wrong):
+def test_impossible_multiplexed_plan_is_refused_by_name(wrong):
     with pytest.raises(PlanError):
         multiplexed_plan(FLASH, **wrong)
 
 
-def test_a_course_follows_exercise_for_a_minute_and_alcohol_for_an_hour():
+def test_course_follows_exercise_for_minute_alcohol_for_hour():
     minute = [s.settings["start_s"] for s in timed_steps(course_plan(FLASH))]
     assert minute == [5.5 * k for k in range(11)]
     hour = course_plan(FLASH, state="alcohol", duration_s=3600, shot_period_s=300, before=3)
@@ -165,7 +165,7 @@ def test_a_course_follows_exercise_for_a_minute_and_alcohol_for_an_hour():
         course_plan(FLASH, shot_period_s=5.25)
 
 
-def test_interleaved_repeats_of_a_state_have_all_others_in_between():
+def test_interleaved_state_repeats_have_all_others_between():
     states = ("neutral", "anger", "fear")
     plan = flash_plan(FLASH, states=states, repeats=3, darks=0, interleave=True)
     shown = [step.index["state"] for step in plan.steps[::2]]
@@ -177,6 +177,6 @@ def test_interleaved_repeats_of_a_state_have_all_others_in_between():
     assert sum(a != b for a, b in pairwise(turns)) == len(plan.steps) // 2
 
 
-def test_a_sequence_lasts_from_its_lead_to_its_last_shot():
+def test_sequence_lasts_from_lead_to_last_shot():
     plan = multiplexed_plan(FLASH, darks=0)
     assert plan.estimated_s(FLASH) == pytest.approx(10.0 + 21 * 5.5 + 5.458)

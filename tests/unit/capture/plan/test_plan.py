@@ -20,7 +20,7 @@ def subject_step(identity="S1", **settings):
     return Step(identity, "subject", {"state": "neutral"}, settings, ("cam",))
 
 
-def test_every_state_and_repeat_has_one_parallel_and_one_crossed_image(flash):
+def test_state_repeat_has_single_parallel_and_crossed_image(flash):
     plan = flash_plan(flash, states=("neutral", "anger", "fear"), repeats=2, darks=3)
     subject = [step for step in plan.steps if step.kind == "subject"]
     seen = Counter((s.index["state"], s.index["repeat"], s.settings["polarizer"]) for s in subject)
@@ -30,7 +30,7 @@ def test_every_state_and_repeat_has_one_parallel_and_one_crossed_image(flash):
     assert all(s.index["polarizer"] == s.settings["polarizer"] for s in subject)
 
 
-def test_the_analyser_turns_once_per_pair(flash):
+def test_analyzer_rotates_once_per_pair(flash):
     plan = flash_plan(flash, states=("a", "b", "c"), repeats=2, darks=0)
     states = [s.settings["polarizer"] for s in plan.steps]
     turns = sum(a != b for a, b in itertools.pairwise(states))
@@ -51,13 +51,13 @@ def test_flats_are_pairs_at_eight_powers_or_more(flash):
     assert max(powers) == 1.0
 
 
-def test_the_malus_series_spans_half_a_turn_in_thirteen_angles(flash):
+def test_malus_series_spans_180_degrees_in_thirteen_angles(flash):
     plan = flash_calibration_plan(flash, "malus", repeats=1)
     angles = [s.settings["analyser_deg"] for s in plan.steps if s.kind == "malus"]
     assert angles == [15.0 * k for k in range(13)]
 
 
-def test_the_chart_is_seen_parallel_and_crossed(flash):
+def test_chart_is_imaged_parallel_and_crossed(flash):
     plan = flash_calibration_plan(flash, "chart")
     assert {s.settings["polarizer"] for s in plan.steps if s.kind == "chart"} == {
         "parallel",
@@ -72,7 +72,7 @@ def test_a_plan_survives_its_json_and_a_pickle(flash, target):
     assert pickle.loads(pickle.dumps(plan)) == plan
 
 
-def test_the_estimate_is_the_read_out_of_every_frame_and_the_turns_between(flash):
+def test_estimate_sums_frame_read_outs_and_rotations_between(flash):
     plan = flash_plan(flash, darks=1, exposure_s=0.5)
     # dark, parallel, crossed: three read-outs and exposures, the analyser set twice
     assert plan.estimated_s(flash) == pytest.approx(3 * (5.45 + 0.5) + 2 * 0.5)
@@ -119,13 +119,13 @@ def test_settings_of_other_rigs_are_allowed():
 
 
 @pytest.mark.parametrize("twin", ["S1", "s1"])
-def test_steps_that_share_a_file_name_are_refused(twin):
+def test_steps_with_equal_file_names_are_refused(twin):
     with pytest.raises(PlanError, match=r"steps\[1\].id"):
         Plan("flash", (subject_step("S1"), subject_step(twin)))
 
 
 @pytest.mark.parametrize("identity", ["../S1", "/S1", "", "a b", "S+1"])
-def test_a_step_id_that_is_a_path_trick_is_refused(identity):
+def test_step_id_with_path_traversal_is_refused(identity):
     with pytest.raises(PlanError, match="id: got"):
         subject_step(identity)
 
@@ -158,12 +158,12 @@ def test_all_faults_of_a_plan_file_are_listed(flash):
         ("[]", "fault"),
     ],
 )
-def test_text_that_is_no_plan_gives_one_error(text, reason):
+def test_invalid_plan_text_gives_single_error(text, reason):
     with pytest.raises(PlanError, match=reason):
         Plan.from_json(text, where="plan.json")
 
 
-def test_a_plan_for_another_rig_or_camera_is_refused(flash):
+def test_plan_for_other_rig_or_camera_is_refused(flash):
     plan = Plan("dome", (Step("S1", "subject", {}, {}, ("left",)),))
     with pytest.raises(PlanError) as caught:
         plan.check(flash)

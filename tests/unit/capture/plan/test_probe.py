@@ -22,7 +22,7 @@ RIG = load_rig("probe")
 PROBE = RIG.probe
 
 
-def test_a_series_is_23_exposures_two_thirds_of_a_stop_apart_in_88_seconds():
+def test_series_has_23_exposures_lasting_88_seconds():
     steps = [s for s in probe_plan(RIG, sites=["cheek"]).steps if s.kind == "fibres"]
     seconds = np.array([step.settings["exposure_s"] for step in steps])
     assert len(seconds) == 23
@@ -34,12 +34,12 @@ def test_a_series_is_23_exposures_two_thirds_of_a_stop_apart_in_88_seconds():
     assert {step.settings["suction_mbar"] for step in steps} == {PROBE.suction_mbar}
 
 
-def test_the_brackets_span_more_than_four_decades_of_exposure():
+def test_brackets_span_more_than_four_exposure_decades():
     seconds = exposure_series_s()
     assert seconds[-1] / seconds[0] > 10**4.4
 
 
-def test_sites_repeats_and_angles_are_series_of_their_own_placement():
+def test_sites_repeats_and_angles_have_own_placement_series():
     plan = probe_plan(RIG, sites=["forehead", "chin"], repeats=2, angles=3, brackets=4)
     places = [placement for placement, _ in all_series(plan)]
     assert [(p.site, p.repeat, p.angle_deg) for p in places] == [
@@ -60,7 +60,7 @@ def test_sixteen_directions_go_all_round_in_equal_steps():
     assert len({step.id for step in plan.steps}) == len(plan.steps)
 
 
-def test_darks_come_first_at_the_shortest_the_longest_and_one_exposure_between():
+def test_darks_come_first_at_shortest_middle_longest_exposure():
     plan = probe_plan(RIG, darks=2)
     kinds = [step.kind for step in plan.steps]
     count = kinds.count("dark")
@@ -75,7 +75,7 @@ def test_darks_come_first_at_the_shortest_the_longest_and_one_exposure_between()
     assert not any("suction_mbar" in step.settings for step in darks)
 
 
-def test_no_suction_of_a_plan_is_longer_than_skin_bears_and_none_is_cut_early():
+def test_suction_stays_within_skin_limit_and_never_truncated():
     rng = np.random.default_rng(5)
     for _ in range(50):
         seconds = rng.uniform(0.3, 30.3, rng.integers(1, 40)).tolist()
@@ -104,7 +104,7 @@ def test_other_rigs_take_the_time_that_they_took():
     assert Plan(rig.name, (step,)).estimated_s(rig) == pytest.approx(1.3)
 
 
-def test_a_calibration_has_the_whole_series_and_each_fibre_uncovered_alone():
+def test_calibration_has_whole_series_and_each_fiber_uncovered():
     plan = probe_calibration_plan(RIG)
     kinds = {kind: [s for s in plan.steps if s.kind == kind] for kind in ("phantom", "mask")}
     assert [s.settings["exposure_s"] for s in kinds["phantom"]] == list(exposure_series_s())
@@ -130,7 +130,7 @@ def test_a_plan_goes_through_json_unchanged():
     plan.check(RIG)
 
 
-def test_light_is_power_times_open_time_and_a_smaller_cone_is_worse_for_an_eye():
+def test_light_is_power_by_time_narrow_cone_worse():
     plan = probe_plan(RIG, sites=["cheek", "chin"], darks=3)
     light = fiber_light(plan, RIG)
     given_ws = 2 * sum(exposure_series_s()) * RIG.lights[0].power_w
@@ -162,7 +162,7 @@ def test_light_is_power_times_open_time_and_a_smaller_cone_is_worse_for_an_eye()
         ({"darks": -1}, "darks: got -1"),
     ],
 )
-def test_what_cannot_be_planned_is_named(words, match):
+def test_impossible_probe_plan_is_refused_by_name(words, match):
     with pytest.raises(PlanError, match=match):
         probe_plan(RIG, **words)
 
@@ -174,7 +174,7 @@ def test_other_rigs_have_no_such_plan():
         probe_calibration_plan(RIG, "white")
 
 
-def test_a_pump_that_may_run_for_less_time_bounds_the_longest_exposure():
+def test_limited_pump_time_bounds_longest_exposure():
     weak = dataclasses.replace(RIG, probe=dataclasses.replace(PROBE, max_suction_s=20.0))
     with pytest.raises(PlanError, match="one suction of 20 s has room for"):
         probe_plan(weak)

@@ -81,7 +81,7 @@ def test_tifffile_reads_every_bit(dng, cfa, pattern):
 
 
 @pytest.mark.parametrize("pattern", [*BAYER, "MONO"])
-def test_the_adobe_sdk_reads_every_bit_and_the_settings(dng, cfa, pattern):
+def test_adobe_sdk_reads_every_bit_and_settings(dng, cfa, pattern):
     dngpy = pytest.importorskip("dngpy", reason="the Adobe SDK reader comes with the dev extra")
     frame = dngpy.Dng(str(dng(pattern)))
     np.testing.assert_array_equal(frame.raw_pixels.squeeze(), cfa)
@@ -113,7 +113,7 @@ def test_our_reader_returns_everything_that_was_written(dng, cfa, pattern):
     assert frame.path == str(file)
 
 
-def test_color_matrix_noise_and_serial_stand_in_the_tags(dng):
+def test_tags_contain_color_matrix_noise_and_serial(dng):
     with tifffile.TiffFile(dng()) as file:
         tags = file.pages[0].tags
         pairs = np.reshape(tags["ColorMatrix1"].value, (-1, 2))
@@ -128,7 +128,7 @@ def test_a_matrix_read_back_is_the_matrix_written(dng):
     np.testing.assert_allclose(raw.read(dng()).color_matrix, MATRIX, rtol=1e-15)
 
 
-def test_what_is_unknown_reads_back_as_unknown(dng):
+def test_unknown_fields_read_back_as_unknown(dng):
     unknown = {
         "color_matrix": None,
         "neutral": None,
@@ -143,7 +143,7 @@ def test_what_is_unknown_reads_back_as_unknown(dng):
     assert {key: getattr(frame, key) for key in unknown} == unknown
 
 
-def test_equal_frames_have_equal_bytes_and_unequal_light_unequal_bytes(cfa):
+def test_equal_frames_have_equal_bytes_unequal_light_differs(cfa):
     assert encode(cfa, "RGGB") == encode(cfa.copy(), "RGGB")
     assert encode(cfa, "RGGB") != encode(cfa, "RGGB", light={"polarizer": "parallel"})
 
@@ -155,7 +155,7 @@ def test_encoding_leaves_the_frame_alone(cfa):
 
 
 @pytest.mark.parametrize("shape", [(2, 2), (2, 64), (130, 66)])
-def test_small_and_odd_shaped_frames_survive(tmp_path, rng, shape):
+def test_small_and_unusually_shaped_frames_round_trip(tmp_path, rng, shape):
     values = rng.integers(0, 65536, shape, dtype=np.uint16)
     raw.write_dng(tmp_path / "a.dng", values, pattern="GRBG", black=0, white=65535)
     np.testing.assert_array_equal(raw.read(tmp_path / "a.dng").cfa, values)
@@ -199,14 +199,14 @@ def test_any_description_of_the_light_survives_the_xmp(light):
         ({"light": {"a": "x" * 20_000}}, "light"),
     ],
 )
-def test_what_cannot_be_written_is_refused_by_name(cfa, changes, field):
+def test_unwritable_dng_is_refused_by_field_name(cfa, changes, field):
     with pytest.raises(RawError) as caught:
         encode(cfa, **({"pattern": "RGGB"} | changes))
     assert field in {fault.path for fault in caught.value.faults}
 
 
 @pytest.mark.parametrize("bad", [np.zeros((3, 4), np.uint16), np.zeros((4, 4)), np.zeros(4, "u2")])
-def test_a_frame_that_is_no_mosaic_is_refused(bad):
+def test_frame_that_is_not_mosaic_is_refused(bad):
     with pytest.raises(RawError, match="cfa"):
         raw.encode_dng(bad, pattern="RGGB", black=0, white=9)
 
@@ -237,7 +237,7 @@ def test_every_flipped_pixel_bit_is_found(dng, rng):
             raw.decode(memoryview(bytes(broken)), where="a.dng")
 
 
-def test_no_flipped_bit_of_the_head_gives_a_wrong_pixel_or_a_foreign_error(dng, cfa, rng):
+def test_flipped_header_bit_never_gives_wrong_pixel(dng, cfa, rng):
     blob = dng().read_bytes()
     head = len(blob) - 96 * 128 * 2
     for _ in range(300):
@@ -273,7 +273,7 @@ def patched(blob, tag, value):
         (34665, 2**31, "directory"),
     ],
 )
-def test_absurd_numbers_in_the_head_are_refused_before_memory_is_taken(dng, tag, value, reason):
+def test_absurd_header_numbers_are_refused_before_allocation(dng, tag, value, reason):
     file = dng()
     file.write_bytes(patched(file.read_bytes(), tag, value))
     with pytest.raises(RawError, match=reason):
@@ -295,7 +295,7 @@ def test_absurd_numbers_in_the_head_are_refused_before_memory_is_taken(dng, tag,
     ],
 )
 @pytest.mark.parametrize("name", ["a.dng", "a.nef"])
-def test_a_file_that_is_no_raw_file_gives_one_error(tmp_path, name, content):
+def test_file_that_is_not_raw_gives_single_error(tmp_path, name, content):
     file = tmp_path / name
     file.write_bytes(content)
     with pytest.raises(RawError) as caught:
@@ -303,7 +303,7 @@ def test_a_file_that_is_no_raw_file_gives_one_error(tmp_path, name, content):
     assert str(file) in str(caught.value)
 
 
-def test_a_missing_file_and_a_folder_give_one_error(tmp_path):
+def test_missing_file_and_folder_give_single_error(tmp_path):
     with pytest.raises(RawError, match="is missing"):
         raw.read(tmp_path / "none.dng")
     with pytest.raises(RawError, match="cannot be read"):
@@ -323,7 +323,7 @@ def test_an_entity_in_the_xmp_is_not_expanded(dng):
 # --- foreign files --------------------------------------------------------------------------------
 
 
-def test_a_foreign_dng_has_its_known_values(test_data):
+def test_foreign_dng_reads_known_values(test_data):
     frame = raw.read(test_data / "raw" / "synth_pidng.dng")
     row, column = np.mgrid[:256, :320]
     np.testing.assert_array_equal(frame.cfa, 512 + 20 * row + 10 * column)
@@ -345,7 +345,7 @@ def test_a_camera_raw_file_is_read(test_data):
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
-def test_a_truncated_camera_raw_file_gives_one_error(test_data, tmp_path, share):
+def test_truncated_camera_raw_file_gives_single_error(test_data, tmp_path, share):
     blob = (test_data / "raw" / "RAW_KODAK_DC50.KDC").read_bytes()
     file = tmp_path / "cut.kdc"
     file.write_bytes(blob[: int(len(blob) * share)])
@@ -402,7 +402,7 @@ def test_colors_come_from_their_own_pixels(pattern, demosaic):
 
 
 @pytest.mark.parametrize("demosaic", ["superpixel", "centered", "bilinear"])
-def test_the_mean_is_unbiased_and_the_propagated_variance_true(rng, demosaic):
+def test_mean_is_unbiased_and_propagated_variance_correct(rng, demosaic):
     """False-alarm rate 1e-3 over all pixels and channels, Sidak-corrected.
 
     Every output value is repeated over many exposures; its sample mean is compared by a z-test
@@ -451,7 +451,7 @@ def test_bilinear_keeps_a_ramp_inside_the_image():
     np.testing.assert_allclose(image.rgb[1:-1, 1:-1], np.repeat(ramp, 3, axis=2), rtol=1e-5)
 
 
-def test_below_black_stays_negative_with_the_read_noise_as_variance():
+def test_below_black_stays_negative_with_read_noise_variance():
     frame = RawFrame(
         cfa=np.full((4, 4), 500, np.uint16),
         pattern="RGGB",
@@ -471,7 +471,7 @@ def test_black_is_subtracted_by_position():
     assert not raw.linear_rgb(frame, gain=1.0, read_noise=1.0).rgb.any()
 
 
-def test_a_saturated_pixel_spoils_exactly_what_it_contributes_to():
+def test_saturated_pixel_invalidates_exactly_its_contributions():
     values = np.full((8, 8), 600, np.uint16)
     values[2, 2] = 1512  # a red site
     frame = RawFrame(cfa=values, pattern="RGGB", black=(512.0,) * 4, white=1512)
@@ -505,7 +505,7 @@ def test_linear_values_leave_the_frame_alone(cfa):
 
 
 @pytest.mark.parametrize("pattern", BAYER)
-def test_a_gradient_of_brightness_has_no_tint_when_colors_are_centered(pattern):
+def test_brightness_gradient_is_untinted_when_colors_are_centered(pattern):
     """Superpixels show the tint: their colors stand a sensor pixel apart."""
     y, x = np.mgrid[0:16, 0:20]
     values = (1000 + 40 * x + 60 * y).astype(np.uint16)
@@ -519,7 +519,7 @@ def test_a_gradient_of_brightness_has_no_tint_when_colors_are_centered(pattern):
     assert tint("superpixel") > 1e-3
 
 
-def test_a_saturated_site_spoils_every_cell_it_reaches():
+def test_saturated_site_invalidates_every_reached_cell():
     values = np.full((8, 8), 1000, np.uint16)
     values[2, 2] = 10_512  # red of RGGB: reaches its own cell and the ones before it
     frame = RawFrame(cfa=values, pattern="RGGB", black=(512.0,) * 4, white=10_512)

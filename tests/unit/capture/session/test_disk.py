@@ -25,7 +25,7 @@ def synced(monkeypatch):
     return seen
 
 
-def test_files_and_folders_are_synchronized_by_the_call_that_is_named(tmp_path, synced):
+def test_files_and_folders_are_synchronized_by_named_call(tmp_path, synced):
     disk = Disk()
     descriptor = disk.create(tmp_path / "frame")
     disk.write(descriptor, b"light")
@@ -37,7 +37,7 @@ def test_files_and_folders_are_synchronized_by_the_call_that_is_named(tmp_path, 
     assert synced == [("fsync", file), ("fdatasync", file), ("fsync", folder)]
 
 
-def test_a_raw_file_is_on_the_disk_before_it_has_its_name(tmp_path, synced):
+def test_raw_file_is_on_disk_before_naming(tmp_path, synced):
     raw.write_dng(
         tmp_path / "a.dng",
         np.full((16, 16), 600, np.uint16),
@@ -50,13 +50,13 @@ def test_a_raw_file_is_on_the_disk_before_it_has_its_name(tmp_path, synced):
     assert synced == [("fsync", (tmp_path / "a.dng").stat().st_ino)]
 
 
-def test_a_calibration_and_its_name_are_on_the_disk(tmp_path, synced):
+def test_calibration_and_its_name_are_on_disk(tmp_path, synced):
     calibration_store._write_atomically(tmp_path / "white.json", b"{}")
     file, folder = (tmp_path / "white.json").stat().st_ino, tmp_path.stat().st_ino
     assert synced == [("fsync", file), ("fsync", folder)]
 
 
-def test_a_descriptor_that_is_none_is_refused(tmp_path):
+def test_invalid_descriptor_is_refused(tmp_path):
     """Also where the tests wait for no disk."""
     descriptor = Disk().create(tmp_path / "frame")
     os.close(descriptor)

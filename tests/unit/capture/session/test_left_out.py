@@ -45,7 +45,7 @@ def commit_all(session):
         commit(session, step.id)
 
 
-def test_steps_left_out_are_not_to_do_and_the_session_closes_complete(session):
+def test_omitted_steps_are_not_pending_and_session_completes(session):
     session.leave_out(["S002", "S003"], reason=WHY, about={"aperture_mm": 5.6}, t_host_s=7.0)
     assert [step.id for step, _ in session.todo()] == ["D000", "S000", "S001"]
     commit_all(session)
@@ -60,7 +60,7 @@ def test_steps_left_out_are_not_to_do_and_the_session_closes_complete(session):
     assert found.warnings == (f"{session.path}: 2 steps left out: {WHY}",)
 
 
-def test_what_was_left_out_survives_an_interruption(session):
+def test_omitted_steps_survive_interruption(session):
     session.leave_out(["S003"], reason=WHY, t_host_s=0.0)
     session.release()
     with Session.resume(session.path) as again:
@@ -75,7 +75,7 @@ def test_what_was_left_out_survives_an_interruption(session):
     ]
 
 
-def test_frames_of_a_step_that_is_left_out_afterwards_stay_and_do_not_count(session):
+def test_frames_of_later_omitted_step_stay_uncounted(session):
     commit_all(session)
     session.leave_out(["S001"], reason=WHY, t_host_s=0.0)
     assert "S001" not in [r.step_id for r in session.frames()]
@@ -85,7 +85,7 @@ def test_frames_of_a_step_that_is_left_out_afterwards_stay_and_do_not_count(sess
     assert (found.ok, found.frames) == (True, 5)
 
 
-def test_other_steps_that_are_missing_still_need_a_reason(session):
+def test_other_missing_steps_still_need_reason(session):
     session.leave_out(["S003"], reason=WHY, t_host_s=0.0)
     with pytest.raises(SessionError, match="4 missing"):
         session.close()
@@ -93,7 +93,7 @@ def test_other_steps_that_are_missing_still_need_a_reason(session):
     assert any("4 frames missing" in text for text in verify(session.path).warnings)
 
 
-def test_a_step_left_out_is_neither_captured_nor_left_out_again(session):
+def test_omitted_step_is_neither_captured_nor_omitted_again(session):
     session.leave_out(["S003"], reason=WHY, t_host_s=0.0)
     before = (session.path / "journal.jsonl").read_bytes()
     with pytest.raises(SessionError, match="was left out"):
@@ -112,13 +112,13 @@ def test_a_step_left_out_is_neither_captured_nor_left_out_again(session):
         (["S9"], WHY, PlanError),
     ],
 )
-def test_what_cannot_be_left_out_leaves_no_trace(session, steps, reason, error):
+def test_impossible_omission_leaves_no_trace(session, steps, reason, error):
     with pytest.raises(error):
         session.leave_out(steps, reason=reason, t_host_s=0.0)
     assert (session.path / "journal.jsonl").read_bytes() == b""
 
 
-def test_one_flipped_bit_of_a_reason_is_found(session):
+def test_flipped_bit_in_reason_is_detected(session):
     session.leave_out(["S003"], reason=WHY, t_host_s=0.0)
     commit_all(session)
     session.close()
@@ -129,7 +129,7 @@ def test_one_flipped_bit_of_a_reason_is_found(session):
     assert not verify(session.path).ok
 
 
-def test_a_refusing_disk_costs_the_reason_and_nothing_acknowledged(session):
+def test_failing_disk_costs_reason_only_keeps_acknowledged_data(session):
     class Full(Disk):
         full = False
 

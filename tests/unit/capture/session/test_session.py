@@ -84,7 +84,7 @@ def files(path):
 # --- life of a session ----------------------------------------------------------------------------
 
 
-def test_a_session_is_a_folder_of_manifest_journal_and_frames(closed):
+def test_session_is_folder_of_manifest_journal_and_frames(closed):
     assert set(files(closed)) == {
         "session.json",
         "journal.jsonl",
@@ -93,7 +93,7 @@ def test_a_session_is_a_folder_of_manifest_journal_and_frames(closed):
     assert (closed / "orphans").is_dir()
 
 
-def test_what_was_committed_is_read_back_bit_for_bit(closed):
+def test_committed_frames_read_back_bit_for_bit(closed):
     opened = Session.open(closed)
     for number, record in enumerate(opened.frames()):
         frame = opened.read(record)
@@ -107,7 +107,7 @@ def test_what_was_committed_is_read_back_bit_for_bit(closed):
         )
 
 
-def test_todo_is_the_plan_minus_what_is_done(session):
+def test_todo_is_plan_minus_completed_steps(session):
     assert [step.id for step, _ in session.todo()] == [step.id for step in PLAN.steps]
     commit(session, "S001")
     assert [step.id for step, _ in session.todo()] == ["D000", "S000", "S002", "S003"]
@@ -122,7 +122,7 @@ def test_frames_are_found_by_kind_and_index(closed):
     assert opened.frames(bracket=1) == []
 
 
-def test_an_interrupted_session_goes_on_where_it_stopped(session):
+def test_interrupted_session_continues_from_last_step(session):
     commit(session, "D000")
     session.release()
     with Session.resume(session.path) as again:
@@ -133,7 +133,7 @@ def test_an_interrupted_session_goes_on_where_it_stopped(session):
     assert verify(session.path, today=NOON.date()).warnings == ()
 
 
-def test_the_last_attempt_of_a_frame_counts_and_the_first_stays(session):
+def test_last_frame_attempt_counts_and_first_stays(session):
     commit(session, "D000", fill=700)
     commit(session, "D000", fill=800, attempt=2)
     (record,) = session.frames("dark")
@@ -141,7 +141,7 @@ def test_the_last_attempt_of_a_frame_counts_and_the_first_stays(session):
     assert (session.path / "frames/D000+cam.dng").exists()
 
 
-def test_reading_needs_no_lock_and_sees_what_was_acknowledged(session):
+def test_reading_without_lock_shows_acknowledged_frames(session):
     commit(session, "D000")
     assert [record.step_id for record in Session.open(session.path).frames()] == ["D000"]
 
@@ -179,7 +179,7 @@ def test_a_session_opened_for_reading_cannot_be_written(session):
         commit(Session.open(session.path), "D000")
 
 
-def test_the_debris_of_an_interrupted_creation_can_be_used_again(tmp_path):
+def test_interrupted_creation_debris_can_be_reused(tmp_path):
     path = tmp_path / "s"
     (path / "frames").mkdir(parents=True)
     (path / "journal.jsonl").touch()
@@ -190,7 +190,7 @@ def test_the_debris_of_an_interrupted_creation_can_be_used_again(tmp_path):
     assert verify(path).ok
 
 
-def test_files_without_a_line_are_set_aside_and_never_lost(session):
+def test_files_without_line_are_set_aside_never_lost(session):
     commit(session, "D000")
     session.release()
     (session.path / "frames/S000+cam.dng").write_bytes(b"unacknowledged")
@@ -202,7 +202,7 @@ def test_files_without_a_line_are_set_aside_and_never_lost(session):
     assert [file.name for file in (session.path / "frames").iterdir()] == ["D000+cam.dng"]
 
 
-def test_orphans_of_one_name_do_not_overwrite_each_other(session):
+def test_orphans_of_same_name_do_not_overwrite(session):
     for content in (b"first", b"second"):
         session.release()
         (session.path / "frames/S000+cam.dng").write_bytes(content)
@@ -244,7 +244,7 @@ def test_a_commit_that_cannot_be_leaves_no_trace(session, change, error, reason)
     commit(session, "S000")
 
 
-def test_a_frame_of_another_step_or_session_is_refused(session, tmp_path):
+def test_frame_of_other_step_or_session_is_refused(session, tmp_path):
     with pytest.raises(SessionError, match="step_id: got 'S001', expected S000"):
         session.commit("S000", "cam", dng(session, "S001"), settings={}, actual={}, t_host_s=0.0)
     with create(tmp_path / "other") as other, pytest.raises(SessionError, match="session_id"):
@@ -258,7 +258,7 @@ def test_a_committed_frame_is_not_committed_twice(session):
 
 
 @pytest.mark.parametrize("content", ["file", "folder"])
-def test_a_session_does_not_start_on_top_of_something(tmp_path, content):
+def test_session_never_starts_over_existing_content(tmp_path, content):
     path = tmp_path / "s"
     if content == "file":
         path.write_text("notes")
@@ -282,7 +282,7 @@ def test_a_session_does_not_start_on_top_of_something(tmp_path, content):
         ({"now": lambda: datetime(2026, 1, 1)}, "created_at"),
     ],
 )
-def test_a_manifest_that_cannot_be_is_refused_before_anything_is_made(tmp_path, changes, reason):
+def test_impossible_manifest_is_refused_before_creation(tmp_path, changes, reason):
     with pytest.raises(SessionError, match=reason):
         create(tmp_path / "s", **changes)
     assert not (tmp_path / "s").exists()
@@ -303,7 +303,7 @@ def test_a_plan_for_another_rig_starts_no_session(tmp_path):
 # --- what is kept ---------------------------------------------------------------------------------
 
 
-def test_the_manifest_says_who_what_with_what_and_whether_it_was_real(tmp_path):
+def test_manifest_records_subject_plan_devices_and_source(tmp_path):
     digest = "sha256:" + "0" * 64
     reference = CalibrationRef("sensor", digest)
     create(
@@ -339,14 +339,14 @@ def test_the_content_hash_vouches_for_every_commit(session):
         ("publication", date(2030, 1, 1), False),
     ],
 )
-def test_consent_ends_with_its_scope_and_its_last_day(session, scope, today, allowed):
+def test_consent_ends_with_scope_and_last_day(session, scope, today, allowed):
     assert session.export_allowed(scope, today=today) == allowed
     if not allowed:
         with pytest.raises(ConsentError, match="P042 has not agreed"):
             session.require_consent(scope, today=today)
 
 
-def test_consent_to_any_use_covers_every_scope_until_its_last_day(tmp_path):
+def test_consent_to_any_use_covers_all_scopes(tmp_path):
     subject = Subject("virtual-III", ("any",), date(2031, 1, 1))
     with create(tmp_path / "s", source="simulated", subject=subject) as made:
         assert made.export_allowed("publication", today=date(2031, 1, 1))
@@ -390,7 +390,7 @@ class FullDisk(Disk):
 @pytest.mark.parametrize(
     "operation", ["create", "write", "fsync", "rename", "fsync_dir", "fdatasync"]
 )
-def test_a_refusing_disk_costs_one_frame_and_none_that_was_acknowledged(session, operation):
+def test_failing_disk_costs_single_frame_not_acknowledged_ones(session, operation):
     commit(session, "D000")
     session.release()
     writer = Session.resume(session.path, disk=FullDisk(operation, after=0))
@@ -405,12 +405,12 @@ def test_a_refusing_disk_costs_one_frame_and_none_that_was_acknowledged(session,
     assert verify(session.path).ok
 
 
-def test_a_disk_error_is_an_operating_system_error_too(tmp_path):
+def test_disk_error_is_also_operating_system_error(tmp_path):
     with pytest.raises(OSError, match="disk refused"):
         create(tmp_path / "s", disk=FullDisk("make_dir", after=1))
 
 
-def test_a_frame_that_vanished_is_named_and_not_silently_retaken(session):
+def test_vanished_frame_is_reported_not_silently_retaken(session):
     commit(session, "D000")
     session.release()
     (session.path / "frames/D000+cam.dng").unlink()
@@ -421,7 +421,7 @@ def test_a_frame_that_vanished_is_named_and_not_silently_retaken(session):
 # --- attachments ----------------------------------------------------------------------------------
 
 
-def test_an_attachment_is_read_back_bit_for_bit_after_the_session_is_closed(session):
+def test_attachment_reads_back_bit_for_bit_after_closing(session):
     data = bytes(range(256)) * 9
     session.attach("scan.ply", data, about={"unit": "mm", "triangles": 12})
     assert session.attachment("scan.ply") == data
@@ -445,7 +445,7 @@ def test_the_content_hash_vouches_for_an_attachment(session):
     assert Session.open(session.path).content_hash == session.content_hash
 
 
-def test_an_attachment_survives_an_interruption_and_strays_go_to_the_orphans(session):
+def test_attachment_survives_interruption_strays_become_orphans(session):
     session.attach("scan.ply", b"scan")
     session.release()
     (session.path / "attachments/other.ply.part").write_bytes(b"half")
@@ -488,7 +488,7 @@ def test_nothing_is_attached_to_a_closed_session(closed):
 @pytest.mark.parametrize(
     "operation", ["make_dir", "create", "write", "fsync", "rename", "fsync_dir", "fdatasync"]
 )
-def test_a_refusing_disk_costs_one_attachment_and_nothing_acknowledged(session, operation):
+def test_failing_disk_costs_attachment_only_keeps_acknowledged_data(session, operation):
     commit(session, "D000")
     session.release()
     writer = Session.resume(session.path, disk=FullDisk(operation, after=0))
@@ -502,7 +502,7 @@ def test_a_refusing_disk_costs_one_attachment_and_nothing_acknowledged(session, 
     assert verify(session.path).ok
 
 
-def test_a_copy_of_a_closed_session_takes_an_attachment_and_the_original_stays(tmp_path, session):
+def test_copy_of_closed_session_takes_attachment_original_unchanged(tmp_path, session):
     commit(session, "D000")
     session.attach("notes.txt", b"as captured")
     session.close(missing_because="the subject left")

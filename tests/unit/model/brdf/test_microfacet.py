@@ -33,19 +33,19 @@ def reflected(theta_light, roughness, kind, eta):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("theta_light", [0.0, 0.6, 1.1])
-def test_a_nearly_smooth_surface_reflects_fresnels_share_once(kind, theta_light):
+def test_nearly_smooth_surface_reflects_fresnel_fraction_once(kind, theta_light):
     expected = float(fresnel.reflectance(np.cos(theta_light), 1.4))
     assert reflected(theta_light, 0.05, kind, 1.4) == pytest.approx(expected, rel=0.03)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_no_surface_gives_more_than_it_gets(kind):
+def test_surface_never_reflects_more_than_incident_light(kind):
     for roughness in (0.1, 0.4, 0.5 if kind == "blinn" else 0.9):
         for theta_light in (0.0, 1.0, 1.4):
             assert reflected(theta_light, roughness, kind, 1e6) < 1.01
 
 
-def test_the_surface_is_finite_at_and_behind_the_horizon():
+def test_surface_is_finite_at_and_behind_horizon():
     f = microfacet.brdf([0.0, -0.5], 0.0, 1.0, 0.0, roughness=0.2, eta=1.4)
     assert np.all(np.isfinite(f))
     with pytest.raises(ValueError, match="roughness"):

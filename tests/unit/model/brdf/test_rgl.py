@@ -47,7 +47,7 @@ def adaptive(rng, *, spectral=False):
 
 
 @pytest.mark.parametrize("name", ["diffuse", "ggx 0.1 eta 1.4", "ggx 0.33 eta 1.4", "retro 0.3"])
-def test_a_written_brdf_is_the_brdf_it_was_made_of(name, rng, tmp_path):
+def test_written_brdf_equals_its_source_brdf(name, rng, tmp_path):
     """Tolerance: linear interpolation between 45 elevations; the median is a third of a percent."""
     brdf = dict(brdf_recipe.materials())[name]
     rgl.write(tmp_path / "a.bsdf", rgl.of_brdf(brdf, description=name))
@@ -128,7 +128,7 @@ def test_flattening_an_uneven_density_spreads_its_samples_evenly(rng, tmp_path):
     assert np.sum((raw - expected) ** 2 / expected) > 500.0
 
 
-def test_what_is_no_isotropic_material_is_named(rng, tmp_path):
+def test_invalid_isotropic_material_error_names_field(rng, tmp_path):
     path = tmp_path / "a.bsdf"
     for change, message in [
         ({"phi_i": np.zeros(8, np.float32)}, "anisotropic"),
@@ -148,7 +148,7 @@ def test_what_is_no_isotropic_material_is_named(rng, tmp_path):
         rgl.read(path)
 
 
-def test_a_brdf_that_is_negative_or_not_finite_is_refused():
+def test_negative_or_nonfinite_brdf_is_refused():
     for value in (-1e-3, np.nan, np.inf):
         with pytest.raises(ValueError, match="brdf"):
             rgl.of_brdf(lambda light, view, v=value: np.full(len(light), v), description="")

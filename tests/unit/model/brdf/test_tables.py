@@ -22,7 +22,7 @@ def directions(rng, n, least=0.3):
     return v[v[:, 2] > least][:n]
 
 
-def test_the_basis_has_59_materials_on_the_grid_that_the_kernels_know(point_basis):
+def test_basis_has_59_materials_on_kernel_grid(point_basis):
     assert point_basis.size == len(set(point_basis.names)) == 59
     assert point_basis.table.shape[:3] == (
         row_kernels.NODES_D,
@@ -66,7 +66,7 @@ def uniform_sky(basis, name, mu_view):
 
 
 @pytest.mark.parametrize("mu_view", [1.0, 0.8, 0.6])
-def test_a_white_furnace_stays_white_with_fresnel_counted_once(point_basis, mu_view):
+def test_white_furnace_stays_white_with_fresnel_counted_once(point_basis, mu_view):
     # A smooth lossless surface over a white inside: F_r from the table, and what enters comes
     # back, F_t(view) F_t(light) R_d / pi integrated with R_d = 1 / (1 - mean F_r).
     specular = uniform_sky(point_basis, "ggx 0.14 eta 1.4", mu_view)
@@ -81,12 +81,12 @@ def test_a_white_furnace_stays_white_with_fresnel_counted_once(point_basis, mu_v
 
 
 @pytest.mark.parametrize("mu_view", [1.0, 0.7, 0.3])
-def test_no_material_sends_back_more_than_it_got(point_basis, mu_view):
+def test_basis_material_never_reflects_more_than_incident_light(point_basis, mu_view):
     for name in ("ggx 0.7 eta 1.55", "beckmann 0.3", "blinn 0.45", "sheen 0.25", "rough diffuse"):
         assert uniform_sky(point_basis, name, mu_view) < 1.02
 
 
-def test_the_light_s_disc_widens_a_narrow_lobe_and_keeps_its_energy():
+def test_light_disc_widens_narrow_lobe_and_keeps_energy():
     sharp = {"ggx 0.05 eta 1.4": dict(brdf_recipe.materials())["ggx 0.05 eta 1.4"]}
     point, disc = (brdf_tables.tabulate(sharp, light_radius_rad=radius) for radius in (0.0, 0.08))
     z = np.array([0.0, 0.0, 1.0])
@@ -135,7 +135,7 @@ def flaws():
     return {"holes": holes, "spiked": spiked, "dark": dark, "no_blue": no_blue}
 
 
-def test_a_folder_of_measured_files_is_read_in_order_however_they_are_spelt(flaws, tmp_path, rng):
+def test_measured_folder_is_read_in_order_any_spelling(flaws, tmp_path, rng):
     for file, which in (
         ("Skin-B.BINARY", "no_blue"),
         ("a.binary", "spiked"),
@@ -161,7 +161,7 @@ def test_a_folder_of_measured_files_is_read_in_order_however_they_are_spelt(flaw
     assert basis.evaluate(z, z, z)[2] == pytest.approx(1e5)
 
 
-def test_a_file_without_light_or_beyond_single_precision_is_named(flaws, tmp_path):
+def test_file_without_light_or_beyond_float32_is_reported(flaws, tmp_path):
     for which, message in (
         ("dark", "no value above 0"),
         ("nothing", "no value"),
@@ -187,7 +187,7 @@ def test_a_mixed_basis_is_the_mixture(point_basis, rng):
         point_basis.mixed(-mix)
 
 
-def test_directions_below_the_horizon_reflect_nothing_and_degenerate_ones_are_finite(point_basis):
+def test_directions_below_horizon_reflect_nothing_degenerate_are_finite(point_basis):
     z = np.array([0.0, 0.0, 1.0])
     assert np.all(point_basis.evaluate(-z, z, z) == 0.0)
     side = np.array([1.0, 0.0, 0.0])

@@ -20,7 +20,7 @@ def fields(rng):
     }
 
 
-def test_arrays_come_back_with_their_types_and_the_same_bytes(fields, tmp_path):
+def test_arrays_round_trip_with_types_and_same_bytes(fields, tmp_path):
     tensor_file.write(tmp_path / "a", fields)
     back = tensor_file.read(tmp_path / "a")
     assert list(back) == list(fields)
@@ -31,7 +31,7 @@ def test_arrays_come_back_with_their_types_and_the_same_bytes(fields, tmp_path):
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
-def test_the_layout_is_the_published_one_to_the_byte(tmp_path):
+def test_layout_matches_published_format_to_the_byte(tmp_path):
     tensor_file.write(tmp_path / "a", {"ab": np.array([[1.5, -2.0]], np.float32)})
     head = b"tensor_file\0" + struct.pack("<BBI", 1, 0, 1)
     entry = struct.pack("<H", 2) + b"ab" + struct.pack("<HBQQQ", 2, 10, 56, 1, 2)

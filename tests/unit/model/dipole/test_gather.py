@@ -54,13 +54,13 @@ def edge_profile(x_mm, media):
 
 @pytest.mark.parametrize("length_mm", [0.01, 0.3, 1.7, 100.0])
 @pytest.mark.parametrize("r_d", [0.0, 1e-6, 0.5, 1.0 - 1e-9, 1.0])
-def test_even_light_comes_back_as_r_d_of_what_entered(length_mm, r_d):
+def test_uniform_light_returns_r_d_of_entering_light(length_mm, r_d):
     points, area, _ = bumpy_face(24)
     out = exitance(points, area, np.full((len(points), 3), 2.5), points[::7], r_d, length_mm)
     np.testing.assert_allclose(out, 2.5 * r_d, rtol=2e-6)
 
 
-def test_the_tree_sums_what_the_direct_sum_does_within_its_bound():
+def test_tree_sum_matches_direct_sum_within_bound():
     points, area, light = bumpy_face()
     at = points[::37] + np.array([0.02, -0.03, 0.01])
     expected = exitance_directly(points, area, light, at, R_D, LENGTH_MM, normalize=False)
@@ -80,7 +80,7 @@ def test_the_tree_sums_what_the_direct_sum_does_within_its_bound():
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_normalized_sums_and_own_light_agree_with_the_direct_sum(known):
+def test_normalized_sums_and_own_light_match_direct_sum(known):
     points, area, light = bumpy_face(40)
     at, own = points[::29], light[::29] if known else None
     rng = np.random.default_rng(3)
@@ -97,7 +97,7 @@ def test_normalized_sums_and_own_light_agree_with_the_direct_sum(known):
 
 @pytest.mark.parametrize("reach_mm", [1e-3, 0.1, 1.0, 30.0])
 @pytest.mark.parametrize("r_d", [1e-4, 0.5, 0.99999])
-def test_the_kernel_has_integral_one_at_any_reach(reach_mm, r_d):
+def test_kernel_integrates_to_unity_at_any_reach(reach_mm, r_d):
     media = Media.of(r_d, 1.3, eta=ETA_SKIN)
     ends = [1e-9, *np.geomspace(1e-4, 100.0, 13), reach_mm]
     ends.sort()
@@ -111,7 +111,7 @@ def test_the_kernel_has_integral_one_at_any_reach(reach_mm, r_d):
     assert (own >= 0).all()
 
 
-def test_a_shadow_edge_has_the_profile_of_the_dipoles_integral_the_finer_the_sources_the_better():
+def test_shadow_edge_converges_to_dipole_profile_with_sources():
     x = np.array([-2.0, -1.0, -0.3, 0.3, 1.0, 2.0])
     media = [Media.of(r, length, eta=ETA_SKIN) for r, length in zip(R_D, LENGTH_MM, strict=True)]
     truth = np.array([[edge_profile(place, medium) for medium in media] for place in x])
@@ -126,7 +126,7 @@ def test_a_shadow_edge_has_the_profile_of_the_dipoles_integral_the_finer_the_sou
     assert worst[2] < 0.3 * worst[0]
 
 
-def test_the_depth_of_the_source_inverts_eq_5_near_both_ends():
+def test_source_depth_inverts_eq_5_near_both_ends():
     r_d = np.concatenate([np.geomspace(1e-6, 0.5, 200), 1.0 - np.geomspace(0.49, 1e-9, 300)])
     media = Media.of(r_d, 2.0, eta=ETA_SKIN)
     expected = 2.0 * np.sqrt(3.0 * dipole.invert_to_deficit(r_d, ETA_SKIN))
@@ -134,7 +134,7 @@ def test_the_depth_of_the_source_inverts_eq_5_near_both_ends():
     assert (np.diff(media.depth_mm) < 0.0).all()
 
 
-def test_light_that_sources_cannot_resolve_stays_and_none_is_lost():
+def test_unresolvable_light_stays_local_and_is_conserved():
     points, area = plane(100.0, 5.0)
     light = np.random.default_rng(1).uniform(0.0, 1.0, (len(points), 3))
     inner = (np.abs(points[:, :2]) < 35.0).all(axis=1)
@@ -172,7 +172,7 @@ def test_a_single_source_and_none_at_all():
     assert exitance(*_sheet(), none, R_D, LENGTH_MM).shape == (0, 3)
 
 
-def test_albedo_above_one_scales_light_that_does_not_spread():
+def test_albedo_above_unity_scales_unscattered_light():
     points, area, light = _sheet()
     inner = np.flatnonzero((np.abs(points[:, :2]) < 3.0).all(axis=1))
     at, own = points[inner], light[inner]
@@ -182,7 +182,7 @@ def test_albedo_above_one_scales_light_that_does_not_spread():
     assert not exitance(points, area, light, at, 0.0, LENGTH_MM).any()
 
 
-def test_a_fold_stays_between_the_darkest_and_the_brightest_light():
+def test_fold_stays_between_darkest_and_brightest_light():
     points, area = plane(12.0, 0.5)
     light = np.zeros((2 * len(points), 3))
     light[: len(points)] = 1.0
@@ -207,7 +207,7 @@ def test_a_spot_gives_back_no_more_than_entered():
         np.testing.assert_allclose(out.sum(axis=0) / spot.sum(axis=0), R_D, rtol=0.01)
 
 
-def test_single_precision_and_far_origins_change_little_and_inputs_stay():
+def test_single_precision_and_far_origins_barely_change_result():
     points, area, light = bumpy_face(32)
     at = points[::11]
     expected = exitance(points, area, light, at, R_D, LENGTH_MM)
@@ -220,7 +220,7 @@ def test_single_precision_and_far_origins_change_little_and_inputs_stay():
     np.testing.assert_allclose(moved, expected, rtol=1e-4, atol=1e-6)
 
 
-def test_every_source_is_in_one_leaf_and_nodes_hold_theirs():
+def test_source_tree_leaves_partition_and_nodes_bound_sources():
     rng = np.random.default_rng(5)
     # equal coordinates must not stop the halving
     place = np.concatenate([rng.normal(size=(300, 3)), np.zeros((50, 3))]).astype(np.float32)

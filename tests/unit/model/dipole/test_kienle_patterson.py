@@ -11,7 +11,7 @@ from model.dipole import profile as dipole
 RADII = np.arange(0.3, 7.2, 0.25)
 
 
-def test_the_surface_transmits_what_the_paper_gives_at_1_4():
+def test_surface_transmission_matches_published_value_at_1_4():
     c_phi, c_flux = diffusion.exit_coefficients(1.4)
     assert c_phi == pytest.approx(0.118, abs=5e-4)
     assert c_flux == pytest.approx(0.306, abs=5e-4)
@@ -63,7 +63,7 @@ def test_rows_of_coefficients_broadcast():
     np.testing.assert_array_equal(both[1], diffusion.reflectance(RADII, 0.1, 2.0, 1.4))
 
 
-def test_far_from_the_source_diffusion_tends_to_transport_and_near_it_does_not():
+def test_diffusion_tends_to_transport_only_far_from_source():
     # Both per power that enters the tissue; the table counts the surface's reflection as loss.
     entered = 1.0 - fresnel.normal_reflectance(1.4)
     radius = np.array([0.2, 2.0, 4.0, 8.0, 12.0])
@@ -78,7 +78,7 @@ def test_far_from_the_source_diffusion_tends_to_transport_and_near_it_does_not()
     assert np.max(np.abs(ratio[dipole][1:] - 1.0)) > 0.1  # the paper's model is worse
 
 
-def test_strong_absorption_no_scattering_and_no_distance_have_clear_outcomes():
+def test_extreme_absorption_scattering_and_distance_are_well_defined():
     assert diffusion.reflectance(RADII, 5.0, 0.0, 1.4).tolist() == [0.0] * RADII.size
     dark = diffusion.derivatives(np.append(0.0, RADII), 10.0, 1.0, 1.6)
     assert np.all(np.isfinite(dark))
@@ -91,7 +91,7 @@ def test_strong_absorption_no_scattering_and_no_distance_have_clear_outcomes():
         diffusion.reflectance(1.0, 0.1, 1.0, 0.9)
 
 
-def test_the_closed_dipole_and_diffusion_hold_over_every_material_of_jensen_2001(test_data):
+def test_closed_dipole_and_diffusion_cover_jensen_2001_materials(test_data):
     path = test_data / "radiative_transfer" / "jensen2001.csv"
     rows = [line.split(",") for line in path.read_text().splitlines()[1:]]
     table = np.array([[float(x) for x in row[1:7]] for row in rows]).reshape(-1, 2, 3)

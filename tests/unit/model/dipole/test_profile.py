@@ -13,7 +13,7 @@ from model import dipole
     ("sigma_a", "sigma_s", "published"),
     [(0.032, 0.74, 0.4360), (0.17, 0.88, 0.2273), (0.48, 1.01, 0.1310)],
 )
-def test_skin_of_jensen_2001_has_its_closed_form_reflectance(sigma_a, sigma_s, published):
+def test_jensen_2001_skin_has_closed_form_reflectance(sigma_a, sigma_s, published):
     r_d = dipole.total_reflectance(sigma_s / (sigma_a + sigma_s), 1.3)
     assert float(r_d) == pytest.approx(published, abs=1e-4)
 
@@ -24,7 +24,7 @@ def materials(test_data):
     return np.array([[float(x) for x in row[1:7]] for row in rows]).reshape(-1, 2, 3)
 
 
-def test_the_profile_integrates_to_the_total_for_every_material_of_jensen_2001(test_data):
+def test_profile_integrates_to_total_for_jensen_2001_materials(test_data):
     for sigma_s, sigma_a in np.moveaxis(materials(test_data), 1, 2).reshape(-1, 2):
         if sigma_a == 0.0:
             continue
@@ -40,7 +40,7 @@ def test_the_profile_integrates_to_the_total_for_every_material_of_jensen_2001(t
         assert total == pytest.approx(float(expected), rel=1e-6)
 
 
-def test_diffusion_is_near_transport_for_high_albedo_and_not_for_low(test_data):
+def test_diffusion_is_near_transport_only_for_high_albedo(test_data):
     path = test_data / "radiative_transfer" / "adding_doubling_semi_infinite.csv"
     with path.open() as stream:
         rows = [[float(x) for x in row] for row in list(csv.reader(stream))[1:]]
@@ -55,7 +55,7 @@ def test_diffusion_is_near_transport_for_high_albedo_and_not_for_low(test_data):
 
 
 @pytest.mark.parametrize("eta", [1.0, 1.3, 1.4, 1.6])
-def test_the_inverse_returns_every_reflectance_from_1e_6_to_1_minus_1e_9(eta):
+def test_inverse_returns_reflectance_from_1e_6_toward_1(eta):
     near_one = 10.0 ** -np.linspace(0.4, 9.0, 60)
     r_d = np.concatenate([10.0 ** np.linspace(-6.0, -0.3, 60), 1.0 - near_one])
     deficit = dipole.invert_to_deficit(r_d, eta)
@@ -67,25 +67,25 @@ def test_the_inverse_returns_every_reflectance_from_1e_6_to_1_minus_1e_9(eta):
     np.testing.assert_allclose(dipole.total_reflectance(alpha, eta), r_d[:60], rtol=1e-14)
 
 
-def test_the_inverse_is_monotone_in_the_deficit_up_to_1_minus_1e_9():
+def test_inverse_is_monotone_in_deficit_near_unity():
     r_d = np.concatenate([np.linspace(1e-6, 0.9, 2000), 1.0 - np.logspace(-1.001, -9, 2000)])
     assert np.all(np.diff(r_d) > 0.0)
     assert np.all(np.diff(dipole.invert_to_deficit(r_d, 1.3)) < 0.0)
     assert np.all(np.diff(dipole.invert_total_reflectance(r_d, 1.3)) >= 0.0)
 
 
-def test_working_in_the_albedo_itself_would_lose_the_deficit_near_one():
+def test_albedo_arithmetic_would_lose_deficit_near_unity():
     deficit = dipole.invert_to_deficit(1.0 - 1e-9, 1.3)
     assert 4e-20 < deficit < 5e-20
     assert 1.0 - dipole.invert_total_reflectance(1.0 - 1e-9, 1.3) == 0.0
 
 
-def test_black_and_white_are_inverted_exactly_for_every_index():
+def test_black_and_white_are_inverted_exactly_any_index():
     for eta in (1.0, 1.3, 1.5):
         np.testing.assert_array_equal(dipole.invert_total_reflectance([0.0, 1.0], eta), [0.0, 1.0])
 
 
-def test_a_reflectance_outside_the_unit_interval_is_a_flagged_outlier():
+def test_reflectance_outside_unit_interval_is_flagged_outlier():
     r_d = np.array([[0.3, 1.0 + 1e-12], [np.nan, -1e-6]])
     outlier = dipole.is_outlier(r_d)
     np.testing.assert_array_equal(outlier, [[False, True], [True, True]])

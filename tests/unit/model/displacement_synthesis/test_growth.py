@@ -74,7 +74,7 @@ def test_cuts_are_not_rougher_than_skin(foreheads):
     assert bend < 1.1
 
 
-def test_steps_left_at_cuts_would_be_seen(foreheads):
+def test_steps_remaining_at_cuts_are_detectable(foreheads):
     _, closed = at_and_off_cuts(foreheads)
     _, left = at_and_off_cuts(foreheads, range_px=0.5)
     assert left > 1.25 * closed
@@ -122,7 +122,7 @@ def test_a_map_goes_on_at_its_other_side(foreheads, wrap, axes):
         assert broken > 3.0 * usual
 
 
-def test_sites_keep_their_roughness_and_meet_without_an_edge(foreheads, cheeks):
+def test_sites_keep_roughness_and_meet_without_edge(foreheads, cheeks):
     patches = {"forehead": foreheads, "cheek": cheeks}
     labels = np.zeros((10, 10), np.int64)
     labels[:, 5:] = 1
@@ -138,7 +138,7 @@ def test_sites_keep_their_roughness_and_meet_without_an_edge(foreheads, cheeks):
     assert bend[310:330].max() < 1.25 * bend[50:-50].max()
 
 
-def test_weights_of_one_site_are_that_site_alone(foreheads, cheeks):
+def test_single_site_weights_give_that_site(foreheads, cheeks):
     only = np.zeros((2, 3, 3))
     only[1] = 0.3
     both = synthesis.grow(
@@ -151,7 +151,7 @@ def test_weights_of_one_site_are_that_site_alone(foreheads, cheeks):
     assert abs(both.std() / np.std(cheeks) - 1.0) < 0.1
 
 
-def test_labels_of_no_site_take_the_nearest_one(foreheads, cheeks):
+def test_unlabeled_cells_take_nearest_site(foreheads, cheeks):
     patches = {"forehead": foreheads, "cheek": cheeks}
     sparse, full = np.full((8, 8), -1), np.zeros((8, 8), int)
     sparse[4, 1], sparse[4, 6] = 0, 1
@@ -163,7 +163,7 @@ def test_labels_of_no_site_take_the_nearest_one(foreheads, cheeks):
     np.testing.assert_array_equal(*maps)
 
 
-def test_features_keep_their_size_on_the_skin_where_pixels_vary(foreheads):
+def test_features_keep_skin_size_where_pixels_vary(foreheads):
     """Rationale: slopes on the skin do not depend on the map's pixels. Tolerance 10 %: coarser
     pixels leave out some fine slope, and scales are met to 2 %."""
     pixel_um = np.repeat(np.repeat([[20.0, 30.0]], 4, axis=0), 4, axis=1)
@@ -205,7 +205,7 @@ def test_a_hole_is_bridged_between_its_borders():
     assert np.abs(bridged - plane).max() < 5.0
 
 
-def test_leveling_halves_a_wave_of_the_cutoff_and_keeps_short_ones():
+def test_leveling_halves_cutoff_wave_and_keeps_short_waves():
     x = np.arange(600) * 10.0
     for wave_um, kept in ((1000.0, 0.5), (100.0, 1.0), (8000.0, 0.01)):
         wave = np.tile(np.sin(2 * np.pi * x / wave_um), (600, 1))
@@ -237,7 +237,7 @@ def test_a_cut_is_the_cheapest_of_all(rng, first, last):
     assert (np.abs(np.diff(path)) <= 1).all()
 
 
-def test_the_cost_of_a_choice_is_that_of_its_cut(rng):
+def test_choice_cost_is_that_of_its_cut(rng):
     heights = rng.standard_normal(2 * 30 * 12).astype(np.float32)
     a, b = heights.reshape(2, 30, 12).astype(np.float64)
     d = a - b
@@ -254,14 +254,14 @@ def test_the_cost_of_a_choice_is_that_of_its_cut(rng):
     assert cut_kernels.cut_cost(heights, 0, 12, 360, 12, grid, np.float32(0.1), 1.0) == 1.0
 
 
-def test_windows_are_no_smoother_than_the_patches_they_are_chosen_from(foreheads):
+def test_windows_are_as_rough_as_their_source_patches(foreheads):
     """Choosing what cuts cheaply could prefer flat skin. Tolerance 5 %: 60 windows of 3 patches."""
     grown = synthesis.grow(foreheads, SIDE, rng=np.random.default_rng(13), **knobs(candidates=64))
     slope = np.sqrt(np.mean(np.gradient(grown)[0] ** 2))
     assert abs(slope / np.sqrt(np.mean([np.gradient(p)[0] ** 2 for p in foreheads])) - 1) < 0.05
 
 
-def test_a_map_is_written_where_it_is_asked_for(foreheads, tmp_path):
+def test_map_is_written_to_requested_array(foreheads, tmp_path):
     out = np.lib.format.open_memmap(
         tmp_path / "map.npy", mode="w+", dtype=np.float32, shape=(300, 200)
     )
@@ -310,12 +310,12 @@ PATCH = np.random.default_rng(0).standard_normal((64, 64))
         ({"a": [PATCH]}, 64, {"regions": np.full((3, 3), -1)}, "no site anywhere"),
     ],
 )
-def test_what_nothing_grows_from_is_refused_by_name(patches, size, changes, message):
+def test_impossible_growth_is_refused_by_name(patches, size, changes, message):
     with pytest.raises(synthesis.SynthesisError, match=message):
         synthesis.grow(patches, size, rng=np.random.default_rng(0), **changes)
 
 
-def test_flat_skin_stays_flat_and_any_unit_will_do():
+def test_flat_skin_stays_flat_in_any_unit():
     flat = synthesis.grow([np.full((100, 100), 5.0)], 200, rng=np.random.default_rng(0))
     np.testing.assert_array_equal(flat, 5.0)
     maps = [
@@ -326,7 +326,7 @@ def test_flat_skin_stays_flat_and_any_unit_will_do():
     np.testing.assert_allclose(maps[2], maps[0], rtol=1e-5, atol=1e-5)
 
 
-def test_a_map_may_be_a_line_or_smaller_than_a_cell():
+def test_map_may_be_line_or_below_cell_size():
     for size in (1, (1, 300), (300, 7)):
         found = synthesis.grow([PATCH], size, rng=np.random.default_rng(0))
         assert np.isfinite(found).all()

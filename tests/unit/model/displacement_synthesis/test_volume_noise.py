@@ -22,7 +22,7 @@ def test_cosines_are_those_of_numpy(rng):
     np.testing.assert_allclose(one.at(points), plain, atol=2e-7)
 
 
-def test_a_wave_is_a_cosine_of_its_turns():
+def test_wave_is_cosine_of_its_cycles():
     turns = np.linspace(-3.0, 3.0, 1001)
     points = np.stack([turns, 0 * turns, 0 * turns], axis=1)
     out = np.empty(turns.size)
@@ -30,7 +30,7 @@ def test_a_wave_is_a_cosine_of_its_turns():
     np.testing.assert_allclose(out, np.cos(2 * np.pi * turns), atol=1e-9)
 
 
-def test_variance_over_space_is_what_was_asked(rng):
+def test_spatial_variance_matches_requested_variance(rng):
     """Of one draw, over a cube far larger than its waves; 20,000 independent places: 1 % error of
     the variance for normal values, limit 4 standard errors."""
     values = noise().at(rng.uniform(0.0, 1000.0, (20_000, 3)))
@@ -39,7 +39,7 @@ def test_variance_over_space_is_what_was_asked(rng):
 
 
 @pytest.mark.parametrize("slope", [-1.0, 0.0, -3.0])
-def test_covariance_over_draws_is_that_of_the_stated_spectrum(slope):
+def test_covariance_over_draws_matches_stated_spectrum(slope):
     """400 draws at places of fixed distance; limit 4 standard errors at 6 distances: fails by
     chance once in 2,600."""
     distances = np.array([0.0, 0.03, 0.06, 0.12, 0.25, 0.6])
@@ -65,7 +65,7 @@ def test_no_power_is_outside_the_band():
     assert power[(k > 4.0) & (k < 8.0)].sum() > 1e-3 * power.sum()
 
 
-def test_power_falls_equally_on_octaves_with_slope_minus_one():
+def test_unit_negative_slope_gives_equal_power_per_octave():
     k = np.linalg.norm(noise(waves=3000).waves_per_mm, axis=1)
     octaves = np.histogram(k, [1, 2, 4, 8])[0] / 3000
     np.testing.assert_allclose(octaves, 1 / 3, atol=2e-3)
@@ -83,14 +83,14 @@ def test_no_direction_is_preferred():
     np.testing.assert_allclose(tensor, np.eye(3) / 3, atol=0.02)
 
 
-def test_slopes_have_the_variance_that_the_spectrum_says(rng):
+def test_slope_variance_matches_spectrum(rng):
     one, step = noise(), 1e-4
     at = rng.uniform(0.0, 1000.0, (20_000, 3))
     slope = (one.at(at + np.array([step, 0.0, 0.0])) - one.at(at)) / (step * 1e3)
     assert abs(slope.var() / one.slope_variance - 1.0) < 0.1
 
 
-def test_a_place_has_one_value_whatever_is_asked_with_it(rng):
+def test_position_value_is_independent_of_other_queries(rng):
     one, points = noise(), rng.uniform(-50.0, 50.0, (3, 400, 3))
     whole = one.at(points)
     np.testing.assert_array_equal(one.at(points[1, 7:9]), whole[1, 7:9])
@@ -109,13 +109,13 @@ def test_a_place_has_one_value_whatever_is_asked_with_it(rng):
         ({"waves": 1}, "waves"),
     ],
 )
-def test_a_spectrum_that_is_none_is_refused(changes, message):
+def test_invalid_spectrum_is_refused(changes, message):
     with pytest.raises(VolumeNoiseError, match=message):
         noise(**changes)
 
 
 @pytest.mark.parametrize("points", [np.zeros(2), np.full((2, 3), np.nan)])
-def test_places_that_are_none_are_refused(points):
+def test_invalid_positions_are_refused(points):
     with pytest.raises(VolumeNoiseError, match="points_mm"):
         noise().at(points)
 

@@ -6,7 +6,7 @@ import pytest
 from model.facial_color.blood_errors import compare
 
 
-def test_one_gain_is_the_best_single_factor(rng):
+def test_single_gain_is_best_factor(rng):
     neutral = rng.uniform(0.01, 0.05, (30, 20))
     truth = 1.4 * neutral + 0.002 * rng.standard_normal(neutral.shape)
     found = compare(truth, truth, neutral)
@@ -16,7 +16,7 @@ def test_one_gain_is_the_best_single_factor(rng):
         assert np.sqrt(np.mean((other * neutral - truth) ** 2)) > found.one_gain
 
 
-def test_what_is_masked_or_missing_does_not_count(rng):
+def test_masked_and_missing_pixels_are_ignored(rng):
     neutral = rng.uniform(0.01, 0.05, (10, 10))
     predicted = neutral.copy()
     predicted[0] = 9.0

@@ -46,7 +46,7 @@ def twin(h, radius_px, valid):
 
 @pytest.mark.parametrize("radius_px", RADII_PX)
 @pytest.mark.parametrize("shape", [(40, 37), (5, 70), (70, 3), (1, 1)])
-def test_disc_holds_the_pixels_within_its_radius_inside_map_and_mask(shape, radius_px, rng):
+def test_disc_contains_pixels_within_radius_map_and_mask(shape, radius_px, rng):
     h = rng.random(shape)
     valid = rng.random(shape) > 0.6
     for mask in (np.ones(shape, bool), valid):
@@ -79,7 +79,7 @@ NEARLY_CONSTANT = {
 
 @pytest.mark.parametrize("kind", NEARLY_CONSTANT)
 @pytest.mark.parametrize("radius_px", [4.0, 16.0])
-def test_deviation_keeps_its_digits_on_a_nearly_constant_map(kind, radius_px, rng):
+def test_deviation_keeps_precision_on_nearly_constant_map(kind, radius_px, rng):
     x = np.linspace(0.0, 1.0, 240)[None, :]
     h = NEARLY_CONSTANT[kind](x) + 1e-5 * rng.standard_normal((50, 240))
     _, deviation, _ = twin(h, radius_px, np.ones(h.shape, bool))
@@ -90,7 +90,7 @@ def test_deviation_keeps_its_digits_on_a_nearly_constant_map(kind, radius_px, rn
     assert np.abs(measure(single, radius_px).deviation / deviation - 1).max() < 2e-4
 
 
-def test_single_precision_map_of_mean_0_3_and_deviation_1e_5_is_within_a_thousandth(rng):
+def test_float32_deviation_is_within_thousandth_at_small_contrast(rng):
     h = 0.3 + 1e-5 * rng.standard_normal((80, 200))
     _, deviation, _ = twin(h, 16.0, np.ones(h.shape, bool))
     found = measure(h.astype(np.float32), 16.0).deviation
@@ -140,14 +140,14 @@ def test_radius_zero_is_the_pixel_itself(rng):
     assert (sigma == 0.0).all()
 
 
-def test_disc_larger_than_the_map_is_the_whole_map(rng):
+def test_disc_larger_than_map_is_whole_map(rng):
     h = rng.random((20, 30))
     mu, sigma = facial_color.local_statistics(h, 1e6)
     np.testing.assert_allclose(mu, h.mean(), rtol=1e-13)
     np.testing.assert_allclose(sigma, h.std(), rtol=1e-13)
 
 
-def test_map_is_not_modified_and_may_be_a_view(rng):
+def test_map_is_unmodified_and_may_be_view(rng):
     h = rng.random((40, 60))
     before = h.copy()
     found = measure(h[::2, ::3], 3.0)
@@ -155,7 +155,7 @@ def test_map_is_not_modified_and_may_be_a_view(rng):
     np.testing.assert_array_equal(found.mean, measure(h[::2, ::3].copy(), 3.0).mean)
 
 
-def test_maps_of_a_stack_are_measured_each_by_itself(rng):
+def test_stacked_maps_are_measured_independently(rng):
     h, valid = rng.random((2, 3, 9, 11)), rng.random((3, 9, 11)) > 0.3
     whole, masked = measure(h, 2.5), measure(h, 2.5, valid=valid)
     for i, j in np.ndindex(2, 3):

@@ -23,7 +23,7 @@ def test_affine_target_is_reproduced_to_rounding(way, rng):
     np.testing.assert_allclose(found.hemoglobin, 1.7 * neutral - 0.02, atol=1e-15)
 
 
-def test_pixel_goes_to_its_rank_among_the_targets_pixels_in_the_window(rng):
+def test_pixel_maps_to_its_rank_in_target_window(rng):
     neutral, target = texture(rng, (25, 23)), texture(rng, (25, 23))
     y, x = np.mgrid[:25, :23]
     found = match_sliding(neutral, target, 4.2).hemoglobin
@@ -33,7 +33,7 @@ def test_pixel_goes_to_its_rank_among_the_targets_pixels_in_the_window(rng):
         assert found[at] == np.sort(target[inside])[rank]
 
 
-def test_matched_map_has_the_targets_distribution_where_it_is_no_gaussian(rng):
+def test_matched_map_has_target_distribution_even_non_gaussian(rng):
     neutral = texture(rng, (120, 120))
     target = 0.02 * np.exp(gaussian_filter(rng.standard_normal((120, 120)), 1.5) * 4)
     radius_px = 20.0
@@ -72,7 +72,7 @@ def test_masked_pixels_never_leak(rng):
     assert np.isnan(found.hemoglobin[hole]).all()
 
 
-def test_pixels_without_a_target_in_reach_are_not_valid(rng):
+def test_pixels_without_reachable_target_are_invalid(rng):
     neutral = texture(rng)
     nowhere = np.zeros(neutral.shape, bool)
     nowhere[:, :10] = True
@@ -81,7 +81,7 @@ def test_pixels_without_a_target_in_reach_are_not_valid(rng):
     assert not found.valid[:, 14:].any()
 
 
-def test_flat_neutral_map_takes_the_middle_of_the_target(rng):
+def test_flat_neutral_map_takes_target_median(rng):
     target = texture(rng)
     found = match_sliding(np.full(target.shape, 0.3), target, 100.0).hemoglobin
     np.testing.assert_allclose(found, np.median(target), rtol=1e-12)

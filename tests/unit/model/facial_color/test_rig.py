@@ -59,11 +59,11 @@ def test_single_precision_maps_come_back_to_their_rounding(neutral):
     np.testing.assert_allclose(found, 1.3 * single, rtol=3e-7)
 
 
-def test_weight_one_on_neutral_is_the_neutral_map(rig, neutral):
+def test_unit_weight_on_neutral_gives_neutral_map(rig, neutral):
     np.testing.assert_allclose(rig.blend({"neutral": 1.0}), neutral, rtol=1e-14)
 
 
-def test_weight_one_on_a_state_has_that_states_local_mean_and_deviation(neutral, rng):
+def test_unit_state_weight_gives_local_mean_and_deviation(neutral, rng):
     state = texture(rng, mean=0.08, deviation=0.008)  # another texture altogether
     rig = HemoglobinRig.from_maps(neutral, {"state": state}, radius_px=RADIUS_PX, stored_size=None)
     mu, sigma = local_statistics(state, RADIUS_PX)
@@ -81,7 +81,7 @@ def test_blend_is_the_affine_combination_of_the_states(rig):
     np.testing.assert_allclose(rig.blend(weights), expected, atol=1e-15)
 
 
-def test_scale_and_bias_are_eqs_4_to_6_on_the_full_map(neutral, rng):
+def test_scale_and_bias_match_eqs_4_to_6(neutral, rng):
     state = neutral + 0.5 * (texture(rng) - 0.05)
     rig = HemoglobinRig.from_maps(neutral, {"state": state}, radius_px=RADIUS_PX, stored_size=None)
     (mu_n, sigma_n), (mu, sigma) = (local_statistics(h, RADIUS_PX) for h in (neutral, state))
@@ -94,7 +94,7 @@ def test_scale_and_bias_are_eqs_4_to_6_on_the_full_map(neutral, rng):
     assert (rig.scale["neutral"] == 1.0).all()
 
 
-def test_weights_that_do_not_sum_to_one_are_refused_with_a_way_out(rig):
+def test_weights_not_summing_to_unity_are_refused_constructively(rig):
     with pytest.raises(
         FacialColorError, match=r"sum of 0\.9, expected 1; neutral=0\.1 .*normalize"
     ):
@@ -112,7 +112,7 @@ def test_weights_that_do_not_sum_to_one_are_refused_with_a_way_out(rig):
     )
 
 
-def test_constant_neutral_region_has_a_finite_scale_near_that_of_the_rest(neutral, rng):
+def test_constant_neutral_region_has_finite_scale_near_surroundings(neutral, rng):
     flat = neutral.copy()
     flat[30:70, 30:70] = 0.05
     flat[30:50, 30:70] += 1e-9 * rng.standard_normal((20, 40))
@@ -131,7 +131,7 @@ def test_constant_neutral_region_has_a_finite_scale_near_that_of_the_rest(neutra
         assert (sigma / sigma_n)[42:48, 42:58].min() > 1e5
 
 
-def test_wholly_constant_neutral_map_keeps_the_scale_at_one():
+def test_wholly_constant_neutral_map_keeps_unit_scale():
     rig = HemoglobinRig.from_maps(
         np.full((40, 40), 0.05), {"state": np.full((40, 40), 0.08)}, radius_px=5.0
     )
@@ -159,7 +159,7 @@ def test_masked_pixels_never_leak(neutral):
     np.testing.assert_allclose(found.hemoglobin[~hole], 1.4 * neutral[~hole], atol=1e-12)
 
 
-def test_state_with_a_mask_of_its_own_is_compared_over_shared_pixels(neutral):
+def test_state_with_own_mask_uses_common_valid_pixels(neutral):
     mask = np.ones(neutral.shape, bool)
     mask[:, 50:] = False
     rig = HemoglobinRig.from_maps(
@@ -178,7 +178,7 @@ def test_state_with_a_mask_of_its_own_is_compared_over_shared_pixels(neutral):
     assert rig.evaluate({"whole": 1.0}).valid.all()
 
 
-def test_concentrations_stay_in_range_and_the_clipped_part_is_told(neutral):
+def test_concentrations_stay_in_range_and_clipping_is_reported(neutral):
     rig = HemoglobinRig.from_maps(neutral, {"flush": neutral + 0.27}, radius_px=RADIUS_PX)
     found = rig.evaluate({"flush": 1.0})
     above = neutral + 0.27 > 0.32
@@ -204,11 +204,11 @@ def test_global_gain_goes_with_its_states_weight(rig):
         rig.evaluate({"anger": 1.0}, gain=-1.0)
 
 
-def test_exercise_and_alcohol_are_states_of_the_whole_body(rig):
+def test_exercise_and_alcohol_are_whole_body_states(rig):
     assert rig.global_states == ("exercise",)
 
 
-def test_storing_small_costs_what_it_says(neutral, rng):
+def test_reduced_storage_error_matches_report(neutral, rng):
     x = np.linspace(0.0, 1.0, neutral.shape[1])
     state = neutral * (1.0 + 0.5 * np.sin(9 * x)) + 0.2 * (texture(rng) - 0.05)
     full, *stored = (
@@ -227,7 +227,7 @@ def test_storing_small_costs_what_it_says(neutral, rng):
     assert full.storage_error()["state"][1] < 1e-15
 
 
-def test_standard_error_holds_the_truth_that_eq_6_leaves_out(neutral, rng):
+def test_standard_error_covers_detail_omitted_by_eq_6(neutral, rng):
     own = 0.3 * (texture(rng) - 0.05)  # the state's own pattern
     truth = 1.3 * neutral + own
     noise = 0.0004
@@ -259,7 +259,7 @@ def test_transfer_to_the_same_neutral_map_changes_nothing(rig, neutral):
         assert again.radius_px == rig.radius_px
 
 
-def test_dilation_carries_over_to_a_face_with_another_amount_of_blood(neutral, rng):
+def test_dilation_transfers_to_face_with_different_blood(neutral, rng):
     # vessels whose volume grows by a factor, on one face with twice the blood of the other
     factor = 1.0 + 0.4 * np.linspace(0.0, 1.0, neutral.shape[1])
     rig = HemoglobinRig.from_maps(neutral, {"state": factor * neutral}, radius_px=RADIUS_PX)

@@ -57,7 +57,7 @@ def numpy_pass(height, axis, alpha, sigma, valid):
 
 
 @pytest.mark.parametrize("mode", ["plain", "holes"])
-def test_two_passes_are_eqs_4_to_6_evaluated_plainly(rng, mode):
+def test_two_passes_match_plain_eqs_4_to_6(rng, mode):
     shape = (61, 83)
     height = relief(shape, rng)
     valid = np.ones(shape, bool)
@@ -78,7 +78,7 @@ def test_two_passes_are_eqs_4_to_6_evaluated_plainly(rng, mode):
         assert same.all()
 
 
-def test_double_heights_are_convolved_in_double_to_the_rounding_of_float32_parameters(rng):
+def test_double_heights_are_convolved_to_float32_parameter_rounding(rng):
     shape = (61, 83)
     height = 1e4 + relief(shape, rng)  # float32 would leave 1e-3 of it
     asked = [np.asarray(v, np.float32) for v in fields(shape)]
@@ -93,7 +93,7 @@ def test_double_heights_are_convolved_in_double_to_the_rounding_of_float32_param
     np.testing.assert_array_equal(still, height)
 
 
-def test_heights_of_a_stack_are_convolved_each_by_itself(rng):
+def test_stacked_heights_are_convolved_independently(rng):
     stack = rng.standard_normal((2, 3, 12, 15)).astype(np.float32)
     valid = rng.random(stack.shape) > 0.05
     kernel = (*slanted(0.4), 0.8, 1.2, -0.9, 1.1)
@@ -110,7 +110,7 @@ def test_heights_of_a_stack_are_convolved_each_by_itself(rng):
     )
 
 
-def test_kernels_along_rows_and_columns_are_those_of_the_fit(rng):
+def test_row_and_column_kernels_match_fit_kernels(rng):
     height = relief((40, 50), rng)
     found = convolve(height, X, Y, 0.7, 1.7, -1.3, 2.2)
     once = 0.3 * height + 0.7 * gaussian_filter1d(height, 1.7, axis=1)
@@ -118,7 +118,7 @@ def test_kernels_along_rows_and_columns_are_those_of_the_fit(rng):
     np.testing.assert_allclose(found, twice, atol=1e-5)
 
 
-def test_strength_zero_changes_no_bit_and_works_without_an_axis(rng):
+def test_zero_strength_is_bit_exact_even_without_axis(rng):
     height = relief((30, 40), rng).astype(np.float32)
     np.testing.assert_array_equal(convolve(height, (0, 0), (0, 0), 0.0, 3.0, 0.0, 3.0), height)
     np.testing.assert_array_equal(convolve(height, X, Y, 1.0, 0.0, -2.0, 0.05), height)
@@ -131,7 +131,7 @@ def test_strength_zero_changes_no_bit_and_works_without_an_axis(rng):
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, np.pi / 4, 1.2, 2.5])
 @pytest.mark.parametrize(("alpha", "sigma"), [(1.0, 1.0), (0.5, 2.5), (-2.0, 1.2)])
-def test_waves_are_scaled_by_the_kernels_own_response_in_any_direction(angle, alpha, sigma):
+def test_waves_scale_with_kernel_response_in_any_direction(angle, alpha, sigma):
     y, x = np.mgrid[:96, :96].astype(np.float64)
     axis_s, axis_t = slanted(angle)
     k = 2.0 * np.pi / 9.0
@@ -143,7 +143,7 @@ def test_waves_are_scaled_by_the_kernels_own_response_in_any_direction(angle, al
         np.testing.assert_allclose(found[inner], gain * wave[inner], atol=0.012 * (1 + abs(alpha)))
 
 
-def test_bilinear_samples_blur_across_a_slanted_line_and_cubic_ones_hardly():
+def test_bilinear_sampling_blurs_slanted_lines_but_cubic_barely():
     y, x = np.mgrid[:96, :96].astype(np.float64)
     axis_s, axis_t = slanted(0.5)
     wave = np.cos(2.0 * np.pi / 5.0 * (x * axis_t[0] + y * axis_t[1]))
@@ -169,7 +169,7 @@ def test_planes_stay_planes_at_borders_and_around_holes():
         np.testing.assert_allclose(found, plane, atol=1e-4)
 
 
-def test_sharpening_does_not_explode_at_borders_seams_and_holes(rng):
+def test_sharpening_stays_bounded_at_borders_seams_and_holes(rng):
     shape = (160, 160)
     height = rng.standard_normal(shape)
     valid = np.ones(shape, bool)
@@ -188,7 +188,7 @@ def test_sharpening_does_not_explode_at_borders_seams_and_holes(rng):
         np.testing.assert_array_equal(found[~valid], garbage.astype(np.float32)[~valid])
 
 
-def test_no_pixel_beside_a_hole_weighs_its_neighbours_more_than_one_far_from_it():
+def test_neighbor_weights_near_hole_never_exceed_distant_ones():
     n = 41
     valid = np.ones((1, n), bool)
     valid[0, [8, 9, 15]] = False
@@ -203,7 +203,7 @@ def test_no_pixel_beside_a_hole_weighs_its_neighbours_more_than_one_far_from_it(
     np.testing.assert_allclose(rows.sum(axis=1)[valid[0]], 1.0, atol=1e-6)
 
 
-def test_a_ramp_beside_a_hole_is_lifted_by_samples_of_one_side_only():
+def test_ramp_near_hole_is_lifted_by_unpaired_samples():
     # what the rule for pairs prevents: this is why it is there
     ramp = np.arange(40.0)
     w = np.exp(-0.5 * (np.arange(-8, 9) / 2.0) ** 2)
@@ -216,7 +216,7 @@ def test_a_ramp_beside_a_hole_is_lifted_by_samples_of_one_side_only():
     assert abs(found[0, 20] - 20.0) < 1e-4
 
 
-def test_tiles_give_the_whole_map_to_the_bit_and_can_go_on_where_they_ended(rng):
+def test_tiles_reproduce_whole_map_exactly_and_can_resume(rng):
     shape = (150, 190)
     height = relief(shape, rng).astype(np.float32)
     height[70:75, 90:99] = np.nan
@@ -252,7 +252,7 @@ def test_tiles_give_the_whole_map_to_the_bit_and_can_go_on_where_they_ended(rng)
         np.testing.assert_array_equal(target, whole)
 
 
-def test_distances_to_what_is_not_valid_are_kings_moves(rng):
+def test_distances_to_invalid_pixels_are_chebyshev(rng):
     valid = rng.random((30, 41)) > 0.004
     bad = np.argwhere(~valid)
     y, x = np.mgrid[:30, :41]
@@ -261,7 +261,7 @@ def test_distances_to_what_is_not_valid_are_kings_moves(rng):
     assert distance_to_invalid(np.ones((3, 3), bool)).min() == 255
 
 
-def test_maps_smaller_than_the_kernel_are_mirrored_as_often_as_needed(rng):
+def test_maps_smaller_than_kernel_are_mirrored_repeatedly(rng):
     height = rng.standard_normal((3, 4))
     found = convolve(height, X, Y, 1.0, 5.0, 1.0, 3.0)
     expected = gaussian_filter1d(gaussian_filter1d(height, 5.0, axis=1), 3.0, axis=0)
@@ -272,7 +272,7 @@ def test_maps_smaller_than_the_kernel_are_mirrored_as_often_as_needed(rng):
     )
 
 
-def test_parameters_beyond_their_ranges_are_refused_with_their_names():
+def test_out_of_range_parameters_are_refused_by_name():
     height = np.zeros((4, 5))
     for arguments, word in (
         (((2.0, 0.0), Y, 1.0, 1.0, 0.0, 1.0), "unit length"),
@@ -306,7 +306,7 @@ def test_parameters_beyond_their_ranges_are_refused_with_their_names():
     assert Window(0, 2, 0, 2).grown(3, (4, 4)) == Window(0, 4, 0, 4)
 
 
-def test_the_input_is_left_as_it_was(rng):
+def test_input_is_unmodified(rng):
     height = rng.standard_normal((20, 20)).astype(np.float32)
     before = height.copy()
     found = convolve(height, X, Y, 0.0, 1.0, 0.0, 1.0)

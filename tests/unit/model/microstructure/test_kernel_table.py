@@ -23,13 +23,13 @@ def test_forehead_is_eqs_8_and_9():
     np.testing.assert_allclose(sigma_um, eq9, atol=1e-12)
 
 
-def test_neutral_skin_keeps_its_relief_and_sigma_jumps_there():
+def test_neutral_skin_keeps_topography_while_sigma_jumps():
     alpha, sigma_um = kernel_parameters([np.nextafter(1.0, 0.0), 1.0])
     np.testing.assert_allclose(alpha, 0.0, atol=1e-12)
     np.testing.assert_allclose(sigma_um, [23.6, 11.7])
 
 
-def test_beyond_the_measured_range_a_table_holds_its_ends_or_goes_on_or_refuses():
+def test_beyond_range_table_clamps_extrapolates_or_refuses():
     held = kernel_parameters([0.5, 2.0])
     np.testing.assert_array_equal(held, kernel_parameters([0.73, 1.28]))
     alpha, sigma_um = kernel_parameters([0.5, 0.665, 2.0], extrapolate="formula")
@@ -45,7 +45,7 @@ def test_beyond_the_measured_range_a_table_holds_its_ends_or_goes_on_or_refuses(
             kernel_parameters(bad)
 
 
-def test_the_neutral_kernel_is_nothing_at_all_in_every_table():
+def test_neutral_kernel_is_identity_in_every_table():
     m = 1.0 / 3.0
     rounded = dataclasses.replace(
         FOREHEAD, alpha_breaks=(), alpha_lines=((m, -np.nextafter(m, 1.0)),)
@@ -64,7 +64,7 @@ def test_kernels_keep_to_their_ranges_for_any_stretch():
         assert sigma_um.min() >= 0.0
 
 
-def test_a_table_goes_through_json_and_damage_is_named():
+def test_table_round_trips_through_json_damage_is_reported():
     text = FOREHEAD.to_json()
     assert KernelTable.from_json(text) == FOREHEAD
     given = json.loads(text)

@@ -64,7 +64,7 @@ def same_line(a, b, atol):
     np.testing.assert_allclose(a, sign * b, atol=atol)
 
 
-def test_a_triangle_has_the_ratios_and_axes_of_eqs_10_to_13(rng):
+def test_triangle_ratios_and_axes_match_eqs_10_13(rng):
     for _ in range(200):
         rest, moved = rng.standard_normal((2, 3, 3)) * 5.0
         uv = rng.random((3, 2))
@@ -81,7 +81,7 @@ def test_a_triangle_has_the_ratios_and_axes_of_eqs_10_to_13(rng):
         same_line(found.axis_t[0], S[:, 1] / scale[1], 1e-5)
 
 
-def test_q_r_and_t_are_what_eq_13s_text_says(rng):
+def test_q_r_and_t_match_eq_13_text(rng):
     rest, uv = rng.standard_normal((3, 3)), rng.random((3, 2))
     F = rng.standard_normal((3, 3))
     moved = rest @ F.T
@@ -95,7 +95,7 @@ def test_q_r_and_t_are_what_eq_13s_text_says(rng):
     assert ratios[0] > ratios[1]
 
 
-def test_a_sheet_stretched_in_any_direction_has_the_ratios_and_axes_of_the_stretch(rng):
+def test_sheet_stretch_gives_ratios_and_axes_any_direction(rng):
     points, faces, uv = sheet()
     for angle in (0.0, 0.4, 1.3, np.pi / 2):
         s, t = (
@@ -113,7 +113,7 @@ def test_a_sheet_stretched_in_any_direction_has_the_ratios_and_axes_of_the_stret
         assert not found.isotropic.any()
 
 
-def test_a_bent_surface_that_is_not_stretched_has_ratios_of_exactly_1(rng):
+def test_bent_unstretched_surface_has_ratios_exactly_1(rng):
     points, faces, uv = ball()
     still = strain(points, points, faces, uv)
     np.testing.assert_array_equal(still.r_s, 1.0)
@@ -123,7 +123,7 @@ def test_a_bent_surface_that_is_not_stretched_has_ratios_of_exactly_1(rng):
     np.testing.assert_allclose([moved.r_s, moved.r_t], 1.0, atol=1e-12)
 
 
-def test_a_blown_up_ball_is_stretched_alike_everywhere_and_prefers_no_axis():
+def test_inflated_ball_is_stretched_uniformly_and_isotropic():
     points, faces, uv = ball()
     for factor in (0.8, 1.3):
         found = strain(points, factor * points, faces, uv)
@@ -134,7 +134,7 @@ def test_a_blown_up_ball_is_stretched_alike_everywhere_and_prefers_no_axis():
         np.testing.assert_allclose(np.abs(found.axis_s[:, 0]), 1.0, atol=0.02)
 
 
-def test_a_seam_of_the_texture_does_not_show_in_the_strain(rng):
+def test_texture_seam_does_not_appear_in_strain(rng):
     points, faces, uv = ball()
     squashed = points * np.array([1.1, 0.9, 0.7]) + 0.3 * np.sin(points[:, ::-1] / 4.0)
     found = strain(points, squashed, faces, uv)
@@ -152,7 +152,7 @@ def test_a_seam_of_the_texture_does_not_show_in_the_strain(rng):
     same_line(found.axis_t[:rings], found.axis_t[-rings:], 1e-9)
 
 
-def test_an_island_turned_mirrored_and_scaled_has_its_axes_turned_with_it(rng):
+def test_island_rotated_mirrored_scaled_transforms_its_axes(rng):
     points, faces, uv = sheet()
     F = np.eye(3) + np.array([[0.2, 0.1, 0], [0.1, -0.1, 0], [0, 0, 0]])
     moved = points @ F.T
@@ -173,7 +173,7 @@ def test_an_island_turned_mirrored_and_scaled_has_its_axes_turned_with_it(rng):
         assert found.uv_turned_share == 0.0
 
 
-def test_lips_that_touch_and_part_do_not_pull_at_each_other():
+def test_lips_touching_then_parting_do_not_interact():
     points, faces, uv = sheet()
     both = np.concatenate([points, points])
     moved = np.concatenate([points, points * [1.5, 1.0, 1.0] + [0, 0, 3.0]])
@@ -184,7 +184,7 @@ def test_lips_that_touch_and_part_do_not_pull_at_each_other():
     np.testing.assert_allclose(found.r_s[len(points) :], 1.5, atol=1e-12)
 
 
-def test_degenerate_triangles_say_nothing_and_leave_their_neighbours_alone(rng):
+def test_degenerate_triangles_are_undefined_and_spare_neighbors(rng):
     points, faces, uv = sheet()
     n = len(points)
     more = np.concatenate([points, [[3.0, 3.0, 0.0], [50.0, 0, 0], [60.0, 0, 0], [70.0, 0, 0]]])
@@ -199,7 +199,7 @@ def test_degenerate_triangles_say_nothing_and_leave_their_neighbours_alone(rng):
     assert found.degenerate_share == pytest.approx(3 / (len(faces) + 3))
 
 
-def test_triangles_that_collapse_are_rank_one_or_nothing():
+def test_collapsed_triangles_are_rank_one_or_invalid():
     points, faces, uv = sheet()
     line = strain(points, points * [1.5, 0.0, 0.0], faces, uv)
     np.testing.assert_allclose(line.r_s, 1.5, atol=1e-12)
@@ -210,7 +210,7 @@ def test_triangles_that_collapse_are_rank_one_or_nothing():
     assert dot.valid.all()
 
 
-def test_triangles_turned_over_in_space_are_strained_by_their_edges(rng):
+def test_flipped_triangles_are_strained_by_their_edges(rng):
     points, faces, uv = sheet()
     moved = points * [-1.2, 0.9, 1.0]  # the sheet seen from behind
     found = strain(points, moved, faces, uv)
@@ -223,7 +223,7 @@ def test_triangles_turned_over_in_space_are_strained_by_their_edges(rng):
     same_line(again.axis_s, found.axis_s, 1e-9)
 
 
-def test_textures_without_area_and_folded_ones_do_not_spoil_the_axes():
+def test_zero_area_and_folded_textures_keep_axes_valid():
     points, faces, uv = sheet()
     moved = points @ np.diag([1.2, 0.9, 1.0])
     folded = uv.copy()
@@ -239,7 +239,7 @@ def test_textures_without_area_and_folded_ones_do_not_spoil_the_axes():
     np.testing.assert_array_equal(nowhere.r_s, 1.0)
 
 
-def test_three_sheets_on_one_edge_are_averaged_by_area():
+def test_three_sheets_on_common_edge_are_area_averaged():
     # not a manifold: fins at right angles, each stretched along the common edge
     points = np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0], [0, -10, 0], [0, 0, 10.0]])
     uv = np.array([[0.5, 0.5], [0.9, 0.5], [0.5, 0.9], [0.5, 0.1], [0.1, 0.7]])
@@ -249,7 +249,7 @@ def test_three_sheets_on_one_edge_are_averaged_by_area():
     np.testing.assert_allclose(found.r_t, 1.0, atol=1e-12)
 
 
-def test_averages_weigh_triangles_by_their_neutral_area():
+def test_averages_weight_triangles_by_neutral_area():
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [-3, 0, 0], [0, -1, 0.0]])
     faces = [[0, 1, 2], [0, 3, 4]]  # areas 1 : 3
     moved = points.copy()

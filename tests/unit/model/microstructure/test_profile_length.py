@@ -19,7 +19,7 @@ def profiles():
     return skin.height_um[:, ::150].T.astype(np.float64)
 
 
-def test_a_sine_has_the_length_of_its_elliptic_integral():
+def test_sine_length_is_its_elliptic_integral():
     """Arc length of a sin(k x) over a period: 4 sqrt(1 + a^2 k^2) E(m) / k, m = a^2 k^2 over 1 +
     a^2 k^2. The polygon is shorter by the square of the spacing: 1e-5 at 2,000 points."""
     amplitude, k = 30.0, 2 * np.pi / 400.0
@@ -29,13 +29,13 @@ def test_a_sine_has_the_length_of_its_elliptic_integral():
     assert found == pytest.approx(4 * np.sqrt(1 + m) * ellipe(m / (1 + m)) / k, rel=1e-5)
 
 
-def test_leading_axes_of_profiles_are_profiles_of_their_own(profiles):
+def test_leading_profile_axes_are_independent_profiles(profiles):
     together = profile_length.surface_length(profiles, spacing_um=SPACING_UM)
     alone = [profile_length.surface_length(p, spacing_um=SPACING_UM) for p in profiles]
     np.testing.assert_allclose(together, alone, rtol=1e-13)
 
 
-def test_unchanged_heights_shorten_under_compression_and_lengthen_under_stretch(profiles):
+def test_unchanged_heights_shorten_compressed_and_lengthen_stretched(profiles):
     """The surface changes less than the ground below it: relief is a reserve."""
     for profile in profiles:
         for stretch in (0.75, 1.35):
@@ -75,7 +75,7 @@ def test_stronger_strain_needs_stronger_kernels(profiles):
     assert alphas[3] == 0.0
 
 
-def test_stretch_beyond_the_reserve_is_told(profiles):
+def test_stretch_beyond_reserve_is_reported(profiles):
     """No surface is shorter than the ground it stands on."""
     profile = profiles[0]
     stretch = 1.05 * reserve_of(profile)
@@ -96,7 +96,7 @@ def test_a_flat_profile_has_no_reserve():
         assert found.change.convolved_ratio == pytest.approx(stretch)
 
 
-def test_strength_beyond_the_kernels_range_is_told(profiles):
+def test_strength_beyond_kernel_range_is_reported(profiles):
     weak = profile_length.keep_length(
         profiles[0], spacing_um=SPACING_UM, stretch=0.6, sigma_um=SPACING_UM
     )
@@ -123,7 +123,7 @@ def test_the_papers_kernels_bring_lengths_nearer_to_neutral(profiles, stretch):
         assert abs(change.convolved_ratio - 1.0) < abs(change.unchanged_ratio - 1.0)
 
 
-def test_a_kernel_is_the_plain_sum_of_eq_6(rng):
+def test_kernel_is_plain_sum_of_eq_6(rng):
     height = rng.standard_normal(60)
     half = microstructure.gaussian_weights(2.0)
     padded = np.pad(height, half.size - 1, mode="symmetric")
@@ -146,7 +146,7 @@ WAVE = np.sin(np.arange(50.0))
         (WAVE, {"sigma_um": 0.0}, "sigma_um"),
     ],
 )
-def test_what_has_no_length_is_refused_by_name(height, changes, message):
+def test_invalid_profile_length_input_is_refused_by_name(height, changes, message):
     given = {"spacing_um": 1.0, "stretch": 1.1, "sigma_um": 2.0, **changes}
     with pytest.raises(ProfileError, match=message):
         profile_length.keep_length(height, **given)

@@ -23,7 +23,7 @@ def wavy(n=9):
     return strain(points, moved, faces, uv), faces, uv
 
 
-def test_a_picture_pixel_down_is_less_v_and_a_pixel_right_is_more_u():
+def test_image_pixel_down_lowers_v_right_raises_u():
     uv = np.array([[0.0, 0.5], [0.5, 0.5], [0.5, 1.0], [0.0, 1.0]])  # top left quarter
     found = rasterize(
         strain(POINTS, POINTS * [1.2, 0.9, 1], FACES, uv), FACES, uv, (40, 80), pad_px=0
@@ -45,7 +45,7 @@ def test_a_picture_pixel_down_is_less_v_and_a_pixel_right_is_more_u():
     np.testing.assert_array_equal(found.stretch[~inside], 1.0)
 
 
-def test_axes_that_lean_up_in_uv_lean_up_in_the_picture():
+def test_axes_leaning_up_in_uv_do_in_image():
     uv = POINTS[:, :2] / 10.0
     c, s = np.cos(0.5), np.sin(0.5)
     axis = np.array([c, s, 0.0])
@@ -55,7 +55,7 @@ def test_axes_that_lean_up_in_uv_lean_up_in_the_picture():
     np.testing.assert_allclose(a * np.sign(a[0]), [c, -s], atol=1e-6)
 
 
-def test_each_pixel_has_the_decomposition_of_the_interpolated_tensor():
+def test_pixel_decomposition_is_that_of_interpolated_tensor():
     found_strain, faces, uv = wavy()
     size = (67, 53)
     found = rasterize(found_strain, faces, uv, size, pad_px=0)
@@ -85,7 +85,7 @@ def test_each_pixel_has_the_decomposition_of_the_interpolated_tensor():
     assert (found.covered[seen == 1]).all()
 
 
-def test_triangles_that_share_an_edge_leave_no_gap_and_windows_agree_to_the_bit():
+def test_edge_sharing_triangles_leave_no_gap_windows_agree():
     found_strain, faces, uv = wavy()
     size = (200, 240)
     whole = rasterize(found_strain, faces, uv, size)
@@ -101,7 +101,7 @@ def test_triangles_that_share_an_edge_leave_no_gap_and_windows_agree_to_the_bit(
             )
 
 
-def test_islands_are_carried_on_beyond_their_border_by_the_padding_only():
+def test_islands_extend_beyond_border_by_padding_only():
     found_strain, faces, uv = wavy()
     found = rasterize(found_strain, faces, uv, (100, 100), pad_px=3)
     assert found.covered[10:90, 10:90].all()
@@ -112,7 +112,7 @@ def test_islands_are_carried_on_beyond_their_border_by_the_padding_only():
     np.testing.assert_array_equal(found.axes[7, 50], found.axes[10, 50])
 
 
-def test_kernels_of_pixels_are_the_tables_with_lengths_in_pixels():
+def test_pixel_kernels_are_table_kernels_in_pixel_lengths():
     found_strain, faces, uv = wavy()
     found = rasterize(found_strain, faces, uv, (64, 64))
     for extrapolate in ("hold", "formula"):
@@ -135,7 +135,7 @@ def test_neutral_pose_leaves_every_kernel_at_nothing():
     assert all(line.nothing for line in line_kernels(still))
 
 
-def test_triangles_without_area_or_of_points_without_strain_cover_nothing():
+def test_zero_area_or_strainless_triangles_cover_nothing():
     uv = np.array([[0.1, 0.1], [0.9, 0.1], [0.9, 0.9], [0.1, 0.9], [0.5, 0.5]])
     points = np.concatenate([POINTS, [[5.0, 5.0, 0.0]]])
     faces = np.array([[0, 1, 2], [0, 2, 4], [3, 3, 4]])  # the diagonal twice over, and a line
@@ -146,7 +146,7 @@ def test_triangles_without_area_or_of_points_without_strain_cover_nothing():
     assert np.isfinite(shown.axes).all()
 
 
-def test_windows_and_meshes_that_do_not_fit_are_refused():
+def test_mismatched_windows_and_meshes_are_refused():
     found, faces, uv = wavy()
     with pytest.raises(StrainError, match="window"):
         rasterize(found, faces, uv, (10, 10), window=Window(0, 11, 0, 5))

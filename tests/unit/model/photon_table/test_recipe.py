@@ -29,7 +29,7 @@ def traced(recipe, seed, photons, fibre, path_end):
     return hist / photons
 
 
-def test_one_walk_serves_all_indices_and_absorptions(recipe):
+def test_single_walk_serves_all_indices_and_absorptions(recipe):
     # 20 batches: beyond 4 standard errors in one of 21 totals once in 60 runs (t, 19 dof).
     absorption = np.array([0.02, 0.2, 1.0])
     seeds = np.random.SeedSequence(5).generate_state(60, np.uint64).reshape(20, 3)
@@ -61,7 +61,7 @@ def test_the_same_seed_traces_the_same_photons(recipe):
     assert np.any(traced(recipe, SEED + np.uint64(1), 500, True, recipe.PATH_END) != first)
 
 
-def test_short_paths_are_the_same_whether_long_ones_are_traced_or_not(recipe):
+def test_short_paths_are_independent_of_long_path_tracing(recipe):
     seeds = np.random.SeedSequence(6).generate_state(120, np.uint64).reshape(40, 3)
     end = np.exp(recipe.LOG_PATH_START + recipe.LOG_PATH_STEP * recipe.SHORT_BIN)
     short, whole = (

@@ -34,7 +34,7 @@ def exact_total(sigma_a, eta, g):
 
 @pytest.mark.parametrize("g", [0.0, 0.3, 0.5, 0.7, 0.8, 0.85, 0.9, 0.95])
 @pytest.mark.parametrize("eta", [1.0, 1.1, 1.33, 1.4, 1.6])
-def test_all_rings_together_reflect_what_adding_doubling_says(eta, g):
+def test_ring_total_reflectance_matches_adding_doubling(eta, g):
     # Stated errors of 0.1 to 0.5 % average out over the rings but for what they share. Under
     # strong absorption a fifth comes from 0.02 transport lengths, where the domain begins, or less.
     ratio = np.array([0.001, 0.03, 0.3, 3.0])
@@ -67,7 +67,7 @@ def test_isotropic_media_reflect_the_published_totals(test_data):
         assert seen == pytest.approx(with_surface - surface, abs=5e-4 + 0.0028 * seen)
 
 
-def test_that_test_tells_similar_phase_functions_apart():
+def test_adding_doubling_test_separates_similar_phase_functions():
     assert abs(total(1.0, 1.4, 0.8) / exact_total(1.0, 1.4, 0.0).item() - 1.0) > 0.05
 
 
@@ -108,7 +108,7 @@ def z_scores(run, sigma_a, sigma_s, g, cores=(0.2, 0.2)):
     return (run.reflectance_per_mm2 - table) / np.hypot(run.stderr, stated)
 
 
-def test_fibres_take_what_the_simulators_own_fibres_take():
+def test_fiber_signals_match_simulated_fibers():
     # Neither walk, scoring in the cone nor averages over the cores are shared. The errors of 20
     # batches follow Student's t with 19 degrees of freedom: beyond 5 once in 400 runs of 28.
     rng = np.random.default_rng(3)
@@ -117,7 +117,7 @@ def test_fibres_take_what_the_simulators_own_fibres_take():
 
 
 @pytest.mark.long
-def test_a_table_of_other_optics_or_cores_is_found_out():
+def test_table_of_other_optics_or_cores_is_detected():
     rng = np.random.default_rng(4)
     run = fibres(0.3, 1.5, 0.8, 800_000, rng)
     assert np.max(np.abs(z_scores(run, 0.3, 1.5, 0.8))) < 5.0
@@ -159,7 +159,7 @@ def test_slopes_are_those_of_the_reflectance(collection, cores):
     )
 
 
-def test_without_absorption_the_slope_is_the_limit_of_slopes_and_the_mean_path():
+def test_zero_absorption_slope_is_limit_and_mean_path():
     slope = [photon_table.derivatives(RADII, a, 1.0) for a in (0.0, 1e-9, 1e-7)]
     np.testing.assert_allclose(slope[1].by_sigma_a, slope[0].by_sigma_a, rtol=1e-3)
     path = -slope[0].by_sigma_a / slope[0].reflectance_per_mm2
@@ -237,7 +237,7 @@ def test_far_away_the_profile_falls_like_diffusion():
         assert np.ptp(ratio) < 0.03 * ratio.mean()
 
 
-def test_beyond_the_table_profiles_go_on_without_a_step():
+def test_profiles_continue_beyond_table_without_step():
     for edge in (np.exp(kernels.RADIUS_START), np.exp(kernels.RADIUS_START + 9.5)):
         low, high = photon_table.reflectance([edge * 0.999999, edge * 1.000001], 0.1, 1.0)
         assert high == pytest.approx(low, rel=1e-4)
@@ -246,7 +246,7 @@ def test_beyond_the_table_profiles_go_on_without_a_step():
     assert high < low
 
 
-def test_similar_phase_functions_differ_near_the_source_and_agree_far_away():
+def test_similar_phase_functions_differ_only_near_source():
     ratio = photon_table.reflectance([0.1, 10.0], 0.01, 1.0, g=0.9) / photon_table.reflectance(
         [0.1, 10.0], 0.01, 1.0, g=0.8
     )
@@ -272,7 +272,7 @@ def test_indices_between_the_nodes_are_interpolated():
     )
 
 
-def test_stated_errors_are_small_where_fibres_measure():
+def test_stated_errors_are_small_where_fibers_measure():
     for collection in ("all", "fibre"):
         near = photon_table.relative_error(
             np.geomspace(0.3, 10.0, 30), [[0.0], [0.03], [0.3]], 1.0, collection=collection
@@ -294,7 +294,7 @@ def test_the_domain_ends_where_the_table_does():
     assert not holds(1.0, 0.1, 0.0)
 
 
-def test_strong_absorption_no_scattering_and_no_distance_have_clear_outcomes():
+def test_extreme_absorption_scattering_and_distance_are_well_defined():
     assert photon_table.reflectance(RADII, 5.0, 0.0).tolist() == [0.0] * RADII.size
     dark = photon_table.reflectance(RADII, 10.0, 1.0)
     assert np.all((dark >= 0.0) & (np.diff(dark, prepend=1.0) <= 0.0))
@@ -316,7 +316,7 @@ def test_strong_absorption_no_scattering_and_no_distance_have_clear_outcomes():
         ({"collection": "some"}, "collection: got 'some'"),
     ],
 )
-def test_media_that_the_table_does_not_hold_are_refused(options, message):
+def test_media_outside_table_are_refused(options, message):
     with pytest.raises(photon_table.TableDomainError, match=message):
         photon_table.reflectance(1.0, 0.1, 1.0, **options)
 

@@ -29,7 +29,7 @@ def test_a_vector_is_93_histograms(rng):
     np.testing.assert_allclose(vector.reshape(93, 256).sum(axis=1), 1.0, atol=1e-12)
 
 
-def test_a_texture_that_matches_already_stays_as_it_is(rng):
+def test_matching_texture_is_unchanged(rng):
     image = texture((96, 80), rng)
     space = TextureSpace.fit([image, texture(64, rng, angle_rad=1.0)])
     found = match(image, describe(image, space=space), space=space, iterations=3)
@@ -57,7 +57,7 @@ def test_an_empty_mask_is_named(rng):
         describe(texture(8, rng), valid=np.zeros((8, 8), bool))
 
 
-def test_what_stands_outside_the_mask_does_not_matter(rng):
+def test_pixels_outside_mask_are_ignored(rng):
     image = texture((60, 50), rng)
     valid = np.ones((60, 50), bool)
     valid[20:35, 10:40] = False
@@ -73,7 +73,7 @@ def test_what_stands_outside_the_mask_does_not_matter(rng):
         np.testing.assert_array_equal(vector, vectors[0])
 
 
-def test_a_masked_texture_has_nearly_the_statistics_of_the_whole(rng):
+def test_masked_texture_nearly_has_whole_texture_statistics(rng):
     """A mask filled with black instead makes edges that the texture has not."""
     image = texture(192, rng)
     y, x = np.mgrid[0:192, 0:192]
@@ -106,7 +106,7 @@ def test_region_and_rest_are_described_apart(rng):
     np.testing.assert_allclose(everything, describe(image, space=space), atol=1e-6)
 
 
-def test_a_region_of_a_few_texels_is_described_and_matched(rng):
+def test_region_of_few_texels_is_described_and_matched(rng):
     image, target = texture(48, rng), texture(48, rng, color=(0.3, 0.25, 0.2))
     few = np.zeros((48, 48), bool)
     few[10, 7:10] = True
@@ -129,7 +129,7 @@ def test_a_soft_region_blends(rng):
     assert change[4] < change[16] < change[31]
 
 
-def test_a_shift_of_the_coarsest_cell_changes_nothing_and_others_little(rng):
+def test_coarsest_cell_shift_is_invariant_others_nearly(rng):
     image = texture(128, rng).astype(np.float64)
     space = TextureSpace.fit([image])
     vector = describe(image, space=space)
@@ -146,7 +146,7 @@ def test_a_shift_of_the_coarsest_cell_changes_nothing_and_others_little(rng):
     assert turned > 5.0 * moved
 
 
-def test_noise_becomes_the_texture_as_nearly_as_an_image_does(rng):
+def test_noise_matches_texture_as_nearly_as_image(rng):
     target = texture(128, rng, angle_rad=0.6, strength=0.08)
     other = texture(128, rng, strength=0.04)
     space = TextureSpace.fit([target, other])
@@ -180,7 +180,7 @@ def test_distances_fall_with_every_iteration(rng):
     assert fine[-1] < 0.3 * fine[0]
 
 
-def test_a_single_color_is_a_fixpoint_and_goes_to_another_single_color(rng):
+def test_single_color_is_fixed_point_or_recolored(rng):
     one, other = np.full((24, 24, 3), (0.5, 0.3, 0.2)), np.full((24, 24, 3), (0.2, 0.3, 0.4))
     space = TextureSpace.fit([one])
     found = match(one, describe(one, space=space), space=space, noise=0.3, rng=rng)
@@ -262,7 +262,7 @@ def test_the_least_standard_error_is_that_of_counting(rng):
     assert np.mean(scatter[used] ** 2 / said[used] ** 2) == pytest.approx(1.0, abs=0.06)
 
 
-def test_a_gray_image_has_a_vector_of_one_channel(rng):
+def test_gray_image_has_single_channel_vector(rng):
     image = rng.uniform(0.2, 0.8, (32, 48))
     assert describe(image).shape == (7936,)
     assert match(image, describe(0.5 * image)).image.shape == (32, 48)
@@ -276,7 +276,7 @@ def test_inputs_stay_as_they_are(rng):
     np.testing.assert_array_equal(target, before[1])
 
 
-def test_what_fits_nothing_is_named(rng):
+def test_mismatched_description_input_is_refused_by_name(rng):
     image = texture(8, rng)
     vector = describe(image)
     broken = image.copy()

@@ -39,7 +39,7 @@ def test_weights_count_like_repeats(rng):
 
 
 @pytest.mark.parametrize("gap", [1e-12, 1e-3, 1.0])
-def test_bins_as_narrow_as_wanted_are_told_apart(gap, rng):
+def test_arbitrarily_narrow_bins_are_distinguished(gap, rng):
     """Half of the edges within a gap far narrower than a cell of the table."""
     edges = np.concatenate([np.linspace(-1.0, 0.0, 128), gap * np.linspace(1.0, 2.0, 128), [9.0]])
     values = np.concatenate([rng.uniform(-1, 9, 2000), gap * rng.uniform(1.0, 2.0, 2000)])
@@ -49,7 +49,7 @@ def test_bins_as_narrow_as_wanted_are_told_apart(gap, rng):
     )
 
 
-def test_values_beyond_the_edges_are_counted_in_the_end_bins_and_reported(rng):
+def test_values_beyond_edges_count_in_end_bins_reported(rng):
     values = np.array([-9.0, -8.0, 0.3, 7.0])
     found = Bins.over(np.linspace(0.0, 1.0, 257)).count(values)
     assert (found.below, found.above) == (0.5, 0.25)
@@ -57,7 +57,7 @@ def test_values_beyond_the_edges_are_counted_in_the_end_bins_and_reported(rng):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_a_map_of_ranks_is_the_target_quantile_of_the_source_rank(dtype, rng):
+def test_rank_map_is_target_quantile_of_source_rank(dtype, rng):
     """Twin: two interpolations of the cumulated shares."""
     edges = np.linspace(-6.0, 6.0, 257)
     bins = Bins.over(edges)
@@ -73,7 +73,7 @@ def test_a_map_of_ranks_is_the_target_quantile_of_the_source_rank(dtype, rng):
     np.testing.assert_allclose(got, expected, atol=1e-9 if dtype == np.float64 else 1e-5)
 
 
-def test_matched_values_have_the_target_histogram_within_a_share_of_a_bin(rng):
+def test_matched_values_have_target_histogram_within_bin_fraction(rng):
     bins = Bins.over(np.linspace(-6.0, 8.0, 257))
     values = rng.standard_normal(200_000)
     wanted = bins.count(rng.gamma(2.0, 1.0, 200_000)).shares
@@ -94,7 +94,7 @@ def test_a_match_has_no_steps():
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-16])
-def test_values_with_the_target_histogram_stay_where_they_are(noise, rng):
+def test_values_with_target_histogram_are_unchanged(noise, rng):
     """Also with bins that both leave empty, and shares that differ by rounding."""
     bins = Bins.over(uneven(rng))
     values = np.concatenate([rng.normal(-2, 0.1, 300), rng.normal(3, 0.2, 300), bins.edges[40:50]])
@@ -103,14 +103,14 @@ def test_values_with_the_target_histogram_stay_where_they_are(noise, rng):
     np.testing.assert_allclose(bins.match(values, source, wanted), values, atol=1e-12)
 
 
-def test_values_beyond_the_edges_stay_when_nothing_is_to_change():
+def test_values_beyond_edges_stay_when_change_is_null():
     bins = Bins.over(np.linspace(0.0, 1.0, 257))
     values = np.array([-4.0, -1.0, 0.2, 0.5, 3.0])
     source = bins.count(values)
     np.testing.assert_allclose(bins.match(values, source, source.shares), values, atol=1e-12)
 
 
-def test_values_all_beyond_the_edges_are_brought_to_the_target(rng):
+def test_values_all_beyond_edges_move_to_target(rng):
     bins = Bins.over(np.linspace(0.0, 1.0, 257))
     values = rng.uniform(50.0, 60.0, 4000)
     wanted = bins.count(rng.uniform(0.25, 0.5, 4000)).shares
@@ -119,7 +119,7 @@ def test_values_all_beyond_the_edges_are_brought_to_the_target(rng):
     assert got.max() < 0.51
 
 
-def test_nothing_lands_in_bins_that_the_target_leaves_empty(rng):
+def test_empty_target_bins_receive_no_values(rng):
     bins = Bins.over(np.linspace(0.0, 1.0, 257))
     values = rng.uniform(0.0, 1.0, 20_000)
     wanted = np.zeros(HISTOGRAM_BINS)
@@ -129,7 +129,7 @@ def test_nothing_lands_in_bins_that_the_target_leaves_empty(rng):
     assert again[wanted == 0.0].sum() < 1e-3
 
 
-def test_a_single_value_goes_into_the_target_and_stays_single():
+def test_single_value_enters_target_and_stays_single():
     bins = Bins.over(np.linspace(0.0, 1.0, 257))
     values = np.full(9, 0.7)
     wanted = np.zeros(HISTOGRAM_BINS)
@@ -150,7 +150,7 @@ def test_a_table_of_cells_never_excludes_a_bin(rng):
         assert histogram_kernels.find(x, edges, scale, least, most) == expected
 
 
-def test_moving_a_histogram_by_half_the_bins_is_a_distance_of_one():
+def test_histogram_moved_half_the_bins_has_unit_distance():
     edges = np.linspace(0.0, 1.0, 257)
     a = np.eye(HISTOGRAM_BINS)[10]
     b = np.eye(HISTOGRAM_BINS)[10 + 128]
@@ -180,12 +180,12 @@ def test_a_valid_vector_is_its_own_nearest(rng):
 
 
 @pytest.mark.parametrize("wrong", [np.zeros(255), np.zeros(0), np.full(256, np.nan), 1.0])
-def test_what_is_no_vector_of_histograms_is_named(wrong):
+def test_invalid_histogram_vector_is_refused(wrong):
     with pytest.raises(HistogramError, match="vectors"):
         project_to_histograms(wrong)
 
 
-def test_group_histograms_are_means_over_images_not_over_texels(rng):
+def test_group_histograms_average_images_not_texels(rng):
     small, large = np.full((2, 2, 3), 0.1), np.full((50, 50, 3), 0.9)
     mask = np.zeros((50, 50), bool)
     mask[0, 0] = True

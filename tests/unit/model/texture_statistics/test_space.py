@@ -37,7 +37,7 @@ def test_colors_come_back_from_their_channels(rng):
     assert np.abs(space.to_colors(space.to_channels(single)) - single).max() < 2e-7
 
 
-def test_no_value_of_the_population_is_clipped_and_every_bin_is_used_sparingly(rng):
+def test_population_values_are_unclipped_and_bins_sparsely_used(rng):
     image = np.exp(rng.standard_normal((128, 128, 3)))
     space = TextureSpace.fit([image])
     found = statistics(image, space=space)
@@ -50,7 +50,7 @@ def test_no_value_of_the_population_is_clipped_and_every_bin_is_used_sparingly(r
     assert (widths.max(axis=-1) < 2.1 / 256 * reach).all()
 
 
-def test_a_huge_range_leaves_neither_the_crowd_nor_the_rare_in_one_bin(rng):
+def test_huge_range_separates_both_common_and_rare_values(rng):
     image = (10.0 ** rng.uniform(-6, 6, (64, 64)))[..., None]
     space = TextureSpace.fit([image])
     found = statistics(image, space=space)
@@ -59,7 +59,7 @@ def test_a_huge_range_leaves_neither_the_crowd_nor_the_rare_in_one_bin(rng):
     assert space.histograms(found.vector)[0, 0].max() < 4.0 / 128
 
 
-def test_a_population_of_one_color_has_axes_and_bins_of_some_width():
+def test_single_color_population_has_nonzero_axes_and_bins():
     space = TextureSpace.fit([np.full((16, 16, 3), (0.4, 0.3, 0.2))])
     np.testing.assert_allclose(space.axes @ space.axes.T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(np.abs(space.axes[0]), 3**-0.5, atol=1e-9)
@@ -69,7 +69,7 @@ def test_a_population_of_one_color_has_axes_and_bins_of_some_width():
     assert (space.histograms(found.vector).max(axis=-1) == 1.0).all()
 
 
-def test_gray_images_have_a_space_that_the_rounding_does_not_turn(rng):
+def test_gray_images_have_space_stable_to_rounding(rng):
     gray = np.repeat(rng.uniform(0.2, 0.8, (32, 32, 1)), 3, axis=2)
     a = TextureSpace.fit([gray])
     b = TextureSpace.fit([gray + 1e-15 * rng.standard_normal(gray.shape)])
@@ -87,13 +87,13 @@ def test_a_stored_space_is_the_same(tmp_path, rng):
 
 
 @pytest.mark.parametrize("content", [b"", b"no space", b"PK\x03\x04broken"])
-def test_a_file_that_is_no_space_is_named(tmp_path, content):
+def test_invalid_texture_space_file_is_reported(tmp_path, content):
     (tmp_path / "space.npz").write_bytes(content)
     with pytest.raises(TextureError, match="no texture space"):
         TextureSpace.load(tmp_path / "space.npz")
 
 
-def test_parts_tile_a_vector_in_the_order_of_their_names():
+def test_parts_tile_vector_in_name_order():
     space = TextureSpace.standard()
     assert space.size == 23808
     assert len(space.responses) == 31
@@ -134,7 +134,7 @@ def test_a_space_that_fits_nothing_is_named(rng):
         TextureSpace.standard(5)
 
 
-def test_what_is_filled_in_continues_its_surroundings_without_detail(rng):
+def test_filled_area_continues_surroundings_without_detail(rng):
     side = 64
     y, x = np.mgrid[0:side, 0:side] * (2 * np.pi / side)
     image = (2.0 + np.sin(x) + np.cos(y))[..., None]
@@ -155,7 +155,7 @@ def test_a_single_valid_texel_fills_everything():
     np.testing.assert_allclose(fill_smoothly(image, valid), 0.25)
 
 
-def test_samples_weigh_their_cells_and_what_is_valid_about_them():
+def test_samples_weight_cells_by_region_and_validity():
     valid = np.ones((32, 20), bool)
     region = np.zeros((32, 20))
     region[:16] = 1.0

@@ -17,7 +17,7 @@ ODD_SIZES = [(1, 1), (1, 7), (2, 2), (8, 5), (4096, 1), (33, 70), (101, 97), (12
 
 @pytest.mark.parametrize("shape", ODD_SIZES)
 @pytest.mark.parametrize(("dtype", "bound"), [(np.float32, 4e-6), (np.float64, 1e-14)])
-def test_an_image_of_any_size_is_its_responses_put_together(shape, dtype, bound, rng):
+def test_image_of_any_size_equals_sum_of_responses(shape, dtype, bound, rng):
     image = rng.standard_normal(shape).astype(dtype)
     before = image.copy()
     found = analyze(image)
@@ -28,7 +28,7 @@ def test_an_image_of_any_size_is_its_responses_put_together(shape, dtype, bound,
     np.testing.assert_array_equal(image, before)
 
 
-def test_a_changed_response_is_no_longer_the_image(rng):
+def test_changed_response_alters_synthesized_image(rng):
     image = rng.standard_normal((40, 30))
     found = analyze(image)
     found.bands[1][2][...] = 0.0
@@ -45,7 +45,7 @@ def test_other_depths_and_orientations_rebuild_too(levels, orientations, rng):
 
 @pytest.mark.parametrize("level", range(5))
 @pytest.mark.parametrize("angle", range(4))
-def test_a_wave_at_the_center_of_a_band_answers_there_alone(level, angle):
+def test_wave_at_band_center_responds_only_in_band(level, angle):
     """Expected: amplitude sqrt(0.8) |cos^3| of the angle between wave and filter, one level."""
     side = 128
     along = side / 2 ** (level + 2)  # cycles an image where the level's filter is 1
@@ -64,7 +64,7 @@ def test_a_wave_at_the_center_of_a_band_answers_there_alone(level, angle):
         assert np.delete(energy, level, axis=0).max() < 1e-20
 
 
-def test_the_low_pass_keeps_the_unit_of_the_image():
+def test_low_pass_keeps_image_unit():
     found = analyze(np.full((64, 48), 0.4))
     np.testing.assert_allclose(found.low, 0.4, atol=1e-15)
     assert max(np.abs(band).max() for band in found.bands) < 1e-15
@@ -76,13 +76,13 @@ def test_energy_is_that_of_the_image(rng):
     assert sum((r**2).mean() for r in analyze(image)) == pytest.approx((image**2).mean())
 
 
-def test_levels_below_the_lowest_frequency_of_a_small_image_are_exactly_zero(rng):
+def test_levels_below_image_lowest_frequency_are_exactly_zero(rng):
     found = analyze(rng.standard_normal((8, 5)))
     assert [np.abs(band).max() > 0 for band in found.bands] == [True] * 3 + [False] * 4
     assert level_sizes((8, 5))[-1] == (1, 1)
 
 
-def test_shifting_by_a_sample_of_the_last_level_shifts_all_responses(rng):
+def test_shift_by_last_level_sample_shifts_all_responses(rng):
     image = rng.standard_normal((128, 256))
     found, shifted = analyze(image), analyze(np.roll(image, (64, 128), (0, 1)))
     for level, (a, b) in enumerate(zip(found.bands, shifted.bands, strict=True)):
@@ -90,7 +90,7 @@ def test_shifting_by_a_sample_of_the_last_level_shifts_all_responses(rng):
         np.testing.assert_allclose(b, moved, atol=1e-13)
 
 
-def test_kernels_do_what_arrays_do(rng):
+def test_kernels_match_array_operations(rng):
     """The adjoint pair, and both against the same sums in plain NumPy."""
     filters = steerable_pyramid._filters((21, 18), 2, 4, "<f8")
     level = filters.levels[1]
@@ -110,7 +110,7 @@ def test_kernels_do_what_arrays_do(rng):
     np.testing.assert_allclose(back, expected, atol=1e-13)
 
 
-def test_as_many_threads_as_wanted_give_the_same_numbers(rng):
+def test_any_thread_count_gives_same_numbers(rng):
     image = rng.standard_normal((300, 40)).astype(np.float32)
     for one, two in zip(analyze(image, workers=1), analyze(image, workers=3), strict=True):
         np.testing.assert_array_equal(one, two)
@@ -125,7 +125,7 @@ def test_as_many_threads_as_wanted_give_the_same_numbers(rng):
         ([[np.inf, -np.inf]], "finite"),
     ],
 )
-def test_what_is_no_image_is_named(image, wrong):
+def test_invalid_pyramid_image_is_refused(image, wrong):
     with pytest.raises(PyramidError, match=wrong):
         analyze(image)
 

@@ -27,7 +27,7 @@ def h_function_at_1(albedo):
 
 
 @pytest.mark.parametrize("albedo", [0.3, 0.7, 0.9, 0.98, 0.999])
-def test_matched_half_space_reflects_as_the_h_function_says(albedo):
+def test_matched_half_space_reflectance_matches_h_function(albedo):
     # Exact: R = 1 - sqrt(1 - a) H(1) for a beam at normal incidence.
     ours = layer_stack_reflectance([1 - albedo], [albedo], [np.inf], eta=1.0)
     assert ours == pytest.approx(1 - np.sqrt(1 - albedo) * h_function_at_1(albedo), abs=1e-7)
@@ -62,7 +62,7 @@ def test_the_three_layer_sample_of_mcml():
     ("sigma_a", "sigma_s_prime", "transport"),
     [(0.032, 0.74, 0.4316), (0.17, 0.88, 0.2098), (0.48, 1.01, 0.1138)],
 )
-def test_jensen_skin1_reflects_as_transport_says(sigma_a, sigma_s_prime, transport):
+def test_jensen_skin1_reflectance_matches_transport(sigma_a, sigma_s_prime, transport):
     ours = layer_stack_reflectance([sigma_a], [sigma_s_prime], [np.inf], eta=1.3)
     assert ours == pytest.approx(transport, rel=4e-3)
 
@@ -90,7 +90,7 @@ def test_random_stacks_agree_with_the_peer_code(rng):
         assert ours == pytest.approx(ur1 - fresnel.normal_reflectance(1.4), abs=6e-4)
 
 
-def test_twelve_directions_are_within_three_millionths_of_the_limit():
+def test_twelve_directions_are_within_three_millionths_of_limit():
     sigma_a = np.array([[0.05, 0.3], [5.0, 0.1], [60.0, 1.0]])
     few = layer_stack_reflectance(sigma_a, [6.0, 3.0], [0.25, np.inf])
     many = layer_stack_reflectance(sigma_a, [6.0, 3.0], [0.25, np.inf], directions=40)
@@ -99,7 +99,7 @@ def test_twelve_directions_are_within_three_millionths_of_the_limit():
 
 @pytest.mark.parametrize("tier", TIERS)
 @pytest.mark.parametrize("eta", [1.0, 1.4])
-def test_a_half_space_without_absorption_returns_all_that_enters(tier, eta):
+def test_nonabsorbing_half_space_returns_all_entering_light(tier, eta):
     ours = layer_stack_reflectance([0.0], [4.0], [np.inf], eta=eta, tier=tier)
     assert ours == pytest.approx(1.0 - fresnel.normal_reflectance(eta), abs=2e-6)
 
@@ -124,7 +124,7 @@ def test_forward_scattering_loses_no_energy(anisotropy):
 @pytest.mark.parametrize(
     ("sigma_a", "thickness"), [(0.0, np.inf), (0.0, 1.0), (2.0, np.inf), (2.0, 0.5)]
 )
-def test_nothing_comes_back_without_scattering_under_a_matched_surface(tier, sigma_a, thickness):
+def test_nonscattering_layers_with_matched_surface_return_nothing(tier, sigma_a, thickness):
     ours = layer_stack_reflectance([sigma_a], [0.0], [thickness], eta=1.0, tier=tier)
     assert ours == pytest.approx(0.0, abs=1e-9)
 
@@ -137,7 +137,7 @@ def test_a_layer_of_no_thickness_changes_nothing(tier):
 
 
 @pytest.mark.parametrize("tier", TIERS)
-def test_a_clear_layer_on_top_of_a_matched_half_space_changes_nothing(tier):
+def test_clear_layer_on_matched_half_space_changes_nothing(tier):
     covered = layer_stack_reflectance([0.0, 0.2], [0.0, 3.0], [0.7, np.inf], tier=tier, eta=1.0)
     alone = layer_stack_reflectance([0.2], [3.0], [np.inf], tier=tier, eta=1.0)
     # Diffuse light is attenuated nowhere in a clear layer; diffusion has no such thing as a
@@ -146,7 +146,7 @@ def test_a_clear_layer_on_top_of_a_matched_half_space_changes_nothing(tier):
 
 
 @pytest.mark.parametrize("tier", TIERS)
-def test_a_layer_cut_in_pieces_reflects_as_the_whole(tier):
+def test_layer_split_in_pieces_reflects_as_whole(tier):
     whole = layer_stack_reflectance([0.4, 0.1], [6.0, 2.0], [0.3, np.inf], tier=tier)
     cut = layer_stack_reflectance(
         [0.4, 0.4, 0.1, 0.1], [6.0, 6.0, 2.0, 2.0], [0.1, 0.2, 1.7, np.inf], tier=tier
@@ -162,7 +162,7 @@ def test_a_deep_layer_is_a_half_space(tier):
 
 
 @pytest.mark.parametrize("tier", TIERS)
-def test_stiff_layers_and_a_resonant_one_stay_finite(tier):
+def test_stiff_and_resonant_layers_stay_finite(tier):
     # 140/mm of melanin at 400 nm; sigma_a = sigma_t / 3 makes kappa equal to the extinction.
     sigma_a = np.array([[70.0, 40.0], [500.0, 0.0], [1.0, 1.0], [0.0, 1e-12]])
     ours = layer_stack_reflectance(sigma_a, [12.0, 2.0], [0.25, np.inf], tier=tier)
@@ -185,7 +185,7 @@ def test_stiff_layers_and_a_resonant_one_stay_finite(tier):
     st.floats(1.0, 1.6),
     st.sampled_from(TIERS),
 )
-def test_reflectance_is_a_fraction_and_falls_when_any_layer_absorbs_more(layers, eta, tier):
+def test_reflectance_is_fraction_decreasing_with_any_absorption(layers, eta, tier):
     sigma_a, sigma_s, thickness = (np.array(column) for column in zip(*layers, strict=True))
     before = layer_stack_reflectance(sigma_a, sigma_s, thickness, eta=eta, tier=tier)
     assert -1e-9 <= before <= 1.0 + 1e-9
@@ -197,7 +197,7 @@ def test_reflectance_is_a_fraction_and_falls_when_any_layer_absorbs_more(layers,
             assert after <= before + 1e-9
 
 
-def test_leading_axes_broadcast_like_a_loop_and_inputs_stay_as_they_are():
+def test_leading_axes_broadcast_like_loop_inputs_unmodified():
     sigma_a = np.array([[[0.1, 0.2]], [[1.0, 2.0]]])
     sigma_s = np.array([[[6.0, 3.0], [8.0, 4.0], [2.0, 1.0]]])
     kept = sigma_a.copy()

@@ -39,7 +39,7 @@ def test_deoxygenated_blood_is_darker_in_the_red_only():
 
 
 @pytest.mark.parametrize("tier", ["adding_doubling", "diffusion"])
-def test_more_of_any_chromophore_makes_skin_darker_at_every_wavelength(tier):
+def test_more_chromophore_darkens_skin_at_every_wavelength(tier):
     melanin = C_M_MAX * np.linspace(0.0, 1.0, 6) ** 3
     blood = C_HD_MAX * np.linspace(0.0, 1.0, 5) ** 3
     # Above 600 nm blood is nearly as clear as the tissue that it displaces: 10 nm up to 600.
@@ -51,7 +51,7 @@ def test_more_of_any_chromophore_makes_skin_darker_at_every_wavelength(tier):
     assert r.max() < 1.0
 
 
-def test_the_tiers_agree_to_a_fifth_over_the_whole_range():
+def test_tiers_agree_to_a_fifth_over_whole_range():
     melanin = C_M_MAX * np.linspace(0.0, 1.0, 5) ** 3
     blood = C_HD_MAX * np.linspace(0.0, 1.0, 5) ** 3
     exact = two_layer_reflectance(spectra.WAVELENGTH_NM, melanin[:, None], blood)
@@ -61,7 +61,7 @@ def test_the_tiers_agree_to_a_fifth_over_the_whole_range():
     assert relative.max() < 0.21
 
 
-def test_measured_skin_can_be_fitted_with_a_small_specular_offset():
+def test_measured_skin_fits_with_small_specular_offset():
     def residual(p):
         model = two_layer_reflectance(NIST_WAVELENGTH_NM, p[0], p[1], beta_m=p[2], oxygenation=p[3])
         return model + p[4] - NIST_MEAN

@@ -14,7 +14,7 @@ def bell(mean, deviation):
     return h / h.sum()
 
 
-def test_quantiles_of_a_bell_are_those_of_the_normal_distribution():
+def test_bell_quantiles_match_normal_distribution():
     from scipy.stats import norm
 
     found = transport.quantiles(bell(0.3, 0.5), EDGES)
@@ -22,7 +22,7 @@ def test_quantiles_of_a_bell_are_those_of_the_normal_distribution():
     np.testing.assert_allclose(found[3:-3], expected[3:-3], atol=0.01)
 
 
-def test_a_shift_moves_a_bell_and_keeps_its_shape():
+def test_shift_moves_bell_and_keeps_shape():
     found = transport.moved(bell(-1.0, 0.4), EDGES, np.full(256, 1.5))
     assert np.abs(np.cumsum(found) - np.cumsum(bell(0.5, 0.4))).max() < 0.01
 
@@ -44,7 +44,7 @@ def test_the_opposite_change_brings_back(mean, rng):
     assert np.abs(np.cumsum(there) - np.cumsum(source)).max() > 0.2
 
 
-def test_no_change_is_the_identity_and_any_change_keeps_a_histogram(rng):
+def test_null_change_is_identity_any_change_keeps_histogram(rng):
     several = rng.random((2, 3, 256)) * (rng.random((2, 3, 256)) > 0.5)
     several /= several.sum(axis=-1, keepdims=True)
     edges = np.broadcast_to(EDGES, (2, 3, 257))
@@ -62,7 +62,7 @@ def test_a_single_value_moves_as_a_whole():
     assert found[103] == pytest.approx(1.0, abs=1e-6)
 
 
-def test_wider_edges_hold_what_would_leave_the_old_ones():
+def test_wider_edges_contain_values_leaving_old_edges():
     source, change = bell(2.0, 0.3), np.full(256, 3.0)
     wide = transport.widened(source, EDGES, change)
     assert wide[-1] > 5.0
@@ -73,7 +73,7 @@ def test_wider_edges_hold_what_would_leave_the_old_ones():
     np.testing.assert_array_equal(transport.widened(source, EDGES, np.zeros(256)), EDGES)
 
 
-def test_what_is_no_histogram_is_refused():
+def test_invalid_histogram_is_refused():
     with pytest.raises(transport.TransportError, match="edges: got"):
         transport.quantiles(np.ones(4) / 4, np.arange(4.0))
     with pytest.raises(transport.TransportError, match="sum"):

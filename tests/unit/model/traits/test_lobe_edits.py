@@ -40,7 +40,7 @@ def face(rng, texels=200):
     return rng.uniform(0.5, 1.5, (texels, 2)), mix
 
 
-def test_an_edit_adds_the_trait_to_the_brdf_of_every_texel(rng):
+def test_edit_adds_trait_to_brdf_of_every_texel(rng):
     space, m = skin(rng), bumps()
     weights, mix = face(rng)
     edit = edit_weights(weights, mix, space, {"lotion": 0.7})
@@ -55,7 +55,7 @@ def test_an_edit_adds_the_trait_to_the_brdf_of_every_texel(rng):
     np.testing.assert_array_equal(edit.mix[:2], mix)
 
 
-def test_an_edit_of_amount_0_returns_weights_and_lobes_bit_for_bit(rng):
+def test_edit_of_amount_0_is_bit_exact(rng):
     weights, mix = face(rng)
     weights = weights.astype(np.float32)
     for amounts in ({}, {"lotion": 0.0}, {"lotion": np.zeros(200)}):
@@ -67,7 +67,7 @@ def test_an_edit_of_amount_0_returns_weights_and_lobes_bit_for_bit(rng):
 
 
 @pytest.mark.parametrize("amount", [0.7, -0.5, 30.0])
-def test_an_edit_and_its_opposite_return_within_what_was_clipped(rng, amount):
+def test_edit_and_opposite_return_within_clipped_amount(rng, amount):
     space, m = skin(rng), bumps()
     weights, mix = face(rng)
     there = edit_weights(weights, mix, space, {"lotion": amount})
@@ -103,7 +103,7 @@ def test_amounts_may_differ_by_texel(rng):
     assert part.weights[80:, 2:].max() == 0.0
 
 
-def test_a_trait_that_the_lobes_can_show_brings_none(rng):
+def test_trait_representable_by_lobes_adds_no_lobes(rng):
     space = skin(rng)
     mix = np.vstack([np.eye(COUNT)[2], np.eye(COUNT)[8]])
     edit = edit_weights(np.ones((3, 2)), mix, space, {"lotion": 0.5})
@@ -111,7 +111,7 @@ def test_a_trait_that_the_lobes_can_show_brings_none(rng):
     assert edit.misfit["lotion"] < 0.05
 
 
-def test_what_cannot_be_taken_off_is_told_per_texel(rng):
+def test_unremovable_amount_is_reported_per_texel(rng):
     space, m = skin(rng), bumps()
     weights, mix = face(rng)
     weights[0] = 0.01
@@ -124,7 +124,7 @@ def test_what_cannot_be_taken_off_is_told_per_texel(rng):
     assert (np.abs(size - edit.moved) <= edit.clipped + 1e-9).all()
 
 
-def test_mixtures_are_the_nearest_in_what_they_reflect(rng):
+def test_mixtures_are_nearest_in_reflected_light(rng):
     space, m = skin(rng), bumps()
     weights, mix = face(rng, texels=20)
     edit = edit_weights(weights, mix, space, {"lotion": 30.0})
@@ -149,7 +149,7 @@ def test_mixtures_are_the_nearest_in_what_they_reflect(rng):
         ({"amounts": {"lotion": np.ones(3)}}, "amount of lotion"),
     ],
 )
-def test_what_does_not_fit_is_refused_by_name(rng, change, message):
+def test_mismatched_lobe_edit_input_is_refused_by_name(rng, change, message):
     given = {"weights": np.ones((4, 2)), "mix": np.ones((2, COUNT)), "amounts": {"lotion": 1.0}}
     given |= change
     with pytest.raises(TraitError, match=message):
@@ -165,7 +165,7 @@ def test_other_materials_are_refused(rng):
         )
 
 
-def test_lengths_are_those_of_what_is_reflected(rng):
+def test_lengths_are_those_of_reflected_light(rng):
     m = bumps()
     v = rng.normal(size=(7, COUNT))
     np.testing.assert_allclose(

@@ -40,7 +40,7 @@ def products(rng, count=12):
     return bumps.T @ bumps
 
 
-def test_a_trait_vector_is_the_difference_of_complement_means(rng):
+def test_trait_vector_is_difference_of_complement_means(rng):
     samples, label, _ = population(rng)
     space = TraitSpace.fit(samples, {"tan": label}, components=39)
     expected = samples[label].mean(axis=0) - samples[~label].mean(axis=0)
@@ -49,7 +49,7 @@ def test_a_trait_vector_is_the_difference_of_complement_means(rng):
     np.testing.assert_allclose(with_it, samples[label].mean(axis=0), atol=1e-10)
 
 
-def test_the_vector_of_a_continuous_trait_is_the_slope_of_a_regression(rng):
+def test_continuous_trait_vector_is_regression_slope(rng):
     samples, _, trait = population(rng, shift=0.0)
     age = rng.uniform(20.0, 60.0, len(samples))
     samples = samples + 0.05 * age[:, None] * trait
@@ -59,7 +59,7 @@ def test_the_vector_of_a_continuous_trait_is_the_slope_of_a_regression(rng):
     assert space.trait("age").others == 0
 
 
-def test_standard_errors_of_two_groups_are_those_of_welch(rng):
+def test_two_group_standard_errors_match_welch(rng):
     samples, label, _ = population(rng)
     found = TraitSpace.fit(samples, {"tan": label}).trait("tan").stderr
     squared = sum(samples[g].var(axis=0, ddof=1) / g.sum() for g in (label, ~label))
@@ -76,7 +76,7 @@ def test_standard_errors_cover_the_truth(rng):
     assert abs(np.mean(inside) - 0.683) < 4 * 0.034
 
 
-def test_regression_tells_apart_traits_that_go_together(rng):
+def test_regression_separates_correlated_traits(rng):
     samples, tan, _ = population(rng, people=200, with_trait=100)
     beard = (rng.random(200) < np.where(tan, 0.9, 0.1)).astype(bool)
     truth = rng.normal(size=samples.shape[1])
@@ -89,7 +89,7 @@ def test_regression_tells_apart_traits_that_go_together(rng):
     assert "goes along with beard" in means.trait("tan").warning
 
 
-def test_the_same_faces_under_two_names_are_reported_and_refused_by_regression(rng):
+def test_duplicate_traits_are_reported_and_refused_by_regression(rng):
     samples, tan, _ = population(rng)
     space = TraitSpace.fit(samples, {"tan": tan, "brown": tan, "pale": ~tan})
     assert "cannot be told apart" in space.trait("tan").warning
@@ -99,7 +99,7 @@ def test_the_same_faces_under_two_names_are_reported_and_refused_by_regression(r
 
 
 @pytest.mark.parametrize("space", ["pca", "nmf"])
-def test_an_edit_of_amount_0_returns_the_sample_bit_for_bit(rng, space):
+def test_edit_of_amount_0_returns_sample_bit_exact(rng, space):
     samples = rng.random((20, 12))
     label = np.arange(20) < 8
     made = TraitSpace.fit(
@@ -117,7 +117,7 @@ def test_an_edit_of_amount_0_returns_the_sample_bit_for_bit(rng, space):
         np.testing.assert_array_equal(made.edit(strange, {}, mode=mode), strange)
 
 
-def test_an_edit_and_its_opposite_return_the_source_where_nothing_is_clipped(rng):
+def test_unclipped_edit_and_opposite_return_source(rng):
     samples, label, _ = population(rng)
     space = TraitSpace.fit(samples, {"tan": label})
     there = space.outcome(samples[20], {"tan": 0.7})
@@ -126,7 +126,7 @@ def test_an_edit_and_its_opposite_return_the_source_where_nothing_is_clipped(rng
 
 
 @pytest.mark.parametrize("amount", [0.3, 1.0, -1.0, 4.0])
-def test_an_edit_and_its_opposite_return_the_source_within_the_stated_bound(rng, amount):
+def test_edit_and_opposite_return_source_within_stated_bound(rng, amount):
     samples, label = histograms(rng)
     space = TraitSpace.fit(samples, {"tan": label})
     there = space.outcome(samples, {"tan": amount})
@@ -138,7 +138,7 @@ def test_an_edit_and_its_opposite_return_the_source_within_the_stated_bound(rng,
     assert (there.share <= 1.0).all()
 
 
-def test_edited_mixtures_stay_non_negative_and_return_within_the_bound(rng):
+def test_edited_mixtures_stay_nonnegative_and_return_within_bound(rng):
     g = products(rng)
     samples = np.where(rng.random((30, 12)) < 0.4, rng.random((30, 12)), 0.0)
     label = np.arange(30) < 12
@@ -152,7 +152,7 @@ def test_edited_mixtures_stay_non_negative_and_return_within_the_bound(rng):
     assert (away <= there.return_bound * (1 + 1e-6) + 1e-9).all()
 
 
-def test_what_a_mixture_lacks_is_taken_off_its_kin(rng):
+def test_mixture_shortfall_is_taken_from_similar_components(rng):
     g = products(rng)
     wanted = np.zeros(12)
     wanted[5], wanted[6] = 1.0, -0.5
@@ -172,7 +172,7 @@ def test_edited_histograms_are_histograms(rng, amount):
     np.testing.assert_allclose(edited.sum(axis=1), 1.0, atol=1e-12)
 
 
-def test_a_convex_edit_of_amount_1_is_the_mean_of_those_with_the_trait(rng):
+def test_convex_edit_of_unit_amount_is_trait_mean(rng):
     samples, label = histograms(rng)
     space = TraitSpace.fit(samples, {"tan": label}, components=29)
     edited = space.edit(samples[25], {"tan": 1.0}, mode="convex")
@@ -189,7 +189,7 @@ def test_amounts_that_make_no_convex_combination_are_refused(rng, amounts):
         space.edit(samples[0], amounts, mode="convex")
 
 
-def test_a_continuous_trait_has_no_group_to_mix_with(rng):
+def test_continuous_trait_has_no_group_to_mix(rng):
     samples, _, _ = population(rng)
     space = TraitSpace.fit(samples, {}, continuous={"age": rng.random(40)})
     with pytest.raises(TraitError, match="continuous"):
@@ -197,7 +197,7 @@ def test_a_continuous_trait_has_no_group_to_mix_with(rng):
 
 
 @pytest.mark.parametrize(("label", "who"), [(False, "nobody"), (True, "everybody")])
-def test_a_trait_of_nobody_or_everybody_is_refused_by_name(rng, label, who):
+def test_trait_of_nobody_or_everybody_is_refused(rng, label, who):
     samples, _, _ = population(rng)
     with pytest.raises(TraitError, match=f"label 'sweat': {who} of 40 has it"):
         TraitSpace.fit(samples, {"sweat": np.full(40, label)})
@@ -214,7 +214,7 @@ def test_groups_of_fewer_than_five_get_a_warning(rng):
     assert "only" not in space.trait("fine").warning
 
 
-def test_two_faces_make_a_trait_whose_error_is_not_known(rng):
+def test_two_faces_make_trait_of_unknown_error(rng):
     space = TraitSpace.fit(rng.random((2, 300)), {"old": [True, False]})
     found = space.trait("old")
     assert found.confidence.p_value == 1.0
@@ -223,7 +223,7 @@ def test_two_faces_make_a_trait_whose_error_is_not_known(rng):
     assert len(space.basis) == 1
 
 
-def test_one_face_with_a_trait_borrows_the_spread_of_the_others(rng):
+def test_single_face_with_trait_borrows_deviation_of_others(rng):
     samples, _, _ = population(rng)
     found = TraitSpace.fit(samples, {"mole": np.arange(40) == 3}).trait("mole")
     spread = samples[np.arange(40) != 3].std(axis=0, ddof=1)
@@ -231,7 +231,7 @@ def test_one_face_with_a_trait_borrows_the_spread_of_the_others(rng):
 
 
 @pytest.mark.parametrize("asked", [0, 6, 100])
-def test_more_components_than_the_samples_differ_in_are_refused(rng, asked):
+def test_components_exceeding_sample_rank_are_refused(rng, asked):
     samples, label, _ = population(rng, people=6, with_trait=3)
     with pytest.raises(TraitError, match=r"components .*: got"):
         TraitSpace.fit(samples, {"tan": label}, components=asked)
@@ -266,7 +266,7 @@ def test_vectors_scale_with_the_samples(rng, scale):
     assert other.confidence.expected_cosine == pytest.approx(one.confidence.expected_cosine)
 
 
-def test_components_of_long_samples_are_those_of_a_plain_svd(rng):
+def test_components_of_long_samples_match_plain_svd(rng):
     samples, label, _ = population(rng, people=12, length=3000, with_trait=5)
     space = TraitSpace.fit(samples, {"tan": label}, components=4)
     off = samples - samples.mean(axis=0)
@@ -282,7 +282,7 @@ def test_a_basis_is_orthonormal_under_the_metric(rng):
     np.testing.assert_allclose(space.basis @ g @ space.basis.T, np.eye(5), atol=1e-8)
 
 
-def test_few_components_are_chosen_where_few_hold_the_trait(rng):
+def test_few_components_are_chosen_where_sufficient_for_trait(rng):
     ways = np.linalg.qr(rng.normal(size=(400, 3)))[0].T
     label = np.arange(60) < 25
     shares = rng.normal(size=(60, 3)) * [8.0, 6.0, 5.0] + 8.0 * label[:, None]
@@ -330,12 +330,12 @@ def test_non_negative_nearest_mixtures_are_those_of_scipy(rng):
     assert found.min() >= 0.0
 
 
-def test_mixtures_without_negative_shares_are_their_own_nearest(rng):
+def test_nonnegative_mixtures_are_their_own_nearest(rng):
     wanted = rng.random((5, 6))
     np.testing.assert_array_equal(nonnegative_kernels.nearest(np.ones((6, 6)), wanted), wanted)
 
 
-def test_projection_on_histograms_is_the_nearest_one(rng):
+def test_histogram_projection_is_nearest_histogram(rng):
     given = rng.normal(size=7)
     found = Histograms(7).project(given)
     near = np.linalg.norm(found - given)
@@ -356,13 +356,13 @@ def test_samples_outside_their_set_are_refused(rng):
         TraitSpace.fit(bad, {"tan": label}, feasible=Histograms())
 
 
-def test_the_smallest_set_that_holds_the_samples_is_found(rng):
+def test_smallest_set_containing_samples_is_found(rng):
     assert feasible_sets.smallest(histograms(rng)[0]) == Histograms(256)
     assert feasible_sets.smallest(rng.random((3, 256))) == NonNegative()
     assert feasible_sets.smallest(rng.normal(size=(3, 256))) == Free()
 
 
-def test_nmf_coordinates_are_non_negative_and_vectors_lie_in_the_basis(rng):
+def test_nmf_coordinates_are_nonnegative_vectors_within_basis(rng):
     basis = rng.random((3, 12))
     label = np.arange(20) < 8
     shares = rng.random((20, 3)) + label[:, None] * [0.0, 1.0, 0.5]
@@ -376,19 +376,19 @@ def test_nmf_coordinates_are_non_negative_and_vectors_lie_in_the_basis(rng):
     assert space.lost < 1e-6
 
 
-def test_a_missing_basis_says_where_to_get_one(rng):
+def test_missing_basis_error_names_its_source(rng):
     with pytest.raises(TraitError, match=r"brdf_basis\.reduce"):
         TraitSpace.fit(rng.random((4, 5)), {"oil": [1, 0, 0, 1]}, space="nmf")
 
 
-def test_an_unknown_trait_is_named_with_those_that_are_there(rng):
+def test_unknown_trait_error_lists_available_traits(rng):
     samples, label, _ = population(rng)
     space = TraitSpace.fit(samples, {"tan": label})
     with pytest.raises(TraitError, match="got 'lotion', expected one of tan"):
         space.edit(samples[0], {"lotion": 1.0})
 
 
-def test_many_samples_are_edited_as_one_by_one(rng):
+def test_batch_edit_equals_individual_edits(rng):
     samples, label = histograms(rng)
     space = TraitSpace.fit(samples, {"tan": label})
     many = space.edit(samples.reshape(5, 6, -1), {"tan": 2.0})
@@ -396,14 +396,14 @@ def test_many_samples_are_edited_as_one_by_one(rng):
     np.testing.assert_allclose(many.reshape(30, -1), one, atol=1e-15)
 
 
-def test_cosines_count_what_the_metric_counts(rng):
+def test_cosine_uses_the_given_metric(rng):
     g = np.array([[1.0, 1.0], [1.0, 1.0]])
     assert cosine([1.0, 0.0], [0.0, 1.0]) == 0.0
     assert cosine([1.0, 0.0], [0.0, 1.0], g) == pytest.approx(1.0)
     assert cosine([1.0, 0.0], [0.0, 0.0]) == 0.0
 
 
-def test_the_opposite_of_a_trait_takes_it_away(rng):
+def test_opposite_trait_removes_trait(rng):
     samples, label, _ = population(rng)
     both = TraitSpace.fit(samples, {"female": label, "male": ~label})
     made = both.trait("female").opposite("male")
@@ -416,7 +416,7 @@ def test_the_opposite_of_a_trait_takes_it_away(rng):
         aged.opposite("young")
 
 
-def test_components_stay_where_the_trait_is_smaller_than_what_people_differ_in(rng):
+def test_components_remain_where_trait_is_below_population_variation(rng):
     samples, label, trait = population(rng, people=60, with_trait=30, shift=0.3)
     space = TraitSpace.fit(samples, {"tan": label})
     assert len(space.basis) == 59
@@ -424,7 +424,7 @@ def test_components_stay_where_the_trait_is_smaller_than_what_people_differ_in(r
     assert space.cosine("tan", trait) > few.cosine("tan", trait)
 
 
-def test_effects_of_other_traits_do_not_pass_for_noise_in_a_regression(rng):
+def test_regression_noise_excludes_effects_of_other_traits(rng):
     samples, tan, _ = population(rng, people=60, with_trait=30, shift=0.4)
     strong = rng.permutation(np.arange(60) < 20)
     samples = samples + 15.0 * strong[:, None] * rng.normal(size=samples.shape[1])

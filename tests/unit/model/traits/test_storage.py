@@ -41,7 +41,7 @@ def library():
     )
 
 
-def test_a_library_comes_back_as_it_was_stored(library):
+def test_library_round_trips_through_storage(library):
     back = trait_storage.from_bytes(library.to_bytes(precision="float64"))
     assert back.source == "simulated"
     assert back.parameters == {"people": 24}
@@ -81,7 +81,7 @@ def test_fewer_bits_change_vectors_by_the_stated_error(library, precision, bound
     assert len(stored) < len(library.to_bytes(precision="float64"))
 
 
-def test_edits_with_fewer_bits_stay_feasible_and_amount_0_the_identity(library):
+def test_low_bit_edits_stay_feasible_amount_0_identity(library):
     back = trait_storage.from_bytes(library.to_bytes(precision="int8")).spaces["albedo"]
     source = library.spaces["albedo"].center
     edited = back.edit(source, {"tan": 0.8})
@@ -137,7 +137,7 @@ def test_spaces_are_found_by_their_traits(library):
         library.having("sweat")
 
 
-def test_the_packaged_traits_are_simulated_and_say_how_near_the_truth_they_come():
+def test_packaged_traits_are_simulated_and_report_truth_error():
     library = trait_storage.default()
     assert library.source == "simulated"
     worn = {"cold", "hot", "sweat", "lotion", "makeup", "powder"}
@@ -155,7 +155,7 @@ def test_the_packaged_traits_are_simulated_and_say_how_near_the_truth_they_come(
         assert max(space.storage_error.values()) < 0.03
 
 
-def test_packaged_lotion_makes_skin_sharper_and_comes_off_again():
+def test_packaged_lotion_sharpens_skin_and_is_removable():
     space = trait_storage.default().spaces["surface"]
     bare = space.center - 0.5 * space.trait("lotion").vector
     bare = space.feasible.project(bare, space.metric)

@@ -8,7 +8,7 @@ import pytest
 from model.wrinkles import block_compression as bc
 
 
-def test_a_block_of_eight_values_decodes_by_the_format_s_ramp():
+def test_eight_value_block_decodes_by_format_ramp():
     # codes 0...7 twice, three bits each, the first texel in the lowest bits
     codes = list(range(8)) * 2
     bits = sum(code << (3 * i) for i, code in enumerate(codes))
@@ -17,7 +17,7 @@ def test_a_block_of_eight_values_decodes_by_the_format_s_ramp():
     np.testing.assert_allclose(bc.decode_bc4(block, (4, 4)).ravel() * 255, ramp * 2, rtol=1e-12)
 
 
-def test_a_block_whose_ends_are_turned_holds_six_values_zero_and_one():
+def test_swapped_block_ends_decode_six_values_plus_extremes():
     codes = list(range(8)) * 2
     bits = sum(code << (3 * i) for i, code in enumerate(codes))
     block = np.array([[[30, 240, *bits.to_bytes(6, "little")]]], np.uint8)
@@ -25,7 +25,7 @@ def test_a_block_whose_ends_are_turned_holds_six_values_zero_and_one():
     np.testing.assert_allclose(bc.decode_bc4(block, (4, 4)).ravel() * 255, ramp * 2, rtol=1e-12)
 
 
-def test_a_color_block_decodes_by_the_format_s_bits():
+def test_color_block_decodes_by_format_bits():
     red, blue = 31 << 11, 31
     codes = [0, 1, 2, 3] * 4
     bits = sum(code << (2 * i) for i, code in enumerate(codes)).to_bytes(4, "little")
@@ -41,12 +41,12 @@ def test_a_color_block_decodes_by_the_format_s_bits():
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0, 0.4, 128 / 255])
-def test_a_flat_block_comes_back_to_half_a_step_of_eight_bits(value):
+def test_flat_block_round_trips_within_half_byte_step(value):
     back = bc.decode_bc4(bc.encode_bc4(np.full((8, 8), value)), (8, 8))
     np.testing.assert_allclose(back, value, atol=0.5 / 255)
 
 
-def test_values_on_a_ramp_of_the_format_come_back_exactly(rng):
+def test_values_on_format_ramp_round_trip_exactly(rng):
     ramp = 30 + (240 - 30) * np.arange(8) / 7
     texture = rng.permuted(np.tile(np.repeat(ramp, 2), (9, 1)), axis=1).reshape(12, 12) / 255
     blocked = texture.reshape(-1, 16)
@@ -55,7 +55,7 @@ def test_values_on_a_ramp_of_the_format_come_back_exactly(rng):
     np.testing.assert_allclose(bc.decode_bc4(bc.encode_bc4(grid), (12, 12)), grid, atol=1e-12)
 
 
-def test_a_block_is_never_worse_than_half_a_step_between_its_extremes(rng):
+def test_block_rms_error_is_within_half_ramp_step(rng):
     texture = rng.random((64, 64))
     back = bc.decode_bc4(bc.encode_bc4(texture), (64, 64))
     for y, x in itertools.product(range(0, 64, 4), repeat=2):
@@ -65,7 +65,7 @@ def test_a_block_is_never_worse_than_half_a_step_between_its_extremes(rng):
         assert rms <= half_a_step
 
 
-def test_the_search_for_ends_is_near_the_best_of_all_pairs(rng):
+def test_end_search_is_near_best_of_all_pairs(rng):
     texture = np.clip(0.5 + 0.1 * rng.standard_normal((4, 40)), 0, 1)
     back = bc.decode_bc4(bc.encode_bc4(texture), (4, 40))
     ours, best = [], []
@@ -90,7 +90,7 @@ def test_two_channels_do_not_touch_each_other(rng):
         np.testing.assert_array_equal(back[..., c], alone)
 
 
-def test_colors_on_a_line_come_back_to_the_steps_of_their_ends(rng):
+def test_collinear_colors_round_trip_to_steps_of_ends(rng):
     ends = np.array([[8, 60, 25], [20, 10, 5]]) / [31, 63, 31]
     part = rng.integers(0, 4, (4, 4, 1)) / 3
     part[0, :2] = [[0], [1]]
@@ -98,7 +98,7 @@ def test_colors_on_a_line_come_back_to_the_steps_of_their_ends(rng):
     np.testing.assert_allclose(bc.decode_bc1(bc.encode_bc1(texture), (4, 4)), texture, atol=1e-12)
 
 
-def test_four_channels_cost_a_byte_a_texel_and_hold_smooth_masks_to_a_few_hundredths():
+def test_four_channels_cost_byte_per_texel_keep_masks():
     y, x = np.mgrid[:64, :64] / 63
     masks = np.stack([x, 1 - x, 0.5 * x + 0.2, y], axis=-1)
     blocks = bc.encode_bc3(masks)
@@ -108,7 +108,7 @@ def test_four_channels_cost_a_byte_a_texel_and_hold_smooth_masks_to_a_few_hundre
 
 
 @pytest.mark.parametrize("bad", [-0.01, 1.01, np.nan])
-def test_values_that_a_texture_does_not_hold_are_refused(bad):
+def test_values_outside_texture_range_are_refused(bad):
     with pytest.raises(bc.BlockError, match=r"texture: got"):
         bc.encode_bc4(np.full((4, 4), bad))
 

@@ -14,7 +14,7 @@ def slopes(rng, steepest, shape=(8, 8)):
     return rng.uniform(-steepest, steepest, (*shape, 2))
 
 
-def test_a_weight_of_one_gives_the_wrinkled_normals_and_none_the_base(rng):
+def test_unit_weight_gives_wrinkled_normals_zero_gives_base(rng):
     base, wrinkle = slopes(rng, 0.3), slopes(rng, 0.3)
     b, w = wrinkles.decode(base), wrinkles.decode(base + wrinkle)
     difference = wrinkle_differences.difference_map(b, w)
@@ -26,7 +26,7 @@ def test_a_weight_of_one_gives_the_wrinkled_normals_and_none_the_base(rng):
     )
 
 
-def test_between_it_is_off_by_the_second_order_and_derivatives_are_exact(rng):
+def test_intermediate_weight_errs_to_second_order_derivatives_exact(rng):
     base, wrinkle = slopes(rng, 0.2, (64, 64)), slopes(rng, 0.2, (64, 64))
     errors = []
     for scale in (1.0, 0.5):
@@ -42,7 +42,7 @@ def test_between_it_is_off_by_the_second_order_and_derivatives_are_exact(rng):
     assert errors[0] / errors[1] == pytest.approx(8.0, rel=0.15)  # slope times squared slope
 
 
-def test_without_renormalization_the_sum_is_no_unit_vector(rng):
+def test_sum_without_renormalization_is_not_unit_vector(rng):
     b, w = wrinkles.decode(slopes(rng, 0.5)), wrinkles.decode(slopes(rng, 0.5))
     d = wrinkle_differences.difference_map(b, w)
     raw = wrinkle_differences.combine(b, d, ONE, np.full(1, 0.5), renormalize=False)
@@ -53,7 +53,7 @@ def test_without_renormalization_the_sum_is_no_unit_vector(rng):
     np.testing.assert_allclose(unit, raw / lengths[..., None], atol=1e-15)
 
 
-def test_it_keeps_slopes_beyond_45_degrees_that_derivatives_clamp():
+def test_differences_keep_slopes_beyond_45_degrees_unlike_derivatives():
     b = np.array([[[0.0, 0.0, 1.0]]])
     w = np.array([[[np.sin(1.0), 0.0, np.cos(1.0)]]])  # 57 degrees
     d = wrinkle_differences.difference_map(b, w)
@@ -63,7 +63,7 @@ def test_it_keeps_slopes_beyond_45_degrees_that_derivatives_clamp():
     assert metrics.angular_error_rad(clamped, w)[0, 0] == pytest.approx(1.0 - np.pi / 4)
 
 
-def test_opposite_slopes_beyond_30_degrees_are_clamped_and_counted():
+def test_opposite_slopes_beyond_30_degrees_are_clamped_counted():
     a = np.radians([29.0, 31.0])
     b = np.stack([-np.sin(a), 0 * a, np.cos(a)], axis=-1)[None]
     w = b * [-1, 1, 1]
@@ -72,7 +72,7 @@ def test_opposite_slopes_beyond_30_degrees_are_clamped_and_counted():
     assert d.values.max() == 1.0
 
 
-def test_missing_normals_add_nothing_and_holes_of_the_base_are_zero(rng):
+def test_missing_normals_add_nothing_base_holes_are_zero(rng):
     b = wrinkles.decode(slopes(rng, 0.5, (4, 4)))
     w = b.copy()
     w[0, 0] = np.nan

@@ -54,7 +54,7 @@ def test_a_model_comes_back_from_its_folder(face, tmp_path):
     assert again.layers[1].table == face.layers[1].table
 
 
-def test_a_hole_of_the_base_is_a_hole_of_the_face(face):
+def test_base_hole_is_hole_of_face(face):
     got = face.evaluate({"joy": 1.0})
     assert not got.valid[3, 4]
     assert not got.normals[3, 4].any()
@@ -67,7 +67,7 @@ def test_neutral_weights_give_the_base(face):
     )
 
 
-def test_what_the_clamp_changed_is_told(face):
+def test_clamp_effect_is_reported(face):
     calm = face.evaluate({"joy": 0.5})
     assert calm.clamped_fraction == 0.0
     np.testing.assert_array_equal(calm.zone_sums[0], calm.zone_weights[0])

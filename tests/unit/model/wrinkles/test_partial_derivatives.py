@@ -55,7 +55,7 @@ def listing_1_1(base, wrinkle, masks, sums):
 
 
 @pytest.mark.parametrize(("dtype", "atol"), [(np.float64, 1e-15), (np.float32, 3e-7)])
-def test_a_normal_comes_back_from_its_derivatives_at_rounding_level(rng, dtype, atol):
+def test_normal_round_trips_through_derivatives_at_rounding_level(rng, dtype, atol):
     n = tilted(rng, (3, 5, 7)).astype(dtype)
     d = wrinkles.encode(n)
     assert d.dtype == dtype
@@ -65,7 +65,7 @@ def test_a_normal_comes_back_from_its_derivatives_at_rounding_level(rng, dtype, 
     np.testing.assert_allclose(back, n, rtol=0, atol=atol)
 
 
-def test_derivatives_are_the_slopes_of_the_height_that_the_normal_belongs_to():
+def test_derivatives_are_height_slopes_of_their_normal():
     dh_dx, dh_dy = 0.3, -0.2
     d = wrinkles.encode(np.array([-dh_dx, -dh_dy, 1.0]))
     np.testing.assert_allclose(d, [-dh_dx, -dh_dy], rtol=1e-15)
@@ -77,7 +77,7 @@ def test_the_length_of_a_normal_does_not_matter(rng):
     np.testing.assert_allclose(wrinkles.encode(n * lengths), wrinkles.encode(n), rtol=1e-14)
 
 
-def test_what_is_steeper_than_45_degrees_is_clamped_and_counted():
+def test_slopes_above_45_degrees_are_clamped_and_counted():
     angles = np.radians([0.0, 44.0, 46.0, 80.0, 89.999])
     n = np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=-1)
     report = wrinkles.encoding_report(n)
@@ -106,7 +106,7 @@ def test_derivatives_whose_squares_overflow_still_decode(dtype):
 
 
 @pytest.mark.parametrize("limit", [1.0, None])
-def test_normals_that_nothing_represents_are_masked_and_never_flat(limit):
+def test_unrepresentable_normals_are_masked_and_never_flat(limit):
     lost = [[0, 0, 0], [0.6, 0, -0.8], [1, 0, 0], [np.nan, 0, 1], [0, np.inf, 1], [0, 0, -1]]
     bare = wrinkles.encode(np.array([*lost, [0.0, 0.6, 0.8]]), limit=limit)
     assert np.isnan(bare[:6]).all()
@@ -120,14 +120,14 @@ def test_normals_that_nothing_represents_are_masked_and_never_flat(limit):
     assert none_left.clamped_fraction == 0.0
 
 
-def test_the_smallest_outward_part_is_clamped_and_not_lost():
+def test_smallest_outward_component_is_clamped_not_lost():
     report = wrinkles.encoding_report(np.array([1.0, -1.0, 5e-324]))
     assert report.valid
     np.testing.assert_array_equal(report.derivatives, [1.0, -1.0])
     assert not wrinkles.encoding_report(np.array([1.0, -1.0, 5e-324]), limit=None).valid
 
 
-def test_derivatives_that_are_not_finite_decode_to_the_zero_vector():
+def test_nonfinite_derivatives_decode_to_zero_vector():
     n = wrinkles.decode(np.array([[np.nan, 0], [np.inf, 0], [0.75, 0]]))
     np.testing.assert_allclose(n, [[0, 0, 0], [0, 0, 0], [0.6, 0, 0.8]], atol=1e-15)
 
@@ -144,7 +144,7 @@ def test_inputs_stay_as_they_were(rng):
         np.testing.assert_array_equal(a, b)
 
 
-def test_texture_values_hold_minus_one_to_one_in_zero_to_one():
+def test_texture_values_encode_signed_range_in_unit_range():
     d = np.array([-1.0, 0.0, 0.5, 1.0])
     np.testing.assert_allclose(wrinkles.to_unit(d), [0, 0.5, 0.75, 1])
     np.testing.assert_allclose(wrinkles.from_unit(wrinkles.to_unit(d)), d)
@@ -154,7 +154,7 @@ def test_texture_values_hold_minus_one_to_one_in_zero_to_one():
             wrinkles.to_unit(np.array([beyond]))
 
 
-def test_the_table_has_the_paper_s_six_expressions_over_eight_zones():
+def test_table_has_six_published_expressions_over_eight_zones():
     assert tuple(JIMENEZ2011_TABLE.rows) == ("joy", "surprise", "fear", "anger", "disgust", "sad")
     assert JIMENEZ2011_TABLE.zones == (
         "red",
@@ -179,12 +179,12 @@ def test_the_table_has_the_paper_s_six_expressions_over_eight_zones():
 
 
 @pytest.mark.parametrize("clamp", ["unit", "signed"])
-def test_surprise_and_anger_leave_a_fifth_in_red_and_green_and_nothing_in_blue_and_brown(clamp):
+def test_surprise_and_anger_leave_fifth_in_red_green(clamp):
     sums = clamped(zone_sums({"surprise": 1.0, "anger": 1.0}), clamp)
     np.testing.assert_allclose(sums[:4], [0.2, 0.2, 0.0, 0.0], atol=1e-15)
 
 
-def test_anger_alone_vanishes_in_the_forehead_under_unit_and_flattens_it_under_signed():
+def test_anger_forehead_vanishes_under_unit_flattens_under_signed():
     sums = zone_sums({"anger": 1.0})
     np.testing.assert_array_equal(clamped(sums, "unit")[:4], 0.0)
     np.testing.assert_allclose(clamped(sums, "signed")[:4], [-0.6, -0.6, -0.8, -0.8])
@@ -198,7 +198,7 @@ def test_anger_alone_vanishes_in_the_forehead_under_unit_and_flattens_it_under_s
 
 
 @pytest.mark.parametrize("clamp", ["unit", "signed"])
-def test_a_zone_s_sum_is_clamped_after_all_blend_shapes_are_added(clamp):
+def test_zone_sum_is_clamped_after_all_blend_shapes(clamp):
     one_by_one = clamped(zone_sums({"joy": 1}), clamp) + clamped(zone_sums({"fear": 1}), clamp)
     together = clamped(zone_sums({"joy": 1.0, "fear": 1.0, "sad": 1.0}), clamp)
     assert one_by_one.max() > 1.0
@@ -209,7 +209,7 @@ def test_a_zone_s_sum_is_clamped_after_all_blend_shapes_are_added(clamp):
     np.testing.assert_allclose(wrinkles.encode(n), 0.5)
 
 
-def test_any_number_of_blend_shapes_of_a_user_s_table_add_up():
+def test_user_table_sums_any_number_of_blend_shapes():
     rng = np.random.default_rng(3)
     rows = {f"shape {i}": tuple(rng.uniform(-0.01, 0.02, 8)) for i in range(300)}
     weights = {name: float(w) for name, w in zip(rows, rng.random(300), strict=True)}
@@ -217,12 +217,12 @@ def test_any_number_of_blend_shapes_of_a_user_s_table_add_up():
     np.testing.assert_allclose(zone_sums(weights, rows), expected, rtol=1e-12)
 
 
-def test_an_unknown_expression_is_named_with_its_neighbour():
+def test_unknown_expression_error_suggests_nearest_name():
     with pytest.raises(WrinkleError, match="'surprise' is near"):
         zone_sums({"suprise": 1.0})
 
 
-def test_weights_that_are_no_numbers_are_refused():
+def test_nonfinite_weights_are_refused():
     with pytest.raises(WrinkleError, match="finite"):
         zone_sums({"joy": float("nan")})
     with pytest.raises(WrinkleError, match="finite"):
@@ -266,7 +266,7 @@ def test_the_sum_is_listing_1_1_s(rng, shape, texels, mask_texels):
     np.testing.assert_allclose(single, expected, atol=5e-7)
 
 
-def test_masks_in_two_textures_are_the_same_eight_zones(rng):
+def test_masks_in_two_textures_are_same_eight_zones(rng):
     base, wrinkle = rng.uniform(-0.5, 0.5, (8, 8, 2)), rng.uniform(-0.5, 0.5, (4, 4, 2))
     masks = rng.random((8, 3, 5))
     expected = wrinkles.combine(base, wrinkle, masks, np.linspace(0, 1, 8))
@@ -277,7 +277,7 @@ def test_masks_in_two_textures_are_the_same_eight_zones(rng):
         np.testing.assert_array_equal(got, expected)
 
 
-def test_a_layer_finer_than_the_base_is_averaged_and_does_not_alias():
+def test_layer_finer_than_base_is_averaged_without_aliasing():
     base = np.zeros((4, 4, 2))
     ripple = np.zeros((64, 64, 2))
     ripple[:, ::2] = 0.5  # a period of two texels: its mean is all that a coarse base can show
@@ -285,7 +285,7 @@ def test_a_layer_finer_than_the_base_is_averaged_and_does_not_alias():
     np.testing.assert_allclose(wrinkles.encode(n), 0.25, atol=1e-12)
 
 
-def test_several_wrinkle_maps_add_up_and_a_lemon_pose_stretches_what_neutral_has(rng):
+def test_wrinkle_maps_add_and_lemon_pose_flattens_neutral(rng):
     base = rng.uniform(-0.4, 0.4, (8, 8, 2))
     first = wrinkles.Layer(rng.uniform(-0.4, 0.4, (4, 4, 2)), rng.random((8, 2, 2)))
     rows = dict.fromkeys(JIMENEZ2011_TABLE.rows, (0.0,)) | {"lemon": (1.0,)}
@@ -308,7 +308,7 @@ def test_no_layer_leaves_the_base(rng):
     np.testing.assert_array_equal(wrinkles.combine_layers(base, [], {}), wrinkles.decode(base))
 
 
-def test_a_hole_in_the_base_is_a_zero_normal_and_its_neighbours_are_whole(rng):
+def test_base_hole_is_zero_normal_and_spares_neighbors(rng):
     base = rng.uniform(-0.5, 0.5, (4, 4, 2))
     base[1, 2] = np.nan
     n = wrinkles.combine(base, np.full((2, 2, 2), 0.1), np.ones((8, 2, 2)), {"joy": 1.0})
@@ -335,7 +335,7 @@ def test_a_hole_in_the_base_is_a_zero_normal_and_its_neighbours_are_whole(rng):
         ({"clamp": "tight"}, "clamp: got 'tight'"),
     ],
 )
-def test_what_does_not_fit_is_refused(change, says):
+def test_mismatched_wrinkle_input_is_refused(change, says):
     given = {
         "base": np.zeros((4, 4, 2)),
         "wrinkle": np.zeros((2, 2, 2)),
@@ -347,7 +347,7 @@ def test_what_does_not_fit_is_refused(change, says):
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
-def test_normals_are_combined_as_the_derivatives_that_they_hold(rng, kind):
+def test_normals_combine_as_their_derivatives(rng, kind):
     base, fold = tilted(rng, (6, 5)).astype(kind), tilted(rng, (4, 4)).astype(kind)
     base[1, 2] = (0.0, 0.0, -1.0)
     masks, weights = rng.random((8, 3, 3)), {"joy": 0.4, "anger": 0.9}
@@ -374,7 +374,7 @@ def test_leading_axes_of_base_and_wrinkle_broadcast(rng):
     assert wrinkles.combine(base[:0], fold, masks, weights).shape == (0, 3, 6, 5, 3)
 
 
-def test_averaging_and_reading_keep_the_mean_of_a_texture(rng):
+def test_averaging_and_reading_keep_texture_mean(rng):
     texture = rng.random((9, 14))
     for shape in ((3, 7), (4, 5), (1, 1)):
         small = texture_resampling.resampled(texture, shape)

@@ -16,7 +16,7 @@ def furrows(side, rng):
     return 0.8 * np.stack([-dx, dy], axis=-1) / max(np.abs(dx).max(), np.abs(dy).max())
 
 
-def test_the_paper_s_96_kilobytes_are_map_and_masks_with_mip_maps_and_without_the_base():
+def test_published_96_kilobytes_include_mip_maps_without_base():
     paper = storage.paper_footprint()
     assert paper.wrinkle_bytes == 64 * 1024
     assert paper.mask_bytes == 8 * 1024
@@ -26,7 +26,7 @@ def test_the_paper_s_96_kilobytes_are_map_and_masks_with_mip_maps_and_without_th
 
 
 @pytest.mark.parametrize(("encoding", "bytes_"), storage.MAP_BYTES.items())
-def test_the_bytes_counted_are_those_that_the_encoding_makes(rng, encoding, bytes_):
+def test_counted_bytes_match_encoded_bytes(rng, encoding, bytes_):
     d = rng.uniform(-1, 1, (32, 16, 2))
     made = {
         "float32": d.astype(np.float32).nbytes,
@@ -40,12 +40,12 @@ def test_the_bytes_counted_are_those_that_the_encoding_makes(rng, encoding, byte
 @pytest.mark.parametrize(
     ("encoding", "largest"), [("float32", 1e-7), ("float16", 5e-4), ("unit8", 1.0 / 255 + 1e-6)]
 )
-def test_a_stored_map_is_off_by_half_a_step_of_its_encoding(rng, encoding, largest):
+def test_stored_map_errs_by_half_step_of_encoding(rng, encoding, largest):
     d = rng.uniform(-1, 1, (20, 20, 2))
     assert np.abs(storage.stored_map(d, encoding) - d).max() <= largest
 
 
-def test_eight_bits_cannot_store_flat_skin_and_blocks_nearly_can():
+def test_eight_bits_cannot_store_flat_skin_blocks_nearly():
     flat = np.zeros((8, 8, 2))
     eight = storage.stored_map(flat, "unit8")
     np.testing.assert_allclose(np.abs(eight), 1 / 255, rtol=1e-6)

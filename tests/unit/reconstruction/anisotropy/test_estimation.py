@@ -33,7 +33,7 @@ def null(rng, angle, cases=NULL_CASES, spread=None):
 
 @pytest.mark.parametrize("ratio", [1.05, 1.5, 4.0])
 @pytest.mark.parametrize("axis_rad", [0.0, 0.4, 1.6, 3.1])
-def test_an_ellipse_without_errors_is_told_exactly(ratio, axis_rad):
+def test_error_free_ellipse_is_recovered_exactly(ratio, axis_rad):
     found = estimate(SIXTEEN, ellipse(SIXTEEN, ratio, axis_rad))
     assert found.ratio == pytest.approx(ratio, rel=1e-9)
     assert abs(np.exp(2j * (found.axis_rad - axis_rad)) - 1) < 1e-7
@@ -77,7 +77,7 @@ def test_isotropic_tissue_is_flagged_at_the_stated_rate(rng, angle, spread, erro
     assert (found.p_value < 0.05).sum() >= stats.binom.ppf(1e-6, NULL_CASES, 0.05)
 
 
-def test_errors_stated_too_small_raise_no_false_alarm_unless_they_are_taken_at_their_word(rng):
+def test_understated_errors_raise_false_alarms_only_as_absolute(rng):
     values, stderr = null(rng, SIXTEEN)
     limit = most_of(NULL_CASES, 0.01 + direction_harmonics.OUTLIER_FALSE_ALARM_RATE)
     assert (estimate(SIXTEEN, values, stderr / 3).p_value < 0.01).sum() <= limit
@@ -88,7 +88,7 @@ def test_errors_stated_too_small_raise_no_false_alarm_unless_they_are_taken_at_t
 
 
 @pytest.mark.parametrize("size", [2.0, 5.0, 8.0, 30.0])
-def test_one_bad_direction_is_no_anisotropy(rng, size):
+def test_single_bad_direction_is_not_anisotropy(rng, size):
     values, stderr = null(rng, SIXTEEN)
     values[3] += size * stderr[3]
     found = estimate(SIXTEEN, values, stderr)
@@ -105,7 +105,7 @@ def test_one_bad_direction_is_no_anisotropy(rng, size):
         )
 
 
-def test_good_directions_are_left_out_at_the_stated_rate(rng):
+def test_good_directions_are_omitted_at_stated_rate(rng):
     values, stderr = null(rng, SIXTEEN, cases=8000)
     found = estimate(SIXTEEN, values, stderr)
     assert found.outlier.any(axis=0).sum() <= most_of(
@@ -132,7 +132,7 @@ def test_ratio_and_axis_are_within_their_standard_errors(rng):
         assert (np.abs(found.ratio - 1.3) < found.ratio_stderr / 1.5).mean() < 0.6
 
 
-def test_errors_of_the_ratio_reach_the_cramer_rao_bound(rng):
+def test_ratio_errors_reach_cramer_rao_bound(rng):
     truth = ellipse(SIXTEEN, 1.2, 2.0)[:, None]
     found = estimate(SIXTEEN, truth * (1 + STDERR * rng.standard_normal((16, 4000))))
     # sigma_tr is mean (1 - h/2 cos) to first order: sd of h is 2 sd sqrt(2 / 16)
@@ -140,7 +140,7 @@ def test_errors_of_the_ratio_reach_the_cramer_rao_bound(rng):
     assert np.log(found.ratio).std() == pytest.approx(bound, rel=0.06)
 
 
-def test_a_tilted_head_is_told_apart_from_anisotropic_tissue(rng):
+def test_tilted_head_is_separated_from_anisotropic_tissue(rng):
     values = ellipse(SIXTEEN, 1.0, 0.0) * (1 + 0.1 * np.cos(SIXTEEN - 2.0))
     values = values[:, None] * (1 + STDERR * rng.standard_normal((16, 2000)))
     found = estimate(SIXTEEN, values)
@@ -154,7 +154,7 @@ def test_a_tilted_head_is_told_apart_from_anisotropic_tissue(rng):
     assert np.isinf(half.tilt_stderr).all()
 
 
-def test_angles_of_further_turns_are_the_same_axes():
+def test_angles_of_further_rotations_give_same_axes():
     values = ellipse(SIXTEEN, 1.7, 0.9)
     found = estimate(SIXTEEN + 2 * np.pi * (np.arange(16) - 8), values)
     assert found.ratio == pytest.approx(1.7, rel=1e-9)
@@ -183,7 +183,7 @@ def test_sixteen_equal_directions_are_isotropic_whatever_their_errors():
         estimate(SIXTEEN, np.full(16, 0.7), np.arange(16.0))
 
 
-def test_p_values_are_told_far_below_what_a_float_holds():
+def test_p_values_are_reported_below_floating_point_range():
     values, stderr = ellipse(SIXTEEN, 1.5, 0.3), np.full(16, 1e-3)
     found = estimate(SIXTEEN, values, stderr, errors="absolute")
     power = direction_harmonics.fit(SIXTEEN, values[:, None], np.full((16, 1), 1e6)).axial_power[0]
@@ -247,7 +247,7 @@ def test_the_unit_of_length_does_not_matter(scale):
     assert found.chi2 == pytest.approx(plain.chi2, rel=1e-9)
 
 
-def test_a_direction_of_tiny_error_is_weighed_not_trusted_alone(rng):
+def test_direction_of_tiny_error_is_weighted_not_dominant(rng):
     truth = ellipse(SIXTEEN, 1.4, 0.3)
     stderr = np.full(16, 0.01)
     stderr[4] = 1e-9
@@ -258,7 +258,7 @@ def test_a_direction_of_tiny_error_is_weighed_not_trusted_alone(rng):
 
 @pytest.mark.parametrize("unit", [1e-300, 1e-150, 1e150, 1.7e308])
 @pytest.mark.parametrize("told", [None, 0.01])
-def test_values_of_any_size_give_the_same_ratio_and_axis(unit, told):
+def test_ratio_and_axis_are_scale_invariant(unit, told):
     shape = ellipse(SIXTEEN, 1.5, 0.3, mean=0.8)
     shape = shape / shape.max()
     errors = "relative" if told is None else "absolute"
@@ -274,7 +274,7 @@ def test_values_of_any_size_give_the_same_ratio_and_axis(unit, told):
 
 
 @pytest.mark.parametrize("height", [1e20, 1e150, 1e300])
-def test_a_direction_far_above_all_others_is_left_out_and_hides_none(height):
+def test_far_outlier_direction_is_omitted_and_hides_none(height):
     values = ellipse(SIXTEEN, 1.5, 0.3)
     valid = np.arange(16) != 3
     values[3] = height

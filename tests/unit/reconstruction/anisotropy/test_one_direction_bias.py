@@ -16,7 +16,7 @@ def ellipse(angle, ratio, axis_rad, mean=0.6):
     return mean * value / np.hypot(np.cos(turn) / ratio, np.sin(turn)).mean()
 
 
-def test_a_single_direction_is_off_by_what_the_ellipse_says():
+def test_single_direction_bias_matches_ellipse():
     found = estimate(SIXTEEN, ellipse(SIXTEEN, 1.3, 0.5))
     angles = np.array([0.1, 0.5, 1.2, 2.9])
     bias = one_direction_bias(found, angles)
@@ -27,7 +27,7 @@ def test_a_single_direction_is_off_by_what_the_ellipse_says():
     assert bias.rms == pytest.approx(np.sqrt((every**2).mean()), abs=1e-5)
 
 
-def test_biases_of_single_directions_are_within_their_standard_errors(rng):
+def test_single_direction_biases_are_within_standard_errors(rng):
     truth = ellipse(SIXTEEN, 1.3, 0.8)[:, None]
     found = estimate(SIXTEEN, truth * (1 + STDERR * rng.standard_normal((16, 3000))))
     angles = np.array([0.0, 0.8, 1.5])
@@ -38,7 +38,7 @@ def test_biases_of_single_directions_are_within_their_standard_errors(rng):
     assert ((off < bias.stderr).mean(axis=1) < 0.72).all()
 
 
-def test_nothing_is_said_of_single_directions_where_nothing_was_told():
+def test_single_direction_bias_is_unknown_without_estimate():
     good = np.zeros((16, 1), bool)
     found = estimate(SIXTEEN, np.ones((16, 1)), valid=good)
     bias = one_direction_bias(found, 0.0)

@@ -5,7 +5,7 @@ from reconstruction.anisotropy import plane_vectors
 
 
 @pytest.mark.parametrize("length", [0.0, 0.3, 1.0, 2.5, 8.0])
-def test_the_error_of_an_axis_is_the_circular_scatter_of_drawn_vectors(length, rng):
+def test_axis_error_is_circular_scatter_of_sampled_vectors(length, rng):
     """Rationale: drawn directions' mean resultant length, by definition.
 
     Expected: sqrt(-2 log R) / 2. Tolerance: R of 400,000 draws has a standard error of at most

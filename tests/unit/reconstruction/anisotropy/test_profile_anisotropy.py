@@ -46,7 +46,7 @@ def read(rng, truth, cases, *, coupling=0.03, fibre=0.01, gain=0.0):
 
 
 @pytest.mark.parametrize("ratio", [1.05, 1.3, 1.8])
-def test_profiles_of_directed_scattering_tell_its_ratio_whatever_coupling_and_fibres_are(ratio):
+def test_directed_scattering_ratio_survives_coupling_and_lost_fibers(ratio):
     truth, _ = turned_profiles(ratio, 0.7)
     found = estimate_from_profiles(SIXTEEN, RADIUS_MM, truth, **MEDIUM)
     assert np.log(found.ratio) == pytest.approx(np.log(ratio), rel=0.02)
@@ -61,7 +61,7 @@ def test_profiles_of_directed_scattering_tell_its_ratio_whatever_coupling_and_fi
     assert off.ratio == pytest.approx(found.ratio, rel=1e-6)
 
 
-def test_coefficients_that_are_a_tenth_off_hardly_change_the_ratio():
+def test_ten_percent_coefficient_errors_barely_change_ratio():
     truth, _ = turned_profiles(1.3, 0.7)
     for factor_a, factor_s in ((1.1, 1.0), (0.9, 1.0), (1.0, 1.1), (1.0, 0.9)):
         found = estimate_from_profiles(
@@ -76,7 +76,7 @@ def test_coefficients_that_are_a_tenth_off_hardly_change_the_ratio():
         )
 
 
-def test_profiles_of_isotropic_tissue_are_flagged_at_the_stated_rate(rng):
+def test_isotropic_tissue_profiles_are_flagged_at_stated_rate(rng):
     truth, _ = turned_profiles(1.0, 0.0)
     seen, variance = read(rng, truth, 800, coupling=0.1, fibre=0.03)
     found = estimate_from_profiles(SIXTEEN, RADIUS_MM, seen, variance, **MEDIUM)
@@ -103,7 +103,7 @@ def test_profiles_tell_the_ratio_within_its_standard_error(rng):
     assert (found.p_value < 0.01).mean() > 0.99
 
 
-def test_far_fibres_lost_in_noise_do_not_tilt_the_answer(rng):
+def test_noisy_far_fibers_do_not_bias_result(rng):
     truth, _ = turned_profiles(1.3, 0.7)
     seen, variance = read(rng, truth, 200)
     noise = 3e-4  # the far half of the fibres, some of them read below 0
@@ -133,7 +133,7 @@ def test_readings_that_do_not_count_may_be_anything(rng):
     assert found.ratio == pytest.approx(1.3, abs=5 * found.ratio_stderr)
 
 
-def test_profiles_are_compared_by_channel_and_in_any_unit(rng):
+def test_profiles_are_compared_per_channel_in_any_unit(rng):
     truth = np.stack([turned_profiles(r, 0.3)[0] for r in (1.1, 1.4)], axis=1)
     found = estimate_from_profiles(SIXTEEN, RADIUS_MM, truth, **MEDIUM)
     scaled = estimate_from_profiles(SIXTEEN, RADIUS_MM, 1e-9 * truth, **MEDIUM)
@@ -144,7 +144,7 @@ def test_profiles_are_compared_by_channel_and_in_any_unit(rng):
     np.testing.assert_allclose(found.mean_per_mm, 0.53, rtol=0.02)
 
 
-def test_profiles_without_signal_or_of_too_few_fibres_tell_nothing(rng):
+def test_signal_free_or_too_few_fibers_give_nothing(rng):
     noise = rng.standard_normal((16, 28))
     found = estimate_from_profiles(SIXTEEN, RADIUS_MM, noise, np.ones((16, 28)), **MEDIUM)
     assert not found.valid

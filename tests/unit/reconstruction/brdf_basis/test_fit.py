@@ -35,7 +35,7 @@ def matrix(s, basis, point):
 
 
 @pytest.mark.parametrize("known_noise", [True, False])
-def test_plain_residuals_are_within_a_fifth_of_a_percent_of_scipy(face, basis, known_noise):
+def test_plain_residuals_match_scipy_within_fifth_of_percent(face, basis, known_noise):
     s = samples_of(face) if known_noise else samples_of(face, variance=None)
     found = brdf_basis.fit_weights(s, basis, compress="none")
     for point in range(20):
@@ -109,9 +109,7 @@ def held_out(p, s, rng, basis, compress):
     return np.abs(surface - p.surface)[at] / total[at], np.sqrt(np.mean(root[at] ** 2))
 
 
-def test_held_out_light_is_predicted_within_5_percent_and_cube_roots_do_better_by_their_measure(
-    face, basis
-):
+def test_held_out_light_errs_below_5_percent(face, basis):
     s = samples_of(face)
     error, root = held_out(face, s, np.random.default_rng(1), basis, "cbrt")
     _, plain_root = held_out(face, s, np.random.default_rng(1), basis, "none")
@@ -175,14 +173,14 @@ def test_extremes_give_masks_and_no_nan(face, basis):
         assert np.all(found.weights[4].sum() > 0.0)
 
 
-def test_points_without_any_light_get_no_weights_every_time(face, basis):
+def test_unlit_points_get_no_weights_every_time(face, basis):
     dark = samples_of(face, variance=None)
     dark = dataclasses.replace(dark, value=np.zeros_like(dark.value))
     for _ in range(3):  # what a call leaves in memory must not matter to the next
         assert not brdf_basis.fit_weights(dark, basis).weights.any()
 
 
-def test_grazing_saturated_and_unknown_samples_are_left_out(face):
+def test_grazing_saturated_and_unknown_samples_are_omitted(face):
     light = face.light.copy()
     flat = np.cross(face.normals, [0.0, 1.0, 0.0])
     light[:, 0] = flat / np.linalg.norm(flat, axis=1, keepdims=True)
@@ -200,7 +198,7 @@ def test_grazing_saturated_and_unknown_samples_are_left_out(face):
         brdf_basis.surface_samples(f, light, face.view, face.normals[:2], r_d, eta=1.3)
 
 
-def test_points_do_not_depend_on_how_they_are_chunked(face, basis):
+def test_points_are_independent_of_chunking(face, basis):
     s = samples_of(face)
     whole = brdf_basis.fit_weights(s, basis)
     fields = [getattr(s, field.name)[10:] for field in dataclasses.fields(s)]
@@ -209,7 +207,7 @@ def test_points_do_not_depend_on_how_they_are_chunked(face, basis):
     np.testing.assert_allclose(part.residual, whole.residual[10:], rtol=0.01)
 
 
-def test_points_of_rank_3_are_reduced_to_3_mixtures_and_no_fewer(basis):
+def test_rank_3_points_need_exactly_3_mixtures(basis):
     rng = np.random.default_rng(2)
     mix = np.zeros((3, 59))
     for row, columns in enumerate(([2, 20], [40], [50, 57])):
@@ -225,7 +223,7 @@ def test_points_of_rank_3_are_reduced_to_3_mixtures_and_no_fewer(basis):
     np.testing.assert_allclose(found @ rows, shares, atol=0.05 * shares.max())
 
 
-def test_four_mixtures_of_a_face_fit_nearly_as_well_as_all_materials(face, basis):
+def test_four_face_mixtures_fit_nearly_like_all_materials(face, basis):
     s = samples_of(face)
     full = brdf_basis.fit_weights(s, basis)
     _, mix, _ = brdf_basis.reduce(full, 4, basis=basis)
@@ -234,7 +232,7 @@ def test_four_mixtures_of_a_face_fit_nearly_as_well_as_all_materials(face, basis
     assert np.median(again.residual / full.residual) < 1.1
 
 
-def test_ranks_beyond_the_data_and_empty_weights_have_clear_outcomes():
+def test_excessive_ranks_and_empty_weights_have_clear_outcomes():
     with pytest.raises(ValueError, match="rank: got 5, expected a number in"):
         brdf_basis.reduce(np.ones((3, 59)), 5)
     found, mix, error = brdf_basis.reduce(np.zeros((10, 59)), 2)

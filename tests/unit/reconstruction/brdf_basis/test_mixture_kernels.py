@@ -12,7 +12,7 @@ def directions(rng, *shape):
     return (way / np.linalg.norm(way, axis=-1, keepdims=True)).astype(np.float32)
 
 
-def test_mixtures_are_the_plain_ones_also_below_the_horizon(rng):
+def test_mixtures_match_plain_ones_also_below_horizon(rng):
     basis = brdf_tables.default().mixed(np.eye(brdf_tables.default().size)[[3, 20, 40, 55]])
     weights = rng.random((30, 4))
     light, view = directions(rng, 30, 50), directions(rng, 30, 50)
@@ -31,7 +31,7 @@ def test_mixtures_are_the_plain_ones_also_below_the_horizon(rng):
     assert apart.mean() < 1e-3
 
 
-def test_mirror_and_normal_directions_have_a_place(rng):
+def test_mirror_and_normal_directions_are_in_table(rng):
     basis = brdf_tables.default().mixed(np.eye(brdf_tables.default().size)[[3]])
     up = np.array([[0.0, 0.0, 1.0]])
     light = np.array([[[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [1.0, 0.0, 0.0]]], np.float32)

@@ -45,7 +45,7 @@ def test_points_of_three_mixtures_need_three(three, basis, method):
     assert found.plateau(most=2) == 2
 
 
-def test_fit_for_the_brdfs_never_loses_by_more_mixtures_nor_to_that_of_shares(many, basis):
+def test_brdf_fit_improves_with_mixtures_and_beats_weights(many, basis):
     ranks = (1, 2, 4, 7, 12)
     shares = brdf_space.curve(many, basis, ranks=ranks, method="shares").error
     brdf = brdf_space.curve(many, basis, ranks=ranks, method="brdf").error
@@ -54,7 +54,7 @@ def test_fit_for_the_brdfs_never_loses_by_more_mixtures_nor_to_that_of_shares(ma
     assert brdf[1] < 0.98 * shares[1]
 
 
-def test_the_error_is_that_of_scipys_non_negative_least_squares(many, basis):
+def test_error_matches_scipy_non_negative_least_squares(many, basis):
     found = brdf_space.curve(many[:60], basis, ranks=(4,), held_out=many[60:])
     values, vectors = np.linalg.eigh(brdf_space.metric(basis))
     root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
@@ -77,13 +77,13 @@ def test_a_refinement_only_lowers_the_error(many, basis, rng):
     assert errors[-1] < 0.8 * errors[0]
 
 
-def test_normalized_curves_begin_at_one(three, basis):
+def test_normalized_curves_begin_at_unity(three, basis):
     found = brdf_space.curve(three, basis, ranks=(1, 2, 3))
     np.testing.assert_allclose(found.normalized(), found.error / found.error[0])
     assert np.isnan(found.held_out).all()
 
 
-def test_ranks_that_the_points_cannot_hold_are_named_and_left_out(three, basis):
+def test_ranks_unsupported_by_points_are_reported_and_omitted(three, basis):
     found = brdf_space.curve(three[:4], basis, ranks=(1, 3, 5, 9))
     assert found.ranks == (1, 3)
     assert [rank for rank, _ in found.left_out] == [5, 9]
@@ -92,7 +92,7 @@ def test_ranks_that_the_points_cannot_hold_are_named_and_left_out(three, basis):
         brdf_space.curve(three[:1], basis, ranks=(2,))
 
 
-def test_points_that_reflect_nothing_are_refused_and_empty_ones_among_others_are_not(three, basis):
+def test_all_dark_points_are_refused_but_some_accepted(three, basis):
     with pytest.raises(SpaceError, match="all 10 points are 0"):
         brdf_space.curve(np.zeros((10, 59)), basis)
     some = np.concatenate([three[:50], np.zeros((20, 59))])
@@ -111,7 +111,7 @@ def test_materials_that_are_there_twice_change_nothing(three, basis):
     np.testing.assert_allclose(two.error, one.error, atol=0.01)
 
 
-def test_the_same_point_over_and_over_needs_one_mixture(three, basis):
+def test_repeated_point_needs_single_mixture(three, basis):
     found = brdf_space.curve(np.tile(three[0], (30, 1)), basis, ranks=(1, 2, 4), method="brdf")
     assert found.error[0] < 1e-3
     assert np.isfinite(found.normalized()).all()
@@ -125,7 +125,7 @@ def test_unheld_narrow_lobes_are_not_used(three, basis):
     assert not brdf_space.usable(np.zeros((3, 59)), basis).any()
 
 
-def test_noise_is_told_by_two_fits(three, basis, rng):
+def test_noise_is_estimated_from_two_fits(three, basis, rng):
     """Independent relative noise s of both fits: they lie s apart, by root 2 over root 2."""
     assert brdf_space.repeatability(three, three, basis) == 0.0
     a, b = (three * (1.0 + 0.1 * rng.standard_normal((len(three), 1))) for _ in range(2))
@@ -135,7 +135,7 @@ def test_noise_is_told_by_two_fits(three, basis, rng):
         brdf_space.repeatability(three, three[:3], basis)
 
 
-def test_people_count_as_one_each_in_the_standard_error(three, many, basis):
+def test_people_count_once_each_in_standard_error(three, many, basis):
     """Copies of a person's points tell nothing new: the standard error of groups does not fall."""
     others = np.concatenate([many[:12], three[:12]])
     copies, whose = np.tile(others, (6, 1)), np.tile(np.arange(24), 6)
@@ -157,7 +157,7 @@ def test_people_count_as_one_each_in_the_standard_error(three, many, basis):
         ({"weights": -np.ones((5, 59))}, "weights: got"),
     ],
 )
-def test_what_makes_no_space_is_refused(change, match, three, basis):
+def test_invalid_brdf_space_input_is_refused(change, match, three, basis):
     given = {"weights": three, "ranks": (1, 2), **change}
     with pytest.raises(ValueError, match=match):
         brdf_space.curve(given.pop("weights"), basis, **given)

@@ -105,7 +105,7 @@ def test_a_mole_is_not_explained_away_by_shade(table, melanin, mole_melanin, exp
 
 
 @pytest.mark.parametrize("melanin", [0.015, 0.05])
-def test_lips_are_not_explained_away_as_usual_skin_with_less_blood(table, melanin, rng):
+def test_lips_are_not_fitted_as_low_blood_skin(table, melanin, rng):
     """4 % of a face has 0.55 times its melanin and 3.4 times its blood, in the same uneven light.
 
     Expected: the face by itself holds less than 40 % of them in one standard error, a mixture
@@ -146,7 +146,7 @@ def test_lips_are_not_explained_away_as_usual_skin_with_less_blood(table, melani
     assert lighter[~lips].mean() < 0.16
 
 
-def test_a_mixture_has_the_moments_of_draws_from_both(table, rng):
+def test_mixture_has_moments_of_samples_from_both(table, rng):
     rgb = 0.7 * table.lookup(np.full((1, 8), 0.05), np.full((1, 8), 0.02))
     first = estimate(rgb, table, prior=shading_prior.of_faces(), variance=np.square(0.01 * rgb))
     second = estimate(
@@ -163,7 +163,7 @@ def test_a_mixture_has_the_moments_of_draws_from_both(table, rng):
     np.testing.assert_allclose(found.stderr_melanin[0, 0], draws.std(), rtol=0.02)
 
 
-def test_slopes_of_light_and_noise_are_no_spots(rng):
+def test_light_slopes_and_noise_are_not_spots(rng):
     """One square holds a slope alike on both sides; 3 deviations leave 1 pixel in 700 by chance."""
     slope = np.exp(np.linspace(0, 1.2, 120))[None, :, None] * np.ones((120, 120, 3))
     assert not is_locally_dark(slope).any()
@@ -174,7 +174,7 @@ def test_slopes_of_light_and_noise_are_no_spots(rng):
 
 
 @pytest.mark.parametrize("size", [40, 400, 900])
-def test_blocks_find_what_every_pixel_by_itself_finds(size, rng):
+def test_block_detection_matches_per_pixel_detection(size, rng):
     """A mole of a face's hundredth is found in pictures of any size, and little else."""
     light = np.exp(0.3 * smooth(rng, (size, size), size / 5))[..., None] * np.ones(3)
     row, column = np.mgrid[:size, :size]
@@ -185,7 +185,7 @@ def test_blocks_find_what_every_pixel_by_itself_finds(size, rng):
     assert found[~mole].mean() < 0.01
 
 
-def test_what_is_no_skin_is_no_spot_and_takes_no_part():
+def test_non_skin_is_not_spot_and_is_ignored():
     light = np.ones((30, 30, 3))
     light[10, 10] = 0.5
     light[20, :5] = np.nan, -1.0, np.inf

@@ -46,7 +46,7 @@ def known_face(table, melanin, spread, blood, blood_spread):
     )
 
 
-def test_the_kernel_sums_what_plain_numpy_sums_under_a_face(table, prior, rng):
+def test_face_kernel_sum_matches_plain_numpy(table, prior, rng):
     """Narrow and wide faces, of the pixels' skin and of darker skin; two skins are possible.
 
     Against a grid twice as fine the plain sum errs by 0.002 of a width, and 2 % of the width.
@@ -120,7 +120,7 @@ def test_a_mole_in_good_light_keeps_its_melanin(table, prior, rng):
     assert inside.mean() > 0.85
 
 
-def test_light_that_all_pixels_have_in_common_makes_the_face_less_sure(table, prior, rng):
+def test_common_light_uncertainty_widens_face_error(table, prior, rng):
     """20 % more light on all of a dark face moves its mean by what its error then says."""
     _, _, _, rgb = face(table, prior, 0.15, 2000, rng)
     gain, common = 1.2, np.log(1.2)
@@ -136,7 +136,7 @@ def test_light_that_all_pixels_have_in_common_makes_the_face_less_sure(table, pr
     assert sure.melanin.stderr < 0.3 * unsure.melanin.stderr
 
 
-def test_an_error_of_color_in_common_makes_the_face_less_sure(table, prior, rng):
+def test_common_color_error_widens_face_error(table, prior, rng):
     _, _, _, rgb = face(table, prior, 0.01, 2000, rng)
     given = {"prior": prior, "common_light": 0.01, "variance": (NOISE * rgb) ** 2}
     plain = fit_face_distribution(rgb, table, **given)
@@ -148,7 +148,7 @@ def test_an_error_of_color_in_common_makes_the_face_less_sure(table, prior, rng)
     assert common.melanin.stderr > 2.0 * plain.melanin.stderr
 
 
-def test_a_few_pixels_are_no_face(table, prior, rng):
+def test_few_pixels_are_not_face(table, prior, rng):
     _, _, _, rgb = face(table, prior, 0.05, 150, rng)
     assert fit_face_distribution(rgb, table, prior=prior, common_light=0.1) is None
     assert (

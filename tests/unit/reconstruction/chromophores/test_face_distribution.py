@@ -33,7 +33,7 @@ def fitted(probability):
 
 
 @pytest.mark.parametrize("spread", [0.1, 0.3])
-def test_means_and_spreads_are_the_truth_within_their_errors_whatever_pixels_err_by(spread, rng):
+def test_means_and_deviations_are_recovered_under_pixel_errors(spread, rng):
     count = 3000
     errors, blood_errors = rng.choice([0.05, 0.2, 0.5], count), rng.choice([0.05, 0.15], count)
     truth, blood = rng.normal(-3.0, spread, count), rng.normal(0.42, 0.08, count)
@@ -51,7 +51,7 @@ def test_means_and_spreads_are_the_truth_within_their_errors_whatever_pixels_err
         assert bell.unexpected < 0.04
 
 
-def test_skin_that_does_not_belong_is_told_and_does_not_widen_the_rest(rng):
+def test_outlier_skin_is_identified_without_widening_the_rest(rng):
     count = 3000
     truth, blood = rng.normal(-3.5, 0.15, count), rng.normal(0.4, 0.06, count)
     truth[:300] = rng.uniform(*MELANIN_ENDS, 300).clip(MELANIN[0], MELANIN[-1])
@@ -64,7 +64,7 @@ def test_skin_that_does_not_belong_is_told_and_does_not_widen_the_rest(rng):
     assert 0.04 < found.blood.unexpected < 0.12
 
 
-def test_pixels_that_differ_by_their_errors_alone_have_the_least_spreads(rng):
+def test_pixels_differing_by_errors_alone_have_least_deviations(rng):
     count = 3000
     found = fitted(
         seen(
@@ -80,7 +80,7 @@ def test_pixels_that_differ_by_their_errors_alone_have_the_least_spreads(rng):
     assert found.melanin.unexpected == pytest.approx(MIN_CONTAMINATION, abs=0.005)
 
 
-def test_densities_over_any_value_have_the_mean_one_in_cells_wider_than_the_bell_too():
+def test_densities_average_to_unity_even_in_wide_cells():
     for mean in (-3.0, -0.75):
         bell = ContaminatedNormal(mean, 0.02, 0.05, *MELANIN_ENDS, stderr=0.01)
         edges = np.linspace(*MELANIN_ENDS, 101)
@@ -90,7 +90,7 @@ def test_densities_over_any_value_have_the_mean_one_in_cells_wider_than_the_bell
         assert bell.relative_density(fine).min() >= 0.05
 
 
-def test_common_errors_widen_by_their_root_sum_of_squares():
+def test_common_errors_widen_by_root_sum_of_squares():
     def face(melanin, blood):
         return FaceDistribution(
             ContaminatedNormal(melanin, 0.3, 0.01, *MELANIN_ENDS),
@@ -105,7 +105,7 @@ def test_common_errors_widen_by_their_root_sum_of_squares():
     assert known.melanin.width == pytest.approx(np.hypot(0.3, 0.5))
 
 
-def test_a_mean_at_the_end_is_known_as_badly_as_it_moves_away_from_it():
+def test_mean_at_range_end_has_inward_uncertainty():
     """A mean that moves by 0.08 to each side, as far as the end at -0.69 lets it."""
 
     def face(melanin):
@@ -132,7 +132,7 @@ def test_blood_that_ends_at_none_may_be_any(mean, told):
     assert known.melanin == skin.melanin
 
 
-def test_what_is_no_probability_or_no_bell_is_refused():
+def test_invalid_probability_or_bell_is_refused():
     with pytest.raises(ValueError, match="shape"):
         fitted(np.ones((3, 5, 2)))
     with pytest.raises(ValueError, match="probability: got"):
@@ -141,7 +141,7 @@ def test_what_is_no_probability_or_no_bell_is_refused():
         ContaminatedNormal(0.0, 0.0, 0.1, -1.0, 1.0)
 
 
-def test_the_plane_kernel_sums_what_plain_numpy_does(rng):
+def test_plane_kernel_sum_matches_plain_numpy(rng):
     pixels, rows, columns, summed = 7, 11, 12, 3
     log_rgb = rng.normal(-1.0, 0.1, (pixels, 3))
     plane = rng.normal(-1.0, 0.1, (rows, columns, 3))

@@ -38,7 +38,7 @@ def weights_of(variance_relative, free):
 
 @pytest.mark.parametrize("light", ["xenon flash", "D65", "A"])
 @pytest.mark.parametrize("shading", MODES)
-def test_the_round_trip_is_exact_wherever_skin_can_be_told(shading, light):
+def test_round_trip_is_exact_where_skin_is_determined(shading, light):
     table = color_table.build(CAMERA, light, anisotropy=ANISOTROPY_SKIN)
     c_m, c_hd = grid_of_skin(160)
     maps = invert(table.lookup(c_m, c_hd), table, shading=shading)
@@ -50,7 +50,7 @@ def test_the_round_trip_is_exact_wherever_skin_can_be_told(shading, light):
 
 
 @pytest.mark.parametrize("shading", MODES)
-def test_rounding_colors_to_single_precision_is_far_below_a_standard_error(shading, table, rng):
+def test_single_precision_color_rounding_is_below_standard_error(shading, table, rng):
     c_m, c_hd = grid_of_skin(60, lowest=0.004)
     colors = table.lookup(c_m, c_hd)
     half_a_step = 2.0**-24 * rng.choice([-1.0, 1.0], colors.shape)  # relative, of single precision
@@ -64,7 +64,7 @@ def test_rounding_colors_to_single_precision_is_far_below_a_standard_error(shadi
         assert (change / getattr(maps, f"stderr_{name}")[told]).max() < 1e-4
 
 
-def test_with_known_shading_every_color_of_the_table_finds_its_melanin(table):
+def test_known_shading_lets_every_color_find_melanin(table):
     c_m, c_hd = grid_of_skin(160)
     maps = invert(table.lookup(c_m, c_hd), table, shading="known")
     assert maps.valid.all()
@@ -73,7 +73,7 @@ def test_with_known_shading_every_color_of_the_table_finds_its_melanin(table):
 
 
 @pytest.mark.parametrize("shading", MODES)
-def test_the_kernel_finds_the_minimum_that_plain_numpy_finds(shading, table, rng):
+def test_kernel_finds_same_minimum_as_plain_numpy(shading, table, rng):
     c_m, c_hd = grid_of_skin(24, lowest=0.004)
     color = table.lookup(c_m, c_hd).reshape(-1, 3)
     noisy = (color * (1.0 + 0.01 * rng.standard_normal(color.shape))).astype(np.float32)
@@ -95,7 +95,7 @@ def test_the_kernel_finds_the_minimum_that_plain_numpy_finds(shading, table, rng
 
 
 @pytest.mark.parametrize("shading", MODES)
-def test_noise_never_leads_to_a_wrong_minimum_that_is_believed(shading, table, rng):
+def test_noise_never_yields_a_trusted_wrong_minimum(shading, table, rng):
     # The true chromophores are one candidate: a minimum that leaves more than they do is wrong.
     c_m, c_hd = (x[..., None] for x in grid_of_skin(20, lowest=0.004))
     color = table.lookup(c_m, c_hd)
@@ -116,7 +116,7 @@ def test_noise_never_leads_to_a_wrong_minimum_that_is_believed(shading, table, r
 
 
 @pytest.mark.parametrize("shading", MODES)
-def test_the_scatter_is_what_cramer_and_rao_allow(shading, table, rng):
+def test_scatter_matches_cramer_rao_bound(shading, table, rng):
     # 4000 draws a point: a ratio of root mean squares has a standard error of 1.1 %; the limit of
     # 1.2 leaves room for the curvature of the model at these errors.
     draws, noise = 4000, 0.004
@@ -160,7 +160,7 @@ def test_a_free_shading_takes_up_any_factor(table, factor, c_m, c_hd):
     np.testing.assert_allclose(scaled.shading, factor * plain.shading, rtol=2e-3)
 
 
-def test_a_known_shading_is_divided_out_with_its_noise(table, rng):
+def test_known_shading_is_divided_out_with_noise(table, rng):
     c_m, c_hd = grid_of_skin(6, lowest=0.005)
     factor = rng.uniform(0.2, 1.0, c_m.shape)
     color = table.lookup(c_m, c_hd)
@@ -171,7 +171,7 @@ def test_a_known_shading_is_divided_out_with_its_noise(table, rng):
     np.testing.assert_allclose(shaded.shading, factor, rtol=1e-6)
 
 
-def test_a_shading_known_to_little_is_a_free_one(table):
+def test_vaguely_known_shading_equals_free_shading(table):
     color = table.lookup([0.02, 0.04], [0.05, 0.1])
     free = invert(color, table)
     vague = invert(color, table, shading="known", model_error=np.full((3, 3), 100.0))
@@ -189,7 +189,7 @@ def test_a_model_error_widens_the_errors_like_noise(table):
     assert invert(color, table, variance=[0.0] * 3).stderr_melanin < 1e-3 * model.stderr_melanin
 
 
-def test_a_model_error_of_the_color_alone_gives_the_errors_it_implies(table):
+def test_color_only_model_error_gives_its_implied_errors(table):
     # One direction of log color, without brightness: singular in the two others.
     direction = np.array([0.8, -0.25, -0.55])
     covariance = 1e-5 * np.outer(direction, direction) + 1e-9 * (3.0 * np.eye(3) - 1.0)
@@ -205,7 +205,7 @@ def test_a_model_error_of_the_color_alone_gives_the_errors_it_implies(table):
 
 
 @pytest.mark.parametrize("shading", MODES)
-def test_unusable_pixels_are_masked_and_their_neighbours_are_not(shading, table):
+def test_unusable_pixels_are_masked_without_affecting_neighbors(shading, table):
     good = table.lookup(0.03, 0.05)
     bad = [[np.nan, 0.2, 0.1], [0.0, 0.2, 0.1], [0.3, -0.01, 0.1], [np.inf, 0.2, 0.1], good]
     rgb = np.array([good, *bad])
@@ -229,7 +229,7 @@ def test_a_bad_variance_or_shading_masks_its_pixel(table):
 
 
 @pytest.mark.parametrize("shading", MODES)
-def test_a_color_that_skin_cannot_have_is_flagged_with_its_distance(shading, table):
+def test_impossible_skin_color_is_flagged_with_distance(shading, table):
     blue = np.array([[0.05, 0.1, 0.4]])
     maps = invert(blue, table, shading=shading)
     assert maps.outside.all()
@@ -238,14 +238,14 @@ def test_a_color_that_skin_cannot_have_is_flagged_with_its_distance(shading, tab
     assert np.isfinite(maps.melanin).all()
 
 
-def test_the_gamut_distance_is_the_relative_distance_to_the_nearest_color(table):
+def test_gamut_distance_is_relative_to_nearest_color(table):
     paler = 1.05 * table.lookup(0.0, 0.0)  # paler than the palest skin
     maps = invert(paler[None], table, shading="known")
     assert maps.gamut_distance[0] == pytest.approx(0.05, rel=0.1)
     assert maps.outside.all()
 
 
-def test_dark_skin_of_free_shading_is_called_ambiguous_and_light_skin_is_not(table):
+def test_dark_free_shading_skin_is_ambiguous_light_not(table):
     light = invert(table.lookup([0.01, 0.02], [0.03, 0.06]), table)
     dark = invert(table.lookup([0.25, 0.4], [0.03, 0.06]), table)
     assert not light.ambiguous.any()
@@ -253,7 +253,7 @@ def test_dark_skin_of_free_shading_is_called_ambiguous_and_light_skin_is_not(tab
     assert not dark.identifiable.any()
 
 
-def test_knowing_the_brightest_shading_rules_the_darker_solution_out(table):
+def test_shading_maximum_excludes_darker_solution(table):
     color = table.lookup([0.0622], [0.005])
     assert invert(color, table).ambiguous.all()
     assert not invert(color, table, shading_max=1.2).ambiguous.any()
@@ -266,7 +266,7 @@ def test_no_confident_number_for_blood_under_heavy_melanin(table):
 
 
 @pytest.mark.parametrize("shading", MODES)
-def test_the_bounds_are_the_standard_errors_of_the_fit(shading, table):
+def test_bounds_are_standard_errors_of_fit(shading, table):
     bounds = identifiability(table, shading=shading, size=24)
     c_m, c_hd = np.broadcast_arrays(bounds.c_m[:, None], bounds.c_hd[None, :])
     inner = (slice(4, -1), slice(4, -1))
@@ -291,7 +291,7 @@ def test_bounds_follow_the_noise_model(table):
 
 
 @pytest.mark.parametrize("shape", [(), (5,), (2, 3), (2, 3, 4)])
-def test_any_leading_shape_gives_the_same_as_a_list_of_pixels(shape, table, rng):
+def test_leading_shape_gives_same_result_as_pixel_list(shape, table, rng):
     c_m = rng.uniform(0.01, 0.04, shape)
     rgb = table.lookup(c_m, 0.05)
     kept = rgb.copy()
@@ -301,7 +301,7 @@ def test_any_leading_shape_gives_the_same_as_a_list_of_pixels(shape, table, rng)
     np.testing.assert_array_equal(rgb, kept)
 
 
-def test_an_empty_picture_gives_empty_maps(table):
+def test_empty_image_gives_empty_maps(table):
     assert invert(np.empty((0, 3)), table).melanin.shape == (0,)
 
 
@@ -319,12 +319,12 @@ def test_an_empty_picture_gives_empty_maps(table):
         ({"shading_max": 0.0}, "shading_max"),
     ],
 )
-def test_arguments_that_do_not_fit_are_refused_by_name(arguments, message, table):
+def test_mismatched_arguments_are_refused_by_name(arguments, message, table):
     with pytest.raises(ChromophoreError, match=message):
         invert(**({"rgb": np.full((4, 3), 0.2), "table": table} | arguments))
 
 
-def test_the_default_noise_is_one_percent(table):
+def test_default_noise_is_one_percent(table):
     color = table.lookup([0.02], [0.05])
     stated = invert(color, table, variance=(chromophores.DEFAULT_RELATIVE_NOISE * color) ** 2)
     np.testing.assert_allclose(
@@ -332,7 +332,7 @@ def test_the_default_noise_is_one_percent(table):
     )
 
 
-def test_the_shading_of_one_map_serves_a_stack_of_them(table, rng):
+def test_single_shading_map_serves_map_stack(table, rng):
     known = rng.uniform(0.5, 1.0, (3, 4)).astype(np.float32)
     rgb = table.lookup(rng.uniform(0.01, 0.1, (2, 3, 4)), 0.05) * known[..., None]
     found = invert(rgb, table, shading=known)

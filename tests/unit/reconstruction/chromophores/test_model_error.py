@@ -29,15 +29,13 @@ def everywhere():
     return np.ones((SIZE, SIZE), bool)
 
 
-def test_shading_that_a_cubic_follows_over_five_pixels_is_no_fine_structure(table):
+def test_cubic_shading_over_five_pixels_is_not_structure(table):
     rows, columns = np.indices((SIZE, SIZE)) / SIZE
     rgb = picture(table, shading=np.exp(-2.0 * rows**2 + columns**3))
     assert model_error.fine_structure(rgb, 0.0 * rgb, everywhere()).max() < 1e-20
 
 
-def test_texture_of_a_pixel_is_fine_structure_and_the_same_texture_over_ten_is_hardly_any(
-    table, rng
-):
+def test_fine_structure_detects_pixel_texture_but_barely_coarse(table, rng):
     fine = picture(table, shading=np.exp(0.02 * rng.standard_normal((SIZE, SIZE))))
     rows, columns = np.indices((SIZE, SIZE))
     wave = np.sin(2 * np.pi * rows / 20) * np.sin(2 * np.pi * columns / 20)
@@ -51,7 +49,7 @@ def test_texture_of_a_pixel_is_fine_structure_and_the_same_texture_over_ten_is_h
     assert found[1] < 0.01 * found[0]
 
 
-def test_noise_of_the_stated_variance_is_no_fine_structure(table, rng):
+def test_noise_of_stated_variance_is_not_fine_structure(table, rng):
     """The mean over the picture is 0 within 4 standard errors, and is not if noise is denied."""
     rgb = picture(table)
     noisy = rgb * (1.0 + 0.01 * rng.standard_normal(rgb.shape))
@@ -66,7 +64,7 @@ def test_noise_of_the_stated_variance_is_no_fine_structure(table, rng):
     assert np.median(left) < 0.2 * 70 / 36 * 0.01**2
 
 
-def test_pixels_that_are_not_skin_count_for_nothing_and_keep_the_transport_term(table, rng):
+def test_non_skin_pixels_keep_only_transport_term(table, rng):
     rgb = picture(table, shading=np.exp(0.02 * rng.standard_normal((SIZE, SIZE))))
     valid = everywhere()
     valid[:, 20:] = False
@@ -82,7 +80,7 @@ def test_pixels_that_are_not_skin_count_for_nothing_and_keep_the_transport_term(
     assert np.median(found[:, :20, 0, 0]) > 1.5 * model_error.color_errors().transport[0, 0]
 
 
-def test_light_from_other_skin_matters_more_on_light_skin_than_on_dark(table):
+def test_interreflection_error_is_larger_on_light_skin(table):
     transport = model_error.color_errors().transport
     spreads = []
     for melanin in (0.006, 0.05, 0.4):
@@ -103,7 +101,7 @@ def test_the_error_of_colors_has_no_brightness(table, rng):
     assert np.linalg.eigvalsh(found).min() > -1e-9 * size.max()
 
 
-def test_each_pixel_is_weighed_by_its_own_error(table):
+def test_pixels_are_weighted_by_own_error(table):
     rgb = np.repeat(table.lookup([[0.01]], [[0.03]]), 2, axis=1)
     prior, variance = lognormal(0.7, 0.6), (1e-3 * rgb) ** 2
     errors = np.stack([model_error.load(), 9.0 * model_error.load()])[None]
@@ -117,9 +115,7 @@ def test_each_pixel_is_weighed_by_its_own_error(table):
     assert found.stderr_melanin[0, 1] > 1.5 * found.stderr_melanin[0, 0]
 
 
-def test_errors_drawn_by_each_pixels_covariance_are_covered_and_twice_as_large_ones_are_not(
-    table, rng
-):
+def test_pixel_covariance_errors_are_covered_doubled_ones_not(table, rng):
     """68 % of 2304 pixels within 4 sigma of a share, and 5 points for the bend of the table."""
     texture = np.where(np.arange(SIZE) < SIZE // 2, 0.005, 0.03)[None, :]
     rgb = picture(table, shading=np.exp(texture * rng.standard_normal((SIZE, SIZE))))
@@ -150,14 +146,14 @@ def test_errors_drawn_by_each_pixels_covariance_are_covered_and_twice_as_large_o
 @pytest.mark.parametrize(
     "errors", [np.zeros((3, 3, 3)), np.full((4, 3, 3), np.nan), -np.ones((4, 3, 3))]
 )
-def test_covariances_that_do_not_fit_the_pixels_are_refused(table, errors):
+def test_mismatched_pixel_covariances_are_refused(table, errors):
     rgb = np.repeat(table.lookup([0.01], [0.03]), 4, axis=0)
     with pytest.raises(ChromophoreError, match="model_error"):
         estimate(rgb, table, prior=lognormal(0.7, 0.6), variance=1e-6, model_error=errors)
 
 
 @pytest.mark.parametrize("pixels", [1, SIZE, 7 * SIZE])
-def test_a_picture_in_bands_is_the_whole_picture_to_the_last_bit(table, rng, monkeypatch, pixels):
+def test_banded_image_matches_whole_image_bit_exact(table, rng, monkeypatch, pixels):
     rgb = picture(table, shading=np.exp(0.05 * rng.standard_normal((SIZE, SIZE))))
     valid = rng.random((SIZE, SIZE)) < 0.95
     valid[:12, :12] = False
@@ -168,7 +164,7 @@ def test_a_picture_in_bands_is_the_whole_picture_to_the_last_bit(table, rng, mon
     assert np.ptp(whole[..., 0, 0]) > 0
 
 
-def test_the_error_of_a_picture_takes_little_memory_beside_itself(table, rng):
+def test_image_error_uses_little_memory_beyond_itself(table, rng):
     rgb = np.tile(picture(table), (12, 12, 1)).astype(np.float32)
     tracemalloc.start()
     found = model_error.of_picture(rgb, (0.01 * rgb) ** 2, np.ones(rgb.shape[:2], bool))

@@ -7,7 +7,7 @@ SHAPE = (80, 80)
 WHOLE = np.ones(SHAPE, bool)
 
 
-def test_pixels_are_not_chosen_for_the_noise_in_them(rng):
+def test_pixel_detection_is_not_selected_by_noise(rng):
     """An estimate clamped at 0, of a quantity far below its noise, is dropped whole."""
     noisy = np.maximum(rng.normal(0.01, 0.05, SHAPE), 0.0)
     stderr = np.full(SHAPE, 0.05)
@@ -17,7 +17,7 @@ def test_pixels_are_not_chosen_for_the_noise_in_them(rng):
     assert noisy[alone].mean() > 5 * 0.01
 
 
-def test_what_stands_out_is_kept_with_its_low_pixels(rng):
+def test_detectable_region_keeps_its_low_pixels(rng):
     estimate = rng.normal(0.1, 0.03, SHAPE)
     kept = detectable(estimate, np.full(SHAPE, 0.03), WHOLE)
     assert kept.all()

@@ -37,7 +37,7 @@ def seen(table, c_m, c_hd, shading, rng, noise=NOISE):
     return clean * (1.0 + noise * rng.standard_normal(clean.shape))
 
 
-def test_the_kernel_sums_what_plain_numpy_sums_over_a_dense_plane(table, prior, rng):
+def test_kernel_sum_matches_plain_numpy_over_dense_plane(table, prior, rng):
     c_m, c_hd, shading = skin(rng, 10, prior)
     # down to skin whose blood nobody can see, and up to where melanin has two solutions
     c_m[:4], c_hd[:4], shading[:4] = [0.06, 0.09, 0.15, 0.45], [0.01, 0.1, 0.02, 0.06], 1.0
@@ -58,7 +58,7 @@ def test_the_kernel_sums_what_plain_numpy_sums_over_a_dense_plane(table, prior, 
         np.testing.assert_allclose(reach, slow[:, k, 1], rtol=0.1)
 
 
-def test_intervals_cover_68_percent_of_skin_that_is_as_expected_beforehand(table, prior, rng):
+def test_intervals_cover_68_percent_of_prior_skin(table, prior, rng):
     # 12000 independent pixels: binomial standard error 0.0043; 4 of them are 0.017, the rest is for
     # bins and for blood that is drawn from a narrower range than the prior has.
     c_m, c_hd, shading = skin(rng, 12_000, prior)
@@ -78,7 +78,7 @@ def test_intervals_cover_68_percent_of_skin_that_is_as_expected_beforehand(table
     assert halved.mean() < 0.5
 
 
-def test_light_skin_gets_the_estimate_and_the_error_of_the_fit(table, prior, rng):
+def test_light_skin_gets_fit_estimate_and_error(table, prior, rng):
     c_m, c_hd = np.array([0.005, 0.01, 0.02, 0.03]), np.full(4, 0.05)
     rgb = 0.8 * table.lookup(c_m, c_hd)
     noise = (0.002 * rgb) ** 2
@@ -93,7 +93,7 @@ def test_light_skin_gets_the_estimate_and_the_error_of_the_fit(table, prior, rng
     np.testing.assert_allclose(found.shading, 0.8, rtol=0.01)
 
 
-def test_without_noise_the_estimate_is_the_true_skin_to_a_percent(table, prior):
+def test_noise_free_estimate_is_true_within_percent(table, prior):
     c_m, c_hd = np.array([0.01, 0.02, 0.03]), np.array([0.03, 0.05, 0.08])
     rgb = 0.6 * table.lookup(c_m, c_hd)
     found = estimate(rgb, table, prior=prior, variance=(1e-5 * rgb) ** 2)
@@ -102,7 +102,7 @@ def test_without_noise_the_estimate_is_the_true_skin_to_a_percent(table, prior):
     assert (found.stderr_melanin < 5e-3 * c_m).all()
 
 
-def test_brightness_tells_dark_skin_from_light_skin_in_less_light(table):
+def test_brightness_separates_dark_skin_from_dimmer_light_skin(table):
     c_m, c_hd = np.array([0.2, 0.35]), np.array([0.05, 0.05])
     rgb = table.lookup(c_m, c_hd)
     noise = (0.004 * rgb) ** 2
@@ -112,7 +112,7 @@ def test_brightness_tells_dark_skin_from_light_skin_in_less_light(table):
     assert (free.melanin < 0.6 * c_m).all()  # what a fit without any knowledge of the light says
 
 
-def test_where_two_solutions_are_possible_the_error_is_of_both_and_holds_the_truth(table):
+def test_two_solutions_give_error_covering_both_and_truth(table):
     truth = 0.12
     rgb = table.lookup([truth], [0.02])
     noise = (0.002 * rgb) ** 2
@@ -140,7 +140,7 @@ def test_a_model_error_widens_the_interval(table, prior):
     assert 1.8 < both.stderr_melanin[0] / alone.stderr_melanin[0] < 2.8  # sqrt(1 + 2^2) = 2.2
 
 
-def test_unusable_pixels_are_masked_and_their_neighbours_are_not(table, prior):
+def test_unusable_pixels_are_masked_without_affecting_neighbors(table, prior):
     good = table.lookup(0.03, 0.05)
     rgb = np.array([[good, [np.nan, 0.2, 0.1], [0.3, -0.01, 0.1]], [good, good, [0.05, 0.1, 0.4]]])
     found = estimate(
@@ -156,7 +156,7 @@ def test_unusable_pixels_are_masked_and_their_neighbours_are_not(table, prior):
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
-def test_light_far_from_what_is_expected_leaves_finite_numbers(scale, table, prior):
+def test_unexpected_light_levels_leave_finite_numbers(scale, table, prior):
     c_m, c_hd = np.array([6e-5, 0.02, 0.45]), np.array([4e-5, 0.05, 0.3])
     rgb = scale * table.lookup(c_m, c_hd)
     found = estimate(rgb, table, prior=prior, variance=(0.01 * rgb) ** 2)
@@ -165,7 +165,7 @@ def test_light_far_from_what_is_expected_leaves_finite_numbers(scale, table, pri
         assert (values > 0).all()
 
 
-def test_what_is_no_skin_by_its_own_errors_is_masked_among_pixels_of_large_errors(prior):
+def test_non_skin_by_own_errors_is_masked(prior):
     """White cloth in a photograph whose background is rough: the usual error passes anything."""
     table = color_table.build("linear sRGB", "D65", anisotropy=ANISOTROPY_SKIN)
     light = np.exp(np.linspace(np.log(0.05), np.log(2.0), 9))[:, None, None]

@@ -10,7 +10,7 @@ from reconstruction.chromophores.shading_prior import (
 )
 
 
-def test_the_prior_of_faces_has_the_mean_and_width_of_its_data():
+def test_face_prior_has_mean_and_width_of_data():
     found = model_error.shading_histogram()
     places = found.low + found.step * (np.arange(len(found.counts)) + 0.5)
     counts = np.array(found.counts, float)
@@ -24,7 +24,7 @@ def test_the_prior_of_faces_has_the_mean_and_width_of_its_data():
     )
 
 
-def test_hardly_any_skin_gets_more_light_than_the_tile_and_much_gets_less():
+def test_skin_rarely_exceeds_white_reference_light_often_less():
     prior = shading_prior.of_faces()
     more = prior.density[prior.nodes > np.log(1.3)].sum() * prior.step
     less = prior.density[prior.nodes < np.log(0.7)].sum() * prior.step
@@ -51,6 +51,6 @@ def test_an_unknown_exposure_adds_its_spread():
         (lambda: from_samples(-9.0, 0.1, [1, 1]), "bins"),
     ],
 )
-def test_what_is_no_distribution_is_refused(make, message):
+def test_invalid_distribution_is_refused(make, message):
     with pytest.raises(ShadingPriorError, match=message):
         make()

@@ -55,7 +55,7 @@ def best_correlations(sources, rgb):
 
 
 @pytest.mark.parametrize("contrast", [1.0, 0.25])
-def test_each_map_follows_its_own_pigment_as_well_as_a_linear_unmixing_can(rng, contrast):
+def test_maps_follow_own_pigment_as_linear_unmixing_can(rng, contrast):
     """Correlation with the logarithm of the pigment, against what the scene allows.
 
     Expected: the correlation r that inverting the scene's own linear mixing gives (here 0.93 and

@@ -43,7 +43,7 @@ def frame(faces):
     return common.frame_around(names, places, unrolled, size=SIZE)
 
 
-def test_the_same_point_of_every_face_comes_to_the_same_place(faces, frame):
+def test_same_point_of_faces_maps_to_same_position(faces, frame):
     places = []
     for face in faces:
         found = common.correspond(marks(face), frame, stderr_mm=0.05)
@@ -56,7 +56,7 @@ def test_the_same_point_of_every_face_comes_to_the_same_place(faces, frame):
     assert np.median(unrolled) > 1.0  # without landmarks they do not
 
 
-def test_errors_grow_with_the_landmarks_noise_and_hold_what_it_does(faces, frame):
+def test_errors_grow_with_landmark_noise_and_cover_effect(faces, frame):
     rng = np.random.default_rng(4)
     face = faces[0]
     at = face[30:66:6, 30:66:6].reshape(-1, 3)
@@ -77,7 +77,7 @@ def test_errors_grow_with_the_landmarks_noise_and_hold_what_it_does(faces, frame
     assert small.mean() < 0.5 * np.mean(told)
 
 
-def test_a_texture_goes_to_the_common_map_and_back(faces, frame):
+def test_texture_round_trips_through_common_map(faces, frame):
     face = faces[1]
     texture = np.stack([np.sin(face[..., 0] / 15), face[..., 1] / 90, face[..., 2] / 90], axis=-1)
     valid = np.ones(texture.shape[:2], bool)
@@ -91,7 +91,7 @@ def test_a_texture_goes_to_the_common_map_and_back(faces, frame):
     assert np.sqrt(np.mean((back - texture)[use] ** 2)) < 0.02
 
 
-def test_what_lies_in_the_shadow_of_an_ear_does_not_mix_with_it(frame, faces):
+def test_ear_shadowed_texels_do_not_mix_with_ear(frame, faces):
     front = faces[0]
     behind = front * [0.7, 1.0, 1.0] - [0.0, 0.0, 25.0]
     position = np.concatenate([front, behind])
@@ -134,7 +134,7 @@ def test_a_frame_comes_back_from_its_document(frame):
         )
 
 
-def test_the_beard_lies_about_the_mouth_and_not_on_the_lips():
+def test_beard_region_surrounds_mouth_but_excludes_lips():
     frame = common_regions.standard_frame(side_mm=240.0, center_mm=(0.0, 0.0), size=120)
     beard = common_regions.region("beard", frame)
     rest = common_regions.region("no-beard", frame)
@@ -156,7 +156,7 @@ def test_the_beard_lies_about_the_mouth_and_not_on_the_lips():
         common_regions.region("ears", frame)
 
 
-def test_a_face_without_landmarks_is_unrolled_from_its_foremost_texels():
+def test_face_without_landmarks_is_unwrapped_from_foremost_texels():
     position = surface()
     valid = np.ones(position.shape[:2], np.bool_)
     found = common.find_cylinder(position + np.array([3.0, -4.0, 5.0]), valid)

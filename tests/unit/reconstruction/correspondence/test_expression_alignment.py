@@ -45,7 +45,7 @@ def alignment_of(source, valid=None, error=0.0, moving_shape=None):
     )
 
 
-def test_a_picture_moved_to_the_right_is_found_to_the_right(rng):
+def test_image_shifted_right_is_found_shifted_right(rng):
     picture = skin(rng)
     found = alignment.align(
         np.roll(picture, (2, 5), (0, 1)),
@@ -60,7 +60,7 @@ def test_a_picture_moved_to_the_right_is_found_to_the_right(rng):
     assert found.by == "landmarks"
 
 
-def test_landmarks_a_few_pixels_off_are_corrected_by_the_flow(rng):
+def test_landmarks_few_pixels_off_are_corrected_by_flow(rng):
     picture = skin(rng)
     off = {name: (x + 2.0, y - 1.5) for name, (x, y) in marks((4.0, 0.0)).items()}
     found = alignment.align(
@@ -86,7 +86,7 @@ def test_light_that_changes_over_the_face_moves_nothing(rng):
     assert np.percentile(gap, 95) < 0.15
 
 
-def test_without_landmarks_features_are_matched_and_the_result_says_so(rng):
+def test_missing_landmarks_use_feature_matches_and_report_this(rng):
     picture = skin(rng, 160)
     found = alignment.align(np.roll(picture, (3, 6), (0, 1)), picture)
     assert found.by == "features"
@@ -94,12 +94,12 @@ def test_without_landmarks_features_are_matched_and_the_result_says_so(rng):
     assert np.percentile(np.linalg.norm(gap, axis=-1), 95) < 0.1
 
 
-def test_pictures_of_different_skin_have_no_features_in_common(rng):
+def test_images_of_different_skin_have_no_common_features(rng):
     with pytest.raises(alignment.AlignmentError, match="give landmarks"):
         alignment.align(skin(rng), skin(rng))
 
 
-def test_where_landmarks_cross_over_the_map_folds_and_is_invalid(rng):
+def test_crossing_landmarks_fold_the_map_and_invalidate(rng):
     picture = np.ones((SIDE, SIDE)) + 1e-6 * rng.standard_normal((SIDE, SIDE))
     neutral = marks()
     crossed = dict(neutral)
@@ -126,7 +126,7 @@ def test_where_landmarks_cross_over_the_map_folds_and_is_invalid(rng):
     assert straight.folded_fraction == 0.0
 
 
-def test_skin_hidden_in_the_moving_picture_is_invalid(rng):
+def test_skin_hidden_in_moving_image_is_invalid(rng):
     picture = skin(rng)
     hidden = np.ones((SIDE, SIDE), bool)
     hidden[40:60, 40:60] = False
@@ -137,7 +137,7 @@ def test_skin_hidden_in_the_moving_picture_is_invalid(rng):
     assert found.valid[15:35, 15:80].all()
 
 
-def test_places_beyond_the_moving_picture_are_invalid(rng):
+def test_positions_beyond_moving_image_are_invalid(rng):
     picture = skin(rng)
     found = alignment.align(
         picture[:, :70],
@@ -149,7 +149,7 @@ def test_places_beyond_the_moving_picture_are_invalid(rng):
     assert found.valid[12:-12, 12:58].all()
 
 
-def test_a_map_is_warped_from_where_it_was_and_its_mask_with_it():
+def test_map_is_warped_from_source_with_its_mask():
     values = np.arange(30, dtype=np.float32).reshape(5, 6)
     valid = np.ones((5, 6), bool)
     valid[2, 4] = False
@@ -162,7 +162,7 @@ def test_a_map_is_warped_from_where_it_was_and_its_mask_with_it():
     assert not moved[~seen].any()
 
 
-def test_a_pixel_between_a_valid_and_a_masked_one_is_masked():
+def test_pixel_between_valid_and_masked_is_masked():
     valid = np.ones((8, 8), bool)
     valid[4, 4] = False
     source = identity((8, 8)) + np.array([0.5, 0.0], np.float32)
@@ -172,7 +172,7 @@ def test_a_pixel_between_a_valid_and_a_masked_one_is_masked():
     assert seen[4, 2]
 
 
-def test_small_contrast_survives_a_shift_by_half_a_pixel_better_than_by_averaging(rng):
+def test_half_pixel_shift_preserves_contrast_better_than_averaging(rng):
     texture = cv2.GaussianBlur(rng.standard_normal((64, 64)), (0, 0), 1.2)
     source = identity((64, 64)) + np.float32(0.5)
     warped, _ = alignment_of(source).warp(texture)
@@ -195,7 +195,7 @@ def test_color_maps_and_single_maps_are_warped_alike(rng):
         np.testing.assert_array_equal(seen, seen_alone)
 
 
-def test_the_error_of_a_warped_map_grows_with_its_slope_times_that_of_the_place():
+def test_warped_map_error_grows_with_slope_and_misplacement():
     ramp = np.broadcast_to(0.5 * np.arange(40.0), (40, 40))
     noise = np.full((40, 40), 0.3)
     still = alignment_of(identity((40, 40))).warp_stderr(ramp, noise)
@@ -206,7 +206,7 @@ def test_the_error_of_a_warped_map_grows_with_its_slope_times_that_of_the_place(
     np.testing.assert_allclose(moved[inner], np.hypot(0.3, 0.5 * np.sqrt(2.0)), rtol=1e-3)
 
 
-def test_the_error_of_the_place_alone_is_that_of_the_slope_on_the_neutral_picture():
+def test_position_error_is_that_of_neutral_image_slope():
     ramp = np.broadcast_to(0.5 * np.arange(40.0), (40, 40))
     found = alignment_of(identity((40, 40)), error=2.0)
     stderr = place_stderr(found, ramp)
@@ -221,7 +221,7 @@ def test_the_error_of_the_place_alone_is_that_of_the_slope_on_the_neutral_pictur
     np.testing.assert_allclose(whole**2, 0.09 + stderr[10:-10, 10:-10] ** 2, rtol=1e-3)
 
 
-def test_a_skin_map_keeps_its_unit_and_gets_its_mask():
+def test_skin_map_keeps_unit_and_gets_mask():
     mapped = SkinMap(np.ones((8, 8)), "mm", np.full((8, 8), 0.1), np.eye(8) < 1)
     warped = alignment_of(identity((8, 8))).warp_map(mapped)
     assert warped.unit == "mm"
@@ -256,7 +256,7 @@ def test_arguments_that_do_not_fit_are_named(rng):
         alignment_of(identity()).warp(np.ones((3, 3)))
 
 
-def test_landmarks_on_one_line_or_not_finite_are_refused():
+def test_collinear_or_nonfinite_landmarks_are_refused():
     line = np.stack([np.arange(6.0), 2 * np.arange(6.0)], axis=1)
     with pytest.raises(landmark_field.LandmarkFieldError, match="on one line"):
         landmark_field.fit(line, line, stderr_px=1.0)
@@ -269,7 +269,7 @@ def test_landmarks_on_one_line_or_not_finite_are_refused():
         landmark_field.fit(square, square, stderr_px=0.0)
 
 
-def test_an_affine_motion_is_told_exactly_and_smoothed_to_it_under_noise(rng):
+def test_affine_motion_is_exact_and_smoothed_under_noise(rng):
     points = rng.uniform(0, 200, (30, 2))
     turn = np.array([[1.02, 0.05], [-0.04, 0.97]])
     noisy = points @ turn + 3.0 + rng.normal(0.0, 1.0, points.shape)
@@ -283,7 +283,7 @@ def test_an_affine_motion_is_told_exactly_and_smoothed_to_it_under_noise(rng):
     assert np.sqrt(((gap / error[:, None]) ** 2).mean()) < 2.0
 
 
-def test_a_misplaced_landmark_is_told_by_the_others(rng):
+def test_misplaced_landmark_is_identified_by_others(rng):
     points = rng.uniform(0, 200, (25, 2))
     moved = points + 4.0
     moved[7] += [15.0, 0.0]
@@ -291,7 +291,7 @@ def test_a_misplaced_landmark_is_told_by_the_others(rng):
     assert int(np.argmax(found.leave_one_out_px)) == 7
 
 
-def test_the_field_on_the_grid_is_the_field_at_the_points(rng):
+def test_grid_field_equals_field_at_points(rng):
     points = rng.uniform(0, 60, (12, 2))
     field = landmark_field.fit(points, points + rng.normal(0, 3, points.shape), stderr_px=0.5)
     moved, error = field.on_grid((61, 57))
@@ -300,7 +300,7 @@ def test_the_field_on_the_grid_is_the_field_at_the_points(rng):
     np.testing.assert_allclose(error[33, 20], stderr[0], rtol=0.1)
 
 
-def test_a_table_of_landmarks_is_read_and_its_faults_are_named_by_line_and_column(tmp_path):
+def test_landmark_table_faults_name_line_and_column(tmp_path):
     path = tmp_path / "landmarks.csv"
     path.write_text('# somebody\nname,x,y\n\nnose tip, 10.5 ,20\n"chin, low",1,-2\n')
     assert landmark_table.read(path) == {"nose tip": (10.5, 20.0), "chin, low": (1.0, -2.0)}

@@ -23,7 +23,7 @@ def fitted(p, method="envelope", **kwargs):
 
 @pytest.mark.parametrize("skin", SKINS)
 @pytest.mark.parametrize("tail", ["light", "heavy"])
-def test_diffuse_reflectance_is_within_3_percent_where_the_minimum_is_not(skin, tail):
+def test_diffuse_reflectance_is_within_3_percent_unlike_minimum(skin, tail):
     p = scene(skin, noise=0.05, tail=tail)
     error = {
         method: np.median(np.abs(fitted(p, method).r_d / p.r_d - 1.0), axis=0)
@@ -34,7 +34,7 @@ def test_diffuse_reflectance_is_within_3_percent_where_the_minimum_is_not(skin, 
     assert np.all(error["minimum"] > error["stable_minimum"])
 
 
-def test_a_minimum_sinks_with_noise_and_with_samples_and_the_fit_does_not():
+def test_minimum_sinks_with_noise_and_samples_unlike_fit():
     bias = {
         (method, noise, samples): float(np.median(fitted(p, method).r_d / p.r_d) - 1.0)
         for noise in (0.01, 0.05)
@@ -47,7 +47,7 @@ def test_a_minimum_sinks_with_noise_and_with_samples_and_the_fit_does_not():
     assert max(abs(value) for key, value in bias.items() if key[0] == "envelope") < 0.02
 
 
-def test_without_a_surface_the_standard_error_is_that_of_the_errors():
+def test_surface_free_standard_error_is_that_of_errors():
     p = scene("light", noise=0.1, points=200, samples=100)
     rng = np.random.default_rng(8)
     pure = clean_diffuse(p)
@@ -71,7 +71,7 @@ def clean_diffuse(p):
     return through[..., None] * p.r_d[:, None] / np.pi
 
 
-def test_normals_and_directions_may_be_one_for_all_points():
+def test_normals_and_directions_may_be_common_to_points():
     p = scene("light", points=8)
     one = p.normals[:1]
     light, view = p.light[:1], p.view[:1]
@@ -101,7 +101,7 @@ def test_samples_darkened_by_a_missed_shadow_are_dropped():
     assert np.median(found.discarded) > 0.5 * share * 3 * np.median(p.valid.sum(axis=1))
 
 
-def test_the_k_smallest_are_dropped_where_k_is_given():
+def test_k_smallest_are_dropped_when_k_is_given():
     p = scene("light", noise=0.01)
     p.f[:, 3] = -1.0
     least = fitted(p, "stable_minimum", discard=0).r_d[p.valid[:, 3]]
@@ -112,7 +112,7 @@ def test_the_k_smallest_are_dropped_where_k_is_given():
         fitted(p, discard=-1)
 
 
-def test_black_white_and_specular_only_surfaces_have_their_albedo():
+def test_black_white_and_specular_surfaces_have_their_albedo():
     p = scene("light", noise=0.01)
     for albedo in (0.0, 1.0):
         rng = np.random.default_rng(4)
@@ -132,7 +132,7 @@ def test_black_white_and_specular_only_surfaces_have_their_albedo():
         assert np.median(np.abs(found.r_d - albedo)) < 0.03 * (0.05 if albedo == 0.0 else 1.0)
 
 
-def test_whatever_is_missing_is_masked_and_never_a_silent_nan():
+def test_missing_values_are_masked_never_silent_nan():
     p = scene("light", points=6, samples=200)
     f, valid = p.f.copy(), p.valid.copy()
     valid[0] = False  # all saturated
@@ -149,7 +149,7 @@ def test_whatever_is_missing_is_masked_and_never_a_silent_nan():
     assert np.all(found.r_d[4] < 0.0)
 
 
-def test_grazing_light_alone_gives_no_estimate_and_duplicates_change_nothing():
+def test_grazing_light_gives_no_estimate_duplicates_change_nothing():
     p = scene("light", points=8, samples=80)
     flat = np.cross(p.normals, [0.0, 1.0, 0.0])
     flat /= np.linalg.norm(flat, axis=1, keepdims=True)
@@ -167,7 +167,7 @@ def test_grazing_light_alone_gives_no_estimate_and_duplicates_change_nothing():
     np.testing.assert_allclose(twice.r_d, once.r_d, atol=2.0 * float(once.stderr.max()))
 
 
-def test_one_light_gives_an_estimate():
+def test_single_light_gives_estimate():
     p = scene("light", points=5, samples=200)
     one = np.zeros_like(p.valid)
     one[:, :3] = p.valid[:, :3]
@@ -193,7 +193,7 @@ def test_leading_axes_broadcast_and_inputs_stay():
 
 
 @pytest.mark.parametrize("method", ["envelope", "stable_minimum"])
-def test_samples_of_one_channel_need_no_axis_for_it(method):
+def test_single_channel_samples_need_no_channel_axis(method):
     p = scene("light", points=6, samples=50)
     told = {"variance": p.variance[..., 1], "valid": p.valid}
     wanted = estimate(
@@ -225,7 +225,7 @@ def test_samples_of_one_channel_need_no_axis_for_it(method):
 
 
 @pytest.mark.parametrize("method", ["envelope", "stable_minimum", "minimum"])
-def test_points_without_samples_or_with_directions_that_are_none_are_masked(method):
+def test_points_without_samples_or_valid_directions_are_masked(method):
     p = scene("light", points=3, samples=20)
     given = {"eta": 1.3, "method": method}
     none = estimate(p.f[:, :0], p.light[:, :0], p.view[:, :0], p.normals, **given)

@@ -34,7 +34,7 @@ def relaxing(phase, constant_s, *, delay_s=0.16):
     return np.array(out)
 
 
-def test_a_disc_mean_is_the_mean_of_its_valid_pixels():
+def test_disc_mean_is_mean_of_valid_pixels():
     rng = np.random.default_rng(0)
     maps = rng.random((3, 20, 30))
     valid = rng.random(maps.shape) > 0.3
@@ -51,7 +51,7 @@ def test_a_disc_mean_is_the_mean_of_its_valid_pixels():
         assert found.pixels[0, k] == here.sum()
 
 
-def test_a_disc_without_valid_pixels_is_masked_and_the_smallest_has_one():
+def test_disc_without_valid_pixels_masked_smallest_keeps_single():
     maps = np.ones((2, 9, 9))
     valid = np.ones(maps.shape, bool)
     valid[1] = False
@@ -69,7 +69,7 @@ def test_a_disc_beyond_the_map_is_refused(place, radius, what):
         disc_means(np.ones((1, 9, 9)), {"a": place}, radius)
 
 
-def test_usual_places_lie_on_the_face_in_the_right_order():
+def test_default_face_positions_are_on_face_and_ordered():
     y, x = np.mgrid[0:200, 0:300]
     face = ((x - 150) / 60) ** 2 + ((y - 100) / 90) ** 2 < 1
     places = usual_places(face)
@@ -81,7 +81,7 @@ def test_usual_places_lie_on_the_face_in_the_right_order():
         usual_places(np.zeros((4, 4), bool))
 
 
-def test_shots_of_one_phase_belong_together_also_across_the_cycles_end():
+def test_same_phase_shots_group_across_cycle_end():
     phase = np.concatenate([PHASE, [9.99, 10.01]])  # 9.99 and 0.007 are one phase
     groups = same_phase(phase, cycle_s=CYCLE_S)
     assert len(np.unique(groups)) == 20
@@ -101,7 +101,7 @@ def test_reproducibility_is_the_scatter_of_repeats_only():
     assert np.isnan(once.sd)
 
 
-def test_a_quick_course_shows_no_transition_more_often_than_stated():
+def test_quick_course_transition_rate_stays_at_stated_rate():
     rng = np.random.default_rng(2)
     clean = relaxing(PHASE, 0.02)
     alarms, runs = 0, 400
@@ -124,7 +124,7 @@ def test_a_slow_course_shows_its_transition(constant_s):
     assert all(0.05 < clean[k] < 0.95 for k in found.where)
 
 
-def test_a_noisy_curve_shows_none_and_says_that_it_could_not():
+def test_noisy_curve_is_reported_as_undecided():
     rng = np.random.default_rng(4)
     value = 0.03 + 0.01 * relaxing(PHASE, 1.0) + 1e-2 * rng.standard_normal(22)
     found = transition(PHASE, value, cycle_s=CYCLE_S)
@@ -132,7 +132,7 @@ def test_a_noisy_curve_shows_none_and_says_that_it_could_not():
     assert found.power < 0.2
 
 
-def test_a_drop_of_blood_is_a_transition_as_well_as_a_rise():
+def test_blood_drop_is_transition_like_rise():
     rng = np.random.default_rng(5)
     value = 0.03 - 0.01 * relaxing(PHASE, 0.8) + 2e-4 * rng.standard_normal(22)
     found = transition(PHASE, value, cycle_s=CYCLE_S)

@@ -46,7 +46,7 @@ def test_a_time_constant_is_recovered_within_its_errors(phase, constant_s):
     assert abs(np.mean(pulls)) < 4.0 / np.sqrt(runs) * max(1.0, np.std(pulls))
 
 
-def test_intervals_of_68_percent_hold_as_often_and_are_longer_above():
+def test_intervals_of_68_percent_cover_and_extend_above():
     """Where noise is large, a constant is better bounded below: its two sides differ."""
     rng, noise = np.random.default_rng(21), 1e-3
     clean, runs, held, longer = relaxing(PHASE, 1.0), 40, 0, []
@@ -65,7 +65,7 @@ def test_intervals_of_68_percent_hold_as_often_and_are_longer_above():
     assert np.median(longer) > 1.0
 
 
-def test_planned_times_instead_of_true_ones_miss_the_time_constant():
+def test_planned_instead_of_true_times_miss_time_constant():
     rng = np.random.default_rng(1)
     late = PHASE + np.where(np.arange(22) % 3 == 0, 1.1, 0.0)
     value = 0.03 + 0.01 * relaxing(late, 2.0) + 1e-4 * rng.standard_normal(22)
@@ -75,7 +75,7 @@ def test_planned_times_instead_of_true_ones_miss_the_time_constant():
     assert planned.noise[0] > 5 * true.noise[0]
 
 
-def test_a_constant_far_below_the_interval_is_only_bounded():
+def test_constant_far_below_interval_is_only_bounded():
     rng = np.random.default_rng(2)
     held = 0
     for _ in range(24):
@@ -89,7 +89,7 @@ def test_a_constant_far_below_the_interval_is_only_bounded():
     assert held >= stats.binom.ppf(0.001, 24, 0.95)
 
 
-def test_a_delay_is_known_to_the_gap_between_two_samples():
+def test_delay_is_known_to_sampling_gap():
     rng = np.random.default_rng(3)
     held = 0
     for _ in range(24):
@@ -101,7 +101,7 @@ def test_a_delay_is_known_to_the_gap_between_two_samples():
     assert held >= stats.binom.ppf(0.001, 24, 0.95)
 
 
-def test_places_that_share_their_course_are_known_better_together():
+def test_positions_with_common_course_are_estimated_better_jointly():
     rng = np.random.default_rng(4)
     gaps = np.array([0.01, -0.006, 0.002, 0.004, 0.008])
     values = 0.03 + gaps[:, None] * relaxing(FINE, 1.0) + 8e-4 * rng.standard_normal((5, 44))
@@ -116,7 +116,7 @@ def test_places_that_share_their_course_are_known_better_together():
     assert (pulls**2).sum() < stats.chi2.ppf(0.999, 5)
 
 
-def test_levels_lie_within_their_errors():
+def test_levels_are_within_their_errors():
     rng = np.random.default_rng(5)
     chi2 = 0.0
     for _ in range(20):
@@ -148,7 +148,7 @@ def test_units_and_offsets_do_not_matter(scale, offset):
     assert found.interval_s == pytest.approx(plain.interval_s, rel=1e-2)
 
 
-def test_missing_samples_are_left_out():
+def test_missing_samples_are_omitted():
     rng = np.random.default_rng(8)
     value = relaxing(FINE, 1.5) + 0.01 * rng.standard_normal(44)
     value[::7] = np.nan
@@ -176,7 +176,7 @@ def test_exercise_fades_and_alcohol_comes_with_their_constants():
     assert rising.start[0] < rising.end[0]
 
 
-def test_a_course_much_longer_than_it_was_followed_is_bounded_from_below():
+def test_course_exceeding_observation_is_bounded_from_below():
     time = 5.5 * np.arange(11)
     rng = np.random.default_rng(10)
     found = fit_course(time, 0.03 + 0.01 * np.exp(-time / 4000) + 1e-5 * rng.standard_normal(11))
@@ -192,7 +192,7 @@ def test_too_little_to_fit_is_refused():
 
 
 @pytest.mark.parametrize("bent", [-0.2, 0.2])
-def test_a_course_that_shows_bent_is_found_where_bends_are_allowed(bent):
+def test_bent_course_is_found_where_bends_are_allowed(bent):
     """Light absorbed twice bends what is seen of blood, which chance does not cover."""
     time = np.linspace(1.0, 60.0, 12)
     part = 1.0 - np.exp(-time / 20.0)
@@ -206,7 +206,7 @@ def test_a_course_that_shows_bent_is_found_where_bends_are_allowed(bent):
     assert found.stderr_time_constant_s > fit_course(time, seen).stderr_time_constant_s
 
 
-def test_the_root_of_blood_finds_the_constant_of_vessels_that_blood_itself_misses():
+def test_blood_root_finds_vessel_constant_that_blood_misses():
     """Vessels whose radius fades by 20 s: blood, their cross-section, fades faster at first."""
     time = np.linspace(1.0, 60.0, 12)
     noise = 3e-5 * np.random.default_rng(5).standard_normal(time.size)
@@ -258,7 +258,7 @@ def with_step(rng, *, constant_s, step, noise=2e-4, gap=0.01):
 
 
 @pytest.mark.parametrize("constant_s", [1.0, 2.0, 4.0])
-def test_what_a_pose_adds_to_its_samples_does_not_pass_for_quick_blood(constant_s):
+def test_pose_offset_in_samples_is_not_quick_blood(constant_s):
     """Steps are drawn from their prior: intervals hold the truth, and plain fits do not."""
     rng = np.random.default_rng(11)
     runs, spread, held, plain = 24, 4e-3, 0, 0
@@ -273,7 +273,7 @@ def test_what_a_pose_adds_to_its_samples_does_not_pass_for_quick_blood(constant_
     assert plain < stats.binom.ppf(0.001, runs, 0.95)
 
 
-def test_steps_and_changes_lie_within_their_errors():
+def test_steps_and_changes_are_within_their_errors():
     rng = np.random.default_rng(12)
     runs, spread, pulls = 24, 4e-3, []
     for _ in range(runs):
@@ -297,7 +297,7 @@ def test_steps_and_changes_lie_within_their_errors():
     assert (squares > 0.05 * runs).all()
 
 
-def test_a_step_of_pose_alone_leaves_the_constant_unknown():
+def test_pose_step_alone_leaves_constant_unknown():
     """Blood so quick that poses alone show it: as large as poses may make it, it tells nothing."""
     rng = np.random.default_rng(13)
     value = with_step(rng, constant_s=1.0, step=5e-3, gap=0.0)
@@ -319,7 +319,7 @@ def test_blood_sets_out_when_the_face_moves():
     assert low <= found.delay_s <= high
 
 
-def test_a_prior_as_a_covariance_of_the_samples_gives_the_same_squares():
+def test_prior_as_sample_covariance_gives_same_squares():
     """Against generalized least squares with the step's variance written out."""
     rng = np.random.default_rng(15)
     value, noise2, spread = with_step(rng, constant_s=2.0, step=3e-3), 4e-8, 1e-3
@@ -346,6 +346,6 @@ def test_a_prior_as_a_covariance_of_the_samples_gives_the_same_squares():
         (PoseStep(MOVED, np.array([np.nan])), "standard errors"),
     ],
 )
-def test_steps_that_do_not_fit_the_samples_are_refused(pose, named):
+def test_steps_mismatching_samples_are_refused(pose, named):
     with pytest.raises(CurveError, match=named):
         fit_cycle(PHASE, relaxing(PHASE, 2.0), cycle_s=CYCLE_S, pose=pose)

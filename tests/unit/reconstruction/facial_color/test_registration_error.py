@@ -38,7 +38,7 @@ def skin(rng, size=SIZE):
     return np.exp(texture[..., None] * np.array([0.5, 1.0, 1.4])) * [0.5, 0.3, 0.2]
 
 
-def test_brightness_errs_by_the_slope_times_the_error_of_the_place(rng):
+def test_brightness_error_is_slope_times_position_error(rng):
     """A ramp of brightness: slope squared times the variance along its axis."""
     columns = np.indices((SIZE, SIZE))[1]
     rgb = np.exp(0.02 * columns)[..., None] * np.array([0.3, 0.2, 0.1])
@@ -49,7 +49,7 @@ def test_brightness_errs_by_the_slope_times_the_error_of_the_place(rng):
     np.testing.assert_allclose(found[8:-8, 8:-8], 0.02**2 * 0.4**2 / 2, rtol=1e-4)
 
 
-def test_an_even_slope_of_light_is_no_error_where_changes_of_light_are_followed(rng):
+def test_uniform_light_slope_is_not_error_when_tracked(rng):
     """A ramp with texture on it: with the window of `light_change` texture alone errs.
 
     The texture is finer than 3 px; of a Gaussian of 1 px slopes less their mean over 3 px keep
@@ -72,7 +72,7 @@ def test_an_even_slope_of_light_is_no_error_where_changes_of_light_are_followed(
 
 
 @pytest.mark.parametrize("window_px", [0.0, -1.0, np.nan, np.inf])
-def test_a_window_that_is_none_is_refused_by_name(window_px):
+def test_invalid_window_is_refused_by_name(window_px):
     rgb = np.ones((SIZE, SIZE, 3))
     with pytest.raises(ValueError, match="light_window_px"):
         misplacement.registration_covariance(
@@ -80,7 +80,7 @@ def test_a_window_that_is_none_is_refused_by_name(window_px):
         )
 
 
-def test_brightness_of_light_that_is_followed_is_left_over_by_so_much(rng):
+def test_tracked_light_leaves_stated_brightness_covariance(rng):
     """Truth: one smooth misplacement of a shaded, textured skin, whose light `light_change` would
     average over 3 px. What is left of the difference is the stated covariance, to 30 % for the
     bends of the texture between pixels and of the place within the window."""
@@ -109,7 +109,7 @@ def test_brightness_of_light_that_is_followed_is_left_over_by_so_much(rng):
     assert denied > 1.5 * seen
 
 
-def test_what_a_shifted_picture_differs_by_is_the_stated_covariance(rng):
+def test_shifted_image_differences_match_stated_covariance(rng):
     """Shifts drawn with the stated error; brightness once, colors `SCALE` times; 25 % for the
     bend of the texture between pixels and for 200 shifts."""
     rgb, stated = skin(rng), 0.3
@@ -132,7 +132,7 @@ def test_what_a_shifted_picture_differs_by_is_the_stated_covariance(rng):
     )
 
 
-def test_noise_is_no_slope_and_masked_pixels_count_for_nothing(rng):
+def test_noise_is_not_slope_masked_pixels_are_ignored(rng):
     rgb = np.broadcast_to([0.5, 0.3, 0.2], (SIZE, SIZE, 3))
     noise = 0.02 * rgb
     noisy = rgb + noise * rng.standard_normal(rgb.shape)
@@ -150,7 +150,7 @@ def test_noise_is_no_slope_and_masked_pixels_count_for_nothing(rng):
     assert np.linalg.eigvalsh(told).min() > -1e-9
 
 
-def test_changes_of_a_misplaced_face_are_covered_and_are_not_without_its_own_error(rng):
+def test_misplaced_face_coverage_requires_registration_error(rng):
     """Two pictures of one skin, the second 0.35 px off along each axis; true change 0.
 
     Expected: at least the 68 % of the interval, less 8 for the texture of one face; without the
@@ -189,7 +189,7 @@ def _texture(rng):
 
 
 @pytest.mark.parametrize("along", [(0.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.3, 0.8)])
-def test_interpolated_noise_is_as_large_as_said(rng, along):
+def test_interpolated_noise_matches_stated_noise(rng, along):
     """Against noise that OpenCV interpolates; 3 % is 4 sigma of 40 000 pixels that share some."""
     noise = rng.standard_normal((200, 200)).astype(np.float32)
     at = dense_flow.grid((200, 200)) + np.asarray(along, np.float32)

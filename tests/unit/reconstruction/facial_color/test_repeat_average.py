@@ -20,7 +20,7 @@ def repeats(rng, *, count=2, size=60, color=1.0, brightness=0.0):
 
 
 @pytest.mark.parametrize("count", [2, 3, 5])
-def test_the_variance_of_the_mean_is_that_of_its_errors(rng, count):
+def test_mean_variance_is_that_of_its_errors(rng, count):
     """Tolerance: 5 standard errors of a variance of 10,800 numbers."""
     rgb, variance, valid, skin = repeats(rng, count=count)
     mean, told, known = repeat_average.average(rgb, variance, valid)
@@ -30,7 +30,7 @@ def test_the_variance_of_the_mean_is_that_of_its_errors(rng, count):
 
 
 @pytest.mark.parametrize("count", [2, 4])
-def test_colors_that_repeat_less_than_their_noise_widen_the_error(rng, count):
+def test_colors_repeating_worse_than_noise_widen_error(rng, count):
     """Tolerance: the median of 3,600 chi-squared numbers is off by 3 % at most."""
     rgb, variance, valid, _ = repeats(rng, count=count, color=3.0)
     assert repeat_average.overdispersion(rgb, variance, valid) == pytest.approx(9.0, rel=0.09)
@@ -40,7 +40,7 @@ def test_colors_that_repeat_less_than_their_noise_widen_the_error(rng, count):
 
 @pytest.mark.parametrize("count", [2, 3])
 @pytest.mark.parametrize("ratio", [4.0, 16.0, 100.0])
-def test_repeats_of_unequal_noise_are_no_worse_than_said(rng, count, ratio):
+def test_repeats_of_unequal_noise_do_not_raise_overdispersion(rng, count, ratio):
     """Rationale: one repeat of a shorter exposure has more noise, which its variance tells.
 
     Tolerance: 4 standard errors of the median of 10,000 chi-squared numbers.
@@ -52,7 +52,7 @@ def test_repeats_of_unequal_noise_are_no_worse_than_said(rng, count, ratio):
     assert repeat_average.overdispersion(rgb, variance, valid) == pytest.approx(1.0, abs=0.06)
 
 
-def test_flashes_that_repeat_less_are_no_error_of_colors(rng):
+def test_less_repeatable_flashes_are_not_color_errors(rng):
     """Rationale: two percent from flash to flash are five times the noise of each pixel; all
     channels alike have them."""
     rgb, variance, valid, _ = repeats(rng, count=3, brightness=0.02)
@@ -61,14 +61,14 @@ def test_flashes_that_repeat_less_are_no_error_of_colors(rng):
     assert repeat_average.overdispersion(rgb, variance, valid) == pytest.approx(1.0, abs=0.05)
 
 
-def test_a_few_pixels_laid_over_others_do_not_count_for_all(rng):
+def test_few_misregistered_pixels_do_not_dominate(rng):
     rgb, variance, valid, _ = repeats(rng)
     rgb[1, :6] = rgb[1, :6, ::-1] * [1.0, 1.3, 0.8]
     assert np.mean(np.square(rgb[1] - rgb[0]) / variance[0]) > 20.0
     assert repeat_average.overdispersion(rgb, variance, valid) < 1.3
 
 
-def test_each_pixel_is_the_mean_of_the_repeats_that_show_it(rng):
+def test_pixel_is_mean_of_repeats_that_show_pixel(rng):
     rgb, variance, valid, _ = repeats(rng)
     one = variance[0].copy()
     valid[0, :10], valid[1, 5:20] = False, False
@@ -83,7 +83,7 @@ def test_each_pixel_is_the_mean_of_the_repeats_that_show_it(rng):
     assert single / double == pytest.approx(2.0, rel=1e-5)
 
 
-def test_one_picture_is_itself(rng):
+def test_single_image_is_its_own_average(rng):
     rgb, variance, valid, _ = repeats(rng, count=1, color=5.0)
     mean, told, _ = repeat_average.average(rgb, variance, valid)
     np.testing.assert_array_equal(mean, rgb[0])
@@ -99,6 +99,6 @@ def test_one_picture_is_itself(rng):
         (np.ones((2, 4, 4, 3)), np.ones((2, 4, 4, 3)), np.ones((2, 4, 4)), "valid"),
     ],
 )
-def test_what_does_not_fit_is_named(rgb, variance, valid, match):
+def test_mismatched_repeat_input_is_refused(rgb, variance, valid, match):
     with pytest.raises(ValueError, match=match):
         repeat_average.average(rgb, variance, valid)

@@ -20,7 +20,7 @@ def captures(rng, *, noise=2e-3, scatter=0.0, slope=0.0, order=ORDER, side=SIDE)
     return maps, np.full(maps.shape, noise)
 
 
-def test_repeats_by_noise_alone_alarm_as_rarely_as_stated(rng):
+def test_noise_only_repeats_alarm_at_stated_rate(rng):
     """300 sets, 10 regions each, 5 % false alarms a set: within a binomial's 4 deviations."""
     alarms = 0
     sets = 300
@@ -33,7 +33,7 @@ def test_repeats_by_noise_alone_alarm_as_rarely_as_stated(rng):
     assert alarms <= 0.05 * sets + 4 * np.sqrt(sets * 0.05 * 0.95)
 
 
-def test_p_values_of_one_region_are_uniform_under_noise(rng):
+def test_region_p_values_are_uniform_under_noise(rng):
     values = []
     for _ in range(300):
         maps, stderr = captures(rng, side=8)
@@ -42,14 +42,14 @@ def test_p_values_of_one_region_are_uniform_under_noise(rng):
     assert stats.kstest(values, "uniform").pvalue > 1e-4
 
 
-def test_captures_that_differ_by_more_than_noise_are_found(rng):
+def test_captures_differing_beyond_noise_are_found(rng):
     maps, stderr = captures(rng, scatter=1e-3)
     found = repeatability.compare(maps, ORDER, stderr=stderr).region("whole face")
     assert found.scatters
     np.testing.assert_allclose(found.within, 1e-3, rtol=4 / np.sqrt(2 * (len(ORDER) - 3)))
 
 
-def test_noise_that_goes_together_is_not_scatter_when_it_is_said_so(rng):
+def test_stated_correlated_noise_is_not_scatter(rng):
     order = ORDER
     coarse = rng.standard_normal((len(order), SIDE // 4, SIDE // 4))
     noise = 2e-3 * np.repeat(np.repeat(coarse, 4, axis=1), 4, axis=2)
@@ -61,7 +61,7 @@ def test_noise_that_goes_together_is_not_scatter_when_it_is_said_so(rng):
     assert not told.region("whole face").scatters
 
 
-def test_between_states_is_what_states_differ_by(rng):
+def test_between_states_variation_matches_state_differences(rng):
     maps, stderr = captures(rng, scatter=5e-4)
     found = repeatability.compare(maps, ORDER, stderr=stderr).region("whole face")
     truth = np.std(list(LEVELS.values()), ddof=1)
@@ -71,7 +71,7 @@ def test_between_states_is_what_states_differ_by(rng):
     np.testing.assert_allclose(found.change_to_scatter * found.within, 0.011, rtol=0.2)
 
 
-def test_the_error_of_the_intraclass_correlation_is_its_scatter(rng):
+def test_intraclass_correlation_error_is_its_scatter(rng):
     states, repeats, draws = 12, 4, 600
     order = tuple(str(k) for k in range(states)) * repeats
     found = []
@@ -87,7 +87,7 @@ def test_the_error_of_the_intraclass_correlation_is_its_scatter(rng):
     np.testing.assert_allclose(np.median(errors), values.std(), rtol=0.2)
 
 
-def test_melanin_that_drifts_is_told_from_blood_that_changes(rng):
+def test_drifting_melanin_is_separated_from_changing_blood(rng):
     maps, stderr = captures(rng, slope=2e-4)
     times = 30.0 * np.arange(len(ORDER))
     found = repeatability.drift(maps, ORDER, times, stderr=stderr)[-1]
@@ -99,7 +99,7 @@ def test_melanin_that_drifts_is_told_from_blood_that_changes(rng):
     assert not found.drifts
 
 
-def test_states_captured_one_after_the_other_are_no_drift(rng):
+def test_states_captured_consecutively_are_not_drift(rng):
     """A line through all captures alike would take the states' order for a drift."""
     order = tuple(sorted(ORDER, key=lambda s: LEVELS[s]))
     maps, stderr = captures(rng, order=order)
@@ -110,7 +110,7 @@ def test_states_captured_one_after_the_other_are_no_drift(rng):
     assert alike.pvalue < 1e-4
 
 
-def test_drift_alarms_as_rarely_as_stated_with_and_without_scatter(rng):
+def test_drift_alarms_at_stated_rate_regardless_of_scatter(rng):
     times = 60.0 * np.arange(len(ORDER))
     for scatter in (0.0, 5e-4):
         alarms = 0
@@ -135,7 +135,7 @@ def test_pixels_invalid_in_any_capture_are_in_none(rng):
     assert np.isfinite(found.region("whole face").means).all()
 
 
-def test_named_regions_are_measured_each_by_itself(rng):
+def test_named_regions_are_measured_independently(rng):
     maps, stderr = captures(rng)
     left = np.zeros((SIDE, SIDE), bool)
     left[:, :12] = True
@@ -148,7 +148,7 @@ def test_named_regions_are_measured_each_by_itself(rng):
     assert found.left_out == (("dot", "0 pixels are valid in all captures"),)
 
 
-def test_maps_without_noise_or_without_change_give_no_nan():
+def test_maps_without_noise_or_change_give_no_nan():
     order = ("neutral", "smile") * 2
     flat = np.full((4, 8, 8), 0.02)
     found = repeatability.compare(flat, order, stderr=np.zeros(flat.shape)).region("whole face")

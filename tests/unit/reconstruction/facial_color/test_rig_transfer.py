@@ -32,7 +32,7 @@ def elsewhere(points):
     return {name: (2.0 * x + 61.0, 2.0 * y + 9.0) for name, (x, y) in points.items()}
 
 
-def test_the_patch_that_reddens_lies_at_the_same_landmark_of_the_other_face():
+def test_reddening_patch_transfers_to_same_landmark():
     neutral, factor = face()
     rig = HemoglobinRig.from_maps(neutral, {"blush": neutral * factor}, radius_px=5.0)
     shape = (220, 200)
@@ -59,7 +59,7 @@ def test_the_radius_grows_with_the_face():
     assert there.radius_px == pytest.approx(10.0, rel=0.05)
 
 
-def test_what_the_rig_never_saw_stays_unknown():
+def test_region_outside_rig_mask_stays_unknown():
     neutral, factor = face()
     seen = np.ones(SHAPE, bool)
     seen[:30] = False

@@ -62,7 +62,7 @@ def chi_square_band(count, sigmas=4.0):
     return 1 - sigmas * np.sqrt(2 / count), 1 + sigmas * np.sqrt(2 / count)
 
 
-def test_without_noise_melanin_blood_and_each_states_light_are_exact(table, prior):
+def test_noise_free_melanin_blood_and_light_are_exact(table, prior):
     light = np.array([0.4, 0.7, 0.5, 0.9, 0.6])[:, None, None]
     color = light * table.lookup(np.full((5, 1), MELANIN), BLOOD[:, None])
     found = shared_melanin.estimate_shared_melanin(
@@ -97,7 +97,7 @@ def test_errors_are_those_of_the_best_unbiased_estimate(table, prior, rng):
         np.testing.assert_allclose(np.median(stderr), np.sqrt(expected), rtol=0.06)
 
 
-def test_the_variance_of_melanin_goes_down_with_the_number_of_states(table, prior, rng):
+def test_melanin_variance_falls_with_number_of_states(table, prior, rng):
     pixels = 2000
     spread = {}
     for states in (1, 2, 5):
@@ -111,7 +111,7 @@ def test_the_variance_of_melanin_goes_down_with_the_number_of_states(table, prio
         assert abs(spread[1] / spread[states] / states - 1) < slack + 0.05
 
 
-def test_an_error_of_the_model_stays_in_melanin_and_leaves_changes(table, prior, rng):
+def test_model_error_stays_in_melanin_and_spares_changes(table, prior, rng):
     """The same error in all states: averaging keeps it, differences lose nearly all of it."""
     covariance = model_error.load()
     pixels = 1500
@@ -137,7 +137,7 @@ def test_an_error_of_the_model_stays_in_melanin_and_leaves_changes(table, prior,
     assert np.mean(((found.melanin - MELANIN) / claimed) ** 2) > 2.0
 
 
-def test_pixels_of_large_errors_leave_the_others_as_they_are(table, prior, rng):
+def test_pixels_of_large_errors_leave_others_unchanged(table, prior, rng):
     """Every map of each pixel is as with a model error of its own kind for all."""
     rgb, variance = pictures(table, rng, noise=0.004, pixels=300)
     fine, coarse = np.diag([2e-4, 1e-4, 3e-4]), np.diag([0.02, 0.01, 0.03])
@@ -164,7 +164,7 @@ def test_pixels_of_large_errors_leave_the_others_as_they_are(table, prior, rng):
     assert np.median(maps(coarse)[2] / maps(fine)[2]) < 0.9  # else nothing was compared
 
 
-def test_one_state_alone_is_weighed_as_a_single_picture(table, prior, rng):
+def test_single_state_matches_single_image_posterior(table, prior, rng):
     rgb, variance = pictures(table, rng, noise=3e-3, pixels=200, blood=BLOOD[:1])
     covariance = model_error.load()
     found = shared_melanin.estimate_shared_melanin(
@@ -180,7 +180,7 @@ def test_one_state_alone_is_weighed_as_a_single_picture(table, prior, rng):
     assert not found.change.any()
 
 
-def test_a_state_that_is_masked_leaves_out_and_the_others_go_on(table, prior, rng):
+def test_masked_state_is_omitted_and_others_continue(table, prior, rng):
     rgb, variance = pictures(table, rng, noise=2e-3, pixels=3)
     valid = np.ones(rgb.shape[:2], bool)
     valid[2, 0] = False
@@ -222,7 +222,7 @@ def test_unusable_colors_are_masked_and_never_unmasked_nan(table, prior):
     assert not found.valid_states[2, 2]
 
 
-def test_a_state_with_another_pixels_melanin_is_a_misfit(table, prior, rng):
+def test_state_with_other_pixel_melanin_is_misfit(table, prior, rng):
     rgb, variance = pictures(table, rng, noise=1e-3, pixels=50)
     rgb[3] *= (np.array([1.12, 0.94, 1.0])).astype(np.float32)
     found = shared_melanin.estimate_shared_melanin(rgb, table, prior=prior, variance=variance)
@@ -244,7 +244,7 @@ def faces(table, rng, shape, noise, light):
     return rgb * light[..., None].astype("f4"), variance * (light**2)[..., None].astype("f4")
 
 
-def test_light_that_changes_smoothly_makes_brightness_tell_changes_of_blood(table, prior, rng):
+def test_smoothly_changing_light_lets_brightness_show_blood_changes(table, prior, rng):
     shape = (64, 64)
     rgb, variance = faces(table, rng, shape, 5e-3, smooth_light(shape))
     free = shared_melanin.estimate_shared_melanin(rgb, table, prior=prior, variance=variance)
@@ -263,7 +263,7 @@ def test_light_that_changes_smoothly_makes_brightness_tell_changes_of_blood(tabl
     np.testing.assert_allclose(again.change[1].mean(), truth, rtol=0.1)
 
 
-def test_a_wrinkles_shadow_that_is_not_smooth_widens_the_error(table, prior, rng):
+def test_unsmooth_wrinkle_shadow_widens_error(table, prior, rng):
     shape = (64, 64)
     light = smooth_light(shape)
     light[1, ::3] *= 0.9
@@ -280,7 +280,7 @@ def test_a_wrinkles_shadow_that_is_not_smooth_widens_the_error(table, prior, rng
     assert np.mean(np.abs(error) < 2 * wrinkled.stderr_change[1]) > 0.9
 
 
-def test_the_layout_of_pixels_changes_nothing_and_inputs_stay(table, prior, rng):
+def test_pixel_layout_changes_nothing_and_inputs_stay(table, prior, rng):
     rgb, variance = pictures(table, rng, noise=3e-3, pixels=12)
     before = rgb.copy()
     flat = shared_melanin.estimate_shared_melanin(rgb, table, prior=prior, variance=variance)
@@ -331,7 +331,7 @@ def test_arguments_that_do_not_fit_are_named(table, prior):
         shared_melanin.estimate_shared_melanin(np.ones(3), table, prior=prior)
 
 
-def test_an_own_error_of_a_state_counts_as_noise_that_goes_together(table, prior, rng):
+def test_state_registration_error_counts_as_correlated_noise(table, prior, rng):
     """Channels that err together in one state: melanin and the change have its variance.
 
     Expected: as drawn, within 4 sigma of 1500 pixels and 30 % for the bend of the table; errors
@@ -356,7 +356,7 @@ def test_an_own_error_of_a_state_counts_as_noise_that_goes_together(table, prior
     assert np.median(without.stderr_change[1]) < 0.3 * np.median(found.stderr_change[1])
 
 
-def test_an_own_error_that_does_not_fit_is_refused(table, prior, rng):
+def test_mismatched_registration_error_is_refused(table, prior, rng):
     rgb, variance = pictures(table, rng, noise=3e-4, pixels=4)
     for wrong in (np.zeros((4, 3, 3)), np.full((len(rgb), 4, 3, 3), np.nan)):
         with pytest.raises(ChromophoreError, match="own_error"):
@@ -365,7 +365,7 @@ def test_an_own_error_that_does_not_fit_is_refused(table, prior, rng):
             )
 
 
-def test_pixels_of_one_face_tell_each_others_melanin_and_moles_stay_moles(table, prior, rng):
+def test_face_pixels_constrain_common_melanin_but_keep_moles(table, prior, rng):
     """Truth: type V, 9 % melanin with 15 % scatter, in light drawn from the prior, two states.
 
     Expected: by the face melanin errs by less than 0.7 of what it does alone, and its interval

@@ -157,7 +157,7 @@ def scene():
 
 
 @pytest.mark.parametrize("alpha", [0.05, 0.1, 0.2, 0.3, 0.5])
-def test_normals_of_a_smooth_relief_are_exact_where_lights_and_roughness_are_known(alpha):
+def test_smooth_normals_are_exact_with_known_lights_roughness(alpha):
     lights, normals = sphere(), relief(48)
     images = pictures(normals, lights, alpha=alpha)
     found = from_patterns(images, lights=SphereLights(lights), alpha=alpha)
@@ -169,7 +169,7 @@ def test_normals_of_a_smooth_relief_are_exact_where_lights_and_roughness_are_kno
 
 
 @pytest.mark.parametrize("alpha", [0.1, 0.3, 0.5])
-def test_the_roughness_is_found_from_how_long_the_vectors_are(alpha):
+def test_roughness_is_found_from_vector_lengths(alpha):
     lights, normals = sphere(), relief(32)
     images = pictures(normals, lights, alpha=alpha)
     found = estimate_roughness(images, lights=SphereLights(lights))
@@ -177,7 +177,7 @@ def test_the_roughness_is_found_from_how_long_the_vectors_are(alpha):
     assert error_deg(from_patterns(images, lights=SphereLights(lights)), normals).mean() < 0.05
 
 
-def test_a_surface_that_leans_to_the_right_and_up_has_normals_that_do(scene):
+def test_surface_leaning_right_and_up_has_such_normals(scene):
     lights, _, _ = scene
     n = np.broadcast_to(unit(np.array([0.2, 0.1, 1.0])), (2, 2, 3))
     for component in ("specular", "diffuse"):
@@ -197,7 +197,7 @@ def test_a_surface_that_leans_to_the_right_and_up_has_normals_that_do(scene):
         *(tuple(n for n in NAMES if n != missing) for missing in NAMES),
     ],
 )
-def test_any_patterns_that_tell_the_vector_give_the_same_normals(scene, names):
+def test_sufficient_pattern_sets_give_equal_normals(scene, names):
     lights, normals, images = scene
     found = from_patterns(only(images, names), lights=SphereLights(lights), alpha=0.2)
     assert found.valid.all()
@@ -210,7 +210,7 @@ def test_any_patterns_that_tell_the_vector_give_the_same_normals(scene, names):
 
 
 @pytest.mark.parametrize("dark", [False, True])
-def test_moments_are_the_weighted_least_squares_of_all_samples(rng, dark):
+def test_moments_are_weighted_least_squares_of_all_samples(rng, dark):
     """The closed form of the kernel beside a dense fit, with samples missing at random."""
     checked = 0
     for _ in range(60):
@@ -256,13 +256,13 @@ def test_moments_are_the_weighted_least_squares_of_all_samples(rng, dark):
         ((), "full"),
     ],
 )
-def test_too_few_patterns_are_refused_by_name_with_what_would_do(scene, names, words):
+def test_too_few_patterns_are_refused_naming_sufficient_ones(scene, names, words):
     _, _, images = scene
     with pytest.raises(MissingPatterns, match=words):
         from_patterns(only(images, NAMES, names) if names else only(images, NAMES, ("dark",)))
 
 
-def test_specular_normals_need_both_polarizers_and_diffuse_ones_crossed(scene):
+def test_specular_normals_need_both_polarizers_diffuse_only_crossed(scene):
     _, normals, images = scene
     with pytest.raises(MissingPatterns, match="no crossed"):
         from_patterns(only(images, NAMES, ()))
@@ -275,7 +275,7 @@ def test_specular_normals_need_both_polarizers_and_diffuse_ones_crossed(scene):
     assert error_deg(found, normals).mean() < 1.0
 
 
-def test_dark_frames_are_subtracted_also_where_one_polarizer_has_them(scene):
+def test_dark_frames_are_subtracted_even_for_single_polarizer(scene):
     lights, normals, clean = scene
     images = pictures(normals, lights, dark=0.03)
     one = {key: image for key, image in images.items() if key != ("dark", "crossed")}
@@ -290,7 +290,7 @@ def test_dark_frames_are_subtracted_also_where_one_polarizer_has_them(scene):
 
 @pytest.mark.parametrize("patterns", [NAMES, ("full", "x", "y", "z"), ("x", "-x", "y", "z")])
 @pytest.mark.parametrize("given", ["model", "arrays"])
-def test_errors_are_as_large_as_the_standard_errors_say(rng, patterns, given):
+def test_errors_match_standard_errors(rng, patterns, given):
     """Mean of squared error over squared standard error is 1.
 
     Its standard deviation is at most sqrt(2 / pixels); false alarm at four of these: 6e-5.
@@ -328,7 +328,7 @@ def test_four_patterns_cost_error_as_announced(rng):
     np.testing.assert_allclose(errors["four"] / errors["all"], told["four"] / told["all"], rtol=0.1)
 
 
-def test_noise_is_found_from_patterns_that_contradict_each_other(rng):
+def test_noise_is_found_from_contradicting_patterns(rng):
     lights, normals = sphere(), relief(64)
     noise = SensorNoise(1e-6, 2e-7)
     images = noisy(pictures(normals, lights, alpha=0.3), noise, rng)
@@ -340,7 +340,7 @@ def test_noise_is_found_from_patterns_that_contradict_each_other(rng):
     assert (four.stderr_rad == np.float32(np.pi)).all()  # nothing to find it from
 
 
-def test_unequal_lights_are_corrected_and_cost_where_they_are_not(rng):
+def test_unequal_lights_are_corrected_and_bias_otherwise(rng):
     lights, normals = sphere(), relief(32)
     strength = np.exp(0.3 * rng.standard_normal(len(lights)))
     images = pictures(normals, lights, strength=strength)
@@ -350,7 +350,7 @@ def test_unequal_lights_are_corrected_and_cost_where_they_are_not(rng):
     assert error_deg(wrong, normals).mean() > 0.5
 
 
-def test_what_is_not_known_about_the_lights_is_in_the_standard_errors():
+def test_light_uncertainty_is_included_in_standard_errors():
     """Squared errors over what is announced, by drawn sphere; false alarm at 4 sigma: 6e-5."""
     lights, normals = sphere(), relief(16)
     rng = np.random.default_rng(7)
@@ -380,7 +380,7 @@ def test_leakage_by_direction_is_corrected():
     assert error_deg(wrong, normals).mean() > 0.2
 
 
-def test_films_mounted_across_turn_no_normal_when_calibrated():
+def test_misoriented_polarizers_leave_calibrated_normals_unrotated():
     """Three of the lights reflect more crossed than parallel: their films are 50 degrees off."""
     lights, normals = sphere(), relief(32)
     leak = np.zeros(len(lights))
@@ -393,7 +393,7 @@ def test_films_mounted_across_turn_no_normal_when_calibrated():
     assert error_deg(unaware, normals).mean() > 0.2
 
 
-def test_an_analyser_ten_degrees_off_costs_signal_and_turns_no_normal(rng, caplog):
+def test_ten_degree_analyzer_offset_costs_signal_not_normals(rng, caplog):
     """Signal falls to cos 20 degrees, with the diffuse light's own polarization turned as well."""
     lights, normals = sphere(), relief(32)
     images = pictures(normals, lights, off_deg=10.0)
@@ -412,7 +412,7 @@ def test_an_analyser_ten_degrees_off_costs_signal_and_turns_no_normal(rng, caplo
     assert 0.9 < np.median(aware.albedo / straight.albedo) < 1.0
 
 
-def test_patterns_that_were_programmed_for_other_directions_are_taken_as_programmed(rng):
+def test_patterns_programmed_for_nominal_directions_use_programmed_directions(rng):
     drawn, normals = sphere(), relief(24)
     built = unit(drawn + 0.02 * rng.standard_normal(drawn.shape))
     images = pictures(normals, built, programmed=drawn)
@@ -423,7 +423,7 @@ def test_patterns_that_were_programmed_for_other_directions_are_taken_as_program
 
 
 @pytest.mark.parametrize("component", ["specular", "diffuse"])
-def test_points_away_from_the_middle_see_lights_and_camera_elsewhere(component):
+def test_off_center_points_use_shifted_light_camera_directions(component):
     """A point 6 mm off the middle, lights at 600 mm and a camera at 300 mm."""
     lights, normals = sphere(400), relief(16)
     point = np.array([6.0, -4.0, 0.0])
@@ -446,7 +446,7 @@ def test_points_away_from_the_middle_see_lights_and_camera_elsewhere(component):
 
 @pytest.mark.parametrize("turn_deg", [0.0, 23.0, 90.0])
 @pytest.mark.parametrize("tilt_deg", [0.0, 30.0, 45.0, 60.0])
-def test_a_flat_patch_has_its_normal_or_none_up_to_steep_tilts(tilt_deg, turn_deg):
+def test_flat_patch_has_normal_or_none_when_steep(tilt_deg, turn_deg):
     """Across the analyser's axis, light mirrored beyond Brewster's angle tells nothing."""
     lights = sphere()
     tilt, turn = np.radians(tilt_deg), np.radians(turn_deg)
@@ -460,7 +460,7 @@ def test_a_flat_patch_has_its_normal_or_none_up_to_steep_tilts(tilt_deg, turn_de
     assert_clean(found)
 
 
-def test_black_skin_has_specular_normals_and_no_diffuse_ones(rng):
+def test_black_skin_has_specular_but_not_diffuse_normals(rng):
     lights, normals = sphere(), relief(24)
     images = noisy(pictures(normals, lights, diffuse=0.0, alpha=0.3), SensorNoise(1e-7, 1e-8), rng)
     kwargs = {"lights": SphereLights(lights), "variance": SensorNoise(1e-7, 1e-8)}
@@ -472,7 +472,7 @@ def test_black_skin_has_specular_normals_and_no_diffuse_ones(rng):
     assert_clean(matte)
 
 
-def test_pictures_without_light_give_no_normals(rng):
+def test_images_without_light_give_no_normals(rng):
     lights = sphere()
     dark = {key: np.zeros((5, 4), np.float32) for key in pictures(relief(4), lights)}
     for images in (dark, noisy(dark, SensorNoise(0.0, 1e-6), rng)):
@@ -483,7 +483,7 @@ def test_pictures_without_light_give_no_normals(rng):
         estimate_roughness(dark, lights=SphereLights(lights))
 
 
-def test_saturated_samples_are_left_out_and_the_others_tell_the_normal(scene):
+def test_saturated_samples_are_omitted_and_others_give_normal(scene):
     lights, normals, images = scene
     clipped = {key: np.minimum(image, 0.9) for key, image in images.items()}
     clipped["x", "parallel"][5:9, 5:9] = 0.9  # one pattern: seven are left
@@ -506,7 +506,7 @@ def test_saturated_samples_are_left_out_and_the_others_tell_the_normal(scene):
 
 
 @pytest.mark.parametrize("options", [{}, {"smoothing": 1.5}, {"smoothing": "wiener"}])
-def test_a_mask_of_one_pixel_and_pictures_full_of_nan_are_survived(scene, options):
+def test_single_pixel_mask_and_nan_images_are_handled(scene, options):
     lights, normals, images = scene
     valid = np.zeros((48, 48), bool)
     valid[7, 9] = True
@@ -523,7 +523,7 @@ def test_a_mask_of_one_pixel_and_pictures_full_of_nan_are_survived(scene, option
     assert not found.valid.any()
 
 
-def test_lobes_beyond_the_horizon_are_no_normals():
+def test_lobes_beyond_horizon_give_no_normals():
     """What comes back from behind the surface, as from a neighbour's flank, has no normal."""
     images = {
         (n, p): np.full((2, 2), 0.5)
@@ -539,7 +539,7 @@ def test_lobes_beyond_the_horizon_are_no_normals():
 
 
 @pytest.mark.parametrize("options", [{"smoothing": 1.5}, {"smoothing": "wiener"}])
-def test_filters_lower_noise_as_they_say_and_keep_smooth_relief(rng, options):
+def test_filters_lower_noise_as_stated_and_keep_topography(rng, options):
     lights = sphere()
     h = gaussian_filter(rng.standard_normal((96, 96)), 18.0, mode="wrap")
     down, right = np.gradient(h)
@@ -571,7 +571,7 @@ def test_tiles_of_rows_make_no_seams(scene, monkeypatch):
     np.testing.assert_array_equal(whole.stderr_rad, tiled.stderr_rad)
 
 
-def test_channels_are_added_for_mirrored_light_and_kept_apart_for_diffuse(scene):
+def test_channels_are_summed_for_specular_separate_for_diffuse(scene):
     lights, _, images = scene
     weights = np.array([0.5, 1.0, 0.2])
     color = {key: image[..., None] * weights for key, image in images.items()}
@@ -592,7 +592,7 @@ def test_types_are_kept(scene):
     assert from_patterns(small).normals.dtype == np.float32
 
 
-def test_what_does_not_fit_is_refused_by_name(scene):
+def test_mismatched_gradient_input_is_refused_by_name(scene):
     lights, _, images = scene
     told = SphereLights(lights)
     with pytest.raises(GradientError, match="did you mean full"):

@@ -25,7 +25,7 @@ def case(rng, side=128):
     return kernel_search.KernelGrid(relief, buckets, ALPHAS, SIGMAS_UM)
 
 
-def test_counts_that_a_search_kept_are_those_of_all_pixels(rng):
+def test_counts_kept_by_search_cover_all_pixels(rng):
     grid = case(rng)
     found = kernel_search.hierarchical(grid, first_sample=1024, rng=rng)
     assert set(found.counts) == set(map(tuple, np.argwhere(found.exact).tolist()))
@@ -40,7 +40,7 @@ def test_counts_that_a_search_kept_are_those_of_all_pixels(rng):
             assert apart == pytest.approx(found.distance[i, j], abs=1e-12)
 
 
-def test_errors_are_the_same_from_kept_counts_and_from_new_ones(rng):
+def test_errors_are_equal_from_kept_and_new_counts(rng):
     grid = case(rng)
     found = kernel_search.hierarchical(grid, first_sample=1024, rng=rng)
     i, j = found.best
@@ -54,7 +54,7 @@ def test_errors_are_the_same_from_kept_counts_and_from_new_ones(rng):
     assert with_counts.alpha[0] > 0.0
 
 
-def test_no_more_counts_are_kept_than_memory_is_granted(rng, monkeypatch):
+def test_kept_counts_stay_within_granted_memory(rng, monkeypatch):
     grid = case(rng)
     monkeypatch.setattr(kernel_search, "KEPT_BYTES", 3 * 4 * (64 * 64 + 1))
     found = kernel_search.hierarchical(grid, first_sample=1024, rng=rng)
@@ -111,7 +111,7 @@ TOLD = {
 }
 
 
-def test_one_piece_of_skin_tells_a_kernel_better_than_two(rng):
+def test_single_skin_piece_determines_kernel_better_than_two(rng):
     height, strained = strained_pair(rng)
     target = normal_histogram.histogram(strained, pixel=6.0)
     alone = kernel_fit.fit_kernel(height, target, axis="x", **TOLD)
@@ -134,7 +134,7 @@ def test_one_piece_of_skin_tells_a_kernel_better_than_two(rng):
         assert fit.sigma_95_um >= 1.959 * fit.sigma_stderr_um
 
 
-def test_errors_of_a_map_on_its_side_are_the_same(rng):
+def test_errors_of_transposed_map_are_equal(rng):
     """Rows for columns, in the map, its target and its blocks: y up turns into x to the right."""
     height, strained = strained_pair(rng, side=64)
     fits = []
@@ -149,7 +149,7 @@ def test_errors_of_a_map_on_its_side_are_the_same(rng):
     assert second.alpha_stderr == pytest.approx(first.alpha_stderr, rel=0.3)
 
 
-def test_pairs_that_nothing_can_be_drawn_of_are_refused_or_left(rng):
+def test_pairs_without_resamples_are_refused_or_fall_back(rng):
     height, strained = strained_pair(rng, side=48)
     target, blocks = normal_histogram.histogram(strained, pixel=6.0), paired(height, strained)
     alone = kernel_fit.fit_kernel(height, target, axis="x", **TOLD)

@@ -48,7 +48,7 @@ def scipy_target(height, alpha, sigma_um, *, stretch, axis):
 
 @pytest.mark.parametrize(("axis", "number"), [("x", 1), ("y", 0)])
 @pytest.mark.parametrize(("alpha", "sigma_um"), [(-1.3, 9.0), (0.8, 44.5), (0.5, 3.0)])
-def test_the_search_sees_the_histogram_of_plain_numpy(rng, axis, number, alpha, sigma_um):
+def test_search_histogram_matches_plain_numpy(rng, axis, number, alpha, sigma_um):
     height = skin(96, rng)
     ours = convolved_histogram(height, alpha, sigma_um, stretch=0.8, axis=axis)
     twin = scipy_target(height, alpha, sigma_um, stretch=0.8, axis=number)
@@ -61,7 +61,7 @@ def test_the_search_sees_the_histogram_of_plain_numpy(rng, axis, number, alpha, 
     ("alpha", "sigma_um", "stretch", "axis"),
     [(-0.63, 17.5, 0.9, "x"), (0.41, 8.0, 1.2, "y"), (1.0, 24.0, 1.28, 1), (-2.0, 6.5, 0.73, 0)],
 )
-def test_a_known_kernel_comes_back_to_the_grid_point(rng, alpha, sigma_um, stretch, axis):
+def test_known_kernel_returns_to_grid_point(rng, alpha, sigma_um, stretch, axis):
     height = skin(128, rng)
     target = scipy_target(
         height, alpha, sigma_um, stretch=stretch, axis=1 if axis in ("x", 1) else 0
@@ -107,7 +107,7 @@ def compared(rng, side, first_sample, grid=(ALPHA_GRID, SIGMAS_UM)):
     return full, part
 
 
-def test_the_hierarchical_search_finds_what_the_exhaustive_one_does(rng):
+def test_hierarchical_search_matches_exhaustive_search(rng):
     for _ in range(4):
         full, part = compared(rng, 144, 2048, **COARSE)
         assert part.best == full.best
@@ -134,7 +134,7 @@ def test_ten_random_cases_agree_with_the_exhaustive_search():
         assert not part.exact.all()
 
 
-def test_no_kernel_is_dropped_that_is_better_than_its_bound(rng):
+def test_kernel_lower_bounds_never_exceed_true_distances(rng):
     """The proof's inequality itself: over a whole grid, lower bounds lie below the distances."""
     height = skin(160, rng)
     target = nh.histogram(unlike(height, rng), pixel=PIXEL_UM)
@@ -148,7 +148,7 @@ def test_no_kernel_is_dropped_that_is_better_than_its_bound(rng):
     assert race.low.max() > 0.05  # and they say something
 
 
-def test_results_do_not_depend_on_the_number_of_threads(rng, monkeypatch):
+def test_results_are_independent_of_thread_count(rng, monkeypatch):
     height = skin(100, rng)
     target = nh.histogram(unlike(height, rng), pixel=PIXEL_UM)
     found = []
@@ -180,7 +180,7 @@ def test_samples_are_changed_as_whole_maps_are(rng):
             np.testing.assert_allclose(b, a[chosen], atol=2e-6)
 
 
-def test_the_border_is_mirrored_and_holes_are_filled_along_the_axis(rng):
+def test_border_is_mirrored_and_holes_filled_along_axis(rng):
     height = skin(40, rng)
     for axis, number in (("x", 1), ("y", 0)):
         ours = convolved(height, 0.7, 90.0, axis=axis, pixel_um=PIXEL_UM)
@@ -229,7 +229,7 @@ def test_a_flat_patch_has_no_kernel():
     assert len(fit.near_best) == COARSE_GRID[0].size * COARSE_GRID[1].size
 
 
-def test_one_bucket_that_holds_everything_tells_nothing(rng):
+def test_single_occupied_bucket_gives_invalid_fit(rng):
     height = 1e-3 * skin(60, rng)
     target = nh.histogram(height, pixel=PIXEL_UM, bins=63)  # odd: 0 is within a bucket
     assert np.count_nonzero(target) == 1
@@ -247,7 +247,7 @@ def test_extreme_strains_are_fitted_as_any_other(rng, stretch):
     assert (fit.alpha, fit.sigma_um) == (-0.5, 20.0)
 
 
-def test_sigma_far_below_a_pixel_is_a_tie_that_goes_to_the_gentlest_kernel(rng):
+def test_subpixel_sigma_tie_takes_gentlest_kernel(rng):
     height = skin(100, rng)
     target = convolved_histogram(height, 0.0, 1.0, stretch=1.0, axis="x")
     assert gaussian_weights(0.4 / PIXEL_UM).size == 1
@@ -265,7 +265,7 @@ def test_sigma_far_below_a_pixel_is_a_tie_that_goes_to_the_gentlest_kernel(rng):
     assert fit.valid  # the wide kernels are worse
 
 
-def test_neutral_skin_has_the_neutral_kernel_and_a_wide_valley(rng):
+def test_neutral_skin_has_neutral_kernel_and_wide_valley(rng):
     height = skin(100, rng)
     target = nh.histogram(height, pixel=PIXEL_UM)
     fit = fit_kernel(height, target, stretch=1.0, axis="x", pixel_um=PIXEL_UM, **COARSE)
@@ -303,7 +303,7 @@ def test_a_finer_minimum_than_the_grid_is_refined(rng):
 
 
 @pytest.mark.long
-def test_standard_errors_tell_how_far_another_patch_is_off(rng):
+def test_standard_errors_predict_deviation_of_other_patch(rng):
     """Target of one patch, kernel of another of the same statistics.
 
     Rationale: 10 errors over their standard errors; their mean square is about 1, and lies in
@@ -353,7 +353,7 @@ def test_settings_that_do_not_fit_are_refused(rng):
 
 
 @pytest.mark.parametrize("shape", [(0, 0), (0, 3), (3, 0), (3, 2)])
-def test_a_grid_that_is_empty_or_of_another_shape_is_named(shape):
+def test_empty_or_misshapen_grid_is_reported(shape):
     alphas, sigmas_um = np.linspace(0.0, 1.0, min(shape[1], 3)), np.arange(1.0, 1.0 + shape[0])
     distance = np.zeros(shape if shape != (3, 2) else (2, 3))
     with pytest.raises(ks.KernelFitError, match=r"distance: got shape"):

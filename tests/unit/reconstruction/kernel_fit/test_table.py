@@ -15,7 +15,7 @@ from reconstruction.kernel_fit.table import (
 )
 
 
-def test_the_papers_points_give_the_papers_lines_of_sigma():
+def test_published_points_give_published_sigma_lines():
     points = forehead_points()
     fit = fit_table(points.stretch, points.alpha, points.sigma_um)
     for ours, paper in (
@@ -28,7 +28,7 @@ def test_the_papers_points_give_the_papers_lines_of_sigma():
     assert np.isfinite([fit.sigma_compression_stderr_um, fit.sigma_stretch_stderr_um]).all()
 
 
-def test_alpha_meets_the_papers_points_no_worse_than_eq_8_with_as_many_lines():
+def test_alpha_fits_published_points_like_eq_8():
     points = forehead_points()
     fit = fit_table(points.stretch, points.alpha, points.sigma_um)
     paper = alpha_rms(FOREHEAD, points.stretch, points.alpha)
@@ -80,7 +80,7 @@ def test_weights_leave_a_bad_point_out():
     assert spoiled.table != clean.table
 
 
-def test_one_sided_points_make_a_one_sided_table():
+def test_single_sided_points_make_single_sided_table():
     r = np.array([1.05, 1.1, 1.15, 1.2])
     fit = fit_table(r, 3.0 * (r - 1.0), 20.0 * r)
     assert fit.table.sigma_compression_um is None
@@ -106,7 +106,7 @@ def test_table_goes_through_json():
     assert KernelTable.from_json(table.to_json()) == table
 
 
-def test_a_direction_that_differs_is_told_from_ones_that_do_not(rng):
+def test_deviating_direction_is_separated_from_equal_ones(rng):
     r = np.tile([0.8, 0.87, 0.93, 1.07, 1.14, 1.21], 4)
     angle = np.repeat(np.radians([0.0, 45.0, 90.0, 135.0]), 6)
     alpha, sigma = kernel_parameters(r)
@@ -121,7 +121,7 @@ def test_a_direction_that_differs_is_told_from_ones_that_do_not(rng):
         direction_dependence(FOREHEAD, r, alpha, sigma, np.zeros(r.size))
 
 
-def test_a_line_of_sigma_that_would_vanish_near_neutral_is_held_at_the_smallest_sigma_searched():
+def test_vanishing_sigma_line_is_clamped_to_smallest_sigma():
     """Points that rise steeply, as the flat valley of alpha and sigma gives them."""
     fit = fit_table([1.1, 1.19, 1.28], [0.28, 0.5, 0.7], [23.5, 92.5, 91.0])
     slope, intercept = fit.table.sigma_stretch_um

@@ -14,7 +14,7 @@ def plain(cos_light, cos_view, eta):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("eta", [0.7, 1.0, 1.3, fresnel.ETA_SKIN, 1e6])
-def test_compiled_and_plain_transmittance_are_equal_to_the_last_bit(rng, eta, dtype):
+def test_compiled_and_plain_transmittance_are_bit_equal(rng, eta, dtype):
     cosines = rng.uniform(-0.2, 1.2, (2, 60, 70)).astype(dtype)
     special = np.array([0.0, 1.0, 1e-30, -1.0, 1e-8, np.nan, np.inf, -np.inf], dtype)
     cosines[:, 0, :8] = special
@@ -28,13 +28,13 @@ def test_compiled_and_plain_transmittance_are_equal_to_the_last_bit(rng, eta, dt
     np.testing.assert_array_equal(cosines, before)
 
 
-def test_a_matched_boundary_passes_everything_and_grazing_light_nothing():
+def test_matched_boundary_transmits_everything_and_grazing_light_nothing():
     up, low = np.ones(3), np.zeros(3)
     np.testing.assert_array_equal(boundary_kernels.transmitted(up, low, 1.0), 1.0)
     np.testing.assert_array_equal(boundary_kernels.transmitted(low, up, 1.4), 0.0)
 
 
-def test_samples_in_any_memory_order_and_none_at_all(rng):
+def test_transmittance_works_in_any_memory_order_or_empty(rng):
     cosines = rng.uniform(0.0, 1.0, (40, 30))
     turned = boundary_kernels.transmitted(cosines.T, cosines.T[:, ::1])
     np.testing.assert_array_equal(turned, plain(cosines.T, cosines.T, fresnel.ETA_SKIN))
@@ -42,7 +42,7 @@ def test_samples_in_any_memory_order_and_none_at_all(rng):
 
 
 @pytest.mark.parametrize("eta", [0.0, -1.0, np.nan, np.inf])
-def test_an_index_that_is_none_is_refused(eta):
+def test_invalid_index_is_refused(eta):
     with pytest.raises(ValueError, match="eta: got"):
         boundary_kernels.transmitted(np.ones(2), np.ones(2), eta)
     with pytest.raises(ValueError, match="cos_light: got"):

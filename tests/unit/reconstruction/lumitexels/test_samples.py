@@ -109,7 +109,7 @@ def image(view, light):
     return signal, np.full_like(signal, 1e-4), None
 
 
-def test_samples_of_a_lambertian_sphere_are_its_albedo_over_pi():
+def test_lambertian_sphere_samples_are_albedo_over_pi():
     """Bilinear sampling on a sphere errs by curvature; well inside it is far below 0.5 %."""
     found = gather(surface(), cameras=CAMERAS, lights=LIGHTS, images=image, caster=CASTER)
     inner = found.valid & (found.cos_light > 0.3) & (found.cos_view > 0.4)
@@ -139,7 +139,7 @@ def test_directions_and_cosines_are_those_of_geometry():
     assert found.view.tolist() == [0] * 4 + [1] * 4
 
 
-def test_a_point_counts_only_where_it_faces_light_and_camera():
+def test_point_counts_only_when_facing_light_and_camera():
     found = gather(surface(5), cameras=CAMERAS, lights=LIGHTS, images=image, caster=CASTER)
     assert (found.cos_light[found.valid] > 0.1).all()
     assert (found.cos_view[found.valid] > 0.1).all()
@@ -149,7 +149,7 @@ def test_a_point_counts_only_where_it_faces_light_and_camera():
     assert np.isinf(found.variance[~found.valid]).all()
 
 
-def test_what_stands_before_the_light_takes_its_samples_and_no_others():
+def test_occluder_before_light_removes_only_its_samples():
     where = surface(5)
     barrier = trimesh.creation.box(extents=(30, 30, 1)).apply_translation(
         0.5 * LIGHTS.position_mm[2]
@@ -228,7 +228,7 @@ def test_variances_are_those_of_noisy_samples(rng):
     assert ratio.mean() == pytest.approx(1.0, abs=0.05)
 
 
-def test_a_moved_subject_gives_the_samples_of_one_at_rest_when_its_poses_are_known():
+def test_moved_subject_with_known_poses_gives_rest_samples():
     """The sphere is turned and shifted 3 mm before each frame; only the shift shows in images."""
     angle = 0.02
     turn = np.array(
@@ -287,7 +287,7 @@ class _Shifted:
         return center + (-along - np.sqrt(np.where(inside > 0, inside, np.nan)))[..., None] * way
 
 
-def test_a_binned_image_is_read_at_the_middle_of_its_cells():
+def test_binned_image_is_read_at_cell_centers():
     """A ramp over the columns: cell k of width 2 stands for pixel 2 k + 0.5."""
     ramp = np.broadcast_to(2 * np.arange(WIDTH // 2) + 0.5, (HEIGHT // 2, WIDTH // 2))
     signal = np.repeat(ramp[..., None], 3, axis=-1).astype(np.float32)
@@ -306,7 +306,7 @@ def test_a_binned_image_is_read_at_the_middle_of_its_cells():
     np.testing.assert_allclose(seen[:, 1], column[found.valid], rtol=1e-4)
 
 
-def test_a_store_on_disk_gives_the_same_samples_chunk_by_chunk(tmp_path):
+def test_disk_store_gives_same_samples_chunk_by_chunk(tmp_path):
     where = surface(5)
     words = {"cameras": CAMERAS, "lights": LIGHTS, "caster": CASTER}
     whole = gather(where, images=image, **words)
@@ -325,7 +325,7 @@ def test_a_store_on_disk_gives_the_same_samples_chunk_by_chunk(tmp_path):
     assert covered == len(where)
 
 
-def test_samples_asked_for_again_are_kept_until_an_image_comes_in(tmp_path, monkeypatch):
+def test_requested_samples_are_kept_until_new_image_arrives(tmp_path, monkeypatch):
     where = surface(5)
     words = {"cameras": CAMERAS, "lights": LIGHTS, "caster": CASTER}
 
@@ -398,7 +398,7 @@ def test_arguments_that_do_not_fit_are_named(change, says):
         gather(surface(), **words, **change)
 
 
-def test_a_surface_needs_one_unit_normal_a_point():
+def test_surface_requires_unit_normal_per_point():
     with pytest.raises(ValueError, match="lengths of normals: got"):
         Surface(np.zeros((2, 3)), np.ones((2, 3)))
     with pytest.raises(ValueError, match="normals: got"):
@@ -407,7 +407,7 @@ def test_a_surface_needs_one_unit_normal_a_point():
         Surface(np.full((2, 3), np.nan), np.zeros((2, 3)))
 
 
-def test_a_point_inside_the_mesh_sees_nothing():
+def test_point_inside_mesh_has_no_valid_samples():
     where = Surface(np.zeros((1, 3)), np.array([[0.0, 0, 1]]))
     found = gather(where, cameras=CAMERAS, lights=LIGHTS, images=image, caster=CASTER)
     assert not found.valid.any()

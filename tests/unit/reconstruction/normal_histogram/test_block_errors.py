@@ -23,7 +23,7 @@ def test_independent_blocks_have_the_error_of_independent_samples(rng):
 
 
 @pytest.mark.parametrize("reach", [0.5, 1.0])
-def test_intervals_of_the_mean_of_a_correlated_field_hold_the_truth(reach, rng):
+def test_correlated_field_mean_intervals_have_nominal_coverage(reach, rng):
     """White noise smoothed over part of a block, cut out of a larger field whose mean is 0."""
     held, naive, trials, part = 0, 0, 150, 6
     for _ in range(trials):
@@ -50,7 +50,7 @@ def test_a_block_counts_by_its_samples(rng):
     assert after == pytest.approx(before, rel=0.2)
 
 
-def test_too_few_blocks_tell_nothing_and_equal_ones_no_error():
+def test_too_few_blocks_give_nothing_equal_zero_error():
     few = np.arange(MIN_BLOCKS - 1.0)
     assert stderr_of_mean(few, np.ones(few.size), PLACES[: few.size]) == (np.inf, 1.0)
     assert stderr_of_mean(np.full(9, 0.5), np.ones(9), PLACES[:9]) == (0.0, 1.0)

@@ -29,7 +29,7 @@ def test_histogram_is_that_of_numpy(rng, limit):
     assert nh.distance(found, numpy_histogram(height.T, pixel=1.5, limit=limit, bins=32)) > 0.05
 
 
-def test_a_slope_that_falls_to_the_right_and_to_the_top_has_its_normal_there():
+def test_slope_falling_right_and_up_has_normal_there():
     rows, columns = np.mgrid[0:10, 0:12].astype(float)
     height = -0.5 * columns + 0.2 * rows  # row 0 is the top: height falls towards it
     shares = nh.histogram(height, pixel=1.0, bins=64)
@@ -61,7 +61,7 @@ def test_holes_and_nan_take_no_part(rng):
     assert nh.distance(seen, nh.histogram(spoiled, pixel=1.0)) > 0.01
 
 
-def test_normals_and_heights_give_one_histogram(rng):
+def test_normals_and_heights_give_same_histogram(rng):
     height = rough(50, rng)
     dx, dy, known = relief_slopes.slopes(height, pixel=1.0)
     normals = np.stack([-dx, -dy, np.ones_like(dx)], axis=-1)
@@ -89,7 +89,7 @@ def test_maps_without_slopes_are_refused():
         nh.histogram(np.zeros((9, 9)), pixel=1.0, limit=1.5)
 
 
-def test_noise_floor_is_the_mean_distance_of_independent_samples(rng):
+def test_noise_floor_is_mean_distance_of_independent_samples(rng):
     p = rng.dirichlet(np.full(300, 0.5))
     for n in (200, 5000):
         distances = [
@@ -99,7 +99,7 @@ def test_noise_floor_is_the_mean_distance_of_independent_samples(rng):
         assert abs(np.mean(distances) - nh.noise_floor(p, n)) < 4 * stderr + 0.005
 
 
-def test_halved_distance_is_the_share_in_other_buckets():
+def test_halved_distance_is_fraction_in_other_buckets():
     a, b = np.array([0.5, 0.5, 0.0]), np.array([0.5, 0.0, 0.5])
     assert nh.distance(a, b) == 1.0
     assert nh.halved_distance(a, b) == 0.5
@@ -107,7 +107,7 @@ def test_halved_distance_is_the_share_in_other_buckets():
         nh.distance(a, b[:2])
 
 
-def test_a_list_of_rows_is_a_relief_and_a_stack_is_none():
+def test_row_list_is_topography_but_stack_is_not():
     rows = [[0.0, 0.2, 0.5], [0.1, 0.2, 0.9]]
     of_list = nh.histogram(rows, pixel=1.0, bins=8)
     np.testing.assert_array_equal(of_list, nh.histogram(np.array(rows), pixel=1.0, bins=8))

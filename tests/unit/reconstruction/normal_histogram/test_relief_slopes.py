@@ -9,13 +9,13 @@ from reconstruction.normal_histogram.relief_slopes import (
 )
 
 
-def test_a_wide_pixel_halves_the_slope_along_its_rows():
+def test_wide_pixel_halves_slope_along_rows():
     height = np.tile(0.4 * np.arange(9.0), (9, 1))
     wide, _, _ = slopes(height, pixel=(1.0, 2.0))
     np.testing.assert_allclose(wide, 0.2, atol=1e-12)
 
 
-def test_slopes_are_numpys_gradients_and_one_sided_beside_holes(rng):
+def test_slopes_match_numpy_gradient_single_sided_near_holes(rng):
     height = rng.standard_normal((9, 12))
     a, b, known = slopes(height, pixel=(2.0, 3.0))
     assert known.all()
@@ -51,7 +51,7 @@ def test_a_list_of_rows_is_a_map():
         (None, "object"),
     ],
 )
-def test_what_is_no_map_of_real_numbers_is_refused(height, told):
+def test_non_real_map_is_refused(height, told):
     with pytest.raises(HistogramError, match=f"height: got {told}" if told[0] != "s" else told):
         stencil(height)
 
@@ -65,7 +65,7 @@ def test_masks_of_another_shape_or_type_are_refused(valid):
         slopes_of_normals(normals, valid=valid)
 
 
-def test_normals_that_face_away_or_are_not_finite_have_no_slope():
+def test_back_facing_or_nonfinite_normals_have_no_slope():
     normals = np.array([[0.3, -0.4, 1.0], [0.3, -0.4, 0.0], [0.0, 0.0, -1.0], [np.nan, 0.0, 1.0]])
     kept = normals.copy()
     a, b, known = slopes_of_normals(2.0 * normals)

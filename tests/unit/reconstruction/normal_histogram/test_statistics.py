@@ -11,7 +11,7 @@ def rough(side, rng, *, correlation_px=2.0, slope=0.3):
     return height * slope / np.gradient(height)[1].std()
 
 
-def test_flat_patch_lies_in_one_bucket_and_is_not_called_aliased():
+def test_flat_patch_fills_single_bucket_without_aliasing():
     flat = measure(np.zeros((20, 20)), pixel=1.0)
     assert flat.occupied == 1
     assert flat.variance_x == flat.variance_y == flat.stderr_x == 0.0
@@ -50,7 +50,7 @@ def test_standard_error_of_variances_is_their_scatter(rng):
     assert scatter > 2.0 * plain  # as if pixels were independent: too small
 
 
-def test_effective_number_of_correlated_normals_tells_the_distance_of_two_patches(rng):
+def test_effective_normal_count_predicts_distance_of_two_patches(rng):
     pairs = [
         [measure(rough(192, rng, correlation_px=5.0), pixel=1.0, bins=16) for _ in range(2)]
         for _ in range(12)

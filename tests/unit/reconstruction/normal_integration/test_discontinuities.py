@@ -43,7 +43,7 @@ def plain_objective(height, normals, k):
     return total
 
 
-def test_a_flap_stands_up_that_a_joined_surface_pulls_down():
+def test_bilateral_integration_raises_flap_joined_surface_flattens():
     truth, normals, _ = flap(96, 1.0)
     joined = rms(integrate(normals), truth)
     found = integrate_broken(normals, settings=Bilateral(sharpness=20.0, stop=0.0))
@@ -61,7 +61,7 @@ def test_the_objective_is_that_of_the_paper():
     assert not found.settled
 
 
-def test_weights_lie_between_zero_and_one_and_open_at_the_jump():
+def test_weights_within_unit_interval_open_at_jump():
     truth, normals, on = flap(96, 1.0)
     found = integrate_broken(normals, settings=Bilateral(sharpness=20.0, stop=0.0))
     assert found.right.min() >= 0.0
@@ -75,7 +75,7 @@ def test_weights_lie_between_zero_and_one_and_open_at_the_jump():
     assert beside.max() > 0.99
 
 
-def test_a_smooth_surface_stays_the_same_up_to_first_order():
+def test_smooth_surface_is_unchanged_to_first_order():
     truth, normals, _ = flap(64, 0.0)
     found = integrate_broken(normals)
     assert rms(found.height, truth) < 0.02 * np.std(truth)
@@ -96,7 +96,7 @@ def test_masks_and_parts_are_kept():
         assert abs(found.height[found.part == part].mean()) < 1e-5
 
 
-def test_one_pixel_and_one_row_have_a_height():
+def test_single_pixel_and_single_row_have_height():
     flat = np.broadcast_to([0.1, 0.0, 1.0], (1, 9, 3))
     assert integrate_broken(flat[:, :1]).height.shape == (1, 1)
     np.testing.assert_allclose(np.diff(integrate_broken(flat).height), -0.1, atol=1e-6)

@@ -32,7 +32,7 @@ def disc_with_holes(side):
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_planes_vanish_up_to_the_border_and_bulges_all_but(masked):
+def test_planes_vanish_to_border_and_bulges_nearly(masked):
     side = 120
     valid = disc_with_holes(side) if masked else None
     y, x = np.mgrid[0:side, 0:side].astype(float)
@@ -44,7 +44,7 @@ def test_planes_vanish_up_to_the_border_and_bulges_all_but(masked):
     assert np.abs(left).max() < 0.02 * 36.0
 
 
-def test_a_filter_without_planes_would_fail_at_the_border():
+def test_filter_without_planes_would_fail_at_border():
     from scipy.ndimage import gaussian_filter
 
     plane = np.add.outer(np.zeros(120), 3.0 * np.arange(120.0))
@@ -67,7 +67,7 @@ def test_parts_do_not_see_each_other():
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (2, 3)])
-def test_narrow_pictures_are_filtered(shape):
+def test_narrow_images_are_filtered(shape):
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]].astype(float)
     left = high_pass(2.0 * x - y, pixel=1.0, cutoff=10.0)
     assert np.isfinite(left).all()
@@ -85,7 +85,7 @@ def test_masked_values_do_not_matter():
     np.testing.assert_array_equal(a, b)
 
 
-def test_filters_refuse_what_makes_no_sense():
+def test_filters_refuse_invalid_arguments():
     flat = np.zeros((4, 4))
     for call in (
         lambda: high_pass(flat, pixel=1.0, cutoff=0.0),
@@ -100,7 +100,7 @@ def test_filters_refuse_what_makes_no_sense():
             call()
 
 
-def test_noise_is_smoothed_and_its_variance_told(rng):
+def test_noise_is_smoothed_and_its_variance_estimated(rng):
     field = slope_fields.from_normals(facing_with_noise((150, 150), 0.02, rng), stderr_rad=0.02)
     smooth = denoise_slopes(field)
     ratio = smooth.gx.var() / field.gx.var()
@@ -122,7 +122,7 @@ def test_the_strength_follows_the_stated_noise(rng):
     assert denoise_slopes(field, strength=0.0) is field
 
 
-def test_an_edge_of_slopes_is_kept_and_does_not_ring(rng):
+def test_slope_edge_is_kept_without_ringing(rng):
     sigma = 0.02
     slope = np.where(np.arange(80) < 40, -0.4, 0.5)
     n = np.stack([-slope, np.zeros(80), np.ones(80)], axis=-1)

@@ -69,7 +69,7 @@ def direct(ax, ay, dx, dy):
 
 
 @pytest.mark.parametrize("method", ["dct", "multigrid"])
-def test_an_asymmetric_surface_comes_back_the_right_way_round(method):
+def test_asymmetric_surface_returns_correctly_oriented(method):
     truth, normals = crooked_surface(70, 90)
     height = integrate(normals, pixel=6.0, method=method, settings=Settings(tolerance=1e-9))
     error = height / 6.0 - centered(truth, np.ones(truth.shape, bool))
@@ -79,13 +79,13 @@ def test_an_asymmetric_surface_comes_back_the_right_way_round(method):
     assert np.abs(mirrored / 6.0 - centered(truth, np.ones(truth.shape, bool))).max() > 1.0
 
 
-def test_normals_with_y_down_are_read_with_y_up_false():
+def test_normals_with_y_down_need_y_up_false():
     _, normals = crooked_surface(40, 50)
     flipped = normals * [1.0, -1.0, 1.0]
     np.testing.assert_allclose(integrate(flipped, y_up=False), integrate(normals), atol=1e-12)
 
 
-def test_a_plane_is_exact_whatever_its_order_and_scale(rng):
+def test_plane_is_exact_for_any_order_and_scale(rng):
     y, x = np.mgrid[0:13, 0:17]
     normals = np.broadcast_to(normals_of(np.array(0.4), np.array(-1.1)), (13, 17, 3))
     truth = 0.4 * x - 1.1 * y
@@ -94,7 +94,7 @@ def test_a_plane_is_exact_whatever_its_order_and_scale(rng):
         np.testing.assert_allclose(height, 2.5 * (truth - truth.mean()), atol=1e-10)
 
 
-def test_the_fourth_order_leaves_a_thirtieth_of_the_error_of_the_mean_of_two():
+def test_fourth_order_leaves_thirtieth_of_second_order_error():
     x = np.mgrid[0:96, 0:96][1]
     theta = 2 * np.pi * 8 / 96
     truth = np.cos(theta * (x + 0.5))  # even at both borders
@@ -112,7 +112,7 @@ def test_the_fourth_order_leaves_a_thirtieth_of_the_error_of_the_mean_of_two():
 @pytest.mark.parametrize(
     "mask", ["disc", "parts", "pepper", "checkerboard", "necks", "odd rows", "one pixel", "spiral"]
 )
-def test_the_multigrid_solves_what_a_direct_solver_solves(mask, weighted, rng):
+def test_multigrid_matches_direct_solver(mask, weighted, rng):
     rows, columns = 45, 62
     _, normals = crooked_surface(rows, columns)
     y, x = np.mgrid[0:rows, 0:columns]
@@ -173,7 +173,7 @@ def test_a_cycle_is_a_symmetric_positive_preconditioner(rng):
     assert np.vdot(cycle(a), a) > 0
 
 
-def test_iterations_hardly_grow_with_the_picture():
+def test_iterations_barely_grow_with_image_size():
     counts = []
     for side in (64, 256):
         _, normals = crooked_surface(side, side)
@@ -198,7 +198,7 @@ def test_the_result_does_not_depend_on_threads():
         np.testing.assert_array_equal(height, heights[0])
 
 
-def test_weights_save_a_height_from_a_region_of_noise(rng):
+def test_weights_protect_height_from_noisy_region(rng):
     truth, normals = crooked_surface(96, 96)
     stderr = np.full((96, 96), 0.01)
     stderr[30:60, 30:60] = 1.0
@@ -233,7 +233,7 @@ def test_weights_over_twelve_decades_are_solved(rng):
 
 
 @pytest.mark.parametrize("focal_px", [50_000.0, 400.0])
-def test_perspective_finds_the_depth_of_a_sphere_seen_by_a_pinhole(focal_px):
+def test_perspective_finds_sphere_depth_from_pinhole_view(focal_px):
     # Rays meet a sphere of radius 0.3 of the distance; all in closed form.
     side, pixel = 81, 0.006
     distance = focal_px * pixel
@@ -279,13 +279,13 @@ def test_a_flat_patch_is_flat():
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 23), (23, 1), (2, 2), (1, 2), (3, 200)])
 @pytest.mark.parametrize("method", ["dct", "multigrid"])
-def test_narrow_pictures_are_integrated(shape, method):
+def test_narrow_images_are_integrated(shape, method):
     truth, normals = crooked_surface(*shape)
     height = integrate(normals, method=method, settings=Settings(tolerance=1e-9))
     assert np.abs(height - (truth - truth.mean())).max() < 5e-3
 
 
-def test_what_has_no_height_is_zero_and_not_valid():
+def test_undetermined_height_is_zero_and_invalid():
     truth, normals = crooked_surface(30, 30)
     normals[3, 4] = np.nan
     normals[10, 11] = 0.0
@@ -325,7 +325,7 @@ def test_normal_maps_bring_their_mask_and_standard_errors(rng):
     )
 
 
-def test_inputs_are_left_as_they_are_and_the_type_stays():
+def test_inputs_are_unmodified_and_type_is_kept():
     _, normals = crooked_surface(16, 16)
     single = normals.astype(np.float32)
     mask, before = disc(16, 16), single.copy()
@@ -350,14 +350,14 @@ def test_inputs_are_left_as_they_are_and_the_type_stays():
         ({"method": "magic"}, "magic"),
     ],
 )
-def test_what_cannot_be_integrated_is_named(change, message):
+def test_invalid_integration_input_is_refused_by_name(change, message):
     given = {"normals": np.broadcast_to([0.0, 0.0, 1.0], (4, 4, 3)), **change}
     with pytest.raises(IntegrationError, match=message):
         integrate(given.pop("normals"), **given)
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
-def test_normals_of_a_stack_are_integrated_each_by_itself(rng, kind):
+def test_stacked_normals_are_integrated_independently(rng, kind):
     n = (rng.normal(size=(2, 3, 9, 10, 3)) * 0.2 + [0.0, 0.0, 1.0]).astype(kind)
     valid = rng.random((9, 10)) > 0.1
     errors = rng.uniform(0.01, 0.02, (3, 9, 10))
@@ -389,7 +389,7 @@ def test_settings_and_cameras_out_of_range_are_named():
             make()
 
 
-def test_too_few_iterations_are_said(rng):
+def test_too_few_iterations_raise_not_converged(rng):
     _, normals = crooked_surface(64, 64)
     noisy = normals + 0.1 * rng.standard_normal(normals.shape)
     with pytest.raises(NotConverged, match="after 1"):

@@ -66,14 +66,14 @@ def test_the_wrong_lens_gives_less_back():
     assert right < 0.7 * wrong
 
 
-def test_noise_is_told_by_what_no_lens_passes():
+def test_noise_is_estimated_beyond_lens_cutoff():
     found = restore(normals_of(seen(bumps(slope=0.05), 0.02)), lens=LENS, valid=ALL)
     # about 9,000 independent powers beyond the cutoff: 1 % scatter; normals bend slopes by < 1 %
     assert found.noise == pytest.approx(0.02, rel=0.05)
     assert found.kept_noise < found.noise
 
 
-def test_noise_that_is_left_is_that_of_the_drawn_fields():
+def test_remaining_noise_matches_sampled_fields():
     found = restore(normals_of(seen(bumps(), 0.03)), lens=LENS, valid=ALL)
     drawn = found.noise_field(np.random.default_rng(5))
     assert np.std(drawn[0]) == pytest.approx(found.kept_noise, rel=0.2)
@@ -85,7 +85,7 @@ def test_a_flat_patch_stays_flat():
     assert np.array_equal(found.normals, flat)
 
 
-def test_pure_noise_is_left_out():
+def test_pure_noise_is_omitted():
     rng = np.random.default_rng(2)
     noise = [0.05 * rng.standard_normal((SIDE, SIDE)) for _ in range(2)]
     found = restore(normals_of(noise), lens=LENS, valid=ALL)
@@ -100,7 +100,7 @@ def test_a_mean_tilt_is_kept():
     assert np.mean(slopes[1]) == pytest.approx(-0.1, abs=2e-3)
 
 
-def test_what_is_not_valid_stands_upright():
+def test_invalid_pixels_get_upright_normals():
     valid = ALL.copy()
     valid[40:60, 40:60] = False
     found = restore(normals_of(bumps()), lens=LENS, valid=valid)
@@ -110,6 +110,6 @@ def test_what_is_not_valid_stands_upright():
 @pytest.mark.parametrize(
     ("lens", "valid", "words"), [(Aperture(17.9, 30.0), ALL, "pixel_um"), (LENS, ~ALL, "valid")]
 )
-def test_what_cannot_be_restored_is_refused(lens, valid, words):
+def test_invalid_restoration_input_is_refused(lens, valid, words):
     with pytest.raises(RestorationError, match=words):
         restore(normals_of(bumps()), lens=lens, valid=valid)

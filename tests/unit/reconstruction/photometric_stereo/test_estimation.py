@@ -59,7 +59,7 @@ def test_normals_of_a_tilted_lambertian_plane_are_exact(tilt_rad, robust):
     assert found.normals.dtype == np.float64
 
 
-def test_a_surface_tilted_to_plus_x_is_brighter_under_lights_from_plus_x():
+def test_surface_tilted_plus_x_brightens_from_plus_x():
     lights = ring(12)
     image = np.maximum(lights[:, 0], 0.0)[:, None] + 0.5 * lights[:, 2:]
     found = estimate_normals(image, lights, robust=False)
@@ -77,7 +77,7 @@ def test_whole_numbers_are_read_as_they_are(dtype):
     np.testing.assert_array_equal(image, kept)
 
 
-def test_points_of_any_shape_are_fitted_one_by_one(rng):
+def test_points_of_any_shape_are_fitted_individually(rng):
     lights, normals = ring(20), caps(rng, 24)
     samples = lambertian(lights, normals) + 0.01 * rng.standard_normal((20, 24))
     whole = estimate_normals(samples.reshape(20, 2, 3, 4), lights)
@@ -85,7 +85,7 @@ def test_points_of_any_shape_are_fitted_one_by_one(rng):
     np.testing.assert_allclose(whole.normals.reshape(24, 3), alone, atol=1e-12)
 
 
-def test_directions_a_point_and_near_lights_equal_each_other(rng):
+def test_per_point_directions_and_near_lights_are_equal(rng):
     lights = 700.0 * ring(30)
     points = rng.uniform(-80, 80, (40, 3))
     normals = caps(rng, 40)
@@ -133,7 +133,7 @@ def reference_irls(lights, samples, *, shadow=0.1, steps=16, ends=8, tuning=4.68
     return b
 
 
-def test_the_kernel_equals_its_numpy_twin(rng):
+def test_kernel_equals_numpy_implementation(rng):
     lights, normals = ring(40, 0.3), caps(rng, 30)
     samples = lambertian(lights, normals) + 0.01 * rng.standard_normal((40, 30))
     samples[rng.random(samples.shape) < 0.1] = 0.0
@@ -154,7 +154,7 @@ def outliers(rng, lights, normals, noise):
     return samples.astype(np.float32)
 
 
-def test_shadows_and_highlights_move_the_robust_fit_little_and_least_squares_much(rng):
+def test_shadows_and_highlights_move_robust_fit_only_little(rng):
     lights, normals = ring(60, 0.4), caps(rng, 500)
     samples = outliers(rng, lights, normals, 0.01)
     robust = estimate_normals(samples, lights)
@@ -197,7 +197,7 @@ def test_standard_errors_of_the_robust_fit_cover(rng):
     assert np.mean((angular_error_rad(found.normals, normals) / found.stderr_rad) ** 2) > 1.5
 
 
-def test_a_variance_that_is_too_small_is_noticed_with_many_lights(rng):
+def test_understated_variance_is_detected_with_many_lights(rng):
     lights, normals = ring(100), caps(rng, 500, 0.4)
     samples = lambertian(lights, normals) + 0.01 * rng.standard_normal((100, 500))
     found = estimate_normals(samples, lights, variance=1e-6, robust=False)
@@ -205,7 +205,7 @@ def test_a_variance_that_is_too_small_is_noticed_with_many_lights(rng):
     assert 0.8 < ratio.mean() < 1.2
 
 
-def test_noisy_lights_weigh_less_when_their_variance_is_known(rng):
+def test_noisy_lights_weight_less_when_variance_is_known(rng):
     lights, normals = ring(20), caps(rng, 800, 0.4)
     noise = np.where(np.arange(20) % 2, 0.1, 0.002)
     samples = lambertian(lights, normals) + noise[:, None] * rng.standard_normal((20, 800))
@@ -215,7 +215,7 @@ def test_noisy_lights_weigh_less_when_their_variance_is_known(rng):
     assert ours < 0.1 * angular_error_rad(equal.normals, normals).mean()
 
 
-def test_the_error_falls_with_the_root_of_the_number_of_lights(rng):
+def test_error_falls_with_root_of_light_count(rng):
     normals = caps(rng, 3000, 0.4)
     errors = []
     for count in (30, 120):
@@ -237,7 +237,7 @@ def matte_few(rng, count, points=3000):
 
 
 @pytest.mark.parametrize("count", [8, 10, 12, 15])
-def test_matte_things_under_few_lights_are_not_worse_than_weighted_least_squares(count, rng):
+def test_few_light_matte_fit_matches_weighted_least_squares(count, rng):
     samples, lights, normals = matte_few(rng, count)
     plain = estimate_normals(samples, lights, robust=False)
     ours = estimate_normals(samples, lights)
@@ -252,7 +252,7 @@ def test_matte_things_under_few_lights_are_not_worse_than_weighted_least_squares
     assert worse.mean() > 3 * worse.std() / np.sqrt(both.sum())
 
 
-def test_clear_highlights_are_left_out_under_few_lights_too(rng):
+def test_clear_highlights_are_omitted_under_few_lights(rng):
     lights, normals = ring(12, 0.4), caps(rng, 2000, 0.5)
     samples = lambertian(lights, normals) + 0.03 * rng.standard_normal((12, 2000))
     samples[rng.integers(0, 12, 2000), np.arange(2000)] += 0.8
@@ -266,7 +266,7 @@ def test_clear_highlights_are_left_out_under_few_lights_too(rng):
 
 @pytest.mark.parametrize("robust", [True, False])
 @pytest.mark.parametrize("count", [3, 4, 6, 12, 33])
-def test_extreme_pixels_are_masked_or_right_and_never_nan(count, robust):
+def test_extreme_pixels_are_masked_or_right_never_nan(count, robust):
     lights = ring(count)
     image = np.zeros((count, 8), np.float32)
     image[:, 1] = lights @ tilted(0.2)  # albedo 1
@@ -289,7 +289,7 @@ def test_extreme_pixels_are_masked_or_right_and_never_nan(count, robust):
         assert not found.valid[[3, 6]].any()
 
 
-def test_a_point_in_attached_shadow_of_half_its_lights_is_exact():
+def test_point_shadowed_from_half_its_lights_is_exact():
     lights = np.concatenate([ring(40, 0.0), -ring(40, 0.0)])
     normal = tilted(1.0)
     found = estimate_normals(lambertian(lights, normal[None]), lights)
@@ -300,7 +300,7 @@ def test_a_point_in_attached_shadow_of_half_its_lights_is_exact():
     np.testing.assert_allclose(wrong.albedo, 0.5, atol=0.02)  # least squares halves it
 
 
-def test_one_hot_pixel_does_not_move_the_normal():
+def test_single_hot_pixel_does_not_move_normal():
     lights, normal = ring(16), tilted(0.3)
     image = lambertian(lights, normal[None])
     image[5] = 50.0
@@ -317,7 +317,7 @@ def test_pixels_of_noise_alone_are_not_valid(rng):
     assert found.valid.mean() < 0.5
 
 
-def test_three_lights_without_variance_bound_nothing_and_with_it_they_do():
+def test_three_lights_bound_errors_only_with_variance():
     lights, normal = ring(3), tilted(0.1)
     image = lambertian(lights, normal[None])
     unknown = estimate_normals(image, lights)
@@ -327,7 +327,7 @@ def test_three_lights_without_variance_bound_nothing_and_with_it_they_do():
     assert known.stderr_rad[0] < 0.2
 
 
-def test_points_whose_good_lights_are_in_a_plane_are_masked():
+def test_points_whose_good_lights_are_coplanar_are_masked():
     lights = np.concatenate([ring(8), [[1, 0, 0], [0, 0, 1], [0.6, 0, 0.8], [0.8, 0, 0.6]]])
     image = lambertian(lights, tilted(0.2)[None])
     usable = np.zeros(image.shape, bool)
@@ -347,7 +347,7 @@ def test_points_whose_good_lights_are_in_a_plane_are_masked():
         (np.array([[0, 0, 1], [1, 0, 0], [0, np.nan, 0], [0, 1, 0]]), r"light_directions\[2\]"),
     ],
 )
-def test_lights_that_tell_no_normal_are_refused_by_name(lights, expected):
+def test_lights_determining_no_normal_are_refused_by_name(lights, expected):
     with pytest.raises(PhotometricStereoError, match=expected):
         estimate_normals(np.ones((len(lights), 2, 2)), lights)
 
@@ -383,7 +383,7 @@ def test_tiles_and_threads_change_nothing(rng, monkeypatch):
     np.testing.assert_array_equal(whole.normals, tiled.normals)
 
 
-def test_the_biweight_keeps_95_percent_of_the_efficiency_of_least_squares(rng):
+def test_biweight_keeps_95_percent_of_least_squares_efficiency(rng):
     lights, normals = ring(60), caps(rng, 6000, 0.3)
     samples = lambertian(lights, normals) + 0.01 * rng.standard_normal((60, 6000))
     robust = angular_error_rad(estimate_normals(samples, lights).normals, normals)
@@ -398,7 +398,7 @@ def test_the_biweight_keeps_95_percent_of_the_efficiency_of_least_squares(rng):
 
 
 @pytest.mark.parametrize("photons", [3.0, 10.0])
-def test_errors_of_few_photons_hold_with_the_variance_that_a_fit_expects(photons):
+def test_few_photon_coverage_is_nominal_with_expected_variance(photons):
     """Rationale: Poisson counts, whose own variance is a draw as well. Expected: 68 % intervals
     hold 60 to 76 %. Tolerance: that range; 2000 points tell it to a percent.
 

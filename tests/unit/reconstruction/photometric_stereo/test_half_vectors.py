@@ -40,7 +40,7 @@ def lobes(rng, count=80, lights=150, views=8, exponent=12.0):
     )
 
 
-def test_the_half_vector_finds_normals_to_the_spacing_of_the_lights(rng):
+def test_half_vector_finds_normals_within_light_spacing(rng):
     value, light, view_dir, view, n, valid = lobes(rng)
     found = estimate(value, light, view_dir, view, valid=valid)
     error = np.degrees(angular_error_rad(found.normals, n))[found.valid]
@@ -58,7 +58,7 @@ def test_denser_lights_give_better_normals(rng):
     assert errors[1] < 0.5 * errors[0]
 
 
-def test_a_view_that_disagrees_is_left_out(rng):
+def test_disagreeing_view_is_omitted(rng):
     value, light, view_dir, view, _, valid = lobes(rng, lights=600)
     clean = estimate(value, light, view_dir, view, valid=valid)
     bad = value.copy()

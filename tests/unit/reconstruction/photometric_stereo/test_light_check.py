@@ -36,7 +36,7 @@ def test_the_right_order_is_left_alone(rng):
         "the halves exchanged",
     ],
 )
-def test_a_wrong_order_is_named_and_mended(name, rng):
+def test_wrong_order_is_reported_and_corrected(name, rng):
     samples, direction = scene(rng)
     order = light_check._orders(24)[name]
     listed = np.empty_like(direction)
@@ -47,13 +47,13 @@ def test_a_wrong_order_is_named_and_mended(name, rng):
     assert found.misfit[name] < 0.5 * found.misfit["as listed"]
 
 
-def test_an_order_that_nobody_would_write_is_called_unknown(rng):
+def test_implausible_order_is_called_unknown(rng):
     samples, direction = scene(rng)
     found = light_check.check(samples, rng.permutation(direction), rng=rng)
     assert found.order == "unknown"
 
 
-def test_a_dead_light_is_found_and_weak_ones_are_measured(rng):
+def test_dead_light_is_found_and_weak_lights_measured(rng):
     samples, direction = scene(rng)
     samples[7] = 0.002 * rng.standard_normal(samples.shape[1])
     samples[11] *= 0.5

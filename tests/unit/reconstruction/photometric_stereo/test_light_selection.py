@@ -63,7 +63,7 @@ def test_least_squares_scatters_as_predicted():
     assert abs(z) < 4.0  # 6e-5 false alarms
 
 
-def test_another_light_never_hurts_and_its_gain_is_the_difference():
+def test_added_light_never_hurts_with_gain_as_difference():
     found = told(face(), dome(10))
     few = selection.predict(found, range(5), least=3)
     gain = selection._gains(found, list(range(5)), least=3)
@@ -76,7 +76,7 @@ def test_another_light_never_hurts_and_its_gain_is_the_difference():
             assert gain[light] == pytest.approx(lost, rel=1e-6)
 
 
-def test_a_greedy_choice_is_nearly_the_best_of_all():
+def test_greedy_choice_is_nearly_optimal():
     found, least = told(face(), dome(11), systematic_rad=0.0), 3
     greedy = selection.select(found, median_rad=0.0, valid_share=2.0, least=least, most=6)
 
@@ -89,7 +89,7 @@ def test_a_greedy_choice_is_nearly_the_best_of_all():
     assert loss(greedy.lights) < every[len(every) // 4]  # far better than at random
 
 
-def test_the_choice_stops_where_what_is_wanted_is_reached_and_keeps_nothing_superfluous():
+def test_selection_stops_at_target_and_keeps_nothing_superfluous():
     found = told(face(), dome(60), 0.02)
     chosen = selection.select(found, median_rad=np.radians(0.6), valid_share=0.95, least=6)
     assert chosen.reached
@@ -102,14 +102,14 @@ def test_the_choice_stops_where_what_is_wanted_is_reached_and_keeps_nothing_supe
     assert len(tighter.lights) > len(chosen.lights)
 
 
-def test_what_no_light_removes_is_said_to_be_out_of_reach():
+def test_irreducible_error_is_reported_out_of_reach():
     found = told(face(), dome(30), systematic_rad=np.radians(1.0))
     chosen = selection.select(found, median_rad=np.radians(0.9), valid_share=0.5, least=6)
     assert not chosen.reached
     assert len(chosen.lights) == 30
 
 
-def test_the_median_of_rayleigh_angles_is_that_of_draws():
+def test_rayleigh_angle_median_matches_samples():
     rng = np.random.default_rng(3)
     scale = np.array([0.1, 0.3, 1.0])
     drawn = rng.rayleigh(np.repeat(scale, 40_000))

@@ -30,7 +30,7 @@ def graph(calls, gain=2):
     ]
 
 
-def test_only_the_ancestors_of_what_is_wanted_run():
+def test_only_ancestors_of_requested_products_run():
     calls = []
     outcome = run(graph(calls), ["map"])
     assert calls == ["read", "scale", "invert"]
@@ -48,7 +48,7 @@ def test_asking_for_nothing_new_does_no_work():
     assert outcome.products == {"map": 7}
 
 
-def test_a_changed_parameter_runs_again_what_depends_on_it_and_no_more():
+def test_changed_parameter_reruns_only_its_dependents():
     calls, cache = [], {}
     run(graph(calls), ["map"], cache=cache)
     calls.clear()
@@ -58,7 +58,7 @@ def test_a_changed_parameter_runs_again_what_depends_on_it_and_no_more():
     assert outcome.products == {"map": 16}
 
 
-def test_an_unknown_map_is_named_with_those_that_can_be_made():
+def test_unknown_map_error_lists_available_maps():
     with pytest.raises(StageError, match=r"'melanine'.*expected one of .*map"):
         run(graph([]), ["melanine"])
 
@@ -69,13 +69,13 @@ def test_stages_that_need_each_other_are_refused():
         order(stages, ["x"])
 
 
-def test_two_makers_of_one_product_are_refused():
+def test_two_makers_of_same_product_are_refused():
     stages = [Stage("a", (), ("x",), dict), Stage("b", (), ("x",), dict)]
     with pytest.raises(StageError, match="made by"):
         order(stages, ["x"])
 
 
-def test_a_stage_that_makes_something_else_is_found_out():
+def test_stage_making_wrong_product_is_detected():
     with pytest.raises(StageError, match="made"):
         run([Stage("a", (), ("x",), lambda: {"z": 1})], ["x"])
 
@@ -126,7 +126,7 @@ def surface_graph(calls):
     ]
 
 
-def test_a_stage_whose_map_is_kept_but_not_what_it_hands_on_runs_again():
+def test_stage_with_kept_map_but_lost_product_reruns():
     calls, folder = [], Folder("normals", "weight", "basis.npz")
     first = run(surface_graph(calls), ["normals"], cache=folder)
     assert first.ran == ("samples", "normals")
@@ -140,7 +140,7 @@ def test_a_stage_whose_map_is_kept_but_not_what_it_hands_on_runs_again():
     assert outcome.left_out == ()
 
 
-def test_a_map_that_is_kept_is_not_made_again_for_a_stage_that_does_not_need_it():
+def test_kept_map_is_not_remade_for_independent_stage():
     calls, folder = [], Folder("normals", "weight", "basis.npz")
     run(surface_graph(calls), ["weight"], cache=folder)
     calls.clear()
@@ -150,7 +150,7 @@ def test_a_map_that_is_kept_is_not_made_again_for_a_stage_that_does_not_need_it(
     assert outcome.left_out == (("samples", "what depends on it was reused"),)
 
 
-def test_files_go_along_with_the_maps_of_their_stage():
+def test_files_accompany_maps_of_their_stage():
     calls, folder = [], Folder("normals", "weight", "basis.npz")
     made = run(surface_graph(calls), ["weight", "basis.npz"], cache=folder).products
     again = run(surface_graph(calls), ["basis.npz"], cache=folder)
@@ -159,7 +159,7 @@ def test_files_go_along_with_the_maps_of_their_stage():
     assert calls == ["samples", "normals", "lobes"]
 
 
-def test_a_stage_that_can_be_reused_only_in_part_is_made_whole():
+def test_partly_reusable_stage_is_made_whole():
     """A folder that lost one of two maps of a stage has neither made from other inputs."""
     calls, folder = [], Folder("weight")
     run(surface_graph(calls), ["weight"], cache=folder)
@@ -170,7 +170,7 @@ def test_a_stage_that_can_be_reused_only_in_part_is_made_whole():
     assert outcome.reused == ()
 
 
-def test_what_is_known_to_be_refused_is_refused_before_anything_is_computed():
+def test_known_refusal_is_raised_before_computation():
     ran = []
     costly = Stage("costly", (), ("x",), lambda: ran.append(1) or {"x": 1})
     refused = Stage("scaled", ("x",), ("y",), lambda x: {"y": x}, refused="y: has no scale")

@@ -8,7 +8,7 @@ LIGHTS = tuple(f"L{k:03}" for k in range(12))
 VIEWS = ("C00", "C03", "C07")
 
 
-def test_names_and_places_mean_lights_and_views_of_the_session():
+def test_names_and_positions_select_lights_and_views():
     held = HoldOut.parse("lights=L007, 2,L007,views=1").within(LIGHTS, VIEWS)
     assert held == HoldOut(("L002", "L007"), ("C03",))
     assert held.holds("L007", "C00")
@@ -33,7 +33,7 @@ def test_nothing_held_out_holds_no_frame():
         ("lights=L001,lights=L002", "at most once"),
     ],
 )
-def test_a_list_that_says_nothing_clear_is_refused(text, named):
+def test_ambiguous_hold_out_list_is_refused(text, named):
     with pytest.raises(HoldOutError, match=named):
         HoldOut.parse(text)
 
@@ -42,6 +42,6 @@ def test_a_list_that_says_nothing_clear_is_refused(text, named):
     ("text", "named"),
     [("lights=L012", "L012"), ("lights=12", "0 to 11"), ("views=C01", "C00, C03, C07")],
 )
-def test_what_the_session_does_not_hold_is_refused_by_name(text, named):
+def test_hold_out_outside_session_is_refused_by_name(text, named):
     with pytest.raises(HoldOutError, match=named):
         HoldOut.parse(text).within(LIGHTS, VIEWS)

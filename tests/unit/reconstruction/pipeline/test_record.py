@@ -33,7 +33,7 @@ def why(entries):
     return {entry["stage"]: entry["why"] for entry in entries}
 
 
-def test_what_nothing_wanted_needs_is_skipped():
+def test_stage_unneeded_by_request_is_skipped():
     outcome = stages.run(graph(), ["melanin"])
     entries = stages.record(graph(), outcome, {})
     assert done(entries) == {"frames": "run", "separate": "run", "invert": "run", "draw": "skipped"}
@@ -42,7 +42,7 @@ def test_what_nothing_wanted_needs_is_skipped():
     assert [len(entry["inputs"]) for entry in entries] == [64, 64, 64, 0]
 
 
-def test_the_same_again_is_reused_and_what_it_needed_is_skipped():
+def test_repeated_run_is_reused_and_inputs_skipped():
     cache = {}
     first = stages.run(graph(), ["melanin"], cache=cache)
     cache = {key: made for key, made in cache.items() if "melanin" in made}
@@ -58,7 +58,7 @@ def test_the_same_again_is_reused_and_what_it_needed_is_skipped():
     assert why(entries)["invert"] == "its inputs are the same"
 
 
-def test_a_changed_setting_runs_what_depends_on_it_and_says_so():
+def test_changed_setting_reruns_dependents_and_reports_reason():
     cache = {}
     first = stages.run(graph(), ["melanin"], cache=cache)
     again = stages.run(graph(gain=3.0), ["melanin"], cache=cache)
@@ -69,7 +69,7 @@ def test_a_changed_setting_runs_what_depends_on_it_and_says_so():
 
 
 @pytest.mark.render
-def test_asking_for_nothing_new_reads_no_frame_and_touches_no_file(tmp_path, monkeypatch):
+def test_repeated_request_reads_no_frame_and_writes_nothing(tmp_path, monkeypatch):
     from capture.session import Session
     from model import store
     from reconstruction.pipeline import recipes as pipeline

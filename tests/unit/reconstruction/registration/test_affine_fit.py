@@ -30,7 +30,7 @@ def test_exact_displacements_give_the_map_and_no_error(rng):
     assert np.sqrt(np.diag(covariance)).max() < 1e-6
 
 
-def test_errors_of_windows_of_their_own_give_the_error_of_least_squares(rng):
+def test_window_errors_give_least_squares_error(rng):
     places = windows(rng, side=12)
     design = np.column_stack([places, np.ones(len(places))])
     stated = [
@@ -44,7 +44,7 @@ def test_errors_of_windows_of_their_own_give_the_error_of_least_squares(rng):
     np.testing.assert_allclose(mean, np.sqrt(np.diag(expected)[order]), rtol=0.15)
 
 
-def test_covariance_is_laid_out_as_the_map(rng):
+def test_covariance_layout_matches_map(rng):
     """A field that moves windows along y alone leaves the first row of F without error."""
     places = windows(rng)
     found = places @ TRUE.T
@@ -55,7 +55,7 @@ def test_covariance_is_laid_out_as_the_map(rng):
 
 
 @pytest.mark.parametrize("reach", [0.8, 1.2])
-def test_intervals_hold_the_truth_where_neighbors_are_alike(reach, rng):
+def test_intervals_have_coverage_where_neighbors_are_alike(reach, rng):
     """A smooth random field, by waves; least squares with its scatter is far too sure of itself."""
     trials, inside, naive = 200, 0, 0
     for _ in range(trials):

@@ -109,7 +109,7 @@ def errors_mm(found, motions):
 
 
 @pytest.mark.parametrize("most_mm", [0.3, 3.0])
-def test_a_drifting_head_is_followed_to_a_fraction_of_a_pixel(most_mm, rng):
+def test_drifting_head_is_tracked_within_fraction_of_pixel(most_mm, rng):
     motions = drift(rng, 5, most_mm, most_mm / 3)
     points, normals = ball_points()
     found = head_motion.estimate(capture(rng, motions), CAMERAS, points, normals, np.arange(5.0))
@@ -143,7 +143,7 @@ def test_standard_errors_have_the_size_of_the_errors(rng):
     assert 0.5 < ratio < 2.5
 
 
-def test_a_twitch_is_no_motion_of_the_head_and_its_frame_not_usable(rng):
+def test_twitch_is_not_head_motion_and_frame_unusable(rng):
     motions = drift(rng, 7, 1.0, 0.3)
     twitches = [0.0, 0.0, 0.0, 4.0, 0.0, 0.0, 0.0]
     points, normals = ball_points()
@@ -184,7 +184,7 @@ def test_matrices_take_points_to_where_they_were():
     )
 
 
-def test_a_black_frame_is_not_usable_and_gives_no_nan(rng):
+def test_black_frame_is_unusable_and_gives_no_nan(rng):
     motions = drift(rng, 4, 0.5, 0.1)
     frames = capture(rng, motions)
     frames[2] = [np.zeros((HEIGHT, WIDTH)) for _ in CAMERAS]
@@ -195,7 +195,7 @@ def test_a_black_frame_is_not_usable_and_gives_no_nan(rng):
     assert not np.isnan(found.stderr).any()
 
 
-def test_what_tells_no_motion_is_refused_by_name(rng):
+def test_frames_without_motion_cues_are_refused_by_name(rng):
     points, normals = ball_points(500)
     frames = [[np.ones((HEIGHT, WIDTH)) for _ in CAMERAS]] * 2
     with pytest.raises(HeadMotionError, match="texture"):

@@ -54,7 +54,7 @@ def test_the_strain_comes_back_within_its_standard_errors(pigment, case):
     assert np.abs(off[:4]).max() < 0.005
 
 
-def test_a_reading_to_begin_with_reaches_strains_beyond_the_search(pigment):
+def test_initial_reading_reaches_strains_beyond_search_range(pigment):
     gradient, shift = CASES["strain 2"]
     first = picture(pigment, np.eye(2), np.zeros(2), seed=1)
     second = picture(pigment, gradient, np.array(shift), seed=2)
@@ -81,7 +81,7 @@ def test_standard_errors_say_how_far_strains_scatter(pigment):
     assert 12.0 < total < 89.0
 
 
-def test_stretch_along_an_axis_shear_and_rotation_follow_from_the_gradient(pigment):
+def test_stretch_shear_and_rotation_follow_from_gradient(pigment):
     angle = math.radians(30)
     turn = np.array([[math.cos(0.02), -math.sin(0.02)], [math.sin(0.02), math.cos(0.02)]])
     axis = np.array([math.cos(angle), math.sin(angle)])
@@ -98,7 +98,7 @@ def test_stretch_along_an_axis_shear_and_rotation_follow_from_the_gradient(pigme
     assert abs(found.along(0.0)[0] - 1.08) > 0.01
 
 
-def test_pictures_of_different_skin_have_no_strain(pigment):
+def test_images_of_different_skin_have_no_strain(pigment):
     first = picture(pigment, np.eye(2), np.zeros(2), seed=1)
     other = picture(pigment.T[::-1], np.eye(2), np.array([170.0, 90.0]), seed=2)
     found = measure_strain(first, other)
@@ -106,7 +106,7 @@ def test_pictures_of_different_skin_have_no_strain(pigment):
     assert np.isinf(found.covariance).all()
 
 
-def test_jaws_that_do_not_move_are_no_skin(pigment):
+def test_stationary_jaws_are_not_skin(pigment):
     """Where both pictures show the same jaws, only the mask keeps them from being followed."""
     gradient = np.diag([0.95, 1.0])
     first = picture(pigment, np.eye(2), np.zeros(2), seed=1)
@@ -121,7 +121,7 @@ def test_jaws_that_do_not_move_are_no_skin(pigment):
 
 
 @pytest.mark.parametrize("shape", [(256, 255), (40, 40)])
-def test_pictures_that_do_not_fit_are_refused(pigment, shape):
+def test_mismatched_images_are_refused(pigment, shape):
     first = picture(pigment, np.eye(2), np.zeros(2), seed=1)
     with pytest.raises(RegistrationError, match="expected"):
         measure_strain(first[: shape[0], : shape[0]], first[: shape[0], : shape[1]])

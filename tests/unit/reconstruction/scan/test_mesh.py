@@ -51,7 +51,7 @@ def area(mesh):
 # --- repair ---------------------------------------------------------------------------------------
 
 
-def test_a_sound_surface_stays_as_it_is():
+def test_sound_surface_is_unchanged():
     before = cap()
     after, report = repair(before, max_hole_mm=0.0)
     assert str(report) == "nothing to mend"
@@ -71,7 +71,7 @@ def test_doubled_vertices_are_welded_and_doubled_triangles_go():
     assert area(after) == pytest.approx(area(mesh))
 
 
-def test_a_fin_goes_and_the_surface_under_it_stays():
+def test_fin_is_removed_and_underlying_surface_stays():
     mesh = cap()
     tip = mesh.vertices_mm[mesh.faces[7]].mean(axis=0) * 1.05
     fin = TriangleMesh(
@@ -85,7 +85,7 @@ def test_a_fin_goes_and_the_surface_under_it_stays():
     assert area(after) == pytest.approx(area(mesh))
 
 
-def test_turned_triangles_are_turned_back_and_an_inside_out_scan_too():
+def test_flipped_triangles_and_inside_out_scan_are_reoriented():
     mesh = cap()
     faces = mesh.faces.copy()
     faces[::7] = faces[::7, ::-1]
@@ -95,7 +95,7 @@ def test_turned_triangles_are_turned_back_and_an_inside_out_scan_too():
         assert (np.einsum("vk,vk->v", after.normals(), after.vertices_mm) > 0).all()
 
 
-def test_surfaces_that_touch_in_one_vertex_are_parted_there():
+def test_surfaces_touching_at_single_vertex_are_separated():
     a, b = plane(), plane()
     both = TriangleMesh(
         np.concatenate([a.vertices_mm, b.vertices_mm + np.array([80.0, 80.0, 0.0])]),
@@ -148,7 +148,7 @@ def test_nothing_sound_is_an_error():
             load_ply(bad)
 
 
-def test_cropping_keeps_what_is_inside():
+def test_cropping_keeps_region_inside_bounds():
     whole = sphere()
     box = crop(whole, box_mm=((-100, 0, -100), (100, 100, 100)))
     assert box.vertices_mm[:, 1].min() > -10
@@ -159,7 +159,7 @@ def test_cropping_keeps_what_is_inside():
 # --- refinement -----------------------------------------------------------------------------------
 
 
-def test_loop_subdivision_of_a_plane_stays_on_the_plane_and_inside_its_rim():
+def test_plane_loop_subdivision_stays_planar_inside_its_rim():
     """Corner triangles have both ends of an inner edge on the rim: the case of `_split_chords`."""
     fine = refine(unwrap(plane()), points=5000)
     assert np.abs(fine.points_mm[:, 2]).max() < 1e-6
@@ -167,7 +167,7 @@ def test_loop_subdivision_of_a_plane_stays_on_the_plane_and_inside_its_rim():
     np.testing.assert_allclose(fine.normals, np.broadcast_to([0, 0, 1.0], fine.normals.shape))
 
 
-def test_without_split_chords_the_library_throws_the_rim_off():
+def test_without_split_chords_library_displaces_rim():
     """If this fails the library has been mended and the split may go."""
     from trimesh.remesh import subdivide_loop
 
@@ -176,12 +176,12 @@ def test_without_split_chords_the_library_throws_the_rim_off():
 
 
 @pytest.mark.parametrize("points", [700, 3000, 12_000, 50_000])
-def test_the_number_of_points_is_the_nearest_step_of_four(points):
+def test_point_count_is_nearest_step_of_four(points):
     fine = refine(unwrap(cap()), points=points)
     assert 0.4 < len(fine.points_mm) / points < 2.2
 
 
-def test_a_refined_sphere_is_smooth_and_a_little_smaller():
+def test_refined_sphere_is_smooth_and_slightly_smaller():
     """Loop's limit surface of an icosphere of 8 mm edges lies within 1 % under it."""
     fine = refine(unwrap(cap()), points=20_000)
     inner = fine.points_mm[:, 2] > 25.0
@@ -213,7 +213,7 @@ def test_a_layout_keeps_areas_and_does_not_overlap():
     assert 0.2 < flat.sum() < 1.0
 
 
-def test_a_moved_scan_moves_points_normals_and_the_mesh_for_rays():
+def test_moved_scan_moves_points_normals_and_ray_mesh():
     fine = refine(unwrap(cap()), points=1000)
     turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     moved = fine.moved(turn, np.array([1.0, 2, 3]))
@@ -222,14 +222,14 @@ def test_a_moved_scan_moves_points_normals_and_the_mesh_for_rays():
     assert moved.coarse.vertices_mm[:, 0].mean() > 30
 
 
-def test_refinement_says_what_it_lacks():
+def test_refinement_reports_missing_requirements():
     with pytest.raises(ScanMeshError, match="texture coordinates"):
         refine(cap(), points=1000)
     with pytest.raises(ScanMeshError, match="points"):
         refine(unwrap(cap()), points=10**9)
 
 
-def test_a_flawed_scan_of_a_head_becomes_one_manifold_surface_near_the_truth():
+def test_flawed_head_scan_becomes_manifold_near_truth():
     from rigsim.scanner.pods import Scanner, scan_face
     from rigsim.subject.head import build_head
 

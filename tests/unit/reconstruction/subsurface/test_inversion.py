@@ -143,7 +143,7 @@ def test_the_tables_layout_is_the_table(g_error, limit):
 
 
 @pytest.mark.parametrize("ratio", [1e-4, 3e-4, 2e-3])
-def test_far_from_the_source_of_weakly_absorbed_light_the_model_is_diffusion_up_to_a_factor(ratio):
+def test_far_weakly_absorbed_light_is_diffusion_to_factor(ratio):
     """At up to 350 transport lengths, where no table reaches; the factor is the fibre's, 5 %."""
     model = profile_model("photon_table", Optics(g=0.8, g_error=0.0, **FIBRES), RADIUS)
     for scattering in (8.0, 20.0, 50.0):
@@ -198,7 +198,7 @@ def coverage(fit, sigma_tr):
     return np.mean((low <= sigma_tr) & (sigma_tr <= high))
 
 
-def test_intervals_hold_the_truth_as_often_as_they_say(rng):
+def test_interval_coverage_matches_nominal(rng):
     """68 % within 60...76 %; a false alarm is rarer than 1e-3 (groups of ten share a medium)."""
     sigma_tr, readings, variance = draws_of_everything(rng)
     fit = fit_table(readings, variance, common_error=0.02)
@@ -210,7 +210,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(rng):
     assert coverage(certain, sigma_tr) < 0.55
 
 
-def test_sigma_tr_is_told_better_than_its_parts(rng):
+def test_sigma_tr_is_better_determined_than_its_parts(rng):
     profile, variance = noisy(table(0.04, 1.5), rng)
     fit = fit_table(profile, variance, common_error=0.05)
     of_sigma_tr = fit.sigma_tr_stderr / fit.sigma_tr_per_mm
@@ -253,7 +253,7 @@ def test_single_precision_and_the_input_are_left_alone():
     np.testing.assert_array_equal(profile, before)
 
 
-def test_without_a_variance_noise_is_found_from_the_residuals(rng):
+def test_noise_without_variance_is_found_from_residuals(rng):
     clean = table(0.1, 1.2)
     deviation = np.where(RADIUS > 5.0, 0.2, 0.01)
     readings = clean * np.exp(deviation * rng.standard_normal((400, 28)))
@@ -275,7 +275,7 @@ def test_without_absorption_the_interval_reaches_zero(rng):
 
 
 @pytest.mark.parametrize("sigma_s", [0.0, 1e-3])
-def test_without_scattering_there_is_no_signal(sigma_s, rng):
+def test_zero_scattering_gives_no_signal(sigma_s, rng):
     profile, variance = noisy(table(0.05, sigma_s), rng)
     fit = fit_table(profile, variance)
     assert fit.outcome == Outcome.NO_SIGNAL
@@ -283,7 +283,7 @@ def test_without_scattering_there_is_no_signal(sigma_s, rng):
     assert fit.interval_per_mm.tolist() == [0.0, np.inf]
 
 
-def test_absorption_ten_times_the_scattering_is_beyond_diffusion_alone(rng):
+def test_strong_absorption_is_beyond_diffusion_alone(rng):
     profile, variance = noisy(table(4.9, 0.5), rng)
     fit = fit_table(profile, variance)
     assert fit.valid
@@ -296,7 +296,7 @@ def test_absorption_ten_times_the_scattering_is_beyond_diffusion_alone(rng):
 
 
 @pytest.mark.parametrize("eta", [1.0, 1.6])
-def test_the_index_of_refraction_matters_and_is_taken_in(eta, rng):
+def test_refractive_index_matters_and_is_included(eta, rng):
     profile, variance = noisy(table(0.1, 1.2, eta=eta), rng)
     truth = dipole.effective_transport(0.1, 1.2)
     fit = fit_table(profile, variance, eta=eta)
@@ -306,7 +306,7 @@ def test_the_index_of_refraction_matters_and_is_taken_in(eta, rng):
 
 
 @pytest.mark.parametrize("how", ["valid", "variance", "value"])
-def test_a_dead_fibre_is_left_out_and_named(how, rng):
+def test_dead_fiber_is_omitted_and_reported(how, rng):
     profile, variance = noisy(table(0.1, 1.2), rng)
     profile[7], valid, code = 0.0, np.ones(28, bool), 1
     if how == "valid":
@@ -325,7 +325,7 @@ def test_a_dead_fibre_is_left_out_and_named(how, rng):
     )
 
 
-def test_a_fibre_far_off_all_others_is_left_out(rng):
+def test_fiber_far_from_others_is_omitted(rng):
     profile, variance = noisy(table(0.1, 1.2), rng)
     profile[9] *= 2.0
     fit = fit_table(profile, variance)
@@ -350,13 +350,13 @@ def test_negative_readings_far_out_are_used(rng):
     assert np.sqrt(np.mean((error / (fit.sigma_tr_stderr / fit.sigma_tr_per_mm)) ** 2)) < 1.2
 
 
-def test_too_few_fibres_are_refused():
+def test_too_few_fibers_are_refused():
     fit = subsurface.invert([1.0], [0.01], variance=[1e-8])
     assert fit.outcome == Outcome.TOO_FEW_FIBRES
     assert not fit.valid
 
 
-def test_one_radius_many_times_tells_nothing_of_the_slope():
+def test_single_repeated_radius_does_not_determine_slope():
     fit = subsurface.invert(np.full(28, 1.0), np.full(28, 0.01), variance=1e-8)
     assert not fit.valid
     assert fit.outcome & Outcome.NOT_IDENTIFIED

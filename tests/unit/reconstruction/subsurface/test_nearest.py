@@ -35,7 +35,7 @@ def by_definition(profile):
     return 0.5 * np.log(3.0 * a * (a + s))
 
 
-def test_the_medium_is_that_of_the_definition_whatever_the_readings_noise(layered):
+def test_nearest_medium_matches_definition_under_any_noise(layered):
     assert (layered > MIN_REFLECTANCE_PER_MM2).all()
     told = by_definition(layered)
     for noise in (1e-4, 1e-3):
@@ -54,7 +54,7 @@ def test_the_medium_is_that_of_the_definition_whatever_the_readings_noise(layere
     assert abs(0.5 * np.log(3.0 * a * (a + s)) - told) > 0.01
 
 
-def test_standard_errors_are_those_of_the_readings_and_not_of_the_misfit(layered):
+def test_standard_errors_come_from_readings_not_misfit(layered):
     """200 draws; deviations are known to 5 %, and the table's own error is not drawn."""
     rng = np.random.default_rng(4)
     noise = 0.01
@@ -67,7 +67,7 @@ def test_standard_errors_are_those_of_the_readings_and_not_of_the_misfit(layered
     assert stated < 0.5 * np.median(fit.model_error)
 
 
-def test_far_fibres_in_the_noise_do_not_hand_the_definition_over_to_the_near_ones(layered):
+def test_noisy_far_fibers_keep_estimate_near_definition(layered):
     """200 draws, noise of half a far reading: that profiles are smooth tells what is hidden."""
     rng = np.random.default_rng(11)
     noise = 0.002 * np.exp(0.8 * RADIUS)
@@ -90,7 +90,7 @@ def test_far_fibres_in_the_noise_do_not_hand_the_definition_over_to_the_near_one
     assert abs(np.mean(off)) < 0.3 * abs(weighed)
 
 
-def test_a_fibre_far_off_the_nearest_medium_is_not_left_out(layered):
+def test_fiber_far_from_nearest_medium_is_not_omitted(layered):
     bent = layered.copy()
     bent[0] *= 1.3
     fit = subsurface.nearest_medium(RADIUS, bent, variance=(1e-3 * bent) ** 2, **CORES)
@@ -99,7 +99,7 @@ def test_a_fibre_far_off_the_nearest_medium_is_not_left_out(layered):
     assert fit.outcome & Outcome.MISFIT
 
 
-def test_fibres_that_take_less_than_the_definitions_light_do_not_count():
+def test_fibers_below_definition_light_level_are_ignored():
     dark = 0.5 * table(0.6, 2.0) * np.exp(LAYERED)
     fit = subsurface.nearest_medium(RADIUS, dark, variance=(1e-3 * dark) ** 2, **CORES)
     assert 10 < fit.used.sum() < 28
@@ -107,7 +107,7 @@ def test_fibres_that_take_less_than_the_definitions_light_do_not_count():
     assert (fit.used != (dark >= MIN_REFLECTANCE_PER_MM2)).sum() <= 1
 
 
-def test_without_enough_light_nothing_is_told(layered):
+def test_too_little_light_gives_no_estimate(layered):
     fit = subsurface.nearest_medium(RADIUS, layered, variance=(3.0 * layered) ** 2, **CORES)
     assert not fit.valid
     assert fit.outcome & (Outcome.NO_SIGNAL | Outcome.TOO_FEW_FIBRES)

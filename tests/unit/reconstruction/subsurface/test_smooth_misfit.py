@@ -39,7 +39,7 @@ def kriged(value, variance, strength):
 
 
 @pytest.mark.parametrize("noise", [0.003, 0.03, 0.3])
-def test_curve_and_errors_are_those_of_kriging_at_the_likeliest_strength(noise):
+def test_curve_and_errors_match_kriging_at_likeliest_strength(noise):
     rng = np.random.default_rng(2)
     spread = noise * np.exp(0.2 * RADIUS)
     value = CURVE + spread * rng.standard_normal(28)
@@ -53,7 +53,7 @@ def test_curve_and_errors_are_those_of_kriging_at_the_likeliest_strength(noise):
 
 
 @pytest.mark.parametrize("unread", [0.0, 0.3, 0.9])
-def test_strengths_are_as_likely_as_the_whole_matrix_says(unread):
+def test_strength_likelihoods_match_full_matrix(unread):
     """Five diagonals against determinant and solution of the full matrix, up to a constant.
 
     Readings of next to no weight have a hundredth here, not `WEAKEST`: the full matrix would lose
@@ -82,7 +82,7 @@ def test_strengths_are_as_likely_as_the_whole_matrix_says(unread):
     )
 
 
-def test_fibres_that_read_nothing_go_straight_on_with_growing_errors():
+def test_unread_fibers_extrapolate_straight_with_growing_errors():
     value = np.broadcast_to(CURVE, (3, 28))
     variance = np.full((3, 28), 0.002**2)
     variance[1, 20:] = np.inf
@@ -97,7 +97,7 @@ def test_fibres_that_read_nothing_go_straight_on_with_growing_errors():
     assert (error[2] > 100.0).all()  # nothing is told
 
 
-def test_errors_are_those_of_the_noise_over_the_fibres_together():
+def test_errors_are_those_of_joint_fiber_noise():
     """Intervals of splines hold on the average of all places (Wahba 1983); 400 draws."""
     rng = np.random.default_rng(3)
     noise = 0.02
@@ -109,7 +109,7 @@ def test_errors_are_those_of_the_noise_over_the_fibres_together():
     assert np.median(error) < 0.6 * noise
 
 
-def test_the_order_of_the_fibres_does_not_matter():
+def test_fiber_order_does_not_matter():
     rng = np.random.default_rng(4)
     value, variance = CURVE[None] + 0.01 * rng.standard_normal((1, 28)), np.full((1, 28), 1e-4)
     mixed = rng.permutation(28)

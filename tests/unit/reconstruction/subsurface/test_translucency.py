@@ -48,7 +48,7 @@ def textbook(prior, at_uv, log, error, to_uv):
     return mean, np.sqrt(total - (cross**2).sum(axis=0))
 
 
-def test_the_map_is_the_posterior_of_a_gaussian_process(rng):
+def test_map_is_gaussian_process_posterior(rng):
     at = rng.uniform(0.1, 0.9, (6, 2))
     sigma = np.exp(-0.2 + 0.2 * rng.standard_normal(6))
     stderr = sigma * rng.uniform(0.01, 0.2, 6)
@@ -77,7 +77,7 @@ def drawn_map(rng, error, stated=1.0):
     return (np.log(found.values[at][:, 0]) - log[4:]) / found.log_stderr[at][:, 0]
 
 
-def test_intervals_hold_the_truth_as_often_as_they_say(rng):
+def test_interval_coverage_matches_nominal(rng):
     z = np.array([drawn_map(rng, 0.05) for _ in range(400)])
     inside = (np.abs(z) < 1).mean(axis=1)  # pixels of a face belong together, faces do not
     expected = 2 * stats.norm.cdf(1) - 1
@@ -88,7 +88,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(rng):
     assert abs(low.mean() - expected) > 4.9 * low.std() / np.sqrt(400)
 
 
-def test_the_map_runs_through_well_measured_places_and_is_uncertain_away_from_them():
+def test_map_interpolates_measured_positions_uncertain_away():
     places = PLACES
     found = interpolate(places, SIGMA_TR, 0.001 * SIGMA_TR, (256, 256))
     prior = population_prior()
@@ -106,7 +106,7 @@ def test_the_map_runs_through_well_measured_places_and_is_uncertain_away_from_th
     assert (np.diff(outward) > -1e-6).all()
 
 
-def test_rows_of_the_map_run_from_the_forehead_down_and_columns_to_the_right():
+def test_map_rows_run_down_from_forehead_columns_right():
     sigma = np.array([[0.4], [0.6], [0.9], [0.5]])
     found = interpolate(PLACES, sigma, 0.01 * sigma, (64, 64), prior=ONE)
     assert found.values[pixel(SITE_UV["forehead"], (64, 64))][0] > 2.2
@@ -115,7 +115,7 @@ def test_rows_of_the_map_run_from_the_forehead_down_and_columns_to_the_right():
     assert left > right
 
 
-def test_one_place_gives_its_value_there_and_the_population_far_away():
+def test_single_position_gives_value_there_population_far_away():
     uv, sigma = np.array([[0.2, 0.3]]), np.array([[0.5]])
     prior = TranslucencyPrior(np.array([0.2]), np.array([0.15]), np.array([0.25]), length_mm=10.0)
     found = interpolate(uv, sigma, 0.1 * sigma, (301, 301), prior=prior)
@@ -132,7 +132,7 @@ def test_one_place_gives_its_value_there_and_the_population_far_away():
     assert found.log_stderr[far][0] == pytest.approx(expected, rel=1e-5)
 
 
-def test_a_worse_measured_place_pulls_less():
+def test_worse_measured_position_has_less_weight():
     uv = np.array([[0.3, 0.5], [0.7, 0.5]])
     sigma = np.array([[0.5], [1.0]])
     even = interpolate(uv, sigma, 0.05 * sigma, (3, 3), prior=ONE)
@@ -140,7 +140,7 @@ def test_a_worse_measured_place_pulls_less():
     assert uneven.values[1, 1, 0] > even.values[1, 1, 0] * 1.05
 
 
-def test_repeats_of_a_place_count_as_one_better_measurement():
+def test_position_repeats_count_as_better_single_measurement():
     uv = np.array([[0.5, 0.5], [0.2, 0.8]])
     sigma, error = np.array([[0.5], [0.8]]), np.array([[0.04], [0.04]])
     single = interpolate(uv, sigma, error / [[2.0], [1.0]], (32, 32), prior=ONE)
@@ -151,7 +151,7 @@ def test_repeats_of_a_place_count_as_one_better_measurement():
     assert repeated.conflicts == ()
 
 
-def test_repeats_that_contradict_each_other_are_named_and_widen_the_error():
+def test_contradicting_repeats_are_reported_and_widen_error():
     uv = np.full((2, 2), 0.5)
     near = interpolate(uv, np.array([[0.50], [0.505]]), np.full((2, 1), 0.01), (9, 9), prior=ONE)
     far = interpolate(uv, np.array([[0.40], [0.60]]), np.full((2, 1), 0.01), (9, 9), prior=ONE)
@@ -164,7 +164,7 @@ def test_repeats_that_contradict_each_other_are_named_and_widen_the_error():
     )
 
 
-def test_exact_and_coincident_places_leave_the_map_finite():
+def test_exact_and_coincident_positions_keep_map_finite():
     uv = np.array([[0.5, 0.5], [0.5, 0.5], [0.5, 0.5 + 2.1 / 330], [0.1, 0.1]])
     sigma = np.full((4, 1), 0.7)
     found = interpolate(uv, sigma, np.zeros((4, 1)), (128, 128), prior=ONE)
@@ -174,7 +174,7 @@ def test_exact_and_coincident_places_leave_the_map_finite():
     assert found.values[64, 64, 0] == pytest.approx(1 / 0.7, rel=1e-3)
 
 
-def test_a_hundred_crowded_places_leave_the_map_finite(rng):
+def test_hundred_crowded_positions_keep_map_finite(rng):
     uv = rng.uniform(0.45, 0.55, (100, 2))
     sigma = np.full((100, 1), 0.7) * np.exp(0.02 * rng.standard_normal((100, 1)))
     found = interpolate(uv, sigma, 0.02 * sigma, (64, 64), prior=ONE)
@@ -183,7 +183,7 @@ def test_a_hundred_crowded_places_leave_the_map_finite(rng):
     assert found.log_stderr.max() <= np.hypot(0.15, 0.25) * (1 + 1e-6)
 
 
-def test_places_that_do_not_count_are_left_out_with_their_reasons():
+def test_uncounted_positions_are_omitted_with_reasons():
     sigma, stderr = SIGMA_TR.copy(), 0.03 * SIGMA_TR
     sigma[0, 0] = np.nan
     sigma[1, 1], stderr[1, 1] = 1e-9, 1.0
@@ -203,7 +203,7 @@ def test_places_that_do_not_count_are_left_out_with_their_reasons():
     np.testing.assert_allclose(found.values[..., 1], kept.values[..., 1], rtol=1e-6)
 
 
-def test_a_channel_without_a_place_is_masked_and_all_without_is_an_error():
+def test_channel_without_position_is_masked_all_without_error():
     places = PLACES
     good = np.ones((4, 3), bool)
     good[:, 2] = False
@@ -217,7 +217,7 @@ def test_a_channel_without_a_place_is_masked_and_all_without_is_an_error():
         interpolate(places, SIGMA_TR, SIGMA_TR * MAX_RELATIVE_ERROR * 1.01, (8, 8))
 
 
-def test_nothing_is_said_where_there_is_no_skin():
+def test_map_is_invalid_outside_skin():
     skin = np.zeros((8, 8), bool)
     skin[2:5] = True
     found = interpolate(PLACES, SIGMA_TR, 0.03 * SIGMA_TR, (8, 8), mask=skin)
@@ -226,7 +226,7 @@ def test_nothing_is_said_where_there_is_no_skin():
     assert (found.stderr[skin] > 0).all()
 
 
-def test_a_face_unlike_the_population_is_told(rng):
+def test_face_unlike_population_is_reported(rng):
     prior = population_prior()
     places = PLACES
     usual = interpolate(places, SIGMA_TR, 0.03 * SIGMA_TR, (4, 4))
@@ -247,7 +247,7 @@ def test_the_prior_has_the_variance_of_the_population(rng):
     np.testing.assert_allclose(logs.var(axis=0).mean(axis=0) + between, total, rtol=0.03)
 
 
-def test_shapes_and_ranges_that_do_not_fit_are_refused():
+def test_mismatched_shapes_and_ranges_are_refused():
     uv, sigma = np.array([[0.5, 0.5]]), np.array([[0.5]])
 
     def call(*, uv=uv, sigma=sigma, stderr=0.1 * sigma, shape=(4, 4), **more):
@@ -273,7 +273,7 @@ def test_shapes_and_ranges_that_do_not_fit_are_refused():
         TranslucencyPrior(np.zeros(1), np.ones(1), np.ones(1), length_mm=0.0)
 
 
-def test_default_places_lie_on_the_simulated_heads():
+def test_default_positions_are_on_simulated_heads():
     from rigsim.subject.head import LANDMARKS_MM, build_head
 
     head = build_head(np.random.default_rng(3))

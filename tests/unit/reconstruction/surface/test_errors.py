@@ -59,7 +59,7 @@ def plain(surface, stderr=0.0):
     )
 
 
-def test_a_planes_normals_get_no_error_from_misplaced_samples_but_the_finest_relief():
+def test_plane_normal_error_from_misplacement_is_fine_relief():
     surface = sheet(flat)
     found = surface_errors.of_normals(plain(surface), surface, 3.0)
     np.testing.assert_allclose(found.stderr, surface_errors.UNRESOLVED_RELIEF_RAD, rtol=1e-6)
@@ -67,7 +67,7 @@ def test_a_planes_normals_get_no_error_from_misplaced_samples_but_the_finest_rel
     np.testing.assert_allclose(coarse.stderr, surface_errors.UNRESOLVED_RELIEF_RAD, rtol=1e-6)
 
 
-def test_the_error_of_misplaced_samples_is_curvature_times_misplacement():
+def test_misplacement_error_is_curvature_times_misplacement():
     """On a ball of radius R normals turn by 1 / R a millimetre in every direction."""
     pixel = 2.0
     for radius in (40.0, 80.0, 160.0):
@@ -78,7 +78,7 @@ def test_the_error_of_misplaced_samples_is_curvature_times_misplacement():
         np.testing.assert_allclose(found.stderr, expected, rtol=0.01)
 
 
-def test_errors_of_normals_without_neighbours_stay_finite():
+def test_normal_errors_without_neighbors_stay_finite():
     surface = sheet(ball(60.0))
     normals = plain(surface)
     here = np.arange(len(normals.valid)) == 200
@@ -115,7 +115,7 @@ def seen_and_true(rng, roughness):
 
 
 @pytest.mark.parametrize("roughness", [0.02, 0.1, 0.3])
-def test_errors_of_albedo_are_as_large_as_its_own_detail_makes_them(roughness):
+def test_albedo_error_matches_subject_albedo_detail(roughness):
     """68 % intervals over 12 patches: each level of detail has a share of its own, 0.60 to 0.80.
 
     Nothing else tells them apart: a constant that suits one is 15 times off for another.
@@ -140,7 +140,7 @@ def test_errors_of_albedo_are_as_large_as_its_own_detail_makes_them(roughness):
     assert np.mean(halved) < 0.55
 
 
-def test_where_neighbors_happen_to_look_alike_the_albedo_is_known_no_better():
+def test_albedo_error_with_similar_neighbors_is_not_reduced():
     """Even skin-like detail: 68 % intervals hold in each third of points by their stated error.
 
     A point's own neighbors alone would be believed too much: below half in the lowest third.
@@ -169,7 +169,7 @@ def test_where_neighbors_happen_to_look_alike_the_albedo_is_known_no_better():
     assert np.ptp(thirds) < 0.5 * np.ptp(alone_thirds)
 
 
-def test_noise_is_no_detail_of_the_albedo():
+def test_albedo_detail_excludes_noise():
     rng = np.random.default_rng(5)
     surface = sheet(flat)
     noisy = 0.3 + 0.01 * rng.standard_normal((len(surface.points_mm), 3))
@@ -185,7 +185,7 @@ def test_noise_is_no_detail_of_the_albedo():
     assert np.median(untold.stderr) > 0.015
 
 
-def test_even_albedo_keeps_the_error_of_its_noise_and_of_its_scale():
+def test_uniform_albedo_error_is_noise_and_scale_error():
     surface = sheet(ball(60.0))
     count = len(surface.points_mm)
     even = PointValues(np.full((count, 3), 0.3), np.full((count, 3), 0.002), np.ones(count, bool))

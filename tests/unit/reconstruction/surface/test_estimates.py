@@ -113,7 +113,7 @@ def albedo_of(normals, r_d=R_D):
     )
 
 
-def test_normals_of_light_from_inside_the_skin_are_exact():
+def test_normals_from_subsurface_light_are_exact():
     truth = cap()
     samples = make(truth)
     found = estimates.normals_from_shading(samples, truth)
@@ -128,7 +128,7 @@ def test_normals_of_light_from_inside_the_skin_are_exact():
 
 
 @pytest.mark.parametrize("tilt_deg", [2.0, 5.0, 10.0])
-def test_each_round_leaves_less_than_a_third_of_what_the_scan_was_off(tilt_deg):
+def test_normal_iteration_reduces_scan_error_below_one_third(tilt_deg):
     """The boundary's transmittance is that of the round before: its error shrinks, not to zero."""
     truth = cap()
     scan = turned(truth, np.radians(tilt_deg))
@@ -150,7 +150,7 @@ def shine(half_rad):
     return 0.3 * np.clip(1.0 - half_rad / np.radians(33.0), 0.0, None)
 
 
-def test_highlights_within_35_degrees_of_the_normal_do_not_bend_it():
+def test_normals_ignore_highlights_within_35_degrees():
     truth = cap()
     samples = make(truth, lobe=shine)
     assert angle_deg(estimates.normals_from_shading(samples, truth), truth).max() < 0.1
@@ -165,7 +165,7 @@ def pulls(truth, samples, rounds):
     return (np.radians(angle_deg(found, truth)) / found.stderr[found.valid, 0]) ** 2
 
 
-def test_standard_errors_of_normals_are_those_of_one_round_and_no_smaller_than_of_two(rng):
+def test_normal_stderr_matches_one_round_and_bounds_two(rng):
     """The second round sees that shading falls faster than the cosine, so it errs less."""
     truth = np.tile(cap(100), (5, 1))
     samples = make(truth, noise=0.01, rng=rng)
@@ -185,7 +185,7 @@ def test_standard_errors_of_normals_are_those_of_one_round_and_no_smaller_than_o
     assert np.sum((apart / stated.stderr[both, 0]) ** 2) > 3 * degrees
 
 
-def test_half_vectors_give_the_normal_of_a_mirror_like_point_to_the_lights_spacing():
+def test_half_vector_normals_are_accurate_to_light_spacing():
     truth = cap()
     samples = make(truth, lights=150, lobe=lambda h: 5.0 * np.exp(-((h / 0.15) ** 2)))
     found = estimates.normals_from_half_vectors(samples)
@@ -195,7 +195,7 @@ def test_half_vectors_give_the_normal_of_a_mirror_like_point_to_the_lights_spaci
     assert np.median(angle_deg(matte, truth)) > 6.0
 
 
-def test_albedo_is_exact_where_the_normals_are_and_the_lobe_leaves_some_samples_free():
+def test_albedo_is_exact_with_exact_normals_and_lobe():
     truth = cap()
     samples = make(truth, lobe=shine)
     found = estimates.albedo(samples, known(truth), stderr_rad=1e-3)
@@ -207,7 +207,7 @@ def test_albedo_is_exact_where_the_normals_are_and_the_lobe_leaves_some_samples_
     assert (naive * np.pi / R_D).mean() > 1.02
 
 
-def test_albedo_does_not_know_how_far_the_scans_normals_were_off():
+def test_albedo_does_not_depend_on_scan_normal_error():
     truth = cap()
     scan = turned(truth, np.radians(8.0))
     # one light ring to a side, as on a cheek: errors of the cosine do not even out
@@ -222,7 +222,7 @@ def test_albedo_does_not_know_how_far_the_scans_normals_were_off():
     assert np.median(np.abs(taken.values / R_D - 1.0)) > 0.01
 
 
-def test_views_aslant_whose_pixels_reach_beyond_the_point_count_less_in_the_albedo():
+def test_albedo_weights_oblique_views_beyond_point_less():
     truth = cap(30, 0.3)
     aslant = np.array([[0.95, 0.0, 0.3], [-0.93, 0.2, 0.3], [0.1, -0.95, 0.3], [0.0, 0.95, 0.3]])
     aslant /= np.linalg.norm(aslant, axis=1, keepdims=True)
@@ -269,7 +269,7 @@ def test_samples_at_other_normals_keep_their_radiance():
     assert not estimates.at_normals(samples, none).valid.any()
 
 
-def test_albedo_is_kept_off_where_there_is_no_normal():
+def test_albedo_without_normal_is_masked():
     truth = cap()
     normals = known(truth)
     normals = dataclasses.replace(normals, valid=np.arange(len(truth)) % 2 == 0)
@@ -278,7 +278,7 @@ def test_albedo_is_kept_off_where_there_is_no_normal():
     assert_clean(found)
 
 
-def test_lobes_taken_off_the_samples_leave_normals_that_highlights_do_not_bend():
+def test_lobe_subtraction_removes_highlight_bias_of_normals():
     truth = cap(40)
     basis = brdf_tables.default()
     mix = np.zeros((1, len(basis.names)))
@@ -315,7 +315,7 @@ def glossy(truth, one, share):
     return dataclasses.replace(samples, f=np.where(samples.valid[..., None], f, 0.0)), weights
 
 
-def test_highlights_move_only_normals_that_light_from_inside_leaves_in_doubt():
+def test_highlights_refine_only_normals_uncertain_from_subsurface_light():
     truth = cap(40)
     basis = brdf_tables.default()
     one = basis.mixed(np.eye(basis.size)[[basis.names.index("beckmann 0.3")]])
@@ -426,7 +426,7 @@ def test_no_estimate_of_spoiled_samples_holds_a_nan(spoil):
         assert angle_deg(normals, truth).max() < 0.3
 
 
-def test_black_skin_has_no_normal_and_an_albedo_of_nothing():
+def test_black_skin_has_invalid_normal_and_zero_albedo():
     truth = cap(30)
     samples = make(truth, r_d=(0.0, 0.0, 0.0), noise=1e-3, rng=np.random.default_rng(4))
     normals = estimates.normals_from_shading(samples, truth)
@@ -438,7 +438,7 @@ def test_black_skin_has_no_normal_and_an_albedo_of_nothing():
     assert not len(good) or np.abs(np.median(good)) < 3.0
 
 
-def test_lights_in_one_plane_give_no_normal_rather_than_a_wrong_one():
+def test_coplanar_lights_give_invalid_normal():
     """Photometric stereo knows nothing across the plane of the lights; near one it says so."""
     truth = cap(30, 0.3)
     tilt = np.linspace(-1.2, 1.2, 40)

@@ -71,7 +71,7 @@ def estimated(lobe, r_d, *, weight=0.8, steps=6, **more):
 
 
 @pytest.mark.parametrize("r_d", [0.5, 0.1, 0.02])
-def test_normals_of_light_and_dark_skin_come_back_within_their_stated_errors(lobe, r_d):
+def test_model_normals_match_truth_within_stated_errors(lobe, r_d):
     found, truth, scan = estimated(lobe, r_d)
     error = angular_error_rad(found.normals, truth)
     assert found.valid.all()
@@ -87,7 +87,7 @@ def test_without_the_lobe_the_highlight_bends_normals(lobe):
     assert np.median(angular_error_rad(bare.normals, truth)) > 3.0 * with_lobe
 
 
-def test_more_light_tells_more(lobe):
+def test_model_normals_improve_with_more_lights(lobe):
     few, truth, _ = estimated(lobe, 0.1, lights=8)
     many, same, _ = estimated(lobe, 0.1, lights=64)
     assert np.median(many.stderr_rad) < 0.6 * np.median(few.stderr_rad)
@@ -96,7 +96,7 @@ def test_more_light_tells_more(lobe):
     )
 
 
-def test_points_that_say_nothing_stay_and_are_not_valid(lobe):
+def test_uninformative_points_keep_start_normal_and_are_invalid(lobe):
     samples, truth, scan = scene(lobe, 0.3)
     nothing = samples.valid.copy()
     nothing[:3] = False

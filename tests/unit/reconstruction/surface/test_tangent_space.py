@@ -16,14 +16,14 @@ def cylinder(shape=(96, 128), radius_mm=60.0, height_mm=80.0):
     return points, normal, angle
 
 
-def test_a_smooth_shape_has_its_own_normal_along_z():
+def test_smooth_shape_normal_is_tangent_z():
     points, normal, _ = cylinder()
     found = tangent_normals(normal, points, np.ones(points.shape[:2], bool), smoothing_mm=3.0)
     inner = found.normals[8:-8, 16:-16]
     np.testing.assert_allclose(inner, np.broadcast_to([0.0, 0.0, 1.0], inner.shape), atol=5e-3)
 
 
-def test_x_runs_along_u_and_y_up_the_texture():
+def test_tangent_x_follows_u_and_y_points_up():
     points, _, angle = cylinder()
     axes, known = frames(points, np.ones(points.shape[:2], bool), smoothing_mm=2.0)
     middle = (48, 64)
@@ -33,7 +33,7 @@ def test_x_runs_along_u_and_y_up_the_texture():
     np.testing.assert_allclose(axes[middle][1], [0.0, 1.0, 0.0], atol=1e-3)
 
 
-def test_a_tilt_of_the_normal_comes_back_as_that_tilt():
+def test_normal_tilt_is_preserved_in_tangent_space():
     points, normal, angle = cylinder()
     along = np.stack([np.cos(angle), 0.0 * angle, -np.sin(angle)], axis=2)
     tilted = np.cos(0.2) * normal + np.sin(0.2) * along
@@ -44,7 +44,7 @@ def test_a_tilt_of_the_normal_comes_back_as_that_tilt():
     assert abs(plain.normals[48, 64, 0]) < 0.01
 
 
-def test_wrinkles_do_not_bend_the_frame_that_they_are_seen_against():
+def test_tangent_frame_ignores_wrinkles():
     points, normal, _ = cylinder((240, 320))
     wave_mm, depth_mm = 4.0, 0.4
     y = points[..., 1]
@@ -63,7 +63,7 @@ def test_wrinkles_do_not_bend_the_frame_that_they_are_seen_against():
     assert lost(0.0) > 0.3  # without smoothing the wrinkles take themselves away
 
 
-def test_errors_turn_with_the_frame_and_masks_are_kept():
+def test_errors_rotate_with_frame_and_masks_are_kept():
     points, normal, _ = cylinder()
     valid = np.ones(points.shape[:2], bool)
     valid[20:30, 20:30] = False

@@ -39,7 +39,7 @@ def whole(surface):
     return np.ones(len(surface.points_mm), bool)
 
 
-def test_the_map_of_positions_says_where_each_texel_is_on_the_plate(surface):
+def test_position_map_gives_texel_positions_on_plate(surface):
     size = 50
     texture = SurfaceTexture.of(surface, size=size)
     found = texture.map(surface.points_mm, None, whole(surface), "mm", "rig frame")
@@ -52,7 +52,7 @@ def test_the_map_of_positions_says_where_each_texel_is_on_the_plate(surface):
     np.testing.assert_allclose(found.values[inside], expected[inside], atol=1e-3)
 
 
-def test_texels_of_a_triangle_with_a_corner_that_was_not_measured_are_filled_but_not_valid(surface):
+def test_triangle_with_unmeasured_corner_is_filled_but_invalid(surface):
     values = np.linspace(1.0, 2.0, len(surface.points_mm))
     valid = whole(surface)
     valid[SIDE * SIDE // 2] = False
@@ -69,7 +69,7 @@ def test_texels_of_a_triangle_with_a_corner_that_was_not_measured_are_filled_but
     assert found.stderr[found.valid].min() > 0.09
 
 
-def test_nothing_measured_gives_a_map_without_a_valid_texel_and_without_nan(surface):
+def test_map_without_measurements_is_invalid_without_nan(surface):
     texture = SurfaceTexture.of(surface, size=32)
     count = len(surface.points_mm)
     none = PointValues(np.zeros((count, 3)), np.zeros((count, 3)), np.zeros(count, bool))
@@ -97,7 +97,7 @@ def test_normals_between_points_are_unit_vectors(surface):
     assert np.linalg.norm(bare.values, axis=-1)[bare.valid].min() < 0.999
 
 
-def test_the_mesh_that_goes_along_is_read_by_other_programs_as_it_was(surface):
+def test_exported_mesh_is_read_unchanged_by_other_programs(surface):
     text = SurfaceTexture.of(surface, size=32).wavefront()
     read = trimesh.load(io.BytesIO(text), file_type="obj", process=False)
     assert len(read.faces) == len(surface.faces)

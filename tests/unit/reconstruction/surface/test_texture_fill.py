@@ -23,7 +23,7 @@ def texel_uv(size):
 
 
 @pytest.mark.parametrize("size", [8, 61, 256])
-def test_every_texel_under_the_surface_is_covered_once_and_no_other(size):
+def test_texel_coverage_is_unique_and_complete_under_surface(size):
     _, _, corner_uv = grid()
     u, v = texel_uv(size)
     inside = (u > 0.05) & (u < 0.95) & (v > 0.05) & (v < 0.95)
@@ -32,7 +32,7 @@ def test_every_texel_under_the_surface_is_covered_once_and_no_other(size):
     np.testing.assert_array_equal(rasterize(mirrored, size).covered, inside)
 
 
-def test_a_linear_field_over_the_texture_is_laid_out_exactly():
+def test_linear_field_is_rasterized_exactly():
     uv, faces, corner_uv = grid()
     texels = rasterize(corner_uv, 128)
     values, weight = texels_from_points(texels, faces, np.stack([uv[:, 0], 3 * uv[:, 1]], axis=-1))
@@ -44,14 +44,14 @@ def test_a_linear_field_over_the_texture_is_laid_out_exactly():
     np.testing.assert_array_equal(weight[~seen], 0.0)
 
 
-def test_the_top_row_is_v_of_one():
+def test_texture_top_row_is_v_equal_one():
     uv, faces, corner_uv = grid()
     made = densify(rasterize(corner_uv, 64), faces, uv[:, 1])
     assert made.values[4, 32, 0] > 0.9
     assert made.values[-5, 32, 0] < 0.1
 
 
-def test_points_sampled_back_from_their_texture_are_the_points():
+def test_points_resampled_from_texture_match_originals():
     uv, faces, corner_uv = grid()
     field = np.stack([uv[:, 0], uv[:, 1] ** 2], axis=-1)
     made = densify(rasterize(corner_uv, 256), faces, field)
@@ -64,7 +64,7 @@ def test_points_sampled_back_from_their_texture_are_the_points():
     np.testing.assert_array_equal(single, back[:, 0])
 
 
-def test_points_without_weight_or_number_leave_a_gap_that_is_filled():
+def test_points_without_weight_or_value_leave_filled_gap():
     uv, faces, corner_uv = grid()
     values = uv[:, 0].copy()
     bad = np.linalg.norm(uv - 0.5, axis=1) < 0.15
@@ -91,7 +91,7 @@ def test_a_constant_stays_constant_whatever_is_known(rng, shape, share):
     np.testing.assert_allclose(found.values[..., 0], 7.25, rtol=1e-5)
 
 
-def test_a_ramp_known_at_scattered_texels_is_a_ramp_everywhere_inside(rng):
+def test_fill_ramp_from_scattered_texels_is_exact_inside(rng):
     """A fifth of the texels known: median error below 0.01 texel steps, largest below half one."""
     y, x = np.mgrid[0:200, 0:200].astype(float)
     ramp = x + 0.5 * y
@@ -101,7 +101,7 @@ def test_a_ramp_known_at_scattered_texels_is_a_ramp_everywhere_inside(rng):
     assert off.max() < 0.5
 
 
-def test_a_gap_in_a_ramp_is_bridged_within_a_twentieth_of_its_width():
+def test_fill_of_ramp_gap_errs_below_twentieth_width():
     x = np.broadcast_to(np.arange(256.0), (256, 256))
     weight = np.ones(x.shape)
     weight[:, 100:140] = 0
@@ -129,7 +129,7 @@ def test_filled_values_stay_between_the_known_ones(rng):
     assert known.min() - margin < found.min() <= found.max() < known.max() + margin
 
 
-def test_confidence_falls_with_the_distance_to_what_is_known():
+def test_confidence_falls_with_distance_to_known_texels():
     weight = np.zeros((128, 128))
     weight[:, :8] = 1
     confidence = push_pull(np.ones(weight.shape), weight).confidence[64]
@@ -137,7 +137,7 @@ def test_confidence_falls_with_the_distance_to_what_is_known():
     assert confidence[8] < 1
 
 
-def test_a_mask_keeps_values_out_and_is_not_filled():
+def test_mask_excludes_values_and_is_not_filled():
     values = np.ones((64, 64))
     values[:, 32:] = 100.0
     weight = np.ones(values.shape)

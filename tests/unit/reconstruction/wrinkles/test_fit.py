@@ -83,7 +83,7 @@ def test_a_map_at_full_resolution_is_kept(rng):
     np.testing.assert_allclose(low_passed(d, (24, 17)).values, d, atol=1e-7)
 
 
-def test_detail_finer_than_a_texel_is_averaged_away_and_does_not_alias():
+def test_detail_finer_than_texel_is_averaged_without_aliasing():
     x = np.arange(256)
     ripple = np.zeros((256, 256, 2))
     ripple[..., 0] = np.cos(np.pi * x)  # one period in two pixels; sixteen pixels a texel
@@ -119,7 +119,7 @@ def test_holes_do_not_leak_into_texels(rng):
 
 
 @pytest.mark.parametrize("side", [8, 16, 64, 128])
-def test_a_texel_scatters_as_its_standard_error_says(rng, side):
+def test_texel_scatter_matches_its_standard_error(rng, side):
     sigma = 0.1
     noise = sigma * rng.standard_normal((128, 128, 2))
     got = low_passed(noise, (side, side), variance=np.full(noise.shape, sigma**2))
@@ -147,7 +147,7 @@ def test_errors_of_normals_become_errors_of_derivatives(rng):
     np.testing.assert_allclose(ratio, 1.0, atol=4 * np.sqrt(2 / 90_000) + 5e-3)  # 4 sigma, bend
 
 
-def test_grazing_normals_and_unknown_errors_are_masked_and_counted():
+def test_grazing_normals_and_unknown_errors_are_masked_counted():
     n = np.zeros((1, 5, 3))
     n[..., 2] = 1.0
     n[0, 1] = [0.99, 0, np.sqrt(1 - 0.99**2)]
@@ -179,7 +179,7 @@ def test_weights_of_a_new_expression_come_back(face, clamp):
     assert got.explained > 1 - 1e-9
 
 
-def test_a_weight_beyond_the_bounds_is_held_at_them_and_said(face):
+def test_weight_beyond_bounds_is_clamped_and_reported(face):
     base, layer = face
     asked = np.array([0.5, -0.6, 0.5, 0.5, 1.7, 0.5, 0.5, 0.5])
     twice = Layer(2 * layer.wrinkle, layer.masks)
@@ -192,7 +192,7 @@ def test_a_weight_beyond_the_bounds_is_held_at_them_and_said(face):
     np.testing.assert_allclose(free.weights[1], -0.6, atol=0.1)
 
 
-def test_weights_scatter_as_their_standard_errors_and_the_cramer_rao_bound_say(face):
+def test_weight_scatter_matches_stderr_and_cramer_rao_bound(face):
     base, layer = face
     true = np.array([0.3, 0.8, 0.4, 0.7, 0.25, 0.5, 0.6, 0.2])
     sigma, draws = 0.1, 24
@@ -221,7 +221,7 @@ def test_weights_scatter_as_their_standard_errors_and_the_cramer_rao_bound_say(f
     assert np.all(ratio < 1.1)
 
 
-def test_a_zone_without_a_wrinkle_has_no_weight_and_an_infinite_error(face):
+def test_zone_without_wrinkle_has_infinite_weight_error(face):
     base, layer = face
     wrinkle = np.array(layer.wrinkle)
     masks = np.zeros_like(layer.masks)
@@ -238,7 +238,7 @@ def test_a_zone_without_a_wrinkle_has_no_weight_and_an_infinite_error(face):
     np.testing.assert_allclose(got.weights[:4], 0.5, atol=1e-6)
 
 
-def test_a_zone_that_is_wholly_masked_out_is_told_and_others_are_not_hurt(face):
+def test_fully_masked_zone_is_reported_and_others_kept(face):
     base, layer = face
     valid = np.ones((SIDE, SIDE), bool)
     # soft masks reach everywhere: cut this one to its own square, then take the square away
@@ -256,7 +256,7 @@ def test_a_zone_that_is_wholly_masked_out_is_told_and_others_are_not_hurt(face):
     np.testing.assert_allclose(got.weights, [0.0] + [0.5] * 7, atol=1e-6)
 
 
-def test_two_masks_that_are_the_same_share_what_nothing_tells_apart(face):
+def test_zones_with_identical_masks_have_undetermined_weights(face):
     base, layer = face
     masks = np.array(layer.masks)
     masks[1] = masks[0]
@@ -268,7 +268,7 @@ def test_two_masks_that_are_the_same_share_what_nothing_tells_apart(face):
     np.testing.assert_allclose(got.weights[2:], 0.4, atol=1e-5)
 
 
-def test_a_face_that_did_not_move_has_weights_of_zero_and_nothing_to_explain(face):
+def test_unmoved_face_has_zero_weights_and_explained_variance(face):
     base, layer = face
     got = wrinkle_fit.fit_weights(layer, wrinkles.decode(base), wrinkles.decode(base))
     np.testing.assert_allclose(got.weights, 0.0, atol=1e-12)
@@ -325,7 +325,7 @@ def test_map_and_weights_together_show_every_expression(face, fitted):
         assert fit.expressions[name].explained > 0.999
 
 
-def test_weights_come_back_up_to_a_scale_of_each_zone(fitted):
+def test_weights_are_recovered_up_to_zone_scale(fitted):
     _, fit = fitted
     got = np.array([fit.layer.table.rows[name] for name in JIMENEZ2011_TABLE.rows])
     true = np.array(list(JIMENEZ2011_TABLE.rows.values()))
@@ -335,7 +335,7 @@ def test_weights_come_back_up_to_a_scale_of_each_zone(fitted):
         np.testing.assert_allclose(got[:, z], scale * true[:, z], atol=0.04)
 
 
-def test_one_expression_alone_gives_its_own_map_with_weights_of_one(face):
+def test_single_expression_gives_own_map_with_unit_weights(face):
     base, layer = face
     joy = {"joy": shown(face, {"joy": 1.0})}
     fit = wrinkle_fit.fit(wrinkles.decode(base), joy, layer.masks, size=(32, 32), clamp="signed")
@@ -344,7 +344,7 @@ def test_one_expression_alone_gives_its_own_map_with_weights_of_one(face):
     assert fit.explained > 0.999
 
 
-def test_names_sizes_and_tables_that_do_not_fit_are_refused(face):
+def test_mismatched_names_sizes_or_tables_are_refused(face):
     base, layer = face
     n = wrinkles.decode(base)
     with pytest.raises(WrinkleError, match="expected at least one"):
@@ -359,7 +359,7 @@ def test_names_sizes_and_tables_that_do_not_fit_are_refused(face):
         wrinkle_fit.fit_weights(layer, n, n, clamp="tight")
 
 
-def test_the_normal_equations_are_those_of_the_full_design(face, rng):
+def test_normal_equations_match_full_design(face, rng):
     _, layer = face
     d = rng.standard_normal((SIDE, SIDE, 2)).astype(np.float32)
     weight = rng.random((SIDE, SIDE)).astype(np.float32)

@@ -33,7 +33,7 @@ def face():
     return wrinkles.decode(base), states, masks, hard
 
 
-def test_the_true_model_has_rank_one_texels_with_the_table_s_amplitudes(face):
+def test_true_model_has_rank_one_texels_of_table(face):
     neutral, states, masks, _ = face
     found = wrinkle_zones.amplitudes(neutral, states, size=(TEXELS, TEXELS))
     assert found.valid.mean() > 0.95
@@ -61,7 +61,7 @@ def test_rough_regions_become_soft_masks_that_explain_more(face):
     assert 1 - explained[1] < 0.3 * (1 - explained[0])
 
 
-def test_without_a_layout_amplitudes_and_places_find_the_zones(face):
+def test_zones_without_layout_come_from_amplitudes_and_positions(face):
     neutral, states, masks, _ = face
     found = wrinkle_zones.amplitudes(neutral, states, size=(TEXELS, TEXELS))
     got = wrinkle_zones.fit_zones(found, zones=8, rng=np.random.default_rng(0))
@@ -107,14 +107,14 @@ def test_texels_below_their_errors_keep_the_layout(face):
     assert silent.valid.mean() < 0.1
 
 
-def test_one_expression_alone_makes_one_distinct_zone(face):
+def test_single_expression_gives_single_distinct_zone(face):
     neutral, states, _, _ = face
     found = wrinkle_zones.amplitudes(neutral, {"joy": states["joy"]}, size=(TEXELS, TEXELS))
     got = wrinkle_zones.fit_zones(found, zones=3, rng=np.random.default_rng(0))
     assert got.distinct == 1
 
 
-def test_what_does_not_fit_is_refused(face):
+def test_mismatched_zone_inputs_are_refused(face):
     neutral, states, _, hard = face
     with pytest.raises(WrinkleError, match="at least one"):
         wrinkle_zones.amplitudes(neutral, {})

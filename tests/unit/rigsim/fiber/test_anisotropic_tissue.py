@@ -36,7 +36,7 @@ def worst(one, other):
 
 
 @pytest.mark.parametrize("harmonics", [8, None])
-def test_without_a_preferred_direction_it_is_the_isotropic_walk(harmonics):
+def test_anisotropic_walk_without_preferred_direction_is_isotropic(harmonics):
     run = traced(replace(ALONG, strength=0.0), (0.4,), seed=1, harmonics=harmonics)
     plain = fibre_profile(
         LayerStack((Layer(inf, 0.05, 7.5, 0.8, 1.4),)),
@@ -51,13 +51,13 @@ def test_without_a_preferred_direction_it_is_the_isotropic_walk(harmonics):
     assert np.abs(z).max() < 4.5
 
 
-def test_light_goes_farther_along_the_fibres_than_across():
+def test_light_travels_farther_along_fibers_than_across():
     run = traced(ALONG, (0.0, 0.5 * pi), seed=3, photons=60_000, fibres=Fibres((7.0,)))
     along, across = run.reflectance_per_mm2[0]
     assert along - across > 4.5 * np.hypot(*run.stderr[0])
 
 
-def test_harmonics_agree_with_fibres_scored_where_they_stand():
+def test_harmonics_agree_with_fibers_scored_at_their_positions():
     angles = (0.0, 0.5, 1.0, 0.5 * pi)
     assert worst(traced(ALONG, angles, seed=4), traced(ALONG, angles, seed=5, harmonics=None)) < 4.5
     # The test can tell: a mean over the directions is not what the fibres see.
@@ -65,7 +65,7 @@ def test_harmonics_agree_with_fibres_scored_where_they_stand():
     assert worst(mean, traced(ALONG, angles, seed=5, harmonics=None)) > 4.5
 
 
-def test_turning_the_tissue_turns_the_profile():
+def test_rotated_tissue_rotates_its_profile():
     turned = traced(replace(ALONG, axis_rad=0.7), (0.7, 0.7 + 0.5 * pi), seed=6)
     straight = traced(ALONG, (0.0, 0.5 * pi), seed=6)
     np.testing.assert_allclose(turned.reflectance_per_mm2, straight.reflectance_per_mm2, rtol=1e-9)

@@ -29,7 +29,7 @@ RIG = load_rig("probe")
 FALSE_ALARM = 4.5  # standard deviations; of some 100 normal values one in 1500 runs exceeds it
 
 
-def test_suction_presses_blood_out_down_to_what_is_kept():
+def test_suction_reduces_blood_to_residual_level():
     skin = SkinTissue("III", seed=4)
     blood = [skin.blood("cheek", p) for p in (0.0, 3.0, 30.0, 60.0, 1e4)]
     assert blood[0] == blood[1] > blood[2] > blood[3] > blood[4]
@@ -38,7 +38,7 @@ def test_suction_presses_blood_out_down_to_what_is_kept():
     assert skin.blood("chin", 60.0) > 1.5 * skin.blood("forehead", 60.0)
 
 
-def test_layers_hold_the_melanin_and_blood_that_were_asked_for():
+def test_layers_contain_requested_melanin_and_blood():
     skin = SkinTissue("III", seed=4)
     optics = skin.optics("cheek", 0.0, 60.0)
     index = optics.wavelength_nm.index(560.0)
@@ -49,7 +49,7 @@ def test_layers_hold_the_melanin_and_blood_that_were_asked_for():
     assert optics.stacks[index].layers[0].thickness_mm == skin.epidermis_mm("cheek")
 
 
-def test_a_profile_under_suction_is_that_of_its_own_blood():
+def test_profile_under_suction_uses_reduced_blood():
     """Reweighted paths against photons of the layers themselves."""
     skin = SkinTissue("II", seed=4)
     profiles = Profiles(RIG, skin, photons=12_000, seed=2, threads=1)
@@ -86,7 +86,7 @@ def _rest(layer):
     return layer.sigma_a_per_mm, layer.sigma_s_per_mm, layer.g, layer.eta
 
 
-def test_profiles_do_not_depend_on_what_was_asked_before():
+def test_profiles_do_not_depend_on_earlier_requests():
     def made(sites):
         profiles = Profiles(RIG, SkinTissue("II"), photons=200, seed=3, threads=1)
         return [profiles.profile(site, 0.0, 60.0).reflectance_per_mm2 for site in sites]
@@ -94,7 +94,7 @@ def test_profiles_do_not_depend_on_what_was_asked_before():
     np.testing.assert_array_equal(made(["cheek"])[0], made(["chin", "cheek"])[1])
 
 
-def test_without_scattering_nothing_comes_back_and_without_absorption_the_most():
+def test_reflectance_is_zero_unscattered_and_maximal_unabsorbed():
     none = Profiles(RIG, HomogeneousTissue(0.1, 0.0), photons=100, seed=0).profile("cheek")
     assert (none.reflectance_per_mm2 == 0.0).all()
     clear, grey = (
@@ -104,7 +104,7 @@ def test_without_scattering_nothing_comes_back_and_without_absorption_the_most()
     assert (clear.reflectance_per_mm2 > grey.reflectance_per_mm2).all()
 
 
-def test_turning_the_head_on_fibrous_tissue_turns_its_profile():
+def test_rotated_head_on_anisotropic_tissue_rotates_profile():
     photons = 20_000
     tissue = FibrousTissue(0.05, 1.5, -1.0, 30.0)
     profiles = Profiles(RIG, tissue, photons=photons, seed=1, threads=1)
@@ -124,7 +124,7 @@ def test_turning_the_head_on_fibrous_tissue_turns_its_profile():
     assert np.abs((along - across) / error).max() > 6.0
 
 
-def test_the_block_is_off_its_certificate_by_less_than_two_uncertainties():
+def test_phantom_deviates_from_certificate_below_two_uncertainties():
     paper = phantom_certificate()
     exact = make_phantom(paper, deviations=(0.0, 0.0))
     for name, key in (("sigma_a_per_mm", "sigma_a"), ("sigma_s_prime_per_mm", "sigma_s_prime")):
@@ -132,7 +132,7 @@ def test_the_block_is_off_its_certificate_by_less_than_two_uncertainties():
         assert 0.0 < abs(ratio - 1.0).max() < 2.0 * paper["uncertainty"][key]
 
 
-def test_the_certificate_is_one_that_a_calibration_reads(tmp_path):
+def test_certificate_is_readable_by_calibration(tmp_path):
     path = tmp_path / "phantom.json"
     path.write_text(json.dumps(phantom_certificate()), encoding="utf-8")
     read = read_certificate(path)
@@ -143,7 +143,7 @@ def test_the_certificate_is_one_that_a_calibration_reads(tmp_path):
     assert (read.g, read.eta) == (PHANTOM_BLOCK.g, PHANTOM_BLOCK.eta)
 
 
-def test_smoothing_lowers_noise_and_leaves_a_bump_of_photons_noise_only():
+def test_smoothing_lowers_noise_with_residual_within_stated_error():
     rng = np.random.default_rng(5)
     radii = np.array(fibres_of(RIG.probe).radii_mm)
     true = np.exp(-radii) / (radii * (radii + 0.5))

@@ -61,7 +61,7 @@ FORWARD = LayerStack((Layer(inf, 0.1, 7.5, 0.85, 1.4),))
 @pytest.mark.parametrize(
     ("stack", "twin", "agree"), [(RED, RED, True), (LAYERED, LAYERED, True), (RED, FORWARD, False)]
 )
-def test_fibres_that_take_all_angles_see_the_exitance_over_their_cores(stack, twin, agree):
+def test_fibers_accepting_all_angles_collect_core_exitance(stack, twin, agree):
     # Independent runs; |z| < 4.5 for each of six radii: false alarms below 2e-3 (t, 19 dof).
     seen = fibre_profile(
         stack,
@@ -79,7 +79,7 @@ def test_fibres_that_take_all_angles_see_the_exitance_over_their_cores(stack, tw
     assert (np.abs(z).max() < 4.5) == agree
 
 
-def test_paths_reweighted_to_more_absorption_agree_with_a_run_there():
+def test_paths_reweighted_to_more_absorption_match_direct_run():
     kept = fibre_paths(
         RED, Fibres(RADII_MM), photons=40_000, rng=np.random.default_rng(2), threads=2
     ).profile(0.4)
@@ -91,7 +91,7 @@ def test_paths_reweighted_to_more_absorption_agree_with_a_run_there():
     assert np.abs(z).max() < 4.5
 
 
-def test_paths_not_reweighted_are_the_profile_itself():
+def test_paths_without_reweighting_give_profile_itself():
     rng = np.random.default_rng
     kept = fibre_paths(RED, Fibres(RADII_MM), photons=2000, rng=rng(4)).profile()
     run = fibre_profile(RED, radii_mm=RADII_MM, photons=2000, rng=rng(4))
@@ -125,7 +125,7 @@ def test_band_is_the_weighted_mean_of_its_wavelengths():
         assert np.abs((both.reflectance_per_mm2[:, band] - mean) / error).max() < 4.5
 
 
-def test_order_of_fibres_and_number_of_threads_change_nothing():
+def test_profile_ignores_fiber_order_and_thread_count():
     rng = np.random.default_rng
     run = fibre_profile(RED, radii_mm=RADII_MM, photons=2000, rng=rng(7))
     other = fibre_profile(RED, radii_mm=RADII_MM[::-1], photons=2000, rng=rng(7), threads=3)
@@ -152,7 +152,7 @@ def test_impossible_requests_are_refused_by_name(request_, field):
 
 
 @pytest.mark.parametrize(("detector_mm", "source_mm"), [(0.2, 0.2), (0.4, 0.1), (0.2, 0.0)])
-def test_shares_of_rings_are_those_of_random_points_in_the_cores(detector_mm, source_mm):
+def test_ring_fractions_match_random_points_in_cores(detector_mm, source_mm):
     rng = np.random.default_rng(8)
     rows, _, _ = ring_kernels(np.array([0.25]), 0.5 * detector_mm, 0.5 * source_mm)
     nodes = rows[0, 0] + np.arange(KERNEL_NODES) / rows[0, 1]
@@ -214,7 +214,7 @@ def test_extreme_media_agree_with_the_plain_walk(layer):
     assert all_angle_z(layer, radii_mm=radii) < 4.5
 
 
-def test_vanishing_absorption_ends_and_changes_nothing_near_the_source():
+def test_vanishing_absorption_terminates_without_change_near_source():
     """A half-space without absorption keeps photons for ever; far ones end by roulette here."""
     runs = [
         fibre_profile(
@@ -259,7 +259,7 @@ def test_little_scattering_goes_as_its_amount():
     assert error < 0.2
 
 
-def test_absorbing_film_of_a_micrometre_weakens_light_twice():
+def test_absorbing_film_of_one_micrometer_attenuates_twice():
     """Index matched, parallel light in and a narrow cone out: exp(-2 sigma_a d), nothing else."""
     tissue = Layer(inf, 0.1, 7.5, 0.8, 1.0)
     runs = [
@@ -280,7 +280,7 @@ def test_absorbing_film_of_a_micrometre_weakens_light_twice():
     assert error.max() < 0.1
 
 
-def test_film_of_tissue_on_the_same_tissue_changes_nothing():
+def test_film_of_identical_tissue_changes_nothing():
     tissue = Layer(inf, 0.1, 7.5, 0.8, 1.4)
     runs = [
         fibre_profile(
@@ -321,7 +321,7 @@ def test_light_goes_both_ways_alike(stack):
 
 
 @pytest.mark.long
-def test_standard_error_is_the_spread_of_repeated_profiles():
+def test_standard_error_matches_scatter_of_repeated_profiles():
     rng = np.random.default_rng(23)
     runs = [fibre_profile(RED, radii_mm=(0.3, 3.3), photons=2000, rng=rng) for _ in range(60)]
     spread = np.var([run.reflectance_per_mm2 for run in runs], axis=0, ddof=1)
@@ -331,7 +331,7 @@ def test_standard_error_is_the_spread_of_repeated_profiles():
     assert np.all((low < spread / stated) & (spread / stated < high))
 
 
-def test_one_percent_at_every_fibre_within_seven_millimetres_takes_half_a_minute():
+def test_fiber_profile_reaches_one_percent_within_half_minute():
     """Red tissue (sigma_a .04, sigma_s' 1.5), on 2 cores; a margin of 8 was measured."""
     radii = 0.3 + 0.25 * np.arange(27)
     red = LayerStack((Layer(inf, 0.04, 7.5, 0.8, 1.4),))

@@ -23,7 +23,7 @@ def point(channels: int = 1) -> np.ndarray:
 
 
 @pytest.mark.parametrize("sigma_mm", [0.5, 1.5, 4.0])
-def test_a_point_spreads_to_a_gaussian_of_the_stated_width_in_mm_both_ways(sigma_mm):
+def test_point_spreads_to_stated_gaussian_width_both_ways(sigma_mm):
     """The texture is twice as fine along v: the width in mm must not depend on it."""
     atlas = plate(64.0, 32.0)
     out = scatter_laterally(point(), atlas, [sigma_mm], [[1.0]])[..., 0]
@@ -34,7 +34,7 @@ def test_a_point_spreads_to_a_gaussian_of_the_stated_width_in_mm_both_ways(sigma
         assert sigma == pytest.approx(sigma_mm, rel=0.02)
 
 
-def test_light_is_conserved_and_an_even_field_stays_even():
+def test_lateral_scattering_conserves_light_and_uniform_fields():
     atlas = plate(64.0, 32.0)
     sigmas, weights = [0.3, 1.0, 5.0], [[0.2, 0.5, 0.3], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
     rng = np.random.default_rng(12345)
@@ -77,12 +77,12 @@ def test_channels_spread_by_their_own_weights():
     assert out[SIZE // 2, SIZE // 2, 0] > 10.0 * out[SIZE // 2, SIZE // 2, 1]
 
 
-def test_kernels_far_below_a_texel_leave_the_field_alone():
+def test_kernels_far_below_texel_keep_field_unchanged():
     out = scatter_laterally(point(), plate(256.0, 256.0), [0.05], [[1.0]])
     np.testing.assert_array_equal(out, point())
 
 
-def test_the_edge_width_of_a_gaussian_is_2_56_sigma():
+def test_gaussian_edge_width_is_2_56_sigma():
     np.testing.assert_allclose(line_spread_mm([0.7], [[1.0]]), [2 * 1.2815516 * 0.7], rtol=1e-4)
 
 

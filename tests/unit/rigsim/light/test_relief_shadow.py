@@ -58,7 +58,7 @@ def seen_from(shadow: ReliefShadow, azimuth_deg: float, elevation_deg: float, ac
 @pytest.mark.parametrize(
     ("azimuth_deg", "before"), [(0.0, "left"), (180.0, "right"), (90.0, "below")]
 )
-def test_a_wall_hides_a_light_as_far_as_its_height_over_the_tangent(azimuth_deg, before, across):
+def test_wall_shadows_light_to_height_over_tangent(azimuth_deg, before, across):
     """A wall of 2 mm and a light 20 degrees up: 5.5 mm of shadow, on the side away from the light.
 
     Tolerance: a texel, and the soft edge, 0.02 rad or 0.3 mm.
@@ -78,7 +78,7 @@ def test_a_wall_hides_a_light_as_far_as_its_height_over_the_tangent(azimuth_deg,
     assert other.min() == 1.0
 
 
-def test_level_skin_and_lights_above_all_slopes_are_never_hidden():
+def test_level_skin_and_high_lights_are_never_shadowed():
     ramp = np.abs(np.arange(SIDE) - 48.0)[None, :].repeat(SIDE, 0) * MM * 1e3 * 0.5
     assert seen_from(level(np.zeros((SIDE, SIDE))), 33.0, 1.0).min() == 1.0
     steep_deg = math.degrees(math.atan(0.5) + 1.1 * SOFT_RAD)
@@ -92,7 +92,7 @@ def face():
     return make_subject("III", seed=0, size=192)
 
 
-def test_wrinkles_shade_a_face_that_has_moved_and_its_two_renderers_agree(face):
+def test_wrinkles_shade_moved_face_equally_in_both_renderers(face):
     rig = small_dome(load_rig("dome"), lights=4, views=1, width_px=64)
     view = rig.views[0].name
     plain = SceneEffects(lateral=False, interreflections=False)
@@ -111,7 +111,7 @@ def test_wrinkles_shade_a_face_that_has_moved_and_its_two_renderers_agree(face):
     assert differ.mean() < 0.002  # rays that two tracers judge differently
 
 
-def test_a_face_at_rest_is_as_it_was_and_says_what_it_lacks(face):
+def test_face_at_rest_is_unchanged_reporting_missing_effect(face):
     rig = load_rig("flash").resized(64)
     rest = FlashScene(rig, face, choice=EMBREE)
     assert rest.needs[WRINKLE_SHADOW_EFFECT].verdict == "unmodeled"

@@ -31,7 +31,7 @@ def slanted(angle_deg: float) -> np.ndarray:
 
 @pytest.mark.parametrize("angle_deg", [0.0, 30.0, 60.0, 80.0, 88.0])
 @pytest.mark.parametrize("roughness", [0.15, 0.3, 0.5])
-def test_white_skin_sends_back_less_light_than_it_gets(angle_deg, roughness):
+def test_white_skin_reflects_less_light_than_received(angle_deg, roughness):
     """R_d of 1, the most oil and the densest fuzz: the worst case of all."""
     way, weight = hemisphere(200, 256)
     packed = [1.0, 1.0, 1.0, roughness, 0.6, surface_brdf.FUZZ_DEPTH, 1.0]
@@ -40,7 +40,7 @@ def test_white_skin_sends_back_less_light_than_it_gets(angle_deg, roughness):
     assert weight @ total[:, 0] < 1.0
 
 
-def test_light_and_camera_may_change_places(rng):
+def test_skin_brdf_is_reciprocal(rng):
     way = rng.standard_normal((500, 2, 3))
     way[..., 2] = np.abs(way[..., 2]) + 1e-3
     way /= np.linalg.norm(way, axis=-1, keepdims=True)
@@ -51,7 +51,7 @@ def test_light_and_camera_may_change_places(rng):
         np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-7)
 
 
-def test_facets_of_a_white_metal_reflect_almost_everything_when_smooth():
+def test_smooth_white_metal_facets_reflect_almost_everything():
     """Without Fresnel only shadowing loses light; GGX has wide tails, so it loses more."""
     way, weight = hemisphere(240, 120)
     light = slanted(30.0)
@@ -61,7 +61,7 @@ def test_facets_of_a_white_metal_reflect_almost_everything_when_smooth():
         assert 1.0 - lost < weight @ np.array(f) < 1.0 + 1e-6
 
 
-def test_r_d_is_what_eq_6_takes_the_minimum_of():
+def test_r_d_without_surface_terms_matches_eq_6():
     """Without surface terms pi f / (T T) is R_d in every direction."""
     way, _ = hemisphere(12, 16)
     packed = [0.6, 0.3, 0.05, 0.3, 0.0, 0.0, 0.0]
@@ -76,7 +76,7 @@ def test_r_d_is_what_eq_6_takes_the_minimum_of():
     assert not specular.any()
 
 
-def test_light_at_normal_incidence_comes_back_from_inside_as_the_tables_reflectance():
+def test_subsurface_reflectance_at_normal_incidence_matches_table():
     """R_d is larger than the reflectance by 1 / (T(0) T_average)."""
     way, weight = hemisphere(64, 4)
     r = 0.5
@@ -85,7 +85,7 @@ def test_light_at_normal_incidence_comes_back_from_inside_as_the_tables_reflecta
     assert weight @ total[:, 1] == pytest.approx(r, rel=1e-4)
 
 
-def test_boundary_is_that_of_the_flash_rigs_closed_form():
+def test_boundary_transmittance_matches_flash_rig_closed_form():
     cosine = np.linspace(0.05, 1.0, 20)
     rs, rp = shading.fresnel_amplitudes(cosine, 1.4)
     ours = [surface_brdf.boundary_transmittance(c, 1.0) for c in cosine]
@@ -93,7 +93,7 @@ def test_boundary_is_that_of_the_flash_rigs_closed_form():
 
 
 @pytest.mark.parametrize(("preset", "part"), [("II", 0.003), ("VI", 0.015)])
-def test_eq_6_errs_by_little_for_want_of_a_direction_without_gloss(preset, part):
+def test_eq_6_error_without_specular_free_direction_small(preset, part):
     """Where the surface shines least, within 70 degrees, it adds this part of blue's R_d."""
     face = make_subject(preset, size=64)
     surface = surface_brdf.skin_surface(face, "Nikon 5100 (NPL)", "LED-B3")
@@ -103,7 +103,7 @@ def test_eq_6_errs_by_little_for_want_of_a_direction_without_gloss(preset, part)
     assert 0.0 < np.median(floor / surface.r_d[bare][:, 2]) < part
 
 
-def test_no_lobe_of_one_roughness_and_index_holds_the_surface_terms():
+def test_single_lobe_does_not_fit_surface_terms():
     """Best multiple of a single lobe, over its roughness, misses by several percent."""
     way, weight = hemisphere(40, 32)
     light = slanted(50.0)
@@ -116,7 +116,7 @@ def test_no_lobe_of_one_roughness_and_index_holds_the_surface_terms():
     assert min(errors) > 0.05
 
 
-def test_a_face_varies_in_gloss_and_stays_in_range():
+def test_face_specular_varies_and_stays_in_range():
     surface = surface_brdf.skin_surface(
         make_subject("V", seed=3, size=64), "Nikon 5100 (NPL)", "LED-B3"
     )

@@ -60,7 +60,7 @@ def test_the_noise_is_that_of_exposures(rng):
         assert found == pytest.approx(float(noise.sigma(level)), rel=0.045)  # 1e-4 twice
 
 
-def test_a_record_may_not_call_negligible_what_is_not():
+def test_effect_record_rejects_wrong_negligible_verdict():
     with pytest.raises(NeedsError, match="build it"):
         Effect("bounces", "negligible", "flat", NEGLIGIBLE_NOISE_RATIO)
     with pytest.raises(NeedsError, match="expected one of built"):
@@ -72,7 +72,7 @@ def test_a_record_may_not_call_negligible_what_is_not():
 
 
 @pytest.mark.parametrize("texels", [3, 15])
-def test_light_lost_at_an_edge_is_what_spreading_moves_across_it(texels):
+def test_edge_light_loss_matches_lateral_scattering(texels):
     """Expected: the mean over a lit pixel beside a shadow; the edge and the pixel's sides run
     between texels. Tolerance: 5 %; texels of a quarter of the kernel's width lose 2 to 4 % less,
     those of half of it 6 %."""
@@ -94,7 +94,7 @@ def test_light_lost_at_an_edge_is_what_spreading_moves_across_it(texels):
     assert lost != pytest.approx(effect_sizes.edge_loss([0.7], [[1.0]], 1.0)[0], rel=0.05)
 
 
-def test_a_plate_gets_no_light_from_itself_and_a_corner_does():
+def test_interreflection_is_zero_on_plate_not_in_corner():
     flat = plate(SQUARE)
     assert effect_sizes.is_flat(flat.mesh)
     assert effect_sizes.exchange_share(flat) == 0.0
@@ -105,7 +105,7 @@ def test_a_plate_gets_no_light_from_itself_and_a_corner_does():
     assert 0.15 < effect_sizes.exchange_share(corner) < 0.5
 
 
-def test_a_groove_hides_its_sky_as_two_walls_do():
+def test_groove_occludes_sky_like_two_walls():
     """In a V of 90 degrees the other wall, of length L, hides (1 - d / sqrt(L^2 + d^2)) / 2 of the
     sky of a point a distance d from the bottom. Tolerance: sectors, and a groove of finite length.
     """
@@ -140,7 +140,7 @@ def flash():
     return load_rig("flash").resized(64)
 
 
-def test_pale_skin_needs_what_the_darkest_does_not(flash, faces):
+def test_pale_skin_needs_effects_negligible_on_darkest(flash, faces):
     pale, dark = (FlashScene(flash, faces[name]).needs for name in ("II", "darkest"))
     assert pale.builds(face_needs.SPECTRAL_EFFECT)
     assert dark[face_needs.SPECTRAL_EFFECT].verdict == "negligible"
@@ -159,7 +159,7 @@ def test_a_noisier_sensor_needs_less(flash, faces):
     assert coarse[face_needs.SPECTRAL_EFFECT].reason.startswith("there is no such light")
 
 
-def test_what_is_asked_for_is_done_and_said(flash, faces):
+def test_requested_effect_is_built_and_reported(flash, faces):
     asked = FlashScene(
         flash, faces["II"], effects=SceneEffects(lateral=False, interreflections=False)
     )
@@ -182,7 +182,7 @@ def grazing(rig, angle_deg=88.0):
 
 
 @pytest.mark.parametrize("power", [1.0, 0.02])
-def test_sizes_are_bounds_where_a_light_grazes_a_plate_that_faces_the_camera(flash, faces, power):
+def test_effect_sizes_are_bounds_under_grazing_light(flash, faces, power):
     """What faces the light is 29 times as bright as the plate, and beyond full scale."""
     rig, face = grazing(flash), faces["darkest"]
     scene = FlashScene(rig, face, power=power)
@@ -201,7 +201,7 @@ def test_sizes_are_bounds_where_a_light_grazes_a_plate_that_faces_the_camera(fla
     assert told["interreflections"] < 40.0 * max(told["spectral"], 0.02)
 
 
-def test_a_highlight_is_brighter_than_dark_skin_and_the_lens_is_judged_by_it(flash, faces):
+def test_lens_effect_follows_highlight_brighter_than_dark_skin(flash, faces):
     """A bound on highlights: above what is found anywhere, though a few times at most."""
     for rig in (flash, grazing(flash, 60.0)):
         scene = FlashScene(rig, faces["darkest"], effects=SceneEffects(lateral=False, optics=False))
@@ -215,7 +215,7 @@ def test_a_highlight_is_brighter_than_dark_skin_and_the_lens_is_judged_by_it(fla
         assert shown.max() < peak
 
 
-def test_fewer_wavelengths_change_no_pixel_by_more_than_is_told(flash, faces):
+def test_fewer_wavelengths_change_pixels_below_stated_bound(flash, faces):
     """Of light from skin to skin, whose share is told as a bound, between any two of its skins."""
     face = faces["II"]
     scene = FlashScene(flash, face)
@@ -238,7 +238,7 @@ def test_fewer_wavelengths_change_no_pixel_by_more_than_is_told(flash, faces):
     assert changes[0] > 3.0 * changes[-1]  # 50 nm miss what 20 nm see
 
 
-def test_of_two_cameras_the_one_that_tells_more_decides(flash, faces):
+def test_more_sensitive_of_two_cameras_decides(flash, faces):
     view = flash.views[0]
     dull = dataclasses.replace(view, read_noise_e=2e4)
     keen = dataclasses.replace(view, name="keen", serial="SR-0002")
@@ -262,13 +262,13 @@ def test_flat_targets_need_neither_shadows_nor_bounces(flash):
         assert scene.needs[face_needs.LATERAL_EFFECT].verdict == "absent"
 
 
-def test_films_alone_ask_for_polarization(flash, faces):
+def test_polarizers_alone_require_polarization(flash, faces):
     assert FlashScene(flash, faces["II"]).needs.builds(face_needs.POLARIZATION_EFFECT)
     dome = load_rig("dome").resized(64).subset(views=["C02"])
     assert DomeScene(dome, faces["II"]).needs[face_needs.POLARIZATION_EFFECT].verdict == "absent"
 
 
-def test_gray_tissue_is_traced_once_and_skin_color_by_color():
+def test_gray_tissue_is_traced_once_skin_by_color():
     rig = load_rig("probe")
     gray = ProbeScene(rig, HomogeneousTissue(0.04, 1.5)).needs
     assert gray["tissue traced color by color"].verdict == "negligible"
@@ -279,7 +279,7 @@ def test_gray_tissue_is_traced_once_and_skin_color_by_color():
 
 
 @pytest.mark.long
-def test_color_of_bounced_light_is_redder_than_band_by_band(flash, faces):
+def test_spectral_interreflection_is_redder_than_band_interreflection(flash, faces):
     """The mean of a square is larger than the square of the mean, in red most."""
     one = FlashScene(flash, faces["II"]).radiance()
     plain = FlashScene(flash, faces["II"], effects=SceneEffects(spectral=False)).radiance()

@@ -58,7 +58,7 @@ def hemisphere(polar=200, around=256):
 @pytest.mark.parametrize("angle_deg", [0.0, 40.0, 70.0, 85.0])
 @pytest.mark.parametrize("powder", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize(("eta", "alpha"), [(1.333, 0.09), (1.5, 0.3)])
-def test_coated_skin_sends_back_less_light_than_it_gets(angle_deg, powder, eta, alpha):
+def test_coated_skin_reflects_less_light_than_received(angle_deg, powder, eta, alpha):
     """The whitest that there is: R_d of 0.9 under a whole film, or of powder's own under grains."""
     way, weight = hemisphere()
     r_d = (1.0 - powder) * 0.9 + powder * 0.55
@@ -68,7 +68,7 @@ def test_coated_skin_sends_back_less_light_than_it_gets(angle_deg, powder, eta, 
     assert weight @ total[:, 0] < 1.0
 
 
-def test_light_and_camera_may_change_places_on_coated_skin(rng):
+def test_coated_skin_brdf_is_reciprocal(rng):
     way = rng.standard_normal((500, 2, 3))
     way[..., 2] = np.abs(way[..., 2]) + 1e-3
     way /= np.linalg.norm(way, axis=-1, keepdims=True)
@@ -81,7 +81,7 @@ def test_light_and_camera_may_change_places_on_coated_skin(rng):
         np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-7)
 
 
-def test_a_film_of_nothing_and_no_grains_are_bare_skin(rng):
+def test_zero_film_and_no_grains_give_bare_skin(rng):
     way, _ = hemisphere(12, 16)
     bare = [0.5, 0.4, 0.3, 0.3, 0.3, 0.001, 0.9]
     one = surface_brdf.evaluate(bare, UP, slanted(50.0), way)
@@ -90,7 +90,7 @@ def test_a_film_of_nothing_and_no_grains_are_bare_skin(rng):
         np.testing.assert_allclose(a, b, rtol=1e-6)
 
 
-def test_grains_alone_follow_the_closed_form_of_a_thick_layer():
+def test_grains_match_closed_form_of_thick_layer():
     """Light from above and back: w p(pi) / (4 pi 2), p = (1 - g^2) / (1 + g)^3 for g < 0."""
     g, w = surface_brdf.POWDER_ASYMMETRY, surface_brdf.POWDER_ALBEDO
     packed = [0.0, 0.0, 0.0, 0.3, 0.2, 0.0, 1.0, 0.0, 0.2, 1.4, 1.0]
@@ -107,19 +107,19 @@ def test_grains_alone_follow_the_closed_form_of_a_thick_layer():
 
 
 @pytest.mark.parametrize("condition", CONDITION_NAMES)
-def test_nothing_of_a_condition_is_the_surface_itself(condition, face, bare):
+def test_condition_of_zero_amount_keeps_surface(condition, face, bare):
     assert conditioned(bare, condition, 0.0) is bare
     assert coated(face, bare, {condition: 0.0}) is bare
     assert conditioned_subject(face, {condition: 0.0}) is face
 
 
-def test_normal_is_the_surface_itself(face, bare):
+def test_normal_condition_keeps_surface(face, bare):
     assert conditioned(bare, "normal") is bare
     again = conditioned_surface(face, CAMERA, LIGHT, {"normal": 1.0})
     np.testing.assert_array_equal(again.packed(), bare.packed())
 
 
-def test_films_shine_more_in_the_mirror_direction_and_powder_and_cold_less(face, bare):
+def test_films_raise_specular_powder_and_cold_lower(face, bare):
     points = face.hair == 0.0
     light, view = slanted(30.0), slanted(30.0, 180.0)
     before = gloss(bare, light, view, points)
@@ -132,7 +132,7 @@ def test_films_shine_more_in_the_mirror_direction_and_powder_and_cold_less(face,
     assert now["powder"] < 0.8 * before
 
 
-def test_powder_throws_light_back_to_where_it_came_from(face, bare):
+def test_powder_scatters_light_backward(face, bare):
     points = face.hair == 0.0
     light = slanted(65.0)
     powdered = conditioned_surface(face, CAMERA, LIGHT, {"powder": 1.0})
@@ -152,7 +152,7 @@ def test_heat_reddens_and_cold_pales(face, bare):
     assert ratio["hot"] > 1.005 * ratio["normal"]
 
 
-def test_makeup_evens_the_color_out_and_covers_towards_its_own(face, bare):
+def test_makeup_evens_color_and_covers_towards_own_color(face, bare):
     skin = (face.hair == 0.0) & face.atlas.covered
     even = conditioned(bare, "makeup")
     assert np.all(even.r_d[skin].std(axis=0) < 0.4 * bare.r_d[skin].std(axis=0))
@@ -164,12 +164,12 @@ def test_makeup_evens_the_color_out_and_covers_towards_its_own(face, bare):
     np.testing.assert_allclose(np.abs(bronze.r_d - [0.4, 0.2, 0.1])[skin], 0.3 * gap, atol=1e-5)
 
 
-def test_more_of_it_is_more(face, bare):
+def test_film_grows_with_condition_amount(face, bare):
     film = [conditioned(bare, "lotion", a).coating.film.mean() for a in (0.3, 0.6, 1.0)]
     np.testing.assert_allclose(np.array(film) / film[-1], [0.3, 0.6, 1.0], rtol=1e-5)
 
 
-def test_one_film_over_another_covers_what_it_left(bare):
+def test_second_film_covers_remainder_of_first(bare):
     both = conditioned(conditioned(bare, "lotion"), "sweat").coating
     assert both.film.mean() == pytest.approx(1.0 - 0.25 * 0.3, rel=1e-5)
     assert ETA["water"] < both.film_eta.mean() < ETA["lotion"]
@@ -185,7 +185,7 @@ def test_the_darkest_face_under_everything_stays_in_range(face):
     assert np.all(total >= specular[:, None])
 
 
-def test_a_posed_face_keeps_its_pose_under_a_condition(face):
+def test_posed_face_keeps_pose_under_condition(face):
     smiling = face.posed("smile")
     hot = conditioned_subject(smiling, {"hot": 1.0})
     assert hot.pose is smiling.pose
@@ -202,7 +202,7 @@ def test_an_unknown_condition_is_refused(condition, amount, match, bare):
         conditioned(bare, condition, amount)
 
 
-def test_a_coating_or_foundation_out_of_range_is_refused(bare):
+def test_coating_or_foundation_out_of_range_is_refused(bare):
     even = np.ones((4, 4), np.float32)
     with pytest.raises(SurfaceError, match="film_eta: got"):
         Coating(even, 0.2 * even, even, even)

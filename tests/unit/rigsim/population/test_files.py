@@ -27,11 +27,11 @@ def person(tmp_path):
     return write
 
 
-def test_a_file_that_says_nothing_is_the_usual_preset(person):
+def test_file_without_settings_gives_default_preset(person):
     assert read(person("")) == load_subject("III")
 
 
-def test_a_preset_by_its_name_is_the_face_of_that_preset():
+def test_preset_name_gives_face_of_that_preset():
     by_name, made = load_subject("V").face(seed=3, size=64), make_subject("V", seed=3, size=64)
     np.testing.assert_array_equal(by_name.melanin, made.melanin)
     np.testing.assert_array_equal(by_name.hemoglobin("anger"), made.hemoglobin("anger"))
@@ -50,7 +50,7 @@ def test_melanin_between_two_presets_is_between_their_faces(person):
     assert medians[1] / medians[0] == pytest.approx((high / low) ** 0.5, rel=0.05)
 
 
-def test_blood_is_a_factor_and_freckles_are_where_they_are_asked_for(person):
+def test_blood_is_factor_and_freckles_follow_requested_positions(person):
     usual = read(person("")).face(seed=4, size=64)
     more = read(person("blood = 2\nfreckles = 1\noil = 1.5")).face(seed=4, size=64)
     np.testing.assert_allclose(
@@ -64,7 +64,7 @@ def test_blood_is_a_factor_and_freckles_are_where_they_are_asked_for(person):
 
 
 @pytest.mark.parametrize("ending", ["npy", "exr"])
-def test_textures_are_what_the_face_is_made_of(person, tmp_path, rng, ending):
+def test_file_textures_become_face_maps(person, tmp_path, rng, ending):
     own = {
         "melanin_map": rng.uniform(0.01, 0.3, (64, 64)).astype(np.float32),
         "hemoglobin_map": rng.uniform(0.0, 0.3, (64, 64)).astype(np.float32),
@@ -85,7 +85,7 @@ def test_textures_are_what_the_face_is_made_of(person, tmp_path, rng, ending):
     np.testing.assert_allclose(inner[0, 0], 0.75 * down[0, 0] + 0.25 * down[0, 1], rtol=1e-5)
 
 
-def test_the_patch_and_the_tissue_are_of_the_same_person(person):
+def test_patch_and_tissue_belong_to_same_person(person):
     ann = read(person("melanin = 0.1\nblood = 1.5"))
     patch, plain = (
         ann.patch("cheek", seed=1, size_mm=0.3),
@@ -101,7 +101,7 @@ def test_the_patch_and_the_tissue_are_of_the_same_person(person):
     assert ann.unused("probe") == ann.unused("flash") == ann.unused("dome") == ()
 
 
-def test_the_record_tells_files_of_one_name_apart(person, tmp_path):
+def test_record_distinguishes_files_of_same_name(person, tmp_path):
     path = person('preset = "IV"\nmelanin_map = "m.npy"')
     np.save(tmp_path / "m.npy", np.full((64, 64), 0.1, np.float32))
     first = record(path)
@@ -143,7 +143,7 @@ def test_the_record_tells_files_of_one_name_apart(person, tmp_path):
         ("melanin", "is not TOML"),
     ],
 )
-def test_what_is_wrong_with_a_file_is_named(person, tmp_path, text, said):
+def test_subject_file_error_names_fault(person, tmp_path, text, said):
     np.save(tmp_path / "flat.npy", np.ones(64))
     np.save(tmp_path / "much.npy", np.full((64, 64), 0.9))
     np.save(tmp_path / "holes.npy", np.full((64, 64), np.nan))
@@ -169,13 +169,13 @@ def test_what_is_wrong_with_a_file_is_named(person, tmp_path, text, said):
     assert "pickle" not in str(caught.value)
 
 
-def test_every_fault_is_told_at_once(person):
+def test_subject_file_errors_are_reported_together(person):
     with pytest.raises(SubjectFileError) as caught:
         read(person('melanin = 0.9\nblood = 9\npreset = "VII"'))
     assert all(name in str(caught.value) for name in ("melanin", "blood", "preset"))
 
 
-def test_faults_of_type_of_range_and_of_names_are_told_together(tmp_path):
+def test_type_range_and_name_errors_are_reported_together(tmp_path):
     (tmp_path / "ann.toml").write_text(
         'melanin = nan\nblood = inf\noil = -1\nfre = 2\npreset = 3\nmesh = "none.obj"\n',
         encoding="utf-8",
@@ -187,13 +187,13 @@ def test_faults_of_type_of_range_and_of_names_are_told_together(tmp_path):
     assert "preset: got 3, expected a valid string" in str(caught.value)
 
 
-def test_a_key_that_is_no_name_of_ours_ends_in_one_error(person):
+def test_unknown_key_gives_single_error(person):
     with pytest.raises(SubjectFileError, match=r"a\.b.*an unknown key"):
         read(person('"a.b" = 1\n"" = 2'))
 
 
 @pytest.mark.parametrize("size", [64, 77, 100])
-def test_texels_that_get_fewer_are_means_of_the_area_that_they_cover(tmp_path, rng, size):
+def test_downsampled_texels_are_area_means(tmp_path, rng, size):
     """Expected: means over a grid so fine that it divides both, in double precision."""
     values = rng.uniform(0.01, 0.3, (128, 128)).astype(np.float32)
     np.save(tmp_path / "m.npy", values)
@@ -214,7 +214,7 @@ def test_fine_stripes_leave_no_coarse_ones(tmp_path):
     assert small.mean() == pytest.approx(0.155, rel=1e-5)
 
 
-def test_a_tissue_that_is_not_known_is_told_of_files():
+def test_unknown_tissue_is_refused_with_hint_of_files():
     with pytest.raises(TissueError, match=r"got 'ann\.TOML'.*or a file NAME\.toml"):
         subject_file.tissue("ann.TOML", seed=0)
     with pytest.raises(TissueError) as caught:
@@ -222,7 +222,7 @@ def test_a_tissue_that_is_not_known_is_told_of_files():
     assert "a file NAME" not in str(caught.value)
 
 
-def test_a_file_of_another_schema_or_of_none_is_refused(tmp_path):
+def test_file_with_other_or_missing_schema_is_refused(tmp_path):
     for text in ('schema = "skinrig.subject/2"\n', "melanin = 0.1\n"):
         (tmp_path / "ann.toml").write_text(text, encoding="utf-8")
         with pytest.raises(SubjectFileError, match="schema"):
@@ -230,7 +230,7 @@ def test_a_file_of_another_schema_or_of_none_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["VII", "ann", "none.toml"])
-def test_what_is_neither_a_preset_nor_a_file_is_refused(text):
+def test_neither_preset_nor_file_is_refused(text):
     with pytest.raises(SubjectFileError, match=r"no such file|or a file NAME\.toml"):
         subject_file.load_subject(text)
 

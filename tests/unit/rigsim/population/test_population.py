@@ -32,7 +32,7 @@ def test_the_groups_have_the_papers_numbers_and_ages():
     assert len({p.name for p in PEOPLE}) == len({p.seed for p in PEOPLE}) == 87
 
 
-def test_the_same_seed_draws_the_same_people_and_another_one_others():
+def test_same_seed_draws_same_people_another_seed_others():
     assert table_1() == PEOPLE
     other = table_1(seed=1)
     assert not {p.melanin for p in other} & {p.melanin for p in PEOPLE}
@@ -75,7 +75,7 @@ def test_stubble_darkens_the_beard_and_nothing_else():
     np.testing.assert_allclose(shade[forehead], 1.0, atol=1e-5)
 
 
-def test_age_brings_spots_and_deeper_furrows():
+def test_age_adds_spots_and_deepens_grooves():
     young = dataclasses.replace(PEOPLE[4], age_years=20.0, beard=0.0, freckles=0.0)
     old = dataclasses.replace(young, age_years=75.0)
     a, b = young.face(128), old.face(128)
@@ -85,7 +85,7 @@ def test_age_brings_spots_and_deeper_furrows():
     assert b.roughness[mask].mean() > a.roughness[mask].mean()
 
 
-def test_a_shift_changes_half_of_the_people_and_only_what_it_names(rng):
+def test_shift_changes_half_of_people_and_named_trait(rng):
     tanned = shifted(PEOPLE, "tan", melanin=1.5, rng=rng)
     changed = [(p, q) for p, q in zip(PEOPLE, tanned, strict=True) if p != q]
     assert len(changed) == 44
@@ -131,7 +131,7 @@ def test_faces_and_shifts_out_of_range_are_refused(rng):
         table_1(seed=-1)
 
 
-def test_the_palest_and_the_darkest_member_can_be_drawn():
+def test_palest_and_darkest_member_can_be_drawn():
     low, high = population.POPULATION_MELANIN_RANGE
     for melanin in (low, high):
         person: Member = dataclasses.replace(PEOPLE[1], melanin=melanin, age_years=90.0)

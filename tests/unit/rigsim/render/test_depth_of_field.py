@@ -62,7 +62,7 @@ def wide_open(rig: Rig, f_number: float) -> LensSpread:
 
 
 @pytest.mark.parametrize("depth_mm", [0.0, 25.0, -85.0])
-def test_a_plate_that_is_seen_whole_gives_all_its_light_at_any_depth(rig, depth_mm):
+def test_fully_visible_plate_keeps_light_at_any_depth(rig, depth_mm):
     spread = wide_open(rig, 2.0)
     depth = np.full((60, 60), np.nan)
     depth[20:40, 20:40] = depth_mm
@@ -71,7 +71,7 @@ def test_a_plate_that_is_seen_whole_gives_all_its_light_at_any_depth(rig, depth_
     assert picture[15, 15] == pytest.approx(1.0, abs=1e-5)
 
 
-def test_a_black_pixel_gets_more_the_further_its_surroundings_are_out_of_focus(rig):
+def test_black_pixel_brightens_with_defocus_of_surroundings(rig):
     spread = wide_open(rig, 4.0)
     hole = np.ones((40, 40))
     hole[20:22, 20:22] = 0.0
@@ -79,7 +79,7 @@ def test_a_black_pixel_gets_more_the_further_its_surroundings_are_out_of_focus(r
     assert (np.diff(dark) > 0.01).all()
 
 
-def test_the_middle_of_a_picture_in_focus_is_airys(rig):
+def test_center_of_focused_image_is_airy_disk(rig):
     """Ratio of what a point sends to its own pixel and to the next, by integrating Airy's pattern.
 
     The table is renormalized to what the picture holds, which ratios do not see. The sample's
@@ -128,7 +128,7 @@ def patterned(buffers: GBuffer) -> np.ndarray:
 
 
 @pytest.mark.parametrize("f_number", [2.0, 1.4])
-def test_a_face_out_of_focus_is_what_rays_through_the_whole_pupil_see(rig, caster, f_number):
+def test_defocused_face_matches_rays_through_whole_pupil(rig, caster, f_number):
     """RMS over the face, and where blur shows, against 40 x 16 rays a pixel.
 
     Diffraction is small there. Both have 16 samples a pixel, since coarse sampling is an error
@@ -166,7 +166,7 @@ def test_an_evenly_bright_face_stays_evenly_bright_inside(rig, caster):
     assert ones.max() < 1.05
 
 
-def test_what_is_in_focus_hides_what_is_bright_and_blurred_behind_it(rig):
+def test_focused_foreground_hides_bright_blurred_background(rig):
     """A black sheet in focus covers the left half of a white wall far behind."""
     spread = wide_open(rig, 2.0)
     depth = np.full((40, 60), -85.0)
@@ -182,7 +182,7 @@ def test_what_is_in_focus_hides_what_is_bright_and_blurred_behind_it(rig):
     assert bare[: r + 1 - 1].sum() > 0.1  # spreading alone would have let this much through
 
 
-def test_what_is_blurred_in_front_covers_as_much_as_its_own_circle(rig):
+def test_blurred_foreground_covers_area_of_its_blur_circle(rig):
     """The same wall in focus, the sheet before it: light at the edge follows the sheet's blur."""
     spread = wide_open(rig, 1.4)
     depth = np.zeros((40, 60))
@@ -196,7 +196,7 @@ def test_what_is_blurred_in_front_covers_as_much_as_its_own_circle(rig):
     assert 0.02 < picture[14] < 0.5
 
 
-def test_a_scene_blurs_where_its_needs_say_so_and_truth_stays_sharp(rig):
+def test_scene_blurs_as_needed_and_truth_stays_sharp(rig):
     face = make_subject("II", seed=0, size=64)
     plain = SceneEffects(lateral=False, interreflections=False)
     blurred = FlashScene(rig, face, effects=plain, choice=EMBREE)
@@ -233,7 +233,7 @@ def test_depths_behind_the_camera_are_refused(rig):
         lens_spread(rig.views[0], "D55", subpixels=0, depths_mm=[0.0])
 
 
-def test_focus_goes_through_the_target_unless_the_view_says_otherwise(rig):
+def test_focus_is_at_target_unless_view_overrides(rig):
     cam = rig.views[0]
     nearer = dataclasses.replace(cam, focus_mm=cam.distance_mm - 25.0)
     tip = np.array([[0.0, 0.0, 25.0]], np.float32)

@@ -17,7 +17,7 @@ def library(folder: Path, name: str) -> Path:
     return path
 
 
-def test_libraries_too_old_by_their_name_are_refused_without_a_probe(tmp_path, monkeypatch):
+def test_libraries_too_old_by_name_skip_probe(tmp_path, monkeypatch):
     monkeypatch.setattr(variant, "probe_library", lambda *_, **__: pytest.fail("probed"))
     for name in ("libLLVM-14.so.1", "libLLVM-15.so.1", "libLLVM.so.16.0"):
         verdict = variant.judge_library(library(tmp_path, name), cache=tmp_path / "cache")
@@ -25,7 +25,7 @@ def test_libraries_too_old_by_their_name_are_refused_without_a_probe(tmp_path, m
         assert "older than 17" in verdict.why
 
 
-def test_a_file_that_is_no_library_ends_the_probe_not_this_process(tmp_path):
+def test_non_library_file_ends_probe_not_this_process(tmp_path):
     path = library(tmp_path, "libLLVM.so.99.1")
     verdict = variant.judge_library(path, cache=tmp_path / "cache")
     assert not verdict.usable
@@ -36,13 +36,13 @@ def test_a_file_that_is_no_library_ends_the_probe_not_this_process(tmp_path):
     not any(0 < variant.major_version(path) < variant.MIN_LLVM_VERSION for path in INSTALLED),
     reason="no old LLVM library on this machine",
 )
-def test_a_real_old_library_is_refused_by_the_probe_too():
+def test_real_old_library_is_refused_by_probe():
     for path in INSTALLED:
         if 0 < variant.major_version(path) < variant.MIN_LLVM_VERSION:
             assert not variant.probe_library(path).usable
 
 
-def test_without_a_usable_library_a_scalar_variant_is_chosen_and_the_reason_told(tmp_path):
+def test_missing_usable_library_gives_scalar_variant_with_reason(tmp_path):
     old = library(tmp_path, "libLLVM-15.so.1")
     choice = variant.choose_variant(
         "spectral_polarized", environment={}, libraries=[old], cache=tmp_path
@@ -53,7 +53,7 @@ def test_without_a_usable_library_a_scalar_variant_is_chosen_and_the_reason_told
     assert not choice.is_vectorized
 
 
-def test_the_first_usable_library_wins_and_its_verdict_is_remembered(tmp_path, monkeypatch):
+def test_first_usable_library_is_chosen_and_verdict_cached(tmp_path, monkeypatch):
     calls = []
 
     def probe(path, **_):
@@ -95,7 +95,7 @@ def test_a_damaged_cache_costs_a_probe_only(tmp_path, monkeypatch, damage):
     assert len(json.loads((tmp_path / "llvm.json").read_text())) == 1
 
 
-def test_the_environment_can_ask_for_a_scalar_variant_or_is_refused():
+def test_environment_requests_scalar_variant_or_is_refused():
     assert variant.choose_variant("rgb", environment={"SKINRIG_MITSUBA": "scalar"}).why
     with pytest.raises(ValueError, match="SKINRIG_MITSUBA: got 'fast'"):
         variant.choose_variant("rgb", environment={"SKINRIG_MITSUBA": "fast"})

@@ -53,7 +53,7 @@ def clean_surface(scan):
     return mesh, heights(mesh.vertices, mesh.vertex_normals)
 
 
-def test_the_same_seed_gives_the_same_bytes_and_another_seed_others():
+def test_same_seed_gives_same_bytes_another_seed_others():
     scanner = Scanner(triangles=12_000, resolution_mm=2.0)
     again = scan_face(HEAD, rng=np.random.default_rng(0), scanner=scanner)
     assert again.ply == scanned().ply
@@ -67,12 +67,12 @@ def test_the_file_holds_the_mesh():
 
 
 @pytest.mark.parametrize("triangles", [4_000, 30_000])
-def test_about_as_many_triangles_come_as_are_asked_for(triangles):
+def test_triangle_count_is_near_request(triangles):
     found = scanned(triangles=triangles, **CLEAN)
     assert len(found.faces) == pytest.approx(triangles, rel=0.2)
 
 
-def test_the_surface_lies_on_the_true_one_and_faces_outward():
+def test_scanned_surface_matches_truth_and_faces_outward():
     """Median error below 0.1 mm; the frames' offset left in, it is a hundred times larger."""
     scan = scanned(triangles=30_000, resolution_mm=1.0, **CLEAN)
     mesh, height = clean_surface(scan)
@@ -98,7 +98,7 @@ def test_noise_grows_with_the_setting():
 
 
 @pytest.mark.long
-def test_features_below_the_resolution_are_lost_and_larger_ones_stay():
+def test_features_below_resolution_are_lost_larger_ones_stay():
     """A plane with ripples of 1 mm and of 10 mm, blurred by a Gaussian of 2 mm at half height.
 
     What stays of a wave is exp(-2 (pi sigma / period)^2): 3e-6 and 0.867; the triangles take up
@@ -129,7 +129,7 @@ def test_features_below_the_resolution_are_lost_and_larger_ones_stay():
         assert share == pytest.approx(np.exp(-2 * (np.pi * sigma / period) ** 2), abs=0.06)
 
 
-def test_what_no_pair_of_camera_and_projector_sees_is_a_hole():
+def test_area_hidden_from_camera_projector_pairs_is_hole():
     """Rays to the two projectors from points below the chin and beside the ears are barred."""
     scan = scanned(triangles=30_000, **CLEAN)
     mesh = trimesh.Trimesh(in_dome(scan), scan.faces, process=False)
@@ -161,7 +161,7 @@ def test_flawed_triangles_are_there_to_be_repaired():
 
 
 @pytest.mark.parametrize(("offset_mm", "offset_deg"), [(0.0, 0.0), (8.0, 3.0)])
-def test_the_offset_of_the_frames_has_the_size_set(offset_mm, offset_deg):
+def test_frame_offset_has_requested_size(offset_mm, offset_deg):
     scan = scanned(triangles=1_000, offset_mm=offset_mm, offset_deg=offset_deg, **CLEAN)
     turn = scan.to_dome[:3, :3]
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
@@ -185,7 +185,7 @@ def test_settings_out_of_range_are_named(wrong):
         Scanner(**wrong)
 
 
-def test_a_wrapped_template_lies_on_the_face_and_keeps_its_texture_in_every_expression():
+def test_wrapped_template_fits_face_keeping_texture_in_expressions():
     """Expected: off the surface by its noise, 0.06 mm rms, and the warp; along it by 0.25 mm."""
     face = make_subject("III", seed=0, size=64)
     for state in ("neutral", "surprise"):

@@ -15,7 +15,7 @@ def slopes(skin: MicroSkin) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 @pytest.mark.parametrize("site", SITE_NAMES)
 @pytest.mark.parametrize("seed", [0, 5])
-def test_facets_of_every_site_are_tilted_by_11_to_20_degrees(site: str, seed: int) -> None:
+def test_facets_of_every_site_tilt_11_to_20deg(site: str, seed: int) -> None:
     x, y = slopes(make_micro_skin(site, seed=seed, size_mm=3.0))
     assert 11.0 <= np.degrees(np.arctan(np.hypot(x, y))).mean() <= 20.0
 
@@ -31,7 +31,7 @@ def test_sites_differ_in_depth_and_direction() -> None:
     assert across["forehead"] > 1.5 > 1.2 > across["cheek"]
 
 
-def test_a_larger_patch_holds_the_smaller_one_at_its_centre() -> None:
+def test_larger_patch_contains_smaller_one_at_center() -> None:
     small = make_micro_skin("chin", seed=2, size_mm=0.8)
     large = make_micro_skin("chin", seed=2, size_mm=1.6)
     inner = slice(40, 120)
@@ -41,20 +41,20 @@ def test_a_larger_patch_holds_the_smaller_one_at_its_centre() -> None:
         )
 
 
-def test_a_seed_gives_the_same_patch_and_another_seed_another() -> None:
+def test_same_seed_gives_same_patch_another_seed_another() -> None:
     one, same, other = (make_micro_skin("cheek", seed=s, size_mm=0.5) for s in (4, 4, 5))
     np.testing.assert_array_equal(one.height_um, same.height_um)
     assert np.corrcoef(one.height_um.ravel(), other.height_um.ravel())[0, 1] < 0.5
 
 
-def test_one_place_has_one_height_whatever_the_texel() -> None:
+def test_position_has_same_height_at_any_texel_size() -> None:
     fine = make_micro_skin("forehead", seed=1, size_mm=1.0, texel_um=5.0)
     coarse = make_micro_skin("forehead", seed=1, size_mm=1.0, texel_um=20.0)
     block = fine.height_um.reshape(50, 4, 50, 4).mean(axis=(1, 3))
     assert np.corrcoef(block.ravel(), coarse.height_um.ravel())[0, 1] > 0.97
 
 
-def test_darker_presets_reflect_less_and_every_one_has_texture() -> None:
+def test_darker_presets_reflect_less_and_all_have_texture() -> None:
     maps = [
         make_micro_skin("cheek", seed=1, size_mm=1.0, preset=preset).albedo
         for preset in ("I", "III", "V", "darkest")
@@ -67,14 +67,14 @@ def test_darker_presets_reflect_less_and_every_one_has_texture() -> None:
         assert m.max() < 1.0
 
 
-def test_the_layer_is_thinner_in_furrows() -> None:
+def test_layer_is_thinner_in_grooves() -> None:
     skin = make_micro_skin("chin", seed=3, size_mm=1.5)
     deep = skin.height_um < np.quantile(skin.height_um, 0.05)
     high = skin.height_um > np.quantile(skin.height_um, 0.5)
     assert skin.layer_um[deep].mean() < 0.85 * skin.layer_um[high].mean()
 
 
-def test_distance_to_the_net_is_that_to_the_second_polygons_bisector() -> None:
+def test_net_distance_is_distance_to_second_polygon_bisector() -> None:
     rng = np.random.default_rng(1)
     # Without jitter polygons are unit squares about half-integers.
     x, y = rng.uniform(-3.0, 3.0, (2, 100))
@@ -99,7 +99,7 @@ def test_a_patch_that_cannot_be_made_is_refused(change: dict[str, object], messa
         make_micro_skin(**({"site": "chin", "size_mm": 0.5} | change))  # type: ignore[arg-type]
 
 
-def test_a_patch_that_contradicts_itself_is_refused() -> None:
+def test_contradictory_patch_is_refused() -> None:
     skin = make_micro_skin("chin", size_mm=0.3)
     with pytest.raises(MicroSkinError, match="albedo"):
         dataclasses.replace(skin, albedo=skin.albedo[:-2])

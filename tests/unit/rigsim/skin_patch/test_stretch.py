@@ -106,7 +106,7 @@ def test_the_membranes_energy_is_that_of_its_metric(rng: np.random.Generator) ->
     assert got == pytest.approx(expected, rel=1e-10)
 
 
-def test_a_squeeze_that_turns_an_element_over_costs_without_limit(rng: np.random.Generator) -> None:
+def test_squeeze_inverting_an_element_has_unbounded_energy(rng: np.random.Generator) -> None:
     p = problem_of(rng)
     v = p.affine()
     v[0, 3, 3] += 30.0
@@ -150,7 +150,7 @@ def test_fourier_coefficients_have_the_nodes_energy_and_derivative(
     assert numeric == pytest.approx(float(np.vdot(slope, d).real), rel=1e-5)
 
 
-def test_tissue_under_a_wave_of_pressure_moves_as_a_half_space(rng: np.random.Generator) -> None:
+def test_tissue_under_pressure_wave_moves_as_half_space(rng: np.random.Generator) -> None:
     # Johnson 1985: under p cos kx upwards, u_z = (1 - nu) p cos kx / (mu k) and
     # u_x = (1 - 2 nu) p sin kx / (2 mu k): points move away from where the surface is lifted.
     p = problem_of(rng, gradient=np.eye(2))
@@ -171,7 +171,7 @@ def test_tissue_under_a_wave_of_pressure_moves_as_a_half_space(rng: np.random.Ge
     np.testing.assert_allclose(force[:2], 0.0, atol=1e-9)
 
 
-def test_the_free_surface_rises_until_it_bears_no_stress() -> None:
+def test_free_surface_rises_until_stress_free() -> None:
     assert surface_rise(1.3, 1.0, 0.5) == pytest.approx(1.0 / 1.3)
     for nu in (0.1, 0.2, 0.45):
         z = surface_rise(0.7, 1.1, nu)
@@ -182,7 +182,7 @@ def test_the_free_surface_rises_until_it_bears_no_stress() -> None:
 
 @pytest.mark.parametrize("stretch", [0.9, 1.2])
 @pytest.mark.parametrize("waves", [2, 4])
-def test_shallow_relief_follows_the_closed_form_of_a_membrane_on_a_foundation(
+def test_shallow_relief_matches_membrane_on_foundation_closed_form(
     stretch: float, waves: int
 ) -> None:
     # Small slopes under constant tension N: (k_f + B K^4 + N K^2) w = (k_f z + B K^4) h.
@@ -210,7 +210,7 @@ def test_shallow_relief_follows_the_closed_form_of_a_membrane_on_a_foundation(
 
 
 @pytest.mark.parametrize("stretch", [0.8, 1.25])
-def test_the_state_found_is_an_equilibrium_of_less_energy(stretch: float) -> None:
+def test_found_state_is_equilibrium_of_less_energy(stretch: float) -> None:
     rng = np.random.default_rng(3)
     skin = make_micro_skin("forehead", seed=1, size_mm=0.8)
     p = layer_problem(skin, mean_gradient(stretch, 30.0))
@@ -235,7 +235,7 @@ def test_the_state_found_is_an_equilibrium_of_less_energy(stretch: float) -> Non
         assert p.energy(state + 0.1 * d)[0] > p.energy(state)[0]
 
 
-def test_a_search_that_may_not_go_on_says_how_far_it_came() -> None:
+def test_interrupted_search_reports_its_progress() -> None:
     p = layer_problem(make_micro_skin("cheek", size_mm=0.4), mean_gradient(0.8, 0.0))
     with pytest.raises(EquilibriumError, match="after 2 steps"):
         find_equilibrium(p, tolerance=1e-6, steps=2)
@@ -277,7 +277,7 @@ def test_stretching_smooths_and_compressing_roughens_along_the_jaws(site: str) -
 @pytest.mark.parametrize("seed", [2, 3, 4])
 @pytest.mark.parametrize("angle_deg", [0.0, 45.0, 90.0])
 @pytest.mark.parametrize("compensation", ["volume", "none"])
-def test_slope_variances_are_monotone_for_every_site_seed_and_angle(
+def test_slope_variances_are_monotone_for_all_sites_angles(
     site: str, seed: int, angle_deg: float, compensation: Compensation
 ) -> None:
     skin = make_micro_skin(site, seed=seed, size_mm=1.2)
@@ -288,7 +288,7 @@ def test_slope_variances_are_monotone_for_every_site_seed_and_angle(
     assert (np.diff(variance) < 0.0).all()
 
 
-def test_turning_skin_and_jaws_together_turns_the_result() -> None:
+def test_rotating_skin_and_jaws_together_rotates_result() -> None:
     skin = make_micro_skin("chin", seed=4, size_mm=0.64)
     turned = dataclasses.replace(
         skin,
@@ -321,7 +321,7 @@ def test_slopes_are_those_of_the_interpolated_height() -> None:
     np.testing.assert_allclose(found.slope_y, by_y, atol=0.01)
 
 
-def test_a_speck_of_pigment_moves_with_its_place_on_the_skin() -> None:
+def test_pigment_speck_moves_with_its_skin_position() -> None:
     skin = make_micro_skin("cheek", seed=6, size_mm=1.0)
     state = deform(skin, stretch=0.85, angle_deg=0.0)
     assert np.abs(state.displacement_um).max() > 2.0
@@ -343,7 +343,7 @@ def test_a_flat_patch_stays_flat_whatever_the_stretch() -> None:
         assert state.membrane_strain == pytest.approx(stretch - 1.0)
 
 
-def test_a_single_furrow_across_the_jaws_opens_and_one_along_them_stays() -> None:
+def test_groove_across_jaws_opens_and_along_them_stays() -> None:
     x = 10.0 * (np.arange(80) - 39.5)
     furrow = -40.0 * np.exp(-((x / 50.0) ** 2))
     across = patch(np.broadcast_to(furrow[None, :], (80, 80)))
@@ -374,7 +374,7 @@ def test_half_and_twice_the_length_have_an_equilibrium(site: str, stretch: float
 
 
 @pytest.mark.parametrize("texel_um", [5.0, 20.0])
-def test_finer_and_coarser_texels_tell_the_same_change(texel_um: float) -> None:
+def test_finer_and_coarser_texels_give_same_change(texel_um: float) -> None:
     got = []
     for texel in (10.0, texel_um):
         skin = make_micro_skin("chin", seed=3, size_mm=0.8, texel_um=texel)
@@ -396,7 +396,7 @@ def test_a_stiffer_layer_keeps_its_length_better() -> None:
     assert strain[-1] < 0.8 * strain[0]
 
 
-def test_a_field_is_filled_by_the_size_asked_for_and_not_by_less() -> None:
+def test_field_is_filled_only_by_requested_size() -> None:
     field, stretch = 0.6, 0.75
     size = size_for(field, stretch, angle_deg=45.0)
     corner = 0.5 * field * np.array([-1.0, 1.0])

@@ -76,7 +76,7 @@ def test_nothing_wrinkles_that_is_not_shortened(face):
     assert not raise_wrinkles(lines, face.atlas, unwrap(grown, SIZE)).height_um.any()
 
 
-def test_shortening_within_the_tension_of_the_skin_raises_nothing():
+def test_shortening_within_skin_tension_raises_no_wrinkles():
     _, lines, _ = plate_wrinkles(1.0, 0.8)
     below, _, _ = plate_wrinkles(1.0, 1.0 - 0.8 * lines.tension)
     above, _, _ = plate_wrinkles(1.0, 1.0 - 1.3 * lines.tension)
@@ -84,14 +84,14 @@ def test_shortening_within_the_tension_of_the_skin_raises_nothing():
     assert np.abs(above.height_um).max() > 50.0
 
 
-def test_shortening_along_the_lines_raises_nothing_and_across_them_it_does():
+def test_shortening_across_lines_raises_wrinkles_along_does_not():
     along, _, _ = plate_wrinkles(0.75, 1.0)
     across, _, _ = plate_wrinkles(1.0, 0.75)
     assert np.abs(along.height_um).mean() < 0.1 * np.abs(across.height_um).mean()
 
 
 @pytest.mark.parametrize("stretch", [0.85, 0.75, 0.65])
-def test_along_a_wrinkled_line_the_skin_keeps_its_slack_length(stretch):
+def test_wrinkled_line_keeps_slack_length_of_skin(stretch):
     """Rationale: what has no room in the surface goes into the wrinkle.
 
     Expected: from furrow to furrow the length is that of the surface and of the excess, which in
@@ -116,7 +116,7 @@ def test_along_a_wrinkled_line_the_skin_keeps_its_slack_length(stretch):
     assert min(gains) > 1.05
 
 
-def test_in_the_middle_of_a_zone_the_whole_excess_is_taken():
+def test_wrinkles_mid_zone_take_whole_excess_length():
     wrinkles, lines, _ = plate_wrinkles(1.0, 0.75, seed=3)
     excess = wrinkles.excess[122:166, 96:160]
     whole = (1.0 - lines.tension) / 0.75 - 1.0
@@ -137,7 +137,7 @@ def test_the_depth_of_a_wave_gives_its_length():
         assert depth * np.ptp(shape) == pytest.approx(depth, rel=1e-6)
 
 
-def test_waves_are_as_long_as_a_stiff_layer_on_a_soft_one_makes_them():
+def test_wavelength_matches_stiff_layer_on_soft_substrate():
     length = {zone.name: zone.wavelength_mm for zone in WRINKLE_ZONES}
     assert 6.0 < length["forehead"] < 9.0
     assert 2.0 < length["crow's feet"] < 3.5
@@ -156,7 +156,7 @@ def test_waves_are_as_long_as_a_stiff_layer_on_a_soft_one_makes_them():
         ("smile", lambda p: (np.abs(p[..., 0] - 24) < 6) & (np.abs(p[..., 1] + 24) < 8)),
     ],
 )
-def test_each_expression_wrinkles_where_it_shortens_the_skin(face, posed, state, where):
+def test_each_expression_wrinkles_where_skin_is_shortened(face, posed, state, where):
     points = face_regions.on_mean_head(face.atlas.position_mm, face.mesh)
     inside = where(points) & (points[..., 2] > -45.0)
     raised = np.abs(posed(state).pose.wrinkles.height_um)
@@ -165,7 +165,7 @@ def test_each_expression_wrinkles_where_it_shortens_the_skin(face, posed, state,
     assert (raised > 0.0).mean() < 0.15
 
 
-def test_expressions_that_shorten_the_same_skin_raise_the_same_lines(face, posed):
+def test_expressions_shortening_same_skin_raise_same_lines(face, posed):
     one = posed("surprise").pose.wrinkles.height_um
     other = posed("fear").pose.wrinkles.height_um
     points = face_regions.on_mean_head(face.atlas.position_mm, face.mesh)
@@ -178,7 +178,7 @@ def test_expressions_that_shorten_the_same_skin_raise_the_same_lines(face, posed
     assert abs(np.corrcoef(one[shared], stranger[shared])[0, 1]) < 0.6
 
 
-def test_wrinkles_deepen_with_the_expression_and_fine_relief_stays(face, posed):
+def test_wrinkles_deepen_with_expression_and_fine_relief_stays(face, posed):
     depth = [
         float(np.abs(posed("surprise", amount).pose.wrinkles.height_um).max())
         for amount in (0.1, 0.6, 1.0, 1.5)
@@ -191,13 +191,13 @@ def test_wrinkles_deepen_with_the_expression_and_fine_relief_stays(face, posed):
     )
 
 
-def test_too_coarse_a_texture_leaves_fine_wrinkles_out_and_says_so():
+def test_coarse_texture_omits_fine_wrinkles_and_reports():
     coarse = make_subject("II", seed=4, size=128).posed("happiness")
     assert "crow's feet" in coarse.pose.wrinkles.left_out
     assert np.isfinite(coarse.pose.wrinkles.height_um).all()
 
 
-def test_normals_of_the_texture_frame_show_the_relief_alone():
+def test_texture_frame_normals_show_relief_alone():
     """A flat plate turned in space has the same tangent normals; a slope along u tilts x only."""
     slope = 0.2
     for mesh in (brow_plate(), turned(brow_plate(), 0.7)):
@@ -211,7 +211,7 @@ def test_normals_of_the_texture_frame_show_the_relief_alone():
         )
 
 
-def test_normals_of_the_texture_frame_point_up_where_height_falls_with_v():
+def test_texture_frame_normals_point_up_where_height_falls():
     atlas = unwrap(brow_plate(), 64)
     rising = np.arange(63.0, -1.0, -1.0)[:, None] / 64 * 28.0  # row 0 is the top, v = 1
     height_um = np.broadcast_to(-200.0 * rising, (64, 64)).astype(np.float32)
@@ -219,7 +219,7 @@ def test_normals_of_the_texture_frame_point_up_where_height_falls_with_v():
     assert normal[32, 32, 1] == pytest.approx(0.2 / math.hypot(0.2, 1.0), abs=1e-4)
 
 
-def test_only_wrinkles_change_the_tangent_normals_of_a_posed_face(face, posed):
+def test_tangent_normals_of_posed_face_change_by_wrinkles(face, posed):
     before, after = face.tangent_normal(), posed("surprise").tangent_normal()
     np.testing.assert_allclose(np.linalg.norm(after, axis=-1), 1.0, atol=1e-5)
     tilt = np.degrees(np.arccos(np.clip(np.sum(before * after, axis=-1), -1.0, 1.0)))

@@ -27,7 +27,7 @@ def at(mesh: Mesh, state: str, landmark: str, **kwargs) -> np.ndarray:
     return displacement_mm(mesh, state, **kwargs)[nearest]
 
 
-def test_a_smile_draws_the_corners_of_the_mouth_up_and_out_by_6_to_10_mm(head):
+def test_smile_moves_mouth_corners_up_out_6_10mm(head):
     for seed in range(12):
         for side, outward in (("left", -1.0), ("right", 1.0)):
             way = at(head, "smile", f"mouth corner {side}", seed=seed)
@@ -66,7 +66,7 @@ def test_anger_draws_the_brows_together(head):
     assert 2.0 < before - after < 9.0
 
 
-def test_states_of_the_whole_body_and_rest_do_not_move_the_face(head):
+def test_whole_body_states_and_rest_keep_face_still(head):
     for state in ("neutral", "exercise", "alcohol"):
         assert not displacement_mm(head, state).any()
     assert not displacement_mm(head, "smile", amount=0.0).any()
@@ -79,7 +79,7 @@ def test_the_back_of_the_head_stays(head):
         assert np.abs(displacement_mm(head, state, amount=1.5)[back]).max() < 0.3
 
 
-def test_persons_have_strengths_of_their_own_and_are_not_quite_symmetric(head):
+def test_subjects_have_individual_strengths_and_slight_asymmetry(head):
     ways = np.array([at(head, "smile", "mouth corner left", seed=seed) for seed in range(8)])
     sizes = np.linalg.norm(ways, axis=-1)
     assert 0.02 < sizes.std() / sizes.mean() < 0.15
@@ -92,7 +92,7 @@ def test_persons_have_strengths_of_their_own_and_are_not_quite_symmetric(head):
 
 
 @pytest.mark.parametrize("state", sorted(EXPRESSION_STRENGTHS))
-def test_no_triangle_folds_and_stretch_is_bounded_even_in_an_extreme(head, state):
+def test_extreme_expression_folds_no_triangle_and_bounds_stretch(head, state):
     """Bounds: between 0.6 and 1.65 of the length in a full expression, 0.42 and 2 in an extreme."""
     for amount, low, high in ((1.0, 0.6, 1.65), (1.5, 0.42, 2.0)):
         for seed in (0, 7):
@@ -109,7 +109,7 @@ def test_a_movement_far_beyond_an_extreme_folds(head):
     assert principal_stretches(head.vertices_mm, moved, head.faces)[1].any()
 
 
-def test_stretch_of_a_sheared_and_stretched_triangle_is_that_of_its_map():
+def test_stretch_of_sheared_triangle_matches_its_map():
     flat = np.array([[0.0, 0, 0], [2.0, 0, 0], [0.5, 1.5, 0], [0.0, 0, 0]])
     linear = np.array([[1.3, 0.4, 0.0], [0.0, 0.7, 0.0], [0.0, 0.0, 1.0]])
     faces = np.array([[0, 1, 2], [0, 3, 1]], np.int32)  # the second has no area
@@ -122,7 +122,7 @@ def test_stretch_of_a_sheared_and_stretched_triangle_is_that_of_its_map():
     assert principal_stretches(flat, mirrored, faces)[1].tolist() == [True, False]
 
 
-def test_normals_turn_with_the_surface(head):
+def test_normals_rotate_with_surface(head):
     """Expected: shading normals are as near to the triangles' as they are at rest."""
 
     def away_deg(mesh: Mesh) -> np.ndarray:
@@ -141,7 +141,7 @@ def test_normals_turn_with_the_surface(head):
     assert np.quantile(kept[moving], 0.95) > np.quantile(rest, 0.95) + 3.0
 
 
-def test_a_mesh_moves_by_its_own_shapes_where_it_has_them(head):
+def test_mesh_with_own_shapes_moves_by_them(head):
     """A shape's left is the person's own: the image's right."""
     side = head.vertices_mm[:, 0] > 0.0
     lift = np.zeros(head.vertices_mm.shape)
@@ -165,7 +165,7 @@ def test_blend_shapes_for_export_are_the_full_expressions(head):
     np.testing.assert_array_equal(shapes["fear"], displacement_mm(head, "fear", seed=2))
 
 
-def test_shapes_of_a_file_come_along_and_must_fit_the_mesh(tmp_path, head):
+def test_file_shapes_are_loaded_and_must_fit_mesh(tmp_path, head):
     path = tmp_path / "shapes.npz"
     deltas = np.zeros((1, *head.vertices_mm.shape), np.float16)
     deltas[0, 5] = 2.0
@@ -184,7 +184,7 @@ def test_shapes_of_a_file_come_along_and_must_fit_the_mesh(tmp_path, head):
 
 
 @pytest.mark.skipif(not SCANNED_HEAD.exists(), reason="the head with blend shapes is not here")
-def test_a_head_with_blend_shapes_smiles_and_opens_its_mouth():
+def test_head_with_blend_shapes_smiles_and_opens_mouth():
     """Its own shapes fold a few of 18,460 triangles inside the lips, and stretch their rims."""
     mesh = centered(load_mesh(SCANNED_HEAD))
     assert len(mesh.shapes) == 22
@@ -199,7 +199,7 @@ def test_a_head_with_blend_shapes_smiles_and_opens_its_mouth():
         assert 0.4 < np.quantile(stretch, 0.001)
 
 
-def test_wrong_wishes_are_named(head):
+def test_invalid_options_are_named(head):
     with pytest.raises(ExpressionError, match="state: got 'joy', expected one of neutral"):
         displacement_mm(head, "joy")
     for amount in (-0.1, 1.6, float("nan")):

@@ -33,7 +33,7 @@ def scenes(rig: Rig, face: SimulatedSubject) -> dict[str, FlashScene]:
     }
 
 
-def test_landmarks_lie_on_the_skin_where_the_mean_head_has_them(face):
+def test_landmarks_are_on_skin_at_mean_head_positions(face):
     points = face.surface_landmarks()
     assert set(points.names) == set(landmarks.POINTS_MM)
     wanted = np.array([(*landmarks.POINTS_MM[name], 0.0) for name in points.names])
@@ -45,7 +45,7 @@ def test_landmarks_lie_on_the_skin_where_the_mean_head_has_them(face):
 
 
 @pytest.mark.parametrize("state", ["neutral", "smile", "surprise"])
-def test_the_position_map_shows_each_landmark_at_its_superpixel(scenes, state):
+def test_position_map_gives_landmarks_at_their_superpixels(scenes, state):
     """Rationale: half a pixel of the sensor is a quarter of a superpixel.
 
     Expected: the map of positions, averaged over 2 x 2 pixels and read at a landmark, is where the
@@ -78,9 +78,7 @@ def test_the_position_map_shows_each_landmark_at_its_superpixel(scenes, state):
     assert np.median(np.abs(errors_mm(0.25))) > 0.7 * quarter_mm
 
 
-def test_landmarks_of_an_expression_are_off_those_at_rest_by_the_projected_movement(
-    scenes, rig, face
-):
+def test_expression_landmarks_shift_by_projected_movement(scenes, rig, face):
     """Expected: f / (D - z) times the movement of the nearest vertex, plus what coming nearer
     enlarges. Tolerance: 0.15 px, as movement changes by a few percent from vertex to vertex."""
     view = rig.views[0]
@@ -104,7 +102,7 @@ def test_landmarks_of_an_expression_are_off_those_at_rest_by_the_projected_movem
     assert corner[1] < -2.0
 
 
-def test_what_the_head_hides_is_not_seen(rig, face):
+def test_landmarks_hidden_by_head_are_not_visible(rig, face):
     caster = Caster(face.mesh, choice=EMBREE)
     points = face.surface_landmarks().on(face.mesh)
     assert landmarks.seen(points, rig.views[0], caster).mean() > 0.9

@@ -17,7 +17,7 @@ def prompted(course, period_s=5.0, count=10):
     return course
 
 
-def test_blood_relaxes_with_its_own_constants_up_and_down():
+def test_blood_relaxes_with_separate_rise_and_fall_constants():
     course = PromptedCourse("smile", rise_s=1.0, fall_s=0.5, reaction_s=0.0, reaction_spread_s=0.0)
     prompted(course, 50.0)
     for since in (0.1, 1.0, 3.0):
@@ -25,7 +25,7 @@ def test_blood_relaxes_with_its_own_constants_up_and_down():
         assert course.level(150.0 + since) == pytest.approx(np.exp(-since / 0.5), abs=1e-9)
 
 
-def test_the_level_is_continuous_and_stays_between_rest_and_full():
+def test_level_is_continuous_and_between_rest_and_full():
     course = prompted(PromptedCourse("anger", rise_s=4.0, fall_s=2.0, seed=3))
     levels = np.array([course.level(t) for t in np.arange(0.0, 60.0, 0.01)])
     assert levels.min() >= 0.0
@@ -33,7 +33,7 @@ def test_the_level_is_continuous_and_stays_between_rest_and_full():
     assert np.abs(np.diff(levels)).max() < 0.01 / 2.0
 
 
-def test_past_times_are_told_as_they_were_whatever_was_asked_since():
+def test_past_levels_do_not_depend_on_later_prompts():
     course = PromptedCourse("smile", rise_s=2.0)
     course.tell(0.0, "smile")
     before = course.level(1.0)
@@ -52,7 +52,7 @@ def test_reactions_follow_their_prompts_each_a_little_otherwise():
     assert course.pose(5.0 * 2 + times[2] + 1e-3) == "smile"
 
 
-def test_exercise_fades_from_its_height_and_alcohol_comes_up():
+def test_exercise_fades_from_peak_and_alcohol_rises():
     exercise, alcohol = EventCourse("exercise"), EventCourse("alcohol")
     for course in (exercise, alcohol):
         course.tell(100.0, "neutral")
@@ -65,7 +65,7 @@ def test_exercise_fades_from_its_height_and_alcohol_comes_up():
     assert alcohol.level(3800.0) == pytest.approx(1 - np.exp(-3))
 
 
-def test_partial_blood_lies_between_rest_and_the_state_and_ends_at_both():
+def test_partial_blood_is_between_rest_and_state_inclusive():
     face = make_subject(size=64)
     rest, full = face.hemoglobin("neutral"), face.hemoglobin("smile")
     np.testing.assert_array_equal(with_blood(face, "smile", 0.0).hemoglobin("smile"), rest)
@@ -74,7 +74,7 @@ def test_partial_blood_lies_between_rest_and_the_state_and_ends_at_both():
     assert np.all((half - rest) * (full - half) >= -1e-9)
 
 
-def test_the_parabola_is_exact_for_blood_that_goes_with_the_radius_squared():
+def test_parabola_is_exact_for_blood_quadratic_in_radius():
     level = 0.37
     values = [(1 + 0.3 * node) ** 2 for node in BLOOD_LEVELS]
     assert np.dot(parabola_weights(level), values) == pytest.approx((1 + 0.3 * level) ** 2)

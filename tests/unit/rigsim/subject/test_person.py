@@ -21,7 +21,7 @@ def regions(face: SimulatedSubject) -> dict[str, np.ndarray]:
     return face_regions.region_masks(face_regions.on_mean_head(face.atlas.position_mm, face.mesh))
 
 
-def test_the_same_seed_makes_the_same_face_and_another_seed_another(face):
+def test_same_seed_makes_same_face_another_seed_another(face):
     again = make_subject("II", seed=4, size=SIZE)
     other = make_subject("II", seed=5, size=SIZE)
     for field in ("melanin", "roughness", "height_um", "normal", "hair"):
@@ -33,7 +33,7 @@ def test_the_same_seed_makes_the_same_face_and_another_seed_another(face):
 
 
 @pytest.mark.parametrize("preset", PRESET_NAMES)
-def test_every_preset_stays_inside_the_ranges_of_the_skin_model(preset):
+def test_every_preset_stays_inside_skin_model_ranges(preset):
     face = make_subject(preset, seed=1, size=96)
     assert 0.0005 < face.melanin.min()
     assert face.melanin.max() < 0.5
@@ -53,7 +53,7 @@ def test_the_presets_span_the_stated_range_in_order():
     assert (values[0], values[-1]) == (0.005, 0.45)
 
 
-def test_the_face_is_as_large_as_an_adults_and_looks_at_the_camera(face):
+def test_face_has_adult_size_and_faces_camera(face):
     low, high = face.mesh.vertices_mm.min(axis=0), face.mesh.vertices_mm.max(axis=0)
     assert 140.0 < high[0] - low[0] < 190.0
     assert 20_000 <= len(face.mesh.faces) <= 60_000
@@ -71,14 +71,14 @@ def test_triangles_are_wound_towards_the_outside(face):
     assert agrees.mean() > 0.99
 
 
-def test_texture_u_runs_to_the_right_and_row_0_is_the_top(face):
+def test_texture_u_runs_right_row_0_is_top(face):
     x, y = face.atlas.position_mm[..., 0], face.atlas.position_mm[..., 1]
     middle = SIZE // 2
     assert (np.diff(x[middle, SIZE // 4 : 3 * SIZE // 4]) > 0.0).all()
     assert y[SIZE // 4, middle] > y[3 * SIZE // 4, middle] + 50.0
 
 
-def test_cheeks_nose_and_lips_hold_more_blood_than_the_forehead(face, regions):
+def test_cheeks_nose_and_lips_exceed_forehead_in_blood(face, regions):
     blood = face.hemoglobin()
     mean = {name: blood[regions[name] > 0.7].mean() for name in regions}
     for name, factor in (("cheeks", 1.3), ("nose", 1.4), ("lips", 2.5)):
@@ -86,7 +86,7 @@ def test_cheeks_nose_and_lips_hold_more_blood_than_the_forehead(face, regions):
 
 
 @pytest.mark.parametrize("region", ["forehead", "cheeks", "nose"])
-def test_blood_is_locally_near_gaussian_with_a_deviation_of_its_own(face, regions, region):
+def test_blood_is_locally_near_gaussian_with_own_deviation(face, regions, region):
     """Within a region: |skewness| below 0.8, |excess kurtosis| below 1.5 (an exponential has 2, 6),
     and a relative deviation between 8 and 35 %."""
     values = face.hemoglobin()[regions[region] > 0.7]
@@ -95,7 +95,7 @@ def test_blood_is_locally_near_gaussian_with_a_deviation_of_its_own(face, region
     assert 0.08 < values.std() / values.mean() < 0.35
 
 
-def test_states_change_the_blood_where_they_should_and_nothing_else(face, regions):
+def test_states_change_blood_only_where_expected(face, regions):
     neutral = face.hemoglobin()
 
     def change(state: str, region: str) -> float:
@@ -113,7 +113,7 @@ def test_states_change_the_blood_where_they_should_and_nothing_else(face, region
     assert change("exercise", "cheeks") / change("exercise", "nose") > 1.1
 
 
-def test_a_state_is_not_a_scaling_and_shifting_of_the_neutral_map(face, regions):
+def test_state_map_is_not_affine_in_neutral_map(face, regions):
     """Within one small patch, the best affine map leaves a part that is not rounding."""
     inside = regions["cheeks"] > 0.8
     x, y = face.hemoglobin()[inside], face.hemoglobin("exercise")[inside]
@@ -136,7 +136,7 @@ def test_pale_skin_has_more_freckles_than_dark_skin():
     assert rough_share("palest") > 2.0 * rough_share("VI")
 
 
-def test_relief_tilts_the_normals_of_a_plane_against_its_slope():
+def test_relief_tilts_plane_normals_against_its_slope():
     corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     plane = build_mesh(
         np.column_stack([corners * [32.0, 16.0], np.zeros(4)]),
@@ -150,7 +150,7 @@ def test_relief_tilts_the_normals_of_a_plane_against_its_slope():
     np.testing.assert_allclose(normal, np.broadcast_to(expected, normal.shape), atol=1e-5)
 
 
-def test_texels_are_as_long_as_the_surface_below_them():
+def test_texel_lengths_match_surface_below():
     corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     plane = build_mesh(
         np.column_stack([corners * [32.0, 16.0], np.zeros(4)]),
@@ -162,7 +162,7 @@ def test_texels_are_as_long_as_the_surface_below_them():
     np.testing.assert_allclose(along_v, 0.5, rtol=1e-5)
 
 
-def test_a_mesh_file_replaces_the_head_and_is_moved_to_the_rigs_centre(tmp_path, face):
+def test_mesh_file_replaces_head_centered_in_rig(tmp_path, face):
     path = tmp_path / "someone.npz"
     np.savez(
         path,
@@ -176,7 +176,7 @@ def test_a_mesh_file_replaces_the_head_and_is_moved_to_the_rigs_centre(tmp_path,
     assert np.abs(moved[0]).max() < 3.0
 
 
-def test_an_obj_file_is_read_with_its_texture_coordinates(tmp_path):
+def test_obj_file_is_read_with_texture_coordinates(tmp_path):
     path = tmp_path / "plate.obj"
     path.write_text("v -50 -50 0\nv 50 -50 0\nv 50 50 5\nvt 0 0\nvt 1 0\nvt 1 1\nf 1/1 2/2 3/3\n")
     mesh = load_mesh(path)
@@ -194,7 +194,7 @@ def test_an_obj_file_is_read_with_its_texture_coordinates(tmp_path):
         ("bare.obj", b"v 0 0 0\nv 9 0 0\nv 0 9 0\nf 1 2 3\n", "no texture coordinates"),
     ],
 )
-def test_a_mesh_file_that_cannot_be_used_is_named(tmp_path, name, content, word):
+def test_unusable_mesh_file_is_named(tmp_path, name, content, word):
     path = tmp_path / name
     if content is not None:
         path.write_bytes(content)
@@ -219,7 +219,7 @@ def test_a_mesh_archive_without_its_arrays_is_named(tmp_path):
         ({"blood": 9.0}, "blood: got 9.0"),
     ],
 )
-def test_wrong_wishes_are_named(change, word):
+def test_invalid_options_are_named(change, word):
     with pytest.raises(SubjectError, match=word):
         make_subject(**({"preset": "I", "seed": 0, "size": 64} | change))
 

@@ -8,11 +8,11 @@ from rigsim.targets.flat import TARGET_NAMES, TargetError, make_target, patch_ce
 CAMERA, LIGHT = "Nikon 5100 (NPL)", "D55"
 
 
-def test_the_white_tile_reflects_99_percent_in_every_channel():
+def test_white_reference_reflects_99_percent_in_every_channel():
     np.testing.assert_allclose(make_target("white").rgb(CAMERA, LIGHT), 0.99, atol=1e-6)
 
 
-def test_the_chart_has_the_colors_of_its_patches_in_their_places():
+def test_chart_has_patch_colors_at_their_positions():
     chart = make_target("chart")
     rgb = chart.rgb(CAMERA, LIGHT)
     size = len(rgb)
@@ -40,7 +40,7 @@ def test_patches_are_evenly_spaced_from_the_top_left():
 
 
 @pytest.mark.parametrize("name", TARGET_NAMES)
-def test_every_target_faces_the_camera_and_reflects_no_more_than_it_gets(name):
+def test_every_target_faces_camera_and_conserves_energy(name):
     target = make_target(name)
     np.testing.assert_allclose(target.mesh.normals, [[0.0, 0.0, 1.0]] * 4)
     assert target.palette.min() >= 0.0

@@ -78,7 +78,7 @@ def test_no_weight_is_lost_in_lanes():
 
 
 @needs_lanes
-def test_equal_seeds_repeat_a_run_in_lanes_and_others_do_not():
+def test_same_seed_repeats_run_in_lanes_others_differ():
     one, two, other = (
         transport(ALONE, photons=5000, rng=np.random.default_rng(seed), engine="drjit")
         for seed in (4, 4, 5)
@@ -88,7 +88,7 @@ def test_equal_seeds_repeat_a_run_in_lanes_and_others_do_not():
 
 
 @needs_lanes
-def test_standard_error_of_lanes_is_the_spread_of_repeated_runs():
+def test_standard_error_of_lanes_matches_repeated_run_scatter():
     rng = np.random.default_rng(7)
     runs = [transport(ALONE, photons=2000, rng=rng, engine="drjit") for _ in range(60)]
     spread = np.var([run.reflectance for run in runs], ddof=1)

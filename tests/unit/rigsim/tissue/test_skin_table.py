@@ -118,7 +118,7 @@ def test_recipe_makes_the_stored_numbers_from_other_photons(table, recipe):
     assert np.all((missing > -1e-9) & (missing < 1e-3))
 
 
-def test_runs_of_the_recipe_share_each_estimate_without_gaps(table, recipe):
+def test_recipe_runs_divide_each_estimate_without_gaps(table, recipe):
     shares = recipe.shares(table.c_m)
     np.testing.assert_allclose(shares.sum(axis=0), 1.0, rtol=1e-12)
     for (c_ref, _), share in zip(recipe.RUNS, shares, strict=True):
@@ -127,7 +127,7 @@ def test_runs_of_the_recipe_share_each_estimate_without_gaps(table, recipe):
 
 
 @pytest.mark.long
-def test_interrupted_recipe_goes_on_and_ends_with_the_same_numbers(recipe, tmp_path):
+def test_interrupted_recipe_resumes_and_ends_with_same_numbers(recipe, tmp_path):
     arguments = ["--photons-scale", "1e-4", "--work", str(tmp_path), "--out"]
     assert recipe.main([*arguments, str(tmp_path / "whole.npz")]) == 0
     parts = sorted(tmp_path.glob("*/*nm.npz"))
@@ -141,7 +141,7 @@ def test_interrupted_recipe_goes_on_and_ends_with_the_same_numbers(recipe, tmp_p
             np.testing.assert_array_equal(whole[name], resumed[name])
 
 
-def test_standard_errors_keep_what_the_module_states(table):
+def test_standard_errors_stay_within_documented_limits(table):
     relative = table.standard_error / table.reflectance
     middle = (table.reflectance > 0.1) & (table.reflectance < 0.5)
     assert np.median(relative[middle]) < 0.002
@@ -187,7 +187,7 @@ def test_more_of_either_chromophore_is_never_brighter(table):
 
 
 @pytest.mark.parametrize("nm", [420.0, 540.0, 700.0])
-def test_interpolation_between_the_nodes_is_exact_to_three_parts_in_ten_thousand(nm):
+def test_interpolation_between_nodes_is_exact_to_3e_4(nm):
     # The same photons, reweighted at nodes and at cell centres: the difference holds no noise.
     nodes = 41
     at = (np.arange(nodes - 1) + 0.5) / (nodes - 1)
@@ -248,7 +248,7 @@ def test_arrays_of_the_shared_table_are_read_only(table):
             assert not value.flags.writeable
 
 
-def test_a_spectrum_of_the_table_fits_real_skin_as_the_module_states(table):
+def test_table_spectrum_fits_real_skin_as_documented(table):
     # Mean of 100 forearms, specular included: Cooksey, Allen, Tsai 2017, doi:10.18434/M38597.
     nm = [400.0, 450.0, 500.0, 540.0, 560.0, 575.0, 600.0, 650.0, 700.0]
     forearms = np.array([0.185, 0.252, 0.328, 0.317, 0.323, 0.327, 0.447, 0.557, 0.602])
@@ -289,7 +289,7 @@ def test_melanin_and_blood_narrow_the_kernels(table):
     assert np.all(rms[1] > rms[2])
 
 
-def test_a_channel_weighs_wavelengths_by_the_light_they_send_back(table):
+def test_channel_weights_wavelengths_by_reflected_light(table):
     c_m, c_hd = 0.01, 0.05
     pair = np.zeros((31, 1))
     pair[[14, 20], 0] = 0.5
@@ -327,7 +327,7 @@ def excess_deviation(table, nm, c_m, c_hd, photons, *, tabulated_nm):
 
 
 @pytest.mark.parametrize(("nm", "c_m", "c_hd", "photons"), LIVE_KERNELS)
-def test_kernels_between_the_nodes_agree_with_photons_traced_now(table, nm, c_m, c_hd, photons):
+def test_kernels_between_nodes_agree_with_traced_photons(table, nm, c_m, c_hd, photons):
     # Interpolation between nodes is off by 0.0021 of the light at most (420 nm, no noise).
     assert excess_deviation(table, nm, c_m, c_hd, photons, tabulated_nm=nm) < 0.0025
 
@@ -338,7 +338,7 @@ def test_kernels_of_another_wavelength_do_not_agree(table, nm, c_m, c_hd, photon
     assert excess_deviation(table, nm, c_m, c_hd, photons, tabulated_nm=other) > 0.0025
 
 
-def test_gaussians_stand_for_the_kernels_within_two_percent_of_the_light(table):
+def test_gaussians_approximate_kernels_within_two_percent(table):
     for c_m, c_hd in ((0.0, 0.0), (0.01, 0.03), (0.05, 0.1), (0.5, 0.32)):
         kernels = table.lateral_kernels(c_m, c_hd, band_weights())
         fit = kernels.gaussians()

@@ -123,7 +123,7 @@ def smallest_p_value(stack):
     return 1.0 - (1.0 - 2.0 * stats.norm.sf(z.max())) ** z.size
 
 
-def test_kernel_agrees_with_a_plain_numpy_walk_with_whole_photons():
+def test_kernel_agrees_with_plain_numpy_whole_photon_walk():
     # False alarms: below 1e-4.
     assert smallest_p_value(STACK) > 1e-4
 
@@ -140,7 +140,7 @@ def test_no_weight_is_lost():
     assert run.ring_reflectance.sum() == pytest.approx(run.reflectance, abs=1e-12)
 
 
-def test_result_does_not_depend_on_the_number_of_threads():
+def test_result_does_not_depend_on_thread_count():
     runs = [
         transport(STACK, photons=8000, rng=np.random.default_rng(4), threads=threads)
         for threads in (1, 2, 5)
@@ -158,7 +158,7 @@ def test_another_seed_gives_another_sample():
     assert one.reflectance != other.reflectance
 
 
-def test_standard_error_is_the_spread_of_repeated_runs():
+def test_standard_error_matches_scatter_of_repeated_runs():
     rng = np.random.default_rng(7)
     runs = [transport(STACK, photons=2000, rng=rng) for _ in range(120)]
     spread = np.var([run.reflectance for run in runs], ddof=1)
@@ -178,7 +178,7 @@ def test_error_falls_with_the_square_root_of_photons():
     assert low < (few.reflectance_stderr / many.reflectance_stderr) ** 2 < high
 
 
-def test_clear_plate_reflects_and_transmits_as_the_fresnel_series_sums():
+def test_clear_plate_matches_fresnel_series_sums():
     plate = LayerStack((Layer(1.0, 0.0, 0.0, 0.0, 1.5),))
     run = transport(plate, photons=400_000, rng=np.random.default_rng(9))
     r = 0.04
@@ -209,7 +209,7 @@ def test_splitting_a_layer_changes_nothing():
     assert abs(one.reflectance - split.reflectance) < 4.0 * error
 
 
-def test_kept_paths_reweighted_give_the_reflectance_at_more_absorption():
+def test_reweighted_paths_give_reflectance_at_more_absorption():
     layers = (Layer(0.2, 0.1, 20.0, 0.8, 1.4), Layer(inf, 0.1, 10.0, 0.8, 1.4))
     extra = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 1.0], [2.0, 4.0]])
     kept = escape_paths(LayerStack(layers), photons=60_000, rng=np.random.default_rng(13))

@@ -44,7 +44,7 @@ def port(world, box):
     return Port(f"sim://{box}?world={world._name}", clock=world.clock)
 
 
-def test_each_box_of_a_shipped_rig_has_its_serial_number_and_its_rig():
+def test_shipped_rig_controllers_have_own_serial_and_rig():
     serials = set()
     for name in ("flash", "dome", "gradient", "probe"):
         for box in load_rig(name).boxes:
@@ -67,7 +67,7 @@ def test_patterns_are_clipped_to_the_exposure(world):
     assert isinstance(seen, PatternLight)
 
 
-def test_an_exposure_is_of_what_was_held_when_it_began(world):
+def test_exposure_uses_grip_at_its_start(world):
     with CaliperBox(port(world, "caliper")) as box:
         box.arm()
         box.set_force_limit(3.0)
@@ -89,7 +89,7 @@ def test_an_exposure_is_of_what_was_held_when_it_began(world):
     assert world.grip_at(-1.0) == world.grips[0][1]
 
 
-def test_what_was_held_is_noted_on_the_way_too(world):
+def test_grip_history_includes_states_during_motion(world):
     with CaliperBox(port(world, "caliper")) as box:
         box.arm()
         box.set_force_limit(3.0)
@@ -111,12 +111,12 @@ def test_a_world_without_a_caliper_holds_nothing():
         world.grip_at(0.0)
 
 
-def test_a_caliper_box_needs_a_caliper():
+def test_caliper_controller_needs_caliper():
     with pytest.raises(ValueError, match="caliper: got none"):
         World(dataclasses.replace(RIG, caliper=None))
 
 
-def test_a_rig_with_a_caliper_begins_with_skin_at_rest():
+def test_rig_with_caliper_starts_with_skin_at_rest():
     assert World(RIG, seed=4).grip_at(0.0) == GripState(
         0.0,
         World(RIG, seed=4).skin.state.step,

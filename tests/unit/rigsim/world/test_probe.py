@@ -73,7 +73,7 @@ def test_light_is_clipped_to_the_exposure(make):
     box.close()
 
 
-def test_an_exposure_is_of_what_the_head_touched_when_it_began(make):
+def test_exposure_uses_head_contact_at_its_start(make):
     scene = Recorder()
     world, box = make(scene)
     times = []
@@ -103,7 +103,7 @@ def test_an_exposure_is_of_what_the_head_touched_when_it_began(make):
     box.close()
 
 
-def test_the_camera_is_released_by_the_shutter_and_sees_its_light(make):
+def test_shutter_triggers_camera_which_receives_its_light(make):
     scene = Recorder()
     world, box = make(scene)
     light(box)
@@ -128,7 +128,7 @@ def test_a_world_without_a_scene_gives_black_frames(make):
     box.close()
 
 
-def test_the_history_of_the_head_begins_in_the_air_and_goes_forward(make):
+def test_head_history_starts_in_air_and_goes_forward(make):
     world, box = make()
     assert world.heads == [(0.0, HeadState("", 0.0, False, 0.0, RIG.probe.camera_c))]
     box.arm()
@@ -144,7 +144,7 @@ def test_the_history_of_the_head_begins_in_the_air_and_goes_forward(make):
     box.close()
 
 
-def test_a_camera_that_warms_is_part_of_what_a_scene_is_told(make):
+def test_camera_warming_is_passed_to_scene(make):
     world, box = make(camera_warms_after=1.0)
     world.clock.sleep(300.0)
     assert world.head_at(0.5).camera_c == RIG.probe.camera_c
@@ -160,7 +160,7 @@ def test_a_world_without_a_probe_has_no_head():
         world.head_at(0.0)
 
 
-def test_a_probe_box_needs_a_probe():
+def test_probe_controller_needs_probe():
     with pytest.raises(ValueError, match="probe: got none"):
         World(dataclasses.replace(RIG, probe=None))
 
@@ -181,7 +181,7 @@ def test_switches_that_make_no_sense_are_named(switches):
         Faults(**switches)
 
 
-def test_the_same_seed_gives_the_same_bytes_at_the_same_times():
+def test_same_seed_gives_same_bytes_at_same_times():
     def transcript(seed):
         world = World(RIG, seed=seed, faults=Faults(drop=0.001, shutter_stuck=0.2, pump_leak=0.1))
         name = world.register(next(NAMES))

@@ -39,7 +39,7 @@ def integrated(law, wanted_mbar, leak, times_s, dt_s=2e-5):
     return np.array(found)
 
 
-def test_a_regulated_pump_comes_to_its_end_as_one_exponential():
+def test_regulated_pump_approaches_target_as_one_exponential():
     sucked = head()
     sucked.draw(60.0, 1.0)
     volume = 2.0 / 1013.25 + 6e-4
@@ -51,7 +51,7 @@ def test_a_regulated_pump_comes_to_its_end_as_one_exponential():
     assert 0.25 < tau_s < 0.4
 
 
-def test_a_pump_that_is_asked_for_more_than_it_can_give_gives_what_it_can_first():
+def test_pump_asked_beyond_capacity_first_gives_free_flow():
     sucked = head()
     sucked.draw(150.0, 0.0)
     times_s = np.array([0.02, 0.1, 0.2, 0.4, 1.0, 2.0])
@@ -74,7 +74,7 @@ def test_a_leak_makes_the_suction_settle_lower(leak):
     assert sucked.suction_mbar(20.0) == pytest.approx(60.0 / (1.0 + leak), rel=1e-6)
 
 
-def test_a_large_leak_keeps_a_pump_at_full_speed_below_what_was_asked():
+def test_large_leak_keeps_full_speed_pump_below_target():
     law = dataclasses.replace(LAW, leak_ml_per_s_mbar=0.02)
     sucked = head(law)
     sucked.draw(150.0, 0.0)
@@ -82,7 +82,7 @@ def test_a_large_leak_keeps_a_pump_at_full_speed_below_what_was_asked():
     assert sucked.suction_mbar(20.0) == pytest.approx(0.8 / (0.02 + 0.8 / 300.0), rel=1e-6)
 
 
-def test_a_vented_cup_fills_as_one_exponential():
+def test_vented_cup_fills_as_one_exponential():
     sucked = head()
     sucked.draw(60.0, 0.0)
     from_mbar = sucked.suction_mbar(5.0)
@@ -94,13 +94,13 @@ def test_a_vented_cup_fills_as_one_exponential():
     assert sucked.suction_mbar(6.0) < 0.01
 
 
-def test_a_pump_that_does_not_turn_sucks_nothing():
+def test_dead_pump_gives_no_suction():
     sucked = head(pump_dead=True)
     sucked.draw(60.0, 0.0)
     assert sucked.suction_mbar(10.0) == 0.0
 
 
-def test_a_head_that_comes_off_loses_its_suction_at_once():
+def test_detached_head_loses_suction_at_once():
     sucked = head(lifts_after_s=3.0)
     sucked.draw(60.0, 1.0)
     held_mbar = sucked.suction_mbar(4.0 - 1e-9)
@@ -120,7 +120,7 @@ def test_a_head_that_comes_off_loses_its_suction_at_once():
     assert sucked.suction_mbar(60.0) > 58.0
 
 
-def test_one_big_step_of_time_equals_many_small_ones():
+def test_one_big_time_step_equals_many_small_ones():
     def play(step_s):
         sucked = head(lifts_after_s=6.0)
         now = 0.0
@@ -159,7 +159,7 @@ def test_suction_has_no_jumps_and_is_remembered():
     assert sucked.state_at(7.0).site == ""
 
 
-def test_loose_skin_takes_longer_and_a_block_takes_the_least():
+def test_loose_skin_takes_longest_and_block_least():
     def reached_s(site, seed):
         sucked = SuckedHead(COOLER, seed=seed)
         sucked.place(site, 0.0, 0.0)
@@ -185,14 +185,14 @@ def test_the_leak_switch_bounds_the_suction_from_above(leak):
         assert 60.0 / (1.03 + leak) < ends_mbar < 60.0 / (1.0 + leak)
 
 
-def test_a_camera_warms_to_the_room_once_its_cooling_fails():
+def test_camera_warms_to_room_after_cooling_fails():
     cooler = CameraCooler(5.0, fails_after_s=100.0)
     assert cooler.camera_c(0.0) == cooler.camera_c(100.0) == 5.0
     assert cooler.camera_c(220.0) == pytest.approx(24.0 - 19.0 / math.e)
     assert cooler.camera_c(1e5) == pytest.approx(24.0)
 
 
-def test_what_makes_no_sense_is_named():
+def test_invalid_parameter_is_named():
     for field, value in (
         ("cup_ml", 0.0),
         ("leak_ml_per_s_mbar", -1e-6),
@@ -214,7 +214,7 @@ def test_what_makes_no_sense_is_named():
         sucked.place("cheek", 0.0, 2.0)
 
 
-def test_no_leak_and_no_skin_are_extremes_that_work():
+def test_zero_leak_and_zero_skin_compliance_work():
     law = dataclasses.replace(LAW, leak_ml_per_s_mbar=0.0, skin_ml_per_mbar=0.0)
     sucked = head(law, pump_dead=True)
     sucked.draw(60.0, 0.0)

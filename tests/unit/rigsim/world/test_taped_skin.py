@@ -37,7 +37,7 @@ def steps(skin, numbers):
     return found
 
 
-def test_the_forces_curve_is_j_shaped_with_fungs_exponent():
+def test_force_curve_is_j_shaped_with_fung_exponent():
     r = np.array([1.0, 1.05, 1.1, 1.15, 1.2])
     slope = np.array([(PLAIN.force_n(x + 1e-6) - PLAIN.force_n(x)) / 1e-6 for x in r])
     np.testing.assert_allclose(slope[0], PLAIN.stiffness_n, rtol=1e-4)
@@ -47,14 +47,14 @@ def test_the_forces_curve_is_j_shaped_with_fungs_exponent():
     assert linear.force_n(1.2) == pytest.approx(0.14)
 
 
-def test_skin_under_tape_that_gives_no_way_follows_the_jaws():
+def test_skin_under_rigid_tape_follows_jaws():
     for state, force_n in steps(held(RIGID), (1, 2, 0, -1, -2)):
         assert state.stretch == pytest.approx(state.aperture_mm / 8.0, abs=1e-12)
         assert force_n == pytest.approx(RIGID.force_n(state.aperture_mm / 8.0), abs=1e-12)
 
 
 @pytest.mark.parametrize("path", [(1, 2, 3), (-1, -2), (2, -2, 2, 0, 1)])
-def test_skin_tape_and_slip_fill_the_jaws_and_the_tape_bears_the_force(path):
+def test_skin_tape_and_slip_fill_jaws_sharing_force(path):
     skin = held()
     for step in path:
         ((state, force_n),) = steps(skin, (step,))
@@ -66,7 +66,7 @@ def test_skin_tape_and_slip_fill_the_jaws_and_the_tape_bears_the_force(path):
 
 
 @pytest.mark.parametrize("step", [3, 2, -2, -4])
-def test_a_move_in_pieces_ends_as_one_in_one_go(step):
+def test_stepwise_move_ends_like_single_move(step):
     whole, pieces = held(), held()
     whole.move(CALIPER.reading_mm(step))
     for aperture_mm in np.linspace(8.0, CALIPER.reading_mm(step), 357)[1:]:
@@ -76,7 +76,7 @@ def test_a_move_in_pieces_ends_as_one_in_one_go(step):
     assert pieces.slip_mm == pytest.approx(whole.slip_mm, abs=1e-9)
 
 
-def test_tape_that_slipped_does_not_bring_the_skin_back_to_where_it_was():
+def test_slipped_tape_does_not_return_skin_to_start():
     stretched, pressed = held(), held()
     assert steps(stretched, (3, 0))[-1][0].stretch < 1.0 - 2e-3
     assert steps(pressed, (-2, 0))[-1][0].stretch > 1.0 + 5e-4
@@ -84,7 +84,7 @@ def test_tape_that_slipped_does_not_bring_the_skin_back_to_where_it_was():
     assert steps(elastic, (3, 0))[-1][0].stretch == pytest.approx(1.0, abs=1e-12)
 
 
-def test_the_slip_is_a_few_per_cent_at_large_steps_and_grows():
+def test_slip_at_large_steps_is_few_percent_growing():
     shares = []
     for seed in range(60):
         skin = TapedSkin(CALIPER, seed=seed)
@@ -96,7 +96,7 @@ def test_the_slip_is_a_few_per_cent_at_large_steps_and_grows():
     assert max(shares) < 0.06
 
 
-def test_buckled_skin_pushes_no_more_than_it_did():
+def test_buckled_skin_force_stays_constant():
     (first, force_n), (deep, deep_n) = steps(held(), (-3, -4))
     assert (first.buckled, deep.buckled) == (True, True)
     assert first.stretch <= PLAIN.buckles_at
@@ -108,7 +108,7 @@ def test_buckled_skin_pushes_no_more_than_it_did():
     assert abs(back_n) < abs(force_n)
 
 
-def test_tape_that_lets_go_leaves_skin_at_rest_until_it_is_taped_again():
+def test_released_tape_leaves_skin_at_rest_until_retaped():
     skin = held()
     near, _ = steps(skin, (3,))[-1]
     assert near.attached
@@ -120,7 +120,7 @@ def test_tape_that_lets_go_leaves_skin_at_rest_until_it_is_taped_again():
     assert force_n > 0.0
 
 
-def test_the_limits_of_stretch_are_drawn_over_the_stated_ranges():
+def test_stretch_limits_are_drawn_over_stated_ranges():
     drawn = [draw_mechanics(seed, angle_deg=0.0) for seed in range(300)]
     for field, low, high in (("buckles_at", 0.70, 0.76), ("detaches_at", 1.25, 1.35)):
         values = np.array([getattr(one, field) for one in drawn])
@@ -139,13 +139,13 @@ def test_skin_depends_on_subject_and_direction_only():
     assert stiff.stiffness_n == pytest.approx(5.0 * usual.stiffness_n)
 
 
-def test_skin_is_anisotropic_with_half_a_turns_period():
+def test_skin_anisotropy_has_half_rotation_period():
     stiff = [draw_mechanics(7, angle_deg=a).stiffness_n for a in (0.0, 45.0, 90.0, 135.0)]
     assert stiff[0] + stiff[2] == pytest.approx(stiff[1] + stiff[3])
     assert max(stiff) / min(stiff) > 1.1
 
 
-def test_the_step_is_the_one_nearest_to_the_jaws():
+def test_step_is_nearest_to_jaws():
     skin = TapedSkin(CALIPER)
     for aperture_mm, step in ((8.0, 0), (8.39, 0), (8.41, 1), (4.8, -4), (7.61, 0)):
         skin.move(aperture_mm)
@@ -153,7 +153,7 @@ def test_the_step_is_the_one_nearest_to_the_jaws():
     assert not skin.state.attached
 
 
-def test_what_makes_no_sense_is_refused():
+def test_invalid_requests_are_refused():
     skin = held()
     with pytest.raises(TapedSkinError, match="let go first"):
         skin.turn(45.0)

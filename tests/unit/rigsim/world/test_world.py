@@ -70,7 +70,7 @@ def test_one_big_step_equals_many_small_ones():
     assert big[2:] == small[2:]
 
 
-def test_virtual_time_passes_only_when_somebody_waits(world):
+def test_virtual_time_passes_only_during_waits(world):
     assert world.now == 0.0
     world.clock.sleep(5.0)
     assert world.now == world.clock.monotonic() == 5.0
@@ -78,7 +78,7 @@ def test_virtual_time_passes_only_when_somebody_waits(world):
     assert world.now == 5.0
 
 
-def test_real_time_passes_by_itself():
+def test_real_time_passes_without_waits():
     world = World(RIG, clock="real")
     before = world.now
     world.clock.sleep(0.02)
@@ -96,7 +96,7 @@ def test_a_name_belongs_to_one_world(world):
         worlds.get("unit-world")
 
 
-def test_a_url_without_a_world_makes_one_and_keeps_it():
+def test_url_without_world_makes_and_keeps_one():
     url = "sim://flash?seed=17&drop=0.25&reset_on_open=1"
     made, name = world_of_url(url)
     assert world_of_url(url) == (made, "flash")
@@ -108,21 +108,21 @@ def test_a_url_without_a_world_makes_one_and_keeps_it():
     again.unregister()
 
 
-def test_a_url_with_an_unknown_world_makes_one_under_that_name():
+def test_url_with_unknown_world_makes_world_so_named():
     made, _ = world_of_url("sim://flash?world=unit-made&clock=real")
     assert worlds.get("unit-made") is made
     assert not made.virtual
     made.unregister()
 
 
-def test_a_world_is_named_by_name_as_by_world():
+def test_world_is_addressed_equally_by_name_or_world():
     made, _ = world_of_url("sim://flash?name=unit-named")
     assert world_of_url("sim://flash?world=unit-named")[0] is made
     made.unregister()
 
 
 @pytest.mark.parametrize("url", ["sim://probe", "sim://probe?seed=1&clock=virtual"])
-def test_cameras_of_a_world_without_a_name_are_found_by_its_box(url):
+def test_cameras_of_unnamed_world_are_found_by_controller(url):
     made, _ = world_of_url(url)
     camera = open_camera("sim://probe/cam")
     assert camera.info.serial == made.rig.view("cam").serial
@@ -154,14 +154,14 @@ def test_a_url_that_no_world_understands_is_named(url, match):
         world_of_url(url)
 
 
-def test_a_rig_with_an_unknown_box_or_clock_is_refused():
+def test_rig_with_unknown_controller_or_clock_is_refused():
     with pytest.raises(ValueError, match="clock"):
         World(RIG, clock="fast")
     with pytest.raises(KeyError, match="expected one of flash"):
         World(RIG).link("dome")
 
 
-def test_without_a_scene_frames_hold_black_level_and_read_noise():
+def test_frames_without_scene_have_black_level_read_noise():
     rig = load_rig("flash").resized(256)
     view = rig.view("cam")
     # two DN, so that rounding is noise like any other
@@ -176,7 +176,7 @@ def test_without_a_scene_frames_hold_black_level_and_read_noise():
     assert frame.std() == pytest.approx(deviation, rel=6.0 / math.sqrt(2.0 * frame.size))
 
 
-def test_an_exposure_sees_the_pops_between_opening_and_closing(world):
+def test_exposure_collects_pops_between_opening_and_closing(world):
     seen = []
 
     class Scene:
@@ -220,13 +220,13 @@ def test_a_read_ends_at_its_timeout(world, port):
     assert world.now - before == pytest.approx(0.02)
 
 
-def test_a_read_without_a_timeout_that_nothing_can_end_is_refused(port):
+def test_endless_read_without_timeout_is_refused(port):
     port.timeout = None
     with pytest.raises(serial.SerialException, match="needs a timeout"):
         port.read(1)
 
 
-def test_a_flush_drops_what_has_arrived(world, port):
+def test_flush_drops_received_bytes(world, port):
     port.write(b"*IDN?\n")
     world.clock.sleep(0.01)
     assert port.in_waiting == 26
@@ -234,7 +234,7 @@ def test_a_flush_drops_what_has_arrived(world, port):
     assert port.in_waiting == 0
 
 
-def test_a_closed_port_says_so(port):
+def test_closed_port_is_reported(port):
     port.close()
     for act in (lambda: port.read(1), lambda: port.write(b"x"), port.reset_input_buffer):
         with pytest.raises(PortNotOpenError):

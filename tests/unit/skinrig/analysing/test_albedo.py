@@ -16,7 +16,7 @@ def lab(tmp_path_factory, dome_faces):
     return folder, *dome_faces.population(folder, count=4)
 
 
-def test_groups_differ_in_their_histograms_as_they_were_made(lab, capsys):
+def test_groups_differ_in_histograms_as_generated(lab, capsys):
     folder, paths, labels = lab
     out = folder / "analysis"
     argv = ["analyse", "albedo", *map(str, paths), "--labels", str(labels), "--out", str(out)]
@@ -59,7 +59,7 @@ def test_labels_without_faces_are_refused(lab, capsys):
 
 
 @pytest.mark.long
-def test_the_simulated_population_is_darker_where_it_is_said_to_be(tmp_path):
+def test_simulated_population_is_darker_where_stated(tmp_path):
     found = analysing_albedo.analyse_simulated(tmp_path / "out", people=6, size=96)
     told = found.document()
     assert told["groups"]["all"] == 6

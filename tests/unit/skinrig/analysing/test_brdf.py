@@ -36,7 +36,7 @@ def seen(skin) -> Captured:
     return brdf_space_datasets.capture(*skin, 120, rng=np.random.default_rng(1))
 
 
-def test_samples_are_the_true_reflection_with_noise_of_the_stated_size(seen):
+def test_samples_are_true_reflection_with_stated_noise(seen):
     assert np.all(np.einsum("pmc,pc->pm", seen.light, seen.normals) >= 0.119)
     pull = (seen.f - seen.clean) / np.sqrt(seen.variance)
     # mean and variance of 57,600 normal deviates: 5 standard errors, false alarms below 1e-5
@@ -70,7 +70,7 @@ def test_mixtures_of_materials_hold_the_true_surface_term(seen, basis):
     assert np.linalg.norm(other - seen.surface) > 0.2 * np.linalg.norm(seen.surface)
 
 
-def test_points_without_anything_diffuse_are_fitted_by_lobes_alone(skin, basis):
+def test_points_without_diffuse_are_fitted_by_lobes_alone(skin, basis):
     surface, place, where = skin
     black = dataclasses.replace(surface, r_d=np.zeros_like(surface.r_d))
     seen = brdf_space_datasets.capture(black, place, where, 60, rng=np.random.default_rng(2))
@@ -94,7 +94,7 @@ def test_the_darkest_person_has_a_surface_too(basis):
     assert np.all(np.diff(found.curve.error) < 0.0)
 
 
-def test_one_condition_alone_is_a_dataset_and_conditions_share_the_points():
+def test_single_condition_is_dataset_and_conditions_share_points():
     rng = np.random.default_rng(5)
     only = brdf_space_datasets.dataset_a(40, conditions=("lotion",), rng=rng)
     assert only.labels == ("lotion",)
@@ -105,7 +105,7 @@ def test_one_condition_alone_is_a_dataset_and_conditions_share_the_points():
     assert 0.0 < two.noise < 1.0
 
 
-def test_a_mean_brdf_under_lotion_peaks_higher_and_under_powder_lower(basis):
+def test_mean_brdf_peaks_higher_under_lotion_than_powder(basis):
     rng = np.random.default_rng(6)
     data = brdf_space_datasets.dataset_a(90, conditions=("normal", "lotion", "powder"), rng=rng)
     found = analysing_brdf.analyse(data, basis, by_label=False, ranks=(1, 2), rng=rng)
@@ -118,7 +118,7 @@ def test_a_mean_brdf_under_lotion_peaks_higher_and_under_powder_lower(basis):
         assert png.startswith(b"\x89PNG")
 
 
-def test_what_cannot_be_sampled_is_refused(skin, rng):
+def test_unsampleable_input_is_refused(skin, rng):
     surface, place, where = skin
     with pytest.raises(DatasetError, match="samples: got 5000"):
         brdf_space_datasets.capture(surface, place, where, 5, samples=5000, rng=rng)
@@ -149,7 +149,7 @@ def appearance(basis, rank, rng, *, names=None):
     return SkinAppearance(maps, "simulated", seed=0, files={"brdf_basis.npz": stream.getvalue()})
 
 
-def test_measured_faces_are_analysed_by_label(tmp_path, basis, capsys):
+def test_measured_faces_are_analyzed_by_label(tmp_path, basis, capsys):
     rng = np.random.default_rng(7)
     agreed = {"pseudonym": "P7", "consent_scope": ["research"], "consent_expires": "2031-01-31"}
     for name in ("a", "b", "c"):

@@ -23,7 +23,7 @@ def part(value: float, name: str = "a", source: str = "measured") -> SkinAppeara
     )
 
 
-def test_a_part_replaces_its_older_self_and_keeps_the_others(tmp_path):
+def test_part_replaces_older_version_and_keeps_others(tmp_path):
     out = tmp_path / "moving"
     dynamic.add(out, FACIAL_COLOR, part(1.0))
     dynamic.add(out, MICROSTRUCTURE, part(2.0, "b"))
@@ -40,7 +40,7 @@ def test_a_part_replaces_its_older_self_and_keeps_the_others(tmp_path):
     ]
 
 
-def test_simulated_data_in_any_part_makes_the_whole_simulated(tmp_path):
+def test_simulated_part_makes_whole_appearance_simulated(tmp_path):
     dynamic.add(tmp_path / "m", FACIAL_COLOR, part(1.0))
     assert store.read(tmp_path / "m").source == "measured"
     dynamic.add(tmp_path / "m", MICROSTRUCTURE, part(2.0, "b", "simulated"))
@@ -58,14 +58,14 @@ def test_a_folder_of_other_maps_is_left_untouched(tmp_path):
     assert hashlib.sha256((out / store.DOCUMENT_FILE).read_bytes()).hexdigest() == before
 
 
-def test_two_parts_cannot_share_a_map(tmp_path):
+def test_same_map_in_two_parts_is_refused(tmp_path):
     dynamic.add(tmp_path / "m", FACIAL_COLOR, part(1.0))
     with pytest.raises(DynamicAppearanceError, match=r"a\.json"):
         dynamic.add(tmp_path / "m", MICROSTRUCTURE, part(2.0))
     assert set(dynamic.read(tmp_path / "m")[1]) == {FACIAL_COLOR}
 
 
-def test_a_folder_without_the_part_names_the_command_that_makes_it(tmp_path):
+def test_folder_without_part_names_command_to_make_one(tmp_path):
     dynamic.add(tmp_path / "m", FACIAL_COLOR, part(1.0))
     with pytest.raises(DynamicAppearanceError, match="skinrig fit microstructure"):
         dynamic.read(tmp_path / "m", parts=(MICROSTRUCTURE,))

@@ -23,13 +23,13 @@ def session(tmp_path):
     return tmp_path / "session-face"
 
 
-def test_each_state_has_its_own_and_what_has_none_has_no_others(session):
+def test_state_truth_is_own_or_missing_never_other(session):
     assert truth_beside(session).name == "truth-face"
     assert truth_beside(session, "smile").name == "truth-face-smile"
     assert truth_beside(session, "anger") is None
 
 
-def test_a_session_that_begins_with_a_state_has_its_truth_without_a_suffix(tmp_path):
+def test_first_state_truth_of_session_has_no_suffix(tmp_path):
     write(tmp_path / "truth-face", "smile")
     write(tmp_path / "truth-face-neutral", "neutral")
     session = tmp_path / "session-face"
@@ -37,7 +37,7 @@ def test_a_session_that_begins_with_a_state_has_its_truth_without_a_suffix(tmp_p
     assert truth_beside(session).name == "truth-face-neutral"
 
 
-def test_where_no_state_is_asked_for_a_sessions_own_will_do(tmp_path):
+def test_truth_without_requested_state_is_session_truth(tmp_path):
     session = tmp_path / "session-face"
     assert truth_beside(session) is None
     write(tmp_path / "truth-face", "hot")

@@ -58,12 +58,12 @@ def test_weights_are_read_by_name():
 
 
 @pytest.mark.parametrize("text", ["smile", "smile=", "=1", "smile=x", "smile=nan", "a=1,a=2", ""])
-def test_a_weight_that_is_none_is_named(text):
+def test_invalid_weight_is_named(text):
     with pytest.raises(ApplyError, match="weights"):
         parse_weights(text)
 
 
-def test_a_state_at_full_weight_has_that_states_blood(face, tmp_path):
+def test_state_at_full_weight_has_its_blood(face, tmp_path):
     folder, neutral = face
     apply_expression(folder, Expression({"smile": 1.0}), out=tmp_path / "out")
     found = store.read(tmp_path / "out").maps["hemoglobin"]
@@ -98,7 +98,7 @@ def test_anger_and_surprise_wrinkle_by_the_papers_table(face, tmp_path):
     assert not np.array_equal(done.maps["normals"].values, signed.maps["normals"].values)
 
 
-def test_weights_that_do_not_sum_to_one_write_nothing(face, tmp_path):
+def test_weights_not_summing_to_one_write_nothing(face, tmp_path):
     folder, _ = face
     out = tmp_path / "out"
     with pytest.raises(FacialColorError, match="normalize"):
@@ -108,7 +108,7 @@ def test_weights_that_do_not_sum_to_one_write_nothing(face, tmp_path):
     assert (out / store.DOCUMENT_FILE).is_file()
 
 
-def test_a_state_that_wrinkles_do_not_know_is_refused(face, tmp_path):
+def test_state_unknown_to_wrinkles_is_refused(face, tmp_path):
     folder, _ = face
     with pytest.raises(ApplyError, match="smiling"):
         apply_expression(
@@ -116,7 +116,7 @@ def test_a_state_that_wrinkles_do_not_know_is_refused(face, tmp_path):
         )
 
 
-def test_what_a_face_lacks_is_left_out_with_the_reason(face, tmp_path):
+def test_missing_face_parts_are_omitted_with_reason(face, tmp_path):
     folder, _ = face
     done = apply_expression(folder, Expression({"smile": 1.0}), out=tmp_path / "out")
     assert ("microstructure", "the folder does not hold it") in done.left_out
@@ -144,7 +144,7 @@ def test_a_rig_is_applied_to_another_faces_blood(face, tmp_path):
         apply_expression(folder, Expression({"smile": 1.0}, onto=empty), out=tmp_path / "no")
 
 
-def test_what_a_result_is_made_of_is_never_replaced(face, tmp_path):
+def test_inputs_of_result_are_never_replaced(face, tmp_path):
     folder, _ = face
     before = (folder / store.DOCUMENT_FILE).read_bytes()
     with pytest.raises(ApplyError, match="the fitted folder itself"):
@@ -174,7 +174,7 @@ def test_weights_are_normalized_for_wrinkles_as_for_blood(face, tmp_path):
         )
 
 
-def test_a_simulated_face_makes_the_result_simulated_and_sizes_must_fit(face, tmp_path):
+def test_simulated_face_gives_simulated_result_sizes_must_fit(face, tmp_path):
     folder, _ = face
     blood = SkinMap(np.full((60, 40), 0.03, np.float32), MAP_UNITS["hemoglobin"])
     melanin = SkinMap(np.full((30, 40), 0.03, np.float32), MAP_UNITS["melanin"])

@@ -33,7 +33,7 @@ def square_mm(side=1.0, n=5):
     )
 
 
-def test_a_patch_stretched_along_x_is_convolved_with_the_tables_kernels(rng):
+def test_patch_stretched_along_x_uses_table_kernels(rng):
     height = rng.standard_normal((128, 128)).astype(np.float32)
     done = apply_microstructure(square_mm(), {"wide": 1.0}, height)
     alpha, sigma_um = kernel_parameters([1.2, 0.9])
@@ -49,7 +49,7 @@ def test_a_patch_stretched_along_x_is_convolved_with_the_tables_kernels(rng):
     json.dumps(dataclasses.asdict(report))
 
 
-def test_neutral_weights_give_the_neutral_relief_to_the_bit(rng):
+def test_neutral_weights_give_neutral_relief_bit_exactly(rng):
     height = rng.standard_normal((40, 60)).astype(np.float32)
     for weights in ({}, {"wide": 0.0}):
         done = apply_microstructure(square_mm(), weights, height)
@@ -57,7 +57,7 @@ def test_neutral_weights_give_the_neutral_relief_to_the_bit(rng):
         assert done.report.changed_share == done.report.unresolved_share == 0.0
 
 
-def test_vertices_beyond_the_fitted_range_are_counted_and_held_by_default(rng):
+def test_vertices_beyond_fitted_range_are_counted_and_clamped(rng):
     height = rng.standard_normal((100, 100)).astype(np.float32)
     held = apply_microstructure(square_mm(), {"far": 0.9}, height)
     assert held.report.outside_share == held.report.above_share == 1.0
@@ -77,7 +77,7 @@ def test_vertices_beyond_the_fitted_range_are_counted_and_held_by_default(rng):
     assert np.abs(gone_on.height - held.height).max() > 0.1
 
 
-def test_a_map_too_coarse_for_the_kernels_is_reported_as_such(rng):
+def test_map_too_coarse_for_kernels_is_reported(rng):
     height = rng.standard_normal((32, 32)).astype(np.float32)
     done = apply_microstructure(square_mm(side=30.0), {"wide": 1.0}, height)
     np.testing.assert_array_equal(done.height, height)
@@ -85,7 +85,7 @@ def test_a_map_too_coarse_for_the_kernels_is_reported_as_such(rng):
     assert done.report.pixel_um == pytest.approx(1e3 * 30.0 / 32.0, rel=1e-5)
 
 
-def test_two_kinds_of_skin_each_have_their_own_kernels_and_are_blended_between(rng):
+def test_two_skin_types_use_own_kernels_and_blend(rng):
     height = rng.standard_normal((128, 128)).astype(np.float32)
     softer = KernelTable(
         (), ((1.5, -1.5),), None, (10.0, 5.0), (1.0, 1.1), "half as strong, fitted to 1.1"
@@ -111,7 +111,7 @@ def test_two_kinds_of_skin_each_have_their_own_kernels_and_are_blended_between(r
         KernelRegions((FOREHEAD, softer), left - 1.0)
 
 
-def test_an_interrupted_run_goes_on_and_gives_the_same_file(rng, tmp_path):
+def test_interrupted_run_resumes_and_gives_same_file(rng, tmp_path):
     height = rng.standard_normal((130, 170)).astype(np.float32)
     valid = rng.random(height.shape) > 0.01
     mesh, weights = square_mm(), {"wide": 0.8}
@@ -147,7 +147,7 @@ def test_an_interrupted_run_goes_on_and_gives_the_same_file(rng, tmp_path):
     assert sorted(p.name for p in out.parent.iterdir()) == ["relief.npy"]
 
 
-def test_reliefs_and_meshes_that_do_not_fit_are_refused(rng, tmp_path):
+def test_mismatched_reliefs_and_meshes_are_refused(rng, tmp_path):
     mesh = square_mm()
     with pytest.raises(ApplyMicrostructureError, match="neutral_height"):
         apply_microstructure(mesh, {}, np.zeros(5, np.float32))

@@ -36,7 +36,7 @@ def states(relief):
     }
 
 
-def test_pixels_of_the_chart_are_as_long_as_their_distance_on_the_sphere():
+def test_chart_pixel_lengths_match_distance_on_sphere():
     points, pixel = SPHERE.points_mm(), SPHERE.pixel_um()
     np.testing.assert_allclose(np.linalg.norm(points, axis=-1), 1.95)
     for axis in (0, 1):
@@ -64,7 +64,7 @@ def test_noise_has_the_slopes_of_its_spectrum_everywhere(states):
 
 
 @pytest.mark.parametrize(("name", "sign"), [("shrunk", 1.0), ("grown", -1.0)])
-def test_shrunk_is_rougher_and_grown_is_smoother_by_more_than_the_stretch(states, name, sign):
+def test_shrunk_skin_roughens_and_grown_smooths_beyond_stretch(states, name, sign):
     """In both directions alike, at all places; and more than unchanged heights would be."""
     neutral, moved, fixed = states["neutral", True], states[name, True], states[name, False]
     for place in ROUGHNESS_POINTS:
@@ -83,7 +83,7 @@ def test_unchanged_heights_get_slopes_by_the_inverse_ratio(states):
     )
 
 
-def test_the_squashed_sphere_is_smooth_along_its_length_and_rough_across(states, relief):
+def test_squashed_sphere_is_smooth_along_and_rough_across(states, relief):
     """At the front s lies along x and t along y, with the ratios of the squash."""
     moved, fixed = states["squashed", True], states["squashed", False]
     middle = SPHERE.texels // 2
@@ -108,7 +108,7 @@ def test_grown_patches_keep_their_slopes_over_the_chart(rng):
     assert max(found) / min(found) < 1.4
 
 
-def test_a_grown_sphere_is_shinier_in_its_picture(states):
+def test_grown_sphere_is_shinier_in_its_image(states):
     """The highlight of a smoother surface is brighter and smaller."""
     peaks = {}
     for name in ("shrunk", "neutral", "grown"):
@@ -119,7 +119,7 @@ def test_a_grown_sphere_is_shinier_in_its_picture(states):
     assert peaks["shrunk"] < peaks["neutral"] < peaks["grown"]
 
 
-def test_the_highlight_is_on_the_side_of_the_light():
+def test_highlight_is_on_light_side():
     flat = np.zeros((400, 400), np.float32)
     picture = spheres.deform(SPHERE, flat, (1, 1, 1)).picture(size_px=65, light=(0.5, 0.5, 0.7))
     row, column = np.unravel_index(picture.argmax(), picture.shape)
@@ -146,6 +146,6 @@ def test_the_highlight_is_on_the_side_of_the_light():
         ),
     ],
 )
-def test_what_is_no_sphere_is_refused_by_name(make, message):
+def test_non_sphere_is_refused_by_name(make, message):
     with pytest.raises(SphereError, match=message):
         make()

@@ -23,7 +23,7 @@ def nodes_of(one):
 
 
 @pytest.mark.parametrize(("stretch", "poisson"), [(1.3, 0.3), (0.8, 0.45), (1.2, 0.5)])
-def test_a_pulled_block_has_the_stretch_of_the_closed_form(stretch, poisson):
+def test_pulled_block_stretch_matches_closed_form(stretch, poisson):
     """Rollers on three sides, the fourth pulled: the ratio across solves
     l^2 - 1 + (lambda / mu) ln(stretch l^2) = 0, or is 1 / sqrt(stretch) at a fixed volume."""
     one = block(3, poisson=poisson)
@@ -46,7 +46,7 @@ def test_a_pulled_block_has_the_stretch_of_the_closed_form(stretch, poisson):
     assert patch.volume_ratio == pytest.approx(stretch * across**2, rel=1e-6)
 
 
-def test_an_affine_motion_of_the_border_moves_the_inside_alike(rng):
+def test_affine_border_motion_moves_interior_alike(rng):
     """The patch test."""
     one = block(4, poisson=0.4)
     nodes = nodes_of(one)
@@ -59,7 +59,7 @@ def test_an_affine_motion_of_the_border_moves_the_inside_alike(rng):
     np.testing.assert_allclose(patch.deformed_mm, nodes + nodes @ matrix.T, atol=1e-8)
 
 
-def test_volume_is_kept_the_better_the_nearer_poisson_is_to_a_half():
+def test_volume_conservation_improves_as_poisson_nears_half():
     lost = [
         abs(
             pushed_patch.push(block(6, poisson=p), Push(contact_mm=2.0), steps=1).volume_ratio - 1.0
@@ -176,7 +176,7 @@ def test_the_surface_looks_out_and_covers_the_square():
     assert uv.max() == 1.0
 
 
-def test_the_probe_takes_the_skin_it_touches_along():
+def test_probe_drags_skin_in_contact():
     probe = Push(depth_mm=0.5, shift_mm=(0.3, -0.2), contact_mm=2.0, centre_mm=(1.0, 0.5))
     patch = pushed_patch.push(block(6), probe, steps=2)
     away = np.hypot(*(patch.rest_mm[:, :2] - (1.0, 0.5)).T)
@@ -187,7 +187,7 @@ def test_the_probe_takes_the_skin_it_touches_along():
     np.testing.assert_allclose(moved[:, 2], tip)
 
 
-def test_skin_is_rougher_before_a_moving_probe_and_smoother_behind_it(rng):
+def test_skin_is_rougher_before_moving_probe_smoother_behind(rng):
     """Where the push compresses along x, slopes along x grow; where it stretches, they shrink."""
     patch = pushed_patch.push(
         block(8), Push(depth_mm=0.0, shift_mm=(1.0, 0.0), contact_mm=1.3), steps=2
@@ -203,7 +203,7 @@ def test_skin_is_rougher_before_a_moving_probe_and_smoother_behind_it(rng):
         assert stretch[0] > 1.1 if sign < 0 else stretch[1] < 0.9
 
 
-def test_a_push_beyond_any_equilibrium_is_told():
+def test_push_beyond_equilibrium_is_reported():
     """A node drawn through the opposite side of its block."""
     one = block(2, poisson=0.5)
     nodes = nodes_of(one)
@@ -231,12 +231,12 @@ def test_a_push_beyond_any_equilibrium_is_told():
         (lambda: pushed_patch.solve(block(1), np.zeros((8, 3)), steps=0), "steps: got 0"),
     ],
 )
-def test_what_cannot_be_pushed_is_refused_by_name(make, message):
+def test_invalid_push_is_refused_by_name(make, message):
     with pytest.raises(PushError, match=message):
         make()
 
 
-def test_without_the_optional_part_the_message_names_it(monkeypatch):
+def test_missing_optional_part_is_named_in_message(monkeypatch):
     monkeypatch.setitem(sys.modules, "skfem", None)
     with pytest.raises(errors.MissingExtra, match=r"skinrig\[fem\]") as caught:
         pushed_patch.push(block(), Push())

@@ -69,7 +69,7 @@ def slopes(height, axis):
     return np.diff(height[20:-20, 20:-20].astype(float), axis=axis).std()
 
 
-def test_skin_that_is_drawn_out_is_smoother_along_the_pull(folder, sheet, tmp_path):
+def test_drawn_out_skin_is_smoother_along_pull(folder, sheet, tmp_path):
     done = applied(folder, sheet, tmp_path / "out", {"drawn": 1.0}, size_px=600)
     before = done.maps["displacement_neutral"].values
     after = done.maps["displacement"].values
@@ -102,7 +102,7 @@ def test_the_same_seed_grows_the_same_relief(folder, sheet, tmp_path):
     assert not np.array_equal(maps[0].values, maps[2].values)
 
 
-def test_names_that_nothing_answers_to_are_refused_and_nothing_is_written(folder, sheet, tmp_path):
+def test_unmatched_names_are_refused_and_nothing_is_written(folder, sheet, tmp_path):
     with pytest.raises(ApplyError, match="drown"):
         applied(folder, sheet, tmp_path / "out", {"drown": 1.0})
     with pytest.raises(ApplyError, match="site"):
@@ -114,7 +114,7 @@ def test_names_that_nothing_answers_to_are_refused_and_nothing_is_written(folder
     assert not (tmp_path / "out").exists()
 
 
-def test_large_maps_go_beside_the_folder(folder, sheet, tmp_path, monkeypatch):
+def test_large_maps_are_written_next_to_folder(folder, sheet, tmp_path, monkeypatch):
     monkeypatch.setattr("skinrig.applying.relief.MAX_EXR_SIDE_PX", 256)
     out = tmp_path / "out"
     applied(folder, sheet, out, {"drawn": 1.0})
@@ -125,7 +125,7 @@ def test_large_maps_go_beside_the_folder(folder, sheet, tmp_path, monkeypatch):
     assert "every 2. pixel" in shown.description
 
 
-def test_noise_in_space_is_as_high_as_the_patches_and_moves_alike(folder, sheet, tmp_path):
+def test_spatial_noise_has_patch_height_and_deforms_alike(folder, sheet, tmp_path):
     done = applied(folder, sheet, tmp_path / "out", {"drawn": 1.0}, size_px=400, source="noise")
     before = done.maps["displacement_neutral"].values
     after = done.maps["displacement"].values

@@ -16,7 +16,7 @@ def point(seconds, error):
     return Point({"n": 1}, Timing(seconds, (seconds, seconds), seconds, 1.0), error, (error, error))
 
 
-def test_the_front_holds_what_nothing_beats_in_both():
+def test_front_contains_all_undominated_points():
     points = (point(1, 8), point(2, 9), point(2, 4), point(4, 4), point(8, 1))
     assert pareto_front(points) == (0, 2, 4)
 
@@ -30,7 +30,7 @@ def test_two_points_have_no_knee():
     assert knee((point(1, 2), point(2, 1))) is None
 
 
-def test_the_first_call_is_timed_apart_from_the_warm_ones():
+def test_first_call_is_timed_separately_from_warm_ones():
     calls = []
     timing = measure(lambda: calls.append(1), repeats=4)
     assert len(calls) == 1 + 4 + 1
@@ -88,7 +88,7 @@ def test_efficiency_is_the_ratio_of_variances():
     assert (written["efficiency"], written["efficiency_interval"]) == (2.25, [1.0, 4.0])
 
 
-def test_a_reference_of_its_own_error_is_told_from_the_truth():
+def test_reference_error_is_distinguished_from_exact_truth():
     means = [
         StageBenchmark("s", "rms", "r", error, (point(1, 1),)).reference_error_means
         for error in (0.0, 0.1)
@@ -97,7 +97,7 @@ def test_a_reference_of_its_own_error_is_told_from_the_truth():
     assert not means[1].startswith("exact")
 
 
-def test_memory_of_slow_calls_is_what_the_process_grew_by(monkeypatch):
+def test_memory_of_slow_calls_is_process_growth(monkeypatch):
     monkeypatch.setattr("skinrig.benchmarks.measurement.MAX_TRACED_CALL_S", 0.0)
     with resident_memory.watched() as seen:
         pass
@@ -108,13 +108,13 @@ def test_memory_of_slow_calls_is_what_the_process_grew_by(monkeypatch):
     assert 60.0 < timing.peak_memory_mb < 160.0
 
 
-def test_memory_of_quick_calls_is_what_they_allocate():
+def test_memory_of_quick_calls_is_their_allocation():
     timing = measure(lambda: np.ones(100_000).sum(), repeats=1, memory=False)
     assert timing.memory_of == "allocated"
     assert 0.8 <= timing.peak_memory_mb < 0.9
 
 
-def test_each_condition_has_a_front_and_a_knee_of_its_own():
+def test_each_condition_has_own_front_and_knee():
     timing = {s: Timing(s, (s, s), s, 1.0) for s in (1.0, 2.0, 4.0)}
     points = [
         Point({"noise": noise, "steps": s}, timing[s], error, (error, error))
@@ -133,7 +133,7 @@ def test_each_condition_has_a_front_and_a_knee_of_its_own():
     assert [p["on_front"] for p in mixed["points"]] == [True] * 3 + [False] * 3
 
 
-def test_a_document_says_how_much_larger_errors_are_on_dark_skin():
+def test_document_reports_error_ratio_on_dark_skin():
     stage = StageBenchmark(
         "s",
         "rms, %",

@@ -10,7 +10,7 @@ from skinrig.benchmarks.stage import Stage, descriptions
 
 
 @pytest.mark.parametrize("name", descriptions())
-def test_a_stage_has_a_function_and_limits_that_its_module_names(name):
+def test_stage_has_function_and_limits_of_its_module(name):
     entry = descriptions()[name]
     module, function = entry["run"].rsplit(".", 1)
     source = Path(find_spec(f"skinrig.benchmarks.{module}").origin).read_text(encoding="utf-8")
@@ -27,7 +27,7 @@ def limit(name, found):
     return limit
 
 
-def test_what_was_found_fills_the_names_and_bounds_of_limits():
+def test_results_fill_limit_names_and_bounds():
     assert limit("photon-transport", {"over_own_walk": 5.0}).passed
     clean = limit("gradient-normals", {("clean", "as it is"): 1.0})
     assert clean.name == "mean error without noise on smooth relief, as it is"
@@ -36,6 +36,6 @@ def test_what_was_found_fills_the_names_and_bounds_of_limits():
     assert (rms.got, rms.bound, rms.passed) == (0.1, 0.2, True)
 
 
-def test_a_limit_that_the_table_lacks_is_an_error():
+def test_limit_missing_in_table_is_error():
     with pytest.raises(KeyError, match="tea"):
         limit("hdr", {"tea": 1.0})

@@ -61,7 +61,7 @@ def run(budget_s, names=None, toy=False, out=None):
     )
 
 
-def test_every_stage_is_measured_small_and_then_the_quickest_at_full_size(calls, capsys):
+def test_stages_run_small_first_then_quickest_full_size(calls, capsys):
     document = run(150.0)
     small = [(name, "small") for name in NAMES]
     assert calls[1:] == [*small, ("b", "full"), ("c", "full")]
@@ -76,7 +76,7 @@ def test_every_stage_is_measured_small_and_then_the_quickest_at_full_size(calls,
     assert "limits not judged, since measured at small size: a;" in capsys.readouterr().err
 
 
-def test_a_budget_for_all_has_all_at_full_size_with_seconds_of_compiling_kept(calls, capsys):
+def test_sufficient_budget_runs_all_full_size_recording_compilation(calls, capsys):
     document = run(400.0)
     assert document["not_judged"] == []
     assert document["stages"]["a"]["compile_seconds"] == pytest.approx(2.0 * (1 + 2 + 4 + 8))
@@ -88,20 +88,20 @@ def test_a_slow_machine_is_noticed(calls, monkeypatch, capsys):
     assert run(150.0)["not_judged"] == ["a"]
 
 
-def test_a_stage_that_is_asked_for_has_its_full_size_at_once(calls, capsys):
+def test_requested_stage_runs_full_size_at_once(calls, capsys):
     document = run(1.0, ["a"])
     assert calls[1:] == [("a", "full")]
     assert document["stages"]["a"]["limits"][0]["passed"]
 
 
-def test_toys_are_judged_by_no_limit(calls, capsys):
+def test_toy_runs_are_not_evaluated_by_limits(calls, capsys):
     document = run(600.0, toy=True)
     assert calls[1:] == [(name, "small") for name in NAMES]
     assert document["passed"]
     assert document["not_judged"] == list(NAMES)
 
 
-def test_a_stage_whose_optional_part_is_missing_is_left_out_unless_asked_for(calls, capsys):
+def test_stage_missing_optional_part_is_skipped_unless_requested(calls, capsys):
     calls[0]["a"] = stage("a", calls, error=MissingExtra("this", "peers"))
     document = run(600.0)
     assert [name for name, _ in document["left_out"]] == ["a"]
@@ -110,7 +110,7 @@ def test_a_stage_whose_optional_part_is_missing_is_left_out_unless_asked_for(cal
         run(600.0, ["a"])
 
 
-def test_a_run_that_is_interrupted_leaves_what_it_measured(calls, tmp_path, capsys):
+def test_interrupted_run_keeps_measured_results(calls, tmp_path, capsys):
     calls[0]["b"] = stage("b", calls, error=KeyboardInterrupt())
     with pytest.raises(KeyboardInterrupt):
         run(600.0, ["a", "b", "c"], out=tmp_path)
@@ -124,7 +124,7 @@ def test_a_run_that_is_interrupted_leaves_what_it_measured(calls, tmp_path, caps
     assert whole["left_out"] == []
 
 
-def test_a_long_stage_that_is_interrupted_leaves_what_it_measured_of_it(calls, tmp_path, capsys):
+def test_interrupted_long_stage_keeps_measured_results(calls, tmp_path, capsys):
     whole = stage("b", calls)
 
     def in_parts(stage):
@@ -148,19 +148,19 @@ def test_a_long_stage_that_is_interrupted_leaves_what_it_measured_of_it(calls, t
     assert document["left_out"] == []
 
 
-def test_a_folder_that_cannot_be_made_is_told_before_anything_is_measured(calls, tmp_path):
+def test_uncreatable_folder_is_reported_before_measuring(calls, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match="file"):
         run(600.0, ["a"], out=tmp_path / "file" / "bench")
     assert calls[1:] == []
 
 
-def test_a_stage_that_is_named_twice_is_measured_once(calls, capsys):
+def test_stage_named_twice_is_measured_once(calls, capsys):
     run(600.0, ["a", "b", "a"])
     assert calls[1:] == [("a", "full"), ("b", "full")]
 
 
-def test_a_table_of_all_points_and_a_plot_a_stage_are_written(calls, tmp_path, capsys):
+def test_table_of_points_and_stage_plots_are_written(calls, tmp_path, capsys):
     document = run(150.0, out=tmp_path)
     bench_table.write(document, tmp_path)
     with (tmp_path / "bench.csv").open() as file:
@@ -173,5 +173,5 @@ def test_a_table_of_all_points_and_a_plot_a_stage_are_written(calls, tmp_path, c
     assert "(knee)" in (tmp_path / "c.svg").read_text()
 
 
-def test_seconds_are_told_of_stages_that_there_are():
+def test_stage_seconds_are_given_only_for_existing_stages():
     assert set(bench_plan.FULL_S) <= set(bench_stages.STAGES)

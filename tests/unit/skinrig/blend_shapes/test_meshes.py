@@ -107,7 +107,7 @@ def glb(document, data):
     return struct.pack("<III", 0x46546C67, 2, 12 + len(body)) + body
 
 
-def test_an_obj_folder_is_split_at_seams_and_polygons_become_triangles(tmp_path):
+def test_obj_folder_is_split_at_seams_and_triangulated(tmp_path):
     mesh = load(obj_folder(tmp_path / "head"))
     assert mesh.vertices_mm.shape == (8, 3)  # two vertices have two texture coordinates each
     assert mesh.faces.shape == (4, 3)
@@ -156,7 +156,7 @@ def test_obj_shapes_of_another_topology_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["glb", "gltf", "data"])
-def test_gltf_targets_come_in_millimetres_in_the_scenes_frame_with_v_up(tmp_path, kind):
+def test_gltf_targets_are_mm_in_scene_frame(tmp_path, kind):
     document, data = gltf_document()
     if kind == "glb":
         path = tmp_path / "face.glb"
@@ -207,7 +207,7 @@ def test_gltf_targets_come_in_millimetres_in_the_scenes_frame_with_v_up(tmp_path
         (lambda d: d["buffers"][0].update(uri="data:;base64,?"), "data URI"),
     ],
 )
-def test_damaged_gltf_files_are_named_with_what_is_wrong(tmp_path, damage, word):
+def test_damaged_gltf_files_are_named_with_fault(tmp_path, damage, word):
     document, data = gltf_document()
     damage(document)
     path = tmp_path / "face.glb"
@@ -216,7 +216,7 @@ def test_damaged_gltf_files_are_named_with_what_is_wrong(tmp_path, damage, word)
         load(path)
 
 
-def test_glb_files_cut_short_or_of_another_kind_are_refused(tmp_path):
+def test_glb_files_truncated_or_foreign_are_refused(tmp_path):
     whole = glb(*gltf_document())
     path = tmp_path / "face.glb"
     for content, word in (
@@ -256,14 +256,14 @@ def arrays():
         ({"uv": np.zeros((2, 2))}, "uv"),
     ],
 )
-def test_npz_files_that_lack_or_contradict_something_are_refused(tmp_path, change, word):
+def test_incomplete_or_contradictory_npz_files_are_refused(tmp_path, change, word):
     given = {**arrays(), **change}
     np.savez(tmp_path / "m.npz", **{k: v for k, v in given.items() if v is not None})
     with pytest.raises(MeshError, match=word):
         load(tmp_path / "m.npz")
 
 
-def test_weights_add_up_and_unknown_shapes_are_named_with_the_nearest(tmp_path):
+def test_weights_add_up_and_unknown_shapes_suggest_nearest(tmp_path):
     np.savez(tmp_path / "m.npz", **arrays())
     mesh = load(tmp_path / "m.npz")
     np.testing.assert_allclose(mesh.deformed({"up": -0.5}), mesh.vertices_mm - 0.5)
@@ -274,7 +274,7 @@ def test_weights_add_up_and_unknown_shapes_are_named_with_the_nearest(tmp_path):
         mesh.deformed({"up": np.nan})
 
 
-def test_files_that_are_not_there_or_of_no_known_kind_are_refused(tmp_path):
+def test_missing_files_or_unknown_kinds_are_refused(tmp_path):
     with pytest.raises(MeshFileError, match="no such"):
         load(tmp_path / "gone.npz")
     (tmp_path / "m.fbx").write_text("")
@@ -286,7 +286,7 @@ def test_files_that_are_not_there_or_of_no_known_kind_are_refused(tmp_path):
 
 
 @pytest.mark.skipif(not ICT.exists(), reason="the shared face mesh is not here")
-def test_the_shared_face_smiles_with_stretched_and_compressed_skin():
+def test_shared_face_smile_stretches_and_compresses_skin():
     mesh = load(ICT)
     found = strain(
         mesh.vertices_mm,

@@ -53,7 +53,7 @@ def flats(rng):
     return rows
 
 
-def test_a_monochrome_sensor_is_calibrated_by_levels_instead_of_a_flashs_power(tmp_path, rng):
+def test_monochrome_sensor_is_calibrated_by_light_levels(tmp_path, rng):
     made = calibrate_gradient("sensor", TargetSessions([Shelf(frames=flats(rng))], tmp_path, MADE))
     found = SensorCalibration.from_calibration(made.calibration, "SG-0001")
     for quantity, true in ((found.gain_e_per_dn, GAIN), (found.read_noise_e, READ_E)):
@@ -63,20 +63,20 @@ def test_a_monochrome_sensor_is_calibrated_by_levels_instead_of_a_flashs_power(t
     assert store.load(tmp_path, "sensor").serials == ("SG-0001",)
 
 
-def test_sessions_without_the_target_are_told_how_to_make_one(tmp_path):
+def test_sessions_without_target_report_how_to_make_one(tmp_path):
     for kind, target in (("lights", "ball"), ("polarization", "ball"), ("sensor", "flat")):
         with pytest.raises(CalibratingError, match=f"--target {target}"):
             calibrate_gradient(kind, TargetSessions([Shelf()], tmp_path, MADE))
 
 
-def test_a_ball_that_was_never_lit_is_no_ball(tmp_path):
+def test_unlit_ball_is_not_a_ball(tmp_path):
     dark = {"pattern": "dark", "level": 0.0, "exposure_s": 0.018, "polarizer": "parallel"}
     frames = [("ball", dark, np.full((128, 128), 64, np.uint16))]
     with pytest.raises(CalibratingError, match="level above 0"):
         calibrate_gradient("lights", TargetSessions([Shelf(frames=frames)], tmp_path, MADE))
 
 
-def test_two_balls_two_rigs_and_other_kinds_are_refused(tmp_path):
+def test_two_balls_rigs_or_other_kinds_are_refused(tmp_path):
     lit = {"pattern": "full", "level": 0.1, "exposure_s": 0.018, "polarizer": "parallel"}
     frames = [("ball", lit, np.full((128, 128), 64, np.uint16))]
     two = [Shelf(frames=frames, name="A"), Shelf(frames=frames, name="B")]
@@ -89,6 +89,6 @@ def test_two_balls_two_rigs_and_other_kinds_are_refused(tmp_path):
         calibrate_gradient("white", TargetSessions([Shelf()], tmp_path, MADE))
 
 
-def test_a_rig_is_told_by_its_box():
+def test_rig_is_identified_by_its_controller():
     assert of_a_gradient_sphere([Shelf()])
     assert not of_a_gradient_sphere([Shelf(load_rig("dome")), Shelf(load_rig("flash"))])

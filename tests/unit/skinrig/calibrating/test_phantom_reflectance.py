@@ -29,7 +29,7 @@ def rig():
     return load_rig("probe")
 
 
-def test_a_gray_phantom_gives_the_tables_reflectance_in_every_band(rig):
+def test_gray_phantom_gives_table_reflectance_in_every_band(rig):
     expected = expected_reflectance(GRAY, rig)
     single = photon_table.reflectance(
         rig.probe.radius_mm, 0.01, 1.0, g=0.8, collection="fibre", core_mm=0.2, source_core_mm=0.2
@@ -44,7 +44,7 @@ def test_a_gray_phantom_gives_the_tables_reflectance_in_every_band(rig):
     np.testing.assert_allclose(expected_reflectance(flat, rig).per_mm2, expected.per_mm2, rtol=1e-9)
 
 
-def test_a_phantom_that_absorbs_blue_gives_less_of_it(rig):
+def test_blue_absorbing_phantom_gives_less_blue(rig):
     paper = dataclasses.replace(
         GRAY,
         wavelength_nm=(400.0, 700.0),
@@ -55,7 +55,7 @@ def test_a_phantom_that_absorbs_blue_gives_less_of_it(rig):
     assert far[0] > far[1] > far[2]
 
 
-def test_what_is_uncertain_moves_the_fibres_as_other_coefficients_would(rig):
+def test_uncertainty_moves_fibers_like_other_coefficients(rig):
     expected = expected_reflectance(GRAY, rig)
     for number, name in enumerate(("sigma_a_per_mm", "sigma_s_prime_per_mm")):
         step = 1e-3

@@ -33,7 +33,7 @@ def sim():
         world.unregister()
 
 
-def test_a_plan_file_of_a_dry_run_captures_as_it_stands(tmp_path, sim, capsys):
+def test_dry_run_plan_file_is_captured_unchanged(tmp_path, sim, capsys):
     file = tmp_path / "plan.json"
     argv = ["capture", "flash", "--dry-run", "--plan-out", str(file)]
     assert main(argv) == 0
@@ -45,7 +45,7 @@ def test_a_plan_file_of_a_dry_run_captures_as_it_stands(tmp_path, sim, capsys):
     assert Session.open(out).plan.steps == flash_plan(load_rig("flash")).steps
 
 
-def test_what_the_subject_agreed_to_and_until_when_is_in_the_session(tmp_path, sim):
+def test_session_records_subject_consent_and_expiry(tmp_path, sim):
     out = tmp_path / "s"
     consent = ["--consent", "research,teaching", "--consent", "publication"]
     argv = ["capture", "flash", "--subject", "P042", *consent, "--consent-expires", "2031-01-01"]
@@ -55,13 +55,13 @@ def test_what_the_subject_agreed_to_and_until_when_is_in_the_session(tmp_path, s
     assert subject.consent_scope == ("research", "teaching", "publication")
 
 
-def test_a_date_that_is_none_is_a_usage_error(capsys):
+def test_invalid_date_is_usage_error(capsys):
     argv = ["capture", "flash", "--dry-run", "--consent-expires", "next year"]
     assert main(argv) == 2
     assert "next year" in capsys.readouterr().err
 
 
-def test_all_missing_addresses_are_one_line_and_a_usage_error(tmp_path, capsys):
+def test_missing_addresses_give_single_line_usage_error(tmp_path, capsys):
     assert main(["capture", "flash", "--out", str(tmp_path / "s")]) == 2
     err = capsys.readouterr().err
     assert "--port flash=URL --camera cam=URL" in err
@@ -69,7 +69,7 @@ def test_all_missing_addresses_are_one_line_and_a_usage_error(tmp_path, capsys):
     assert not (tmp_path / "s").exists()
 
 
-def test_an_unknown_kind_of_camera_is_told_before_a_port_is_opened(tmp_path, capsys):
+def test_unknown_camera_kind_is_reported_before_opening_port(tmp_path, capsys):
     argv = ["capture", "flash", "--out", str(tmp_path / "s")]
     argv += ["--port", "flash=/dev/no-such-port", "--camera", "cam=blah:1"]
     assert main(argv) == 2
@@ -79,15 +79,13 @@ def test_an_unknown_kind_of_camera_is_told_before_a_port_is_opened(tmp_path, cap
 
 
 @pytest.mark.parametrize("force", ["0", "-1", "nan", "inf"])
-def test_a_force_that_is_none_is_refused_even_in_a_dry_run(force, capsys):
+def test_invalid_force_is_refused_even_in_dry_run(force, capsys):
     assert main(["capture", "gradient", "--dry-run", "--force-limit", force]) == 3
     assert f"--force-limit: got {force}, expected more than 0 newton" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("there_before", [True, False])
-def test_a_capture_that_fails_before_its_first_frame_leaves_no_session(
-    tmp_path, sim, capsys, there_before
-):
+def test_capture_failing_before_first_frame_leaves_no_session(tmp_path, sim, capsys, there_before):
     out = tmp_path / "s"
     if there_before:
         out.mkdir()
@@ -98,7 +96,7 @@ def test_a_capture_that_fails_before_its_first_frame_leaves_no_session(
     assert not there_before or not list(out.iterdir())
 
 
-def test_a_capture_that_fails_later_keeps_what_it_has(tmp_path, sim, capsys):
+def test_capture_failing_later_keeps_recorded_data(tmp_path, sim, capsys):
     out = tmp_path / "s"
     argv = ["capture", "flash", "--out", str(out)]
     assert main([*argv, *sim("w4", misfire=1.0)]) == 4
@@ -108,7 +106,7 @@ def test_a_capture_that_fails_later_keeps_what_it_has(tmp_path, sim, capsys):
     assert Session.open(out).closed
 
 
-def test_a_first_step_that_fails_does_not_speak_of_resuming(tmp_path, sim, capsys):
+def test_first_step_failure_does_not_suggest_resuming(tmp_path, sim, capsys):
     out = tmp_path / "s"
     assert main(["capture", "flash", "--out", str(out), *sim("w6", drop_frame=1.0)]) == 4
     err = capsys.readouterr().err
@@ -117,7 +115,7 @@ def test_a_first_step_that_fails_does_not_speak_of_resuming(tmp_path, sim, capsy
     assert not out.exists()
 
 
-def test_what_is_not_the_sessions_own_is_never_removed(tmp_path):
+def test_files_foreign_to_session_are_never_removed(tmp_path):
     path = tmp_path / "s"
     session = Session.create(
         path,
@@ -135,7 +133,7 @@ def test_what_is_not_the_sessions_own_is_never_removed(tmp_path):
 
 
 @pytest.mark.parametrize("error", [CameraBusy("busy"), PortBusy("busy")])
-def test_a_device_that_is_held_is_asked_for_again_and_said_so_once(error):
+def test_busy_device_is_retried_and_reported_once(error):
     now, said, failures = [0.0], [], [error] * 3
 
     def open_device():
@@ -154,7 +152,7 @@ def test_a_device_that_is_held_is_asked_for_again_and_said_so_once(error):
     assert now[0] == pytest.approx(3 * 0.5 + 10.0)
 
 
-def test_a_device_that_is_broken_is_not_asked_for_again():
+def test_broken_device_is_not_retried():
     def open_device():
         raise CameraError("broken")
 
@@ -168,7 +166,7 @@ def test_addresses_of_the_wrong_form_are_usage_errors():
             addresses.addresses(given, "--port")
 
 
-def test_an_import_knows_whose_photographs_they_are_and_by_which_rig(tmp_path, sim, capsys):
+def test_import_records_subject_and_rig_of_photographs(tmp_path, sim, capsys):
     shot = tmp_path / "shot"
     argv = ["capture", "flash", "--out", str(shot), *sim("w7")]
     assert main(argv) == 0

@@ -14,7 +14,7 @@ from skinrig.capturing.light_safety import light_figures, light_rows
 @pytest.mark.parametrize(
     ("name", "plan_of"), [("dome", dome_plan), ("gradient", gradient_plan), ("probe", probe_plan)]
 )
-def test_every_figure_is_told_in_words_and_percent(name, plan_of):
+def test_every_figure_is_described_with_percent(name, plan_of):
     rig = load_rig(name)
     figures = light_figures(plan_of(rig), rig)
     rows = light_rows(figures)

@@ -9,7 +9,7 @@ from skinrig.drawing import png
 
 
 @pytest.mark.parametrize("shape", [(3, 5), (4, 2, 3)])
-def test_an_8_bit_image_reads_back_equal_through_another_reader(shape):
+def test_8_bit_image_reads_back_equal_elsewhere(shape):
     image = np.random.default_rng(12345).integers(0, 256, shape, dtype=np.uint8)
     np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(png.encode(image)))), image)
 
@@ -21,7 +21,7 @@ def test_a_16_bit_gray_image_reads_back_equal():
 
 @pytest.mark.parametrize("quick", [False, True])
 @pytest.mark.parametrize("channels", [3, 4])
-def test_a_16_bit_color_image_keeps_all_its_bits(rng, channels, quick):
+def test_16_bit_color_image_keeps_all_bits(rng, channels, quick):
     image = rng.integers(0, 65536, (5, 7, channels), dtype=np.uint16)
     data = png.encode(image, quick=quick)
     assert data[24:26] == bytes([16, {3: 2, 4: 6}[channels]])  # depth and color type
@@ -29,7 +29,7 @@ def test_a_16_bit_color_image_keeps_all_its_bits(rng, channels, quick):
     np.testing.assert_array_equal(read[..., [2, 1, 0, 3][:channels]], image)
 
 
-def test_a_view_of_an_image_is_encoded_as_it_reads(rng):
+def test_image_view_is_encoded_as_read(rng):
     image = rng.integers(0, 256, (8, 9, 4), dtype=np.uint8)[::-2, ::2]
     np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(png.encode(image)))), image)
 
@@ -42,7 +42,7 @@ def test_an_image_that_png_cannot_hold_is_refused(image):
         png.encode(image)
 
 
-def test_invalid_pixels_are_gray_and_ends_have_the_ends_colors():
+def test_invalid_pixels_are_gray_and_extremes_are_clamped():
     values = np.array([[0.0, 1.0, np.nan, 2.0, 0.5]])
     valid = np.array([[True, True, True, True, False]])
     image = png.Scale(0.0, 1.0).colors(values, valid)
@@ -53,7 +53,7 @@ def test_invalid_pixels_are_gray_and_ends_have_the_ends_colors():
 
 
 @pytest.mark.parametrize("shape", [(37, 41, 3), (37, 41)])
-def test_smooth_pictures_read_back_equal_through_every_filter(shape):
+def test_smooth_images_read_back_equal_through_every_filter(shape):
     rows, columns = np.mgrid[: shape[0], : shape[1]]
     for smooth in (3 * rows, 3 * columns, rows + columns, rows * columns):
         image = np.broadcast_to(

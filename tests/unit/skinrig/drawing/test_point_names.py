@@ -34,7 +34,7 @@ def test_names_of_points_close_together_do_not_overlap(count):
             assert not box.contains(*dot)
 
 
-def test_a_name_avoids_lines_and_one_wider_than_the_plot_is_left_out():
+def test_name_avoids_lines_and_is_omitted_if_wide():
     figure, axes = figures.canvas(5.2, 3.4)
     axes.set_xlim(0.0, 1.0)
     axes.set_ylim(0.0, 1.0)

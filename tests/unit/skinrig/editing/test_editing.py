@@ -61,7 +61,7 @@ def test_an_edit_of_amount_zero_changes_no_bit(lab, capsys):
     assert store.read(out).inputs["appearance"] == contents.digest(paths[0] / store.DOCUMENT_FILE)
 
 
-def test_a_tan_darkens_by_what_it_did_in_the_population_and_only_the_albedo(source, library):
+def test_tan_edit_darkens_only_albedo_as_in_population(source, library):
     done = editing.edited(source, EditRequest(traits={"tan": 1.0}), library)
     assert done.changed == ("r_d",)
     old, new = source.appearance.maps["r_d"], done.appearance.maps["r_d"]
@@ -76,7 +76,7 @@ def test_a_tan_darkens_by_what_it_did_in_the_population_and_only_the_albedo(sour
     assert done.record["albedo"]["distance_after"] < done.record["albedo"]["distance_before"]
 
 
-def test_an_edit_and_its_opposite_return_the_source_within_the_error_that_is_told(source, library):
+def test_edit_and_opposite_return_source_within_stated_error(source, library):
     order = EditRequest(traits={"tan": 0.8, "oily": 0.6})
     there = editing.edited(source, order, library)
     face = dataclasses.replace(source, appearance=there.appearance)
@@ -99,7 +99,7 @@ def test_an_edit_and_its_opposite_return_the_source_within_the_error_that_is_tol
     assert back.record["before"]["traits"] == {"tan": 0.8, "oily": 0.6}
 
 
-def test_oil_changes_the_lobes_as_it_did_in_the_population_and_not_the_albedo(source, library):
+def test_oil_edit_changes_only_lobes_as_in_population(source, library):
     done = editing.edited(source, EditRequest(traits={"oily": 1.0}), library)
     assert "r_d" not in done.changed
     assert "lobe_residual" not in done.appearance.maps
@@ -121,7 +121,7 @@ def test_oil_changes_the_lobes_as_it_did_in_the_population_and_not_the_albedo(so
 
 
 @pytest.mark.parametrize("traits", [{"tan": 1.0}, {"oily": 1.0}])
-def test_a_mask_keeps_every_bit_where_it_is_black(traits, source, library, tmp_path):
+def test_mask_keeps_every_bit_where_black(traits, source, library, tmp_path):
     shape = source.r_d.values.shape[:2]
     mask = np.zeros(shape, np.uint8)
     mask[10:40, 8:24] = 255
@@ -138,7 +138,7 @@ def test_a_mask_keeps_every_bit_where_it_is_black(traits, source, library, tmp_p
     assert most > 0.05
 
 
-def test_a_region_changes_the_beard_and_not_the_forehead(source, library):
+def test_region_edit_changes_beard_not_forehead(source, library):
     done = editing.edited(source, EditRequest(traits={"tan": 1.0}, region="beard"), library)
     height = source.position[..., 1]
     good = source.r_d.valid
@@ -148,7 +148,7 @@ def test_a_region_changes_the_beard_and_not_the_forehead(source, library):
     assert ratio[chin].mean() < 0.9
 
 
-def test_an_edit_has_no_seam_between_the_islands_of_a_texture(source, library):
+def test_edit_has_no_seam_between_texture_islands(source, library):
     """Both sides of the cut at height 0 darken alike."""
     done = editing.edited(source, EditRequest(traits={"tan": 1.0}), library)
     change = np.log(done.appearance.maps["r_d"].values / source.r_d.values).mean(axis=-1)
@@ -181,7 +181,7 @@ def test_single_colors_darkest_and_whitest_faces_survive(kind, dome_faces, libra
         assert change < 0 if amount > 0 else change >= 0
 
 
-def test_reflectance_above_white_is_left_where_it_is_not_edited_and_never_made(source, library):
+def test_reflectance_above_white_is_kept_but_never_made(source, library):
     r_d = source.r_d
     values = r_d.values.copy()
     values[20:23, 12:15] = 1.3
@@ -194,7 +194,7 @@ def test_reflectance_above_white_is_left_where_it_is_not_edited_and_never_made(s
     assert new[r_d.valid & ~outlier].max() <= 1.0
 
 
-def test_a_face_without_lobes_is_edited_in_its_albedo(source, library):
+def test_face_without_lobes_is_edited_in_albedo(source, library):
     maps = {n: m for n, m in source.appearance.maps.items() if not n.startswith("basis")}
     face = dataclasses.replace(
         source, appearance=dataclasses.replace(source.appearance, maps=maps, files={})
@@ -232,7 +232,7 @@ def test_the_same_seed_makes_the_same_face(source, library):
         (["--trait", "tan=1", "--seed", "-1"], 3, "seed: got -1, expected at least 0"),
     ],
 )
-def test_a_wrong_edit_is_one_clear_error_and_writes_nothing(argv, code, says, lab, capsys):
+def test_invalid_edit_gives_clear_error_and_writes_nothing(argv, code, says, lab, capsys):
     folder, paths, _ = lab
     out = folder / "wrong"
     space = ["--space", str(folder / "traits.npz")]
@@ -243,7 +243,7 @@ def test_a_wrong_edit_is_one_clear_error_and_writes_nothing(argv, code, says, la
     assert not out.exists()
 
 
-def test_masks_that_are_none_are_refused_by_name(source, library, tmp_path):
+def test_invalid_masks_are_refused_by_name(source, library, tmp_path):
     (tmp_path / "black.png").write_bytes(png.encode(np.zeros((64, 64), np.uint8)))
     (tmp_path / "wide.png").write_bytes(png.encode(np.ones((32, 64), np.uint8)))
     (tmp_path / "text.png").write_text("no picture")
@@ -271,7 +271,7 @@ def test_an_interrupted_edit_leaves_nothing_half_written(lab, monkeypatch):
     assert {p.name for p in folder.iterdir()} == before
 
 
-def test_json_is_one_document_with_what_was_done(lab, capsys):
+def test_json_is_single_document_of_performed_edit(lab, capsys):
     folder, paths, _ = lab
     argv = ["edit", str(paths[0]), "--space", str(folder / "traits.npz"), "--json"]
     assert main([*argv, "--trait", "age=10", "--out", str(folder / "older")]) == 0
@@ -299,7 +299,7 @@ def test_the_source_is_never_written_over(lab, capsys):
         ("", "is empty"),
     ],
 )
-def test_bad_labels_are_one_clear_error(table, says, lab, tmp_path, capsys):
+def test_bad_labels_give_single_clear_error(table, says, lab, tmp_path, capsys):
     _, paths, _ = lab
     (tmp_path / "labels.csv").write_text(table)
     out = tmp_path / "traits.npz"
@@ -309,7 +309,7 @@ def test_bad_labels_are_one_clear_error(table, says, lab, tmp_path, capsys):
     assert not out.exists()
 
 
-def test_faces_without_landmarks_are_told_what_to_do(lab, tmp_path, dome_faces, capsys):
+def test_faces_without_landmarks_are_refused_with_remedy(lab, tmp_path, dome_faces, capsys):
     _, paths, labels = lab
     bare = store.write(tmp_path / "appearance-1", dome_faces.face(1))
     argv = ["fit", "traits", str(paths[0]), str(bare), "--labels", str(labels)]
@@ -328,7 +328,7 @@ def test_groups_of_fewer_than_five_are_warned_of(lab, capsys):
     assert {row["trait"] for row in told["rows"]} == {"tan", "oily", "age"}
 
 
-def test_landmarks_of_a_table_in_texels_are_those_of_the_mesh(source, tmp_path):
+def test_landmark_table_in_texels_matches_mesh_landmarks(source, tmp_path):
     rows, columns = np.nonzero(source.surface)
     picked = {"nose tip": (int(columns[5]), int(rows[5])), "chin": (int(columns[9]), int(rows[9]))}
     table = tmp_path / "marks.csv"
@@ -344,7 +344,7 @@ def test_landmarks_of_a_table_in_texels_are_those_of_the_mesh(source, tmp_path):
         face_textures.read_landmarks(table, source)
 
 
-def test_a_map_without_error_or_mask_is_edited_too(source, library):
+def test_map_without_error_or_mask_is_edited(source, library):
     bare = {
         n: SkinMap(m.values, m.unit) for n, m in source.appearance.maps.items() if n != "position"
     }

@@ -33,7 +33,7 @@ def drawn(cheek, kind="freckles", seed=3, mask=None, **more):
 
 
 @pytest.mark.parametrize(("kind", "density"), [("freckles", 2.0), ("moles", 0.3)])
-def test_as_many_spots_as_asked_for_keep_their_distance(cheek, kind, density):
+def test_requested_number_of_spots_keeps_distance(cheek, kind, density):
     found = drawn(cheek, kind, density_per_cm2=density)
     assert abs(len(found.center_mm) - 36 * density) <= 1
     apart = np.linalg.norm(found.center_mm[:, None] - found.center_mm, axis=-1)
@@ -41,12 +41,12 @@ def test_as_many_spots_as_asked_for_keep_their_distance(cheek, kind, density):
     assert apart.min() >= 0.6 * 10 / np.sqrt(density)
 
 
-def test_the_same_seed_draws_the_same_and_another_one_other_spots(cheek):
+def test_same_seed_draws_same_spots_another_seed_others(cheek):
     np.testing.assert_array_equal(drawn(cheek).gain, drawn(cheek).gain)
     assert not np.array_equal(drawn(cheek).gain, drawn(cheek, seed=4).gain)
 
 
-def test_nothing_changes_outside_the_mask_and_by_an_amount_of_zero(cheek):
+def test_edit_changes_nothing_outside_mask_or_at_zero(cheek):
     mask = np.zeros((SIDE, SIDE))
     mask[:, :40] = 1.0
     found = drawn(cheek, mask=mask)
@@ -74,7 +74,7 @@ def test_a_spot_has_the_color_of_more_melanin(cheek):
     assert np.all((left(0.25) > 0) & (left(0.25) <= 1))
 
 
-def test_spots_smaller_than_a_texel_darken_by_their_area(cheek):
+def test_spots_smaller_than_texel_darken_by_area(cheek):
     density = 20.0
     found = drawn(cheek, "follicles", density_per_cm2=density)
     diameter = found.diameter_mm
@@ -92,7 +92,7 @@ def chart_of(position, on):
 
 
 @pytest.mark.parametrize(("kind", "density"), [("freckles", 1.5), ("moles", 0.3)])
-def test_spots_that_were_added_are_found_and_taken_away(cheek, kind, density):
+def test_added_spots_are_found_and_removed(cheek, kind, density):
     position, skin, on = cheek
     spots = drawn(cheek, kind, density_per_cm2=density)
     spotted = skin * spots.gain
@@ -117,7 +117,7 @@ def test_skin_without_spots_is_left_alone(cheek):
     assert not found.share.any()
 
 
-def test_a_brow_is_no_spot():
+def test_brow_is_not_a_spot():
     image = np.full((80, 80, 3), 0.3)
     image[40:43, 10:70] = 0.08
     image[20:24, 20:24] = 0.1

@@ -16,7 +16,7 @@ def table():
     return color_table.build(CAMERA, LIGHT, anisotropy=ANISOTROPY_SKIN)
 
 
-def test_a_shading_that_is_hardly_known_has_the_bound_of_a_free_one(table):
+def test_nearly_unknown_shading_has_bound_of_free_shading(table):
     noise = 0.005
     free = identifiability(
         table, variance=lambda rgb: (noise * rgb) ** 2, model_error=model_error.load(), size=24
@@ -29,7 +29,7 @@ def test_a_shading_that_is_hardly_known_has_the_bound_of_a_free_one(table):
     np.testing.assert_allclose(blood.reshape(10, 10), free.stderr_hemoglobin[6:16, 6:16], rtol=0.02)
 
 
-def test_the_bound_scales_with_the_noise_and_shrinks_with_what_is_known(table):
+def test_bound_scales_with_noise_and_shrinks_with_knowledge(table):
     c_m, c_hd = np.array([0.02]), np.array([0.05])
     few, many = np.full((1, 3), 1e-2), np.full((1, 3), 4e-2)
     loud = relative_bounds(table, c_m, c_hd, few, shading_spread=0.6)
@@ -63,7 +63,7 @@ def scene(table, melanin, stderr):
     return found, truth
 
 
-def test_the_bound_of_maps_is_that_at_the_truth(table, rng):
+def test_map_bound_is_evaluated_at_truth(table, rng):
     found, truth = scene(table, 0.02, 0.01)
     bounds = cramer_rao(found, truth)
     expected, _ = relative_bounds(
@@ -77,7 +77,7 @@ def test_the_bound_of_maps_is_that_at_the_truth(table, rng):
     assert cramer_rao(SkinAppearance({}, "simulated"), truth) == {}
 
 
-def test_an_inflated_standard_error_does_not_widen_its_own_limit(table, rng):
+def test_inflated_standard_error_keeps_its_limit(table, rng):
     from skinrig.evaluating.flash import compare, limit
 
     honest, inflated = (

@@ -88,7 +88,7 @@ def test_spheres_show_truth_and_estimate_alike(truth):
     assert image[:half, half:].sum() > 3 * image[half:, :half].sum()
 
 
-def test_a_spot_that_looks_aside_makes_the_same_sphere():
+def test_sphere_is_same_for_spot_facing_aside():
     def facing(normal):
         def reflect(light, camera):
             return np.repeat((np.maximum(light @ normal, 0) ** 3)[:, None], 3, axis=1)

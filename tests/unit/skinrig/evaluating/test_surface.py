@@ -41,7 +41,7 @@ def tilted(normals, sigma_rad, rng):
     return out / np.linalg.norm(out, axis=-1, keepdims=True)
 
 
-def test_a_known_tilt_is_measured_and_covered_as_its_standard_error_says(rng):
+def test_known_tilt_is_measured_with_stated_coverage(rng):
     truth, maps = plane(60, rng), plane(80, rng)
     sigma = math.radians(0.8)
     maps["normals"] = tilted(maps["normals"], sigma, rng)
@@ -54,14 +54,14 @@ def test_a_known_tilt_is_measured_and_covered_as_its_standard_error_says(rng):
     assert row.coverage.share == pytest.approx(0.6827, abs=0.024)
 
 
-def test_a_standard_error_half_as_large_is_caught_by_its_coverage(rng):
+def test_halved_standard_error_fails_coverage(rng):
     truth, maps = plane(60, rng), plane(80, rng)
     maps["normals"] = tilted(maps["normals"], 0.02, rng)
     found = appearance(maps, normals=np.full((80, 80, 3), 0.01))
     assert evaluation.compare(found, appearance(truth), rng=rng)[0].coverage.share < 0.4
 
 
-def test_albedo_is_judged_by_channel_and_relative_to_the_truth(rng):
+def test_albedo_is_evaluated_per_channel_relative_to_truth(rng):
     truth, maps = plane(40, rng), plane(40, rng)
     maps["r_d"] = maps["r_d"] * [1.02, 1.0, 0.9]
     rows = evaluation.compare(appearance(maps), appearance(truth), rng=rng)
@@ -72,7 +72,7 @@ def test_albedo_is_judged_by_channel_and_relative_to_the_truth(rng):
     assert blue.judged[1] > blue.judged[2] > red.judged[1]
 
 
-def test_texels_without_a_true_point_near_by_are_left_out(rng):
+def test_texels_far_from_true_points_are_omitted(rng):
     truth, maps = plane(40, rng), plane(40, rng)
     maps["position"] = maps["position"] + [10.0, 0.0, 0.0]
     pairs = evaluation.match(appearance(maps), appearance(truth))

@@ -73,7 +73,7 @@ def exported(appearance, tmp_path_factory):
 
 
 @pytest.mark.parametrize(("to", "suffix"), [("merl", ".binary"), ("rgl", ".bsdf")])
-def test_lobes_are_white_and_what_the_model_evaluates(to, suffix, exported, lobes, rng):
+def test_exported_lobes_are_white_and_match_model(to, suffix, exported, lobes, rng):
     """Tolerance: half a bin of MERL, or interpolation of RGL, moves the edge of a lobe by 5 %."""
     light, view = directions(rng, 2000), directions(rng, 2000)
     true = lobes[2].evaluate(light, view, UP)
@@ -87,7 +87,7 @@ def test_lobes_are_white_and_what_the_model_evaluates(to, suffix, exported, lobe
 
 
 @pytest.mark.parametrize(("to", "suffix"), [("merl", ".binary"), ("rgl", ".bsdf")])
-def test_a_place_is_its_mixture_and_the_light_from_inside(to, suffix, exported, lobes, rng):
+def test_exported_position_is_mixture_plus_subsurface_light(to, suffix, exported, lobes, rng):
     light, view = directions(rng, 2000), directions(rng, 2000)
     passed = (1 - fresnel.reflectance(light[:, 2], 1.4)) * (
         1 - fresnel.reflectance(view[:, 2], 1.4)
@@ -100,7 +100,7 @@ def test_a_place_is_its_mixture_and_the_light_from_inside(to, suffix, exported, 
     assert np.sqrt(np.mean((found - true) ** 2) / np.mean(true**2)) < 0.06
 
 
-def test_the_document_tells_the_light_s_size_and_what_each_file_is(exported, lobes):
+def test_document_reports_light_size_and_file_contents(exported, lobes):
     told = json.loads((exported / "merl" / "brdfs.json").read_text())
     assert told["light_radius_rad"] == lobes[2].light_radius_rad
     assert set(told["files"]) == {"lobe_0.binary", "lobe_1.binary", "place.binary"}
@@ -129,7 +129,7 @@ def test_a_region_is_the_mean_over_its_texels(appearance, tmp_path, lobes, rng):
     assert np.sqrt(np.mean((found - true) ** 2) / np.mean(true**2)) < 0.06
 
 
-def test_places_without_reflectance_are_named(appearance, tmp_path):
+def test_positions_without_reflectance_are_named(appearance, tmp_path):
     with pytest.raises(ExportError, match="row 0, column 4"):
         write(store.read(appearance), tmp_path, Place(0.5, 1.0), "rgl")
     with pytest.raises(ExportError, match=r"u 1\.5"):
@@ -143,7 +143,7 @@ def test_places_without_reflectance_are_named(appearance, tmp_path):
         write(store.read(tmp_path / "dark"), tmp_path, Place(0.5, 0.5), "rgl")
 
 
-def test_the_command_line_exports_and_says_what_is_wrong(appearance, tmp_path, capsys):
+def test_command_line_exports_and_reports_errors(appearance, tmp_path, capsys):
     out = str(tmp_path / "out")
     assert main(["export", str(appearance), "--to", "rgl", "--at", "0.2,0.4", "--out", out]) == 0
     assert (tmp_path / "out" / "place.bsdf").is_file()

@@ -57,7 +57,7 @@ def test_a_fitted_reflectance_leaves_within_the_consent_alone(dome, tmp_path):
     refused_beyond(tmp_path / "model", tmp_path, "mtlx")
 
 
-def test_a_model_of_two_sessions_needs_the_consent_of_both(dome, tmp_path):
+def test_model_of_two_sessions_needs_both_consents(dome, tmp_path):
     """A dome of one subject and a probe of another: neither alone may be overruled."""
     fit_reflectance(dome("dome"), out=tmp_path / "model")
     both = consent.merge_consent(
@@ -94,7 +94,7 @@ def test_fitted_wrinkles_leave_within_the_consent_alone(dome, smiling, tmp_path)
     refused_beyond(tmp_path / "moving", tmp_path, "metahuman")
 
 
-def test_wrinkles_of_one_silent_session_leave_for_nothing(dome, smiling, tmp_path):
+def test_wrinkles_from_session_without_consent_are_not_exported(dome, smiling, tmp_path):
     faces = [dome("n", state="neutral"), smiling("s", None)]
     fit_wrinkles(faces, out=tmp_path / "moving", size=32, mask_size=16)
     with pytest.raises(ConsentError, match="unknown has not agreed"):
@@ -164,7 +164,7 @@ def test_an_edited_face_leaves_within_the_consent_alone(dome, tmp_path):
 
 
 @pytest.mark.long
-def test_traits_bear_the_consent_of_the_people_they_were_learned_of(tmp_path, dome_faces):
+def test_traits_carry_consent_of_their_training_subjects(tmp_path, dome_faces):
     """Traits of measured faces on a simulated one: the people behind them are asked for, too."""
     paths, labels = dome_faces.population(tmp_path)
     target = paths[0]
@@ -193,7 +193,7 @@ def test_traits_bear_the_consent_of_the_people_they_were_learned_of(tmp_path, do
 
 
 @pytest.mark.long
-def test_a_page_of_a_measured_face_says_what_its_subject_agreed_to(dome, tmp_path):
+def test_page_of_measured_face_reports_subject_consent(dome, tmp_path):
     from skinrig.viewer import faces, packing
 
     scene = faces.scene([dome("dome")], size=64)
@@ -204,7 +204,7 @@ def test_a_page_of_a_measured_face_says_what_its_subject_agreed_to(dome, tmp_pat
 
 
 @pytest.mark.long
-def test_a_page_of_a_simulated_face_names_nobody(face_folder):
+def test_page_of_simulated_face_names_no_subject(face_folder):
     from skinrig.viewer import faces
 
     assert consent.CONSENT_KEY not in faces.scene([face_folder], size=64).provenance
@@ -216,7 +216,7 @@ def consent_of(html):
     return found.group() if found else ""
 
 
-def test_a_report_names_whom_it_shows_and_for_what_it_may_be_handed_on(dome, tmp_path):
+def test_report_names_subjects_and_permitted_uses(dome, tmp_path):
     shown = tmp_path / "shown"
     shown.mkdir()
     dome("shown/monday")
@@ -255,7 +255,7 @@ def test_a_report_on_a_session_names_its_subject(tmp_path):
     ]
 
 
-def test_a_rendering_bears_the_consent_of_whom_it_shows(dome):
+def test_rendering_carries_consent_of_shown_subject(dome):
     from skinrig.rendering.figures import RenderModel as Rendered
 
     assert Rendered.of(dome("dome")).record()[consent.CONSENT_KEY] == [NARROW]

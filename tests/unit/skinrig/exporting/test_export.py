@@ -27,7 +27,7 @@ def measured(patch, tmp_path):
 
 
 @pytest.mark.parametrize("to", ["maps", "mtlx", "gltf", "merl"])
-def test_maps_of_a_person_leave_only_as_agreed_and_only_in_time(measured, tmp_path, to):
+def test_maps_export_requires_subject_consent_and_valid_date(measured, tmp_path, to):
     def export(**more):
         return exporting.export(measured, tmp_path / "out", to=to, now=NOW, **more)
 
@@ -41,7 +41,7 @@ def test_maps_of_a_person_leave_only_as_agreed_and_only_in_time(measured, tmp_pa
 
 
 @pytest.mark.parametrize("to", ["mtlx", "gltf", "usd"])
-def test_a_photographs_maps_are_told_that_they_are_no_surface(tmp_path, to):
+def test_photograph_maps_are_refused_for_surface_formats(tmp_path, to):
     """Not to reconstruct a position, which no session of the flash rig has."""
     values, valid = np.full((4, 4), 0.02, np.float32), np.ones((4, 4), bool)
     flat = SkinMap(values, MAP_UNITS["melanin"], valid=valid)
@@ -52,18 +52,18 @@ def test_a_photographs_maps_are_told_that_they_are_no_surface(tmp_path, to):
     assert exporting.export(maps, tmp_path / "out", to="maps").files > 1
 
 
-def test_what_was_simulated_needs_no_consent(face_folder, tmp_path):
+def test_simulated_data_needs_no_consent(face_folder, tmp_path):
     assert exporting.export(face_folder, tmp_path / "out", to="mtlx").files > 5
 
 
-def test_measured_maps_that_do_not_tell_the_consent_do_not_leave(patch, tmp_path):
+def test_measured_maps_without_consent_record_are_not_exported(patch, tmp_path):
     silent = store.write(tmp_path / "old", patch.face(source="measured"))
     with pytest.raises(ConsentError, match="does not record") as error:
         exporting.export(silent, tmp_path / "out", to="maps", use="research")
     assert "skinrig reconstruct" in str(error.value)
 
 
-def test_consent_of_every_part_of_a_moving_face_counts():
+def test_moving_face_needs_consent_of_every_part():
     told = {"pseudonym": "a", "consent_scope": ["research", "film"], "consent_expires": None}
     other = {"pseudonym": "b", "consent_scope": ["research"], "consent_expires": None}
     parts = {
@@ -83,7 +83,7 @@ def test_consent_of_every_part_of_a_moving_face_counts():
         consent.require(mixed, "research", where="x")
 
 
-def test_what_is_made_of_silent_measurements_agrees_to_nothing():
+def test_result_of_measurements_without_consent_permits_no_use():
     made = SkinAppearance(
         {},
         "simulated",
@@ -93,14 +93,14 @@ def test_what_is_made_of_silent_measurements_agrees_to_nothing():
         consent.require(made, "research", where="x")
 
 
-def test_a_damaged_date_is_no_consent(patch):
+def test_damaged_date_is_not_a_consent(patch):
     told = {**patch.consent, "consent_expires": "soon"}
     face = SkinAppearance({}, "measured", {consent.CONSENT_KEY: [told]})
     with pytest.raises(ConsentError, match="got 'soon'"):
         consent.require(face, "research", where="x")
 
 
-def test_the_texture_that_colors_are_put_on_must_be_free_too(measured, face_folder, tmp_path):
+def test_target_texture_of_colors_needs_consent(measured, face_folder, tmp_path):
     order = Delivery(onto=measured)
     with pytest.raises(ConsentError, match="P042"):
         exporting.export(
@@ -132,7 +132,7 @@ def test_a_failure_on_the_way_leaves_nothing(patch, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["face"]
 
 
-def test_an_existing_folder_and_an_unknown_format_are_refused(face_folder, tmp_path):
+def test_existing_folder_or_unknown_format_is_refused(face_folder, tmp_path):
     with pytest.raises(ExportError, match="exists"):
         exporting.export(face_folder, tmp_path, to="maps")
     with pytest.raises(ExportError, match=", ".join(APPEARANCE_FORMATS)):
@@ -151,9 +151,7 @@ def test_the_manifest_lists_every_file(face_folder, tmp_path):
 # consent on its way ---------------------------------------------------------------------------
 
 
-def test_maps_of_a_captured_session_bear_its_consent_and_older_ones_are_brought_up_to_date(
-    tmp_path,
-):
+def test_session_maps_carry_consent_and_older_are_updated(tmp_path):
     from capture import raw
     from capture.plan import flash_plan
     from capture.rig import load_rig
@@ -206,7 +204,7 @@ def test_maps_of_a_captured_session_bear_its_consent_and_older_ones_are_brought_
     assert told() == [expected]
 
 
-def test_a_fitted_model_bears_the_consent_of_what_it_is_made_of(measured, tmp_path):
+def test_fitted_model_carries_consent_of_its_sources(measured, tmp_path):
     from skinrig.fitting.reflectance import fit_reflectance
 
     fit_reflectance(measured, out=tmp_path / "model")

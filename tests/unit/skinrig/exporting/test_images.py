@@ -19,7 +19,7 @@ def ramp(rng):
     return values
 
 
-def test_an_exr_holds_every_value_exactly_and_says_its_unit(tmp_path, ramp):
+def test_exr_stores_values_exactly_with_unit(tmp_path, ramp):
     out = ImageFolder(tmp_path, Delivery(udim="dot"))
     name = out.exr(Image(name="depth", values=ramp, unit="mm", what="of the patch"))
     assert name == "exr/depth.1001.exr"
@@ -45,7 +45,7 @@ def test_only_linear_srgb_claims_srgb_primaries(tmp_path, ramp):
     assert claims == {SRGB_SPACE: True, CAMERA_SPACE: False}
 
 
-def test_a_16_bit_png_decodes_to_the_values_by_what_its_record_says(tmp_path, ramp):
+def test_16_bit_png_decodes_to_values_by_record(tmp_path, ramp):
     out = ImageFolder(tmp_path, Delivery())
     name = out.png(Image(name="depth", values=ramp, unit="mm", low=-0.5, high=3.5))
     told = out.records[name]
@@ -58,7 +58,7 @@ def test_a_16_bit_png_decodes_to_the_values_by_what_its_record_says(tmp_path, ra
     assert hashlib.sha256((tmp_path / name).read_bytes()).hexdigest() == told["sha256"]
 
 
-def test_a_color_png_decodes_by_the_srgb_curve_and_counts_what_it_clips(tmp_path, ramp):
+def test_color_png_uses_srgb_curve_and_counts_clipping(tmp_path, ramp):
     out = ImageFolder(tmp_path, Delivery())
     name = out.png(Image(name="color", values=ramp, unit="1", space=SRGB_SPACE))
     codes = cv2.imread(str(tmp_path / name), cv2.IMREAD_UNCHANGED)[..., ::-1] / 65535.0
@@ -70,7 +70,7 @@ def test_a_color_png_decodes_by_the_srgb_curve_and_counts_what_it_clips(tmp_path
     assert out.records[name]["clipped_share"] == pytest.approx(share, abs=1e-3)
 
 
-def test_a_range_that_follows_the_values_sees_valid_ones_alone():
+def test_value_range_uses_valid_values_only():
     values = np.array([[1.0, 2.0], [3.0, 1e6]])
     valid = np.array([[True, True], [True, False]])
     codes, told = coded(Image(name="a", values=values, unit="1", valid=valid))
@@ -78,7 +78,7 @@ def test_a_range_that_follows_the_values_sees_valid_ones_alone():
     assert codes.tolist() == [[0, 32768], [65535, 65535]]
 
 
-def test_a_constant_map_and_one_without_a_valid_pixel_are_coded_without_division():
+def test_constant_or_invalid_map_is_coded_without_division():
     constant, told = coded(Image(name="a", values=np.full((2, 2), 4.0), unit="1"))
     assert (constant.tolist(), told["low"]) == ([[0, 0], [0, 0]], 4.0)
     nothing = Image(
@@ -90,7 +90,7 @@ def test_a_constant_map_and_one_without_a_valid_pixel_are_coded_without_division
 @pytest.mark.parametrize(
     ("field", "value"), [("unit", "inch"), ("normal_y", "up"), ("udim", "1001")]
 )
-def test_a_word_that_means_nothing_is_refused_by_its_options_name(field, value):
+def test_invalid_option_value_is_refused_by_option_name(field, value):
     with pytest.raises(
         UnusableError, match=f"--{field.replace('_', '-')}: got '{value}', expected"
     ):

@@ -44,7 +44,7 @@ def picture(rng):
     )
 
 
-def test_every_map_is_there_with_its_values_and_a_record(picture, tmp_path):
+def test_every_map_is_exported_with_values_and_record(picture, tmp_path):
     assert maps.write(picture, tmp_path, Delivery()) == []
     told = json.loads((tmp_path / "maps.json").read_text())
     for name, one in picture.maps.items():
@@ -58,7 +58,7 @@ def test_every_map_is_there_with_its_values_and_a_record(picture, tmp_path):
     assert told["inputs"] == {"session": "abc"}
 
 
-def test_pngs_of_chromophores_have_the_same_range_for_every_subject(picture, tmp_path):
+def test_chromophore_pngs_share_range_for_every_subject(picture, tmp_path):
     maps.write(picture, tmp_path, Delivery(only=("melanin",)))
     told = json.loads((tmp_path / "maps.json").read_text())["files"]["png/melanin.png"]
     assert (told["low"], told["high"]) == (0.0, 0.5)
@@ -79,7 +79,7 @@ def test_chromophores_are_packed_melanin_red_hemoglobin_green(picture, tmp_path)
     )
 
 
-def test_green_of_a_cameras_normals_is_turned_for_directx_alone(picture, tmp_path):
+def test_camera_normals_green_is_flipped_for_directx_only(picture, tmp_path):
     for word in ("gl", "dx"):
         (tmp_path / word).mkdir()
         maps.write(picture, tmp_path / word, Delivery(normal_y=word))
@@ -90,9 +90,7 @@ def test_green_of_a_cameras_normals_is_turned_for_directx_alone(picture, tmp_pat
     assert "y down" in told["files"]["exr/normals.exr"]["what"]
 
 
-def test_normals_of_a_dome_keep_the_rig_frame_and_come_in_the_textures_frame_too(
-    simulated_face, patch, tmp_path
-):
+def test_dome_normals_keep_rig_frame_adding_tangent_frame(simulated_face, patch, tmp_path):
     maps.write(simulated_face, tmp_path, Delivery(normal_y="dx"))
     world = simulated_face.maps["normals"].values
     np.testing.assert_array_equal(read(tmp_path / "exr/normals.exr"), world)
@@ -104,7 +102,7 @@ def test_normals_of_a_dome_keep_the_rig_frame_and_come_in_the_textures_frame_too
     assert (tmp_path / "files/mesh.obj").read_bytes() == simulated_face.files["mesh.obj"]
 
 
-def test_errors_and_masks_are_written_where_they_are_asked_for(picture, tmp_path):
+def test_errors_and_masks_are_written_on_request(picture, tmp_path):
     maps.write(picture, tmp_path, Delivery(with_errors=True, only=("melanin",)))
     np.testing.assert_array_equal(
         read(tmp_path / "exr/melanin.stderr.exr"), picture.maps["melanin"].stderr
@@ -112,6 +110,6 @@ def test_errors_and_masks_are_written_where_they_are_asked_for(picture, tmp_path
     assert read(tmp_path / "exr/melanin.valid.exr")[0, :2].tolist() == [0.0, 1.0]
 
 
-def test_a_map_that_is_not_there_is_named_with_those_that_are(picture, tmp_path):
+def test_missing_map_is_named_with_available_ones(picture, tmp_path):
     with pytest.raises(ExportError, match="got roughness, expected of diffuse, hemoglobin"):
         maps.write(picture, tmp_path, Delivery(only=("roughness",)))

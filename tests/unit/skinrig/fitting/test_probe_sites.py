@@ -44,7 +44,7 @@ def probe(measured=MEASURED, stderr=0.02, files=None):
     )
 
 
-def test_sites_lie_at_a_mean_faces_distances_from_the_nose_and_the_map_runs_through_them():
+def test_sites_match_mean_face_distances_and_map_interpolates():
     position, nose = face()
     found = probe_sites.place(probe(), position)
     assert [site.name for site in found.sites] == list(MEASURED)
@@ -75,7 +75,7 @@ def test_the_layout_of_the_texture_does_not_matter():
     )
 
 
-def test_a_table_says_where_sites_are_and_names_others(tmp_path):
+def test_table_sets_site_positions_and_names_others(tmp_path):
     position, _ = face()
     table = tmp_path / "sites.csv"
     table.write_text("name,x,y\ncheek,50,40\nscar,20,20\n")
@@ -89,7 +89,7 @@ def test_a_table_says_where_sites_are_and_names_others(tmp_path):
     assert "forehead, chin" in found.assumed[0]
 
 
-def test_sites_that_are_unknown_or_off_the_scan_are_left_out_with_the_reason():
+def test_unknown_or_unscanned_sites_are_omitted_with_reason():
     position, _ = face()
     upper = SkinMap(position.values, "mm", valid=position.values[..., 1] > -20.0)
     found = probe_sites.place(probe({**MEASURED, "elbow": (0.6, 1.0, 1.5)}), upper)
@@ -102,7 +102,7 @@ def test_sites_that_are_unknown_or_off_the_scan_are_left_out_with_the_reason():
         probe_sites.place(probe({"elbow": (0.6, 1.0, 1.5)}), position)
 
 
-def test_a_channel_without_a_fit_is_left_out_and_one_without_any_is_masked():
+def test_missing_channel_fit_is_omitted_all_missing_masked():
     position, _ = face()
     found = probe_sites.place(probe({**MEASURED, "cheek": (None, 1.1, 1.6)}), position)
     assert [what for what, _ in found.left_out] == ["cheek, channel 0"]
@@ -114,7 +114,7 @@ def test_a_channel_without_a_fit_is_left_out_and_one_without_any_is_masked():
         probe_sites.place(probe(nothing), position)
 
 
-def test_flat_patches_and_single_texels_have_a_map_too():
+def test_flat_patches_and_single_texels_get_map():
     flat, _ = face(flat=True)
     assert probe_sites.place(probe(), flat).map.valid.all()
     one = SkinMap(np.zeros((1, 1, 3), np.float32), "mm")
@@ -132,7 +132,7 @@ def test_a_probe_without_sites_is_named(files):
 
 
 @pytest.mark.parametrize("seed", [0, 5])
-def test_sites_of_simulated_heads_are_found_within_a_centimetre_over_the_skin(seed):
+def test_simulated_head_sites_are_found_within_a_centimeter(seed):
     mesh = build_head(np.random.default_rng(seed), columns=84, rows=90)
     points = mesh.vertices_mm[: len(mesh.vertices_mm) // 85 * 85]
     found = probe_sites.place(probe(), SkinMap(points.reshape(-1, 85, 3), "mm"))

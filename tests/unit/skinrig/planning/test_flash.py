@@ -30,7 +30,7 @@ def small(monkeypatch, look):
     monkeypatch.setattr(flash, "simulate_observation", lambda *args, **kwargs: look)
 
 
-def test_more_light_frames_and_darks_leave_less_error_down_to_that_of_the_model(look):
+def test_more_frames_and_darks_lower_error_to_model(look):
     def median(**settings):
         return flash.predict(look, **settings).median("melanin")
 
@@ -43,7 +43,7 @@ def test_more_light_frames_and_darks_leave_less_error_down_to_that_of_the_model(
     assert floor < median(repeats=16, power=1.0, darks=4) < 1.2 * floor
 
 
-def test_four_frames_halve_what_noise_alone_leaves(look):
+def test_four_frames_halve_noise_error(look):
     still = replace(look, gain=0.0, floor=0.0)
 
     def noise(repeats):
@@ -57,7 +57,7 @@ def test_four_frames_halve_what_noise_alone_leaves(look):
     assert np.median(noise(1) / noise(4)) == pytest.approx(2.0, rel=0.05)
 
 
-def test_the_plan_leaves_out_what_the_errors_wanted_do_not_need(small, tmp_path, capsys):
+def test_plan_omits_exposures_unneeded_for_wanted_errors(small, tmp_path, capsys):
     file = tmp_path / "plan.json"
     want = "melanin<=8%,hemoglobin<=20%"
     assert main(["plan", "flash", "--want", want, "--out", str(file), "--json"]) == 0
@@ -80,16 +80,14 @@ def test_the_plan_leaves_out_what_the_errors_wanted_do_not_need(small, tmp_path,
         assert other["median"] == pytest.approx(one["median"], rel=1e-9)
 
 
-def test_where_the_model_error_alone_is_too_large_more_frames_are_not_asked_for(small, capsys):
+def test_dominant_model_error_does_not_request_more_frames(small, capsys):
     assert main(["plan", "flash", "--want", "melanin<=1%"]) == 1
     said = capsys.readouterr().out
     assert "more frames will not help" in said
     assert "NOT REACHED" in said
 
 
-def test_where_no_light_tells_hemoglobin_none_is_left_out_as_if_it_were_reached(
-    small, rig, monkeypatch
-):
+def test_undetermined_hemoglobin_does_not_count_as_reached(small, rig, monkeypatch):
     seen = flash.predict
 
     def blind(*args, **settings):
@@ -104,7 +102,7 @@ def test_where_no_light_tells_hemoglobin_none_is_left_out_as_if_it_were_reached(
     assert not any("reaches" in why for _, why in told.left_out)
 
 
-def test_a_plan_without_crossed_frames_or_of_another_rig_is_refused(rig, small, tmp_path, capsys):
+def test_plan_without_crossed_frames_or_foreign_is_refused(rig, small, tmp_path, capsys):
     whole = flash_plan(rig)
     bare = replace(
         whole, steps=tuple(s for s in whole.steps if s.index.get("polarizer") != "crossed")

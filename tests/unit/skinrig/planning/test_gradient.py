@@ -42,7 +42,7 @@ def test_complements_and_longer_exposures_lower_the_error(look):
     assert median(PATTERN_SETS[1], 0.009) < least
 
 
-def test_the_quickest_scan_that_reaches_the_error_is_taken(small, tmp_path, capsys):
+def test_quickest_scan_reaching_error_is_chosen(small, tmp_path, capsys):
     file = tmp_path / "plan.json"
     assert (
         main(["plan", "gradient", "--want", "normals<=2.5deg", "--out", str(file), "--json"]) == 0
@@ -61,7 +61,7 @@ def test_the_quickest_scan_that_reaches_the_error_is_taken(small, tmp_path, caps
     assert again["forecasts"][0]["median"] == pytest.approx(last["normals_deg"], rel=1e-9)
 
 
-def test_what_no_scan_reaches_says_why(small, capsys, monkeypatch):
+def test_unreachable_error_reports_reason(small, capsys, monkeypatch):
     monkeypatch.setattr(gradient, "PATTERN_SETS", PATTERN_SETS[:1])
     monkeypatch.setattr(gradient, "EXPOSURE_CHOICES", (1.0,))
     assert main(["plan", "gradient", "--want", "normals<=0.1deg"]) == 1
@@ -70,7 +70,7 @@ def test_what_no_scan_reaches_says_why(small, capsys, monkeypatch):
     assert "the lens shows" in said
 
 
-def test_exposures_that_saturate_or_ask_too_much_of_an_led_are_no_candidates(rig, look):
+def test_saturating_or_overloading_exposures_are_not_candidates(rig, look):
     bright = replace(look, rates={key: 1000.0 * rate for key, rate in look.rates.items()})
     assert not list(gradient.candidates(rig, bright))
     seconds = [plan.estimated_s(rig) for _, plan in gradient.candidates(rig, look)]
@@ -78,14 +78,14 @@ def test_exposures_that_saturate_or_ask_too_much_of_an_led_are_no_candidates(rig
     assert len(seconds) > 10
 
 
-def test_patterns_that_do_not_tell_a_gradient_are_refused(rig):
+def test_patterns_not_determining_gradient_are_refused(rig):
     plan = gradient_plan(rig, angles=[0], steps=(0, 0), patterns=("full", "x", "y"))
     with pytest.raises(plans.PlanningError, match="z or -z"):
         gradient.setting_of(plan)
 
 
 @pytest.mark.long
-def test_normals_are_reconstructed_from_four_patterns_as_well_as_is_forecast(rig, tmp_path):
+def test_normals_from_four_patterns_match_forecast_error(rig, tmp_path):
     from reconstruction.gradient_normals.estimation import estimate_roughness, from_patterns
 
     look = gradient.simulate_observation(rig, "III", seed=3, side_px=96)

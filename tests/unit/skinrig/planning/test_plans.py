@@ -25,17 +25,17 @@ from skinrig.planning import dome, dome_observation, plans
         ("normals<=1deg,normals<=2deg", "twice"),
     ],
 )
-def test_what_cannot_be_wanted_is_told(text, word):
+def test_invalid_want_is_reported(text, word):
     with pytest.raises(plans.PlanningError, match=word):
         plans.read_wants(text, "dome")
 
 
-def test_a_number_that_cannot_be_wanted_is_told_as_it_was_written():
+def test_invalid_wanted_number_is_reported_as_written():
     with pytest.raises(plans.PlanningError, match="got melanin<=0%, expected a number above 0"):
         plans.read_wants("melanin<=0%", "flash")
 
 
-def test_errors_by_site_are_told_with_their_colors():
+def test_errors_by_site_are_reported_with_colors():
     rig = load_rig("flash")
     knobs = {plans.PERCENT_BY_SITE: {"chin": [0.444, 1.399, math.inf]}}
     choice = plans.Choice(rig, flash_plan(rig), (), 2.0, knobs, ())
@@ -43,12 +43,12 @@ def test_errors_by_site_are_told_with_their_colors():
     assert "percent by site: chin red 0.444 %, green 1.4 %, blue not told" in told
 
 
-def test_a_rig_that_has_no_plans_of_its_own_is_told(capsys):
+def test_rig_without_own_plans_is_reported(capsys):
     assert main(["plan", "moon", "--want", "normals<=1deg"]) == 3
     assert "expected one of dome" in capsys.readouterr().err
 
 
-def test_a_quantity_that_keeps_no_estimate_is_said_to_and_not_given_an_infinite_error():
+def test_quantity_without_estimate_is_reported_without_infinite_error():
     rig = load_rig("flash")
     told = plans.Forecast("hemoglobin", "%", math.inf, (math.inf, math.inf), 20.0)
     choice = plans.Choice(rig, flash_plan(rig), (told,), 2.0, {}, ())
@@ -68,7 +68,7 @@ def look(rig):
     return dome_observation.simulate_observation(rig, "III", points=300)
 
 
-def test_lights_from_behind_reach_no_point_that_looks_ahead(rig, look):
+def test_backlights_reach_no_point_facing_forward(rig, look):
     ahead = look.normals[:, 2] > 0.95
     behind = [k for k, light in enumerate(rig.lights) if light.position_mm[2] < -300]
     told = look.information(range(len(rig.views))).weight
@@ -77,14 +77,14 @@ def test_lights_from_behind_reach_no_point_that_looks_ahead(rig, look):
     assert told[ahead].any()
 
 
-def test_darker_skin_and_fewer_cameras_tell_less(rig, look):
+def test_darker_skin_and_fewer_cameras_raise_error(rig, look):
     dark = dome_observation.simulate_observation(rig, "VI", points=300)
     every = look.information(range(16)).weight.sum()
     assert dark.information(range(16)).weight.sum() < every
     assert look.information(range(4)).weight.sum() < every
 
 
-def test_albedo_is_forecast_by_the_subjects_own_detail_and_gloss(rig, look):
+def test_albedo_forecast_uses_subject_detail_and_specular(rig, look):
     """Coarser pixels and darker skin, where the same gloss is more, leave more error."""
     every = range(len(rig.views)), range(len(rig.lights))
 
@@ -104,13 +104,13 @@ def test_albedo_is_forecast_by_the_subjects_own_detail_and_gloss(rig, look):
     assert forecast(even) < 0.6 * forecast(look)
 
 
-def test_the_median_of_errors_about_offsets_is_that_of_draws(rng):
+def test_median_of_offset_errors_matches_draws(rng):
     offset, sigma = rng.normal(0.0, 0.02, (400, 3)), rng.uniform(0.005, 0.03, (400, 3))
     drawn = np.abs(offset + sigma * rng.standard_normal((500, 400, 3)))
     assert dome._median_magnitude(offset, sigma) == pytest.approx(np.median(drawn), rel=0.01)
 
 
-def test_a_plan_keeps_what_it_promises_and_says_what_it_leaves_out(tmp_path, capsys, monkeypatch):
+def test_plan_keeps_promised_error_and_reports_omissions(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(dome_observation, "FACE_POINTS", 300)
     file = tmp_path / "plan.json"
     code = main(
@@ -144,7 +144,7 @@ def test_a_plan_keeps_what_it_promises_and_says_what_it_leaves_out(tmp_path, cap
         assert other["median"] == pytest.approx(one["median"], rel=1e-9)
 
 
-def test_what_is_out_of_reach_says_why(capsys, monkeypatch):
+def test_unreachable_target_reports_reason(capsys, monkeypatch):
     monkeypatch.setattr(dome_observation, "FACE_POINTS", 200)
     assert (
         main(

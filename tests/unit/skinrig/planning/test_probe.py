@@ -33,7 +33,7 @@ def small(monkeypatch, look):
     monkeypatch.setattr(probe, "LONGEST_EXPOSURE_CHOICES_S", (0.5, 4.0))
 
 
-def test_longer_exposures_and_placements_lower_the_error_down_to_the_common_one(look):
+def test_longer_exposures_and_placements_approach_common_error(look):
     def sigma(*exposures_s, repeats=1, darks=2):
         found = probe.predict(look, Setting(SITES, exposures_s, repeats, darks))
         assert (found.sigma >= found.common).all()
@@ -45,7 +45,7 @@ def test_longer_exposures_and_placements_lower_the_error_down_to_the_common_one(
     assert sigma(0.00115, 0.01, darks=1) > short
 
 
-def test_fits_that_plans_share_leave_the_forecast_to_the_bit_as_it_is(look):
+def test_fits_shared_by_plans_keep_forecast_bit_exactly(look):
     memory = {}
     settings = [
         Setting(SITES, exposures_s, repeats, darks)
@@ -61,7 +61,7 @@ def test_fits_that_plans_share_leave_the_forecast_to_the_bit_as_it_is(look):
     assert len(memory) < len(settings)
 
 
-def test_the_interval_is_wide_where_all_fits_share_their_error_and_narrow_where_none_does():
+def test_interval_is_wide_when_fits_share_error():
     shape = (12, 3)
     every, one = np.ones(shape, bool), np.full(shape, 0.01)
     told = (one, every, np.ones(12, bool))
@@ -80,7 +80,7 @@ def test_the_interval_is_wide_where_all_fits_share_their_error_and_narrow_where_
     assert 0.7 < low < 1.0 < high < 1.4
 
 
-def test_variance_of_a_reading_follows_its_photons_and_saturation(look):
+def test_reading_variance_follows_photons_and_saturation(look):
     series = exposure_series_s()
     skin = look.reflectance[0]
     assert np.isfinite(probe_observation.reading_variance(look, skin, series, 2, 1.0)).all()
@@ -95,7 +95,7 @@ def test_variance_of_a_reading_follows_its_photons_and_saturation(look):
     assert (dim / four < 4.01).all()
 
 
-def test_the_quickest_plan_that_reaches_the_error_leaves_out_exposures(small, tmp_path, capsys):
+def test_quickest_plan_reaching_error_omits_exposures(small, tmp_path, capsys):
     file = tmp_path / "plan.json"
     assert main(["plan", "probe", "--want", "sigma_tr<=4%", "--out", str(file), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
@@ -109,14 +109,14 @@ def test_the_quickest_plan_that_reaches_the_error_leaves_out_exposures(small, tm
     assert again["forecasts"][0]["median"] == pytest.approx(document["forecasts"][0]["median"])
 
 
-def test_what_the_certificate_forbids_says_that_more_exposures_will_not_help(small, capsys):
+def test_certificate_limit_reports_more_exposures_will_not_help(small, capsys):
     assert main(["plan", "probe", "--want", "sigma_tr<=0.001%"]) == 1
     said = capsys.readouterr().out
     assert "will not help" in said
     assert "certificate" in said
 
 
-def test_a_site_is_left_out_only_where_the_others_tell_it_well_enough(look):
+def test_site_is_omitted_only_if_others_determine_quantity(look):
     setting = Setting(SITES, exposure_series_s(), 1, 2)
     plan = probe_plan(load_rig("probe"), sites=SITES)
 

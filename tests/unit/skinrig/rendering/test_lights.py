@@ -22,7 +22,7 @@ def stage():
     return RenderRig.of("dome", None)
 
 
-def test_a_light_of_the_rig_stands_where_it_is_drawn_and_shows_one_on_white_at_the_origin(stage):
+def test_rig_light_is_at_nominal_position_and_scale(stage):
     lamp = stage.light("L017*0.5")
     drawn = load_rig("dome").light("L017")
     towards, white = lamp.reach([[0.0, 0.0, 0.0]])
@@ -32,7 +32,7 @@ def test_a_light_of_the_rig_stands_where_it_is_drawn_and_shows_one_on_white_at_t
     assert stage.assumed == ["light L017 stands as the rig's file draws it"]
 
 
-def test_a_calibrated_light_gives_what_its_table_says_everywhere():
+def test_calibrated_light_matches_its_table_everywhere():
     rig = load_rig("dome").subset(lights=["L010", "L020"])
     nominal = LightTable.nominal(rig, white_per_s=3.0)
     lamp = Light.of_table(nominal, "L020", radius_mm=10.0)
@@ -73,7 +73,7 @@ def test_words_that_are_no_view_are_refused(stage, words):
         stage.camera(words, size_px=64)
 
 
-def test_a_view_of_the_rig_keeps_its_field_at_any_size(stage):
+def test_rig_view_keeps_field_at_any_size(stage):
     small, large = (stage.camera("C03", size_px=n) for n in (65, 650))
     assert small.image_size[0] == 65
     assert large.image_size[0] == 650
@@ -105,7 +105,7 @@ def test_a_light_that_cannot_shine_is_refused(fields):
         Light(name="wrong", **fields)
 
 
-def test_an_environments_lights_bring_its_irradiance_to_every_side():
+def test_environment_lights_give_its_irradiance_on_every_side():
     """Stratified draws: the sum over cosines has a few percent of noise with 400 lights."""
     towards, solid = directions(32, 64)
     image = np.repeat(
@@ -122,7 +122,7 @@ def test_an_environments_lights_bring_its_irradiance_to_every_side():
             np.testing.assert_allclose(found, true, rtol=0.1)
 
 
-def test_an_environments_right_side_lights_the_left_of_a_face_that_looks_at_its_middle():
+def test_environment_right_side_lights_left_of_facing_face():
     """Who stands inside and looks along +z has -x at the right hand."""
     image = np.zeros((16, 32, 3))
     image[8, 24] = 1.0

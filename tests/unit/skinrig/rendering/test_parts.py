@@ -48,7 +48,7 @@ def model():
     )
 
 
-def test_lookups_blend_the_texels_of_the_same_place_as_a_plain_loop_does():
+def test_texel_lookups_blend_positions_like_plain_loop():
     rng = np.random.default_rng(0)
     values = rng.random((6, 7, 2)).astype(np.float32)
     known = rng.random((6, 7)) < 0.7
@@ -75,7 +75,7 @@ def test_lookups_blend_the_texels_of_the_same_place_as_a_plain_loop_does():
     assert 0 < np.count_nonzero(share) < 60
 
 
-def test_points_without_a_texel_of_their_own_take_what_is_around_on_the_surface(model):
+def test_points_without_own_texel_use_surface_neighborhood(model):
     corners = np.array([[-30.0, -30, 0], [30, -30, 0], [30, 30, 0], [-30, 30, 0]])
     mesh = build_mesh(corners, [[0, 1, 2], [0, 2, 3]], corners[:, :2] / 60.0 + 0.5)
     laid = FittedSurface.of(model, mesh)
@@ -88,7 +88,7 @@ def test_points_without_a_texel_of_their_own_take_what_is_around_on_the_surface(
     np.testing.assert_allclose(stray.weights, own.weights, atol=0.02)
 
 
-def test_shares_that_fewer_mixtures_hold_exactly_are_found(model):
+def test_weights_exact_with_fewer_mixtures_are_found(model):
     two = reduced(model, 2, rng=np.random.default_rng(0))
     assert two.lobes.size == 2
     up = np.array([0.0, 0.0, 1.0])
@@ -102,7 +102,7 @@ def test_shares_that_fewer_mixtures_hold_exactly_are_found(model):
     assert reduced(model, 3, rng=np.random.default_rng(0)) is model
 
 
-def test_nearest_shares_are_not_negative_and_keep_what_mixtures_hold(model):
+def test_nearest_weights_are_nonnegative_and_keep_mixture_weights(model):
     mix = np.array([[1.0, 0.0, 0.0], [0.0, 0.3, 0.7]])
     shares = np.array([[2.0, 0.3, 0.7], [0.0, 0.0, 0.0], [0.0, 0.6, 1.4]])
     found = nearest_shares(shares, mix, model.lobes)
@@ -117,7 +117,7 @@ def test_more_lobes_than_a_model_has_are_refused(model):
 
 @pytest.mark.long
 @pytest.mark.render
-def test_a_shadow_is_the_wider_the_smaller_sigma_tr(model, monkeypatch):
+def test_shadow_widens_with_smaller_sigma_tr(model, monkeypatch):
     """Rationale: light that spreads by 1/sigma_tr crosses the edge so far.
 
     Expected: width in proportion to 1/sigma_tr for one R_d, within 15 %: a grid of 0.07 mm and the
@@ -136,7 +136,7 @@ def test_a_shadow_is_the_wider_the_smaller_sigma_tr(model, monkeypatch):
     np.testing.assert_allclose(ratio, expected, rtol=0.15)
 
 
-def test_a_shadow_lies_right_of_the_middle(model, monkeypatch):
+def test_shadow_is_right_of_middle(model, monkeypatch):
     monkeypatch.setattr(shadow, "PATCH_TEXELS", 32)
     seen = Boundary.on_plane(model, size_px=48).shown(None, subpixels=1)
     place, level = shadow.profile(seen)
@@ -144,7 +144,7 @@ def test_a_shadow_lies_right_of_the_middle(model, monkeypatch):
     assert np.all(level[place > 0.6] == 0.0)
 
 
-def test_tones_are_linear_below_the_knee_and_still_grow_above_white():
+def test_tones_are_linear_below_knee_and_grow_above():
     linear = np.array([0.0, 0.2, 0.4])
     np.testing.assert_array_equal(tone(2.0 * linear, 0.5), tone(linear, 1.0))
     bright = tone(np.array([TONE_KNEE, 1.0, 1.5, 2.0]), 1.0).astype(int)
@@ -166,7 +166,7 @@ def test_a_sheet_shows_its_panels_pixel_by_pixel():
         sheet([[Panel("one", image), Panel("two", image[:10])]])
 
 
-def test_a_rendering_replaces_an_older_one_and_nothing_else(tmp_path):
+def test_rendering_replaces_only_older_rendering(tmp_path):
     image = np.zeros((2, 3, 3), np.float32)
     out = tmp_path / "picture"
     for word in ("first", "second"):
@@ -181,7 +181,7 @@ def test_a_rendering_replaces_an_older_one_and_nothing_else(tmp_path):
     assert (tmp_path / "other" / "letter.txt").read_text() == "dear"
 
 
-def test_a_rendering_that_fails_to_be_written_leaves_nothing(tmp_path):
+def test_rendering_with_failed_write_leaves_nothing(tmp_path):
     with pytest.raises(TypeError):
         folder.write(
             tmp_path / "x",

@@ -93,7 +93,7 @@ def front_camera(size=33, fov=6.0):
     return rendering_camera.looking_at(FRONT, fov_deg=fov, size_px=(size, size))
 
 
-def test_a_white_patch_that_faces_the_light_shows_what_passes_the_boundary_twice(matt):
+def test_white_patch_facing_light_shows_double_boundary_transmittance(matt):
     mesh = plane()
     seen = render(
         model_on(mesh, matt), mesh, front_camera(), Light(name="front", direction=(0, 0, 1))
@@ -105,7 +105,7 @@ def test_a_white_patch_that_faces_the_light_shows_what_passes_the_boundary_twice
     assert seen.lit.all()
 
 
-def test_a_patch_is_lit_by_the_cosine_and_the_transmittance_of_its_angle(matt):
+def test_patch_irradiance_follows_cosine_and_transmittance(matt):
     mesh = plane()
     light = Light(
         name="aslant", direction=(np.sin(1.0), 0.0, np.cos(1.0)), intensity=(2.0, 1.0, 0.5)
@@ -116,14 +116,14 @@ def test_a_patch_is_lit_by_the_cosine_and_the_transmittance_of_its_angle(matt):
     np.testing.assert_allclose(middle(seen.radiance), expected, rtol=1e-4)
 
 
-def test_light_at_a_place_falls_off_by_the_square_of_its_distance(matt):
+def test_point_light_falls_with_squared_distance(matt):
     mesh = plane()
     near = Light(name="near", position_mm=(0.0, 0.0, 300.0), reference_mm=600.0)
     seen = render(model_on(mesh, matt), mesh, front_camera(), near)
     np.testing.assert_allclose(middle(seen.radiance), 4.0 * transmitted(1.0) ** 2, rtol=1e-4)
 
 
-def test_the_surface_term_is_that_of_the_tables_at_a_known_pixel(shiny):
+def test_surface_term_matches_tables_at_known_pixel(shiny):
     mesh = plane()
     camera = front_camera()
     light = np.array([0.5, 0.2, 0.8])
@@ -152,7 +152,7 @@ def test_light_from_the_right_brightens_the_right(matt):
         assert high.sum() > 2.0 * low.sum()
 
 
-def test_a_card_casts_its_shadow_where_geometry_says(matt):
+def test_card_shadow_is_where_geometry_predicts(matt):
     mesh = plane()
     corners = np.array([[0.0, -80, 40], [80, -80, 40], [80, 80, 40], [0, 80, 40]])
     card = build_mesh(corners, [[0, 1, 2], [0, 2, 3]], np.zeros((4, 2)))
@@ -167,7 +167,7 @@ def test_a_card_casts_its_shadow_where_geometry_says(matt):
     assert not seen.lit[30, column : 61 - column].any()
 
 
-def test_a_wide_light_casts_a_soft_shadow_as_wide_as_geometry_says(matt):
+def test_wide_light_soft_shadow_matches_geometry(matt):
     mesh = plane()
     corners = np.array([[0.0, -80, 40], [80, -80, 40], [80, 80, 40], [0, 80, 40]])
     card = build_mesh(corners, [[0, 1, 2], [0, 2, 3]], np.zeros((4, 2)))
@@ -195,7 +195,7 @@ def test_two_lights_add_up(shiny):
     np.testing.assert_allclose(both.radiance, both.diffuse + both.surface)
 
 
-def test_parts_of_a_broad_light_give_together_what_it_gives(matt):
+def test_parts_of_broad_light_sum_to_whole(matt):
     mesh = plane()
     broad = Light(name="broad", direction=(0.3, 0.0, 1.0), radius=0.3)
     assert len(broad.parts()) == 16
@@ -228,7 +228,7 @@ def rotation():
     return turn_x @ turn_y
 
 
-def test_a_face_that_turned_with_light_and_camera_looks_the_same(shiny):
+def test_face_rotated_with_light_and_camera_looks_same(shiny):
     mesh = dome_mesh()
     model = model_on(mesh, shiny, r_d=(0.5, 0.4, 0.3), size=64)
     rng = np.random.default_rng(0)
@@ -271,7 +271,7 @@ def test_stretched_skin_has_flatter_relief(matt):
     assert normal[0] / normal[2] == pytest.approx(0.375, rel=1e-4)
 
 
-def test_texels_without_a_measurement_are_told_from_those_with_one(matt):
+def test_unmeasured_texels_are_distinguished_from_measured(matt):
     mesh = plane()
     model = model_on(mesh, matt)
     valid = model.valid.copy()
@@ -296,7 +296,7 @@ def test_texels_without_a_measurement_are_told_from_those_with_one(matt):
     ("place", "says"),
     [((0.0, 0.0, -700.0), "behind the head"), ((0.0, 3000.0, 700.0), "sees nothing")],
 )
-def test_a_camera_that_cannot_see_the_face_is_refused(matt, place, says):
+def test_camera_missing_face_is_refused(matt, place, says):
     mesh = plane()
     target = (0.0, 0.0, 0.0) if "behind" in says else (0.0, 3000.0, 0.0)
     camera = rendering_camera.looking_at(place, target_mm=target, size_px=(16, 16))
@@ -360,7 +360,7 @@ def test_under_even_light_spreading_changes_nothing(matt):
 
 @pytest.mark.parametrize("r_d", [0.0, 1e-6, 1.0 - 1e-9, 1.0, 1.5])
 @pytest.mark.parametrize("sigma_tr", [1e-3, 1.0, 1e3])
-def test_extreme_skin_gives_finite_pictures_in_proportion_to_its_albedo(matt, r_d, sigma_tr):
+def test_extreme_skin_gives_finite_images_proportional_to_albedo(matt, r_d, sigma_tr):
     """R_d above 1 is an outlier: light stays where it entered, and nothing is clamped."""
     mesh = plane()
     model = model_on(mesh, matt, r_d=(r_d, 0.5, 0.1), size=16)

@@ -52,7 +52,7 @@ def write_run(folder, *, captured="2026-03-10", valid_until=date(2026, 6, 1), wo
     return folder
 
 
-def test_a_calibration_is_as_old_as_it_was_at_capture(tmp_path):
+def test_calibration_age_is_age_at_capture(tmp_path):
     html = report.build([write_run(tmp_path)])
     assert "The only check kept its limit" in html
     assert "in force, 83 days left" in html  # 10 March to 1 June
@@ -60,7 +60,7 @@ def test_a_calibration_is_as_old_as_it_was_at_capture(tmp_path):
 
 
 @pytest.mark.parametrize("captured", ["2026-06-02", "2026-02-28"])
-def test_a_calibration_that_was_not_in_force_at_capture_is_a_missed_check(tmp_path, captured):
+def test_calibration_not_in_force_is_missed_check(tmp_path, captured):
     html = report.build([write_run(tmp_path, captured=captured)])
     assert "1 of 1 checks missed" in html
     assert "not in force at capture" in html
@@ -73,7 +73,7 @@ def test_the_worst_device_is_named(tmp_path):
     assert "0.3" in row[: row.index("</tr>")]
 
 
-def test_a_damaged_calibration_is_told_and_missed_and_the_rest_is_shown(tmp_path):
+def test_damaged_calibration_is_missed_and_rest_shown(tmp_path):
     path = write_run(tmp_path) / "calibration" / "geometry.json"
     path.write_text(path.read_text().replace("0.1", "0.2"))
     html = report.build([tmp_path])
@@ -90,7 +90,7 @@ def test_without_a_session_no_age_is_claimed(tmp_path):
 
 
 @pytest.mark.parametrize("given", ["folder", "file by file"])
-def test_a_calibration_is_known_by_what_it_holds_whatever_its_folder_is_called(tmp_path, given):
+def test_calibration_is_identified_by_contents_not_folder_name(tmp_path, given):
     folder = write_run(tmp_path)
     (folder / "calibration").rename(folder / "mine")
     places = [folder] if given == "folder" else [folder / "maps", folder / "mine"]

@@ -33,7 +33,7 @@ def maps(tmp_path):
     return tmp_path
 
 
-def test_one_run_is_reported_and_two_are_compared_and_it_is_said_which(maps, capsys):
+def test_report_states_whether_runs_are_reported_or_compared(maps, capsys):
     out = maps / "page.html"
     assert main(["report", str(maps / "monday"), "-o", str(out)]) == 0
     assert "No limit was checked" in capsys.readouterr().out
@@ -49,20 +49,20 @@ def test_one_run_is_reported_and_two_are_compared_and_it_is_said_which(maps, cap
     assert [p.name for p in maps.iterdir() if p.name.startswith(".")] == []
 
 
-def test_the_folder_of_a_page_is_made_as_those_of_maps_are(maps):
+def test_page_folder_is_created_like_map_folders(maps):
     out = maps / "reports" / "today" / "page.html"
     assert main(["report", str(maps / "monday"), "-o", str(out)]) == 0
     assert [p.name for p in out.parent.iterdir()] == ["page.html"]
 
 
-def test_what_cannot_be_compared_is_refused_and_nothing_is_written(maps, capsys):
+def test_incomparable_inputs_are_refused_and_nothing_is_written(maps, capsys):
     out = maps / "page.html"
     assert main(["report", str(maps / "monday"), "--compare", "-o", str(out)]) == 3
     assert "expected two of one kind" in capsys.readouterr().err
     assert not out.exists()
 
 
-def test_a_page_that_cannot_be_written_leaves_the_old_one_and_no_part(maps, monkeypatch):
+def test_failed_page_write_keeps_old_page_only(maps, monkeypatch):
     out = maps / "page.html"
     out.write_text("old")
 
@@ -95,5 +95,5 @@ def test_a_document_that_is_damaged_is_named(maps, capsys):
         (r"faces from the front (\d+)", FRONT_VIEW_WIDTH_PX),
     ],
 )
-def test_the_page_on_reports_tells_the_numbers_of_the_program(words, value):
+def test_documentation_page_on_reports_matches_program_numbers(words, value):
     assert float(re.search(words, PAGE.read_text("utf-8"))[1]) == value

@@ -85,7 +85,7 @@ def html(tmp_path_factory):
     return report.build([tmp_path])
 
 
-def test_a_page_has_landmarks_headings_in_order_captions_and_texts(html):
+def test_page_has_landmarks_ordered_headings_captions_and_texts(html):
     outline = Outline(html)
     assert outline.faults == []
     assert outline.headings[0] == 1
@@ -106,12 +106,12 @@ def test_a_page_has_landmarks_headings_in_order_captions_and_texts(html):
         ('role="img"', ""),
     ],
 )
-def test_the_outline_finds_what_is_missing(html, what, into):
+def test_outline_finds_missing_elements(html, what, into):
     assert what in html
     assert Outline(html.replace(what, into)).faults
 
 
-def test_the_policy_allows_the_page_s_own_style_and_nothing_else(html):
+def test_page_policy_allows_only_own_style(html):
     style = re.search(r"<style>(.*?)</style>", html, re.DOTALL)[1]
     digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
     policy = re.search(r'Content-Security-Policy" content="([^"]*)"', html)[1]
@@ -122,7 +122,7 @@ def test_the_policy_allows_the_page_s_own_style_and_nothing_else(html):
     assert html.count("<style") == 1
 
 
-def test_a_picture_tells_in_words_what_it_shows_in_colors():
+def test_image_text_describes_content_shown_in_colors():
     values = np.arange(100.0).reshape(10, 10)
     valid = np.ones((10, 10), bool)
     valid[:2] = False
@@ -134,7 +134,7 @@ def test_a_picture_tells_in_words_what_it_shows_in_colors():
     )
 
 
-def test_a_map_s_picture_has_the_scale_s_colors_to_a_128th_and_gray_without_a_value(rng):
+def test_map_image_uses_scale_colors_and_gray_invalid(rng):
     values = rng.random((40, 50))
     values[3, 4] = np.nan
     data = png.Scale(0.0, 1.0).encode(values, levels=map_images.SCALE_COLORS)
@@ -148,7 +148,7 @@ def test_a_map_s_picture_has_the_scale_s_colors_to_a_128th_and_gray_without_a_va
     assert np.abs(eighth - fine).max() > step
 
 
-def test_a_picture_of_noise_takes_its_seven_bits_a_pixel_and_one_of_a_slope_far_fewer(rng):
+def test_noise_image_takes_seven_bits_slope_far_fewer(rng):
     bits = 7 * 128 * 128 / 8
     noise = png.Scale(0.0, 1.0).encode(rng.random((128, 128)))
     assert bits < len(noise) < 1.1 * bits
@@ -156,14 +156,14 @@ def test_a_picture_of_noise_takes_its_seven_bits_a_pixel_and_one_of_a_slope_far_
     assert len(png.Scale(0.0, 1.0).encode(slope)) < 0.2 * bits
 
 
-def test_the_bar_beside_a_picture_runs_through_the_picture_s_colors(html):
+def test_colorbar_spans_colors_of_image(html):
     style = re.search(r"<style>(.*?)</style>", html, re.DOTALL)[1]
     stops = re.search(r"\.bar\.viridis\{background:linear-gradient\(90deg,([^)]*)\)", style)[1]
     assert stops.split(",")[0] == "#" + bytes(png.palette("viridis", 2)[0]).hex()
     assert len(stops.split(",")) == page.BAR_STOPS
 
 
-def test_a_plot_is_well_formed_and_says_its_numbers():
+def test_plot_is_well_formed_and_states_numbers():
     series = [figures.Curve("red", [1.0, 2.0, 3.0], [1.0, 0.1, 0.01], [0.1, 0.01, 0.02])]
     drawn = figures.curves("decay", "mm", "1/mm", series, log_y=True)
     root = ElementTree.fromstring(drawn)
@@ -174,7 +174,7 @@ def test_a_plot_is_well_formed_and_says_its_numbers():
     assert {"decay", "mm", "1/mm", "red", "0.01", "0.1"} <= texts
 
 
-def test_plots_of_one_page_do_not_share_names_of_their_parts():
+def test_plots_on_same_page_have_distinct_ids():
     plots = [
         figures.curves(title, "x", "y", [figures.Curve("one", [0.0, 1.0], [0.0, 1.0])])
         for title in ("first", "second")
@@ -186,7 +186,7 @@ def test_plots_of_one_page_do_not_share_names_of_their_parts():
         assert {a or b for a, b in re.findall(r'href="#([^"]*)"|url\(#([^)]*)\)', plot)} == names
 
 
-def test_lines_of_a_simplified_plot_stay_where_they_were():
+def test_simplified_plot_lines_keep_position():
     path = '<path d="M 10.004 20.006 \nL 30.5 40 \n" style="fill: none; stroke: #123456"/>'
     other = path.replace("10.004", "11").replace("30.5", "31")
     drawn = f'<svg width="9pt"><g id="g_1">{path}{other}</g></svg>'
@@ -196,14 +196,14 @@ def test_lines_of_a_simplified_plot_stay_where_they_were():
     assert found[1] == "M10 20.01L30.5 40M11 20.01L31 40"
 
 
-def test_skin_that_fares_worse_than_the_whole_is_named_though_the_check_is_kept():
+def test_worst_skin_is_named_even_if_check_passes():
     kept = page.Check("melanin", 5.0, 10.0, "<=", "%", worst="dark: 30 %", worst_got=25.0)
     assert any("beyond the limit of the whole" in text for text in verdict.weaknesses([kept]))
     even = page.Check("melanin", 5.0, 10.0, "<=", "%", worst="dark: 9 %", worst_got=8.0)
     assert not any("beyond the limit" in text for text in verdict.weaknesses([even]))
 
 
-def test_a_check_that_is_no_number_is_missed():
+def test_non_numeric_check_is_missed():
     missed = page.Check("error", float("nan"), 1.0, "<=")
     assert verdict.headline([missed]) == "1 of 1 checks missed its limit."
     assert "missed: error, – , at most 1" in " ".join(verdict.weaknesses([missed])).replace(
@@ -214,20 +214,20 @@ def test_a_check_that_is_no_number_is_missed():
 @pytest.mark.parametrize(
     ("unit", "shown"), [("deg", "1.5°"), ("°", "1.5°"), ("%", "1.5 %"), ("1/mm", "1.5 1/mm")]
 )
-def test_a_check_is_told_the_same_way_in_the_table_and_in_the_verdict(unit, shown):
+def test_check_reads_same_in_table_and_verdict(unit, shown):
     check = page.Check("normals, median", 1.5, 1.0, "<=", unit)
     assert f">{shown}</td>" in page.fragment([page.checks_table([check])])
     assert f" {shown}" in page.fragment(verdict.section([check])).split("<h2>Checks</h2>")[0]
 
 
-def test_a_narrow_cell_does_not_part_a_number_from_its_percent_sign():
+def test_narrow_cell_keeps_number_with_percent_sign():
     check = page.Check("melanin", 1.0, 2.0, "<=", "%", "bound 11 %", worst="dark: 20.8 %")
     html = page.fragment([page.checks_table([check])])
     assert "20.8\N{NO-BREAK SPACE}%" in html
     assert "11\N{NO-BREAK SPACE}%" in html
 
 
-def test_headings_of_tables_set_units_apart_by_a_comma():
+def test_table_headings_separate_units_by_comma():
     joined = re.compile(r"[^,0-9 ] (%|°|um|mm|1/mm|px|N)$")
     found = [
         f"{path.name}:{node.lineno}: {node.value}"

@@ -45,7 +45,7 @@ def folder(tmp_path, rng):
     return tmp_path
 
 
-def test_the_page_is_the_same_twice_and_asks_for_nothing(folder):
+def test_page_is_reproducible_and_requests_nothing(folder):
     html = report.build([folder])
     assert html == report.build([folder])
     assert "default-src 'none'" in html
@@ -53,13 +53,13 @@ def test_the_page_is_the_same_twice_and_asks_for_nothing(folder):
     assert "<script" not in html
 
 
-def test_truth_estimate_error_and_standard_error_stand_side_by_side(folder):
+def test_truth_estimate_error_and_stderr_are_adjacent(folder):
     html = report.build([folder])
     for title in ("truth", "estimate", "estimate − truth", "standard error"):
         assert f"<figcaption>{title}</figcaption>" in html
 
 
-def test_a_missed_limit_is_said_first(folder):
+def test_missed_limit_is_reported_first(folder):
     html = report.build([folder])
     assert "1 of 2 checks missed" in html
     assert html.index("missed</td>") < html.index("kept</td>")
@@ -71,20 +71,20 @@ def test_text_from_files_cannot_become_markup(folder):
     assert "&lt;b&gt;flat" in html
 
 
-def test_maps_without_a_truth_are_reported_with_their_standard_errors(folder):
+def test_maps_without_truth_are_reported_with_stderr(folder):
     html = report.build([folder / "appearance"])
     assert "No truth lies beside" in html
     assert "estimate − truth" not in html
 
 
-def test_an_empty_folder_is_refused_with_what_to_do(tmp_path):
+def test_empty_folder_is_refused_with_remedy(tmp_path):
     with pytest.raises(report.ReportError, match="skinrig demo"):
         report.build([tmp_path])
     with pytest.raises(report.ReportError, match="does not exist"):
         report.build([tmp_path / "nothing"])
 
 
-def test_the_first_screen_says_that_nobody_was_measured(folder):
+def test_first_screen_states_absence_of_measured_subjects(folder):
     assert "All of it is simulated: no person was measured." in report.build([folder])
     document = json.loads((folder / "appearance" / "appearance.json").read_text())
     found = discover([folder])
@@ -94,7 +94,7 @@ def test_the_first_screen_says_that_nobody_was_measured(folder):
     assert found.words().endswith("None of it is simulated.")
 
 
-def test_a_map_of_rounding_alone_does_not_look_like_structure(rng):
+def test_map_of_rounding_alone_shows_no_structure(rng):
     noise = 1e-11 * rng.random((24, 32))
 
     def shown(values):

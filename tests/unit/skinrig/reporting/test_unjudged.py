@@ -15,13 +15,13 @@ def maps(**extra):
     )
 
 
-def test_standard_errors_are_told_by_band_of_what_was_found():
+def test_standard_errors_are_reported_by_estimated_band():
     body = page.fragment(verdict.unjudged(maps()))
     assert '<td class="k">melanin 0–0.02</td><td class="n">300</td><td class="n">5</td>' in body
     assert '<td class="k">melanin 0.1–0.2</td><td class="n">300</td><td class="n">20</td>' in body
 
 
-def test_coverage_is_not_claimed_and_residuals_are_told():
+def test_coverage_is_not_claimed_and_residuals_are_reported():
     residual = SkinMap(np.full((20, 30), 0.25), "1")
     body = page.fragment(verdict.unjudged(maps(residual=residual)))
     assert "is not claimed here" in body
@@ -38,7 +38,7 @@ def test_pixels_without_a_value_are_counted():
     assert '<td class="n">25</td>' in body
 
 
-def test_maps_without_any_error_of_their_own_say_nothing_in_numbers():
+def test_maps_without_errors_report_no_numbers():
     picture = SkinMap(np.ones((4, 4, 3)), "1")
     body = page.fragment(verdict.unjudged(SkinAppearance({"picture": picture}, "measured")))
     assert "<table" not in body

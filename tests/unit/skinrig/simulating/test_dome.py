@@ -19,7 +19,7 @@ DOME = load_rig("dome")
 SMALL_POSES = 10
 
 
-def test_what_is_kept_of_a_dome_is_spread_evenly():
+def test_reduced_dome_lights_are_evenly_distributed():
     places = np.array([light.position_mm for light in DOME.lights])
     way = places / np.linalg.norm(places, axis=1)[:, None]
     chosen = farthest_point_sample(places, 24)
@@ -43,7 +43,7 @@ def test_simulating_a_dome_loads_nothing_that_only_evaluates():
     assert run.returncode == 0, run.stderr
 
 
-def test_a_small_dome_keeps_its_names_and_fields_of_view():
+def test_small_dome_keeps_names_and_fields_of_view():
     small = small_dome(DOME, lights=12, views=3, width_px=130)
     assert {light.name for light in small.lights} <= {light.name for light in DOME.lights}
     for view in small.views:
@@ -80,7 +80,7 @@ def test_a_targets_session_is_complete_and_sound(tmp_path):
     assert min(changes) > 2.0 * noise
 
 
-def test_a_simulation_goes_on_where_it_was_stopped_with_the_same_settings_only(tmp_path):
+def test_simulation_resumes_only_with_same_settings(tmp_path):
     class Enough(Exception):
         pass
 
@@ -110,18 +110,18 @@ def test_a_simulation_goes_on_where_it_was_stopped_with_the_same_settings_only(t
         ({"seed": -1}, "seed"),
     ],
 )
-def test_what_the_dome_cannot_do_is_refused_before_a_folder_is_made(tmp_path, more, match):
+def test_unsupported_dome_options_are_refused_before_folder_creation(tmp_path, more, match):
     with pytest.raises(SimulationError, match=match):
         simulate_session("dome", tmp_path / "s", **more)
     assert not (tmp_path / "s").exists()
 
 
-def test_the_flash_rig_knows_no_lights_to_choose(tmp_path):
+def test_flash_rig_refuses_choice_of_lights(tmp_path):
     with pytest.raises(SimulationError, match="lights: the flash rig knows nothing of it"):
         simulate_session("flash", tmp_path / "s", lights=12)
 
 
-def test_flicker_and_dose_are_said_before_anything_is_captured(tmp_path, capsys):
+def test_flicker_and_dose_are_reported_before_capture(tmp_path, capsys):
     assert main(["capture", "dome", "--dry-run"]) == 0
     said = capsys.readouterr()
     text = said.out + said.err
@@ -135,7 +135,7 @@ def test_flicker_and_dose_are_said_before_anything_is_captured(tmp_path, capsys)
     assert lines[1].startswith("light dose: at most 0 Ws")
 
 
-def test_a_plan_for_closed_eyes_says_so():
+def test_plan_requiring_closed_eyes_is_reported():
     from capture.plan.dome import dome_plan
 
     plan = dome_plan(DOME, order=list(range(150)), tracking_every=0)
@@ -143,7 +143,7 @@ def test_a_plan_for_closed_eyes_says_so():
     assert "must be closed or shielded" in light_lines(plan, DOME)[0]
 
 
-def test_nonsense_about_the_eyes_is_refused(capsys):
+def test_invalid_eye_options_are_refused(capsys):
     assert main(["capture", "dome", "--dry-run", "--eyes", "shut"]) == 3
     assert "open, closed, shielded" in capsys.readouterr().err
 
@@ -151,7 +151,7 @@ def test_nonsense_about_the_eyes_is_refused(capsys):
 @pytest.mark.render
 @pytest.mark.long
 @pytest.mark.timeout(300)
-def test_a_faces_session_holds_a_scan_and_its_truth_lies_beside(tmp_path):
+def test_face_session_contains_scan_and_separate_truth(tmp_path):
     from model import store
 
     done = simulate_session(

@@ -8,7 +8,7 @@ from skinrig.simulating.orders import SimulationError
 from skinrig.simulating.simulation import simulate_session
 
 
-def test_where_a_face_stands_is_in_its_session_and_its_truth(tmp_path):
+def test_face_position_is_in_session_and_truth(tmp_path):
     done = simulate_session(
         "flash",
         tmp_path / "session-far",
@@ -36,15 +36,13 @@ def test_where_a_face_stands_is_in_its_session_and_its_truth(tmp_path):
         ("probe", {"nearer_mm": 9.0}, "the probe rig knows nothing of it"),
     ],
 )
-def test_a_place_that_no_face_can_stand_at_is_refused_before_a_folder_is_made(
-    tmp_path, rig, asked, told
-):
+def test_impossible_face_position_is_refused_before_folder_creation(tmp_path, rig, asked, told):
     with pytest.raises(SimulationError, match=f"^nearer: .*{told}"):
         simulate_session(rig, tmp_path / "session", width_px=64, **asked)
     assert not (tmp_path / "session").exists()
 
 
-def test_a_sequence_has_no_place_of_its_own(tmp_path):
+def test_sequence_has_no_own_position(tmp_path):
     from skinrig.capturing.sequences import SequenceOrder
 
     order = SequenceOrder(state="smile")

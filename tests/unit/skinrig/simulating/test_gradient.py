@@ -16,7 +16,7 @@ from skinrig.simulating.simulation import simulate_session
 RIG = load_rig("gradient")
 
 
-def test_patterns_on_skin_want_eyes_closed_or_shielded_whatever_the_figures_say():
+def test_patterns_on_skin_require_closed_or_shielded_eyes():
     plan = gradient_plan(RIG, angles=[0])
     figures = light_figures(plan, RIG)
     assert figures["flashes_per_s"] < RIG.leds.max_flashes_per_s
@@ -28,19 +28,19 @@ def test_patterns_on_skin_want_eyes_closed_or_shielded_whatever_the_figures_say(
     assert last.startswith("patterns: 0.50 s of light a state")
 
 
-def test_targets_of_the_sphere_may_be_seen():
+def test_sphere_targets_may_be_viewed_with_open_eyes():
     for target in ("ball", "flat", "dark"):
         figures = light_figures(gradient_calibration_plan(RIG, target), RIG)
         assert figures["open_eyes"] == "allowed", target
         assert "state_s" not in figures
 
 
-def test_a_plan_of_skin_needs_both_boxes_and_one_of_a_target_the_sphere():
+def test_skin_plan_needs_both_controllers_target_plan_sphere():
     assert needed_boxes(RIG, choose_plan(RIG, None, None)) == ("gradient_sphere", "caliper")
     assert needed_boxes(RIG, choose_plan(RIG, None, "ball")) == ("gradient_sphere",)
 
 
-def test_angles_and_steps_are_read_from_the_command_line():
+def test_angles_and_steps_are_parsed_from_command_line():
     plan = choose_plan(
         RIG, None, None, angles=parse_floats("0,90", ""), steps=parse_range("-1..2", "")
     )
@@ -51,13 +51,13 @@ def test_angles_and_steps_are_read_from_the_command_line():
 
 
 @pytest.mark.parametrize("text", ["-2", "2..", "a..b", "..", "1,2"])
-def test_a_range_that_is_none_is_a_usage_error(text):
+def test_invalid_range_is_usage_error(text):
     with pytest.raises(UsageError, match=r"--steps: got .* expected FIRST\.\.LAST"):
         parse_range(text, "--steps")
 
 
 @pytest.mark.parametrize("text", ["", "x", "0,,90", "0;90"])
-def test_angles_that_are_none_are_a_usage_error(text):
+def test_invalid_angles_are_usage_error(text):
     with pytest.raises(UsageError, match="--angles"):
         parse_floats(text, "--angles")
 
@@ -71,7 +71,7 @@ def test_angles_are_for_skin_in_a_caliper_only(tmp_path):
         choose_plan(RIG, tmp_path / "plan.json", None, steps=(0, 1))
 
 
-def test_skin_is_drawn_large_enough_for_the_field_in_every_state():
+def test_skin_patch_covers_field_in_every_state():
     rig = RIG.cropped(32)
     one = make_scene(rig, plan=gradient_plan(rig, angles=[0]))
     every = make_scene(rig, plan=gradient_plan(rig))
@@ -99,7 +99,7 @@ def test_targets_are_simulated_without_a_truth(target, tmp_path):
         ({"steps": (1, 2)}, "steps"),
     ],
 )
-def test_what_the_rig_does_not_know_is_refused_before_anything_is_made(more, match, tmp_path):
+def test_options_unknown_to_rig_are_refused_at_once(more, match, tmp_path):
     out = tmp_path / "session-no"
     with pytest.raises(ValueError, match=match):
         simulate_session("gradient", out, width_px=32, **more)
@@ -109,6 +109,6 @@ def test_what_the_rig_does_not_know_is_refused_before_anything_is_made(more, mat
 @pytest.mark.parametrize(
     ("rig", "more"), [("flash", {"site": "chin"}), ("dome", {"steps": (0, 1)})]
 )
-def test_other_rigs_know_nothing_of_a_caliper(rig, more, tmp_path):
+def test_other_rigs_refuse_caliper_options(rig, more, tmp_path):
     with pytest.raises(SimulationError, match="knows nothing of it"):
         simulate_session(rig, tmp_path / "session-no", **more)

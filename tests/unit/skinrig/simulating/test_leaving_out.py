@@ -20,7 +20,7 @@ def test_every_name_is_an_effect_that_scenes_take(rig):
         assert list(asked.values()).count(False) == 1
 
 
-def test_effects_left_out_of_the_flash_rig_are_told_under_their_names(tmp_path):
+def test_omitted_flash_effects_are_reported_by_name(tmp_path):
     rig = load_rig("flash").resized(48)
     asked = {"width_px": 48, "plan": flash_plan(rig), "leave_out": ("subsurface", "optics")}
     made = simulate_session("flash", tmp_path / "s", **asked)
@@ -42,7 +42,7 @@ def test_effects_left_out_of_the_flash_rig_are_told_under_their_names(tmp_path):
         ("dome", {"leave_out": ("optics",), "target": "white"}, "not of a target"),
     ],
 )
-def test_what_cannot_be_left_out_is_refused_before_a_folder_is_made(tmp_path, rig, more, match):
+def test_invalid_omission_is_refused_before_folder_creation(tmp_path, rig, more, match):
     with pytest.raises(SimulationError, match=match):
         simulate_session(rig, tmp_path / "s", **more)
     assert not (tmp_path / "s").exists()

@@ -43,9 +43,7 @@ def pixels(folder):
 
 
 @pytest.mark.parametrize(("rig", "count"), [("flash", 2), ("dome", 3), ("dome", 8), ("probe", 3)])
-def test_a_resumed_session_holds_the_pixels_of_one_that_was_not_stopped(
-    tmp_path, monkeypatch, rig, count
-):
+def test_resumed_session_has_pixels_of_uninterrupted_session(tmp_path, monkeypatch, rig, count):
     simulate_session(rig, tmp_path / "whole", **ASKED[rig])
     with monkeypatch.context() as patch:
         commit_only(patch, count)
@@ -62,9 +60,7 @@ def test_a_resumed_session_holds_the_pixels_of_one_that_was_not_stopped(
         np.testing.assert_array_equal(parts[key], frame, err_msg=str(key))
 
 
-def test_no_two_shots_of_skin_in_a_caliper_that_is_taped_anew_share_their_noise(
-    tmp_path, monkeypatch
-):
+def test_shots_of_retaped_caliper_skin_have_independent_noise(tmp_path, monkeypatch):
     from rigsim.world.world import World
 
     asked = {"width_px": 32, "angles": (0.0,), "steps": (-1, 1)}
@@ -93,7 +89,7 @@ def test_no_two_shots_of_skin_in_a_caliper_that_is_taped_anew_share_their_noise(
     assert len(set(seeds)) == len(seeds)
 
 
-def test_a_server_that_goes_on_does_not_give_the_noise_of_its_first_shots_again():
+def test_running_server_does_not_repeat_first_shot_noise():
     """Frames of no scene are noise alone, drawn by the number of the shot.
 
     The camera of the gradient rig reads out in milliseconds; one with a flash takes five seconds.
@@ -120,7 +116,7 @@ def test_a_server_that_goes_on_does_not_give_the_noise_of_its_first_shots_again(
     assert (after != second).any()
 
 
-def test_a_new_session_begins_at_none(tmp_path):
+def test_new_session_starts_at_shot_zero(tmp_path):
     simulate_session("flash", tmp_path / "s", **ASKED["flash"])
     session = Session.open(tmp_path / "s")
     assert shots_made(session) == {"cam": len(session.frames())}

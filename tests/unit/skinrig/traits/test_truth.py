@@ -11,7 +11,7 @@ from skinrig.traits.truth import CommonFaces
 PEOPLE = table_1()
 
 
-def test_each_condition_is_given_to_as_many_people_and_replaces_what_they_wore():
+def test_conditions_are_assigned_equally_replacing_earlier_ones():
     names = ("normal", "lotion", "powder")
     given = trait_truth.assigned(PEOPLE[:60], names, rng=np.random.default_rng(0))
     labels = trait_truth.labels_of(given, names[1:])
@@ -21,7 +21,7 @@ def test_each_condition_is_given_to_as_many_people_and_replaces_what_they_wore()
         assert dataclasses.replace(one, applied=other.applied) == other
 
 
-def test_directions_are_even_over_the_cap_above_the_horizon():
+def test_directions_are_uniform_over_cap_above_horizon():
     found = trait_truth.directions((20_000,), rng=np.random.default_rng(0))
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-12)
     assert found[:, 2].min() >= trait_truth.MIN_SAMPLED_COSINE
@@ -29,14 +29,14 @@ def test_directions_are_even_over_the_cap_above_the_horizon():
     assert found[:, 2].mean() == pytest.approx(0.56, abs=4 * 0.0018)
 
 
-def test_a_trait_that_is_none_changes_no_light():
+def test_zero_trait_changes_no_light():
     people = [dataclasses.replace(PEOPLE[0], applied=())]
     rng = np.random.default_rng(0)
     same = trait_truth.lobe_changes(people, {"worn": people}, points=3, pairs=50, rng=rng)["worn"]
     assert np.abs(same.radiance).max() < 1e-12
 
 
-def test_lotion_sharpens_what_the_surface_reflects():
+def test_lotion_sharpens_surface_reflection():
     people = [dataclasses.replace(PEOPLE[0], applied=())]
     worn = [dataclasses.replace(PEOPLE[0], applied=(("lotion", 1.0),))]
     change = trait_truth.lobe_changes(
@@ -55,7 +55,7 @@ def test_lotion_sharpens_what_the_surface_reflects():
     assert change.cosine(sharp - wide, basis) > 0.5 > 0.0 > change.cosine(wide - sharp, basis)
 
 
-def test_faces_of_different_heads_lie_on_each_other_in_the_common_map():
+def test_faces_of_different_heads_align_in_common_map():
     people = [next(p for p in PEOPLE if p.head == head) for head in (0, 1, 2)]
     faces = CommonFaces.of(people, size=64, common=48)
     seen = [faces.albedo(p, noise=0.0, rng=np.random.default_rng(0)) for p in people]

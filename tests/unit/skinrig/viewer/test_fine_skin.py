@@ -13,7 +13,7 @@ from skinrig.viewer import packing as arrays
 from skinrig.viewer.fine_skin import FineSkin
 
 
-def test_fine_maps_are_those_of_the_person_at_that_size():
+def test_fine_maps_match_person_at_that_size():
     person = make_subject("II", seed=2, size=64)
     whole = make_subject("II", seed=2, size=128)
     skin = FineSkin(person, 128)
@@ -28,7 +28,7 @@ def test_fine_maps_are_those_of_the_person_at_that_size():
 
 
 @pytest.mark.parametrize("count", [0, 1, 5, 200_000])
-def test_parts_come_out_of_one_member_as_they_went_in(count, rng):
+def test_gzipped_parts_are_recovered_from_single_member(count, rng):
     noise = rng.integers(0, 256, count, dtype=np.uint8).tobytes()
     steps = rng.choice(np.array([0, 0, 0, 1, 255], np.uint8), 3 * count).tobytes()
     text = b"vertex of a face, " * count
@@ -43,7 +43,7 @@ def test_parts_come_out_of_one_member_as_they_went_in(count, rng):
     assert reader.unused_data == b""
 
 
-def test_noise_packs_no_larger_than_by_searching_for_repetitions(rng):
+def test_noise_packs_as_small_as_with_repetition_search(rng):
     noise = np.clip(rng.normal(128.0, 6.0, 300_000), 0, 255).astype(np.uint8).tobytes()
     assert len(arrays.gzipped([noise])) <= len(gzip.compress(noise, 9))
     repeated = noise[:1000] * 300

@@ -72,7 +72,7 @@ def test_a_patch_bends_on_as_the_surface_does(scan):
         assert (outward > 0.0).all()
 
 
-def test_patches_get_charts_of_their_own_that_lie_apart(scan):
+def test_patches_get_own_separate_charts(scan):
     closed = patch_charts.closed(scan)
     assert closed.left_open_mm == ()
     new = closed.mesh.uv[len(scan.uv) :]
@@ -113,7 +113,7 @@ def test_measured_colors_continue_linearly_into_patches(scan):
     assert not changed[rows, columns].any()
 
 
-def test_a_texture_without_room_leaves_a_hole_open_and_says_so(scan):
+def test_texture_without_room_leaves_hole_open_and_reports(scan):
     wide = (scan.uv - scan.uv.min()) / np.ptp(scan.uv)
     full = build_mesh(scan.vertices_mm, scan.faces, wide)
     corners = np.array([[-90, -90, -60], [90, -90, -60], [90, 90, -60], [-90, 90, -60]], np.float32)

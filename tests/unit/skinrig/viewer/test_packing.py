@@ -43,7 +43,7 @@ def test_text_gives_its_bytes_back(count, rng):
     assert not {chr(code) for code in page.UNSAFE_CODES} & set(text)
 
 
-def test_text_of_bytes_that_are_all_unsafe_is_safe_and_small():
+def test_text_of_only_unsafe_bytes_is_safe_small():
     for fill in (0, 255):
         text = page.as_text(bytes([fill]) * 7001)
         assert not {chr(code) for code in page.UNSAFE_CODES} & set(text)
@@ -73,7 +73,7 @@ def test_a_constant_texture_is_exact():
     np.testing.assert_array_equal(packing.dequantize(words, low, high), values)
 
 
-def test_a_coarse_finest_octave_keeps_means_and_states_its_error(rng):
+def test_coarse_finest_octave_keeps_means_and_states_error(rng):
     smooth = np.add.outer(np.sin(np.arange(64) / 9.0), np.cos(np.arange(64) / 7.0))
     values = (smooth + 0.1 * rng.normal(size=(64, 64)))[..., None].astype(np.float32)
     step = float(np.ptp(values)) / 255.0
@@ -109,7 +109,7 @@ def test_the_same_scene_gives_the_same_bytes(rng):
     assert other.payload != first.payload
 
 
-def test_arrays_lie_where_the_header_says(rng):
+def test_arrays_are_at_offsets_in_header(rng):
     values = rng.normal(size=(8, 8, 1)).astype(np.float32)
     packed = packing.pack(_scene(noise=Texture(values, "f32")))
     entry = packed.header["textures"]["noise"]["data"]
@@ -123,12 +123,12 @@ def test_arrays_lie_where_the_header_says(rng):
     np.testing.assert_array_equal(found[::-1], values)  # the page's row 0 is the bottom
 
 
-def test_blend_shapes_are_kept_to_a_quarter_of_a_micrometer():
+def test_blend_shapes_are_quantized_to_quarter_micrometer():
     packed = as_packed(_scene()).mesh.shapes["smile"]
     assert np.abs(packed - _scene().mesh.shapes["smile"]).max() <= 0.5 * packing.SHAPE_STEP_MM
 
 
-def test_vertices_at_one_place_share_a_normal():
+def test_vertices_at_same_position_share_normal():
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 0]], np.float32)
     assert packing.welded(points).tolist() == [0, 1, 0]
 
@@ -143,7 +143,7 @@ def test_vertices_at_one_place_share_a_normal():
         ({"values": np.zeros((4, 4, 1), np.float32), "storage": "u4"}, "unknown"),
     ],
 )
-def test_a_texture_that_is_none_is_refused(texture, what):
+def test_invalid_texture_is_refused(texture, what):
     with pytest.raises(SceneError, match=what):
         Texture(**texture)
 

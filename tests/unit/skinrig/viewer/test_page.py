@@ -40,7 +40,7 @@ def _inline(text):
     return re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
 
 
-def test_a_page_allows_its_own_script_and_style_and_no_network(scene):
+def test_page_allows_own_script_and_style_without_network(scene):
     text = page.build(scene)
     policy = _policy(text)
     assert "default-src 'none'" in policy
@@ -63,18 +63,18 @@ def test_the_same_scene_gives_the_same_page(scene):
     assert page.build(scene) == page.build(scene)
 
 
-def test_every_script_is_packed_and_the_starter_comes_last():
+def test_every_script_is_packed_and_starter_is_last():
     found = {entry.name for entry in page._files("js", ".js")}
     assert found == {f"{name}.js" for name in page.SCRIPT_NAMES}
     assert page.SCRIPT_NAMES[0] == "graph"
     assert page.SCRIPT_NAMES[-1] == "main"
 
 
-def test_comments_are_left_out_of_the_page_and_code_is_not():
+def test_comments_are_removed_from_page_but_code_kept():
     assert page._bare("  // why\n  a = 'x // y';\n\tb();\n") == "a = 'x // y';\nb();\n"
 
 
-def test_a_page_replaces_an_older_one_whole(scene, tmp_path):
+def test_page_replaces_older_page_completely(scene, tmp_path):
     out = tmp_path / "deep" / "face.html"
     first = page.write(scene, out)
     assert out.stat().st_size == first["bytes"]
@@ -82,7 +82,7 @@ def test_a_page_replaces_an_older_one_whole(scene, tmp_path):
     assert sorted(p.name for p in out.parent.iterdir()) == ["face.html"]
 
 
-def test_a_page_that_cannot_be_packed_leaves_the_older_one(scene, tmp_path, monkeypatch):
+def test_page_with_failed_packing_leaves_older_page(scene, tmp_path, monkeypatch):
     out = tmp_path / "face.html"
     out.write_text("older")
 
@@ -97,17 +97,17 @@ def test_a_page_that_cannot_be_packed_leaves_the_older_one(scene, tmp_path, monk
 
 
 @pytest.mark.parametrize("size", [32, 8192])
-def test_a_size_that_no_page_can_hold_is_refused(size):
+def test_size_too_large_for_page_is_refused(size):
     with pytest.raises(SceneError, match="expected 64 to 4096"):
         faces.scene(size=size)
 
 
-def test_landmarks_without_a_picture_are_refused(tmp_path):
+def test_landmarks_without_image_are_refused(tmp_path):
     with pytest.raises(SceneError, match="name the folder"):
         faces.scene(landmarks=tmp_path / "landmarks.csv")
 
 
-def test_maps_that_no_face_can_wear_are_refused_with_what_makes_them(tmp_path):
+def test_maps_unusable_on_face_are_refused_with_remedy(tmp_path):
     from model import store
 
     flat = SkinAppearance(

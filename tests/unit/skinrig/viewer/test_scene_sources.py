@@ -22,7 +22,7 @@ STATES = ("smile", "exercise")
 SIZE = 128
 
 
-def test_missing_texels_continue_what_is_beside_them(rng):
+def test_missing_texels_continue_their_neighbors(rng):
     values = rng.uniform(1.0, 2.0, (32, 32))
     valid = np.ones((32, 32), bool)
     valid[:, 20:] = False
@@ -80,7 +80,7 @@ def folder(subject, tmp_path_factory):
     return root
 
 
-def test_blood_drawn_on_a_picture_comes_to_lie_where_it_was_on_the_face(subject, folder):
+def test_blood_from_image_maps_to_its_face_position(subject, folder):
     appearance, _ = dynamic_appearance.read(folder / "appearance")
     source = SceneSource(
         "dynamic",
@@ -115,17 +115,17 @@ def test_blood_drawn_on_a_picture_comes_to_lie_where_it_was_on_the_face(subject,
     assert found.facts["leave_one_out_px"] < 1.0
 
 
-def test_a_picture_that_nothing_places_is_refused_with_what_to_give(folder):
+def test_image_without_landmarks_is_refused_with_remedy(folder):
     with pytest.raises(SceneError, match="--landmarks FILE"):
         procedural.scene([folder / "appearance"], size=64)
 
 
-def test_two_folders_of_one_kind_are_refused(folder):
+def test_two_folders_of_same_kind_are_refused(folder):
     with pytest.raises(SceneError, match="same kind"):
         procedural.scene([folder / "appearance", folder / "appearance"], size=64)
 
 
-def test_a_mesh_that_reaches_out_of_its_texture_is_refused(tmp_path):
+def test_mesh_reaching_outside_texture_is_refused(tmp_path):
     np.savez(
         tmp_path / "face.npz",
         vertices_mm=np.array([[0, 0, 0], [90, 0, 0], [0, 90, 0]], np.float32),
@@ -138,5 +138,5 @@ def test_a_mesh_that_reaches_out_of_its_texture_is_refused(tmp_path):
         procedural.load_mesh(tmp_path / "face.npz")
 
 
-def test_a_folder_says_its_schema(folder):
+def test_folder_states_its_schema(folder):
     assert store.read_document(folder / "appearance").parameters["kind"] == "dynamic"

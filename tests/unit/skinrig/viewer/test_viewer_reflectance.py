@@ -47,7 +47,7 @@ def traits(face):
     return found
 
 
-def test_the_chosen_table_is_within_its_bound_and_the_next_coarser_one_is_not(face):
+def test_chosen_table_meets_bound_and_next_coarser_misses(face):
     found = reflectance_assets.chosen_table(face.lobes)
     assert max(found.rms_error, found.strong_error) <= reflectance_assets.MAX_FORM_ERROR
     coarser = reflectance_assets.TRIED_SLABS[reflectance_assets.TRIED_SLABS.index(found.slabs) - 1]
@@ -56,7 +56,7 @@ def test_the_chosen_table_is_within_its_bound_and_the_next_coarser_one_is_not(fa
     assert max(reflectance_assets.table_errors(back, table)) > reflectance_assets.MAX_FORM_ERROR
 
 
-def test_factors_as_good_as_the_table_need_more_look_ups(face, forms):
+def test_factors_as_accurate_as_table_need_more_lookups(face, forms):
     found = reflectance_assets.chosen_table(face.lobes)
     factors = [one for one in forms if one.lookups <= found.lookups]
     assert all(one.rms_error > found.rms_error for one in factors)
@@ -69,7 +69,7 @@ def test_errors_of_factors_fall_with_their_rank(forms):
     assert by_rank[8] < by_rank[2] < by_rank[1]
 
 
-def test_an_atlas_holds_each_lobe_at_its_place(face):
+def test_atlas_stores_each_lobe_at_its_position(face):
     found = reflectance_assets.chosen_table(face.lobes)
     image = reflectance_assets.atlas(found)
     assert image.shape == (found.slabs * 32, 90, 4)
@@ -84,7 +84,7 @@ def test_lambertian_lobes_need_no_slabs():
     assert reflectance_assets.chosen_table(flat).slabs == 1
 
 
-def test_slabs_that_do_not_divide_the_nodes_are_refused(face):
+def test_slabs_not_dividing_nodes_are_refused(face):
     with pytest.raises(ValueError, match="slabs: got 5"):
         reflectance_assets.in_slabs(face.lobes.table.astype(np.float64), 5)
 
@@ -108,7 +108,7 @@ def _dipole_edge(x_mm: float, channel: int) -> float:
     return float((dy[lit] @ values @ dy) / R_D[channel])
 
 
-def test_gaussians_spread_an_edge_of_light_as_the_dipole_does():
+def test_gaussians_blur_light_edge_like_dipole():
     found = gaussian_profiles.fit(R_D, SIGMA_TR)
     spread = np.sqrt(2.0 * found.variances_mm2)
     for x in (0.0, 0.3, 1.0, 3.0):
@@ -118,13 +118,13 @@ def test_gaussians_spread_an_edge_of_light_as_the_dipole_does():
             assert abs(edge - expected) < 0.004, (x, channel)
 
 
-def test_one_gaussian_misses_the_edge_by_far_more_than_four():
+def test_single_gaussian_misses_edge_far_more_than_four():
     one, four = (gaussian_profiles.fit(R_D, SIGMA_TR, count=n) for n in (1, 4))
     assert one.edge_error.max() > 0.05
     assert four.edge_error.max() < 0.002
 
 
-def test_even_light_stays_as_it_is_and_red_spreads_farther_than_blue():
+def test_uniform_light_is_kept_and_red_spreads_farthest():
     found = gaussian_profiles.fit(R_D, SIGMA_TR)
     np.testing.assert_allclose(found.weights.sum(axis=0), 1.0, atol=1e-12)
     assert (found.weights >= 0.0).all()
@@ -141,12 +141,12 @@ def test_a_profile_scales_with_the_translucency():
 @pytest.mark.parametrize(
     ("r_d", "sigma_tr"), [([0.0, 0.3, 0.3], [1, 1, 1]), ([0.3, 0.3, 0.3], [1, 0, 1])]
 )
-def test_skin_that_cannot_be_is_refused(r_d, sigma_tr):
+def test_invalid_skin_is_refused(r_d, sigma_tr):
     with pytest.raises(SceneError, match="above 0"):
         gaussian_profiles.fit(r_d, sigma_tr)
 
 
-def test_traits_bring_lobes_and_leave_the_face_s_own_bit_for_bit(face, traits):
+def test_traits_add_lobes_and_keep_face_bit_exactly(face, traits):
     found = traits
     assert found.lobes.lobes.size > 3
     np.testing.assert_array_equal(found.lobes.lobes.table[..., :3], face.lobes.table[..., :3])
@@ -154,14 +154,14 @@ def test_traits_bring_lobes_and_leave_the_face_s_own_bit_for_bit(face, traits):
     assert not found.lobes.shares[..., 3:].any()
 
 
-def test_no_trait_leaves_shares_alone(traits):
+def test_zero_traits_keep_weights(traits):
     found = traits
     rows = found.lobes.shares.reshape(-1, found.lobes.lobes.size)
     np.testing.assert_array_equal(found.projected(rows, {}), rows)
 
 
 @pytest.mark.parametrize("name", ["lotion", "powder", "sweat"])
-def test_the_page_s_traits_are_the_editor_s_within_the_stated_error(traits, name):
+def test_page_traits_match_editor_within_stated_error(traits, name):
     found = traits
     space = trait_storage.default().spaces["surface"]
     rows = found.lobes.shares.reshape(-1, found.lobes.lobes.size).astype(np.float64)
@@ -192,7 +192,7 @@ def test_traits_of_other_materials_are_left_out(face):
     assert trait_assets.surface_traits(others) is None
 
 
-def test_opposite_traits_have_one_slider_and_chance_has_none():
+def test_opposite_traits_share_slider_chance_traits_have_none():
     traits = trait_storage.default().spaces["albedo"].traits
     names = trait_assets.distinct_from_chance(traits)
     assert "caucasian" not in names
@@ -200,7 +200,7 @@ def test_opposite_traits_have_one_slider_and_chance_has_none():
     assert "tan" in names
 
 
-def test_a_face_without_fits_shows_the_population_and_says_so(procedural_source):
+def test_face_without_fits_shows_population_and_reports(procedural_source):
     found = reflectance_assets.lobes_of(procedural_source)
     assert found.origin == "population"
     assets = reflectance_assets.assemble(procedural_source, found)
@@ -219,7 +219,7 @@ def procedural_source() -> SceneSource:
     return SceneSource("procedural", mesh, 64, 0, None, None)
 
 
-def test_filling_keeps_what_is_known_and_continues_it():
+def test_filling_keeps_known_values_and_extends_them():
     values = np.zeros((16, 16, 1), np.float32)
     valid = np.zeros((16, 16), bool)
     valid[:, :8], values[:, :8] = True, 3.0
@@ -229,7 +229,7 @@ def test_filling_keeps_what_is_known_and_continues_it():
     np.testing.assert_allclose(coarse, 3.0, rtol=1e-5)
 
 
-def test_presets_name_only_what_a_face_has():
+def test_presets_name_only_available_face_parts():
     found = faces.presets(["anger", "surprise", "exercise"])
     assert list(found) == [
         "neutral",

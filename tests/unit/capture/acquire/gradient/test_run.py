@@ -169,7 +169,7 @@ def test_every_frame_shows_its_pattern_and_its_state(make):
     assert verify(bench.session.path).ok
 
 
-def test_a_frame_says_what_the_caliper_read_and_felt(make):
+def test_frame_records_caliper_reading_and_force(make):
     bench = make()
     bench.run()
     forces = {}
@@ -186,7 +186,7 @@ def test_a_frame_says_what_the_caliper_read_and_felt(make):
     assert bench.session.read(record).light["pattern"] == "x"
 
 
-def test_the_skin_has_stretched_by_less_than_the_reading_says(make):
+def test_skin_stretch_is_below_caliper_reading(make):
     """The frames' own grip differs from the caliper's reading: neither may stand for the other."""
     bench = make()
     bench.run()
@@ -203,7 +203,7 @@ def test_each_angle_is_taped_by_itself(make):
 
 
 @pytest.mark.long
-def test_a_whole_plan_ends_where_skin_buckles_and_comes_off_at_every_angle(make):
+def test_full_plan_ends_at_buckling_detachment_every_angle(make):
     bench = make(gradient_plan(RIG))
     bench.run()
     assert bench.session.todo() == []
@@ -217,7 +217,7 @@ def test_a_whole_plan_ends_where_skin_buckles_and_comes_off_at_every_angle(make)
     assert verify(bench.session.path).ok
 
 
-def test_a_capture_takes_the_time_that_its_plan_says_and_that_of_finding_home(make):
+def test_capture_takes_planned_time_plus_homing(make):
     bench = make(short(patterns=LIGHT_PATTERNS))
     homing = []
     honest = bench.caliper.home
@@ -234,7 +234,7 @@ def test_a_capture_takes_the_time_that_its_plan_says_and_that_of_finding_home(ma
     assert 1.0 < (bench.world.now - sum(homing)) / bench.plan.estimated_s(RIG) < 1.6
 
 
-def test_a_scan_goes_by_in_the_time_that_the_plan_gives_it(make):
+def test_scan_takes_planned_time(make):
     bench = make(short(steps=(0, 0), patterns=LIGHT_PATTERNS))
     bench.run()
     times = [r.line.t_box_s for r in bench.session.frames("gradient")]
@@ -256,7 +256,7 @@ def test_targets_need_neither_caliper_nor_force(make, target):
 # how far skin goes ----------------------------------------------------------------------------
 
 
-def test_compression_ends_where_the_skin_buckles_and_stretching_where_it_comes_off(make):
+def test_compression_ends_at_buckling_and_stretching_at_detachment(make):
     bench = make(short(steps=(-4, 8), patterns=["full"]))
     bench.run()
     reached = check_frames(bench.session)  # no frame of buckled skin is among them
@@ -277,7 +277,7 @@ def test_compression_ends_where_the_skin_buckles_and_stretching_where_it_comes_o
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_no_frame_of_buckled_skin_is_kept_of_any_subject(make, seed):
+def test_frames_of_buckled_skin_are_never_kept(make, seed):
     bench = make(short(steps=(-4, 0), patterns=["full"]), seed=seed)
     bench.run()
     check_frames(bench.session)
@@ -295,7 +295,7 @@ def test_buckled_skin_would_show_without_the_watch(make, monkeypatch):
         check_frames(bench.session)
 
 
-def test_the_force_limit_ends_a_way_and_no_other(make):
+def test_force_limit_ends_only_its_own_direction(make):
     bench = make(short(steps=(-1, 6), patterns=["full"]))
     bench.run(force_limit_n=0.25)
     reached = check_frames(bench.session)
@@ -306,7 +306,7 @@ def test_the_force_limit_ends_a_way_and_no_other(make):
     assert bench.session.todo() == []
 
 
-def test_skin_that_comes_off_at_the_first_step_leaves_neutral_and_compression(make):
+def test_skin_detached_at_first_step_keeps_neutral_compression(make):
     bench = make(short(steps=(-1, 3), patterns=["full"]))
     law = bench.world.skin.mechanics
     bench.world.skin._fixed = dataclasses.replace(law, detaches_at=1.05)
@@ -325,7 +325,7 @@ PUSHES = [  # force at neutral and at each step, and the first step that is not 
 
 
 @pytest.mark.parametrize(("forces", "first"), PUSHES)
-def test_skin_has_buckled_where_its_push_grows_no_more(forces, first):
+def test_skin_buckles_where_push_force_stops_growing(forces, first):
     watch = ForceWatch(RIG.caliper, -1, at_rest_n=forces[0])
     found = None
     for k, force_n in enumerate(forces[1:], 1):
@@ -357,7 +357,7 @@ def kill_at_commit(bench, number):
 
 
 @pytest.mark.parametrize("number", [1, 2, 5, 8, 11, 14, 25])
-def test_a_capture_is_resumed_wherever_it_was_cut(make, number):
+def test_capture_resumes_after_any_interruption(make, number):
     bench = make(short(steps=(-1, 2)))
     kill_at_commit(bench, number)
     with pytest.raises(Killed):
@@ -387,7 +387,7 @@ def _first(bench, number):
     return set(order[: number - 1])
 
 
-def test_a_new_taping_is_counted_and_its_neutral_pictured(make):
+def test_new_taping_is_counted_and_its_neutral_imaged(make):
     bench = make(short(steps=(-1, 1)))
     kill_at_commit(bench, 1 + 6 + 6 + 3)  # in the middle of a000_p1
     with pytest.raises(Killed):
@@ -404,7 +404,7 @@ def test_a_new_taping_is_counted_and_its_neutral_pictured(make):
     assert (frame.cfa[2, 1], frame.cfa[2, 2], frame.cfa[2, 3]) == (1000, 1000, 1)
 
 
-def test_how_far_the_skin_went_is_known_after_a_resume(make):
+def test_skin_travel_limits_are_restored_after_resume(make):
     bench = make(short(steps=(-4, 1), patterns=["full"]))
     honest = bench.session.leave_out
 
@@ -442,7 +442,7 @@ def test_a_stop_between_states_ends_dark_and_released(make):
     check_frames(bench.session)
 
 
-def test_a_lost_box_ends_dark_and_released_and_what_was_kept_is_safe(make):
+def test_lost_controller_ends_dark_released_keeps_captured_frames(make):
     bench = make(short(steps=(-2, 2)), unplug_after=6.0)
     with pytest.raises(LinkLost):
         bench.run()
@@ -466,7 +466,7 @@ def test_a_lost_box_ends_dark_and_released_and_what_was_kept_is_safe(make):
     ],
     ids=lambda faults: next(iter(faults)),
 )
-def test_whatever_goes_wrong_every_kept_frame_is_the_right_one(make, faults):
+def test_kept_frames_are_correct_under_any_fault(make, faults):
     bench = make(short(steps=(-1, 1)), **faults)
     done = bench.run()
     assert bench.session.todo() == []
@@ -477,7 +477,7 @@ def test_whatever_goes_wrong_every_kept_frame_is_the_right_one(make, faults):
         assert done.stale > 0
 
 
-def test_a_missed_pulse_does_not_give_frames_to_the_wrong_pattern(make):
+def test_missed_pulse_never_assigns_frames_to_wrong_pattern(make):
     bench = make(short(steps=(0, 0)))
     body = bench.world.camera("cam")
     honest, count = body.edge, itertools.count()
@@ -489,7 +489,7 @@ def test_a_missed_pulse_does_not_give_frames_to_the_wrong_pattern(make):
     assert tries == [1] * 5 + [2]
 
 
-def test_a_camera_that_loses_everything_ends_the_capture_dark_and_released(make):
+def test_camera_losing_everything_ends_capture_dark_and_released(make):
     bench = make(short(steps=(0, 0)))
     bench.world.camera("cam").edge = lambda now: None
     with pytest.raises(AcquisitionError, match=r"failed 3 times.*no frame was recorded"):
@@ -498,7 +498,7 @@ def test_a_camera_that_loses_everything_ends_the_capture_dark_and_released(make)
     assert bench.session.frames() == []
 
 
-def test_skin_that_a_silent_host_let_go_is_taped_again(make):
+def test_skin_released_by_silent_host_is_taped_again(make):
     """Frames that come slowly starve the caliper of its host: it lets the skin go, as it must."""
     bench = make(short(steps=(0, 1)))
     honest, count = bench.sphere.trigger, itertools.count()
@@ -518,7 +518,7 @@ def test_skin_that_a_silent_host_let_go_is_taped_again(make):
     assert bench.at_rest
 
 
-def test_a_motor_that_stalls_is_homed_and_the_skin_taped_again(make):
+def test_stalled_motor_is_homed_and_skin_taped_again(make):
     bench = make(short(steps=(0, 2)), jaw_stall=0.15)
     bench.run()
     assert bench.session.todo() == []
@@ -526,14 +526,14 @@ def test_a_motor_that_stalls_is_homed_and_the_skin_taped_again(make):
     assert bench.session.left_out() == {}
 
 
-def test_a_motor_that_always_stalls_ends_the_capture_with_what_to_do(make):
+def test_permanently_stalled_motor_ends_capture_with_instructions(make):
     bench = make(short(steps=(0, 1)), jaw_stall=1.0)
     with pytest.raises(DeviceError, match=r"homing ended|failed 3 times"):
         bench.run()
     assert bench.at_rest
 
 
-def test_an_emergency_stop_ends_the_capture_dark_and_released(make):
+def test_emergency_stop_ends_capture_dark_and_released(make):
     bench = make(short(), interlock_after=9.0)
     with pytest.raises(DeviceError):
         bench.run()
@@ -549,21 +549,21 @@ def untouched(bench):
 
 
 @pytest.mark.parametrize("limit", [None, 0.0, -1.0, 50.0, float("nan")])
-def test_a_capture_without_a_force_limit_that_the_sensor_knows_is_refused(make, limit):
+def test_capture_without_valid_force_limit_is_refused(make, limit):
     bench = make()
     with pytest.raises(AcquisitionError, match=r"force limit.*nothing has moved"):
         bench.run(force_limit_n=limit)
     assert untouched(bench)
 
 
-def test_open_eyes_beside_patterns_are_refused(make):
+def test_open_eyes_during_patterns_are_refused(make):
     bench = make()
     with pytest.raises(AcquisitionError, match=r"eyes.*nothing was lit.*--eyes"):
         bench.run(eyes="open")
     assert untouched(bench)
 
 
-def test_a_capture_of_skin_without_its_caliper_is_refused(make):
+def test_skin_capture_without_caliper_is_refused(make):
     bench = make()
     with pytest.raises(AcquisitionError, match=r"caliper.*--port caliper=URL"):
         run_plan(
@@ -618,7 +618,7 @@ def test_a_camera_that_cannot_be_released_is_refused(make):
     assert untouched(bench)
 
 
-def test_too_much_light_for_one_subject_is_refused(make):
+def test_excessive_light_for_subject_is_refused(make):
     plan = short(steps=(0, 0), patterns=["full"])
     step = plan.steps[1]
     many = tuple(

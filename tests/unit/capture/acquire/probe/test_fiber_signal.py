@@ -45,7 +45,7 @@ def looked(rates, rng, count=EVERY, **more):
     return signal
 
 
-def test_a_rate_is_that_of_the_brightest_unsaturated_exposure(rng):
+def test_rate_uses_brightest_unsaturated_exposure(rng):
     rates = np.geomspace(10.0, 0.2, 28)
     signal = looked(rates, rng, dark_e=50.0)
     np.testing.assert_allclose(
@@ -54,20 +54,20 @@ def test_a_rate_is_that_of_the_brightest_unsaturated_exposure(rng):
     assert signal.level.max() < 1.0
 
 
-def test_a_series_goes_on_until_the_faintest_fibre_has_half_of_full_scale(rng):
+def test_series_continues_until_faintest_fiber_reaches_half_scale(rng):
     rates = np.geomspace(10.0, 0.8, 28)
     enough = [looked(rates, rng, count).verdict(SERIES_S[count:]).enough for count in range(1, 8)]
     # 0.8/s comes to a half at 0.63 s: the exposure of 1 s is the sixth
     assert enough == [False] * 5 + [True] * 2
 
 
-def test_the_noise_alone_is_never_enough_while_it_may_hide_a_signal(rng):
+def test_noise_is_never_enough_while_signal_may_hide(rng):
     rates = np.full(28, 5.0)
     rates[-1] = 2e-3
     assert not looked(rates, rng, 5).verdict(SERIES_S[5:]).enough
 
 
-def test_what_all_exposures_left_would_not_show_is_given_up_and_named(rng):
+def test_signal_undetectable_in_remaining_exposures_is_abandoned_reported(rng):
     rates = np.full(28, 5.0)
     rates[-2:] = 0.0
     verdict = looked(rates, rng).verdict([1e-3])
@@ -78,7 +78,7 @@ def test_what_all_exposures_left_would_not_show_is_given_up_and_named(rng):
     )
 
 
-def test_a_fibre_that_saturates_in_the_shortest_exposure_is_told_apart(rng):
+def test_fiber_saturated_in_shortest_exposure_is_distinguished(rng):
     rates = np.full(28, 5.0)
     rates[0] = 1e3
     verdict = looked(rates, rng, 5).verdict(SERIES_S[5:])
@@ -87,14 +87,14 @@ def test_a_fibre_that_saturates_in_the_shortest_exposure_is_told_apart(rng):
     assert verdict.hopeless == ()
 
 
-def test_few_hot_pixels_are_no_signal(rng):
+def test_few_hot_pixels_are_not_signal(rng):
     clean = looked(np.full(28, 0.01), rng)
     hot = looked(np.full(28, 0.01), rng, hot=6)
     assert hot.level.max() == pytest.approx(clean.level.max(), rel=0.2)
     assert not hot.verdict([1.0]).saturated
 
 
-def test_dark_current_is_no_signal(rng):
+def test_dark_current_is_not_signal(rng):
     signal = looked(np.zeros(28), rng, dark_e=300.0)
     assert np.abs(signal.signal_to_noise).max() < 6.0
     assert signal.level.max() < 0.03

@@ -200,7 +200,7 @@ def check_frames(session):
 # what is captured -----------------------------------------------------------------------------
 
 
-def test_every_frame_shows_its_light_and_the_head_held_where_it_was_placed(make):
+def test_frames_show_their_light_and_head_held_throughout(make):
     bench = make(short(sites=("forehead", "chin"), angles=2))
     done = bench.run(all_brackets=True)
     assert (done.frames, done.retakes, done.stale) == (len(bench.plan.steps), 0, 0)
@@ -221,14 +221,14 @@ def test_every_frame_shows_its_light_and_the_head_held_where_it_was_placed(make)
     assert verify(bench.session.path).ok
 
 
-def test_repeats_are_placed_anew(make):
+def test_repeats_reposition_head(make):
     bench = make(short(repeats=2, brackets=2))
     bench.run()
     assert len(bench.placings) == 2
     assert set(check_frames(bench.session).values()) == {1, 2}
 
 
-def test_a_whole_series_rests_once_and_takes_the_time_that_its_plan_says(make):
+def test_whole_series_rests_once_and_takes_planned_time(make):
     plan = probe_plan(RIG, sites=["cheek"], darks=0)
     bench = make(plan, Witness(bright=0.03))
     bench.run(all_brackets=True)
@@ -259,7 +259,7 @@ def test_no_suction_lasts_longer_than_skin_bears(make):
 # fewer exposures ------------------------------------------------------------------------------
 
 
-def test_longer_exposures_are_left_out_when_all_fibres_have_been_seen(make):
+def test_longer_exposures_are_omitted_once_all_fibers_measured(make):
     bench = make(short(brackets=10, longest_s=4.0), Witness(bright=10.0, fall_mm=7.0))
     bench.run()
     (reason,) = set(bench.session.left_out().values())
@@ -281,20 +281,20 @@ def test_longer_exposures_are_left_out_when_all_fibres_have_been_seen(make):
     assert verify(bench.session.path).ok
 
 
-def test_all_brackets_are_taken_when_they_are_asked_for(make):
+def test_all_brackets_are_taken_on_request(make):
     bench = make(short(brackets=10, longest_s=4.0), Witness(bright=10.0, fall_mm=7.0))
     bench.run(all_brackets=True)
     assert bench.session.left_out() == {}
     assert len(bench.session.frames("fibres")) == 10
 
 
-def test_nothing_is_left_out_while_a_fibre_can_still_be_measured(make):
+def test_exposures_continue_while_any_fiber_is_still_measurable(make):
     bench = make(short(brackets=10, longest_s=4.0), Witness(bright=10.0, fall_mm=1.0))
     bench.run()
     assert len(bench.session.frames("fibres")) == 10
 
 
-def test_fibres_that_stay_in_the_noise_do_not_hold_up_the_others(make):
+def test_fibers_staying_in_noise_do_not_delay_others(make):
     scene = Witness(bright=3e4, fall_mm=0.25)  # bright near ones, and nothing at all far off
     bench = make(short(brackets=12, longest_s=0.1, step_ev=0.5), scene)
     bench.run()
@@ -302,7 +302,7 @@ def test_fibres_that_stay_in_the_noise_do_not_hold_up_the_others(make):
     assert all("would stay in the noise" in reason for reason in reasons)
 
 
-def test_a_whole_series_says_which_fibres_it_does_not_show(make):
+def test_whole_series_reports_undetected_fibers(make):
     scene = Witness(bright=1e4, fall_mm=0.25)
     bench = make(short(brackets=6, longest_s=0.5), scene)
     bench.run()
@@ -315,7 +315,7 @@ def test_a_whole_series_says_which_fibres_it_does_not_show(make):
 # pressure and temperature ---------------------------------------------------------------------
 
 
-def test_a_leak_is_refused_in_one_sentence_with_what_was_reached_and_what_to_do(make):
+def test_leak_is_refused_reporting_pressure_reached_and_remedy(make):
     bench = make(short(darks=0), pump_leak=0.8)
     with pytest.raises(AcquisitionError) as caught:
         bench.run()
@@ -331,7 +331,7 @@ def test_a_leak_is_refused_in_one_sentence_with_what_was_reached_and_what_to_do(
     assert bench.at_rest
 
 
-def test_a_small_leak_that_leaves_the_limits_is_refused_too(make):
+def test_small_leak_leaving_limits_is_refused(make):
     """The box holds what reaches 70 %; the measurement wants more."""
     bench = make(short(darks=0), pump_leak=0.2)
     with pytest.raises(AcquisitionError, match=r"the suction is 4\d|5[0-3] mbar"):
@@ -339,7 +339,7 @@ def test_a_small_leak_that_leaves_the_limits_is_refused_too(make):
     assert bench.session.frames() == []
 
 
-def test_a_dead_pump_and_a_dead_gauge_each_say_so(make, tmp_path):
+def test_dead_pump_and_dead_gauge_are_reported_separately(make, tmp_path):
     bench = make(short(darks=0), pump_dead=True)
     with pytest.raises(AcquisitionError, match="reached only"):
         bench.run()
@@ -349,7 +349,7 @@ def test_a_dead_pump_and_a_dead_gauge_each_say_so(make, tmp_path):
     assert bench.session.frames() == []
 
 
-def test_a_head_that_comes_off_is_placed_anew_and_its_series_begins_again(make):
+def test_detached_head_is_placed_again_and_series_restarts(make):
     bench = make(short(brackets=8, longest_s=2.0), head_lifts_after=4.5)
     done = bench.run(all_brackets=True)
     assert done.retakes == 1
@@ -383,7 +383,7 @@ class Drifting:
         return value
 
 
-def test_an_exposure_during_which_the_suction_drifts_is_taken_again_after_new_suction(make):
+def test_exposure_with_drifting_suction_is_retaken_after_suction(make):
     bench = make()
     bench.box = Drifting(bench.box, {2, 3})
     done = bench.run(all_brackets=True)
@@ -404,7 +404,7 @@ def test_three_drifts_refuse_the_measurement(make):
     assert bench.at_rest
 
 
-def test_a_camera_that_warms_is_refused_with_its_temperature(make):
+def test_warming_camera_is_refused_with_temperature(make):
     bench = make(camera_warms_after=0.0)
     bench.world.advance(60.0)
     with pytest.raises(AcquisitionError, match=r"camera: still at \d+\.\d degrees.*cooling"):
@@ -414,7 +414,7 @@ def test_a_camera_that_warms_is_refused_with_its_temperature(make):
     assert bench.at_rest
 
 
-def test_a_camera_that_is_still_warm_is_waited_for(make):
+def test_camera_still_warm_is_waited_for(make):
     bench = make(short(darks=1))
     honest, count = bench.box.camera_c, itertools.count()
     bench.box.camera_c = lambda: honest() + (12.0 if next(count) < 5 else 0.0)
@@ -427,7 +427,7 @@ def test_a_camera_that_is_still_warm_is_waited_for(make):
 
 
 @pytest.mark.parametrize("faults", [{"stale": 0.3}, {"drop_frame": 0.15}])
-def test_frames_that_fail_now_and_then_leave_a_sound_session(make, faults):
+def test_occasional_frame_failures_leave_sound_session(make, faults):
     bench = make(short(brackets=8), **faults)
     done = bench.run(all_brackets=True)
     assert done.stale + done.retakes > 0
@@ -436,7 +436,7 @@ def test_frames_that_fail_now_and_then_leave_a_sound_session(make, faults):
 
 
 @pytest.mark.parametrize("part", ["_stuck", "_jam"])
-def test_a_shutter_that_fails_now_and_then_leaves_a_sound_session(make, part):
+def test_occasional_shutter_failures_leave_sound_session(make, part):
     bench = make(short(brackets=8))
     shutter, honest, count = bench.world.box("probe").device.shutter, bench.box.open_shutter, [0]
 
@@ -467,7 +467,7 @@ def test_a_shutter_that_fails_now_and_then_leaves_a_sound_session(make, part):
         ({"shutter_stuck": 1.0}, "did not open"),
     ],
 )
-def test_what_never_works_ends_the_capture_with_its_reason(make, faults, match):
+def test_permanent_fault_ends_capture_with_reason(make, faults, match):
     bench = make(short(darks=0), **faults)
     with pytest.raises(AcquisitionError, match=match):
         bench.run()
@@ -475,7 +475,7 @@ def test_what_never_works_ends_the_capture_with_its_reason(make, faults, match):
     assert bench.at_rest
 
 
-def test_a_camera_without_a_trigger_line_is_refused_before_anything_is_lit(make):
+def test_camera_without_trigger_line_is_refused_before_light(make):
     bench = make()
     object.__setattr__(bench.cameras["cam"].info, "triggers", (Trigger.SOFTWARE,))
     with pytest.raises(CameraError, match="trigger line"):
@@ -493,7 +493,7 @@ def test_a_camera_without_a_trigger_line_is_refused_before_anything_is_lit(make)
         ("dose_ws", 1e-4, "light dose"),
     ],
 )
-def test_a_box_that_allows_less_refuses_the_plan_before_anything_is_lit(make, key, value, match):
+def test_plan_beyond_controller_limits_is_refused_before_light(make, key, value, match):
     bench = make()
     bench.box._limits = {**bench.box.limits, key: value}
     with pytest.raises(AcquisitionError, match=match):
@@ -509,7 +509,7 @@ def test_the_emergency_stop_ends_a_capture(make):
     assert bench.at_rest
 
 
-def test_the_dose_of_a_subject_is_the_box_s_to_refuse(make):
+def test_subject_dose_is_refused_by_controller(make):
     bench = make(short(darks=0))
     bench.world.box("probe").device.shutter.dose_limit_ws = 1e-6
     with pytest.raises(CommandRefused, match="104"):
@@ -550,7 +550,7 @@ def kill_at(bench, owner, name, number):
         ("session", "leave_out", 2),
     ],
 )
-def test_a_capture_is_resumed_wherever_it_was_cut(make, owner, name, number):
+def test_capture_resumes_after_any_interruption(make, owner, name, number):
     bench = make(short(sites=("forehead", "cheek"), brackets=8, longest_s=2.0), Witness(20.0, 7.0))
     kill_at(bench, getattr(bench, owner), name, number)
     with pytest.raises(Killed):
@@ -591,7 +591,7 @@ def test_a_series_of_two_placements_would_not_pass(make):
     assert {anew[step] for step in anew if step not in series} == {(1, 2)}
 
 
-def test_an_operator_stops_between_two_exposures_and_all_is_dark(make):
+def test_operator_stop_between_exposures_leaves_all_dark(make):
     bench = make()
     count = itertools.count()
     with pytest.raises(Interrupted):
@@ -607,7 +607,7 @@ def test_an_operator_stops_between_two_exposures_and_all_is_dark(make):
 # the phantom ----------------------------------------------------------------------------------
 
 
-def test_the_phantom_is_placed_once_and_each_fibre_uncovered_alone(make):
+def test_phantom_is_placed_once_fibers_uncovered_singly(make):
     plan = probe_calibration_plan(RIG, darks=1, brackets=10, longest_s=4.0, step_ev=1.0)
     bench = make(plan, Witness(bright=20.0, fall_mm=2.0))
     bench.run()
@@ -636,7 +636,7 @@ def test_the_phantom_is_placed_once_and_each_fibre_uncovered_alone(make):
     assert reason in bench.told
 
 
-def test_all_masks_are_taken_when_they_are_asked_for_and_the_dark_needs_no_head(make):
+def test_requested_masks_are_taken_dark_needs_no_head(make):
     plan = probe_calibration_plan(RIG, darks=1, brackets=4, longest_s=0.1, step_ev=2.0)
     bench = make(plan, Witness(20.0))
     bench.run(all_brackets=True)
@@ -656,7 +656,7 @@ def test_darks_need_a_capped_head_and_no_light(make):
     assert abs(record.actual["camera_c"] - PROBE.camera_c) <= PROBE.camera_tolerance_c
 
 
-def test_mask_choice_goes_on_after_a_resume_without_choosing_again(make):
+def test_mask_choice_continues_after_resume_without_choosing_again(make):
     plan = probe_calibration_plan(RIG, darks=0, brackets=8, longest_s=1.0, step_ev=1.0)
     bench = make(plan, Witness(20.0))
     kill_at(bench, bench.box, "open_shutter", 8 + 7)
@@ -673,7 +673,7 @@ def test_mask_choice_goes_on_after_a_resume_without_choosing_again(make):
     assert (placed["phantom at 0 degrees"], placed["fibre 0"], placed["fibre 5"]) == (1, 1, 2)
 
 
-def test_dark_frames_are_taken_under_a_cap_also_after_the_box_has_let_go(make):
+def test_capped_dark_frames_are_taken_after_controller_release(make):
     bench = make(probe_calibration_plan(RIG, "dark", darks=2, brackets=5, longest_s=0.1))
 
     def late(honest, which):

@@ -53,7 +53,7 @@ def test_the_chart_is_found_at_any_orientation(angle_deg, patch_px):
     assert np.abs(centers - truth).max() < 0.12 * patch_px
 
 
-def test_refined_centers_are_exact_to_a_fiftieth_of_a_patch():
+def test_refined_centers_are_exact_to_fiftieth_of_patch():
     image, truth = draw_chart(50, rng=np.random.default_rng(2), angle_rad=0.03)
     assert np.abs(find_chart(image) - truth).max() < 1.0
 
@@ -98,12 +98,12 @@ def test_wrong_corner_patches_are_refused():
         (np.random.default_rng(0).random((90, 120, 3)), "no ColorChecker"),
     ],
 )
-def test_an_image_without_a_chart_gives_one_clear_error(image, says):
+def test_image_without_chart_gives_single_clear_error(image, says):
     with pytest.raises(ChartError, match=says):
         find_chart(image)
 
 
-def test_a_saturated_patch_is_left_out_and_the_others_are_exact():
+def test_saturated_patch_is_omitted_and_others_are_exact():
     rng = np.random.default_rng(4)
     image, truth = draw_chart(40, rng=rng)
     valid = np.ones(image.shape[:2], bool)
@@ -119,7 +119,7 @@ def test_a_saturated_patch_is_left_out_and_the_others_are_exact():
 
 
 @pytest.mark.parametrize("method", ["linear", "root_polynomial"])
-def test_a_camera_that_is_a_matrix_of_the_eye_is_recovered_exactly(method):
+def test_camera_linear_in_eye_response_is_recovered_exactly(method):
     xyz = colorimetry.chart_reference("D55")
     fit = fit_matrix(7.0 * xyz @ CAMERA.T, xyz, method=method, illuminant="D55")
     assert fit.max_delta_e < 1e-6
@@ -147,7 +147,7 @@ def test_a_given_white_is_kept_exactly(method):
     assert not np.allclose(fit_matrix(rgb, xyz, method=method).apply(white), [0.9642, 1, 0.8252])
 
 
-def test_held_out_errors_exceed_the_errors_of_the_fit():
+def test_held_out_errors_exceed_fit_errors():
     rng = np.random.default_rng(7)
     xyz = colorimetry.chart_reference()
     rgb = np.abs(xyz @ CAMERA.T * (1 + 0.05 * rng.normal(size=(24, 3))))
@@ -273,7 +273,7 @@ def test_a_color_calibration_survives_the_disk(tmp_path):
 
 @needs_data
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])
-def test_the_chart_on_a_real_photograph_is_found_and_measured(turns):
+def test_chart_in_real_photograph_is_found_and_measured(turns):
     """Expected: the published medians of the patches' middles, to 2 of 255 levels."""
     cv2 = pytest.importorskip("cv2")
     photo = cv2.imread(str(DATA / "colorchecker" / "colorchecker_classic_photo.png"))[..., ::-1]
@@ -288,7 +288,7 @@ def test_the_chart_on_a_real_photograph_is_found_and_measured(turns):
 
 
 @needs_data
-def test_a_real_photograph_fits_its_chart_within_three_delta_e():
+def test_real_photograph_fits_chart_within_three_delta_e():
     cv2 = pytest.importorskip("cv2")
     photo = cv2.imread(str(DATA / "colorchecker" / "colorchecker_classic_photo.png"))[..., ::-1]
     s = photo / 255.0
@@ -300,7 +300,7 @@ def test_a_real_photograph_fits_its_chart_within_three_delta_e():
 
 
 @needs_data
-def test_the_retyped_chart_is_the_published_one():
+def test_retyped_chart_equals_published_chart():
     path = DATA / "colorchecker" / "colorchecker24_lab_d50_xrite_after2014.csv"
     published = np.loadtxt(path, delimiter=",", skiprows=1)
     lab = colorimetry.lab_from_xyz(

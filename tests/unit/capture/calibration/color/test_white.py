@@ -26,7 +26,7 @@ def reference(rng, *, degree=4, lights=(1.0, 0.5, 1.0)):
     )
 
 
-def test_a_white_surface_is_balanced_to_one_in_every_channel_and_pixel():
+def test_white_surface_is_balanced_to_unity_everywhere():
     """Expected: known shading within 5 stated errors everywhere, 0.2 % on average."""
     white = reference(np.random.default_rng(1))
     balanced, variance, valid = white.balance(shading())
@@ -44,7 +44,7 @@ def test_half_the_light_gives_the_same_reflectance():
 
 
 @pytest.mark.parametrize("degree", [4, None])
-def test_stated_errors_are_of_the_size_of_the_true_ones(degree):
+def test_stated_errors_match_size_of_true_errors(degree):
     """Expected: root mean square of error over stated error between 0.8 and 1.2.
 
     12 seeds x 3 channels x 15 coefficients are 540 independent numbers: standard deviation 0.03.
@@ -56,7 +56,7 @@ def test_stated_errors_are_of_the_size_of_the_true_ones(degree):
     assert 0.8 < np.sqrt(np.mean(ratios)) < 1.2
 
 
-def test_the_variance_of_a_reflectance_holds_that_of_the_reference():
+def test_reflectance_variance_includes_reference_variance():
     white = reference(np.random.default_rng(3), degree=None)
     _, variance, _ = white.balance(0.5 * shading(), variance=np.full((*SHAPE, 3), 1e-5))
     expected = 1e-5 / white.signal**2 + (0.5 * shading() / white.signal**2 * white.stderr) ** 2

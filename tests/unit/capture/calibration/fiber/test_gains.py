@@ -116,7 +116,7 @@ def test_reflectance_comes_back_within_its_errors():
     assert min(blind) > 10
 
 
-def test_pairs_of_fibres_are_measured_within_their_errors(rng):
+def test_fiber_pairs_are_measured_within_errors(rng):
     probe = Probe(rng)
     found = measure_crosstalk(probe.masks(), probe.read(PHANTOM))
     first = DISTANCE == 1
@@ -129,7 +129,7 @@ def test_pairs_of_fibres_are_measured_within_their_errors(rng):
     assert found.matrix[far].mean() == pytest.approx(probe.matrix[far].mean(), rel=0.2)
 
 
-def test_stray_light_is_told_from_cross_talk(rng):
+def test_stray_light_is_separated_from_crosstalk(rng):
     probe = Probe(rng, stray=5e-5)
     found = measure_crosstalk(probe.masks(), probe.read(PHANTOM))
     sigmas = (found.offset - probe.stray) / np.hypot(found.offset_stderr, found.offset_common)
@@ -138,7 +138,7 @@ def test_stray_light_is_told_from_cross_talk(rng):
     assert (found.offset_stderr < 0.2 * 5e-5).all()
 
 
-def test_what_leaks_through_covers_is_no_stray_light(rng):
+def test_cover_leakage_is_not_stray_light(rng):
     probe = Probe(rng, stray=0.0, leak=1e-5)
     found = measure_crosstalk(probe.masks(), probe.read(PHANTOM))
     assert found.cover_leak == pytest.approx(1e-5, abs=5 * found.cover_leak_stderr)
@@ -149,7 +149,7 @@ def test_what_leaks_through_covers_is_no_stray_light(rng):
     assert (error < 1e-6).any(axis=0).all()
 
 
-def test_two_spots_that_overlap_are_unmixed_by_frames_with_one_uncovered(rng):
+def test_overlapping_spots_are_unmixed_by_single_uncovered_frames(rng):
     matrix = mixing(rng)
     matrix[8, 9], matrix[9, 8] = 0.5, 0.4
     probe = Probe(rng, matrix=matrix)
@@ -175,7 +175,7 @@ def test_a_weaker_source_gives_the_same_reflectance(rng):
     assert (wrong.reflectance_per_mm2[near] < 0.3 * SKIN[near]).all()
 
 
-def test_a_dead_fibre_is_reported_and_leaves_the_others_alone(rng):
+def test_dead_fiber_is_reported_without_affecting_others(rng):
     probe = Probe(rng, dead=[7])
     calibration = probe.calibrate()
     assert np.flatnonzero(calibration.dead).tolist() == [7]
@@ -186,7 +186,7 @@ def test_a_dead_fibre_is_reported_and_leaves_the_others_alone(rng):
     np.testing.assert_allclose(result.reflectance_per_mm2[[6, 8]], SKIN[[6, 8]], rtol=0.02)
 
 
-def test_a_saturated_fibre_is_flagged_and_its_leak_bounded(rng):
+def test_saturated_fiber_is_flagged_and_its_leak_bounded(rng):
     probe = Probe(rng)
     calibration = probe.calibrate()
     result = calibration.reflectance(probe.read(SKIN, saturated=[0, 1]))
@@ -198,14 +198,14 @@ def test_a_saturated_fibre_is_flagged_and_its_leak_bounded(rng):
     assert np.abs(sigmas).max() < 5
 
 
-def test_a_series_that_is_saturated_everywhere_gives_nothing_and_says_so(rng):
+def test_fully_saturated_series_is_reported_without_result(rng):
     probe = Probe(rng)
     result = probe.calibrate().reflectance(probe.read(SKIN, saturated=range(28)))
     assert not result.valid.any()
     assert set(result.reasons) == set(NAMES)
 
 
-def test_no_signal_in_far_fibres_keeps_its_sign_and_its_error(rng):
+def test_signal_free_far_fibers_keep_sign_and_error(rng):
     probe = Probe(rng)
     calibration = probe.calibrate()
     dark = np.where(RADIUS[:, None] < 3, SKIN, 0.0)
@@ -217,7 +217,7 @@ def test_no_signal_in_far_fibres_keeps_its_sign_and_its_error(rng):
     assert np.abs(away(result, dark)).max() < 6
 
 
-def test_what_the_certificate_leaves_open_moves_all_fibres_together(rng):
+def test_certificate_scale_uncertainty_is_common_to_all_fibers(rng):
     probe = Probe(rng)
     scale = np.full((1, 28, 3), 0.03)
     expected = ExpectedReflectance(1.03 * PHANTOM, 0.002 * PHANTOM, scale)
@@ -294,7 +294,7 @@ CERTIFICATE = {
 }
 
 
-def test_a_certificate_is_read_and_its_faults_are_listed(tmp_path):
+def test_certificate_is_read_and_faults_are_listed(tmp_path):
     path = tmp_path / "phantom.json"
     path.write_text(json.dumps(CERTIFICATE))
     certificate = read_certificate(path)
@@ -316,7 +316,7 @@ def test_a_certificate_is_read_and_its_faults_are_listed(tmp_path):
         read_certificate(tmp_path / "none.json")
 
 
-def test_what_a_mean_of_far_pairs_has_wrong_moves_all_their_fibres_together():
+def test_far_pair_mean_error_is_common_to_fibers():
     count, rng = 12, np.random.default_rng(0)
     light, reference, ratio = (rng.uniform(1.0, 9.0, (count, 3)) for _ in range(3))
     place = np.arange(count)

@@ -65,7 +65,7 @@ def test_five_decades_are_read_within_their_errors(bench, all_brackets_s, five_d
     assert abs((raw.signal - truth) / raw.stderr).max() > 6
 
 
-def test_light_below_the_dark_signal_is_read_without_bias(fibre_camera, brackets_s):
+def test_light_below_dark_signal_is_read_without_bias(fibre_camera, brackets_s):
     away, level = [], []
     for seed in range(3):
         camera = fibre_camera(np.random.default_rng(seed))
@@ -92,9 +92,7 @@ def test_no_light_gives_both_signs_with_a_variance(fibre_camera, brackets_s):
     assert_consistent(readings.signal / readings.stderr)
 
 
-def test_a_series_that_is_saturated_even_in_its_shortest_exposure_is_flagged(
-    fibre_camera, brackets_s, five_decades
-):
+def test_series_saturated_in_shortest_exposure_is_flagged(fibre_camera, brackets_s, five_decades):
     camera = fibre_camera(np.random.default_rng(5))
     light = five_decades.copy()
     light[:3] *= 100.0
@@ -108,7 +106,7 @@ def test_a_series_that_is_saturated_even_in_its_shortest_exposure_is_flagged(
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_fewer_brackets_read_what_they_can(bench, all_brackets_s, five_decades, count):
+def test_fewer_brackets_read_valid_subset(bench, all_brackets_s, five_decades, count):
     camera, darks, frames = bench
     chosen = [14, 18, 22][:count]
     readings = read(camera, [frames[k] for k in chosen], all_brackets_s[chosen], darks)
@@ -127,7 +125,7 @@ def test_the_order_of_the_frames_does_not_matter(bench, all_brackets_s, rng):
     np.testing.assert_allclose(one.signal, two.signal, rtol=1e-12)
 
 
-def test_a_camera_that_has_warmed_up_is_read_without_bias(fibre_camera, brackets_s):
+def test_warmed_camera_is_read_without_bias(fibre_camera, brackets_s):
     camera = fibre_camera(np.random.default_rng(9))
     light = np.full((28, 3), 1.0)
     warm = camera.series(light, brackets_s, dark=2 ** (3 / 7))
@@ -157,7 +155,7 @@ def test_dark_current_and_offsets_are_found(fibre_camera):
     assert predicted < camera.bias_e.std()  # better than one number for all
 
 
-def test_darks_of_one_exposure_hold_for_that_exposure_only(fibre_camera, five_decades):
+def test_single_exposure_darks_apply_to_that_exposure_only(fibre_camera, five_decades):
     camera = fibre_camera(np.random.default_rng(13))
     darks = camera.darks((30.0,))
     frames = camera.series(five_decades, (30.0,))
@@ -166,7 +164,7 @@ def test_darks_of_one_exposure_hold_for_that_exposure_only(fibre_camera, five_de
         read(camera, frames, (1.0,), darks)
 
 
-def test_missing_darks_and_frames_that_do_not_fit_are_named(fibre_camera):
+def test_missing_darks_and_mismatched_frames_are_reported(fibre_camera):
     camera = fibre_camera(np.random.default_rng(13))
     with pytest.raises(DarkError, match="at least one; capture darks first"):
         measure_darks([], [], noise=camera.noise)
@@ -198,7 +196,7 @@ def test_many_hot_pixels_make_a_spot_invalid(fibre_camera, brackets_s):
     assert readings.valid[[19, 21]].all()
 
 
-def test_bright_light_is_merged_as_by_the_merge_of_brackets(bench, all_brackets_s):
+def test_bright_light_merges_like_bracket_merge(bench, all_brackets_s):
     camera, darks, frames = bench
     merged = merge_series(frames, all_brackets_s, darks=darks, noise=camera.noise)
     noise = camera.noise
@@ -219,7 +217,7 @@ def test_bright_light_is_merged_as_by_the_merge_of_brackets(bench, all_brackets_
     assert np.median(ratio) == pytest.approx(1.0, abs=0.02)
 
 
-def test_the_error_falls_with_exposure_as_counted_electrons_say(fibre_camera):
+def test_error_falls_with_exposure_as_electron_counts_predict(fibre_camera):
     camera = fibre_camera(np.random.default_rng(19))
     light = np.full((28, 3), 100.0)
     darks = camera.darks()
@@ -231,7 +229,7 @@ def test_the_error_falls_with_exposure_as_counted_electrons_say(fibre_camera):
     assert np.median(short / long) == pytest.approx(predicted, rel=0.05)
 
 
-def test_a_camera_without_colors_is_read_as_one(fibre_camera, brackets_s):
+def test_monochrome_camera_is_read_as_single_channel(fibre_camera, brackets_s):
     camera = fibre_camera(np.random.default_rng(31))
     gray = dataclasses.replace(camera.noise, pattern="MONO")
     light = np.full((28, 3), 50.0)
@@ -244,7 +242,7 @@ def test_a_camera_without_colors_is_read_as_one(fibre_camera, brackets_s):
     assert_consistent((readings.signal - truth) / readings.stderr)
 
 
-def test_sums_scale_with_the_aperture_not_with_the_light_around(fibre_camera):
+def test_sums_scale_with_aperture_not_surrounding_light(fibre_camera):
     camera = fibre_camera(np.random.default_rng(23), veil=1e-4)
     light = np.full((28, 3), 100.0)
     times = (1.0, 10.0)
@@ -259,7 +257,7 @@ def test_sums_scale_with_the_aperture_not_with_the_light_around(fibre_camera):
         assert np.median(readings.around) == pytest.approx(expected, rel=0.05)
 
 
-def test_light_of_other_lengths_than_the_exposures_gives_the_same_rates(fibre_camera, rng):
+def test_light_durations_differing_from_exposures_give_same_rates(fibre_camera, rng):
     camera = fibre_camera(rng)
     light = np.full((28, 3), 100.0)
     darks = camera.darks()
@@ -277,7 +275,7 @@ def test_light_of_other_lengths_than_the_exposures_gives_the_same_rates(fibre_ca
         read(camera, frames, exposures, darks, light_s=[1.0, 5.0, 0.0])
 
 
-def test_a_source_that_is_not_steady_is_seen_in_the_frames(fibre_camera, brackets_s, five_decades):
+def test_unsteady_source_is_detected_in_frames(fibre_camera, brackets_s, five_decades):
     camera = fibre_camera(np.random.default_rng(29))
     ripple = np.random.default_rng(1).normal(1, 0.01, 12)
     rate = camera.rate(five_decades)

@@ -41,7 +41,7 @@ APERTURE = np.full(4, 16.0)
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.1])
-def test_fluxes_are_unbiased_and_scatter_as_stated_also_on_a_slope(rng, tilt):
+def test_fluxes_are_unbiased_with_stated_scatter_on_slope(rng, tilt):
     electrons = np.array([3e5, 1e5, 3e4, 1e4])
     light = scene(PIXELS, electrons, tilt=tilt)
     pulls = []
@@ -68,7 +68,7 @@ def test_middles_scatter_as_stated(rng):
     assert np.sum(np.square(pulls)) > 0.15 * 96
 
 
-def test_saturated_spots_are_flagged_and_a_shorter_exposure_measures_them(rng):
+def test_saturated_spots_are_flagged_shorter_exposure_measures_them(rng):
     electrons = np.array([3e6, 1e5, 3e5, 1e5])
     light = scene(PIXELS, electrons)
     long, short = exposed(light, rng), exposed(light, rng, amount=0.1)
@@ -83,7 +83,7 @@ def test_saturated_spots_are_flagged_and_a_shorter_exposure_measures_them(rng):
     assert abs(again.value[0] - 0.1 * electrons[0] / WELL_E) < 4 * np.sqrt(again.variance[0])
 
 
-def test_spots_at_the_border_or_without_light_are_not_measured(rng):
+def test_spots_at_border_or_unlit_are_not_measured(rng):
     places = np.array([[5.0, 100.0], [100.0, 100.0], [np.nan, np.nan]])
     part = exposed(scene(places[:1], [1e5]), rng)
     flux = measure_flux(part, places, aperture_px=np.full(3, 16.0))
@@ -93,7 +93,7 @@ def test_spots_at_the_border_or_without_light_are_not_measured(rng):
     assert np.isnan(middle).all()
 
 
-def test_the_light_that_a_perfect_lens_spreads_beyond_the_disc_is_known():
+def test_perfect_lens_light_beyond_disc_is_known():
     """Airy's pattern, summed over a disc and its ring, against the asymptote."""
     from scipy.special import j1
 

@@ -26,9 +26,7 @@ def falling():
     return np.geomspace(1e5, 50.0, 28)[:, None] * np.array([0.6, 1.0, 0.5])
 
 
-def test_spots_off_their_places_on_a_turned_row_are_found_within_their_errors(
-    rng, fibre_camera, falling
-):
+def test_displaced_spots_on_rotated_row_found_within_errors(rng, fibre_camera, falling):
     camera = fibre_camera(rng)
     spots = find(camera, falling)
     assert spots.found.all()
@@ -45,14 +43,14 @@ def test_spots_off_their_places_on_a_turned_row_are_found_within_their_errors(
 
 
 @pytest.mark.parametrize("shift", [(5.0, 5.0), (-5.0, -5.0), (-15.0, 8.0)])
-def test_a_row_that_is_shifted_as_a_whole_is_found(rng, fibre_camera, falling, shift):
+def test_row_shifted_as_whole_is_found(rng, fibre_camera, falling, shift):
     camera = fibre_camera(rng, shift=shift)
     spots = find(camera, falling)
     np.testing.assert_allclose(spots.center_px, camera.places, atol=0.1)
     np.testing.assert_allclose(spots.shift_px, shift, atol=1.0)
 
 
-def test_a_dark_fibre_is_reported_at_the_place_where_it_must_end(rng, fibre_camera, falling):
+def test_dark_fiber_is_reported_at_its_expected_position(rng, fibre_camera, falling):
     light = falling.copy()
     light[11] = 0.0
     camera = fibre_camera(rng)
@@ -63,7 +61,7 @@ def test_a_dark_fibre_is_reported_at_the_place_where_it_must_end(rng, fibre_came
     assert "dark" in spots.findings[0]
 
 
-def test_a_spot_that_is_no_fibres_is_named(rng, fibre_camera, falling):
+def test_foreign_spot_is_reported_with_position(rng, fibre_camera, falling):
     camera = fibre_camera(rng)
     camera.places[20, 1] -= 38.0
     other = fibre_camera(np.random.default_rng(3), places=camera.places)
@@ -71,7 +69,7 @@ def test_a_spot_that_is_no_fibres_is_named(rng, fibre_camera, falling):
         find(other, falling)
 
 
-def test_no_light_and_too_few_spots_are_told_apart(rng, fibre_camera, falling):
+def test_missing_light_and_too_few_spots_are_distinguished(rng, fibre_camera, falling):
     camera = fibre_camera(rng)
     with pytest.raises(SpotError, match="found none"):
         find(camera, np.zeros((28, 3)))
@@ -81,7 +79,7 @@ def test_no_light_and_too_few_spots_are_told_apart(rng, fibre_camera, falling):
         find(camera, light)
 
 
-def test_two_spots_that_merge_are_told_apart_by_frames_with_one_uncovered(rng, fibre_camera):
+def test_merging_spots_are_resolved_by_single_uncovered_frames(rng, fibre_camera):
     nominal = fibre_camera(rng, shift=(0, 0), turn_rad=0, jitter_px=0).places
     places = nominal.copy()
     places[8, 0] += 14.0
@@ -102,7 +100,7 @@ def test_two_spots_that_merge_are_told_apart_by_frames_with_one_uncovered(rng, f
     assert any("F09 and F10 end in one spot" in text for text in blind.findings)
 
 
-def test_a_cover_over_the_wrong_fibre_is_an_error(rng, fibre_camera, falling):
+def test_cover_over_wrong_fiber_is_error(rng, fibre_camera, falling):
     camera = fibre_camera(rng)
     alone = np.zeros_like(falling)
     alone[5] = falling[5]

@@ -52,7 +52,7 @@ def shifted(camera, shift_mm, turn_rad):
     )
 
 
-def test_a_nominal_camera_is_the_view_of_the_rig():
+def test_nominal_camera_is_rig_view():
     for view in DOME.views:
         camera = CameraPose.nominal(view)
         np.testing.assert_allclose(camera.center_mm, view.position_mm, atol=1e-9)
@@ -83,7 +83,7 @@ def test_rays_invert_projection(rng):
     np.testing.assert_allclose(rays, expected, atol=1e-10)
 
 
-def test_what_is_behind_a_camera_appears_nowhere():
+def test_points_behind_camera_project_to_nan():
     camera = CameraPose.nominal(DOME.views[0])
     assert np.isnan(camera.project(2.0 * camera.center_mm)).all()
 
@@ -103,7 +103,7 @@ def test_a_lens_without_inverse_is_refused():
         ("translation_mm", [0.0, 0.0]),
     ],
 )
-def test_what_is_no_camera_is_refused(field, value):
+def test_invalid_camera_field_is_refused(field, value):
     with pytest.raises(ValueError, match=field):
         dataclasses.replace(CameraPose.nominal(DOME.views[0]), **{field: value})
 
@@ -141,7 +141,7 @@ def test_cameras_survive_their_calibration(tmp_path):
         geometry.poses_from(loaded, DOME)
 
 
-def test_the_derivatives_of_the_bundle_are_those_of_the_projection(rng):
+def test_bundle_derivatives_are_those_of_projection(rng):
     camera = bent(CameraPose.nominal(DOME.views[2]))
     place = boards_in_view(rng, 2)[1]
     points = BOARD.points_mm[::5]
@@ -203,7 +203,7 @@ def test_a_bundle_finds_cameras_within_their_errors(rng, gauge):
     assert chi2.ppf(1e-3, degrees) < squares < chi2.ppf(1 - 1e-3, degrees)
 
 
-def test_one_wrong_corner_in_twenty_does_not_move_the_bundle(rng):
+def test_bundle_resists_five_percent_wrong_corners(rng):
     nominal = geometry.nominal_cameras(DOME.subset(views=["C06", "C07", "C08"]))
     places = boards_in_view(rng, 6)
     seen = sightings_of(nominal, places, rng, 0.05)
@@ -218,7 +218,7 @@ def test_one_wrong_corner_in_twenty_does_not_move_the_bundle(rng):
     assert sum(found.outliers.values()) >= len(seen)
 
 
-def test_distortion_left_out_shows_in_the_reprojection(rng):
+def test_omitted_distortion_shows_in_reprojection(rng):
     nominal = geometry.nominal_cameras(DOME.subset(views=["C06", "C07", "C08"]))
     true = {name: bent(camera, np.array([-0.3, 0, 0, 0, 0])) for name, camera in nominal.items()}
     seen = sightings_of(true, boards_in_view(rng, 8), rng, 0.05)
@@ -230,7 +230,7 @@ def test_distortion_left_out_shows_in_the_reprojection(rng):
 
 
 @pytest.mark.parametrize("culprit", ["C06", "C08"])
-def test_a_camera_that_moved_is_named_and_no_other(rng, culprit):
+def test_only_moved_camera_is_reported(rng, culprit):
     before = geometry.nominal_cameras(DOME.subset(views=["C05", "C06", "C07", "C08"]))
     now = {**before, culprit: shifted(before[culprit], np.array([1.5, 0, 0]), [0, 0.004, 0])}
     seen = sightings_of(now, boards_in_view(rng, 6), rng, 0.1)
@@ -245,7 +245,7 @@ def test_a_camera_that_moved_is_named_and_no_other(rng, culprit):
     )
 
 
-def test_cameras_that_share_no_board_are_named(rng):
+def test_cameras_without_common_board_are_reported(rng):
     nominal = geometry.nominal_cameras(DOME.subset(views=["C05", "C06", "C07", "C10"]))
     seen = sightings_of(nominal, boards_in_view(rng, 6), rng, 0.05)
     apart = {k: s for k, s in seen.items() if (k[0] in ("C05", "C06")) == (k[1] in (0, 1, 2))}

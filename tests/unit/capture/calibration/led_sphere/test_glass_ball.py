@@ -43,7 +43,7 @@ def angle_deg(a, b):
     return np.degrees(np.linalg.norm(a - b, axis=1))
 
 
-def test_a_spot_lies_where_the_way_of_light_is_stationary():
+def test_spot_is_where_optical_path_is_stationary():
     """Fermat's principle knows no normals: the length of the way over the ball is least."""
     center, light = np.array([0.4, -0.3, -2.5]), PLACE[77]
     eye = CAMERA.center_mm
@@ -60,7 +60,7 @@ def test_a_spot_lies_where_the_way_of_light_is_stationary():
     np.testing.assert_allclose(seen(center, light[None])[0], CAMERA.project(point), atol=2e-3)
 
 
-def test_the_ball_is_found_to_microns_by_lights_known_to_millimetres(rng):
+def test_ball_located_to_microns_by_millimeter_known_lights(rng):
     center, places = np.array([0.4, -0.3, -2.7]), sphere(rng)
     pixels = seen(center, places, 6.01) + 0.1 * rng.standard_normal(PLACE[:, :2].shape)
     fit = locate_ball(pixels, CAMERA, PLACE, TARGET, noise_px=0.1)
@@ -71,7 +71,7 @@ def test_the_ball_is_found_to_microns_by_lights_known_to_millimetres(rng):
     assert fit.light_scatter_mm == pytest.approx(1.5, rel=0.3)
 
 
-def test_directions_are_found_within_their_errors_and_better_than_drawn(rng):
+def test_directions_are_within_errors_and_beat_nominal(rng):
     center, places = np.array([-0.2, 0.5, -3.2]), sphere(rng)
     pixels = seen(center, places) + 0.05 * rng.standard_normal(PLACE[:, :2].shape)
     fit = locate_ball(pixels, CAMERA, PLACE, TARGET, noise_px=0.05)
@@ -93,7 +93,7 @@ def test_directions_are_found_within_their_errors_and_better_than_drawn(rng):
     assert low < 2 * np.sum(own**2) < 1.3 * high
 
 
-def test_a_tenth_of_the_lights_dead_and_stray_spots_change_nothing(rng):
+def test_dead_lights_and_stray_spots_change_nothing(rng):
     center, places = np.array([0.4, -0.3, -2.7]), sphere(rng)
     dead = rng.choice(len(PLACE), 13, replace=False)
     pixels = np.delete(seen(center, places), dead, axis=0)
@@ -105,7 +105,7 @@ def test_a_tenth_of_the_lights_dead_and_stray_spots_change_nothing(rng):
     assert np.abs(fit.ball.center_mm - center)[:2].max() < 0.01
 
 
-def test_a_ball_two_millimetres_off_is_found_and_what_falls_outside_is_known(rng):
+def test_displaced_ball_is_found_and_spots_outside_known(rng):
     center, places = np.array([2.0, -0.5, -3.0]), sphere(rng)
     pixels = seen(center, places)
     inside = ((pixels > 0) & (pixels < 2047)).all(axis=1)
@@ -117,7 +117,7 @@ def test_a_ball_two_millimetres_off_is_found_and_what_falls_outside_is_known(rng
     assert fit.in_field[~inside].sum() == 0
 
 
-def test_a_crop_that_shows_half_the_ball_is_refused_by_name(rng):
+def test_crop_showing_half_ball_is_refused_by_name(rng):
     small = CameraPose.nominal(RIG.cropped(512).view("cam"))
     pixels = seen(BEHIND, PLACE, camera=small)
     inside = ((pixels > 0) & (pixels < 511)).all(axis=1)
@@ -131,7 +131,7 @@ def test_a_crop_that_shows_half_the_ball_is_refused_by_name(rng):
         locate_ball(pixels[inside], half, PLACE, TARGET)
 
 
-def test_no_spots_and_spots_of_something_else_are_refused_by_name(rng):
+def test_missing_and_foreign_spots_are_refused_by_name(rng):
     with pytest.raises(BallError, match="no spot stands out"):
         locate_ball(np.zeros((0, 2)), CAMERA, PLACE, TARGET)
     with pytest.raises(BallError, match="lights' pattern"):
@@ -154,7 +154,7 @@ def test_spots_are_found_to_a_pixel(rng):
     assert gaps.min(axis=0).max() < 1.5
 
 
-def test_the_magnification_is_that_of_a_convex_mirror_on_its_axis():
+def test_magnification_is_that_of_convex_mirror_on_axis():
     light = np.array([[0.0, 0.0, 600.0]])
     shown = mirror_lights(CAMERA, BEHIND, 6.0, light)
     # thin mirror of focal length R / 2: the image of a light s away stands f s / (s + f) behind
@@ -164,7 +164,7 @@ def test_the_magnification_is_that_of_a_convex_mirror_on_its_axis():
     np.testing.assert_allclose(shown.magnification_px2[0], (size * per_mm) ** 2, rtol=1e-4)
 
 
-def test_a_root_finder_on_the_surface_agrees_where_a_light_is_mirrored():
+def test_mirrored_light_position_matches_surface_root_finder():
     """In the plane of camera, ball and light one angle decides; it is found by bisection."""
     light = np.array([400.0, 0.0, 447.0])
     eye = CAMERA.center_mm

@@ -57,7 +57,7 @@ def written(folder, rng):
     return lights, leaks
 
 
-def test_a_sphere_is_read_as_it_was_written(tmp_path, rng):
+def test_sphere_calibration_round_trips_through_file(tmp_path, rng):
     lights, leaks = written(tmp_path, rng)
     found = SphereCalibration.load(tmp_path, RIG, on=MADE)
     for name in (
@@ -75,7 +75,7 @@ def test_a_sphere_is_read_as_it_was_written(tmp_path, rng):
     np.testing.assert_array_equal(found.usable, lights.valid & ~lights.dead)
 
 
-def test_a_subset_of_the_lights_comes_in_the_rigs_order(tmp_path, rng):
+def test_light_subset_comes_in_rig_order(tmp_path, rng):
     lights, _ = written(tmp_path, rng)
     some = RIG.subset(lights=["G100", "G003"])
     found = SphereCalibration.load(tmp_path, some)
@@ -83,7 +83,7 @@ def test_a_subset_of_the_lights_comes_in_the_rigs_order(tmp_path, rng):
     np.testing.assert_array_equal(found.lights.intensities, lights.intensities[[3, 100]])
 
 
-def test_another_rig_another_camera_and_another_day_are_refused(tmp_path, rng):
+def test_other_rig_camera_and_day_are_refused(tmp_path, rng):
     written(tmp_path, rng)
     with pytest.raises(store.CalibrationMismatch, match="other"):
         SphereCalibration.load(tmp_path, dataclasses.replace(RIG, name="other"))
@@ -96,7 +96,7 @@ def test_another_rig_another_camera_and_another_day_are_refused(tmp_path, rng):
         SphereCalibration.load(tmp_path / "none", RIG)
 
 
-def test_what_is_no_table_is_refused(rng):
+def test_invalid_light_table_is_refused(rng):
     lights = table(rng)
     with pytest.raises(ValueError, match="unit vectors"):
         dataclasses.replace(lights, directions=2 * lights.directions)

@@ -56,7 +56,7 @@ def spots(
 
 
 @pytest.mark.parametrize("zero_deg", [0.0, 0.6, -10.0])
-def test_analyser_films_and_axes_are_found_within_their_errors(rng, zero_deg):
+def test_analyzer_polarizers_and_axes_are_within_their_errors(rng, zero_deg):
     *data, truth = spots(rng, zero_deg=zero_deg, turn_deg=0.3)
     fit = fit_films(*data, GLASS)
     assert abs(np.degrees(fit.zero_rad - truth["zero"])) < 0.1
@@ -82,7 +82,7 @@ def test_analyser_films_and_axes_are_found_within_their_errors(rng, zero_deg):
 
 
 @pytest.mark.parametrize("zero_deg", [0.6, -10.0])
-def test_what_skin_leaks_follows_from_what_glass_leaks(rng, zero_deg):
+def test_skin_leakage_follows_from_glass_leakage(rng, zero_deg):
     *data, truth = spots(rng, zero_deg=zero_deg, turn_deg=0.3)
     value, error = leakage(fit_films(*data, GLASS), SKIN)
     pull = (value - truth["leak"]) / error
@@ -96,7 +96,7 @@ def test_what_skin_leaks_follows_from_what_glass_leaks(rng, zero_deg):
 
 
 @pytest.mark.long
-def test_with_two_readings_the_errors_say_that_signs_are_open(rng):
+def test_two_readings_errors_reflect_open_signs(rng):
     *data, truth = spots(rng, zero_deg=0.6, turn_deg=0.3, series=TWO_STATES)
     fit = fit_films(*data, GLASS)
     assert abs(fit.zero_rad - truth["zero"]) < 4 * fit.zero_stderr_rad
@@ -108,7 +108,7 @@ def test_with_two_readings_the_errors_say_that_signs_are_open(rng):
 
 
 @pytest.mark.long
-def test_errors_of_the_zero_are_as_large_as_stated_over_many_spheres(rng):
+def test_zero_errors_match_stated_over_many_spheres(rng):
     pulls = []
     for _ in range(12):
         *data, truth = spots(rng, zero_deg=rng.normal(0, 0.7), turn_deg=0.5)
@@ -118,7 +118,7 @@ def test_errors_of_the_zero_are_as_large_as_stated_over_many_spheres(rng):
     assert low < np.sum(np.square(pulls)) < high
 
 
-def test_one_light_far_off_does_not_turn_the_analyser(rng):
+def test_single_outlier_light_does_not_rotate_analyzer(rng):
     readings, rates, variance, good, truth = spots(rng, zero_deg=0.5, turn_deg=0.0)
     turn = np.zeros(len(PLACE))
     turn[7] = np.radians(8.0)
@@ -140,7 +140,7 @@ def test_dead_lights_have_no_strength_and_no_say(rng):
     assert abs(fit.zero_rad - truth["zero"]) < 4 * fit.zero_stderr_rad
 
 
-def test_one_reading_or_no_unsaturated_spots_are_refused(rng):
+def test_single_reading_or_saturated_spots_are_refused(rng):
     readings, rates, variance, good, _ = spots(rng, zero_deg=0.5, turn_deg=0.2)
     with pytest.raises(PolarizationError, match="two that differ"):
         fit_films(readings[:3], rates[:3], variance[:3], good[:3], GLASS)

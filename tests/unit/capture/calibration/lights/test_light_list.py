@@ -17,7 +17,7 @@ CAMERAS = nominal_cameras(DOME.subset(views=["C03", "C06", "C07", "C08", "C13"])
 RADIUS_MM = 50.0
 
 
-def test_a_white_follows_the_inverse_square_law_the_lobe_and_the_axis():
+def test_white_follows_inverse_square_lobe_and_axis():
     table = LightTable(
         np.array([[0.0, 0.0, 700.0]]), np.full((1, 3), 490_000.0), np.array([2.0]), ("a",)
     )
@@ -84,7 +84,7 @@ def test_reflections_obey_the_law_of_reflection(rng):
     np.testing.assert_allclose(direction, expected, atol=1e-7)
 
 
-def test_an_outline_is_an_ellipse_whose_middle_is_not_the_centre():
+def test_outline_is_ellipse_with_center_off_middle():
     camera = CAMERAS["C07"]
     center = np.array([90.0, 60.0, 40.0])
     outline = mirror_sphere.contour(camera, center, RADIUS_MM, 180)
@@ -102,7 +102,7 @@ def test_an_outline_is_an_ellipse_whose_middle_is_not_the_centre():
         mirror_sphere.contour(camera, camera.center_mm + 10.0, RADIUS_MM, 10)
 
 
-def test_a_sphere_is_located_within_its_errors_and_a_wrong_radius_is_noticed(rng):
+def test_sphere_is_located_within_errors_wrong_radius_detected(rng):
     center = np.array([-60.0, 30.0, 10.0])
     squares = 0.0
     for _ in range(8):
@@ -164,7 +164,7 @@ def test_lights_are_placed_within_their_errors(rng):
     assert chi2.ppf(5e-4, degrees) < squares < chi2.ppf(1 - 5e-4, degrees)
 
 
-def test_lights_seen_by_one_camera_only_are_flagged_and_keep_their_drawing(rng):
+def test_lights_visible_to_single_camera_keep_nominal_flagged(rng):
     lights, _, spheres, seen = lights_and_highlights(rng, 0.05)
     name = next(iter(lights))
     kept = []
@@ -184,7 +184,7 @@ def test_lights_seen_by_one_camera_only_are_flagged_and_keep_their_drawing(rng):
         mirror_lights.locate_lights(one, CAMERAS, spheres, lights)
 
 
-def test_what_little_is_seen_follows_the_drawing_where_its_tolerance_is_given(rng):
+def test_sparse_sightings_follow_nominal_given_tolerance(rng):
     lights, true, spheres, seen = lights_and_highlights(rng, 0.6)
     free = mirror_lights.locate_lights(seen, CAMERAS, spheres, lights)
     held = mirror_lights.locate_lights(seen, CAMERAS, spheres, lights, nominal_stderr_mm=2.5)
@@ -234,7 +234,7 @@ def some_lights(rng):
     return dataclasses.replace(table, intensity=12.0 * power * table.intensity)
 
 
-def test_powers_and_gains_are_told_apart(rng):
+def test_powers_and_gains_are_separated(rng):
     table = some_lights(rng)
     gains = {"C06": 1.02, "C07": 1.0, "C08": 1 / 1.02}
     samples = plate_samples(rng, table, poses=(0, 60, -60), gains=gains, noise=1e-3)
@@ -292,7 +292,7 @@ def test_balls_without_highlight_are_named():
         directions_from_chrome_ball([spot], np.zeros((81, 81)))
 
 
-def test_a_camera_at_the_origin_of_its_own_frame_projects_to_its_middle():
+def test_camera_at_own_origin_projects_to_image_middle():
     camera = CameraPose(
         "x", np.diag([500.0, 500.0, 1.0]), np.zeros(5), np.eye(3), np.zeros(3), (8, 6)
     )

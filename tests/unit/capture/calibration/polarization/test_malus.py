@@ -30,14 +30,14 @@ def measured(rng, *, extinction=500.0, jitter=0.005, noise=2e-5, repeats=2, zero
 
 @pytest.mark.parametrize("zero_deg", [-89.0, -30.0, 0.0, 2.5, 60.0, 89.9])
 @pytest.mark.parametrize("extinction", [1.5, 20.0, 1e3, 1e6])
-def test_a_noise_free_series_gives_zero_and_extinction_exactly(zero_deg, extinction):
+def test_noise_free_series_gives_exact_zero_and_extinction(zero_deg, extinction):
     zero = np.deg2rad(zero_deg)
     fit = fit_malus(ANGLES, malus(ANGLES, zero=zero, extinction=extinction))
     assert fit.zero_rad[0] == pytest.approx(zero, abs=1e-9)
     assert fit.leak[0] == pytest.approx(1 / extinction, abs=1e-9)
 
 
-def test_an_analyser_turned_the_other_way_has_the_opposite_zero():
+def test_analyzer_rotated_oppositely_has_opposite_zero():
     fit = fit_malus(-ANGLES, malus(ANGLES, zero=0.1))
     assert fit.zero_rad[0] == pytest.approx(-0.1)
 
@@ -54,7 +54,7 @@ def fits():
     return [fit_malus(a, i, variance=v) for a, i, v in series]
 
 
-def test_stated_errors_cover_zero_and_leak_in_68_percent_of_the_series(fits):
+def test_stated_zero_and_leak_errors_cover_68_percent(fits):
     """26 frames, light scattering by 0.5 %, which the fit has to find out: false-alarm rate 1e-3.
 
     One standard error from 23 degrees of freedom holds 67 %, which the band includes.
@@ -65,7 +65,7 @@ def test_stated_errors_cover_zero_and_leak_in_68_percent_of_the_series(fits):
     assert covered(leak, 1 / 500, np.array([f.leak_stderr[0] for f in fits]))
 
 
-def test_the_coverage_test_fails_for_a_wrong_zero_and_a_wrong_leak(fits):
+def test_coverage_test_fails_for_wrong_zero_and_leak(fits):
     zero = np.array([f.zero_rad[0] for f in fits])
     leak = np.array([f.leak[0] for f in fits])
     error = np.array([f.zero_stderr_rad[0] for f in fits])
@@ -74,7 +74,7 @@ def test_the_coverage_test_fails_for_a_wrong_zero_and_a_wrong_leak(fits):
     assert not covered(leak, 1 / 500 + 2 * error.mean(), error)
 
 
-def test_the_extinction_interval_holds_the_truth_in_95_percent(fits):
+def test_extinction_interval_coverage_is_95_percent(fits):
     inside = sum(f.extinction_lower[0] < 500 < f.extinction_upper[0] for f in fits)
     low, high = binom.ppf([5e-4, 1 - 5e-4], len(fits), 0.95)
     assert low <= inside <= high
@@ -95,7 +95,7 @@ def test_weights_make_the_dark_angles_tell_the_extinction():
     assert np.std(weighted) < 0.5 * np.std(plain)
 
 
-def test_an_extinction_below_the_noise_floor_has_a_lower_bound_only():
+def test_extinction_below_noise_floor_has_lower_bound_only():
     angles, intensity, variance = measured(
         np.random.default_rng(3), extinction=1e7, noise=2e-3, jitter=0.0
     )
@@ -127,12 +127,12 @@ def test_channels_are_fitted_each_as_if_alone():
         (ANGLES, np.where(ANGLES > 1, np.nan, 1.0), "finite"),
     ],
 )
-def test_an_unusable_series_says_what_to_take(angles, intensity, says):
+def test_unusable_series_error_names_required_frames(angles, intensity, says):
     with pytest.raises(PolarizationError, match=says):
         fit_malus(angles, intensity)
 
 
-def test_the_polarized_target_is_picked_out_of_the_picture():
+def test_polarized_target_is_located_in_image():
     rng = np.random.default_rng(7)
     target = np.zeros((30, 40), bool)
     target[10:20, 15:25] = True
@@ -145,7 +145,7 @@ def test_the_polarized_target_is_picked_out_of_the_picture():
     np.testing.assert_array_equal(masked, target & (np.arange(40) < 20))
 
 
-def test_a_misaligned_analyser_leaks_as_the_square_of_the_angle():
+def test_misaligned_analyzer_leaks_with_square_of_angle():
     calibration = PolarizationCalibration.from_fit(
         fit_malus(ANGLES, np.stack([malus(ANGLES, zero=0.05, extinction=1e9)] * 3, 1)), "RGB"
     )

@@ -41,7 +41,7 @@ def by_skin(eta=1.4):
 
 
 @pytest.mark.parametrize("eta", [1.33, 1.52, 2.4])
-def test_amplitudes_are_those_of_the_textbook_at_normal_brewsters_and_grazing_incidence(eta):
+def test_amplitudes_match_textbook_at_normal_brewster_and_grazing(eta):
     rs, rp = fresnel_amplitudes([1.0, np.cos(np.arctan(eta)), 1e-9], eta)
     normal = (eta - 1) / (eta + 1)
     np.testing.assert_allclose([rs[0], rp[0]], [-normal, normal], rtol=1e-12)
@@ -50,7 +50,7 @@ def test_amplitudes_are_those_of_the_textbook_at_normal_brewsters_and_grazing_in
     np.testing.assert_allclose([rs[2] ** 2, rp[2] ** 2], 1.0, atol=1e-6)
 
 
-def test_the_rig_extinguishes_what_skin_mirrors_but_not_what_glass_does():
+def test_rig_extinguishes_skin_mirror_reflection_but_not_glass():
     parallel, crossed = by_skin().transmit_through_analyzer([0.0, np.pi / 2])
     assert (crossed / parallel).max() < 1e-5  # axes in the file are rounded to 0.01 degrees
     parallel, crossed = by_ball().transmit_through_analyzer([0.0, np.pi / 2])
@@ -58,7 +58,7 @@ def test_the_rig_extinguishes_what_skin_mirrors_but_not_what_glass_does():
     assert (crossed / parallel).max() > 0.1
 
 
-def test_what_the_analyser_passes_parallel_and_crossed_is_the_reflectance():
+def test_parallel_and_crossed_transmission_sum_to_reflectance():
     reflection = by_ball()
     leak, turn = 1e-3, np.radians(np.linspace(-3, 3, len(PLACE)))
     both = reflection.transmit_through_analyzer([0.4, 0.4 + np.pi / 2], turn, 0.1, 0.0, leak).sum(
@@ -70,7 +70,7 @@ def test_what_the_analyser_passes_parallel_and_crossed_is_the_reflectance():
     np.testing.assert_allclose(both, (1 + leak) * whole, rtol=np.radians(1.2) ** 2)
 
 
-def test_a_reading_and_the_analysers_zero_add():
+def test_reading_and_analyzer_zero_add():
     reflection = by_ball()
     np.testing.assert_allclose(
         reflection.transmit_through_analyzer([0.5], 0.0, 0.2),

@@ -98,7 +98,7 @@ def outside_interval(count_inside, count, share=0.6827, false_alarm=1e-3):
         ("nonlinearity", 0.0),
     ],
 )
-def test_stated_errors_cover_the_truth_in_68_percent_of_the_runs(calibrations, name, truth):
+def test_stated_errors_cover_truth_in_68_percent(calibrations, name, truth):
     """Rationale: one standard error must hold 68 % of the truths.
 
     Expected: 180 estimates (60 seeds x 3 colors) per quantity; false-alarm rate 1e-3 per quantity.
@@ -112,12 +112,12 @@ def test_stated_errors_cover_the_truth_in_68_percent_of_the_runs(calibrations, n
     assert np.abs(z).max() < 5
 
 
-def test_the_coverage_test_fails_for_a_gain_two_percent_off(calibrations):
+def test_coverage_test_fails_for_gain_two_percent_off(calibrations):
     z = np.array([sigmas(c.gain_e_per_dn, 2.5 * 1.02) for c in calibrations])
     assert outside_interval(int((np.abs(z) < 1).sum()), z.size)
 
 
-def test_the_gain_error_falls_with_the_square_root_of_the_pixels():
+def test_gain_error_falls_with_root_of_pixel_count():
     """Expected: 4 x the pixels, 1/2 the stated error, within 15 % (it is a smooth function)."""
     errors = [
         Bench(shape=shape)
@@ -135,7 +135,7 @@ def test_the_variance_follows_the_line_of_photon_transfer(calibrations):
     assert abs(chi2.mean() - 1.0) < 0.05
 
 
-def test_the_full_well_is_found_where_the_variance_collapses():
+def test_full_well_is_found_where_variance_collapses():
     bench = Bench(full_well=24000.0, color=(1.0, 1.0, 1.0))
     result = bench.calibrate(np.random.default_rng(3), levels=12, top=1.3)
     assert result.saturated_by == ("full well",) * 3
@@ -144,7 +144,7 @@ def test_the_full_well_is_found_where_the_variance_collapses():
     assert np.abs(sigmas(result.gain_e_per_dn, 2.5)).max() < 4
 
 
-def test_the_white_level_is_found_where_the_converter_ends():
+def test_white_level_is_found_at_converter_limit():
     bench = Bench(full_well=1e9, color=(1.0, 1.0, 1.0))
     result = bench.calibrate(np.random.default_rng(3), levels=12, top=1.6)
     assert result.saturated_by == ("white level",) * 3
@@ -167,7 +167,7 @@ def test_the_flat_field_takes_the_vignetting_out():
     assert result.flat_mosaic(*bench.shape).min() < 0.8
 
 
-def test_a_nonlinear_sensor_is_seen_and_a_linear_one_is_not():
+def test_nonlinear_sensor_is_detected_and_linear_is_not():
     """A response losing 3 % at full signal is found with the right size, well outside its error."""
     q = {}
     for bend in (0.0, -0.03):
@@ -188,7 +188,7 @@ def test_dark_current_comes_from_darks_of_several_times():
     assert Bench().calibrate(np.random.default_rng(2)).dark_e_per_s is None
 
 
-def test_hot_pixels_are_left_out():
+def test_hot_pixels_are_omitted():
     bench = Bench(prnu=0.0)
     rng = np.random.default_rng(4)
     response, offset = bench.fixed_pattern(rng)
@@ -204,13 +204,13 @@ def test_hot_pixels_are_left_out():
     assert np.abs(sigmas(result.gain_e_per_dn, 2.5)).max() < 4
 
 
-def test_a_monochrome_sensor_is_one_color():
+def test_monochrome_sensor_is_single_color():
     result = Bench(pattern="MONO").calibrate(np.random.default_rng(6))
     assert result.colors == ("MONO",)
     assert np.abs(sigmas(result.gain_e_per_dn, 2.5)).max() < 4
 
 
-def test_the_noise_profile_predicts_the_variance_of_a_frame(calibrations):
+def test_noise_profile_predicts_frame_variance(calibrations):
     scale, offset = calibrations[0].noise_profile()
     span = 16383 - 512
     assert scale == pytest.approx(1 / (2.5 * span), rel=0.05)
@@ -262,12 +262,12 @@ def _frames(n, value=600):
         ),
     ],
 )
-def test_unusable_frames_say_what_to_take(pairs, darks, says):
+def test_unusable_frames_error_names_required_frames(pairs, darks, says):
     with pytest.raises(PhotonTransferError, match=says):
         photon_transfer(pairs(), darks(), white_dn=16383)
 
 
-def test_copies_of_one_frame_are_no_pair():
+def test_identical_frames_are_not_pair():
     ramp = np.linspace(0, 1, 128)[None, :] * np.ones((128, 1))
     pairs = [
         FlatPair(*[(512 + x * 14000 * ramp).astype(np.uint16)] * 2, x) for x in (0.3, 0.6, 0.9)

@@ -301,7 +301,7 @@ def released(camera, body, trigger, clock):
 
 
 @pytest.mark.parametrize("trigger", [Trigger.SOFTWARE, Trigger.EDGE])
-def test_a_frame_is_what_the_camera_was_set_to_and_was_released_by(camera, body, clock, trigger):
+def test_frame_matches_camera_settings_and_its_release(camera, body, clock, trigger):
     for shot in (1, 2):
         before = released(camera, body, trigger, clock)
         frame, stale = next_frame(camera, seq=0, not_before_s=before, want=WANT, timeout_s=2.0)
@@ -313,7 +313,7 @@ def test_a_frame_is_what_the_camera_was_set_to_and_was_released_by(camera, body,
         assert len(body.requeued) == shot
 
 
-def test_a_camera_says_what_it_is(camera):
+def test_camera_reports_its_identity(camera):
     info = camera.info
     assert (info.serial, info.model) == ("B2", "Body 12?")
     assert (info.width_px, info.height_px, info.pattern) == (6, 4, "RGGB")
@@ -327,7 +327,7 @@ def test_a_camera_is_set_to_raw_values(camera, body):
     assert (at["AcquisitionMode"], at["BalanceRatio"]) == ("Continuous", 1.0)
 
 
-def test_edges_are_those_of_the_line_that_was_asked_for(bus, body):
+def test_edges_come_from_requested_line(bus, body):
     camera = genicam.open_camera("B2?line=Line1&format=BayerRG8&black=3.5")
     assert (camera.info.black, camera.info.white) == ((3.5,) * 4, 255)
     camera.arm(2, Trigger.EDGE)
@@ -362,7 +362,7 @@ def test_every_other_trigger_is_switched_off(camera, body):
     assert seen == ["AcquisitionStart", "FrameStart"]
 
 
-def test_settings_are_the_nearest_the_camera_has_and_said_so(camera, body):
+def test_settings_are_nearest_available_and_reported(camera, body):
     # steps of 20 us from 20 us; 6.02 dB is a factor of 2
     got = camera.configure(Exposure(0.000033, 200))
     assert (got.exposure_s, got.iso) == (pytest.approx(40e-6), 200)
@@ -373,7 +373,7 @@ def test_settings_are_the_nearest_the_camera_has_and_said_so(camera, body):
     assert (got.exposure_s, got.iso) == (pytest.approx(20e-6), 1585)  # 24 dB
 
 
-def test_a_gain_of_0_db_is_called_what_the_address_says(bus, body):
+def test_gain_of_0_db_has_name_from_address(bus, body):
     camera = genicam.open_camera("B2?iso=160")
     assert camera.configure(Exposure(0.008, 160)).iso == 160
     assert body.nodes["Gain"].value == 0.0
@@ -382,7 +382,7 @@ def test_a_gain_of_0_db_is_called_what_the_address_says(bus, body):
     camera.close()
 
 
-def test_a_gain_of_another_unit_is_left_at_its_least(bus, body):
+def test_gain_of_other_unit_stays_at_minimum(bus, body):
     body.nodes["Gain"] = Node(4.0, low=1.0, high=16.0)
     camera = genicam.open_camera("B2?iso=160")
     assert camera.configure(Exposure(0.008, 640)) == Exposure(0.008, 160)
@@ -421,7 +421,7 @@ def test_the_clock_of_older_cameras_counts_ticks(bus, body, clock):
     camera.close()
 
 
-def test_frames_are_counted_from_arming_and_lost_ones_with_them(camera, body):
+def test_frames_are_counted_from_arming_including_lost(camera, body):
     for _ in range(2):
         camera.arm(4, Trigger.EDGE)
         for _ in range(4):
@@ -430,7 +430,7 @@ def test_frames_are_counted_from_arming_and_lost_ones_with_them(camera, body):
         assert [camera.frame(1.0).seq for _ in range(3)] == [0, 2, 3]
 
 
-def test_frames_of_a_sequence_find_their_rows_of_light_by_the_cameras_clock(camera, body, clock):
+def test_sequence_frames_match_light_rows_by_camera_clock(camera, body, clock):
     """Twelve releases a second, as a light dome gives them; one frame is lost on its way."""
     camera.configure(WANT)
     offset = compare_clocks(camera, lambda: clock.now)
@@ -475,7 +475,7 @@ def test_a_frame_of_before_the_trigger_is_stale(camera, body):
         next_frame(camera, seq=0, not_before_s=before, want=WANT, timeout_s=1.0)
 
 
-def test_a_producer_that_stamps_by_another_clock_is_told(camera, body):
+def test_producer_stamping_by_other_clock_is_reported(camera, body):
     camera.arm(1, Trigger.EDGE)
     body.ahead_s = 3600.0
     body.released_by("Line2")
@@ -492,9 +492,7 @@ def test_a_producer_that_stamps_by_another_clock_is_told(camera, body):
         ({"raw_buffer": bytes(47)}, "47 bytes, expected 48"),
     ],
 )
-def test_what_is_no_frame_of_the_format_is_refused_and_its_buffer_given_back(
-    camera, body, changes, message
-):
+def test_frame_of_wrong_format_is_refused_buffer_returned(camera, body, changes, message):
     camera.arm(2, Trigger.EDGE)
     body.expose(**changes)
     with pytest.raises(FrameRefused, match=message):
@@ -504,7 +502,7 @@ def test_what_is_no_frame_of_the_format_is_refused_and_its_buffer_given_back(
     assert camera.frame(1.0).image.shape == (4, 6)
 
 
-def test_padding_and_offset_of_a_buffer_are_left_out(camera, body):
+def test_buffer_padding_and_offset_are_omitted(camera, body):
     camera.arm(1, Trigger.EDGE)
     lines = np.arange(24, dtype="<u2").reshape(4, 6)
     blob = b"header--" + b"".join(line.tobytes() + b"pad." for line in lines)
@@ -512,14 +510,14 @@ def test_padding_and_offset_of_a_buffer_are_left_out(camera, body):
     np.testing.assert_array_equal(camera.frame(1.0).image, lines)
 
 
-def test_incomplete_frames_are_said_to_be(camera, body):
+def test_incomplete_frames_are_reported(camera, body):
     camera.arm(1, Trigger.EDGE)
     body.buffers.append(None)
     with pytest.raises(FrameTimeout, match="1 came with bytes missing"):
         camera.frame(1.0)
 
 
-def test_a_camera_that_is_not_armed_gives_no_frame_and_is_not_fired(camera):
+def test_unarmed_camera_gives_no_frame_and_is_unfired(camera):
     with pytest.raises(FrameTimeout, match="not armed"):
         camera.frame(1.0)
     with pytest.raises(CameraError, match="not armed"):
@@ -541,7 +539,7 @@ def test_other_triggers_are_refused(camera, trigger):
         camera.arm(0, Trigger.EDGE)
 
 
-def test_every_frame_of_a_sequence_has_its_buffer_or_the_sequence_is_refused(camera, body):
+def test_sequence_without_buffer_per_frame_is_refused(camera, body):
     """They are fetched when the sequence is over; one without a buffer would be lost."""
     camera.arm(300, Trigger.EDGE)
     assert body.announced == 301
@@ -553,14 +551,14 @@ def test_every_frame_of_a_sequence_has_its_buffer_or_the_sequence_is_refused(cam
     assert body.announced == 41
 
 
-def test_a_camera_whose_library_is_missing_names_the_extra(monkeypatch):
+def test_missing_camera_library_error_names_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "harvesters", None)  # as if it were not installed
     with pytest.raises(ImportError, match=r"skinrig\[genicam\]") as caught:
         open_camera("genicam:1234")
     assert isinstance(caught.value, CameraError)
 
 
-def test_the_library_is_imported_by_nothing_but_such_an_address():
+def test_library_is_imported_only_by_genicam_address():
     code = (
         "import sys, capture.devices.cameras.genicam\n"
         "from capture.devices.camera import check_address\n"
@@ -571,7 +569,7 @@ def test_the_library_is_imported_by_nothing_but_such_an_address():
     assert run.stdout == "[]\n"
 
 
-def test_a_camera_that_is_gone_is_a_lost_link_and_can_be_closed(bus, body):
+def test_vanished_camera_is_lost_link_and_closable(bus, body):
     camera = genicam.open_camera("B2")
     camera.arm(1, Trigger.EDGE)
     body.gone = True
@@ -587,7 +585,7 @@ def test_a_camera_that_is_gone_is_a_lost_link_and_can_be_closed(bus, body):
 # finding it -----------------------------------------------------------------------------------
 
 
-def test_cameras_of_a_producer_share_it_and_the_last_closes_it(bus):
+def test_cameras_of_producer_reuse_handle_and_last_closes(bus):
     first, second = genicam.open_camera("B2"), genicam.open_camera("C3")
     assert len(bus) == 1
     first.close()
@@ -597,13 +595,13 @@ def test_cameras_of_a_producer_share_it_and_the_last_closes_it(bus):
     genicam.open_camera("B2").close()
 
 
-def test_the_producers_own_identifier_is_an_address_as_well(bus):
+def test_producer_identifier_is_accepted_as_address(bus):
     camera = genicam.open_camera("id-B2")
     assert camera.info.serial == "id-B2"
     camera.close()
 
 
-def test_a_camera_that_is_not_there_is_named_with_those_that_are(bus):
+def test_missing_camera_error_lists_available_cameras(bus):
     with pytest.raises(CameraUrlError, match=r"genicam:D4.*A1.*B2.*C3.*one\.cti, two\.cti"):
         genicam.open_camera("D4")
 
@@ -614,7 +612,7 @@ def test_a_camera_that_another_program_has_is_busy(bus, body):
         genicam.open_camera("B2")
 
 
-def test_without_a_producer_it_says_where_it_looked(bus, tmp_path, monkeypatch):
+def test_missing_producer_error_lists_searched_locations(bus, tmp_path, monkeypatch):
     (tmp_path / "empty").mkdir()
     for given in ("empty", "none.cti"):
         with pytest.raises(CameraUrlError, match=rf"no GenTL producer.*{given}"):
@@ -654,9 +652,7 @@ def having(**changed):
         (having(BalanceRatio=Node(2.0, low=2.0, high=4.0)), "BalanceRatio of Red: got 2"),
     ],
 )
-def test_a_camera_whose_frames_could_not_be_believed_is_refused_and_let_go(
-    bus, body, change, message
-):
+def test_camera_with_unreliable_frames_is_refused_and_released(bus, body, change, message):
     change(body.nodes)
     with pytest.raises(CameraError, match=rf"genicam:B2.*{message}"):
         genicam.open_camera("B2")
@@ -679,19 +675,19 @@ def test_a_camera_whose_frames_could_not_be_believed_is_refused_and_let_go(
         "B2?line=Line1&line=Line2",
     ],
 )
-def test_an_address_that_says_something_else_is_refused(rest):
+def test_address_of_other_form_is_refused(rest):
     with pytest.raises(CameraUrlError, match="expected genicam:SERIAL"):
         genicam.parse_address(rest)
 
 
-def test_a_format_or_line_that_it_lacks_is_named_with_those_it_has(bus):
+def test_missing_format_or_line_error_lists_available(bus):
     with pytest.raises(CameraError, match=r"Mono12p.*BayerRG12"):
         genicam.open_camera("B2?format=Mono12p")
     with pytest.raises(CameraUrlError, match=r"Line9.*Software, Line1, Line2"):
         genicam.open_camera("B2?line=Line9")
 
 
-def test_every_error_of_the_library_is_one_of_a_camera():
+def test_every_library_error_is_camera_error():
     library = genicam_producer.Library(None, (GenericError,))
     kinds = {
         "AccessException": CameraError,

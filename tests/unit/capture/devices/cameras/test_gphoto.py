@@ -186,19 +186,19 @@ def shoot(camera, body, trigger, clock):
     return next_frame(camera, seq=0, not_before_s=armed_s, want=WANT, timeout_s=5.0)
 
 
-def test_a_camera_is_found_by_its_serial_number_wherever_it_is_plugged_in(clock, body):
+def test_camera_is_found_by_serial_on_any_port(clock, body):
     for bus in itertools.permutations([Body("A1", "usb:1,4"), body, Body("C3", "usb:1,6")]):
         assert GphotoCamera(library(*bus, clock=clock), "B2", clock=clock).info.serial == "B2"
 
 
-def test_a_camera_that_is_not_there_is_named_with_those_that_are(clock):
+def test_missing_camera_error_lists_available_cameras(clock):
     bus = library(Body("A1", "usb:1,4"), Body("C3", "usb:1,6", held=True), clock=clock)
     with pytest.raises(CameraUrlError, match=r"(?s)serial A1.*claim"):
         GphotoCamera(bus, "B2", clock=clock)
 
 
 @pytest.mark.parametrize("trigger", [Trigger.EDGE, Trigger.SOFTWARE])
-def test_a_frame_is_what_the_camera_was_set_to_and_was_released_by(camera, body, clock, trigger):
+def test_frame_matches_camera_settings_and_its_release(camera, body, clock, trigger):
     before = body.shots
     frame, stale = shoot(camera, body, trigger, clock)
     assert (stale, body.shots) == (0, before + 1)
@@ -209,7 +209,7 @@ def test_a_frame_is_what_the_camera_was_set_to_and_was_released_by(camera, body,
     assert again.image != frame.image
 
 
-def test_settings_are_the_nearest_the_camera_has_and_said_so(camera):
+def test_settings_are_nearest_available_and_reported(camera):
     # nearest in stops: 0.004 is 0.3 stops from 0.005, 0.008 is 0.7
     assert camera.configure(Exposure(0.005, 130)) == Exposure(0.004, 100)
     assert camera.configure(Exposure(0.02, 1600)) == Exposure(1 / 60, 200)
@@ -223,7 +223,7 @@ def test_a_camera_on_automatic_has_nothing_to_set(clock):
         camera.configure(WANT)
 
 
-def test_a_file_from_before_arming_is_no_frame(camera, body, clock):
+def test_file_from_before_arming_is_not_frame(camera, body, clock):
     camera.configure(WANT)
     body.edge()  # somebody pressed the shutter
     camera.arm(1, Trigger.EDGE)
@@ -231,7 +231,7 @@ def test_a_file_from_before_arming_is_no_frame(camera, body, clock):
         camera.frame(2.0)
 
 
-def test_a_camera_that_hands_out_its_last_file_again_is_stale(camera, body, clock):
+def test_camera_returning_last_file_again_is_stale(camera, body, clock):
     shoot(camera, body, Trigger.EDGE, clock)
     body.stuck = True
     with pytest.raises(FrameTimeout):
@@ -242,7 +242,7 @@ def test_a_camera_that_hands_out_its_last_file_again_is_stale(camera, body, cloc
     assert raw.decode(memoryview(frame.image), where="test").cfa.max() == 600 + body.shots
 
 
-def test_a_stale_file_before_the_right_one_is_dropped_and_counted(camera, body, clock):
+def test_stale_file_before_right_file_is_dropped_counted(camera, body, clock):
     shoot(camera, body, Trigger.EDGE, clock)
     camera.arm(1, Trigger.EDGE)
     armed_s = clock.now
@@ -255,13 +255,13 @@ def test_a_stale_file_before_the_right_one_is_dropped_and_counted(camera, body, 
     assert raw.decode(memoryview(frame.image), where="test").cfa.max() == 600 + body.shots
 
 
-def test_a_camera_that_was_not_fired_gives_no_frame(camera):
+def test_unfired_camera_gives_no_frame(camera):
     camera.arm(1, Trigger.SOFTWARE)
     with pytest.raises(FrameTimeout, match="not fired"):
         camera.frame(1.0)
 
 
-def test_what_the_library_raises_is_a_camera_error(camera, body):
+def test_library_exception_becomes_camera_error(camera, body):
     body.broken = True
     with pytest.raises(CameraError, match="I/O in progress"):
         camera.configure(WANT)

@@ -61,7 +61,7 @@ def test_packed_values_are_those_that_the_library_unpacks(name):
     )
 
 
-def test_numbers_of_two_bytes_may_have_the_high_one_first():
+def test_two_byte_numbers_may_be_big_endian():
     got = pixel_format.parse("Mono12").unpack(
         bytes([0x0A, 0xBC, 0x01, 0x02]), width_px=2, height_px=1, big_endian=True
     )
@@ -99,7 +99,7 @@ def test_other_formats_are_not_raw(name):
     assert pixel_format.parse(name) is None
 
 
-def test_the_deepest_raw_format_is_chosen_and_a_conversion_to_gray_never():
+def test_deepest_raw_format_is_chosen_gray_conversion_never():
     assert pixel_format.deepest(["Mono16", "BayerRG8", "BayerRG10p"]).name == "BayerRG10p"
     assert pixel_format.deepest(["Mono12p", "Mono12", "Mono12Packed"]).name == "Mono12"
     assert pixel_format.deepest(["RGB8", "YUV422_8"]) is None

@@ -16,7 +16,7 @@ def turn(axis, angle):
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
-def test_a_moved_head_sees_itself_from_the_same_places_as_the_rig_sees_it(rng):
+def test_moved_head_projections_match_rig_frame(rng):
     cameras = tuple(CameraPose.nominal(view) for view in RIG.views)
     lights = LightTable.nominal(RIG)
     dome = Dome(None, cameras, lights, lights, (), True, lambda *_: None)

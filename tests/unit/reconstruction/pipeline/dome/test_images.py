@@ -83,7 +83,7 @@ def make(path, rng, *, ambient=0.0, darks=0, profile=True):
     return Session.open(path)
 
 
-def test_two_exposures_give_the_rate_though_the_long_one_is_saturated(tmp_path, rng):
+def test_two_exposures_give_rate_despite_saturated_long_exposure(tmp_path, rng):
     # red fills 80 %, green 120 % of the range in the long exposure
     images = DomeImages(make(tmp_path / "s", rng))
     image = images.image("C00", "L000")
@@ -106,7 +106,7 @@ def test_the_variance_is_that_of_repeated_captures(tmp_path, rng):
     np.testing.assert_allclose(said, seen, rtol=0.1)
 
 
-def test_the_light_of_the_room_is_taken_off_with_the_darks(tmp_path, rng):
+def test_room_light_is_subtracted_with_darks(tmp_path, rng):
     with_darks = DomeImages(make(tmp_path / "a", rng, ambient=0.2, darks=4)).image("C00", "L000")
     without = DomeImages(make(tmp_path / "b", rng, ambient=0.2)).image("C00", "L000")
     assert with_darks.rgb[..., 2].mean() == pytest.approx(RATE[2], abs=0.02)
@@ -114,7 +114,7 @@ def test_the_light_of_the_room_is_taken_off_with_the_darks(tmp_path, rng):
     assert with_darks.variance.mean() > without.variance.mean()
 
 
-def test_a_sensor_of_unknown_noise_is_named_and_a_calibrated_one_is_not(tmp_path, rng):
+def test_sensor_of_unknown_noise_is_reported_calibrated_not(tmp_path, rng):
     session = make(tmp_path / "s", rng, profile=False)
     with pytest.raises(InputsError, match="calibrate the sensor"):
         DomeImages(session).image("C00", "L000")
@@ -122,7 +122,7 @@ def test_a_sensor_of_unknown_noise_is_named_and_a_calibrated_one_is_not(tmp_path
     assert DomeImages(session, noise=noise).image("C00", "L000").valid.all()
 
 
-def test_what_the_session_lacks_is_named(tmp_path, rng):
+def test_missing_session_frames_are_reported(tmp_path, rng):
     images = DomeImages(make(tmp_path / "s", rng))
     with pytest.raises(InputsError, match="lacks camera C00, light L001"):
         images.image("C00", "L001")
@@ -130,11 +130,11 @@ def test_what_the_session_lacks_is_named(tmp_path, rng):
         DomeImages(images._session, kind="mirror")
 
 
-def test_the_middle_of_the_sensors_first_cell_is_the_first_pixel():
+def test_first_sensor_cell_center_is_first_pixel():
     np.testing.assert_array_equal(DomeImage.from_sensor_px(np.array([0.5, 0.5])), [0.0, 0.0])
 
 
-def test_times_are_the_boxs(tmp_path, rng):
+def test_times_are_controller_times(tmp_path, rng):
     assert DomeImages(make(tmp_path / "s", rng)).times_s("C00", "L000") == (1.5, 1.5)
 
 

@@ -77,7 +77,7 @@ def test_lights_without_measured_strengths_give_no_albedo(session, tmp_path):
     assert "the lights' intensities are nominal and relative" in evidence.assumed
 
 
-def test_lights_without_measured_places_are_named_as_assumed(session, tmp_path):
+def test_unmeasured_light_positions_are_reported_as_assumed(session, tmp_path):
     evidence = evidence_with(session, tmp_path / "c", {"positions": "nominal"})
     assert not albedo_of(evidence)
     assert "the lights' positions are nominal" in evidence.assumed

@@ -109,7 +109,7 @@ def follow(session):
     return follow_head(session, IMAGES, CAMERAS, SURFACE, PIXEL_MM)
 
 
-def test_cameras_of_half_the_pixels_see_where_the_images_have_it():
+def test_half_resolution_cameras_project_to_full_image_positions():
     points = SURFACE.points_mm[:50]
     half = HalfPixels(CAMERAS[0])
     np.testing.assert_allclose(
@@ -118,7 +118,7 @@ def test_cameras_of_half_the_pixels_see_where_the_images_have_it():
     assert DomeImage.from_sensor_px(np.array([0.5, 2.5])).tolist() == [0.0, 1.0]
 
 
-def test_a_head_at_rest_is_found_at_rest_and_exposures_may_be_merged():
+def test_head_at_rest_is_found_still_exposures_mergeable():
     found = follow(Shots())
     assert found.still
     assert found.usable.all()
@@ -126,7 +126,7 @@ def test_a_head_at_rest_is_found_at_rest_and_exposures_may_be_merged():
     assert found.record()["images_left_out"] == 0
 
 
-def test_the_poses_take_the_mean_head_to_where_each_image_saw_it():
+def test_poses_map_mean_head_to_its_image_positions():
     found = follow(Shots(*FAR))
     assert not found.still
     assert found.usable.all()
@@ -151,7 +151,7 @@ def test_the_poses_take_the_mean_head_to_where_each_image_saw_it():
     np.testing.assert_allclose(found.displacement_mm.max(), max(moves), rtol=0.15)
 
 
-def test_frames_of_other_light_levels_show_the_same_motion():
+def test_frames_of_other_light_levels_show_same_motion():
     same = follow(Shots(*FAR))
     other = follow(Shots(*FAR, levels=(1.0, 0.4)))
     points = np.array([[0.0, 0.0, RADIUS_MM], [40.0, 0.0, 57.0]])
@@ -171,7 +171,7 @@ def test_frames_of_other_light_levels_show_the_same_motion():
     ],
     ids=lambda x: x if isinstance(x, str) else "",
 )
-def test_without_two_frames_of_all_cameras_nobody_followed_the_head(session, why):
+def test_fewer_than_two_full_frames_record_untracked_head(session, why):
     assert follow(session) is None, why
 
 
@@ -182,7 +182,7 @@ def test_images_outside_the_tracking_frames_are_not_used():
     assert not found.still
 
 
-def test_tracking_frames_that_cover_no_image_are_an_error():
+def test_tracking_frames_covering_no_image_are_error():
     with pytest.raises(InputsError, match="no image lies between two tracking frames"):
         follow(Shots(*FAR, times_s=(30.0, 40.0)))
 

@@ -31,7 +31,7 @@ def frames(rng, asked):
     return maps
 
 
-def test_frames_of_one_pose_scatter_as_they_say_and_not_by_what_the_alignment_is_off():
+def test_same_pose_frames_scatter_as_stated_without_alignment():
     """One alignment lays all of them: its error is theirs together, a step and no noise."""
     asked = PHASE < PROMPT_S
     evidence = SimpleNamespace(assumed=[])

@@ -84,7 +84,7 @@ def fitted(relief):
     return strains, counted, document, told
 
 
-def test_known_kernels_come_back_at_both_angles(fitted):
+def test_known_kernels_are_recovered_at_both_angles(fitted):
     _, _, document, _ = fitted
     for fit in document["fits"]:
         step = 1 if "_p" in fit["name"] else -1
@@ -105,7 +105,7 @@ def test_variances_change_more_along_the_jaws_than_across(fitted):
         assert along[0] / along[1] > 1.5 * max(across[0] / across[1], 1.0)
 
 
-def test_errors_of_variances_hold_what_pictures_hide(fitted):
+def test_variance_errors_include_detail_hidden_in_images(fitted):
     """As a share of the variance beside the scatter over patches, which large patches outgrow."""
     strains, counted, _, _ = fitted
     for row in histogram_document(strains, counted)["states"]:
@@ -121,7 +121,7 @@ def test_errors_of_variances_hold_what_pictures_hide(fitted):
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 35.0, 90.0])
-def test_a_state_is_counted_in_the_blocks_that_show_its_skin(relief, angle_deg):
+def test_state_is_counted_in_blocks_that_show_skin(relief, angle_deg):
     """Skin moved and stretched, counted in the neutral map's blocks, against counting it there.
 
     Rationale: the state's height at F X + shift is the neutral one's at X, so that its slopes times
@@ -160,14 +160,14 @@ def test_a_state_is_counted_in_the_blocks_that_show_its_skin(relief, angle_deg):
     assert np.median(own) < 0.5 * np.median(other)
 
 
-def test_progress_is_told_and_the_direction_does_not_matter_here(fitted):
+def test_progress_is_reported_and_direction_is_irrelevant(fitted):
     _, _, document, told = fitted
     assert told == [0.0, 0.25, 0.5, 0.75]
     if document["direction"] is not None:
         assert document["direction"]["p_alpha"] > 1e-3
 
 
-def test_a_state_near_neutral_or_without_strain_has_no_kernel(relief):
+def test_state_near_neutral_or_unstrained_has_no_kernel(relief):
     lost = state(0.0, 2, 1.2)
     lost = StateStrain(
         lost.state, 1.2, Strain(np.eye(2), np.zeros(2), np.full((6, 6), np.inf), math.inf, 0, False)
@@ -192,7 +192,7 @@ def test_only_skin_that_both_states_show_is_counted(relief):
     assert counted[wide.state.name].samples == pytest.approx(SIDE * SIDE / 2, rel=0.05)
 
 
-def test_jaws_are_no_skin():
+def test_jaws_are_not_skin():
     picture = np.full((200, 200), 0.3, np.float32)
     picture[:, :40] = 0.02
     mask = skin_mask(picture)

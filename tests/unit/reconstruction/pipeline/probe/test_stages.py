@@ -57,7 +57,7 @@ def fit_of(document, method, number=0, channel="green"):
     return next(f for f in fits if (f["method"], f["channel"]) == (method, channel))
 
 
-def test_each_method_is_told_for_each_channel_and_the_fitting_model_comes_back():
+def test_methods_reported_per_channel_and_fitting_model_recovered():
     _, document = documents([profile()])
     assert len(document["measurements"][0]["fits"]) == 9
     found = fit_of(document, "photon_table")
@@ -68,7 +68,7 @@ def test_each_method_is_told_for_each_channel_and_the_fitting_model_comes_back()
     assert dipole["sigma_tr_per_mm"] / SIGMA_TR < 0.9
 
 
-def test_what_the_phantom_leaves_uncertain_widens_the_interval_and_moves_nothing():
+def test_phantom_uncertainty_widens_interval_without_shift():
     _, without = documents([profile()])
     _, document = documents([profile(common=0.02)])
     narrow, wide = (fit_of(d, "photon_table") for d in (without, document))
@@ -88,7 +88,7 @@ def test_what_the_phantom_leaves_uncertain_widens_the_interval_and_moves_nothing
     )
 
 
-def test_repeats_average_their_own_errors_but_not_the_phantoms():
+def test_repeats_average_own_errors_but_not_phantom_error():
     rng = np.random.default_rng(3)
     noise = 0.1
     alone, told = documents([profile(common=0.02, noise=noise, rng=rng)])
@@ -106,7 +106,7 @@ def test_repeats_average_their_own_errors_but_not_the_phantoms():
     assert [entry["site"] for entry in document["sites"]] == ["cheek"] * 3
 
 
-def test_repeats_that_scatter_more_than_they_say_are_believed_less():
+def test_repeats_scattering_beyond_errors_get_less_weight():
     calm, _ = documents([profile(repeat=k) for k in range(4)])
     torn = [profile(repeat=k) for k in range(4)]
     for k, one in enumerate(torn):
@@ -117,7 +117,7 @@ def test_repeats_that_scatter_more_than_they_say_are_believed_less():
     assert (ratio > 2).all()
 
 
-def test_a_site_without_a_valid_fit_has_no_value_and_an_infinite_error():
+def test_site_without_valid_fit_has_infinite_error():
     dark = profile()
     dark.reflectance.valid[:] = False
     made, document = documents([dark])
@@ -144,7 +144,7 @@ def test_a_measurement_is_called_after_its_placement():
     assert len(names) == 32
 
 
-def test_a_profile_dimmed_by_a_layer_on_top_is_fitted_up_to_a_factor():
+def test_profile_dimmed_by_top_layer_fits_to_factor():
     _, document = documents([profile(scale=0.4)])
     fit = fit_of(document, "photon_table")
     assert fit["sigma_tr_per_mm"] == pytest.approx(SIGMA_TR, rel=0.02)
@@ -153,7 +153,7 @@ def test_a_profile_dimmed_by_a_layer_on_top_is_fitted_up_to_a_factor():
     assert fit_of(documents([profile()])[1], "photon_table")["factor"] == 1.0
 
 
-def test_fibres_that_are_off_each_by_itself_make_no_layers():
+def test_independently_outlying_fibers_do_not_indicate_layers():
     """Twenty draws of 5 % a fibre, as of dirt since the calibration; none is stated as noise."""
     rng = np.random.default_rng(8)
     torn = [profile(noise=1e-3, repeat=k) for k in range(20)]
@@ -170,7 +170,7 @@ def test_fibres_that_are_off_each_by_itself_make_no_layers():
     assert 0.5 < np.sqrt(np.mean(off[~layered] ** 2)) < 1.4
 
 
-def test_a_turn_of_the_head_is_fitted_as_one_tissue_layered_where_all_directions_are_dimmed():
+def test_head_rotation_is_layered_only_where_all_dimmed():
     """What dims in some directions and brightens in others is no layer: none gets a factor."""
 
     def factors(scales):

@@ -67,7 +67,7 @@ def white(rig):
     return direct(rig, make_target("white"))
 
 
-def test_white_tile_gets_what_intensity_lobe_cosine_and_distance_say(rig, white):
+def test_white_reference_follows_intensity_lobe_cosine_and_distance(rig, white):
     """Closed form at each pixel's centre; tolerance: the pixel's size of 3 mm."""
     images = white.radiance("C")
     assert np.ptp(images[0]) > 0.05 * images[0].max()  # lobe and distance matter
@@ -88,14 +88,14 @@ def test_white_tile_gets_what_intensity_lobe_cosine_and_distance_say(rig, white)
     assert not images[4].any()  # it shines on the tile's back
 
 
-def test_white_reference_facing_the_meter_led_gets_the_meter_rate(white):
+def test_white_reference_facing_meter_led_gets_meter_rate(white):
     image = white.radiance("C", [0])[0]
     middle = image[image.shape[0] // 2, image.shape[1] // 2]
     assert middle.max() == pytest.approx(0.99 * DOME_METER_RATE_PER_S, rel=1e-3)
     np.testing.assert_allclose(middle / middle.max(), white.white_rgb(), rtol=1e-5)
 
 
-def test_a_dome_as_built_has_its_own_gains_dead_lights_and_wires(rig, white):
+def test_actual_dome_has_own_gains_dead_lights_wires(rig, white):
     axes = np.array([-np.array(light.position_mm) for light in rig.lights])
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     built = BuiltDome(
@@ -110,7 +110,7 @@ def test_a_dome_as_built_has_its_own_gains_dead_lights_and_wires(rig, white):
     assert (crossed.mean() - 64.0) / (straight.mean() - 64.0) == pytest.approx(1.0, rel=0.01)
 
 
-def test_a_bent_image_shows_points_where_the_lens_puts_them(rig, face):
+def test_distorted_image_shows_points_at_lens_projection(rig, face):
     """Tolerance: the middle of what a pixel of 3 mm covers, and rows kept as float32."""
     built = build(rig, seed=2, tolerances=Tolerances(distortion=0.2))
     scene = direct(rig, face, dome=built)
@@ -129,7 +129,7 @@ def test_a_bent_image_shows_points_where_the_lens_puts_them(rig, face):
     assert miss(np.zeros(5)) > 0.1
 
 
-def test_light_from_the_right_brightens_the_right_and_from_above_the_top(scene):
+def test_light_direction_brightens_matching_side_of_image(scene):
     front, right, left, top, back = scene.radiance("C").sum(axis=-1)
     half = right.shape[1] // 2
     assert right[:, half:].sum() > 3.0 * right[:, :half].sum()
@@ -139,7 +139,7 @@ def test_light_from_the_right_brightens_the_right_and_from_above_the_top(scene):
     assert back.sum() < 0.2 * front.sum()
 
 
-def test_one_light_of_many_is_the_light_alone(scene):
+def test_one_light_at_a_time_matches_single_light(scene):
     every = scene.radiance("C")
     for k in (3, 0):
         np.testing.assert_array_equal(scene.radiance("C", [k])[0], every[k])
@@ -147,7 +147,7 @@ def test_one_light_of_many_is_the_light_alone(scene):
     assert every.min() == 0.0
 
 
-def test_truth_maps_explain_the_frontal_image_of_a_matt_face(scene, rig):
+def test_truth_maps_reproduce_frontal_image_of_matte_face(scene, rig):
     """pi f_r from `brdf` at each pixel's truth, times the light there, is the image."""
     truth = scene.truth()
     image = scene.radiance("C", [0])[0]
@@ -207,7 +207,7 @@ def test_exposures_add_in_on_time_and_level(scene):
     assert (half - dark) / (whole - dark) == pytest.approx(0.5, abs=bound)
 
 
-def test_both_exposures_of_a_light_come_from_the_same_radiance(scene):
+def test_both_exposures_of_light_share_same_radiance(scene):
     """Noise aside, 120 ms hold four times the light of 30 ms at every pixel."""
 
     def mean_frame(on_s):
@@ -222,7 +222,7 @@ def test_both_exposures_of_a_light_come_from_the_same_radiance(scene):
     assert np.median(long[bright] / short[bright]) == pytest.approx(4.0, rel=0.01)
 
 
-def test_no_pulse_gives_a_dark_frame_and_the_same_seed_the_same_frame(scene):
+def test_missing_pulse_gives_dark_frame_reproducible_by_seed(scene):
     dark = scene.exposure("C", pops=[], exposure_s=0.05, seed=0)
     assert dark.mean() == pytest.approx(64.0, abs=0.5)
     pulse = [Pulse(2, 1.0, 0.0, 0.03)]
@@ -237,14 +237,14 @@ def test_subpixels_change_edges_only(rig, face, scene):
     assert fine.sum() == pytest.approx(coarse.sum(), rel=5e-3)
 
 
-def test_head_stands_at_its_mesh_at_time_zero(rig, face, scene):
+def test_head_matches_its_mesh_at_time_zero(rig, face, scene):
     moving = direct(rig, face, motion=head_motion(3))
     np.testing.assert_array_equal(moving.radiance("C", [0]), scene.radiance("C", [0]))
     assert (moving.radiance("C", [0], t_s=9.0) != scene.radiance("C", [0])).any()
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_drift_and_turn_reach_their_drawn_sizes_smoothly(seed):
+def test_drift_and_rotation_reach_drawn_sizes_smoothly(seed):
     motion = head_motion(seed, drift_mm=2.0, drift_deg=0.5)
     t = np.linspace(0.0, 25.0, 2001)
     poses = [motion.pose(float(x)) for x in t]
@@ -257,7 +257,7 @@ def test_drift_and_turn_reach_their_drawn_sizes_smoothly(seed):
     np.testing.assert_allclose(motion.pose(0.0)[0], np.eye(3), atol=1e-12)
 
 
-def test_a_shifted_head_is_the_still_head_seen_by_a_shifted_rig(rig, face):
+def test_shifted_head_equals_still_head_in_shifted_rig(rig, face):
     """Moving the head by s is moving camera and lights by -s, apart from where LEDs point."""
     motion = head_motion(3, drift_mm=3.0, drift_deg=1.0, twitch=False)
     rotation, shift = motion.pose(7.0)
@@ -285,7 +285,7 @@ def test_a_shifted_head_is_the_still_head_seen_by_a_shifted_rig(rig, face):
     assert np.percentile(np.abs(moved[bright] / still[bright] - 1.0), 95) < 0.03
 
 
-def test_a_twitch_moves_the_mouth_for_half_a_second_and_nothing_else(rig, face, scene):
+def test_twitch_moves_only_mouth_for_half_a_second(rig, face, scene):
     motion = head_motion(3, drift_mm=0.0, drift_deg=0.0)
     start = motion.twitch_start_s
     assert motion.twitch(start) == motion.twitch(start + 0.51) == 0.0
@@ -304,13 +304,13 @@ def test_a_twitch_moves_the_mouth_for_half_a_second_and_nothing_else(rig, face, 
     assert change[near].sum() > 20.0 * change[~near].sum()
 
 
-def test_a_target_stays_where_it_stands(rig, white):
+def test_target_stays_in_place(rig, white):
     moving = direct(rig, make_target("white"), motion=head_motion(1))
     np.testing.assert_array_equal(moving.radiance("C", [1], t_s=5.0), white.radiance("C", [1]))
     assert not direct(rig, make_target("dark")).radiance("C", [0]).any()
 
 
-def test_the_vectorized_kernel_and_the_plain_one_agree(rig, face, scene):
+def test_vectorized_and_scalar_kernels_agree(rig, face, scene):
     """Two codes of one formula, two ray tracers; float32 against float64, and rays at edges."""
     if not choose_variant("rgb").is_vectorized:
         pytest.skip("no LLVM: there is one kernel only")
@@ -353,7 +353,7 @@ def test_a_condition_is_in_the_truth(rig, face):
         direct(rig, make_target("white"), conditions={"hot": 1.0})
 
 
-def test_what_cannot_be_is_refused(rig, face, scene):
+def test_impossible_scene_requests_are_refused(rig, face, scene):
     with pytest.raises(SceneError, match="is no LED"):
         direct(load_rig("flash").resized(64), face)
     with pytest.raises(SceneError, match="light: got 9"):
@@ -372,7 +372,7 @@ def test_what_cannot_be_is_refused(rig, face, scene):
         head_motion(0, drift_mm=50.0)
 
 
-def test_what_is_not_built_is_named_and_what_is_built_is_not(rig, face, scene):
+def test_omitted_effects_are_named_and_built_are_not(rig, face, scene):
     names = {name for name, _ in scene.left_out}
     assert {"light from skin to skin", "movement of the head"} <= names
     moving = {name for name, _ in direct(rig, face, motion=head_motion(0)).left_out}

@@ -54,7 +54,7 @@ def test_a_lens_bends_and_unbends(rng):
     )
 
 
-def test_a_dome_is_built_the_same_in_every_subset_and_near_its_drawing():
+def test_actual_dome_is_reproducible_and_near_nominal():
     whole, part = build(load_rig("dome"), seed=4), build(RIG, seed=4)
     assert whole.rig.view("C10").position_mm == part.rig.view("C10").position_mm
     assert whole.rig.light("L033") == part.rig.light("L033")
@@ -70,7 +70,7 @@ def test_a_dome_is_built_the_same_in_every_subset_and_near_its_drawing():
     assert exact.rig.views[0].position_mm == pytest.approx(RIG.views[0].position_mm)
 
 
-def test_a_white_plate_shows_the_inverse_square_law_and_the_cosine():
+def test_white_plate_follows_inverse_square_and_cosine():
     scene = TargetScene("white", build(RIG, seed=1, tolerances=EXACT), seed=1, slope_deg=0.0)
     frontal = int(np.argmax([light.position_mm[2] for light in RIG.lights]))
     light = scene.light("C07", lit(frontal))
@@ -86,7 +86,7 @@ def test_a_white_plate_shows_the_inverse_square_law_and_the_cosine():
     np.testing.assert_allclose(twice, 2.0 * light, rtol=1e-6)
 
 
-def test_a_plate_is_dark_from_behind_and_by_lights_behind():
+def test_plate_is_dark_from_behind_and_when_backlit():
     scene = TargetScene("white", build(RIG, seed=1, tolerances=EXACT), seed=1)
     behind = int(np.argmin([light.position_mm[2] for light in RIG.lights]))
     assert scene.light("C07", lit(behind)).max() == 0.0
@@ -94,7 +94,7 @@ def test_a_plate_is_dark_from_behind_and_by_lights_behind():
     assert scene.light("C10", lit(*range(150))).max() == 0.0
 
 
-def test_print_appears_where_it_is(rng):
+def test_print_appears_at_its_position(rng):
     scene = target_scene("charuco", RIG, seed=2)
     view, lens = scene.rig.views[0], scene.dome.distortion["C07"]
     image = scene.light("C07", lit(*range(0, 150, 10)))[..., 1]
@@ -122,7 +122,7 @@ def test_a_ball_shows_lights_where_angles_are_equal(rng):
         assert np.linalg.norm(np.cross(out + back, normal)) < 1e-9
 
 
-def test_the_light_of_an_led_in_a_ball_is_conserved():
+def test_light_of_led_in_ball_is_conserved():
     """Flux of a highlight in closed form: a convex mirror of radius r shows a small distant disc of
     radiance L and radius a at d as an image that is smaller by about r / (2 d)."""
     scene = TargetScene("mirror", build(RIG, seed=1, tolerances=EXACT), seed=1)
@@ -151,7 +151,7 @@ def test_the_light_of_an_led_in_a_ball_is_conserved():
     assert flux == pytest.approx(expected, rel=0.15)
 
 
-def test_frames_have_noise_of_the_sensor_and_follow_their_seed():
+def test_frames_have_sensor_noise_and_follow_seed():
     scene = target_scene("white", RIG, seed=3)
     pops = [Pulse(FRONT, 1.0, 1.0, 1.03)]
     one = scene.exposure("C07", pops=pops, exposure_s=0.03, seed=1)
@@ -169,7 +169,7 @@ def test_frames_have_noise_of_the_sensor_and_follow_their_seed():
     assert gap.std() == pytest.approx(expected, rel=4.5 / np.sqrt(2 * gap.size) + 0.02)
 
 
-def test_dead_lights_are_dark_and_crossed_wires_light_another():
+def test_dead_lights_are_dark_crossed_wires_light_others():
     straight = build(RIG, seed=1)
     wiring = list(range(150))
     wiring[40], wiring[FRONT] = FRONT, 40

@@ -50,7 +50,7 @@ def still(rig: Rig, face: SimulatedSubject) -> FlashScene:
     return scene_of(rig, face, "smile", movement=False)
 
 
-def test_the_moved_face_is_shown_and_its_maps_with_it(rest, smile):
+def test_moved_face_is_rendered_with_matching_maps(rest, smile):
     before, after = rest.truth(), smile.truth()
     x, y = before["position_mm"][..., 0], before["position_mm"][..., 1]
     corner = before["mask"] & after["mask"] & (np.hypot(x - 30.0, y + 40.0) < 12.0)
@@ -61,7 +61,7 @@ def test_the_moved_face_is_shown_and_its_maps_with_it(rest, smile):
     assert np.abs(after["uv"] - before["uv"])[still].max() < 0.002
 
 
-def test_blood_of_a_state_carried_back_along_the_skin_is_that_at_rest(smile, rig):
+def test_state_blood_warped_back_matches_blood_at_rest(smile, rig):
     """Rationale: each pixel's skin is known at rest, so the moved map can be laid over the face at
     rest, where it must be the blood of that state.
 
@@ -87,7 +87,7 @@ def test_blood_of_a_state_carried_back_along_the_skin_is_that_at_rest(smile, rig
         assert np.median(unmoved[checked]) > 3.0 * np.median(error)
 
 
-def test_blood_at_rest_is_what_the_unmoved_face_shows(smile, still):
+def test_blood_at_rest_matches_unmoved_face(smile, still):
     truth, unmoved = smile.truth(), still.truth()
     for name in ("hemoglobin", "melanin", "mask"):
         np.testing.assert_array_equal(truth[f"{name}_at_rest"], unmoved[name])
@@ -96,7 +96,7 @@ def test_blood_at_rest_is_what_the_unmoved_face_shows(smile, still):
     assert "position_at_rest_mm" not in unmoved
 
 
-def test_where_a_state_changes_no_blood_light_spreads_over_it_as_at_rest(rig, face):
+def test_unchanged_blood_is_laterally_scattered_as_at_rest(rig, face):
     """Rationale: a picture shows blood as light has spread over it, whatever the state, so what a
     state's map at rest is compared with is as smooth as the neutral one. A sharp map less a blurred
     one would be a change where there is none.
@@ -119,7 +119,7 @@ def test_where_a_state_changes_no_blood_light_spreads_over_it_as_at_rest(rig, fa
     assert difference("hemoglobin_blurred_at_rest") < difference("hemoglobin_at_rest") / 3.0
 
 
-def test_without_movement_states_change_the_blood_only_and_that_is_said(rest, smile, still):
+def test_states_without_movement_change_blood_only_as_reported(rest, smile, still):
     np.testing.assert_array_equal(still.truth()["normals"], rest.truth()["normals"])
     assert (still.truth()["hemoglobin"] != rest.truth()["hemoglobin"]).any()
     said = dict(still.left_out)
@@ -128,14 +128,14 @@ def test_without_movement_states_change_the_blood_only_and_that_is_said(rest, sm
     assert smile.needs.builds("shadows of wrinkles")
 
 
-def test_global_states_do_not_move_and_neutral_needs_no_maps_at_rest(rest, tired):
+def test_global_states_keep_pose_neutral_skips_rest_maps(rest, tired):
     truth = tired.truth()
     np.testing.assert_array_equal(truth["position_mm"], rest.truth()["position_mm"])
     np.testing.assert_array_equal(truth["hemoglobin_at_rest"], truth["hemoglobin"])
     assert not [name for name in rest.truth() if "at_rest" in name]
 
 
-def test_a_posed_subject_keeps_its_pose_whatever_its_blood_does(rig, face, tired):
+def test_posed_subject_keeps_pose_when_blood_changes(rig, face, tired):
     half = face.posed("smile", 0.5)
     scene = scene_of(rig, half, "exercise")
     assert scene.subject is half
@@ -144,7 +144,7 @@ def test_a_posed_subject_keeps_its_pose_whatever_its_blood_does(rig, face, tired
     )
 
 
-def test_scenes_that_share_their_light_give_what_they_give_alone(rig, rest, tired):
+def test_scenes_sharing_light_match_scenes_alone(rig, rest, tired):
     beside = tired.radiance()
     stranger = make_subject("II", seed=4, size=256)  # the same person, nothing shared
     alone = scene_of(rig, stranger, "exercise").radiance()
@@ -152,7 +152,7 @@ def test_scenes_that_share_their_light_give_what_they_give_alone(rig, rest, tire
     assert (beside != rest.radiance()).any()
 
 
-def test_truth_on_disk_has_landmarks_and_blood_at_rest_with_masks_of_their_own(smile, rest):
+def test_stored_truth_has_landmarks_and_masked_rest_blood(smile, rest):
     truth = truth_of(smile, 4, "0" * 64, "smile")
     assert truth.parameters["state"] == "smile"
     assert truth.parameters["movement"] is True
@@ -171,7 +171,7 @@ def test_truth_on_disk_has_landmarks_and_blood_at_rest_with_masks_of_their_own(s
 
 
 @pytest.mark.long
-def test_the_dome_shows_an_expression_with_its_normals_in_the_texture_frame(face):
+def test_dome_renders_expression_with_texture_frame_normals(face):
     rig = small_dome(load_rig("dome"), lights=4, views=1, width_px=32)
     scenes = {
         state: DomeScene(rig, face, state=state, choice=EMBREE) for state in ("neutral", "surprise")

@@ -51,7 +51,7 @@ def real(rig: Rig, face: SimulatedSubject) -> FlashScene:
     return scene_of(rig, face, subpixels=2)
 
 
-def test_a_white_tile_gives_the_metered_level_behind_parallel_and_crossed_films(rig):
+def test_white_reference_gives_metered_level_behind_both_polarizers(rig):
     scene = scene_of(rig, make_target("white"), films=IDEAL_POLARIZERS)
     crossed, parallel = scene.radiance("crossed"), scene.radiance("parallel")
     middle = crossed[rig.views[0].height_px // 2, WIDTH // 2]
@@ -60,7 +60,7 @@ def test_a_white_tile_gives_the_metered_level_behind_parallel_and_crossed_films(
     np.testing.assert_allclose(parallel, crossed, rtol=1e-5)
 
 
-def test_light_on_the_tile_falls_with_cosine_and_inverse_square(rig):
+def test_light_on_tile_follows_cosine_and_inverse_square(rig):
     scene = scene_of(rig, make_target("white"), films=IDEAL_POLARIZERS)
     view = rig.views[0]
     image = scene.radiance("crossed")[..., 1] / (0.99 * scene.white_rgb()[1])
@@ -79,7 +79,7 @@ def test_light_on_the_tile_falls_with_cosine_and_inverse_square(rig):
     np.testing.assert_allclose(image, expected, rtol=1e-4)
 
 
-def test_a_light_on_the_right_makes_the_right_side_bright(rig, face):
+def test_light_on_right_brightens_right_side(rig, face):
     right = dataclasses.replace(rig, lights=(rig.light("right"),))
     scene = scene_of(right, face, lateral=False)
     image = scene.radiance("crossed").sum(axis=-1)
@@ -89,7 +89,7 @@ def test_a_light_on_the_right_makes_the_right_side_bright(rig, face):
     assert (shine * columns).sum() / shine.sum() > WIDTH / 2 + 5
 
 
-def test_row_0_shows_the_top_of_the_face_and_column_0_its_left(real):
+def test_row_0_is_top_and_column_0_left(real):
     truth = real.truth()
     rows, columns = np.nonzero(truth["mask"])
     y, x = truth["position_mm"][rows, columns, 1], truth["position_mm"][rows, columns, 0]
@@ -100,7 +100,7 @@ def test_row_0_shows_the_top_of_the_face_and_column_0_its_left(real):
     assert 0.2 < hair_rows.mean() / truth["hair"].shape[0] < 0.45
 
 
-def test_the_crossed_image_is_shading_times_reflectance_but_for_what_leaks(ideal):
+def test_crossed_image_is_shading_times_reflectance_plus_leak(ideal):
     """Without lateral transport and with ideal films, what exceeds the product is the specular
     leak of skew directions: positive, and below 1 % of the white reference."""
     truth = ideal.truth()
@@ -112,7 +112,7 @@ def test_the_crossed_image_is_shading_times_reflectance_but_for_what_leaks(ideal
     assert np.abs(rest).max() < 0.01 * METER_LEVEL
 
 
-def test_skin_that_faces_the_camera_is_brighter_than_a_lambertian_one_of_its_reflectance(ideal):
+def test_skin_facing_camera_is_brighter_than_lambertian(ideal):
     """Expected: T(0)^2 / (T(0) T_average) = 1.053 in the middle of the forehead."""
     truth = ideal.truth()
     facing = truth["mask"] & (truth["normals"][..., 2] > 0.995)
@@ -120,7 +120,7 @@ def test_skin_that_faces_the_camera_is_brighter_than_a_lambertian_one_of_its_ref
     assert ratio.mean() == pytest.approx(0.97222 / 0.92319, rel=5e-3)
 
 
-def test_both_images_split_into_light_from_inside_and_from_the_surface(ideal):
+def test_both_images_split_into_subsurface_and_surface_light(ideal):
     """Near the axis: crossed = d / 2, parallel = d / 2 + s; far off it parallel is not."""
     truth = ideal.truth()
     crossed, parallel = ideal.radiance("crossed"), ideal.radiance("parallel")
@@ -133,7 +133,7 @@ def test_both_images_split_into_light_from_inside_and_from_the_surface(ideal):
     assert np.quantile(off, 0.9) > 0.01
 
 
-def test_images_behind_crossed_analysers_add_up_to_a_constant(real):
+def test_images_behind_crossed_analyzers_sum_to_constant(real):
     sums = [
         real.radiance("parallel", angle) + real.radiance("parallel", angle + 90.0)
         for angle in (0.0, 17.0, 45.0)
@@ -144,7 +144,7 @@ def test_images_behind_crossed_analysers_add_up_to_a_constant(real):
     np.testing.assert_allclose(sums[2], sums[0], rtol=3e-3, atol=1e-6)
 
 
-def test_the_metal_target_goes_dark_behind_the_crossed_analyser_as_the_films_say(rig):
+def test_metal_target_is_dark_behind_crossed_analyzer(rig):
     films = Polarizers(light_extinction=2000.0, analyser_extinction=3000.0, analyser_zero_deg=1.0)
     scene = scene_of(rig, make_target("malus"), films=films)
     middle = np.s_[rig.views[0].height_px // 2, WIDTH // 2]
@@ -157,7 +157,7 @@ def test_the_metal_target_goes_dark_behind_the_crossed_analyser_as_the_films_say
     assert curve[6] / curve[0] == pytest.approx(leak + math.sin(math.radians(1.0)) ** 2, rel=0.1)
 
 
-def test_the_flat_is_even_and_unpolarized_and_the_cap_is_dark(rig):
+def test_flat_is_uniform_unpolarized_and_cap_is_dark(rig):
     flat, dark = scene_of(rig, make_target("flat")), scene_of(rig, make_target("dark"))
     image = flat.radiance("parallel")
     assert image.max() == pytest.approx(FLAT_LEVEL)
@@ -166,7 +166,7 @@ def test_the_flat_is_even_and_unpolarized_and_the_cap_is_dark(rig):
     assert not dark.radiance("crossed").any()
 
 
-def test_the_chart_is_found_where_it_stands(rig):
+def test_chart_is_found_at_its_position(rig):
     scene = scene_of(rig.resized(504), make_target("chart"), subpixels=2)
     view = scene.rig.views[0]
     found = find_chart(scene.radiance("crossed") / scene.white_rgb())
@@ -176,7 +176,7 @@ def test_the_chart_is_found_where_it_stands(rig):
     np.testing.assert_allclose(found, np.column_stack([x, y]), atol=0.6)
 
 
-def test_exposures_scale_with_the_power_of_the_pops_and_add_up(rig, face):
+def test_exposures_scale_with_pop_power_and_add_up(rig, face):
     quiet = dataclasses.replace(
         sensor_of(rig.views[0], prnu=0.0, dsnu_e=0.0, vignetting=0.0, dark_e_per_s=0.0),
         read_noise_e=0.0,
@@ -204,7 +204,7 @@ def test_without_a_pop_the_frame_is_dark(rig):
     assert frame.std() == pytest.approx(math.hypot(noise_dn, math.sqrt(1 / 12)), rel=0.05)
 
 
-def test_the_same_seed_gives_the_same_frame_and_another_seed_another(real):
+def test_same_seed_gives_same_frame_another_seed_another(real):
     frames = [
         real.exposure("cam", pops=(Fired(),), exposure_s=0.01, seed=seed) for seed in (1, 1, 2)
     ]
@@ -224,7 +224,7 @@ def test_exercise_reddens_the_cheeks_and_leaves_the_melanin(rig, face, ideal):
     assert ratio[:, 0].mean() > ratio[:, 1].mean()
 
 
-def test_lateral_transport_smooths_what_is_seen_and_keeps_the_sharp_truth(real, ideal):
+def test_lateral_transport_smooths_image_and_keeps_truth_sharp(real, ideal):
     truth = real.truth()
     inside = truth["mask"]
     # Texels are 1 mm here. Melanin lies above the spreading and stays half sharp.
@@ -242,7 +242,7 @@ def test_lateral_transport_smooths_what_is_seen_and_keeps_the_sharp_truth(real, 
     np.testing.assert_array_equal(ideal.truth()["hemoglobin"], ideal.truth()["hemoglobin_blurred"])
 
 
-def test_truth_is_finite_and_normals_are_unit_vectors_towards_the_camera(real):
+def test_truth_is_finite_with_unit_normals_towards_camera(real):
     truth = real.truth()
     shape = real.rig.views[0].height_px, WIDTH
     for name, values in truth.items():
@@ -255,7 +255,7 @@ def test_truth_is_finite_and_normals_are_unit_vectors_towards_the_camera(real):
     assert truth["hair"][inside].max() < 0.02
 
 
-def test_the_films_of_a_rig_follow_from_its_serial_number(rig):
+def test_polarizers_of_rig_follow_from_serial_number(rig):
     films = draw_polarizers(rig)
     assert films == draw_polarizers(rig)
     assert 1500.0 <= films.light_extinction <= 6000.0
@@ -264,14 +264,14 @@ def test_the_films_of_a_rig_follow_from_its_serial_number(rig):
     assert draw_polarizers(dataclasses.replace(rig, views=(view,))) != films
 
 
-def test_what_is_left_out_is_said_with_its_reason(real, ideal, rig):
+def test_omitted_effects_are_reported_with_reason(real, ideal, rig):
     for scene in (real, ideal, scene_of(rig, make_target("white"))):
         assert len(scene.left_out) >= 3
         assert all(what and why for what, why in scene.left_out)
     assert len(ideal.left_out) == len(real.left_out) + 2  # spreading, and the lens
 
 
-def test_wrong_wishes_are_named(rig, face, real):
+def test_invalid_options_are_named(rig, face, real):
     mixed = dataclasses.replace(
         rig, lights=(rig.lights[0], dataclasses.replace(rig.lights[1], illuminant="A"))
     )

@@ -41,11 +41,11 @@ def places(
     return here, there
 
 
-def test_a_face_that_moves_nowhere_is_the_same_object(face):
+def test_unmoved_face_is_same_object(face):
     assert face.moved_by((0.0, 0.0, 0.0)) is face
 
 
-def test_only_the_place_of_a_moved_face_is_another(face, nearer):
+def test_moved_face_differs_only_in_position(face, nearer):
     covered = face.atlas.covered
     for way in (
         nearer.mesh.vertices_mm - face.mesh.vertices_mm,
@@ -58,7 +58,7 @@ def test_only_the_place_of_a_moved_face_is_another(face, nearer):
     assert nearer.moved_by((0.0, 0.0, -NEARER_MM)).offset_mm == face.offset_mm
 
 
-def test_moving_and_making_a_face_are_done_in_any_order(face, nearer):
+def test_moving_and_building_face_commute(face, nearer):
     first, last = face.posed("smile").moved_by((0.0, 0.0, NEARER_MM)), nearer.posed("smile")
     np.testing.assert_allclose(first.mesh.vertices_mm, last.mesh.vertices_mm, atol=1e-3)
     way = last.mesh.vertices_mm - face.posed("smile").mesh.vertices_mm
@@ -67,12 +67,12 @@ def test_moving_and_making_a_face_are_done_in_any_order(face, nearer):
 
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (0.0, 0.0, np.nan), (0.0, np.inf, 0.0)])
-def test_an_offset_that_is_no_place_is_refused_by_name(face, offset):
+def test_invalid_offset_is_refused_by_name(face, offset):
     with pytest.raises(SubjectError, match="offset_mm"):
         face.moved_by(offset)
 
 
-def test_light_on_a_moved_face_is_that_of_its_place(rig, places):
+def test_light_on_moved_face_matches_its_position(rig, places):
     """Rationale: cosine and inverse square from each flash's place, over those on the tile.
 
     Expected: the closed form where skin faces both flashes. Tolerance 2 %: relief bends normals
@@ -96,7 +96,7 @@ def test_light_on_a_moved_face_is_that_of_its_place(rig, places):
     assert 1.05 < there / here < 1.15
 
 
-def test_pictures_and_landmarks_show_a_moved_face_where_its_truth_says(rig, places):
+def test_images_and_landmarks_follow_moved_face_truth(rig, places):
     view = rig.views[0]
     for scene in places:
         truth = scene.truth()
@@ -116,7 +116,7 @@ def test_pictures_and_landmarks_show_a_moved_face_where_its_truth_says(rig, plac
             )
 
 
-def test_the_lens_blurs_a_face_that_stands_out_of_focus(rig, face):
+def test_lens_blurs_face_out_of_focus(rig, face):
     """The lens stays focused on the tile's place: slopes of the picture lose energy with depth."""
     view = rig.views[0]
     kept = []

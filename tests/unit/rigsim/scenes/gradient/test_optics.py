@@ -68,7 +68,7 @@ def test_defocus_follows_stokseth_s_limit_of_geometry(lens):
 
 
 @pytest.mark.parametrize("subpixels", [1, 2, 3])
-def test_waves_leave_the_lens_with_the_otf_s_amplitude_and_in_place(lens, subpixels):
+def test_blurred_waves_keep_phase_with_otf_amplitude(lens, subpixels):
     side, period_px = 96, 8.0
     x = (np.arange(side * subpixels) + 0.5) / subpixels - 0.5
     phase = 2.0 * math.pi / period_px
@@ -80,7 +80,7 @@ def test_waves_leave_the_lens_with_the_otf_s_amplitude_and_in_place(lens, subpix
     np.testing.assert_allclose(seen[side // 2, 16:-16], expected[16:-16], atol=2e-3)
 
 
-def test_slices_of_depth_give_what_one_depth_gives(lens, rng):
+def test_depth_slices_match_single_depth(lens, rng):
     """A step of 0.5 mm: far from it each side is blurred as if it were alone."""
     image = rng.random((1, 96, 96), np.float32)
     depth = np.where(np.arange(96) < 48, 0.0, 0.5).astype(np.float32) * np.ones((96, 1), np.float32)
@@ -92,7 +92,7 @@ def test_slices_of_depth_give_what_one_depth_gives(lens, rng):
     assert np.abs(near - far).max() > 5e-3
 
 
-def test_nonsense_about_lenses_is_refused(lens):
+def test_invalid_lens_is_refused(lens):
     with pytest.raises(BlurError, match="weights"):
         Lens(30.0, 300.0, 0.9, 5.5, (550.0,), (0.5,))
     with pytest.raises(BlurError, match="images"):
@@ -101,7 +101,7 @@ def test_nonsense_about_lenses_is_refused(lens):
         blur(np.zeros((1, 9, 9), np.float32), lens, depth_mm=np.full((9, 9), np.nan, np.float32))
 
 
-def test_slopes_come_through_as_lens_and_pixels_let_them(lens):
+def test_slope_transfer_matches_lens_and_pixel_mtf(lens):
     """The whole chain is linear in small slopes, so it is the OTF; tolerance 0.02."""
     periods = [60.0, 30.0, 20.0]
     found = slope_transfer(periods)
@@ -110,7 +110,7 @@ def test_slopes_come_through_as_lens_and_pixels_let_them(lens):
     np.testing.assert_allclose(found, expected, atol=0.02)
 
 
-def test_ten_micrometres_are_not_resolved(lens):
+def test_ten_micrometers_are_not_resolved(lens):
     """Features of 10 um, waves of 20 um, keep a twentieth; below 15 um nothing is left."""
     assert 17.0 < lens.cutoff_period_um < 19.0
     twenty, fourteen = slope_transfer([20.0, 14.0])
@@ -123,7 +123,7 @@ def test_ten_micrometres_are_not_resolved(lens):
 
 
 @pytest.mark.parametrize("azimuth_deg", [0.0, 90.0, 180.0, 270.0, 33.0, 141.0, 250.0])
-def test_a_wall_has_the_horizon_of_its_height_over_its_distance(azimuth_deg):
+def test_wall_horizon_is_height_over_distance(azimuth_deg):
     """A disc of 40 um stands in the middle; seen from 0.2 mm off, against the light."""
     pixel_um = 5.0
     y, x = np.mgrid[60:-61:-1, -60:61] * pixel_um
@@ -159,7 +159,7 @@ def test_horizons_of_hills_are_those_of_marching_rays(rng, azimuth_deg):
     assert np.sqrt(np.mean((found - best) ** 2)) < 0.02
 
 
-def test_level_ground_has_no_horizon_and_nonsense_is_refused():
+def test_level_ground_has_zero_horizon_invalid_input_refused():
     flat = np.zeros((8, 8), np.float32)
     assert not horizon_tangent(flat, pixel_um=6.0, azimuth_rad=0.3).any()
     with pytest.raises(HorizonError, match="height_um"):
@@ -173,7 +173,7 @@ def test_level_ground_has_no_horizon_and_nonsense_is_refused():
     ("alpha", "size", "most"),
     [(0.25, 65, 0.002), pytest.param(0.15, 129, 0.003, marks=pytest.mark.long)],
 )
-def test_tables_give_what_sums_over_the_leds_give(rig, sphere, rng, alpha, size, most):
+def test_tables_match_sums_over_leds(rig, sphere, rng, alpha, size, most):
     """RMS over normals of 14 degrees of tilt, over the mean of moment 1, in the whole field."""
     count = 600
     slopes = rng.normal(0.0, 0.25, (count, 2))
@@ -222,7 +222,7 @@ def test_tables_without_nodes_are_refused(rig, sphere):
 # sphere, motion, ball -----------------------------------------------------------------------------
 
 
-def test_a_sphere_as_built_is_near_its_drawing_and_never_on_it(rig, sphere):
+def test_actual_sphere_is_near_but_never_equals_nominal(rig, sphere):
     built = build_sphere(rig, seed=5, dead=("G007",), weak=("G008",))
     off = built.position_mm - sphere.position_mm
     assert 0.8 < off.std() < 1.2
@@ -238,7 +238,7 @@ def test_a_sphere_as_built_is_near_its_drawing_and_never_on_it(rig, sphere):
         dataclasses.replace(built, position_mm=built.position_mm[:5])
 
 
-def test_shifts_of_a_blurred_picture_are_exact_to_a_percent():
+def test_shifts_of_blurred_image_are_within_one_percent():
     y, x = np.mgrid[0:48, 0:48].astype(float)
 
     def scene(x, y):
@@ -251,7 +251,7 @@ def test_shifts_of_a_blurred_picture_are_exact_to_a_percent():
     assert np.abs(image[8:-8, 8:-8] - expected).max() > 0.3
 
 
-def test_poses_and_drift_depend_on_seed_and_state_alone():
+def test_poses_and_drift_depend_on_seed_and_state():
     one, same, other = PatchMotion(1), PatchMotion(1), PatchMotion(2)
     assert one.pose(45.0, 2) == same.pose(45.0, 2)
     assert one.pose(45.0, 2) != one.pose(45.0, 3)
@@ -261,7 +261,7 @@ def test_poses_and_drift_depend_on_seed_and_state_alone():
     assert 0.7 < drift.std() < 1.3
 
 
-def test_the_ball_shows_leds_where_the_law_of_reflection_puts_them(rig):
+def test_ball_shows_leds_at_mirror_reflection_positions(rig):
     """Spots' middles of light against half-vectors, from the middle of the pupil; 0.3 px."""
     from scipy.ndimage import center_of_mass, label
 
@@ -285,13 +285,13 @@ def test_the_ball_shows_leds_where_the_law_of_reflection_puts_them(rig):
     assert distance.max() < 0.3
 
 
-def test_crossed_polarizers_dim_the_ball_a_thousandfold_but_not_to_nothing(rig):
+def test_crossed_polarizers_dim_ball_thousandfold_not_to_zero(rig):
     scene = GradientScene(rig.cropped(256), "ball")
     parallel, crossed = (scene.radiance("full", analyser_deg=a) for a in (0.0, 90.0))
     assert 1e-4 < crossed.max() / parallel.max() < 5e-3
 
 
-def test_shares_of_the_leds_are_followed(rig):
+def test_led_weights_scale_ball_image(rig):
     """The spot of a LED that gives half is half as bright, a dead one's is gone."""
     scene = GradientScene(rig.cropped(256), "ball")
     full = scene.radiance("full")

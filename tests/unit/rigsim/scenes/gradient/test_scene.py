@@ -57,7 +57,7 @@ def scene(rig, skin):
     return GradientScene(rig, skin, table_size=33)
 
 
-def test_a_diffuser_gets_its_part_of_the_meter_rate_behind_either_analyser(rig):
+def test_diffuser_gets_its_meter_rate_behind_any_analyzer(rig):
     """Tolerance: the corner of the field, and what the sphere as drawn is off its unit (none)."""
     flat = GradientScene(rig, "flat", films=IDEAL_POLARIZERS)
     for reading in (0.0, 90.0, 37.0):
@@ -88,7 +88,7 @@ def test_a_pattern_and_its_complement_make_full(scene):
     assert not scene.radiance("dark", grip=NEUTRAL).any()
 
 
-def test_slopes_towards_the_right_and_the_top_are_bright_under_x_and_y(scene):
+def test_slopes_right_and_up_brighten_x_y_patterns(scene):
     """The surface's reflection, which crossing removes, leans with the normal."""
     normals = scene.surface(NEUTRAL).normals
     moments = scene.moments(NEUTRAL)
@@ -101,7 +101,7 @@ def test_slopes_towards_the_right_and_the_top_are_bright_under_x_and_y(scene):
         assert abs(np.corrcoef(ratio, normals[..., 1 - axis][inner].ravel())[0, 1]) < 0.5
 
 
-def test_crossed_polarizers_remove_the_surface_reflection_of_a_flat_patch(rig, flat_skin):
+def test_crossed_polarizers_remove_specular_of_flat_patch(rig, flat_skin):
     """Black skin, ideal films: what is left in the middle is what is off the central view."""
     black = dataclasses.replace(flat_skin, albedo=np.zeros_like(flat_skin.albedo))
     scene = GradientScene(rig, black, films=IDEAL_POLARIZERS, table_size=33)
@@ -114,7 +114,7 @@ def test_crossed_polarizers_remove_the_surface_reflection_of_a_flat_patch(rig, f
     assert extra == pytest.approx(np.sin(np.radians(10.0)) ** 2, abs=0.01)
 
 
-def test_crossed_pictures_show_the_pigment(scene):
+def test_crossed_images_show_pigment(scene):
     surface = scene.surface(NEUTRAL)
     crossed = scene.moments(NEUTRAL)["crossed"][0]
     inner = (slice(6, -6), slice(6, -6))
@@ -130,7 +130,7 @@ def test_jaws_are_dark_and_end_at_the_aperture(rig, flat_skin):
     assert image[jaw].max() < 0.4 * image[between].min()
 
 
-def test_exposures_have_the_sensor_s_noise_and_no_other(scene):
+def test_exposures_have_only_sensor_noise(scene):
     """Two exposures of the same state differ by shot and read noise alone (chi-square, 1e-6)."""
     frames = [
         scene.exposure("cam", pops=[Light("full")], exposure_s=0.04, seed=k, grip=NEUTRAL)
@@ -155,7 +155,7 @@ def test_no_light_gives_a_dark_frame(scene):
     assert dark.mean() == pytest.approx(scene.sensor().black, abs=0.5)
 
 
-def test_a_jump_of_20_pixels_moves_the_picture_by_20_pixels(rig, skin):
+def test_jump_of_20_pixels_moves_image_20_pixels(rig, skin):
     still = PatchMotion(
         0,
         angle_um=0.0,
@@ -173,7 +173,7 @@ def test_a_jump_of_20_pixels_moves_the_picture_by_20_pixels(rig, skin):
     assert np.abs(after[inner, 28:-8] / before[inner, 28:-8] - 1).mean() > 0.02
 
 
-def test_drift_moves_the_picture_as_it_says(rig, skin):
+def test_drift_moves_image_as_stated(rig, skin):
     """A drifted picture is the picture of skin that lies there; tolerance: 6-point shifts."""
     still = {"angle_um": 0.0, "angle_turn_deg": 0.0, "state_um": 0.0, "state_turn_deg": 0.0}
     drifting = PatchMotion(4, drift_um=4.0, **still)
@@ -192,7 +192,7 @@ def test_drift_moves_the_picture_as_it_says(rig, skin):
     assert np.abs(still_there / lain - 1.0).max() > 3.0 * error
 
 
-def test_truth_of_states_says_what_was_done(scene):
+def test_state_truth_records_applied_motion(scene):
     stretched = GripState(45.0, 2, 9.6, 1.15, True, False)
     truth = ground_truth(scene, [NEUTRAL, stretched])
     states = {row["name"]: row for row in truth.parameters["states"]}
@@ -211,7 +211,7 @@ def test_truth_of_states_says_what_was_done(scene):
     assert np.corrcoef(slope.ravel(), told.ravel())[0, 1] > 0.97
 
 
-def test_nonsense_is_refused(rig, skin, scene):
+def test_invalid_scene_requests_are_refused(rig, skin, scene):
     with pytest.raises(SceneError, match="grip: got none"):
         scene.radiance("full")
     with pytest.raises(SceneError, match="pattern: got 'w'"):
@@ -248,7 +248,7 @@ def test_cliffs_of_75_degrees_are_dark_but_finite():
     assert specular[valley].mean() < 0.8 * specular[crest].mean()  # their normals are alike
 
 
-def test_buckled_and_detached_skin_are_drawn_as_what_they_are(scene):
+def test_buckled_and_detached_skin_are_rendered_as_such(scene):
     """A fold tilts normals by up to 15 degrees; skin that came off does not even bulge."""
     buckled = GripState(0.0, -3, 5.6, 0.72, True, True)
     loose = GripState(0.0, 5, 12.0, 1.0, False, False)

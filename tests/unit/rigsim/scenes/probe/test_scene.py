@@ -59,7 +59,7 @@ def lit(exposure_s, *, level=1.0, fibre=None):
     return [SourceLight(level, 0.0, exposure_s, fibre)]
 
 
-def test_light_of_two_per_mm2_fills_eight_tenths_of_the_middle_in_the_shortest_exposure():
+def test_spot_center_reaches_eight_tenths_in_shortest_exposure():
     build = build_probe(RIG, seed=0, tolerances=NOMINAL)
     scene = ProbeScene(RIG, HomogeneousTissue(0.04, 1.5), build=build, photons=1)
     light = scene.image(scene.through_fibres(np.full((28, 3), 2.0))) * 30.0 * 2.0 ** (-22 * 2 / 3)
@@ -69,13 +69,13 @@ def test_light_of_two_per_mm2_fills_eight_tenths_of_the_middle_in_the_shortest_e
     np.testing.assert_allclose(middle / middle.max(), white, rtol=1e-5)
 
 
-def test_a_spots_flux_is_its_area_wherever_it_stands():
+def test_spot_flux_is_its_area_at_any_position():
     ideal = dataclasses.replace(build_probe(RIG, seed=3), wings=0.0, veil=0.0)
     flux = unit_images(ideal, VIEW).sum(axis=(1, 2), dtype=np.float64)
     np.testing.assert_allclose(flux, AREA_PX, rtol=1e-5)
 
 
-def test_wings_and_veil_add_what_they_say():
+def test_wings_and_veil_add_stated_light():
     build = dataclasses.replace(build_probe(RIG, seed=3), wings=0.0, veil=5e-5)
     image = unit_images(build, VIEW)[4]
     assert image[0, 1000] == np.float32(5e-5)
@@ -88,7 +88,7 @@ def test_wings_and_veil_add_what_they_say():
     assert near / far == pytest.approx(8.0, rel=0.05)
 
 
-def test_spots_stand_where_they_were_built_off_the_drawing(scene):
+def test_spots_are_at_actual_positions_off_nominal(scene):
     images = unit_images(
         dataclasses.replace(scene.build, wings=0.0, veil=0.0, unevenness=np.zeros((28, 3))), VIEW
     )
@@ -101,7 +101,7 @@ def test_spots_stand_where_they_were_built_off_the_drawing(scene):
     assert 0.5 < off.mean() < 6.0
 
 
-def test_a_frame_is_linear_in_light_up_to_rounding(noiseless):
+def test_frame_is_linear_in_light_up_to_rounding(noiseless):
     head = CHEEK
     light = noiseless.fibre_light(head)
     one, both = noiseless.image(light), noiseless.image(light + 2.0 * light[::-1])
@@ -162,7 +162,7 @@ def test_noise_is_that_of_electrons(scene):
     assert abs(ratio.mean() - 1.0) < FALSE_ALARM * math.sqrt(2.0 / inside.sum())
 
 
-def test_dark_current_doubles_every_six_and_a_half_kelvin(scene):
+def test_dark_current_doubles_every_6_5_kelvin(scene):
     sensors = [scene.sensor(camera_c=c) for c in (5.0, 11.5, 18.0)]
     assert [s.dark_e_per_s / DARK_E_PER_S for s in sensors] == pytest.approx([1.0, 2.0, 4.0])
     cold, warm = (
@@ -177,7 +177,7 @@ def test_dark_current_doubles_every_six_and_a_half_kelvin(scene):
     assert warm - cold == pytest.approx(DARK_E_PER_S * 30.0 * 15.0 / VIEW.gain_e_per_dn, rel=0.04)
 
 
-def test_some_pixels_are_hot_at_the_same_places(scene):
+def test_hot_pixels_keep_same_positions(scene):
     frames = [
         scene.exposure("cam", pops=[], exposure_s=30.0, seed=s, head=CHEEK).astype(float)
         for s in (1, 2)
@@ -187,7 +187,7 @@ def test_some_pixels_are_hot_at_the_same_places(scene):
     assert (hot[0] & hot[1]).sum() > 0.9 * hot[0].sum()
 
 
-def test_covered_fibres_pass_a_hundred_thousandth(scene):
+def test_covered_fibers_transmit_a_hundred_thousandth(scene):
     uncovered, masked = scene.fibre_light(CHEEK), scene.fibre_light(CHEEK, fibre=0)
     share = masked[:, 1] / uncovered[:, 1]
     assert share[0] == pytest.approx(1.0, rel=2e-3)
@@ -198,7 +198,7 @@ def test_covered_fibres_pass_a_hundred_thousandth(scene):
     )
 
 
-def test_a_head_in_the_air_sees_the_room_and_not_the_source(scene):
+def test_head_in_air_receives_room_light_not_source(scene):
     lights = [
         scene.exposure("cam", pops=pops, exposure_s=1.0, seed=1, head=AIR).astype(float)
         for pops in (lit(1.0), [])
@@ -224,7 +224,7 @@ def test_equal_seeds_give_equal_frames_whatever_came_before(scene):
     assert (frames[0] != again).any()
 
 
-def test_what_makes_no_sense_is_refused(scene):
+def test_invalid_exposure_requests_are_refused(scene):
     with pytest.raises(SceneError, match="view"):
         scene.exposure("left", pops=[], exposure_s=1.0, seed=0, head=CHEEK)
     with pytest.raises(SceneError, match="level"):

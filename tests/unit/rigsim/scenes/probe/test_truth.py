@@ -25,7 +25,7 @@ FALSE_ALARM = 4.5  # standard deviations; of some 100 normal values one in 1500 
 
 
 @pytest.mark.parametrize(("sigma_a", "scattering"), [(0.04, 1.5), (0.3, 2.0)])
-def test_the_stored_profile_is_that_of_photons_traced_for_it(sigma_a, scattering):
+def test_stored_profile_matches_traced_photons(sigma_a, scattering):
     """28 z values; photons of their own with fibres of their own size against scaled points."""
     layer = Layer(inf, sigma_a, scattering / 0.2, 0.8, 1.4)
     traced = fibre_profile(
@@ -45,7 +45,7 @@ def test_the_stored_profile_is_that_of_photons_traced_for_it(sigma_a, scattering
 @pytest.mark.parametrize(
     ("sigma_a", "scattering"), [(0.02, 1.0), (0.1, 2.5), (0.5, 3.0), (0.9, 2.4)]
 )
-def test_the_nearest_medium_of_a_homogeneous_one_is_itself(sigma_a, scattering):
+def test_nearest_medium_of_homogeneous_medium_is_itself(sigma_a, scattering):
     """Photons' noise on every fibre; the fit's error is a fraction of one fibre's."""
     value, _ = WhiteFibre.load().profile(sigma_a, scattering, FIBRES)
     noise = 0.01
@@ -68,7 +68,7 @@ def test_the_fit_finds_out_a_wrong_medium():
     assert bent.residual > 0.15
 
 
-def test_a_factor_is_free_only_where_a_layer_may_dim():
+def test_factor_is_free_only_where_layer_may_dim():
     value, _ = WhiteFibre.load().profile(0.1, 2.0, FIBRES)
     free, fixed = (nearest_medium(0.5 * value, FIBRES, dimmed=dimmed) for dimmed in (True, False))
     assert free.factor == pytest.approx(0.5, rel=1e-3)
@@ -78,14 +78,14 @@ def test_a_factor_is_free_only_where_a_layer_may_dim():
     assert fixed.residual > 0.05
 
 
-def test_what_cannot_be_fitted_is_refused():
+def test_unfittable_profile_is_refused():
     with pytest.raises(FitError, match="bright"):
         nearest_medium(np.full(28, 1e-9), FIBRES)
     with pytest.raises(WhiteFibreError, match="inside the table"):
         WhiteFibre.load().profile(0.1, 9.0, FIBRES)
 
 
-def test_the_truth_of_a_gray_medium_is_its_own(tmp_path):
+def test_truth_of_gray_medium_is_its_own(tmp_path):
     scene = ProbeScene(RIG, HomogeneousTissue(0.1, 2.0), photons=1)
     truth = ground_truth(scene, [Probing("cheek", 1, 22.5, 59.0)])
     (entry,) = truth.parameters["profiles"]
@@ -103,7 +103,7 @@ def test_the_truth_of_a_gray_medium_is_its_own(tmp_path):
     assert np.array(truth.parameters["crosstalk"]).shape == (28, 28)
 
 
-def test_the_truth_of_a_spectral_medium_lies_between_its_wavelengths():
+def test_truth_of_spectral_medium_is_between_its_wavelengths():
     scene = ProbeScene(RIG, PHANTOM_BLOCK, photons=1)
     (entry,) = ground_truth(scene, [Probing("phantom", 0, 0.0, 60.0)]).parameters["profiles"]
     sigma_a = np.array(PHANTOM_BLOCK.sigma_a_per_mm)

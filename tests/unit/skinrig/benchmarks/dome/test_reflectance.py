@@ -7,7 +7,7 @@ from skinrig.benchmarks.dome import reflectance
 from skinrig.benchmarks.stage import Stage
 
 
-def test_points_of_the_benchmark_lie_above_their_horizon_and_keep_lights_apart(rng):
+def test_benchmark_points_are_above_horizon_with_separate_lights(rng):
     p = reflectance.face_points("III", points=6, samples=40, rng=rng)
     assert p.valid.mean() > 0.9
     assert 0.02 < p.left_out.mean() < 0.6
@@ -20,7 +20,7 @@ def test_points_of_the_benchmark_lie_above_their_horizon_and_keep_lights_apart(r
 
 
 @pytest.mark.long
-def test_more_lobes_predict_lights_that_were_left_out_better():
+def test_more_lobes_predict_held_out_lights_better():
     stage = Stage("reflectance", toy=True)
     reflectance.model(stage)
     by_rank = {p.knobs["rank"]: p.error for p in stage.points if p.knobs["part"] == "lobes"}

@@ -8,7 +8,7 @@ from skinrig.benchmarks.dome import texture
 from skinrig.benchmarks.stage import Stage
 
 
-def test_a_missing_peer_is_said_and_no_limit_is_claimed(monkeypatch):
+def test_missing_peer_is_reported_without_claimed_limit(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyrtools", None)
     monkeypatch.setitem(sys.modules, "pyrtools.pyramids", None)
     stage = Stage("texture-matching")
@@ -18,7 +18,7 @@ def test_a_missing_peer_is_said_and_no_limit_is_claimed(monkeypatch):
     assert "skinrig[peers]" in stage.left_out[0][1]
 
 
-def test_our_responses_are_those_of_the_peer(rng):
+def test_responses_match_peer(rng):
     """Tolerance: the peer interpolates its filters in a table."""
     pytest.importorskip("pyrtools")
     image = rng.standard_normal((512, 512))
@@ -27,7 +27,7 @@ def test_our_responses_are_those_of_the_peer(rng):
 
 
 @pytest.mark.long
-def test_our_matching_ends_as_near_as_the_peers():
+def test_matching_converges_as_close_as_peer():
     pytest.importorskip("pyrtools")
     stage = Stage("texture-matching")
     texture.against_peer(stage, 512)
@@ -35,7 +35,7 @@ def test_our_matching_ends_as_near_as_the_peers():
     assert [limit.passed for limit in stage.benchmark().limits[2:]] == [True, True]
 
 
-def test_a_made_texture_is_periodic_and_has_spots_of_their_own_color(rng):
+def test_made_texture_is_periodic_with_distinct_spot_color(rng):
     plain = texture.skin_texture(128, spots=0.0, rng=np.random.default_rng(1))
     spotted = texture.skin_texture(128, spots=10.0, rng=np.random.default_rng(1))
     assert np.abs(plain[0] - plain[-1]).max() < 2.0 * np.abs(np.diff(plain, axis=0)).max()

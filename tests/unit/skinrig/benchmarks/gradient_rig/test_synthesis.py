@@ -36,7 +36,7 @@ def test_autocorrelation_of_a_wave_is_a_wave():
     np.testing.assert_allclose(found[:, 64], np.cos(np.arange(-64, 65) / 5.0), atol=0.03)
 
 
-def test_furrows_have_a_skewness_that_their_normal_twin_has_not(rng):
+def test_grooves_are_skewed_unlike_their_normal_twin(rng):
     furrows = -np.exp(-((gaussian_filter(rng.standard_normal((300, 300)), 4.0) / 0.02) ** 2))
     smooth = gaussian_filter(rng.standard_normal((300, 300)), 4.0)
     found = [

@@ -32,14 +32,14 @@ def test_honest_gaussian_intervals_are_kept_at_both_levels(rng):
         assert found.interval[1] > level / 100 - 0.003
 
 
-def test_intervals_half_as_wide_as_the_errors_are_missed(rng):
+def test_intervals_half_as_wide_as_errors_miss_coverage(rng):
     # it can fail: 38 % are inside
     found = pooled(trials_of(rng, shared=0.0, scale=2.0), level=68)
     assert found.verdict == "missed"
     assert found.share == pytest.approx(0.383, abs=0.02)
 
 
-def test_errors_that_pixels_share_leave_the_coverage_as_open_as_subjects_do(rng):
+def test_correlated_pixel_errors_widen_coverage_like_subjects(rng):
     """In 300 runs 95 % intervals of the coverage hold the true one in 90 to 99 %: 3.5 sigma."""
     held = 0
     for _ in range(300):
@@ -50,11 +50,11 @@ def test_errors_that_pixels_share_leave_the_coverage_as_open_as_subjects_do(rng)
     assert high - low > 0.05
 
 
-def test_a_single_subject_tells_no_interval(rng):
+def test_single_subject_gives_no_interval(rng):
     assert pooled(trials_of(rng, shared=0.0, subjects=1), level=68).interval == (0.0, 1.0)
 
 
-def test_bands_are_told_beside_all_and_subjects_without_truths_are_left_out(rng):
+def test_bands_are_reported_and_subjects_without_truth_omitted(rng):
     made = trials_of(rng, shared=0.0, band="light") + trials_of(rng, shared=0.0, band="dark")
     made.append(Trial("x", "masked", "dark", np.empty(0), float("nan"), "%", GAUSSIAN_95))
     rows = by_band(made, level=95, confidence=0.95)
@@ -63,13 +63,13 @@ def test_bands_are_told_beside_all_and_subjects_without_truths_are_left_out(rng)
         pooled(made, level=68)
 
 
-def test_angles_of_two_gaussian_components_reach_their_68_percent(rng):
+def test_angles_of_two_gaussian_components_reach_68_percent(rng):
     angle = np.hypot(*rng.standard_normal((2, 200_000)))
     # 4 sigma of the share
     assert np.mean(angle <= RAYLEIGH_68) == pytest.approx(0.6827, abs=0.0042)
 
 
-def test_a_few_truths_that_all_lie_inside_leave_the_coverage_open():
+def test_few_truths_all_inside_leave_coverage_open():
     """Two subjects with two truths each, all inside: that is no proof of 95 % or more."""
     trials = [Trial("x", str(k), "any", np.array([0.1, 0.2]), 1.0, "s", 1.96) for k in range(2)]
     row = pooled(trials, level=68, confidence=0.95)

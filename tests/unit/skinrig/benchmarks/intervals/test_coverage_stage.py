@@ -16,20 +16,20 @@ def point(share, interval):
     return intervals._point(Covered("x", "any", 68, share, interval, 6, 1.0, "%"), ONCE)
 
 
-def test_an_interval_that_holds_the_nominal_coverage_allows_a_distance_of_0():
+def test_interval_containing_nominal_coverage_allows_zero_distance():
     found = point(0.72, (0.60, 0.80))
     assert found.error == pytest.approx(4.0)
     assert found.error_interval == pytest.approx((0.0, 12.0))
 
 
 @pytest.mark.parametrize(("share", "interval"), [(0.5, (0.4, 0.6)), (0.86, (0.76, 0.96))])
-def test_an_interval_beside_it_does_not(share, interval):
+def test_interval_excluding_nominal_coverage_excludes_zero_distance(share, interval):
     found = point(share, interval)
     assert found.error == pytest.approx(18.0)
     assert found.error_interval == pytest.approx((8.0, 28.0))
 
 
-def test_media_show_an_axis_turned_the_other_way_or_across():
+def test_media_distinguish_axis_mirrored_or_across():
     """10 degrees tell them apart: the axis is known to a few.
 
     Rationale: at 0 and 90 degrees a direction and its mirror image are one; at 45 a direction
@@ -43,7 +43,7 @@ def test_media_show_an_axis_turned_the_other_way_or_across():
 
 
 @pytest.mark.parametrize("medium", intervals.ANISOTROPIC_MEDIA)
-def test_the_estimator_finds_the_axis_that_media_are_judged_by(medium):
+def test_estimator_finds_axis_that_evaluates_media(medium):
     """Exact decays: least along the direction in which light goes farthest."""
     true_deg = interval_trials_probe._farthest_deg(medium)
     angle = np.radians(np.arange(8) * 22.5)

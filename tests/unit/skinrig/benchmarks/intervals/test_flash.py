@@ -8,7 +8,7 @@ from reconstruction.chromophores import shading_prior
 from skinrig.benchmarks.intervals import flash as trials
 
 
-def test_subjects_stand_off_the_tiles_place_by_what_the_stated_error_of_light_is_of():
+def test_subject_distance_from_tile_matches_stated_light_error():
     """Light goes with the square of the distance; chi-square of 400 draws, 1 % false alarms."""
     distance_mm = 1000.0
     nearer = np.array([trials.nearer_mm(seed) for seed in range(400)])
@@ -20,7 +20,7 @@ def test_subjects_stand_off_the_tiles_place_by_what_the_stated_error_of_light_is
     assert abs(nearer.mean()) < 2.6 * nearer.std() / np.sqrt(nearer.size)
 
 
-def test_each_subject_is_simulated_where_it_was_drawn_to_stand(tmp_path, monkeypatch):
+def test_each_subject_is_simulated_at_its_drawn_position(tmp_path, monkeypatch):
     class Asked(Exception):
         """Stops before anything is rendered."""
 

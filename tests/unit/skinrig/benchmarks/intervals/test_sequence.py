@@ -33,7 +33,7 @@ def trials(rng, **more):
     ]
 
 
-def test_time_constants_in_noise_are_held_as_often_as_said(rng):
+def test_time_constants_in_noise_have_stated_coverage(rng):
     """300 fits: 4 sigma of a share of 68 % is 11 points, of 95 % 5."""
     made = trials(rng, noise=4e-4)
     assert abs(pooled(made, level=68).share - 0.683) < 0.11
@@ -66,7 +66,7 @@ def told(known, best, inner, outer):
         ([33.0, 60.0], [30.0, 90.0], 0.0, 0.0),
     ],
 )
-def test_each_interval_counts_as_it_stands(inner, outer, held_68, held_95):
+def test_each_interval_counts_as_stated(inner, outer, held_68, held_95):
     fit = told("estimated", 35.0, inner, outer)
     one = of_fits("x", [fit], CONSTANT_S, "a", "any")
     assert one.share(68) == held_68
@@ -82,7 +82,7 @@ def test_each_interval_counts_as_it_stands(inner, outer, held_68, held_95):
         ("only below", [0.0, 5.0], [0.0, 8.0], (0, 0)),
     ],
 )
-def test_bounds_are_intervals_that_are_open_to_one_side(known, inner, outer, held):
+def test_bounds_are_one_sided_intervals(known, inner, outer, held):
     one = of_fits(
         "x",
         [told(known, 4.0 if known == "only below" else 90.0, inner, outer)],
@@ -94,12 +94,12 @@ def test_bounds_are_intervals_that_are_open_to_one_side(known, inner, outer, hel
     assert np.isnan(one.width)
 
 
-def test_what_tells_nothing_is_left_out():
+def test_uninformative_fits_are_omitted():
     fit = told("unknown", 0.1, [0.0, None], [0.0, None])
     assert of_fits("x", [fit], CONSTANT_S, "a", "any").deviation.size == 0
 
 
-def test_each_person_reacts_in_a_time_of_their_own():
+def test_each_subject_has_individual_reaction_time():
     own = [order_of("smile", seed).reaction_s for seed in range(200)]
     assert order_of("smile", 3).reaction_s == own[3]
     low, high = REACTION_RANGE_S

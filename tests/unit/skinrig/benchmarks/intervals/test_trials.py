@@ -65,7 +65,7 @@ def absorptions(found, truth, subject):
 
 
 @pytest.mark.parametrize("trial", [decays, absorptions])
-def test_intervals_of_a_medium_as_wide_as_its_errors_are_kept_and_halved_ones_missed(trial):
+def test_medium_intervals_keep_coverage_and_halved_ones_miss(trial):
     """80 media of 3 colors: 240 draws; the share is off by 0.08 with a chance of 1 % at most."""
     rng = np.random.default_rng(8)
     honest = [trial(*medium(rng), f"{k}") for k in range(80)]
@@ -75,7 +75,7 @@ def test_intervals_of_a_medium_as_wide_as_its_errors_are_kept_and_halved_ones_mi
     assert pooled(halved, level=68).verdict == "missed"
 
 
-def test_coefficients_that_are_not_told_apart_are_not_judged():
+def test_indistinguishable_coefficients_are_not_evaluated():
     found, truth = medium(np.random.default_rng(1), told=False)
     assert absorptions(found, truth, "x").deviation.size == 0
     assert decays(found, truth, "x").deviation.size == 3
@@ -108,7 +108,7 @@ def directed(rng, *, axis_deg, stated):
 
 
 @pytest.mark.parametrize("axis_deg", [0.0, 60.0, 179.5])
-def test_axis_and_ratio_of_an_ellipse_are_judged_wherever_the_axis_lies(axis_deg):
+def test_ellipse_parameters_are_evaluated_at_any_axis_direction(axis_deg):
     rng = np.random.default_rng(3)
     for stated, verdict in ((1.0, "kept"), (0.5, "missed")):
         made = [
@@ -123,7 +123,7 @@ def test_axis_and_ratio_of_an_ellipse_are_judged_wherever_the_axis_lies(axis_deg
             assert pooled(trials, level=68).verdict == verdict
 
 
-def test_widths_of_a_change_are_told_over_what_changes(rng):
+def test_change_widths_are_reported_over_changing_pixels(rng):
     """Rationale: over a change of nothing any width is infinite."""
     rest = np.full((20, 20), 0.04)
     change = np.where(np.arange(20) < 12, 0.0, 0.01) * np.ones((20, 1))

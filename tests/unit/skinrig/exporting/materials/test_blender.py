@@ -84,9 +84,7 @@ FORMATS = pytest.mark.parametrize("format_", ["glb", "usd", "usd in cm, dx"])
 
 
 @FORMATS
-def test_blender_puts_vertices_and_texture_coordinates_where_they_were_measured(
-    in_blender, material, format_
-):
+def test_blender_keeps_measured_vertices_and_texture_coordinates(in_blender, material, format_):
     found, _ = in_blender(format_)
     np.testing.assert_allclose(found["vertices"], MM * material.mesh.vertices_mm, atol=2e-8)
     assert np.array_equal(found["faces"], material.mesh.faces)
@@ -103,7 +101,7 @@ def test_blender_has_the_blend_shapes_as_shape_keys(in_blender, material, format
 
 
 @FORMATS
-def test_blender_reads_base_color_as_srgb_and_all_else_as_data(in_blender, material, format_):
+def test_blender_reads_base_color_as_srgb_others_data(in_blender, material, format_):
     found, facts = in_blender(format_)
     assert [facts[f"{n}_space"] for n in ("base_color", "roughness", "normal")] == [
         "sRGB",
@@ -123,9 +121,7 @@ def test_blender_reads_base_color_as_srgb_and_all_else_as_data(in_blender, mater
 
 
 @FORMATS
-def test_the_normals_that_cycles_shades_with_are_those_that_were_measured(
-    in_blender, material, format_
-):
+def test_cycles_shading_normals_match_measured_normals(in_blender, material, format_):
     """Baked by Cycles, whose tangents are its own; a map read upside down would be 20 degrees off.
 
     8 bits in a .glb move a normal by up to 0.4 degrees, bilinear lookup and the bake the rest.
@@ -145,7 +141,7 @@ def test_the_normals_that_cycles_shades_with_are_those_that_were_measured(
 
 
 @FORMATS
-def test_the_script_sets_the_light_below_the_surface_in_metres(in_blender, material, format_):
+def test_script_sets_subsurface_scattering_in_meters(in_blender, material, format_):
     found, facts = in_blender(format_)
     assert (facts["subsurface_weight"], facts["method"]) == (1.0, "RANDOM_WALK")
     in_mm = facts["subsurface_scale"] / MM / (4.0 * math.pi)
@@ -161,15 +157,13 @@ def test_the_script_sets_the_light_below_the_surface_in_metres(in_blender, mater
         np.testing.assert_allclose(weight[on], material.specular_weight[on], atol=1e-6)
 
 
-def test_what_gltf_says_of_the_light_below_the_surface_becomes_a_property(in_blender, material):
+def test_gltf_subsurface_extras_become_property(in_blender, material):
     _, facts = in_blender("glb")
     told = facts["properties"]["subsurface"]
     np.testing.assert_allclose(told["mean_free_path_mm"], material.usual_radius_mm(), rtol=1e-5)
 
 
-def test_without_the_script_blender_shows_no_light_below_the_surface(
-    simulated_face, shapes_file, tmp_path
-):
+def test_blender_without_script_shows_no_subsurface_light(simulated_face, shapes_file, tmp_path):
     """The reason for the script: an importer that fills this in makes it needless."""
     gltf.write(simulated_face, tmp_path, Delivery(mesh=shapes_file))
     _, facts = read(tmp_path / gltf.GLB_FILE, tmp_path / "read.npz", bake=0)
@@ -185,7 +179,7 @@ def constants(script):
     }
 
 
-def test_the_script_names_its_file_and_radii_without_blender():
+def test_script_names_file_and_radii_without_blender():
     script = blender.Import.of_channels("skin.glb", [0.2, 0.5, 0.1]).script()
     told = constants(script)
     assert told["CHANNELS"] == (0.4, 1.0, 0.2)

@@ -55,7 +55,7 @@ def picture(parsed, number):
     return cv2.imdecode(np.frombuffer(blob, np.uint8), cv2.IMREAD_UNCHANGED)
 
 
-def test_lengths_are_metres_and_texture_coordinates_grow_downwards(parsed, material):
+def test_lengths_are_meters_and_texture_v_grows_downwards(parsed, material):
     attributes = parsed.meshes[0].primitives[0].attributes
     points = accessor(parsed, attributes.POSITION)
     np.testing.assert_allclose(points, material.mesh.vertices_mm * MM, atol=1e-9)
@@ -67,7 +67,7 @@ def test_lengths_are_metres_and_texture_coordinates_grow_downwards(parsed, mater
     assert np.array_equal(faces.reshape(-1, 3), material.mesh.faces)
 
 
-def test_tangents_follow_growing_u_and_bitangents_point_up_the_picture(parsed):
+def test_tangents_follow_u_and_bitangents_point_image_up(parsed):
     attributes = parsed.meshes[0].primitives[0].attributes
     normal, tangent = accessor(parsed, attributes.NORMAL), accessor(parsed, attributes.TANGENT)
     middle = len(normal) // 2
@@ -76,7 +76,7 @@ def test_tangents_follow_growing_u_and_bitangents_point_up_the_picture(parsed):
     np.testing.assert_allclose(bitangent, [0, 1, 0], atol=1e-3)
 
 
-def test_morph_targets_have_their_names_and_move_by_metres(parsed, material):
+def test_morph_targets_are_named_and_displaced_in_meters(parsed, material):
     mesh = parsed.meshes[0]
     assert mesh.extras["targetNames"] == ["jawOpen", "smile left"]
     for target, name in zip(mesh.primitives[0].targets, mesh.extras["targetNames"], strict=True):
@@ -85,7 +85,7 @@ def test_morph_targets_have_their_names_and_move_by_metres(parsed, material):
     assert mesh.weights == [0.0, 0.0]
 
 
-def test_pictures_decode_to_color_roughness_normals_and_weight(parsed, material):
+def test_images_decode_to_color_roughness_normals_and_weight(parsed, material):
     told = parsed.materials[0]
     color = picture(parsed, told.pbrMetallicRoughness.baseColorTexture.index)[..., ::-1] / 255.0
     np.testing.assert_allclose(color, srgb_curve(material.base_color), atol=0.51 / 255)
@@ -102,7 +102,7 @@ def test_pictures_decode_to_color_roughness_normals_and_weight(parsed, material)
     assert color[60, 32, 1] > color[8, 32, 1] + 0.05
 
 
-def test_what_gltf_has_no_place_for_is_in_extras(parsed, material):
+def test_values_unsupported_by_gltf_are_in_extras(parsed, material):
     told = parsed.materials[0]
     assert told.extensions["KHR_materials_ior"]["ior"] == pytest.approx(1.4)
     sigma = told.extras["subsurface"]["sigma_tr_per_mm"]
@@ -110,14 +110,14 @@ def test_what_gltf_has_no_place_for_is_in_extras(parsed, material):
     np.testing.assert_allclose(sigma, 1.0 / depth, rtol=1e-6)
 
 
-def test_our_own_reader_gets_the_mesh_back_in_mm(folder, material):
+def test_skinrig_reader_recovers_mesh_in_mm(folder, material):
     read = blend_shapes.load(folder / "skin.glb")
     np.testing.assert_allclose(read.vertices_mm, material.mesh.vertices_mm, atol=1e-4)
     np.testing.assert_allclose(read.uv, material.mesh.uv, atol=1e-6)
     np.testing.assert_allclose(read.shapes["jawOpen"], material.shapes["jawOpen"], atol=1e-4)
 
 
-def test_trimesh_sees_the_same_surface(folder, material):
+def test_trimesh_reads_same_surface(folder, material):
     import trimesh
 
     data = io.BytesIO((folder / "skin.glb").read_bytes())
@@ -155,7 +155,7 @@ def validated(path):
 
 
 @pytest.mark.skipif(validator() is None, reason="GLTF_VALIDATOR names no npm gltf-validator")
-def test_khronos_finds_nothing_to_say(folder, tmp_path):
+def test_khronos_validator_reports_no_issues(folder, tmp_path):
     report = validated(folder / "skin.glb")
     assert report["issues"]["messages"] == []
     assert report["info"]["totalVertexCount"] == 169
@@ -169,12 +169,12 @@ def test_khronos_finds_nothing_to_say(folder, tmp_path):
 @pytest.mark.parametrize(
     "wrong", [{"unit": "mm"}, {"normal_y": "dx"}, {"udim": "dot"}], ids=lambda one: next(iter(one))
 )
-def test_what_gltf_fixes_cannot_be_asked_for(simulated_face, tmp_path, wrong):
+def test_options_fixed_by_gltf_are_refused(simulated_face, tmp_path, wrong):
     with pytest.raises(UsageError, match="glTF knows"):
         gltf.write(simulated_face, tmp_path, Delivery(**wrong))
 
 
-def test_a_mesh_without_shapes_has_no_targets_and_that_is_told(simulated_face, tmp_path):
+def test_mesh_without_shapes_reports_missing_targets(simulated_face, tmp_path):
     left_out = dict(gltf.write(simulated_face, tmp_path, Delivery()))
     assert "--mesh" in left_out["morph targets"]
     assert json.loads((tmp_path / "glb.json").read_text())["morph_targets"] == []

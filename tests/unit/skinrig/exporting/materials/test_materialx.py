@@ -38,7 +38,7 @@ def written(request, simulated_face, tmp_path):
     return request.param, tmp_path
 
 
-def test_the_radius_in_scene_units_gives_sigma_tr_back(written, material):
+def test_radius_in_scene_units_recovers_sigma_tr(written, material):
     unit, folder = written
     inputs = surface_inputs((folder / "skin.mtlx").read_text())
     radius = float(inputs["subsurface_radius"]["value"])
@@ -53,7 +53,7 @@ def test_the_radius_in_scene_units_gives_sigma_tr_back(written, material):
     assert (told["scene_unit"], told["mm_per_scene_unit"]) == (unit, pytest.approx(1 / MM[unit]))
 
 
-def test_the_mesh_beside_it_has_the_scene_unit(written, material):
+def test_exported_obj_mesh_has_scene_unit(written, material):
     import trimesh
 
     unit, folder = written
@@ -66,7 +66,7 @@ def test_the_mesh_beside_it_has_the_scene_unit(written, material):
     )
 
 
-def test_materialx_itself_finds_the_documents_valid(simulated_face, tmp_path):
+def test_materialx_validates_documents(simulated_face, tmp_path):
     mx = pytest.importorskip("MaterialX")
     from skinrig.exporting import maps
 
@@ -117,7 +117,7 @@ def test_an_essl_shader_is_generated_from_the_material(simulated_face, tmp_path)
 
 
 @pytest.mark.parametrize(("normal_y", "sign"), [("gl", 1.0), ("dx", -1.0)])
-def test_the_node_turns_a_map_of_either_green_to_the_same_normals(
+def test_node_decodes_either_green_to_same_normals(
     simulated_face, material, tmp_path, normal_y, sign
 ):
     materialx.write(simulated_face, tmp_path, Delivery(normal_y=normal_y))
@@ -131,7 +131,7 @@ def test_the_node_turns_a_map_of_either_green_to_the_same_normals(
     np.testing.assert_allclose(xyz * [x, y, 1.0], material.normals, atol=1.01 / 65535)
 
 
-def test_color_is_marked_as_linear_srgb_and_data_as_nothing(simulated_face, tmp_path):
+def test_color_is_linear_srgb_and_data_untagged(simulated_face, tmp_path):
     materialx.write(simulated_face, tmp_path, Delivery())
     graph = ElementTree.fromstring((tmp_path / "skin.mtlx").read_text()).find("nodegraph")
     spaces = {node.get("name"): node[0].get("colorspace") for node in graph.findall("image")}
@@ -144,7 +144,7 @@ def test_color_is_marked_as_linear_srgb_and_data_as_nothing(simulated_face, tmp_
     }
 
 
-def test_base_color_is_what_the_model_reflects_below_the_surface(simulated_face, material):
+def test_base_color_is_model_subsurface_reflectance(simulated_face, material):
     """Even light: the mean over directions of R_d F_t(l) F_t(v) / pi, over 1 - F(v)."""
     from model import fresnel
 
@@ -155,7 +155,7 @@ def test_base_color_is_what_the_model_reflects_below_the_surface(simulated_face,
     np.testing.assert_allclose(material.base_color, r_d * through, rtol=1e-4)
 
 
-def test_errors_and_the_mask_go_beside_where_they_are_asked_for(simulated_face, tmp_path):
+def test_errors_and_mask_are_exported_on_request(simulated_face, tmp_path):
     materialx.write(simulated_face, tmp_path, Delivery(with_errors=True, udim="underscore"))
     mask = read(tmp_path / "textures/mask_1001.exr")
     assert (mask[0, 0], mask[32, 32]) == (0.0, 1.0)

@@ -15,7 +15,7 @@ from skinrig.exporting.materials.subsurface_radius import (
 
 
 @pytest.mark.parametrize("color", [0.1, 0.3, 0.5, 0.7, 0.9])
-def test_the_medium_of_a_color_shows_that_color_by_exact_transport(color):
+def test_medium_of_color_shows_color_by_exact_transport(color):
     """Half space of the same index, isotropic scattering, light at normal incidence.
 
     The published fit is of even light from all sides: at normal incidence less comes back.
@@ -47,17 +47,17 @@ def exact_decay(albedo):
 
 
 @pytest.mark.parametrize("albedo", [0.2, 0.4, 0.7, 0.9, 0.99, 0.99999])
-def test_light_decays_as_transport_theory_has_it(albedo):
+def test_light_decay_matches_transport_theory(albedo):
     assert decay(1.0 - albedo) == pytest.approx(exact_decay(albedo), rel=1e-5)
 
 
-def test_diffusion_alone_would_be_off_by_what_the_docs_say():
+def test_diffusion_alone_deviates_as_documented():
     """sqrt(3 (1 - albedo)) over the exact decay: why the exact one is used."""
     off = [np.sqrt(3.0 * (1.0 - a)) / exact_decay(a) for a in (0.9, 0.7, 0.4)]
     np.testing.assert_allclose(off, [1.042, 1.145, 1.361], atol=0.002)
 
 
-def test_the_renderers_medium_lets_light_decay_as_the_measured_one(rng):
+def test_renderer_medium_decays_like_measured_medium(rng):
     for depth, color, deficit in rng.uniform([0.2, 0.05, 0.02], [8.0, 0.95, 0.6], (20, 3)):
         radius = float(radius_mm(depth, color, deficit))
         rendered = exact_decay(1.0 - float(deficit_root(color)) ** 2) / radius

@@ -15,7 +15,7 @@ def lobes_named(*names):
 
 
 @pytest.mark.parametrize("alpha", [0.1, 0.22, 0.33, 0.48])
-def test_a_surface_that_is_one_lobe_gets_its_own_roughness_and_weight(alpha):
+def test_single_lobe_surface_recovers_roughness_and_weight(alpha):
     """Tables are coarse and seen by a round light: 2 % of roughness, 4 % of weight."""
     found = fit(lobes_named(f"ggx {alpha:g} eta 1.4"), [[[1.0], [0.5]]], eta=1.4)
     np.testing.assert_allclose(found.roughness[0], np.sqrt(alpha), rtol=0.02)
@@ -23,7 +23,7 @@ def test_a_surface_that_is_one_lobe_gets_its_own_roughness_and_weight(alpha):
     assert found.misfit.max() < 0.04
 
 
-def test_the_misfit_tells_a_mixture_that_no_lobe_is():
+def test_misfit_reveals_mixture_unlike_any_lobe():
     lobes = lobes_named("ggx 0.1 eta 1.4", "ggx 0.58 eta 1.4")
     found = fit(lobes, [[[1.0, 0.0], [0.0, 1.0], [0.5, 0.5]]], eta=1.4)
     assert found.misfit[0, 2] > 0.2 > 3.0 * found.misfit[0, :2].max()
@@ -36,6 +36,6 @@ def test_a_denser_surface_is_a_heavier_lobe():
     assert 1.4 < found.weight[0, 0] < 1.7
 
 
-def test_what_reflects_nothing_has_no_weight():
+def test_non_reflecting_surface_has_zero_weight():
     found = fit(lobes_named("ggx 0.33 eta 1.4"), [[[0.0]]], eta=1.4)
     assert (found.weight[0, 0], found.roughness[0, 0], found.misfit[0, 0]) == (0.0, 1.0, 0.0)

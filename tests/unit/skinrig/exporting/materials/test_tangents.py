@@ -37,7 +37,7 @@ def renderer_decodes(framed, codes, size):
     return out
 
 
-def test_a_renderer_of_its_own_gets_the_measured_normals_back(patch):
+def test_independent_renderer_recovers_measured_normals(patch):
     mesh, size = patch.mesh(), 12
     world = patch.bumpy(unwrap(mesh, size).normal)
     framed = FramedMesh.of(mesh)
@@ -55,14 +55,14 @@ def test_world_to_tangent_and_back_loses_nothing(patch):
     assert angle_rad(back, world)[covered].max() < 2e-6
 
 
-def test_a_smooth_surface_is_flat_in_its_own_frame(patch):
+def test_smooth_surface_is_flat_in_own_frame(patch):
     framed = FramedMesh.of(patch.mesh())
     axes, covered = framed.texel_frames(SIZE)
     flat = to_tangent(unwrap(patch.mesh(), SIZE).normal, axes, covered)
     assert np.abs(flat[covered] - [0.0, 0.0, 1.0]).max() < 1e-3
 
 
-def test_a_slope_towards_growing_u_and_v_is_red_and_green():
+def test_slope_towards_u_and_v_is_red_green():
     flat = build_mesh(
         [[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0]],
         [[0, 1, 2], [0, 2, 3]],
@@ -74,7 +74,7 @@ def test_a_slope_towards_growing_u_and_v_is_red_and_green():
         assert found[4, 4, channel] == pytest.approx(0.6, abs=1e-6)
 
 
-def test_a_mirrored_chart_gets_vertices_of_its_own_with_the_other_sign():
+def test_mirrored_chart_gets_own_vertices_with_opposite_sign():
     points = [[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0]]
     faces = [[0, 1, 2], [0, 2, 3]]
     mirrored = [[0.5, 0], [1, 0], [1, 1], [1, 1]]  # the second triangle folds back over the first
@@ -88,7 +88,7 @@ def test_a_mirrored_chart_gets_vertices_of_its_own_with_the_other_sign():
     assert angle_rad(back, world)[covered].max() < 2e-6
 
 
-def test_a_triangle_without_area_in_the_texture_leaves_finite_frames():
+def test_triangle_without_texture_area_leaves_finite_frames():
     points = [[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0]]
     uv = [[0.2, 0.2], [0.2, 0.2], [0.2, 0.2], [0.9, 0.9]]
     framed = FramedMesh.of(build_mesh(points, [[0, 1, 2], [0, 2, 3]], uv))
@@ -96,7 +96,7 @@ def test_a_triangle_without_area_in_the_texture_leaves_finite_frames():
     np.testing.assert_allclose(length, 1.0, atol=1e-6)
 
 
-def test_a_normal_behind_the_surface_is_laid_onto_its_horizon():
+def test_normal_behind_surface_is_clamped_to_horizon():
     flat = build_mesh([[0, 0, 0], [9, 0, 0], [0, 9, 0]], [[0, 1, 2]], [[0, 0], [1, 0], [0, 1]])
     axes, covered = FramedMesh.of(flat).texel_frames(8)
     found = to_tangent(np.full((8, 8, 3), (0.6, 0.0, -0.8)), axes, covered)
@@ -104,7 +104,7 @@ def test_a_normal_behind_the_surface_is_laid_onto_its_horizon():
     assert found[7, 0, 0] > 0.99
 
 
-def test_relief_goes_on_where_it_was_not_measured_instead_of_lying_on_the_horizon(patch):
+def test_relief_continues_smoothly_where_unmeasured(patch):
     """What is filled in the rig's frame is laid onto another part's horizon: dark specks."""
     framed = FramedMesh.of(patch.mesh())
     axes, covered = framed.texel_frames(SIZE)
@@ -118,7 +118,7 @@ def test_relief_goes_on_where_it_was_not_measured_instead_of_lying_on_the_horizo
     assert old[20, 20, 2] < 0.5
 
 
-def test_holes_are_counted_without_seams_of_charts_and_the_outer_rim(patch):
+def test_holes_are_counted_without_seams_and_outer_rim(patch):
     mesh = patch.mesh()
     middle = mesh.vertices_mm[mesh.faces].mean(axis=1)
     near = [np.linalg.norm(middle[:, :2] - [x, y], axis=1) < 9.0 for x, y in ((0, 0), (25, 25))]

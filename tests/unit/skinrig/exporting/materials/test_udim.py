@@ -42,7 +42,7 @@ def read(path):
         return channels["RGB" if "RGB" in channels else "Y"].pixels.copy()
 
 
-def test_each_tile_has_its_textures_and_the_first_has_the_maps(simulated_face, head, tmp_path):
+def test_each_tile_has_textures_and_first_has_maps(simulated_face, head, tmp_path):
     left_out = materialx.write(simulated_face, tmp_path, Delivery(mesh=head, udim="dot"))
     assert [what for what, _ in left_out] == ["maps of tile 1002"]
     material = Material.of(simulated_face, head)
@@ -63,9 +63,7 @@ def test_each_tile_has_its_textures_and_the_first_has_the_maps(simulated_face, h
     assert "1001" not in text
 
 
-def test_the_normal_map_of_an_empty_tile_is_flat_in_either_direction_of_green(
-    simulated_face, head, tmp_path
-):
+def test_empty_tile_normal_map_is_flat_either_green(simulated_face, head, tmp_path):
     import cv2
 
     order = Delivery(mesh=head, udim="underscore", normal_y="dx")
@@ -74,7 +72,7 @@ def test_the_normal_map_of_an_empty_tile_is_flat_in_either_direction_of_green(
     np.testing.assert_allclose(codes / 65535.0, [0.5, 0.5, 1.0], atol=1e-5)
 
 
-def test_maps_are_those_of_a_mesh_of_the_first_tile_alone(simulated_face, head, shapes_file):
+def test_maps_match_mesh_of_first_tile_alone(simulated_face, head, shapes_file):
     """The frames at the rim follow the whole mesh: its normals average both sides there."""
     both = Material.of(simulated_face, head)
     alone = Material.of(simulated_face, shapes_file)
@@ -103,7 +101,7 @@ def test_usd_keeps_all_faces_and_their_coordinates(simulated_face, head, tmp_pat
     assert (tmp_path / "textures/specular_roughness.1002.png").is_file()
 
 
-def test_names_without_numbers_and_gltf_are_refused_by_name(simulated_face, head, tmp_path):
+def test_multi_tile_mesh_needs_udim_and_rejects_gltf(simulated_face, head, tmp_path):
     with pytest.raises(
         UsageError, match="--udim: got none, but the mesh reaches over tiles 1001, "
     ):
@@ -133,7 +131,7 @@ def test_tiles_are_counted_by_tens_upwards():
         assert udim.tiles_of(corner + shift, np.array([[0, 1, 2]])).tolist() == [number]
 
 
-def test_a_mesh_beside_the_first_tile_gets_no_maps(patch, simulated_face, tmp_path):
+def test_mesh_outside_first_tile_is_refused(patch, simulated_face, tmp_path):
     arrays = two_tiles(patch)
     arrays["uv"] = arrays["uv"] + [1.0, 0.0]
     np.savez(tmp_path / "back.npz", **arrays)
@@ -141,7 +139,7 @@ def test_a_mesh_beside_the_first_tile_gets_no_maps(patch, simulated_face, tmp_pa
         Material.of(simulated_face, tmp_path / "back.npz")
 
 
-def test_an_obj_over_two_tiles_is_read_as_the_npz_is(patch, head, tmp_path):
+def test_obj_over_two_tiles_is_read_like_npz(patch, head, tmp_path):
     arrays = two_tiles(patch)
     lines = ["v {} {} {}".format(*row) for row in arrays["vertices_mm"].tolist()]
     lines += ["vt {} {}".format(*row) for row in arrays["uv"].tolist()]
@@ -153,7 +151,7 @@ def test_an_obj_over_two_tiles_is_read_as_the_npz_is(patch, head, tmp_path):
     np.testing.assert_allclose(corners[0], corners[1], atol=1e-6)
 
 
-def test_meshes_of_one_tile_and_faults_of_meshes_are_as_before(shapes_file, tmp_path):
+def test_single_tile_meshes_and_mesh_faults_are_unchanged(shapes_file, tmp_path):
     found = udim.read(shapes_file)
     assert found.tiles == (1001,)
     assert isinstance(found.first(), Mesh)

@@ -26,7 +26,7 @@ def stage(simulated_face, shapes_file, tmp_path_factory):
     return pxr.Stage.Open(str(out / "skin.usdc"))
 
 
-def test_points_lie_in_the_stated_unit_and_texture_coordinates_grow_upwards(stage, material):
+def test_points_are_in_stated_unit_texture_v_upwards(stage, material):
     from pxr import UsdGeom
 
     assert UsdGeom.GetStageMetersPerUnit(stage) == 0.01
@@ -42,7 +42,7 @@ def test_points_lie_in_the_stated_unit_and_texture_coordinates_grow_upwards(stag
     np.testing.assert_allclose(np.array(st), material.mesh.uv, atol=1e-7)
 
 
-def test_blend_shapes_move_points_as_the_mesh_does_under_usds_own_skinning(stage, material):
+def test_blend_shapes_under_usd_skinning_match_mesh(stage, material):
     from pxr import Usd, UsdGeom, UsdSkel
 
     skeleton = UsdSkel.Animation(stage.GetPrimAtPath("/Skin/Skeleton/Neutral"))
@@ -56,7 +56,7 @@ def test_blend_shapes_move_points_as_the_mesh_does_under_usds_own_skinning(stage
     np.testing.assert_allclose(points, 0.1 * moved, atol=1e-5)
 
 
-def test_the_preview_turns_a_directx_map_back_and_reads_color_as_srgb(stage):
+def test_preview_flips_directx_map_and_reads_srgb_color(stage):
     from pxr import UsdShade
 
     def node(name):
@@ -94,9 +94,7 @@ def test_the_openpbr_network_uses_nodes_that_materialx_has(stage, material):
     assert radius == pytest.approx(0.1 * material.radius_mm[material.covered].max(), rel=1e-6)
 
 
-def test_usds_validators_find_nothing_but_nodes_of_a_plugin_they_lack(
-    simulated_face, shapes_file, tmp_path
-):
+def test_usd_validators_report_only_missing_plugin_nodes(simulated_face, shapes_file, tmp_path):
     validation = pytest.importorskip("pxr.UsdValidation")
     from pxr import Usd
 
@@ -114,9 +112,7 @@ def test_sigma_tr_is_in_the_materials_custom_data(stage, material):
     np.testing.assert_allclose(np.array(told), 1.0 / depth, rtol=1e-6)
 
 
-def test_without_usd_the_extra_is_named_and_nothing_is_written(
-    simulated_face, tmp_path, monkeypatch
-):
+def test_missing_usd_names_extra_and_writes_nothing(simulated_face, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
     with pytest.raises(MissingExtra, match=r"skinrig\[usd\]") as error:
         usd.write(simulated_face, tmp_path, Delivery())

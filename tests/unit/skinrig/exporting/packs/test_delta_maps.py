@@ -83,7 +83,7 @@ def moving(rng):
     )
 
 
-def test_base_color_plus_its_delta_is_the_color_of_the_expression(moving, tmp_path):
+def test_base_color_plus_delta_gives_expression_color(moving, tmp_path):
     left_out = dict(delta_maps.write(moving, tmp_path, Delivery(only=("fear", "smile"))))
     told = json.loads((tmp_path / "delta_maps.json").read_text())["color"]
     assert told["maps"] == {"cm1": "fear", "cm2": "smile"}
@@ -105,9 +105,7 @@ def test_base_color_plus_its_delta_is_the_color_of_the_expression(moving, tmp_pa
 
 
 @pytest.mark.parametrize(("normal_y", "y"), [("gl", 1.0), ("dx", -1.0)])
-def test_normals_plus_a_wrinkle_delta_are_the_normals_of_the_expression(
-    moving, tmp_path, normal_y, y
-):
+def test_normals_plus_wrinkle_delta_give_expression_normals(moving, tmp_path, normal_y, y):
     delta_maps.write(moving, tmp_path, Delivery(normal_y=normal_y))
     told = json.loads((tmp_path / "delta_maps.json").read_text())["wrinkles"]
     assert told["maps"] == {"wm1": "smile", "wm2": "anger"}
@@ -124,7 +122,7 @@ def test_normals_plus_a_wrinkle_delta_are_the_normals_of_the_expression(
         np.testing.assert_allclose(slopes * [1.0, y], expected, atol=2e-4)
 
 
-def test_masks_of_zones_are_there_by_name_with_row_0_at_the_top(moving, tmp_path):
+def test_zone_masks_are_named_with_row_0_top(moving, tmp_path):
     delta_maps.write(moving, tmp_path, Delivery())
     told = json.loads((tmp_path / "delta_maps.json").read_text())["wrinkles"]["masks"]
     assert told == {"wrinkle_mask_0_0": "upper", "wrinkle_mask_0_1": "lower"}
@@ -132,14 +130,14 @@ def test_masks_of_zones_are_there_by_name_with_row_0_at_the_top(moving, tmp_path
     assert (upper[2, 60], upper[120, 60]) == (65535, 0)
 
 
-def test_of_more_than_three_states_the_rest_is_named(moving, tmp_path):
+def test_states_beyond_three_are_named_as_omitted(moving, tmp_path):
     left_out = [what for what, _ in delta_maps.write(moving, tmp_path, Delivery())]
     assert "color of smile" in left_out  # the fourth by name
     with pytest.raises(ExportError, match="got 'joy', expected of anger, fear, sadness, smile"):
         delta_maps.write(moving, tmp_path, Delivery(only=("joy",)))
 
 
-def test_a_folder_without_wrinkles_or_color_says_what_is_missing(moving, tmp_path):
+def test_folder_without_wrinkles_or_color_reports_missing_part(moving, tmp_path):
     parts = dict(moving.parameters["parts"])
     del parts["wrinkles"]
     alone = SkinAppearance(

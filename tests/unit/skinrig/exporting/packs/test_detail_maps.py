@@ -26,7 +26,7 @@ def read(path):
 
 @pytest.mark.parametrize("slope", [0.1, 0.5, 2.0])
 @pytest.mark.parametrize("turned", [False, True])
-def test_light_left_in_a_groove_is_that_of_its_walls_in_closed_form(slope, turned):
+def test_groove_occlusion_matches_closed_form_of_walls(slope, turned):
     """An infinite groove leaves 1 / sqrt(1 + s^2): the mean of 1 - sin^2 of its horizons.
 
     16 directions integrate it within 0.2 %; the reach does not matter while walls go on.
@@ -45,7 +45,7 @@ def test_ridges_and_flat_skin_keep_all_light():
     assert np.array_equal(visible_share(np.full((9, 9), 3.0), part[:9, :9]), np.ones((9, 9)))
 
 
-def test_heights_of_another_part_of_the_texture_shade_nothing():
+def test_heights_of_other_texture_parts_shade_nothing():
     """Parts are integrated for themselves: their heights have no common zero."""
     height, part = np.zeros((16, 16)), np.zeros((16, 16), int)
     height[:, 8:], part[:, 8:] = 50.0, 1
@@ -53,7 +53,7 @@ def test_heights_of_another_part_of_the_texture_shade_nothing():
     assert visible_share(height, np.zeros_like(part))[8, 7] < 0.6
 
 
-def test_a_crease_in_wrinkle_normals_is_dark_in_the_cavity_map_and_nothing_else_is(tmp_path):
+def test_cavity_map_is_dark_only_in_wrinkle_creases(tmp_path):
     x = np.arange(SIDE) - SIDE / 2
     depth = -4.0 * np.exp(-((x / 3.0) ** 2))  # of a crease along y
     slopes = np.zeros((SIDE, SIDE, 2))
@@ -75,14 +75,14 @@ def test_a_crease_in_wrinkle_normals_is_dark_in_the_cavity_map_and_nothing_else_
     np.testing.assert_allclose(codes / 65535.0, seen, atol=0.51 / 65535)
 
 
-def test_without_any_valid_normal_no_cavity_is_made_up(tmp_path):
+def test_cavity_without_valid_normals_is_not_made(tmp_path):
     out = ImageFolder(tmp_path, Delivery())
     told = detail_maps.cavity(np.zeros((8, 8, 2)), np.zeros((8, 8), bool), 8, out)
     assert (told, out.left_out) == ({}, [("cavity", "no wrinkle normal is valid")])
     assert list(tmp_path.iterdir()) == []
 
 
-def test_tiled_relief_has_no_seam_in_height_or_slope_and_keeps_its_variance(rng):
+def test_tiled_relief_has_no_seam_and_keeps_variance(rng):
     """Smooth noise: across the tile's border it differs as it does elsewhere, in value and slope.
 
     Over 24 reliefs the RMS of differences across borders is that inside within 15 %, 5 standard
@@ -113,7 +113,7 @@ def test_tiled_relief_has_no_seam_in_height_or_slope_and_keeps_its_variance(rng)
     assert np.mean(variance) == pytest.approx(1.0, abs=0.05)
 
 
-def test_micro_normals_have_the_slopes_of_the_relief_in_its_own_unit():
+def test_micro_normals_match_relief_slopes_in_own_unit():
     x = np.arange(128)
     relief = 5.0 * np.sin(2 * np.pi * 3 * x / 128)[:, None] * np.ones((1, 128))  # um, rows
     normals = periodic_normals(relief, 6.0)
@@ -148,7 +148,7 @@ def relief(rng):
     )
 
 
-def test_a_pack_of_relief_alone_holds_micro_normals_with_their_size_on_skin(relief, tmp_path):
+def test_relief_only_pack_has_micro_normals_with_size(relief, tmp_path):
     left_out = dict(delta_maps.write(relief, tmp_path, Delivery(normal_y="dx")))
     told = json.loads((tmp_path / "delta_maps.json").read_text())
     (entry,) = told["micro"].values()
@@ -171,7 +171,7 @@ def test_the_green_of_micro_normals_follows_the_order(relief, tmp_path):
     np.testing.assert_array_equal(up * [1.0, -1.0, 1.0], down)
 
 
-def test_scatter_is_the_models_translucency_at_the_size_of_packs(patch, tmp_path, monkeypatch):
+def test_scatter_is_model_translucency_at_pack_size(patch, tmp_path, monkeypatch):
     monkeypatch.setattr(detail_maps, "SCATTER_SIZE", patch.side)
     face = patch.face(parameters={"assumed": ["translucency is the population's", "other"]})
     onto = store.write(tmp_path / "model", face)

@@ -58,7 +58,7 @@ def session(tmp_path):
 
 
 @pytest.mark.parametrize("to", ["mhl", "frames", "event-model"])
-def test_only_what_the_subject_agreed_to_leaves_and_only_in_time(session, tmp_path, to):
+def test_export_requires_subject_consent_and_valid_date(session, tmp_path, to):
     out = tmp_path / "out"
     for use, today in (("publication", DAY), ("research", date(2030, 1, 2)), ("any", DAY)):
         with pytest.raises(ConsentError, match="has not agreed"):
@@ -76,7 +76,7 @@ def test_consent_is_asked_for_at_the_command_line(session, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["files"] == 4
 
 
-def test_an_exported_session_is_a_session_with_all_that_was_committed(session, tmp_path):
+def test_exported_session_contains_all_committed_data(session, tmp_path):
     export(session, tmp_path / "out", to="mhl", use="research", today=DAY)
     copy = Session.open(tmp_path / "out")
     assert copy.content_hash == Session.open(session).content_hash
@@ -95,7 +95,7 @@ def test_a_damaged_session_is_not_handed_on(session, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["s"]
 
 
-def test_an_existing_folder_and_an_unknown_format_are_refused(session, tmp_path):
+def test_existing_folder_or_unknown_format_is_refused(session, tmp_path):
     with pytest.raises(ExportError, match="exists"):
         export(session, session, to="frames", use="research", today=DAY)
     with pytest.raises(ExportError, match="mhl, frames, event-model"):
@@ -105,7 +105,7 @@ def test_an_existing_folder_and_an_unknown_format_are_refused(session, tmp_path)
 # ASC MHL --------------------------------------------------------------------------------------
 
 
-def test_a_c4_id_is_the_published_one():
+def test_c4_id_matches_published_value():
     """The ID of no bytes at all, as SMPTE ST 2114 lists it."""
     expected = (
         "c459dsjfscH38cYeXXYogktxf4Cd9ibshE3BHUo6a58hBXmRQdZrAkZzsWcbWtDg5oQstpDuni4Hirj75GEmTc1sFT"
@@ -124,7 +124,7 @@ def ascmhl(*argv):
     )
 
 
-def test_the_reference_tool_verifies_an_export_and_names_what_was_changed(session, tmp_path):
+def test_reference_tool_verifies_export_and_names_changes(session, tmp_path):
     pytest.importorskip("ascmhl")
     out = tmp_path / "delivery"
     export(session, out, to="mhl", use="research", today=DAY)
@@ -143,7 +143,7 @@ def test_the_reference_tool_verifies_an_export_and_names_what_was_changed(sessio
     assert "S000+cam.dng" in changed.stdout + changed.stderr
 
 
-def test_a_sealed_folder_names_no_host_and_is_not_sealed_twice(session, tmp_path):
+def test_sealed_folder_names_no_host_sealed_only_once(session, tmp_path):
     import platform
 
     from capture.session import SessionError
@@ -176,7 +176,7 @@ def test_documents_fit_the_schemas_of_the_event_model(exported):
         event_model.schema_validators[kind].validate(document)
 
 
-def test_a_run_router_follows_every_document_to_its_run(exported):
+def test_run_router_assigns_every_document_to_its_run(exported):
     event_model = pytest.importorskip("event_model")
     seen = []
 
@@ -196,7 +196,7 @@ def test_a_run_router_follows_every_document_to_its_run(exported):
     ]
 
 
-def test_every_event_leads_to_a_frame_of_the_export(exported):
+def test_every_event_refers_to_exported_frame(exported):
     out, documents = exported
     by_name = {}
     for name, document in documents:
@@ -214,7 +214,7 @@ def test_every_event_leads_to_a_frame_of_the_export(exported):
     assert [event["data"]["attempt"] for event in by_name["event"]] == [1, 1, 1, 2]
 
 
-def test_a_run_that_lacks_frames_says_so(session, tmp_path):
+def test_run_lacking_frames_reports_missing_frames(session, tmp_path):
     unfinished = Session.create(
         tmp_path / "t",
         plan=flash_plan(RIG),

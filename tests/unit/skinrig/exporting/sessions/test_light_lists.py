@@ -56,7 +56,7 @@ def export(session, out, **more):
     return exporting.export(session.path, out, "lp", **told)
 
 
-def test_directions_and_pictures_come_back_through_an_import(session, lights, tmp_path):
+def test_directions_and_images_survive_import(session, lights, tmp_path):
     export(session, tmp_path / "out")
     found = find(tmp_path / "out")
     assert found.kind == "lp"
@@ -91,7 +91,7 @@ def test_positions_are_there_for_near_lights(session, lights, tmp_path):
     assert json.loads((tmp_path / "out" / "lights.json").read_text())["source"] == "measured"
 
 
-def test_a_light_beside_the_camera_is_on_the_axis_and_one_above_it_is_up(rng):
+def test_light_at_camera_is_on_axis_above_up(rng):
     """Of a camera that looks down from above, its up towards -z."""
     down, right = np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])
     rotation = np.stack([right, np.cross(down, right), down])
@@ -109,7 +109,7 @@ def test_the_same_session_gives_the_same_bytes(session, tmp_path):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
 
-def test_pictures_leave_only_within_the_consent(session, tmp_path):
+def test_images_are_exported_only_within_consent(session, tmp_path):
     with pytest.raises(ConsentError, match="has not agreed"):
         export(session, tmp_path / "out", use="publication")
     with pytest.raises(ConsentError, match="has not agreed"):
@@ -117,7 +117,7 @@ def test_pictures_leave_only_within_the_consent(session, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_camera_that_is_not_there_is_named_with_those_that_are(session, tmp_path):
+def test_missing_camera_is_named_with_available_ones(session, tmp_path):
     with pytest.raises(ExportError, match="got 'C9', expected one of cam"):
         export(session, tmp_path / "out", delivery=Delivery(camera="C9"))
     assert not (tmp_path / "out").exists()

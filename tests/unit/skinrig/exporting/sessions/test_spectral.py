@@ -51,7 +51,7 @@ def wavelengths(names, kind):
     return found
 
 
-def test_reflectance_is_the_two_layer_models_at_each_wavelength(flash, tmp_path):
+def test_reflectance_matches_two_layer_model_per_wavelength(flash, tmp_path):
     stokes.write_spectra(flash, tmp_path, Delivery())
     header, found = channels(tmp_path / "reflectance.exr")
     named = wavelengths(found, "T")
@@ -71,7 +71,7 @@ def test_reflectance_is_the_two_layer_models_at_each_wavelength(flash, tmp_path)
     assert not any(layer[0, 0] for layer in found.values())  # where melanin is not known
 
 
-def test_spectra_average_to_the_colors_of_the_cameras_table(rng):
+def test_spectra_average_to_camera_table_colors(rng):
     c_m, c_hd = rng.uniform(0.005, 0.45, 40), rng.uniform(0.002, 0.3, 40)
     table = color_table.build(CAMERA, LIGHT, anisotropy=ANISOTROPY_SKIN)
     reflectance = color_table.spectral_reflectance(c_m, c_hd, anisotropy=ANISOTROPY_SKIN)
@@ -85,7 +85,7 @@ def test_fractions_outside_the_table_have_no_spectrum():
             color_table.spectral_reflectance(c_m, c_hd)
 
 
-def test_stokes_components_give_the_parallel_and_the_crossed_picture(flash, tmp_path):
+def test_stokes_components_give_parallel_and_crossed_images(flash, tmp_path):
     """An analyser along (across) the polarizer passes (S0 + S1) / 2 and (S0 - S1) / 2."""
     stokes.write_spectra(flash, tmp_path, Delivery())
     header, found = channels(tmp_path / "stokes.exr")
@@ -101,7 +101,7 @@ def test_stokes_components_give_the_parallel_and_the_crossed_picture(flash, tmp_
     np.testing.assert_allclose((s0 - s1) / 2, diffuse / 2, atol=1e-6)
 
 
-def test_the_document_says_what_is_measured_and_what_is_not(flash, tmp_path):
+def test_document_separates_measured_from_unmeasured(flash, tmp_path):
     left_out = stokes.write_spectra(
         SkinAppearance({n: flash.maps[n] for n in ("melanin", "hemoglobin")}, "simulated"),
         tmp_path,

@@ -67,7 +67,7 @@ def read(path):
         return dict(file.header()), {n: c.pixels.copy() for n, c in file.channels().items()}
 
 
-def test_the_two_polarizations_come_back_from_s0_and_s1(tmp_path):
+def test_both_polarizations_are_recovered_from_s0_and_s1(tmp_path):
     session = made(tmp_path)
     export(session, tmp_path / "out", to="stokes", use="research", today=DAY)
     told = json.loads((tmp_path / "out/stokes.json").read_text())
@@ -86,7 +86,7 @@ def test_the_two_polarizations_come_back_from_s0_and_s1(tmp_path):
         assert (header["spectralLayoutVersion"], header["emissiveUnits"]) == ("1.0", "1")
 
 
-def test_channels_are_named_as_the_published_layout_has_them(tmp_path):
+def test_channels_are_named_as_in_published_layout(tmp_path):
     fichet = pytest.importorskip("colour.io.fichet2021")
     export(made(tmp_path), tmp_path / "out", to="stokes", use="research", today=DAY)
     _, found = read(tmp_path / "out/stokes_a000_n0_full.exr")
@@ -96,7 +96,7 @@ def test_channels_are_named_as_the_published_layout_has_them(tmp_path):
         assert re.match(rf"^{fichet.PATTERN_FICHET2021}$", band), (kind, dot)
 
 
-def test_the_document_says_along_which_axis_and_what_was_not_measured(tmp_path):
+def test_document_reports_axis_and_unmeasured_components(tmp_path):
     done = export(
         made(tmp_path, patterns=("full", "dark")),
         tmp_path / "out",
@@ -118,7 +118,7 @@ def test_the_document_says_along_which_axis_and_what_was_not_measured(tmp_path):
     assert done.left_out == ()
 
 
-def test_use_beyond_the_consent_other_rigs_and_unknown_states_are_refused(tmp_path, capsys):
+def test_use_beyond_consent_and_other_inputs_are_refused(tmp_path, capsys):
     session = made(tmp_path)
     with pytest.raises(ConsentError, match="has not agreed"):
         export(session, tmp_path / "out", to="stokes", use="film", today=DAY)
@@ -139,7 +139,7 @@ def test_use_beyond_the_consent_other_rigs_and_unknown_states_are_refused(tmp_pa
     assert "next: read stokes.json" in capsys.readouterr().out
 
 
-def test_a_session_of_another_rig_is_sent_where_it_belongs(tmp_path):
+def test_session_of_other_rig_is_redirected(tmp_path):
     from capture.plan import flash_plan
 
     rig = load_rig("flash").resized(16)

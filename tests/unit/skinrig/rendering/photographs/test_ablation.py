@@ -37,13 +37,13 @@ def model(lobes, weights, rng):
     )
 
 
-def test_skin_that_shines_by_one_lobe_is_as_it_was_with_one_lobe(lobes, rng):
+def test_single_lobe_skin_is_unchanged_by_ablation(lobes, rng):
     strength = rng.uniform(0.5, 2.0, (SIDE, SIDE, 1))
     weights = strength * np.array([0.3, 0.7])
     np.testing.assert_allclose(one_lobe(model(lobes, weights, rng)), weights, rtol=1e-5)
 
 
-def test_one_lobe_keeps_how_much_is_reflected_and_gives_up_how_sharply(lobes, rng):
+def test_single_lobe_keeps_amount_and_loses_sharpness(lobes, rng):
     weights = rng.uniform(0.0, 1.0, (SIDE, SIDE, 2))
     made = one_lobe(model(lobes, weights, rng)).reshape(-1, 2)
     share = made / made.sum(axis=1, keepdims=True)
@@ -55,7 +55,7 @@ def test_one_lobe_keeps_how_much_is_reflected_and_gives_up_how_sharply(lobes, rn
     assert abs(one.mean() / true.mean() - 1) < 0.1
 
 
-def test_parts_that_are_taken_out_are_the_mesh_s_normal_and_the_mean_albedo(lobes, rng):
+def test_removed_parts_become_mesh_normal_and_mean_albedo(lobes, rng):
     whole = model(lobes, np.ones((SIDE, SIDE, 2)), rng)
     mesh = build_mesh(
         [[0, -8, 0], [8, -8, 0], [8, 0, 0], [0, 0, 0]],
@@ -72,7 +72,7 @@ def test_parts_that_are_taken_out_are_the_mesh_s_normal_and_the_mean_albedo(lobe
         np.testing.assert_array_equal(less[other].normals, whole.normals)
 
 
-def test_lighter_skin_has_the_greater_angle_and_gray_is_on_the_neutral_axis():
+def test_lighter_skin_has_greater_angle_and_gray_neutral():
     gray = skin_bands.typology_angle_deg([0.5, 0.5, 0.5])
     assert gray == pytest.approx(90.0, abs=0.1)
     skins = skin_bands.typology_angle_deg(

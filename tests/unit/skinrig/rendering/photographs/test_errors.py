@@ -24,7 +24,7 @@ def scene(rng):
     return rgb, Photograph(noisy, np.full(rgb.shape, sigma**2), valid), covered, lit
 
 
-def test_a_rendering_that_is_right_differs_by_the_noise_alone(rng):
+def test_correct_rendering_differs_by_noise_alone(rng):
     rgb, photo, covered, lit = scene(rng)
     pair = errors.compare(photo, rgb, covered=covered, lit=lit)
     count = np.count_nonzero(pair.lit)
@@ -34,7 +34,7 @@ def test_a_rendering_that_is_right_differs_by_the_noise_alone(rng):
 
 
 @pytest.mark.parametrize("factor", [0.9, 1.05, 1.3])
-def test_a_rendering_that_is_too_bright_by_a_factor_is_off_by_that(rng, factor):
+def test_rendering_too_bright_by_factor_errs_by_factor(rng, factor):
     rgb, photo, covered, lit = scene(rng)
     exact = Photograph(rgb, photo.variance, photo.valid)
     pair = errors.compare(exact, factor * rgb, covered=covered, lit=lit)
@@ -43,7 +43,7 @@ def test_a_rendering_that_is_too_bright_by_a_factor_is_off_by_that(rng, factor):
     assert np.sign(np.nanmedian(pair.signed)) == np.sign(factor - 1)
 
 
-def test_missing_structure_counts_more_against_similarity_than_an_even_error_as_large(rng):
+def test_missing_structure_lowers_similarity_beyond_uniform_error(rng):
     rgb, photo, covered, lit = scene(rng)
     fine = rgb * (1 + 0.03 * rng.choice([-1.0, 1.0], rgb.shape[:2]))[..., None]
     exact = Photograph(fine, photo.variance, photo.valid)
@@ -53,7 +53,7 @@ def test_missing_structure_counts_more_against_similarity_than_an_even_error_as_
     assert smooth.ssim < even.ssim < 1.0
 
 
-def test_only_pixels_whose_neighbors_are_in_the_light_too_count_as_lit(rng):
+def test_pixels_count_as_lit_only_with_lit_neighbors(rng):
     _, photo, covered, lit = scene(rng)
     lit[10, 10] = False
     found = errors.lit_pixels(photo, covered=covered, lit=lit)
@@ -78,7 +78,7 @@ def test_saturated_and_noisy_pixels_do_not_count(rng):
     assert (pair.lit == found).all()
 
 
-def test_photographs_are_summed_up_over_pixels_with_an_interval_over_photographs(rng):
+def test_photograph_summary_pools_pixels_with_interval_over_photographs(rng):
     rgb, photo, covered, lit = scene(rng)
     exact = Photograph(rgb, photo.variance, photo.valid)
     pairs = [
@@ -93,7 +93,7 @@ def test_photographs_are_summed_up_over_pixels_with_an_interval_over_photographs
     assert found.bias == pytest.approx(found.median)
 
 
-def test_errors_by_band_are_those_of_the_pixels_in_it(rng):
+def test_errors_by_band_use_pixels_of_band(rng):
     rgb, photo, covered, lit = scene(rng)
     exact = Photograph(rgb, photo.variance, photo.valid)
     factor = np.where(np.arange(SIDE)[:, None] < 12, 1.02, 1.2)[..., None]

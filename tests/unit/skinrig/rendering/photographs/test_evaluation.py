@@ -11,7 +11,7 @@ def appearance(melanin, stderr=None, valid=None):
     )
 
 
-def test_an_honest_estimate_shows_its_spread_and_covers_the_truth(rng):
+def test_unbiased_estimate_reports_its_scatter_and_full_coverage(rng):
     truth = np.full((60, 60), 0.08)
     stderr = np.full((60, 60), 0.008)
     estimate = truth + rng.normal(0, 0.008, truth.shape)
@@ -30,7 +30,7 @@ def test_masked_pixels_are_counted_and_do_not_err(rng):
     assert row.median_relative < 1e-6
 
 
-def test_each_pixel_falls_into_the_band_of_its_true_melanin(rng):
+def test_each_pixel_is_binned_by_true_melanin(rng):
     truth = np.repeat([[0.01], [0.3]], 30, axis=1)
     rows = compare(appearance(truth * 1.1), appearance(truth), rng=rng)
     assert [(row.band_name, row.pixels) for row in rows] == [

@@ -28,7 +28,7 @@ def light(rng):
     return rng.uniform(0.1, 0.5, (24, 32, 3))
 
 
-def test_brighter_light_is_told_by_its_factor_although_both_pictures_look_alike(light, tmp_path):
+def test_brighter_light_is_reported_by_factor_despite_similarity(light, tmp_path):
     """A picture may be shown at a brightness of its own: codes would say that nothing differs."""
     a = folder(tmp_path / "a", light, shown=light)
     b = folder(tmp_path / "b", 1.25 * light, shown=light)
@@ -41,7 +41,7 @@ def test_brighter_light_is_told_by_its_factor_although_both_pictures_look_alike(
     assert (codes.kind, codes.equal) == ("8-bit codes", True)
 
 
-def test_a_spot_that_brightens_is_found_where_it_is_and_in_its_channel(light, tmp_path):
+def test_brightening_spot_is_located_with_its_channel(light, tmp_path):
     other = light.copy()
     other[5:8, 20:24, 0] += 0.3
     (one,), _ = image_comparison.compared(
@@ -62,7 +62,7 @@ def test_colors_of_png_files_keep_their_order(light, tmp_path):
     np.testing.assert_allclose(found.a, light, atol=0.51 / 255)
 
 
-def test_pictures_of_other_sizes_or_of_one_run_alone_are_named(light, tmp_path):
+def test_images_of_other_size_or_unpaired_are_named(light, tmp_path):
     a, b = folder(tmp_path / "a", light), folder(tmp_path / "b", light[:12])
     (b / "shadow.png").write_bytes(png.encode(np.zeros((4, 4), np.uint8)))
     found, refused = image_comparison.compared(a, b)
@@ -70,7 +70,7 @@ def test_pictures_of_other_sizes_or_of_one_run_alone_are_named(light, tmp_path):
     assert dict(refused) == {"radiance": "sizes 24 x 32 x 3 and 12 x 32 x 3", "shadow": "only in B"}
 
 
-def test_a_report_on_two_folders_of_pictures_compares_them(light, tmp_path):
+def test_report_on_two_image_folders_compares_images(light, tmp_path):
     a = folder(tmp_path / "monday", light, samples=4)
     b = folder(tmp_path / "tuesday", 1.1 * light, samples=16, seconds=9.0)
     done = report.make([a, b])
@@ -83,7 +83,7 @@ def test_a_report_on_two_folders_of_pictures_compares_them(light, tmp_path):
     assert report.make([a, b], compare=False).compared is None
 
 
-def test_pictures_inside_two_runs_belong_together_by_their_folders_name(light, tmp_path):
+def test_images_in_two_runs_pair_by_folder_name(light, tmp_path):
     for run, gain in (("x", 1.0), ("y", 1.0)):
         folder(tmp_path / run / "pictures-front", gain * light)
     folder(tmp_path / "x" / "pictures-side", light)
@@ -98,7 +98,7 @@ def test_pictures_inside_two_runs_belong_together_by_their_folders_name(light, t
     assert "all that the records say, is the same" in html
 
 
-def test_a_check_of_photographs_that_failed_only_once_is_told_as_changed(light, tmp_path):
+def test_photograph_check_failing_once_is_reported_as_changed(light, tmp_path):
     row = {
         "pairs": 2,
         "median": 0.03,
@@ -122,7 +122,7 @@ def test_a_check_of_photographs_that_failed_only_once_is_told_as_changed(light, 
     assert "1 of 1 checks of both changed their verdict, 1 for the worse" in html
 
 
-def test_a_damaged_picture_is_named_and_the_rest_is_compared(light, tmp_path):
+def test_damaged_image_is_named_and_rest_compared(light, tmp_path):
     a, b = folder(tmp_path / "a", light), folder(tmp_path / "b", light)
     for one in (a, b):
         (one / "broken.png").write_bytes(b"no picture")

@@ -35,7 +35,7 @@ def two_estimates(rng, *, stated=1.0, spread=(0.3, 0.4)):
     return maps[0], maps[1]
 
 
-def test_noise_of_the_stated_size_lies_apart_as_chance_has_it(rng):
+def test_noise_of_stated_size_differs_as_expected(rng):
     found = compare("thickness", *two_estimates(rng))
     for share, expected in zip(found.beyond, CHANCE_FRACTIONS, strict=True):
         assert share_is(share, expected)
@@ -43,13 +43,13 @@ def test_noise_of_the_stated_size_lies_apart_as_chance_has_it(rng):
     assert not found.disagree
 
 
-def test_noise_twice_as_large_as_stated_is_called_a_disagreement(rng):
+def test_noise_twice_stated_size_is_reported_as_disagreement(rng):
     found = compare("thickness", *two_estimates(rng, stated=0.5))
     assert not share_is(found.beyond[0], CHANCE_FRACTIONS[0])
     assert found.disagree
 
 
-def test_a_spot_that_moved_by_five_standard_errors_is_found_where_it_is(rng):
+def test_spot_shifted_by_five_standard_errors_is_located(rng):
     one, other = two_estimates(rng)
     values = other.values.copy()
     values[20:60, 100:140] += 2.5
@@ -75,7 +75,7 @@ def noisy_normals(rng, spread, stated):
     return SkinMap(normals, "1", np.full(normals.shape, stated))
 
 
-def test_normals_that_err_as_stated_lie_apart_as_chance_has_it(rng):
+def test_normals_with_stated_errors_differ_as_expected(rng):
     honest = [noisy_normals(rng, 0.01, 0.01) for _ in range(2)]
     found = compare("normals", *honest)
     assert found.unit == "°"
@@ -85,7 +85,7 @@ def test_normals_that_err_as_stated_lie_apart_as_chance_has_it(rng):
     assert compare("normals", *(noisy_normals(rng, 0.01, 0.005) for _ in range(2))).disagree
 
 
-def test_equal_maps_are_zero_apart_even_where_they_claim_no_error():
+def test_equal_maps_differ_by_zero_despite_zero_error():
     one = SkinMap(np.ones((3, 4)), "mm", np.zeros((3, 4)))
     found = compare("thickness", one, one)
     assert found.high == 0.0
@@ -93,7 +93,7 @@ def test_equal_maps_are_zero_apart_even_where_they_claim_no_error():
     assert not found.disagree
 
 
-def test_pixels_that_one_estimate_masks_are_counted_and_not_subtracted():
+def test_pixels_masked_in_either_estimate_are_counted_only():
     valid = np.array([[True, False, True]])
     one = SkinMap(np.ones((1, 3)), "mm", np.ones((1, 3)), valid)
     found = compare("thickness", one, SkinMap(np.full((1, 3), 2.0), "mm", np.ones((1, 3))))
@@ -101,7 +101,7 @@ def test_pixels_that_one_estimate_masks_are_counted_and_not_subtracted():
     assert np.isnan(found.difference[0, 1])
 
 
-def test_of_colors_the_channel_that_is_farthest_off_is_shown():
+def test_color_map_shows_channel_of_largest_difference():
     one = SkinMap(np.zeros((1, 1, 3)), "1", np.ones((1, 1, 3)))
     other = SkinMap(np.array([[[0.0, -6.0, 3.0]]]), "1", np.ones((1, 1, 3)))
     found = compare("r_d", one, other)
@@ -116,7 +116,7 @@ def test_of_colors_the_channel_that_is_farthest_off_is_shown():
         (SkinMap(np.ones((2, 2)), "um"), "units 'mm' and 'um'"),
     ],
 )
-def test_maps_that_cannot_be_subtracted_are_refused_with_what_differs(other, word):
+def test_unsubtractable_maps_are_refused_with_difference(other, word):
     with pytest.raises(ValueError, match=word):
         compare("thickness", SkinMap(np.ones((2, 2)), "mm"), other)
 
@@ -177,20 +177,20 @@ def folders(tmp_path, rng):
         (("a",), False),
     ],
 )
-def test_exactly_two_of_one_kind_are_a_comparison(folders, given, compared):
+def test_two_inputs_of_same_kind_make_a_comparison(folders, given, compared):
     paths = [folders[name] for name in given]
     assert (run_comparison.sides(paths) is not None) == compared
     assert run_comparison.sides(paths, insist=False) is None
 
 
-def test_a_comparison_of_what_are_not_two_runs_is_refused_with_what_was_given(folders):
+def test_comparison_of_other_than_two_runs_is_refused(folders):
     with pytest.raises(ReportError, match=r"a \(maps\).*truth \(truth\), expected two of one kind"):
         report.make([folders["a"], folders["truth"]], compare=True)
     with pytest.raises(ReportError, match="does not exist"):
         report.make([folders["a"], folders["a"] / "nothing"])
 
 
-def test_a_check_that_got_worse_is_said_first(folders):
+def test_worsened_check_is_reported_first(folders):
     done = report.make([folders["a"], folders["b"], folders["truth"]])
     assert done.compared == ("A: a", "B: b")
     assert "1 of 1 checks of both changed their verdict, 1 for the worse." in done.html
@@ -200,13 +200,13 @@ def test_a_check_that_got_worse_is_said_first(folders):
     assert done.html == report.make([folders["a"], folders["b"], folders["truth"]]).html
 
 
-def test_without_truths_it_is_said_that_nobody_knows_which_run_is_right(folders):
+def test_comparison_without_truth_leaves_better_run_undecided(folders):
     html = report.make([folders["a"], folders["b"]]).html
     assert "what differs can be told, what is right cannot" in html
     assert "Errors against the truths" not in html
 
 
-def test_two_runs_are_paired_by_the_names_of_their_folders(tmp_path, rng):
+def test_two_runs_are_paired_by_folder_names(tmp_path, rng):
     for run in ("one", "two"):
         (tmp_path / run).mkdir()
         write_maps(tmp_path / run / "face", rng)
@@ -217,7 +217,7 @@ def test_two_runs_are_paired_by_the_names_of_their_folders(tmp_path, rng):
     assert "hand" in html
 
 
-def test_two_runs_of_the_same_frames_are_said_to_share_their_noise(tmp_path, rng):
+def test_runs_of_same_frames_are_reported_as_correlated(tmp_path, rng):
     for run in ("one", "two"):
         (tmp_path / run).mkdir()
         write_maps(tmp_path / run / "face", rng)
@@ -231,7 +231,7 @@ def test_two_benchmarks_are_compared_setting_by_setting(tmp_path):
     assert '<td class="n">2</td>' in html  # seconds of B over those of A
 
 
-def test_meshes_of_other_places_are_not_subtracted(tmp_path, rng):
+def test_meshes_at_other_positions_are_not_subtracted(tmp_path, rng):
     for name, at in (("a", 0.0), ("b", 8.0)):
         place = np.zeros((20, 20, 3))
         place[..., 0], place[..., 1] = np.meshgrid(np.arange(20.0) + at, np.arange(20.0))

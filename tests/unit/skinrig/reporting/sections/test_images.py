@@ -31,7 +31,7 @@ def a_folder(path, **document):
     return path
 
 
-def test_a_comparison_adds_its_limit_and_names_what_was_left_out(tmp_path):
+def test_comparison_adds_limit_and_names_omissions(tmp_path):
     folder = a_folder(
         tmp_path / "pictures",
         **{
@@ -52,14 +52,14 @@ def test_a_comparison_adds_its_limit_and_names_what_was_left_out(tmp_path):
     assert body.count("data:image/png") == 1
 
 
-def test_a_report_finds_pictures_below_its_folder(tmp_path):
+def test_report_finds_images_below_its_folder(tmp_path):
     a_folder(tmp_path / "pictures", view={"name": "C03"}, lights={"L017": 1}, lobes=4)
     html = build([tmp_path])
     assert "Rendering: pictures" in html
     assert "L017" in html
 
 
-def test_large_pictures_stay_in_their_folder(tmp_path, monkeypatch):
+def test_large_images_stay_in_their_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(pictures, "MAX_IMAGE_BYTES", 10)
     folder = a_folder(tmp_path / "pictures", view={"name": "C03"}, lights={})
     body = page.fragment(pictures.section(folder, []))
@@ -67,7 +67,7 @@ def test_large_pictures_stay_in_their_folder(tmp_path, monkeypatch):
     assert "data:image" not in body
 
 
-def test_other_documents_are_no_pictures(tmp_path):
+def test_other_documents_are_not_images(tmp_path):
     folder = tmp_path / "pictures"
     folder.mkdir()
     (folder / "analysis.json").write_text(json.dumps({"schema": "somebody.else/1"}))

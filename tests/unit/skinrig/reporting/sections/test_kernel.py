@@ -37,7 +37,7 @@ def table_of(fit):
     return list(zip(head, cells, strict=False))
 
 
-def test_kernels_stand_with_their_standard_errors_and_half_widths():
+def test_kernels_are_reported_with_stderr_and_half_widths():
     assert table_of(FIT)[2:8] == [
         ("alpha", "-0.17"),
         ("standard error", "0.12"),
@@ -49,6 +49,6 @@ def test_kernels_stand_with_their_standard_errors_and_half_widths():
 
 
 @pytest.mark.parametrize("missing", ["alpha_95", "sigma_95_um"])
-def test_kernels_that_were_fitted_before_there_were_half_widths_have_a_dash(missing):
+def test_kernels_fitted_without_half_widths_show_dash(missing):
     row = table_of({key: value for key, value in FIT.items() if key != missing})
     assert row[4 if missing == "alpha_95" else 7][1] == "–"

@@ -64,7 +64,7 @@ def write_truth(folder, state, name, values):
     )
 
 
-def test_a_rig_that_has_the_true_blood_keeps_its_limit_and_one_that_has_not_misses(tmp_path):
+def test_rig_with_true_blood_passes_limit_other_misses(tmp_path):
     neutral = moving(tmp_path / "moving", {"neutral": "truth", "smile": "truth-smile"})
     write_truth(tmp_path / "truth", "neutral", "hemoglobin", neutral)
     write_truth(tmp_path / "truth-smile", "smile", "hemoglobin_at_rest", 1.5 * neutral)
@@ -76,7 +76,7 @@ def test_a_rig_that_has_the_true_blood_keeps_its_limit_and_one_that_has_not_miss
     assert "1 of 1 checks missed its limit." in report.build([tmp_path])
 
 
-def test_without_truth_the_face_is_shown_with_its_own_errors(tmp_path):
+def test_face_without_truth_is_shown_with_own_errors(tmp_path):
     moving(tmp_path / "moving", {})
     page = report.build([tmp_path / "moving"])
     assert "No limit was checked" in page
@@ -86,7 +86,7 @@ def test_without_truth_the_face_is_shown_with_its_own_errors(tmp_path):
     assert "zones' sums" in unescape(page)
 
 
-def test_a_sequence_shows_its_places_and_what_is_only_bounded(tmp_path):
+def test_sequence_shows_positions_and_bounded_quantities(tmp_path):
     places = {"cheek": 0.03, "chin": 0.02}
     told = {
         "schema": "skinrig.perfusion-curves/1",

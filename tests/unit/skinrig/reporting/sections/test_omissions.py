@@ -31,7 +31,7 @@ def session(tmp_path):
     return make
 
 
-def test_what_is_left_out_comes_before_what_is_built(session):
+def test_omitted_effects_are_listed_before_built_ones(session):
     html = page.fragment(sections_session.omissions([session("session-a", {"effects": EFFECTS})]))
     places = [html.index(word) for word in ("bounces", "lens", "shadows")]
     assert places == sorted(places)
@@ -40,7 +40,7 @@ def test_what_is_left_out_comes_before_what_is_built(session):
     assert "<flat>" not in html
 
 
-def test_sessions_of_like_scenes_share_a_table_in_any_order(session):
+def test_sessions_of_similar_scenes_share_table_any_order(session):
     two = [session(name, {"effects": EFFECTS}) for name in ("session-b", "session-a")]
     other = session("session-c", {"effects": EFFECTS[:1]})
     html = page.fragment(sections_session.omissions([*two, other]))
@@ -49,5 +49,5 @@ def test_sessions_of_like_scenes_share_a_table_in_any_order(session):
     assert html == page.fragment(sections_session.omissions([other, *reversed(two)]))
 
 
-def test_measured_sessions_and_folders_that_are_none_say_nothing(session, tmp_path):
+def test_measured_sessions_and_invalid_folders_report_no_omissions(session, tmp_path):
     assert not list(sections_session.omissions([session("session-real", {}), tmp_path / "nowhere"]))

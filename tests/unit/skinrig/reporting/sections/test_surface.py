@@ -28,7 +28,7 @@ def test_the_frontmost_of_two_points_is_shown():
     assert image[view.rows[0], view.columns[0]] == 2.0
 
 
-def test_points_outside_the_box_are_not_wrapped_to_its_other_side():
+def test_points_outside_bounds_are_not_wrapped():
     view = FrontView.of(np.array([[-1.0, 10.0, 0.0], [5.0, 10.0, 0.0]]), BOX)
     assert view.rows[0] == view.columns[0] == -1
     _, valid = view.picture(np.array([7.0, 1.0]))
@@ -44,7 +44,7 @@ def sphere():
     return normals, inside
 
 
-def test_the_section_checks_normals_and_albedo_and_shows_the_baseline_unchecked(sphere):
+def test_surface_section_checks_normals_and_albedo_not_baseline(sphere):
     normals, inside = sphere
     albedo = np.full((60, 60, 3), 0.4)
     maps = {
@@ -74,7 +74,7 @@ def test_the_section_checks_normals_and_albedo_and_shows_the_baseline_unchecked(
     assert body.count("<img") > 8
 
 
-def test_without_a_truth_the_section_shows_standard_errors_and_checks_nothing(sphere):
+def test_surface_section_without_truth_shows_stderr_without_checks(sphere):
     normals, inside = sphere
     maps = {
         "position": SkinMap(50 * normals, "mm", valid=inside),

@@ -66,7 +66,7 @@ def test_a_color_calibration_brings_camera_colors_to_srgb(tmp_path, named):
     assert np.abs(found.convert(rgb) - rgb).max() > 0.05
 
 
-def test_a_calibration_of_another_session_beside_is_not_taken(tmp_path):
+def test_calibration_of_neighboring_session_is_not_used(tmp_path):
     _calibration(tmp_path / "calibration")
     found = facial_color.camera_color_of(_source(tmp_path, inputs={"calibration color": "0" * 64}))
     assert not found.known
@@ -75,7 +75,7 @@ def test_a_calibration_of_another_session_beside_is_not_taken(tmp_path):
     assert "as if it were linear sRGB" in found.provenance
 
 
-def test_a_tabulated_sensor_sees_skin_as_srgb_does(tmp_path, monkeypatch):
+def test_tabulated_sensor_renders_skin_like_srgb(tmp_path, monkeypatch):
     """Within 0.01 of skin of another grid; without the matrix it is off by far more."""
     source = _source(tmp_path, parameters={"session": "session"})
 

@@ -45,7 +45,7 @@ def test_texels_find_their_pixels_through_exact_landmarks(dome, rng):
     assert found.leave_one_out_px < 0.1
 
 
-def test_pixels_are_off_by_no_more_than_noisy_landmarks(dome, rng):
+def test_pixel_errors_stay_within_landmark_noise(dome, rng):
     position, normal = dome
     solid, flat = _landmarks(position, rng, noise_px=1.0, count=40)
     found = place(
@@ -56,7 +56,7 @@ def test_pixels_are_off_by_no_more_than_noisy_landmarks(dome, rng):
     assert np.sqrt(np.mean(off**2)) < 2.0
 
 
-def test_a_map_comes_back_as_it_was_where_the_camera_saw_it(dome, rng):
+def test_map_is_recovered_where_visible_to_camera(dome, rng):
     position, normal = dome
     solid, flat = _landmarks(position, rng)
     found = place(
@@ -71,7 +71,7 @@ def test_a_map_comes_back_as_it_was_where_the_camera_saw_it(dome, rng):
     assert np.abs(values - wanted)[known].max() < 2e-5
 
 
-def test_skin_that_turns_away_from_the_camera_is_not_taken(dome, rng):
+def test_skin_facing_away_from_camera_is_not_used(dome, rng):
     position, normal = dome
     solid, flat = _landmarks(position, rng)
     turned = normal.copy()

@@ -45,14 +45,14 @@ def test_zones_go_into_two_rgba_textures_a_layer():
     assert "wrinkle_base" not in made["textures"]
 
 
-def test_a_fitted_base_comes_along_with_its_holes_filled():
+def test_fitted_base_is_included_with_holes_filled():
     base = np.full((16, 16, 2), 0.3, np.float32)
     base[4:8, 4:8] = np.nan
     made = wrinkle_assets.from_model(WrinkleModel(base, (layer(),)), source("joy"), origin="fitted")
     np.testing.assert_allclose(made["textures"]["wrinkle_base"].values, 0.3, rtol=1e-6)
 
 
-def test_what_pixels_still_show_is_the_rms_of_means_of_a_zones_part():
+def test_retained_rms_is_rms_of_zone_means():
     model = WrinkleModel(np.zeros((16, 16, 2), np.float32), (layer(),))
     rows = wrinkle_assets.retained_rms(model, (16, 16))
     assert len(rows) == wrinkle_assets.ZONES_PER_LAYER
@@ -66,7 +66,7 @@ def test_what_pixels_still_show_is_the_rms_of_means_of_a_zones_part():
     assert all(row == [0.0] * 5 for row in rows[2:])
 
 
-def test_expressions_that_the_mesh_cannot_make_leave_wrinkles_out():
+def test_expressions_missing_in_mesh_omit_wrinkles():
     model = WrinkleModel(np.zeros((16, 16, 2), np.float32), (layer(),))
     made = wrinkle_assets.from_model(model, source("jawOpen"), origin="simulated")
     assert "textures" not in made
@@ -75,7 +75,7 @@ def test_expressions_that_the_mesh_cannot_make_leave_wrinkles_out():
     )
 
 
-def test_more_maps_or_zones_than_the_shader_holds_are_refused():
+def test_maps_or_zones_beyond_shader_limit_are_refused():
     base = np.zeros((16, 16, 2), np.float32)
     with pytest.raises(SceneError, match="got 5 wrinkle maps, expected at most 4"):
         wrinkle_assets.from_model(
@@ -86,7 +86,7 @@ def test_more_maps_or_zones_than_the_shader_holds_are_refused():
 
 
 @pytest.mark.long
-def test_wrinkles_of_a_simulated_person_explain_its_own_expressions():
+def test_wrinkles_of_simulated_person_explain_own_expressions():
     from model.wrinkles.partial_derivatives import encode
     from rigsim.subject.person import make_subject
 

@@ -35,7 +35,7 @@ def slope_variance(height, pixel, stretch=(1.0, 1.0)):
 
 
 @pytest.mark.parametrize(("r_s", "r_t"), [(1.25, 0.8125), (1.125, 1.0), (1.0, 0.75)])
-def test_the_variance_of_slopes_under_strain_is_that_of_convolved_relief(relief, r_s, r_t):
+def test_slope_variance_under_strain_matches_convolved_relief(relief, r_s, r_t):
     growth = assets.grown(relief)
     table = relief_growth.strained_variance(growth, relief.table)
     ratios = np.linspace(*relief_growth.STRETCH_RANGE, relief_growth.STRETCH_NODES)
@@ -79,7 +79,7 @@ def test_larger_pixels_show_less_of_the_slopes(relief):
     assert rms[5] < 0.1 * rms[0]
 
 
-def test_a_displacement_has_as_many_pixels_as_the_skin_has_lengths_of_the_patch(relief):
+def test_displacement_pixel_count_is_skin_length_over_pixel(relief):
     facts = assets.from_relief(relief, plate(250.0))["facts"]["microstructure"]
     assert facts["virtual_px"] == pytest.approx(250e3 / relief.pixel_um, abs=8)
     # 4 sigmas of the widest kernel, 22.4 um at r = 1.28, and two pixels for samples

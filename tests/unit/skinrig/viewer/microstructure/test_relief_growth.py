@@ -23,12 +23,12 @@ def growth() -> GrownRelief:
     return GrownRelief(gaussian_patch(), 15.0, 40, 7)
 
 
-def test_a_window_is_a_part_of_every_larger_one(growth):
+def test_window_is_part_of_every_larger_window(growth):
     large = window(growth, -100, 50, (300, 280))
     np.testing.assert_array_equal(window(growth, -30, 90, (64, 48)), large[70:134, 40:88])
 
 
-def test_grown_relief_has_the_mean_and_variance_of_its_patch(growth):
+def test_grown_relief_has_mean_and_variance_of_patch(growth):
     grown = window(growth, 0, 0, (1200, 1200))
     # some 1200^2 / (2 pi (2 * 3)^2) independent places, drawn from a patch that has 160 itself:
     # 20 % is four standard errors of its variance
@@ -47,7 +47,7 @@ def test_grown_relief_has_no_seams(growth):
     assert largest_step(tiled) > 3.0 * largest_step(growth.patch)
 
 
-def test_a_coarser_level_is_the_mean_of_the_finer_one_but_for_changing_weights(growth):
+def test_coarser_level_is_finer_mean_except_changing_weights(growth):
     fine = window(growth, 160, 320, (512, 512)).astype(np.float64)
     for level in range(1, GROWN_LEVELS):
         side = 512 >> level
@@ -59,7 +59,7 @@ def test_a_coarser_level_is_the_mean_of_the_finer_one_but_for_changing_weights(g
         assert np.std(coarse[:, 1:] - mean[:, :-1]) > 2.0 * np.std(coarse - mean)
 
 
-def test_every_place_that_is_shown_lies_in_the_patch():
+def test_every_shown_position_is_inside_patch():
     # a patch of which each pixel is its own address, so that a wrap would show as a jump
     patch = np.arange(96.0 * 96.0).reshape(96, 96).astype(np.float32)
     largest = relief_growth.largest_cell_px(96)
@@ -70,7 +70,7 @@ def test_every_place_that_is_shown_lies_in_the_patch():
         GrownRelief(patch, 10.0, largest + 1, 1)
 
 
-def test_another_seed_shows_other_places(growth):
+def test_another_seed_shows_other_positions(growth):
     other = GrownRelief(growth.patch, growth.pixel_um, growth.cell_px, growth.seed + 1)
     a, b = (window(one, 0, 0, (400, 400)) for one in (growth, other))
     assert abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 0.3
@@ -85,12 +85,12 @@ def test_another_seed_shows_other_places(growth):
         ({"seed": -1}, "seed: got -1"),
     ],
 )
-def test_what_cannot_be_grown_from_is_refused(change, message):
+def test_unusable_patch_is_refused(change, message):
     settings = {"patch": np.zeros((96, 96), np.float32), "pixel_um": 1.0, "cell_px": 17, "seed": 0}
     with pytest.raises(SceneError, match=message):
         GrownRelief(**(settings | change))
 
 
-def test_places_beyond_32_bits_are_refused(growth):
+def test_positions_beyond_32_bits_are_refused(growth):
     with pytest.raises(ValueError, match="window: got"):
         window(growth, relief_growth.MAX_LATTICE_PX, 0, (8, 8))

@@ -30,13 +30,13 @@ def heights(pyramid, level, row, column):
     return pyramid.low + (pyramid.high - pyramid.low) * (words / 65535.0)
 
 
-def test_tiles_put_together_are_the_displacement_to_half_a_word(pyramid, displacement):
+def test_assembled_tiles_match_displacement_to_half_quantum(pyramid, displacement):
     found = np.block([[heights(pyramid, 0, r, c) for c in range(4)] for r in range(4)])
     assert np.abs(found - displacement).max() <= 0.51 * pyramid.step_um
     assert pyramid.step_um < 2e-3
 
 
-def test_each_level_is_the_mean_of_the_finer_one(pyramid, displacement):
+def test_each_level_is_mean_of_finer_level(pyramid, displacement):
     assert [level.shape[0] for level in pyramid.levels] == [1024, 512]
     mean = displacement.astype(np.float64).reshape(512, 2, 512, 2).mean(axis=(1, 3))
     np.testing.assert_allclose(pyramid.levels[1], mean, atol=1e-5)
@@ -64,7 +64,7 @@ def test_holes_are_refused_and_nothing_half_written_stays(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_file_that_is_no_array_of_heights_is_refused(tmp_path):
+def test_file_without_height_array_is_refused(tmp_path):
     other = tmp_path / "other.npy"
     other.write_bytes(b"not an array")
     with pytest.raises(TileError, match=r"not a \.npy file"):
@@ -124,7 +124,7 @@ def test_no_other_path_is_answered(served, path):
 
 
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1", "[::1]:1"])
-def test_a_name_that_was_bound_to_this_machine_is_refused(served, host):
+def test_foreign_host_name_is_refused(served, host):
     assert ask(served, "/", host=host)[0] == 403
     assert ask(served, "/", host=f"localhost:{served.port}")[0] == 200
 
@@ -149,7 +149,7 @@ def test_a_taken_port_is_named(served):
             pass
 
 
-def test_a_closed_server_answers_nobody():
+def test_closed_server_answers_no_request():
     with server.serve(b"page") as one:
         assert ask(one, "/")[1] == b"page"
     with pytest.raises(ConnectionRefusedError):
