@@ -40,8 +40,8 @@ class Document:
     __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
 
     def to_json(self) -> dict[str, Any]:
-        """Return the fields as `json` writes them; see `table_of`."""
-        return table_of(self)
+        """Return the fields as `json` writes them; see `to_json_table`."""
+        return to_json_table(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,10 +88,17 @@ class InputError(ValueError):
 
     @classmethod
     def at(
-        cls, what: str, path: str, got: str, expected: str, *, where: object = "", advice: str = ""
+        cls,
+        problem: str,
+        path: str,
+        got: str,
+        expected: str,
+        *,
+        where: object = "",
+        advice: str = "",
     ) -> Self:
         """Return the error of one fault, at a path in a document or file."""
-        return cls(what, where=str(where), faults=[Fault(path, got, expected)], advice=advice)
+        return cls(problem, where=str(where), faults=[Fault(path, got, expected)], advice=advice)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Keep the parts when the error travels between processes."""
@@ -104,13 +111,13 @@ def _rebuild(
     return kind(what, where=where, faults=faults, advice=advice)
 
 
-class Checks:
+class FaultCollector:
     """Collect the faults of one value and raise them together.
 
     Examples
     --------
-    >>> checks = Checks("Light 'left'", InputError)
-    >>> checks.that("radius_mm", -3.0, False, "> 0")
+    >>> checks = FaultCollector("Light 'left'", InputError)
+    >>> checks.check("radius_mm", -3.0, False, "> 0")
     >>> checks.close()
     Traceback (most recent call last):
         ...
@@ -123,25 +130,25 @@ class Checks:
         self._error = error
         self._faults: list[Fault] = []
 
-    def that(self, field: str, got: object, good: bool, expected: str) -> None:
+    def check(self, field: str, got: object, good: bool, expected: str) -> None:
         """Note a fault of ``field`` unless ``good``."""
         if not good:
-            self._faults.append(Fault(field, shown(got), expected))
+            self._faults.append(Fault(field, short_repr(got), expected))
 
     def note(self, fault: Fault) -> None:
         """Note a fault found elsewhere."""
         self._faults.append(fault)
 
-    def finite(self, **values: float | Iterable[float]) -> None:
+    def check_finite(self, **values: float | Iterable[float]) -> None:
         """Note a fault for each value (or row of values) that is not finite."""
         for field, value in values.items():
             row = (value,) if isinstance(value, int | float) else tuple(value)
-            self.that(field, value, all(math.isfinite(x) for x in row), "finite numbers")
+            self.check(field, value, all(math.isfinite(x) for x in row), "finite numbers")
 
-    def positive(self, **values: float) -> None:
+    def check_positive(self, **values: float) -> None:
         """Note a fault for each value that is not a finite number above zero."""
         for field, value in values.items():
-            self.that(field, value, math.isfinite(value) and value > 0, "a finite number > 0")
+            self.check(field, value, math.isfinite(value) and value > 0, "a finite number > 0")
 
     def close(self) -> None:
         """Raise everything noted, or return."""
@@ -149,13 +156,13 @@ class Checks:
             raise self._error(f"{self._what} is not valid", faults=self._faults)
 
 
-def shown(value: object) -> str:
+def short_repr(value: object) -> str:
     """Return a short ``repr`` of ``value`` for a message."""
     text = repr(value)
     return text if len(text) <= 80 else text[:77] + "..."
 
 
-def parse(kind: type[_T], data: object, *, where: str, error: type[InputError]) -> _T:
+def parse_document(kind: type[_T], data: object, *, where: str, error: type[InputError]) -> _T:
     """Build the frozen dataclass ``kind`` from decoded TOML or JSON, strictly.
 
     Parameters
@@ -171,7 +178,7 @@ def parse(kind: type[_T], data: object, *, where: str, error: type[InputError]) 
     """
     bad: list[Fault] = []
     try:
-        text = json.dumps(_speakable(data, "", bad), allow_nan=False)
+        text = json.dumps(_replace_non_json(data, "", bad), allow_nan=False)
         value: _T = _adapter(typing.cast(typing.Any, kind)).validate_json(text)
     except RecursionError as exc:
         raise error("is nested too deeply", where=where) from exc
@@ -229,7 +236,7 @@ def canonical_json(data: object) -> bytes:
     return json.dumps(data, sort_keys=True, separators=(",", ":"), allow_nan=False).encode("ascii")
 
 
-def table_of(row: Any) -> dict[str, Any]:
+def to_json_table(row: Any) -> dict[str, Any]:
     """Return the fields of a dataclass as JSON values, those of dataclasses in it too.
 
     Parameters
@@ -239,7 +246,7 @@ def table_of(row: Any) -> dict[str, Any]:
 
     Examples
     --------
-    >>> table_of(Fault("a", "1", "2"))
+    >>> to_json_table(Fault("a", "1", "2"))
     {'path': 'a', 'got': '1', 'expected': '2', 'hint': ''}
     """
     return {field.name: _plain(getattr(row, field.name)) for field in dataclass_fields(row)}
@@ -247,7 +254,7 @@ def table_of(row: Any) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     if is_dataclass(value):
-        return table_of(value)
+        return to_json_table(value)
     if isinstance(value, tuple):
         return [_plain(part) for part in value]
     if isinstance(value, date):
@@ -255,14 +262,14 @@ def _plain(value: Any) -> Any:
     return dict(value) if isinstance(value, Mapping) else value
 
 
-def near_miss(key: str, known: Iterable[str]) -> str:
+def suggest_key(key: str, known: Iterable[str]) -> str:
     """Return a suggestion for an unknown key, empty where nothing is near.
 
     Examples
     --------
-    >>> near_miss("wavelength_um", ["wavelength_nm", "width_px"])
+    >>> suggest_key("wavelength_um", ["wavelength_nm", "width_px"])
     'did you mean wavelength_nm? (x1000)'
-    >>> near_miss("focal", ["focal_mm"])
+    >>> suggest_key("focal", ["focal_mm"])
     'did you mean focal_mm? (in mm)'
     """
     names = list(known)
@@ -278,10 +285,10 @@ def near_miss(key: str, known: Iterable[str]) -> str:
     return f"did you mean {close[0]}?" if close else ""
 
 
-def _unit_factor(unit: str, wanted: str) -> float | None:
+def _unit_factor(unit: str, target: str) -> float | None:
     for row in _SI_UNITS:
-        if unit in row and wanted in row:
-            return row[unit] / row[wanted]
+        if unit in row and target in row:
+            return row[unit] / row[target]
     return None
 
 
@@ -307,7 +314,7 @@ def _faults(line: Any, kind: type) -> Iterable[Fault]:
         return
     if line["type"] == "unexpected_keyword_argument":
         known = sorted(_known_keys(kind, location[:-1]))
-        hint = near_miss(str(location[-1]), known)
+        hint = suggest_key(str(location[-1]), known)
         yield Fault(_path(location), "an unknown key", f"one of {', '.join(known)}", hint)
     elif line["type"] in ("missing", "missing_argument"):
         yield Fault(_path(location), "nothing", "a value: the key is required")
@@ -315,7 +322,7 @@ def _faults(line: Any, kind: type) -> Iterable[Fault]:
         # the library's sentences begin so; after our "expected" only their rest reads on
         reason = str(line["msg"]).removeprefix("Value error, ").removeprefix("Input should be ")
         yield Fault(
-            _path(location), shown(line["input"]), reason[:1].lower() + reason[1:].rstrip(".")
+            _path(location), short_repr(line["input"]), reason[:1].lower() + reason[1:].rstrip(".")
         )
 
 
@@ -332,19 +339,20 @@ def _known_keys(kind: Any, location: Sequence[object]) -> set[str]:
     )
 
 
-def _speakable(data: object, path: str, bad: list[Fault]) -> object:
+def _replace_non_json(data: object, path: str, bad: list[Fault]) -> object:
     """Return ``data`` with what JSON cannot hold (NaN, dates) noted in ``bad`` and nulled."""
     if isinstance(data, dict):
         return {
-            str(k): _speakable(v, f"{path}.{k}" if path else str(k), bad) for k, v in data.items()
+            str(k): _replace_non_json(v, f"{path}.{k}" if path else str(k), bad)
+            for k, v in data.items()
         }
     if isinstance(data, list | tuple):
-        return [_speakable(v, f"{path}[{i}]", bad) for i, v in enumerate(data)]
+        return [_replace_non_json(v, f"{path}[{i}]", bad) for i, v in enumerate(data)]
     if isinstance(data, float) and not math.isfinite(data):
-        bad.append(Fault(path, shown(data), "a finite number"))
+        bad.append(Fault(path, short_repr(data), "a finite number"))
         return None
     if not isinstance(data, str | int | float | bool | None):
-        bad.append(Fault(path, shown(data), "a number, text, list or table"))
+        bad.append(Fault(path, short_repr(data), "a number, text, list or table"))
         return None
     return data
 

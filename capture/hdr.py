@@ -12,7 +12,7 @@ from numba.extending import intrinsic
 from numpy.typing import ArrayLike, NDArray
 
 from capture.arrays import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
-from capture.documents import Checks, InputError
+from capture.documents import FaultCollector, InputError
 
 N_WEIGHTING_STEPS: Final = 1
 """Rounds of weighing; a second changes the estimate by less than 1 % of its standard error."""
@@ -36,7 +36,7 @@ class BracketError(InputError):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Response:
+class ResponseCurve:
     """How an encoded picture's values follow from exposure, up to one factor a channel."""
 
     exposure: Float64Array
@@ -53,9 +53,9 @@ class Response:
         """
         picture = np.asarray(image)
         if picture.dtype != np.uint8 or picture.shape[-1:] != self.exposure.shape[1:]:
-            checks = Checks("Picture", BracketError)
+            checks = FaultCollector("Picture", BracketError)
             expected = f"uint8, (..., {self.exposure.shape[1]})"
-            checks.that("image", (str(picture.dtype), picture.shape), False, expected)
+            checks.check("image", (str(picture.dtype), picture.shape), False, expected)
             checks.close()
         step = np.gradient(self.exposure, axis=0)
         variance = self.stderr**2 + step**2 / 12.0
@@ -74,7 +74,7 @@ def recover_response(
     rng: np.random.Generator,
     pixels: int = 150,
     smoothness: float = 10.0,
-) -> Response:
+) -> ResponseCurve:
     """Recover the response of a camera from a bracket of JPEG pictures (OpenCV's Debevec).
 
     Raw frames need no such thing: they are linear, see `merge`.
@@ -110,17 +110,17 @@ def recover_response(
 
     stack = [np.asarray(image) for image in images]
     times = np.asarray(exposures_s, np.float64)
-    checks = Checks("Bracket", BracketError)
-    checks.that("images", len(stack), len(stack) >= 2, "at least two")
+    checks = FaultCollector("Bracket", BracketError)
+    checks.check("images", len(stack), len(stack) >= 2, "at least two")
     kinds = sorted({(str(image.dtype), image.shape) for image in stack})
     fits = len(kinds) == 1 and stack[0].dtype == np.uint8 and stack[0].shape[2:] == (3,)
-    checks.that("images", kinds, fits, "uint8 of one shape (H, W, 3)")
+    checks.check("images", kinds, fits, "uint8 of one shape (H, W, 3)")
     positive = bool(np.isfinite(times).all() and (times > 0).all())
-    checks.that("exposures_s", times.tolist(), positive, "finite seconds > 0")
+    checks.check("exposures_s", times.tolist(), positive, "finite seconds > 0")
     one_each = times.shape == (len(stack),) and len(np.unique(times)) >= 2
-    checks.that("exposures_s", times.tolist(), one_each, f"{len(stack)} times, two that differ")
-    checks.that("pixels", pixels, pixels >= 50, ">= 50")
-    checks.positive(smoothness=smoothness)
+    checks.check("exposures_s", times.tolist(), one_each, f"{len(stack)} times, two that differ")
+    checks.check("pixels", pixels, pixels >= 50, ">= 50")
+    checks.check_positive(smoothness=smoothness)
     checks.close()
     values = np.stack([image.reshape(-1, 3) for image in stack])  # (N, H W, 3)
     # pixels spread over the values of the middle exposure, each group with its own
@@ -147,7 +147,7 @@ def recover_response(
     inner[3:-3] = True  # the ends are clipped
     valid = (seen >= 20) & rising & inner
     stderr = exposure.std(axis=0, ddof=1) / np.sqrt(_N_GROUPS)
-    return Response(mean, stderr, np.asarray(valid, np.bool_))
+    return ResponseCurve(mean, stderr, np.asarray(valid, np.bool_))
 
 
 def merge(
@@ -214,7 +214,9 @@ def merge(
     stack = [np.asarray(frame) for frame in frames]
     times = np.asarray(exposures_s, np.float64)
     _check(stack, times, gain=gain, read_noise=read_noise, black=black, white=white)
-    stack = [frame if np.issubdtype(frame.dtype, np.integer) else _whole(frame) for frame in stack]
+    stack = [
+        frame if np.issubdtype(frame.dtype, np.integer) else _as_integer(frame) for frame in stack
+    ]
     if any(frame.dtype != np.uint16 for frame in stack):
         return merge_reference(
             stack, times, gain=gain, read_noise=read_noise, black=black, white=white
@@ -233,7 +235,7 @@ def merge(
             _merge_tiles(
                 np.array([row.ctypes.data for row in rows], np.int64),
                 (times / longest).astype(np.float32),
-                _starters(times),
+                _choose_first_frames(times),
                 np.float32(1.0 / gain),
                 np.float32((read_noise / gain) ** 2 + 1.0 / 12.0),
                 np.float32(black),
@@ -262,7 +264,7 @@ def merge_reference(
     floor = (read_noise / gain) ** 2 + 1.0 / 12.0  # DN^2, with the rounding to whole DN
     shape = frames[0].shape
     signal, time = np.zeros(shape), np.zeros(shape)
-    for k in _starters(times):
+    for k in _choose_first_frames(times):
         frame, t = frames[k], times[k]
         usable = frame < white
         # first by read noise alone, where the longest exposure counts most
@@ -288,7 +290,7 @@ def merge_reference(
     )
 
 
-def _starters(times: Float64Array) -> Int64Array:
+def _choose_first_frames(times: Float64Array) -> Int64Array:
     """Return the frames for the first guess: all, or of dense brackets those a factor 3 apart.
 
     The weights need the radiance to some percent only. The shortest and the longest take part.
@@ -302,11 +304,11 @@ def _starters(times: Float64Array) -> Int64Array:
     return np.array(chosen, np.int64)
 
 
-def _floating(frame: NDArray[Any]) -> bool:
+def _as_float(frame: NDArray[Any]) -> bool:
     return bool(np.issubdtype(frame.dtype, np.floating))
 
 
-def _whole(frame: NDArray[Any]) -> NDArray[np.integer]:
+def _as_integer(frame: NDArray[Any]) -> NDArray[np.integer]:
     """Return whole numbers of a floating type as uint16 where that holds them, else as int64."""
     held = not frame.size or (float(frame.min()) >= 0 and float(frame.max()) <= 65535)
     return frame.astype(np.uint16 if held else np.int64)
@@ -321,21 +323,21 @@ def _check(
     black: float,
     white: float,
 ) -> None:
-    checks = Checks("Bracket", BracketError)
-    checks.that("frames", len(stack), len(stack) > 0, "at least one frame")
+    checks = FaultCollector("Bracket", BracketError)
+    checks.check("frames", len(stack), len(stack) > 0, "at least one frame")
     shapes = sorted({frame.shape for frame in stack})
-    checks.that("frames", shapes, len(shapes) <= 1, "frames of one shape")
-    numbers = all(np.issubdtype(f.dtype, np.integer) or _floating(f) for f in stack)
-    checks.that("frames", [str(f.dtype) for f in stack][:3], numbers, "raw DN, whole numbers")
+    checks.check("frames", shapes, len(shapes) <= 1, "frames of one shape")
+    numbers = all(np.issubdtype(f.dtype, np.integer) or _as_float(f) for f in stack)
+    checks.check("frames", [str(f.dtype) for f in stack][:3], numbers, "raw DN, whole numbers")
     for k, frame in enumerate(stack):
-        if not _floating(frame):
+        if not _as_float(frame):
             continue
         values = frame.astype(np.float64, copy=False)
         part = (values == np.rint(values)) & (
             np.abs(values) < _MAX_EXACT_INTEGER
         )  # NaN is not whole
         if not part.all():
-            checks.that(
+            checks.check(
                 f"frames[{k}]",
                 float(values[~part].flat[0]),
                 False,
@@ -344,12 +346,12 @@ def _check(
             )
             break
     one_each = times.shape == (len(stack),)
-    checks.that("exposures_s", times.shape, one_each, f"{len(stack)} times")
+    checks.check("exposures_s", times.shape, one_each, f"{len(stack)} times")
     positive = bool(np.isfinite(times).all() and (times > 0).all())
-    checks.that("exposures_s", times.tolist(), positive, "finite seconds > 0")
-    checks.positive(gain=gain)
-    checks.that("read_noise", read_noise, 0 <= read_noise < np.inf, ">= 0")
-    checks.that("white", white, white > black, f"> black {black}")
+    checks.check("exposures_s", times.tolist(), positive, "finite seconds > 0")
+    checks.check_positive(gain=gain)
+    checks.check("read_noise", read_noise, 0 <= read_noise < np.inf, ">= 0")
+    checks.check("white", white, white > black, f"> black {black}")
     checks.close()
 
 
@@ -391,7 +393,7 @@ def _merge_tiles(  # type: ignore[no-untyped-def]
             if len(addresses) % 2:
                 k = len(addresses) - 1
                 frame = carray(_as_pointer(addresses[k]), size, np.uint16)[start : start + count]
-                _add_weighed(frame, times[k], first, floor, black, white, s, w)
+                _add_weighted(frame, times[k], first, floor, black, white, s, w)
         for i in range(count):
             good = w[i] > 0.0
             valid[start + i] = good
@@ -410,7 +412,7 @@ def _add(frame, t, black, white, s, w):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", fastmath=_FAST_MATH)
-def _add_weighed(frame, t, first, floor, black, white, s, w):  # type: ignore[no-untyped-def]
+def _add_weighted(frame, t, first, floor, black, white, s, w):  # type: ignore[no-untyped-def]
     """Add the tile of one frame, weighed by its time over its variance."""
     for i in range(len(s)):
         v = np.float32(frame[i])

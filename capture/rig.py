@@ -14,7 +14,14 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
 
-from capture.documents import Checks, Document, Fault, near_miss, parse, read_toml
+from capture.documents import (
+    Document,
+    Fault,
+    FaultCollector,
+    parse_document,
+    read_toml,
+    suggest_key,
+)
 from capture.rig_parts import (
     AXIS_RULE,
     ID_RULE,
@@ -99,46 +106,46 @@ class View(Document):
     target."""
 
     def __post_init__(self) -> None:
-        checks = Checks(f"View {self.name!r}", RigError)
-        checks.that("name", self.name, is_id(self.name), ID_RULE)
+        checks = FaultCollector(f"View {self.name!r}", RigError)
+        checks.check("name", self.name, is_id(self.name), ID_RULE)
         for field in ("camera_model", "serial", "spectral_sensitivity"):
             text = getattr(self, field)
-            checks.that(field, text, bool(text) and text.isprintable(), "a printable text")
-        checks.finite(position_mm=self.position_mm, target_mm=self.target_mm, up=self.up)
+            checks.check(field, text, bool(text) and text.isprintable(), "a printable text")
+        checks.check_finite(position_mm=self.position_mm, target_mm=self.target_mm, up=self.up)
         axis = _minus(self.position_mm, self.target_mm)
-        checks.that("target_mm", self.target_mm, _norm(axis) > 0, "not the camera's own position")
-        checks.that("up", self.up, _norm(_cross(self.up, axis)) > 0, "not along the optical axis")
-        checks.positive(
+        checks.check("target_mm", self.target_mm, _norm(axis) > 0, "not the camera's own position")
+        checks.check("up", self.up, _norm(_cross(self.up, axis)) > 0, "not along the optical axis")
+        checks.check_positive(
             focal_mm=self.focal_mm,
             pixel_um=self.pixel_um,
             f_number=self.f_number,
             full_well_e=self.full_well_e,
         )
         if self.focus_mm is not None:
-            checks.positive(focus_mm=self.focus_mm)
+            checks.check_positive(focus_mm=self.focus_mm)
         step = 1 if self.cfa == "MONO" else 2
         for field in ("width_px", "height_px"):
             size = getattr(self, field)
             even = 2 <= size <= MAX_SIDE_PX and size % step == 0
-            checks.that(field, size, even, f"2 to {MAX_SIDE_PX}, even for a color filter array")
+            checks.check(field, size, even, f"2 to {MAX_SIDE_PX}, even for a color filter array")
         for field in ("readout_s", "shutter_lag_s"):
             seconds = getattr(self, field)
-            checks.that(field, seconds, 0 <= seconds < math.inf, "seconds >= 0")
-        checks.that("bit_depth", self.bit_depth, 8 <= self.bit_depth <= 16, "8 to 16")
-        checks.that("cfa", self.cfa, self.cfa in CFA_PATTERNS, f"one of {', '.join(CFA_PATTERNS)}")
-        checks.that("black_level", self.black_level, self.black_level >= 0, ">= 0")
+            checks.check(field, seconds, 0 <= seconds < math.inf, "seconds >= 0")
+        checks.check("bit_depth", self.bit_depth, 8 <= self.bit_depth <= 16, "8 to 16")
+        checks.check("cfa", self.cfa, self.cfa in CFA_PATTERNS, f"one of {', '.join(CFA_PATTERNS)}")
+        checks.check("black_level", self.black_level, self.black_level >= 0, ">= 0")
         top = 2**self.bit_depth - 1 if 8 <= self.bit_depth <= 16 else 65_535
-        checks.that(
+        checks.check(
             "white_level",
             self.white_level,
             self.black_level < self.white_level <= top,
             f"black_level {self.black_level} < white_level <= {top}",
         )
         analyser = self.analyser_axis_deg
-        checks.that(
+        checks.check(
             "analyser_axis_deg", analyser, analyser is None or 0 <= analyser < 180, AXIS_RULE
         )
-        checks.that("read_noise_e", self.read_noise_e, 0 <= self.read_noise_e < math.inf, ">= 0")
+        checks.check("read_noise_e", self.read_noise_e, 0 <= self.read_noise_e < math.inf, ">= 0")
         checks.close()
 
     @property
@@ -252,32 +259,32 @@ class Rig(Document):
     """What touches the skin with fibres; None: nothing does."""
 
     def __post_init__(self) -> None:
-        checks = Checks(f"Rig {self.name!r}", RigError)
-        checks.that("name", self.name, is_id(self.name), ID_RULE)
+        checks = FaultCollector(f"Rig {self.name!r}", RigError)
+        checks.check("name", self.name, is_id(self.name), ID_RULE)
         for field, rows in (("lights", self.lights), ("views", self.views)):
             names = tuple(row.name for row in rows)
-            checks.that(field, names, len(rows) > 0, "at least one")
-            checks.that(
+            checks.check(field, names, len(rows) > 0, "at least one")
+            checks.check(
                 field, names, len({n.casefold() for n in names}) == len(names), "names that differ"
             )
         good = all(is_id(box) for box in self.boxes) and len(set(self.boxes)) == len(self.boxes)
-        checks.that("boxes", self.boxes, good, f"names that differ, of {ID_RULE}")
-        checks.that("recycle_s", self.recycle_s, 0 <= self.recycle_s < math.inf, "seconds >= 0")
-        checks.positive(max_pops_per_min=self.max_pops_per_min)
+        checks.check("boxes", self.boxes, good, f"names that differ, of {ID_RULE}")
+        checks.check("recycle_s", self.recycle_s, 0 <= self.recycle_s < math.inf, "seconds >= 0")
+        checks.check_positive(max_pops_per_min=self.max_pops_per_min)
         move = self.polarizer_move_s
-        checks.that("polarizer_move_s", move, 0 <= move < math.inf, "seconds >= 0")
+        checks.check("polarizer_move_s", move, 0 <= move < math.inf, "seconds >= 0")
         has_leds = any(light.power_w is not None for light in self.lights)
         known = self.leds is not None or not has_leds
-        checks.that("leds", self.leds, known, "the limits of the LEDs among the lights")
+        checks.check("leds", self.leds, known, "the limits of the LEDs among the lights")
         checks.close()
 
     def view(self, name: str) -> View:
         """Return the view called ``name``."""
-        return _named(self.views, name, f"rig {self.name!r} has no view {name!r}")
+        return _find_by_name(self.views, name, f"rig {self.name!r} has no view {name!r}")
 
     def light(self, name: str) -> Light:
         """Return the light called ``name``."""
-        return _named(self.lights, name, f"rig {self.name!r} has no light {name!r}")
+        return _find_by_name(self.lights, name, f"rig {self.name!r} has no light {name!r}")
 
     def resized(self, width_px: int) -> Rig:
         """Return this rig with every view ``width_px`` wide: same field of view, larger pixels.
@@ -336,7 +343,7 @@ def rig_from_json(data: Mapping[str, Any], *, where: str = "rig") -> Rig:
     RigError
         With every fault's path, what was found and what was expected.
     """
-    return parse(Rig, data, where=where, error=RigError)
+    return parse_document(Rig, data, where=where, error=RigError)
 
 
 def load_rig(name_or_path: str | Path) -> Rig:
@@ -366,7 +373,8 @@ def load_rig(name_or_path: str | Path) -> Rig:
         known = sorted(file.stem for file in shipped.glob("*.toml"))
         if text not in known:
             hint = (
-                near_miss(text, known) or f"one of {', '.join(known)}, or the path of a .toml file"
+                suggest_key(text, known)
+                or f"one of {', '.join(known)}, or the path of a .toml file"
             )
             raise RigError("there is no such rig", faults=[Fault("rig", repr(text), hint)])
         path = shipped / f"{text}.toml"
@@ -377,7 +385,7 @@ MAX_LISTED_NAMES = 40
 """Names of lights or views that a message lists; of more it tells the first ones and the last."""
 
 
-def _named(rows: tuple[Any, ...], name: str, what: str) -> Any:
+def _find_by_name(rows: tuple[Any, ...], name: str, label: str) -> Any:
     for row in rows:
         if row.name == name:
             return row
@@ -385,5 +393,5 @@ def _named(rows: tuple[Any, ...], name: str, what: str) -> Any:
     listed = ", ".join(known)
     if len(known) > MAX_LISTED_NAMES:
         listed = f"{', '.join(known[:2])} … {known[-1]}, {len(known)} in all"
-    fault = Fault("name", repr(name), f"one of {listed}", near_miss(name, known))
-    raise RigError(what, faults=[fault])
+    fault = Fault("name", repr(name), f"one of {listed}", suggest_key(name, known))
+    raise RigError(label, faults=[fault])

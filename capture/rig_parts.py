@@ -4,7 +4,7 @@ import dataclasses
 import math
 from dataclasses import dataclass
 
-from capture.documents import Checks, Document, InputError
+from capture.documents import Document, FaultCollector, InputError
 
 Vector = tuple[float, float, float]
 
@@ -55,20 +55,20 @@ class Light(Document):
     """Radius of the emitting disc, mm, > 0."""
 
     def __post_init__(self) -> None:
-        checks = Checks(f"Light {self.name!r}", RigError)
-        checks.that("name", self.name, is_id(self.name), ID_RULE)
-        checks.finite(position_mm=self.position_mm)
-        checks.that(
+        checks = FaultCollector(f"Light {self.name!r}", RigError)
+        checks.check("name", self.name, is_id(self.name), ID_RULE)
+        checks.check_finite(position_mm=self.position_mm)
+        checks.check(
             "position_mm", self.position_mm, math.hypot(*self.position_mm) > 0, "not the origin"
         )
-        checks.that("illuminant", self.illuminant, bool(self.illuminant), "a name")
+        checks.check("illuminant", self.illuminant, bool(self.illuminant), "a name")
         axis, half = self.polarizer_axis_deg, self.half_intensity_deg
-        checks.that("polarizer_axis_deg", axis, axis is None or 0 <= axis < 180, AXIS_RULE)
-        checks.that("half_intensity_deg", half, half is None or 0 < half < 90, "0 < degrees < 90")
+        checks.check("polarizer_axis_deg", axis, axis is None or 0 <= axis < 180, AXIS_RULE)
+        checks.check("half_intensity_deg", half, half is None or 0 < half < 90, "0 < degrees < 90")
         strengths = {"energy_ws": self.energy_ws, "power_w": self.power_w}
         given = {name: value for name, value in strengths.items() if value is not None}
-        checks.that("energy_ws, power_w", tuple(given), len(given) == 1, "one of the two")
-        checks.positive(radius_mm=self.radius_mm, **given)
+        checks.check("energy_ws, power_w", tuple(given), len(given) == 1, "one of the two")
+        checks.check_positive(radius_mm=self.radius_mm, **given)
         checks.close()
 
     @property
@@ -126,16 +126,20 @@ class LedLimits(Document):
     """Longest table the box holds, >= 1."""
 
     def __post_init__(self) -> None:
-        checks = Checks("LED limits", RigError)
+        checks = FaultCollector("LED limits", RigError)
         counts = ("max_at_once", "max_rows", "overlap_s", "settle_s")
         fields = [field.name for field in dataclasses.fields(self)]
-        checks.positive(**{name: getattr(self, name) for name in fields if name not in counts})
-        checks.that("max_duty", self.max_duty, self.max_duty <= 1, "0 < duty <= 1")
-        checks.that("thermal_trip", self.thermal_trip, self.thermal_trip < 1, "0 < trip < 1")
-        checks.that("max_at_once", self.max_at_once, self.max_at_once >= 2, ">= 2")
-        checks.that("max_rows", self.max_rows, self.max_rows >= 1, ">= 1")
+        checks.check_positive(
+            **{name: getattr(self, name) for name in fields if name not in counts}
+        )
+        checks.check("max_duty", self.max_duty, self.max_duty <= 1, "0 < duty <= 1")
+        checks.check("thermal_trip", self.thermal_trip, self.thermal_trip < 1, "0 < trip < 1")
+        checks.check("max_at_once", self.max_at_once, self.max_at_once >= 2, ">= 2")
+        checks.check("max_rows", self.max_rows, self.max_rows >= 1, ">= 1")
         good = 0 <= self.overlap_s <= self.settle_s < math.inf
-        checks.that("settle_s", self.settle_s, good, f"0 <= overlap_s {self.overlap_s} <= settle_s")
+        checks.check(
+            "settle_s", self.settle_s, good, f"0 <= overlap_s {self.overlap_s} <= settle_s"
+        )
         checks.close()
 
 
@@ -162,19 +166,19 @@ class Caliper(Document):
     """How long the skin is left to creep after a move before it is scanned, s, >= 0."""
 
     def __post_init__(self) -> None:
-        checks = Checks("Caliper", RigError)
-        checks.positive(
+        checks = FaultCollector("Caliper", RigError)
+        checks.check_positive(
             aperture_mm=self.aperture_mm, step_mm=self.step_mm, speed_mm_per_s=self.speed_mm_per_s
         )
-        checks.that("settle_s", self.settle_s, 0 <= self.settle_s < math.inf, "seconds >= 0")
+        checks.check("settle_s", self.settle_s, 0 <= self.settle_s < math.inf, "seconds >= 0")
         open_mm = self.aperture_mm + self.first_step * self.step_mm
         narrow = self.first_step <= 0 and open_mm > 0
-        checks.that("first_step", self.first_step, narrow, "<= 0, and the jaws apart")
-        checks.that("last_step", self.last_step, self.last_step >= 0, ">= 0")
+        checks.check("first_step", self.first_step, narrow, "<= 0, and the jaws apart")
+        checks.check("last_step", self.last_step, self.last_step >= 0, ">= 0")
         for angle in self.angles_deg:
-            checks.that("angles_deg", angle, 0 <= angle < 180, AXIS_RULE)
+            checks.check("angles_deg", angle, 0 <= angle < 180, AXIS_RULE)
         differ = len(set(self.angles_deg)) == len(self.angles_deg) > 0
-        checks.that("angles_deg", self.angles_deg, differ, "at least one, none twice")
+        checks.check("angles_deg", self.angles_deg, differ, "at least one, none twice")
         checks.close()
 
     def reading_mm(self, step: int) -> float:
@@ -204,12 +208,12 @@ class Fiber(Document):
     """Nominal centre of its end in the camera's image, pixels, x right, y down."""
 
     def __post_init__(self) -> None:
-        checks = Checks(f"Fibre {self.name!r}", RigError)
-        checks.that("name", self.name, is_id(self.name), ID_RULE)
-        checks.finite(position_mm=self.position_mm, spot_px=self.spot_px)
-        checks.positive(core_mm=self.core_mm, numerical_aperture=self.numerical_aperture)
+        checks = FaultCollector(f"Fibre {self.name!r}", RigError)
+        checks.check("name", self.name, is_id(self.name), ID_RULE)
+        checks.check_finite(position_mm=self.position_mm, spot_px=self.spot_px)
+        checks.check_positive(core_mm=self.core_mm, numerical_aperture=self.numerical_aperture)
         na = self.numerical_aperture
-        checks.that("numerical_aperture", na, na < 1, "0 < NA < 1")
+        checks.check("numerical_aperture", na, na < 1, "0 < NA < 1")
         checks.close()
 
     @property
@@ -252,26 +256,26 @@ class Probe(Document):
     """How far from it a measurement may go on, kelvin, > 0."""
 
     def __post_init__(self) -> None:
-        checks = Checks("Probe", RigError)
+        checks = FaultCollector("Probe", RigError)
         names = tuple(fibre.name for fibre in self.fibres)
         differ = len(set(names)) == len(names) > 0
-        checks.that("fibres", names, differ, "at least one, names that differ")
+        checks.check("fibres", names, differ, "at least one, names that differ")
         radii = tuple(fibre.radius_mm for fibre in self.fibres)
         grow = all(a < b for a, b in zip((0.0, *radii), radii, strict=False))
-        checks.that("fibres", radii, grow, "growing distances > 0 from the source")
+        checks.check("fibres", radii, grow, "growing distances > 0 from the source")
         fields = [field.name for field in dataclasses.fields(self)]
         free = ("fibres", "rest_s", "settle_s", "camera_c")
-        checks.positive(**{name: getattr(self, name) for name in fields if name not in free})
+        checks.check_positive(**{name: getattr(self, name) for name in fields if name not in free})
         na = self.source_numerical_aperture
-        checks.that("source_numerical_aperture", na, na < 1, "0 < NA < 1")
+        checks.check("source_numerical_aperture", na, na < 1, "0 < NA < 1")
         for name in ("rest_s", "settle_s"):
             seconds = getattr(self, name)
-            checks.that(name, seconds, 0 <= seconds < math.inf, "seconds >= 0")
+            checks.check(name, seconds, 0 <= seconds < math.inf, "seconds >= 0")
         most = self.max_suction_mbar
         fits = self.suction_mbar + self.suction_tolerance_mbar <= most
-        checks.that("suction_mbar", self.suction_mbar, fits, f"with its tolerance <= {most}")
+        checks.check("suction_mbar", self.suction_mbar, fits, f"with its tolerance <= {most}")
         kept = -80.0 <= self.camera_c <= 60.0
-        checks.that("camera_c", self.camera_c, kept, "-80 to 60 degrees Celsius")
+        checks.check("camera_c", self.camera_c, kept, "-80 to 60 degrees Celsius")
         checks.close()
 
     @property

@@ -30,9 +30,9 @@ class Checks:
 
     error: type[ValueError] = ValueError
 
-    def require(self, holds: Any, name: str, got: Any, expected: str) -> None:
+    def require(self, condition: Any, name: str, got: Any, expected: str) -> None:
         """Refuse what does not hold."""
-        if not holds:
+        if not condition:
             raise self.error(f"{name}: got {got}, expected {expected}")
 
     def within(self, name: str, given: Any, interval: str = FINITE) -> None:
@@ -60,9 +60,9 @@ class Checks:
         got = f"{wrong[0]} and {wrong.size - 1} others of {values.size} numbers"
         raise self.error(f"{name}: got {got}, expected {what}")
 
-    def choice(self, name: str, given: Any, known: Iterable[Any]) -> None:
+    def choice(self, name: str, given: Any, allowed: Iterable[Any]) -> None:
         """Refuse what is none of some names or numbers."""
-        if given not in (names := tuple(known)):
+        if given not in (names := tuple(allowed)):
             raise self.error(f"{name}: got {given!r}, expected one of {', '.join(map(str, names))}")
 
     def shape(self, name: str, array: Any, *expected: Axes) -> None:
@@ -94,7 +94,9 @@ class Checks:
         self.within(name, array, interval)
         return array
 
-    def together(self, interval: str = "[-inf, inf]", /, **given: Any) -> list[NDArray[np.float64]]:
+    def broadcast_together(
+        self, interval: str = "[-inf, inf]", /, **given: Any
+    ) -> list[NDArray[np.float64]]:
         """Return arrays in float64 at their common shape; refuse shapes that do not broadcast.
 
         Parameters
@@ -116,7 +118,7 @@ class Checks:
                 f"{', '.join(given)}: got shapes {got}, expected ones that broadcast"
             ) from None
 
-    def spread(self, name: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    def broadcast(self, name: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
         """Return an array broadcast to a shape, or refuse it."""
         try:
             return np.broadcast_to(array, shape)

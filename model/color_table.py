@@ -17,12 +17,12 @@ from model.tissue_optics.layers import BETA_M, C_HD_MAX, C_HE_PER_C_HD, C_M_MAX,
 
 SPECTRAL_NODES = 41
 """Nodes along each axis of the stored spectral table, see tools/make_reflectance_table.py."""
-LIVE_NODES = 29
+COMPUTED_SPECTRAL_NODES = 29
 """Nodes along each axis when the spectral table must be computed first."""
 STORED_ANISOTROPIES = (0.0, 0.8)
 """Mean cosines g of scattering for which the spectral table is stored."""
 _MIN_SIZE = 8
-_POINTS_AT_ONCE = 32_768
+_CHUNK_POINTS = 32_768
 
 
 class ColorTableError(ValueError):
@@ -130,15 +130,15 @@ class ColorTable:
         self, c_m: ArrayLike, c_hd: ArrayLike
     ) -> tuple[Float64Array, Float64Array, Float64Array]:
         """Return the color and its derivatives by the two node indices."""
-        i, j = Checks(ColorTableError).together(
+        i, j = Checks(ColorTableError).broadcast_together(
             c_m=_node_index("c_m", c_m, self.c_m_max, self.size),
             c_hd=_node_index("c_hd", c_hd, self.c_hd_max, self.size),
         )
         shape = i.shape
         i, j = i.ravel(), j.ravel()
         out = np.empty((3, i.size, 3))
-        for start in range(0, i.size, _POINTS_AT_ONCE):
-            part = slice(start, start + _POINTS_AT_ONCE)
+        for start in range(0, i.size, _CHUNK_POINTS):
+            part = slice(start, start + _CHUNK_POINTS)
             row = np.minimum(i[part].astype(np.intp), self.size - 2)
             column = np.minimum(j[part].astype(np.intp), self.size - 2)
             cell = self.cells[row, column]
@@ -243,7 +243,7 @@ def spectral_reflectance(
     >>> spectral_reflectance(0.02, 0.02)[[5, 15, 25]].round(2).tolist()
     [0.17, 0.2, 0.34]
     """
-    melanin, blood = Checks(ColorTableError).together(c_m=c_m, c_hd=c_hd)
+    melanin, blood = Checks(ColorTableError).broadcast_together(c_m=c_m, c_hd=c_hd)
     for name, values, most in (("c_m", melanin, C_M_MAX), ("c_hd", blood, C_HD_MAX)):
         Checks(ColorTableError).within(name, values, f"[0, {most}]")
     log_reflectance = _log_spectra(anisotropy, BETA_M, OXYGEN_SATURATION, ETA_SKIN)
@@ -270,7 +270,7 @@ def _log_spectra(anisotropy: float, beta_m: float, oxygenation: float, eta: floa
         source = resources.files("model").joinpath("data", "two_layer_reflectance.npz")
         with source.open("rb") as stream, np.load(stream) as stored:
             return np.asarray(stored[f"log_reflectance_g{anisotropy:g}"], dtype=np.float64)
-    u, v = spectral_axes(LIVE_NODES)
+    u, v = spectral_axes(COMPUTED_SPECTRAL_NODES)
     reflectance = two_layer_reflectance(
         spectra.WAVELENGTH_NM,
         u[:, None] ** 3,

@@ -23,7 +23,7 @@ TABLE_SHAPE = (90, 90, 180)
 """Bins over theta_h, theta_d and phi_d."""
 BRDF_SCALE = np.array([1.0, 1.15, 1.66]) / 1500.0
 """BRDF in 1/sr of a stored 1, red, green, blue."""
-NOT_MEASURED = -1.0
+UNMEASURED_VALUE = -1.0
 """Stored where there is no value; readers take anything negative."""
 FILE_BYTES = 12 + 3 * 8 * 90 * 90 * 180
 
@@ -52,7 +52,7 @@ class MerlTable:
         Checks().shape("MerlTable.stored", self.stored, (3, *TABLE_SHAPE))
 
     @classmethod
-    def of_values(cls, values: ArrayLike) -> MerlTable:
+    def from_values(cls, values: ArrayLike) -> MerlTable:
         """Make a table of BRDF values in 1/sr, (90, 90, 180, 3) or broadcast.
 
         What is negative, in any channel, was not measured: -1 is stored for all three.
@@ -62,7 +62,7 @@ class MerlTable:
         stored = np.empty((3, *TABLE_SHAPE))
         for channel, scale in enumerate(BRDF_SCALE):
             np.divide(brdf[..., channel], scale, out=stored[channel])
-            stored[channel][none] = NOT_MEASURED
+            stored[channel][none] = UNMEASURED_VALUE
         return cls(stored)
 
     def lookup(self, theta_h: ArrayLike, theta_d: ArrayLike, phi_d: ArrayLike) -> Float64Array:
@@ -86,7 +86,9 @@ class MerlTable:
         ValueError
             For angles out of range or not finite, and shapes that do not broadcast.
         """
-        h, d, phi = bins(*Checks().together(theta_h=theta_h, theta_d=theta_d, phi_d=phi_d))
+        h, d, phi = bin_indices(
+            *Checks().broadcast_together(theta_h=theta_h, theta_d=theta_d, phi_d=phi_d)
+        )
         return np.asarray(np.moveaxis(self.stored[:, h, d, phi], 0, -1) * BRDF_SCALE)
 
     @property
@@ -95,14 +97,14 @@ class MerlTable:
         return np.asarray(np.all(self.stored >= 0.0, axis=0))
 
 
-def bins(
+def bin_indices(
     theta_h: ArrayLike, theta_d: ArrayLike, phi_d: ArrayLike
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
     """Return the bin of each angle; theta_h's bins are spaced by its square root.
 
     Examples
     --------
-    >>> [int(i) for i in bins(0.0, 0.0, -3.141592)]
+    >>> [int(i) for i in bin_indices(0.0, 0.0, -3.141592)]
     [0, 0, 0]
     """
     h = np.asarray(theta_h, dtype=np.float64)

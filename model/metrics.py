@@ -65,7 +65,7 @@ class Coverage:
 
     Attributes
     ----------
-    share
+    fraction
         In [0, 1]; NaN when nothing was counted.
     interval
         Exact (Clopper-Pearson) 95 % interval of the share, for independent trials.
@@ -73,7 +73,7 @@ class Coverage:
         Trials.
     """
 
-    share: float
+    fraction: float
     interval: tuple[float, float]
     count: int
 

@@ -142,7 +142,7 @@ def assemble(
     needed = ("position", "r_d", f"{WEIGHT_PREFIX}0")
     for name in needed:
         _map(dome, name)
-    lobes = lobes_of(dome)
+    lobes = load_basis(dome)
     names = [f"{WEIGHT_PREFIX}{k}" for k in range(lobes.size)]
     found = next((name for name in NORMAL_MAPS if name in dome.maps), None)
     if found is None:
@@ -173,7 +173,7 @@ def assemble(
     if translucency is None:
         translucency, what = population_mean_mm()
         assumed = (what,)
-    depth, depth_stderr, known = _over_texture(translucency, shape)
+    depth, depth_stderr, known = _resample_translucency(translucency, shape)
     valid &= known
     return SkinReflectance(
         r_d=r_d.values,
@@ -200,7 +200,7 @@ def population_mean_mm() -> tuple[Float64Array, str]:
     )
 
 
-def lobes_of(appearance: SkinAppearance) -> BrdfBasis:
+def load_basis(appearance: SkinAppearance) -> BrdfBasis:
     """Return the lobes that the maps `basis_weight_0` and on are shares of.
 
     Raises
@@ -228,7 +228,7 @@ def lobes_of(appearance: SkinAppearance) -> BrdfBasis:
     names = [f"{WEIGHT_PREFIX}{k}" for k in range(table.shape[-1])]
     for name in names:
         _map(appearance, name)
-    return brdf_tables.of_columns(table, names, light_radius_rad=radius)
+    return brdf_tables.basis_from_columns(table, names, light_radius_rad=radius)
 
 
 def lobe_brdf(
@@ -248,12 +248,12 @@ def lobe_brdf(
     return found
 
 
-def transmitted(cosine: ArrayLike, eta: float = fresnel.ETA_SKIN) -> Float64Array:
+def transmittance(cosine: ArrayLike, eta: float = fresnel.ETA_SKIN) -> Float64Array:
     """Return F_t, the share of light that passes the surface at a cosine; 0 below the horizon.
 
     Examples
     --------
-    >>> transmitted([1.0, -0.2]).round(4).tolist()
+    >>> transmittance([1.0, -0.2]).round(4).tolist()
     [0.9722, 0.0]
     """
     mu = np.asarray(cosine, np.float64)
@@ -293,22 +293,22 @@ def _normals(appearance: SkinAppearance) -> SkinMap:
     )
 
 
-def _over_texture(
+def _resample_translucency(
     given: ArrayLike | SkinMap, shape: tuple[int, ...]
 ) -> tuple[Float32Array, Float32Array | None, BoolArray]:
     """Return a translucency on a texture of a shape, its standard error, and where it is known."""
     if isinstance(given, SkinMap):
         Checks(SkinReflectanceError).shape("translucency", given.values, ("H", "W", 3))
-        known = _resampled(given.mask.astype(np.float32)[..., None], shape)[..., 0] > 0.999
-        stderr = None if given.stderr is None else _resampled(given.stderr, shape)
-        return _resampled(given.values, shape), stderr, known
+        known = _resample_image(given.mask.astype(np.float32)[..., None], shape)[..., 0] > 0.999
+        stderr = None if given.stderr is None else _resample_image(given.stderr, shape)
+        return _resample_image(given.values, shape), stderr, known
     values = np.asarray(given, np.float32)
-    even = Checks(SkinReflectanceError).spread("translucency", values, (*shape, 3))
+    even = Checks(SkinReflectanceError).broadcast("translucency", values, (*shape, 3))
     Checks(SkinReflectanceError).within("translucency", values, "(0, inf)")
     return even.copy(), None, np.ones(shape, bool)
 
 
-def _resampled(image: Float32Array, shape: tuple[int, ...]) -> Float32Array:
+def _resample_image(image: Float32Array, shape: tuple[int, ...]) -> Float32Array:
     """Return (h, w, C) at the texels of another size, linear, held beyond its outermost texels."""
     for axis, size in enumerate(shape):
         old = image.shape[axis]

@@ -142,7 +142,7 @@ def require_free(path: str | Path) -> None:
         )
 
 
-def read(path: str | Path, *, only: tuple[str, ...] | None = None) -> SkinAppearance:
+def read(path: str | Path, *, map_names: tuple[str, ...] | None = None) -> SkinAppearance:
     """Read an APPEARANCE/ or TRUTH/ folder and check every file that is read.
 
     Parameters
@@ -160,7 +160,7 @@ def read(path: str | Path, *, only: tuple[str, ...] | None = None) -> SkinAppear
     """
     folder = Path(path)
     document = read_document(folder)
-    names = tuple(document.maps) if only is None else only
+    names = tuple(document.maps) if map_names is None else map_names
     missing = [name for name in names if name not in document.maps]
     if missing:
         raise StoreError(

@@ -13,7 +13,7 @@ from model.arrays import Float64Array, FloatArray, Int64Array
 from model.checks import Checks
 
 
-def taps(texels: int, pixels: int) -> tuple[Int64Array, Float64Array]:
+def bilinear_taps(texels: int, pixels: int) -> tuple[Int64Array, Float64Array]:
     """Return each pixel's first texel and the part that the next one has, bilinearly.
 
     Parameters
@@ -23,7 +23,7 @@ def taps(texels: int, pixels: int) -> tuple[Int64Array, Float64Array]:
 
     Examples
     --------
-    >>> first, part = taps(2, 4)
+    >>> first, part = bilinear_taps(2, 4)
     >>> first.tolist(), part.tolist()
     ([0, 0, 0, 1], [0.0, 0.25, 0.75, 0.0])
     """
@@ -35,7 +35,7 @@ def taps(texels: int, pixels: int) -> tuple[Int64Array, Float64Array]:
 
 def reading_matrix(texels: int, pixels: int) -> Any:
     """Return the sparse matrix that reads `texels` bilinearly at `pixels`; rows sum to 1."""
-    first, part = taps(texels, pixels)
+    first, part = bilinear_taps(texels, pixels)
     rows = np.arange(pixels)
     after = np.minimum(first + 1, texels - 1)
     values = np.concatenate([1.0 - part, part])
@@ -58,7 +58,7 @@ def averaging_matrix(pixels: int, texels: int) -> Any:
     return sparse.csr_array((np.concatenate(values), places), shape=(texels, pixels))
 
 
-def resampled(texture: FloatArray, shape: tuple[int, int]) -> FloatArray:
+def resample(texture: FloatArray, shape: tuple[int, int]) -> FloatArray:
     """Return a texture at another resolution: averaged where finer, read bilinearly where coarser.
 
     Parameters
@@ -80,7 +80,7 @@ def resampled(texture: FloatArray, shape: tuple[int, int]) -> FloatArray:
 
     Examples
     --------
-    >>> resampled(np.arange(4.0)[None], (1, 2)).tolist()
+    >>> resample(np.arange(4.0)[None], (1, 2)).tolist()
     [[0.5, 2.5]]
     """
     given = np.asarray(texture)

@@ -47,7 +47,7 @@ CHANNEL_CORRELATION = ((1.0, 0.8, 0.5), (0.8, 1.0, 0.7), (0.5, 0.7, 1.0))
 greatest sigma_tr (figure 17) all three rise, blue by little."""
 
 
-class PopulationError(ValueError):
+class TranslucencyPopulationError(ValueError):
     """Moments, correlations or measurements that make no population."""
 
 
@@ -82,18 +82,20 @@ class TranslucencyPopulation:
         shape = (len(self.sites), len(self.channels))
         for name in ("mean_per_mm", "deviation_per_mm"):
             values = np.array(getattr(self, name), np.float64)
-            Checks(PopulationError).numbers(name, values, shape, interval="(0, inf)")
+            Checks(TranslucencyPopulationError).numbers(name, values, shape, interval="(0, inf)")
             values.setflags(write=False)
             object.__setattr__(self, name, values)
-        Checks(PopulationError).within("site_correlation", self.site_correlation, "[0, 1)")
+        Checks(TranslucencyPopulationError).within(
+            "site_correlation", self.site_correlation, "[0, 1)"
+        )
         matrix = np.array(self.channel_correlation, np.float64)
         if matrix.shape != (shape[1], shape[1]) or not np.array_equal(matrix, matrix.T):
-            raise PopulationError(
+            raise TranslucencyPopulationError(
                 f"channel_correlation: got {matrix.tolist()}, expected a symmetric matrix over "
                 f"{shape[1]} channels"
             )
         if not (np.diagonal(matrix) == 1).all() or np.linalg.eigvalsh(matrix)[0] <= 0:
-            raise PopulationError(
+            raise TranslucencyPopulationError(
                 f"channel_correlation: got {matrix.tolist()}, expected ones on the diagonal and "
                 "positive eigenvalues"
             )
@@ -138,7 +140,7 @@ class TranslucencyPopulation:
         >>> people.shape, bool((people > 0).all()), round(float(people[:, 1, 0].mean()), 2)
         ((1000, 3, 3), True, 0.54)
         """
-        Checks(PopulationError).within("n", n, "[1, inf)")
+        Checks(TranslucencyPopulationError).within("n", n, "[1, inf)")
         normal = rng.standard_normal((n, self.log_mean.size))
         logs = self.log_mean.reshape(-1) + normal @ np.linalg.cholesky(self.log_covariance()).T
         return np.asarray(np.exp(logs).reshape(n, *self.log_mean.shape))
@@ -160,7 +162,7 @@ def weyrich_2005(*, reading: Reading = "deviation") -> TranslucencyPopulation:
     >>> weyrich_2005(reading="variance").deviation_per_mm[:, 0].round(3).tolist()
     [0.416, 0.275, 0.485]
     """
-    Checks(PopulationError).choice("reading", reading, ("deviation", "variance"))
+    Checks(TranslucencyPopulationError).choice("reading", reading, ("deviation", "variance"))
     text = resources.files("model").joinpath("data/weyrich2005_table2.csv").read_text("utf-8")
     rows = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
     mean, printed = np.zeros((2, len(SITE_NAMES), len(CHANNEL_NAMES)))
@@ -202,9 +204,11 @@ class SiteMeasurement:
         object.__setattr__(self, "valid", tuple(bool(v) for v in self.valid))
         count = len(self.sigma_tr_per_mm)
         if not count:
-            raise PopulationError("sigma_tr_per_mm: got nothing, expected one value a channel")
+            raise TranslucencyPopulationError(
+                "sigma_tr_per_mm: got nothing, expected one value a channel"
+            )
         if len(self.stderr_per_mm) != count or (self.valid and len(self.valid) != count):
-            raise PopulationError(
+            raise TranslucencyPopulationError(
                 f"stderr_per_mm, valid: got {len(self.stderr_per_mm)}, {len(self.valid)} values, "
                 f"expected {count} as of sigma_tr_per_mm"
             )
@@ -323,7 +327,7 @@ def table(
         For shapes that do not fit, or a counted value that is not finite and above 0.
     """
     values = np.asarray(sigma_tr_per_mm, np.float64)
-    check = Checks(PopulationError)
+    check = Checks(TranslucencyPopulationError)
     check.shape("sigma_tr_per_mm", values, ("n", len(sites), len(channels)))
     good = np.ones(values.shape, bool) if valid is None else np.array(valid, bool)
     noise = np.zeros(values.shape)
@@ -396,7 +400,7 @@ def summarize(
     by_person: dict[str, dict[str, list[SiteMeasurement]]] = {}
     for one in measurements:
         if len(one.sigma_tr_per_mm) != len(channels):
-            raise PopulationError(
+            raise TranslucencyPopulationError(
                 f"sigma_tr_per_mm: got {len(one.sigma_tr_per_mm)} channels of {one.subject!r}, "
                 f"expected {len(channels)}"
             )
@@ -406,7 +410,9 @@ def summarize(
     if sites is None:
         sites = [s for s in SITE_NAMES if s in found] + sorted(found - set(SITE_NAMES))
     if not found & set(sites):
-        raise PopulationError(f"measurements: got none at {', '.join(sites) or 'any place'}")
+        raise TranslucencyPopulationError(
+            f"measurements: got none at {', '.join(sites) or 'any place'}"
+        )
     shape = (len(by_person), len(sites), len(channels))
     values, errors, good = np.zeros(shape), np.zeros(shape), np.zeros(shape, bool)
     for k, places in enumerate(by_person.values()):
@@ -423,7 +429,7 @@ def _averaged(repeats: list[SiteMeasurement]) -> tuple[Float64Array, Float64Arra
     told = np.array([one.valid or (True,) * values.shape[1] for one in repeats])
     told &= np.isfinite(values) & (values > 0)
     whose = f"stderr_per_mm of {repeats[0].subject!r}"
-    Checks(PopulationError).within(whose, errors[told], "(0, inf)")
+    Checks(TranslucencyPopulationError).within(whose, errors[told], "(0, inf)")
     some = np.asarray(told.any(axis=0), np.bool_)
     # relative to the least error: squares of errors in a small unit vanish
     least = np.where(some, np.where(told, errors, np.inf).min(axis=0), 1.0)

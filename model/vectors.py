@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from model.arrays import Float64Array, FloatArray
 
 
-def nearest_shares(rows: Float64Array) -> Float64Array:
+def project_to_simplex(rows: Float64Array) -> Float64Array:
     """Return the nearest shares of at least 0 that sum to 1, row by row (n, d)."""
     falling = -np.sort(-rows, axis=1)
     excess = (np.cumsum(falling, axis=1) - 1.0) / np.arange(1, rows.shape[1] + 1)

@@ -7,11 +7,11 @@ from typing import Any, Final
 
 from numba import types
 
-CONTRACT: Final = {"contract"}
+FASTMATH_CONTRACT: Final = {"contract"}
 """Fast-math flags."""
-OVER_PIXELS: Final[dict[str, Any]] = {
+PIXEL_KERNEL_OPTIONS: Final[dict[str, Any]] = {
     "parallel": True,
-    "fastmath": CONTRACT,
+    "fastmath": FASTMATH_CONTRACT,
     "cache": True,
     "nogil": True,
     "boundscheck": False,
@@ -20,6 +20,6 @@ OVER_PIXELS: Final[dict[str, Any]] = {
 """Options of a kernel that is called for all pixels."""
 
 
-def given(dtype: types.Type, axes: int) -> types.Array:
+def readonly_array_type(dtype: types.Type, axes: int) -> types.Array:
     """Return the type of a contiguous argument that is only read, and may be read-only."""
     return types.Array(dtype, axes, "C", readonly=True)

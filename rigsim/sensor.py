@@ -97,7 +97,7 @@ class Sensor:
         return 1.0 / range_e, floor_e2 / range_e**2
 
 
-def sensor_of(
+def make_sensor(
     view: View,
     *,
     dark_e_per_s: float = 0.2,
@@ -135,7 +135,7 @@ def sensor_of(
     )
 
 
-def expose(
+def expose_sensor(
     irradiance_rgb: ArrayLike, *, sensor: Sensor, rng: np.random.Generator, exposure_s: float = 0.0
 ) -> UInt16Array:
     """Expose the sensor once.
@@ -167,7 +167,7 @@ def expose(
         raise SensorError("irradiance_rgb: got negative or non-finite values, expected >= 0")
     if not 0.0 <= exposure_s < math.inf:
         raise SensorError(f"exposure_s: got {exposure_s}, expected >= 0")
-    filtered = mosaic(light, sensor.cfa)
+    filtered = apply_cfa(light, sensor.cfa)
     pattern = fixed_pattern(sensor, filtered.shape)
     full_e = sensor.gain_e_per_dn * (sensor.white - sensor.black)
     mean_e = filtered * pattern.response * np.float32(full_e)
@@ -182,7 +182,7 @@ def expose(
     return np.clip(dn, 0, sensor.white).astype(np.uint16)
 
 
-def mosaic(light: ArrayLike, cfa: str) -> Float32Array:
+def apply_cfa(light: ArrayLike, cfa: str) -> Float32Array:
     """Return what lies behind each pixel's filter.
 
     Parameters
@@ -199,7 +199,7 @@ def mosaic(light: ArrayLike, cfa: str) -> Float32Array:
 
     Examples
     --------
-    >>> mosaic(np.broadcast_to([1.0, 2.0, 3.0], (2, 2, 3)), "RGGB").tolist()
+    >>> apply_cfa(np.broadcast_to([1.0, 2.0, 3.0], (2, 2, 3)), "RGGB").tolist()
     [[1.0, 2.0], [2.0, 3.0]]
     """
     image = np.asarray(light, np.float32)

@@ -89,7 +89,9 @@ def specular_stokes(
         raise ShadingError(f"metal: got {metal}, expected a reflectance from 0 to 1")
     absorbs, right = _vector(light_absorbs), _vector(image_right)
     root = math.sqrt(metal)
-    return kernels.specular(n, light, v, rough, float(eta), absorbs, right, 1.0 / extinction, root)
+    return kernels.specular_stokes(
+        n, light, v, rough, float(eta), absorbs, right, 1.0 / extinction, root
+    )
 
 
 def entry_transmittance(
@@ -116,7 +118,9 @@ def entry_transmittance(
     """
     n, light, _ = _directions(normal, to_light, to_light)
     _check(eta, extinction)
-    return kernels.entry(n, light, float(eta), _vector(light_absorbs), 1.0 / extinction)
+    return kernels.entry_transmittance(
+        n, light, float(eta), _vector(light_absorbs), 1.0 / extinction
+    )
 
 
 def exit_stokes(
@@ -138,10 +142,10 @@ def exit_stokes(
     """
     n, v, _ = _directions(normal, to_camera, to_camera)
     _check(eta, math.inf)
-    return kernels.leave(n, v, float(eta), _vector(image_right))
+    return kernels.exit_stokes(n, v, float(eta), _vector(image_right))
 
 
-def analyse(
+def apply_analyzer(
     stokes: ArrayLike,
     to_camera: ArrayLike,
     *,
@@ -172,7 +176,7 @@ def analyse(
     """
     _check(2.0, extinction)
     s = np.asarray(stokes, np.float32)
-    cos2, sin2 = analyser_frame(
+    cos2, sin2 = analyzer_frame(
         to_camera, passes_deg=passes_deg, image_right=image_right, image_up=image_up
     )
     leak = 1.0 / extinction
@@ -180,7 +184,7 @@ def analyse(
     return np.asarray(0.5 * through, np.float32)
 
 
-def analyser_frame(
+def analyzer_frame(
     to_camera: ArrayLike, *, passes_deg: float, image_right: ArrayLike, image_up: ArrayLike
 ) -> tuple[Float32Array, Float32Array]:
     """Return cosine and sine of twice the analyser's angle in each camera ray's frame.
@@ -188,7 +192,7 @@ def analyser_frame(
     Parameters
     ----------
     to_camera, passes_deg, image_right, image_up
-        As for `analyse`.
+        As for `apply_analyzer`.
 
     Returns
     -------
@@ -199,7 +203,7 @@ def analyser_frame(
     right, up = _vector(image_right), _vector(image_up)
     angle = math.radians(passes_deg)
     absorbs = -math.sin(angle) * right + math.cos(angle) * up
-    cos2, sin2 = kernels.analyser(np.ascontiguousarray(v.reshape(-1, 3)), right, absorbs)
+    cos2, sin2 = kernels.analyzer_frame(np.ascontiguousarray(v.reshape(-1, 3)), right, absorbs)
     return cos2.reshape(v.shape[:-1]), sin2.reshape(v.shape[:-1])
 
 

@@ -22,7 +22,9 @@ def _smith(cosine, alpha):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def specular_one(n0, n1, n2, l0, l1, l2, v0, v1, v2, alpha, eta, absorbs, right, leak, metal):  # type: ignore[no-untyped-def]
+def specular_stokes_element(  # type: ignore[no-untyped-def]
+    n0, n1, n2, l0, l1, l2, v0, v1, v2, alpha, eta, absorbs, right, leak, metal
+):
     """Return the Stokes vector of `specular_stokes` for one element, for compiled callers.
 
     All numbers are float64; ``leak`` is 1 over the extinction, ``metal`` the root of its argument.
@@ -86,7 +88,7 @@ def specular_one(n0, n1, n2, l0, l1, l2, v0, v1, v2, alpha, eta, absorbs, right,
 
 
 @njit(cache=True, inline="always")
-def entry_one(n0, n1, n2, l0, l1, l2, eta, absorbs, leak):  # type: ignore[no-untyped-def]
+def entry_transmittance_element(n0, n1, n2, l0, l1, l2, eta, absorbs, leak):  # type: ignore[no-untyped-def]
     """Return `entry_transmittance` for one element, for compiled callers; float64."""
     entered = 0.0
     nl = min(1.0, n0 * l0 + n1 * l1 + n2 * l2)
@@ -106,32 +108,32 @@ def entry_one(n0, n1, n2, l0, l1, l2, eta, absorbs, leak):  # type: ignore[no-un
 
 
 @njit(parallel=True, cache=True)
-def specular(normal, light, camera, alpha, eta, absorbs, right, leak, metal):  # type: ignore[no-untyped-def]
+def specular_stokes(normal, light, camera, alpha, eta, absorbs, right, leak, metal):  # type: ignore[no-untyped-def]
     """Return `rigsim.shading.specular_stokes` of elements, shape (N, 3)."""
     out = np.zeros((normal.shape[0], 3), np.float32)
     for i in prange(normal.shape[0]):
         n0, n1, n2 = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
         l0, l1, l2 = float(light[i, 0]), float(light[i, 1]), float(light[i, 2])
         v0, v1, v2 = float(camera[i, 0]), float(camera[i, 1]), float(camera[i, 2])
-        out[i, 0], out[i, 1], out[i, 2] = specular_one(
+        out[i, 0], out[i, 1], out[i, 2] = specular_stokes_element(
             n0, n1, n2, l0, l1, l2, v0, v1, v2, float(alpha[i]), eta, absorbs, right, leak, metal
         )
     return out
 
 
 @njit(parallel=True, cache=True)
-def entry(normal, light, eta, absorbs, leak):  # type: ignore[no-untyped-def]
+def entry_transmittance(normal, light, eta, absorbs, leak):  # type: ignore[no-untyped-def]
     """Return `rigsim.shading.entry_transmittance` of elements, shape (N,)."""
     out = np.zeros(normal.shape[0], np.float32)
     for i in prange(normal.shape[0]):
         n0, n1, n2 = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
         l0, l1, l2 = float(light[i, 0]), float(light[i, 1]), float(light[i, 2])
-        out[i] = entry_one(n0, n1, n2, l0, l1, l2, eta, absorbs, leak)
+        out[i] = entry_transmittance_element(n0, n1, n2, l0, l1, l2, eta, absorbs, leak)
     return out
 
 
 @njit(parallel=True, cache=True)
-def leave(normal, camera, eta, right):  # type: ignore[no-untyped-def]
+def exit_stokes(normal, camera, eta, right):  # type: ignore[no-untyped-def]
     """Return `rigsim.shading.exit_stokes` of elements, shape (N, 3)."""
     out = np.zeros((normal.shape[0], 3), np.float32)
     for i in prange(normal.shape[0]):
@@ -159,8 +161,8 @@ def leave(normal, camera, eta, right):  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True, cache=True)
-def analyser(camera, right, absorbs):  # type: ignore[no-untyped-def]
-    """Return `rigsim.shading.analyser_frame` of rays, shape (N,) twice."""
+def analyzer_frame(camera, right, absorbs):  # type: ignore[no-untyped-def]
+    """Return `rigsim.shading.analyzer_frame` of rays, shape (N,) twice."""
     cos2 = np.empty(camera.shape[0], np.float32)
     sin2 = np.empty(camera.shape[0], np.float32)
     for i in prange(camera.shape[0]):

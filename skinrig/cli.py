@@ -73,7 +73,7 @@ def _root(
 def demo(
     out: Out = Path("demo"),
     rigs: Annotated[
-        str, typer.Option(autocompletion=completion.several_rigs)
+        str, typer.Option(autocompletion=completion.complete_rig_list)
     ] = "flash,dome,gradient,probe",
     seed: Seed = 0,
     json: Json = False,
@@ -130,34 +130,40 @@ def main(argv: list[str] | None = None) -> int:
         code = getattr(stop, "exit_code", None)
         return int(code if code is not None else getattr(stop, "code", 0) or 0)
     except (typer.Abort, KeyboardInterrupt):
-        return _failed(KeyboardInterrupt(), errors.EXIT_INTERRUPTED, given)
+        return _report_failure(KeyboardInterrupt(), errors.EXIT_INTERRUPTED, given)
     except Exception as error:
         if hasattr(error, "exit_code") and hasattr(error, "show"):  # a usage error of Typer's
             error.show()
-            return _failed(error, errors.EXIT_USAGE, given, say=False)
-        return _failed(error, errors.exit_code(error), given)
+            return _report_failure(error, errors.EXIT_USAGE, given, print_message=False)
+        return _report_failure(error, errors.exit_code(error), given)
     if result == errors.EXIT_INTERRUPTED:  # Typer turns Ctrl-C into this code, without a word
-        return _failed(KeyboardInterrupt(), errors.EXIT_INTERRUPTED, given)
+        return _report_failure(KeyboardInterrupt(), errors.EXIT_INTERRUPTED, given)
     return int(result or 0)
 
 
-def _failed(error: BaseException, code: int, given: Sequence[str], *, say: bool = True) -> int:
+def _report_failure(
+    error: BaseException, code: int, arguments: Sequence[str], *, print_message: bool = True
+) -> int:
     """Tell people, and programs that asked for JSON, why a command ended; return its code."""
     format_message = getattr(error, "format_message", None)
     if isinstance(error, KeyboardInterrupt):
-        told = errors.interruption(given)
+        told = errors.interruption(arguments)
     else:
-        told = errors.sentence(error) if say or format_message is None else str(format_message())
-    if say:
+        told = (
+            errors.sentence(error)
+            if print_message or format_message is None
+            else str(format_message())
+        )
+    if print_message:
         print(f"skinrig: {told}", file=sys.stderr)
     # none of a command's own came before: it is the last that a command prints
-    Console("--json" in given).document("skinrig.error/1", {"error": told, "exit_code": code})
+    Console("--json" in arguments).document("skinrig.error/1", {"error": told, "exit_code": code})
     return code
 
 
 def run() -> None:
     """Entry point of the console script."""
-    kernel_cache.provide(os.environ)
+    kernel_cache.provide_kernel_cache(os.environ)
     sys.exit(main())
 
 

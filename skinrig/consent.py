@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, date, datetime
 from typing import Any, Protocol
 
-from capture.session import ConsentError, Subject
+from capture.session import ConsentError, SubjectRecord
 from capture.session.manifest import ANY_USE
 from skinrig.errors import UsageError
 
@@ -12,7 +12,7 @@ CONSENT_KEY = "consent"
 """Of an appearance's parameters: what the subject of each measured session agreed to."""
 
 
-class Traced(Protocol):
+class HasProvenance(Protocol):
     """What says where it is from: an appearance, its document, a library of traits."""
 
     @property
@@ -24,9 +24,9 @@ class Traced(Protocol):
         """Return how it was made."""
 
 
-def subject_of(
+def parse_subject(
     pseudonym: str, scopes: Sequence[str] | None, expires: datetime | date | None
-) -> Subject:
+) -> SubjectRecord:
     """Return the subject that the options name.
 
     Parameters
@@ -45,15 +45,15 @@ def subject_of(
 
     Examples
     --------
-    >>> subject_of("P042", ["research,teaching", "publication"], date(2031, 1, 1)).consent_scope
+    >>> parse_subject("P042", ["research,teaching", "publication"], date(2031, 1, 1)).consent_scope
     ('research', 'teaching', 'publication')
     """
     words = [word.strip() for text in scopes or () for word in text.split(",")]
     day = expires.date() if isinstance(expires, datetime) else expires
-    return Subject(pseudonym, tuple(dict.fromkeys(filter(None, words))), day)
+    return SubjectRecord(pseudonym, tuple(dict.fromkeys(filter(None, words))), day)
 
 
-def recorded(appearance: Traced) -> list[dict[str, Any]]:
+def read_consent(appearance: HasProvenance) -> list[dict[str, Any]]:
     """Return what the subjects of an appearance's measured sessions agreed to, each once.
 
     Parameters
@@ -71,14 +71,14 @@ def recorded(appearance: Traced) -> list[dict[str, Any]]:
     --------
     >>> from model.skin import SkinAppearance
     >>> told = {"pseudonym": "P042", "consent_scope": ["research"], "consent_expires": None}
-    >>> recorded(SkinAppearance({}, "measured", {"consent": [told]})) == [told]
+    >>> read_consent(SkinAppearance({}, "measured", {"consent": [told]})) == [told]
     True
     """
     found = [dict(one) for part in _sources(appearance) for one in part.get(CONSENT_KEY) or ()]
     return [one for k, one in enumerate(found) if one not in found[:k]]
 
 
-def merge_consent(*appearances: Traced) -> list[dict[str, Any]]:
+def merge_consent(*appearances: HasProvenance) -> list[dict[str, Any]]:
     """Return the record that what is made of several appearances must bear.
 
     One that was measured and says nothing counts as of a subject who agreed to nothing.
@@ -91,8 +91,8 @@ def merge_consent(*appearances: Traced) -> list[dict[str, Any]]:
     """
     out: list[dict[str, Any]] = []
     for appearance in appearances:
-        records = recorded(appearance)
-        if _silent(appearance):
+        records = read_consent(appearance)
+        if _has_unknown_consent(appearance):
             records.append({"pseudonym": "unknown", "consent_scope": [], "consent_expires": None})
         out += [one for one in records if one not in out]
     return out
@@ -116,7 +116,9 @@ def format_consent(records: Sequence[Mapping[str, Any]]) -> list[str]:
     return lines
 
 
-def require(appearance: Traced, use: str | None, *, where: str, today: date | None = None) -> None:
+def require_consent(
+    appearance: HasProvenance, use: str | None, *, folder: str, today: date | None = None
+) -> None:
     """Raise where a subject has not agreed to a use of what was measured of it.
 
     Parameters
@@ -138,11 +140,11 @@ def require(appearance: Traced, use: str | None, *, where: str, today: date | No
         When it lies outside what was agreed to, the consent has ended, or measured maps do not
         say what was agreed to.
     """
-    records = recorded(appearance)
-    if _silent(appearance):
+    records = read_consent(appearance)
+    if _has_unknown_consent(appearance):
         raise ConsentError(
             "does not record what its subjects agreed to",
-            where=where,
+            where=folder,
             advice="It was made before consent was kept with maps: make it again from its "
             "sessions with `skinrig reconstruct` or `skinrig fit`.",
         )
@@ -152,13 +154,13 @@ def require(appearance: Traced, use: str | None, *, where: str, today: date | No
     for record in records:
         scope = [str(word) for word in record.get("consent_scope") or ()]
         expires = record.get("consent_expires")
-        if {use, ANY_USE} & set(scope) and (expires is None or day <= _day(expires, where)):
+        if {use, ANY_USE} & set(scope) and (expires is None or day <= _day(expires, folder)):
             continue
         allowed = ", ".join(scope) or "nothing"
         raise ConsentError(
             f"subject {record.get('pseudonym')} has not agreed to this use: got {use!r}, expected "
             f"one of: {allowed}" + (f", until {expires}" if expires else ""),
-            where=where,
+            where=folder,
             advice="Ask the subject again, or keep the data inside the agreed scope.",
         )
 
@@ -172,13 +174,13 @@ def _day(text: object, where: str) -> date:
         ) from error
 
 
-def _silent(appearance: Traced) -> bool:
+def _has_unknown_consent(appearance: HasProvenance) -> bool:
     """Return whether anything in it was measured of somebody whose consent is not told."""
     parts = _sources(appearance)
     return any(part.get("source") == "measured" and not part.get(CONSENT_KEY) for part in parts)
 
 
-def _sources(appearance: Traced) -> list[dict[str, Any]]:
+def _sources(appearance: HasProvenance) -> list[dict[str, Any]]:
     """Return what an appearance, or each part of one that moves, says of where it is from."""
     parts = appearance.parameters.get("parts")
     if isinstance(parts, dict) and parts:

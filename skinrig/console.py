@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 
-def plain(value: Any) -> Any:
+def to_json_value(value: Any) -> Any:
     """Return ``value`` as something that JSON can hold; NaN and infinities become None.
 
     Examples
     --------
     >>> from pathlib import Path
-    >>> plain({"error": float("nan"), "sizes": (1, 2), "folder": Path("out")})
+    >>> to_json_value({"error": float("nan"), "sizes": (1, 2), "folder": Path("out")})
     {'error': None, 'sizes': [1, 2], 'folder': 'out'}
     """
     if value is None or isinstance(value, (str, int)):
@@ -23,32 +23,32 @@ def plain(value: Any) -> Any:
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_json_value(item) for key, item in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):
-        return [plain(item) for item in value]
+        return [to_json_value(item) for item in value]
     # arrays and their scalars know it; NumPy itself would cost every command a tenth of a second
     if hasattr(value, "tolist"):
-        return plain(value.tolist())
+        return to_json_value(value.tolist())
     return str(value)
 
 
-def picked(source: object, *names: str) -> dict[str, Any]:
+def select_attributes(source: object, *names: str) -> dict[str, Any]:
     """Return some attributes of an object by their names.
 
     Examples
     --------
-    >>> picked(3 + 4j, "real", "imag")
+    >>> select_attributes(3 + 4j, "real", "imag")
     {'real': 3.0, 'imag': 4.0}
     """
     return {name: getattr(source, name) for name in names}
 
 
-def counted(number: int, noun: str) -> str:
+def format_count(number: int, noun: str) -> str:
     """Return how many there are of what a noun with a plural in s names.
 
     Examples
     --------
-    >>> counted(1, "photograph"), counted(0, "frame")
+    >>> format_count(1, "photograph"), format_count(0, "frame")
     ('1 photograph', '0 frames')
     """
     return f"{number} {noun}{'' if number == 1 else 's'}"
@@ -113,4 +113,7 @@ class Console:
     def document(self, schema: str, content: Mapping[str, Any]) -> None:
         """Print the one JSON document of the command, when it was asked for."""
         if self.as_json:
-            print(json.dumps({"schema": schema, **plain(content)}, allow_nan=False), flush=True)
+            print(
+                json.dumps({"schema": schema, **to_json_value(content)}, allow_nan=False),
+                flush=True,
+            )

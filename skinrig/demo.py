@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from skinrig.benchmarks.stages import run_stages
-from skinrig.console import Console, plain
-from skinrig.demo_rigs import RIGS, Findings, Run
-from skinrig.kernel_cache import WAITING_ASLEEP
+from skinrig.console import Console, to_json_value
+from skinrig.demo_rigs import RIGS, DemoResults, RigDemo
+from skinrig.kernel_cache import PASSIVE_WAIT_SETTINGS
 from skinrig.next_steps import suggest
+from skinrig.unit_format import format_unit
 from skinrig.workspace import scan
-from skinrig.written_units import unit_sign
 
 MAX_JOBS = 2
 """Rigs that run side by side: much of each is the work of one core, or waits for a compiler."""
@@ -38,10 +38,10 @@ BENCH_STAGES = (
 """Stages whose error is measured against run time, at their small size: of each rig some, which
 take about a second; `skinrig bench` measures all."""
 BENCH_BUDGET_S = 8.0
-LONGEST_FIRST = ("gradient", "dome", "flash", "probe")
-SLEEPING_THREADS = {**WAITING_ASLEEP, "OPENBLAS_NUM_THREADS": "1"}
+RIG_ORDER = ("gradient", "dome", "flash", "probe")
+SLEEPING_THREADS = {**PASSIVE_WAIT_SETTINGS, "OPENBLAS_NUM_THREADS": "1"}
 """Environment of rigs side by side, where the user has not set it: the cores are shared."""
-Shares = dict[str, float]
+SecondsByStep = dict[str, float]
 
 
 class DemoError(ValueError):
@@ -86,35 +86,35 @@ def run_demo(
     at_once = min(len(asked), MAX_JOBS, os.cpu_count() or 1) if jobs is None else jobs
     order = (out, seed, width_px, console)
     if at_once > 1:
-        parts = _side_by_side(asked, order, at_once)
+        parts = _run_in_processes(asked, order, at_once)
     else:
         parts = {rig: _run_rig(rig, *order) for rig in asked}
-    found = Findings()
-    shares: Shares = {}
+    found = DemoResults()
+    shares: SecondsByStep = {}
     for rig in asked:
         part, seconds = parts[rig]
         found.errors += part.errors
         found.tables += part.tables
         shares |= seconds
-    with _share("measure error against run time", shares, console):
+    with _time_step("measure error against run time", shares, console):
         bench = run_stages(
             BENCH_STAGES, budget_s=BENCH_BUDGET_S, toy=True, out=out, console=console
         )
-    spent = Findings()
+    spent = DemoResults()
     title = "Seconds" + (", rigs side by side" if at_once > 1 else "")
     spent.add_table(title, ["step", "seconds"], ((n, round(s, 2)) for n, s in shares.items()))
     document: dict[str, Any] = {"schema": "skinrig.demo/1", "title": "This demo"}
     document["tables"] = spent.tables + found.tables
     # seconds differ from run to run: they stand in a document of their own, not in the maps
-    (out / "demo.json").write_text(json.dumps(plain(document), indent=1), encoding="utf-8")
-    with _share("report", shares, console):
+    (out / "demo.json").write_text(json.dumps(to_json_value(document), indent=1), encoding="utf-8")
+    with _time_step("report", shares, console):
         from skinrig.report import build
 
         (out / "report.html").write_text(build([out], title="skinrig demo"), encoding="utf-8")
     console.say("")
     console.rows(
         ("subject", "map", "error", "unit", "68 % interval covers, %", "masked, %"),
-        [[*row[:3], unit_sign(row[3]), *row[4:]] for row in found.errors],
+        [[*row[:3], format_unit(row[3]), *row[4:]] for row in found.errors],
     )
     console.say("")
     by_rig = [
@@ -138,15 +138,15 @@ def run_demo(
 
 
 _Order = tuple[Path, int, int | None, Console]
-_Parts = dict[str, tuple[Findings, Shares]]
+_Parts = dict[str, tuple[DemoResults, SecondsByStep]]
 
 
-def _side_by_side(rigs: Sequence[str], order: _Order, at_once: int) -> _Parts:
+def _run_in_processes(rigs: Sequence[str], order: _Order, at_once: int) -> _Parts:
     """Run rigs in processes of their own; an error of one stops all."""
     pool = ProcessPoolExecutor(
         at_once, mp_context=multiprocessing.get_context("spawn"), initializer=_die_when_interrupted
     )
-    first = sorted(rigs, key=lambda rig: LONGEST_FIRST.index(rig) if rig in LONGEST_FIRST else 0)
+    first = sorted(rigs, key=lambda rig: RIG_ORDER.index(rig) if rig in RIG_ORDER else 0)
     try:
         with _environment(SLEEPING_THREADS):  # processes start as their work is handed in
             futures = {rig: pool.submit(_run_rig, rig, *order) for rig in first}
@@ -183,19 +183,19 @@ def _die_when_interrupted() -> None:
 
 def _run_rig(
     rig: str, out: Path, seed: int, width_px: int | None, console: Console
-) -> tuple[Findings, Shares]:
-    found = Findings()
-    shares: Shares = {}
-    RIGS[rig](Run(out, seed, lambda name: _share(name, shares, console), width_px, found))
+) -> tuple[DemoResults, SecondsByStep]:
+    found = DemoResults()
+    shares: SecondsByStep = {}
+    RIGS[rig](RigDemo(out, seed, lambda name: _time_step(name, shares, console), width_px, found))
     return found, shares
 
 
 @contextmanager
-def _share(name: str, shares: Shares, console: Console) -> Iterator[None]:
+def _time_step(name: str, seconds: SecondsByStep, console: Console) -> Iterator[None]:
     console.progress(name)
     start = time.perf_counter()
     yield
-    shares[name] = time.perf_counter() - start
+    seconds[name] = time.perf_counter() - start
 
 
 def _make_room(out: Path) -> None:

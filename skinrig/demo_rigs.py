@@ -16,7 +16,7 @@ from model import store
 from model.skin import SkinAppearance
 from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.inputs import DomeOptions
-from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
+from skinrig.appearances.dynamic import FACIAL_COLOR, describe_parts
 from skinrig.applying.expression import hemoglobin_rig
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.capturing.light_safety import light_rows
@@ -25,8 +25,8 @@ from skinrig.evaluating import surface as surface_evaluation
 from skinrig.fitting.facial_color import fit_facial_color
 from skinrig.fitting.microstructure import fit_microstructure
 from skinrig.rendering.photographs.errors import FULL_MODEL
-from skinrig.reporting.map_names import state_words
-from skinrig.simulating.orders import Simulated
+from skinrig.reporting.map_names import state_title
+from skinrig.simulating.orders import SimulationResult
 from skinrig.simulating.simulation import simulate_session
 
 FLASH_SUBJECTS = ("II", "IV")
@@ -44,11 +44,11 @@ DOME_WANT = (
     *("half_vector_normals", "normals", "normals_refined", "r_d", "lobe_residual", "samples"),
     *(f"basis_weight_{lobe}" for lobe in range(4)),
 )
-DOME_HELD_OUT = "lights=16,23"
+DOME_HOLD_OUT = "lights=16,23"
 """Lights, by number, whose photographs no fit sees: renderings are compared with them."""
-DOME_LEFT_OUT = ("subsurface",)
+DOME_OMITTED_EFFECTS = ("subsurface",)
 """Light that spreads sideways takes half a minute, and blurs less than its pixels of 2 mm."""
-DOME_COMPARED = 3
+N_COMPARED_PHOTOGRAPHS = 3
 """How many of their photographs are compared."""
 DOME_WIDTH_PX = 320
 """Pixels across each of the dome's cameras, unless said otherwise."""
@@ -62,7 +62,7 @@ GRADIENT_WANT = ("normals", "height", "crossed", "strain", "histograms", "kernel
 
 
 @dataclass(slots=True)
-class Findings:
+class DemoResults:
     """What the rigs of a demo leave for its tables."""
 
     errors: list[list[Any]] = field(default_factory=list)
@@ -70,39 +70,39 @@ class Findings:
     tables: list[dict[str, Any]] = field(default_factory=list)
 
     def add(
-        self, name: str, what: str, error: float, unit: str, coverage: float, masked: float
+        self, name: str, quantity: str, error: float, unit: str, coverage: float, masked: float
     ) -> None:
         """Add the error of a map; coverage and the share masked as shares of 1."""
-        self.errors.append([name, what, error, unit, 100 * coverage, 100 * masked])
+        self.errors.append([name, quantity, error, unit, 100 * coverage, 100 * masked])
 
     def add_table(self, title: str, head: list[str], rows: Iterable[Iterable[Any]]) -> None:
         """Add a table."""
         self.tables.append({"title": title, "head": head, "rows": [list(row) for row in rows]})
 
-    def add_light(self, title: str, capture: Simulated) -> None:
+    def add_light(self, title: str, capture: SimulationResult) -> None:
         """Add a table of the light that a capture took."""
         self.add_table(title, ["figure", "value"], light_rows(capture.light))
 
-    def add_left_out(self, rig: str, capture: Simulated) -> None:
+    def add_omissions(self, rig: str, capture: SimulationResult) -> None:
         """Add a table of what a capture's simulator did not build."""
         title = f"Left out by the simulator of the {rig}"
         self.add_table(title, ["what", "why"], capture.left_out)
 
 
-Share = Callable[[str], AbstractContextManager[None]]
+StepTimer = Callable[[str], AbstractContextManager[None]]
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class RigDemo:
     """A demo of one rig: where it writes, with which seed, and how it tells its steps."""
 
     out: Path
     seed: int
-    share: Share
+    share: StepTimer
     width_px: int | None
-    found: Findings
+    found: DemoResults
 
-    def simulate(self, rig: str, name: str, **options: Any) -> Simulated:
+    def simulate(self, rig: str, name: str, **options: Any) -> SimulationResult:
         """Simulate a capture into ``session-RIG-NAME``."""
         return simulate_session(rig, self.out / f"session-{rig}-{name}", seed=self.seed, **options)
 
@@ -112,7 +112,11 @@ class Run:
         calibrate(kind, sessions, self.out / f"calibration-{rig}")
 
     def reconstruct(
-        self, rig: str, capture: Simulated, want: tuple[str, ...], hold_out: str | None = None
+        self,
+        rig: str,
+        capture: SimulationResult,
+        want: tuple[str, ...],
+        hold_out: str | None = None,
     ) -> tuple[str, Path, SkinAppearance, SkinAppearance]:
         """Make the maps of a capture; return their name, folder, and maps and truth."""
         folder = self.out / capture.session.name.replace("session", "appearance")
@@ -128,7 +132,7 @@ class Run:
         return folder.name.removeprefix("appearance-"), folder, store.read(folder), truth
 
 
-def _flash(run: Run) -> None:
+def _flash(run: RigDemo) -> None:
     """Capture targets and two faces with the flash rig, down to melanin, blood and its changes."""
     found, width = run.found, run.width_px
     with run.share("flash: capture the calibration targets"):
@@ -137,7 +141,7 @@ def _flash(run: Run) -> None:
     with run.share("flash: calibrate"):
         for target, kind in FLASH_CALIBRATIONS.items():
             run.calibrate("flash", kind, target)
-    captures: list[Simulated] = []
+    captures: list[SimulationResult] = []
     with run.share("flash: capture two faces"):
         for number, subject in enumerate(FLASH_SUBJECTS):
             states = FLASH_STATES if number == 0 else ("neutral",)
@@ -150,37 +154,37 @@ def _flash(run: Run) -> None:
             for row in flash.compare(maps, truth, rng=np.random.default_rng(0)):
                 if row.band is None and row.against == "blurred":
                     error = 100 * row.median_relative
-                    found.add(name, row.name, error, "%", row.coverage.share, row.masked)
+                    found.add(name, row.name, error, "%", row.coverage.fraction, row.masked)
     with run.share("flash: fit the blood of a moving face"):
         moving = run.out / f"appearance-flash-moving-{FLASH_SUBJECTS[0]}"
         calibration = run.out / "calibration-flash"
         fit_facial_color([captures[0].session], out=moving, calibration=calibration)
-        _judge_moving(moving, found)
+        _evaluate_states(moving, found)
     found.add_table(
         "Resolution lost as light spreads in the skin, 10 to 90 % of an edge, mm",
         ["subject", "red", "green", "blue"],
         ([c.session.name, *(round(mm, 3) for mm in c.blur_mm)] for c in captures),
     )
-    found.add_left_out("flash rig", captures[0])
+    found.add_omissions("flash rig", captures[0])
 
 
-def _judge_moving(appearance: Path, found: Findings) -> None:
+def _evaluate_states(appearance: Path, found: DemoResults) -> None:
     maps = store.read(appearance)
-    named = parts_of(maps)[FACIAL_COLOR]["truth"]
+    named = describe_parts(maps)[FACIAL_COLOR]["truth"]
     truths = {state: store.read(appearance.parent / folder) for state, folder in named.items()}
     rng = np.random.default_rng(0)
     states, _ = facial_color.compare(maps, hemoglobin_rig(maps), truths, rng=rng)
     name = appearance.name.removeprefix("appearance-")
     for row in states:
-        if row.way in (facial_color.PREDICTION_METHODS[1], facial_color.PREDICTION_METHODS[3]):
-            what = f"blood of {row.state}, {row.way}"
+        if row.method in (facial_color.PREDICTION_METHODS[1], facial_color.PREDICTION_METHODS[3]):
+            what = f"blood of {row.state}, {row.method}"
             found.add(name, what, 100 * row.median_relative, "%", row.coverage, 0.0)
 
 
-def _dome(run: Run) -> None:
+def _dome(run: RigDemo) -> None:
     """Capture targets and a face with the light dome, down to normals, albedo and lobes."""
     from skinrig.evaluating import reflection
-    from skinrig.rendering.photographs.evaluation import Judging, evaluate_folders
+    from skinrig.rendering.photographs.evaluation import EvaluationSettings, evaluate_folders
 
     found = run.found
     width = DOME_WIDTH_PX if run.width_px is None else min(run.width_px, DOME_WIDTH_PX)
@@ -192,12 +196,18 @@ def _dome(run: Run) -> None:
         run.calibrate("dome", "lights", "mirror", "white")
     with run.share("dome: scan and capture a face"):
         capture = run.simulate(
-            "dome", DOME_SUBJECT, subject=DOME_SUBJECT, leave_out=DOME_LEFT_OUT, width_px=width
+            "dome",
+            DOME_SUBJECT,
+            subject=DOME_SUBJECT,
+            leave_out=DOME_OMITTED_EFFECTS,
+            width_px=width,
         )
     with run.share("dome: reconstruct normals, albedo and lobes"):
-        name, folder, maps, truth = run.reconstruct("dome", capture, DOME_WANT, DOME_HELD_OUT)
+        name, folder, maps, truth = run.reconstruct("dome", capture, DOME_WANT, DOME_HOLD_OUT)
         for row in surface_evaluation.compare(maps, truth, rng=np.random.default_rng(0)):
-            found.add(name, row.name, row.judged[1], row.unit, row.coverage.share, row.masked)
+            found.add(
+                name, row.name, row.limit_check[1], row.unit, row.coverage.fraction, row.masked
+            )
         held_out = reflection.compare(maps, truth, rng=np.random.default_rng(0))
         if held_out is not None:
             error = 100 * held_out.median
@@ -207,7 +217,7 @@ def _dome(run: Run) -> None:
             folder,
             capture.session,
             run.out / f"pictures-{name}",
-            Judging(count=DOME_COMPARED, seed=run.seed),
+            EvaluationSettings(count=N_COMPARED_PHOTOGRAPHS, seed=run.seed),
             calibration=run.out / "calibration-dome",
         )
     models = {FULL_MODEL: compared[FULL_MODEL], **compared["ablation"]}
@@ -217,10 +227,10 @@ def _dome(run: Run) -> None:
         ([name, 100 * row["median"], 100 * row["total_error"]] for name, row in models.items()),
     )
     found.add_light("Light of the dome's capture", capture)
-    found.add_left_out("dome", capture)
+    found.add_omissions("dome", capture)
 
 
-def _gradient(run: Run) -> None:
+def _gradient(run: RigDemo) -> None:
     """Capture a glass ball and stretched skin in the gradient sphere, down to kernels."""
     found = run.found
     with run.share("gradient: capture a ball of black glass"):
@@ -243,13 +253,13 @@ def _gradient(run: Run) -> None:
         strain = microrelief.compare_stretch(maps, truth)
         if strain:
             worst = max(strain, key=lambda row: abs(row.error))
-            what, error = f"stretch, {state_words(worst.state)}", 100 * abs(worst.error)
+            what, error = f"stretch, {state_title(worst.state)}", 100 * abs(worst.error)
             found.add(name, what, error, "%", float("nan"), 0.0)
     found.add_light("Light of a state's scan in the gradient sphere", capture)
-    found.add_left_out("gradient sphere", capture)
+    found.add_omissions("gradient sphere", capture)
 
 
-def _probe(run: Run) -> None:
+def _probe(run: RigDemo) -> None:
     """Calibrate a fibre probe, and measure a medium and three sites of a face."""
     with run.share("probe: capture a phantom"):
         run.simulate("probe", "phantom", target="phantom")
@@ -264,14 +274,14 @@ def _probe(run: Run) -> None:
         for capture in captures:
             name, _, maps, truth = run.reconstruct("probe", capture, PROBE_WANT)
             fits = subsurface.compare_fits(maps, truth)
-            for row in subsurface.by_method(fits):
+            for row in subsurface.summarize_methods(fits):
                 lost = np.mean([not fit.valid for fit in fits if fit.method == row.method])
                 what, error = f"sigma_tr, {row.method}", 100 * row.median
                 run.found.add(name, what, error, "%", row.coverage, float(lost))
-    run.found.add_left_out("fibre probe", captures[-1])
+    run.found.add_omissions("fibre probe", captures[-1])
 
 
-RIGS: Mapping[str, Callable[[Run], None]] = {
+RIGS: Mapping[str, Callable[[RigDemo], None]] = {
     "flash": _flash,
     "dome": _dome,
     "gradient": _gradient,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class InstallationCheck:
     """One thing that was looked at."""
 
     what: str
@@ -46,7 +46,7 @@ _EXTRA_PACKAGES = {
 }
 
 
-def examine(*, probe_renderer: bool = True) -> list[Finding]:
+def check_installation(*, probe_renderer: bool = True) -> list[InstallationCheck]:
     """Look at Python, the packages, the renderer's variant, threads and serial ports.
 
     Parameters
@@ -56,18 +56,20 @@ def examine(*, probe_renderer: bool = True) -> list[Finding]:
     """
     new_enough = sys.version_info >= (3, 11)
     mend = "" if new_enough else "install Python 3.11 or newer"
-    findings = [Finding("Python", platform.python_version(), new_enough, mend)]
+    findings = [InstallationCheck("Python", platform.python_version(), new_enough, mend)]
     for module, name in _REQUIRED_PACKAGES.items():
         present = importlib.util.find_spec(module) is not None
         state = importlib.metadata.version(name) if present else "missing"
-        findings.append(Finding(name, state, present, "" if present else f"pip install {name}"))
+        findings.append(
+            InstallationCheck(name, state, present, "" if present else f"pip install {name}")
+        )
     for module, extra in _EXTRA_PACKAGES.items():
         present = importlib.util.find_spec(module) is not None
         state = "installed" if present else "not installed"
         mend = "" if present else f"pip install 'skinrig[{extra}]' when you need it"
-        findings.append(Finding(f"optional: {extra}", state, True, mend))
+        findings.append(InstallationCheck(f"optional: {extra}", state, True, mend))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    findings.append(Finding("cores", str(cores), True))
+    findings.append(InstallationCheck("cores", str(cores), True))
     if probe_renderer:
         findings.append(_renderer())
     findings.append(_serial_ports())
@@ -76,24 +78,24 @@ def examine(*, probe_renderer: bool = True) -> list[Finding]:
     return findings
 
 
-def _renderer() -> Finding:
+def _renderer() -> InstallationCheck:
     from rigsim.render import variant
 
     choice = variant.choose_variant()
     fast = choice.name.startswith("llvm")
     mend = "" if fast else "for speed install LLVM 17 or newer: apt-get install libllvm19"
-    return Finding("Mitsuba variant", f"{choice.name} ({choice.why})", True, mend)
+    return InstallationCheck("Mitsuba variant", f"{choice.name} ({choice.why})", True, mend)
 
 
-def _serial_ports() -> Finding:
+def _serial_ports() -> InstallationCheck:
     from capture.devices.port_url import serial_ports
 
     ports = serial_ports()
     mend = "" if ports else "none is needed to simulate; plug the rig in and look again"
-    return Finding("serial ports", ", ".join(ports) or "none", True, mend)
+    return InstallationCheck("serial ports", ", ".join(ports) or "none", True, mend)
 
 
-def _camera_producers() -> Finding:
+def _camera_producers() -> InstallationCheck:
     from capture.devices.camera import CameraUrlError
     from capture.devices.cameras.genicam_producer import PRODUCER_PATH_VARIABLE, producer_files
 
@@ -102,4 +104,4 @@ def _camera_producers() -> Finding:
     except CameraUrlError:
         state = ""
     mend = f"install the camera maker's software and set {PRODUCER_PATH_VARIABLE} to its folder"
-    return Finding("GenTL producers", state or "none", True, "" if state else mend)
+    return InstallationCheck("GenTL producers", state or "none", True, "" if state else mend)

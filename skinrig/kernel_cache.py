@@ -7,7 +7,7 @@ from pathlib import Path
 
 PACKAGES_FOLDER = Path(__file__).parent.parent
 """The folder that the packages are installed in."""
-WAITING_ASLEEP = {"OMP_WAIT_POLICY": "PASSIVE"}
+PASSIVE_WAIT_SETTINGS = {"OMP_WAIT_POLICY": "PASSIVE"}
 """Threads that spin as they wait hold a core that other work of the machine could have. OpenMP
 reads it when it is loaded, which is before the first parallel loop."""
 
@@ -30,12 +30,12 @@ def user_cache(environment: Mapping[str, str]) -> Path:
     return Path(environment.get("HOME") or Path.home()) / ".cache"
 
 
-def writable(folder: Path) -> bool:
+def is_writable(folder: Path) -> bool:
     """Make a folder if it is missing and return whether files can be written into it.
 
     Examples
     --------
-    >>> writable(Path("/proc/none/such"))
+    >>> is_writable(Path("/proc/none/such"))
     False
     """
     try:
@@ -45,7 +45,9 @@ def writable(folder: Path) -> bool:
     return os.access(folder, os.W_OK | os.X_OK)
 
 
-def provide(environment: MutableMapping[str, str], packages: Path = PACKAGES_FOLDER) -> Path | None:
+def provide_kernel_cache(
+    environment: MutableMapping[str, str], packages: Path = PACKAGES_FOLDER
+) -> Path | None:
     """Name a private folder for compiled kernels where Numba would find none.
 
     Numba keeps them beside the sources or in the user's cache, and refuses to compile where it can
@@ -68,7 +70,7 @@ def provide(environment: MutableMapping[str, str], packages: Path = PACKAGES_FOL
     if sys.platform == "win32" or environment.get("NUMBA_CACHE_DIR"):
         return None
     beside = packages / "model" / "__pycache__"
-    if writable(beside) or writable(user_cache(environment) / "numba"):
+    if is_writable(beside) or is_writable(user_cache(environment) / "numba"):
         return None
     import atexit  # here: no other start of a command has to load them
     import shutil
@@ -80,7 +82,7 @@ def provide(environment: MutableMapping[str, str], packages: Path = PACKAGES_FOL
     return folder
 
 
-def wait_asleep(environment: MutableMapping[str, str]) -> None:
+def set_passive_waiting(environment: MutableMapping[str, str]) -> None:
     """Let threads sleep as they wait, unless the user has said how they shall.
 
     Parameters
@@ -91,12 +93,12 @@ def wait_asleep(environment: MutableMapping[str, str]) -> None:
     Examples
     --------
     >>> environment = {"HOME": "/home/me"}
-    >>> wait_asleep(environment)
+    >>> set_passive_waiting(environment)
     >>> environment["OMP_WAIT_POLICY"]
     'PASSIVE'
-    >>> wait_asleep(asked := {"OMP_WAIT_POLICY": "ACTIVE"})
+    >>> set_passive_waiting(asked := {"OMP_WAIT_POLICY": "ACTIVE"})
     >>> asked
     {'OMP_WAIT_POLICY': 'ACTIVE'}
     """
-    for name, value in WAITING_ASLEEP.items():
+    for name, value in PASSIVE_WAIT_SETTINGS.items():
         environment.setdefault(name, value)

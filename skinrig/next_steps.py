@@ -57,7 +57,7 @@ def shell_quote(path: str | Path) -> str:
     return shlex.quote(str(path))
 
 
-def after_session(
+def suggest_after_session(
     rig: str, session: str | Path, target: str | None, *, calibration: str | Path = "calibration"
 ) -> str:
     """Return the command that a session is for, most likely.
@@ -75,9 +75,9 @@ def after_session(
 
     Examples
     --------
-    >>> after_session("flash", "session-flash", None)
+    >>> suggest_after_session("flash", "session-flash", None)
     'skinrig reconstruct session-flash --want melanin,hemoglobin --out appearance'
-    >>> after_session("probe", "session-phantom", "phantom")
+    >>> suggest_after_session("probe", "session-phantom", "phantom")
     'skinrig calibrate fibre session-phantom --out calibration'
     """
     place, store = shell_quote(session), shell_quote(calibration)
@@ -119,21 +119,21 @@ def suggest(found: Workspace, folder: Path) -> tuple[Step, ...]:
     fresh = [
         (path, document)
         for path, document in found.sessions.items()
-        if path.name not in used and not _target(document) and not _is_gray(document)
+        if path.name not in used and not _target(document) and not _is_grayscale(document)
     ]
     if fresh:
         path, document = fresh[0]
         rig = document.get("rig", {}).get("name", "")
         where = next((c for c in found.calibrations if rig in c.name), None)
         where = where or next(iter(found.calibrations), Path("calibration"))
-        command = after_session(rig, path, None, calibration=where)
+        command = suggest_after_session(rig, path, None, calibration=where)
         if rig not in CALIBRATION_BY_TARGET:
             command += _state_option(document)
         steps.append(Step(command, "maps with standard errors"))
     if found.appearances:
-        seen = shell_quote(_most_whole(found.appearances, ("facial_color.json", "mesh.obj")))
+        seen = shell_quote(_most_complete(found.appearances, ("facial_color.json", "mesh.obj")))
         steps.append(Step(f"skinrig view {seen}", "a page that shows the skin moving, under light"))
-        given = _most_whole(found.appearances, ("mesh.obj",))
+        given = _most_complete(found.appearances, ("mesh.obj",))
         measured = found.appearances[given].get("source") == "measured"
         use = " --use research" if measured else ""
         command = f"skinrig export {shell_quote(given)} --to maps{use} --out export"
@@ -205,14 +205,14 @@ def _state_option(session: Mapping[str, Any]) -> str:
     return "" if not states or "neutral" in states else f" --state {shell_quote(states[0])}"
 
 
-def _is_gray(session: Mapping[str, Any]) -> bool:
+def _is_grayscale(session: Mapping[str, Any]) -> bool:
     """Tell imported photographs without color, of which no map of skin can be made."""
     rig = session.get("rig", {})
     filters = {view.get("cfa") for view in rig.get("views", ())}
     return rig.get("name") not in CALIBRATION_BY_TARGET and filters == {"MONO"}
 
 
-def _most_whole(appearances: Mapping[Path, Mapping[str, Any]], files: Sequence[str]) -> Path:
+def _most_complete(appearances: Mapping[Path, Mapping[str, Any]], files: Sequence[str]) -> Path:
     """Return the appearance that holds the first of some files, else the next, most maps first."""
 
     def rank(path: Path) -> tuple[int, int]:

@@ -8,12 +8,12 @@ from typing import Any
 
 from model import store
 from model.skin import SkinAppearance
-from skinrig.appearances.dynamic import parts_of
+from skinrig.appearances.dynamic import describe_parts
 from skinrig.reporting import map_images, page, provenance
 from skinrig.reporting import verdict as verdict_section
 from skinrig.reporting.comparison import page as comparison
 from skinrig.reporting.comparison import runs as run_comparison
-from skinrig.reporting.folders import Findings, ReportError, discover, read_json
+from skinrig.reporting.folders import ReportError, ReportInputs, discover, read_json
 from skinrig.reporting.sections import (
     bench,
     calibration,
@@ -86,11 +86,11 @@ def make(
         runs.
     """
     places = [Path(p) for p in paths]
-    both = run_comparison.sides(places, insist=compare)
+    both = run_comparison.split_sides(places, require_comparison=compare)
     if both is not None:
         for run in both:
-            judge(run.found, run.checks)
-        pairs = run_comparison.compared(*both)
+            evaluate_checks(run.found, run.checks)
+        pairs = run_comparison.compare_maps_of_runs(*both)
         html = page.document(
             title, comparison.lead(*both, pairs), comparison.sections(*both, pairs)
         )
@@ -99,23 +99,23 @@ def make(
     checks_of_all: list[page.Check] = []
     found = discover(places)
     body = sections(found, checks_of_all)
-    lead = verdict_section.section(checks_of_all, found.words(), _least_known(found))
+    lead = verdict_section.section(checks_of_all, found.summary(), _list_least_certain(found))
     html = page.document(title, lead, body)
     return Report(html, tuple(checks_of_all), None)
 
 
-def _least_known(found: Findings) -> list[str]:
+def _list_least_certain(found: ReportInputs) -> list[str]:
     """Return what maps without a truth know least of."""
     told = []
     for name, folder in found.appearances.items():
         parameters: Mapping[str, Any] = store.read_document(folder).parameters
         states = parameters.get("parts", {}).get("facial_color", {}).get("truth", {})
         if not found.truths.keys() & {parameters.get("truth"), *states.values()}:
-            told += verdict_section.least_known(name, store.read(folder))
+            told += verdict_section.list_least_certain(name, store.read(folder))
     return told
 
 
-def judge(found: Findings, checks: list[page.Check]) -> None:
+def evaluate_checks(found: ReportInputs, checks: list[page.Check]) -> None:
     """Judge all that was found as its report does, without what the report only shows.
 
     Parameters
@@ -126,7 +126,7 @@ def judge(found: Findings, checks: list[page.Check]) -> None:
         Judgements are added to it.
     """
     appearances = {name: store.read(folder) for name, folder in found.appearances.items()}
-    sessions = session.facts_of(found.sessions)
+    sessions = session.read_session_facts(found.sessions)
     for blocks in (
         _maps(found, appearances, checks),
         _documents(found, checks),
@@ -135,7 +135,7 @@ def judge(found: Findings, checks: list[page.Check]) -> None:
         deque(blocks, maxlen=0)  # each section judges while its blocks are made
 
 
-def sections(found: Findings, checks: list[page.Check]) -> list[page.Block]:
+def sections(found: ReportInputs, checks: list[page.Check]) -> list[page.Block]:
     """Return the sections on all that was found, and judge it.
 
     Parameters
@@ -146,7 +146,7 @@ def sections(found: Findings, checks: list[page.Check]) -> list[page.Block]:
         Judgements are added to it.
     """
     appearances = {name: store.read(folder) for name, folder in found.appearances.items()}
-    sessions = session.facts_of(found.sessions)
+    sessions = session.read_session_facts(found.sessions)
     return [
         *_maps(found, appearances, checks),
         *chromophore.identifiability(appearances.values()),
@@ -160,19 +160,21 @@ def sections(found: Findings, checks: list[page.Check]) -> list[page.Block]:
 
 
 def _maps(
-    found: Findings, appearances: Mapping[str, SkinAppearance], checks: list[page.Check]
+    found: ReportInputs, appearances: Mapping[str, SkinAppearance], checks: list[page.Check]
 ) -> Iterator[page.Block]:
     for name, appearance in appearances.items():
         if dynamic.is_dynamic(appearance):
-            yield from _dynamic_section(page.Subject(name, appearance, None, checks), found)
+            yield from _dynamic_section(
+                page.ReportedAppearance(name, appearance, None, checks), found
+            )
         else:
-            truth = found.truth_of(appearance)
-            yield from _appearance_section(page.Subject(name, appearance, truth, checks))
+            truth = found.find_truth(appearance)
+            yield from _appearance_section(page.ReportedAppearance(name, appearance, truth, checks))
     for folder in found.pictures:
         yield from image_section.section(folder, checks)
 
 
-def _documents(found: Findings, checks: list[page.Check]) -> Iterator[page.Block]:
+def _documents(found: ReportInputs, checks: list[page.Check]) -> Iterator[page.Block]:
     for path in found.documents:
         document = read_json(path)
         if bench.is_bench(document):
@@ -183,7 +185,7 @@ def _documents(found: Findings, checks: list[page.Check]) -> Iterator[page.Block
             yield from _document_section(document)
 
 
-def _appearance_section(subject: page.Subject) -> Iterator[page.Block]:
+def _appearance_section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
     appearance, truth = subject.appearance, subject.truth
     yield page.Heading(f"Maps: {subject.name}", level=2)
     images = [
@@ -206,13 +208,13 @@ def _appearance_section(subject: page.Subject) -> Iterator[page.Block]:
             yield from chromophore.errors(subject, truth)
         yield from chromophore.panels(appearance, truth)
     if truth is None:
-        yield from verdict_section.unjudged(appearance)
+        yield from verdict_section.uncertainty_blocks(appearance)
     yield from provenance.section(appearance)
 
 
-def _dynamic_section(subject: page.Subject, found: Findings) -> Iterator[page.Block]:
+def _dynamic_section(subject: page.ReportedAppearance, found: ReportInputs) -> Iterator[page.Block]:
     appearance = subject.appearance
-    part = parts_of(appearance).get("facial_color", {})
+    part = describe_parts(appearance).get("facial_color", {})
     truths = {
         state: store.read(found.truths[folder])
         for state, folder in part.get("truth", {}).items()
@@ -221,7 +223,7 @@ def _dynamic_section(subject: page.Subject, found: Findings) -> Iterator[page.Bl
     yield page.Heading(f"Moving face: {subject.name}", level=2)
     yield from dynamic.section(subject, truths)
     if not truths:
-        yield from verdict_section.unjudged(appearance)
+        yield from verdict_section.uncertainty_blocks(appearance)
     yield from provenance.section(appearance)
 
 

@@ -181,7 +181,7 @@ def worlds_of_others():
 
 def _worlds():
     world = sys.modules.get("rigsim.world.world")  # most tests need none, and its import takes time
-    return {} if world is None else world._BENCH
+    return {} if world is None else world._WORLDS
 
 
 @pytest.fixture(scope="session")

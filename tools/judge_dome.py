@@ -63,7 +63,7 @@ def main(arguments: list[str]) -> None:
             print(
                 f"  {row.name:20} {row.unit:3} points {row.points} masked {100 * row.masked:.0f} % "
                 f"mean {row.mean:.3f} median {row.median:.3f} 95th {row.high:.2f} "
-                f"bias {row.bias:.2f} covers {100 * row.coverage.share:.0f} % "
+                f"bias {row.bias:.2f} covers {100 * row.coverage.fraction:.0f} % "
                 f"stderr {row.median_stderr:.3f}"
             )
         print(f"  {reflection.compare(found, truth, rng=np.random.default_rng(0))}")

@@ -20,9 +20,9 @@ import numpy as np
 
 from model import store
 from reconstruction.pipeline import recipes as pipeline
-from reconstruction.pipeline.flash.stages import NOISE_STDERR
+from reconstruction.pipeline.flash.stages import NOISE_STDERR_SUFFIX
 from skinrig.calibrating.calibrate import calibrate
-from skinrig.evaluating.bounds import cramer_rao
+from skinrig.evaluating.bounds import chromophore_bounds
 from skinrig.evaluating.flash import (
     BOUND_FACTOR,
     MAX_MEDIAN_MELANIN_ERROR,
@@ -58,7 +58,7 @@ def main(first: int, last: int) -> None:
                 calibration=folder / "calibration",
             )
             found, truth = store.read(folder / f"maps-{seed}"), store.read(done.truth or "")
-            bounds = cramer_rao(found, truth)
+            bounds = chromophore_bounds(found, truth)
             skin = truth.maps["mask"].values > 0.5
             for key, rows in pooled.items():
                 estimate = found.maps[key]
@@ -67,7 +67,7 @@ def main(first: int, last: int) -> None:
                     truth.maps[f"{key}_blurred"].values,
                     estimate.values,
                     estimate.stderr,
-                    found.maps[key + NOISE_STDERR].values,
+                    found.maps[key + NOISE_STDERR_SUFFIX].values,
                     bounds[key],
                     estimate.valid,
                 )

@@ -31,7 +31,7 @@ def main(arguments: list[str]) -> None:
             "probe", out / "session-phantom", target="phantom", seed=first, size="full"
         )
         calibrate("fibre", [out / "session-phantom"], out / "calibration")
-    rows: list[evaluation.FitError] = []
+    rows: list[evaluation.FitAccuracy] = []
     for seed in range(first, first + media):
         sigma_a, sigma_s_prime, g = medium(seed)
         session = out / f"session-{seed}"
@@ -67,7 +67,7 @@ def main(arguments: list[str]) -> None:
             flush=True,
         )
     print("method          fits  median %  worst %  bias %  68 % interval covers %")
-    for each in evaluation.by_method(rows):
+    for each in evaluation.summarize_methods(rows):
         print(
             f"{each.method:15} {each.fits:4d}  {100 * each.median:8.2f}  {100 * each.worst:7.2f}  "
             f"{100 * each.bias:+6.2f}  {100 * each.coverage:6.1f}"

@@ -21,7 +21,7 @@ from reconstruction.pipeline.inputs import DomeOptions
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.fitting.reflectance import fit_reflectance
 from skinrig.rendering.photographs.errors import FULL_MODEL
-from skinrig.rendering.photographs.evaluation import Judging, evaluate_folders
+from skinrig.rendering.photographs.evaluation import EvaluationSettings, evaluate_folders
 from skinrig.simulating.simulation import simulate_session
 
 SUBJECTS = ("palest", "II", "III", "V", "darkest")
@@ -69,7 +69,7 @@ def main(arguments: list[str]) -> int:
             out / f"model-{subject}",
             out / f"session-{subject}",
             out / f"judged-{subject}",
-            Judging(count=PHOTOGRAPHS),
+            EvaluationSettings(count=PHOTOGRAPHS),
             calibration=calibration,
         )
         records.append(record)

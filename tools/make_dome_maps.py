@@ -31,7 +31,7 @@ def panels(
     for name in ("normals", "r_d"):
         shown = maps.maps[name]
         valid = None if shown.valid is None else shown.valid[there]
-        image, seen = view.picture(shown.values[there], valid=valid)
+        image, seen = view.rasterize(shown.values[there], valid=valid)
         picture = 0.5 + 0.5 * image if name == "normals" else image / 0.8
         codes = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
         codes = codes if name == "normals" else png.srgb8(picture)

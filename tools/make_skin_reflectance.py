@@ -32,9 +32,9 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from rigsim.tissue import skin_layers
-from rigsim.tissue.photon_walk import ROULETTE_BELOW, ROULETTE_SURVIVAL
+from rigsim.tissue.photon_walk import ROULETTE_MAX_WEIGHT, ROULETTE_SURVIVAL
 from rigsim.tissue.skin_table import c_hd_axis, c_m_axis
-from rigsim.tissue.tissue_mc import EscapePaths, escape_paths
+from rigsim.tissue.tissue_mc import EscapePaths, trace_escape_paths
 
 FloatArray = NDArray[np.float64]
 
@@ -70,7 +70,7 @@ def survivals(
     melanin = skin_layers.melanin_per_mm(wavelength_nm) - baseline
     blood = skin_layers.blood_per_mm(wavelength_nm) - baseline
     epidermis, dermis = paths.path_mm.T
-    in_blood = skin_layers.EPIDERMAL_BLOOD_SHARE * epidermis + dermis
+    in_blood = skin_layers.EPIDERMAL_BLOOD_RATIO * epidermis + dermis
     by_melanin = np.exp(-np.outer(epidermis, (c_m - c_ref) * melanin))
     by_melanin *= (paths.weight / paths.photons)[:, None]
     return by_melanin, np.exp(-np.outer(in_blood, c_hd * blood))
@@ -97,8 +97,8 @@ def simulate(
     sums: dict[str, FloatArray] = {}
     for index, (c_ref, photons) in enumerate(RUNS):
         rng = np.random.default_rng([seed, round(wavelength_nm), index])
-        batches = escape_paths(
-            skin_layers.skin(wavelength_nm, c_ref, 0.0),
+        batches = trace_escape_paths(
+            skin_layers.skin_layer_stack(wavelength_nm, c_ref, 0.0),
             photons=round(scale * photons),
             rng=rng,
             batches=BATCHES,
@@ -143,11 +143,11 @@ def parameters(seed: int, scale: float) -> dict[str, object]:
         "take_over": TAKE_OVER,
         "nodes": [NODES, LATERAL_NODES],
         "ring_edges_mm": [float(edge) for edge in RING_EDGES_MM],
-        "roulette": [ROULETTE_BELOW, ROULETTE_SURVIVAL],
+        "roulette": [ROULETTE_MAX_WEIGHT, ROULETTE_SURVIVAL],
         "epidermis_mm": skin_layers.EPIDERMIS_MM,
         "eta": skin_layers.ETA,
         "g": skin_layers.SKIN_ANISOTROPY,
-        "epidermal_blood_share": skin_layers.EPIDERMAL_BLOOD_SHARE,
+        "epidermal_blood_share": skin_layers.EPIDERMAL_BLOOD_RATIO,
         "wavelength_nm": wavelengths,
         "melanin_per_mm": [skin_layers.melanin_per_mm(nm) for nm in wavelengths],
         "blood_per_mm": [skin_layers.blood_per_mm(nm) for nm in wavelengths],

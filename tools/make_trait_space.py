@@ -3,8 +3,8 @@
 Run from the repository root, ``python tools/make_trait_space.py`` (about 3 minutes of one core;
 see `main` for options).
 
-- People: the 87 of `rigsim.population.population.table_1`. A random half of them gets a tan (1.5
-times the
+- People: the 87 of `rigsim.population.population.draw_population`. A random half of them gets a
+tan (1.5 times the
   melanin); everybody gets one of normal (twice as often), cold, hot, sweat, lotion, makeup and
   powder instead of what they wore.
 - Surface: materials fitted to 2 % noisy light from 40 points of each face in 240 pairs of light
@@ -38,7 +38,7 @@ from model.traits.storage import PACKAGED_FILE, TraitLibrary, from_bytes
 from reconstruction import brdf_basis
 from reconstruction.correspondence import common_regions
 from rigsim.population.conditions import CONDITION_NAMES
-from rigsim.population.population import Member, shifted, table_1
+from rigsim.population.population import Member, draw_population, shift_trait
 from skinrig.traits import albedo_vectors, regions
 from skinrig.traits import truth as trait_truth
 from skinrig.traits.truth import CommonFaces
@@ -66,12 +66,14 @@ LIMIT_BYTES = 1_500_000
 
 
 def population(seed: int) -> tuple[Member, ...]:
-    people = shifted(table_1(seed=seed), "tan", melanin=TAN, rng=np.random.default_rng([seed, 1]))
-    return trait_truth.assigned(people, WORN, rng=np.random.default_rng([seed, 2]))
+    people = shift_trait(
+        draw_population(seed=seed), "tan", melanin=TAN, rng=np.random.default_rng([seed, 1])
+    )
+    return trait_truth.assign_conditions(people, WORN, rng=np.random.default_rng([seed, 2]))
 
 
 def mixtures(people: Sequence[Member], seed: int) -> np.ndarray:
-    basis = brdf_tables.default()
+    basis = brdf_tables.default_basis()
     means = []
     for k, person in enumerate(people):
         rng = np.random.default_rng([seed, 3, k])
@@ -93,15 +95,15 @@ def kept(work: Path | None, name: str, make: Callable[[], np.ndarray]) -> np.nda
 
 
 def surface_space(people: Sequence[Member], means: np.ndarray, seed: int) -> TraitSpace:
-    basis = brdf_tables.default()
+    basis = brdf_tables.default_basis()
     strength = basis.strength()
     return TraitSpace.fit(
         means,
-        trait_truth.labels_of(people, SEEN_ON_SURFACE),
+        trait_truth.label_members(people, SEEN_ON_SURFACE),
         continuous={"age": np.array([person.age_years for person in people])},
         space="nmf",
         basis=brdf_basis.reduce(means, RANK, basis=basis)[1],
-        metric=basis.kinship() * np.outer(strength, strength),
+        metric=basis.cosine_similarity() * np.outer(strength, strength),
         contrast="regression",
         names=basis.names,
         seed=seed,
@@ -130,7 +132,7 @@ def packaged(space: TraitSpace) -> TraitSpace:
 
 
 def surface_truth(space: TraitSpace, people: Sequence[Member], seed: int) -> dict[str, float]:
-    basis = brdf_tables.default()
+    basis = brdf_tables.default_basis()
     some = [people[i] for i in np.random.default_rng([seed, 4]).permutation(len(people))[:COMPARED]]
     bare = [dataclasses.replace(person, applied=()) for person in some]
     worn = {
@@ -172,7 +174,7 @@ def drawn(
 
 
 def vectors(maps: np.ndarray, faces: CommonFaces, texture: TextureSpace, region: str) -> np.ndarray:
-    inside = common_regions.region(region, faces.frame)
+    inside = common_regions.region_mask(region, faces.frame)
     return np.array(
         [
             albedo_vectors.vector(
@@ -197,7 +199,7 @@ def albedo_space(
     seed: int,
 ) -> TraitSpace:
     ages = {"age": np.array([person.age_years for person in people])}
-    labels = trait_truth.labels_of(people, BORN)
+    labels = trait_truth.label_members(people, BORN)
     worn = {n: np.array([n in p.labels for p in people]) for n in PUT_ON}
     space = fitted(many, {**labels, **worn}, ages, texture, seed)
     told = {name: np.array([one == name for one in shows]) for name in PUT_ON}
@@ -215,7 +217,7 @@ def albedo_space(
 
 
 def fitted(rows, labels, continuous, texture, seed) -> TraitSpace:
-    return albedo_vectors.fit(
+    return albedo_vectors.fit_albedo_traits(
         rows, labels, continuous, texture, "quantiles", contrast="regression", seed=seed
     ).traits
 
@@ -272,7 +274,7 @@ def main() -> None:
     again = kept(given.work, "again", lambda: drawn(faces, seen, noise, (given.seed, 9)))
     tell("albedo maps drawn")
     texture = TextureSpace.fit(
-        [albedo_vectors.encoded(one[..., :3], "quantiles") for one in (*once, *again)],
+        [albedo_vectors.encode_albedo(one[..., :3], "quantiles") for one in (*once, *again)],
         valid=[one[..., 3] > 0 for one in (*once, *again)],
     )
     spaces = {}

@@ -23,14 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from rigsim.fiber.profile import Fibres, fibre_paths
+from rigsim.fiber.profile import FiberGeometry, trace_fiber_paths
 from rigsim.fiber.white_fiber import (
     ETA,
     HENYEY_GREENSTEIN_G,
     NUMERICAL_APERTURE,
     TABLE_FILE,
-    decay,
-    disc_points,
+    decay_rate,
+    disc_quadrature,
     distance_axis,
 )
 from rigsim.tissue.tissue_mc import Layer, LayerStack
@@ -73,8 +73,8 @@ SPAN = 12.0  # a base tells of absorptions up to this multiple of its own
 
 def groups(base: float) -> list[tuple[FloatArray, float, int]]:
     """Return distances, the width that they are averaged over, and photons, of each run."""
-    far = min(FARTHEST, LAST_LOG / max(float(decay(base)), 1e-9))
-    width = float(np.clip(0.4 / max(float(decay(base)), 1e-9), 0.05, 1.2))
+    far = min(FARTHEST, LAST_LOG / max(float(decay_rate(base)), 1e-9))
+    width = float(np.clip(0.4 / max(float(decay_rate(base)), 1e-9), 0.05, 1.2))
     edge = min(2.5, 0.5 * far)
     near, middle, beyond = PHOTONS[base]
     return [
@@ -105,9 +105,9 @@ def trace(work: Path, scale: float, threads: int, seed: int) -> list[dict[str, F
                         ),
                     )
                 )
-                paths = fibre_paths(
+                paths = trace_fiber_paths(
                     stack,
-                    Fibres(
+                    FiberGeometry(
                         tuple(radius.tolist()), width, 0.0, NUMERICAL_APERTURE, NUMERICAL_APERTURE
                     ),
                     photons=round(scale * photons),
@@ -138,12 +138,12 @@ class Curve:
     """log(F d) + decay d as a spline of few knots, fitted to averages over discs."""
 
     def __init__(self, radius: FloatArray, width: FloatArray, absorption: float) -> None:
-        points, self.share = disc_points(4, 9)
+        points, self.share = disc_quadrature(4, 9)
         self.apart = np.hypot(
             radius[:, None] + 0.5 * width[:, None] * points[:, 0],
             0.5 * width[:, None] * points[:, 1],
         )
-        self.radius, self.decay = radius, float(decay(absorption))
+        self.radius, self.decay = radius, float(decay_rate(absorption))
         axis = distance_axis(radius)
         count = max(3, round(4.0 * float(axis[-1] - axis[0])))
         inner = np.linspace(axis[0], axis[-1], count + 1)[1:-1]

@@ -4,7 +4,7 @@ The driver decides nothing and this package nothing about bytes: what to shoot i
 is missing is the session's, whether a frame is the right one is the camera rule's.
 """
 
-from capture.acquire.outcome import Acquired, AcquisitionError, Interrupted, Operator
+from capture.acquire.outcome import AcquisitionError, AcquisitionResult, Interrupted, Operator
 from capture.acquire.run import run_plan
 
-__all__ = ["Acquired", "AcquisitionError", "Interrupted", "Operator", "run_plan"]
+__all__ = ["AcquisitionError", "AcquisitionResult", "Interrupted", "Operator", "run_plan"]

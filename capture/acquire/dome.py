@@ -9,14 +9,14 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from capture.acquire.frames import configure, wanted_exposure
+from capture.acquire.frames import configure_camera, requested_exposure
 from capture.acquire.outcome import (
     MAX_ATTEMPTS,
-    Acquired,
     AcquisitionError,
+    AcquisitionResult,
     CaptureRun,
-    refuse_step,
     require_trigger_line,
+    step_limit_error,
 )
 from capture.acquire.table_run import TableRun
 from capture.devices.camera import Frame
@@ -27,7 +27,7 @@ from capture.devices.wire import Code
 from capture.plan import Plan, Step, Value
 from capture.plan.dose import dose_report
 from capture.plan.flicker import flicker_report
-from capture.plan.rows import LedRow, led_rows, passes
+from capture.plan.rows import LedRow, led_rows, split_passes
 from capture.rig import LedLimits, Rig
 
 log = logging.getLogger(__name__)
@@ -40,7 +40,7 @@ MIN_DARK_GAP_S = 1.1
 DOME_LEASE_S = 2.0
 
 
-def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> Acquired:
+def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> AcquisitionResult:
     """Capture what the session still lacks of a plan of the dome; see `run_plan`."""
     box: DomeBox = boxes["dome"]
     check_safety(run.plan, run.rig, eyes=run.eyes)
@@ -51,13 +51,13 @@ def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> Acquired:
     scan = _Sequences(run, box)
     try:
         begin_lit_run(run, box, DOME_LEASE_S)
-        for piece in _pieces(run.steps_to_do(), int(box.limits.get("max_rows", 1024))):
+        for piece in _split_sequences(run.pending_steps(), int(box.limits.get("max_rows", 1024))):
             run.operator.stop_if_asked()
             scan.prepare(piece[0])
             scan.take(piece)
     finally:
         run.tear_down(box)
-    return run.account(box.failed_leds)
+    return run.summarize(box.failed_leds)
 
 
 def begin_lit_run(run: CaptureRun, box: LedBox, lease_s: float) -> None:
@@ -111,13 +111,13 @@ def _check_box(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
         check_dwell(step, row.dwell_s, limits)
         if len(row.leds) > int(limits["max_at_once"]):
             what = f"got {len(row.leds)} lights at once, the box allows {limits['max_at_once']}"
-            raise refuse_step(step, what)
+            raise step_limit_error(step, what)
         exposure_s = float(step.settings["exposure_s"])
         views = [rig.view(name) for name in step.cameras]
         ends_s = settle_s + max(view.shutter_lag_s for view in views) + exposure_s
         over_s = ends_s + max(view.readout_s for view in views) - settle_s
         if ends_s > row.dwell_s - overlap_s or over_s > row.dwell_s:
-            raise too_long(step, row.dwell_s)
+            raise row_overrun_error(step, row.dwell_s)
 
 
 def check_dwell(step: Step, dwell_s: float, limits: Mapping[str, Any]) -> None:
@@ -125,20 +125,20 @@ def check_dwell(step: Step, dwell_s: float, limits: Mapping[str, Any]) -> None:
     low_s, high_s = float(limits["row_min_us"]) / 1e6, float(limits["row_max_us"]) / 1e6
     if not low_s <= dwell_s <= high_s:
         what = f"got dwell_s {dwell_s:g}, the box allows {low_s:g} to {high_s:g}"
-        raise refuse_step(step, what)
+        raise step_limit_error(step, what)
 
 
-def too_long(step: Step, dwell_s: float) -> AcquisitionError:
+def row_overrun_error(step: Step, dwell_s: float) -> AcquisitionError:
     """Return the error of a step whose row has no room for its exposure."""
     exposure_s = float(step.settings["exposure_s"])
     what = f"exposure_s {exposure_s:g} and the read-out do not fit into dwell_s {dwell_s:g}"
-    return refuse_step(step, what)
+    return step_limit_error(step, what)
 
 
-def _pieces(steps: Sequence[Step], most: int) -> Iterator[list[Step]]:
-    for piece in passes(steps):
-        for first in range(0, len(piece), most):
-            yield piece[first : first + most]
+def _split_sequences(steps: Sequence[Step], max_steps: int) -> Iterator[list[Step]]:
+    for piece in split_passes(steps):
+        for first in range(0, len(piece), max_steps):
+            yield piece[first : first + max_steps]
 
 
 class _Sequences:
@@ -167,7 +167,7 @@ class _Sequences:
                 return
             self._run.operator.stop_if_asked()
             log.warning("%d steps from %s on, attempt %d: %s", len(left), left[0].id, attempt, why)
-        raise self._run.given_up(f"{len(left)} steps from {left[0].id} on", why)
+        raise self._run.retry_limit_error(f"{len(left)} steps from {left[0].id} on", why)
 
     def _attempt(self, steps: list[Step], attempt: int) -> tuple[list[Step], str]:
         """Run steps as one sequence, or one by one where that would flicker too much.
@@ -193,8 +193,8 @@ class _Sequences:
         """Run steps as one sequence; return those that lack a frame, and why."""
         run, box = self._run, self._box
         rows = led_rows(steps, run.rig)
-        for name, camera in run.cameras_of(steps[0]).items():
-            configure(name, camera, wanted_exposure(steps[0]))
+        for name, camera in run.step_cameras(steps[0]).items():
+            configure_camera(name, camera, requested_exposure(steps[0]))
         mask = run.camera_mask(steps[0])
         box.load([TableRow(row.leds, row.level, row.dwell_s, mask) for row in rows])
         box.arm()
@@ -235,4 +235,6 @@ class _Sequences:
         light: dict[str, Value] = {"light": run.light_names(row.leds) or "none", "level": row.level}
         if failed:
             light["dead_lights"] = run.light_names(failed)
-        run.keep(step, frames, light=light, tries=attempt, t_box_s=t_box_s, noted=light)
+        run.commit_frames(
+            step, frames, light=light, tries=attempt, t_box_s=t_box_s, journal_entries=light
+        )

@@ -15,12 +15,12 @@ FRAME_MARGIN_S = 5.0
 """How much longer than exposure and read-out a frame may take to come."""
 
 
-def wanted_exposure(step: Step) -> Exposure:
+def requested_exposure(step: Step) -> Exposure:
     """Return the exposure that a step asks for."""
     return Exposure(float(step.settings["exposure_s"]), int(step.settings["iso"]))
 
 
-def configure(name: str, camera: Camera, want: Exposure) -> None:
+def configure_camera(name: str, camera: Camera, want: Exposure) -> None:
     """Set the camera of view ``name``; raise where it is off by more than a third of a stop."""
     got = camera.configure(want)
     if abs(got.deviation_ev(want)) > 1.0 / 3.0 + 1e-9:
@@ -36,13 +36,13 @@ def arm_cameras(
     """Set cameras and arm each for one frame; return each one's time of that, s, by view."""
     armed_s = {}
     for name, camera in cameras.items():
-        configure(name, camera, want)
+        configure_camera(name, camera, want)
         camera.arm(1, triggers[name])
         armed_s[name] = camera.clock_s()
     return armed_s
 
 
-def collect(
+def collect_frames(
     cameras: Mapping[str, Camera],
     want: Exposure,
     armed_s: Mapping[str, float],
@@ -63,7 +63,7 @@ def frame_timeout_s(step: Step, view: View) -> float:
     return float(step.settings["exposure_s"]) + view.readout_s + FRAME_MARGIN_S
 
 
-def encode(
+def encode_step_frame(
     frame: Frame,
     view: View,
     camera: Camera,

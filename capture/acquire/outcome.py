@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from capture.acquire.frames import encode
+from capture.acquire.frames import encode_step_frame
 from capture.devices.box import Box
 from capture.devices.camera import Camera, CameraError, Frame, Trigger
 from capture.devices.led_box import Eyes
@@ -30,7 +30,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 @dataclass(frozen=True, slots=True)
-class Acquired:
+class AcquisitionResult:
     """What a run of a plan did.
 
     Attributes
@@ -109,7 +109,7 @@ class CaptureRun:
     plan, rig, cameras, session, operator, eyes, force_limit_n, all_brackets
         See `capture.acquire.run.run_plan`.
     steps, frames, stale, retakes : int
-        What was done so far, see `Acquired`.
+        What was done so far, see `AcquisitionResult`.
     """
 
     plan: Plan
@@ -131,11 +131,11 @@ class CaptureRun:
         records = self.session.frames()
         self._attempts = {(record.step_id, record.camera): record.attempt for record in records}
 
-    def steps_to_do(self) -> list[Step]:
+    def pending_steps(self) -> list[Step]:
         """Return the steps that lack a frame of any camera, once each, in the plan's order."""
-        return list({step.id: step for step, _ in self.session.todo()}.values())
+        return list({step.id: step for step, _ in self.session.pending_frames()}.values())
 
-    def cameras_of(self, step: Step) -> dict[str, Camera]:
+    def step_cameras(self, step: Step) -> dict[str, Camera]:
         """Return the cameras of a step, by view."""
         return {name: self.cameras[name] for name in step.cameras}
 
@@ -147,12 +147,14 @@ class CaptureRun:
         """Return the names of lights by number, joined by +."""
         return "+".join(self.rig.lights[led].name for led in leds)
 
-    def encoded(self, step: Step, name: str, frame: Frame, light: Mapping[str, Value]) -> bytes:
+    def encode_frame(
+        self, step: Step, name: str, frame: Frame, light: Mapping[str, Value]
+    ) -> bytes:
         """Return a frame of the view ``name`` as our DNG."""
         view, camera = self.rig.view(name), self.cameras[name]
-        return encode(frame, view, camera, step, self.session, light)
+        return encode_step_frame(frame, view, camera, step, self.session, light)
 
-    def keep(
+    def commit_frames(
         self,
         step: Step,
         frames: Mapping[str, Frame],
@@ -160,7 +162,7 @@ class CaptureRun:
         light: Mapping[str, Value],
         tries: int,
         t_box_s: float | None,
-        noted: Mapping[str, Value],
+        journal_entries: Mapping[str, Value],
     ) -> None:
         """Commit the frames of a step, one a camera.
 
@@ -184,9 +186,9 @@ class CaptureRun:
             self.session.commit(
                 step.id,
                 name,
-                self.encoded(step, name, frame, light),
+                self.encode_frame(step, name, frame, light),
                 settings=dict(step.settings),
-                actual={**shot, "serial": frame.serial, "tries": tries, **noted},
+                actual={**shot, "serial": frame.serial, "tries": tries, **journal_entries},
                 t_box_s=t_box_s,
                 t_host_s=self.operator.clock(),
                 attempt=attempt,
@@ -195,26 +197,26 @@ class CaptureRun:
             self.frames += 1
         self.steps += 1
 
-    def missed(self, step: Step, attempt: int, why: object) -> str:
+    def note_retake(self, step: Step, attempt: int, reason: object) -> str:
         """Note that a step must be taken again; return why."""
-        log.warning("step %s, attempt %d: %s", step.id, attempt, why)
+        log.warning("step %s, attempt %d: %s", step.id, attempt, reason)
         self.retakes += 1
-        return str(why)
+        return str(reason)
 
-    def leave_out(self, ids: Sequence[str], reason: str, about: Mapping[str, Value]) -> None:
+    def omit_steps(self, ids: Sequence[str], reason: str, about: Mapping[str, Value]) -> None:
         """Note in the session that steps are not taken, and why."""
         time_s = self.operator.clock()
-        self.session.leave_out(ids, reason=reason, about=about, t_host_s=time_s)
+        self.session.omit_steps(ids, reason=reason, about=about, t_host_s=time_s)
 
-    def given_up(self, what: str, why: str) -> AcquisitionError:
+    def retry_limit_error(self, label: str, reason: str) -> AcquisitionError:
         """Return the error of a step that failed too often, with what to do about it."""
-        advice = next_attempt(captured=bool(self.session.frames()))
-        return AcquisitionError(f"{what}: failed {MAX_ATTEMPTS} times ({why}); {advice}")
+        advice = recovery_advice(captured=bool(self.session.frames()))
+        return AcquisitionError(f"{label}: failed {MAX_ATTEMPTS} times ({reason}); {advice}")
 
-    def account(self, dead_leds: Iterable[int] = ()) -> Acquired:
+    def summarize(self, dead_leds: Iterable[int] = ()) -> AcquisitionResult:
         """Return what was done, with the numbers of the LEDs that drew no current."""
         dead = tuple(self.rig.lights[led].name for led in sorted(dead_leds))
-        return Acquired(self.steps, self.frames, self.stale, self.retakes, dead)
+        return AcquisitionResult(self.steps, self.frames, self.stale, self.retakes, dead)
 
     def tear_down(self, box: Box) -> None:
         """Put the light out and let the cameras go; nothing here hides the error that led here."""
@@ -228,20 +230,22 @@ class CaptureRun:
                 camera.abort()
 
 
-def next_attempt(*, captured: bool) -> str:
+def recovery_advice(*, captured: bool) -> str:
     """Return what to do after a capture failed, by whether the session has frames."""
     if captured:
         return "the session keeps its frames: remove the cause, then add --resume to the command"
     return "no frame was recorded: remove the cause, then run the command again"
 
 
-def refuse_step(step: Step, what: str, *, done: str = "lit") -> AcquisitionError:
-    """Return the error of a step that asks for more than its box allows; nothing was ``done``."""
-    return AcquisitionError(f"step {step.id}: {what}; nothing was {done}: change the plan")
+def step_limit_error(step: Step, problem: str, *, action: str = "lit") -> AcquisitionError:
+    """Return the error of a step that asks for more than its box allows; nothing was ``action``."""
+    return AcquisitionError(f"step {step.id}: {problem}; nothing was {action}: change the plan")
 
 
-def require_trigger_line(name: str, camera: Camera, why: str) -> None:
-    """Raise where a box's line cannot release a camera; ``why`` names the line and the need."""
+def require_trigger_line(name: str, camera: Camera, trigger_line: str) -> None:
+    """Raise if a camera cannot be released by ``trigger_line``, the name of a controller's line."""
     if Trigger.EDGE not in camera.info.triggers:
         serial = camera.info.serial
-        raise CameraError(f"view {name!r}: the camera {serial} cannot be released by the {why}")
+        raise CameraError(
+            f"view {name!r}: the camera {serial} cannot be released by the {trigger_line}"
+        )

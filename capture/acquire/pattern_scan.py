@@ -9,12 +9,12 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from capture.acquire.frames import configure, wanted_exposure
+from capture.acquire.frames import configure_camera, requested_exposure
 from capture.acquire.outcome import MAX_ATTEMPTS, CaptureRun
 from capture.acquire.table_run import TableRun
 from capture.devices.camera import Frame
 from capture.devices.gradient_sphere import ANALYZER_DEG, GradientSphereBox, PatternRow
-from capture.devices.led_box import Judgment
+from capture.devices.led_box import TableEvaluation
 from capture.devices.port import CommandRefused
 from capture.devices.wire import Code
 from capture.plan import Step, Value
@@ -28,7 +28,7 @@ MAX_DARK_GAPS = 5
 
 
 @dataclass(frozen=True, slots=True)
-class Taken:
+class StepFrames:
     """The frames of one step, one a camera."""
 
     step: Step
@@ -41,19 +41,19 @@ class Taken:
     """Name of the scan."""
 
 
-def reading_deg(step: Step) -> float:
+def analyzer_reading_deg(step: Step) -> float:
     """Return the reading of the analyser that a step asks for, degrees.
 
     Examples
     --------
-    >>> reading_deg(Step("a", "ball", {}, {"polarizer": "crossed"}, ("cam",)))
+    >>> analyzer_reading_deg(Step("a", "ball", {}, {"polarizer": "crossed"}, ("cam",)))
     90.0
     """
     given = step.settings.get("analyser_deg")
     return ANALYZER_DEG[str(step.settings["polarizer"])] if given is None else float(given)
 
 
-class Scanner:
+class PatternScanner:
     """Scans with one sphere in one run.
 
     Parameters
@@ -71,7 +71,7 @@ class Scanner:
         self._run, self._sphere, self._keep_alive = run, sphere, keep_alive
         self._scans = 0
 
-    def scan(self, steps: Sequence[Step]) -> list[Taken]:
+    def scan(self, steps: Sequence[Step]) -> list[StepFrames]:
         """Take steps that share exposure and cameras; nothing is committed.
 
         Raises
@@ -79,7 +79,7 @@ class Scanner:
         AcquisitionError
             When a camera loses a step's frame three times.
         """
-        found: dict[str, Taken] = {}
+        found: dict[str, StepFrames] = {}
         why = ""
         for attempt in range(1, MAX_ATTEMPTS + 1):
             left = [step for step in steps if step.id not in found]
@@ -89,9 +89,9 @@ class Scanner:
             if len(found) == len(steps):
                 return [found[step.id] for step in steps]
             log.warning("scan of %s, attempt %d: %s", steps[0].id, attempt, why)
-        raise self._run.given_up(f"scan of {steps[0].id}", why)
+        raise self._run.retry_limit_error(f"scan of {steps[0].id}", why)
 
-    def commit(self, taken: Sequence[Taken], actual: Mapping[str, Value]) -> None:
+    def commit(self, taken: Sequence[StepFrames], actual: Mapping[str, Value]) -> None:
         """Commit the frames of a scan, with what else is known of them."""
         dead = self._run.light_names(sorted(self._sphere.failed_leds))
         for one in taken:
@@ -99,24 +99,29 @@ class Scanner:
             light: dict[str, Value] = {
                 "pattern": str(step.settings["pattern"]),
                 "level": float(step.settings["level"]),
-                "analyser_deg": reading_deg(step),
+                "analyser_deg": analyzer_reading_deg(step),
             }
             if dead:
                 light["dead_lights"] = dead
             noted = {"token": one.token, **light, **actual}
-            self._run.keep(
-                step, one.frames, light=light, tries=one.tries, t_box_s=one.t_box_s, noted=noted
+            self._run.commit_frames(
+                step,
+                one.frames,
+                light=light,
+                tries=one.tries,
+                t_box_s=one.t_box_s,
+                journal_entries=noted,
             )
             self._keep_alive()
 
-    def encoded(self, one: Taken, name: str) -> bytes:
+    def encode_frame(self, taken: StepFrames, name: str) -> bytes:
         """Return one camera's frame of a step as a file."""
-        light = {"pattern": str(one.step.settings["pattern"])}
-        return self._run.encoded(one.step, name, one.frames[name], light)
+        light = {"pattern": str(taken.step.settings["pattern"])}
+        return self._run.encode_frame(taken.step, name, taken.frames[name], light)
 
-    def turn_to(self, step: Step) -> None:
+    def rotate_analyzer(self, step: Step) -> None:
         """Begin to turn the analyser to where a step wants it."""
-        self._sphere.set_analyser(reading_deg(step))
+        self._sphere.set_analyzer(analyzer_reading_deg(step))
 
     def pause(self, seconds: float) -> None:
         """Let time pass while all boxes know that the host is there."""
@@ -128,16 +133,16 @@ class Scanner:
 
     # one sequence -----------------------------------------------------------------------------
 
-    def _sequence(self, steps: Sequence[Step], attempt: int) -> tuple[list[Taken], str]:
+    def _sequence(self, steps: Sequence[Step], attempt: int) -> tuple[list[StepFrames], str]:
         """Run steps as one table; return those of which every camera has a frame."""
         run, sphere = self._run, self._sphere
-        for name, camera in run.cameras_of(steps[0]).items():
-            configure(name, camera, wanted_exposure(steps[0]))
+        for name, camera in run.step_cameras(steps[0]).items():
+            configure_camera(name, camera, requested_exposure(steps[0]))
         mask = run.camera_mask(steps[0])
         rows = [
             PatternRow(
                 str(step.settings["pattern"]),
-                reading_deg(step),
+                analyzer_reading_deg(step),
                 float(step.settings["level"]),
                 float(step.settings["dwell_s"]),
                 mask,
@@ -146,9 +151,9 @@ class Scanner:
         ]
         sphere.load(rows)
         sphere.arm()
-        sphere.set_analyser(rows[0].analyser_deg)
+        sphere.set_analyzer(rows[0].analyser_deg)
         sphere.wait_settled()
-        log.info("the box judges the scan: %s", self._judged(len(rows)))
+        log.info("the box judges the scan: %s", self._arm_scan(len(rows)))
         self._scans += 1
         token = f"{run.operator.run_id}.{self._scans}.{attempt}"
         table = TableRun(
@@ -164,11 +169,11 @@ class Scanner:
         taken = []
         for number, step in enumerate(steps):
             for row, frames in table.rows(number, number + 1):
-                taken.append(Taken(step, frames, table.times_s[row], attempt, token))
+                taken.append(StepFrames(step, frames, table.times_s[row], attempt, token))
             self._keep_alive()
         return taken, table.end()
 
-    def _judged(self, rows: int) -> Judgment:
+    def _arm_scan(self, rows: int) -> TableEvaluation:
         """Arm the table, after darkness where the light of a moment ago makes it too much."""
         for _ in range(MAX_DARK_GAPS):
             try:

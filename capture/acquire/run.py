@@ -4,11 +4,11 @@ from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any
 
-from capture.acquire.outcome import Acquired, AcquisitionError, CaptureRun, Operator
+from capture.acquire.outcome import AcquisitionError, AcquisitionResult, CaptureRun, Operator
 from capture.devices.camera import Camera, check_serials
 from capture.devices.led_box import Eyes
 from capture.plan import Plan
-from capture.plan.rig_kinds import RIG_KINDS, kind_of
+from capture.plan.rig_kinds import RIG_KINDS, find_rig_kind
 from capture.rig import Rig
 from capture.session import Session
 
@@ -24,7 +24,7 @@ def run_plan(
     eyes: Eyes = "open",
     force_limit_n: float | None = None,
     all_brackets: bool = False,
-) -> Acquired:
+) -> AcquisitionResult:
     """Capture what the session still lacks of a plan.
 
     Parameters
@@ -64,7 +64,7 @@ def run_plan(
         When the operator said so.
     """
     plan.check(rig)
-    kind = kind_of(rig)
+    kind = find_rig_kind(rig)
     if (box := RIG_KINDS[kind].box) not in boxes:
         raise AcquisitionError(f"box {box!r}: no port was given; add --port {box}=URL")
     check_serials(cameras, [(view.name, view.serial) for view in rig.views])
@@ -74,5 +74,5 @@ def run_plan(
         "all_brackets": all_brackets,
     }
     run = CaptureRun(plan, rig, cameras, session, operator or Operator(), **asked)
-    acquire: Callable[..., Acquired] = import_module(f"capture.acquire.{kind}").acquire
+    acquire: Callable[..., AcquisitionResult] = import_module(f"capture.acquire.{kind}").acquire
     return acquire(run, boxes)

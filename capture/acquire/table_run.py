@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.acquire.frames import frame_timeout_s, wanted_exposure
+from capture.acquire.frames import frame_timeout_s, requested_exposure
 from capture.acquire.outcome import CaptureRun
 from capture.devices.camera import (
     Camera,
@@ -125,7 +125,7 @@ class FrameStream:
         self.stale = 0
         self.refused: list[str] = []
 
-    def until(self, row: int) -> dict[int, Frame]:
+    def read_until(self, row: int) -> dict[int, Frame]:
         """Return the frames of all rows up to `row` that were not asked for before."""
         found: dict[int, Frame] = {}
         while not self._ended:
@@ -149,7 +149,7 @@ class FrameStream:
         except FrameRefused as error:
             self.refused.append(str(error))
             return False
-        row = self._row_of(frame)
+        row = self._find_row(frame)
         if row is None or row <= self._last_row:
             self.stale += 1
             return False
@@ -169,7 +169,7 @@ class FrameStream:
         self._next = (row, frame)
         return True
 
-    def _row_of(self, frame: Frame) -> int | None:
+    def _find_row(self, frame: Frame) -> int | None:
         box_s = frame.t_start_s - self._clock.offset_s
         place = int(np.argmin(np.abs(self._times - box_s)))
         allowed_s = self._clock.uncertainty_s + CLOCK_DRIFT_S_PER_S * abs(box_s - self._clock.box_s)
@@ -217,7 +217,7 @@ class TableRun:
         keep_alive: Callable[[], object] = lambda: None,
     ) -> None:
         self._run, self._box, self._steps, self._what = run, box, steps, what
-        self._cameras = run.cameras_of(steps[0])
+        self._cameras = run.step_cameras(steps[0])
         clocks = {name: compare_clocks(camera, box.ping) for name, camera in self._cameras.items()}
         keep_alive()
         for camera in self._cameras.values():
@@ -235,7 +235,7 @@ class TableRun:
                 row_times_s=self.times_s,
                 dwell_s=dwell_s,
                 clock=clocks[name],
-                want=wanted_exposure(steps[0]),
+                want=requested_exposure(steps[0]),
                 lag_s=run.rig.view(name).shutter_lag_s,
                 timeout_s=frame_timeout_s(steps[0], run.rig.view(name)),
             )
@@ -260,7 +260,7 @@ class TableRun:
     def rows(self, first: int, last: int) -> Iterator[tuple[int, dict[str, Frame]]]:
         """Yield the rows before ``last`` of which every camera has its frame, with the frames."""
         # camera by camera, so that each works on what it has just seen
-        found = {name: stream.until(last - 1) for name, stream in self._streams.items()}
+        found = {name: stream.read_until(last - 1) for name, stream in self._streams.items()}
         for row in range(first, last):
             frames = {name: some.pop(row) for name, some in found.items() if row in some}
             if len(frames) == len(self._streams):

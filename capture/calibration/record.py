@@ -15,7 +15,7 @@ from capture.documents import InputError
 
 
 def freeze_arrays(
-    row: Any, shape: tuple[int, ...], *names: str, kind: Any = np.float64, of: str = ""
+    row: Any, shape: tuple[int, ...], *names: str, kind: Any = np.float64, owner: str = ""
 ) -> None:
     """Replace fields by read-only copies of the type; refuse another shape or infinite numbers.
 
@@ -27,7 +27,7 @@ def freeze_arrays(
         if array.shape != shape or not np.isfinite(array).all():
             raise ValueError(
                 f"{type(row).__name__}.{name}: got shape {array.shape}, expected finite numbers of"
-                f" shape {shape}{of}"
+                f" shape {shape}{owner}"
             )
         array.setflags(write=False)
         object.__setattr__(row, name, array)
@@ -95,7 +95,7 @@ class Quantity:
         object.__setattr__(self, "stderr", stderr)
 
     @property
-    def known_stderr(self) -> Float64Array:
+    def stderr_or_zero(self) -> Float64Array:
         """Standard errors of the value's shape; 0 where none is stated."""
         return np.zeros_like(self.value) if self.stderr is None else self.stderr
 
@@ -205,7 +205,7 @@ class Provenance(Origin):
     serial: str
 
 
-def of_devices(
+def make_device_calibration(
     kind: str,
     values: Mapping[str, Mapping[str, Quantity]],
     meaning: Mapping[str, str],
@@ -239,7 +239,7 @@ def of_devices(
     )
 
 
-def of_one_device(
+def make_single_device_calibration(
     kind: str,
     values: Mapping[str, Quantity],
     meaning: Mapping[str, str],
@@ -247,9 +247,9 @@ def of_one_device(
     maps: Mapping[str, Float32Array] | None = None,
     **about: Unpack[Provenance],
 ) -> Calibration:
-    """Return the `Calibration` of one device; see `of_devices`."""
+    """Return the `Calibration` of one device; see `make_device_calibration`."""
     origin = cast(Origin, {key: word for key, word in about.items() if key != "serial"})
-    return of_devices(kind, {about["serial"]: values}, meaning, maps=maps, **origin)
+    return make_device_calibration(kind, {about["serial"]: values}, meaning, maps=maps, **origin)
 
 
 Column: TypeAlias = NDArray[Any] | tuple[NDArray[Any], NDArray[Any]]
@@ -294,9 +294,9 @@ class DeviceColumns:
 
     def errors(self, name: str) -> Float64Array:
         """Return the standard errors of a quantity, shape (N, ...); 0 where none is stated."""
-        return np.array([self._calibration.quantity(n, name).known_stderr for n in self.names])
+        return np.array([self._calibration.quantity(n, name).stderr_or_zero for n in self.names])
 
-    def both(self, name: str) -> tuple[Float64Array, Float64Array]:
+    def values_and_errors(self, name: str) -> tuple[Float64Array, Float64Array]:
         """Return the values of a quantity and their standard errors."""
         return self.values(name), self.errors(name)
 

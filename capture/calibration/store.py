@@ -34,25 +34,25 @@ from capture.calibration.record import (
     digest_arrays,
     require_plain_name,
 )
-from capture.calibration.validity import Drift, drift, require
+from capture.calibration.validity import CalibrationDrift, measure_drift, require_valid
 
 __all__ = [
     "CALIBRATION_KINDS",
     "SCHEMA",
     "Calibration",
     "CalibrationDamaged",
+    "CalibrationDrift",
     "CalibrationError",
     "CalibrationExpired",
     "CalibrationMismatch",
     "CalibrationMissing",
-    "Drift",
     "Quantity",
     "Source",
     "default_validity",
     "digest_arrays",
-    "drift",
     "load",
-    "require",
+    "measure_drift",
+    "require_valid",
     "save",
 ]
 

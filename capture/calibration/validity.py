@@ -10,7 +10,7 @@ from capture.calibration.record import Calibration, CalibrationExpired, Calibrat
 
 
 @dataclass(frozen=True, slots=True)
-class Drift:
+class CalibrationDrift:
     """How one number moved between two calibrations.
 
     Attributes
@@ -36,7 +36,7 @@ class Drift:
         return f"{self.serial} {self.name}: {self.old:.6g} -> {self.new:.6g} ({size})"
 
 
-def require(
+def require_valid(
     calibration: Calibration,
     *,
     rig: str,
@@ -88,7 +88,7 @@ def require(
     return calibration
 
 
-def drift(old: Calibration, new: Calibration) -> tuple[Drift, ...]:
+def measure_drift(old: Calibration, new: Calibration) -> tuple[CalibrationDrift, ...]:
     """Compare two calibrations of one kind, number by number, largest change first.
 
     Parameters
@@ -111,7 +111,7 @@ def drift(old: Calibration, new: Calibration) -> tuple[Drift, ...]:
             f"drift: got {old.kind!r} of rig {old.rig!r} and {new.kind!r} of rig {new.rig!r},"
             " expected two of one kind and one rig"
         )
-    rows: list[Drift] = []
+    rows: list[CalibrationDrift] = []
     for serial in sorted(set(old.values) & set(new.values)):
         for name in sorted(set(old.values[serial]) & set(new.values[serial])):
             a, b = old.values[serial][name], new.values[serial][name]
@@ -126,7 +126,7 @@ def drift(old: Calibration, new: Calibration) -> tuple[Drift, ...]:
                 label = name + "".join(f"[{i}]" for i in index)
                 sigmas = change / float(error[index]) if error[index] > 0 else None
                 rows.append(
-                    Drift(
+                    CalibrationDrift(
                         serial, label, float(a.value[index]), float(b.value[index]), change, sigmas
                     )
                 )

@@ -160,7 +160,7 @@ class Box:
             payload = self._port.ask("SYST:ERR?")
             code, comma, text = payload.partition(",")
             if not comma or not code.removeprefix("-").isdecimal():
-                raise self._bad("SYST:ERR?", payload, 'code,"text"')
+                raise self._bad_answer("SYST:ERR?", payload, 'code,"text"')
             if int(code) == 0:
                 break
             found.append((int(code), text.strip('"')))
@@ -182,7 +182,7 @@ class Box:
 
     # answers ----------------------------------------------------------------------------------
 
-    def _bad(self, text: str, payload: str, expected: str) -> BadAnswer:
+    def _bad_answer(self, text: str, payload: str, expected: str) -> BadAnswer:
         return BadAnswer(
             f"{self._port.url}: {text!r} was answered with {payload!r}, expected {expected}"
         )
@@ -205,7 +205,7 @@ class Box:
         try:
             return decode(payload)
         except (ValueError, KeyError) as exc:
-            raise self._bad(shown or text, payload, expected) from exc
+            raise self._bad_answer(shown or text, payload, expected) from exc
 
     def _read_or_none(
         self, text: str, decode: Callable[[str], T], expected: str, *, shown: str = ""
@@ -218,14 +218,14 @@ class Box:
     def _number(self, text: str) -> float:
         payload, value = self._read(text, lambda got: (got, float(got)), "a number")
         if not math.isfinite(value):
-            raise self._bad(text, payload, "a finite number")
+            raise self._bad_answer(text, payload, "a finite number")
         return value
 
     def _flag(self, text: str) -> bool:
         return self._read(text, {"0": False, "1": True}.__getitem__, "0 or 1")
 
     def _count(self, text: str, expected: str, *, shown: str) -> int:
-        return self._read(text, whole_number, expected, shown=shown)
+        return self._read(text, parse_whole_number, expected, shown=shown)
 
     def _token_time(self, command: str, token: str, *, shown: str = "") -> float:
         """Give a command with a token; return the box's time at which it was done, s."""
@@ -234,7 +234,7 @@ class Box:
             name, _, t_us = payload.partition(",")
             if name != token:
                 raise ValueError(payload)
-            return whole_number(t_us) / 1e6
+            return parse_whole_number(t_us) / 1e6
 
         return self._read(f"{command} {token}", time_s, "token,us", shown=shown or command)
 
@@ -258,19 +258,19 @@ class Box:
             left_s -= every_s
 
 
-def whole_number(text: str) -> int:
+def parse_whole_number(text: str) -> int:
     """Return a number that is written in digits only; raise ValueError otherwise."""
     if not text.isdecimal():
         raise ValueError(text)
     return int(text)
 
 
-def decimal(field: str, value: float, digits: int) -> str:
+def format_decimal(field: str, value: float, digits: int) -> str:
     """Return a finite number in as few digits as it needs, at most ``digits`` after the point.
 
     Examples
     --------
-    >>> decimal("seconds", 0.25, 6), decimal("angle_deg", -0.0, 3)
+    >>> format_decimal("seconds", 0.25, 6), format_decimal("angle_deg", -0.0, 3)
     ('0.25', '0')
     """
     if not math.isfinite(value):

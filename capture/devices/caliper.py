@@ -12,10 +12,12 @@ because the tape gives way.
 from dataclasses import dataclass
 from typing import ClassVar, Final, Literal, get_args
 
-from capture.devices.box import Box, BoxStatus, StatusBit, decimal
+from capture.devices.box import Box, BoxStatus, StatusBit, format_decimal
 
-Ended = Literal["reached", "force", "stall", "detached", "no_home", "stopped"]
-_END_WORDS: dict[str, Ended] = {word.replace("_", "").upper(): word for word in get_args(Ended)}
+MoveEnd = Literal["reached", "force", "stall", "detached", "no_home", "stopped"]
+_MOVE_ENDS_BY_WORD: dict[str, MoveEnd] = {
+    word.replace("_", "").upper(): word for word in get_args(MoveEnd)
+}
 _TRAVEL_POLL_S = 0.1
 """Silence between two renewals of the lease; shorter than the shortest lease."""
 _TRAVEL_MARGIN_S = 2.0
@@ -28,7 +30,7 @@ class MoveReport:
 
     number: int
     """Moves since the box was made, this one included."""
-    ended: Ended
+    ended: MoveEnd
     """reached: the jaws stand where they were sent. force: the limit was met; the jaws have gone
     back to where they stood before. stall: the motor has lost steps; home again. detached: the
     force fell to nothing at once; the jaws stand where that was. no_home: the home mark was not
@@ -92,7 +94,7 @@ class CaliperBox(Box):
         CommandRefused
             Out of the range of the sensor (-222), or below the force that there is now (106).
         """
-        self._port.ask(f"CAL:FORC:LIM {decimal('newton', newton, 4)}")
+        self._port.ask(f"CAL:FORC:LIM {format_decimal('newton', newton, 4)}")
 
     def force_limit_n(self) -> float | None:
         """Return the force limit, N; None: nobody has set one, and nothing will move."""
@@ -114,7 +116,7 @@ class CaliperBox(Box):
 
     def set_angle(self, angle_deg: float) -> None:
         """Turn the jaws to one of ``limits["angles_deg"]`` and wait; refused while skin is held."""
-        self._port.ask(f"CAL:ANG {decimal('angle_deg', angle_deg, 4)}")
+        self._port.ask(f"CAL:ANG {format_decimal('angle_deg', angle_deg, 4)}")
         self._wait(360.0 / float(self.limits["turn_deg_per_s"]) + _TRAVEL_MARGIN_S)
 
     def angle_deg(self) -> float:
@@ -131,7 +133,7 @@ class CaliperBox(Box):
         """
         self._port.ask("CAL:ATT")
 
-    def attached(self) -> bool:
+    def is_attached(self) -> bool:
         """Tell whether the box holds skin, as far as its force sensor can tell."""
         return self._flag("CAL:ATT?")
 
@@ -153,7 +155,7 @@ class CaliperBox(Box):
 
     def last_move(self) -> MoveReport | None:
         """Return how the last move ended, None when there was none since power-up."""
-        return self._read_or_none("CAL:LAST?", _report, "number,END,step,mm,N,us")
+        return self._read_or_none("CAL:LAST?", _parse_report, "number,END,step,mm,N,us")
 
     def release(self) -> None:
         """Let the skin go, at once; a person has to tape the jaws again."""
@@ -171,7 +173,7 @@ class CaliperBox(Box):
         self._wait(4.0 * travel_mm / float(limits["speed_mm_per_s"]) + _TRAVEL_MARGIN_S)
         report = self.last_move()
         if report is None or report.number != number:
-            raise self._bad("CAL:LAST?", str(report), f"the end of move {number}")
+            raise self._bad_answer("CAL:LAST?", str(report), f"the end of move {number}")
         return report
 
     def _wait(self, timeout_s: float) -> None:
@@ -179,9 +181,9 @@ class CaliperBox(Box):
         self._wait_settled(timeout_s, _TRAVEL_POLL_S, self._port.listen, fault)
 
 
-def _report(payload: str) -> MoveReport:
+def _parse_report(payload: str) -> MoveReport:
     number, ended, step, mm, newton, t_us = payload.split(",")
-    end, t_s = _END_WORDS[ended], int(t_us) / 1e6
+    end, t_s = _MOVE_ENDS_BY_WORD[ended], int(t_us) / 1e6
     return MoveReport(int(number), end, int(step), float(mm), float(newton), t_s)
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
-from capture.devices.led_box import LEVEL_STEPS, Judgment, LedBox, LedStatus
+from capture.devices.led_box import LEVEL_STEPS, LedBox, LedStatus, TableEvaluation
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class DomeBox(LedBox):
         """
         self._send_table("SEQ", [row.text() for row in rows], joint=";")
 
-    def arm_sequence(self, rows: int) -> Judgment:
+    def arm_sequence(self, rows: int) -> TableEvaluation:
         """Let the box judge its table of `rows` rows and make it ready for one run.
 
         Raises

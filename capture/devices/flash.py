@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from capture.devices.box import Box, BoxStatus, StatusBit, decimal
+from capture.devices.box import Box, BoxStatus, StatusBit, format_decimal
 from capture.devices.port import PortTimeout
 
 FLASH_KIND = "flash"
@@ -51,7 +51,7 @@ class ChargeState:
     """When it would, s; 0 when ready."""
 
 
-class Status(BoxStatus):
+class FlashStatus(BoxStatus):
     """The bits of ``STAT?``."""
 
     __slots__ = ()
@@ -78,9 +78,9 @@ class FlashBox(Box):
 
     kind = FLASH_KIND
 
-    def status(self) -> Status:
+    def status(self) -> FlashStatus:
         """Return the status bits."""
-        return Status(int(self._number("STAT?")))
+        return FlashStatus(int(self._number("STAT?")))
 
     # analyser ---------------------------------------------------------------------------------
 
@@ -95,15 +95,15 @@ class FlashBox(Box):
         """Return the stop that was last asked for."""
         return self._read("FLAS:POL?", _POLARIZER_WORDS.__getitem__, "PAR or CROS")
 
-    def set_analyser(self, angle_deg: float) -> None:
+    def set_analyzer(self, angle_deg: float) -> None:
         """Begin to turn the analyser to a reading, in degrees."""
-        self._port.ask(f"FLAS:POL:ANG {decimal('angle_deg', angle_deg, 9)}")
+        self._port.ask(f"FLAS:POL:ANG {format_decimal('angle_deg', angle_deg, 9)}")
 
     def analyser_deg(self) -> float:
         """Return the reading that the analyser has or turns to, in degrees."""
         return self._number("FLAS:POL:ANG?")
 
-    def settled(self) -> bool:
+    def is_settled(self) -> bool:
         """Tell whether the analyser stands still."""
         return self._flag("*OPC?")
 
@@ -111,7 +111,7 @@ class FlashBox(Box):
 
     def set_power(self, power: float) -> None:
         """Set the power of the next pops, 0 to 1 of full."""
-        self._port.ask(f"FLAS:POW {decimal('power', power, 9)}")
+        self._port.ask(f"FLAS:POW {format_decimal('power', power, 9)}")
 
     def power(self) -> float:
         """Return the power of the next pop, 0 to 1 of full."""
@@ -119,7 +119,7 @@ class FlashBox(Box):
 
     def set_sync_delay(self, seconds: float) -> None:
         """Set how long after the camera line the flash pops, in s; 0 at power-up."""
-        self._port.ask(f"FLAS:SYNC {decimal('seconds', seconds * 1e6, 9)}")
+        self._port.ask(f"FLAS:SYNC {format_decimal('seconds', seconds * 1e6, 9)}")
 
     def sync_delay_s(self) -> float:
         """Return how long after the camera line the flash pops, in s."""
@@ -157,11 +157,11 @@ class FlashBox(Box):
         A retry on the line never pops twice. After `PortTimeout` or `LinkLost` it is not known
         whether it popped: `last_pop` tells, unless the box has rebooted.
         """
-        return self._read(f"FLAS:FIRE {token}", _report, _REPORT_FIELDS, shown="FLAS:FIRE")
+        return self._read(f"FLAS:FIRE {token}", _parse_report, _REPORT_FIELDS, shown="FLAS:FIRE")
 
     def last_pop(self) -> FlashReport | None:
         """Return the report of the last pop since power-up, None when there was none."""
-        return self._read_or_none("FLAS:LAST?", _report, _REPORT_FIELDS)
+        return self._read_or_none("FLAS:LAST?", _parse_report, _REPORT_FIELDS)
 
     def count(self) -> int:
         """Return the number of pops since the box was made."""
@@ -175,13 +175,13 @@ class FlashBox(Box):
 
     def lamp_on(self, seconds: float) -> None:
         """Light the modelling lamps for `seconds` (at most 0.5) from now."""
-        self._port.ask(f"FLAS:LAMP ON,{decimal('seconds', seconds * 1e3, 9)}")
+        self._port.ask(f"FLAS:LAMP ON,{format_decimal('seconds', seconds * 1e3, 9)}")
 
     def lamp_off(self) -> None:
         """Put the modelling lamps out."""
         self._port.ask("FLAS:LAMP OFF")
 
-    def lamp_lit(self) -> bool:
+    def is_lamp_lit(self) -> bool:
         """Tell whether the modelling lamps are on."""
         return self._flag("FLAS:LAMP?")
 
@@ -191,7 +191,7 @@ def _charge_state(payload: str) -> ChargeState:
     return ChargeState(float(charge), int(ready) == 1, int(wait_ms) / 1e3)
 
 
-def _report(payload: str) -> FlashReport:
+def _parse_report(payload: str) -> FlashReport:
     token, t_us, power, stop, angle_deg, count = payload.split(",")
     polarizer, t_s = _POLARIZER_WORDS[stop], int(t_us) / 1e6
     return FlashReport(token, t_s, float(power), polarizer, float(angle_deg), int(count))

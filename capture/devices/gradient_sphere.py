@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Final, Literal
 
-from capture.devices.box import StatusBit, decimal
-from capture.devices.led_box import LEVEL_STEPS, Judgment, LedBox, LedStatus
+from capture.devices.box import StatusBit, format_decimal
+from capture.devices.led_box import LEVEL_STEPS, LedBox, LedStatus, TableEvaluation
 from capture.plan.steps import LIGHT_PATTERNS
 
 Polarizer = Literal["parallel", "crossed"]
@@ -49,7 +49,7 @@ class PatternRow:
         'DARK:0:0:30000:1'
         """
         level = 0 if self.pattern == "dark" else round(self.level * LEVEL_STEPS)
-        angle = decimal("analyser_deg", self.analyser_deg, 3)
+        angle = format_decimal("analyser_deg", self.analyser_deg, 3)
         dwell_us = round(self.dwell_s * 1e6)
         return f"{_pattern(self.pattern).upper()}:{angle}:{level}:{dwell_us}:{self.mask:X}"
 
@@ -84,15 +84,15 @@ class GradientSphereBox(LedBox):
             raise ValueError(f"polarizer: got {polarizer!r}, expected 'parallel' or 'crossed'")
         self._port.ask(f"POL {ANALYZER_DEG[polarizer]:.0f}")
 
-    def set_analyser(self, angle_deg: float) -> None:
+    def set_analyzer(self, angle_deg: float) -> None:
         """Begin to turn the analyser to a reading of 0 to 180 degrees."""
-        self._port.ask(f"POL:ANG {decimal('angle_deg', angle_deg, 3)}")
+        self._port.ask(f"POL:ANG {format_decimal('angle_deg', angle_deg, 3)}")
 
     def analyser_deg(self) -> float:
         """Return the reading that the analyser has or turns to, in degrees."""
         return self._number("POL?")
 
-    def settled(self) -> bool:
+    def is_settled(self) -> bool:
         """Tell whether the analyser stands still and no scan is running."""
         return self._flag("*OPC?")
 
@@ -117,7 +117,7 @@ class GradientSphereBox(LedBox):
         if pattern == "dark":
             self.put_out()
             return
-        span_ms = decimal("seconds", seconds * 1e3, 6)
+        span_ms = format_decimal("seconds", seconds * 1e3, 6)
         self._port.ask(f"PATT {_pattern(pattern).upper()},{span_ms},{round(level * LEVEL_STEPS)}")
 
     def put_out(self) -> None:
@@ -128,7 +128,7 @@ class GradientSphereBox(LedBox):
         """Return the pattern that is on, "dark" for none."""
         payload = self._port.ask("PATT?").lower()
         if payload not in LIGHT_PATTERNS:
-            raise self._bad("PATT?", payload, "a pattern")
+            raise self._bad_answer("PATT?", payload, "a pattern")
         return payload
 
     # scans ------------------------------------------------------------------------------------
@@ -143,7 +143,7 @@ class GradientSphereBox(LedBox):
         """
         self._send_table("SEQ", [row.text() for row in rows], joint=";")
 
-    def arm_scan(self, rows: int) -> Judgment:
+    def arm_scan(self, rows: int) -> TableEvaluation:
         """Let the box judge its table of `rows` rows and make it ready for one run.
 
         Raises

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from capture.devices import wire
-from capture.devices.box import Box, BoxStatus, StatusBit, whole_number
+from capture.devices.box import Box, BoxStatus, StatusBit, parse_whole_number
 from capture.devices.port import Port
 
 Eyes = Literal["open", "closed", "shielded"]
@@ -23,7 +23,7 @@ _MAX_PROGRAM_LINE_BYTES = 200
 
 
 @dataclass(frozen=True, slots=True)
-class Judgment:
+class TableEvaluation:
     """What the box makes of a table that it accepts."""
 
     flashes_per_s: float
@@ -39,7 +39,7 @@ class Judgment:
 
 
 @dataclass(frozen=True, slots=True)
-class Position:
+class SequencePosition:
     """Where a sequence stands."""
 
     state: str
@@ -94,11 +94,11 @@ class LedBox(Box):
         wanted = f"{len(texts)},{wire.crc16(chr(10).join(texts).encode()):04X}"
         payload = self._port.ask(f"{name}:CRC?")
         if payload != wanted:
-            raise self._bad(f"{name}:CRC?", payload, f"{wanted}, the table that was sent")
+            raise self._bad_answer(f"{name}:CRC?", payload, f"{wanted}, the table that was sent")
 
-    def _arm_table(self, rows: int) -> Judgment:
+    def _arm_table(self, rows: int) -> TableEvaluation:
         expected = "flashes,rms,duty,heat,Ws"
-        return self._read(f"SEQ:ARM {rows}", _judgment, expected, shown="SEQ:ARM")
+        return self._read(f"SEQ:ARM {rows}", _parse_evaluation, expected, shown="SEQ:ARM")
 
     def trigger(self, token: str) -> float:
         """Run the armed table once; return the box's time of its beginning, in s.
@@ -108,14 +108,14 @@ class LedBox(Box):
         """
         return self._token_time("TRIG", token)
 
-    def position(self) -> Position:
+    def position(self) -> SequencePosition:
         """Tell where the sequence stands."""
-        return self._read("SEQ:POS?", _position, "state,row,rows,token")
+        return self._read("SEQ:POS?", _parse_position, "state,row,rows,token")
 
     def step_time(self, row: int) -> float | None:
         """Return the box's time at which a row released its cameras, in s; None: it has not."""
         text, expected = f"SEQ:STEP? {row}", "us or NONE"
-        t_us = self._read_or_none(text, whole_number, expected, shown="SEQ:STEP?")
+        t_us = self._read_or_none(text, parse_whole_number, expected, shown="SEQ:STEP?")
         return None if t_us is None else t_us / 1e6
 
     def listen(self, seconds: float) -> dict[int, float]:
@@ -162,7 +162,7 @@ class LedBox(Box):
         """Return what was said of the subject's eyes."""
         payload = self._port.ask("SAFE:EYES?").lower()
         if payload not in EYE_STATES:
-            raise self._bad("SAFE:EYES?", payload, "OPEN, CLOSED or SHIELDED")
+            raise self._bad_answer("SAFE:EYES?", payload, "OPEN, CLOSED or SHIELDED")
         return payload
 
     def dose_ws(self, led: int) -> float:
@@ -174,11 +174,11 @@ class LedBox(Box):
         self._port.ask(f"DOSE:NEW {pseudonym}")
 
 
-def _judgment(payload: str) -> Judgment:
+def _parse_evaluation(payload: str) -> TableEvaluation:
     flashes, rms, duty, heat, dose_ws = (float(field) for field in payload.split(","))
-    return Judgment(flashes, rms, duty, heat, dose_ws)
+    return TableEvaluation(flashes, rms, duty, heat, dose_ws)
 
 
-def _position(payload: str) -> Position:
+def _parse_position(payload: str) -> SequencePosition:
     state, row, rows, token = payload.split(",")
-    return Position(state, int(row), int(rows), "" if token == "-" else token)
+    return SequencePosition(state, int(row), int(rows), "" if token == "-" else token)

@@ -60,7 +60,7 @@ log = logging.getLogger(__name__)
 READ_SLICE_S = 0.02
 """How long one read waits, in s; longer waits are made of slices."""
 MAX_CAPABILITY_PARTS = 1024
-NOISE_LIMIT_BYTES = 65_536
+MAX_NOISE_BYTES = 65_536
 """So many bytes without the answer among them end an attempt, whatever the clock says."""
 
 try:
@@ -198,7 +198,7 @@ class Port:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def hello(self, *, patience_s: float = 3.0) -> Hello:
+    def hello(self, *, timeout_s: float = 3.0) -> Hello:
         """Learn the epoch and the identity of the box; needed first and after each reboot.
 
         Parameters
@@ -209,11 +209,11 @@ class Port:
         self._check_thread()
         self.boot = wire.UNKNOWN_BOOT
         self._next_event = None
-        with self._translated("flush"):
+        with self._translate_errors("flush"):
             self._serial.reset_input_buffer()
         self._splitter.clear()
         self._lines.clear()
-        attempts = max(1, round(patience_s / self._timeout_s))
+        attempts = max(1, round(timeout_s / self._timeout_s))
         reply = self._exchange("SYST:HELLO?", attempts=attempts, knock=True)
         if reply.code != Code.OK:
             raise CommandRefused("SYST:HELLO?", reply.code, reply.payload)
@@ -330,9 +330,9 @@ class Port:
         self._lines.clear()
 
     @contextlib.contextmanager
-    def _translated(self, doing: str) -> Iterator[None]:
+    def _translate_errors(self, action: str) -> Iterator[None]:
         if self._serial is None:
-            raise LinkLost(f"{self.url}: cannot {doing}, the port is closed; reopen it")
+            raise LinkLost(f"{self.url}: cannot {action}, the port is closed; reopen it")
         try:
             yield
         except serial.SerialTimeoutException as exc:
@@ -340,7 +340,7 @@ class Port:
         except _LINK_FAILURES as exc:
             self.close()
             raise LinkLost(
-                f"{self.url}: the link was lost in {doing} ({exc}); whether the last act was done "
+                f"{self.url}: the link was lost in {action} ({exc}); whether the last act was done "
                 "is not known; reopen the port"
             ) from exc
 
@@ -355,7 +355,7 @@ class Port:
             # a newline lost before would glue two frames together
             line = b"\n" + frame if knock or attempt else frame
             try:
-                with self._translated("write"):
+                with self._translate_errors("write"):
                     self._serial.write(line)
             except _WriteStalled:
                 log.warning("%s: the box does not take bytes", self.url)
@@ -385,7 +385,7 @@ class Port:
         """Yield frames from the box for `seconds`; events are also kept in `events`."""
         start_s = self.clock.monotonic()
         silent_s = 0.0
-        bytes_left = NOISE_LIMIT_BYTES
+        bytes_left = MAX_NOISE_BYTES
         while True:
             while self._lines:
                 frame = self._frame_in(self._lines.popleft())
@@ -393,7 +393,7 @@ class Port:
                     yield frame
             if max(silent_s, self.clock.monotonic() - start_s) >= seconds or bytes_left <= 0:
                 return
-            with self._translated("read"):
+            with self._translate_errors("read"):
                 data = self._serial.read(max(1, self._serial.in_waiting))
             silent_s += 0.0 if data else READ_SLICE_S
             bytes_left -= len(data)

@@ -12,12 +12,12 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar, Final, Literal, get_args
 
-from capture.devices.box import Box, BoxStatus, StatusBit, decimal
+from capture.devices.box import Box, BoxStatus, StatusBit, format_decimal
 
-Shut = Literal["open", "timed", "asked", "pump", "jam", "interlock", "dark"]
-Vented = Literal["timed", "asked", "low", "lost", "high", "gauge", "interlock", "dark"]
-_SHUTTER_WORDS: dict[str, Shut] = {word.upper(): word for word in get_args(Shut)}
-_VENT_WORDS: dict[str, Vented] = {word.upper(): word for word in get_args(Vented)}
+ShutterEnd = Literal["open", "timed", "asked", "pump", "jam", "interlock", "dark"]
+SuctionEnd = Literal["timed", "asked", "low", "lost", "high", "gauge", "interlock", "dark"]
+_SHUTTER_ENDS_BY_WORD: dict[str, ShutterEnd] = {word.upper(): word for word in get_args(ShutterEnd)}
+_SUCTION_ENDS_BY_WORD: dict[str, SuctionEnd] = {word.upper(): word for word in get_args(SuctionEnd)}
 _VALVE_POLL_S = 0.1
 """Silence between two renewals of the lease; shorter than the shortest lease."""
 _VALVE_MARGIN_S = 2.0
@@ -25,14 +25,14 @@ _VALVE_MARGIN_S = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Opening:
+class ShutterOpening:
     """One opening of the source's shutter, on the box's clock."""
 
     number: int
     """Openings tried since the box was made, this one included."""
     t_open_s: float
     """When the blades had cleared the fibre and the camera's line was pulsed, s since power-up."""
-    ended: Shut
+    ended: ShutterEnd
     """open: not yet. timed: by its own end. asked: by `ProbeBox.close_shutter`, or the head was
     taken off. pump: the suction ended. jam: the blades did not close, and the LED was put out.
     interlock, dark: the box has let go of everything."""
@@ -46,7 +46,7 @@ class SuctionReport:
 
     number: int
     """Times of suction since the box was made, this one included."""
-    ended: Vented
+    ended: SuctionEnd
     """timed: by its own end. asked: by `ProbeBox.vent`. low: not reached in time, so a leak or a
     pump that does not turn. lost: it fell at once, the head has come off. high: the regulator does
     not hold it. gauge: the gauge is dead. interlock, dark: the box has let go of everything. Only
@@ -121,7 +121,7 @@ class ProbeBox(Box):
         CommandRefused
             Unless armed (-203, 108); while the pump is on or the shutter open (-213).
         """
-        self._port.ask(f"HEAD:SITE {site},{decimal('angle_deg', angle_deg, 6)}")
+        self._port.ask(f"HEAD:SITE {site},{format_decimal('angle_deg', angle_deg, 6)}")
 
     def placement(self) -> tuple[str, float] | None:
         """Return site and angle in degrees; None: nobody has said it since the head was let go."""
@@ -144,8 +144,8 @@ class ProbeBox(Box):
             placed or the pump on (-213), the skin rests (103), beyond the limits (-222), the gauge
             dead (-240), the emergency stop open (107).
         """
-        span_ms = decimal("seconds", seconds * 1e3, 6)
-        text = f"PUMP ON,{span_ms},{decimal('mbar', mbar, 6)}"
+        span_ms = format_decimal("seconds", seconds * 1e3, 6)
+        text = f"PUMP ON,{span_ms},{format_decimal('mbar', mbar, 6)}"
         return self._count(text, "the number of the suction", shown="PUMP ON")
 
     def vent(self) -> None:
@@ -184,7 +184,7 @@ class ProbeBox(Box):
         """Return what the LED is driven at, 0 to 1 of full."""
         return self._number("LED?") / float(self.limits["level_steps"])
 
-    def open_shutter(self, seconds: float) -> Opening:
+    def open_shutter(self, seconds: float) -> ShutterOpening:
         """Open the shutter for `seconds`; the camera's line is pulsed when the blades are clear.
 
         With the LED on it opens only while the head is held: an eye might be before the fibre.
@@ -198,23 +198,25 @@ class ProbeBox(Box):
             blades stuck or made dark meanwhile (-240), the dose of light reached (104), the
             emergency stop open (107).
         """
-        span_ms = decimal("seconds", seconds * 1e3, 6)
-        return self._read(f"SHUT OPEN,{span_ms}", _begun, "number,us", shown="SHUT OPEN")
+        span_ms = format_decimal("seconds", seconds * 1e3, 6)
+        return self._read(
+            f"SHUT OPEN,{span_ms}", _parse_suction_number, "number,us", shown="SHUT OPEN"
+        )
 
     def close_shutter(self) -> None:
         """Close the shutter before its own end; where it is stuck open, try to close it again."""
         self._port.ask("SHUT CLOSE")
 
-    def last_opening(self) -> Opening | None:
+    def last_opening(self) -> ShutterOpening | None:
         """Return the last opening and how it ended, None when there was none since power-up."""
         return self._read_or_none("SHUT:LAST?", _opening, "number,END,us,us")
 
-    def openings(self) -> int:
+    def count_openings(self) -> int:
         """Return how many openings were tried since the box was made."""
         return int(self._number("SHUT:COUN?"))
 
-    def cover(self, fibre: int | None) -> None:
-        """Cover all detection fibres but number `fibre`, from 0; None: uncover all. Wait for it.
+    def cover(self, fiber: int | None) -> None:
+        """Cover all detection fibres but number `fiber`, from 0; None: uncover all. Wait for it.
 
         Raises
         ------
@@ -223,10 +225,10 @@ class ProbeBox(Box):
         PortTimeout
             When the cover does not arrive.
         """
-        self._port.ask(f"FIB {'ALL' if fibre is None else fibre}")
+        self._port.ask(f"FIB {'ALL' if fiber is None else fiber}")
         self._wait(float(self.limits["cover_ms"]) / 1e3 + _VALVE_MARGIN_S)
 
-    def uncovered(self) -> int | None:
+    def uncovered_fiber(self) -> int | None:
         """Return the number of the only fibre that is not covered; None: none is covered."""
         return self._read("FIB?", lambda got: None if got == "ALL" else int(float(got)), "a number")
 
@@ -285,18 +287,18 @@ def _suction_state(payload: str) -> SuctionState:
 
 def _suction_report(payload: str) -> SuctionReport:
     number, ended, mbar, t_us = payload.split(",")
-    return SuctionReport(int(number), _VENT_WORDS[ended], float(mbar), int(t_us) / 1e6)
+    return SuctionReport(int(number), _SUCTION_ENDS_BY_WORD[ended], float(mbar), int(t_us) / 1e6)
 
 
-def _begun(payload: str) -> Opening:
+def _parse_suction_number(payload: str) -> ShutterOpening:
     number, t_us = payload.split(",")
-    return Opening(int(number), int(t_us) / 1e6, "open", math.inf)
+    return ShutterOpening(int(number), int(t_us) / 1e6, "open", math.inf)
 
 
-def _opening(payload: str) -> Opening:
+def _opening(payload: str) -> ShutterOpening:
     number, ended, open_us, shut_us = payload.split(",")
     shut_s = math.inf if shut_us == "-" else int(shut_us) / 1e6
-    return Opening(int(number), int(open_us) / 1e6, _SHUTTER_WORDS[ended], shut_s)
+    return ShutterOpening(int(number), int(open_us) / 1e6, _SHUTTER_ENDS_BY_WORD[ended], shut_s)
 
 
 DRIVER: Final = ProbeBox

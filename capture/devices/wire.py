@@ -233,7 +233,7 @@ def decode(line: bytes) -> Request | Reply | Event:
         raise BadFrame(str(exc)) from exc
 
 
-def looks_framed(line: bytes) -> bool:
+def is_frame_like(line: bytes) -> bool:
     """Tell whether a line is, or was before it was damaged, meant as a frame."""
     return line[:1] in (b"@", b"=", b"!") or _CHECKSUM_PATTERN.search(line) is not None
 

@@ -16,16 +16,16 @@ from capture.importers import light_lists
 from capture.importers.images import Photo, PhotoError, read_photo
 from capture.importers.imported_session import (
     DISTANCE_MM,
-    imported_session,
-    sha256_of,
-    stand_in_light,
-    stand_in_rig,
-    stand_in_view,
+    create_imported_session,
+    hash_file,
+    make_placeholder_light,
+    make_placeholder_rig,
+    make_placeholder_view,
 )
 from capture.importers.light_lists import LightList, LightListError
 from capture.plan import Plan, Step, Value
 from capture.rig import Rig
-from capture.session import Session, Subject
+from capture.session import Session, SubjectRecord
 
 Encoding = Literal["auto", "sRGB", "linear"]
 
@@ -36,7 +36,7 @@ LINEAR_MISFIT_RATIO = 0.8
 
 
 @dataclass(frozen=True, slots=True)
-class ImportedStack:
+class ImageStackImport:
     """What an import of pictures with a light list made."""
 
     path: str
@@ -59,9 +59,9 @@ def import_light_list(
     mask: str | Path | None = None,
     encoding: Encoding = "auto",
     mm_per_px: float | None = None,
-    subject: Subject | None = None,
+    subject: SubjectRecord | None = None,
     now: Callable[[], datetime] | None = None,
-) -> ImportedStack:
+) -> ImageStackImport:
     """Turn pictures of one object under many lights into a closed session; all, or none.
 
     Parameters
@@ -99,23 +99,23 @@ def import_light_list(
     clock = now or (lambda: datetime.now(UTC))
     if encoding not in ("auto", "sRGB", "linear"):
         raise LightListError.at("cannot be read so", "encoding", encoding, "auto, sRGB or linear")
-    found = light_lists.find(Path(directory), lights=Path(lights) if lights else None)
-    if len(found.pictures) < 3:
+    found = light_lists.find_light_list(Path(directory), lights=Path(lights) if lights else None)
+    if len(found.images) < 3:
         raise LightListError(
             "has too few pictures",
             where=str(directory),
-            faults=[Fault("pictures", str(len(found.pictures)), "at least 3, one a light")],
+            faults=[Fault("pictures", str(len(found.images)), "at least 3, one a light")],
         )
     near = mm_per_px is not None
     if mm_per_px is not None and not 0 < mm_per_px < 1e3:
         raise LightListError.at("has no such scale", "mm_per_px", str(mm_per_px), "0 < mm < 1000")
-    where_mask = Path(mask) if mask else light_lists.mask_of(found.pictures[0].parent)
+    where_mask = Path(mask) if mask else light_lists.find_mask(found.images[0].parent)
     sampled, first, notes = _sample(found, where_mask)
     as_linear = first.encoding == "sRGB" and (
-        encoding == "linear" or (encoding == "auto" and _adds_up_as_codes(sampled, found))
+        encoding == "linear" or (encoding == "auto" and _is_linear_despite_encoding(sampled, found))
     )
     shown = "linear" if as_linear else first.encoding
-    assumed = _assumed(found, notes, near=near, as_linear=as_linear, encoding=encoding)
+    assumed = _list_assumptions(found, notes, near=near, as_linear=as_linear, encoding=encoding)
     rig = _rig(found, first.frame, near=near)
     steps = _steps(found)
     extra = {
@@ -128,21 +128,23 @@ def import_light_list(
             "intensity": None if found.intensity is None else found.intensity.tolist(),
         },
         "photographs": [
-            {"step": step.id, "sha256": sha256_of(file), "encoding": shown}
-            for step, file in zip(steps, found.pictures, strict=True)
+            {"step": step.id, "sha256": hash_file(file), "encoding": shown}
+            for step, file in zip(steps, found.images, strict=True)
         ],
     }
     target = Path(out)
-    with imported_session(target, Plan(rig.name, steps), rig, subject, extra, clock) as session:
+    with create_imported_session(
+        target, Plan(rig.name, steps), rig, subject, extra, clock
+    ) as session:
         if where_mask is not None:
             session.attach("mask.png", _mask_png(where_mask, first.frame))
-        for step, file in zip(steps, found.pictures, strict=True):
+        for step, file in zip(steps, found.images, strict=True):
             _commit(session, step, file, clock, as_linear=as_linear)
     listed, masked = f"{found.file} ({found.kind})", where_mask.name if where_mask else ""
-    return ImportedStack(str(target), len(steps), listed, shown, masked, assumed)
+    return ImageStackImport(str(target), len(steps), listed, shown, masked, assumed)
 
 
-def _pixels_of(frame: raw.RawFrame) -> tuple[int, int]:
+def _pixel_shape(frame: raw.RawFrame) -> tuple[int, int]:
     """Return rows and columns of an imported picture: a 2 x 2 cell is one pixel, unless MONO."""
     height, width = frame.cfa.shape
     return (height, width) if frame.pattern == "MONO" else (height // 2, width // 2)
@@ -164,11 +166,11 @@ def _sample(found: LightList, mask: Path | None) -> tuple[Float64Array, Photo, d
     rows, notes, faults = [], {}, []
     first: Photo | None = None
     chosen: NDArray[np.intp] | None = None
-    for file in found.pictures:
+    for file in found.images:
         photo = read_photo(file)
         frame = photo.frame
         notes.update(dict.fromkeys(photo.notes))
-        shape = _pixels_of(frame)
+        shape = _pixel_shape(frame)
         if first is None:
             first = photo
             inside = np.ones(shape, bool) if mask is None else light_lists.read_mask(mask, shape)
@@ -177,23 +179,23 @@ def _sample(found: LightList, mask: Path | None) -> tuple[Float64Array, Photo, d
         same = (first.encoding, first.frame.pattern, first.frame.cfa.shape, first.frame.white)
         if (photo.encoding, frame.pattern, frame.cfa.shape, frame.white) != same:
             got = f"{photo.encoding} {shape[1]} x {shape[0]} {frame.pattern}"
-            wanted = _pixels_of(first.frame)
+            wanted = _pixel_shape(first.frame)
             expected = f"{first.encoding} {wanted[1]} x {wanted[0]} {first.frame.pattern}"
             faults.append(Fault(file.name, got, expected))
             continue
-        gray = light_lists.gray(frame).reshape(-1)[chosen]
+        gray = light_lists.to_gray(frame).reshape(-1)[chosen]
         rows.append(gray.astype(np.float64) / frame.white)
     if faults or first is None:
         raise PhotoError(
             "pictures differ",
-            where=str(found.pictures[0].parent),
+            where=str(found.images[0].parent),
             faults=faults,
             advice="All pictures must be of one camera and one setting.",
         )
     return np.array(rows), first, notes
 
 
-def _adds_up_as_codes(samples: Float64Array, found: LightList) -> bool:
+def _is_linear_despite_encoding(samples: Float64Array, found: LightList) -> bool:
     """Return whether the files' values obey the shading better than the light they should code."""
     decoded = np.clip(samples, 0.0, 1.0)
     codes = np.asarray(_encode_srgb(decoded))
@@ -215,7 +217,7 @@ def _misfit(samples: FloatArray, directions: Float64Array) -> float:
     return float(residual.mean() / lit.mean())
 
 
-def _assumed(
+def _list_assumptions(
     found: LightList, notes: dict[str, None], *, near: bool, as_linear: bool, encoding: Encoding
 ) -> list[str]:
     texts = [n for n in notes if not (as_linear and "were decoded by the sRGB curve" in n)]
@@ -224,7 +226,7 @@ def _assumed(
         texts.append(f"the files' values count as linear light, {why}")
     if not near:
         texts.append("the lights are far away: only their directions count")
-        if not found.are_unit:
+        if not found.has_unit_vectors:
             texts.append("the list's rows are positions; give mm_per_px to use them as such")
     if found.intensity is None:
         texts.append("all lights are of one strength, over the exposure where files state it")
@@ -236,17 +238,19 @@ def _assumed(
 def _rig(found: LightList, frame: raw.RawFrame, *, near: bool) -> Rig:
     positions = found.vectors if near else DISTANCE_MM * found.directions
     lights = [
-        stand_in_light(f"L{k:03d}", (float(x), float(y), float(z)), "D65")
+        make_placeholder_light(f"L{k:03d}", (float(x), float(y), float(z)), "D65")
         for k, (x, y, z) in enumerate(positions)
     ]
-    return stand_in_rig(
-        LIGHT_LIST_RIG_NAME, lights, stand_in_view(frame, spectral_sensitivity="linear sRGB")
+    return make_placeholder_rig(
+        LIGHT_LIST_RIG_NAME,
+        lights,
+        make_placeholder_view(frame, spectral_sensitivity="linear sRGB"),
     )
 
 
 def _steps(found: LightList) -> tuple[Step, ...]:
     steps = []
-    for number in range(len(found.pictures)):
+    for number in range(len(found.images)):
         light = f"L{number:03d}"
         index: dict[str, str | int | float] = {"light": light, "exposure": 0, "pass": 0}
         settings: dict[str, Value] = {"light": light}
@@ -257,7 +261,7 @@ def _steps(found: LightList) -> tuple[Step, ...]:
 def _mask_png(path: Path, frame: raw.RawFrame) -> bytes:
     import cv2
 
-    inside = light_lists.read_mask(path, _pixels_of(frame))
+    inside = light_lists.read_mask(path, _pixel_shape(frame))
     _, data = cv2.imencode(".png", inside.astype(np.uint8) * 255)
     return bytes(data)
 

@@ -95,12 +95,12 @@ def _decode_srgb(values: FloatArray) -> FloatArray:
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
-def _cells_of(rgb: UInt16Array) -> UInt16Array:
+def _rgb_to_mosaic(rgb: UInt16Array) -> UInt16Array:
     """Return an RGGB frame, (2H, 2W), each of whose 2 x 2 cells is one pixel of an RGB picture.
 
     Examples
     --------
-    >>> _cells_of(np.array([[[1, 2, 3]]], np.uint16)).tolist()
+    >>> _rgb_to_mosaic(np.array([[[1, 2, 3]]], np.uint16)).tolist()
     [[1, 2], [2, 3]]
     """
     height, width, _ = rgb.shape
@@ -187,7 +187,7 @@ def _raw(file: Path, where: str) -> Photo:
 def _frame(values: UInt16Array, black: int) -> raw.RawFrame:
     color = values.ndim == 3
     return raw.RawFrame(
-        cfa=_cells_of(values) if color else np.ascontiguousarray(values),
+        cfa=_rgb_to_mosaic(values) if color else np.ascontiguousarray(values),
         pattern="RGGB" if color else "MONO",
         black=(float(black),) * (4 if color else 1),
         white=WHITE_DN,

@@ -14,7 +14,7 @@ from capture.importers.images import PhotoError
 from capture.plan import Plan
 from capture.raw import RawFrame
 from capture.rig import Light, Rig, Vector, View
-from capture.session import Session, SessionDiskError, Subject
+from capture.session import Session, SessionDiskError, SubjectRecord
 
 SENSOR_MM = 36.0
 """Width of the full-frame sensor that stands in for an unknown one."""
@@ -22,7 +22,7 @@ DISTANCE_MM = 1000.0
 """Distance of a camera, or of a light, that nobody measured."""
 
 
-def stand_in_view(frame: RawFrame, **known: Any) -> View:
+def make_placeholder_view(frame: RawFrame, **known: Any) -> View:
     """Return a view that fits a picture of which only the frame is known.
 
     Parameters
@@ -56,28 +56,28 @@ def stand_in_view(frame: RawFrame, **known: Any) -> View:
     return View(**{**about, **known})
 
 
-def stand_in_light(name: str, position_mm: Vector, illuminant: str, **known: Any) -> Light:
+def make_placeholder_light(name: str, position_mm: Vector, illuminant: str, **known: Any) -> Light:
     """Return a light of which nothing but its place and color is known."""
     about = {"illuminant": illuminant, "energy_ws": 1.0, "radius_mm": 1.0, **known}
     return Light(name=name, position_mm=position_mm, **about)
 
 
-def stand_in_rig(name: str, lights: Sequence[Light], *views: View) -> Rig:
+def make_placeholder_rig(name: str, lights: Sequence[Light], *views: View) -> Rig:
     """Return a rig without boxes."""
     return Rig(name=name, lights=tuple(lights), views=views, boxes=(), recycle_s=0.0)
 
 
-def sha256_of(file: Path) -> str:
+def hash_file(file: Path) -> str:
     """Return the digest of a file's bytes, with its algorithm's name before it."""
     return f"sha256:{hashlib.sha256(file.read_bytes()).hexdigest()}"
 
 
 @contextmanager
-def imported_session(
+def create_imported_session(
     target: Path,
     plan: Plan,
     rig: Rig,
-    subject: Subject | None,
+    subject: SubjectRecord | None,
     extra: Mapping[str, Any],
     clock: Callable[[], datetime],
 ) -> Iterator[Session]:
@@ -105,7 +105,7 @@ def imported_session(
             plan=plan,
             rig=rig,
             devices={},
-            subject=subject or Subject("unnamed"),
+            subject=subject or SubjectRecord("unnamed"),
             source="measured",
             extra=extra,
             now=clock,

@@ -22,7 +22,7 @@ Kind = Literal["lp", "list", "chrome ball"]
 IMAGE_SUFFIXES = frozenset(
     ".png .jpg .jpeg .tif .tiff .exr .dng .nef .cr2 .cr3 .arw .orf .rw2 .raf .pef .srw .kdc".split()
 )
-BALL_NAMES = ("chrome", "ball", "sphere", "mirror")
+BALL_FOLDER_NAMES = ("chrome", "ball", "sphere", "mirror")
 MAX_LIGHTS = 10_000
 UNIT_LENGTH_RANGE = (0.98, 1.02)
 """Lengths up to which the rows of a list count as directions rounded in the file."""
@@ -36,7 +36,7 @@ class LightListError(InputError):
 class LightList:
     """Lights in the order of the pictures."""
 
-    pictures: tuple[Path, ...]
+    images: tuple[Path, ...]
     vectors: Float64Array
     """(N, 3), as in the file: unit vectors, or positions."""
     kind: Kind
@@ -51,25 +51,25 @@ class LightList:
         return np.asarray(self.vectors / np.linalg.norm(self.vectors, axis=1, keepdims=True))
 
     @property
-    def are_unit(self) -> bool:
+    def has_unit_vectors(self) -> bool:
         """Whether the rows are directions rather than positions."""
         length = np.linalg.norm(self.vectors, axis=1)
         return bool((length > UNIT_LENGTH_RANGE[0]).all() and (length < UNIT_LENGTH_RANGE[1]).all())
 
 
-def natural(name: str) -> tuple[tuple[int, int | str], ...]:
+def natural_sort_key(name: str) -> tuple[tuple[int, int | str], ...]:
     """Return a key that sorts names as people count: 2 before 10.
 
     Examples
     --------
-    >>> sorted(["b.10.png", "b.2.png", "a.png"], key=natural)
+    >>> sorted(["b.10.write_png", "b.2.write_png", "a.write_png"], key=natural_sort_key)
     ['a.png', 'b.2.png', 'b.10.png']
     """
     parts = re.split(r"(\d+)", name.casefold())
     return tuple((0, int(part)) if part.isdigit() else (1, part) for part in parts if part)
 
 
-def find(directory: Path, *, lights: Path | None = None) -> LightList:
+def find_light_list(directory: Path, *, lights: Path | None = None) -> LightList:
     """Find the pictures of a folder and the lights they were taken under.
 
     Parameters
@@ -114,10 +114,10 @@ def _images_in(directory: Path) -> tuple[Path, ...]:
     listed = directory / "filenames.txt"
     if listed.is_file():
         names = [line.strip() for line in _text(listed).splitlines() if line.strip()]
-        return tuple(_named(name, directory, listed) for name in names)
+        return tuple(_find_image_file(name, directory, listed) for name in names)
     files = (f for f in directory.iterdir() if f.is_file() and not f.name.startswith("."))
     images = (f for f in files if f.suffix.lower() in IMAGE_SUFFIXES and not _is_mask(f))
-    return tuple(sorted(images, key=lambda file: natural(file.name)))
+    return tuple(sorted(images, key=lambda file: natural_sort_key(file.name)))
 
 
 def _is_mask(file: Path) -> bool:
@@ -125,13 +125,13 @@ def _is_mask(file: Path) -> bool:
 
     Examples
     --------
-    >>> _is_mask(Path("buddha.mask.png")), _is_mask(Path("damask.png"))
+    >>> _is_mask(Path("buddha.mask.write_png")), _is_mask(Path("damask.write_png"))
     (True, False)
     """
     return "mask" in re.split(r"[^a-z]+", file.stem.lower())
 
 
-def mask_of(directory: Path) -> Path | None:
+def find_mask(directory: Path) -> Path | None:
     """Return the mask of a folder of pictures, None where it has none or several."""
     found = [f for f in directory.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES and _is_mask(f)]
     return found[0] if len(found) == 1 else None
@@ -145,7 +145,7 @@ def read_mask(path: Path, shape: tuple[int, int]) -> BoolArray:
     LightListError
         Where it is of another size than the pictures, or black.
     """
-    values = gray(read_photo(path).frame)
+    values = to_gray(read_photo(path).frame)
     if values.shape != shape:
         got, wanted = f"{values.shape[1]} x {values.shape[0]}", f"{shape[1]} x {shape[0]}"
         raise LightListError.at("does not fit the pictures", "mask", got, wanted, where=path)
@@ -155,7 +155,7 @@ def read_mask(path: Path, shape: tuple[int, int]) -> BoolArray:
     return np.asarray(values > 0.5 * top)
 
 
-def gray(frame: RawFrame) -> Float32Array:
+def to_gray(frame: RawFrame) -> Float32Array:
     """Return the mean of an imported picture's channels, (H, W), DN; each 2 x 2 cell is a pixel."""
     cells = frame.cfa.astype(np.float32)
     if frame.pattern == "MONO":
@@ -186,7 +186,7 @@ def _folder(directory: Path) -> Path:
 
 
 def _is_ball(folder: Path) -> bool:
-    return any(word in folder.name.lower() for word in BALL_NAMES)
+    return any(word in folder.name.lower() for word in BALL_FOLDER_NAMES)
 
 
 def _source(directory: Path) -> Path:
@@ -252,13 +252,13 @@ def _from_lp(path: Path, directory: Path) -> LightList:
         words = row.split()
         where = f"{path}, line {number}"
         vectors.append(_vector(words[-3:], where))
-        pictures.append(_named(" ".join(words[:-3]), directory, path))
+        pictures.append(_find_image_file(" ".join(words[:-3]), directory, path))
     if len(set(pictures)) < len(pictures):
         raise LightListError("names a picture twice", where=str(path))
     return LightList(tuple(pictures), np.array(vectors), "lp", path.name)
 
 
-def _named(name: str, directory: Path, source: Path) -> Path:
+def _find_image_file(name: str, directory: Path, source: Path) -> Path:
     """Return the file an entry means: by name, without its folder, or with another suffix."""
     base = re.split(r"[\\/]", name)[-1]
     files = {file.name.casefold(): file for file in directory.iterdir() if file.is_file()}
@@ -319,13 +319,13 @@ def _from_text(path: Path, directory: Path) -> LightList:
 def _from_ball(folder: Path, count: int) -> Float64Array:
     from capture.calibration.lights.chrome_ball import ChromeBallError, directions_from_chrome_ball
 
-    pictures, mask = _images_in(folder), mask_of(folder)
+    pictures, mask = _images_in(folder), find_mask(folder)
     if len(pictures) != count or mask is None:
         got = f"{len(pictures)} pictures, {'a' if mask else 'no'} mask"
         raise LightListError.at(
             "does not fit the pictures", "ball", got, f"{count} pictures and one mask", where=folder
         )
-    grays = [gray(read_photo(picture).frame) for picture in pictures]
+    grays = [to_gray(read_photo(picture).frame) for picture in pictures]
     try:
         return np.asarray(directions_from_chrome_ball(grays, read_mask(mask, grays[0].shape)))
     except ChromeBallError as exc:

@@ -61,7 +61,7 @@ class ScannedMesh:
 
 
 @dataclass(frozen=True, slots=True)
-class ImportedMesh:
+class MeshImport:
     """What an import did."""
 
     path: str
@@ -134,7 +134,7 @@ def read_mesh(path: str | Path, *, unit: str = "mm") -> ScannedMesh:
 
 def import_mesh(
     path: str | Path, *, session: str | Path, out: str | Path | None = None, unit: str = "mm"
-) -> ImportedMesh:
+) -> MeshImport:
     """Attach a scanned mesh to a session that holds none yet, as ``scan.ply`` in mm.
 
     Parameters
@@ -168,20 +168,20 @@ def import_mesh(
         opened, reason = reopen_copy(session, out)
         with opened:
             opened.attach(SCAN_FILE, mesh.to_ply(), about=mesh.about)
-            opened.close(missing_because=reason)
+            opened.close(missing_reason=reason)
     else:
         with Session.resume(session) as opened:
             opened.attach(SCAN_FILE, mesh.to_ply(), about=mesh.about)
     width, height, depth = (float(x) for x in np.ptp(mesh.vertices_mm, axis=0))
     counts, size_mm = (len(mesh.vertices_mm), len(mesh.faces)), (width, height, depth)
     written = str(out if out is not None else session)
-    return ImportedMesh(written, *counts, mesh.uv is not None, size_mm, out is not None)
+    return MeshImport(written, *counts, mesh.uv is not None, size_mm, out is not None)
 
 
 _Arrays = tuple[Float64Array, Int64Array, Float64Array | None]
 
 
-def _decode(data: bytes, kind: str, place: Path) -> _Arrays:
+def _decode(data: bytes, kind: str, source: Path) -> _Arrays:
     """Return vertices, faces and texture coordinates of all parts of a file."""
     import trimesh
 
@@ -191,10 +191,10 @@ def _decode(data: bytes, kind: str, place: Path) -> _Arrays:
         parts = [part for part in loaded.dump() if hasattr(part, "faces")]
     except Exception as exc:  # the readers raise whatever their parsers meet
         reason = str(exc).splitlines()[0] if str(exc) else type(exc).__name__
-        raise _error(place, "content", reason, f"a whole {kind.upper()} file") from exc
+        raise _error(source, "content", reason, f"a whole {kind.upper()} file") from exc
     if not parts or not sum(len(part.faces) for part in parts):
         got = "points only" if parts or loaded.geometry else "nothing"
-        raise _error(place, "faces", got, "at least one triangle")
+        raise _error(source, "faces", got, "at least one triangle")
     first = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([np.asarray(part.vertices, np.float64) for part in parts])
     faces = np.concatenate(
@@ -234,6 +234,6 @@ def _check_extent(extent_mm: Float64Array, scale: float, where: Path) -> None:
     raise MeshImportError("is no size of a face", where=str(where), faults=[fault])
 
 
-def _error(place: Path, field: str, got: str, expected: str) -> MeshImportError:
+def _error(source: Path, field: str, got: str, expected: str) -> MeshImportError:
     faults = [Fault(field, got, expected)]
-    return MeshImportError("is not a mesh that can be used", where=str(place), faults=faults)
+    return MeshImportError("is not a mesh that can be used", where=str(source), faults=faults)

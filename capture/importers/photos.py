@@ -13,15 +13,15 @@ from capture.documents import Fault, InputError
 from capture.importers.images import Encoding, Photo, PhotoError, read_photo
 from capture.importers.imported_session import (
     DISTANCE_MM,
-    imported_session,
-    sha256_of,
-    stand_in_light,
-    stand_in_rig,
-    stand_in_view,
+    create_imported_session,
+    hash_file,
+    make_placeholder_light,
+    make_placeholder_rig,
+    make_placeholder_view,
 )
 from capture.plan import Kind, Plan, Step, Value
 from capture.rig import Rig, View
-from capture.session import Session, Subject
+from capture.session import Session, SubjectRecord
 
 logger = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ _POLARIZER_WORDS = {"parallel": "parallel", "crossed": "crossed", "cross": "cros
 
 
 @dataclass(frozen=True, slots=True)
-class Imported:
+class PhotoImport:
     """What an import made."""
 
     path: str
@@ -81,9 +81,9 @@ def import_photos(
     sensitivity: str | None = None,
     illuminant: str | None = None,
     kind: Kind = "subject",
-    subject: Subject | None = None,
+    subject: SubjectRecord | None = None,
     now: Callable[[], datetime] | None = None,
-) -> Imported:
+) -> PhotoImport:
     """Turn photographs into a closed session; all of them, or none.
 
     Every photograph becomes a state of the subject, named after its file; a single one is called
@@ -135,13 +135,13 @@ def import_photos(
     listed = [{"step": s.id, "sha256": e.sha256, "encoding": e.encoding} for s, e in steps]
     extra = {"assumed": assumed, "photographs": listed}
     target = Path(out)
-    with imported_session(target, plan, used, subject, extra, clock) as session:
+    with create_imported_session(target, plan, used, subject, extra, clock) as session:
         for step, entry in steps:
             _commit(session, step, entry, clock)
     states = tuple(dict.fromkeys(str(step.index["state"]) for step, _ in steps))
     color = {str(step.index["state"]) for step, entry in steps if entry.view.cfa != "MONO"}
     colored = tuple(state for state in states if state in color)
-    return Imported(str(target), len(steps), assumed, states, tuple(ignored), colored)
+    return PhotoImport(str(target), len(steps), assumed, states, tuple(ignored), colored)
 
 
 def _files(directory: Path) -> tuple[list[Path], list[str]]:
@@ -191,9 +191,9 @@ def _inspect(files: Sequence[Path]) -> list[_Entry]:
 
 def _entry(file: Path, photo: Photo) -> _Entry:
     frame = photo.frame
-    view = stand_in_view(frame, analyser_axis_deg=0.0)
+    view = make_placeholder_view(frame, analyser_axis_deg=0.0)
     return _Entry(
-        file, sha256_of(file), photo.encoding, view, frame.exposure_s, frame.iso, photo.notes
+        file, hash_file(file), photo.encoding, view, frame.exposure_s, frame.iso, photo.notes
     )
 
 
@@ -233,17 +233,17 @@ def _rig(
         for camera, name in names.items()
     )
     place = (0.0, 0.0, DISTANCE_MM)
-    light = stand_in_light("unknown", place, illuminant, polarizer_axis_deg=0.0)
-    made = stand_in_rig(IMPORTED_RIG_NAME, [light], *views)
+    light = make_placeholder_light("unknown", place, illuminant, polarizer_axis_deg=0.0)
+    made = make_placeholder_rig(IMPORTED_RIG_NAME, [light], *views)
     return made, [names[entry.camera] for entry in entries]
 
 
-def _named(stem: str) -> tuple[str, str | None]:
+def _parse_stem(stem: str) -> tuple[str, str | None]:
     """Split a file's stem into a state and the polarizer's state its words name.
 
     Examples
     --------
-    >>> _named("anna crossed-2"), _named("portrait"), _named("crossed")
+    >>> _parse_stem("anna crossed-2"), _parse_stem("portrait"), _parse_stem("crossed")
     (('anna-2', 'crossed'), ('portrait', None), ('neutral', 'crossed'))
     """
     words = [word for word in re.split(r"[^A-Za-z0-9]+", stem) if word]
@@ -257,7 +257,7 @@ def _named(stem: str) -> tuple[str, str | None]:
 def _steps(
     entries: Sequence[_Entry], views: Sequence[str], kind: Kind
 ) -> list[tuple[Step, _Entry]]:
-    named = [_named(entry.file.stem) for entry in entries]
+    named = [_parse_stem(entry.file.stem) for entry in entries]
     if len({state for state, _ in named}) == 1:
         named = [("neutral", polarizer) for _, polarizer in named]
     seen: set[tuple[str, str]] = set()
@@ -290,7 +290,7 @@ def _assumptions(
     counts = Counter(note for entry in entries for note in entry.notes)
     total = len(entries)
     texts = [note if n == total else f"{note} ({n} of {total})" for note, n in counts.items()]
-    plain = sum(_named(entry.file.stem)[1] is None for entry in entries)
+    plain = sum(_parse_stem(entry.file.stem)[1] is None for entry in entries)
     if plain:
         of = "" if plain == total else f" ({plain} of {total})"
         texts.append(

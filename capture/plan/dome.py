@@ -6,15 +6,15 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from capture.plan.eye_light import eye_light
+from capture.plan.eye_light import eye_irradiance
 from capture.plan.light_order import best_order
 from capture.plan.rows import LedRow
-from capture.plan.steps import Index, Kind, Plan, StepSeries, Value, require
+from capture.plan.steps import Index, Kind, Plan, StepSeries, Value, require_argument
 from capture.rig import LedLimits, Rig
 
 DomeTarget = Literal["charuco", "mirror", "white", "dark"]
 
-EXPOSURES_S = (0.06, 0.015)
+DOME_EXPOSURES_S = (0.06, 0.015)
 """Two stops apart; the longer one and its read-out fit into a twelfth of a second."""
 FRAMES_PER_S = 12.0
 TRACKING_INTERVAL_LIGHTS = 25
@@ -36,9 +36,9 @@ LEVEL_STEPS = 1000
 def dome_plan(
     rig: Rig,
     *,
-    exposures_s: Sequence[float] = EXPOSURES_S,
+    exposures_s: Sequence[float] = DOME_EXPOSURES_S,
     frames_per_s: float = FRAMES_PER_S,
-    tracking_every: int = TRACKING_INTERVAL_LIGHTS,
+    tracking_interval: int = TRACKING_INTERVAL_LIGHTS,
     darks: int = 2,
     level: float = 1.0,
     iso: int = 100,
@@ -54,7 +54,7 @@ def dome_plan(
         Exposure of each pass over all lights, s.
     frames_per_s : float
         Lights a second, > 0.
-    tracking_every : int
+    tracking_interval : int
         Lights between two frames lit by several lights at once, from which motion is estimated; 0
         for none. A pass with tracking also begins and ends with one.
     darks : int
@@ -81,23 +81,25 @@ def dome_plan(
     >>> from capture.rig import load_rig
     >>> dome = load_rig("dome")
     >>> plan = dome_plan(dome)
-    >>> sum(step.kind == "olat" for step in plan.steps), round(plan.estimated_s(dome), 1)
+    >>> sum(step.kind == "olat" for step in plan.steps), round(plan.estimate_duration_s(dome), 1)
     (300, 26.5)
     """
-    require(tracking_every >= 0, "tracking_every", tracking_every, ">= 0")
-    require(darks >= 0, "darks", darks, ">= 0")
+    require_argument(tracking_interval >= 0, "tracking_every", tracking_interval, ">= 0")
+    require_argument(darks >= 0, "darks", darks, ">= 0")
     series = _Series(rig, frames_per_s=frames_per_s, iso=iso)
     shown = best_order(rig, dwell_s=series.dwell_s) if order is None else [int(k) for k in order]
-    require(sorted(shown) == list(range(len(rig.lights))), "order", shown, "every light once")
+    require_argument(
+        sorted(shown) == list(range(len(rig.lights))), "order", shown, "every light once"
+    )
     for number, exposure_s in enumerate(exposures_s):
         series.darks(darks, exposure_s, number)
         for place, light in enumerate(shown):
-            if tracking_every and place % tracking_every == 0:
+            if tracking_interval and place % tracking_interval == 0:
                 series.tracking(number, place, exposure_s, shown[max(place - 1, 0)], level)
             name = rig.lights[light].name
             index: Index = {"light": name, "exposure": number, "pass": number}
             series.expose(f"{name}-{number}", "olat", index, exposure_s, light=name, level=level)
-        if tracking_every:
+        if tracking_interval:
             series.tracking(number, len(shown), exposure_s, shown[-1], level)
     return series.plan()
 
@@ -106,7 +108,7 @@ def dome_calibration_plan(
     rig: Rig,
     target: DomeTarget,
     *,
-    exposures_s: Sequence[float] = EXPOSURES_S,
+    exposures_s: Sequence[float] = DOME_EXPOSURES_S,
     poses: int = 14,
     spheres: int = 4,
     plates: int = 7,
@@ -149,10 +151,10 @@ def dome_calibration_plan(
     ('mirror', 1, 40)
     """
     targets = get_args(DomeTarget)
-    require(target in targets, "target", target, f"one of {', '.join(targets)}")
-    require(darks >= 0, "darks", darks, ">= 0")
+    require_argument(target in targets, "target", target, f"one of {', '.join(targets)}")
+    require_argument(darks >= 0, "darks", darks, ">= 0")
     for name, count in (("poses", poses), ("spheres", spheres), ("plates", plates)):
-        require(count >= 1, name, count, ">= 1")
+        require_argument(count >= 1, name, count, ">= 1")
     series = _Series(rig, frames_per_s=FRAMES_PER_S, iso=iso)
     if target == "dark":
         for number, exposure_s in enumerate(exposures_s):
@@ -161,7 +163,9 @@ def dome_calibration_plan(
     if target == "charuco":
         series.darks(darks, exposures_s[0], 0)
         for pose in range(poses):
-            series.several(f"P{pose:02d}", "charuco", {"pose": pose}, exposures_s[0], level)
+            series.expose_tracking_lights(
+                f"P{pose:02d}", "charuco", {"pose": pose}, exposures_s[0], level
+            )
         return series.plan()
     order = best_order(rig, dwell_s=series.dwell_s)
     if target == "mirror":
@@ -170,7 +174,7 @@ def dome_calibration_plan(
     series.darks(darks, exposures_s[0], 0)
     for pose in range(plates):
         index: Index = {"pose": pose, "light": "several"}
-        series.several(f"W{pose}-markers", "white", index, exposures_s[0], level)
+        series.expose_tracking_lights(f"W{pose}-markers", "white", index, exposures_s[0], level)
         normal = None if plate_normals is None else plate_normals[pose]
         for light in order:
             name = rig.lights[light].name
@@ -184,7 +188,7 @@ def _cosine(a: Sequence[float], b: Sequence[float]) -> float:
     return float(np.dot(a, b) / (np.linalg.norm(a) * np.linalg.norm(b)))
 
 
-def tracking_lights(rig: Rig) -> list[int]:
+def choose_tracking_lights(rig: Rig) -> list[int]:
     """Return lights spread over the half of the dome in front of the subject, at most 6.
 
     Each next one is the farthest from those before it, beginning with the most frontal.
@@ -203,32 +207,34 @@ class _Series(StepSeries):
     """Steps being numbered, for all views of one dome."""
 
     def __init__(self, rig: Rig, *, frames_per_s: float, iso: int) -> None:
-        require(rig.leds is not None, "rig", rig.name, "one with LEDs and their limits")
-        require(frames_per_s > 0, "frames_per_s", frames_per_s, "> 0")
+        require_argument(rig.leds is not None, "rig", rig.name, "one with LEDs and their limits")
+        require_argument(frames_per_s > 0, "frames_per_s", frames_per_s, "> 0")
         self._limits = rig.leds or LedLimits()
         # the box counts microseconds
         self.dwell_s = round(1e6 / frames_per_s) / 1e6
         most_s = self._limits.max_on_s
         slowest = f"at least {1.0 / most_s:g} 1/s"
-        require(self.dwell_s <= most_s, "frames_per_s", frames_per_s, slowest)
+        require_argument(self.dwell_s <= most_s, "frames_per_s", frames_per_s, slowest)
         super().__init__(rig, iso=iso, dwell_s=self.dwell_s)
-        self._tracking = tracking_lights(rig)
-        self._eye = eye_light(rig)
+        self._tracking = choose_tracking_lights(rig)
+        self._eye = eye_irradiance(rig)
 
     def expose(
         self, identity: str, kind: Kind, index: Index, exposure_s: float, **settings: Value
     ) -> None:
         level = float(settings.get("level", 0.0))
-        require(0 <= level <= 1, "level", level, "0 to 1")
+        require_argument(0 <= level <= 1, "level", level, "0 to 1")
         limits = self._limits
         # an LED held longer than the duty allows would be refused by the box
         on_s = limits.max_duty * limits.duty_window_s
-        require(level * self.dwell_s <= on_s, "level x dwell", level * self.dwell_s, f"<= {on_s}")
+        require_argument(
+            level * self.dwell_s <= on_s, "level x dwell", level * self.dwell_s, f"<= {on_s}"
+        )
         readout_s = max(view.readout_s for view in self._rig.views)
         room_s = self.dwell_s - limits.settle_s - limits.overlap_s
         fits = exposure_s <= room_s and exposure_s + readout_s <= self.dwell_s
         expected = f"to fit with read-out {readout_s:g} s into {self.dwell_s:g} s a light"
-        require(fits, "exposure_s", exposure_s, expected)
+        require_argument(fits, "exposure_s", exposure_s, expected)
         self.add(identity, kind, index, exposure_s=float(exposure_s), **settings)
 
     def darks(self, count: int, exposure_s: float, number: int) -> None:
@@ -248,9 +254,9 @@ class _Series(StepSeries):
         wanted = max(level * float(self._eye[before]), MIN_TRACKING_LIGHT * brightest)
         each = wanted / max(float(self._eye[self._tracking].sum()), 1e-12)
         index: Index = {"after": after, "exposure": number, "pass": number}
-        self.several(f"T{number}-{after:03d}", "tracking", index, exposure_s, each)
+        self.expose_tracking_lights(f"T{number}-{after:03d}", "tracking", index, exposure_s, each)
 
-    def several(
+    def expose_tracking_lights(
         self, identity: str, kind: Kind, index: Index, exposure_s: float, level: float
     ) -> None:
         """Add a step lit by the tracking lights together; ``level`` is cut to what one may give."""
@@ -294,12 +300,12 @@ class _Series(StepSeries):
         )
 
 
-def as_table(rows: Sequence[LedRow]) -> list[tuple[tuple[int, ...], int, int]]:
+def to_box_rows(rows: Sequence[LedRow]) -> list[tuple[tuple[int, ...], int, int]]:
     """Return rows as the box counts them: LEDs, level in thousandths, time in us.
 
     Examples
     --------
-    >>> as_table([LedRow((3,), 1.0, 0.083333), LedRow((), 0.0, 0.05)])
+    >>> to_box_rows([LedRow((3,), 1.0, 0.083333), LedRow((), 0.0, 0.05)])
     [((3,), 1000, 83333), ((), 0, 50000)]
     """
     return [(row.leds, round(LEVEL_STEPS * row.level), round(1e6 * row.dwell_s)) for row in rows]

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.plan.eye_light import eye_light, radiant_intensity
-from capture.plan.probe import all_series
+from capture.plan.eye_light import eye_irradiance, radiant_intensity
+from capture.plan.probe import group_by_series
 from capture.plan.rows import led_rows
-from capture.plan.steps import Plan, Step, require
+from capture.plan.steps import Plan, Step, require_argument
 from capture.rig import Light, Probe, Rig
 
 BLUE_LIMIT_J_M2_SR = 1e6
@@ -55,7 +55,7 @@ def dose_report(plan: Plan, rig: Rig) -> DoseReport:
     """
     on_s = np.zeros(len(rig.lights))
     for row in led_rows(plan.steps, rig):
-        on_s += row.given(len(rig.lights)) * row.dwell_s
+        on_s += row.light_levels(len(rig.lights)) * row.dwell_s
     power_w = np.array([light.power_w or 0.0 for light in rig.lights])
     area_m2 = [math.pi * (light.radius_mm * 1e-3) ** 2 for light in rig.lights]
     radiance = np.array([radiant_intensity(light) for light in rig.lights]) / area_m2
@@ -65,7 +65,7 @@ def dose_report(plan: Plan, rig: Rig) -> DoseReport:
         led_ws=float(on_s[most] * power_w[most]),
         limit_ws=rig.leds.dose_ws if rig.leds is not None else math.inf,
         blue_share=float((radiance * on_s).max() / BLUE_LIMIT_J_M2_SR),
-        eye_j_m2=float(eye_light(rig) @ on_s),
+        eye_j_m2=float(eye_irradiance(rig) @ on_s),
     )
 
 
@@ -108,7 +108,7 @@ def fiber_light(plan: Plan, rig: Rig) -> FiberLight:
         (float(step.settings["level"]) for step in plan.steps), default=0.0
     )
     by_placement: dict[object, float] = {}
-    for placement, steps in all_series(plan):
+    for placement, steps in group_by_series(plan):
         given_ws = sum(_given_ws(step, source) for step in steps)
         by_placement[placement] = by_placement.get(placement, 0.0) + given_ws
     core_m2 = math.pi * (0.5e-3 * probe.source_core_mm) ** 2
@@ -137,5 +137,5 @@ def _given_ws(step: Step, source: Light) -> float:
 
 
 def _source(rig: Rig) -> tuple[Probe, Light]:
-    require(rig.probe is not None, "rig", rig.name, "one with a probe")
+    require_argument(rig.probe is not None, "rig", rig.name, "one with a probe")
     return rig.probe, rig.lights[0]  # type: ignore[return-value]

@@ -42,7 +42,7 @@ def radiant_intensity(light: Light) -> float:
     return power_w * (light.lobe_exponent + 1.0) / (2.0 * math.pi)
 
 
-def eye_light(
+def eye_irradiance(
     rig: Rig, *, eyes_mm: Sequence[Vector] | None = None, facing: Vector = (0.0, 0.0, 1.0)
 ) -> Float64Array:
     """Return each light's irradiance at the eyes at level 1, mean of both, W/m^2.
@@ -65,7 +65,7 @@ def eye_light(
     --------
     >>> from capture.rig import load_rig
     >>> dome = load_rig("dome")
-    >>> light = eye_light(dome)
+    >>> light = eye_irradiance(dome)
     >>> front = max(range(150), key=lambda k: dome.lights[k].position_mm[2])
     >>> bool(light[front] == light.max()), int((light == 0).sum())
     (True, 81)

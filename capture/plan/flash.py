@@ -12,7 +12,7 @@ from capture.plan.steps import (
     Polarizer,
     StepSeries,
     Value,
-    require,
+    require_argument,
 )
 from capture.rig import Rig
 
@@ -69,15 +69,15 @@ def flash_plan(
     >>> [(s.id, s.settings["polarizer"]) for s in plan.steps]  # doctest: +NORMALIZE_WHITESPACE
     [('D000', 'parallel'), ('S000', 'parallel'), ('S001', 'crossed'), ('S002', 'crossed'),
      ('S003', 'parallel')]
-    >>> round(plan.estimated_s(rig), 2)
+    >>> round(plan.estimate_duration_s(rig), 2)
     28.79
     >>> plan = flash_plan(rig, states=("neutral", "anger"), repeats=2, darks=0, interleave=True)
     >>> [s.index["state"] for s in plan.steps[::2]]
     ['neutral', 'anger', 'neutral', 'anger']
     """
-    require(repeats >= 1, "repeats", repeats, ">= 1")
-    require(darks >= 0, "darks", darks, ">= 0")
-    require(0 < power <= 1, "power", power, "0 < power <= 1")
+    require_argument(repeats >= 1, "repeats", repeats, ">= 1")
+    require_argument(darks >= 0, "darks", darks, ">= 0")
+    require_argument(0 < power <= 1, "power", power, "0 < power <= 1")
     series = _Series(rig, exposure_s=exposure_s, iso=iso)
     series.darks(darks)
     pair: list[Polarizer] = ["parallel", "crossed"]
@@ -126,10 +126,10 @@ def flash_calibration_plan(
     (180.0, 'malus')
     """
     targets = get_args(Target)
-    require(target in targets, "target", target, f"one of {', '.join(targets)}")
+    require_argument(target in targets, "target", target, f"one of {', '.join(targets)}")
     least = 2 if target == "flat" else 1
-    require(repeats >= least, "repeats", repeats, f">= {least}")
-    require(darks >= 0, "darks", darks, ">= 0")
+    require_argument(repeats >= least, "repeats", repeats, f">= {least}")
+    require_argument(darks >= 0, "darks", darks, ">= 0")
     series = _Series(rig, exposure_s=exposure_s, iso=iso)
     series.darks(8 * repeats if target == "dark" else darks)
     conditions: Iterable[tuple[dict[str, str | float], dict[str, Value]]]

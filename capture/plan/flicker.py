@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture.arrays import Float64Array
-from capture.plan.eye_light import eye_light
-from capture.plan.rows import LedRow, led_rows, passes
+from capture.plan.eye_light import eye_irradiance
+from capture.plan.rows import LedRow, led_rows, split_passes
 from capture.plan.steps import Plan, Step
 from capture.rig import LedLimits, Rig
 
-BAND_HZ = (3.0, 65.0)
-FUSION_HZ = 65.0
+FLICKER_BAND_HZ = (3.0, 65.0)
+FLICKER_FUSION_HZ = 65.0
 MIN_FLASH_CHANGE = 0.1
 """Least change of a flash, of the brightest light of the plan."""
 EYE_SAMPLE_S = 1e-3
@@ -66,7 +66,7 @@ def eye_signal(
     ndarray
         (T,), W/m^2.
     """
-    light = np.array([float(row.given(len(weights)) @ weights) for row in rows])
+    light = np.array([float(row.light_levels(len(weights)) @ weights) for row in rows])
     ends = np.cumsum([row.dwell_s for row in rows])
     starts = np.concatenate([[0.0], ends[:-1] - overlap_s]) if len(rows) else ends
     # the integral of each row's light up to t is a ramp from its start to its end
@@ -84,17 +84,17 @@ def eye_signal(
 
 def average_over_flicker_fusion(signal: Float64Array) -> Float64Array:
     """Return a signal averaged over 1/65 s, as the eye sees it."""
-    width = round(1.0 / FUSION_HZ / EYE_SAMPLE_S)
+    width = round(1.0 / FLICKER_FUSION_HZ / EYE_SAMPLE_S)
     return np.convolve(signal, np.full(width, 1.0 / width), mode="same")
 
 
-def count_flashes(signal: Float64Array, *, least: float) -> float:
-    """Return the most flashes in any second: half the number of turns that differ by ``least``.
+def count_flashes(signal: Float64Array, *, min_change: float) -> float:
+    """Return the most flashes in any second: half its turns that differ by ``min_change``.
 
     Examples
     --------
     >>> on = np.r_[np.zeros(100), np.ones(100)]
-    >>> count_flashes(np.tile(on, 10), least=0.1)
+    >>> count_flashes(np.tile(on, 10), min_change=0.1)
     5.0
     """
     turns: list[int] = []
@@ -103,13 +103,13 @@ def count_flashes(signal: Float64Array, *, least: float) -> float:
     for number, value in enumerate(signal.tolist()):
         if rising is None:
             low, high = min(low, value), max(high, value)
-            if high - low < least:
+            if high - low < min_change:
                 continue
             rising, extreme = value == high, value
             turns.append(number)
         elif (value - extreme if rising else extreme - value) > 0.0:
             extreme = value
-        elif abs(value - extreme) >= least:
+        elif abs(value - extreme) >= min_change:
             rising, extreme = not rising, value
             turns.append(number)
     times = np.array(turns) * EYE_SAMPLE_S
@@ -133,7 +133,7 @@ def band_rms(signal: Float64Array) -> float:
         return 0.0
     power = np.abs(np.fft.rfft(signal)) ** 2
     frequency_hz = np.fft.rfftfreq(signal.size, EYE_SAMPLE_S)
-    inside = (frequency_hz >= BAND_HZ[0]) & (frequency_hz <= BAND_HZ[1])
+    inside = (frequency_hz >= FLICKER_BAND_HZ[0]) & (frequency_hz <= FLICKER_BAND_HZ[1])
     return float(np.sqrt(2.0 * power[inside].sum()) / signal.size / mean)
 
 
@@ -154,7 +154,7 @@ def flicker_of_rows(
     rest = round(DARK_PADDING_S / EYE_SAMPLE_S)
     seen = average_over_flicker_fusion(signal)
     rms = band_rms(signal[rest:-rest]) if seconds >= MIN_RMS_DURATION_S else 0.0
-    flashes = count_flashes(seen, least=MIN_FLASH_CHANGE * float(seen.max()))
+    flashes = count_flashes(seen, min_change=MIN_FLASH_CHANGE * float(seen.max()))
     return FlickerReport(flashes, rms, seconds, float(signal[rest:-rest].mean()))
 
 
@@ -179,11 +179,11 @@ def flicker_report(plan: Plan, rig: Rig) -> FlickerReport:
     >>> report.flashes_per_s <= 1.0, report.within(dome.leds)
     (True, True)
     """
-    weights = eye_light(rig)
+    weights = eye_irradiance(rig)
     overlap_s = rig.leds.overlap_s if rig.leds is not None else 0.0
     reports = [
-        flicker_of_rows(_with_turns(piece, rig), weights, overlap_s=overlap_s)
-        for piece in passes(plan.steps)
+        flicker_of_rows(_insert_analyzer_rotations(piece, rig), weights, overlap_s=overlap_s)
+        for piece in split_passes(plan.steps)
     ]
     seconds = sum(report.seconds for report in reports)
     mean = sum(report.mean_w_m2 * report.seconds for report in reports)
@@ -195,7 +195,7 @@ def flicker_report(plan: Plan, rig: Rig) -> FlickerReport:
     )
 
 
-def _with_turns(steps: Sequence[Step], rig: Rig) -> list[LedRow]:
+def _insert_analyzer_rotations(steps: Sequence[Step], rig: Rig) -> list[LedRow]:
     """Return the rows of steps, and darkness where the analyser turns between two of them."""
     rows: list[LedRow] = []
     before: object = None

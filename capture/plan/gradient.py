@@ -12,7 +12,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from capture.plan.rows import led_rows, passes
+from capture.plan.rows import led_rows, split_passes
 from capture.plan.steps import (
     LIGHT_PATTERNS,
     POLARIZER_STATES,
@@ -21,17 +21,17 @@ from capture.plan.steps import (
     Step,
     StepSeries,
     Value,
-    require,
-    whole,
+    int_if_whole,
+    require_argument,
 )
 from capture.rig import Caliper, LedLimits, Rig
 
 GradientTarget = Literal["ball", "dark", "flat"]
 
-DWELL_S = 0.031
+PATTERN_DWELL_S = 0.031
 """Light of a pattern: 16 of them take half a second, and all LEDs stay within a duty of a quarter,
 because x and -x together are one full."""
-EXPOSURE_S = 0.018
+PATTERN_EXPOSURE_S = 0.018
 """Fits into it with the read-out."""
 SCAN_ORDER = ("full", "z", "x", "-x", "y", "-y", "-z", "dark")
 """From bright to dark for an eye beside the patch."""
@@ -62,13 +62,13 @@ def state_name(angle_deg: float, step: int) -> str:
     return f"a{round(angle_deg):03d}_{letter}{abs(step)}"
 
 
-def state_of(step: Step) -> str | None:
+def strain_state(step: Step) -> str | None:
     """Return the state that a step shows; None where the caliper holds no skin.
 
     Examples
     --------
     >>> index = {"angle": 90, "caliper": 1, "pattern": "x", "polarizer": "crossed"}
-    >>> state_of(Step("s", "gradient", index, {}, ("cam",)))
+    >>> strain_state(Step("s", "gradient", index, {}, ("cam",)))
     'a090_p1'
     """
     if step.kind != "gradient" or "caliper" not in step.index:
@@ -83,8 +83,8 @@ def gradient_plan(
     steps: tuple[int, int] | None = None,
     patterns: Sequence[str] = LIGHT_PATTERNS,
     darks: int = 2,
-    exposure_s: float = EXPOSURE_S,
-    dwell_s: float = DWELL_S,
+    exposure_s: float = PATTERN_EXPOSURE_S,
+    dwell_s: float = PATTERN_DWELL_S,
     level: float = 1.0,
     iso: int = 100,
 ) -> Plan:
@@ -126,7 +126,7 @@ def gradient_plan(
     >>> from capture.rig import load_rig
     >>> rig = load_rig("gradient")
     >>> plan = gradient_plan(rig, angles=[0], steps=(-1, 1), darks=0)
-    >>> [state for state, _ in states(plan)], len(plan.steps)
+    >>> [state for state, _ in group_by_state(plan)], len(plan.steps)
     (['a000_n0', 'a000_m1', 'a000_p1'], 48)
     >>> plan.steps[0].id, plan.steps[-2].id
     ('a000-n0-par-full', 'a000-p1-cro--z')
@@ -135,15 +135,19 @@ def gradient_plan(
     known = caliper.angles_deg
     chosen = known if angles is None else tuple(float(angle) for angle in angles)
     for angle in chosen:
-        require(angle in known, "angles", angle, f"of {', '.join(f'{a:g}' for a in known)}")
-    require(len(set(chosen)) == len(chosen) > 0, "angles", chosen, "at least one, none twice")
+        require_argument(
+            angle in known, "angles", angle, f"of {', '.join(f'{a:g}' for a in known)}"
+        )
+    require_argument(
+        len(set(chosen)) == len(chosen) > 0, "angles", chosen, "at least one, none twice"
+    )
     first, last = (caliper.first_step, caliper.last_step) if steps is None else steps
     within = f"{caliper.first_step} to 0, and 0 to {caliper.last_step}"
     good = caliper.first_step <= first <= 0 <= last <= caliper.last_step
-    require(good, "steps", (first, last), within)
+    require_argument(good, "steps", (first, last), within)
     ordered = _ordered(patterns)
-    require(0 < level <= 1, "level", level, "0 < level <= 1")
-    require(darks >= 0, "darks", darks, ">= 0")
+    require_argument(0 < level <= 1, "level", level, "0 < level <= 1")
+    require_argument(darks >= 0, "darks", darks, ">= 0")
     series = _Series(rig, exposure_s=exposure_s, dwell_s=dwell_s, iso=iso)
     series.darks(darks)
     for angle in chosen:
@@ -152,7 +156,7 @@ def gradient_plan(
             for polarizer in POLARIZER_STATES:
                 for pattern in ordered:
                     light = {"pattern": pattern, "polarizer": polarizer}
-                    index: Index = {"angle": whole(angle), "caliper": position, **light}
+                    index: Index = {"angle": int_if_whole(angle), "caliper": position, **light}
                     identity = f"{name}-{polarizer[:3]}-{pattern}"
                     series.add(identity, "gradient", index, **light, level=level)
     return series.plan()
@@ -165,8 +169,8 @@ def gradient_calibration_plan(
     repeats: int | None = None,
     darks: int = 2,
     level: float = 1.0,
-    exposure_s: float = EXPOSURE_S,
-    dwell_s: float = DWELL_S,
+    exposure_s: float = PATTERN_EXPOSURE_S,
+    dwell_s: float = PATTERN_DWELL_S,
     iso: int = 100,
 ) -> Plan:
     """Plan the frames of one calibration of the gradient sphere; no caliper takes part.
@@ -198,12 +202,12 @@ def gradient_calibration_plan(
     (14, 'ball', {'pattern': 'dark', 'polarizer': 'crossed', 'reading': 100, 'repeat': 0})
     """
     targets = get_args(GradientTarget)
-    require(target in targets, "target", target, f"one of {', '.join(targets)}")
+    require_argument(target in targets, "target", target, f"one of {', '.join(targets)}")
     count = {"ball": 1, "flat": 2, "dark": 16}[target] if repeats is None else repeats
     least = 2 if target == "flat" else 1
-    require(count >= least, "repeats", count, f">= {least}")
-    require(darks >= 0, "darks", darks, ">= 0")
-    require(0 < level <= 1, "level", level, "0 < level <= 1")
+    require_argument(count >= least, "repeats", count, f">= {least}")
+    require_argument(darks >= 0, "darks", darks, ">= 0")
+    require_argument(0 < level <= 1, "level", level, "0 < level <= 1")
     series = _Series(rig, exposure_s=exposure_s, dwell_s=dwell_s, iso=iso)
     if target == "dark":
         series.darks(count)
@@ -229,9 +233,9 @@ def gradient_calibration_plan(
     return series.plan()
 
 
-def states(plan: Plan) -> Iterator[tuple[str, list[Step]]]:
+def group_by_state(plan: Plan) -> Iterator[tuple[str, list[Step]]]:
     """Return the states of a plan in its order, each with its steps."""
-    for name, group in groupby(plan.steps, key=state_of):
+    for name, group in groupby(plan.steps, key=strain_state):
         if name is not None:
             yield name, list(group)
 
@@ -249,7 +253,7 @@ def scan_duty(steps: Sequence[Step], rig: Rig) -> float:
     """
     limits = rig.leds or LedLimits()
     rows = led_rows(steps, rig)
-    levels = np.array([row.given(len(rig.lights)) for row in rows])
+    levels = np.array([row.light_levels(len(rig.lights)) for row in rows])
     ends = np.zeros(len(rows))
     clock, before = 0.0, None
     for number, (step, row) in enumerate(zip(steps, rows, strict=True)):
@@ -270,15 +274,19 @@ def scan_duty(steps: Sequence[Step], rig: Rig) -> float:
 
 
 def _caliper(rig: Rig) -> Caliper:
-    require(rig.caliper is not None, "rig", rig.name, "one with a caliper")
+    require_argument(rig.caliper is not None, "rig", rig.name, "one with a caliper")
     return rig.caliper  # type: ignore[return-value]
 
 
 def _ordered(patterns: Sequence[str]) -> list[str]:
     chosen = list(patterns)
     for pattern in chosen:
-        require(pattern in LIGHT_PATTERNS, "patterns", pattern, f"of {', '.join(LIGHT_PATTERNS)}")
-    require(len(set(chosen)) == len(chosen) > 0, "patterns", chosen, "at least one, none twice")
+        require_argument(
+            pattern in LIGHT_PATTERNS, "patterns", pattern, f"of {', '.join(LIGHT_PATTERNS)}"
+        )
+    require_argument(
+        len(set(chosen)) == len(chosen) > 0, "patterns", chosen, "at least one, none twice"
+    )
     return sorted(chosen, key=SCAN_ORDER.index)
 
 
@@ -286,15 +294,17 @@ class _Series(StepSeries):
     """Steps being collected, for all views of one rig at one exposure."""
 
     def __init__(self, rig: Rig, *, exposure_s: float, dwell_s: float, iso: int) -> None:
-        require(rig.leds is not None, "rig", rig.name, "one with LEDs and their limits")
+        require_argument(rig.leds is not None, "rig", rig.name, "one with LEDs and their limits")
         limits = rig.leds or LedLimits()
-        require(0 < dwell_s <= limits.max_on_s, "dwell_s", dwell_s, f"<= {limits.max_on_s:g}")
+        require_argument(
+            0 < dwell_s <= limits.max_on_s, "dwell_s", dwell_s, f"<= {limits.max_on_s:g}"
+        )
         readout_s = max(view.readout_s for view in rig.views)
         lag_s = max(view.shutter_lag_s for view in rig.views)
         room_s = dwell_s - limits.settle_s - limits.overlap_s - lag_s
         fits = 0 < exposure_s <= room_s and exposure_s + readout_s + lag_s <= dwell_s
         expected = f"to fit with read-out {readout_s:g} s into {dwell_s:g} s a pattern"
-        require(fits, "exposure_s", exposure_s, expected)
+        require_argument(fits, "exposure_s", exposure_s, expected)
         super().__init__(rig, exposure_s=float(exposure_s), dwell_s=float(dwell_s), iso=iso)
         self._limits = limits
 
@@ -307,14 +317,14 @@ class _Series(StepSeries):
         """Return the plan; a piece of it that asks too much of an LED is refused."""
         limits = self._limits
         judged: dict[tuple[object, ...], float] = {}
-        for piece in passes(self._steps):
+        for piece in split_passes(self._steps):
             key = tuple((s.settings["pattern"], s.settings["level"]) for s in piece)
             if key not in judged:
                 judged[key] = scan_duty(piece, self._rig)
         most = max(judged.values(), default=0.0)
         got = f"{most:.3f} over {limits.duty_window_s:g} s"
         expected = f"at most {limits.max_duty:g}: less level, shorter light or fewer patterns"
-        require(most <= limits.max_duty, "duty", got, expected)
+        require_argument(most <= limits.max_duty, "duty", got, expected)
         return self.plan_within(
             max_duty=limits.max_duty, max_on_s=limits.max_on_s, dose_ws=limits.dose_ws
         )

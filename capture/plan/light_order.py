@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 
 from capture.arrays import Float64Array
-from capture.plan.eye_light import eye_light
+from capture.plan.eye_light import eye_irradiance
 from capture.plan.flicker import FlickerReport, flicker_of_rows
 from capture.plan.rows import LedRow
 from capture.rig import Rig
@@ -19,12 +19,12 @@ N_ORDER_BANDS = 6
 """Bands of eye light within which the path is kept short."""
 
 
-def by_name(rig: Rig) -> list[int]:
+def order_by_name(rig: Rig) -> list[int]:
     """Return the lights in the rig's own order."""
     return list(range(len(rig.lights)))
 
 
-def spiral(rig: Rig) -> list[int]:
+def order_along_spiral(rig: Rig) -> list[int]:
     """Return the lights on a spiral around the vertical axis, from the top down."""
     place = _directions(rig)
     turn = np.arctan2(place[:, 0], place[:, 2])
@@ -32,23 +32,25 @@ def spiral(rig: Rig) -> list[int]:
     return [int(k) for k in np.lexsort((turn, -ring))]
 
 
-def nearest(rig: Rig) -> list[int]:
+def order_by_short_path(rig: Rig) -> list[int]:
     """Return a short path through all lights: always on to the nearest, then mended by 2-opt.
 
     It begins at the light that the eyes see least.
     """
-    return _path(_directions(rig), list(range(len(rig.lights))), int(np.argmin(eye_light(rig))))
+    return _short_path(
+        _directions(rig), list(range(len(rig.lights))), int(np.argmin(eye_irradiance(rig)))
+    )
 
 
-def _rise_and_fall(rig: Rig) -> list[int]:
+def _order_by_rise_and_fall(rig: Rig) -> list[int]:
     """Return the lights sorted by what the eyes see: every other one rising, the rest falling."""
-    rising = np.argsort(eye_light(rig), kind="stable")
+    rising = np.argsort(eye_irradiance(rig), kind="stable")
     return [int(k) for k in (*rising[::2], *rising[1::2][::-1])]
 
 
-def _rise_and_fall_nearby(rig: Rig) -> list[int]:
+def _order_by_bands(rig: Rig) -> list[int]:
     """Return the lights in bands of what the eyes see, rising and falling, each a short path."""
-    place, light = _directions(rig), eye_light(rig)
+    place, light = _directions(rig), eye_irradiance(rig)
     rising = np.argsort(light, kind="stable")
     legs = [rising[::2], rising[1::2][::-1]]
     order: list[int] = []
@@ -58,17 +60,17 @@ def _rise_and_fall_nearby(rig: Rig) -> list[int]:
             if rest:
                 start = order[-1] if order else rest[0]
                 first = rest[int(np.argmax(place[rest] @ place[start]))]
-                order += _path(place, rest, first)
+                order += _short_path(place, rest, first)
     return order
 
 
 LIGHT_ORDERS: Mapping[str, Callable[[Rig], list[int]]] = MappingProxyType(
     {
-        "name": by_name,
-        "spiral": spiral,
-        "nearest": nearest,
-        "rise and fall": _rise_and_fall,
-        "rise and fall, nearby": _rise_and_fall_nearby,
+        "name": order_by_name,
+        "spiral": order_along_spiral,
+        "nearest": order_by_short_path,
+        "rise and fall": _order_by_rise_and_fall,
+        "rise and fall, nearby": _order_by_bands,
     }
 )
 
@@ -82,7 +84,7 @@ def compare_orders(rig: Rig, *, dwell_s: float) -> dict[str, FlickerReport]:
     dwell_s : float
         Time of each light, s.
     """
-    weights = eye_light(rig)
+    weights = eye_irradiance(rig)
     overlap_s = rig.leds.overlap_s if rig.leds is not None else 0.0
     found = {}
     for name, order in LIGHT_ORDERS.items():
@@ -116,27 +118,27 @@ def _directions(rig: Rig) -> Float64Array:
     return np.asarray(place / np.linalg.norm(place, axis=1)[:, None])
 
 
-def _path(place: Float64Array, members: list[int], first: int) -> list[int]:
+def _short_path(position: Float64Array, members: list[int], first: int) -> list[int]:
     """Return a short path through ``members`` from ``first``: greedy, then 2-opt."""
     rest = [k for k in members if k != first]
     path = [first] if first in members else []
     at = first
     while rest:
-        at = rest[int(np.argmax(place[rest] @ place[at]))]
+        at = rest[int(np.argmax(position[rest] @ position[at]))]
         path.append(at)
         rest.remove(at)
-    return _without_crossings(place, path)
+    return _improve_2opt(position, path)
 
 
-def _without_crossings(place: Float64Array, path: list[int]) -> list[int]:
+def _improve_2opt(position: Float64Array, path: list[int]) -> list[int]:
     """Reverse parts of a path while that shortens it; its first light stays."""
     way = np.array(path)
     for _ in range(20):
         changed = False
         for i in range(len(way) - 2):
-            a, b = place[way[i]], place[way[i + 1]]
-            ends = place[way[i + 2 :]]
-            after = np.vstack([place[way[i + 3 :]], np.zeros((1, 3))])
+            a, b = position[way[i]], position[way[i + 1]]
+            ends = position[way[i + 2 :]]
+            after = np.vstack([position[way[i + 3 :]], np.zeros((1, 3))])
             # the last light has nothing behind it: reversing up to it saves that step
             old = np.linalg.norm(a - b) + np.linalg.norm(ends - after, axis=1)
             new = np.linalg.norm(ends - a, axis=1) + np.linalg.norm(b - after, axis=1)

@@ -16,8 +16,8 @@ from fractions import Fraction
 
 from capture.documents import Fault
 from capture.plan.flash import flash_plan
-from capture.plan.phases import PhaseGrid, Seconds, equivalent_period_s, exact, phase_grid
-from capture.plan.steps import Plan, PlanError, Step, Value, require
+from capture.plan.phases import PhaseGrid, Seconds, equivalent_period_s, phase_grid, to_fraction
+from capture.plan.steps import Plan, PlanError, Step, Value, require_argument
 from capture.rig import Rig
 
 RELEASE_DELAY_S = 0.04
@@ -41,7 +41,7 @@ class ReadOutError(PlanError):
     equivalent_s: float = math.nan
 
 
-def image_s(rig: Rig, exposure_s: float) -> Fraction:
+def min_shot_interval_s(rig: Rig, exposure_s: float) -> Fraction:
     """Return the shortest time from shot to shot of a rig's slowest camera, s.
 
     Shutter lag, exposure, read-out and the release of the next image.
@@ -49,11 +49,13 @@ def image_s(rig: Rig, exposure_s: float) -> Fraction:
     Examples
     --------
     >>> from capture.rig import load_rig
-    >>> round(float(image_s(load_rig("flash"), 0.008)), 3)
+    >>> round(float(min_shot_interval_s(load_rig("flash"), 0.008)), 3)
     5.498
     """
-    slowest = max(exact(view.shutter_lag_s) + exact(view.readout_s) for view in rig.views)
-    return slowest + exact(exposure_s) + exact(RELEASE_DELAY_S)
+    slowest = max(
+        to_fraction(view.shutter_lag_s) + to_fraction(view.readout_s) for view in rig.views
+    )
+    return slowest + to_fraction(exposure_s) + to_fraction(RELEASE_DELAY_S)
 
 
 def multiplexed_plan(
@@ -111,23 +113,29 @@ def multiplexed_plan(
 
     Examples
     --------
-    >>> from capture.plan.phases import phases
+    >>> from capture.plan.phases import phase_coverage
     >>> from capture.rig import load_rig
     >>> plan = multiplexed_plan(load_rig("flash"), darks=0)
-    >>> len(plan.steps), phases(plan).distinct, phases(plan).interval_s
+    >>> len(plan.steps), phase_coverage(plan).distinct, phase_coverage(plan).interval_s
     (22, 20, 0.5)
     >>> [(s.settings["start_s"], s.index["phase_s"]) for s in plan.steps[:3]]
     [(0.0, 0.0), (5.5, 5.5), (11.0, 1.0)]
     """
     grid = phase_grid(prompt_period_s, shot_period_s)
-    require(state != rest, "state", state, f"not {rest!r}, which it changes with")
-    require(captures is None or cycles is None, "captures, cycles", (captures, cycles), "one only")
-    require(captures is None or captures >= 1, "captures", captures, ">= 1")
-    require(cycles is None or cycles >= 1, "cycles", cycles, ">= 1")
-    require(lead_cycles >= 0, "lead_cycles", lead_cycles, ">= 0")
-    shortest = image_s(rig, SEQUENCE_EXPOSURE_S) if read_out_s is None else exact(read_out_s)
+    require_argument(state != rest, "state", state, f"not {rest!r}, which it changes with")
+    require_argument(
+        captures is None or cycles is None, "captures, cycles", (captures, cycles), "one only"
+    )
+    require_argument(captures is None or captures >= 1, "captures", captures, ">= 1")
+    require_argument(cycles is None or cycles >= 1, "cycles", cycles, ">= 1")
+    require_argument(lead_cycles >= 0, "lead_cycles", lead_cycles, ">= 0")
+    shortest = (
+        min_shot_interval_s(rig, SEQUENCE_EXPOSURE_S)
+        if read_out_s is None
+        else to_fraction(read_out_s)
+    )
     if grid.shot_period_s < shortest:
-        raise _too_slow(grid, shortest)
+        raise _readout_error(grid, shortest)
     _check_flash(rig, grid.shot_period_s, power)
     if cycles is not None:
         captures = math.ceil(cycles * grid.cycle_s / grid.shot_period_s)
@@ -202,12 +210,16 @@ def course_plan(
     >>> [s.settings.get("start_s") for s in plan.steps[:4]], plan.steps[-1].settings["start_s"]
     ([None, None, 0.0, 5.5], 55.0)
     """
-    period, duration = exact(shot_period_s), exact(duration_s)
-    require(state != rest, "state", state, f"not {rest!r}, which comes before")
-    require(period > 0, "shot_period_s", shot_period_s, "seconds > 0")
-    require(duration >= period, "duration_s", duration_s, f">= {float(period):g} s")
-    require(before >= 1, "before", before, ">= 1")
-    shortest = image_s(rig, SEQUENCE_EXPOSURE_S) if read_out_s is None else exact(read_out_s)
+    period, duration = to_fraction(shot_period_s), to_fraction(duration_s)
+    require_argument(state != rest, "state", state, f"not {rest!r}, which comes before")
+    require_argument(period > 0, "shot_period_s", shot_period_s, "seconds > 0")
+    require_argument(duration >= period, "duration_s", duration_s, f">= {float(period):g} s")
+    require_argument(before >= 1, "before", before, ">= 1")
+    shortest = (
+        min_shot_interval_s(rig, SEQUENCE_EXPOSURE_S)
+        if read_out_s is None
+        else to_fraction(read_out_s)
+    )
     if period < shortest:
         raise ReadOutError(
             "the camera is too slow",
@@ -235,7 +247,7 @@ def _period_fault(period: Fraction, shortest: Fraction) -> Fault:
     return Fault("shot_period_s", f"{float(period):g}", f">= {float(shortest):g} s, the read-out")
 
 
-def _too_slow(grid: PhaseGrid, shortest: Fraction) -> ReadOutError:
+def _readout_error(grid: PhaseGrid, shortest: Fraction) -> ReadOutError:
     instead = equivalent_period_s(grid.cycle_s / 2, grid.shot_period_s, shortest)
     error = ReadOutError(
         "the camera is too slow",
@@ -248,10 +260,12 @@ def _too_slow(grid: PhaseGrid, shortest: Fraction) -> ReadOutError:
 
 
 def _check_flash(rig: Rig, period: Fraction, power: float) -> None:
-    require(0 < power <= 1, "power", power, "0 < power <= 1")
+    require_argument(0 < power <= 1, "power", power, "0 < power <= 1")
     slowest = max(rig.recycle_s * power, 60.0 / rig.max_pops_per_min)
     expected = f">= {slowest:g} s, what the flash needs to recycle"
-    require(period >= exact(slowest), "shot_period_s", f"{float(period):g}", expected)
+    require_argument(
+        period >= to_fraction(slowest), "shot_period_s", f"{float(period):g}", expected
+    )
 
 
 def _settings(power: float) -> dict[str, Value]:

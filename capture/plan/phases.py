@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
 
-from capture.documents import Fault, shown
-from capture.plan.steps import Plan, PlanError, Step, require
+from capture.documents import Fault, short_repr
+from capture.plan.steps import Plan, PlanError, Step, require_argument
 
 Seconds = int | float | str | Decimal | Fraction
 """A time; numbers count as the decimals that they are printed as."""
@@ -38,17 +38,17 @@ class PhaseGrid:
     """Time between neighbouring phases, all of them met, s: the effective sampling interval."""
 
     @property
-    def aliased(self) -> bool:
+    def is_aliased(self) -> bool:
         """Whether so few phases are met that what lies between the states cannot be seen."""
         return self.distinct < MIN_PHASES
 
 
-def exact(value: Seconds) -> Fraction:
+def to_fraction(value: Seconds) -> Fraction:
     """Return a time as the fraction that its decimal notation means.
 
     Examples
     --------
-    >>> exact(5.25), exact("0.1") + exact(0.2)
+    >>> to_fraction(5.25), to_fraction("0.1") + to_fraction(0.2)
     (Fraction(21, 4), Fraction(3, 10))
 
     Raises
@@ -59,7 +59,7 @@ def exact(value: Seconds) -> Fraction:
     try:
         number = Fraction(value if isinstance(value, Fraction) else str(value))
     except (ValueError, ZeroDivisionError) as exc:
-        fault = Fault("seconds", shown(value), "a finite number")
+        fault = Fault("seconds", short_repr(value), "a finite number")
         raise PlanError("cannot plan", faults=[fault]) from exc
     return number.limit_denominator(_MAX_PERIOD_DENOMINATOR)
 
@@ -81,9 +81,9 @@ def phase_grid(prompt_period_s: Seconds, shot_period_s: Seconds) -> PhaseGrid:
     >>> float(phase_grid(5, 10.25).interval_s)
     0.25
     """
-    prompt, shot = exact(prompt_period_s), exact(shot_period_s)
-    require(prompt > 0, "prompt_period_s", prompt_period_s, "seconds > 0")
-    require(shot > 0, "shot_period_s", shot_period_s, "seconds > 0")
+    prompt, shot = to_fraction(prompt_period_s), to_fraction(shot_period_s)
+    require_argument(prompt > 0, "prompt_period_s", prompt_period_s, "seconds > 0")
+    require_argument(shot > 0, "shot_period_s", shot_period_s, "seconds > 0")
     cycle = 2 * prompt
     interval = _common_measure(cycle, shot)
     return PhaseGrid(cycle, shot, int(cycle / interval), interval)
@@ -109,7 +109,7 @@ def equivalent_period_s(
     >>> float(equivalent_period_s(5, 5.25, 5.5)), float(equivalent_period_s(5, 2.5, 5.5))
     (10.25, 7.5)
     """
-    grid, shortest = phase_grid(prompt_period_s, shot_period_s), exact(read_out_s)
+    grid, shortest = phase_grid(prompt_period_s, shot_period_s), to_fraction(read_out_s)
     half = grid.cycle_s / 2
     halves = max(0, math.ceil((shortest - grid.shot_period_s) / half))
     for more in (halves, halves + 1):
@@ -120,7 +120,7 @@ def equivalent_period_s(
 
 
 @dataclass(frozen=True, slots=True)
-class Phases:
+class PhaseCoverage:
     """Which phases of its cycle a sequence covers."""
 
     cycle_s: float
@@ -144,7 +144,7 @@ class Phases:
         return len(self.covered_s)
 
     @property
-    def aliased(self) -> bool:
+    def is_aliased(self) -> bool:
         """Whether shot and prompt periods meet too few phases, however long the sequence is."""
         return self.possible < MIN_PHASES
 
@@ -155,7 +155,7 @@ class Phases:
             f"{self.cycle_s:g} s cycle, {again} of them again: sampled every {self.interval_s:g} s,"
             f" largest gap {self.largest_gap_s:g} s"
         )
-        if self.aliased:
+        if self.is_aliased:
             text += (
                 f"; the periods alias: only {self.possible} phases can be met, "
                 "choose a shot period that has less in common with the cycle"
@@ -163,7 +163,7 @@ class Phases:
         return text
 
 
-def phases(plan: Plan) -> Phases:
+def phase_coverage(plan: Plan) -> PhaseCoverage:
     """Return which phases of its cycle the shots of a multiplexed plan meet.
 
     Raises
@@ -175,21 +175,21 @@ def phases(plan: Plan) -> Phases:
     --------
     >>> from capture.plan.multiplexed import multiplexed_plan
     >>> from capture.rig import load_rig
-    >>> print(phases(multiplexed_plan(load_rig("flash"), shot_period_s=10.25)))
+    >>> print(phase_coverage(multiplexed_plan(load_rig("flash"), shot_period_s=10.25)))
     44 captures meet 40 distinct phases of the 10 s cycle, 4 of them again: sampled every 0.25 s, \
 largest gap 0.25 s
     """
     shots = timed_steps(plan)
-    cycle = 2 * exact(plan.limits.get("prompt_period_s", 0.0))
-    require(cycle > 0 and bool(shots), "plan", plan.rig, "a plan of multiplexed_plan")
-    grid = phase_grid(cycle / 2, exact(plan.limits["shot_period_s"]))
+    cycle = 2 * to_fraction(plan.limits.get("prompt_period_s", 0.0))
+    require_argument(cycle > 0 and bool(shots), "plan", plan.rig, "a plan of multiplexed_plan")
+    grid = phase_grid(cycle / 2, to_fraction(plan.limits["shot_period_s"]))
     met: dict[Fraction, int] = {}
     for step in shots:
-        phase = exact(float(step.settings["start_s"])) % cycle
+        phase = to_fraction(float(step.settings["start_s"])) % cycle
         met[phase] = met.get(phase, 0) + 1
     covered = sorted(met)
     around = [*covered[1:], covered[0] + cycle]
-    return Phases(
+    return PhaseCoverage(
         cycle_s=float(cycle),
         covered_s=tuple(float(phase) for phase in covered),
         repeats=tuple(met[phase] for phase in covered),

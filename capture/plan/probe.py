@@ -10,8 +10,8 @@ from collections.abc import Iterator, Sequence
 from itertools import groupby
 from typing import Literal, get_args
 
-from capture.plan.steps import Index, Kind, Plan, Step, StepSeries, require, whole
-from capture.plan.suction import Placement, placement_of
+from capture.plan.steps import Index, Kind, Plan, Step, StepSeries, int_if_whole, require_argument
+from capture.plan.suction import HeadPlacement, step_placement
 from capture.rig import Probe, Rig, is_id
 
 ProbeTarget = Literal["phantom", "dark"]
@@ -43,7 +43,7 @@ def probe_plan(
     repeats: int = 1,
     angles: int = 1,
     brackets: int = N_BRACKETS,
-    longest_s: float = MAX_EXPOSURE_S,
+    max_exposure_s: float = MAX_EXPOSURE_S,
     step_ev: float = BRACKET_STEP_EV,
     darks: int = 2,
     level: float = 1.0,
@@ -67,7 +67,7 @@ def probe_plan(
         tells the two apart.
     brackets : int
         Exposures of a series, >= 2; number 0 is the shortest.
-    longest_s : float
+    max_exposure_s : float
         The last exposure, s, > 0.
     step_ev : float
         From one exposure to the next, stops, > 0.
@@ -101,18 +101,20 @@ def probe_plan(
     >>> [step.id for step in probe_plan(rig, sites=["chin"], angles=16).steps][-1]
     'chin-r0-a337.5-b22'
     >>> frames_s = sum(step.settings["exposure_s"] + 0.3 for step in plan.steps)
-    >>> round(frames_s), round(plan.estimated_s(rig))
+    >>> round(frames_s), round(plan.estimate_duration_s(rig))
     (88, 99)
     """
     chosen = tuple(sites)
     for site in chosen:
         named = is_id(site) and site not in (PHANTOM_SITE, CAP_SITE)
-        require(named, "sites", site, f"a name, not {PHANTOM_SITE!r} or {CAP_SITE!r}")
-    require(len(set(chosen)) == len(chosen) > 0, "sites", chosen, "at least one, none twice")
-    require(repeats >= 1, "repeats", repeats, ">= 1")
-    require(1 <= angles <= 360, "angles", angles, "1 to 360")
+        require_argument(named, "sites", site, f"a name, not {PHANTOM_SITE!r} or {CAP_SITE!r}")
+    require_argument(
+        len(set(chosen)) == len(chosen) > 0, "sites", chosen, "at least one, none twice"
+    )
+    require_argument(repeats >= 1, "repeats", repeats, ">= 1")
+    require_argument(1 <= angles <= 360, "angles", angles, "1 to 360")
     series = _Series(
-        rig, brackets=brackets, longest_s=longest_s, step_ev=step_ev, level=level, iso=iso
+        rig, brackets=brackets, longest_s=max_exposure_s, step_ev=step_ev, level=level, iso=iso
     )
     series.darks(darks)
     for site in chosen:
@@ -128,7 +130,7 @@ def probe_calibration_plan(
     *,
     repeats: int = 1,
     brackets: int = N_BRACKETS,
-    longest_s: float = MAX_EXPOSURE_S,
+    max_exposure_s: float = MAX_EXPOSURE_S,
     step_ev: float = BRACKET_STEP_EV,
     darks: int = 4,
     level: float = 1.0,
@@ -163,11 +165,13 @@ def probe_calibration_plan(
     (196, 'mask-f00-b0', 'mask-f27-b6', 27)
     """
     targets = get_args(ProbeTarget)
-    require(target in targets, "target", target, f"one of {', '.join(targets)}")
-    require(repeats >= 1, "repeats", repeats, ">= 1")
-    require(darks >= (1 if target == "dark" else 0), "darks", darks, ">= 0, of the dark >= 1")
+    require_argument(target in targets, "target", target, f"one of {', '.join(targets)}")
+    require_argument(repeats >= 1, "repeats", repeats, ">= 1")
+    require_argument(
+        darks >= (1 if target == "dark" else 0), "darks", darks, ">= 0, of the dark >= 1"
+    )
     series = _Series(
-        rig, brackets=brackets, longest_s=longest_s, step_ev=step_ev, level=level, iso=iso
+        rig, brackets=brackets, longest_s=max_exposure_s, step_ev=step_ev, level=level, iso=iso
     )
     series.darks(darks)
     if target == "phantom":
@@ -181,7 +185,7 @@ def probe_calibration_plan(
 def exposure_series_s(
     brackets: int = N_BRACKETS,
     *,
-    longest_s: float = MAX_EXPOSURE_S,
+    max_exposure_s: float = MAX_EXPOSURE_S,
     step_ev: float = BRACKET_STEP_EV,
 ) -> tuple[float, ...]:
     """Return the exposures of a series, s, from short to long.
@@ -191,10 +195,10 @@ def exposure_series_s(
     >>> [round(seconds, 2) for seconds in exposure_series_s(4)]
     [7.5, 11.91, 18.9, 30.0]
     """
-    return tuple(longest_s * 2.0 ** (-step_ev * (brackets - 1 - k)) for k in range(brackets))
+    return tuple(max_exposure_s * 2.0 ** (-step_ev * (brackets - 1 - k)) for k in range(brackets))
 
 
-def all_series(plan: Plan) -> Iterator[tuple[Placement, tuple[Step, ...]]]:
+def group_by_series(plan: Plan) -> Iterator[tuple[HeadPlacement, tuple[Step, ...]]]:
     """Return the series of a plan on skin or phantom in its order, each with its steps.
 
     The steps of a series show one placement of the head; each covered fibre has a series.
@@ -203,11 +207,11 @@ def all_series(plan: Plan) -> Iterator[tuple[Placement, tuple[Step, ...]]]:
     --------
     >>> from capture.rig import load_rig
     >>> plan = probe_plan(load_rig("probe"), sites=["cheek", "chin"], brackets=3)
-    >>> [(str(placement), len(steps)) for placement, steps in all_series(plan)]
+    >>> [(str(placement), len(steps)) for placement, steps in group_by_series(plan)]
     [('cheek at 0 degrees', 3), ('chin at 0 degrees', 3)]
     """
     for (placement, _), group in groupby(
-        plan.steps, key=lambda step: (placement_of(step), step.settings.get("fibre"))
+        plan.steps, key=lambda step: (step_placement(step), step.settings.get("fibre"))
     ):
         if placement is not None:
             yield placement, tuple(group)
@@ -219,21 +223,21 @@ class _Series(StepSeries):
     def __init__(
         self, rig: Rig, *, brackets: int, longest_s: float, step_ev: float, level: float, iso: int
     ) -> None:
-        require(rig.probe is not None, "rig", rig.name, "one with a probe")
+        require_argument(rig.probe is not None, "rig", rig.name, "one with a probe")
         self._probe: Probe = rig.probe  # type: ignore[assignment]
         probe = self._probe
-        require(brackets >= 2, "brackets", brackets, ">= 2")
-        require(step_ev > 0, "step_ev", step_ev, "stops > 0")
+        require_argument(brackets >= 2, "brackets", brackets, ">= 2")
+        require_argument(step_ev > 0, "step_ev", step_ev, "stops > 0")
         readout_s = max(view.readout_s for view in rig.views)
         most_s = min(probe.max_open_s, probe.max_suction_s - probe.settle_s - readout_s)
         room = f"<= {most_s:g}, which one suction of {probe.max_suction_s:g} s has room for"
-        require(0 < longest_s <= most_s, "longest_s", longest_s, room)
-        require(0 < level <= 1, "level", level, "0 < level <= 1")
-        self._exposures_s = exposure_series_s(brackets, longest_s=longest_s, step_ev=step_ev)
+        require_argument(0 < longest_s <= most_s, "longest_s", longest_s, room)
+        require_argument(0 < level <= 1, "level", level, "0 < level <= 1")
+        self._exposures_s = exposure_series_s(brackets, max_exposure_s=longest_s, step_ev=step_ev)
         super().__init__(rig, level=float(level), iso=iso)
 
     def darks(self, count: int) -> None:
-        require(count >= 0, "darks", count, ">= 0")
+        require_argument(count >= 0, "darks", count, ">= 0")
         last = len(self._exposures_s) - 1
         for bracket in dict.fromkeys(round(share * last) for share in DARK_POSITIONS):
             for repeat in range(count):
@@ -243,7 +247,7 @@ class _Series(StepSeries):
 
     def measure(self, kind: Kind, site: str, repeat: int, angle_deg: float) -> None:
         for bracket, exposure_s in enumerate(self._exposures_s):
-            index: Index = {"site": site, "repeat": repeat, "angle": whole(angle_deg)}
+            index: Index = {"site": site, "repeat": repeat, "angle": int_if_whole(angle_deg)}
             held = {"exposure_s": exposure_s, "suction_mbar": self._probe.suction_mbar}
             identity = f"{site}-r{repeat}-a{_angle_text(angle_deg)}-b{bracket:02d}"
             self.add(identity, kind, {**index, "bracket": bracket}, **held)
@@ -258,7 +262,7 @@ class _Series(StepSeries):
                 self.add(f"mask-f{fibre:02d}-b{bracket}", "mask", index, **held, fibre=fibre)
 
     def plan(self) -> Plan:
-        require(len(self._steps) > 0, "darks", 0, "something to capture")
+        require_argument(len(self._steps) > 0, "darks", 0, "something to capture")
         probe = self._probe
         limits = {
             "max_suction_mbar": probe.max_suction_mbar,

@@ -26,13 +26,13 @@ RIG_KINDS: Final = {
 }
 
 
-def kind_of(rig: Rig) -> str:
+def find_rig_kind(rig: Rig) -> str:
     """Return the name of a rig's kind: that of its controller, "flash" where it has none of them.
 
     Examples
     --------
     >>> from capture.rig import load_rig
-    >>> kind_of(load_rig("gradient"))
+    >>> find_rig_kind(load_rig("gradient"))
     'gradient'
     """
     return next((name for name, kind in RIG_KINDS.items() if kind.box in rig.boxes), "flash")

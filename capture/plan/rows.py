@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from capture.arrays import Float64Array
-from capture.plan.steps import Step, require
+from capture.plan.steps import Step, require_argument
 from capture.rig import Rig, Vector
 
 _AXIS_INDEX = {"x": 0, "y": 1, "z": 2}
@@ -23,28 +23,28 @@ class LedRow:
     """Light relative to full, 0 to 1."""
     dwell_s: float
     """How long, s."""
-    shares: tuple[float, ...] = ()
+    fractions: tuple[float, ...] = ()
     """Of the level, what each of the LEDs gives, 0 to 1; empty: all of them all of it."""
 
-    def given(self, lights: int) -> Float64Array:
+    def light_levels(self, lights: int) -> Float64Array:
         """Return the level of each of so many lights, shape (lights,), 0 to 1.
 
         Examples
         --------
-        >>> LedRow((0, 2), 0.5, 0.03, (1.0, 0.2)).given(3).tolist()
+        >>> LedRow((0, 2), 0.5, 0.03, (1.0, 0.2)).light_levels(3).tolist()
         [0.5, 0.0, 0.1]
         """
         levels = np.zeros(lights)
-        levels[list(self.leds)] = self.level * np.array(self.shares or (1.0,) * len(self.leds))
+        levels[list(self.leds)] = self.level * np.array(self.fractions or (1.0,) * len(self.leds))
         return levels
 
 
-def pattern_shares(places_mm: Sequence[Vector], pattern: str) -> Float64Array:
+def pattern_weights(positions_mm: Sequence[Vector], pattern: str) -> Float64Array:
     """Return what a pattern of the gradient sphere asks of lights at these places, 0 to 1.
 
     Parameters
     ----------
-    places_mm : sequence of 3-vectors
+    positions_mm : sequence of 3-vectors
         Rig frame.
     pattern : str
         "full": 1; "x": (1 + x)/2 with x of the unit vector to the light, "-x": (1 - x)/2; so y and
@@ -56,24 +56,24 @@ def pattern_shares(places_mm: Sequence[Vector], pattern: str) -> Float64Array:
 
     Examples
     --------
-    >>> pattern_shares([(600.0, 0.0, 0.0), (0.0, 0.0, 600.0)], "-x").tolist()
+    >>> pattern_weights([(600.0, 0.0, 0.0), (0.0, 0.0, 600.0)], "-x").tolist()
     [0.0, 0.5]
     """
-    places = np.asarray(places_mm, np.float64)
+    places = np.asarray(positions_mm, np.float64)
     if pattern in ("full", "dark"):
         return np.full(len(places), float(pattern == "full"))
     axis = _AXIS_INDEX.get(pattern.removeprefix("-"))
-    require(axis is not None, "pattern", pattern, "full, x, y, z, -x, -y, -z or dark")
+    require_argument(axis is not None, "pattern", pattern, "full, x, y, z, -x, -y, -z or dark")
     coordinate = places[:, axis] / np.linalg.norm(places, axis=1)
     return 0.5 * (1.0 - coordinate if pattern.startswith("-") else 1.0 + coordinate)
 
 
-def lights_of(step: Step) -> tuple[str, ...]:
+def step_lights(step: Step) -> tuple[str, ...]:
     """Return the names of the lights that a step of the dome switches on; none when dark.
 
     Examples
     --------
-    >>> lights_of(Step("T1", "tracking", {}, {"leds": "L003+L010"}, ("C00",)))
+    >>> step_lights(Step("T1", "tracking", {}, {"leds": "L003+L010"}, ("C00",)))
     ('L003', 'L010')
     """
     leds, light = step.settings.get("leds"), step.settings.get("light", "none")
@@ -97,10 +97,10 @@ def led_rows(steps: Iterable[Step], rig: Rig) -> tuple[LedRow, ...]:
         if (pattern := step.settings.get("pattern", "dark")) != "dark":
             places = tuple(light.position_mm for light in rig.lights)
             level = float(step.settings.get("level", 1.0))
-            shares = _shares(places, str(pattern))
+            shares = _pattern_weights(places, str(pattern))
             rows.append(LedRow(tuple(range(len(places))), level, dwell_s, shares))
             continue
-        names = lights_of(step)
+        names = step_lights(step)
         for name in names:
             rig.light(name)  # names what is unknown
         level = float(step.settings.get("level", 0.0)) if names else 0.0
@@ -109,11 +109,11 @@ def led_rows(steps: Iterable[Step], rig: Rig) -> tuple[LedRow, ...]:
 
 
 @lru_cache(maxsize=64)
-def _shares(places_mm: tuple[Vector, ...], pattern: str) -> tuple[float, ...]:
-    return tuple(pattern_shares(places_mm, pattern).tolist())
+def _pattern_weights(positions_mm: tuple[Vector, ...], pattern: str) -> tuple[float, ...]:
+    return tuple(pattern_weights(positions_mm, pattern).tolist())
 
 
-def passes(steps: Sequence[Step]) -> list[list[Step]]:
+def split_passes(steps: Sequence[Step]) -> list[list[Step]]:
     """Cut steps where cameras must be set anew or something must be put before them.
 
     Steps of one piece share exposure, sensitivity, cameras, pose and the state of the skin, and so

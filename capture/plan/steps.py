@@ -9,16 +9,16 @@ from types import MappingProxyType
 from typing import Any, Literal, get_args
 
 from capture.documents import (
-    Checks,
     Document,
     Fault,
+    FaultCollector,
     InputError,
-    near_miss,
-    parse,
+    parse_document,
     read_json,
-    shown,
+    short_repr,
+    suggest_key,
 )
-from capture.plan.suction import held_s
+from capture.plan.suction import suction_overhead_s
 from capture.rig import ID_RULE, Rig, is_id
 
 Value = str | int | float | bool
@@ -100,20 +100,20 @@ class Step(Document):
     cameras: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        checks = Checks(f"Step {self.id!r}", PlanError)
-        checks.that("id", self.id, is_id(self.id), ID_RULE)
-        checks.that("kind", self.kind, self.kind in STEP_KINDS, f"one of {', '.join(STEP_KINDS)}")
+        checks = FaultCollector(f"Step {self.id!r}", PlanError)
+        checks.check("id", self.id, is_id(self.id), ID_RULE)
+        checks.check("kind", self.kind, self.kind in STEP_KINDS, f"one of {', '.join(STEP_KINDS)}")
         for table, types in (("index", (str, int, float)), ("settings", (str, int, float, bool))):
             for key, value in getattr(self, table).items():
                 good = isinstance(value, types) and (types[-1] is bool or value is not True)
                 good = good and not (isinstance(value, float) and not math.isfinite(value))
-                checks.that(f"{table}.{key}", value, good, "a text or a finite number")
+                checks.check(f"{table}.{key}", value, good, "a text or a finite number")
         for fault in _check_settings(self.settings):
             checks.note(fault)
         differ = len(set(self.cameras)) == len(self.cameras) > 0
-        checks.that("cameras", self.cameras, differ, "at least one, none twice")
+        checks.check("cameras", self.cameras, differ, "at least one, none twice")
         for camera in self.cameras:
-            checks.that("cameras", camera, is_id(camera), ID_RULE)
+            checks.check("cameras", camera, is_id(camera), ID_RULE)
         checks.close()
         object.__setattr__(self, "index", MappingProxyType(dict(self.index)))
         object.__setattr__(self, "settings", MappingProxyType(dict(self.settings)))
@@ -131,9 +131,9 @@ def _check_settings(settings: Mapping[str, Value]) -> list[Fault]:
         if key in _SETTING_RULES:
             types, good, expected = _SETTING_RULES[key]
             if not isinstance(value, types) or isinstance(value, bool) or not good(value):
-                faults.append(Fault(f"settings.{key}", shown(value), expected))
-        elif hint := near_miss(key, _SETTING_RULES):
-            faults.append(Fault(f"settings.{key}", shown(value), "a known setting", hint))
+                faults.append(Fault(f"settings.{key}", short_repr(value), expected))
+        elif hint := suggest_key(key, _SETTING_RULES):
+            faults.append(Fault(f"settings.{key}", short_repr(value), "a known setting", hint))
     return faults
 
 
@@ -156,16 +156,16 @@ class Plan(Document):
     limits: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        checks = Checks("Plan", PlanError)
-        checks.that("rig", self.rig, is_id(self.rig), ID_RULE)
-        checks.that("steps", self.steps, len(self.steps) > 0, "at least one step")
+        checks = FaultCollector("Plan", PlanError)
+        checks.check("rig", self.rig, is_id(self.rig), ID_RULE)
+        checks.check("steps", self.steps, len(self.steps) > 0, "at least one step")
         seen: dict[str, int] = {}
         for number, step in enumerate(self.steps):
             first = seen.setdefault(step.id.casefold(), number)
             unlike = f"an id unlike that of steps[{first}]"
-            checks.that(f"steps[{number}].id", step.id, first == number, unlike)
+            checks.check(f"steps[{number}].id", step.id, first == number, unlike)
         for key, value in self.limits.items():
-            checks.that(f"limits.{key}", value, math.isfinite(value), "a finite number")
+            checks.check(f"limits.{key}", value, math.isfinite(value), "a finite number")
         checks.close()
         object.__setattr__(self, "limits", MappingProxyType(dict(self.limits)))
 
@@ -180,22 +180,22 @@ class Plan(Document):
                 return step
         ids = [step.id for step in self.steps]
         expected = f"one of {len(ids)} ids from {ids[0]} to {ids[-1]}"
-        fault = Fault("step", repr(step_id), expected, near_miss(step_id, ids))
+        fault = Fault("step", repr(step_id), expected, suggest_key(step_id, ids))
         raise PlanError(f"the plan has no step {step_id!r}", faults=[fault])
 
     def check(self, rig: Rig) -> None:
         """Raise where the plan is for another rig or asks for views the rig does not have."""
-        checks = Checks(f"Plan for rig {self.rig!r}", PlanError)
-        checks.that("rig", self.rig, self.rig == rig.name, f"the rig's name {rig.name!r}")
+        checks = FaultCollector(f"Plan for rig {self.rig!r}", PlanError)
+        checks.check("rig", self.rig, self.rig == rig.name, f"the rig's name {rig.name!r}")
         views = [view.name for view in rig.views]
         for number, step in enumerate(self.steps):
             for camera in step.cameras:
                 known = camera in views
                 path = f"steps[{number}].cameras"
-                checks.that(path, camera, known, f"one of {', '.join(views)}")
+                checks.check(path, camera, known, f"one of {', '.join(views)}")
         checks.close()
 
-    def estimated_s(self, rig: Rig) -> float:
+    def estimate_duration_s(self, rig: Rig) -> float:
         """Return the least time the plan takes on ``rig``, s.
 
         Per step the slowest camera's exposure and read-out, or the recycling of the flash or the
@@ -234,7 +234,9 @@ class Plan(Document):
                 held = now
             total += max(turn_s, move_s)  # the analyser turns while the jaws move
         return (
-            total + last_s + (0.0 if rig.probe is None else held_s(self.steps, each_s, rig.probe))
+            total
+            + last_s
+            + (0.0 if rig.probe is None else suction_overhead_s(self.steps, each_s, rig.probe))
         )
 
     @staticmethod
@@ -248,7 +250,7 @@ class Plan(Document):
         """
         if isinstance(data, str | bytes):
             data = read_json(data, where=where, error=PlanError)
-        return parse(Plan, data, where=where, error=PlanError)
+        return parse_document(Plan, data, where=where, error=PlanError)
 
 
 class StepSeries:
@@ -277,12 +279,12 @@ class StepSeries:
         return Plan(self._rig.name, tuple(self._steps), limits)
 
 
-def whole(angle_deg: float) -> int | float:
+def int_if_whole(angle_deg: float) -> int | float:
     """Return an angle as a whole number where it is one."""
     return int(angle_deg) if float(angle_deg).is_integer() else float(angle_deg)
 
 
-def require(good: bool, name: str, got: object, expected: str) -> None:
+def require_argument(condition: bool, name: str, got: object, expected: str) -> None:
     """Raise `PlanError` where an argument of a generator of plans is not as expected."""
-    if not good:
-        raise PlanError("cannot plan", faults=[Fault(name, shown(got), expected)])
+    if not condition:
+        raise PlanError("cannot plan", faults=[Fault(name, short_repr(got), expected)])

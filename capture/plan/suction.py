@@ -29,7 +29,7 @@ class ProbeStep(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Placement:
+class HeadPlacement:
     """Where a person has put the head; another repeat is another placement."""
 
     site: str
@@ -41,66 +41,66 @@ class Placement:
         return f"{self.site} at {self.angle_deg:g} degrees{again}"
 
 
-def placement_of(step: ProbeStep) -> Placement | None:
+def step_placement(step: ProbeStep) -> HeadPlacement | None:
     """Return where a step wants the head; None where it does not matter.
 
     Examples
     --------
     >>> from capture.plan import Step
     >>> index = {"site": "cheek", "repeat": 0, "angle": 22.5, "bracket": 3}
-    >>> str(placement_of(Step("s", "fibres", index, {}, ("cam",))))
+    >>> str(step_placement(Step("s", "fibres", index, {}, ("cam",))))
     'cheek at 22.5 degrees'
     """
     if step.kind == "mask":
-        return Placement("phantom", 0.0, 0)
+        return HeadPlacement("phantom", 0.0, 0)
     if step.kind not in ("fibres", "phantom"):
         return None
     index = step.index
-    return Placement(str(index["site"]), float(index["angle"]), int(index["repeat"]))
+    return HeadPlacement(str(index["site"]), float(index["angle"]), int(index["repeat"]))
 
 
-def room_s(probe: Probe) -> float:
+def exposure_time_per_suction_s(probe: Probe) -> float:
     """Return how long exposures and their read-out may take in one suction, s.
 
     Examples
     --------
     >>> from capture.rig import load_rig
-    >>> room_s(load_rig("probe").probe)
+    >>> exposure_time_per_suction_s(load_rig("probe").probe)
     57.0
     """
     return probe.max_suction_s - PUMP_TIME_S - probe.settle_s
 
 
-def spans(seconds: Sequence[float], probe: Probe) -> list[range]:
+def split_into_suctions(seconds: Sequence[float], probe: Probe) -> list[range]:
     """Return which exposures of a placement share a suction, each with its read-out, s.
 
     Examples
     --------
     >>> from capture.plan.probe import exposure_series_s
     >>> from capture.rig import load_rig
-    >>> spans([t + 0.3 for t in exposure_series_s()], load_rig("probe").probe)
+    >>> split_into_suctions([t + 0.3 for t in exposure_series_s()], load_rig("probe").probe)
     [range(0, 21), range(21, 23)]
     """
     found: list[range] = []
     first, used_s = 0, 0.0
     for number, one_s in enumerate(seconds):
-        if number > first and used_s + one_s + WIRE_SLACK_S > room_s(probe):
+        if number > first and used_s + one_s + WIRE_SLACK_S > exposure_time_per_suction_s(probe):
             found.append(range(first, number))
             first, used_s = number, 0.0
         used_s += one_s + WIRE_SLACK_S
     return [*found, range(first, len(seconds))] if seconds else found
 
 
-def held_s(steps: Sequence[ProbeStep], seconds: Sequence[float], probe: Probe) -> float:
+def suction_overhead_s(steps: Sequence[ProbeStep], seconds: Sequence[float], probe: Probe) -> float:
     """Return the time that suction and rests add to a plan's steps, each of so many seconds."""
     total, held, group = 0.0, None, list[float]()
 
     def end_of_group() -> float:
-        count = len(spans(group, probe))
+        count = len(split_into_suctions(group, probe))
         return count * (PUMP_TIME_S + probe.settle_s) + max(count - 1, 0) * probe.rest_s
 
     for step, one_s in zip(steps, seconds, strict=True):
-        place = placement_of(step) if "suction_mbar" in step.settings else None
+        place = step_placement(step) if "suction_mbar" in step.settings else None
         if place != held:
             total += end_of_group()
             held, group = place, []

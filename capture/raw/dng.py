@@ -32,8 +32,8 @@ from capture.raw.tiff import (
     UNDEFINED,
     Directory,
     Entry,
-    directory,
-    entry,
+    encode_directory,
+    encode_entry,
 )
 
 XMP_NAMESPACE = "urn:skinrig:frame:1"
@@ -126,11 +126,13 @@ def encode_frame(frame: RawFrame) -> bytes:
     pixels = np.ascontiguousarray(frame.cfa, dtype="<u2").tobytes()
     exif = _exif_entries(frame)
     # lay out once with zero offsets to learn the sizes, then with the true ones
-    main = directory(_main_entries(frame, pixels, 0, 0), 8)
+    main = encode_directory(_main_entries(frame, pixels, 0, 0), 8)
     exif_at = 8 + len(main)
-    pixels_at = -(-(exif_at + len(directory(exif, exif_at))) // _ALIGNMENT_BYTES) * _ALIGNMENT_BYTES
-    main = directory(_main_entries(frame, pixels, exif_at, pixels_at), 8)
-    head = struct.pack("<2sHI", b"II", 42, 8) + main + directory(exif, exif_at)
+    pixels_at = (
+        -(-(exif_at + len(encode_directory(exif, exif_at))) // _ALIGNMENT_BYTES) * _ALIGNMENT_BYTES
+    )
+    main = encode_directory(_main_entries(frame, pixels, exif_at, pixels_at), 8)
+    head = struct.pack("<2sHI", b"II", 42, 8) + main + encode_directory(exif, exif_at)
     return head.ljust(pixels_at, b"\0") + pixels
 
 
@@ -146,7 +148,7 @@ def write_dng(path: str | Path, cfa: UInt16Array, **description: Any) -> None:
     part.replace(target)
 
 
-def is_ours(buffer: memoryview) -> bool:
+def is_skinrig_dng(buffer: memoryview) -> bool:
     """Return whether the file was written by `encode_dng`, even where a part of its head is hurt.
 
     Two marks are looked for, so that a damaged file of ours is refused by our strict reader and
@@ -219,33 +221,33 @@ def _main_entries(frame: RawFrame, pixels: bytes, exif_at: int, pixels_at: int) 
     crop = _CROP_PX if min(height, width) >= 8 * _CROP_PX else 0
     model = frame.camera_model or "unknown camera"
     entries = [
-        entry(254, LONG, [0]),
-        entry(256, LONG, [width]),
-        entry(257, LONG, [height]),
-        entry(258, SHORT, [16]),
-        entry(259, SHORT, [1]),
-        entry(262, SHORT, [_LINEAR_PHOTOMETRIC if mono else _CFA_PHOTOMETRIC]),
-        entry(271, ASCII, SOFTWARE_NAME),
-        entry(272, ASCII, model),
-        entry(273, LONG, [pixels_at]),
-        entry(274, SHORT, [1]),
-        entry(277, SHORT, [1]),
-        entry(278, LONG, [height]),
-        entry(279, LONG, [len(pixels)]),
-        entry(284, SHORT, [1]),
-        entry(305, ASCII, SOFTWARE_NAME),
-        entry(700, BYTE, _xmp(frame, pixels)),
-        entry(34665, LONG, [exif_at]),
-        entry(50706, BYTE, [1, 4, 0, 0]),
-        entry(50707, BYTE, [1, 3, 0, 0]),
-        entry(50708, ASCII, model),
-        entry(50713, SHORT, [side, side]),
-        entry(50714, RATIONAL, frame.black),
-        entry(50717, LONG, [frame.white]),
-        entry(50718, RATIONAL, [1.0, 1.0]),
-        entry(50719, LONG, [crop, crop]),
-        entry(50720, LONG, [width - 2 * crop, height - 2 * crop]),
-        entry(50829, LONG, [0, 0, height, width]),
+        encode_entry(254, LONG, [0]),
+        encode_entry(256, LONG, [width]),
+        encode_entry(257, LONG, [height]),
+        encode_entry(258, SHORT, [16]),
+        encode_entry(259, SHORT, [1]),
+        encode_entry(262, SHORT, [_LINEAR_PHOTOMETRIC if mono else _CFA_PHOTOMETRIC]),
+        encode_entry(271, ASCII, SOFTWARE_NAME),
+        encode_entry(272, ASCII, model),
+        encode_entry(273, LONG, [pixels_at]),
+        encode_entry(274, SHORT, [1]),
+        encode_entry(277, SHORT, [1]),
+        encode_entry(278, LONG, [height]),
+        encode_entry(279, LONG, [len(pixels)]),
+        encode_entry(284, SHORT, [1]),
+        encode_entry(305, ASCII, SOFTWARE_NAME),
+        encode_entry(700, BYTE, _xmp(frame, pixels)),
+        encode_entry(34665, LONG, [exif_at]),
+        encode_entry(50706, BYTE, [1, 4, 0, 0]),
+        encode_entry(50707, BYTE, [1, 3, 0, 0]),
+        encode_entry(50708, ASCII, model),
+        encode_entry(50713, SHORT, [side, side]),
+        encode_entry(50714, RATIONAL, frame.black),
+        encode_entry(50717, LONG, [frame.white]),
+        encode_entry(50718, RATIONAL, [1.0, 1.0]),
+        encode_entry(50719, LONG, [crop, crop]),
+        encode_entry(50720, LONG, [width - 2 * crop, height - 2 * crop]),
+        encode_entry(50829, LONG, [0, 0, height, width]),
     ]
     if not mono:
         matrix = (
@@ -254,43 +256,45 @@ def _main_entries(frame: RawFrame, pixels: bytes, exif_at: int, pixels_at: int) 
             else tuple(frame.color_matrix.ravel().tolist())
         )
         entries += [
-            entry(33421, SHORT, [2, 2]),
-            entry(33422, BYTE, [_CFA_LETTERS.index(c) for c in frame.pattern]),
-            entry(50710, BYTE, [0, 1, 2]),
-            entry(50711, SHORT, [1]),
-            entry(50721, SRATIONAL, matrix),
-            entry(50728, RATIONAL, frame.neutral or (1.0, 1.0, 1.0)),
-            entry(50778, SHORT, [ILLUMINANT_CODES[frame.color_illuminant]]),
+            encode_entry(33421, SHORT, [2, 2]),
+            encode_entry(33422, BYTE, [_CFA_LETTERS.index(c) for c in frame.pattern]),
+            encode_entry(50710, BYTE, [0, 1, 2]),
+            encode_entry(50711, SHORT, [1]),
+            encode_entry(50721, SRATIONAL, matrix),
+            encode_entry(50728, RATIONAL, frame.neutral or (1.0, 1.0, 1.0)),
+            encode_entry(50778, SHORT, [ILLUMINANT_CODES[frame.color_illuminant]]),
         ]
     if frame.camera_serial:
-        entries.append(entry(50735, ASCII, frame.camera_serial))
+        entries.append(encode_entry(50735, ASCII, frame.camera_serial))
     if frame.noise_profile is not None:
-        entries.append(entry(51041, DOUBLE, frame.noise_profile))
+        entries.append(encode_entry(51041, DOUBLE, frame.noise_profile))
     if frame.captured_at is not None:
-        entries.append(entry(306, ASCII, f"{frame.captured_at.astimezone(UTC):%Y:%m:%d %H:%M:%S}"))
+        entries.append(
+            encode_entry(306, ASCII, f"{frame.captured_at.astimezone(UTC):%Y:%m:%d %H:%M:%S}")
+        )
     return entries
 
 
 def _exif_entries(frame: RawFrame) -> list[Entry]:
-    entries = [entry(36864, UNDEFINED, b"0231")]
+    entries = [encode_entry(36864, UNDEFINED, b"0231")]
     if frame.exposure_s is not None:
-        entries.append(entry(33434, RATIONAL, [frame.exposure_s]))
+        entries.append(encode_entry(33434, RATIONAL, [frame.exposure_s]))
     if frame.f_number is not None:
-        entries.append(entry(33437, RATIONAL, [frame.f_number]))
+        entries.append(encode_entry(33437, RATIONAL, [frame.f_number]))
     if frame.iso is not None:
         # ISO above 16 bit stands in the long tag alone, EXIF 2.3 section 4.6.5
-        entries.append(entry(34855, SHORT, [min(int(frame.iso), 65_535)]))
-        entries.append(entry(34864, SHORT, [3]))
-        entries.append(entry(34867, LONG, [int(frame.iso)]))
+        entries.append(encode_entry(34855, SHORT, [min(int(frame.iso), 65_535)]))
+        entries.append(encode_entry(34864, SHORT, [3]))
+        entries.append(encode_entry(34867, LONG, [int(frame.iso)]))
     if frame.focal_mm is not None:
-        entries.append(entry(37386, RATIONAL, [frame.focal_mm]))
+        entries.append(encode_entry(37386, RATIONAL, [frame.focal_mm]))
     if frame.camera_serial:
-        entries.append(entry(42033, ASCII, frame.camera_serial))
+        entries.append(encode_entry(42033, ASCII, frame.camera_serial))
     if frame.captured_at is not None:
         moment = frame.captured_at.astimezone(UTC)
-        entries.append(entry(36867, ASCII, f"{moment:%Y:%m:%d %H:%M:%S}"))
-        entries.append(entry(36881, ASCII, "+00:00"))
-        entries.append(entry(37521, ASCII, f"{moment:%f}"))
+        entries.append(encode_entry(36867, ASCII, f"{moment:%Y:%m:%d %H:%M:%S}"))
+        entries.append(encode_entry(36881, ASCII, "+00:00"))
+        entries.append(encode_entry(37521, ASCII, f"{moment:%f}"))
     return entries
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from capture.arrays import Float64Array, UInt16Array
-from capture.documents import Checks, InputError, canonical_json
+from capture.documents import FaultCollector, InputError, canonical_json
 from capture.rig import CFA_PATTERNS, MAX_SIDE_PX
 
 # 2**28 pixels: ten times the largest sensor of a capture rig, and 512 MiB of memory
@@ -62,56 +62,60 @@ class RawFrame:
     """File the frame was read from, empty for a frame made in memory."""
 
     def __post_init__(self) -> None:
-        checks = Checks(f"Raw frame{' of step ' + self.step_id if self.step_id else ''}", RawError)
+        checks = FaultCollector(
+            f"Raw frame{' of step ' + self.step_id if self.step_id else ''}", RawError
+        )
         shape, dtype = self.cfa.shape, self.cfa.dtype
-        checks.that("cfa", f"{dtype} {shape}", self.cfa.ndim == 2, "uint16 of shape (H, W)")
-        checks.that("cfa", str(dtype), dtype == np.uint16, "uint16")
+        checks.check("cfa", f"{dtype} {shape}", self.cfa.ndim == 2, "uint16 of shape (H, W)")
+        checks.check("cfa", str(dtype), dtype == np.uint16, "uint16")
         mono = self.pattern == "MONO"
-        checks.that("pattern", self.pattern, self.pattern in CFA_PATTERNS, f"one of {CFA_PATTERNS}")
+        checks.check(
+            "pattern", self.pattern, self.pattern in CFA_PATTERNS, f"one of {CFA_PATTERNS}"
+        )
         if self.cfa.ndim == 2:
             even = mono or (shape[0] % 2 == 0 and shape[1] % 2 == 0)
             size = 1 <= min(shape) and max(shape) <= MAX_SIDE_PX and self.cfa.size <= MAX_PIXELS
-            checks.that("cfa", shape, size, f"sides of 1 to {MAX_SIDE_PX}, {MAX_PIXELS} pixels")
-            checks.that("cfa", shape, even, "even height and width for a color filter array")
+            checks.check("cfa", shape, size, f"sides of 1 to {MAX_SIDE_PX}, {MAX_PIXELS} pixels")
+            checks.check("cfa", shape, even, "even height and width for a color filter array")
         cells = 1 if mono else 4
-        checks.that("black", self.black, len(self.black) == cells, f"{cells} value(s)")
-        checks.that("white", self.white, 0 < self.white <= 65_535, "1 to 65535")
+        checks.check("black", self.black, len(self.black) == cells, f"{cells} value(s)")
+        checks.check("white", self.white, 0 < self.white <= 65_535, "1 to 65535")
         below = all(math.isfinite(b) and 0 <= b < self.white for b in self.black)
-        checks.that("black", self.black, below, f"0 <= black < white {self.white}")
+        checks.check("black", self.black, below, f"0 <= black < white {self.white}")
         for name in ("exposure_s", "iso", "f_number", "focal_mm"):
             value = getattr(self, name)
             good = value is None or (math.isfinite(value) and value > 0)
-            checks.that(name, value, good, "a finite number > 0, or None")
+            checks.check(name, value, good, "a finite number > 0, or None")
         if self.color_matrix is not None:
             good = self.color_matrix.shape == (3, 3) and bool(np.isfinite(self.color_matrix).all())
-            checks.that("color_matrix", self.color_matrix, good, "(3, 3) finite numbers")
+            checks.check("color_matrix", self.color_matrix, good, "(3, 3) finite numbers")
         codes = ", ".join(ILLUMINANT_CODES)
         good = self.color_illuminant in ILLUMINANT_CODES
-        checks.that("color_illuminant", self.color_illuminant, good, f"one of {codes}")
+        checks.check("color_illuminant", self.color_illuminant, good, f"one of {codes}")
         if self.neutral is not None:
             good = len(self.neutral) == 3 and all(0 < x < math.inf for x in self.neutral)
-            checks.that("neutral", self.neutral, good, "three finite numbers > 0")
+            checks.check("neutral", self.neutral, good, "three finite numbers > 0")
         colored = self.color_matrix is not None or self.neutral is not None
-        checks.that("color_matrix, neutral", "given", not (mono and colored), "None for MONO")
+        checks.check("color_matrix, neutral", "given", not (mono and colored), "None for MONO")
         if self.noise_profile is not None:
             good = len(self.noise_profile) == 2 and all(
                 0 <= x < math.inf for x in self.noise_profile
             )
-            checks.that("noise_profile", self.noise_profile, good, "(scale, offset), finite, >= 0")
+            checks.check("noise_profile", self.noise_profile, good, "(scale, offset), finite, >= 0")
         for name in ("camera_model", "camera_serial", "step_id", "session_id"):
             text = getattr(self, name)
             good = text.isascii() and (text.isprintable() or not text) and len(text) <= 200
-            checks.that(name, text, good, "at most 200 printable ASCII characters")
+            checks.check(name, text, good, "at most 200 printable ASCII characters")
         if self.captured_at is not None:
             zoned = self.captured_at.utcoffset() is not None
-            checks.that("captured_at", self.captured_at.isoformat(), zoned, "a time with its zone")
+            checks.check("captured_at", self.captured_at.isoformat(), zoned, "a time with its zone")
         try:
             size_bytes = len(canonical_json(dict(self.light)))
-            checks.that(
+            checks.check(
                 "light", f"{size_bytes} bytes", size_bytes <= 16_384, "at most 16 KiB of JSON"
             )
         except (TypeError, ValueError, RecursionError) as exc:
-            checks.that("light", str(exc), False, "values that JSON can hold, all finite")
+            checks.check("light", str(exc), False, "values that JSON can hold, all finite")
         checks.close()
 
 
@@ -143,10 +147,10 @@ def noise_profile(
     >>> noise_profile(2.0, 4.0, black=24, white=1024)
     (0.0005, 4e-06)
     """
-    checks = Checks("Noise profile", RawError)
-    checks.positive(gain_e_per_dn=gain_e_per_dn)
-    checks.that("read_noise_e", read_noise_e, 0 <= read_noise_e < math.inf, ">= 0")
-    checks.that("white", white, white > black, f"> black {black}")
+    checks = FaultCollector("Noise profile", RawError)
+    checks.check_positive(gain_e_per_dn=gain_e_per_dn)
+    checks.check("read_noise_e", read_noise_e, 0 <= read_noise_e < math.inf, ">= 0")
+    checks.check("white", white, white > black, f"> black {black}")
     checks.close()
     full_scale_e = gain_e_per_dn * (white - black)
     return 1.0 / full_scale_e, (read_noise_e / full_scale_e) ** 2

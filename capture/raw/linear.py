@@ -6,7 +6,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from capture.arrays import BoolArray, Float32Array
-from capture.documents import Checks, Fault
+from capture.documents import Fault, FaultCollector
 from capture.raw.frame import RawError, RawFrame, noise_profile
 
 Demosaic = Literal["superpixel", "centered", "bilinear"]
@@ -76,11 +76,11 @@ def linear_rgb(
     >>> image.rgb[0, 0].round(6).tolist(), (image.variance[0, 0] * 1e6).round(1).tolist()
     ([0.10000000149011612, 0.10000000149011612, 0.10000000149011612], [54.0, 27.0, 54.0])
     """
-    checks = Checks("linear_rgb", RawError)
+    checks = FaultCollector("linear_rgb", RawError)
     known = get_args(Demosaic)
-    checks.that("demosaic", demosaic, demosaic in known, ", ".join(known))
+    checks.check("demosaic", demosaic, demosaic in known, ", ".join(known))
     pair = (gain is None) == (read_noise is None)
-    checks.that("gain, read_noise", (gain, read_noise), pair, "both or neither")
+    checks.check("gain, read_noise", (gain, read_noise), pair, "both or neither")
     checks.close()
     if frame.pattern == "MONO":
         fault = Fault("pattern", "MONO", "RGGB, BGGR, GRBG or GBRG")
@@ -120,10 +120,10 @@ def linear_mono(
     >>> linear_mono(frame, gain=2.0, read_noise=4.0)[0][0, 0].round(6).item()
     0.10000000149011612
     """
-    checks = Checks("linear_mono", RawError)
+    checks = FaultCollector("linear_mono", RawError)
     pair = (gain is None) == (read_noise is None)
-    checks.that("gain, read_noise", (gain, read_noise), pair, "both or neither")
-    checks.that("pattern", frame.pattern, frame.pattern == "MONO", "MONO")
+    checks.check("gain, read_noise", (gain, read_noise), pair, "both or neither")
+    checks.check("pattern", frame.pattern, frame.pattern == "MONO", "MONO")
     checks.close()
     x, variance = _pixels(frame, gain, read_noise)
     return x, variance, frame.cfa < frame.white
@@ -218,13 +218,15 @@ def _centered(
         ahead = (cell // 2 == 0, cell % 2 == 0)
         band = _COLOR_LETTERS.index(letter)
         weight = np.float32(1.0 / pattern.count(letter))
-        rgb[..., band] += weight * _to_middle(x[part], ahead, power=1)
-        noise[..., band] += weight**2 * _to_middle(variance[part], ahead, power=2)
-        bad |= _to_middle((~good[part]).astype(np.float32), ahead, power=1) > 0
+        rgb[..., band] += weight * _shift_to_cell_center(x[part], ahead, power=1)
+        noise[..., band] += weight**2 * _shift_to_cell_center(variance[part], ahead, power=2)
+        bad |= _shift_to_cell_center((~good[part]).astype(np.float32), ahead, power=1) > 0
     return LinearImage(rgb, noise, ~bad)
 
 
-def _to_middle(plane: Float32Array, ahead: tuple[bool, bool], *, power: int) -> Float32Array:
+def _shift_to_cell_center(
+    plane: Float32Array, ahead: tuple[bool, bool], *, power: int
+) -> Float32Array:
     """Shift a plane by a quarter of its pitch along both axes, with weights to ``power``.
 
     At the border, where the neighbor is missing, the plane's own value stands alone.
@@ -252,7 +254,7 @@ def _bilinear(
         mask = np.zeros(x.shape, np.float32)
         for cell in (c for c in range(4) if pattern[c] == letter):
             mask[cell // 2 :: 2, cell % 2 :: 2] = 1
-        spread = _spread_green if letter == "G" else _spread_sparse
+        spread = _interpolate_green if letter == "G" else _interpolate_sparse
         # weights that leave the image are shared among the others: a flat field stays flat
         total = spread(mask, power=1)
         rgb[..., band] = spread(x * mask, power=1) / total
@@ -261,7 +263,7 @@ def _bilinear(
     return LinearImage(rgb, noise, valid)
 
 
-def _spread_sparse(plane: Float32Array, *, power: int) -> Float32Array:
+def _interpolate_sparse(plane: Float32Array, *, power: int) -> Float32Array:
     """Convolve a red or blue plane (zero elsewhere) with the triangle's ``power``, separably."""
     side, centre = (np.float32(w**power) for w in _TRIANGLE_FILTER[:2])
     rows = centre * plane
@@ -273,7 +275,7 @@ def _spread_sparse(plane: Float32Array, *, power: int) -> Float32Array:
     return both
 
 
-def _spread_green(plane: Float32Array, *, power: int) -> Float32Array:
+def _interpolate_green(plane: Float32Array, *, power: int) -> Float32Array:
     """Convolve the green plane: itself where it is green, else a quarter of each neighbour."""
     weight = np.float32(0.25**power)
     spread = plane.copy()

@@ -8,7 +8,7 @@ import numpy as np
 import rawpy
 
 from capture.documents import Fault
-from capture.raw.dng import decode_dng, is_ours
+from capture.raw.dng import decode_dng, is_skinrig_dng
 from capture.raw.frame import MAX_PIXELS, RawError, RawFrame
 from capture.raw.tiff import Directory
 
@@ -53,9 +53,9 @@ def read(path: str | Path) -> RawFrame:
 
 def decode(buffer: memoryview, *, where: str = "") -> RawFrame:
     """Return the raw frame of a file's bytes; see `read`."""
-    if is_ours(buffer):
+    if is_skinrig_dng(buffer):
         return decode_dng(buffer, where=where)
-    return _foreign(buffer, _tags(buffer, where), where)
+    return _decode_with_libraw(buffer, _tags(buffer, where), where)
 
 
 def _tags(buffer: memoryview, where: str) -> Directory | None:
@@ -74,7 +74,7 @@ def _error(what: str, where: str, path: str, got: str, expected: str) -> RawErro
     return RawError(what, where=where, faults=[Fault(path, got, expected)], advice=_RAW_ADVICE)
 
 
-def _foreign(buffer: memoryview, tags: Directory | None, where: str) -> RawFrame:
+def _decode_with_libraw(buffer: memoryview, tags: Directory | None, where: str) -> RawFrame:
     with rawpy.RawPy() as raw:
         try:
             raw.open_buffer(_Reader(buffer))
@@ -127,7 +127,7 @@ def _translate(raw: Any, tags: Directory | None, where: str) -> RawFrame:
         cells = raw.raw_colors_visible[:2, :2].ravel()
         pattern = "".join(chr(raw.color_desc[int(c)]) for c in cells)
     levels = raw.black_level_per_channel
-    description = _described(raw, tags)
+    description = _read_description(raw, tags)
     try:
         return RawFrame(
             cfa=cfa,
@@ -143,7 +143,7 @@ def _translate(raw: Any, tags: Directory | None, where: str) -> RawFrame:
         ) from exc
 
 
-def _described(raw: Any, tags: Directory | None) -> dict[str, Any]:
+def _read_description(raw: Any, tags: Directory | None) -> dict[str, Any]:
     """Return what the file says beside its pixels; whatever it does not say stays out."""
     found: dict[str, Any] = {}
     other = getattr(raw, "other", None)

@@ -34,7 +34,7 @@ class Entry:
     data: bytes
 
 
-def entry(tag: int, kind: int, values: Sequence[float] | str | bytes) -> Entry:
+def encode_entry(tag: int, kind: int, values: Sequence[float] | str | bytes) -> Entry:
     """Return a little-endian entry; rationals take the nearest fraction of 32-bit integers."""
     if isinstance(values, str):
         values = values.encode("ascii") + b"\0"
@@ -50,7 +50,7 @@ def entry(tag: int, kind: int, values: Sequence[float] | str | bytes) -> Entry:
     return Entry(tag, kind, len(values), data)
 
 
-def directory(entries: Iterable[Entry], offset: int) -> bytes:
+def encode_directory(entries: Iterable[Entry], offset: int) -> bytes:
     """Return a directory, as it stands at ``offset`` of the file, followed by its longer values."""
     ordered = sorted(entries, key=lambda e: e.tag)
     table = struct.pack("<H", len(ordered))

@@ -10,7 +10,7 @@ from capture.session.errors import (
     SessionLocked,
 )
 from capture.session.journal import AttachmentLine, FrameLine
-from capture.session.manifest import SCHEMA, CalibrationRef, Manifest, Subject
+from capture.session.manifest import SCHEMA, CalibrationRef, Manifest, SubjectRecord
 from capture.session.reopening import reopen_copy
 from capture.session.store import Session
 from capture.session.verification import VerifyReport, verify
@@ -31,7 +31,7 @@ __all__ = [
     "SessionDiskError",
     "SessionError",
     "SessionLocked",
-    "Subject",
+    "SubjectRecord",
     "VerifyReport",
     "reopen_copy",
     "verify",

@@ -8,7 +8,14 @@ from pathlib import Path
 from capture.documents import Fault
 from capture.session.disk import read_file
 from capture.session.errors import NotASession, SessionDamage, SessionError
-from capture.session.journal import AttachmentLine, CloseLine, FrameLine, LeftOutLine, Walk, walk
+from capture.session.journal import (
+    AttachmentLine,
+    CloseLine,
+    FrameLine,
+    JournalWalk,
+    OmissionLine,
+    walk_journal,
+)
 from capture.session.manifest import Manifest, decode
 
 MANIFEST_FILE, JOURNAL_FILE = "session.json", "journal.jsonl"
@@ -18,11 +25,11 @@ MAX_JOURNAL_BYTES = 2**30
 
 
 @dataclass(frozen=True, slots=True)
-class Contents:
+class SessionContents:
     """What the two text files of a session say."""
 
     manifest: Manifest
-    walk: Walk
+    walk: JournalWalk
 
     @property
     def frame_lines(self) -> tuple[FrameLine, ...]:
@@ -35,9 +42,9 @@ class Contents:
         return tuple(line for _, line in self.walk.lines if isinstance(line, AttachmentLine))
 
     @property
-    def left_out_lines(self) -> tuple[LeftOutLine, ...]:
+    def omission_lines(self) -> tuple[OmissionLine, ...]:
         """What was left out and why, in the order in which it was."""
-        return tuple(line for _, line in self.walk.lines if isinstance(line, LeftOutLine))
+        return tuple(line for _, line in self.walk.lines if isinstance(line, OmissionLine))
 
     @property
     def file_lines(self) -> tuple[FrameLine | AttachmentLine, ...]:
@@ -51,7 +58,7 @@ class Contents:
         return last if isinstance(last, CloseLine) else None
 
 
-def read_contents(path: Path) -> Contents:
+def read_contents(path: Path) -> SessionContents:
     """Return manifest and journal of the session at ``path``; damage of the journal is noted.
 
     Raises
@@ -78,20 +85,20 @@ def read_contents(path: Path) -> Contents:
     if path.is_file():
         raise no_session()
     where = path / MANIFEST_FILE
-    data = read_file(where, limit=MAX_MANIFEST_BYTES, what="manifest", missing=no_session)
+    data = read_file(where, limit=MAX_MANIFEST_BYTES, label="manifest", missing=no_session)
     manifest, seal = decode(data, where=str(where))
     where = path / JOURNAL_FILE
-    journal = read_file(where, limit=MAX_JOURNAL_BYTES, what="journal")
+    journal = read_file(where, limit=MAX_JOURNAL_BYTES, label="journal")
     _require_folder(path / FRAMES_FOLDER)
     if os.path.lexists(path / ATTACHMENTS_FOLDER):  # made with the first attachment
         _require_folder(path / ATTACHMENTS_FOLDER)
-    walked = walk(journal, seal=seal, where=str(where))
+    walked = walk_journal(journal, seal=seal, where=str(where))
     if walked.damage is None:
-        walked = _against_plan(walked, manifest, str(where))
-    return Contents(manifest, walked)
+        walked = _check_against_plan(walked, manifest, str(where))
+    return SessionContents(manifest, walked)
 
 
-def _against_plan(walked: Walk, manifest: Manifest, where: str) -> Walk:
+def _check_against_plan(walked: JournalWalk, manifest: Manifest, where: str) -> JournalWalk:
     """Note the first line that the plan does not allow: an unknown step, a frame twice."""
     seen: set[str] = set()
     left_out: set[str] = set()
@@ -103,7 +110,7 @@ def _against_plan(walked: Walk, manifest: Manifest, where: str) -> Walk:
         elif isinstance(line, AttachmentLine):
             got, good, expected = line.file, line.file not in seen, "each attachment once"
             seen.add(line.file)
-        elif isinstance(line, LeftOutLine):
+        elif isinstance(line, OmissionLine):
             strangers = [step for step in line.steps if step not in steps or step in left_out]
             got, good = ", ".join(strangers), not strangers
             expected = "steps of the plan, each left out once"
@@ -127,7 +134,7 @@ def _against_plan(walked: Walk, manifest: Manifest, where: str) -> Walk:
                 advice="The journal was changed by another program; restore it from a copy.",
             )
             good_lines = tuple(pair for pair in walked.lines if pair[0] < byte)
-            return Walk(good_lines, walked.head, byte, 0, damage)
+            return JournalWalk(good_lines, walked.head, byte, 0, damage)
     return walked
 
 
@@ -150,7 +157,7 @@ def _require_folder(folder: Path) -> None:
         raise SessionDamage("is damaged", where=str(folder), faults=faults, advice=advice)
 
 
-def undamaged_contents(path: Path) -> Contents:
+def read_undamaged_contents(path: Path) -> SessionContents:
     """Return manifest and journal; damage of the journal is an error."""
     contents = read_contents(path)
     if contents.walk.damage is not None:

@@ -79,7 +79,7 @@ class Disk:
 
 
 def read_file(
-    path: Path, *, limit: int, what: str, missing: Callable[[], SessionError] | None = None
+    path: Path, *, limit: int, label: str, missing: Callable[[], SessionError] | None = None
 ) -> bytes:
     """Return the bytes of a regular file of at most ``limit`` bytes, following no link.
 
@@ -95,20 +95,20 @@ def read_file(
         if isinstance(exc, FileNotFoundError) and missing is not None:
             raise missing() from exc
         got = "a symbolic link" if path.is_symlink() else str(exc.strerror)
-        raise _damage(path, what, got, "a file") from exc
+        raise _damage_error(path, label, got, "a file") from exc
     with open(descriptor, "rb") as file:
         state = os.fstat(descriptor)
         if not stat.S_ISREG(state.st_mode):
-            raise _damage(path, what, "not a plain file", "a file")
+            raise _damage_error(path, label, "not a plain file", "a file")
         if state.st_size > limit:
-            raise _damage(path, what, f"{state.st_size} bytes", f"at most {limit}")
+            raise _damage_error(path, label, f"{state.st_size} bytes", f"at most {limit}")
         try:
             return file.read()
         except OSError as exc:
-            raise _damage(path, what, str(exc.strerror), "a readable file") from exc
+            raise _damage_error(path, label, str(exc.strerror), "a readable file") from exc
 
 
-def _damage(path: Path, what: str, got: str, expected: str) -> SessionDamage:
+def _damage_error(path: Path, label: str, got: str, expected: str) -> SessionDamage:
     advice = "Restore the file from a copy; skinrig verify lists all that is damaged."
-    faults = [Fault(what, got, expected)]
+    faults = [Fault(label, got, expected)]
     return SessionDamage("cannot be read", where=str(path), faults=faults, advice=advice)

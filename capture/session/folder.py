@@ -11,7 +11,7 @@ from capture.session.contents import (
     JOURNAL_FILE,
     MANIFEST_FILE,
     ORPHANS_FOLDER,
-    Contents,
+    SessionContents,
     list_files,
 )
 from capture.session.disk import Disk
@@ -108,7 +108,7 @@ def require_free(path: Path) -> None:
         raise SessionError("cannot start here", where=str(path), faults=faults, advice=advice)
 
 
-def set_orphans_aside(disk: Disk, path: Path, contents: Contents) -> None:
+def move_orphans(disk: Disk, path: Path, contents: SessionContents) -> None:
     """Move files without a line to ``orphans/``; a committed file that is gone is an error."""
     lines = {line.file: line for line in contents.file_lines}
     present = list_files(path)

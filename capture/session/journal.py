@@ -12,14 +12,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from capture.documents import (
-    Checks,
     Document,
     Fault,
+    FaultCollector,
     canonical_json,
-    parse,
+    parse_document,
     read_json,
-    shown,
-    table_of,
+    short_repr,
+    to_json_table,
 )
 from capture.plan import Value
 from capture.rig import ID_RULE, is_id
@@ -50,15 +50,15 @@ class FrameLine(Document):
     t_host_s: float
 
     def __post_init__(self) -> None:
-        checks = Checks("Frame line", SessionDamage)
+        checks = FaultCollector("Frame line", SessionDamage)
         for name in ("step", "camera"):
-            checks.that(name, getattr(self, name), is_id(getattr(self, name)), ID_RULE)
-        checks.that("attempt", self.attempt, self.attempt >= 1, ">= 1")
-        expected = frame_file(self.step, self.camera, self.attempt)
-        checks.that("file", self.file, self.file == expected, expected)
-        checks.that("bytes", self.bytes, self.bytes > 0, "> 0")
+            checks.check(name, getattr(self, name), is_id(getattr(self, name)), ID_RULE)
+        checks.check("attempt", self.attempt, self.attempt >= 1, ">= 1")
+        expected = frame_path(self.step, self.camera, self.attempt)
+        checks.check("file", self.file, self.file == expected, expected)
+        checks.check("bytes", self.bytes, self.bytes > 0, "> 0")
         good = _XXH128_PATTERN.fullmatch(self.xxh128) is not None
-        checks.that("xxh128", self.xxh128, good, "32 hexadecimal digits")
+        checks.check("xxh128", self.xxh128, good, "32 hexadecimal digits")
         checks.close()
 
 
@@ -75,18 +75,18 @@ class AttachmentLine(Document):
     """Where it is from, for people: texts and numbers."""
 
     def __post_init__(self) -> None:
-        checks = Checks("Attachment line", SessionDamage)
-        checks.that("name", self.name, is_attachment_name(self.name), ATTACHMENT_RULE)
-        expected = attachment_file(self.name)
-        checks.that("file", self.file, self.file == expected, expected)
-        checks.that("bytes", self.bytes, self.bytes > 0, "> 0")
+        checks = FaultCollector("Attachment line", SessionDamage)
+        checks.check("name", self.name, is_attachment_name(self.name), ATTACHMENT_RULE)
+        expected = attachment_path(self.name)
+        checks.check("file", self.file, self.file == expected, expected)
+        checks.check("bytes", self.bytes, self.bytes > 0, "> 0")
         good = _XXH128_PATTERN.fullmatch(self.xxh128) is not None
-        checks.that("xxh128", self.xxh128, good, "32 hexadecimal digits")
+        checks.check("xxh128", self.xxh128, good, "32 hexadecimal digits")
         checks.close()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LeftOutLine(Document):
+class OmissionLine(Document):
     """Steps of the plan that will not be captured, as the journal holds them."""
 
     steps: tuple[str, ...]
@@ -97,12 +97,12 @@ class LeftOutLine(Document):
     t_host_s: float
 
     def __post_init__(self) -> None:
-        checks = Checks("Line of steps left out", SessionDamage)
+        checks = FaultCollector("Line of steps left out", SessionDamage)
         differ = len(set(self.steps)) == len(self.steps) > 0
-        checks.that("steps", self.steps, differ, "at least one, none twice")
+        checks.check("steps", self.steps, differ, "at least one, none twice")
         for step in self.steps:
-            checks.that("steps", step, is_id(step), ID_RULE)
-        checks.that("reason", self.reason, bool(self.reason.strip()), "a text")
+            checks.check("steps", step, is_id(step), ID_RULE)
+        checks.check("reason", self.reason, bool(self.reason.strip()), "a text")
         checks.close()
 
 
@@ -117,17 +117,17 @@ class CloseLine(Document):
     """Why they were not, empty where none is missing."""
 
 
-Line = FrameLine | AttachmentLine | LeftOutLine | CloseLine
+Line = FrameLine | AttachmentLine | OmissionLine | CloseLine
 _LINE_KINDS: Mapping[str, type[Any]] = {
     "frame": FrameLine,
     "attachment": AttachmentLine,
-    "left_out": LeftOutLine,
+    "left_out": OmissionLine,
     "close": CloseLine,
 }
 
 
 @dataclass(frozen=True, slots=True)
-class Walk:
+class JournalWalk:
     """What a journal holds."""
 
     lines: tuple[tuple[int, Line], ...]
@@ -147,12 +147,12 @@ class Walk:
         return bool(self.lines) and isinstance(self.lines[-1][1], CloseLine)
 
 
-def frame_file(step: str, camera: str, attempt: int) -> str:
+def frame_path(step: str, camera: str, attempt: int) -> str:
     """Return the path of a frame inside its session.
 
     Examples
     --------
-    >>> frame_file("S001", "cam", 1), frame_file("S001", "cam", 2)
+    >>> frame_path("S001", "cam", 1), frame_path("S001", "cam", 2)
     ('frames/S001+cam.dng', 'frames/S001+cam+2.dng')
     """
     suffix = "" if attempt == 1 else f"+{attempt}"
@@ -170,12 +170,12 @@ def is_attachment_name(name: str) -> bool:
     return is_id(name) and not name.endswith(".part")
 
 
-def attachment_file(name: str) -> str:
+def attachment_path(name: str) -> str:
     """Return the path of an attachment inside its session.
 
     Examples
     --------
-    >>> attachment_file("scan.ply")
+    >>> attachment_path("scan.ply")
     'attachments/scan.ply'
     """
     return f"attachments/{name}"
@@ -184,12 +184,12 @@ def attachment_file(name: str) -> str:
 def seal_line(previous: str, line: Line) -> tuple[bytes, str]:
     """Return the bytes of the line that follows ``previous``, and its hash."""
     kind = next(name for name, known in _LINE_KINDS.items() if isinstance(line, known))
-    record = canonical_json({"type": kind, **table_of(line)})
+    record = canonical_json({"type": kind, **to_json_table(line)})
     digest = hashlib.sha256(previous.encode("ascii") + record).hexdigest()
     return b'{"h":"' + digest.encode("ascii") + b'","r":' + record + b"}\n", digest
 
 
-def walk(data: bytes, *, seal: str, where: str) -> Walk:
+def walk_journal(data: bytes, *, seal: str, where: str) -> JournalWalk:
     """Follow the chain from ``seal`` to the last line, a torn tail, or the first damage."""
     lines: list[tuple[int, Line]] = []
     head, start = seal, 0
@@ -197,44 +197,48 @@ def walk(data: bytes, *, seal: str, where: str) -> Walk:
         stop = data.find(b"\n", start)
         text = data[start:] if stop < 0 else data[start : stop + 1]
         if lines and isinstance(lines[-1][1], CloseLine):
-            damage = _damage(where, start, "data after the end", shown(text[:40]), "nothing")
-            return Walk(tuple(lines), head, start, 0, damage)
+            damage = _damage_error(
+                where, start, "data after the end", short_repr(text[:40]), "nothing"
+            )
+            return JournalWalk(tuple(lines), head, start, 0, damage)
         try:
             line, digest = _unseal(text, head, f"{where}, byte {start}")
         except SessionDamage as exc:
             if _is_torn(text, stop < 0, last=start + len(text) == len(data), head=head):
-                return Walk(tuple(lines), head, start, len(data) - start, None)
-            return Walk(tuple(lines), head, start, 0, exc)
+                return JournalWalk(tuple(lines), head, start, len(data) - start, None)
+            return JournalWalk(tuple(lines), head, start, 0, exc)
         if line is None:  # complete but for its newline: was never acknowledged
-            return Walk(tuple(lines), head, start, len(data) - start, None)
+            return JournalWalk(tuple(lines), head, start, len(data) - start, None)
         lines.append((start, line))
         head, start = digest, start + len(text)
-    return Walk(tuple(lines), head, start, 0, None)
+    return JournalWalk(tuple(lines), head, start, 0, None)
 
 
 def _unseal(text: bytes, head: str, where: str) -> tuple[Line | None, str]:
     """Return content and hash of one line; None where only its newline is missing."""
     if len(text) > MAX_LINE_BYTES:
-        raise _damage(where, None, "line", f"{len(text)} bytes", f"at most {MAX_LINE_BYTES}")
+        raise _damage_error(where, None, "line", f"{len(text)} bytes", f"at most {MAX_LINE_BYTES}")
     content = read_json(text, where=where, error=SessionDamage)
     if not isinstance(content, dict) or not isinstance(content.get("r"), dict):
-        raise _damage(where, None, "line", shown(content), '{"h": hash, "r": record}')
+        raise _damage_error(where, None, "line", short_repr(content), '{"h": hash, "r": record}')
     record = dict(content["r"])
     kind = record.pop("type", None)
     try:
         packed = canonical_json(content["r"])
         digest = hashlib.sha256(head.encode("ascii") + packed).hexdigest()
     except (ValueError, RecursionError) as exc:
-        raise _damage(where, None, "line", str(exc), "canonical JSON") from exc
+        raise _damage_error(where, None, "line", str(exc), "canonical JSON") from exc
     expected = b'{"h":"' + digest.encode("ascii") + b'","r":' + packed + b"}\n"
     if text != expected:
         if text + b"\n" == expected:
             return None, digest
-        got = shown(content.get("h"))
-        raise _damage(where, None, "hash", got, f"{digest}: the line is not what was written")
+        got = short_repr(content.get("h"))
+        raise _damage_error(where, None, "hash", got, f"{digest}: the line is not what was written")
     if isinstance(kind, str) and kind in _LINE_KINDS:
-        return parse(_LINE_KINDS[kind], record, where=where, error=SessionDamage), digest
-    raise _damage(where, None, "type", shown(kind), '"frame", "attachment", "left_out" or "close"')
+        return parse_document(_LINE_KINDS[kind], record, where=where, error=SessionDamage), digest
+    raise _damage_error(
+        where, None, "type", short_repr(kind), '"frame", "attachment", "left_out" or "close"'
+    )
 
 
 def _is_torn(text: bytes, unended: bool, *, last: bool, head: str) -> bool:
@@ -257,7 +261,9 @@ def _is_torn(text: bytes, unended: bool, *, last: bool, head: str) -> bool:
     return whole is not None
 
 
-def _damage(where: str, byte: int | None, path: str, got: str, expected: str) -> SessionDamage:
+def _damage_error(
+    where: str, byte: int | None, path: str, got: str, expected: str
+) -> SessionDamage:
     place = where if byte is None else f"{where}, byte {byte}"
     advice = "Restore the journal from a copy; no line after this byte can be trusted."
     faults = [Fault(path, got, expected)]

@@ -12,7 +12,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from capture.documents import Checks, Document, Fault, parse, read_json, table_of
+from capture.documents import (
+    Document,
+    Fault,
+    FaultCollector,
+    parse_document,
+    read_json,
+    to_json_table,
+)
 from capture.plan import Plan
 from capture.rig import ID_RULE, Rig, is_id
 from capture.session.errors import SessionDamage, SessionError
@@ -27,7 +34,7 @@ _PSEUDONYM_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
 
 @dataclass(frozen=True, slots=True)
-class Subject(Document):
+class SubjectRecord(Document):
     """Who was captured, never by name, and what the person agreed to.
 
     Parameters
@@ -42,7 +49,7 @@ class Subject(Document):
 
     Examples
     --------
-    >>> Subject("P042", ("research",), date(2031, 1, 1)).pseudonym
+    >>> SubjectRecord("P042", ("research",), date(2031, 1, 1)).pseudonym
     'P042'
     """
 
@@ -51,11 +58,11 @@ class Subject(Document):
     consent_expires: date | None = None
 
     def __post_init__(self) -> None:
-        checks = Checks("Subject", SessionError)
+        checks = FaultCollector("SubjectRecord", SessionError)
         good = _PSEUDONYM_PATTERN.fullmatch(self.pseudonym) is not None
-        checks.that("pseudonym", self.pseudonym, good, "letters, digits, _ . - (no full name)")
+        checks.check("pseudonym", self.pseudonym, good, "letters, digits, _ . - (no full name)")
         for scope in self.consent_scope:
-            checks.that("consent_scope", scope, is_id(scope), ID_RULE)
+            checks.check("consent_scope", scope, is_id(scope), ID_RULE)
         checks.close()
 
 
@@ -70,10 +77,10 @@ class CalibrationRef(Document):
     """Where it stood, for people; the hash decides."""
 
     def __post_init__(self) -> None:
-        checks = Checks("CalibrationRef", SessionError)
-        checks.that("kind", self.kind, is_id(self.kind), ID_RULE)
+        checks = FaultCollector("CalibrationRef", SessionError)
+        checks.check("kind", self.kind, is_id(self.kind), ID_RULE)
         good = _SHA256_PATTERN.fullmatch(self.sha256) is not None
-        checks.that("sha256", self.sha256, good, '"sha256:" and 64 hexadecimal digits')
+        checks.check("sha256", self.sha256, good, '"sha256:" and 64 hexadecimal digits')
         checks.close()
 
 
@@ -84,7 +91,7 @@ class Manifest(Document):
     id: str
     created_at: datetime
     source: Source
-    subject: Subject
+    subject: SubjectRecord
     plan: Plan
     rig: Rig
     devices: Mapping[str, Any] = field(default_factory=dict)
@@ -96,18 +103,18 @@ class Manifest(Document):
     extra: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        checks = Checks("Session", SessionError)
-        checks.that("id", self.id, is_id(self.id), ID_RULE)
+        checks = FaultCollector("Session", SessionError)
+        checks.check("id", self.id, is_id(self.id), ID_RULE)
         good = self.source in ("measured", "simulated")
-        checks.that("source", self.source, good, '"measured" or "simulated"')
+        checks.check("source", self.source, good, '"measured" or "simulated"')
         zoned = self.created_at.utcoffset() is not None
-        checks.that("created_at", self.created_at.isoformat(), zoned, "a time with its zone")
+        checks.check("created_at", self.created_at.isoformat(), zoned, "a time with its zone")
         checks.close()
         self.plan.check(self.rig)
 
     def to_json(self) -> dict[str, Any]:
         """Return the manifest as JSON values, schema included, without the seal."""
-        return {"schema": SCHEMA, **table_of(self)}
+        return {"schema": SCHEMA, **to_json_table(self)}
 
     def encode(self) -> tuple[bytes, str]:
         """Return the bytes of session.json and the seal that the journal starts from."""
@@ -123,8 +130,8 @@ def seal(content: Mapping[str, Any]) -> tuple[bytes, str]:
         Where ``content`` holds what JSON cannot.
     """
     try:
-        digest = hashlib.sha256(_written(content)).hexdigest()
-        return _written({**content, _SEAL_KEY: f"sha256:{digest}"}), f"sha256:{digest}"
+        digest = hashlib.sha256(_format_document(content)).hexdigest()
+        return _format_document({**content, _SEAL_KEY: f"sha256:{digest}"}), f"sha256:{digest}"
     except (TypeError, ValueError, RecursionError) as exc:
         fault = Fault("devices, extra", str(exc), "texts, finite numbers, lists and tables")
         raise SessionError("the manifest cannot be written", faults=[fault]) from exc
@@ -157,10 +164,10 @@ def decode(data: bytes, *, where: str) -> tuple[Manifest, str]:
         advice = "Restore session.json from a copy: it was changed after it was written."
         faults = [Fault(_SEAL_KEY, got, expected)]
         raise SessionDamage("is damaged", where=where, faults=faults, advice=advice)
-    return parse(Manifest, content, where=where, error=SessionDamage), expected
+    return parse_document(Manifest, content, where=where, error=SessionDamage), expected
 
 
-def versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
     """Return the versions of what wrote a session."""
     try:
         ours = version("skinrig")
@@ -176,10 +183,10 @@ def calibration_refs(
     return tuple(
         c
         if isinstance(c, CalibrationRef)
-        else parse(CalibrationRef, dict(c), where="calibrations", error=SessionError)
+        else parse_document(CalibrationRef, dict(c), where="calibrations", error=SessionError)
         for c in calibrations
     )
 
 
-def _written(content: Mapping[str, Any]) -> bytes:
+def _format_document(content: Mapping[str, Any]) -> bytes:
     return (json.dumps(content, sort_keys=True, indent=1, allow_nan=False) + "\n").encode("ascii")

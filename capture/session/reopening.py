@@ -11,7 +11,7 @@ from capture.session.contents import (
     MAX_JOURNAL_BYTES,
     MAX_MANIFEST_BYTES,
     ORPHANS_FOLDER,
-    undamaged_contents,
+    read_undamaged_contents,
 )
 from capture.session.disk import Disk, read_file
 from capture.session.errors import SessionError
@@ -56,7 +56,7 @@ def reopen_copy(
     """
     disk = disk or Disk()
     place, target = Path(path), Path(copy)
-    contents = undamaged_contents(place)
+    contents = read_undamaged_contents(place)
     if contents.close_line is None:
         advice = "An open session needs no copy: Session.resume opens it."
         faults = [Fault("session", "open", "closed")]
@@ -64,8 +64,8 @@ def reopen_copy(
     (start, reason) = next(
         (byte, line.reason) for byte, line in contents.walk.lines if isinstance(line, CloseLine)
     )
-    journal = read_file(place / JOURNAL_FILE, limit=MAX_JOURNAL_BYTES, what="journal")[:start]
-    manifest = read_file(place / MANIFEST_FILE, limit=MAX_MANIFEST_BYTES, what="manifest")
+    journal = read_file(place / JOURNAL_FILE, limit=MAX_JOURNAL_BYTES, label="journal")[:start]
+    manifest = read_file(place / MANIFEST_FILE, limit=MAX_MANIFEST_BYTES, label="manifest")
     require_free(target)
     with DiskErrors(target):
         folders = [

@@ -12,27 +12,38 @@ from typing import Any, Literal
 
 import xxhash
 
-from capture.documents import Checks, Fault, shown
+from capture.documents import Fault, FaultCollector, short_repr
 from capture.plan import Plan, Value
 from capture.rig import Rig
-from capture.session.contents import ATTACHMENTS_FOLDER, JOURNAL_FILE, Contents, undamaged_contents
+from capture.session.contents import (
+    ATTACHMENTS_FOLDER,
+    JOURNAL_FILE,
+    SessionContents,
+    read_undamaged_contents,
+)
 from capture.session.disk import Disk
 from capture.session.errors import SessionDiskError, SessionError, SessionLocked
-from capture.session.folder import DiskErrors, make_folder, set_orphans_aside, write_new
+from capture.session.folder import DiskErrors, make_folder, move_orphans, write_new
 from capture.session.journal import (
     ATTACHMENT_RULE,
     MAX_LINE_BYTES,
     AttachmentLine,
     CloseLine,
     FrameLine,
-    LeftOutLine,
     Line,
-    attachment_file,
-    frame_file,
+    OmissionLine,
+    attachment_path,
+    frame_path,
     is_attachment_name,
     seal_line,
 )
-from capture.session.manifest import CalibrationRef, Manifest, Subject, calibration_refs, versions
+from capture.session.manifest import (
+    CalibrationRef,
+    Manifest,
+    SubjectRecord,
+    calibration_refs,
+    package_versions,
+)
 from capture.session.view import MAX_FRAME_BYTES, SessionView, check_blob
 
 _log = logging.getLogger(__name__)
@@ -54,7 +65,7 @@ class Session(SessionView):
     >>> folder = tempfile.TemporaryDirectory()
     >>> session = Session.create(
     ...     folder.name + "/s", plan=flash_plan(rig, darks=1), rig=rig, devices={},
-    ...     subject=Subject("P042", ("research",)), source="simulated", seed=1)
+    ...     subject=SubjectRecord("P042", ("research",)), source="simulated", seed=1)
     >>> step, camera = session.todo()[0]
     >>> blob = raw.encode_dng(
     ...     np.full((10, 16), 512, np.uint16), pattern="RGGB", black=512, white=16383,
@@ -67,7 +78,7 @@ class Session(SessionView):
     """
 
     def __init__(
-        self, path: Path, contents: Contents, *, disk: Disk, descriptor: int | None
+        self, path: Path, contents: SessionContents, *, disk: Disk, descriptor: int | None
     ) -> None:
         super().__init__(path, contents)
         self._disk = disk
@@ -81,7 +92,7 @@ class Session(SessionView):
         plan: Plan,
         rig: Rig,
         devices: Mapping[str, Any],
-        subject: Subject,
+        subject: SubjectRecord,
         source: Literal["measured", "simulated"],
         calibrations: Sequence[CalibrationRef | Mapping[str, str]] = (),
         seed: int | None = None,
@@ -131,7 +142,7 @@ class Session(SessionView):
             devices=dict(devices),
             calibrations=calibration_refs(calibrations),
             seed=seed,
-            versions=versions(),
+            versions=package_versions(),
             extra=dict(extra or {}),
         )
         make_folder(disk, place, manifest.encode()[0])
@@ -149,7 +160,7 @@ class Session(SessionView):
             Where manifest or journal are not what was written.
         """
         place = Path(path)
-        return cls(place, undamaged_contents(place), disk=Disk(), descriptor=None)
+        return cls(place, read_undamaged_contents(place), disk=Disk(), descriptor=None)
 
     @classmethod
     def resume(cls, path: str | Path, *, disk: Disk | None = None) -> Session:
@@ -169,14 +180,14 @@ class Session(SessionView):
         """
         disk = disk or Disk()
         place = Path(path)
-        undamaged_contents(place)
+        read_undamaged_contents(place)
         with DiskErrors(place):
             descriptor = disk.open_append(place / JOURNAL_FILE)
         try:
             if not disk.lock(descriptor):
                 what = "another process is writing this session"
                 raise SessionLocked(what, where=str(place), advice="Wait for it, or stop it.")
-            contents = undamaged_contents(place)  # again, under the lock
+            contents = read_undamaged_contents(place)  # again, under the lock
             if contents.walk.closed:
                 advice = "Start a new session; a closed one is never modified."
                 raise SessionError("the session is closed", where=str(place), advice=advice)
@@ -185,7 +196,7 @@ class Session(SessionView):
                     _log.warning("%s: cut %d torn bytes", place / JOURNAL_FILE, contents.walk.torn)
                     disk.truncate(descriptor, contents.walk.end)
                     disk.fdatasync(descriptor)
-                set_orphans_aside(disk, place, contents)
+                move_orphans(disk, place, contents)
         except BaseException:
             disk.close(descriptor)
             raise
@@ -234,7 +245,7 @@ class Session(SessionView):
             step=step_id,
             camera=camera,
             attempt=attempt,
-            file=frame_file(step_id, camera, attempt),
+            file=frame_path(step_id, camera, attempt),
             bytes=len(blob),
             xxh128=xxhash.xxh3_128_hexdigest(blob),
             settings=dict(settings),
@@ -268,18 +279,18 @@ class Session(SessionView):
         """
         descriptor = self._writable()
         if name in self._attached:
-            faults = [Fault("name", shown(name), "a name that is free")]
+            faults = [Fault("name", short_repr(name), "a name that is free")]
             advice = "What is attached stays; choose another name."
             what = "an attachment of this name is there already"
             raise SessionError(what, where=str(self.path), faults=faults, advice=advice)
-        checks = Checks("Attachment", SessionError)
-        checks.that("name", name, is_attachment_name(name), ATTACHMENT_RULE)
+        checks = FaultCollector("Attachment", SessionError)
+        checks.check("name", name, is_attachment_name(name), ATTACHMENT_RULE)
         fits = 0 < len(data) <= MAX_FRAME_BYTES
-        checks.that("data", f"{len(data)} bytes", fits, f"1 to {MAX_FRAME_BYTES} bytes")
+        checks.check("data", f"{len(data)} bytes", fits, f"1 to {MAX_FRAME_BYTES} bytes")
         checks.close()
         line = AttachmentLine(
             name=name,
-            file=attachment_file(name),
+            file=attachment_path(name),
             bytes=len(data),
             xxh128=xxhash.xxh3_128_hexdigest(data),
             about=dict(about or {}),
@@ -287,7 +298,7 @@ class Session(SessionView):
         self._write(descriptor, line, bytes(data))
         self._attached[name] = line
 
-    def leave_out(
+    def omit_steps(
         self,
         step_ids: Sequence[str],
         *,
@@ -321,15 +332,15 @@ class Session(SessionView):
             resumed.
         """
         descriptor = self._writable()
-        checks = Checks("Steps left out", SessionError)
+        checks = FaultCollector("Steps left out", SessionError)
         differ = len(set(step_ids)) == len(step_ids) > 0
-        checks.that("step_ids", tuple(step_ids), differ, "at least one, none twice")
-        checks.that("reason", reason, bool(reason.strip()), "a text")
+        checks.check("step_ids", tuple(step_ids), differ, "at least one, none twice")
+        checks.check("reason", reason, bool(reason.strip()), "a text")
         for step_id in step_ids:
             self.plan.step(step_id)  # names what is unknown
-            checks.that("step_ids", step_id, step_id not in self._left_out, "not left out before")
+            checks.check("step_ids", step_id, step_id not in self._left_out, "not left out before")
         checks.close()
-        line = LeftOutLine(
+        line = OmissionLine(
             steps=tuple(step_ids), reason=reason, about=dict(about or {}), t_host_s=float(t_host_s)
         )
         text, head = self._seal(line)
@@ -364,12 +375,12 @@ class Session(SessionView):
             raise
         self._head = head
 
-    def close(self, *, missing_because: str = "") -> None:
+    def close(self, *, missing_reason: str = "") -> None:
         """End the session for good: nothing can be added afterwards.
 
         Parameters
         ----------
-        missing_because : str
+        missing_reason : str
             Why steps of the plan are missing; required where some are that were not left out.
 
         Raises
@@ -378,14 +389,14 @@ class Session(SessionView):
             Where steps are missing and no reason is given.
         """
         descriptor = self._writable()
-        missing = tuple(dict.fromkeys(step.id for step, _ in self.todo()))
-        if missing and not missing_because:
+        missing = tuple(dict.fromkeys(step.id for step, _ in self.pending_frames()))
+        if missing and not missing_reason:
             faults = [Fault("steps", f"{len(missing)} missing, first {missing[0]!r}", "none")]
             advice = "Capture them, release() the session to go on later, or say why they stay out."
             what = "the session is not complete"
             raise SessionError(what, where=str(self.path), faults=faults, advice=advice)
         frames = sum(len(lines) for lines in self._lines.values())
-        line = CloseLine(frames=frames, missing=missing, reason=missing_because if missing else "")
+        line = CloseLine(frames=frames, missing=missing, reason=missing_reason if missing else "")
         text, head = self._seal(line)
         try:
             with DiskErrors(self.path):
@@ -418,10 +429,10 @@ class Session(SessionView):
     def _check_commit(self, step_id: str, camera: str, blob: bytes, attempt: int) -> None:
         step = self.plan.step(step_id)
         if camera not in step.cameras:
-            faults = [Fault("camera", shown(camera), f"one of {', '.join(step.cameras)}")]
+            faults = [Fault("camera", short_repr(camera), f"one of {', '.join(step.cameras)}")]
             raise SessionError(f"step {step_id!r} has no such camera", faults=faults)
         if step_id in self._left_out:
-            faults = [Fault("step", shown(step_id), "one that was not left out")]
+            faults = [Fault("step", short_repr(step_id), "one that was not left out")]
             raise SessionError("the step was left out", where=str(self.path), faults=faults)
         done = self._lines.get((step_id, camera), [])
         expected = done[-1].attempt + 1 if done else 1
@@ -436,7 +447,9 @@ class Session(SessionView):
         try:
             text, head = seal_line(self._head, line)
         except (TypeError, ValueError, RecursionError) as exc:
-            path = "about" if isinstance(line, AttachmentLine | LeftOutLine) else "settings, actual"
+            path = (
+                "about" if isinstance(line, AttachmentLine | OmissionLine) else "settings, actual"
+            )
             faults = [Fault(path, str(exc), "texts, finite numbers, true or false")]
             raise SessionError("the journal line cannot be written", faults=faults) from exc
         if len(text) > MAX_LINE_BYTES:

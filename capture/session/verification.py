@@ -11,7 +11,7 @@ from capture.session.contents import (
     JOURNAL_FILE,
     MANIFEST_FILE,
     ORPHANS_FOLDER,
-    Contents,
+    SessionContents,
     list_files,
     read_contents,
 )
@@ -92,7 +92,7 @@ def verify(path: str | Path, *, today: date | None = None) -> VerifyReport:
     return VerifyReport(not problems, tuple(problems), tuple(warnings), frames, size)
 
 
-def _stray_files(place: Path, contents: Contents) -> list[str]:
+def _stray_files(place: Path, contents: SessionContents) -> list[str]:
     known = {line.file for line in contents.file_lines}
     advice = "it was never acknowledged; resuming sets it aside"
     return [
@@ -102,14 +102,14 @@ def _stray_files(place: Path, contents: Contents) -> list[str]:
     ]
 
 
-def _state(place: Path, contents: Contents) -> list[str]:
+def _state(place: Path, contents: SessionContents) -> list[str]:
     notes = []
     walk = contents.walk
     if walk.torn:
         where = f"{place / JOURNAL_FILE}, byte {walk.end}"
         notes.append(f"{where}: {walk.torn} bytes of a line cut off by a crash; resuming cuts them")
     done = {(line.step, line.camera) for line in contents.frame_lines}
-    left_out = {step: line.reason for line in contents.left_out_lines for step in line.steps}
+    left_out = {step: line.reason for line in contents.omission_lines for step in line.steps}
     steps = [step for step in contents.manifest.plan.steps if step.id not in left_out]
     missing = sum((step.id, camera) not in done for step in steps for camera in step.cameras)
     end = contents.close_line
@@ -129,7 +129,7 @@ def _state(place: Path, contents: Contents) -> list[str]:
     return notes
 
 
-def _consent(contents: Contents, today: date) -> list[str]:
+def _consent(contents: SessionContents, today: date) -> list[str]:
     subject = contents.manifest.subject
     who = f"subject {subject.pseudonym}"
     if not subject.consent_scope:

@@ -8,12 +8,12 @@ from pathlib import Path
 import xxhash
 
 from capture import raw
-from capture.documents import Fault, shown
+from capture.documents import Fault, short_repr
 from capture.plan import Step, Value
-from capture.session.contents import Contents
+from capture.session.contents import SessionContents
 from capture.session.disk import read_file
 from capture.session.errors import ConsentError, SessionDamage, SessionError
-from capture.session.journal import AttachmentLine, FrameLine, LeftOutLine
+from capture.session.journal import AttachmentLine, FrameLine, OmissionLine
 from capture.session.manifest import ANY_USE
 
 MAX_FRAME_BYTES = 2**30
@@ -71,7 +71,7 @@ class FrameRecord:
 def check_file(path: Path, line: FrameLine | AttachmentLine) -> bytes:
     """Return the bytes of a committed file, after size and hash have been checked."""
     what = "frame" if isinstance(line, FrameLine) else "attachment"
-    blob = read_file(path, limit=MAX_FRAME_BYTES, what=what)
+    blob = read_file(path, limit=MAX_FRAME_BYTES, label=what)
     found = xxhash.xxh3_128_hexdigest(blob)
     if len(blob) != line.bytes or found != line.xxh128:
         got = f"{len(blob)} bytes, xxh128 {found}"
@@ -94,7 +94,7 @@ def check_blob(blob: bytes, step_id: str, session_id: str) -> None:
         if got != wanted:
             advice = "Encode the DNG with the step and session it is committed to."
             what = "the frame says it belongs elsewhere"
-            raise SessionError(what, faults=[Fault(field, shown(got), wanted)], advice=advice)
+            raise SessionError(what, faults=[Fault(field, short_repr(got), wanted)], advice=advice)
 
 
 class SessionView:
@@ -120,7 +120,7 @@ class SessionView:
         Seed of the simulation, None for a measured session.
     """
 
-    def __init__(self, path: Path, contents: Contents) -> None:
+    def __init__(self, path: Path, contents: SessionContents) -> None:
         self.path = path
         self.manifest = manifest = contents.manifest
         self.id, self.plan, self.rig = manifest.id, manifest.plan, manifest.rig
@@ -133,11 +133,11 @@ class SessionView:
         self._attached: dict[str, AttachmentLine] = {
             line.name: line for line in contents.attachment_lines
         }
-        self._left_out: dict[str, LeftOutLine] = {
-            step: line for line in contents.left_out_lines for step in line.steps
+        self._left_out: dict[str, OmissionLine] = {
+            step: line for line in contents.omission_lines for step in line.steps
         }
 
-    def todo(self) -> list[tuple[Step, str]]:
+    def pending_frames(self) -> list[tuple[Step, str]]:
         """Return the steps and cameras without a committed frame, in the order of the plan.
 
         Steps that were left out are not to be done.
@@ -150,7 +150,7 @@ class SessionView:
             if (step.id, camera) not in self._lines
         ]
 
-    def left_out(self) -> Mapping[str, str]:
+    def omitted_steps(self) -> Mapping[str, str]:
         """Return the steps that will not be captured, each with the reason, in the plan's order."""
         return {
             step.id: self._left_out[step.id].reason
@@ -158,7 +158,7 @@ class SessionView:
             if step.id in self._left_out
         }
 
-    def left_out_line(self, step_id: str) -> LeftOutLine:
+    def omission_line(self, step_id: str) -> OmissionLine:
         """Return what the journal says of a step that was left out.
 
         Raises
@@ -167,7 +167,7 @@ class SessionView:
             Where it was not.
         """
         if step_id not in self._left_out:
-            faults = [Fault("step", shown(step_id), "a step that was left out")]
+            faults = [Fault("step", short_repr(step_id), "a step that was left out")]
             raise SessionError("was not left out", where=str(self.path), faults=faults)
         return self._left_out[step_id]
 
@@ -224,7 +224,7 @@ class SessionView:
         """
         if name not in self._attached:
             known = ", ".join(self._attached) or "none"
-            faults = [Fault("attachment", shown(name), f"one of: {known}")]
+            faults = [Fault("attachment", short_repr(name), f"one of: {known}")]
             raise SessionError("holds no such attachment", where=str(self.path), faults=faults)
         return self._attached[name]
 
@@ -241,20 +241,20 @@ class SessionView:
         line = self.attachment_line(name)
         return check_file(self.path / line.file, line)
 
-    def export_allowed(self, scope: str, *, today: date | None = None) -> bool:
+    def is_export_allowed(self, scope: str, *, today: date | None = None) -> bool:
         """Return whether the subject's consent covers ``scope`` on the day; "any" covers all."""
         expires = self.subject.consent_expires
         in_time = expires is None or (today or datetime.now(UTC).date()) <= expires
         return in_time and bool({scope, ANY_USE} & set(self.subject.consent_scope))
 
     def require_consent(self, scope: str, *, today: date | None = None) -> None:
-        """Raise `ConsentError` where `export_allowed` is False."""
-        if not self.export_allowed(scope, today=today):
+        """Raise `ConsentError` where `is_export_allowed` is False."""
+        if not self.is_export_allowed(scope, today=today):
             allowed = ", ".join(self.subject.consent_scope) or "nothing"
             until = self.subject.consent_expires
             expected = f"one of: {allowed}" + (f", until {until}" if until else "")
             what = f"subject {self.subject.pseudonym} has not agreed to this use"
-            faults = [Fault("scope", shown(scope), expected)]
+            faults = [Fault("scope", short_repr(scope), expected)]
             advice = "Ask the subject again, or keep the data inside the agreed scope."
             raise ConsentError(what, where=str(self.path), faults=faults, advice=advice)
 

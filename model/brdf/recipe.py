@@ -21,7 +21,7 @@ BECKMANN_ROUGHNESS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6)
 BLINN_ROUGHNESS = (0.08, 0.13, 0.2, 0.28, 0.36, 0.45)
 SHEEN_WIDTH = (0.25, 0.4, 0.6)
 RETRO_WIDTH = (0.15, 0.3, 0.5)
-ETA_FACETS = 1.4  # of the Beckmann and cosine-power lobes, skin's
+FACET_ETA = 1.4  # of the Beckmann and cosine-power lobes, skin's
 
 
 def materials() -> Iterator[tuple[str, Brdf]]:
@@ -36,9 +36,9 @@ def materials() -> Iterator[tuple[str, Brdf]]:
         for roughness in GGX_ROUGHNESS:
             yield f"ggx {roughness:g} eta {eta:g}", _facets(roughness, eta, "ggx")
     for roughness in BECKMANN_ROUGHNESS:
-        yield f"beckmann {roughness:g}", _facets(roughness, ETA_FACETS, "beckmann")
+        yield f"beckmann {roughness:g}", _facets(roughness, FACET_ETA, "beckmann")
     for roughness in BLINN_ROUGHNESS:
-        yield f"blinn {roughness:g}", _facets(roughness, ETA_FACETS, "blinn")
+        yield f"blinn {roughness:g}", _facets(roughness, FACET_ETA, "blinn")
     for width in SHEEN_WIDTH:
         yield f"sheen {width:g}", _sheen(width)
     for width in RETRO_WIDTH:

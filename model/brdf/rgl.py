@@ -114,10 +114,10 @@ class RglTable:
         square = np.stack(
             [np.sqrt(_elevation(half) * (2.0 / np.pi)), np.mod(turn / (2.0 * np.pi) + 0.5, 1.0)], -1
         )
-        slices = _Slices.of(self.theta_i.astype(np.float64), _elevation(at))
-        found = slices.bilinear(self.values, _flattened(self.vndf, slices, square))
+        slices = _Interpolation.of(self.theta_i.astype(np.float64), _elevation(at))
+        found = slices.bilinear(self.values, _invert_sampling(self.vndf, slices, square))
         own = np.stack([np.sqrt(_elevation(at) * (2.0 / np.pi)), np.zeros(len(at))], -1)
-        first = _Slices(*(np.zeros(len(at), np.intp),) * 2, np.zeros(len(at)))
+        first = _Interpolation(*(np.zeros(len(at), np.intp),) * 2, np.zeros(len(at)))
         # +x of the view's azimuth; an isotropic material's area depends on the elevation alone
         scale = first.bilinear(self.ndf[None, None], square) / (
             4.0 * first.bilinear(self.sigma[None, None], own)
@@ -127,7 +127,7 @@ class RglTable:
         return out
 
 
-def of_brdf(brdf: Brdf, *, description: str) -> RglTable:
+def tabulate_brdf(brdf: Brdf, *, description: str) -> RglTable:
     """Tabulate a BRDF.
 
     Parameters
@@ -252,15 +252,15 @@ def _elevation(unit: Float64Array) -> Float64Array:
 
 
 @dataclass(frozen=True, slots=True)
-class _Slices:
+class _Interpolation:
     """Between which two tables each sample lies, and where."""
 
     low: NDArray[np.intp]
     high: NDArray[np.intp]
-    share: Float64Array
+    fraction: Float64Array
 
     @classmethod
-    def of(cls, nodes: Float64Array, at: Float64Array) -> _Slices:
+    def of(cls, nodes: Float64Array, at: Float64Array) -> _Interpolation:
         if len(nodes) == 1:
             zero = np.zeros(len(at), np.intp)
             return cls(zero, zero, np.zeros(len(at)))
@@ -271,13 +271,13 @@ class _Slices:
     def take(self, grids: Float64Array, *index: NDArray[np.intp]) -> Float64Array:
         """Return elements of (T, ...), mixed from two tables."""
         low, high = grids[(self.low, *index)], grids[(self.high, *index)]
-        return np.asarray((1.0 - self.share) * low + self.share * high)
+        return np.asarray((1.0 - self.fraction) * low + self.fraction * high)
 
     def bilinear(self, grids: Float32Array, square: Float64Array) -> Float64Array:
         """Return (n, C) of (T, C, Y, X) at places (n, 2), x first."""
         (x, y), (fx, fy) = _cells(square, grids.shape[-1], grids.shape[-2])
         out = np.zeros((len(square), grids.shape[1]))
-        for table, part in ((self.low, 1.0 - self.share), (self.high, self.share)):
+        for table, part in ((self.low, 1.0 - self.fraction), (self.high, self.fraction)):
             for dy in (0, 1):
                 for dx in (0, 1):
                     weight = part * (fy if dy else 1.0 - fy) * (fx if dx else 1.0 - fx)
@@ -294,7 +294,9 @@ def _cells(
     return (column, row), (x - column, y - row)
 
 
-def _flattened(vndf: Float32Array, slices: _Slices, square: Float64Array) -> Float64Array:
+def _invert_sampling(
+    vndf: Float32Array, slices: _Interpolation, square: Float64Array
+) -> Float64Array:
     """Return where sampling of a piecewise bilinear density would have come from, (n, 2).
 
     Rows first by the marginal density, then columns within the row: shares of the mass below.

@@ -93,7 +93,7 @@ class BrdfBasis:
         """
         light, view, n = (np.asarray(v, dtype=np.float64) for v in (light_dir, view_dir, normal))
         mu_l, mu_v = np.sum(light * n, axis=-1), np.sum(view * n, axis=-1)
-        (i_d, i_phi, i_h), (d, h) = _place(mu_l, mu_v, np.sum(light * view, axis=-1))
+        (i_d, i_phi, i_h), (d, h) = _locate_cell(mu_l, mu_v, np.sum(light * view, axis=-1))
         found = np.zeros(())
         for up_d in (0, 1):
             for up_h in (0, 1):
@@ -106,21 +106,21 @@ class BrdfBasis:
         """Return each material's RMS over the grid, (K,), 1/sr; nodes count by solid angle."""
         return np.asarray(np.sqrt(np.diag(_gram(self))))
 
-    def kinship(self) -> Float64Array:
+    def cosine_similarity(self) -> Float64Array:
         """Return the cosines between the materials, (K, K): 1 for one of the same shape."""
         gram = _gram(self)
         size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
         return np.ascontiguousarray(gram / size / size[:, None])
 
-    def mixed(self, mix: ArrayLike) -> BrdfBasis:
-        """Return the basis whose R materials are the rows of `mix`, (R, K), at least 0."""
-        rows = Checks(BasisError).numbers("mix", mix, ("R", self.size), interval="[0, inf]")
+    def mix_materials(self, weights: ArrayLike) -> BrdfBasis:
+        """Return the basis whose R materials are the rows of `weights`, (R, K), at least 0."""
+        rows = Checks(BasisError).numbers("mix", weights, ("R", self.size), interval="[0, inf]")
         table = self.table[..., : self.size].astype(np.float64) @ rows.T
-        return _padded(table, [f"mix {i}" for i in range(len(rows))], self.light_radius_rad)
+        return _pad_table(table, [f"mix {i}" for i in range(len(rows))], self.light_radius_rad)
 
 
 @lru_cache(maxsize=4)
-def default(light_radius_rad: float = LED_RADIUS_RAD) -> BrdfBasis:
+def default_basis(light_radius_rad: float = LED_RADIUS_RAD) -> BrdfBasis:
     """Return the 59 dielectrics of :mod:`model.brdf.recipe`, made on first use (2 s).
 
     Parameters
@@ -142,13 +142,13 @@ def tabulate(materials: dict[str, Brdf], *, light_radius_rad: float = 0.0) -> Br
     light_radius_rad
         Angular radius of the light to convolve with, rad, in [0, 0.5].
     """
-    columns = [_convolved(brdf, light_radius_rad) for brdf in materials.values()]
+    columns = [_average_over_light(brdf, light_radius_rad) for brdf in materials.values()]
     if not columns:
         raise BasisError("materials: got none, expected at least one")
-    return _padded(np.stack(columns, axis=-1), list(materials), light_radius_rad)
+    return _pad_table(np.stack(columns, axis=-1), list(materials), light_radius_rad)
 
 
-def of_columns(
+def basis_from_columns(
     columns: Float64Array | Float32Array, names: Sequence[str], *, light_radius_rad: float
 ) -> BrdfBasis:
     """Return the basis whose table, without its padding, was kept.
@@ -163,7 +163,7 @@ def of_columns(
     light_radius_rad
         Of the light that they are convolved with.
     """
-    return _padded(np.asarray(columns, np.float64), names, light_radius_rad)
+    return _pad_table(np.asarray(columns, np.float64), names, light_radius_rad)
 
 
 def load(folder: str | os.PathLike[str], *, light_radius_rad: float = LED_RADIUS_RAD) -> BrdfBasis:
@@ -190,28 +190,28 @@ def load(folder: str | os.PathLike[str], *, light_radius_rad: float = LED_RADIUS
     paths = sorted((p for p in found if p.suffix.lower() == ".binary"), key=lambda p: p.name)
     if not paths:
         raise BasisError(f"{folder}: got no .binary files, expected MERL tables")
-    columns = [_of_file(path, light_radius_rad) for path in paths]
-    return _padded(np.stack(columns, -1), [path.stem for path in paths], light_radius_rad)
+    columns = [_read_material(path, light_radius_rad) for path in paths]
+    return _pad_table(np.stack(columns, -1), [path.stem for path in paths], light_radius_rad)
 
 
-def _of_file(path: Path, light_radius_rad: float) -> Float32Array:
+def _read_material(path: Path, light_radius_rad: float) -> Float32Array:
     mean = merl.read_mean(path)
     if not np.nanmax(mean, initial=0.0) > 0.0:
         raise BasisError(f"{path}: got no value above 0, expected a material that reflects")
     if not np.nanmax(mean) < np.finfo(np.float32).max:
         raise BasisError(f"{path}: got {np.nanmax(mean):.3g} 1/sr, expected less than 3e38")
-    return _convolved(_nearest_bin(mean), light_radius_rad).astype(np.float32)
+    return _average_over_light(_nearest_bin(mean), light_radius_rad).astype(np.float32)
 
 
 def _nearest_bin(mean: Float64Array) -> Brdf:
     def brdf(light: Float64Array, view: Float64Array) -> Float64Array:
         h, d, phi = merl.to_angles(light, view, [0.0, 0.0, 1.0])
-        return np.asarray(mean[merl.bins(np.minimum(h, _HALF_PI), d, phi)])
+        return np.asarray(mean[merl.bin_indices(np.minimum(h, _HALF_PI), d, phi)])
 
     return brdf
 
 
-def nodes() -> tuple[Float64Array, Float64Array, Float64Array]:
+def grid_nodes() -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return theta_d, phi_d and theta_h of the grid's nodes, rad."""
     return (
         np.linspace(0.0, _HALF_PI, NODES_D),
@@ -223,7 +223,7 @@ def nodes() -> tuple[Float64Array, Float64Array, Float64Array]:
 @lru_cache(maxsize=4)
 def _gram(basis: BrdfBasis) -> Float64Array:
     """Return the products of the materials over the grid, nodes counting by solid angle."""
-    d, _, h = nodes()
+    d, _, h = grid_nodes()
     solid = np.sin(2.0 * d)[:, None] * (np.sin(h) * np.gradient(h))
     weight = np.sqrt(np.broadcast_to((solid / solid.sum())[:, None], basis.table.shape[:3]))
     scaled = basis.table[..., : basis.size] * weight[..., None].astype(np.float32)
@@ -231,13 +231,13 @@ def _gram(basis: BrdfBasis) -> Float64Array:
     return np.asarray(flat.T @ flat, dtype=np.float64) / NODES_PHI
 
 
-def _convolved(brdf: Brdf, radius_rad: float) -> Float64Array:
+def _average_over_light(brdf: Brdf, radius_rad: float) -> Float64Array:
     """Return a BRDF at the nodes, averaged with the cosine over a disc of light directions."""
     Checks(BasisError).within("light_radius_rad", radius_rad, "[0, 0.5]")
-    d, phi, h = np.meshgrid(*nodes(), indexing="ij")
+    d, phi, h = np.meshgrid(*grid_nodes(), indexing="ij")
     light, view = merl.to_directions(h, d, phi)
     if radius_rad == 0.0:
-        return _filled(np.asarray(brdf(light, view)))
+        return _fill_unknown(np.asarray(brdf(light, view)))
     # Seven points: exact on a disc for polynomials of degree 5 (Stroud 1971, S2 5-1).
     helper = np.where(np.abs(light[..., 1:2]) < 0.9, [0.0, 1.0, 0.0], [1.0, 0.0, 0.0])
     u = unit_vectors(np.cross(helper, light))
@@ -254,10 +254,10 @@ def _convolved(brdf: Brdf, radius_rad: float) -> Float64Array:
         total += np.where(known, share * np.where(known, value, 0.0), 0.0)
         weight += np.where(known, share, 0.0)
     with np.errstate(invalid="ignore"):
-        return _filled(total / weight)
+        return _fill_unknown(total / weight)
 
 
-def _filled(values: Float64Array) -> Float64Array:
+def _fill_unknown(values: Float64Array) -> Float64Array:
     """Put the nearest known node where a value is unknown, and 0 where it is below 0."""
     unknown = ~np.isfinite(values)
     if np.all(unknown):
@@ -268,14 +268,14 @@ def _filled(values: Float64Array) -> Float64Array:
     return np.maximum(values, 0.0)
 
 
-def _padded(columns: Float64Array, names: Sequence[str], light_radius_rad: float) -> BrdfBasis:
+def _pad_table(columns: Float64Array, names: Sequence[str], light_radius_rad: float) -> BrdfBasis:
     lanes = -(-len(names) // VECTOR_LANES) * VECTOR_LANES
     table = np.zeros((*columns.shape[:3], lanes), dtype=np.float32)
     table[..., : len(names)] = np.where(columns < MIN_STORED_VALUE, 0.0, columns)
     return BrdfBasis(table, tuple(names), light_radius_rad)
 
 
-def _place(
+def _locate_cell(
     mu_l: Float64Array, mu_v: Float64Array, between: Float64Array
 ) -> tuple[tuple[NDArray[np.intp], ...], tuple[Float64Array, Float64Array]]:
     """Return the cell along theta_d, phi_d, theta_h and the place in it, from cosines alone."""

@@ -42,7 +42,7 @@ _MAX_DEPTH_RATIO = float(np.sqrt(3.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Media:
+class DipoleMedia:
     """Dipoles of exit points and channels, all arrays of one shape.
 
     Attributes
@@ -61,7 +61,7 @@ class Media:
     scale: Float64Array
 
     @staticmethod
-    def of(r_d: ArrayLike, translucency_mm: ArrayLike, *, eta: float) -> Media:
+    def of(r_d: ArrayLike, translucency_mm: ArrayLike, *, eta: float) -> DipoleMedia:
         """Return the dipoles of R_d and 1/sigma_tr, mm, which broadcast together.
 
         R_d above 1, which no medium has, counts as 1: light that does not spread. R_d below 0
@@ -69,33 +69,35 @@ class Media:
 
         Examples
         --------
-        >>> Media.of(0.436, 3.674, eta=1.3).depth_mm.round(2).tolist()
+        >>> DipoleMedia.of(0.436, 3.674, eta=1.3).depth_mm.round(2).tolist()
         1.3
         """
         albedo, length = np.broadcast_arrays(
             np.asarray(r_d, np.float64), np.asarray(translucency_mm, np.float64)
         )
-        lost, depth = _inverse(eta)
+        lost, depth = _inverse_albedo_table(eta)
         q = np.interp(1.0 - np.clip(albedo, 0.0, 1.0), lost, depth)
         b = 1.0 + 4.0 / 3.0 * fresnel.boundary_factor(eta)
-        return Media(1.0 / length, q * length, b * q * length, 1.0 / (np.exp(-q) + np.exp(-b * q)))
+        return DipoleMedia(
+            1.0 / length, q * length, b * q * length, 1.0 / (np.exp(-q) + np.exp(-b * q))
+        )
 
 
 @lru_cache(maxsize=8)
-def _inverse(eta: float) -> tuple[Float64Array, Float64Array]:
+def _inverse_albedo_table(eta: float) -> tuple[Float64Array, Float64Array]:
     """Return 1 - R_d, rising, and sqrt(3 (1 - alpha')) at nodes, for linear interpolation."""
     q = _MAX_DEPTH_RATIO * np.linspace(0.0, 1.0, 8193) ** 3
     return dipole.absorbed_fraction(np.minimum(q**2 / 3.0, 1.0), eta), q
 
 
-def profile(radius_mm: ArrayLike, media: Media) -> Float64Array:
+def profile(radius_mm: ArrayLike, media: DipoleMedia) -> Float64Array:
     """Return the dipole's profile over R_d, 1/mm^2: its integral over the plane is 1.
 
     Where R_d is 1 all light leaves where it entered: 0 at every distance.
 
     Examples
     --------
-    >>> medium = Media.of(0.436, 3.674, eta=1.3)
+    >>> medium = DipoleMedia.of(0.436, 3.674, eta=1.3)
     >>> exact = dipole.reflectance(1.0, 0.032, 0.74, 1.3) / 0.436
     >>> bool(abs(profile(1.0, medium) / exact - 1) < 1e-3)
     True
@@ -110,13 +112,13 @@ def profile(radius_mm: ArrayLike, media: Media) -> Float64Array:
     return np.asarray(media.scale * total / (2.0 * np.pi))
 
 
-def share_within(radius_mm: ArrayLike, media: Media) -> Float64Array:
+def encircled_fraction(radius_mm: ArrayLike, media: DipoleMedia) -> Float64Array:
     """Return the share of light that comes out within a radius of where it went in.
 
     Examples
     --------
-    >>> medium = Media.of(0.436, 3.674, eta=1.3)
-    >>> share_within([0.0, 1.0, 1e3], medium).round(2).tolist()
+    >>> medium = DipoleMedia.of(0.436, 3.674, eta=1.3)
+    >>> encircled_fraction([0.0, 1.0, 1e3], medium).round(2).tolist()
     [0.0, 0.22, 1.0]
     """
     r = np.asarray(radius_mm, np.float64)
@@ -128,7 +130,7 @@ def share_within(radius_mm: ArrayLike, media: Media) -> Float64Array:
     return np.asarray(media.scale * total)
 
 
-def kernel(radius_mm: ArrayLike, reach_mm: ArrayLike, media: Media) -> Float64Array:
+def kernel(radius_mm: ArrayLike, reach_mm: ArrayLike, media: DipoleMedia) -> Float64Array:
     """Return the profile as sources of a finite reach carry it, 1/mm^2, integral 1.
 
     Parameters
@@ -141,7 +143,7 @@ def kernel(radius_mm: ArrayLike, reach_mm: ArrayLike, media: Media) -> Float64Ar
 
 
 def kernel_parts(
-    radius_mm: ArrayLike, reach_mm: ArrayLike, media: Media
+    radius_mm: ArrayLike, reach_mm: ArrayLike, media: DipoleMedia
 ) -> tuple[Float64Array, Float64Array]:
     """Return the kernel in two parts: `own` is light that comes out nearer than sources can tell.
 
@@ -152,23 +154,23 @@ def kernel_parts(
     a = np.where(a > 1e-150, a, 0.0)
     inside = (r < a) & (a > MIN_RADIUS_PER_DEPTH * media.depth_mm)
     a = np.where(a > 0.0, a, 1.0)
-    edge, missing = profile(a, media), _missing(a, media)
+    edge, missing = profile(a, media), _missing_fraction(a, media)
     shape = np.where(inside, 3.0 / (np.pi * a**2) * (1.0 - (r / a) ** 2) ** 2, 0.0)
-    own = _missing(SELF_RADIUS_FRACTION * a, media)
+    own = _missing_fraction(SELF_RADIUS_FRACTION * a, media)
     far = np.where(inside, edge, profile(r, media))
     return np.asarray(far + shape * (missing - own)), np.asarray(shape * own)
 
 
-def _missing(reach_mm: Float64Array, media: Media) -> Float64Array:
+def _missing_fraction(reach_mm: Float64Array, media: DipoleMedia) -> Float64Array:
     """Return the share of light within a reach above that of an even disc as at its edge."""
-    return share_within(reach_mm, media) - np.pi * reach_mm**2 * profile(reach_mm, media)
+    return encircled_fraction(reach_mm, media) - np.pi * reach_mm**2 * profile(reach_mm, media)
 
 
-def exitance_directly(
+def sum_exitance(
     source_mm: ArrayLike,
     source_area_mm2: ArrayLike,
     entered: ArrayLike,
-    at_mm: ArrayLike,
+    exit_mm: ArrayLike,
     r_d: ArrayLike,
     translucency_mm: ArrayLike,
     *,
@@ -180,7 +182,7 @@ def exitance_directly(
 
     Takes Q x S x 3 evaluations of the kernel: a reference, for a few thousand of each.
     """
-    source, at = np.asarray(source_mm, np.float64), np.asarray(at_mm, np.float64)
+    source, at = np.asarray(source_mm, np.float64), np.asarray(exit_mm, np.float64)
     area, light = np.asarray(source_area_mm2, np.float64), np.asarray(entered, np.float64)
     albedo = np.broadcast_to(np.asarray(r_d, np.float64), (len(at), 3))
     length = np.broadcast_to(np.asarray(translucency_mm, np.float64), (len(at), 3))
@@ -198,7 +200,7 @@ def exitance_directly(
         away = np.sqrt(away)
         nearest = light[np.argmin(away, axis=1)]
         for c in range(3):
-            media = Media.of(albedo[part, c, None], length[part, c, None], eta=eta)
+            media = DipoleMedia.of(albedo[part, c, None], length[part, c, None], eta=eta)
             carried, near = (share * area for share in kernel_parts(away, reach, media))
             mass, total = (carried + near).sum(axis=1), carried @ light[:, c]
             total += near @ light[:, c] if own is None else near.sum(axis=1) * own[part, c]

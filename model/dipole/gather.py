@@ -31,12 +31,12 @@ from model.arrays import Float32Array, Float64Array, Int32Array
 from model.checks import FINITE, Checks
 from model.dipole import gather_kernels as dipole_gather_kernels
 from model.dipole import source_tree_kernels
-from model.dipole.direct_sum import SOURCE_RADIUS_PER_SIDE, Media
+from model.dipole.direct_sum import SOURCE_RADIUS_PER_SIDE, DipoleMedia
 
 GATHER_TOL = 0.1
 """Largest error that exit points may have over the brightest light that entered, if all nodes erred
 to the same side by as much as they can. Measured errors are a hundred times smaller."""
-NODES_SHARING_TOL = 30.0
+N_TOL_SHARING_NODES = 30.0
 """Nodes that share the tolerance: so many come near their bounds."""
 _CHUNK_POINTS = 1 << 14
 
@@ -55,9 +55,9 @@ class SourceTree:
         Origin of the tree's own coordinates.
     order : ndarray of int
         Sources in the tree's order; those without area are left out.
-    place, reach, area : ndarray of float32
+    position, reach, area : ndarray of float32
         (S, 3), (S,), (S,): mm, mm, mm^2, in the tree's order.
-    seen, low, high, skip : ndarray
+    node_summary, low, high, skip : ndarray
         Nodes; see `model.dipole.source_tree_kernels`.
     size : int
         Number of sources given.
@@ -65,10 +65,10 @@ class SourceTree:
 
     center_mm: Float64Array
     order: NDArray[np.intp]
-    place: Float32Array
+    position: Float32Array
     reach: Float32Array
     area: Float32Array
-    seen: Float32Array
+    node_summary: Float32Array
     low: Int32Array
     high: Int32Array
     skip: Int32Array
@@ -104,15 +104,17 @@ class SourceTree:
             seen = np.zeros((0, source_tree_kernels.NODE_COLUMNS), np.float32)
             empty = np.zeros(0, np.float32)
             return SourceTree(center, some, near, empty, empty, seen, none, none, none, size)
-        order, low, high, skip = source_tree_kernels.split(near, source_tree_kernels.LEAF_SIZE)
+        order, low, high, skip = source_tree_kernels.split_sources(
+            near, source_tree_kernels.LEAF_SIZE
+        )
         near, area = near[order], area[order].astype(np.float32)
         reach = (SOURCE_RADIUS_PER_SIDE * np.sqrt(area)).astype(np.float32)
-        seen = source_tree_kernels.summarize(near, area, reach, low, high)
+        seen = source_tree_kernels.summarize_nodes(near, area, reach, low, high)
         return SourceTree(center, some[order], near, reach, area, seen, low, high, skip, size)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Gathered:
+class GatherResult:
     """What leaves at exit points.
 
     Attributes
@@ -131,7 +133,7 @@ class Gathered:
     work: Int32Array
 
 
-class Gathering(TypedDict, total=False):
+class GatherSettings(TypedDict, total=False):
     """What `exitance` leaves to `gather`."""
 
     eta: float
@@ -145,10 +147,10 @@ def exitance(
     source_mm: ArrayLike,
     source_area_mm2: ArrayLike,
     entered: ArrayLike,
-    at_mm: ArrayLike,
+    exit_mm: ArrayLike,
     r_d: ArrayLike,
     translucency_mm: ArrayLike,
-    **gathering: Unpack[Gathering],
+    **gathering: Unpack[GatherSettings],
 ) -> Float64Array:
     """Return the radiant exitance below the surface at points, from light that entered at others.
 
@@ -199,13 +201,13 @@ def exitance(
     [1.2, 0.6, 0.4]
     """
     tree = SourceTree.of(source_mm, source_area_mm2)
-    return gather(tree, entered, at_mm, r_d, translucency_mm, **gathering).exitance
+    return gather(tree, entered, exit_mm, r_d, translucency_mm, **gathering).exitance
 
 
 def gather(
     tree: SourceTree,
     entered: ArrayLike,
-    at_mm: ArrayLike,
+    exit_mm: ArrayLike,
     r_d: ArrayLike,
     translucency_mm: ArrayLike,
     *,
@@ -214,14 +216,14 @@ def gather(
     tolerance: float = GATHER_TOL,
     entered_at: ArrayLike | None = None,
     workers: int = 1,
-) -> Gathered:
+) -> GatherResult:
     """Return what leaves, as `exitance`, for a tree that is used for several lights or views."""
     light = np.asarray(entered, np.float64)
-    at = np.asarray(at_mm, np.float64)
+    at = np.asarray(exit_mm, np.float64)
     _expect("entered", light, (tree.size, 3))
     _expect("at_mm", at, (len(at), 3))
-    albedo = _spread("r_d", r_d, len(at))
-    length = _spread("translucency_mm", translucency_mm, len(at))
+    albedo = _broadcast("r_d", r_d, len(at))
+    length = _broadcast("translucency_mm", translucency_mm, len(at))
     own = np.full((1, 3), np.nan)
     if entered_at is not None:
         own = np.asarray(entered_at, np.float64)
@@ -232,16 +234,16 @@ def gather(
     found = np.zeros((len(at), 3))
     bound, work = np.zeros(len(at), np.float32), np.zeros(len(at), np.int32)
     if not len(tree.order):
-        return Gathered(found, bound, work)
+        return GatherResult(found, bound, work)
     light = light[tree.order]
     moments = source_tree_kernels.light_moments(
-        tree.place, tree.area, light, tree.low, tree.high, tree.seen
+        tree.position, tree.area, light, tree.low, tree.high, tree.node_summary
     )
     own = np.broadcast_to(own, at.shape)
 
     def one(start: int) -> None:
         part = slice(start, start + _CHUNK_POINTS)
-        media = Media.of(albedo[part], length[part], eta=eta)
+        media = DipoleMedia.of(albedo[part], length[part], eta=eta)
         here = np.ascontiguousarray(own[part]).view()
         here.flags.writeable = False  # what may be written would have the kernel compiled anew
         dipole_gather_kernels.gather(
@@ -251,13 +253,13 @@ def gather(
             media.height_mm,
             media.scale,
             here,
-            tolerance / NODES_SHARING_TOL,
+            tolerance / N_TOL_SHARING_NODES,
             normalize,
-            tree.place,
+            tree.position,
             tree.reach,
             tree.area,
             light,
-            tree.seen,
+            tree.node_summary,
             moments,
             tree.low,
             tree.high,
@@ -275,7 +277,7 @@ def gather(
     else:
         with ThreadPoolExecutor(workers) as pool:
             list(pool.map(one, starts))
-    return Gathered(found, bound, work)
+    return GatherResult(found, bound, work)
 
 
 def _expect(
@@ -285,7 +287,7 @@ def _expect(
     Checks(GatherError).within(f"{name} (leave points without it out)", values, interval)
 
 
-def _spread(name: str, given: ArrayLike, count: int) -> Float64Array:
+def _broadcast(name: str, given: ArrayLike, count: int) -> Float64Array:
     values = np.asarray(given, np.float64)
     _expect(name, values, values.shape)
-    return Checks(GatherError).spread(name, values, (count, 3))
+    return Checks(GatherError).broadcast(name, values, (count, 3))

@@ -14,8 +14,8 @@ from numba import float32, njit
 from model.dipole.direct_sum import MIN_RADIUS_PER_DEPTH, MIN_RELATIVE_LIGHT, SELF_RADIUS_FRACTION
 from model.dipole.source_tree_kernels import AREA, RADIUS, REACH, SPREAD
 
-BUFFER_SIZE = 512
-NEAR_SIZE = 64
+FAR_BUFFER_SIZE = 512
+NEAR_BUFFER_SIZE = 64
 _FAST_MATH = {"contract", "reassoc", "nsz", "arcp"}
 _TWO_PI = 2.0 * math.pi
 
@@ -129,23 +129,23 @@ def _add_near(count, near, media, q, own, total):
 
 
 @njit
-def _nearest(point, place, seen, low, high, skip):
+def _nearest(point, position, node_summary, low, high, skip):
     """Return the source nearest to a point."""
     best, found = np.inf, 0
     node = 0
     while node < len(skip):
-        x = seen[node, 0] - point[0]
-        y = seen[node, 1] - point[1]
-        z = seen[node, 2] - point[2]
-        gap = math.sqrt(x * x + y * y + z * z) - seen[node, RADIUS]
+        x = node_summary[node, 0] - point[0]
+        y = node_summary[node, 1] - point[1]
+        z = node_summary[node, 2] - point[2]
+        gap = math.sqrt(x * x + y * y + z * z) - node_summary[node, RADIUS]
         if gap > 0.0 and gap * gap >= best:
             node = skip[node]
             continue
         if skip[node] == node + 1:
             for i in range(low[node], high[node]):
-                x = place[i, 0] - point[0]
-                y = place[i, 1] - point[1]
-                z = place[i, 2] - point[2]
+                x = position[i, 0] - point[0]
+                y = position[i, 1] - point[1]
+                z = position[i, 2] - point[2]
                 away = x * x + y * y + z * z
                 if away < best:
                     best, found = away, i
@@ -155,7 +155,7 @@ def _nearest(point, place, seen, low, high, skip):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def gather(
-    at,
+    exit_point,
     sigma,
     depth,
     height,
@@ -163,11 +163,11 @@ def gather(
     own,
     tolerance,
     normalize,
-    place,
+    position,
     reach,
     area,
     entered,
-    seen,
+    node_summary,
     moments,
     low,
     high,
@@ -197,18 +197,18 @@ def gather(
     work
         (Q,) nodes and sources that were summed.
     """
-    away2 = np.empty(BUFFER_SIZE, np.float32)
-    mass = np.empty(BUFFER_SIZE, np.float32)
-    light = np.empty((3, BUFFER_SIZE), np.float32)
-    pull = np.empty((3, BUFFER_SIZE), np.float32)
-    near_away2, near_reach = np.empty(NEAR_SIZE), np.empty(NEAR_SIZE)
-    near_area, near_light = np.empty(NEAR_SIZE), np.empty((3, NEAR_SIZE))
+    away2 = np.empty(FAR_BUFFER_SIZE, np.float32)
+    mass = np.empty(FAR_BUFFER_SIZE, np.float32)
+    light = np.empty((3, FAR_BUFFER_SIZE), np.float32)
+    pull = np.empty((3, FAR_BUFFER_SIZE), np.float32)
+    near_away2, near_reach = np.empty(NEAR_BUFFER_SIZE), np.empty(NEAR_BUFFER_SIZE)
+    near_area, near_light = np.empty(NEAR_BUFFER_SIZE), np.empty((3, NEAR_BUFFER_SIZE))
     media, far = (sigma, depth, height, scale), (away2, mass, light, pull)
     near = (near_away2, near_reach, near_area, near_light)
     total = np.zeros((3, 2))
     nodes = len(skip)
-    for q in range(len(at)):
-        p0, p1, p2 = at[q, 0], at[q, 1], at[q, 2]
+    for q in range(len(exit_point)):
+        p0, p1, p2 = exit_point[q, 0], exit_point[q, 1], exit_point[q, 2]
         # one kernel that is above all channels' own: widest decay, largest dipole
         s = float32(min(sigma[q, 0], sigma[q, 1], sigma[q, 2]))
         z = min(depth[q, 0], depth[q, 1], depth[q, 2])
@@ -223,12 +223,16 @@ def gather(
         err = 0.0
         node = 0
         while node < nodes:
-            x, y, z = seen[node, 0] - p0, seen[node, 1] - p1, seen[node, 2] - p2
+            x, y, z = (
+                node_summary[node, 0] - p0,
+                node_summary[node, 1] - p1,
+                node_summary[node, 2] - p2,
+            )
             r2 = x * x + y * y + z * z
             r = math.sqrt(r2)
             opened = True
-            if r > seen[node, REACH]:
-                gap = r - seen[node, RADIUS]
+            if r > node_summary[node, REACH]:
+                gap = r - node_summary[node, RADIUS]
                 d2 = gap * gap + least2
                 d = math.sqrt(d2)
                 t = s * d
@@ -238,17 +242,17 @@ def gather(
                 e *= e
                 e *= e
                 bend = float32(12.0) + t * (float32(12.0) + t * (float32(5.0) + t))
-                strays = factor * seen[node, SPREAD] * bend
+                strays = factor * node_summary[node, SPREAD] * bend
                 room = e * d2 * d2 * d
                 if strays <= limit * room:
                     opened = False
             if not opened:
-                if count == BUFFER_SIZE:
+                if count == FAR_BUFFER_SIZE:
                     _add_far(count, far, media, q, total)
                     count = 0
                 err += strays / room
                 away2[count] = r2
-                mass[count] = seen[node, AREA]
+                mass[count] = node_summary[node, AREA]
                 for c in range(3):
                     light[c, count] = moments[node, c]
                     pull[c, count] = (
@@ -262,11 +266,11 @@ def gather(
                 continue
             if skip[node] == node + 1:
                 for i in range(low[node], high[node]):
-                    x, y, z = place[i, 0] - p0, place[i, 1] - p1, place[i, 2] - p2
+                    x, y, z = position[i, 0] - p0, position[i, 1] - p1, position[i, 2] - p2
                     r2 = x * x + y * y + z * z
                     used += 1
                     if r2 < reach[i] * reach[i]:
-                        if close == NEAR_SIZE:
+                        if close == NEAR_BUFFER_SIZE:
                             _add_near(close, near, media, q, own, total)
                             close = 0
                         near_away2[close] = r2
@@ -276,7 +280,7 @@ def gather(
                             near_light[c, close] = area[i] * entered[i, c]
                         close += 1
                     else:
-                        if count == BUFFER_SIZE:
+                        if count == FAR_BUFFER_SIZE:
                             _add_far(count, far, media, q, total)
                             count = 0
                         away2[count] = r2
@@ -296,7 +300,7 @@ def gather(
                 found[q, c] = total[c, 0] / total[c, 1]
             else:
                 if nearest < 0:
-                    nearest = _nearest(at[q], place, seen, low, high, skip)
+                    nearest = _nearest(exit_point[q], position, node_summary, low, high, skip)
                 found[q, c] = entered[nearest, c]
         bound[q] = err
         work[q] = used

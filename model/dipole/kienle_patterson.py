@@ -23,7 +23,7 @@ MAX_COEFFICIENT = 1e100
 """Most of a coefficient, 1/mm, or a distance, mm: its cube is still a number."""
 
 
-class Slopes(NamedTuple):
+class ProfileDerivatives(NamedTuple):
     """A profile of reflectance and its derivatives, broadcast alike."""
 
     reflectance_per_mm2: Float64Array
@@ -75,7 +75,7 @@ def reflectance(
 
 def derivatives(
     radius_mm: ArrayLike, sigma_a_per_mm: ArrayLike, sigma_s_prime_per_mm: ArrayLike, eta: float
-) -> Slopes:
+) -> ProfileDerivatives:
     """Return the profile and its derivatives by both coefficients; arguments of `reflectance`.
 
     Without scattering the derivatives are 0, too.
@@ -86,7 +86,7 @@ def derivatives(
     >>> bool(np.all(slopes.by_sigma_a < 0.0))
     True
     """
-    radius, absorption, scattering = Checks().together(
+    radius, absorption, scattering = Checks().broadcast_together(
         f"[0, {MAX_COEFFICIENT}]",
         radius_mm=radius_mm,
         sigma_a_per_mm=sigma_a_per_mm,
@@ -122,7 +122,7 @@ def derivatives(
     by_a = sigma_s * (by_t + k_k_by_a * by_k_over_k - both)
     by_s = sigma_s * (by_t + k_k_by_s * by_k_over_k) + both * sigma_a
     whole = (sigma_s * unit * both * unit, by_a * unit, by_s * unit)
-    return Slopes(*(np.asarray(scale * part) for part in whole))
+    return ProfileDerivatives(*(np.asarray(scale * part) for part in whole))
 
 
 def exit_coefficients(eta: float) -> tuple[float, float]:

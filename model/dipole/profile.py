@@ -56,7 +56,7 @@ def reflectance(
     >>> float(reflectance(1.0, 0.032, 0.74, 1.3).round(5))
     0.02202
     """
-    r, sigma_a, sigma_s = Checks().together(
+    r, sigma_a, sigma_s = Checks().broadcast_together(
         f"[0, {MAX_COEFFICIENT}]",
         radius_mm=radius_mm,
         sigma_a_per_mm=sigma_a_per_mm,

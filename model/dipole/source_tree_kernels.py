@@ -18,13 +18,13 @@ NODE_COLUMNS = 8
 
 
 @njit(cache=True, nogil=True)
-def split(place, leaf):
+def split_sources(position, leaf):
     """Return the sources' order and the nodes' first and last sources, nodes before their halves.
 
-    ``place`` is (S, 3). A node ``i`` with ``skip[i] == i + 1`` is a leaf; any other's halves are
+    ``position`` is (S, 3). A node ``i`` with ``skip[i] == i + 1`` is a leaf; any other's halves are
     node ``i + 1`` and what follows it.
     """
-    count = len(place)
+    count = len(position)
     order = np.arange(count)
     most = 4 * max(count // leaf, 1) + 4
     low, high = np.empty(most, np.int32), np.empty(most, np.int32)
@@ -40,14 +40,14 @@ def split(place, leaf):
             continue
         axis, longest = 0, -1.0
         for k in range(3):
-            least = most_ = place[order[lo], k]
+            least = most_ = position[order[lo], k]
             for i in range(lo, hi):
-                value = place[order[i], k]
+                value = position[order[i], k]
                 least, most_ = min(least, value), max(most_, value)
             if most_ - least > longest:
                 axis, longest = k, most_ - least
         middle = (lo + hi) // 2
-        _select(place, order, axis, lo, hi - 1, middle)
+        _select(position, order, axis, lo, hi - 1, middle)
         stack[top, 0], stack[top, 1] = middle, hi
         stack[top + 1, 0], stack[top + 1, 1] = lo, middle
         top += 2
@@ -61,15 +61,15 @@ def split(place, leaf):
 
 
 @njit(cache=True, nogil=True)
-def _select(place, order, axis, lo, hi, middle):
+def _select(position, order, axis, lo, hi, middle):
     """Reorder so that what lies below ``middle`` is no greater than what lies above (Hoare)."""
     while lo < hi:
-        pivot = place[order[(lo + hi) // 2], axis]
+        pivot = position[order[(lo + hi) // 2], axis]
         i, j = lo, hi
         while i <= j:
-            while place[order[i], axis] < pivot:
+            while position[order[i], axis] < pivot:
                 i += 1
-            while place[order[j], axis] > pivot:
+            while position[order[j], axis] > pivot:
                 j -= 1
             if i <= j:
                 order[i], order[j] = order[j], order[i]
@@ -84,7 +84,7 @@ def _select(place, order, axis, lo, hi, middle):
 
 
 @njit(cache=True, nogil=True)
-def summarize(place, area, reach, low, high):
+def summarize_nodes(position, area, reach, low, high):
     """Return what a walk reads of each node, (N, 8), from sources in the tree's order."""
     nodes = len(low)
     found = np.zeros((nodes, NODE_COLUMNS), np.float32)
@@ -93,15 +93,15 @@ def summarize(place, area, reach, low, high):
         for i in range(low[node], high[node]):
             a = area[i]
             total += a
-            x += a * place[i, 0]
-            y += a * place[i, 1]
-            z += a * place[i, 2]
+            x += a * position[i, 0]
+            y += a * position[i, 1]
+            z += a * position[i, 2]
         # rounded first: distances are from the centroid that is kept
         found[node, 0], found[node, 1], found[node, 2] = x / total, y / total, z / total
         x, y, z = np.float64(found[node, 0]), np.float64(found[node, 1]), np.float64(found[node, 2])
         farthest = moment = widest = 0.0
         for i in range(low[node], high[node]):
-            away = (place[i, 0] - x) ** 2 + (place[i, 1] - y) ** 2 + (place[i, 2] - z) ** 2
+            away = (position[i, 0] - x) ** 2 + (position[i, 1] - y) ** 2 + (position[i, 2] - z) ** 2
             moment += area[i] * away
             farthest = max(farthest, away)
             widest = max(widest, math.sqrt(away) + reach[i])
@@ -113,7 +113,7 @@ def summarize(place, area, reach, low, high):
 
 
 @njit(cache=True, nogil=True)
-def light_moments(place, area, entered, low, high, seen):
+def light_moments(position, area, entered, low, high, node_summary):
     """Return light (3) and its first moments about the centroid (3 x 3) of each node, (N, 12)."""
     nodes = len(low)
     found = np.zeros((nodes, 12), np.float32)
@@ -125,7 +125,7 @@ def light_moments(place, area, entered, low, high, seen):
                 power = area[i] * entered[i, c]
                 moment[c] += power
                 for k in range(3):
-                    moment[3 + 3 * c + k] += power * (place[i, k] - seen[node, k])
+                    moment[3 + 3 * c + k] += power * (position[i, k] - node_summary[node, k])
         for k in range(12):
             found[node, k] = moment[k]
     return found

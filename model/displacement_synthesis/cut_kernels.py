@@ -149,7 +149,7 @@ def cut_columns(row, grid, site, per_step):
 
 
 @njit(cache=True, nogil=True)
-def cell_and_place(at, lines, wrap, overlap, cuts):
+def locate_in_cells(at, lines, wrap, overlap, cuts):
     """Return which of a row of cells shows a pixel of the map, and where in its window.
 
     Parameters
@@ -184,13 +184,13 @@ def cell_and_place(at, lines, wrap, overlap, cuts):
 
 
 @njit(cache=True, nogil=True)
-def place_in_row(row, y, x, grid, site):
+def locate_in_row(row, y, x, grid, site):
     """Return (cell's column, pixel in the sources or -1) that a row of cells shows at (y, x).
 
     ``y`` is the row within the windows, ``x`` within the map.
     """
     cuts = site.across[row, :, y]
-    column, local = cell_and_place(x, grid.lines_x, grid.wrap[1], grid.overlap, cuts)
+    column, local = locate_in_cells(x, grid.lines_x, grid.wrap[1], grid.overlap, cuts)
     cell, sources = site.cells[row, column], site.sources.table
     if cell[0] < 0:
         return column, -1
@@ -216,8 +216,8 @@ def _band_misfit(line, first, last, grid, site, per_step, band, misfit):
     for i in range(first, last):
         x = i % width if grid.wrap[1] else min(max(i, 0), width - 1)
         for place in range(overlap):
-            _, p = place_in_row(above, start + place, x, grid, site)
-            _, q = place_in_row(line, place, x, grid, site)
+            _, p = locate_in_row(above, start + place, x, grid, site)
+            _, q = locate_in_row(line, place, x, grid, site)
             band[0, i - first, place] = heights[p] if p >= 0 else 0.0
             band[1, i - first, place] = heights[q] if q >= 0 else 0.0
     upper, lower = band[0].reshape(-1), band[1].reshape(-1)

@@ -28,8 +28,8 @@ from model.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from model.checks import Checks
 from model.displacement_synthesis import cut_kernels, kernels
 from model.displacement_synthesis.layout import CellGrid, Layout, SiteLayout
-from model.displacement_synthesis.regions import coarse_weights, interpolated
-from model.displacement_synthesis.sources import Sources, SynthesisError, gather
+from model.displacement_synthesis.regions import coarse_weights, interpolate_weights
+from model.displacement_synthesis.sources import PatchSources, SynthesisError, gather_sources
 
 Wrap: TypeAlias = Literal["none", "u", "both"]
 Patches: TypeAlias = Sequence[ArrayLike] | Mapping[str, Sequence[ArrayLike]]
@@ -73,7 +73,7 @@ def grow(
     threads : int
         Threads to use, 1 to 64; they do not change the result.
     **knobs
-        Of :func:`lay_out`: ``pixel_um``, ``patch_pixel_um``, ``wrap``, ``cells_px``,
+        Of :func:`build_layout`: ``pixel_um``, ``patch_pixel_um``, ``wrap``, ``cells_px``,
         ``candidates``, ``range_px``, ``transition_px``.
 
     Returns
@@ -98,7 +98,7 @@ def grow(
     >>> grow([patch], 200, rng=rng).shape
     (200, 200)
     """
-    layout = lay_out(patches, size_px, rng=rng, regions=regions, threads=threads, **knobs)
+    layout = build_layout(patches, size_px, rng=rng, regions=regions, threads=threads, **knobs)
     target = np.empty(layout.shape, np.float32) if out is None else out
     check = Checks(SynthesisError)
     check.choice("out", target.dtype, (np.dtype(np.float32),))
@@ -117,7 +117,7 @@ def grow(
     return target
 
 
-def lay_out(
+def build_layout(
     patches: Patches,
     size_px: int | tuple[int, int],
     *,
@@ -190,8 +190,8 @@ def lay_out(
     seed = int(rng.integers(2**62))
     sites = []
     for number, (name, each) in enumerate(by_site.items()):
-        sources = gather(each, zooms, window=grid.window, name=f"patches of {name}")
-        needed = None if weights is None else _needed(weights[number], grid)
+        sources = gather_sources(each, zooms, window=grid.window, name=f"patches of {name}")
+        needed = None if weights is None else _find_needed_cells(weights[number], grid)
         knobs = (candidates, np.float32(0.25 / range_px**2), np.uint64(seed + 7919 * number))
         sites.append(_choose(sources, grid, levels, needed, knobs, threads))
     return Layout(grid=grid, sites=tuple(sites), weights=weights, range_px=range_px)
@@ -245,13 +245,13 @@ def _levels(
     return levels.reshape(counts).astype(np.int64), zooms
 
 
-def _needed(weights: Float64Array, grid: CellGrid) -> BoolArray:
+def _find_needed_cells(weights: Float64Array, grid: CellGrid) -> BoolArray:
     """Return which cells show a site at all, with a margin of a cell."""
     shape = (int(grid.lines_y[-1]), int(grid.lines_x[-1]))
     found = np.empty((grid.lines_y.size - 1, grid.lines_x.size - 1), bool)
     for row in range(found.shape[0]):
         part = (int(grid.lines_y[row]), int(grid.lines_y[row + 1]))
-        share = interpolated(weights, shape, part, (0, shape[1]), wrap=grid.wrap)
+        share = interpolate_weights(weights, shape, part, (0, shape[1]), wrap=grid.wrap)
         found[row] = np.maximum.reduceat(share.max(axis=0), grid.lines_x[:-1]) > 0
     for axis in (0, 1):
         found = found | np.roll(found, 1, axis) | np.roll(found, -1, axis)
@@ -259,7 +259,7 @@ def _needed(weights: Float64Array, grid: CellGrid) -> BoolArray:
 
 
 def _choose(
-    sources: Sources,
+    sources: PatchSources,
     grid: CellGrid,
     levels: Int64Array,
     needed: BoolArray | None,
@@ -277,7 +277,7 @@ def _choose(
     )
     if needed is not None:
         site.cells[~needed, 0] = -2
-    allowed = _allowance(sources, grid.window)
+    allowed = _max_filled_pixels(sources, grid.window)
 
     def choose(row: int, first: int, beside: bool, above: bool) -> None:
         kernels.choose_windows(row, first, beside, above, grid, levels, site, allowed, knobs)
@@ -307,7 +307,7 @@ def _choose(
     return site
 
 
-def _allowance(sources: Sources, window: int) -> int:
+def _max_filled_pixels(sources: PatchSources, window: int) -> int:
     """Return how many filled pixels windows may have: what a twentieth of all windows keep to.
 
     Raises

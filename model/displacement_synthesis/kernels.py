@@ -14,14 +14,14 @@ that runs along a column.
 import numpy as np
 from numba import njit
 
-from model.displacement_synthesis.cut_kernels import cell_and_place, cut_cost, place_in_row
+from model.displacement_synthesis.cut_kernels import cut_cost, locate_in_cells, locate_in_row
 
 MAX_DRAWS = 24
 """Places drawn before a window with too many filled pixels is given up for another candidate."""
 
 
 @njit(cache=True, nogil=True)
-def mixed(key):
+def mix_bits(key):
     """Return 64 bits that depend on every bit of ``key`` (the finalizer of splitmix64)."""
     z = np.uint64(key) + np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -31,11 +31,11 @@ def mixed(key):
 
 @njit(cache=True, nogil=True)
 def _uniform(key):
-    return float(mixed(key) >> np.uint64(11)) * 2.0**-53
+    return float(mix_bits(key) >> np.uint64(11)) * 2.0**-53
 
 
 @njit(cache=True, nogil=True)
-def _filled_in(filled, source, y, x, window):
+def _count_filled(filled, source, y, x, window):
     """Return how many pixels of a source's window were filled, by the summed-area table."""
     wide = source[2]
     first = source[3] + y * (wide + 1) + x
@@ -45,14 +45,14 @@ def _filled_in(filled, source, y, x, window):
 
 
 @njit(cache=True, nogil=True)
-def _drawn(key, sources, filled, window, most_filled):
+def _draw_window(key, sources, filled, window, max_filled):
     """Return (source, row, column) of a window with few filled pixels; source -1: none found.
 
     Places are drawn as if windows might stand out of the source by half their size, and are then
     moved inside: pixels near its border are so used almost as often as those of the middle.
     """
     for attempt in range(MAX_DRAWS):
-        at = mixed(key + np.uint64(attempt))
+        at = mix_bits(key + np.uint64(attempt))
         total = 0
         for k in range(sources.shape[0]):
             total += sources[k, 1] * sources[k, 2]
@@ -68,13 +68,13 @@ def _drawn(key, sources, filled, window, most_filled):
         x = int(_uniform(at + np.uint64(2)) * wide) - window // 2
         y = min(max(y, 0), high - window)
         x = min(max(x, 0), wide - window)
-        if _filled_in(filled, sources[chosen], y, x, window) <= most_filled:
+        if _count_filled(filled, sources[chosen], y, x, window) <= max_filled:
             return chosen, y, x
     return -1, 0, 0
 
 
 @njit(cache=True, nogil=True)
-def _neighbour(row, column, axis, side, grid, cells):
+def _neighbor(row, column, axis, side, grid, cells):
     """Return the cell beside (axis 1) or above and below (axis 0) one, or -1: none is chosen."""
     cell = column if axis else row
     other, count = cell - 1 + 2 * side, cells.shape[axis]
@@ -87,7 +87,7 @@ def _neighbour(row, column, axis, side, grid, cells):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def choose_windows(row, first_column, beside, above, grid, levels, site, most_filled, knobs):
+def choose_windows(row, first_column, beside, above, grid, levels, site, max_filled, knobs):
     """Choose windows for every other cell of a row, by the cheapest cuts to neighbours there.
 
     Parameters
@@ -102,7 +102,7 @@ def choose_windows(row, first_column, beside, above, grid, levels, site, most_fi
     site : SiteLayout
         ``cells`` are written; their source before: -1 not chosen yet, -2 no cell is needed here;
         after the call, -1: no window was to be had.
-    most_filled : int
+    max_filled : int
         Filled pixels of a window.
     knobs : (int, float32, uint64)
         Candidates, squared slope per squared step, seed.
@@ -114,24 +114,24 @@ def choose_windows(row, first_column, beside, above, grid, levels, site, most_fi
             continue
         first = sources.level_first[levels[row, column]]
         own = sources.table[first : sources.level_first[levels[row, column] + 1]]
-        key = mixed(seed ^ mixed(np.uint64(row) * np.uint64(1 << 24) + np.uint64(column)))
+        key = mix_bits(seed ^ mix_bits(np.uint64(row) * np.uint64(1 << 24) + np.uint64(column)))
         best = np.inf
         for number in range(candidates):
             drawn = key + np.uint64(number) * np.uint64(1 << 16)
-            k, y, x = _drawn(drawn, own, sources.filled, grid.window, most_filled)
+            k, y, x = _draw_window(drawn, own, sources.filled, grid.window, max_filled)
             if k < 0:
                 continue
             cost = 0.0
             for axis in (1, 0):
                 if not (beside if axis else above):
                     continue
-                heights = sources.heights if axis else sources.turned
+                heights = sources.heights if axis else sources.transposed
                 lines = grid.lines_x if axis else grid.lines_y
                 here, step = own[k, 0] + y * own[k, 2] + x, own[k, 2]
                 if axis == 0:
                     here, step = own[k, 4] + x * own[k, 1] + y, own[k, 1]
                 for side in range(2):
-                    other = _neighbour(row, column, axis, side, grid, cells)
+                    other = _neighbor(row, column, axis, side, grid, cells)
                     if other < 0 or cost >= best:
                         continue
                     o = cells[row, other] if axis else cells[other, column]
@@ -147,7 +147,7 @@ def choose_windows(row, first_column, beside, above, grid, levels, site, most_fi
                     cost += cut_cost(heights, a, a_step, b, b_step, grid, per_step, best - cost)
             if cost < best:
                 best = cost
-                count = _filled_in(sources.filled, own[k], y, x, grid.window)
+                count = _count_filled(sources.filled, own[k], y, x, grid.window)
                 cells[row, column, 0], cells[row, column, 1] = first + k, y
                 cells[row, column, 2], cells[row, column, 3] = x, count
                 if not (beside or above):
@@ -155,7 +155,7 @@ def choose_windows(row, first_column, beside, above, grid, levels, site, most_fi
 
 
 @njit(cache=True, nogil=True)
-def lay_down(top, left, grid, site, out, labels, pixels):
+def write_windows(top, left, grid, site, out, labels, pixels):
     """Write the windows' pixels of one tile.
 
     Parameters
@@ -187,8 +187,8 @@ def lay_down(top, left, grid, site, out, labels, pixels):
             pixels[i, j] = -1
             if y < 0 or y >= height or x < 0 or x >= width:
                 continue
-            row, local = cell_and_place(y, grid.lines_y, wrap_y, grid.overlap, site.down[:, x])
-            column, p = place_in_row(row, local, x, grid, site)
+            row, local = locate_in_cells(y, grid.lines_y, wrap_y, grid.overlap, site.down[:, x])
+            column, p = locate_in_row(row, local, x, grid, site)
             if p >= 0:
                 out[i, j] = site.sources.heights[p]
                 labels[i, j] = row * nx + column
@@ -196,7 +196,7 @@ def lay_down(top, left, grid, site, out, labels, pixels):
 
 
 @njit(cache=True, nogil=True)
-def steps_at_cuts(out, labels, pixels, site, divergence):
+def cut_divergence(out, labels, pixels, site, divergence):
     """Write the divergence of what differences across cuts have too much.
 
     Across a cut the difference ought to be the mean of those that both windows have there.

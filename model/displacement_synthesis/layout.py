@@ -11,12 +11,12 @@ from scipy import fft
 
 from model.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from model.displacement_synthesis import kernels
-from model.displacement_synthesis.regions import interpolated
-from model.displacement_synthesis.sources import Sources, SynthesisError
+from model.displacement_synthesis.regions import interpolate_weights
+from model.displacement_synthesis.sources import PatchSources, SynthesisError
 
 TILE_PX = 1024
 """Side of the tiles that steps are closed in; part of the result's definition."""
-MARGIN_RANGES = 8.0
+MARGIN_TO_RANGE_RATIO = 8.0
 """A tile's margin in ranges of the screened Poisson equation: e^-8 of a step is left there."""
 
 
@@ -38,7 +38,7 @@ class CellGrid(NamedTuple):
 class SiteLayout(NamedTuple):
     """What the patches of one site were laid out to."""
 
-    sources: Sources
+    sources: PatchSources
     cells: Int64Array
     """(ny, nx, 4): source, row and column of the window, filled pixels in it; source -2: none."""
     across: NDArray[np.int16]
@@ -99,7 +99,7 @@ class Layout:
             ]
         return out
 
-    def at_cuts(self, rows: tuple[int, int], columns: tuple[int, int]) -> BoolArray:
+    def cut_mask(self, rows: tuple[int, int], columns: tuple[int, int]) -> BoolArray:
         """Return which pixels touch another window than their own, in any site that shows there.
 
         Parameters
@@ -110,7 +110,7 @@ class Layout:
         self._check(rows, columns)
         found = np.zeros((rows[1] - rows[0], columns[1] - columns[0]), bool)
         for site in self.sites:
-            _, labels, _ = self._laid_down(site, rows[0], columns[0], found.shape)
+            _, labels, _ = self._write_windows(site, rows[0], columns[0], found.shape)
             for axis in (0, 1):
                 other = np.diff(labels, axis=axis) != 0
                 ends = [np.zeros_like(other.take([0], axis)), other]
@@ -134,7 +134,7 @@ class Layout:
             return self._relief(self.sites[0], top, left, (high, wide))
         part = (top, top + high), (left, left + wide)
         shares = np.stack(
-            [interpolated(one, shape, *part, wrap=self.grid.wrap) for one in self.weights]
+            [interpolate_weights(one, shape, *part, wrap=self.grid.wrap) for one in self.weights]
         )
         shares /= np.sqrt((shares**2).sum(axis=0))
         out = np.zeros((high, wide), np.float32)
@@ -150,26 +150,26 @@ class Layout:
             if not 0 <= first < last <= size:
                 raise SynthesisError(f"{name}: got {first}...{last}, expected within 0...{size}")
 
-    def _laid_down(
+    def _write_windows(
         self, site: SiteLayout, top: int, left: int, size: tuple[int, int]
     ) -> tuple[Float32Array, Int64Array, Int64Array]:
         out = np.empty(size, np.float32)
         labels, pixels = np.empty(size, np.int64), np.empty(size, np.int64)
-        kernels.lay_down(top, left, self.grid, site, out, labels, pixels)
+        kernels.write_windows(top, left, self.grid, site, out, labels, pixels)
         return out, labels, pixels
 
     def _relief(self, site: SiteLayout, top: int, left: int, size: tuple[int, int]) -> Float32Array:
-        margin = math.ceil(MARGIN_RANGES * self.range_px)
-        out, labels, pixels = self._laid_down(
+        margin = math.ceil(MARGIN_TO_RANGE_RATIO * self.range_px)
+        out, labels, pixels = self._write_windows(
             site, top - margin, left - margin, (size[0] + 2 * margin, size[1] + 2 * margin)
         )
         steps = np.empty_like(out)
-        kernels.steps_at_cuts(out, labels, pixels, site, steps)
-        out += _closing(steps, self.range_px)
+        kernels.cut_divergence(out, labels, pixels, site, steps)
+        out += _solve_correction(steps, self.range_px)
         return out[margin : margin + size[0], margin : margin + size[1]]
 
 
-def _closing(divergence: Float32Array, range_px: float) -> Float32Array:
+def _solve_correction(divergence: Float32Array, range_px: float) -> Float32Array:
     """Return c of ``(1 / range^2 - Laplace) c = divergence``, periodic over the array."""
     rows, columns = (fft.next_fast_len(n, real=True) for n in divergence.shape)
     spectrum = fft.rfft2(divergence, s=(rows, columns))

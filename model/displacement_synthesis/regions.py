@@ -65,7 +65,7 @@ def coarse_weights(
     return weights
 
 
-def interpolated(
+def interpolate_weights(
     weights: Float64Array,
     shape: tuple[int, int],
     rows: tuple[int, int],

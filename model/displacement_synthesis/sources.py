@@ -29,7 +29,7 @@ class SynthesisError(ValueError):
     """Patches, sizes, regions or knobs that nothing can be grown from."""
 
 
-def leveled(
+def level_patch(
     height_um: ArrayLike,
     *,
     pixel_um: float,
@@ -69,7 +69,7 @@ def leveled(
     Examples
     --------
     >>> ramp = np.add.outer(np.arange(50.0), np.arange(50.0))
-    >>> bool(abs(leveled(ramp, pixel_um=10.0, cutoff_um=100.0)[20:30, 20:30]).max() < 1e-3)
+    >>> bool(abs(level_patch(ramp, pixel_um=10.0, cutoff_um=100.0)[20:30, 20:30]).max() < 1e-3)
     True
     """
     height, known = _checked(height_um, valid, "height_um")
@@ -102,10 +102,10 @@ def _checked(
     return values, known
 
 
-def filled(height: FloatArray, known: BoolArray) -> Float32Array:
+def fill_holes(height: FloatArray, valid: BoolArray) -> Float32Array:
     """Return heights with each hole bridged by means of what surrounds it, the nearest first."""
-    values = np.where(known, height, 0.0).astype(np.float64)
-    weight = known.astype(np.float64)
+    values = np.where(valid, height, 0.0).astype(np.float64)
+    weight = valid.astype(np.float64)
     sigma = 1.0
     while not (weight > 0).all():
         near = gaussian_filter(weight, sigma, truncate=3.0)
@@ -117,26 +117,26 @@ def filled(height: FloatArray, known: BoolArray) -> Float32Array:
     return values.astype(np.float32)
 
 
-class Sources(NamedTuple):
+class PatchSources(NamedTuple):
     """All patches of a site at all scales, in one flat array."""
 
     table: Int64Array
-    """(S, 5): first pixel in ``heights``, height, width, first entry in ``filled``, first pixel in
-    ``turned``."""
+    """(S, 5): first pixel in ``heights``, height, width, first entry in ``fill_holes``, first
+    pixel in ``transposed``."""
     level_first: Int64Array
     """(L + 1,): sources of scale l begin at level_first[l]."""
     heights: Float32Array
     """(N,) heights, um."""
-    turned: Float32Array
+    transposed: Float32Array
     """(N,) the same with each source transposed."""
     filled: Int32Array
     """(M,) summed-area tables, (height + 1, width + 1) each, of pixels without a height of their
     own."""
 
 
-def gather(
+def gather_sources(
     patches: Sequence[ArrayLike], zooms: Sequence[float], *, window: int, name: str
-) -> Sources:
+) -> PatchSources:
     """Resample patches to all scales and put them into one array.
 
     Parameters
@@ -158,7 +158,7 @@ def gather(
     if not len(patches):
         raise SynthesisError(f"{name}: got no patch")
     checked = [_checked(patch, None, f"{name}[{n}]") for n, patch in enumerate(patches)]
-    whole = [(filled(height, known), known) for height, known in checked]
+    whole = [(fill_holes(height, known), known) for height, known in checked]
     if sum(h.size * z * z for h, _ in whole for z in zooms) > MAX_SOURCE_PX:
         raise SynthesisError(
             f"{name}: got more than {MAX_SOURCE_PX} pixels at {len(zooms)} scales, expected fewer "
@@ -185,16 +185,16 @@ def gather(
     heights, turned = np.empty(pixel, np.float32), np.empty(pixel, np.float32)
     sums = np.zeros(entry, np.int32)
     for (begin, high, wide, entry, _), (number, zoom) in zip(rows, used, strict=True):
-        scaled, missing = _scaled(*whole[number], zoom)
+        scaled, missing = _resample(*whole[number], zoom)
         heights[begin : begin + scaled.size] = scaled.reshape(-1)
         turned[begin : begin + scaled.size] = scaled.T.reshape(-1)
         table = sums[entry : entry + (high + 1) * (wide + 1)].reshape(high + 1, wide + 1)
         table[1:, 1:] = missing.cumsum(0, dtype=np.int32).cumsum(1, dtype=np.int32)
-    return Sources(
+    return PatchSources(
         table=np.array(rows, np.int64),
         level_first=np.array(firsts, np.int64),
         heights=heights,
-        turned=turned,
+        transposed=turned,
         filled=sums,
     )
 
@@ -203,15 +203,17 @@ def _scaled_shape(shape: tuple[int, ...], zoom: float) -> tuple[int, int]:
     return max(1, int(shape[0] * zoom + 1e-9)), max(1, int(shape[1] * zoom + 1e-9))
 
 
-def _scaled(height: Float32Array, known: BoolArray, zoom: float) -> tuple[Float32Array, BoolArray]:
+def _resample(
+    height: Float32Array, valid: BoolArray, zoom: float
+) -> tuple[Float32Array, BoolArray]:
     """Return heights with ``zoom`` times the pixels a side, and which of them were filled."""
     if abs(zoom - 1.0) < 1e-9:
-        return height, ~known
+        return height, ~valid
     places = [(np.arange(n) + 0.5) / zoom - 0.5 for n in _scaled_shape(height.shape, zoom)]
     grid = np.meshgrid(*places, indexing="ij")
     smooth = height
     if zoom < 1.0:
         smooth = gaussian_filter(height, 0.5 * math.sqrt(zoom**-2 - 1.0), mode="nearest")
     values = map_coordinates(smooth, grid, order=3, mode="nearest")
-    share = map_coordinates((~known).astype(np.float32), grid, order=1, mode="nearest")
+    share = map_coordinates((~valid).astype(np.float32), grid, order=1, mode="nearest")
     return values.astype(np.float32), share > 0.25

@@ -35,7 +35,7 @@ class _Neutral:
     valid: BoolArray
     stderr: Float64Array
     radius_px: float
-    cells: coarse_maps.Cells
+    cells: coarse_maps.CoarseGrid
     own: DiscStatistics
     mean: Float64Array
     """Of discs, a value a cell."""
@@ -48,7 +48,7 @@ class _Neutral:
         masks: Mapping[str, BoolArray],
         errors: Mapping[str, Float64Array],
         radius_px: float,
-        cells: coarse_maps.Cells,
+        cells: coarse_maps.CoarseGrid,
     ) -> _Neutral:
         image, valid = images[NEUTRAL], masks[NEUTRAL]
         if not valid.any():
@@ -70,7 +70,7 @@ class _Neutral:
         )
 
 
-def fitted(
+def fit_rig_maps(
     neutral: ArrayLike,
     states: Mapping[str, ArrayLike],
     *,
@@ -90,7 +90,9 @@ def fitted(
     images = {NEUTRAL: base} | {n: _image(n, m, shape) for n, m in states.items()}
     masks = _masks(valid, images)
     errors = _errors(stderr, images)
-    rest = _Neutral.of(images, masks, errors, radius_px, coarse_maps.fitting(shape, stored_size))
+    rest = _Neutral.of(
+        images, masks, errors, radius_px, coarse_maps.coarse_grid(shape, stored_size)
+    )
     texture_px = texture_area_px(base - rest.own.mean, rest.valid)
     made = {n: _state(images[n], masks[n], errors[n], rest, texture_px) for n in states}
     listed = [n for n in GLOBAL_STATES if n in states] if global_states is None else global_states
@@ -124,7 +126,7 @@ def _state(
         )
         for stats, e in ((seen, error), (rest, neutral.stderr))
     ]
-    ratio = deviation_ratio.estimate(
+    ratio = deviation_ratio.estimate_ratio(
         seen.deviation, rest.deviation, sampled + measured[0] + measured[1], where
     )
     s = ratio.value
@@ -220,7 +222,7 @@ def texture_area_px(base: Float64Array, valid: BoolArray) -> float:
     return area
 
 
-def transferred(
+def transfer_rig_maps(
     rig: RigMaps,
     neutral: ArrayLike,
     *,
@@ -236,23 +238,23 @@ def transferred(
     errors = _errors({} if stderr is None else {NEUTRAL: stderr}, images)
     size = rig.neutral_mean.shape
     stored = (min(size[0], base.shape[0]), min(size[1], base.shape[1]))
-    cells = coarse_maps.Cells((base.shape[0], base.shape[1]), stored)
+    cells = coarse_maps.CoarseGrid((base.shape[0], base.shape[1]), stored)
     radius_px = float(rig.radius_px * np.sqrt(base.size / rig.neutral.size))
     rest = _Neutral.of(images, masks, errors, radius_px, cells)
     mean, here = rest.mean, rest.mean_valid
-    source_mean, source_valid = _resampled(rig.neutral_mean, rig.neutral_mean_valid, stored)
+    source_mean, source_valid = _resample(rig.neutral_mean, rig.neutral_mean_valid, stored)
     made = {}
     for name, state in rig.states.items():
         maps = {
-            field: _resampled(getattr(state, field), state.valid, stored)[0]
+            field: _resample(getattr(state, field), state.valid, stored)[0]
             for field in ("scale", "bias", "scale_stderr", "bias_stderr", "misfit")
         }
-        both = _resampled(state.bias, state.valid, stored)[1] & source_valid & here
+        both = _resample(state.bias, state.valid, stored)[1] & source_valid & here
         if transfer == "difference":
             maps["bias"] = mean + maps["bias"] - source_mean
         elif transfer == "ratio":
             variance = maps["bias_stderr"] ** 2 + (ROUNDING_ERROR * maps["bias"]) ** 2
-            change = deviation_ratio.estimate(maps["bias"], source_mean, variance, both)
+            change = deviation_ratio.estimate_ratio(maps["bias"], source_mean, variance, both)
             known = both & (source_mean > 0.0)
             maps["bias"] = mean * change.value
             maps["bias_stderr"] = np.abs(mean) * change.stderr
@@ -268,7 +270,7 @@ def transferred(
     return rest.rig(made, rig.global_states)
 
 
-def _resampled(
+def _resample(
     values: Float64Array, valid: BoolArray, shape: tuple[int, int]
 ) -> tuple[Float64Array, BoolArray]:
     """Return a stored map at another size, and where it holds something."""
@@ -276,11 +278,11 @@ def _resampled(
         return values, valid
     few = (min(values.shape[0], shape[0]), min(values.shape[1], shape[1]))
     if few != values.shape:
-        values, valid = coarse_maps.Cells((values.shape[0], values.shape[1]), few).coarsen(
+        values, valid = coarse_maps.CoarseGrid((values.shape[0], values.shape[1]), few).coarsen(
             values, valid
         )
     if few != shape:
-        (values,) = coarse_maps.Cells(shape, few).refine(values, valid=valid)
+        (values,) = coarse_maps.CoarseGrid(shape, few).refine(values, valid=valid)
         valid = np.isfinite(values)
     return np.where(valid, values, 0.0), valid
 

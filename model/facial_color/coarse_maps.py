@@ -13,7 +13,7 @@ class CoarseMapError(ValueError):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Cells:
+class CoarseGrid:
     """How the pixels of a map share the cells of a small one.
 
     Cell and pixel grids cover the same rectangle. A cell is the mean of the valid pixels in it,
@@ -60,7 +60,9 @@ class Cells:
         valid
             (h, w): cells that hold something.
         """
-        down, across = (_hats(*pair) for pair in zip(self.shape, self.stored, strict=True))
+        down, across = (
+            _interpolation_weights(*pair) for pair in zip(self.shape, self.stored, strict=True)
+        )
         if valid.all():
             return tuple(np.asarray(down @ one @ across.T) for one in cells)
         weight = down @ valid.astype(np.float64) @ across.T
@@ -70,18 +72,18 @@ class Cells:
         )
 
 
-def fitting(shape: tuple[int, int], size: int | None) -> Cells:
+def coarse_grid(shape: tuple[int, int], size: int | None) -> CoarseGrid:
     """Return the cells of a map kept at ``size`` a side, or at its own where that is less.
 
     Examples
     --------
-    >>> fitting((2048, 100), 256).stored
+    >>> coarse_grid((2048, 100), 256).stored
     (256, 100)
     """
     if size is not None and size < 1:
         raise CoarseMapError(f"size: got {size}, expected at least 1 cell")
     few = shape if size is None else (min(shape[0], size), min(shape[1], size))
-    return Cells(shape, few)
+    return CoarseGrid(shape, few)
 
 
 def _areas(pixels: int, cells: int) -> csr_array:
@@ -95,7 +97,7 @@ def _areas(pixels: int, cells: int) -> csr_array:
     return csr_array((share, (rows, columns)), shape=(cells, pixels))
 
 
-def _hats(pixels: int, cells: int) -> csr_array:
+def _interpolation_weights(pixels: int, cells: int) -> csr_array:
     """Return the weights of linear interpolation between cell centres, (pixels, cells)."""
     at = np.clip((np.arange(pixels) + 0.5) * (cells / pixels) - 0.5, 0.0, cells - 1.0)
     low = np.minimum(at.astype(np.intp), max(cells - 2, 0))

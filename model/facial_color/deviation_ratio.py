@@ -27,7 +27,7 @@ ROUNDING_ERROR = float(np.finfo(np.float32).eps)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ratio:
+class RatioEstimate:
     """Estimated ratios, arrays of the shape of what they were estimated from."""
 
     value: Float64Array
@@ -38,9 +38,9 @@ class Ratio:
     """rho: what was expected before a place was looked at, and its standard deviation."""
 
 
-def estimate(
-    numerator: Float64Array, denominator: Float64Array, variance: Float64Array, held: BoolArray
-) -> Ratio:
+def estimate_ratio(
+    numerator: Float64Array, denominator: Float64Array, variance: Float64Array, valid: BoolArray
+) -> RatioEstimate:
     """Estimate numerator / denominator under the prior that the map itself gives.
 
     Parameters
@@ -59,23 +59,23 @@ def estimate(
     Examples
     --------
     >>> seen = np.array([0.0, 1e-9, 1.0, 2.0])
-    >>> found = estimate(1.5 * seen + [0.1, 0.1, 0, 0], seen, np.full(4, 1e-6), seen >= 0)
+    >>> found = estimate_ratio(1.5 * seen + [0.1, 0.1, 0, 0], seen, np.full(4, 1e-6), seen >= 0)
     >>> found.value.round(2).tolist()
     [1.5, 1.5, 1.5, 1.5]
     """
     # one that is no number, or has no variance, would be in the prior of all
     known_of = [np.isfinite(x) for x in (numerator, denominator, variance)]
-    held = held & np.logical_and.reduce(known_of) & (np.nan_to_num(variance) >= 0.0)
-    a, b, v = (np.where(held, x, 0.0) for x in (numerator, denominator, variance))
-    prior = overall(a, b)
+    valid = valid & np.logical_and.reduce(known_of) & (np.nan_to_num(variance) >= 0.0)
+    a, b, v = (np.where(valid, x, 0.0) for x in (numerator, denominator, variance))
+    prior = global_ratio(a, b)
     gain, error = prior**2 * b, prior**2 * b**2 + v
     there = error > 0.0
     value = prior + np.where(there, gain * (a - prior * b) / np.where(there, error, 1.0), 0.0)
     known = np.where(there, v / np.where(there, error, 1.0), 1.0)
-    return Ratio(value, np.where(held, prior * np.sqrt(known), prior), prior)
+    return RatioEstimate(value, np.where(valid, prior * np.sqrt(known), prior), prior)
 
 
-def overall(numerator: Float64Array, denominator: Float64Array) -> float:
+def global_ratio(numerator: Float64Array, denominator: Float64Array) -> float:
     """Return the least-squares ratio over a map.
 
     1 where the denominator is 0 everywhere: nothing says that anything should change.

@@ -45,7 +45,7 @@ def _add_down(running, new, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
-def _along(v, n, r0, r1, r2, r3):
+def _sum_rows(v, n, r0, r1, r2, r3):
     """Write the sums along four rows, before each entry and after the last; return the largest."""
     v0, v1, v2, v3 = v[0], v[1], v[2], v[3]
     s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
@@ -106,7 +106,7 @@ def _valid_moments_of(row, valid, about):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _directly(image, half, y, x):
+def _sum_disc(image, half, y, x):
     """Return mean and variance of one disc by summing its pixels about one of them."""
     h, valid, masked = image
     rows, columns = h.shape
@@ -133,7 +133,7 @@ def _directly(image, half, y, x):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _stays(image, half, y, x, level):
+def _is_constant_step(image, half, y, x, level):
     """Return whether what a disc gains by a step to column `x` is all of one value."""
     h = image[0]
     rows, columns = h.shape
@@ -228,7 +228,9 @@ def _tile(image, disc, trusted, box, room, found):
                             value = d if moment == 0 else (d * d if moment == 1 else 1.0)
                         v[b, c - c0] = value
                 _add_down(running, v[b, :wide], q[k + b + 1, skip:])
-            most = _along(v, wide, p[k, skip:], p[k + 1, skip:], p[k + 2, skip:], p[k + 3, skip:])
+            most = _sum_rows(
+                v, wide, p[k, skip:], p[k + 1, skip:], p[k + 2, skip:], p[k + 3, skip:]
+            )
             if moment == 1:
                 largest = max(largest, most)
         if moment == 1:
@@ -266,11 +268,11 @@ def _tile(image, disc, trusted, box, room, found):
             mean[y, x0 + i] = about + m
             if held * variance * trusted >= doubt:
                 constant = False
-            elif constant and _stays(image, half, y, x0 + i, level):
+            elif constant and _is_constant_step(image, half, y, x0 + i, level):
                 mean[y, x0 + i] = level
                 variance = np.float64(0.0)
             else:
-                level, variance = _directly(image, half, y, x0 + i)
+                level, variance = _sum_disc(image, half, y, x0 + i)
                 mean[y, x0 + i] = level
                 constant = variance == 0.0
             deviation[y, x0 + i] = np.sqrt(max(variance, 0.0))

@@ -77,7 +77,7 @@ def half_widths(radius_px: float, rows: int, columns: int) -> Int64Array:
     )
 
 
-def _only_read(values: NDArray[Any]) -> NDArray[Any]:
+def _read_only_view(values: NDArray[Any]) -> NDArray[Any]:
     """Return a view that cannot be written: a kernel is compiled anew for arrays that can."""
     view = values.view()
     view.flags.writeable = False
@@ -143,8 +143,8 @@ def measure(h: ArrayLike, radius_px: float, *, valid: BoolArray | None = None) -
     for at in np.ndindex(h.shape[:-2]):
         mask = nothing if valid is None else np.ascontiguousarray(valid[at])
         disc_kernels.disc_moments(
-            _only_read(np.ascontiguousarray(h[at])),
-            _only_read(mask.view(np.uint8)),
+            _read_only_view(np.ascontiguousarray(h[at])),
+            _read_only_view(mask.view(np.uint8)),
             valid is not None,
             half,
             high,

@@ -71,7 +71,7 @@ def from_maps_and_document(maps: Mapping[str, SkinMap], document: bytes) -> Hemo
     version = loaded.get("schema") if isinstance(loaded, dict) else None
     if version != SCHEMA:
         raise FacialColorError(f"{RIG_DOCUMENT}: got schema {version!r}, expected {SCHEMA!r}")
-    _exactly("", loaded, _DOCUMENT_KEYS)
+    _require_equal("", loaded, _DOCUMENT_KEYS)
     shape, stored = (_size(key, loaded[key]) for key in ("shape", "stored"))
     radius = _number("radius_px", loaded["radius_px"])
     listed = loaded["global_states"]
@@ -84,7 +84,7 @@ def from_maps_and_document(maps: Mapping[str, SkinMap], document: bytes) -> Hemo
     for name, entry in loaded["states"].items():
         if not isinstance(entry, dict):
             raise FacialColorError(f"{RIG_DOCUMENT}: states.{name}: expected an object")
-        _exactly(f"states.{name}.", entry, set(_STATE_KEYS))
+        _require_equal(f"states.{name}.", entry, set(_STATE_KEYS))
         number = {key: _number(f"states.{name}.{key}", entry[key]) for key in _STATE_KEYS}
         scale, bias, misfit = (
             _map(maps, f"{kind}_{name}", stored, unit) for kind, (unit, _) in _STATE_MAPS.items()
@@ -138,7 +138,7 @@ def _map(maps: Mapping[str, SkinMap], name: str, shape: tuple[int, int], unit: s
     return found
 
 
-def _exactly(where: str, got: Mapping[str, Any], expected: set[str]) -> None:
+def _require_equal(where: str, got: Mapping[str, Any], expected: set[str]) -> None:
     for key in sorted(expected - set(got)):
         raise FacialColorError(f"{RIG_DOCUMENT}: {where}{key} is missing")
     for key in sorted(set(got) - expected):

@@ -125,10 +125,10 @@ def _gather(h: Any, valid: Any, half: Any, y: Any, x: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _at_share(ordered: Any, share: Any) -> Any:
+def _quantile(ordered: Any, fraction: Any) -> Any:
     """Return the value below which a share of the ordered values lies."""
     n = ordered.size
-    at = min(max(share * n - 0.5, 0.0), n - 1.0)
+    at = min(max(fraction * n - 0.5, 0.0), n - 1.0)
     low = min(int(at), n - 1)
     part = at - low
     if part < 1e-9 or low == n - 1:
@@ -178,5 +178,5 @@ def _match_windows(
                     below = np.searchsorted(source, a[k, c])
                     upto = np.searchsorted(source, a[k, c], side="right")
                     share = 0.5 * (below + upto) / source.size
-                    total[k, c] += hat * _at_share(wanted, share)
+                    total[k, c] += hat * _quantile(wanted, share)
                     weight[k, c] += hat

@@ -30,7 +30,7 @@ from model.tissue_optics.layers import C_HD_MAX
 
 STORED_SIZE: Final = 256
 """Cells a side of the stored scale and bias maps (Jimenez2010, section 6)."""
-BLOOD_LIMITS: Final = (0.0, C_HD_MAX)
+HEMOGLOBIN_LIMITS: Final = (0.0, C_HD_MAX)
 """Volume fractions of blood that exist, Jimenez2010, Table 1."""
 GLOBAL_GAINS: Final[Mapping[str, float]] = MappingProxyType({"anger": 1.27, "fear": 0.81})
 """Factors of all blood at full emotion, beside the expression (Jimenez2010, section 7)."""
@@ -146,7 +146,7 @@ class HemoglobinRig(RigMaps):
         scale is sigma_i/sigma_n under the prior of `model.facial_color.deviation_ratio`, which
         bounds it where the neutral map is constant.
         """
-        maps = basis.fitted(
+        maps = basis.fit_rig_maps(
             neutral,
             states,
             radius_px=radius_px,
@@ -155,10 +155,10 @@ class HemoglobinRig(RigMaps):
             global_states=global_states,
             stored_size=stored_size,
         )
-        return cls._of(maps)
+        return cls._from_rig_maps(maps)
 
     @classmethod
-    def _of(cls, maps: RigMaps) -> HemoglobinRig:
+    def _from_rig_maps(cls, maps: RigMaps) -> HemoglobinRig:
         return cls(**{field.name: getattr(maps, field.name) for field in fields(RigMaps)})
 
     @property
@@ -189,7 +189,7 @@ class HemoglobinRig(RigMaps):
         """Return what storing small changes in each state: rms and largest, volume fraction."""
         return {n: (s.storage_rms, s.storage_largest) for n, s in self.states.items()}
 
-    def weights_of(
+    def check_weights(
         self, weights: Mapping[str, float], *, normalize: bool = False
     ) -> dict[str, float]:
         """Return checked weights that sum to one.
@@ -233,7 +233,7 @@ class HemoglobinRig(RigMaps):
         normalize: bool = False,
         gains: Mapping[str, float] | None = None,
         gain: float = 1.0,
-        limits: tuple[float, float] = BLOOD_LIMITS,
+        limits: tuple[float, float] = HEMOGLOBIN_LIMITS,
     ) -> HemoglobinBlend:
         """Blend states, eq. (6).
 
@@ -261,7 +261,9 @@ class HemoglobinRig(RigMaps):
         FacialColorError
             For weights that sum to something else, an unknown state, or a negative factor.
         """
-        used = {n: w for n, w in self.weights_of(weights, normalize=normalize).items() if w != 0.0}
+        used = {
+            n: w for n, w in self.check_weights(weights, normalize=normalize).items() if w != 0.0
+        }
         factor = gain * (
             1.0 + math.fsum(w * ((gains or {}).get(n, 1.0) - 1.0) for n, w in used.items())
         )
@@ -303,7 +305,7 @@ class HemoglobinRig(RigMaps):
             np.where(valid, error, np.nan).astype(kind),
         )
 
-    def applied_to(
+    def transfer_to(
         self,
         neutral: ArrayLike,
         *,
@@ -337,6 +339,6 @@ class HemoglobinRig(RigMaps):
         FacialColorError
             For a map or mask that fits nothing.
         """
-        return self._of(
-            basis.transferred(self, neutral, valid=valid, stderr=stderr, transfer=transfer)
+        return self._from_rig_maps(
+            basis.transfer_rig_maps(self, neutral, valid=valid, stderr=stderr, transfer=transfer)
         )

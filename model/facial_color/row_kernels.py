@@ -98,14 +98,14 @@ def disc_row(t, square, p, q, half, high, inner, rows, y):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def square_row(square, p, nothing, inner, width, rows, y, first):
+def square_row(square, p, empty, inner, width, rows, y, first):
     """Move the square's sums down to row `y`, or begin them there."""
     left, right = width - inner, width + inner + 1
     if first:
         square[:] = 0.0
         for k in range(max(y - inner, 0), min(y + inner + 1, rows)):
-            _move_square(square, p[k], nothing, left, right)
+            _move_square(square, p[k], empty, left, right)
         return
-    new = p[y + inner] if y + inner < rows else nothing
-    old = p[y - inner - 1] if y - inner - 1 >= 0 else nothing
+    new = p[y + inner] if y + inner < rows else empty
+    old = p[y - inner - 1] if y - inner - 1 >= 0 else empty
     _move_square(square, new, old, left, right)

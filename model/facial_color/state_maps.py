@@ -10,7 +10,7 @@ import numpy as np
 
 from model.arrays import BoolArray, Float64Array, FloatArray
 from model.checks import Checks
-from model.facial_color.coarse_maps import Cells
+from model.facial_color.coarse_maps import CoarseGrid
 
 NEUTRAL: Final = "neutral"
 
@@ -100,10 +100,10 @@ class RigMaps:
         object.__setattr__(self, "states", MappingProxyType(dict(self.states)))
 
     @property
-    def cells(self) -> Cells:
+    def cells(self) -> CoarseGrid:
         """How the stored maps lie on the neutral map."""
         rows, columns = self.neutral.shape
-        return Cells((rows, columns), (self.neutral_mean.shape[0], self.neutral_mean.shape[1]))
+        return CoarseGrid((rows, columns), (self.neutral_mean.shape[0], self.neutral_mean.shape[1]))
 
     @property
     def neutral_mean_valid(self) -> BoolArray:

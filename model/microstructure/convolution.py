@@ -35,7 +35,7 @@ from numpy.typing import ArrayLike
 from model.arrays import BoolArray, Float32Array, FloatArray, UInt8Array
 from model.checks import Checks
 from model.microstructure import convolution_kernels as kernels
-from model.microstructure.map_windows import Window
+from model.microstructure.map_windows import MapWindow
 
 Sampling = Literal["cubic", "linear"]
 Border = Literal["mirror", "open"]
@@ -86,11 +86,11 @@ class LineKernels(NamedTuple):
         )
 
     @property
-    def nothing(self) -> bool:
+    def is_identity(self) -> bool:
         """Whether no pixel changes."""
         return not (self.alpha.any() and self.sigma_px.any())
 
-    def part(self, window: Window) -> LineKernels:
+    def part(self, window: MapWindow) -> LineKernels:
         """Return the kernels of a window within this one."""
 
         def cut(values: Float32Array) -> Float32Array:
@@ -110,7 +110,7 @@ def _field(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Float32Array
     raise ConvolutionError(f"{name}: got shape {given.shape}, expected {shape} or {shape[2:]}")
 
 
-def reach_of(lines: LineKernels, shape: tuple[int, int], sampling: Sampling = "cubic") -> int:
+def kernel_reach(lines: LineKernels, shape: tuple[int, int], sampling: Sampling = "cubic") -> int:
     """Return how many pixels away the farthest samples of a window are; 0 if nothing changes.
 
     Raises
@@ -145,21 +145,21 @@ def _usable(height: FloatArray, valid: ArrayLike | None) -> UInt8Array:
 
 def _pass(
     source: FloatArray,
-    source_window: Window,
+    source_window: MapWindow,
     clear: UInt8Array,
     lines: LineKernels,
-    window: Window,
+    window: MapWindow,
     shape: tuple[int, int],
     sampling: Sampling,
     border: Border,
 ) -> FloatArray:
     """Return one pass in a window of the map."""
-    if lines.nothing:
+    if lines.is_identity:
         inner = window.within(source_window)
         return source[inner.rows, inner.columns]
     out = np.empty(window.shape, source.dtype)
     reach, code = _INTERPOLATION_CODES[sampling], _BORDER_CODES[border]
-    kernels.along_lines(source, clear, source_window, shape, lines, window, reach, code, out)
+    kernels.convolve_lines(source, clear, source_window, shape, lines, window, reach, code, out)
     return out
 
 
@@ -220,13 +220,13 @@ def convolve(
     first = LineKernels.of(axis_s, alpha_s, sigma_s, shape)
     second = LineKernels.of(axis_t, alpha_t, sigma_t, shape)
     for lines in (first, second):
-        reach_of(lines, shape, sampling)
+        kernel_reach(lines, shape, sampling)
     single = given.dtype in (np.float16, np.float32)
     source: FloatArray = np.ascontiguousarray(given, np.float32 if single else np.float64)
     mask = _mask(valid, source.shape)
-    if first.nothing and second.nothing:
+    if first.is_identity and second.is_identity:
         return source.copy()
-    whole = Window(0, shape[0], 0, shape[1])
+    whole = MapWindow(0, shape[0], 0, shape[1])
 
     def convolved(at: tuple[int, ...]) -> FloatArray:
         clear = _usable(source[at], None if mask is None else mask[at])
@@ -250,17 +250,17 @@ def _mask(valid: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray | None:
     return np.broadcast_to(mask, shape)
 
 
-def tiles_of(shape: tuple[int, int], tile: int) -> list[Window]:
+def list_tiles(shape: tuple[int, int], tile: int) -> list[MapWindow]:
     """Return the tiles of a map, row by row.
 
     Examples
     --------
-    >>> [t.shape for t in tiles_of((5, 3), 3)]
+    >>> [t.shape for t in list_tiles((5, 3), 3)]
     [(3, 3), (2, 3)]
     """
     Checks(ConvolutionError).within("tile", tile, "[1, inf)")
     return [
-        Window(top, min(top + tile, shape[0]), left, min(left + tile, shape[1]))
+        MapWindow(top, min(top + tile, shape[0]), left, min(left + tile, shape[1]))
         for top in range(0, shape[0], tile)
         for left in range(0, shape[1], tile)
     ]
@@ -269,10 +269,10 @@ def tiles_of(shape: tuple[int, int], tile: int) -> list[Window]:
 def convolve_tiled(
     source: Any,
     target: Any,
-    fields_at: Callable[[Window], tuple[LineKernels, LineKernels]],
+    fields_at: Callable[[MapWindow], tuple[LineKernels, LineKernels]],
     *,
     tile: int = 2048,
-    valid_at: Callable[[Window], BoolArray] | None = None,
+    valid_at: Callable[[MapWindow], BoolArray] | None = None,
     sampling: Sampling = "cubic",
     border: Border = "mirror",
     finished: Collection[int] = (),
@@ -294,7 +294,7 @@ def convolve_tiled(
     sampling, border
         As of `convolve`.
     finished : collection of int
-        Numbers of tiles (in the order of `tiles_of`) that the target holds already.
+        Numbers of tiles (in the order of `list_tiles`) that the target holds already.
     progress : callable, optional
         Called as ``progress(number, count)`` after the tile of that number was written; what it
         raises ends the work, and the tiles told so far are in the target.
@@ -313,23 +313,23 @@ def convolve_tiled(
     if isinstance(source, np.ndarray) and isinstance(target, np.ndarray):
         if np.may_share_memory(source, target):
             raise ConvolutionError("target: got the source's memory, expected another array")
-    tiles = tiles_of(shape, tile)
+    tiles = list_tiles(shape, tile)
     margin = 0
     for number, window in enumerate(tiles):
         if number in finished:
             continue
         while True:
-            around = window.grown(margin, shape)
+            around = window.expand(margin, shape)
             first, second = fields_at(around)
             for lines in (first, second):
                 _fits(lines, around)
             inner = second.part(window.within(around))
-            needed = reach_of(inner, window.shape, sampling)
-            if needed <= margin or around == Window(0, shape[0], 0, shape[1]):
+            needed = kernel_reach(inner, window.shape, sampling)
+            if needed <= margin or around == MapWindow(0, shape[0], 0, shape[1]):
                 break
             margin = needed
-        reach = reach_of(first, around.shape, sampling)
-        beyond = around.grown(max(reach, needed), shape)
+        reach = kernel_reach(first, around.shape, sampling)
+        beyond = around.expand(max(reach, needed), shape)
         heights = np.ascontiguousarray(source[beyond.rows, beyond.columns], np.float32)
         changed = heights[window.within(beyond).rows, window.within(beyond).columns]
         if reach or needed:
@@ -346,7 +346,7 @@ def convolve_tiled(
             progress(number, len(tiles))
 
 
-def _fits(lines: LineKernels, window: Window) -> None:
+def _fits(lines: LineKernels, window: MapWindow) -> None:
     for name, values in lines._asdict().items():
         check = Checks(ConvolutionError)
         check.choice(f"{name} of fields_at", values.dtype, (np.dtype(np.float32),))

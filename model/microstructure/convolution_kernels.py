@@ -71,7 +71,7 @@ def distance_to_invalid(valid):
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def check_rows(lines, rows, most):
+def check_rows(lines, rows, max_sigma):
     """Return what is wrong with each row's parameters, and the largest sigma that is used there.
 
     Parameters
@@ -79,7 +79,7 @@ def check_rows(lines, rows, most):
     lines : LineKernels
     rows : int
         Of the window.
-    most : float
+    max_sigma : float
         Largest sigma allowed, px.
 
     Returns
@@ -105,7 +105,7 @@ def check_rows(lines, rows, most):
                 wrong = NOT_FINITE
             elif a < -2.0 or a > 1.0:
                 wrong = ALPHA
-            elif s < 0.0 or s > most:
+            elif s < 0.0 or s > max_sigma:
                 wrong = SIGMA
             elif a != 0.0 and s > 0.0:
                 u = axis[y * xh, x * xw, 0]
@@ -184,7 +184,7 @@ def _tap(f, k, reach):
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def along_lines(source, clear, seen, size, lines, window, reach, border, out):
+def convolve_lines(source, clear, source_window, size, lines, window, reach, border, out):
     """Write ``h + alpha (G * h - h)`` with the Gaussian along each pixel's own line (eqs. 3 and 6).
 
     Two samples at the same distance to both sides are one pair; a pair of which one cannot be
@@ -196,7 +196,7 @@ def along_lines(source, clear, seen, size, lines, window, reach, border, out):
         A window of the map.
     clear : (h, w) uint8 or (0, 0)
         Of `distance_to_invalid` there; empty: all is valid.
-    seen, window : Window
+    source_window, window : Window
         Where source and output are in the map.
     size : (int, int)
         Of the map.
@@ -208,7 +208,7 @@ def along_lines(source, clear, seen, size, lines, window, reach, border, out):
         Pixels that are not valid keep their value.
     """
     rows, columns = size
-    top, left = seen.top, seen.left
+    top, left = source_window.top, source_window.left
     axis, alpha, sigma = lines
     ah, aw = alpha.shape[0] > 1, alpha.shape[1] > 1
     sh, sw = sigma.shape[0] > 1, sigma.shape[1] > 1

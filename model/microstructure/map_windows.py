@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 
-class Window(NamedTuple):
+class MapWindow(NamedTuple):
     """A rectangle of a map, px: rows [top, bottom), columns [left, right)."""
 
     top: int
@@ -28,18 +28,18 @@ class Window(NamedTuple):
         """Columns, as an index."""
         return slice(self.left, self.right)
 
-    def grown(self, by: int, shape: tuple[int, int]) -> Window:
+    def expand(self, margin: int, shape: tuple[int, int]) -> MapWindow:
         """Return the window with a margin, as far as the map goes."""
-        return Window(
-            max(self.top - by, 0),
-            min(self.bottom + by, shape[0]),
-            max(self.left - by, 0),
-            min(self.right + by, shape[1]),
+        return MapWindow(
+            max(self.top - margin, 0),
+            min(self.bottom + margin, shape[0]),
+            max(self.left - margin, 0),
+            min(self.right + margin, shape[1]),
         )
 
-    def within(self, other: Window) -> Window:
+    def within(self, other: MapWindow) -> MapWindow:
         """Return the window counted from another's first pixel."""
-        return Window(
+        return MapWindow(
             self.top - other.top,
             self.bottom - other.top,
             self.left - other.left,

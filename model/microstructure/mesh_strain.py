@@ -61,7 +61,7 @@ class MeshStrain:
         T - 1 on R's axes: entries 11, 12, 22.
     uv_metric : ndarray of float64, shape (V, 3)
         Q R^T, symmetric: entries 11, 12, 22; texture units per mm.
-    place : ndarray of int64, shape (V,)
+    point_index : ndarray of int64, shape (V,)
         Vertices of the same number are one point of the skin.
     degenerate_share : float
         Of the triangles: without area in space.
@@ -81,7 +81,7 @@ class MeshStrain:
     valid: BoolArray
     tensor: Float64Array
     uv_metric: Float64Array
-    place: Int64Array
+    point_index: Int64Array
     degenerate_share: float
     uv_degenerate_share: float
     uv_turned_share: float
@@ -92,7 +92,7 @@ def _numbers(name: str, values: ArrayLike, columns: int) -> Float64Array:
     return Checks(StrainError).numbers(name, given, (None, columns))
 
 
-def places_of(*positions: Float64Array) -> Int64Array:
+def index_points(*positions: Float64Array) -> Int64Array:
     """Give vertices at the same positions, in every array, the same number.
 
     Parameters
@@ -102,7 +102,7 @@ def places_of(*positions: Float64Array) -> Int64Array:
 
     Examples
     --------
-    >>> places_of(np.array([[1.0, 2.0], [0.0, 0.0], [1.0, 2.0]])).tolist()
+    >>> index_points(np.array([[1.0, 2.0], [0.0, 0.0], [1.0, 2.0]])).tolist()
     [1, 0, 1]
     """
     keys = np.concatenate(positions, axis=1).T + 0.0
@@ -159,7 +159,7 @@ def strain(
         raise StrainError(f"faces: got {given.dtype} {given.shape}, expected integers (F, 3)")
     triangles = np.ascontiguousarray(given, np.int64)
     Checks(StrainError).within("faces", triangles, f"[0, {len(rest)})")
-    place = places_of(rest, moved)
+    place = index_points(rest, moved)
     triangle = kernels.triangle_strain(rest, moved, triangles, texture)
     places = int(place.max(initial=-1)) + 1
     stretch, column_s, column_t, tensor, metric, even, valid = kernels.vertex_strain(
@@ -182,7 +182,7 @@ def strain(
         valid=valid,
         tensor=tensor,
         uv_metric=metric,
-        place=place,
+        point_index=place,
         degenerate_share=float(share[kernels.DEGENERATE]),
         uv_degenerate_share=float(share[kernels.NO_TEXTURE]),
         uv_turned_share=float(share[kernels.TURNED]),

@@ -31,7 +31,7 @@ MAX_ALPHA = 1e3
 """Strengths beyond this are not sought: the profile has nothing at sigma's scale to sharpen."""
 
 
-class ProfileError(ValueError):
+class SurfaceProfileError(ValueError):
     """A profile, a stretch or a kernel that no length can be told of."""
 
 
@@ -64,13 +64,13 @@ def surface_length(height_um: ArrayLike, *, spacing_um: float) -> Float64Array:
 
 
 def _heights(height_um: ArrayLike, spacing_um: float) -> Float64Array:
-    height = Checks(ProfileError).numbers("height_um", height_um, ("...", "N"))
-    Checks(ProfileError).within("heights of height_um", height.shape[-1], "[2, inf)")
-    Checks(ProfileError).within("spacing_um", spacing_um, "(0, inf)")
+    height = Checks(SurfaceProfileError).numbers("height_um", height_um, ("...", "N"))
+    Checks(SurfaceProfileError).within("heights of height_um", height.shape[-1], "[2, inf)")
+    Checks(SurfaceProfileError).within("spacing_um", spacing_um, "(0, inf)")
     return height
 
 
-def convolved(
+def convolve_profile(
     height_um: ArrayLike, alpha: float, sigma_um: float, *, spacing_um: float
 ) -> Float64Array:
     """Return profiles convolved with a kernel of eq. (6), mirrored at their ends.
@@ -92,13 +92,13 @@ def convolved(
         For heights, a strength or lengths that are not finite, or lengths that are not above 0.
     """
     height = _heights(height_um, spacing_um)
-    Checks(ProfileError).within("alpha", alpha)
-    return height + alpha * _change(height, sigma_um, spacing_um)
+    Checks(SurfaceProfileError).within("alpha", alpha)
+    return height + alpha * _unit_change(height, sigma_um, spacing_um)
 
 
-def _change(height: Float64Array, sigma_um: float, spacing_um: float) -> Float64Array:
+def _unit_change(height: Float64Array, sigma_um: float, spacing_um: float) -> Float64Array:
     """Return the blurred profile less itself: what one of alpha adds."""
-    Checks(ProfileError).within("sigma_um", sigma_um, "(0, inf)")
+    Checks(SurfaceProfileError).within("sigma_um", sigma_um, "(0, inf)")
     half = gaussian_weights(sigma_um / spacing_um)
     weights = np.concatenate([half[:0:-1], half])
     return np.asarray(correlate1d(height, weights, axis=-1, mode="reflect") - height)
@@ -164,7 +164,7 @@ def length_change(
     (1.125, 1.108)
     """
     height = _profile(height_um, spacing_um, stretch)
-    moved = convolved(height, alpha, sigma_um, spacing_um=spacing_um)
+    moved = convolve_profile(height, alpha, sigma_um, spacing_um=spacing_um)
     return LengthChange(
         stretch=float(stretch),
         neutral_um=float(surface_length(height, spacing_um=spacing_um)),
@@ -176,27 +176,27 @@ def length_change(
 
 
 def _profile(height_um: ArrayLike, spacing_um: float, stretch: float) -> Float64Array:
-    height = Checks(ProfileError).numbers("height_um", height_um, ("N",))
+    height = Checks(SurfaceProfileError).numbers("height_um", height_um, ("N",))
     surface_length(height, spacing_um=spacing_um)
-    Checks(ProfileError).within("stretch", stretch, "(0, inf)")
+    Checks(SurfaceProfileError).within("stretch", stretch, "(0, inf)")
     return height
 
 
 @dataclass(frozen=True, slots=True)
-class KeptLength:
-    """The kernel that keeps a profile's length; see :func:`keep_length`."""
+class LengthPreservingKernel:
+    """The kernel that keeps a profile's length; see :func:`find_length_preserving_kernel`."""
 
     change: LengthChange
     """What that kernel, or the nearest one, does."""
-    kept: bool
+    is_preserved: bool
     """Whether the length is the neutral one."""
     within_limits: bool
     """Whether the strength lies in the kernel's range, -2 to 1."""
 
 
-def keep_length(
+def find_length_preserving_kernel(
     height_um: ArrayLike, *, spacing_um: float, stretch: float, sigma_um: float
-) -> KeptLength:
+) -> LengthPreservingKernel:
     """Find the strength of a kernel that keeps the length of a profile's surface.
 
     Parameters
@@ -230,12 +230,12 @@ def keep_length(
     Examples
     --------
     >>> wave = 60.0 * np.sin(np.arange(600) / 10.0)
-    >>> found = keep_length(wave, spacing_um=5.0, stretch=1.05, sigma_um=30.0)
+    >>> found = find_length_preserving_kernel(wave, spacing_um=5.0, stretch=1.05, sigma_um=30.0)
     >>> found.kept, round(found.change.alpha, 2), round(found.change.convolved_ratio, 6)
     (True, 0.44, 1.0)
     """
     height = _profile(height_um, spacing_um, stretch)
-    change = _change(height, sigma_um, spacing_um)
+    change = _unit_change(height, sigma_um, spacing_um)
     a, b = np.diff(height), np.diff(change)
     neutral = float(np.hypot(a, spacing_um).sum())
     run = spacing_um * stretch
@@ -251,21 +251,21 @@ def keep_length(
     alpha = 0.0
     if abs(excess(0.0)) > 1e-12 * neutral and slope(0.0) < 0:
         if excess(0.0) < 0:
-            alpha = -_crossing(lambda strength: excess(-strength), MAX_ALPHA)
+            alpha = -_find_sign_change(lambda strength: excess(-strength), MAX_ALPHA)
         else:
-            shortest = _crossing(slope, MAX_ALPHA)
-            alpha = _crossing(excess, shortest)
+            shortest = _find_sign_change(slope, MAX_ALPHA)
+            alpha = _find_sign_change(excess, shortest)
     found = length_change(
         height, spacing_um=spacing_um, stretch=stretch, alpha=alpha, sigma_um=sigma_um
     )
-    return KeptLength(
+    return LengthPreservingKernel(
         change=found,
-        kept=abs(found.convolved_ratio - 1.0) < 1e-9,
+        is_preserved=abs(found.convolved_ratio - 1.0) < 1e-9,
         within_limits=ALPHA_LIMITS[0] <= alpha <= ALPHA_LIMITS[1],
     )
 
 
-def _crossing(function: Callable[[float], float], last: float) -> float:
+def _find_sign_change(function: Callable[[float], float], last: float) -> float:
     """Return where a function changes its sign between 0 and ``last``; ``last`` if nowhere."""
     if function(0.0) * function(last) > 0:
         return last

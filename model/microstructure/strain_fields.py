@@ -17,7 +17,7 @@ from model.checks import Checks
 from model.microstructure import texture_kernels
 from model.microstructure.convolution import LineKernels
 from model.microstructure.kernel_table import ALPHA_LIMITS, FOREHEAD, KernelTable
-from model.microstructure.map_windows import Window
+from model.microstructure.map_windows import MapWindow
 from model.microstructure.mesh_strain import MeshStrain, StrainError
 
 PAD_PX = 4
@@ -53,7 +53,7 @@ def rasterize(
     uv: ArrayLike,
     size: tuple[int, int],
     *,
-    window: Window | None = None,
+    window: MapWindow | None = None,
     pad_px: int = PAD_PX,
 ) -> TextureStrain:
     """Fill a texture, or a window of it, with the strain of a mesh.
@@ -81,10 +81,10 @@ def rasterize(
     height, width = size
     if height < 1 or width < 1 or pad_px < 0:
         raise StrainError(f"size, pad_px: got {size}, {pad_px}, expected at least 1 px and 0 px")
-    asked = Window(0, height, 0, width) if window is None else window
-    if asked.grown(0, size) != asked or min(asked.shape) < 1:
+    asked = MapWindow(0, height, 0, width) if window is None else window
+    if asked.expand(0, size) != asked or min(asked.shape) < 1:
         raise StrainError(f"window: got {asked}, expected one within {size}")
-    around = asked.grown(pad_px, size)
+    around = asked.expand(pad_px, size)
     shape = around.shape
     state = np.zeros(shape, np.uint8)
     stretch = np.ones((*shape, 2), np.float32)
@@ -133,7 +133,7 @@ class KernelRegions:
         Checks(StrainError).shape("weights", self.weights, (count, "h", "w"))
         Checks(StrainError).within("weights", self.weights, "[0, inf)")
 
-    def shares_at(self, u: FloatArray, v: FloatArray) -> Float32Array:
+    def weights_at(self, u: FloatArray, v: FloatArray) -> Float32Array:
         """Return shares at rows of v and columns of u, shape (N, len(v), len(u))."""
         _, height, width = self.weights.shape
         y0, y1, fy = _between((1.0 - np.asarray(v)) * height - 0.5, height)
@@ -165,7 +165,7 @@ def regional_kernels(
     regions: KernelRegions,
     size: tuple[int, int],
     *,
-    window: Window | None = None,
+    window: MapWindow | None = None,
     extrapolate: Literal["hold", "formula"] = "hold",
 ) -> tuple[LineKernels, LineKernels]:
     """Return the kernels of both passes, alpha and sigma blended by how much of each kind is there.
@@ -180,11 +180,11 @@ def regional_kernels(
     window, extrapolate
         As of `rasterize` and `line_kernels`.
     """
-    here = Window(0, size[0], 0, size[1]) if window is None else window
+    here = MapWindow(0, size[0], 0, size[1]) if window is None else window
     made = [line_kernels(strain, table, extrapolate=extrapolate) for table in regions.tables]
     if len(made) == 1:
         return made[0]
-    shares = regions.shares_at(
+    shares = regions.weights_at(
         (np.arange(here.left, here.right) + 0.5) / size[1],
         1.0 - (np.arange(here.top, here.bottom) + 0.5) / size[0],
     )
@@ -224,7 +224,7 @@ def line_kernels(
     shape = strain.covered.shape
     alpha, sigma = np.empty((2, *shape), np.float32), np.empty((2, *shape), np.float32)
     ends = table.stretch_range if extrapolate == "hold" else (0.0, math.inf)
-    texture_kernels.look_up(
+    texture_kernels.look_up_kernels(
         strain.stretch,
         (strain.covered | strain.padded).astype(np.uint8),
         np.asarray(table.alpha_breaks, np.float64),

@@ -34,7 +34,7 @@ def _edge(points, i, j):
 
 
 @njit(inline="always")
-def principal(p, q, r):
+def principal_values(p, q, r):
     """Return mean and half the difference of the eigenvalues of (p, q, r), and the larger's axis.
 
     The axis is the first one where there is no difference.
@@ -138,7 +138,7 @@ def triangle_strain(rest, moved, faces, uv):
 
 
 @njit(inline="always")
-def _carried(basis, normal):
+def _rotate_axes(basis, normal):
     """Return a triangle's axes turned by the shortest way into the plane across `normal`."""
     n = (basis[2, 0], basis[2, 1], basis[2, 2])
     c = _dot(n, normal)
@@ -153,13 +153,13 @@ def _carried(basis, normal):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def vertex_strain(faces, place, places, kind, basis, area, change, to_uv):
+def vertex_strain(faces, point_index, places, kind, basis, area, change, to_uv):
     """Average triangles at vertices, weighed by their rest areas.
 
     Parameters
     ----------
     faces : (F, 3) int64
-    place : (V,) int64
+    point_index : (V,) int64
         Which vertices are one on the skin: equal numbers below ``places``.
     places : int
     kind, basis, area, change, to_uv
@@ -176,13 +176,13 @@ def vertex_strain(faces, place, places, kind, basis, area, change, to_uv):
     even, valid : (V,) bool
         No axis is preferred; there is a triangle, and one with a texture.
     """
-    count = place.size
+    count = point_index.size
     normal = np.zeros((places, 3))
     widest = np.full(places, -1)
     for f in range(faces.shape[0]):
         if kind[f] != DEGENERATE:
             for corner in range(3):
-                w = place[faces[f, corner]]
+                w = point_index[faces[f, corner]]
                 if widest[w] < 0 or area[f] > area[widest[w]]:
                     widest[w] = f
                 for m in range(3):
@@ -197,7 +197,7 @@ def vertex_strain(faces, place, places, kind, basis, area, change, to_uv):
         else:
             for m in range(3):
                 normal[w, m] /= length
-        first, second = _carried(basis[widest[w]], normal[w])
+        first, second = _rotate_axes(basis[widest[w]], normal[w])
         for m in range(3):
             axes[w, 0, m], axes[w, 1, m] = first[m], second[m]
     tensor_at = np.zeros((places, 3))
@@ -211,8 +211,8 @@ def vertex_strain(faces, place, places, kind, basis, area, change, to_uv):
         p, q, r = change[f, 0], change[f, 1], change[f, 2]
         for corner in range(3):
             vertex = faces[f, corner]
-            w = place[vertex]
-            here = _carried(basis[f], normal[w])
+            w = point_index[vertex]
+            here = _rotate_axes(basis[f], normal[w])
             b00, b01 = _dot(axes[w, 0], here[0]), _dot(axes[w, 0], here[1])
             b10, b11 = _dot(axes[w, 1], here[0]), _dot(axes[w, 1], here[1])
             tensor_at[w, 0] += area[f] * (b00 * b00 * p + 2.0 * b00 * b01 * q + b01 * b01 * r)
@@ -239,8 +239,8 @@ def vertex_strain(faces, place, places, kind, basis, area, change, to_uv):
                 vertex = faces[f, corner]
                 if share[vertex, 0] == 0.0 or share[vertex, 1] == 0.0:
                     continue
-                w = place[vertex]
-                here = _carried(basis[f], normal[w])
+                w = point_index[vertex]
+                here = _rotate_axes(basis[f], normal[w])
                 det = to_uv[f, 0, 0] * to_uv[f, 1, 1] - to_uv[f, 0, 1] * to_uv[f, 1, 0]
                 det *= _dot(axes[w, 0], here[0]) * _dot(axes[w, 1], here[1]) - _dot(
                     axes[w, 0], here[1]
@@ -253,7 +253,7 @@ def vertex_strain(faces, place, places, kind, basis, area, change, to_uv):
     tensor, metric = np.zeros((count, 3)), np.zeros((count, 3))
     even, valid = np.ones(count, np.bool_), np.zeros(count, np.bool_)
     for vertex in range(count):
-        w = place[vertex]
+        w = point_index[vertex]
         side = 0 if share[vertex, 0] >= share[vertex, 1] else 1
         if weight[w] == 0.0 or share[vertex, side] == 0.0:
             continue
@@ -275,7 +275,7 @@ def vertex_strain(faces, place, places, kind, basis, area, change, to_uv):
         tensor[vertex, 1] = o00 * o10 * t[0] + (o00 * o11 + o01 * o10) * t[1] + o01 * o11 * t[2]
         tensor[vertex, 2] = o10 * o10 * t[0] + 2.0 * o10 * o11 * t[1] + o11 * o11 * t[2]
         # ratios from what the vertices of one place share, for the same ones to the bit
-        mean, h, ax, ay = principal(t[0], t[1], t[2])
+        mean, h, ax, ay = principal_values(t[0], t[1], t[2])
         stretch[vertex, 0] = max(1.0 + mean + h, 0.0)
         stretch[vertex, 1] = max(1.0 + mean - h, 0.0)
         even[vertex] = 2.0 * h <= ISOTROPY_TOL * stretch[vertex, 0]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from model.microstructure.strain_kernels import ISOTROPY_TOL, principal
+from model.microstructure.strain_kernels import ISOTROPY_TOL, principal_values
 
 BAND_ROWS = 32
 """Rows of the texture filled by one thread at a time."""
@@ -91,7 +91,7 @@ def fill_texture(faces, places, values, valid, window, size, found):
                     q += wk * (values[k, 1] - values[i, 1])
                     s = values[i, 2] + wj * (values[j, 2] - values[i, 2])
                     s += wk * (values[k, 2] - values[i, 2])
-                    mean, h, vx, vy = principal(p, q, s)
+                    mean, h, vx, vy = principal_values(p, q, s)
                     if 2.0 * h <= ISOTROPY_TOL * (1.0 + mean + h):
                         vx, vy = 1.0, 0.0
                     p = values[i, 3] + wj * (values[j, 3] - values[i, 3])
@@ -137,7 +137,9 @@ def pad_once(state, before, stretch, axes, scale):
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def look_up(stretch, state, breaks, alpha_lines, sigma_lines, ends, limits, scale, alpha, sigma):
+def look_up_kernels(
+    stretch, state, breaks, alpha_lines, sigma_lines, ends, limits, scale, alpha, sigma
+):
     """Write strength and sigma in pixels for each pixel's two stretch ratios (eqs. 8 and 9).
 
     Parameters

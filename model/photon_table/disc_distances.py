@@ -46,7 +46,7 @@ def distance_rule(
     >>> [values.tolist() for values in distance_rule(1.0, 0.0, 0.0)]  # two points
     [[1.0], [1.0]]
     """
-    Checks().together(
+    Checks().broadcast_together(
         "[0, inf)", radius_mm=radius_mm, core_mm=core_mm, source_core_mm=source_core_mm
     )
     # squares of lengths in a unit near the largest neither vanish nor overflow; by a power of two

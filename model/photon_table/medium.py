@@ -37,19 +37,19 @@ class Medium:
     """ln of the relative standard error at every other knot, shape (radii/2, roots/2)."""
 
 
-def asymmetries() -> tuple[float, ...]:
+def stored_asymmetries() -> tuple[float, ...]:
     """Return the values of g that the table holds, increasing; others between are interpolated.
 
     Examples
     --------
-    >>> 0.8 in asymmetries()
+    >>> 0.8 in stored_asymmetries()
     True
     """
     return tuple(float(x) for x in _stored()["g"])
 
 
 @lru_cache(maxsize=64)
-def prepare(eta: float, g: float, collection: Collection) -> Medium:
+def prepare_medium(eta: float, g: float, collection: Collection) -> Medium:
     """Return one medium of the table, interpolated over eta and g.
 
     Raises

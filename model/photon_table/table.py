@@ -20,10 +20,10 @@ from scipy.interpolate import RectBivariateSpline
 
 from model.arrays import BoolArray, Float64Array
 from model.checks import Checks
-from model.dipole.kienle_patterson import Slopes
+from model.dipole.kienle_patterson import ProfileDerivatives
 from model.photon_table import kernels
 from model.photon_table.disc_distances import distance_rules
-from model.photon_table.medium import Collection, prepare
+from model.photon_table.medium import Collection, prepare_medium
 
 NUMERICAL_APERTURE = 0.22
 """Of the source and of the detectors in the collection "fibre", in air."""
@@ -37,7 +37,7 @@ MAX_RELATIVE_ERROR = 0.03
 """Standard error of the table itself, relative, up to which a point is in the domain."""
 
 
-class Optics(TypedDict, total=False):
+class PhotonTableOptics(TypedDict, total=False):
     """What `reflectance` and `derivatives` assume of skin and fibers."""
 
     eta: float
@@ -51,7 +51,7 @@ def reflectance(
     radius_mm: ArrayLike,
     sigma_a_per_mm: ArrayLike,
     sigma_s_prime_per_mm: ArrayLike,
-    **optics: Unpack[Optics],
+    **optics: Unpack[PhotonTableOptics],
 ) -> Float64Array:
     """Return the reflectance per area at a distance from the source.
 
@@ -78,7 +78,7 @@ def reflectance(
     Returns
     -------
     ndarray
-        R in 1/mm^2; 0 where there is no scattering. Outside `domain` it is an extrapolation.
+        R in 1/mm^2; 0 where there is no scattering. Outside `is_in_domain` it is an extrapolation.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def derivatives(
     collection: Collection = "all",
     core_mm: float = 0.0,
     source_core_mm: float = 0.0,
-) -> Slopes:
+) -> ProfileDerivatives:
     """Return the reflectance and its derivatives by both coefficients.
 
     Parameters and errors as :func:`reflectance`. The derivatives are those of the spline itself;
@@ -120,7 +120,7 @@ def derivatives(
     >>> bool(np.all(slopes.by_sigma_a < 0.0))
     True
     """
-    medium = prepare(eta, g, collection)
+    medium = prepare_medium(eta, g, collection)
     radius, sigma_a, sigma_s = _not_negative(radius_mm, sigma_a_per_mm, sigma_s_prime_per_mm)
     for name, length in (("core_mm", core_mm), ("source_core_mm", source_core_mm)):
         Checks().within(name, length, f"[0, {MAX_QUANTITY}]")
@@ -162,7 +162,7 @@ def derivatives(
         out,
     )
     out[:, ~scatters] = 0.0
-    return Slopes(*(part.reshape(shape) for part in out))
+    return ProfileDerivatives(*(part.reshape(shape) for part in out))
 
 
 def relative_error(
@@ -184,7 +184,7 @@ def relative_error(
     >>> bool(relative_error(2.0, 0.05, 1.0) < 0.01)
     True
     """
-    medium = prepare(eta, g, collection)
+    medium = prepare_medium(eta, g, collection)
     given = (radius_mm, sigma_a_per_mm, sigma_s_prime_per_mm)
     radius, sigma_a, sigma_s = np.broadcast_arrays(*_not_negative(*given))
     scatters = (sigma_s >= np.finfo(np.float64).tiny) & (radius > 0.0)
@@ -200,7 +200,7 @@ def relative_error(
     return np.asarray(np.where(held & (value < 0.5), value, np.inf))
 
 
-def domain(
+def is_in_domain(
     radius_mm: ArrayLike,
     sigma_a_per_mm: ArrayLike,
     sigma_s_prime_per_mm: ArrayLike,
@@ -213,7 +213,7 @@ def domain(
 
     Examples
     --------
-    >>> domain([0.001, 2.0, 2.0, 200.0], [0.1, 0.1, 20.0, 0.1], 1.0).tolist()
+    >>> is_in_domain([0.001, 2.0, 2.0, 200.0], [0.1, 0.1, 20.0, 0.1], 1.0).tolist()
     [False, True, False, False]
     """
     radius, sigma_a, sigma_s = (

@@ -50,7 +50,7 @@ def principal_axes(covariance: Float64Array, unit: float) -> Float64Array:
     return np.ascontiguousarray(axes * np.sign(largest)[:, None])
 
 
-def uneven_edges(quantiles: ArrayLike, unit: float) -> Float64Array:
+def make_bin_edges(quantiles: ArrayLike, unit: float) -> Float64Array:
     """Return 257 edges: half of the bins spread evenly, half by how often values occur.
 
     Parameters
@@ -67,7 +67,7 @@ def uneven_edges(quantiles: ArrayLike, unit: float) -> Float64Array:
 
     Examples
     --------
-    >>> edges = uneven_edges(np.linspace(0.0, 1.0, 1001), 1.0)
+    >>> edges = make_bin_edges(np.linspace(0.0, 1.0, 1001), 1.0)
     >>> edges[[0, 128, 256]].round(3).tolist()
     [-0.05, 0.5, 1.05]
     """

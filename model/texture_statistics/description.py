@@ -22,9 +22,9 @@ from numpy.typing import ArrayLike
 from model.arrays import BoolArray, Float64Array, FloatArray
 from model.checks import Checks
 from model.texture_statistics import steerable_pyramid
-from model.texture_statistics.histograms import Bins, Counted, distance
+from model.texture_statistics.histograms import Bins, HistogramCount, histogram_distance
 from model.texture_statistics.masks import fill_smoothly, response_weights
-from model.texture_statistics.space import TextureError, TextureSpace, checked_image, weight_of
+from model.texture_statistics.space import TextureError, TextureSpace, check_image, response_weight
 from model.texture_statistics.steerable_pyramid import Responses, thread_count
 
 Weights = tuple[FloatArray, tuple[FloatArray, ...]] | None
@@ -43,13 +43,13 @@ class TextureStatistics:
     """(23808,) for RGB at full depth: shares of 256 bins, histogram after histogram."""
     clipped: Float64Array
     """(C, responses): share of samples outside the space's edges, counted in the end bins."""
-    effective: Float64Array
+    n_effective: Float64Array
     """(C, responses): independent samples at most; neighbors are correlated."""
 
     def stderr(self) -> Float64Array:
-        """Return the least standard error of the vector: binomial, of `effective` samples."""
-        h = self.vector.reshape(*self.effective.shape, -1)
-        return np.sqrt(h * (1.0 - h) / self.effective[..., None]).reshape(-1)
+        """Return the least standard error of the vector: binomial, of `n_effective` samples."""
+        h = self.vector.reshape(*self.n_effective.shape, -1)
+        return np.sqrt(h * (1.0 - h) / self.n_effective[..., None]).reshape(-1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,8 +60,8 @@ class MatchedTexture:
     """As the image given; texels outside the mask or the region as they were."""
     distances: Float64Array
     """(iterations + 1, C, responses): how far the values of each response are from the target's, in
-    spreads of the population (`model.texture_statistics.histograms.distance`): at the start, then
-    after each iteration."""
+    spreads of the population (`model.texture_statistics.histograms.histogram_distance`): at the
+    start, then after each iteration."""
     clipped: Float64Array
     """(C, responses): share of the result's samples outside the space's edges."""
 
@@ -76,7 +76,7 @@ class MatchedTexture:
         return self.distances[-1]
 
 
-class Sampled(TypedDict, total=False):
+class StatisticsSettings(TypedDict, total=False):
     """What of an image is described, and in which space."""
 
     space: TextureSpace | None
@@ -85,7 +85,7 @@ class Sampled(TypedDict, total=False):
     workers: int | None
 
 
-def describe(image: ArrayLike, **sampled: Unpack[Sampled]) -> Float64Array:
+def describe(image: ArrayLike, **sampled: Unpack[StatisticsSettings]) -> Float64Array:
     """Return the statistics of a texture as a row vector, (23808,) for RGB.
 
     The vector of `statistics`, with its parameters.
@@ -134,8 +134,8 @@ def statistics(
         For an image, mask or region that fits nothing, an empty mask, valid texels that are not
         finite, a region without valid texels.
     """
-    colors, mask = checked_image(image, valid)
-    used = TextureSpace.standard(colors.shape[2]) if space is None else space
+    colors, mask = check_image(image, valid)
+    used = TextureSpace.opponent(colors.shape[2]) if space is None else space
     _check_channels(colors, used)
     weights = _weights(mask, region, used.levels)
     channels = used.to_channels(fill_smoothly(colors, mask))
@@ -145,9 +145,9 @@ def statistics(
             pyramid = _analyze(channel, used, workers)
             counted.append(_count(pool, (channel, *pyramid), _bins(used, c), used, weights))
     return TextureStatistics(
-        np.concatenate([one.shares for row in counted for one in row]),
+        np.concatenate([one.fractions for row in counted for one in row]),
         np.array([[one.below + one.above for one in row] for row in counted]),
-        np.array([[one.effective for one in row] for row in counted]),
+        np.array([[one.n_effective for one in row] for row in counted]),
     )
 
 
@@ -211,17 +211,17 @@ def match(
     >>> bool(found.after.mean() < 0.5 * found.before.mean())
     True
     """
-    colors, mask = checked_image(image, valid)
+    colors, mask = check_image(image, valid)
     Checks(TextureError).within("iterations", iterations, "[0, inf)")
     Checks(TextureError).within("noise", noise, "[0, inf)")
     Checks(TextureError).choice("start", start, ("image", "noise"))
     if (noise > 0.0 or start == "noise") and rng is None:
         raise TextureError("rng: got None, expected a generator: noise is drawn from it")
     if np.ndim(target) == 1:
-        used = TextureSpace.standard(colors.shape[2]) if space is None else space
+        used = TextureSpace.opponent(colors.shape[2]) if space is None else space
         wanted = used.check(target)
     else:
-        texture, known = checked_image(target, target_valid)
+        texture, known = check_image(target, target_valid)
         if space is None:
             both = ([texture], [known]) if start == "noise" else ([texture, colors], [known, mask])
             used = TextureSpace.fit(both[0], valid=both[1], workers=workers)
@@ -243,15 +243,15 @@ def match(
             if rng is not None and start == "noise":
                 middle, spread = _moments(bins[0], wanted[c, 0])
                 grain = middle + spread * rng.standard_normal(now.shape)
-                now = _blended(original, grain, blend, mask)
+                now = _blend_masked(original, grain, blend, mask)
             if rng is not None and noise > 0.0:
                 grain = noise * float(now[blend > 0.0].std()) * rng.standard_normal(now.shape)
-                now = _blended(original, now + grain, blend, mask)
+                now = _blend_masked(original, now + grain, blend, mask)
             for iteration in range(iterations + 1):
                 pyramid = _analyze(now, used, workers)
                 counted = _count(pool, (now, *pyramid), bins, used, weights)
-                shares = np.stack([one.shares for one in counted])
-                distances[iteration, c] = distance(shares, wanted[c], used.edges[c])
+                shares = np.stack([one.fractions for one in counted])
+                distances[iteration, c] = histogram_distance(shares, wanted[c], used.edges[c])
                 if iteration == iterations:
                     break
                 far = distances[iteration, c] > MATCH_TOL
@@ -261,7 +261,7 @@ def match(
                     counted[0] = bins[0].count(now, None if weights is None else weights[0])
                 if far.any():
                     now = bins[0].match(now, counted[0], wanted[c, 0])
-                    now = _blended(original, now, blend, mask)
+                    now = _blend_masked(original, now, blend, mask)
             clipped[c] = [one.below + one.above for one in counted]
             channels[c] = now
     matched = np.where(blend[..., None] > 0.0, used.to_colors(channels), colors)
@@ -293,7 +293,7 @@ def _analyze(channel: FloatArray, space: TextureSpace, workers: int | None) -> R
 
 
 def _bins(space: TextureSpace, channel: int) -> list[Bins]:
-    return [Bins.over(edges) for edges in space.edges[channel]]
+    return [Bins.from_edges(edges) for edges in space.edges[channel]]
 
 
 def _count(
@@ -302,20 +302,22 @@ def _count(
     bins: list[Bins],
     space: TextureSpace,
     weights: Weights,
-) -> list[Counted]:
+) -> list[HistogramCount]:
     """Count all histograms of a channel."""
 
-    def one(r: int) -> Counted:
-        counts = None if weights is None else weight_of(weights, r, space.orientations)
+    def one(r: int) -> HistogramCount:
+        counts = None if weights is None else response_weight(weights, r, space.orientations)
         return bins[r].count(responses[r], counts)
 
-    return _each(pool, one, range(len(bins)), large=responses[0].size > _MIN_PARALLEL_PIXELS)
+    return _map_in_threads(
+        pool, one, range(len(bins)), large=responses[0].size > _MIN_PARALLEL_PIXELS
+    )
 
 
 def _move(
     pool: ThreadPoolExecutor,
     pyramid: Responses,
-    counted: list[Counted],
+    counted: list[HistogramCount],
     bins: list[Bins],
     wanted: Float64Array,
     far: BoolArray,
@@ -326,17 +328,19 @@ def _move(
         if far[r]:
             bins[r].match(response, counted[r], wanted[r], out=response)
 
-    _each(pool, one, range(1, len(bins)), pyramid, large=pyramid.high.size > _MIN_PARALLEL_PIXELS)
+    _map_in_threads(
+        pool, one, range(1, len(bins)), pyramid, large=pyramid.high.size > _MIN_PARALLEL_PIXELS
+    )
 
 
-def _each(
+def _map_in_threads(
     pool: ThreadPoolExecutor, one: Callable[..., T], *items: Iterable[Any], large: bool
 ) -> list[T]:
     """Do all items: in threads when images are large enough to be worth them."""
     return list((pool.map if large else map)(one, *items))
 
 
-def _blended(
+def _blend_masked(
     original: FloatArray, new: FloatArray, blend: FloatArray, mask: BoolArray
 ) -> FloatArray:
     """Keep the original where nothing is to change, and continue the result past the mask."""
@@ -346,8 +350,8 @@ def _blended(
     return fill_smoothly(mixed[..., None], mask)[..., 0]
 
 
-def _moments(bins: Bins, shares: Float64Array) -> tuple[float, float]:
+def _moments(bins: Bins, fractions: Float64Array) -> tuple[float, float]:
     """Return mean and standard deviation of a histogram."""
     middles = 0.5 * (bins.edges[1:] + bins.edges[:-1])
-    mean = float(shares @ middles)
-    return mean, float(np.sqrt(shares @ (middles - mean) ** 2))
+    mean = float(fractions @ middles)
+    return mean, float(np.sqrt(fractions @ (middles - mean) ** 2))

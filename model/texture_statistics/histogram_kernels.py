@@ -7,12 +7,12 @@ from numba import njit
 
 TABLE_CELLS = 16384
 """Even cells over the edges, in each of which a table bounds the bin."""
-SHARE_TOL = 1e-12
+FRACTION_TOL = 1e-12
 """Shares that differ by less are rounding: far below the share of one texel."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def bound_bins(edges, count, scale, least, most):
+def bound_bins(edges, count, scale, min_bin, max_bin):
     """Bound the bin of all values in each cell.
 
     Parameters
@@ -21,26 +21,26 @@ def bound_bins(edges, count, scale, least, most):
         Not falling; the first ``count`` count.
     scale : float
         Cells per unit from the first edge on.
-    least, most : (TABLE_CELLS,) int, written
+    min_bin, max_bin : (TABLE_CELLS,) int, written
         A value's cell and an edge's are found by the same arithmetic, which keeps their order:
         edges of cells before are certainly below the value, those of later ones above.
     """
     passed = 0
     for cell in range(TABLE_CELLS):
-        least[cell] = max(passed - 1, 0)
+        min_bin[cell] = max(passed - 1, 0)
         while passed < count and (edges[passed] - edges[0]) * scale < cell + 1:
             passed += 1
-        most[cell] = max(passed - 1, 0)
+        max_bin[cell] = max(passed - 1, 0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def find(x, edges, scale, least, most):
+def find_edge(x, edges, scale, min_bin, max_bin):
     """Return which edge is the last at or below ``x``; the first if none is.
 
     Parameters as of `bound_bins`.
     """
     cell = int(min(max((x - edges[0]) * scale, 0.0), TABLE_CELLS - 1.0))
-    low, high = int(least[cell]), int(most[cell])
+    low, high = int(min_bin[cell]), int(max_bin[cell])
     while high - low > 8:
         middle = (low + high + 1) // 2
         if edges[middle] <= x:
@@ -53,7 +53,7 @@ def find(x, edges, scale, least, most):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def count(values, edges, scale, least, most, sums):
+def count(values, edges, scale, min_bin, max_bin, sums):
     """Count values in bins; the end bins take what lies beyond.
 
     Parameters
@@ -73,7 +73,7 @@ def count(values, edges, scale, least, most, sums):
     below, above, lowest, highest = 0, 0, np.inf, -np.inf
     for k in range(values.size):
         x = float(values[k])
-        sums[find(x, edges, scale, least, most)] += 1.0
+        sums[find_edge(x, edges, scale, min_bin, max_bin)] += 1.0
         lowest, highest = min(lowest, x), max(highest, x)
         below += x < bottom
         above += x > top
@@ -81,7 +81,7 @@ def count(values, edges, scale, least, most, sums):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def count_weighted(values, weights, edges, scale, least, most, sums):
+def count_weighted(values, weights, edges, scale, min_bin, max_bin, sums):
     """Add the weights of values to their bins; values of weight 0 are no values.
 
     Parameters as of `count`; ``weights`` is (n,) float. Returns weights below and above, least
@@ -93,7 +93,7 @@ def count_weighted(values, weights, edges, scale, least, most, sums):
         x, weight = float(values[k]), float(weights[k])
         if weight <= 0.0:
             continue
-        sums[find(x, edges, scale, least, most)] += weight
+        sums[find_edge(x, edges, scale, min_bin, max_bin)] += weight
         squares += weight * weight
         lowest, highest = min(lowest, x), max(highest, x)
         if x < bottom:
@@ -104,7 +104,7 @@ def count_weighted(values, weights, edges, scale, least, most, sums):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def plan(source, target, edges, begin, end, to, slope):
+def plan_transport(source, target, edges, begin, end, to, slope):
     """Lay out the rising, piecewise straight map from one distribution to another.
 
     Parameters
@@ -126,12 +126,12 @@ def plan(source, target, edges, begin, end, to, slope):
         if source[i + 1] <= rank:
             i += 1
             continue
-        if target[j + 1] <= rank + SHARE_TOL:
+        if target[j + 1] <= rank + FRACTION_TOL:
             j += 1
             continue
         # ends that differ by rounding are one: else bins left empty would be crossed
         until = source[i + 1]
-        if target[j + 1] < until - SHARE_TOL:
+        if target[j + 1] < until - FRACTION_TOL:
             until = target[j + 1]
         share, width = source[i + 1] - source[i], edges[i + 1] - edges[i]
         begin[pieces] = edges[i] + width * ((rank - source[i]) / share)
@@ -149,24 +149,24 @@ def plan(source, target, edges, begin, end, to, slope):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def move(values, source, target, edges, out):
+def move_values(values, source, target, edges, out):
     """Write each value's counterpart of the same rank under the target's distribution.
 
     Parameters
     ----------
     values : (n,) float
     source, target, edges
-        As of `plan`; the edges reach to where the values end.
+        As of `plan_transport`; the edges reach to where the values end.
     out : (n,) float, written
     """
     size = 2 * edges.size
     begin, end, to, slope = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
-    pieces = plan(source, target, edges, begin, end, to, slope)
+    pieces = plan_transport(source, target, edges, begin, end, to, slope)
     reach = end[pieces - 1] - begin[0]
     scale = TABLE_CELLS / reach if reach > 0.0 else 0.0
     least, most = np.empty(TABLE_CELLS, np.int16), np.empty(TABLE_CELLS, np.int16)
     bound_bins(begin, pieces, scale, least, most)
     for k in range(values.size):
         x = float(values[k])
-        p = find(x, begin, scale, least, most)
+        p = find_edge(x, begin, scale, least, most)
         out[k] = to[p] + slope[p] * (min(max(x, begin[p]), end[p]) - begin[p])

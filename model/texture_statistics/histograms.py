@@ -11,31 +11,31 @@ from numpy.typing import ArrayLike, NDArray
 from model.arrays import BoolArray, Float64Array, FloatArray, Int64Array
 from model.checks import Checks
 from model.texture_statistics import histogram_kernels
-from model.vectors import nearest_shares
+from model.vectors import project_to_simplex
 
 HISTOGRAM_BINS = 256
 """Bins of every histogram (Weyrich et al. 2006, section 10.2)."""
 
 
-class HistogramError(ValueError):
+class TextureHistogramError(ValueError):
     """Edges, histograms or groups that fit nothing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Counted:
+class HistogramCount:
     """One histogram and what it was counted from."""
 
-    shares: Float64Array
+    fractions: Float64Array
     """(256,), sums to 1."""
     below: float
     """Share of values below the edges; it is in the first bin."""
     above: float
     """Share of values above the edges; it is in the last bin."""
-    least: float
+    min_value: float
     """Least value."""
-    most: float
+    max_value: float
     """Largest value."""
-    effective: float
+    n_effective: float
     """Samples of equal weight that would tell as much."""
 
 
@@ -46,11 +46,11 @@ class Bins:
     edges: Float64Array
     """(257,), rising; a bin holds its lower edge."""
     scale: float
-    least: NDArray[np.int16]
-    most: NDArray[np.int16]
+    min_bin: NDArray[np.int16]
+    max_bin: NDArray[np.int16]
 
     @classmethod
-    def over(cls, edges: ArrayLike) -> Bins:
+    def from_edges(cls, edges: ArrayLike) -> Bins:
         """Make the table of some edges."""
         e = np.ascontiguousarray(edges, np.float64)
         _check_edges(e, (HISTOGRAM_BINS + 1,))
@@ -60,7 +60,7 @@ class Bins:
         histogram_kernels.bound_bins(e, HISTOGRAM_BINS, scale, least, most)
         return cls(e, scale, least, most)
 
-    def count(self, values: FloatArray, weights: FloatArray | None = None) -> Counted:
+    def count(self, values: FloatArray, weights: FloatArray | None = None) -> HistogramCount:
         """Count values (any shape), weighted or not.
 
         Examples
@@ -71,7 +71,7 @@ class Bins:
         """
         flat = np.ascontiguousarray(values).reshape(-1)
         sums = np.zeros(HISTOGRAM_BINS)
-        table = (self.edges, self.scale, self.least, self.most, sums)
+        table = (self.edges, self.scale, self.min_bin, self.max_bin, sums)
         if weights is None:
             below, above, least, most = histogram_kernels.count(flat, *table)
             squares = float(flat.size)
@@ -82,15 +82,15 @@ class Bins:
             )
         total = float(sums.sum())
         if not total > 0.0:
-            raise HistogramError("weights: got none above 0, expected at least one")
-        return Counted(
+            raise TextureHistogramError("weights: got none above 0, expected at least one")
+        return HistogramCount(
             sums / total, below / total, above / total, least, most, total * total / squares
         )
 
     def match(
         self,
         values: FloatArray,
-        source: Counted,
+        source: HistogramCount,
         target: Float64Array,
         *,
         out: FloatArray | None = None,
@@ -125,29 +125,29 @@ class Bins:
         widen the end bins of both histograms to where they reach.
         """
         flat = np.ascontiguousarray(values).reshape(-1)
-        _check_shares("target", target, HISTOGRAM_BINS)
-        Checks(HistogramError).within("values (leave out what is masked)", flat)
-        own, wanted = cumulated(source.shares), cumulated(target)
+        _check_fractions("target", target, HISTOGRAM_BINS)
+        Checks(TextureHistogramError).within("values (leave out what is masked)", flat)
+        own, wanted = cumulate_fractions(source.fractions), cumulate_fractions(target)
         edges = self.edges.copy()
-        edges[0], edges[-1] = min(edges[0], source.least), max(edges[-1], source.most)
+        edges[0], edges[-1] = min(edges[0], source.min_value), max(edges[-1], source.max_value)
         moved = np.empty(np.shape(values), flat.dtype) if out is None else out
-        histogram_kernels.move(flat, own, wanted, edges, moved.reshape(-1))
+        histogram_kernels.move_values(flat, own, wanted, edges, moved.reshape(-1))
         return moved
 
 
-def _check_shares(name: str, shares: ArrayLike, bins: int | None = None) -> Float64Array:
-    check = Checks(HistogramError)
-    h = check.numbers(name, shares, ("...", bins or "bins"), interval="[0, inf)")
+def _check_fractions(name: str, fractions: ArrayLike, bins: int | None = None) -> Float64Array:
+    check = Checks(TextureHistogramError)
+    h = check.numbers(name, fractions, ("...", bins or "bins"), interval="[0, inf)")
     check.within(f"sum of {name}", h.sum(axis=-1), "(0, inf)")
     return h
 
 
 def _check_edges(edges: Float64Array, shape: tuple[int | str, ...]) -> None:
-    Checks(HistogramError).numbers("edges", edges, shape)
-    Checks(HistogramError).within("steps of edges", np.diff(edges, axis=-1), "(0, inf)")
+    Checks(TextureHistogramError).numbers("edges", edges, shape)
+    Checks(TextureHistogramError).within("steps of edges", np.diff(edges, axis=-1), "(0, inf)")
 
 
-def cumulated(shares: ArrayLike) -> Float64Array:
+def cumulate_fractions(fractions: ArrayLike) -> Float64Array:
     """Return the cumulated shares at all edges, (..., 257), from 0 to exactly 1.
 
     Raises
@@ -155,13 +155,13 @@ def cumulated(shares: ArrayLike) -> Float64Array:
     HistogramError
         For shares that are not finite, negative, or all 0.
     """
-    h = _check_shares("shares", shares)
+    h = _check_fractions("shares", fractions)
     run = np.concatenate([np.zeros((*h.shape[:-1], 1)), np.cumsum(h, axis=-1)], axis=-1)
     run /= run[..., -1:]
     return np.asarray(np.minimum(run, 1.0))
 
 
-def distance(a: ArrayLike, b: ArrayLike, edges: ArrayLike) -> Float64Array:
+def histogram_distance(a: ArrayLike, b: ArrayLike, edges: ArrayLike) -> Float64Array:
     """Return how far values must move, on average, to make one histogram of another.
 
     Parameters
@@ -183,13 +183,16 @@ def distance(a: ArrayLike, b: ArrayLike, edges: ArrayLike) -> Float64Array:
 
     Examples
     --------
-    >>> float(distance(np.eye(256)[3], np.eye(256)[131], np.arange(257.0)))
+    >>> float(histogram_distance(np.eye(256)[3], np.eye(256)[131], np.arange(257.0)))
     1.0
     """
     e = np.asarray(edges, np.float64)
-    first, second = _check_shares("a", a, HISTOGRAM_BINS), _check_shares("b", b, HISTOGRAM_BINS)
+    first, second = (
+        _check_fractions("a", a, HISTOGRAM_BINS),
+        _check_fractions("b", b, HISTOGRAM_BINS),
+    )
     _check_edges(e, ("...", HISTOGRAM_BINS + 1))
-    apart = np.abs(cumulated(first) - cumulated(second))
+    apart = np.abs(cumulate_fractions(first) - cumulate_fractions(second))
     moved = np.sum(0.5 * (apart[..., 1:] + apart[..., :-1]) * np.diff(e, axis=-1), axis=-1)
     quarter = HISTOGRAM_BINS // 4
     return np.asarray(moved / (e[..., 3 * quarter] - e[..., quarter]))
@@ -220,10 +223,10 @@ def project_to_histograms(vectors: ArrayLike) -> Float64Array:
     >>> project_to_histograms(edited)[:3].round(6).tolist()
     [0.8, 0.2, 0.0]
     """
-    v = Checks(HistogramError).numbers("vectors", vectors, ("...", "n"))
+    v = Checks(TextureHistogramError).numbers("vectors", vectors, ("...", "n"))
     whole = v.size and v.shape[-1] % HISTOGRAM_BINS == 0
-    Checks(HistogramError).require(whole, "vectors", v.shape, f"(..., n x {HISTOGRAM_BINS})")
-    return nearest_shares(v.reshape(-1, HISTOGRAM_BINS)).reshape(v.shape)
+    Checks(TextureHistogramError).require(whole, "vectors", v.shape, f"(..., n x {HISTOGRAM_BINS})")
+    return project_to_simplex(v.reshape(-1, HISTOGRAM_BINS)).reshape(v.shape)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -275,7 +278,7 @@ def rgb_histograms(
     ([[0.5, 0.5], [0.5, 0.5], [0.5, 0.5]], [2])
     """
     low, high = reach
-    check = Checks(HistogramError)
+    check = Checks(TextureHistogramError)
     check.within("bins", bins, "[2, inf)")
     check.within("reach", high, f"({low}, inf)")
     check.require(valid is None or len(valid) == len(images), "valid", valid, "a mask an image")
@@ -288,7 +291,9 @@ def rgb_histograms(
         check.shape(f"valid[{number}]", mask, pixels.shape[:2])
         rows = pixels.reshape(-1, pixels.shape[2]) if mask is None else pixels[mask]
         if not len(rows) or not np.isfinite(rows).all():
-            raise HistogramError(f"images[{number}]: got no valid texel, or one that is not finite")
+            raise TextureHistogramError(
+                f"images[{number}]: got no valid texel, or one that is not finite"
+            )
         shares = [np.histogram(np.clip(c, low, high), edges)[0] / len(rows) for c in rows.T]
         found.append(shares)
         outside.append(((rows < low) | (rows > high)).mean(axis=0))

@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike
 from model.arrays import BoolArray, Float64Array, FloatArray
 from model.checks import Checks
 from model.texture_statistics import steerable_pyramid
-from model.texture_statistics.bins import OPPONENT_AXES, principal_axes, uneven_edges
+from model.texture_statistics.bins import OPPONENT_AXES, make_bin_edges, principal_axes
 from model.texture_statistics.histograms import HISTOGRAM_BINS
 from model.texture_statistics.masks import fill_smoothly, response_weights
 from model.texture_statistics.steerable_pyramid import LEVELS, ORIENTATIONS
@@ -103,7 +103,7 @@ class TextureSpace:
 
         Examples
         --------
-        >>> TextureSpace.standard().part(2, "low-pass")
+        >>> TextureSpace.opponent().part(2, "low-pass")
         slice(23552, 23808, None)
         """
         names = self.responses
@@ -160,7 +160,7 @@ class TextureSpace:
         )
 
     @classmethod
-    def standard(cls, channels: int = 3) -> TextureSpace:
+    def opponent(cls, channels: int = 3) -> TextureSpace:
         """Return the space for reflectances 0...1 of which no population is known.
 
         Channels are brightness, red less green and yellow less blue (RGB), or the image itself
@@ -232,7 +232,7 @@ class TextureSpace:
         moments = []
         unit = 0.0
         for image, mask in zip(images, masks, strict=True):
-            colors, inside = checked_image(image, mask)
+            colors, inside = check_image(image, mask)
             rows = colors[inside].astype(np.float64)
             unit = max(unit, float(np.abs(rows).max()))
             center = rows.mean(axis=0)
@@ -253,7 +253,7 @@ class TextureSpace:
         edges = np.empty_like(plain.edges)
         for c in range(pooled.shape[1]):
             for r in range(pooled.shape[2]):
-                edges[c, r] = uneven_edges(pooled[:, c, r], unit or 1.0)
+                edges[c, r] = make_bin_edges(pooled[:, c, r], unit or 1.0)
         return cls(mean, axes, edges, levels, orientations, count)
 
     def save(self, path: str | Path) -> None:
@@ -279,7 +279,7 @@ class TextureSpace:
         return cls(mean, axes, edges, levels, orientations, images)
 
 
-def checked_image(image: ArrayLike, valid: ArrayLike | None) -> tuple[FloatArray, BoolArray]:
+def check_image(image: ArrayLike, valid: ArrayLike | None) -> tuple[FloatArray, BoolArray]:
     """Return an image as (H, W, C), float64 if it was and float32 if not, and its mask."""
     values = np.asarray(image)
     values = values.astype(np.float64 if values.dtype == np.float64 else np.float32, copy=False)
@@ -298,7 +298,7 @@ def _quantiles(
     space: TextureSpace, image: ArrayLike, valid: BoolArray | None, workers: int | None
 ) -> FloatArray:
     """Return even quantiles of the valid samples of all responses, (C, R, quantiles) float32."""
-    colors, mask = checked_image(image, valid)
+    colors, mask = check_image(image, valid)
     weights = None if mask.all() else response_weights(mask, None, space.levels)
     out = np.empty((space.channels, len(space.responses), _N_QUANTILES), colors.dtype)
     for c, channel in enumerate(space.to_channels(fill_smoothly(colors, mask))):
@@ -307,14 +307,14 @@ def _quantiles(
         )
         for r, values in enumerate((channel, *pyramid)):
             if weights is not None:
-                values = values[weight_of(weights, r, space.orientations) > 0.0]
+                values = values[response_weight(weights, r, space.orientations) > 0.0]
             ordered = np.sort(values, axis=None)
             ranks = np.linspace(0.0, ordered.size - 1.0, _N_QUANTILES)
             out[c, r] = ordered[np.rint(ranks).astype(np.int64)]
     return out
 
 
-def weight_of(
+def response_weight(
     weights: tuple[FloatArray, tuple[FloatArray, ...]], response: int, orientations: int
 ) -> FloatArray:
     """Return the weights of the samples of a response out of those of all levels."""

@@ -257,7 +257,7 @@ def _filters(shape: tuple[int, int], levels: int, orientations: int, kind: str) 
     toward = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     made = []
     for number in range(levels + 1):
-        level = _place(shape, number)
+        level = _make_level(shape, number)
         log_radius = _log_radius(level)
         lower = np.cos(0.5 * np.pi * np.clip(log_radius + number + 1.0, 0.0, 1.0))
         if number < levels:
@@ -266,7 +266,7 @@ def _filters(shape: tuple[int, int], levels: int, orientations: int, kind: str) 
             lower = level_gain * lower * upper / radius**order
         fy, fx, weight = (a.astype(kind) for a in (level.fy, level.fx, lower))
         made.append(_Level(level.rows, level.columns, level.size, fy, fx, weight))
-    high = np.sin(0.5 * np.pi * np.clip(_log_radius(_place(shape, 0)) + 1.0, 0.0, 1.0))
+    high = np.sin(0.5 * np.pi * np.clip(_log_radius(_make_level(shape, 0)) + 1.0, 0.0, 1.0))
     complex_kind = np.result_type(kind, np.complex64).type
     return _Filters(
         high.astype(kind),
@@ -277,7 +277,7 @@ def _filters(shape: tuple[int, int], levels: int, orientations: int, kind: str) 
     )
 
 
-def _place(shape: tuple[int, int], number: int) -> _Level:
+def _make_level(shape: tuple[int, int], number: int) -> _Level:
     """Return where the low frequencies of a level lie; its filter is still empty."""
     height, width = size = _size(shape, number)
     # signed frequencies of the level's rows, in cycles an image, and where the spectrum has them

@@ -264,7 +264,7 @@ def layer_stack_reflectance(
     0.21
     """
     Checks(TissueError).choice("tier", tier, TIER_NAMES)
-    sigma_a, sigma_s, thickness = Checks(TissueError).together(
+    sigma_a, sigma_s, thickness = Checks(TissueError).broadcast_together(
         sigma_a_per_mm=sigma_a_per_mm,
         sigma_s_prime_per_mm=sigma_s_prime_per_mm,
         thickness_mm=thickness_mm,

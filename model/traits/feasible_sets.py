@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from model.arrays import BoolArray, Float64Array
 from model.checks import Checks
 from model.traits import nonnegative_kernels
-from model.vectors import nearest_shares
+from model.vectors import project_to_simplex
 
 FEASIBLE_TOL = 1e-5
 """What float32 leaves of a sum of one, and of a share of zero."""
@@ -26,7 +26,7 @@ class FeasibleError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Free:
+class UnconstrainedSet:
     """Everything finite."""
 
     def contains(self, samples: ArrayLike) -> BoolArray:
@@ -47,7 +47,7 @@ class Free:
 
 
 @dataclass(frozen=True, slots=True)
-class NonNegative:
+class NonNegativeSet:
     """Samples of shares that are at least 0."""
 
     def contains(self, samples: ArrayLike) -> BoolArray:
@@ -72,15 +72,18 @@ class NonNegative:
 
         Examples
         --------
-        >>> NonNegative().project([1.0, -0.5]).tolist()
+        >>> NonNegativeSet().project([1.0, -0.5]).tolist()
         [1.0, 0.0]
-        >>> NonNegative().project([1.0, -0.5], np.array([[1.0, 0.8], [0.8, 1.0]])).round(6).tolist()
+        >>> NonNegativeSet().project([1.0, -0.5], np.array([[1.0, 0.8], [0.8,
+        ...     1.0]])).round(6).tolist()
         [0.6, 0.0]
         """
         s = np.asarray(samples, np.float64)
         if metric is None or metric.ndim == 1:
             return np.maximum(s, 0.0)
-        return nonnegative_kernels.nearest(metric, s.reshape(-1, s.shape[-1])).reshape(s.shape)
+        return nonnegative_kernels.nearest_mixtures(metric, s.reshape(-1, s.shape[-1])).reshape(
+            s.shape
+        )
 
     def tangent(self, vector: ArrayLike) -> Float64Array:
         """Return the part of a direction (d,) along the set: all of it."""
@@ -92,7 +95,7 @@ class NonNegative:
 
 
 @dataclass(frozen=True, slots=True)
-class Histograms:
+class HistogramSet:
     """Samples made of histograms, one after another, each at least 0 and of sum one."""
 
     block: int = HISTOGRAM_BINS
@@ -132,13 +135,13 @@ class Histograms:
 
         Examples
         --------
-        >>> Histograms(3).project([0.75, 0.5, -0.25]).tolist()
+        >>> HistogramSet(3).project([0.75, 0.5, -0.25]).tolist()
         [0.625, 0.375, 0.0]
         """
         if metric is not None:
             raise FeasibleError("metric: got weights, expected none for histograms")
         rows = self._blocks(samples).reshape(-1, self.block)
-        return nearest_shares(rows).reshape(np.shape(samples))
+        return project_to_simplex(rows).reshape(np.shape(samples))
 
     def tangent(self, vector: ArrayLike) -> Float64Array:
         """Return the part of a direction (d,) along the set: each histogram keeps its sum."""
@@ -158,32 +161,33 @@ class Histograms:
         return s.reshape(*s.shape[:-1], -1, self.block)
 
 
-FeasibleSet: TypeAlias = Free | NonNegative | Histograms
+FeasibleSet: TypeAlias = UnconstrainedSet | NonNegativeSet | HistogramSet
 
 
 def from_document(document: Mapping[str, Any]) -> FeasibleSet:
     """Return the set that a `document` names."""
     name = document.get("set")
     if name == "free":
-        return Free()
+        return UnconstrainedSet()
     if name == "non-negative":
-        return NonNegative()
+        return NonNegativeSet()
     if name == "histograms":
-        return Histograms(int(document["block"]))
+        return HistogramSet(int(document["block"]))
     raise FeasibleError(
         f"set: got {name!r}, expected 'free', 'non-negative' or 'histograms'; a newer version "
         "may have written it"
     )
 
 
-def smallest(samples: Float64Array) -> FeasibleSet:
+def smallest_feasible_set(samples: Float64Array) -> FeasibleSet:
     """Return the smallest set that holds samples (n, d): histograms of 256, non-negative, free.
 
     Examples
     --------
-    >>> smallest(np.array([[0.0, 2.0]])), smallest(np.array([[0.0, -2.0]]))
-    (NonNegative(), Free())
+    >>> smallest_feasible_set(np.array([[0.0, 2.0]])), smallest_feasible_set(np.array([[0.0,
+    ...     -2.0]]))
+    (NonNegativeSet(), UnconstrainedSet())
     """
-    if samples.shape[-1] % HISTOGRAM_BINS == 0 and Histograms().contains(samples).all():
-        return Histograms()
-    return NonNegative() if bool((samples >= 0.0).all()) else Free()
+    if samples.shape[-1] % HISTOGRAM_BINS == 0 and HistogramSet().contains(samples).all():
+        return HistogramSet()
+    return NonNegativeSet() if bool((samples >= 0.0).all()) else UnconstrainedSet()

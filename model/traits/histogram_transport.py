@@ -20,11 +20,11 @@ N_QUANTILES = 256
 """Quantiles of a histogram, at even shares (k + 1/2) / 256."""
 
 
-class TransportError(ValueError):
+class HistogramTransportError(ValueError):
     """Histograms, edges or changes that do not fit each other."""
 
 
-def shares() -> Float64Array:
+def quantile_levels() -> Float64Array:
     """Return the shares at which quantiles are taken, (256,)."""
     return (np.arange(N_QUANTILES) + 0.5) / N_QUANTILES
 
@@ -51,7 +51,7 @@ def quantiles(histograms: ArrayLike, edges: ArrayLike) -> Float64Array:
     [0.0078125, 2.0078125, 3.9921875]
     """
     h, e = _checked(histograms, edges)
-    at = shares()
+    at = quantile_levels()
     out = np.empty((len(h), N_QUANTILES))
     for k in range(len(h)):
         filled, place = _rising(np.concatenate([[0.0], np.cumsum(h[k])]), e[k])
@@ -59,13 +59,13 @@ def quantiles(histograms: ArrayLike, edges: ArrayLike) -> Float64Array:
     return out.reshape(*np.shape(histograms)[:-1], N_QUANTILES)
 
 
-def widened(histograms: ArrayLike, edges: ArrayLike, change: ArrayLike) -> Float64Array:
+def widen_edges(histograms: ArrayLike, edges: ArrayLike, change: ArrayLike) -> Float64Array:
     """Return edges stretched so far that nothing leaves them when quantiles change.
 
     Parameters
     ----------
     histograms, edges, change
-        As of `moved`.
+        As of `shift_quantiles`.
 
     Returns
     -------
@@ -86,8 +86,12 @@ def widened(histograms: ArrayLike, edges: ArrayLike, change: ArrayLike) -> Float
     return out.reshape(np.shape(edges))
 
 
-def moved(
-    histograms: ArrayLike, edges: ArrayLike, change: ArrayLike, *, onto: ArrayLike | None = None
+def shift_quantiles(
+    histograms: ArrayLike,
+    edges: ArrayLike,
+    change: ArrayLike,
+    *,
+    target_edges: ArrayLike | None = None,
 ) -> Float64Array:
     """Return histograms with what they count moved by a change of their quantiles.
 
@@ -109,14 +113,14 @@ def moved(
 
     Examples
     --------
-    >>> moved([0.0, 1.0, 0.0], [0.0, 1.0, 2.0, 3.0], np.full(256, 0.5)).round(3).tolist()
+    >>> shift_quantiles([0.0, 1.0, 0.0], [0.0, 1.0, 2.0, 3.0], np.full(256, 0.5)).round(3).tolist()
     [0.0, 0.5, 0.5]
     """
     h, e = _checked(histograms, edges)
-    to = e if onto is None else _checked(histograms, onto)[1]
+    to = e if target_edges is None else _checked(histograms, target_edges)[1]
     by = _change(histograms, change)
     out = np.empty_like(h)
-    at = shares()
+    at = quantile_levels()
     for k in range(len(h)):
         if not by[k].any() and to is e:
             out[k] = h[k]
@@ -136,18 +140,18 @@ def moved(
 def _change(histograms: ArrayLike, change: ArrayLike) -> Float64Array:
     shape = (*np.shape(histograms)[:-1], N_QUANTILES)
     by = np.broadcast_to(np.asarray(change, np.float64), shape).reshape(-1, N_QUANTILES)
-    Checks(TransportError).within("change", by)
+    Checks(HistogramTransportError).within("change", by)
     return by
 
 
 def _checked(histograms: ArrayLike, edges: ArrayLike) -> tuple[Float64Array, Float64Array]:
     given = np.asarray(histograms, np.float64)
     over = np.asarray(edges, np.float64)
-    Checks(TransportError).shape("histograms", given, ("...", "bins"))
-    Checks(TransportError).shape("edges", over, (*given.shape[:-1], given.shape[-1] + 1))
+    Checks(HistogramTransportError).shape("histograms", given, ("...", "bins"))
+    Checks(HistogramTransportError).shape("edges", over, (*given.shape[:-1], given.shape[-1] + 1))
     h = given.reshape(-1, given.shape[-1])
     if not np.isfinite(h).all() or h.min() < 0 or not np.allclose(h.sum(axis=1), 1.0, atol=1e-5):
-        raise TransportError("histograms: got negative shares or a sum that is not 1")
+        raise HistogramTransportError("histograms: got negative shares or a sum that is not 1")
     return h, over.reshape(-1, given.shape[-1] + 1)
 
 

@@ -37,7 +37,7 @@ from model.traits.vectors import TraitError
 
 MIN_ERROR_GAIN = 0.05
 """A trait brings a lobe when that lowers the error of its edit by more than this share of it."""
-CANDIDATE_SHARES = (0.3, 1.0, 3.0)
+CANDIDATE_WEIGHTS = (0.3, 1.0, 3.0)
 """Times the mean shares that a candidate assumes can be taken off."""
 TRIAL_TEXELS = 1000
 """Texels on which candidates are tried."""
@@ -74,7 +74,7 @@ class LobeEdit:
     misfit: Mapping[str, float]
 
     @property
-    def share(self) -> float:
+    def clipped_fraction(self) -> float:
         """Share of the change over all texels that could not be taken off, RMS."""
         asked = float(np.sqrt(np.mean(self.moved**2))) if len(self.moved) else 0.0
         return float(np.sqrt(np.mean(self.clipped**2))) / asked if asked > 0.0 else 0.0
@@ -144,16 +144,16 @@ def edit_weights(
     change = np.zeros((len(t), len(lobes)))
     misfit, unseen = {}, zero.copy()
     for name, vector in vectors.items():
-        z = _on_lobes(lobes, vector, space.metric)
+        z = _project_on_lobes(lobes, vector, space.metric)
         change += asked[name][:, None] * z
-        size = float(reduced_spaces.lengths(vector, space.metric))
-        off = float(reduced_spaces.lengths(z @ lobes - vector, space.metric))
+        size = float(reduced_spaces.metric_lengths(vector, space.metric))
+        off = float(reduced_spaces.metric_lengths(z @ lobes - vector, space.metric))
         misfit[name] = off / size if size > 0.0 else 0.0
         unseen += np.abs(asked[name]) * off
     wanted = _padded(t, len(lobes)) + change
-    found = nonnegative_kernels.nearest(gram, wanted)
-    clipped = reduced_spaces.lengths(found - wanted, gram)
-    moved = reduced_spaces.lengths(change, gram)
+    found = nonnegative_kernels.nearest_mixtures(gram, wanted)
+    clipped = reduced_spaces.metric_lengths(found - wanted, gram)
+    moved = reduced_spaces.metric_lengths(change, gram)
     return LobeEdit(found.astype(dtype), lobes, moved, clipped, clipped + unseen, misfit)
 
 
@@ -181,7 +181,7 @@ def _padded(t: Float64Array, count: int) -> Float64Array:
     return np.pad(t, ((0, 0), (0, count - t.shape[1])))
 
 
-def _on_lobes(
+def _project_on_lobes(
     lobes: Float64Array, vector: Float64Array, metric: Float64Array | None
 ) -> Float64Array:
     """Return the signed shares of lobes that come nearest to a vector."""
@@ -205,15 +205,15 @@ class _Trial:
         """Return the lobes and, where it is worth it, one more for the trait."""
         vector, metric = self.vector, self.metric
         strength = float(np.sqrt(np.mean(self.amount**2)))
-        size = strength * float(reduced_spaces.lengths(vector, metric))
+        size = strength * float(reduced_spaces.metric_lengths(vector, metric))
         if size == 0.0:
             return lobes
         way = vector if float(self.amount.mean()) >= 0.0 else -vector
         found = [np.maximum(way, 0.0)]
-        frame = reduced_spaces.framed(np.eye(len(vector)), metric)
+        frame = reduced_spaces.to_euclidean_frame(np.eye(len(vector)), metric)
         columns = np.vstack([lobes, np.eye(len(vector))]) @ frame
         usual = _padded(self.shares, len(lobes)).mean(axis=0)
-        for given in CANDIDATE_SHARES:
+        for given in CANDIDATE_WEIGHTS:
             wanted = given * usual @ lobes + strength * way
             most = 50 * len(columns)
             found.append(nnls(columns.T, wanted @ frame, maxiter=most)[0][len(lobes) :])
@@ -224,9 +224,9 @@ class _Trial:
 
     def _error(self, lobes: Float64Array) -> float:
         """Return the RMS length by which edits on some lobes miss what was asked."""
-        z = _on_lobes(lobes, self.vector, self.metric)
+        z = _project_on_lobes(lobes, self.vector, self.metric)
         source, amount = _padded(self.shares, len(lobes)), self.amount[:, None]
         gram = reduced_spaces.times_metric(lobes, self.metric) @ lobes.T
-        done = nonnegative_kernels.nearest(gram, source + amount * z) - source
-        off = reduced_spaces.lengths(done @ lobes - amount * self.vector, self.metric)
+        done = nonnegative_kernels.nearest_mixtures(gram, source + amount * z) - source
+        off = reduced_spaces.metric_lengths(done @ lobes - amount * self.vector, self.metric)
         return float(np.sqrt(np.mean(off**2)))

@@ -20,7 +20,7 @@ JOIN_TOL = 1e-10
 BLOCK_ROWS = 512  # rows that share their working memory
 
 
-def nearest(gram: Float64Array, wanted: Float64Array) -> Float64Array:
+def nearest_mixtures(gram: Float64Array, wanted: Float64Array) -> Float64Array:
     """Return the non-negative mixtures x that are nearest: least (x - t)' G (x - t).
 
     Parameters
@@ -36,14 +36,15 @@ def nearest(gram: Float64Array, wanted: Float64Array) -> Float64Array:
 
     Examples
     --------
-    >>> nearest(np.array([[1.0, 0.8], [0.8, 1.0]]), np.array([[1.0, -0.5]])).round(6).tolist()
+    >>> nearest_mixtures(np.array([[1.0, 0.8], [0.8, 1.0]]), np.array([[1.0,
+    ...     -0.5]])).round(6).tolist()
     [[0.6, 0.0]]
     """
     out = np.array(wanted, np.float64, order="C")
     beyond = np.flatnonzero((out < 0.0).any(axis=1))
     if len(beyond):
         rows = np.ascontiguousarray(out[beyond])
-        _nearest(np.ascontiguousarray(gram, np.float64), rows)
+        _solve_rows(np.ascontiguousarray(gram, np.float64), rows)
         out[beyond] = rows
     return out
 
@@ -79,7 +80,7 @@ def _back(low, used, y):
 
 
 @njit(cache=True, nogil=True)
-def _one(gram, t, x, rhs, active, low, y, refused):
+def _solve_row(gram, t, x, rhs, active, low, y, refused):
     size = len(t)
     norm = 0.0
     for p in range(size):
@@ -140,7 +141,7 @@ def _one(gram, t, x, rhs, active, low, y, refused):
 
 
 @njit(parallel=True, cache=True)
-def _nearest(gram, rows):
+def _solve_rows(gram, rows):
     count, size = rows.shape
     for block in prange((count + BLOCK_ROWS - 1) // BLOCK_ROWS):
         x, rhs, y = np.empty(size), np.empty(size), np.empty(size)
@@ -148,6 +149,6 @@ def _nearest(gram, rows):
         low = np.empty((size, size))
         refused = np.empty(size, np.bool_)
         for row in range(block * BLOCK_ROWS, min((block + 1) * BLOCK_ROWS, count)):
-            _one(gram, rows[row], x, rhs, active, low, y, refused)
+            _solve_row(gram, rows[row], x, rhs, active, low, y, refused)
             for p in range(size):
                 rows[row, p] = x[p]

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from model.arrays import Float64Array
 from model.checks import Checks
 from model.traits import nonnegative_kernels
-from model.traits.vectors import Trait, TraitError, exponent_of
+from model.traits.vectors import Trait, TraitError, scale_exponent
 
 SpaceKind = Literal["pca", "nmf"]
 
@@ -81,13 +81,13 @@ def times_metric(samples: Float64Array, metric: Float64Array | None) -> Float64A
     return np.asarray(samples * metric if metric.ndim == 1 else samples @ metric)
 
 
-def lengths(samples: Float64Array, metric: Float64Array | None) -> Float64Array:
+def metric_lengths(samples: Float64Array, metric: Float64Array | None) -> Float64Array:
     """Return the lengths of samples (..., d) under the metric, (...)."""
     squared = np.sum(samples * times_metric(samples, metric), axis=-1)
     return np.asarray(np.sqrt(np.maximum(squared, 0.0)))
 
 
-def framed(samples: Float64Array, metric: Float64Array | None) -> Float64Array:
+def to_euclidean_frame(samples: Float64Array, metric: Float64Array | None) -> Float64Array:
     """Return samples (n, d) in a frame where the metric is the plain sum of squares."""
     if metric is None:
         return samples
@@ -97,7 +97,7 @@ def framed(samples: Float64Array, metric: Float64Array | None) -> Float64Array:
     return np.asarray(samples @ (vectors * np.sqrt(np.maximum(values, 0.0))))
 
 
-def principal(
+def principal_components(
     samples: Float64Array,
     traits: Sequence[Trait],
     *,
@@ -114,7 +114,7 @@ def principal(
     traits
         What the number of components is chosen for.
     components : int or None
-        At most the rank of the samples' differences; None: see `choose`.
+        At most the rank of the samples' differences; None: see `choose_component_count`.
     metric
         See `check_metric`.
     rng
@@ -126,18 +126,18 @@ def principal(
         When all samples are the same, have fewer independent differences than asked for, or are
         not finite.
     """
-    exponent = exponent_of(samples)
+    exponent = scale_exponent(samples)
     samples = np.ldexp(samples, -exponent)
     n, d = samples.shape
     center = samples.mean(axis=0)
     off = samples - center
-    y = framed(off, metric)
+    y = to_euclidean_frame(off, metric)
     # The triangle of a QR factorization has the same values and left vectors, and is small.
     small = np.asarray(np.linalg.qr(y.T, mode="r")).T if d > n else y
     u, s, _ = scipy.linalg.svd(small, full_matrices=False)
     eps = float(np.finfo(np.float64).eps)
     # What rounding leaves of directions that are not there, and of the mean taken off
-    floor = max(max(n, d) * s[0], 8.0 * np.sqrt(n) * float(lengths(center, metric))) * eps
+    floor = max(max(n, d) * s[0], 8.0 * np.sqrt(n) * float(metric_lengths(center, metric))) * eps
     rank = int(np.count_nonzero(s > floor))
     if rank == 0:
         raise TraitError(f"samples: all {n} are the same, nothing can be learned from them")
@@ -145,7 +145,7 @@ def principal(
         what = f"components (the {n} samples differ in {rank})"
         Checks(TraitError).within(what, components, f"[1, {rank}]")
     scores = u[:, :rank] * s[:rank]
-    kept = choose(scores, traits, rng=rng) if components is None else components
+    kept = choose_component_count(scores, traits, rng=rng) if components is None else components
     # A basis as sums of the samples needs no inverse of the metric.
     basis = (u[:, :kept] / s[:kept]).T @ off
     held = np.where(np.arange(rank) < kept, scores, 0.0)
@@ -154,7 +154,9 @@ def principal(
     return Reduction("pca", center, basis, scores, held, scores[:, :kept].copy(), lost)
 
 
-def choose(scores: Float64Array, traits: Sequence[Trait], *, rng: np.random.Generator) -> int:
+def choose_component_count(
+    scores: Float64Array, traits: Sequence[Trait], *, rng: np.random.Generator
+) -> int:
     """Return how many components make trait vectors that hold for other people.
 
     Parameters
@@ -180,7 +182,7 @@ def choose(scores: Float64Array, traits: Sequence[Trait], *, rng: np.random.Gene
     most = min(n // 2 - 2, rank)
     if not used or most < 2 or not scores.any():
         return rank
-    scores = np.ldexp(scores, -exponent_of(scores))
+    scores = np.ldexp(scores, -scale_exponent(scores))
     total = np.zeros(most)
     products = scores @ scores.T
     for trait in used:
@@ -209,7 +211,7 @@ def choose(scores: Float64Array, traits: Sequence[Trait], *, rng: np.random.Gene
     return int(np.argmax(total)) + 1 if better else rank
 
 
-def mixtures(
+def fit_mixtures(
     samples: Float64Array, basis: ArrayLike | None, *, metric: Float64Array | None
 ) -> Reduction:
     """Return samples as non-negative mixtures of a basis.
@@ -238,19 +240,19 @@ def mixtures(
     b = Checks(TraitError).numbers("basis", basis, ("K", d), interval="[0, inf)")
     if not (b.max(axis=1) > 0.0).all():
         raise TraitError("basis: got a mixture of nothing")
-    exponent = exponent_of(samples)
+    exponent = scale_exponent(samples)
     samples = np.ldexp(samples, -exponent)
     coordinates = mixture_coordinates(samples, b, metric)
     mixed = coordinates @ b
     off = samples - mixed
     center = samples.mean(axis=0)
-    spread = float(np.linalg.norm(lengths(samples - center, metric)))
-    rounding = 8.0 * len(samples) * float(lengths(center, metric)) * np.finfo(np.float64).eps
+    spread = float(np.linalg.norm(metric_lengths(samples - center, metric)))
+    rounding = 8.0 * len(samples) * float(metric_lengths(center, metric)) * np.finfo(np.float64).eps
     if spread <= rounding:
         raise TraitError(f"samples: all {len(samples)} are the same, nothing can be learned")
     gone = off - off.mean(axis=0)
-    lost = float(np.linalg.norm(lengths(gone, metric))) / spread
-    whole, held = framed(samples, metric), framed(mixed, metric)
+    lost = float(np.linalg.norm(metric_lengths(gone, metric))) / spread
+    whole, held = to_euclidean_frame(samples, metric), to_euclidean_frame(mixed, metric)
     center, whole, held, coordinates = (
         np.ldexp(values, exponent) for values in (center, whole, held, coordinates)
     )
@@ -270,7 +272,7 @@ def mixture_coordinates(
         For what is not finite, and a metric that is none of samples of this length.
     """
     samples, basis = np.asarray(samples, np.float64), np.asarray(basis, np.float64)
-    unit, own = exponent_of(samples), exponent_of(basis)
+    unit, own = scale_exponent(samples), scale_exponent(basis)
     d = basis.shape[1]
     if metric is not None:
         Checks(TraitError).numbers("metric", metric, (d,), (d, d))
@@ -278,5 +280,5 @@ def mixture_coordinates(
     products = times_metric(materials, metric)
     gram = products @ materials.T
     plain = np.linalg.lstsq(gram, products @ np.ldexp(samples, -unit).T, rcond=1e-12)[0].T
-    shares = nonnegative_kernels.nearest(gram, np.ascontiguousarray(plain))
+    shares = nonnegative_kernels.nearest_mixtures(gram, np.ascontiguousarray(plain))
     return np.asarray(np.ldexp(shares, unit - own))

@@ -57,7 +57,7 @@ class EditOutcome:
     return_bound: Float64Array
 
     @property
-    def share(self) -> Float64Array:
+    def clipped_fraction(self) -> Float64Array:
         """Share of the change that was not possible; 0 where nothing was asked for."""
         asked = np.where(self.moved > 0.0, self.moved, 1.0)
         return np.where(self.moved > 0.0, self.clipped / asked, 0.0)
@@ -147,7 +147,7 @@ class TraitSpace:
             For "nmf": non-negative mixtures, as `reconstruction.brdf_basis.reduce` gives them.
         components : int, optional
             For "pca"; by default all, or fewer where their vectors hold better for other people,
-            see `model.traits.reduced_spaces.choose`.
+            see `model.traits.reduced_spaces.choose_component_count`.
         metric : array_like, shape (d,) or (d, d), optional
             What differences count. For mixtures of materials give their products over directions
             (`brdf_products`): their shares alone are no measure of what is seen.
@@ -179,20 +179,20 @@ class TraitSpace:
         """
         x = Checks(TraitError).numbers("samples", samples, ("n", "d"))
         Checks(TraitError).choice("space", space, ("pca", "nmf"))
-        traits = trait_vectors.traits_of(labels, continuous, len(x), contrast=contrast)
+        traits = trait_vectors.parse_traits(labels, continuous, len(x), contrast=contrast)
         g = reduced_spaces.check_metric(metric, x.shape[1])
-        inside = feasible_sets.smallest(x) if feasible is None else feasible
+        inside = feasible_sets.smallest_feasible_set(x) if feasible is None else feasible
         if not inside.contains(x).all():
             bad = int(np.count_nonzero(~inside.contains(x)))
             raise TraitError(f"samples: {bad} of {len(x)} are not in the set {inside}")
         rng = np.random.default_rng(seed)
         with threadpool_limits(limits=1, user_api="blas"):  # many small matrices
             if space == "pca":
-                reduced = reduced_spaces.principal(
+                reduced = reduced_spaces.principal_components(
                     x, traits, components=components, metric=g, rng=rng
                 )
             else:
-                reduced = reduced_spaces.mixtures(x, basis, metric=g)
+                reduced = reduced_spaces.fit_mixtures(x, basis, metric=g)
             found = _vectors(x, traits, reduced, inside, contrast, rng)
         return cls(
             kind=space,
@@ -255,7 +255,7 @@ class TraitSpace:
     def edit(
         self, sample: ArrayLike, amounts: Mapping[str, float], *, mode: Mode = "linear"
     ) -> FloatArray:
-        """Return samples with more or less of some traits; see `outcome`.
+        """Return samples with more or less of some traits; see `edit_with_outcome`.
 
         Examples
         --------
@@ -263,9 +263,9 @@ class TraitSpace:
         >>> space.edit([0.5, 1.0], {"red": -2.0}).tolist()
         [0.0, 1.0]
         """
-        return self.outcome(sample, amounts, mode=mode).sample
+        return self.edit_with_outcome(sample, amounts, mode=mode).sample
 
-    def outcome(
+    def edit_with_outcome(
         self, sample: ArrayLike, amounts: Mapping[str, float], *, mode: Mode = "linear"
     ) -> EditOutcome:
         """Edit samples by traits, and say what was not possible.
@@ -307,12 +307,12 @@ class TraitSpace:
             wanted = s + sum(
                 (a * self.traits[n].vector for n, a in amounts.items()), np.zeros(s.shape[-1])
             )
-        moved = reduced_spaces.lengths(wanted - s, self.metric)
+        moved = reduced_spaces.metric_lengths(wanted - s, self.metric)
         if not any(amounts.values()):
             zero = np.zeros_like(moved)
             return EditOutcome(given.astype(dtype), zero, zero, zero)
         found = self.feasible.project(wanted, self._products())
-        clipped = reduced_spaces.lengths(found - wanted, self.metric)
+        clipped = reduced_spaces.metric_lengths(found - wanted, self.metric)
         return EditOutcome(found.astype(dtype), moved, clipped, clipped)
 
     def _products(self) -> Float64Array | None:
@@ -345,7 +345,9 @@ def cosine(a: ArrayLike, b: ArrayLike, metric: Float64Array | None = None) -> fl
     x, y = np.asarray(a, np.float64), np.asarray(b, np.float64)
     Checks(TraitError).shape("directions", x, ("d",))
     Checks(TraitError).shape("directions", y, x.shape)
-    size = float(reduced_spaces.lengths(x, metric) * reduced_spaces.lengths(y, metric))
+    size = float(
+        reduced_spaces.metric_lengths(x, metric) * reduced_spaces.metric_lengths(y, metric)
+    )
     return float(x @ reduced_spaces.times_metric(y, metric)) / size if size > 0.0 else 0.0
 
 
@@ -362,10 +364,10 @@ def _vectors(
     found = {}
     for k, trait in enumerate(traits):
         beside = tuple(t for t in traits if t is not trait) if contrast == "regression" else ()
-        sure = trait_vectors.confidence(
-            trait, reduced.scores, whole=reduced.whole, beside=beside, rng=rng
+        sure = trait_vectors.direction_confidence(
+            trait, reduced.scores, whole=reduced.whole, covariates=beside, rng=rng
         )
-        left = trait_vectors.residuals(trait, x, beside=beside)
+        left = trait_vectors.residuals(trait, x, covariates=beside)
         weights = trait_vectors.error_weights(trait, left[:, -1], 2 + len(beside))
         others = [
             (t.name, float(r))
@@ -384,6 +386,6 @@ def _vectors(
             others=len(x) - trait.members,
             confidence=sure,
             confounded=confounded,
-            warnings=trait_vectors.doubts(trait, sure, confounded),
+            warnings=trait_vectors.list_warnings(trait, sure, confounded),
         )
     return found

@@ -69,7 +69,7 @@ class TraitLibrary:
         """All traits of all spaces, in alphabetical order."""
         return tuple(sorted({name for space in self.spaces.values() for name in space.traits}))
 
-    def having(self, trait: str) -> dict[str, TraitSpace]:
+    def spaces_with(self, trait: str) -> dict[str, TraitSpace]:
         """Return the spaces that have a trait; raises `TraitError` when none has."""
         found = {name: space for name, space in self.spaces.items() if trait in space.traits}
         if not found:
@@ -120,7 +120,7 @@ class TraitLibrary:
 
 
 @cache
-def default() -> TraitLibrary:
+def load_packaged_traits() -> TraitLibrary:
     """Return the packaged traits, learned from a simulated population.
 
     `tools/make_trait_space.py` makes them; `parameters` says of whom, and how near they come to
@@ -203,10 +203,10 @@ def _packed(
     errors = {}
     back = _decoded(prefix + "vectors", arrays)
     for k, name in enumerate(names):
-        size = float(reduced_spaces.lengths(found[k].vector, space.metric))
+        size = float(reduced_spaces.metric_lengths(found[k].vector, space.metric))
         read = back[k] if precision == "float64" else space.feasible.tangent(back[k])
         gap = read - found[k].vector
-        miss = float(reduced_spaces.lengths(gap, space.metric))
+        miss = float(reduced_spaces.metric_lengths(gap, space.metric))
         errors[name] = miss / size if size > 0.0 else 0.0
     return {
         **{key: getattr(space, key) for key in _SPACE_KEYS},

@@ -140,7 +140,7 @@ class Trait:
         return int(self.values.sum()) if self.kind == "binary" else len(self.values)
 
 
-def traits_of(
+def parse_traits(
     labels: Mapping[str, ArrayLike],
     continuous: Mapping[str, ArrayLike],
     count: int,
@@ -173,7 +173,7 @@ def traits_of(
 
     Examples
     --------
-    >>> traits_of({"lotion": [True, False, False]}, {}, 3)[0].contrast.round(6).tolist()
+    >>> parse_traits({"lotion": [True, False, False]}, {}, 3)[0].contrast.round(6).tolist()
     [1.0, -0.5, -0.5]
     """
     Checks(TraitError).choice("contrast", contrast, ("means", "regression"))
@@ -234,7 +234,7 @@ def _value(name: str, given: ArrayLike, count: int) -> Float64Array:
     return value
 
 
-def exponent_of(*values: Float64Array) -> int:
+def scale_exponent(*values: Float64Array) -> int:
     """Return the power of two that scales numbers to sizes up to 1; 0 where all are 0.
 
     What does not depend on a unit is computed of ``numpy.ldexp(values, -exponent)``, exactly the
@@ -252,7 +252,7 @@ def exponent_of(*values: Float64Array) -> int:
 
     Examples
     --------
-    >>> exponent_of(np.array([0.3, -5.0])), exponent_of(np.zeros(3))
+    >>> scale_exponent(np.array([0.3, -5.0])), scale_exponent(np.zeros(3))
     (3, 0)
     """
     for each in values:
@@ -270,7 +270,7 @@ def correlations(traits: tuple[Trait, ...]) -> Float64Array:
 
 
 def residuals(
-    trait: Trait, samples: Float64Array, *, beside: tuple[Trait, ...] = ()
+    trait: Trait, samples: Float64Array, *, covariates: tuple[Trait, ...] = ()
 ) -> Float64Array:
     """Return what the trait leaves of samples (n, d), and each one's leverage in a last column.
 
@@ -279,7 +279,7 @@ def residuals(
     beside
         Other traits in the same regression; none for a difference of means.
     """
-    columns = [np.ones(len(samples)), *(t.values - t.values.mean() for t in (trait, *beside))]
+    columns = [np.ones(len(samples)), *(t.values - t.values.mean() for t in (trait, *covariates))]
     q = np.linalg.qr(np.column_stack(columns))[0]
     left = samples - q @ (q.T @ samples)
     return np.column_stack([left, np.minimum((q**2).sum(axis=1), 1.0)])
@@ -302,12 +302,12 @@ def error_weights(trait: Trait, leverage: Float64Array, parameters: int) -> Floa
     return np.asarray(weight + np.where(free, alone / freedom, 0.0))
 
 
-def confidence(
+def direction_confidence(
     trait: Trait,
     scores: Float64Array,
     *,
     whole: Float64Array | None = None,
-    beside: tuple[Trait, ...] = (),
+    covariates: tuple[Trait, ...] = (),
     permutations: int = 999,
     resamples: int = 400,
     rng: np.random.Generator,
@@ -317,7 +317,7 @@ def confidence(
     Parameters
     ----------
     trait
-        See `traits_of`.
+        See `parse_traits`.
     scores : ndarray, shape (n, r)
         What the reduced space holds of the samples, in an orthonormal frame; finite.
     whole : ndarray, shape (n, r), optional
@@ -339,10 +339,14 @@ def confidence(
     c = trait.contrast
     if whole is None:
         whole = scores
-    exponent = exponent_of(scores, whole)
+    exponent = scale_exponent(scores, whole)
     scores, whole = (np.ldexp(values, -exponent) for values in (scores, whole))
     vector, true = c @ scores, c @ whole
-    base = whole if not beside else residuals(beside[0], whole, beside=beside[1:])[:, :-1]
+    base = (
+        whole
+        if not covariates
+        else residuals(covariates[0], whole, covariates=covariates[1:])[:, :-1]
+    )
     length, far = float(np.linalg.norm(vector)), float(np.linalg.norm(true))
     beyond = 0
     for start in range(0, permutations, _CHUNK_TRAITS):
@@ -350,13 +354,13 @@ def confidence(
         mixed = rng.permuted(np.broadcast_to(c, (many, n)), axis=1)
         beyond += int(np.count_nonzero(np.linalg.norm(mixed @ base, axis=1) >= far * (1.0 - 1e-12)))
     p = (1 + beyond) / (1 + permutations)
-    left = residuals(trait, scores, beside=beside)
+    left = residuals(trait, scores, covariates=covariates)
     off, leverage = left[:, :-1], left[:, -1]
-    weights = error_weights(trait, leverage, 2 + len(beside))
+    weights = error_weights(trait, leverage, 2 + len(covariates))
     noise = float(np.sqrt(weights @ (off**2).sum(axis=1)))
     if not weights.any() or length == 0.0:
         return Confidence(p, 0.0, (0.0, 0.0, 0.0), float("inf"))
-    all_left = residuals(trait, whole, beside=beside)[:, :-1]
+    all_left = residuals(trait, whole, covariates=covariates)[:, :-1]
     squared = float(far**2 - weights @ (all_left**2).sum(axis=1))
     along = float(vector @ true - weights @ (off * all_left).sum(axis=1))
     expected = max(along, 0.0) / (length * np.sqrt(squared)) if squared > 0.0 else 0.0
@@ -371,8 +375,8 @@ def confidence(
     return Confidence(p, float(min(expected, 1.0)), (low, middle, high), noise / length)
 
 
-def doubts(
-    trait: Trait, sure: Confidence, confounded: tuple[tuple[str, float], ...]
+def list_warnings(
+    trait: Trait, confidence: Confidence, confounded: tuple[tuple[str, float], ...]
 ) -> tuple[str, ...]:
     """Return what to warn of, a sentence each."""
     said = []
@@ -388,16 +392,17 @@ def doubts(
         said.append(
             f"{trait.name}: only {len(trait.values)} faces, expected {MIN_GROUP_SIZE} or more"
         )
-    if np.isinf(sure.relative_noise):
+    if np.isinf(confidence.relative_noise):
         said.append(f"{trait.name}: its error is not known, too few faces")
-    elif sure.p_value > MAX_P_VALUE:
+    elif confidence.p_value > MAX_P_VALUE:
         said.append(
-            f"{trait.name}: shuffled labels give as much (p = {sure.p_value:.2g}); it may be noise"
+            f"{trait.name}: shuffled labels give as much (p = {confidence.p_value:.2g}); it may"
+            f" be noise"
         )
-    elif sure.expected_cosine < MIN_COSINE:
+    elif confidence.expected_cosine < MIN_COSINE:
         said.append(
             f"{trait.name}: noisy, its cosine to the true direction is about "
-            f"{sure.expected_cosine:.2f}"
+            f"{confidence.expected_cosine:.2f}"
         )
     for other, r in confounded:
         said.append(

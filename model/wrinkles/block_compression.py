@@ -28,7 +28,7 @@ class BlockError(ValueError):
     """A texture that blocks cannot hold, or blocks that are no texture."""
 
 
-def blocks_of(shape: tuple[int, int]) -> tuple[int, int]:
+def block_grid_shape(shape: tuple[int, int]) -> tuple[int, int]:
     """Return rows and columns of blocks; the last ones may reach beyond the texture."""
     return -(-shape[0] // BLOCK_SIDE), -(-shape[1] // BLOCK_SIDE)
 
@@ -269,7 +269,7 @@ def _cut(values: FloatArray) -> Float64Array:
     """Return blocks (rows, columns, 16, channels) of (h, w, channels), edges repeated."""
     v = Checks(BlockError).numbers("texture", values, ("h", "w", "channels"), interval="[0, 1]")
     h, w, channels = v.shape
-    rows, columns = blocks_of((h, w))
+    rows, columns = block_grid_shape((h, w))
     v = np.pad(v, ((0, rows * BLOCK_SIDE - h), (0, columns * BLOCK_SIDE - w), (0, 0)), mode="edge")
     v = v.reshape(rows, BLOCK_SIDE, columns, BLOCK_SIDE, channels).swapaxes(1, 2)
     return v.reshape(rows, columns, 16, channels)
@@ -287,7 +287,7 @@ def _channels(values: FloatArray, wanted: int) -> None:
 
 def _checked(blocks: UInt8Array, size: int, shape: tuple[int, int]) -> UInt8Array:
     data = np.asarray(blocks)
-    expected = (*blocks_of(shape), size)
+    expected = (*block_grid_shape(shape), size)
     Checks(BlockError).choice("blocks", data.dtype, (np.dtype(np.uint8),))
     Checks(BlockError).shape("blocks", data, expected)
     return data

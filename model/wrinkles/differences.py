@@ -25,7 +25,7 @@ from model.wrinkles.expressions import (
     Table,
     Weights,
     WrinkleError,
-    clamped,
+    clamp_sums,
     zone_sums,
 )
 from model.wrinkles.masks import Masks, mask_stack, zone_strength
@@ -110,14 +110,14 @@ def combine(
     d = wrinkles.from_unit(_normals("difference", given))
     Checks(WrinkleError).within("difference", d)
     stack = mask_stack(masks)
-    sums = clamped(zone_sums(weights, table), clamp)
+    sums = clamp_sums(zone_sums(weights, table), clamp)
     shape = (normals.shape[0], normals.shape[1])
     out = np.empty_like(normals)
-    with kernels.threads_for(shape[0] * shape[1]):
+    with kernels.choose_thread_count(shape[0] * shape[1]):
         kernels.add_difference(
             normals,
-            *wrinkles.widened(np.moveaxis(d, 2, 0), shape, normals.dtype),
-            *wrinkles.widened(zone_strength(stack, sums)[None], shape, normals.dtype),
+            *wrinkles.to_kernel_planes(np.moveaxis(d, 2, 0), shape, normals.dtype),
+            *wrinkles.to_kernel_planes(zone_strength(stack, sums)[None], shape, normals.dtype),
             int(renormalize),
             out,
         )

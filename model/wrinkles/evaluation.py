@@ -27,10 +27,10 @@ from model.wrinkles.expressions import (
     Weights,
     WrinkleError,
     as_table,
-    clamped,
+    clamp_sums,
     zone_sums,
 )
-from model.wrinkles.partial_derivatives import Layer
+from model.wrinkles.partial_derivatives import WrinkleLayer
 
 SCHEMA = "skinrig.wrinkles/1"
 WRINKLE_FILE = "wrinkles.json"
@@ -84,7 +84,7 @@ class WrinkleModel:
     """
 
     base: FloatArray
-    layers: tuple[Layer, ...]
+    layers: tuple[WrinkleLayer, ...]
     clamp: Clamp = "unit"
     valid: BoolArray | None = None
     base_stderr: FloatArray | None = None
@@ -116,14 +116,14 @@ class WrinkleModel:
 
         Examples
         --------
-        >>> layer = Layer(np.full((2, 2, 2), 0.5), np.ones((8, 1, 1)))
+        >>> layer = WrinkleLayer(np.full((2, 2, 2), 0.5), np.ones((8, 1, 1)))
         >>> face = WrinkleModel(np.zeros((4, 4, 2)), (layer,)).evaluate({"anger": 1.0})
         >>> face.zone_weights[0].tolist(), face.clamped_fraction
         ([0.0, 0.0, 0.0, 0.0, 0.8, 0.8, 1.0, 0.0], 1.0)
         """
         assert self.valid is not None  # noqa: S101
         sums = tuple(zone_sums(weights, layer.table) for layer in self.layers)
-        held = tuple(clamped(one, self.clamp) for one in sums)
+        held = tuple(clamp_sums(one, self.clamp) for one in sums)
         normals = wrinkles.combine_layers(self.base, self.layers, weights, clamp=self.clamp)
         normals[~self.valid] = 0.0
         parts = [
@@ -188,7 +188,7 @@ class WrinkleModel:
                 name: tuple(math.inf if value is None else float(value) for value in row)
                 for name, row in given["weight_stderr"].items()
             }
-            base = _named(maps, "wrinkle_base")
+            base = _require_map(maps, "wrinkle_base")
             return cls(
                 base.values[..., :2],
                 layers,
@@ -206,25 +206,25 @@ class WrinkleModel:
 
 
 def _map(
-    derivatives: FloatArray, stderr: FloatArray | None, valid: BoolArray | None, what: str
+    derivatives: FloatArray, stderr: FloatArray | None, valid: BoolArray | None, description: str
 ) -> SkinMap:
     def three(values: FloatArray) -> Float32Array:
         padding = ((0, 0), (0, 0), (0, 1))
         return np.pad(np.asarray(values, np.float32), padding)
 
     error = None if stderr is None else three(stderr)
-    return SkinMap(three(derivatives), "1", error, valid, f"{what}: {DERIVATIVE_FRAME}")
+    return SkinMap(three(derivatives), "1", error, valid, f"{description}: {DERIVATIVE_FRAME}")
 
 
-def _layer(entry: Mapping[str, Any], maps: Mapping[str, SkinMap]) -> Layer:
-    wrinkle = _named(maps, entry["map"])
-    masks = np.stack([_named(maps, name).values for name in entry["masks"]])
+def _layer(entry: Mapping[str, Any], maps: Mapping[str, SkinMap]) -> WrinkleLayer:
+    wrinkle = _require_map(maps, entry["map"])
+    masks = np.stack([_require_map(maps, name).values for name in entry["masks"]])
     table = ExpressionTable(tuple(entry["zones"]), entry["rows"], str(entry["source"]))
     stderr = None if wrinkle.stderr is None else wrinkle.stderr[..., :2]
-    return Layer(wrinkle.values[..., :2], masks, table, stderr, wrinkle.valid)
+    return WrinkleLayer(wrinkle.values[..., :2], masks, table, stderr, wrinkle.valid)
 
 
-def _named(maps: Mapping[str, SkinMap], name: str) -> SkinMap:
+def _require_map(maps: Mapping[str, SkinMap], name: str) -> SkinMap:
     if name not in maps:
         raise WrinkleError(f"{WRINKLE_FILE}: names the map {name!r}, which is not there")
     return maps[name]

@@ -181,12 +181,12 @@ def zone_sums(weights: Weights, table: Table = JIMENEZ2011_TABLE) -> Float64Arra
     return Checks(WrinkleError).numbers("weights (blend shapes by name, or by zone)", sums, ("Z",))
 
 
-def clamped(sums: ArrayLike, clamp: Clamp = "unit") -> Float64Array:
+def clamp_sums(sums: ArrayLike, clamp: Clamp = "unit") -> Float64Array:
     """Return sums held in the range of `ZONE_SUM_LIMITS`; the caller reports where it changes them.
 
     Examples
     --------
-    >>> clamped([-0.6, 0.2, 1.7]).tolist(), clamped([-0.6, 0.2, 1.7], "signed").tolist()
+    >>> clamp_sums([-0.6, 0.2, 1.7]).tolist(), clamp_sums([-0.6, 0.2, 1.7], "signed").tolist()
     ([0.0, 0.2, 1.0], [-0.6, 0.2, 1.0])
     """
     Checks(WrinkleError).choice("clamp", clamp, ZONE_SUM_LIMITS)

@@ -19,7 +19,7 @@ MIN_PARALLEL_PIXELS = 500_000
 
 
 @contextmanager
-def threads_for(pixels: int) -> Iterator[None]:
+def choose_thread_count(pixels: int) -> Iterator[None]:
     """Keep to one thread while few pixels are computed."""
     before = numba.get_num_threads()
     if pixels < MIN_PARALLEL_PIXELS:

@@ -36,7 +36,7 @@ from model.wrinkles.expressions import (
     Table,
     Weights,
     WrinkleError,
-    clamped,
+    clamp_sums,
     zone_sums,
 )
 from model.wrinkles.masks import Masks, mask_stack, real_array, zone_strength
@@ -47,7 +47,7 @@ MAX_DERIVATIVE = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Encoding:
+class EncodedDerivatives:
     """Derivatives with what was lost on the way.
 
     Attributes
@@ -77,7 +77,7 @@ def encode(normals: ArrayLike, *, limit: float | None = MAX_DERIVATIVE) -> Float
         +X right, +Y up, +Z outward, of any positive length.
     limit : float, optional
         Derivatives are clamped to [-limit, limit]; None keeps them as they are. How many were
-        clamped says :func:`encoding_report`, which has masks, and 0 in place of NaN.
+        clamped says :func:`encode_with_report`, which has masks, and 0 in place of NaN.
 
     Returns
     -------
@@ -91,17 +91,19 @@ def encode(normals: ArrayLike, *, limit: float | None = MAX_DERIVATIVE) -> Float
     >>> encode([[0.6, 0.0, 0.8], [0.0, 0.0, -1.0]]).round(9).tolist()
     [[0.75, 0.0], [nan, nan]]
     """
-    report = encoding_report(normals, limit=limit)
+    report = encode_with_report(normals, limit=limit)
     report.derivatives[~report.valid] = np.nan
     return report.derivatives
 
 
-def encoding_report(normals: ArrayLike, *, limit: float | None = MAX_DERIVATIVE) -> Encoding:
+def encode_with_report(
+    normals: ArrayLike, *, limit: float | None = MAX_DERIVATIVE
+) -> EncodedDerivatives:
     """Encode as :func:`encode` does, and say which pixels were clamped or have no derivative.
 
     Examples
     --------
-    >>> report = encoding_report([[0, 0, 1.0], [0.8, 0, 0.6], [0, 0, -1.0]])
+    >>> report = encode_with_report([[0, 0, 1.0], [0.8, 0, 0.6], [0, 0, -1.0]])
     >>> report.derivatives.tolist(), report.clamped_fraction, report.valid.tolist()
     ([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]], 0.5, [True, True, False])
     """
@@ -121,7 +123,7 @@ def encoding_report(normals: ArrayLike, *, limit: float | None = MAX_DERIVATIVE)
     d[~valid] = 0.0
     count = int(np.count_nonzero(valid))
     share = float(np.count_nonzero(beyond)) / count if count else 0.0
-    return Encoding(d, valid, beyond, share)
+    return EncodedDerivatives(d, valid, beyond, share)
 
 
 def decode(derivatives: ArrayLike) -> FloatArray:
@@ -173,7 +175,7 @@ def from_unit(values: ArrayLike, *, limit: float = MAX_DERIVATIVE) -> FloatArray
 
 
 @dataclass(frozen=True, slots=True)
-class Layer:
+class WrinkleLayer:
     """One wrinkle map with its zones, and what expressions ask of them.
 
     Attributes
@@ -262,18 +264,18 @@ def combine(
             f"expected ones that broadcast"
         ) from None
     if not lead:
-        return combine_layers(below, [Layer(above, masks, table)], weights, clamp=clamp)  # type: ignore[arg-type]
+        return combine_layers(below, [WrinkleLayer(above, masks, table)], weights, clamp=clamp)  # type: ignore[arg-type]
     below = np.broadcast_to(below, (*lead, *below.shape[-3:]))
     above = np.broadcast_to(above, (*lead, *above.shape[-3:]))
     out = np.empty((*below.shape[:-1], 3), below.dtype)
     for at in np.ndindex(lead):
-        layer = Layer(above[at], masks, table)  # type: ignore[arg-type]
+        layer = WrinkleLayer(above[at], masks, table)  # type: ignore[arg-type]
         out[at] = combine_layers(below[at], [layer], weights, clamp=clamp)
     return out
 
 
 def combine_layers(
-    base: ArrayLike, layers: Sequence[Layer], weights: Weights, *, clamp: Clamp = "unit"
+    base: ArrayLike, layers: Sequence[WrinkleLayer], weights: Weights, *, clamp: Clamp = "unit"
 ) -> FloatArray:
     """Return the normals of a base map with several wrinkle maps, such as one of a lemon pose.
 
@@ -296,25 +298,25 @@ def combine_layers(
     if not layers:
         return decode(total)
     for last, layer in zip([False] * (len(layers) - 1) + [True], layers, strict=True):
-        strength = zone_strength(layer.masks, clamped(zone_sums(weights, layer.table), clamp))
+        strength = zone_strength(layer.masks, clamp_sums(zone_sums(weights, layer.table), clamp))
         shape = (total.shape[0], total.shape[1])
         parts = (
-            *widened(np.moveaxis(layer.wrinkle, 2, 0), shape, total.dtype),
-            *widened(strength[None], shape, total.dtype),
+            *to_kernel_planes(np.moveaxis(layer.wrinkle, 2, 0), shape, total.dtype),
+            *to_kernel_planes(strength[None], shape, total.dtype),
         )
         if last:
             normals = np.empty((*shape, 3), total.dtype)
-            with kernels.threads_for(shape[0] * shape[1]):
+            with kernels.choose_thread_count(shape[0] * shape[1]):
                 kernels.add_and_normalize(total, *parts, normals)
             return normals
         if total is base or np.shares_memory(total, np.asarray(base)):
             total = total.copy()
-        with kernels.threads_for(shape[0] * shape[1]):
+        with kernels.choose_thread_count(shape[0] * shape[1]):
             kernels.add(total, *parts)
     raise AssertionError("a last layer returns")
 
 
-def widened(planes: FloatArray, shape: tuple[int, int], dtype: Any) -> tuple[Any, ...]:
+def to_kernel_planes(planes: FloatArray, shape: tuple[int, int], dtype: Any) -> tuple[Any, ...]:
     """Return what the kernels read of a texture: planes with the base's columns, rows' taps.
 
     Parameters
@@ -330,8 +332,8 @@ def widened(planes: FloatArray, shape: tuple[int, int], dtype: Any) -> tuple[Any
     C planes (h', W), first texel row (H,) int64 and part of the next (H,)
     """
     rows = min(planes.shape[1], shape[0])
-    wide = resampling.resampled(planes.astype(dtype, copy=False), (rows, shape[1]))
-    first, part = resampling.taps(rows, shape[0])
+    wide = resampling.resample(planes.astype(dtype, copy=False), (rows, shape[1]))
+    first, part = resampling.bilinear_taps(rows, shape[0])
     return (*np.ascontiguousarray(wide, dtype), first, part.astype(dtype))
 
 

@@ -69,7 +69,7 @@ def texture_bytes(shape: tuple[int, int], bytes_per_texel: int, *, in_blocks: bo
     """Return the bytes of one level; blocks of 4 x 4 are whole."""
     h, w = shape
     if in_blocks:
-        rows, columns = blocks.blocks_of(shape)
+        rows, columns = blocks.block_grid_shape(shape)
         h, w = rows * blocks.BLOCK_SIDE, columns * blocks.BLOCK_SIDE
     return h * w * bytes_per_texel
 
@@ -117,7 +117,7 @@ def paper_footprint() -> Footprint:
     return footprint((WRINKLE_SIDE, WRINKLE_SIDE), (MASK_SIDE, MASK_SIDE))
 
 
-def stored_map(derivatives: FloatArray, encoding: MapEncoding) -> FloatArray:
+def round_trip_map(derivatives: FloatArray, encoding: MapEncoding) -> FloatArray:
     """Return derivatives as they come back from a texture.
 
     Parameters
@@ -145,7 +145,7 @@ def stored_map(derivatives: FloatArray, encoding: MapEncoding) -> FloatArray:
     return d.astype(np.float32)
 
 
-def stored_masks(masks: Masks, encoding: MaskEncoding) -> FloatArray:
+def round_trip_masks(masks: Masks, encoding: MaskEncoding) -> FloatArray:
     """Return masks (Z, h, w), float32, as they come back from RGBA textures.
 
     "unit8" and "bc3" hold [0, 1]; the others what their numbers hold.

@@ -56,12 +56,12 @@ def relative_sigma_tr(
     return values, np.stack([by_u, by_v], axis=-1)
 
 
-def all_directions() -> Float64Array:
+def uniform_axial_directions() -> Float64Array:
     """Return directions that go evenly over all axes, rad, (`N_MEAN_DIRECTIONS`,)."""
     return np.asarray(np.arange(N_MEAN_DIRECTIONS) * (np.pi / N_MEAN_DIRECTIONS))
 
 
-def fit(
+def fit_ellipses(
     angle_rad: Float64Array, values: Float64Array, weight: Float64Array, start: HarmonicFit
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Fit ellipses, with the first harmonic as a factor ``1 + a cos theta + b sin theta``.
@@ -87,10 +87,13 @@ def fit(
     """
     count = values.shape[1]
     free = np.column_stack(
-        [np.repeat(start.told[:, None], 3, axis=1), np.repeat(start.odd[:, None], 2, axis=1)]
+        [
+            np.repeat(start.determined[:, None], 3, axis=1),
+            np.repeat(start.has_first_harmonic[:, None], 2, axis=1),
+        ]
     )
-    y, w = values.T, np.where(start.told, weight, 0.0).T
-    mean = np.where(start.told, start.coefficients[:, 0], 1.0)
+    y, w = values.T, np.where(start.determined, weight, 0.0).T
+    mean = np.where(start.determined, start.coefficients[:, 0], 1.0)
     mean = np.where(mean > 0, mean, 1.0)
     axial = -start.coefficients[:, AXIAL_COLUMNS] / mean[:, None]
     size = np.hypot(axial[:, 0], axial[:, 1])
@@ -156,7 +159,7 @@ def _linearized(
 
 def mean_over_directions(parameters: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return sigma_tr averaged over all directions (B,), and its derivatives by l, u, v (B, 3)."""
-    shape, by_uv = relative_sigma_tr(all_directions(), parameters[:, 1:3])
+    shape, by_uv = relative_sigma_tr(uniform_axial_directions(), parameters[:, 1:3])
     size = np.exp(0.5 * parameters[:, 0])
     mean = size * shape.mean(axis=1)
     return mean, np.column_stack([0.5 * mean, size[:, None] * by_uv.mean(axis=1)])

@@ -17,14 +17,14 @@ from scipy import stats
 from reconstruction.arrays import BoolArray, Float64Array, Int64Array
 
 CONSTANT_COLUMNS, ODD_COLUMNS, AXIAL_COLUMNS = slice(0, 1), slice(1, 3), slice(3, 5)
-"""Columns of `design`."""
+"""Columns of `design_matrix`."""
 MIN_DIRECTIONS = 5
 """Different directions without which nothing is said: three are fitted, two show the errors."""
-MIN_ODD_DIRECTIONS = 8
+MIN_FIRST_HARMONIC_DIRECTIONS = 8
 """Different directions from which the first harmonic is fitted, too."""
-MAX_CONDITION = 50.0
+MAX_CONDITION_NUMBER = 50.0
 """Of the design matrix for an axis; directions close together do not tell a harmonic."""
-MAX_ODD_CONDITION = 6.0
+MAX_FIRST_HARMONIC_CONDITION_NUMBER = 6.0
 """Beyond, directions do not go around: the first harmonic would cost more than it tells."""
 OUTLIER_FALSE_ALARM_RATE = 1e-3
 """Chance that a fit loses a good direction as an outlier; no more is added to false alarms."""
@@ -32,7 +32,7 @@ DIRECTIONS_PER_OUTLIER = 8
 """One of so many directions may be left out as an outlier."""
 
 
-def design(angle_rad: Float64Array) -> Float64Array:
+def design_matrix(angle_rad: Float64Array) -> Float64Array:
     """Return the columns ``1, cos theta, sin theta, cos 2 theta, sin 2 theta``, (N, 5)."""
     return np.stack(
         [
@@ -46,7 +46,7 @@ def design(angle_rad: Float64Array) -> Float64Array:
     )
 
 
-def different_directions(angle_rad: Float64Array, used: BoolArray) -> Int64Array:
+def count_distinct_directions(angle_rad: Float64Array, used: BoolArray) -> Int64Array:
     """Return how many different directions of a turn are used, (B,); to a millionth of a turn."""
     turns = np.round(np.mod(angle_rad / math.tau, 1.0) * 1e6).astype(np.int64) % 1_000_000
     same = turns == np.unique(turns)[:, None]
@@ -61,11 +61,11 @@ class HarmonicFit:
     ----------
     coefficients : ndarray, shape (B, 5)
         b0...b4; 0 where not fitted.
-    told, odd : ndarray of bool, shape (B,)
+    determined, has_first_harmonic : ndarray of bool, shape (B,)
         Constant and second harmonic are fitted; the first one is, too.
     residual : ndarray, shape (B,)
         Weighted sum of squared residuals.
-    axial_power, odd_power : ndarray, shape (B,)
+    axial_power, first_harmonic_power : ndarray, shape (B,)
         Weighted sums of squares that the second and the first harmonic explain.
     dof : ndarray of int, shape (B,)
         Degrees of freedom of the residuals; 0 where not told.
@@ -75,16 +75,18 @@ class HarmonicFit:
     """
 
     coefficients: Float64Array
-    told: BoolArray
-    odd: BoolArray
+    determined: BoolArray
+    has_first_harmonic: BoolArray
     residual: Float64Array
     axial_power: Float64Array
-    odd_power: Float64Array
+    first_harmonic_power: Float64Array
     dof: Int64Array
     studentized: Float64Array
 
 
-def fit(angle_rad: Float64Array, values: Float64Array, weight: Float64Array) -> HarmonicFit:
+def fit_harmonics(
+    angle_rad: Float64Array, values: Float64Array, weight: Float64Array
+) -> HarmonicFit:
     """Fit the harmonics that the directions tell.
 
     Parameters
@@ -97,14 +99,14 @@ def fit(angle_rad: Float64Array, values: Float64Array, weight: Float64Array) -> 
     -------
     HarmonicFit
     """
-    x = design(angle_rad)
+    x = design_matrix(angle_rad)
     n, count = values.shape
     used = weight > 0
-    directions = different_directions(angle_rad, used)
+    directions = count_distinct_directions(angle_rad, used)
     told, odd = np.zeros(count, bool), np.zeros(count, bool)
     for chosen, least, most, flag in (
-        ([0, 3, 4], MIN_DIRECTIONS, MAX_CONDITION, told),
-        ([0, 1, 2, 3, 4], MIN_ODD_DIRECTIONS, MAX_ODD_CONDITION, odd),
+        ([0, 3, 4], MIN_DIRECTIONS, MAX_CONDITION_NUMBER, told),
+        ([0, 1, 2, 3, 4], MIN_FIRST_HARMONIC_DIRECTIONS, MAX_FIRST_HARMONIC_CONDITION_NUMBER, odd),
     ):
         # singular values of the design on used directions, whatever their weights
         gram = np.einsum("ni,nb,nj->bij", x[:, chosen], used.astype(float), x[:, chosen])
@@ -149,7 +151,7 @@ def fit(angle_rad: Float64Array, values: Float64Array, weight: Float64Array) -> 
     return HarmonicFit(coefficients, told, odd, residual, axial, first, dof, studentized)
 
 
-def without_outliers(
+def exclude_outliers(
     angle_rad: Float64Array, values: Float64Array, weight: Float64Array
 ) -> tuple[Float64Array, BoolArray]:
     """Return the weights with those of outliers set to 0, and which ones these are, (N, B).
@@ -163,7 +165,7 @@ def without_outliers(
     most = (weight > 0).sum(axis=0) // DIRECTIONS_PER_OUTLIER
     active = np.arange(values.shape[1])
     for number in range(int(most.max(initial=0))):
-        found = fit(angle_rad, values[:, active], kept[:, active])
+        found = fit_harmonics(angle_rad, values[:, active], kept[:, active])
         size = np.abs(found.studentized)
         worst = size.argmax(axis=0)
         here = np.arange(active.size)
@@ -180,13 +182,13 @@ def without_outliers(
     return kept, outlier
 
 
-def log_tail(power: Float64Array, residual: Float64Array, dof: Int64Array) -> Float64Array:
+def log_p_value(power: Float64Array, residual: Float64Array, dof: Int64Array) -> Float64Array:
     """Return log P that two coefficients explain so much, in errors that the residuals tell.
 
     Examples
     --------
     >>> from scipy import stats
-    >>> p = np.exp(log_tail(np.array([6.0]), np.array([11.0]), np.array([11])))
+    >>> p = np.exp(log_p_value(np.array([6.0]), np.array([11.0]), np.array([11])))
     >>> bool(np.isclose(p[0], stats.f.sf(3.0, 2, 11)))
     True
     """

@@ -31,9 +31,9 @@ from reconstruction.anisotropy.direction_harmonics import MIN_DIRECTIONS, Harmon
 from reconstruction.anisotropy.plane_vectors import (
     UNKNOWN_AXIS_RAD,
     axis_stderr,
-    length_and_errors,
+    estimate_length,
     quadratic_form,
-    within_period,
+    wrap_angle,
 )
 from reconstruction.arrays import BoolArray, Float64Array, Int64Array
 
@@ -169,28 +169,30 @@ def estimate(
         angle_rad, sigma_tr_per_mm, stderr_per_mm, valid, errors
     )
     # sums and squares of values at the ends of the range would leave it
-    y, weight, outlier, least, scale, exponent = _near_one(angle, values, stderr, good, outliers)
-    linear = direction_harmonics.fit(angle, y, weight)
-    p, inverse, residual = diffusion_ellipse.fit(angle, y, weight, linear)
+    y, weight, outlier, least, scale, exponent = _normalize_values(
+        angle, values, stderr, good, outliers
+    )
+    linear = direction_harmonics.fit_harmonics(angle, y, weight)
+    p, inverse, residual = diffusion_ellipse.fit_ellipses(angle, y, weight, linear)
     # what rounding leaves is neither a residual nor a harmonic
     rounding = (16 * np.finfo(np.float64).eps) ** 2 * (weight * y * y).sum(axis=0)
     residual = np.maximum(residual, rounding)
-    factor, log_p, log_odd = _chances(linear, residual, least, rounding, errors)
+    factor, log_p, log_odd = _error_scale_and_p_values(linear, residual, least, rounding, errors)
     covariance = inverse * (factor**2)[:, None, None]
     covariance[:, 1:3, 1:3] += log_ratio_error**2 * p[:, 1:3, None] * p[:, None, 1:3]
     with np.errstate(over="ignore"):
         told_chi2 = residual / least / least
     chi2 = linear.dof.astype(np.float64) if stderr_per_mm is None else told_chi2
 
-    h, h_stderr, h_across = length_and_errors(p[:, 1:3], covariance[:, 1:3, 1:3])
+    h, h_stderr, h_across = estimate_length(p[:, 1:3], covariance[:, 1:3, 1:3])
     mean, by_parameter = diffusion_ellipse.mean_over_directions(p[:, :3])
     mean_error = np.sqrt(quadratic_form(by_parameter, covariance[:, :3, :3]))
     with np.errstate(over="ignore"):
         mean, mean_error = (np.ldexp(one * scale, exponent) for one in (mean, mean_error))
-    tilt, tilt_stderr, _ = length_and_errors(p[:, 3:], covariance[:, 3:, 3:])
+    tilt, tilt_stderr, _ = estimate_length(p[:, 3:], covariance[:, 3:, 3:])
     ellipse = p[:, :3].copy()
     ellipse[:, 0] += 2.0 * (np.log(scale) + exponent * math.log(2.0))
-    told, odd = linear.told, linear.odd
+    told, odd = linear.determined, linear.has_first_harmonic
 
     def shaped(found: NDArray[Any], otherwise: float, where: BoolArray = told) -> NDArray[Any]:
         kept = where.reshape(-1, *[1] * (found.ndim - 1))
@@ -199,7 +201,7 @@ def estimate(
     return Anisotropy(
         ratio=shaped(np.exp(h), 1.0),
         ratio_stderr=shaped(np.exp(h) * h_stderr, math.inf),
-        axis_rad=shaped(within_period(0.5 * np.arctan2(p[:, 2], p[:, 1]), math.pi), 0.0),
+        axis_rad=shaped(wrap_angle(0.5 * np.arctan2(p[:, 2], p[:, 1]), math.pi), 0.0),
         axis_stderr_rad=shaped(axis_stderr(h, h_across), UNKNOWN_AXIS_RAD),
         p_value=shaped(np.exp(log_p), 1.0),
         log10_p=shaped(log_p / math.log(10.0), 0.0),
@@ -207,7 +209,7 @@ def estimate(
         mean_stderr_per_mm=shaped(mean_error, math.inf),
         tilt=shaped(tilt, 0.0, odd),
         tilt_stderr=shaped(tilt_stderr, math.inf, odd),
-        tilt_rad=shaped(within_period(np.arctan2(p[:, 4], p[:, 3]), math.tau), 0.0, odd),
+        tilt_rad=shaped(wrap_angle(np.arctan2(p[:, 4], p[:, 3]), math.tau), 0.0, odd),
         tilt_p_value=shaped(np.exp(log_odd), 1.0, odd),
         chi2=shaped(chi2, 0.0),
         dof=linear.dof.reshape(shape),
@@ -221,11 +223,11 @@ def estimate(
     )
 
 
-def _near_one(
+def _normalize_values(
     angle: Float64Array, values: Float64Array, stderr: Float64Array, good: BoolArray, outliers: bool
 ) -> tuple[Float64Array, Float64Array, BoolArray, Float64Array, Float64Array, Int64Array]:
     """Return values about 1 and their weights, outliers, least errors, scale, power of two."""
-    exponent = _far_exponent(np.where(good, values, 0.0).max(axis=0, initial=0.0))
+    exponent = _scaling_exponent(np.where(good, values, 0.0).max(axis=0, initial=0.0))
     with np.errstate(over="ignore"):
         values, stderr = np.ldexp(values, -exponent), np.ldexp(stderr, -exponent)
     scale = np.where(good, values, 0.0).sum(axis=0) / np.maximum(good.sum(axis=0), 1)
@@ -240,17 +242,21 @@ def _near_one(
     weight = np.where(good & (relative <= MAX_ERROR_RATIO * least), (least / relative) ** 2, 0.0)
     outlier = np.zeros(weight.shape, bool)
     if outliers:
-        weight, outlier = direction_harmonics.without_outliers(angle, y, weight)
+        weight, outlier = direction_harmonics.exclude_outliers(angle, y, weight)
         # others beside one far above them were next to nothing of the mean
         kept = np.where(weight > 0, y, 0.0)
-        closer = _far_exponent(kept.max(axis=0, initial=0.0))
+        closer = _scaling_exponent(kept.max(axis=0, initial=0.0))
         y = np.ldexp(np.where(closer == 0, y, kept), -closer)
         least, exponent = np.ldexp(least, -closer), exponent + closer
     return y, weight, outlier, least, scale, exponent
 
 
-def _chances(
-    linear: HarmonicFit, residual: Float64Array, least: Float64Array, rounding: Any, errors: Errors
+def _error_scale_and_p_values(
+    linear: HarmonicFit,
+    residual: Float64Array,
+    min_errors: Float64Array,
+    rounding: Any,
+    errors: Errors,
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return what standard errors are multiplied by, and log P of both harmonics by chance."""
     dof = np.maximum(linear.dof, 1)
@@ -258,13 +264,16 @@ def _chances(
         # as wide as needed to hold 68 % with few degrees of freedom, too
         factor = np.sqrt(residual / dof) * stats.t.ppf(special.ndtr(1.0), dof)
         linear_residual = np.maximum(linear.residual, rounding)
-        log_p = direction_harmonics.log_tail(linear.axial_power, linear_residual, linear.dof)
-        log_odd = direction_harmonics.log_tail(linear.odd_power, linear_residual, linear.dof)
+        log_p = direction_harmonics.log_p_value(linear.axial_power, linear_residual, linear.dof)
+        log_odd = direction_harmonics.log_p_value(
+            linear.first_harmonic_power, linear_residual, linear.dof
+        )
     else:
-        factor = least
+        factor = min_errors
         with np.errstate(over="ignore"):
             log_p, log_odd = (
-                -0.5 * power / least / least for power in (linear.axial_power, linear.odd_power)
+                -0.5 * power / min_errors / min_errors
+                for power in (linear.axial_power, linear.first_harmonic_power)
             )
     return factor, log_p, log_odd
 
@@ -282,7 +291,9 @@ def _checked(
     given = np.asarray(sigma_tr_per_mm, np.float64)
     check.shape("sigma_tr_per_mm", given, (angle.size, *given.shape[1:]))
     check.choice("errors", errors, ("relative", "absolute"))
-    several = direction_harmonics.different_directions(angle, np.ones((angle.size, 1), bool))[0]
+    several = direction_harmonics.count_distinct_directions(angle, np.ones((angle.size, 1), bool))[
+        0
+    ]
     check.within("different directions of angle_rad", several, f"[{MIN_DIRECTIONS}, inf)")
     stderr: Float64Array = np.zeros_like(given)
     if stderr_per_mm is not None:
@@ -303,14 +314,14 @@ def _checked(
     return angle, values, np.where(whole, 1.0, stderr), good, shape
 
 
-def _far_exponent(largest: Float64Array) -> Int64Array:
+def _scaling_exponent(largest: Float64Array) -> Int64Array:
     """Return the power of two of values (B,) far from 1; 0 for those that are not, and for 0."""
     exponent = np.frexp(largest)[1].astype(np.int64)
     return np.where((largest > 0) & (np.abs(exponent) > MAX_EXPONENT), exponent, 0)
 
 
-def _reasons(angle: Float64Array, used: BoolArray, told: BoolArray) -> NDArray[np.str_]:
-    several = direction_harmonics.different_directions(angle, used)
+def _reasons(angle: Float64Array, used: BoolArray, determined: BoolArray) -> NDArray[np.str_]:
+    several = direction_harmonics.count_distinct_directions(angle, used)
     return np.array(
         [
             ""
@@ -318,14 +329,14 @@ def _reasons(angle: Float64Array, used: BoolArray, told: BoolArray) -> NDArray[n
             else f"{n} usable directions, expected {MIN_DIRECTIONS} or more"
             if n < MIN_DIRECTIONS
             else "directions lie too close together to tell an axis"
-            for ok, n in zip(told, several, strict=True)
+            for ok, n in zip(determined, several, strict=True)
         ],
         dtype=np.str_,
     )
 
 
 @dataclass(frozen=True, slots=True)
-class OneDirectionBias:
+class SingleDirectionBias:
     """What a fit along one direction of anisotropic tissue is off from the mean over directions.
 
     Attributes
@@ -345,12 +356,14 @@ class OneDirectionBias:
     rms: Float64Array
 
 
-def one_direction_bias(found: Anisotropy, angle_rad: ArrayLike) -> OneDirectionBias:
+def estimate_single_direction_bias(
+    anisotropy: Anisotropy, angle_rad: ArrayLike
+) -> SingleDirectionBias:
     """Say how far sigma_tr along single directions is from its mean over all directions.
 
     Parameters
     ----------
-    found : Anisotropy
+    anisotropy : Anisotropy
         Where it is not `valid` biases are 0, with infinite standard errors.
     angle_rad : array_like, shape (K,)
         Directions in which the head would be set down, rad.
@@ -369,16 +382,16 @@ def one_direction_bias(found: Anisotropy, angle_rad: ArrayLike) -> OneDirectionB
     >>> from reconstruction.anisotropy.estimation import estimate
     >>> angle = np.deg2rad(np.arange(16) * 22.5)
     >>> found = estimate(angle, np.hypot(np.cos(angle) / 1.2, np.sin(angle)))
-    >>> bias = one_direction_bias(found, [0.0, np.pi / 2])
+    >>> bias = estimate_single_direction_bias(found, [0.0, np.pi / 2])
     >>> bias.bias.round(3).tolist(), round(float(bias.rms), 3)
     ([-0.093, 0.089], 0.064)
     """
     angle = np.atleast_1d(np.asarray(angle_rad, np.float64))
     Checks(AnisotropyError).numbers("angle_rad", angle, ("K",))
-    shape = found.valid.shape
-    valid = found.valid.reshape(-1)
-    p = found.parameters.reshape(-1, 3)
-    covariance = np.where(valid[:, None, None], found.covariance.reshape(-1, 3, 3), 0.0)
+    shape = anisotropy.valid.shape
+    valid = anisotropy.valid.reshape(-1)
+    p = anisotropy.parameters.reshape(-1, 3)
+    covariance = np.where(valid[:, None, None], anisotropy.covariance.reshape(-1, 3, 3), 0.0)
     flat = np.column_stack([np.zeros(len(p)), p[:, 1:]])
     mean, mean_by = diffusion_ellipse.mean_over_directions(flat)
     values, by_uv = diffusion_ellipse.relative_sigma_tr(angle, p[:, 1:])
@@ -389,10 +402,10 @@ def one_direction_bias(found: Anisotropy, angle_rad: ArrayLike) -> OneDirectionB
     )
     variance = np.einsum("bki,bij,bkj->kb", by, covariance[:, 1:, 1:], by)
     h = np.hypot(p[:, 1], p[:, 2])
-    every = diffusion_ellipse.all_directions()
+    every = diffusion_ellipse.uniform_axial_directions()
     around = diffusion_ellipse.relative_sigma_tr(every, p[:, 1:])[0] / mean[:, None]
     stderr = np.where(valid, np.sqrt(np.maximum(variance, 0.0)), math.inf)
-    return OneDirectionBias(
+    return SingleDirectionBias(
         bias=(ratio - 1.0).T.reshape((-1, *shape)),
         stderr=stderr.reshape((-1, *shape)),
         lowest=(np.exp(-0.5 * h) / mean - 1.0).reshape(shape),

@@ -16,7 +16,7 @@ def quadratic_form(vectors: Float64Array, matrices: Float64Array) -> Float64Arra
     return np.maximum(np.einsum("bi,bij,bj->b", vectors, matrices, vectors), 0.0)
 
 
-def length_and_errors(
+def estimate_length(
     pair: Float64Array, covariance: Float64Array
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return the length of vectors, and their standard errors along and across themselves.
@@ -34,7 +34,7 @@ def length_and_errors(
 
     Examples
     --------
-    >>> found = length_and_errors(np.array([[0.0, 5.0]]), np.diag([9.0, 4.0])[None])
+    >>> found = estimate_length(np.array([[0.0, 5.0]]), np.diag([9.0, 4.0])[None])
     >>> [values.tolist() for values in found]
     [[5.0], [2.0], [3.0]]
     """
@@ -49,12 +49,12 @@ def length_and_errors(
     )
 
 
-def within_period(angle: Float64Array, period: float) -> Float64Array:
+def wrap_angle(angle: Float64Array, period: float) -> Float64Array:
     """Return angles within [0, period), in their unit; what rounds up to the period is 0.
 
     Examples
     --------
-    >>> within_period(np.array([-90.0, 450.0, -1e-30]), 360.0).tolist()
+    >>> wrap_angle(np.array([-90.0, 450.0, -1e-30]), 360.0).tolist()
     [270.0, 90.0, 0.0]
     """
     within = np.mod(angle, period)

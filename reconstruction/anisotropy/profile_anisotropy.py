@@ -68,7 +68,7 @@ class ProfileComparison:
     used: BoolArray
 
 
-def compare(
+def compare_profiles(
     readings: Float64Array,
     variance: Float64Array,
     valid: BoolArray,
@@ -169,7 +169,7 @@ def estimate_from_profiles(
 ) -> Anisotropy:
     """Tell ratio and axis of anisotropy from the profiles themselves.
 
-    Each profile is compared with the mean one (:func:`compare`) and asked how much more
+    Each profile is compared with the mean one (:func:`compare_profiles`) and asked how much more
     tissue scatters along its direction, and how well the head coupled. What is wrong with a fibre
     in all directions cancels, and so does coupling: errors are several times smaller than those of
     sigma_tr fitted direction by direction (bench stage "anisotropy").
@@ -236,9 +236,9 @@ def estimate_from_profiles(
     good = good & np.isfinite(profiles) & np.isfinite(of_each)
     check.within("variance", of_each[good], "[0, inf)")
     shape = profiles.shape[1:-1]
-    a = check.spread("sigma_a_per_mm", np.asarray(sigma_a_per_mm, np.float64), shape).reshape(-1)
+    a = check.broadcast("sigma_a_per_mm", np.asarray(sigma_a_per_mm, np.float64), shape).reshape(-1)
     s = np.asarray(sigma_s_prime_per_mm, np.float64)
-    s = check.spread("sigma_s_prime_per_mm", s, shape).reshape(-1)
+    s = check.broadcast("sigma_s_prime_per_mm", s, shape).reshape(-1)
 
     def table(
         absorption: Float64Array, scattering: Float64Array
@@ -247,7 +247,7 @@ def estimate_from_profiles(
         return found.reflectance_per_mm2, found.by_sigma_s_prime
 
     rows = (angle.size, -1, r.size)
-    found = compare(
+    found = compare_profiles(
         profiles.reshape(rows), of_each.reshape(rows), good.reshape(rows), a, s, table, floor=floor
     )
     told = found.valid

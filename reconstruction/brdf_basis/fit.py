@@ -150,7 +150,9 @@ def surface_samples(
     Checks(SampleError).shape("r_d", albedo, (points, channels))
     cos_l = np.einsum("pmc,pc->pm", light, n)
     cos_v = np.einsum("pmc,pc->pm", view, n)
-    through = boundary_kernels.transmitted(np.nan_to_num(cos_l), np.nan_to_num(cos_v), eta)
+    through = boundary_kernels.boundary_transmittance(
+        np.nan_to_num(cos_l), np.nan_to_num(cos_v), eta
+    )
     surface = f - (through[..., None] * albedo[:, None] / np.pi)
     usable = np.all(np.isfinite(surface), axis=-1) & (cos_l >= MIN_SAMPLE_COSINE)
     usable &= cos_v >= MIN_SAMPLE_COSINE
@@ -210,7 +212,7 @@ def fit_weights(
     residual, stderr = fit_points(
         basis.table,
         basis.size,
-        basis.kinship(),
+        basis.cosine_similarity(),
         *(np.ascontiguousarray(array, dtype=np.float32) for array in given),
         np.ascontiguousarray(samples.valid),
         N_REWEIGHTINGS if compress == "cbrt" else 0,
@@ -290,7 +292,9 @@ def reduce(
     mix = np.where(size > 0.0, mix / np.where(size > 0.0, size, 1.0), 1.0 / len(scale))
     found = found * size.T
     gap = shares - found @ mix
-    gram = np.eye(len(scale)) if basis is None else basis.kinship() * np.outer(scale, scale)
+    gram = (
+        np.eye(len(scale)) if basis is None else basis.cosine_similarity() * np.outer(scale, scale)
+    )
     squared = [float(np.einsum("pk,kl,pl->", a, gram, a, optimize=True)) for a in (gap, shares)]
     return found, mix, float(np.sqrt(max(squared[0], 0.0) / squared[1]))
 
@@ -303,8 +307,8 @@ def _factor(model: NMF, data: Float64Array) -> tuple[Float64Array, Float64Array]
     return found, np.asarray(model.components_)
 
 
-def plateau(errors: ArrayLike, *, share: float = PLATEAU_FRACTION) -> int:
-    """Return the rank from which more do not help: within `share` of all that ranks gained.
+def find_plateau_rank(errors: ArrayLike, *, fraction: float = PLATEAU_FRACTION) -> int:
+    """Return the rank from which more do not help: within `fraction` of all that ranks gained.
 
     Parameters
     ----------
@@ -316,15 +320,15 @@ def plateau(errors: ArrayLike, *, share: float = PLATEAU_FRACTION) -> int:
 
     Examples
     --------
-    >>> plateau([1.0, 0.4, 0.15, 0.11, 0.1, 0.1])
+    >>> find_plateau_rank([1.0, 0.4, 0.15, 0.11, 0.1, 0.1])
     4
     """
     error = np.asarray(errors, dtype=np.float64)
     least = float(error.min())
-    return int(np.argmax(error <= least + share * (float(error[0]) - least))) + 1
+    return int(np.argmax(error <= least + fraction * (float(error[0]) - least))) + 1
 
 
-def lit_sphere(
+def render_lit_sphere(
     weights: ArrayLike,
     basis: BrdfBasis,
     *,

@@ -13,7 +13,7 @@ from reconstruction.arrays import Float32Array, Float64Array
 _HALF_PI = 0.5 * math.pi
 
 
-def evaluate(
+def evaluate_mixtures(
     table: Float32Array,
     weights: Float64Array,
     light_dir: Float32Array,

@@ -23,8 +23,8 @@ from reconstruction.brdf_basis.row_kernels import (
     fill_any,
     find_nodes,
     gather_column,
-    pull_of_columns,
-    squares_of_columns,
+    multiply_transpose,
+    weighted_column_norms,
 )
 
 MAX_ACTIVE_COLUMNS = 32
@@ -41,7 +41,7 @@ HUBER_SIGMAS = 3.0
 
 
 @njit(nogil=True)
-def _join(begin, end, column, target, count, gram, rhs):  # type: ignore[no-untyped-def]
+def _extend_normal_equations(begin, end, column, target, count, gram, rhs):  # type: ignore[no-untyped-def]
     """Fill the Gram matrix and the right-hand side of columns ``begin`` to ``end``."""
     for p in range(begin, end):
         for q in range(p + 1):
@@ -77,7 +77,7 @@ def _cholesky(gram, rhs, active, used, low, trial):  # type: ignore[no-untyped-d
 
 
 @njit(nogil=True)
-def _small(gram, rhs, size, norm, x, active, low, trial, refused):  # type: ignore[no-untyped-def]
+def _minimize_active_set(gram, rhs, size, norm, x, active, low, trial, refused):  # type: ignore[no-untyped-def]
     """Minimize x' G x / 2 - rhs' x over x >= 0 by active sets, from the ``x`` given."""
     used = 0
     for p in range(size):
@@ -175,15 +175,17 @@ def _solve(  # type: ignore[no-untyped-def]
         target[i] = root[i] * value[i]
     for p in range(size):
         gather_column(rows, root, working[p], count, column[p])
-    _join(0, size, column, target, count, gram, rhs)
+    _extend_normal_equations(0, size, column, target, count, gram, rhs)
     norm = math.sqrt(dot(target, target, count))
     for step in range(materials + 2):
         # The first round's misfit is that of what the set explains at best
-        _small(gram, rhs, size, 1e-3 * norm if step == 0 else norm, x, active, low, trial, refused)
+        _minimize_active_set(
+            gram, rhs, size, 1e-3 * norm if step == 0 else norm, x, active, low, trial, refused
+        )
         norm = _misfit(column, x, size, target, count, residual)
         for i in range(count):
             force[i] = root[i] * residual[i]
-        pull_of_columns(rows, force, count, pull)
+        multiply_transpose(rows, force, count, pull)
         for p in range(size):
             pull[working[p]] = 0.0
         if size + MAX_JOINING_COLUMNS > MAX_ACTIVE_COLUMNS:
@@ -197,7 +199,7 @@ def _solve(  # type: ignore[no-untyped-def]
             size = kept
             if size + MAX_JOINING_COLUMNS > MAX_ACTIVE_COLUMNS:
                 break
-            _join(0, size, column, target, count, gram, rhs)
+            _extend_normal_equations(0, size, column, target, count, gram, rhs)
         before = size
         for k in range(materials):
             pull[k] = pull[k] / math.sqrt(square[k]) if square[k] > 0.0 else 0.0
@@ -218,12 +220,12 @@ def _solve(  # type: ignore[no-untyped-def]
             size += 1
         if size == before:
             break
-        _join(before, size, column, target, count, gram, rhs)
+        _extend_normal_equations(before, size, column, target, count, gram, rhs)
     return size
 
 
 @njit(nogil=True)
-def _reweigh(value, variance, model, count, weight, scatter):  # type: ignore[no-untyped-def]
+def _update_weights(value, variance, model, count, weight, scatter):  # type: ignore[no-untyped-def]
     """Weigh samples by noise plus a misfit that is even in cube roots; return its new square.
 
     With u the model, a misfit tau of cube roots is 3 u^(2/3) tau of u, so the weight is
@@ -391,8 +393,8 @@ def fit_points(  # type: ignore[no-untyped-def]
             for _ in range(reweightings):
                 for i in range(count):
                     model[i] = y[i] - residual[i] / root[i]
-                scatter = _reweigh(y, var, model, count, weight, scatter)
-                squares_of_columns(rows, weight, count, square)
+                scatter = _update_weights(y, var, model, count, weight, scatter)
+                weighted_column_norms(rows, weight, count, square)
                 size = _solve(
                     rows,
                     y,

@@ -27,10 +27,10 @@ def _angle(c):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp", "nnan"})
-def find_nodes(light, view, normal, picked, count, cos_l, place):  # type: ignore[no-untyped-def]
+def find_nodes(light, view, normal, picked, count, cos_l, node_position):  # type: ignore[no-untyped-def]
     """Fill the cosine of the light and the place on the table's axes of the picked samples."""
     n0, n1, n2 = float64(normal[0]), float64(normal[1]), float64(normal[2])
-    on_d, on_phi, on_h = place[0], place[1], place[2]
+    on_d, on_phi, on_h = node_position[0], node_position[1], node_position[2]
     for j in range(count):
         i = picked[j]
         l0, l1, l2 = float64(light[i, 0]), float64(light[i, 1]), float64(light[i, 2])
@@ -96,7 +96,7 @@ fill_any = _row_filler(0)
 
 
 @njit(nogil=True, fastmath=FAST_MATH)
-def pull_of_columns(rows, force, count, total):  # type: ignore[no-untyped-def]
+def multiply_transpose(rows, force, count, total):  # type: ignore[no-untyped-def]
     """Fill the matrix' transpose times ``force``, in blocks of float32 added up in float64."""
     lanes = rows.shape[1]
     block = np.empty(lanes, dtype=np.float32)
@@ -120,7 +120,7 @@ def pull_of_columns(rows, force, count, total):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, fastmath=FAST_MATH)
-def squares_of_columns(rows, weight, count, total):  # type: ignore[no-untyped-def]
+def weighted_column_norms(rows, weight, count, total):  # type: ignore[no-untyped-def]
     """Fill the weighted square of each column."""
     lanes = rows.shape[1]
     block = np.empty(lanes, dtype=np.float32)

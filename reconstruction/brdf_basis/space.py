@@ -29,7 +29,7 @@ CURVE_RANKS: Final = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16)
 MAX_SWEEPS: Final = 60
 SWEEP_TOL: Final = 1e-7
 """Relative change of what is lowered below which a refinement ends."""
-UNHELD_STRENGTH_RATIO: Final = 8.0
+MAX_STRENGTH_RATIO: Final = 8.0
 """Times the median strength from which on a point's mixture counts as not held down by samples."""
 PLATEAU_FRACTIONS: Final = (0.02, 0.05, 0.1)
 """Shares of the plateau's rule at which it is told."""
@@ -57,7 +57,7 @@ class SpaceCurve:
         The mixtures of each rank, each of sum 1.
     points, held_out_points : int
         How many there were of either.
-    left_out : tuple of (int, str)
+    omitted : tuple of (int, str)
         Ranks that were asked for and not made, with the reason.
     """
 
@@ -68,16 +68,16 @@ class SpaceCurve:
     mixes: tuple[Float64Array, ...]
     points: int
     held_out_points: int
-    left_out: tuple[tuple[int, str], ...]
+    omitted: tuple[tuple[int, str], ...]
 
-    def plateau(
-        self, *, share: float = brdf_basis.PLATEAU_FRACTION, most: int | None = None
+    def plateau_rank(
+        self, *, fraction: float = brdf_basis.PLATEAU_FRACTION, max_rank: int | None = None
     ) -> int:
         """Return the number of mixtures from which on more do not help.
 
-        The first rank whose error exceeds the least one by no more than `share` of the fall from
-        the first rank to the least error (`reconstruction.brdf_basis.plateau`). The answer depends
-        on the share, and on how many ranks are looked at.
+        The first rank whose error exceeds the least one by no more than `fraction` of the fall from
+        the first rank to the least error (`reconstruction.brdf_basis.find_plateau_rank`). The
+        answer depends on the share, and on how many ranks are looked at.
 
         Parameters
         ----------
@@ -86,30 +86,30 @@ class SpaceCurve:
         most
             Look at ranks up to this one only; None: all.
         """
-        among = [k for k, rank in enumerate(self.ranks) if most is None or rank <= most]
+        among = [k for k, rank in enumerate(self.ranks) if max_rank is None or rank <= max_rank]
         if not among:
-            raise SpaceError(f"most: got {most}, expected at least {self.ranks[0]}")
-        return self.ranks[brdf_basis.plateau(self.error[among], share=share) - 1]
+            raise SpaceError(f"most: got {max_rank}, expected at least {self.ranks[0]}")
+        return self.ranks[brdf_basis.find_plateau_rank(self.error[among], fraction=fraction) - 1]
 
     def normalized(self) -> Float64Array:
         """Return the errors over that of the first rank, (R,): several curves on one scale."""
         return self.error / self.error[0] if self.error[0] > 0.0 else np.zeros_like(self.error)
 
 
-def usable(weights: ArrayLike, basis: BrdfBasis) -> BoolArray:
+def is_constrained(weights: ArrayLike, basis: BrdfBasis) -> BoolArray:
     """Return which points' mixtures are held down by their samples, (P,).
 
     A lobe so narrow that no pair of light and view met it can have any share: mixtures of more
-    than `UNHELD_STRENGTH_RATIO` times the median strength, and empty ones, are not used.
+    than `MAX_STRENGTH_RATIO` times the median strength, and empty ones, are not used.
     """
     strength = _checked(weights, basis) @ basis.strength()
     some = strength[strength > 0.0]
     return (strength > 0.0) & (
-        strength < UNHELD_STRENGTH_RATIO * (np.median(some) if len(some) else 0.0)
+        strength < MAX_STRENGTH_RATIO * (np.median(some) if len(some) else 0.0)
     )
 
 
-def curve(
+def compute_error_curve(
     weights: ArrayLike,
     basis: BrdfBasis,
     *,
@@ -163,7 +163,7 @@ def curve(
     if list(ranks) != sorted(set(ranks)) or not len(ranks) or ranks[0] < 1:
         raise SpaceError(f"ranks: got {list(ranks)}, expected growing numbers from 1")
     Checks().choice("method", method, ("shares", "brdf"))
-    gram = metric(basis)
+    gram = brdf_inner_products(basis)
     if not np.any(shares):
         raise SpaceError(f"weights: all {len(shares)} points are 0, none shows how it reflects")
     most = min(shares.shape)
@@ -184,12 +184,14 @@ def curve(
     for rank in made:
         mix = brdf_basis.reduce(shares, rank, basis=basis, seed=seed)[1]
         if method == "brdf":
-            mix = refine(shares, mix, basis)
+            mix = refine_mixtures(shares, mix, basis)
             if mixes and _error(shares, mix, gram) >= errors[-1]:
-                mix = refine(shares, _grown(shares, mixes[-1], rank, gram), basis)
+                mix = refine_mixtures(
+                    shares, _add_worst_points(shares, mixes[-1], rank, gram), basis
+                )
         mixes.append(mix)
         errors.append(_error(shares, mix, gram))
-        found, deviation = _of_groups(others, whose, mix, gram)
+        found, deviation = _jackknife_error(others, whose, mix, gram)
         outside.append(found)
         spread.append(deviation)
     return SpaceCurve(
@@ -204,7 +206,7 @@ def curve(
     )
 
 
-def refine(
+def refine_mixtures(
     weights: ArrayLike, mix: ArrayLike, basis: BrdfBasis, *, sweeps: int = MAX_SWEEPS
 ) -> Float64Array:
     """Lower the BRDFs' error of common mixtures, shares and mixtures in turn.
@@ -232,7 +234,7 @@ def refine(
     so that the error never grows (hierarchical alternating least squares: Cichocki and Phan 2009,
     doi:10.1587/transfun.E92.A.708, there without a metric).
     """
-    shares, gram = _checked(weights, basis), metric(basis)
+    shares, gram = _checked(weights, basis), brdf_inner_products(basis)
     rows = np.array(_checked(mix, basis))
     found = mixture_coordinates(shares, rows, gram)
     last = np.inf
@@ -252,14 +254,14 @@ def refine(
     return np.where(size > 0.0, rows / np.where(size > 0.0, size, 1.0), even)
 
 
-def _descend(values: Float64Array, wanted: Float64Array, square: Float64Array) -> None:
+def _descend(values: Float64Array, target: Float64Array, square: Float64Array) -> None:
     """Lower x A x' - 2 b x' of each row x, one column after the other, in place; x >= 0."""
     for k in np.flatnonzero(np.diag(square) > 0.0):
-        step = (wanted[:, k] - values @ square[:, k]) / square[k, k]
+        step = (target[:, k] - values @ square[:, k]) / square[k, k]
         values[:, k] = np.maximum(values[:, k] + step, 0.0)
 
 
-def repeatability(first: ArrayLike, second: ArrayLike, basis: BrdfBasis) -> float:
+def repeat_distance(first: ArrayLike, second: ArrayLike, basis: BrdfBasis) -> float:
     """Return how far two fits of the same points lie apart, as a part of their BRDFs.
 
     The root of half the squared difference, over the mean square: what noise alone leaves, and
@@ -267,17 +269,17 @@ def repeatability(first: ArrayLike, second: ArrayLike, basis: BrdfBasis) -> floa
     """
     a, b = _checked(first, basis), _checked(second, basis)
     Checks(SpaceError).shape("second", b, a.shape)
-    gram = metric(basis)
+    gram = brdf_inner_products(basis)
     size = 0.5 * (_squares(a, gram).sum() + _squares(b, gram).sum())
     if size == 0.0:
         return float("nan")
     return float(np.sqrt(0.5 * _squares(a - b, gram).sum() / size))
 
 
-def metric(basis: BrdfBasis) -> Float64Array:
+def brdf_inner_products(basis: BrdfBasis) -> Float64Array:
     """Return the products of the materials' BRDFs, (K, K), nodes counting by solid angle."""
     strength = basis.strength()
-    return basis.kinship() * np.outer(strength, strength)
+    return basis.cosine_similarity() * np.outer(strength, strength)
 
 
 def _checked(weights: ArrayLike, basis: BrdfBasis) -> Float64Array:
@@ -294,7 +296,9 @@ def _error(shares: Float64Array, mix: Float64Array, gram: Float64Array) -> float
     return float(np.sqrt(_squares(gap, gram).sum() / _squares(shares, gram).sum()))
 
 
-def _grown(shares: Float64Array, mix: Float64Array, rank: int, gram: Float64Array) -> Float64Array:
+def _add_worst_points(
+    shares: Float64Array, mix: Float64Array, rank: int, gram: Float64Array
+) -> Float64Array:
     """Add the points that mixtures make worst, one after the other, until there are enough."""
     while len(mix) < rank:
         gap = shares - mixture_coordinates(shares, mix, gram) @ mix
@@ -303,14 +307,14 @@ def _grown(shares: Float64Array, mix: Float64Array, rank: int, gram: Float64Arra
     return mix
 
 
-def _of_groups(
-    shares: Float64Array, whose: NDArray[np.generic], mix: Float64Array, gram: Float64Array
+def _jackknife_error(
+    shares: Float64Array, groups: NDArray[np.generic], mix: Float64Array, gram: Float64Array
 ) -> tuple[float, float]:
     """Return the error of points and its standard error by leaving out one group after another."""
     if not np.any(shares):
         return float("nan"), float("nan")
     gap = shares - mixture_coordinates(shares, mix, gram) @ mix
-    _, group = np.unique(whose, return_inverse=True)
+    _, group = np.unique(groups, return_inverse=True)
     lost = np.bincount(group, _squares(gap, gram))
     all_of = np.bincount(group, _squares(shares, gram))
     count = len(lost)

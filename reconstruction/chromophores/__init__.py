@@ -3,10 +3,10 @@
 from reconstruction.chromophores.inversion import (
     ChromophoreMaps,
     Identifiability,
-    identifiability,
+    add_brightness_variance,
+    compute_identifiability,
     invert,
     model_covariance,
-    without_brightness,
 )
 from reconstruction.chromophores.pixel_checks import ChromophoreError
 
@@ -14,8 +14,8 @@ __all__ = [
     "ChromophoreError",
     "ChromophoreMaps",
     "Identifiability",
-    "identifiability",
+    "add_brightness_variance",
+    "compute_identifiability",
     "invert",
     "model_covariance",
-    "without_brightness",
 ]

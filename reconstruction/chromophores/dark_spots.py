@@ -24,9 +24,9 @@ from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float32Array
 from reconstruction.chromophores.pixel_checks import (
     ChromophoreError,
-    broadcast,
-    checked_mask,
-    usable_colors,
+    broadcast_to_pixels,
+    check_mask,
+    is_usable_color,
 )
 from reconstruction.chromophores.posterior import ChromophorePosterior
 
@@ -81,10 +81,10 @@ def is_locally_dark(
     got = f"shape {light.shape}"
     check = Checks(ChromophoreError)
     check.require(light.ndim == 3 and light.shape[-1], "colors", got, "(rows, columns, 3)")
-    good = usable_colors(light)
+    good = is_usable_color(light)
     if valid is not None:
-        good &= checked_mask(valid, good.shape)
-    whole = None if variance is None else broadcast("variance", variance, light.shape)
+        good &= check_mask(valid, good.shape)
+    whole = None if variance is None else broadcast_to_pixels("variance", variance, light.shape)
     log_light = np.full(good.shape, np.nan, dtype=np.float32)
     least = np.full(good.shape, MIN_LOG_CONTRAST, dtype=np.float32)
     for start in range(0, len(good), _BAND_ROWS):  # copies of a whole picture need gigabytes
@@ -127,7 +127,7 @@ def is_lighter_than_face_prior(
 
 
 def average_hypotheses(
-    by_face: ChromophorePosterior, alone: ChromophorePosterior, where: ArrayLike
+    by_face: ChromophorePosterior, alone: ChromophorePosterior, equally_likely: ArrayLike
 ) -> ChromophorePosterior:
     """Return estimates that hold both of two explanations, where they are equally probable.
 
@@ -149,7 +149,7 @@ def average_hypotheses(
     reconstruction.chromophores.ChromophoreError
         When shapes differ.
     """
-    doubtful = np.asarray(where, dtype=np.bool_)
+    doubtful = np.asarray(equally_likely, dtype=np.bool_)
     for estimate in (by_face, alone):
         Checks(ChromophoreError).shape("where", doubtful, estimate.melanin.shape)
     mixed = {}

@@ -20,17 +20,21 @@ from reconstruction.chromophores import dark_spots, shading_prior
 from reconstruction.chromophores import face_kernels as kernels
 from reconstruction.chromophores import model_error as color_errors
 from reconstruction.chromophores import posterior as chromophore_posterior
-from reconstruction.chromophores.face_distribution import FaceDistribution, fit, with_common_errors
-from reconstruction.chromophores.inversion import without_brightness
+from reconstruction.chromophores.face_distribution import (
+    FaceDistribution,
+    add_systematic_errors,
+    fit_distribution,
+)
+from reconstruction.chromophores.inversion import add_brightness_variance
 from reconstruction.chromophores.pixel_checks import (
     ChromophoreError,
-    broadcast,
-    colors_of,
-    usable_colors,
+    broadcast_to_pixels,
+    check_colors,
+    is_usable_color,
 )
 from reconstruction.chromophores.posterior import ChromophorePosterior
 from reconstruction.chromophores.shading_prior import ShadingPrior
-from reconstruction.chromophores.start import MIN_AXIS_FRACTION, evaluate
+from reconstruction.chromophores.start import MIN_AXIS_FRACTION, evaluate_table
 
 N_SAMPLE_PIXELS: Final = 1500
 """Evenly spread over the face: its mean is known to a thirtieth of its spread by them, less than
@@ -91,13 +95,14 @@ def fit_face_distribution(
     Examples
     --------
     >>> from model import color_table
-    >>> from reconstruction.chromophores.shading_prior import lognormal
+    >>> from reconstruction.chromophores.shading_prior import lognormal_prior
     >>> rng = np.random.default_rng(0)
     >>> table = color_table.build("Nikon 5100 (NPL)", "D65")
     >>> melanin = 0.05 * np.exp(0.15 * rng.standard_normal(1000))
     >>> light = 0.7 * np.exp(0.3 * rng.standard_normal((1000, 1)))
     >>> seen = light * table.lookup(melanin, 0.02) * (1 + 3e-3 * rng.standard_normal((1000, 3)))
-    >>> found = fit_face_distribution(seen, table, prior=lognormal(0.7, 0.3), common_light=0.1,
+    >>> prior = lognormal_prior(0.7, 0.3)
+    >>> found = fit_face_distribution(seen, table, prior=prior, common_light=0.1,
     ...                   variance=(3e-3 * seen) ** 2).melanin
     >>> bool(abs(np.exp(found.mean) - 0.05) < 0.003), bool(0.1 < found.spread < 0.2)
     (True, True)
@@ -123,7 +128,7 @@ def fit_face_distribution(
     blood = (np.arange(N_BLOOD_NODES) + 0.5) * (1.0 - MIN_AXIS_FRACTION) / N_BLOOD_NODES
     blood += MIN_AXIS_FRACTION
     axis = np.cbrt(np.exp(log_melanin) / table.c_m_max)
-    plane = np.log(evaluate(table, *np.meshgrid(axis, blood, indexing="ij"))[0])
+    plane = np.log(evaluate_table(table, *np.meshgrid(axis, blood, indexing="ij"))[0])
 
     places = log_melanin, blood.reshape(-1, _N_BLOOD_NODES_SUMMED).mean(axis=1)
     ends = melanin_ends, (MIN_AXIS_FRACTION, 1.0)
@@ -136,14 +141,14 @@ def fit_face_distribution(
         seen = np.log(colors) + color, weights, mean, plane
         by_light = cost, prior.low + light, prior.step
         kernels.plane_probability(*seen, *by_light, _N_BLOOD_NODES_SUMMED, probability)
-        return fit(probability, places, ends, begin=begin)
+        return fit_distribution(probability, places, ends, initial=begin)
 
     still = np.zeros(3)
     usual = fitted(0.0, still)
     moved = [(fitted(-common_light, still, usual), fitted(common_light, still, usual))]
-    for color in _independent(common_color):
+    for color in _covariance_factors(common_color):
         moved.append((fitted(0.0, -color, usual), fitted(0.0, color, usual)))
-    return with_common_errors(usual, moved)
+    return add_systematic_errors(usual, moved)
 
 
 def fit_with_white_reference(
@@ -164,9 +169,9 @@ def fit_with_white_reference(
     return fit_face_distribution(
         rgb,
         table,
-        prior=shading_prior.of_faces(softness=shading_prior.MIN_SOFTNESS),
+        prior=shading_prior.face_prior(softness=shading_prior.MIN_SOFTNESS),
         common_light=shading_prior.LOG_SHADING_SOFTNESS,
-        common_color=color_errors.color_errors().transport,
+        common_color=color_errors.load_error_terms().transport,
         variance=variance,
         model_error=model_error,
     )
@@ -227,8 +232,8 @@ def _sampled(
     valid: ArrayLike | None,
 ) -> tuple[Float32Array, Float64Array, Float64Array]:
     """Return colors (n, 3), noise (n, 3) and model errors (n, 3, 3) or (3, 3) of some pixels."""
-    colors = colors_of(rgb)
-    good = usable_colors(colors)
+    colors = check_colors(rgb)
+    good = is_usable_color(colors)
     if valid is not None:
         good &= np.asarray(valid, dtype=np.bool_)
     places = np.flatnonzero(good)
@@ -237,7 +242,7 @@ def _sampled(
     chosen = colors.reshape(-1, 3)[places]
     noise = np.square(0.01 * chosen.astype(np.float64))
     if variance is not None:
-        whole = broadcast("variance", variance, colors.shape)
+        whole = broadcast_to_pixels("variance", variance, colors.shape)
         noise = whole.reshape(-1, 3)[places].astype(np.float64)
     errors = np.zeros((3, 3)) if model_error is None else np.asarray(model_error, np.float64)
     Checks(ChromophoreError).shape("model_error", errors, (3, 3), (*colors.shape, 3))
@@ -247,14 +252,14 @@ def _sampled(
 def _weights(relative: Float64Array, errors: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return weights of color, brightness projected out, and those of the mean that tells light."""
     total = (relative + MIN_COLOR_ERROR**2)[:, :, None] * np.eye(3) + errors
-    weights = np.linalg.inv(without_brightness(total))
+    weights = np.linalg.inv(add_brightness_variance(total))
     row = weights.sum(axis=-1)
     whole = row.sum(axis=-1)
     weights -= row[:, :, None] * row[:, None, :] / whole[:, None, None]
     return np.ascontiguousarray(weights), np.ascontiguousarray(row / whole[:, None])
 
 
-def _independent(covariance: ArrayLike | None) -> list[Float64Array]:
+def _covariance_factors(covariance: ArrayLike | None) -> list[Float64Array]:
     """Return vectors whose outer products sum up to a covariance."""
     if covariance is None:
         return []

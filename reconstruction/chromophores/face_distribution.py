@@ -29,8 +29,8 @@ from reconstruction.arrays import Float32Array, Float64Array, FloatArray
 
 MIN_CONTAMINATION: Final = 0.01
 """Least part of the skin that follows no distribution at all, as of the light
-(`reconstruction.chromophores.shading_prior.UNEXPECTED_PROBABILITY`): moles and lips are not pulled
-to the face's mean."""
+(`reconstruction.chromophores.shading_prior.CONTAMINATION_PROBABILITY`): moles and lips are not
+pulled to the face's mean."""
 MAX_CONTAMINATION: Final = 0.5
 MIN_SIGMAS: Final = (0.02, 0.05)
 """Least standard deviations of log melanin, below which no colors tell it, and of blood's cube
@@ -41,7 +41,7 @@ _START_SIGMAS: Final = (0.3, 0.1)
 _SEARCH_SCALE: Final = np.array([0.1, 0.3, 0.5, 0.03, 0.3, 0.5])
 """Of means, logs of spreads and of parts: what the search takes for one."""
 _DIFFERENCE_STEP: Final = 1e-5
-END_DISTANCE: Final = 0.02
+MIN_LIMIT_DISTANCE: Final = 0.02
 """Distance from an end, of log melanin and of blood's axis, within which a mean is held by it: the
 last place that a mean may have lies up to 0.016 before the end."""
 _MAX_ROUNDS: Final = 60
@@ -52,9 +52,9 @@ class ContaminatedNormal:
     """A normal distribution over part of the skin, and any value alike over the rest."""
 
     mean: float
-    spread: float
+    sd: float
     """Standard deviation, without what is not known of the mean."""
-    unexpected: float
+    contamination: float
     """Part of the skin that may have any value, 0 to 1."""
     low: float
     high: float
@@ -65,18 +65,18 @@ class ContaminatedNormal:
     def __post_init__(self) -> None:
         """Refuse what is no distribution."""
         check = Checks()
-        check.settings(self, mean=FINITE, spread="(0, inf)", unexpected="(0, 1]", low=FINITE)
+        check.settings(self, mean=FINITE, spread="(0, inf)", contamination="(0, 1]", low=FINITE)
         check.settings(self, high=f"({self.low}, inf)", stderr="[0, inf)")
 
     @property
-    def width(self) -> float:
+    def total_sd(self) -> float:
         """Standard deviation of one pixel's value from the mean, whose error is part of it."""
-        return math.hypot(self.spread, self.stderr)
+        return math.hypot(self.sd, self.stderr)
 
     @property
-    def height(self) -> float:
+    def peak_density(self) -> float:
         """Density of the normal part at its mean, over that of any value alike."""
-        width = self.width
+        width = self.total_sd
         inside = ndtr((self.high - self.mean) / width) - ndtr((self.low - self.mean) / width)
         whole = math.sqrt(2.0 * math.pi) * width * max(float(inside), 1e-12)
         return (self.high - self.low) / whole
@@ -91,18 +91,18 @@ class ContaminatedNormal:
         >>> round(float(bell.relative_density(at).mean()), 2), round(bell.height, 3)
         (1.0, 7.979)
         """
-        bell = self.height * np.exp(-0.5 * np.square((at - self.mean) / self.width))
-        return np.asarray((1.0 - self.unexpected) * bell + self.unexpected)
+        bell = self.peak_density * np.exp(-0.5 * np.square((at - self.mean) / self.total_sd))
+        return np.asarray((1.0 - self.contamination) * bell + self.contamination)
 
-    def of_cells(self, edges: Float64Array) -> Float64Array:
+    def cell_densities(self, edges: Float64Array) -> Float64Array:
         """Return the means of `relative_density` between ascending edges (n + 1,), shape (n,).
 
         A cell may be wider than the bell.
         """
-        below = ndtr((edges - self.mean) / self.width)
-        whole = self.height * math.sqrt(2.0 * math.pi) * self.width
+        below = ndtr((edges - self.mean) / self.total_sd)
+        whole = self.peak_density * math.sqrt(2.0 * math.pi) * self.total_sd
         bell = whole * np.diff(below) / np.diff(edges)
-        return np.asarray((1.0 - self.unexpected) * bell + self.unexpected)
+        return np.asarray((1.0 - self.contamination) * bell + self.contamination)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,12 +115,16 @@ class FaceDistribution:
     """Of the cube root of the volume fraction in the dermis, as a part of the table's end."""
 
 
-Places = tuple[Float64Array, Float64Array]
-Ends = tuple[tuple[float, float], tuple[float, float]]
+AxisPositions = tuple[Float64Array, Float64Array]
+AxisLimits = tuple[tuple[float, float], tuple[float, float]]
 
 
-def fit(
-    probability: FloatArray, places: Places, ends: Ends, *, begin: FaceDistribution | None = None
+def fit_distribution(
+    probability: FloatArray,
+    positions: AxisPositions,
+    ends: AxisLimits,
+    *,
+    initial: FaceDistribution | None = None,
 ) -> FaceDistribution:
     """Return the distribution under which the colors of many pixels are the most probable.
 
@@ -138,7 +142,7 @@ def fit(
     Returns
     -------
     FaceDistribution
-        The means' standard errors are 0, see `with_common_errors`.
+        The means' standard errors are 0, see `add_systematic_errors`.
 
     Raises
     ------
@@ -153,20 +157,20 @@ def fit(
     >>> of_melanin = np.exp(-0.5 * ((melanin[:, None] - seen) / 0.3) ** 2)
     >>> of_blood = np.exp(-0.5 * ((blood - 0.4) / 0.1) ** 2)
     >>> ends = (-9.0, -0.7), (0.04, 1.0)
-    >>> found = fit(of_melanin * of_blood, (melanin, blood), ends).melanin
+    >>> found = fit_distribution(of_melanin * of_blood, (melanin, blood), ends).melanin
     >>> bool(abs(found.mean + 3.0) < 0.03), bool(abs(found.spread - 0.2) < 0.03)
     (True, True)
     """
-    Checks().shape("probability", probability, ("pixels", places[0].size, places[1].size))
+    Checks().shape("probability", probability, ("pixels", positions[0].size, positions[1].size))
     flat = probability.reshape(len(probability), -1)
     total = flat.sum(axis=1, dtype=np.float64)
     Checks().within("sum of each pixel's probability", total, "(0, inf)")
-    search = _Search((flat / total[:, None]).astype(np.float32), places, ends)
-    bells = search.start() if begin is None else (begin.melanin, begin.blood)
-    start = [(bell.mean, math.log(bell.spread), math.log(bell.unexpected)) for bell in bells]
+    search = _Search((flat / total[:, None]).astype(np.float32), positions, ends)
+    bells = search.start() if initial is None else (initial.melanin, initial.blood)
+    start = [(bell.mean, math.log(bell.sd), math.log(bell.contamination)) for bell in bells]
     parts = math.log(MIN_CONTAMINATION), math.log(MAX_CONTAMINATION)
     bounds = []
-    for at, least, most in zip(places, MIN_SIGMAS, MAX_SIGMAS, strict=True):
+    for at, least, most in zip(positions, MIN_SIGMAS, MAX_SIGMAS, strict=True):
         bounds += [(at[0], at[-1]), (math.log(least), math.log(most)), parts]
     low, high = np.array(bounds).T / _SEARCH_SCALE
     found = minimize(
@@ -177,10 +181,10 @@ def fit(
         bounds=np.stack([low, high], axis=1),
         options={"maxiter": _MAX_ROUNDS, "ftol": 1e-7, "gtol": 1e-5},
     )
-    return FaceDistribution(*search.bells(found.x))
+    return FaceDistribution(*search.distributions(found.x))
 
 
-Bells = tuple[ContaminatedNormal, ContaminatedNormal]
+NormalPair = tuple[ContaminatedNormal, ContaminatedNormal]
 
 
 class _Search:
@@ -189,7 +193,7 @@ class _Search:
     Of six unknowns over `_SEARCH_SCALE`: means, logs of spreads and of parts.
     """
 
-    def __init__(self, share: Float32Array, places: Places, ends: Ends) -> None:
+    def __init__(self, share: Float32Array, places: AxisPositions, ends: AxisLimits) -> None:
         self.share, self.places, self.ends = share, places, ends
         self.shape = places[0].size, places[1].size
         self.edges = [
@@ -197,7 +201,7 @@ class _Search:
             for at in places
         ]
 
-    def start(self) -> Bells:
+    def start(self) -> NormalPair:
         """Return where to begin when nothing is known."""
         usual = self.share.mean(axis=0, dtype=np.float64).reshape(self.shape)
         melanin = float(usual.sum(axis=1) @ self.places[0])
@@ -207,7 +211,7 @@ class _Search:
             ContaminatedNormal(blood, _START_SIGMAS[1], 0.1, *self.ends[1]),
         )
 
-    def bells(self, unknowns: Float64Array) -> Bells:
+    def distributions(self, unknowns: Float64Array) -> NormalPair:
         unknowns = unknowns * _SEARCH_SCALE
         first, second = (
             ContaminatedNormal(float(mean), math.exp(spread), math.exp(part), *ends)
@@ -216,8 +220,8 @@ class _Search:
         return first, second
 
     def densities(self, unknowns: Float64Array) -> tuple[Float64Array, Float64Array]:
-        first, second = self.bells(unknowns)
-        return first.of_cells(self.edges[0]), second.of_cells(self.edges[1])
+        first, second = self.distributions(unknowns)
+        return first.cell_densities(self.edges[0]), second.cell_densities(self.edges[1])
 
     def misfit(self, unknowns: Float64Array) -> tuple[float, Float64Array]:
         """Return -log likelihood of a pixel on the mean, and its gradient."""
@@ -234,7 +238,7 @@ class _Search:
         return -float(np.log(each).mean()), -gradient / len(self.share)
 
 
-def with_common_errors(
+def add_systematic_errors(
     usual: FaceDistribution, moved: Sequence[tuple[FaceDistribution, FaceDistribution]]
 ) -> FaceDistribution:
     """Return the distribution with its means' standard errors, and any blood where none is told.
@@ -252,7 +256,8 @@ def with_common_errors(
     >>> def face(mean):
     ...     blood = ContaminatedNormal(0.4, 0.1, 0.01, 0.0, 1.0)
     ...     return FaceDistribution(ContaminatedNormal(mean, 0.3, 0.01, -9.0, -0.7), blood)
-    >>> known = with_common_errors(face(-3.0), [(face(-3.4), face(-2.6)), (face(-3.3), face(-2.7))])
+    >>> known = add_systematic_errors(face(-3.0), [(face(-3.4), face(-2.6)), (face(-3.3),
+    ...     face(-2.7))])
     >>> round(known.melanin.stderr, 6), known.blood.stderr
     (0.5, 0.0)
     """
@@ -260,18 +265,18 @@ def with_common_errors(
     def with_error(name: str) -> ContaminatedNormal:
         own = getattr(usual, name)
         means = [(getattr(minus, name).mean, getattr(plus, name).mean) for minus, plus in moved]
-        return replace(own, stderr=math.sqrt(sum(_moves_by(own, *pair) ** 2 for pair in means)))
+        return replace(own, stderr=math.sqrt(sum(_mean_shift(own, *pair) ** 2 for pair in means)))
 
     blood = with_error("blood")
-    if blood.mean - blood.low < END_DISTANCE:
-        blood = replace(blood, unexpected=1.0)
+    if blood.mean - blood.low < MIN_LIMIT_DISTANCE:
+        blood = replace(blood, contamination=1.0)
     return FaceDistribution(with_error("melanin"), blood)
 
 
-def _moves_by(usual: ContaminatedNormal, minus: float, plus: float) -> float:
+def _mean_shift(usual: ContaminatedNormal, minus: float, plus: float) -> float:
     """Return by how much a mean moves with one standard error of what moved it to both sides."""
     held = any(
-        min(mean - usual.low, usual.high - mean) < END_DISTANCE
+        min(mean - usual.low, usual.high - mean) < MIN_LIMIT_DISTANCE
         for mean in (minus, usual.mean, plus)
     )
     if held:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import float32, float64, int64, njit, prange, void
 
-from reconstruction.compiled import OVER_PIXELS, given
+from reconstruction.compiled import PIXEL_KERNEL_OPTIONS, readonly_array_type
 
 NEGLIGIBLE_DEVIANCE = 36.0
 """-2 log p above the pixel's lowest from which on probability is left out."""
@@ -13,17 +13,21 @@ NEGLIGIBLE_DEVIANCE = 36.0
 
 @njit(
     void(
-        given(float64, 2),  # log rgb (n, 3)
-        given(float64, 3),  # weights of its errors, brightness projected out (n, 3, 3)
-        given(float64, 2),  # weights of its mean that tells shading (n, 3), their sum is 1
-        given(float64, 3),  # log color of the plane (m, b, 3)
-        given(float64, 1),  # -2 log probability of log shading
+        readonly_array_type(float64, 2),  # log rgb (n, 3)
+        readonly_array_type(
+            float64, 3
+        ),  # weights of its errors, brightness projected out (n, 3, 3)
+        readonly_array_type(
+            float64, 2
+        ),  # weights of its mean that tells shading (n, 3), their sum is 1
+        readonly_array_type(float64, 3),  # log color of the plane (m, b, 3)
+        readonly_array_type(float64, 1),  # -2 log probability of log shading
         float64,  # log shading at the first node of it
         float64,  # and its step
         int64,  # places in blood that are summed
         float32[:, :, ::1],  # probability (n, m, b / summed), 0 before
     ),
-    **OVER_PIXELS,
+    **PIXEL_KERNEL_OPTIONS,
 )
 def plane_probability(  # type: ignore[no-untyped-def]
     log_rgb, weights, mean, plane, prior, prior_low, prior_step, summed, probability

@@ -17,11 +17,16 @@ from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import inversion_kernels as kernels
 from reconstruction.chromophores.pixel_checks import (
     ChromophoreError,
-    broadcast,
-    checked_mask,
-    colors_of,
+    broadcast_to_pixels,
+    check_colors,
+    check_mask,
 )
-from reconstruction.chromophores.start import MIN_AXIS_FRACTION, Start, evaluate, start_for
+from reconstruction.chromophores.start import (
+    MIN_AXIS_FRACTION,
+    InverseColorTable,
+    evaluate_table,
+    inverse_table_for,
+)
 
 Shading = Literal["known"] | ArrayLike | None
 
@@ -141,15 +146,15 @@ def invert(
     >>> [f"{value:.3f}" for value in maps.shading[0]]
     ['0.800', '0.800']
     """
-    colors = colors_of(rgb)
+    colors = check_colors(rgb)
     shape = colors.shape[:-1]
     free, known = _shading(shading, shape)
     pixels = int(np.prod(shape, dtype=np.int64))
     maps = np.empty((len(kernels.INVERSION_MAPS), pixels), dtype=np.float32)
     masks = np.empty((len(kernels.INVERSION_MASKS), pixels), dtype=np.bool_)
     covariance = model_covariance(model_error, variance is None)
-    covariance = without_brightness(covariance) if free else covariance
-    start = start_for(table, free)
+    covariance = add_brightness_variance(covariance) if free else covariance
+    start = inverse_table_for(table, free)
     brightest = np.inf if shading_max is None else shading_max
     Checks(ChromophoreError).within("shading_max", brightest, "(0, inf]")
     kernels.fit_pixels(
@@ -202,7 +207,7 @@ class Identifiability:
         return np.asarray((self.stderr_hemoglobin <= MAX_IDENTIFIABLE_STDERR) & ~self.ambiguous)
 
 
-def identifiability(
+def compute_identifiability(
     table: ColorTable,
     *,
     shading: Literal["known"] | float | None = None,
@@ -235,7 +240,8 @@ def identifiability(
     Examples
     --------
     >>> from model import color_table
-    >>> bounds = identifiability(color_table.build("Nikon 5100 (NPL)", "D65"), shading="known")
+    >>> bounds = compute_identifiability(color_table.build("Nikon 5100 (NPL)", "D65"),
+    ...     shading="known")
     >>> darker = np.searchsorted(bounds.c_m, 0.1), np.searchsorted(bounds.c_hd, 0.02)
     >>> bool(bounds.stderr_melanin[darker] < 0.1), bool(bounds.hemoglobin_identifiable[darker])
     (True, False)
@@ -244,14 +250,14 @@ def identifiability(
     level = shading if isinstance(shading, int | float) else 1.0
     fraction = np.linspace(MIN_AXIS_FRACTION, 1.0, size)
     a, b = np.meshgrid(fraction, fraction, indexing="ij")
-    color, by_a, by_b = evaluate(table, a, b)
+    color, by_a, by_b = evaluate_table(table, a, b)
     seen = level * color
     noise = variance(seen) if callable(variance) else variance
     noise = np.zeros(3) if noise is None else np.asarray(noise, dtype=np.float64)
     covariance = model_covariance(model_error, variance is None)
     weights = _weights(
         np.broadcast_to(noise, seen.shape) / seen**2,
-        without_brightness(covariance) if shading is None else covariance,
+        add_brightness_variance(covariance) if shading is None else covariance,
         free=shading is None,
     )
     gradient = np.stack([by_a / color, by_b / color], axis=-1)
@@ -260,7 +266,7 @@ def identifiability(
     det = np.maximum(aa * bb - ab**2, 1e-12 * aa * bb)
     ambiguous = np.zeros(a.shape, dtype=np.bool_)
     if shading is None:
-        ambiguous = _second_solution(start_for(table, True), color, gradient)
+        ambiguous = _second_solution(inverse_table_for(table, True), color, gradient)
     return Identifiability(
         c_m=table.c_m_max * fraction**3,
         c_hd=table.c_hd_max * fraction**3,
@@ -295,7 +301,7 @@ def model_covariance(model_error: ArrayLike | None, default_noise: bool) -> Floa
     return np.asarray(covariance + floor * np.eye(3))
 
 
-def without_brightness(covariance: Float64Array) -> Float64Array:
+def add_brightness_variance(covariance: Float64Array) -> Float64Array:
     """Add an error common to the channels to a covariance whose weights will leave it out anyway.
 
     A covariance of colors without brightness has none, and its inverse would lose all digits.
@@ -322,7 +328,9 @@ def _weights(
     return np.asarray(weights)
 
 
-def _second_solution(start: Start, color: Float64Array, gradient: Float64Array) -> BoolArray:
+def _second_solution(
+    start: InverseColorTable, color: Float64Array, gradient: Float64Array
+) -> BoolArray:
     """Return where skin seen with a shading of 1 has its color from other chromophores too."""
     log_color = np.log(color)
     place = np.rint(log_color @ start.projection[:, :3].T + start.projection[:, 3])
@@ -339,7 +347,7 @@ def _shading(shading: Shading, shape: tuple[int, ...]) -> tuple[bool, Float32Arr
         return shading is None, np.ones(1, dtype=np.float32)
     known = np.asarray(shading, dtype=np.float32)
     if known.ndim:
-        known = broadcast("shading", known, shape)
+        known = broadcast_to_pixels("shading", known, shape)
     return False, np.ascontiguousarray(known).reshape(-1)
 
 
@@ -347,11 +355,11 @@ def _variance(variance: ArrayLike | None, shape: tuple[int, ...]) -> Float32Arra
     """Return the variance of each pixel (n, 3), or of all (1, 3)."""
     values = np.zeros(3) if variance is None else np.asarray(variance)
     if values.shape != (3,):
-        values = broadcast("variance", values, (*shape, 3))
+        values = broadcast_to_pixels("variance", values, (*shape, 3))
     return np.ascontiguousarray(values, np.float32).reshape(-1, 3)
 
 
 def _usable(valid: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray:
     """Return which pixels may be used (n,), or that all may (1,)."""
-    usable = np.ones(1, np.bool_) if valid is None else checked_mask(valid, shape)
+    usable = np.ones(1, np.bool_) if valid is None else check_mask(valid, shape)
     return np.ascontiguousarray(usable).reshape(-1)

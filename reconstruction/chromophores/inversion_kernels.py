@@ -9,7 +9,7 @@ import numpy as np
 from numba import boolean, float32, float64, int64, njit, prange, void
 
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION
-from reconstruction.compiled import CONTRACT, OVER_PIXELS, given
+from reconstruction.compiled import FASTMATH_CONTRACT, PIXEL_KERNEL_OPTIONS, readonly_array_type
 
 MAX_FIT_STEPS = 12
 MAX_AXIS_STEP = 0.12
@@ -58,7 +58,7 @@ _HALF = np.float32(0.5)
 _ZERO = np.float32(0.0)
 
 
-@njit(inline="always", fastmath=CONTRACT)
+@njit(inline="always", fastmath=FASTMATH_CONTRACT)
 def _cell(q, x, y):  # type: ignore[no-untyped-def]
     """Return one channel's value and derivatives v, v_x, v_y in its cell."""
     v = v_x = v_y = _ZERO
@@ -70,7 +70,7 @@ def _cell(q, x, y):  # type: ignore[no-untyped-def]
     return v, v_x, v_y
 
 
-@njit(inline="always", fastmath=CONTRACT)
+@njit(inline="always", fastmath=FASTMATH_CONTRACT)
 def _cell_bend(q, x, y):  # type: ignore[no-untyped-def]
     """Return one channel's second derivatives v_xx, v_xy, v_yy in its cell."""
     v = v_x = v_y = v_xx = v_xy = v_yy = _ZERO
@@ -85,7 +85,7 @@ def _cell_bend(q, x, y):  # type: ignore[no-untyped-def]
     return _TWO * v_xx, v_xy, _TWO * v_yy
 
 
-@njit(inline="always", fastmath=CONTRACT)
+@njit(inline="always", fastmath=FASTMATH_CONTRACT)
 def _solve(haa, hab, hbb, ra, rb):  # type: ignore[no-untyped-def]
     """Solve the 2 x 2 normal equations; a singular one gets a ridge."""
     det = float64(haa) * hbb - float64(hab) * hab
@@ -95,7 +95,7 @@ def _solve(haa, hab, hbb, ra, rb):  # type: ignore[no-untyped-def]
     return step_a, step_b
 
 
-@njit(inline="always", fastmath=CONTRACT)
+@njit(inline="always", fastmath=FASTMATH_CONTRACT)
 def _form(w, p0, p1, p2, q0, q1, q2):  # type: ignore[no-untyped-def]
     """Return p' W q."""
     return (
@@ -108,7 +108,7 @@ def _form(w, p0, p1, p2, q0, q1, q2):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(inline="always", fastmath=CONTRACT)
+@njit(inline="always", fastmath=FASTMATH_CONTRACT)
 def _weights(a00, a11, a22, a01, a02, a12):  # type: ignore[no-untyped-def]
     """Invert a symmetric 3 x 3 covariance; return w00, w01, w02, w11, w12, w22."""
     c00 = a11 * a22 - a12 * a12
@@ -125,7 +125,7 @@ def _weights(a00, a11, a22, a01, a02, a12):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(inline="always", fastmath=CONTRACT)
+@njit(inline="always", fastmath=FASTMATH_CONTRACT)
 def _project(rows, l0, l1, l2):  # type: ignore[no-untyped-def]
     """Take log RGB to the coordinates of a start grid."""
     return (
@@ -134,7 +134,7 @@ def _project(rows, l0, l1, l2):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(inline="always", fastmath=CONTRACT)
+@njit(inline="always", fastmath=FASTMATH_CONTRACT)
 def _guess(axes, y0, y1):  # type: ignore[no-untyped-def]
     """Interpolate the start grid bilinearly, clamped to it."""
     last = axes.shape[0] - 1
@@ -151,7 +151,7 @@ def _guess(axes, y0, y1):  # type: ignore[no-untyped-def]
     return min(max(a, _MIN_AXIS_FRACTION), _ONE), min(max(b, _MIN_AXIS_FRACTION), _ONE)
 
 
-@njit(inline="always", fastmath=CONTRACT)
+@njit(inline="always", fastmath=FASTMATH_CONTRACT)
 def _bounded(a, b, step_a, step_b, aa, ab, bb, ra, rb):  # type: ignore[no-untyped-def]
     """Stop a step at the table's edge, where the other chromophore is fitted alone."""
     if a + step_a < _MIN_AXIS_FRACTION or a + step_a > _ONE:
@@ -175,17 +175,17 @@ def _bounded(a, b, step_a, step_b, aa, ab, bb, ra, rb):  # type: ignore[no-untyp
 
 @njit(
     void(
-        given(float32, 2),  # rgb (n, 3)
-        given(float32, 2),  # variance (n, 3) or (1, 3)
-        given(float32, 1),  # shading (n,) or (1,)
-        given(boolean, 1),  # usable (n,) or (1,)
+        readonly_array_type(float32, 2),  # rgb (n, 3)
+        readonly_array_type(float32, 2),  # variance (n, 3) or (1, 3)
+        readonly_array_type(float32, 1),  # shading (n,) or (1,)
+        readonly_array_type(boolean, 1),  # usable (n,) or (1,)
         boolean,  # shading is free
-        given(float32, 2),  # covariance of the model's relative error (3, 3)
-        given(float32, 5),  # cells of the color table
-        given(float32, 1),  # ends of the axes as volume fractions (2,)
-        given(float32, 2),  # projection of log rgb, and offset (2, 4)
-        given(float32, 3),  # start grid on it (g, g, 2)
-        given(float32, 2),  # mean log color of second solutions (g, g)
+        readonly_array_type(float32, 2),  # covariance of the model's relative error (3, 3)
+        readonly_array_type(float32, 5),  # cells of the color table
+        readonly_array_type(float32, 1),  # ends of the axes as volume fractions (2,)
+        readonly_array_type(float32, 2),  # projection of log rgb, and offset (2, 4)
+        readonly_array_type(float32, 3),  # start grid on it (g, g, 2)
+        readonly_array_type(float32, 2),  # mean log color of second solutions (g, g)
         float32,  # largest plausible log shading
         float32,  # sign of the surface's side on which light skin lies
         float32,  # largest relative standard error of an identifiable chromophore
@@ -193,7 +193,7 @@ def _bounded(a, b, step_a, step_b, aa, ab, bb, ra, rb):  # type: ignore[no-untyp
         boolean[:, ::1],  # masks (5, n): see MASKS
         int64,  # pixels a task
     ),
-    **OVER_PIXELS,
+    **PIXEL_KERNEL_OPTIONS,
 )
 def fit_pixels(  # type: ignore[no-untyped-def]
     rgb,

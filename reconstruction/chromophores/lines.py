@@ -11,7 +11,7 @@ import numpy as np
 
 from model.color_table import ColorTable
 from reconstruction.arrays import Float64Array
-from reconstruction.chromophores.start import MIN_AXIS_FRACTION, evaluate
+from reconstruction.chromophores.start import MIN_AXIS_FRACTION, evaluate_table
 
 N_LINES = 49
 """Values of melanin at which there is a line."""
@@ -24,7 +24,7 @@ MELANIN_AXIS = np.linspace(float(MIN_AXIS_FRACTION), 1.0, (N_LINES - 1) * NODES_
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lines:
+class EqualMelaninLines:
     """Log colors of skin along lines of equal melanin, each array (LINES, NODES, 3)."""
 
     log_rgb: Float64Array
@@ -36,11 +36,11 @@ class Lines:
 
 
 @lru_cache(maxsize=16)
-def lines_of(table: ColorTable) -> Lines:
+def equal_melanin_lines(table: ColorTable) -> EqualMelaninLines:
     """Return the lines of a table; kept for the tables used last."""
     low = float(MIN_AXIS_FRACTION)
     a, b = np.meshgrid(
         np.linspace(low, 1.0, N_LINES), np.linspace(low, 1.0, N_LINE_NODES), indexing="ij"
     )
-    color, by_a, by_b = evaluate(table, a, b)
-    return Lines(np.log(color), by_a / color, by_b / color)
+    color, by_a, by_b = evaluate_table(table, a, b)
+    return EqualMelaninLines(np.log(color), by_a / color, by_b / color)

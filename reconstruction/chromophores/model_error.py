@@ -45,13 +45,13 @@ class ColorErrors:
     """(3, 3): covariance of what every pixel has."""
     fine: Float64Array
     """(3, 3): covariance over the mean square of fine structure."""
-    bounced: float
+    interreflection: float
     """Standard deviation of the light from other skin, over the light and reflectance of a pixel;
     the light is that on a white tile."""
 
 
 @dataclass(frozen=True, slots=True)
-class Histogram:
+class ShadingHistogram:
     """Counts in bins of equal width."""
 
     low: float
@@ -63,19 +63,19 @@ class Histogram:
 
 
 @lru_cache(maxsize=1)
-def load() -> Float64Array:
+def load_covariance() -> Float64Array:
     """Return the covariance of log color that the model leaves unexplained, (3, 3), of all pixels.
 
-    For where there is no picture to tell fine structure by; elsewhere `of_picture` knows more. Of
-    the logarithm of white-balanced camera RGB, between what the table predicts for the true
-    chromophores and what a capture shows with its noise taken away; scaled so that with
+    For where there is no picture to tell fine structure by; elsewhere `image_covariance` knows
+    more. Of the logarithm of white-balanced camera RGB, between what the table predicts for the
+    true chromophores and what a capture shows with its noise taken away; scaled so that with
     noise 68 % of errors lie inside the 68 % ellipse.
     """
     return np.array(_document()["log_covariance"], np.float64)
 
 
 @lru_cache(maxsize=1)
-def color_errors() -> ColorErrors:
+def load_error_terms() -> ColorErrors:
     """Return the terms of a pixel's error."""
     found = _document()["by_picture"]
     return ColorErrors(
@@ -85,7 +85,7 @@ def color_errors() -> ColorErrors:
     )
 
 
-def of_picture(
+def image_covariance(
     rgb: FloatArray, variance: FloatArray, valid: BoolArray, *, errors: ColorErrors | None = None
 ) -> Float64Array:
     """Return the covariance of each pixel's relative error beside noise, (H, W, 3, 3).
@@ -108,18 +108,18 @@ def of_picture(
     Examples
     --------
     >>> even = np.full((9, 9, 3), [0.5, 0.3, 0.2])
-    >>> found = of_picture(even, 0.0 * even, np.ones((9, 9), bool))
+    >>> found = image_covariance(even, 0.0 * even, np.ones((9, 9), bool))
     >>> found.shape, bool(np.ptp(found[..., 0, 0]) < 1e-12)
     ((9, 9, 3, 3), True)
     """
-    terms = color_errors() if errors is None else errors
+    terms = load_error_terms() if errors is None else errors
     structure = fine_structure(rgb, variance, usable_pixels(rgb, valid, variance))
     covariance = np.empty((*valid.shape, 3, 3))
     for rows in _bands(valid.shape):
         here = usable_pixels(rgb[rows], valid[rows], variance[rows])
         color = np.where(here[..., None], rgb[rows], 0.0).astype(np.float64)
         color -= color.mean(axis=-1, keepdims=True)
-        color *= terms.bounced
+        color *= terms.interreflection
         covariance[rows] = terms.transport + structure[rows][..., None, None] * terms.fine
         covariance[rows] += color[..., :, None] * color[..., None, :]
     return covariance
@@ -146,8 +146,8 @@ def usable_pixels(
     Parameters
     ----------
     rgb, valid, variance
-        As of `of_picture`; without a variance noise is not asked for. A single pixel whose noise
-        over its color is no number would spoil what is said of all around it.
+        As of `image_covariance`; without a variance noise is not asked for. A single pixel whose
+        noise over its color is no number would spoil what is said of all around it.
     """
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         good = valid & np.isfinite(rgb).all(axis=-1) & (rgb > 0.0).all(axis=-1)
@@ -162,7 +162,7 @@ def fine_structure(rgb: FloatArray, variance: FloatArray, valid: BoolArray) -> F
     Parameters
     ----------
     rgb, variance, valid
-        As of `of_picture`; rgb is positive where valid.
+        As of `image_covariance`; rgb is positive where valid.
 
     Returns
     -------
@@ -228,13 +228,15 @@ def _squared_differences(
     return squares, count
 
 
-def shading_histogram() -> Histogram:
+def load_shading_histogram() -> ShadingHistogram:
     """Return how log shading is distributed over the skin of the same subjects."""
     found = _document()["log_shading"]
-    return Histogram(float(found["low"]), float(found["step"]), tuple(map(int, found["counts"])))
+    return ShadingHistogram(
+        float(found["low"]), float(found["step"]), tuple(map(int, found["counts"]))
+    )
 
 
-def identity() -> dict[str, str]:
+def data_hash() -> dict[str, str]:
     """Return the hash of the data, for the parameters of a stage."""
     text = json.dumps(_document(), sort_keys=True)
     return {"model_error": hashlib.sha256(text.encode("utf-8")).hexdigest()}

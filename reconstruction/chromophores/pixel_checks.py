@@ -19,22 +19,22 @@ class ChromophoreError(ValueError):
     """Arguments of the chromophore fit that do not fit each other."""
 
 
-def usable_colors(colors: FloatArray) -> BoolArray:
+def is_usable_color(colors: FloatArray) -> BoolArray:
     """Return where colors (..., 3) are finite and above 0, (...)."""
     with np.errstate(invalid="ignore"):
         return np.asarray(np.isfinite(colors).all(axis=-1) & (colors > 0.0).all(axis=-1))
 
 
-def checked_mask(valid: ArrayLike, shape: tuple[int, ...]) -> BoolArray:
+def check_mask(valid: ArrayLike, shape: tuple[int, ...]) -> BoolArray:
     """Return a mask of bool of a shape, or raise `ChromophoreError`."""
     given = np.asarray(valid)
     Checks(ChromophoreError).mask("valid", given, shape)
     return given
 
 
-def broadcast(name: str, given: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+def broadcast_to_pixels(name: str, array: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
     """Return what goes along with pixels broadcast to a shape, or raise `ChromophoreError`."""
-    values = np.asarray(given)
+    values = np.asarray(array)
     try:
         return np.broadcast_to(values, shape)
     except ValueError as error:
@@ -42,7 +42,7 @@ def broadcast(name: str, given: ArrayLike, shape: tuple[int, ...]) -> FloatArray
         raise ChromophoreError(f"{name}: got {values.shape}, expected {expected}") from error
 
 
-def colors_of(rgb: ArrayLike, *leading: str) -> Float32Array:
+def check_colors(rgb: ArrayLike, *leading: str) -> Float32Array:
     """Return colors as float32, or raise `ChromophoreError` for a shape other than (..., 3).
 
     Parameters
@@ -57,7 +57,7 @@ def colors_of(rgb: ArrayLike, *leading: str) -> Float32Array:
     return colors
 
 
-def detectable(
+def is_detectable(
     estimate: FloatArray, stderr: FloatArray, valid: BoolArray, *, size_px: int = NEIGHBORHOOD_PX
 ) -> BoolArray:
     """Return where the mean standard error around is small against the mean estimate around.
@@ -81,7 +81,7 @@ def detectable(
     Examples
     --------
     >>> one = np.ones((3, 3))
-    >>> bool(detectable(one, 0.2 * one, one > 0).all())
+    >>> bool(is_detectable(one, 0.2 * one, one > 0).all())
     True
     """
     Checks().require(size_px >= 1 and size_px % 2, "size_px", size_px, "an odd number, at least 1")

@@ -20,12 +20,12 @@ from reconstruction.chromophores import posterior_kernels as ridge
 from reconstruction.chromophores.face_distribution import FaceDistribution
 from reconstruction.chromophores.inversion import (
     DEFAULT_RELATIVE_NOISE,
+    add_brightness_variance,
     invert,
     model_covariance,
-    without_brightness,
 )
 from reconstruction.chromophores.inversion_kernels import OUTSIDE_DISTANCE, OUTSIDE_SIGMAS
-from reconstruction.chromophores.lines import MELANIN_AXIS, lines_of
+from reconstruction.chromophores.lines import MELANIN_AXIS, equal_melanin_lines
 from reconstruction.chromophores.pixel_checks import ChromophoreError
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION
@@ -118,10 +118,11 @@ def estimate(
     Examples
     --------
     >>> from model import color_table
-    >>> from reconstruction.chromophores.shading_prior import lognormal
+    >>> from reconstruction.chromophores.shading_prior import lognormal_prior
     >>> table = color_table.build("Nikon 5100 (NPL)", "D65")
     >>> color = 0.8 * table.lookup([[0.01, 0.02]], [[0.05, 0.05]])
-    >>> found = estimate(color, table, prior=lognormal(0.7, 0.6), variance=(1e-3 * color) ** 2)
+    >>> prior = lognormal_prior(0.7, 0.6)
+    >>> found = estimate(color, table, prior=prior, variance=(1e-3 * color) ** 2)
     >>> [f"{value:.3f}" for value in found.melanin[0]]
     ['0.010', '0.020']
     >>> [f"{value:.2f}" for value in found.shading[0]]
@@ -137,9 +138,9 @@ def estimate(
     fractions = np.stack([fitted.melanin, fitted.hemoglobin], axis=-1) / ends
     begin = np.clip(np.cbrt(np.where(usable[..., None], fractions, 0.1)), MIN_AXIS_FRACTION, 1.0)
     noise = np.zeros(3) if variance is None else np.asarray(variance, dtype=np.float32)
-    lines = lines_of(table)
+    lines = equal_melanin_lines(table)
     maps = np.empty((len(ridge.POSTERIOR_MAPS), pixels), dtype=np.float32)
-    ridge.weigh_pixels(
+    ridge.integrate_posteriors(
         np.ascontiguousarray(colors).reshape(-1, 3),
         np.ascontiguousarray(np.broadcast_to(noise, colors.shape), np.float32).reshape(-1, 3),
         usable.reshape(-1),
@@ -152,7 +153,7 @@ def estimate(
         -2.0 * np.log(prior.density),
         prior.low,
         prior.step,
-        *_of_face(face, table),
+        *_face_prior_costs(face, table),
         maps,
         _TASK_PIXELS,
     )
@@ -170,7 +171,9 @@ def estimate(
     )
 
 
-def _of_face(face: FaceDistribution | None, table: ColorTable) -> tuple[Float64Array, Float64Array]:
+def _face_prior_costs(
+    face: FaceDistribution | None, table: ColorTable
+) -> tuple[Float64Array, Float64Array]:
     """Return the kernel's -2 log probability of melanin, and its four numbers of blood."""
     if face is None:
         return np.zeros(MELANIN_AXIS.size), np.array([0.5, 1.0, 0.0, 1.0])
@@ -178,7 +181,7 @@ def _of_face(face: FaceDistribution | None, table: ColorTable) -> tuple[Float64A
     blood = face.blood
     return (
         -2.0 * np.log(density / density.max()),
-        np.array([blood.mean, blood.width, blood.height, blood.unexpected]),
+        np.array([blood.mean, blood.total_sd, blood.peak_density, blood.contamination]),
     )
 
 
@@ -195,7 +198,7 @@ def _covariances(
     each = np.asarray(0.0 if model_error is None else model_error, dtype=np.float64)
     if each.ndim < 3:
         usual = model_covariance(model_error, default_noise)
-        covariances = without_brightness(usual + MIN_RELATIVE_NOISE**2 * np.eye(3))[None]
+        covariances = add_brightness_variance(usual + MIN_RELATIVE_NOISE**2 * np.eye(3))[None]
         return model_error, covariances[(..., *_UPPER_TRIANGLE)]
     check = Checks(ChromophoreError)
     check.shape("model_error", each, (*shape, 3, 3))

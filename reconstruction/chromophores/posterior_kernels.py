@@ -7,14 +7,15 @@ are distributed over the face, the ridge is that of the product, and each line i
 the face's blood too. `reconstruction.chromophores.posterior` is the door;
 its tests sum the same over a dense plane.
 
-A pixel goes through `weights_of`, `follow`, `_lowest`, `_look_across` and `_sum_up`. These hand on:
+A pixel goes through `color_weights`, `follow_ridge`, `_min_ridge_cost`, `_evaluate_across_ridge`
+and `_integrate_ridge`. These hand on:
 
 - `seen`: natural logarithms of the pixel's color;
-- `w`, `s`: of `weights_of`;
+- `w`, `s`: of `color_weights`;
 - `light`: -2 log probability of log shading at even nodes, the first of them, and their step;
 - `k`: a line of equal melanin; `a`, `b`: fractions of the melanin and the blood axis, cube roots of
   volume fractions over the largest;
-- `between`: the lowest cost between each line and the next, of `_lowest`.
+- `between`: the lowest cost between each line and the next, of `_min_ridge_cost`.
 """
 
 import math
@@ -26,21 +27,21 @@ from numba import boolean, float32, float64, int64, njit, prange, void
 from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.chromophores.lines import N_LINES
 from reconstruction.chromophores.ridge_kernels import (
-    AXIS_BEGIN,
+    AXIS_START,
     MELANIN_STEP,
     RIDGE_JUMP_COST,
     TAIL_COST,
     Ridge,
     blood_cost,
     color_at,
-    follow,
+    color_weights,
+    follow_ridge,
     hermite,
     melanin_cost,
     prior_cost,
     quadratic_form,
-    weights_of,
 )
-from reconstruction.compiled import CONTRACT, OVER_PIXELS, given
+from reconstruction.compiled import FASTMATH_CONTRACT, PIXEL_KERNEL_OPTIONS, readonly_array_type
 
 N_PROBES = 8
 """Places between two lines where the cost is looked at first."""
@@ -74,7 +75,7 @@ POSTERIOR_MAPS = (
 _MAX_NODES = (N_LINES - 1) * MIN_NODES + N_FINE
 
 
-class _Beside(NamedTuple):
+class _CrossRidge(NamedTuple):
     """How probability spreads over blood on each line, across the ridge."""
 
     across: Float64Array
@@ -89,15 +90,15 @@ class _Beside(NamedTuple):
     """(COARSE,): costs on one wide line."""
 
 
-@njit(fastmath=CONTRACT)
+@njit(fastmath=FASTMATH_CONTRACT)
 def _volume(k, x, end):  # type: ignore[no-untyped-def]
     """Return the volume fraction of melanin a part x of the way past line k."""
-    a = AXIS_BEGIN + (k + x) * MELANIN_STEP
+    a = AXIS_START + (k + x) * MELANIN_STEP
     return end * a * a * a
 
 
-@njit(fastmath=CONTRACT)
-def _place(values, at, count, wanted):  # type: ignore[no-untyped-def]
+@njit(fastmath=FASTMATH_CONTRACT)
+def _interpolate_inverse(values, at, count, wanted):  # type: ignore[no-untyped-def]
     """Interpolate `at` where the ascending `values`, count + 1 of them, reach `wanted`."""
     if wanted <= values[0]:
         return at[0]
@@ -114,18 +115,18 @@ def _place(values, at, count, wanted):  # type: ignore[no-untyped-def]
     return at[low] + part * (at[high] - at[low])
 
 
-@njit(fastmath=CONTRACT)
-def _center_and_reach(edges, total, count):  # type: ignore[no-untyped-def]
+@njit(fastmath=FASTMATH_CONTRACT)
+def _median_and_half_width(edges, total, count):  # type: ignore[no-untyped-def]
     """Return the median, and the distance from it within which one sigma's probability lies.
 
     `total` is the cumulative probability at each of the `edges`, 0 at the first one.
     """
-    center = _place(total, edges, count, 0.5 * total[count])
+    center = _interpolate_inverse(total, edges, count, 0.5 * total[count])
     low, high = 0.0, max(edges[count] - center, center - edges[0])
     for _ in range(N_HALVINGS):
         middle = 0.5 * (low + high)
-        above = _place(edges, total, count, center + middle)
-        below = _place(edges, total, count, center - middle)
+        above = _interpolate_inverse(edges, total, count, center + middle)
+        below = _interpolate_inverse(edges, total, count, center - middle)
         if above - below < ONE_SIGMA_PROBABILITY * total[count]:
             low = middle
         else:
@@ -133,10 +134,10 @@ def _center_and_reach(edges, total, count):  # type: ignore[no-untyped-def]
     return center, 0.5 * (low + high)
 
 
-@njit(fastmath=CONTRACT, error_model="numpy")
-def _lowest(ridge, light, melanin_of_face, between):  # type: ignore[no-untyped-def]
+@njit(fastmath=FASTMATH_CONTRACT, error_model="numpy")
+def _min_ridge_cost(ridge, light, melanin_of_face, between):  # type: ignore[no-untyped-def]
     """Return the lowest cost along the ridge, and of colors alone; write it between the lines."""
-    cost, slope, shade, face_cost = ridge.cost, ridge.slope, ridge.shade, ridge.face_cost
+    cost, slope, shade, face_cost = ridge.cost, ridge.slope, ridge.log_shading, ridge.face_cost
     lowest, color_lowest = np.inf, np.inf
     for k in range(N_LINES - 1):
         least = np.inf
@@ -155,18 +156,18 @@ def _lowest(ridge, light, melanin_of_face, between):  # type: ignore[no-untyped-
     return lowest, color_lowest
 
 
-@njit(fastmath=CONTRACT, error_model="numpy")
-def _look_across(  # type: ignore[no-untyped-def]
-    log_rgb, by_b, seen, w, s, light, blood_of_face, between, lowest, ridge, beside_ridge
+@njit(fastmath=FASTMATH_CONTRACT, error_model="numpy")
+def _evaluate_across_ridge(  # type: ignore[no-untyped-def]
+    log_rgb, by_b, log_color, w, s, light, blood_of_face, between, lowest, ridge, beside_ridge
 ):
     """Write how probability spreads over blood on each line that matters; return ends of blood."""
-    cost, shade, blood, second = ridge.cost, ridge.shade, ridge.blood, ridge.second
-    spread, pull = ridge.spread, ridge.pull
+    cost, shade, blood, second = ridge.cost, ridge.log_shading, ridge.blood, ridge.second_blood
+    spread, pull = ridge.blood_sd, ridge.clipped_step
     across, coarse, wide = beside_ridge.across, beside_ridge.coarse, beside_ridge.wide
     across_low, across_width = beside_ridge.low, beside_ridge.width
-    l0, l1, l2 = seen
+    l0, l1, l2 = log_color
     s0, s1, s2 = s
-    b_low, b_high = 1.0, AXIS_BEGIN
+    b_low, b_high = 1.0, AXIS_START
     for k in range(N_LINES):
         beside = min(between[max(k - 1, 0)], between[min(k, N_LINES - 2)])
         if not beside < lowest + NEGLIGIBLE_COST:
@@ -175,28 +176,28 @@ def _look_across(  # type: ignore[no-untyped-def]
         reach = 2.6 * spread[k]
         if pull[k] != 0.0:
             reach = min(reach, 5.0 * spread[k] * spread[k] / abs(pull[k]))
-        low = max(min(b, second[k]) - reach, AXIS_BEGIN)
+        low = max(min(b, second[k]) - reach, AXIS_START)
         high = min(max(b, second[k]) + reach, 1.0)
         wide[k] = high - low > SHAPE_EXTENT
         if wide[k]:
             # The curvature says little of the far ends: look where probability ends.
-            width = (1.0 - AXIS_BEGIN) / N_COARSE
+            width = (1.0 - AXIS_START) / N_COARSE
             least = np.inf
             for i in range(N_COARSE):
-                f0, f1, f2 = color_at(log_rgb, by_b, k, AXIS_BEGIN + (i + 0.5) * width)[:3]
+                f0, f1, f2 = color_at(log_rgb, by_b, k, AXIS_START + (i + 0.5) * width)[:3]
                 e0, e1, e2 = l0 - f0, l1 - f1, l2 - f2
                 t = s0 * e0 + s1 * e1 + s2 * e2
                 value = quadratic_form(w, e0, e1, e2, e0, e1, e2)
                 value += prior_cost(light, t)
-                more, _, _ = blood_cost(blood_of_face, AXIS_BEGIN + (i + 0.5) * width)
+                more, _, _ = blood_cost(blood_of_face, AXIS_START + (i + 0.5) * width)
                 value += more
                 coarse[i] = value
                 least = min(least, value)
-            low, high = 1.0, AXIS_BEGIN
+            low, high = 1.0, AXIS_START
             for i in range(N_COARSE):
                 if coarse[i] < least + TAIL_COST:
-                    low = min(low, AXIS_BEGIN + max(i - 0.5, 0.0) * width)
-                    high = max(high, AXIS_BEGIN + min(i + 1.5, N_COARSE + 0.0) * width)
+                    low = min(low, AXIS_START + max(i - 0.5, 0.0) * width)
+                    high = max(high, AXIS_START + min(i + 1.5, N_COARSE + 0.0) * width)
         width = (high - low) / N_ACROSS
         across_low[k], across_width[k] = low, width
         if beside < lowest + 10.0:
@@ -221,15 +222,15 @@ def _look_across(  # type: ignore[no-untyped-def]
     return b_low, b_high
 
 
-@njit(fastmath=CONTRACT, error_model="numpy")
-def _sum_up(  # type: ignore[no-untyped-def]
+@njit(fastmath=FASTMATH_CONTRACT, error_model="numpy")
+def _integrate_ridge(  # type: ignore[no-untyped-def]
     ridge, beside_ridge, between, lowest, light, melanin_of_face, end, blood_ends, sums
 ):
     """Sum over melanin along the ridge, and over blood across it.
 
     Returns how many edges there are along melanin, the sum of log shadings, and bins a blood.
     """
-    cost, slope, shade = ridge.cost, ridge.slope, ridge.shade
+    cost, slope, shade = ridge.cost, ridge.slope, ridge.log_shading
     blood, blood_slope = ridge.blood, ridge.blood_slope
     across, wide = beside_ridge.across, beside_ridge.wide
     across_low, across_width = beside_ridge.low, beside_ridge.width
@@ -262,7 +263,7 @@ def _sum_up(  # type: ignore[no-untyped-def]
             mass = 0.0
             if value < NEGLIGIBLE_COST:
                 # every ratio of melanin is as likely as any other
-                weight = math.exp(-0.5 * value) / (each * (AXIS_BEGIN + (k + x) * MELANIN_STEP))
+                weight = math.exp(-0.5 * value) / (each * (AXIS_START + (k + x) * MELANIN_STEP))
                 b = (1.0 - x) * across_low[k] + x * across_low[k + 1]
                 if not (wide[k] or wide[k + 1]):
                     bent, _ = hermite(
@@ -291,30 +292,34 @@ def _sum_up(  # type: ignore[no-untyped-def]
 
 @njit(
     void(
-        given(float32, 2),  # rgb (n, 3)
-        given(float32, 2),  # variance (n, 3)
-        given(boolean, 1),  # usable (n,)
-        given(float32, 2),  # where to begin: fractions of the axes (n, 2)
-        given(float64, 2),  # upper triangles of the model error's covariances (n, 6) or (1, 6)
-        given(float64, 3),  # log color of the lines (LINES, NODES, 3)
-        given(float64, 3),  # its derivative by melanin
-        given(float64, 3),  # its derivative by blood
-        given(float64, 1),  # ends of the axes as volume fractions (2,)
-        given(float64, 1),  # -2 log probability of log shading
+        readonly_array_type(float32, 2),  # rgb (n, 3)
+        readonly_array_type(float32, 2),  # variance (n, 3)
+        readonly_array_type(boolean, 1),  # usable (n,)
+        readonly_array_type(float32, 2),  # where to begin: fractions of the axes (n, 2)
+        readonly_array_type(
+            float64, 2
+        ),  # upper triangles of the model error's covariances (n, 6) or (1, 6)
+        readonly_array_type(float64, 3),  # log color of the lines (LINES, NODES, 3)
+        readonly_array_type(float64, 3),  # its derivative by melanin
+        readonly_array_type(float64, 3),  # its derivative by blood
+        readonly_array_type(float64, 1),  # ends of the axes as volume fractions (2,)
+        readonly_array_type(float64, 1),  # -2 log probability of log shading
         float64,  # log shading at the first node of it
         float64,  # and its step
-        given(float64, 1),  # -2 log probability of melanin at MELANIN_AXIS, 0 at the greatest
-        given(float64, 1),  # of blood: see blood_cost
+        readonly_array_type(
+            float64, 1
+        ),  # -2 log probability of melanin at MELANIN_AXIS, 0 at the greatest
+        readonly_array_type(float64, 1),  # of blood: see blood_cost
         float32[:, ::1],  # maps (6, n): see MAPS
         int64,  # pixels a task
     ),
-    **OVER_PIXELS,
+    **PIXEL_KERNEL_OPTIONS,
 )
-def weigh_pixels(  # type: ignore[no-untyped-def]
+def integrate_posteriors(  # type: ignore[no-untyped-def]
     rgb,
     variance,
     usable,
-    begin,
+    start,
     model,
     log_rgb,
     by_a,
@@ -335,7 +340,7 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
     for task in prange((pixels + block - 1) // block):
         r = np.empty((9, N_LINES))
         ridge = Ridge(r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8])
-        beside = _Beside(
+        beside = _CrossRidge(
             np.empty((N_LINES, N_ACROSS)),
             np.empty(N_LINES),
             np.empty(N_LINES),
@@ -353,15 +358,15 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
                 continue
             d0, d1, d2 = float64(rgb[n, 0]), float64(rgb[n, 1]), float64(rgb[n, 2])
             seen = math.log(d0), math.log(d1), math.log(d2)
-            w, s = weights_of(d0, d1, d2, variance[n], model[n if each_model else 0])
-            follow(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, begin[n], ridge)
-            lowest, color_lowest = _lowest(ridge, light, melanin_of_face, between)
-            b_low, b_high = _look_across(
+            w, s = color_weights(d0, d1, d2, variance[n], model[n if each_model else 0])
+            follow_ridge(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, start[n], ridge)
+            lowest, color_lowest = _min_ridge_cost(ridge, light, melanin_of_face, between)
+            b_low, b_high = _evaluate_across_ridge(
                 log_rgb, by_b, seen, w, s, light, blood_of_face, between, lowest, ridge, beside
             )
             sums = edges_a, total_a, bins
             blood_ends = b_low, b_high
-            count, mean_shade, per_b = _sum_up(
+            count, mean_shade, per_b = _integrate_ridge(
                 ridge, beside, between, lowest, light, melanin_of_face, ends[0], blood_ends, sums
             )
             edges_b[0], total_b[0] = ends[1] * b_low**3, 0.0
@@ -372,9 +377,9 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
                 for m in range(6):
                     maps[m, n] = np.nan
                 continue
-            center, reach = _center_and_reach(edges_a, total_a, count)
+            center, reach = _median_and_half_width(edges_a, total_a, count)
             maps[0, n], maps[3, n] = center, reach
-            center, reach = _center_and_reach(edges_b, total_b, N_BINS)
+            center, reach = _median_and_half_width(edges_b, total_b, N_BINS)
             maps[1, n], maps[4, n] = center, reach
             maps[2, n] = math.exp(mean_shade / total_a[count])
             maps[5, n] = math.sqrt(color_lowest)

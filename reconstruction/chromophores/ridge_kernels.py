@@ -11,7 +11,7 @@ from numba import float64, njit
 from reconstruction.arrays import Float64Array
 from reconstruction.chromophores.lines import N_LINE_NODES, N_LINES, NODES_PER_LINE
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION
-from reconstruction.compiled import CONTRACT
+from reconstruction.compiled import FASTMATH_CONTRACT
 
 N_NEWTON_STEPS = 4
 MAX_RIDGE_STEP = 0.12
@@ -24,9 +24,9 @@ RIDGE_JUMP_COST = 2.0
 """Cost below the ridge's from which on a place beside it is taken for the ridge."""
 TAIL_COST = 8.0
 """Cost above the lowest where the ends are set."""
-AXIS_BEGIN = float(MIN_AXIS_FRACTION)
-MELANIN_STEP = (1.0 - AXIS_BEGIN) / (N_LINES - 1)
-BLOOD_STEP = (1.0 - AXIS_BEGIN) / (N_LINE_NODES - 1)
+AXIS_START = float(MIN_AXIS_FRACTION)
+MELANIN_STEP = (1.0 - AXIS_START) / (N_LINES - 1)
+BLOOD_STEP = (1.0 - AXIS_START) / (N_LINE_NODES - 1)
 
 
 class Ridge(NamedTuple):
@@ -36,21 +36,21 @@ class Ridge(NamedTuple):
     """-2 log of the likelihood and of the face's blood there."""
     slope: Float64Array
     """Its derivative by the fraction of the melanin axis, along the ridge."""
-    shade: Float64Array
+    log_shading: Float64Array
     """Log shading."""
     face_cost: Float64Array
     """The face's part of the cost."""
     blood: Float64Array
     blood_slope: Float64Array
-    second: Float64Array
+    second_blood: Float64Array
     """Blood of another place on the line that matters, else that of the ridge."""
-    spread: Float64Array
+    blood_sd: Float64Array
     """Standard deviation of blood by the curvature."""
-    pull: Float64Array
+    clipped_step: Float64Array
     """Step that would be left where an end of the axis holds the ridge; else 0."""
 
 
-@njit(fastmath=CONTRACT)
+@njit(fastmath=FASTMATH_CONTRACT)
 def quadratic_form(w, p0, p1, p2, q0, q1, q2):  # type: ignore[no-untyped-def]
     """Return p' W q."""
     return (
@@ -63,7 +63,7 @@ def quadratic_form(w, p0, p1, p2, q0, q1, q2):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(fastmath=CONTRACT)
+@njit(fastmath=FASTMATH_CONTRACT)
 def hermite(v0, v1, d0, d1, x, step):  # type: ignore[no-untyped-def]
     """Return the cubic with these values and derivatives at the ends, and its derivative."""
     rise = v1 - v0
@@ -74,10 +74,10 @@ def hermite(v0, v1, d0, d1, x, step):  # type: ignore[no-untyped-def]
     return value, slope
 
 
-@njit(fastmath=CONTRACT)
+@njit(fastmath=FASTMATH_CONTRACT)
 def color_at(log_rgb, by_b, k, b):  # type: ignore[no-untyped-def]
     """Return the log color and its derivative by blood on line k, the node and the way past it."""
-    y = (b - AXIS_BEGIN) / BLOOD_STEP
+    y = (b - AXIS_START) / BLOOD_STEP
     j = min(int(y), N_LINE_NODES - 2)
     x = y - j
     v, w, d, e = log_rgb[k, j], log_rgb[k, j + 1], by_b[k, j], by_b[k, j + 1]
@@ -87,7 +87,7 @@ def color_at(log_rgb, by_b, k, b):  # type: ignore[no-untyped-def]
     return f0, f1, f2, g0, g1, g2, j, x
 
 
-@njit(fastmath=CONTRACT)
+@njit(fastmath=FASTMATH_CONTRACT)
 def prior_cost(light, t):  # type: ignore[no-untyped-def]
     """Return -2 log p of a log shading; beyond the table its ends go on straight."""
     prior, low, step = light
@@ -96,12 +96,12 @@ def prior_cost(light, t):  # type: ignore[no-untyped-def]
     return prior[i] + (y - i) * (prior[i + 1] - prior[i])
 
 
-@njit(fastmath=CONTRACT)
+@njit(fastmath=FASTMATH_CONTRACT)
 def blood_cost(of_face, b):  # type: ignore[no-untyped-def]
     """Return -2 log p of blood over the greatest p, its force on b, and its stiffness, >= 0.
 
-    `of_face`: mean, spread, height of the bell over that of any blood, part of the skin with any;
-    1 if there is no face.
+    `face_trials`: mean, spread, height of the bell over that of any blood, part of the skin with
+    any; 1 if there is no face.
     """
     away = (b - of_face[0]) / of_face[1]
     bell = (1.0 - of_face[3]) * of_face[2] * math.exp(-0.5 * away * away)
@@ -111,7 +111,7 @@ def blood_cost(of_face, b):  # type: ignore[no-untyped-def]
     return cost, -share * away / of_face[1], share / (of_face[1] * of_face[1])
 
 
-@njit(fastmath=CONTRACT)
+@njit(fastmath=FASTMATH_CONTRACT)
 def melanin_cost(of_face, k, x):  # type: ignore[no-untyped-def]
     """Return -2 log p of melanin over the greatest p, a part x of the way past line k."""
     y = x * NODES_PER_LINE
@@ -120,8 +120,8 @@ def melanin_cost(of_face, k, x):  # type: ignore[no-untyped-def]
     return of_face[i0] + (y - i) * (of_face[i0 + 1] - of_face[i0])
 
 
-@njit(fastmath=CONTRACT)
-def descend(log_rgb, by_b, k, b, seen, w, of_face):  # type: ignore[no-untyped-def]
+@njit(fastmath=FASTMATH_CONTRACT)
+def fit_blood(log_rgb, by_b, k, b, log_color, w, of_face):  # type: ignore[no-untyped-def]
     """Return the blood on line k near which color and face are the most probable.
 
     Also the last step that would be left, by how much blood is stiff there by the color and in
@@ -129,12 +129,12 @@ def descend(log_rgb, by_b, k, b, seen, w, of_face):  # type: ignore[no-untyped-d
     """
     for turn in range(N_NEWTON_STEPS + 1):
         f0, f1, f2, g0, g1, g2, j, x = color_at(log_rgb, by_b, k, b)
-        e0, e1, e2 = seen[0] - f0, seen[1] - f1, seen[2] - f2
+        e0, e1, e2 = log_color[0] - f0, log_color[1] - f1, log_color[2] - f2
         by_color = quadratic_form(w, g0, g1, g2, g0, g1, g2) + 1e-9
         pushed = quadratic_form(w, g0, g1, g2, e0, e1, e2)
         _, force, stiff = blood_cost(of_face, b)
         step = (pushed + force) / (by_color + stiff)
-        moved = min(max(b + min(max(step, -MAX_RIDGE_STEP), MAX_RIDGE_STEP), AXIS_BEGIN), 1.0) - b
+        moved = min(max(b + min(max(step, -MAX_RIDGE_STEP), MAX_RIDGE_STEP), AXIS_START), 1.0) - b
         if turn == N_NEWTON_STEPS or moved * moved * (by_color + stiff) < STEP_TOL * STEP_TOL:
             break
         b += moved
@@ -143,18 +143,18 @@ def descend(log_rgb, by_b, k, b, seen, w, of_face):  # type: ignore[no-untyped-d
     return b, step, by_color, by_color + stiff, pushed, e0, e1, e2, g0, g1, g2, j, x
 
 
-@njit(fastmath=CONTRACT)
-def cost_after(w, s, found, of_face):  # type: ignore[no-untyped-def]
-    """Return blood, cost, the face's part of it and shading after the last step of `descend`.
+@njit(fastmath=FASTMATH_CONTRACT)
+def final_cost(w, s, found, of_face):  # type: ignore[no-untyped-def]
+    """Return blood, cost, the face's part of it and shading after the last step of `fit_blood`.
 
     Also whether it is held: a place at an end of the axis that would go on stays there.
     """
     b, step, by_color, _, pushed, e0, e1, e2, g0, g1, g2 = found[:11]
-    held = (b <= AXIS_BEGIN and step < 0.0) or (b >= 1.0 and step > 0.0)
+    held = (b <= AXIS_START and step < 0.0) or (b >= 1.0 and step > 0.0)
     square = quadratic_form(w, e0, e1, e2, e0, e1, e2)
     after = b
     if not held:
-        after = min(max(b + step, AXIS_BEGIN), 1.0)
+        after = min(max(b + step, AXIS_START), 1.0)
         square += step * (step * by_color - 2.0 * pushed)
     more, _, _ = blood_cost(of_face, after)
     shade = s[0] * e0 + s[1] * e1 + s[2] * e2
@@ -162,8 +162,8 @@ def cost_after(w, s, found, of_face):  # type: ignore[no-untyped-def]
     return after, max(square, 0.0) + more, more, shade, held
 
 
-@njit(fastmath=CONTRACT, error_model="numpy")
-def weights_of(d0, d1, d2, noise, model):  # type: ignore[no-untyped-def]
+@njit(fastmath=FASTMATH_CONTRACT, error_model="numpy")
+def color_weights(d0, d1, d2, noise, model):  # type: ignore[no-untyped-def]
     """Return the weights of relative errors of a color, brightness projected out, and its own.
 
     The first is the upper triangle of a matrix of rank 2; the second tells a log brightness from
@@ -193,13 +193,13 @@ def weights_of(d0, d1, d2, noise, model):  # type: ignore[no-untyped-def]
     return w, (s0, s1, s2)
 
 
-@njit(fastmath=CONTRACT, error_model="numpy")
-def follow(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, begin, ridge):  # type: ignore[no-untyped-def]
+@njit(fastmath=FASTMATH_CONTRACT, error_model="numpy")
+def follow_ridge(log_rgb, by_a, by_b, log_color, w, s, light, blood_of_face, begin, ridge):  # type: ignore[no-untyped-def]
     """Write the ridge, followed to both sides of where the fit ended."""
-    cost, slope, shade, face_cost = ridge.cost, ridge.slope, ridge.shade, ridge.face_cost
-    blood, blood_slope, second = ridge.blood, ridge.blood_slope, ridge.second
-    spread, pull = ridge.spread, ridge.pull
-    first = min(max(int((begin[0] - AXIS_BEGIN) / MELANIN_STEP + 0.5), 0), N_LINES - 1)
+    cost, slope, shade, face_cost = ridge.cost, ridge.slope, ridge.log_shading, ridge.face_cost
+    blood, blood_slope, second = ridge.blood, ridge.blood_slope, ridge.second_blood
+    spread, pull = ridge.blood_sd, ridge.clipped_step
+    first = min(max(int((begin[0] - AXIS_START) / MELANIN_STEP + 0.5), 0), N_LINES - 1)
     for side in range(2):
         b = float64(begin[1])
         if side == 1:
@@ -207,13 +207,13 @@ def follow(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, begin, ridge):
         count = N_LINES - first if side == 0 else first
         for index in range(count):
             k = first + index if side == 0 else first - 1 - index
-            found = descend(log_rgb, by_b, k, b, seen, w, blood_of_face)
-            after, least, more, t, held = cost_after(w, s, found, blood_of_face)
+            found = fit_blood(log_rgb, by_b, k, b, log_color, w, blood_of_face)
+            after, least, more, t, held = final_cost(w, s, found, blood_of_face)
             b, second[k] = found[0], after
             if abs(after - blood_of_face[0]) > 2.0 * blood_of_face[1]:
                 # the same melanin may have the color with blood that the face has
-                other = descend(log_rgb, by_b, k, blood_of_face[0], seen, w, blood_of_face)
-                o_after, o_least, o_more, o_t, o_held = cost_after(w, s, other, blood_of_face)
+                other = fit_blood(log_rgb, by_b, k, blood_of_face[0], log_color, w, blood_of_face)
+                o_after, o_least, o_more, o_t, o_held = final_cost(w, s, other, blood_of_face)
                 better = least + prior_cost(light, t)
                 better -= o_least + prior_cost(light, o_t)
                 if better > 0.0:

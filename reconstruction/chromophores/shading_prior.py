@@ -20,9 +20,9 @@ from reconstruction.chromophores import model_error
 LOG_SHADING_SOFTNESS = 0.1
 """Spread of log shading that is added to the measured one: a face 5 % of its distance off the
 tile's place gets 10 % more or less light."""
-UNEXPECTED_PROBABILITY = 0.01
+CONTAMINATION_PROBABILITY = 0.01
 """Probability that a pixel does not follow the distribution at all ..."""
-UNEXPECTED_LOG_SIGMA = 1.5
+CONTAMINATION_LOG_SIGMA = 1.5
 """... but a normal one this wide in log shading, about the same mean."""
 _LOG_LOW, _LOG_HIGH, _LOG_STEP = -8.0, 5.0, 0.05
 MIN_SOFTNESS = _LOG_STEP
@@ -70,45 +70,45 @@ class ShadingPrior:
         return float((self.nodes * self.density).sum() * self.step)
 
     @property
-    def spread(self) -> float:
+    def sd(self) -> float:
         """Standard deviation of log shading."""
         return float(np.sqrt(((self.nodes - self.mean) ** 2 * self.density).sum() * self.step))
 
-    def broadened(self, spread: float) -> ShadingPrior:
+    def broaden(self, log_sd: float) -> ShadingPrior:
         """Return the prior with an unknown exposure: a normal spread of log shading more.
 
         Examples
         --------
-        >>> prior = lognormal(0.7, 0.3).broadened(0.4)
+        >>> prior = lognormal_prior(0.7, 0.3).broaden(0.4)
         >>> round(prior.spread, 3)
         0.5
         """
-        Checks(ShadingPriorError).within("spread", spread, "(0, 2)")
-        reach = np.arange(-math.ceil(4 * spread / self.step), math.ceil(4 * spread / self.step) + 1)
-        kernel = np.exp(-0.5 * (reach * self.step / spread) ** 2)
+        Checks(ShadingPriorError).within("spread", log_sd, "(0, 2)")
+        reach = np.arange(-math.ceil(4 * log_sd / self.step), math.ceil(4 * log_sd / self.step) + 1)
+        kernel = np.exp(-0.5 * (reach * self.step / log_sd) ** 2)
         wide = np.convolve(self.density, kernel / kernel.sum())
         return ShadingPrior(
             self.low + reach[0] * self.step, self.step, np.maximum(wide, np.finfo(float).tiny)
         )
 
 
-def lognormal(center: float, spread: float) -> ShadingPrior:
+def lognormal_prior(center: float, log_sd: float) -> ShadingPrior:
     """Return a prior without a rig's shape: log shading is normal around log ``center``.
 
     Examples
     --------
-    >>> round(lognormal(0.7, 0.6).mean, 3) == round(float(np.log(0.7)), 3)
+    >>> round(lognormal_prior(0.7, 0.6).mean, 3) == round(float(np.log(0.7)), 3)
     True
     """
-    Checks(ShadingPriorError).within("center, spread", (center, spread), "(0, inf]")
-    step = spread / 12.0
+    Checks(ShadingPriorError).within("center, spread", (center, log_sd), "(0, inf]")
+    step = log_sd / 12.0
     reach = np.arange(-96, 97)  # 8 spreads
     return ShadingPrior(
         math.log(center) + reach[0] * step, step, np.exp(-0.5 * (reach / 12.0) ** 2)
     )
 
 
-def from_samples(
+def prior_from_histogram(
     low: float, step: float, counts: ArrayLike, *, softness: float = LOG_SHADING_SOFTNESS
 ) -> ShadingPrior:
     """Return the prior that a histogram of log shading gives, a little softened.
@@ -130,33 +130,33 @@ def from_samples(
     nodes = np.arange(_LOG_LOW, _LOG_HIGH + 0.5 * _LOG_STEP, _LOG_STEP)
     check.within("bins", places, f"[{_LOG_LOW + 1.0}, {_LOG_HIGH - 1.0}]")
     share = heights / heights.sum()
-    density = (share * _normal(nodes[:, None] - places, softness)).sum(axis=1)
+    density = (share * _normal_density(nodes[:, None] - places, softness)).sum(axis=1)
     mean = float((share * places).sum())
-    rest = _normal(nodes - mean, UNEXPECTED_LOG_SIGMA)
+    rest = _normal_density(nodes - mean, CONTAMINATION_LOG_SIGMA)
     return ShadingPrior(
         _LOG_LOW,
         _LOG_STEP,
-        (1.0 - UNEXPECTED_PROBABILITY) * density + UNEXPECTED_PROBABILITY * rest,
+        (1.0 - CONTAMINATION_PROBABILITY) * density + CONTAMINATION_PROBABILITY * rest,
     )
 
 
-def of_faces(*, softness: float = LOG_SHADING_SOFTNESS) -> ShadingPrior:
+def face_prior(*, softness: float = LOG_SHADING_SOFTNESS) -> ShadingPrior:
     """Return the prior of a face before the flash rig, relative to a white tile in its place.
 
     The distribution over the skin of the simulated subjects of seeds 0 to 19, all skin types, in
     their mean and width and shape; ``tools/fit_model_error.py`` measures it. No other seeds set it.
-    `softness` as of `from_samples`: as small as it gets for light that a face's pixels do not have
-    in common.
+    `softness` as of `prior_from_histogram`: as small as it gets for light that a face's pixels do
+    not have in common.
 
     Examples
     --------
-    >>> prior = of_faces()
+    >>> prior = face_prior()
     >>> bool(-0.7 < prior.mean < -0.3), bool(0.5 < prior.spread < 0.8)
     (True, True)
     """
-    found = model_error.shading_histogram()
-    return from_samples(found.low, found.step, found.counts, softness=softness)
+    found = model_error.load_shading_histogram()
+    return prior_from_histogram(found.low, found.step, found.counts, softness=softness)
 
 
-def _normal(away: Float64Array, spread: float) -> Float64Array:
+def _normal_density(away: Float64Array, spread: float) -> Float64Array:
     return np.exp(-0.5 * (away / spread) ** 2) / (math.sqrt(2.0 * math.pi) * spread)

@@ -28,7 +28,7 @@ _POLISH_STEPS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Start:
+class InverseColorTable:
     """The turned table: from a projected log color to fractions of the table's axes."""
 
     projection: Float64Array
@@ -44,11 +44,11 @@ class Start:
 
 
 @lru_cache(maxsize=16)
-def start_for(table: ColorTable, free_shading: bool) -> Start:
+def inverse_table_for(table: ColorTable, free_shading: bool) -> InverseColorTable:
     """Return the turned table; kept for the tables used last."""
     fraction = np.linspace(MIN_AXIS_FRACTION, 1.0, _SAMPLES_PER_AXIS)
     a, b = np.meshgrid(fraction, fraction, indexing="ij")
-    rgb, by_a, by_b = evaluate(table, a, b)
+    rgb, by_a, by_b = evaluate_table(table, a, b)
     log_rgb = np.log(rgb)
     across = np.cross(by_a / rgb, by_b / rgb)
     normal = np.full(3, 1.0 / np.sqrt(3.0)) if free_shading else _unfolding_direction(across)
@@ -69,7 +69,7 @@ def start_for(table: ColorTable, free_shading: bool) -> Start:
     axes = np.stack([a[chosen][nearest], b[chosen][nearest]], axis=-1)
     axes = _polish(table, axes, nodes.reshape(-1, 2), projection, offset)
     twin = _twin_grid(log_rgb[~chosen], projection, offset)
-    return Start(
+    return InverseColorTable(
         np.column_stack([projection, offset]),
         axes.reshape(START_GRID_SIZE, START_GRID_SIZE, 2).astype(np.float32),
         twin,
@@ -78,7 +78,7 @@ def start_for(table: ColorTable, free_shading: bool) -> Start:
     )
 
 
-def evaluate(
+def evaluate_table(
     table: ColorTable, a: Float64Array, b: Float64Array
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return the color and its derivatives by the fractions a and b of the table's axes."""
@@ -145,7 +145,7 @@ def _polish(
     best = axes.copy()
     best_miss = np.full(len(axes), np.inf)
     for _ in range(_POLISH_STEPS + 1):
-        rgb, by_a, by_b = evaluate(table, axes[:, 0], axes[:, 1])
+        rgb, by_a, by_b = evaluate_table(table, axes[:, 0], axes[:, 1])
         miss = nodes - np.log(rgb) @ projection.T - offset
         size = np.hypot(miss[:, 0], miss[:, 1])
         closer = size < best_miss

@@ -24,12 +24,14 @@ SHADOW_DEPTH_MM: Final = 10.0
 """Texels this far under the outermost at their place lie in its shadow (under ear or chin)."""
 
 
-def splat(at: Float64Array, values: Float64Array, size: int) -> tuple[Float64Array, Float64Array]:
+def splat_bilinear(
+    position_px: Float64Array, values: Float64Array, size: int
+) -> tuple[Float64Array, Float64Array]:
     """Add values to the four pixels around each place; return sums (N, N, C) and weights."""
     total = np.zeros((size * size, values.shape[1]))
     weight = np.zeros(size * size)
-    low = np.floor(at).astype(np.int64)
-    part = at - low
+    low = np.floor(position_px).astype(np.int64)
+    part = position_px - low
     for dx in (0, 1):
         for dy in (0, 1):
             share = np.abs(1 - dx - part[:, 0]) * np.abs(1 - dy - part[:, 1])
@@ -42,15 +44,15 @@ def splat(at: Float64Array, values: Float64Array, size: int) -> tuple[Float64Arr
     return total.reshape(size, size, -1), weight.reshape(size, size)
 
 
-def closed(known: BoolArray) -> BoolArray:
+def close_gaps(covered: BoolArray) -> BoolArray:
     """Close gaps of up to two pixels, as between texels that lie wider than the map's pixels."""
-    padded = np.pad(known, 3, mode="edge")
+    padded = np.pad(covered, 3, mode="edge")
     closed = binary_closing(padded, structure=np.ones((3, 3)), iterations=2)
-    return np.asarray(closed[3:-3, 3:-3] | known, np.bool_)
+    return np.asarray(closed[3:-3, 3:-3] | covered, np.bool_)
 
 
-def outermost(
-    place: Float64Array, reach: Float64Array, shown: BoolArray, side_mm: float, size: int
+def is_outermost(
+    position: Float64Array, reach: Float64Array, visible: BoolArray, side_mm: float, size: int
 ) -> BoolArray:
     """Return the texels that lie about as far out as any near their place, on cells of 2 mm.
 
@@ -64,19 +66,19 @@ def outermost(
         (H, W): those that there are.
     """
     cells = max(1, math.ceil(side_mm / 2.0))
-    at = np.floor((place + 0.5) * (cells / size)).astype(np.int64)
-    inside = shown & np.all((at >= 0) & (at < cells), axis=2)
+    at = np.floor((position + 0.5) * (cells / size)).astype(np.int64)
+    inside = visible & np.all((at >= 0) & (at < cells), axis=2)
     index = at[..., 1] * cells + at[..., 0]
     highest = np.zeros(cells * cells)
     np.maximum.at(highest, index[inside], reach[inside])
     highest = maximum_filter(highest.reshape(cells, cells), size=3, mode="nearest").ravel()
-    out = shown & ~inside
+    out = visible & ~inside
     out[inside] = reach[inside] >= highest[index[inside]] - SHADOW_DEPTH_MM
     return np.asarray(out, np.bool_)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Chart:
+class TexelChart:
     """Where each texel of a face's texture lies in the common map.
 
     Attributes
@@ -94,7 +96,7 @@ class Chart:
     """
 
     size: int
-    place_px: Float64Array
+    position_px: Float64Array
     on_surface: BoolArray
     outermost: BoolArray
     stderr_mm: Float32Array
@@ -122,11 +124,11 @@ class Chart:
         use = self.on_surface & self.outermost
         if valid is not None:
             use = use & np.asarray(valid, np.bool_)
-        total, weight = splat(self.place_px[use], _layers(image)[use], self.size)
+        total, weight = splat_bilinear(self.position_px[use], _layers(image)[use], self.size)
         mean = total / np.maximum(weight, 1e-12)[..., None]
         known = weight > 0.0
         filled = fill_smoothly(mean, known) if known.any() else np.zeros_like(mean)
-        near = closed(known) if known.any() else known
+        near = close_gaps(known) if known.any() else known
         return filled.astype(np.float32).reshape(known.shape + image.shape[2:]), near
 
     def read(self, common: ArrayLike) -> tuple[Float32Array, BoolArray]:
@@ -145,14 +147,16 @@ class Chart:
             Texels of the surface inside the map.
         """
         image = np.asarray(common, np.float64)
-        at = [self.place_px[..., 1], self.place_px[..., 0]]
+        at = [self.position_px[..., 1], self.position_px[..., 0]]
         out = [
             map_coordinates(layer, at, order=1, mode="nearest")
             for layer in np.moveaxis(_layers(image), 2, 0)
         ]
         values = np.stack(out, axis=-1).astype(np.float32)
         last = self.size - 0.5
-        inside = self.on_surface & np.all((self.place_px >= -0.5) & (self.place_px <= last), axis=2)
+        inside = self.on_surface & np.all(
+            (self.position_px >= -0.5) & (self.position_px <= last), axis=2
+        )
         return values.reshape(self.on_surface.shape + image.shape[2:]), inside
 
 
@@ -161,9 +165,9 @@ def _layers(image: Float64Array) -> Float64Array:
     return image if image.ndim == 3 else image[..., None]
 
 
-def chart(
+def chart_texels(
     position_mm: ArrayLike, valid: ArrayLike, correspondence: Correspondence, frame: CommonFrame
-) -> Chart:
+) -> TexelChart:
     """Lay a face's texels out in the common map.
 
     Parameters
@@ -185,12 +189,12 @@ def chart(
         raise ParameterizationError("position: no texel is valid")
     place = np.full((*shown.shape, 2), -2.0)
     error = np.full(shown.shape, np.nan, np.float32)
-    uv, off = correspondence.at(position[shown])
-    place[shown], error[shown] = frame.pixel(uv), off
+    uv, off = correspondence.map_points(position[shown])
+    place[shown], error[shown] = frame.to_pixel(uv), off
     tip = np.asarray(correspondence.cylinder.tip_mm)
     reach = np.zeros(shown.shape)
     reach[shown] = np.hypot(
         position[shown, 0] - tip[0], position[shown, 2] - tip[2] + CYLINDER_RADIUS_MM
     )
-    visible = shown & outermost(place, reach, shown, frame.side_mm, frame.size)
-    return Chart(frame.size, place, shown, visible, error)
+    visible = shown & is_outermost(place, reach, shown, frame.side_mm, frame.size)
+    return TexelChart(frame.size, place, shown, visible, error)

@@ -111,7 +111,7 @@ class CommonFrame:
         """Side of a pixel."""
         return self.side_mm / self.size
 
-    def pixel(self, uv_mm: ArrayLike) -> Float64Array:
+    def to_pixel(self, uv_mm: ArrayLike) -> Float64Array:
         """Return (column, row) of places in the map, (..., 2); pixel (0, 0) is centred at 0, 0."""
         uv = (np.asarray(uv_mm, np.float64) - self.center_mm) / self.pixel_mm
         middle = 0.5 * (self.size - 1)
@@ -128,7 +128,7 @@ class CommonFrame:
         Checks(ParameterizationError).choice("landmark", name, sorted(self.names))
         return self.landmarks_mm[self.names.index(name)]
 
-    def document(self) -> dict[str, object]:
+    def to_document(self) -> dict[str, object]:
         """Return the frame as JSON values; `from_document` reads them back."""
         return {
             "names": list(self.names),
@@ -140,15 +140,15 @@ class CommonFrame:
         }
 
     @staticmethod
-    def from_document(told: Mapping[str, object]) -> CommonFrame:
-        """Return the frame that `document` described.
+    def from_document(document: Mapping[str, object]) -> CommonFrame:
+        """Return the frame that `to_document` described.
 
         Raises
         ------
         ParameterizationError
             Naming what is missing or of another kind.
         """
-        values: Any = told
+        values: Any = document
         try:
             radius_mm = float(values["radius_mm"])
             u, v = map(float, values["center_mm"])
@@ -176,7 +176,7 @@ class Correspondence:
     cylinder: Cylinder
     field: LandmarkField | None = None
 
-    def at(self, position_mm: ArrayLike) -> tuple[Float64Array, Float64Array]:
+    def map_points(self, position_mm: ArrayLike) -> tuple[Float64Array, Float64Array]:
         """Return common (u, v) of points, (..., 2), and their standard error, (...), mm.
 
         Parameters
@@ -197,7 +197,7 @@ class Correspondence:
         moved, error = np.empty_like(flat), np.empty(len(flat))
         for start in range(0, len(flat), _TEXELS_PER_BATCH):
             part = slice(start, start + _TEXELS_PER_BATCH)
-            by, off = self.field.at(flat[part])
+            by, off = self.field.evaluate(flat[part])
             moved[part], error[part] = flat[part] + by, np.hypot(off, self.field.stderr_px)
         return moved.reshape(*shape, 2), error.reshape(shape)
 
@@ -226,7 +226,7 @@ def find_cylinder(position_mm: ArrayLike, valid: ArrayLike) -> Cylinder:
     return Cylinder((float(x), float(y), float(z)))
 
 
-def common_landmarks(faces: Sequence[Mapping[str, Point]]) -> tuple[tuple[str, ...], Float64Array]:
+def average_landmarks(faces: Sequence[Mapping[str, Point]]) -> tuple[tuple[str, ...], Float64Array]:
     """Return the landmarks that all faces have, and their mean places in the unrolled plane.
 
     Parameters
@@ -271,7 +271,7 @@ def _unrolled(landmarks: Mapping[str, Point], names: Sequence[str]) -> Float64Ar
     return Cylinder(landmarks[NOSE_LANDMARK]).unroll([landmarks[name] for name in names])
 
 
-def correspond(
+def fit_correspondence(
     landmarks: Mapping[str, Point], frame: CommonFrame, *, stderr_mm: float = 1.0
 ) -> Correspondence:
     """Find how a face's landmarks lie in the common map.
@@ -306,10 +306,10 @@ def correspond(
     own = _unrolled(landmarks, names)
     common = np.array([frame.landmark(name) for name in names])
     try:
-        field = landmark_field.fit(own, common, stderr_px=stderr_mm)
+        field = landmark_field.fit_landmark_field(own, common, stderr_px=stderr_mm)
     except LandmarkFieldError as error:
         raise ParameterizationError(str(error).replace("stderr_px", "stderr_mm")) from error
-    if field.folds():
+    if field.has_folds():
         worst = names[int(np.argmax(field.leave_one_out_px))]
         raise ParameterizationError(
             f"landmarks: no map without folds goes through them; {worst!r} lies "
@@ -319,10 +319,10 @@ def correspond(
     return Correspondence(cylinder, field)
 
 
-def frame_around(
+def fit_common_frame(
     names: tuple[str, ...],
     landmarks_mm: Float64Array,
-    places_mm: Sequence[Float64Array],
+    positions_mm: Sequence[Float64Array],
     *,
     size: int,
 ) -> CommonFrame:
@@ -331,14 +331,14 @@ def frame_around(
     Parameters
     ----------
     names, landmarks_mm
-        As `common_landmarks` gives them.
+        As `average_landmarks` gives them.
     places_mm
         Of each face, unrolled places of its texels, (n, 2).
     size
         Pixels a side.
     """
-    low = np.median([np.quantile(at, 0.01, axis=0) for at in places_mm], axis=0)
-    high = np.median([np.quantile(at, 0.99, axis=0) for at in places_mm], axis=0)
+    low = np.median([np.quantile(at, 0.01, axis=0) for at in positions_mm], axis=0)
+    high = np.median([np.quantile(at, 0.99, axis=0) for at in positions_mm], axis=0)
     # no wider than a quarter turn to either side: beyond it a face shows ears and hair
     reach = 0.5 * math.pi * CYLINDER_RADIUS_MM
     low[0], high[0] = max(low[0], -reach), min(high[0], reach)

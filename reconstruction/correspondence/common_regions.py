@@ -55,7 +55,7 @@ def standard_frame(*, side_mm: float, center_mm: tuple[float, float], size: int)
     return CommonFrame(names, places, center_mm, side_mm, size)
 
 
-def region(name: str, frame: CommonFrame) -> BoolArray:
+def region_mask(name: str, frame: CommonFrame) -> BoolArray:
     """Return the pixels of a region, (N, N).
 
     Parameters

@@ -25,8 +25,8 @@ from reconstruction.registration import (
     RegistrationError,
     dense_flow,
     feature_matches,
+    is_inside_image,
     normalize_local_contrast,
-    within,
 )
 
 Points = Mapping[str, tuple[float, float]]
@@ -112,16 +112,18 @@ class Alignment:
             polynomials, which keep small contrast, beside masked ones linearly.
         """
         image, good = self._checked(values, valid)
-        filled = np.where(_beside(good, image), image, 0.0).astype(np.float32)
+        filled = np.where(_match_channels(good, image), image, 0.0).astype(np.float32)
         unknown = (~good).astype(np.float32)
-        near = dense_flow.bilinear(unknown, self.source_px)
-        wide = dense_flow.bilinear(cv2.dilate(unknown, np.ones((5, 5), np.uint8)), self.source_px)
+        near = dense_flow.sample_image(unknown, self.source_px)
+        wide = dense_flow.sample_image(
+            cv2.dilate(unknown, np.ones((5, 5), np.uint8)), self.source_px
+        )
         seen = self.valid & (near <= 0.0)
         shape = seen.shape + image.shape[2:]
-        linear = dense_flow.bilinear(filled, self.source_px).reshape(shape)
-        cubic = dense_flow.bilinear(filled, self.source_px, interpolation=cv2.INTER_CUBIC)
-        best = np.where(_beside(wide <= 0.0, image), cubic.reshape(shape), linear)
-        return np.where(_beside(seen, image), best, 0.0).astype(np.float32), seen
+        linear = dense_flow.sample_image(filled, self.source_px).reshape(shape)
+        cubic = dense_flow.sample_image(filled, self.source_px, interpolation=cv2.INTER_CUBIC)
+        best = np.where(_match_channels(wide <= 0.0, image), cubic.reshape(shape), linear)
+        return np.where(_match_channels(seen, image), best, 0.0).astype(np.float32), seen
 
     def warp_stderr(
         self, values: ArrayLike, stderr: ArrayLike, valid: ArrayLike | None = None
@@ -146,10 +148,10 @@ class Alignment:
         variance, seen = self.warp(np.square(own), good)
         slope = _slope_variance(image, good)
         steep, _ = self.warp(slope, None)
-        place = _beside(np.square(self.error_px) / 2.0, image)
+        place = _match_channels(np.square(self.error_px) / 2.0, image)
         # cubic interpolation may undershoot
         total = np.maximum(variance, 0.0) + np.maximum(steep, 0.0) * place
-        return np.where(_beside(seen, image), np.sqrt(total), 0.0).astype(np.float32)
+        return np.where(_match_channels(seen, image), np.sqrt(total), 0.0).astype(np.float32)
 
     def warp_map(self, skin_map: SkinMap) -> SkinMap:
         """Lay a map with its own standard error and mask over the neutral picture.
@@ -167,7 +169,7 @@ class Alignment:
         stderr = None
         if skin_map.stderr is not None:
             variance, _ = self.warp(np.square(skin_map.stderr), skin_map.valid)
-            left = _beside(dense_flow.noise_left(self.source_px), values)
+            left = _match_channels(dense_flow.interpolated_noise_variance(self.source_px), values)
             stderr = np.sqrt(np.maximum(variance, 0.0) * left).astype(np.float32)
         return SkinMap(values, skin_map.unit, stderr, seen, skin_map.description)
 
@@ -179,7 +181,7 @@ class Alignment:
         check("values", image, self.moving_shape, (*self.moving_shape, "C"))
         good = np.ones(self.moving_shape, bool) if valid is None else np.asarray(valid, bool)
         check("valid", good, self.moving_shape)
-        return image, good & _everywhere(np.isfinite(image))
+        return image, good & _valid_in_all_channels(np.isfinite(image))
 
 
 def align(
@@ -191,7 +193,7 @@ def align(
     valid_moving: ArrayLike | None = None,
     valid_neutral: ArrayLike | None = None,
     landmark_stderr_px: float = LANDMARK_STDERR_PX,
-    largest_error_px: float = MAX_ALIGNMENT_ERROR_PX,
+    max_error_px: float = MAX_ALIGNMENT_ERROR_PX,
     rounds: int = dense_flow.N_WARP_ROUNDS,
 ) -> Alignment:
     """Find where each pixel of the neutral picture lies in that of an expression.
@@ -209,7 +211,7 @@ def align(
     landmark_stderr_px : float
         Standard error of a landmark in one picture along each axis, above 0. It sets how smooth
         the motion between landmarks is.
-    largest_error_px : float
+    max_error_px : float
         Pixels with a larger estimated error are invalid.
     rounds : int
         How often the dense flow is followed; 0: landmarks or features alone.
@@ -252,30 +254,30 @@ def align(
             names, points, moved = _common(landmarks_moving, landmarks_neutral)
             by, stderr = "landmarks", math.sqrt(2.0) * landmark_stderr_px
         else:
-            points, moved = feature_matches.match(
+            points, moved = feature_matches.match_features(
                 first, second, valid=mask, valid_second=mask_second
             )
             names = [f"feature {k + 1}" for k in range(len(points))]
             by, stderr = "features", math.sqrt(2.0) * FEATURE_STDERR_PX
-        field = landmark_field.fit(points, moved, stderr_px=stderr)
+        field = landmark_field.fit_landmark_field(points, moved, stderr_px=stderr)
     except (feature_matches.FeatureError, landmark_field.LandmarkFieldError) as few:
         raise AlignmentError(str(few)) from few
-    displacement, uncertain = field.on_grid(first.shape)
-    flow = dense_flow.refine(
+    displacement, uncertain = field.evaluate_grid(first.shape)
+    flow = dense_flow.refine_flow(
         first,
         second,
-        dense_flow.grid(first.shape) + displacement,
+        dense_flow.pixel_grid(first.shape) + displacement,
         uncertain,
         valid=mask,
         valid_second=mask_second,
         rounds=rounds,
     )
-    seen = _within(flow.source_px, mask_second) & mask
+    seen = _is_inside(flow.source_px, mask_second) & mask
     folded = _folded(flow.source_px)
     error = math.sqrt(2.0) * flow.stderr_px
     return Alignment(
         source_px=flow.source_px,
-        valid=seen & ~folded & (error <= largest_error_px),
+        valid=seen & ~folded & (error <= max_error_px),
         error_px=error.astype(np.float32),
         residual_px=flow.gap_px,
         followed=flow.followed,
@@ -297,10 +299,10 @@ def _structure(name: str, picture: ArrayLike, valid: ArrayLike | None) -> tuple[
         )
     good = np.ones(image.shape[:2], bool) if valid is None else np.asarray(valid, bool)
     Checks(AlignmentError).shape(f"valid_{name}", good, image.shape[:2])
-    good = good & _everywhere(np.isfinite(image) & (image > 0.0))
+    good = good & _valid_in_all_channels(np.isfinite(image) & (image > 0.0))
     if not good.any():
         raise AlignmentError(f"{name}: has no valid pixel with light")
-    shown = np.where(_beside(good, image), image, 1.0)
+    shown = np.where(_match_channels(good, image), image, 1.0)
     value = np.exp(np.log(shown).mean(axis=-1)) if image.ndim == 3 else shown
     # where there is no skin goes on what is beside it: an edge of the mask is no structure
     weight = good.astype(np.float64)
@@ -311,12 +313,12 @@ def _structure(name: str, picture: ArrayLike, valid: ArrayLike | None) -> tuple[
     return normalize_local_contrast(np.where(good, value, around)), good
 
 
-def _beside(array: NDArray[Any], image: NDArray[Any]) -> NDArray[Any]:
+def _match_channels(array: NDArray[Any], image: NDArray[Any]) -> NDArray[Any]:
     """Return an array of pixels (H, W) as it broadcasts beside an image (H, W) or (H, W, C)."""
     return array[..., None] if image.ndim == 3 else array
 
 
-def _everywhere(good: BoolArray) -> BoolArray:
+def _valid_in_all_channels(good: BoolArray) -> BoolArray:
     """Return where all channels of (H, W) or (H, W, C) are good, (H, W)."""
     return np.asarray(good.all(axis=-1)) if good.ndim == 3 else good
 
@@ -335,10 +337,10 @@ def _common(moving: Points, neutral: Points) -> tuple[list[str], Float64Array, F
     )
 
 
-def _within(source_px: Float32Array, mask: BoolArray) -> BoolArray:
+def _is_inside(source_px: Float32Array, mask: BoolArray) -> BoolArray:
     """Return which places are inside a picture, and all pixels around them in its mask."""
-    missing = dense_flow.bilinear((~mask).astype(np.float32), source_px)
-    return np.asarray(within(source_px, mask.shape) & (missing <= 0.0))
+    missing = dense_flow.sample_image((~mask).astype(np.float32), source_px)
+    return np.asarray(is_inside_image(source_px, mask.shape) & (missing <= 0.0))
 
 
 def _folded(source_px: Float32Array) -> BoolArray:
@@ -358,11 +360,11 @@ def _folded(source_px: Float32Array) -> BoolArray:
 
 
 def _landmark_rms(source_px: Float32Array, points: Float64Array, moved: Float64Array) -> float:
-    inside = within(points, source_px.shape)
+    inside = is_inside_image(points, source_px.shape)
     if not inside.any():
         return math.nan
     at = points[inside].astype(np.float32)[None]
-    put = dense_flow.bilinear(source_px, at)[0]
+    put = dense_flow.sample_image(source_px, at)[0]
     return float(np.sqrt(((put - moved[inside]) ** 2).sum(axis=1).mean()))
 
 
@@ -370,7 +372,7 @@ def _slope_variance(image: Float32Array, good: BoolArray) -> Float32Array:
     """Return the squared slope of a map per px, smoothed over 2 px."""
     weight = good.astype(np.float32)
     share = cv2.GaussianBlur(weight, (0, 0), 2.0)
-    keep, spread = _beside(weight, image), _beside(share, image)
+    keep, spread = _match_channels(weight, image), _match_channels(share, image)
     known = np.where(keep > 0, image, 0.0).astype(np.float32)
     smooth = np.asarray(cv2.GaussianBlur(known, (0, 0), 2.0)).reshape(image.shape)
     smooth = smooth / np.maximum(spread, 1e-6)

@@ -72,7 +72,7 @@ class LandmarkField:
         """Smoothing of the thin-plate spline: noise over strength."""
         return self.stderr_px**2 / max(self.strength, self.stderr_px**2 / _MAX_STRENGTH)
 
-    def on_grid(self, shape: tuple[int, int]) -> tuple[Float64Array, Float64Array]:
+    def evaluate_grid(self, shape: tuple[int, int]) -> tuple[Float64Array, Float64Array]:
         """Return the displacement (H, W, 2) and its standard error along each axis (H, W), px.
 
         Parameters
@@ -83,7 +83,7 @@ class LandmarkField:
         rows = np.arange(0.0, shape[0] - 1 + FIELD_GRID_PX, FIELD_GRID_PX)
         columns = np.arange(0.0, shape[1] - 1 + FIELD_GRID_PX, FIELD_GRID_PX)
         nodes = np.stack(np.meshgrid(columns, rows), axis=-1)
-        moved, error = self.at(nodes.reshape(-1, 2))
+        moved, error = self.evaluate(nodes.reshape(-1, 2))
         coarse = np.dstack([moved.reshape(*nodes.shape[:2], 2), error.reshape(nodes.shape[:2])])
         x, y = np.meshgrid(
             np.arange(shape[1], dtype=np.float32) / FIELD_GRID_PX,
@@ -94,17 +94,17 @@ class LandmarkField:
         ).astype(np.float64)
         return fine[..., :2], np.maximum(fine[..., 2], 0.0)
 
-    def folds(self) -> bool:
+    def has_folds(self) -> bool:
         """Return whether it turns anything over, within the landmarks and a fifth around."""
         low, high = self.points_px.min(axis=0), self.points_px.max(axis=0)
         rim = 0.2 * (high - low)
         along = [np.linspace(a - r, b + r, 40) for a, b, r in zip(low, high, rim, strict=True)]
         points = np.stack(np.meshgrid(*along), axis=-1)
-        moved = points + self.at(points.reshape(-1, 2))[0].reshape(points.shape)
+        moved = points + self.evaluate(points.reshape(-1, 2))[0].reshape(points.shape)
         du, dv = np.diff(moved, axis=1)[:-1], np.diff(moved, axis=0)[:, :-1]
         return bool(np.any(du[..., 0] * dv[..., 1] - du[..., 1] * dv[..., 0] <= 0.0))
 
-    def at(self, points_px: ArrayLike) -> tuple[Float64Array, Float64Array]:
+    def evaluate(self, points_px: ArrayLike) -> tuple[Float64Array, Float64Array]:
         """Return displacement (N, 2) and standard error along each axis (N,) at some points, px.
 
         Parameters
@@ -130,7 +130,9 @@ class LandmarkField:
         return np.asarray(spline(at)), np.sqrt(variance)
 
 
-def fit(points_px: ArrayLike, moved_px: ArrayLike, *, stderr_px: float) -> LandmarkField:
+def fit_landmark_field(
+    points_px: ArrayLike, moved_px: ArrayLike, *, stderr_px: float
+) -> LandmarkField:
     """Draw a smooth displacement through landmarks.
 
     Parameters
@@ -152,7 +154,7 @@ def fit(points_px: ArrayLike, moved_px: ArrayLike, *, stderr_px: float) -> Landm
     Examples
     --------
     >>> corners = np.array([[0, 0], [0, 90], [90, 0], [90, 90], [40, 50]], float)
-    >>> field = fit(corners, 1.1 * corners + 3, stderr_px=0.5)
+    >>> field = fit_landmark_field(corners, 1.1 * corners + 3, stderr_px=0.5)
     >>> field.at([[45, 45]])[0].round(2).tolist()
     [[7.5, 7.5]]
     """

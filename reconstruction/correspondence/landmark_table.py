@@ -11,7 +11,7 @@ class LandmarkError(ValueError):
     """A table of landmarks that cannot be read."""
 
 
-def read(path: str | Path) -> dict[str, tuple[float, float]]:
+def read_landmark_table(path: str | Path) -> dict[str, tuple[float, float]]:
     """Read named points from a CSV file with the header ``name,x,y``.
 
     Parameters

@@ -128,7 +128,7 @@ def estimate(
     if method == "envelope":
         if discard:
             usable &= _ranks(ratio) >= discard
-        start = _lower(ratio, usable)
+        start = _lower_quartile(ratio, usable)
         r_d, stderr = np.empty(start.shape), np.empty(start.shape)
         counts = np.zeros((len(start), 2), dtype=np.int64)
         fit_envelope(
@@ -196,7 +196,7 @@ def _checked(
     points = math.prod(lead)
 
     def whole(name: str, array: NDArray[Any], *axes: int) -> NDArray[Any]:
-        spread = np.ascontiguousarray(Checks().spread(name, array, (*lead, *axes)))
+        spread = np.ascontiguousarray(Checks().broadcast(name, array, (*lead, *axes)))
         return spread.reshape(points, *axes)
 
     f = np.ascontiguousarray(f).reshape(points, samples, channels)
@@ -226,7 +226,7 @@ def _ratios(samples: _Samples, eta: float) -> tuple[Float64Array, Float64Array, 
     above = (cosines[0] >= MIN_FACTOR_COSINE) & (cosines[1] >= MIN_FACTOR_COSINE)
     above &= np.isfinite(cosines[0]) & np.isfinite(cosines[1])
     cos_light, cos_view = (np.where(above, cosine, 1.0) for cosine in cosines)
-    through = boundary_kernels.transmitted(cos_light, cos_view, eta)
+    through = boundary_kernels.boundary_transmittance(cos_light, cos_view, eta)
     good = samples.usable & above[..., None]
     with np.errstate(divide="ignore", invalid="ignore"):  # nothing is let through below eta = 1
         ratio = np.pi * np.where(good, samples.f, 0.0) / through[..., None]
@@ -238,7 +238,7 @@ def _ranks(ratio: Float64Array) -> NDArray[np.intp]:
     return np.argsort(np.argsort(ratio, axis=1, kind="stable"), axis=1, kind="stable")
 
 
-def _lower(ratio: Float64Array, usable: BoolArray) -> Float64Array:
+def _lower_quartile(ratio: Float64Array, usable: BoolArray) -> Float64Array:
     """Return the lower quartile of the ratios: a start that neither lobes nor outliers move far."""
     count = usable.sum(axis=1)
     ordered = np.sort(ratio, axis=1)

@@ -35,7 +35,7 @@ def _fresnel(c, eta):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True)
-def _shapes(light, view, normal, eta, through, slope, lobe):  # type: ignore[no-untyped-def]
+def _shapes(light, view, normal, eta, transmittance, slope, lobe):  # type: ignore[no-untyped-def]
     """Fill the unit diffuse BRDF, what an error of the normal does to it, and the lobes.
 
     Returns False for a light or view too near to the horizon.
@@ -49,7 +49,9 @@ def _shapes(light, view, normal, eta, through, slope, lobe):  # type: ignore[no-
         return False
     mu_l, mu_v = min(mu_l, 1.0), min(mu_v, 1.0)
     between = max(min(between, 1.0), -1.0)
-    through[0] = (1.0 - _fresnel(mu_l, eta)) * (1.0 - _fresnel(mu_v, eta)) / math.pi  # eq. (6)
+    transmittance[0] = (
+        (1.0 - _fresnel(mu_l, eta)) * (1.0 - _fresnel(mu_v, eta)) / math.pi
+    )  # eq. (6)
     slope[0] = math.sqrt(1.0 / (mu_l * mu_l) - 1.0)
     cos_d = math.sqrt(0.5 * (1.0 + between))
     cos_h = min((mu_l + mu_v) / max(2.0 * cos_d, 1e-9), 1.0)
@@ -170,12 +172,12 @@ def _bounded(h, rhs, channels, free, low, b, x):  # type: ignore[no-untyped-def]
     cache=True,
 )
 def fit_envelope(  # type: ignore[no-untyped-def]
-    f, variance, light, view, normal, valid, start, eta, tilt_rad, known, r_d, stderr, counts
+    f, variance, light, view, normal, valid, start, eta, tilt_rad, has_variance, r_d, stderr, counts
 ):
     """Fill R_d (P, C), its standard error, and samples used and dropped (P, 2) of every point.
 
-    ``start`` is a first R_d; ``tilt_rad`` the normals' standard error; ``known`` says whether the
-    variances are, or only their ratios.
+    ``start`` is a first R_d; ``tilt_rad`` the normals' standard error; ``has_variance`` says
+    whether the variances are, or only their ratios.
     """
     points, samples, channels = f.shape
     for point in prange(points):
@@ -269,7 +271,7 @@ def fit_envelope(  # type: ignore[no-untyped-def]
             for c in range(channels):
                 grown = scale2[c] * clipped[c] / seen[c] / CLIPPED_MEAN
                 if seen[c] > 3:
-                    scale2[c] = max(grown, 1.0) if known else max(grown, 1e-12)
+                    scale2[c] = max(grown, 1.0) if has_variance else max(grown, 1e-12)
             counts[point, 0], counts[point, 1] = used, dropped
         if size == 0:
             continue
@@ -278,5 +280,5 @@ def fit_envelope(  # type: ignore[no-untyped-def]
             b[c] = 1.0
             _substitute(low, size, b)
             r_d[point, c] = x[c]
-            if known or seen[c] > 3:
+            if has_variance or seen[c] > 3:
                 stderr[point, c] = math.sqrt(max(b[c], 0.0))

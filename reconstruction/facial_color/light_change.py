@@ -16,7 +16,7 @@ MAX_LIGHT_CHANGE = 1.0
 """Most that matters: with more, the brightness tells nothing."""
 
 
-def smooth(
+def smooth_light_changes(
     log_shading: Float32Array,
     shading_variance: Float32Array,
     good: BoolArray,

@@ -21,7 +21,7 @@ from scipy import stats
 from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float64Array, Int64Array
 
-FACE_PLACES = ("forehead", "cheek", "nose", "chin", "temple")
+FACE_SITES = ("forehead", "cheek", "nose", "chin", "temple")
 """Places that are followed."""
 TRANSITION_FALSE_ALARM_RATE = 0.05
 """Rate at which a cycle without transition is said to have one."""
@@ -59,9 +59,9 @@ class DiscMeans:
         return self.pixels > 0
 
 
-def disc_means(
+def average_discs(
     maps: ArrayLike,
-    places: Mapping[str, tuple[float, float]],
+    positions: Mapping[str, tuple[float, float]],
     radius_px: float,
     *,
     stderr: ArrayLike | None = None,
@@ -73,7 +73,7 @@ def disc_means(
     ----------
     maps : array_like, shape (N, H, W)
         Aligned maps, such as hemoglobin, one a frame.
-    places : mapping of str to (x, y)
+    positions : mapping of str to (x, y)
         Centres, px: x to the right and y down from the centre of the first pixel.
     radius_px : float
         Of the discs, px, > 0; the pixel nearest to the centre always belongs to it.
@@ -94,7 +94,7 @@ def disc_means(
     Examples
     --------
     >>> ramp = np.arange(25.0).reshape(1, 5, 5)
-    >>> disc_means(ramp, {"middle": (2, 2)}, 1.0).mean.tolist()
+    >>> average_discs(ramp, {"middle": (2, 2)}, 1.0).mean.tolist()
     [[12.0]]
     """
     values = np.asarray(maps, np.float64)
@@ -102,12 +102,14 @@ def disc_means(
     Checks(CurveError).within("radius_px", radius_px, "(0, inf)")
     good = np.isfinite(values)
     if valid is not None:
-        good &= _like(valid, values, "valid").astype(bool)
-    spread = None if stderr is None else _like(stderr, values, "stderr").astype(np.float64)
+        good &= _broadcast_like(valid, values, "valid").astype(bool)
+    spread = (
+        None if stderr is None else _broadcast_like(stderr, values, "stderr").astype(np.float64)
+    )
     if spread is not None:
         good &= np.isfinite(spread)
     means, errors, counts = [], [], []
-    for name, place in places.items():
+    for name, place in positions.items():
         rows, columns = disc_pixels(values.shape[1:], name, place, radius_px)
         here = good[:, rows, columns]
         shown = np.where(here, values[:, rows, columns], 0.0)
@@ -128,7 +130,7 @@ def disc_means(
 
 
 def disc_pixels(
-    shape: tuple[int, ...], name: str, place: tuple[float, float], radius_px: float
+    shape: tuple[int, ...], name: str, position: tuple[float, float], radius_px: float
 ) -> tuple[Int64Array, Int64Array]:
     """Return rows and columns of the pixels of a disc about (x, y), px.
 
@@ -138,7 +140,7 @@ def disc_pixels(
         Where its centre lies beyond the map.
     """
     height, width = shape
-    x, y = place
+    x, y = position
     inside = -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5
     expected = f"within {width} x {height} px"
     Checks(CurveError).require(inside, name, f"({x:g}, {y:g}) px", expected)
@@ -148,7 +150,7 @@ def disc_pixels(
     return found_rows, found_columns
 
 
-def usual_places(skin: ArrayLike) -> dict[str, tuple[float, float]]:
+def standard_positions(skin: ArrayLike) -> dict[str, tuple[float, float]]:
     """Return where the places are on a face of which only the outline is known, px.
 
     Parameters
@@ -159,7 +161,7 @@ def usual_places(skin: ArrayLike) -> dict[str, tuple[float, float]]:
     Returns
     -------
     dict
-        (x, y) of :data:`FACE_PLACES`; by the middle 96 % of the skin in each direction.
+        (x, y) of :data:`FACE_SITES`; by the middle 96 % of the skin in each direction.
 
     Raises
     ------
@@ -190,7 +192,7 @@ class Reproducibility:
     """Longest time between two shots of one phase, s; 0 without repeats."""
 
 
-def reproducibility(
+def estimate_reproducibility(
     time_s: ArrayLike, phase_s: ArrayLike, values: ArrayLike, *, cycle_s: float
 ) -> Reproducibility:
     """Compare shots of the same phase in different cycles.
@@ -205,12 +207,12 @@ def reproducibility(
 
     Examples
     --------
-    >>> found = reproducibility([0, 5, 10], [0, 5, 0.01], [1.0, 2.0, 1.2], cycle_s=10)
+    >>> found = estimate_reproducibility([0, 5, 10], [0, 5, 0.01], [1.0, 2.0, 1.2], cycle_s=10)
     >>> round(found.sd, 3), found.repeats, found.longest_s
     (0.141, 1, 10.0)
     """
     time, phase, value = (np.asarray(v, np.float64) for v in (time_s, phase_s, values))
-    groups = same_phase(phase, cycle_s=cycle_s)
+    groups = group_by_phase(phase, cycle_s=cycle_s)
     squares, repeats, longest = 0.0, 0, 0.0
     for group in np.unique(groups):
         members = groups == group
@@ -222,7 +224,7 @@ def reproducibility(
     return Reproducibility(sd, repeats, longest)
 
 
-def same_phase(phase_s: ArrayLike, *, cycle_s: float) -> Int64Array:
+def group_by_phase(phase_s: ArrayLike, *, cycle_s: float) -> Int64Array:
     """Return a number for each shot that those of one phase share, shape (N,).
 
     Phases are parted at gaps that are wider than a quarter of the usual interval.
@@ -266,7 +268,7 @@ class Transition:
         return self.power >= 0.5
 
 
-def transition(
+def find_transition(
     phase_s: ArrayLike,
     values: ArrayLike,
     *,
@@ -362,7 +364,7 @@ def _between(phase: Float64Array, value: Float64Array, begin: float, end: float)
     return np.asarray(order[inside], np.int64)
 
 
-def _like(part: ArrayLike, values: Float64Array, name: str) -> NDArray[np.generic]:
+def _broadcast_like(part: ArrayLike, values: Float64Array, name: str) -> NDArray[np.generic]:
     array = np.asarray(part)
     Checks(CurveError).shape(name, array, values.shape)
     return array

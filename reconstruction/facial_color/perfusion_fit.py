@@ -19,10 +19,10 @@ from scipy import stats
 from model.checks import Checks
 from reconstruction.arrays import Float64Array
 from reconstruction.facial_color.perfusion_curves import CurveError
-from reconstruction.facial_color.perfusion_likelihood import ProfileLikelihood, Search
-from reconstruction.facial_color.perfusion_samples import PoseStep, Samples
+from reconstruction.facial_color.perfusion_likelihood import ProfileLikelihood, RelaxationGrid
+from reconstruction.facial_color.perfusion_samples import CurveSamples, PoseStep
 
-Known = Literal["estimated", "only below", "only above", "unknown"]
+TimeConstantStatus = Literal["estimated", "only below", "only above", "unknown"]
 
 BOUND_LEVEL = 0.95
 """Confidence of bounds."""
@@ -58,7 +58,7 @@ class RelaxationFit:
     interval_68_s: tuple[float, float]
     """68 % interval of the time constant, s, within the 95 % one: its ends lie as far from the best
     as the likelihood says of each side, not a standard error to both."""
-    known: Known
+    known: TimeConstantStatus
     """Whether the time constant is estimated, or "only below" the interval's upper end, or "only
     above" its lower one, or the levels do not differ."""
     delay_s: float
@@ -147,7 +147,7 @@ def fit_cycle(
     check.within("bend", bend, "[0, 1)")
     check.within("cycle_s", cycle_s, "(0, inf)")
     check.within("change_s", middle, f"(0, {cycle_s})")
-    data = Samples.of(phase, values, stderr, pose)
+    data = CurveSamples.of(phase, values, stderr, pose)
     phase = np.where(np.isfinite(phase), phase, 0.0)  # of weight 0, but a number
 
     def straight(delay: Float64Array, constant: Float64Array) -> Float64Array:
@@ -166,11 +166,11 @@ def fit_cycle(
     constants = np.geomspace(spacing / 50, 4 * cycle_s, _GRID_NODES)
     longest = 0.5 * min(middle, cycle_s - middle)
     delays = np.linspace(0.0, longest, _DELAY_NODES)
-    if data.stepped:
-        between = data.moves_between(phase % cycle_s, middle, longest)
+    if data.has_steps:
+        between = data.pose_change_interval(phase % cycle_s, middle, longest)
         delays = np.linspace(*between, _POSE_DELAY_NODES)
     changes = np.concatenate([phase % cycle_s, (phase - middle) % cycle_s])
-    return _fit_bent(data, Search(straight, delays, constants, changes), bend)
+    return _fit_bent(data, RelaxationGrid(straight, delays, constants, changes), bend)
 
 
 def fit_course(time_s: ArrayLike, values: ArrayLike, *, bend: float = 0.0) -> RelaxationFit:
@@ -201,7 +201,7 @@ def fit_course(time_s: ArrayLike, values: ArrayLike, *, bend: float = 0.0) -> Re
     time = np.asarray(time_s, np.float64)
     after = (time >= 0) & np.isfinite(time)
     time = time[after]
-    data = Samples.of(time, np.atleast_2d(np.asarray(values, np.float64))[:, after], None)
+    data = CurveSamples.of(time, np.atleast_2d(np.asarray(values, np.float64))[:, after], None)
 
     def course(delay: Float64Array, constant: Float64Array) -> Float64Array:
         """Part of the way to the new level."""
@@ -210,10 +210,10 @@ def fit_course(time_s: ArrayLike, values: ArrayLike, *, bend: float = 0.0) -> Re
     span = float(np.ptp(time))
     spacing = span / max(1, time.size - 1)
     constants = np.geomspace(spacing / 50, 50 * span, _GRID_NODES)
-    return _fit_bent(data, Search(course, np.zeros(1), constants, np.zeros(0)), bend)
+    return _fit_bent(data, RelaxationGrid(course, np.zeros(1), constants, np.zeros(0)), bend)
 
 
-def _fit_bent(data: Samples, search: Search, bend: float) -> RelaxationFit:
+def _fit_bent(data: CurveSamples, search: RelaxationGrid, bend: float) -> RelaxationFit:
     """Return a fit whose time constant is as uncertain as what may have bent the values."""
 
     def fit(amount: float) -> RelaxationFit:
@@ -250,7 +250,7 @@ def _fit_bent(data: Samples, search: Search, bend: float) -> RelaxationFit:
     )
 
 
-def of_vessels(fit: RelaxationFit) -> RelaxationFit:
+def square_levels(fit: RelaxationFit) -> RelaxationFit:
     """Return the levels of blood of a fit to its square root.
 
     Blood fills its vessels' cross-section: where their radius relaxes exponentially, so does the
@@ -269,7 +269,7 @@ def of_vessels(fit: RelaxationFit) -> RelaxationFit:
     Examples
     --------
     >>> time = np.linspace(0.0, 60.0, 12)
-    >>> found = of_vessels(fit_course(time, 0.15 + 0.03 * np.exp(-time / 20.0)))
+    >>> found = square_levels(fit_course(time, 0.15 + 0.03 * np.exp(-time / 20.0)))
     >>> round(float(found.start[0]), 4), round(float(found.end[0]), 4), round(found.time_constant_s)
     (0.0324, 0.0225, 20)
     """
@@ -287,17 +287,17 @@ def of_vessels(fit: RelaxationFit) -> RelaxationFit:
     )
 
 
-def _fit(given: Samples, search: Search) -> RelaxationFit:
+def _fit(given: CurveSamples, search: RelaxationGrid) -> RelaxationFit:
     data = given.with_free_step()
-    for _ in range(1 + data.stepped):
+    for _ in range(1 + data.has_steps):
         fit = _fit_once(data, search)
         # how much a step is held by its prior depends on the noise, which a free step leaves
         data = given.with_prior(np.square(fit.noise))
     return fit
 
 
-def _fit_once(data: Samples, search: Search) -> RelaxationFit:
-    landscape = ProfileLikelihood.of(data, search)
+def _fit_once(data: CurveSamples, search: RelaxationGrid) -> RelaxationFit:
+    landscape = ProfileLikelihood.evaluate(data, search)
     curve, delays = search.curve, search.delays
     delay, constant, noise2 = landscape.delay_s, landscape.time_constant_s, landscape.noise2
     interval, inner = map(landscape.constant_interval, (BOUND_LEVEL, ONE_SIGMA_LEVEL))
@@ -311,9 +311,9 @@ def _fit_once(data: Samples, search: Search) -> RelaxationFit:
     found_shape = curve(np.array([[delay]]), np.array([[constant]]))
     level, gap = (part[0] for part in data.levels(found_shape))
     flat = (data.residual(np.zeros_like(found_shape))[0] / noise2).sum()
-    differ = (flat - landscape.least) / curves / max(landscape.least / landscape.freedom, 1e-300)
-    changes = stats.f.sf(differ, curves, landscape.freedom) < LEVEL_TEST_P_VALUE
-    known: Known = "estimated"
+    differ = (flat - landscape.min_chi2) / curves / max(landscape.min_chi2 / landscape.dof, 1e-300)
+    changes = stats.f.sf(differ, curves, landscape.dof) < LEVEL_TEST_P_VALUE
+    known: TimeConstantStatus = "estimated"
     if not changes:
         known, interval, inner = "unknown", (0.0, float("inf")), (0.0, float("inf"))
     elif interval[0] == 0.0:
@@ -322,9 +322,9 @@ def _fit_once(data: Samples, search: Search) -> RelaxationFit:
         known = "only above"
     step = data.step(found_shape)[0]
     errors = landscape.level_errors(
-        gap, with_constant=known == "estimated", with_delay=delays.size > 1 and not data.stepped
+        gap, with_constant=known == "estimated", with_delay=delays.size > 1 and not data.has_steps
     )
-    if data.stepped:
+    if data.has_steps:
         # beside a step the delay trades with levels, and its end is as likely as its middle
         weights = landscape.delay_weights()
         shapes = curve(delays[:, None], landscape.constant_at_delays()[:, None])

@@ -17,9 +17,9 @@ import numpy as np
 from scipy import optimize, stats
 
 from reconstruction.arrays import Float64Array
-from reconstruction.facial_color.perfusion_samples import Samples
+from reconstruction.facial_color.perfusion_samples import CurveSamples
 
-Ends = tuple[float, float]
+Interval = tuple[float, float]
 Shape = Callable[[Float64Array, Float64Array], Float64Array]
 """Delays and constants of shape (..., 1) to the part of the way, (..., N)."""
 
@@ -30,7 +30,7 @@ _MIN_DELAY_STEPS = 3.0
 
 
 @dataclass(frozen=True, slots=True)
-class Search:
+class RelaxationGrid:
     """What is tried for a curve."""
 
     curve: Shape
@@ -47,26 +47,26 @@ class Search:
 class ProfileLikelihood:
     """Square sums of curves over their noise, at delays and time constants."""
 
-    data: Samples
-    search: Search
+    data: CurveSamples
+    search: RelaxationGrid
     total: Float64Array
     """(C, D or more): square sums of the best levels; beyond D are delays of each constant's
     own."""
     noise2: Float64Array
     """(P,): variance of one sample of each curve."""
-    freedom: float
+    dof: float
     """Degrees of freedom of all curves together."""
     delay_s: float
     """Most likely delay, s."""
     time_constant_s: float
     """Most likely time constant, s."""
-    least: float
+    min_chi2: float
     """Least square sum."""
     chi2: float
     """Weighted square sum over the degrees of freedom by the given standard errors; NaN without."""
 
     @staticmethod
-    def of(data: Samples, search: Search) -> ProfileLikelihood:
+    def evaluate(data: CurveSamples, search: RelaxationGrid) -> ProfileLikelihood:
         """Look at all delays and constants, and refine the best.
 
         Parameters
@@ -122,14 +122,14 @@ class ProfileLikelihood:
             search,
             total=total,
             noise2=noise2,
-            freedom=nu,
+            dof=nu,
             delay_s=delay,
             time_constant_s=constant,
-            least=min(least, float(total.min())),
+            min_chi2=min(least, float(total.min())),
             chi2=float((by_curve[best] / data.variance).sum() / nu) if known else float("nan"),
         )
 
-    def constant_interval(self, level: float) -> Ends:
+    def constant_interval(self, level: float) -> Interval:
         """Return the ends of the time constant's interval of a confidence, s; 0, inf: none.
 
         Parameters
@@ -138,7 +138,7 @@ class ProfileLikelihood:
             Confidence, in (0, 1).
         """
         logs, best = np.log(self.search.constants), float(np.log(self.time_constant_s))
-        profile = self.total.min(axis=1) - self.least
+        profile = self.total.min(axis=1) - self.min_chi2
         low, high = _crossings(logs, profile, best, self._excess(level))
         return float(np.exp(low)), float(np.exp(high))
 
@@ -226,10 +226,10 @@ class ProfileLikelihood:
     def _along(self) -> Float64Array:
         """Return the excess of the square sum over its least, by delay, (D,)."""
         least = self.total[:, : self.search.delays.size].min(axis=0)
-        return np.asarray(least - self.least)
+        return np.asarray(least - self.min_chi2)
 
     def _excess(self, level: float) -> float:
-        return float(stats.f.ppf(level, 1, self.freedom))
+        return float(stats.f.ppf(level, 1, self.dof))
 
 
 def _near(since: Float64Array, constant: float, delays: Float64Array) -> Float64Array:
@@ -276,7 +276,7 @@ def _refined(
     return float(start[0]), float(start[1]), at_start
 
 
-def _crossings(grid: Float64Array, profile: Float64Array, best: float, excess: float) -> Ends:
+def _crossings(grid: Float64Array, profile: Float64Array, best: float, excess: float) -> Interval:
     """Return where a profile first rises by ``excess`` on both sides of its best; inf: nowhere."""
     ends: list[float] = []
     for sign in (-1, 1):

@@ -29,7 +29,7 @@ class PoseStep:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Samples:
+class CurveSamples:
     """Curves (P, N) with weights that sum to the number of samples of each; 0 where missing."""
 
     values: Float64Array
@@ -40,13 +40,13 @@ class Samples:
     """(N,): 1 where the face has moved, else 0."""
     stderr_of_pose: Float64Array
     """(P,): prior of the step; 0 where there is none, and where all samples are of one pose."""
-    taken: Float64Array
+    removed_fraction: Float64Array
     """(P,): part of the moved samples' mean that is taken from them, 0 to 1."""
 
     @staticmethod
     def of(
         at: Float64Array, values: ArrayLike, stderr: ArrayLike | None, pose: PoseStep | None = None
-    ) -> Samples:
+    ) -> CurveSamples:
         """Return the samples of curves, without steps yet.
 
         Parameters
@@ -81,14 +81,16 @@ class Samples:
         known = scale[:, 0] if stderr is not None else np.full(len(shown), np.nan)
         moved, of_pose = _steps(pose, good)
         none = np.zeros(len(shown))
-        return Samples(np.where(good, shown, 0.0), inverse * scale, known, moved, of_pose, none)
+        return CurveSamples(
+            np.where(good, shown, 0.0), inverse * scale, known, moved, of_pose, none
+        )
 
     @property
-    def stepped(self) -> bool:
+    def has_steps(self) -> bool:
         """Whether any curve has a step."""
         return bool((self.stderr_of_pose > 0).any())
 
-    def moves_between(
+    def pose_change_interval(
         self, phase: Float64Array, middle: float, longest: float
     ) -> tuple[float, float]:
         """Return between which delays the face moves: when it last had not, and first had.
@@ -112,16 +114,16 @@ class Samples:
         low, high = min(not_yet, already), max(not_yet, already)
         return (low, high) if high > low else (0.0, longest)
 
-    def with_free_step(self) -> Samples:
+    def with_free_step(self) -> CurveSamples:
         """Return these with steps of which nothing is known, where there are any."""
-        return replace(self, taken=np.where(self.stderr_of_pose > 0, 1.0, 0.0))
+        return replace(self, removed_fraction=np.where(self.stderr_of_pose > 0, 1.0, 0.0))
 
-    def with_prior(self, noise2: Float64Array) -> Samples:
+    def with_prior(self, noise2: Float64Array) -> CurveSamples:
         """Return these with steps of their prior, for noise of these variances (P,)."""
         many = (self.weights * self.moved).sum(axis=-1) * self.stderr_of_pose**2
         held = many / np.maximum(noise2 + many, 1e-300)
         # B = 1 - c m m'W / m'Wm has B'WB = W - (2c - c^2) W m m'W / m'Wm: W less the step's part
-        return replace(self, taken=1.0 - np.sqrt(np.maximum(1.0 - held, 0.0)))
+        return replace(self, removed_fraction=1.0 - np.sqrt(np.maximum(1.0 - held, 0.0)))
 
     def residual(self, shape: Float64Array) -> Float64Array:
         """Return the weighted square sum of the best levels, (..., P), of shapes (..., N)."""
@@ -147,16 +149,16 @@ class Samples:
         """Return the best step of each curve, (..., P), of shapes (..., N)."""
         level, gap = self.levels(shape)
         left = self.values - level[..., None] - gap[..., None] * shape[..., None, :]
-        return np.asarray((1.0 - (1.0 - self.taken) ** 2) * self._of_moved(left))
+        return np.asarray((1.0 - (1.0 - self.removed_fraction) ** 2) * self._of_moved(left))
 
     def _without_step(self, shape: Float64Array) -> tuple[Float64Array, Float64Array, Float64Array]:
         """Return ones, values and shape with the moved samples' mean taken from them."""
         curve = shape[..., None, :]
-        if not self.taken.any():
+        if not self.removed_fraction.any():
             return np.ones_like(self.values), self.values, curve
 
         def shed(part: Float64Array) -> Float64Array:
-            off = self.taken * self._of_moved(part)
+            off = self.removed_fraction * self._of_moved(part)
             return np.asarray(part - off[..., None] * self.moved)
 
         return shed(np.ones_like(self.values)), shed(self.values), shed(curve)

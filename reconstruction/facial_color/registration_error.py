@@ -107,7 +107,9 @@ def _slopes(
         whole = good[here] & good[after]
         slope = np.where(whole[..., None], log_rgb[after] - log_rgb[here], 0.0)
         if window_px is not None:
-            slope = np.where(whole[..., None], slope - _even(slope, whole, window_px), 0.0)
+            slope = np.where(
+                whole[..., None], slope - _average_brightness_slope(slope, whole, window_px), 0.0
+            )
         products = slope[..., :, None] * slope[..., None, :]
         by_noise = np.where(whole[..., None], noise[after] + noise[here], 0.0)
         products -= by_noise[..., :, None] * np.eye(3)
@@ -124,7 +126,9 @@ def _slopes(
     return np.asarray((vectors * np.maximum(values, 0.0)[..., None, :]) @ vectors.swapaxes(-1, -2))
 
 
-def _even(slope: Float64Array, known: BoolArray, window_px: float) -> Float64Array:
+def _average_brightness_slope(
+    slope: Float64Array, known: BoolArray, window_px: float
+) -> Float64Array:
     """Return the slope of brightness averaged over a window, (..., 1), for all channels alike."""
     weight = gaussian_filter(known.astype(np.float64), window_px, mode="constant")
     total = gaussian_filter(slope.mean(axis=-1), window_px, mode="constant")

@@ -16,7 +16,7 @@ _MAX_MEDIAN_PIXELS = 200_000
 """Pixels that tell a median to a quarter of a percent."""
 
 
-def average(
+def average_repeats(
     rgb: FloatArray, variance: FloatArray, valid: BoolArray
 ) -> tuple[Float32Array, Float32Array, BoolArray]:
     """Return the mean of repeats where any is valid, and the variance of the mean.
@@ -47,7 +47,7 @@ def average(
     Examples
     --------
     >>> noise = 0.01 * np.random.default_rng(0).standard_normal((4, 50, 50, 3))
-    >>> mean, variance, _ = average(
+    >>> mean, variance, _ = average_repeats(
     ...     0.5 + noise, np.full_like(noise, 1e-4), np.ones((4, 50, 50), bool))
     >>> bool(abs(mean.mean() - 0.5) < 1e-3), bool(abs(variance.mean() / 2.5e-5 - 1.0) < 0.1)
     (True, True)
@@ -76,7 +76,7 @@ def overdispersion(rgb: FloatArray, variance: FloatArray, valid: BoolArray) -> f
     Parameters
     ----------
     rgb, variance, valid
-        As of `average`.
+        As of `average_repeats`.
 
     Examples
     --------

@@ -91,14 +91,14 @@ class Repeatability:
         The whole face is the last one.
     false_alarm : float
         Chance that any region is said to scatter when there is noise alone.
-    left_out : tuple of (str, str)
+    omitted : tuple of (str, str)
         Regions with too few valid pixels, and how many they have.
     """
 
     states: tuple[str, ...]
     regions: tuple[RegionRepeatability, ...]
     false_alarm: float
-    left_out: tuple[tuple[str, str], ...]
+    omitted: tuple[tuple[str, str], ...]
 
     def region(self, name: str) -> RegionRepeatability:
         """Return a region by name."""
@@ -110,7 +110,7 @@ class Repeatability:
 
 
 @dataclass(frozen=True, slots=True)
-class Drift:
+class MapDrift:
     """How a map changes over the order of capture.
 
     Attributes
@@ -132,7 +132,7 @@ class Drift:
     drifts: bool
 
 
-def compare(
+def compare_states(
     maps: ArrayLike,
     states: Sequence[str],
     *,
@@ -179,7 +179,7 @@ def compare(
     >>> rng = np.random.default_rng(0)
     >>> level = np.array([0.02, 0.03, 0.02, 0.03])[:, None, None]
     >>> maps = level + 1e-3 * rng.standard_normal((4, 24, 24))
-    >>> found = compare(
+    >>> found = compare_states(
     ...     maps, ["neutral", "smile"] * 2, stderr=np.full(maps.shape, 1e-3)
     ... ).region("whole face")
     >>> found.correlation > 0.99, found.scatters
@@ -194,7 +194,7 @@ def compare(
     return Repeatability(captured.states, found, false_alarm, left_out)
 
 
-def drift(
+def fit_drift(
     maps: ArrayLike,
     states: Sequence[str],
     times_s: ArrayLike,
@@ -204,13 +204,13 @@ def drift(
     regions: Mapping[str, ArrayLike] | None = None,
     correlated_px: float = 1.0,
     false_alarm: float = SCATTER_FALSE_ALARM_RATE,
-) -> tuple[Drift, ...]:
+) -> tuple[MapDrift, ...]:
     """Fit how a map, such as melanin, drifts over the time of capture.
 
     Parameters
     ----------
     maps, states, stderr, valid, regions, correlated_px, false_alarm
-        As of `compare`; states that were captured once tell nothing of drift.
+        As of `compare_states`; states that were captured once tell nothing of drift.
     times_s : array_like, shape (N,)
         When each was captured, s.
 
@@ -231,7 +231,7 @@ def drift(
     --------
     >>> times = 60.0 * np.arange(6)
     >>> maps = 0.02 + 1e-4 * np.arange(6)[:, None, None] + np.zeros((6, 8, 8))
-    >>> found = drift(maps, ["neutral", "smile"] * 3, times, stderr=np.full(maps.shape, 1e-4))
+    >>> found = fit_drift(maps, ["neutral", "smile"] * 3, times, stderr=np.full(maps.shape, 1e-4))
     >>> f"{found[-1].slope_per_minute:.5f}", found[-1].drifts
     ('0.00010', True)
     """
@@ -258,7 +258,7 @@ def drift(
         sigmas = abs(slope) / max(stderr_slope, 1e-300)
         one_side = stats.t.sf(sigmas, degrees) if by_scatter >= by_noise else stats.norm.sf(sigmas)
         p_value = float(2 * one_side)
-        found.append(Drift(region.name, slope, stderr_slope, p_value, p_value < limit))
+        found.append(MapDrift(region.name, slope, stderr_slope, p_value, p_value < limit))
     return tuple(found)
 
 

@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from model.checks import Checks
 from model.facial_color import HemoglobinRig, StateMaps
-from model.facial_color.coarse_maps import Cells
+from model.facial_color.coarse_maps import CoarseGrid
 from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.correspondence import landmark_field
 
@@ -60,12 +60,12 @@ def transfer_rig(
     onto = np.array([landmarks_onto[name] for name in names], np.float64)
     own = np.array([landmarks_rig[name] for name in names], np.float64)
     try:
-        field = landmark_field.fit(onto, own, stderr_px=TRANSFER_LANDMARK_STDERR_PX)
+        field = landmark_field.fit_landmark_field(onto, own, stderr_px=TRANSFER_LANDMARK_STDERR_PX)
     except landmark_field.LandmarkFieldError as error:
         raise RigTransferError(f"landmarks: {error}") from error
     stored = (min(rig.neutral_mean.shape[0], shape[0]), min(rig.neutral_mean.shape[1], shape[1]))
     place = _centres(shape, stored)
-    moved, unsure_px = field.at(place.reshape(-1, 2))
+    moved, unsure_px = field.evaluate(place.reshape(-1, 2))
     source = place + moved.reshape(place.shape)
     told = unsure_px.reshape(stored) <= rig.radius_px
     sides = zip(
@@ -86,7 +86,7 @@ def transfer_rig(
             storage_rms=state.storage_rms,
             storage_largest=state.storage_largest,
         )
-    (neutral,) = Cells(shape, stored).refine(np.where(here, mean, 0.0), valid=here)
+    (neutral,) = CoarseGrid(shape, stored).refine(np.where(here, mean, 0.0), valid=here)
     valid = np.isfinite(neutral)
     size = float(np.median(np.hypot(*np.gradient(source[..., 0]))))
     per_cell = shape[1] / stored[1]

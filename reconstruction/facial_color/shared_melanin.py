@@ -31,20 +31,24 @@ from model.color_table import ColorTable
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.chromophores import (
     ChromophoreError,
+    add_brightness_variance,
     invert,
     model_covariance,
-    without_brightness,
 )
 from reconstruction.chromophores.face import estimate_face
 from reconstruction.chromophores.inversion import DEFAULT_RELATIVE_NOISE
-from reconstruction.chromophores.pixel_checks import broadcast, checked_mask, usable_colors
+from reconstruction.chromophores.pixel_checks import (
+    broadcast_to_pixels,
+    check_mask,
+    is_usable_color,
+)
 from reconstruction.chromophores.posterior import MIN_RELATIVE_NOISE, ChromophorePosterior
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION
 from reconstruction.facial_color import light_change
 from reconstruction.facial_color import shared_melanin_kernels as kernels
 
-OWN_VARIANCE_FRACTION = 0.01
+STATE_VARIANCE_FRACTION = 0.01
 """Part of the model error's variance that is each state's own: 0.0001 to 0.007 between simulated
 pictures of the same unmoved face in neutral, smile, fear and exercise, seeds 0 to 3."""
 SHADING_WINDOW_PX = 3.0
@@ -88,7 +92,7 @@ class SharedMelanin:
     """State that changes are taken from."""
 
     @property
-    def misfits(self) -> BoolArray:
+    def is_misfit(self) -> BoolArray:
         """(S, ...): the color does not belong to the pixel's melanin: misplaced, or a highlight."""
         with np.errstate(invalid="ignore"):
             return np.asarray(self.valid_states & (self.residual > MISFIT_SIGMAS))
@@ -104,8 +108,8 @@ def estimate_shared_melanin(
     valid: ArrayLike | None = None,
     reference: int = 0,
     shading_window_px: float | None = None,
-    own_share: float = OWN_VARIANCE_FRACTION,
-    own_error: ArrayLike | None = None,
+    state_variance_fraction: float = STATE_VARIANCE_FRACTION,
+    state_covariance: ArrayLike | None = None,
     one_face: bool = False,
 ) -> SharedMelanin:
     """Estimate one melanin and the blood of every state, pixel by pixel.
@@ -133,9 +137,9 @@ def estimate_shared_melanin(
         by a Gaussian of so many px, best `SHADING_WINDOW_PX`; pixels may be off it by as much as
         their colors and their neighbors' show. Pixels must be (H, W) then. None: the light is free
         in each pixel and state.
-    own_share : float
+    state_variance_fraction : float
         Part of the model error's variance that is each state's own, 0...1.
-    own_error : array_like, shape (S, ..., 3, 3), optional
+    state_covariance : array_like, shape (S, ..., 3, 3), optional
         Covariance of what each state's relative color errs by beside all that, such as where it
         was misplaced (`reconstruction.facial_color.registration_error`). None: nothing.
     one_face : bool
@@ -155,10 +159,10 @@ def estimate_shared_melanin(
     Examples
     --------
     >>> from model import color_table
-    >>> from reconstruction.chromophores.shading_prior import lognormal
+    >>> from reconstruction.chromophores.shading_prior import lognormal_prior
     >>> table = color_table.build("Nikon 5100 (NPL)", "D65")
     >>> color = 0.8 * table.lookup([[0.02], [0.02]], [[0.03], [0.05]])
-    >>> given = {"prior": lognormal(0.7, 0.6), "variance": (2e-3 * color) ** 2}
+    >>> given = {"prior": lognormal_prior(0.7, 0.6), "variance": (2e-3 * color) ** 2}
     >>> found = estimate_shared_melanin(color, table, **given)
     >>> f"{found.melanin[0]:.3f}", f"{found.change[1, 0]:.3f}"
     ('0.020', '0.020')
@@ -172,15 +176,15 @@ def estimate_shared_melanin(
     if shading_window_px is not None:
         check.within("shading_window_px", shading_window_px, "(0, inf]")
         check.require(len(shape) == 2, "shading_window_px", f"rgb {colors.shape}", "(S, H, W, 3)")
-    check.within("own_share", own_share, "[0, 1]")
+    check.within("own_share", state_variance_fraction, "[0, 1]")
     seen = _States.of(colors, variance, valid)
     each_error, usual = _model_errors(model_error, shape, seen.usable)
-    common = each_error * (1.0 - own_share)
-    least = own_share * usual + MIN_RELATIVE_NOISE**2
-    owns = _own_errors(own_error, least, (states, *shape), seen.usable)
+    common = each_error * (1.0 - state_variance_fraction)
+    least = state_variance_fraction * usual + MIN_RELATIVE_NOISE**2
+    owns = _state_covariances(state_covariance, least, (states, *shape), seen.usable)
     mean, mean_variance = _mean_color(seen, table, owns)
     mean_rgb = np.exp(mean)
-    error = _with_mean_of(owns, seen, common)
+    error = _mean_color_covariance(owns, seen, common)
     found = estimate_face(
         mean_rgb.reshape(*shape, 3),
         table,
@@ -196,7 +200,9 @@ def estimate_shared_melanin(
     if shading_window_px is not None and states > 1:
         good = fit.good & (of_states["residual"] < MISFIT_SIGMAS)
         light = of_states["log_shading"], of_states["log_shading_variance"]
-        log_change, stiffness = light_change.smooth(*light, good, shape, shading_window_px)
+        log_change, stiffness = light_change.smooth_light_changes(
+            *light, good, shape, shading_window_px
+        )
         stiffness = np.where(fit.good, stiffness, 0.0).astype(np.float32)
         of_pixels, of_states = fit(log_change, stiffness)
     named = {name: values.reshape(states, *shape) for name, values in of_states.items()}
@@ -227,12 +233,12 @@ class _States:
 
     @staticmethod
     def of(colors: Float32Array, variance: ArrayLike | None, valid: ArrayLike | None) -> _States:
-        usable = usable_colors(colors)
+        usable = is_usable_color(colors)
         if valid is not None:
-            usable &= checked_mask(valid, usable.shape)
+            usable &= check_mask(valid, usable.shape)
         relative: FloatArray = np.full(colors.shape, DEFAULT_RELATIVE_NOISE**2, np.float32)
         if variance is not None:
-            values = broadcast("variance", np.asarray(variance, np.float32), colors.shape)
+            values = broadcast_to_pixels("variance", np.asarray(variance, np.float32), colors.shape)
             negative = np.nan_to_num(values[usable]).min(initial=0.0) < 0.0
             Checks(ChromophoreError).require(not negative, "variance", "a negative one", ">= 0")
             relative = values / np.square(np.where(usable[..., None], colors, 1.0))
@@ -266,7 +272,7 @@ class _BloodFit:
         self._fixed = (
             np.ascontiguousarray(begin, np.float32),
             np.where(np.isfinite(stderr), stderr, 0.0).astype(np.float32),
-            np.ascontiguousarray(without_brightness(errors[0])),
+            np.ascontiguousarray(add_brightness_variance(errors[0])),
             errors[1],
             np.ascontiguousarray(table.cells, np.float64),
             *ends.tolist(),
@@ -287,7 +293,7 @@ class _BloodFit:
         of_states = np.empty((len(kernels.STATE_MAPS), states, pixels), np.float32)
         seen = self._seen.log_rgb, self._seen.relative, self.good, self._mean
         maps = of_pixels, of_states, _TASK_PIXELS
-        kernels.blood_of_states(*seen, log_change, stiffness, *self._fixed, self._reference, *maps)
+        kernels.fit_state_blood(*seen, log_change, stiffness, *self._fixed, self._reference, *maps)
         return of_pixels, dict(zip(kernels.STATE_MAPS, of_states, strict=True))
 
 
@@ -312,14 +318,17 @@ def _model_errors(
 _UPPER_TRIANGLE = np.triu_indices(3)
 
 
-def _own_errors(
-    own_error: ArrayLike | None, least: Float64Array, shape: tuple[int, ...], usable: BoolArray
+def _state_covariances(
+    state_covariance: ArrayLike | None,
+    min_variance: Float64Array,
+    shape: tuple[int, ...],
+    usable: BoolArray,
 ) -> Float64Array:
     """Return upper triangles of the states' own covariances, (S, n or 1, 6)."""
-    diagonal = np.diag(least)[_UPPER_TRIANGLE]
-    if own_error is None:
+    diagonal = np.diag(min_variance)[_UPPER_TRIANGLE]
+    if state_covariance is None:
         return np.ascontiguousarray(np.broadcast_to(diagonal, (shape[0], 1, 6)))
-    given = np.asarray(own_error, np.float64)
+    given = np.asarray(state_covariance, np.float64)
     Checks(ChromophoreError).shape("own_error", given, (*shape, 3, 3))
     flat = given.reshape(shape[0], -1, 3, 3)[..., _UPPER_TRIANGLE[0], _UPPER_TRIANGLE[1]]
     Checks(ChromophoreError).within("own_error", flat[usable])
@@ -329,7 +338,7 @@ def _own_errors(
     return np.ascontiguousarray(np.where(usable[..., None], flat, 0.0) + diagonal)
 
 
-def _with_mean_of(owns: Float64Array, seen: _States, common: Float64Array) -> Float64Array:
+def _mean_color_covariance(owns: Float64Array, seen: _States, common: Float64Array) -> Float64Array:
     """Return what the mean color of the states errs by beside noise, (3, 3) or (n, 3, 3)."""
     if owns.shape[1] == 1:
         own = np.zeros((3, 3))
@@ -362,7 +371,7 @@ def _mean_color(
     mean, variance = np.empty((2, *plain.shape), np.float32)
     given = seen.log_rgb, seen.relative, seen.usable, begin.astype(np.float32), owns
     cells = np.ascontiguousarray(table.cells, np.float64)
-    kernels.mean_color(*given, cells, mean, variance, _TASK_PIXELS)
+    kernels.average_state_colors(*given, cells, mean, variance, _TASK_PIXELS)
     return mean, variance
 
 

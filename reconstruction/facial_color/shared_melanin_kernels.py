@@ -10,7 +10,7 @@ import numpy as np
 from numba import boolean, float32, float64, int64, njit, prange, void
 
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION
-from reconstruction.compiled import CONTRACT, OVER_PIXELS, given
+from reconstruction.compiled import FASTMATH_CONTRACT, PIXEL_KERNEL_OPTIONS, readonly_array_type
 
 MAX_SHARED_STEPS = 12
 MAX_BLOOD_STEP = 0.15
@@ -31,7 +31,7 @@ STATE_MAPS = (
 _MIN_AXIS_FRACTION = float(MIN_AXIS_FRACTION)
 
 
-@njit(fastmath=CONTRACT)
+@njit(fastmath=FASTMATH_CONTRACT)
 def _color(cells, a, b, out):  # type: ignore[no-untyped-def]
     """Write log color and its derivatives by the axes' fractions: out (3 of value, a, b; 3)."""
     last = cells.shape[0]
@@ -51,7 +51,7 @@ def _color(cells, a, b, out):  # type: ignore[no-untyped-def]
         out[2, c] = v_y * last / v
 
 
-@njit(fastmath=CONTRACT)
+@njit(fastmath=FASTMATH_CONTRACT)
 def _weights(each, model, stiffness, w):  # type: ignore[no-untyped-def]
     """Write the inverse of each + model + brightness / stiffness, (3, 3), to `w`.
 
@@ -79,7 +79,7 @@ def _weights(each, model, stiffness, w):  # type: ignore[no-untyped-def]
     return t0 / total, t1 / total, t2 / total
 
 
-@njit(fastmath=CONTRACT)
+@njit(fastmath=FASTMATH_CONTRACT)
 def _times(w, g):  # type: ignore[no-untyped-def]
     """Return W g."""
     return (
@@ -89,7 +89,7 @@ def _times(w, g):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(fastmath=CONTRACT)
+@njit(fastmath=FASTMATH_CONTRACT)
 def _form(each, common, p, q):  # type: ignore[no-untyped-def]
     """Return p' (each + common brightness) q; `each` is symmetric, (3, 3)."""
     return (
@@ -103,8 +103,8 @@ def _form(each, common, p, q):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(fastmath=CONTRACT)
-def _own_error(variance, own, each):  # type: ignore[no-untyped-def]
+@njit(fastmath=FASTMATH_CONTRACT)
+def _fill_state_covariance(variance, own, each):  # type: ignore[no-untyped-def]
     """Write a state's own covariance to `each`, (3, 3): noise and the triangle of its own error."""
     each[0, 0] = variance[0] + own[0]
     each[1, 1] = variance[1] + own[3]
@@ -114,12 +114,12 @@ def _own_error(variance, own, each):  # type: ignore[no-untyped-def]
     each[1, 2] = each[2, 1] = own[4]
 
 
-@njit(fastmath=CONTRACT)
+@njit(fastmath=FASTMATH_CONTRACT)
 def _dot(p, q):  # type: ignore[no-untyped-def]
     return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
 
 
-@njit(fastmath=CONTRACT)
+@njit(fastmath=FASTMATH_CONTRACT)
 def _blood(cells, w, log_rgb, a, b, color):  # type: ignore[no-untyped-def]
     """Return the blood, as a fraction of its axis, that fits a log color under a melanin.
 
@@ -155,19 +155,21 @@ def _blood(cells, w, log_rgb, a, b, color):  # type: ignore[no-untyped-def]
 
 @njit(
     void(
-        given(float32, 3),  # log rgb (s, n, 3)
-        given(float32, 3),  # relative variance (s, n, 3)
-        given(boolean, 2),  # usable (s, n)
-        given(float32, 2),  # where to begin: fractions of the axes (n, 2)
-        given(float64, 3),  # upper triangle of each state's own covariance (s, n or 1, 6)
-        given(float64, 5),  # cells of the color table
+        readonly_array_type(float32, 3),  # log rgb (s, n, 3)
+        readonly_array_type(float32, 3),  # relative variance (s, n, 3)
+        readonly_array_type(boolean, 2),  # usable (s, n)
+        readonly_array_type(float32, 2),  # where to begin: fractions of the axes (n, 2)
+        readonly_array_type(
+            float64, 3
+        ),  # upper triangle of each state's own covariance (s, n or 1, 6)
+        readonly_array_type(float64, 5),  # cells of the color table
         float32[:, ::1],  # mean log color as of skin with the mean blood (n, 3)
         float32[:, ::1],  # its relative variance, noise alone (n, 3)
         int64,  # pixels a task
     ),
-    **OVER_PIXELS,
+    **PIXEL_KERNEL_OPTIONS,
 )
-def mean_color(  # type: ignore[no-untyped-def]
+def average_state_colors(  # type: ignore[no-untyped-def]
     log_rgb, variance, usable, begin, owns, cells, mean, mean_variance, block
 ):
     """Average the states' colors as if all had the mean blood; shapes are in the signature."""
@@ -191,7 +193,7 @@ def mean_color(  # type: ignore[no-untyped-def]
                     continue
                 for c in range(3):
                     here[c] = log_rgb[s, n, c]
-                _own_error(variance[s, n], owns[s, n if owns.shape[1] > 1 else 0], each)
+                _fill_state_covariance(variance[s, n], owns[s, n if owns.shape[1] > 1 else 0], each)
                 _weights(each, nothing, 0.0, w)
                 blood[s] = _blood(cells, w, here, a, b, color)
                 share[s] = 1.0 / (each[0, 0] + each[1, 1] + each[2, 2])
@@ -216,17 +218,25 @@ def mean_color(  # type: ignore[no-untyped-def]
 
 @njit(
     void(
-        given(float32, 3),  # log rgb (s, n, 3)
-        given(float32, 3),  # relative variance (s, n, 3)
-        given(boolean, 2),  # usable (s, n)
-        given(float32, 2),  # mean log color (n, 3), as of `mean_color`
-        given(float32, 2),  # log shading of each state, up to a factor (s, n)
-        given(float32, 2),  # one over its variance (s, n); 0 everywhere: free
-        given(float32, 2),  # melanin and where blood begins: fractions of the axes (n, 2)
-        given(float32, 1),  # standard error of melanin, as a fraction of its axis (n,)
-        given(float64, 3),  # covariance of the model error common to the states (n or 1, 3, 3)
-        given(float64, 3),  # upper triangle of each state's own covariance (s, n or 1, 6)
-        given(float64, 5),  # cells of the color table
+        readonly_array_type(float32, 3),  # log rgb (s, n, 3)
+        readonly_array_type(float32, 3),  # relative variance (s, n, 3)
+        readonly_array_type(boolean, 2),  # usable (s, n)
+        readonly_array_type(float32, 2),  # mean log color (n, 3), as of `average_state_colors`
+        readonly_array_type(float32, 2),  # log shading of each state, up to a factor (s, n)
+        readonly_array_type(float32, 2),  # one over its variance (s, n); 0 everywhere: free
+        readonly_array_type(
+            float32, 2
+        ),  # melanin and where blood begins: fractions of the axes (n, 2)
+        readonly_array_type(
+            float32, 1
+        ),  # standard error of melanin, as a fraction of its axis (n,)
+        readonly_array_type(
+            float64, 3
+        ),  # covariance of the model error common to the states (n or 1, 3, 3)
+        readonly_array_type(
+            float64, 3
+        ),  # upper triangle of each state's own covariance (s, n or 1, 6)
+        readonly_array_type(float64, 5),  # cells of the color table
         float64,  # end of the axis of melanin as a volume fraction
         float64,  # end of the axis of blood as a volume fraction
         int64,  # state that changes are taken from
@@ -234,9 +244,9 @@ def mean_color(  # type: ignore[no-untyped-def]
         float32[:, :, ::1],  # maps of the states (8, s, n): see STATE_MAPS
         int64,  # pixels a task
     ),
-    **OVER_PIXELS,
+    **PIXEL_KERNEL_OPTIONS,
 )
-def blood_of_states(  # type: ignore[no-untyped-def]
+def fit_state_blood(  # type: ignore[no-untyped-def]
     log_rgb,
     variance,
     usable,
@@ -291,7 +301,9 @@ def blood_of_states(  # type: ignore[no-untyped-def]
                 share[s] = 0.0
                 if not (usable[s, n] and a == a):
                     continue
-                _own_error(variance[s, n], owns[s, n if owns.shape[1] > 1 else 0], each[s])
+                _fill_state_covariance(
+                    variance[s, n], owns[s, n if owns.shape[1] > 1 else 0], each[s]
+                )
                 level[s] = 1.0 / stiffness[s, n] if stiffness[s, n] > 0.0 else 0.0
                 share[s] = 1.0 / (each[s, 0, 0] + each[s, 1, 1] + each[s, 2, 2])
                 total += share[s]

@@ -2,12 +2,12 @@
 
 from reconstruction.gradient_normals.estimation import Roughness, estimate_roughness, from_patterns
 from reconstruction.gradient_normals.noise import SensorNoise
-from reconstruction.gradient_normals.patterns import GradientError, MissingPatterns
+from reconstruction.gradient_normals.patterns import GradientError, MissingPatternsError
 from reconstruction.gradient_normals.sphere_lights import SphereLights, SphereLightsError
 
 __all__ = [
     "GradientError",
-    "MissingPatterns",
+    "MissingPatternsError",
     "Roughness",
     "SensorNoise",
     "SphereLights",

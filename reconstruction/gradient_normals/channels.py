@@ -21,7 +21,7 @@ from reconstruction.gradient_normals.patterns import (
     POLARIZER_NAMES,
     GradientError,
     Key,
-    Stack,
+    PatternStack,
 )
 from reconstruction.normal_maps import NormalMaps
 
@@ -59,7 +59,7 @@ class PatternSamples:
         given = sliced(self.patterns), sliced(self.variance), sliced(self.valid)
         return PatternSamples(*given, self.saturation)
 
-    def summed(self) -> PatternSamples:
+    def sum_channels(self) -> PatternSamples:
         """Add the channels of pictures up; NaN where one of them is not valid or saturated."""
         out: dict[Key, FloatArray] = {}
         for key, given in self.patterns.items():
@@ -92,7 +92,7 @@ class PatternSamples:
         return total(variance)
 
 
-def joined(maps: Sequence[NormalMaps]) -> NormalMaps:
+def stack_channels(maps: Sequence[NormalMaps]) -> NormalMaps:
     """Return the maps of channels as one, channels on the points' last axis."""
     return NormalMaps(
         np.stack([m.normals for m in maps], axis=-2),
@@ -103,7 +103,7 @@ def joined(maps: Sequence[NormalMaps]) -> NormalMaps:
     )
 
 
-def collect(given: PatternSamples) -> dict[str, Stack]:
+def sort_by_polarization(samples: PatternSamples) -> dict[str, PatternStack]:
     """Check the pictures and sort them by polarization.
 
     Returns
@@ -112,10 +112,10 @@ def collect(given: PatternSamples) -> dict[str, Stack]:
         By polarization, of those that pictures were given of.
     """
     check = Checks(GradientError)
-    check.require(given.patterns, "patterns", "none", "pictures keyed (pattern, polarizer)")
+    check.require(samples.patterns, "patterns", "none", "pictures keyed (pattern, polarizer)")
     shape: tuple[int, ...] = ()
-    stacks: dict[str, Stack] = {}
-    for key, picture in given.patterns.items():
+    stacks: dict[str, PatternStack] = {}
+    for key, picture in samples.patterns.items():
         name, polarizer = _known_key(key)
         image = np.asarray(picture)
         where, got = f"patterns[{name!r}, {polarizer!r}]", f"{image.dtype} of shape {image.shape}"
@@ -123,16 +123,16 @@ def collect(given: PatternSamples) -> dict[str, Stack]:
         check.require(good, where, got, "linear numbers (H, W) or (H, W, C)")
         shape = shape or image.shape
         check.shape(where, image, shape)
-        stack = stacks.setdefault(polarizer, Stack({}, None, {}))
-        stack.pictures[name] = image
-        mask = _mask(given.valid, (name, polarizer), shape)
-        if given.saturation is not None:
+        stack = stacks.setdefault(polarizer, PatternStack({}, None, {}))
+        stack.images[name] = image
+        mask = _mask(samples.valid, (name, polarizer), shape)
+        if samples.saturation is not None:
             with np.errstate(invalid="ignore"):
-                clear = ~(image >= given.saturation)
+                clear = ~(image >= samples.saturation)
             mask = clear if mask is None else mask & clear
         if mask is not None and not mask.all():
             stack.valid[name] = mask
-    variance = given.variance
+    variance = samples.variance
     if variance is None or isinstance(variance, SensorNoise):
         return stacks
     return {
@@ -165,10 +165,12 @@ def _mask(valid: Valid, key: Key, shape: tuple[int, ...]) -> BoolArray | None:
     return np.asarray(given)
 
 
-def _with_variance(stack: Stack, polarizer: str, variance: Any, shape: tuple[int, ...]) -> Stack:
+def _with_variance(
+    stack: PatternStack, polarizer: str, variance: Any, shape: tuple[int, ...]
+) -> PatternStack:
     found: dict[str, FloatArray] = {}
     check = Checks(GradientError)
-    for name in stack.pictures:
+    for name in stack.images:
         key, where = (name, polarizer), f"variance[{name!r}, {polarizer!r}]"
         own = variance
         if isinstance(variance, Mapping):
@@ -185,4 +187,4 @@ def _with_variance(stack: Stack, polarizer: str, variance: Any, shape: tuple[int
             stack.valid[name] = good if before is None else before & good
             values = np.where(good, values, 1.0)
         found[name] = values
-    return Stack(stack.pictures, found, stack.valid)
+    return PatternStack(stack.images, found, stack.valid)

@@ -28,20 +28,24 @@ from reconstruction.gradient_normals.channels import (
     PatternSamples,
     Valid,
     Variance,
-    collect,
-    joined,
+    sort_by_polarization,
+    stack_channels,
 )
-from reconstruction.gradient_normals.inversion import Inversion, places_of, views_of
-from reconstruction.gradient_normals.lobe_response import Response
+from reconstruction.gradient_normals.inversion import (
+    MomentInversion,
+    frame_positions,
+    normalize_views,
+)
+from reconstruction.gradient_normals.lobe_response import LobeResponseTable
 from reconstruction.gradient_normals.moments import (
-    Reflection,
-    prepare,
-    with_filter,
-    with_shared_dark,
+    ReflectionMoments,
+    apply_wiener_filter,
+    prepare_moments,
+    share_dark_frames,
 )
 from reconstruction.gradient_normals.noise import SensorNoise
 from reconstruction.gradient_normals.patterns import GradientError, Key
-from reconstruction.gradient_normals.sphere_lights import SphereLights, frame_of
+from reconstruction.gradient_normals.sphere_lights import SphereLights, view_frame
 from reconstruction.normal_maps import NormalMaps
 from reconstruction.tiles import map_on_threads
 
@@ -185,12 +189,12 @@ def from_patterns(
     if samples.channels is None:
         return normals_of(samples)
     if component == "specular":
-        return normals_of(samples.summed())
-    return joined([normals_of(samples.channel(k)) for k in range(samples.channels)])
+        return normals_of(samples.sum_channels())
+    return stack_channels([normals_of(samples.channel(k)) for k in range(samples.channels)])
 
 
 def _normals(
-    reflection: Reflection,
+    reflection: ReflectionMoments,
     view: ArrayLike,
     lights: SphereLights | None,
     alpha: float | Roughness | None,
@@ -200,19 +204,21 @@ def _normals(
     executor: Executor | None,
 ) -> NormalMaps:
     shape = reflection.shape
-    middle, each_view = views_of(view, shape)
-    places = places_of(points_mm, shape, middle, lights)
+    middle, each_view = normalize_views(view, shape)
+    places = frame_positions(points_mm, shape, middle, lights)
     if lights is None:
         got = "it without lights"
         Checks(GradientError).require(alpha is None, "alpha", got, "both or neither")
-        table = Response(np.zeros((0, 0, 0)), 0.0, 1.0, frame_of(middle))
+        table = LobeResponseTable(np.zeros((0, 0, 0)), 0.0, 1.0, view_frame(middle))
     elif reflection.component == "diffuse":
-        table = lobe_response.diffuse(lights, view=middle, eta=eta, near=places is not None)
+        table = lobe_response.diffuse_response(
+            lights, view=middle, eta=eta, near=places is not None
+        )
     else:
         if alpha is None:
             alpha = _roughness(reflection, lights, middle, eta)
         known = alpha if isinstance(alpha, Roughness) else Roughness(float(alpha), 0.0, 0)
-        table = lobe_response.specular(
+        table = lobe_response.specular_response(
             lights,
             view=middle,
             alpha=known.alpha,
@@ -221,8 +227,10 @@ def _normals(
             alpha_stderr=known.stderr,
         )
     if wiener:
-        reflection = with_filter(reflection)
-    return _maps(Inversion.of(reflection, table, lights, eta), each_view, places, executor)
+        reflection = apply_wiener_filter(reflection)
+    return _maps(
+        MomentInversion.prepare(reflection, table, lights, eta), each_view, places, executor
+    )
 
 
 def estimate_roughness(
@@ -255,10 +263,10 @@ def estimate_roughness(
     """
     samples = PatternSamples(patterns, variance, valid, saturation)
     if samples.channels is not None:
-        samples = samples.summed()
+        samples = samples.sum_channels()
     smooth = smooth_px, smooth_px if smooth_crossed_px is None else smooth_crossed_px
     reflection = _reflection_of(samples, "specular", lights, smooth)
-    found = _roughness(reflection, lights, views_of(view, reflection.shape)[0], eta)
+    found = _roughness(reflection, lights, normalize_views(view, reflection.shape)[0], eta)
     if found.pixels == 0:
         raise GradientError("patterns: no pixel has a specular signal above its noise")
     return found
@@ -269,7 +277,7 @@ def _reflection_of(
     component: Literal["specular", "diffuse"],
     lights: SphereLights | None,
     smooth_px: tuple[float, float],
-) -> Reflection:
+) -> ReflectionMoments:
     """Return the moments of one component's reflection, corrected for leaking polarizers."""
     leakage = 0.0
     if lights is not None:
@@ -278,8 +286,8 @@ def _reflection_of(
         if leakage > MAX_MEDIAN_LEAKAGE:
             _warn_of_leakage(round(leakage, 4))
     noise = samples.variance if isinstance(samples.variance, SensorNoise) else None
-    stacks = with_shared_dark(collect(samples))
-    return prepare(stacks, component, noise=noise, leakage=leakage, smooth_px=smooth_px)
+    stacks = share_dark_frames(sort_by_polarization(samples))
+    return prepare_moments(stacks, component, noise=noise, leakage=leakage, smooth_px=smooth_px)
 
 
 @lru_cache(maxsize=64)
@@ -294,7 +302,7 @@ def _warn_of_leakage(leakage: float) -> None:
 
 
 def _roughness(
-    reflection: Reflection, lights: SphereLights, middle: FloatArray, eta: float
+    reflection: ReflectionMoments, lights: SphereLights, middle: FloatArray, eta: float
 ) -> Roughness:
     rows = list(reflection.tiles())
     height, width = reflection.shape
@@ -312,8 +320,10 @@ def _roughness(
 
     def excess(log_alpha: float) -> tuple[float, FloatArray]:
         """Return how much longer the vectors are than this roughness makes them, each and all."""
-        table = lobe_response.specular(lights, view=middle, alpha=float(np.exp(log_alpha)), eta=eta)
-        found = Inversion.of(reflection, table, lights, eta).normals(moments)
+        table = lobe_response.specular_response(
+            lights, view=middle, alpha=float(np.exp(log_alpha)), eta=eta
+        )
+        found = MomentInversion.prepare(reflection, table, lights, eta).normals(moments)
         # no vector is longer than its light; a lobe that falls between lights has no length at all
         length = found[:, kernels.CONCENTRATION]
         good = (found[:, kernels.STATUS] == kernels.GOOD) & (length >= 0.0) & (length <= 1.0)
@@ -353,7 +363,7 @@ def _roughness(
 
 
 def _maps(
-    inversion: Inversion,
+    inversion: MomentInversion,
     view: FloatArray | None,
     places: FloatArray | None,
     executor: Executor | None,
@@ -394,7 +404,7 @@ def _maps(
 
     contradiction = map_on_threads(solve, list(reflection.tiles()), executor)
     chi, free = (sum(part) for part in zip(*contradiction, strict=True))
-    if reflection.judged and free and chi > MAX_RESIDUAL_RATIO * free:
+    if reflection.has_given_noise and free and chi > MAX_RESIDUAL_RATIO * free:
         _log.warning(
             "patterns contradict each other: residuals of redundant pictures are %.1f times their"
             " noise; did subject or light change between them?",

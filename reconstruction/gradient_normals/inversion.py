@@ -10,16 +10,18 @@ from numpy.typing import ArrayLike
 from model.checks import Checks
 from reconstruction.arrays import Float64Array, FloatArray
 from reconstruction.gradient_normals import kernels
-from reconstruction.gradient_normals.lobe_response import Response
-from reconstruction.gradient_normals.moments import Reflection
+from reconstruction.gradient_normals.lobe_response import LobeResponseTable
+from reconstruction.gradient_normals.moments import ReflectionMoments
 from reconstruction.gradient_normals.patterns import GradientError
-from reconstruction.gradient_normals.sphere_lights import SphereLights, frame_of
+from reconstruction.gradient_normals.sphere_lights import SphereLights, view_frame
 
 MIN_MOMENT_SIGMAS = 3.0
 """Length of the moment vector over its standard error, below which a pixel has no normal."""
 
 
-def views_of(view: ArrayLike, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray | None]:
+def normalize_views(
+    view: ArrayLike, shape: tuple[int, int]
+) -> tuple[FloatArray, FloatArray | None]:
     """Return the mean view (3,), and every pixel's (P, 3) or none (0, 3)."""
     v = np.asarray(view, np.float64)
     Checks(GradientError).shape("view", v, (3,), (*shape, 3))
@@ -32,7 +34,7 @@ def views_of(view: ArrayLike, shape: tuple[int, int]) -> tuple[FloatArray, Float
     return middle / np.linalg.norm(middle), v.reshape(-1, 3)
 
 
-def places_of(
+def frame_positions(
     points_mm: ArrayLike | None,
     shape: tuple[int, int],
     middle: FloatArray,
@@ -53,11 +55,11 @@ def places_of(
             "points_mm: got points farther from the middle than a fifth of the lights' distance;"
             " directions to the lights are followed to first order only"
         )
-    return np.asarray(flat @ frame_of(middle)[:2].T)
+    return np.asarray(flat @ view_frame(middle)[:2].T)
 
 
 @dataclass(frozen=True, slots=True)
-class Inversion:
+class MomentInversion:
     """What turns the moments of a reflection into normals.
 
     Attributes
@@ -73,16 +75,19 @@ class Inversion:
         Where the search for a place begins, by what is seen.
     """
 
-    reflection: Reflection
-    table: Response
+    reflection: ReflectionMoments
+    table: LobeResponseTable
     eta: float
     analyser: Float64Array
     starts: Float64Array
 
     @staticmethod
-    def of(
-        reflection: Reflection, table: Response, lights: SphereLights | None, eta: float
-    ) -> Inversion:
+    def prepare(
+        reflection: ReflectionMoments,
+        table: LobeResponseTable,
+        lights: SphereLights | None,
+        eta: float,
+    ) -> MomentInversion:
         """Prepare the inversion by a table that was made for these lights."""
         analyser, starts = np.zeros(2), np.zeros((2, 2, 2))
         if lights is not None:
@@ -90,14 +95,14 @@ class Inversion:
         if table.coefficients.size:
             lines = int(np.clip(3.0 / table.step, 65, 257))
             starts = np.empty((lines, lines, 2))
-            kernels.starts(table.coefficients, table.least, table.step, starts)
-        return Inversion(reflection, table, eta, analyser, starts)
+            kernels.fill_start_grid(table.coefficients, table.min_coordinate, table.step, starts)
+        return MomentInversion(reflection, table, eta, analyser, starts)
 
     def normals(
         self,
         moments: tuple[FloatArray, FloatArray],
         view: FloatArray | None = None,
-        place: FloatArray | None = None,
+        position: FloatArray | None = None,
     ) -> Float64Array:
         """Return normals and what is known of them (P, NORMAL_COLUMNS), see :mod:`kernels`.
 
@@ -107,7 +112,7 @@ class Inversion:
             As of `Reflection.moments`.
         view : ndarray, shape (P, 3), optional
             Each pixel's view, where it is not the table's.
-        place : ndarray, shape (P, 2), optional
+        position : ndarray, shape (P, 2), optional
             Each pixel's place in the field, mm.
         """
         table, reflection = self.table, self.reflection
@@ -117,14 +122,14 @@ class Inversion:
             table.frame,
             reflection.component == "specular",
             table.coefficients,
-            table.least,
+            table.min_coordinate,
             table.step,
             self.starts,
             self.analyser,
             self.eta,
             np.zeros((0, 3)) if view is None else view,
-            np.zeros((0, 2)) if place is None else place,
-            reflection.told > 0,
+            np.zeros((0, 2)) if position is None else position,
+            reflection.noise_source > 0,
             MIN_MOMENT_SIGMAS,
             1e-5 if reflection.kind == np.float32 else 1e-9,
             out,

@@ -33,15 +33,15 @@ _COARSE_TOL = 2e-3
 _MAX_MOMENT_CHANGE = (
     1e-2  # relative changes of the moment vector by the polarization of diffuse light
 )
-_EXACT_TURNS = 8
+_N_EXACT_ROTATIONS = 8
 _STEEP, _UNLIKE = 0.866, 0.03
 _MIN_FACING = 0.1  # cosine to the view, which tables end at
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def _cell(least, step, size, u):  # type: ignore[no-untyped-def]
+def _cell(min_coordinate, step, size, u):  # type: ignore[no-untyped-def]
     """Return the first of the four grid lines about a place, and the place between them."""
-    q = (u - least) / step
+    q = (u - min_coordinate) / step
     i = min(max(math.floor(q), 1), size - 3)
     return i - 1, q - i
 
@@ -65,13 +65,13 @@ def _slopes(f):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def lookup(table, least, step, u0, u1, x, y):  # type: ignore[no-untyped-def]
+def lookup(table, min_coordinate, step, u0, u1, x, y):  # type: ignore[no-untyped-def]
     """Return the place seen of a normal at (u0, u1), from (x, y), and its derivatives.
 
     In the order v0, v1, dv0/du0, dv0/du1, dv1/du0, dv1/du1.
     """
-    i0, f = _cell(least, step, table.shape[0], u0)
-    i1, g = _cell(least, step, table.shape[0], u1)
+    i0, f = _cell(min_coordinate, step, table.shape[0], u0)
+    i1, g = _cell(min_coordinate, step, table.shape[0], u1)
     a0, a1, a2, a3 = _weights(f)
     d0, d1, d2, d3 = _slopes(f)
     wy, dy = _weights(g), _slopes(g)
@@ -103,26 +103,26 @@ def lookup(table, least, step, u0, u1, x, y):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _others(table, least, step, u0, u1, spread):  # type: ignore[no-untyped-def]
-    """Put scale, concentration and systematic covariance (3) at a place into ``spread``."""
-    i0, f = _cell(least, step, table.shape[0], u0)
-    i1, g = _cell(least, step, table.shape[0], u1)
+def _interpolate_covariance(table, min_coordinate, step, u0, u1, covariance):  # type: ignore[no-untyped-def]
+    """Put scale, concentration and systematic covariance (3) at a place into ``covariance``."""
+    i0, f = _cell(min_coordinate, step, table.shape[0], u0)
+    i1, g = _cell(min_coordinate, step, table.shape[0], u1)
     wx, wy = _weights(f), _weights(g)
-    spread[:] = 0.0
+    covariance[:] = 0.0
     for m in range(4):
         for n in range(4):
             w = wy[m] * wx[n]
             for k in range(5):
-                spread[k] += w * table[i1 + m, i0 + n, 2 + k]
+                covariance[k] += w * table[i1 + m, i0 + n, 2 + k]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _settle(table, least, step, s0, s1, u0, u1, x, y, close):  # type: ignore[no-untyped-def]
+def _solve_newton(table, min_coordinate, step, s0, s1, u0, u1, x, y, close):  # type: ignore[no-untyped-def]
     """Find the place whose normal shows (s0, s1), by Newton's method from (u0, u1).
 
     Return the place, what it still lacks, and the derivatives there.
     """
-    v0, v1, j00, j01, j10, j11 = lookup(table, least, step, u0, u1, x, y)
+    v0, v1, j00, j01, j10, j11 = lookup(table, min_coordinate, step, u0, u1, x, y)
     e0, e1 = s0 - v0, s1 - v1
     off = math.sqrt(e0 * e0 + e1 * e1)
     for _ in range(_MAX_PASSES):
@@ -139,7 +139,7 @@ def _settle(table, least, step, s0, s1, u0, u1, x, y, close):  # type: ignore[no
         for _ in range(_STEPS_BACK):
             t0, t1 = u0 + part * d0, u1 + part * d1
             if t0 * t0 + t1 * t1 < 2.0 * (1.0 - _MIN_FACING):
-                v0, v1, k00, k01, k10, k11 = lookup(table, least, step, t0, t1, x, y)
+                v0, v1, k00, k01, k10, k11 = lookup(table, min_coordinate, step, t0, t1, x, y)
                 f0, f1 = s0 - v0, s1 - v1
                 now = math.sqrt(f0 * f0 + f1 * f1)
                 if now < off:
@@ -153,7 +153,7 @@ def _settle(table, least, step, s0, s1, u0, u1, x, y, close):  # type: ignore[no
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def starts(table, least, step, out):  # type: ignore[no-untyped-def]
+def fill_start_grid(table, min_coordinate, step, out):  # type: ignore[no-untyped-def]
     """Put the places that show those of a grid into ``out`` (G, G, 2): where Newton may begin.
 
     The grid covers -sqrt(2) to sqrt(2); where nothing shows a place, it is given itself.
@@ -166,8 +166,8 @@ def starts(table, least, step, out):  # type: ignore[no-untyped-def]
             s0 = reach * (2.0 * j / (size - 1) - 1.0)
             out[i, j, 0], out[i, j, 1] = s0, s1
             if s0 * s0 + s1 * s1 < 2.0 * (1.0 - _MIN_FACING):
-                u0, u1, off, _, _, _, _ = _settle(
-                    table, least, step, s0, s1, s0, s1, 0.0, 0.0, 1e-6
+                u0, u1, off, _, _, _, _ = _solve_newton(
+                    table, min_coordinate, step, s0, s1, s0, s1, 0.0, 0.0, 1e-6
                 )
                 if off < _MAX_POSITION_ERROR:
                     out[i, j, 0], out[i, j, 1] = u0, u1
@@ -175,7 +175,7 @@ def starts(table, least, step, out):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _start(grid, s0, s1):  # type: ignore[no-untyped-def]
-    """Return the place to begin at, by the bilinear grid of :func:`starts`."""
+    """Return the place to begin at, by the bilinear grid of :func:`fill_start_grid`."""
     size = grid.shape[0]
     scale = (size - 1) / (2.0 * math.sqrt(2.0))
     q0, q1 = (s0 + math.sqrt(2.0)) * scale, (s1 + math.sqrt(2.0)) * scale
@@ -216,14 +216,14 @@ def invert(  # type: ignore[no-untyped-def]
     frame,
     mirror,
     table,
-    least,
+    min_coordinate,
     step,
     grid,
     analyser,
     eta,
     view,
-    place,
-    told,
+    position,
+    has_noise,
     needed,
     close,
     out,
@@ -240,18 +240,18 @@ def invert(  # type: ignore[no-untyped-def]
     mirror : bool
         A reflection's vector, not a matte surface's.
     table, least, step
-        See :class:`reconstruction.gradient_normals.lobe_response.Response`; a table of size 0: the
-        vector points where it should.
+        See :class:`reconstruction.gradient_normals.lobe_response.LobeResponseTable`; a table of
+        size 0: the vector points where it should.
     grid : ndarray, shape (G, G, 2)
-        Of :func:`starts`; not read without a table.
+        Of :func:`fill_start_grid`; not read without a table.
     analyser : ndarray, shape (2,)
         Passing axis in the frame; zeros: diffuse light is taken to be unpolarized.
     eta : float
     view : ndarray, shape (P, 3), or (0, 3)
         Each pixel's view, rig frame, where it is not the frame's.
-    place : ndarray, shape (P, 2), or (0, 2)
+    position : ndarray, shape (P, 2), or (0, 2)
         Each pixel's place in the field, along the frame's first two axes, mm.
-    told : bool
+    has_noise : bool
         Whether variances are known.
     needed : float
         Length of the vector over its standard error below which there is no signal.
@@ -304,7 +304,7 @@ def invert(  # type: ignore[no-untyped-def]
         ratio = 1.0
         u0, u1 = 0.0, 0.0
         status = GOOD
-        x, y = (place[p, 0], place[p, 1]) if place.shape[0] else (0.0, 0.0)
+        x, y = (position[p, 0], position[p, 1]) if position.shape[0] else (0.0, 0.0)
         j00, j01, j10, j11 = 1.0, 0.0, 0.0, 1.0
         rough = polarized  # normals as the grid has them, until the polarization settles
         for turn in range(last + 1):
@@ -324,7 +324,7 @@ def invert(  # type: ignore[no-untyped-def]
                 for j in range(3):
                     wide += c[i] * cov[i, j] * c[j]
             wide = math.sqrt(max(wide, 0.0)) / length if length > 0.0 else 0.0
-            if not (length > 0.0 and c0 > 0.0) or (told and length < needed * wide):
+            if not (length > 0.0 and c0 > 0.0) or (has_noise and length < needed * wide):
                 status = DIM
                 break
             # where the vector points, as a place, and how it moves with the vector
@@ -363,8 +363,8 @@ def invert(  # type: ignore[no-untyped-def]
             if rough or not polarized:
                 u0, u1 = _start(grid, s0, s1)
             if not rough:
-                u0, u1, off, j00, j01, j10, j11 = _settle(
-                    table, least, step, s0, s1, u0, u1, x, y, close
+                u0, u1, off, j00, j01, j10, j11 = _solve_newton(
+                    table, min_coordinate, step, s0, s1, u0, u1, x, y, close
                 )
                 if off > _MAX_POSITION_ERROR:
                     status = HORIZON
@@ -378,7 +378,7 @@ def invert(  # type: ignore[no-untyped-def]
             change = abs(fresh - ratio) * abs(crossed[C_0, p]) / c0
             ratio = fresh
             if rough:
-                rough = change > _COARSE_TOL and turn < last - _EXACT_TURNS
+                rough = change > _COARSE_TOL and turn < last - _N_EXACT_ROTATIONS
             elif change < max(10.0 * close, 1e-7):
                 break
             elif turn == last and change > _MAX_MOMENT_CHANGE:
@@ -388,14 +388,14 @@ def invert(  # type: ignore[no-untyped-def]
             continue
         # noise: covariance of the place seen, through the inverse of the table's derivative
         e00, e01, e11 = 0.0, 0.0, 0.0
-        if told:
+        if has_noise:
             for i in range(3):
                 for j in range(3):
                     e00 += slope[0, i] * cov[i, j] * slope[0, j]
                     e01 += slope[0, i] * cov[i, j] * slope[1, j]
                     e11 += slope[1, i] * cov[i, j] * slope[1, j]
         if tabled:
-            _others(table, least, step, u0, u1, spread)
+            _interpolate_covariance(table, min_coordinate, step, u0, u1, spread)
         else:
             spread[:] = 0.0
             spread[0] = 1.0
@@ -404,7 +404,7 @@ def invert(  # type: ignore[no-untyped-def]
         square = u0 * u0 + u1 * u1
         m = math.sqrt(1.0 - 0.25 * square)
         error = math.pi
-        if told and abs(det) > 1e-6:
+        if has_noise and abs(det) > 1e-6:
             i00, i01, i10, i11 = j11 / det, -j01 / det, -j10 / det, j00 / det
             a00 = i00 * i00 * e00 + 2.0 * i00 * i01 * e01 + i01 * i01 * e11
             a11 = i10 * i10 * e00 + 2.0 * i10 * i11 * e01 + i11 * i11 * e11
@@ -428,12 +428,12 @@ def invert(  # type: ignore[no-untyped-def]
                 continue
             g0, g1, g2 = r0 / size, r1 / size, r2 / size
         longer = length
-        if told:
+        if has_noise:
             # noise across the vector makes it longer
             longer -= 0.5 * (cov[0, 0] + cov[1, 1] + cov[2, 2] - wide * wide) / length
         if mirror and tabled and n2 < _STEEP:
             # near Brewster's angle another normal shows the same vector, but not as long
-            doubt = 3.0 * math.sqrt(max(var0, 0.0) + wide * wide) / c0 if told else 0.0
+            doubt = 3.0 * math.sqrt(max(var0, 0.0) + wide * wide) / c0 if has_noise else 0.0
             if abs(longer / c0 - spread[1]) > _UNLIKE + doubt:
                 out[p, STATUS] = HORIZON
                 continue
@@ -441,7 +441,7 @@ def invert(  # type: ignore[no-untyped-def]
         out[p, ALBEDO] = c0 / spread[0] if spread[0] > 0.0 else 0.0
         out[p, STDERR] = error
         out[p, STDERR_ALBEDO] = (
-            math.sqrt(max(var0, 0.0)) / spread[0] if told and spread[0] > 0.0 else np.inf
+            math.sqrt(max(var0, 0.0)) / spread[0] if has_noise and spread[0] > 0.0 else np.inf
         )
         out[p, CONCENTRATION] = spread[1]
         out[p, CONCENTRATION_SEEN] = longer / c0

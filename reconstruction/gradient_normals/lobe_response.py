@@ -25,10 +25,10 @@ from reconstruction.arrays import Float64Array
 from reconstruction.gradient_normals.sphere_lights import (
     SphereLights,
     SphereLightsError,
-    frame_of,
-    normal_at,
-    place_of,
+    disc_from_normal,
+    normal_from_disc,
     require_unit_vectors,
+    view_frame,
 )
 from reconstruction.polarization import fresnel_amplitudes
 
@@ -50,21 +50,21 @@ FIELD_LAYERS = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Response:
+class LobeResponseTable:
     """A table of what is seen, by the normal's place; spline coefficients.
 
     Attributes
     ----------
     coefficients : ndarray of float64, shape (G, G, K)
         Cubic B-splines on a grid of places, first axis along the frame's second direction.
-    least, step : float
+    min_coordinate, step : float
         Place of the first grid line, distance of grid lines.
     frame : ndarray, shape (3, 3)
         Rows: right, up and the view, in the rig frame.
     """
 
     coefficients: Float64Array
-    least: float
+    min_coordinate: float
     step: float
     frame: Float64Array
 
@@ -98,7 +98,7 @@ def facet_reflectance(lights: SphereLights, view: Float64Array, eta: float) -> F
     s = np.cross(facet, light)
     size = np.linalg.norm(s, axis=1, keepdims=True)
     # a light along the view: s and p are alike, and any direction across serves
-    s = np.where(size > 1e-9, s / np.maximum(size, 1e-9), frame_of(view)[0])
+    s = np.where(size > 1e-9, s / np.maximum(size, 1e-9), view_frame(view)[0])
     p_in, p_out = np.cross(-light, s), np.cross(np.broadcast_to(view, s.shape), s)
     a_s, a_p = s @ np.asarray(lights.analyser), p_out @ np.asarray(lights.analyser)
     if len(lights.polarizers):
@@ -110,7 +110,7 @@ def facet_reflectance(lights: SphereLights, view: Float64Array, eta: float) -> F
     return np.asarray((r_s * r_p) ** 2 / np.maximum(lost, 1e-300))
 
 
-def specular(
+def specular_response(
     lights: SphereLights,
     *,
     view: ArrayLike,
@@ -118,7 +118,7 @@ def specular(
     eta: float,
     near: bool = False,
     alpha_stderr: float = 0.0,
-) -> Response:
+) -> LobeResponseTable:
     """Return the table of a rough dielectric surface, parallel less crossed.
 
     Parameters
@@ -147,7 +147,9 @@ def specular(
     return _cached(lights, way, float(alpha), _index(eta), near, float(alpha_stderr))
 
 
-def diffuse(lights: SphereLights, *, view: ArrayLike, eta: float, near: bool = False) -> Response:
+def diffuse_response(
+    lights: SphereLights, *, view: ArrayLike, eta: float, near: bool = False
+) -> LobeResponseTable:
     """Return the table of a matte interior below a smooth surface: Lambert, Fresnel on entry."""
     return _cached(lights, _direction(view), np.nan, _index(eta), near, 0.0)
 
@@ -169,9 +171,9 @@ def _cached(
     eta: float,
     near: bool,
     alpha_stderr: float,
-) -> Response:
+) -> LobeResponseTable:
     # directions rounded twice, as all tables so far were made of
-    lights, frame = replace(lights), frame_of(view)
+    lights, frame = replace(lights), view_frame(view)
     matte = np.isnan(alpha)
     step = 0.05 if matte else float(np.clip(alpha / 4.0, FINEST, COARSEST))
     lines = int(np.ceil(TABLE_REACH / step)) + MARGIN_LINES
@@ -180,8 +182,8 @@ def _cached(
     # beyond the horizon's side of the disc: as at its end, so that splines stay calm
     length = np.linalg.norm(places, axis=1, keepdims=True)
     places = places * np.minimum(1.0, 1.38 / np.maximum(length, 1e-9))
-    normals = normal_at(places) @ frame
-    see = _matte_sums(lights, frame, eta) if matte else _glossy_sums(lights, frame, alpha, eta)
+    normals = normal_from_disc(places) @ frame
+    see = _diffuse_sums(lights, frame, eta) if matte else _specular_sums(lights, frame, alpha, eta)
     layers = np.empty((len(places), TABLE_LAYERS + (FIELD_LAYERS if near else 0)))
     for start in range(0, len(places), 2048):
         part = slice(start, start + 2048)
@@ -199,7 +201,7 @@ def _cached(
         if alpha_stderr > 0.0:
             step_a = 0.02 * alpha
             before, after = (
-                seen(np.zeros(3), _glossy_sums(lights, frame, a, eta))[:, :2]
+                seen(np.zeros(3), _specular_sums(lights, frame, a, eta))[:, :2]
                 for a in (alpha - step_a, alpha + step_a)
             )
             move = (after - before) / (2.0 * step_a) * alpha_stderr
@@ -211,7 +213,7 @@ def _cached(
     coefficients = np.stack(
         [spline_filter(grid[..., k], order=3, mode="mirror") for k in range(grid.shape[2])], axis=-1
     )
-    return Response(coefficients, float(axis[0]), step, frame)
+    return LobeResponseTable(coefficients, float(axis[0]), step, frame)
 
 
 Sums = Callable[[Float64Array, Float64Array], Float64Array]
@@ -232,7 +234,7 @@ def _white(lights: SphereLights, frame: Float64Array) -> float:
     return float(np.sum(lights.intensities * facing) / np.pi)
 
 
-def _glossy_sums(lights: SphereLights, frame: Float64Array, alpha: float, eta: float) -> Sums:
+def _specular_sums(lights: SphereLights, frame: Float64Array, alpha: float, eta: float) -> Sums:
     view = frame[2]
     mirrored = facet_reflectance(lights, view, eta) * (1.0 - lights.leakage)
     # the analyser halves the white diffuser's light, and none of the polarized reflection's
@@ -249,7 +251,7 @@ def _glossy_sums(lights: SphereLights, frame: Float64Array, alpha: float, eta: f
     return each
 
 
-def _matte_sums(lights: SphereLights, frame: Float64Array, eta: float) -> Sums:
+def _diffuse_sums(lights: SphereLights, frame: Float64Array, eta: float) -> Sums:
     white = max(_white(lights, frame), 1e-300)
     mean = 1.0 - fresnel.diffuse_external(eta)
 
@@ -334,4 +336,4 @@ def direction_from_moments(vector: Float64Array, mirror: bool) -> tuple[Float64A
     scale = np.sqrt(2.0 / up)
     slope = scale[:, None, None] * turn[:, :2]
     slope -= (scale / (2.0 * up))[:, None, None] * n[:, :2, None] * turn[:, None, 2]
-    return place_of(n), slope
+    return disc_from_normal(n), slope

@@ -17,7 +17,7 @@ MOMENT_ROWS = 15
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def moments(y, noise, gain, read, told, dark, out):  # type: ignore[no-untyped-def]
+def fit_moments(y, noise, gain, read, noise_source, dark, out):  # type: ignore[no-untyped-def]
     """Fit light, gradient and dark level to the patterns of one polarization, per pixel.
 
     Parameters
@@ -25,11 +25,11 @@ def moments(y, noise, gain, read, told, dark, out):  # type: ignore[no-untyped-d
     y : ndarray, shape (8, P)
         Samples; NaN where there is none.
     noise : ndarray, shape (8, P)
-        Variances; read only where `told` is 1.
+        Variances; read only where `noise_source` is 1.
     gain, read : float
-        Variance as ``read + gain * signal``; read only where `told` is 2. With `told` 0 all
-        samples count alike, and variances are for a variance of 1.
-    told : int
+        Variance as ``read + gain * signal``; read only where `noise_source` is 2. With
+        `noise_source` 0 all samples count alike, and variances are for a variance of 1.
+    noise_source : int
     dark : bool
         Whether the dark level is unknown; else it is 0.
     out : ndarray, shape (MOMENT_ROWS, P)
@@ -53,15 +53,15 @@ def moments(y, noise, gain, read, told, dark, out):  # type: ignore[no-untyped-d
                 used += 1
                 top = max(top, float(y[k, p]))
         out[USED, p] = used
-        if told == 1:
+        if noise_source == 1:
             for k in range(8):
                 v[k] = noise[k, p]
         else:
             for k in range(8):
                 v[k] = 1.0
-        rounds = 2 if told == 2 else 1
+        rounds = 2 if noise_source == 2 else 1
         for turn in range(rounds):
-            if told == 2:
+            if noise_source == 2:
                 # signals of the fit before, not the samples: these would weigh their own noise
                 base = max(out[C_0, p], 0.0) if turn else top
                 floor = 1e-6 * (read + gain * top) if top > 0.0 else max(read, 1e-12)
@@ -161,7 +161,7 @@ def moments(y, noise, gain, read, told, dark, out):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def smooth(image, taps, mask, out, line):  # type: ignore[no-untyped-def]
+def convolve_separable(image, taps, mask, out, line):  # type: ignore[no-untyped-def]
     """Convolve rows and columns of ``image * mask`` (H, W) by symmetric taps; 0 outside.
 
     `line` (H, W) is scratch; `taps` has the middle first.

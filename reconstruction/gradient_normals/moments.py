@@ -10,8 +10,13 @@ from model.checks import Checks
 from reconstruction.arrays import Float64Array, FloatArray
 from reconstruction.gradient_normals import moment_kernels
 from reconstruction.gradient_normals.noise import SensorNoise, estimate_noise
-from reconstruction.gradient_normals.patterns import GradientError, MissingPatterns, Stack, require
-from reconstruction.gradient_normals.wiener import filtered
+from reconstruction.gradient_normals.patterns import (
+    GradientError,
+    MissingPatternsError,
+    PatternStack,
+    require_patterns,
+)
+from reconstruction.gradient_normals.wiener import filter_image
 
 TILE_PIXELS = 65_536
 _VALUE_ROWS = slice(moment_kernels.C_0, moment_kernels.V_0)
@@ -26,12 +31,12 @@ _VARIANCE_PAIRS = (
     (moment_kernels.V_YZ, 2, 3),
 )
 """Rows of variances, and which moments they are of."""
-REACH_SIGMA = 3.5
+KERNEL_RADIUS_SIGMAS = 3.5
 """Where a smoothing kernel ends, in its standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)
-class Reflection:
+class ReflectionMoments:
     """What is needed to compute the moments of a component, tile by tile.
 
     Attributes
@@ -42,9 +47,9 @@ class Reflection:
     crossed : Stack
     noise : SensorNoise or None
         None where the stacks hold variances, or nothing is known.
-    told : int
+    noise_source : int
         0: noise is unknown; 1: the stacks' variances; 2: `noise`.
-    judged : bool
+    has_given_noise : bool
         Whether the noise was given, and residuals can be judged by it.
     leakage : float
         Of the specular reflection what passes crossed, over parallel; for diffuse moments.
@@ -52,24 +57,24 @@ class Reflection:
         Standard deviations of the Gaussians, parallel and crossed, px.
     kind : dtype
         float32 or float64.
-    clean : tuple of ndarray, shape (4, H, W), or None
+    filtered_moments : tuple of ndarray, shape (4, H, W), or None
         Filtered moments, parallel and crossed, that replace the pictures' own.
-    shares : tuple of ndarray, shape (2, 4), or None
+    variance_ratios : tuple of ndarray, shape (2, 4), or None
         Variance of what is to be inverted, over that of the pictures' own parallel and crossed
-        moments, with `clean`.
+        moments, with `filtered_moments`.
     """
 
     component: Literal["specular", "diffuse"]
-    parallel: Stack | None
-    crossed: Stack
+    parallel: PatternStack | None
+    crossed: PatternStack
     noise: SensorNoise | None
-    told: int
-    judged: bool
+    noise_source: int
+    has_given_noise: bool
     leakage: float
     smooth_px: tuple[float, float]
     kind: Any
-    clean: tuple[FloatArray, FloatArray] | None = None
-    shares: tuple[FloatArray, FloatArray] | None = None
+    filtered_moments: tuple[FloatArray, FloatArray] | None = None
+    variance_ratios: tuple[FloatArray, FloatArray] | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -90,38 +95,41 @@ class Reflection:
         """
         crossed = self._of(self.crossed, rows, self.smooth_px[1])
         if self.parallel is None:
-            if self.clean is not None:
+            if self.filtered_moments is not None:
                 self._replace(crossed, crossed, rows)
             return crossed, crossed[:, :0]
         parallel = self._of(self.parallel, rows, self.smooth_px[0])
         if self.component == "specular":
-            if self.clean is not None:
+            if self.filtered_moments is not None:
                 self._replace(parallel, crossed, rows)
             return parallel, crossed
         k = self.leakage / (1.0 - self.leakage)
         cleaned, values, variances = crossed.copy(), _VALUE_ROWS, _VARIANCE_ROWS
         cleaned[values] -= k * (parallel[values] - crossed[values])
         cleaned[variances] = (1.0 + k) ** 2 * crossed[variances] + k**2 * parallel[variances]
-        if self.clean is not None:
+        if self.filtered_moments is not None:
             self._replace(cleaned, cleaned, rows)
         return cleaned, crossed[:, :0]
 
     def _replace(self, first: FloatArray, second: FloatArray, rows: slice) -> None:
         """Put filtered moments in, and all of their variance into the first."""
-        if self.clean is None or self.shares is None:
+        if self.filtered_moments is None or self.variance_ratios is None:
             return
         lost = ~np.isfinite(first[0]) | ~np.isfinite(second[0])
-        a, b = (np.sqrt(share) for share in self.shares)
+        a, b = (np.sqrt(share) for share in self.variance_ratios)
         for row, i, j in _VARIANCE_PAIRS:
             first[row] *= a[i] * a[j]
             if second is not first:
                 first[row] += b[i] * b[j] * second[row]
                 second[row] = 0.0
-        for moments, clean in ((first, self.clean[0]), (second, self.clean[1])):
+        for moments, clean in (
+            (first, self.filtered_moments[0]),
+            (second, self.filtered_moments[1]),
+        ):
             moments[_VALUE_ROWS] = clean[:, rows].reshape(4, -1)
             moments[: moment_kernels.CHI, lost] = np.nan
 
-    def _of(self, stack: Stack, rows: slice, sigma: float) -> FloatArray:
+    def _of(self, stack: PatternStack, rows: slice, sigma: float) -> FloatArray:
         taps = _taps(sigma).astype(self.kind)
         reach = len(taps) - 1
         start, stop = max(0, rows.start - reach), min(self.shape[0], rows.stop + reach)
@@ -134,7 +142,9 @@ class Reflection:
         if noise.strides[2] == 0:
             flat = np.broadcast_to(noise[:, :1, 0], flat.shape)
         gain, read = (self.noise.gain, self.noise.read_variance) if self.noise else (0.0, 1.0)
-        moment_kernels.moments(y.reshape(len(y), -1), flat, gain, read, self.told, stack.dark, out)
+        moment_kernels.fit_moments(
+            y.reshape(len(y), -1), flat, gain, read, self.noise_source, stack.has_dark, out
+        )
         if reach:
             _smooth(out.reshape(-1, height, width), taps)
         inner = out.reshape(-1, height, width)[:, rows.start - start : rows.stop - start]
@@ -145,7 +155,7 @@ def _taps(sigma: float) -> Float64Array:
     """Return a Gaussian's taps from its middle outward, the whole kernel's sum 1."""
     if sigma == 0.0:
         return np.ones(1)
-    k = np.arange(int(np.ceil(REACH_SIGMA * sigma)) + 1)
+    k = np.arange(int(np.ceil(KERNEL_RADIUS_SIGMAS * sigma)) + 1)
     taps = np.exp(-0.5 * (k / sigma) ** 2)
     return np.asarray(taps / (2.0 * taps.sum() - taps[0]))
 
@@ -157,24 +167,26 @@ def _smooth(moments: FloatArray, taps: FloatArray) -> None:
         return
     line, found = np.empty_like(moments[0]), np.empty_like(moments[0])
     share = np.empty_like(moments[0])
-    moment_kernels.smooth(np.ones_like(share), taps, mask, share, line)
+    moment_kernels.convolve_separable(np.ones_like(share), taps, mask, share, line)
     share[~mask] = 1.0
     squared = taps * taps
     for row in range(moment_kernels.CHI):
         mean = row < moment_kernels.V_0
-        moment_kernels.smooth(moments[row], taps if mean else squared, mask, found, line)
+        moment_kernels.convolve_separable(
+            moments[row], taps if mean else squared, mask, found, line
+        )
         moments[row] = found / share if mean else found / share**2
         moments[row][~mask] = np.nan
 
 
-def prepare(
-    stacks: Mapping[str, Stack],
+def prepare_moments(
+    stacks: Mapping[str, PatternStack],
     component: Literal["specular", "diffuse"],
     *,
     noise: SensorNoise | None,
     leakage: float,
     smooth_px: tuple[float, float],
-) -> Reflection:
+) -> ReflectionMoments:
     """Check that the pictures tell the component, and what is known of their noise.
 
     Parameters
@@ -182,7 +194,7 @@ def prepare(
     stacks
         By polarization; with variances, or with `noise`, or neither.
     component, noise, leakage, smooth_px
-        See :class:`Reflection`.
+        See :class:`ReflectionMoments`.
 
     Raises
     ------
@@ -198,11 +210,13 @@ def prepare(
                 f" {' and '.join(wanted)} ones, full, x, y, z at least"
             )
             why = ": parallel pictures hold both reflections, and crossed ones tell the diffuse"
-            raise MissingPatterns(text + why if component == "specular" else text)
-        require(stacks[polarizer].pictures, polarizer=polarizer, purpose=f"{component} normals")
+            raise MissingPatternsError(text + why if component == "specular" else text)
+        require_patterns(
+            stacks[polarizer].images, polarizer=polarizer, purpose=f"{component} normals"
+        )
     used = {name: stacks[name] for name in wanted}
     parallel = stacks.get("parallel")
-    if component == "diffuse" and (leakage == 0.0 or parallel is None or parallel.redundant < 0):
+    if component == "diffuse" and (leakage == 0.0 or parallel is None or parallel.redundancy < 0):
         parallel = None
     elif parallel is not None:
         used["parallel"] = parallel
@@ -211,8 +225,8 @@ def prepare(
     if told == 2:
         noise = noise or estimate_noise(used)
         told = 0 if noise is None else 2
-    kinds = {image.dtype for stack in used.values() for image in stack.pictures.values()}
-    return Reflection(
+    kinds = {image.dtype for stack in used.values() for image in stack.images.values()}
+    return ReflectionMoments(
         component,
         parallel,
         stacks["crossed"],
@@ -225,7 +239,7 @@ def prepare(
     )
 
 
-def with_filter(reflection: Reflection) -> Reflection:
+def apply_wiener_filter(reflection: ReflectionMoments) -> ReflectionMoments:
     """Return the reflection with its moments filtered by what share of each frequency is signal.
 
     Diffuse moments are filtered first, and what is left of the parallel ones without them next:
@@ -236,7 +250,7 @@ def with_filter(reflection: Reflection) -> Reflection:
     GradientError
         Where the noise is not known.
     """
-    if not reflection.told:
+    if not reflection.noise_source:
         raise GradientError(
             "wiener: noise is unknown, as no patterns are redundant; give variance, or a smoothing"
             " in px"
@@ -258,24 +272,26 @@ def with_filter(reflection: Reflection) -> Reflection:
     shares = np.ones((2, 4))
     for m in range(4):
         base = raw[-1][m]
-        glow, kept = filtered(base, noise[len(raw) - 1, m], valid)
+        glow, kept = filter_image(base, noise[len(raw) - 1, m], valid)
         if not two:
             raw[0][m], shares[0, m] = glow, kept
             continue
-        spark, left = filtered(raw[0][m] - glow, noise[0, m] + kept * noise[1, m], valid)
+        spark, left = filter_image(raw[0][m] - glow, noise[0, m] + kept * noise[1, m], valid)
         raw[0][m], raw[1][m] = spark + glow, glow
         shares[:, m] = left, left * kept
-    return replace(reflection, clean=(raw[0], raw[-1]), shares=(shares[0], shares[1]))
+    return replace(
+        reflection, filtered_moments=(raw[0], raw[-1]), variance_ratios=(shares[0], shares[1])
+    )
 
 
-def with_shared_dark(stacks: Mapping[str, Stack]) -> dict[str, Stack]:
+def share_dark_frames(stacks: Mapping[str, PatternStack]) -> dict[str, PatternStack]:
     """Give a dark frame that was taken in one polarization only to the other, too.
 
     The analyser does not change it where no other light is about. Its noise then counts in both,
     though it cancels in their difference: standard errors err to the large side.
     """
     out = dict(stacks)
-    dark = [name for name, stack in stacks.items() if stack.dark]
+    dark = [name for name, stack in stacks.items() if stack.has_dark]
     if len(stacks) == 2 and len(dark) == 1:
         source = stacks[dark[0]]
         other = next(name for name in stacks if name != dark[0])
@@ -286,6 +302,6 @@ def with_shared_dark(stacks: Mapping[str, Stack]) -> dict[str, Stack]:
         valid = dict(stack.valid)
         if "dark" in source.valid:
             valid["dark"] = source.valid["dark"]
-        pictures = {**stack.pictures, "dark": source.pictures["dark"]}
-        out[other] = Stack(pictures, variance, valid)
+        pictures = {**stack.images, "dark": source.images["dark"]}
+        out[other] = PatternStack(pictures, variance, valid)
     return out

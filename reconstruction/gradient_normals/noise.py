@@ -7,7 +7,12 @@ import numpy as np
 
 from model.checks import Checks
 from reconstruction.arrays import Float64Array, FloatArray
-from reconstruction.gradient_normals.patterns import PATTERN_NAMES, GradientError, Stack, design
+from reconstruction.gradient_normals.patterns import (
+    PATTERN_NAMES,
+    GradientError,
+    PatternStack,
+    design_matrix,
+)
 
 _CHI_MEDIAN = 0.4549364  # of the square of a standard normal variable
 
@@ -35,7 +40,7 @@ class SensorNoise:
         check.require(some, "SensorNoise", "no noise at all", "gain or read_variance")
 
 
-def estimate_noise(stacks: Mapping[str, Stack]) -> SensorNoise | None:
+def estimate_noise(stacks: Mapping[str, PatternStack]) -> SensorNoise | None:
     """Estimate the sensor's noise from how patterns and complements contradict each other.
 
     Parameters
@@ -76,12 +81,12 @@ def estimate_noise(stacks: Mapping[str, Stack]) -> SensorNoise | None:
     return SensorNoise(gain, read) if gain > 0.0 or read > 0.0 else None
 
 
-def _contrasts(stack: Stack) -> list[Float64Array]:
+def _contrasts(stack: PatternStack) -> list[Float64Array]:
     """Return weights (8,) of orthogonal sums of the pictures that hold nothing but noise."""
-    names: list[str] = [name for name in PATTERN_NAMES if name in stack.pictures]
-    if stack.redundant < 1:
+    names: list[str] = [name for name in PATTERN_NAMES if name in stack.images]
+    if stack.redundancy < 1:
         return []
-    A = design(names, dark=stack.dark)
+    A = design_matrix(names, dark=stack.has_dark)
     left = np.linalg.svd(A)[0][:, A.shape[1] :]
     weights = np.zeros((left.shape[1], len(PATTERN_NAMES)))
     weights[:, [PATTERN_NAMES.index(name) for name in names]] = left.T

@@ -22,41 +22,41 @@ class GradientError(ValueError):
     """Pictures that no normals can be computed from."""
 
 
-class MissingPatterns(GradientError):
+class MissingPatternsError(GradientError):
     """Too few patterns to tell the light and its three moments."""
 
 
 @dataclass(frozen=True, slots=True)
-class Stack:
+class PatternStack:
     """The pictures of one polarization, by pattern.
 
     Attributes
     ----------
-    pictures : dict of str to ndarray, shape (H, W)
+    images : dict of str to ndarray, shape (H, W)
     variance : dict of str to ndarray, broadcastable to (H, W), or None
     valid : dict of str to ndarray of bool, shape (H, W)
         Only those that are not valid everywhere.
     """
 
-    pictures: dict[str, FloatArray]
+    images: dict[str, FloatArray]
     variance: dict[str, FloatArray] | None
     valid: dict[str, BoolArray]
 
     @property
     def shape(self) -> tuple[int, int]:
         """Height and width."""
-        height, width = next(iter(self.pictures.values())).shape
+        height, width = next(iter(self.images.values())).shape
         return height, width
 
     @property
-    def dark(self) -> bool:
+    def has_dark(self) -> bool:
         """Whether a dark frame is among the pictures, and not yet subtracted."""
-        return "dark" in self.pictures
+        return "dark" in self.images
 
     @property
-    def redundant(self) -> int:
+    def redundancy(self) -> int:
         """How many more pictures there are than what is asked for."""
-        return redundancy(self.pictures)
+        return redundancy(self.images)
 
     def samples(self, rows: slice, kind: Any) -> FloatArray:
         """Return samples (8, h, W) in the order of :data:`PATTERN_NAMES`, NaN where missing."""
@@ -64,8 +64,8 @@ class Stack:
         height = len(range(*rows.indices(self.shape[0])))
         out = np.full((len(PATTERN_NAMES), height, width), np.nan, kind)
         for k, name in enumerate(PATTERN_NAMES):
-            if name in self.pictures:
-                out[k] = self.pictures[name][rows]
+            if name in self.images:
+                out[k] = self.images[name][rows]
                 if name in self.valid:
                     out[k][~self.valid[name][rows]] = np.nan
         if not np.isfinite(out).all():
@@ -79,13 +79,13 @@ class Stack:
             return np.broadcast_to(np.ones(1, kind), (len(PATTERN_NAMES), height, width))
         out = np.ones((len(PATTERN_NAMES), height, width), kind)
         for k, name in enumerate(PATTERN_NAMES):
-            if name in self.pictures:
+            if name in self.images:
                 given = self.variance[name]
                 out[k] = given[rows] if given.ndim else given
         return out
 
 
-def design(names: list[str], *, dark: bool) -> Float64Array:
+def design_matrix(names: list[str], *, dark: bool) -> Float64Array:
     """Return the weights (R, 4 or 5) of full light, moments and dark level in each picture."""
     rows = []
     for name in names:
@@ -108,13 +108,13 @@ def redundancy(names: Mapping[str, Any]) -> int:
     """
     chosen = [name for name in PATTERN_NAMES if name in names]
     dark = "dark" in chosen
-    A = design(chosen, dark=dark)
+    A = design_matrix(chosen, dark=dark)
     rank = int(np.linalg.matrix_rank(A)) if chosen else 0
     unknowns = 5 if dark else 4
     return len(chosen) - unknowns if rank == unknowns else rank - unknowns
 
 
-def require(names: Mapping[str, Any], *, polarizer: str, purpose: str) -> None:
+def require_patterns(names: Mapping[str, Any], *, polarizer: str, purpose: str) -> None:
     """Refuse patterns that do not tell the full light and its three moments.
 
     Raises
@@ -130,7 +130,7 @@ def require(names: Mapping[str, Any], *, polarizer: str, purpose: str) -> None:
     if "full" not in lit and not any(a in lit and f"-{a}" in lit for a in "xyz"):
         needs.append("full, or a complement of one more pattern")
     missing = [name for name in PATTERN_NAMES if name not in names]
-    raise MissingPatterns(
+    raise MissingPatternsError(
         f"patterns: {purpose} needs the {polarizer} pictures to tell full light and three"
         f" gradients; got {', '.join(lit) or 'none'}; missing {', '.join(missing)};"
         f" {' and '.join(needs)} would do"

@@ -123,7 +123,7 @@ def require_unit_vectors(name: str, vectors: ArrayLike) -> Float64Array:
     return np.asarray(array / length[:, None])
 
 
-def frame_of(view: ArrayLike) -> Float64Array:
+def view_frame(view: ArrayLike) -> Float64Array:
     """Return the orthonormal frame about a view, rows right, up, view; identity for +z.
 
     Parameters
@@ -147,7 +147,7 @@ def frame_of(view: ArrayLike) -> Float64Array:
     return np.stack([right, np.cross(v, right), v])
 
 
-def normal_at(place: Float64Array) -> Float64Array:
+def normal_from_disc(position: Float64Array) -> Float64Array:
     """Return the unit normals (..., 3) at places (..., 2), in the frame of the view.
 
     The horizon is at a length of sqrt(2); places beyond it have the normal of the horizon there.
@@ -159,17 +159,17 @@ def normal_at(place: Float64Array) -> Float64Array:
 
     Examples
     --------
-    >>> normal_at(np.array([1.0, 0.0])).round(4).tolist()
+    >>> normal_from_disc(np.array([1.0, 0.0])).round(4).tolist()
     [0.866, 0.0, 0.5]
     """
-    Checks(SphereLightsError).within("place", place)
-    length = np.hypot(place[..., :1], place[..., 1:])
-    seen = place * np.minimum(1.0, np.sqrt(2.0) / np.maximum(length, 1e-9))
+    Checks(SphereLightsError).within("place", position)
+    length = np.hypot(position[..., :1], position[..., 1:])
+    seen = position * np.minimum(1.0, np.sqrt(2.0) / np.maximum(length, 1e-9))
     square = np.minimum(length, np.sqrt(2.0)) ** 2
     return np.concatenate([seen * np.sqrt(1.0 - square / 4.0), 1.0 - square / 2.0], axis=-1)
 
 
-def place_of(normal: Float64Array) -> Float64Array:
+def disc_from_normal(normal: Float64Array) -> Float64Array:
     """Return the places (..., 2) of unit normals (..., 3), in the frame of the view.
 
     Raises

@@ -17,7 +17,7 @@ SPECTRUM_BANDS = 64
 """A spectrum is averaged over about this part of its width, which it must be smooth over."""
 
 
-def filtered(image: FloatArray, variance: float, valid: BoolArray) -> tuple[FloatArray, float]:
+def filter_image(image: FloatArray, variance: float, valid: BoolArray) -> tuple[FloatArray, float]:
     """Return a picture as its signal most likely is, and what is left of its noise.
 
     Parameters
@@ -39,7 +39,7 @@ def filtered(image: FloatArray, variance: float, valid: BoolArray) -> tuple[Floa
     Examples
     --------
     >>> rng = np.random.default_rng(1)
-    >>> found, share = filtered(rng.standard_normal((64, 64)), 1.0, np.ones((64, 64), bool))
+    >>> found, share = filter_image(rng.standard_normal((64, 64)), 1.0, np.ones((64, 64), bool))
     >>> bool(found.std() < 0.2 and share < 0.1)
     True
     """

@@ -17,22 +17,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction.arrays import Float64Array, Int64Array
-from reconstruction.kernel_fit.search import Found, KernelGrid
+from reconstruction.kernel_fit.search import KernelGrid, KernelSearchResult
 from reconstruction.normal_histogram import blocks as normal_blocks
 from reconstruction.normal_histogram import kernels
 from reconstruction.normal_histogram.blocks import MIN_BLOCKS
 
 N_DRAWS = 200
 """Histograms drawn for the standard errors."""
-MAX_DRAWN = 64
+MAX_CANDIDATE_KERNELS = 64
 """Nearly-as-good kernels among which each draw finds its best."""
-DRAWN_SIGMAS = 3.0
+CANDIDATE_SIGMAS = 3.0
 """They are taken from within so many standard errors of the distance."""
-MAX_PAIRED = 140
+MAX_PAIRED_KERNELS = 140
 """The same of histograms of one piece of skin."""
 PAIRED_PX = 1_000_000
-"""Of maps with more normals the valley is shorter, and fewer are taken, down to `MAX_DRAWN`: on
-1000 x 1000 pixels each takes 0.02 s."""
+"""Of maps with more normals the valley is shorter, and fewer are taken, down to
+`MAX_CANDIDATE_KERNELS`: on 1000 x 1000 pixels each takes 0.02 s."""
 PAIRED_SIGMAS = 4.0
 """The same of histograms of one piece of skin, whose valley is wider than their scatter."""
 INTERVAL_COVERAGES = 0.6827, 0.95
@@ -48,13 +48,13 @@ class BlockCounts:
     Attributes
     ----------
     counts : ndarray of float64, shape (blocks, buckets)
-    growth : float
+    variance_inflation : float
         By how much larger the variance of the mean squared slope is than that of independent
         blocks, because neighbors are alike.
     """
 
     counts: Float64Array
-    growth: float
+    variance_inflation: float
 
     @property
     def samples(self) -> int:
@@ -69,7 +69,11 @@ class BlockCounts:
     @property
     def effective_samples(self) -> float:
         """Independent samples that would be as noisy."""
-        return max(1.0, normal_blocks.effective_number(self.counts, self.samples) / self.growth)
+        return max(
+            1.0,
+            normal_blocks.effective_sample_count(self.counts, self.samples)
+            / self.variance_inflation,
+        )
 
     def residuals(self) -> Float64Array:
         """Return each block's part in the error of the shares, (blocks, buckets).
@@ -79,10 +83,10 @@ class BlockCounts:
         """
         sizes = self.counts.sum(axis=1)
         counts = self.counts[sizes > 0]
-        scale = math.sqrt(len(counts) / max(len(counts) - 1, 1) * self.growth)
-        return np.asarray(normal_blocks.residuals_of(counts) * scale)
+        scale = math.sqrt(len(counts) / max(len(counts) - 1, 1) * self.variance_inflation)
+        return np.asarray(normal_blocks.block_residuals(counts) * scale)
 
-    def noise(self, target: Float64Array, target_samples: float) -> float:
+    def distance_stderr(self, target: Float64Array, target_samples: float) -> float:
         """Return the standard error of the distance to a target of so many effective samples."""
         effective, residuals = self.effective_samples, self.residuals()
         signs = np.sign(self.counts.sum(axis=0) / self.samples - target)
@@ -90,12 +94,12 @@ class BlockCounts:
         own = max(1.0 / effective, float(np.sum((residuals @ signs) ** 2)))
         return math.sqrt(own * (1.0 + effective / target_samples))
 
-    def scatter(self, target_samples: float) -> Float64Array:
+    def block_contributions(self, target_samples: float) -> Float64Array:
         """Return the parts of blocks in the error of both histograms, as of `residuals`."""
         return self.residuals() * math.sqrt(1.0 + self.effective_samples / target_samples)
 
 
-def of_kernel(grid: KernelGrid, alpha: float, sigma_um: float) -> BlockCounts:
+def count_blocks(grid: KernelGrid, alpha: float, sigma_um: float) -> BlockCounts:
     """Count the normals of a relief that a kernel has changed, in blocks of its map.
 
     Parameters
@@ -106,19 +110,21 @@ def of_kernel(grid: KernelGrid, alpha: float, sigma_um: float) -> BlockCounts:
         The kernel; sigma in um.
     """
     relief, buckets = grid.relief, grid.buckets
-    group, groups = normal_blocks.block_of(relief.places, relief.code.shape)
-    da, db = relief.change(sigma_um)
+    group, groups = normal_blocks.assign_blocks(relief.places, relief.code.shape)
+    da, db = relief.slope_change(sigma_um)
     a, b = relief.along + np.float32(alpha) * da, relief.across + np.float32(alpha) * db
     counts = kernels.count_in_groups(-a, -b, group, groups, buckets.bins, buckets.limit)
     steep = 1.0 + a * a + b * b
     growth = [
-        normal_blocks.block_error(m * m / steep, group, groups, relief.code.shape)[1]
+        normal_blocks.block_mean_stderr(m * m / steep, group, groups, relief.code.shape)[1]
         for m in (a, b)
     ]
     return BlockCounts(np.asarray(counts, np.float64), 0.5 * (growth[0] + growth[1]))
 
 
-def nearly_as_good(grid: KernelGrid, found: Found, noise: float) -> Int64Array:
+def near_best_kernels(
+    grid: KernelGrid, search_result: KernelSearchResult, noise: float
+) -> Int64Array:
     """Return the kernels that are no further than `noise` from the best, (K, 2).
 
     Parameters
@@ -133,9 +139,9 @@ def nearly_as_good(grid: KernelGrid, found: Found, noise: float) -> Int64Array:
     ndarray of int64
         Indices (sigma, alpha), the best first, then by distance, the gentler of equals first.
     """
-    distance = found.distance
-    i, j = np.nonzero(distance <= distance[found.best] + noise)
-    first = (i == found.best[0]) & (j == found.best[1])
+    distance = search_result.distance
+    i, j = np.nonzero(distance <= distance[search_result.best] + noise)
+    first = (i == search_result.best[0]) & (j == search_result.best[1])
     order = np.lexsort((grid.sigmas_um[i], np.abs(grid.alphas[j]), distance[i, j], ~first))
     return np.stack([i, j], axis=1)[order]
 
@@ -155,12 +161,12 @@ class HalfWidths:
 
 
 @dataclass(frozen=True, slots=True)
-class Draws:
+class HistogramResampling:
     """Histograms drawn anew, and how far they move the best kernel of a search.
 
     Attributes
     ----------
-    grid, found
+    grid, search_result
         Of the search.
     noise : float
         Standard error of the distance.
@@ -169,11 +175,11 @@ class Draws:
     """
 
     grid: KernelGrid
-    found: Found
+    search_result: KernelSearchResult
     noise: float
     rng: np.random.Generator
 
-    def widths_of_best(self, scatter: Float64Array) -> HalfWidths:
+    def best_kernel_widths(self, scatter: Float64Array) -> HalfWidths:
         """Return ways of the best kernel that most drawn histograms of other skin stay within.
 
         Not their root mean square: a long valley leads few of them far away.
@@ -183,9 +189,11 @@ class Draws:
         scatter : ndarray, shape (blocks, buckets)
             Of `BlockCounts.scatter`.
         """
-        near = nearly_as_good(self.grid, self.found, DRAWN_SIGMAS * self.noise)
-        some = near[np.unique(np.linspace(0, len(near) - 1, MAX_DRAWN).round().astype(int))]
-        gap = self.found.shares(self.grid, some) - self.grid.buckets.target
+        near = near_best_kernels(self.grid, self.search_result, CANDIDATE_SIGMAS * self.noise)
+        some = near[
+            np.unique(np.linspace(0, len(near) - 1, MAX_CANDIDATE_KERNELS).round().astype(int))
+        ]
+        gap = self.search_result.histograms(self.grid, some) - self.grid.buckets.target
         used = np.flatnonzero(gap.any(axis=0) | scatter.any(axis=0))
         gap, scatter = gap[:, used], scatter[:, used]
         best = np.empty(N_DRAWS, int)
@@ -194,13 +202,13 @@ class Draws:
             best[draw] = int(np.argmin(np.abs(gap + moved).sum(axis=1)))
         return _widths(self.grid, some, best)
 
-    def widths_of_pair(self, target_blocks: Float64Array, growth: float) -> HalfWidths | None:
+    def paired_widths(self, target_blocks: Float64Array, growth: float) -> HalfWidths | None:
         """Return ways of the best that most drawn pairs of histograms of one skin stay within.
 
         Parameters
         ----------
         target_blocks : ndarray, shape (blocks, buckets)
-            Counts behind the target in the skin of each block of the relief, of `of_kernel`.
+            Counts behind the target in the skin of each block of the relief, of `count_blocks`.
         growth : float
             Of `BlockCounts`. Of the relief's roughness, not of its difference from the target's:
             how many furrows a patch has is what the next patch differs by.
@@ -211,36 +219,39 @@ class Draws:
             None where fewer than `MIN_BLOCKS` blocks are in both maps.
         """
         grid, relief, buckets = self.grid, self.grid.relief, self.grid.buckets
-        group, groups = normal_blocks.block_of(relief.places, relief.code.shape)
+        group, groups = normal_blocks.assign_blocks(relief.places, relief.code.shape)
         ours = np.bincount(group, minlength=groups)
         both = np.flatnonzero((ours > 0) & (target_blocks.sum(axis=1) > 0))
         if len(both) < MIN_BLOCKS:
             return None
-        theirs = normal_blocks.residuals_of(target_blocks[both])
+        theirs = normal_blocks.block_residuals(target_blocks[both])
         factors = self.rng.standard_normal((N_DRAWS, len(both)))
         factors = np.float32(math.sqrt(len(both) / (len(both) - 1) * growth)) * factors
         factors = factors.astype(np.float32)
-        near = nearly_as_good(grid, self.found, PAIRED_SIGMAS * self.noise)
+        near = near_best_kernels(grid, self.search_result, PAIRED_SIGMAS * self.noise)
         # dense about the best, sparse where hardly a draw comes
-        most = max(MAX_DRAWN, min(MAX_PAIRED, MAX_PAIRED * PAIRED_PX // relief.places.size))
+        most = max(
+            MAX_CANDIDATE_KERNELS,
+            min(MAX_PAIRED_KERNELS, MAX_PAIRED_KERNELS * PAIRED_PX // relief.places.size),
+        )
         steps = np.linspace(0.0, 1.0, most) ** 1.5 * (len(near) - 1)
         some = near[np.unique(steps.round().astype(int))]
         distance = np.empty((N_DRAWS, len(some)), np.float32)
         for i in np.unique(some[:, 0]).tolist():
-            da, db = relief.change(float(grid.sigmas_um[i]))
+            da, db = relief.slope_change(float(grid.sigmas_um[i]))
             for column in np.flatnonzero(some[:, 0] == i).tolist():
                 alpha = np.float32(grid.alphas[some[column, 1]])
                 a, b = -(relief.along + alpha * da), -(relief.across + alpha * db)
                 counts = kernels.count_in_groups(a, b, group, groups, buckets.bins, buckets.limit)
                 gap = counts.sum(axis=0) / relief.places.size - buckets.target
-                apart = normal_blocks.residuals_of(np.asarray(counts[both], np.float64)) - theirs
+                apart = normal_blocks.block_residuals(np.asarray(counts[both], np.float64)) - theirs
                 used = np.flatnonzero((gap != 0.0) | apart.any(axis=0))
                 moved = factors @ apart[:, used].astype(np.float32)
                 distance[:, column] = np.abs(gap[used].astype(np.float32) + moved).sum(axis=1)
         return _widths(grid, some, distance.argmin(axis=1))
 
 
-def of_grid(widths: HalfWidths, grid: KernelGrid) -> HalfWidths:
+def add_grid_error(widths: HalfWidths, grid: KernelGrid) -> HalfWidths:
     """Return half widths with the grid's own: a step over sqrt(12), as of an even error."""
     step = [float(np.diff(g).min()) if g.size > 1 else 0.0 for g in (grid.alphas, grid.sigmas_um)]
 

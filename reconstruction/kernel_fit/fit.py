@@ -21,9 +21,14 @@ from model.microstructure import ALPHA_LIMITS
 from reconstruction import normal_histogram
 from reconstruction.arrays import Float64Array, FloatArray
 from reconstruction.kernel_fit import search as kernel_search
-from reconstruction.kernel_fit.neutral_relief import Axis, KernelFitError, Relief, relief_of
+from reconstruction.kernel_fit.neutral_relief import (
+    Axis,
+    KernelFitError,
+    NeutralRelief,
+    prepare_relief,
+)
 from reconstruction.kernel_fit.outcome import KernelFit, summarize_search
-from reconstruction.kernel_fit.search import Buckets, KernelGrid
+from reconstruction.kernel_fit.search import KernelGrid, TargetBuckets
 from reconstruction.normal_histogram import blocks as normal_blocks
 from reconstruction.normal_histogram import kernels
 
@@ -51,7 +56,7 @@ class KernelSearch:
     """
 
     method: Literal["hierarchical", "exhaustive"] = "hierarchical"
-    first_sample: int = kernel_search.FIRST_SAMPLE
+    first_sample: int = kernel_search.FIRST_SAMPLE_PIXELS
     seed: int = 0
 
 
@@ -119,7 +124,7 @@ def fit_kernel(
     check = Checks(KernelFitError)
     normal_histogram.check_buckets(bins, BUCKET_LIMIT)
     target = _target(target_histogram, bins, transposed=axis in ("y", 0))
-    relief = relief_of(
+    relief = prepare_relief(
         neutral_height_um,
         stretch=stretch,
         axis=axis,
@@ -129,7 +134,7 @@ def fit_kernel(
     )
     tried = KernelGrid(
         relief,
-        Buckets(target, bins, BUCKET_LIMIT),
+        TargetBuckets(target, bins, BUCKET_LIMIT),
         _grid("alphas", grid[0], str(list(ALPHA_LIMITS))),
         _grid("sigmas_um", grid[1], "[1e-9, inf)"),
     )
@@ -139,11 +144,13 @@ def fit_kernel(
     blocks = _blocks(target_blocks, relief, bins, transposed=axis in ("y", 0))
     rng = np.random.default_rng(search.seed)
     if search.method == "exhaustive":
-        found = kernel_search.exhaustive(tried)
+        found = kernel_search.search_exhaustively(tried)
     else:
-        found = kernel_search.hierarchical(tried, first_sample=search.first_sample, rng=rng)
+        found = kernel_search.search_hierarchically(
+            tried, first_sample=search.first_sample, rng=rng
+        )
     behind: dict[str, Any] = {"target_samples": target_samples, "target_blocks": blocks}
-    with kernels.threads_for(500 * relief.places.size):
+    with kernels.limit_threads(500 * relief.places.size):
         return summarize_search(tried, found, search=search.method, **behind, rng=rng)
 
 
@@ -165,13 +172,13 @@ def _target(histogram: FloatArray, bins: int, *, transposed: bool) -> Float64Arr
 
 
 def _blocks(
-    counts: NDArray[np.integer] | None, relief: Relief, bins: int, *, transposed: bool
+    counts: NDArray[np.integer] | None, relief: NeutralRelief, bins: int, *, transposed: bool
 ) -> Float64Array | None:
     """Return counts of the target by blocks of the relief, (blocks, bins ** 2 + 1)."""
     if counts is None:
         return None
     parts = np.asarray(counts, np.float64)
-    grid = normal_blocks.grid_of(relief.code.shape)
+    grid = normal_blocks.block_grid_shape(relief.code.shape)
     if transposed and parts.ndim == 4:
         parts = parts.transpose(1, 0, 3, 2)
     check = Checks(KernelFitError)

@@ -22,7 +22,7 @@ from model.checks import Checks
 from model.microstructure import gaussian_weights
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
 from reconstruction.normal_histogram import kernels
-from reconstruction.normal_histogram.relief_slopes import HistogramError, pixel_sides, stencil
+from reconstruction.normal_histogram.relief_slopes import HistogramError, pixel_sides, slope_stencil
 
 Axis = Literal["x", "y", 0, 1]
 
@@ -32,7 +32,7 @@ class KernelFitError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Relief:
+class NeutralRelief:
     """A neutral relief with its axis of strain along the rows, and the samples of its slopes.
 
     Attributes
@@ -66,10 +66,12 @@ class Relief:
         in_row = known.sum(axis=1)
         object.__setattr__(self, "places", np.flatnonzero(known))
         object.__setattr__(self, "starts", (np.cumsum(in_row) - in_row).astype(np.int64))
-        for name, leans in zip(("along", "across"), self._leans(self.height_um), strict=True):
+        for name, leans in zip(
+            ("along", "across"), self._negative_slopes(self.height_um), strict=True
+        ):
             object.__setattr__(self, name, leans)
 
-    def _leans(self, height: Float32Array) -> tuple[Float32Array, Float32Array]:
+    def _negative_slopes(self, height: Float32Array) -> tuple[Float32Array, Float32Array]:
         """Return minus the slopes of heights at the samples, along and across: (N,), (N,)."""
         a, b = np.empty(self.places.size, np.float32), np.empty(self.places.size, np.float32)
         right, down = np.float32(self.right_um), np.float32(self.down_um)
@@ -80,14 +82,14 @@ class Relief:
         """Return the discrete Gaussian's right half, from the middle on; they sum to 1 mirrored."""
         return gaussian_weights(sigma_um / self.pixel_um).astype(np.float32)
 
-    def change(self, sigma_um: float) -> tuple[Float32Array, Float32Array]:
+    def slope_change(self, sigma_um: float) -> tuple[Float32Array, Float32Array]:
         """Return what a Gaussian of sigma changes the samples' slopes by: (N,), (N,)."""
         moved = np.empty_like(self.height_um)
-        kernels.blurred_less_itself(self.height_um, self.weights(sigma_um), moved)
-        return self._leans(moved)
+        kernels.blur_difference(self.height_um, self.weights(sigma_um), moved)
+        return self._negative_slopes(moved)
 
 
-def relief_of(
+def prepare_relief(
     neutral_height_um: ArrayLike,
     *,
     stretch: float,
@@ -95,7 +97,7 @@ def relief_of(
     pixel_um: float | tuple[float, float],
     stretch_across: float = 1.0,
     valid: ArrayLike | None = None,
-) -> Relief:
+) -> NeutralRelief:
     """Return a neutral relief, its axis of strain turned into rows, with its samples.
 
     Parameters
@@ -115,7 +117,7 @@ def relief_of(
     check.choice("axis", axis, ("x", "y", 1, 0))
     along_y = axis in ("y", 0)
     try:
-        code = stencil(neutral_height_um, valid)
+        code = slope_stencil(neutral_height_um, valid)
         down, right = pixel_sides(pixel_um)
     except HistogramError as error:
         raise KernelFitError(f"of the neutral relief, {error}") from error
@@ -124,11 +126,11 @@ def relief_of(
     good = _usable(height, valid)
     if along_y:
         height, good = height.T, good.T
-        code = stencil(np.ascontiguousarray(height), good)
-    filled = _filled(height, good).astype(np.float32)
+        code = slope_stencil(np.ascontiguousarray(height), good)
+    filled = _fill_holes(height, good).astype(np.float32)
     if along_y:
-        return Relief(filled, code, -down * stretch, right * stretch_across, down)
-    return Relief(filled, code, right * stretch, -down * stretch_across, right)
+        return NeutralRelief(filled, code, -down * stretch, right * stretch_across, down)
+    return NeutralRelief(filled, code, right * stretch, -down * stretch_across, right)
 
 
 def _usable(height: Float64Array, valid: ArrayLike | None) -> BoolArray:
@@ -137,7 +139,7 @@ def _usable(height: Float64Array, valid: ArrayLike | None) -> BoolArray:
     return good if valid is None else good & np.asarray(valid, bool)
 
 
-def _filled(height: Float64Array, good: BoolArray) -> Float64Array:
+def _fill_holes(height: Float64Array, good: BoolArray) -> Float64Array:
     """Return heights about their mean, with holes filled linearly along the rows."""
     filled = np.where(good, height - height[good].mean(), 0.0)
     columns = np.arange(height.shape[1])
@@ -146,7 +148,7 @@ def _filled(height: Float64Array, good: BoolArray) -> Float64Array:
     return filled
 
 
-def convolved(
+def convolve_relief(
     height_um: ArrayLike,
     alpha: float,
     sigma_um: float,
@@ -174,17 +176,17 @@ def convolved(
     Raises
     ------
     KernelFitError
-        As of :func:`relief_of`.
+        As of :func:`prepare_relief`.
 
     Examples
     --------
     >>> furrow = np.tile([0.0, 0.0, -4.0, 0.0, 0.0], (3, 1))
-    >>> convolved(furrow, 1.0, 8.0, axis="x", pixel_um=10.0)[0].round(2)
+    >>> convolve_relief(furrow, 1.0, 8.0, axis="x", pixel_um=10.0)[0].round(2)
     array([-0.09, -0.91, -1.99, -0.91, -0.09])
     """
-    relief = relief_of(height_um, stretch=1.0, axis=axis, pixel_um=pixel_um, valid=valid)
+    relief = prepare_relief(height_um, stretch=1.0, axis=axis, pixel_um=pixel_um, valid=valid)
     moved = np.empty_like(relief.height_um)
-    kernels.blurred_less_itself(relief.height_um, relief.weights(sigma_um), moved)
+    kernels.blur_difference(relief.height_um, relief.weights(sigma_um), moved)
     if axis in ("y", 0):
         moved = moved.T
     height = np.asarray(height_um, np.float64)

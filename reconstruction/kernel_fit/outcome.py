@@ -9,7 +9,7 @@ from reconstruction import normal_histogram
 from reconstruction.arrays import Float64Array
 from reconstruction.kernel_fit import errors as kernel_errors
 from reconstruction.kernel_fit import search as kernel_search
-from reconstruction.kernel_fit.search import Found, KernelGrid
+from reconstruction.kernel_fit.search import KernelGrid, KernelSearchResult
 from reconstruction.normal_histogram.statistics import SAMPLES_PER_BUCKET
 
 FINER_ALPHA, FINER_SIGMA = 10, 5
@@ -101,7 +101,7 @@ class KernelFit:
 
 def summarize_search(
     grid: KernelGrid,
-    found: Found,
+    search_result: KernelSearchResult,
     *,
     search: str,
     target_samples: float | None,
@@ -128,21 +128,27 @@ def summarize_search(
     alphas, sigmas_um = grid.alphas, grid.sigmas_um
     samples = relief.places.size
     before = float(grid.distances(sigmas_um[0], np.zeros(1))[0])
-    i, j = found.best
-    alpha, sigma, distance = float(alphas[j]), float(sigmas_um[i]), float(found.distance[i, j])
-    blocks = kernel_errors.of_kernel(grid, alpha, sigma)
+    i, j = search_result.best
+    alpha, sigma, distance = (
+        float(alphas[j]),
+        float(sigmas_um[i]),
+        float(search_result.distance[i, j]),
+    )
+    blocks = kernel_errors.count_blocks(grid, alpha, sigma)
     effective, occupied = blocks.effective_samples, blocks.occupied
     theirs = effective if target_samples is None else float(target_samples)
-    noise = blocks.noise(target, theirs)
+    noise = blocks.distance_stderr(target, theirs)
     floor = normal_histogram.noise_floor(target, effective, theirs)
-    rows, columns = kernel_errors.nearly_as_good(grid, found, noise).T
-    near = np.stack([alphas[columns], sigmas_um[rows], found.distance[rows, columns]], axis=1)
+    rows, columns = kernel_errors.near_best_kernels(grid, search_result, noise).T
+    near = np.stack(
+        [alphas[columns], sigmas_um[rows], search_result.distance[rows, columns]], axis=1
+    )
     reason = ""
     if np.ptp(relief.along) == 0.0 and np.ptp(relief.across) == 0.0:
         reason = "the neutral relief is flat: every kernel leaves it so"
     elif occupied == 1 and np.count_nonzero(target) == 1 and distance in (0.0, 2.0):
         reason = "one bucket holds everything"
-    elif float(found.distance.max()) - distance <= noise:
+    elif float(search_result.distance.max()) - distance <= noise:
         reason = "the distance does not depend on the kernel beyond its noise"
     if reason:
         alpha, distance = 0.0, before
@@ -150,10 +156,12 @@ def summarize_search(
         told = kernel_errors.HalfWidths((math.inf, math.inf), (math.inf, math.inf))
     else:
         refined = _refined(grid, (i, j), distance)
-        draws = kernel_errors.Draws(grid, found, noise, rng)
-        pair = target_blocks is not None and draws.widths_of_pair(target_blocks, blocks.growth)
-        told = pair or draws.widths_of_best(blocks.scatter(theirs))
-        told = kernel_errors.of_grid(told, grid)
+        draws = kernel_errors.HistogramResampling(grid, search_result, noise, rng)
+        pair = target_blocks is not None and draws.paired_widths(
+            target_blocks, blocks.variance_inflation
+        )
+        told = pair or draws.best_kernel_widths(blocks.block_contributions(theirs))
+        told = kernel_errors.add_grid_error(told, grid)
     return KernelFit(
         alpha=alpha,
         sigma_um=sigma,
@@ -177,8 +185,8 @@ def summarize_search(
         samples=samples,
         effective_samples=effective,
         search=search,
-        miss_probability=0.0 if found.exact.all() else kernel_search.MAX_MISS_PROBABILITY,
-        passes=found.passes,
+        miss_probability=0.0 if search_result.exact.all() else kernel_search.MAX_MISS_PROBABILITY,
+        passes=search_result.passes,
         reason=reason,
     )
 

@@ -27,7 +27,7 @@ import numpy as np
 
 from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
-from reconstruction.kernel_fit.neutral_relief import KernelFitError, Relief
+from reconstruction.kernel_fit.neutral_relief import KernelFitError, NeutralRelief
 from reconstruction.normal_histogram import kernels
 
 MAX_MISS_PROBABILITY = 1e-6
@@ -36,17 +36,17 @@ DISTANCE_ROUNDING = 2e-4
 """Distance granted to rounding: on samples, sums of single precision are taken in another order."""
 TIE_TOL = 1e-12
 """Distances that differ by less are tied."""
-FIRST_SAMPLE = 16_384
+FIRST_SAMPLE_PIXELS = 16_384
 SAMPLE_GROWTH = 5.6
 """From one sample to the next. On 2000 x 2000 pixels these took the fewest evaluations of what was
-tried, with samples whose neighbourhoods stay below `WINDOW_BYTES`."""
+tried, with samples whose neighbourhoods stay below `MAX_WINDOW_BYTES`."""
 MAX_SAMPLE_FRACTION = 0.35
 """Share of all pixels from which all are taken."""
-WINDOW_BYTES = 300_000_000
+MAX_WINDOW_BYTES = 300_000_000
 """Most memory for the neighbourhoods of sampled pixels; beyond, whole maps are convolved."""
 N_ANCHORS = 6
 """Kernels evaluated on all pixels between two samples."""
-KEPT_BYTES = 100_000_000
+MAX_CACHED_COUNT_BYTES = 100_000_000
 """Most memory for counts of kernels evaluated on all pixels, which standard errors need again."""
 
 
@@ -55,7 +55,7 @@ Slopes = tuple[Float32Array, Float32Array]
 
 
 @dataclass(frozen=True, slots=True)
-class Buckets:
+class TargetBuckets:
     """The target of a search.
 
     Attributes
@@ -73,7 +73,7 @@ class Buckets:
     def count(self, start: Slopes, change: Slopes, alphas: Float64Array) -> Int32Array:
         """Count the samples of each alpha, in parts: (parts, A, bins ** 2 + 1)."""
         given = alphas.astype(np.float32)
-        parts = kernels.threads()
+        parts = kernels.thread_count()
         return kernels.count_kernels(*start, *change, given, self.bins, self.limit, parts)
 
 
@@ -89,15 +89,15 @@ class KernelGrid:
         Increasing.
     """
 
-    relief: Relief
-    buckets: Buckets
+    relief: NeutralRelief
+    buckets: TargetBuckets
     alphas: Float64Array
     sigmas_um: Float64Array
 
     def count(self, sigma_um: float, alphas: Float64Array) -> Int32Array:
         """Count all pixels of the relief that kernels of one sigma have changed, in parts."""
         relief = self.relief
-        change = relief.change(float(sigma_um))
+        change = relief.slope_change(float(sigma_um))
         return self.buckets.count((relief.along, relief.across), change, alphas)
 
     def distances(self, sigma_um: float, alphas: Float64Array) -> Float64Array:
@@ -106,7 +106,7 @@ class KernelGrid:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class KernelSearchResult:
     """What a search knows of its grid; arrays have the shape (sigmas, alphas).
 
     Attributes
@@ -130,31 +130,31 @@ class Found:
     passes: float
     counts: dict[tuple[int, int], Int32Array] = field(default_factory=dict)
 
-    def shares(self, grid: KernelGrid, wanted: Int64Array) -> Float64Array:
+    def histograms(self, grid: KernelGrid, indices: Int64Array) -> Float64Array:
         """Return histograms of kernels, (K, buckets), counting what the search has not kept.
 
         Parameters
         ----------
         grid
             Of the search.
-        wanted : ndarray, shape (K, 2)
+        indices : ndarray, shape (K, 2)
             Indices (sigma, alpha).
         """
-        out = np.empty((len(wanted), grid.buckets.target.size))
-        kept = np.array([(i, j) in self.counts for i, j in wanted.tolist()], bool)
+        out = np.empty((len(indices), grid.buckets.target.size))
+        kept = np.array([(i, j) in self.counts for i, j in indices.tolist()], bool)
         for row in np.flatnonzero(kept):
-            out[row] = self.counts[wanted[row, 0], wanted[row, 1]]
+            out[row] = self.counts[indices[row, 0], indices[row, 1]]
         rows = np.flatnonzero(~kept)
-        for i in np.unique(wanted[rows, 0]):
-            some = rows[wanted[rows, 0] == i]
-            out[some] = grid.count(grid.sigmas_um[i], grid.alphas[wanted[some, 1]]).sum(axis=0)
+        for i in np.unique(indices[rows, 0]):
+            some = rows[indices[rows, 0] == i]
+            out[some] = grid.count(grid.sigmas_um[i], grid.alphas[indices[some, 1]]).sum(axis=0)
         return out / grid.relief.places.size
 
 
-def gentlest(
+def find_best(
     distance: Float64Array, alphas: Float64Array, sigmas_um: Float64Array
 ) -> tuple[int, int]:
-    """Return the indices of the least distance, (S, A), ties by the rule of :class:`Found`.
+    """Return the indices (S, A) of the minimum distance; ties as in `KernelSearchResult`.
 
     Raises
     ------
@@ -170,20 +170,20 @@ def gentlest(
     return int(i[order[0]]), int(j[order[0]])
 
 
-def exhaustive(grid: KernelGrid) -> Found:
+def search_exhaustively(grid: KernelGrid) -> KernelSearchResult:
     """Evaluate all kernels of the grid on all pixels."""
     distance = np.empty((grid.sigmas_um.size, grid.alphas.size))
-    with kernels.threads_for(grid.relief.places.size * distance.size):
+    with kernels.limit_threads(grid.relief.places.size * distance.size):
         for i, sigma in enumerate(grid.sigmas_um):
             distance[i] = grid.distances(sigma, grid.alphas)
-    best = gentlest(distance, grid.alphas, grid.sigmas_um)
-    return Found(distance, np.ones(distance.shape, bool), best, float(distance.size))
+    best = find_best(distance, grid.alphas, grid.sigmas_um)
+    return KernelSearchResult(distance, np.ones(distance.shape, bool), best, float(distance.size))
 
 
-def hierarchical(
-    grid: KernelGrid, *, first_sample: int = FIRST_SAMPLE, rng: np.random.Generator
-) -> Found:
-    """Find what :func:`exhaustive` does, but for a chance of `MAX_MISS_PROBABILITY`.
+def search_hierarchically(
+    grid: KernelGrid, *, first_sample: int = FIRST_SAMPLE_PIXELS, rng: np.random.Generator
+) -> KernelSearchResult:
+    """Find what :func:`search_exhaustively` does, but for a chance of `MAX_MISS_PROBABILITY`.
 
     Parameters
     ----------
@@ -198,11 +198,11 @@ def hierarchical(
     """
     pixels = grid.relief.places.size
     if first_sample >= MAX_SAMPLE_FRACTION * pixels:
-        return exhaustive(grid)
+        return search_exhaustively(grid)
     sizes = [first_sample]
     while sizes[-1] * SAMPLE_GROWTH < MAX_SAMPLE_FRACTION * pixels:
         sizes.append(int(sizes[-1] * SAMPLE_GROWTH))
-    with kernels.threads_for(first_sample * grid.alphas.size * grid.sigmas_um.size):
+    with kernels.limit_threads(first_sample * grid.alphas.size * grid.sigmas_um.size):
         return _Race(grid).run(sizes, rng)
 
 
@@ -222,7 +222,7 @@ class _Race:
         self.signs: list[Float64Array] = []
         self.passes = 0.0
 
-    def run(self, sizes: list[int], rng: np.random.Generator) -> Found:
+    def run(self, sizes: list[int], rng: np.random.Generator) -> KernelSearchResult:
         pixels = self.grid.relief.places.size
         order = rng.permutation(pixels)[: sizes[-1]]
         tests = self.low.size * len(sizes) * (1 + N_ANCHORS)
@@ -235,7 +235,7 @@ class _Race:
             before = size
             self._anchor()
         self._finish()
-        best = gentlest(self.distance, self.alphas, self.sigmas)
+        best = find_best(self.distance, self.alphas, self.sigmas)
         # a sample's distance is larger than that of all, alike for kernels that are alike
         excess = np.zeros(len(sizes))
         for number in range(len(sizes)):
@@ -246,7 +246,7 @@ class _Race:
                 excess[number] = excess[number - 1] / math.sqrt(SAMPLE_GROWTH)
         distance = np.where(self.exact, self.distance, self.guess - excess[self.level])
         distance[~self.exact] = np.maximum(distance[~self.exact], self.distance[best])
-        return Found(distance, self.exact, best, self.passes, self.counts)
+        return KernelSearchResult(distance, self.exact, best, self.passes, self.counts)
 
     @property
     def _open(self) -> BoolArray:
@@ -272,7 +272,9 @@ class _Race:
             da, db = change.at(float(self.sigmas[i]))
             first = buckets.count(old, (da[:before], db[:before]), self.alphas[j])
             second = buckets.count(new, (da[before:], db[before:]), self.alphas[j])
-            found = kernels.bounds(first, second, buckets.target, before, fresh, pixels, signs)
+            found = kernels.distance_bounds(
+                first, second, buckets.target, before, fresh, pixels, signs
+            )
             self.guess[i, j], low = found.T
             self.level[i, j] = number
             self.low[i, j] = np.maximum(self.low[i, j], low - slack)
@@ -301,7 +303,7 @@ class _Race:
         self.passes += j.size
         whole = counts.sum(axis=0, dtype=np.int32)
         for row, column in enumerate(j.tolist()):
-            if (len(self.counts) + 1) * whole[row].nbytes <= KEPT_BYTES:
+            if (len(self.counts) + 1) * whole[row].nbytes <= MAX_CACHED_COUNT_BYTES:
                 self.counts[i, column] = whole[row]
         if keep is not None:
             shares = whole[list(j).index(keep)] / self.grid.relief.places.size
@@ -320,23 +322,23 @@ class _SampledChange:
 
     SIZE = 1024
 
-    def __init__(self, relief: Relief, chosen: Int64Array, most_um: float) -> None:
+    def __init__(self, relief: NeutralRelief, chosen: Int64Array, most_um: float) -> None:
         self.relief, self.chosen = relief, chosen
         reach = relief.weights(float(most_um)).size - 1
         blocks = -(-chosen.size // self.SIZE)
-        self.small = 8 * blocks * reach * self.SIZE <= WINDOW_BYTES
+        self.small = 8 * blocks * reach * self.SIZE <= MAX_WINDOW_BYTES
         if self.small:
             self.along = np.zeros((blocks, reach, self.SIZE), np.float32)
             self.across = np.zeros_like(self.along)
             right, down = np.float32(relief.right_um), np.float32(relief.down_um)
             given = relief.height_um, relief.code, relief.places[chosen], right, down
-            kernels.windows(*given, self.along, self.across)
+            kernels.fill_windows(*given, self.along, self.across)
 
     def at(self, sigma_um: float) -> tuple[Float32Array, Float32Array]:
         """Return both changes, in the order of the chosen pixels."""
         if not self.small:
-            a, b = self.relief.change(sigma_um)
+            a, b = self.relief.slope_change(sigma_um)
             return a[self.chosen], b[self.chosen]
         da, db = np.empty(self.chosen.size, np.float32), np.empty(self.chosen.size, np.float32)
-        kernels.weighed(self.along, self.across, self.relief.weights(sigma_um), da, db)
+        kernels.sum_weighted_windows(self.along, self.across, self.relief.weights(sigma_um), da, db)
         return da, db

@@ -92,7 +92,7 @@ def fit_table(
     *,
     weights: ArrayLike | None = None,
     max_segments: int = 2,
-    least_points: int = MIN_POINTS,
+    min_points: int = MIN_POINTS,
     source: str = "fitted",
 ) -> TableFit:
     """Fit a table of kernels to kernels fitted at single stretch ratios.
@@ -106,7 +106,7 @@ def fit_table(
         parameters, or of alpha and of sigma. Equal by default; 0 leaves a point out.
     max_segments : int
         Most lines of alpha, 1...4. Two are as many as eq. (8) has within its limits.
-    least_points : int
+    min_points : int
         Points that each line of alpha must be informed by: on it or its ends, the neutral kernel
         among them, and not held at a limit.
     source : str
@@ -130,7 +130,7 @@ def fit_table(
     w = np.broadcast_to(w[:, None] if w.ndim == 1 else w, (w.shape[0], 2))
     w = check.numbers("weights", w, (r.size, 2), interval="[0, inf)")
     check.within("max_segments", max_segments, "[1, 4]")
-    check.within("least_points", least_points, "[1, inf)")
+    check.within("least_points", min_points, "[1, inf)")
     for point, (stretched, strength, width) in enumerate(zip(r, a, s, strict=True)):
         check.within(f"point {point}, stretch", stretched, "(0, inf)")
         check.within(f"point {point}, alpha", strength, str(list(ALPHA_LIMITS)))
@@ -149,7 +149,7 @@ def fit_table(
     criterion = {}
     n = r.size
     for segments in range(1, max_segments + 1):
-        fit = points.fitted(segments, least_points)
+        fit = points.fit_lines(segments, min_points)
         if fit is None or n <= 2 * segments - 1:
             continue
         fits[segments] = fit
@@ -237,7 +237,7 @@ class _Points:
         assert best is not None  # noqa: S101
         return best
 
-    def fitted(self, segments: int, least_points: int) -> _AlphaFit | None:
+    def fit_lines(self, segments: int, min_points: int) -> _AlphaFit | None:
         """Return lines and breaks of least squares; None without room."""
 
         def tried(breaks: Float64Array) -> _AlphaFit:
@@ -248,7 +248,7 @@ class _Points:
             edges = np.concatenate([[-np.inf], breaks, [np.inf]])
             points = np.append(self.r[informing], 1.0)
             for first, last in pairwise(edges):
-                if np.count_nonzero((points >= first) & (points <= last)) < least_points:
+                if np.count_nonzero((points >= first) & (points <= last)) < min_points:
                     return none
             return _AlphaFit(self, slopes, breaks, rss)
 
@@ -262,7 +262,7 @@ class _Points:
         for _ in range(3):  # finer around the best, one break at a time
             for k in range(segments - 1):
                 for place in np.linspace(best.breaks[k] - step, best.breaks[k] + step, 41):
-                    other = tried(best.moved(k, place))
+                    other = tried(best.move_break(k, place))
                     if other.rss < best.rss - 1e-15:
                         best = other
             step /= 10.0
@@ -279,35 +279,35 @@ class _AlphaFit:
     rss: float
 
     @property
-    def free(self) -> int:
+    def dof(self) -> int:
         """Degrees of freedom."""
         return self.points.r.size - self.slopes.size - self.breaks.size
 
-    def moved(self, k: int, place: float) -> Float64Array:
+    def move_break(self, k: int, position: float) -> Float64Array:
         """Return the breaks with one of them elsewhere."""
         breaks = self.breaks.copy()
-        breaks[k] = place
+        breaks[k] = position
         return breaks
 
     def covariance(self) -> Float64Array:
         """Return that of the slopes at these breaks; infinite where no point is left over."""
         slopes, informing, _ = self.points.slopes(self.breaks)
         X = _design(self.points.r, self.breaks)[informing]
-        if self.free <= 0 or np.linalg.matrix_rank(X) < slopes.size:
+        if self.dof <= 0 or np.linalg.matrix_rank(X) < slopes.size:
             return np.diag(np.full(slopes.size, np.inf))
         weighted = X * self.points.w[informing, None]
-        return np.asarray(np.linalg.inv(weighted.T @ X) * self.rss / self.free)
+        return np.asarray(np.linalg.inv(weighted.T @ X) * self.rss / self.dof)
 
     def break_stderr(self) -> tuple[float, ...]:
         """Return half of the ways that breaks can move until the misfit grows by one residual's."""
-        if self.free <= 0:
+        if self.dof <= 0:
             return (math.inf,) * self.breaks.size
-        most = self.rss * (1.0 + 1.0 / self.free)
+        most = self.rss * (1.0 + 1.0 / self.dof)
         widths = []
         for k in range(self.breaks.size):
             near = [float(self.breaks[k])]
             for place in np.linspace(self.points.r[0], self.points.r[-1], 400):
-                breaks = self.moved(k, place)
+                breaks = self.move_break(k, place)
                 if (np.diff(breaks) > 0).all() and self.points.slopes(breaks)[2] <= most:
                     near.append(float(place))
             widths.append(0.5 * (max(near) - min(near)))
@@ -370,7 +370,7 @@ class DirectionDependence:
     p_sigma: float
 
 
-def direction_dependence(
+def estimate_direction_dependence(
     table: KernelTable,
     stretch: ArrayLike,
     alpha: ArrayLike,

@@ -14,7 +14,9 @@ from model.fresnel import ETA_SKIN
 from reconstruction.arrays import Float64Array, FloatArray
 
 
-def transmitted(cos_light: FloatArray, cos_view: FloatArray, eta: float = ETA_SKIN) -> Float64Array:
+def boundary_transmittance(
+    cos_light: FloatArray, cos_view: FloatArray, eta: float = ETA_SKIN
+) -> Float64Array:
     """Return F_t(light) F_t(view) of a smooth boundary.
 
     Parameters
@@ -36,7 +38,7 @@ def transmitted(cos_light: FloatArray, cos_view: FloatArray, eta: float = ETA_SK
 
     Examples
     --------
-    >>> transmitted(np.array([1.0, 0.0]), np.array([1.0, 1.0])).round(4).tolist()
+    >>> boundary_transmittance(np.array([1.0, 0.0]), np.array([1.0, 1.0])).round(4).tolist()
     [0.9452, 0.0]
     """
     Checks().shape("cos_light", cos_light, np.shape(cos_view))

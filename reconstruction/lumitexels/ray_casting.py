@@ -30,7 +30,7 @@ class RayCaster:
     Examples
     --------
     >>> caster = RayCaster([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
-    >>> caster.blocked([[0.2, 0.2, 1.0]], [[0.0, 0.0, -1.0]], [2.0]).tolist()
+    >>> caster.is_blocked([[0.2, 0.2, 1.0]], [[0.0, 0.0, -1.0]], [2.0]).tolist()
     [True]
     """
 
@@ -73,7 +73,7 @@ class RayCaster:
             distance[part] = np.where(triangle[part] >= 0, hit["tfar"], np.inf)
         return triangle, distance
 
-    def blocked(
+    def is_blocked(
         self, origins_mm: ArrayLike, directions: ArrayLike, length_mm: ArrayLike
     ) -> BoolArray:
         """Return which rays meet a triangle before their end.

@@ -20,7 +20,7 @@ SHADOW_RAY_OFFSET_MM: Final = 0.1
 """Shadow rays start so far above the surface."""
 
 
-class Camera(Protocol):
+class CameraProjection(Protocol):
     """What is needed of a calibrated camera."""
 
     @property
@@ -31,7 +31,7 @@ class Camera(Protocol):
         """Return columns and rows, shape (N, 2), px; NaN behind the camera."""
 
 
-class Lights(Protocol):
+class LightSources(Protocol):
     """What is needed of calibrated lights."""
 
     @property
@@ -47,7 +47,7 @@ class Lights(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Surface:
+class SampledSurface:
     """Points that samples are gathered for."""
 
     points_mm: Float32Array
@@ -109,8 +109,8 @@ class Visibility:
     """Shape (V, P)."""
 
 
-def visibility(
-    surface: Surface,
+def compute_visibility(
+    surface: SampledSurface,
     caster: RayCaster,
     *,
     cameras_mm: ArrayLike,
@@ -143,7 +143,7 @@ def visibility(
         facing = np.flatnonzero(np.einsum("pk,pk->p", way, surface.normals) > min_cosine)
         start = surface.points_mm[facing] + np.float32(offset_mm) * surface.normals[facing]
         out = np.zeros(len(surface), np.bool_)
-        out[facing] = ~caster.blocked(start, way[facing], length[facing, 0])
+        out[facing] = ~caster.is_blocked(start, way[facing], length[facing, 0])
         return out
 
     lights = np.asarray(lights_mm, np.float32).reshape(-1, 3)

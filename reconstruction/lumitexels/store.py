@@ -21,11 +21,11 @@ from reconstruction.lumitexels.ray_casting import RayCaster
 from reconstruction.lumitexels.samples import (
     MIN_VISIBLE_COSINE,
     SHADOW_RAY_OFFSET_MM,
-    Camera,
-    Lights,
+    CameraProjection,
+    LightSources,
     Lumitexels,
-    Surface,
-    visibility,
+    SampledSurface,
+    compute_visibility,
 )
 
 BYTES_PER_SAMPLE: Final = 57
@@ -53,7 +53,7 @@ class LumitexelStore:
     binning : int
         Camera pixels along each side of an image pixel: 2 for images of 2 x 2 cells.
     light_radius_mm, offset_mm : float
-        See `reconstruction.lumitexels.visibility`.
+        See `reconstruction.lumitexels.compute_visibility`.
     folder : Path, optional
         Existing folder for the tables; in memory by default.
     dtype : dtype
@@ -63,10 +63,10 @@ class LumitexelStore:
 
     def __init__(
         self,
-        surface: Surface,
+        surface: SampledSurface,
         *,
-        cameras: Sequence[Camera],
-        lights: Lights,
+        cameras: Sequence[CameraProjection],
+        lights: LightSources,
         caster: RayCaster,
         poses: ArrayLike | None = None,
         binning: int = 1,
@@ -80,7 +80,7 @@ class LumitexelStore:
         self._cameras, self._lights, self._binning = tuple(cameras), lights, binning
         self._poses = _checked_poses(poses, len(cameras), self.light_count)
         Checks().within("binning", binning, "[1, inf)")
-        seen = visibility(
+        seen = compute_visibility(
             surface,
             caster,
             cameras_mm=np.array([camera.center_mm for camera in cameras]).reshape(-1, 3),
@@ -274,7 +274,7 @@ def _back(poses: Float64Array, point: FloatArray) -> Float64Array:
     return np.asarray(np.einsum("lji,lj->li", poses[:, :3, :3], point - poses[:, :3, 3]))
 
 
-def _moved(lights: Lights, poses: Float64Array) -> Lights:
+def _moved(lights: LightSources, poses: Float64Array) -> LightSources:
     """Return the lights as they stand for the subject in each one's own frame."""
     names = getattr(lights, "__dataclass_fields__", {})
     if "position_mm" not in names:
@@ -286,7 +286,7 @@ def _moved(lights: Lights, poses: Float64Array) -> Lights:
     }
     if "axis" in names:
         changes["axis"] = np.einsum("lji,lj->li", turn, held.axis)
-    moved: Lights = replace(held, **changes)
+    moved: LightSources = replace(held, **changes)
     return moved
 
 

@@ -17,7 +17,7 @@ from model.checks import Checks
 from reconstruction.arrays import Float64Array, FloatArray, Int64Array
 from reconstruction.normal_histogram import kernels
 from reconstruction.normal_histogram.counting import check_buckets
-from reconstruction.normal_histogram.relief_slopes import HistogramError, slopes, turned
+from reconstruction.normal_histogram.relief_slopes import HistogramError, rotate_components, slopes
 
 BLOCKS_PER_SIDE = 8
 """A map is cut into so many blocks a side."""
@@ -30,30 +30,30 @@ MIN_BLOCKS = 5
 """Fewer tell neither how they scatter nor how they are alike."""
 
 
-def grid_of(shape: tuple[int, ...], blocks: int = BLOCKS_PER_SIDE) -> tuple[int, int]:
-    """Return into how many rows and columns of blocks `block_of` cuts a map of (H, W) pixels.
+def block_grid_shape(shape: tuple[int, ...], blocks: int = BLOCKS_PER_SIDE) -> tuple[int, int]:
+    """Return into how many rows and columns of blocks `assign_blocks` cuts a map of (H, W) pixels.
 
     Examples
     --------
-    >>> grid_of((1000, 20), 8)
+    >>> block_grid_shape((1000, 20), 8)
     (8, 5)
     """
     return max(1, min(blocks, shape[0] // 4)), max(1, min(blocks, shape[1] // 4))
 
 
-def block_of(
-    places: Int64Array, shape: tuple[int, ...], blocks: int = BLOCKS_PER_SIDE
+def assign_blocks(
+    pixel_indices: Int64Array, shape: tuple[int, ...], blocks: int = BLOCKS_PER_SIDE
 ) -> tuple[Int64Array, int]:
     """Return the block of pixels ``y * W + x``, and how many blocks there are.
 
     A map is cut into ``blocks`` along each axis, fewer where they would be below 4 pixels.
     """
-    down, across = grid_of(shape, blocks)
-    y, x = np.divmod(places, shape[1])
+    down, across = block_grid_shape(shape, blocks)
+    y, x = np.divmod(pixel_indices, shape[1])
     return y * down // shape[0] * across + x * across // shape[1], down * across
 
 
-def block_counts(
+def count_block_normals(
     height: ArrayLike,
     block: Int64Array,
     blocks: int,
@@ -90,13 +90,13 @@ def block_counts(
     Checks(HistogramError).within("blocks", blocks, "[1, inf)")
     a, b, known = slopes(height, pixel=pixel, valid=valid)
     known = known & (block >= 0) & (block < blocks)
-    a, b = turned(a[known], b[known], angle_rad)
+    a, b = rotate_components(a[known], b[known], angle_rad)
     group = np.asarray(block[known], np.int64)
     counts = kernels.count_in_groups(a, b, group, blocks, bins, float(limit))
     return np.asarray(counts[:, :-1], np.int64).reshape(blocks, bins, bins)
 
 
-def residuals_of(counts: Float64Array) -> Float64Array:
+def block_residuals(counts: Float64Array) -> Float64Array:
     """Return what each block adds to the error of the shares that all have in common.
 
     Parameters
@@ -111,7 +111,7 @@ def residuals_of(counts: Float64Array) -> Float64Array:
 
     Examples
     --------
-    >>> residuals_of(np.array([[3.0, 1.0], [1.0, 3.0]]))
+    >>> block_residuals(np.array([[3.0, 1.0], [1.0, 3.0]]))
     array([[ 0.125, -0.125],
            [-0.125,  0.125]])
     """
@@ -120,7 +120,7 @@ def residuals_of(counts: Float64Array) -> Float64Array:
     return np.asarray((counts - sizes[:, None] * common) / sizes.sum())
 
 
-def effective_number(counts: Float64Array, samples: int) -> float:
+def effective_sample_count(counts: Float64Array, samples: int) -> float:
     """Return how many independent samples would make blocks differ as much as they do.
 
     Parameters
@@ -142,7 +142,7 @@ def effective_number(counts: Float64Array, samples: int) -> float:
     if n < 2:
         return float(samples)
     p = counts.sum(axis=0) / sizes.sum()
-    residual = residuals_of(counts)
+    residual = block_residuals(counts)
     variance = n / (n - 1) * float(np.sum(residual * residual))
     spread = float(np.sum(p * (1.0 - p)))
     if variance <= 0 or spread <= 0:
@@ -150,8 +150,8 @@ def effective_number(counts: Float64Array, samples: int) -> float:
     return float(np.clip(spread / variance, 1.0, samples))
 
 
-def stderr_of_mean(
-    values: Float64Array, sizes: Float64Array, places: Float64Array
+def mean_stderr(
+    values: Float64Array, sizes: Float64Array, positions: Float64Array
 ) -> tuple[float, float]:
     """Return the standard error of the mean of all samples, and what it is of that of independents.
 
@@ -161,7 +161,7 @@ def stderr_of_mean(
         Means of the blocks.
     sizes : ndarray, shape (B,)
         Samples of each, > 0.
-    places : ndarray, shape (B, 2)
+    positions : ndarray, shape (B, 2)
         Middles, in sides of a block.
 
     Returns
@@ -176,7 +176,7 @@ def stderr_of_mean(
     --------
     >>> rng = np.random.default_rng(0)
     >>> y, x = np.mgrid[:8, :8].reshape(2, -1)
-    >>> alone, growth = stderr_of_mean(rng.normal(size=64), np.ones(64), np.stack([x, y], 1))
+    >>> alone, growth = mean_stderr(rng.normal(size=64), np.ones(64), np.stack([x, y], 1))
     >>> bool(0.1 < alone < 0.17), bool(growth < 1.5)
     (True, True)
     """
@@ -187,7 +187,7 @@ def stderr_of_mean(
         return 0.0, 1.0
     weights = sizes / sizes.sum()
     own = np.diag(sizes.mean() / sizes)
-    apart = np.linalg.norm(places[:, None] - places[None], axis=-1)
+    apart = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
     logs, variances = [], []
     for reach in CORRELATION_LENGTHS:
         alike = np.exp(-((apart / reach) ** 2))
@@ -211,7 +211,7 @@ def stderr_of_mean(
     return float(np.sqrt(variance)), max(1.0, variance / variances[0])
 
 
-def block_error(
+def block_mean_stderr(
     values: FloatArray,
     group: Int64Array,
     groups: int,
@@ -225,18 +225,18 @@ def block_error(
     values : ndarray, shape (N,)
         Of the samples, any unit.
     group, groups, shape, blocks
-        Of `block_of`.
+        Of `assign_blocks`.
 
     Returns
     -------
     stderr : float
         In the unit of the values.
     growth : float
-        As of :func:`stderr_of_mean`.
+        As of :func:`mean_stderr`.
     """
     sizes = np.bincount(group, minlength=groups).astype(np.float64)
     some = np.flatnonzero(sizes > 0)
     means = np.bincount(group, values, groups)[some] / sizes[some]
-    _, across = grid_of(shape, blocks)
+    _, across = block_grid_shape(shape, blocks)
     places = np.stack(np.divmod(some, across), axis=1).astype(np.float64)
-    return stderr_of_mean(means, sizes[some], places)
+    return mean_stderr(means, sizes[some], places)

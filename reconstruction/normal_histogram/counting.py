@@ -18,13 +18,13 @@ from reconstruction.arrays import Float64Array, Int64Array
 from reconstruction.normal_histogram import kernels
 from reconstruction.normal_histogram.relief_slopes import (
     HistogramError,
+    rotate_components,
     slopes,
-    slopes_of_normals,
-    turned,
+    slopes_from_normals,
 )
 
 
-def bucket_counts(
+def count_normals(
     slope_x: ArrayLike, slope_y: ArrayLike, *, bins: int = 64, limit: float = 1.0
 ) -> tuple[Int64Array, int]:
     """Count the normals of slopes in buckets.
@@ -55,8 +55,8 @@ def bucket_counts(
     p = np.ascontiguousarray(slope_x, np.float64).reshape(-1)
     q = np.ascontiguousarray(slope_y, np.float64).reshape(-1)
     Checks(HistogramError).require(p.shape == q.shape, "slope_y", f"{q.size} slopes", f"{p.size}")
-    with kernels.threads_for(100 * p.size):
-        counts = kernels.count_slopes(p, q, bins, float(limit), kernels.threads()).sum(axis=0)
+    with kernels.limit_threads(100 * p.size):
+        counts = kernels.count_slopes(p, q, bins, float(limit), kernels.thread_count()).sum(axis=0)
     return counts[:-1].reshape(bins, bins), int(counts[-1])
 
 
@@ -130,8 +130,10 @@ def from_slopes(
     angle_rad: float = 0.0,
 ) -> Float64Array:
     """Return the histogram of normals given as slopes dh/dx, dh/dy; see :func:`histogram`."""
-    p, q = turned(np.asarray(slope_x, np.float64), np.asarray(slope_y, np.float64), angle_rad)
-    return shares_of(bucket_counts(p, q, bins=bins, limit=limit)[0])
+    p, q = rotate_components(
+        np.asarray(slope_x, np.float64), np.asarray(slope_y, np.float64), angle_rad
+    )
+    return normalize_counts(count_normals(p, q, bins=bins, limit=limit)[0])
 
 
 def from_normals(
@@ -146,11 +148,11 @@ def from_normals(
 
     Normals that are not finite or do not face z count as not valid.
     """
-    a, b, known = slopes_of_normals(normals, valid=valid)
+    a, b, known = slopes_from_normals(normals, valid=valid)
     return from_slopes(a[known], b[known], bins=bins, limit=limit, angle_rad=angle_rad)
 
 
-def shares_of(counts: Int64Array) -> Float64Array:
+def normalize_counts(counts: Int64Array) -> Float64Array:
     """Return counts over their sum, of at least one sample."""
     total = int(counts.sum())
     Checks(HistogramError).require(total, "height", "no sample within the limit", "at least one")

@@ -25,13 +25,13 @@ MIN_PARALLEL_NORMALS = 100_000_000
 """Normals computed in all, below which one thread is sooner done than several are brought in."""
 
 
-def threads() -> int:
+def thread_count() -> int:
     """Return into how many parts the samples are cut."""
     return min(int(numba.get_num_threads()), MAX_THREADS)
 
 
 @contextmanager
-def threads_for(work: int) -> Iterator[None]:
+def limit_threads(work: int) -> Iterator[None]:
     """Keep to one thread while ``work`` normals are computed, if they are few."""
     before = numba.get_num_threads()
     if work < MIN_PARALLEL_NORMALS:
@@ -139,7 +139,7 @@ def _mirrored(i, n):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def blurred_less_itself(height: Any, weights: Any, out: Any) -> None:
+def blur_difference(height: Any, weights: Any, out: Any) -> None:
     """Write G * h - h along the rows; `weights` as of `gaussian_weights`, float32, mirrored."""
     rows, columns = height.shape
     reach = weights.size - 1
@@ -160,8 +160,8 @@ def blurred_less_itself(height: Any, weights: Any, out: Any) -> None:
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def windows(
-    height: Any, code: Any, places: Any, right: Any, down: Any, along: Any, across: Any
+def fill_windows(
+    height: Any, code: Any, positions: Any, right: Any, down: Any, along: Any, across: Any
 ) -> None:
     """Write the second differences of minus the slopes around samples, k pixels to either side.
 
@@ -169,7 +169,7 @@ def windows(
     ----------
     height, code, right, down
         As of `negative_slopes`.
-    places : (m,) int64
+    positions : (m,) int64
         Pixels, y * W + x.
     along, across : (blocks, R, B) float32, written
         ``lean(x + k) + lean(x - k) - 2 lean(x)`` for k = 1...R of sample ``block * B + i``.
@@ -178,8 +178,8 @@ def windows(
     blocks, reach, size = along.shape
     two = np.float32(2.0)
     for block in prange(blocks):
-        for i in range(min(size, places.size - block * size)):
-            y, x = divmod(places[block * size + i], columns)
+        for i in range(min(size, positions.size - block * size)):
+            y, x = divmod(positions[block * size + i], columns)
             c = code[y, x]
             x0, x1 = x - (c & 1), x + ((c >> 1) & 1)
             above, below = height[y - ((c >> 2) & 1)], height[y + ((c >> 3) & 1)]
@@ -205,7 +205,7 @@ def windows(
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def weighed(along: Any, across: Any, weights: Any, da: Any, db: Any) -> None:
+def sum_weighted_windows(along: Any, across: Any, weights: Any, da: Any, db: Any) -> None:
     """Write the weighted sums of windows over k: `negative_slopes` of G * h - h at the samples."""
     blocks, _, size = along.shape
     for block in prange(blocks):
@@ -297,7 +297,7 @@ def distances(counts: Any, target: Any) -> Any:
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def bounds(
+def distance_bounds(
     first: Any, second: Any, target: Any, before: Any, fresh: Any, pixels: Any, signs: Any
 ) -> Any:
     """Return distances on a sample, and estimates of what the distances are at least.

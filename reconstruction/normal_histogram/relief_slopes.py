@@ -19,7 +19,7 @@ class HistogramError(ValueError):
     """A relief, normals, shares or settings that no histogram can be made of."""
 
 
-def stencil(height: ArrayLike, valid: ArrayLike | None = None) -> UInt8Array:
+def slope_stencil(height: ArrayLike, valid: ArrayLike | None = None) -> UInt8Array:
     """Return which neighbours each pixel's slopes are taken from.
 
     Parameters
@@ -42,11 +42,11 @@ def stencil(height: ArrayLike, valid: ArrayLike | None = None) -> UInt8Array:
 
     Examples
     --------
-    >>> stencil([[0.0, 1.0], [2.0, 3.0]])
+    >>> slope_stencil([[0.0, 1.0], [2.0, 3.0]])
     array([[10,  9],
            [ 6,  5]], dtype=uint8)
     """
-    given = _map_of(height)
+    given = _as_height_map(height)
     good = np.isfinite(given) & _mask(valid, given.shape)
     code = np.zeros(given.shape, np.uint8)
     code[:, 1:] |= good[:, :-1].astype(np.uint8)
@@ -57,7 +57,7 @@ def stencil(height: ArrayLike, valid: ArrayLike | None = None) -> UInt8Array:
     return code
 
 
-def _map_of(height: ArrayLike) -> FloatArray:
+def _as_height_map(height: ArrayLike) -> FloatArray:
     """Return heights as an array of real numbers (H, W)."""
     try:
         given = np.asarray(height)
@@ -116,7 +116,7 @@ def slopes(
     y_up : bool
         True: y points to row 0. False: y grows with the row.
     valid : array_like of bool, shape (H, W), optional
-        Heights to use, as of :func:`stencil`.
+        Heights to use, as of :func:`slope_stencil`.
 
     Returns
     -------
@@ -128,7 +128,7 @@ def slopes(
     Raises
     ------
     HistogramError
-        As of :func:`stencil` and :func:`pixel_sides`.
+        As of :func:`slope_stencil` and :func:`pixel_sides`.
 
     Examples
     --------
@@ -136,14 +136,14 @@ def slopes(
     >>> dh_dx.tolist(), bool(dh_dy.any()), bool(known.all())
     ([[0.5, 0.5], [0.5, 0.5]], False, True)
     """
-    code = stencil(height, valid)
+    code = slope_stencil(height, valid)
     down, right = pixel_sides(pixel)
-    with kernels.threads_for(100 * code.size):
+    with kernels.limit_threads(100 * code.size):
         a, b = kernels.slopes(np.asarray(height, np.float64), code, right, -down if y_up else down)
     return a, b, code > 0
 
 
-def slopes_of_normals(
+def slopes_from_normals(
     normals: ArrayLike, *, valid: ArrayLike | None = None
 ) -> tuple[Float64Array, Float64Array, BoolArray]:
     """Return the slopes of the surface that has these normals.
@@ -170,7 +170,7 @@ def slopes_of_normals(
 
     Examples
     --------
-    >>> dh_dx, dh_dy, known = slopes_of_normals([[-0.5, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    >>> dh_dx, dh_dy, known = slopes_from_normals([[-0.5, 0.0, 1.0], [0.0, 0.0, -1.0]])
     >>> dh_dx.tolist(), known.tolist()
     ([0.5, 0.0], [True, False])
     """
@@ -182,7 +182,9 @@ def slopes_of_normals(
     return a, b, known
 
 
-def turned(a: FloatArray, b: FloatArray, angle_rad: float) -> tuple[Float64Array, Float64Array]:
+def rotate_components(
+    a: FloatArray, b: FloatArray, angle_rad: float
+) -> tuple[Float64Array, Float64Array]:
     """Return the components of plane vectors, such as slopes, along turned axes.
 
     Parameters
@@ -204,7 +206,7 @@ def turned(a: FloatArray, b: FloatArray, angle_rad: float) -> tuple[Float64Array
 
     Examples
     --------
-    >>> x, y = turned(np.array([1.0]), np.array([0.0]), math.pi / 2)
+    >>> x, y = rotate_components(np.array([1.0]), np.array([0.0]), math.pi / 2)
     >>> x.round(6).tolist(), y.round(6).tolist()
     ([0.0], [-1.0])
     """

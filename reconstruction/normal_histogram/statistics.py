@@ -14,12 +14,12 @@ from reconstruction.arrays import Float64Array
 from reconstruction.normal_histogram import kernels
 from reconstruction.normal_histogram.blocks import (
     BLOCKS_PER_SIDE,
-    block_error,
-    block_of,
-    effective_number,
+    assign_blocks,
+    block_mean_stderr,
+    effective_sample_count,
 )
-from reconstruction.normal_histogram.counting import check_buckets, shares_of
-from reconstruction.normal_histogram.relief_slopes import slopes, turned
+from reconstruction.normal_histogram.counting import check_buckets, normalize_counts
+from reconstruction.normal_histogram.relief_slopes import rotate_components, slopes
 
 SAMPLES_PER_BUCKET = 16.0
 """Mean number of samples in an occupied bucket below which a histogram is called aliased: its
@@ -50,7 +50,7 @@ class NormalStatistics:
         Of n_x and n_y (n_s, n_t on turned axes) about their means, over all samples.
     stderr_x, stderr_y : float
         Standard errors of the variances, of what another patch of the same skin and size would
-        show (`reconstruction.normal_histogram.blocks.stderr_of_mean`); infinite below five blocks.
+        show (`reconstruction.normal_histogram.blocks.mean_stderr`); infinite below five blocks.
     """
 
     histogram: Float64Array
@@ -66,7 +66,7 @@ class NormalStatistics:
     stderr_y: float
 
 
-def measure(
+def measure_normals(
     height: ArrayLike,
     *,
     pixel: float | tuple[float, float],
@@ -100,22 +100,24 @@ def measure(
     Examples
     --------
     >>> ridges = np.tile([0.0, 3.0, 0.0, 0.0], (40, 10))  # um: ridges 20 um apart
-    >>> found = measure(ridges, pixel=5.0)
+    >>> found = measure_normals(ridges, pixel=5.0)
     >>> found.samples, found.occupied, round(found.variance_x, 4), found.variance_y
     (1600, 4, 0.0458, 0.0)
     """
     check_buckets(bins, limit)
     a, b, known = slopes(height, pixel=pixel, valid=valid)
-    a, b = turned(a, b, angle_rad)
-    group, groups = block_of(np.flatnonzero(known), known.shape, blocks)
+    a, b = rotate_components(a, b, angle_rad)
+    group, groups = assign_blocks(np.flatnonzero(known), known.shape, blocks)
     p, q = a[known], b[known]
     counts = kernels.count_in_groups(p, q, group, groups, bins, float(limit))
     outside = int(counts[:, -1].sum())
     counts = counts[:, :-1]
-    shares = shares_of(counts.sum(axis=0)).reshape(bins, bins)
+    shares = normalize_counts(counts.sum(axis=0)).reshape(bins, bins)
     w = 1.0 / np.sqrt(1.0 + p * p + q * q)
     x, y = -p * w, -q * w
-    errors = [block_error((m - m.mean()) ** 2, group, groups, known.shape, blocks) for m in (x, y)]
+    errors = [
+        block_mean_stderr((m - m.mean()) ** 2, group, groups, known.shape, blocks) for m in (x, y)
+    ]
     growth = 0.5 * (errors[0][1] + errors[1][1])
     samples = int(counts.sum())
     occupied = int(np.count_nonzero(shares))
@@ -123,7 +125,9 @@ def measure(
         histogram=shares,
         samples=samples,
         outside=outside,
-        effective_samples=max(1.0, effective_number(counts.astype(np.float64), samples) / growth),
+        effective_samples=max(
+            1.0, effective_sample_count(counts.astype(np.float64), samples) / growth
+        ),
         occupied=occupied,
         samples_per_bucket=samples / occupied,
         aliased=samples / occupied < SAMPLES_PER_BUCKET,

@@ -17,9 +17,13 @@ from numpy.typing import ArrayLike
 from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 from reconstruction.normal_integration import slope_fields
-from reconstruction.normal_integration.integration import parts, to_height
+from reconstruction.normal_integration.integration import label_parts, to_height
 from reconstruction.normal_integration.slope_fields import Perspective, SlopeField
-from reconstruction.normal_integration.weighted_poisson import Hierarchy, IntegrationError, solve
+from reconstruction.normal_integration.weighted_poisson import (
+    IntegrationError,
+    MultigridHierarchy,
+    solve_poisson,
+)
 from reconstruction.normal_maps import NormalMaps
 
 
@@ -76,7 +80,7 @@ def _one_sided(gx, gy, ux, uy, wx, wy, ex, ey, x, ax, ay, dx, dy, energy):  # ty
 
 
 @dataclass(frozen=True, slots=True)
-class Bilateral:
+class BilateralSettings:
     """Settings of the bilaterally weighted integration.
 
     Attributes
@@ -106,7 +110,7 @@ class Bilateral:
 
 
 @dataclass(frozen=True, slots=True)
-class BrokenHeight:
+class DiscontinuousHeight:
     """A height with jumps.
 
     Attributes
@@ -123,7 +127,7 @@ class BrokenHeight:
         The paper's objective at the last round's weights, px^2.
     rounds : int
         That were made.
-    settled : bool
+    converged : bool
         Whether the energy stopped changing.
     """
 
@@ -134,10 +138,10 @@ class BrokenHeight:
     below: Float32Array
     energy: float
     rounds: int
-    settled: bool
+    converged: bool
 
 
-def integrate_broken(
+def integrate_with_discontinuities(
     normals: FloatArray | NormalMaps,
     *,
     pixel: float = 1.0,
@@ -145,8 +149,8 @@ def integrate_broken(
     stderr_rad: ArrayLike | None = None,
     y_up: bool = True,
     camera: Perspective | None = None,
-    settings: Bilateral | None = None,
-) -> BrokenHeight:
+    settings: BilateralSettings | None = None,
+) -> DiscontinuousHeight:
     """Return a height that may jump where the slopes of both sides do not fit a joined surface.
 
     Parameters
@@ -175,12 +179,12 @@ def integrate_broken(
     --------
     >>> import numpy as np
     >>> flat = np.broadcast_to([0.0, 0.0, 1.0], (8, 8, 3))
-    >>> found = integrate_broken(flat)
+    >>> found = integrate_with_discontinuities(flat)
     >>> float(np.ptp(found.height)), found.settled
     (0.0, True)
     """
     Checks(IntegrationError).within("pixel", pixel, "(0, inf)")
-    chosen = settings or Bilateral()
+    chosen = settings or BilateralSettings()
     slopes = slope_fields.from_normals(
         normals, valid=valid, stderr_rad=stderr_rad, y_up=y_up, camera=camera
     )
@@ -188,7 +192,7 @@ def integrate_broken(
     ax, ay, dx, dy = slope_fields.edges(slopes, order=2)
     ex, ey = (ax > 0).astype(np.float32), (ay > 0).astype(np.float32)
     x = np.zeros(dx.shape)
-    solve(Hierarchy(ax, ay), dx, dy, x, tolerance=1e-2)
+    solve_poisson(MultigridHierarchy(ax, ay), dx, dy, x, tolerance=1e-2)
     wx, wy = np.zeros_like(ax), np.zeros_like(ax)
     by_row = np.zeros(ax.shape[0])
     before, settled, done = np.inf, False, 0
@@ -199,12 +203,14 @@ def integrate_broken(
         settled = abs(before - energy) <= chosen.stop * before if before < np.inf else energy == 0.0
         if settled or done >= chosen.rounds:
             break
-        solve(Hierarchy(ax, ay), dx, dy, x, tolerance=1e-6, iterations=chosen.inner)
+        solve_poisson(
+            MultigridHierarchy(ax, ay), dx, dy, x, tolerance=1e-6, iterations=chosen.inner
+        )
         before, done = energy, done + 1
-    part = parts(slopes.valid)
+    part = label_parts(slopes.valid)
     kind = np.asarray(normals.normals if isinstance(normals, NormalMaps) else normals).dtype
     height = to_height(x[1:-1, 1:-1], part, pixel=pixel, camera=camera)
-    return BrokenHeight(
+    return DiscontinuousHeight(
         height.astype(np.float32) if kind == np.float32 else height,
         slopes.valid,
         part,

@@ -11,7 +11,7 @@ from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.normal_integration.slope_fields import SlopeField
 from reconstruction.normal_integration.weighted_poisson import IntegrationError
 
-SIGMA_OF_CUTOFF = float(np.sqrt(np.log(2.0) / 2.0) / np.pi)
+SIGMA_PER_CUTOFF = float(np.sqrt(np.log(2.0) / 2.0) / np.pi)
 """Standard deviation of the Gaussian over the wavelength it halves (ISO 16610-21: 0.18739)."""
 _TRUNCATE_SIGMAS = 4.0  # standard deviations at which the Gaussian ends
 
@@ -65,7 +65,7 @@ def high_pass(
     good = np.ones(values.shape, bool) if valid is None else np.asarray(valid, bool)
     Checks(IntegrationError).shape("valid", good, values.shape)
     out = np.zeros_like(values)
-    sigma = SIGMA_OF_CUTOFF * cutoff / pixel
+    sigma = SIGMA_PER_CUTOFF * cutoff / pixel
     if good.all():
         return _without_planes(values, good, sigma)
     part, _ = ndimage.label(good)

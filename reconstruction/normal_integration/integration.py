@@ -21,21 +21,21 @@ from reconstruction.normal_integration.height_filters import denoise_slopes
 from reconstruction.normal_integration.slope_fields import Perspective, SlopeField
 from reconstruction.normal_integration.weighted_poisson import (
     Convergence,
-    Hierarchy,
     IntegrationError,
-    solve,
+    MultigridHierarchy,
+    solve_poisson,
 )
 from reconstruction.normal_maps import NormalMaps
 
 Method = Literal["auto", "multigrid", "dct"]
 
 
-class NotConverged(IntegrationError, ArithmeticError):
+class ConvergenceError(IntegrationError, ArithmeticError):
     """The equations were not solved to the tolerance within the iterations allowed."""
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class IntegrationSettings:
     """Effort of an integration.
 
     Attributes
@@ -90,7 +90,7 @@ def integrate(
     camera: Perspective | None = None,
     method: Method = "auto",
     denoise: float = 0.0,
-    settings: Settings | None = None,
+    settings: IntegrationSettings | None = None,
 ) -> FloatArray:
     """Return the height whose slopes fit those of the normals best.
 
@@ -172,7 +172,7 @@ def integrate(
 
 def _converged(found: HeightMap) -> FloatArray:
     if not found.convergence.converged:
-        raise NotConverged(
+        raise ConvergenceError(
             f"iterations: residual {found.convergence.residual:.1e} after "
             f"{found.convergence.iterations}; allow more, or a larger tolerance"
         )
@@ -188,7 +188,7 @@ def _for_each(
     given = np.asarray(values)
     if not given.ndim:
         return lambda at: given
-    spread = Checks(IntegrationError).spread(name, given, shape)
+    spread = Checks(IntegrationError).broadcast(name, given, shape)
     return lambda at: spread[at]
 
 
@@ -202,7 +202,7 @@ def integrate_map(
     camera: Perspective | None = None,
     method: Method = "auto",
     denoise: float = 0.0,
-    settings: Settings | None = None,
+    settings: IntegrationSettings | None = None,
 ) -> HeightMap:
     """Return the height as `integrate` does, with mask, parts and how well it was solved.
 
@@ -221,7 +221,7 @@ def integrate_map(
         As of `integrate`; equations that were not solved are told by `convergence` instead.
     """
     Checks(IntegrationError).within("pixel", pixel, "(0, inf)")
-    chosen = settings or Settings()
+    chosen = settings or IntegrationSettings()
     slopes = slope_fields.from_normals(
         normals, valid=valid, stderr_rad=stderr_rad, y_up=y_up, camera=camera
     )
@@ -237,7 +237,7 @@ def integrate_map(
         relief, convergence = _by_cosines(slopes, chosen), Convergence(0, 0.0, True)
     else:
         relief, convergence = _by_multigrid(slopes, chosen)
-    part = parts(slopes.valid)
+    part = label_parts(slopes.valid)
     kind = np.asarray(normals.normals if isinstance(normals, NormalMaps) else normals).dtype
     height = to_height(relief, part, pixel=pixel, camera=camera)
     return HeightMap(
@@ -245,16 +245,23 @@ def integrate_map(
     )
 
 
-def _by_multigrid(slopes: SlopeField, settings: Settings) -> tuple[Float64Array, Convergence]:
+def _by_multigrid(
+    slopes: SlopeField, settings: IntegrationSettings
+) -> tuple[Float64Array, Convergence]:
     ax, ay, dx, dy = slope_fields.edges(slopes, order=settings.order)
     x = np.zeros(dx.shape)
-    convergence = solve(
-        Hierarchy(ax, ay), dx, dy, x, tolerance=settings.tolerance, iterations=settings.iterations
+    convergence = solve_poisson(
+        MultigridHierarchy(ax, ay),
+        dx,
+        dy,
+        x,
+        tolerance=settings.tolerance,
+        iterations=settings.iterations,
     )
     return x[1:-1, 1:-1], convergence
 
 
-def _by_cosines(slopes: SlopeField, settings: Settings) -> Float64Array:
+def _by_cosines(slopes: SlopeField, settings: IntegrationSettings) -> Float64Array:
     """Solve the same equations on a full rectangle, whose eigenvectors are cosines."""
     _, _, dx, dy = slope_fields.edges(slopes, order=settings.order)
     b = dx[1:-1, :-2] - dx[1:-1, 1:-1] + dy[:-2, 1:-1] - dy[1:-1, 1:-1]
@@ -269,7 +276,7 @@ def _by_cosines(slopes: SlopeField, settings: Settings) -> Float64Array:
     return np.asarray(fft.idctn(waves, type=2, norm="ortho", workers=2, overwrite_x=True))
 
 
-def parts(valid: BoolArray) -> Int32Array:
+def label_parts(valid: BoolArray) -> Int32Array:
     """Return the number of each pixel's connected part, from 1; 0 where not valid."""
     if valid.all():
         return np.ones(valid.shape, np.int32)

@@ -98,7 +98,7 @@ class Aperture:
 
 
 @dataclass(frozen=True, slots=True)
-class Restored:
+class RestoredNormals:
     """Normals of the surface before the lens.
 
     Attributes
@@ -118,16 +118,19 @@ class Restored:
     kept_noise: float
     filter: Float64Array
 
-    def noise_field(self, rng: np.random.Generator) -> tuple[Float64Array, Float64Array]:
+    def sample_noise(self, rng: np.random.Generator) -> tuple[Float64Array, Float64Array]:
         """Draw the noise that is left in both slopes, each of shape (H, W)."""
         shape = self.normals.shape[:2]
-        x, y = (filtered(self.noise * rng.standard_normal(shape), self.filter) for _ in range(2))
+        x, y = (
+            filter_by_transfer(self.noise * rng.standard_normal(shape), self.filter)
+            for _ in range(2)
+        )
         return x, y
 
 
-def restore(
+def restore_normals(
     normals: FloatArray, *, lens: Aperture, valid: BoolArray, smooth_px: float = 0.0
-) -> Restored:
+) -> RestoredNormals:
     """Undo the blur of the lens where waves stand above the noise.
 
     Parameters
@@ -182,21 +185,22 @@ def restore(
     gain = np.minimum(1.0 / np.maximum(blur, 1e-6), MAX_GAIN)
     wiener = np.where(beyond, 0.0, share * gain)
     restored = [
-        np.where(known, filtered(s, wiener) + m, 0.0) for s, m in zip(slopes, means, strict=True)
+        np.where(known, filter_by_transfer(s, wiener) + m, 0.0)
+        for s, m in zip(slopes, means, strict=True)
     ]
     found = unit_vectors(np.stack([-restored[0], -restored[1], np.ones_like(restored[0])], axis=-1))
     found[~known] = (0.0, 0.0, 1.0)
     noise = math.sqrt(noise_power / power.size)
     applied = wiener * smoothing
     kept = noise * math.sqrt(float(np.mean(applied**2)))
-    return Restored(found.astype(normals.dtype), noise, kept, applied)
+    return RestoredNormals(found.astype(normals.dtype), noise, kept, applied)
 
 
 def _padded(values: Float64Array) -> Float64Array:
     return np.pad(values, PAD_PX, mode="symmetric")
 
 
-def filtered(values: Float64Array, transfer: Float64Array) -> Float64Array:
+def filter_by_transfer(values: Float64Array, transfer: Float64Array) -> Float64Array:
     """Return values whose waves were multiplied by a transfer on a grid 64 pixels larger."""
     whole = fft.ifft2(fft.fft2(_padded(values), workers=-1) * transfer, workers=-1).real
     return whole[PAD_PX:-PAD_PX, PAD_PX:-PAD_PX]

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from reconstruction.arrays import BoolArray, Float32Array, FloatArray
-from reconstruction.normal_integration.height_filters import SIGMA_OF_CUTOFF
+from reconstruction.normal_integration.height_filters import SIGMA_PER_CUTOFF
 
 RELATIVE_HEIGHT_ERROR: Final = 0.07
 """Error of a height over the standard deviation of the relief."""
@@ -20,7 +20,7 @@ RELATIVE_SLOPE_ERROR: Final = 0.055
 """Error of a normal, rad in one direction, over the standard deviation of slopes."""
 
 
-def of_height(height: FloatArray, stderr: Float32Array, valid: BoolArray) -> Float32Array:
+def height_stderr(height: FloatArray, stderr: Float32Array, valid: BoolArray) -> Float32Array:
     """Return standard errors of a relief's heights by noise and model together.
 
     Parameters
@@ -40,7 +40,7 @@ def of_height(height: FloatArray, stderr: Float32Array, valid: BoolArray) -> Flo
     Examples
     --------
     >>> known = np.ones((1, 2), bool)
-    >>> found = of_height(np.array([[-1.0, 1.0]]), np.zeros((1, 2), np.float32), known)
+    >>> found = height_stderr(np.array([[-1.0, 1.0]]), np.zeros((1, 2), np.float32), known)
     >>> found.astype(float).round(3).tolist()
     [[0.07, 0.07]]
     """
@@ -50,7 +50,7 @@ def of_height(height: FloatArray, stderr: Float32Array, valid: BoolArray) -> Flo
     return np.where(valid, np.hypot(stderr, np.float32(model)), stderr)
 
 
-def of_normals(normals: FloatArray, stderr: Float32Array, valid: BoolArray) -> Float32Array:
+def normal_stderr(normals: FloatArray, stderr: Float32Array, valid: BoolArray) -> Float32Array:
     """Return standard errors of a relief's normals by noise and model together.
 
     Parameters
@@ -74,7 +74,7 @@ def of_normals(normals: FloatArray, stderr: Float32Array, valid: BoolArray) -> F
     return np.where(valid, np.hypot(stderr, np.float32(model)), stderr)
 
 
-def expected_rms(
+def expected_height_rms(
     shape: tuple[int, int], slope_stderr: float, *, pixel: float = 1.0, cutoff: float | None = None
 ) -> float:
     """Return the height's RMS error over a rectangle whose slopes have white noise.
@@ -101,7 +101,7 @@ def expected_rms(
     --------
     Noise of 1.5 degrees' tilt on 2048 x 2048 pixels of 6 um, without what is longer than 1 mm:
 
-    >>> round(expected_rms((2048, 2048), 0.026, pixel=6.0, cutoff=1000.0), 2)
+    >>> round(expected_height_rms((2048, 2048), 0.026, pixel=6.0, cutoff=1000.0), 2)
     0.12
     """
     waves = [np.pi * np.arange(n) / n for n in shape]
@@ -117,6 +117,6 @@ def expected_rms(
     laplacian[0, 0] = np.inf
     density = power / laplacian**2
     if cutoff is not None:
-        sigma = SIGMA_OF_CUTOFF * cutoff / pixel
+        sigma = SIGMA_PER_CUTOFF * cutoff / pixel
         density *= (1.0 - np.exp(-0.5 * sigma**2 * squared)) ** 2
     return float(slope_stderr * pixel * np.sqrt(density.sum() / (shape[0] * shape[1])))

@@ -48,7 +48,7 @@ class _Level:
     x: Float32Array
 
 
-class Hierarchy:
+class MultigridHierarchy:
     """The grids of a multigrid, made from the weights of the finest grid's edges.
 
     Parameters
@@ -125,8 +125,8 @@ class Hierarchy:
             kernels.smooth_coarse(A, b, x, 1, 2)
 
 
-def solve(
-    hierarchy: Hierarchy,
+def solve_poisson(
+    hierarchy: MultigridHierarchy,
     dx: Float64Array,
     dy: Float64Array,
     x: Float64Array,
@@ -141,7 +141,8 @@ def solve(
     hierarchy : Hierarchy
         Of the edges' weights; it gives the preconditioner and the equations.
     dx, dy : ndarray, shape (H + 2, W + 2), float64
-        Difference wanted along the edges of `Hierarchy.ax` and `Hierarchy.ay`, finite.
+        Difference wanted along the edges of `MultigridHierarchy.ax` and `MultigridHierarchy.ay`,
+        finite.
     x : ndarray, shape (H + 2, W + 2), float64
         Where to begin, and the solution. Its constant in each connected part is arbitrary.
     tolerance : float

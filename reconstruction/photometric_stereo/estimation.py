@@ -17,7 +17,7 @@ from model.checks import Checks
 from reconstruction.arrays import BoolArray, FloatArray
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
 from reconstruction.photometric_stereo import kernels
-from reconstruction.photometric_stereo.solver_kernels import Settings
+from reconstruction.photometric_stereo.solver_kernels import RobustFitLimits
 from reconstruction.tiles import map_on_threads
 
 TILE_POINTS = 8192
@@ -70,9 +70,9 @@ class Robustness:
         check.settings(self, l1_iterations="[0, inf)", iterations="[1, inf)", few="[0, inf)")
         check.settings(self, shadow="[0, 1)", grazing="[0, 1)", tuning="[1, inf)")
 
-    def settings(self, kind: Any) -> Settings:
+    def settings(self, kind: Any) -> RobustFitLimits:
         """Return the limits of a fit in the data's type."""
-        limits = Settings(
+        limits = RobustFitLimits(
             shadow=self.shadow,
             grazing=self.grazing,
             tuning=self.tuning,
@@ -89,7 +89,7 @@ class Robustness:
             clear=CLEAR_OUTLIER_RESIDUAL,
             loose=LOOSE_RESIDUAL,
         )
-        return Settings(*(kind(limit) for limit in limits))
+        return RobustFitLimits(*(kind(limit) for limit in limits))
 
 
 def estimate_normals(
@@ -285,11 +285,11 @@ def _geometry(
             f"light_directions[{wrong[0]}]: got {towards[wrong[0]].tolist()}, expected a direction"
         )
     towards = towards / length[:, None]
-    require_spread(towards)
+    require_noncoplanar(towards)
     return _Geometry(kernels.SHARED, shared=towards)
 
 
-def require_spread(directions: FloatArray) -> None:
+def require_noncoplanar(directions: FloatArray) -> None:
     """Refuse unit vectors (N, 3) that lie in a plane through the surface point.
 
     Raises

@@ -20,7 +20,7 @@ TILE_POINTS = 2048
 N_BRIGHTEST = 4
 """Samples of one view whose directions are interpolated; the paper's number."""
 OUTLIER_SIGMAS = 3.0
-MIN_SPREAD_RAD = math.radians(1.0)
+MIN_ANGLE_SD_RAD = math.radians(1.0)
 """Views closer than this to the others' middle are no outliers, however well those agree."""
 
 
@@ -209,7 +209,7 @@ def _estimate(values, light_dir, view_dir, view, valid, views, normals, stderr, 
             angles[i] = _angle(half[i], half[middle])
         # the median of the others' distances; 1.18 makes it a standard deviation in two dimensions
         ordered = np.sort(angles[:found])
-        spread = max(ordered[(found + 1) // 2] / 1.1774, MIN_SPREAD_RAD)
+        spread = max(ordered[(found + 1) // 2] / 1.1774, MIN_ANGLE_SD_RAD)
         x = y = z = 0.0
         kept = 0
         for i in range(found):

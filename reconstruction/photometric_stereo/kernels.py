@@ -13,11 +13,11 @@ from numba import boolean, float32, float64, int64, njit, types, void
 
 from reconstruction.photometric_stereo.solver_kernels import (
     FAST_MATH,
-    Settings,
+    RobustFitLimits,
+    fill_residuals,
+    fit_intensity_weighted,
     kth_largest,
-    noise_of,
-    plain_fit,
-    residuals_of,
+    residual_scale,
     step_biweight,
     step_l1,
     step_squares,
@@ -191,7 +191,7 @@ def _finish(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _clearly_off(x, y, z, s, q, b0, b1, b2, bright, clear):  # type: ignore[no-untyped-def]
+def _count_outliers(x, y, z, s, q, b0, b1, b2, bright, clear):  # type: ignore[no-untyped-def]
     """Count samples off a fit by more than a part of a bright one; less counts as its square.
 
     Dark samples, which shadows are, count by their brightness.
@@ -280,8 +280,8 @@ def _fit_point(  # type: ignore[no-untyped-def]
         length = kind(math.sqrt(b0 * b0 + b1 * b1 + b2 * b2))
         least = max(settings.grazing * length, above)
         if step % 2 == 0 and step < 4:
-            count = residuals_of(x, y, z, v, s, m, b0, b1, b2, least, q)
-            scale = max(noise_of(q, count), floor)
+            count = fill_residuals(x, y, z, v, s, m, b0, b1, b2, least, q)
+            scale = max(residual_scale(q, count), floor)
         per_reach = one / (settings.tuning * scale)
         d0, d1, d2 = step_biweight(x, y, z, v, s, b0, b1, b2, per_reach * per_reach, least)
         b0, b1, b2 = kind(b0 + d0), kind(b1 + d1), kind(b2 + d2)
@@ -293,10 +293,10 @@ def _fit_point(  # type: ignore[no-untyped-def]
         return done
     # few samples, and the robust fit is not much better than real surfaces are Lambertian: what
     # looks like an outlier may be chance, unless it is a clear one; more so the looser the fit
-    p0, p1, p2 = plain_fit(x, y, z, v, s, e, q, m)
+    p0, p1, p2 = fit_intensity_weighted(x, y, z, v, s, e, q, m)
     clear = settings.clear
-    gained = _clearly_off(x, y, z, s, q, p0, p1, p2, bright, clear)
-    gained -= _clearly_off(x, y, z, s, q, b0, b1, b2, bright, clear)
+    gained = _count_outliers(x, y, z, s, q, p0, p1, p2, bright, clear)
+    gained -= _count_outliers(x, y, z, s, q, b0, b1, b2, bright, clear)
     if gained > one + loose / settings.loose:
         return done
     for k in range(x.size):
@@ -329,7 +329,7 @@ def _gather(samples, start, size, known, v, s):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _direct(geometry, way, lights, place, v, s, x, y, z):  # type: ignore[no-untyped-def]
+def _fill_light_vectors(geometry, way, lights, position, v, s, x, y, z):  # type: ignore[no-untyped-def]
     """Write one point's light vectors, as long as their strength; drop lights without one."""
     directions, per_point, positions, points = geometry
     kind = v.dtype.type
@@ -341,15 +341,15 @@ def _direct(geometry, way, lights, place, v, s, x, y, z):  # type: ignore[no-unt
             z[k] = directions[k, 2] * s[k]
             continue
         if way == PER_POINT:
-            x[k] = kind(per_point[k, place, 0])
-            y[k] = kind(per_point[k, place, 1])
-            z[k] = kind(per_point[k, place, 2])
+            x[k] = kind(per_point[k, position, 0])
+            y[k] = kind(per_point[k, position, 1])
+            z[k] = kind(per_point[k, position, 2])
             length = x[k] * x[k] + y[k] * y[k] + z[k] * z[k]
             there = length > kind(0.25) and length < kind(4.0)
         else:
-            x[k] = positions[k, 0] - points[place, 0]
-            y[k] = positions[k, 1] - points[place, 1]
-            z[k] = positions[k, 2] - points[place, 2]
+            x[k] = positions[k, 0] - points[position, 0]
+            y[k] = positions[k, 1] - points[position, 1]
+            z[k] = positions[k, 2] - points[position, 2]
             length = x[k] * x[k] + y[k] * y[k] + z[k] * z[k]
             there = length > zero and length - length == zero
             if there:
@@ -391,7 +391,7 @@ def _fit_points(  # type: ignore[no-untyped-def]
         _gather(samples, start, size, known, v, s)
         for p in range(size):
             place = start + p
-            _direct(geometry, way, lights, place, v[p], s[p], x, y, z)
+            _fill_light_vectors(geometry, way, lights, place, v[p], s[p], x, y, z)
             out[place] = out.dtype.type(0.0)
             valid[place] = _fit_point(
                 x,
@@ -422,7 +422,7 @@ def fit_points(kind: type[np.floating]) -> Any:
 
     samples = types.Tuple([given(real, 2), given(real, 2), given(boolean, 2), given(real, 2)])
     geometry = types.Tuple([real[:, ::1], given(real, 3), real[:, ::1], given(real, 2)])
-    limits = types.NamedUniTuple(real, len(Settings._fields), Settings)
+    limits = types.NamedUniTuple(real, len(RobustFitLimits._fields), RobustFitLimits)
     counts = (int64, boolean, boolean, int64, int64)
     signature = void(samples, geometry, *counts, limits, real[:, ::1], boolean[::1])
     return njit(signature, cache=True, nogil=True, error_model="numpy")(_fit_points)

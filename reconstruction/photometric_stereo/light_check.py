@@ -53,7 +53,7 @@ class LightCheck:
     points: int
 
 
-def check(
+def check_lights(
     intensity: FloatArray,
     light_directions: ArrayLike,
     *,
@@ -100,7 +100,7 @@ def check(
             f"intensity: got light from {np.count_nonzero(~dead)} of {lights} lights, expected at"
             " least 4 to compare an order with the shading"
         )
-    evidence = _Evidence(samples, usable, dead)
+    evidence = _ShadingSamples(samples, usable, dead)
     orders = _orders(lights)
     misfit = {name: evidence.misfit(directions[order]) for name, order in orders.items()}
     best = min(misfit, key=lambda name: misfit[name])
@@ -174,7 +174,7 @@ def _orders(lights: int) -> dict[str, NDArray[np.intp]]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Evidence:
+class _ShadingSamples:
     """Samples (L, P) of some points, which of them count, and lights that give nothing."""
 
     samples: Float64Array

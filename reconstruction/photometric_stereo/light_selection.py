@@ -35,7 +35,7 @@ class SelectionError(ValueError):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Information:
+class FisherInformation:
     """What each of L lights tells of each of P points.
 
     Attributes
@@ -76,7 +76,7 @@ class Information:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Prediction:
+class ErrorPrediction:
     """Errors that a set of lights leaves.
 
     Attributes
@@ -87,7 +87,7 @@ class Prediction:
         Standard error of log rho.
     valid : ndarray of bool, shape (P,)
         At least `least` lights reach the point.
-    valid_share : float
+    valid_fraction : float
         By importance.
     median_rad : float
         Median angle between estimate and truth over the valid points: where half of the angles,
@@ -97,12 +97,12 @@ class Prediction:
     tilt_rad: Float64Array
     log_albedo: Float64Array
     valid: BoolArray
-    valid_share: float
+    valid_fraction: float
     median_rad: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Selection:
+class LightSelection:
     """Lights in the order of their choice, and what each further one buys.
 
     Attributes
@@ -119,11 +119,11 @@ class Selection:
 
     lights: tuple[int, ...]
     path: tuple[tuple[int, float, float], ...]
-    prediction: Prediction
+    prediction: ErrorPrediction
     reached: bool
 
 
-def information(
+def fisher_information(
     normals: ArrayLike,
     to_light: ArrayLike,
     relative_variance: ArrayLike,
@@ -131,7 +131,7 @@ def information(
     reaches: ArrayLike | None = None,
     importance: ArrayLike | None = None,
     systematic_rad: ArrayLike = 0.0,
-) -> Information:
+) -> FisherInformation:
     """Return what lights tell of points.
 
     Parameters
@@ -153,8 +153,8 @@ def information(
     --------
     >>> up = [[0.0, 0.0, 1.0]]
     >>> ring = np.array([[0.6, 0, 0.8], [-0.6, 0, 0.8], [0, 0.6, 0.8], [0, -0.6, 0.8]])
-    >>> found = information(up, ring, np.full((1, 4), 1e-4))
-    >>> round(float(np.degrees(predict(found, range(4), least=3).tilt_rad[0])), 3)
+    >>> found = fisher_information(up, ring, np.full((1, 4), 1e-4))
+    >>> round(float(np.degrees(predict_errors(found, range(4), min_lights=3).tilt_rad[0])), 3)
     0.54
     """
     n = np.asarray(normals, np.float64)
@@ -168,7 +168,7 @@ def information(
         tilt = np.stack([np.einsum("plk,pk->pl", way, t) for t in (first, second)], -1)
         tilt = np.where(cosine[..., None] > 1e-9, tilt / cosine[..., None], 0.0)
     count = len(n)
-    return Information(
+    return FisherInformation(
         tilt,
         weight,
         weight > 0 if reaches is None else np.asarray(reaches, np.bool_),
@@ -177,44 +177,46 @@ def information(
     )
 
 
-def predict(found: Information, lights: ArrayLike, *, least: int) -> Prediction:
+def predict_errors(
+    information: FisherInformation, lights: ArrayLike, *, min_lights: int
+) -> ErrorPrediction:
     """Return the errors that these lights leave.
 
     Parameters
     ----------
-    found : Information
+    information : Information
     lights : array_like of int
         Numbers along L.
-    least : int
+    min_lights : int
         Fewest lights that must reach a point, at least 3.
     """
     chosen = np.asarray(list(lights), np.intp)  # type: ignore[arg-type]
-    covariance = np.asarray(np.linalg.inv(_start(found, chosen)), np.float64)
-    reached = np.count_nonzero(found.reaches[:, chosen], axis=1)
-    return _judged(found, covariance, reached, least)
+    covariance = np.asarray(np.linalg.inv(_start(information, chosen)), np.float64)
+    reached = np.count_nonzero(information.reaches[:, chosen], axis=1)
+    return _evaluate_prediction(information, covariance, reached, min_lights)
 
 
-def select(
-    found: Information,
+def select_lights(
+    information: FisherInformation,
     *,
     median_rad: float,
-    valid_share: float,
-    least: int,
-    most: int | None = None,
+    valid_fraction: float,
+    min_lights: int,
+    max_lights: int | None = None,
     fixed: tuple[int, ...] = (),
-) -> Selection:
+) -> LightSelection:
     """Choose as few lights as reach an error.
 
     Parameters
     ----------
-    found : Information
+    information : Information
     median_rad : float
         Wanted median angle, rad.
-    valid_share : float
+    valid_fraction : float
         Wanted share of the points that have an estimate, 0 to 1.
-    least : int
+    min_lights : int
         Fewest lights that must reach a point, at least 3.
-    most : int, optional
+    max_lights : int, optional
         Largest number to choose; all by default.
     fixed : tuple of int
         Lights that are used anyway.
@@ -222,43 +224,43 @@ def select(
     Returns
     -------
     Selection
-        `reached` says whether what is wanted is predicted; if not, the selection holds the `most`
-        best lights.
+        `reached` says whether what is wanted is predicted; if not, the selection holds the
+        `max_lights` best lights.
     """
-    Checks(SelectionError).within("least", least, "[3, inf)")
-    lights = found.weight.shape[1]
-    most = lights if most is None else min(most, lights)
+    Checks(SelectionError).within("least", min_lights, "[3, inf)")
+    lights = information.weight.shape[1]
+    max_lights = lights if max_lights is None else min(max_lights, lights)
     chosen = list(fixed)
     path: list[tuple[int, float, float]] = []
-    prediction = predict(found, chosen, least=least)
-    while len(chosen) < most and not _good(prediction, median_rad, valid_share):
-        gain = _gains(found, chosen, least)
+    prediction = predict_errors(information, chosen, min_lights=min_lights)
+    while len(chosen) < max_lights and not _good(prediction, median_rad, valid_fraction):
+        gain = _gains(information, chosen, min_lights)
         gain[chosen] = -np.inf
         chosen.append(int(np.argmax(gain)))
-        prediction = predict(found, chosen, least=least)
-        path.append((len(chosen), prediction.median_rad, prediction.valid_share))
-    if _good(prediction, median_rad, valid_share):
+        prediction = predict_errors(information, chosen, min_lights=min_lights)
+        path.append((len(chosen), prediction.median_rad, prediction.valid_fraction))
+    if _good(prediction, median_rad, valid_fraction):
         for light in [light for light in chosen if light not in fixed]:
             without = [other for other in chosen if other != light]
-            now = predict(found, without, least=least)
-            if _good(now, median_rad, valid_share):
+            now = predict_errors(information, without, min_lights=min_lights)
+            if _good(now, median_rad, valid_fraction):
                 chosen, prediction = without, now
-    reached = _good(prediction, median_rad, valid_share)
-    return Selection(tuple(chosen), tuple(path), prediction, reached)
+    reached = _good(prediction, median_rad, valid_fraction)
+    return LightSelection(tuple(chosen), tuple(path), prediction, reached)
 
 
-def _good(prediction: Prediction, median_rad: float, valid_share: float) -> bool:
-    return prediction.median_rad <= median_rad and prediction.valid_share >= valid_share
+def _good(prediction: ErrorPrediction, median_rad: float, valid_share: float) -> bool:
+    return prediction.median_rad <= median_rad and prediction.valid_fraction >= valid_share
 
 
-def _start(found: Information, chosen: NDArray[np.intp]) -> Float64Array:
+def _start(found: FisherInformation, chosen: NDArray[np.intp]) -> Float64Array:
     """Return the information of these lights, (P, 3, 3)."""
     weight = found.weight[:, chosen]
     g = np.concatenate([found.tilt[:, chosen], np.ones((*weight.shape, 1))], axis=-1)
     return np.asarray(np.einsum("pl,pli,plj->pij", weight, g, g) + _PRIOR_INFORMATION * np.eye(3))
 
 
-def _gains(found: Information, chosen: list[int], least: int) -> Float64Array:
+def _gains(found: FisherInformation, chosen: list[int], min_lights: int) -> Float64Array:
     """Return by how much each light would lower the mean squared error of the points, (L,).
 
     Points that too few lights reach count `UNKNOWN_ERROR_RAD` and more, the more the fewer reach
@@ -275,40 +277,40 @@ def _gains(found: Information, chosen: list[int], least: int) -> Float64Array:
     trace = covariance[:, 0, 0] + covariance[:, 1, 1]
     floor = np.square(found.systematic_rad)
     unknown = UNKNOWN_ERROR_RAD**2
-    now = _loss(0.5 * trace + floor, reached, least, unknown)
+    now = _loss(0.5 * trace + floor, reached, min_lights, unknown)
     then = _loss(
         0.5 * (trace[:, None] - drop) + floor[:, None],
         reached[:, None] + found.reaches,
-        least,
+        min_lights,
         unknown,
     )
     return np.asarray(found.importance @ (now[:, None] - then))
 
 
 def _loss(
-    variance: Float64Array, reached: NDArray[np.intp], least: int, unknown: float
+    variance: Float64Array, reached: NDArray[np.intp], min_lights: int, unknown: float
 ) -> Float64Array:
-    missing = np.clip(least - reached, 0, None) / least
+    missing = np.clip(min_lights - reached, 0, None) / min_lights
     return np.where(missing > 0, unknown * (1.0 + missing), np.minimum(variance, unknown))
 
 
-def _judged(
-    found: Information, covariance: Float64Array, reached: NDArray[np.intp], least: int
-) -> Prediction:
+def _evaluate_prediction(
+    found: FisherInformation, covariance: Float64Array, reached: NDArray[np.intp], min_lights: int
+) -> ErrorPrediction:
     variance = 0.5 * (covariance[:, 0, 0] + covariance[:, 1, 1]) + found.systematic_rad**2
-    valid = np.asarray(reached >= least)
+    valid = np.asarray(reached >= min_lights)
     total = float(found.importance.sum())
     share = float(found.importance[valid].sum()) / total if total > 0 else 0.0
-    return Prediction(
+    return ErrorPrediction(
         np.sqrt(variance),
         np.sqrt(covariance[:, 2, 2]),
         valid,
         share,
-        median_of_rayleigh(np.sqrt(variance[valid]), found.importance[valid]),
+        rayleigh_mixture_median(np.sqrt(variance[valid]), found.importance[valid]),
     )
 
 
-def median_of_rayleigh(scale: ArrayLike, weight: ArrayLike | None = None) -> float:
+def rayleigh_mixture_median(scale: ArrayLike, weight: ArrayLike | None = None) -> float:
     """Return the median of a mixture of Rayleigh distributions; pi / 2 for none.
 
     Parameters
@@ -319,7 +321,7 @@ def median_of_rayleigh(scale: ArrayLike, weight: ArrayLike | None = None) -> flo
 
     Examples
     --------
-    >>> round(median_of_rayleigh([1.0, 1.0]), 4)
+    >>> round(rayleigh_mixture_median([1.0, 1.0]), 4)
     1.1774
     """
     s = np.asarray(scale, np.float64)

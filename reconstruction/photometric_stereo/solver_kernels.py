@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 from numba import njit
 
 
-class Settings(NamedTuple):
+class RobustFitLimits(NamedTuple):
     """Limits of a robust fit, all in the data's type; see `estimation.Robustness`."""
 
     shadow: Any
@@ -103,7 +103,7 @@ def step_squares(x, y, z, v, m, b0, b1, b2):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST_MATH, error_model="numpy")
-def step_biweight(x, y, z, v, s, b0, b1, b2, per_reach2, least):  # type: ignore[no-untyped-def]
+def step_biweight(x, y, z, v, s, b0, b1, b2, per_reach2, min_shading):  # type: ignore[no-untyped-def]
     """Return the step of Tukey's biweight over the samples that the fit itself sees lit."""
     zero, one = x.dtype.type(0.0), x.dtype.type(1.0)
     xx, xy, xz, yy, yz, zz, gx, gy, gz = zero, zero, zero, zero, zero, zero, zero, zero, zero
@@ -112,7 +112,7 @@ def step_biweight(x, y, z, v, s, b0, b1, b2, per_reach2, least):  # type: ignore
         fit = xk * b0 + yk * b1 + zk * b2
         r = v[k] - fit
         t = max(one - r * r * per_reach2, zero)
-        w = t * t if fit > least * s[k] else zero
+        w = t * t if fit > min_shading * s[k] else zero
         wx, wy, wz = w * xk, w * yk, w * zk
         xx += wx * xk
         xy += wx * yk
@@ -150,7 +150,7 @@ def kth_largest(q, rank):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST_MATH, error_model="numpy")
-def residuals_of(x, y, z, v, s, m, b0, b1, b2, least, q):  # type: ignore[no-untyped-def]
+def fill_residuals(x, y, z, v, s, m, b0, b1, b2, min_shading, q):  # type: ignore[no-untyped-def]
     """Put |r| of the samples that are not dark into q, -1 for others; return their number.
 
     Nor those that the fit does not see lit.
@@ -159,14 +159,14 @@ def residuals_of(x, y, z, v, s, m, b0, b1, b2, least, q):  # type: ignore[no-unt
     count = zero
     for k in range(x.size):
         fit = x[k] * b0 + y[k] * b1 + z[k] * b2
-        lit = (fit > least * s[k]) & (m[k] > zero)
+        lit = (fit > min_shading * s[k]) & (m[k] > zero)
         q[k] = abs(v[k] - fit) if lit else -one
         count += one if lit else zero
     return int(count)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST_MATH, error_model="numpy")
-def noise_of(q, count):  # type: ignore[no-untyped-def]
+def residual_scale(q, count):  # type: ignore[no-untyped-def]
     """Return the scale of residuals: their median without the three that any fit makes 0."""
     if count < 4:
         return q.dtype.type(0.0)
@@ -176,7 +176,7 @@ def noise_of(q, count):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def plain_fit(x, y, z, v, s, e, q, m):  # type: ignore[no-untyped-def]
+def fit_intensity_weighted(x, y, z, v, s, e, q, m):  # type: ignore[no-untyped-def]
     """Return least squares with each sample weighed by the square of its intensity.
 
     Leaves the weights' roots in e, intensities in q and the weights in m.

@@ -15,7 +15,7 @@ class StageError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Stage:
+class PipelineStage:
     """One step of a reconstruction.
 
     Attributes
@@ -43,7 +43,7 @@ class Stage:
     refused: str = ""
 
 
-def stage_maker(base: Mapping[str, Any]) -> Callable[..., Stage]:
+def make_stage_factory(base: Mapping[str, Any]) -> Callable[..., PipelineStage]:
     """Return what makes the stages of one graph, whose parameters begin with those of ``base``.
 
     It takes a stage's name, its needs and what it makes as names parted by spaces, and what runs
@@ -52,44 +52,44 @@ def stage_maker(base: Mapping[str, Any]) -> Callable[..., Stage]:
 
     Examples
     --------
-    >>> stage = stage_maker({"revision": 1})("double", "x", "y", lambda x: 2 * x, gain=2)
+    >>> stage = make_stage_factory({"revision": 1})("double", "x", "y", lambda x: 2 * x, gain=2)
     >>> stage.run(x=3), stage.parameters
     ({'y': 6}, {'revision': 1, 'gain': 2})
     """
 
     def stage(
         name: str, needs: str, makes: str, run: Callable[..., Any], refused: str = "", **more: Any
-    ) -> Stage:
+    ) -> PipelineStage:
         products = tuple(makes.split())
 
         def made(**needed: Any) -> Mapping[str, Any]:
             found: Any = run(**needed)
             return found if len(products) > 1 else {products[0]: found}
 
-        return Stage(name, tuple(needs.split()), products, made, {**base, **more}, refused)
+        return PipelineStage(name, tuple(needs.split()), products, made, {**base, **more}, refused)
 
     return stage
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class RunResult:
     """What a run of the graph did."""
 
     products: Mapping[str, Any]
     """The wanted products, by name."""
     ran: tuple[str, ...]
     reused: tuple[str, ...]
-    left_out: tuple[tuple[str, str], ...]
+    omitted: tuple[tuple[str, str], ...]
     """Stages that nothing wanted needs, each with the reason."""
     keys: Mapping[str, str]
     """Input hash of each stage that was needed."""
     assumed: tuple[str, ...] = ()
     """What was taken for granted for want of a calibration."""
     work: tuple[Mapping[str, str], ...] = ()
-    """What became of each stage and why, see `record`."""
+    """What became of each stage and why, see `record_run`."""
 
 
-def order(stages: Sequence[Stage], want: Iterable[str]) -> list[Stage]:
+def order_stages(stages: Sequence[PipelineStage], want: Iterable[str]) -> list[PipelineStage]:
     """Return the stages that ``want`` depends on, each after those it needs.
 
     Parameters
@@ -107,19 +107,19 @@ def order(stages: Sequence[Stage], want: Iterable[str]) -> list[Stage]:
 
     Examples
     --------
-    >>> a = Stage("a", (), ("x",), dict)
-    >>> b = Stage("b", ("x",), ("y",), dict)
-    >>> [stage.name for stage in order([b, a], ["y"])]
+    >>> a = PipelineStage("a", (), ("x",), dict)
+    >>> b = PipelineStage("b", ("x",), ("y",), dict)
+    >>> [stage.name for stage in order_stages([b, a], ["y"])]
     ['a', 'b']
     """
-    maker: dict[str, Stage] = {}
+    maker: dict[str, PipelineStage] = {}
     for stage in stages:
         for product in stage.makes:
             if product in maker:
                 both = f"{maker[product].name!r} and {stage.name!r}"
                 raise StageError(f"product {product!r}: made by {both}")
             maker[product] = stage
-    ordered: list[Stage] = []
+    ordered: list[PipelineStage] = []
     visiting: list[str] = []
 
     def visit(product: str, by: str) -> None:
@@ -144,13 +144,13 @@ def order(stages: Sequence[Stage], want: Iterable[str]) -> list[Stage]:
     return ordered
 
 
-def input_hashes(ordered: Iterable[Stage]) -> dict[str, str]:
+def input_hashes(ordered: Iterable[PipelineStage]) -> dict[str, str]:
     """Return the hash of all that a stage's products depend on, by the name of the stage.
 
     Parameters
     ----------
     ordered
-        As `order` returns them.
+        As `order_stages` returns them.
     """
     made_by = {product: stage.name for stage in ordered for product in stage.makes}
     keys: dict[str, str] = {}
@@ -161,13 +161,13 @@ def input_hashes(ordered: Iterable[Stage]) -> dict[str, str]:
     return keys
 
 
-def run(
-    stages: Sequence[Stage],
+def run_stages(
+    stages: Sequence[PipelineStage],
     want: Sequence[str],
     *,
     cache: MutableMapping[str, Mapping[str, Any]] | None = None,
     progress: Callable[[str], None] | None = None,
-) -> Outcome:
+) -> RunResult:
     """Compute the wanted products and nothing else.
 
     A stage whose input hash is in the cache is not run; neither are the stages that only it
@@ -189,7 +189,7 @@ def run(
     -------
     Outcome
     """
-    needed = order(stages, want)
+    needed = order_stages(stages, want)
     made_by = {product: stage for stage in needed for product in stage.makes}
     keys = input_hashes(needed)
     cache = {} if cache is None else cache
@@ -230,11 +230,11 @@ def run(
     idle = [s.name for s in needed if s.name not in ran and s.name not in reused]
     left_out += [(name, "what depends on it was reused") for name in idle]
     wanted = {product: products[product] for product in want}
-    return Outcome(wanted, tuple(ran), tuple(reused), tuple(left_out), keys)
+    return RunResult(wanted, tuple(ran), tuple(reused), tuple(left_out), keys)
 
 
-def record(
-    graph: Sequence[Stage], outcome: Outcome, before: Mapping[str, str]
+def record_run(
+    graph: Sequence[PipelineStage], outcome: RunResult, before: Mapping[str, str]
 ) -> tuple[dict[str, str], ...]:
     """Return what a run did, stage by stage in the order of the graph.
 
@@ -255,12 +255,12 @@ def record(
 
     Examples
     --------
-    >>> a = Stage("a", (), ("x",), dict)
-    >>> outcome = Outcome({}, ("a",), (), (), {"a": "12"})
-    >>> record([a], outcome, {"a": "34"})[0]["why"]
+    >>> a = PipelineStage("a", (), ("x",), dict)
+    >>> outcome = RunResult({}, ("a",), (), (), {"a": "12"})
+    >>> record_run([a], outcome, {"a": "34"})[0]["why"]
     'its inputs have changed'
     """
-    skipped = dict(outcome.left_out)
+    skipped = dict(outcome.omitted)
 
     def entry(name: str) -> dict[str, str]:
         key = outcome.keys.get(name, "")
@@ -276,23 +276,23 @@ def record(
     return tuple(entry(stage.name) for stage in graph)
 
 
-def attributes_of(record: Any, names: str) -> dict[str, Any]:
+def select_attributes(record: Any, names: str) -> dict[str, Any]:
     """Return attributes of a record by their names, which are parted by spaces.
 
     Examples
     --------
-    >>> attributes_of(3 + 4j, "real imag")
+    >>> select_attributes(3 + 4j, "real imag")
     {'real': 3.0, 'imag': 4.0}
     """
     return {name: getattr(record, name) for name in names.split()}
 
 
-def document_bytes(document: Mapping[str, Any]) -> bytes:
+def serialize_document(document: Mapping[str, Any]) -> bytes:
     """Return a document as JSON text, UTF-8; arrays become lists, what is not finite null.
 
     Examples
     --------
-    >>> document_bytes({"r_mm": np.array([1.0, np.nan])}).split()
+    >>> serialize_document({"r_mm": np.array([1.0, np.nan])}).split()
     [b'{', b'"r_mm":', b'[', b'1.0,', b'null', b']', b'}']
     """
     return json.dumps(_plain(document), indent=1, allow_nan=False).encode("utf-8")

@@ -21,7 +21,7 @@ class HoldOut:
     Attributes
     ----------
     lights, views
-        Names or, before `within`, places in the session's order, counted from 0.
+        Names or, before `resolve`, places in the session's order, counted from 0.
     """
 
     lights: tuple[str, ...] = ()
@@ -55,7 +55,7 @@ class HoldOut:
             lists[field].append(word.strip())
         return HoldOut(tuple(lists.get("lights", ())), tuple(lists.get("views", ())))
 
-    def within(self, lights: Sequence[str], views: Sequence[str]) -> HoldOut:
+    def resolve(self, lights: Sequence[str], views: Sequence[str]) -> HoldOut:
         """Return the names, in the session's order, that these names and places mean.
 
         Parameters
@@ -74,7 +74,7 @@ class HoldOut:
         """Return whether anything is held out."""
         return bool(self.lights or self.views)
 
-    def holds(self, light: str, view: str) -> bool:
+    def is_held_out(self, light: str, view: str) -> bool:
         """Return whether a frame of this light and view stays out of the fits."""
         return light in self.lights or view in self.views
 

@@ -15,7 +15,7 @@ from typing import Any
 from capture.calibration import store as calibration_store
 from capture.calibration.record import CALIBRATION_KINDS
 from capture.session import Session
-from reconstruction.pipeline.graph import Stage, stage_maker
+from reconstruction.pipeline.graph import PipelineStage, make_stage_factory
 from reconstruction.pipeline.hold_out import NO_HOLD_OUT, HoldOut
 
 PROGRESS_INTERVAL_S = 5.0
@@ -88,7 +88,7 @@ class Inputs:
     progress: Callable[[str], None] | None = None
     _reported_at: float = 0.0
 
-    def tell(self, stage: str, done: float) -> None:
+    def report_progress(self, stage: str, done: float) -> None:
         """Say how far a stage is, 0 to 1, every few seconds at most."""
         now = time.monotonic()
         if self.progress is not None and now - self._reported_at >= PROGRESS_INTERVAL_S:
@@ -142,7 +142,7 @@ class Inputs:
             found.hold_out = HoldOut.parse(text) if isinstance(text, str) else text
         return found
 
-    def stage_maker(self, revision: int) -> Callable[..., Stage]:
+    def stage_maker(self, revision: int) -> Callable[..., PipelineStage]:
         """Return `graph.stage_maker` for stages of a revision of their code and all that was read.
 
         Parameters
@@ -150,7 +150,9 @@ class Inputs:
         revision
             Grows when the code of a stage changes its result, so that older maps are made again.
         """
-        return stage_maker({"revision": revision, "inputs": dict(sorted(self.hashes.items()))})
+        return make_stage_factory(
+            {"revision": revision, "inputs": dict(sorted(self.hashes.items()))}
+        )
 
     def load(
         self, kind: str, serials: Sequence[str], otherwise: str
@@ -175,7 +177,7 @@ class Inputs:
             with suppress(calibration_store.CalibrationMissing):
                 found = calibration_store.load(self.calibration, kind)
                 rig, day = self.session.rig.name, self.on_date
-                calibration_store.require(
+                calibration_store.require_valid(
                     found, rig=rig, serials=list(serials), on_date=day, kind=kind
                 )
                 content = (self.calibration / f"{kind}.json").read_bytes()

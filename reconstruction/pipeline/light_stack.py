@@ -36,7 +36,7 @@ OUTLIER_SIGMAS = 4.0
 
 
 @dataclass(frozen=True, slots=True)
-class Stack:
+class LightStack:
     """Gray pictures under each light, over exposure and strength of the light."""
 
     gray: Float32Array
@@ -53,7 +53,7 @@ class Stack:
 
 
 @dataclass(frozen=True, slots=True)
-class Lights:
+class StackLights:
     """Lights that agree with the shading."""
 
     vectors: Float64Array
@@ -63,7 +63,7 @@ class Lights:
     alive: BoolArray
 
 
-def graph(inputs: Inputs) -> list[stages.Stage]:
+def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     """Return the stages that a session with a light list can go through; see `stages.run`."""
     stage = inputs.stage_maker(STAGE_REVISION)
     known = "stack lights normals gray_albedo"
@@ -85,7 +85,7 @@ def _linear(frame: raw.RawFrame) -> tuple[Float32Array, BoolArray]:
     return image.rgb, image.valid
 
 
-def _stack(session: Session) -> Stack:
+def _stack(session: Session) -> LightStack:
     records = tuple(session.frames("olat"))
     got = f"{len(records)} frames under a light each"
     Checks(InputsError).require(len(records) >= 3, f"{session.path}", got, "3")
@@ -125,10 +125,10 @@ def _stack(session: Session) -> Stack:
         if mask is None or mask.shape != inside.shape:
             raise InputsError(f"{session.path}: its mask does not fit its pictures")
         inside = np.asarray(mask > 127)
-    return Stack(gray, usable, inside, records, gain, folder)
+    return LightStack(gray, usable, inside, records, gain, folder)
 
 
-def _lights(inputs: Inputs, stack: Stack) -> Lights:
+def _lights(inputs: Inputs, stack: LightStack) -> StackLights:
     """Take the list's lights if the shading agrees, else the order that it agrees with."""
     session = inputs.session
     listed = session.manifest.extra["light_list"]
@@ -142,12 +142,12 @@ def _lights(inputs: Inputs, stack: Stack) -> Lights:
     scale = float(listed.get("mm_per_px") or 1.0)
     alive = np.ones(len(vectors), bool)
     try:
-        found = light_check.check(
+        found = light_check.check_lights(
             stack.gray, unit, valid=stack.usable & stack.inside, rng=np.random.default_rng(0)
         )
     except PhotometricStereoError as error:
         inputs.assumed.append(f"the lights belong to their pictures ({error})")
-        return Lights(vectors, near, scale, alive)
+        return StackLights(vectors, near, scale, alive)
     best = f"{100 * min(found.misfit.values()):.1f} %"
     as_listed = f"{100 * found.misfit['as listed']:.1f} %"
     if found.order == "unknown":
@@ -177,7 +177,7 @@ def _lights(inputs: Inputs, stack: Stack) -> Lights:
         "misfit": {name: round(value, 5) for name, value in found.misfit.items()},
         "dead": [int(k) for k in np.flatnonzero(found.dead)],
     }
-    return Lights(vectors, near, scale, alive)
+    return StackLights(vectors, near, scale, alive)
 
 
 def _points_mm(shape: tuple[int, int], mm_per_px: float) -> Float64Array:
@@ -187,7 +187,7 @@ def _points_mm(shape: tuple[int, int], mm_per_px: float) -> Float64Array:
     return np.stack([mm_per_px * x, mm_per_px * y, np.zeros(shape)], axis=-1)
 
 
-def _estimate(stack: Stack, lights: Lights, *, robust: bool) -> NormalMaps:
+def _estimate(stack: LightStack, lights: StackLights, *, robust: bool) -> NormalMaps:
     alive = slice(None) if lights.alive.all() else lights.alive
     vectors = lights.vectors[alive]
     near: dict[str, Any] = {}
@@ -207,7 +207,7 @@ def _roughness_of_field(found: NormalMaps, both: BoolArray) -> float:
     return float(np.median(curl[inner])) if inner.any() else float("inf")
 
 
-def _normals(inputs: Inputs, stack: Stack, lights: Lights) -> Mapping[str, Any]:
+def _normals(inputs: Inputs, stack: LightStack, lights: StackLights) -> Mapping[str, Any]:
     """Estimate normals both ways and keep those that are more of a surface's."""
     found = {robust: _estimate(stack, lights, robust=robust) for robust in (True, False)}
     both = found[True].valid & found[False].valid
@@ -233,7 +233,11 @@ def _normals(inputs: Inputs, stack: Stack, lights: Lights) -> Mapping[str, Any]:
 
 
 def _albedo(
-    session: Session, stack: Stack, lights: Lights, normals: SkinMap, gray_albedo: NormalMaps
+    session: Session,
+    stack: LightStack,
+    lights: StackLights,
+    normals: SkinMap,
+    gray_albedo: NormalMaps,
 ) -> SkinMap:
     """Fit each channel's albedo to the samples that agree with the gray fit."""
     n, gray = normals.values, gray_albedo

@@ -14,10 +14,10 @@ class Recipe:
 
     maps: tuple[str, ...]
     """Names of the maps."""
-    graph: Callable[[Inputs], list[stages.Stage]]
+    graph: Callable[[Inputs], list[stages.PipelineStage]]
     files: tuple[str, ...] = ()
     """Names of what is no map and goes along: meshes, tables."""
-    always: tuple[str, ...] = ()
+    required: tuple[str, ...] = ()
     """What the other maps mean nothing without."""
     products: Callable[[Session], Mapping[str, tuple[str, ...]]] | None = None
     """Where a name stands for more than itself, as for a map of each state: what for, by name."""

@@ -18,14 +18,14 @@ from reconstruction.pipeline.inputs import DomeOptions, Inputs, InputsError
 from reconstruction.pipeline.recipe import Recipe
 
 
-def light_list() -> Recipe:
+def light_list_recipe() -> Recipe:
     """Return the recipe of images under listed lights, imported without a rig."""
     from reconstruction.pipeline import light_stack
 
     return Recipe(light_stack.MAP_NAMES, light_stack.graph)
 
 
-def recipe_of(session: Session) -> Recipe:
+def recipe_for_session(session: Session) -> Recipe:
     """Return what can be made of a session.
 
     Raises
@@ -34,7 +34,7 @@ def recipe_of(session: Session) -> Recipe:
         When no step of its plan shows a subject.
     """
     if "light_list" in session.manifest.extra:
-        return light_list()
+        return light_list_recipe()
     kinds = {step.kind for step in session.plan.steps}
     for rig, kind in RIG_KINDS.items():
         if kind.subject_step in kinds:
@@ -60,7 +60,7 @@ def reconstruct(
     dome: DomeOptions | None = None,
     truth: str = "",
     progress: Callable[[str], None] | None = None,
-) -> stages.Outcome:
+) -> stages.RunResult:
     """Make the wanted maps of a session and write them to an APPEARANCE/ folder.
 
     Parameters
@@ -100,7 +100,7 @@ def reconstruct(
         or out of date.
     """
     opened = Session.open(session)
-    recipe = recipe_of(opened)
+    recipe = recipe_for_session(opened)
     store.require_free(out)
     options = dome or DomeOptions()
     _require_fitting_options(opened, recipe, options)
@@ -117,10 +117,10 @@ def reconstruct(
     graph = recipe.graph(inputs)
     products = _planned_products(graph, recipe, opened, want)
     previous = _Previous.of(Path(out))
-    held = previous.held(graph)
+    held = previous.current_products(graph)
     kept = {previous.keys[name]: contents for name, contents in held.items()}
-    outcome = stages.run(graph, products, cache=kept, progress=progress)
-    work = stages.record(graph, outcome, {name: previous.keys[name] for name in held})
+    outcome = stages.run_stages(graph, products, cache=kept, progress=progress)
+    work = stages.record_run(graph, outcome, {name: previous.keys[name] for name in held})
     outcome = replace(outcome, assumed=tuple(inputs.assumed), work=work)
     # what the subject agreed to goes wherever the maps go
     consent = [opened.manifest.to_json()["subject"]] if opened.source == "measured" else []
@@ -152,30 +152,30 @@ def _require_known(want: Sequence[str], maps: Sequence[str]) -> None:
 
 
 def _planned_products(
-    graph: Sequence[stages.Stage], recipe: Recipe, session: Session, want: Sequence[str]
+    graph: Sequence[stages.PipelineStage], recipe: Recipe, session: Session, want: Sequence[str]
 ) -> list[str]:
     """Return the products of all stages that make something wanted.
 
     A stage's other maps cost nothing more, and only whole stages can be reused.
     """
     kept_names = recipe.expand(session, (*recipe.maps, *recipe.files))
-    wanted = set(recipe.expand(session, (*want, *recipe.always)))
+    wanted = set(recipe.expand(session, (*want, *recipe.required)))
     made = [name for stage in graph if wanted.intersection(stage.makes) for name in stage.makes]
     return [name for name in made if name in kept_names]
 
 
 def _appearance(
     inputs: Inputs,
-    graph: Sequence[stages.Stage],
-    outcome: stages.Outcome,
+    graph: Sequence[stages.PipelineStage],
+    outcome: stages.RunResult,
     made: Mapping[str, SkinMap | bytes],
     previous: _Previous,
     parameters: Mapping[str, object],
 ) -> SkinAppearance:
     """Return what was made, with what an older folder holds that is still current."""
-    keys = stages.input_hashes(stages.order(graph, [p for s in graph for p in s.makes]))
+    keys = stages.input_hashes(stages.order_stages(graph, [p for s in graph for p in s.makes]))
     kept = dict(made)
-    for stage, held in previous.held(graph).items():
+    for stage, held in previous.current_products(graph).items():
         if previous.keys[stage] == keys[stage]:
             kept |= {name: value for name, value in held.items() if name not in kept}
     noted = dict(inputs.noted)
@@ -196,7 +196,7 @@ def _appearance(
         },
         inputs=inputs.hashes,
         versions={name: metadata.version(name) for name in ("skinrig", "numpy", "scipy", "numba")},
-        left_out=outcome.left_out,
+        left_out=outcome.omitted,
         files={name: value for name, value in kept.items() if isinstance(value, bytes)},
         seed=inputs.session.seed,
     )
@@ -234,7 +234,9 @@ class _Previous:
             {str(name): str(key) for name, key in keys},
         )
 
-    def held(self, graph: Sequence[stages.Stage]) -> dict[str, Mapping[str, SkinMap | bytes]]:
+    def current_products(
+        self, graph: Sequence[stages.PipelineStage]
+    ) -> dict[str, Mapping[str, SkinMap | bytes]]:
         """Return what the folder holds of each stage that it has the input hash of."""
         of_stages: dict[str, Mapping[str, SkinMap | bytes]] = {}
         for stage in graph:

@@ -11,14 +11,14 @@ from reconstruction.pipeline.inputs import InputsError
 
 
 @dataclass(frozen=True, slots=True)
-class SensorNoise:
+class ElectronNoise:
     """Conversion gain, electrons per DN, and read noise, electrons rms, of one camera."""
 
     gain: float
     read_noise: float
 
     @staticmethod
-    def of(frame: raw.RawFrame) -> SensorNoise:
+    def of(frame: raw.RawFrame) -> ElectronNoise:
         """Read them off the frame's own noise profile.
 
         Raises
@@ -32,4 +32,4 @@ class SensorNoise:
         scale, offset = frame.noise_profile
         span = frame.white - float(np.mean(frame.black))
         gain = 1.0 / max(scale * span, 1e-12)
-        return SensorNoise(gain, float(np.sqrt(offset)) * span * gain)
+        return ElectronNoise(gain, float(np.sqrt(offset)) * span * gain)

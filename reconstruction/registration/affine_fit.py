@@ -23,15 +23,15 @@ SHARED_FRACTIONS = (0.0, 0.3, 0.6, 0.8, 0.9, 0.97)
 
 
 def fit_affine(
-    places: Float64Array, found: Float64Array, *, window_px: float
+    points_px: Float64Array, displaced_px: Float64Array, *, window_px: float
 ) -> tuple[Float64Array, Float64Array]:
     """Fit an affine map to displaced points, with its covariance.
 
     Parameters
     ----------
-    places : ndarray, shape (N, 2)
+    points_px : ndarray, shape (N, 2)
         Points of the first picture about its middle, px; at least 7, not on a line.
-    found : ndarray, shape (N, 2)
+    displaced_px : ndarray, shape (N, 2)
         Where they are in the second, px.
     window_px : float
         Side of the windows that were followed: the unit of `CORRELATION_LENGTHS`.
@@ -55,13 +55,13 @@ def fit_affine(
     >>> (solution.round(6) + 0.0).tolist()
     [[1.1, 0.0], [0.0, 0.9], [2.0, 2.0]]
     """
-    count = len(places)
-    if not (np.isfinite(places).all() and np.isfinite(found).all()):
+    count = len(points_px)
+    if not (np.isfinite(points_px).all() and np.isfinite(displaced_px).all()):
         raise ValueError("places, found: got what is no number, expected finite px")
-    design = np.column_stack([places, np.ones(count)])
+    design = np.column_stack([points_px, np.ones(count)])
     if count < 7 or np.linalg.matrix_rank(design) < 3:
         raise ValueError(f"places: got {count} points, expected at least 7, not all on one line")
-    apart = np.linalg.norm(places[:, None] - places[None], axis=-1) / window_px
+    apart = np.linalg.norm(points_px[:, None] - points_px[None], axis=-1) / window_px
     free = count - 3
     kept: list[tuple[float, Float64Array, Float64Array, Float64Array]] = []
     for reach in CORRELATION_LENGTHS:
@@ -69,7 +69,11 @@ def fit_affine(
         for share in SHARED_FRACTIONS:
             if share == 0.0 and reach != CORRELATION_LENGTHS[0]:
                 continue  # without a field its reach does not matter
-            kept.append(_given(design, found, share * alike + (1.0 - share) * np.eye(count)))
+            kept.append(
+                _fit_with_correlation(
+                    design, displaced_px, share * alike + (1.0 - share) * np.eye(count)
+                )
+            )
     log = np.array([each[0] for each in kept])
     # the case without a field stands for all reaches
     log[0] += np.log(len(CORRELATION_LENGTHS))
@@ -92,7 +96,7 @@ def _correlation(distance: Float64Array) -> Float64Array:
     return np.exp(-(distance**2))
 
 
-def _given(
+def _fit_with_correlation(
     design: Float64Array, found: Float64Array, correlation: Float64Array
 ) -> tuple[float, Float64Array, Float64Array, Float64Array]:
     """Return log evidence, map, inverse information, and sums of squares of one correlation."""

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from reconstruction.arrays import BoolArray, Float32Array, FloatArray, UInt8Array
-from reconstruction.registration.tracking import within
+from reconstruction.registration.tracking import is_inside_image
 
 N_WARP_ROUNDS = 2
 """How often the second picture is warped and the rest followed."""
@@ -65,7 +65,7 @@ class DenseFlow:
     followed: BoolArray
 
 
-def refine(
+def refine_flow(
     first: UInt8Array,
     second: UInt8Array,
     source_px: FloatArray,
@@ -96,21 +96,21 @@ def refine(
     """
     at = source_px.astype(np.float32)
     error = np.maximum(stderr_px.astype(np.float32), np.float32(MIN_FLOW_ERROR_PX))
-    here = grid(valid.shape)
+    here = pixel_grid(valid.shape)
     gap = np.zeros(valid.shape, np.float32)
     known = np.zeros(valid.shape, bool)
     stderr = error
     for _ in range(rounds):
-        both = valid & (bilinear(valid_second.astype(np.float32), at) > 0.999)
+        both = valid & (sample_image(valid_second.astype(np.float32), at) > 0.999)
         one = np.where(both, first, 128).astype(np.uint8)
-        two = np.where(both, bilinear(second, at), 128).astype(np.uint8)
+        two = np.where(both, sample_image(second, at), 128).astype(np.uint8)
         there = _follow(one, two)
         back = _follow(two, one)
-        gap = np.linalg.norm(there + bilinear(back, here + there), axis=-1)
+        gap = np.linalg.norm(there + sample_image(back, here + there), axis=-1)
         moved = here + there
-        known = both & (gap <= MAX_GAP_PX) & within(moved, valid.shape)
-        known &= bilinear(both.astype(np.float32), moved) > 0.999
-        noise = _noise_variance(one, bilinear(two, moved))
+        known = both & (gap <= MAX_GAP_PX) & is_inside_image(moved, valid.shape)
+        known &= sample_image(both.astype(np.float32), moved) > 0.999
+        noise = _noise_variance(one, sample_image(two, moved))
         weight = known.astype(np.float32)
         share = np.maximum(_blurred(weight), 1e-6)
         wide = _blurred(np.where(known, gap, 0.0).astype(np.float32) ** 2) / share
@@ -124,18 +124,18 @@ def refine(
             variance += np.float32(factor) * part
         trust = np.where(known, error**2 / (error**2 + variance), 0.0).astype(np.float32)
         step = filled + trust[..., None] * (there - filled)
-        at = bilinear(at, (here + step).astype(np.float32))
+        at = sample_image(at, (here + step).astype(np.float32))
         stderr = np.where(known, np.sqrt(trust * variance), error).astype(np.float32)
     return DenseFlow(at, stderr, gap.astype(np.float32), known)
 
 
-def grid(shape: tuple[int, ...]) -> Float32Array:
+def pixel_grid(shape: tuple[int, ...]) -> Float32Array:
     """Return column and row of every pixel, (H, W, 2)."""
     x, y = np.meshgrid(np.arange(shape[1], dtype=np.float32), np.arange(shape[0], dtype=np.float32))
     return np.stack([x, y], axis=-1)
 
 
-def bilinear(image: Any, at_px: Float32Array, *, interpolation: int = cv2.INTER_LINEAR) -> Any:
+def sample_image(image: Any, at_px: Float32Array, *, interpolation: int = cv2.INTER_LINEAR) -> Any:
     """Return an image's values at (column, row); beyond its border those of the border."""
     flat = at_px.reshape(*at_px.shape[:2], 2)
     return cv2.remap(
@@ -143,7 +143,7 @@ def bilinear(image: Any, at_px: Float32Array, *, interpolation: int = cv2.INTER_
     )
 
 
-def noise_left(at_px: Float32Array) -> Float32Array:
+def interpolated_noise_variance(at_px: Float32Array) -> Float32Array:
     """Return the variance that cubic interpolation leaves of noise of single pixels, (H, W).
 
     Parameters
@@ -182,7 +182,7 @@ def _noise_variance(one: UInt8Array, two: UInt8Array) -> Float32Array:
 
 def _deformation(at_px: Float32Array) -> tuple[Float32Array, Float32Array]:
     """Return the squares of the Laplacian and of the gradient of a map's displacement."""
-    away = at_px - grid(at_px.shape)
+    away = at_px - pixel_grid(at_px.shape)
     displacement = np.asarray(cv2.GaussianBlur(away, (0, 0), DERIVATIVE_WINDOW_PX))
     parts = [np.ascontiguousarray(displacement[..., k]) for k in (0, 1)]
     bent = np.sum([cv2.Laplacian(part, cv2.CV_32F) ** 2 for part in parts], axis=0)

@@ -39,7 +39,7 @@ class FeatureError(RegistrationError):
     """Two pictures in which too few of the same points were found."""
 
 
-def match(
+def match_features(
     first: UInt8Array, second: UInt8Array, *, valid: BoolArray, valid_second: BoolArray
 ) -> tuple[Float64Array, Float64Array]:
     """Find points that two pictures share.

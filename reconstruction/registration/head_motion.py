@@ -45,7 +45,7 @@ class HeadMotionError(ValueError):
     """Frames, cameras or points that no motion can be estimated from."""
 
 
-class Camera(Protocol):
+class TrackingCamera(Protocol):
     """What is needed of a camera."""
 
     @property
@@ -85,7 +85,7 @@ class HeadMotion:
     residual_px: Float64Array
     tracks: NDArray[np.intp]
 
-    def at(self, times_s: ArrayLike) -> tuple[Float64Array, Float64Array]:
+    def interpolate(self, times_s: ArrayLike) -> tuple[Float64Array, Float64Array]:
         """Return the motion between frames: rotation vectors (K, 3) and translations (K, 3).
 
         Straight between usable frames; before the first and after the last as there.
@@ -107,13 +107,13 @@ class HeadMotion:
 
     def matrices(self, times_s: ArrayLike) -> Float64Array:
         """Return the motion as (K, 4, 4) matrices that take points to where they were."""
-        turn, shift = self.at(times_s)
+        turn, shift = self.interpolate(times_s)
         out = np.tile(np.eye(4), (len(turn), 1, 1))
         out[:, :3, :3] = rotation_matrix(turn)
         out[:, :3, 3] = shift
         return out
 
-    def covered(self, times_s: ArrayLike) -> BoolArray:
+    def is_covered(self, times_s: ArrayLike) -> BoolArray:
         """Return which times lie between two usable frames that follow each other, (K,)."""
         when = np.atleast_1d(np.asarray(times_s, np.float64))
         after = np.searchsorted(self.times_s, when, side="left")
@@ -155,7 +155,7 @@ def rotation_matrix(vector_rad: ArrayLike) -> Float64Array:
 
 def estimate(
     frames: Sequence[Sequence[FloatArray]] | FloatArray,
-    cameras: Sequence[Camera],
+    cameras: Sequence[TrackingCamera],
     points_mm: ArrayLike,
     normals: ArrayLike,
     times_s: ArrayLike,
@@ -205,7 +205,7 @@ def estimate(
         seen = _facing(points, outward, np.asarray(camera.center_mm, np.float64))
         places = np.full((len(points), 2), np.nan)
         places[seen] = camera.project(points[seen])
-        chosen.append(registration.textured(even, places, count=tracks_per_camera))
+        chosen.append(registration.select_textured_points(even, places, count=tracks_per_camera))
         evened.append(even)
     total = sum(len(rows) for rows in chosen)
     if total < MIN_TRACKS:
@@ -219,7 +219,9 @@ def estimate(
             found.append(_Pose(np.zeros(6), np.zeros(6), np.zeros(total)))
             continue
         found.append(_pose(pictures, cameras, points, chosen, evened, iterations))
-    return _judged(found, np.concatenate([points[rows] for rows in chosen]), times, reference)
+    return _evaluate_frames(
+        found, np.concatenate([points[rows] for rows in chosen]), times, reference
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,7 +236,7 @@ class _Pose:
 
 def _checked(
     frames: Sequence[Sequence[FloatArray]] | FloatArray,
-    cameras: Sequence[Camera],
+    cameras: Sequence[TrackingCamera],
     points_mm: ArrayLike,
     normals: ArrayLike,
     times_s: ArrayLike,
@@ -263,17 +265,17 @@ def _facing(points: Float64Array, normals: Float64Array, center: Float64Array) -
 
 def _pose(
     pictures: Sequence[FloatArray] | FloatArray,
-    cameras: Sequence[Camera],
+    cameras: Sequence[TrackingCamera],
     points: Float64Array,
     chosen: Sequence[NDArray[np.intp]],
     evened: Sequence[UInt8Array],
     iterations: int,
 ) -> _Pose:
-    seen: list[tuple[Camera, Float64Array, Float64Array]] = []
+    seen: list[tuple[TrackingCamera, Float64Array, Float64Array]] = []
     kept = []
     for picture, camera, rows, even in zip(pictures, cameras, chosen, evened, strict=True):
         start = np.asarray(camera.project(points[rows])) if len(rows) else np.zeros((0, 2))
-        tracks = registration.track(
+        tracks = registration.track_points(
             even, registration.normalize_local_contrast(np.asarray(picture)), start
         )
         kept.append(tracks.valid)
@@ -320,7 +322,7 @@ def _worst_part(points: Float64Array, length: Float64Array) -> float:
     return worst
 
 
-def _blocks(seen: Sequence[tuple[Camera, Float64Array, Float64Array]]) -> NDArray[np.intp]:
+def _blocks(seen: Sequence[tuple[TrackingCamera, Float64Array, Float64Array]]) -> NDArray[np.intp]:
     """Return a number for each track: that of its camera's part of the image."""
     names = [
         np.stack([np.full(len(at), k), *(at // BLOCK_PX).T.astype(np.intp)], axis=1)
@@ -363,7 +365,7 @@ def _stderr(
 
 
 def _residuals(
-    seen: Sequence[tuple[Camera, Float64Array, Float64Array]], motion: Float64Array
+    seen: Sequence[tuple[TrackingCamera, Float64Array, Float64Array]], motion: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
     """Return what is left of the tracks (n, 2) and its derivative by the motion (n, 2, 6)."""
     rows, slopes = [], []
@@ -389,7 +391,7 @@ def _residuals(
     return np.where(known[:, None], r, 1e6), np.where(known[:, None, None], J, 0.0)
 
 
-def _judged(
+def _evaluate_frames(
     found: Sequence[_Pose], points: Float64Array, times: Float64Array, reference: int
 ) -> HeadMotion:
     """Compare the frames with each other: what is usual is noise, what is not an expression."""

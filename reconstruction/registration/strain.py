@@ -21,8 +21,8 @@ from reconstruction.registration.affine_fit import fit_affine
 from reconstruction.registration.tracking import (
     RegistrationError,
     normalize_local_contrast,
-    textured,
-    track,
+    select_textured_points,
+    track_points,
 )
 
 MIN_STRAIN_SIDE_PX = 64
@@ -71,7 +71,7 @@ class Strain:
     windows: int
     valid: bool
 
-    def along(self, angle_rad: float) -> tuple[float, float]:
+    def stretch_along(self, angle_rad: float) -> tuple[float, float]:
         """Return the stretch ratio of a line at an angle (+x towards +y), and its standard error.
 
         Examples
@@ -273,13 +273,17 @@ def _by_windows(
     eroded = cv2.erode(mask.astype(np.uint8), window)
     candidates = candidates[eroded[candidates[:, 1].astype(int), candidates[:, 0].astype(int)] > 0]
     cell, margin = STRAIN_WINDOW_PX, STRAIN_WINDOW_PX // 2 + 1
-    chosen = textured(one, candidates, count=MAX_WINDOWS, cell_px=cell, margin_px=margin)
+    chosen = select_textured_points(
+        one, candidates, count=MAX_WINDOWS, cell_px=cell, margin_px=margin
+    )
     start = candidates[chosen]
     for number in range(N_STRAIN_ROUNDS):
         back = _warped_back(two, affine, cv2.INTER_CUBIC)
         seen = _warped_back(other.astype(np.uint8), affine, cv2.INTER_NEAREST, border=0)
         seen = cv2.erode(seen, window, borderValue=0)
-        tracks = track(one, back, start, window_px=STRAIN_WINDOW_PX, levels=2 if number == 0 else 0)
+        tracks = track_points(
+            one, back, start, window_px=STRAIN_WINDOW_PX, levels=2 if number == 0 else 0
+        )
         inside = seen[start[:, 1].astype(int), start[:, 0].astype(int)] > 0
         good = tracks.valid & inside
         fit = _fit(start[good], tracks.points_px[good], shape, last=number == N_STRAIN_ROUNDS - 1)

@@ -16,9 +16,9 @@ class RegistrationError(ValueError):
 
 
 CONTRAST_SIGMA_PX = 8.0
-MAX_BACK_PX = 0.3
+MAX_BACKTRACK_ERROR_PX = 0.3
 """Farthest a point may end from where it began after the way back."""
-MIN_PEAK = 1e-12
+MIN_IMAGE_PEAK = 1e-12
 """Brightest value below which, or above one over which, a picture's unit is not kept: local spreads
 would fall below the floor that stands for no texture at all, or overflow."""
 
@@ -64,7 +64,7 @@ def normalize_local_contrast(image: FloatArray) -> UInt8Array:
     known = np.isfinite(image)
     values = np.maximum(np.where(known, image, 0.0), 0.0)
     top = float(values.max())
-    if top > 0.0 and not MIN_PEAK < top < 1.0 / MIN_PEAK:
+    if top > 0.0 and not MIN_IMAGE_PEAK < top < 1.0 / MIN_IMAGE_PEAK:
         values = values / top  # squares in single precision hold no more
     values = np.sqrt(values).astype(np.float32)
     mean = cv2.GaussianBlur(values, (0, 0), CONTRAST_SIGMA_PX)
@@ -74,20 +74,25 @@ def normalize_local_contrast(image: FloatArray) -> UInt8Array:
     return np.clip(np.rint(128 + 32 * rest / np.maximum(spread, floor)), 0, 255).astype(np.uint8)
 
 
-def within(at_px: FloatArray, shape: tuple[int, ...], margin_px: int = 0) -> BoolArray:
+def is_inside_image(at_px: FloatArray, shape: tuple[int, ...], margin_px: int = 0) -> BoolArray:
     """Return which places (..., 2), column and row, lie in an image, so far from its border."""
     last = [shape[1] - 1 - margin_px, shape[0] - 1 - margin_px]
     return np.asarray(((at_px >= margin_px) & (at_px <= last)).all(axis=-1))
 
 
-def textured(
-    even: UInt8Array, points_px: Float64Array, *, count: int, cell_px: int = 12, margin_px: int = 12
+def select_textured_points(
+    local_contrast: UInt8Array,
+    points_px: Float64Array,
+    *,
+    count: int,
+    cell_px: int = 12,
+    margin_px: int = 12,
 ) -> NDArray[np.intp]:
     """Choose points that can be tracked: the one with most texture in each cell of the image.
 
     Parameters
     ----------
-    even : ndarray of uint8, shape (H, W)
+    local_contrast : ndarray of uint8, shape (H, W)
         As from `normalize_local_contrast`.
     points_px : ndarray, shape (P, 2)
         Candidates; those that are not finite or too near the border are left out.
@@ -101,13 +106,13 @@ def textured(
     ndarray of int
         Indices into `points_px`.
     """
-    width = even.shape[1]
+    width = local_contrast.shape[1]
     with np.errstate(invalid="ignore"):
-        chosen = np.flatnonzero(within(points_px, even.shape, margin_px))
+        chosen = np.flatnonzero(is_inside_image(points_px, local_contrast.shape, margin_px))
     if not chosen.size:
         return chosen
     places = np.rint(points_px[chosen]).astype(int)
-    texture = cv2.cornerMinEigenVal(even, 9, ksize=3)[places[:, 1], places[:, 0]]
+    texture = cv2.cornerMinEigenVal(local_contrast, 9, ksize=3)[places[:, 1], places[:, 0]]
     cell = (places[:, 1] // cell_px) * (width // cell_px + 1) + places[:, 0] // cell_px
     order = np.lexsort((-texture, cell))
     first = np.ones(order.size, bool)
@@ -118,7 +123,7 @@ def textured(
     return np.sort(chosen[best])
 
 
-def track(
+def track_points(
     first: UInt8Array,
     second: UInt8Array,
     points_px: Float64Array,
@@ -158,6 +163,11 @@ def track(
     back, returned, _ = cv2.calcOpticalFlowPyrLK(two, one, there, None, **settings)
     gap = np.linalg.norm(back - start, axis=-1).reshape(-1)
     there = there.reshape(-1, 2).astype(np.float64)
-    inside = within(there, first.shape)
-    good = (found.reshape(-1) == 1) & (returned.reshape(-1) == 1) & inside & (gap <= MAX_BACK_PX)
+    inside = is_inside_image(there, first.shape)
+    good = (
+        (found.reshape(-1) == 1)
+        & (returned.reshape(-1) == 1)
+        & inside
+        & (gap <= MAX_BACKTRACK_ERROR_PX)
+    )
     return Tracks(np.where(good[:, None], there, start.reshape(-1, 2)), good)

@@ -17,7 +17,7 @@ from reconstruction.scan.repair import (
     boundary_edges,
     crop,
     directed_edges,
-    repair,
+    repair_mesh,
 )
 
 FACE_BOX_MM: Final = ((-100.0, -108.0, -105.0), (100.0, 150.0, 60.0))
@@ -42,7 +42,7 @@ class RefinedScan:
     report: RepairReport
     """What the cleaning found."""
 
-    def moved(self, rotation: Float64Array, translation_mm: Float64Array) -> RefinedScan:
+    def transform(self, rotation: Float64Array, translation_mm: Float64Array) -> RefinedScan:
         """Return the surface after a rigid motion ``rotation @ p + translation_mm``."""
         turn = np.asarray(rotation, np.float64)
         vertices_mm = self.coarse.vertices_mm @ turn.T + translation_mm
@@ -81,7 +81,7 @@ def load_ply(data: bytes) -> TriangleMesh:
     return TriangleMesh(vertices, faces, np.asarray(uv, np.float64)[faces] if given else None)
 
 
-def prepare(scan: bytes | TriangleMesh, *, points: int = 500_000) -> RefinedScan:
+def prepare_scan(scan: bytes | TriangleMesh, *, points: int = 500_000) -> RefinedScan:
     """Crop, repair, lay out and refine a scan.
 
     Parameters
@@ -94,7 +94,7 @@ def prepare(scan: bytes | TriangleMesh, *, points: int = 500_000) -> RefinedScan
     Returns
     -------
     RefinedScan
-        In the frame of the scan; see `reconstruction.scan.registration.register`.
+        In the frame of the scan; see `reconstruction.scan.registration.register_scan`.
 
     Raises
     ------
@@ -102,13 +102,13 @@ def prepare(scan: bytes | TriangleMesh, *, points: int = 500_000) -> RefinedScan
         Where nothing of the scan can be used.
     """
     mesh = load_ply(scan) if isinstance(scan, bytes) else scan
-    mesh, report = repair(crop(mesh, box_mm=FACE_BOX_MM))
+    mesh, report = repair_mesh(crop(mesh, box_mm=FACE_BOX_MM))
     if mesh.corner_uv is None:
-        mesh = unwrap(mesh)
-    return refine(mesh, points=points, report=report)
+        mesh = unwrap_mesh(mesh)
+    return refine_mesh(mesh, points=points, report=report)
 
 
-def unwrap(mesh: TriangleMesh) -> TriangleMesh:
+def unwrap_mesh(mesh: TriangleMesh) -> TriangleMesh:
     """Lay a surface out flat with little stretch, in charts that fill the unit square (xatlas)."""
     import xatlas
 
@@ -121,7 +121,9 @@ def unwrap(mesh: TriangleMesh) -> TriangleMesh:
     return TriangleMesh(mesh.vertices_mm, mesh.faces, np.asarray(uv, np.float64)[index])
 
 
-def refine(mesh: TriangleMesh, *, points: int, report: RepairReport | None = None) -> RefinedScan:
+def refine_mesh(
+    mesh: TriangleMesh, *, points: int, report: RepairReport | None = None
+) -> RefinedScan:
     """Refine a clean surface by Loop subdivision to about `points` points.
 
     Texture coordinates are refined linearly: each half of an edge is half of it in the texture.

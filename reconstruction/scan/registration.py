@@ -17,14 +17,14 @@ from scipy import ndimage
 
 from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int64Array
-from reconstruction.lumitexels import Lights, Surface, visibility
+from reconstruction.lumitexels import LightSources, SampledSurface, compute_visibility
 from reconstruction.lumitexels.ray_casting import RayCaster
 from reconstruction.scan.repair import TriangleMesh
 from reconstruction.scan.rough_normals import (
     NormalEvidence,
     RayCamera,
-    RegistrationError,
-    photometric_normals,
+    ScanRegistrationError,
+    estimate_rough_normals,
 )
 
 MAX_IMAGE_WIDTH_PX: Final = 320
@@ -62,7 +62,7 @@ class RigidFit:
         return np.asarray(points_mm, np.float64) @ self.rotation.T + self.translation_mm
 
 
-def register(
+def register_scan(
     points_mm: ArrayLike,
     normals: ArrayLike,
     evidence: Sequence[NormalEvidence],
@@ -97,8 +97,8 @@ def register(
     """
     p = np.asarray(points_mm, np.float64)
     n = np.asarray(normals, np.float64)
-    Checks(RegistrationError).shape("points_mm", p, ("P", 3))
-    Checks(RegistrationError).shape("normals", n, p.shape)
+    Checks(ScanRegistrationError).shape("points_mm", p, ("P", 3))
+    Checks(ScanRegistrationError).shape("normals", n, p.shape)
     if visible is None:
         visible = np.ones((len(evidence), len(p)), np.bool_)
     turn = np.eye(3) if start is None else np.asarray(start[0], np.float64)
@@ -113,7 +113,7 @@ def register(
             center = turn @ middle + shift
             system = _gauss_newton(p, n, turn, shift, center, maps, evidence, visible)
             if system.samples < 200:
-                raise RegistrationError(
+                raise ScanRegistrationError(
                     f"samples: got {system.samples} points seen, expected at least 200; "
                     "check the calibration, and the scan's unit and frame"
                 )
@@ -142,11 +142,11 @@ def register(
     )
 
 
-def align(
+def align_scan(
     mesh: TriangleMesh,
     *,
     cameras: Sequence[RayCamera],
-    lights: Lights,
+    lights: LightSources,
     stacks: Callable[[int], FloatArray],
     binning: int = 1,
     points: int = 6000,
@@ -189,7 +189,7 @@ def align(
         moved = mesh.vertices_mm if fit is None else fit.move(mesh.vertices_mm)
         caster = RayCaster(moved, mesh.faces)
         evidence = [
-            photometric_normals(
+            estimate_rough_normals(
                 image,
                 camera,
                 lights,
@@ -201,14 +201,14 @@ def align(
         ]
         here = p if fit is None else fit.move(p)
         facing = n if fit is None else n @ fit.rotation.T
-        seen = visibility(
-            Surface(here.astype(np.float32), facing.astype(np.float32)),
+        seen = compute_visibility(
+            SampledSurface(here.astype(np.float32), facing.astype(np.float32)),
             caster,
             cameras_mm=np.array([camera.center_mm for camera in cameras]),
             lights_mm=np.zeros((0, 3)),
             min_cosine=MIN_SCAN_COSINE,
         ).view
-        fit = register(
+        fit = register_scan(
             p,
             n,
             evidence,
@@ -217,7 +217,7 @@ def align(
             blurs_px=(8.0, 3.0, 1.5, 0.5) if number == 0 else (1.5, 0.5),
         )
     if fit is None:
-        raise RegistrationError(f"rounds: got {rounds}, expected at least 1")
+        raise ScanRegistrationError(f"rounds: got {rounds}, expected at least 1")
     return fit
 
 
@@ -270,14 +270,14 @@ def _blurred(view: NormalEvidence, blur_px: float) -> Float32Array:
 def _gauss_newton(
     p: Float64Array,
     n: Float64Array,
-    turn: Float64Array,
+    rotation: Float64Array,
     shift: Float64Array,
     center: Float64Array,
     maps: Sequence[Float32Array],
     evidence: Sequence[NormalEvidence],
     visible: BoolArray,
 ) -> _System:
-    points, model = p @ turn.T + shift, n @ turn.T
+    points, model = p @ rotation.T + shift, n @ rotation.T
     rows, residuals, jacobians, trusts = [], [], [], []
     for view, layers, seen in zip(evidence, maps, visible, strict=True):
         to_camera = view.camera.center_mm - points
@@ -321,7 +321,7 @@ def _clustered(system: _System, p: Float64Array) -> Float64Array:
     cell = cell.reshape(-1)
     sums = np.stack([np.bincount(cell, system.by_point[:, j]) for j in range(6)], axis=-1)
     used = np.count_nonzero(np.abs(sums).sum(axis=1))
-    Checks(RegistrationError).within("cells with points", used, "(6, inf)")
+    Checks(ScanRegistrationError).within("cells with points", used, "(6, inf)")
     inverse = np.linalg.inv(system.matrix)
     spread = inverse @ (sums.T @ sums) @ inverse * used / (used - 6)
     return np.sqrt(np.diag(spread))

@@ -55,7 +55,7 @@ class TriangleMesh:
         up = np.array([0.0, 0.0, 1.0])
         return np.where(length > 0, total / np.maximum(length, 1e-300), up).astype(np.float32)
 
-    def kept(self, rows: BoolArray | NDArray[np.intp]) -> TriangleMesh:
+    def select_faces(self, rows: BoolArray | NDArray[np.intp]) -> TriangleMesh:
         """Return some of the triangles, without vertices that none of them uses."""
         faces = self.faces[rows]
         used, faces = np.unique(faces, return_inverse=True)
@@ -75,7 +75,9 @@ class RepairReport:
         return ", ".join(found) or "nothing to mend"
 
 
-def repair(mesh: TriangleMesh, *, max_hole_mm: float = 40.0) -> tuple[TriangleMesh, RepairReport]:
+def repair_mesh(
+    mesh: TriangleMesh, *, max_hole_mm: float = 40.0
+) -> tuple[TriangleMesh, RepairReport]:
     """Make one manifold, oriented surface of a scan.
 
     Parameters
@@ -106,7 +108,7 @@ def repair(mesh: TriangleMesh, *, max_hole_mm: float = 40.0) -> tuple[TriangleMe
     mesh = _some(mesh, good)
     _, first = np.unique(np.sort(mesh.faces, axis=1), axis=0, return_index=True)
     counts["doubled triangles"] = len(mesh.faces) - len(first)
-    mesh = mesh.kept(np.sort(first))
+    mesh = mesh.select_faces(np.sort(first))
     before = len(mesh.faces)
     mesh = _without_surplus(mesh)
     counts["triangles on edges of three"] = before - len(mesh.faces)
@@ -153,14 +155,14 @@ def crop(
             f"crop: got no triangle of {len(keep)} in the box {box_mm}, expected the face; "
             "check unit and frame of the scan"
         )
-    return mesh.kept(keep)
+    return mesh.select_faces(keep)
 
 
 def largest_surface(mesh: TriangleMesh) -> TriangleMesh:
     """Return the connected surface of the largest area."""
     group = _face_groups(mesh.faces)
     area = np.bincount(group, np.linalg.norm(mesh.face_vectors(), axis=1))
-    return mesh.kept(group == int(np.argmax(area)))
+    return mesh.select_faces(group == int(np.argmax(area)))
 
 
 def boundary_edges(faces: Int64Array) -> Int64Array:
@@ -220,7 +222,7 @@ def _without_surplus(mesh: TriangleMesh) -> TriangleMesh:
 def _some(mesh: TriangleMesh, keep: BoolArray) -> TriangleMesh:
     if not keep.any():
         raise ScanMeshError("mesh: got no sound triangle, expected a surface")
-    return mesh.kept(keep)
+    return mesh.select_faces(keep)
 
 
 def _face_groups(faces: Int64Array) -> NDArray[np.intp]:

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from model.fresnel import ETA_SKIN, reflectance
 from reconstruction.arrays import Float32Array, Float64Array, FloatArray
-from reconstruction.lumitexels import Camera, Lights
+from reconstruction.lumitexels import CameraProjection, LightSources
 from reconstruction.lumitexels.ray_casting import RayCaster
 
 COS_HIGHLIGHT: Final = float(np.cos(np.radians(45.0)))
@@ -21,11 +21,11 @@ MIN_COS_LIGHT: Final = 0.3
 MIN_COS_VIEW: Final = 0.2
 
 
-class RegistrationError(ValueError):
+class ScanRegistrationError(ValueError):
     """Photographs that do not say where the scan is."""
 
 
-class RayCamera(Camera, Protocol):
+class RayCamera(CameraProjection, Protocol):
     """A camera that also gives the rays of its pixels."""
 
     def rays(self, pixels: ArrayLike) -> Float64Array:
@@ -45,10 +45,10 @@ class NormalEvidence:
     """Camera pixels along each side of a pixel here."""
 
 
-def photometric_normals(
+def estimate_rough_normals(
     stack: FloatArray,
     camera: RayCamera,
-    lights: Lights,
+    lights: LightSources,
     caster: RayCaster,
     *,
     surface_normals: FloatArray,
@@ -81,7 +81,9 @@ def photometric_normals(
     """
     count, height, width = stack.shape
     if count != len(lights.position_mm):
-        raise RegistrationError(f"stack: got {count} images, expected {len(lights.position_mm)}")
+        raise ScanRegistrationError(
+            f"stack: got {count} images, expected {len(lights.position_mm)}"
+        )
     row, column = np.mgrid[0:height, 0:width]
     pixels = np.stack([column, row], axis=-1).reshape(-1, 2) * binning + 0.5 * (binning - 1)
     ways = camera.rays(pixels)
@@ -104,7 +106,7 @@ def photometric_normals(
         ordered = np.sort(np.where(facing_light, cos_half, np.inf), axis=0)
         edge = np.maximum(ordered[min(MIN_SCAN_LIGHTS, count) - 1], COS_HIGHLIGHT)
         diffuse = facing_light & (cos_half <= edge) & (cos_view > MIN_COS_VIEW)
-        passed = _passed(cos_light) * _passed(cos_view)
+        passed = _boundary_transmittance(cos_light) * _boundary_transmittance(cos_view)
         found, share = _robust_normals(direction, np.where(diffuse, values / passed, np.nan))
         facing = np.einsum("pk,pk->p", found, ways[part]) < 0
         normals[part] = np.where(facing[:, None], found, 0.0)
@@ -114,7 +116,7 @@ def photometric_normals(
     )
 
 
-def _passed(cosine: Float64Array) -> Float64Array:
+def _boundary_transmittance(cosine: Float64Array) -> Float64Array:
     """Return the share of light that passes the skin's boundary at a cosine, at least 0.05."""
     at = np.linspace(0.0, 1.0, 513)
     share = 1.0 - reflectance(at, ETA_SKIN)

@@ -1,12 +1,12 @@
 """Subsurface scattering: optical properties from radial profiles."""
 
 from reconstruction.subsurface.inversion import SubsurfaceError, fit_dipole, invert, nearest_medium
-from reconstruction.subsurface.outcome import Outcome, SubsurfaceFit
-from reconstruction.subsurface.profile_batch import LeftOut
+from reconstruction.subsurface.outcome import FitOutcome, SubsurfaceFit
+from reconstruction.subsurface.profile_batch import OmissionReason
 
 __all__ = [
-    "LeftOut",
-    "Outcome",
+    "FitOutcome",
+    "OmissionReason",
     "SubsurfaceError",
     "SubsurfaceFit",
     "fit_dipole",

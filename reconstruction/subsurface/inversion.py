@@ -49,13 +49,13 @@ from reconstruction.arrays import BoolArray, Float64Array, UInt8Array
 from reconstruction.subsurface import kernels, nearest
 from reconstruction.subsurface.models import (
     FIT_METHODS,
+    FiberOptics,
     Method,
-    Optics,
     ProfileModel,
     profile_model,
 )
 from reconstruction.subsurface.outcome import SubsurfaceFit, evaluate_fits
-from reconstruction.subsurface.profile_batch import Fits, LeftOut, ProfileBatch
+from reconstruction.subsurface.profile_batch import Fits, OmissionReason, ProfileBatch
 from reconstruction.subsurface.profile_fit import fit_profiles
 
 PROFILES_PER_BATCH = 8192
@@ -125,7 +125,7 @@ def invert(
     >>> float(fit.sigma_a_per_mm.round(6)), float(fit.sigma_s_prime_per_mm.round(6))
     (0.04, 1.5)
     """
-    light = Optics(eta, **optics)
+    light = FiberOptics(eta, **optics)
     _check_settings(method, light, common_error=common_error, model_error=model_error or 0.0)
     layout = _lay_out(radius_mm, reflectance_per_mm2, variance, valid)
     g_error = light.g_error if method == "photon_table" else 0.0
@@ -183,7 +183,7 @@ def nearest_medium(
     (0.5, 2.0)
     """
     settings = {"collection": "fibre"} | optics
-    light = Optics(eta, **settings, g=nearest.NEAREST_MEDIUM_G, g_error=0.0)
+    light = FiberOptics(eta, **settings, g=nearest.NEAREST_MEDIUM_G, g_error=0.0)
     _check_settings("photon_table", light)
     layout = _lay_out(radius_mm, reflectance_per_mm2, variance, valid)
     batch = layout.batch(_prior(nearest.LOG_FACTOR_SIGMA, nearest.NEAREST_MEDIUM_G, 0.0))
@@ -228,7 +228,7 @@ class _Layout:
 
     y: Float64Array
     variance: Float64Array | None
-    left_out: UInt8Array
+    omission: UInt8Array
     radius_mm: Float64Array
     """(N or 1, F)."""
     shape: tuple[int, ...]
@@ -236,14 +236,14 @@ class _Layout:
 
     def batch(self, prior: Float64Array) -> ProfileBatch:
         """Return the profiles as fits take them."""
-        return ProfileBatch.lay_out(self.y, self.variance, self.left_out, prior)
+        return ProfileBatch.lay_out(self.y, self.variance, self.omission, prior)
 
     def fit(
         self,
         batch: ProfileBatch,
         model_at: Callable[[Float64Array], ProfileModel],
         fit: Callable[[ProfileBatch, ProfileModel], Fits],
-        most: int | None = None,
+        max_profiles: int | None = None,
     ) -> Fits:
         """Fit all profiles, those of equal radii by one model, at most so many at a time."""
         parts = []
@@ -251,7 +251,7 @@ class _Layout:
         which = np.broadcast_to(which.reshape(-1), self.y.shape[:1])
         for number, radius_mm in enumerate(distinct):
             rows, model = np.flatnonzero(which == number), model_at(np.ascontiguousarray(radius_mm))
-            step = most or max(rows.size, 1)
+            step = max_profiles or max(rows.size, 1)
             for begin in range(0, max(rows.size, 1), step):
                 some = rows[begin : begin + step]
                 parts.append((some, fit(batch.select(some), model)))
@@ -283,21 +283,21 @@ def _lay_out(
         radius = _broadcast("radius_mm", radius, full)
     check.within("radius_mm", radius, "[0, inf)")
     y = y.reshape(-1, full[-1])
-    left_out = np.full(y.shape, LeftOut.USED, np.uint8)
+    left_out = np.full(y.shape, OmissionReason.USED, np.uint8)
 
-    def leave_out(where: BoolArray, reason: LeftOut) -> None:
-        left_out[(left_out == LeftOut.USED) & where] = reason
+    def leave_out(where: BoolArray, reason: OmissionReason) -> None:
+        left_out[(left_out == OmissionReason.USED) & where] = reason
 
     if valid is not None:
         given = _broadcast("valid", np.asarray(valid, bool), full).reshape(y.shape)
-        leave_out(~given, LeftOut.MASKED)
-    leave_out(~np.isfinite(y), LeftOut.NOT_FINITE)
+        leave_out(~given, OmissionReason.MASKED)
+    leave_out(~np.isfinite(y), OmissionReason.NOT_FINITE)
     noise = None
     if variance is None:
-        leave_out(~(y > 0.0), LeftOut.NOT_ABOVE_ZERO)
+        leave_out(~(y > 0.0), OmissionReason.NOT_ABOVE_ZERO)
     else:
         noise = _broadcast("variance", np.asarray(variance, np.float64), full).reshape(y.shape)
-        leave_out(~((noise >= 0.0) & (noise < math.inf)), LeftOut.NO_VARIANCE)
+        leave_out(~((noise >= 0.0) & (noise < math.inf)), OmissionReason.NO_VARIANCE)
     rows = radius.reshape(-1, full[-1]) if radius.size else np.zeros((1, full[-1]))
     return _Layout(y, noise, left_out, rows, shape)
 
@@ -312,7 +312,7 @@ def _broadcast(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArra
         ) from error
 
 
-def _check_settings(method: str, optics: Optics, **not_negative: float) -> None:
+def _check_settings(method: str, optics: FiberOptics, **not_negative: float) -> None:
     check = Checks(SubsurfaceError)
     check.choice("method", method, FIT_METHODS)
     check.choice("collection", optics.collection, ("all", "fibre"))

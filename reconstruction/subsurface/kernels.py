@@ -25,7 +25,7 @@ _FAST_MATH = {"contract", "reassoc", "nsz"}
 _FOUR_PI = 4.0 * math.pi
 
 
-class Curves(NamedTuple):
+class ForwardModel(NamedTuple):
     """A forward model at fixed radii, as the kernels take it."""
 
     kind: int
@@ -175,7 +175,7 @@ def evaluate_one(curves, theta, w, m, jac):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def valleys(score: Any, valley: Any, place: Any, depth: Any) -> None:
+def find_valleys(score: Any, valley: Any, position: Any, depth: Any) -> None:
     """Find the deepest two valleys of a misfit along its first axis.
 
     Parameters
@@ -184,7 +184,7 @@ def valleys(score: Any, valley: Any, place: Any, depth: Any) -> None:
         Infinite where there is no model.
     valley : (2, N) int64
         Index on the first axis, the deepest valley first.
-    place, depth : (2, N) float64
+    position, depth : (2, N) float64
         Index on the second axis of the least misfit there, and that misfit, from the parabola
         through three nodes; an infinite depth where there is no second valley.
     """
@@ -206,16 +206,20 @@ def valleys(score: Any, valley: Any, place: Any, depth: Any) -> None:
                     at[i] -= 0.5 * lean / bend
                     low[i + 1] -= 0.125 * lean * lean / bend
         for v in range(2):
-            valley[v, n], place[v, n], depth[v, n] = 0, 0.0, np.inf
+            valley[v, n], position[v, n], depth[v, n] = 0, 0.0, np.inf
         for i in range(n_s):
             here = low[i + 1]
             if here < np.inf and here <= low[i] and here <= low[i + 2]:
                 v = 0 if here < depth[0, n] else 1
                 if v == 0:
-                    valley[1, n], place[1, n], depth[1, n] = valley[0, n], place[0, n], depth[0, n]
+                    valley[1, n], position[1, n], depth[1, n] = (
+                        valley[0, n],
+                        position[0, n],
+                        depth[0, n],
+                    )
                 elif here >= depth[1, n]:
                     continue
-                valley[v, n], place[v, n], depth[v, n] = i, at[i], here
+                valley[v, n], position[v, n], depth[v, n] = i, at[i], here
 
 
 @njit(cache=True, error_model="numpy")

@@ -25,7 +25,7 @@ _FAST_MATH = {"contract", "reassoc", "nsz"}
 _MIN_REFLECTANCE = 1e-290
 
 
-class Problem(NamedTuple):
+class FitProblem(NamedTuple):
     """What is fitted and how."""
 
     y: Float64Array
@@ -43,11 +43,11 @@ class Problem(NamedTuple):
     """(4, 2): least and greatest value of each parameter."""
     rounds: int
     """Times the model's error is taken anew."""
-    most: int
+    max_steps: int
     """Steps of a round at most."""
 
 
-class Found(NamedTuple):
+class FitBuffers(NamedTuple):
     """Where the results go."""
 
     theta: Float64Array

@@ -14,7 +14,7 @@ from threadpoolctl import ThreadpoolController
 
 from model import fresnel
 from model.dipole import kienle_patterson as diffusion
-from model.photon_table import asymmetries
+from model.photon_table import stored_asymmetries
 from model.photon_table import table as photon_table
 from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.subsurface import kernels
@@ -61,7 +61,7 @@ MIN_LOG_REFLECTANCE = -100.0
 """Logarithms of reflectance below this are as good as none, for starts."""
 
 
-class Optics(NamedTuple):
+class FiberOptics(NamedTuple):
     """What light meets between the source and a fiber."""
 
     eta: float = fresnel.ETA_SKIN
@@ -93,7 +93,7 @@ class ProfileModel:
         Greatest sigma_a/sigma_s' that the model is good for.
     """
 
-    curves: kernels.Curves
+    curves: kernels.ForwardModel
     bounds: Float64Array
     error: Float64Array
     bias: tuple[float, float]
@@ -190,7 +190,7 @@ class ProfileModel:
                     score -= left
             score += nowhere
             score = score.reshape(-1, log_s.size, log_k.size)
-            kernels.valleys(score, valley[:, part], place[:, part], depth[:, part])
+            kernels.find_valleys(score, valley[:, part], place[:, part], depth[:, part])
         ends = []
         for which, at in zip(valley, place, strict=True):
             start = np.zeros((which.size, kernels.N_PARAMETERS))
@@ -219,13 +219,15 @@ def _log_absorption(log_sigma_tr: Float64Array, log_sigma_s: Float64Array) -> Fl
     return np.asarray(log_sigma_s + np.log(x) - np.log1p(np.sqrt(1.0 + 2.0 * x)))
 
 
-def profile_model(method: Method, optics: Optics, radius_mm: Float64Array) -> ProfileModel:
+def profile_model(method: Method, optics: FiberOptics, radius_mm: Float64Array) -> ProfileModel:
     """Return a method's model at some radii (F,)."""
     if method == "photon_table":
         return _tabled(radius_mm.tobytes(), optics)
     constants, error, bias = _CLOSED_FORM_MODELS[method](optics.eta)
     return ProfileModel(
-        curves=kernels.Curves(0, radius_mm, constants, np.ones((3, 2)), np.zeros((1, 1, 1, 1))),
+        curves=kernels.ForwardModel(
+            0, radius_mm, constants, np.ones((3, 2)), np.zeros((1, 1, 1, 1))
+        ),
         bounds=_bounds(SIGMA_S_RANGE, (0.0, 1.0)),
         error=error,
         bias=bias,
@@ -238,10 +240,10 @@ def _bounds(sigma_s: tuple[float, float], g: tuple[float, float]) -> Float64Arra
 
 
 @lru_cache(maxsize=16)
-def _tabled(radius: bytes, optics: Optics) -> ProfileModel:
+def _tabled(radius: bytes, optics: FiberOptics) -> ProfileModel:
     """Lay the photon table out as log R + sigma_tr r over (sigma_s', root, g)."""
     radius_mm = np.frombuffer(radius, np.float64).copy()  # not read-only: one kernel for all
-    held = asymmetries()
+    held = stored_asymmetries()
     low = max(optics.g - 3.0 * optics.g_error, held[0])
     high = min(optics.g + 3.0 * optics.g_error, held[-1])
     count = 4 if high - low > 1e-6 else 1
@@ -275,7 +277,7 @@ def _tabled(radius: bytes, optics: Optics) -> ProfileModel:
         grid[:, :, n] = log_table(radius_mm, g, cores_mm) + beyond + decay
     axes = np.stack([np.array([logs[0], roots[0], low]), steps], axis=1)
     return ProfileModel(
-        curves=kernels.Curves(kernels.TABLE_MODEL, radius_mm, np.zeros(4), axes, grid),
+        curves=kernels.ForwardModel(kernels.TABLE_MODEL, radius_mm, np.zeros(4), axes, grid),
         bounds=_bounds(TABLE_SIGMA_S_RANGE, (low, high)),
         error=TABLE_ERROR,
         bias=(0.0, 0.0),

@@ -9,7 +9,7 @@ from scipy.special import gammaincc, stdtrit
 
 from reconstruction.arrays import BoolArray, Float64Array, Int64Array, UInt8Array, UInt16Array
 from reconstruction.subsurface.models import Method
-from reconstruction.subsurface.profile_batch import Fits, LeftOut, ProfileBatch
+from reconstruction.subsurface.profile_batch import Fits, OmissionReason, ProfileBatch
 from reconstruction.subsurface.profile_fit import MIN_OBSERVED_FIBERS, MISFIT_P_VALUE
 
 MIN_FIBERS = 4
@@ -33,7 +33,7 @@ MAX_RELATIVE_MISFIT = 2.0
 """Times the misfit that a fibre counts there at most: one must not hide what all others say."""
 
 
-class Outcome(IntFlag):
+class FitOutcome(IntFlag):
     """What became of a fit; the first eight bits make it invalid, the others are remarks."""
 
     GOOD = 0
@@ -50,15 +50,15 @@ class Outcome(IntFlag):
 
 _INVALID_CODE = 255
 _REASON_BY_CODE = {
-    Outcome.TOO_FEW_FIBRES: f"fewer than {MIN_FIBERS} fibres to use",
-    Outcome.NO_SIGNAL: f"fewer than {MIN_OBSERVED_FIBERS} fibres stand out of their noise",
-    Outcome.NOT_CONVERGED: "the fit did not settle",
-    Outcome.AT_BOUND: "a coefficient runs against its limit",
-    Outcome.OUTSIDE_DOMAIN: "sigma_a / sigma_s' is beyond what the model is good for",
-    Outcome.NOT_IDENTIFIED: "the profile does not tell sigma_tr",
-    Outcome.WRONG_PROFILE: "no medium of this kind has such a profile, or its scale is wrong",
-    Outcome.MISFIT: "residuals exceed their errors; a model error takes up the rest",
-    Outcome.COEFFICIENTS_NOT_IDENTIFIED: "sigma_a and sigma_s' are not told apart well",
+    FitOutcome.TOO_FEW_FIBRES: f"fewer than {MIN_FIBERS} fibres to use",
+    FitOutcome.NO_SIGNAL: f"fewer than {MIN_OBSERVED_FIBERS} fibres stand out of their noise",
+    FitOutcome.NOT_CONVERGED: "the fit did not settle",
+    FitOutcome.AT_BOUND: "a coefficient runs against its limit",
+    FitOutcome.OUTSIDE_DOMAIN: "sigma_a / sigma_s' is beyond what the model is good for",
+    FitOutcome.NOT_IDENTIFIED: "the profile does not tell sigma_tr",
+    FitOutcome.WRONG_PROFILE: "no medium of this kind has such a profile, or its scale is wrong",
+    FitOutcome.MISFIT: "residuals exceed their errors; a model error takes up the rest",
+    FitOutcome.COEFFICIENTS_NOT_IDENTIFIED: "sigma_a and sigma_s' are not told apart well",
 }
 
 
@@ -96,9 +96,9 @@ class SubsurfaceFit:
         by themselves, as by dirt, do not agree. False without a misfit.
     used : ndarray of bool, shape (..., F)
     left_out : ndarray of uint8, shape (..., F)
-        Values of `LeftOut`.
+        Values of `OmissionReason`.
     outcome : ndarray of uint16, shape (...)
-        Bits of `Outcome`.
+        Bits of `FitOutcome`.
     predicted_per_mm2 : ndarray, shape (..., F)
         The fitted profile with the common factor, 1/mm^2, at every fibre.
     residual : ndarray, shape (..., F)
@@ -157,7 +157,11 @@ class SubsurfaceFit:
     @property
     def coefficients_identified(self) -> BoolArray:
         """Whether sigma_a and sigma_s' are told one by one; `valid` speaks of sigma_tr alone."""
-        unclear = Outcome.COEFFICIENTS_NOT_IDENTIFIED | Outcome.TOO_FEW_FIBRES | Outcome.NO_SIGNAL
+        unclear = (
+            FitOutcome.COEFFICIENTS_NOT_IDENTIFIED
+            | FitOutcome.TOO_FEW_FIBRES
+            | FitOutcome.NO_SIGNAL
+        )
         return np.asarray((self.outcome & np.uint16(unclear)) == 0)
 
     def reason(self, index: int | tuple[int, ...] = ()) -> str:
@@ -217,7 +221,7 @@ def evaluate_fits(
     covariance[~known] = math.inf
 
     outcome = _outcomes(batch, fits, misfit, log_stderr, pair_stderr)
-    nothing = (outcome & np.uint16(Outcome.TOO_FEW_FIBRES | Outcome.NO_SIGNAL)) != 0
+    nothing = (outcome & np.uint16(FitOutcome.TOO_FEW_FIBRES | FitOutcome.NO_SIGNAL)) != 0
     for estimate in (a, s, sigma_tr, p_value):
         estimate[nothing] = math.nan
     covariance[nothing] = math.inf
@@ -240,7 +244,7 @@ def evaluate_fits(
         "model_error": fits.model_error,
         "bent": _bent(batch, fits),
         "used": fits.used,
-        "left_out": np.where(fits.outlier, np.uint8(LeftOut.OUTLIER), batch.left_out),
+        "left_out": np.where(fits.outlier, np.uint8(OmissionReason.OUTLIER), batch.omission),
         "outcome": outcome,
         "predicted_per_mm2": np.where(nothing[:, None], math.nan, fits.predicted),
         "residual": residual,
@@ -259,25 +263,25 @@ def _outcomes(
     log_stderr: Float64Array,
     pair_stderr: Float64Array,
 ) -> UInt16Array:
-    """Return bits of `Outcome`, (N,), by the errors of log sigma_tr and of the coefficients."""
+    """Return bits of `FitOutcome`, (N,), by the errors of log sigma_tr and of the coefficients."""
     fibers, observed = fits.used.sum(axis=1), fits.observed.sum(axis=1)
     y = batch.y if batch.logarithmic else np.log(np.where(fits.observed, batch.y, 1.0))
     square = np.where(fits.observed, (y - fits.log_predicted) ** 2, 0.0)
     off = np.sqrt(square.sum(axis=1) / np.maximum(observed, 1))
     outcome = np.zeros(fibers.shape, np.uint16)
     for bit, where in (
-        (Outcome.TOO_FEW_FIBRES, fibers < MIN_FIBERS),
-        (Outcome.NO_SIGNAL, (fibers >= MIN_FIBERS) & (observed < MIN_OBSERVED_FIBERS)),
-        (Outcome.NOT_CONVERGED, fits.steps < 0),
-        (Outcome.AT_BOUND, fits.at_bound),
-        (Outcome.OUTSIDE_DOMAIN, ~fits.in_domain),
-        (Outcome.NOT_IDENTIFIED, log_stderr > MAX_LOG_STDERR),
-        (Outcome.WRONG_PROFILE, (off > MAX_LOG_RMS) | (fits.model_error > MAX_MODEL_ERROR)),
-        (Outcome.MISFIT, misfit),
-        (Outcome.COEFFICIENTS_NOT_IDENTIFIED, pair_stderr > MAX_PAIR_LOG_STDERR),
+        (FitOutcome.TOO_FEW_FIBRES, fibers < MIN_FIBERS),
+        (FitOutcome.NO_SIGNAL, (fibers >= MIN_FIBERS) & (observed < MIN_OBSERVED_FIBERS)),
+        (FitOutcome.NOT_CONVERGED, fits.steps < 0),
+        (FitOutcome.AT_BOUND, fits.at_bound),
+        (FitOutcome.OUTSIDE_DOMAIN, ~fits.in_domain),
+        (FitOutcome.NOT_IDENTIFIED, log_stderr > MAX_LOG_STDERR),
+        (FitOutcome.WRONG_PROFILE, (off > MAX_LOG_RMS) | (fits.model_error > MAX_MODEL_ERROR)),
+        (FitOutcome.MISFIT, misfit),
+        (FitOutcome.COEFFICIENTS_NOT_IDENTIFIED, pair_stderr > MAX_PAIR_LOG_STDERR),
     ):
         outcome[where] |= np.uint16(bit)
-    alone = np.uint16(Outcome.TOO_FEW_FIBRES | Outcome.NO_SIGNAL)
+    alone = np.uint16(FitOutcome.TOO_FEW_FIBRES | FitOutcome.NO_SIGNAL)
     outcome[(outcome & alone) != 0] &= alone
     return outcome
 

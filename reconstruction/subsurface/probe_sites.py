@@ -46,7 +46,7 @@ def read_landmarks(
     """
     height, width = texture_px
     try:
-        places_px = landmark_table.read(path)
+        places_px = landmark_table.read_landmark_table(path)
     except landmark_table.LandmarkError as error:
         raise TranslucencyError(str(error)) from error
     found: dict[str, tuple[float, float]] = {}

@@ -25,7 +25,7 @@ MIN_REFLECTANCE = 1e-290
 """Smallest prediction that has a logarithm."""
 
 
-class LeftOut(IntEnum):
+class OmissionReason(IntEnum):
     """Why a fiber takes no part in a fit; the values of `SubsurfaceFit.left_out`."""
 
     USED = 0
@@ -44,8 +44,8 @@ class ProfileBatch:
     """(N, F) reflectance, or its logarithm; 0 where not used."""
     variance: Float64Array
     """(N, F), of `y`, infinite where not used."""
-    left_out: UInt8Array
-    """(N, F), values of `LeftOut`."""
+    omission: UInt8Array
+    """(N, F), values of `OmissionReason`."""
     observed: BoolArray
     """(N, F): readings that stand out of their noise."""
     logarithmic: bool
@@ -58,23 +58,23 @@ class ProfileBatch:
         cls,
         y: Float64Array,
         variance: Float64Array | None,
-        left_out: UInt8Array,
+        omission: UInt8Array,
         prior: Float64Array,
     ) -> ProfileBatch:
         """Lay out profiles (N, F)."""
-        used = left_out == LeftOut.USED
+        used = omission == OmissionReason.USED
         if variance is None:
             logs = np.log(np.where(used, y, 1.0))
             deviation = np.where(used, INITIAL_DEVIATION**2, math.inf)
-            return cls(logs, deviation, left_out, used, True, prior)
+            return cls(logs, deviation, omission, used, True, prior)
         clean, noise = np.where(used, y, 0.0), np.where(used, variance, math.inf)
         observed = used & (clean > SIGNAL_SIGMAS * np.sqrt(noise))
-        return cls(clean, noise, left_out, observed, False, prior)
+        return cls(clean, noise, omission, observed, False, prior)
 
     @property
     def used(self) -> BoolArray:
         """Fibers that take part, (N, F)."""
-        return np.asarray(self.left_out == LeftOut.USED)
+        return np.asarray(self.omission == OmissionReason.USED)
 
     def select(self, rows: NDArray[np.intp]) -> ProfileBatch:
         """Return some of the profiles."""
@@ -82,7 +82,7 @@ class ProfileBatch:
             self,
             y=self.y[rows],
             variance=self.variance[rows],
-            left_out=self.left_out[rows],
+            omission=self.omission[rows],
             observed=self.observed[rows],
         )
 
@@ -176,7 +176,7 @@ def fit_from(
     """
     given = batch.y if y is None else y
     n, shape = len(given), given.shape
-    found = levenberg_marquardt.Found(
+    found = levenberg_marquardt.FitBuffers(
         start.copy(),
         np.empty((n, 4, 4)),
         np.empty(n),
@@ -184,7 +184,7 @@ def fit_from(
         np.empty(shape),
         np.empty(n, np.int64),
     )
-    problem = levenberg_marquardt.Problem(
+    problem = levenberg_marquardt.FitProblem(
         given,
         batch.variance if variance is None else variance,
         batch.logarithmic or y is not None,

@@ -137,7 +137,7 @@ class TranslucencyMap:
     p_value : ndarray of float64, shape (C,)
         Chance that the population holds a face so unlike its mean; 1 without a usable place. When
         tiny, standard errors away from the places are not to be relied on.
-    left_out : tuple of (str, str)
+    omitted : tuple of (str, str)
         Measurement and channel, and why it was left out.
     conflicts : tuple of (str, str)
         Place and channel whose repeats contradict each other, and how; their error was widened.
@@ -149,7 +149,7 @@ class TranslucencyMap:
     log_stderr: Float32Array
     used: BoolArray
     p_value: Float64Array
-    left_out: tuple[tuple[str, str], ...]
+    omitted: tuple[tuple[str, str], ...]
     conflicts: tuple[tuple[str, str], ...]
 
 
@@ -256,7 +256,7 @@ def interpolate(
         log_stderr=log_stderr,
         used=usable,
         p_value=p_value,
-        left_out=tuple(left_out),
+        omitted=tuple(left_out),
         conflicts=tuple(conflicts),
     )
 

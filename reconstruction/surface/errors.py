@@ -112,7 +112,7 @@ def change_per_mm(
     return np.sqrt(np.maximum(mean, 0.0))
 
 
-def of_normals(normals: PointValues, surface: RefinedScan, pixel_mm: float) -> PointValues:
+def add_normal_errors(normals: PointValues, surface: RefinedScan, pixel_mm: float) -> PointValues:
     """Add to the standard errors of normals what misplaced samples do to them.
 
     Parameters
@@ -134,7 +134,7 @@ def of_normals(normals: PointValues, surface: RefinedScan, pixel_mm: float) -> P
     return PointValues(normals.values, np.where(normals.valid[:, None], stderr, 0.0), normals.valid)
 
 
-def of_albedo(
+def add_albedo_errors(
     r_d: PointValues, normals: PointValues, surface: RefinedScan, pixel_mm: float
 ) -> PointValues:
     """Add to the standard errors of the albedo what normals, misplaced samples and pixels do to it.

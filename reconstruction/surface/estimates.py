@@ -72,7 +72,7 @@ class PointValues:
         return PointValues(self.values[rows], self.stderr[rows], self.valid[rows])
 
 
-def seen_enough(samples: Lumitexels) -> BoolArray:
+def has_enough_samples(samples: Lumitexels) -> BoolArray:
     """Return which points have samples of enough lights and views, shape (P,)."""
 
     def kinds(index: NDArray[np.integer]) -> NDArray[np.intp]:
@@ -88,7 +88,7 @@ def normals_from_half_vectors(samples: Lumitexels) -> PointValues:
     """Return the published estimate: half vectors of each view's four brightest samples."""
     ways = samples.light_dir, samples.view_dir, samples.view
     found = half_vector_normals.estimate(samples.f.mean(axis=-1), *ways, valid=samples.valid)
-    good = seen_enough(samples) & found.valid
+    good = has_enough_samples(samples) & found.valid
     return _of_normals(found.normals, found.stderr_rad / np.sqrt(2.0), good)
 
 
@@ -125,7 +125,7 @@ def normals_from_shading(
     half /= np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-6)
     light_dir = np.ascontiguousarray(samples.light_dir.transpose(1, 0, 2))
     start = np.asarray(normals, np.float64)
-    good = seen_enough(samples)
+    good = has_enough_samples(samples)
     stderr = np.full(len(start), np.pi)
     for _ in range(rounds):
         cos_light = np.einsum("pmk,pk->pm", samples.light_dir, start)
@@ -137,7 +137,7 @@ def normals_from_shading(
             & (np.einsum("pmk,pk->pm", half, start) < np.cos(highlight_rad))
         )
         # the cosine that made f from the radiance is the scan's, not that of this round
-        passed = boundary_kernels.transmitted(cos_light, cos_view)
+        passed = boundary_kernels.boundary_transmittance(cos_light, cos_view)
         scale = np.pi * samples.cos_light / np.maximum(passed, 1e-3)
         found = photometric_stereo.estimate_normals(
             np.where(use, gray * scale, 0.0).T.astype(np.float32),
@@ -157,7 +157,7 @@ def _of_normals(normals: FloatArray, stderr_rad: FloatArray, good: BoolArray) ->
     return PointValues.masked(normals, spread, good)
 
 
-def at_normals(samples: Lumitexels, normals: PointValues) -> Lumitexels:
+def reproject_samples(samples: Lumitexels, normals: PointValues) -> Lumitexels:
     """Return samples whose f_r is that of a surface with these normals, and not of the scan's.
 
     A sample's radiance was divided by the cosine at the scan's normal, degrees off the true one:
@@ -188,7 +188,7 @@ def at_normals(samples: Lumitexels, normals: PointValues) -> Lumitexels:
     )
 
 
-def albedo(samples: Lumitexels, normals: PointValues, *, stderr_rad: float) -> PointValues:
+def estimate_albedo(samples: Lumitexels, normals: PointValues, *, stderr_rad: float) -> PointValues:
     """Return R_d of three channels by eq. (6) of Weyrich et al. 2005, see `diffuse_albedo`.
 
     Parameters
@@ -208,7 +208,7 @@ def albedo(samples: Lumitexels, normals: PointValues, *, stderr_rad: float) -> P
     a rim what lies behind the face as well: its deviation from the point's own light counts in
     proportion to that length.
     """
-    samples = at_normals(samples, normals)
+    samples = reproject_samples(samples, normals)
     strip = 1.0 / np.maximum(samples.cos_view, MIN_STRIP_COSINE)[..., None]
     found = diffuse_albedo.estimate(
         samples.f,
@@ -224,11 +224,11 @@ def albedo(samples: Lumitexels, normals: PointValues, *, stderr_rad: float) -> P
     return PointValues.masked(found.r_d, found.stderr, good)
 
 
-def surface_samples(
+def specular_samples(
     samples: Lumitexels, normals: PointValues, r_d: PointValues
 ) -> brdf_basis.SurfaceSamples:
     """Return what is left of the samples when the light from inside is taken off."""
-    samples = at_normals(samples, normals)
+    samples = reproject_samples(samples, normals)
     return brdf_basis.surface_samples(
         samples.f,
         samples.light_dir,
@@ -241,7 +241,7 @@ def surface_samples(
     )
 
 
-def lobe_weights(
+def fit_lobe_weights(
     samples: Lumitexels, normals: PointValues, r_d: PointValues, basis: BrdfBasis
 ) -> PointValues:
     """Return the shares of a basis at each point, and in the last column the fit's residual.
@@ -249,7 +249,7 @@ def lobe_weights(
     The standard error of the shares is that of the lobe's overall scale: single shares of nearly
     dependent lobes are not determined.
     """
-    found = brdf_basis.fit_weights(surface_samples(samples, normals, r_d), basis)
+    found = brdf_basis.fit_weights(specular_samples(samples, normals, r_d), basis)
     good = found.valid & normals.valid & r_d.valid
     scale = np.where(np.isfinite(found.stderr), LOBE_SCALE_ERROR_RATIO * found.stderr, 1.0)
     residual = np.where(good, found.residual, 0.0)
@@ -272,7 +272,7 @@ def normals_from_remainder(
         Of the same points.
     """
     known = normals.valid & r_d.valid
-    samples = at_normals(samples, normals)
+    samples = reproject_samples(samples, normals)
     shine = lobes.where(known).evaluate(samples, normals.values)
     # a lobe is known no better than a few percent: where it is strong a sample says less
     bare = dataclasses.replace(
@@ -285,13 +285,13 @@ def normals_from_remainder(
     return _of_normals(found.values, found.stderr[:, 0], known & found.valid)
 
 
-def normals_from_all_light(
+def normals_from_full_model(
     samples: Lumitexels,
     normals: PointValues,
     r_d: PointValues,
     lobes: PointLobes,
     *,
-    now: Float64Array | None = None,
+    initial_normals: Float64Array | None = None,
 ) -> PointValues:
     """Return normals that hold what highlights say, where light from inside says too little.
 
@@ -310,9 +310,9 @@ def normals_from_all_light(
     rows = np.flatnonzero(normals.valid & r_d.valid & (normals.stderr[:, 0] > LOBE_TILT_RAD))
     if not len(rows):
         return normals
-    start = normals.values if now is None else now
+    start = normals.values if initial_normals is None else initial_normals
     r_d_gray = r_d.values[rows].mean(axis=-1)
-    found = model_normals.estimate(rows_of(samples, rows), start[rows], r_d_gray, lobes[rows])
+    found = model_normals.estimate(select_points(samples, rows), start[rows], r_d_gray, lobes[rows])
     ours = np.square(np.hypot(found.stderr_rad, LOBE_TILT_RAD))
     theirs = np.square(normals.stderr[rows, 0])
     share = np.where(found.valid, theirs / (theirs + ours), 0.0)[:, None]
@@ -325,13 +325,13 @@ def normals_from_all_light(
     return PointValues(values, stderr, normals.valid)
 
 
-def sample_counts(part: slice, samples: Lumitexels) -> PointValues:
+def count_samples(part: slice, samples: Lumitexels) -> PointValues:
     """Return how many samples each point has; valid where they are enough for an estimate."""
     counts = samples.counts[:, None].astype(np.float64)
-    return PointValues(counts, np.zeros_like(counts), seen_enough(samples))
+    return PointValues(counts, np.zeros_like(counts), has_enough_samples(samples))
 
 
-def rows_of(samples: Lumitexels, rows: NDArray[np.integer]) -> Lumitexels:
+def select_points(samples: Lumitexels, rows: NDArray[np.integer]) -> Lumitexels:
     """Return the samples of some of the points."""
     names = ("f", "variance", "light_dir", "view_dir", "cos_light", "cos_view", "valid")
     some = {name: getattr(samples, name)[rows] for name in names}

@@ -55,7 +55,7 @@ class PointLobes:
     def evaluate(self, samples: Lumitexels, normals: Float64Array) -> Float32Array:
         """Return f_r of the lobes for samples at normals (P, 3)."""
         ways = samples.light_dir, samples.view_dir
-        return mixture_kernels.evaluate(self.basis.table, self.weights, *ways, normals)
+        return mixture_kernels.evaluate_mixtures(self.basis.table, self.weights, *ways, normals)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,7 +192,7 @@ class _Fit:
         cos_light = np.einsum("pmk,pk->pm", s.light_dir, normals)
         cos_view = np.einsum("pmk,pk->pm", s.view_dir, normals)
         lobes = self.lobes.evaluate(s, normals)
-        through = boundary_kernels.transmitted(cos_light, cos_view)
+        through = boundary_kernels.boundary_transmittance(cos_light, cos_view)
         # the cosine that made f from the radiance is the scan's
         ratio = np.clip(cos_light, 0.0, None) / s.cos_light
         value = (self.r_d[:, None] * through / np.pi + lobes) * ratio

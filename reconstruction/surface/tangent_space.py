@@ -42,7 +42,7 @@ class TangentNormals:
     valid: BoolArray
 
 
-def frames(
+def tangent_frames(
     position_mm: ArrayLike, valid: ArrayLike, *, smoothing_mm: float = SMOOTHING_MM
 ) -> tuple[Float64Array, BoolArray]:
     """Return the axes of the texture on the smoothed shape.
@@ -106,7 +106,7 @@ def tangent_normals(
     normals : array_like, shape (H, W, 3)
         Unit normals in the frame of the positions.
     position_mm, valid, smoothing_mm
-        See :func:`frames`.
+        See :func:`tangent_frames`.
     stderr : array_like, shape (H, W, 3), optional
         Standard errors of the normals' components.
 
@@ -128,7 +128,7 @@ def tangent_normals(
     [0.6000000238418579, 0.0, 0.800000011920929]
     """
     given = np.asarray(normals, np.float64)
-    axes, known = frames(position_mm, valid, smoothing_mm=smoothing_mm)
+    axes, known = tangent_frames(position_mm, valid, smoothing_mm=smoothing_mm)
     Checks(TangentSpaceError).shape("normals", given, (*known.shape, 3))
     good = np.asarray(valid, bool) & known & np.isfinite(given).all(axis=2)
     turned = _unit(np.einsum("hwij,hwj->hwi", axes, np.where(good[..., None], given, 0.0)))

@@ -2,8 +2,8 @@
 
 The model says that an expression e adds D_e(x) = (sum_z w_ez m_z(x)) W(x) to the neutral
 derivatives: one wrinkle map W, shown by masks m_z with weights w_ez. Given masks, W is linear in
-the data and so are the weights, each with the other fixed; :func:`fit` takes them in turn.
-Weights and map are determined up to a scale of each zone (and its sign): a fit begins with a
+the data and so are the weights, each with the other fixed; :func:`fit_wrinkle_map` takes them in
+turn. Weights and map are determined up to a scale of each zone (and its sign): a fit begins with a
 largest weight of 1 in each, overlapping zones settle theirs, and none ends above 1.
 
 References
@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from model import texture_resampling as resampling
 from model.checks import Checks
-from model.wrinkles import Layer, Masks, WrinkleError, mask_stack
+from model.wrinkles import Masks, WrinkleError, WrinkleLayer, mask_stack
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import JIMENEZ2011_TABLE, ZONE_SUM_LIMITS, Clamp, ExpressionTable
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
@@ -31,15 +31,15 @@ from reconstruction.wrinkles.texels import (
     SOLVER_TOL,
     Derivatives,
     Texels,
-    derivatives_of,
     fit_texels,
+    measure_derivatives,
 )
 from reconstruction.wrinkles.weights import (
     Difference,
     ZoneEquations,
     ZoneWeights,
-    equations_of,
-    zone_weights,
+    build_equations,
+    fit_zone_weights,
 )
 
 Measured: TypeAlias = ArrayLike | NormalMaps | Derivatives
@@ -68,18 +68,18 @@ class WrinkleFit:
         1 - |misfit|^2 / |differences|^2 with the table's weights, all expressions together.
     rounds : int
         Of map and weights in turn; 0 where the weights were given.
-    settled : bool
+    converged : bool
         The last round explained no more than `MISFIT_TOL` of the differences in addition.
     clamp : {"unit", "signed"}
         Range of the weights.
     """
 
-    layer: Layer
+    layer: WrinkleLayer
     expressions: Mapping[str, ZoneWeights]
     base: Derivatives
     explained: float
     rounds: int
-    settled: bool
+    converged: bool
     clamp: Clamp
 
     def model(self) -> WrinkleModel:
@@ -92,7 +92,7 @@ class WrinkleFit:
 
 
 def fit_weights(
-    layer: Layer, neutral: Measured, expression: Measured, *, clamp: Clamp = "unit"
+    layer: WrinkleLayer, neutral: Measured, expression: Measured, *, clamp: Clamp = "unit"
 ) -> ZoneWeights:
     """Return the weights of zones with which a wrinkle map shows a new expression best.
 
@@ -110,14 +110,14 @@ def fit_weights(
     ZoneWeights
     """
     Checks(WrinkleError).choice("clamp", clamp, ZONE_SUM_LIMITS)
-    difference = differences(derivatives_of(neutral), {"expression": expression})["expression"]
+    difference = differences(measure_derivatives(neutral), {"expression": expression})["expression"]
     wrinkle = _read(np.asarray(layer.wrinkle, np.float64), difference.weight.shape)
-    return zone_weights(
+    return fit_zone_weights(
         np.asarray(layer.masks, np.float64), wrinkle, difference, ZONE_SUM_LIMITS[clamp]
     )
 
 
-def fit(
+def fit_wrinkle_map(
     neutral: Measured,
     expressions: Mapping[str, Measured],
     masks: Masks,
@@ -163,7 +163,7 @@ def fit(
     names = zones if zones is not None else _zone_names(len(stack))
     if len(names) != len(stack):
         raise WrinkleError(f"zones: got {len(names)} names, expected {len(stack)}")
-    base = derivatives_of(neutral)
+    base = measure_derivatives(neutral)
     data = differences(base, expressions)
     rounds, settled = 0, True
     if table is not None:
@@ -171,11 +171,11 @@ def fit(
         for name, row in rows.items():
             Checks(WrinkleError).shape(f"table[{name!r}]", row, (len(stack),))
     else:
-        rows, rounds, settled = _in_turn(stack, data, base, size, clamp)
-    texels = _shown_by(stack, rows, data, size)
+        rows, rounds, settled = _alternate(stack, data, base, size, clamp)
+    texels = _solve_map(stack, rows, data, size)
     wrinkle = _read(texels.values, base.valid.shape)
     found = {
-        name: zone_weights(stack, wrinkle, one, ZONE_SUM_LIMITS[clamp])
+        name: fit_zone_weights(stack, wrinkle, one, ZONE_SUM_LIMITS[clamp])
         for name, one in data.items()
     }
     source = "fitted to normals" if table is None else table.source
@@ -184,7 +184,7 @@ def fit(
     equations = _equations(stack, texels, data)
     misfit = sum(one.misfit(rows[name]) for name, one in equations.items())
     total = sum(one.total for one in equations.values())
-    layer = Layer(
+    layer = WrinkleLayer(
         texels.values.astype(np.float32),
         stack.astype(np.float32),
         ExpressionTable(names, {name: tuple(row) for name, row in rows.items()}, source),
@@ -196,7 +196,7 @@ def fit(
     )
 
 
-def _in_turn(
+def _alternate(
     masks: Float64Array,
     data: Mapping[str, Difference],
     base: Derivatives,
@@ -208,7 +208,7 @@ def _in_turn(
     Weights hardly depend on detail: they are sought at a resolution that two pixels a texel of
     map or masks suffice for.
     """
-    rows = _begun(masks, data, base)
+    rows = _initial_weights(masks, data, base)
     if len(data) == 1:
         return rows, 0, True  # every weight is 1
     shape = base.valid.shape
@@ -219,8 +219,8 @@ def _in_turn(
     bounds = (0.0 if clamp == "unit" else -math.inf, math.inf)
     left = math.inf
     for rounds in range(1, FIT_ROUNDS + 1):
-        equations = _equations(masks, _shown_by(masks, rows, data, rough, tolerance=1e-7), data)
-        free = {name: one.least(bounds) for name, one in equations.items()}
+        equations = _equations(masks, _solve_map(masks, rows, data, rough, tolerance=1e-7), data)
+        free = {name: one.solve_bounded(bounds) for name, one in equations.items()}
         rows = _limited(free)
         misfit = sum(equations[name].misfit(row) for name, row in free.items())
         total = sum(one.total for one in equations.values())
@@ -258,7 +258,7 @@ def differences(base: Derivatives, expressions: Mapping[str, Measured]) -> dict[
     """Return expressions less the neutral face, on pixels that are valid in both."""
     data = {}
     for name, given in expressions.items():
-        one = derivatives_of(given)
+        one = measure_derivatives(given)
         Checks(WrinkleError).shape(name, one.values, base.values.shape)
         good = base.valid & one.valid
         kept = good[..., None]
@@ -284,11 +284,11 @@ def _zone_names(count: int) -> tuple[str, ...]:
 
 
 def _read(texels: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    planes = resampling.resampled(np.moveaxis(texels, 2, 0), (shape[0], shape[1]))
+    planes = resampling.resample(np.moveaxis(texels, 2, 0), (shape[0], shape[1]))
     return np.moveaxis(planes, 0, 2)
 
 
-def _shown_by(
+def _solve_map(
     masks: Float64Array,
     rows: Mapping[str, Float64Array],
     data: Mapping[str, Difference],
@@ -302,7 +302,7 @@ def _shown_by(
     product, noise = np.zeros((*shape, 2)), np.zeros((*shape, 2))
     for name, one in data.items():
         small = np.tensordot(rows[name], masks, axes=1)
-        strength = resampling.resampled(small, (shape[0], shape[1]))
+        strength = resampling.resample(small, (shape[0], shape[1]))
         v = one.weight * strength
         weight += v * strength
         product += v[..., None] * one.values
@@ -315,10 +315,10 @@ def _equations(
     masks: Float64Array, texels: Texels, data: Mapping[str, Difference]
 ) -> dict[str, ZoneEquations]:
     shape = next(iter(data.values())).weight.shape
-    return equations_of(masks, _read(texels.values, shape), data, with_noise=False)
+    return build_equations(masks, _read(texels.values, shape), data, with_noise=False)
 
 
-def _begun(
+def _initial_weights(
     masks: Float64Array, data: Mapping[str, Difference], base: Derivatives
 ) -> dict[str, Float64Array]:
     """Return first weights: in each zone, the leading direction of the expressions' products.
@@ -328,7 +328,7 @@ def _begun(
     """
     names = list(data)
     texels, shape = masks.shape[1:], base.valid.shape
-    reduced = resampling.resampled(masks, (min(texels[0], shape[0]), min(texels[1], shape[1])))
+    reduced = resampling.resample(masks, (min(texels[0], shape[0]), min(texels[1], shape[1])))
     by, bx = (
         resampling.reading_matrix(t, p) for t, p in zip(reduced.shape[1:], shape, strict=True)
     )

@@ -55,7 +55,7 @@ class Derivatives:
     too_steep_fraction: float
 
 
-def derivatives_of(
+def measure_derivatives(
     normals: ArrayLike | NormalMaps | Derivatives,
     *,
     stderr_rad: ArrayLike | None = None,
@@ -85,7 +85,7 @@ def derivatives_of(
         normals = normals.normals
     n = np.asarray(normals, np.float64)
     Checks(WrinkleError).shape("normals", n, ("H", "W", 3))
-    report = wrinkles.encoding_report(n, limit=None)
+    report = wrinkles.encode_with_report(n, limit=None)
     good = report.valid.copy()
     shape = n.shape[:2]
     Checks(WrinkleError).shape("valid", valid, shape)
@@ -159,9 +159,9 @@ def fit_texels(
         raise WrinkleError(f"size: got {shape}, expected 1 to {(height, width)} texels")
     by, bx = (resampling.reading_matrix(t, p) for t, p in zip(shape, (height, width), strict=True))
     A = normal_matrix(by, bx, np.asarray(weight, np.float64), shape)
-    summed = gathered(by, bx, weight)
-    full = gathered(by, bx, np.ones((1, 1)))
-    coverage = gathered(by, bx, covered) / full
+    summed = gather_texels(by, bx, weight)
+    full = gather_texels(by, bx, np.ones((1, 1)))
+    coverage = gather_texels(by, bx, covered) / full
     relative = summed / (full * max(float(np.max(weight, initial=0.0)), 1e-300))
     valid = (coverage >= MIN_COVERAGE) & (relative >= MIN_STRENGTH)
     values = np.zeros((*shape, 2))
@@ -176,19 +176,19 @@ def fit_texels(
     matrix = (matrix + RELATIVE_DAMPING * sparse.eye_array(some.size)).tocsr()
     spread = _inverse_diagonal(by) * _inverse_diagonal(bx)
     for c in (0, 1):
-        b = gathered(by, bx, product[..., c]).ravel()[some]
+        b = gather_texels(by, bx, product[..., c]).ravel()[some]
         first = b / summed.ravel()[some] / root
         solved, _ = cg(matrix, root * b, x0=first, rtol=tolerance, maxiter=500)
         plane = np.zeros(summed.size)
         plane[some] = root * solved
         values[..., c] = np.where(valid, plane.reshape(shape), 0.0)
-        scatter = gathered(by, bx, noise[..., c])
+        scatter = gather_texels(by, bx, noise[..., c])
         variance = np.divide(scatter, summed**2, out=np.zeros_like(scatter), where=valid)
         stderr[..., c] = np.where(valid, np.sqrt(spread * variance), np.inf)
     return Texels(values, stderr, valid)
 
 
-def gathered(by: Any, bx: Any, image: FloatArray) -> Float64Array:
+def gather_texels(by: Any, bx: Any, image: FloatArray) -> Float64Array:
     """Return what each texel's weights gather from an image: B^T image.
 
     Parameters

@@ -14,7 +14,7 @@ from scipy.optimize import lsq_linear
 
 from model import texture_resampling as resampling
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from reconstruction.wrinkles.texels import gathered, normal_matrix
+from reconstruction.wrinkles.texels import gather_texels, normal_matrix
 
 MAX_STDERR = 0.5
 """A weight that is known no better tells nothing about [0, 1]."""
@@ -120,7 +120,7 @@ class ZoneEquations:
         scaled = self.matrix / np.outer(root, root)
         return np.linalg.pinv(scaled, rcond=MIN_EIGENVALUE, hermitian=True) / np.outer(root, root)
 
-    def least(self, bounds: tuple[float, float]) -> Float64Array:
+    def solve_bounded(self, bounds: tuple[float, float]) -> Float64Array:
         """Return the weights within bounds that leave least; 0 for zones without a wrinkle."""
         diagonal = np.diag(self.matrix)
         some = diagonal > MIN_EIGENVALUE * diagonal.max(initial=0.0)
@@ -141,7 +141,7 @@ class ZoneEquations:
         return np.clip(weights, *bounds)
 
 
-def equations_of(
+def build_equations(
     masks: FloatArray,
     wrinkle: FloatArray,
     data: Mapping[str, Difference],
@@ -160,7 +160,7 @@ def equations_of(
         False leaves `noise` at 0, which weights do not need.
     """
     shape = next(iter(data.values())).weight.shape
-    masks = resampling.resampled(
+    masks = resampling.resample(
         masks, (min(masks.shape[1], shape[0]), min(masks.shape[2], shape[1]))
     )
     h, w = masks.shape[1:]
@@ -185,12 +185,12 @@ def equations_of(
             scatter = np.einsum("hwc,hwc,hwc->hw", wrinkle, wrinkle, one.variance)
             noise = squares(scatter * v * v)
         found[name] = ZoneEquations(
-            matrix, flat @ gathered(by, bx, agreement).ravel(), noise, float((v * total).sum())
+            matrix, flat @ gather_texels(by, bx, agreement).ravel(), noise, float((v * total).sum())
         )
     return found
 
 
-def zone_weights(
+def fit_zone_weights(
     masks: Float64Array, wrinkle: FloatArray, difference: Difference, bounds: tuple[float, float]
 ) -> ZoneWeights:
     """Return the bounded weights of one expression with their errors.
@@ -198,13 +198,13 @@ def zone_weights(
     Parameters
     ----------
     masks, wrinkle
-        As of :func:`equations_of`.
+        As of :func:`build_equations`.
     difference : Difference
     bounds : (float, float)
     """
-    equations = equations_of(masks, wrinkle, {"": difference})[""]
+    equations = build_equations(masks, wrinkle, {"": difference})[""]
     fast = equations.determined()
-    weights = np.where(fast, equations.least(bounds), 0.0)
+    weights = np.where(fast, equations.solve_bounded(bounds), 0.0)
     inverse = equations.inverse()
     covariance = inverse @ equations.noise @ inverse
     seen = inverse @ _scatter(masks, wrinkle, difference, weights) @ inverse
@@ -235,7 +235,7 @@ def _scatter(
     """
     shape = difference.weight.shape
     size = (shape[0], shape[1])
-    strength = resampling.resampled(np.tensordot(weights, masks, axes=1), size)
+    strength = resampling.resample(np.tensordot(weights, masks, axes=1), size)
     left = difference.values - strength[..., None] * wrinkle
     score = np.einsum("hwc,hwc->hw", wrinkle, left) * difference.weight
     rows, columns = (
@@ -243,7 +243,7 @@ def _scatter(
     )
     sums = []
     for mask in masks:
-        image = resampling.resampled(mask, size) * score
+        image = resampling.resample(mask, size) * score
         sums.append(np.add.reduceat(np.add.reduceat(image, rows, axis=0), columns, axis=1).ravel())
     blocks = np.stack(sums)
     count = max(int(np.count_nonzero(np.abs(blocks).sum(axis=0))), 1)

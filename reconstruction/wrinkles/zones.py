@@ -20,11 +20,11 @@ from scipy.cluster.vq import kmeans2
 from scipy.ndimage import distance_transform_edt
 
 from model.texture_resampling import averaging_matrix
-from model.vectors import nearest_shares
+from model.vectors import project_to_simplex
 from model.wrinkles import Masks, WrinkleError, mask_stack
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.wrinkles.fit import Measured, differences
-from reconstruction.wrinkles.texels import derivatives_of
+from reconstruction.wrinkles.texels import measure_derivatives
 
 MIN_SIGNAL = 3.0
 """A texel's pattern counts when its energy is so many times the scatter that stated errors lead
@@ -49,7 +49,7 @@ class Amplitudes:
         Largest by size 1 in each texel; 0 where not valid.
     energy : ndarray, shape (h, w)
         Mean square of the pattern at amplitude 1, errors taken off.
-    rank_one_share : ndarray, shape (h, w)
+    rank_one_fraction : ndarray, shape (h, w)
         Part of the expressions' squares in the texel that one pattern explains; 0 where not valid.
     valid : ndarray of bool, shape (h, w)
         Some expression moves the texel beyond its errors.
@@ -59,7 +59,7 @@ class Amplitudes:
 
     values: Float64Array
     energy: Float64Array
-    rank_one_share: Float64Array
+    rank_one_fraction: Float64Array
     valid: BoolArray
     names: tuple[str, ...]
 
@@ -76,7 +76,7 @@ class ZoneFit:
         A row an expression; the scale of a zone is that of its amplitudes.
     valid : ndarray of bool, shape (h, w)
         The data speak for the texel's mask; elsewhere it is the layout's.
-    rank_one_share : float
+    rank_one_fraction : float
         Part of all squares that one pattern a texel explains: how far the premise of one wrinkle
         map holds at all.
     explained : float
@@ -88,12 +88,12 @@ class ZoneFit:
     masks: Float32Array
     weights: Mapping[str, tuple[float, ...]]
     valid: BoolArray
-    rank_one_share: float
+    rank_one_fraction: float
     explained: float
     distinct: int
 
 
-def amplitudes(
+def estimate_amplitudes(
     neutral: Measured, expressions: Mapping[str, Measured], *, size: tuple[int, int] = (64, 64)
 ) -> Amplitudes:
     """Return the rank-one amplitudes of expressions in each texel of the masks.
@@ -108,7 +108,7 @@ def amplitudes(
     """
     if not expressions:
         raise WrinkleError("expressions: got none, expected at least one")
-    base = derivatives_of(neutral)
+    base = measure_derivatives(neutral)
     shape = base.valid.shape
     if size[0] > shape[0] or size[1] > shape[1] or min(size) < 1:
         raise WrinkleError(f"size: got {size}, expected 1 to {shape} texels")
@@ -141,13 +141,13 @@ def amplitudes(
 
 
 def fit_zones(
-    found: Amplitudes, *, zones: int = 8, layout: Masks | None = None, rng: np.random.Generator
+    amplitudes: Amplitudes, *, zones: int = 8, layout: Masks | None = None, rng: np.random.Generator
 ) -> ZoneFit:
     """Return masks of zones, from a first layout or from amplitudes and places alone.
 
     Parameters
     ----------
-    found : Amplitudes
+    amplitudes : Amplitudes
     zones : int
         How many, without a layout.
     layout : array_like, shape (Z, h, w), optional
@@ -156,11 +156,11 @@ def fit_zones(
     rng
         Draws the first centres, without a layout.
     """
-    shape = found.valid.shape
-    if not found.valid.any():
+    shape = amplitudes.valid.shape
+    if not amplitudes.valid.any():
         raise WrinkleError("amplitudes: got no texel with a wrinkle, expected some")
     if layout is None:
-        start = _clustered(found, zones, rng)
+        start = _clustered(amplitudes, zones, rng)
     else:
         start = mask_stack(layout).astype(np.float64)
         if start.shape[1:] != shape:
@@ -170,10 +170,10 @@ def fit_zones(
         start = np.where(total > 0, start / np.where(total > 0, total, 1.0), 1.0 / len(start))
     count = len(start)
     prior = start.reshape(count, -1).T
-    target = found.values.reshape(len(found.names), -1).T
-    strength = found.energy.ravel()
+    target = amplitudes.values.reshape(len(amplitudes.names), -1).T
+    strength = amplitudes.energy.ravel()
     relative = strength / strength[strength > 0].mean()
-    trust = np.where(found.valid.ravel(), relative / (relative + 0.1), 0.0)
+    trust = np.where(amplitudes.valid.ravel(), relative / (relative + 0.1), 0.0)
     masks = prior.copy()
     weights = np.zeros((count, target.shape[1]))
     for _ in range(ZONE_ROUNDS):
@@ -184,12 +184,12 @@ def fit_zones(
             break
     left = (strength[:, None] * (target - masks @ weights) ** 2).sum()
     whole = (strength[:, None] * target**2).sum()
-    squares = strength / np.maximum(found.rank_one_share.ravel(), 1e-12)
+    squares = strength / np.maximum(amplitudes.rank_one_fraction.ravel(), 1e-12)
     squares *= (target**2).sum(axis=1)
     return ZoneFit(
         masks.T.reshape(count, *shape).astype(np.float32),
-        {name: tuple(map(float, weights[:, e])) for e, name in enumerate(found.names)},
-        found.valid,
+        {name: tuple(map(float, weights[:, e])) for e, name in enumerate(amplitudes.names)},
+        amplitudes.valid,
         float((strength * (target**2).sum(axis=1)).sum() / squares.sum()),
         float(1.0 - left / whole),
         _distinct(weights),
@@ -251,7 +251,7 @@ def _on_simplex_fit(
     pull = target @ weights.T
     for _ in range(GRADIENT_STEPS):
         slope = trust[:, None] * (masks @ gram - pull) + LAYOUT_WEIGHT * (masks - prior)
-        masks = nearest_shares(masks - scale * slope)
+        masks = project_to_simplex(masks - scale * slope)
     return masks
 
 

@@ -17,7 +17,7 @@ UNDISTORT_STEPS: Final = 12
 
 
 @dataclass(frozen=True, slots=True)
-class Tolerances:
+class DomeTolerances:
     """Standard deviations of what a workshop leaves; 0 builds to the drawing."""
 
     camera_mm: float = 1.5
@@ -47,7 +47,7 @@ class Tolerances:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BuiltDome:
+class ActualDome:
     """The truth about a rig; what its file says is ``nominal``."""
 
     nominal: Rig
@@ -65,12 +65,12 @@ class BuiltDome:
     wiring: tuple[int, ...] = ()
     """Light that answers to each channel of the box; empty: each to its own."""
 
-    def answering(self, channel: int) -> int:
+    def light_of_channel(self, channel: int) -> int:
         """Return the light that a channel of the box drives."""
         return self.wiring[channel] if self.wiring else channel
 
 
-def build(rig: Rig, *, seed: int, tolerances: Tolerances | None = None) -> BuiltDome:
+def build_dome(rig: Rig, *, seed: int, tolerances: DomeTolerances | None = None) -> ActualDome:
     """Draw a dome as built; the same seed builds each named part the same in any subset.
 
     Parameters
@@ -82,7 +82,7 @@ def build(rig: Rig, *, seed: int, tolerances: Tolerances | None = None) -> Built
     tolerances
         Standard deviations; None takes the usual ones.
     """
-    size = tolerances or Tolerances()
+    size = tolerances or DomeTolerances()
     views, distortion, gain = [], {}, {}
     for view in rig.views:
         rng = np.random.default_rng([seed, *view.serial.encode()])
@@ -109,10 +109,10 @@ def build(rig: Rig, *, seed: int, tolerances: Tolerances | None = None) -> Built
         axis = axis + np.cross(turn, axis)
         axes.append(axis / np.linalg.norm(axis))
     built = dataclasses.replace(rig, views=tuple(views), lights=tuple(lights))
-    return BuiltDome(rig, built, np.array(axes), distortion, gain)
+    return ActualDome(rig, built, np.array(axes), distortion, gain)
 
 
-def _shifted(view: View, size: Tolerances, rng: np.random.Generator) -> View:
+def _shifted(view: View, size: DomeTolerances, rng: np.random.Generator) -> View:
     place = np.array(view.position_mm) + size.camera_mm * rng.standard_normal(3)
     right, up, back = (np.array(axis) for axis in view.axes)
     turn = math.radians(size.camera_deg) * rng.standard_normal(3)
@@ -129,7 +129,7 @@ def _shifted(view: View, size: Tolerances, rng: np.random.Generator) -> View:
     )
 
 
-def bend(xy: ArrayLike, distortion: ArrayLike) -> Float64Array:
+def distort(xy: ArrayLike, distortion: ArrayLike) -> Float64Array:
     """Return where a lens puts rays: slopes across the axis to slopes on the sensor, (..., 2)."""
     slopes = np.asarray(xy, np.float64)
     k1, k2, p1, p2, k3 = np.asarray(distortion, np.float64)
@@ -145,8 +145,8 @@ def bend(xy: ArrayLike, distortion: ArrayLike) -> Float64Array:
     return slopes * (1 + k1 * square + k2 * square**2 + k3 * square**3) + tangential
 
 
-def unbend(xy: ArrayLike, distortion: ArrayLike) -> Float64Array:
-    """Return the ray that a lens puts at ``xy``: the inverse of `bend`, by Newton's method."""
+def undistort(xy: ArrayLike, distortion: ArrayLike) -> Float64Array:
+    """Return the ray that a lens puts at ``xy``: the inverse of `distort`, by Newton's method."""
     wanted = np.asarray(xy, np.float64)
     found = wanted.copy()
     if not np.any(distortion):
@@ -154,9 +154,9 @@ def unbend(xy: ArrayLike, distortion: ArrayLike) -> Float64Array:
     step = 1e-6
     right, down = np.array([step, 0.0]), np.array([0.0, step])
     for _ in range(UNDISTORT_STEPS):
-        miss = bend(found, distortion) - wanted
-        gx = (bend(found + right, distortion) - bend(found - right, distortion)) / (2 * step)
-        gy = (bend(found + down, distortion) - bend(found - down, distortion)) / (2 * step)
+        miss = distort(found, distortion) - wanted
+        gx = (distort(found + right, distortion) - distort(found - right, distortion)) / (2 * step)
+        gy = (distort(found + down, distortion) - distort(found - down, distortion)) / (2 * step)
         det = gx[..., 0] * gy[..., 1] - gx[..., 1] * gy[..., 0]
         found[..., 0] -= (gy[..., 1] * miss[..., 0] - gy[..., 0] * miss[..., 1]) / det
         found[..., 1] -= (gx[..., 0] * miss[..., 1] - gx[..., 1] * miss[..., 0]) / det
@@ -171,12 +171,12 @@ def pixel_corner_rays(view: View, distortion: ArrayLike) -> Float64Array:
     columns = np.arange(view.width_px + 1) - view.width_px / 2  # corners lie half a pixel off
     rows = np.arange(view.height_px + 1) - view.height_px / 2
     x, y = np.meshgrid(columns / view.focal_px, rows / view.focal_px)
-    slopes = unbend(np.stack([x, y], axis=-1), distortion)
+    slopes = undistort(np.stack([x, y], axis=-1), distortion)
     right, up, back = (np.array(axis) for axis in view.axes)
     return np.asarray(slopes[..., :1] * right - slopes[..., 1:] * up - back)
 
 
-def image_of(view: View, distortion: ArrayLike, points_mm: ArrayLike) -> Float64Array:
+def project_points(view: View, distortion: ArrayLike, points_mm: ArrayLike) -> Float64Array:
     """Return column and row where points appear, shape (..., 2); NaN behind the camera."""
     offset = np.asarray(points_mm, np.float64) - view.position_mm
     right, up, back = (np.array(axis) for axis in view.axes)
@@ -184,4 +184,4 @@ def image_of(view: View, distortion: ArrayLike, points_mm: ArrayLike) -> Float64
     depth = np.where(depth > 0.0, depth, np.nan)
     slopes = np.stack([offset @ right / depth, -(offset @ up) / depth], axis=-1)
     middle = np.array([(view.width_px - 1) / 2, (view.height_px - 1) / 2])
-    return bend(slopes, distortion) * view.focal_px + middle
+    return distort(slopes, distortion) * view.focal_px + middle

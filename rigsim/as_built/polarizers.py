@@ -13,7 +13,7 @@ from rigsim.shading import axis_in_plane
 
 Polarizer = Literal["parallel", "crossed"]
 
-READING_DEG = {"parallel": 0.0, "crossed": 90.0}
+POLARIZER_READING_DEG = {"parallel": 0.0, "crossed": 90.0}
 """Reading of the analyser's rotator in each state."""
 
 
@@ -43,7 +43,7 @@ class Polarizers:
                 f"analyser_zero_deg: got {self.analyser_zero_deg}, expected -10 to 10"
             )
 
-    def passes_deg(self, view: View, polarizer: str, analyser_deg: float | None) -> float:
+    def analyzer_axis_deg(self, view: View, polarizer: str, analyser_deg: float | None) -> float:
         """Return the true passing axis of the analyser, degrees from the image's x axis.
 
         Parameters
@@ -55,9 +55,9 @@ class Polarizers:
         analyser_deg
             Reading of the rotator; ``None`` takes that of the state.
         """
-        if polarizer not in READING_DEG:
+        if polarizer not in POLARIZER_READING_DEG:
             raise PolarizerError(f"polarizer: got {polarizer!r}, expected parallel or crossed")
-        reading = READING_DEG[polarizer] if analyser_deg is None else analyser_deg
+        reading = POLARIZER_READING_DEG[polarizer] if analyser_deg is None else analyser_deg
         if not math.isfinite(reading):
             raise PolarizerError(f"analyser_deg: got {reading}, expected a finite angle")
         if view.analyser_axis_deg is None:

@@ -19,7 +19,7 @@ FIBER_END_UNEVENNESS: Final = 0.05
 its modes are not filled alike."""
 
 
-class BuildError(ValueError):
+class ProbeBuildError(ValueError):
     """A probe is described wrongly."""
 
 
@@ -29,11 +29,11 @@ class ProbeTolerances:
 
     gain: float = 0.05
     """Relative standard deviation of the fibres' transmissions; none is off by more than twice."""
-    place_px: float = 0.6
+    position_px: float = 0.6
     """Standard deviation of a spot's place, pixels, per axis."""
     shift_px: float = 1.0
     """Standard deviation of the row's common shift, pixels, per axis."""
-    turn_deg: float = 0.2
+    rotation_deg: float = 0.2
     """Standard deviation of the row's turn about the image's middle, degrees."""
     radius: float = 0.02
     """Relative standard deviation of the spots' radii."""
@@ -50,11 +50,11 @@ class ProbeTolerances:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if not (0.0 <= value < math.inf and (value > 0.0 or field.name != "edge_px")):
-                raise BuildError(f"{field.name}: got {value}, expected a finite number >= 0")
+                raise ProbeBuildError(f"{field.name}: got {value}, expected a finite number >= 0")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ProbeBuild:
+class ActualProbe:
     """The truth about the fibres, in the order of the rig."""
 
     spot_px: Float64Array
@@ -90,22 +90,22 @@ class ProbeBuild:
         ):
             value = getattr(self, name)
             if value.shape != shape or not np.isfinite(value).all():
-                raise BuildError(f"{name}: got shape {value.shape}, expected finite {shape}")
+                raise ProbeBuildError(f"{name}: got shape {value.shape}, expected finite {shape}")
         for name in ("radius_px", "gain"):
             least = float(getattr(self, name).min(initial=math.inf))
             if not least > 0.0:
-                raise BuildError(f"{name}: got {least}, expected > 0")
+                raise ProbeBuildError(f"{name}: got {least}, expected > 0")
         if not (self.crosstalk >= 0.0).all() or not np.allclose(self.crosstalk.sum(axis=0), 1.0):
-            raise BuildError("crosstalk: expected shares >= 0 that sum to 1 in each column")
+            raise ProbeBuildError("crosstalk: expected shares >= 0 that sum to 1 in each column")
         for name, most in (("wings", 1.0), ("veil", 0.01), ("cover_leak", 1.0), ("ripple", 0.1)):
             value = getattr(self, name)
             if not 0.0 <= value <= most:
-                raise BuildError(f"{name}: got {value}, expected 0 to {most}")
+                raise ProbeBuildError(f"{name}: got {value}, expected 0 to {most}")
         if not 0.0 < self.edge_px < math.inf:
-            raise BuildError(f"edge_px: got {self.edge_px}, expected > 0")
+            raise ProbeBuildError(f"edge_px: got {self.edge_px}, expected > 0")
 
 
-def build_probe(rig: Rig, *, seed: int, tolerances: ProbeTolerances | None = None) -> ProbeBuild:
+def build_probe(rig: Rig, *, seed: int, tolerances: ProbeTolerances | None = None) -> ActualProbe:
     """Draw a probe as built.
 
     Parameters
@@ -134,29 +134,31 @@ def build_probe(rig: Rig, *, seed: int, tolerances: ProbeTolerances | None = Non
     ((28,), True)
     """
     if rig.probe is None or len(rig.views) != 1:
-        raise BuildError(f"rig {rig.name!r}: expected a contact probe and one view")
+        raise ProbeBuildError(f"rig {rig.name!r}: expected a contact probe and one view")
     size = ProbeTolerances() if tolerances is None else tolerances
     view, fibres = rig.views[0], rig.probe.fibres
     count = len(fibres)
     rng = np.random.default_rng([seed, 0x70726F62])
-    turn = math.radians(size.turn_deg) * float(rng.standard_normal())
+    turn = math.radians(size.rotation_deg) * float(rng.standard_normal())
     middle = 0.5 * np.array([view.width_px - 1.0, view.height_px - 1.0])
     place = np.array([fibre.spot_px for fibre in fibres]) - middle
     c, s = math.cos(turn), math.sin(turn)
     place = place @ np.array([[c, s], [-s, c]]) + middle
-    place += size.shift_px * _bounded(rng, (1, 2)) + size.place_px * _bounded(rng, (count, 2))
-    gain = 1.0 + size.gain * _bounded(rng, (count,))
-    radius = SPOT_RADIUS_PX * (1.0 + size.radius * _bounded(rng, (count,)))
+    place += size.shift_px * _draw_truncated_normal(
+        rng, (1, 2)
+    ) + size.position_px * _draw_truncated_normal(rng, (count, 2))
+    gain = 1.0 + size.gain * _draw_truncated_normal(rng, (count,))
+    radius = SPOT_RADIUS_PX * (1.0 + size.radius * _draw_truncated_normal(rng, (count,)))
     uneven = (
-        FIBER_END_UNEVENNESS * _bounded(rng, (count, 3))
+        FIBER_END_UNEVENNESS * _draw_truncated_normal(rng, (count, 3))
         if size.radius > 0.0
         else np.zeros((count, 3))
     )
-    return ProbeBuild(
+    return ActualProbe(
         place,
         radius,
         gain,
-        _leaks(count, size.crosstalk, rng),
+        _draw_crosstalk(count, size.crosstalk, rng),
         uneven,
         size.edge_px,
         size.wings,
@@ -164,7 +166,7 @@ def build_probe(rig: Rig, *, seed: int, tolerances: ProbeTolerances | None = Non
     )
 
 
-def unit_images(build: ProbeBuild, view: View) -> Float32Array:
+def fiber_unit_images(build: ActualProbe, view: View) -> Float32Array:
     """Return the image of each fibre's light, wings and veil included.
 
     All images have one flux, to what the wings throw beside the sensor: that of an even spot of
@@ -203,15 +205,15 @@ def unit_images(build: ProbeBuild, view: View) -> Float32Array:
     return out
 
 
-def _bounded(rng: np.random.Generator, shape: tuple[int, ...]) -> Float64Array:
+def _draw_truncated_normal(rng: np.random.Generator, shape: tuple[int, ...]) -> Float64Array:
     """Return standard normal numbers of at most 2; a workshop throws the others away."""
     return np.asarray(np.clip(rng.standard_normal(shape), -2.0, 2.0))
 
 
-def _leaks(count: int, neighbour: float, rng: np.random.Generator) -> Float64Array:
+def _draw_crosstalk(count: int, neighbor: float, rng: np.random.Generator) -> Float64Array:
     out = np.zeros((count, count))
-    for step, share in ((1, neighbour), (2, 0.1 * neighbour)):
+    for step, share in ((1, neighbor), (2, 0.1 * neighbor)):
         for i in range(count - step):
-            leak = share * math.exp(0.3 * float(_bounded(rng, ())))
+            leak = share * math.exp(0.3 * float(_draw_truncated_normal(rng, ())))
             out[i, i + step] = out[i + step, i] = leak
     return np.asarray(out + np.diag(1.0 - out.sum(axis=0)))

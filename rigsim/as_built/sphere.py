@@ -34,13 +34,13 @@ class SphereError(ValueError):
 INTENSITY_DEVIATION: Final = 0.05
 """Standard deviation of the logarithm of an LED's intensity."""
 
-PLACE_DEVIATION_MM: Final = 1.0
+POSITION_DEVIATION_MM: Final = 1.0
 AXIS_DEVIATION_DEG: Final = 1.0
 """Standard deviations of an LED's place along each axis, and of its film's turn."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BuiltSphere:
+class ActualSphere:
     """The truth about the LEDs, in the order of the rig."""
 
     nominal: Rig
@@ -86,7 +86,7 @@ class BuiltSphere:
         )
 
 
-def nominal_sphere(rig: Rig) -> BuiltSphere:
+def nominal_sphere(rig: Rig) -> ActualSphere:
     """Return a sphere that stands exactly as its drawing says.
 
     Parameters
@@ -105,7 +105,7 @@ def nominal_sphere(rig: Rig) -> BuiltSphere:
             f"lights: got the spectra {', '.join(sorted(spectra_names))}, expected one"
         )
     power = np.array([_power(light) for light in rig.lights])
-    return BuiltSphere(
+    return ActualSphere(
         rig,
         np.array([light.position_mm for light in rig.lights], np.float64),
         power / power.mean(),
@@ -116,7 +116,7 @@ def nominal_sphere(rig: Rig) -> BuiltSphere:
 
 def build_sphere(
     rig: Rig, *, seed: int, dead: tuple[str, ...] = (), weak: tuple[str, ...] = ()
-) -> BuiltSphere:
+) -> ActualSphere:
     """Draw a sphere as built; the same seed builds each LED the same in any subset.
 
     Parameters
@@ -138,7 +138,7 @@ def build_sphere(
     position, intensity, absorbs = [], [], []
     for light, power in zip(rig.lights, drawn.intensity, strict=True):
         rng = np.random.default_rng([seed, *light.name.encode()])
-        place = np.asarray(light.position_mm) + PLACE_DEVIATION_MM * rng.standard_normal(3)
+        place = np.asarray(light.position_mm) + POSITION_DEVIATION_MM * rng.standard_normal(3)
         share = 0.0 if light.name in dead else 1.0 / 3.0 if light.name in weak else 1.0
         turn_deg = AXIS_DEVIATION_DEG * float(rng.standard_normal())
         position.append(place)
@@ -147,7 +147,7 @@ def build_sphere(
         )
         axis_deg = 0.0 if light.polarizer_axis_deg is None else light.polarizer_axis_deg
         absorbs.append(axis_in_plane(axis_deg + 90.0 + turn_deg, place, (0.0, 1.0, 0.0)))
-    return BuiltSphere(
+    return ActualSphere(
         rig, np.array(position), np.array(intensity), np.array(absorbs), drawn.radius_mm
     )
 
@@ -158,12 +158,12 @@ def _power(light: Light) -> float:
     return light.power_w
 
 
-REFERENCE_MM: Final = 600.0
+REFERENCE_DISTANCE_MM: Final = 600.0
 """Distance at which an LED of intensity 1 gives unit irradiance."""
 
 
 def diffuser_radiance(
-    sphere: BuiltSphere, x_mm: Float64Array, y_mm: Float64Array, *, extinction: float = math.inf
+    sphere: ActualSphere, x_mm: Float64Array, y_mm: Float64Array, *, extinction: float = math.inf
 ) -> Float64Array:
     """Return the radiance of a perfect white diffuser at z = 0 that faces +z, for each moment.
 
@@ -195,6 +195,13 @@ def diffuser_radiance(
         if place[2] <= 0.0:
             continue
         square = (place[0] - x) ** 2 + (place[1] - y) ** 2 + place[2] ** 2
-        light = film / math.pi * sphere.intensity[led] * REFERENCE_MM**2 * place[2] / square**1.5
+        light = (
+            film
+            / math.pi
+            * sphere.intensity[led]
+            * REFERENCE_DISTANCE_MM**2
+            * place[2]
+            / square**1.5
+        )
         out += weight.reshape(4, *[1] * (out.ndim - 1)) * light
     return out

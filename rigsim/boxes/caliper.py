@@ -21,7 +21,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from capture.devices.wire import Code
-from rigsim.boxes.command import Act, Command, Refused, command_table, number
+from rigsim.boxes.command import (
+    Command,
+    CommandHandler,
+    CommandRefused,
+    build_command_table,
+    parse_number,
+)
 from rigsim.boxes.device import Device, Wiring
 
 CALIPER_CONTROL_PERIOD_S = 5e-3
@@ -29,17 +35,17 @@ CALIPER_CONTROL_PERIOD_S = 5e-3
 MAX_CAPTURE_STEPS = 15
 FORCE_LIMIT_N = (0.05, 10.0)
 """What the sensor can tell; what skin may bear is for a person to say."""
-LAG_MM = 0.05
+STALL_LAG_MM = 0.05
 """Steps that the motor has lost, mm, from which a stall is known."""
-TURN_DEG_PER_S = 90.0
+ROTATION_DEG_PER_S = 90.0
 FORCE_ZERO_DEVIATION_N = 0.01
 """Deviation of what a sensor says of no force before it is tared, N."""
-HOME_SPEED = 0.5
+HOMING_SPEED_FRACTION = 0.5
 """Of the normal one."""
-COMES_OFF_FROM_N = 0.05
-COMES_OFF_SHARE = 0.25
+MIN_DETACHMENT_FORCE_N = 0.05
+DETACHED_FORCE_FRACTION = 0.25
 """Share that is left, after one control period, of the force on skin that has come off."""
-LET_GO_S = 0.25
+RELEASE_TIME_S = 0.25
 """Force that is still beyond the limit so long after the jaws have turned back: let go."""
 
 _STEP_PATTERN = re.compile(r"-?[0-9]{1,3}")
@@ -141,7 +147,7 @@ class CaliperUnit(Device):
             "aperture_mm": self._caliper.aperture_mm,
             "angles_deg": list(self._caliper.angles_deg),
             "speed_mm_per_s": self._caliper.speed_mm_per_s,
-            "turn_deg_per_s": TURN_DEG_PER_S,
+            "turn_deg_per_s": ROTATION_DEG_PER_S,
             "force_limit_min_n": FORCE_LIMIT_N[0],
             "force_limit_max_n": FORCE_LIMIT_N[1],
             "control_period_ms": CALIPER_CONTROL_PERIOD_S * 1e3,
@@ -149,7 +155,7 @@ class CaliperUnit(Device):
 
     def commands(self) -> dict[str, Command]:
         """Return the command table: the manual of the box."""
-        acts: dict[str, Act] = {
+        acts: dict[str, CommandHandler] = {
             "CAL:HOME": self._home,
             "CAL:STEP:ABS": self._step,
             "CAL:POS?": lambda *_: f"{self.aperture_mm:.3f}" if self.homed else "NONE",
@@ -165,7 +171,7 @@ class CaliperUnit(Device):
             "CAL:FORC:LIM": self._set_limit,
             "CAL:FORC:LIM?": lambda *_: "NONE" if self.limit_n is None else f"{self.limit_n:g}",
         }
-        return command_table("caliper", acts)
+        return build_command_table("caliper", acts)
 
     # time -------------------------------------------------------------------------------------
 
@@ -195,17 +201,17 @@ class CaliperUnit(Device):
         """Let the skin go and stop whatever moves."""
         self._release(now, "DARK")
 
-    def busy(self, now: float) -> bool:
+    def is_busy(self, now: float) -> bool:
         """Tell whether jaws or ring move."""
         return self._move is not None or self._turning is not None
 
     def states(self, now: float) -> dict[int, bool]:
         """Return 16 moving, 32 homed, 512 skin held, 1024 force limit met."""
         tripped = self._barred is not None
-        return {16: self.busy(now), 32: self.homed, 512: self.attached, 1024: tripped}
+        return {16: self.is_busy(now), 32: self.homed, 512: self.attached, 1024: tripped}
 
     @property
-    def felt_n(self) -> float:
+    def measured_force_n(self) -> float:
         """What the sensor says since it was tared, N."""
         return self._load.force_n + self._offset_n - self._zero_n
 
@@ -218,16 +224,16 @@ class CaliperUnit(Device):
         self._load.move(self.aperture_mm)
         self._on_change(now)
         move.ticks += 1
-        limit_n, force_n = self.limit_n or 0.0, self.felt_n
+        limit_n, force_n = self.limit_n or 0.0, self.measured_force_n
         before_n, self._last_force_n = self._last_force_n, force_n
-        lost = abs(driven_mm - self.aperture_mm) > LAG_MM
-        if self._came_off(direction, before_n, force_n):
+        lost = abs(driven_mm - self.aperture_mm) > STALL_LAG_MM
+        if self._has_detached(direction, before_n, force_n):
             self.attached = False
             self._load.release()
             self._on_change(now)
             self._end(move, "DETACHED", now)
         elif math.isfinite(move.tripped_s):
-            if abs(force_n) >= limit_n and (lost or now > move.tripped_s + LET_GO_S):
+            if abs(force_n) >= limit_n and (lost or now > move.tripped_s + RELEASE_TIME_S):
                 self._release(now, "FORCE")
             elif lost:
                 self._lose_steps(move, now)
@@ -240,15 +246,17 @@ class CaliperUnit(Device):
         elif now >= move.arrives_s:
             self._arrive(move, now)
 
-    def _came_off(self, direction: int, before_n: float, force_n: float) -> bool:
-        pulled = self.attached and direction > 0 and before_n >= COMES_OFF_FROM_N
-        return pulled and abs(force_n) <= COMES_OFF_SHARE * before_n
+    def _has_detached(self, direction: int, before_n: float, force_n: float) -> bool:
+        pulled = self.attached and direction > 0 and before_n >= MIN_DETACHMENT_FORCE_N
+        return pulled and abs(force_n) <= DETACHED_FORCE_FRACTION * before_n
 
     def _turn_back(self, move: _Move, now: float) -> None:
         """Go back to where the jaws stood before: the force has met its limit."""
-        move.reading_mm, move.force_n, move.tripped_s = self.aperture_mm, self.felt_n, now
+        move.reading_mm, move.force_n, move.tripped_s = self.aperture_mm, self.measured_force_n, now
         self._barred = (move.direction, self.aperture_mm)
-        self.say("CAL:FORC:TRIP", f"{self.aperture_mm:.3f},{move.force_n:.3f},{self.clock_us(now)}")
+        self.queue_event(
+            "CAL:FORC:TRIP", f"{self.aperture_mm:.3f},{move.force_n:.3f},{self.clock_us(now)}"
+        )
         move.to_mm, move.from_mm = move.from_mm, self.aperture_mm
         move.start_s, move.ticks, move.stalls_at_mm = now, 0, None
 
@@ -268,7 +276,7 @@ class CaliperUnit(Device):
         self._move = None
         caliper = self._caliper
         step = round((self.aperture_mm - caliper.aperture_mm) / caliper.step_mm)
-        reading_mm, force_n = self.aperture_mm, self.felt_n
+        reading_mm, force_n = self.aperture_mm, self.measured_force_n
         if how == "FORCE":
             reading_mm, force_n = move.reading_mm, move.force_n
         clock_us = self.clock_us(now)
@@ -282,7 +290,7 @@ class CaliperUnit(Device):
         self._barred = None
         if self.attached:
             self.attached = False
-            self.say("CAL:FREE", f"{why},{self.clock_us(now)}")
+            self.queue_event("CAL:FREE", f"{why},{self.clock_us(now)}")
         self._last_force_n = 0.0
         self._load.release()
         self._on_change(now)
@@ -292,15 +300,15 @@ class CaliperUnit(Device):
     def _require_fit(self, now: float) -> None:
         """Refuse to move with the stop open, a dead sensor, no limit, or on the move."""
         self._require_closed_stop()
-        Refused.when(self.faults.force_dead, Code.HARDWARE, "the force sensor is dead")
-        Refused.when(self.busy(now), Code.IGNORED, "on the move")
+        CommandRefused.raise_if(self.faults.force_dead, Code.HARDWARE, "the force sensor is dead")
+        CommandRefused.raise_if(self.is_busy(now), Code.IGNORED, "on the move")
 
     def _require_limit(self) -> None:
         if self.limit_n is None:
-            raise Refused(Code.IGNORED, "CAL:FORC:LIM first; there is no default")
+            raise CommandRefused(Code.IGNORED, "CAL:FORC:LIM first; there is no default")
 
     def _require_free(self) -> None:
-        Refused.when(self.attached, Code.IGNORED, "skin is held; CAL:REL first")
+        CommandRefused.raise_if(self.attached, Code.IGNORED, "skin is held; CAL:REL first")
 
     def _begin(self, to_mm: float, now: float, *, homing: bool) -> str:
         caliper = self._caliper
@@ -308,12 +316,12 @@ class CaliperUnit(Device):
         if self._rng.random() < self._stall:
             share = float(self._rng.random())
             stalls_at_mm = self.aperture_mm + share * (to_mm - self.aperture_mm)
-        speed = caliper.speed_mm_per_s * (HOME_SPEED if homing else 1.0)
+        speed = caliper.speed_mm_per_s * (HOMING_SPEED_FRACTION if homing else 1.0)
         self.moves.append((now, to_mm))
         self._move = _Move(
             len(self.moves), homing, now, self.aperture_mm, to_mm, speed, stalls_at_mm
         )
-        self._last_force_n = self.felt_n
+        self._last_force_n = self.measured_force_n
         return str(len(self.moves))
 
     def _home(self, _: str, now: float) -> str:
@@ -326,34 +334,36 @@ class CaliperUnit(Device):
         if self.faults.home_missed and self._move is not None:
             # on to the end of the travel, where the motor loses its steps
             end_mm = self._ends_mm[0] if self.aperture_mm > home_mm else self._ends_mm[1]
-            beyond_mm = math.copysign(2.0 * LAG_MM, end_mm - home_mm)
+            beyond_mm = math.copysign(2.0 * STALL_LAG_MM, end_mm - home_mm)
             self._move.to_mm, self._move.stalls_at_mm = end_mm + beyond_mm, end_mm
         return answer
 
     def _step(self, arguments: str, now: float) -> str:
         if _STEP_PATTERN.fullmatch(arguments) is None:
-            raise Refused(Code.SYNTAX, "expected a whole number of steps")
+            raise CommandRefused(Code.SYNTAX, "expected a whole number of steps")
         step = int(arguments)
         if not self.step_min <= step <= self.step_max:
-            raise Refused(Code.OUT_OF_RANGE, f"expected {self.step_min} to {self.step_max} steps")
+            raise CommandRefused(
+                Code.OUT_OF_RANGE, f"expected {self.step_min} to {self.step_max} steps"
+            )
         self._require_fit(now)
         self._require_limit()
-        Refused.when(not self.homed, Code.IGNORED, "CAL:HOME first")
+        CommandRefused.raise_if(not self.homed, Code.IGNORED, "CAL:HOME first")
         to_mm = self._caliper.reading_mm(step)
         if self._barred is not None:
             direction, reading_mm = self._barred
             if direction * (to_mm - reading_mm) >= 0.0:
-                raise Refused(Code.FORCE, f"the limit was met at {reading_mm:.3f} mm")
+                raise CommandRefused(Code.FORCE, f"the limit was met at {reading_mm:.3f} mm")
         return self._begin(to_mm, now, homing=False)
 
     def _turn(self, arguments: str, now: float) -> None:
-        angle_deg = number(arguments, 0.0, 180.0, "degrees")
+        angle_deg = parse_number(arguments, 0.0, 180.0, "degrees")
         if angle_deg not in self._caliper.angles_deg:
             known = ", ".join(f"{angle:g}" for angle in self._caliper.angles_deg)
-            raise Refused(Code.OUT_OF_RANGE, f"expected one of {known} degrees")
+            raise CommandRefused(Code.OUT_OF_RANGE, f"expected one of {known} degrees")
         self._require_fit(now)
         self._require_free()
-        turns_s = abs(angle_deg - self.angle_deg) / TURN_DEG_PER_S
+        turns_s = abs(angle_deg - self.angle_deg) / ROTATION_DEG_PER_S
         self._turning = (now + turns_s, angle_deg)
         self.advance(now)
 
@@ -364,7 +374,7 @@ class CaliperUnit(Device):
         self._require_free()
         home_mm = self._caliper.aperture_mm
         if not self.homed or abs(self.aperture_mm - home_mm) > 1e-6:
-            raise Refused(Code.IGNORED, "CAL:HOME, or step 0, first")
+            raise CommandRefused(Code.IGNORED, "CAL:HOME, or step 0, first")
         self._zero_n = self._load.force_n + self._offset_n
         self._load.attach(self.angle_deg)
         self.attached = True
@@ -372,12 +382,14 @@ class CaliperUnit(Device):
         self._on_change(now)
 
     def _get_force(self, _: str, now: float) -> str:
-        Refused.when(self.faults.force_dead, Code.HARDWARE, "the force sensor is dead")
-        return f"{self.felt_n:.3f}"
+        CommandRefused.raise_if(self.faults.force_dead, Code.HARDWARE, "the force sensor is dead")
+        return f"{self.measured_force_n:.3f}"
 
     def _set_limit(self, arguments: str, now: float) -> None:
-        limit_n = number(arguments, *FORCE_LIMIT_N, "N")
-        if abs(self.felt_n) >= limit_n:
-            raise Refused(Code.FORCE, f"there are {self.felt_n:.3f} N now; CAL:REL first")
+        limit_n = parse_number(arguments, *FORCE_LIMIT_N, "N")
+        if abs(self.measured_force_n) >= limit_n:
+            raise CommandRefused(
+                Code.FORCE, f"there are {self.measured_force_n:.3f} N now; CAL:REL first"
+            )
         self.limit_n = limit_n
         self._barred = None

@@ -34,7 +34,7 @@ _CODE_TEXTS = {
 }
 
 
-class Refused(Exception):
+class CommandRefused(Exception):
     """A command that is not carried out, with its code; the box did nothing."""
 
     def __init__(self, code: Code, detail: str = "") -> None:
@@ -43,23 +43,23 @@ class Refused(Exception):
         self.reason = _CODE_TEXTS[code] + (f"; {detail}" if detail else "")
 
     @classmethod
-    def when(cls, wrong: object, code: Code, detail: str = "") -> None:
+    def raise_if(cls, condition: object, code: Code, detail: str = "") -> None:
         """Refuse the command when something is wrong."""
-        if wrong:
+        if condition:
             raise cls(code, detail)
 
 
 @dataclass(frozen=True, slots=True)
-class Later:
+class PendingReply:
     """An act that is under way: it is answered when it is over."""
 
     at_s: float
     """When, s, on the world's clock."""
-    outcome: Callable[[], str | Refused]
+    outcome: Callable[[], str | CommandRefused]
     """Payload of the answer, or why there is none; asked for then."""
 
 
-Act: TypeAlias = Callable[[str, float], str | Later | None]
+CommandHandler: TypeAlias = Callable[[str, float], str | PendingReply | None]
 """(arguments, now in s) -> payload of the answer (None: empty), or when it comes; may refuse."""
 
 
@@ -67,7 +67,7 @@ Act: TypeAlias = Callable[[str, float], str | Later | None]
 class Command:
     """One row of a command table."""
 
-    run: Act
+    run: CommandHandler
     arguments: str = ""
     """What follows the header, as the manual writes it; empty: nothing may follow."""
     armed: bool = False
@@ -80,46 +80,48 @@ class Command:
     """What it does, in one line."""
 
 
-def command_table(kind: str, acts: Mapping[str, Act]) -> dict[str, Command]:
+def build_command_table(kind: str, handlers: Mapping[str, CommandHandler]) -> dict[str, Command]:
     """Return the commands of a kind of box, in its manual's order, each with what it does."""
     rows = package_table("box_commands")[kind]
-    return {header: Command(acts[header], **row) for header, row in rows.items()}
+    return {header: Command(handlers[header], **row) for header, row in rows.items()}
 
 
-def number(text: str, low: float, high: float, unit: str) -> float:
+def parse_number(text: str, low: float, high: float, unit: str) -> float:
     """Return the number that a command gives, or refuse with -102 or -222.
 
     Examples
     --------
-    >>> number("0.5", 0.0, 1.0, "of full power")
+    >>> parse_number("0.5", 0.0, 1.0, "of full power")
     0.5
     """
     if _NUMBER_PATTERN.fullmatch(text) is None:
-        raise Refused(Code.SYNTAX, "expected a number")
+        raise CommandRefused(Code.SYNTAX, "expected a number")
     value = float(text)
     if not low <= value <= high:
-        raise Refused(Code.OUT_OF_RANGE, f"expected {low:g} to {high:g} {unit}")
+        raise CommandRefused(Code.OUT_OF_RANGE, f"expected {low:g} to {high:g} {unit}")
     return value
 
 
-def choice(text: str, names: tuple[str, ...]) -> str:
+def parse_choice(text: str, names: tuple[str, ...]) -> str:
     """Return the upper-case word that a command gives, or refuse with -102."""
     if text.upper() not in names:
-        raise Refused(Code.SYNTAX, f"expected {' or '.join(names)}")
+        raise CommandRefused(Code.SYNTAX, f"expected {' or '.join(names)}")
     return text.upper()
 
 
-def word(text: str) -> str:
+def parse_token(text: str) -> str:
     """Return the token that a command gives, or refuse with -102."""
     if _WORD_PATTERN.fullmatch(text) is None:
-        raise Refused(Code.SYNTAX, "expected 1 to 48 of A-Z a-z 0-9 . _ -")
+        raise CommandRefused(Code.SYNTAX, "expected 1 to 48 of A-Z a-z 0-9 . _ -")
     return text
 
 
-def whole(text: str, low: int, high: int) -> int:
+def parse_integer(text: str, low: int, high: int) -> int:
     """Return a whole number that a command gives, or refuse with -102 or -222."""
     if not (text.isascii() and text.isdecimal() and len(text) <= 9):
-        raise Refused(Code.SYNTAX, "expected a whole number")
+        raise CommandRefused(Code.SYNTAX, "expected a whole number")
     value = int(text)
-    Refused.when(not low <= value <= high, Code.OUT_OF_RANGE, f"expected {low} to {high}")
+    CommandRefused.raise_if(
+        not low <= value <= high, Code.OUT_OF_RANGE, f"expected {low} to {high}"
+    )
     return value

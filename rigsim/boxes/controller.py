@@ -15,15 +15,22 @@ import numpy as np
 
 from capture.devices import wire
 from capture.devices.wire import Code, Event, Reply, Request
-from rigsim.boxes.command import Act, Command, Later, Refused, command_table, number
+from rigsim.boxes.command import (
+    Command,
+    CommandHandler,
+    CommandRefused,
+    PendingReply,
+    build_command_table,
+    parse_number,
+)
 from rigsim.boxes.device import Device
 
 FIRMWARE = "1.0"
-CACHED_REPLIES = 8
-ERROR_QUEUE = 16
-CAPABILITY_PART = 48
+MAX_CACHED_REPLIES = 8
+MAX_QUEUED_ERRORS = 16
+CAPABILITY_CHUNK_CHARS = 48
 """Characters of the limits that one line carries: a short line survives a bad cable."""
-LEASE_MS = (300, 5000)
+LEASE_RANGE_MS = (300, 5000)
 DEFAULT_LEASE_MS = 1000
 
 
@@ -68,8 +75,8 @@ class Controller:
             self.boot = int(self._rng.integers(1, 0x10000))
         self._splitter = wire.LineSplitter()
         self._errors: deque[tuple[int, str]] = deque()
-        self._replies: deque[tuple[int, str, bytes]] = deque(maxlen=CACHED_REPLIES)
-        self._under_way: tuple[Request, Later] | None = None
+        self._replies: deque[tuple[int, str, bytes]] = deque(maxlen=MAX_CACHED_REPLIES)
+        self._under_way: tuple[Request, PendingReply] | None = None
         self._events = 0
         self._lease_ms = DEFAULT_LEASE_MS
         self._lease_end = math.inf
@@ -113,7 +120,9 @@ class Controller:
         if now < self._ready_at:
             return output
         for line in self._splitter.feed(data):
-            answer = self._framed if wire.looks_framed(line) else self._bare
+            answer = (
+                self._handle_framed_line if wire.is_frame_like(line) else self._handle_bare_line
+            )
             output += answer(line, now)
             output += self._device_events()
         return output
@@ -123,7 +132,7 @@ class Controller:
 
     # frames -----------------------------------------------------------------------------------
 
-    def _framed(self, line: bytes, now: float) -> bytes:
+    def _handle_framed_line(self, line: bytes, now: float) -> bytes:
         try:
             frame = wire.decode(line)
         except wire.BadFrame:
@@ -133,7 +142,7 @@ class Controller:
         if frame.boot == wire.UNKNOWN_BOOT and frame.text == "SYST:HELLO?":
             return wire.encode(Reply(frame.seq, self.boot, Code.OK, self._hello()))
         if self._foreign_epoch(frame.boot):
-            refused = Refused(Code.BOOT_CHANGED)
+            refused = CommandRefused(Code.BOOT_CHANGED)
             return wire.encode(Reply(frame.seq, self.boot, refused.code, refused.reason))
         self._renew_lease(now)
         answers = list(self._replies)
@@ -145,21 +154,21 @@ class Controller:
             if self._same_request(seq, text, frame):
                 return answer
             if seq == frame.seq:
-                refused = Refused(Code.SEQ_REUSED)
+                refused = CommandRefused(Code.SEQ_REUSED)
                 self._remember(refused)
                 return wire.encode(Reply(frame.seq, self.boot, refused.code, refused.reason))
         try:
             outcome = self._execute(frame.text, now)
-        except Refused as refused:
+        except CommandRefused as refused:
             return self._answer(frame, refused, now)
-        if isinstance(outcome, Later):
+        if isinstance(outcome, PendingReply):
             self._under_way = (frame, outcome)
             self._renew_lease(now)
             return b""
         return self._answer(frame, outcome, now)
 
-    def _answer(self, request: Request, outcome: str | Refused, now: float) -> bytes:
-        if isinstance(outcome, Refused):
+    def _answer(self, request: Request, outcome: str | CommandRefused, now: float) -> bytes:
+        if isinstance(outcome, CommandRefused):
             self._remember(outcome)
             reply = Reply(request.seq, self.boot, outcome.code, outcome.reason)
         else:
@@ -169,7 +178,7 @@ class Controller:
         self._replies.append((request.seq, request.text, answer))
         return answer
 
-    def _bare(self, line: bytes, now: float) -> bytes:
+    def _handle_bare_line(self, line: bytes, now: float) -> bytes:
         text = line.decode("ascii", errors="replace").strip()
         header, _, arguments = text.partition(" ")
         header = header.upper()
@@ -177,22 +186,24 @@ class Controller:
         try:
             if command is not None:
                 dark = command.bare or arguments.upper() in command.harmless
-                Refused.when(not (header.endswith("?") or dark), Code.UNFRAMED)
+                CommandRefused.raise_if(not (header.endswith("?") or dark), Code.UNFRAMED)
             payload = self._execute(text, now)
-        except Refused as refused:
+        except CommandRefused as refused:
             self._remember(refused)
             return b""
         return f"{payload}\n".encode() if header.endswith("?") else b""
 
-    def _execute(self, text: str, now: float) -> str | Later:
+    def _execute(self, text: str, now: float) -> str | PendingReply:
         header, _, arguments = text.partition(" ")
         command = self.commands.get(header.upper())
         if command is None:
-            raise Refused(Code.UNDEFINED_HEADER)
+            raise CommandRefused(Code.UNDEFINED_HEADER)
         if bool(arguments) != bool(command.arguments):
-            raise Refused(Code.SYNTAX, f"expected {header.upper()} {command.arguments}".strip())
+            raise CommandRefused(
+                Code.SYNTAX, f"expected {header.upper()} {command.arguments}".strip()
+            )
         if command.armed and not (self.armed or arguments.upper() in command.harmless):
-            raise Refused(Code.WATCHDOG_TRIPPED if self.tripped else Code.NOT_ARMED)
+            raise CommandRefused(Code.WATCHDOG_TRIPPED if self.tripped else Code.NOT_ARMED)
         return command.run(arguments, now) or ""
 
     def _same_request(self, seq: int, text: str, frame: Request) -> bool:
@@ -205,10 +216,10 @@ class Controller:
         number, self._events = self._events, wire.next_seq(self._events)
         return wire.encode(Event(number, self.boot, name, payload))
 
-    def _remember(self, refused: Refused) -> None:
-        if len(self._errors) == ERROR_QUEUE:
+    def _remember(self, refused: CommandRefused) -> None:
+        if len(self._errors) == MAX_QUEUED_ERRORS:
             self._errors.pop()
-            refused = Refused(Code.QUEUE_OVERFLOW)
+            refused = CommandRefused(Code.QUEUE_OVERFLOW)
         self._errors.append((int(refused.code), refused.reason))
 
     # lease and arming -------------------------------------------------------------------------
@@ -224,11 +235,11 @@ class Controller:
     # the commands every box knows -------------------------------------------------------------
 
     def _own_commands(self) -> dict[str, Command]:
-        acts: dict[str, Act] = {
+        acts: dict[str, CommandHandler] = {
             "*IDN?": lambda *_: f"RIGSIM,{self.device.model},{self.serial},{FIRMWARE}",
             "*RST": self._reset,
             "*CLS": lambda *_: self._errors.clear(),
-            "*OPC?": lambda _, now: "0" if self.device.busy(now) else "1",
+            "*OPC?": lambda _, now: "0" if self.device.is_busy(now) else "1",
             "SYST:ERR?": self._error,
             "SYST:HELLO?": lambda *_: self._hello(),
             "SYST:CAP?": self._capable,
@@ -242,7 +253,7 @@ class Controller:
             "ABOR": self._safe,
             "STAT?": self._status,
         }
-        return command_table("any", acts)
+        return build_command_table("any", acts)
 
     def _hello(self) -> str:
         return f"{self._protocol},{self.device.kind},{self.serial},{FIRMWARE}"
@@ -259,21 +270,21 @@ class Controller:
         table = {
             "kind": self.device.kind,
             "protocol": self._protocol,
-            "lease_min_ms": LEASE_MS[0],
-            "lease_max_ms": LEASE_MS[1],
+            "lease_min_ms": LEASE_RANGE_MS[0],
+            "lease_max_ms": LEASE_RANGE_MS[1],
             **self.device.capabilities(),
         }
         return wire.seal(json.dumps(table, separators=(",", ":"), allow_nan=False))
 
     def _capable_part(self, arguments: str, now: float) -> str:
         text = self._capable("", now)
-        last = (len(text) - 1) // CAPABILITY_PART
-        part = int(number(arguments, 0, last, "parts"))
-        start = part * CAPABILITY_PART
-        return f"{int(part == last)},{text[start : start + CAPABILITY_PART]}"
+        last = (len(text) - 1) // CAPABILITY_CHUNK_CHARS
+        part = int(parse_number(arguments, 0, last, "parts"))
+        start = part * CAPABILITY_CHUNK_CHARS
+        return f"{int(part == last)},{text[start : start + CAPABILITY_CHUNK_CHARS]}"
 
     def _set_lease(self, arguments: str, now: float) -> None:
-        self._lease_ms = int(number(arguments, LEASE_MS[0], LEASE_MS[1], "ms"))
+        self._lease_ms = int(parse_number(arguments, LEASE_RANGE_MS[0], LEASE_RANGE_MS[1], "ms"))
 
     def _arm(self, _: str, now: float) -> None:
         self.armed = True

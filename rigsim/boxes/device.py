@@ -10,7 +10,7 @@ import numpy as np
 
 from capture.devices.wire import Code
 from capture.rig import Rig
-from rigsim.boxes.command import Command, Refused, word
+from rigsim.boxes.command import Command, CommandRefused, parse_token
 from rigsim.boxes.faults import NO_FAULTS, Faults
 
 STATUS_INTERLOCK = 256
@@ -42,10 +42,10 @@ class SuctionLoad(Protocol):
     def place(self, site: str, angle_deg: float, now: float) -> None:
         """Be put somewhere by a person."""
 
-    def take_away(self, now: float) -> None:
+    def remove(self, now: float) -> None:
         """Be taken off."""
 
-    def draw(self, wanted_mbar: float, now: float) -> None:
+    def start_suction(self, target_mbar: float, now: float) -> None:
         """Have the vent closed and the pump switched on."""
 
     def vent(self, now: float) -> None:
@@ -117,7 +117,7 @@ class Device(ABC):
         """Return bits 4 and up of ``STAT?`` but `STATUS_INTERLOCK`, and whether each is set."""
 
     @abstractmethod
-    def busy(self, now: float) -> bool:
+    def is_busy(self, now: float) -> bool:
         """Return whether something that was accepted is still going on."""
 
     @abstractmethod
@@ -150,7 +150,7 @@ class Device(ABC):
         self._events.clear()
         return events
 
-    def say(self, name: str, payload: str) -> None:
+    def queue_event(self, name: str, payload: str) -> None:
         """Have an event sent."""
         self._events.append((name, payload))
 
@@ -163,12 +163,12 @@ class Device(ABC):
         return ()
 
     def _trigger_camera(self, arguments: str, now: float) -> str:
-        token = word(arguments)
+        token = parse_token(arguments)
         self._on_trigger(now)
         return f"{token},{self.clock_us(now)}"
 
     def _require_closed_stop(self) -> None:
-        Refused.when(self.interlock, Code.INTERLOCK)
+        CommandRefused.raise_if(self.interlock, Code.INTERLOCK)
 
     def _stop_opens_s(self) -> float:
         """Return when somebody will open the stop, s; inf where it is open."""

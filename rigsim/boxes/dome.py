@@ -14,15 +14,22 @@ from collections.abc import Sequence
 
 from capture.devices.wire import Code
 from rigsim.boxes import led_table
-from rigsim.boxes.command import Act, Command, Refused, command_table, number, whole
+from rigsim.boxes.command import (
+    Command,
+    CommandHandler,
+    CommandRefused,
+    build_command_table,
+    parse_integer,
+    parse_number,
+)
 from rigsim.boxes.device import Wiring
-from rigsim.boxes.led_sequencer import LED_MS, LedSequencer, Run
-from rigsim.boxes.led_table import LEVEL_STEPS, LedPulse, Row, Switch
+from rigsim.boxes.led_sequencer import LED_RANGE_MS, LedSequencer, SequenceRun
+from rigsim.boxes.led_table import LEVEL_STEPS, LedPulse, LedTableRow, SequenceEvent
 
 DEFAULT_LED_MS = 100.0
 
 
-class DomeUnit(LedSequencer[Row]):
+class DomeUnit(LedSequencer[LedTableRow]):
     """State of the dome's box behind its controller.
 
     Parameters
@@ -40,39 +47,41 @@ class DomeUnit(LedSequencer[Row]):
 
     def commands(self) -> dict[str, Command]:
         """Return the command table: the manual of the box."""
-        acts: dict[str, Act] = {
+        acts: dict[str, CommandHandler] = {
             "SEQ:DEF": self._define_rows,
             "LED:ON": self._light,
             "LED:OFF": self._put_out,
             "LED?": lambda *_: "+".join(map(str, self.bank.lit)) or "-",
         }
-        return super().commands() | command_table("dome", acts)
+        return super().commands() | build_command_table("dome", acts)
 
     # sequence ---------------------------------------------------------------------------------
 
-    def _parse_rows(self, text: str) -> list[Row]:
+    def _parse_rows(self, text: str) -> list[LedTableRow]:
         return led_table.parse_rows(
             text,
             count=self.bank.count,
-            at_once=self._limits.max_at_once,
+            max_leds=self._limits.max_at_once,
             cameras=self._cameras,
-            most_us=self._row_max_us,
+            max_us=self._row_max_us,
         )
 
-    def _lit_by(self, rows: Sequence[Row], now: float) -> list[LedPulse]:
-        return led_table.lit_by(rows, now, overlap_s=self._limits.overlap_s)
+    def _lit_by(self, rows: Sequence[LedTableRow], now: float) -> list[LedPulse]:
+        return led_table.pulses_from_rows(rows, now, overlap_s=self._limits.overlap_s)
 
-    def _schedule(self, rows: Sequence[Row]) -> list[Switch]:
+    def _schedule(self, rows: Sequence[LedTableRow]) -> list[SequenceEvent]:
         limits = self._limits
-        return led_table.switches(rows, overlap_s=limits.overlap_s, settle_s=limits.settle_s)
+        return led_table.schedule_rows(rows, overlap_s=limits.overlap_s, settle_s=limits.settle_s)
 
-    def _switch_light(self, run: Run[Row], switch: Switch, now: float) -> None:
+    def _switch_light(
+        self, run: SequenceRun[LedTableRow], switch: SequenceEvent, now: float
+    ) -> None:
         row = run.rows[switch.row]
-        if switch.what == "on":
+        if switch.action == "on":
             before = run.rows[switch.row - 1].leds
             self._turn_on([led for led in row.leds if led not in before], row.level, now)
             return
-        held = run.rows[switch.row - 1] if switch.row else Row((), 0, 0, 0)
+        held = run.rows[switch.row - 1] if switch.row else LedTableRow((), 0, 0, 0)
         for led in held.leds:
             if led not in row.leds:
                 self.bank.switch_off(led, now)
@@ -84,36 +93,40 @@ class DomeUnit(LedSequencer[Row]):
     def _turn_on(self, leds: Sequence[int], level: float, now: float) -> None:
         for led in leds:
             if not self.bank.switch_on(led, level, now):
-                self.say("LED:FAIL", str(led))
+                self.queue_event("LED:FAIL", str(led))
 
     def light_now(self, now: float) -> list[LedPulse]:
         """Return the stretches of light that are going on, as given so far."""
-        return self.bank.going_on(now)
+        return self.bank.ongoing_pulses(now)
 
     # single LEDs ------------------------------------------------------------------------------
 
     def _leds(self, text: str) -> tuple[int, ...]:
-        return led_table.parse_leds(text, count=self.bank.count, at_once=self._limits.max_at_once)
+        return led_table.parse_leds(text, count=self.bank.count, max_leds=self._limits.max_at_once)
 
     def _light(self, arguments: str, now: float) -> None:
         self._require_still()
         parts = arguments.split(",")
-        Refused.when(len(parts) > 3, Code.SYNTAX, "expected LEDS,MS,LEVEL")
+        CommandRefused.raise_if(len(parts) > 3, Code.SYNTAX, "expected LEDS,MS,LEVEL")
         leds = self._leds(parts[0])
-        longest_ms = min(LED_MS[1], self._limits.max_on_s * 1e3)
+        longest_ms = min(LED_RANGE_MS[1], self._limits.max_on_s * 1e3)
         span_ms = (
-            number(parts[1], LED_MS[0], longest_ms, "ms") if len(parts) > 1 else DEFAULT_LED_MS
+            parse_number(parts[1], LED_RANGE_MS[0], longest_ms, "ms")
+            if len(parts) > 1
+            else DEFAULT_LED_MS
         )
-        level = whole(parts[2], 1, LEVEL_STEPS) / LEVEL_STEPS if len(parts) > 2 else 1.0
+        level = parse_integer(parts[2], 1, LEVEL_STEPS) / LEVEL_STEPS if len(parts) > 2 else 1.0
         if len({*leds, *self.bank.lit}) > self._limits.max_at_once:
-            raise Refused(Code.OUT_OF_RANGE, f"more than {self._limits.max_at_once} LEDs at once")
+            raise CommandRefused(
+                Code.OUT_OF_RANGE, f"more than {self._limits.max_at_once} LEDs at once"
+            )
         self._require_closed_stop()
         dead = [led for led in leds if led in self.bank.dead]
         if dead:
-            raise Refused(Code.HARDWARE, f"LED {dead[0]} draws no current")
+            raise CommandRefused(Code.HARDWARE, f"LED {dead[0]} draws no current")
         end_s = now + span_ms / 1e3
         wanted = [LedPulse(led, level, now, end_s) for led in leds]
-        self.bank.require(wanted, now)
+        self.bank.require_within_limits(wanted, now)
         self._require_calm(wanted, now)
         self._sequence_armed = False
         for led in leds:

@@ -14,19 +14,19 @@ from capture.rig import Light
 from rigsim.arrays import Float64Array
 from rigsim.boxes.led_table import LedPulse
 
-EYE_MM = (0.0, 25.0, 80.0)
+EYE_POSITION_MM = (0.0, 25.0, 80.0)
 """Between the eyes of a nominal head, rig frame; it looks along +z."""
 FLICKER_BAND_HZ = (3.0, 65.0)
-BLUR_S = 1.0 / 65.0
+FLICKER_FUSION_S = 1.0 / 65.0
 """Shortest time in which flicker is seen."""
-GRID_S = 2e-3
-FLASH_SHARE = 0.1
+FLICKER_SAMPLE_S = 2e-3
+MIN_FLASH_FRACTION = 0.1
 """Least change of a flash, of the brightest light."""
-RMS_FROM_S = 2.0
+MIN_RMS_SPAN_S = 2.0
 """Shorter light is judged by its flashes alone."""
 
 
-class EyeGuard:
+class EyeFlickerMonitor:
     """Flicker at the eyes.
 
     Parameters
@@ -36,22 +36,26 @@ class EyeGuard:
     """
 
     def __init__(self, lights: Sequence[Light]) -> None:
-        self.weights = np.array([_at_eye(light) for light in lights])
+        self.weights = np.array([_irradiance_at_eye(light) for light in lights])
 
     def flashes_per_s(self, light: Iterable[LedPulse]) -> float:
         """Return the flashes in the worst second: half the turns of a tenth of the brightest."""
         times, integral = self._integral(light)
         if times.size == 0:
             return 0.0
-        grid = np.arange(times[0] - 0.1, times[-1] + 0.1, GRID_S)
-        upper = np.interp(grid + 0.5 * BLUR_S, times, integral)
-        seen = (upper - np.interp(grid - 0.5 * BLUR_S, times, integral)) / BLUR_S
+        grid = np.arange(times[0] - 0.1, times[-1] + 0.1, FLICKER_SAMPLE_S)
+        upper = np.interp(grid + 0.5 * FLICKER_FUSION_S, times, integral)
+        seen = (
+            upper - np.interp(grid - 0.5 * FLICKER_FUSION_S, times, integral)
+        ) / FLICKER_FUSION_S
         if seen.max() <= 0.0:
             return 0.0
-        turns = grid[_turns(seen, FLASH_SHARE * float(seen.max()))]
+        turns = grid[_turning_points(seen, MIN_FLASH_FRACTION * float(seen.max()))]
         if turns.size == 0:
             return 0.0
-        within = np.searchsorted(turns, turns + 1.0 - 0.5 * GRID_S) - np.arange(turns.size)
+        within = np.searchsorted(turns, turns + 1.0 - 0.5 * FLICKER_SAMPLE_S) - np.arange(
+            turns.size
+        )
         return float(within.max()) / 2.0
 
     def rms(self, light: Iterable[LedPulse]) -> float:
@@ -68,7 +72,7 @@ class EyeGuard:
         weight = np.array(list(lit.values()))
         start, span = float(on.min()), float(off.max() - on.min())
         mean = float((weight * (off - on)).sum()) / span
-        if span < RMS_FROM_S or mean <= 0.0:
+        if span < MIN_RMS_SPAN_S or mean <= 0.0:
             return 0.0
         orders = np.arange(
             math.ceil(FLICKER_BAND_HZ[0] * span), math.floor(FLICKER_BAND_HZ[1] * span) + 1
@@ -95,9 +99,9 @@ class EyeGuard:
         return times, total[: times.size]
 
 
-def _at_eye(light: Light) -> float:
+def _irradiance_at_eye(light: Light) -> float:
     """Return the irradiance of an LED at level 1 on the eye, W/m^2."""
-    x, y, z = (e - p for e, p in zip(EYE_MM, light.position_mm, strict=True))
+    x, y, z = (e - p for e, p in zip(EYE_POSITION_MM, light.position_mm, strict=True))
     distance_mm = math.hypot(x, y, z)
     cosine = max(-z / distance_mm, 0.0)
     px, py, pz = light.position_mm
@@ -108,17 +112,17 @@ def _at_eye(light: Light) -> float:
     return (light.power_w or 0.0) * spread * cosine / (1e-3 * distance_mm) ** 2
 
 
-def _turns(values: Float64Array, least: float) -> list[int]:
-    """Return where a curve has risen, or fallen, by ``least`` since its last turn."""
+def _turning_points(values: Float64Array, min_change: float) -> list[int]:
+    """Return where a curve has risen, or fallen, by ``min_change`` since its last turn."""
     found: list[int] = []
     low = high = float(values[0])
     direction = 0
     for place, value in enumerate(values.tolist()):
         low, high = min(low, value), max(high, value)
-        if direction <= 0 and value >= low + least:
+        if direction <= 0 and value >= low + min_change:
             direction, high = 1, value
             found.append(place)
-        elif direction >= 0 and value <= high - least:
+        elif direction >= 0 and value <= high - min_change:
             direction, low = -1, value
             found.append(place)
         if direction > 0:

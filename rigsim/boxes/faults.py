@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
-from capture.documents import near_miss
+from capture.documents import suggest_key
 from rigsim.package_data import package_table
 
 Probability: TypeAlias = float
@@ -184,7 +184,7 @@ class Faults:
         values: dict[str, float | int | bool | str] = {}
         for name, text in switches.items():
             if name not in fields:
-                hint = near_miss(name, list(fields)) or f"one of {', '.join(fields)}"
+                hint = suggest_key(name, list(fields)) or f"one of {', '.join(fields)}"
                 raise ValueError(f"{name}: no such switch; {hint}")
             values[name] = _value(name, text, type(fields[name].default))
         return cls(**values)  # type: ignore[arg-type]

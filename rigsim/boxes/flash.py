@@ -18,22 +18,31 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from capture.devices.wire import Code
-from rigsim.boxes.command import Act, Command, Later, Refused, choice, command_table, number, word
+from rigsim.boxes.command import (
+    Command,
+    CommandHandler,
+    CommandRefused,
+    PendingReply,
+    build_command_table,
+    parse_choice,
+    parse_number,
+    parse_token,
+)
 from rigsim.boxes.device import Device, Wiring
 
 Polarizer = Literal["parallel", "crossed"]
 
 MIN_POWER = 1.0 / 256.0
-LAMP_MS = (1.0, 500.0)
+LAMP_RANGE_MS = (1.0, 500.0)
 ANALYZER_RANGE_DEG = (0.0, 180.0)
-SYNC_US = (0.0, 50_000.0)
+SYNC_RANGE_US = (0.0, 50_000.0)
 """Delay from camera line to pop; an answer may not keep the line waiting for longer."""
 POP_WINDOW_S = 60.0
-READINGS_DEG: dict[Polarizer, float] = {"parallel": 0.0, "crossed": 90.0}
+POLARIZER_READING_DEG: dict[Polarizer, float] = {"parallel": 0.0, "crossed": 90.0}
 
 CHARGER_HEADROOM = 1.05
 """Voltage the charger aims at, relative to full; it stops at full."""
-CHARGE_SHARE = 0.9
+CHARGE_TIME_FRACTION = 0.9
 """Time from empty to full as a share of the recycle time."""
 LAMP_TAU_S = 20.0
 """Time constant of the lamp driver's temperature, s."""
@@ -83,7 +92,7 @@ class FlashUnit(Device):
         self._pops_per_min = math.floor(rig.max_pops_per_min)
         self._s_per_deg = rig.polarizer_move_s / 90.0
         headroom = math.log(CHARGER_HEADROOM / (CHARGER_HEADROOM - 1.0))
-        self._charge_tau_s = faults.slow_charge * CHARGE_SHARE * rig.recycle_s / headroom
+        self._charge_tau_s = faults.slow_charge * CHARGE_TIME_FRACTION * rig.recycle_s / headroom
         self._now = 0.0
         # what the box keeps without power: the count, heat, charge and the last pops
         self.count = 0
@@ -96,7 +105,7 @@ class FlashUnit(Device):
         self._last_pop = -math.inf
         self._last_power = 0.0
         self._coming: tuple[float, str] | None = None  # when the tube will pop, and its token
-        self._outcome: str | Refused = ""
+        self._outcome: str | CommandRefused = ""
         self.angle_deg = 0.0
         self._settled_at = 0.0
         self.reset(0.0, power_up=True)
@@ -111,7 +120,7 @@ class FlashUnit(Device):
         self.polarizer: Polarizer = "parallel"
         self.analyser_deg: float | None = None
         self.last_report = ""
-        self._turn(READINGS_DEG["parallel"], now)
+        self._turn(POLARIZER_READING_DEG["parallel"], now)
 
     def capabilities(self) -> Mapping[str, Any]:
         """Return limits and counts, units in the names."""
@@ -120,10 +129,10 @@ class FlashUnit(Device):
             "power_max": 1.0,
             "analyser_min_deg": ANALYZER_RANGE_DEG[0],
             "analyser_max_deg": ANALYZER_RANGE_DEG[1],
-            "sync_min_us": SYNC_US[0],
-            "sync_max_us": SYNC_US[1],
-            "lamp_min_ms": LAMP_MS[0],
-            "lamp_max_ms": LAMP_MS[1],
+            "sync_min_us": SYNC_RANGE_US[0],
+            "sync_max_us": SYNC_RANGE_US[1],
+            "lamp_min_ms": LAMP_RANGE_MS[0],
+            "lamp_max_ms": LAMP_RANGE_MS[1],
             "recycle_s": self.rig.recycle_s,
             "pops_per_min": self._pops_per_min,
             "move_s_per_deg": round(self._s_per_deg, 6),
@@ -131,7 +140,7 @@ class FlashUnit(Device):
 
     def commands(self) -> dict[str, Command]:
         """Return the command table: the manual of the box."""
-        acts: dict[str, Act] = {
+        acts: dict[str, CommandHandler] = {
             "FLAS:POL": self._set_polarizer,
             "FLAS:POL?": self._get_polarizer,
             "FLAS:POL:ANG": self._set_angle,
@@ -148,7 +157,7 @@ class FlashUnit(Device):
             "FLAS:LAMP?": lambda *_: str(int(self._lamp.lit)),
             "CAM:TRIG": self._trigger_camera,
         }
-        return command_table("flash", acts)
+        return build_command_table("flash", acts)
 
     # time -------------------------------------------------------------------------------------
 
@@ -189,7 +198,7 @@ class FlashUnit(Device):
         self._lamps_out(now)
         if self._coming is not None:
             self._coming = None
-            self._outcome = Refused(Code.HARDWARE, "made dark before the pop")
+            self._outcome = CommandRefused(Code.HARDWARE, "made dark before the pop")
 
     def _lamps_out(self, now: float) -> None:
         if self._lamp.lit:
@@ -202,14 +211,14 @@ class FlashUnit(Device):
         """Whether a modelling lamp is on."""
         return self._lamp.lit
 
-    def busy(self, now: float) -> bool:
+    def is_busy(self, now: float) -> bool:
         """Tell whether the analyser is turning."""
         return now < self._settled_at
 
     def states(self, now: float) -> dict[int, bool]:
         """Return 16 turning, 32 no pop possible yet, 64 lamp on, 128 too hot."""
         waits = self._wait_for_fire(now)[0] > 0.0
-        return {16: self.busy(now), 32: waits, 64: self._lamp.lit, 128: self._lamp.hot}
+        return {16: self.is_busy(now), 32: waits, 64: self._lamp.lit, 128: self._lamp.hot}
 
     # analyser ---------------------------------------------------------------------------------
 
@@ -219,16 +228,16 @@ class FlashUnit(Device):
         self.angle_deg = reading_deg
 
     def _set_polarizer(self, arguments: str, now: float) -> None:
-        stop = choice(arguments, ("PAR", "CROS"))
+        stop = parse_choice(arguments, ("PAR", "CROS"))
         self.polarizer = "parallel" if stop == "PAR" else "crossed"
         self.analyser_deg = None
-        self._turn(READINGS_DEG[self.polarizer], now)
+        self._turn(POLARIZER_READING_DEG[self.polarizer], now)
 
     def _get_polarizer(self, _: str, now: float) -> str:
         return "PAR" if self.polarizer == "parallel" else "CROS"
 
     def _set_angle(self, arguments: str, now: float) -> None:
-        self.analyser_deg = number(arguments, *ANALYZER_RANGE_DEG, "degrees")
+        self.analyser_deg = parse_number(arguments, *ANALYZER_RANGE_DEG, "degrees")
         self._turn(self.analyser_deg, now)
 
     def _get_angle(self, _: str, now: float) -> str:
@@ -237,13 +246,13 @@ class FlashUnit(Device):
     # flash ------------------------------------------------------------------------------------
 
     def _set_power(self, arguments: str, now: float) -> None:
-        self.power = number(arguments, MIN_POWER, 1.0, "of full power")
+        self.power = parse_number(arguments, MIN_POWER, 1.0, "of full power")
 
     def _get_power(self, _: str, now: float) -> str:
         return f"{self.power:.8f}"
 
     def _set_sync(self, arguments: str, now: float) -> None:
-        self.sync_s = number(arguments, *SYNC_US, "us") / 1e6
+        self.sync_s = parse_number(arguments, *SYNC_RANGE_US, "us") / 1e6
 
     def charge(self, now: float) -> float:
         """Return the energy in the capacitor at `now`, 0 to 1 of a full pop."""
@@ -274,21 +283,21 @@ class FlashUnit(Device):
         wait_ms = math.ceil(max(0.0, self._wait_for_fire(now)[0]) * 1e3)
         return f"{self.charge(now):.4f},{int(wait_ms == 0)},{wait_ms}"
 
-    def _fire(self, arguments: str, now: float) -> str | Later:
-        token = word(arguments)
+    def _fire(self, arguments: str, now: float) -> str | PendingReply:
+        token = parse_token(arguments)
         self._require_closed_stop()
         wait_s, code, why = self._wait_for_fire(now)
         # a clock of microseconds cannot tell a shorter wait from none
         if wait_s > 1e-6:
-            raise Refused(code, f"{why}, {math.ceil(wait_s * 1e3)} ms")
+            raise CommandRefused(code, f"{why}, {math.ceil(wait_s * 1e3)} ms")
         self._lamps_out(now)
         self._on_trigger(now)
         at_s = now + self.sync_s
         self._coming = (at_s, token)
         if self.sync_s > 0.0:
-            return Later(at_s, lambda: self._outcome)
+            return PendingReply(at_s, lambda: self._outcome)
         self._pop(now)
-        if isinstance(self._outcome, Refused):
+        if isinstance(self._outcome, CommandRefused):
             raise self._outcome
         return self._outcome
 
@@ -298,7 +307,7 @@ class FlashUnit(Device):
         self._coming = None
         self._lamps_out(now)
         if self._rng.random() < self.faults.misfire:
-            self._outcome = Refused(Code.HARDWARE, "the tube did not ignite")
+            self._outcome = CommandRefused(Code.HARDWARE, "the tube did not ignite")
             return
         self._volt = math.sqrt(max(0.0, self._voltage(now) ** 2 - self.power))
         self._volt_at = self._last_pop = now
@@ -322,14 +331,14 @@ class FlashUnit(Device):
 
     def _set_lamp(self, arguments: str, now: float) -> None:
         what, _, length = arguments.partition(",")
-        if choice(what, ("ON", "OFF")) == "OFF":
-            Refused.when(length, Code.SYNTAX, "expected OFF")
+        if parse_choice(what, ("ON", "OFF")) == "OFF":
+            CommandRefused.raise_if(length, Code.SYNTAX, "expected OFF")
             self._lamps_out(now)
             return
-        span_ms = number(length, *LAMP_MS, "ms")
+        span_ms = parse_number(length, *LAMP_RANGE_MS, "ms")
         self._require_closed_stop()
-        Refused.when(self._lamp.hot, Code.THERMAL, f"wait until below {HEAT_CLEAR:g}")
-        Refused.when(self.faults.lamp_dead, Code.HARDWARE, "the lamp draws no current")
+        CommandRefused.raise_if(self._lamp.hot, Code.THERMAL, f"wait until below {HEAT_CLEAR:g}")
+        CommandRefused.raise_if(self.faults.lamp_dead, Code.HARDWARE, "the lamp draws no current")
         if not self._lamp.lit:
             self._lamp.lit = True
             self._lamp_since = now

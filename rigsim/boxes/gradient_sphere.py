@@ -21,10 +21,18 @@ import numpy as np
 
 from capture.devices.wire import Code
 from rigsim.boxes import led_table
-from rigsim.boxes.command import Act, Command, Refused, choice, command_table, number, whole
+from rigsim.boxes.command import (
+    Command,
+    CommandHandler,
+    CommandRefused,
+    build_command_table,
+    parse_choice,
+    parse_integer,
+    parse_number,
+)
 from rigsim.boxes.device import Wiring
-from rigsim.boxes.led_sequencer import LED_MS, LedSequencer, Run
-from rigsim.boxes.led_table import LEVEL_STEPS, LedPulse, Switch, table_crc
+from rigsim.boxes.led_sequencer import LED_RANGE_MS, LedSequencer, SequenceRun
+from rigsim.boxes.led_table import LEVEL_STEPS, LedPulse, SequenceEvent, table_crc
 
 DEFAULT_LED_MS = 100.0
 _GAINS_PATTERN = re.compile(r"[0-9]{1,4}(\+[0-9]{1,4})*")
@@ -64,7 +72,7 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
     def __init__(self, wiring: Wiring) -> None:
         rig, faults = wiring.rig, wiring.faults
         self._s_per_deg = rig.polarizer_move_s / 90.0
-        self._shares = led_table.pattern_shares(rig.lights)
+        self._shares = led_table.pattern_led_fractions(rig.lights)
         health = np.ones(len(rig.lights))
         for led, share in faults.weak_leds.items():
             health[led] = share
@@ -95,7 +103,7 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
 
     def commands(self) -> dict[str, Command]:
         """Return the command table: the manual of the box."""
-        acts: dict[str, Act] = {
+        acts: dict[str, CommandHandler] = {
             "SEQ:DEF": self._define_rows,
             "PATT": self._light,
             "PATT?": self._lit_now,
@@ -106,21 +114,21 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
             "GAIN:DEF": self._define_gains,
             "GAIN:CRC?": lambda *_: f"{len(self._gains_sent)},{table_crc(self._gains_sent)}",
         }
-        return super().commands() | command_table("gradient_sphere", acts)
+        return super().commands() | build_command_table("gradient_sphere", acts)
 
     # analyser ---------------------------------------------------------------------------------
 
-    def turning(self, now: float) -> bool:
+    def is_analyzer_rotating(self, now: float) -> bool:
         """Tell whether the analyser turns."""
         return now < self._settled_at
 
-    def busy(self, now: float) -> bool:
+    def is_busy(self, now: float) -> bool:
         """Tell whether a scan is stepping or the analyser turns."""
-        return super().busy(now) or self.turning(now)
+        return super().is_busy(now) or self.is_analyzer_rotating(now)
 
     def states(self, now: float) -> dict[int, bool]:
         """Return those of all boxes with LEDs, and 1024 turning."""
-        return super().states(now) | {1024: self.turning(now)}
+        return super().states(now) | {1024: self.is_analyzer_rotating(now)}
 
     def _turn(self, reading_deg: float, now: float) -> None:
         start = max(now, self._settled_at)
@@ -128,19 +136,19 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         self.analyser_deg = reading_deg
 
     def _set_stop(self, arguments: str, now: float) -> None:
-        self._set_angle(choice(arguments, ("0", "90")), now)
+        self._set_angle(parse_choice(arguments, ("0", "90")), now)
 
     def _set_angle(self, arguments: str, now: float) -> None:
-        reading_deg = round(number(arguments, *led_table.ANALYZER_RANGE_DEG, "degrees"), 3)
+        reading_deg = round(parse_number(arguments, *led_table.ANALYZER_RANGE_DEG, "degrees"), 3)
         self._require_still()
-        Refused.when(self.lit, Code.IGNORED, "a light is on; PATT DARK first")
+        CommandRefused.raise_if(self.lit, Code.IGNORED, "a light is on; PATT DARK first")
         self._sequence_armed = False
         self._turn(reading_deg, now)
 
     def _require_settled(self, now: float) -> None:
-        if self.turning(now):
+        if self.is_analyzer_rotating(now):
             wait_ms = (self._settled_at - now) * 1e3
-            raise Refused(Code.IGNORED, f"analyser turning, {wait_ms:.0f} ms")
+            raise CommandRefused(Code.IGNORED, f"analyser turning, {wait_ms:.0f} ms")
 
     # light ------------------------------------------------------------------------------------
 
@@ -174,7 +182,7 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         for led, driven in enumerate(self._levels(pattern, level)):
             if not self.bank.switch_on(led, driven, now, end_s=end_s) and led not in self._failed:
                 self._failed.add(led)
-                self.say("LED:FAIL", str(led))
+                self.queue_event("LED:FAIL", str(led))
         shares = np.array(self.gains) / LEVEL_STEPS * self._health
         given = () if (shares == 1.0).all() else tuple(shares.tolist())
         self._shining = PatternLight(pattern, level, now, now, self.analyser_deg, given)
@@ -188,20 +196,22 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
     def _light(self, arguments: str, now: float) -> None:
         self._require_still()
         name, *more = arguments.split(",")
-        Refused.when(len(more) > 2, Code.SYNTAX, "expected PATTERN,MS,LEVEL")
-        pattern = led_table.pattern_name(name)
+        CommandRefused.raise_if(len(more) > 2, Code.SYNTAX, "expected PATTERN,MS,LEVEL")
+        pattern = led_table.parse_pattern_name(name)
         if pattern == "dark":
-            Refused.when(more, Code.SYNTAX, "expected DARK")
+            CommandRefused.raise_if(more, Code.SYNTAX, "expected DARK")
             self.bank.all_off(now)
             return
-        longest_ms = min(LED_MS[1], self._limits.max_on_s * 1e3)
-        span_ms = number(more[0], LED_MS[0], longest_ms, "ms") if more else DEFAULT_LED_MS
-        level = whole(more[1], 1, LEVEL_STEPS) / LEVEL_STEPS if len(more) > 1 else 1.0
+        longest_ms = min(LED_RANGE_MS[1], self._limits.max_on_s * 1e3)
+        span_ms = (
+            parse_number(more[0], LED_RANGE_MS[0], longest_ms, "ms") if more else DEFAULT_LED_MS
+        )
+        level = parse_integer(more[1], 1, LEVEL_STEPS) / LEVEL_STEPS if len(more) > 1 else 1.0
         self._require_closed_stop()
         self._require_settled(now)
         end_s = now + span_ms / 1e3
         wanted = self._wanted(pattern, level, now, end_s)
-        self.bank.require(wanted, now)
+        self.bank.require_within_limits(wanted, now)
         self._require_calm(wanted, now)
         self._sequence_armed = False
         self._failed = set()
@@ -214,29 +224,33 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
     # scans ------------------------------------------------------------------------------------
 
     def _parse_rows(self, text: str) -> list[led_table.PatternRow]:
-        return led_table.parse_patterns(text, cameras=self._cameras, most_us=self._row_max_us)
+        return led_table.parse_pattern_rows(text, cameras=self._cameras, max_us=self._row_max_us)
 
     def _lit_by(self, rows: Sequence[led_table.PatternRow], now: float) -> list[LedPulse]:
         self._require_settled(now)
-        times = led_table.starts(rows, reading_deg=self.analyser_deg, s_per_deg=self._s_per_deg)
+        times = led_table.pattern_start_times(
+            rows, reading_deg=self.analyser_deg, s_per_deg=self._s_per_deg
+        )
         found: list[LedPulse] = []
         for row, (_, lit_s) in zip(rows, times, strict=True):
             start_s = now + lit_s
             found += self._wanted(row.pattern, row.level, start_s, start_s + row.dwell_us * 1e-6)
         return found
 
-    def _schedule(self, rows: Sequence[led_table.PatternRow]) -> list[Switch]:
+    def _schedule(self, rows: Sequence[led_table.PatternRow]) -> list[SequenceEvent]:
         self._failed = set()
-        return led_table.schedule(
+        return led_table.schedule_pattern_rows(
             rows,
             reading_deg=self.analyser_deg,
             s_per_deg=self._s_per_deg,
             settle_s=self._limits.settle_s,
         )
 
-    def _switch_light(self, run: Run[led_table.PatternRow], switch: Switch, now: float) -> None:
+    def _switch_light(
+        self, run: SequenceRun[led_table.PatternRow], switch: SequenceEvent, now: float
+    ) -> None:
         row = run.rows[switch.row]
-        if switch.what == "rotate":
+        if switch.action == "rotate":
             self.bank.all_off(now)
             self._turn(row.analyser_deg, now)
         else:
@@ -254,11 +268,11 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         self._require_still()
         first_text, _, rest = arguments.partition(",")
         if _GAINS_PATTERN.fullmatch(rest) is None:
-            raise Refused(Code.SYNTAX, "expected FIRST,GAIN+GAIN...")
-        first = whole(first_text, 0, len(self._gains_sent))
+            raise CommandRefused(Code.SYNTAX, "expected FIRST,GAIN+GAIN...")
+        first = parse_integer(first_text, 0, len(self._gains_sent))
         gains = [int(part) for part in rest.split("+")]
         if first + len(gains) > self.bank.count or max(gains) > LEVEL_STEPS:
-            raise Refused(
+            raise CommandRefused(
                 Code.OUT_OF_RANGE, f"expected 0 to {LEVEL_STEPS} for {self.bank.count} LEDs"
             )
         self._gains_sent[first : first + len(gains)] = gains

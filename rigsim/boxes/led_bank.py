@@ -8,11 +8,11 @@ import numpy as np
 
 from capture.devices.wire import Code
 from capture.rig import LedLimits, Rig
-from rigsim.boxes.command import Refused
+from rigsim.boxes.command import CommandRefused
 from rigsim.boxes.faults import Faults
 from rigsim.boxes.led_table import LedPulse
 
-CLEAR_SHARE = 0.5
+TRIP_RESET_FRACTION = 0.5
 """Temperature, of the trip's, below which a hot LED may be lit again."""
 
 
@@ -53,7 +53,7 @@ class LedBank:
         return tuple(sorted(self._lit))
 
     @property
-    def any_hot(self) -> bool:
+    def has_tripped(self) -> bool:
         """Whether the driver has tripped for an LED."""
         return bool(self._hot.any())
 
@@ -86,7 +86,7 @@ class LedBank:
             self._hot[led] = True
         for led in [k for k, (_, _, end_s) in self._lit.items() if end_s <= now]:
             self.switch_off(led, now)
-        self._hot &= self._heat >= CLEAR_SHARE * self.limits.thermal_trip
+        self._hot &= self._heat >= TRIP_RESET_FRACTION * self.limits.thermal_trip
         return tripped
 
     def _heat_until(self, now: float) -> None:
@@ -128,7 +128,7 @@ class LedBank:
         for led in list(self._lit):
             self.switch_off(led, now)
 
-    def going_on(self, now: float) -> list[LedPulse]:
+    def ongoing_pulses(self, now: float) -> list[LedPulse]:
         """Return the stretches of light that have not ended, as given so far."""
         return [
             LedPulse(led, level * self._weak.get(led, 1.0), since, max(now, since))
@@ -137,32 +137,40 @@ class LedBank:
 
     # what is asked for ------------------------------------------------------------------------
 
-    def since(self, start_s: float) -> list[LedPulse]:
+    def pulses_since(self, start_s: float) -> list[LedPulse]:
         """Return light driven after `start_s` and, to its end, what is still going on."""
         past = [pulse for row in self._past.values() for pulse in row if pulse.t_off_s > start_s]
         still = [LedPulse(led, level, on, end) for led, (level, on, end) in self._lit.items()]
         return past + [pulse for pulse in still if math.isfinite(pulse.t_off_s)]
 
-    def require(self, wanted: Iterable[LedPulse], now: float) -> tuple[float, float, float]:
-        """Return most duty, heat and dose (Ws) with `wanted` light; refuse what is too much."""
+    def require_within_limits(
+        self, requested: Iterable[LedPulse], now: float
+    ) -> tuple[float, float, float]:
+        """Return most duty, heat and dose (Ws) with `requested` light; refuse what is too much."""
         limits = self.limits
         rows: dict[int, list[LedPulse]] = {}
-        for pulse in wanted:
+        for pulse in requested:
             rows.setdefault(pulse.led, []).append(pulse)
         most_duty = most_heat = most_dose = 0.0
         self._heat_until(now)
         for led, new in rows.items():
-            Refused.when(self._hot[led], Code.THERMAL, f"LED {led}, wait until it has cooled")
+            CommandRefused.raise_if(
+                self._hot[led], Code.THERMAL, f"LED {led}, wait until it has cooled"
+            )
             duty = self._duty(led, new, now)
             if duty > limits.max_duty + 1e-9:
-                raise Refused(Code.DUTY, f"LED {led}, {duty:.3f} over {limits.duty_window_s:g} s")
+                raise CommandRefused(
+                    Code.DUTY, f"LED {led}, {duty:.3f} over {limits.duty_window_s:g} s"
+                )
             heat = self._heat_after(led, new, now)
             if heat >= limits.thermal_trip:
-                raise Refused(Code.THERMAL, f"LED {led} would reach {heat:.2f}")
+                raise CommandRefused(Code.THERMAL, f"LED {led} would reach {heat:.2f}")
             give = sum(pulse.level * (pulse.t_off_s - pulse.t_on_s) for pulse in new)
             dose = float(self._dose_ws[led] + self._power_w[led] * give)
             if dose > limits.dose_ws:
-                raise Refused(Code.LIGHT_DOSE, f"LED {led}, {dose:.2f} of {limits.dose_ws:g} Ws")
+                raise CommandRefused(
+                    Code.LIGHT_DOSE, f"LED {led}, {dose:.2f} of {limits.dose_ws:g} Ws"
+                )
             most_duty, most_heat = max(most_duty, duty), max(most_heat, heat)
             most_dose = max(most_dose, dose)
         return most_duty, most_heat, most_dose

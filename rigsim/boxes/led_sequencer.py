@@ -14,16 +14,31 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from capture.devices.wire import Code
-from rigsim.boxes.command import Act, Command, Refused, choice, command_table, whole, word
+from rigsim.boxes.command import (
+    Command,
+    CommandHandler,
+    CommandRefused,
+    build_command_table,
+    parse_choice,
+    parse_integer,
+    parse_token,
+)
 from rigsim.boxes.device import Device, Wiring
-from rigsim.boxes.eye_guard import EyeGuard
+from rigsim.boxes.eye_guard import EyeFlickerMonitor
 from rigsim.boxes.led_bank import LedBank
-from rigsim.boxes.led_table import LEVEL_STEPS, ROW_US, LedPulse, Switch, TableRow, table_crc
+from rigsim.boxes.led_table import (
+    LEVEL_STEPS,
+    ROW_RANGE_US,
+    LedPulse,
+    SequenceEvent,
+    TableRow,
+    table_crc,
+)
 
 _MASK_PATTERN = re.compile(r"[0-9A-Fa-f]{1,8}")
-LED_MS = (1.0, 500.0)
+LED_RANGE_MS = (1.0, 500.0)
 EYE_STATES = ("OPEN", "CLOSED", "SHIELDED")
-HISTORY_S = 1.0
+FLICKER_HISTORY_S = 1.0
 """Light so long ago counts as one with light to come."""
 
 
@@ -31,13 +46,13 @@ RowT = TypeVar("RowT", bound=TableRow)
 
 
 @dataclass(slots=True)
-class Run(Generic[RowT]):
+class SequenceRun(Generic[RowT]):
     """A sequence that was triggered."""
 
     token: str
     start_s: float
     rows: list[RowT]
-    todo: list[Switch]
+    pending: list[SequenceEvent]
     state: str = "RUN"
     row: int = -1
 
@@ -59,8 +74,8 @@ class LedSequencer(Device, Generic[RowT]):
         self._cameras = len(rig.views)
         self.bank = LedBank(rig, self.faults, on_light)
         self._limits = self.bank.limits
-        self._guard = EyeGuard(rig.lights)
-        self._run: Run[RowT] | None = None
+        self._guard = EyeFlickerMonitor(rig.lights)
+        self._run: SequenceRun[RowT] | None = None
         # tokens and times of all sequences since the box was made
         self.runs: list[tuple[str, float]] = []
 
@@ -75,11 +90,11 @@ class LedSequencer(Device, Generic[RowT]):
         """Return the light of a sequence that would begin at `now`."""
 
     @abstractmethod
-    def _schedule(self, rows: Sequence[RowT]) -> list[Switch]:
+    def _schedule(self, rows: Sequence[RowT]) -> list[SequenceEvent]:
         """Return everything that happens in a sequence, in order of time."""
 
     @abstractmethod
-    def _switch_light(self, run: Run[RowT], switch: Switch, now: float) -> None:
+    def _switch_light(self, run: SequenceRun[RowT], switch: SequenceEvent, now: float) -> None:
         """Do what a switch says that is neither ``pulse`` nor ``end``."""
 
     # settings ---------------------------------------------------------------------------------
@@ -101,11 +116,11 @@ class LedSequencer(Device, Generic[RowT]):
             "leds": self.bank.count,
             "cameras": self._cameras,
             "max_rows": limits.max_rows,
-            "row_min_us": ROW_US[0],
+            "row_min_us": ROW_RANGE_US[0],
             "row_max_us": self._row_max_us,
             "level_steps": LEVEL_STEPS,
             "max_at_once": limits.max_at_once,
-            "led_max_ms": min(LED_MS[1], limits.max_on_s * 1e3),
+            "led_max_ms": min(LED_RANGE_MS[1], limits.max_on_s * 1e3),
             "max_duty": limits.max_duty,
             "duty_window_s": limits.duty_window_s,
             "thermal_tau_s": limits.thermal_tau_s,
@@ -119,11 +134,11 @@ class LedSequencer(Device, Generic[RowT]):
 
     @property
     def _row_max_us(self) -> int:
-        return min(ROW_US[1], round(self._limits.max_on_s * 1e6))
+        return min(ROW_RANGE_US[1], round(self._limits.max_on_s * 1e6))
 
     def commands(self) -> dict[str, Command]:
         """Return the commands that these boxes share."""
-        acts: dict[str, Act] = {
+        acts: dict[str, CommandHandler] = {
             "SEQ:CLE": self._clear_table,
             "SEQ:CRC?": lambda *_: f"{len(self.table)},{table_crc(self.table)}",
             "SEQ:ARM": self._arm_sequence,
@@ -138,7 +153,7 @@ class LedSequencer(Device, Generic[RowT]):
             "DOSE?": self._dose,
             "DOSE:NEW": self._new_subject,
         }
-        return command_table("led_sequencer", acts)
+        return build_command_table("led_sequencer", acts)
 
     # time -------------------------------------------------------------------------------------
 
@@ -146,8 +161,8 @@ class LedSequencer(Device, Generic[RowT]):
         """Return when the sequence or an LED will next change, in s; inf for never."""
         run = self._run
         due = self.bank.deadline()
-        if run is not None and run.todo:
-            due = min(due, run.start_s + run.todo[0].t_s)
+        if run is not None and run.pending:
+            due = min(due, run.start_s + run.pending[0].t_s)
         return due
 
     def advance(self, now: float) -> None:
@@ -155,8 +170,8 @@ class LedSequencer(Device, Generic[RowT]):
         while (due := self.deadline()) <= now:
             self._pass_until(due)
             run = self._run
-            while run is not None and run.todo and run.start_s + run.todo[0].t_s <= due:
-                self._switch(run, run.todo.pop(0), due)
+            while run is not None and run.pending and run.start_s + run.pending[0].t_s <= due:
+                self._switch(run, run.pending.pop(0), due)
         self._pass_until(now)
 
     def _pass_until(self, now: float) -> None:
@@ -165,16 +180,16 @@ class LedSequencer(Device, Generic[RowT]):
             self._events += [("LED:HOT", str(led)) for led in tripped]
             self.go_dark(now)
 
-    def _switch(self, run: Run[RowT], switch: Switch, now: float) -> None:
-        if switch.what == "pulse":
+    def _switch(self, run: SequenceRun[RowT], switch: SequenceEvent, now: float) -> None:
+        if switch.action == "pulse":
             run.row = switch.row
             self._steps[switch.row] = self.clock_us(now)
             self._on_trigger(now, run.rows[switch.row].mask & self.mask)
-            self.say("SEQ:STEP", f"{switch.row},{self.clock_us(now)}")
-        elif switch.what == "end":
+            self.queue_event("SEQ:STEP", f"{switch.row},{self.clock_us(now)}")
+        elif switch.action == "end":
             self.bank.all_off(now)
             run.state = "DONE"
-            self.say("SEQ:DONE", f"{len(run.rows)},{self.clock_us(now)}")
+            self.queue_event("SEQ:DONE", f"{len(run.rows)},{self.clock_us(now)}")
         else:
             self._switch_light(run, switch, now)
 
@@ -183,10 +198,10 @@ class LedSequencer(Device, Generic[RowT]):
         self.bank.all_off(now)
         self._sequence_armed = False
         run = self._run
-        if run is not None and run.todo:
-            run.todo.clear()
+        if run is not None and run.pending:
+            run.pending.clear()
             run.state = "STOP"
-            self.say("SEQ:STOP", f"{run.row},{self.clock_us(now)}")
+            self.queue_event("SEQ:STOP", f"{run.row},{self.clock_us(now)}")
 
     @property
     def lit(self) -> bool:
@@ -194,23 +209,23 @@ class LedSequencer(Device, Generic[RowT]):
         return bool(self.bank.lit)
 
     @property
-    def running(self) -> bool:
+    def is_running(self) -> bool:
         """Whether a sequence is stepping."""
         return self._run is not None and self._run.state == "RUN"
 
-    def busy(self, now: float) -> bool:
+    def is_busy(self, now: float) -> bool:
         """Tell whether a sequence is stepping."""
-        return self.running
+        return self.is_running
 
     def states(self, now: float) -> dict[int, bool]:
         """Return 16 running, 32 sequence armed, 64 lit, 128 hot, 512 eyes safe."""
-        running = {16: self.running, 32: self._sequence_armed, 64: self.lit}
-        return running | {128: self.bank.any_hot, 512: self.eyes != "OPEN"}
+        running = {16: self.is_running, 32: self._sequence_armed, 64: self.lit}
+        return running | {128: self.bank.has_tripped, 512: self.eyes != "OPEN"}
 
     # sequence ---------------------------------------------------------------------------------
 
     def _require_still(self) -> None:
-        Refused.when(self.running, Code.IGNORED, "a sequence is running")
+        CommandRefused.raise_if(self.is_running, Code.IGNORED, "a sequence is running")
 
     def _clear_table(self, _: str, now: float) -> None:
         self._require_still()
@@ -220,26 +235,28 @@ class LedSequencer(Device, Generic[RowT]):
     def _define_rows(self, arguments: str, now: float) -> None:
         self._require_still()
         first_text, comma, rest = arguments.partition(",")
-        Refused.when(not comma, Code.SYNTAX, "expected FIRST,ROW;...")
+        CommandRefused.raise_if(not comma, Code.SYNTAX, "expected FIRST,ROW;...")
         # a gap in the table would be a row that nobody described
-        first = whole(first_text, 0, len(self.table))
+        first = parse_integer(first_text, 0, len(self.table))
         rows = self._parse_rows(rest)
         if first + len(rows) > self._limits.max_rows:
-            raise Refused(Code.OUT_OF_RANGE, f"expected at most {self._limits.max_rows} rows")
+            raise CommandRefused(
+                Code.OUT_OF_RANGE, f"expected at most {self._limits.max_rows} rows"
+            )
         settle_us = self._limits.settle_s * 1e6
         if any(row.dwell_us < settle_us for row in rows):
-            raise Refused(Code.OUT_OF_RANGE, f"expected rows longer than {settle_us:g} us")
+            raise CommandRefused(Code.OUT_OF_RANGE, f"expected rows longer than {settle_us:g} us")
         self.table[first : first + len(rows)] = rows
         self._sequence_armed = False
 
     def _arm_sequence(self, arguments: str, now: float) -> str:
         self._require_still()
-        rows = whole(arguments, 1, self._limits.max_rows)
+        rows = parse_integer(arguments, 1, self._limits.max_rows)
         if rows != len(self.table):
-            raise Refused(Code.OUT_OF_RANGE, f"the table has {len(self.table)} rows")
+            raise CommandRefused(Code.OUT_OF_RANGE, f"the table has {len(self.table)} rows")
         self._require_closed_stop()
         wanted = self._lit_by(self.table, now)
-        duty, heat, dose_ws = self.bank.require(wanted, now)
+        duty, heat, dose_ws = self.bank.require_within_limits(wanted, now)
         flashes, rms = self._require_calm(wanted, now)
         self._sequence_armed = True
         return f"{flashes:.2f},{rms:.4f},{duty:.4f},{heat:.4f},{dose_ws:.4f}"
@@ -250,27 +267,31 @@ class LedSequencer(Device, Generic[RowT]):
         Flashes are counted together with those of the last second.
         """
         limits = self._limits
-        past = [pulse for pulse in self.bank.since(now - HISTORY_S) if pulse.t_on_s < now]
+        past = [
+            pulse for pulse in self.bank.pulses_since(now - FLICKER_HISTORY_S) if pulse.t_on_s < now
+        ]
         flashes, rms = self._guard.flashes_per_s([*past, *wanted]), self._guard.rms(wanted)
         if self.eyes == "OPEN":
             if flashes >= limits.max_flashes_per_s:
-                raise Refused(Code.FLICKER, f"{flashes:.1f} flashes per s at open eyes")
+                raise CommandRefused(Code.FLICKER, f"{flashes:.1f} flashes per s at open eyes")
             if rms > limits.max_flicker_rms:
-                raise Refused(Code.FLICKER, f"rms {rms:.2f} of 3 to 65 Hz at open eyes")
+                raise CommandRefused(Code.FLICKER, f"rms {rms:.2f} of 3 to 65 Hz at open eyes")
         return flashes, rms
 
     def _trigger(self, arguments: str, now: float) -> str:
-        token = word(arguments)
+        token = parse_token(arguments)
         self._require_still()
         self._require_closed_stop()
-        Refused.when(not self._sequence_armed, Code.NOT_ARMED, "SEQ:ARM judges the table first")
+        CommandRefused.raise_if(
+            not self._sequence_armed, Code.NOT_ARMED, "SEQ:ARM judges the table first"
+        )
         # light that was under way at SEQ:ARM, or came after it, has been given by now
-        self.bank.require(self._lit_by(self.table, now), now)
+        self.bank.require_within_limits(self._lit_by(self.table, now), now)
         self._sequence_armed = False
         self.bank.all_off(now)
         rows = list(self.table)
         self._steps = {}
-        self._run = Run(token, now, rows, self._schedule(rows))
+        self._run = SequenceRun(token, now, rows, self._schedule(rows))
         self.runs.append((token, now))
         self.advance(now)
         return f"{token},{self.clock_us(now)}"
@@ -284,35 +305,35 @@ class LedSequencer(Device, Generic[RowT]):
         return f"{run.state},{run.row},{len(run.rows)},{run.token}"
 
     def _step_time(self, arguments: str, now: float) -> str:
-        row = whole(arguments, 0, self._limits.max_rows - 1)
+        row = parse_integer(arguments, 0, self._limits.max_rows - 1)
         return str(self._steps[row]) if row in self._steps else "NONE"
 
     # cameras, eyes, dose ----------------------------------------------------------------------
 
     def _set_mask(self, arguments: str, now: float) -> None:
         if _MASK_PATTERN.fullmatch(arguments) is None:
-            raise Refused(Code.SYNTAX, "expected a mask in hexadecimal digits")
+            raise CommandRefused(Code.SYNTAX, "expected a mask in hexadecimal digits")
         mask = int(arguments, 16)
         if mask >= 1 << self._cameras:
-            raise Refused(Code.OUT_OF_RANGE, f"expected a mask of {self._cameras} cameras")
+            raise CommandRefused(Code.OUT_OF_RANGE, f"expected a mask of {self._cameras} cameras")
         self._require_still()
         self.mask = mask
 
     def _release(self, arguments: str, now: float) -> str:
-        token = word(arguments)
+        token = parse_token(arguments)
         self._require_still()
         self._on_trigger(now, self.mask)
         return f"{token},{self.clock_us(now)}"
 
     def _set_eyes(self, arguments: str, now: float) -> None:
-        self.eyes = choice(arguments, EYE_STATES)
+        self.eyes = parse_choice(arguments, EYE_STATES)
         self._sequence_armed = False
 
     def _dose(self, arguments: str, now: float) -> str:
-        return f"{self.bank.dose_ws(whole(arguments, 0, self.bank.count - 1)):.6f}"
+        return f"{self.bank.dose_ws(parse_integer(arguments, 0, self.bank.count - 1)):.6f}"
 
     def _new_subject(self, arguments: str, now: float) -> None:
-        word(arguments)
+        parse_token(arguments)
         self._require_still()
         self.bank.new_subject()
         # eyes are a person's, and so is what was said of them

@@ -13,10 +13,10 @@ from capture.devices.wire import Code
 from capture.plan.steps import LIGHT_PATTERNS
 from capture.rig import Light
 from rigsim.arrays import Float64Array
-from rigsim.boxes.command import Refused, number
+from rigsim.boxes.command import CommandRefused, parse_number
 
 LEVEL_STEPS = 1000
-ROW_US = (2_000, 500_000)
+ROW_RANGE_US = (2_000, 500_000)
 ANALYZER_RANGE_DEG = (0.0, 180.0)
 _PATTERN_ROW_PATTERN = re.compile(
     r"([A-Za-z-]{1,4}):([0-9]{1,3}(?:\.[0-9]{1,3})?):([0-9]{1,4}):([0-9]{1,7}):([0-9A-Fa-f]{1,8})"
@@ -59,19 +59,21 @@ class TableRow:
         """How long it is lit, s."""
         return self.dwell_us * 1e-6
 
-    def checked(self, is_dark: bool, *, cameras: int, most_us: int) -> Self:
+    def require_valid(self, is_dark: bool, *, cameras: int, max_us: int) -> Self:
         """Return the row, or refuse what the box cannot do."""
         if self.level_steps > LEVEL_STEPS or is_dark != (self.level_steps == 0):
-            raise Refused(Code.OUT_OF_RANGE, f"expected level 1 to {LEVEL_STEPS}, 0 when dark")
-        if not ROW_US[0] <= self.dwell_us <= most_us:
-            raise Refused(Code.OUT_OF_RANGE, f"expected {ROW_US[0]} to {most_us} us")
+            raise CommandRefused(
+                Code.OUT_OF_RANGE, f"expected level 1 to {LEVEL_STEPS}, 0 when dark"
+            )
+        if not ROW_RANGE_US[0] <= self.dwell_us <= max_us:
+            raise CommandRefused(Code.OUT_OF_RANGE, f"expected {ROW_RANGE_US[0]} to {max_us} us")
         if self.mask >= 1 << cameras:
-            raise Refused(Code.OUT_OF_RANGE, f"expected a mask of {cameras} cameras")
+            raise CommandRefused(Code.OUT_OF_RANGE, f"expected a mask of {cameras} cameras")
         return self
 
 
 @dataclass(frozen=True, slots=True)
-class Row(TableRow):
+class LedTableRow(TableRow):
     """One row of the table."""
 
     leds: tuple[int, ...]
@@ -89,30 +91,34 @@ class Row(TableRow):
         return f"{leds}:{self.level_steps}:{self.dwell_us}:{self.mask:X}"
 
 
-def parse_leds(text: str, *, count: int, at_once: int) -> tuple[int, ...]:
+def parse_leds(text: str, *, count: int, max_leds: int) -> tuple[int, ...]:
     """Return the numbers in ``3+17``, rising; refuse what is no list of existing LEDs."""
     parts = text.split("+")
     if not all(part.isdecimal() and len(part) <= 4 for part in parts):
-        raise Refused(Code.SYNTAX, "expected LED numbers joined by +")
+        raise CommandRefused(Code.SYNTAX, "expected LED numbers joined by +")
     numbers = tuple(sorted({int(part) for part in parts}))
-    Refused.when(len(numbers) != len(parts), Code.SYNTAX, "an LED stands twice")
-    Refused.when(numbers[-1] >= count, Code.OUT_OF_RANGE, f"expected LED 0 to {count - 1}")
-    if len(numbers) > at_once:
-        raise Refused(Code.OUT_OF_RANGE, f"expected at most {at_once} LEDs at once")
+    CommandRefused.raise_if(len(numbers) != len(parts), Code.SYNTAX, "an LED stands twice")
+    CommandRefused.raise_if(
+        numbers[-1] >= count, Code.OUT_OF_RANGE, f"expected LED 0 to {count - 1}"
+    )
+    if len(numbers) > max_leds:
+        raise CommandRefused(Code.OUT_OF_RANGE, f"expected at most {max_leds} LEDs at once")
     return numbers
 
 
-def parse_rows(text: str, *, count: int, at_once: int, cameras: int, most_us: int) -> list[Row]:
+def parse_rows(
+    text: str, *, count: int, max_leds: int, cameras: int, max_us: int
+) -> list[LedTableRow]:
     """Return rows separated by ``;``, each ``leds:level:us:mask``."""
     rows = []
     for part in text.split(";"):
         found = _ROW_PATTERN.fullmatch(part)
         if found is None:
-            raise Refused(Code.SYNTAX, "expected LEDS:LEVEL:US:MASK;...")
+            raise CommandRefused(Code.SYNTAX, "expected LEDS:LEVEL:US:MASK;...")
         leds_text, level, dwell, mask = found.groups()
-        leds = () if leds_text == "-" else parse_leds(leds_text, count=count, at_once=at_once)
-        row = Row(leds, int(level), int(dwell), int(mask, 16))
-        rows.append(row.checked(not leds, cameras=cameras, most_us=most_us))
+        leds = () if leds_text == "-" else parse_leds(leds_text, count=count, max_leds=max_leds)
+        row = LedTableRow(leds, int(level), int(dwell), int(mask, 16))
+        rows.append(row.require_valid(not leds, cameras=cameras, max_us=max_us))
     return rows
 
 
@@ -122,36 +128,40 @@ def table_crc(rows: Sequence[object]) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Switch:
+class SequenceEvent:
     """Something that the sequencer does at a time."""
 
     t_s: float
     """Since the sequence began, s."""
-    what: str
+    action: str
     """``on``, ``turn`` (of one row into the next), ``pulse`` or ``end``."""
     row: int
     """Row that it belongs to."""
 
 
-def switches(rows: Sequence[Row], *, overlap_s: float, settle_s: float) -> list[Switch]:
+def schedule_rows(
+    rows: Sequence[LedTableRow], *, overlap_s: float, settle_s: float
+) -> list[SequenceEvent]:
     """Return everything that happens in a sequence, in order of time.
 
     The next row's LEDs come on `overlap_s` before the last row's go off; cameras are released
     `settle_s` after the row's turn, when only its own LEDs are on and steady.
     """
-    found: list[Switch] = []
+    found: list[SequenceEvent] = []
     start_s = 0.0
     for place, row in enumerate(rows):
         if place:
-            found.append(Switch(start_s - overlap_s, "on", place))
-        found.append(Switch(start_s, "turn", place))
-        found.append(Switch(start_s + settle_s, "pulse", place))
+            found.append(SequenceEvent(start_s - overlap_s, "on", place))
+        found.append(SequenceEvent(start_s, "turn", place))
+        found.append(SequenceEvent(start_s + settle_s, "pulse", place))
         start_s += row.dwell_s
-    found.append(Switch(start_s, "end", len(rows) - 1))
+    found.append(SequenceEvent(start_s, "end", len(rows) - 1))
     return sorted(found, key=lambda switch: switch.t_s)
 
 
-def lit_by(rows: Sequence[Row], start_s: float, *, overlap_s: float) -> list[LedPulse]:
+def pulses_from_rows(
+    rows: Sequence[LedTableRow], start_s: float, *, overlap_s: float
+) -> list[LedPulse]:
     """Return the light of a sequence that begins at `start_s`, per LED without gaps or overlap."""
     found: list[LedPulse] = []
     going: dict[int, tuple[float, float]] = {}  # LED -> level, since
@@ -190,36 +200,36 @@ class PatternRow(TableRow):
         return f"{text}:{self.mask:X}"
 
 
-def pattern_name(text: str) -> str:
+def parse_pattern_name(text: str) -> str:
     """Return the pattern that a command names, or refuse."""
     name = text.lower()
     if name not in LIGHT_PATTERNS:
-        raise Refused(Code.SYNTAX, f"expected {' or '.join(LIGHT_PATTERNS).upper()}")
+        raise CommandRefused(Code.SYNTAX, f"expected {' or '.join(LIGHT_PATTERNS).upper()}")
     return name
 
 
-def parse_patterns(text: str, *, cameras: int, most_us: int) -> list[PatternRow]:
+def parse_pattern_rows(text: str, *, cameras: int, max_us: int) -> list[PatternRow]:
     """Return rows separated by ``;``, each ``pattern:degrees:level:us:mask``."""
     rows = []
     for part in text.split(";"):
         found = _PATTERN_ROW_PATTERN.fullmatch(part)
         if found is None:
-            raise Refused(Code.SYNTAX, "expected PATTERN:DEGREES:LEVEL:US:MASK;...")
+            raise CommandRefused(Code.SYNTAX, "expected PATTERN:DEGREES:LEVEL:US:MASK;...")
         name, angle, level, dwell, mask = found.groups()
-        pattern = pattern_name(name)
-        angle_deg = number(angle, *ANALYZER_RANGE_DEG, "degrees")
+        pattern = parse_pattern_name(name)
+        angle_deg = parse_number(angle, *ANALYZER_RANGE_DEG, "degrees")
         row = PatternRow(pattern, angle_deg, int(level), int(dwell), int(mask, 16))
-        rows.append(row.checked(pattern == "dark", cameras=cameras, most_us=most_us))
+        rows.append(row.require_valid(pattern == "dark", cameras=cameras, max_us=max_us))
     return rows
 
 
-def pattern_shares(lights: Sequence[Light]) -> dict[str, Float64Array]:
+def pattern_led_fractions(lights: Sequence[Light]) -> dict[str, Float64Array]:
     """Return what each pattern asks of each LED, 0 to 1: pattern -> (L,).
 
     Examples
     --------
     >>> led = Light(name="a", position_mm=(0, 300, 400), radius_mm=3, power_w=1)
-    >>> {name: float(share[0].round(9)) for name, share in pattern_shares([led]).items()}
+    >>> {name: float(share[0].round(9)) for name, share in pattern_led_fractions([led]).items()}
     {'full': 1.0, 'x': 0.5, 'y': 0.8, 'z': 0.9, '-x': 0.5, '-y': 0.2, '-z': 0.1, 'dark': 0.0}
     """
     places = np.array([light.position_mm for light in lights], np.float64)
@@ -231,7 +241,7 @@ def pattern_shares(lights: Sequence[Light]) -> dict[str, Float64Array]:
     return {name: shares[name] for name in LIGHT_PATTERNS}
 
 
-def starts(
+def pattern_start_times(
     rows: Sequence[PatternRow], *, reading_deg: float, s_per_deg: float
 ) -> list[tuple[float, float]]:
     """Return when each row's turning of the analyser begins and when its light does, s.
@@ -255,21 +265,21 @@ def starts(
     return found
 
 
-def schedule(
+def schedule_pattern_rows(
     rows: Sequence[PatternRow], *, reading_deg: float, s_per_deg: float, settle_s: float
-) -> list[Switch]:
+) -> list[SequenceEvent]:
     """Return everything that happens in a scan, in order of time.
 
     ``rotate``: dark, and the analyser begins to turn; ``light``: a row's pattern comes on in place
     of the last; ``pulse``: its cameras are released, `settle_s` later; ``end``.
     """
-    found: list[Switch] = []
+    found: list[SequenceEvent] = []
     end_s = 0.0
-    times = starts(rows, reading_deg=reading_deg, s_per_deg=s_per_deg)
+    times = pattern_start_times(rows, reading_deg=reading_deg, s_per_deg=s_per_deg)
     for place, (row, (turn_s, lit_s)) in enumerate(zip(rows, times, strict=True)):
         if not math.isclose(turn_s, lit_s, abs_tol=1e-12):
-            found.append(Switch(turn_s, "rotate", place))
-        found.append(Switch(lit_s, "light", place))
-        found.append(Switch(lit_s + settle_s, "pulse", place))
+            found.append(SequenceEvent(turn_s, "rotate", place))
+        found.append(SequenceEvent(lit_s, "light", place))
+        found.append(SequenceEvent(lit_s + settle_s, "pulse", place))
         end_s = lit_s + row.dwell_s
-    return [*found, Switch(end_s, "end", len(rows) - 1)]
+    return [*found, SequenceEvent(end_s, "end", len(rows) - 1)]

@@ -19,9 +19,23 @@ from collections.abc import Mapping
 from typing import Any
 
 from capture.devices.wire import Code
-from rigsim.boxes.command import Act, Command, Later, Refused, command_table, number, word
+from rigsim.boxes.command import (
+    Command,
+    CommandHandler,
+    CommandRefused,
+    PendingReply,
+    build_command_table,
+    parse_number,
+    parse_token,
+)
 from rigsim.boxes.device import Device, Wiring
-from rigsim.boxes.source_shutter import COVER_S, LEVEL_STEPS, SHUTTER_MS, SourceLight, SourceShutter
+from rigsim.boxes.source_shutter import (
+    COVER_MOVE_S,
+    LEVEL_STEPS,
+    MIN_OPENING_MS,
+    SourceLight,
+    SourceShutter,
+)
 from rigsim.boxes.suction_pump import (
     MAX_PUMPING_S,
     MIN_SUCTION_MBAR,
@@ -33,7 +47,7 @@ from rigsim.boxes.suction_pump import (
 
 __all__ = ["ProbeUnit", "SourceLight"]
 
-THERMOMETER_C = 0.03
+THERMOMETER_STD_C = 0.03
 """Standard deviation of one reading of the camera's thermometer, kelvin."""
 _WHOLE_PATTERN = re.compile(r"[0-9]{1,4}")
 
@@ -76,10 +90,10 @@ class ProbeUnit(Device):
         return {
             "fibres": len(probe.fibres),
             "level_steps": LEVEL_STEPS,
-            "shutter_min_ms": SHUTTER_MS,
+            "shutter_min_ms": MIN_OPENING_MS,
             "shutter_max_ms": round(probe.max_open_s * 1e3, 6),
-            "shutter_lag_ms": SHUTTER_MS,
-            "cover_ms": COVER_S * 1e3,
+            "shutter_lag_ms": MIN_OPENING_MS,
+            "cover_ms": COVER_MOVE_S * 1e3,
             "suction_min_mbar": MIN_SUCTION_MBAR,
             "suction_max_mbar": probe.max_suction_mbar,
             "suction_min_ms": MIN_SUCTION_MS,
@@ -94,7 +108,7 @@ class ProbeUnit(Device):
 
     def commands(self) -> dict[str, Command]:
         """Return the command table: the manual of the box."""
-        acts: dict[str, Act] = {
+        acts: dict[str, CommandHandler] = {
             "HEAD:SITE": self._place,
             "HEAD:SITE?": self._get_place,
             "HEAD:FREE": self._take_away,
@@ -112,12 +126,12 @@ class ProbeUnit(Device):
             "FIB?": lambda *_: "ALL" if self.shutter.fibre is None else str(self.shutter.fibre),
             "CAM:TRIG": self._trigger_camera,
             "CAM:TEMP?": lambda _, now: (
-                f"{self._load.camera_c(now) + float(self._rng.normal(0.0, THERMOMETER_C)):.2f}"
+                f"{self._load.camera_c(now) + float(self._rng.normal(0.0, THERMOMETER_STD_C)):.2f}"
             ),
             "DOSE?": lambda *_: f"{self.shutter.dose_ws:.6f}",
             "DOSE:NEW": self._new_subject,
         }
-        return command_table("probe", acts)
+        return build_command_table("probe", acts)
 
     # time -------------------------------------------------------------------------------------
 
@@ -147,28 +161,30 @@ class ProbeUnit(Device):
         """Whether light comes out of the source."""
         return self.shutter.lit
 
-    def busy(self, now: float) -> bool:
+    def is_busy(self, now: float) -> bool:
         """Tell whether the shutter is open or the cover moves."""
-        return self.shutter.under_way(now)
+        return self.shutter.is_moving(now)
 
     def states(self, now: float) -> dict[int, bool]:
         """Return 16 busy, 32 sucking, 64 lit, 512 placed, 1024 resting, 2048 jammed."""
         pump, shutter = self.pump, self.shutter
-        lit = {16: self.busy(now), 32: pump.drawing, 64: shutter.lit, 2048: shutter.jammed}
-        return lit | {512: pump.placement is not None, 1024: pump.rest_ms(now) > 0}
+        lit = {16: self.is_busy(now), 32: pump.is_pumping, 64: shutter.lit, 2048: shutter.jammed}
+        return lit | {512: pump.placement is not None, 1024: pump.remaining_rest_ms(now) > 0}
 
     def _let_go(self, now: float, how: str) -> None:
         self.shutter.go_dark(now, how)
         self.pump.vent(now, how)
-        self.pump.take_away(now)
+        self.pump.remove_head(now)
 
     # head and pump ----------------------------------------------------------------------------
 
     def _place(self, arguments: str, now: float) -> None:
         label, _, angle = arguments.partition(",")
-        site = word(label)
-        angle_deg = number(angle, 0.0, 360.0, "degrees, less than 360")
-        Refused.when(angle_deg == 360.0, Code.OUT_OF_RANGE, "expected 0 to less than 360 degrees")
+        site = parse_token(label)
+        angle_deg = parse_number(angle, 0.0, 360.0, "degrees, less than 360")
+        CommandRefused.raise_if(
+            angle_deg == 360.0, Code.OUT_OF_RANGE, "expected 0 to less than 360 degrees"
+        )
         self.shutter.require_closed(now)
         self.pump.place(site, angle_deg, now)
 
@@ -179,9 +195,9 @@ class ProbeUnit(Device):
         return f"{site},{angle_deg:g}"
 
     def _take_away(self, _: str, now: float) -> None:
-        self.shutter.shut(now, "ASKED")
+        self.shutter.abort_opening(now, "ASKED")
         self.pump.vent(now, "ASKED")
-        self.pump.take_away(now)
+        self.pump.remove_head(now)
 
     def _pump(self, arguments: str, now: float) -> str:
         if arguments.upper() == "VENT":
@@ -190,9 +206,9 @@ class ProbeUnit(Device):
         on, _, rest = arguments.partition(",")
         length, comma, suction = rest.partition(",")
         if on.upper() != "ON" or not comma:
-            raise Refused(Code.SYNTAX, "expected ON,<ms>,<mbar> or VENT")
-        span_ms = number(length, MIN_SUCTION_MS, self._probe.max_suction_s * 1e3, "ms")
-        mbar = number(suction, MIN_SUCTION_MBAR, self._probe.max_suction_mbar, "mbar")
+            raise CommandRefused(Code.SYNTAX, "expected ON,<ms>,<mbar> or VENT")
+        span_ms = parse_number(length, MIN_SUCTION_MS, self._probe.max_suction_s * 1e3, "ms")
+        mbar = parse_number(suction, MIN_SUCTION_MBAR, self._probe.max_suction_mbar, "mbar")
         self._require_closed_stop()
         return self.pump.draw(span_ms / 1e3, mbar, now)
 
@@ -200,42 +216,44 @@ class ProbeUnit(Device):
 
     def _set_level(self, arguments: str, now: float) -> None:
         if _WHOLE_PATTERN.fullmatch(arguments) is None:
-            raise Refused(Code.SYNTAX, "expected a whole number of thousandths")
+            raise CommandRefused(Code.SYNTAX, "expected a whole number of thousandths")
         level = int(arguments)
         if level > LEVEL_STEPS:
-            raise Refused(Code.OUT_OF_RANGE, f"expected 0 to {LEVEL_STEPS} thousandths")
+            raise CommandRefused(Code.OUT_OF_RANGE, f"expected 0 to {LEVEL_STEPS} thousandths")
         if level > 0:
             self._require_closed_stop()
         self.shutter.set_level(level, now)
 
-    def _shut(self, arguments: str, now: float) -> str | Later:
+    def _shut(self, arguments: str, now: float) -> str | PendingReply:
         if arguments.upper() == "CLOSE":
             self.shutter.close(now)
             return ""
         what, _, length = arguments.partition(",")
-        Refused.when(what.upper() != "OPEN", Code.SYNTAX, "expected OPEN,<ms> or CLOSE")
-        span_ms = number(length, SHUTTER_MS, self._probe.max_open_s * 1e3, "ms")
+        CommandRefused.raise_if(what.upper() != "OPEN", Code.SYNTAX, "expected OPEN,<ms> or CLOSE")
+        span_ms = parse_number(length, MIN_OPENING_MS, self._probe.max_open_s * 1e3, "ms")
         self._require_closed_stop()
-        if self.shutter.level > 0 and not self.pump.holds:
-            raise Refused(Code.IGNORED, "the head is not held; PUMP ON, and wait")
+        if self.shutter.level > 0 and not self.pump.has_reached_target:
+            raise CommandRefused(Code.IGNORED, "the head is not held; PUMP ON, and wait")
         at_s, outcome = self.shutter.open(span_ms / 1e3, now)
-        return Later(at_s, outcome)
+        return PendingReply(at_s, outcome)
 
     def _get_shutter(self, _: str, now: float) -> str:
         if self.shutter.jammed:
             return "JAM"
-        return f"OPEN,{self.shutter.left_ms(now)}" if self.shutter.is_open else "CLOSED"
+        return f"OPEN,{self.shutter.remaining_ms(now)}" if self.shutter.is_open else "CLOSED"
 
     def _cover(self, arguments: str, now: float) -> None:
         if arguments.upper() == "ALL":
             self.shutter.cover(None, now)
             return
         if _WHOLE_PATTERN.fullmatch(arguments) is None:
-            raise Refused(Code.SYNTAX, "expected the number of a fibre, or ALL")
+            raise CommandRefused(Code.SYNTAX, "expected the number of a fibre, or ALL")
         if int(arguments) >= self.shutter.fibres:
-            raise Refused(Code.OUT_OF_RANGE, f"expected 0 to {self.shutter.fibres - 1} or ALL")
+            raise CommandRefused(
+                Code.OUT_OF_RANGE, f"expected 0 to {self.shutter.fibres - 1} or ALL"
+            )
         self.shutter.cover(int(arguments), now)
 
     def _new_subject(self, arguments: str, now: float) -> None:
-        word(arguments)
+        parse_token(arguments)
         self.shutter.dose_ws = 0.0

@@ -10,15 +10,15 @@ from dataclasses import dataclass
 
 from capture.devices.wire import Code
 from capture.rig import LedLimits
-from rigsim.boxes.command import Refused
+from rigsim.boxes.command import CommandRefused
 from rigsim.boxes.device import Device, Wiring
 
 LEVEL_STEPS = 1000
-SHUTTER_MS = 1.0
+MIN_OPENING_MS = 1.0
 """Shortest opening, ms, and time from the command to blades that have cleared the fibre."""
-JAM_S = 0.02
+JAM_DETECTION_S = 0.02
 """Time after which blades that have not closed are known to be stuck, s."""
-COVER_S = 0.3
+COVER_MOVE_S = 0.3
 """Time in which the cover goes from any place to any other, s."""
 
 
@@ -32,7 +32,7 @@ class SourceLight:
     """World time of its beginning, s."""
     t_off_s: float
     """World time of its end, s."""
-    fibre: int | None
+    fiber: int | None
     """Number of the only detection fibre that is not covered, from 0; None: none is covered."""
 
 
@@ -43,7 +43,7 @@ class _Opening:
     number: int
     clears_s: float
     ends_s: float
-    outcome: str | Refused | None = None  # how the command is answered, once that is known
+    outcome: str | CommandRefused | None = None  # how the command is answered, once that is known
     open: bool = False
     jams_s: float = math.inf  # when the LED is put out because the blades do not close
 
@@ -92,7 +92,7 @@ class SourceShutter:
         """Whether light comes out of the source."""
         return self._light_since is not None
 
-    def under_way(self, now: float) -> bool:
+    def is_moving(self, now: float) -> bool:
         """Tell whether an opening is going on or the cover moves."""
         return self._opening is not None or now < self._settled_s
 
@@ -102,7 +102,7 @@ class SourceShutter:
             return []
         return [self._stretch(self._light_since, max(now, self._light_since))]
 
-    def left_ms(self, now: float) -> int:
+    def remaining_ms(self, now: float) -> int:
         """Return how long the shutter will be open yet, ms."""
         left_s = 0.0 if self._opening is None else self._opening.ends_s - now
         return max(0, math.ceil(left_s * 1e3)) if math.isfinite(left_s) else 0
@@ -133,7 +133,7 @@ class SourceShutter:
 
     def _clear(self, opening: _Opening, now: float) -> None:
         if self._rng.random() < self._stuck:
-            opening.outcome = Refused(Code.HARDWARE, "the shutter did not open")
+            opening.outcome = CommandRefused(Code.HARDWARE, "the shutter did not open")
             self._opening = None
             return
         opening.open = True
@@ -145,7 +145,7 @@ class SourceShutter:
     def _shut(self, opening: _Opening, how: str, now: float) -> None:
         """Let the blades fall, at a moment of the box's own or the host's choice."""
         if self._rng.random() < self._jam:
-            opening.ends_s, opening.jams_s = math.inf, now + JAM_S
+            opening.ends_s, opening.jams_s = math.inf, now + JAM_DETECTION_S
             return
         self._end(opening, how, now)
 
@@ -160,7 +160,7 @@ class SourceShutter:
         self._opening = None
         opened = self.last_report.split(",")[2]
         self.last_report = f"{opening.number},{how},{opened},{self._box.clock_us(now)}"
-        self._box.say("SHUT:END", self.last_report)
+        self._box.queue_event("SHUT:END", self.last_report)
 
     def _begin_light(self, now: float) -> None:
         if self.level > 0:
@@ -181,21 +181,21 @@ class SourceShutter:
 
     # what is asked for ------------------------------------------------------------------------
 
-    def open(self, seconds: float, now: float) -> tuple[float, Callable[[], str | Refused]]:
+    def open(self, seconds: float, now: float) -> tuple[float, Callable[[], str | CommandRefused]]:
         """Begin an opening; return when it is known how that went, and what tells it."""
-        Refused.when(self.jammed, Code.HARDWARE, "the shutter is stuck open; SHUT CLOSE")
+        CommandRefused.raise_if(self.jammed, Code.HARDWARE, "the shutter is stuck open; SHUT CLOSE")
         self.require_closed(now)
         give_ws = self._power_w * self.level / LEVEL_STEPS * seconds
         if self.dose_ws + give_ws > self.dose_limit_ws:
             dose = f"{self.dose_ws + give_ws:.3f} of {self.dose_limit_ws:g} Ws"
-            raise Refused(Code.LIGHT_DOSE, dose)
+            raise CommandRefused(Code.LIGHT_DOSE, dose)
         self.count += 1
-        clears_s = now + SHUTTER_MS / 1e3
+        clears_s = now + MIN_OPENING_MS / 1e3
         opening = _Opening(self.count, clears_s, clears_s + seconds)
         self._opening = opening
 
-        def outcome() -> str | Refused:
-            return opening.outcome or Refused(Code.HARDWARE, "made dark before it opened")
+        def outcome() -> str | CommandRefused:
+            return opening.outcome or CommandRefused(Code.HARDWARE, "made dark before it opened")
 
         return clears_s, outcome
 
@@ -203,18 +203,18 @@ class SourceShutter:
         """Let the blades fall because the host says so; try it again where they are stuck."""
         if self.jammed:
             self.jammed = self._rng.random() < self._jam
-            Refused.when(self.jammed, Code.HARDWARE, "the shutter is stuck open")
+            CommandRefused.raise_if(self.jammed, Code.HARDWARE, "the shutter is stuck open")
         elif self._opening is not None and not self._opening.open:
             self._opening = None
         elif self._opening is not None and math.isinf(self._opening.jams_s):
             self._shut(self._opening, "ASKED", now)
 
-    def go_dark(self, now: float, how: str) -> None:
+    def go_dark(self, now: float, outcome: str) -> None:
         """Put the LED out and let the blades fall, at once."""
         self._put_out(now)
-        self.shut(now, how)
+        self.abort_opening(now, outcome)
 
-    def shut(self, now: float, how: str) -> None:
+    def abort_opening(self, now: float, outcome: str) -> None:
         """End an opening at once, for a reason of the box's own."""
         opening = self._opening
         if opening is None or not opening.open:
@@ -222,20 +222,22 @@ class SourceShutter:
         elif self._rng.random() < self._jam or math.isfinite(opening.jams_s):
             self._give_up(opening, now)
         else:
-            self._end(opening, how, now)
+            self._end(opening, outcome, now)
 
     def require_closed(self, now: float) -> None:
         """Refuse while the shutter is open, or opens, or the cover moves."""
         if self._opening is not None:
-            raise Refused(Code.IGNORED, "the shutter is open")
-        Refused.when(now < self._settled_s, Code.IGNORED, "the cover moves")
+            raise CommandRefused(Code.IGNORED, "the shutter is open")
+        CommandRefused.raise_if(now < self._settled_s, Code.IGNORED, "the cover moves")
 
     def set_level(self, level: int, now: float) -> None:
         """Drive the LED behind the closed shutter, 0 to 1000 thousandths of full."""
         if level > 0:
             self.require_closed(now)
-            Refused.when(self.jammed, Code.HARDWARE, "the shutter is stuck open; SHUT CLOSE")
-            Refused.when(self._dead, Code.HARDWARE, "the LED draws no current")
+            CommandRefused.raise_if(
+                self.jammed, Code.HARDWARE, "the shutter is stuck open; SHUT CLOSE"
+            )
+            CommandRefused.raise_if(self._dead, Code.HARDWARE, "the LED draws no current")
             self.level = level
         else:
             self._put_out(now)
@@ -245,7 +247,7 @@ class SourceShutter:
         self.require_closed(now)
         if fibre != self.fibre:
             self.fibre = fibre
-            self._settled_s = now + COVER_S
+            self._settled_s = now + COVER_MOVE_S
 
     def forget(self, *, power_up: bool, now: float) -> None:
         """Return to the settings of power-up, dark already: no fibre covered."""
@@ -253,4 +255,4 @@ class SourceShutter:
             self.last_report = ""
         if self.fibre is not None:
             self.fibre = None
-            self._settled_s = now + COVER_S
+            self._settled_s = now + COVER_MOVE_S

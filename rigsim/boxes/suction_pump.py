@@ -13,7 +13,7 @@ import numpy as np
 
 from capture.devices.wire import Code
 from capture.rig import Probe
-from rigsim.boxes.command import Refused
+from rigsim.boxes.command import CommandRefused
 from rigsim.boxes.device import Device, SuctionLoad
 from rigsim.boxes.source_shutter import SourceShutter
 
@@ -29,7 +29,7 @@ MIN_SUCTION_MBAR = 10.0
 """Least suction that may be asked for, well above the gauge's deviation."""
 MIN_SUCTION_MS = 100.0
 GAUGE_NOISE_MBAR = 0.3
-GAUGE_ZERO_MBAR = 0.7
+GAUGE_ZERO_DEVIATION_MBAR = 0.7
 """Standard deviations of one reading of the gauge, and of its zero from box to box."""
 
 
@@ -47,7 +47,7 @@ class Gauge:
     def __init__(self, *, rng: np.random.Generator, dead_after_s: float = math.inf) -> None:
         self._rng = rng
         self._dead_after_s = dead_after_s
-        self._zero_mbar = float(rng.normal(0.0, GAUGE_ZERO_MBAR))
+        self._zero_mbar = float(rng.normal(0.0, GAUGE_ZERO_DEVIATION_MBAR))
 
     def read(self, true_mbar: float, now: float) -> float | None:
         """Return a reading, mbar; None when it is dead."""
@@ -105,34 +105,34 @@ class SuctionPump:
     # now --------------------------------------------------------------------------------------
 
     @property
-    def drawing(self) -> bool:
+    def is_pumping(self) -> bool:
         """Whether the pump is on."""
         return self._draw is not None
 
     @property
-    def holds(self) -> bool:
+    def has_reached_target(self) -> bool:
         """Whether the suction that was asked for is, or was, there since the pump went on."""
         return self._draw is not None and self._draw.held
 
-    def rest_ms(self, now: float) -> int:
+    def remaining_rest_ms(self, now: float) -> int:
         """Return how long the skin rests yet, ms."""
         # a clock of microseconds cannot tell a shorter rest from none
         rest_s = self._rested_s - now
-        return math.ceil(rest_s * 1e3) if rest_s > 1e-6 and not self.drawing else 0
+        return math.ceil(rest_s * 1e3) if rest_s > 1e-6 and not self.is_pumping else 0
 
     def state(self, now: float) -> str:
         """Return ``ON,mbar,ms left``, ``REST,ms left`` or ``VENT``."""
         if self._draw is not None:
             left_ms = math.ceil((self._draw.ends_s - now) * 1e3)
             return f"ON,{self._draw.wanted_mbar:g},{left_ms}"
-        rest_ms = self.rest_ms(now)
+        rest_ms = self.remaining_rest_ms(now)
         return f"REST,{rest_ms}" if rest_ms else "VENT"
 
     def read(self, now: float) -> float:
         """Return what the gauge says, mbar."""
         reading = self._gauge.read(self._load.suction_mbar(now), now)
         if reading is None:
-            raise Refused(Code.HARDWARE, "the pressure gauge is dead")
+            raise CommandRefused(Code.HARDWARE, "the pressure gauge is dead")
         return reading
 
     # time -------------------------------------------------------------------------------------
@@ -167,42 +167,42 @@ class SuctionPump:
         self._load.vent(now)
         self._rested_s = now + self._probe.rest_s
         self.last_report = f"{draw.number},{how},{draw.mbar:.1f},{self._box.clock_us(now)}"
-        self._box.say("PUMP:END", self.last_report)
-        self._shutter.shut(now, "PUMP")
+        self._box.queue_event("PUMP:END", self.last_report)
+        self._shutter.abort_opening(now, "PUMP")
 
     def _fail(self, draw: _Draw, how: str, now: float) -> None:
         self._end(draw, how, now)
-        self.take_away(now)
+        self.remove_head(now)
 
     # what is asked for ------------------------------------------------------------------------
 
     def place(self, site: str, angle_deg: float, now: float) -> None:
         """Take down where a person says that the head sits now."""
         if self._draw is not None:
-            raise Refused(Code.IGNORED, "the pump is on; PUMP VENT first")
+            raise CommandRefused(Code.IGNORED, "the pump is on; PUMP VENT first")
         self._load.place(site, angle_deg, now)
         self.placement = (site, angle_deg)
 
-    def take_away(self, now: float) -> None:
+    def remove_head(self, now: float) -> None:
         """Forget where the head sits: it is taken off."""
         self.placement = None
-        self._load.take_away(now)
+        self._load.remove(now)
 
     def draw(self, seconds: float, mbar: float, now: float) -> str:
         """Switch the pump on until its own end; return the number of this time of suction."""
         if self._draw is not None:
-            raise Refused(Code.IGNORED, "the pump is on; PUMP VENT first")
+            raise CommandRefused(Code.IGNORED, "the pump is on; PUMP VENT first")
         if self.placement is None:
-            raise Refused(Code.IGNORED, "HEAD:SITE first")
-        if rest_ms := self.rest_ms(now):
-            raise Refused(Code.RECYCLE, f"skin, {rest_ms} ms")
+            raise CommandRefused(Code.IGNORED, "HEAD:SITE first")
+        if rest_ms := self.remaining_rest_ms(now):
+            raise CommandRefused(Code.RECYCLE, f"skin, {rest_ms} ms")
         self.read(now)
         self.count += 1
         self._draw = _Draw(self.count, now, now + seconds, mbar)
-        self._load.draw(mbar, now)
+        self._load.start_suction(mbar, now)
         return str(self.count)
 
-    def vent(self, now: float, how: str) -> None:
+    def vent(self, now: float, outcome: str) -> None:
         """Switch the pump off and open the vent."""
         if self._draw is not None:
-            self._end(self._draw, how, now)
+            self._end(self._draw, outcome, now)

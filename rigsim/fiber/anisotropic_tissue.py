@@ -19,7 +19,7 @@ from rigsim.arrays import Float64Array
 from rigsim.fiber import photon_splitting as splitting
 from rigsim.fiber import profile as profiles
 from rigsim.fiber.anisotropic_walk import walk_anisotropic
-from rigsim.fiber.rings import KERNEL_NODES, disc_overlap
+from rigsim.fiber.rings import KERNEL_NODES, disc_overlap_area
 from rigsim.tissue import tissue_mc
 from rigsim.tissue.tissue_mc import TransportError
 
@@ -59,9 +59,9 @@ class AnisotropicTissue:
                 raise TransportError(f"{name}: expected {expected}, got {getattr(self, name)}")
 
 
-def anisotropic_profile(
+def trace_anisotropic_profile(
     tissue: AnisotropicTissue,
-    fibres: profiles.Fibres,
+    fibers: profiles.FiberGeometry,
     *,
     azimuth_rad: ArrayLike,
     photons: int,
@@ -69,7 +69,7 @@ def anisotropic_profile(
     harmonics: int | None = MAX_HARMONIC,
     batches: int = tissue_mc.MIN_BATCHES,
     threads: int = 1,
-) -> profiles.FibreProfile:
+) -> profiles.FiberProfile:
     """Trace light to lines of fibres that stand on the tissue in several directions.
 
     Parameters
@@ -81,7 +81,7 @@ def anisotropic_profile(
     azimuth_rad
         Directions of the line, rad from +x towards +y, shape (A,).
     photons, rng, batches, threads
-        As in `rigsim.fiber.profile.fibre_profile`.
+        As in `rigsim.fiber.profile.trace_fiber_profile`.
     harmonics
         Even order up to which the dependence on the direction is scored, in rings, by its Fourier
         series: the tissue's mirror symmetry leaves even ones only. ``None`` scores fibres where
@@ -100,8 +100,9 @@ def anisotropic_profile(
 
     Examples
     --------
-    >>> run = anisotropic_profile(
-    ...     AnisotropicTissue(0.05, 7.5), profiles.Fibres((0.3, 1.8)), azimuth_rad=(0.0, 1.5708),
+    >>> run = trace_anisotropic_profile(
+    ...     AnisotropicTissue(0.05, 7.5), profiles.FiberGeometry((0.3, 1.8)),
+    ...     azimuth_rad=(0.0, 1.5708),
     ...     photons=4000, rng=np.random.default_rng(0),
     ... )
     >>> bool(run.reflectance_per_mm2[1, 0] > run.reflectance_per_mm2[1, 1])  # farther along
@@ -111,13 +112,13 @@ def anisotropic_profile(
     if angles.ndim != 1 or not angles.size or not np.all(np.isfinite(angles)):
         raise TransportError("azimuth_rad: expected finite angles on one axis, at least one")
     count = tissue_mc.photons_per_batch(photons, batches, threads)
-    radii = np.array(fibres.radii_mm)
+    radii = np.array(fibers.radii_mm)
     order = np.argsort(np.repeat(radii, angles.size), kind="stable")
     far = np.repeat(radii, angles.size)[order]
     way = np.tile(angles - tissue.axis_rad, radii.size)[order]
     places = np.ascontiguousarray(np.stack([far * np.cos(way), far * np.sin(way)], axis=1))
-    both = 0.5 * (fibres.core_mm + fibres.source_core_mm)
-    overlap, per_mm = _overlap(fibres)
+    both = 0.5 * (fibers.core_mm + fibers.source_core_mm)
+    overlap, per_mm = _overlap(fibers)
     bins_per_mm = 2000.0 / (far[-1] + both)
     edges = np.arange(2001) / bins_per_mm
     starts = np.searchsorted(far + both, edges[:-1], side="right")
@@ -136,7 +137,7 @@ def anisotropic_profile(
         if harmonics < 0 or harmonics % 2:
             raise TransportError(f"harmonics: expected even and >= 0, or None, got {harmonics}")
         line = np.sort(radii)
-        rings = np.stack([_harmonics(radius, fibres, harmonics) for radius in line])
+        rings = np.stack([_harmonics(radius, fibers, harmonics) for radius in line])
         shape = (line.size, rings.shape[2])
         starts = np.searchsorted(line + both, edges[:-1], side="right")
         counts = np.maximum(np.searchsorted(line - both, edges[1:], side="left") - starts, 0)
@@ -151,12 +152,14 @@ def anisotropic_profile(
         walk_anisotropic(medium, sines, (places, overlap, per_mm), *how, (tally, visited))
         return tally / traced, visited
 
-    sines = fibres.source_numerical_aperture, fibres.numerical_aperture
-    window = splitting.flat_window(reach, farthest)
+    sines = fibers.source_numerical_aperture, fibers.numerical_aperture
+    window = splitting.uniform_window(reach, farthest)
     for seed in seeds[batches:]:
-        pilot = max(200, round(profiles.PILOT_SHARE * count * batches))
-        window = splitting.learned_window(run(window, pilot, seed)[1], window, reach, farthest)
-    rows = tissue_mc.in_threads(lambda batch: run(window, count, seeds[batch])[0], batches, threads)
+        pilot = max(200, round(profiles.PILOT_FRACTION * count * batches))
+        window = splitting.adapt_window(run(window, pilot, seed)[1], window, reach, farthest)
+    rows = tissue_mc.run_in_threads(
+        lambda batch: run(window, count, seeds[batch])[0], batches, threads
+    )
     each = np.empty((batches, radii.size, angles.size))
     if harmonics is None:
         flat = each.reshape(batches, far.size)  # the same memory
@@ -165,22 +168,22 @@ def anisotropic_profile(
         orders = np.arange(0, harmonics + 4, 2)[: rings.shape[2]]
         turns = np.cos(np.outer(orders, angles - tissue.axis_rad))
         each[:, np.argsort(radii, kind="stable")] = np.array(rows) @ turns
-    return profiles.summary(radii, each, count * batches)
+    return profiles.mean_and_stderr(radii, each, count * batches)
 
 
-def _overlap(fibres: profiles.Fibres) -> tuple[Float64Array, float]:
+def _overlap(fibres: profiles.FiberGeometry) -> tuple[Float64Array, float]:
     """Return the density of (point in one core - point in the other) and its nodes per mm."""
     detector, source = 0.5 * fibres.core_mm, 0.5 * fibres.source_core_mm
     if source == 0.0:
         raise TransportError("source_core_mm: expected > 0 on anisotropic tissue, got 0")
     apart = np.linspace(0.0, detector + source, OVERLAP_NODES)
-    area = disc_overlap(apart, detector, source)
+    area = disc_overlap_area(apart, detector, source)
     density = area / (np.pi * detector**2 * np.pi * source**2)
     density[-1] = 0.0
     return density, (OVERLAP_NODES - 1) / apart[-1]
 
 
-def _harmonics(radius_mm: float, fibres: profiles.Fibres, most: int) -> Float64Array:
+def _harmonics(radius_mm: float, fibres: profiles.FiberGeometry, max_harmonic: int) -> Float64Array:
     """Return the even harmonics of a fibre's density over the direction to the exit, by radius."""
     detector, source = 0.5 * fibres.core_mm, 0.5 * fibres.source_core_mm
     both = detector + source
@@ -197,9 +200,9 @@ def _harmonics(radius_mm: float, fibres: profiles.Fibres, most: int) -> Float64A
             rho[:, None] ** 2 + radius_mm**2 - 2.0 * rho[:, None] * radius_mm * np.cos(angle), 0.0
         )
     )
-    area = disc_overlap(apart, detector, source)
+    area = disc_overlap_area(apart, detector, source)
     density = area / (np.pi * detector**2 * np.pi * source**2)
-    orders = np.arange(0, most + 1, 2)
+    orders = np.arange(0, max_harmonic + 1, 2)
     parts = np.einsum("rn,n,rnk->rk", density, weights, np.cos(angle[..., None] * orders))
     parts *= (0.5 * half / np.pi)[:, None] * np.where(orders == 0, 1.0, 2.0)
     table = np.zeros((2 + rho.size, orders.size + 1))

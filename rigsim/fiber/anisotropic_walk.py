@@ -6,22 +6,22 @@ import numpy as np
 from numba import njit
 
 from rigsim.fiber.walk import MAX_COPIES, MAX_DEPTH_GAIN, STACK_DEPTH
-from rigsim.tissue.photon_walk import disc_point, draw, fresnel, scatter
+from rigsim.tissue.photon_walk import draw_disc_point, draw_uniform, fresnel, scatter_direction
 
 
 @njit(inline="always")
-def _turn(s0, s1, s2, s3, ux, uy, uz, g, strength, most):  # type: ignore[no-untyped-def]
+def _scatter_direction(s0, s1, s2, s3, ux, uy, uz, g, strength, most):  # type: ignore[no-untyped-def]
     """Draw by Henyey and Greenstein, kept with the weight of the new direction."""
     while True:
-        s0, s1, s2, s3, vx, vy, vz = scatter(s0, s1, s2, s3, ux, uy, uz, g)
-        s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+        s0, s1, s2, s3, vx, vy, vz = scatter_direction(s0, s1, s2, s3, ux, uy, uz, g)
+        s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
         if u * most <= 1.0 + strength * (vx * vx - 1.0 / 3.0):
             return s0, s1, s2, s3, vx, vy, vz
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def walk_anisotropic(  # type: ignore[no-untyped-def]
-    medium, sines, spots, bins, rings, window, per_mm, photons, seed, found
+    medium, sines, core_centers, bins, rings, window, per_mm, photons, seed, found
 ):
     """Trace photons from a point source in a cone and score fibres where they stand.
 
@@ -42,7 +42,7 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
         even harmonics over the direction; then light is scored by harmonics, and `bins`
         tell distances. float64, shape (R, 1 + nodes, H); R = 0 for light scored in places.
     window, photons, seed
-        As in `rigsim.fiber.walk.walk_to_fibres`.
+        As in `rigsim.fiber.walk.walk_to_fibers`.
     per_mm
         Cells of `window` per mm, and growth of the kept weight per mm of depth.
     found
@@ -50,7 +50,7 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
         and the weight that visited each distance, see there.
     """
     source_sine, fibre_sine = sines
-    places, overlap, overlap_per_mm = spots
+    places, overlap, overlap_per_mm = core_centers
     starts, counts, bins_per_mm = bins
     cells_per_mm, deeper_per_mm = per_mm
     tally, visited = found
@@ -61,7 +61,7 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
     by_ring = rings.shape[0] > 0
     waiting = np.empty((STACK_DEPTH, 7))
     for _ in range(photons):
-        s0, s1, s2, s3, ux, uy = disc_point(s0, s1, s2, s3)
+        s0, s1, s2, s3, ux, uy = draw_disc_point(s0, s1, s2, s3)
         ux *= source_sine
         uy *= source_sine
         reflected, uz = fresnel(sqrt(1.0 - ux * ux - uy * uy), 1.0, eta)
@@ -76,7 +76,7 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
                 kept = 1.0 + strength * g * g * along
                 scattering = sigma_s * (1.0 + strength * along) * kept
                 sigma_t = sigma_a + scattering
-                s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+                s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
                 step = -log(u) / sigma_t
                 if z + step * uz < 0.0:
                     step = -z / uz
@@ -84,7 +84,7 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
                     y += step * uy
                     z = 0.0
                     reflected, _mu = fresnel(-uz, eta, 1.0)
-                    s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+                    s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
                     if u > reflected:
                         break  # seen already: all light that leaves comes straight from a collision
                     uz = -uz
@@ -98,9 +98,9 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
                 deeper = min(1.0 + z * deeper_per_mm, MAX_DEPTH_GAIN)
                 visited[0, cell] += weight * chance
                 visited[1, cell] += weight / deeper
-                s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+                s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
                 if u <= chance:
-                    s0, s1, s2, s3, p, q = disc_point(s0, s1, s2, s3)
+                    s0, s1, s2, s3, p, q = draw_disc_point(s0, s1, s2, s3)
                     p *= fibre_sine / eta
                     q *= fibre_sine / eta
                     mu = sqrt(1.0 - p * p - q * q)
@@ -154,7 +154,7 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
                                     )
                 target = window[cell] * deeper
                 if weight < 0.5 * target:
-                    s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+                    s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
                     if u * target > weight:
                         break
                     weight = target
@@ -166,11 +166,15 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
                         row[0], row[1], row[2] = x, y, z
                         row[3], row[4], row[5], row[6] = ux, uy, uz, weight
                         alive += 1
-                s0, s1, s2, s3, ux, uy, uz = _turn(s0, s1, s2, s3, ux, uy, uz, g, strength, most)
+                s0, s1, s2, s3, ux, uy, uz = _scatter_direction(
+                    s0, s1, s2, s3, ux, uy, uz, g, strength, most
+                )
             if alive == 0:
                 break
             alive -= 1
             row = waiting[alive]
             x, y, z, weight = row[0], row[1], row[2], row[6]
             ux, uy, uz = row[3], row[4], row[5]
-            s0, s1, s2, s3, ux, uy, uz = _turn(s0, s1, s2, s3, ux, uy, uz, g, strength, most)
+            s0, s1, s2, s3, ux, uy, uz = _scatter_direction(
+                s0, s1, s2, s3, ux, uy, uz, g, strength, most
+            )

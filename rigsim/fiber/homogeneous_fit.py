@@ -8,7 +8,7 @@ them from noise. The factor is for what pigment in a thin layer on top takes fro
 in and out, at all distances alike. Tissue without layers that scatters by direction has no such
 factor: with one its nearest media jump between far valleys from one direction to the next. Of dark
 skin the nearest medium scatters without bounds: its profile is that of a dipole at the surface,
-which tells sigma_tr and no more; the search ends at `MAX_SCATTERING`.
+which tells sigma_tr and no more; the search ends at `MAX_SCATTERING_PER_MM`.
 """
 
 import math
@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from rigsim.arrays import Float64Array
-from rigsim.fiber.profile import Fibres
-from rigsim.fiber.white_fiber import WhiteFibre
+from rigsim.fiber.profile import FiberGeometry
+from rigsim.fiber.white_fiber import FiberTable
 
 MIN_REFLECTANCE_PER_MM2: Final = 1e-7
 """R_f that gives a tenth of an electron per pixel and exposure of 30 s for each electron of read
@@ -41,7 +41,7 @@ SEARCH_STARTS_PER_MM: Final = (
 )
 """sigma_a and sigma_s' in 1/mm from which the search begins; the best end counts. Layers dim near
 fibres less than far ones, which looks like more scattering than tissue has."""
-MAX_SCATTERING: Final = 200.0
+MAX_SCATTERING_PER_MM: Final = 200.0
 """Of the search, 1/mm."""
 OFF_TABLE_RESIDUAL: Final = 1e3
 """Residual of media that the table does not hold."""
@@ -74,8 +74,8 @@ class HomogeneousFit:
         return math.sqrt(3.0 * a * (a + self.sigma_s_prime_per_mm))
 
 
-def nearest_medium(
-    reflectance_per_mm2: ArrayLike, fibres: Fibres, *, dimmed: bool = True
+def fit_homogeneous_medium(
+    reflectance_per_mm2: ArrayLike, fibers: FiberGeometry, *, dimmed: bool = True
 ) -> HomogeneousFit:
     """Return the homogeneous medium that is nearest to a profile.
 
@@ -101,37 +101,37 @@ def nearest_medium(
 
     Examples
     --------
-    >>> fibres = Fibres(tuple(0.3 + 0.25 * k for k in range(28)))
-    >>> own, _ = WhiteFibre.load().profile(0.1, 2.0, fibres)
-    >>> fit = nearest_medium(own, fibres)
+    >>> fibres = FiberGeometry(tuple(0.3 + 0.25 * k for k in range(28)))
+    >>> own, _ = FiberTable.load().profile(0.1, 2.0, fibres)
+    >>> fit = fit_homogeneous_medium(own, fibres)
     >>> round(fit.sigma_a_per_mm, 3), round(fit.sigma_s_prime_per_mm, 2)
     (0.1, 2.0)
     """
     profile = np.asarray(reflectance_per_mm2, np.float64)
     use = profile >= MIN_REFLECTANCE_PER_MM2
-    if profile.shape != (len(fibres.radii_mm),) or int(use.sum()) < MIN_BRIGHT_FIBERS:
+    if profile.shape != (len(fibers.radii_mm),) or int(use.sum()) < MIN_BRIGHT_FIBERS:
         raise FitError(
             f"reflectance_per_mm2: got {int(use.sum())} bright of {profile.shape}, expected "
-            f"{len(fibres.radii_mm)} with at least {MIN_BRIGHT_FIBERS} of "
+            f"{len(fibers.radii_mm)} with at least {MIN_BRIGHT_FIBERS} of "
             f"{MIN_REFLECTANCE_PER_MM2} 1/mm^2"
         )
-    table = WhiteFibre.load()
-    used = Fibres(
-        tuple(np.array(fibres.radii_mm)[use].tolist()),
-        fibres.core_mm,
-        fibres.source_core_mm,
-        fibres.numerical_aperture,
-        fibres.source_numerical_aperture,
+    table = FiberTable.load()
+    used = FiberGeometry(
+        tuple(np.array(fibers.radii_mm)[use].tolist()),
+        fibers.core_mm,
+        fibers.source_core_mm,
+        fibers.numerical_aperture,
+        fibers.source_numerical_aperture,
     )
     target = np.log(profile[use])
-    both = 0.5 * (fibres.core_mm + fibres.source_core_mm)
+    both = 0.5 * (fibers.core_mm + fibers.source_core_mm)
     low = table.distance[0] / (min(used.radii_mm) - both)
     # sigma_a / sigma_s' rather than sigma_a, as the table ends there
-    bounds = np.log([[1e-6, low * 1.0001], [table.absorption[-1] * 0.9999, MAX_SCATTERING]])
+    bounds = np.log([[1e-6, low * 1.0001], [table.absorption[-1] * 0.9999, MAX_SCATTERING_PER_MM]])
 
     def misfit(logs: Float64Array) -> Float64Array:
         scattering = math.exp(logs[1])
-        if not table.holds(math.exp(logs[0]) * scattering, scattering, used):
+        if not table.covers(math.exp(logs[0]) * scattering, scattering, used):
             return OFF_TABLE_RESIDUAL * np.cos(np.arange(target.size))
         value, _ = table.profile(math.exp(logs[0]) * scattering, scattering, used)
         off = np.log(value) - target

@@ -12,27 +12,27 @@ import numpy as np
 from rigsim.arrays import Float64Array
 
 WINDOW_CELLS: Final = 256
-SMOOTHED_CELLS: Final = 8  # to each side
+SMOOTHING_CELLS: Final = 8  # to each side
 MIN_TRACKS: Final = 50.0
 MAX_TRACKS: Final = 30.0
 """Collisions at a distance, as a multiple of the most anywhere without splitting: where nearly all
 light is too deep to be scored, splitting it further is not worth its time."""
-SCORED_DEPTH: Final = 1.5
+FULL_SCORING_OPTICAL_DEPTH: Final = 1.5
 """Optical depth above which every collision is scored; below, fewer and fewer with more weight."""
 
 
-def flat_window(reach_mm: float, farthest_mm: float) -> Float64Array:
+def uniform_window(reach_mm: float, farthest_mm: float) -> Float64Array:
     """Return weights of 1 up to the farthest fibre, and more beyond."""
     s = (np.arange(WINDOW_CELLS + 1) + 0.5) * reach_mm / WINDOW_CELLS
     return np.asarray(np.maximum(1.0, (s / farthest_mm) ** 3))
 
 
-def learned_window(
+def adapt_window(
     visited: Float64Array, used: Float64Array, reach_mm: float, farthest_mm: float
 ) -> Float64Array:
     """Return target weights in proportion to how much weight passes each distance."""
     s = (np.arange(len(used)) + 0.5) * reach_mm / WINDOW_CELLS
-    kernel = np.ones(2 * SMOOTHED_CELLS + 1)
+    kernel = np.ones(2 * SMOOTHING_CELLS + 1)
     around = np.convolve(np.ones(WINDOW_CELLS), kernel, "same")
     scored, every = (np.convolve(row[:-1], kernel, "same") / around for row in visited)
     tracks = [np.convolve(row[:-1] / used[:-1], kernel, "same") for row in visited]
@@ -58,7 +58,7 @@ def _falling(weight: Float64Array, tracks: Float64Array) -> tuple[Float64Array, 
         return np.ones(len(weight)), 0
     peak = int(np.argmax(weight[:reached]))
     relative = weight / weight[peak]
-    before = max(peak, reached - 4 * SMOOTHED_CELLS)
+    before = max(peak, reached - 4 * SMOOTHING_CELLS)
     fall = 0.0
     if before < reached - 1:
         fall = np.log(relative[reached - 1] / relative[before]) / (reached - 1 - before)
@@ -79,12 +79,12 @@ def transport_depth_mm(table: Float64Array) -> float:
     return bottom if bottom < inf else 1.0
 
 
-def scoring_chances(table: Float64Array) -> tuple[Float64Array, float]:
+def scoring_probabilities(table: Float64Array) -> tuple[Float64Array, float]:
     """Return the probability to score a collision by its depth, and the levels per mm."""
     depths, optical = [0.0], [0.0]
     for row in table[1:-1]:
         if row[2] > 0.0:
-            limit = (SCORED_DEPTH + 40.0 - row[6]) / row[2]
+            limit = (FULL_SCORING_OPTICAL_DEPTH + 40.0 - row[6]) / row[2]
             if limit <= 0.0:
                 break
             depths.append(min(row[1], row[0] + limit))
@@ -95,4 +95,4 @@ def scoring_chances(table: Float64Array) -> tuple[Float64Array, float]:
     levels = 4096
     per_mm = levels / depths[-1] if depths[-1] > 0.0 else 1.0
     at = np.interp(np.arange(levels) / per_mm, depths, optical)
-    return np.exp(np.minimum(SCORED_DEPTH - at, 0.0)), per_mm
+    return np.exp(np.minimum(FULL_SCORING_OPTICAL_DEPTH - at, 0.0)), per_mm

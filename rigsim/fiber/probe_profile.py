@@ -14,16 +14,22 @@ from scipy.interpolate import BSpline
 from capture.rig import Fiber, Probe, Rig
 from model import spectra
 from rigsim.arrays import Float64Array
-from rigsim.fiber.anisotropic_tissue import anisotropic_profile
+from rigsim.caching import LruCache
+from rigsim.fiber.anisotropic_tissue import trace_anisotropic_profile
 from rigsim.fiber.probe_tissue import FibrousTissue, ProbedTissue, TissueError, TissueOptics
-from rigsim.fiber.profile import FibrePaths, Fibres, SpectralStack, fibre_paths, fibre_profile
-from rigsim.fiber.white_fiber import ETA, HENYEY_GREENSTEIN_G, WhiteFibre
-from rigsim.kept import Kept
+from rigsim.fiber.profile import (
+    FiberGeometry,
+    FiberPaths,
+    SpectralStack,
+    trace_fiber_paths,
+    trace_fiber_profile,
+)
+from rigsim.fiber.white_fiber import ETA, HENYEY_GREENSTEIN_G, FiberTable
 
 MAX_KEPT_PROFILES: Final = 64
 """Profiles and runs of photons that are kept."""
 
-HALF_TURN_DIRECTIONS: Final = 16
+DIRECTIONS_PER_HALF_TURN: Final = 16
 """Directions over half a turn in which anisotropic tissue is traced; it has harmonics to the 8th,
 so that those between follow from them exactly."""
 
@@ -32,7 +38,7 @@ SUCTION_STEP_MBAR: Final = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Profile:
+class BandProfile:
     """Reflectance in the fibres in the camera's bands."""
 
     reflectance_per_mm2: Float64Array
@@ -41,7 +47,7 @@ class Profile:
     """Standard error of the Monte Carlo, same shape."""
 
 
-class Profiles:
+class ProfileCache:
     """Profiles of one tissue under one probe.
 
     Parameters
@@ -68,11 +74,13 @@ class Profiles:
         self.photons, self.seed, self.threads = photons, seed, threads
         self.probe: Probe = rig.probe
         most = MAX_KEPT_PROFILES
-        self._runs: Kept[tuple[object, ...], FibrePaths | Profile] = Kept(lambda _: most)
+        self._runs: LruCache[tuple[object, ...], FiberPaths | BandProfile] = LruCache(
+            lambda _: most
+        )
         self._by_turn: Float64Array | None = None
-        self._profiles: Kept[tuple[object, ...], Profile] = Kept(lambda _: most)
+        self._profiles: LruCache[tuple[object, ...], BandProfile] = LruCache(lambda _: most)
 
-    def profile(self, site: str, angle_deg: float = 0.0, suction_mbar: float = 0.0) -> Profile:
+    def profile(self, site: str, angle_deg: float = 0.0, suction_mbar: float = 0.0) -> BandProfile:
         """Return what the fibres take at a site.
 
         Parameters
@@ -96,51 +104,51 @@ class Profiles:
         """
         suction = SUCTION_STEP_MBAR * round(suction_mbar / SUCTION_STEP_MBAR)
 
-        def make() -> Profile:
+        def make() -> BandProfile:
             if isinstance(self.tissue, FibrousTissue):
-                return self._turned(self.tissue, angle_deg)
-            return self._made(self.tissue.optics(site, angle_deg, suction))
+                return self._profile_at_angle(self.tissue, angle_deg)
+            return self._compute(self.tissue.optics(site, angle_deg, suction))
 
         return self._profiles.get((site, angle_deg, suction), make)
 
-    def _turned(self, tissue: FibrousTissue, angle_deg: float) -> Profile:
+    def _profile_at_angle(self, tissue: FibrousTissue, angle_deg: float) -> BandProfile:
         """Return the profile along one direction, by the Fourier series of those traced."""
         if self._by_turn is None:
-            run = anisotropic_profile(
+            run = trace_anisotropic_profile(
                 tissue.medium(),
-                fibres_of(self.probe),
-                azimuth_rad=np.pi * np.arange(HALF_TURN_DIRECTIONS) / HALF_TURN_DIRECTIONS,
+                probe_fibers(self.probe),
+                azimuth_rad=np.pi * np.arange(DIRECTIONS_PER_HALF_TURN) / DIRECTIONS_PER_HALF_TURN,
                 photons=self.photons,
                 rng=np.random.default_rng([self.seed, zlib.crc32(repr(tissue).encode())]),
                 threads=self.threads,
             )
             self._by_turn = run.batch_reflectance_per_mm2
-        order = np.fft.rfftfreq(HALF_TURN_DIRECTIONS, 1.0 / HALF_TURN_DIRECTIONS)
+        order = np.fft.rfftfreq(DIRECTIONS_PER_HALF_TURN, 1.0 / DIRECTIONS_PER_HALF_TURN)
         share = (
-            np.where((order == 0) | (2 * order == HALF_TURN_DIRECTIONS), 1.0, 2.0)
-            / HALF_TURN_DIRECTIONS
+            np.where((order == 0) | (2 * order == DIRECTIONS_PER_HALF_TURN), 1.0, 2.0)
+            / DIRECTIONS_PER_HALF_TURN
         )
         wave = share * np.exp(2j * order * np.radians(angle_deg))
         each = (np.fft.rfft(self._by_turn, axis=-1) @ wave).real
         value, error = smooth_profile(np.array(self.probe.radius_mm), each[..., None])
-        return Profile(np.repeat(value, 3, axis=1), np.repeat(error, 3, axis=1))
+        return BandProfile(np.repeat(value, 3, axis=1), np.repeat(error, 3, axis=1))
 
-    def _made(self, optics: TissueOptics) -> Profile:
+    def _compute(self, optics: TissueOptics) -> BandProfile:
         key = (optics.wavelength_nm, optics.stacks)
-        run = self._runs.get(key, lambda: self._traced(optics))
-        if isinstance(run, Profile):
+        run = self._runs.get(key, lambda: self._trace(optics))
+        if isinstance(run, BandProfile):
             return run
         made = run.profile(optics.amount)
         value, error = smooth_profile(made.radii_mm, made.batch_reflectance_per_mm2)
-        return Profile(value, error)
+        return BandProfile(value, error)
 
-    def _traced(self, optics: TissueOptics) -> FibrePaths | Profile:
+    def _trace(self, optics: TissueOptics) -> FiberPaths | BandProfile:
         words = repr((optics.wavelength_nm, optics.stacks)).encode()
         rng = np.random.default_rng([self.seed, zlib.crc32(words)])
-        stack = optics.stacks[0] if not optics.wavelength_nm else self.spectral(optics)
-        kind = fibres_of(self.probe)
+        stack = optics.stacks[0] if not optics.wavelength_nm else self.spectral_stack(optics)
+        kind = probe_fibers(self.probe)
         if optics.absorber is not None:
-            return fibre_paths(
+            return trace_fiber_paths(
                 stack,
                 kind,
                 photons=self.photons,
@@ -148,23 +156,23 @@ class Profiles:
                 absorber=optics.absorber,
                 threads=self.threads,
             )
-        stored = self._stored(optics, kind)
+        stored = self._look_up(optics, kind)
         if stored is not None:
             return stored
         if not any(layer.sigma_s_per_mm for one in optics.stacks for layer in one.layers):
             nothing = np.zeros((len(self.probe.fibres), 3))
-            return Profile(nothing, nothing)
-        made = fibre_profile(
+            return BandProfile(nothing, nothing)
+        made = trace_fiber_profile(
             stack, photons=self.photons, rng=rng, threads=self.threads, **dataclasses.asdict(kind)
         )
         value, error = made.reflectance_per_mm2, made.stderr
         if value.ndim == 1:
             value, error = (np.repeat(a[:, None], 3, axis=1) for a in (value, error))
-        return Profile(value, error)
+        return BandProfile(value, error)
 
-    def _stored(self, optics: TissueOptics, kind: Fibres) -> Profile | None:
+    def _look_up(self, optics: TissueOptics, kind: FiberGeometry) -> BandProfile | None:
         """Return the profile of a homogeneous medium that the stored photons tell of."""
-        table = WhiteFibre.load()
+        table = FiberTable.load()
         each = []
         for stack in optics.stacks:
             layer = stack.layers[0]
@@ -173,18 +181,18 @@ class Profiles:
                 len(stack.layers) > 1
                 or abs(layer.g - HENYEY_GREENSTEIN_G) > 1e-12
                 or (layer.eta, stack.eta_above) != (ETA, 1.0)
-                or not table.holds(layer.sigma_a_per_mm, scattering, kind)
+                or not table.covers(layer.sigma_a_per_mm, scattering, kind)
             ):
                 return None
             each.append(table.profile(layer.sigma_a_per_mm, scattering, kind))
         weights = np.ones((1, 3))
         if optics.wavelength_nm:
-            weights = self.spectral(optics).band_weights
+            weights = self.spectral_stack(optics).band_weights
         # errors of similar media are of the same photons: they add up
         value, error = (np.stack(part).T @ weights for part in zip(*each, strict=True))
-        return Profile(value, error)
+        return BandProfile(value, error)
 
-    def spectral(self, optics: TissueOptics) -> SpectralStack:
+    def spectral_stack(self, optics: TissueOptics) -> SpectralStack:
         """Return the stacks with the camera's bands under the probe's light."""
         weights = spectra.band_weights(
             self.rig.views[0].spectral_sensitivity,
@@ -194,7 +202,7 @@ class Profiles:
         return SpectralStack(optics.wavelength_nm, optics.stacks, weights)
 
 
-def fibres_of(probe: Probe) -> Fibres:
+def probe_fibers(probe: Probe) -> FiberGeometry:
     """Return the probe's fibres as the walk of photons wants them.
 
     Raises
@@ -206,7 +214,7 @@ def fibres_of(probe: Probe) -> Fibres:
     for fibre in probe.fibres:
         if (fibre.core_mm, fibre.numerical_aperture) != (first.core_mm, first.numerical_aperture):
             raise TissueError(f"fibre {fibre.name!r}: expected all detection fibres alike")
-    return Fibres(
+    return FiberGeometry(
         probe.radius_mm,
         first.core_mm,
         probe.source_core_mm,

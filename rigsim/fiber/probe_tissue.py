@@ -24,7 +24,7 @@ MIN_SIGMA_A_PER_MM: Final = 1e-7
 """Absorption that a medium without any is traced with, 1/mm: else photons wander for ever. A path
 of 1 m loses a ten-thousandth."""
 
-BLOOD_AT_REST: Final[Mapping[str, float]] = {
+RESTING_BLOOD_FRACTION: Final[Mapping[str, float]] = {
     "forehead": 0.005,
     "cheek": 0.006,
     "chin": 0.016,
@@ -32,14 +32,14 @@ BLOOD_AT_REST: Final[Mapping[str, float]] = {
 }
 """Volume fraction of blood in the dermis at rest, by site; of the whole dermis down to centimetres,
 so less than what colors the face, whose vessels lie under the epidermis."""
-MELANIN_SHARE: Final = 0.25
+PRESET_MELANIN_FRACTION: Final = 0.25
 """Of the presets' melanin: theirs colors the faces of other rigs, while spectra of forearms ask for
 about 0.003 (`rigsim.tissue.skin_table`), and so do the paper's sigma_tr. This project's choice."""
-BLOOD_KEPT: Final = 0.25
+INCOMPRESSIBLE_BLOOD_FRACTION: Final = 0.25
 """Share of the blood at rest that no pressure presses out."""
-CAPILLARY_MBAR: Final = 30.0
+CAPILLARY_PRESSURE_MBAR: Final = 30.0
 """Pressure in capillaries that the head's works against, mbar: about 23 mm of mercury."""
-TOUCH_MBAR: Final = 3.0
+CONTACT_PRESSURE_MBAR: Final = 3.0
 """Pressure under a head that is laid on without suction, mbar."""
 
 SKIN_WAVELENGTHS_NM: Final = (440.0, 465.0, 490.0, 515.0, 540.0, 560.0, 580.0, 600.0, 620.0, 650.0)
@@ -196,7 +196,7 @@ class SkinTissue:
         BLOOD_KEPT + (1 - BLOOD_KEPT) exp(-pressure / CAPILLARY_MBAR),
 
     with the suction as the pressure, for the rim's force is the suction times the cup's area and
-    the face's area is about that, and `TOUCH_MBAR` of a head that is only laid on.
+    the face's area is about that, and `CONTACT_PRESSURE_MBAR` of a head that is only laid on.
 
     Parameters
     ----------
@@ -256,7 +256,7 @@ class SkinTissue:
     def melanin(self, site: str) -> float:
         """Return the volume fraction of melanosomes in an epidermis of 0.25 mm."""
         factor = math.exp(0.1 * float(self._own[0]) + 0.05 * self._drawn(site)[0])
-        return MELANIN_SHARE * self._melanin * factor
+        return PRESET_MELANIN_FRACTION * self._melanin * factor
 
     def epidermis_mm(self, site: str) -> float:
         """Return the epidermis's thickness, mm."""
@@ -264,34 +264,36 @@ class SkinTissue:
 
     def blood(self, site: str, suction_mbar: float) -> float:
         """Return the volume fraction of blood in the dermis under the head."""
-        pressure = max(suction_mbar, TOUCH_MBAR)
-        left = BLOOD_KEPT + (1.0 - BLOOD_KEPT) * math.exp(-pressure / CAPILLARY_MBAR)
+        pressure = max(suction_mbar, CONTACT_PRESSURE_MBAR)
+        left = INCOMPRESSIBLE_BLOOD_FRACTION + (1.0 - INCOMPRESSIBLE_BLOOD_FRACTION) * math.exp(
+            -pressure / CAPILLARY_PRESSURE_MBAR
+        )
         return left * self._rest(site)
 
     def optics(self, site: str, angle_deg: float, suction_mbar: float) -> TissueOptics:
         """Return the layers; the blood above what no pressure takes out is the absorber."""
         del angle_deg
         rest = self._rest(site)
-        least = BLOOD_KEPT * rest
+        least = INCOMPRESSIBLE_BLOOD_FRACTION * rest
         melanin, thickness = self.melanin(site), self.epidermis_mm(site)
         stacks, absorber = [], []
         for wavelength in SKIN_WAVELENGTHS_NM:
-            stack = skin_layers.skin(wavelength, melanin, least)
+            stack = skin_layers.skin_layer_stack(wavelength, melanin, least)
             top = dataclasses.replace(stack.layers[0], thickness_mm=thickness)
             stacks.append(dataclasses.replace(stack, layers=(top, *stack.layers[1:])))
             # more blood is less of the bloodless rest
             dermis = skin_layers.blood_per_mm(wavelength) - skin_layers.baseline_per_mm(wavelength)
-            absorber.append([skin_layers.EPIDERMAL_BLOOD_SHARE * dermis, dermis])
+            absorber.append([skin_layers.EPIDERMAL_BLOOD_RATIO * dermis, dermis])
         amount = self.blood(site, suction_mbar) - least
         return TissueOptics(SKIN_WAVELENGTHS_NM, tuple(stacks), np.array(absorber), amount)
 
     def _rest(self, site: str) -> float:
-        if site not in BLOOD_AT_REST:
-            known = ", ".join(BLOOD_AT_REST)
+        if site not in RESTING_BLOOD_FRACTION:
+            known = ", ".join(RESTING_BLOOD_FRACTION)
             raise TissueError(f"site: got {site!r}, expected one of {known}")
         return (
             self._blood
-            * BLOOD_AT_REST[site]
+            * RESTING_BLOOD_FRACTION[site]
             * math.exp(0.15 * float(self._own[1]) + 0.1 * self._drawn(site)[2])
         )
 
@@ -350,7 +352,7 @@ def make_phantom(
     )
 
 
-def parse_subject(text: str, *, seed: int = 0) -> ProbedTissue:
+def parse_tissue(text: str, *, seed: int = 0) -> ProbedTissue:
     """Return the tissue that a subject's text names.
 
     Parameters
@@ -368,9 +370,9 @@ def parse_subject(text: str, *, seed: int = 0) -> ProbedTissue:
 
     Examples
     --------
-    >>> parse_subject("homogeneous:0.04,1.5").sigma_s_prime_per_mm
+    >>> parse_tissue("homogeneous:0.04,1.5").sigma_s_prime_per_mm
     1.5
-    >>> parse_subject("III", seed=2).preset
+    >>> parse_tissue("III", seed=2).preset
     'III'
     """
     name, colon, rest = text.partition(":")

@@ -21,13 +21,13 @@ from numpy.typing import ArrayLike, NDArray
 from rigsim.arrays import Float32Array, Float64Array, Int64Array
 from rigsim.fiber.photon_splitting import (
     WINDOW_CELLS,
-    flat_window,
-    learned_window,
-    scoring_chances,
+    adapt_window,
+    scoring_probabilities,
     transport_depth_mm,
+    uniform_window,
 )
 from rigsim.fiber.rings import ring_kernels
-from rigsim.fiber.walk import walk_to_fibres
+from rigsim.fiber.walk import walk_to_fibers
 from rigsim.tissue import tissue_mc
 from rigsim.tissue.tissue_mc import LayerStack, TransportError
 
@@ -40,7 +40,7 @@ PATH_STEP: Final = 0.006
 MAX_PATH_MM: Final = 20_000.0
 """Longer paths count as this one when they are reweighted: exp(-sigma 20 m) is 0 for all tissue."""
 
-PILOT_SHARE: Final = 0.01
+PILOT_FRACTION: Final = 0.01
 """Photons that each of `PILOT_RUNS` runs spends to learn how many arrive where, of those traced."""
 
 PILOT_RUNS: Final = 3
@@ -48,7 +48,7 @@ PILOT_RUNS: Final = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Fibres:
+class FiberGeometry:
     """A source fibre and detection fibres that stand on the surface."""
 
     radii_mm: tuple[float, ...]
@@ -109,7 +109,7 @@ class SpectralStack:
 
 
 @dataclass(frozen=True, slots=True)
-class FibreProfile:
+class FiberProfile:
     """Reflectance in the fibre by distance, with one-sigma standard errors."""
 
     radii_mm: Float64Array
@@ -130,7 +130,7 @@ class FibreProfile:
 
 
 @dataclass(frozen=True, slots=True)
-class FibrePaths:
+class FiberPaths:
     """Light in the fibres by the path that it took through one absorber.
 
     More of the absorber weakens a path by the factor exp(-sigma path) and changes no collision, so
@@ -146,7 +146,7 @@ class FibrePaths:
     photons: int
     """Photons traced."""
 
-    def profile(self, extra_per_mm: float = 0.0) -> FibreProfile:
+    def profile(self, extra_per_mm: float = 0.0) -> FiberProfile:
         """Return the profile with absorption added to that of the run.
 
         Parameters
@@ -168,10 +168,10 @@ class FibrePaths:
         _require("extra_per_mm", extra_per_mm, fine, "a finite number >= 0")
         survival = np.exp(-extra_per_mm * self.path_mm)
         each = np.einsum("bfn...,n->bf...", self.score, survival, dtype=np.float64)
-        return summary(self.radii_mm, each, self.photons)
+        return mean_and_stderr(self.radii_mm, each, self.photons)
 
 
-def fibre_profile(
+def trace_fiber_profile(
     stack: LayerStack | SpectralStack,
     *,
     radii_mm: ArrayLike,
@@ -183,7 +183,7 @@ def fibre_profile(
     source_numerical_aperture: float = 0.22,
     batches: int = tissue_mc.MIN_BATCHES,
     threads: int = 1,
-) -> FibreProfile:
+) -> FiberProfile:
     """Trace light from a source fibre to detection fibres on the same surface.
 
     Parameters
@@ -222,13 +222,13 @@ def fibre_profile(
     >>> from math import inf
     >>> from rigsim.tissue.tissue_mc import Layer
     >>> red = LayerStack((Layer(inf, 0.04, 7.5, 0.8, 1.4),))
-    >>> near_and_far = fibre_profile(
+    >>> near_and_far = trace_fiber_profile(
     ...     red, radii_mm=(0.3, 3.3), photons=4000, rng=np.random.default_rng(0)
     ... )
     >>> bool(near_and_far.reflectance_per_mm2[0] > 10.0 * near_and_far.reflectance_per_mm2[1])
     True
     """
-    fibres = Fibres(
+    fibres = FiberGeometry(
         tuple(np.atleast_1d(np.asarray(radii_mm, np.float64)).tolist()),
         core_mm,
         source_core_mm,
@@ -236,25 +236,25 @@ def fibre_profile(
         source_numerical_aperture,
     )
     each, traced = _trace(stack, fibres, photons, rng, batches, threads, None)
-    return summary(np.array(fibres.radii_mm), each, traced)
+    return mean_and_stderr(np.array(fibres.radii_mm), each, traced)
 
 
-def fibre_paths(
+def trace_fiber_paths(
     stack: LayerStack | SpectralStack,
-    fibres: Fibres,
+    fibers: FiberGeometry,
     *,
     photons: int,
     rng: np.random.Generator,
     absorber: ArrayLike | None = None,
     batches: int = tissue_mc.MIN_BATCHES,
     threads: int = 1,
-) -> FibrePaths:
-    """Trace light as `fibre_profile` does and keep its paths through one absorber.
+) -> FiberPaths:
+    """Trace light as `trace_fiber_profile` does and keep its paths through one absorber.
 
     Parameters
     ----------
     stack, photons, rng, batches, threads
-        As in `fibre_profile`. Take the smallest absorption of interest.
+        As in `trace_fiber_profile`. Take the smallest absorption of interest.
     fibres
         The fibres.
     absorber
@@ -276,8 +276,8 @@ def fibre_paths(
     >>> from math import inf
     >>> from rigsim.tissue.tissue_mc import Layer
     >>> clear = LayerStack((Layer(inf, 0.01, 7.5, 0.8, 1.4),))
-    >>> paths = fibre_paths(
-    ...     clear, Fibres((0.3, 3.3)), photons=4000, rng=np.random.default_rng(0)
+    >>> paths = trace_fiber_paths(
+    ...     clear, FiberGeometry((0.3, 3.3)), photons=4000, rng=np.random.default_rng(0)
     ... )
     >>> light, dark = paths.profile(0.0), paths.profile(0.24)
     >>> bool((light.reflectance_per_mm2 > dark.reflectance_per_mm2).all())
@@ -296,9 +296,9 @@ def fibre_paths(
         ) from error
     if not shares.max() > 0.0:
         raise TransportError("absorber: expected a share > 0 in some layer, got none")
-    each, traced = _trace(stack, fibres, photons, rng, batches, threads, shares / shares.max())
+    each, traced = _trace(stack, fibers, photons, rng, batches, threads, shares / shares.max())
     nodes = PATH_SCALE_MM * np.expm1(PATH_STEP * np.arange(_path_nodes())) * shares.max()
-    return FibrePaths(np.array(fibres.radii_mm), nodes, each.astype(np.float32), traced)
+    return FiberPaths(np.array(fibers.radii_mm), nodes, each.astype(np.float32), traced)
 
 
 def _path_nodes() -> int:
@@ -311,15 +311,15 @@ def _spectral(stack: LayerStack | SpectralStack) -> SpectralStack:
     return SpectralStack((0.0,), (stack,), np.ones((1, 1)))
 
 
-def summary(radii_mm: Float64Array, each: Float64Array, photons: int) -> FibreProfile:
+def mean_and_stderr(radii_mm: Float64Array, batches: Float64Array, photons: int) -> FiberProfile:
     """Return mean and standard error of independent batches, shape (batches, F, ...)."""
-    error = each.std(axis=0, ddof=1) / np.sqrt(len(each))
-    return FibreProfile(radii_mm, each.mean(axis=0), error, each, photons)
+    error = batches.std(axis=0, ddof=1) / np.sqrt(len(batches))
+    return FiberProfile(radii_mm, batches.mean(axis=0), error, batches, photons)
 
 
 def _trace(
     stack: LayerStack | SpectralStack,
-    fibres: Fibres,
+    fibres: FiberGeometry,
     photons: int,
     rng: np.random.Generator,
     batches: int,
@@ -347,7 +347,7 @@ def _trace(
         traced += count * batches
         row = None if absorber is None else absorber[index]
         plan = _Plan(layers, fibres, rings, row)
-        for batch, score in enumerate(plan.traced(count, batches, seeds, threads)):
+        for batch, score in enumerate(plan.trace(count, batches, seeds, threads)):
             for band in range(bands[0]):
                 weight = spectral.band_weights[index, band]
                 total[batch, ..., band] += weight / count * score
@@ -363,7 +363,7 @@ class _Plan:
     """What the walk needs of one stack and its fibres."""
 
     def __init__(
-        self, stack: LayerStack, fibres: Fibres, rings: Rings, absorber: Float64Array | None
+        self, stack: LayerStack, fibres: FiberGeometry, rings: Rings, absorber: Float64Array | None
     ) -> None:
         self.fibres, self.rings = fibres, rings
         table = tissue_mc.layer_table(stack)
@@ -380,19 +380,19 @@ class _Plan:
         farthest = max(fibres.radii_mm) + 0.5 * (fibres.core_mm + fibres.source_core_mm)
         self.reach_mm = 3.0 * max(farthest, 1.0)
         self.farthest_mm = max(farthest, 1.0)
-        self.chances, self.chances_per_mm = scoring_chances(self.table)
+        self.chances, self.chances_per_mm = scoring_probabilities(self.table)
         self.deeper_per_mm = 1.0 / transport_depth_mm(self.table)
 
-    def traced(
+    def trace(
         self, count: int, batches: int, seeds: NDArray[np.uint64], threads: int
     ) -> list[Float64Array]:
         """Return the sums of each batch's scores, its photons split as pilots have learned."""
-        window = flat_window(self.reach_mm, self.farthest_mm)
-        pilot = max(200, round(PILOT_SHARE * count * batches))
+        window = uniform_window(self.reach_mm, self.farthest_mm)
+        pilot = max(200, round(PILOT_FRACTION * count * batches))
         for seed in seeds[batches:]:
             visited = self._run(window, pilot, seed)[1]
-            window = learned_window(visited, window, self.reach_mm, self.farthest_mm)
-        return tissue_mc.in_threads(
+            window = adapt_window(visited, window, self.reach_mm, self.farthest_mm)
+        return tissue_mc.run_in_threads(
             lambda batch: self._run(window, count, seeds[batch])[0], batches, threads
         )
 
@@ -408,7 +408,7 @@ class _Plan:
         per_mm = WINDOW_CELLS / self.reach_mm, self.deeper_per_mm, self.chances_per_mm
         paths, found = (PATH_STEP, PATH_SCALE_MM), (tally, histogram, visited)
         how = (self.rings, window, self.chances, per_mm, paths, photons, seed.copy())
-        walk_to_fibres(self.table, sines, *how, found)
+        walk_to_fibers(self.table, sines, *how, found)
         return (histogram if self.counts_paths else tally), visited
 
 

@@ -28,7 +28,7 @@ def ring_kernels(
         low = max(0.0, radius - both)
         rho = np.linspace(low, radius + both, KERNEL_NODES)
         row[:3] = low, (KERNEL_NODES - 1) / (rho[-1] - rho[0]), bins_per_mm
-        density = _ring_share(rho, radius, detector_mm, source_mm)
+        density = _ring_density(rho, radius, detector_mm, source_mm)
         # The walk interpolates: what the interpolant holds in total must be 1.
         a, b = rho[:-1], rho[1:]
         da, db = density[:-1], density[1:]
@@ -40,7 +40,7 @@ def ring_kernels(
     return rows, starts.astype(np.int64), np.maximum(stops - starts, 0).astype(np.int64)
 
 
-def _ring_share(
+def _ring_density(
     rho_mm: Float64Array, radius_mm: float, detector_mm: float, source_mm: float
 ) -> Float64Array:
     """Return the mean over directions of the density of (point in one core - point in the other).
@@ -68,18 +68,18 @@ def _ring_share(
             0.0,
         )
     )
-    area = disc_overlap(apart, detector_mm, source_mm)
+    area = disc_overlap_area(apart, detector_mm, source_mm)
     mean = (area * weights).sum(axis=1) * 0.5 * half / pi
     return np.asarray(mean / (pi * detector_mm**2 * pi * source_mm**2))
 
 
-def disc_overlap(apart: Float64Array, a: float, b: float) -> Float64Array:
+def disc_overlap_area(distance: Float64Array, a: float, b: float) -> Float64Array:
     """Return the area that two discs of radii a and b share at a distance of their centres."""
     small = min(a, b)
-    d = np.clip(apart, abs(a - b) + 1e-12, a + b)
+    d = np.clip(distance, abs(a - b) + 1e-12, a + b)
     first = np.arccos(np.clip((d * d + a * a - b * b) / (2.0 * d * a), -1.0, 1.0))
     second = np.arccos(np.clip((d * d + b * b - a * a) / (2.0 * d * b), -1.0, 1.0))
     product = (a + b - d) * (d + a - b) * (d - a + b) * (d + a + b)
     kite = 0.5 * np.sqrt(np.maximum(product, 0.0))
     lens = a * a * first + b * b * second - kite
-    return np.where(apart <= abs(a - b), pi * small * small, lens)
+    return np.where(distance <= abs(a - b), pi * small * small, lens)

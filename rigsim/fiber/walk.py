@@ -13,7 +13,7 @@ from math import copysign, exp, log, sqrt
 import numpy as np
 from numba import njit
 
-from rigsim.tissue.photon_walk import disc_point, draw, fresnel, scatter
+from rigsim.tissue.photon_walk import draw_disc_point, draw_uniform, fresnel, scatter_direction
 
 TABLE_COLUMNS = 8
 """Columns of the layer table: top, bottom (mm), sigma_t (1/mm), albedo, g, eta, optical depth of
@@ -26,7 +26,7 @@ _STATE_SIZE = 9  # x, y, z, ux, uy, uz, weight, path, layer
 
 
 @njit(inline="always")
-def _on_fibres(rho, value, path, rings, paths, tally, histogram):  # type: ignore[no-untyped-def]
+def _score_fibers(rho, value, path, rings, paths, tally, histogram):  # type: ignore[no-untyped-def]
     """Add light that leaves at a distance to the fibres that reach there."""
     kernels, starts, counts = rings
     log_step, path_scale = paths
@@ -63,7 +63,7 @@ def _on_fibres(rho, value, path, rings, paths, tally, histogram):  # type: ignor
     nogil=True,
     error_model="numpy",
 )
-def walk_to_fibres(  # type: ignore[no-untyped-def]
+def walk_to_fibers(  # type: ignore[no-untyped-def]
     table, sines, rings, window, chances, per_mm, paths, photons, seed, found
 ):
     """Trace photons from a point source in a cone and score what fibres take.
@@ -114,7 +114,7 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
     eta_ratio = eta_above / table[1, 5]
 
     for _ in range(photons):
-        s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+        s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
         sine2 = source_sine * source_sine * u / (eta_above * eta_above)
         reflected, mu = fresnel(sqrt(1.0 - sine2), eta_above, table[1, 5])
         x, y, z = 0.0, 0.0, 0.0  # position, mm
@@ -134,7 +134,7 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
             bottom = table[layer, 1]
             sigma_t = table[layer, 2]
             g = table[layer, 4]
-            s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+            s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
             depth_left = -log(u)  # optical depth to the next collision
 
             while True:
@@ -152,10 +152,10 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
                     level = int(z * chances_per_mm)
                     chance = chances[level] if level < levels else 0.0
                     if chance > 0.0:
-                        s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+                        s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
                         if u <= chance:
                             # A direction within the cone outside, uniform in projected angle.
-                            s0, s1, s2, s3, p, q = disc_point(s0, s1, s2, s3)
+                            s0, s1, s2, s3, p, q = draw_disc_point(s0, s1, s2, s3)
                             norm = p * p + q * q
                             eta = table[layer, 5]
                             p *= fibre_sine
@@ -187,14 +187,14 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
                                     value *= 1.0 - reflected
                             value *= exp(-tau)
                             rho = sqrt(x_out * x_out + y_out * y_out)
-                            _on_fibres(rho, value, out_path, rings, paths, tally, histogram)
+                            _score_fibers(rho, value, out_path, rings, paths, tally, histogram)
 
                     deeper = min(1.0 + z * deeper_per_mm, MAX_DEPTH_GAIN)
                     target = window[cell] * deeper
                     visited[0, cell] += weight * chance
                     visited[1, cell] += weight / deeper
                     if weight < 0.5 * target:
-                        s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+                        s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
                         if u * target > weight:
                             break
                         weight = target
@@ -211,10 +211,10 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
                     # The light that goes straight on from here has been scored, in part.
                     direct = True
                     was_x, was_y, was_z = ux, uy, uz
-                    s0, s1, s2, s3, ux, uy, uz = scatter(s0, s1, s2, s3, ux, uy, uz, g)
+                    s0, s1, s2, s3, ux, uy, uz = scatter_direction(s0, s1, s2, s3, ux, uy, uz, g)
                     from_layer, now_z = layer, uz
                     turn = was_x * ux + was_y * uy + was_z * uz
-                    s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+                    s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
                     depth_left = -log(u)
                     continue
 
@@ -230,7 +230,7 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
                 eta_beyond = table[beyond, 5]
                 if eta != eta_beyond:
                     reflected, mu = fresnel(abs(uz), eta, eta_beyond)
-                    s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+                    s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
                     if u <= reflected:
                         uz = -uz
                         direct = False
@@ -251,7 +251,7 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
                             share = phase / (drawn + phase)
                         value = share * weight * eta_above * eta_above / (fibre_sine * fibre_sine)
                         rho = sqrt(x * x + y * y)
-                        _on_fibres(rho, value, path, rings, paths, tally, histogram)
+                        _score_fibers(rho, value, path, rings, paths, tally, histogram)
                     break
                 if beyond == last:
                     break
@@ -271,7 +271,7 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
             chance = chances[level] if level < levels else 0.0
             direct = True
             was_x, was_y, was_z = row[3], row[4], row[5]
-            s0, s1, s2, s3, ux, uy, uz = scatter(
+            s0, s1, s2, s3, ux, uy, uz = scatter_direction(
                 s0, s1, s2, s3, was_x, was_y, was_z, table[layer, 4]
             )
             from_layer, now_z = layer, uz

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import RectBivariateSpline, RegularGridInterpolator
 
 from rigsim.arrays import Float64Array
-from rigsim.fiber.profile import Fibres
+from rigsim.fiber.profile import FiberGeometry
 
 HENYEY_GREENSTEIN_G: Final = 0.8
 ETA: Final = 1.4
@@ -33,9 +33,9 @@ MAX_CONTINUED_ABSORPTION: Final = 0.01
 """sigma_a / sigma_s' up to which the table is continued beyond its last distance: there its decay
 is that of diffusion to a thousandth."""
 
-DIFFUSED_FROM: Final = (12.0, 20.0)
+DIFFUSION_BLEND_RANGE: Final = (12.0, 20.0)
 """Distances between which what photons told of each goes over into what all of them tell of
-diffused light (`diffused`)."""
+diffused light (`log_diffuse_reflectance`)."""
 MEAN_SQUARE_DEPTH: Final = 17.5
 """Mean square depth of that light's source and its image, in 1 / sigma_s'^2: from the photons of
 sigma_a / sigma_s' of 0.003 to 0.009, which alone would say 17.0 to 17.4, and less surely 19.5 of
@@ -46,11 +46,11 @@ DISC_RADII, DISC_TURNS = 2, 6
 """Points in a core: rings, and points on each."""
 
 
-class WhiteFibreError(ValueError):
+class FiberTableError(ValueError):
     """A medium or a distance outside the table."""
 
 
-def decay(absorption: ArrayLike) -> Float64Array:
+def decay_rate(absorption: ArrayLike) -> Float64Array:
     """Return about what the logarithm of F falls by per unit of distance, far away.
 
     Parameters
@@ -73,7 +73,7 @@ def absorption_axis(absorption: ArrayLike) -> Float64Array:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class WhiteFibre:
+class FiberTable:
     """The table."""
 
     distance: Float64Array
@@ -89,7 +89,7 @@ class WhiteFibre:
 
     @staticmethod
     @cache
-    def load() -> WhiteFibre:
+    def load() -> FiberTable:
         """Return the stored table, read-only."""
         path = resources.files("rigsim").joinpath("data", TABLE_FILE)
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
@@ -100,15 +100,17 @@ class WhiteFibre:
             recipe = json.loads(str(stored["recipe"]))
         for array in arrays.values():
             array.setflags(write=False)
-        return WhiteFibre(**arrays, recipe=recipe)
+        return FiberTable(**arrays, recipe=recipe)
 
-    def holds(self, sigma_a_per_mm: float, sigma_s_prime_per_mm: float, fibres: Fibres) -> bool:
+    def covers(
+        self, sigma_a_per_mm: float, sigma_s_prime_per_mm: float, fibers: FiberGeometry
+    ) -> bool:
         """Return whether a medium under some fibres is inside the table."""
         if not sigma_s_prime_per_mm > 0.0:
             return False
-        both = 0.5 * (fibres.core_mm + fibres.source_core_mm)
-        near, far = min(fibres.radii_mm) - both, max(fibres.radii_mm) + both
-        apertures = (fibres.numerical_aperture, fibres.source_numerical_aperture)
+        both = 0.5 * (fibers.core_mm + fibers.source_core_mm)
+        near, far = min(fibers.radii_mm) - both, max(fibers.radii_mm) + both
+        apertures = (fibers.numerical_aperture, fibers.source_numerical_aperture)
         return bool(
             apertures == (NUMERICAL_APERTURE, NUMERICAL_APERTURE)
             and near * sigma_s_prime_per_mm >= self.distance[0]
@@ -120,7 +122,7 @@ class WhiteFibre:
         )
 
     def profile(
-        self, sigma_a_per_mm: float, sigma_s_prime_per_mm: float, fibres: Fibres
+        self, sigma_a_per_mm: float, sigma_s_prime_per_mm: float, fibers: FiberGeometry
     ) -> tuple[Float64Array, Float64Array]:
         """Return what fibres take.
 
@@ -144,33 +146,35 @@ class WhiteFibre:
 
         Examples
         --------
-        >>> r_f, error = WhiteFibre.load().profile(0.04, 1.5, Fibres((0.3, 3.3)))
+        >>> r_f, error = FiberTable.load().profile(0.04, 1.5, FiberGeometry((0.3, 3.3)))
         >>> bool(r_f[0] > 20.0 * r_f[1] > 0.0), bool((error < 0.01 * r_f).all())
         (True, True)
         """
-        if not self.holds(sigma_a_per_mm, sigma_s_prime_per_mm, fibres):
-            raise WhiteFibreError(
+        if not self.covers(sigma_a_per_mm, sigma_s_prime_per_mm, fibers):
+            raise FiberTableError(
                 f"sigma_a, sigma_s': got {sigma_a_per_mm}, {sigma_s_prime_per_mm} 1/mm, expected "
                 "both, and the fibres, inside the table"
             )
-        apart, share = distances(fibres)
+        apart, share = core_distances(fibers)
         scaled = apart * sigma_s_prime_per_mm
         a = sigma_a_per_mm / sigma_s_prime_per_mm
         shape, error = _splines()
         held = np.minimum(scaled, self.distance[-1])
         x = distance_axis(held)
         y = np.full_like(x, float(absorption_axis(a)))
-        fall = float(decay(a))
+        fall = float(decay_rate(a))
         log_f = shape.ev(x, y) - np.log(held) - fall * scaled
         # beyond the table: log_f has gone on with the fall of the last distance
-        log_f += (diffused(scaled, a) + fall * scaled) - (diffused(held, a) + fall * held)
+        log_f += (log_diffuse_reflectance(scaled, a) + fall * scaled) - (
+            log_diffuse_reflectance(held, a) + fall * held
+        )
         each = share * np.exp(log_f)
         value = sigma_s_prime_per_mm**2 * each.sum(axis=1)
         relative = error(np.stack([x, y], axis=-1))
         return value, np.asarray((relative * each).sum(axis=1) / each.sum(axis=1) * value)
 
 
-def diffused(distance: Float64Array, absorption: float) -> Float64Array:
+def log_diffuse_reflectance(distance: Float64Array, absorption: float) -> Float64Array:
     """Return the logarithm of diffused light far from its source, up to a constant.
 
     That of a dipole in the depth: (1 + k d) exp(-k d) / d^3 with d^2 = distance^2 +
@@ -189,16 +193,16 @@ def diffused(distance: Float64Array, absorption: float) -> Float64Array:
     return np.asarray(np.log1p(k * d) - k * d - 3.0 * np.log(d))
 
 
-def _of_all(table: WhiteFibre) -> tuple[Float64Array, Float64Array]:
+def _pool_far_nodes(table: FiberTable) -> tuple[Float64Array, Float64Array]:
     """Return shape and error with far nodes of weak absorption told by all of them together."""
     shape, error = table.shape.copy(), table.relative_error.copy()
-    near, far = DIFFUSED_FROM
+    near, far = DIFFUSION_BLEND_RANGE
     rows = table.distance > near
     x = table.distance[rows]
     share = np.clip(np.log(x / near) / np.log(far / near), 0.0, 1.0)
     for column in np.flatnonzero(table.absorption <= MAX_CONTINUED_ABSORPTION):
         a = float(table.absorption[column])
-        curve = diffused(x, a) + np.log(x) + float(decay(a)) * x
+        curve = log_diffuse_reflectance(x, a) + np.log(x) + float(decay_rate(a)) * x
         weight = 1.0 / error[rows, column] ** 2
         level = (weight * (shape[rows, column] - curve)).sum() / weight.sum()
         shape[rows, column] += share * (curve + level - shape[rows, column])
@@ -209,14 +213,14 @@ def _of_all(table: WhiteFibre) -> tuple[Float64Array, Float64Array]:
 
 @cache
 def _splines() -> tuple[RectBivariateSpline, RegularGridInterpolator]:
-    table = WhiteFibre.load()
+    table = FiberTable.load()
     axes = distance_axis(table.distance), absorption_axis(table.absorption)
-    shape, error = _of_all(table)
+    shape, error = _pool_far_nodes(table)
     return RectBivariateSpline(*axes, shape, s=0.0), RegularGridInterpolator(axes, error)
 
 
 @lru_cache(maxsize=8)
-def distances(fibres: Fibres) -> tuple[Float64Array, Float64Array]:
+def core_distances(fibers: FiberGeometry) -> tuple[Float64Array, Float64Array]:
     """Return distances of pairs of points, one in each core, and their shares.
 
     Parameters
@@ -231,31 +235,31 @@ def distances(fibres: Fibres) -> tuple[Float64Array, Float64Array]:
 
     Examples
     --------
-    >>> apart, share = distances(Fibres((0.3,), 0.2, 0.2))
+    >>> apart, share = core_distances(FiberGeometry((0.3,), 0.2, 0.2))
     >>> round(float(apart.min()), 2) >= 0.1, round(float((share * apart**2).sum()), 6)
     (True, 0.1)
     """
-    one, weight = disc_points(DISC_RADII, DISC_TURNS)
-    target = 0.5 * fibres.core_mm * one
-    source = 0.5 * fibres.source_core_mm * one
+    one, weight = disc_quadrature(DISC_RADII, DISC_TURNS)
+    target = 0.5 * fibers.core_mm * one
+    source = 0.5 * fibers.source_core_mm * one
     offset = (target[:, None, :] - source[None, :, :]).reshape(-1, 2)
     share = np.outer(weight, weight).reshape(-1)
-    radii = np.array(fibres.radii_mm)[:, None]
+    radii = np.array(fibers.radii_mm)[:, None]
     apart = np.hypot(radii + offset[:, 0], offset[:, 1])
     return apart, np.broadcast_to(share, apart.shape)
 
 
-def disc_points(rings: int, turns: int) -> tuple[Float64Array, Float64Array]:
+def disc_quadrature(rings: int, points_per_ring: int) -> tuple[Float64Array, Float64Array]:
     """Return points in the unit disc, shape (rings turns, 2), and their shares of its area.
 
     Examples
     --------
-    >>> points, share = disc_points(2, 6)
+    >>> points, share = disc_quadrature(2, 6)
     >>> round(float(share @ (points**2).sum(axis=1)), 12)  # the mean of r^2
     0.5
     """
     nodes, weights = np.polynomial.legendre.leggauss(rings)
     radius = np.sqrt(0.5 * (nodes + 1.0))
-    turn = 2.0 * math.pi * (np.arange(turns) + 0.25) / turns
+    turn = 2.0 * math.pi * (np.arange(points_per_ring) + 0.25) / points_per_ring
     points = radius[:, None, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    return points.reshape(-1, 2), np.repeat(0.5 * weights / turns, turns)
+    return points.reshape(-1, 2), np.repeat(0.5 * weights / points_per_ring, points_per_ring)

@@ -50,9 +50,9 @@ class Atlas:
         along_u, along_v = self.texel_mm()
         return float(np.median(np.maximum(along_u, along_v)[self.covered]))
 
-    def moved_by(self, way_mm: Float32Array) -> Atlas:
+    def translate(self, offset_mm: Float32Array) -> Atlas:
         """Return the atlas of the surface moved as a whole by (3,) mm, rig frame."""
-        there = np.where(self.covered[..., None], self.position_mm + way_mm, self.position_mm)
+        there = np.where(self.covered[..., None], self.position_mm + offset_mm, self.position_mm)
         return dataclasses.replace(self, position_mm=there)
 
 

@@ -206,7 +206,7 @@ def load_mesh(path: str | Path) -> Mesh:
     Returns
     -------
     Mesh
-        The mesh as it stands in the file; see `centered` to move it to the rig's origin.
+        The mesh as it stands in the file; see `center_face` to move it to the rig's origin.
 
     Raises
     ------
@@ -223,7 +223,7 @@ def load_mesh(path: str | Path) -> Mesh:
     raise MeshFileError(f"{path}: got suffix {path.suffix!r}, expected .npz or .obj")
 
 
-def centered(mesh: Mesh, *, nose_tip_mm: tuple[float, float, float] = (0.0, -8.0, 25.0)) -> Mesh:
+def center_face(mesh: Mesh, *, nose_tip_mm: tuple[float, float, float] = (0.0, -8.0, 25.0)) -> Mesh:
     """Move a face mesh so that the rig's cameras look at its middle.
 
     Parameters

@@ -12,7 +12,7 @@ from numba import njit, prange
 from rigsim.arrays import Float32Array, Float64Array
 
 
-def polygon_net(
+def polygon_edge_distance(
     x: Float64Array, y: Float64Array, *, jitter: float, seed: int
 ) -> tuple[Float32Array, Float32Array]:
     """Return how far points are from the edges of a polygon net.
@@ -36,7 +36,7 @@ def polygon_net(
     Examples
     --------
     >>> x, y = np.meshgrid(np.linspace(0.0, 5.0, 50), np.linspace(0.0, 5.0, 50))
-    >>> distance, number = polygon_net(x, y, jitter=0.8, seed=1)
+    >>> distance, number = polygon_edge_distance(x, y, jitter=0.8, seed=1)
     >>> bool(distance.min() >= 0.0), bool(distance.max() < 1.2)
     (True, True)
     """

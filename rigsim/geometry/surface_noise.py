@@ -50,7 +50,7 @@ def smooth_noise(points_mm: FloatArray, cells_mm: tuple[float, ...], *, seed: in
     return (total * scale).reshape(points_mm.shape[:-1])
 
 
-def line_network(
+def vessel_network(
     points_mm: FloatArray, cell_mm: float, width_mm: float, *, seed: int
 ) -> Float32Array:
     """Return a network of branching lines, such as small vessels make.
@@ -79,7 +79,7 @@ def line_network(
     return np.exp(-across * across).reshape(points_mm.shape[:-1]).astype(np.float32)
 
 
-def scattered_spots(
+def random_spots(
     points_mm: FloatArray,
     density: FloatArray,
     *,
@@ -87,7 +87,7 @@ def scattered_spots(
     radius_mm: tuple[float, float],
     seed: int,
     softness: float = 6.0,
-    smallest_mm: float | FloatArray = 0.0,
+    min_radius_mm: float | FloatArray = 0.0,
 ) -> Float32Array:
     """Return round spots at random places.
 
@@ -116,7 +116,7 @@ def scattered_spots(
     """
     flat = _flat(points_mm)
     chance = np.ascontiguousarray(np.broadcast_to(density, points_mm.shape[:-1]), np.float32)
-    floor = np.ascontiguousarray(np.broadcast_to(smallest_mm, points_mm.shape[:-1]), np.float32)
+    floor = np.ascontiguousarray(np.broadcast_to(min_radius_mm, points_mm.shape[:-1]), np.float32)
     sizes = (float(size) for size in (cell_mm, *radius_mm, softness))
     spots = _spots(flat, chance.reshape(-1), floor.reshape(-1), *sizes, _salt(seed, 0))
     return spots.reshape(points_mm.shape[:-1])

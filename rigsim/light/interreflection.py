@@ -3,7 +3,7 @@
 Light that leaves the interior of one patch falls on another, enters it and leaves again. Patches
 are the texels of a coarse texture; the exchange between two that see each other is that of two
 points, each with the boundary's transmittance at its own angle. The series over bounces is summed
-until what is left is below `DEFAULT_LAST_BOUNCE`.
+until what is left is below `DEFAULT_MIN_BOUNCE_FRACTION`.
 
 Light that went from skin to skin is reflected twice or more, so it is redder than once. A
 camera's channel is a sum over wavelengths. What is reflected once may be summed before, as its
@@ -27,12 +27,12 @@ from scipy import sparse
 
 from rigsim.arrays import Float32Array, Float64Array
 from rigsim.geometry.atlas import Atlas, dilate_texture, sample, unwrap
-from rigsim.light.seen_skin import SeenSkin
+from rigsim.light.observed_skin import ObservedSkin
 from rigsim.light.surface_brdf import transmittance
-from rigsim.render import OFFSET_MM, Caster
+from rigsim.render import RAY_OFFSET_MM, Caster
 from rigsim.tissue.skin_table import SkinTable
 
-DEFAULT_LAST_BOUNCE: Final = 1e-3
+DEFAULT_MIN_BOUNCE_FRACTION: Final = 1e-3
 """Share of the first bounce below which further ones are left out."""
 
 MAX_BOUNCES: Final = 30
@@ -41,7 +41,7 @@ PATCHES_PER_SIDE: Final = 96
 """Texels along one side of the coarse texture. On a pale head under one light what comes by other
 skin, 1 % of all, is 16 % low with 64, 6 % with 96 and 4 % with 128, against Mitsuba."""
 
-PAIRS_AT_ONCE: Final = 1 << 21
+PAIRS_PER_BLOCK: Final = 1 << 21
 
 
 class Interreflection:
@@ -82,8 +82,12 @@ class Interreflection:
         """Return the patches' middles in mm and their normals, shape (1, P, 3) each."""
         return (self.atlas.position_mm[self._covered][None], self.atlas.normal[self._covered][None])
 
-    def indirect(
-        self, entered: Float32Array, r_d: Float32Array, *, enough: float = DEFAULT_LAST_BOUNCE
+    def indirect_irradiance(
+        self,
+        entered: Float32Array,
+        r_d: Float32Array,
+        *,
+        min_bounce_fraction: float = DEFAULT_MIN_BOUNCE_FRACTION,
     ) -> Float32Array:
         """Return what enters by way of other skin.
 
@@ -104,7 +108,7 @@ class Interreflection:
         """
         latest = self.exchange @ (r_d * entered[:, None])
         total = latest.copy()
-        least = enough * float(np.abs(latest).max(initial=0.0))
+        least = min_bounce_fraction * float(np.abs(latest).max(initial=0.0))
         for _ in range(MAX_BOUNCES):
             if not float(np.abs(latest).max(initial=0.0)) > least:
                 break
@@ -136,17 +140,17 @@ def _exchange(
 ) -> sparse.csr_array:
     count = len(point)
     rows, columns, values = [], [], []
-    step = max(1, PAIRS_AT_ONCE // count)
+    step = max(1, PAIRS_PER_BLOCK // count)
     for first in range(0, count, step):
         block = np.arange(first, min(first + step, count))
         strength = np.zeros((len(block), count - first), np.float32)
         _form(point, normal, first, strength)
         i, j = np.nonzero(strength)
-        start = point[block[i]] + np.float32(OFFSET_MM) * normal[block[i]]
-        way = point[first + j] + np.float32(OFFSET_MM) * normal[first + j] - start
+        start = point[block[i]] + np.float32(RAY_OFFSET_MM) * normal[block[i]]
+        way = point[first + j] + np.float32(RAY_OFFSET_MM) * normal[first + j] - start
         length = np.linalg.norm(way, axis=-1)
         way /= length[:, None]
-        free = ~caster.blocked(start, way, 0.999 * length)
+        free = ~caster.is_blocked(start, way, 0.999 * length)
         i, j = i[free], j[free]
         share = strength[i, j]
         # what two patches send each other goes along one line: it is traced once
@@ -187,7 +191,7 @@ MIN_REFLECTANCE: Final = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Bounces:
+class InterreflectionSettings:
     """How light goes from skin to skin."""
 
     exchange: Interreflection
@@ -196,7 +200,7 @@ class Bounces:
     """Whether wavelengths are told apart; without, each channel is taken as one."""
     step: int = 1
     """Every how many of the table's wavelengths are summed at, 1 or one of `WAVELENGTH_STEPS`."""
-    enough: float = DEFAULT_LAST_BOUNCE
+    min_bounce_fraction: float = DEFAULT_MIN_BOUNCE_FRACTION
     """Share of the first bounce below which further ones are left out."""
 
 
@@ -216,13 +220,17 @@ class InterreflectionColor:
     """
 
     def __init__(
-        self, bounces: Bounces, skin: SeenSkin, r_d: Float32Array, reflectance: Float32Array
+        self,
+        bounces: InterreflectionSettings,
+        skin: ObservedSkin,
+        r_d: Float32Array,
+        reflectance: Float32Array,
     ) -> None:
-        self._bounce, self._enough = bounces.exchange, bounces.enough
+        self._bounce, self._enough = bounces.exchange, bounces.min_bounce_fraction
         subject = skin.subject
         covered = subject.atlas.covered.astype(np.float32)
         factor = r_d / np.maximum(reflectance, np.float32(MIN_REFLECTANCE))
-        layers = np.dstack([covered, subject.melanin, skin.blood, factor, r_d])
+        layers = np.dstack([covered, subject.melanin, skin.blood_volume_fraction, factor, r_d])
         coarse = self._bounce.coarsen(np.asarray(layers * covered[..., None], np.float32))
         coarse[:, 1:] /= np.maximum(coarse[:, :1], np.float32(MIN_REFLECTANCE))
         self._r_d = np.ascontiguousarray(coarse[:, 6:])
@@ -235,7 +243,7 @@ class InterreflectionColor:
             self._channel = np.maximum(self._spectrum @ weights, MIN_REFLECTANCE).astype(np.float32)
             self._weights = np.asarray(weights, np.float32)
 
-    def entering(self, direct: Float32Array) -> Float32Array:
+    def indirect_irradiance(self, direct: Float32Array) -> Float32Array:
         """Return the light that enters by way of other skin.
 
         Parameters
@@ -250,16 +258,20 @@ class InterreflectionColor:
             in a channel it gives what leaves in that channel.
         """
         if self._weights is None:
-            return self._bounce.indirect(direct, self._r_d, enough=self._enough)
-        each = self._bounce.indirect(direct, self._spectrum, enough=self._enough)
+            return self._bounce.indirect_irradiance(
+                direct, self._r_d, min_bounce_fraction=self._enough
+            )
+        each = self._bounce.indirect_irradiance(
+            direct, self._spectrum, min_bounce_fraction=self._enough
+        )
         covered = self._bounce.atlas.covered
         out = np.zeros((*covered.shape, self._weights.shape[1]), np.float32)
         out[covered] = ((each[covered] * self._spectrum) @ self._weights) / self._channel
         return out
 
     def on_texture(self, direct: Float32Array, size: int) -> Float32Array:
-        """Return `entering` on a texture of so many texels a side, shape (size, size, 3)."""
-        coarse = self.entering(direct)
+        """Return `indirect_irradiance` on a texture, shape (size, size, 3)."""
+        coarse = self.indirect_irradiance(direct)
         filled = dilate_texture(coarse, self._bounce.atlas.covered, steps=2)
         middle = (np.arange(size, dtype=np.float32) + np.float32(0.5)) / np.float32(size)
         u, v = np.meshgrid(middle, middle[::-1])
@@ -267,17 +279,17 @@ class InterreflectionColor:
         return sample(filled, uv, np.ones((size, size), np.bool_))
 
 
-def color_error(skin: SeenSkin) -> Float64Array:
+def channel_approximation_error(skin: ObservedSkin) -> Float64Array:
     """Return by how much each channel's mean of R^2 is off the square of its mean, shape (3,).
 
     Of typical skin.
     """
     weights = skin.band_weights()
-    typical = SkinTable.load().spectra(*(np.median(part) for part in skin.covered()))
+    typical = SkinTable.load().spectra(*(np.median(part) for part in skin.covered_chromophores()))
     return np.asarray(np.abs((typical**2 @ weights) / (typical @ weights) ** 2 - 1.0), np.float64)
 
 
-def step_error(skin: SeenSkin, step: int) -> Float64Array:
+def wavelength_step_error(skin: ObservedSkin, step: int) -> Float64Array:
     """Return by how much each channel of light from skin to skin is off at fewer wavelengths.
 
     Parameters
@@ -293,7 +305,7 @@ def step_error(skin: SeenSkin, step: int) -> Float64Array:
         Relative, shape (3,): the most for light that goes between any two of the face's extremes
         and middles of melanin and blood, by its mean of products over its mean.
     """
-    ends = [[part.min(), np.median(part), part.max()] for part in skin.covered()]
+    ends = [[part.min(), np.median(part), part.max()] for part in skin.covered_chromophores()]
     melanin, blood = (axis.ravel() for axis in np.meshgrid(*ends))
     spectra = SkinTable.load().spectra(melanin, blood)
 

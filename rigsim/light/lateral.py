@@ -26,7 +26,7 @@ from rigsim.geometry.atlas import Atlas
 IMPLICIT_STEPS: Final = 6
 """Implicit steps between two widths."""
 
-IGNORED_TEXELS: Final = 0.25
+MIN_SIGMA_TEXELS: Final = 0.25
 """Kernels narrower than this part of the smallest texel leave the field as it is."""
 
 COLUMN_BLOCK: Final = 64
@@ -77,7 +77,7 @@ def scatter_laterally(
     total = np.zeros_like(state)
     time = 0.0
     for k, width in enumerate(sigma):
-        if width > IGNORED_TEXELS * smallest_mm:
+        if width > MIN_SIGMA_TEXELS * smallest_mm:
             step = (0.5 * width * width - time) / IMPLICIT_STEPS
             for n in range(IMPLICIT_STEPS):
                 order = (_flow_rows, _flow_columns) if n % 2 == 0 else (_flow_columns, _flow_rows)
@@ -88,7 +88,7 @@ def scatter_laterally(
     return total
 
 
-def line_spread_mm(sigmas_mm: ArrayLike, weights: ArrayLike) -> Float64Array:
+def edge_width_mm(sigmas_mm: ArrayLike, weights: ArrayLike) -> Float64Array:
     """Return how wide a sum of Gaussians blurs an edge: from 10 to 90 % of the step.
 
     Parameters
@@ -103,7 +103,7 @@ def line_spread_mm(sigmas_mm: ArrayLike, weights: ArrayLike) -> Float64Array:
 
     Examples
     --------
-    >>> line_spread_mm([1.0], [[1.0]]).round(3).tolist()
+    >>> edge_width_mm([1.0], [[1.0]]).round(3).tolist()
     [2.563]
     """
     sigma = np.asarray(sigmas_mm, np.float64)

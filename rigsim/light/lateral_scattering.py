@@ -1,8 +1,8 @@
 """What leaves the inside of a face under one lamp: light that spread sideways, or came from skin.
 
 The light that enters is gathered in the face's texture; it spreads by the same lateral transport as
-in the flash rig (`rigsim.light.subsurface_radiance.spread_pattern` says how well that holds), and
-comes from other skin by `rigsim.light.interreflection`.
+in the flash rig (`rigsim.light.subsurface_radiance.scatter_patterned_light` says how well that
+holds), and comes from other skin by `rigsim.light.interreflection`.
 """
 
 from typing import Final
@@ -13,11 +13,11 @@ from rigsim import shading
 from rigsim.arrays import Float32Array
 from rigsim.geometry.atlas import dilate_texture
 from rigsim.light import lateral
-from rigsim.light.interreflection import Bounces, InterreflectionColor
+from rigsim.light.interreflection import InterreflectionColor, InterreflectionSettings
+from rigsim.light.observed_skin import ObservedSkin
 from rigsim.light.olat import Lamp
 from rigsim.light.relief_shadow import ReliefShadow
-from rigsim.light.seen_skin import SeenSkin
-from rigsim.light.subsurface_radiance import pigment_filter
+from rigsim.light.subsurface_radiance import pigment_transmittance
 from rigsim.light.surface_brdf import HAIR_REFLECTANCE, SkinSurface
 from rigsim.render import Caster, visibility
 from rigsim.tissue.skin_layers import ETA
@@ -47,11 +47,11 @@ class LateralScattering:
 
     def __init__(
         self,
-        skin: SeenSkin,
+        skin: ObservedSkin,
         surface: SkinSurface,
         caster: Caster,
         subsurface: bool,
-        bounces: Bounces | None,
+        bounces: InterreflectionSettings | None,
         relief: ReliefShadow | None,
     ) -> None:
         self._subject, self._surface, self._caster = skin.subject, surface, caster
@@ -59,9 +59,9 @@ class LateralScattering:
         if bounces is not None:
             self._color = InterreflectionColor(bounces, skin, surface.r_d, surface.reflectance)
         if subsurface:
-            clear = skin.without_melanin()
-            self._kernels = skin.kernels()
-            self._pigment = pigment_filter(surface.reflectance, clear, skin.subject.atlas)
+            clear = skin.reflectance_without_melanin()
+            self._kernels = skin.lateral_kernels()
+            self._pigment = pigment_transmittance(surface.reflectance, clear, skin.subject.atlas)
             self._inside = self._pigment * clear
 
     def glow(self, lamp: Lamp) -> Float32Array:
@@ -85,13 +85,15 @@ class LateralScattering:
         came: Float32Array | None = None
         if self._bounces is not None:
             point, normal = self._bounces.exchange.surface()
-            direct = entering(self._caster, lamp, point, normal, normal)[0]
+            direct = entering_irradiance(self._caster, lamp, point, normal, normal)[0]
             came = self._color.on_texture(direct, atlas.size)
         if not self.subsurface:
             if came is None:
                 raise ValueError("glow: got neither subsurface nor bounce, expected one")
             return dilate_texture(surface.r_d * came, atlas.covered)
-        entered = entering(self._caster, lamp, atlas.position_mm, surface.normal, atlas.normal)
+        entered = entering_irradiance(
+            self._caster, lamp, atlas.position_mm, surface.normal, atlas.normal
+        )
         if self._relief is not None:
             entered *= self._relief.on_texture(
                 atlas.position_mm, lamp.position_mm, radius_mm=lamp.radius_mm
@@ -107,7 +109,7 @@ class LateralScattering:
         return dilate_texture(scale * ((1.0 - hair) * self._pigment * skin + over), atlas.covered)
 
 
-def entering(
+def entering_irradiance(
     caster: Caster,
     lamp: Lamp,
     position_mm: Float32Array,

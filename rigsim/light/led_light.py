@@ -11,9 +11,9 @@ from rigsim.arrays import Float64Array
 
 DOME_METER_RATE_PER_S: Final = 12.0
 """Full scales per second in the strongest channel of a perfect white that faces the LED of
-`METER_LED`: white needs 60 ms for 0.7 of full scale."""
+`METERING_LED`: white needs 60 ms for 0.7 of full scale."""
 
-METER_LED: Final = (1.0, 40.0, 700.0)
+METERING_LED: Final = (1.0, 40.0, 700.0)
 """Power in W, half-intensity angle in degrees and distance in mm of the LED that defines it."""
 
 
@@ -44,7 +44,7 @@ def white_intensity(light: Light, view: View) -> Float64Array:
     """
     if light.power_w is None:
         raise ValueError(f"light {light.name!r}: got no power_w, expected an LED")
-    power, half_deg, distance_mm = METER_LED
+    power, half_deg, distance_mm = METERING_LED
     # The lobe cos^n over the half sphere holds 2 pi / (n + 1) of the intensity on the axis.
     unit = power * (_exponent(half_deg) + 1.0) / distance_mm**2
     strength = light.power_w * (lobe_exponent(light) + 1.0)

@@ -5,7 +5,7 @@ direction. So four sums over the LEDs, with weights 1, x, y and z, give all cond
 surface's reflection as Stokes vectors, which serve any analyser, and of the light that enters.
 
 The sums are smooth functions of the normal and of the place in the field, and are looked up in a
-table; `direct_moments` is the sum itself.
+table; `sum_led_moments` is the sum itself.
 
 Notes
 -----
@@ -16,7 +16,7 @@ with cubics in p (Catmull and Rom 1974) and linearly over the field. Steeper nor
 
 The LEDs are points here. They stand about 17 degrees apart, so that facets that mirror neighbours
 into the camera differ by 8.5 degrees: a lobe narrower than that resolves them, and the sum over
-the normal shows their lattice. `ripple` measures it.
+the normal shows their lattice. `lattice_ripple` measures it.
 """
 
 import math
@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike
 
 from rigsim import shading
 from rigsim.arrays import BoolArray, Float32Array, Float64Array
-from rigsim.as_built.sphere import REFERENCE_MM, BuiltSphere
+from rigsim.as_built.sphere import REFERENCE_DISTANCE_MM, ActualSphere
 from rigsim.light.led_light import lobe_exponent
 
 MAX_TILT_DEG: Final = 70.0
@@ -45,7 +45,7 @@ class MomentError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Surface:
+class MicrofacetSurface:
     """How a surface element reflects, and who looks at it."""
 
     alpha: float
@@ -61,12 +61,12 @@ class Surface:
 
 
 @dataclass(frozen=True, slots=True)
-class Moments:
+class LightMoments:
     """Sums over the LEDs for some surface elements."""
 
     specular: Float32Array
     """Stokes vectors of the surface's reflection, shape (N, 4, 3), radiance in 1/sr per unit of
-    `irradiance_share`; the moments in the order of `rigsim.as_built.sphere.MOMENT_NAMES`."""
+    `irradiance_per_led`; the moments in the order of `rigsim.as_built.sphere.MOMENT_NAMES`."""
     entering: Float32Array
     """Light that enters, shape (N, 4), cosine included."""
 
@@ -76,8 +76,8 @@ class Moments:
         return np.concatenate([self.specular.reshape(count, 12), self.entering], axis=1)
 
 
-def irradiance_share(
-    sphere: BuiltSphere, places_mm: ArrayLike, led: int
+def irradiance_per_led(
+    sphere: ActualSphere, positions_mm: ArrayLike, led: int
 ) -> tuple[Float64Array, Float64Array]:
     """Return where an LED is seen, and its irradiance across the beam, its film aside.
 
@@ -98,20 +98,20 @@ def irradiance_share(
         Intensity times the square of 600 mm over distance squared, shape (N,).
     """
     place = sphere.position_mm[led]
-    way = place - np.asarray(places_mm, np.float64)
+    way = place - np.asarray(positions_mm, np.float64)
     square = np.einsum("ni,ni->n", way, way)
     to_light = way / np.sqrt(square)[:, None]
     off = np.clip(to_light @ (place / np.linalg.norm(place)), 0.0, 1.0)
     lobe = off ** lobe_exponent(sphere.nominal.lights[led])
-    return to_light, sphere.intensity[led] * lobe * REFERENCE_MM**2 / square
+    return to_light, sphere.intensity[led] * lobe * REFERENCE_DISTANCE_MM**2 / square
 
 
 def led_moments(
     normals: ArrayLike,
-    places_mm: ArrayLike,
-    sphere: BuiltSphere,
+    positions_mm: ArrayLike,
+    sphere: ActualSphere,
     led: int,
-    surface: Surface,
+    surface: MicrofacetSurface,
     *,
     alpha: ArrayLike | None = None,
 ) -> tuple[Float32Array, Float32Array]:
@@ -128,8 +128,8 @@ def led_moments(
     alpha
         Roughness of each, shape (N,); None takes the surface's.
     """
-    points = np.asarray(places_mm, np.float64)
-    to_light, share = irradiance_share(sphere, points, led)
+    points = np.asarray(positions_mm, np.float64)
+    to_light, share = irradiance_per_led(sphere, points, led)
     to_camera = np.asarray(surface.eye_mm) - points
     to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
     specular = shading.specular_stokes(
@@ -155,15 +155,15 @@ def led_moments(
     return specular * scale[:, None], np.asarray(entry * scale, np.float32)
 
 
-def direct_moments(
+def sum_led_moments(
     normals: ArrayLike,
-    places_mm: ArrayLike,
-    sphere: BuiltSphere,
-    surface: Surface,
+    positions_mm: ArrayLike,
+    sphere: ActualSphere,
+    surface: MicrofacetSurface,
     *,
     leds: Sequence[int] | None = None,
     alpha: ArrayLike | None = None,
-) -> Moments:
+) -> LightMoments:
     """Sum over the LEDs one by one.
 
     Parameters
@@ -186,7 +186,7 @@ def direct_moments(
     Moments
     """
     n = np.asarray(normals, np.float32)
-    points = np.broadcast_to(np.asarray(places_mm, np.float64), n.shape)
+    points = np.broadcast_to(np.asarray(positions_mm, np.float64), n.shape)
     specular = np.zeros((len(n), 4, 3))
     entering = np.zeros((len(n), 4))
     weights = sphere.weights
@@ -196,7 +196,7 @@ def direct_moments(
         stokes, entry = led_moments(n, points, sphere, led, surface, alpha=alpha)
         specular += weights[led][None, :, None] * stokes[:, None, :]
         entering += weights[led][None, :] * entry[:, None]
-    return Moments(specular.astype(np.float32), entering.astype(np.float32))
+    return LightMoments(specular.astype(np.float32), entering.astype(np.float32))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -249,9 +249,9 @@ class MomentTable:
         return out
 
 
-def build_table(
-    sphere: BuiltSphere,
-    surface: Surface,
+def tabulate_moments(
+    sphere: ActualSphere,
+    surface: MicrofacetSurface,
     *,
     half_field_mm: float,
     alpha_range: tuple[float, float] | None = None,
@@ -264,7 +264,7 @@ def build_table(
     Parameters
     ----------
     sphere, surface, leds
-        As for `direct_moments`.
+        As for `sum_led_moments`.
     half_field_mm
         Half the side of the field, mm, > 0.
     alpha_range
@@ -308,20 +308,22 @@ def build_table(
         indexing="ij",
     )
     places = np.stack([nodes[column], nodes[row], np.zeros(row.shape)], axis=-1).reshape(-1, 3)
-    found = direct_moments(
+    found = sum_led_moments(
         normals[node.ravel()], places, sphere, surface, leds=leds, alpha=alphas[k.ravel()]
     )
     values[:, :, :, inside] = found.packed().reshape(*row.shape, MOMENT_CHANNELS)
     return MomentTable(values, alphas, half_field_mm, reach)
 
 
-def ripple(sphere: BuiltSphere, surface: Surface, *, steepest_deg: float = 25.0) -> float:
+def lattice_ripple(
+    sphere: ActualSphere, surface: MicrofacetSurface, *, max_slope_deg: float = 25.0
+) -> float:
     """Return how much the lattice of LEDs shows in the reflection of light from everywhere.
 
     Parameters
     ----------
     sphere, surface
-        As for `direct_moments`.
+        As for `sum_led_moments`.
     steepest_deg
         Tilt up to which normals are tried.
 
@@ -332,11 +334,11 @@ def ripple(sphere: BuiltSphere, surface: Surface, *, steepest_deg: float = 25.0)
     """
     count = 2500
     k = np.arange(count) + 0.5
-    height = 1.0 - (1.0 - math.cos(math.radians(steepest_deg))) * k / count
+    height = 1.0 - (1.0 - math.cos(math.radians(max_slope_deg))) * k / count
     phi = math.pi * (1.0 + math.sqrt(5.0)) * k
     flat = np.sqrt(1.0 - height**2)
     normals = np.column_stack([flat * np.cos(phi), flat * np.sin(phi), height])
-    s0 = direct_moments(normals, (0.0, 0.0, 0.0), sphere, surface).specular[:, 0, 0]
+    s0 = sum_led_moments(normals, (0.0, 0.0, 0.0), sphere, surface).specular[:, 0, 0]
     x, y = normals[:, 0], normals[:, 1]
     basis = np.column_stack([np.ones(count), x, y, x * x, x * y, y * y])
     rest = s0 - basis @ np.linalg.lstsq(basis, s0, rcond=None)[0]

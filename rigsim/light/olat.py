@@ -24,10 +24,10 @@ from rigsim.light.olat_kernels import (
     UINT16_FULL_SCALE,
 )
 from rigsim.light.surface_brdf import MAX_R_D
-from rigsim.render import OFFSET_MM, Caster, GBuffer, g_buffer
-from rigsim.render.depth_of_field import LensPicture, before_focus, lens_spread
+from rigsim.render import RAY_OFFSET_MM, Caster, GBuffer, g_buffer
+from rigsim.render.depth_of_field import LensImage, depth_before_focus, tabulate_defocus
 
-LookUp = Callable[[GBuffer, Int32Array], tuple[Float32Array, Float32Array]]
+SurfaceLookup = Callable[[GBuffer, Int32Array], tuple[Float32Array, Float32Array]]
 """Gives the shading normals, shape (n, 3), and the surfaces of a G-buffer's rays, shape (n, 7) or
 with a coating (n, 11)."""
 
@@ -98,7 +98,7 @@ class Hits:
     """Centre of projection, shape (3,)."""
     kind: int
     """`SKIN_ROWS`, `MATT_ROWS` or `METAL_ROWS`."""
-    lens: LensPicture | None = None
+    lens: LensImage | None = None
     """How the lens spreads the rows' light; None: it is sharp everywhere."""
 
     def scatter(self, rows: Float32Array) -> Float32Array:
@@ -150,7 +150,7 @@ def unpack_surface(surface: UInt16Array) -> Float32Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Looking:
+class CameraSettings:
     """How cameras look."""
 
     subpixels: int
@@ -164,8 +164,8 @@ class Looking:
 def find_hits(
     caster: Caster,
     view: View,
-    look_up: LookUp,
-    how: Looking,
+    look_up: SurfaceLookup,
+    settings: CameraSettings,
     kind: int = SKIN_ROWS,
     distortion: ArrayLike | None = None,
 ) -> Hits:
@@ -191,7 +191,7 @@ def find_hits(
     Hits
         Rows sorted by pixel.
     """
-    k, width, height = how.subpixels, view.width_px, view.height_px
+    k, width, height = settings.subpixels, view.width_px, view.height_px
     band = max(1, RAYS_PER_BAND // (width * k * k))
     parts: list[tuple[Any, ...]] = []
     begin, end = _rows_of(caster, view, bent=distortion is not None and bool(np.any(distortion)))
@@ -218,11 +218,11 @@ def find_hits(
     starts = np.flatnonzero(np.diff(owner, prepend=-1))
     pixels, begins = owner[starts], np.append(starts, len(owner)).astype(np.int32)
     lens = None
-    if how.optics:
-        toward = before_focus(view, position)
+    if settings.optics:
+        toward = depth_before_focus(view, position)
         depths = float(toward.min(initial=0.0)), float(toward.max(initial=0.0))
-        spread = lens_spread(view, how.illuminant, subpixels=k, depths_mm=depths)
-        lens = LensPicture(spread, (height, width), pixels, begins, slots, toward)
+        spread = tabulate_defocus(view, settings.illuminant, subpixels=k, depths_mm=depths)
+        lens = LensImage(spread, (height, width), pixels, begins, slots, toward)
     shape, eye = (height, width), np.asarray(view.position_mm, np.float64)
     return Hits(
         shape, k, pixels, begins, position, normals, prim, slots, uv, packed, eye, kind, lens
@@ -280,7 +280,7 @@ def _rows_of(caster: Caster, view: View, *, bent: bool) -> tuple[int, int]:
     return begin, min(max(end, begin + 1), view.height_px)
 
 
-def seen_from(hits: Hits, caster: Caster, lamp: Lamp) -> BoolArray:
+def is_lamp_visible(hits: Hits, caster: Caster, lamp: Lamp) -> BoolArray:
     """Tell which rows see their point of a light.
 
     Every row has its own point on the disc; neighbours' points are spread evenly over it. Only
@@ -316,15 +316,15 @@ def seen_from(hits: Hits, caster: Caster, lamp: Lamp) -> BoolArray:
     length = np.empty(count[-1], np.float32)
     rows, mesh = (hits.position_mm, hits.normal, hits.prim), caster.mesh
     rays = (index, start, way, length)
-    kernels.aim(*rows, mesh.vertices_mm, mesh.faces, center, targets, count, *rays)
+    kernels.aim_shadow_rays(*rows, mesh.vertices_mm, mesh.faces, center, targets, count, *rays)
     visible = np.zeros(len(hits.position_mm), np.bool_)
-    visible[index] = ~caster.blocked(start, way, length)
+    visible[index] = ~caster.is_blocked(start, way, length)
     return visible
 
 
-def lift(hits: Hits, caster: Caster) -> Float32Array:
+def shadow_ray_origins(hits: Hits, caster: Caster) -> Float32Array:
     """Return where the rows' shadow rays start, above their triangles, shape (n, 3)."""
-    offset = np.float32(OFFSET_MM) * caster.face_normals[hits.prim]
+    offset = np.float32(RAY_OFFSET_MM) * caster.face_normals[hits.prim]
     return np.asarray(hits.position_mm + offset, np.float32)
 
 
@@ -333,14 +333,16 @@ def sum_rows(
 ) -> Float32Array:
     """Sum what rows send, shape (n,) each, times a color, into whole pixels, shape (H, W, 3)."""
     if hits.lens is not None:
-        return hits.lens.see(np.stack([red, green, blue], axis=1)) * np.asarray(color, np.float32)
+        return hits.lens.render(np.stack([red, green, blue], axis=1)) * np.asarray(
+            color, np.float32
+        )
     out = np.zeros((hits.shape[0] * hits.shape[1], 3), np.float32)
     share = np.asarray(color, np.float32) / np.float32(hits.subpixels**2)
     kernels.sum_rows(hits.pixel, hits.first, red, green, blue, share, out)
     return out.reshape(*hits.shape, 3)
 
 
-def light_up(
+def shade_rows(
     hits: Hits,
     lamp: Lamp,
     visible: BoolArray,
@@ -359,7 +361,7 @@ def light_up(
     lamp
         The light.
     visible
-        Rows that see it, see `seen_from`.
+        Rows that see it, see `is_lamp_visible`.
     color
         Intensity on the light's axis, shape (3,), see `rigsim.light.led_light`.
     glow
@@ -382,7 +384,7 @@ def light_up(
     faded = np.ones(0, np.float32) if relief is None else relief
     samples = (hits.position_mm, hits.normal, hits.surface, hits.camera_mm, hits.kind)
     light = (center, axis, float(lamp.exponent))
-    kernels.shade(samples, light, visible, extra, diffuse, faded, rows)
+    kernels.shade_rows(samples, light, visible, extra, diffuse, faded, rows)
     return sum_rows(hits, rows[0], rows[1], rows[2], color)
 
 

@@ -8,13 +8,13 @@ from numba import njit, prange
 
 from rigsim.light.surface_brdf import (
     MAX_R_D,
-    boundary,
     coated_terms,
-    ggx,
+    ggx_brdf,
     surface_terms,
     transmittance,
+    two_way_transmittance,
 )
-from rigsim.render import OFFSET_MM
+from rigsim.render import RAY_OFFSET_MM
 
 ROWS_PER_CHUNK: Final = 1 << 13
 """Rows that one thread works on at a time."""
@@ -35,7 +35,7 @@ ETA_COLUMN: Final = 9
 
 
 @njit(cache=True)  # a few ms at most: waiting for a second thread would take longer
-def sum_rows(pixel, first, red, green, blue, share, out):  # type: ignore[no-untyped-def]
+def sum_rows(pixel, first, red, green, blue, weight, out):  # type: ignore[no-untyped-def]
     """Sum what rows send into whole pixels, times a share per channel."""
     for p in range(pixel.shape[0]):
         r = g = b = np.float32(0.0)
@@ -43,9 +43,9 @@ def sum_rows(pixel, first, red, green, blue, share, out):  # type: ignore[no-unt
             r += red[i]
             g += green[i]
             b += blue[i]
-        out[pixel[p], 0] = share[0] * r
-        out[pixel[p], 1] = share[1] * g
-        out[pixel[p], 2] = share[2] * b
+        out[pixel[p], 0] = weight[0] * r
+        out[pixel[p], 1] = weight[1] * g
+        out[pixel[p], 2] = weight[2] * b
 
 
 @njit(cache=True, inline="always")
@@ -71,8 +71,8 @@ def count_facing(position, normal, center, count):  # type: ignore[no-untyped-de
 
 
 @njit(parallel=True, cache=True)
-def aim(  # type: ignore[no-untyped-def]
-    position, normal, prim, vertices, faces, center, targets, count, index, start, way, length
+def aim_shadow_rays(  # type: ignore[no-untyped-def]
+    position, normal, prim, vertices, faces, center, targets, count, index, start, direction, length
 ):
     """Aim the shadow rays of rows that face a light, each at its own point of it."""
     for chunk in prange(count.shape[0] - 1):
@@ -95,19 +95,19 @@ def aim(  # type: ignore[no-untyped-def]
             n0, n1, n2 = e1 * f2 - e2 * f1, e2 * f0 - e0 * f2, e0 * f1 - e1 * f0
             norm = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
             # Rays start above the triangle, on the side that the light is on if it is in front.
-            lift = OFFSET_MM / norm if norm > 0.0 else 0.0
+            lift = RAY_OFFSET_MM / norm if norm > 0.0 else 0.0
             p0, p1, p2 = p0 + lift * n0, p1 + lift * n1, p2 + lift * n2
             w0, w1, w2 = x - p0, y - p1, z - p2
             far = math.sqrt(w0 * w0 + w1 * w1 + w2 * w2)
             index[at] = i
             start[at, 0], start[at, 1], start[at, 2] = p0, p1, p2
-            way[at, 0], way[at, 1], way[at, 2] = w0 / far, w1 / far, w2 / far
+            direction[at, 0], direction[at, 1], direction[at, 2] = w0 / far, w1 / far, w2 / far
             length[at] = 0.999 * far
             at += 1
 
 
 @njit(parallel=True, cache=True)
-def shade(samples, light, visible, glow, diffuse, relief, out):  # type: ignore[no-untyped-def]
+def shade_rows(samples, light, visible, glow, diffuse, relief, out):  # type: ignore[no-untyped-def]
     """Add what rows send to a camera under one light.
 
     Parameters
@@ -117,7 +117,7 @@ def shade(samples, light, visible, glow, diffuse, relief, out):  # type: ignore[
     light
         Middle of the light in mm, its axis, and the exponent of its lobe.
     visible, glow, diffuse, relief, out
-        As in `rigsim.light.olat.light_up`; ``glow`` and ``relief`` without a row are none.
+        As in `rigsim.light.olat.shade_rows`; ``glow`` and ``relief`` without a row are none.
     """
     position, normal, surface, camera, kind = samples
     center, axis, exponent = light
@@ -172,7 +172,7 @@ def shade(samples, light, visible, glow, diffuse, relief, out):  # type: ignore[
         nh = min((nl + nv) / length, 1.0)
         rough = surface[i, 3] / UINT16_FULL_SCALE
         if kind == METAL_ROWS:
-            lobe = math.pi * strength * ggx(nl, nv, nh, rough)
+            lobe = math.pi * strength * ggx_brdf(nl, nv, nh, rough)
             out[0, i] += lobe * r0
             out[1, i] += lobe * r1
             out[2, i] += lobe * r2
@@ -199,7 +199,7 @@ def shade(samples, light, visible, glow, diffuse, relief, out):  # type: ignore[
         else:
             lobe = surface_terms(nl, nv, nh, 0.5 * length, rough, oil, MAX_FUZZ * fuzz)
         gloss = math.pi * strength * bare * lobe
-        inside = strength * boundary(nl, nv) if diffuse else 0.0
+        inside = strength * two_way_transmittance(nl, nv) if diffuse else 0.0
         out[0, i] += gloss + inside * r0
         out[1, i] += gloss + inside * r1
         out[2, i] += gloss + inside * r2

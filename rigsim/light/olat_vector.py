@@ -12,13 +12,13 @@ import numpy as np
 
 from rigsim.arrays import Float32Array, Float64Array
 from rigsim.light import surface_brdf as brdf
-from rigsim.light.olat import DISC_POINTS, Hits, Lamp, disc_points, lift, sum_rows
+from rigsim.light.olat import DISC_POINTS, Hits, Lamp, disc_points, shadow_ray_origins, sum_rows
 from rigsim.light.olat_kernels import BARE_COLUMNS, ETA_COLUMN, MAX_FUZZ, UINT16_FULL_SCALE
-from rigsim.render import Caster, load, with_slack
+from rigsim.render import Caster, load_mitsuba, pad_memory
 from rigsim.tissue.skin_layers import ETA
 
 
-class VectorLight:
+class VectorizedShader:
     """Rows of skin, ready to be lit.
 
     Parameters
@@ -33,15 +33,15 @@ class VectorLight:
         self._choice = caster.choice
         self._scene = caster.scene
         self.hits = hits
-        mi = load(self._choice)
-        self._start = mi.Point3f(*_columns(lift(hits, caster)))
+        mi = load_mitsuba(self._choice)
+        self._start = mi.Point3f(*_columns(shadow_ray_origins(hits, caster)))
         # Normal and surface as ten half words, or fourteen: a dome holds sixteen views.
         halves = np.concatenate([hits.normal.view(np.uint16), hits.surface], axis=1)
         words = np.ascontiguousarray(halves).view(np.uint32)
-        self._words = [mi.UInt32(with_slack(words[:, k])) for k in range(words.shape[1])]
+        self._words = [mi.UInt32(pad_memory(words[:, k])) for k in range(words.shape[1])]
         self._across, self._along = (mi.Float(points) for points in disc_points(DISC_POINTS))
 
-    def light_up(
+    def shade_rows(
         self,
         lamp: Lamp,
         color: Float32Array,
@@ -50,7 +50,7 @@ class VectorLight:
         diffuse: bool = True,
         relief: Float32Array | None = None,
     ) -> Float32Array:
-        """Trace shadow rays, shade and sum into pixels; see `rigsim.light.olat.light_up`.
+        """Trace shadow rays, shade and sum into pixels; see `rigsim.light.olat.shade_rows`.
 
         Parameters
         ----------
@@ -66,7 +66,7 @@ class VectorLight:
             return np.zeros((*self.hits.shape, 3), np.float32)
         import drjit as dr
 
-        mi = load(self._choice)
+        mi = load_mitsuba(self._choice)
 
         def number(value: float) -> Any:
             return dr.opaque(mi.Float, float(value))
@@ -96,7 +96,7 @@ class VectorLight:
         lobe = dr.power(dr.maximum(off, 1e-9), number(lamp.exponent))
         strength = dr.select(active, nl / squared * lobe, 0.0)
         if relief is not None:
-            strength *= mi.Float(with_slack(relief))
+            strength *= mi.Float(pad_memory(relief))
         half = to_light + to_camera
         length = dr.norm(half)
         nh, lh = dr.minimum((nl + nv) / length, 1.0), 0.5 * length
@@ -149,7 +149,7 @@ class VectorLight:
 
 
 def _columns(rows: Float32Array) -> list[Float32Array]:
-    return [with_slack(np.asarray(rows[:, k], np.float32)) for k in range(rows.shape[1])]
+    return [pad_memory(np.asarray(rows[:, k], np.float32)) for k in range(rows.shape[1])]
 
 
 def _grains(nl: Any, nv: Any, lh: Any) -> Any:

@@ -32,7 +32,7 @@ from rigsim.subject import SimulatedSubject
 HORIZON_DIRECTIONS: Final = 24
 """Directions in which horizons are found; between them they are blended."""
 
-SOFT_RAD: Final = 0.02
+HORIZON_SOFTNESS_RAD: Final = 0.02
 """Least half width of a shadow's edge in elevation: a texel is no point."""
 
 
@@ -104,7 +104,7 @@ class ReliefShadow:
             ]
         )
 
-    def seen(
+    def visible_fraction(
         self,
         uv: Float32Array,
         position_mm: Float32Array,
@@ -133,16 +133,16 @@ class ReliefShadow:
         out = np.empty(len(uv), np.float32)
         points = (np.ascontiguousarray(part, np.float32) for part in (uv, position_mm))
         light = (np.asarray(light_mm, np.float64), radius_mm)
-        _seen(*points, *light, self._du, self._dv, self._horizon, out)
+        _visible_fraction(*points, *light, self._du, self._dv, self._horizon, out)
         return out
 
     def on_texture(
         self, position_mm: Float32Array, light_mm: ArrayLike, *, radius_mm: float = 0.0
     ) -> Float32Array:
-        """Return `seen` of every texel, shape (N, N), from their positions, shape (N, N, 3)."""
+        """Return `visible_fraction` per texel, shape (N, N), from positions, shape (N, N, 3)."""
         middle = (np.arange(self._size, dtype=np.float32) + np.float32(0.5)) / self._size
         uv = np.stack(np.meshgrid(middle, middle[::-1]), axis=-1).reshape(-1, 2)
-        found = self.seen(
+        found = self.visible_fraction(
             uv.astype(np.float32), position_mm.reshape(-1, 3), light_mm, radius_mm=radius_mm
         )
         return found.reshape(self._size, self._size)
@@ -193,7 +193,7 @@ def _sweep(field, step, drift, out):  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True, cache=True)
-def _seen(uv, position, light, radius, du, dv, horizon, out):  # type: ignore[no-untyped-def]
+def _visible_fraction(uv, position, light, radius, du, dv, horizon, out):  # type: ignore[no-untyped-def]
     size = du.shape[0]
     turns = horizon.shape[0]
     for i in prange(uv.shape[0]):
@@ -226,7 +226,7 @@ def _seen(uv, position, light, radius, du, dv, horizon, out):  # type: ignore[no
         share = turn - k
         low, high = horizon[k % turns, row, column], horizon[(k + 1) % turns, row, column]
         edge = math.atan(((1.0 - share) * float(low) + share * float(high)) / texel_um)
-        soft = max(radius / far, SOFT_RAD)
+        soft = max(radius / far, HORIZON_SOFTNESS_RAD)
         out[i] = min(max(0.5 + (math.asin(min(up, 1.0)) - edge) / (2.0 * soft), 0.0), 1.0)
         if edge <= 0.0:
             out[i] = 1.0
@@ -238,7 +238,7 @@ ELEVATION_NODES: Final = 6
 _ELEVATION_QUADRATURE: Final = np.polynomial.legendre.leggauss(ELEVATION_NODES)
 
 
-def hidden_share(
+def hidden_sky_fraction(
     height_um: Float32Array,
     normals: Float32Array,
     *,
@@ -283,7 +283,8 @@ def hidden_share(
 
     >>> tilt = math.radians(60.0)
     >>> lean = np.zeros((1, 1, 3), np.float32) + np.float32([math.sin(tilt), 0.0, math.cos(tilt)])
-    >>> found = hidden_share(np.zeros((1, 1), np.float32), lean, margin=0, pixel_um=1, sectors=64)
+    >>> found = hidden_sky_fraction(np.zeros((1, 1), np.float32), lean, margin=0, pixel_um=1,
+    ...     sectors=64)
     >>> round(float(found[0, 0]), 3)
     0.25
     """

@@ -7,13 +7,13 @@ import numpy as np
 from numba import njit, prange
 
 from rigsim.arrays import BoolArray, Float32Array
-from rigsim.as_built.sphere import REFERENCE_MM, BuiltSphere
+from rigsim.as_built.sphere import REFERENCE_DISTANCE_MM, ActualSphere
 from rigsim.light.led_light import lobe_exponent
-from rigsim.light.lobe_moments import Surface
-from rigsim.shading_kernels import entry_one, specular_one
+from rigsim.light.lobe_moments import MicrofacetSurface
+from rigsim.shading_kernels import entry_transmittance_element, specular_stokes_element
 
 
-class Elements(Protocol):
+class SurfaceElements(Protocol):
     """Surface elements of a picture."""
 
     @property
@@ -37,13 +37,13 @@ class Elements(Protocol):
         """Where light is taken away, shape (H, W)."""
 
 
-def remove_hidden(
+def subtract_hidden_led(
     packed: Float32Array,
-    elements: Elements,
+    elements: SurfaceElements,
     horizon: tuple[Float32Array, Float32Array, float],
-    sphere: BuiltSphere,
+    sphere: ActualSphere,
     led: int,
-    surface: Surface,
+    surface: MicrofacetSurface,
 ) -> None:
     """Take an LED away from where it stands behind the horizon, in place.
 
@@ -52,7 +52,7 @@ def remove_hidden(
     Parameters
     ----------
     packed
-        Moments, planar, shape (16, H, W): as `rigsim.light.lobe_moments.Moments.packed`.
+        Moments, planar, shape (16, H, W): as `rigsim.light.lobe_moments.LightMoments.packed`.
     elements
         The surface.
     horizon
@@ -70,7 +70,7 @@ def remove_hidden(
     first, second, between = horizon
     flat = (elements.x_mm, elements.y_mm, elements.alpha, elements.skin, first, second)
     low = np.float32(math.tan(max(elevation - radius, 0.0)))
-    intensity = float(sphere.intensity[led]) * REFERENCE_MM**2
+    intensity = float(sphere.intensity[led]) * REFERENCE_DISTANCE_MM**2
     lobe = (intensity, lobe_exponent(sphere.nominal.lights[led]), sphere.weights[led])
     look = (np.array(surface.eye_mm, np.float64), np.array(surface.image_right, np.float64))
     _remove(
@@ -107,10 +107,12 @@ def _remove(packed, elements, edge, led, look):  # type: ignore[no-untyped-def]
         v0, v1, v2 = eye[0] - x[i], eye[1] - y[i], eye[2]
         length = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
         v0, v1, v2 = v0 / length, v1 / length, v2 / length
-        s0, s1, s2 = specular_one(
+        s0, s1, s2 = specular_stokes_element(
             n0, n1, n2, l0, l1, l2, v0, v1, v2, float(alpha[i]), eta, absorbs, right, leak, 0.0
         )
-        entered = share * nl * entry_one(n0, n1, n2, l0, l1, l2, eta, absorbs, leak)
+        entered = (
+            share * nl * entry_transmittance_element(n0, n1, n2, l0, l1, l2, eta, absorbs, leak)
+        )
         for m in range(4):
             weight = weights[m] * share
             packed[3 * m, i] -= weight * s0

@@ -11,9 +11,9 @@ from rigsim.arrays import Float32Array, Float64Array
 from rigsim.as_built.polarizers import Polarizers, absorbing_axis
 from rigsim.geometry.atlas import Atlas
 from rigsim.light import lateral
-from rigsim.light.interreflection import Bounces, InterreflectionColor
+from rigsim.light.interreflection import InterreflectionColor, InterreflectionSettings
+from rigsim.light.observed_skin import ObservedSkin
 from rigsim.light.relief_shadow import ReliefShadow
-from rigsim.light.seen_skin import SeenSkin
 from rigsim.light.surface_brdf import HAIR_REFLECTANCE
 from rigsim.render import Caster, visibility
 from rigsim.subject import SimulatedSubject
@@ -22,14 +22,14 @@ from rigsim.tissue.skin_layers import ETA
 
 PIGMENT_BLUR_MM: Final = 0.12
 """Width of the blur of melanin's absorbance; fitted to photons that walk through patterned skin,
-see `spread_pattern`."""
+see `scatter_patterned_light`."""
 
 FLASH_SHADOW_SAMPLES: Final = 8
 """Points on each flash that cast shadows."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SurfaceLight:
+class SurfaceIllumination:
     """Light on a face, whatever its skin is made of; textures of shape (N, N[, L])."""
 
     visible: Float32Array
@@ -45,28 +45,28 @@ class SurfaceLight:
 class SubsurfaceRadiance:
     """Light on and out of a face; textures of shape (N, N[, C])."""
 
-    surface: SurfaceLight
+    surface: SurfaceIllumination
     """Light on it."""
     reflectance: Float32Array
     """Sharp white-balanced diffuse reflectance of the skin, shape (N, N, 3)."""
-    sharp: Float32Array
+    unscattered: Float32Array
     """Light that would leave where it entered, before the surface's exit: what entered, from
     flashes and from other skin, times reflectance and the interior's scale, shape (N, N, 3)."""
-    spread: Float32Array
+    scattered: Float32Array
     """The same with lateral transport unless it is left out, and behind hair."""
     kernels: GaussianSum
     """Lateral profile of each channel at the face's typical skin."""
 
 
-def light_surface(
+def illuminate_surface(
     subject: SimulatedSubject,
     lights: tuple[Light, ...],
     weights: Float64Array,
-    films: Polarizers,
+    polarizers: Polarizers,
     *,
     caster: Caster,
     relief: ReliefShadow | None = None,
-) -> SurfaceLight:
+) -> SurfaceIllumination:
     """Light the surface of a face.
 
     Parameters
@@ -110,7 +110,7 @@ def light_surface(
             visible[:, k] *= relief.on_texture(
                 atlas.position_mm, light.position_mm, radius_mm=light.radius_mm
             ).reshape(-1)
-        to_light, falloff = toward(light, position)
+        to_light, falloff = direction_and_falloff(light, position)
         cosine = np.maximum(np.einsum("ij,ij->i", normal, to_light), 0.0)
         falling = np.float32(weights[k]) * falloff * cosine * visible[:, k]
         irradiance += falling
@@ -119,20 +119,24 @@ def light_surface(
             to_light,
             eta=ETA,
             light_absorbs=absorbing_axis(light),
-            extinction=films.light_extinction,
+            extinction=polarizers.light_extinction,
         )
     covered = atlas.covered.reshape(-1)
     irradiance[~covered] = 0.0
     entered[~covered] = 0.0
-    return SurfaceLight(
+    return SurfaceIllumination(
         visible.reshape(size, size, len(lights)),
         irradiance.reshape(size, size),
         entered.reshape(size, size),
     )
 
 
-def light_skin(
-    skin: SeenSkin, surface: SurfaceLight, *, lateral_transport: bool, bounces: Bounces | None
+def render_subsurface_radiance(
+    skin: ObservedSkin,
+    surface: SurfaceIllumination,
+    *,
+    lateral_transport: bool,
+    interreflection: InterreflectionSettings | None,
 ) -> SubsurfaceRadiance:
     """Let the light on a face into its skin and out again.
 
@@ -157,26 +161,28 @@ def light_skin(
     hair = subject.hair[..., None]
     covering = np.asarray(HAIR_REFLECTANCE, np.float32) * hair
     within = surface.entered[..., None]
-    if bounces is not None:
+    if interreflection is not None:
         outside = scale * ((1.0 - hair) * reflectance + covering)
-        color = InterreflectionColor(bounces, skin, outside, reflectance)
+        color = InterreflectionColor(interreflection, skin, outside, reflectance)
         covered = subject.atlas.covered
-        sums = bounces.exchange.coarsen(np.dstack([surface.entered, covered]).astype(np.float32))
+        sums = interreflection.exchange.coarsen(
+            np.dstack([surface.entered, covered]).astype(np.float32)
+        )
         direct = np.asarray(sums[:, 0] / np.maximum(sums[:, 1], 1e-6), np.float32)
         came = color.on_texture(direct, subject.size)
         within = within + np.where(covered[..., None], came, np.float32(0.0))
     sharp = scale * within * reflectance
-    kernels = skin.kernels()
+    kernels = skin.lateral_kernels()
     spread = sharp
     if lateral_transport:
-        spread = scale * spread_through_pigment(skin, reflectance, within, kernels)
+        spread = scale * scatter_through_pigment(skin, reflectance, within, kernels)
     # Hair is dark and matt, and lets no light into the skin below it.
     spread = (1.0 - hair) * spread + scale * within * covering
     return SubsurfaceRadiance(surface, reflectance, sharp, spread, kernels)
 
 
-def spread_through_pigment(
-    skin: SeenSkin, reflectance: Float32Array, entered: Float32Array, kernels: GaussianSum
+def scatter_through_pigment(
+    skin: ObservedSkin, reflectance: Float32Array, entered: Float32Array, kernels: GaussianSum
 ) -> Float32Array:
     """Return the light that leaves after it has spread, per unit of the interior's scale.
 
@@ -200,11 +206,11 @@ def spread_through_pigment(
     --------
     spread_pattern : what is done, and how well it holds.
     """
-    without = skin.without_melanin()
-    return spread_pattern(reflectance, without, entered, skin.subject.atlas, kernels)
+    without = skin.reflectance_without_melanin()
+    return scatter_patterned_light(reflectance, without, entered, skin.subject.atlas, kernels)
 
 
-def spread_pattern(
+def scatter_patterned_light(
     reflectance: Float32Array,
     without_melanin: Float32Array,
     entered: Float32Array,
@@ -241,13 +247,13 @@ def spread_pattern(
     edges and spots, to which the width was fitted, and by 3 to 4 % on stripes of 0.75 mm, to which
     it was not; leaving transport out errs by 6.3 % on the six, blurring the reflectance by 3.7 %.
     """
-    pigment = pigment_filter(reflectance, without_melanin, atlas)
+    pigment = pigment_transmittance(reflectance, without_melanin, atlas)
     light = entered if entered.ndim == 3 else entered[..., None]
     inside = np.ascontiguousarray(pigment * without_melanin * light, np.float32)
     return pigment * lateral.scatter_laterally(inside, atlas, kernels.sigmas_mm, kernels.weights)
 
 
-def pigment_filter(
+def pigment_transmittance(
     reflectance: Float32Array, without_melanin: Float32Array, atlas: Atlas
 ) -> Float32Array:
     """Return which part of light the pigment above the place where it enters or leaves lets pass.
@@ -259,7 +265,9 @@ def pigment_filter(
     return np.exp(lateral.scatter_laterally(log_m, atlas, [PIGMENT_BLUR_MM], channels))
 
 
-def toward(light: Light, position_mm: Float32Array) -> tuple[Float32Array, Float32Array]:
+def direction_and_falloff(
+    light: Light, position_mm: Float32Array
+) -> tuple[Float32Array, Float32Array]:
     """Return unit vectors to a light and the inverse square of its distance in 1/mm^2."""
     way = np.asarray(light.position_mm, np.float32) - position_mm
     squared = np.einsum("...j,...j->...", way, way)

@@ -25,7 +25,7 @@ boundary. It is not the reflectance for light at normal incidence R, which also 
 boundary: R_d = R / (T(0) T_average) = 1.114 R for an index of 1.4, see
 `rigsim.shading.interior_scale`. The surface terms are nowhere exactly zero, so even without noise
 the minimum lies above R_d by the smallest surface term in the directions that were measured, see
-`surface_floor`.
+`min_surface_reflection`.
 
 References
 ----------
@@ -206,7 +206,7 @@ def skin_surface(
     )
 
 
-def evaluate(
+def evaluate_brdf(
     packed: ArrayLike, normal: ArrayLike, to_light: ArrayLike, to_camera: ArrayLike
 ) -> tuple[Float32Array, Float32Array]:
     """Evaluate the reflection at points.
@@ -230,7 +230,7 @@ def evaluate(
     Examples
     --------
     >>> up = np.array([0.0, 0.0, 1.0])
-    >>> total, specular = evaluate([0.5, 0.4, 0.3, 0.3, 0.2, 0.0, 1.0], up, up, up)
+    >>> total, specular = evaluate_brdf([0.5, 0.4, 0.3, 0.3, 0.2, 0.0, 1.0], up, up, up)
     >>> bool(total[0, 0] > total[0, 2] > specular[0] > 0.0)
     True
     """
@@ -249,13 +249,13 @@ def evaluate(
     return _evaluate(*full)
 
 
-def surface_floor(packed: ArrayLike, *, steepest_deg: float = 70.0) -> Float32Array:
+def min_surface_reflection(packed: ArrayLike, *, max_slope_deg: float = 70.0) -> Float32Array:
     """Return the least of pi f_surface / (T T): how far eq. (6)'s minimum lies above R_d.
 
     Parameters
     ----------
     packed
-        As for `evaluate`, shape (n, 7) or (n, 11).
+        As for `evaluate_brdf`, shape (n, 7) or (n, 11).
     steepest_deg
         Light and camera are taken no more aslant than this, degrees.
 
@@ -267,7 +267,7 @@ def surface_floor(packed: ArrayLike, *, steepest_deg: float = 70.0) -> Float32Ar
     values = np.atleast_2d(np.asarray(packed, np.float32))
     least = np.full(len(values), np.inf, np.float32)
     up = np.array([0.0, 0.0, 1.0], np.float32)
-    angles = np.radians(np.linspace(0.0, steepest_deg, 8))
+    angles = np.radians(np.linspace(0.0, max_slope_deg, 8))
     for light in angles:
         for camera in angles[angles <= light + 1e-9]:
             for turn in (0.0, 0.5 * math.pi, math.pi):
@@ -277,7 +277,7 @@ def surface_floor(packed: ArrayLike, *, steepest_deg: float = 70.0) -> Float32Ar
                     math.sin(camera) * math.sin(turn),
                     math.cos(camera),
                 ]
-                surface = evaluate(values, up, to_light, to_camera)[1]
+                surface = evaluate_brdf(values, up, to_light, to_camera)[1]
                 passed = boundary_transmittance(math.cos(light), math.cos(camera))
                 least = np.minimum(least, np.float32(math.pi / passed) * surface)
     return least
@@ -294,7 +294,7 @@ def _fresnel(cosine, eta):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def beckmann(nl, nv, nh, alpha):  # type: ignore[no-untyped-def]
+def beckmann_brdf(nl, nv, nh, alpha):  # type: ignore[no-untyped-def]
     """Return D G / (4 n.l n.v) of Beckmann facets."""
     a2 = alpha * alpha
     c2 = nh * nh
@@ -316,7 +316,7 @@ def _beckmann_g1(c, alpha):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def ggx(nl, nv, nh, alpha):  # type: ignore[no-untyped-def]
+def ggx_brdf(nl, nv, nh, alpha):  # type: ignore[no-untyped-def]
     """Return D G / (4 n.l n.v) of GGX facets."""
     a2 = alpha * alpha
     t = nh * nh * (a2 - 1.0) + 1.0
@@ -345,16 +345,16 @@ def coated_terms(  # type: ignore[no-untyped-def]
     if film < 1.0:
         total = (1.0 - film) * _facets(nl, nv, nh, lh, roughness, oil)
     if film > 0.0:
-        total += film * _fresnel(lh, film_eta) * ggx(nl, nv, nh, film_alpha)
+        total += film * _fresnel(lh, film_eta) * ggx_brdf(nl, nv, nh, film_alpha)
     if fuzz > 0.0:
         total += _down(nl, nv, fuzz)
     if powder > 0.0:
-        total = (1.0 - powder) * total + powder * grains(nl, nv, lh)
+        total = (1.0 - powder) * total + powder * powder_scattering(nl, nv, lh)
     return total
 
 
 @njit(cache=True, inline="always")
-def grains(nl, nv, lh):  # type: ignore[no-untyped-def]
+def powder_scattering(nl, nv, lh):  # type: ignore[no-untyped-def]
     """Return the single scattering of a thick layer of grains."""
     g = POWDER_ASYMMETRY
     turned = 1.0 - 2.0 * lh * lh  # cosine between the way in and the way out
@@ -364,9 +364,9 @@ def grains(nl, nv, lh):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, inline="always")
 def _facets(nl, nv, nh, lh, roughness, oil):  # type: ignore[no-untyped-def]
-    total = (1.0 - oil) * _fresnel(lh, ETA) * beckmann(nl, nv, nh, roughness)
+    total = (1.0 - oil) * _fresnel(lh, ETA) * beckmann_brdf(nl, nv, nh, roughness)
     if oil > 0.0:
-        total += oil * _fresnel(lh, ETA_OIL) * ggx(nl, nv, nh, OIL_SMOOTHING * roughness)
+        total += oil * _fresnel(lh, ETA_OIL) * ggx_brdf(nl, nv, nh, OIL_SMOOTHING * roughness)
     return total
 
 
@@ -383,7 +383,7 @@ def transmittance(cosine):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def boundary(nl, nv):  # type: ignore[no-untyped-def]
+def two_way_transmittance(nl, nv):  # type: ignore[no-untyped-def]
     """Return the transmittance of the boundary on the way in times that on the way out."""
     return (1.0 - _fresnel(nl, ETA)) * (1.0 - _fresnel(nv, ETA))
 
@@ -401,7 +401,7 @@ def boundary_transmittance(cos_light: float, cos_camera: float) -> float:
 
 @njit(cache=True)
 def _boundary(nl, nv):  # type: ignore[no-untyped-def]
-    return boundary(nl, nv)
+    return two_way_transmittance(nl, nv)
 
 
 @njit(parallel=True, cache=True)
@@ -427,7 +427,7 @@ def _evaluate(packed, normal, light, camera):  # type: ignore[no-untyped-def]
         else:
             lobes = surface_terms(nl, nv, nh, 0.5 * length, p[3], p[4], p[5])
         surface = p[6] * lobes
-        inside = boundary(nl, nv) / math.pi
+        inside = two_way_transmittance(nl, nv) / math.pi
         specular[i] = surface
         for k in range(3):
             total[i, k] = inside * packed[i, k] + surface

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from rigsim.arrays import Float64Array, FloatArray
 from rigsim.geometry.mesh import Mesh
 from rigsim.light.interreflection import Interreflection
-from rigsim.needs.effects import Noise
+from rigsim.needs.effects import PixelNoise
 from rigsim.render import Caster
 from rigsim.tissue.skin_layers import ETA
 
@@ -63,7 +63,7 @@ def edge_loss(sigmas_mm: ArrayLike, weights: ArrayLike, pixel_mm: float) -> Floa
     return np.asarray(weight @ mean, np.float64)
 
 
-def spread_over_noise(lost: ArrayLike, level: ArrayLike, noise: Noise) -> Float64Array:
+def scattering_over_noise(lost: ArrayLike, level: ArrayLike, noise: PixelNoise) -> Float64Array:
     """Return how much spreading across a shadow's edge changes a pixel, over its noise.
 
     Parameters
@@ -83,14 +83,14 @@ def spread_over_noise(lost: ArrayLike, level: ArrayLike, noise: Noise) -> Float6
 
     Examples
     --------
-    >>> spread_over_noise([0.1], [0.5], Noise(1e-4, 0.0)).round(3).tolist()
+    >>> scattering_over_noise([0.1], [0.5], PixelNoise(1e-4, 0.0)).round(3).tolist()
     [22.361]
     """
     gained = np.minimum(np.asarray(lost, np.float64) * np.asarray(level, np.float64), 1.0)
     return np.asarray(gained / noise.sigma(gained), np.float64)
 
 
-def exchange_share(caster: Caster) -> float:
+def max_exchange_fraction(caster: Caster) -> float:
     """Return which part of the light that leaves a surface falls back onto its hollows at most.
 
     Parameters
@@ -118,39 +118,41 @@ def is_flat(mesh: Mesh) -> bool:
     return bool(spread[-1] <= 1e-6 * max(spread[0], 1e-300))
 
 
-def bounced(share: float, reflectance: float) -> float:
+def interreflection_over_direct(exchange_fraction: float, reflectance: float) -> float:
     """Return the light that comes by way of other skin over the brightest direct light.
 
     Parameters
     ----------
     share
-        See `exchange_share`, 0 to below 1.
+        See `max_exchange_fraction`, 0 to below 1.
     reflectance
         The largest diffuse reflectance, 0 to 1.
 
     Examples
     --------
-    >>> round(bounced(0.2, 0.5), 4)
+    >>> round(interreflection_over_direct(0.2, 0.5), 4)
     0.1111
     """
-    once = share * reflectance
+    once = exchange_fraction * reflectance
     if not 0.0 <= once < 1.0:
-        raise ValueError(f"share, reflectance: got {share}, {reflectance}, expected 0 to 1")
+        raise ValueError(
+            f"share, reflectance: got {exchange_fraction}, {reflectance}, expected 0 to 1"
+        )
     return once / (1.0 - once)
 
 
-def steepest_slope(slope_x: FloatArray, slope_y: FloatArray) -> float:
+def max_slope(slope_x: FloatArray, slope_y: FloatArray) -> float:
     """Return the steepest slope of a relief: a light above that elevation shines everywhere.
 
     Examples
     --------
-    >>> steepest_slope(np.array([3.0, 0.0]), np.array([4.0, 0.0]))
+    >>> max_slope(np.array([3.0, 0.0]), np.array([4.0, 0.0]))
     5.0
     """
     return float(np.hypot(slope_x, slope_y).max(initial=0.0))
 
 
-def most_irradiance(mesh: Mesh, places_mm: ArrayLike, weights_mm2: ArrayLike) -> float:
+def max_irradiance(mesh: Mesh, positions_mm: ArrayLike, weights_mm2: ArrayLike) -> float:
     """Return a bound on the light that lights together send to any point of a mesh.
 
     Parameters
@@ -173,21 +175,21 @@ def most_irradiance(mesh: Mesh, places_mm: ArrayLike, weights_mm2: ArrayLike) ->
     --------
     >>> from rigsim.geometry.mesh import build_mesh
     >>> plate = build_mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], [[0, 0], [1, 0], [0, 1]])
-    >>> round(most_irradiance(plate, [[0, 0, 100]], [100.0**2]), 3)
+    >>> round(max_irradiance(plate, [[0, 0, 100]], [100.0**2]), 3)
     1.0
     """
     points = np.asarray(mesh.vertices_mm, np.float64)
     total = 0.0
     for place, weight in zip(
-        np.asarray(places_mm, np.float64), np.asarray(weights_mm2, np.float64), strict=True
+        np.asarray(positions_mm, np.float64), np.asarray(weights_mm2, np.float64), strict=True
     ):
         squared = float(np.min(np.sum((place - points) ** 2, axis=1)))
         total += float(weight) / max(squared, 1e-12)
     return total
 
 
-def highlight(
-    mesh: Mesh, places_mm: ArrayLike, weights_mm2: ArrayLike, camera_mm: ArrayLike, alpha: float
+def max_highlight(
+    mesh: Mesh, positions_mm: ArrayLike, weights_mm2: ArrayLike, camera_mm: ArrayLike, alpha: float
 ) -> float:
     """Return a bound on what a surface's facets reflect, over the light of a white plate.
 
@@ -196,7 +198,7 @@ def highlight(
     mesh
         The surface.
     places_mm, weights_mm2
-        Lights, as of `most_irradiance`.
+        Lights, as of `max_irradiance`.
     camera_mm
         The camera, shape (3,).
     alpha
@@ -213,7 +215,7 @@ def highlight(
     --------
     >>> from rigsim.geometry.mesh import build_mesh
     >>> plate = build_mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], [[0, 0], [1, 0], [0, 1]])
-    >>> bound = highlight(plate, [[0, 0, 1e4]], [1e8], [0, 0, 1e4], 0.5)
+    >>> bound = max_highlight(plate, [[0, 0, 1e4]], [1e8], [0, 0, 1e4], 0.5)
     >>> round(bound / (2.0 * (0.4 / 2.4) ** 2 / (2.0 * 0.5**3)), 3)
     1.0
     """
@@ -222,7 +224,7 @@ def highlight(
     to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
     total = 0.0
     for place, weight in zip(
-        np.asarray(places_mm, np.float64), np.asarray(weights_mm2, np.float64), strict=True
+        np.asarray(positions_mm, np.float64), np.asarray(weights_mm2, np.float64), strict=True
     ):
         to_light = place - points
         to_light /= np.linalg.norm(to_light, axis=1, keepdims=True)
@@ -230,5 +232,5 @@ def highlight(
         cosine = math.sqrt(max(0.5 * (1.0 + between), 0.0))  # of half the angle
         inside = math.sqrt(ETA**2 - 1.0 + cosine**2)
         across = ((cosine - inside) / (cosine + inside)) ** 2
-        total += 2.0 * across * most_irradiance(mesh, [place], [weight])
+        total += 2.0 * across * max_irradiance(mesh, [place], [weight])
     return total / (2.0 * alpha**3)

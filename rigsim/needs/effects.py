@@ -16,7 +16,7 @@ from typing import Any, Final, Literal, TypeAlias, get_args
 import numpy as np
 
 from capture.plan import Plan
-from capture.plan.rows import lights_of
+from capture.plan.rows import step_lights
 from rigsim.arrays import Float64Array, FloatArray
 from rigsim.package_data import package_table
 from rigsim.sensor import Sensor
@@ -44,7 +44,7 @@ class NeedsError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Noise:
+class PixelNoise:
     """Noise of one exposure of one pixel, where 1 is full scale."""
 
     scale: float
@@ -60,7 +60,7 @@ class Noise:
             )
 
     @classmethod
-    def of(cls, sensor: Sensor, exposure_s: float = 0.0) -> Noise:
+    def of(cls, sensor: Sensor, exposure_s: float = 0.0) -> PixelNoise:
         """Return the noise of a sensor's pixels.
 
         Parameters
@@ -77,12 +77,12 @@ class Noise:
 
         Examples
         --------
-        >>> float(Noise(1e-4, 9e-8).sigma(1.0).round(5))
+        >>> float(PixelNoise(1e-4, 9e-8).sigma(1.0).round(5))
         0.01
         """
         return np.sqrt(self.scale * np.maximum(level, 0.0) + self.offset)
 
-    def share(self, change: float, level: float = 1.0) -> float:
+    def change_over_noise(self, change: float, level: float = 1.0) -> float:
         """Return a relative change of a signal over its noise.
 
         Parameters
@@ -94,7 +94,7 @@ class Noise:
 
         Examples
         --------
-        >>> round(Noise(1e-4, 0.0).share(0.002), 3)
+        >>> round(PixelNoise(1e-4, 0.0).share(0.002), 3)
         0.2
         """
         return abs(change) * level / float(self.sigma(level))
@@ -133,7 +133,7 @@ class SceneEffects:
         return cls(**{SWITCH_FIELDS.get(name, name): asked for name, asked in switches.items()})
 
 
-EFFECTS_BY_SIZE: Final = SceneEffects()
+AUTOMATIC_EFFECTS: Final = SceneEffects()
 """Every effect that is large enough to change pixels, and no other."""
 
 
@@ -170,7 +170,7 @@ class Effect:
             )
 
     @property
-    def built(self) -> bool:
+    def is_built(self) -> bool:
         """Whether it is in the picture."""
         return self.verdict == "built"
 
@@ -227,19 +227,19 @@ class EffectSelection:
 
     def builds(self, name: str) -> bool:
         """Return whether an effect is built."""
-        return self[name].built
+        return self[name].is_built
 
     @property
-    def left_out(self) -> list[tuple[str, str]]:
+    def omitted(self) -> list[tuple[str, str]]:
         """Return what is not built, with the reasons."""
-        return [(effect.name, effect.reason) for effect in self.effects if not effect.built]
+        return [(effect.name, effect.reason) for effect in self.effects if not effect.is_built]
 
     def document(self) -> list[dict[str, str | float | None]]:
         """Return this as JSON values."""
         return [effect.document() for effect in self.effects]
 
 
-def merge_selections(each: Sequence[EffectSelection]) -> EffectSelection:
+def merge_selections(selections: Sequence[EffectSelection]) -> EffectSelection:
     """Return what a scene must hold that several cameras look at: what any of them needs.
 
     Parameters
@@ -250,26 +250,26 @@ def merge_selections(each: Sequence[EffectSelection]) -> EffectSelection:
     Examples
     --------
     >>> coarse, fine = (
-    ...     EffectSelection((decide("blur", size, None, switch="optics", because="a lens"),))
+    ...     EffectSelection((decide_effect("blur", size, None, switch="optics", reason="a lens"),))
     ...     for size in (0.01, 5.0)
     ... )
     >>> merge_selections([coarse, fine])["blur"].over_noise
     5.0
     """
     found: dict[str, Effect] = {}
-    for effect in (effect for needs in each for effect in needs):
+    for effect in (effect for needs in selections for effect in needs):
         other = found.get(effect.name)
-        if other is None or _need(effect) > _need(other):
+        if other is None or _priority(effect) > _priority(other):
             found[effect.name] = effect
     return EffectSelection(tuple(found.values()))
 
 
-def _need(effect: Effect) -> tuple[bool, float]:
-    return effect.built, effect.over_noise or 0.0
+def _priority(effect: Effect) -> tuple[bool, float]:
+    return effect.is_built, effect.over_noise or 0.0
 
 
-def decide(
-    name: str, over_noise: float, asked: bool | None, *, switch: str, because: str
+def decide_effect(
+    name: str, over_noise: float, requested: bool | None, *, switch: str, reason: str
 ) -> Effect:
     """Decide on an effect that a scene can build: as it was asked for, or by its size.
 
@@ -288,20 +288,20 @@ def decide(
 
     Examples
     --------
-    >>> decide("bounces", 3.0, None, switch="bounces", because="hollows").verdict
+    >>> decide_effect("bounces", 3.0, None, switch="bounces", reason="hollows").verdict
     'built'
-    >>> decide("bounces", 0.0, None, switch="bounces", because="all is flat").verdict
+    >>> decide_effect("bounces", 0.0, None, switch="bounces", reason="all is flat").verdict
     'negligible'
-    >>> decide("bounces", 3.0, False, switch="bounces", because="hollows").reason
+    >>> decide_effect("bounces", 3.0, False, switch="bounces", reason="hollows").reason
     'bounces=False asks for it; hollows: up to 3 times the noise'
     """
     if not over_noise >= 0.0:
         raise NeedsError(f"{name}: over_noise: got {over_noise}, expected >= 0")
-    size = f"{because}: up to {over_noise:.3g} times the noise"
-    if asked is None:
+    size = f"{reason}: up to {over_noise:.3g} times the noise"
+    if requested is None:
         verdict: Verdict = "built" if over_noise >= NEGLIGIBLE_NOISE_RATIO else "negligible"
         return Effect(name, verdict, size, over_noise, switch)
-    if asked:
+    if requested:
         text = (
             size if over_noise >= NEGLIGIBLE_NOISE_RATIO else f"{switch}=True asks for it; {size}"
         )
@@ -311,7 +311,7 @@ def decide(
     return Effect(name, "asked", f"{switch}=False asks for it; {size}", over_noise, switch)
 
 
-def longest_on_s(plan: Plan) -> float | None:
+def max_on_time_s(plan: Plan) -> float | None:
     """Return how long lights are on at most in one exposure of a plan, s; None: they never are.
 
     Parameters
@@ -324,11 +324,11 @@ def longest_on_s(plan: Plan) -> float | None:
     --------
     >>> from capture.plan.gradient import gradient_plan
     >>> from capture.rig import load_rig
-    >>> longest_on_s(gradient_plan(load_rig("gradient")))
+    >>> max_on_time_s(gradient_plan(load_rig("gradient")))
     0.018
     """
     lit = [
-        max(len(lights_of(step)), 1)
+        max(len(step_lights(step)), 1)
         * float(step.settings["level"])
         * float(step.settings["exposure_s"])
         for step in plan.steps
@@ -337,7 +337,7 @@ def longest_on_s(plan: Plan) -> float | None:
     return max(lit, default=0.0) or None
 
 
-def left_out_of(*images: str) -> list[Effect]:
+def omitted_effects(*images: str) -> list[Effect]:
     """Return effects that images leave out in every case, by the tables of ``left_out.toml``."""
     tables = package_table("left_out")
     verdicts: tuple[Verdict, ...] = ("absent", "unmodeled")

@@ -7,12 +7,22 @@ import numpy as np
 
 from capture.rig import Rig, View
 from rigsim.arrays import Float64Array, FloatArray
-from rigsim.light.interreflection import WAVELENGTH_STEPS, color_error, step_error
-from rigsim.light.seen_skin import SeenSkin
-from rigsim.needs.effect_sizes import bounced, edge_loss, spread_over_noise
-from rigsim.needs.effects import NEGLIGIBLE_NOISE_RATIO, Effect, Noise, SceneEffects, decide
+from rigsim.light.interreflection import (
+    WAVELENGTH_STEPS,
+    channel_approximation_error,
+    wavelength_step_error,
+)
+from rigsim.light.observed_skin import ObservedSkin
+from rigsim.needs.effect_sizes import edge_loss, interreflection_over_direct, scattering_over_noise
+from rigsim.needs.effects import (
+    NEGLIGIBLE_NOISE_RATIO,
+    Effect,
+    PixelNoise,
+    SceneEffects,
+    decide_effect,
+)
 from rigsim.render import Caster
-from rigsim.render.depth_of_field import facing_depths, lens_spread
+from rigsim.render.depth_of_field import depth_range, tabulate_defocus
 from rigsim.subject import SimulatedSubject
 
 LATERAL_EFFECT = "light spreading sideways in skin"
@@ -44,7 +54,7 @@ MAX_REMAINING_NOISE_RATIO = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scenery:
+class ViewingConditions:
     """What a camera looks at and with, and what of it is asked for."""
 
     view: View
@@ -52,24 +62,24 @@ class Scenery:
     """Spectrum of the lights."""
     caster: Caster
     """The mesh."""
-    share: float
-    """`exchange_share` of the mesh."""
-    noise: Noise
+    exchange_fraction: float
+    """`max_exchange_fraction` of the mesh."""
+    noise: PixelNoise
     """Of the sensor."""
     effects: SceneEffects
     """What is asked for."""
     subpixels: int
     """Rays along each side of a pixel."""
 
-    def skin(self, subject: SimulatedSubject, state: str) -> SeenSkin:
+    def observe_skin(self, subject: SimulatedSubject, state: str) -> ObservedSkin:
         """Return a face as the camera sees it."""
-        return SeenSkin(subject, state, self.view.spectral_sensitivity, self.illuminant)
+        return ObservedSkin(subject, state, self.view.spectral_sensitivity, self.illuminant)
 
 
-def face_effects(
-    skin: SeenSkin,
-    scenery: Scenery,
-    brightest: Float64Array,
+def select_face_effects(
+    skin: ObservedSkin,
+    scenery: ViewingConditions,
+    peak_reflectance: Float64Array,
     *,
     level: FloatArray,
     peak: float,
@@ -83,7 +93,7 @@ def face_effects(
     skin, scenery
         The face, and the camera that looks at it.
     brightest
-        Its `brightest_rgb`.
+        Its `max_reflectance_rgb`.
     level
         What its brightest skin gives, full scales, shape (3,).
     peak
@@ -93,55 +103,68 @@ def face_effects(
     lateral_switch
         What switches lateral transport.
     """
-    noise, share, effects = scenery.noise, scenery.share, scenery.effects
+    noise, share, effects = scenery.noise, scenery.exchange_fraction, scenery.effects
     pixel_mm = scenery.view.distance_mm / scenery.view.focal_px
-    kernels = skin.kernels()
+    kernels = skin.lateral_kernels()
     lost = edge_loss(kernels.sigmas_mm, kernels.weights, pixel_mm)
-    more = level * [bounced(share, float(reflectance)) for reflectance in brightest]
+    more = level * [
+        interreflection_over_direct(share, float(reflectance)) for reflectance in peak_reflectance
+    ]
     more = np.minimum(more, 1.0)
     unseen = more / noise.sigma(more)  # where nothing else shines
-    bounces = decide(
+    bounces = decide_effect(
         INTERREFLECTION_EFFECT,
         float(unseen.max()),
         effects.interreflections,
         switch="interreflections",
-        because=f"hollows get {100 * share:.0f} % of what their surroundings send out",
+        reason=f"hollows get {100 * share:.0f} % of what their surroundings send out",
     )
-    off = float((unseen * color_error(skin)).max()) if bounces.built else 0.0
+    off = float((unseen * channel_approximation_error(skin)).max()) if bounces.is_built else 0.0
     why = "a channel's mean of squares is not the square of its mean"
-    why = why if bounces.built else "there is no such light"
+    why = why if bounces.is_built else "there is no such light"
     asked = effects.spectral
     spectral = off >= NEGLIGIBLE_NOISE_RATIO if asked is None else asked
-    thinned = [_finer(bounces, spectral, spectral_step(skin, bounces))] if finer else []
+    thinned = (
+        [_wavelength_step_effect(bounces, spectral, choose_spectral_step(skin, bounces))]
+        if finer
+        else []
+    )
     return [
-        *textures(skin),
-        Effect(SHADOW_EFFECT, "built", "a face shades itself", noise.share(1.0, min(peak, 1.0))),
-        decide(
+        *texture_effects(skin),
+        Effect(
+            SHADOW_EFFECT,
+            "built",
+            "a face shades itself",
+            noise.change_over_noise(1.0, min(peak, 1.0)),
+        ),
+        decide_effect(
             LATERAL_EFFECT,
-            float(spread_over_noise(lost, level, noise).max()),
+            float(scattering_over_noise(lost, level, noise).max()),
             effects.lateral,
             switch=lateral_switch,
-            because=f"pixels of {pixel_mm:.2f} mm lose {100 * lost.max():.1f} % at a shadow's edge",
+            reason=f"pixels of {pixel_mm:.2f} mm lose {100 * lost.max():.1f} % at a shadow's edge",
         ),
         bounces,
-        decide(SPECTRAL_EFFECT, off, asked, switch="spectral", because=why),
+        decide_effect(SPECTRAL_EFFECT, off, asked, switch="spectral", reason=why),
         *thinned,
-        further_bounces(bounces, share * float(brightest.max())),
-        lens(scenery, peak),
-        wrinkles(skin.subject, scenery, peak),
+        further_bounces_effect(bounces, share * float(peak_reflectance.max())),
+        lens_effect(scenery, peak),
+        wrinkle_shadow_effect(skin.subject, scenery, peak),
     ]
 
 
-def movement(subject: SimulatedSubject, asked: bool, name: str) -> Effect:
+def movement_effect(subject: SimulatedSubject, requested: bool, name: str) -> Effect:
     """Return whether the face moves with its state."""
-    if not asked:
+    if not requested:
         return Effect(name, "asked", "movement=False asks for it", switch="movement")
     if subject.pose is None:
         return Effect(name, "absent", "at rest nothing moves", switch="movement")
     return Effect(name, "built", "the state moves the face", switch="movement")
 
 
-def wrinkles(subject: SimulatedSubject, scenery: Scenery, level: float) -> Effect:
+def wrinkle_shadow_effect(
+    subject: SimulatedSubject, scenery: ViewingConditions, level: float
+) -> Effect:
     """Return whether the relief of a face that has moved hides lights from itself.
 
     Pores of a face at rest tilt less than 4 degrees and are not built: under a light that grazes
@@ -159,16 +182,16 @@ def wrinkles(subject: SimulatedSubject, scenery: Scenery, level: float) -> Effec
     steepest = 1e-3 * float(np.hypot(right / across, down / along).max(initial=0.0))
     # a light as low as the relief is steep shines with that sine, and may be hidden
     most = min(1.0, steepest / math.hypot(1.0, steepest) * level)
-    return decide(
+    return decide_effect(
         WRINKLE_SHADOW_EFFECT,
         most / float(scenery.noise.sigma(0.0)),
         scenery.effects.relief_shadows,
         switch="relief_shadows",
-        because=f"wrinkles as steep as {math.degrees(math.atan(steepest)):.0f} degrees",
+        reason=f"wrinkles as steep as {math.degrees(math.atan(steepest)):.0f} degrees",
     )
 
 
-def lens(scenery: Scenery, level: float) -> Effect:
+def lens_effect(scenery: ViewingConditions, level: float) -> Effect:
     """Return whether a camera's lens blurs: what a pixel loses to its neighbors where it is worst.
 
     Parameters
@@ -179,22 +202,22 @@ def lens(scenery: Scenery, level: float) -> Effect:
         The brightest pixel, full scales; it may be over-full.
     """
     view, noise, subpixels = scenery.view, scenery.noise, scenery.subpixels
-    depths = facing_depths(view, scenery.caster.mesh)
-    spread = lens_spread(view, scenery.illuminant, subpixels=subpixels, depths_mm=depths)
-    spilled = spread.spilled(depths)
+    depths = depth_range(view, scenery.caster.mesh)
+    spread = tabulate_defocus(view, scenery.illuminant, subpixels=subpixels, depths_mm=depths)
+    spilled = spread.max_spilled_fraction(depths)
     far = max(abs(depth) for depth in depths)
     gained = min(1.0, level * spilled)  # by a black pixel amid bright ones, where noise is least
-    return decide(
+    return decide_effect(
         LENS_EFFECT,
         gained / float(noise.sigma(gained)),
         scenery.effects.optics,
         switch="optics",
-        because=f"at f/{view.f_number:g}, up to {far:.0f} mm off focus, "
+        reason=f"at f/{view.f_number:g}, up to {far:.0f} mm off focus, "
         f"{100 * spilled:.0f} % of a pixel's light falls on others",
     )
 
 
-def polarization(rig: Rig, view: View) -> Effect:
+def polarization_effect(rig: Rig, view: View) -> Effect:
     """Return whether light is kept as Stokes vectors: films alone tell polarized light apart."""
     films = [light.name for light in rig.lights if light.polarizer_axis_deg is not None]
     if films or view.analyser_axis_deg is not None:
@@ -207,14 +230,14 @@ def polarization(rig: Rig, view: View) -> Effect:
     )
 
 
-def bands(view: View) -> Effect:
+def band_effect(view: View) -> Effect:
     """Return how many colors are kept."""
     if view.cfa == "MONO":
         return Effect(BAND_EFFECT, "built", "one: the sensor has no filters")
     return Effect(BAND_EFFECT, "built", "three: those of the sensor's filters")
 
 
-def textures(skin: SeenSkin) -> list[Effect]:
+def texture_effects(skin: ObservedSkin) -> list[Effect]:
     """Return whether a face needs its relief and its map of pigment."""
     subject = skin.subject
     covered = subject.atlas.covered
@@ -238,24 +261,24 @@ def textures(skin: SeenSkin) -> list[Effect]:
     ]
 
 
-def brightest_rgb(skin: SeenSkin) -> Float64Array:
+def max_reflectance_rgb(skin: ObservedSkin) -> Float64Array:
     """Return the largest white-balanced reflectance of a face's skin in each channel, (3,)."""
-    rgb = skin.color.rgb(*(part[::TEXEL_STEP] for part in skin.covered()))
+    rgb = skin.color.rgb(*(part[::TEXEL_STEP] for part in skin.covered_chromophores()))
     return np.asarray(rgb.reshape(-1, 3).max(axis=0), np.float64)
 
 
-def last_bounce(over_noise: float) -> float:
+def choose_min_bounce_fraction(over_noise: float) -> float:
     """Return the share of the first bounce at which summing ends, by what bounces change at most.
 
     Examples
     --------
-    >>> last_bounce(0.5), last_bounce(500.0)
+    >>> choose_min_bounce_fraction(0.5), choose_min_bounce_fraction(500.0)
     (0.001, 0.0001)
     """
     return min(MAX_LAST_BOUNCE, MAX_REMAINING_NOISE_RATIO / max(over_noise, 1e-9))
 
 
-def spectral_step(skin: SeenSkin, bounces: Effect) -> tuple[int, float]:
+def choose_spectral_step(skin: ObservedSkin, bounces: Effect) -> tuple[int, float]:
     """Return at which of the table's wavelengths light from skin to skin is summed: every n-th.
 
     Returns
@@ -267,37 +290,39 @@ def spectral_step(skin: SeenSkin, bounces: Effect) -> tuple[int, float]:
     size = float(bounces.over_noise or 0.0)
     change = math.inf
     for step in WAVELENGTH_STEPS:
-        change = size * float(step_error(skin, step).max())
+        change = size * float(wavelength_step_error(skin, step).max())
         if change < NEGLIGIBLE_NOISE_RATIO:
             return step, change
     return 1, change
 
 
-def _finer(bounces: Effect, spectral: bool, found: tuple[int, float]) -> Effect:
+def _wavelength_step_effect(bounces: Effect, spectral: bool, found: tuple[int, float]) -> Effect:
     """Return whether all of the table's wavelengths are needed for light from skin to skin."""
     step, over_noise = found
-    if not (bounces.built and spectral):
-        why = "there is no such light" if not bounces.built else "channels are taken whole"
+    if not (bounces.is_built and spectral):
+        why = "there is no such light" if not bounces.is_built else "channels are taken whole"
         return Effect(WAVELENGTH_STEP_EFFECT, "negligible", why, 0.0, "spectral_step")
     nm = f"each {10 * step} nm are enough" if step > 1 else "each 20 nm would not be enough"
-    return decide(WAVELENGTH_STEP_EFFECT, over_noise, None, switch="spectral_step", because=nm)
+    return decide_effect(
+        WAVELENGTH_STEP_EFFECT, over_noise, None, switch="spectral_step", reason=nm
+    )
 
 
-def further_bounces(bounces: Effect, once: float) -> Effect:
-    """Return what is left of light from skin to skin; ``once`` is the share that bounces on."""
-    if not bounces.built:
+def further_bounces_effect(bounces: Effect, bounce_fraction: float) -> Effect:
+    """Return the effect of bounces after the first; ``bounce_fraction`` of light bounces on."""
+    if not bounces.is_built:
         return Effect(
             FURTHER_BOUNCES_EFFECT, "negligible", "there is no such light", 0.0, "last_bounce"
         )
     over_noise = float(bounces.over_noise or 0.0)
-    last = last_bounce(over_noise)
+    last = choose_min_bounce_fraction(over_noise)
     because = f"summing ends at {last:.1g} of the first"
-    left = over_noise * last / (1.0 - once)
-    return decide(FURTHER_BOUNCES_EFFECT, left, None, switch="last_bounce", because=because)
+    left = over_noise * last / (1.0 - bounce_fraction)
+    return decide_effect(FURTHER_BOUNCES_EFFECT, left, None, switch="last_bounce", reason=because)
 
 
-def hollows(scenery: Scenery) -> tuple[float, str]:
+def target_interreflection_size(scenery: ViewingConditions) -> tuple[float, str]:
     """Return the size of light from one part of a target to another, over noise, and why."""
-    if scenery.share == 0.0:
+    if scenery.exchange_fraction == 0.0:
         return 0.0, "the target is flat"
     return math.inf, "the target has hollows"

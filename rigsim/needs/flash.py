@@ -4,17 +4,17 @@ from capture.rig import Rig
 from rigsim import shading
 from rigsim.arrays import FloatArray
 from rigsim.needs import face
-from rigsim.needs.effect_sizes import highlight, most_irradiance
-from rigsim.needs.effects import Effect, EffectSelection, decide, left_out_of
+from rigsim.needs.effect_sizes import max_highlight, max_irradiance
+from rigsim.needs.effects import Effect, EffectSelection, decide_effect, omitted_effects
 from rigsim.subject import SimulatedSubject
 from rigsim.targets import Target
 
 
-def flash_needs(
+def select_flash_effects(
     rig: Rig,
     subject: SimulatedSubject | Target,
     state: str,
-    scenery: face.Scenery,
+    scenery: face.ViewingConditions,
     white_rgb: FloatArray,
     weights_mm2: FloatArray,
     movement: bool,
@@ -37,44 +37,46 @@ def flash_needs(
         Whether the face moves with its state.
     """
     view, mesh = scenery.view, scenery.caster.mesh
-    made = [face.polarization(rig, view), face.bands(view)]
+    made = [face.polarization_effect(rig, view), face.band_effect(view)]
     if isinstance(subject, Target):
         made += _of_target(subject, scenery)
         if subject.kind not in ("source", "cap"):
-            made += [face.lens(scenery, float(white_rgb.max())), *left_out_of("glare")]
+            made += [face.lens_effect(scenery, float(white_rgb.max())), *omitted_effects("glare")]
         else:
             made.append(
                 Effect(face.LENS_EFFECT, "negligible", "all of the picture is alike", 0.0, "optics")
             )
         made.append(Effect(face.WRINKLE_SHADOW_EFFECT, "absent", f"{subject.name} has none"))
-        return EffectSelection((*made, *left_out_of("flash")))
-    skin = scenery.skin(subject, state)
-    brightest = face.brightest_rgb(skin)
+        return EffectSelection((*made, *omitted_effects("flash")))
+    skin = scenery.observe_skin(subject, state)
+    brightest = face.max_reflectance_rgb(skin)
     places = [light.position_mm for light in rig.lights]
     # not cut at full scale: light of pixels that are full goes on to others all the same
-    level = most_irradiance(mesh, places, weights_mm2) * white_rgb * brightest
+    level = max_irradiance(mesh, places, weights_mm2) * white_rgb * brightest
     rough = max(float(subject.roughness[subject.atlas.covered].min()), shading.ALPHA_RANGE[0])
-    shine = highlight(mesh, places, weights_mm2, view.position_mm, rough)
+    shine = max_highlight(mesh, places, weights_mm2, view.position_mm, rough)
     peak = float((level + white_rgb * shine).max())
-    made += face.face_effects(skin, scenery, brightest, level=level, peak=peak, finer=True)
+    made += face.select_face_effects(skin, scenery, brightest, level=level, peak=peak, finer=True)
     made += _movement(subject, movement)
-    return EffectSelection((*made, *left_out_of("flash", "flash_face")))
+    return EffectSelection((*made, *omitted_effects("flash", "flash_face")))
 
 
-def _of_target(target: Target, scenery: face.Scenery) -> list[Effect]:
+def _of_target(target: Target, scenery: face.ViewingConditions) -> list[Effect]:
     """Return what flat targets need: no effect of depth."""
-    size, because = face.hollows(scenery)
+    size, because = face.target_interreflection_size(scenery)
     return [
-        decide(face.SHADOW_EFFECT, size, None, switch="", because=because),
-        decide(face.INTERREFLECTION_EFFECT, size, None, switch="interreflections", because=because),
+        decide_effect(face.SHADOW_EFFECT, size, None, switch="", reason=because),
+        decide_effect(
+            face.INTERREFLECTION_EFFECT, size, None, switch="interreflections", reason=because
+        ),
         Effect(face.LATERAL_EFFECT, "absent", f"{target.name} is opaque"),
     ]
 
 
 def _movement(subject: SimulatedSubject, movement: bool) -> list[Effect]:
-    made = face.movement(subject, movement, "movement of the face with the states")
-    if subject.pose is None or not made.built:
+    made = face.movement_effect(subject, movement, "movement of the face with the states")
+    if subject.pose is None or not made.is_built:
         return [made]
-    zones = ", ".join(subject.pose.wrinkles.left_out)
+    zones = ", ".join(subject.pose.wrinkles.omitted)
     coarse = Effect(f"fine wrinkles ({zones})", "unmodeled", "the texture's texels are too coarse")
-    return [made, *left_out_of("moving_face"), *([coarse] if zones else [])]
+    return [made, *omitted_effects("moving_face"), *([coarse] if zones else [])]

@@ -9,18 +9,25 @@ import scipy.fft
 from capture.rig import Rig
 from rigsim import shading
 from rigsim.arrays import Float64Array, FloatArray
-from rigsim.as_built.sphere import BuiltSphere
-from rigsim.light.relief_shadow import hidden_share
+from rigsim.as_built.sphere import ActualSphere
+from rigsim.light.relief_shadow import hidden_sky_fraction
 from rigsim.needs import face
-from rigsim.needs.effect_sizes import bounced, edge_loss, steepest_slope
-from rigsim.needs.effects import Effect, EffectSelection, Noise, SceneEffects, decide, left_out_of
+from rigsim.needs.effect_sizes import edge_loss, interreflection_over_direct, max_slope
+from rigsim.needs.effects import (
+    Effect,
+    EffectSelection,
+    PixelNoise,
+    SceneEffects,
+    decide_effect,
+    omitted_effects,
+)
 from rigsim.render.lens_blur import Lens
 from rigsim.skin_patch.microrelief import MicroSkin, lateral_kernel
 from rigsim.tissue.skin_layers import ETA
 
 OPTICS_EFFECT: Final = "diffraction and defocus"
 
-MAX_STEEPENING: Final = 1.6
+MAX_SLOPE_GAIN: Final = 1.6
 """How much compression steepens the relief at most: the skin buckles at 0.66 of its length."""
 
 ANALYZED_TEXELS: Final = 384
@@ -29,14 +36,14 @@ ANALYZED_TEXELS: Final = 384
 HORIZON_SECTORS: Final = 8
 
 
-def gradient_needs(
+def select_gradient_effects(
     rig: Rig,
     subject: MicroSkin | str,
-    sphere: BuiltSphere,
+    sphere: ActualSphere,
     lens: Lens,
-    noise: Noise,
+    noise: PixelNoise,
     white: float,
-    moving: bool,
+    is_moving: bool,
     effects: SceneEffects,
 ) -> EffectSelection:
     """Decide what a scene in the gradient sphere builds.
@@ -58,44 +65,48 @@ def gradient_needs(
         What is asked for.
     """
     view = rig.views[0]
-    made = [face.polarization(rig, view), face.bands(view), _optics(lens, effects.optics, noise)]
+    made = [
+        face.polarization_effect(rig, view),
+        face.band_effect(view),
+        _optics(lens, effects.optics, noise),
+    ]
     if not isinstance(subject, MicroSkin):
         flat = "a ball bulges" if subject == "ball" else "the target is flat"
         for name, switch in (
             (face.SHADOW_EFFECT, "shadows"),
             (face.INTERREFLECTION_EFFECT, "interreflections"),
         ):
-            made.append(decide(name, 0.0, None, switch=switch, because=flat))
+            made.append(decide_effect(name, 0.0, None, switch=switch, reason=flat))
         made.append(Effect(face.LATERAL_EFFECT, "absent", f"{subject} is glass, gray or nothing"))
-        return EffectSelection((*made, *left_out_of("gradient")))
+        return EffectSelection((*made, *omitted_effects("gradient")))
     made += _of_skin(subject, sphere, lens, noise, white, effects)
     still = Effect("movement of the patch", "absent", "motion=None", switch="motion")
-    if not moving:
-        return EffectSelection((*made, still, *left_out_of("gradient", "gradient_skin")))
+    if not is_moving:
+        return EffectSelection((*made, still, *omitted_effects("gradient", "gradient_skin")))
     moved = Effect("movement of the patch", "built", "it drifts and jumps", None, "motion")
     small = f"30 ms move 0.1 um; a pixel: {lens.pixel_on_subject_um:.1f} um"
     blur = Effect("blur by movement within an exposure", "unmodeled", small)
-    world, limits = left_out_of("gradient"), left_out_of("gradient_skin")
+    world, limits = omitted_effects("gradient"), omitted_effects("gradient_skin")
     return EffectSelection((*made, moved, *world, blur, *limits))
 
 
-def _optics(lens: Lens, asked: bool | None, noise: Noise) -> Effect:
+def _optics(lens: Lens, asked: bool | None, noise: PixelNoise) -> Effect:
     nyquist_per_mm = 500.0 / lens.pixel_on_subject_um
-    kept = float(lens.transfer(np.array([nyquist_per_mm]))[0])
-    return decide(
+    kept = float(lens.otf(np.array([nyquist_per_mm]))[0])
+    return decide_effect(
         OPTICS_EFFECT,
-        noise.share(1.0 - kept),
+        noise.change_over_noise(1.0 - kept),
         asked,
         switch="optics",
-        because=f"the lens passes {100 * kept:.0f} % of a pattern as fine as the pixels",
+        reason=f"the lens passes {100 * kept:.0f} % of a pattern as fine as the pixels",
     )
 
 
 def _of_skin(
     skin: MicroSkin,
-    sphere: BuiltSphere,
+    sphere: ActualSphere,
     lens: Lens,
-    noise: Noise,
+    noise: PixelNoise,
     white: float,
     effects: SceneEffects,
 ) -> list[Effect]:
@@ -105,12 +116,12 @@ def _of_skin(
         skin.height_um[middle - half : middle + half, middle - half : middle + half]
     )
     down, right = (np.asarray(slope) for slope in np.gradient(part, skin.texel_um))
-    steepest = MAX_STEEPENING * steepest_slope(right, down)
+    steepest = MAX_SLOPE_GAIN * max_slope(right, down)
     place = sphere.position_mm[sphere.position_mm[:, 2] > 0.0]
     lowest = float((place[:, 2] / np.hypot(place[:, 0], place[:, 1])).min())
     length = np.sqrt(1.0 + right**2 + down**2)
     normals = np.stack([-right / length, down / length, 1.0 / length], axis=-1)
-    hidden = shading.interior_scale(ETA) * hidden_share(
+    hidden = shading.interior_scale(ETA) * hidden_sky_fraction(
         part,
         normals.astype(np.float32),
         margin=0,
@@ -120,42 +131,42 @@ def _of_skin(
     )
     sigmas, weights = lateral_kernel(skin)
     if effects.lateral is not False:  # what comes from other walls spreads as all light does
-        hidden = _spread(hidden, sigmas, weights, 1e-3 * skin.texel_um)
+        hidden = _scatter_hidden_light(hidden, sigmas, weights, 1e-3 * skin.texel_um)
     # light that goes along the surface grows with the square of slopes
-    share = min(MAX_STEEPENING**2 * float(np.quantile(hidden, 0.999)), 0.9)
+    share = min(MAX_SLOPE_GAIN**2 * float(np.quantile(hidden, 0.999)), 0.9)
     brightest = float(skin.albedo.max())
-    more = bounced(share, brightest)
+    more = interreflection_over_direct(share, brightest)
     pixel_mm = 1e-3 * lens.pixel_on_subject_um
     lost = float(edge_loss(sigmas, weights[None], pixel_mm).max())
     level = min(1.0, white * brightest)
     deg = (math.degrees(math.atan(steepest)), math.degrees(math.atan(lowest)))
     return [
         Effect(face.RELIEF_EFFECT, "built", f"pixels of {1e3 * pixel_mm:.1f} um resolve it"),
-        decide(
+        decide_effect(
             face.SHADOW_EFFECT,
-            noise.share(1.0) if steepest > lowest else 0.0,
+            noise.change_over_noise(1.0) if steepest > lowest else 0.0,
             effects.relief_shadows,
             switch="shadows",
-            because=f"slopes up to {deg[0]:.0f} degrees, LEDs down to {deg[1]:.0f}",
+            reason=f"slopes up to {deg[0]:.0f} degrees, LEDs down to {deg[1]:.0f}",
         ),
-        decide(
+        decide_effect(
             face.LATERAL_EFFECT,
-            noise.share(lost, level),
+            noise.change_over_noise(lost, level),
             effects.lateral,
             switch="lateral",
-            because=f"pixels of {1e3 * pixel_mm:.1f} um lose {100 * lost:.0f} % at a shadow's edge",
+            reason=f"pixels of {1e3 * pixel_mm:.1f} um lose {100 * lost:.0f} % at a shadow's edge",
         ),
-        decide(
+        decide_effect(
             face.INTERREFLECTION_EFFECT,
-            noise.share(more, level),
+            noise.change_over_noise(more, level),
             effects.interreflections,
             switch="interreflections",
-            because=f"walls of furrows get up to {100 * share:.1f} % of what others send out",
+            reason=f"walls of furrows get up to {100 * share:.1f} % of what others send out",
         ),
     ]
 
 
-def _spread(
+def _scatter_hidden_light(
     hidden: FloatArray, sigmas_mm: Float64Array, weights: Float64Array, texel_mm: float
 ) -> Float64Array:
     """Return the light of a part of the patch after it has spread; beyond it goes on mirrored."""

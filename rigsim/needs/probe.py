@@ -5,10 +5,10 @@ from typing import Final
 import numpy as np
 
 from capture.rig import Rig
-from rigsim.as_built.probe import ProbeBuild
+from rigsim.as_built.probe import ActualProbe
 from rigsim.fiber.probe_tissue import HomogeneousTissue, ProbedTissue
-from rigsim.needs.effects import Effect, EffectSelection, Noise, left_out_of
-from rigsim.needs.face import bands, polarization
+from rigsim.needs.effects import Effect, EffectSelection, PixelNoise, omitted_effects
+from rigsim.needs.face import band_effect, polarization_effect
 
 TRANSPORT_EFFECT: Final = "paths of photons between source and fibres"
 CROSSTALK_EFFECT: Final = "light that fibres pass to each other"
@@ -18,8 +18,8 @@ LAYERS_EFFECT: Final = "layers of the tissue"
 DARK_CURRENT_EFFECT: Final = "dark current and hot pixels"
 
 
-def probe_needs(
-    rig: Rig, tissue: ProbedTissue, build: ProbeBuild, *, noise: Noise, hot: float
+def select_probe_effects(
+    rig: Rig, tissue: ProbedTissue, build: ActualProbe, *, noise: PixelNoise, hot: float
 ) -> EffectSelection:
     """Decide what a scene under the probe builds.
 
@@ -41,18 +41,20 @@ def probe_needs(
     np.fill_diagonal(others, 0.0)
     leaked = float(others.max(initial=0.0))
     made = [
-        polarization(rig, view),
-        bands(view),
+        polarization_effect(rig, view),
+        band_effect(view),
         Effect(
             TRANSPORT_EFFECT,
             "built",
             "photons are followed: all light in the fibres has been inside",
         ),
-        _sized(
+        _always_built_effect(
             CROSSTALK_EFFECT, leaked, noise, f"up to {100 * leaked:.2g} % of a neighbor's light"
         ),
-        _sized(WINGS_EFFECT, build.wings, noise, f"{100 * build.wings:.2g} % of a spot's light"),
-        _sized(
+        _always_built_effect(
+            WINGS_EFFECT, build.wings, noise, f"{100 * build.wings:.2g} % of a spot's light"
+        ),
+        _always_built_effect(
             DARK_CURRENT_EFFECT,
             hot,
             noise,
@@ -62,14 +64,14 @@ def probe_needs(
     ]
     if tissue.kind == "layered":
         made.append(Effect(LAYERS_EFFECT, "built", "epidermis above dermis, thinned by suction"))
-        return EffectSelection((*made, *left_out_of("probe", "probe_layered")))
+        return EffectSelection((*made, *omitted_effects("probe", "probe_layered")))
     asked = tissue.kind == "homogeneous"
     why = "the tissue was asked for as homogeneous" if asked else "fibrous tissue has one layer"
     made.append(Effect(LAYERS_EFFECT, "absent", why))
-    return EffectSelection((*made, *left_out_of("probe")))
+    return EffectSelection((*made, *omitted_effects("probe")))
 
 
-def _sized(name: str, change: float, noise: Noise, because: str) -> Effect:
+def _always_built_effect(name: str, change: float, noise: PixelNoise, because: str) -> Effect:
     """Return an effect of the probe as built that is there at any size."""
     over = change / float(noise.sigma(change))
     return Effect(name, "built", f"{because}: up to {over:.3g} times the noise", over)

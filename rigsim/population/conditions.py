@@ -17,8 +17,8 @@ powder   grains on 45 %, which scatter back; a matte white part below them; a fi
 ======== ========================================================================================
 
 What grains scatter once goes every way, and eq. (6) takes the least of it for diffuse light: under
-powder the minimum lies some 13 % above R_d (`rigsim.light.surface_brdf.surface_floor`, the truth's
-map ``r_d_floor``).
+powder the minimum lies some 13 % above R_d (`rigsim.light.surface_brdf.min_surface_reflection`,
+the truth's map ``r_d_floor``).
 
 All these amounts are chosen; what is known is their direction and order of size:
 
@@ -50,7 +50,7 @@ from rigsim.tissue.skin_layers import ETA
 CONDITION_NAMES: Final = ("normal", "cold", "hot", "sweat", "lotion", "makeup", "powder")
 """The seven conditions of dataset A."""
 
-POWDER_MATTE: Final = np.array([0.55, 0.54, 0.52], np.float32)
+POWDER_COLOR: Final = np.array([0.55, 0.54, 0.52], np.float32)
 """What grains scatter more than once, in the unit of R_d; with `POWDER_ALBEDO` below 1."""
 
 MAX_OIL: Final = 0.95
@@ -96,7 +96,7 @@ _CONDITION_CHANGES: Final[Mapping[str, _Change]] = {
 }
 
 
-def checked(conditions: Mapping[str, float]) -> dict[str, float]:
+def validate_conditions(conditions: Mapping[str, float]) -> dict[str, float]:
     """Return conditions in the order in which they come upon a face.
 
     Parameters
@@ -111,7 +111,7 @@ def checked(conditions: Mapping[str, float]) -> dict[str, float]:
 
     Examples
     --------
-    >>> checked({"powder": 1, "lotion": 0.6})
+    >>> validate_conditions({"powder": 1, "lotion": 0.6})
     {'lotion': 0.6, 'powder': 1.0}
     """
     for name, amount in conditions.items():
@@ -124,7 +124,7 @@ def checked(conditions: Mapping[str, float]) -> dict[str, float]:
     return {name: float(conditions[name]) for name in CONDITION_NAMES if name in conditions}
 
 
-def conditioned_subject(
+def condition_subject(
     subject: SimulatedSubject, conditions: Mapping[str, float]
 ) -> SimulatedSubject:
     """Return a face whose vessels answer to conditions; its surface stays.
@@ -141,19 +141,21 @@ def conditioned_subject(
     Subject
         The same object where nothing changes.
     """
-    change = sum(a * _CONDITION_CHANGES[name].vessels for name, a in checked(conditions).items())
+    change = sum(
+        a * _CONDITION_CHANGES[name].vessels for name, a in validate_conditions(conditions).items()
+    )
     if change == 0.0:
         return subject
     regions = subject.perfusion.regions
     answer = 0.7 + 0.3 * np.maximum(regions["cheeks"], regions["nose"])
-    perfusion = subject.perfusion.dilated(change * answer)
+    perfusion = subject.perfusion.dilate(change * answer)
     rest = subject.rest
     if rest is not None:
         rest = dataclasses.replace(rest, perfusion=perfusion)
     return dataclasses.replace(subject, perfusion=perfusion, rest=rest)
 
 
-def conditioned(
+def apply_condition(
     surface: SkinSurface,
     condition: str,
     amount: float = 1.0,
@@ -162,7 +164,7 @@ def conditioned(
     foundation: ArrayLike | None = None,
     seed: int = 0,
 ) -> SkinSurface:
-    """Return a surface under a condition; its blood stays, see `conditioned_subject`.
+    """Return a surface under a condition; its blood stays, see `condition_subject`.
 
     Parameters
     ----------
@@ -189,7 +191,7 @@ def conditioned(
     ConditionError
         The condition or its amount is unknown.
     """
-    (amount,) = checked({condition: amount}).values()
+    (amount,) = validate_conditions({condition: amount}).values()
     change = _CONDITION_CHANGES[condition]
     if amount == 0.0 or change == _Change():
         return surface
@@ -205,17 +207,17 @@ def conditioned(
         fuzz=surface.fuzz * part(change.fuzz),
     )
     if change.cover > 0.0:
-        found = _painted(found, amount * change.cover, regions, foundation)
+        found = _apply_foundation(found, amount * change.cover, regions, foundation)
     on = surface.coating
     zero = np.zeros_like(surface.oil)
     if on is None:
         on = Coating(zero, zero + np.float32(0.2), zero + np.float32(ETA), zero)
     if change.film is not None:
-        share = amount * _spread(change.film, surface, points_mm, regions, seed)
-        on = _over(on, change.film, np.asarray(share, np.float32))
+        share = amount * _film_coverage(change.film, surface, points_mm, regions, seed)
+        on = _add_film(on, change.film, np.asarray(share, np.float32))
     if change.powder > 0.0:
         grainy = np.float32(amount * change.powder) * surface.bare
-        found = _mixed(found, grainy, POWDER_MATTE)
+        found = _mix_color(found, grainy, POWDER_COLOR)
         on = dataclasses.replace(on, powder=np.asarray(1.0 - (1.0 - on.powder) * (1.0 - grainy)))
     return dataclasses.replace(found, coating=on)
 
@@ -234,26 +236,30 @@ def conditioned_surface(
     conditions
         Name to amount, 0 to 1.
     """
-    changed = conditioned_subject(subject, conditions)
-    return coated(changed, skin_surface(changed, camera, light), conditions)
+    changed = condition_subject(subject, conditions)
+    return apply_conditions(changed, skin_surface(changed, camera, light), conditions)
 
 
-def coated(
+def apply_conditions(
     subject: SimulatedSubject, surface: SkinSurface, conditions: Mapping[str, float]
 ) -> SkinSurface:
     """Return the surface of a face under conditions, in order, on its own points and seed."""
-    wanted = {name: a for name, a in checked(conditions).items() if a > 0.0 and name != "normal"}
+    wanted = {
+        name: a
+        for name, a in validate_conditions(conditions).items()
+        if a > 0.0 and name != "normal"
+    }
     if not wanted:
         return surface
     points = subject.perfusion.points_mm
     for name, amount in wanted.items():
-        surface = conditioned(
+        surface = apply_condition(
             surface, name, amount, points_mm=points, seed=subject.seed + CONDITION_NAMES.index(name)
         )
     return surface
 
 
-def _painted(
+def _apply_foundation(
     surface: SkinSurface,
     cover: float,
     regions: Mapping[str, Float32Array] | None,
@@ -272,12 +278,12 @@ def _painted(
     share = np.float32(cover) * surface.bare
     if regions is not None:
         share = share * (1.0 - regions["lips"])
-    return _mixed(surface, share, color)
+    return _mix_color(surface, share, color)
 
 
-def _mixed(surface: SkinSurface, share: Float32Array, color: Float32Array) -> SkinSurface:
+def _mix_color(surface: SkinSurface, fraction: Float32Array, color: Float32Array) -> SkinSurface:
     """Return a surface of which a share has another diffuse color."""
-    part, scale = share[..., None], np.float32(interior_scale(ETA))
+    part, scale = fraction[..., None], np.float32(interior_scale(ETA))
     reflectance = (1.0 - part) * surface.reflectance + part * color / scale
     return dataclasses.replace(
         surface,
@@ -286,7 +292,7 @@ def _mixed(surface: SkinSurface, share: Float32Array, color: Float32Array) -> Sk
     )
 
 
-def _spread(
+def _film_coverage(
     film: _Film,
     surface: SkinSurface,
     points_mm: Float32Array | None,
@@ -305,12 +311,12 @@ def _spread(
     return np.asarray(np.clip(share, 0.0, 1.0), np.float32)
 
 
-def _over(below: Coating, film: _Film, share: Float32Array) -> Coating:
+def _add_film(below: Coating, film: _Film, fraction: Float32Array) -> Coating:
     """Lay a film over a coating; where both lie, alpha and index are the mean by their shares."""
-    total = below.film + share
-    weight = np.where(total > 0.0, share / np.maximum(total, np.float32(1e-6)), 1.0)
+    total = below.film + fraction
+    weight = np.where(total > 0.0, fraction / np.maximum(total, np.float32(1e-6)), 1.0)
     return Coating(
-        film=np.asarray(1.0 - (1.0 - below.film) * (1.0 - share), np.float32),
+        film=np.asarray(1.0 - (1.0 - below.film) * (1.0 - fraction), np.float32),
         film_alpha=np.asarray((1.0 - weight) * below.film_alpha + weight * film.alpha, np.float32),
         film_eta=np.asarray((1.0 - weight) * below.film_eta + weight * film.eta, np.float32),
         powder=below.powder,

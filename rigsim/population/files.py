@@ -31,10 +31,10 @@ from typing import Any, Final, cast
 
 import numpy as np
 
-from capture.documents import Checks, Document, Fault, parse, read_toml
-from rigsim.fiber.probe_tissue import ProbedTissue, SkinTissue, TissueError, parse_subject
+from capture.documents import Document, Fault, FaultCollector, parse_document, read_toml
+from rigsim.fiber.probe_tissue import ProbedTissue, SkinTissue, TissueError, parse_tissue
 from rigsim.geometry.mesh import Mesh, MeshError, load_mesh
-from rigsim.population.textures import MAP_RANGES, SubjectFileError, load, texture
+from rigsim.population.textures import MAP_RANGES, SubjectFileError, load_texture, resample_texture
 from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
 from rigsim.subject import PRESET_NAMES, SimulatedSubject, make_subject, pigment
 from rigsim.subject.perfusion import MAX_HEMOGLOBIN
@@ -72,10 +72,10 @@ class SubjectFile(Document):
 
     def __post_init__(self) -> None:
         """Check ranges, and that nothing is said twice."""
-        checks = Checks("the subject", SubjectFileError)
-        checks.that("schema", self.schema, self.schema == SCHEMA, repr(SCHEMA))
+        checks = FaultCollector("the subject", SubjectFileError)
+        checks.check("schema", self.schema, self.schema == SCHEMA, repr(SCHEMA))
         known = ", ".join(PRESET_NAMES)
-        checks.that("preset", self.preset, self.preset in PRESET_NAMES, f"one of {known}")
+        checks.check("preset", self.preset, self.preset in PRESET_NAMES, f"one of {known}")
         for name, low, high in (
             ("melanin", *PRESET_MELANIN_RANGE),
             ("blood", 0.1, 4.0),
@@ -84,26 +84,30 @@ class SubjectFile(Document):
         ):
             value = getattr(self, name)
             good = value is None or low <= value <= high
-            checks.that(name, value, good, f"{low:g} to {high:g}")
+            checks.check(name, value, good, f"{low:g} to {high:g}")
         if self.melanin_map is not None:
             drawn = self.melanin is None and self.freckles is None
-            checks.that("melanin_map", self.melanin_map, drawn, "no melanin and freckles beside it")
+            checks.check(
+                "melanin_map", self.melanin_map, drawn, "no melanin and freckles beside it"
+            )
         if self.hemoglobin_map is not None:
-            checks.that(
+            checks.check(
                 "hemoglobin_map", self.hemoglobin_map, self.blood == 1.0, "no blood beside it"
             )
         checks.close()
 
     @property
-    def fraction(self) -> float:
+    def melanosome_fraction(self) -> float:
         """Volume fraction of melanosomes around which the skin varies."""
         return pigment.MELANIN_PRESETS[self.preset] if self.melanin is None else self.melanin
 
     @property
-    def nearest(self) -> str:
+    def nearest_preset(self) -> str:
         """Name of the preset whose melanin is nearest, by its logarithm."""
         presets = pigment.MELANIN_PRESETS
-        return min(presets, key=lambda name: abs(math.log(presets[name] / self.fraction)))
+        return min(
+            presets, key=lambda name: abs(math.log(presets[name] / self.melanosome_fraction))
+        )
 
     def face(
         self, *, seed: int, size: int = 512, mesh: Mesh | str | Path | None = None
@@ -131,23 +135,23 @@ class SubjectFile(Document):
                 f"mesh: the subject's file names {self.mesh}; leave the other out"
             )
         found = make_subject(
-            self.nearest, seed=seed, size=size, mesh=mesh or self.mesh, blood=self.blood
+            self.nearest_preset, seed=seed, size=size, mesh=mesh or self.mesh, blood=self.blood
         )
         if self == SubjectFile(preset=self.preset, blood=self.blood, mesh=self.mesh):
             return found
         perfusion = found.perfusion
         if self.melanin_map is not None:
-            melanin = texture("melanin_map", self.melanin_map, size)
+            melanin = resample_texture("melanin_map", self.melanin_map, size)
         else:
-            melanin = pigment.melanin_map(
+            melanin = pigment.draw_melanin_map(
                 perfusion.points_mm,
                 perfusion.regions,
-                self.fraction,
+                self.melanosome_fraction,
                 seed=seed,
                 freckles=self.freckles,
             )
         if self.hemoglobin_map is not None:
-            blood = texture("hemoglobin_map", self.hemoglobin_map, size).astype(np.float64)
+            blood = resample_texture("hemoglobin_map", self.hemoglobin_map, size).astype(np.float64)
             # the fold of `Perfusion.blood`, backwards: compartments keep their shares
             wanted = blood / (1.0 - (blood / MAX_HEMOGLOBIN) ** 4) ** 0.25
             factor = wanted / perfusion.compartments.sum(axis=-1)
@@ -160,25 +164,25 @@ class SubjectFile(Document):
     def patch(self, site: str, *, seed: int, size_mm: float) -> MicroSkin:
         """Return a patch of skin before the gradient sphere, see `make_micro_skin`."""
         return make_micro_skin(
-            site, seed=seed, size_mm=size_mm, preset=self.nearest, melanin=self.melanin
+            site, seed=seed, size_mm=size_mm, preset=self.nearest_preset, melanin=self.melanin
         )
 
     def tissue(self, *, seed: int) -> SkinTissue:
         """Return the skin under the fibre probe, see `SkinTissue`."""
-        return SkinTissue(self.nearest, seed=seed, melanin=self.melanin, blood=self.blood)
+        return SkinTissue(self.nearest_preset, seed=seed, melanin=self.melanin, blood=self.blood)
 
-    def unused(self, rig: str) -> tuple[str, ...]:
+    def unused_keys(self, rig: str) -> tuple[str, ...]:
         """Return the keys that were given and say nothing of what a rig sees."""
         usual = SubjectFile()
         return tuple(k for k in _UNUSED_KEYS.get(rig, ()) if getattr(self, k) != getattr(usual, k))
 
 
-def is_file(text: str) -> bool:
+def is_subject_file(text: str) -> bool:
     """Return whether a subject's text names a file.
 
     Examples
     --------
-    >>> is_file("people/ann.toml"), is_file("IV"), is_file("P12")
+    >>> is_subject_file("people/ann.toml"), is_subject_file("IV"), is_subject_file("P12")
     (True, False, False)
     """
     return text.endswith(SUBJECT_SUFFIX)
@@ -199,11 +203,11 @@ def load_subject(text: str) -> SubjectFile:
 
     Examples
     --------
-    >>> load_subject("IV").fraction
+    >>> load_subject("IV").melanosome_fraction
     0.047
     """
-    if is_file(text):
-        return read(text)
+    if is_subject_file(text):
+        return read_subject_file(text)
     if text not in PRESET_NAMES:
         raise SubjectFileError(
             f"subject: got {text!r}, expected one of {', '.join(PRESET_NAMES)}, or a file "
@@ -212,27 +216,27 @@ def load_subject(text: str) -> SubjectFile:
     return SubjectFile(preset=text)
 
 
-def tissue(text: str, *, seed: int) -> ProbedTissue:
+def load_tissue(text: str, *, seed: int) -> ProbedTissue:
     """Return the tissue under the fibre probe that a text names.
 
     Parameters
     ----------
     text
-        A file, or what `rigsim.fiber.probe_tissue.parse_subject` takes.
+        A file, or what `rigsim.fiber.probe_tissue.parse_tissue` takes.
     seed
         Of what differs between subjects.
     """
-    if is_file(text):
+    if is_subject_file(text):
         return load_subject(text).tissue(seed=seed)
     try:
-        return parse_subject(text, seed=seed)
+        return parse_tissue(text, seed=seed)
     except TissueError as error:
         if ":" in text:  # a medium whose numbers are wrong
             raise
         raise TissueError(f"{error}, or a file NAME{SUBJECT_SUFFIX}") from error
 
 
-def read(path: str | Path) -> SubjectFile:
+def read_subject_file(path: str | Path) -> SubjectFile:
     """Read a subject's file; the files that it names get its folder before them.
 
     Raises
@@ -245,7 +249,7 @@ def read(path: str | Path) -> SubjectFile:
     faults: list[Fault] = []
     if "schema" not in document:
         faults.append(Fault("schema", "nothing", f'a first line schema = "{SCHEMA}"'))
-    found = _parsed(document, str(path), faults)
+    found = _parse_document(document, str(path), faults)
     files = {
         key: str(place.parent / name)
         for key in _FILE_KEYS
@@ -259,13 +263,13 @@ def read(path: str | Path) -> SubjectFile:
         raise SubjectFileError(number, where=str(path), faults=faults)
     for key, name in files.items():
         if key in MAP_RANGES:
-            load(key, name)
+            load_texture(key, name)
         else:
             _check_mesh(str(path), name, Path(name).stat().st_mtime_ns)
     return dataclasses.replace(found, **cast(Any, files))
 
 
-def _parsed(document: Mapping[str, Any], where: str, faults: list[Fault]) -> SubjectFile:
+def _parse_document(document: Mapping[str, Any], where: str, faults: list[Fault]) -> SubjectFile:
     """Return what the right keys of a document say, the others' faults added to a list.
 
     Ranges are looked at only when all types are right: so that both are told at once, keys with
@@ -274,7 +278,7 @@ def _parsed(document: Mapping[str, Any], where: str, faults: list[Fault]) -> Sub
     rest = dict(document)
     while True:
         try:
-            return parse(SubjectFile, rest, where=where, error=SubjectFileError)
+            return parse_document(SubjectFile, rest, where=where, error=SubjectFileError)
         except SubjectFileError as error:
             faults += error.faults
             wrong = {re.split(r"[.\[]", fault.path)[0] for fault in error.faults}
@@ -292,7 +296,7 @@ def _check_mesh(where: str, path: str, changed_ns: int) -> None:
         raise SubjectFileError(f"mesh: {error}", where=where) from error
 
 
-def record(text: str) -> str | dict[str, Any]:
+def record_subject(text: str) -> str | dict[str, Any]:
     """Return what a manifest or a truth records of a subject: a preset, or all that a file says.
 
     Parameters
@@ -306,9 +310,9 @@ def record(text: str) -> str | dict[str, Any]:
         Of a file its name and the keys that it sets; of the files that it names the name and the
         SHA-256, so that others of the same name are told apart.
     """
-    if not is_file(text):
+    if not is_subject_file(text):
         return text
-    found, usual = read(text), SubjectFile()
+    found, usual = read_subject_file(text), SubjectFile()
     said: dict[str, Any] = {"file": Path(text).name, "preset": found.preset}
     for key in (field.name for field in dataclasses.fields(found)):
         value = getattr(found, key)

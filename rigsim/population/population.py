@@ -37,12 +37,12 @@ import numpy as np
 from rigsim.arrays import BoolArray, Float32Array
 from rigsim.geometry.atlas import Atlas, unwrap
 from rigsim.geometry.mesh import Mesh
-from rigsim.geometry.surface_noise import scattered_spots, smooth_noise
+from rigsim.geometry.surface_noise import random_spots, smooth_noise
 from rigsim.light.surface_brdf import SkinSurface
-from rigsim.population.conditions import checked, conditioned_surface
+from rigsim.population.conditions import conditioned_surface, validate_conditions
 from rigsim.subject import SimulatedSubject, face_regions, pigment, relief
 from rigsim.subject.head import build_head
-from rigsim.subject.perfusion import perfuse
+from rigsim.subject.perfusion import draw_perfusion
 from rigsim.subject.person import SIZE_RANGE
 
 HEAD_SHAPES: Final = 6
@@ -55,9 +55,9 @@ MAX_SKIN_HAIR: Final = 0.02
 """Texels with more hair than this part are not skin."""
 
 POPULATION_MELANIN_RANGE: Final = (0.004, 0.3)
-BEARD_FROM: Final = 0.35
+MIN_LABELED_STUBBLE: Final = 0.35
 """Members with at least this much stubble are labelled "beard"."""
-FRECKLED_FROM: Final = 0.45
+MIN_LABELED_FRECKLES: Final = 0.45
 
 Sex = Literal["male", "female"]
 Ethnicity = Literal["caucasian", "asian"]
@@ -94,7 +94,7 @@ class Member:
     applied: tuple[tuple[str, float], ...] = ()
     """Conditions of `rigsim.population.conditions.CONDITION_NAMES` with their amounts."""
     marks: frozenset[str] = frozenset()
-    """Names of traits that were added, see `shifted`."""
+    """Names of traits that were added, see `shift_trait`."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -106,7 +106,7 @@ class Member:
                 )
         if len({name for name, _ in self.applied}) < len(self.applied):
             raise PopulationError(f"applied to {self.name}: got {self.applied}, one of them twice")
-        checked(dict(self.applied))
+        validate_conditions(dict(self.applied))
 
     @property
     def conditions(self) -> frozenset[str]:
@@ -120,8 +120,8 @@ class Member:
         Sex, ethnicity, "beard" and "freckles" where there is much of either, conditions, marks.
         """
         seen = {self.sex, self.ethnicity, *self.conditions, *self.marks}
-        seen |= {"beard"} if self.beard >= BEARD_FROM else set()
-        seen |= {"freckles"} if self.freckles >= FRECKLED_FROM else set()
+        seen |= {"beard"} if self.beard >= MIN_LABELED_STUBBLE else set()
+        seen |= {"freckles"} if self.freckles >= MIN_LABELED_FRECKLES else set()
         return frozenset(seen)
 
     def face(self, size: int = 256) -> SimulatedSubject:
@@ -150,7 +150,7 @@ class Member:
 
     def _flat(self, size: int) -> SimulatedSubject:
         """Return the face without relief and of even roughness: all that its color needs."""
-        mesh, atlas, points, regions = _laid_out(self.head, size)
+        mesh, atlas, points, regions = _lay_out_head(self.head, size)
         even = np.zeros((size, size), np.float32)
         return SimulatedSubject(
             preset=_nearest_preset(self.melanin),
@@ -158,7 +158,7 @@ class Member:
             mesh=mesh,
             atlas=atlas,
             melanin=self._melanin(points, regions),
-            perfusion=perfuse(points, regions, seed=self.seed, amount=self.blood),
+            perfusion=draw_perfusion(points, regions, seed=self.seed, amount=self.blood),
             roughness=even + np.float32(0.3),
             height_um=even,
             hair=relief.hair_map(points, seed=self.seed),
@@ -203,7 +203,7 @@ class Member:
         return surface.r_d, face.atlas.covered & (face.hair < MAX_SKIN_HAIR)
 
     def _melanin(self, points: Float32Array, regions: Mapping[str, Float32Array]) -> Float32Array:
-        drawn = pigment.melanin_map(
+        drawn = pigment.draw_melanin_map(
             points, regions, self.melanin, seed=self.seed, freckles=self.freckles
         )
         old = (self.age_years - 15.0) / 60.0
@@ -212,7 +212,7 @@ class Member:
             np.maximum(regions["forehead"], regions["temples"]), regions["cheeks"]
         )
         amount = 0.8 * min(max((self.age_years - 35.0) / 40.0, 0.0), 1.0)
-        step += 0.8 * scattered_spots(
+        step += 0.8 * random_spots(
             points,
             0.5 * amount * sunny * (1.0 - regions["lips"]),
             cell_mm=9.0,
@@ -263,7 +263,7 @@ POPULATION_GROUPS: Final = (
 _WORN_PRODUCTS: Final = (("lotion",), ("makeup",), ("lotion", "makeup"))
 
 
-def table_1(*, seed: int = 0) -> tuple[Member, ...]:
+def draw_population(*, seed: int = 0) -> tuple[Member, ...]:
     """Draw the population of table 1.
 
     Parameters
@@ -278,7 +278,7 @@ def table_1(*, seed: int = 0) -> tuple[Member, ...]:
 
     Examples
     --------
-    >>> people = table_1()
+    >>> people = draw_population()
     >>> len(people), sum(p.sex == "female" for p in people)
     (87, 17)
     >>> sorted(people[55].labels - {"freckles"})
@@ -290,12 +290,12 @@ def table_1(*, seed: int = 0) -> tuple[Member, ...]:
     for row, group in enumerate(POPULATION_GROUPS):
         rng = np.random.default_rng([seed, 600, row])
         for index in range(group.count):
-            members.append(_drawn(group, index, len(members), rng))
+            members.append(_draw_member(group, index, len(members), rng))
     return tuple(members)
 
 
-def member(name: str) -> Member:
-    """Return a member of `table_1` by name, "P01" to "P87".
+def get_member(name: str) -> Member:
+    """Return a member of `draw_population` by name, "P01" to "P87".
 
     Raises
     ------
@@ -304,23 +304,23 @@ def member(name: str) -> Member:
 
     Examples
     --------
-    >>> member("P56").group
+    >>> get_member("P56").group
     'caucasian female, lotion or makeup'
     """
-    found = {person.name: person for person in table_1()}
+    found = {person.name: person for person in draw_population()}
     if name not in found:
         raise PopulationError(f"member: got {name!r}, expected P01 to P{len(found)}")
     return found[name]
 
 
-def shifted(
+def shift_trait(
     members: Sequence[Member],
     trait: str,
     *,
     melanin: float = 1.0,
     blood: float = 1.0,
-    apply: Mapping[str, float] | None = None,
-    share: float = 0.5,
+    products: Mapping[str, float] | None = None,
+    fraction: float = 0.5,
     rng: np.random.Generator,
 ) -> tuple[Member, ...]:
     """Add a known trait to a random part of a population.
@@ -354,21 +354,21 @@ def shifted(
 
     Examples
     --------
-    >>> people = table_1()
-    >>> tanned = shifted(people, "tan", melanin=1.5, rng=np.random.default_rng(1))
+    >>> people = draw_population()
+    >>> tanned = shift_trait(people, "tan", melanin=1.5, rng=np.random.default_rng(1))
     >>> sum("tan" in person.labels for person in tanned)
     44
     """
-    if not 0.0 <= share <= 1.0:
-        raise PopulationError(f"share: got {share}, expected 0 to 1")
-    chosen = set(rng.permutation(len(members))[: round(share * len(members))].tolist())
-    worn = checked({} if apply is None else apply)
+    if not 0.0 <= fraction <= 1.0:
+        raise PopulationError(f"share: got {fraction}, expected 0 to 1")
+    chosen = set(rng.permutation(len(members))[: round(fraction * len(members))].tolist())
+    worn = validate_conditions({} if products is None else products)
     return tuple(
         dataclasses.replace(
             member,
             melanin=member.melanin * melanin,
             blood=member.blood * blood,
-            applied=tuple(checked(dict(member.applied) | worn).items()),
+            applied=tuple(validate_conditions(dict(member.applied) | worn).items()),
             marks=member.marks | {trait},
         )
         if index in chosen
@@ -377,7 +377,7 @@ def shifted(
     )
 
 
-def _drawn(group: Group, index: int, number: int, rng: np.random.Generator) -> Member:
+def _draw_member(group: Group, index: int, number: int, rng: np.random.Generator) -> Member:
     low, high = group.age_years
     age = float((low, high)[index] if index < 2 else rng.integers(low, high + 1))
     male, pale = group.sex == "male", group.ethnicity == "caucasian"
@@ -422,7 +422,9 @@ def _head_mesh(head: int) -> Mesh:
 
 
 @lru_cache(maxsize=MAX_KEPT_HEADS)
-def _laid_out(head: int, size: int) -> tuple[Mesh, Atlas, Float32Array, Mapping[str, Float32Array]]:
+def _lay_out_head(
+    head: int, size: int
+) -> tuple[Mesh, Atlas, Float32Array, Mapping[str, Float32Array]]:
     """Return a head, its texture, the texels on the mean head and its regions.
 
     A head takes 8 MB at 256 texels, 120 MB at 1024.
@@ -433,5 +435,5 @@ def _laid_out(head: int, size: int) -> tuple[Mesh, Atlas, Float32Array, Mapping[
         )
     mesh = _head_mesh(head)
     atlas = unwrap(mesh, size)
-    points = face_regions.on_mean_head(atlas.position_mm, mesh)
+    points = face_regions.to_mean_head(atlas.position_mm, mesh)
     return mesh, atlas, points, face_regions.region_masks(points)

@@ -28,7 +28,7 @@ class SubjectFileError(InputError):
     """A subject that is neither a preset nor a file that can be used."""
 
 
-def load(key: str, path: str) -> Float32Array:
+def load_texture(key: str, path: str) -> Float32Array:
     """Return a texture as its file has it.
 
     Parameters
@@ -105,7 +105,7 @@ def _check_shape(where: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> No
         )
 
 
-def texture(key: str, path: str, size: int) -> Float32Array:
+def resample_texture(key: str, path: str, size: int) -> Float32Array:
     """Return a texture of so many texels a side.
 
     Where they are fewer than the file's, each is the mean of the area that it covers, so that
@@ -114,7 +114,7 @@ def texture(key: str, path: str, size: int) -> Float32Array:
     Parameters
     ----------
     key, path
-        See `load`.
+        See `load_texture`.
     size
         Texels a side.
 
@@ -123,16 +123,16 @@ def texture(key: str, path: str, size: int) -> Float32Array:
     ndarray of float32
         Shape (size, size), volume fractions.
     """
-    values = load(key, path)
+    values = load_texture(key, path)
     if size < values.shape[0]:
-        values = area_means(values, size)
+        values = average_areas(values, size)
     elif size > values.shape[0]:
         scale = size / values.shape[0]
         values = zoom(values, scale, order=1, mode="nearest", grid_mode=True)
     return np.ascontiguousarray(values, np.float32)
 
 
-def area_means(values: Float32Array, size: int) -> Float32Array:
+def average_areas(values: Float32Array, size: int) -> Float32Array:
     """Return the means of a square image over fewer, larger texels, whose edges may cut its own.
 
     Parameters
@@ -149,7 +149,7 @@ def area_means(values: Float32Array, size: int) -> Float32Array:
 
     Examples
     --------
-    >>> area_means(np.array([[0, 2, 0], [2, 8, 2], [0, 2, 0]], np.float32), 1).item()
+    >>> average_areas(np.array([[0, 2, 0], [2, 8, 2], [0, 2, 0]], np.float32), 1).item()
     1.7777777910232544
     """
     many = values.shape[0]

@@ -10,14 +10,14 @@ from numpy.typing import ArrayLike
 
 from rigsim.arrays import BoolArray, Float32Array, Int32Array
 from rigsim.geometry.mesh import Mesh
-from rigsim.render.renderer import load, with_slack
+from rigsim.render.renderer import load_mitsuba, pad_memory
 from rigsim.render.variant import VariantChoice, choose_variant
 
 RAYS_PER_CALL: Final = 1 << 22
 """Rays traced in one call; bounds the memory that a ray batch takes."""
 
 
-Hits: TypeAlias = tuple[Int32Array, Float32Array]
+RayHits: TypeAlias = tuple[Int32Array, Float32Array]
 """The triangle that each ray meets, -1 for none, and weights of its corners 1 and 2, (N, 2)."""
 
 
@@ -46,7 +46,7 @@ class Caster:
         if self._face_normals is None:
             corners = self.mesh.vertices_mm[self.mesh.faces]
             edges = corners[:, 1:] - corners[:, :1]
-            self._face_normals = unit(np.cross(edges[:, 0], edges[:, 1]))
+            self._face_normals = normalize(np.cross(edges[:, 0], edges[:, 1]))
         return self._face_normals
 
     @property
@@ -54,7 +54,7 @@ class Caster:
         """Mitsuba's scene of the mesh, for kernels that trace and shade at once, or None."""
         return self._tracer.scene
 
-    def first_hit(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
+    def first_hit(self, origins: ArrayLike, directions: ArrayLike) -> RayHits:
         """Find the first triangle on each ray.
 
         Parameters
@@ -78,7 +78,9 @@ class Caster:
             prim[part], weight[part] = self._tracer.first_hit(start[part], way[part])
         return prim, weight
 
-    def blocked(self, origins: ArrayLike, directions: ArrayLike, length_mm: ArrayLike) -> BoolArray:
+    def is_blocked(
+        self, origins: ArrayLike, directions: ArrayLike, length_mm: ArrayLike
+    ) -> BoolArray:
         """Tell which rays meet a triangle before their end.
 
         Parameters
@@ -99,33 +101,33 @@ class Caster:
         length = np.ascontiguousarray(np.broadcast_to(length_mm, len(start)), np.float32)
         out = np.empty(len(start), np.bool_)
         for part in _parts(len(start)):
-            out[part] = self._tracer.blocked(start[part], way[part], length[part])
+            out[part] = self._tracer.is_blocked(start[part], way[part], length[part])
         return out
 
 
 class _MitsubaTracer:
     def __init__(self, mesh: Mesh, choice: VariantChoice) -> None:
         self._choice = choice
-        mi = load(choice)
+        mi = load_mitsuba(choice)
         shape = mi.Mesh("mesh", len(mesh.vertices_mm), len(mesh.faces))
         parameters = mi.traverse(shape)
-        parameters["vertex_positions"] = with_slack(np.ravel(mesh.vertices_mm))
-        parameters["faces"] = with_slack(np.ravel(mesh.faces).astype(np.uint32))
+        parameters["vertex_positions"] = pad_memory(np.ravel(mesh.vertices_mm))
+        parameters["faces"] = pad_memory(np.ravel(mesh.faces).astype(np.uint32))
         parameters.update()
         self.scene: Any = mi.load_dict({"type": "scene", "mesh": shape})
 
     def _ray(
         self, mi: Any, origins: Float32Array, directions: Float32Array, length: Any = None
     ) -> Any:
-        start = mi.Point3f(*(with_slack(origins[:, k]) for k in range(3)))
-        way = mi.Vector3f(*(with_slack(directions[:, k]) for k in range(3)))
+        start = mi.Point3f(*(pad_memory(origins[:, k]) for k in range(3)))
+        way = mi.Vector3f(*(pad_memory(directions[:, k]) for k in range(3)))
         ray = mi.Ray3f(start, way)
         if length is not None:
-            ray.maxt = mi.Float(with_slack(length))
+            ray.maxt = mi.Float(pad_memory(length))
         return ray
 
-    def first_hit(self, origins: Float32Array, directions: Float32Array) -> Hits:
-        mi = load(self._choice)
+    def first_hit(self, origins: Float32Array, directions: Float32Array) -> RayHits:
+        mi = load_mitsuba(self._choice)
         import drjit as dr
 
         ray = self._ray(mi, origins, directions)
@@ -136,10 +138,10 @@ class _MitsubaTracer:
         weight = np.stack([np.array(hit.prim_uv.x), np.array(hit.prim_uv.y)], axis=-1)
         return prim, np.where(valid[:, None], weight, 0.0).astype(np.float32)
 
-    def blocked(
+    def is_blocked(
         self, origins: Float32Array, directions: Float32Array, length: Float32Array
     ) -> BoolArray:
-        mi = load(self._choice)
+        mi = load_mitsuba(self._choice)
         hit = self.scene.ray_test(self._ray(mi, origins, directions, length), coherent=True)
         return np.array(hit, np.bool_)
 
@@ -153,7 +155,7 @@ class _EmbreeTracer:
         self._scene = rtcore_scene.EmbreeScene()
         TriangleMesh(self._scene, mesh.vertices_mm, mesh.faces)
 
-    def first_hit(self, origins: Float32Array, directions: Float32Array) -> Hits:
+    def first_hit(self, origins: Float32Array, directions: Float32Array) -> RayHits:
         if not len(origins):
             return np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
         hit = self._scene.run(origins, directions, output=True)
@@ -161,7 +163,7 @@ class _EmbreeTracer:
         weight = np.stack([hit["u"], hit["v"]], axis=-1).astype(np.float32)
         return prim, np.where(prim[:, None] >= 0, weight, np.float32(0.0))
 
-    def blocked(
+    def is_blocked(
         self, origins: Float32Array, directions: Float32Array, length: Float32Array
     ) -> BoolArray:
         if not len(origins):
@@ -182,7 +184,7 @@ def _parts(count: int) -> list[slice]:
     return [slice(at, min(at + RAYS_PER_CALL, count)) for at in range(0, count, RAYS_PER_CALL)]
 
 
-def unit(vectors: Float32Array) -> Float32Array:
+def normalize(vectors: Float32Array) -> Float32Array:
     """Return vectors of length 1; those of length 0 stay."""
     squared = np.einsum("...i,...i->...", vectors, vectors)
     inverse = np.zeros_like(squared)

@@ -12,7 +12,7 @@ is. A pixel that sees nothing but one smooth surface gets weights of sum 1, sinc
 change along rays: what the spreading alone would miss is the change of the circle along a slope,
 1e-4 on a face. At an edge two layers are told apart by the widest gap in depth; the far one gets
 what the near one leaves free, also of what it hides from the pupil's middle, which looks as the
-rest does. Light further out than `LensSpread.radius` pixels is put back: the far rings of
+rest does. Light further out than `DefocusKernels.radius` pixels is put back: the far rings of
 diffraction, and the glare of real lenses, are not in the picture.
 """
 
@@ -29,9 +29,9 @@ from numpy.typing import ArrayLike
 from capture.rig import View
 from rigsim.arrays import Float32Array, Float64Array, Int32Array, UInt8Array
 from rigsim.geometry.mesh import Mesh
-from rigsim.render.lens_blur import BlurError, Lens, lens_of
+from rigsim.render.lens_blur import BlurError, Lens, focused_lens
 
-STEP_PX: Final = 0.1
+DEFOCUS_STEP_PX: Final = 0.1
 MAX_WEIGHT_DEPTHS: Final = 33
 """Between depths at which weights are computed they are blended; those are so much blur apart, in
 pixels' diameters, or so many."""
@@ -45,14 +45,14 @@ DIFFRACTION_MARGIN: Final = 4.0
 SPECTRUM_NODES: Final = 3
 """Wavelengths that stand for the spectrum."""
 
-GAP_MM: Final = 3.0
-GAP_PX: Final = 3.0
+DEPTH_GAP_MM: Final = 3.0
+DEPTH_GAP_PX: Final = 3.0
 """Gap in depth, the wider of the two, at which one surface stands before another."""
 
 DEPTH_RANGE_FACTOR: Final = 1.2
 """Step of the ranges of depth for which tables are made."""
 
-GAP_BINS: Final = 64
+DEPTH_GAP_BINS: Final = 64
 """Depths that are told apart when a gap is looked for."""
 
 MAX_FREQUENCY: Final = 6.0
@@ -60,7 +60,7 @@ MAX_FREQUENCY: Final = 6.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LensSpread:
+class DefocusKernels:
     """Shares of a sample's light that fall on the pixels around it, by depth."""
 
     radius: int
@@ -74,21 +74,21 @@ class LensSpread:
     distance_mm: float
     """From the pupil to the plane in focus, mm."""
     furthest: float
-    """Largest `off_focus` in the table."""
+    """Largest `defocus` in the table."""
     gap_mm: float
     """Gap in depth at which one surface stands before another."""
 
-    def off_focus(self, toward_mm: ArrayLike) -> Float64Array:
+    def defocus(self, toward_mm: ArrayLike) -> Float64Array:
         """Return what the circle of confusion goes with, of points so far before the focus."""
         depth = np.asarray(toward_mm, np.float64)
         return depth / (self.distance_mm - depth)
 
     def slices(self, toward_mm: ArrayLike) -> UInt8Array:
         """Return the rows of the table for points so far before the plane in focus, mm."""
-        place = np.abs(self.off_focus(toward_mm)) * ((DEPTH_SLICES - 1) / max(self.furthest, 1e-12))
+        place = np.abs(self.defocus(toward_mm)) * ((DEPTH_SLICES - 1) / max(self.furthest, 1e-12))
         return np.asarray(np.clip(np.rint(place), 0, DEPTH_SLICES - 1), np.uint8)
 
-    def spilled(self, toward_mm: ArrayLike) -> float:
+    def max_spilled_fraction(self, toward_mm: ArrayLike) -> float:
         """Return which share of a pixel's light falls on others, at the worst of some depths.
 
         Parameters
@@ -102,7 +102,9 @@ class LensSpread:
         return float(1.0 - self.table[rows, own].sum(axis=1).min())
 
 
-def lens_spread(view: View, illuminant: str, *, subpixels: int, depths_mm: ArrayLike) -> LensSpread:
+def tabulate_defocus(
+    view: View, illuminant: str, *, subpixels: int, depths_mm: ArrayLike
+) -> DefocusKernels:
     """Return how a camera's lens spreads light of points between some depths.
 
     Parameters
@@ -125,15 +127,17 @@ def lens_spread(view: View, illuminant: str, *, subpixels: int, depths_mm: Array
     --------
     >>> from capture.rig import load_rig
     >>> cam = load_rig("flash").resized(768).view("cam")
-    >>> spread = lens_spread(cam, "D55", subpixels=2, depths_mm=[-85.0, 25.0])
-    >>> spread.radius, round(spread.spilled(-85.0), 2)
+    >>> spread = tabulate_defocus(cam, "D55", subpixels=2, depths_mm=[-85.0, 25.0])
+    >>> spread.radius, round(spread.max_spilled_fraction(-85.0), 2)
     (2, 0.58)
     """
-    return spread_of(lens_of(view, illuminant), subpixels=subpixels, depths_mm=depths_mm)
+    return tabulate_lens_defocus(
+        focused_lens(view, illuminant), subpixels=subpixels, depths_mm=depths_mm
+    )
 
 
-def spread_of(lens: Lens, *, subpixels: int, depths_mm: ArrayLike) -> LensSpread:
-    """Return how a lens spreads light; see `lens_spread`.
+def tabulate_lens_defocus(lens: Lens, *, subpixels: int, depths_mm: ArrayLike) -> DefocusKernels:
+    """Return how a lens spreads light; see `tabulate_defocus`.
 
     Raises
     ------
@@ -155,12 +159,12 @@ def spread_of(lens: Lens, *, subpixels: int, depths_mm: ArrayLike) -> LensSpread
 
 
 @lru_cache(maxsize=8)  # a dome's cameras are alike, and the faces before them
-def _spread(lens: Lens, subpixels: int, furthest: float) -> LensSpread:
+def _spread(lens: Lens, subpixels: int, furthest: float) -> DefocusKernels:
     pixel_mm = 1e-3 * lens.pixel_on_subject_um
     pupil_mm = 0.5 * lens.magnification * lens.distance_mm / lens.working_f_number
     rings = DIFFRACTION_MARGIN * 1e-3 * lens.cutoff_period_um
     radius = max(1, math.ceil((pupil_mm * furthest + rings) / pixel_mm))
-    count = math.ceil(2.0 * pupil_mm * furthest / pixel_mm / STEP_PX) + 2
+    count = math.ceil(2.0 * pupil_mm * furthest / pixel_mm / DEFOCUS_STEP_PX) + 2
     nodes = np.linspace(0.0, furthest, min(count, MAX_WEIGHT_DEPTHS) if furthest > 0.0 else 1)
     exact = np.stack([_weights(lens, node * lens.distance_mm, radius, subpixels) for node in nodes])
     place = np.linspace(0.0, len(nodes) - 1.0, DEPTH_SLICES)
@@ -168,8 +172,13 @@ def _spread(lens: Lens, subpixels: int, furthest: float) -> LensSpread:
     high = np.minimum(low + 1, len(nodes) - 1)
     share = (place - low)[:, None, None]
     table = ((1.0 - share) * exact[low] + share * exact[high]).astype(np.float32)
-    return LensSpread(
-        radius, subpixels, table, lens.distance_mm, furthest, max(GAP_MM, GAP_PX * pixel_mm)
+    return DefocusKernels(
+        radius,
+        subpixels,
+        table,
+        lens.distance_mm,
+        furthest,
+        max(DEPTH_GAP_MM, DEPTH_GAP_PX * pixel_mm),
     )
 
 
@@ -202,29 +211,29 @@ def _weights(lens: Lens, depth_mm: float, radius: int, subpixels: int) -> Float6
     squares *= np.where(frequency > 0.0, 2.0, 1.0)  # those below 0 are the same
     waves = np.cos(2.0 * np.pi * offset[:, None] * frequency) * squares
     radial = np.hypot(frequency[:, None], frequency) / pixel_mm
-    otf = lens.transfer(radial, depth_mm=depth_mm)
+    otf = lens.otf(radial, depth_mm=depth_mm)
     found = np.maximum(waves @ otf @ waves.T, 0.0)
     found /= found.sum()
     by_pixel = found.reshape(wide, subpixels, wide, subpixels).transpose(0, 2, 1, 3)
     return np.asarray(by_pixel.reshape(wide**2, subpixels**2), np.float64)
 
 
-def before_focus(view: View, points_mm: Float32Array) -> Float32Array:
+def depth_before_focus(view: View, points_mm: Float32Array) -> Float32Array:
     """Return how far points stand before a camera's plane in focus, mm, shape (n,) of (n, 3)."""
     back = np.asarray(view.axes[2])
     focus = float(np.asarray(view.position_mm) @ back) - view.focus_distance_mm
     return np.asarray(points_mm @ back.astype(np.float32) - np.float32(focus), np.float32)
 
 
-def facing_depths(view: View, mesh: Mesh) -> tuple[float, float]:
+def depth_range(view: View, mesh: Mesh) -> tuple[float, float]:
     """Return between which depths before the plane in focus a mesh faces the camera, mm."""
     way = np.asarray(view.position_mm, np.float32) - mesh.vertices_mm
     facing = np.einsum("ij,ij->i", way, mesh.normals) > 0.0
-    depths = before_focus(view, mesh.vertices_mm[facing])
+    depths = depth_before_focus(view, mesh.vertices_mm[facing])
     return float(depths.min(initial=0.0)), float(depths.max(initial=0.0))
 
 
-class LensPicture:
+class LensImage:
     """The samples of one picture, ready to be seen through a lens with any light on them.
 
     Parameters
@@ -245,7 +254,7 @@ class LensPicture:
 
     def __init__(
         self,
-        spread: LensSpread,
+        spread: DefocusKernels,
         shape: tuple[int, int],
         pixel: Int32Array,
         first: Int32Array,
@@ -263,7 +272,7 @@ class LensPicture:
         self._far = np.zeros(shape, np.float32)
         _layers(*self._samples, np.float32(spread.gap_mm), self._cut, self._far)
 
-    def see(self, rows: Float32Array) -> Float32Array:
+    def render(self, rows: Float32Array) -> Float32Array:
         """Return the picture of samples of some radiance.
 
         Parameters
@@ -294,7 +303,7 @@ def _layers(  # type: ignore[no-untyped-def]
     for y in prange(height):
         depth = np.empty(wide * wide * per_pixel, np.float32)
         share = np.empty(wide * wide * per_pixel, np.float32)
-        filled = np.empty(GAP_BINS, np.uint8)
+        filled = np.empty(DEPTH_GAP_BINS, np.uint8)
         for x in range(width):
             count, missing = 0, np.float32(0.0)
             total, inside = np.float32(0.0), np.float32(0.0)
@@ -322,11 +331,11 @@ def _layers(  # type: ignore[no-untyped-def]
             if high - low > gap:
                 # the widest run of empty bins is the gap, to the width of a bin
                 filled[:] = 0
-                per_mm = np.float32(GAP_BINS - 1) / (high - low)
+                per_mm = np.float32(DEPTH_GAP_BINS - 1) / (high - low)
                 for k in range(count):
                     filled[int((depth[k] - low) * per_mm)] = 1
                 run, widest, end = 0, 0, 0
-                for k in range(GAP_BINS):
+                for k in range(DEPTH_GAP_BINS):
                     run = 0 if filled[k] else run + 1
                     if run > widest:
                         widest, end = run, k

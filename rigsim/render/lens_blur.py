@@ -24,10 +24,10 @@ from rigsim.arrays import Float32Array, Float64Array
 SPECTRUM_NODES: Final = 9
 """Wavelengths that stand for the spectrum."""
 
-SLICE_MM: Final = 0.25
+DEPTH_SLICE_MM: Final = 0.25
 """Distance of the depths at which the OTF is exact; between them pictures are blended."""
 
-FLAT_MM: Final = 0.15
+MAX_FLAT_DEPTH_RANGE_MM: Final = 0.15
 """Range of depths that one slice stands for."""
 
 OTF_NODES: Final = 513
@@ -90,7 +90,7 @@ class Lens:
         aperture = self.working_f_number / self.magnification
         return 1e3 * depth_mm / (8.0 * aperture**2)
 
-    def transfer(self, per_mm: ArrayLike, *, depth_mm: float = 0.0) -> Float64Array:
+    def otf(self, per_mm: ArrayLike, *, depth_mm: float = 0.0) -> Float64Array:
         """Return the lens's OTF, without pixels.
 
         Parameters
@@ -116,7 +116,7 @@ class Lens:
         return total
 
 
-def lens_of(view: View, illuminant: str) -> Lens:
+def focused_lens(view: View, illuminant: str) -> Lens:
     """Return the lens of a view, focused as the view says.
 
     Parameters
@@ -134,7 +134,7 @@ def lens_of(view: View, illuminant: str) -> Lens:
     Examples
     --------
     >>> from capture.rig import load_rig
-    >>> lens = lens_of(load_rig("gradient").view("cam"), "LED-B3")
+    >>> lens = focused_lens(load_rig("gradient").view("cam"), "LED-B3")
     >>> round(lens.working_f_number, 2), round(lens.cutoff_period_um, 1)
     (30.67, 17.9)
     """
@@ -155,7 +155,7 @@ def lens_of(view: View, illuminant: str) -> Lens:
     )
 
 
-def blur(
+def blur_images(
     images: Float32Array,
     lens: Lens,
     *,
@@ -211,7 +211,7 @@ def blur(
         2j * np.pi * offset * pixel_mm * fx
     )
     filters = [
-        (lens.transfer(radius, depth_mm=depth) * pixel * (turn if subpixels > 1 else 1.0)).astype(
+        (lens.otf(radius, depth_mm=depth) * pixel * (turn if subpixels > 1 else 1.0)).astype(
             np.complex64 if subpixels > 1 else np.float32
         )
         for depth, _ in slices
@@ -221,7 +221,7 @@ def blur(
         for factor, (_, share) in zip(filters, slices, strict=True):
             part = images[k] if share is None else images[k] * share
             found = scipy.fft.rfft2(np.pad(part, pad, mode="reflect"), workers=FFT_WORKERS)
-            spectrum += factor * _folded(found, coarse)
+            spectrum += factor * _fold_spectrum(found, coarse)
         picture = scipy.fft.irfft2(spectrum, coarse, workers=FFT_WORKERS)
         out[k] = picture[BORDER_PX : BORDER_PX + out.shape[1], BORDER_PX : BORDER_PX + out.shape[2]]
     if subpixels > 1:
@@ -233,7 +233,9 @@ BORDER_PX: Final = 12
 """Mirrored pixels around a picture while it is blurred; the lens spreads light over fewer."""
 
 
-def _folded(spectrum: NDArray[np.complex64], shape: tuple[int, int]) -> NDArray[np.complex64]:
+def _fold_spectrum(
+    spectrum: NDArray[np.complex64], shape: tuple[int, int]
+) -> NDArray[np.complex64]:
     """Return the frequencies that pixels can carry; the lens lets no others pass."""
     rows, columns = shape
     if spectrum.shape == (rows, columns // 2 + 1):
@@ -252,9 +254,9 @@ def _slices(depth_mm: Float32Array | None) -> list[tuple[float, Float32Array | N
     low, high = float(depth_mm.min()), float(depth_mm.max())
     if not math.isfinite(high - low):
         raise BlurError("depth_mm: got values that are not finite, expected finite ones")
-    if high - low <= FLAT_MM:
+    if high - low <= MAX_FLAT_DEPTH_RANGE_MM:
         return [(0.5 * (low + high), None)]
-    count = math.ceil((high - low) / SLICE_MM) + 1
+    count = math.ceil((high - low) / DEPTH_SLICE_MM) + 1
     nodes = np.linspace(low, high, count)
     place = (depth_mm - np.float32(low)) * np.float32((count - 1) / (high - low))
     return [

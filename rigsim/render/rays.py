@@ -8,12 +8,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from capture.rig import View
 from rigsim.arrays import BoolArray, Float32Array, Int32Array
-from rigsim.as_built.dome import unbend
+from rigsim.as_built.dome import undistort
 from rigsim.geometry.atlas import interpolate
-from rigsim.render.caster import Caster, unit
+from rigsim.render.caster import Caster, normalize
 from rigsim.render.renderer import RenderError
 
-OFFSET_MM: Final = 0.02
+RAY_OFFSET_MM: Final = 0.02
 """Distance by which shadow rays start above the surface; far above float32 steps at 200 mm."""
 
 
@@ -36,7 +36,7 @@ class GBuffer:
     to_camera: Float32Array
     """Unit vector from the point to the camera."""
 
-    def inside(
+    def hit_samples(
         self,
     ) -> tuple[NDArray[np.int_], Float32Array, Float32Array, Float32Array, Float32Array]:
         """Return index, uv, position, normal and way to the camera of samples that meet the mesh.
@@ -84,7 +84,7 @@ def camera_rays(
     y = (np.arange(first * k, last * k) + 0.5) / k - 0.5 - 0.5 * (view.height_px - 1)
     if distortion is not None and np.any(distortion):
         slopes = np.stack(np.meshgrid(x / view.focal_px, y / view.focal_px), axis=-1)
-        slopes = unbend(slopes, distortion)
+        slopes = undistort(slopes, distortion)
         bent = slopes[..., :1] * right - slopes[..., 1:] * up - back
         bent /= np.linalg.norm(bent, axis=-1, keepdims=True)
         directions = bent.astype(np.float32)
@@ -158,7 +158,7 @@ def trace(caster: Caster, origins: Float32Array, directions: Float32Array) -> GB
         mask=mask.reshape(shape),
         prim=prim.reshape(shape),
         position_mm=position,
-        normal=unit(normal),
+        normal=normalize(normal),
         face_normal=face_normal.reshape(*shape, 3),
         uv=uv,
         to_camera=-directions,
@@ -242,7 +242,7 @@ def visibility(
     side = np.cross(helper, axis)
     side /= np.linalg.norm(side)
     other = np.cross(axis, side)
-    start = points[index] + np.float32(OFFSET_MM) * normals[index]
+    start = points[index] + np.float32(RAY_OFFSET_MM) * normals[index]
     golden = np.pi * (3.0 - np.sqrt(5.0))
     turn = (index * 0.754877666) % 1.0 * 2.0 * np.pi  # inverse of the plastic number: well spread
     for k in range(samples):
@@ -254,6 +254,6 @@ def visibility(
         way /= length[:, None]
         front = np.einsum("ij,ij->i", way, normals[index]) > 0.0
         ray = np.flatnonzero(front)
-        free = ~caster.blocked(start[ray], way[ray], length[ray] * np.float32(0.999))
+        free = ~caster.is_blocked(start[ray], way[ray], length[ray] * np.float32(0.999))
         seen[index[ray]] += free
     return (seen / np.float32(samples)).reshape(leading)

@@ -14,7 +14,7 @@ class RenderError(RuntimeError):
     """Mitsuba gave an image that cannot be used, or cannot be started."""
 
 
-def load(choice: VariantChoice) -> Any:
+def load_mitsuba(choice: VariantChoice) -> Any:
     """Import Mitsuba with a variant set.
 
     Parameters
@@ -60,10 +60,10 @@ def thread_count() -> int:
     return max(1, min(cores, 16))
 
 
-SLACK_VALUES: Final = 64
+PADDING_VALUES: Final = 64
 
 
-def with_slack(values: NDArray[np.generic]) -> NDArray[Any]:
+def pad_memory(values: NDArray[np.generic]) -> NDArray[Any]:
     """Return a copy of a row of numbers whose memory goes on beyond its end.
 
     The renderer works on NumPy's memory itself, in whole vectors of up to 16 numbers, and Embree
@@ -72,10 +72,10 @@ def with_slack(values: NDArray[np.generic]) -> NDArray[Any]:
 
     Examples
     --------
-    >>> row = with_slack(np.arange(5, dtype=np.float32))
+    >>> row = pad_memory(np.arange(5, dtype=np.float32))
     >>> row.tolist(), row.base.size - row.size
     ([0.0, 1.0, 2.0, 3.0, 4.0], 64)
     """
-    held = np.zeros(values.size + SLACK_VALUES, values.dtype)
+    held = np.zeros(values.size + PADDING_VALUES, values.dtype)
     held[: values.size] = values.reshape(-1)
     return held[: values.size]

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from capture.rig import Rig, View
 from rigsim.arrays import Float32Array, Float64Array
 from rigsim.geometry.mesh import Mesh
-from rigsim.render.renderer import RenderError, load
+from rigsim.render.renderer import RenderError, load_mitsuba
 from rigsim.render.variant import Kind, choose_variant
 
 
@@ -45,7 +45,7 @@ def radiance(
         holds values that are not finite.
     """
     _refuse_negative_light(description)
-    mi = load(choose_variant(kind))
+    mi = load_mitsuba(choose_variant(kind))
     scene = mi.load_dict(_with_transforms(mi, description))
     image = np.array(mi.TensorXf(mi.render(scene, spp=samples, seed=seed)).numpy(), np.float32)
     bad = int(np.count_nonzero(~np.isfinite(image).all(axis=-1)))
@@ -75,7 +75,7 @@ def _refuse_negative_light(description: Mapping[str, Any], where: str = "") -> N
                 )
 
 
-class MovedLight:
+class MovableLightScene:
     """A described scene whose one point light is moved from render to render.
 
     Nothing is compiled or parsed anew when the light moves, so that the time of a call is the time
@@ -91,7 +91,7 @@ class MovedLight:
 
     def __init__(self, description: Mapping[str, Any], *, kind: Kind) -> None:
         self._choice = choose_variant(kind)
-        mi = load(self._choice)
+        mi = load_mitsuba(self._choice)
         self._scene = mi.load_dict(_with_transforms(mi, description))
         self._parameters = mi.traverse(self._scene)
 
@@ -105,7 +105,7 @@ class MovedLight:
         samples, seed
             As for `radiance`.
         """
-        mi = load(self._choice)
+        mi = load_mitsuba(self._choice)
         self._parameters["light.position"] = mi.Point3f(*(float(x) for x in np.ravel(light_mm)))
         self._parameters.update()
         image = np.array(mi.render(self._scene, spp=samples, seed=seed).numpy(), np.float32)
@@ -176,7 +176,7 @@ def perspective(
     return description | ({"sampler": {"type": sampler, "sample_count": 4}} if sampler else {})
 
 
-def point_rig(rig: Rig) -> Rig:
+def point_light_rig(rig: Rig) -> Rig:
     """Return a rig whose lights are points that shine evenly, as Mitsuba's point light does."""
     lights = tuple(
         dataclasses.replace(light, half_intensity_deg=None, radius_mm=1e-3) for light in rig.lights
@@ -195,7 +195,7 @@ def rough_metal(distribution: str, eta: float, alpha: Any) -> dict[str, Any]:
     }
 
 
-def matt_plastic(eta: float, reflectance: Any) -> dict[str, Any]:
+def matte_plastic(eta: float, reflectance: Any) -> dict[str, Any]:
     """Return the description of an interior behind a smooth boundary that does not shine."""
     return {
         "type": "plastic",

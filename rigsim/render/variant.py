@@ -73,7 +73,7 @@ print("LLVM " + ".".join(map(str, version)))
 
 
 @dataclass(frozen=True, slots=True)
-class LibraryVerdict:
+class LibraryCheck:
     """What was found out about one LLVM library."""
 
     path: str
@@ -101,7 +101,7 @@ class VariantChoice:
         return self.name.startswith("llvm")
 
 
-def find_libraries(environment: Mapping[str, str] | None = None) -> tuple[Path, ...]:
+def find_llvm_libraries(environment: Mapping[str, str] | None = None) -> tuple[Path, ...]:
     """Return the LLVM libraries of this machine, the newest version first.
 
     Parameters
@@ -144,7 +144,7 @@ def major_version(path: Path) -> int:
     return int(match.group(1)) if match else 0
 
 
-def judge_library(path: Path, *, cache: Path | None = None) -> LibraryVerdict:
+def check_library(path: Path, *, cache: Path | None = None) -> LibraryCheck:
     """Find out, without risk to this process, whether an LLVM library can be used.
 
     Parameters
@@ -162,15 +162,15 @@ def judge_library(path: Path, *, cache: Path | None = None) -> LibraryVerdict:
     path = path.resolve()
     version = major_version(path)
     if 0 < version < MIN_LLVM_VERSION:
-        return LibraryVerdict(str(path), False, f"LLVM {version} is older than {MIN_LLVM_VERSION}")
+        return LibraryCheck(str(path), False, f"LLVM {version} is older than {MIN_LLVM_VERSION}")
     if not path.is_file():
-        return LibraryVerdict(str(path), False, "there is no such file")
-    folder = user_cache() if cache is None else cache
+        return LibraryCheck(str(path), False, "there is no such file")
+    folder = user_cache_dir() if cache is None else cache
     key = f"{path}|{path.stat().st_mtime_ns}|{sys.executable}"
     known = _read_cache(folder)
     if key in known:
         usable, why = known[key]
-        return LibraryVerdict(str(path), usable, why)
+        return LibraryCheck(str(path), usable, why)
     verdict = probe_library(path)
     if _NOT_RUN not in verdict.why:  # a busy machine is no verdict on the library
         known[key] = (verdict.usable, verdict.why)
@@ -178,7 +178,7 @@ def judge_library(path: Path, *, cache: Path | None = None) -> LibraryVerdict:
     return verdict
 
 
-def probe_library(path: Path, *, timeout_s: float = PROBE_TIMEOUT_S) -> LibraryVerdict:
+def probe_library(path: Path, *, timeout_s: float = PROBE_TIMEOUT_S) -> LibraryCheck:
     """Render eight by eight pixels with an LLVM library in another process.
 
     Parameters
@@ -204,13 +204,13 @@ def probe_library(path: Path, *, timeout_s: float = PROBE_TIMEOUT_S) -> LibraryV
             check=False,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
-        return LibraryVerdict(str(path), False, f"{_NOT_RUN}: {error}")
+        return LibraryCheck(str(path), False, f"{_NOT_RUN}: {error}")
     if done.returncode == 0 and done.stdout.strip():
-        return LibraryVerdict(str(path), True, done.stdout.strip().splitlines()[-1])
+        return LibraryCheck(str(path), True, done.stdout.strip().splitlines()[-1])
     said = (done.stderr.strip().splitlines() or ["no message"])[-1]
     if done.returncode < 0:
         said = f"it ended the probe by signal {-done.returncode}"
-    return LibraryVerdict(str(path), False, said)
+    return LibraryCheck(str(path), False, said)
 
 
 def choose_variant(
@@ -258,8 +258,8 @@ def choose_variant(
     if asked not in ("", "llvm"):
         raise ValueError(f"SKINRIG_MITSUBA: got {asked!r}, expected scalar, llvm or nothing")
     refused = []
-    for path in find_libraries(environment) if libraries is None else libraries:
-        verdict = judge_library(path, cache=cache)
+    for path in find_llvm_libraries(environment) if libraries is None else libraries:
+        verdict = check_library(path, cache=cache)
         if verdict.usable:
             return VariantChoice(f"llvm_ad_{kind}", f"{verdict.why} works", verdict.path)
         refused.append(f"{verdict.path}: {verdict.why}")
@@ -268,7 +268,7 @@ def choose_variant(
     return VariantChoice(_SCALAR_VARIANTS[kind], f"no LLVM {MIN_LLVM_VERSION} or newer ({why})", "")
 
 
-def user_cache() -> Path:
+def user_cache_dir() -> Path:
     """Return the folder in which verdicts are kept, by the XDG convention."""
     base = os.environ.get("XDG_CACHE_HOME", "")
     return (Path(base) if base else Path.home() / ".cache") / "skinrig"

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 from rigsim.arrays import Float64Array, FloatArray, Int32Array, Int64Array
 
 
-def add_flaws(
+def add_mesh_defects(
     vertices_mm: Float64Array, faces: Int32Array, *, edge_mm: float, rng: np.random.Generator
 ) -> tuple[Float64Array, Int32Array]:
     """Return a mesh with holes, islands, doubled vertices, degenerate and surplus triangles.
@@ -45,7 +45,9 @@ def add_flaws(
     return vertices[order], shuffled.astype(np.int32)
 
 
-def binary_ply(vertices_mm: FloatArray, faces: Int32Array, uv: FloatArray | None = None) -> bytes:
+def encode_binary_ply(
+    vertices_mm: FloatArray, faces: Int32Array, uv: FloatArray | None = None
+) -> bytes:
     """Return a mesh as the bytes of a little-endian binary PLY with float32 positions.
 
     With ``uv``, shape (V, 2), its vertices have texture coordinates s and t.

@@ -36,7 +36,7 @@ class RangeImage:
     """Trust in each range, shape (N, N), 0 to 1; also the slope of distance to the surface."""
 
     @classmethod
-    def looking(
+    def from_view(
         cls, center_mm: Float64Array, target_mm: Float64Array, side: int, pitch: float
     ) -> RangeImage:
         """Return an image that sees nothing yet."""
@@ -55,7 +55,7 @@ class RangeImage:
         way = local @ self.axes
         return np.asarray(way / np.linalg.norm(way, axis=-1, keepdims=True))
 
-    def filled(self, range_mm: Float64Array, weight: Float64Array) -> RangeImage:
+    def with_ranges(self, range_mm: Float64Array, weight: Float64Array) -> RangeImage:
         """Return the image with ranges."""
         return replace(self, range_mm=range_mm, weight=weight)
 
@@ -64,7 +64,7 @@ class RangeImage:
         seen = np.isfinite(self.range_mm)
         return self.center_mm + self.range_mm[seen][:, None] * self.rays()[seen]
 
-    def distances(self, points: Float64Array) -> tuple[Float64Array, Float64Array]:
+    def signed_distances(self, points: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Return how far each point lies before the surface, and its weight; NaN where unseen."""
         local = (points - self.center_mm) @ self.axes.T
         middle = 0.5 * (len(self.range_mm) - 1)
@@ -77,7 +77,9 @@ class RangeImage:
         return before * np.sqrt(weight), weight
 
 
-def fuse(images: Sequence[RangeImage], voxel_mm: float) -> tuple[Float64Array, Int32Array]:
+def fuse_range_images(
+    images: Sequence[RangeImage], voxel_mm: float
+) -> tuple[Float64Array, Int32Array]:
     """Join range images into a triangle mesh.
 
     Parameters
@@ -106,7 +108,7 @@ def fuse(images: Sequence[RangeImage], voxel_mm: float) -> tuple[Float64Array, I
         points = low + voxel_mm * np.stack([np.full_like(y, i), y, z], axis=-1).reshape(-1, 3)
         total, weights = np.zeros(len(points)), np.zeros(len(points))
         for image in images:
-            before, weight = image.distances(points)
+            before, weight = image.signed_distances(points)
             near = np.isfinite(before) & (before > -deep)
             total[near] += weight[near] * np.minimum(before[near], deep)
             weights[near] += weight[near]
@@ -170,10 +172,10 @@ def _surface_net(
         flip = ~inside[here][crossed]
         quad[flip] = quad[flip][:, ::-1]
         quads.append(quad[(quad >= 0).all(axis=1)])
-    return vertices, _cut(vertices, np.concatenate(quads))
+    return vertices, _triangulate_quads(vertices, np.concatenate(quads))
 
 
-def _cut(vertices: Float64Array, quads: Int64Array) -> Int32Array:
+def _triangulate_quads(vertices: Float64Array, quads: Int64Array) -> Int32Array:
     """Cut quads along their shorter diagonals."""
     a, b, c, d = (vertices[quads[:, k]] for k in range(4))
     along = np.linalg.norm(a - c, axis=1) <= np.linalg.norm(b - d, axis=1)

@@ -17,30 +17,30 @@ from rigsim.geometry.atlas import interpolate, sample
 from rigsim.geometry.mesh import Mesh, MeshError, build_mesh, grid_faces
 from rigsim.geometry.surface_noise import smooth_noise
 from rigsim.render import Caster
-from rigsim.scanner.flaws import add_flaws, binary_ply
-from rigsim.scanner.fusion import RangeImage, fuse
+from rigsim.scanner.flaws import add_mesh_defects, encode_binary_ply
+from rigsim.scanner.fusion import RangeImage, fuse_range_images
 
 POD_AZIMUTH_DEG: Final = (-38.0, 38.0)
 """Where the pods stand around the subject, from the front."""
-CAMERA_ASIDE_DEG: Final = ((-9.0, 13.0), (9.0, -13.0))
+CAMERA_OFFSET_DEG: Final = ((-9.0, 13.0), (9.0, -13.0))
 """Azimuth and elevation of a pod's cameras from its projector."""
-DISTANCE_MM: Final = 900.0
+WORKING_DISTANCE_MM: Final = 900.0
 TARGET_MM: Final = (0.0, 0.0, -40.0)
 """Point that all devices face."""
-MIN_COSINE: Final = 0.25
+MIN_INCIDENCE_COSINE: Final = 0.25
 """Stripes that arrive or are seen at a flatter angle are not decoded: 76 degrees."""
 MAX_RANGE_JUMP_MM: Final = 4.0
 """Neighbouring pixels whose ranges differ by more are at an edge and are dropped."""
-WRAP_NOISE_SHARE: Final = 0.4
+WRAP_NOISE_FRACTION: Final = 0.4
 """Part of a range's noise that a wrapped template keeps."""
-WRAP_SLIDE_MM: Final = 0.25
+WRAP_TANGENTIAL_STD_MM: Final = 0.25
 """Deviation along the surface of a wrapped template from the same skin, mm in each direction."""
-COARSE_MM: Final = (8.0, 5.0)
+COARSE_VOXELS_MM: Final = (8.0, 5.0)
 """Voxels of two rough passes, which tell how many triangles a fine one gives."""
 
 
 @dataclass(frozen=True, slots=True)
-class Scanner:
+class ScannerSettings:
     """What a scanner does to the surface."""
 
     triangles: int = 40_000
@@ -74,7 +74,7 @@ class Scanner:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scan:
+class ScanResult:
     """What the scanner delivers, and what only the simulation knows."""
 
     ply: bytes
@@ -93,9 +93,9 @@ def scan_face(
     mesh: Mesh,
     *,
     rng: np.random.Generator,
-    scanner: Scanner | None = None,
+    scanner: ScannerSettings | None = None,
     relief_um: Float32Array | None = None,
-) -> Scan:
+) -> ScanResult:
     """Scan a face.
 
     Parameters
@@ -105,7 +105,7 @@ def scan_face(
     rng
         Source of noise, flaws and the offset between the frames.
     scanner
-        Its properties; those of `Scanner` by default.
+        Its properties; those of `ScannerSettings` by default.
     relief_um
         Height of pores and wrinkles over the mesh as a texture, shape (N, N), um.
 
@@ -118,24 +118,24 @@ def scan_face(
     MeshError
         The scanner sees nothing of the mesh.
     """
-    scanner = scanner or Scanner()
+    scanner = scanner or ScannerSettings()
     worn = _with_collar(mesh) if scanner.clothes else mesh
     caster = Caster(worn)
     images = [
         _range_image(caster, projector, camera, scanner, relief_um, len(mesh.faces), rng)
         for azimuth in POD_AZIMUTH_DEG
-        for projector in [_place(azimuth, 0.0)]
-        for aside, up in CAMERA_ASIDE_DEG
-        for camera in [_place(azimuth + aside, up)]
+        for projector in [_pod_position(azimuth, 0.0)]
+        for aside, up in CAMERA_OFFSET_DEG
+        for camera in [_pod_position(azimuth + aside, up)]
     ]
-    edge_mm = _edge_for(images, scanner.triangles)
-    vertices, faces = fuse(images, edge_mm)
+    edge_mm = _voxel_size_for(images, scanner.triangles)
+    vertices, faces = fuse_range_images(images, edge_mm)
     if scanner.flaws:
-        vertices, faces = add_flaws(vertices, faces, edge_mm=edge_mm, rng=rng)
-    to_scanner = _offset(scanner, rng)
+        vertices, faces = add_mesh_defects(vertices, faces, edge_mm=edge_mm, rng=rng)
+    to_scanner = _draw_scanner_pose(scanner, rng)
     there = (vertices @ to_scanner[:3, :3].T + to_scanner[:3, 3]).astype(np.float32)
-    return Scan(
-        ply=binary_ply(there, faces),
+    return ScanResult(
+        ply=encode_binary_ply(there, faces),
         to_dome=np.asarray(np.linalg.inv(to_scanner), np.float64),
         vertices_mm=there,
         faces=faces,
@@ -143,7 +143,9 @@ def scan_face(
     )
 
 
-def wrap_template(mesh: Mesh, *, rng: np.random.Generator, scanner: Scanner | None = None) -> Scan:
+def wrap_template(
+    mesh: Mesh, *, rng: np.random.Generator, scanner: ScannerSettings | None = None
+) -> ScanResult:
     """Scan a face and wrap a template onto the scan, as people do to compare expressions.
 
     The template has the triangles and the texture coordinates of the mesh, whatever the face does;
@@ -165,20 +167,20 @@ def wrap_template(mesh: Mesh, *, rng: np.random.Generator, scanner: Scanner | No
     Scan
         With texture coordinates in its PLY.
     """
-    scanner = scanner or Scanner()
+    scanner = scanner or ScannerSettings()
     seed = int(rng.integers(2**31))
     points = mesh.vertices_mm
     # a template of the resolution's stiffness averages the noise of many ranges
-    fit = WRAP_NOISE_SHARE * scanner.noise_mm * smooth_noise(points, (4.0,), seed=seed)
+    fit = WRAP_NOISE_FRACTION * scanner.noise_mm * smooth_noise(points, (4.0,), seed=seed)
     fit += scanner.warp_mm * smooth_noise(points, (60.0,), seed=seed + 1)
     slide = np.stack([smooth_noise(points, (25.0,), seed=seed + 2 + k) for k in range(3)], axis=-1)
     slide -= np.sum(slide * mesh.normals, axis=-1, keepdims=True) * mesh.normals
-    wrapped = points + fit[:, None] * mesh.normals + WRAP_SLIDE_MM * slide
-    to_scanner = _offset(scanner, rng)
+    wrapped = points + fit[:, None] * mesh.normals + WRAP_TANGENTIAL_STD_MM * slide
+    to_scanner = _draw_scanner_pose(scanner, rng)
     there = (wrapped @ to_scanner[:3, :3].T + to_scanner[:3, 3]).astype(np.float32)
     edges = mesh.vertices_mm[mesh.faces[:, 0]] - mesh.vertices_mm[mesh.faces[:, 1]]
-    return Scan(
-        ply=binary_ply(there, mesh.faces, mesh.uv),
+    return ScanResult(
+        ply=encode_binary_ply(there, mesh.faces, mesh.uv),
         to_dome=np.asarray(np.linalg.inv(to_scanner), np.float64),
         vertices_mm=there,
         faces=mesh.faces,
@@ -186,32 +188,32 @@ def wrap_template(mesh: Mesh, *, rng: np.random.Generator, scanner: Scanner | No
     )
 
 
-def _edge_for(images: list[RangeImage], triangles: int) -> float:
+def _voxel_size_for(images: list[RangeImage], triangles: int) -> float:
     """Return the side of voxels that give so many triangles.
 
     A surface of area A with rims of length R gives about (a A - b R h) / h^2 of them: cells at
     the rims are lost.
     """
-    counts = np.array([len(fuse(images, side)[1]) for side in COARSE_MM])
+    counts = np.array([len(fuse_range_images(images, side)[1]) for side in COARSE_VOXELS_MM])
     if not counts.all():
         raise MeshError("scan: got no triangle, expected a face that looks towards +z")
-    h = np.array(COARSE_MM)
+    h = np.array(COARSE_VOXELS_MM)
     area, rim = np.linalg.solve(np.stack([np.ones(2), -h], axis=1), counts * h**2)
     rim = max(float(rim), 0.0)
     return float((-rim + math.sqrt(rim**2 + 4.0 * triangles * area)) / (2.0 * triangles))
 
 
-def _place(azimuth_deg: float, elevation_deg: float) -> Float64Array:
+def _pod_position(azimuth_deg: float, elevation_deg: float) -> Float64Array:
     a, e = math.radians(azimuth_deg), math.radians(elevation_deg)
     way = np.array([math.sin(a) * math.cos(e), math.sin(e), math.cos(a) * math.cos(e)])
-    return np.array(TARGET_MM) + DISTANCE_MM * way
+    return np.array(TARGET_MM) + WORKING_DISTANCE_MM * way
 
 
 def _range_image(
     caster: Caster,
     projector: Float64Array,
     camera: Float64Array,
-    scanner: Scanner,
+    scanner: ScannerSettings,
     relief_um: Float32Array | None,
     skin_faces: int,
     rng: np.random.Generator,
@@ -219,7 +221,7 @@ def _range_image(
     """Return ranges where one camera decodes the stripes of one projector."""
     pitch_mm = min(0.7 * scanner.resolution_mm, 1.5)
     side = 2 * round(190.0 / pitch_mm)
-    empty = RangeImage.looking(camera, np.array(TARGET_MM), side, pitch_mm / DISTANCE_MM)
+    empty = RangeImage.from_view(camera, np.array(TARGET_MM), side, pitch_mm / WORKING_DISTANCE_MM)
     ways = empty.rays().reshape(-1, 3).astype(np.float32)
     prim, weight = caster.first_hit(np.broadcast_to(camera.astype(np.float32), ways.shape), ways)
     fields = interpolate(caster.attributes, caster.mesh.faces, prim, weight)
@@ -230,15 +232,17 @@ def _range_image(
     to_projector /= length[:, None]
     cos_camera = -np.einsum("nk,nk->n", ways, normals)
     cos_projector = np.einsum("nk,nk->n", to_projector, normals)
-    good = (prim >= 0) & (cos_camera > MIN_COSINE) & (cos_projector > MIN_COSINE)
+    good = (
+        (prim >= 0) & (cos_camera > MIN_INCIDENCE_COSINE) & (cos_projector > MIN_INCIDENCE_COSINE)
+    )
     start = points[good] + 0.05 * normals[good]
-    good[good] = ~caster.blocked(start, to_projector[good], length[good])
+    good[good] = ~caster.is_blocked(start, to_projector[good], length[good])
     if relief_um is not None:
         skin = good & (prim < skin_faces)
         height_mm = 1e-3 * sample(relief_um, uv, skin)
-        range_mm -= np.where(skin, height_mm / np.maximum(cos_camera, MIN_COSINE), 0.0)
+        range_mm -= np.where(skin, height_mm / np.maximum(cos_camera, MIN_INCIDENCE_COSINE), 0.0)
     noise = rng.standard_normal(len(range_mm)) * scanner.noise_mm
-    range_mm += noise / np.sqrt(np.clip(cos_camera * cos_projector, MIN_COSINE**2, 1.0))
+    range_mm += noise / np.sqrt(np.clip(cos_camera * cos_projector, MIN_INCIDENCE_COSINE**2, 1.0))
     ranges, good = range_mm.reshape(side, side), good.reshape(side, side)
     good &= _smooth_around(ranges, good)
     sigma_px = scanner.resolution_mm / 2.3548 / pitch_mm
@@ -247,7 +251,7 @@ def _range_image(
     blurred = total / np.maximum(weight_sum, 1e-9)
     slow = ndimage.gaussian_filter(rng.standard_normal((side, side)), side / 12, mode="wrap")
     blurred += scanner.warp_mm * slow / slow.std()
-    return empty.filled(
+    return empty.with_ranges(
         np.where(good & (weight_sum > 0.5), blurred, np.nan),
         np.clip(cos_camera * cos_projector, 0.0, 1.0).reshape(side, side),
     )
@@ -282,7 +286,7 @@ def _with_collar(mesh: Mesh) -> Mesh:
     )
 
 
-def _offset(scanner: Scanner, rng: np.random.Generator) -> Float64Array:
+def _draw_scanner_pose(scanner: ScannerSettings, rng: np.random.Generator) -> Float64Array:
     """Draw the motion from the rig frame to the scanner's: fixed size, random direction."""
     axis, shift = rng.standard_normal(3), rng.standard_normal(3)
     x, y, z = axis / np.linalg.norm(axis)

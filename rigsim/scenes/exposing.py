@@ -7,10 +7,10 @@ import numpy as np
 
 from capture.rig import Rig, RigError, View
 from rigsim.arrays import Float32Array, UInt16Array
-from rigsim.needs.effects import EffectSelection, Noise, SceneEffects
-from rigsim.needs.face import INTERREFLECTION_EFFECT, Scenery, last_bounce
+from rigsim.needs.effects import EffectSelection, PixelNoise, SceneEffects
+from rigsim.needs.face import INTERREFLECTION_EFFECT, ViewingConditions, choose_min_bounce_fraction
 from rigsim.render import Caster
-from rigsim.sensor import Sensor, expose, sensor_of
+from rigsim.sensor import Sensor, expose_sensor, make_sensor
 from rigsim.subject import SimulatedSubject
 from rigsim.targets import Target
 from rigsim.world.light_record import SwitchedLight
@@ -22,7 +22,7 @@ class SceneError(ValueError):
     """A scene is asked for something that it does not hold."""
 
 
-def full_power_s(light: SwitchedLight, name: str) -> float:
+def full_power_duration_s(light: SwitchedLight, name: str) -> float:
     """Return for how long full power would give the light of a stretch, s.
 
     Parameters
@@ -45,7 +45,7 @@ def full_power_s(light: SwitchedLight, name: str) -> float:
     Examples
     --------
     >>> from rigsim.boxes.led_table import LedPulse
-    >>> full_power_s(LedPulse(led=3, level=0.5, t_on_s=1.0, t_off_s=1.5), "LED 3")
+    >>> full_power_duration_s(LedPulse(led=3, level=0.5, t_on_s=1.0, t_off_s=1.5), "LED 3")
     0.25
     """
     if not 0.0 <= light.level <= 1.0:
@@ -70,9 +70,9 @@ class RigScene:
     """What is built, what is not, and why."""
 
     @property
-    def left_out(self) -> list[tuple[str, str]]:
+    def omitted(self) -> list[tuple[str, str]]:
         """What the scene does not build, with the reason."""
-        return self.needs.left_out
+        return self.needs.omitted
 
     def _camera(self, name: str | None) -> View:
         """Return a camera by its name; None takes the first."""
@@ -119,7 +119,7 @@ class RigScene:
             energy = energy_of(pop) * (1.0 + deviation * rng.standard_normal())
             if energy > 0.0:
                 light += np.float32(energy) * image_of(pop)
-        return expose(light, sensor=self.sensor(view.name), rng=rng, exposure_s=exposure_s)
+        return expose_sensor(light, sensor=self.sensor(view.name), rng=rng, exposure_s=exposure_s)
 
 
 class FaceScene(RigScene):
@@ -143,32 +143,39 @@ class FaceScene(RigScene):
         if subpixels < 1:
             raise SceneError(f"subpixels: got {subpixels}, expected at least 1")
         if movement and isinstance(subject, SimulatedSubject) and subject.pose is None:
-            subject = subject.posed(state)
+            subject = subject.with_expression(state)
         self.rig, self.subject, self.state, self.movement = rig, subject, state, movement
         self.seed, self.subpixels = seed, subpixels
         self._illuminant = rig.lights[0].illuminant
         self._sensors = {
-            view.name: sensor_of(view) if sensor is None else sensor for view in rig.views
+            view.name: make_sensor(view) if sensor is None else sensor for view in rig.views
         }
 
     def sensor(self, view_name: str | None = None) -> Sensor:
         """Return the sensor of a view; None takes the first."""
         return self._sensors[self._camera(view_name).name]
 
-    def _face(self, what: str = "truth") -> SimulatedSubject:
+    def _face(self, quantity: str = "truth") -> SimulatedSubject:
         """Return the face, or say what of a target was asked for."""
         if not isinstance(self.subject, SimulatedSubject):
-            raise SceneError(f"{what}: got the target {self.subject.name!r}, expected a face")
+            raise SceneError(f"{quantity}: got the target {self.subject.name!r}, expected a face")
         return self.subject
 
     def _scenery(
-        self, view: View, caster: Caster, share: float, noise: Noise, effects: SceneEffects
-    ) -> Scenery:
+        self,
+        view: View,
+        caster: Caster,
+        exchange_fraction: float,
+        noise: PixelNoise,
+        effects: SceneEffects,
+    ) -> ViewingConditions:
         """Return what a camera looks at and with."""
-        return Scenery(view, self._illuminant, caster, share, noise, effects, self.subpixels)
+        return ViewingConditions(
+            view, self._illuminant, caster, exchange_fraction, noise, effects, self.subpixels
+        )
 
     def _last_bounce(self, effects: SceneEffects) -> float:
         """Return the share of the first bounce below which further ones are left out."""
         if effects.last_bounce is not None:
             return effects.last_bounce
-        return last_bounce(self.needs[INTERREFLECTION_EFFECT].over_noise or 0.0)
+        return choose_min_bounce_fraction(self.needs[INTERREFLECTION_EFFECT].over_noise or 0.0)

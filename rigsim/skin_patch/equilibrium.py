@@ -32,18 +32,24 @@ from scipy import fft
 from scipy.optimize import brentq
 
 from rigsim.arrays import ComplexArray, Float32Array, Float64Array
-from rigsim.skin_patch.stretch_kernels import bending, gather, membrane, rotate_coefficients, tissue
+from rigsim.skin_patch.stretch_kernels import (
+    add_bending_forces,
+    add_membrane_forces,
+    add_tissue_forces,
+    gather_coefficient_forces,
+    rotate_coefficients,
+)
 
 Pairs = deque[tuple[Float32Array, Float32Array, float]]
 
 
-SQUEEZED_UM: Final = 10.0
+SQUEEZED_DEPTH_UM: Final = 10.0
 """Depth of tissue that resists the squeeze of a furrow beyond the linear half-space, um. As in a
 compressible neo-Hookean solid, -log J keeps neighbouring points from changing sides; this project's
 choice, small beside the wavelengths of the relief."""
 
 
-PARALLEL_NODES: Final = 400_000
+MIN_PARALLEL_NODES: Final = 400_000
 """Patches with fewer nodes are computed by one thread."""
 
 
@@ -51,7 +57,7 @@ class EquilibriumError(RuntimeError):
     """No equilibrium was found within the allowed steps."""
 
 
-def surface_rise(stretch_s: float, stretch_t: float, poisson: float) -> float:
+def surface_rise_factor(stretch_s: float, stretch_t: float, poisson: float) -> float:
     """Return by what factor the free surface of stretched tissue rises.
 
     Parameters
@@ -63,9 +69,9 @@ def surface_rise(stretch_s: float, stretch_t: float, poisson: float) -> float:
 
     Examples
     --------
-    >>> round(surface_rise(1.25, 0.8944, 0.5), 3)
+    >>> round(surface_rise_factor(1.25, 0.8944, 0.5), 3)
     0.894
-    >>> surface_rise(1.25, 0.8944, 0.0)
+    >>> surface_rise_factor(1.25, 0.8944, 0.0)
     1.0
     """
     area = stretch_s * stretch_t
@@ -114,12 +120,14 @@ class LayerProblem:
             raise ValueError("gradient: expected a positive determinant")
         self._moment = np.empty(shape)
         # Small patches are quicker without waiting for other threads.
-        self._workers = 1 if self.neutral_um.size < PARALLEL_NODES else min(2, get_num_threads())
+        self._workers = (
+            1 if self.neutral_um.size < MIN_PARALLEL_NODES else min(2, get_num_threads())
+        )
         left, stretches, right = np.linalg.svd(self.gradient)
         # factor of a relief without a layer
-        self.rise = surface_rise(float(stretches[0]), float(stretches[1]), self.poisson)
+        self.rise = surface_rise_factor(float(stretches[0]), float(stretches[1]), self.poisson)
         shear = 0.5 / (1.0 + self.poisson)
-        self._bulk = shear * SQUEEZED_UM
+        self._bulk = shear * SQUEEZED_DEPTH_UM
         nominal = shear * (stretches - self.rise**2 / stretches)
         pull = (left * nominal) @ right
         h = self.neutral_um
@@ -228,7 +236,7 @@ class LayerProblem:
         deviation = state - self.affine()
         hat = fft.rfft2(deviation, norm="forward", workers=self._workers)
         pulled = np.zeros_like(hat)
-        elastic = tissue(hat, self._elastic, self._unit, self._weight, pulled)
+        elastic = add_tissue_forces(hat, self._elastic, self._unit, self._weight, pulled)
         force += fft.irfft2(pulled, s=self.neutral_um.shape, norm="forward", workers=self._workers)
         return local + elastic, force
 
@@ -242,7 +250,7 @@ class LayerProblem:
         return float(total) / self.neutral_um.size, force
 
     def _layer(self, state: Float64Array, force: Float64Array) -> float:
-        total = membrane(
+        total = add_membrane_forces(
             state,
             self.neutral_um,
             self.membrane_um,
@@ -251,7 +259,7 @@ class LayerProblem:
             self.texel_um,
             force,
         )
-        total += bending(
+        total += add_bending_forces(
             state[2], self.neutral_um, self.bending_um3, self.texel_um, self._moment, force[2]
         )
         return float(total)
@@ -263,8 +271,8 @@ class LayerProblem:
         hat = fft.rfft2(force, norm="forward", workers=self._workers)
         slope = np.empty_like(q)
         with self._threads():
-            elastic = tissue(moved, self._elastic, self._unit, self._weight, hat)
-            gather(hat, self._scale, self._unit, self._weight, slope)
+            elastic = add_tissue_forces(moved, self._elastic, self._unit, self._weight, hat)
+            gather_coefficient_forces(hat, self._scale, self._unit, self._weight, slope)
         return local + elastic, slope
 
     def start(self) -> ComplexArray:
@@ -330,7 +338,9 @@ def find_equilibrium(
             evaluations += 1
             if np.isfinite(got) and got <= energy + 1e-4 * length * along + floor:
                 break
-            length *= 0.5 if not np.isfinite(got) else _shorter(energy, along, got, length)
+            length *= (
+                0.5 if not np.isfinite(got) else _parabola_step_factor(energy, along, got, length)
+            )
             if length < 1e-9:
                 raise EquilibriumError(
                     f"residual: got {size / first:.2g}, expected {tolerance}; the energy does not "
@@ -373,9 +383,11 @@ def _single(a: ComplexArray) -> Float32Array:
     return a.astype(np.complex64).reshape(-1).view(np.float32)
 
 
-def _shorter(energy: float, along: float, got: float, length: float) -> float:
+def _parabola_step_factor(
+    energy: float, along: float, energy_change: float, length: float
+) -> float:
     """Return the factor to the minimum of the parabola through what is known, 0.1 to 0.5."""
-    curve = got - energy - along * length
+    curve = energy_change - energy - along * length
     return float(np.clip(-0.5 * along * length / curve, 0.1, 0.5)) if curve > 0.0 else 0.5
 
 

@@ -22,8 +22,8 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from rigsim.arrays import Float32Array, Float64Array
-from rigsim.geometry.polygon_net import polygon_net
-from rigsim.geometry.surface_noise import line_network, scattered_spots, smooth_noise
+from rigsim.geometry.polygon_net import polygon_edge_distance
+from rigsim.geometry.surface_noise import random_spots, smooth_noise, vessel_network
 from rigsim.package_data import package_table
 from rigsim.subject.pigment import MAX_MELANIN, MELANIN_PRESETS
 from rigsim.tissue.lateral_kernels import SIGMAS_MM
@@ -39,7 +39,7 @@ SITE_NAMES: Final = get_args(SiteName)
 TEXEL_RANGE_UM: Final = (2.0, 40.0)
 SIZE_RANGE_MM: Final = (0.1, 40.0)
 MAX_TEXELS: Final = 4096
-BAND_NM: Final = (450.0, 650.0)
+CAMERA_BAND_NM: Final = (450.0, 650.0)
 """What a monochrome camera sees of white LEDs, as one equally weighted band; this project's
 choice."""
 
@@ -88,7 +88,7 @@ class MicroSkin:
     height_um: Float32Array
     """Height of the neutral surface, um, mean 0 over large areas, pits are negative."""
     albedo: Float32Array
-    """Diffuse reflectance in `BAND_NM`, 0 to 1."""
+    """Diffuse reflectance in `CAMERA_BAND_NM`, 0 to 1."""
     alpha: Float32Array
     """GGX roughness of facets below 10 um, 0.1 to 0.5."""
     layer_um: Float32Array
@@ -150,7 +150,7 @@ def make_micro_skin(
         Seed of every pattern, >= 0.
     size_mm
         Side of the patch, 0.1 to 40 mm, rounded up to an even number of texels. How much a field
-        of view needs tells `rigsim.skin_patch.stretch.size_for`.
+        of view needs tells `rigsim.skin_patch.stretch.required_size_mm`.
     texel_um
         Distance of texels, 2 to 40 um; detail finer than two texels is left out.
     preset
@@ -228,7 +228,7 @@ def _relief(
     across = -math.sin(angle) * x + math.cos(angle) * y
 
     def net(scale: float, turn: int) -> tuple[Float32Array, Float32Array]:
-        distance, number = polygon_net(
+        distance, number = polygon_edge_distance(
             along / (where.elongation * scale * cell),
             across / (scale * cell),
             jitter=where.jitter,
@@ -258,19 +258,19 @@ def _relief(
     # Plateaus: every small polygon at its own level, bulging towards its middle.
     height += where.dome_um * (level - 0.5) * (1.0 - shallow)
     height += 2.0 * where.dome_um * np.minimum(first / cell, 0.5)
-    pores = scattered_spots(
+    pores = random_spots(
         points,
         np.full(points.shape[:-1], where.pores, np.float32),
         cell_mm=1.0,
         radius_mm=(0.05, 0.13),
         seed=salt + 7,
         softness=3.0,
-        smallest_mm=0.8 * texel_mm,
+        min_radius_mm=0.8 * texel_mm,
     )
     height -= where.pore_um * pores
     # Corneocytes, 35 um across, some lifted; then grain down to the texel.
     if texel_mm <= 0.0175:
-        edge, lifted = polygon_net(
+        edge, lifted = polygon_edge_distance(
             points[..., 0].astype(np.float64) / 0.035,
             points[..., 1].astype(np.float64) / 0.035,
             jitter=0.9,
@@ -294,7 +294,7 @@ def _albedo(points: Float32Array, furrow: Float32Array, melanin: float, seed: in
     speckle += 0.4 * smooth_noise(points, (0.08,), seed=salt + 1)
     speckle += 0.3 * smooth_noise(points, (0.05,), seed=salt + 2)
     slow = smooth_noise(points, (1.5, 0.6), seed=salt + 3)
-    spots = scattered_spots(
+    spots = random_spots(
         points,
         np.full(points.shape[:-1], 0.35, np.float32),
         cell_mm=0.5,
@@ -303,11 +303,11 @@ def _albedo(points: Float32Array, furrow: Float32Array, melanin: float, seed: in
         softness=4.0,
     )
     c_m = melanin * np.exp(0.45 * speckle + 0.12 * slow + 0.5 * spots - 0.1 * furrow)
-    vessels = line_network(points, 1.6, 0.04, seed=salt + 5)
+    vessels = vessel_network(points, 1.6, 0.04, seed=salt + 5)
     patchy = np.clip(smooth_noise(points, (1.1,), seed=salt + 6), 0.0, 1.0)
     c_hd = 0.035 * np.exp(0.10 * slow + 0.8 * vessels * patchy)
     table = SkinTable.load()
-    band = (table.wavelength_nm >= BAND_NM[0]) & (table.wavelength_nm <= BAND_NM[1])
+    band = (table.wavelength_nm >= CAMERA_BAND_NM[0]) & (table.wavelength_nm <= CAMERA_BAND_NM[1])
     nodes_m = np.geomspace(melanin / 12.0, min(12.0 * melanin, MAX_MELANIN), 48)
     nodes_h = np.geomspace(0.01, 0.15, 24)
     tabulated = table.spectra(nodes_m[:, None], nodes_h[None, :])[..., band].mean(axis=-1)
@@ -327,7 +327,7 @@ def _alpha(where: _Site, points: Float32Array, seed: int) -> Float32Array:
 def lateral_kernel(skin: MicroSkin) -> tuple[Float64Array, Float64Array]:
     """Return widths in mm and weights of the Gaussians of the camera's band, shape (K,) each."""
     table = SkinTable.load()
-    band = (table.wavelength_nm >= BAND_NM[0]) & (table.wavelength_nm <= BAND_NM[1])
+    band = (table.wavelength_nm >= CAMERA_BAND_NM[0]) & (table.wavelength_nm <= CAMERA_BAND_NM[1])
     weights = (band / band.sum())[:, None]
     kernels = table.lateral_kernels(skin.melanin_fraction, PATCH_BLOOD_FRACTION, weights)
     gaussians = kernels.gaussians(SIGMAS_MM)

@@ -14,17 +14,17 @@ DRIFT_HZ: Final = (0.11, 0.23, 0.37)
 """Frequencies of slow drift: breath and muscle tone."""
 
 
-class MotionError(ValueError):
+class PatchMotionError(ValueError):
     """A motion is described wrongly."""
 
 
 @dataclass(frozen=True, slots=True)
-class Pose:
+class PatchPose:
     """Where the skin's own origin is, and how the skin is turned."""
 
     x_mm: float
     y_mm: float
-    turn_rad: float
+    rotation_rad: float
     """From +x towards +y."""
 
 
@@ -54,18 +54,18 @@ class PatchMotion:
         for name in ("angle_um", "angle_turn_deg", "state_um", "state_turn_deg", "drift_um"):
             value = getattr(self, name)
             if not 0.0 <= value < math.inf:
-                raise MotionError(f"{name}: got {value}, expected >= 0")
+                raise PatchMotionError(f"{name}: got {value}, expected >= 0")
         if self.seed < 0:
-            raise MotionError(f"seed: got {self.seed}, expected >= 0")
+            raise PatchMotionError(f"seed: got {self.seed}, expected >= 0")
 
-    def pose(self, angle_deg: float, step: int) -> Pose:
+    def pose(self, angle_deg: float, step: int) -> PatchPose:
         """Return where the skin lies in a state of the caliper, drift and jumps aside."""
         taping = np.random.default_rng([self.seed, 1, round(1e3 * angle_deg)]).standard_normal(3)
         state = np.random.default_rng([self.seed, 2, round(1e3 * angle_deg), step + 1000])
         moved = state.standard_normal(3)
         x, y = 1e-3 * (self.angle_um * taping[:2] + self.state_um * moved[:2])
         turn = self.angle_turn_deg * taping[2] + self.state_turn_deg * moved[2]
-        return Pose(float(x), float(y), math.radians(float(turn)))
+        return PatchPose(float(x), float(y), math.radians(float(turn)))
 
     def jump_mm(self, t_s: float) -> tuple[float, float]:
         """Return the sum of the jumps until a world time, mm."""
@@ -82,7 +82,7 @@ class PatchMotion:
         return float(x), float(y)
 
 
-def shifted(
+def shift_image(
     image: Float32Array, shift_mm: tuple[float, float], *, pixel_um: float, border_px: int
 ) -> Float32Array:
     """Return a picture without its border after what it shows has moved.
@@ -107,7 +107,7 @@ def shifted(
     dx, dy = 1e3 * shift_mm[0] / pixel_um, -1e3 * shift_mm[1] / pixel_um
     reach = border_px - 3
     if max(abs(dx), abs(dy)) > reach:
-        raise MotionError(f"drift: got {dx:.1f}, {dy:.1f} px, expected at most {reach}")
+        raise PatchMotionError(f"drift: got {dx:.1f}, {dy:.1f} px, expected at most {reach}")
     out = image
     for axis, shift in ((0, dy), (1, dx)):
         whole = math.floor(-shift)

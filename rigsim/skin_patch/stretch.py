@@ -17,7 +17,7 @@ from scipy.ndimage import spline_filter
 from rigsim.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from rigsim.skin_patch.equilibrium import Convergence, LayerProblem, find_equilibrium
 from rigsim.skin_patch.microrelief import MicroSkin
-from rigsim.skin_patch.stretch_kernels import spline
+from rigsim.skin_patch.stretch_kernels import evaluate_spline
 
 Compensation = Literal["volume", "none"] | float
 
@@ -107,7 +107,7 @@ class StretchedSkin:
         column = (inverse[0, 0] * x + inverse[0, 1] * y + middle).reshape(-1)
         row = (middle - inverse[1, 0] * x - inverse[1, 1] * y).reshape(-1)
         height, by_row, by_column = (np.empty(row.size) for _ in range(3))
-        spline(self._coefficients, row, column, True, height, by_row, by_column)
+        evaluate_spline(self._coefficients, row, column, True, height, by_row, by_column)
         inside = np.isfinite(height)
         for values in (height, by_row, by_column):
             values[~inside] = 0.0
@@ -115,7 +115,7 @@ class StretchedSkin:
         slope_x = 1e-3 * (by_column * inverse[0, 0] - by_row * inverse[1, 0])
         slope_y = 1e-3 * (by_column * inverse[0, 1] - by_row * inverse[1, 1])
         albedo = np.empty(row.size)
-        spline(self._pigment, row, column, False, albedo, albedo, albedo)
+        evaluate_spline(self._pigment, row, column, False, albedo, albedo, albedo)
         albedo = np.where(inside, albedo, 0.0)
         alpha = np.where(inside, _bilinear(self.alpha, row, column), 0.0)
         maps = [
@@ -125,7 +125,9 @@ class StretchedSkin:
         return SurfaceSample(maps[0], maps[1], maps[2], maps[3], maps[4], inside.reshape(x.shape))
 
 
-def stretches(stretch: float, compensation: Compensation = "volume") -> tuple[float, float]:
+def principal_stretches(
+    stretch: float, compensation: Compensation = "volume"
+) -> tuple[float, float]:
     """Return the stretches along and across the jaws' axis.
 
     Parameters
@@ -144,7 +146,7 @@ def stretches(stretch: float, compensation: Compensation = "volume") -> tuple[fl
 
     Examples
     --------
-    >>> stretches(1.21)[1] == 1.21**-0.5, stretches(1.21, "none")
+    >>> principal_stretches(1.21)[1] == 1.21**-0.5, principal_stretches(1.21, "none")
     (True, (1.21, 1.0))
     """
     if not STRETCH_RANGE[0] <= stretch <= STRETCH_RANGE[1]:
@@ -170,7 +172,7 @@ def mean_gradient(
     >>> mean_gradient(0.64, 90.0).round(3).tolist()
     [[1.25, 0.0], [0.0, 0.64]]
     """
-    s, t = stretches(stretch, compensation)
+    s, t = principal_stretches(stretch, compensation)
     if not math.isfinite(angle_deg):
         raise StretchError(f"angle_deg: got {angle_deg}, expected a finite angle")
     # A quarter turn is exact, so that states at 0 and 90 degrees have no shear at all.
@@ -181,7 +183,7 @@ def mean_gradient(
     return np.array([[s * c * c + t * d * d, shear], [shear, s * d * d + t * c * c]])
 
 
-def size_for(
+def required_size_mm(
     field_mm: float,
     stretch: float | Sequence[float],
     *,
@@ -203,9 +205,9 @@ def size_for(
 
     Examples
     --------
-    >>> size_for(2.0, 1.0, angle_deg=0.0)
+    >>> required_size_mm(2.0, 1.0, angle_deg=0.0)
     2.04
-    >>> size_for(2.0, (0.8, 1.2), angle_deg=0.0) > 2.5
+    >>> required_size_mm(2.0, (0.8, 1.2), angle_deg=0.0) > 2.5
     True
     """
     values = [stretch] if isinstance(stretch, (int, float)) else list(stretch)
@@ -217,7 +219,7 @@ def size_for(
     return round(2.0 * reach + 0.04, 6)
 
 
-def deform(
+def stretch_skin(
     skin: MicroSkin,
     *,
     stretch: float,
@@ -236,7 +238,7 @@ def deform(
     angle_deg
         Direction of the axis from +x towards +y, degrees.
     compensation
-        What happens across: see `stretches`.
+        What happens across: see `principal_stretches`.
     tolerance
         Out-of-balance force at which the search for the equilibrium ends, relative to that of the
         affinely deformed relief, 1e-8 to 0.5.
@@ -263,14 +265,14 @@ def deform(
     --------
     >>> from rigsim.skin_patch.microrelief import make_micro_skin
     >>> skin = make_micro_skin("cheek", seed=1, size_mm=0.6)
-    >>> long = deform(skin, stretch=1.2, angle_deg=0.0)
+    >>> long = stretch_skin(skin, stretch=1.2, angle_deg=0.0)
     >>> bool(long.excess_length < long.neutral_excess_length)
     True
     """
     if not 1e-8 <= tolerance <= 0.5:
         raise StretchError(f"tolerance: got {tolerance}, expected 1e-8 to 0.5")
     gradient = mean_gradient(stretch, angle_deg, compensation)
-    s, t = stretches(stretch, compensation)
+    s, t = principal_stretches(stretch, compensation)
     before = _excess_length(skin.height_um, skin.texel_um, np.eye(2), angle_deg)
     made = partial(StretchedSkin, skin, s, t, angle_deg, gradient)
     if s == 1.0 and t == 1.0:
@@ -283,7 +285,7 @@ def deform(
     state, convergence = find_equilibrium(problem, tolerance=tolerance)
     row, column = _pull_back(state[:2], gradient, skin.texel_um, count)
     height = np.empty(row.size)
-    spline(_filtered(state[2]), row, column, False, height, height, height)
+    evaluate_spline(_spline_coefficients(state[2]), row, column, False, height, height, height)
     # Rows of the equilibrium grow with y.
     height = height.reshape(count, count)[::-1] + problem.rise * mean
     last = count - 1.0
@@ -292,7 +294,7 @@ def deform(
         np.clip(column - _SPLINE_MARGIN, 0.0, last),
     )
     tint = np.empty(row.size)
-    spline(_coefficients(skin.albedo), *inner, False, tint, tint, tint)
+    evaluate_spline(_coefficients(skin.albedo), *inner, False, tint, tint, tint)
     albedo = tint.reshape(count, count)[::-1]
     alpha = _bilinear(skin.alpha, *inner).reshape(count, count)[::-1]
     displacement = np.moveaxis(state[:2, :count, :count], 0, -1)[::-1]
@@ -367,7 +369,7 @@ def _coefficients(values: FloatArray) -> Float64Array:
     return np.asarray(spline_filter(np.asarray(values, np.float64), mode="mirror"))
 
 
-def _filtered(values: Float64Array) -> Float64Array:
+def _spline_coefficients(values: Float64Array) -> Float64Array:
     """Return spline coefficients of a periodic field with a margin all around."""
     return np.asarray(spline_filter(np.pad(values, _SPLINE_MARGIN, mode="wrap"), mode="mirror"))
 
@@ -385,15 +387,15 @@ def _pull_back(
     shear = np.gradient(moved[0], axis=0) * np.gradient(moved[1], axis=1)
     if (bent[0] * bent[1] - shear).min() <= 0.0:
         raise StretchError("stretch: the surface would fold over its own furrows")
-    along, up = _filtered(moved[0]), _filtered(moved[1])
+    along, up = _spline_coefficients(moved[0]), _spline_coefficients(moved[1])
     goal_row, goal_column = (
         m.reshape(-1).astype(np.float64) + _SPLINE_MARGIN for m in np.mgrid[0:count, 0:count]
     )
     row, column = goal_row.copy(), goal_column.copy()
     a, ar, ac, b, br, bc = (np.empty(row.size) for _ in range(6))
     for _ in range(30):
-        spline(along, row, column, True, a, ar, ac)
-        spline(up, row, column, True, b, br, bc)
+        evaluate_spline(along, row, column, True, a, ar, ac)
+        evaluate_spline(up, row, column, True, b, br, bc)
         miss_c, miss_r = column + a - goal_column, row + b - goal_row
         far = max(float(np.abs(miss_c).max()), float(np.abs(miss_r).max()))
         if not far > 1e-5:

@@ -36,7 +36,7 @@ def _corner(a1, a2, a3, b1, b2, b3, p, q):  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True, cache=True, fastmath=True)
-def membrane(v, neutral, stiffness, f, bulk, texel, force):  # type: ignore[no-untyped-def]
+def add_membrane_forces(v, neutral, stiffness, f, bulk, texel, force):  # type: ignore[no-untyped-def]
     """Add the forces of the stretched membrane to ``force``; return its energy, summed over nodes.
 
     Parameters
@@ -140,7 +140,7 @@ def membrane(v, neutral, stiffness, f, bulk, texel, force):  # type: ignore[no-u
 
 
 @njit(parallel=True, cache=True, fastmath=True)
-def bending(height, neutral, stiffness, texel, moment, force):  # type: ignore[no-untyped-def]
+def add_bending_forces(height, neutral, stiffness, texel, moment, force):  # type: ignore[no-untyped-def]
     """Add the forces against a change of curvature to ``force``; return the energy's sum.
 
     Parameters
@@ -211,8 +211,8 @@ def rotate_coefficients(q, scale, unit, out):  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True, cache=True, fastmath=True)
-def tissue(hat, elastic, unit, weight, pulled):  # type: ignore[no-untyped-def]
-    """Add the forces of a half-space to ``pulled``; return its energy.
+def add_tissue_forces(hat, elastic, unit, weight, force):  # type: ignore[no-untyped-def]
+    """Add the forces of a half-space to ``force``; return its energy.
 
     Parameters
     ----------
@@ -223,7 +223,7 @@ def tissue(hat, elastic, unit, weight, pulled):  # type: ignore[no-untyped-def]
     unit : ndarray (2, N, K)
     weight : ndarray (N, K)
         How often a coefficient counts: 2 where the other half is left out.
-    pulled : ndarray (3, N, K) of complex128
+    force : ndarray (3, N, K) of complex128
         Forces' coefficients are added.
     """
     part = np.zeros(hat.shape[1])
@@ -246,15 +246,15 @@ def tissue(hat, elastic, unit, weight, pulled):  # type: ignore[no-untyped-def]
                 + up.real * f_up.real
                 + up.imag * f_up.imag
             )
-            pulled[0, i, j] += ux * f_along - uy * f_across
-            pulled[1, i, j] += uy * f_along + ux * f_across
-            pulled[2, i, j] += f_up
+            force[0, i, j] += ux * f_along - uy * f_across
+            force[1, i, j] += uy * f_along + ux * f_across
+            force[2, i, j] += f_up
         part[i] = total
     return 0.5 * part.sum()
 
 
 @njit(parallel=True, cache=True, fastmath=True)
-def gather(hat, scale, unit, weight, out):  # type: ignore[no-untyped-def]
+def gather_coefficient_forces(hat, scale, unit, weight, out):  # type: ignore[no-untyped-def]
     """Turn forces on x, y, z into the derivative by scaled coefficients.
 
     This is the adjoint of `rotate_coefficients`.
@@ -283,7 +283,7 @@ def _basis(k, t):  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True, cache=True)
-def spline(coefficients, row, column, want_slope, value, along_row, along_column):  # type: ignore[no-untyped-def]
+def evaluate_spline(coefficients, row, column, want_slope, value, along_row, along_column):  # type: ignore[no-untyped-def]
     """Evaluate a cubic B-spline and its derivatives at points inside the grid.
 
     Parameters

@@ -36,7 +36,7 @@ TENSION_RANGE: Final = (0.05, 0.10)
 GROOVE_NARROWING: Final = 1.2
 """How much narrower furrows are than ridges; 0 is a cosine."""
 
-MIN_WAVE_TEXELS: Final = 3.0
+MIN_TEXELS_PER_WAVE: Final = 3.0
 """Texels that a wave needs; finer wrinkles are left out."""
 
 SEAM_STEPS: Final = 6.0
@@ -50,7 +50,7 @@ MODULUS_RATIO: Final = 100.0
 
 
 @dataclass(frozen=True, slots=True)
-class Zone:
+class WrinkleZone:
     """A part of the face whose wrinkles run along one family of lines."""
 
     name: str
@@ -58,7 +58,7 @@ class Zone:
     """Thickness of the layer that buckles."""
     across_mm: Callable[[Float64Array], Float64Array]
     """Distance across the lines, of points on the mean head with x >= 0, mm."""
-    share: Callable[[Float64Array], Float64Array]
+    wrinkling_fraction: Callable[[Float64Array], Float64Array]
     """Part of the shortening beyond the tension that goes into wrinkles, 0 to 1."""
     mirrored: bool = True
     """Whether both halves of the face have lines of their own kind; else lines cross the middle."""
@@ -121,49 +121,49 @@ def _fan(p: Float64Array) -> Float64Array:
 
 
 WRINKLE_ZONES: Final = (
-    Zone(
+    WrinkleZone(
         "forehead",
         0.36,
         lambda p: _y(p) - 0.0035 * _x(p) ** 2,
         _plateau((0.0, 62.0, 0.0), (46.0, 20.0, 55.0)),
         mirrored=False,
     ),
-    Zone(
+    WrinkleZone(
         "glabella",
         0.34,
         lambda p: _x(p) * (1.0 + 0.008 * (_y(p) - 44.0)),
         _plateau((0.0, 43.0, 4.0), (14.0, 13.0, 40.0)),
         mirrored=False,
     ),
-    Zone(
+    WrinkleZone(
         "nasal root",
         0.22,
         lambda p: _y(p) - 0.03 * _x(p) ** 2,
         _plateau((0.0, 22.0, 9.0), (10.0, 8.0, 25.0)),
         mirrored=False,
     ),
-    Zone(
+    WrinkleZone(
         "nose sides",
         0.17,
         lambda p: 0.86 * _y(p) - 0.5 * _x(p),
         _plateau((9.0, 7.0, 11.0), (7.0, 9.0, 25.0)),
     ),
-    Zone("crow's feet", 0.13, _fan, _plateau((55.0, 23.0, -26.0), (11.0, 15.0, 30.0))),
-    Zone(
+    WrinkleZone("crow's feet", 0.13, _fan, _plateau((55.0, 23.0, -26.0), (11.0, 15.0, 30.0))),
+    WrinkleZone(
         "lower lids",
         0.13,
         lambda p: _y(p) - 0.012 * (_x(p) - 31.0) ** 2,
         _plateau((34.0, 9.0, -4.0), (15.0, 6.5, 30.0)),
         tension=0.6,
     ),
-    Zone("nasolabial fold", 0.5, _off_fold, _near_fold, tension=0.2, single=True),
-    Zone(
+    WrinkleZone("nasolabial fold", 0.5, _off_fold, _near_fold, tension=0.2, single=True),
+    WrinkleZone(
         "mouth corners",
         0.30,
         lambda p: np.hypot(_x(p) - 22.0, 0.8 * (_y(p) + 41.0)),
         _plateau((38.0, -42.0, -8.0), (8.0, 11.0, 30.0), 0.35),
     ),
-    Zone(
+    WrinkleZone(
         "chin",
         0.26,
         lambda p: _y(p) + 0.006 * _x(p) ** 2,
@@ -178,14 +178,14 @@ WRINKLE_ZONES: Final = (
 class ZoneLines:
     """Where a person's skin can buckle in one zone, at n texels of the face's texture."""
 
-    zone: Zone
+    zone: WrinkleZone
     texel: NDArray[np.intp]
     """Flat indices of the texels, shape (n,)."""
     phase_rad: Float64Array
     """2 pi times the number of waves across the lines, shape (n,); 0 in a furrow."""
     slope: Float64Array
     """Its change along u and v, rad per unit of u and v, shape (n, 2)."""
-    share: Float64Array
+    wrinkling_fraction: Float64Array
     """Part of the excess length that goes into the zone's wrinkles, shape (n,)."""
 
 
@@ -206,11 +206,11 @@ class Wrinkles:
     """Height added to the relief, um; zero on average over a wave."""
     excess: Float32Array
     """Length that the wrinkles take in, relative to the surface they lie on; 0 where smooth."""
-    left_out: tuple[str, ...]
+    omitted: tuple[str, ...]
     """Zones whose waves are too short for the texture."""
 
 
-def wrinkle_lines(points_mm: Float32Array, covered: BoolArray, *, seed: int) -> WrinkleLines:
+def draw_wrinkle_lines(points_mm: Float32Array, covered: BoolArray, *, seed: int) -> WrinkleLines:
     """Draw where a person's skin can buckle.
 
     Parameters
@@ -243,7 +243,7 @@ def wrinkle_lines(points_mm: Float32Array, covered: BoolArray, *, seed: int) -> 
         wave = zone.wavelength_mm * float(rng.uniform(0.88, 1.14))
         offset = rng.uniform(0.0, 2.0 * math.pi, 2)
         lifts = rng.uniform(0.8, 1.0, 2)
-        share = zone.share(folded)
+        share = zone.wrinkling_fraction(folded)
         near = np.flatnonzero(share > 0.01)
         share = share[near]
         # the texel, its neighbours at larger and smaller u, at larger and smaller v
@@ -276,15 +276,18 @@ def wrinkle_lines(points_mm: Float32Array, covered: BoolArray, *, seed: int) -> 
     # zones that overlap divide the shortening among them
     together = np.zeros(size * size)
     for lines in drawn:
-        together[lines.texel] += lines.share
+        together[lines.texel] += lines.wrinkling_fraction
     crowd = np.maximum(together, 1.0)
     return WrinkleLines(
-        tuple(dataclasses.replace(one, share=one.share / crowd[one.texel]) for one in drawn),
+        tuple(
+            dataclasses.replace(one, wrinkling_fraction=one.wrinkling_fraction / crowd[one.texel])
+            for one in drawn
+        ),
         tension,
     )
 
 
-def raise_wrinkles(lines: WrinkleLines, rest: Atlas, posed: Atlas) -> Wrinkles:
+def form_wrinkles(lines: WrinkleLines, rest: Atlas, posed: Atlas) -> Wrinkles:
     """Raise the wrinkles of a face whose surface has moved.
 
     Parameters
@@ -315,13 +318,13 @@ def raise_wrinkles(lines: WrinkleLines, rest: Atlas, posed: Atlas) -> Wrinkles:
         steady = (before > 1e-6) & (after > 1e-6)
         stretch = np.where(steady, before / np.maximum(after, 1e-9), 1.0)
         slack = (1.0 - one.zone.tension * lines.tension) / np.maximum(stretch, 1e-3) - 1.0
-        excess = one.share * np.maximum(slack, 0.0)
+        excess = one.wrinkling_fraction * np.maximum(slack, 0.0)
         wave_mm = 2.0 * math.pi / np.maximum(after, 1e-9)
-        fine = soft_step((wave_mm / texel_mm[one.texel] - MIN_WAVE_TEXELS) / 0.5)
+        fine = soft_step((wave_mm / texel_mm[one.texel] - MIN_TEXELS_PER_WAVE) / 0.5)
         if (excess > 0.0).any() and float(np.median(fine)) < 0.5:
             left_out.append(one.zone.name)
         excess *= fine
-        height[one.texel] += 1e3 * wave_mm * depth_of(excess) * _profile(one.phase_rad)
+        height[one.texel] += 1e3 * wave_mm * wave_depth(excess) * _profile(one.phase_rad)
         total[one.texel] += excess
     return Wrinkles(
         height.astype(np.float32).reshape(size, size),
@@ -330,7 +333,7 @@ def raise_wrinkles(lines: WrinkleLines, rest: Atlas, posed: Atlas) -> Wrinkles:
     )
 
 
-def depth_of(excess: ArrayLike) -> Float64Array:
+def wave_depth(excess: ArrayLike) -> Float64Array:
     """Return how deep a wave is that takes in an excess of length.
 
     Parameters
@@ -345,7 +348,7 @@ def depth_of(excess: ArrayLike) -> Float64Array:
 
     Examples
     --------
-    >>> bool(depth_of(0.0) == 0.0)
+    >>> bool(wave_depth(0.0) == 0.0)
     True
     """
     return np.interp(np.asarray(excess, np.float64), _WAVE_EXCESS, _WAVE_DEPTH)

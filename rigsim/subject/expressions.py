@@ -1,7 +1,7 @@
 """How a face moves in an expression: action units that pull the skin, and states made of them.
 
 Each action is a smooth field on the mean head, so any mesh that
-`rigsim.subject.face_regions.on_mean_head` places can wear it; a mesh that brings blend shapes of
+`rigsim.subject.face_regions.to_mean_head` places can wear it; a mesh that brings blend shapes of
 the common names moves by its own. Eyes and mouth stay closed: a jaw that drops stretches the lips
 in place of parting them.
 
@@ -21,7 +21,7 @@ import numpy as np
 from rigsim.arrays import Float32Array, Float64Array
 from rigsim.geometry.mesh import Mesh, build_mesh, vertex_normals
 from rigsim.package_data import package_table
-from rigsim.subject.face_regions import mean_head_scale, on_mean_head
+from rigsim.subject.face_regions import mean_head_scale, to_mean_head
 from rigsim.subject.perfusion import STATE_NAMES
 
 Vector = tuple[float, float, float]
@@ -74,7 +74,7 @@ MAX_ASYMMETRY: Final = 0.06
 """Largest relative difference of each side from a person's own strength."""
 
 
-def moves(state: str) -> bool:
+def is_moving_state(state: str) -> bool:
     """Tell whether a state moves the face.
 
     Raises
@@ -84,7 +84,7 @@ def moves(state: str) -> bool:
 
     Examples
     --------
-    >>> moves("smile"), moves("alcohol"), moves("neutral")
+    >>> is_moving_state("smile"), is_moving_state("alcohol"), is_moving_state("neutral")
     (True, False, False)
     """
     if state not in STATE_NAMES:
@@ -120,9 +120,9 @@ def displacement_mm(mesh: Mesh, state: str, *, amount: float = 1.0, seed: int = 
     if not AMOUNT_RANGE[0] <= amount <= AMOUNT_RANGE[1]:
         raise ExpressionError(f"amount: got {amount}, expected {AMOUNT_RANGE[0]} to 1.5")
     total = np.zeros(mesh.vertices_mm.shape, np.float64)
-    if not moves(state) or amount == 0.0:
+    if not is_moving_state(state) or amount == 0.0:
         return total.astype(np.float32)
-    points = on_mean_head(mesh.vertices_mm, mesh).astype(np.float64)
+    points = to_mean_head(mesh.vertices_mm, mesh).astype(np.float64)
     scale = mean_head_scale(mesh)
     sides = _sides(seed)
     for action, strength in EXPRESSION_STRENGTHS[state].items():
@@ -140,7 +140,7 @@ def blend_shapes(mesh: Mesh, *, seed: int = 0) -> dict[str, Float32Array]:
     return {state: displacement_mm(mesh, state, seed=seed) for state in EXPRESSION_STRENGTHS}
 
 
-def moved(mesh: Mesh, deltas_mm: Float32Array) -> Mesh:
+def displace_mesh(mesh: Mesh, deltas_mm: Float32Array) -> Mesh:
     """Return a mesh whose vertices have moved; triangles and texture coordinates stay.
 
     Parameters

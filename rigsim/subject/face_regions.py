@@ -39,7 +39,7 @@ _BALL_CENTERS_MM: Final = dict(LANDMARKS_MM) | {
 }
 
 
-def on_mean_head(points_mm: Float32Array, mesh: Mesh) -> Float32Array:
+def to_mean_head(points_mm: Float32Array, mesh: Mesh) -> Float32Array:
     """Move points of a face mesh to where they would lie on the mean head.
 
     Parameters
@@ -61,7 +61,7 @@ def on_mean_head(points_mm: Float32Array, mesh: Mesh) -> Float32Array:
 
 
 def from_mean_head(points_mm: FloatArray, mesh: Mesh) -> Float64Array:
-    """Move points of the mean head to a face mesh, the inverse of `on_mean_head`.
+    """Move points of the mean head to a face mesh, the inverse of `to_mean_head`.
 
     Parameters
     ----------

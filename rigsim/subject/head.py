@@ -22,7 +22,7 @@ Point = tuple[float, float, float]
 
 MAX_PHI_RAD: Final = 2.0
 """Half of the angle about the vertical axis that the texture covers."""
-CENTER_SHARE: Final = 0.6
+CENTER_LINEAR_FRACTION: Final = 0.6
 """Part of PHI_MAX_RAD per unit of u at the middle; the rest grows with the third power."""
 AXIS_Z_MM: Final = -70.0
 """Depth of the vertical axis from which rays leave."""
@@ -98,7 +98,7 @@ def build_head(rng: np.random.Generator, *, columns: int = 168, rows: int = 178)
 
 def _rays(u: Float64Array, v: Float64Array) -> tuple[Float64Array, Float64Array]:
     s = 2.0 * u - 1.0
-    phi = MAX_PHI_RAD * (CENTER_SHARE * s + (1.0 - CENTER_SHARE) * s**3)
+    phi = MAX_PHI_RAD * (CENTER_LINEAR_FRACTION * s + (1.0 - CENTER_LINEAR_FRACTION) * s**3)
     low, high = Y_RANGE_MM
     # The last part of v fans out over the crown; the speed along the surface stays even.
     bend = 0.77

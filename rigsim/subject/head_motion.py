@@ -12,15 +12,15 @@ import numpy as np
 
 from rigsim.arrays import Float64Array
 from rigsim.geometry.mesh import Mesh
-from rigsim.subject.expressions import moved
-from rigsim.subject.face_regions import on_mean_head
+from rigsim.subject.expressions import displace_mesh
+from rigsim.subject.face_regions import to_mean_head
 from rigsim.subject.head import LANDMARKS_MM
 
-SPAN_S: Final = 25.0
+TWITCH_WINDOW_S: Final = 25.0
 """Time within which the drift reaches its stated size: that of a capture."""
 
-DRIFT_MM: Final = (0.3, 3.0)
-DRIFT_DEG: Final = (0.1, 1.0)
+DRIFT_RANGE_MM: Final = (0.3, 3.0)
+DRIFT_RANGE_DEG: Final = (0.1, 1.0)
 """Ranges from which the greatest shift and turn are drawn."""
 
 SWAY_WAVES: Final = 5
@@ -30,19 +30,19 @@ SWAY_BAND_HZ: Final = (0.02, 0.4)
 PIVOT_MM: Final = (0.0, 0.0, -70.0)
 """Middle of the head, about which it turns; the shift is that of this point."""
 
-TWITCH_S: Final = 0.5
-TWITCH_MM: Final = (0.8, 2.0)
+TWITCH_DURATION_S: Final = 0.5
+TWITCH_RANGE_MM: Final = (0.8, 2.0)
 TWITCH_RADIUS_MM: Final = 14.0
 """Length of the twitch, range of its size, and how far it reaches from the corner of the mouth."""
 
 
-class MotionError(ValueError):
+class HeadMotionError(ValueError):
     """A motion is described wrongly."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadMotion:
-    """Drift and twitch of one capture; see `head_motion`."""
+    """Drift and twitch of one capture; see `draw_head_motion`."""
 
     amplitude: Float64Array
     """Waves of shift x, y, z in mm and of turn about x, y, z in rad, shape (WAVES, 6)."""
@@ -62,11 +62,11 @@ class HeadMotion:
         for name in ("amplitude", "frequency_hz", "phase_rad"):
             array = getattr(self, name)
             if array.ndim != 2 or array.shape[1] != 6 or not np.isfinite(array).all():
-                raise MotionError(f"{name}: got shape {array.shape}, expected finite (n, 6)")
+                raise HeadMotionError(f"{name}: got shape {array.shape}, expected finite (n, 6)")
         if not self.twitch_mm >= 0.0:
-            raise MotionError(f"twitch_mm: got {self.twitch_mm}, expected >= 0")
+            raise HeadMotionError(f"twitch_mm: got {self.twitch_mm}, expected >= 0")
         if self.twitch_side not in ("left", "right"):
-            raise MotionError(f"twitch_side: got {self.twitch_side!r}, expected left or right")
+            raise HeadMotionError(f"twitch_side: got {self.twitch_side!r}, expected left or right")
 
     def pose(self, t_s: float) -> tuple[Float64Array, Float64Array]:
         """Return where the head is.
@@ -83,16 +83,16 @@ class HeadMotion:
         """
         at = 2.0 * math.pi * self.frequency_hz * t_s + self.phase_rad
         state = np.sum(self.amplitude * (np.sin(at) - np.sin(self.phase_rad)), axis=0)
-        rotation = _turn(state[3:])
+        rotation = _rotation_matrix(state[3:])
         pivot = np.array(PIVOT_MM)
         return rotation, pivot - rotation @ pivot + state[:3]
 
-    def twitch(self, t_s: float) -> float:
+    def twitch_amount(self, t_s: float) -> float:
         """Return how far the twitch has gone, 0 (rest) to 1."""
-        phase = (t_s - self.twitch_start_s) / TWITCH_S
+        phase = (t_s - self.twitch_start_s) / TWITCH_DURATION_S
         return math.sin(math.pi * phase) ** 2 if 0.0 < phase < 1.0 else 0.0
 
-    def twitched(self, mesh: Mesh, amount: float) -> Mesh:
+    def apply_twitch(self, mesh: Mesh, amount: float) -> Mesh:
         """Return a face whose corner of the mouth is drawn up and outwards.
 
         Parameters
@@ -100,24 +100,24 @@ class HeadMotion:
         mesh
             The still face.
         amount
-            Result of `twitch`.
+            Result of `twitch_amount`.
 
         Returns
         -------
         Mesh
             The same triangles; normals are turned as the surface is.
         """
-        points = on_mean_head(mesh.vertices_mm, mesh)
+        points = to_mean_head(mesh.vertices_mm, mesh)
         corner = np.array(LANDMARKS_MM[f"mouth corner {self.twitch_side}"])
         squared = np.sum((points - corner) ** 2, axis=-1) / TWITCH_RADIUS_MM**2
         outward = -1.0 if self.twitch_side == "left" else 1.0
         way = np.array([0.75 * outward, 0.6, -0.28])
         way /= np.linalg.norm(way)
         deltas = np.exp(-squared)[:, None] * (amount * self.twitch_mm * way)
-        return moved(mesh, deltas.astype(np.float32))
+        return displace_mesh(mesh, deltas.astype(np.float32))
 
 
-def head_motion(
+def draw_head_motion(
     seed: int, *, drift_mm: float | None = None, drift_deg: float | None = None, twitch: bool = True
 ) -> HeadMotion:
     """Draw the motion of a head during one capture.
@@ -139,39 +139,39 @@ def head_motion(
 
     Examples
     --------
-    >>> rotation, shift_mm = head_motion(1).pose(0.0)
+    >>> rotation, shift_mm = draw_head_motion(1).pose(0.0)
     >>> bool(np.allclose(rotation, np.eye(3)) and np.allclose(shift_mm, 0.0))
     True
     """
     rng = np.random.default_rng([seed, 5])
-    sizes = [float(rng.uniform(*DRIFT_MM)), float(rng.uniform(*DRIFT_DEG))]
+    sizes = [float(rng.uniform(*DRIFT_RANGE_MM)), float(rng.uniform(*DRIFT_RANGE_DEG))]
     for k, (name, value) in enumerate((("drift_mm", drift_mm), ("drift_deg", drift_deg))):
         if value is not None:
             if not 0.0 <= value <= 10.0:
-                raise MotionError(f"{name}: got {value}, expected 0 to 10")
+                raise HeadMotionError(f"{name}: got {value}, expected 0 to 10")
             sizes[k] = value
     low, high = np.log(SWAY_BAND_HZ)
     frequency = np.exp(rng.uniform(low, high, (SWAY_WAVES, 6)))
     amplitude = rng.standard_normal((SWAY_WAVES, 6)) / np.sqrt(frequency)
     phase = rng.uniform(0.0, 2.0 * math.pi, (SWAY_WAVES, 6))
-    t = np.linspace(0.0, SPAN_S, 501)[:, None, None]
+    t = np.linspace(0.0, TWITCH_WINDOW_S, 501)[:, None, None]
     track = np.sum(
         amplitude * (np.sin(2.0 * math.pi * frequency * t + phase) - np.sin(phase)), axis=1
     )
     amplitude[:, :3] *= sizes[0] / np.linalg.norm(track[:, :3], axis=1).max()
     amplitude[:, 3:] *= math.radians(sizes[1]) / np.linalg.norm(track[:, 3:], axis=1).max()
-    start = float(rng.uniform(0.2, 0.8)) * SPAN_S if twitch else math.inf
+    start = float(rng.uniform(0.2, 0.8)) * TWITCH_WINDOW_S if twitch else math.inf
     return HeadMotion(
         amplitude=amplitude,
         frequency_hz=frequency,
         phase_rad=phase,
         twitch_start_s=start,
-        twitch_mm=float(rng.uniform(*TWITCH_MM)) if twitch else 0.0,
+        twitch_mm=float(rng.uniform(*TWITCH_RANGE_MM)) if twitch else 0.0,
         twitch_side=str(rng.choice(["left", "right"])),
     )
 
 
-def _turn(vector: Float64Array) -> Float64Array:
+def _rotation_matrix(vector: Float64Array) -> Float64Array:
     """Return the rotation about a vector by its length in rad (Rodrigues)."""
     angle = float(np.linalg.norm(vector))
     if angle < 1e-12:

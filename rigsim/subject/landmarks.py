@@ -34,7 +34,7 @@ POINTS_MM: Final[Mapping[str, tuple[float, float]]] = {
 """Where the points lie on the mean head seen from the front, (x, y) in mm; left and right as seen
 in the image. On the skin they are where a look along -z meets it."""
 
-NEAR_MM: Final = 0.5
+OCCLUSION_TOLERANCE_MM: Final = 0.5
 """Surface nearer than this to a point does not hide it."""
 
 
@@ -48,7 +48,7 @@ class SurfacePoints:
     weights: Float64Array
     """Their weights, shape (n, 3)."""
 
-    def on(self, mesh: Mesh) -> Float64Array:
+    def positions_on(self, mesh: Mesh) -> Float64Array:
         """Return where the points are on a mesh of the same triangles, shape (n, 3), mm."""
         corners = mesh.vertices_mm[self.corners].astype(np.float64)
         return np.einsum("nk,nkc->nc", self.weights, corners)
@@ -58,7 +58,7 @@ class SurfacePoints:
         return np.einsum("nk,nkc->nc", self.weights, mesh.uv[self.corners].astype(np.float64))
 
 
-def find(mesh: Mesh) -> SurfacePoints:
+def find_landmarks(mesh: Mesh) -> SurfacePoints:
     """Find the named points on a face at rest.
 
     Parameters
@@ -95,7 +95,7 @@ def find(mesh: Mesh) -> SurfacePoints:
     )
 
 
-def project(points_mm: Float64Array, view: View) -> Float64Array:
+def project_points(points_mm: Float64Array, view: View) -> Float64Array:
     """Return where a camera sees points, px.
 
     Parameters
@@ -118,7 +118,7 @@ def project(points_mm: Float64Array, view: View) -> Float64Array:
     return np.stack([x, y], axis=-1)
 
 
-def seen(points_mm: Float64Array, view: View, caster: Caster) -> BoolArray:
+def is_visible(points_mm: Float64Array, view: View, caster: Caster) -> BoolArray:
     """Tell which points a camera sees, shape (n,).
 
     Parameters
@@ -130,13 +130,15 @@ def seen(points_mm: Float64Array, view: View, caster: Caster) -> BoolArray:
     caster
         The mesh that may stand before them.
     """
-    pixels = project(points_mm, view)
+    pixels = project_points(points_mm, view)
     inside = (pixels > -0.5) & (pixels < np.array([view.width_px, view.height_px]) - 0.5)
     origin = np.asarray(view.position_mm)
     way = points_mm - origin
     distance = np.linalg.norm(way, axis=-1)
     way /= distance[:, None]
-    before = caster.blocked(np.broadcast_to(origin, way.shape), way, distance - NEAR_MM)
+    before = caster.is_blocked(
+        np.broadcast_to(origin, way.shape), way, distance - OCCLUSION_TOLERANCE_MM
+    )
     return np.asarray(inside.all(axis=1) & ~before)
 
 

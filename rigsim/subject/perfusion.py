@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigsim.arrays import Float32Array
-from rigsim.geometry.surface_noise import line_network, smooth_noise
+from rigsim.geometry.surface_noise import smooth_noise, vessel_network
 from rigsim.package_data import package_table
 
 MAX_HEMOGLOBIN: Final = 0.32
@@ -107,7 +107,7 @@ class Perfusion:
         # Vessels fill the dermis at most up to the limit; the fold keeps the order of values.
         return np.asarray(total / (1.0 + (total / MAX_HEMOGLOBIN) ** 4) ** 0.25, np.float32)
 
-    def dilated(self, change: ArrayLike) -> Perfusion:
+    def dilate(self, change: ArrayLike) -> Perfusion:
         """Return the perfusion after a lasting change of the vessels' radius, such as by heat.
 
         Parameters
@@ -124,7 +124,7 @@ class Perfusion:
         return replace(self, compartments=np.asarray(grown, np.float32))
 
 
-def perfuse(
+def draw_perfusion(
     points_mm: Float32Array, regions: Mapping[str, Float32Array], *, seed: int, amount: float = 1.0
 ) -> Perfusion:
     """Draw the vessels of a face and what each state does to them.
@@ -158,8 +158,8 @@ def perfuse(
     bed = 1.0 + 0.16 * contrast * smooth_noise(points_mm, (14.0, 6.0, 3.0), seed=seed + 41)
     loops = 1.0 + 0.24 * contrast * smooth_noise(points_mm, (2.6, 1.5, 0.9), seed=seed + 42)
     # Means of the networks over space, so that the plexus is 1 on average.
-    fine = line_network(points_mm, 3.4, 0.55, seed=seed + 43) / 0.15
-    coarse = line_network(points_mm, 9.0, 0.8, seed=seed + 44) / 0.083
+    fine = vessel_network(points_mm, 3.4, 0.55, seed=seed + 43) / 0.15
+    coarse = vessel_network(points_mm, 9.0, 0.8, seed=seed + 44) / 0.083
     plexus = 0.45 + 0.3 * np.minimum(fine, 4.0) + 0.25 * contrast * np.minimum(coarse, 4.0)
     layers = (np.maximum(bed, 0.1), np.maximum(loops, 0.05), plexus)
     compartments = np.stack(

@@ -18,20 +18,20 @@ from rigsim.arrays import Float32Array
 from rigsim.subject.perfusion import STATE_NAMES, Perfusion, StateError
 from rigsim.subject.person import SimulatedSubject
 
-RELAXATION_S: Final = 0.02
+EXPRESSION_TAU_S: Final = 0.02
 """Time constant of the blood of an expression, s. Jimenez et al. 2010, section 3.1, saw no phase
 between two states at samples 0.25 s apart: mostly, the moving face squeezes its skin."""
 
-REACTION_S: Final = 0.16
+REACTION_TIME_S: Final = 0.16
 """Time from a sound to the movement, s; simple reactions to sounds take about 0.16 s."""
 
-REACTION_SPREAD_S: Final = 0.02
+REACTION_STD_S: Final = 0.02
 """Standard deviation of the reaction time, s."""
 
-FADING_S: Final = 40.0
+EXERCISE_TAU_S: Final = 40.0
 """Time constant of the flush after exercise, s."""
 
-ABSORPTION_S: Final = 1200.0
+ALCOHOL_TAU_S: Final = 1200.0
 """Time constant of the flush after a drink, s."""
 
 
@@ -39,14 +39,14 @@ class CourseError(ValueError):
     """A course of blood that cannot be made."""
 
 
-class Course(Protocol):
+class PerfusionCourse(Protocol):
     """What a state's blood does in time."""
 
     @property
     def state(self) -> str:
         """Which state of `rigsim.subject.perfusion.STATE_NAMES`."""
 
-    def tell(self, now_s: float, asked: str) -> None:
+    def prompt(self, now_s: float, state: str) -> None:
         """Let the person hear, at a world time in s, what is asked of him."""
 
     def level(self, t_s: float) -> float:
@@ -84,10 +84,10 @@ class PromptedCourse:
     """
 
     state: str
-    rise_s: float = RELAXATION_S
-    fall_s: float = RELAXATION_S
-    reaction_s: float = REACTION_S
-    reaction_spread_s: float = REACTION_SPREAD_S
+    rise_s: float = EXPRESSION_TAU_S
+    fall_s: float = EXPRESSION_TAU_S
+    reaction_s: float = REACTION_TIME_S
+    reaction_spread_s: float = REACTION_STD_S
     seed: int = 0
     _moves: list[tuple[float, float, float]] = dataclasses.field(default_factory=list)
     """World time of each movement, s; the level then; the level that is gone to."""
@@ -99,7 +99,7 @@ class PromptedCourse:
         for name in ("reaction_s", "reaction_spread_s"):
             _require(0 <= getattr(self, name) < math.inf, name, getattr(self, name), "seconds >= 0")
 
-    def tell(self, now_s: float, asked: str) -> None:
+    def prompt(self, now_s: float, state: str) -> None:
         """Let the person hear a prompt at a world time, s."""
         number = len(self._moves)
         rng = np.random.default_rng([self.seed, 90, number])
@@ -107,7 +107,7 @@ class PromptedCourse:
         moved_s = now_s + late_s
         if self._moves:
             moved_s = max(moved_s, self._moves[-1][0])
-        self._moves.append((moved_s, self.level(moved_s), float(asked == self.state)))
+        self._moves.append((moved_s, self.level(moved_s), float(state == self.state)))
 
     def level(self, t_s: float) -> float:
         """Return how much of the expression's blood is there at a world time, s: 0 to 1."""
@@ -158,11 +158,11 @@ class EventCourse:
         """The time constant, s."""
         if self.constant_s is not None:
             return self.constant_s
-        return ABSORPTION_S if self.state == "alcohol" else FADING_S
+        return ALCOHOL_TAU_S if self.state == "alcohol" else EXERCISE_TAU_S
 
-    def tell(self, now_s: float, asked: str) -> None:
+    def prompt(self, now_s: float, state: str) -> None:
         """Let the event end at a world time, s; may lie before 0 where a world began later."""
-        if asked == self.state and math.isinf(self._over_s):
+        if state == self.state and math.isinf(self._over_s):
             self._over_s = now_s
 
     def level(self, t_s: float) -> float:
@@ -178,20 +178,20 @@ class EventCourse:
 
 
 @dataclass(frozen=True, slots=True)
-class HeldPerfusion(Perfusion):
+class FixedPerfusion(Perfusion):
     """Vessels that are dilated by a part of what one state asks for, whatever the face shows."""
 
-    held: str = "neutral"
+    base: str = "neutral"
     """State of the blood."""
     level: float = 0.0
     """Part of its dilation, 0 to 1."""
 
     def dilation(self, state: str) -> Float32Array:
         """Return the relative change of the vessels' radius, shape (...); ``state`` is not used."""
-        return np.asarray(np.float32(self.level) * Perfusion.dilation(self, self.held))
+        return np.asarray(np.float32(self.level) * Perfusion.dilation(self, self.base))
 
 
-def with_blood(subject: SimulatedSubject, state: str, level: float) -> SimulatedSubject:
+def fix_blood_level(subject: SimulatedSubject, state: str, level: float) -> SimulatedSubject:
     """Return a face whose blood stays at a level of one state in whatever state it is shown.
 
     Parameters
@@ -214,14 +214,14 @@ def with_blood(subject: SimulatedSubject, state: str, level: float) -> Simulated
     --------
     >>> from rigsim.subject import make_subject
     >>> face = make_subject(size=64)
-    >>> half = with_blood(face, "exercise", 0.5).hemoglobin("neutral").mean()
+    >>> half = fix_blood_level(face, "exercise", 0.5).hemoglobin("neutral").mean()
     >>> bool(face.hemoglobin().mean() < half < face.hemoglobin("exercise").mean())
     True
     """
     _check_state(state)
     _require(0.0 <= level <= 1.0, "level", level, "0 to 1")
     own = subject.perfusion
-    held = HeldPerfusion(own.compartments, own.points_mm, own.regions, own.seed, state, level)
+    held = FixedPerfusion(own.compartments, own.points_mm, own.regions, own.seed, state, level)
     return dataclasses.replace(subject, perfusion=held)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from rigsim.arrays import Float32Array
 from rigsim.geometry.atlas import Atlas, unwrap
-from rigsim.geometry.mesh import Mesh, centered, load_mesh
+from rigsim.geometry.mesh import Mesh, center_face, load_mesh
 from rigsim.subject import (
     expression_wrinkles,
     expressions,
@@ -23,7 +23,7 @@ from rigsim.subject import (
     relief,
 )
 from rigsim.subject.head import LANDMARKS_MM, build_head
-from rigsim.subject.perfusion import STATE_NAMES, Perfusion, StateError, perfuse
+from rigsim.subject.perfusion import STATE_NAMES, Perfusion, StateError, draw_perfusion
 
 PRESET_NAMES: Final = tuple(pigment.MELANIN_PRESETS)
 """Names of the presets, pale to dark."""
@@ -37,7 +37,7 @@ class SubjectError(ValueError):
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
-class Pose:
+class ExpressionPose:
     """The surface of a face in an expression, on the texture of the face at rest."""
 
     state: str
@@ -84,7 +84,7 @@ class SimulatedSubject:
     """Part of each texel that brows and lashes cover, 0 to 1."""
     normal: Float32Array
     """Unit normals of mesh and relief, shape (N, N, 3), rig frame."""
-    pose: Pose | None = None
+    pose: ExpressionPose | None = None
     """The expression that the geometry is in; ``None`` at rest."""
     rest: SimulatedSubject | None = None
     """The same face at rest; ``None`` for a face that is at rest itself."""
@@ -93,7 +93,7 @@ class SimulatedSubject:
     oiliness: float = 1.0
     """Factor of the share of the surface that oil covers."""
     offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """How far the whole face was moved from where it was made, rig frame, see `moved_by`."""
+    """How far the whole face was moved from where it was made, rig frame, see `translate`."""
 
     @property
     def size(self) -> int:
@@ -110,7 +110,7 @@ class SimulatedSubject:
         """
         return self.perfusion.blood(state)
 
-    def posed(self, state: str, amount: float = 1.0) -> SimulatedSubject:
+    def with_expression(self, state: str, amount: float = 1.0) -> SimulatedSubject:
         """Return this face in an expression: moved, with its wrinkles.
 
         Parameters
@@ -141,7 +141,7 @@ class SimulatedSubject:
         if not low <= amount <= high:
             raise expressions.ExpressionError(f"amount: got {amount}, expected {low:g} to {high}")
         rest = self if self.rest is None else self.rest
-        if amount == 0.0 or not expressions.moves(state):
+        if amount == 0.0 or not expressions.is_moving_state(state):
             return rest
         pose = _pose(rest, state, float(amount))
         return dataclasses.replace(
@@ -154,7 +154,7 @@ class SimulatedSubject:
             rest=rest,
         )
 
-    def moved_by(self, offset_mm: tuple[float, float, float]) -> SimulatedSubject:
+    def translate(self, offset_mm: tuple[float, float, float]) -> SimulatedSubject:
         """Return this face standing elsewhere, as a whole.
 
         Parameters
@@ -180,10 +180,12 @@ class SimulatedSubject:
         there = dataclasses.replace(
             rest,
             mesh=dataclasses.replace(rest.mesh, vertices_mm=rest.mesh.vertices_mm + way),
-            atlas=rest.atlas.moved_by(way),
+            atlas=rest.atlas.translate(way),
             offset_mm=(rest.offset_mm[0] + x, rest.offset_mm[1] + y, rest.offset_mm[2] + z),
         )
-        return there if self.pose is None else there.posed(self.pose.state, self.pose.amount)
+        return (
+            there if self.pose is None else there.with_expression(self.pose.state, self.pose.amount)
+        )
 
     def blend_shapes(self) -> dict[str, Float32Array]:
         """Return how each expression moves the vertices, {state: (V, 3) in mm}, rig frame."""
@@ -218,7 +220,7 @@ class SimulatedSubject:
 
     def surface_landmarks(self) -> landmarks.SurfacePoints:
         """Return named points of the skin itself; ``.on(mesh)`` says where they are."""
-        return landmarks.find(self.mesh if self.rest is None else self.rest.mesh)
+        return landmarks.find_landmarks(self.mesh if self.rest is None else self.rest.mesh)
 
 
 def _three(offset_mm: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -228,7 +230,9 @@ def _three(offset_mm: tuple[float, float, float]) -> tuple[float, float, float]:
     return float(given[0]), float(given[1]), float(given[2])
 
 
-_poses: WeakValueDictionary[tuple[int, int, int, str, float], Pose] = WeakValueDictionary()
+_poses: WeakValueDictionary[tuple[int, int, int, str, float], ExpressionPose] = (
+    WeakValueDictionary()
+)
 """Poses that somebody holds, by what they are made of; a pose holds its origin, so that an id
 stays that of the same object."""
 _lines: WeakValueDictionary[tuple[int, int, int], expression_wrinkles.WrinkleLines] = (
@@ -237,22 +241,24 @@ _lines: WeakValueDictionary[tuple[int, int, int], expression_wrinkles.WrinkleLin
 """Their lines, by the first three of the same."""
 
 
-def _pose(rest: SimulatedSubject, state: str, amount: float) -> Pose:
+def _pose(rest: SimulatedSubject, state: str, amount: float) -> ExpressionPose:
     """Return a pose of a face at rest; the same object as long as anybody holds it."""
     key = (id(rest.mesh), id(rest.height_um), rest.seed, state, amount)
     pose = _poses.get(key)
     if pose is None:
         deltas = expressions.displacement_mm(rest.mesh, state, amount=amount, seed=rest.seed)
-        mesh = expressions.moved(rest.mesh, deltas)
+        mesh = expressions.displace_mesh(rest.mesh, deltas)
         atlas = unwrap(mesh, rest.size)
         lines = _lines.get(key[:3])
         if lines is None:
-            points = face_regions.on_mean_head(rest.atlas.position_mm, rest.mesh)
-            lines = expression_wrinkles.wrinkle_lines(points, rest.atlas.covered, seed=rest.seed)
+            points = face_regions.to_mean_head(rest.atlas.position_mm, rest.mesh)
+            lines = expression_wrinkles.draw_wrinkle_lines(
+                points, rest.atlas.covered, seed=rest.seed
+            )
             _lines[key[:3]] = lines
-        wrinkles = expression_wrinkles.raise_wrinkles(lines, rest.atlas, atlas)
+        wrinkles = expression_wrinkles.form_wrinkles(lines, rest.atlas, atlas)
         height = rest.height_um + wrinkles.height_um
-        pose = Pose(
+        pose = ExpressionPose(
             state=state,
             amount=amount,
             origin=(rest.mesh, rest.height_um),
@@ -322,9 +328,9 @@ def make_subject(
     elif isinstance(mesh, Mesh):
         surface = mesh
     else:
-        surface = centered(load_mesh(mesh))
+        surface = center_face(load_mesh(mesh))
     atlas = unwrap(surface, size)
-    points = face_regions.on_mean_head(atlas.position_mm, surface)
+    points = face_regions.to_mean_head(atlas.position_mm, surface)
     regions = face_regions.region_masks(points)
     height = relief.height_um(points, regions, texel_mm=atlas.typical_texel_mm(), seed=seed)
     return SimulatedSubject(
@@ -332,8 +338,10 @@ def make_subject(
         seed=seed,
         mesh=surface,
         atlas=atlas,
-        melanin=pigment.melanin_map(points, regions, pigment.MELANIN_PRESETS[preset], seed=seed),
-        perfusion=perfuse(points, regions, seed=seed, amount=blood),
+        melanin=pigment.draw_melanin_map(
+            points, regions, pigment.MELANIN_PRESETS[preset], seed=seed
+        ),
+        perfusion=draw_perfusion(points, regions, seed=seed, amount=blood),
         roughness=relief.roughness_map(points, regions, seed=seed),
         height_um=height,
         hair=relief.hair_map(points, seed=seed),

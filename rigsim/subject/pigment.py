@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 
 from rigsim.arrays import Float32Array, FloatArray
-from rigsim.geometry.surface_noise import scattered_spots, smooth_noise
+from rigsim.geometry.surface_noise import random_spots, smooth_noise
 from rigsim.subject.face_regions import soft_step
 
 MAX_MELANIN: Final = 0.5
@@ -29,7 +29,7 @@ moderately (11-16 %) and darkly (18-43 %) pigmented adults belong to a real epid
 the darkest reflects less than real skin does."""
 
 
-def melanin_map(
+def draw_melanin_map(
     points_mm: Float32Array,
     regions: Mapping[str, Float32Array],
     base: float,
@@ -67,14 +67,14 @@ def melanin_map(
     step += 0.05 * smooth_noise(points_mm, (7.0, 3.0, 1.4), seed=seed + 12)
     step += 0.12 * regions["forehead"] + 0.14 * regions["lids"] + 0.06 * regions["temples"]
     step -= 0.55 * regions["lips"] + 0.10 * regions["neck"]
-    step += _tan(points_mm, base, rng)
+    step += _suntan(points_mm, base, rng)
     step += _freckles(points_mm, regions, base, seed=seed, rng=rng, amount=freckles)
     step += _moles(points_mm, base, seed=seed, rng=rng)
     odds = base / (MAX_MELANIN - base) * np.exp(step)
     return np.asarray(MAX_MELANIN * odds / (1.0 + odds), np.float32)
 
 
-def _tan(points: Float32Array, base: float, rng: np.random.Generator) -> FloatArray:
+def _suntan(points: Float32Array, base: float, rng: np.random.Generator) -> FloatArray:
     """Sun everywhere but under a cap or behind glasses; half a tan is in the base already."""
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     gain = float(rng.uniform(0.25, 0.5)) * (0.4 + 0.6 * float(np.exp(-base / 0.1)))
@@ -102,14 +102,14 @@ def _freckles(
     # Freckles belong to pale skin.
     drawn = float(rng.uniform(0.2, 0.8))  # drawn anyway, so that moles stay where they are
     density = (drawn if amount is None else amount) * float(np.exp(-base / 0.05))
-    spots = scattered_spots(
+    spots = random_spots(
         points, density * where, cell_mm=3.6, radius_mm=(0.4, 1.1), seed=seed + 21, softness=5.0
     )
     return 0.9 * spots
 
 
 def _moles(points: Float32Array, base: float, *, seed: int, rng: np.random.Generator) -> FloatArray:
-    spots = scattered_spots(
+    spots = random_spots(
         points,
         np.full(points.shape[:-1], 0.16),
         cell_mm=26.0,

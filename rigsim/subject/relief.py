@@ -6,7 +6,7 @@ import numpy as np
 
 from rigsim.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from rigsim.geometry.atlas import Atlas
-from rigsim.geometry.surface_noise import line_network, scattered_spots, smooth_noise
+from rigsim.geometry.surface_noise import random_spots, smooth_noise, vessel_network
 from rigsim.subject.face_regions import soft_step
 
 
@@ -34,26 +34,26 @@ def height_um(
     height = np.zeros(points_mm.shape[:-1], np.float32)
     porous = 0.25 + 0.6 * regions["nose"] + 0.5 * regions["cheeks"] + 0.2 * regions["forehead"]
     porous = np.clip(porous * (1.0 - regions["lips"]) * (1.0 - 0.8 * regions["lids"]), 0.0, 1.0)
-    pores = scattered_spots(
+    pores = random_spots(
         points_mm,
         porous,
         cell_mm=1.1,
         radius_mm=(0.10, 0.24),
         seed=seed + 71,
         softness=4.0,
-        smallest_mm=0.8 * texel_mm,
+        min_radius_mm=0.8 * texel_mm,
     )
     height -= 60.0 * pores * (0.5 + 0.5 * porous)
     # Lines of expression: horizontal on the forehead, fans beside the eyes, upright on the lips.
     stretched = points_mm * np.array([0.12, 1.0, 0.4], np.float32)
-    height -= _furrows(stretched, 9.0, 0.9, texel_mm, 45.0, seed + 72) * regions["forehead"]
+    height -= _grooves(stretched, 9.0, 0.9, texel_mm, 45.0, seed + 72) * regions["forehead"]
     fans = points_mm * np.array([0.25, 1.0, 0.25], np.float32)
-    height -= _furrows(fans, 4.0, 0.6, texel_mm, 45.0, seed + 73) * regions["crow"]
+    height -= _grooves(fans, 4.0, 0.6, texel_mm, 45.0, seed + 73) * regions["crow"]
     upright = points_mm * np.array([1.0, 0.15, 0.3], np.float32)
-    height -= _furrows(upright, 2.4, 0.45, texel_mm, 60.0, seed + 74) * regions["lips"]
+    height -= _grooves(upright, 2.4, 0.45, texel_mm, 60.0, seed + 74) * regions["lips"]
     # The net of primary lines, a quarter of a millimetre apart, where texels can show it.
     if texel_mm < 0.2:
-        net = line_network(points_mm, 0.6, max(0.1, texel_mm), seed=seed + 75)
+        net = vessel_network(points_mm, 0.6, max(0.1, texel_mm), seed=seed + 75)
         height -= 18.0 * net
     if texel_mm < 0.8:
         height += 6.0 * smooth_noise(points_mm, (max(1.0, 2.5 * texel_mm),), seed=seed + 76)
@@ -208,7 +208,7 @@ def tangent_normals(atlas: Atlas, normal: Float32Array) -> Float32Array:
     return turned.astype(np.float32)
 
 
-def _furrows(
+def _grooves(
     points: Float32Array,
     cell_mm: float,
     width_mm: float,
@@ -217,7 +217,7 @@ def _furrows(
     seed: int,
 ) -> Float32Array:
     drawn = max(width_mm, 1.2 * texel_mm)
-    lines = line_network(points, cell_mm, drawn, seed=seed)
+    lines = vessel_network(points, cell_mm, drawn, seed=seed)
     return np.asarray(depth_um * width_mm / drawn * lines, np.float32)
 
 
@@ -243,14 +243,14 @@ def stubble_map(
     area *= (1.0 - regions["lips"]) * (1.0 - 0.8 * regions["nose"])
     area *= np.clip(1.0 + 0.25 * smooth_noise(points, (12.0, 5.0), seed=seed + 511), 0.3, 1.5)
     dense = np.asarray(np.clip(amount * area, 0.0, 1.0), np.float32)
-    dots = scattered_spots(
+    dots = random_spots(
         points,
         dense,
         cell_mm=0.9,
         radius_mm=(0.12, 0.22),
         seed=seed + 512,
         softness=4.0,
-        smallest_mm=0.7 * texel_mm,
+        min_radius_mm=0.7 * texel_mm,
     )
     # Half of the shadow is blurred: light spreads in skin further than between two follicles.
     return np.asarray(np.clip(0.45 * dense + 0.55 * dots, 0.0, 1.0), np.float32)

@@ -14,14 +14,14 @@ from numba import njit
 from capture.rig import View
 from rigsim import shading
 from rigsim.arrays import Float32Array, Float64Array
-from rigsim.as_built.sphere import BuiltSphere
+from rigsim.as_built.sphere import ActualSphere
 from rigsim.targets.mirror_ball import reflection_point
 
 GLASS_BALL_RADIUS_MM: Final = 6.0
 ETA: Final = 1.52
 """Of crown glass."""
 
-CENTER_MM: Final = (0.0, 0.0, -3.0)
+NOMINAL_CENTER_MM: Final = (0.0, 0.0, -3.0)
 """Where the ball's middle is on average: the spots near the axis, half a radius before the middle,
 are then in focus."""
 
@@ -32,14 +32,14 @@ PUPIL_POINTS: Final = 37
 RAYS_PER_SIDE: Final = 4
 
 
-def ball_center_mm(seed: int) -> Float64Array:
+def draw_ball_center_mm(seed: int) -> Float64Array:
     """Return where the ball's middle is, mm, rig frame, shape (3,)."""
     rng = np.random.default_rng([seed, 12])
-    return np.array(CENTER_MM) + BALL_PLACEMENT_DEVIATION_MM * rng.standard_normal(3)
+    return np.array(NOMINAL_CENTER_MM) + BALL_PLACEMENT_DEVIATION_MM * rng.standard_normal(3)
 
 
-def ball_stokes(
-    view: View, sphere: BuiltSphere, *, extinction: float, center_mm: Float64Array
+def render_ball_stokes(
+    view: View, sphere: ActualSphere, *, extinction: float, center_mm: Float64Array
 ) -> Float32Array:
     """Return the picture of the ball for each moment of the light, each pixel averaged.
 

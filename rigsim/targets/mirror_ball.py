@@ -21,18 +21,18 @@ CLOTH_ROWS: Final = 48
 """Rows of the map of light on the cloth; it has twice as many columns."""
 
 
-Lamps: TypeAlias = tuple[Float64Array, Float64Array, Float64Array, Float64Array]
+LampArrays: TypeAlias = tuple[Float64Array, Float64Array, Float64Array, Float64Array]
 """Lights that are on: places in mm (L, 3), axes (L, 3), exponents (L,) and strengths (L,)."""
 
-Ball: TypeAlias = tuple[Float64Array, float, float]
+BallArrays: TypeAlias = tuple[Float64Array, float, float]
 """Middle in mm, shape (3,), radius in mm and reflectance of a ball."""
 
-Led: TypeAlias = tuple[Float64Array, Float64Array, float, float, float]
+LedArrays: TypeAlias = tuple[Float64Array, Float64Array, float, float, float]
 """Place in mm, axis, exponent, radius in mm and strength of one of the lights."""
 
 
 @njit(cache=True, nogil=True)
-def light_on_cloth(lamps: Lamps) -> Float64Array:
+def cloth_radiance(lamps: LampArrays) -> Float64Array:
     """Return the light that the cloth sends back, shape (`CLOTH_ROWS`, 2 `CLOTH_ROWS`).
 
     In the unit of a white's signal; rows by elevation from +y down, columns by azimuth
@@ -148,8 +148,8 @@ def _inside(rays, i, j, y, x, ray):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def surroundings(
-    rays: Float64Array, eye_mm: Float64Array, ball: Ball, cloth: Float64Array, subpixels: int
+def render_cloth(
+    rays: Float64Array, eye_mm: Float64Array, ball: BallArrays, cloth: Float64Array, subpixels: int
 ) -> Float32Array:
     """Return the cloth as each pixel sees it, past the ball and in it; without the LEDs.
 
@@ -162,7 +162,7 @@ def surroundings(
     ball
         The ball; a radius of 0 shows the cloth alone.
     cloth
-        From `light_on_cloth`.
+        From `cloth_radiance`.
     subpixels
         Rays along each side of pixels on the ball's outline.
     """
@@ -205,11 +205,11 @@ def add_lamp(  # type: ignore[no-untyped-def]
     image
         Shape (H, W).
     rays
-        As of `surroundings`.
+        As of `render_cloth`.
     box
         First and past-the-last row and column that the LED can cover, shape (4,).
     eye_mm, ball
-        As of `surroundings`.
+        As of `render_cloth`.
     led
         Place in mm, axis, exponent of the lobe, radius in mm, and intensity on the axis in the unit
         of a white's signal x mm^2.

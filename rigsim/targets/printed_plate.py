@@ -68,7 +68,7 @@ def charuco_board() -> Plate:
                 continue
             top, left = row * SQUARE_CELLS, column * SQUARE_CELLS
             light[top : top + SQUARE_CELLS, left : left + SQUARE_CELLS] = True
-            _stamp(light, number, top + 1, left + 1)
+            _print_marker(light, number, top + 1, left + 1)
             number += 1
     return Plate(np.where(light, PAPER_REFLECTANCE, INK_REFLECTANCE), np.zeros((0, 4)))
 
@@ -92,7 +92,7 @@ def white_plate(*, slope_deg: float, rng: np.random.Generator) -> Plate:
     )
     places = [(left, top) for top in tops for left in lefts if (left, top) != (lefts[1], tops[1])]
     for k, (left, top) in enumerate(places):
-        _stamp(light, PLATE_FIRST_MARKER + k, top, left)
+        _print_marker(light, PLATE_FIRST_MARKER + k, top, left)
     waves = 6
     length_mm = rng.uniform(30.0, 150.0, waves)
     angle = rng.uniform(0.0, 2.0 * np.pi, waves)
@@ -106,7 +106,7 @@ def white_plate(*, slope_deg: float, rng: np.random.Generator) -> Plate:
     )
 
 
-def _stamp(light: BoolArray, number: int, top: int, left: int) -> None:
+def _print_marker(light: BoolArray, number: int, top: int, left: int) -> None:
     """Print a marker into a raster, in place."""
     light[top : top + MARKER_CELLS, left : left + MARKER_CELLS] = False
     bits = DICT_4X4_50[number]
@@ -116,8 +116,8 @@ def _stamp(light: BoolArray, number: int, top: int, left: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def plate_light(  # type: ignore[no-untyped-def]
-    rays, eye_mm, rotation, place_mm, paper, lights, subpixels
+def render_plate(  # type: ignore[no-untyped-def]
+    rays, eye_mm, rotation, position_mm, paper, lights, subpixels
 ):
     """Return what each pixel sees of a plate: sum of ``strength lobe cos / d^2`` x reflectance.
 
@@ -145,10 +145,10 @@ def plate_light(  # type: ignore[no-untyped-def]
     lamp_mm, lamp_axis, lamp_exponent, lamp_strength = lights
     height, width = rays.shape[0] - 1, rays.shape[1] - 1
     out = np.zeros((height, width), np.float32)
-    eye = rotation.T @ (eye_mm - place_mm)
+    eye = rotation.T @ (eye_mm - position_mm)
     if eye[2] >= 0.0:
         return out
-    lamps = (lamp_mm - place_mm) @ rotation
+    lamps = (lamp_mm - position_mm) @ rotation
     axes = lamp_axis @ rotation
     rows, columns = reflectance.shape
     turned = np.ascontiguousarray(rotation.T)

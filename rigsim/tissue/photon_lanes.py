@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigsim.arrays import Float32Array, Float64Array, UInt32Array
-from rigsim.render import load
+from rigsim.render import load_mitsuba
 from rigsim.render.variant import choose_variant
-from rigsim.tissue.photon_walk import ROULETTE_BELOW, ROULETTE_SURVIVAL, TALLY_COUNT
+from rigsim.tissue.photon_walk import ROULETTE_MAX_WEIGHT, ROULETTE_SURVIVAL, TALLY_COUNT
 
 PHOTONS_PER_LANE: Final = (32, 256)
 """Fewest and most photons that a lane traces in turn: with more, lanes wait less at the end."""
@@ -72,19 +72,19 @@ def walk_lanes(
     """
     together = max(PHOTONS_PER_CALL // photons, 1)
     runs = [
-        _batches(table, ring_edges2, photons, seed[at : at + together], len(seed))
+        _trace_batches(table, ring_edges2, photons, seed[at : at + together], len(seed))
         for at in range(0, len(seed), together)
     ]
     return LaneTallies(np.concatenate([run.tally for run in runs]), runs[0].photons)
 
 
-def _batches(
+def _trace_batches(
     table: Float64Array, ring_edges2: Float64Array, photons: int, seed: NDArray[np.uint64], of: int
 ) -> LaneTallies:
     """Trace some of all batches; lanes are shared out by the number of all."""
     import drjit as dr
 
-    load(choose_variant("mono"))
+    load_mitsuba(choose_variant("mono"))
     batches = len(seed)
     per_lane = min(max(photons * of // MIN_LANES, PHOTONS_PER_LANE[0]), PHOTONS_PER_LANE[1])
     per_lane = min(per_lane, photons)
@@ -180,7 +180,7 @@ def _run(
             part + Float64(dr.select(collides & (layer == k + 1), taken, 0.0))
             for k, part in enumerate(absorbed)
         )
-        plays = kept < ROULETTE_BELOW
+        plays = kept < ROULETTE_MAX_WEIGHT
         dies = collides & plays & (chance > ROULETTE_SURVIVAL)
         after = dr.select(plays, dr.select(dies, 0.0, kept * (1.0 / ROULETTE_SURVIVAL)), kept)
         lost += Float64(dr.select(collides, kept - after, 0.0))

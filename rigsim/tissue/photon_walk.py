@@ -9,7 +9,7 @@ TALLY_COUNT = 5
 """Scores ahead of the layers and rings: diffuse and unscattered reflectance, diffuse and
 unscattered transmittance, weight removed minus weight added by the roulette."""
 
-ROULETTE_BELOW = 1e-2  # weight under which a photon has to play
+ROULETTE_MAX_WEIGHT = 1e-2  # weight under which a photon has to play
 ROULETTE_SURVIVAL = 0.1  # probability to go on, with the weight divided by it
 
 _UNIFORM_STEP = 2.0**-53
@@ -18,7 +18,7 @@ _RNG_SHIFTS = tuple(np.uint64(n) for n in (11, 17, 45, 19))
 
 
 @njit(inline="always")
-def draw(s0, s1, s2, s3):  # type: ignore[no-untyped-def]
+def draw_uniform(s0, s1, s2, s3):  # type: ignore[no-untyped-def]
     """Step xoshiro256+ (Blackman, Vigna 2021, doi:10.1145/3460772); uniform in (0, 1]."""
     word = s0 + s3
     t = s1 << _RNG_SHIFTS[1]
@@ -32,12 +32,12 @@ def draw(s0, s1, s2, s3):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def disc_point(s0, s1, s2, s3):  # type: ignore[no-untyped-def]
+def draw_disc_point(s0, s1, s2, s3):  # type: ignore[no-untyped-def]
     """Draw a point in the unit disc, evenly."""
     while True:
-        s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+        s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
         p = 2.0 * u - 1.0
-        s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+        s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
         q = 2.0 * u - 1.0
         if p * p + q * q <= 1.0:
             return s0, s1, s2, s3, p, q
@@ -57,9 +57,9 @@ def fresnel(mu_i, eta_i, eta_t):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def scatter(s0, s1, s2, s3, ux, uy, uz, g):  # type: ignore[no-untyped-def]
+def scatter_direction(s0, s1, s2, s3, ux, uy, uz, g):  # type: ignore[no-untyped-def]
     """Turn a direction by the Henyey-Greenstein phase function of mean cosine g."""
-    s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+    s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
     if g == 0.0:
         cos_theta = 2.0 * u - 1.0
     else:
@@ -67,9 +67,9 @@ def scatter(s0, s1, s2, s3, ux, uy, uz, g):  # type: ignore[no-untyped-def]
         cos_theta = (1.0 + g * g - part * part) / (2.0 * g)
     # Azimuth from a point in the unit disc: cos 2a = (p^2 - q^2)/(p^2 + q^2).
     while True:
-        s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+        s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
         p = 2.0 * u - 1.0
-        s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+        s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
         q = 2.0 * u - 1.0
         pp = p * p
         qq = q * q
@@ -145,7 +145,7 @@ def walk(table, ring_edges2, photons, seed, tally, events):  # type: ignore[no-u
         sigma_t = table[layer, 2]
         albedo = table[layer, 3]
         g = table[layer, 4]
-        s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+        s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
         depth_left = -log(u)  # optical depth to the next collision
 
         while True:
@@ -159,16 +159,16 @@ def walk(table, ring_edges2, photons, seed, tally, events):  # type: ignore[no-u
                 path[layer - 1] += step
                 tally[TALLY_COUNT + layer - 1] += weight * (1.0 - albedo)
                 weight *= albedo
-                if weight < ROULETTE_BELOW:
-                    s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+                if weight < ROULETTE_MAX_WEIGHT:
+                    s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
                     if u > ROULETTE_SURVIVAL:
                         tally[4] += weight
                         break
                     tally[4] += weight - weight / ROULETTE_SURVIVAL
                     weight /= ROULETTE_SURVIVAL
                 scattered = True
-                s0, s1, s2, s3, ux, uy, uz = scatter(s0, s1, s2, s3, ux, uy, uz, g)
-                s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+                s0, s1, s2, s3, ux, uy, uz = scatter_direction(s0, s1, s2, s3, ux, uy, uz, g)
+                s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
                 depth_left = -log(u)
                 continue
 
@@ -184,7 +184,7 @@ def walk(table, ring_edges2, photons, seed, tally, events):  # type: ignore[no-u
             eta_beyond = table[beyond, 5]
             if eta != eta_beyond:
                 reflected, mu_t = fresnel(abs(uz), eta, eta_beyond)
-                s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+                s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
                 if u <= reflected:
                     uz = -uz
                     continue

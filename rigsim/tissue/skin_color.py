@@ -47,7 +47,7 @@ class SkinColor:
         melanin, blood = _flat(c_m, MAX_C_M), _flat(c_hd, MAX_C_HD)
         return _lookup(self.log_rgb, melanin, blood).reshape(*np.shape(c_m), 3)
 
-    def nearest(
+    def nearest_fractions(
         self, rgb: Float32Array, c_m: Float32Array, c_hd: Float32Array, *, steps: int = 12
     ) -> tuple[Float32Array, Float32Array]:
         """Return the fractions whose color is nearest to a given one, in log reflectance.

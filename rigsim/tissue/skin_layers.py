@@ -15,8 +15,8 @@ ETA = 1.4  # Donner et al. 2008, both layers
 SKIN_ANISOTROPY = (
     0.8  # Henyey-Greenstein g; van Gemert et al. 1989, doi:10.1109/10.42108: .75-.82 visible
 )
-EUMELANIN_SHARE = 0.61  # beta_m, Donner et al. 2008; the rest is pheomelanin
-EPIDERMAL_BLOOD_SHARE = 0.25  # C_he / C_hd, Jimenez et al. 2010, doi:10.1145/1882261.1866167
+EUMELANIN_FRACTION = 0.61  # beta_m, Donner et al. 2008; the rest is pheomelanin
+EPIDERMAL_BLOOD_RATIO = 0.25  # C_he / C_hd, Jimenez et al. 2010, doi:10.1145/1882261.1866167
 BLOOD_OXYGENATION = 0.75  # S, Donner and Jensen 2006, doi:10.2312/EGWR/EGSR06/409-417
 BLOOD_G_PER_L, HEMOGLOBIN_G_PER_MOL = 150.0, 64_500.0  # Prahl 1998 (OMLC)
 
@@ -37,7 +37,7 @@ def melanin_per_mm(wavelength_nm: float) -> float:
     """
     eumelanin = 6.6e10 * wavelength_nm**-3.33
     pheomelanin = 2.9e14 * wavelength_nm**-4.75
-    return EUMELANIN_SHARE * eumelanin + (1.0 - EUMELANIN_SHARE) * pheomelanin
+    return EUMELANIN_FRACTION * eumelanin + (1.0 - EUMELANIN_FRACTION) * pheomelanin
 
 
 def blood_per_mm(wavelength_nm: float) -> float:
@@ -89,7 +89,7 @@ def epidermis_scattering_per_mm(wavelength_nm: float) -> float:
     return 14.74 * wavelength_nm**-0.22 + 2.2e11 * wavelength_nm**-4.0
 
 
-def skin(wavelength_nm: float, c_m: float, c_hd: float) -> LayerStack:
+def skin_layer_stack(wavelength_nm: float, c_m: float, c_hd: float) -> LayerStack:
     """Return the layers of skin at one wavelength.
 
     Parameters
@@ -113,7 +113,7 @@ def skin(wavelength_nm: float, c_m: float, c_hd: float) -> LayerStack:
 
     Examples
     --------
-    >>> stack = skin(500.0, 0.1, 0.04)
+    >>> stack = skin_layer_stack(500.0, 0.1, 0.04)
     >>> [round(layer.sigma_a_per_mm, 3) for layer in stack.layers]
     [6.029, 0.515]
     """
@@ -123,7 +123,7 @@ def skin(wavelength_nm: float, c_m: float, c_hd: float) -> LayerStack:
     melanin = melanin_per_mm(wavelength_nm)
     blood = blood_per_mm(wavelength_nm)
     baseline = baseline_per_mm(wavelength_nm)
-    c_he = EPIDERMAL_BLOOD_SHARE * c_hd
+    c_he = EPIDERMAL_BLOOD_RATIO * c_hd
     epidermis = c_m * melanin + c_he * blood + (1.0 - c_m - c_he) * baseline
     dermis = c_hd * blood + (1.0 - c_hd) * baseline
     sigma_s = epidermis_scattering_per_mm(wavelength_nm) / (1.0 - SKIN_ANISOTROPY)

@@ -35,7 +35,7 @@ from rigsim.tissue.lateral_kernels import LateralKernels
 from rigsim.tissue.skin_layers import MAX_C_HD, MAX_C_M
 
 _TABLE_FILE = "skin_reflectance_mc.npz"
-EMPTY_RING = 1e-9  # share that stands for a far ring that no photon reached
+EMPTY_RING_FRACTION = 1e-9  # share that stands for a far ring that no photon reached
 
 
 class SkinTableError(ValueError):
@@ -208,7 +208,7 @@ def _load() -> SkinTable:
 
 def _log_shares(rings: Float64Array) -> Float64Array:
     shares = rings / rings.sum(axis=2, keepdims=True)
-    return np.log(np.maximum(shares, EMPTY_RING))
+    return np.log(np.maximum(shares, EMPTY_RING_FRACTION))
 
 
 def _hermite_patches(reflectance: Float64Array) -> Float64Array:

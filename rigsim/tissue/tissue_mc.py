@@ -91,7 +91,7 @@ class LayerStack:
 
 
 @dataclass(frozen=True, slots=True)
-class Transport:
+class TransportResult:
     """Where the light of a pencil beam of unit power goes, with one-sigma standard errors.
 
     All fractions are of the incident power, the mirror reflection of the first surface included,
@@ -161,7 +161,7 @@ class EscapePaths:
     """Photons that were traced for them."""
 
 
-def transport(
+def trace_photons(
     stack: LayerStack,
     *,
     photons: int,
@@ -170,7 +170,7 @@ def transport(
     batches: int = MIN_BATCHES,
     threads: int = 1,
     engine: Literal["numba", "drjit", "auto"] = "numba",
-) -> Transport:
+) -> TransportResult:
     """Trace a pencil beam that falls at right angles on a stack of layers.
 
     Parameters
@@ -210,7 +210,7 @@ def transport(
     Examples
     --------
     >>> slab = LayerStack((Layer(0.2, 1.0, 9.0, 0.75, 1.0),))  # van de Hulst: R .09739, T .66096
-    >>> run = transport(slab, photons=20_000, rng=np.random.default_rng(1))
+    >>> run = trace_photons(slab, photons=20_000, rng=np.random.default_rng(1))
     >>> abs(run.reflectance - 0.09739) < 4 * run.reflectance_stderr
     True
     >>> round(run.balance, 9)
@@ -232,14 +232,14 @@ def transport(
         def run(batch: int) -> None:
             walk(table, edges * edges, count, seeds[batch], tallies[batch], no_events)
 
-        in_threads(run, batches, threads)
+        run_in_threads(run, batches, threads)
     tallies /= count
     mean = tallies.mean(axis=0)
     error = tallies.std(axis=0, ddof=1) / np.sqrt(batches)
     transmitted = tallies[:, 2] + tallies[:, 3]
     layer_part = slice(TALLY_COUNT, TALLY_COUNT + n_layers)
     ring_part = slice(TALLY_COUNT + n_layers, None)
-    return Transport(
+    return TransportResult(
         specular=stack.specular_reflectance + float(mean[1]),
         reflectance=float(mean[0]),
         reflectance_stderr=float(error[0]),
@@ -256,7 +256,7 @@ def transport(
     )
 
 
-def escape_paths(
+def trace_escape_paths(
     stack: LayerStack,
     *,
     photons: int,
@@ -269,8 +269,8 @@ def escape_paths(
     Parameters
     ----------
     stack, photons, rng, batches, threads
-        As in `transport`. Take the smallest absorption of interest: reweighting to a smaller one
-        than that of `stack` multiplies the weights of long paths and the noise explodes.
+        As in `trace_photons`. Take the smallest absorption of interest: reweighting to a smaller
+        one than that of `stack` multiplies the weights of long paths and the noise explodes.
 
     Returns
     -------
@@ -285,7 +285,7 @@ def escape_paths(
     Examples
     --------
     >>> skin = LayerStack((Layer(inf, 0.1, 10.0, 0.8, 1.4),))
-    >>> batches = escape_paths(skin, photons=2000, rng=np.random.default_rng(0))
+    >>> batches = trace_escape_paths(skin, photons=2000, rng=np.random.default_rng(0))
     >>> len(batches), batches[0].path_mm.shape[1]
     (20, 1)
     """
@@ -301,7 +301,7 @@ def escape_paths(
         kept = events[: walk(table, edges2, count, seeds[batch], tally, events)].copy()
         return EscapePaths(kept[:, 0], np.sqrt(kept[:, 1]), kept[:, 2:], count)
 
-    return tuple(in_threads(run, batches, threads))
+    return tuple(run_in_threads(run, batches, threads))
 
 
 def _lanes_work() -> bool:
@@ -339,7 +339,7 @@ def batch_seeds(rng: np.random.Generator, batches: int) -> NDArray[np.uint64]:
     return rng.integers(1, 2**64, size=(batches, 4), dtype=np.uint64)
 
 
-def in_threads(run: Callable[[int], _T], batches: int, threads: int) -> list[_T]:
+def run_in_threads(run: Callable[[int], _T], batches: int, threads: int) -> list[_T]:
     """Return what `run` gives for each batch, in order; it must release the interpreter."""
     if threads == 1:
         return [run(batch) for batch in range(batches)]

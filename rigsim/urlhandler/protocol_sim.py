@@ -22,14 +22,14 @@ from capture.rig import load_rig
 from rigsim import world as worlds
 from rigsim.boxes.faults import Faults
 from rigsim.world import World
-from rigsim.world.link import Link, LinkStalled, Unplugged
+from rigsim.world.link import Link, LinkStalled, LinkUnplugged
 from rigsim.world.rig_boxes import BOXES
 
 REAL_POLL_S = 0.002
 """How often a port on the real clock looks whether another thread did something."""
 
 
-def world_of_url(url: str) -> tuple[World, str]:
+def world_from_url(url: str) -> tuple[World, str]:
     """Return the world of a ``sim://`` URL, made if need be, and the name of the box.
 
     Raises
@@ -47,7 +47,7 @@ def world_of_url(url: str) -> tuple[World, str]:
         raise ValueError(f"{url}: got world and name, which mean the same; give one")
     name = settings.pop("world", settings.pop("name", url))
     try:
-        return _with_box(worlds.get(name), box, url), box
+        return _with_box(worlds.get_world(name), box, url), box
     except KeyError:
         pass
     seed, clock = settings.pop("seed", "0"), settings.pop("clock", "virtual")
@@ -90,7 +90,7 @@ class Serial(SerialBase):
             raise SerialException("Port must be configured before it can be used.")
         if self.is_open:
             raise SerialException("Port is already open.")
-        world, box = world_of_url(self._port)
+        world, box = world_from_url(self._port)
         with world.lock:
             world.advance(world.now)
             link = world.link(box)
@@ -98,7 +98,7 @@ class Serial(SerialBase):
                 raise SerialException(errno.EAGAIN, f"Could not exclusively lock port {self._port}")
             try:
                 link.attach(world.now)
-            except Unplugged as exc:
+            except LinkUnplugged as exc:
                 raise SerialException(errno.ENOENT, f"could not open port {self._port}") from exc
         self._world, self._link = world, link
         self.is_open = True
@@ -127,7 +127,7 @@ class Serial(SerialBase):
             world.advance(world.now)
             try:
                 link.check(world.now)
-            except Unplugged as exc:
+            except LinkUnplugged as exc:
                 raise OSError(errno.EIO, "Input/output error") from exc
             return link.waiting
 
@@ -141,7 +141,7 @@ class Serial(SerialBase):
                 due = world.advance(world.now)
                 try:
                     link.check(world.now)
-                except Unplugged as exc:
+                except LinkUnplugged as exc:
                     what = "device reports readiness to read but returned no data"
                     raise SerialException(f"{what} (device disconnected?)") from exc
                 data += link.take(size - len(data))
@@ -161,7 +161,7 @@ class Serial(SerialBase):
                 world.advance(world.now)
                 try:
                     link.send(data, world.now)
-                except Unplugged as exc:
+                except LinkUnplugged as exc:
                     raise SerialException(f"write failed: [Errno {errno.EIO}]") from exc
                 except LinkStalled as exc:
                     if world.now >= until:
@@ -181,6 +181,6 @@ class Serial(SerialBase):
             world.advance(world.now)
             try:
                 link.check(world.now)
-            except Unplugged as exc:
+            except LinkUnplugged as exc:
                 raise termios.error(errno.EIO, "Input/output error") from exc
             link.flush()

@@ -2,7 +2,7 @@
 
 from capture.devices import camera
 from capture.rig import RigError
-from rigsim.world.world import get_by_name_or_box
+from rigsim.world.world import find_world
 
 
 def open_camera(rest: str) -> camera.Camera:
@@ -14,7 +14,7 @@ def open_camera(rest: str) -> camera.Camera:
     if not (name and slash and view_name):
         raise camera.CameraUrlError(f"sim://{rest}: got {rest!r}, expected WORLD/VIEW")
     try:
-        return get_by_name_or_box(name).camera(view_name)
+        return find_world(name).camera(view_name)
     except (KeyError, RigError) as exc:
         raise camera.CameraUrlError(
             f"sim://{rest}: {exc.args[0]}; open its box first, by "

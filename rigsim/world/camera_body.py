@@ -21,7 +21,7 @@ from rigsim.arrays import UInt16Array
 from rigsim.boxes.faults import Faults
 from rigsim.world.light_record import Light
 
-ISO = (50, 25_600)
+ISO_RANGE = (50, 25_600)
 
 
 EXPOSURE_RANGE_S = (1.0 / 8000.0, 30.0)
@@ -133,7 +133,7 @@ class CameraBody:
         """Set an exposure within what the camera can do, and return it."""
         self.exposure = Exposure(
             min(max(want.exposure_s, EXPOSURE_RANGE_S[0]), EXPOSURE_RANGE_S[1]),
-            min(max(want.iso, ISO[0]), ISO[1]),
+            min(max(want.iso, ISO_RANGE[0]), ISO_RANGE[1]),
         )
         return self.exposure
 
@@ -167,7 +167,7 @@ class CameraBody:
             self.missed_edges += 1
 
     @property
-    def reading_out(self) -> bool:
+    def is_exposing(self) -> bool:
         """Whether an exposure or its read-out is under way."""
         return self.world.now < self._busy_until
 

@@ -48,7 +48,7 @@ class CameraService:
 
         class Handler(socketserver.BaseRequestHandler):
             def handle(self) -> None:
-                service.converse(self.request)
+                service.serve_client(self.request)
 
         class Server(socketserver.ThreadingTCPServer):
             daemon_threads = True
@@ -74,7 +74,7 @@ class CameraService:
                     connection.shutdown(socket.SHUT_RDWR)
         self._server.server_close()
 
-    def converse(self, connection: socket.socket) -> None:
+    def serve_client(self, connection: socket.socket) -> None:
         """Answer one client until it hangs up."""
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         with self._lock:
@@ -112,7 +112,7 @@ class CameraService:
                 fault = f"view: got {name!r}, expected one of {', '.join(self.addresses)}"
             elif current is not None or (holder is not None and not _hung_up(holder)):
                 fault, error = f"view {name!r}: another program has this camera", "CameraBusy"
-            elif self.world.camera(name).reading_out:
+            elif self.world.camera(name).is_exposing:
                 # armed now, it would miss its trigger
                 fault, error = f"view {name!r}: is reading out a frame of before", "CameraBusy"
             else:

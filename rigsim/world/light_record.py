@@ -28,7 +28,7 @@ class LightRecord:
         self.pops: list[FlashPop] = []
         self.switched: list[SwitchedLight] = []
 
-    def keep(self, light: Light) -> None:
+    def add(self, light: Light) -> None:
         """Keep a pop, or a stretch of light that has ended."""
         if isinstance(light, FlashPop):
             self.pops.append(light)
@@ -36,7 +36,7 @@ class LightRecord:
             self.switched.append(light)
 
     def between(
-        self, start: float, end: float, going_on: Sequence[SwitchedLight]
+        self, start: float, end: float, ongoing: Sequence[SwitchedLight]
     ) -> tuple[Light, ...]:
         """Return pops from `start` to `end`, both included, and other light clipped to them, s.
 
@@ -50,7 +50,7 @@ class LightRecord:
         first = bisect_right(self.switched, start, key=lambda light: light.t_off_s)
         clipped = (
             replace(light, t_on_s=max(light.t_on_s, start), t_off_s=min(light.t_off_s, end))
-            for light in [*self.switched[first:], *going_on]
+            for light in [*self.switched[first:], *ongoing]
             if light.t_on_s < end and light.t_off_s > start
         )
         return (*self.pops_between(start, end), *clipped)

@@ -18,10 +18,10 @@ STALL_BUFFER_BYTES = 256
 """What the line holds while a stalled box takes nothing."""
 BOOT_BANNER = b"\r\nrst:0x1 (POWERON),boot:0x13\r\nheap 203412 free\r\n"
 
-Record = Callable[[float, str, bytes], None]
+RecordBytes = Callable[[float, str, bytes], None]
 
 
-class Unplugged(Exception):
+class LinkUnplugged(Exception):
     """The cable is out."""
 
 
@@ -46,7 +46,7 @@ class Link:
     """
 
     def __init__(
-        self, box: Controller, *, faults: Faults, rng: np.random.Generator, record: Record
+        self, box: Controller, *, faults: Faults, rng: np.random.Generator, record: RecordBytes
     ) -> None:
         self.box = box
         self.attached = False
@@ -67,7 +67,7 @@ class Link:
     # the host's end ---------------------------------------------------------------------------
 
     def attach(self, now: float) -> None:
-        """Open the port; raise `Unplugged` when nothing is there."""
+        """Open the port; raise `LinkUnplugged` when nothing is there."""
         self._first_open = min(self._first_open, now)
         self._opened_at = now
         self.check(now)
@@ -82,10 +82,10 @@ class Link:
         self._received.clear()
 
     def check(self, now: float) -> None:
-        """Raise `Unplugged` while the cable is out; a port opened before stays dead after."""
+        """Raise `LinkUnplugged` while the cable is out; a port opened before stays dead after."""
         out = self._first_open + self._faults.unplug_after
         if now >= out and (now < out + self._faults.replug_after or self._opened_at < out):
-            raise Unplugged
+            raise LinkUnplugged
 
     def send(self, data: bytes, now: float) -> None:
         """Send bytes to the box; raise `LinkStalled` when they do not fit."""

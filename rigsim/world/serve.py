@@ -20,7 +20,7 @@ from typing import Self
 
 from capture.rig import Rig, load_rig
 from rigsim.boxes.faults import Faults
-from rigsim.world.box_ends import BoxEnd, PtyEnd, TcpEnd
+from rigsim.world.box_endpoints import BoxEndpoint, PtyEndpoint, TcpEndpoint
 from rigsim.world.camera_service import CameraService
 from rigsim.world.world import Scene, World
 
@@ -35,7 +35,7 @@ class ServeError(ValueError):
     """An address that cannot be served on."""
 
 
-def serve(
+def serve_world(
     rig_name: str | Rig,
     *,
     pty: bool = False,
@@ -46,7 +46,7 @@ def serve(
     faults: Faults | None = None,
     shots_made: Mapping[str, int] | None = None,
     world: World | None = None,
-) -> Served:
+) -> ServedWorld:
     """Serve the boxes and cameras of a rig until the result is closed.
 
     Parameters
@@ -79,7 +79,7 @@ def serve(
 
     Examples
     --------
-    >>> with serve("flash") as served:
+    >>> with serve_world("flash") as served:
     ...     sorted(served.addresses)
     ['cam', 'flash']
     """
@@ -91,7 +91,7 @@ def serve(
         )
     if world.virtual:
         raise ServeError("clock: got a virtual one, expected 'real': other programs share our time")
-    return Served(world, pty=pty, host_port=_host_port(tcp, allow_remote))
+    return ServedWorld(world, pty=pty, host_port=_host_port(tcp, allow_remote))
 
 
 def _host_port(text: str, allow_remote: bool) -> tuple[str, int]:
@@ -113,7 +113,7 @@ def _host_port(text: str, allow_remote: bool) -> tuple[str, int]:
     return host, int(port)
 
 
-class Served:
+class ServedWorld:
     """Boxes and cameras being served; close it to stop.
 
     Attributes
@@ -131,12 +131,12 @@ class Served:
         self._selector = selectors.DefaultSelector()
         self._wake_read, self._wake_write = os.pipe()
         self._selector.register(self._wake_read, selectors.EVENT_READ, lambda: None)
-        self._ends: list[BoxEnd] = []
+        self._ends: list[BoxEndpoint] = []
         host, port = host_port
         try:
             for name in world.rig.boxes:
                 link = world.link(name)
-                end = PtyEnd(world, link) if pty else TcpEnd(world, link, host, port)
+                end = PtyEndpoint(world, link) if pty else TcpEndpoint(world, link, host, port)
                 self._ends.append(end)
                 end.start(self._selector)
                 self.addresses[name] = end.address
@@ -183,7 +183,7 @@ class Served:
         world = self.world
         while not self._closing.is_set():
             pause = min(MAX_IDLE_S, world.deadline() - world.now)
-            if any(end.stalled for end in self._ends):
+            if any(end.is_stalled for end in self._ends):
                 pause = min(pause, STALL_POLL_S)
             for key, _ in self._selector.select(max(0.0, pause)):
                 key.data()

@@ -23,16 +23,21 @@ from typing import Final
 
 import numpy as np
 
-AIR_MBAR: Final = 1013.25
+ATMOSPHERE_MBAR: Final = 1013.25
 """Standard atmosphere, mbar (ISO 2533:1975)."""
-OPEN_RIM_ML_PER_S_MBAR: Final = 1.0
+OPEN_RIM_LEAK_ML_PER_S_MBAR: Final = 1.0
 """Leak of a head that touches nothing, mL/s per mbar: about a hundred pumps."""
-SKIN_ML_PER_MBAR: Final = {"forehead": 4e-4, "cheek": 8e-4, "chin": 6e-4, "abdomen": 1e-3}
+SKIN_COMPLIANCE_ML_PER_MBAR: Final = {
+    "forehead": 4e-4,
+    "cheek": 8e-4,
+    "chin": 6e-4,
+    "abdomen": 1e-3,
+}
 """What skin rises into the cup per suction, mL/mbar: tenths of a millimetre over the rim's area at
 tens of mbar, more where it is loose. This project's choice; other sites are as the chin."""
-ROOM_C: Final = 24.0
+ROOM_TEMPERATURE_C: Final = 24.0
 """Temperature that a camera without cooling comes to, degrees Celsius."""
-WARMS_TAU_S: Final = 120.0
+CAMERA_WARMING_TAU_S: Final = 120.0
 """Time constant of a camera's warming, s."""
 
 
@@ -90,7 +95,7 @@ class SuctionMechanics:
     @property
     def compliance_ml_per_mbar(self) -> float:
         """Air to be taken per suction, mL/mbar."""
-        return self.cup_ml / AIR_MBAR + self.skin_ml_per_mbar
+        return self.cup_ml / ATMOSPHERE_MBAR + self.skin_ml_per_mbar
 
     @property
     def time_constant_s(self) -> float:
@@ -110,7 +115,7 @@ class SuctionMechanics:
 class CameraCooler:
     """Keeps the camera at one temperature until it fails."""
 
-    kept_c: float
+    setpoint_c: float
     """Degrees Celsius."""
     fails_after_s: float = math.inf
     """World time, s."""
@@ -126,8 +131,10 @@ class CameraCooler:
         """
         warm_s = t_s - self.fails_after_s
         if warm_s <= 0.0:
-            return self.kept_c
-        return ROOM_C + (self.kept_c - ROOM_C) * math.exp(-warm_s / WARMS_TAU_S)
+            return self.setpoint_c
+        return ROOM_TEMPERATURE_C + (self.setpoint_c - ROOM_TEMPERATURE_C) * math.exp(
+            -warm_s / CAMERA_WARMING_TAU_S
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +166,7 @@ class _Phase:
         return self.t_s - math.log1p(-share) / self.rate_per_s if share < 1.0 else math.inf
 
 
-class SuckedHead:
+class ProbeHead:
     """The probe's head on, or off, the skin; all that happens to it goes forward in time.
 
     Parameters
@@ -181,7 +188,7 @@ class SuckedHead:
 
     Examples
     --------
-    >>> head = SuckedHead(CameraCooler(5.0), seed=1)
+    >>> head = ProbeHead(CameraCooler(5.0), seed=1)
     >>> head.place("cheek", 45.0, 0.0)
     >>> head.draw(60.0, 1.0)
     >>> round(head.suction_mbar(1.3)), round(head.suction_mbar(4.0))
@@ -222,7 +229,7 @@ class SuckedHead:
         plain = SuctionMechanics()
         rng = np.random.default_rng([self._seed, 0x7375, zlib.crc32(site.encode())])
         rim, skin = float(rng.uniform(0.005, 0.02)), float(rng.uniform(0.8, 1.2))
-        give = SKIN_ML_PER_MBAR.get(site, SKIN_ML_PER_MBAR["chin"])
+        give = SKIN_COMPLIANCE_ML_PER_MBAR.get(site, SKIN_COMPLIANCE_ML_PER_MBAR["chin"])
         if site == "phantom":
             rim, give = 0.1 * rim, 0.0
         leak = plain.regulator_ml_per_s_mbar * (rim + self._leak)
@@ -240,19 +247,19 @@ class SuckedHead:
         self.mechanics = self._mechanics(site)
         self._begin(now, site=site, angle_deg=angle_deg, placed=bool(site))
 
-    def take_away(self, now: float) -> None:
+    def remove(self, now: float) -> None:
         """Be taken off, or come off."""
         self.advance(now)
         last = self._phases[-1]
         if last.placed:
             self._begin(now, site="", angle_deg=last.angle_deg, placed=False)
 
-    def draw(self, wanted_mbar: float, now: float) -> None:
+    def start_suction(self, target_mbar: float, now: float) -> None:
         """Have the vent closed and the pump switched on."""
-        if not 0.0 < wanted_mbar < math.inf:
-            raise SuctionError(f"wanted_mbar: got {wanted_mbar}, expected mbar > 0")
+        if not 0.0 < target_mbar < math.inf:
+            raise SuctionError(f"wanted_mbar: got {target_mbar}, expected mbar > 0")
         self.advance(now)
-        self._vented, self._wanted_mbar = False, wanted_mbar
+        self._vented, self._wanted_mbar = False, target_mbar
         if math.isinf(self._lifts_at_s):
             self._lifts_at_s = now + self._lifts_after_s
         self._renew(now)
@@ -295,7 +302,7 @@ class SuckedHead:
         return HeadState(phase.site, phase.angle_deg, phase.placed, suction_mbar, camera_c)
 
     @property
-    def changes_s(self) -> tuple[float, ...]:
+    def change_times_s(self) -> tuple[float, ...]:
         """World times at which something was switched or changed, s, rising."""
         return tuple(phase.t_s for phase in self._phases)
 
@@ -308,7 +315,7 @@ class SuckedHead:
         law = self.mechanics
         from_mbar = self._phases[-1].suction_mbar(now) if self._phases else 0.0
         share = 1.0 / law.compliance_ml_per_mbar
-        leak = law.leak_ml_per_s_mbar if placed else OPEN_RIM_ML_PER_S_MBAR
+        leak = law.leak_ml_per_s_mbar if placed else OPEN_RIM_LEAK_ML_PER_S_MBAR
         drive, rate, regulated_mbar = 0.0, leak, math.inf
         if self._vented:
             rate += law.vent_ml_per_s_mbar

@@ -30,7 +30,7 @@ from rigsim.world.camera_body import CameraBody
 from rigsim.world.light_record import Light, LightRecord
 from rigsim.world.link import Link
 from rigsim.world.rig_boxes import make_box
-from rigsim.world.suction import CameraCooler, HeadState, SuckedHead
+from rigsim.world.suction import CameraCooler, HeadState, ProbeHead
 from rigsim.world.taped_skin import GripState, TapedSkin
 
 TRANSCRIPT_LINES = 4096
@@ -124,10 +124,10 @@ class World:
             stiffness = self.faults.skin_stiff
             self.skin = TapedSkin(self.rig.caliper, seed=seed, stiffness=stiffness)
             self._note_grip(0.0)
-        self.head: SuckedHead | None = None
+        self.head: ProbeHead | None = None
         if self.rig.probe is not None:
             kept_c, fails_after_s = self.rig.probe.camera_c, self.faults.camera_warms_after
-            self.head = SuckedHead(
+            self.head = ProbeHead(
                 CameraCooler(kept_c, fails_after_s=fails_after_s),
                 seed=seed,
                 leak=self.faults.pump_leak,
@@ -150,7 +150,7 @@ class World:
             rig=self.rig,
             rng=self.rng_for("box", name),
             faults=self.faults,
-            on_light=self._light.keep,
+            on_light=self._light.add,
             on_trigger=self._trigger,
             on_grip=self._note_grip,
             skin=self.skin,
@@ -285,13 +285,13 @@ class World:
             return self.head.state_at(t_s)
 
     @property
-    def heads(self) -> list[tuple[float, HeadState]]:
+    def head_history(self) -> list[tuple[float, HeadState]]:
         """World times, s, at which something changed under the probe's head, and its states then.
 
         Between them the suction relaxes; `head_at` tells it for any time.
         """
         with self.lock:
-            times = () if self.head is None else self.head.changes_s
+            times = () if self.head is None else self.head.change_times_s
             return [(t_s, self.head_at(t_s)) for t_s in times]
 
     def _note_grip(self, now: float) -> None:
@@ -341,7 +341,7 @@ class World:
 
     def register(self, name: str) -> str:
         """Make the world reachable as ``sim://flash?world=NAME`` and return `name`."""
-        other = _BENCH.setdefault(name, self)
+        other = _WORLDS.setdefault(name, self)
         if other is not self:
             raise ValueError(f"name: got {name!r}, which another world has; unregister it first")
         self._name = name
@@ -349,15 +349,15 @@ class World:
 
     def unregister(self) -> None:
         """Take the world's name away; doing so twice is allowed."""
-        if _BENCH.get(self._name) is self:
-            del _BENCH[self._name]
+        if _WORLDS.get(self._name) is self:
+            del _WORLDS[self._name]
         self._name = ""
 
 
-_BENCH: dict[str, World] = {}
+_WORLDS: dict[str, World] = {}
 
 
-def get(name: str) -> World:
+def get_world(name: str) -> World:
     """Return the registered world called `name`.
 
     Raises
@@ -365,13 +365,13 @@ def get(name: str) -> World:
     KeyError
         When there is none.
     """
-    if name not in _BENCH:
-        known = ", ".join(_BENCH) or "none"
+    if name not in _WORLDS:
+        known = ", ".join(_WORLDS) or "none"
         raise KeyError(f"world: got {name!r}, expected a registered one: {known}")
-    return _BENCH[name]
+    return _WORLDS[name]
 
 
-def get_by_name_or_box(name: str) -> World:
+def find_world(name: str) -> World:
     """Return the registered world called `name`, or the only one without a name of that box.
 
     Parameters
@@ -385,14 +385,14 @@ def get_by_name_or_box(name: str) -> World:
     KeyError
         When there is none, or several worlds without a name have that box.
     """
-    unnamed = [url for url in _BENCH if url.partition("?")[0] == f"sim://{name}"]
-    if name in _BENCH or not unnamed:
-        return get(name)
+    unnamed = [url for url in _WORLDS if url.partition("?")[0] == f"sim://{name}"]
+    if name in _WORLDS or not unnamed:
+        return get_world(name)
     if len(unnamed) > 1:
         raise KeyError(
             f"world: got {name!r}, of which there are {len(unnamed)}, expected one with a name"
         )
-    return _BENCH[unnamed[0]]
+    return _WORLDS[unnamed[0]]
 
 
 def _dark_frame(view: View, rng: np.random.Generator) -> UInt16Array:

@@ -19,9 +19,9 @@ from model.texture_statistics.histograms import GroupHistograms
 from model.texture_statistics.space import TextureSpace
 from reconstruction.correspondence import common_regions
 from reconstruction.correspondence.common_parameterization import CommonFrame
-from rigsim.population.population import table_1
+from rigsim.population.population import draw_population
 from skinrig import consent
-from skinrig.analysing.brdf_space_figures import new_figure, png_of
+from skinrig.analysing.brdf_space_figures import encode_figure, new_figure
 from skinrig.appearances import face_textures
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.fitting import traits
@@ -29,7 +29,7 @@ from skinrig.fitting.traits import TraitFitError
 from skinrig.traits import albedo_vectors
 from skinrig.traits import labels as trait_labels
 from skinrig.traits.albedo_vectors import AlbedoSample
-from skinrig.traits.truth import ALBEDO_NOISE, CommonFaces, labels_of
+from skinrig.traits.truth import ALBEDO_NOISE, CommonFaces, label_members
 
 HISTOGRAM_BINS: Final = 128
 ALL_GROUPS: Final = "all"
@@ -96,7 +96,7 @@ class AlbedoAnalysis:
         }
 
 
-def analyse_measured(
+def analyze_measured(
     out: Path,
     appearances: Sequence[Path],
     *,
@@ -132,21 +132,21 @@ def analyse_measured(
     groups = {ALL_GROUPS: np.ones(len(names), np.bool_)}
     if labels is not None:
         table = trait_labels.read(labels, names)
-        groups |= complements(table.binary)
+        groups |= add_complement_groups(table.binary)
     samples = []
     for face in faces:
         tell(face.name)
         samples.append(traits.albedo_sample(face, frame))
     seen = [face.appearance for face in faces]
     found = dataclasses.replace(
-        analyse(samples, names, groups, frame),
+        analyze(samples, names, groups, frame),
         source="measured" if any(one.source == "measured" for one in seen) else "simulated",
         consent=tuple(consent.merge_consent(*seen)),
     )
     return _write(out, found)
 
 
-def analyse_simulated(
+def analyze_simulated(
     out: Path,
     *,
     people: int = 87,
@@ -154,7 +154,7 @@ def analyse_simulated(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> AlbedoAnalysis:
-    """Analyse the simulated population of table 1; parameters as of `analyse_measured`.
+    """Analyse the simulated population of table 1; parameters as of `analyze_measured`.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def analyse_simulated(
         Of the population.
     """
     tell = progress or (lambda text: None)
-    everybody = table_1(seed=seed)
+    everybody = draw_population(seed=seed)
     if not 2 <= people <= len(everybody):
         raise TraitFitError(f"people: got {people}, expected 2 to {len(everybody)}")
     chosen = np.random.default_rng([seed, 1]).permutation(len(everybody))[:people]
@@ -180,14 +180,16 @@ def analyse_simulated(
         samples.append(faces.albedo(person, noise=ALBEDO_NOISE, rng=rng))
     known = sorted({label for person in some for label in person.labels})
     binary = {
-        name: flags for name, flags in labels_of(some, known).items() if 0 < flags.sum() < len(some)
+        name: flags
+        for name, flags in label_members(some, known).items()
+        if 0 < flags.sum() < len(some)
     }
     groups = {ALL_GROUPS: np.ones(len(some), np.bool_)} | binary
     names = tuple(person.name for person in some)
-    return _write(out, analyse(samples, names, groups, faces.frame))
+    return _write(out, analyze(samples, names, groups, faces.frame))
 
 
-def complements(binary: Mapping[str, BoolArray]) -> dict[str, BoolArray]:
+def add_complement_groups(binary: Mapping[str, BoolArray]) -> dict[str, BoolArray]:
     """Return each group that has members, and of those with a trait also those without."""
     out = {}
     for name, flags in binary.items():
@@ -197,7 +199,7 @@ def complements(binary: Mapping[str, BoolArray]) -> dict[str, BoolArray]:
     return out
 
 
-def analyse(
+def analyze(
     samples: Sequence[AlbedoSample],
     names: tuple[str, ...],
     groups: Mapping[str, BoolArray],
@@ -206,13 +208,13 @@ def analyse(
     """Analyse albedo maps that lie in one common map."""
     images = [one.r_d for one in samples]
     texture = TextureSpace.fit(
-        [albedo_vectors.encoded(image, VECTOR_KIND) for image in images],
+        [albedo_vectors.encode_albedo(image, VECTOR_KIND) for image in images],
         valid=[one.valid for one in samples],
     )
     histograms, explained, scores = {}, {}, {}
     left_out: list[tuple[str, str]] = []
     for region in ("face", "beard", "no-beard"):
-        inside = common_regions.region(region, frame)
+        inside = common_regions.region_mask(region, frame)
         masks = [inside & one.valid for one in samples]
         fewest = min(int(mask.sum()) for mask in masks)
         if fewest < traits.MIN_REGION_PIXELS:
@@ -307,4 +309,4 @@ def _figure(found: AlbedoAnalysis) -> bytes:
         axes.set_title(f"{one.names[g]} ({one.members[g]})", fontsize=9)
         axes.tick_params(labelsize=7)
     figure.suptitle(f"R_d, camera RGB, {region}: mean histograms with standard errors", fontsize=9)
-    return png_of(figure, dpi=110)
+    return encode_figure(figure, dpi=110)

@@ -18,7 +18,7 @@ from reconstruction.brdf_basis.space import SpaceCurve
 from skinrig import consent
 from skinrig.analysing import brdf_space_datasets, brdf_space_figures
 from skinrig.analysing.brdf_space_datasets import Dataset
-from skinrig.appearances.face_textures import valid_of
+from skinrig.appearances.face_textures import valid_texels
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.editing import surface_mixtures
 from skinrig.editing.surface_mixtures import SurfaceMixtureError
@@ -42,7 +42,7 @@ class AnalysisError(ValueError):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Analysis:
+class BrdfRankAnalysis:
     """One curve of fig. 15, and the mean BRDFs of fig. 14."""
 
     data: Dataset
@@ -73,18 +73,21 @@ class Analysis:
             "held_out_error": _numbers(found.held_out),
             "held_out_stderr": _numbers(found.held_out_stderr),
             "noise": _numbers([self.data.noise])[0],
-            "plateau": found.plateau(),
+            "plateau": found.plateau_rank(),
             "plateau_by_share": {
-                f"{share:g}": found.plateau(share=share) for share in brdf_space.PLATEAU_FRACTIONS
+                f"{share:g}": found.plateau_rank(fraction=share)
+                for share in brdf_space.PLATEAU_FRACTIONS
             },
-            "plateau_by_largest_rank": {str(most): found.plateau(most=most) for most in tops},
+            "plateau_by_largest_rank": {
+                str(most): found.plateau_rank(max_rank=most) for most in tops
+            },
             "rank_at_noise": self.above_noise,
             "points_lost": self.data.lost,
-            "left_out": [list(row) for row in found.left_out],
+            "left_out": [list(row) for row in found.omitted],
         }
 
 
-def analyse(
+def analyze(
     data: Dataset,
     basis: BrdfBasis,
     *,
@@ -93,7 +96,7 @@ def analyse(
     ranks: Sequence[int] = brdf_space.CURVE_RANKS,
     method: brdf_space.Method = "shares",
     rng: np.random.Generator,
-) -> Analysis:
+) -> BrdfRankAnalysis:
     """Make the curve and the means of one dataset.
 
     Parameters
@@ -107,7 +110,7 @@ def analyse(
     groups
         Which labels are averaged together, by name, (labels,) bool each; None: each for itself.
     ranks, method
-        See `reconstruction.brdf_basis.space.curve`.
+        See `reconstruction.brdf_basis.space.compute_error_curve`.
     rng
         Chooses the points.
 
@@ -131,7 +134,7 @@ def analyse(
         out[rng.permutation(count)[: round(HELD_OUT_FRACTION * count)]] = True
     trained = rng.permutation(np.flatnonzero(~out))[:MAX_TRAINING_POINTS]
     tried = rng.permutation(np.flatnonzero(out))[:MAX_HELD_OUT_POINTS]
-    curve = brdf_space.curve(
+    curve = brdf_space.compute_error_curve(
         data.weights[trained],
         basis,
         ranks=ranks,
@@ -148,10 +151,10 @@ def analyse(
         among = members[data.label]
         if among.any():
             means[name] = data.weights[among].mean(axis=0)
-    return Analysis(data, curve, "people" if by_label else "points", means)
+    return BrdfRankAnalysis(data, curve, "people" if by_label else "points", means)
 
 
-def analyse_simulated(
+def analyze_simulated(
     out: Path,
     *,
     points: int = N_POINTS_PER_DATASET,
@@ -159,7 +162,7 @@ def analyse_simulated(
     method: brdf_space.Method = "shares",
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
-) -> tuple[Analysis, ...]:
+) -> tuple[BrdfRankAnalysis, ...]:
     """Analyse one simulated person, dataset A and dataset B, and write the figures.
 
     Parameters
@@ -171,28 +174,28 @@ def analyse_simulated(
     points_each
         Points of each of the 87 people of dataset B.
     method
-        See `reconstruction.brdf_basis.space.curve`.
+        See `reconstruction.brdf_basis.space.compute_error_curve`.
     seed
         Of points, noise and factorizations.
     progress
         Called with a line for each face.
     """
-    basis = brdf_tables.default()
+    basis = brdf_tables.default_basis()
     rng = np.random.default_rng([seed, 70])
     sets = (
-        brdf_space_datasets.one_person(points, rng=rng),
-        brdf_space_datasets.dataset_a(points, progress=progress, rng=rng),
-        brdf_space_datasets.dataset_b(points_each, progress=progress, rng=rng),
+        brdf_space_datasets.sample_one_person(points, rng=rng),
+        brdf_space_datasets.build_dataset_a(points, progress=progress, rng=rng),
+        brdf_space_datasets.build_dataset_b(points_each, progress=progress, rng=rng),
     )
     found = tuple(
-        analyse(data, basis, by_label=data.name == "dataset B", method=method, rng=rng)
+        analyze(data, basis, by_label=data.name == "dataset B", method=method, rng=rng)
         for data in sets
     )
     _write(out, found, basis, spheres=found[1], method=method, source="simulated")
     return found
 
 
-def analyse_measured(
+def analyze_measured(
     out: Path,
     folders: Sequence[Path],
     *,
@@ -201,13 +204,13 @@ def analyse_measured(
     points_each: int = N_POINTS_PER_FACE,
     method: brdf_space.Method = "shares",
     seed: int = 0,
-) -> tuple[Analysis, ...]:
+) -> tuple[BrdfRankAnalysis, ...]:
     """Analyse the lobes of measured faces, and write the figures.
 
     Parameters
     ----------
     out
-        Folder to write, see `analyse_simulated`.
+        Folder to write, see `analyze_simulated`.
     folders
         APPEARANCE/ folders of dome sessions with lobes.
     labels
@@ -218,7 +221,7 @@ def analyse_measured(
     points_each
         Texels of each face.
     method, seed
-        See `analyse_simulated`.
+        See `analyze_simulated`.
 
     Raises
     ------
@@ -236,9 +239,9 @@ def analyse_measured(
     if len(set(names)) < len(names):
         raise UnusableError(f"appearances: got {', '.join(names)}, one of them twice")
     table = None if labels is None else trait_labels.read(labels, names)
-    materials = brdf_tables.default() if basis is None else brdf_tables.load(basis)
+    materials = brdf_tables.default_basis() if basis is None else brdf_tables.load(basis)
     rng = np.random.default_rng([seed, 71])
-    found = [_measured(folder, materials, points_each, rng) for folder in folders]
+    found = [_read_weights(folder, materials, points_each, rng) for folder in folders]
     sets = [
         Dataset(name, shares, np.zeros(len(shares), np.int64), (name,), np.nan, lost)
         for name, (shares, lost, _) in zip(names, found, strict=True)
@@ -252,10 +255,10 @@ def analyse_measured(
     groups = None if table is None else dict(table.binary)
     how: dict[str, Any] = {"method": method, "rng": rng}
     done = tuple(
-        _of_face(data, materials, kept, **how) for data, kept in zip(sets, lobes, strict=False)
+        _analyze_face(data, materials, kept, **how) for data, kept in zip(sets, lobes, strict=False)
     )
     for data in sets[len(lobes) :]:
-        done += (analyse(data, materials, by_label=True, groups=groups, **how),)
+        done += (analyze(data, materials, by_label=True, groups=groups, **how),)
     told = [store.read_document(folder) for folder in folders]
     source = "measured" if any(one.source == "measured" for one in told) else "simulated"
     agreed = consent.merge_consent(*told)
@@ -263,17 +266,19 @@ def analyse_measured(
     return done
 
 
-def _of_face(data: Dataset, materials: BrdfBasis, lobes: int, **how: Any) -> Analysis:
+def _analyze_face(
+    data: Dataset, materials: BrdfBasis, lobes: int, **options: Any
+) -> BrdfRankAnalysis:
     """Analyse one face up to the lobes it was reconstructed with, and say why no further."""
     ranks = [rank for rank in brdf_space.CURVE_RANKS if rank <= lobes]
-    one = analyse(data, materials, by_label=False, ranks=ranks, **how)
+    one = analyze(data, materials, by_label=False, ranks=ranks, **options)
     why = f"the face has {lobes} lobes; `skinrig reconstruct --rank 24` keeps more"
     beyond = tuple((rank, why) for rank in brdf_space.CURVE_RANKS if rank > lobes)
-    curve = dataclasses.replace(one.curve, left_out=(*one.curve.left_out, *beyond[:1]))
+    curve = dataclasses.replace(one.curve, omitted=(*one.curve.omitted, *beyond[:1]))
     return dataclasses.replace(one, curve=curve)
 
 
-def _measured(
+def _read_weights(
     folder: Path, materials: BrdfBasis, count: int, rng: np.random.Generator
 ) -> tuple[Float64Array, int, int]:
     """Return shares of the materials at random texels, how many are no use, and its lobes."""
@@ -290,21 +295,21 @@ def _measured(
             f"({lobes.materials[0]}, ...), expected {materials.size} ({materials.names[0]}, ...); "
             "say --basis DIR where they were fitted with other files than the built-in ones"
         )
-    known = np.logical_and.reduce([valid_of(one) for one in lobes.maps])
+    known = np.logical_and.reduce([valid_texels(one) for one in lobes.maps])
     at = rng.permutation(np.flatnonzero(known))[:count]
     if not len(at):
         raise AnalysisError(f"{folder}: none of its texels has valid lobes")
     mixed = lobes.weights().reshape(-1, len(lobes.mix))[at] @ lobes.mix
-    kept_rows = brdf_space.usable(mixed, materials)
+    kept_rows = brdf_space.is_constrained(mixed, materials)
     return mixed[kept_rows], int(np.count_nonzero(~kept_rows)), len(lobes.mix)
 
 
 def _write(
     out: Path,
-    found: Sequence[Analysis],
+    found: Sequence[BrdfRankAnalysis],
     basis: BrdfBasis,
     *,
-    spheres: Analysis,
+    spheres: BrdfRankAnalysis,
     method: str,
     source: str,
     agreed: Sequence[Mapping[str, Any]] = (),
@@ -330,7 +335,7 @@ def _write(
                 table.writerow((one.data.name, rank, *(f"{v[k]:.6g}" for v in values)))
     curves = {one.data.name: one.curve for one in found}
     (out / "figure-15.png").write_bytes(brdf_space_figures.curves(curves))
-    (out / "figure-14.png").write_bytes(brdf_space_figures.spheres(spheres.means, basis))
+    (out / "figure-14.png").write_bytes(brdf_space_figures.draw_spheres(spheres.means, basis))
 
 
 def _numbers(values: Sequence[float] | Float64Array) -> list[float | None]:

@@ -21,7 +21,7 @@ from reconstruction.brdf_basis import space as brdf_space
 from rigsim.light import surface_brdf
 from rigsim.light.surface_brdf import SkinSurface
 from rigsim.population.conditions import CONDITION_NAMES, conditioned_surface
-from rigsim.population.population import MAX_SKIN_HAIR, Member, table_1
+from rigsim.population.population import MAX_SKIN_HAIR, Member, draw_population
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 
 MIN_COS_LIGHT: Final = 0.12
@@ -45,7 +45,7 @@ class DatasetError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Captured:
+class CapturedSamples:
     """BRDF samples of P points, as `reconstruction.brdf_basis.surface_samples` takes them."""
 
     f: Float64Array
@@ -63,12 +63,12 @@ class Captured:
     clean: Float64Array
     """The samples without noise, (P, M, 3), 1/sr."""
 
-    def again(self, count: int, *, rng: np.random.Generator) -> Captured:
+    def again(self, count: int, *, rng: np.random.Generator) -> CapturedSamples:
         """Return the first points with other noise."""
         part = {name: getattr(self, name)[:count] for name in self.__dataclass_fields__}
         sigma = np.sqrt(part["variance"])
         noise = sigma * rng.standard_normal(sigma.shape)
-        return Captured(**(part | {"f": part["clean"] + noise}))
+        return CapturedSamples(**(part | {"f": part["clean"] + noise}))
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,15 +89,15 @@ class Dataset:
     """Points without a fit."""
 
 
-def capture(
+def sample_surface(
     surface: SkinSurface,
     position_mm: Float32Array,
-    where: BoolArray,
+    mask: BoolArray,
     count: int,
     *,
     samples: int = SAMPLES_PER_POINT,
     rng: np.random.Generator,
-) -> Captured:
+) -> CapturedSamples:
     """Return samples of random points of a face.
 
     Parameters
@@ -127,13 +127,16 @@ def capture(
     rig = load_rig("dome")
     lights = np.array([light.position_mm for light in rig.lights])
     views = np.array([view.position_mm for view in rig.views])
-    texels = np.flatnonzero(where)
+    texels = np.flatnonzero(mask)
     # A third more than needed: some lie too flat to lights or cameras.
     few = max(count + count // 3, 64)
     drawn = rng.choice(texels, few, replace=few > len(texels)) if len(texels) else texels
     normal = surface.normal.reshape(-1, 3)[drawn].astype(np.float64)
     place = position_mm.reshape(-1, 3)[drawn].astype(np.float64)
-    above_l, above_v = _above(lights, place, normal), _above(views, place, normal)
+    above_l, above_v = (
+        _cosines_above_horizon(lights, place, normal),
+        _cosines_above_horizon(views, place, normal),
+    )
     pairs = (above_l >= MIN_COS_LIGHT).sum(1) * (above_v >= MIN_COS_VIEW).sum(1)
     able = np.flatnonzero(pairs >= samples)
     if not len(able):
@@ -150,16 +153,14 @@ def capture(
     view_index, light_index = np.divmod(order[:, :samples], len(lights))
     to_light = _unit(lights[light_index] - place[:, None])
     to_view = _unit(views[view_index] - place[:, None])
-    packed = np.repeat(
-        surface.packed().reshape(len(where) ** 2, -1)[drawn[chosen]], samples, axis=0
-    )
-    clean, specular = surface_brdf.evaluate(
+    packed = np.repeat(surface.packed().reshape(len(mask) ** 2, -1)[drawn[chosen]], samples, axis=0)
+    clean, specular = surface_brdf.evaluate_brdf(
         packed, np.repeat(normal, samples, axis=0), to_light.reshape(-1, 3), to_view.reshape(-1, 3)
     )
     f = clean.astype(np.float64).reshape(count, samples, 3)
     mu = np.einsum("pmc,pc->pm", to_light, normal)[..., None]
     sigma = RADIANCE_NOISE * (f * mu + NOISE_FLOOR_OF_WHITE / np.pi) / mu
-    return Captured(
+    return CapturedSamples(
         f=f + sigma * rng.standard_normal(f.shape),
         variance=np.maximum(sigma, 1e-9) ** 2,
         light=to_light,
@@ -171,7 +172,9 @@ def capture(
     )
 
 
-def fitted(captured: Captured, basis: brdf_tables.BrdfBasis) -> brdf_basis.BasisWeights:
+def fit_materials(
+    captured: CapturedSamples, basis: brdf_tables.BrdfBasis
+) -> brdf_basis.BasisWeights:
     """Fit the materials to what is left of samples after their estimated diffuse part."""
     samples = (captured.f, captured.light, captured.view, captured.normals)
     known: dict[str, Any] = {"eta": fresnel.ETA_SKIN, "variance": captured.variance}
@@ -180,13 +183,13 @@ def fitted(captured: Captured, basis: brdf_tables.BrdfBasis) -> brdf_basis.Basis
     return brdf_basis.fit_weights(given, basis)
 
 
-def one_person(points: int, *, rng: np.random.Generator) -> Dataset:
+def sample_one_person(points: int, *, rng: np.random.Generator) -> Dataset:
     """Return points of the face of dataset A as it usually is."""
-    person = table_1()[DATASET_A_MEMBER]
-    return _gathered("one person", {"normal": points}, lambda _: _skin(person, {}), rng=rng)
+    person = draw_population()[DATASET_A_MEMBER]
+    return _collect_points("one person", {"normal": points}, lambda _: _skin(person, {}), rng=rng)
 
 
-def dataset_a(
+def build_dataset_a(
     points: int,
     *,
     conditions: Sequence[str] = CONDITION_NAMES,
@@ -210,15 +213,15 @@ def dataset_a(
         raise DatasetError(
             f"points: got {points} for {len(conditions)} conditions, expected one each or more"
         )
-    person = table_1()[DATASET_A_MEMBER]
+    person = draw_population()[DATASET_A_MEMBER]
     share = np.diff(np.linspace(0, points, len(conditions) + 1).round().astype(int))
     counts = dict(zip(conditions, share.tolist(), strict=True))
-    return _gathered(
+    return _collect_points(
         "dataset A", counts, lambda k: _skin(person, {conditions[k]: 1.0}), progress, rng=rng
     )
 
 
-def dataset_b(
+def build_dataset_b(
     points: int,
     *,
     members: Sequence[Member] | None = None,
@@ -232,17 +235,17 @@ def dataset_b(
     points
         How many of each.
     members
-        None: the 87 of `rigsim.population.population.table_1`.
+        None: the 87 of `rigsim.population.population.draw_population`.
     progress
         Called with each member's name.
     rng
         Of everything random.
     """
-    people = table_1() if members is None else tuple(members)
+    people = draw_population() if members is None else tuple(members)
     if not people or points < 1:
         raise DatasetError(f"points: got {points} of {len(people)} people, expected 1 of 1 or more")
     counts = dict.fromkeys((person.name for person in people), points)
-    return _gathered("dataset B", counts, lambda k: _skin(people[k], None), progress, rng=rng)
+    return _collect_points("dataset B", counts, lambda k: _skin(people[k], None), progress, rng=rng)
 
 
 Skin = tuple[SkinSurface, Float32Array, BoolArray]
@@ -258,7 +261,7 @@ def _skin(member: Member, conditions: dict[str, float] | None) -> Skin:
     return surface, face.atlas.position_mm, face.atlas.covered & (face.hair < MAX_SKIN_HAIR)
 
 
-def _gathered(
+def _collect_points(
     name: str,
     counts: Mapping[str, int],
     skin: Callable[[int], Skin],
@@ -267,7 +270,7 @@ def _gathered(
     rng: np.random.Generator,
 ) -> Dataset:
     """Return points of some labels, as many of each as is said."""
-    basis = brdf_tables.default()
+    basis = brdf_tables.default_basis()
     weights, label = [], []
     twice: tuple[list[Float64Array], list[Float64Array]] = ([], [])
     lost = 0
@@ -277,28 +280,28 @@ def _gathered(
         surface, place, where = skin(k)
         for start in range(0, count, POINTS_PER_FIT):
             some = min(POINTS_PER_FIT, count - start)
-            seen = capture(surface, place, where, some, rng=rng)
-            fit = fitted(seen, basis)
+            seen = sample_surface(surface, place, where, some, rng=rng)
+            fit = fit_materials(seen, basis)
             good = fit.valid & (fit.weights @ basis.strength() > 0.0)
             lost += int(np.count_nonzero(~good))
             weights.append(fit.weights[good])
             label.append(np.full(np.count_nonzero(good), k))
             if start == 0:
                 few = min(MAX_REPEATED_POINTS, len(good))
-                other = fitted(seen.again(few, rng=rng), basis)
+                other = fit_materials(seen.again(few, rng=rng), basis)
                 both = good[:few] & other.valid
                 twice[0].append(fit.weights[:few][both])
                 twice[1].append(other.weights[both])
     shares = np.concatenate(weights)
-    kept = brdf_space.usable(shares, basis)
+    kept = brdf_space.is_constrained(shares, basis)
     again = [np.concatenate(part) for part in twice]
-    held = brdf_space.usable(again[0], basis) & brdf_space.usable(again[1], basis)
+    held = brdf_space.is_constrained(again[0], basis) & brdf_space.is_constrained(again[1], basis)
     return Dataset(
         name,
         shares[kept],
         np.concatenate(label)[kept],
         tuple(counts),
-        brdf_space.repeatability(again[0][held], again[1][held], basis),
+        brdf_space.repeat_distance(again[0][held], again[1][held], basis),
         lost + int(np.count_nonzero(~kept)),
     )
 
@@ -307,7 +310,9 @@ def _unit(vectors: Float64Array) -> Float64Array:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
-def _above(places_mm: Float64Array, points_mm: Float64Array, normals: Float64Array) -> Float64Array:
+def _cosines_above_horizon(
+    positions_mm: Float64Array, points_mm: Float64Array, normals: Float64Array
+) -> Float64Array:
     """Return cosines to the normals of the ways from points to places, (points, places)."""
-    way = _unit(places_mm[None] - points_mm[:, None])
+    way = _unit(positions_mm[None] - points_mm[:, None])
     return np.einsum("pkc,pc->pk", way, normals)

@@ -43,7 +43,7 @@ def curves(found: Mapping[str, SpaceCurve]) -> bytes:
         (line,) = plot.plot(curve.ranks, curve.error / scale, "o-", ms=3, lw=1.2, label=name)
         color = line.get_color()
         plot.plot(curve.ranks, curve.held_out / scale, "--", lw=1.0, color=color)
-        rank = curve.plateau()
+        rank = curve.plateau_rank()
         at = curve.error[curve.ranks.index(rank)] / scale
         plot.plot([rank], [at], "o", ms=10, mfc="none", mec=color)
         above = {"xytext": (0, 8), "textcoords": "offset points", "ha": "center"}
@@ -53,10 +53,10 @@ def curves(found: Mapping[str, SpaceCurve]) -> bytes:
     plot.set_ylim(bottom=0.0)
     plot.set_title("Error against number of mixtures (dashed: not used for them)", fontsize=10)
     plot.legend(fontsize=8, frameon=False)
-    return png_of(figure)
+    return encode_figure(figure)
 
 
-def spheres(means: Mapping[str, Float64Array], basis: BrdfBasis) -> bytes:
+def draw_spheres(means: Mapping[str, Float64Array], basis: BrdfBasis) -> bytes:
     """Draw mean BRDFs on spheres, lit from two directions.
 
     Parameters
@@ -71,7 +71,7 @@ def spheres(means: Mapping[str, Float64Array], basis: BrdfBasis) -> bytes:
     bytes
         PNG; all spheres share one exposure and a gamma of 2.2.
     """
-    pictures = lit(means, basis)
+    pictures = render_spheres(means, basis)
     shown = np.concatenate([p[p > 0.0] for row in pictures.values() for p in row])
     white = float(np.percentile(shown, SPHERE_WHITE_PERCENTILE)) if len(shown) else 1.0
     count = max(len(means), 1)
@@ -83,14 +83,16 @@ def spheres(means: Mapping[str, Float64Array], basis: BrdfBasis) -> bytes:
             level = np.clip(picture / white, 0.0, 1.0) ** (1.0 / DISPLAY_GAMMA)
             axes[k, column].imshow(level, cmap="gray", vmin=0.0, vmax=1.0)
         axes[0, column].set_title(name, fontsize=8)
-    return png_of(figure)
+    return encode_figure(figure)
 
 
-def lit(means: Mapping[str, Float64Array], basis: BrdfBasis) -> dict[str, tuple[Float64Array, ...]]:
+def render_spheres(
+    means: Mapping[str, Float64Array], basis: BrdfBasis
+) -> dict[str, tuple[Float64Array, ...]]:
     """Return each label's sphere under each of `SPHERE_LIGHTS`, (SPHERE_PX, SPHERE_PX), 1/sr."""
     return {
         name: tuple(
-            brdf_basis.lit_sphere(shares, basis, light_dir=way, size_px=SPHERE_PX)
+            brdf_basis.render_lit_sphere(shares, basis, light_dir=way, size_px=SPHERE_PX)
             for way, _ in SPHERE_LIGHTS
         )
         for name, shares in means.items()
@@ -107,7 +109,7 @@ def new_figure(width_in: float, height_in: float, rows: int, columns: int) -> tu
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def png_of(figure: Any, dpi: int = 140) -> bytes:
+def encode_figure(figure: Any, dpi: int = 140) -> bytes:
     """Return a figure as the bytes of a PNG."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=dpi, metadata={"Software": None})

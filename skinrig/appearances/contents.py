@@ -14,14 +14,14 @@ from skinrig import consent
 from skinrig.arrays import BoolArray
 
 
-def jointly_valid(*maps: SkinMap) -> BoolArray:
+def intersect_valid(*maps: SkinMap) -> BoolArray:
     """Return the texels that are valid in all of some maps of one size, (H, W).
 
     Examples
     --------
     >>> whole = SkinMap(np.zeros((1, 2), np.float32), "1")
     >>> half = SkinMap(whole.values, "1", valid=np.array([[True, False]]))
-    >>> jointly_valid(whole, half).tolist()
+    >>> intersect_valid(whole, half).tolist()
     [[True, False]]
     """
     good = np.ones(maps[0].values.shape[:2], np.bool_)
@@ -30,7 +30,7 @@ def jointly_valid(*maps: SkinMap) -> BoolArray:
     return good
 
 
-def assumed_by(appearance: SkinAppearance) -> list[str]:
+def list_assumptions(appearance: SkinAppearance) -> list[str]:
     """Return what an appearance takes for granted, a text each."""
     texts = appearance.parameters.get("assumed", ())
     return [str(text) for text in texts] if isinstance(texts, list | tuple) else []
@@ -47,7 +47,7 @@ def digest(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def made_of(
+def derive_appearance(
     *sources: SkinAppearance,
     maps: Mapping[str, SkinMap],
     parameters: Mapping[str, object],

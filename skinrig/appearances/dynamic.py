@@ -54,7 +54,7 @@ def add(out: Path, name: str, part: SkinAppearance) -> SkinAppearance:
         ``out`` holds maps of another kind, or another part has a map of the same name.
     """
     previous = _previous(out) or SkinAppearance({}, part.source)
-    parts = {other: entry for other, entry in parts_of(previous).items() if other != name}
+    parts = {other: entry for other, entry in describe_parts(previous).items() if other != name}
     maps = {key: previous.maps[key] for entry in parts.values() for key in entry["maps"]}
     files = {key: previous.files[key] for entry in parts.values() for key in entry["files"]}
     sources = {part.source, *(str(entry["source"]) for entry in parts.values())}
@@ -101,7 +101,7 @@ def read(
         It holds none of them.
     """
     appearance = store.read(path)
-    found = parts_of(appearance) if appearance.parameters.get("kind") == DYNAMIC_KIND else {}
+    found = describe_parts(appearance) if appearance.parameters.get("kind") == DYNAMIC_KIND else {}
     if not set(parts) & set(found):
         commands = " or ".join(f"`{FIT_COMMANDS[name]}`" for name in parts)
         raise DynamicAppearanceError(
@@ -123,7 +123,7 @@ def _previous(out: Path) -> SkinAppearance | None:
     return store.read(out)
 
 
-def parts_of(appearance: SkinAppearance) -> dict[str, Any]:
+def describe_parts(appearance: SkinAppearance) -> dict[str, Any]:
     """Return what an appearance says of its parts, by name; empty where it has none."""
     parts = appearance.parameters.get("parts")
     return dict(parts) if isinstance(parts, dict) else {}

@@ -12,7 +12,7 @@ import numpy as np
 from model import store
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.correspondence import charts, common_parameterization, landmark_table
-from reconstruction.correspondence.charts import Chart
+from reconstruction.correspondence.charts import TexelChart
 from reconstruction.correspondence.common_parameterization import (
     CommonFrame,
     Correspondence,
@@ -65,7 +65,7 @@ class Face:
     @property
     def surface(self) -> BoolArray:
         """Texels that show the surface, (H, W)."""
-        return valid_of(_map(self, "position"))
+        return valid_texels(_map(self, "position"))
 
     @property
     def r_d(self) -> SkinMap:
@@ -95,15 +95,15 @@ class Face:
             cylinder = common_parameterization.find_cylinder(self.position, self.surface)
             return Correspondence(cylinder)
         try:
-            return common_parameterization.correspond(
+            return common_parameterization.fit_correspondence(
                 self.landmarks, frame, stderr_mm=LANDMARK_STDERR_MM
             )
         except ParameterizationError as error:
             raise FaceError(f"{self.path}: {error}") from error
 
-    def chart(self, frame: CommonFrame) -> Chart:
+    def chart(self, frame: CommonFrame) -> TexelChart:
         """Return where each texel lies in a common map."""
-        return charts.chart(self.position, self.surface, self.correspondence(frame), frame)
+        return charts.chart_texels(self.position, self.surface, self.correspondence(frame), frame)
 
 
 def read(path: Path, landmarks: Path | None = None) -> Face:
@@ -141,16 +141,16 @@ def read(path: Path, landmarks: Path | None = None) -> Face:
 
 def common_frame(faces: Sequence[Face], size: int | None = None) -> CommonFrame:
     """Return the common map of some faces with landmarks."""
-    names, places = common_parameterization.common_landmarks([face.landmarks for face in faces])
+    names, places = common_parameterization.average_landmarks([face.landmarks for face in faces])
     cylinders = [common_parameterization.Cylinder(face.landmarks["nose tip"]) for face in faces]
     unrolled = [
         cylinder.unroll(face.position[face.surface])
         for cylinder, face in zip(cylinders, faces, strict=True)
     ]
     if size is None:
-        coarse = common_parameterization.frame_around(names, places, unrolled, size=64)
-        size = size_for(coarse.side_mm, max(face.texel_mm() for face in faces))
-    return common_parameterization.frame_around(names, places, unrolled, size=size)
+        coarse = common_parameterization.fit_common_frame(names, places, unrolled, size=64)
+        size = choose_size(coarse.side_mm, max(face.texel_mm() for face in faces))
+    return common_parameterization.fit_common_frame(names, places, unrolled, size=size)
 
 
 def read_landmarks(path: Path, face: Face) -> Landmarks:
@@ -181,7 +181,7 @@ def read_landmarks(path: Path, face: Face) -> Landmarks:
         return found
     position, on = face.position, face.surface
     out: Landmarks = {}
-    for name, (x, y) in landmark_table.read(path).items():
+    for name, (x, y) in landmark_table.read_landmark_table(path).items():
         column, row = round(x), round(y)
         inside = 0 <= row < on.shape[0] and 0 <= column < on.shape[1]
         if not inside or not on[row, column]:
@@ -194,18 +194,22 @@ def read_landmarks(path: Path, face: Face) -> Landmarks:
     return out
 
 
-def valid_of(one: SkinMap) -> BoolArray:
+def valid_texels(skin_map: SkinMap) -> BoolArray:
     """Return the texels of a map that mean something, (H, W)."""
-    finite = np.isfinite(one.values) if one.values.ndim == 2 else np.isfinite(one.values).all(-1)
-    return np.asarray(finite if one.valid is None else finite & one.valid, np.bool_)
+    finite = (
+        np.isfinite(skin_map.values)
+        if skin_map.values.ndim == 2
+        else np.isfinite(skin_map.values).all(-1)
+    )
+    return np.asarray(finite if skin_map.valid is None else finite & skin_map.valid, np.bool_)
 
 
-def size_for(side_mm: float, texel_mm: float) -> int:
+def choose_size(side_mm: float, texel_mm: float) -> int:
     """Return how many pixels a side a map needs to show texels of a size: a power of two.
 
     Examples
     --------
-    >>> size_for(240.0, 1.0)
+    >>> choose_size(240.0, 1.0)
     128
     """
     return int(2 ** np.clip(math.floor(math.log2(max(side_mm / texel_mm, 1.0))), 6, 10))

@@ -49,7 +49,7 @@ class FrontView:
             np.argsort(position_mm[:, 2], kind="stable"),
         )
 
-    def picture(
+    def rasterize(
         self, values: FloatArray, *, valid: BoolArray | None = None
     ) -> tuple[Float64Array, BoolArray]:
         """Return the picture of a value at each point, (N,) or (N, 3), and where there is one.

@@ -10,7 +10,7 @@ DEFAULT_STATE: Final = "neutral"
 """The state that is meant where none is said."""
 
 
-def truth_of_state(session: Path, state: str) -> Path | None:
+def find_state_truth(session: Path, state: str) -> Path | None:
     """Return the folder with a simulated session's truth of a state, where there is one.
 
     A session's first state has no name in its folder's: ``truth-face`` of `session-face`, and
@@ -24,12 +24,12 @@ def truth_of_state(session: Path, state: str) -> Path | None:
     return None
 
 
-def truth_beside(session: Path, state: str = DEFAULT_STATE) -> Path | None:
+def find_comparison_truth(session: Path, state: str = DEFAULT_STATE) -> Path | None:
     """Return the folder with what maps of a session's state are to be compared with, or None.
 
     Where no state is asked for, as of rigs before which faces hold still, it is the session's own.
     """
-    found = truth_of_state(session, state)
+    found = find_state_truth(session, state)
     if found is not None or state != DEFAULT_STATE:
         return found
     folder = truth_folder(session)

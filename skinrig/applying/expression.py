@@ -19,10 +19,10 @@ from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import ROW_OF_STATE, Clamp
 from reconstruction.facial_color.rig_transfer import transfer_rig
 from skinrig.appearances import dynamic as dynamic_appearance
-from skinrig.appearances.contents import document_digest, jointly_valid, made_of
+from skinrig.appearances.contents import derive_appearance, document_digest, intersect_valid
 from skinrig.appearances.dynamic import DYNAMIC_PARTS, FACIAL_COLOR, WRINKLES
 from skinrig.capturing.option_values import parse_amounts
-from skinrig.console import picked
+from skinrig.console import select_attributes
 from skinrig.errors import UsageError, one_of
 
 EXPRESSION_KIND = "expression"
@@ -40,7 +40,7 @@ class WeightsError(ApplyError, UsageError):
 
 
 @dataclass(slots=True)
-class Applied:
+class AppliedExpression:
     """What came out of an evaluation.
 
     Attributes
@@ -62,7 +62,7 @@ class Applied:
 
 
 @dataclass(frozen=True, slots=True)
-class OtherFace:
+class TargetFace:
     """A face that a rig was not fitted to.
 
     Attributes
@@ -84,7 +84,7 @@ class OtherFace:
 
 
 @dataclass(frozen=True, slots=True)
-class Expression:
+class ExpressionRequest:
     """What is asked for.
 
     Attributes
@@ -108,7 +108,7 @@ class Expression:
     clamp: Clamp = "unit"
     emotional: bool = False
     gain: float = 1.0
-    onto: OtherFace | None = None
+    onto: TargetFace | None = None
 
 
 def parse_weights(text: str) -> dict[str, float]:
@@ -133,13 +133,13 @@ def parse_weights(text: str) -> dict[str, float]:
 
 def apply_expression(
     path: Path,
-    expression: Expression,
+    expression: ExpressionRequest,
     *,
     out: Path,
     parts: Sequence[str] = DYNAMIC_PARTS,
-    relief: Callable[[SkinAppearance, dict[str, Any], Applied], None] | None = None,
+    relief: Callable[[SkinAppearance, dict[str, Any], AppliedExpression], None] | None = None,
     progress: Callable[[str], None] | None = None,
-) -> Applied:
+) -> AppliedExpression:
     """Evaluate the parts of a dynamic appearance and write their maps.
 
     Parameters
@@ -170,8 +170,8 @@ def apply_expression(
         one_of("parts", name, DYNAMIC_PARTS, ApplyError)
     appearance, found = dynamic_appearance.read(path, parts=parts)
     _check_target(out, path)
-    expression = normalized(expression)
-    done = Applied()
+    expression = normalize_weights(expression)
+    done = AppliedExpression()
     for name in DYNAMIC_PARTS:
         if name not in found or name not in parts:
             why = "not asked for" if name in found else "the folder does not hold it"
@@ -199,14 +199,14 @@ def apply_expression(
         for name, part in done.figures.items()
     }
     other = expression.onto
-    made = made_of(
+    made = derive_appearance(
         *((appearance,) if other is None else (appearance, other.appearance)),
         maps=done.maps,
         parameters={
             "kind": EXPRESSION_KIND,
             "weights": dict(expression.weights),
             "figures": figures,
-            **picked(expression, "clamp", "emotional", "gain"),
+            **select_attributes(expression, "clamp", "emotional", "gain"),
         },
         inputs={
             "appearance": document_digest(path),
@@ -232,7 +232,7 @@ def _check_target(out: Path, path: Path) -> None:
             )
 
 
-def normalized(expression: Expression) -> Expression:
+def normalize_weights(expression: ExpressionRequest) -> ExpressionRequest:
     """Return the expression with the weights that all parts are evaluated with."""
     if not expression.normalize:
         return expression
@@ -248,11 +248,13 @@ def hemoglobin_rig(appearance: SkinAppearance) -> HemoglobinRig:
     return from_maps_and_document(appearance.maps, appearance.files[RIG_DOCUMENT])
 
 
-def _facial_color(appearance: SkinAppearance, expression: Expression, done: Applied) -> None:
+def _facial_color(
+    appearance: SkinAppearance, expression: ExpressionRequest, done: AppliedExpression
+) -> None:
     rig = hemoglobin_rig(appearance)
     maps = appearance.maps
     if expression.onto is not None:
-        rig = _carried(rig, expression.onto, done)
+        rig = _transfer_rig(rig, expression.onto, done)
         maps = expression.onto.appearance.maps
     blend = rig.evaluate(
         expression.weights,
@@ -272,43 +274,47 @@ def _facial_color(appearance: SkinAppearance, expression: Expression, done: Appl
         done.left_out.append(("color", "there is no melanin map"))
         return
     melanin = maps["melanin"]
-    seen = good & jointly_valid(melanin)
+    seen = good & intersect_valid(melanin)
     done.maps["melanin"] = melanin
     note = f"diffuse reflectance as {COLOR_OBSERVER} under {COLOR_ILLUMINANT}, white = 1"
-    done.maps["color"] = SkinMap(colors(melanin.values, held, seen), "1", None, seen, note)
+    done.maps["color"] = SkinMap(
+        skin_reflectance(melanin.values, held, seen), "1", None, seen, note
+    )
 
 
-def _carried(rig: HemoglobinRig, other: OtherFace, done: Applied) -> HemoglobinRig:
+def _transfer_rig(rig: HemoglobinRig, target: TargetFace, done: AppliedExpression) -> HemoglobinRig:
     """Return the rig for another face's blood."""
-    if "hemoglobin" not in other.appearance.maps:
-        names = ", ".join(other.appearance.maps) or "none"
+    if "hemoglobin" not in target.appearance.maps:
+        names = ", ".join(target.appearance.maps) or "none"
         raise ApplyError(f"onto: got maps {names}, expected hemoglobin among them")
-    blood = other.appearance.maps["hemoglobin"]
-    melanin = other.appearance.maps.get("melanin")
+    blood = target.appearance.maps["hemoglobin"]
+    melanin = target.appearance.maps.get("melanin")
     if melanin is not None and melanin.values.shape != blood.values.shape:
         raise ApplyError(
             f"onto: melanin is {melanin.values.shape}, hemoglobin {blood.values.shape}, expected "
             "one size"
         )
     shape = (blood.values.shape[0], blood.values.shape[1])
-    if other.landmarks is not None and other.landmarks_rig is not None:
+    if target.landmarks is not None and target.landmarks_rig is not None:
         rig = transfer_rig(
-            rig, shape, landmarks_rig=other.landmarks_rig, landmarks_onto=other.landmarks
+            rig, shape, landmarks_rig=target.landmarks_rig, landmarks_onto=target.landmarks
         )
     else:
         done.left_out.append(("landmarks", "none: both faces are taken to be framed alike"))
-    return rig.applied_to(blood.values, valid=blood.valid, stderr=blood.stderr)
+    return rig.transfer_to(blood.values, valid=blood.valid, stderr=blood.stderr)
 
 
-def colors(melanin: Any, hemoglobin: Any, seen: Any) -> Any:
+def skin_reflectance(melanin: Any, hemoglobin: Any, valid: Any) -> Any:
     """Return diffuse reflectance of skin in linear sRGB under D65, (H, W, 3); 0 outside."""
     table = color_table.build(COLOR_OBSERVER, COLOR_ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
-    color = np.zeros((*seen.shape, 3), np.float32)
-    color[seen] = table.lookup(melanin[seen], hemoglobin[seen])
+    color = np.zeros((*valid.shape, 3), np.float32)
+    color[valid] = table.lookup(melanin[valid], hemoglobin[valid])
     return color
 
 
-def _wrinkles(appearance: SkinAppearance, expression: Expression, done: Applied) -> None:
+def _wrinkles(
+    appearance: SkinAppearance, expression: ExpressionRequest, done: AppliedExpression
+) -> None:
     model = WrinkleModel.from_maps(appearance.maps, appearance.files[WRINKLE_FILE])
     weights = wrinkle_weights(model, expression.weights)
     shown = replace(model, clamp=expression.clamp).evaluate(weights)

@@ -19,9 +19,9 @@ from model.microstructure.convolution import (
     Sampling,
     convolve,
     convolve_tiled,
-    tiles_of,
+    list_tiles,
 )
-from model.microstructure.map_windows import Window
+from model.microstructure.map_windows import MapWindow
 from model.microstructure.mesh_strain import MeshStrain, strain
 from model.microstructure.strain_fields import (
     KernelRegions,
@@ -31,13 +31,13 @@ from model.microstructure.strain_fields import (
     regional_kernels,
 )
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, Int64Array
+from skinrig.atomic_file import write_atomically
 from skinrig.blend_shapes.meshes import BlendShapeMesh
-from skinrig.console import picked
-from skinrig.whole_file import write_whole
+from skinrig.console import select_attributes
 
 TILE_PX: Final = 2048
 JOURNAL_SCHEMA: Final = "skinrig.microstructure-tiles/1"
-COUNTING_SIDE_PX: Final = 1024
+STATISTICS_SIDE_PX: Final = 1024
 """Shares of pixels are counted on a texture of so many a side."""
 MIN_SIGMA_PX: Final = 0.3
 """The discrete Gaussian of a narrower kernel leaves 99 % and more to the pixel itself."""
@@ -186,18 +186,20 @@ def apply_microstructure(
         table if isinstance(table, KernelRegions) else KernelRegions((table,), np.ones((1, 1, 1)))
     )
     begin = time.perf_counter()
-    moved = mesh.deformed(weights)
+    moved = mesh.deform(weights)
     found = strain(mesh.vertices_mm, moved, mesh.faces, mesh.uv)
     pose = _Pose(mesh, found, regions, size, extrapolate)
     strain_s = time.perf_counter() - begin
 
-    def valid_at(window: Window) -> BoolArray:
+    def valid_at(window: MapWindow) -> BoolArray:
         return np.asarray(valid[window.rows, window.columns], bool)
 
     if out is None:
         journal = _Tiles(np.empty(size, np.float32), [])
     else:
-        job = _job(moved, mesh, neutral_height, valid, regions, (extrapolate, sampling, str(tile)))
+        job = _hash_job(
+            moved, mesh, neutral_height, valid, regions, (extrapolate, sampling, str(tile))
+        )
         journal = _Journal.open(Path(out), job, size)
     before = list(journal.finished)
 
@@ -225,16 +227,16 @@ def apply_microstructure(
         extrapolate=extrapolate,
         strain_s=strain_s,
         convolution_s=convolution_s,
-        tiles=len(tiles_of(size, tile)),
+        tiles=len(list_tiles(size, tile)),
         tiles_before=len(before),
-        **picked(found, "degenerate_share", "uv_degenerate_share", "uv_turned_share"),
+        **select_attributes(found, "degenerate_share", "uv_degenerate_share", "uv_turned_share"),
         **pose.shares(),
         **pose.stretches(),
     )
     return AppliedMicrostructure(journal.target, report)
 
 
-def under_strain(
+def convolve_by_strain(
     height: Float32Array, found: MeshStrain, faces: Int64Array, uv: Float64Array, table: KernelTable
 ) -> tuple[Float32Array, TextureStrain]:
     """Return a map in memory convolved by the strain of its mesh, and the strain at its pixels."""
@@ -254,7 +256,7 @@ class _Pose:
     """Rows and columns of the map."""
     extrapolate: Literal["hold", "formula"]
 
-    def kernels(self, window: Window) -> tuple[LineKernels, LineKernels]:
+    def kernels(self, window: MapWindow) -> tuple[LineKernels, LineKernels]:
         """Return the kernels at the pixels of a window."""
         shown = rasterize(self.strain, self.mesh.faces, self.mesh.uv, self.size, window=window)
         how: dict[str, Any] = {"window": window, "extrapolate": self.extrapolate}
@@ -262,7 +264,7 @@ class _Pose:
 
     def shares(self) -> dict[str, Any]:
         """Return shares of pixels: covered; of these, changed, and asked for but unresolved."""
-        coarser = math.ceil(max(self.size) / COUNTING_SIDE_PX)
+        coarser = math.ceil(max(self.size) / STATISTICS_SIDE_PX)
         few = (math.ceil(self.size[0] / coarser), math.ceil(self.size[1] / coarser))
         shown = rasterize(self.strain, self.mesh.faces, self.mesh.uv, few, pad_px=0)
         changed, narrow = np.zeros((2, *few), bool)
@@ -313,7 +315,7 @@ class _Pose:
         }
 
 
-def _job(
+def _hash_job(
     moved: Float64Array,
     mesh: BlendShapeMesh,
     height: Any,
@@ -389,7 +391,7 @@ class _Journal(_Tiles):
 
     def _write(self) -> None:
         told = {"schema": JOURNAL_SCHEMA, "job": self.job, "finished": self.finished}
-        write_whole(self.path, json.dumps(told))
+        write_atomically(self.path, json.dumps(told))
 
     def close(self) -> None:
         self.target.flush()

@@ -26,7 +26,7 @@ from model import microstructure
 from model.displacement_synthesis import growth as displacement_synthesis
 from model.displacement_synthesis.volume_noise import VolumeNoise
 from model.microstructure import FOREHEAD, KernelTable, strain_fields
-from skinrig.applying.microstructure import under_strain
+from skinrig.applying.microstructure import convolve_by_strain
 from skinrig.arrays import Float32Array, Float64Array, Int64Array
 from skinrig.errors import one_of
 
@@ -77,11 +77,11 @@ class Sphere:
         step = 2.0 * CHART_HALF_SIDE / self.texels
         return np.asarray(2e3 * self.radius_mm * step / (1.0 + x * x + y * y))
 
-    def noise_relief(self, noise: VolumeNoise) -> Float32Array:
+    def sample_noise_relief(self, noise: VolumeNoise) -> Float32Array:
         """Return noise in space as a map of the chart, (N, N) um."""
         return noise.at(self.points_mm()).astype(np.float32)
 
-    def grown_relief(
+    def grow_relief(
         self, patches: Sequence[ArrayLike], *, patch_pixel_um: float, rng: np.random.Generator
     ) -> Float32Array:
         """Return patches grown over the chart at their own size on the skin, (N, N) um."""
@@ -136,26 +136,26 @@ class DeformedSphere:
         along = along + self.strain.axes[..., 1] * down[..., None]
         return np.asarray(1e-3 * along * self.strain.px_per_mm / self.strain.stretch)
 
-    def roughness(self, place: str, *, within_rad: float = 0.2) -> tuple[float, float]:
+    def roughness(self, site: str, *, within_rad: float = 0.2) -> tuple[float, float]:
         """Return the variances of slopes along s and t around a place.
 
         Parameters
         ----------
-        place : str
+        site : str
             One of :data:`ROUGHNESS_POINTS`.
         within_rad : float
             Angle around it on the neutral sphere, rad, 0.02 to 0.5.
         """
-        one_of("place", place, ROUGHNESS_POINTS, SphereError)
+        one_of("place", site, ROUGHNESS_POINTS, SphereError)
         if not 0.02 <= within_rad <= 0.5:
             raise SphereError(f"within_rad: got {within_rad}, expected 0.02...0.5")
-        near = self.sphere.points_mm() @ np.asarray(ROUGHNESS_POINTS[place]) > (
+        near = self.sphere.points_mm() @ np.asarray(ROUGHNESS_POINTS[site]) > (
             self.sphere.radius_mm * math.cos(within_rad)
         )
         variance_s, variance_t = np.var(self.slopes()[near], axis=0).tolist()
         return variance_s, variance_t
 
-    def picture(
+    def render(
         self,
         *,
         size_px: int = 256,
@@ -261,6 +261,6 @@ def deform(
         raise SphereError(f"ratios: got {ratios}, expected three finite numbers above 0")
     vertices, faces, uv = sphere.mesh()
     found = microstructure.strain(vertices, vertices * scale, faces, uv)
-    moved, field = under_strain(height, found, faces, uv, table)
+    moved, field = convolve_by_strain(height, found, faces, uv, table)
     shown = moved if dynamic else height
     return DeformedSphere(sphere, (scale[0], scale[1], scale[2]), shown, field)

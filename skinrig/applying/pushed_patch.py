@@ -26,7 +26,7 @@ from scipy.sparse.linalg import splu
 
 from model import microstructure
 from model.microstructure import FOREHEAD, KernelTable, MeshStrain, strain_fields
-from skinrig.applying.microstructure import under_strain
+from skinrig.applying.microstructure import convolve_by_strain
 from skinrig.arrays import Float32Array, Float64Array, Int64Array
 from skinrig.errors import MissingExtra
 
@@ -70,7 +70,7 @@ class SkinBlock:
             raise PushError(f"divisions: got {self.divisions}, expected three of 1...64")
 
     @property
-    def inverse_lambda(self) -> float:
+    def inverse_lame_lambda(self) -> float:
         """Lame's first parameter inverted, for a shear modulus of 1."""
         return (1.0 - 2.0 * self.poisson) / (2.0 * self.poisson)
 
@@ -87,7 +87,7 @@ class Push:
     """How far the tip's lowest point goes in, mm; below 0 it pulls."""
     shift_mm: tuple[float, float] = (0.8, 0.0)
     """How far it goes along x and y, mm."""
-    centre_mm: tuple[float, float] = (0.0, 0.0)
+    center_mm: tuple[float, float] = (0.0, 0.0)
     """Where it touches, mm from the middle of the block."""
 
     def __post_init__(self) -> None:
@@ -96,7 +96,7 @@ class Push:
                 f"contact_mm, tip_mm: got {self.contact_mm}, {self.tip_mm}, "
                 "expected 0 < contact <= tip"
             )
-        if not np.isfinite([self.depth_mm, *self.shift_mm, *self.centre_mm]).all():
+        if not np.isfinite([self.depth_mm, *self.shift_mm, *self.center_mm]).all():
             raise PushError("depth_mm, shift_mm, centre_mm: got NaN or infinity")
 
 
@@ -157,7 +157,7 @@ class PushedPatch:
         height = np.asarray(height_um, np.float32)
         if height.ndim != 2 or height.shape[0] != height.shape[1]:
             raise PushError(f"height_um: got shape {height.shape}, expected (N, N)")
-        return under_strain(height, self.strain(), self.surface, self.uv, table)
+        return convolve_by_strain(height, self.strain(), self.surface, self.uv, table)
 
 
 def push(block: SkinBlock, probe: Push, *, steps: int = 2) -> PushedPatch:
@@ -185,7 +185,7 @@ def push(block: SkinBlock, probe: Push, *, steps: int = 2) -> PushedPatch:
     """
     mesh = _mesh(block)
     nodes = mesh.p.T
-    away = nodes[:, :2] - np.asarray(probe.centre_mm)
+    away = nodes[:, :2] - np.asarray(probe.center_mm)
     distance = np.hypot(away[:, 0], away[:, 1])
     half = 0.5 * block.width_mm
     touched = (nodes[:, 2] > -1e-9) & (distance <= probe.contact_mm + 1e-9)
@@ -233,7 +233,7 @@ def solve(block: SkinBlock, given_mm: ArrayLike, *, steps: int = 2) -> PushedPat
     reached, step, iterations = 0.0, 1.0 / steps, 0
     while reached < 1.0 - 1e-12:
         target = min(1.0, reached + step)
-        found, count = tissue.equilibrium(state, given * target)
+        found, count = tissue.find_equilibrium(state, given * target)
         iterations += count
         if found is None:
             step *= 0.5
@@ -294,7 +294,7 @@ class _Tissue:
         self.mesh = _mesh(block)
         self.nodes = np.ascontiguousarray(self.mesh.p.T)
         self.corners = np.ascontiguousarray(self.mesh.t.T, np.int64)
-        self.inverse_lambda = block.inverse_lambda
+        self.inverse_lambda = block.inverse_lame_lambda
         self.tolerance_mm = RELATIVE_MOVE_TOL * block.width_mm
         bubble = fem.Basis(self.mesh, fem.ElementTetMini(), intorder=5)
         linear = bubble.with_element(fem.ElementTetP1())
@@ -317,13 +317,15 @@ class _Tissue:
             np.zeros_like(self.nodes), np.zeros((len(self.corners), 3)), np.zeros(len(self.nodes))
         )
 
-    def equilibrium(self, begin: _State, given: Float64Array) -> tuple[_State | None, int]:
+    def find_equilibrium(
+        self, start: _State, displacement_mm: Float64Array
+    ) -> tuple[_State | None, int]:
         """Return the equilibrium with given displacements, or None, and corrections made."""
-        known = np.isfinite(given)
+        known = np.isfinite(displacement_mm)
         free = np.concatenate([~known.reshape(-1), np.ones(len(self.nodes), bool)])
         first = np.zeros(free.size)
-        first[: -len(self.nodes)][known.reshape(-1)] = (given - begin.nodes_mm)[known]
-        state = begin
+        first[: -len(self.nodes)][known.reshape(-1)] = (displacement_mm - start.nodes_mm)[known]
+        state = start
         for count in range(1, MAX_NEWTON_ITERATIONS + 1):
             system = self._system(state)
             if system is None:
@@ -364,7 +366,7 @@ class _Tissue:
         """
         moves = np.concatenate([state.nodes_mm[self.corners], state.bubbles_mm[:, None]], axis=1)
         deformation = moves.transpose(0, 2, 1)[:, None] @ self.gradients + np.eye(3)
-        ratio, inverse = _inverted(deformation)
+        ratio, inverse = _invert_matrices(deformation)
         if not (ratio > 0).all():
             return None
         spatial = self.gradients @ inverse
@@ -410,7 +412,7 @@ class _Tissue:
         return whole.tocsr(), np.asarray(total, np.float64), (follows, own)
 
 
-def _inverted(matrices: Float64Array) -> tuple[Float64Array, Float64Array]:
+def _invert_matrices(matrices: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return determinants and inverses of (..., 3, 3) matrices, by the cross products of rows."""
     a, b, c = (matrices[..., row, :] for row in range(3))
     columns = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-1)

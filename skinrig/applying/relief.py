@@ -13,24 +13,24 @@ import numpy as np
 from scipy import ndimage
 
 from model.displacement_synthesis import growth as displacement_synthesis
-from model.displacement_synthesis.sources import leveled
+from model.displacement_synthesis.sources import level_patch
 from model.displacement_synthesis.volume_noise import VolumeNoise
 from model.microstructure import KernelTable
 from model.microstructure.strain_fields import KernelRegions
 from model.skin import SkinAppearance, SkinMap
 from rigsim.geometry.atlas import dilate_texture, unwrap
 from rigsim.geometry.mesh import build_mesh
-from rigsim.subject.expressions import displacement_mm, moves
-from rigsim.subject.face_regions import on_mean_head, region_masks
+from rigsim.subject.expressions import displacement_mm, is_moving_state
+from rigsim.subject.face_regions import region_masks, to_mean_head
 from rigsim.subject.perfusion import STATE_NAMES
 from skinrig.appearances.contents import digest
 from skinrig.appearances.dynamic import MICROSTRUCTURE
-from skinrig.applying.expression import Applied, ApplyError
+from skinrig.applying.expression import AppliedExpression, ApplyError
 from skinrig.applying.microstructure import apply_microstructure
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.blend_shapes import meshes as blend_shapes
 from skinrig.blend_shapes.meshes import BlendShapeMesh
-from skinrig.console import picked
+from skinrig.console import select_attributes
 from skinrig.errors import one_of
 
 REGION_ATLAS_PX: Final = 256
@@ -79,18 +79,18 @@ class ReliefRequest:
         one_of("extrapolate", self.extrapolate, EXTRAPOLATION_MODES, ApplyError)
 
     @property
-    def large(self) -> bool:
+    def exceeds_exr(self) -> bool:
         """Whether the maps are too large for EXR."""
         return self.size_px > MAX_EXR_SIDE_PX
 
 
 @dataclass(frozen=True, slots=True)
-class Relief:
+class ReliefEvaluator:
     """Evaluates the microstructure part of a dynamic appearance on a mesh.
 
     Attributes
     ----------
-    asked
+    request
         Which relief.
     mesh
         With a shape for each name in ``weights``.
@@ -106,11 +106,11 @@ class Relief:
         Called with one line now and then.
     """
 
-    asked: ReliefRequest
+    request: ReliefRequest
     mesh: BlendShapeMesh
     weights: Mapping[str, float]
     own_shapes: tuple[str, ...]
-    aside: Path
+    temporary_folder: Path
     mesh_sha256: str
     progress: Callable[[str], None]
 
@@ -118,11 +118,11 @@ class Relief:
     def of(
         path: Path,
         weights: Mapping[str, float],
-        asked: ReliefRequest,
+        request: ReliefRequest,
         *,
         out: Path,
         progress: Callable[[str], None],
-    ) -> Relief:
+    ) -> ReliefEvaluator:
         """Load the mesh and give it the shapes that states need.
 
         Maps of more than `MAX_EXR_SIDE_PX` go to a folder beside ``out``, as .npy files.
@@ -132,17 +132,19 @@ class Relief:
         ApplyError, MeshError
             For a size, a weight's name or a mesh that cannot be used.
         """
-        if not MIN_PATCH_PX <= asked.size_px <= 65_536:
-            raise ApplyError(f"size: got {asked.size_px}, expected {MIN_PATCH_PX} to 65536 px")
+        if not MIN_PATCH_PX <= request.size_px <= 65_536:
+            raise ApplyError(f"size: got {request.size_px}, expected {MIN_PATCH_PX} to 65536 px")
         used = {name: weight for name, weight in weights.items() if name != "neutral"}
         mesh, own = _with_states(blend_shapes.load(path), list(used))
         kept = {name: weight for name, weight in used.items() if name in mesh.shapes}
         aside = out.with_name(f"{out.name}-large")
-        return Relief(asked, mesh, kept, own, aside, _sha256(path), progress)
+        return ReliefEvaluator(request, mesh, kept, own, aside, _sha256(path), progress)
 
-    def __call__(self, appearance: SkinAppearance, part: dict[str, Any], done: Applied) -> None:
+    def __call__(
+        self, appearance: SkinAppearance, part: dict[str, Any], done: AppliedExpression
+    ) -> None:
         """Grow the neutral relief, move it, and put the maps into ``done``."""
-        sites, asked = dict(part["sites"]), self.asked
+        sites, asked = dict(part["sites"]), self.request
         if asked.site is not None:
             one_of("site", asked.site, sites, ApplyError)
         names = [asked.site] if asked.site is not None else list(sites)
@@ -158,43 +160,44 @@ class Relief:
             neutral,
             tables[0] if regions is None else KernelRegions(tables, regions),
             extrapolate=asked.extrapolate,
-            out=self.aside / "displacement.npy" if asked.large else None,
+            out=self.temporary_folder / "displacement.npy" if asked.exceeds_exr else None,
             progress=lambda at, of: self.progress(f"tile {at} of {of}"),
         )
         made = "noise as high as" if asked.source == "noise" else "grown from"
         note = f"um, {made} measured patches; texture of the mesh"
-        step = -(-asked.size_px // MAX_EXR_SIDE_PX) if asked.large else 1
-        if asked.large:
-            why = f"EXR of {asked.size_px} px: written to {self.aside.name} as .npy"
+        step = -(-asked.size_px // MAX_EXR_SIDE_PX) if asked.exceeds_exr else 1
+        if asked.exceeds_exr:
+            why = f"EXR of {asked.size_px} px: written to {self.temporary_folder.name} as .npy"
             done.left_out.append((MICROSTRUCTURE, why))
             note += f"; every {step}. pixel"
         for name, height, more in (
             ("displacement_neutral", neutral, ""),
             ("displacement", moved.height, ", under strain"),
         ):
-            shown = np.array(height[::step, ::step]) if asked.large else np.asarray(height)
+            shown = np.array(height[::step, ::step]) if asked.exceeds_exr else np.asarray(height)
             done.maps[name] = SkinMap(shown, "um", None, None, note + more)
         figures = asdict(moved.report)
         seconds = {f"{key[:-2]}_seconds": figures.pop(key) for key in SECONDS_KEYS}
         done.figures[MICROSTRUCTURE] = {
             "sites": names,
-            **picked(asked, "source", "seed"),
+            **select_attributes(asked, "source", "seed"),
             "tables": [table.source for table in tables],
             "own_shapes": list(self.own_shapes),
             **figures,
             **seconds,
         }
         done.inputs["mesh"] = self.mesh_sha256
-        if asked.large:
+        if asked.exceeds_exr:
             done.figures[MICROSTRUCTURE]["files"] = {
-                path.name: _sha256(path) for path in sorted(self.aside.glob("displacement*.npy"))
+                path.name: _sha256(path)
+                for path in sorted(self.temporary_folder.glob("displacement*.npy"))
             }
 
     def _neutral(
         self, appearance: SkinAppearance, sites: Mapping[str, Any], regions: Float64Array | None
     ) -> Any:
         """Return the neutral relief on the mesh's texture, um: grown patches, or noise."""
-        asked = self.asked
+        asked = self.request
         patches = {name: [_patch(name, appearance, entry)] for name, entry in sites.items()}
         pixels_um = [float(entry["pixel_um"]) for entry in sites.values()]
         if max(pixels_um) > (1.0 + PIXEL_SIZE_TOL) * min(pixels_um):
@@ -205,9 +208,9 @@ class Relief:
         rng, scale = np.random.default_rng(asked.seed), _scale(self.mesh)
         shape = f"{asked.size_px} x {asked.size_px}"
         neutral: Any = None
-        if asked.large:
-            self.aside.mkdir(parents=True, exist_ok=True)
-            growing = self.aside / "displacement_neutral.npy.part"
+        if asked.exceeds_exr:
+            self.temporary_folder.mkdir(parents=True, exist_ok=True)
+            growing = self.temporary_folder / "displacement_neutral.npy.part"
             neutral = np.lib.format.open_memmap(growing, "w+", np.float32, (asked.size_px,) * 2)
         if asked.source == "noise":
             self.progress(f"draw noise on {shape} pixels")
@@ -225,9 +228,9 @@ class Relief:
                 patch_pixel_um=float(np.mean(pixels_um)),
                 threads=2,
             )
-        if asked.large:
+        if asked.exceeds_exr:
             neutral.flush()
-            os.replace(growing, self.aside / "displacement_neutral.npy")
+            os.replace(growing, self.temporary_folder / "displacement_neutral.npy")
         return neutral
 
 
@@ -251,7 +254,7 @@ def _with_states(
             f"weights: got {unknown[0]!r}, expected a state ({', '.join(STATE_NAMES)}) or a shape "
             f"of the mesh ({', '.join(mesh.shapes) or 'it has none'})"
         )
-    missing = [name for name in names if name not in own and moves(name)]
+    missing = [name for name in names if name not in own and is_moving_state(name)]
     if not missing:
         return mesh, own
     face = build_mesh(mesh.vertices_mm, mesh.faces, mesh.uv, shapes=dict(mesh.shapes))
@@ -266,7 +269,7 @@ def _patch(site: str, appearance: SkinAppearance, entry: Mapping[str, Any]) -> F
             f"{site}: a patch of {relief.values.shape} px, expected {MIN_PATCH_PX} px or more "
             "a side"
         )
-    return leveled(relief.values, pixel_um=float(entry["pixel_um"]), valid=relief.valid)
+    return level_patch(relief.values, pixel_um=float(entry["pixel_um"]), valid=relief.valid)
 
 
 def _noise(
@@ -323,7 +326,7 @@ def _regions(mesh: BlendShapeMesh, names: Sequence[str]) -> Float64Array | None:
             "choose one with --site"
         )
     atlas = _atlas(mesh)
-    masks = region_masks(on_mean_head(atlas.position_mm, _face(mesh)))
+    masks = region_masks(to_mean_head(atlas.position_mm, _face(mesh)))
     weights = np.stack([sum(masks[r] for r in SITE_REGIONS[name]) for name in names])
     weights = weights.astype(np.float64) * atlas.covered
     # where no region speaks all sites mix evenly

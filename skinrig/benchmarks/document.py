@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from skinrig.benchmarks.results import BandError, Point, StageBenchmark
+from skinrig.benchmarks.results import ErrorEstimate, Point, StageBenchmark
 from skinrig.evaluating import skin_bands
 
 SCHEMA: Final = "skinrig.bench/2"
@@ -94,7 +94,7 @@ def to_document(stages: Iterable[StageBenchmark]) -> dict[str, Any]:
     document: dict[str, Any] = {
         "schema": SCHEMA,
         "machine": machine(),
-        "skin_bands": {name: band.told() for name, band in skin_bands.MELANIN_BANDS.items()},
+        "skin_bands": {name: band.to_dict() for name, band in skin_bands.MELANIN_BANDS.items()},
         "stages": {stage.name: _stage(stage) for stage in stages},
     }
     document["passed"] = all(limit.passed for stage in stages for limit in stage.limits)
@@ -121,7 +121,7 @@ def _stage(stage: StageBenchmark) -> dict[str, Any]:
         "limits": [asdict(limit) | {"passed": limit.passed} for limit in stage.limits],
         "left_out": [list(item) for item in stage.left_out],
         "by_band": [_band(name, error) for name, error in stage.by_band.items()],
-        "darkest_over_lightest": _dark_over_light(stage.by_band),
+        "darkest_over_lightest": _dark_to_light_ratio(stage.by_band),
         "no_bands": stage.no_bands or None,
     }
 
@@ -146,11 +146,11 @@ def _point(point: Point, *, squared: bool) -> dict[str, Any]:
     }
 
 
-def _band(name: str, error: BandError) -> dict[str, Any]:
+def _band(name: str, error: ErrorEstimate) -> dict[str, Any]:
     return {"band": name, **asdict(error), "error_interval": list(error.error_interval)}
 
 
-def _dark_over_light(by_band: Mapping[str, BandError]) -> dict[str, Any] | None:
+def _dark_to_light_ratio(by_band: Mapping[str, ErrorEstimate]) -> dict[str, Any] | None:
     """Return the last band's error over the first's, with the ends that both intervals allow."""
     skins = list(by_band.values())
     if len(skins) < 2 or not skins[0].error > 0.0:

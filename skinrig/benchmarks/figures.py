@@ -35,14 +35,14 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     named = len(fronts) <= MAX_NAMED_FRONTS
     for number, front in enumerate(fronts):
         color = figures.SERIES_COLORS[number % len(figures.SERIES_COLORS)]
-        own = np.array([_shares(p, front["condition"]) for p in points])
+        own = np.array([_matches_condition(p, front["condition"]) for p in points])
         best = np.array(front["points"], int)
         beaten = np.setdiff1d(np.flatnonzero(own), best)
         axes.errorbar(
             seconds[own], error[own], yerr=bars[:, own], fmt="none", ecolor=color, elinewidth=1
         )
         axes.plot(seconds[beaten], error[beaten], "o", mfc="none", mec=color, ms=4)
-        what = _words(front["condition"]) or "front"
+        what = _format_knobs(front["condition"]) or "front"
         axes.plot(
             seconds[best], error[best], "o-", color=color, ms=4, label=what if named else None
         )
@@ -50,7 +50,7 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
         if bend is not None:
             axes.plot(seconds[bend], error[bend], "o", mfc="none", mec="0.5", ms=11)
         for index in best if named or len(best) > 1 else ():
-            label = _words(_effort(points, index, front["condition"]))
+            label = _format_knobs(_effort(points, index, front["condition"]))
             label += "  (knee)" if index == bend else ""
             label += "  (error 0)" if exact[index] else ""
             labels.append((label, float(seconds[index]), float(error[index])))
@@ -64,7 +64,7 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
         )
     axes.margins(x=0.25, y=0.2)
     small = document.get("size") == "small"
-    _dress(axes, f"{stage}, small size" if small else stage, document["error_name"])
+    _set_up_axes(axes, f"{stage}, small size" if small else stage, document["error_name"])
     legend = None
     if axes.get_legend_handles_labels()[0]:
         legend = axes.legend(fontsize=6, frameon=False)
@@ -82,10 +82,10 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     )
     told = "; ".join(_summary(front, seconds, error) for front in fronts[:MAX_NAMED_FRONTS])
     alt = (
-        f"{stage}: {document['error_name']}, {figures.span_of(error)}, against "
-        f"{figures.span_of(seconds)} seconds for {len(points)} settings; fronts: {told}"
+        f"{stage}: {document['error_name']}, {figures.format_range(error)}, against "
+        f"{figures.format_range(seconds)} seconds for {len(points)} settings; fronts: {told}"
     )
-    return figures.finished(figure, alt)
+    return figures.to_svg(figure, alt)
 
 
 def _measured(points: Sequence[Mapping[str, Any]]) -> tuple[NDArray[Any], ...]:
@@ -115,18 +115,18 @@ def _effort(
 
 
 def _summary(front: Mapping[str, Any], seconds: NDArray[Any], error: NDArray[Any]) -> str:
-    told = f"{_words(front['condition']) or 'front'}: {len(front['points'])} settings"
+    told = f"{_format_knobs(front['condition']) or 'front'}: {len(front['points'])} settings"
     bend = front["knee"]
     if bend is None:
         return told
     return f"{told}, knee at {seconds[bend]:.3g} s, error {error[bend]:.3g}"
 
 
-def _dress(axes: Any, title: str, error_name: str) -> None:
+def _set_up_axes(axes: Any, title: str, error_name: str) -> None:
     """Set log scales, title and names of the axes."""
     axes.set_xscale("log")
     axes.set_yscale("log")
-    figures.plain_numbers(axes.xaxis, axes.yaxis)
+    figures.format_log_axes(axes.xaxis, axes.yaxis)
     axes.set_xlabel("seconds, warm, median")
     axes.set_ylabel("\n".join(textwrap.wrap(error_name, 36)))
     axes.set_title(title, fontsize=10)
@@ -136,15 +136,15 @@ MAX_NAMED_FRONTS = 6
 """Fronts that a plot has room to name; of more, only those of several points are labelled."""
 
 
-def _shares(point: Mapping[str, Any], condition: Mapping[str, Any]) -> bool:
+def _matches_condition(point: Mapping[str, Any], condition: Mapping[str, Any]) -> bool:
     return all(point["knobs"].get(name) == value for name, value in condition.items())
 
 
-def _words(knobs: Mapping[str, Any]) -> str:
+def _format_knobs(knobs: Mapping[str, Any]) -> str:
     return ", ".join(f"{k} {v}" for k, v in knobs.items() if v is not None)
 
 
-def compared_fronts(
+def plot_compared_fronts(
     stage: str, a: tuple[str, Mapping[str, Any]], b: tuple[str, Mapping[str, Any]]
 ) -> str:
     """Draw one stage of two benchmarks: error against seconds of all settings, log-log.
@@ -177,12 +177,13 @@ def compared_fronts(
             }
         )
         told.append(
-            f"{label}: errors {figures.span_of(error)} in {figures.span_of(seconds)} seconds"
+            f"{label}: errors {figures.format_range(error)} in {figures.format_range(seconds)}"
+            f" seconds"
         )
     for knobs in sorted(places[0].keys() & places[1].keys()):
         (s0, e0), (s1, e1) = places[0][knobs], places[1][knobs]
         axes.plot([s0, s1], [e0, e1], "-", color="0.5", lw=0.6, zorder=0)
     axes.margins(x=0.15, y=0.2)
-    _dress(axes, stage, a[1]["error_name"])
+    _set_up_axes(axes, stage, a[1]["error_name"])
     axes.legend(fontsize=7, frameon=False)
-    return figures.finished(figure, f"{stage}: {'; '.join(told)}")
+    return figures.to_svg(figure, f"{stage}: {'; '.join(told)}")

@@ -63,7 +63,7 @@ def measure_and_keep(
     cold = time.perf_counter() - start
     seconds: list[float] = []
     made: list[Made] = []
-    with resident_memory.watched() as rise:
+    with resident_memory.track_peak() as rise:
         for _ in range(repeats):
             made.clear()
             start = time.perf_counter()
@@ -80,12 +80,12 @@ def measure_and_keep(
     return timing, made[0]
 
 
-def spent(call: Callable[[], Made], repeats: int = 1) -> tuple[float, Made]:
+def measure_processor_time(call: Callable[[], Made], repeats: int = 1) -> tuple[float, Made]:
     """Return the least processor time of some calls, s, and what the last made.
 
     Examples
     --------
-    >>> spent(lambda: sum(range(100)), 2)[1]
+    >>> measure_processor_time(lambda: sum(range(100)), 2)[1]
     4950
     """
     seconds = np.inf
@@ -104,10 +104,10 @@ def processor_seconds(call: Callable[[], object], repeats: int = 1) -> float:
     >>> 0.0 <= processor_seconds(lambda: sum(range(100)), 2) < 1.0
     True
     """
-    return spent(call, repeats)[0]
+    return measure_processor_time(call, repeats)[0]
 
 
-def once(call: Callable[[], Made]) -> tuple[Timing, Made]:
+def measure_once(call: Callable[[], Made]) -> tuple[Timing, Made]:
     """Make something a single time, for a call too long to repeat: cold and warm are one.
 
     Returns
@@ -118,10 +118,10 @@ def once(call: Callable[[], Made]) -> tuple[Timing, Made]:
 
     Examples
     --------
-    >>> once(lambda: sum(range(100)))[1]
+    >>> measure_once(lambda: sum(range(100)))[1]
     4950
     """
-    with resident_memory.watched() as rise:
+    with resident_memory.track_peak() as rise:
         start = time.perf_counter()
         made = call()
         seconds = time.perf_counter() - start

@@ -22,54 +22,56 @@ DEFAULT_STAGE_S: Final = 120.0
 
 
 @dataclass(slots=True)
-class Pace:
+class MachinePace:
     """How much longer stages take on this machine than :data:`FULL_S` says."""
 
-    told_s: float = 0.0
-    took_s: float = 0.0
+    expected_s: float = 0.0
+    measured_s: float = 0.0
 
-    def add(self, told_s: float, took_s: float) -> None:
+    def add(self, expected_s: float, measured_s: float) -> None:
         """Count a stage that was measured at full size."""
-        self.told_s += told_s
-        self.took_s += took_s
+        self.expected_s += expected_s
+        self.measured_s += measured_s
 
     @property
     def factor(self) -> float:
         """Seconds taken over seconds told; 1 while too little was measured."""
-        return self.took_s / self.told_s if self.told_s > MIN_PACE_SAMPLE_S else 1.0
+        return self.measured_s / self.expected_s if self.expected_s > MIN_PACE_SAMPLE_S else 1.0
 
-    def fits(self, told_s: float, left_s: float) -> bool:
+    def fits(self, expected_s: float, left_s: float) -> bool:
         """Return whether a stage will end within ``left_s``, with some to spare.
 
         Examples
         --------
-        >>> Pace(told_s=20.0, took_s=40.0).fits(10.0, left_s=24.0)
+        >>> MachinePace(expected_s=20.0, measured_s=40.0).fits(10.0, left_s=24.0)
         False
-        >>> Pace(told_s=20.0, took_s=40.0).fits(10.0, left_s=26.0)
+        >>> MachinePace(expected_s=20.0, measured_s=40.0).fits(10.0, left_s=26.0)
         True
         """
-        return TIME_SAFETY_FACTOR * self.factor * told_s <= left_s
+        return TIME_SAFETY_FACTOR * self.factor * expected_s <= left_s
 
 
-def in_order(names: Iterable[str]) -> list[str]:
+def order_small_stages(names: Iterable[str]) -> list[str]:
     """Return stages in the order of their small sizes, those that take about a second first.
 
     Then a budget that is too small for all leaves the fewest out.
 
     Examples
     --------
-    >>> in_order(["traits", "hdr", "normals"])
+    >>> order_small_stages(["traits", "hdr", "normals"])
     ['hdr', 'normals', 'traits']
     """
     return sorted(names, key=lambda name: SMALL_S.get(name, 1.0))
 
 
-def quickest_first(names: Iterable[str], seconds: Mapping[str, float]) -> list[tuple[str, float]]:
+def order_full_stages(
+    names: Iterable[str], seconds: Mapping[str, float]
+) -> list[tuple[str, float]]:
     """Return stages with what each should take at full size, the quickest first.
 
     Examples
     --------
-    >>> quickest_first(["a", "b", "c"], {"a": 2.0, "b": 1.0})
+    >>> order_full_stages(["a", "b", "c"], {"a": 2.0, "b": 1.0})
     [('b', 1.0), ('a', 2.0), ('c', 120.0)]
     """
     return sorted(

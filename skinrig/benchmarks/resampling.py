@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from model import metrics
 from skinrig.arrays import BoolArray, FloatArray
-from skinrig.benchmarks.results import BandError
+from skinrig.benchmarks.results import ErrorEstimate
 
 N_BOOTSTRAP_DRAWS = 200
 TILE_PX = 16
@@ -17,7 +17,7 @@ TILE_PX = 16
 
 def median_error(
     values: ArrayLike, bound: float | None = None, *, rng: np.random.Generator | None = None
-) -> BandError:
+) -> ErrorEstimate:
     """Return the median of errors that are independent of each other, with its 68 % interval.
 
     Parameters
@@ -35,10 +35,10 @@ def median_error(
     2.0
     """
     rng = rng or np.random.default_rng(0)
-    return BandError(*metrics.median_with_interval(values, rng=rng), bound)
+    return ErrorEstimate(*metrics.median_with_interval(values, rng=rng), bound)
 
 
-def mean_error(values: ArrayLike) -> BandError:
+def mean_error(values: ArrayLike) -> ErrorEstimate:
     """Return the mean of independent errors with its standard error to both sides.
 
     Examples
@@ -49,10 +49,10 @@ def mean_error(values: ArrayLike) -> BandError:
     sizes = np.asarray(values, np.float64).ravel()
     mean = float(sizes.mean())
     half = float(sizes.std(ddof=1) / np.sqrt(sizes.size)) if sizes.size > 1 else float("nan")
-    return BandError(mean, (mean - half, mean + half))
+    return ErrorEstimate(mean, (mean - half, mean + half))
 
 
-def drawn_again(
+def bootstrap_interval(
     values: ArrayLike,
     statistic: Callable[..., Any] = np.median,
     *,
@@ -74,7 +74,7 @@ def drawn_again(
 
     Examples
     --------
-    >>> drawn_again([2.0, 2.0, 2.0])
+    >>> bootstrap_interval([2.0, 2.0, 2.0])
     (2.0, 2.0)
     """
     one = np.asarray(values)
@@ -84,53 +84,53 @@ def drawn_again(
     return float(low), float(high)
 
 
-def drawn_median(values: ArrayLike, bound: float | None = None, **draws: Any) -> BandError:
-    """Return the median of independent errors with the interval that `drawn_again` gives.
+def bootstrap_median(values: ArrayLike, bound: float | None = None, **draws: Any) -> ErrorEstimate:
+    """Return the median of independent errors with the interval that `bootstrap_interval` gives.
 
     Examples
     --------
-    >>> drawn_median([2.0, 2.0]).error_interval
+    >>> bootstrap_median([2.0, 2.0]).error_interval
     (2.0, 2.0)
     """
     middle = float(np.median(np.asarray(values)))
-    return BandError(middle, drawn_again(values, **draws), bound)
+    return ErrorEstimate(middle, bootstrap_interval(values, **draws), bound)
 
 
-def drawn_columns_median(
+def bootstrap_columns_median(
     values: ArrayLike, bound: float | None = None, *, draws: int = N_BOOTSTRAP_DRAWS
-) -> BandError:
+) -> ErrorEstimate:
     """Return the median of errors (draws, n) of which the n columns are independent.
 
     Examples
     --------
-    >>> drawn_columns_median([[2.0, 2.0], [2.0, 2.0]]).error_interval
+    >>> bootstrap_columns_median([[2.0, 2.0], [2.0, 2.0]]).error_interval
     (2.0, 2.0)
     """
     errors = np.asarray(values)
-    interval = drawn_again(
+    interval = bootstrap_interval(
         errors.T, lambda again, axis: np.median(again, axis=(axis, 2)), draws=draws
     )
-    return BandError(float(np.median(errors)), interval, bound)
+    return ErrorEstimate(float(np.median(errors)), interval, bound)
 
 
-def drawn_rms(squared: ArrayLike, bound: float | None = None, **draws: Any) -> BandError:
+def bootstrap_rms(squared: ArrayLike, bound: float | None = None, **draws: Any) -> ErrorEstimate:
     """Return the root of the mean of independent squares with the bootstrap's 68 % interval.
 
     Examples
     --------
-    >>> drawn_rms([4.0, 4.0]).error_interval
+    >>> bootstrap_rms([4.0, 4.0]).error_interval
     (2.0, 2.0)
     """
-    low, high = np.sqrt(drawn_again(squared, np.mean, **draws)).tolist()
-    return BandError(float(np.sqrt(np.mean(np.asarray(squared)))), (low, high), bound)
+    low, high = np.sqrt(bootstrap_interval(squared, np.mean, **draws)).tolist()
+    return ErrorEstimate(float(np.sqrt(np.mean(np.asarray(squared)))), (low, high), bound)
 
 
-def squares(side: int) -> list[tuple[slice, slice]]:
+def split_squares(side: int) -> list[tuple[slice, slice]]:
     """Return the places of 8 x 8 squares of an image (or more, where 8 is no divisor).
 
     Examples
     --------
-    >>> len(squares(64)), squares(64)[1]
+    >>> len(split_squares(64)), split_squares(64)[1]
     (64, (slice(0, 8, None), slice(8, 16, None)))
     """
     step = max(side // 8, 1)
@@ -138,9 +138,9 @@ def squares(side: int) -> list[tuple[slice, slice]]:
     return list(itertools.product(parts, parts))
 
 
-def rms_of_draws(
-    off: ArrayLike, *, bound: float | None = None, freedom: int | None = None
-) -> BandError:
+def gaussian_rms(
+    errors: ArrayLike, *, bound: float | None = None, freedom: int | None = None
+) -> ErrorEstimate:
     """Return the root mean square of Gaussian errors, whose own relative error is 1/sqrt(2 n).
 
     Parameters
@@ -154,15 +154,19 @@ def rms_of_draws(
 
     Examples
     --------
-    >>> rms_of_draws([2.0, -2.0]).error_interval
+    >>> gaussian_rms([2.0, -2.0]).error_interval
     (1.0, 3.0)
     """
-    sizes = np.asarray(off, np.float64)
+    sizes = np.asarray(errors, np.float64)
     error = float(np.sqrt(np.mean(sizes**2)))
-    return BandError.around(error, error / float(np.sqrt(2 * (freedom or sizes.size))), bound)
+    return ErrorEstimate.symmetric(
+        error, error / float(np.sqrt(2 * (freedom or sizes.size))), bound
+    )
 
 
-def tiled_rms(difference: FloatArray, where: BoolArray, *, tile_px: int = TILE_PX) -> BandError:
+def bootstrap_tiled_rms(
+    difference: FloatArray, mask: BoolArray, *, tile_px: int = TILE_PX
+) -> ErrorEstimate:
     """Return the root mean square of a picture's errors; the interval is over its tiles.
 
     Neighboring pixels err alike, so that tiles are drawn again, not pixels.
@@ -184,15 +188,15 @@ def tiled_rms(difference: FloatArray, where: BoolArray, *, tile_px: int = TILE_P
     Examples
     --------
     >>> import numpy as np
-    >>> tiled_rms(np.full((32, 32), 2.0), np.ones((32, 32), bool)).error_interval
+    >>> bootstrap_tiled_rms(np.full((32, 32), 2.0), np.ones((32, 32), bool)).error_interval
     (2.0, 2.0)
     """
     squared = np.square(np.asarray(difference, np.float64))
     squared = squared if squared.ndim == 2 else squared.mean(axis=-1)
-    rows, columns = np.nonzero(where)
+    rows, columns = np.nonzero(mask)
     _, which = np.unique(np.stack([rows, columns]) // tile_px, axis=1, return_inverse=True)
-    sums, counts = np.bincount(which, squared[where]), np.bincount(which)
+    sums, counts = np.bincount(which, squared[mask]), np.bincount(which)
     drawn = np.random.default_rng(0).integers(len(sums), size=(N_BOOTSTRAP_DRAWS, len(sums)))
     roots = np.sqrt(sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1))
     low, high = np.percentile(roots, [16, 84])
-    return BandError(float(np.sqrt(squared[where].mean())), (float(low), float(high)))
+    return ErrorEstimate(float(np.sqrt(squared[mask].mean())), (float(low), float(high)))

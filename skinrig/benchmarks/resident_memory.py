@@ -18,20 +18,20 @@ PEAK_RESET_CODE = "5"
 
 @dataclass(slots=True)
 class Peak:
-    """What :func:`watched` found."""
+    """What :func:`track_peak` found."""
 
     mb: float | None = None
     """Most resident memory above that at the start, MB; None: this system does not tell."""
 
 
 @contextmanager
-def watched() -> Iterator[Peak]:
+def track_peak() -> Iterator[Peak]:
     """Measure how far resident memory rises within the block; free heap is given back before.
 
     Examples
     --------
     >>> import numpy as np
-    >>> with watched() as peak:
+    >>> with track_peak() as peak:
     ...     held = np.ones(8_000_000)
     >>> peak.mb is None or 50 < peak.mb < 100
     True

@@ -88,7 +88,7 @@ class Limit:
 
 
 @dataclass(frozen=True, slots=True)
-class BandError:
+class ErrorEstimate:
     """Error in one band of skin, with the setting that is usual."""
 
     error: float
@@ -98,23 +98,23 @@ class BandError:
     """Least error that any unbiased estimator could have there; None: not known."""
 
     @classmethod
-    def around(cls, error: float, half: float, bound: float | None = None) -> BandError:
+    def symmetric(cls, error: float, half: float, bound: float | None = None) -> ErrorEstimate:
         """Return an error whose interval reaches as far to both sides.
 
         Examples
         --------
-        >>> BandError.around(2.0, 0.5).error_interval
+        >>> ErrorEstimate.around(2.0, 0.5).error_interval
         (1.5, 2.5)
         """
         return cls(error, (error - half, error + half), bound)
 
     @classmethod
-    def of_size(cls, size: float, half: float) -> BandError:
+    def nonnegative(cls, size: float, half: float) -> ErrorEstimate:
         """Return the same of a size, which is never below 0.
 
         Examples
         --------
-        >>> BandError.of_size(2.0, 2.5).error_interval
+        >>> ErrorEstimate.nonnegative(2.0, 2.5).error_interval
         (0.0, 4.5)
         """
         return cls(size, (max(size - half, 0.0), size + half))
@@ -135,7 +135,7 @@ class StageBenchmark:
     limits: tuple[Limit, ...] = ()
     left_out: tuple[tuple[str, str], ...] = ()
     """What this run did not measure, and why."""
-    by_band: Mapping[str, BandError] = field(default_factory=dict)
+    by_band: Mapping[str, ErrorEstimate] = field(default_factory=dict)
     """Error by melanin band, from light to dark, same unit; see `skinrig.evaluating.skin_bands`."""
     no_bands: str = ""
     """Why errors do not depend on how dark skin is, where there are no bands."""

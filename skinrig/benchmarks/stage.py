@@ -8,12 +8,12 @@ from importlib import resources
 from typing import Any
 
 from skinrig.benchmarks.measurement import Made, measure_and_keep
-from skinrig.benchmarks.results import BandError, Knob, Limit, Point, StageBenchmark, Timing
+from skinrig.benchmarks.results import ErrorEstimate, Knob, Limit, Point, StageBenchmark, Timing
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, MelaninBand
 
 STAGES_TABLE = resources.files("skinrig").joinpath("data/benchmarks.toml")
 
-Findings = dict[str | tuple[Any, ...], float | tuple[float, float]]
+LimitValues = dict[str | tuple[Any, ...], float | tuple[float, float]]
 """What was found of limits, by their keys in the table. What follows a key's first part fills the
 numbered braces of the limit's name; beside a value may stand its bound, where the run sets it."""
 
@@ -25,7 +25,7 @@ def descriptions() -> dict[str, dict[str, Any]]:
 
 
 @dataclass(slots=True)
-class Stage:
+class BenchmarkStage:
     """A stage at one size, to which its function adds what it measures."""
 
     name: str
@@ -33,9 +33,9 @@ class Stage:
     """Whether sizes are small: limits are then judged by nobody, and need not be found."""
     points: list[Point] = field(default_factory=list)
     """In the order in which they are shown."""
-    limits: Findings = field(default_factory=dict)
+    limits: LimitValues = field(default_factory=dict)
     """Those without a finding are not judged."""
-    by_band: dict[str, BandError] = field(default_factory=dict)
+    by_band: dict[str, ErrorEstimate] = field(default_factory=dict)
     """Errors by melanin band."""
     left_out: list[tuple[str, str]] = field(default_factory=list)
     """What this run did not measure, and why, beside what no run does."""
@@ -65,9 +65,9 @@ class Stage:
         self,
         knobs: Mapping[str, Knob],
         timing: Timing,
-        outcome: BandError,
+        outcome: ErrorEstimate,
         also: Mapping[str, Knob] | None = None,
-    ) -> BandError:
+    ) -> ErrorEstimate:
         """Add a point, with what else was measured at its setting, and return its error."""
         low_to_high, bound = outcome.error_interval, outcome.cramer_rao_bound
         self.points.append(Point(knobs, timing, outcome.error, low_to_high, bound, also or {}))
@@ -77,12 +77,12 @@ class Stage:
         self,
         knobs: Mapping[str, Knob],
         call: Callable[[], Made],
-        error: Callable[[Made], BandError],
+        error: Callable[[Made], ErrorEstimate],
         *,
         also: Mapping[str, Knob] | None = None,
         repeats: int | None = None,
         memory: bool | None = True,
-    ) -> BandError:
+    ) -> ErrorEstimate:
         """Time a call, take its error and add the point; return the error.
 
         Parameters
@@ -100,9 +100,10 @@ class Stage:
 
         Examples
         --------
-        >>> stage = Stage("hdr", toy=True)
-        >>> stage.measure({"n": 9}, lambda: sum(range(9)), lambda s: BandError.around(s - 30.0, 1))
-        BandError(error=6.0, error_interval=(5.0, 7.0), cramer_rao_bound=None)
+        >>> stage = BenchmarkStage("hdr", toy=True)
+        >>> stage.measure({"n": 9}, lambda: sum(range(9)),
+        ...     lambda s: ErrorEstimate.around(s - 30.0, 1))
+        ErrorEstimate(error=6.0, error_interval=(5.0, 7.0), cramer_rao_bound=None)
         """
         timing, made = self.time(call, repeats=repeats, memory=memory)
         return self.add(knobs, timing, error(made), also)
@@ -111,11 +112,11 @@ class Stage:
         """Return the first point whose knobs are set to these."""
         return next(point for point in self.points if knobs.items() <= point.knobs.items())
 
-    def on_each_skin(self, error: Callable[[MelaninBand], BandError]) -> None:
+    def measure_bands(self, error: Callable[[MelaninBand], ErrorEstimate]) -> None:
         """Take the error on skin of each melanin band."""
         self.by_band |= {name: error(band) for name, band in MELANIN_BANDS.items()}
 
-    def benchmark(self) -> StageBenchmark:
+    def to_benchmark(self) -> StageBenchmark:
         """Return what was found so far with the stage's description."""
         entry, error = descriptions()[self.name], self.reference_error
         return StageBenchmark(

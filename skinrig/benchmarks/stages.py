@@ -8,14 +8,14 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
+from skinrig.atomic_file import write_atomically
 from skinrig.benchmarks import plan as bench_plan
 from skinrig.benchmarks import table as bench_table
 from skinrig.benchmarks.document import to_document
 from skinrig.benchmarks.results import StageBenchmark
-from skinrig.benchmarks.stage import Stage, descriptions
-from skinrig.console import Console, plain
+from skinrig.benchmarks.stage import BenchmarkStage, descriptions
+from skinrig.console import Console, to_json_value
 from skinrig.errors import EXTRA_MISSING, exit_code, sentence
-from skinrig.whole_file import write_whole
 
 STAGES: dict[str, str] = {name: entry["run"] for name, entry in descriptions().items()}
 """Module and function of each; a module is imported, and its kernels compiled, when it is run."""
@@ -29,14 +29,14 @@ class BenchError(ValueError):
     """A stage that cannot be measured."""
 
 
-def _measured(name: str, *, toy: bool) -> Iterator[StageBenchmark]:
+def _iterate_results(name: str, *, toy: bool) -> Iterator[StageBenchmark]:
     """Yield what a stage has measured: once, or of a long one ever more until it is whole."""
     module, function = STAGES[name].rsplit(".", 1)
-    stage = Stage(name, toy=toy)
+    stage = BenchmarkStage(name, toy=toy)
     run = getattr(import_module(f"skinrig.benchmarks.{module}"), function)
     for _ in run(stage) or ():
-        yield stage.benchmark()
-    yield stage.benchmark()
+        yield stage.to_benchmark()
+    yield stage.to_benchmark()
 
 
 def run_stages(
@@ -69,7 +69,7 @@ def run_stages(
     BenchError
         For an unknown stage.
     """
-    chosen = list(dict.fromkeys(names)) if names else bench_plan.in_order(STAGES)
+    chosen = list(dict.fromkeys(names)) if names else bench_plan.order_small_stages(STAGES)
     for name in chosen:
         if name not in STAGES:
             raise BenchError(f"stage: got {name!r}, expected one of {', '.join(STAGES)}")
@@ -81,9 +81,9 @@ def run_stages(
     for name in chosen:
         run.measure(name, "small" if small else "full")
     if small and not toy:
-        run.enlarge()
+        run.measure_full_sizes()
     document = run.document()
-    bench_table.show(document, console)
+    bench_table.print_tables(document, console)
     return document
 
 
@@ -95,7 +95,7 @@ class _Run:
     """What was measured so far."""
 
     console: Console
-    until_s: float
+    deadline_s: float
     """When the budget ends, by `time.perf_counter`."""
     asked: bool
     """Whether stages were asked for by name: then what they need must be there."""
@@ -115,25 +115,25 @@ class _Run:
         self._measure(name, size, began)
         if name in self.to_do:
             self.to_do.remove(name)
-        self.keep()
+        self.save()
         return time.perf_counter() - began
 
-    def keep(self) -> None:
+    def save(self) -> None:
         """Write what there is: a run that is interrupted leaves what it measured."""
         if self.out is not None:
-            text = json.dumps(plain(self.document()), indent=1, sort_keys=True)
-            write_whole(self.out / "bench.json", text + "\n")
+            text = json.dumps(to_json_value(self.document()), indent=1, sort_keys=True)
+            write_atomically(self.out / "bench.json", text + "\n")
 
     def _measure(self, name: str, size: Size, began: float) -> None:
-        if began > self.until_s:
+        if began > self.deadline_s:
             self.left_out.append((name, "the budget was used up"))
             return
         self.console.progress(f"bench {name}, {size} size")
         try:
-            for made in _measured(name, toy=size == "small"):
+            for made in _iterate_results(name, toy=size == "small"):
                 if name in self.to_do:
                     self._take(name, made, size)
-                    self.keep()
+                    self.save()
         except ImportError as error:
             if self.asked or exit_code(error) != EXTRA_MISSING:
                 raise
@@ -149,11 +149,11 @@ class _Run:
                 max(p.timing.cold_s - p.timing.seconds, 0.0) for p in made.points
             )
 
-    def enlarge(self) -> None:
+    def measure_full_sizes(self) -> None:
         """Measure again at full size what fits into the rest of the budget."""
-        pace = bench_plan.Pace()
-        for name, told_s in bench_plan.quickest_first(self.done, bench_plan.FULL_S):
-            left_s = self.until_s - bench_plan.REPORT_RESERVE_S - time.perf_counter()
+        pace = bench_plan.MachinePace()
+        for name, told_s in bench_plan.order_full_stages(self.done, bench_plan.FULL_S):
+            left_s = self.deadline_s - bench_plan.REPORT_RESERVE_S - time.perf_counter()
             if not pace.fits(told_s, left_s):
                 break
             pace.add(told_s, self.measure(name, "full"))

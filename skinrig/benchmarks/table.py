@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from skinrig.atomic_file import write_atomically
 from skinrig.console import Console
-from skinrig.whole_file import write_whole
 
 _POINT_COLUMNS = (
     "seconds",
@@ -22,7 +22,7 @@ BAND_COLUMNS = ("stage", "skin", "error", "low", "high", "Cramér-Rao", "of ligh
 """Of the table of errors by band: the last but one is the error over that of the lightest band."""
 
 
-def show(document: Mapping[str, Any], console: Console) -> None:
+def print_tables(document: Mapping[str, Any], console: Console) -> None:
     """Print each stage's points and limits, then one line a stage and what was not judged.
 
     Parameters
@@ -45,7 +45,7 @@ def show(document: Mapping[str, Any], console: Console) -> None:
                 "",
             ),
             [
-                (knobs(point), *(_cell(point[key]) for key in _POINT_COLUMNS), _place(point))
+                (format_knobs(point), *(_cell(point[key]) for key in _POINT_COLUMNS), _place(point))
                 for point in stage["points"]
             ],
         )
@@ -124,7 +124,7 @@ def write(document: Mapping[str, Any], out: Path) -> None:
         (
             name,
             stage["size"],
-            knobs(point),
+            format_knobs(point),
             stage["error_name"],
             *(point[key] for key in _POINT_COLUMNS),
             *point["error_interval"],
@@ -135,12 +135,12 @@ def write(document: Mapping[str, Any], out: Path) -> None:
         for point in stage["points"]
     ]
     head = ("stage", "size", "setting", "error is", *_POINT_COLUMNS, "low", "high", "front", "knee")
-    write_whole(out / "bench.csv", _csv(head, rows))
-    write_whole(out / "bench-bands.csv", _csv(BAND_COLUMNS, bands(document)))
+    write_atomically(out / "bench.csv", _csv(head, rows))
+    write_atomically(out / "bench-bands.csv", _csv(BAND_COLUMNS, bands(document)))
     for name, stage in document["stages"].items():
         if stage["points"]:
             plot = bench_figures.error_against_seconds(name, stage)
-            write_whole(out / f"{name}.svg", plot + "\n")
+            write_atomically(out / f"{name}.svg", plot + "\n")
 
 
 def _csv(head: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
@@ -151,12 +151,12 @@ def _csv(head: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
     return text.getvalue()
 
 
-def knobs(point: Mapping[str, Any]) -> str:
+def format_knobs(point: Mapping[str, Any]) -> str:
     """Return what a point's knobs were set to, on one line.
 
     Examples
     --------
-    >>> knobs({"knobs": {"lights": 12, "fit": "robust"}})
+    >>> format_knobs({"knobs": {"lights": 12, "fit": "robust"}})
     'lights=12 fit=robust'
     """
     return " ".join(f"{name}={value}" for name, value in point["knobs"].items())
@@ -186,7 +186,7 @@ def _line(name: str, stage: Mapping[str, Any]) -> tuple[object, ...]:
         len(points),
         len(stage["fronts"]),
         min((float(point["error"]) for point in points), default=""),
-        knobs(bend) if bend else many,
+        format_knobs(bend) if bend else many,
         bend["seconds"] if bend else "",
         min(known) if known else "",
         verdict if stage["size"] == "full" else "not judged",

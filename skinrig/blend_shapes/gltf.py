@@ -57,45 +57,45 @@ class _Gltf:
         try:
             data = path.read_bytes()
         except OSError as error:
-            raise self.wrong(f"cannot be read: {error.strerror}") from error
+            raise self.build_error(f"cannot be read: {error.strerror}") from error
         text = self._unpacked(data) if path.suffix.lower() == ".glb" else data
         try:
             document = json.loads(text)
         except (json.JSONDecodeError, UnicodeDecodeError) as error:
-            raise self.wrong(f"not JSON: {error}") from error
+            raise self.build_error(f"not JSON: {error}") from error
         if not isinstance(document, dict):
-            raise self.wrong("got no JSON object")
+            raise self.build_error("got no JSON object")
         version = document.get("asset", {}).get("version", "none")
         if not str(version).startswith("2."):
-            raise self.wrong(f"got glTF version {version}, expected 2")
+            raise self.build_error(f"got glTF version {version}, expected 2")
         for name in document.get("extensionsRequired", []):
             if name in COMPRESSION_EXTENSIONS:
-                raise self.wrong(f"geometry is compressed by {name}; export it without")
+                raise self.build_error(f"geometry is compressed by {name}; export it without")
         self.document: dict[str, Any] = document
         self.buffers: dict[int, bytes] = {}
 
-    def wrong(self, what: str) -> MeshFileError:
-        return MeshFileError(f"{self.path}: {what}")
+    def build_error(self, message: str) -> MeshFileError:
+        return MeshFileError(f"{self.path}: {message}")
 
     def _unpacked(self, data: bytes) -> bytes:
         if len(data) < 20 or struct.unpack_from("<I", data)[0] != GLB_MAGIC:
-            raise self.wrong("not a GLB file")
+            raise self.build_error("not a GLB file")
         length = struct.unpack_from("<I", data, 8)[0]
         if length != len(data):
-            raise self.wrong(f"got {len(data)} bytes, expected {length}: it was cut short")
+            raise self.build_error(f"got {len(data)} bytes, expected {length}: it was cut short")
         at, text = 12, None
         while at + 8 <= len(data):
             size, kind = struct.unpack_from("<II", data, at)
             chunk = data[at + 8 : at + 8 + size]
             if len(chunk) != size:
-                raise self.wrong("a chunk is cut short")
+                raise self.build_error("a chunk is cut short")
             if kind == GLB_JSON and text is None:
                 text = chunk
             elif kind == GLB_BIN and self.binary is None:
                 self.binary = chunk
             at += 8 + size
         if text is None:
-            raise self.wrong("has no JSON chunk")
+            raise self.build_error("has no JSON chunk")
         return text
 
     def buffer(self, number: int) -> bytes:
@@ -104,23 +104,25 @@ class _Gltf:
             uri = entry.get("uri")
             if uri is None:
                 if self.binary is None or number != 0:
-                    raise self.wrong(f"buffer {number} has no data")
+                    raise self.build_error(f"buffer {number} has no data")
                 data = self.binary
             elif uri.startswith("data:"):
                 try:
                     data = base64.b64decode(uri.split(",", 1)[1], validate=True)
                 except (IndexError, binascii.Error) as error:
-                    raise self.wrong(f"buffer {number}: its data URI is damaged") from error
+                    raise self.build_error(f"buffer {number}: its data URI is damaged") from error
             else:
                 file = self.path.parent / unquote(uri)
                 if ".." in Path(unquote(uri)).parts or Path(unquote(uri)).is_absolute():
-                    raise self.wrong(f"buffer {number}: got {uri!r}, expected a file beside it")
+                    raise self.build_error(
+                        f"buffer {number}: got {uri!r}, expected a file beside it"
+                    )
                 try:
                     data = file.read_bytes()
                 except OSError as error:
-                    raise self.wrong(f"buffer {number}: {uri!r} cannot be read") from error
+                    raise self.build_error(f"buffer {number}: {uri!r} cannot be read") from error
             if len(data) < int(entry["byteLength"]):
-                raise self.wrong(f"buffer {number} is cut short")
+                raise self.build_error(f"buffer {number} is cut short")
             self.buffers[number] = data
         return self.buffers[number]
 
@@ -135,18 +137,20 @@ class _Gltf:
         data = self.buffer(int(view["buffer"]))
         last = int(view.get("byteOffset", 0)) + int(view["byteLength"])
         if start < 0 or stride < kind.itemsize * width or end > min(last, len(data)):
-            raise self.wrong(f"buffer view {view_number} is shorter than what is stored there")
+            raise self.build_error(
+                f"buffer view {view_number} is shorter than what is stored there"
+            )
         return np.ndarray((count, width), kind, data, start, (stride, kind.itemsize)).copy()
 
     def accessor(self, number: int, kind: str) -> NDArray[Any]:
         """Return an accessor's numbers, normalised ones as floats, shape (N, width)."""
         entry = self.document["accessors"][number]
         if entry["type"] != kind:
-            raise self.wrong(f"accessor {number}: got {entry['type']}, expected {kind}")
+            raise self.build_error(f"accessor {number}: got {entry['type']}, expected {kind}")
         component, count = int(entry["componentType"]), int(entry["count"])
         width = ACCESSOR_WIDTHS[kind]
         if component not in COMPONENT_DTYPES:
-            raise self.wrong(f"accessor {number}: got component type {component}")
+            raise self.build_error(f"accessor {number}: got component type {component}")
         if "bufferView" in entry:
             values = self._rows(entry, count, component, width)
         else:
@@ -156,7 +160,7 @@ class _Gltf:
             n, at, new = int(sparse["count"]), sparse["indices"], sparse["values"]
             places = self._rows(at, n, int(at["componentType"]), 1)[:, 0]
             if n and int(places.max()) >= count:
-                raise self.wrong(f"accessor {number}: a sparse index is beyond {count - 1}")
+                raise self.build_error(f"accessor {number}: a sparse index is beyond {count - 1}")
             values[places] = self._rows(new, n, component, width)
         if entry.get("normalized") and values.dtype.kind in "iu":
             top = float(np.iinfo(values.dtype).max)
@@ -188,11 +192,11 @@ def read(path: Path) -> MeshArrays:
     except MeshFileError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
-        raise gltf.wrong(f"a part is missing or of a wrong kind: {error!r}") from error
+        raise gltf.build_error(f"a part is missing or of a wrong kind: {error!r}") from error
 
 
 def _read(gltf: _Gltf) -> MeshArrays:
-    number = _chosen(gltf)
+    number = _select_mesh(gltf)
     mesh = gltf.document["meshes"][number]
     matrix = _transform(gltf, number)
     vertices, texture, faces, moved = [], [], [], []
@@ -200,11 +204,11 @@ def _read(gltf: _Gltf) -> MeshArrays:
     for index, primitive in enumerate(mesh["primitives"]):
         where = f"mesh {mesh.get('name', number)!r}, primitive {index}"
         if primitive.get("mode", TRIANGLES_MODE) != TRIANGLES_MODE:
-            raise gltf.wrong(f"{where}: got mode {primitive['mode']}, expected triangles")
+            raise gltf.build_error(f"{where}: got mode {primitive['mode']}, expected triangles")
         attributes = primitive["attributes"]
         for name in ("POSITION", "TEXCOORD_0"):
             if name not in attributes:
-                raise gltf.wrong(f"{where}: lacks {name}")
+                raise gltf.build_error(f"{where}: lacks {name}")
         points = gltf.accessor(attributes["POSITION"], "VEC3").astype(np.float64)
         uv = gltf.accessor(attributes["TEXCOORD_0"], "VEC2").astype(np.float64)
         if "indices" in primitive:
@@ -212,7 +216,9 @@ def _read(gltf: _Gltf) -> MeshArrays:
         else:
             corners = np.arange(len(points), dtype=np.int64)
         if corners.size % 3 or (corners.size and corners.max() >= len(points)):
-            raise gltf.wrong(f"{where}: its indices make no triangles of {len(points)} vertices")
+            raise gltf.build_error(
+                f"{where}: its indices make no triangles of {len(points)} vertices"
+            )
         targets = []
         for target in primitive.get("targets", []):
             deltas = np.zeros_like(points)
@@ -220,25 +226,27 @@ def _read(gltf: _Gltf) -> MeshArrays:
                 deltas = gltf.accessor(target["POSITION"], "VEC3").astype(np.float64)
             targets.append(deltas @ matrix[:3, :3].T)
         if any(len(values) != len(points) for values in (uv, *targets)):
-            raise gltf.wrong(f"{where}: its attributes and targets differ in length")
+            raise gltf.build_error(f"{where}: its attributes and targets differ in length")
         vertices.append(points @ matrix[:3, :3].T + matrix[:3, 3])
         texture.append(np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1))
         faces.append(corners.reshape(-1, 3) + count)
         moved.append(targets)
         count += len(points)
     if len({len(targets) for targets in moved}) != 1:
-        raise gltf.wrong("primitives of the mesh differ in their number of targets")
+        raise gltf.build_error("primitives of the mesh differ in their number of targets")
     unnamed = [f"shape_{i}" for i in range(len(moved[0]))]
     names = mesh.get("extras", {}).get("targetNames") or unnamed
     if len(names) != len(moved[0]) or len(set(names)) != len(names):
-        raise gltf.wrong(f"got {len(names)} names of targets, expected {len(moved[0])} distinct")
+        raise gltf.build_error(
+            f"got {len(names)} names of targets, expected {len(moved[0])} distinct"
+        )
     shapes = {
         str(name): np.concatenate([targets[i] for targets in moved]) for i, name in enumerate(names)
     }
     return np.concatenate(vertices), np.concatenate(texture), np.concatenate(faces), shapes
 
 
-def _chosen(gltf: _Gltf) -> int:
+def _select_mesh(gltf: _Gltf) -> int:
     meshes = gltf.document.get("meshes", [])
     able = {
         number: str(mesh.get("name", number))
@@ -247,7 +255,9 @@ def _chosen(gltf: _Gltf) -> int:
     }
     if len(able) != 1:
         listed = ", ".join(able.values()) or "none"
-        raise gltf.wrong(f"got {len(able)} meshes with morph targets ({listed}), expected one")
+        raise gltf.build_error(
+            f"got {len(able)} meshes with morph targets ({listed}), expected one"
+        )
     return next(iter(able))
 
 
@@ -266,7 +276,7 @@ def _transform(gltf: _Gltf, mesh: int) -> Float64Array:
             return matrix
         here = parent[here]
         matrix = _local(nodes[here]) @ matrix
-    raise gltf.wrong("its nodes go in circles")
+    raise gltf.build_error("its nodes go in circles")
 
 
 def _local(node: dict[str, Any]) -> Float64Array:

@@ -43,7 +43,7 @@ class BlendShapeMesh:
         """Check shapes, indices and sizes."""
         check_triangles(self.vertices_mm, self.faces, self.uv, self.shapes)
 
-    def deformed(self, weights: Mapping[str, float]) -> Float64Array:
+    def deform(self, weights: Mapping[str, float]) -> Float64Array:
         """Return the vertices under weights of shapes, mm, shape (V, 3).
 
         Parameters

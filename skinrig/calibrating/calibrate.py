@@ -14,9 +14,14 @@ from capture.calibration.color import matrix as color
 from capture.calibration.fiber.phantom import read_certificate
 from capture.session import FrameRecord, Session
 from skinrig.arrays import Float32Array
-from skinrig.calibrating import dome, gradient, probe, white_tile
-from skinrig.calibrating.outcome import CalibratingError, Made, TargetSessions, photon_transfer
-from skinrig.console import picked
+from skinrig.calibrating import dome, gradient, probe, white_reference
+from skinrig.calibrating.outcome import (
+    CalibratingError,
+    CalibrationResult,
+    TargetSessions,
+    photon_transfer,
+)
+from skinrig.console import select_attributes
 from skinrig.errors import one_of
 
 CALIBRATION_KINDS = (
@@ -30,11 +35,11 @@ CALIBRATION_KINDS = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Outcome(Made):
+class SavedCalibration(CalibrationResult):
     """A calibration that was made, and how it differs from the one before it."""
 
     path: Path
-    drift: tuple[store.Drift, ...]
+    drift: tuple[store.CalibrationDrift, ...]
 
 
 def calibrate(
@@ -45,7 +50,7 @@ def calibrate(
     created: date | None = None,
     targets: dome.DomeTargets | None = None,
     phantom: str | Path | None = None,
-) -> Outcome:
+) -> SavedCalibration:
     """Make one kind of calibration from target sessions and save it.
 
     Parameters
@@ -81,22 +86,24 @@ def calibrate(
     if kind == probe.FIBER_CALIBRATION_KIND:
         paper = None if phantom is None else read_certificate(phantom)
         made = probe.calibrate_probe(given, certificate=paper)
-    elif gradient.of_a_gradient_sphere(opened):
+    elif gradient.has_gradient_session(opened):
         made = gradient.calibrate_gradient(kind, given)
     elif kind in dome.DOME_CALIBRATION_KINDS:
         made = dome.calibrate_dome(kind, given, targets=targets)
     else:
         frames = _Frames(given)
         calibration = _CALIBRATION_MAKERS[kind](frames)
-        made = Made(calibration, tuple(_summary(calibration)), tuple(frames.findings))
-    drift: tuple[store.Drift, ...] = ()
+        made = CalibrationResult(calibration, tuple(_summary(calibration)), tuple(frames.findings))
+    drift: tuple[store.CalibrationDrift, ...] = ()
     try:
-        drift = store.drift(store.load(out, kind), made.calibration)
+        drift = store.measure_drift(store.load(out, kind), made.calibration)
     except store.CalibrationMissing:
         pass
     Path(out).mkdir(parents=True, exist_ok=True)
     path = store.save(made.calibration, out)
-    return Outcome(**picked(made, "calibration", "summary", "findings"), path=path, drift=drift)
+    return SavedCalibration(
+        **select_attributes(made, "calibration", "summary", "findings"), path=path, drift=drift
+    )
 
 
 Shots = list[tuple[FrameRecord, raw.RawFrame]]
@@ -118,12 +125,12 @@ class _Frames:
         self.about = {"serial": serials[0], **targets.provenance()}
         self.findings: list[str] = []
 
-    def need(self, kind: str, **index: str | int | float) -> Shots:
+    def require_frames(self, kind: str, **index: str | int | float) -> Shots:
         """Return records with their frames, or raise where there are none."""
-        found = self._targets.need("flash", kind, **index)
+        found = self._targets.require_frames("flash", kind, **index)
         return [(record, session.read(record)) for record, session in found]
 
-    def setting(self, record: FrameRecord, name: str) -> float:
+    def read_setting(self, record: FrameRecord, name: str) -> float:
         """Return a number that a frame was taken with."""
         try:
             return float(record.settings[name])
@@ -147,40 +154,48 @@ def _linear(shots: Shots) -> list[raw.LinearImage]:
 
 
 def _sensor(frames: _Frames) -> store.Calibration:
-    flats = [(frames.setting(record, "power"), frame) for record, frame in frames.need("flat")]
-    darks = [(frames.setting(record, "exposure_s"), frame) for record, frame in frames.need("dark")]
+    flats = [
+        (frames.read_setting(record, "power"), frame)
+        for record, frame in frames.require_frames("flat")
+    ]
+    darks = [
+        (frames.read_setting(record, "exposure_s"), frame)
+        for record, frame in frames.require_frames("dark")
+    ]
     result = photon_transfer(flats, darks)
     return result.to_calibration(**frames.about)
 
 
 def _white(frames: _Frames) -> store.Calibration:
     dark = frames.dark_level()
-    shots = frames.need("subject", polarizer="crossed")
-    powers = [frames.setting(record, "power") for record, _ in shots]
+    shots = frames.require_frames("subject", polarizer="crossed")
+    powers = [frames.read_setting(record, "power") for record, _ in shots]
     linear = _linear(shots)
     for (record, _), image in zip(shots, linear, strict=True):
         what = f"frame {record.step_id} of state {record.index.get('state')!r}"
-        frames.findings += white_tile.examine(image.rgb - dark, image.valid, what)
+        frames.findings += white_reference.check_white_reference(
+            image.rgb - dark, image.valid, what
+        )
     # the tile depolarizes: crossed filters pass half of its light, the diffuse total is twice that
     reference = white.white_reference(
         [2.0 * (image.rgb - dark) for image in linear],
         variances=[4.0 * image.variance for image in linear],
         valid=[image.valid for image in linear],
         lights=powers,
-        reflectance=WHITE_TILE_REFLECTANCE,
+        reflectance=WHITE_REFERENCE_REFLECTANCE,
         # every pixel by itself: what the pixels' own gains differ by must cancel in the ratio
         degree=None,
     )
     return reference.to_calibration(**frames.about)
 
 
-WHITE_TILE_REFLECTANCE = 0.99
+WHITE_REFERENCE_REFLECTANCE = 0.99
 """Of the white tile, pressed PTFE or the like, between 400 and 700 nm."""
 
 
 def _color(frames: _Frames) -> store.Calibration:
     dark = frames.dark_level()
-    linear = _linear(frames.need("chart", polarizer="crossed"))
+    linear = _linear(frames.require_frames("chart", polarizer="crossed"))
     image = np.mean([picture.rgb - dark for picture in linear], axis=0)
     valid = np.logical_and.reduce([picture.valid for picture in linear])
     centers = chart.find_chart(image)
@@ -199,12 +214,12 @@ def _color(frames: _Frames) -> store.Calibration:
 
 def _polarization(frames: _Frames) -> store.Calibration:
     dark = frames.dark_level()
-    shots = frames.need("malus")
-    angles = np.deg2rad([frames.setting(record, "analyser_deg") for record, _ in shots])
+    shots = frames.require_frames("malus")
+    angles = np.deg2rad([frames.read_setting(record, "analyser_deg") for record, _ in shots])
     linear = _linear(shots)
     images = [picture.rgb - dark for picture in linear]
     valid = np.logical_and.reduce([picture.valid for picture in linear])
-    chosen = polarization.modulated_pixels(angles, images, valid=valid)
+    chosen = polarization.find_modulated_pixels(angles, images, valid=valid)
     count = int(np.count_nonzero(chosen))
     if not count:
         raise CalibratingError("malus frames: no pixel follows the analyser; check the target")

@@ -9,14 +9,19 @@ import numpy as np
 from capture import raw
 from capture.calibration import geometry, store
 from capture.calibration.geometry import bundle
-from capture.calibration.geometry.board import Board, Sighting, find_board
+from capture.calibration.geometry.board import Board, CornerObservation, find_board
 from capture.calibration.lights import LightTable, light_fit, mirror_lights, mirror_sphere
 from capture.calibration.lights.white_plate import PlateSamples, PlateWindow, WhitePlate
 from capture.calibration.sensor.mosaic import channel_levels, neutral_mosaic
 from capture.rig import Rig
 from capture.session import FrameRecord, Session
 from skinrig.arrays import Float64Array
-from skinrig.calibrating.outcome import CalibratingError, Made, TargetSessions, numbered
+from skinrig.calibrating.outcome import (
+    CalibratingError,
+    CalibrationResult,
+    TargetSessions,
+    number_findings,
+)
 
 DOME_CALIBRATION_KINDS = ("geometry", "lights")
 LIGHT_TOLERANCE_MM = 5.0
@@ -42,7 +47,9 @@ def dome_targets(square_mm: float, sphere_radius_mm: float) -> DomeTargets:
     return DomeTargets(board, sphere_radius_mm)
 
 
-def calibrate_dome(kind: str, given: TargetSessions, targets: DomeTargets | None = None) -> Made:
+def calibrate_dome(
+    kind: str, sessions: TargetSessions, targets: DomeTargets | None = None
+) -> CalibrationResult:
     """Make the calibration "geometry" or "lights" of a dome.
 
     Parameters
@@ -60,32 +67,32 @@ def calibrate_dome(kind: str, given: TargetSessions, targets: DomeTargets | None
     CalibratingError
         When the frames that are needed are missing.
     """
-    rigs = {session.rig.name for session in given.sessions}
+    rigs = {session.rig.name for session in sessions.sessions}
     if len(rigs) != 1:
         raise CalibratingError(f"sessions: got rigs {sorted(rigs)}, expected one")
-    if "dome" not in given.rig.boxes:
+    if "dome" not in sessions.rig.boxes:
         raise CalibratingError(
             f"kind {kind!r}: got a session of rig {rigs.pop()!r}, expected one of a dome"
         )
-    return (_geometry if kind == "geometry" else _lights)(given, targets or DomeTargets())
+    return (_geometry if kind == "geometry" else _lights)(sessions, targets or DomeTargets())
 
 
 def _frames(
-    given: TargetSessions, kind: str, place: str
+    sessions: TargetSessions, kind: str, index_name: str
 ) -> Iterator[tuple[int, Session, FrameRecord]]:
     """Yield frames with the number of their place, over all sessions."""
-    for number, session in enumerate(given.sessions):
+    for number, session in enumerate(sessions.sessions):
         for record in session.frames(kind):
-            yield SESSION_STEP * number + int(record.index[place]), session, record
+            yield SESSION_STEP * number + int(record.index[index_name]), session, record
 
 
-def _geometry(given: TargetSessions, what: DomeTargets) -> Made:
-    rig = given.rig
-    sightings: dict[tuple[str, int], Sighting] = {}
+def _geometry(sessions: TargetSessions, targets: DomeTargets) -> CalibrationResult:
+    rig = sessions.rig
+    sightings: dict[tuple[str, int], CornerObservation] = {}
     without = 0
-    for pose, session, record in _frames(given, "charuco", "pose"):
+    for pose, session, record in _frames(sessions, "charuco", "pose"):
         image = raw.linear_rgb(session.read(record), demosaic="bilinear").rgb
-        sighting = find_board(image, what.board)
+        sighting = find_board(image, targets.board)
         if sighting is None:
             without += 1
         else:
@@ -96,9 +103,9 @@ def _geometry(given: TargetSessions, what: DomeTargets) -> Made:
             " it (`skinrig simulate dome --target charuco`), or say its squares"
         )
     start = geometry.nominal_cameras(rig)
-    findings = _moved(sightings, what.board, given.folder, rig)
+    findings = _describe_movement(sightings, targets.board, sessions.folder, rig)
     in_jig = any(pose == 0 for _, pose in sightings)
-    found = bundle.adjust(sightings, what.board, start, gauge="board" if in_jig else "cameras")
+    found = bundle.adjust(sightings, targets.board, start, gauge="board" if in_jig else "cameras")
     summary = [
         ("frames with the board", f"{len(sightings)} of {len(sightings) + without}"),
         ("rig frame", "the board in its jig" if in_jig else "the nominal cameras"),
@@ -111,37 +118,37 @@ def _geometry(given: TargetSessions, what: DomeTargets) -> Made:
         told = f"centre {place} mm; f {focal:.1f} ± {focal_error:.1f} px"
         summary.append((f"{name} ({camera.serial})", f"{found.rms_px[name]:.3f} px; {told}"))
     calibration = geometry.to_calibration(
-        found.cameras, reprojection_px=found.rms_px, **given.provenance()
+        found.cameras, reprojection_px=found.rms_px, **sessions.provenance()
     )
-    return Made(calibration, tuple(summary), findings)
+    return CalibrationResult(calibration, tuple(summary), findings)
 
 
-def _moved(
-    sightings: Mapping[tuple[str, int], Sighting], board: Board, folder: Path, rig: Rig
+def _describe_movement(
+    sightings: Mapping[tuple[str, int], CornerObservation], board: Board, folder: Path, rig: Rig
 ) -> tuple[str, ...]:
     """Return what moved since the geometry in a folder; nothing without one."""
     try:
-        previous = geometry.poses_from(store.load(folder, "geometry"), rig)
-        return tuple(str(moved) for moved in bundle.find_moved(sightings, board, previous))
+        previous = geometry.cameras_from_calibration(store.load(folder, "geometry"), rig)
+        return tuple(str(moved) for moved in bundle.find_moved_cameras(sightings, board, previous))
     except (store.CalibrationMissing, store.CalibrationMismatch, bundle.BundleError):
         return ()
 
 
-def _lights(given: TargetSessions, what: DomeTargets) -> Made:
-    rig = given.rig
-    cameras = geometry.poses_from(store.load(given.folder, "geometry"), rig)
+def _lights(sessions: TargetSessions, targets: DomeTargets) -> CalibrationResult:
+    rig = sessions.rig
+    cameras = geometry.cameras_from_calibration(store.load(sessions.folder, "geometry"), rig)
     table = LightTable.nominal(rig)
     findings: list[str] = []
     summary: list[tuple[str, str]] = []
     notes = {}
-    kinds = {record.kind for session in given.sessions for record in session.frames()}
+    kinds = {record.kind for session in sessions.sessions for record in session.frames()}
     if not kinds & {"mirror", "white"}:
         raise CalibratingError(
             "sessions: hold no frames of kind 'mirror' or 'white'; capture a target (`skinrig"
             " simulate dome --target mirror`, `--target white`)"
         )
     if "mirror" in kinds:
-        places = _mirror(given, cameras, what)
+        places = _mirror(sessions, cameras, targets)
         table = replace(
             table,
             position_mm=places.position_mm,
@@ -158,18 +165,20 @@ def _lights(given: TargetSessions, what: DomeTargets) -> Made:
         few = [n for n, ok in zip(places.names, places.valid, strict=True) if not ok]
         if few:
             findings.append(f"seen by too few cameras to be placed, left out: {', '.join(few)}")
-        findings += [f"light {a} shone at the place of {b}" for a, b in places.answers.items()]
-        findings += [f"light {name} was never seen in a sphere" for name in places.unseen]
+        findings += [f"light {a} shone at the place of {b}" for a, b in places.swapped.items()]
+        findings += [f"light {name} was never seen in a sphere" for name in places.unobserved]
     else:
         notes["positions"] = "nominal: no session of the mirror sphere was given"
     if "white" in kinds:
-        samples = _white(given, cameras, what)
-        fit = light_fit.fit_lights(samples, table, cameras, plate=what.plate)
+        samples = _white(sessions, cameras, targets)
+        fit = light_fit.fit_lights(samples, table, cameras, plate=targets.plate)
         table = fit.table
         lit = table.intensity[table.valid]
         relative = table.intensity_stderr[table.valid] / np.where(lit > 0, lit, 1.0)
         count = int((table.intensity > 0).all(axis=1).sum())
-        shared = f"{100 * what.plate.reflectance_stderr:.1f} % in common: the plate's reflectance"
+        shared = (
+            f"{100 * targets.plate.reflectance_stderr:.1f} % in common: the plate's reflectance"
+        )
         summary += [
             ("lights measured", f"{count} of {len(rig.lights)}, in {fit.frames} frames"),
             ("standard error of an intensity", f"{100 * np.median(relative):.2f} % (and {shared})"),
@@ -180,29 +189,31 @@ def _lights(given: TargetSessions, what: DomeTargets) -> Made:
             corner = 1 + float(response.vignetting.sum())
             summary.append((f"{serial} gain R, G, B", f"{gain}; corner {100 * corner:.0f} %"))
         findings += [f"light {name} is dead" for name in fit.dead]
-        findings += [f"light order: {a} shows the shading of {b}" for a, b in fit.answers.items()]
-        if fit.unseen:
-            findings.append(f"the plate never faced {', '.join(fit.unseen)}: left out")
+        findings += [f"light order: {a} shows the shading of {b}" for a, b in fit.swapped.items()]
+        if fit.unobserved:
+            findings.append(f"the plate never faced {', '.join(fit.unobserved)}: left out")
     else:
         notes["intensities"] = "nominal and relative: no session of the white plate was given"
-    calibration = table.to_calibration(notes={**notes, **numbered(findings)}, **given.provenance())
-    return Made(calibration, tuple(summary), tuple(findings))
+    calibration = table.to_calibration(
+        notes={**notes, **number_findings(findings)}, **sessions.provenance()
+    )
+    return CalibrationResult(calibration, tuple(summary), tuple(findings))
 
 
 def _mirror(
-    given: TargetSessions, cameras: Mapping[str, geometry.CameraPose], what: DomeTargets
+    sessions: TargetSessions, cameras: Mapping[str, geometry.CameraPose], targets: DomeTargets
 ) -> mirror_lights.LightPositions:
     """Return the lights' places from the frames of mirror spheres."""
-    lights = given.rig.lights
+    lights = sessions.rig.lights
     outlines: dict[int, dict[str, Float64Array]] = {}
     colors: dict[str, Float64Array] = {}
-    for sphere, session, record in _frames(given, "mirror", "sphere"):
+    for sphere, session, record in _frames(sessions, "mirror", "sphere"):
         if record.index.get("light") != "outline":
             continue
         frame = session.read(record)
         colors[record.camera] = channel_levels(frame)
         image = neutral_mosaic(frame, colors[record.camera])
-        edges = mirror_sphere.find_outline(image, cameras[record.camera], what.sphere_radius_mm)
+        edges = mirror_sphere.find_outline(image, cameras[record.camera], targets.sphere_radius_mm)
         if edges is not None:
             outlines.setdefault(sphere, {})[record.camera] = edges
     if not outlines:
@@ -211,12 +222,12 @@ def _mirror(
             " light = 'outline') must show it darker than what is behind it"
         )
     spheres = {
-        number: mirror_sphere.locate_sphere(edges, cameras, what.sphere_radius_mm)
+        number: mirror_sphere.locate_sphere(edges, cameras, targets.sphere_radius_mm)
         for number, edges in outlines.items()
     }
     windows: dict[tuple[str, int], mirror_lights.SphereWindow] = {}
     seen = []
-    for sphere, session, record in _frames(given, "mirror", "sphere"):
+    for sphere, session, record in _frames(sessions, "mirror", "sphere"):
         lit_dome = record.index.get("light") == "outline"
         if lit_dome or sphere not in spheres or record.camera not in colors:
             continue
@@ -225,7 +236,7 @@ def _mirror(
             windows[key] = mirror_lights.SphereWindow.of(cameras[record.camera], spheres[sphere])
         image = neutral_mosaic(session.read(record), colors[record.camera])
         pixels = mirror_lights.find_highlights(image, windows[key])
-        seen.append(mirror_lights.Highlights(record.camera, sphere, _lit(record), pixels))
+        seen.append(mirror_lights.Highlights(record.camera, sphere, _lit_lights(record), pixels))
     return mirror_lights.locate_lights(
         seen,
         cameras,
@@ -236,21 +247,21 @@ def _mirror(
     )
 
 
-def _lit(record: FrameRecord) -> tuple[str, ...]:
+def _lit_lights(record: FrameRecord) -> tuple[str, ...]:
     """Return the names of the lights that were on."""
     several = str(record.settings.get("leds", ""))
     return tuple(several.split("+")) if several else (str(record.settings["light"]),)
 
 
 def _white(
-    given: TargetSessions, cameras: Mapping[str, geometry.CameraPose], what: DomeTargets
+    sessions: TargetSessions, cameras: Mapping[str, geometry.CameraPose], targets: DomeTargets
 ) -> list[PlateSamples]:
     """Return the parts of the white plate in all frames lit by one light."""
-    markers: dict[tuple[str, int], Sighting] = {}
-    for pose, session, record in _frames(given, "white", "pose"):
+    markers: dict[tuple[str, int], CornerObservation] = {}
+    for pose, session, record in _frames(sessions, "white", "pose"):
         if record.index.get("light") == "several":
             image = raw.linear_rgb(session.read(record), demosaic="bilinear").rgb
-            sighting = what.plate.find(image)
+            sighting = targets.plate.find(image)
             if sighting is not None:
                 markers[record.camera, pose] = sighting
     if not markers:
@@ -259,17 +270,17 @@ def _white(
             " (index light = 'several')"
         )
     places = {
-        pose: bundle.place_board(markers, what.plate, cameras, pose)
+        pose: bundle.estimate_board_pose(markers, targets.plate, cameras, pose)
         for pose in {pose for _, pose in markers}
     }
     windows: dict[tuple[str, int], PlateWindow | None] = {}
     samples = []
-    for pose, session, record in _frames(given, "white", "pose"):
+    for pose, session, record in _frames(sessions, "white", "pose"):
         if record.index.get("light") == "several" or pose not in places:
             continue
         key = (record.camera, pose)
         if key not in windows:
-            windows[key] = PlateWindow.of(cameras[record.camera], places[pose], what.plate)
+            windows[key] = PlateWindow.of(cameras[record.camera], places[pose], targets.plate)
         window = windows[key]
         if window is None:
             continue

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from capture.calibration.fiber.spot_photometry import Shot, shot
+from capture.calibration.fiber.spot_photometry import SpotImage, make_spot_image
 from capture.calibration.led_sphere.glass_ball import GlassBall
 from capture.calibration.led_sphere.survey import SphereSurvey, survey_sphere
 from capture.calibration.record import Quantity
@@ -14,9 +14,9 @@ from capture.session import FrameRecord, Session
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.calibrating.outcome import (
     CalibratingError,
-    Made,
+    CalibrationResult,
     TargetSessions,
-    numbered,
+    number_findings,
     photon_transfer,
 )
 
@@ -25,12 +25,12 @@ ANALYZER_READING_DEG = {"parallel": 0.0, "crossed": 90.0}
 """Reading of the analyser in each of its named states."""
 
 
-def of_a_gradient_sphere(sessions: Sequence[Session]) -> bool:
+def has_gradient_session(sessions: Sequence[Session]) -> bool:
     """Return whether any session was captured in a gradient sphere."""
     return any("gradient_sphere" in session.rig.boxes for session in sessions)
 
 
-def calibrate_gradient(kind: str, given: TargetSessions) -> Made:
+def calibrate_gradient(kind: str, sessions: TargetSessions) -> CalibrationResult:
     """Make the calibration "sensor", "lights" or "polarization" of a gradient sphere.
 
     Parameters
@@ -48,49 +48,50 @@ def calibrate_gradient(kind: str, given: TargetSessions) -> Made:
     BallError, PolarizationError
         When the ball's frames do not tell what is wanted.
     """
-    rigs = {session.rig.name for session in given.sessions}
-    if len(rigs) != 1 or len(given.serials) != 1:
+    rigs = {session.rig.name for session in sessions.sessions}
+    if len(rigs) != 1 or len(sessions.serials) != 1:
         raise CalibratingError(
-            f"sessions: got rigs {sorted(rigs)} with cameras {sorted(given.serials)}, expected one"
+            f"sessions: got rigs {sorted(rigs)} with cameras {sorted(sessions.serials)}, expected"
+            f" one"
             " rig with one camera"
         )
     if kind not in GRADIENT_CALIBRATION_KINDS:
         known = ", ".join(GRADIENT_CALIBRATION_KINDS)
         raise CalibratingError(f"kind: got {kind!r}, expected one of {known} of rig {rigs.pop()!r}")
     if kind == "sensor":
-        return _sensor(given)
-    survey, notes = _survey(given)
+        return _sensor(sessions)
+    survey, notes = _survey(sessions)
     findings = (*survey.findings, *notes)
-    about = {"notes": numbered(findings), **given.provenance()}
+    about = {"notes": number_findings(findings), **sessions.provenance()}
     if kind == "lights":
         made = survey.lights.to_calibration(ball=_ball_quantities(survey), **about)
-        return Made(made, _lights_summary(survey), findings)
-    made = survey.films.to_calibration(serial=given.rig.views[0].serial, **about)
-    return Made(made, _films_summary(survey), findings)
+        return CalibrationResult(made, _lights_summary(survey), findings)
+    made = survey.polarizers.to_calibration(serial=sessions.rig.views[0].serial, **about)
+    return CalibrationResult(made, _polarizer_summary(survey), findings)
 
 
-def _survey(given: TargetSessions) -> tuple[SphereSurvey, tuple[str, ...]]:
-    with_ball = {session.id for _, session in given.need("gradient", "ball")}
+def _survey(sessions: TargetSessions) -> tuple[SphereSurvey, tuple[str, ...]]:
+    with_ball = {session.id for _, session in sessions.require_frames("gradient", "ball")}
     if len(with_ball) > 1:
         raise CalibratingError(
             f"sessions: got {len(with_ball)} of the ball, expected one; between two the ball has"
             " moved, so calibrate from each alone"
         )
-    flat, notes = _flat_field(given)
-    shots = tuple(_shots(given, flat))
+    flat, notes = _flat_field(sessions)
+    shots = tuple(_shots(sessions, flat))
     if not shots:
         raise CalibratingError(
             "sessions: hold no frames of the ball under pattern 'full' at a level above 0"
         )
-    view = given.rig.views[0].name
-    return survey_sphere(shots, given.rig, view=view, target=GlassBall()), notes
+    view = sessions.rig.views[0].name
+    return survey_sphere(shots, sessions.rig, view=view, target=GlassBall()), notes
 
 
-def _shots(given: TargetSessions, flat: Float64Array | float) -> Iterator[Shot]:
+def _shots(sessions: TargetSessions, flat: Float64Array | float) -> Iterator[SpotImage]:
     """Yield the exposures of the lit ball, the dark of their own exposure time taken off."""
     darks: dict[float, list[Float32Array]] = defaultdict(list)
     lit: list[tuple[FrameRecord, Session]] = []
-    for record, session in given.need("gradient", "ball"):
+    for record, session in sessions.require_frames("gradient", "ball"):
         if record.settings.get("pattern") == "dark":
             darks[float(record.settings["exposure_s"])].append(_above_black(session.read(record)))
         elif record.settings.get("pattern") == "full" and float(record.settings["level"]) > 0:
@@ -104,7 +105,7 @@ def _shots(given: TargetSessions, flat: Float64Array | float) -> Iterator[Shot]:
         dark = means.get(exposure_s)
         count = len(darks[exposure_s])
         offset = 0.0 if frame.noise_profile is None else frame.noise_profile[1]
-        yield shot(
+        yield make_spot_image(
             frame,
             amount_s=_light_s(record),
             reading_deg=_reading_deg(record),
@@ -131,26 +132,29 @@ def _reading_deg(record: FrameRecord) -> float:
     return ANALYZER_READING_DEG[str(record.settings["polarizer"])]
 
 
-def _flat_field(given: TargetSessions) -> tuple[Float64Array | float, tuple[str, ...]]:
+def _flat_field(sessions: TargetSessions) -> tuple[Float64Array | float, tuple[str, ...]]:
     """Return the camera's flat field, from the folder's sensor calibration where there is one."""
-    known = given.sensor()
+    known = sessions.sensor()
     if known is None:
         return 1.0, (
             "the folder holds no sensor calibration: intensities hold the lens's own shading;"
             " calibrate sensor first",
         )
-    view = given.rig.views[0]
+    view = sessions.rig.views[0]
     return known.flat_mosaic(view.height_px, view.width_px), ()
 
 
-def _sensor(given: TargetSessions) -> Made:
-    flats = [(_light_s(record), of.read(record)) for record, of in given.need("gradient", "flat")]
+def _sensor(sessions: TargetSessions) -> CalibrationResult:
+    flats = [
+        (_light_s(record), of.read(record))
+        for record, of in sessions.require_frames("gradient", "flat")
+    ]
     darks = [
         (float(record.settings["exposure_s"]), of.read(record))
-        for record, of in given.need("gradient", "dark")
+        for record, of in sessions.require_frames("gradient", "dark")
     ]
     result = photon_transfer(flats, darks)
-    made = result.to_calibration(serial=given.rig.views[0].serial, **given.provenance())
+    made = result.to_calibration(serial=sessions.rig.views[0].serial, **sessions.provenance())
     rows = []
     for name, quantity, scale, unit in (
         ("gain", result.gain_e_per_dn, 1.0, "e/DN"),
@@ -160,7 +164,7 @@ def _sensor(given: TargetSessions) -> Made:
     ):
         error = 0.0 if quantity.stderr is None else scale * float(quantity.stderr[0])
         rows.append((name, f"{scale * float(quantity.value[0]):.4g} ± {error:.2g} {unit}"))
-    return Made(made, tuple(rows))
+    return CalibrationResult(made, tuple(rows))
 
 
 def _ball_quantities(survey: SphereSurvey) -> dict[str, Quantity]:
@@ -192,8 +196,8 @@ def _lights_summary(survey: SphereSurvey) -> tuple[tuple[str, str], ...]:
     )
 
 
-def _films_summary(survey: SphereSurvey) -> tuple[tuple[str, str], ...]:
-    films = survey.films
+def _polarizer_summary(survey: SphereSurvey) -> tuple[tuple[str, str], ...]:
+    films = survey.polarizers
     zero, error = np.degrees([films.misalignment_rad, films.misalignment_stderr_rad])
     leaked, glass = films.leakage, films.glass_leakage[films.valid]
     low = f"9 of 10 lights below {100 * np.quantile(leaked, 0.9):.2f} %"

@@ -21,7 +21,7 @@ class CalibratingError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class CalibrationResult:
     """A calibration and what to say of it."""
 
     calibration: store.Calibration
@@ -69,7 +69,7 @@ class TargetSessions:
             for record in session.frames(kind, **index)
         ]
 
-    def need(
+    def require_frames(
         self, rig: str, kind: str, **index: str | int | float
     ) -> list[tuple[FrameRecord, Session]]:
         """Return the frames of a kind, or raise where there are none and say how to get them."""
@@ -89,18 +89,18 @@ class TargetSessions:
         try:
             found = store.load(self.folder, "sensor")
             how: dict[str, Any] = {"serials": [serial], "on_date": self.created}
-            store.require(found, rig=self.rig.name, kind="sensor", **how)
+            store.require_valid(found, rig=self.rig.name, kind="sensor", **how)
         except store.CalibrationMissing:
             return None
         return SensorCalibration.from_calibration(found, serial)
 
 
-def numbered(findings: Iterable[str]) -> Mapping[str, str]:
+def number_findings(findings: Iterable[str]) -> Mapping[str, str]:
     """Return findings as notes of a calibration.
 
     Examples
     --------
-    >>> numbered(["light L007 is dead"])
+    >>> number_findings(["light L007 is dead"])
     {'finding 0': 'light L007 is dead'}
     """
     return {f"finding {k}": text for k, text in enumerate(findings)}
@@ -127,7 +127,7 @@ def photon_transfer(
         for k in range(0, len(cfas) - 1, 2)
     ]
     first = flats[0][1]
-    return sensor.photon_transfer(
+    return sensor.calibrate_sensor(
         pairs,
         [frame.cfa for _, frame in darks],
         white_dn=first.white,

@@ -65,7 +65,7 @@ def expected_reflectance(certificate: PhantomCertificate, rig: Rig) -> ExpectedR
     cores: dict[str, Any] = {"core_mm": probe.fibres[0].core_mm}
     cores["source_core_mm"] = probe.source_core_mm
     try:
-        held = photon_table.domain(*at, **how)
+        held = photon_table.is_in_domain(*at, **how)
         slopes = photon_table.derivatives(*at, **(cores | how))
         own = photon_table.relative_error(*at, **how)
     except photon_table.TableDomainError as exc:

@@ -14,7 +14,12 @@ from capture.calibration.fiber.probe_calibration import FiberCalibration
 from capture.calibration.fiber.readings import FiberReadings, sum_spots
 from capture.calibration.fiber.spots import find_fiber_spots
 from capture.session import FrameRecord, Session
-from skinrig.calibrating.outcome import CalibratingError, Made, TargetSessions, numbered
+from skinrig.calibrating.outcome import (
+    CalibratingError,
+    CalibrationResult,
+    TargetSessions,
+    number_findings,
+)
 from skinrig.calibrating.phantom_reflectance import expected_reflectance, packaged_certificate
 
 FIBER_CALIBRATION_KIND: Final = "fibre"
@@ -22,7 +27,9 @@ MIN_HEALTHY_GAIN: Final = 0.5
 """Of the usual gain: a fibre below it is told of."""
 
 
-def calibrate_probe(given: TargetSessions, certificate: PhantomCertificate | None = None) -> Made:
+def calibrate_probe(
+    sessions: TargetSessions, certificate: PhantomCertificate | None = None
+) -> CalibrationResult:
     """Make the calibration "fibre" of a probe from a session of target "phantom".
 
     Parameters
@@ -40,19 +47,19 @@ def calibrate_probe(given: TargetSessions, certificate: PhantomCertificate | Non
     CalibrationError
         When the frames do not tell what is wanted.
     """
-    if len(given.sessions) != 1:
+    if len(sessions.sessions) != 1:
         raise CalibratingError(
-            f"sessions: got {len(given.sessions)}, expected one; between two the light may have"
+            f"sessions: got {len(sessions.sessions)}, expected one; between two the light may have"
             " changed, so calibrate from each alone"
         )
-    session = given.sessions[0]
+    session = sessions.sessions[0]
     rig = session.rig
     if rig.probe is None:
         raise CalibratingError(
             f"kind 'fibre': got a session of rig {rig.name!r}, expected one with a fibre probe"
         )
     paper = certificate or _packaged_certificate(session)
-    noise, notes = _noise(given)
+    noise, notes = _noise(sessions)
     series = _Series(session, noise)
     phantoms = series.phantoms()
     level = series.level()
@@ -75,13 +82,17 @@ def calibrate_probe(given: TargetSessions, certificate: PhantomCertificate | Non
             "the session holds no frames with covered fibres: cross-talk and stray light are taken"
             " to be none, and the far fibres' errors do not know of it",
         )
-    findings = (*spots.findings, *notes, *_worn(fibres))
+    findings = (*spots.findings, *notes, *_report_worn_fibers(fibres))
     made = fibres.to_calibration(
         serial=rig.views[0].serial,
-        notes={**numbered(findings), "phantom": paper.name or "not named", "noise": noise.origin},
-        **given.provenance(),
+        notes={
+            **number_findings(findings),
+            "phantom": paper.name or "not named",
+            "noise": noise.origin,
+        },
+        **sessions.provenance(),
     )
-    return Made(made, _summary(fibres, series, paper), findings)
+    return CalibrationResult(made, _summary(fibres, series, paper), findings)
 
 
 class _Series:
@@ -127,7 +138,7 @@ class _Series:
 
     def masks(self) -> Mapping[int, MergedSeries]:
         """Return the series with one fibre uncovered, by its number; merged when asked for."""
-        return _Merging(_grouped(self._session.frames("mask"), "fibre"), self._merge)
+        return _MergedSeries(_grouped(self._session.frames("mask"), "fibre"), self._merge)
 
     @property
     def counts(self) -> tuple[int, int, int]:
@@ -146,7 +157,7 @@ class _Series:
         )
 
 
-class _Merging(Mapping[int, MergedSeries]):
+class _MergedSeries(Mapping[int, MergedSeries]):
     """Series of a session by a number, of which one at a time is held."""
 
     def __init__(
@@ -186,14 +197,14 @@ def _temperature(records: Sequence[FrameRecord]) -> float | None:
     return float(np.mean(told)) if told else None
 
 
-def _noise(given: TargetSessions) -> tuple[CameraNoise, tuple[str, ...]]:
-    known = given.sensor()
+def _noise(sessions: TargetSessions) -> tuple[CameraNoise, tuple[str, ...]]:
+    known = sessions.sensor()
     if known is None:
-        return CameraNoise.of_view(given.rig.views[0]), (
+        return CameraNoise.from_view(sessions.rig.views[0]), (
             "the folder holds no sensor calibration: gain and read noise are the camera's nominal"
             " ones",
         )
-    return CameraNoise.of_sensor(known), ()
+    return CameraNoise.from_sensor(known), ()
 
 
 def _packaged_certificate(session: Session) -> PhantomCertificate:
@@ -226,7 +237,7 @@ def _mean(readings: Sequence[FiberReadings]) -> FiberReadings:
     )
 
 
-def _worn(fibres: FiberCalibration) -> tuple[str, ...]:
+def _report_worn_fibers(fibres: FiberCalibration) -> tuple[str, ...]:
     both = zip(fibres.gain.T, fibres.valid.T, strict=True)
     usual = np.array([np.median(gain[good]) if good.any() else 1.0 for gain, good in both])
     found = []

@@ -16,7 +16,7 @@ from capture.devices.camera import Camera, open_camera
 from capture.devices.led_box import Eyes
 from capture.plan import Plan
 from capture.rig import Rig
-from capture.session import Session, Subject
+from capture.session import Session, SubjectRecord
 from skinrig.capturing.addresses import open_box, open_with_retry, require_addresses
 from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.capturing.plan_choice import needed_boxes, write_plan
@@ -35,7 +35,7 @@ class CaptureOrder:
     """Address of each box."""
     cameras: Mapping[str, str]
     """Address of each camera."""
-    subject: Subject
+    subject: SubjectRecord
     dry_run: bool = False
     """Only print the plan."""
     plan_out: Path | None = None
@@ -69,7 +69,7 @@ def capture_session(
     DeviceError
         When a box or camera fails; what was captured stays and can be resumed.
     """
-    seconds = plan.estimated_s(rig)
+    seconds = plan.estimate_duration_s(rig)
     needed = needed_boxes(rig, plan)
     if not order.dry_run:
         require_addresses(rig, order.boxes, order.cameras, needed=needed)
@@ -121,7 +121,7 @@ def _run(
                 subject=order.subject,
                 source="simulated" if maker.upper().startswith("RIGSIM") else "measured",
             )
-            stack.enter_context(_unless_used(session, fresh, console))
+            stack.enter_context(_discard_unused_session(session, fresh, console))
         stack.callback(session.release)
         with _stop_on_signal() as stopped:
             done = run_plan(
@@ -132,16 +132,16 @@ def _run(
                 session=session,
                 operator=Operator(
                     progress=console.progress,
-                    prompt=partial(ask, console.progress),
+                    prompt=partial(prompt_operator, console.progress),
                     interrupted=stopped,
-                    signal=partial(sound, console.progress),
+                    signal=partial(signal_subject, console.progress),
                 ),
                 eyes=order.eyes,
                 force_limit_n=order.force_limit_n,
                 all_brackets=order.all_brackets,
             )
         session.close()
-        left_out = dict(session.left_out())
+        left_out = dict(session.omitted_steps())
     if done.dead_lights:
         console.say(f"dead lights: {', '.join(done.dead_lights)}; their frames are dark")
     console.each("left out", dict.fromkeys(left_out.values()))
@@ -169,23 +169,27 @@ def _open_devices(
     return boxes, cameras
 
 
-def ask(progress: Callable[[str], None], what: str) -> None:
+def prompt_operator(progress: Callable[[str], None], instruction: str) -> None:
     """Say what the operator has to make ready, and wait for Enter where there is a keyboard."""
-    what = what if what.startswith(("step ", "tape ", "place ", "put ")) else f"make ready: {what}"
+    instruction = (
+        instruction
+        if instruction.startswith(("step ", "tape ", "place ", "put "))
+        else f"make ready: {instruction}"
+    )
     if sys.stdin is None or not sys.stdin.isatty():
-        progress(what)
+        progress(instruction)
         return
-    progress(f"{what}; then press Enter")
+    progress(f"{instruction}; then press Enter")
     sys.stdin.readline()
 
 
-def sound(progress: Callable[[str], None], what: str) -> None:
+def signal_subject(progress: Callable[[str], None], instruction: str) -> None:
     """Ring the terminal's bell and say what the subject shall change to; wait for nothing."""
-    progress(f"\a{what}")
+    progress(f"\a{instruction}")
 
 
 @contextlib.contextmanager
-def _unless_used(session: Session, fresh: bool, console: Console) -> Iterator[None]:
+def _discard_unused_session(session: Session, fresh: bool, console: Console) -> Iterator[None]:
     """Take a new session away again when a device failed before its first frame."""
     try:
         yield

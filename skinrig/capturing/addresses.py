@@ -13,23 +13,23 @@ from skinrig.errors import UsageError
 if TYPE_CHECKING:
     from capture.devices.box import Box
 
-RETRY_S = 10.0
+RETRY_TIMEOUT_S = 10.0
 """How long a device that is held, or reads out a frame of before, is asked for again."""
 RETRY_PAUSE_S = 0.5
 
 _T = TypeVar("_T")
 
 
-def addresses(given: Sequence[str], option: str) -> dict[str, str]:
+def parse_addresses(pairs: Sequence[str], option: str) -> dict[str, str]:
     """Return NAME=URL pairs as a mapping.
 
     Examples
     --------
-    >>> addresses(["flash=/dev/ttyUSB0"], "--port")
+    >>> parse_addresses(["flash=/dev/ttyUSB0"], "--port")
     {'flash': '/dev/ttyUSB0'}
     """
     found: dict[str, str] = {}
-    for text in given:
+    for text in pairs:
         name, equals, url = text.partition("=")
         if not (equals and name and url):
             raise UsageError(f"{option}: got {text!r}, expected NAME=URL")
@@ -98,7 +98,7 @@ def open_with_retry(
     open_device: Callable[[], _T],
     progress: Callable[[str], None],
     *,
-    retry_s: float = RETRY_S,
+    retry_s: float = RETRY_TIMEOUT_S,
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> _T:

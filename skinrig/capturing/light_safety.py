@@ -6,9 +6,9 @@ from typing import Final
 from capture.plan import Plan
 from capture.plan.dose import SKIN_APERTURE_MM, dose_report, fiber_light
 from capture.plan.flicker import flicker_report
-from capture.plan.gradient import scan_duty, states
+from capture.plan.gradient import group_by_state, scan_duty
 from capture.rig import LedLimits, Rig
-from skinrig.console import picked
+from skinrig.console import select_attributes
 
 LIGHT_FIGURE_LABELS: Final[Mapping[str, str]] = {
     "flashes_per_s": "flashes in the worst second",
@@ -65,11 +65,11 @@ def light_figures(plan: Plan, rig: Rig) -> Mapping[str, float | str]:
     if rig.probe is not None:
         light = fiber_light(plan, rig)
         names = ("led", "led_ws", "limit_ws", "placement_ws", "skin_w_m2", "stare_s")
-        return picked(light, *names)
+        return select_attributes(light, *names)
     flicker, dose = flicker_report(plan, rig), dose_report(plan, rig)
     limits = rig.leds or LedLimits()
     skin: dict[str, float | str] = {}
-    for _, steps in states(plan):  # one is like the other
+    for _, steps in group_by_state(plan):  # one is like the other
         light_s = sum(float(step.settings["dwell_s"]) for step in steps)
         skin = {"state_s": light_s, "duty": scan_duty(steps, rig)}
         break
@@ -77,7 +77,7 @@ def light_figures(plan: Plan, rig: Rig) -> Mapping[str, float | str]:
         "flashes_per_s": flicker.flashes_per_s,
         "flicker_rms": flicker.rms,
         "open_eyes": "allowed" if flicker.within(limits) and not skin else "refused",
-        **picked(dose, "led", "led_ws", "limit_ws", "blue_share", "eye_j_m2"),
+        **select_attributes(dose, "led", "led_ws", "limit_ws", "blue_share", "eye_j_m2"),
         **skin,
     }
 

@@ -153,8 +153,8 @@ def parse_sequence(
     order = SequenceOrder(
         state=state, shot_period_s=shot_period, captures=captures, duration_s=duration
     )
-    if order.prompted and duration is not None:
+    if order.is_prompted and duration is not None:
         raise UsageError(f"--duration: is for an event; {state} goes by --captures")
-    if not order.prompted and (prompt_period is not None or captures is not None):
+    if not order.is_prompted and (prompt_period is not None or captures is not None):
         raise UsageError(f"--prompt-period, --captures: {state} is no expression; use --duration")
     return order if prompt_period is None else replace(order, prompt_period_s=prompt_period)

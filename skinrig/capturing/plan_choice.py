@@ -8,7 +8,12 @@ from typing import Any, get_args
 
 from capture.plan import Plan, flash_calibration_plan, flash_plan
 from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
-from capture.plan.gradient import GradientTarget, gradient_calibration_plan, gradient_plan, state_of
+from capture.plan.gradient import (
+    GradientTarget,
+    gradient_calibration_plan,
+    gradient_plan,
+    strain_state,
+)
 from capture.plan.probe import PROBE_SITES, ProbeTarget, probe_calibration_plan, probe_plan
 from capture.rig import Rig
 from skinrig.capturing.sequences import SequenceOrder, sequence_plan
@@ -27,7 +32,7 @@ def read_plan(file: Path) -> Plan:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OwnPlan:
+class DefaultPlan:
     """What a rig's own plan is of.
 
     Raises
@@ -54,28 +59,28 @@ class OwnPlan:
         if "gradient_sphere" in rig.boxes:
             if self.target is None:
                 return gradient_plan(rig, angles=self.angles, steps=self.steps)
-            return gradient_calibration_plan(rig, self._target_of(get_args(GradientTarget)))
+            return gradient_calibration_plan(rig, self._check_target(get_args(GradientTarget)))
         if "dome" in rig.boxes:
             if self.target is None:
                 return dome_plan(rig)
-            return dome_calibration_plan(rig, self._target_of(get_args(DomeTarget)))
+            return dome_calibration_plan(rig, self._check_target(get_args(DomeTarget)))
         repeats = self.repeats
         if rig.probe is not None:
             if self.target is None:
-                sites, angles = self.sites or PROBE_SITES, directions_of(self.angles)
+                sites, angles = self.sites or PROBE_SITES, parse_direction_count(self.angles)
                 return probe_plan(rig, sites=sites, repeats=repeats, angles=angles)
-            target = self._target_of(get_args(ProbeTarget))
+            target = self._check_target(get_args(ProbeTarget))
             return probe_calibration_plan(rig, target, repeats=repeats)
         if self.target is None:
             states = self.states or ("neutral",)
             return flash_plan(rig, states=states, repeats=repeats, interleave=True)
         if self.target == "white":
             return flash_plan(rig, states=("white",), repeats=max(4, repeats))
-        target = self._target_of(("white", *FLASH_CALIBRATION_TARGETS))
+        target = self._check_target(("white", *FLASH_CALIBRATION_TARGETS))
         return flash_calibration_plan(rig, target)
 
-    def _target_of(self, known: Sequence[str]) -> Any:
-        return one_of("target", str(self.target), known, CaptureError)
+    def _check_target(self, targets: Sequence[str]) -> Any:
+        return one_of("target", str(self.target), targets, CaptureError)
 
 
 def choose_plan(
@@ -98,7 +103,7 @@ def choose_plan(
     sequence
         In time, of the flash rig.
     details
-        Further fields of `OwnPlan`.
+        Further fields of `DefaultPlan`.
 
     Raises
     ------
@@ -107,7 +112,7 @@ def choose_plan(
     UsageError
         For what the rig does not know, or that a plan in a file has already.
     """
-    asked = OwnPlan(target=target, **details)
+    asked = DefaultPlan(target=target, **details)
     own = file is None and target is None
     if sequence is not None:
         if not own or "flash" not in rig.boxes:
@@ -129,7 +134,7 @@ def choose_plan(
     return asked.of(rig) if file is None else read_plan(file)
 
 
-def directions_of(angles: Sequence[float] | None) -> int:
+def parse_direction_count(angles: Sequence[float] | None) -> int:
     """Return how many directions of the probe's head ``--angles N`` asks for; 1 for None.
 
     Raises
@@ -139,7 +144,7 @@ def directions_of(angles: Sequence[float] | None) -> int:
 
     Examples
     --------
-    >>> directions_of((16.0,)), directions_of(None)
+    >>> parse_direction_count((16.0,)), parse_direction_count(None)
     (16, 1)
     """
     if angles is None:
@@ -154,7 +159,7 @@ def directions_of(angles: Sequence[float] | None) -> int:
 
 def needed_boxes(rig: Rig, plan: Plan) -> tuple[str, ...]:
     """Return the boxes of a rig that a plan uses: a caliper only where it holds skin."""
-    skin = any(state_of(step) is not None for step in plan.steps)
+    skin = any(strain_state(step) is not None for step in plan.steps)
     return tuple(name for name in rig.boxes if skin or name != "caliper")
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from capture.plan import Plan
 from capture.plan.multiplexed import course_plan, multiplexed_plan
-from capture.plan.phases import phases
+from capture.plan.phases import phase_coverage
 from capture.rig import Rig
 
 EVENT_STATES = ("exercise", "alcohol")
@@ -35,7 +35,7 @@ class SequenceOrder:
     usual one. A real person has their own."""
 
     @property
-    def prompted(self) -> bool:
+    def is_prompted(self) -> bool:
         """Whether prompts make the course, and not an event."""
         return self.state not in EVENT_STATES
 
@@ -43,7 +43,7 @@ class SequenceOrder:
         """Return this as JSON values."""
         told: dict[str, Any] = {
             "state": self.state,
-            "prompt_period_s": self.prompt_period_s if self.prompted else None,
+            "prompt_period_s": self.prompt_period_s if self.is_prompted else None,
             "shot_period_s": self.shot_period_s,
             "captures": self.captures,
             "duration_s": self.duration_s,
@@ -66,7 +66,7 @@ def sequence_plan(rig: Rig, order: SequenceOrder, *, darks: int = 4) -> Plan:
     >>> plan.steps[-1].settings["start_s"]
     3600.0
     """
-    if order.prompted:
+    if order.is_prompted:
         return multiplexed_plan(
             rig,
             state=order.state,
@@ -95,5 +95,5 @@ def sequence_lines(plan: Plan) -> list[str]:
     '22 captures meet 20 distinct phases of the 10 s cycle, 2 of them again'
     """
     if plan.limits.get("prompt_period_s", 0.0) > 0:
-        return [str(phases(plan))]
+        return [str(phase_coverage(plan))]
     return []

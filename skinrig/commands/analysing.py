@@ -66,13 +66,13 @@ def analyse_brdf(
     if appearances:
         each = points or analysing_brdf.N_POINTS_PER_FACE
         given: dict[str, Any] = {"labels": labels, "basis": basis, "method": how, "seed": seed}
-        found = analysing_brdf.analyse_measured(out, appearances, points_each=each, **given)
+        found = analysing_brdf.analyze_measured(out, appearances, points_each=each, **given)
     elif labels is not None or basis is not None:
         raise UsageError("--labels, --basis: are of measured faces; name their folders")
     else:
         some = points or analysing_brdf.N_POINTS_PER_DATASET
         each = max(1, round(0.4 * some))
-        found = analysing_brdf.analyse_simulated(
+        found = analysing_brdf.analyze_simulated(
             out, points=some, points_each=each, method=how, seed=seed, progress=console.progress
         )
     documents = [one.document() for one in found]

@@ -11,8 +11,8 @@ import typer
 from skinrig import errors
 from skinrig.commands import options
 from skinrig.commands.help import RigCommand, RigFileGroup
-from skinrig.commands.options import command, option, target_of
-from skinrig.console import Console, counted, picked
+from skinrig.commands.options import command, option, target_option
+from skinrig.console import Console, format_count, select_attributes
 
 if TYPE_CHECKING:
     from skinrig.capturing.acquisition import CaptureOrder
@@ -68,15 +68,15 @@ class CaptureOptions:
     def order(self, **more: Any) -> CaptureOrder:
         """Return the order of a capture, with what only some rigs have."""
         from skinrig.capturing.acquisition import CaptureOrder
-        from skinrig.capturing.addresses import addresses
-        from skinrig.consent import subject_of
+        from skinrig.capturing.addresses import parse_addresses
+        from skinrig.consent import parse_subject
 
         return CaptureOrder(
             out=self.out,
-            boxes=addresses(self.port or (), "--port"),
-            cameras=addresses(self.camera or (), "--camera"),
-            subject=subject_of(self.subject, self.consent, self.consent_expires),
-            **picked(self, "dry_run", "plan_out", "resume"),
+            boxes=parse_addresses(self.port or (), "--port"),
+            cameras=parse_addresses(self.camera or (), "--camera"),
+            subject=parse_subject(self.subject, self.consent, self.consent_expires),
+            **select_attributes(self, "dry_run", "plan_out", "resume"),
             **more,
         )
 
@@ -87,7 +87,7 @@ def capture_flash(
     context: typer.Context,
     common: CaptureOptions,
     sequence: options.SequenceOptions,
-    target: Annotated[str | None, target_of("flash")] = None,
+    target: Annotated[str | None, target_option("flash")] = None,
     state: list[str] | None = None,
     repeats: options.Pairs = 1,
 ) -> None:
@@ -110,7 +110,7 @@ def capture_flash(
 def capture_dome(
     context: typer.Context,
     common: CaptureOptions,
-    target: Annotated[str | None, target_of("dome")] = None,
+    target: Annotated[str | None, target_option("dome")] = None,
     eyes: Eyes = "open",
 ) -> None:
     """Run a plan on a dome: a face under one light after the other, or a target.
@@ -127,7 +127,7 @@ def capture_dome(
 def capture_gradient(
     context: typer.Context,
     common: CaptureOptions,
-    target: Annotated[str | None, target_of("gradient")] = None,
+    target: Annotated[str | None, target_option("gradient")] = None,
     eyes: Eyes = "open",
     force_limit: float | None = None,
     angles: options.Angles = None,
@@ -154,7 +154,7 @@ def capture_gradient(
 def capture_probe(
     context: typer.Context,
     common: CaptureOptions,
-    target: Annotated[str | None, target_of("probe")] = None,
+    target: Annotated[str | None, target_option("probe")] = None,
     sites: options.Sites = None,
     repeats: options.Placements = 1,
     angles: options.Directions = None,
@@ -267,7 +267,7 @@ def _serve(context: typer.Context, common: ServeOptions, site: str | None = None
     from skinrig.simulating.serving import ServeOrder, serve_rig
 
     options = ("pty", "tcp", "allow_remote", "subject", "size", "seed", "resume")
-    order = ServeOrder(site=site, **picked(common, *options))
+    order = ServeOrder(site=site, **select_attributes(common, *options))
     serve_rig(str(context.info_name), order, Console(common.json))
 
 
@@ -289,10 +289,10 @@ def verify(session: Path, /, json: options.Json = False) -> None:
     console.each("warning", found.warnings)
     console.each("damaged", found.problems)
     console.say(
-        f"{session}: {'sound' if found.ok else 'DAMAGED'}, {counted(found.frames, 'frame')}, "
+        f"{session}: {'sound' if found.ok else 'DAMAGED'}, {format_count(found.frames, 'frame')}, "
         f"{found.bytes / 1e6:.1f} MB"
     )
-    figures = picked(found, "ok", "problems", "warnings", "frames", "bytes")
+    figures = select_attributes(found, "ok", "problems", "warnings", "frames", "bytes")
     console.document("skinrig.verify/1", figures)
     if not found.ok:
         raise typer.Exit(errors.BAD_INPUT)

@@ -13,13 +13,13 @@ import typer
 from reconstruction.correspondence import landmark_table
 from skinrig.commands.help import Command, Subcommands
 from skinrig.commands.options import Json, NewMaps, command
-from skinrig.console import Console, picked
+from skinrig.console import Console, select_attributes
 from skinrig.errors import UsageError, one_of
 from skinrig.next_steps import shell_quote
 
 if TYPE_CHECKING:
-    from skinrig.applying.expression import Applied, Expression, OtherFace
-    from skinrig.applying.relief import Relief, ReliefRequest
+    from skinrig.applying.expression import AppliedExpression, ExpressionRequest, TargetFace
+    from skinrig.applying.relief import ReliefEvaluator, ReliefRequest
 
 fit_app = typer.Typer(cls=Subcommands, help="Fit models to captured data.", no_args_is_help=True)
 apply_app = typer.Typer(
@@ -59,7 +59,7 @@ def fit_facial_color(
         Cells a side of scale and bias maps.
     """
     from skinrig.fitting.facial_color import fit_facial_color as fit
-    from skinrig.fitting.facial_color import summary
+    from skinrig.fitting.facial_color import summarize_states
 
     console = Console(json)
     found = fit(
@@ -71,11 +71,11 @@ def fit_facial_color(
         stored_size=stored_size,
         progress=console.progress,
     )
-    rows = summary(found)
+    rows = summarize_states(found)
     console.rows(
         ("state", "change of blood, points", "change, %", "median scale", "place error, px"), rows
     )
-    console.left_out(found.left_out)
+    console.left_out(found.omitted)
     states = ",".join(found.hemoglobin)
     console.say(f"{out}: hemoglobin rig of {states}")
     last = list(found.changes)[-1]
@@ -83,7 +83,9 @@ def fit_facial_color(
         f"next: skinrig apply expression {shell_quote(out)} --weights {last}=1 --out {last}"
     )
     found_values = {"states": list(found.hemoglobin), "radius_px": found.rig.radius_px}
-    fitted(console, "facial_color", out, found_values | {"left_out": found.left_out, "rows": rows})
+    print_fit(
+        console, "facial_color", out, found_values | {"left_out": found.omitted, "rows": rows}
+    )
 
 
 @fit_app.command("wrinkles", cls=Command)
@@ -116,13 +118,18 @@ def fit_wrinkles(
         Seed of the search for zones.
     """
     from skinrig.fitting.wrinkles import fit_wrinkles as fit
-    from skinrig.fitting.wrinkles import summary, zone_names
+    from skinrig.fitting.wrinkles import summarize_expressions, zone_names
 
     console = Console(json)
     found = fit(appearances, out=out, masks=mask, size=size, mask_size=mask_size, seed=seed)
-    console.rows(("expression", *zone_names(found).values()), summary(found))
+    console.rows(("expression", *zone_names(found).values()), summarize_expressions(found))
     console.say(f"{out}: wrinkles explain {100 * found.fit.explained:.0f} % of the differences")
-    fitted(console, "wrinkles", out, {"explained": found.fit.explained, "rows": summary(found)})
+    print_fit(
+        console,
+        "wrinkles",
+        out,
+        {"explained": found.fit.explained, "rows": summarize_expressions(found)},
+    )
 
 
 @fit_app.command("microstructure", cls=Command)
@@ -156,7 +163,7 @@ def fit_microstructure(
         "--out DIR"
     )
     sites = {site: one.document() for site, one in found.items()}
-    fitted(console, "microstructure", out, {"sites": sites})
+    print_fit(console, "microstructure", out, {"sites": sites})
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,17 +192,17 @@ class ReliefOptions:
 
     def relief(
         self, mesh: Path, weights: Mapping[str, float], out: Path, console: Console
-    ) -> Relief:
+    ) -> ReliefEvaluator:
         """Return what evaluates the relief on a mesh under weights of its shapes."""
-        from skinrig.applying.relief import Relief
+        from skinrig.applying.relief import ReliefEvaluator
 
-        return Relief.of(mesh, weights, self.request(), out=out, progress=console.progress)
+        return ReliefEvaluator.of(mesh, weights, self.request(), out=out, progress=console.progress)
 
     def request(self) -> ReliefRequest:
         """Return the relief that is asked for."""
         from skinrig.applying.relief import ReliefRequest
 
-        given = picked(self, "site", "extrapolate", "seed")
+        given = select_attributes(self, "site", "extrapolate", "seed")
         return ReliefRequest(size_px=self.size, source=self.synthesize, **given)
 
 
@@ -229,17 +236,17 @@ class ExpressionOptions:
     onto: Path | None = None
     landmarks: list[Path] | None = None
 
-    def expression(self, weights: Mapping[str, float]) -> Expression:
+    def expression(self, weights: Mapping[str, float]) -> ExpressionRequest:
         """Return the expression that is asked for."""
-        from skinrig.applying.expression import Expression
+        from skinrig.applying.expression import ExpressionRequest
 
-        return Expression(
+        return ExpressionRequest(
             weights,
             normalize=self.normalize,
             clamp=one_of("--clamp", self.clamp, ("unit", "signed")),
             emotional=self.emotional,
             gain=self.gain,
-            onto=_other_face(self.onto, self.landmarks or []),
+            onto=_read_target_face(self.onto, self.landmarks or []),
         )
 
 
@@ -279,7 +286,7 @@ def apply_expression(
     relief = None
     moving.request()  # checked even where no mesh is given
     if mesh is not None:
-        relief = moving.relief(mesh, applying.normalized(given).weights, out, console)
+        relief = moving.relief(mesh, applying.normalize_weights(given).weights, out, console)
     done = applying.apply_expression(
         appearance, given, out=out, parts=parts, relief=relief, progress=console.progress
     )
@@ -314,7 +321,7 @@ def apply_microstructure(
     from skinrig.applying import expression as applying
 
     console = Console(json)
-    given = applying.Expression(applying.parse_weights(weights))
+    given = applying.ExpressionRequest(applying.parse_weights(weights))
     relief = moving.relief(mesh, given.weights, out, console)
     parts = (MICROSTRUCTURE,)
     done = applying.apply_expression(
@@ -323,10 +330,10 @@ def apply_microstructure(
     _report(console, out, done)
 
 
-def _other_face(onto: Path | None, landmarks: list[Path]) -> OtherFace | None:
+def _read_target_face(onto: Path | None, landmarks: list[Path]) -> TargetFace | None:
     """Return the face that a rig is applied to, with its landmarks."""
     from model import store
-    from skinrig.applying.expression import OtherFace
+    from skinrig.applying.expression import TargetFace
 
     if onto is None:
         if landmarks:
@@ -337,25 +344,29 @@ def _other_face(onto: Path | None, landmarks: list[Path]) -> OtherFace | None:
             f"--landmarks: got {len(landmarks)} tables, expected two, of the rig's face and of the "
             "other, or none"
         )
-    tables = [landmark_table.read(path) for path in landmarks]
+    tables = [landmark_table.read_landmark_table(path) for path in landmarks]
     own, other = tables if tables else (None, None)
     read = {"onto": onto / store.DOCUMENT_FILE}
     read |= dict(zip(("landmarks of the rig", "landmarks of the other"), landmarks, strict=False))
     found = store.read(onto)
     hashes = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in read.items()}
-    return OtherFace(found, landmarks=other, landmarks_rig=own, hashes=hashes)
+    return TargetFace(found, landmarks=other, landmarks_rig=own, hashes=hashes)
 
 
-def _report(console: Console, out: Path, done: Applied) -> None:
+def _report(console: Console, out: Path, done: AppliedExpression) -> None:
     """Print what an evaluation made."""
     console.figures(done.figures, int, float, str)
     console.left_out(done.left_out)
     console.say(f"{out}: {', '.join(done.maps)}")
-    document = {"out": out, "maps": list(done.maps), **picked(done, "figures", "left_out")}
+    document = {
+        "out": out,
+        "maps": list(done.maps),
+        **select_attributes(done, "figures", "left_out"),
+    }
     console.document("skinrig.apply/1", document)
 
 
-def fitted(console: Console, model: str, out: Path, found: Mapping[str, Any]) -> None:
+def print_fit(console: Console, model: str, out: Path, found: Mapping[str, Any]) -> None:
     """Print the document of a fit."""
     console.document("skinrig.fit/1", {"model": model, "out": out, **found})
 
@@ -385,11 +396,11 @@ def fit_reflectance(
         Table name,x,y of the probe's sites in texels of the dome's maps.
     """
     from skinrig.fitting.reflectance import fit_reflectance as fit
-    from skinrig.fitting.reflectance import summary
+    from skinrig.fitting.reflectance import summarize_medians
 
     console = Console(json)
     found = fit(dome, probe, out=out, landmarks=landmarks)
-    rows = summary(found)
+    rows = summarize_medians(found)
     console.rows(("median over valid texels", "red", "green", "blue"), rows)
     for site in found.placed.sites if found.placed is not None else ():
         console.say(f"{site.name}: texel row {site.texel[0]}, column {site.texel[1]}")
@@ -398,4 +409,9 @@ def fit_reflectance(
     valid = float(found.model.valid.mean())
     console.say(f"{out}: reflectance model, {100 * valid:.0f} % of its texels valid")
     console.say(f"next: skinrig render {shell_quote(out)} --light 1,1,2 --out picture")
-    fitted(console, "reflectance", out, picked(found, "assumed", "left_out") | {"rows": rows})
+    print_fit(
+        console,
+        "reflectance",
+        out,
+        select_attributes(found, "assumed", "left_out") | {"rows": rows},
+    )

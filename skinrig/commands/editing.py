@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 from skinrig.commands.analysing import Labels
-from skinrig.commands.dynamic import fitted
+from skinrig.commands.dynamic import print_fit
 from skinrig.commands.options import Json, NewMaps, Out, Seed, command, option
-from skinrig.console import Console, picked
+from skinrig.console import Console, select_attributes
 from skinrig.errors import UsageError, one_of
 from skinrig.next_steps import shell_quote
 
@@ -69,10 +69,10 @@ class EditOptions:
         from skinrig.editing.edit import EditRequest
 
         return EditRequest(
-            traits=parse_amounts(_words(self.trait), "--trait"),
+            traits=parse_amounts(_split_names(self.trait), "--trait"),
             parts=parse_names(self.parts),
             spots=parse_spots(self.spots),
-            **picked(self, "region", "mask", "landmarks", "basis", "iterations", "seed"),
+            **select_attributes(self, "region", "mask", "landmarks", "basis", "iterations", "seed"),
         )
 
 
@@ -93,7 +93,7 @@ def edit(appearance: Path, /, out: NewMaps, chosen: EditOptions, json: Json = Fa
     console = Console(json)
     order = chosen.request()
     library, digest = regions.load(chosen.space) if order.traits else (None, "")
-    done = editing.edit(
+    done = editing.edit_folder(
         appearance, order, out=out, library=library, library_hash=digest, progress=console.progress
     )
     parts = {part: done.record.get(part, {}) for part in editing.EDITABLE_PARTS}
@@ -170,7 +170,7 @@ def fit_traits(
         "traits": names,
         "rows": [dict(zip(keys, row, strict=True)) for row in found.rows],
     }
-    fitted(console, "traits", out, learned | picked(found, "warnings", "left_out"))
+    print_fit(console, "traits", out, learned | select_attributes(found, "warnings", "left_out"))
 
 
 @command
@@ -201,7 +201,7 @@ def analyse_albedo(
 
     console = Console(json)
     if appearances:
-        found = analysing_albedo.analyse_measured(
+        found = analysing_albedo.analyze_measured(
             out,
             appearances,
             labels=labels,
@@ -212,7 +212,7 @@ def analyse_albedo(
     elif labels is not None or landmarks is not None:
         raise UsageError("--labels, --landmarks: are of measured faces; name their folders")
     else:
-        found = analysing_albedo.analyse_simulated(
+        found = analysing_albedo.analyze_simulated(
             out, people=people, seed=seed, progress=console.progress
         )
     document = found.document()
@@ -234,7 +234,7 @@ def analyse_albedo(
     console.document("skinrig.analyse-albedo/1", {"out": out, **document})
 
 
-def _words(text: str | None) -> list[str]:
+def _split_names(text: str | None) -> list[str]:
     """Return what commas part, nothing where nothing stands."""
     return [word.strip() for word in (text or "").split(",") if word.strip()]
 
@@ -250,7 +250,7 @@ def parse_spots(text: str | None) -> tuple[Any, ...]:
     from skinrig.editing.spots import SpotOrder
 
     out = []
-    for word in _words(text):
+    for word in _split_names(text):
         kind, _, rest = word.partition("=")
         amount, colon, density = rest.partition(":")
         try:

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from skinrig.commands.options import Json, Out, command
-from skinrig.console import Console, counted, picked
+from skinrig.console import Console, format_count, select_attributes
 from skinrig.errors import UnusableError, one_of
-from skinrig.exporting.options import Delivery, Place
+from skinrig.exporting.options import ExportSettings, SkinPosition
 
 NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
     "maps": "read maps.json: units, ranges and frames; maps.mtlx holds the color spaces",
@@ -61,10 +61,12 @@ class DeliveryOptions:
         """Names of what is written; none: all that there are."""
         return () if self.only is None else tuple(name.strip() for name in self.only.split(","))
 
-    def delivery(self, **more: Any) -> Delivery:
+    def delivery(self, **more: Any) -> ExportSettings:
         """Return the same as an export takes it, with what other options say."""
-        same = picked(self, "unit", "normal_y", "udim", "with_errors", "mesh", "onto")
-        return Delivery(only=self.names, landmarks=tuple(self.landmarks or ()), **same, **more)
+        same = select_attributes(self, "unit", "normal_y", "udim", "with_errors", "mesh", "onto")
+        return ExportSettings(
+            only=self.names, landmarks=tuple(self.landmarks or ()), **same, **more
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,11 +87,11 @@ class PlaceOptions:
     radius: float = 0.0
     without_diffuse: bool = False
 
-    def named(self) -> Place | None:
+    def named(self) -> SkinPosition | None:
         """Return the place; None without one."""
         if self.at is None:
             return None
-        return Place.named(self.at, radius_mm=self.radius, diffuse=not self.without_diffuse)
+        return SkinPosition.parse(self.at, radius_mm=self.radius, diffuse=not self.without_diffuse)
 
 
 @command
@@ -137,10 +139,10 @@ def export(
         to, "hand the folder on; `ascmhl verify` tells whether it is still whole"
     )
     console.left_out(done.left_out)
-    console.say(f"{done.path}: {counted(done.files, 'file')}, listed in {done.manifest}")
+    console.say(f"{done.path}: {format_count(done.files, 'file')}, listed in {done.manifest}")
     console.say(f"next: {after}")
-    document = picked(done, "path", "files", "manifest") | {"to": to, "next": after}
-    console.document("skinrig.export/1", document | picked(done, "left_out"))
+    document = select_attributes(done, "path", "files", "manifest") | {"to": to, "next": after}
+    console.document("skinrig.export/1", document | select_attributes(done, "left_out"))
 
 
 def _check_format(

@@ -46,16 +46,18 @@ class _WithoutTypes:
         return getattr(self._formatter, name)
 
     def write_dl(self, rows: Iterable[tuple[str, str]], *args: Any, **settings: Any) -> None:
-        self._formatter.write_dl([(plain(name), text) for name, text in rows], *args, **settings)
+        self._formatter.write_dl(
+            [(format_argument(name), text) for name, text in rows], *args, **settings
+        )
 
 
-def plain(name: str) -> str:
+def format_argument(name: str) -> str:
     """Return how an argument is listed, with what one of it is.
 
     Examples
     --------
-    >>> plain("paths... <list[Path]>"), plain("--consent-expires <%Y-%m-%d>"), plain("--size <int>")
-    ('paths... <path>', '--consent-expires <date>', '--size <int>')
+    >>> format_argument("paths... <list[Path]>"), format_argument("--expires <%Y-%m-%d>")
+    ('paths... <path>', '--expires <date>')
     """
     for pattern, words in _TYPE_LABELS:
         name = pattern.sub(words, name)

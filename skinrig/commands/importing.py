@@ -6,7 +6,7 @@ import typer
 
 from skinrig.commands.help import Command, Subcommands
 from skinrig.commands.options import Consent, ConsentExpires, Json, Out, command
-from skinrig.console import Console, counted, picked
+from skinrig.console import Console, format_count, select_attributes
 from skinrig.next_steps import shell_quote
 
 import_app = typer.Typer(
@@ -41,15 +41,15 @@ def import_photos(
     """
     from capture.importers import import_photos as bring_in
     from capture.rig import load_rig
-    from skinrig.consent import subject_of
+    from skinrig.consent import parse_subject
 
     console = Console(json)
-    person = subject_of(subject, consent, consent_expires)
+    person = parse_subject(subject, consent, consent_expires)
     done = bring_in(directory, out=out, rig=None if rig is None else load_rig(rig), subject=person)
     console.each("assumed", done.assumed)
     console.each("ignored", done.ignored)
     console.say(
-        f"{done.path}: {counted(done.frames, 'photograph')}, states {', '.join(done.states)}"
+        f"{done.path}: {format_count(done.frames, 'photograph')}, states {', '.join(done.states)}"
     )
     place = shell_quote(out)
     if done.color_states:
@@ -61,7 +61,8 @@ def import_photos(
         after = f"verify {place}"
     console.say(f"next: skinrig {after}")
     console.document(
-        "skinrig.import/1", picked(done, "path", "frames", "assumed", "states", "ignored")
+        "skinrig.import/1",
+        select_attributes(done, "path", "frames", "assumed", "states", "ignored"),
     )
 
 
@@ -98,7 +99,7 @@ def import_mesh(
     console.say(f"next: skinrig {after if done.reopened else f'verify {shell_quote(done.path)}'}")
     console.document(
         "skinrig.import/1",
-        picked(done, "path", "vertices", "faces", "has_uv", "extent_mm", "reopened"),
+        select_attributes(done, "path", "vertices", "faces", "has_uv", "extent_mm", "reopened"),
     )
 
 
@@ -143,10 +144,11 @@ def import_lp(
         mm_per_px=mm_per_px,
     )
     console.each("assumed", done.assumed)
-    console.say(f"{done.path}: {counted(done.frames, 'picture')}, lights of {done.lights}")
+    console.say(f"{done.path}: {format_count(done.frames, 'picture')}, lights of {done.lights}")
     console.say(
         f"next: skinrig reconstruct {shell_quote(out)} --want normals,albedo --out appearance"
     )
     console.document(
-        "skinrig.import/1", picked(done, "path", "frames", "lights", "encoding", "mask", "assumed")
+        "skinrig.import/1",
+        select_attributes(done, "path", "frames", "lights", "encoding", "mask", "assumed"),
     )

@@ -10,9 +10,9 @@ from skinrig import errors
 from skinrig.benchmarks import table as bench_table
 from skinrig.commands import completion
 from skinrig.commands.options import Json, command
-from skinrig.console import Console, picked
-from skinrig.doctor import examine
-from skinrig.kernel_cache import wait_asleep
+from skinrig.console import Console, select_attributes
+from skinrig.doctor import check_installation
+from skinrig.kernel_cache import set_passive_waiting
 
 BUDGET_S = 600.0
 """Seconds of a benchmark that names none."""
@@ -72,7 +72,9 @@ def bench(
         raise errors.UnusableError(
             f"--out: {out} is a file, expected a folder, new or to be replaced"
         )
-    wait_asleep(os.environ)  # before numerical libraries are loaded: one stage runs at a time
+    set_passive_waiting(
+        os.environ
+    )  # before numerical libraries are loaded: one stage runs at a time
     if extremes:
         from skinrig.reporting.sections.extremes import run_extremes
 
@@ -94,12 +96,12 @@ def doctor(json: Json = False) -> None:
     Example: skinrig doctor
     """
     console = Console(json)
-    findings = examine()
+    findings = check_installation()
     console.rows(
         ("", "what", "state", "to mend"),
         [("ok" if f.fine else "!!", f.what, f.state, f.mend) for f in findings],
     )
-    rows = [picked(f, "what", "state", "fine", "mend") for f in findings]
+    rows = [select_attributes(f, "what", "state", "fine", "mend") for f in findings]
     console.document("skinrig.doctor/1", {"findings": rows})
     if not all(f.fine for f in findings):
         raise typer.Exit(errors.EXTRA_MISSING)

@@ -29,7 +29,7 @@ Seed = Annotated[int, option("Seed of everything that is drawn.")]
 Out = Annotated[Path, option("Folder to write.", "--out")]
 
 
-def _free(context: typer.Context, out: Path) -> Path:
+def _check_output_folder(context: typer.Context, out: Path) -> Path:
     """Refuse a folder that maps cannot go to before minutes are spent on them."""
     if not context.resilient_parsing:
         from model.store import require_free
@@ -38,27 +38,29 @@ def _free(context: typer.Context, out: Path) -> Path:
     return out
 
 
-NewMaps = Annotated[Path, typer.Option("--out", callback=_free, help="Folder to write.")]
+NewMaps = Annotated[
+    Path, typer.Option("--out", callback=_check_output_folder, help="Folder to write.")
+]
 """An APPEARANCE/ folder, new or to be replaced."""
 
 
-def file_to_write(context: typer.Context, out: Path | None) -> Path | None:
+def check_output_file(context: typer.Context, out: Path | None) -> Path | None:
     """Refuse a folder where a file is to be written, before the work."""
     if out is not None and not context.resilient_parsing and out.is_dir():
         raise UnusableError(f"--out: {out} is a folder, expected a file to write")
     return out
 
 
-def page_to_write(context: typer.Context, out: Path | None) -> Path | None:
+def check_output_page(context: typer.Context, out: Path | None) -> Path | None:
     """Refuse a folder, and the standard output, which has no name to be opened by."""
     if out is not None and not context.resilient_parsing and str(out) == STDOUT_MARK:
         raise UsageError("--out: got '-', expected a file to write")
-    return file_to_write(context, out)
+    return check_output_file(context, out)
 
 
 STDOUT_MARK = "-"
 """The standard output where a file is named."""
-Page = Annotated[Path, typer.Option("-o", "--out", callback=page_to_write, help="The page.")]
+Page = Annotated[Path, typer.Option("-o", "--out", callback=check_output_page, help="The page.")]
 Subject = Annotated[
     str,
     option(
@@ -91,12 +93,12 @@ ConsentExpires = Annotated[
 ]
 
 
-def target_of(rig: str) -> Any:
+def target_option(rig: str) -> Any:
     """Return the option --target of a rig."""
-    names = completion.targets_of(rig)
+    names = completion.target_completer(rig)
     return option(
         f"A target instead of a subject: {', '.join(names)}.",
-        autocompletion=lambda incomplete: completion.beginning(names, incomplete),
+        autocompletion=lambda incomplete: completion.filter_by_prefix(names, incomplete),
     )
 
 
@@ -154,7 +156,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         is_argument = one.kind is Parameter.POSITIONAL_ONLY
         if is_argument:
             positional.append(name)
-        kind = _described(name, types[name], helps, argument=is_argument)
+        kind = _annotate_parameter(name, types[name], helps, argument=is_argument)
         shown.append(one.replace(annotation=kind, kind=Parameter.KEYWORD_ONLY))
 
     def run(**given: Any) -> None:
@@ -179,11 +181,13 @@ def _options_of(group: Any) -> Iterator[Parameter]:
             one.name,
             Parameter.KEYWORD_ONLY,
             default=Parameter.empty if one.default is MISSING else one.default,
-            annotation=_described(one.name, hints[one.name], helps),
+            annotation=_annotate_parameter(one.name, hints[one.name], helps),
         )
 
 
-def _described(name: str, kind: Any, helps: Mapping[str, str], *, argument: bool = False) -> Any:
+def _annotate_parameter(
+    name: str, kind: Any, helps: Mapping[str, str], *, argument: bool = False
+) -> Any:
     """Return a parameter's type with its option or argument; flags have no opposite."""
     if name not in helps:
         return kind

@@ -8,12 +8,12 @@ from typing import Annotated
 import typer
 
 from skinrig import errors
+from skinrig.atomic_file import write_atomically
 from skinrig.commands.help import RigCommand, RigGroup
-from skinrig.commands.options import Json, Subject, command, file_to_write, option
-from skinrig.console import Console, picked
+from skinrig.commands.options import Json, Subject, check_output_file, command, option
+from skinrig.console import Console, select_attributes
 from skinrig.next_steps import shell_quote
-from skinrig.whole_file import write_whole
-from skinrig.written_units import written
+from skinrig.unit_format import format_quantity
 
 plan_app = typer.Typer(
     cls=RigGroup,
@@ -56,7 +56,7 @@ class PlanOptions:
     subject: Subject = "III"
     valid_share: float = 0.9
     forecast: Path | None = None
-    out: Annotated[Path | None, typer.Option("--out", callback=file_to_write)] = None
+    out: Annotated[Path | None, typer.Option("--out", callback=check_output_file)] = None
     confirm: Path | None = None
     seed: int = 0
     json: Json = False
@@ -128,8 +128,8 @@ def _plan(
     most_lights: int | None = None,
 ) -> None:
     """Choose a plan, print it, and write it."""
-    from skinrig.planning.plans import choose, lines
-    from skinrig.simulating.subject_records import unused_subject_keys
+    from skinrig.planning.plans import choose, format_choice
+    from skinrig.simulating.subject_records import find_unused_subject_keys
 
     console = Console(common.json)
     subject, seed = common.subject, common.seed
@@ -137,29 +137,30 @@ def _plan(
         raise errors.UnusableError(
             f"--valid-share: got {common.valid_share:g}, expected above 0, up to 1"
         )
-    unused = unused_subject_keys(subject, rig, console.progress)
-    asked = picked(common, "subject", "seed", "valid_share", "forecast")
+    unused = find_unused_subject_keys(subject, rig, console.progress)
+    asked = select_attributes(common, "subject", "seed", "valid_share", "forecast")
     choice = choose(rig, want, width_px=width, most_lights=most_lights, **asked)
-    for line in lines(choice):
+    for line in format_choice(choice):
         console.say(line)
     document = choice.to_document()
     if unused:
         document["subject_unused"] = list(unused)
     reached = choice.reached
     if common.confirm is not None:
-        from skinrig.planning.confirmation import confirmed
+        from skinrig.planning.confirmation import confirm_choice
 
-        found = confirmed(
+        found = confirm_choice(
             choice, common.confirm, subject=subject, seed=seed, progress=console.progress
         )
         document["confirmation"] = found
         for row in found:
             console.say(
-                f"measured: {row['name']} {written(format(row['median'], '.3g'), row['unit'])}, "
+                f"measured: {row['name']}"
+                f" {format_quantity(format(row['median'], '.3g'), row['unit'])}, "
                 f"{'within' if row['within'] else 'OUTSIDE'} the forecast's interval"
             )
     if (out := common.out) is not None:
-        write_whole(out, json_text.dumps(choice.plan.to_json(), indent=1) + "\n")
+        write_atomically(out, json_text.dumps(choice.plan.to_json(), indent=1) + "\n")
         console.say(f"next: skinrig capture {rig} --plan {shell_quote(out)} --out session")
     console.document(document.pop("schema"), document)
     if not reached:

@@ -8,7 +8,7 @@ import typer
 
 from skinrig.commands import completion
 from skinrig.commands.options import Json, Out, command
-from skinrig.console import Console, counted, picked
+from skinrig.console import Console, format_count, select_attributes
 from skinrig.errors import UnusableError
 from skinrig.next_steps import shell_quote
 
@@ -84,7 +84,7 @@ def check_rank(rank: int | None, basis: Path | None) -> None:
         where = "the built-in basis" if basis is None else str(basis)
         raise UnusableError(
             f"--rank: got {rank}, expected at most {most}: lobes are mixtures of the "
-            f"{counted(most, 'material')} of {where}"
+            f"{format_count(most, 'material')} of {where}"
         )
 
 
@@ -92,7 +92,7 @@ def check_rank(rank: int | None, basis: Path | None) -> None:
 def reconstruct(
     sessions: Annotated[list[Path], typer.Argument(metavar="SESSION")],
     /,
-    want: Annotated[str, typer.Option(autocompletion=completion.wants)],
+    want: Annotated[str, typer.Option(autocompletion=completion.complete_wants)],
     out: Out,
     calibration: Path | None = None,
     state: str = "neutral",
@@ -134,14 +134,14 @@ def reconstruct(
     """
     from reconstruction.pipeline import recipes as pipeline
     from reconstruction.pipeline.inputs import DomeOptions
-    from skinrig.appearances.state_truth import truth_beside
+    from skinrig.appearances.state_truth import find_comparison_truth
 
     console = Console(json)
     check_rank(rank, basis)
     wants = [name.strip() for name in want.split(",") if name.strip()]
     made = []
-    for session, folder in zip(sessions, folders_of(sessions, out), strict=True):
-        truth = truth_beside(session, state)
+    for session, folder in zip(sessions, assign_output_folders(sessions, out), strict=True):
+        truth = find_comparison_truth(session, state)
         if len(sessions) > 1:
             console.say(f"{session}:")
         done = pipeline.reconstruct(
@@ -158,8 +158,8 @@ def reconstruct(
         console.each("assumed", done.assumed)
         console.say(f"run: {', '.join(done.ran) or 'nothing'}")
         console.say(f"reused: {', '.join(done.reused) or 'nothing'}")
-        console.each("left out", (f"{what} ({why})" for what, why in done.left_out))
-        written = picked(done, "ran", "reused", "left_out", "assumed", "work")
+        console.each("left out", (f"{what} ({why})" for what, why in done.omitted))
+        written = select_attributes(done, "ran", "reused", "left_out", "assumed", "work")
         made.append({"path": folder, **written})
     console.say(f"next: skinrig report {shell_quote(out)}")
     console.document(
@@ -167,7 +167,7 @@ def reconstruct(
     )
 
 
-def folders_of(sessions: Sequence[Path], out: Path) -> list[Path]:
+def assign_output_folders(sessions: Sequence[Path], out: Path) -> list[Path]:
     """Return where the maps of each session go.
 
     Parameters
@@ -184,7 +184,7 @@ def folders_of(sessions: Sequence[Path], out: Path) -> list[Path]:
 
     Examples
     --------
-    >>> [str(folder) for folder in folders_of([Path("a"), Path("b/c")], Path("out"))]
+    >>> [str(folder) for folder in assign_output_folders([Path("a"), Path("b/c")], Path("out"))]
     ['out/a', 'out/c']
     """
     if len(sessions) == 1:

@@ -10,11 +10,11 @@ import typer
 
 from skinrig import errors
 from skinrig.commands.options import Json, Out, command
-from skinrig.console import Console, picked
+from skinrig.console import Console, select_attributes
 from skinrig.errors import UnusableError, UsageError
 
 if TYPE_CHECKING:
-    from skinrig.rendering.figures import Effort
+    from skinrig.rendering.figures import RenderSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ def render(appearance: list[Path], /, out: Out, asked: RenderOptions, json: Json
     """
     from skinrig.rendering import figures
     from skinrig.rendering.render import Subsurface
-    from skinrig.rendering.request import subpixels_of
+    from skinrig.rendering.request import parse_subpixels
 
     console = Console(json)
     if asked.subsurface not in get_args(Subsurface):
@@ -124,10 +124,10 @@ def render(appearance: list[Path], /, out: Out, asked: RenderOptions, json: Json
         raise UnusableError(f"--exposure: got {asked.exposure}, expected a factor above 0")
     if len(appearance) > 1 and asked.bases is None:
         raise UsageError("appearance: got several, expected one; several are for --bases")
-    effort = figures.Effort(
-        subpixels=subpixels_of(asked.samples),
+    effort = figures.RenderSettings(
+        subpixels=parse_subpixels(asked.samples),
         progress=console.progress,
-        **picked(asked, "subsurface", "shadow_samples", "exposure", "seed"),
+        **select_attributes(asked, "subsurface", "shadow_samples", "exposure", "seed"),
     )
     console.progress(f"read {', '.join(str(path) for path in appearance)}")
     if asked.against is not None and not asked.components:
@@ -150,12 +150,12 @@ def _compare(
         appearance,
         session,
         out,
-        evaluation.Judging(
+        evaluation.EvaluationSettings(
             count=asked.photographs,
             progress=console.progress,
-            **picked(asked, "subsurface", "ablation", "seed"),
+            **select_attributes(asked, "subsurface", "ablation", "seed"),
         ),
-        **picked(asked, "calibration", "translucency"),
+        **select_attributes(asked, "calibration", "translucency"),
     )
     photographs_errors.print_comparison(console, found)
     if not found["passed"]:
@@ -163,15 +163,15 @@ def _compare(
 
 
 def _draw(
-    appearance: list[Path], out: Path, asked: RenderOptions, effort: Effort
+    appearance: list[Path], out: Path, asked: RenderOptions, effort: RenderSettings
 ) -> dict[str, Any]:
     """Draw a picture, a photograph beside its rendering, or one for each number of lobes."""
     from skinrig.rendering import figures
-    from skinrig.rendering.request import RenderRig, lights_of
+    from skinrig.rendering.request import RenderRig, parse_lights
 
     stage = RenderRig.of(asked.rig, asked.calibration)
     camera = stage.camera(asked.view, size_px=asked.size, target_mm=asked.target, fov_deg=asked.fov)
-    lights = lights_of(
+    lights = parse_lights(
         stage,
         asked.light or (),
         radius_mm=asked.light_radius,
@@ -188,13 +188,13 @@ def _draw(
         return figures.draw_photograph(
             subjects[0], asked.against, asked.view, name, out, effort, calibration=calibration
         )
-    picture = figures.Asked(camera, lights, out, effort, stage.assumed)
+    picture = figures.RenderRequest(camera, lights, out, effort, stage.assumed)
     if asked.bases is None:
-        return figures.draw(subjects[0], picture, components=asked.components)
-    return figures.draw_bases(subjects, _ranks(asked.bases), picture)
+        return figures.draw_rendering(subjects[0], picture, components=asked.components)
+    return figures.draw_bases(subjects, _parse_ranks(asked.bases), picture)
 
 
-def _ranks(text: str) -> list[int]:
+def _parse_ranks(text: str) -> list[int]:
     try:
         found = [int(part) for part in text.split(",")]
     except ValueError:
@@ -204,7 +204,7 @@ def _ranks(text: str) -> list[int]:
     return found
 
 
-def _sigma_tr(row: dict[str, Any]) -> str:
+def _parse_sigma_tr(row: dict[str, Any]) -> str:
     if row["sigma_tr_per_mm"] is None:
         return str(row["name"]).replace("_", " ")
     return ", ".join(f"{value:.4g}" for value in row["sigma_tr_per_mm"])
@@ -221,7 +221,7 @@ def _report(console: Console, done: dict[str, Any]) -> None:
     if "boundaries" in done:
         console.rows(
             ("skin", "sigma_tr, 1/mm", "90 to 10 % red, mm", "green", "blue"),
-            ((row["skin"], _sigma_tr(row), *row["rise_mm"]) for row in done["boundaries"]),
+            ((row["skin"], _parse_sigma_tr(row), *row["rise_mm"]) for row in done["boundaries"]),
         )
     console.say(f"{done['out']}: {', '.join(done['files'])}, {done['seconds']:.1f} s")
     console.document(done["schema"], {k: v for k, v in done.items() if k != "schema"})

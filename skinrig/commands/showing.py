@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from skinrig.commands.options import STDOUT_MARK, Json, Page, command, file_to_write
-from skinrig.console import Console, picked
+from skinrig.commands.options import STDOUT_MARK, Json, Page, check_output_file, command
+from skinrig.console import Console, select_attributes
 from skinrig.errors import UnusableError, UsageError
 
 MAX_PORT = 65_535
@@ -17,7 +17,9 @@ MAX_PORT = 65_535
 def report(
     paths: list[Path],
     /,
-    out: Annotated[Path, typer.Option("-o", "--out", callback=file_to_write)] = Path("report.html"),
+    out: Annotated[Path, typer.Option("-o", "--out", callback=check_output_file)] = Path(
+        "report.html"
+    ),
     compare: Annotated[
         bool | None, typer.Option("--compare/--no-compare", show_default=False)
     ] = None,
@@ -41,8 +43,8 @@ def report(
     compare
         Put two runs side by side; default: where PATHS are exactly two of one kind.
     """
+    from skinrig.atomic_file import write_atomically
     from skinrig.report import make
-    from skinrig.whole_file import write_whole
 
     piped = str(out) == STDOUT_MARK
     if piped and json:
@@ -53,7 +55,7 @@ def report(
     if piped:
         typer.echo(done.html, nl=False)
     else:
-        write_whole(out, done.html)
+        write_atomically(out, done.html)
     size = len(done.html.encode())
     if done.compared is None:
         talk.say(done.verdict)
@@ -67,7 +69,7 @@ def report(
 
 
 @dataclass(frozen=True, slots=True)
-class FaceOptions:
+class ViewFaceOptions:
     """Geometry and color of the face that is drawn.
 
     Attributes
@@ -113,7 +115,7 @@ def view(
     /,
     *,
     out: Page = Path("page.html"),
-    face: FaceOptions,
+    face: ViewFaceOptions,
     port: int | None = None,
     displacement: Path | None = None,
     head: HeadOptions,
@@ -145,8 +147,8 @@ def view(
         raise UnusableError(f"--port: got {port}, expected 0 to {MAX_PORT}")
     if displacement is not None and port is None:
         raise UsageError("displacement: a page in a file cannot fetch it; add --port 0")
-    given = picked(face, "mesh", "landmarks", "calibration")
-    given |= picked(head, "preset", "seed", "size")
+    given = select_attributes(face, "mesh", "landmarks", "calibration")
+    given |= select_attributes(head, "preset", "seed", "size")
     console.progress("making textures and tables")
     scene = faces.scene(appearance or [], **given)
     document: dict[str, Any]

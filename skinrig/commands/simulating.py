@@ -10,12 +10,12 @@ import typer
 
 from skinrig.commands import completion, options
 from skinrig.commands.help import RigCommand, RigGroup
-from skinrig.commands.options import command, option, target_of
-from skinrig.console import Console, counted, picked
-from skinrig.next_steps import after_session
+from skinrig.commands.options import command, option, target_option
+from skinrig.console import Console, format_count, select_attributes
+from skinrig.next_steps import suggest_after_session
 
 if TYPE_CHECKING:
-    from skinrig.simulating.orders import Order
+    from skinrig.simulating.orders import SimulationOrder
 
 simulate_app = typer.Typer(
     cls=RigGroup,
@@ -55,10 +55,10 @@ class SimulateOptions:
     resume: options.Resume = False
     json: options.Json = False
 
-    def ordered(self, subject: str, console: Console) -> dict[str, Any]:
+    def request_fields(self, subject: str, console: Console) -> dict[str, Any]:
         """Return what every order has, by name."""
         from skinrig.capturing.plan_choice import read_plan
-        from skinrig.consent import subject_of
+        from skinrig.consent import parse_subject
         from skinrig.simulating.orders import SIMULATED_USES
         from skinrig.simulating.subject_records import pseudonym
 
@@ -66,14 +66,14 @@ class SimulateOptions:
         person = None
         if not self.resume or self.consent or self.consent_expires is not None:
             name = pseudonym(subject, self.seed)
-            person = subject_of(name, self.consent or SIMULATED_USES, self.consent_expires)
+            person = parse_subject(name, self.consent or SIMULATED_USES, self.consent_expires)
         plan = None if self.plan is None else read_plan(self.plan)
         order = {"subject": subject, "plan": plan, "person": person, "progress": console.progress}
-        return order | picked(self, "out", "size", "seed", "resume")
+        return order | select_attributes(self, "out", "size", "seed", "resume")
 
 
 @dataclass(frozen=True, slots=True)
-class FaceOptions:
+class SimulatedFaceOptions:
     """Options of a simulated face.
 
     Attributes
@@ -100,17 +100,17 @@ class FaceOptions:
 
         leave_out = parse_names(self.leave_out) or ()
         order = {"width_px": self.width, "leave_out": leave_out}
-        return order | picked(self, "mesh", "movement")
+        return order | select_attributes(self, "mesh", "movement")
 
 
 @simulate_app.command("flash", cls=RigCommand)
 @command
 def simulate_flash(
     common: SimulateOptions,
-    face: FaceOptions,
+    face: SimulatedFaceOptions,
     sequence: options.SequenceOptions,
     subject: options.Subject = "III",
-    target: Annotated[str | None, target_of("flash")] = None,
+    target: Annotated[str | None, target_option("flash")] = None,
     repeats: options.Pairs = 1,
     state: States = None,
     nearer: Annotated[float, typer.Option(metavar="MM")] = 0.0,
@@ -131,7 +131,7 @@ def simulate_flash(
 
     console = Console(common.json)
     order = FlashOrder(
-        **common.ordered(subject, console),
+        **common.request_fields(subject, console),
         **face.ordered(),
         target=target,
         states=tuple(state or ("neutral",)),
@@ -147,9 +147,9 @@ def simulate_flash(
 @command
 def simulate_dome(
     common: SimulateOptions,
-    face: FaceOptions,
+    face: SimulatedFaceOptions,
     subject: Annotated[str, typer.Option(autocompletion=completion.subjects)] = "III",
-    target: Annotated[str | None, target_of("dome")] = None,
+    target: Annotated[str | None, target_option("dome")] = None,
     lights: int | None = None,
     views: int | None = None,
     move: bool = False,
@@ -194,7 +194,7 @@ def simulate_dome(
 
     console = Console(common.json)
     order = DomeOrder(
-        **common.ordered(subject, console),
+        **common.request_fields(subject, console),
         **face.ordered(),
         target=target,
         lights=lights,
@@ -214,7 +214,7 @@ def simulate_dome(
 def simulate_gradient(
     common: SimulateOptions,
     subject: options.Subject = "III",
-    target: Annotated[str | None, target_of("gradient")] = None,
+    target: Annotated[str | None, target_option("gradient")] = None,
     width: options.Width = None,
     site: options.Site = None,
     angles: options.Angles = None,
@@ -236,7 +236,7 @@ def simulate_gradient(
 
     console = Console(common.json)
     order = GradientOrder(
-        **common.ordered(subject, console),
+        **common.request_fields(subject, console),
         target=target,
         width_px=width,
         site=site,
@@ -252,7 +252,7 @@ def simulate_gradient(
 def simulate_probe(
     common: SimulateOptions,
     subject: Annotated[str, typer.Option(autocompletion=completion.subjects)] = "III",
-    target: Annotated[str | None, target_of("probe")] = None,
+    target: Annotated[str | None, target_option("probe")] = None,
     sites: options.Sites = None,
     repeats: options.Placements = 1,
     angles: options.Directions = None,
@@ -273,7 +273,7 @@ def simulate_probe(
 
     console = Console(common.json)
     order = ProbeOrder(
-        **common.ordered(subject, console),
+        **common.request_fields(subject, console),
         target=target,
         sites=parse_names(sites),
         repeats=repeats,
@@ -283,12 +283,12 @@ def simulate_probe(
     _simulate(order, console, target)
 
 
-def _simulate(order: Order, console: Console, target: str | None) -> None:
+def _simulate(order: SimulationOrder, console: Console, target: str | None) -> None:
     """Simulate an order, and print what was made and the next step."""
     from skinrig.simulating.simulation import simulate
 
     done = simulate(order)
     truth = f", truth in {done.truth}" if done.truth else ""
-    console.say(f"{done.session}: {counted(done.frames, 'frame')}{truth}")
-    console.say(f"next: {after_session(order.rig, order.out, target)}")
+    console.say(f"{done.session}: {format_count(done.frames, 'frame')}{truth}")
+    console.say(f"next: {suggest_after_session(order.rig, order.out, target)}")
     console.document("skinrig.simulate/1", done.document())

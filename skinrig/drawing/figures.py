@@ -30,17 +30,17 @@ def canvas(width_in: float, height_in: float) -> tuple[Any, Any]:
     return figure, axes
 
 
-def finished(figure: Any, alt: str) -> str:
+def to_svg(figure: Any, alt: str) -> str:
     """Return a figure as SVG text, with ``alt`` for those who do not see it."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     buffer = io.StringIO()
     # savefig would draw twice, the first time for the layout, which the one drawing finds as well
     FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
-    return svg.simplified(buffer.getvalue(), alt=alt)
+    return svg.simplify_svg(buffer.getvalue(), alt=alt)
 
 
-def plain_numbers(*log_axes: Any) -> None:
+def format_log_axes(*log_axes: Any) -> None:
     """Label decades by plain numbers, and what lies between them where decades are too few."""
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
@@ -54,7 +54,7 @@ def plain_numbers(*log_axes: Any) -> None:
         axis.set_tick_params(which="minor", labelsize=7)
 
 
-def span_of(values: FloatArray) -> str:
+def format_range(values: FloatArray) -> str:
     """Return the ends of what is finite, as words."""
     finite = values[np.isfinite(values)]
     return f"{finite.min():.3g} to {finite.max():.3g}" if finite.size else "none"
@@ -88,7 +88,7 @@ def bars(
     axes.set_xticks(position, labels, fontsize=8)
     _title(axes, title, y_name=unit)
     held = "".join(f"; limit of {name} {limit:.3g}" for name, limit in (limits or {}).items())
-    return finished(figure, f"{title}, {unit}: {'; '.join(words)}{held}")
+    return to_svg(figure, f"{title}, {unit}: {'; '.join(words)}{held}")
 
 
 def _title(axes: Any, title: str, y_name: str, x_name: str = "") -> None:
@@ -99,7 +99,7 @@ def _title(axes: Any, title: str, y_name: str, x_name: str = "") -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Curve:
+class PlotSeries:
     """One series of a plot: points with standard errors, a line, or both."""
 
     name: str
@@ -115,7 +115,7 @@ class Curve:
 
 
 def curves(
-    title: str, x_name: str, y_name: str, series: Sequence[Curve], *, log_y: bool = False
+    title: str, x_name: str, y_name: str, series: Sequence[PlotSeries], *, log_y: bool = False
 ) -> str:
     """Draw series over a common axis, with bars of one standard error; NaN leaves a gap.
 
@@ -137,14 +137,14 @@ def curves(
         axes.errorbar(x, y, yerr=np.stack([down, bars]), label=curve.name, **look)
     if log_y:
         axes.set_yscale("log")
-        plain_numbers(axes.yaxis)
+        format_log_axes(axes.yaxis)
     _title(axes, title, y_name, x_name)
     told = "; ".join(
-        f"{curve.name} {span_of(np.asarray(curve.y, float))} over "
-        f"{span_of(np.asarray(curve.x, float))}"
+        f"{curve.name} {format_range(np.asarray(curve.y, float))} over "
+        f"{format_range(np.asarray(curve.x, float))}"
         for curve in series
     )
-    return finished(figure, f"{title}: {y_name} against {x_name}; {told}")
+    return to_svg(figure, f"{title}: {y_name} against {x_name}; {told}")
 
 
 def sensitivity(title: str, c_m: FloatArray, c_hd: FloatArray, percent: FloatArray) -> str:
@@ -193,4 +193,4 @@ def sensitivity(title: str, c_m: FloatArray, c_hd: FloatArray, percent: FloatArr
         f"{100 * float(np.mean(shown < 10)):.0f} %, above 100 % on "
         f"{100 * float(np.mean(shown > 100)):.0f} % of the plane"
     )
-    return finished(figure, alt)
+    return to_svg(figure, alt)

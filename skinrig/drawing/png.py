@@ -58,7 +58,7 @@ def encode(image: NDArray[np.generic], *, quick: bool = False) -> bytes:
     return cv2.imencode(".png", stored, [cv2.IMWRITE_PNG_COMPRESSION, level])[1].tobytes()
 
 
-def address(file: bytes) -> str:
+def to_data_url(file: bytes) -> str:
     """Return a PNG file's bytes as a ``data:`` address."""
     return "data:image/png;base64," + base64.b64encode(file).decode("ascii")
 

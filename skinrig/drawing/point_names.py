@@ -67,7 +67,7 @@ def name_points(
         words.set_in_layout(False)  # a long name must not squeeze the axes away
         found = None
         for place in _LABEL_OFFSETS:
-            box = _moved(words, place)
+            box = _place_label(words, place)
             within = inside.containsx(box.x0) and inside.containsx(box.x1)
             within = within and inside.containsy(box.y0) and inside.containsy(box.y1)
             if not within or any(box.overlaps(other) for other in taken):
@@ -80,12 +80,12 @@ def name_points(
         if found is None:
             words.remove()
         else:
-            taken.append(_moved(words, found))
+            taken.append(_place_label(words, found))
 
 
-def _moved(words: Any, place: tuple[int, int, str, str]) -> Any:
+def _place_label(words: Any, offset: tuple[int, int, str, str]) -> Any:
     """Put a name at a place of `_LABEL_OFFSETS`, and return the box that it then fills, pixels."""
-    dx, dy, across, up = place
+    dx, dy, across, up = offset
     words.set_position((dx, dy))
     words.set_ha(across)
     words.set_va(up)

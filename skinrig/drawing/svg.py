@@ -13,7 +13,7 @@ _DROPPED_STYLES = {"font-family", "stroke-linejoin"}
 _FONT_FAMILY = "DejaVu Sans, Verdana, Arial, sans-serif"
 
 
-def simplified(drawn: str, *, alt: str) -> str:
+def simplify_svg(svg: str, *, alt: str) -> str:
     r"""Return a plot of matplotlib's SVG writer in a fifth to half of its length.
 
     Parameters
@@ -34,13 +34,13 @@ def simplified(drawn: str, *, alt: str) -> str:
     --------
     >>> line = '<path d="M 1.23456 2 \nL 3 4 " style="fill: none; stroke: #000000"/>'
     >>> drawn = f'<?xml?><svg width="9pt"><g id="a"><g id="b">{line}</g></g></svg>'
-    >>> shorter = simplified(drawn, alt="a < b")
+    >>> shorter = simplify_svg(drawn, alt="a < b")
     >>> shorter[shorter.index("<path"):]
     '<path d="M1.23 2L3 4" fill="none" stroke="currentColor"/></svg>'
     >>> 'aria-label="a &lt; b"' in shorter
     True
     """
-    text = drawn[drawn.index("<svg") :].strip()
+    text = svg[svg.index("<svg") :].strip()
     text = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", text, flags=re.DOTALL)
     text = re.sub(r"<style\b.*?</style>", "", text, flags=re.DOTALL)
     text = re.sub(r"<path\b[^>]*fill: none; opacity: 0\"/>", "", text)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model import texture_statistics
-from reconstruction.correspondence.charts import Chart
+from reconstruction.correspondence.charts import TexelChart
 from reconstruction.surface import texture_fill
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.traits import albedo_vectors
@@ -80,12 +80,12 @@ class AlbedoEdit:
 def edit_albedo(
     r_d: ArrayLike,
     valid: ArrayLike,
-    chart: Chart,
+    chart: TexelChart,
     space: AlbedoTraits,
     amounts: Mapping[str, float],
     *,
     region: BoolArray,
-    share: Float64Array,
+    weight: Float64Array,
     iterations: int = 5,
     noise: float = MATCHING_NOISE,
     rng: np.random.Generator,
@@ -116,7 +116,7 @@ def edit_albedo(
     rng
         Draws the noise.
     """
-    image, known = chart.gather(albedo_vectors.encoded(r_d, space.kind), valid)
+    image, known = chart.gather(albedo_vectors.encode_albedo(r_d, space.kind), valid)
     used = region & known
     if not used.any():
         raise AlbedoEditError("r_d: no valid texel lies in the region that is edited")
@@ -132,11 +132,11 @@ def edit_albedo(
     change = _log_ratio(np.asarray(found.image, np.float64), start, space.kind, used)
     change[~used] = 0.0
     filled = texture_fill.push_pull(change, used.astype(np.float32)).values
-    filled = filled * np.asarray(share, np.float32)[..., None]
+    filled = filled * np.asarray(weight, np.float32)[..., None]
     texels, _ = chart.read(filled)
     spread = texture_fill.push_pull(texels, chart.on_surface.astype(np.float32)).values  # gutters
     most = -np.log(MIN_ALBEDO_FACTOR)
-    told = albedo_vectors.telling(space.texture)
+    told = albedo_vectors.informative_responses(space.texture)
     return AlbedoEdit(
         np.exp(np.clip(spread, -most, most)).astype(np.float32),
         clipped,

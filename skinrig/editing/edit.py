@@ -20,7 +20,7 @@ from skinrig.appearances import face_textures
 from skinrig.appearances.contents import digest, document_digest
 from skinrig.appearances.face_textures import Face
 from skinrig.arrays import BoolArray, Float32Array
-from skinrig.console import picked
+from skinrig.console import select_attributes
 from skinrig.editing import albedo as editing_albedo
 from skinrig.editing import masks, pigment_spots, surface_mixtures
 from skinrig.editing import spots as editing_spots
@@ -36,7 +36,7 @@ EDITABLE_PARTS: Final = ("albedo", "surface")
 MAX_TRAIT_AMOUNT: Final = 10.0
 """Of a trait. The strongest of the package's change R_d by a factor of 1.3 (tan) to 1.9 (powder) an
 amount: at 10 they reach the least or greatest factor of an edit, and more says nothing more."""
-MAX_DISTANCE_LEFT: Final = 0.5
+MAX_RESIDUAL_DISTANCE: Final = 0.5
 """Share of the distance to the wanted histograms that is left, from which on it is told."""
 STALE_MAPS: Final = {"lobe_residual": "is of the lobes before the edit"}
 """Maps that an edit of the lobes leaves without meaning."""
@@ -104,7 +104,7 @@ class EditRequest:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Edited:
+class EditResult:
     """What an edit made.
 
     Attributes
@@ -126,7 +126,7 @@ class Edited:
 
 
 @dataclass(slots=True)
-class _Work:
+class _EditState:
     """State of an edit under way."""
 
     face: Face
@@ -139,15 +139,15 @@ class _Work:
     left_out: list[tuple[str, str]]
 
 
-def edit(
+def edit_folder(
     path: Path,
-    order: EditRequest,
+    request: EditRequest,
     *,
     out: Path,
     library: TraitLibrary | None = None,
     library_hash: str = "",
     progress: Callable[[str], None] | None = None,
-) -> Edited:
+) -> EditResult:
     """Write an edited appearance.
 
     Parameters
@@ -172,46 +172,46 @@ def edit(
     """
     if out.resolve() == path.resolve():
         raise EditError(f"out: {out} is the source; name another folder")
-    face = face_textures.read(path, order.landmarks)
+    face = face_textures.read(path, request.landmarks)
     inputs = {
         **{f"source {name}": value for name, value in face.appearance.inputs.items()},
         "appearance": document_digest(path),
     }
-    for name, file in (("mask", order.mask), ("landmarks", order.landmarks)):
+    for name, file in (("mask", request.mask), ("landmarks", request.landmarks)):
         if file is not None:
             inputs[name] = digest(file)
     if library is not None and library_hash:
         inputs["traits"] = library_hash
-    done = edited(face, order, library, progress=progress)
+    done = edit_face(face, request, library, progress=progress)
     store.write(out, dataclasses.replace(done.appearance, inputs=inputs))
     return done
 
 
-def edited(
+def edit_face(
     face: Face,
-    order: EditRequest,
+    request: EditRequest,
     library: TraitLibrary | None = None,
     *,
     progress: Callable[[str], None] | None = None,
-) -> Edited:
-    """Edit an appearance in memory; see `edit`."""
+) -> EditResult:
+    """Edit an appearance in memory; see `edit_folder`."""
     tell = progress or (lambda text: None)
     source = face.appearance
-    parts = _opened(order, library)
+    parts = _open_library(request, library)
     shape = _texture_shape(source, face)
-    mask = None if order.mask is None else masks.read(order.mask, shape)
+    mask = None if request.mask is None else masks.read(request.mask, shape)
     maps, files = dict(source.maps), dict(source.files)
-    work = _Work(face, order, mask, maps, files, {}, [], list(source.left_out))
-    asked = {name: amount for name, amount in order.traits.items() if amount}
+    work = _EditState(face, request, mask, maps, files, {}, [], list(source.left_out))
+    asked = {name: amount for name, amount in request.traits.items() if amount}
     if asked and parts is not None:
-        chosen = _chosen(asked, parts, work)
+        chosen = _select_traits(asked, parts, work)
         if chosen["albedo"]:
             tell(f"albedo: {', '.join(chosen['albedo'])}")
             _edit_albedo(work, parts, chosen["albedo"])
         if chosen["surface"]:
             tell(f"lobes: {', '.join(chosen['surface'])}")
             _edit_surface(work, parts, chosen["surface"])
-    spots = [spot for spot in order.spots if spot.amount]
+    spots = [spot for spot in request.spots if spot.amount]
     if spots:
         _edit_spots(work, spots, tell)
     changed = sorted(
@@ -221,10 +221,10 @@ def edited(
     )
     record = {
         "of": face.path.resolve().name,
-        "traits": dict(order.traits),
-        "mask": None if order.mask is None else order.mask.name,
-        "spots": [dataclasses.asdict(spot) for spot in order.spots],
-        **picked(order, "region", "seed", "iterations"),
+        "traits": dict(request.traits),
+        "mask": None if request.mask is None else request.mask.name,
+        "spots": [dataclasses.asdict(spot) for spot in request.spots],
+        **select_attributes(request, "region", "seed", "iterations"),
         "landmarks": face.marked_by,
         "changed": changed,
         "warnings": list(work.warnings),
@@ -242,17 +242,17 @@ def edited(
     appearance = dataclasses.replace(
         source, maps=work.maps, files=work.files, left_out=left_out, parameters=parameters
     )
-    return Edited(appearance, tuple(changed), record, tuple(work.warnings))
+    return EditResult(appearance, tuple(changed), record, tuple(work.warnings))
 
 
-def _opened(order: EditRequest, library: TraitLibrary | None) -> LibraryParts | None:
+def _open_library(request: EditRequest, library: TraitLibrary | None) -> LibraryParts | None:
     """Return the library's parts, after a check that it has what is asked for."""
-    if not order.traits:
+    if not request.traits:
         return None
     if library is None:
         raise EditError("traits: got no library to take them from, expected --space FILE")
-    parts = regions.parts_of(library)
-    for name in order.traits:
+    parts = regions.open_library(library)
+    for name in request.traits:
         if name not in parts.traits:
             near = difflib.get_close_matches(name, parts.traits, n=1, cutoff=0.5)
             hint = f"; did you mean {near[0]!r}?" if near else ""
@@ -260,8 +260,8 @@ def _opened(order: EditRequest, library: TraitLibrary | None) -> LibraryParts | 
                 f"trait {name!r}: is not one of {', '.join(parts.traits)}{hint} "
                 "`skinrig fit traits` learns others"
             )
-    if order.region != "face":
-        one_of("region", order.region, dict.fromkeys(("face", *parts.albedo)), EditError)
+    if request.region != "face":
+        one_of("region", request.region, dict.fromkeys(("face", *parts.albedo)), EditError)
     return parts
 
 
@@ -276,8 +276,8 @@ def _texture_shape(source: SkinAppearance, face: Face) -> tuple[int, int]:
     )
 
 
-def _chosen(
-    asked: Mapping[str, float], parts: LibraryParts, work: _Work
+def _select_traits(
+    requested: Mapping[str, float], parts: LibraryParts, work: _EditState
 ) -> dict[str, dict[str, float]]:
     """Return which traits to use in which part."""
     order = work.order
@@ -287,7 +287,7 @@ def _chosen(
     }
     missing = {"albedo": "r_d", "surface": "basis_weight_0"}
     out: dict[str, dict[str, float]] = {part: {} for part in EDITABLE_PARTS}
-    for name, amount in asked.items():
+    for name, amount in requested.items():
         possible = [p for p in EDITABLE_PARTS if name in have[p] and missing[p] in work.maps]
         if order.parts is not None:
             use = [p for p in possible if p in order.parts]
@@ -312,29 +312,31 @@ def _chosen(
     return out
 
 
-def _edit_albedo(work: _Work, parts: LibraryParts, amounts: Mapping[str, float]) -> None:
+def _edit_albedo(work: _EditState, parts: LibraryParts, amounts: Mapping[str, float]) -> None:
     order, mask = work.order, work.mask
     space = parts.albedo[order.region]
     chart = work.face.chart(parts.frame)
     source = work.maps["r_d"]
-    _say_unmarked(work)
+    _warn_without_landmarks(work)
 
-    region = common_regions.region(order.region, parts.frame)
-    share = masks.feathered(order.region, parts.frame)
+    region = common_regions.region_mask(order.region, parts.frame)
+    share = masks.feather_region(order.region, parts.frame)
 
     def one(values: Float32Array, given: Mapping[str, float], stream: int) -> AlbedoEdit:
         how: dict[str, Any] = {"region": region, "share": share, "iterations": order.iterations}
         rng = np.random.default_rng([order.seed, stream])
-        known = face_textures.valid_of(source)
+        known = face_textures.valid_texels(source)
         return editing_albedo.edit_albedo(values, known, chart, space, given, **how, rng=rng)
 
     found = one(source.values, amounts, 0)
     values, held = found.apply(source.values, mask)
     back = one(values, {name: -amount for name, amount in amounts.items()}, 1)
     again, _ = back.apply(values, mask)
-    work.maps["r_d"] = editing_spots.with_values(source, values)
-    good = face_textures.valid_of(source) & (values != source.values).any(axis=-1)
-    if found.after > MAX_DISTANCE_LEFT * found.before and any(abs(a) > 1 for a in amounts.values()):
+    work.maps["r_d"] = editing_spots.replace_values(source, values)
+    good = face_textures.valid_texels(source) & (values != source.values).any(axis=-1)
+    if found.after > MAX_RESIDUAL_DISTANCE * found.before and any(
+        abs(a) > 1 for a in amounts.values()
+    ):
         work.warnings.append(
             f"albedo: matching came {100 * (1 - found.after / found.before):.0f} % of the way to "
             "the histograms asked for; smaller amounts can be reached"
@@ -352,25 +354,25 @@ def _edit_albedo(work: _Work, parts: LibraryParts, amounts: Mapping[str, float])
     }
 
 
-def _edit_surface(work: _Work, parts: LibraryParts, amounts: Mapping[str, float]) -> None:
+def _edit_surface(work: _EditState, parts: LibraryParts, amounts: Mapping[str, float]) -> None:
     order, mask = work.order, work.mask
     if parts.surface is None:
         return
     share = mask
     if order.region != "face":
-        _say_unmarked(work)
-        over = masks.on_texture(order.region, parts.frame, work.face.chart(parts.frame))
+        _warn_without_landmarks(work)
+        over = masks.region_weights(order.region, parts.frame, work.face.chart(parts.frame))
         share = over if mask is None else mask * over
     current = dataclasses.replace(work.face.appearance, maps=work.maps, files=work.files)
     source = surface_mixtures.read(current)
-    found = editing_surface.edit_surface(source, parts.surface, amounts, share=share)
-    tables = surface_mixtures.materials_of(source.materials, source.light_radius_rad, order.basis)
+    found = editing_surface.edit_surface(source, parts.surface, amounts, weight=share)
+    tables = surface_mixtures.load_materials(source.materials, source.light_radius_rad, order.basis)
     back = editing_surface.edit_surface(
-        found.mixtures, parts.surface, {n: -a for n, a in amounts.items()}, share=share
+        found.mixtures, parts.surface, {n: -a for n, a in amounts.items()}, weight=share
     )
     strength = tables.strength()
-    replaced = surface_mixtures.replaced(
-        current, found.mixtures, surface_mixtures.written(found.mixtures, tables)
+    replaced = surface_mixtures.replace_mixtures(
+        current, found.mixtures, surface_mixtures.serialize_mixtures(found.mixtures, tables)
     )
     work.maps = {n: m for n, m in replaced.maps.items() if n not in STALE_MAPS}
     work.files = dict(replaced.files)
@@ -380,33 +382,35 @@ def _edit_surface(work: _Work, parts: LibraryParts, amounts: Mapping[str, float]
         "clipped_share": found.clipped,
         "misfit": dict(found.misfit),
         "lobes": len(found.mixtures.mix),
-        "change_rms": _strengths_apart(found.mixtures, source, strength),
-        "return_error_rms": _strengths_apart(back.mixtures, source, strength),
+        "change_rms": _strength_difference(found.mixtures, source, strength),
+        "return_error_rms": _strength_difference(back.mixtures, source, strength),
         "stderr": "carried; of a lobe that a trait brought the relative error of its vector",
     }
 
 
-def _edit_spots(work: _Work, spots: Sequence[SpotOrder], tell: Callable[[str], None]) -> None:
+def _edit_spots(
+    work: _EditState, spots: Sequence[SpotOrder], progress: Callable[[str], None]
+) -> None:
     face, order, mask = work.face, work.order, work.mask
     if "r_d" not in work.maps:
         raise EditError(f"{face.path}: has no map r_d, which spots are drawn into")
     frame = editing_spots.spot_frame(face)
     chart = face.chart(frame)
-    skin = masks.on_texture("skin" if order.region == "face" else order.region, frame, chart)
+    skin = masks.region_weights("skin" if order.region == "face" else order.region, frame, chart)
     # a picture says itself where spots may be; without one they keep off eyes, brows and lips
     share = skin if mask is None else (mask if order.region == "face" else mask * skin)
     told = []
     for number, spot in enumerate(spots):
-        tell(f"{spot.kind}: {spot.amount:+g}")
+        progress(f"{spot.kind}: {spot.amount:+g}")
         source = work.maps["r_d"]
         rng = np.random.default_rng([order.seed, 2, number])
         if spot.amount > 0:
-            values, one = editing_spots.added(face, source, spot, share, rng)
-            work.maps["r_d"] = editing_spots.with_values(source, values)
+            values, one = editing_spots.add_spots(face, source, spot, share, rng)
+            work.maps["r_d"] = editing_spots.replace_values(source, values)
         else:
-            values, one = editing_spots.removed(source, spot, share, chart, frame)
-            good = face_textures.valid_of(source) if source.valid is not None else None
-            moved = editing_spots.with_values(source, values)
+            values, one = editing_spots.remove_spots(source, spot, share, chart, frame)
+            good = face_textures.valid_texels(source) if source.valid is not None else None
+            moved = editing_spots.replace_values(source, values)
             if moved.stderr is not None:  # what is filled in is known no better than it changed
                 off = np.abs(values - source.values)
                 moved = dataclasses.replace(moved, stderr=np.hypot(moved.stderr, off))
@@ -418,29 +422,29 @@ def _edit_spots(work: _Work, spots: Sequence[SpotOrder], tell: Callable[[str], N
                 f"{spot.kind}: are smaller ({least} mm) than a texel ({face.texel_mm():.2f} mm) "
                 "and only darken it by their share"
             )
-    _say_unmarked(work)
+    _warn_without_landmarks(work)
     work.record["spots_done"] = told
 
 
-def _say_unmarked(work: _Work) -> None:
+def _warn_without_landmarks(work: _EditState) -> None:
     text = "the face has no landmarks: it was unrolled from its foremost point, regions are typical"
     regional = work.order.region != "face" or work.order.spots
     if not work.face.landmarks and regional and text not in work.warnings:
         work.warnings.append(text)
 
 
-def _relative(a: Float32Array, b: Float32Array, good: BoolArray) -> float:
-    return _rms_apart(a[good].astype(np.float64), b[good].astype(np.float64))
+def _relative(a: Float32Array, b: Float32Array, valid: BoolArray) -> float:
+    return _relative_rms_difference(a[valid].astype(np.float64), b[valid].astype(np.float64))
 
 
-def _strengths_apart(a: SurfaceMixtures, b: SurfaceMixtures, strength: NDArray[Any]) -> float:
+def _strength_difference(a: SurfaceMixtures, b: SurfaceMixtures, strength: NDArray[Any]) -> float:
     """Return how far two faces' mixtures differ over the texels, RMS, relative to the second's."""
     good = b.valid
     x, y = (one.weights()[good] @ (one.mix * strength) for one in (a, b))
-    return _rms_apart(x, y)
+    return _relative_rms_difference(x, y)
 
 
-def _rms_apart(a: NDArray[Any], b: NDArray[Any]) -> float:
+def _relative_rms_difference(a: NDArray[Any], b: NDArray[Any]) -> float:
     """Return how far some values are from others, RMS, relative to the others; 0 without any."""
     size = float(np.sqrt(np.mean(b**2))) if b.size else 0.0
     return float(np.sqrt(np.mean((a - b) ** 2))) / size if size > 0 else 0.0

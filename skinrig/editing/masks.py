@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from model import store
 from reconstruction.correspondence import common_regions
-from reconstruction.correspondence.charts import Chart
+from reconstruction.correspondence.charts import TexelChart
 from reconstruction.correspondence.common_parameterization import CommonFrame
 from skinrig.arrays import Float32Array, Float64Array
 
@@ -66,9 +66,9 @@ def read(path: Path, shape: tuple[int, int]) -> Float32Array:
     return gray
 
 
-def feathered(name: str, frame: CommonFrame) -> Float64Array:
+def feather_region(name: str, frame: CommonFrame) -> Float64Array:
     """Return a region of the common map whose rim fades over `FEATHER_MM`, (N, N), 0 to 1."""
-    inside = common_regions.region(name, frame).astype(np.float64)
+    inside = common_regions.region_mask(name, frame).astype(np.float64)
     if name == "face":
         return inside
     soft = gaussian_filter(inside, max(0.4 * FEATHER_MM / frame.pixel_mm, 0.5))
@@ -76,11 +76,11 @@ def feathered(name: str, frame: CommonFrame) -> Float64Array:
     return np.asarray(share * share * (3.0 - 2.0 * share))
 
 
-def on_texture(name: str, frame: CommonFrame, chart: Chart) -> Float32Array:
+def region_weights(name: str, frame: CommonFrame, chart: TexelChart) -> Float32Array:
     """Return a region's share at the texels of a face, (H, W); off the face it is 0."""
     if name == "face":
         return np.ones(chart.on_surface.shape, np.float32)
-    share, inside = chart.read(feathered(name, frame))
+    share, inside = chart.read(feather_region(name, frame))
     return np.where(inside, np.clip(share, 0.0, 1.0), 0.0).astype(np.float32)
 
 

@@ -43,7 +43,7 @@ class SpotKind:
     ----------
     diameter_mm
         Median.
-    spread
+    log_diameter_std
         Standard deviation of the diameter's logarithm.
     melanin
         Volume fraction of the epidermis that it holds more than the skin around.
@@ -56,7 +56,7 @@ class SpotKind:
     """
 
     diameter_mm: float
-    spread: float
+    log_diameter_std: float
     melanin: float
     edge: float
     density_per_cm2: float
@@ -75,7 +75,7 @@ some tens of beard hairs a cm^2."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Spots:
+class DrawnSpots:
     """Spots that were drawn.
 
     Attributes
@@ -107,7 +107,7 @@ def draw(
     density_per_cm2: float | None = None,
     rng: np.random.Generator,
     table: ColorTable | None = None,
-) -> Spots:
+) -> DrawnSpots:
     """Draw spots into a mask.
 
     Parameters
@@ -155,10 +155,10 @@ def draw(
         raise SpotError(f"density of {kind}: asks for {wanted:.0f} spots, at most {MAX_SPOTS}")
     number = int(np.floor(wanted + rng.random())) if amount > 0 else 0
     centers = _scatter(place[share > 0], (area * share)[share > 0], number, density, rng)
-    diameter = what.diameter_mm * np.exp(what.spread * rng.standard_normal(len(centers)))
+    diameter = what.diameter_mm * np.exp(what.log_diameter_std * rng.standard_normal(len(centers)))
     depth = _profile(place, share > 0, centers, diameter, area, what.edge, rng) * share
     gain = np.exp(depth[..., None] * np.log(transmitted)).astype(np.float32)
-    return Spots(gain, centers, diameter, transmitted)
+    return DrawnSpots(gain, centers, diameter, transmitted)
 
 
 def texel_area_mm2(position_mm: Float64Array, surface: BoolArray) -> Float64Array:
@@ -231,8 +231,8 @@ def _scatter(
 
 
 def _profile(
-    place: Float64Array,
-    where: BoolArray,
+    position: Float64Array,
+    mask: BoolArray,
     centers: Float64Array,
     diameter: Float64Array,
     area: Float64Array,
@@ -243,11 +243,11 @@ def _profile(
 
     A spot smaller than a texel darkens it by its share of the area.
     """
-    depth = np.zeros(where.shape)
+    depth = np.zeros(mask.shape)
     if not len(centers):
         return depth
-    points = place[where]
-    half_texel = 0.5 * np.sqrt(np.median(area[where]))
+    points = position[mask]
+    half_texel = 0.5 * np.sqrt(np.median(area[mask]))
     inside = np.zeros(len(points))
     tree = cKDTree(points)
     turn = rng.normal(0.0, 1.0, (len(centers), 3, 3))
@@ -264,5 +264,5 @@ def _profile(
         rise = np.clip((1.0 - reach) / soft + 0.5 * min(soft, 1.0), 0.0, 1.0)
         profile = rise * rise * (3.0 - 2.0 * rise) * (radius / wide) ** 2
         inside[near] = np.maximum(inside[near], profile)
-    depth[where] = inside
+    depth[mask] = inside
     return depth

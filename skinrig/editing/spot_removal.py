@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from reconstruction.correspondence.charts import Chart
+from reconstruction.correspondence.charts import TexelChart
 from reconstruction.surface import texture_fill
 from skinrig.arrays import BoolArray, Float32Array
 
@@ -25,7 +25,7 @@ MAX_ELONGATION: Final = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Removal:
+class SpotRemoval:
     """Spots found, and what the skin would be without them.
 
     Attributes
@@ -43,14 +43,14 @@ class Removal:
     spots: int
 
 
-def find(
+def fill_spots(
     r_d: ArrayLike,
     valid: ArrayLike,
-    chart: Chart,
+    chart: TexelChart,
     *,
     pixel_mm: float,
     range_mm: tuple[float, float],
-) -> Removal:
+) -> SpotRemoval:
     """Find spots of a face and fill them.
 
     Parameters
@@ -67,17 +67,17 @@ def find(
         Smallest and largest diameter.
     """
     image, known = chart.gather(r_d, valid)
-    spots, count = dark_spots(image, known, pixel_mm=pixel_mm, range_mm=range_mm)
+    spots, count = detect_dark_spots(image, known, pixel_mm=pixel_mm, range_mm=range_mm)
     filled = texture_fill.push_pull(image, (known & ~spots).astype(np.float32))
     soft = ndimage.gaussian_filter(spots.astype(np.float64), 0.7)
     share, inside = chart.read(np.minimum(1.0, 2.0 * soft))
     fill, _ = chart.read(filled.values)
     use = inside & chart.outermost
-    return Removal(fill, np.where(use, np.clip(share, 0.0, 1.0), 0.0).astype(np.float32), count)
+    return SpotRemoval(fill, np.where(use, np.clip(share, 0.0, 1.0), 0.0).astype(np.float32), count)
 
 
-def dark_spots(
-    image: ArrayLike, known: ArrayLike, *, pixel_mm: float, range_mm: tuple[float, float]
+def detect_dark_spots(
+    image: ArrayLike, valid: ArrayLike, *, pixel_mm: float, range_mm: tuple[float, float]
 ) -> tuple[BoolArray, int]:
     """Return the pixels of small dark spots, (N, N), with their rims, and how many spots there are.
 
@@ -92,7 +92,7 @@ def dark_spots(
     range_mm
         Smallest and largest diameter.
     """
-    good = np.asarray(known, np.bool_)
+    good = np.asarray(valid, np.bool_)
     color = np.asarray(image, np.float64)
     floor = 1e-3 * max(float(np.median(color[good])), 1e-9) if good.any() else 1.0
     light = np.log(np.maximum(color, floor)).mean(axis=-1)

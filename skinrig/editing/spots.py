@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from model.skin import SkinMap
 from reconstruction.correspondence import common_parameterization
-from reconstruction.correspondence.charts import Chart
+from reconstruction.correspondence.charts import TexelChart
 from reconstruction.correspondence.common_parameterization import CommonFrame
 from reconstruction.surface import texture_fill
 from skinrig.appearances import face_textures
@@ -55,13 +55,13 @@ def spot_frame(face: Face) -> CommonFrame:
         return face_textures.common_frame([face])
     cylinder = common_parameterization.find_cylinder(face.position, face.surface)
     places = cylinder.unroll(face.position[face.surface])
-    around = common_parameterization.frame_around((), np.empty((0, 2)), [places], size=64)
-    size = face_textures.size_for(around.side_mm, face.texel_mm())
+    around = common_parameterization.fit_common_frame((), np.empty((0, 2)), [places], size=64)
+    size = face_textures.choose_size(around.side_mm, face.texel_mm())
     return dataclasses.replace(around, size=size)
 
 
-def added(
-    face: Face, source: SkinMap, spot: SpotOrder, share: Float32Array, rng: np.random.Generator
+def add_spots(
+    face: Face, source: SkinMap, spot: SpotOrder, weight: Float32Array, rng: np.random.Generator
 ) -> tuple[Float32Array, dict[str, Any]]:
     """Return R_d with spots drawn in, and what was done, as JSON values."""
     place, density = (face.position, face.surface), spot.density_per_cm2
@@ -69,12 +69,12 @@ def added(
         spot.kind,
         source.values,
         *place,
-        share,
+        weight,
         amount=spot.amount,
         density_per_cm2=density,
         rng=rng,
     )
-    gain = _bled(drawn.gain, face.surface, share)
+    gain = _dilate_factors(drawn.gain, face.surface, weight)
     values = np.where(gain == 1.0, source.values, source.values * gain)
     return values, {
         "drawn": len(drawn.center_mm),
@@ -84,33 +84,35 @@ def added(
     }
 
 
-def removed(
-    source: SkinMap, spot: SpotOrder, share: Float32Array, chart: Chart, frame: CommonFrame
+def remove_spots(
+    source: SkinMap, spot: SpotOrder, weight: Float32Array, chart: TexelChart, frame: CommonFrame
 ) -> tuple[Float32Array, dict[str, Any]]:
     """Return R_d with spots filled from around, and what was done, as JSON values."""
-    valid, sizes = face_textures.valid_of(source), pigment_spots.SPOT_KINDS[spot.kind].range_mm
-    found = spot_removal.find(source.values, valid, chart, pixel_mm=frame.pixel_mm, range_mm=sizes)
-    part = (np.float32(-spot.amount) * share * found.share)[..., None]
+    valid, sizes = face_textures.valid_texels(source), pigment_spots.SPOT_KINDS[spot.kind].range_mm
+    found = spot_removal.fill_spots(
+        source.values, valid, chart, pixel_mm=frame.pixel_mm, range_mm=sizes
+    )
+    part = (np.float32(-spot.amount) * weight * found.share)[..., None]
     wanted = source.values * (1 - part) + found.fill * part
     ratio = np.where(
         part == 0.0, 1.0, wanted / np.maximum(source.values, albedo_vectors.MIN_REFLECTANCE)
     )
-    gain = _bled(ratio.astype(np.float32), chart.on_surface, share)
+    gain = _dilate_factors(ratio.astype(np.float32), chart.on_surface, weight)
     values = np.where(part == 0.0, source.values * gain, wanted)
     values = np.where(gain == 1.0, source.values, values)
     return values.astype(np.float32), {"found": found.spots}
 
 
-def _bled(gain: Float32Array, surface: BoolArray, share: Float32Array) -> Float32Array:
+def _dilate_factors(gain: Float32Array, surface: BoolArray, weight: Float32Array) -> Float32Array:
     """Carry factors two texels beyond the rims of a texture's islands, where lookups reach."""
-    rim = ndimage.binary_dilation(surface, iterations=2) & ~surface & (share > 0)
+    rim = ndimage.binary_dilation(surface, iterations=2) & ~surface & (weight > 0)
     if not rim.any():
         return gain
     filled = texture_fill.push_pull(np.log(gain), surface.astype(np.float32), mask=surface | rim)
     return np.where(rim[..., None], np.exp(filled.values), gain).astype(np.float32)
 
 
-def with_values(source: SkinMap, values: Float32Array) -> SkinMap:
+def replace_values(source: SkinMap, values: Float32Array) -> SkinMap:
     """Return a map with other values, its standard error scaled as they are."""
     error = source.stderr
     if error is not None:

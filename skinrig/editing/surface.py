@@ -13,7 +13,7 @@ from skinrig.editing.surface_mixtures import SurfaceMixtures
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SurfaceEdit:
+class SurfaceEditResult:
     """Edited lobes, and what of the edit was possible.
 
     Attributes
@@ -36,8 +36,8 @@ def edit_surface(
     space: TraitSpace,
     amounts: Mapping[str, float],
     *,
-    share: FloatArray | None = None,
-) -> SurfaceEdit:
+    weight: FloatArray | None = None,
+) -> SurfaceEditResult:
     """Change the lobes of a face.
 
     Parameters
@@ -58,12 +58,12 @@ def edit_surface(
     """
     weights = source.weights()
     shape = weights.shape[:2]
-    part = np.ones(shape) if share is None else np.asarray(share, np.float64)
+    part = np.ones(shape) if weight is None else np.asarray(weight, np.float64)
     asked = {name: amount * part.reshape(-1) for name, amount in amounts.items()}
     rows = weights.reshape(-1, weights.shape[2])
     found = lobe_edits.edit_weights(rows, source.mix, space, asked, materials=source.materials)
     if not any(amounts.values()):
-        return SurfaceEdit(source, 0.0, {})
+        return SurfaceEditResult(source, 0.0, {})
     new = np.asarray(found.weights).reshape(*shape, -1).astype(np.float32)
     noise = _noise(space, amounts)
     maps = [
@@ -79,7 +79,7 @@ def edit_surface(
     moved, clipped = found.moved[counted], found.clipped[counted]
     size = float(np.sqrt(np.mean(moved**2))) if len(moved) else 0.0
     lost = float(np.sqrt(np.mean(clipped**2))) / size if size > 0 else 0.0
-    return SurfaceEdit(edited, lost, dict(found.misfit))
+    return SurfaceEditResult(edited, lost, dict(found.misfit))
 
 
 def _noise(space: TraitSpace, amounts: Mapping[str, float]) -> float:

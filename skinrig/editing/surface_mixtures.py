@@ -13,7 +13,7 @@ from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
 from model.skin import SkinAppearance, SkinMap
 from model.skin_reflectance import BASIS_FILE, WEIGHT_PREFIX
-from skinrig.appearances.contents import jointly_valid
+from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import BoolArray, Float64Array
 
 OUTLIER_STRENGTH_RATIO: Final = 6.0
@@ -53,7 +53,7 @@ class SurfaceMixtures:
     @property
     def valid(self) -> BoolArray:
         """Texels where all shares are known, (H, W)."""
-        return jointly_valid(*self.maps)
+        return intersect_valid(*self.maps)
 
     def weights(self) -> Float64Array:
         """Return the shares at least 0, (H, W, K)."""
@@ -113,7 +113,9 @@ def read(appearance: SkinAppearance) -> SurfaceMixtures:
     return SurfaceMixtures(tuple(maps), mix, names, stored)
 
 
-def materials_of(names: tuple[str, ...], light_radius_rad: float, folder: Any = None) -> BrdfBasis:
+def load_materials(
+    names: tuple[str, ...], light_radius_rad: float, folder: Any = None
+) -> BrdfBasis:
     """Return the tables that lobes are mixtures of.
 
     Parameters
@@ -131,7 +133,7 @@ def materials_of(names: tuple[str, ...], light_radius_rad: float, folder: Any = 
         When they are others.
     """
     if folder is None:
-        found = brdf_tables.default(light_radius_rad)
+        found = brdf_tables.default_basis(light_radius_rad)
     else:
         found = brdf_tables.load(folder, light_radius_rad=light_radius_rad)
     if found.names != names:
@@ -143,17 +145,19 @@ def materials_of(names: tuple[str, ...], light_radius_rad: float, folder: Any = 
     return found
 
 
-def written(edited: SurfaceMixtures, materials: BrdfBasis) -> bytes:
+def serialize_mixtures(edited: SurfaceMixtures, materials: BrdfBasis) -> bytes:
     """Return the file that goes with edited lobes, tables and all."""
     stream = io.BytesIO()
     arrays = dict(edited.stored)
     arrays["mix"] = edited.mix
-    arrays["table"] = materials.mixed(edited.mix).table[..., : len(edited.mix)]
+    arrays["table"] = materials.mix_materials(edited.mix).table[..., : len(edited.mix)]
     np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
     return stream.getvalue()
 
 
-def replaced(appearance: SkinAppearance, edited: SurfaceMixtures, file: bytes) -> SkinAppearance:
+def replace_mixtures(
+    appearance: SkinAppearance, edited: SurfaceMixtures, file: bytes
+) -> SkinAppearance:
     """Return an appearance with other lobes."""
     maps = {n: m for n, m in appearance.maps.items() if not n.startswith(WEIGHT_PREFIX)}
     maps |= {f"{WEIGHT_PREFIX}{k}": one for k, one in enumerate(edited.maps)}

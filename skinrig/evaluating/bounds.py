@@ -6,11 +6,13 @@ from model import color_table
 from model.skin import SkinAppearance
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error, shading_prior
-from skinrig.appearances.contents import jointly_valid
+from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import Float64Array
 
 
-def cramer_rao(appearance: SkinAppearance, truth: SkinAppearance) -> dict[str, Float64Array]:
+def chromophore_bounds(
+    appearance: SkinAppearance, truth: SkinAppearance
+) -> dict[str, Float64Array]:
     """Return relative bounds of the standard errors of melanin and hemoglobin, each (H, W).
 
     Fisher's information of a pixel's three channels about both cube roots and the log of its
@@ -45,10 +47,10 @@ def cramer_rao(appearance: SkinAppearance, truth: SkinAppearance) -> dict[str, F
     with np.errstate(invalid="ignore"):
         usable = (c_m > 0) & (c_m <= table.c_m_max) & (c_hd > 0) & (c_hd <= table.c_hd_max)
         usable &= (diffuse.values > 0).all(axis=-1)
-    usable &= jointly_valid(diffuse)
+    usable &= intersect_valid(diffuse)
     noise = (diffuse.stderr[usable] / diffuse.values[usable]).astype(np.float64) ** 2
-    prior = shading_prior.of_faces().spread
-    relative = relative_bounds(table, c_m[usable], c_hd[usable], noise, shading_spread=prior)
+    prior = shading_prior.face_prior().sd
+    relative = relative_bounds(table, c_m[usable], c_hd[usable], noise, log_shading_std=prior)
     found = {}
     for name, values in zip(("melanin", "hemoglobin"), relative, strict=True):
         whole = np.full(usable.shape, np.nan)
@@ -63,7 +65,7 @@ def relative_bounds(
     c_hd: Float64Array,
     relative_variance: Float64Array,
     *,
-    shading_spread: float,
+    log_shading_std: float,
     model_scale: float = 1.0,
 ) -> tuple[Float64Array, Float64Array]:
     """Return the smallest relative standard errors of melanin and hemoglobin, each (n,).
@@ -85,7 +87,7 @@ def relative_bounds(
     # by the logarithm of each fraction, so that errors come out relative
     gradient = table.jacobian(c_m, c_hd) / color[..., None]
     gradient = gradient * np.stack([c_m, c_hd], axis=-1)[:, None, :]
-    known = model_scale * model_error.load() + shading_spread**2
+    known = model_scale * model_error.load_covariance() + log_shading_std**2
     covariance = relative_variance[..., None] * np.eye(3) + known
     fisher = np.swapaxes(gradient, -1, -2) @ np.linalg.solve(covariance, gradient)
     aa, ab, bb = fisher[:, 0, 0], fisher[:, 0, 1], fisher[:, 1, 1]

@@ -10,7 +10,7 @@ from model import metrics
 from model.facial_color import HemoglobinRig
 from model.facial_color.state_maps import NEUTRAL
 from model.skin import SkinAppearance, SkinMap
-from skinrig.appearances.contents import jointly_valid
+from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import BoolArray, FloatArray
 
 PREDICTION_METHODS: Final = ("measured map", "rig, eq. (6)", "one gain", "neutral map")
@@ -21,12 +21,12 @@ MAX_LEVEL_ERROR: Final = 0.15
 
 
 @dataclass(frozen=True, slots=True)
-class StateError:
+class PredictionAccuracy:
     """How well one way gives one state's blood.
 
     Attributes
     ----------
-    state, way
+    state, method
         Name of the state; one of `PREDICTION_METHODS`.
     median_relative, interval
         Median of |found - true| / true and its 68 % bootstrap interval.
@@ -41,7 +41,7 @@ class StateError:
     """
 
     state: str
-    way: str
+    method: str
     median_relative: float
     interval: tuple[float, float]
     rms: float
@@ -51,7 +51,7 @@ class StateError:
 
 
 @dataclass(frozen=True, slots=True)
-class ChangeError:
+class BloodChangeAccuracy:
     """How well the change of one state's mean blood over the face was found.
 
     Attributes
@@ -91,7 +91,7 @@ def compare(
     truths: Mapping[str, SkinAppearance],
     *,
     rng: np.random.Generator,
-) -> tuple[list[StateError], list[ChangeError]]:
+) -> tuple[list[PredictionAccuracy], list[BloodChangeAccuracy]]:
     """Compare each state's blood with its truth.
 
     Parameters
@@ -112,8 +112,8 @@ def compare(
     changes
         A row for each state.
     """
-    states: list[StateError] = []
-    changes: list[ChangeError] = []
+    states: list[PredictionAccuracy] = []
+    changes: list[BloodChangeAccuracy] = []
     rest = true_blood(truths[NEUTRAL]) if NEUTRAL in truths else None
     for state in rig.states:
         true = true_blood(truths[state]) if state in truths else None
@@ -121,7 +121,7 @@ def compare(
         if true is None or measured is None or true.values.shape != measured.values.shape:
             continue
         blend = rig.evaluate({state: 1.0})
-        seen = jointly_valid(true, measured) & blend.valid & (true.values > 0)
+        seen = intersect_valid(true, measured) & blend.valid & (true.values > 0)
         if not seen.any():
             continue
         neutral = rig.neutral.astype(np.float64)
@@ -139,30 +139,32 @@ def compare(
         change = appearance.maps.get(f"change_{state}")
         if change is None or rest is None or change.stderr is None:
             continue
-        both = seen & jointly_valid(change, rest)
+        both = seen & intersect_valid(change, rest)
         moved = true.values.astype(np.float64) - rest.values
         got = change.values.astype(np.float64)
         moved, got = moved[both], got[both]
         rms = float(np.sqrt(np.mean((got - moved) ** 2)))
-        held = metrics.coverage(got, change.stderr[both], moved).share
-        changes.append(ChangeError(state, float(moved.mean()), float(got.mean()), rms, held))
+        held = metrics.coverage(got, change.stderr[both], moved).fraction
+        changes.append(
+            BloodChangeAccuracy(state, float(moved.mean()), float(got.mean()), rms, held)
+        )
     return states, changes
 
 
 def _row(
     state: str,
-    way: str,
+    method: str,
     values: FloatArray,
     stderr: FloatArray | None,
     true: FloatArray,
-    seen: BoolArray,
+    visible: BoolArray,
     rng: np.random.Generator,
-) -> StateError:
-    found, real = values[seen].astype(np.float64), true[seen].astype(np.float64)
+) -> PredictionAccuracy:
+    found, real = values[visible].astype(np.float64), true[visible].astype(np.float64)
     relative = (found - real) / real
     median, interval = metrics.median_with_interval(np.abs(relative), rng=rng)
     held = float("nan")
     if stderr is not None:
-        held = metrics.coverage(found, stderr[seen].astype(np.float64), real).share
+        held = metrics.coverage(found, stderr[visible].astype(np.float64), real).fraction
     rms, bias = float(np.sqrt(np.mean((found - real) ** 2))), float(np.median(relative))
-    return StateError(state, way, median, interval, rms, bias, held, int(seen.sum()))
+    return PredictionAccuracy(state, method, median, interval, rms, bias, held, int(visible.sum()))

@@ -7,10 +7,10 @@ import numpy as np
 
 from model import metrics
 from model.skin import SkinAppearance, SkinMap
-from reconstruction.pipeline.flash.stages import NOISE_STDERR
-from skinrig.appearances.contents import jointly_valid
+from reconstruction.pipeline.flash.stages import NOISE_STDERR_SUFFIX
+from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
-from skinrig.evaluating.bounds import cramer_rao
+from skinrig.evaluating.bounds import chromophore_bounds
 
 MELANIN_RANGES: tuple[tuple[float, float], ...] = (
     (0.0, 0.02),
@@ -23,7 +23,7 @@ MELANIN_RANGES: tuple[tuple[float, float], ...] = (
 
 
 @dataclass(frozen=True, slots=True)
-class MapError:
+class MapAccuracy:
     """How one map compares with one truth, over one band of melanin.
 
     Attributes
@@ -76,7 +76,7 @@ MIN_BOUND_ERROR = 0.10
 BOUND_FACTOR = 1.3
 
 
-def limit(row: MapError) -> float:
+def limit(row: MapAccuracy) -> float:
     """Return the largest median relative error that counts as kept.
 
     15 % where the Cramer-Rao bound at the truth is below 10 %, elsewhere 1.3 times that bound. An
@@ -86,7 +86,7 @@ def limit(row: MapError) -> float:
     return MAX_MEDIAN_MELANIN_ERROR if least < MIN_BOUND_ERROR else BOUND_FACTOR * least
 
 
-def bound(row: MapError) -> float:
+def bound(row: MapAccuracy) -> float:
     """Return the relative bound that a row is held to, see `limit`."""
     return row.median_bound if np.isfinite(row.median_bound) else row.median_stderr
 
@@ -97,7 +97,7 @@ def compare(
     *,
     names: tuple[str, ...] = ("melanin", "hemoglobin"),
     rng: np.random.Generator,
-) -> list[MapError]:
+) -> list[MapAccuracy]:
     """Compare maps with their truths, over all pixels and in each band of melanin.
 
     Parameters
@@ -120,7 +120,7 @@ def compare(
     if "melanin" not in truth.maps:
         raise ValueError("truth: has no map 'melanin', which the bands are made from")
     melanin = truth.maps["melanin"].values
-    bounds = cramer_rao(appearance, truth)
+    bounds = chromophore_bounds(appearance, truth)
     rows = []
     for name in names:
         if name not in appearance.maps:
@@ -136,13 +136,13 @@ def compare(
                     f"shape {true_map.values.shape}, expected the same"
                 )
             skin = _skin(truth, true_map.values)
-            floors = appearance.maps.get(name + NOISE_STDERR), bounds.get(name)
+            floors = appearance.maps.get(name + NOISE_STDERR_SUFFIX), bounds.get(name)
             for band in (None, *MELANIN_RANGES):
                 chosen = skin
                 if band is not None:
                     chosen = skin & (melanin >= band[0]) & (melanin < band[1])
                 figures = _figures(estimate, true_map.values, chosen, rng, *floors)
-                rows.append(MapError(name=name, against=against, band=band, **figures))
+                rows.append(MapAccuracy(name=name, against=against, band=band, **figures))
     return [row for row in rows if row.pixels >= 20]
 
 
@@ -161,8 +161,8 @@ def _figures(
     noise: SkinMap | None,
     bound: Float64Array | None,
 ) -> dict[str, Any]:
-    """Return the figures of a `MapError` over some pixels."""
-    valid = chosen & jointly_valid(estimate)
+    """Return the figures of a `MapAccuracy` over some pixels."""
+    valid = chosen & intersect_valid(estimate)
     pixels = int(np.count_nonzero(chosen))
     value = estimate.values[valid].astype(np.float64)
     true_value = true_values[valid].astype(np.float64)
@@ -178,7 +178,7 @@ def _figures(
         spread = float(np.median(ratios)) if ratios.size else float("nan")
     noise_held = float("nan")
     if noise is not None:
-        noise_held = metrics.coverage(value, noise.values[valid], true_value).share
+        noise_held = metrics.coverage(value, noise.values[valid], true_value).fraction
     told = np.empty(0) if bound is None else bound[valid & np.isfinite(bound)]
     return {
         "pixels": pixels,

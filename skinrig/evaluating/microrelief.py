@@ -15,9 +15,9 @@ from reconstruction.pipeline.gradient.stages import (
     KERNEL_FILE,
     STRAIN_FILE,
 )
-from skinrig.appearances.contents import jointly_valid
+from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import Float32Array, Float64Array
-from skinrig.evaluating.subsurface import document_of, number
+from skinrig.evaluating.subsurface import parse_number, read_document
 from skinrig.evaluating.surface import RAYLEIGH_68
 
 MAX_NORMAL_ERROR_DEG = 1.5
@@ -29,7 +29,7 @@ MAX_HISTOGRAM_DISTANCE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class ReliefError:
+class ReliefAccuracy:
     """How normals and height of one state compare with the truth.
 
     Attributes
@@ -71,7 +71,7 @@ class ReliefError:
 
 
 @dataclass(frozen=True, slots=True)
-class StretchError:
+class StretchAccuracy:
     """What caliper, images and truth say of a state's stretch along the jaws."""
 
     state: str
@@ -86,7 +86,7 @@ class StretchError:
         return self.found - self.truth
 
 
-def states_of(appearance: SkinAppearance) -> list[str]:
+def find_states(appearance: SkinAppearance) -> list[str]:
     """Return the names of the states that an appearance holds normals or heights of."""
     return sorted(
         {
@@ -100,7 +100,7 @@ def states_of(appearance: SkinAppearance) -> list[str]:
 
 def compare(
     appearance: SkinAppearance, truth: SkinAppearance, *, rng: np.random.Generator
-) -> list[ReliefError]:
+) -> list[ReliefAccuracy]:
     """Compare the normals and heights of every state with their truths, pixel by pixel.
 
     Parameters
@@ -112,12 +112,12 @@ def compare(
     """
     pixel_um = float(str(appearance.parameters.get("pixel_um", "nan")))
     rows = []
-    for state in states_of(appearance):
+    for state in find_states(appearance):
         found, true = appearance.maps.get(f"normals_{state}"), truth.maps.get(f"normals_{state}")
         if found is None or true is None:
             continue
-        skin = jointly_valid(true)
-        good = skin & jointly_valid(found)
+        skin = intersect_valid(true)
+        good = skin & intersect_valid(found)
         seen = truth.maps.get(f"normals_seen_{state}", true)
         error = np.degrees(metrics.angular_error_rad(found.values[good], seen.values[good]))
         sharp = np.degrees(metrics.angular_error_rad(found.values[good], true.values[good]))
@@ -131,7 +131,7 @@ def compare(
         spread = float(np.median(stderr)) if stderr.size else math.nan
         angles = (off, middle, interval, unblurred, spread, held)
         heights = _height(appearance, truth, state, pixel_um)
-        rows.append(ReliefError(state, int(skin.sum()), masked, *angles, *heights))
+        rows.append(ReliefAccuracy(state, int(skin.sum()), masked, *angles, *heights))
     return rows
 
 
@@ -141,7 +141,7 @@ def _height(
     found, true = appearance.maps.get(f"height_{state}"), truth.maps.get(f"height_{state}")
     if found is None or true is None or not math.isfinite(pixel_um):
         return math.nan, math.nan, math.nan
-    good = jointly_valid(found) & jointly_valid(true)
+    good = intersect_valid(found) & intersect_valid(true)
     if not good.any():
         return math.nan, math.nan, math.nan
     relief = true_relief(appearance, truth, state)
@@ -159,15 +159,15 @@ def true_relief(appearance: SkinAppearance, truth: SkinAppearance, state: str) -
     """
     true, found = truth.maps[f"height_{state}"], appearance.maps[f"height_{state}"]
     pixel_um = float(str(appearance.parameters["pixel_um"]))
-    good = jointly_valid(true) & jointly_valid(found)
+    good = intersect_valid(true) & intersect_valid(found)
     return np.asarray(
         high_pass(true.values, pixel=pixel_um, cutoff=CUTOFF_UM, valid=good), np.float32
     )
 
 
-def compare_stretch(appearance: SkinAppearance, truth: SkinAppearance) -> list[StretchError]:
+def compare_stretch(appearance: SkinAppearance, truth: SkinAppearance) -> list[StretchAccuracy]:
     """Compare the stretch of every state, as the caliper and the images say it, with the truth."""
-    measured = document_of(appearance, STRAIN_FILE)
+    measured = read_document(appearance, STRAIN_FILE)
     known = truth.parameters.get("states")
     if measured is None or not isinstance(known, list):
         return []
@@ -180,26 +180,31 @@ def compare_stretch(appearance: SkinAppearance, truth: SkinAppearance) -> list[S
         gradient = np.asarray(true[name]["gradient"], float)
         angle = math.radians(float(state["angle_deg"]))
         axis = np.array([math.cos(angle), math.sin(angle)])
-        reading, truth_s = number(state["reading_ratio"]), float(np.linalg.norm(gradient @ axis))
-        found, stderr = number(state["stretch_s"]), number(state["stretch_s_stderr"])
-        rows.append(StretchError(name, reading, truth_s, found, stderr))
+        reading, truth_s = (
+            parse_number(state["reading_ratio"]),
+            float(np.linalg.norm(gradient @ axis)),
+        )
+        found, stderr = parse_number(state["stretch_s"]), parse_number(state["stretch_s_stderr"])
+        rows.append(StretchAccuracy(name, reading, truth_s, found, stderr))
     return rows
 
 
 def distances(appearance: SkinAppearance) -> list[tuple[str, float, float, float]]:
     """Return state, stretch, and the distance of histograms before and after the fitted kernel."""
-    fitted = document_of(appearance, KERNEL_FILE)
+    fitted = read_document(appearance, KERNEL_FILE)
     if fitted is None:
         return []
     fits = [fit for fit in fitted["fits"] if fit["valid"]]
-    distance = [(number(fit["distance_before"]), number(fit["distance"])) for fit in fits]
+    distance = [
+        (parse_number(fit["distance_before"]), parse_number(fit["distance"])) for fit in fits
+    ]
     return [
-        (str(fit["name"]), number(fit["stretch_s"]), *both)
+        (str(fit["name"]), parse_number(fit["stretch_s"]), *both)
         for fit, both in zip(fits, distance, strict=True)
     ]
 
 
-def variances(
+def normal_variances(
     appearance: SkinAppearance,
 ) -> Mapping[float, list[tuple[float, float, float, float]]]:
     """Return, by the caliper's angle, stretch and variance of n along the jaws, with errors.
@@ -210,8 +215,8 @@ def variances(
         Angle in degrees -> list of (stretch, its standard error, variance, its standard error), by
         stretch.
     """
-    histograms = document_of(appearance, HISTOGRAM_FILE)
-    strain = document_of(appearance, STRAIN_FILE)
+    histograms = read_document(appearance, HISTOGRAM_FILE)
+    strain = read_document(appearance, STRAIN_FILE)
     if histograms is None or strain is None:
         return {}
     stretch = {s["name"]: s for s in strain["states"] if s["valid"]}
@@ -220,8 +225,8 @@ def variances(
         state = stretch.get(entry["name"])
         if state is None or entry["variance_s"] is None:
             continue
-        along = number(state["stretch_s"]), number(state["stretch_s_stderr"])
-        spread = number(entry["variance_s"]), number(entry["variance_s_stderr"])
+        along = parse_number(state["stretch_s"]), parse_number(state["stretch_s_stderr"])
+        spread = parse_number(entry["variance_s"]), parse_number(entry["variance_s_stderr"])
         found.setdefault(float(state["angle_deg"]), []).append((*along, *spread))
     return {angle: sorted(rows) for angle, rows in sorted(found.items())}
 

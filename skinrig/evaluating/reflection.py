@@ -13,18 +13,18 @@ from model.brdf.tables import BrdfBasis
 from model.skin import SkinAppearance
 from model.skin_reflectance import BASIS_FILE
 from reconstruction import brdf_basis
-from reconstruction.lumitexels.boundary_kernels import transmitted
+from reconstruction.lumitexels.boundary_kernels import boundary_transmittance
 from reconstruction.pipeline.dome.lobes import weight_names
-from skinrig.appearances.contents import jointly_valid
+from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import Float64Array
-from skinrig.evaluating.reflection_truth import TEST_FILE, sphere
+from skinrig.evaluating.reflection_truth import TEST_FILE, render_sphere
 from skinrig.evaluating.surface import MAX_MATCH_DISTANCE_MM
 
 MAX_HELD_OUT_ERROR = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class HeldOut:
+class HeldOutAccuracy:
     """How well reflection is predicted.
 
     Attributes
@@ -45,7 +45,7 @@ class HeldOut:
     highlights: float
 
 
-def basis_of(appearance: SkinAppearance) -> BrdfBasis | None:
+def read_basis(appearance: SkinAppearance) -> BrdfBasis | None:
     """Return the reduced basis that an appearance's weights are shares of, or None."""
     if BASIS_FILE not in appearance.files:
         return None
@@ -54,12 +54,12 @@ def basis_of(appearance: SkinAppearance) -> BrdfBasis | None:
     if any(name not in appearance.maps for name in weight_names(table.shape[-1])):
         return None
     names = [f"mix {k}" for k in range(table.shape[-1])]
-    return brdf_tables.of_columns(table, names, light_radius_rad=radius)
+    return brdf_tables.basis_from_columns(table, names, light_radius_rad=radius)
 
 
 def compare(
     appearance: SkinAppearance, truth: SkinAppearance, *, rng: np.random.Generator
-) -> HeldOut | None:
+) -> HeldOutAccuracy | None:
     """Predict the reflection at the test's points and directions, and compare.
 
     Parameters
@@ -76,7 +76,7 @@ def compare(
     HeldOut or None
         None where one of the two lacks what it takes.
     """
-    held = _held_by(appearance, truth)
+    held = _read_test(appearance, truth)
     if held is None or not held[1].size:
         return None
     basis, at, test = held
@@ -89,7 +89,7 @@ def compare(
     )
     _, interval = metrics.median_with_interval(by_point, rng=rng)
     shiny = usable & (test["surface"] > 0.5 * true_f.mean(axis=-1))
-    return HeldOut(
+    return HeldOutAccuracy(
         points=at.size,
         directions=light.shape[1],
         median=float(np.median(error[usable])),
@@ -131,7 +131,7 @@ def surface_test(appearance: SkinAppearance, truth: SkinAppearance) -> SurfaceTe
     SurfaceTest or None
         None where one of the two lacks what it takes.
     """
-    held = _held_by(appearance, truth)
+    held = _read_test(appearance, truth)
     if held is None:
         return None
     basis, at, test = held
@@ -140,15 +140,15 @@ def surface_test(appearance: SkinAppearance, truth: SkinAppearance) -> SurfaceTe
     return SurfaceTest(at, lobes * cosine, test["surface"] * cosine)
 
 
-def _held_by(
+def _read_test(
     appearance: SkinAppearance, truth: SkinAppearance
 ) -> tuple[BrdfBasis, NDArray[np.intp], dict[str, Float64Array]] | None:
     """Return basis, texels and the test at the points that the appearance holds; None: no test."""
-    basis = basis_of(appearance)
+    basis = read_basis(appearance)
     if basis is None or TEST_FILE not in truth.files or "r_d" not in appearance.maps:
         return None
     with np.load(io.BytesIO(truth.files[TEST_FILE]), allow_pickle=False) as stored:
-        at = _texels_for(stored["texel"], appearance, truth)
+        at = _nearest_texels(stored["texel"], appearance, truth)
         known = at >= 0
         names = ("light", "view", "f_r", "surface")
         test = {name: stored[name][known].astype(np.float64) for name in names}
@@ -163,7 +163,7 @@ def _lobes(
     view: Float64Array,
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return f_r of the lobes, 1/sr, and cosines of light and view, each (S, K)."""
-    normals = normal_at(appearance, texels)
+    normals = read_normals(appearance, texels)
     weights = np.stack(
         [appearance.maps[name].values.reshape(-1)[texels] for name in weight_names(basis.size)],
         axis=-1,
@@ -189,7 +189,7 @@ def predict(
     appearance
         With "r_d", weights and normals, refined ones if there are.
     basis
-        Of the weights, see `basis_of`.
+        Of the weights, see `read_basis`.
     texels
         Flat indices, shape (S,).
     light, view
@@ -197,12 +197,12 @@ def predict(
     """
     lobes, cos_light, cos_view = _lobes(appearance, basis, texels, light, view)
     r_d = appearance.maps["r_d"].values.reshape(-1, 3)[texels].astype(np.float64)
-    inside = r_d[:, None] / np.pi * transmitted(cos_light, cos_view)[..., None]
+    inside = r_d[:, None] / np.pi * boundary_transmittance(cos_light, cos_view)[..., None]
     above = (cos_light > 0) & (cos_view > 0)
     return np.where(above[..., None], inside + lobes[..., None], np.nan)
 
 
-def normal_at(appearance: SkinAppearance, texels: NDArray[np.integer]) -> Float64Array:
+def read_normals(appearance: SkinAppearance, texels: NDArray[np.integer]) -> Float64Array:
     """Return normals at flat texel indices, (S, 3): refined ones where there are some."""
 
     def flat(name: str) -> Float64Array:
@@ -210,23 +210,23 @@ def normal_at(appearance: SkinAppearance, texels: NDArray[np.integer]) -> Float6
 
     if "normals_refined" not in appearance.maps:
         return flat("normals")
-    good = jointly_valid(appearance.maps["normals_refined"]).reshape(-1)[texels]
+    good = intersect_valid(appearance.maps["normals_refined"]).reshape(-1)[texels]
     return np.where(good[:, None], flat("normals_refined"), flat("normals"))
 
 
-def spheres(
+def render_spheres(
     appearance: SkinAppearance, truth: SkinAppearance
 ) -> list[tuple[str, Float64Array, Float64Array | None]]:
     """Return the reflection of some sites on spheres: name, truth and estimate.
 
     The estimate is None at sites that it does not reach; without a test file nothing is returned.
     """
-    basis = basis_of(appearance)
+    basis = read_basis(appearance)
     if basis is None or TEST_FILE not in truth.files or "r_d" not in appearance.maps:
         return []
     with np.load(io.BytesIO(truth.files[TEST_FILE]), allow_pickle=False) as stored:
         names, texels, images = stored["site"], stored["site_texel"], stored["sphere"]
-    own = _texels_for(texels, appearance, truth)
+    own = _nearest_texels(texels, appearance, truth)
     out: list[tuple[str, Float64Array, Float64Array | None]] = []
     for name, texel, image in zip(names, own, images, strict=True):
         at, drawn = np.array([texel]), None
@@ -237,22 +237,22 @@ def spheres(
             return predict(appearance, basis, at, light[None], view[None])[0]
 
         if texel >= 0:
-            drawn, _ = sphere(reflect, normal_at(appearance, at)[0])
+            drawn, _ = render_sphere(reflect, read_normals(appearance, at)[0])
         out.append((str(name), np.asarray(image, np.float64), drawn))
     return out
 
 
-def _texels_for(
-    wanted: NDArray[np.integer], appearance: SkinAppearance, truth: SkinAppearance
+def _nearest_texels(
+    texels: NDArray[np.integer], appearance: SkinAppearance, truth: SkinAppearance
 ) -> NDArray[np.intp]:
     """Return the nearest texel of an appearance to each texel of the truth, -1 for none near."""
     from scipy.spatial import cKDTree
 
     place = appearance.maps["position"]
-    texel = np.flatnonzero(jointly_valid(place, appearance.maps["r_d"]))
+    texel = np.flatnonzero(intersect_valid(place, appearance.maps["r_d"]))
     if not len(texel):
-        return np.full(len(wanted), -1, np.intp)
+        return np.full(len(texels), -1, np.intp)
     tree = cKDTree(place.values.reshape(-1, 3)[texel])
-    true_place = truth.maps["position"].values.reshape(-1, 3)[wanted]
+    true_place = truth.maps["position"].values.reshape(-1, 3)[texels]
     distance, index = tree.query(true_place, distance_upper_bound=MAX_MATCH_DISTANCE_MM)
     return np.where(np.isfinite(distance), texel[np.minimum(index, len(texel) - 1)], -1)

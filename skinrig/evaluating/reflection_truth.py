@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.skin import SkinAppearance
-from skinrig.appearances.contents import jointly_valid
+from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 
 TEST_FILE: Final = "reflection_test.npz"
@@ -58,7 +58,7 @@ def make_test(
     """
     place = truth.maps["position"]
     size = place.values.shape[0]
-    valid = jointly_valid(place)
+    valid = intersect_valid(place)
     chosen = rng.permutation(np.flatnonzero(valid))[:points]
     all_normals = truth.maps["normals"].values.reshape(-1, 3).astype(np.float64)
 
@@ -67,8 +67,8 @@ def make_test(
         return np.stack([(columns + 0.5) / size, 1.0 - (rows + 0.5) / size], axis=-1)
 
     uv, normals = uv_of(chosen), all_normals[chosen]
-    light = _around(normals, directions, rng)
-    view = _around(normals, directions, rng)
+    light = _sample_directions(normals, directions, rng)
+    view = _sample_directions(normals, directions, rng)
     flat = np.repeat(uv, directions, axis=0)
     total, surface = scene.brdf(flat, light.reshape(-1, 3), view.reshape(-1, 3))
     spheres, at = [], []
@@ -82,7 +82,7 @@ def make_test(
         ) -> Float64Array:
             return np.asarray(scene.brdf(spot.repeat(len(to_light), 0), to_light, to_camera)[0])
 
-        spheres.append(sphere(reflect, all_normals[texel])[0])
+        spheres.append(render_sphere(reflect, all_normals[texel])[0])
         at.append(texel)
     stream = io.BytesIO()
     np.savez_compressed(
@@ -99,7 +99,7 @@ def make_test(
     return stream.getvalue()
 
 
-def sphere(
+def render_sphere(
     reflect: Callable[[Float64Array, Float64Array], Float64Array],
     normal: Float64Array,
     *,
@@ -127,8 +127,8 @@ def sphere(
     inside = x**2 + y**2 < 1.0
     outward = np.stack([x, y, np.sqrt(np.where(inside, 1.0 - x**2 - y**2, 0.0))], -1)[inside]
     shade = np.maximum(outward @ np.asarray(light_dir), 0.0)
-    to_light = _turned(np.asarray(light_dir), outward, normal)
-    to_camera = _turned(np.array([0.0, 0.0, 1.0]), outward, normal)
+    to_light = _rotate_direction(np.asarray(light_dir), outward, normal)
+    to_camera = _rotate_direction(np.array([0.0, 0.0, 1.0]), outward, normal)
     image = np.zeros((SPHERE_PX, SPHERE_PX, 3))
     lit = shade > 0
     seen = np.nan_to_num(reflect(to_light[lit], to_camera[lit])) * shade[lit, None]
@@ -136,7 +136,9 @@ def sphere(
     return image, inside
 
 
-def _turned(direction: Float64Array, outward: Float64Array, normal: Float64Array) -> Float64Array:
+def _rotate_direction(
+    direction: Float64Array, outward: Float64Array, normal: Float64Array
+) -> Float64Array:
     """Return a direction seen from points of a sphere as seen from a spot: outward to normal.
 
     The turn is the shortest one, Rodrigues' formula for two unit vectors.
@@ -150,7 +152,7 @@ def _turned(direction: Float64Array, outward: Float64Array, normal: Float64Array
     )
 
 
-def _around(normals: Float64Array, count: int, rng: np.random.Generator) -> Float64Array:
+def _sample_directions(normals: Float64Array, count: int, rng: np.random.Generator) -> Float64Array:
     """Draw directions around normals, even in solid angle down to `MIN_TEST_COSINE`, (S, K, 3)."""
     shape = (len(normals), count)
     z = rng.uniform(MIN_TEST_COSINE, 1.0, shape)

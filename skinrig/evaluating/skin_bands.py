@@ -50,12 +50,12 @@ def typology_angle_deg(reflectance: ArrayLike) -> Float64Array:
     return np.asarray(metrics.individual_typology_angle_deg(lightness, b_star))
 
 
-def bands_of(angle_deg: ArrayLike) -> NDArray[np.str_]:
+def classify_typology(angle_deg: ArrayLike) -> NDArray[np.str_]:
     """Return the names of the bands that angles lie in.
 
     Examples
     --------
-    >>> bands_of([60.0, 30.0, -31.0]).tolist()
+    >>> classify_typology([60.0, 30.0, -31.0]).tolist()
     ['very light', 'intermediate', 'dark']
     """
     angle = np.asarray(angle_deg, np.float64)
@@ -86,7 +86,7 @@ class MelaninBand:
         """
         return _reflectance(self.melanin, self.hemoglobin)
 
-    def told(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return what a document says of the band."""
         return {
             "melanin": list(self.melanin_range),
@@ -115,12 +115,12 @@ def _reflectance(melanin: float, hemoglobin: float) -> Float64Array:
     return found
 
 
-def melanin_band(melanin: ArrayLike) -> NDArray[np.str_]:
+def classify_melanin(melanin: ArrayLike) -> NDArray[np.str_]:
     """Return the names of the bands that volume fractions of melanin lie in.
 
     Examples
     --------
-    >>> melanin_band([0.005, 0.02, 0.3]).tolist()
+    >>> classify_melanin([0.005, 0.02, 0.3]).tolist()
     ['light', 'medium', 'dark']
     """
     edges = [band.melanin_range[0] for band in MELANIN_BANDS.values()][1:]

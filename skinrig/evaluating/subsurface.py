@@ -21,7 +21,7 @@ MIN_SIGNAL_TO_NOISE = 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class ProfileError:
+class ProfileAccuracy:
     """How one measured profile compares with the true one.
 
     Attributes
@@ -45,7 +45,7 @@ class ProfileError:
 
 
 @dataclass(frozen=True, slots=True)
-class FitError:
+class FitAccuracy:
     """How one fitted sigma_tr compares with the truth."""
 
     name: str
@@ -72,7 +72,7 @@ class FitError:
         return self.interval[0] <= self.truth <= self.interval[1]
 
 
-def document_of(appearance: SkinAppearance, name: str) -> Mapping[str, Any] | None:
+def read_document(appearance: SkinAppearance, name: str) -> Mapping[str, Any] | None:
     """Return one of the JSON files of an appearance, or None."""
     blob = appearance.files.get(name)
     return None if blob is None else json.loads(blob)
@@ -83,31 +83,31 @@ def true_profiles(truth: SkinAppearance | None) -> Mapping[str, Mapping[str, Any
     known = None if truth is None else truth.parameters.get("profiles")
     if not isinstance(known, list):
         return {}
-    return {name_of(entry): entry for entry in known}
+    return {format_measurement_name(entry): entry for entry in known}
 
 
-def name_of(entry: Mapping[str, Any]) -> str:
+def format_measurement_name(entry: Mapping[str, Any]) -> str:
     """Return the name of a measurement from its site, repeat and angle.
 
     Examples
     --------
-    >>> name_of({"site": "cheek", "repeat": 1, "angle_deg": 22.5})
+    >>> format_measurement_name({"site": "cheek", "repeat": 1, "angle_deg": 22.5})
     'cheek_r1_a022.5'
     """
     return f"{entry['site']}_r{int(entry['repeat'])}_a{float(entry['angle_deg']):05.1f}"
 
 
-def compare_profiles(appearance: SkinAppearance, truth: SkinAppearance) -> list[ProfileError]:
+def compare_profiles(appearance: SkinAppearance, truth: SkinAppearance) -> list[ProfileAccuracy]:
     """Compare the profiles of every measurement and channel with the true ones."""
-    measured, known = document_of(appearance, PROFILE_FILE), true_profiles(truth)
-    rows: list[ProfileError] = []
+    measured, known = read_document(appearance, PROFILE_FILE), true_profiles(truth)
+    rows: list[ProfileAccuracy] = []
     for entry in [] if measured is None else measured["measurements"]:
-        true = known.get(name_of(entry))
+        true = known.get(format_measurement_name(entry))
         if true is None:
             continue
         for number, channel in enumerate(CHANNEL_NAMES):
             one = entry["channels"][channel]
-            found, stderr = numbers(one["reflectance_per_mm2"]), numbers(one["stderr"])
+            found, stderr = parse_numbers(one["reflectance_per_mm2"]), parse_numbers(one["stderr"])
             real = np.asarray(true["reflectance_per_mm2"], float)[:, number]
             noise = np.asarray(true["stderr"], float)[:, number]
             good = np.asarray(one["valid"], bool) & (found > MIN_SIGNAL_TO_NOISE * stderr)
@@ -117,30 +117,35 @@ def compare_profiles(appearance: SkinAppearance, truth: SkinAppearance) -> list[
             inside = np.abs(found - real) <= np.hypot(stderr, noise)
             median, worst = float(np.median(error)), float(error.max())
             held = float(inside[good].mean())
-            name = name_of(entry)
-            rows.append(ProfileError(name, channel, median, worst, int(good.sum()), held))
+            name = format_measurement_name(entry)
+            rows.append(ProfileAccuracy(name, channel, median, worst, int(good.sum()), held))
     return rows
 
 
-def compare_fits(appearance: SkinAppearance, truth: SkinAppearance) -> list[FitError]:
+def compare_fits(appearance: SkinAppearance, truth: SkinAppearance) -> list[FitAccuracy]:
     """Compare every fitted sigma_tr with the true one."""
-    fitted, known = document_of(appearance, SUBSURFACE_FILE), true_profiles(truth)
-    rows: list[FitError] = []
+    fitted, known = read_document(appearance, SUBSURFACE_FILE), true_profiles(truth)
+    rows: list[FitAccuracy] = []
     for entry in [] if fitted is None else fitted["measurements"]:
-        true = known.get(name_of(entry))
+        true = known.get(format_measurement_name(entry))
         if true is None:
             continue
         for fit in entry["fits"]:
             sigma_tr = float(true["sigma_tr_per_mm"][CHANNEL_NAMES.index(fit["channel"])])
-            low, high = numbers(fit["interval_per_mm"]).tolist()
-            known_by = (name_of(entry), fit["channel"], fit["method"], str(true["kind"]))
-            found = number(fit["sigma_tr_per_mm"]), number(fit["sigma_tr_stderr"])
-            rows.append(FitError(*known_by, sigma_tr, *found, (low, high), bool(fit["valid"])))
+            low, high = parse_numbers(fit["interval_per_mm"]).tolist()
+            known_by = (
+                format_measurement_name(entry),
+                fit["channel"],
+                fit["method"],
+                str(true["kind"]),
+            )
+            found = parse_number(fit["sigma_tr_per_mm"]), parse_number(fit["sigma_tr_stderr"])
+            rows.append(FitAccuracy(*known_by, sigma_tr, *found, (low, high), bool(fit["valid"])))
     return rows
 
 
 @dataclass(frozen=True, slots=True)
-class MethodError:
+class MethodAccuracy:
     """Errors of one method over many fits."""
 
     method: str
@@ -154,7 +159,7 @@ class MethodError:
     """Share of truths within the 68 % interval."""
 
 
-def by_method(rows: Sequence[FitError]) -> list[MethodError]:
+def summarize_methods(rows: Sequence[FitAccuracy]) -> list[MethodAccuracy]:
     """Return the errors of each method over its valid fits."""
     found = []
     for method in METHOD_NAMES:
@@ -164,15 +169,15 @@ def by_method(rows: Sequence[FitError]) -> list[MethodError]:
         error = np.array([row.relative for row in chosen])
         median, worst = float(np.median(np.abs(error))), float(np.abs(error).max())
         bias, held = float(error.mean()), float(np.mean([row.covered for row in chosen]))
-        found.append(MethodError(method, len(chosen), median, worst, bias, held))
+        found.append(MethodAccuracy(method, len(chosen), median, worst, bias, held))
     return found
 
 
-def number(value: object) -> float:
+def parse_number(value: object) -> float:
     """Return a number of a document; null becomes NaN."""
     return math.nan if value is None else float(str(value))
 
 
-def numbers(values: Sequence[object]) -> Float64Array:
+def parse_numbers(values: Sequence[object]) -> Float64Array:
     """Return numbers of a document, float64; null becomes NaN."""
-    return np.array([number(value) for value in values], np.float64)
+    return np.array([parse_number(value) for value in values], np.float64)

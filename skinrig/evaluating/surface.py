@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from model import metrics
 from model.skin import SkinAppearance, SkinMap
-from skinrig.appearances.contents import jointly_valid
+from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.evaluating import skin_bands
 
@@ -37,7 +37,7 @@ class SurfaceTruthError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Match:
+class TexelMatch:
     """Which texel of the truth lies nearest to each texel of an estimate.
 
     Attributes
@@ -57,7 +57,7 @@ class Match:
 
 
 @dataclass(frozen=True, slots=True)
-class SurfaceError:
+class SurfaceAccuracy:
     """How one map of a surface, or one channel of it, compares with the truth.
 
     Attributes
@@ -91,16 +91,19 @@ class SurfaceError:
     median_stderr: float
 
     @property
-    def judged(self) -> tuple[str, float, float]:
+    def limit_check(self) -> tuple[str, float, float]:
         """What is held to a limit: its name, the value and the limit, in ``unit``."""
         if self.unit == "deg":
             return "mean error", self.mean, MAX_NORMAL_ERROR_DEG
         return "median error", self.median, 100.0 * MAX_ALBEDO_ERROR
 
 
-def match(
-    appearance: SkinAppearance, truth: SkinAppearance, *, near_mm: float = MAX_MATCH_DISTANCE_MM
-) -> Match:
+def match_texels(
+    appearance: SkinAppearance,
+    truth: SkinAppearance,
+    *,
+    max_distance_mm: float = MAX_MATCH_DISTANCE_MM,
+) -> TexelMatch:
     """Find the true texel nearest to each texel of an estimate.
 
     Parameters
@@ -120,10 +123,10 @@ def match(
     for name, side in (("appearance", appearance), ("truth", truth)):
         if "position" not in side.maps:
             raise SurfaceTruthError(f"{name}: has no map 'position', which texels are matched by")
-    rows, columns = np.nonzero(jointly_valid(appearance.maps["position"]))
+    rows, columns = np.nonzero(intersect_valid(appearance.maps["position"]))
     place = appearance.maps["position"].values[rows, columns]
     true_place = truth.maps["position"]
-    usable = jointly_valid(true_place)
+    usable = intersect_valid(true_place)
     if "mask" in truth.maps:
         usable = usable & (truth.maps["mask"].values > 0.5)
     # a texel whose nearest true one does not count, under a brow, has no truth either
@@ -132,18 +135,18 @@ def match(
         raise SurfaceTruthError("truth: no texel of it is valid")
     tree = cKDTree(true_place.values.reshape(-1, 3)[known])
     distance, index = tree.query(place, workers=1)
-    near = (distance <= near_mm) & usable.reshape(-1)[known[index]]
+    near = (distance <= max_distance_mm) & usable.reshape(-1)[known[index]]
     if not near.any():
         raise SurfaceTruthError(
-            f"position: no texel lies within {near_mm:g} mm of the true surface; nearest "
+            f"position: no texel lies within {max_distance_mm:g} mm of the true surface; nearest "
             f"{distance.min() if len(distance) else math.nan:.1f} mm: is the scan registered?"
         )
-    return Match(rows[near], columns[near], known[index[near]], distance[near])
+    return TexelMatch(rows[near], columns[near], known[index[near]], distance[near])
 
 
 def compare(
     appearance: SkinAppearance, truth: SkinAppearance, *, rng: np.random.Generator
-) -> list[SurfaceError]:
+) -> list[SurfaceAccuracy]:
     """Compare normals and albedo with their truths.
 
     Parameters
@@ -156,7 +159,7 @@ def compare(
     rng
         For the bootstrap intervals.
     """
-    pairs = match(appearance, truth)
+    pairs = match_texels(appearance, truth)
     rows = []
     for name in NORMAL_MAPS:
         if name in appearance.maps and "normals" in truth.maps:
@@ -166,8 +169,8 @@ def compare(
     return rows
 
 
-def errors_at(
-    name: str, appearance: SkinAppearance, truth: SkinAppearance, pairs: Match
+def matched_errors(
+    name: str, appearance: SkinAppearance, truth: SkinAppearance, pairs: TexelMatch
 ) -> Float64Array:
     """Return a map's error at each matched texel, NaN where it is not valid.
 
@@ -175,7 +178,7 @@ def errors_at(
     """
     estimate = appearance.maps[name]
     values = estimate.values[pairs.rows, pairs.columns].astype(np.float64)
-    good = jointly_valid(estimate)[pairs.rows, pairs.columns]
+    good = intersect_valid(estimate)[pairs.rows, pairs.columns]
     true_name = "normals" if name in NORMAL_MAPS else name
     true_values = _flat(truth.maps[true_name])[pairs.truth]
     if name in NORMAL_MAPS:
@@ -197,14 +200,14 @@ def errors_by_band(appearance: SkinAppearance, truth: SkinAppearance) -> list[Ba
     """
     if "r_d" not in truth.maps:
         return []
-    pairs = match(appearance, truth)
+    pairs = match_texels(appearance, truth)
     true_color = truth.maps["r_d"].values.reshape(-1, 3)[pairs.truth].astype(np.float64)
-    bands = skin_bands.bands_of(skin_bands.typology_angle_deg(true_color))
+    bands = skin_bands.classify_typology(skin_bands.typology_angle_deg(true_color))
     rows: list[Banded] = []
     for key in ("r_d", *NORMAL_MAPS):
         if key not in appearance.maps or (key != "r_d" and "normals" not in truth.maps):
             continue
-        error = np.abs(errors_at(key, appearance, truth, pairs))
+        error = np.abs(matched_errors(key, appearance, truth, pairs))
         for band in skin_bands.TYPOLOGY_NAMES:
             own = error[bands == band]
             told = own[np.isfinite(own)]
@@ -218,9 +221,9 @@ def errors_by_band(appearance: SkinAppearance, truth: SkinAppearance) -> list[Ba
 
 
 def _angles(
-    name: str, estimate: SkinMap, truth: SkinAppearance, pairs: Match, rng: np.random.Generator
-) -> SurfaceError:
-    good = jointly_valid(estimate)[pairs.rows, pairs.columns]
+    name: str, estimate: SkinMap, truth: SkinAppearance, pairs: TexelMatch, rng: np.random.Generator
+) -> SurfaceAccuracy:
+    good = intersect_valid(estimate)[pairs.rows, pairs.columns]
     normals = estimate.values[pairs.rows, pairs.columns][good].astype(np.float64)
     angle = metrics.angular_error_rad(normals, _flat(truth.maps["normals"])[pairs.truth][good])
     stderr = None
@@ -236,9 +239,9 @@ def _angles(
 
 
 def _channels(
-    name: str, estimate: SkinMap, truth: SkinAppearance, pairs: Match, rng: np.random.Generator
-) -> list[SurfaceError]:
-    good = jointly_valid(estimate)[pairs.rows, pairs.columns]
+    name: str, estimate: SkinMap, truth: SkinAppearance, pairs: TexelMatch, rng: np.random.Generator
+) -> list[SurfaceAccuracy]:
+    good = intersect_valid(estimate)[pairs.rows, pairs.columns]
     values = estimate.values[pairs.rows, pairs.columns][good].astype(np.float64)
     true_values = _flat(truth.maps[name])[pairs.truth][good]
     rows = []
@@ -263,25 +266,25 @@ def _row(
     name: str,
     unit: str,
     error: Float64Array,
-    good: BoolArray,
-    held: metrics.Coverage,
-    spread: float,
+    valid: BoolArray,
+    coverage: metrics.Coverage,
+    stderr: float,
     bias: float,
     rng: np.random.Generator,
-) -> SurfaceError:
+) -> SurfaceAccuracy:
     median, interval = metrics.median_with_interval(error, rng=rng)
-    return SurfaceError(
+    return SurfaceAccuracy(
         name=name,
         unit=unit,
-        points=len(good),
-        masked=1.0 - float(good.mean()) if len(good) else math.nan,
+        points=len(valid),
+        masked=1.0 - float(valid.mean()) if len(valid) else math.nan,
         mean=float(error.mean()) if len(error) else math.nan,
         median=median,
         interval=interval,
         high=float(np.percentile(error, 95)) if len(error) else math.nan,
         bias=bias,
-        coverage=held,
-        median_stderr=spread,
+        coverage=coverage,
+        median_stderr=stderr,
     )
 
 

@@ -10,7 +10,7 @@ from model.brdf import rgl
 from model.brdf.tables import BrdfBasis
 from model.skin import SkinAppearance
 from skinrig.arrays import BoolArray, Float64Array
-from skinrig.exporting.options import Delivery, ExportError, Place
+from skinrig.exporting.options import ExportError, ExportSettings, SkinPosition
 from skinrig.exporting.sealing import write_json
 
 Brdf = Callable[[Float64Array, Float64Array], Float64Array]
@@ -21,17 +21,17 @@ BRDF_SUFFIXES: Mapping[str, str] = {"merl": ".binary", "rgl": ".bsdf"}
 _SURFACE_NORMAL = np.array([0.0, 0.0, 1.0])
 
 
-def write_merl(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> None:
+def write_merl(appearance: SkinAppearance, folder: Path, delivery: ExportSettings) -> None:
     """Write tables of MERL, .binary of 35 MB each; see `write`."""
     write(appearance, folder, delivery.place, "merl")
 
 
-def write_rgl(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> None:
+def write_rgl(appearance: SkinAppearance, folder: Path, delivery: ExportSettings) -> None:
     """Write .bsdf files for Mitsuba's ``measured``, RGB; see `write`."""
     write(appearance, folder, delivery.place, "rgl")
 
 
-def write(appearance: SkinAppearance, folder: Path, place: Place | None, to: str) -> None:
+def write(appearance: SkinAppearance, folder: Path, place: SkinPosition | None, to: str) -> None:
     """Write each lobe as lobe_K, and the BRDF of a place as place, with a document that tells all.
 
     Parameters
@@ -52,7 +52,7 @@ def write(appearance: SkinAppearance, folder: Path, place: Place | None, to: str
     model.skin_reflectance.SkinReflectanceError
         Where the appearance has no lobes.
     """
-    lobes = skin_reflectance.lobes_of(appearance)
+    lobes = skin_reflectance.load_basis(appearance)
     suffix, light = BRDF_SUFFIXES[to], lobes.light_radius_rad
     files: dict[str, object] = {}
     for k in range(lobes.size):
@@ -92,16 +92,16 @@ def merl_table(brdf: Brdf) -> merl.MerlTable:
         above = (light[..., 2] > 0.0) & (view[..., 2] > 0.0)
         found = np.asarray(brdf(light[above], view[above]))
         values[i][above] = found.reshape(len(found), -1)
-    return merl.MerlTable.of_values(values)
+    return merl.MerlTable.from_values(values)
 
 
 def _lobe(lobes: BrdfBasis, k: int) -> Brdf:
-    one = lobes.mixed(np.eye(lobes.size)[k : k + 1])
+    one = lobes.mix_materials(np.eye(lobes.size)[k : k + 1])
     return lambda light, view: one.evaluate(light, view, _SURFACE_NORMAL)[:, 0]
 
 
 def _place(
-    appearance: SkinAppearance, lobes: BrdfBasis, place: Place
+    appearance: SkinAppearance, lobes: BrdfBasis, place: SkinPosition
 ) -> tuple[Brdf, dict[str, object]]:
     """Return the mean BRDF over the texels of a place, and what to tell of it."""
     model = skin_reflectance.assemble(appearance)
@@ -117,7 +117,7 @@ def _place(
             f"place: r_d is {r_d.tolist()} there, below 0; take another place, a wider radius, or "
             "--without-diffuse"
         )
-    surface = lobes.mixed(model.weights[near].astype(np.float64).mean(axis=0)[None])
+    surface = lobes.mix_materials(model.weights[near].astype(np.float64).mean(axis=0)[None])
 
     def brdf(light: Float64Array, view: Float64Array) -> Float64Array:
         found = np.repeat(surface.evaluate(light, view, _SURFACE_NORMAL), 3, axis=-1)
@@ -139,7 +139,7 @@ def _place(
     return brdf, entry
 
 
-def _nearest_valid(valid: BoolArray, place: Place) -> tuple[int, int]:
+def _nearest_valid(valid: BoolArray, place: SkinPosition) -> tuple[int, int]:
     height, width = valid.shape
     row = min(int((1.0 - place.v) * height), height - 1)
     column = min(int(place.u * width), width - 1)
@@ -151,9 +151,9 @@ def _nearest_valid(valid: BoolArray, place: Place) -> tuple[int, int]:
     return row, column
 
 
-def _write(to: str, path: Path, brdf: Brdf, told: str, light_radius_rad: float) -> None:
+def _write(to: str, path: Path, brdf: Brdf, description: str, light_radius_rad: float) -> None:
     if to == "merl":  # the format has no place for words
         merl.write(path, merl_table(brdf))
     else:
-        told = f"{told}; measured with a light of radius {light_radius_rad:.6g} rad"
-        rgl.write(path, rgl.of_brdf(brdf, description=told))
+        description = f"{description}; measured with a light of radius {light_radius_rad:.6g} rad"
+        rgl.write(path, rgl.tabulate_brdf(brdf, description=description))

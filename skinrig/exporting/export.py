@@ -11,8 +11,8 @@ from model import store
 from model.skin import SkinAppearance
 from skinrig import consent
 from skinrig.errors import UsageError, one_of
-from skinrig.exporting.options import Delivery, ExportError
-from skinrig.exporting.sealing import Exported, sealed
+from skinrig.exporting.options import ExportError, ExportSettings
+from skinrig.exporting.sealing import ExportResult, export_sealed
 
 APPEARANCE_FORMATS: Final[Mapping[str, str]] = {
     "maps": "maps.write",
@@ -39,12 +39,12 @@ _DOME_MAPS: Final = ("position", "normals", "normals_refined", "r_d")
 """Maps of which a dome's reconstruction holds one at least."""
 
 
-def writer(to: str) -> Any:
-    """Return the function that writes a format: of appearance or session, folder, `Delivery`.
+def load_writer(to: str) -> Any:
+    """Return the function that writes a format: of appearance or session, folder, `ExportSettings`.
 
     Examples
     --------
-    >>> sorted({writer(to).__name__ for to in APPEARANCE_FORMATS})
+    >>> sorted({load_writer(to).__name__ for to in APPEARANCE_FORMATS})
     ['write', 'write_merl', 'write_rgl', 'write_spectra']
     """
     module, _, name = {**APPEARANCE_FORMATS, **SESSION_FORMATS}[to].rpartition(".")
@@ -55,12 +55,12 @@ def export(
     source: str | Path,
     out: str | Path,
     to: str,
-    delivery: Delivery | None = None,
+    delivery: ExportSettings | None = None,
     *,
     use: str | None = None,
     today: date | None = None,
     now: datetime | None = None,
-) -> Exported:
+) -> ExportResult:
     """Write an appearance or a session for another program, sealed by an ASC MHL manifest.
 
     The folder is there as a whole, or not at all.
@@ -74,7 +74,7 @@ def export(
     to
         One of `APPEARANCE_FORMATS`, or of `SESSION_FORMATS` for a session.
     delivery
-        Scene unit, tiles, green of normals, errors, mesh; None: as `Delivery()`.
+        Scene unit, tiles, green of normals, errors, mesh; None: as `ExportSettings()`.
     use
         What the copy is for. Must lie within the consent of every measured subject, on a day
         before it ends; may be None where an appearance was simulated.
@@ -101,7 +101,7 @@ def export(
     one_of("to", to, (*APPEARANCE_FORMATS, *SESSION_FORMATS), ExportError)
     if Path(out).exists():
         raise ExportError(f"{out}: exists; choose a new folder")
-    order = delivery or Delivery()
+    order = delivery or ExportSettings()
     held: SkinAppearance | Session
     if to in SESSION_FORMATS:
         held = _session(source, use, today)
@@ -115,14 +115,14 @@ def export(
             )
         if order.onto is not None:
             _appearance(order.onto, use, today)  # its maps are handed on, too
-    write = writer(to)
-    return sealed(Path(out), lambda part: write(held, part, order), now)
+    write = load_writer(to)
+    return export_sealed(Path(out), lambda part: write(held, part, order), now)
 
 
 def _appearance(path: str | Path, use: str | None, today: date | None) -> SkinAppearance:
     """Read an appearance whose subjects agreed to a use."""
     appearance = store.read(path)
-    consent.require(appearance, use, where=str(path), today=today)
+    consent.require_consent(appearance, use, folder=str(path), today=today)
     return appearance
 
 

@@ -18,8 +18,8 @@ from model.skin import SkinAppearance
 from skinrig.appearances.contents import digest
 from skinrig.arrays import BoolArray, FloatArray
 from skinrig.drawing import png
-from skinrig.exporting.options import FIRST_TILE, Delivery
-from skinrig.exporting.sealing import provenance, write_json
+from skinrig.exporting.options import FIRST_TILE, ExportSettings
+from skinrig.exporting.sealing import describe_provenance, write_json
 
 SRGB_SPACE: Final = "linear sRGB"
 CAMERA_SPACE: Final = "camera RGB, linear, white balanced"
@@ -39,7 +39,7 @@ PNG_RANGES: Final[Mapping[str, tuple[float, float]]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Image:
+class ExportImage:
     """One image to write.
 
     Attributes
@@ -73,14 +73,14 @@ class Image:
     filler: tuple[float, ...] | None = None
 
     @staticmethod
-    def of_normals(
-        name: str, normals: FloatArray, delivery: Delivery, what: str, **more: Any
-    ) -> Image:
+    def from_normals(
+        name: str, normals: FloatArray, delivery: ExportSettings, description: str, **more: Any
+    ) -> ExportImage:
         """Return a map of normals, +Y up, with the green that is asked for."""
         turned = normals * np.array([1.0, delivery.y, 1.0], np.float32)
-        return Image(name, turned, "1", DATA_SPACE, what, -1.0, 1.0, **more)
+        return ExportImage(name, turned, "1", DATA_SPACE, description, -1.0, 1.0, **more)
 
-    def on_empty_tile(self) -> Image:
+    def fill_empty_tile(self) -> ExportImage:
         """Return the image of a tile where nothing was measured, of one value."""
         layers = self.values if self.values.ndim == 3 else self.values[..., None]
         rows = layers[self.valid] if self.valid is not None else layers.reshape(-1, layers.shape[2])
@@ -112,19 +112,19 @@ class ImageFolder:
     """
 
     root: Path
-    delivery: Delivery
+    delivery: ExportSettings
     records: dict[str, dict[str, Any]] = field(default_factory=dict)
     tiles: tuple[int, ...] = (FIRST_TILE,)
     left_out: list[tuple[str, str]] = field(default_factory=list)
 
-    def leave_out(self, what: str, why: str) -> None:
+    def record_omission(self, item: str, why: str) -> None:
         """Record what is not written, and why."""
-        self.left_out.append((what, why))
+        self.left_out.append((item, why))
 
-    def exr(self, image: Image, folder: str = "exr") -> str:
+    def write_exr(self, image: ExportImage, folder: str = "exr") -> str:
         """Write a float32 EXR a tile; return the first's name below the root."""
 
-        def put(path: Path, one: Image) -> dict[str, Any]:
+        def put(path: Path, one: ExportImage) -> dict[str, Any]:
             channels = {"Y" if one.values.ndim == 2 else "RGB": one.values}
             header = {"unit": one.unit, "colorSpace": one.space, "comments": one.what}
             write_channels(path, channels, header, rec709=one.space == SRGB_SPACE)
@@ -132,45 +132,49 @@ class ImageFolder:
 
         return self._tiled(image, folder, "exr", put)
 
-    def png(self, image: Image, folder: str = "png") -> str:
+    def write_png(self, image: ExportImage, folder: str = "png") -> str:
         """Write a PNG of 16 bits a tile; return the first's name below the root.
 
         Colors in `SRGB_SPACE` are coded by sRGB's curve, all else in proportion.
         """
 
-        def put(path: Path, one: Image) -> dict[str, Any]:
-            codes, told = coded(one)
+        def put(path: Path, one: ExportImage) -> dict[str, Any]:
+            codes, told = encode_png_codes(one)
             path.write_bytes(png.encode(codes, quick=True))
             return told
 
-        low, high = coded_range(image)
+        low, high = png_code_range(image)
         return self._tiled(replace(image, low=low, high=high), folder, "png", put)
 
-    def both(self, image: Image) -> str:
+    def write_exr_and_png(self, image: ExportImage) -> str:
         """Write a float EXR and a 16-bit PNG a tile; return the first PNG's name."""
-        self.exr(image)
-        return self.png(image)
+        self.write_exr(image)
+        return self.write_png(image)
 
-    def errors(self, images: Iterable[Image], folder: str = "exr") -> None:
+    def errors(self, images: Iterable[ExportImage], folder: str = "exr") -> None:
         """Write images of errors, where they are asked for."""
         if self.delivery.with_errors:
             for image in images:
-                self.exr(image, folder)
+                self.write_exr(image, folder)
 
-    def document(self, file: str, appearance: SkinAppearance, told: Mapping[str, Any]) -> None:
+    def document(self, file: str, appearance: SkinAppearance, content: Mapping[str, Any]) -> None:
         """Write the document that says where an export is from, and what each file holds."""
         files = dict(sorted(self.records.items()))
-        write_json(self.root / file, {**provenance(appearance), **told, "files": files})
+        write_json(self.root / file, {**describe_provenance(appearance), **content, "files": files})
 
     def _tiled(
-        self, image: Image, folder: str, suffix: str, put: Callable[[Path, Image], dict[str, Any]]
+        self,
+        image: ExportImage,
+        folder: str,
+        suffix: str,
+        put: Callable[[Path, ExportImage], dict[str, Any]],
     ) -> str:
         """Write an image of each tile and keep its record; return the first's name."""
         (self.root / folder).mkdir(exist_ok=True)
         names = []
         for tile in self.tiles:
-            one = image if tile == self.tiles[0] else image.on_empty_tile()
-            names.append(f"{folder}/{self.delivery.tiled(image.name, suffix, tile)}")
+            one = image if tile == self.tiles[0] else image.fill_empty_tile()
+            names.append(f"{folder}/{self.delivery.format_tile_name(image.name, suffix, tile)}")
             self.records[names[-1]] = {
                 "what": one.what,
                 "unit": one.unit,
@@ -183,7 +187,7 @@ class ImageFolder:
         return names[0]
 
 
-def coded(image: Image, *, depth: int = 16) -> tuple[NDArray[Any], dict[str, Any]]:
+def encode_png_codes(image: ExportImage, *, depth: int = 16) -> tuple[NDArray[Any], dict[str, Any]]:
     """Return PNG codes and how they become values again.
 
     Parameters
@@ -201,8 +205,9 @@ def coded(image: Image, *, depth: int = 16) -> tuple[NDArray[Any], dict[str, Any
 
     Examples
     --------
-    >>> ramp = Image(name="a", values=np.array([[0.0, 1.0, 3.0]]), unit="mm", low=0.0, high=2.0)
-    >>> codes, told = coded(ramp)
+    >>> ramp = ExportImage(name="a", values=np.array([[0.0, 1.0, 3.0]]), unit="mm", low=0.0,
+    ...     high=2.0)
+    >>> codes, told = encode_png_codes(ramp)
     >>> codes.tolist(), told["clipped_share"] > 0.3
     ([[0, 32768, 65535]], True)
     """
@@ -210,7 +215,7 @@ def coded(image: Image, *, depth: int = 16) -> tuple[NDArray[Any], dict[str, Any
     top = 2**depth - 1
     values = np.nan_to_num(np.asarray(image.values, np.float64))
     shown = values if image.valid is None else values[image.valid]
-    low, high = coded_range(image)
+    low, high = png_code_range(image)
     if image.space == SRGB_SPACE:
         position = png.srgb_curve(np.clip(values, 0.0, 1.0))
         encoding = f"sRGB curve (IEC 61966-2-1): value = inverse curve of code / {top}"
@@ -229,12 +234,12 @@ def coded(image: Image, *, depth: int = 16) -> tuple[NDArray[Any], dict[str, Any
     return np.round(position * top).astype(dtype), told
 
 
-def coded_range(image: Image) -> tuple[float, float]:
-    """Return the values of an image's least and largest PNG code, see `coded`.
+def png_code_range(image: ExportImage) -> tuple[float, float]:
+    """Return the values of an image's least and largest PNG code, see `encode_png_codes`.
 
     Examples
     --------
-    >>> coded_range(Image(name="a", values=np.array([[1.0, 3.0]]), unit="mm", low=0.0))
+    >>> png_code_range(ExportImage(name="a", values=np.array([[1.0, 3.0]]), unit="mm", low=0.0))
     (0.0, 3.0)
     """
     if image.space == SRGB_SPACE:

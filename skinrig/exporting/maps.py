@@ -8,20 +8,20 @@ from typing import Final
 import numpy as np
 
 from model.skin import SkinAppearance, SkinMap
-from skinrig.appearances.contents import jointly_valid
+from skinrig.appearances.contents import intersect_valid
 from skinrig.exporting.images import (
     CAMERA_SPACE,
     DATA_SPACE,
     SRGB_SPACE,
-    Image,
+    ExportImage,
     ImageFolder,
     png_range,
 )
 from skinrig.exporting.materials import materialx, tangents
 from skinrig.exporting.materials.tangents import FramedMesh
-from skinrig.exporting.options import Delivery, ExportError
+from skinrig.exporting.options import ExportError, ExportSettings
 from skinrig.exporting.sealing import IMAGE_ORIENTATION
-from skinrig.rendering.geometry import MESH_FILES, GeometryError, own_mesh
+from skinrig.rendering.geometry import MESH_FILES, GeometryError, read_own_mesh
 
 DOCUMENT_FILE: Final = "maps.json"
 SCHEMA: Final = "skinrig.export.maps/1"
@@ -31,7 +31,9 @@ SRGB_MAPS: Final = ("picture", "specular_picture", "color")
 CAMERA_RGB_MAPS: Final = ("diffuse", "specular", "r_d", "reflectance", "albedo", "crossed")
 
 
-def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[tuple[str, str]]:
+def write(
+    appearance: SkinAppearance, folder: Path, delivery: ExportSettings
+) -> list[tuple[str, str]]:
     """Write the maps of an appearance.
 
     Parameters
@@ -65,26 +67,26 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     shown: dict[str, tuple[str, str]] = {}  # what a material file names: file and its type
     for name in names:
         image = _image(name, appearance.maps[name], delivery, on_mesh)
-        exr = out.exr(image)
-        out.png(image)
+        exr = out.write_exr(image)
+        out.write_png(image)
         colored = "color3" if image.space == SRGB_SPACE else "vector3"
         shown[name] = (exr, colored if image.values.ndim == 3 else "float")
         out.errors(_errors(name, appearance.maps[name]))
     if {"melanin", "hemoglobin"} <= set(names):
-        packed = _packed(appearance)
+        packed = _pack_chromophores(appearance)
         if packed is None:
-            out.leave_out(CHROMOPHORE_PACK, "melanin and hemoglobin are of different sizes")
+            out.record_omission(CHROMOPHORE_PACK, "melanin and hemoglobin are of different sizes")
         else:
-            out.exr(packed)
+            out.write_exr(packed)
             # with the ranges of its channels: values times 2 and 4, blue 0
             scaled = packed.values * np.array([2.0, 4.0, 1.0], np.float32)
             what = f"{packed.what}; R is 2 times melanin, G is 4 times hemoglobin"
-            out.png(replace(packed, values=scaled, what=what, low=0.0, high=1.0))
+            out.write_png(replace(packed, values=scaled, what=what, low=0.0, high=1.0))
     normal = None
     if on_mesh:
         normal, why = _tangent_normals(appearance, names, out)
         if why:
-            out.leave_out("normal", why)
+            out.record_omission("normal", why)
     text = materialx.images_document(shown, delivery, tangent_normal=normal)
     (folder / "maps.mtlx").write_text(text, encoding="utf-8")
     for name, data in sorted(appearance.files.items()):
@@ -96,7 +98,7 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         {
             "schema": SCHEMA,
             "orientation": IMAGE_ORIENTATION,
-            "normal_y": delivery.green,
+            "normal_y": delivery.green_direction,
             "udim": "none" if delivery.udim == "none" else "tile 1001",
             "rig_frame": "mm, +x right, +y up, +z towards the main camera",
             "left_out": [list(row) for row in out.left_out],
@@ -105,11 +107,11 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     return out.left_out
 
 
-def _image(name: str, one: SkinMap, delivery: Delivery, on_mesh: bool) -> Image:
+def _image(name: str, skin_map: SkinMap, delivery: ExportSettings, on_mesh: bool) -> ExportImage:
     """Return a map as an image: normals seen by a camera get the green that is asked for."""
-    values, what = one.values, one.description
+    values, what = skin_map.values, skin_map.description
     low, high = png_range(name)
-    if _is_normals(name, one):
+    if _is_normals(name, skin_map):
         low, high = -1.0, 1.0
         if not on_mesh:
             values = values * np.array([1.0, delivery.y, 1.0], np.float32)
@@ -122,30 +124,30 @@ def _image(name: str, one: SkinMap, delivery: Delivery, on_mesh: bool) -> Image:
     elif values.ndim == 3 and name.startswith(CAMERA_RGB_MAPS):
         space = CAMERA_SPACE
         low, high = (0.0, 1.0) if low is None else (low, high)
-    return Image(name, values, one.unit, space, what, low, high, one.valid)
+    return ExportImage(name, values, skin_map.unit, space, what, low, high, skin_map.valid)
 
 
-def _is_normals(name: str, one: SkinMap) -> bool:
-    return "normals" in name and one.values.ndim == 3
+def _is_normals(name: str, skin_map: SkinMap) -> bool:
+    return "normals" in name and skin_map.values.ndim == 3
 
 
-def _errors(name: str, one: SkinMap) -> Iterator[Image]:
-    if one.stderr is not None:
-        unit = "rad" if _is_normals(name, one) else one.unit
+def _errors(name: str, skin_map: SkinMap) -> Iterator[ExportImage]:
+    if skin_map.stderr is not None:
+        unit = "rad" if _is_normals(name, skin_map) else skin_map.unit
         what = f"standard error of {name}, 68 %"
-        yield Image(f"{name}.stderr", one.stderr, unit, what=what, valid=one.valid)
+        yield ExportImage(f"{name}.stderr", skin_map.stderr, unit, what=what, valid=skin_map.valid)
     what = f"1 where {name} means something, else 0"
-    yield Image(f"{name}.valid", jointly_valid(one).astype(np.float32), what=what)
+    yield ExportImage(f"{name}.valid", intersect_valid(skin_map).astype(np.float32), what=what)
 
 
-def _packed(appearance: SkinAppearance) -> Image | None:
+def _pack_chromophores(appearance: SkinAppearance) -> ExportImage | None:
     melanin, blood = appearance.maps["melanin"], appearance.maps["hemoglobin"]
     if melanin.values.shape != blood.values.shape:
         return None
-    valid = jointly_valid(melanin, blood)
+    valid = intersect_valid(melanin, blood)
     layers = [melanin.values, blood.values, np.zeros_like(blood.values)]
     what = "R melanin (epidermis), G hemoglobin (dermis), volume fractions; B is empty, 0"
-    return Image(CHROMOPHORE_PACK, np.stack(layers, axis=-1), what=what, valid=valid)
+    return ExportImage(CHROMOPHORE_PACK, np.stack(layers, axis=-1), what=what, valid=valid)
 
 
 def _tangent_normals(
@@ -160,13 +162,15 @@ def _tangent_normals(
     if height != width:
         return None, f"{found} is {height} x {width}, expected a square texture"
     try:
-        mesh = own_mesh(appearance)
+        mesh = read_own_mesh(appearance)
     except GeometryError as error:
         return None, str(error)
     axes, covered = FramedMesh.of(mesh).texel_frames(height)
     valid = covered & one.mask
-    turned = tangents.filled(tangents.to_tangent(one.values, axes, covered), valid)
+    turned = tangents.fill_tangent_normals(
+        tangents.rotate_to_tangent(one.values, axes, covered), valid
+    )
     what = f"{found} in the tangent frames of the mesh's vertices (MikkTSpace's rules)"
-    what = f"{what}, {out.delivery.green}"
-    image = Image.of_normals("normal_tangent", turned, out.delivery, what, valid=valid)
-    return out.both(image), ""
+    what = f"{what}, {out.delivery.green_direction}"
+    image = ExportImage.from_normals("normal_tangent", turned, out.delivery, what, valid=valid)
+    return out.write_exr_and_png(image), ""

@@ -29,7 +29,7 @@ class ExportError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class SkinPosition:
     """Where on the texture the skin is looked at.
 
     Attributes
@@ -56,7 +56,7 @@ class Place:
             )
 
     @staticmethod
-    def named(at: str, *, radius_mm: float, diffuse: bool) -> Place:
+    def parse(text: str, *, radius_mm: float, diffuse: bool) -> SkinPosition:
         """Return the place that a command line names as U,V.
 
         Raises
@@ -65,14 +65,14 @@ class Place:
             When it is not two numbers.
         """
         try:
-            u, v = (float(part) for part in at.split(","))
+            u, v = (float(part) for part in text.split(","))
         except ValueError as error:
-            raise UsageError(f"--at: got {at!r}, expected U,V such as 0.5,0.4") from error
-        return Place(u, v, radius_mm, diffuse)
+            raise UsageError(f"--at: got {text!r}, expected U,V such as 0.5,0.4") from error
+        return SkinPosition(u, v, radius_mm, diffuse)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Delivery:
+class ExportSettings:
     """How an appearance or a session is to be delivered.
 
     Attributes
@@ -111,7 +111,7 @@ class Delivery:
     mesh: Path | None = None
     onto: Path | None = None
     landmarks: tuple[Path, ...] = ()
-    place: Place | None = None
+    place: SkinPosition | None = None
     camera: str | None = None
     calibration: Path | None = None
 
@@ -134,7 +134,7 @@ class Delivery:
         return NORMAL_Y[self.normal_y]
 
     @property
-    def green(self) -> str:
+    def green_direction(self) -> str:
         """What growing green of a normal map means, for people."""
         return "+Y (OpenGL)" if self.y > 0 else "-Y (DirectX)"
 
@@ -144,21 +144,21 @@ class Delivery:
         return self.unit or "m"
 
     @property
-    def per_mm(self) -> float:
+    def units_per_mm(self) -> float:
         """Scene units in a millimeter."""
         return M_PER_MM / UNITS_M[self.scene_unit]
 
-    def tiled(self, name: str, suffix: str, tile: int | str = FIRST_TILE) -> str:
+    def format_tile_name(self, name: str, suffix: str, tile: int | str = FIRST_TILE) -> str:
         """Return the file name of a texture's tile.
 
         Examples
         --------
-        >>> Delivery(udim="underscore").tiled("normal", "png")
+        >>> ExportSettings(udim="underscore").format_tile_name("normal", "png")
         'normal_1001.png'
         """
         number = "" if self.udim == "none" else tile
         return f"{name}{TILE_SEPARATORS[self.udim]}{number}.{suffix}"
 
-    def referred(self, name: str, suffix: str) -> str:
+    def format_reference(self, name: str, suffix: str) -> str:
         """Return a texture's name as a material file refers to all its tiles."""
-        return self.tiled(name, suffix, "<UDIM>")
+        return self.format_tile_name(name, suffix, "<UDIM>")

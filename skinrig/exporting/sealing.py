@@ -12,11 +12,11 @@ from typing import Any, Final
 from capture.session.mhl import write_first_generation
 from model.skin import SkinAppearance
 from skinrig import consent
-from skinrig.whole_file import whole_folder
+from skinrig.atomic_file import replace_folder_atomically
 
 
 @dataclass(frozen=True, slots=True)
-class Exported:
+class ExportResult:
     """What an export made.
 
     Attributes
@@ -37,11 +37,11 @@ class Exported:
     left_out: tuple[tuple[str, str], ...] = ()
 
 
-def sealed(
+def export_sealed(
     target: Path,
     write: Callable[[Path], Sequence[tuple[str, str]] | None],
     now: datetime | None = None,
-) -> Exported:
+) -> ExportResult:
     """Let ``write`` fill a hidden folder, seal it, and rename it once it is complete.
 
     Parameters
@@ -59,13 +59,13 @@ def sealed(
         With what ``write`` returned as left out, where it returned anything.
     """
     moment = now or datetime.now(UTC)
-    with whole_folder(target) as part:  # of the final name, which the manifest bears
+    with replace_folder_atomically(target) as part:  # of the final name, which the manifest bears
         left_out = tuple(write(part) or ())
         written = [path for path in part.rglob("*") if path.is_file()]
         for path in written:  # the manifest bears dates: one moment, one manifest
             os.utime(path, (moment.timestamp(), moment.timestamp()))
         manifest = write_first_generation(part, now=moment, version=version("skinrig"))
-    return Exported(target, target / manifest.relative_to(part), len(written), left_out)
+    return ExportResult(target, target / manifest.relative_to(part), len(written), left_out)
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
@@ -79,7 +79,7 @@ IMAGE_ORIENTATION: Final = (
 )
 
 
-def provenance(appearance: SkinAppearance) -> dict[str, Any]:
+def describe_provenance(appearance: SkinAppearance) -> dict[str, Any]:
     """Return where an appearance is from, as JSON values.
 
     Parameters
@@ -89,7 +89,7 @@ def provenance(appearance: SkinAppearance) -> dict[str, Any]:
 
     Examples
     --------
-    >>> found = provenance(SkinAppearance({}, "simulated", {"assumed": ["a"]}, seed=7))
+    >>> found = describe_provenance(SkinAppearance({}, "simulated", {"assumed": ["a"]}, seed=7))
     >>> found["source"], found["seed"], found["assumed"], found["consent"]
     ('simulated', 7, ['a'], [])
     """
@@ -104,5 +104,5 @@ def provenance(appearance: SkinAppearance) -> dict[str, Any]:
         "versions": dict(appearance.versions),
         "seed": appearance.seed,
         "assumed": list(dict.fromkeys(assumed)),
-        "consent": consent.recorded(appearance),
+        "consent": consent.read_consent(appearance),
     }

@@ -13,13 +13,21 @@ from reconstruction import normal_integration, polarization
 from reconstruction import photometric_stereo as stereo
 from reconstruction.surface import texture_fill
 from rigsim import render
-from skinrig.extremes.expectations import Unexpected, clean, masked, near, refused, rising, within
-from skinrig.extremes.inputs import Real, ring
+from skinrig.extremes.expectations import (
+    ExpectationError,
+    expect_error,
+    expect_finite,
+    expect_near,
+    expect_rising,
+    expect_valid_fraction,
+    expect_within,
+)
+from skinrig.extremes.inputs import InputPrecision, ring
 
 NON_FINITE_VALUES = (np.nan, np.inf, -np.inf)
 
 
-def _no_numbers_in_light(real: Real) -> str:
+def _no_numbers_in_light(real: InputPrecision) -> str:
     lights = ring(8, 0.6)
     for bad in NON_FINITE_VALUES:
         seen = real(np.tile(lights[:, 2:, None], (1, 2, 2)))
@@ -27,13 +35,15 @@ def _no_numbers_in_light(real: Real) -> str:
         seen[:, 1, 0] = bad
         found = stereo.estimate_normals(seen, lights)
         if found.valid.tolist() != [[True, True], [False, True]]:
-            raise Unexpected(f"valid: got {found.valid.tolist()} with {bad} in one light, and all")
-        near(found.normals[found.valid], np.tile([0.0, 0.0, 1.0], (3, 1)), absolute=1e-5)
-        clean(found.normals, np.ones((2, 2), bool), what="normals")
+            raise ExpectationError(
+                f"valid: got {found.valid.tolist()} with {bad} in one light, and all"
+            )
+        expect_near(found.normals[found.valid], np.tile([0.0, 0.0, 1.0], (3, 1)), absolute=1e-5)
+        expect_finite(found.normals, np.ones((2, 2), bool), label="normals")
     return "one light left out, the pixel without any masked"
 
 
-def _no_numbers_in_normals(real: Real) -> str:
+def _no_numbers_in_normals(real: InputPrecision) -> str:
     y, x = np.mgrid[0:12, 0:12]
     normals = np.stack([-0.3 + 0.0 * x, 0.1 + 0.0 * y, np.ones((12, 12))], -1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
@@ -44,30 +54,30 @@ def _no_numbers_in_normals(real: Real) -> str:
     kept = np.ones((12, 12), bool)
     kept[5, 5] = kept[7, 2] = False
     off = (found - whole)[kept]
-    return "off by " + within(off - off.mean(), -0.02, 0.02, what="pixels")
+    return "off by " + expect_within(off - off.mean(), -0.02, 0.02, label="pixels")
 
 
-def _no_numbers_in_statistics(real: Real) -> str:
+def _no_numbers_in_statistics(real: InputPrecision) -> str:
     plain = real(0.1 + 0.01 * np.random.default_rng(0).random((12, 12)))
     told = []
     for bad in NON_FINITE_VALUES:
         broken = plain.copy()
         broken[6, 6] = bad
         mean, deviation = facial_color.local_statistics(broken, 3.0)
-        clean(mean, np.ones_like(mean, bool), what="mean")
-        clean(deviation, np.ones_like(mean, bool), what="deviation")
+        expect_finite(mean, np.ones_like(mean, bool), label="mean")
+        expect_finite(deviation, np.ones_like(mean, bool), label="deviation")
         told.append(np.max(np.abs(mean - facial_color.local_statistics(plain, 3.0)[0])))
-    return "means move by " + within(told, 0.0, 1e-3, what="at most")
+    return "means move by " + expect_within(told, 0.0, 1e-3, label="at most")
 
 
 def _each_refused(calls: list[tuple[str, Callable[[float], object]]]) -> str:
     for word, call in calls:
         for bad in NON_FINITE_VALUES:
-            refused(lambda call=call, bad=bad: call(bad), ValueError, word)  # type: ignore[misc]
+            expect_error(lambda call=call, bad=bad: call(bad), ValueError, word)  # type: ignore[misc]
     return f"ValueError naming it, for {len(calls)} inputs and 3 values each"
 
 
-def _no_numbers_in_media(real: Real) -> str:
+def _no_numbers_in_media(real: InputPrecision) -> str:
     def stack(value: float) -> object:
         return tissue_optics.layer_stack_reflectance(real([value]), real([1.0]), real([math.inf]))
 
@@ -83,18 +93,18 @@ def _no_numbers_in_media(real: Real) -> str:
     )
 
 
-def _single_pixels(real: Real) -> str:
-    near(normal_integration.integrate(real([[[0.0, 0.6, 0.8]]])), [[0.0]])
+def _single_pixels(real: InputPrecision) -> str:
+    expect_near(normal_integration.integrate(real([[[0.0, 0.6, 0.8]]])), [[0.0]])
     one = real(np.full((1, 1, 3), 0.5))
-    masked(polarization.separate(one, 0.4 * one).valid, share=(1.0, 1.0))
+    expect_valid_fraction(polarization.separate(one, 0.4 * one).valid, fraction_range=(1.0, 1.0))
     mean, deviation = facial_color.local_statistics(one[..., 0], 2.0)
-    near(mean, [[0.5]], relative=1e-6)
-    near(deviation, [[0.0]], absolute=1e-9)
-    near(texture_fill.push_pull(one, np.ones((1, 1))).values, one, relative=1e-6)
+    expect_near(mean, [[0.5]], relative=1e-6)
+    expect_near(deviation, [[0.0]], absolute=1e-9)
+    expect_near(texture_fill.push_pull(one, np.ones((1, 1))).values, one, relative=1e-6)
     return "heights, polarizations, statistics and textures of 1 x 1"
 
 
-def _eight_thousand(_: Real) -> str:
+def _eight_thousand(_: InputPrecision) -> str:
     shape = (4320, 7680)
     dn = np.empty((2, *shape), np.uint16)
     dn[0], dn[1] = 9000, 2634
@@ -104,15 +114,17 @@ def _eight_thousand(_: Real) -> str:
     radiance, variance, valid = hdr.merge(dn, (1.0, 0.25), **told)
     small = hdr.merge(dn[:, :2, :2], (1.0, 0.25), **told)
     for whole, part in zip((radiance, variance), small, strict=False):
-        near(whole[:2, :2], part, relative=1e-6)
+        expect_near(whole[:2, :2], part, relative=1e-6)
         inner = whole[1:-1]
-        near([inner.min(), inner.max()], [part[1, 0], part[1, 0]], relative=1e-6)
+        expect_near([inner.min(), inner.max()], [part[1, 0], part[1, 0]], relative=1e-6)
     if valid[-1, -1] or not valid[:-1].all():
-        raise Unexpected("valid: expected all but the last pixel, which every frame saturates")
+        raise ExpectationError(
+            "valid: expected all but the last pixel, which every frame saturates"
+        )
     return f"{radiance.size / 1e6:.3g} million pixels, as in a small picture"
 
 
-def _missed_range(_: Real) -> str:
+def _missed_range(_: InputPrecision) -> str:
     # rows: below the noise of all, saturated in all, in all but the shortest, in none
     dn = np.array(
         [[512, 16383, 16383, 9000], [512, 16383, 16383, 2634], [512, 16383, 3000, 1042]], np.uint16
@@ -121,14 +133,16 @@ def _missed_range(_: Real) -> str:
         dn, (1.0, 0.25, 0.0625), gain=0.5, read_noise=3.0, black=512.0, white=16383.0
     )
     if valid[:, 0].tolist() != [True, False, True, True]:
-        raise Unexpected(f"valid: got {valid[:, 0].tolist()}, expected all but the second")
-    clean(radiance, valid, what="radiance")
-    near(radiance[2, 0], (3000 - 512) / 0.0625, relative=1e-5)
-    within(radiance[0, 0] / np.sqrt(variance[0, 0]), -1.0, 1.0, what="darkness over its error")
-    return masked(valid, share=(0.75, 0.75))
+        raise ExpectationError(f"valid: got {valid[:, 0].tolist()}, expected all but the second")
+    expect_finite(radiance, valid, label="radiance")
+    expect_near(radiance[2, 0], (3000 - 512) / 0.0625, relative=1e-5)
+    expect_within(
+        radiance[0, 0] / np.sqrt(variance[0, 0]), -1.0, 1.0, label="darkness over its error"
+    )
+    return expect_valid_fraction(valid, fraction_range=(0.75, 0.75))
 
 
-def _mirror_and_chalk(real: Real) -> str:
+def _mirror_and_chalk(real: InputPrecision) -> str:
     lights = np.concatenate([ring(24, 0.6), ring(12, 0.3)])
     seen = np.zeros((36, 1, 3))
     seen[5, 0, 0] = 1.0  # a mirror: one light of all is seen in it
@@ -137,14 +151,14 @@ def _mirror_and_chalk(real: Real) -> str:
     seen[7, 0, 2] += 50.0  # chalk under varnish
     found = stereo.estimate_normals(real(seen), lights)
     if found.valid.tolist() != [[False, True, True]]:
-        raise Unexpected(f"valid: got {found.valid.tolist()}, expected all but the mirror")
+        raise ExpectationError(f"valid: got {found.valid.tolist()}, expected all but the mirror")
     off = np.arccos(np.clip(found.normals[0, 1:, 2], -1.0, 1.0))
-    return "mirror masked; chalk and varnish off by " + within(
-        np.degrees(off), 0.0, 0.1, what="degrees"
+    return "mirror masked; chalk and varnish off by " + expect_within(
+        np.degrees(off), 0.0, 0.1, label="degrees"
     )
 
 
-def _conditions(real: Real) -> str:
+def _conditions(real: InputPrecision) -> str:
     rng = np.random.default_rng(0)
     one = rng.random(20)
     told, worst = [], []
@@ -154,15 +168,15 @@ def _conditions(real: Real) -> str:
         told.append(float(np.linalg.cond(basis)))
         samples = rng.random((5, 6)) @ basis
         got = reduced_spaces.mixture_coordinates(samples, basis, None)
-        within(got, 0.0, 1e3, what="shares")
+        expect_within(got, 0.0, 1e3, label="shares")
         worst.append(np.max(np.abs(got @ basis - samples)) / samples.max())
-    rising(told[: 2 if real.single else 5], what="conditions")
-    return f"conditions {told[0]:.2g} to {max(told):.2g}: samples again within " + within(
-        worst, 0.0, 1e-6, what="share"
+    expect_rising(told[: 2 if real.single else 5], label="conditions")
+    return f"conditions {told[0]:.2g} to {max(told):.2g}: samples again within " + expect_within(
+        worst, 0.0, 1e-6, label="share"
     )
 
 
-def _light_in_renderer(_: Real) -> str:
+def _light_in_renderer(_: InputPrecision) -> str:
     def scene(emitter: dict[str, object]) -> dict[str, object]:
         film = {"type": "hdrfilm", "width": 4, "height": 4}
         return {
@@ -182,7 +196,7 @@ def _light_in_renderer(_: Real) -> str:
             {"type": "envmap", "bitmap": np.full((4, 8, 3), bad, np.float32)},
         ]
     for emitter in emitters:
-        refused(
+        expect_error(
             lambda emitter=emitter: render.radiance(scene(emitter), kind="rgb", samples=1),  # type: ignore[misc]
             render.RenderError,
             "light",

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from skinrig.extremes.expectations import Case, Unexpected
-from skinrig.extremes.inputs import Real
+from skinrig.extremes.expectations import Case, ExpectationError
+from skinrig.extremes.inputs import InputPrecision
 
 SCHEMA = "skinrig.extremes.cases/1"
 
@@ -24,12 +24,15 @@ CASES_TABLE = resources.files("skinrig").joinpath("data/extremes.csv")
 """Name, stage, extreme, danger and expectation of each case, with module and function of its trial;
 `one_precision` says why one run stands for both, where a trial has no precision to choose."""
 
-INPUT_PRECISIONS: Mapping[str, Real] = {"float32": Real(np.float32), "float64": Real(np.float64)}
+INPUT_PRECISIONS: Mapping[str, InputPrecision] = {
+    "float32": InputPrecision(np.float32),
+    "float64": InputPrecision(np.float64),
+}
 """What the inputs of each case are given in."""
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class CaseOutcome:
     """What one precision of one case did."""
 
     got: str
@@ -38,11 +41,11 @@ class Outcome:
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
+class CaseResult:
     """A case with its outcomes by precision."""
 
     case: Case
-    outcomes: Mapping[str, Outcome]
+    outcomes: Mapping[str, CaseOutcome]
 
     @property
     def passed(self) -> bool:
@@ -50,7 +53,7 @@ class Result:
         return all(outcome.passed for outcome in self.outcomes.values())
 
 
-def all_cases() -> tuple[Case, ...]:
+def read_cases() -> tuple[Case, ...]:
     """Return every case, in the order of the light: transport, images, surface, motion."""
     rows = csv.DictReader(CASES_TABLE.read_text(encoding="utf-8").splitlines())
     return tuple(_case(**row) for row in rows)
@@ -61,9 +64,9 @@ def _case(*, run: str, **words: str) -> Case:
     return Case(run=getattr(import_module(f"skinrig.extremes.{module}"), function), **words)
 
 
-def try_case(case: Case) -> Result:
+def try_case(case: Case) -> CaseResult:
     """Run a case in every precision; whatever it raises becomes its outcome."""
-    outcomes: dict[str, Outcome] = {}
+    outcomes: dict[str, CaseOutcome] = {}
     for name, real in INPUT_PRECISIONS.items():
         if case.one_precision and outcomes:
             outcomes[name] = next(iter(outcomes.values()))
@@ -72,17 +75,17 @@ def try_case(case: Case) -> Result:
         try:
             with np.errstate(all="ignore"):
                 got, passed = case.run(real), True
-        except Unexpected as error:
+        except ExpectationError as error:
             got, passed = str(error), False
         except Exception as error:  # any other error is what the table is to show
             got, passed = f"{type(error).__name__}: {error}", False
-        outcomes[name] = Outcome(got, passed, time.perf_counter() - start)
-    return Result(case, outcomes)
+        outcomes[name] = CaseOutcome(got, passed, time.perf_counter() - start)
+    return CaseResult(case, outcomes)
 
 
 def run_cases(
     stages: Sequence[str] = (), *, progress: Callable[[str], None] | None = None
-) -> list[Result]:
+) -> list[CaseResult]:
     """Run all cases, or those of some stages.
 
     Parameters
@@ -97,7 +100,7 @@ def run_cases(
     ValueError
         For a stage without cases.
     """
-    cases = all_cases()
+    cases = read_cases()
     known = sorted({case.stage for case in cases})
     for stage in stages:
         if stage not in known:
@@ -112,7 +115,7 @@ def run_cases(
     return found
 
 
-def to_document(results: Iterable[Result]) -> dict[str, Any]:
+def to_document(results: Iterable[CaseResult]) -> dict[str, Any]:
     """Return the machine-readable table of a run."""
     rows = [
         {

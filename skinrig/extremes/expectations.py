@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from skinrig.arrays import Float64Array
-from skinrig.extremes.inputs import Real
+from skinrig.extremes.inputs import InputPrecision
 
 
-class Unexpected(AssertionError):
+class ExpectationError(AssertionError):
     """A stage did something else than it should; the text says what."""
 
 
@@ -27,46 +27,46 @@ class Case:
     """Why that can break."""
     expected: str
     """The behavior that holds."""
-    run: Callable[[Real], str]
-    """Tries it with inputs of a precision; returns what happened, or raises `Unexpected`."""
+    run: Callable[[InputPrecision], str]
+    """Tries it with inputs of a precision; returns what happened, or raises `ExpectationError`."""
     one_precision: str = ""
     """Why its inputs have no precision to choose, so that one run stands for both; empty: they
     have."""
 
 
-def near(
+def expect_near(
     got: ArrayLike, expected: ArrayLike, *, relative: float = 0.0, absolute: float = 0.0
 ) -> str:
     """Return the value where it is as near as said, else raise."""
     value, target = np.asarray(got, np.float64), np.asarray(expected, np.float64)
     away = np.abs(value - target)
     if not np.all(away <= absolute + relative * np.abs(target)):
-        raise Unexpected(f"got {_short(value)}, expected {_short(target)}")
+        raise ExpectationError(f"got {_short(value)}, expected {_short(target)}")
     return _short(value)
 
 
-def within(got: ArrayLike, low: float, high: float, *, what: str = "values") -> str:
+def expect_within(got: ArrayLike, low: float, high: float, *, label: str = "values") -> str:
     """Return the range of the values where all are finite and within the bounds, else raise."""
     value = np.asarray(got, np.float64)
     if not np.all(np.isfinite(value)) or value.size == 0:
-        raise Unexpected(f"{what}: got {_short(value)}, expected finite values")
+        raise ExpectationError(f"{label}: got {_short(value)}, expected finite values")
     if np.min(value) < low or np.max(value) > high:
-        raise Unexpected(
-            f"{what}: got {np.min(value):.6g} to {np.max(value):.6g}, expected {low:g} to {high:g}"
+        raise ExpectationError(
+            f"{label}: got {np.min(value):.6g} to {np.max(value):.6g}, expected {low:g} to {high:g}"
         )
-    return f"{what} {np.min(value):.4g} to {np.max(value):.4g}"
+    return f"{label} {np.min(value):.4g} to {np.max(value):.4g}"
 
 
-def rising(got: ArrayLike, *, strictly: bool = True, what: str = "values") -> str:
+def expect_rising(got: ArrayLike, *, strictly: bool = True, label: str = "values") -> str:
     """Return the ends of the values where they are finite and rise, else raise."""
     value = np.asarray(got, np.float64)
     steps = np.diff(value)
     if not np.all(np.isfinite(value)) or np.any(steps < 0) or (strictly and np.any(steps == 0)):
-        raise Unexpected(f"{what}: got {_short(value)}, expected values that rise")
-    return f"{what} rise from {value[0]:.4g} to {value[-1]:.4g}"
+        raise ExpectationError(f"{label}: got {_short(value)}, expected values that rise")
+    return f"{label} rise from {value[0]:.4g} to {value[-1]:.4g}"
 
 
-def refused(call: Callable[[], object], error: type[BaseException], *words: str) -> str:
+def expect_error(call: Callable[[], object], error: type[BaseException], *words: str) -> str:
     """Return the message where the call raises this error and says these words, else raise."""
     try:
         got = call()
@@ -74,27 +74,34 @@ def refused(call: Callable[[], object], error: type[BaseException], *words: str)
         text = str(caught)
         for word in words:
             if word not in text:
-                raise Unexpected(f"the error does not say {word!r}: {text}") from caught
+                raise ExpectationError(f"the error does not say {word!r}: {text}") from caught
         return f"{type(caught).__name__}: {text}"
     except Exception as caught:
-        raise Unexpected(f"{type(caught).__name__} instead of {error.__name__}: {caught}") from None
-    raise Unexpected(f"got {type(got).__name__}, expected {error.__name__}")
+        raise ExpectationError(
+            f"{type(caught).__name__} instead of {error.__name__}: {caught}"
+        ) from None
+    raise ExpectationError(f"got {type(got).__name__}, expected {error.__name__}")
 
 
-def masked(valid: ArrayLike, *, share: tuple[float, float] = (0.0, 0.0)) -> str:
+def expect_valid_fraction(
+    valid: ArrayLike, *, fraction_range: tuple[float, float] = (0.0, 0.0)
+) -> str:
     """Return how much is valid where that share lies in the range, else raise."""
     kept = float(np.mean(np.asarray(valid, np.float64)))
-    if not share[0] <= kept <= share[1]:
-        raise Unexpected(f"valid: got a share of {kept:.3g}, expected {share[0]:g} to {share[1]:g}")
+    if not fraction_range[0] <= kept <= fraction_range[1]:
+        raise ExpectationError(
+            f"valid: got a share of {kept:.3g}, expected {fraction_range[0]:g} to"
+            f" {fraction_range[1]:g}"
+        )
     return f"{100 * kept:.3g} % valid"
 
 
-def clean(values: ArrayLike, valid: ArrayLike, *, what: str = "values") -> str:
+def expect_finite(values: ArrayLike, valid: ArrayLike, *, label: str = "values") -> str:
     """Return that every valid value is finite, else raise."""
     shown = np.asarray(values)[np.asarray(valid, np.bool_)]
     if not np.all(np.isfinite(shown)):
-        raise Unexpected(f"{what}: got NaN or infinity at a valid place")
-    return f"{what} finite where valid"
+        raise ExpectationError(f"{label}: got NaN or infinity at a valid place")
+    return f"{label} finite where valid"
 
 
 def _short(value: Float64Array) -> str:

@@ -10,7 +10,7 @@ from skinrig.arrays import Float64Array, Int64Array
 
 
 @dataclass(frozen=True, slots=True)
-class Real:
+class InputPrecision:
     """A precision of inputs; called, it returns values as numbers of it."""
 
     dtype: type[np.float32] | type[np.float64]

@@ -6,11 +6,18 @@ import numpy as np
 
 from model.dipole.gather import GatherError, exitance
 from model.dipole.maps import DipoleMaps
-from skinrig.extremes.expectations import Unexpected, masked, near, refused, rising, within
-from skinrig.extremes.inputs import Real
+from skinrig.extremes.expectations import (
+    ExpectationError,
+    expect_error,
+    expect_near,
+    expect_rising,
+    expect_valid_fraction,
+    expect_within,
+)
+from skinrig.extremes.inputs import InputPrecision
 
 
-def _patch(real: Real, *, step_mm: float = 0.5, count: int = 20):  # type: ignore[no-untyped-def]
+def _patch(real: InputPrecision, *, step_mm: float = 0.5, count: int = 20):  # type: ignore[no-untyped-def]
     """Return places and areas of a curved patch."""
     at = (np.arange(count) - 0.5 * (count - 1)) * step_mm
     x, y = np.meshgrid(at, at)
@@ -18,69 +25,76 @@ def _patch(real: Real, *, step_mm: float = 0.5, count: int = 20):  # type: ignor
     return real(place), real(np.full(count**2, step_mm**2))
 
 
-def _even(real: Real) -> str:
+def _even(real: InputPrecision) -> str:
     place, area = _patch(real)
     light = real(np.full((len(area), 3), 3.0))
     told = []
     ends = itertools.product((0.0, 1e-6, 0.5, 1.0 - 1e-9, 1.0), (0.01, 1.0, 100.0))
     for r_d, length in ends:
         got = exitance(place, area, light, place[::9], r_d, length)
-        near(got, np.full(got.shape, 3.0 * r_d), relative=1e-5)
+        expect_near(got, np.full(got.shape, 3.0 * r_d), relative=1e-5)
         told.append(r_d)
     return f"R_d times what entered, for {len(told)} pairs"
 
 
-def _coarse(real: Real) -> str:
+def _coarse(real: InputPrecision) -> str:
     place, area = _patch(real, step_mm=5.0)
     light = real(1.0 + np.sin(place.astype(np.float64)))
     got = exitance(place, area, light, place, 0.5, 0.01, entered_at=light)
-    return near(got.sum() / (0.5 * light.astype(np.float64).sum()), 1.0, relative=0.01)
+    return expect_near(got.sum() / (0.5 * light.astype(np.float64).sum()), 1.0, relative=0.01)
 
 
-def _above_one(real: Real) -> str:
+def _above_one(real: InputPrecision) -> str:
     found = DipoleMaps.of(real([[[1.2, 1.0, 0.5]]]), real(2.0), eta=1.4)
     if found.outlier.tolist() != [[[True, False, False]]]:
-        raise Unexpected(f"outlier: got {found.outlier.tolist()}, expected the first alone")
+        raise ExpectationError(f"outlier: got {found.outlier.tolist()}, expected the first alone")
     place, area = _patch(real)
     light = real(np.ones((len(area), 3)))
-    near(exitance(place, area, light, place[:5], 1.2, 1.0), np.full((5, 3), 1.2), relative=1e-5)
-    return masked(found.valid, share=(0.3, 0.4)) + ", a named outlier; 1.2 times what entered"
+    expect_near(
+        exitance(place, area, light, place[:5], 1.2, 1.0), np.full((5, 3), 1.2), relative=1e-5
+    )
+    return (
+        expect_valid_fraction(found.valid, fraction_range=(0.3, 0.4))
+        + ", a named outlier; 1.2 times what entered"
+    )
 
 
-def _inverse(real: Real) -> str:
+def _inverse(real: InputPrecision) -> str:
     lost = np.geomspace(1e-6 if real.single else 1e-9, 0.999999, 60)
     found = DipoleMaps.of((1.0 - real(lost))[:, None], [1.0], eta=1.4)
-    masked(found.valid, share=(1.0, 1.0))
-    return rising(found.deficit[:, 0], what="1 - alpha'")
+    expect_valid_fraction(found.valid, fraction_range=(1.0, 1.0))
+    return expect_rising(found.deficit[:, 0], label="1 - alpha'")
 
 
-def _single(real: Real) -> str:
+def _single(real: InputPrecision) -> str:
     one = real([[1.0, 2.0, 3.0]])
-    return near(exitance(one, real([0.1]), one, one, 0.5, 1.0), [[0.5, 1.0, 1.5]], relative=1e-6)
+    return expect_near(
+        exitance(one, real([0.1]), one, one, 0.5, 1.0), [[0.5, 1.0, 1.5]], relative=1e-6
+    )
 
 
-def _empty(real: Real) -> str:
+def _empty(real: InputPrecision) -> str:
     shape = (2, 2, 3)
     found = DipoleMaps.of(
         real(np.full(shape, 0.5)), real(np.ones(shape)), eta=1.4, valid=np.zeros((2, 2), bool)
     )
     none = real(np.zeros((0, 3)))
-    near(exitance(none, none[:, 0], none, real(np.zeros((2, 3))), 0.5, 1.0), 0.0)
-    return masked(found.valid) + ", nothing leaves"
+    expect_near(exitance(none, none[:, 0], none, real(np.zeros((2, 3))), 0.5, 1.0), 0.0)
+    return expect_valid_fraction(found.valid) + ", nothing leaves"
 
 
-def _folded(real: Real) -> str:
+def _folded(real: InputPrecision) -> str:
     place, area = _patch(real)
     both = np.concatenate([place, place + real([0.0, 0.0, 1e-3])])
     light = np.zeros((len(both), 3), real.dtype)
     light[: len(place)] = 1.0
     got = exitance(both, np.tile(area, 2), light, both, 1.0, (0.05, 1.0, 50.0))
-    return within(got, -1e-3, 1.0 + 1e-3, what="exitance over the brightest")
+    return expect_within(got, -1e-3, 1.0 + 1e-3, label="exitance over the brightest")
 
 
-def _opaque(real: Real) -> str:
+def _opaque(real: InputPrecision) -> str:
     place, area = _patch(real)
     light = real(np.ones((len(area), 3)))
-    return refused(
+    return expect_error(
         lambda: exitance(place, area, light, place, 0.5, 0.0), GatherError, "translucency_mm"
     )

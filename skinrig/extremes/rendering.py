@@ -14,10 +14,10 @@ from rigsim import render, sensor
 from rigsim.geometry.mesh import MeshError, build_mesh, vertex_normals
 from rigsim.light import surface_brdf
 from rigsim.render import Caster, visibility
-from rigsim.sensor import sensor_of
+from rigsim.sensor import make_sensor
 from skinrig.arrays import Float64Array, FloatArray
-from skinrig.extremes.expectations import Unexpected, near, refused, within
-from skinrig.extremes.inputs import Real, sheet_faces
+from skinrig.extremes.expectations import ExpectationError, expect_error, expect_near, expect_within
+from skinrig.extremes.inputs import InputPrecision, sheet_faces
 
 if TYPE_CHECKING:
     from rigsim.sensor import Sensor
@@ -39,7 +39,7 @@ def _seen(mesh, light_mm) -> FloatArray:  # type: ignore[no-untyped-def]
     )
 
 
-def _shadow_off_origin(_: Real) -> str:
+def _shadow_off_origin(_: InputPrecision) -> str:
     # a wall 4 mm high throws the same shadow wherever the face is
     def wall(x, y):  # type: ignore[no-untyped-def]
         return 4.0 * (np.abs(x) < 0.5)
@@ -50,11 +50,11 @@ def _shadow_off_origin(_: Real) -> str:
     there = _seen(_sheet(wall, away), light + away)
     share = float(np.mean(here != there))
     if float(np.mean(here == 0)) < 0.05:
-        raise Unexpected("no shadow at all")
-    return "places that differ: " + within(share, 0.0, 0.01, what="share")
+        raise ExpectationError("no shadow at all")
+    return "places that differ: " + expect_within(share, 0.0, 0.01, label="share")
 
 
-def _fine_shadow_off_origin(_: Real) -> str:
+def _fine_shadow_off_origin(_: InputPrecision) -> str:
     # furrows of 60 um under light at 80 degrees, where the renderer's own offsets are 90 um
     def furrows(x, y):  # type: ignore[no-untyped-def]
         return 0.03 * np.cos(2.0 * np.pi * x / 0.2)
@@ -65,54 +65,62 @@ def _fine_shadow_off_origin(_: Real) -> str:
     there = _seen(_sheet(furrows, away, side=101, pitch_mm=0.02), light + away)
     shadowed = float(np.mean(here == 0))
     if not 0.2 < shadowed < 0.9:
-        raise Unexpected(f"got {shadowed:.2g} in shadow, expected furrows that shade each other")
+        raise ExpectationError(
+            f"got {shadowed:.2g} in shadow, expected furrows that shade each other"
+        )
     share = float(np.mean(here != there))
-    return f"{shadowed:.2g} in shadow; places that differ: " + within(share, 0, 0.02, what="share")
+    return f"{shadowed:.2g} in shadow; places that differ: " + expect_within(
+        share, 0, 0.02, label="share"
+    )
 
 
-def _no_self_shadow(_: Real) -> str:
+def _no_self_shadow(_: InputPrecision) -> str:
     lit = _seen(_sheet(lambda x, y: 0.0 * x), (5700.0, 0.0, 10.0))  # 0.1 degrees over the sheet
-    return "lit " + within(lit, 1.0, 1.0, what="share")
+    return "lit " + expect_within(lit, 1.0, 1.0, label="share")
 
 
-def _light_on_skin(_: Real) -> str:
+def _light_on_skin(_: InputPrecision) -> str:
     lit = _seen(_sheet(lambda x, y: 0.0 * x), (0.3, 0.3, 1.0))
-    return within(lit, 1.0, 1.0, what="share lit by a light at 1 mm")
+    return expect_within(lit, 1.0, 1.0, label="share lit by a light at 1 mm")
 
 
-def _light_near_far_skin(_: Real) -> str:
+def _light_near_far_skin(_: InputPrecision) -> str:
     # where the renderer's own offsets, which grow with the distance, are as long as the ray
     lit = _seen(_sheet(lambda x, y: 0.0 * x, (0.0, 0.0, 1000.0)), (0.3, 0.3, 1000.1))
-    return within(lit, 1.0, 1.0, what="share lit by a light at 0.1 mm")
+    return expect_within(lit, 1.0, 1.0, label="share lit by a light at 0.1 mm")
 
 
-def _light_behind(_: Real) -> str:
-    return within(_seen(_sheet(lambda x, y: 0.0 * x), (0.0, 0.0, -300.0)), 0.0, 0.0, what="share")
+def _light_behind(_: InputPrecision) -> str:
+    return expect_within(
+        _seen(_sheet(lambda x, y: 0.0 * x), (0.0, 0.0, -300.0)), 0.0, 0.0, label="share"
+    )
 
 
-def _zero_triangles(real: Real) -> str:
+def _zero_triangles(real: InputPrecision) -> str:
     points = real(np.array([[0, 0, 0], [40, 0, 0], [0, 40, 0], [80, 0, 0], [40, 40, 9]]))
     faces = np.array([[0, 1, 2], [0, 1, 3], [1, 4, 2]])  # the second has no area
     normals = vertex_normals(points, faces)
-    near(np.linalg.norm(normals, axis=-1)[[0, 1, 2]], np.ones(3), absolute=1e-5)
+    expect_near(np.linalg.norm(normals, axis=-1)[[0, 1, 2]], np.ones(3), absolute=1e-5)
     lit = _seen(build_mesh(points, faces, points[:, :2] / 80.0), (0, 0, 300))
-    return "corners of those with area: lit " + within(lit[:3], 1.0, 1.0, what="share")
+    return "corners of those with area: lit " + expect_within(lit[:3], 1.0, 1.0, label="share")
 
 
-def _wrong_unit(real: Real) -> str:
+def _wrong_unit(real: InputPrecision) -> str:
     points = real(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]))
-    return refused(
+    return expect_error(
         lambda: build_mesh(points, np.array([[0, 1, 2]]), np.zeros((3, 2))),
         MeshError,
         "millimetres",
     )
 
 
-def _surface(direction: Float64Array, roughness: float, real: Real) -> tuple[float, float]:
+def _surface(
+    direction: Float64Array, roughness: float, real: InputPrecision
+) -> tuple[float, float]:
 
     packed = real([0.5, 0.4, 0.3, roughness, 0.5, 0.0015, 1.0])
     up = np.array([0.0, 0.0, 1.0])
-    total, specular = surface_brdf.evaluate(packed, up, direction, direction * [-1, -1, 1])
+    total, specular = surface_brdf.evaluate_brdf(packed, up, direction, direction * [-1, -1, 1])
     return float(total[0].max()), float(specular[0])
 
 
@@ -121,37 +129,37 @@ def _tilted(degrees: float) -> Float64Array:
     return np.array([math.sin(angle), 0.0, math.cos(angle)])
 
 
-def _grazing(real: Real) -> str:
+def _grazing(real: InputPrecision) -> str:
     values = [_surface(_tilted(d), 0.3, real)[0] for d in (0.0, 60.0, 89.0, 89.9)]
     cosine = math.cos(math.radians(89.9))
-    within(values[-1] * cosine, 0.0, 1e3, what="radiance")
+    expect_within(values[-1] * cosine, 0.0, 1e3, label="radiance")
     up, low = real(1.0), real(cosine)
     half = real(math.cos(math.radians(89.9 / 2)))
     there, back = (
         microfacet.brdf(a, b, half, half, roughness=0.3, eta=1.4, kind="ggx")
         for a, b in ((up, low), (low, up))
     )
-    near(there, back, relative=1e-6)
+    expect_near(there, back, relative=1e-6)
     # a mirror's whole light: the lobe's share of it rises to all at grazing
     flat = microfacet.brdf(low, low, up, low, roughness=0.3, eta=1.4, kind="ggx")
     lobe = float(flat) * cosine * 4 * math.pi * 0.3**2 * cosine
-    within(lobe, 0.0, 1.0, what="share of a mirror's light")
-    return within(values, 0.0, 1e6, what="f_r")
+    expect_within(lobe, 0.0, 1.0, label="share of a mirror's light")
+    return expect_within(values, 0.0, 1e6, label="f_r")
 
 
-def _roughness_ends(real: Real) -> str:
+def _roughness_ends(real: InputPrecision) -> str:
     along = [real(1.0)] * 4
     sharp = microfacet.brdf(*along, roughness=0.01, eta=1.4, kind="ggx")
     # at the peak D = 1 / (pi a^2), G = 1: F0 / (4 pi a^2)
-    near(sharp, (0.4 / 2.4) ** 2 / (4 * math.pi * 0.01**2), relative=1e-3)
+    expect_near(sharp, (0.4 / 2.4) ** 2 / (4 * math.pi * 0.01**2), relative=1e-3)
     flat = microfacet.brdf(*along, roughness=1.0, eta=1.4, kind="ggx")
     # D = 1 / pi everywhere
-    return f"peak {float(sharp):.4g}; at 1 " + near(
+    return f"peak {float(sharp):.4g}; at 1 " + expect_near(
         flat, (0.4 / 2.4) ** 2 / (4 * math.pi), relative=1e-4
     )
 
 
-def _furnace(real: Real) -> str:
+def _furnace(real: InputPrecision) -> str:
     rng = np.random.default_rng(7)
     count = 200_000
     u, v = rng.random(count), rng.random(count)
@@ -161,39 +169,41 @@ def _furnace(real: Real) -> str:
     packed = real([1.0, 1.0, 1.0, 0.35, 0.6, 0.0015, 1.0])
     back = []
     for degrees in (0.0, 45.0, 80.0):
-        total, _ = surface_brdf.evaluate(packed, [0.0, 0.0, 1.0], light, _tilted(degrees))
+        total, _ = surface_brdf.evaluate_brdf(packed, [0.0, 0.0, 1.0], light, _tilted(degrees))
         back.append(float(np.pi * np.mean(np.asarray(total, np.float64)[:, 0])))
-    return within(back, 0.7, 1.01, what="share reflected")
+    return expect_within(back, 0.7, 1.01, label="share reflected")
 
 
 def _chip() -> Sensor:
 
-    return sensor_of(load_rig("flash").views[0])
+    return make_sensor(load_rig("flash").views[0])
 
 
-def _bad_light(real: Real) -> str:
+def _bad_light(real: InputPrecision) -> str:
     def exposed(value: float) -> object:
         light = real(np.full((2, 2, 3), value))
-        return sensor.expose(light, sensor=_chip(), rng=np.random.default_rng(0))
+        return sensor.expose_sensor(light, sensor=_chip(), rng=np.random.default_rng(0))
 
     for value in (np.nan, np.inf):
-        refused(partial(exposed, value), sensor.SensorError)
-    return refused(partial(exposed, -1.0), sensor.SensorError)
+        expect_error(partial(exposed, value), sensor.SensorError)
+    return expect_error(partial(exposed, -1.0), sensor.SensorError)
 
 
-def _very_bright(real: Real) -> str:
+def _very_bright(real: InputPrecision) -> str:
     chip = _chip()
-    dn = sensor.expose(real(np.full((4, 4, 3), 1e9)), sensor=chip, rng=np.random.default_rng(0))
-    return near(dn, np.full((4, 4), chip.white), absolute=0.0)
+    dn = sensor.expose_sensor(
+        real(np.full((4, 4, 3), 1e9)), sensor=chip, rng=np.random.default_rng(0)
+    )
+    return expect_near(dn, np.full((4, 4), chip.white), absolute=0.0)
 
 
-def _negative_environment(_: Real) -> str:
+def _negative_environment(_: InputPrecision) -> str:
     scene = {
         "type": "scene",
         "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}},
         "light": {"type": "constant", "radiance": {"type": "rgb", "value": [-1.0, -1.0, -1.0]}},
         "integrator": {"type": "path"},
     }
-    return refused(
+    return expect_error(
         lambda: render.radiance(scene, kind="rgb", samples=1), render.RenderError, "light.radiance"
     )

@@ -11,8 +11,15 @@ from reconstruction import diffuse_albedo, kernel_fit, normal_histogram, normal_
 from reconstruction import photometric_stereo as stereo
 from reconstruction.surface import texture_fill
 from skinrig.arrays import Float64Array, FloatArray
-from skinrig.extremes.expectations import Unexpected, clean, masked, near, refused, within
-from skinrig.extremes.inputs import Real, ring
+from skinrig.extremes.expectations import (
+    ExpectationError,
+    expect_error,
+    expect_finite,
+    expect_near,
+    expect_valid_fraction,
+    expect_within,
+)
+from skinrig.extremes.inputs import InputPrecision, ring
 
 UP_NORMAL = np.array([0.0, 0.0, 1.0])
 
@@ -26,41 +33,41 @@ def _degrees_off(normals: FloatArray, truth: FloatArray) -> float:
     return float(np.degrees(np.max(angular_error_rad(normals, truth))))
 
 
-def _lit(lights: Float64Array, normal: Float64Array, real: Real) -> NDArray[Any]:
+def _lit(lights: Float64Array, normal: Float64Array, real: InputPrecision) -> NDArray[Any]:
     return real(np.clip(lights @ normal, 0.0, None)[:, None, None])
 
 
-def _refused_under(lights: Float64Array, real: Real, *words: str) -> str:
+def _refused_under(lights: Float64Array, real: InputPrecision, *words: str) -> str:
     estimate = partial(stereo.estimate_normals, _lit(lights, UP_NORMAL, real), lights)
-    return refused(estimate, stereo.PhotometricStereoError, *words)
+    return expect_error(estimate, stereo.PhotometricStereoError, *words)
 
 
-def _coplanar(real: Real) -> str:
+def _coplanar(real: InputPrecision) -> str:
     lights = np.array([[np.sin(t), 0.0, np.cos(t)] for t in np.linspace(-0.6, 0.6, 9)])
     return _refused_under(lights, real, "plane", "along (0.0, -1.0, 0.0);")
 
 
-def _collinear(real: Real) -> str:
+def _collinear(real: InputPrecision) -> str:
     lights = np.repeat(UP_NORMAL[None], 5, axis=0)
     return _refused_under(lights, real, "line", "(0.0, -1.0, 0.0) and (-1.0, 0.0, 0.0)")
 
 
-def _all_shadowed(real: Real) -> str:
+def _all_shadowed(real: InputPrecision) -> str:
     lights = ring(8, 0.6)
     found = stereo.estimate_normals(real(np.zeros((8, 3, 3))), lights)
-    clean(found.normals, found.valid, what="normals")
-    return masked(found.valid)
+    expect_finite(found.normals, found.valid, label="normals")
+    return expect_valid_fraction(found.valid)
 
 
-def _two_lights_left(real: Real) -> str:
+def _two_lights_left(real: InputPrecision) -> str:
     lights = ring(8, 0.6)
     seen = np.zeros((8, 1, 1), bool)
     seen[:2] = True
     found = stereo.estimate_normals(_lit(lights, UP_NORMAL, real), lights, valid=seen)
-    return masked(found.valid)
+    return expect_valid_fraction(found.valid)
 
 
-def _nearly_coplanar(real: Real) -> str:
+def _nearly_coplanar(real: InputPrecision) -> str:
     t, k = np.linspace(-0.6, 0.6, 9), np.arange(9)
     lights = np.stack([np.sin(t), 1e-3 * (-1.0) ** k, np.cos(t)], axis=-1)
     lights /= np.linalg.norm(lights, axis=-1, keepdims=True)
@@ -70,28 +77,28 @@ def _nearly_coplanar(real: Real) -> str:
         found = stereo.estimate_normals(noisy, lights, variance=real(np.full((9, 1, 1), 1e-6)))
     except stereo.PhotometricStereoError as error:
         return f"refused: {error}"
-    clean(found.normals, found.valid, what="normals")
+    expect_finite(found.normals, found.valid, label="normals")
     if np.any(found.valid):
         off = _degrees_off(found.normals[found.valid], np.broadcast_to(UP_NORMAL, (1, 3)))
         said = float(np.degrees(found.stderr_rad[found.valid].max()))
         if off > 4 * said:
-            raise Unexpected(f"{off:.2g} degrees off, but says {said:.2g}")
+            raise ExpectationError(f"{off:.2g} degrees off, but says {said:.2g}")
         return f"{off:.2g} degrees off, says {said:.2g}"
-    return masked(found.valid)
+    return expect_valid_fraction(found.valid)
 
 
-def _grazing(real: Real) -> str:
+def _grazing(real: InputPrecision) -> str:
     lights = ring(12, np.radians(89.9))
     every = np.vstack([lights, UP_NORMAL])
     found = stereo.estimate_normals(_lit(every, UP_NORMAL, real), every)
-    clean(found.normals, found.valid, what="normals")
+    expect_finite(found.normals, found.valid, label="normals")
     if not np.all(found.valid):
-        return masked(found.valid)
+        return expect_valid_fraction(found.valid)
     off = _degrees_off(found.normals[0], np.broadcast_to(UP_NORMAL, (1, 3)))
-    return within(off, 0.0, 0.1, what="degrees")
+    return expect_within(off, 0.0, 0.1, label="degrees")
 
 
-def _near_light(real: Real) -> str:
+def _near_light(real: InputPrecision) -> str:
     places = 1.0 * ring(8, 0.6)  # a millimetre from the skin
     away = np.linalg.norm(places, axis=-1)
     lit = np.clip(places @ UP_NORMAL / away, 0, None) / away**2
@@ -101,11 +108,13 @@ def _near_light(real: Real) -> str:
         light_positions_mm=places,
         points_mm=np.zeros((1, 1, 3)),
     )
-    masked(found.valid, share=(1.0, 1.0))
-    return within(_degrees_off(found.normals[0], UP_NORMAL[None]), 0.0, 0.05, what="degrees")
+    expect_valid_fraction(found.valid, fraction_range=(1.0, 1.0))
+    return expect_within(
+        _degrees_off(found.normals[0], UP_NORMAL[None]), 0.0, 0.05, label="degrees"
+    )
 
 
-def _far_light(real: Real) -> str:
+def _far_light(real: InputPrecision) -> str:
     places = 1e7 * ring(8, 0.6)
     lit = np.clip(ring(8, 0.6) @ UP_NORMAL, 0, None) / 1e14
     found = stereo.estimate_normals(
@@ -115,102 +124,104 @@ def _far_light(real: Real) -> str:
         points_mm=np.zeros((1, 1, 3)),
         light_intensity=np.full(8, 1e14),
     )
-    masked(found.valid, share=(1.0, 1.0))
-    return within(_degrees_off(found.normals[0], UP_NORMAL[None]), 0.0, 0.05, what="degrees")
+    expect_valid_fraction(found.valid, fraction_range=(1.0, 1.0))
+    return expect_within(
+        _degrees_off(found.normals[0], UP_NORMAL[None]), 0.0, 0.05, label="degrees"
+    )
 
 
-def _scales(real: Real) -> str:
+def _scales(real: InputPrecision) -> str:
     lights = ring(8, 0.6)
     tilted = np.array([0.3, -0.2, np.sqrt(1 - 0.13)])
     off = []
     for scale in (1e-12, 1e12):
         found = stereo.estimate_normals(real(scale) * _lit(lights, tilted, real), lights)
-        masked(found.valid, share=(1.0, 1.0))
+        expect_valid_fraction(found.valid, fraction_range=(1.0, 1.0))
         off.append(_degrees_off(found.normals[0], tilted[None]))
-    return within(off, 0.0, 0.05, what="degrees")
+    return expect_within(off, 0.0, 0.05, label="degrees")
 
 
-def _cliff(real: Real) -> str:
+def _cliff(real: InputPrecision) -> str:
     slope = np.zeros((24, 24))
     slope[:, 12] = 20.0  # a wall of 87 degrees
     normals = np.stack([-slope, np.zeros_like(slope), np.ones_like(slope)], -1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     height = normal_integration.integrate(real(normals))
     step = float(height[:, 14:].mean() - height[:, :11].mean())
-    within(height, -40.0, 40.0, what="height")
-    return "step of " + within(abs(step), 10.0, 21.0, what="pixels")
+    expect_within(height, -40.0, 40.0, label="height")
+    return "step of " + expect_within(abs(step), 10.0, 21.0, label="pixels")
 
 
-def _horizontal_normals(real: Real) -> str:
+def _horizontal_normals(real: InputPrecision) -> str:
     normals = _upward(8)
     normals[4, 4] = (1.0, 0.0, 0.0)
     try:
         height = normal_integration.integrate(real(normals))
     except normal_integration.IntegrationError as error:
         return f"refused: {error}"
-    return within(height[np.isfinite(height)], -1e4, 1e4, what="height")
+    return expect_within(height[np.isfinite(height)], -1e4, 1e4, label="height")
 
 
-def _islands(real: Real) -> str:
+def _islands(real: InputPrecision) -> str:
     valid = np.zeros((16, 16), bool)
     valid[2:5, 2:5] = valid[10:14, 9:15] = valid[0, 15] = True
     height = normal_integration.integrate(real(_upward(16)), valid=valid)
-    return near(height[valid], np.zeros(int(valid.sum())), absolute=1e-4)
+    return expect_near(height[valid], np.zeros(int(valid.sum())), absolute=1e-4)
 
 
-def _empty_mask(real: Real) -> str:
+def _empty_mask(real: InputPrecision) -> str:
     normals, nowhere = real(_upward(4)), np.zeros((4, 4), bool)
     integrate = partial(normal_integration.integrate, normals, valid=nowhere)
-    return refused(integrate, normal_integration.IntegrationError, "valid")
+    return expect_error(integrate, normal_integration.IntegrationError, "valid")
 
 
-def _flat_height(real: Real) -> str:
+def _flat_height(real: InputPrecision) -> str:
     shares = normal_histogram.histogram(real(np.zeros((64, 64))), pixel=10.0)
-    near(shares.sum(), 1.0, absolute=1e-9)
-    return near(np.max(shares[31:33, 31:33]), np.max(shares), absolute=0.0)
+    expect_near(shares.sum(), 1.0, absolute=1e-9)
+    return expect_near(np.max(shares[31:33, 31:33]), np.max(shares), absolute=0.0)
 
 
-def _steep_height(real: Real) -> str:
+def _steep_height(real: InputPrecision) -> str:
     rows = np.arange(64.0)[:, None] * np.ones((1, 64))
     shares = normal_histogram.histogram(real(1e6 * rows), pixel=1.0)
-    near(shares.sum(), 1.0, absolute=1e-9)
+    expect_near(shares.sum(), 1.0, absolute=1e-9)
     edge = shares[0].sum() + shares[-1].sum()
-    return near(edge, 1.0, absolute=1e-6)
+    return expect_near(edge, 1.0, absolute=1e-6)
 
 
-def _one_point(real: Real) -> str:
-    return refused(
+def _one_point(real: InputPrecision) -> str:
+    return expect_error(
         lambda: normal_histogram.histogram(real(np.zeros((1, 1))), pixel=1.0), ValueError
     )
 
 
-def _relief_without_relief(real: Real) -> str:
+def _relief_without_relief(real: InputPrecision) -> str:
     flat = real(np.zeros((64, 64)))
     target = normal_histogram.histogram(flat, pixel=10.0)
     try:
         found = kernel_fit.fit_kernel(flat, target, stretch=1.1, axis="x", pixel_um=10.0)
     except ValueError as error:
         return f"refused: {error}"
-    return masked(found.valid)
+    return expect_valid_fraction(found.valid)
 
 
-def _no_diffuse(real: Real) -> str:
+def _no_diffuse(real: InputPrecision) -> str:
     lights = np.vstack([ring(20, 0.5), ring(20, 0.9)])
     views = np.broadcast_to(UP_NORMAL, lights.shape)
     samples = np.zeros((1, 40, 3))
     found = diffuse_albedo.estimate(
         real(samples), lights[None], views[None], UP_NORMAL[None], eta=1.4
     )
-    clean(found.r_d, found.valid, what="R_d")
+    expect_finite(found.r_d, found.valid, label="R_d")
     if not np.any(found.valid):
-        return masked(found.valid)
-    return within(found.r_d[found.valid], -1e-6, 1e-6, what="R_d")
+        return expect_valid_fraction(found.valid)
+    return expect_within(found.r_d[found.valid], -1e-6, 1e-6, label="R_d")
 
 
-def _nothing_to_fill(real: Real) -> str:
+def _nothing_to_fill(real: InputPrecision) -> str:
     empty = texture_fill.push_pull(real(np.zeros((9, 7, 3))), np.zeros((9, 7)))
     one = np.zeros((9, 7))
     one[4, 3] = 1.0
     filled = texture_fill.push_pull(real(np.full((9, 7, 3), 0.4)), one)
-    clean(empty.values, np.ones((9, 7), bool), what="empty texture")
-    return near(filled.values, np.full((9, 7, 3), 0.4), relative=1e-5)
+    expect_finite(empty.values, np.ones((9, 7), bool), label="empty texture")
+    return expect_near(filled.values, np.full((9, 7, 3), 0.4), relative=1e-5)

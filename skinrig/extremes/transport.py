@@ -7,14 +7,25 @@ import numpy as np
 from model import dipole, photon_table, tissue_optics
 from model.dipole import kienle_patterson as diffusion
 from reconstruction import subsurface
-from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
+from rigsim.tissue.tissue_mc import Layer, LayerStack, trace_photons
 from skinrig.arrays import Float64Array
-from skinrig.extremes.expectations import Unexpected, clean, masked, near, refused, rising, within
-from skinrig.extremes.inputs import Real
+from skinrig.extremes.expectations import (
+    ExpectationError,
+    expect_error,
+    expect_finite,
+    expect_near,
+    expect_rising,
+    expect_valid_fraction,
+    expect_within,
+)
+from skinrig.extremes.inputs import InputPrecision
 
 
 def _layers(
-    real: Real, *layers: tuple[float, float, float], eta: float = 1.4, directions: int | None = None
+    real: InputPrecision,
+    *layers: tuple[float, float, float],
+    eta: float = 1.4,
+    directions: int | None = None,
 ) -> Float64Array:
     """Return the reflectance of layers by sigma_a and sigma_s', 1/mm, and thickness, mm."""
     return tissue_optics.layer_stack_reflectance(
@@ -22,173 +33,173 @@ def _layers(
     )
 
 
-def _albedo_near_one(real: Real) -> str:
+def _albedo_near_one(real: InputPrecision) -> str:
     deficit = np.logspace(-15, -1, 57)
     lost = dipole.absorbed_fraction(real(deficit), 1.4)
-    said = rising(lost, what="1 - R_d")
+    said = expect_rising(lost, label="1 - R_d")
     back = dipole.invert_to_deficit(1.0 - np.asarray(lost[deficit > 1e-12]), 1.4)
     # 1 - R_d carries the rounding of R_d itself, eps; the deficit goes with its square
     rounding = np.finfo(np.float64).eps / np.asarray(lost[deficit > 1e-12])
     single = float(np.finfo(real.dtype).eps) * 4
     away = np.abs(back / np.asarray(real(deficit), np.float64)[deficit > 1e-12] - 1)
     if np.any(away > single + 8 * rounding):
-        raise Unexpected(f"the inverse is off by {float(np.max(away)):.2g}")
+        raise ExpectationError(f"the inverse is off by {float(np.max(away)):.2g}")
     return f"{said}; inverse within {float(np.max(away)):.1g}"
 
 
-def _least_step(real: Real) -> float:
+def _least_step(real: InputPrecision) -> float:
     """Return the exponent of the smallest 1 - R_d that a precision tells from the next."""
     return -6.5 if real.single else -9.0
 
 
-def _reflectance_ends(real: Real) -> str:
+def _reflectance_ends(real: InputPrecision) -> str:
     r_d = np.concatenate([np.logspace(-6, -1, 21), 1.0 - np.logspace(-1.2, _least_step(real), 21)])
-    return rising(-dipole.invert_to_deficit(real(r_d), 1.4), what="alpha' - 1")
+    return expect_rising(-dipole.invert_to_deficit(real(r_d), 1.4), label="alpha' - 1")
 
 
-def _all_light_back(real: Real) -> str:
-    return near(
+def _all_light_back(real: InputPrecision) -> str:
+    return expect_near(
         [dipole.total_reflectance(real(1.0), eta) for eta in (1.0, 1.3, 1.4, 1.6)],
         [1.0] * 4,
         absolute=0.0,
     )
 
 
-def _more_than_all(real: Real) -> str:
-    return refused(
+def _more_than_all(real: InputPrecision) -> str:
+    return expect_error(
         lambda: dipole.invert_total_reflectance(real(1.02), 1.4),
         dipole.ReflectanceOutlierError,
         "1.02",
     )
 
 
-def _no_absorption(real: Real) -> str:
+def _no_absorption(real: InputPrecision) -> str:
     r = real([0.1, 1.0, 10.0])
     clear = dipole.reflectance(r, real(0.0), real(1.0), 1.4)
     faint = dipole.reflectance(r, real(1e-12), real(1.0), 1.4)
-    return near(faint, clear, relative=1e-4)
+    return expect_near(faint, clear, relative=1e-4)
 
 
-def _black_medium(real: Real) -> str:
+def _black_medium(real: InputPrecision) -> str:
     inside = _layers(real, (1e3, 1.0, math.inf))
-    said = within(inside, 0.0, 2e-3, what="R_d of layers")
+    said = expect_within(inside, 0.0, 2e-3, label="R_d of layers")
     value = dipole.reflectance(real([0.0, 0.01, 0.1, 1.0, 10.0]), real(1e3), real(1.0), 1.4)
-    rising(-np.asarray(value, np.float64), strictly=False, what="-R(r)")
+    expect_rising(-np.asarray(value, np.float64), strictly=False, label="-R(r)")
     # of 1000 / 1001 that is absorbed at each event hardly anything comes back
     total = dipole.total_reflectance(1.0 / 1001.0, 1.4)
-    within(total, 0.0, 2e-3, what="dipole's R_d")
-    return said + "; " + within(value, 0.0, 1e3, what="R(r)")
+    expect_within(total, 0.0, 2e-3, label="dipole's R_d")
+    return said + "; " + expect_within(value, 0.0, 1e3, label="R(r)")
 
 
-def _radius_ends(real: Real) -> str:
+def _radius_ends(real: InputPrecision) -> str:
     r = real([0.0, 1e-9, 1e-3, 1e2, 1e4])
     one = dipole.reflectance(r, real(0.02), real(1.0), 1.4)
     two = diffusion.reflectance(r, real(0.02), real(1.0), 1.4)
-    near(one[0], one[1], relative=1e-5)
+    expect_near(one[0], one[1], relative=1e-5)
     far = real([1e30])
-    within(dipole.reflectance(far, real(0.02), real(1.0), 1.4), 0.0, 0.0, what="at 1e30 mm")
-    refused(
+    expect_within(dipole.reflectance(far, real(0.02), real(1.0), 1.4), 0.0, 0.0, label="at 1e30 mm")
+    expect_error(
         lambda: dipole.reflectance(real(np.inf), real(0.02), real(1.0), 1.4),
         ValueError,
         "radius_mm",
     )
-    rising(-np.asarray(one, np.float64)[1:], strictly=False, what="-R(r)")
-    return f"dipole {within(one, 0.0, 10.0)}; diffusion {within(two, -1e-9, 10.0)}"
+    expect_rising(-np.asarray(one, np.float64)[1:], strictly=False, label="-R(r)")
+    return f"dipole {expect_within(one, 0.0, 10.0)}; diffusion {expect_within(two, -1e-9, 10.0)}"
 
 
-def _index_ends(real: Real) -> str:
+def _index_ends(real: InputPrecision) -> str:
     found = [float(_layers(real, (0.01, 1.0, math.inf), eta=eta)) for eta in (1.0, 1.6)]
     if not found[0] > found[1]:
-        raise Unexpected(f"got {found}, expected less light to leave a denser medium")
-    return within(found, 0.3, 0.9, what="R_d at eta 1 and 1.6")
+        raise ExpectationError(f"got {found}, expected less light to leave a denser medium")
+    return expect_within(found, 0.3, 0.9, label="R_d at eta 1 and 1.6")
 
 
-def _index_not_physical(real: Real) -> str:
+def _index_not_physical(real: InputPrecision) -> str:
     eta = float(real(0.9))
-    return refused(
+    return expect_error(
         lambda: tissue_optics.layer_stack_reflectance([0.01], [1.0], [math.inf], eta=eta),
         ValueError,
         "eta",
     )
 
 
-def _thin_layer(real: Real) -> str:
+def _thin_layer(real: InputPrecision) -> str:
     bare = _layers(real, (0.02, 1.5, math.inf))
     covered = _layers(real, (5.0, 1.5, 1e-9), (0.02, 1.5, math.inf))
-    return near(covered, bare, relative=1e-6)
+    return expect_near(covered, bare, relative=1e-6)
 
 
-def _no_layer_at_all(real: Real) -> str:
+def _no_layer_at_all(real: InputPrecision) -> str:
     clear = _layers(real, (0.0, 0.0, 1.0))
     surface = ((1.4 - 1.0) / (1.4 + 1.0)) ** 2
     # a pane of glass: what its back reflects, through its front, to and fro
-    return near(clear, surface * (1.0 - surface) ** 2 / (1.0 - surface**2), relative=1e-6)
+    return expect_near(clear, surface * (1.0 - surface) ** 2 / (1.0 - surface**2), relative=1e-6)
 
 
-def _stiff_layers(real: Real) -> str:
+def _stiff_layers(real: InputPrecision) -> str:
     fine, finer = (
         _layers(real, (60.0, 7.0, 0.25), (0.05, 3.5, math.inf), directions=n) for n in (16, 32)
     )
-    return near(fine, finer, relative=0.01)
+    return expect_near(fine, finer, relative=0.01)
 
 
-def _conserving_layers(real: Real) -> str:
+def _conserving_layers(real: InputPrecision) -> str:
     white = _layers(real, (0.0, 5.0, 0.25), (0.0, 1.0, math.inf))
     entered = 1.0 - ((1.4 - 1.0) / (1.4 + 1.0)) ** 2  # what the surface does not reflect at once
-    return near(white, entered, absolute=2e-3)
+    return expect_near(white, entered, absolute=2e-3)
 
 
-def _pigment_ends(real: Real) -> str:
+def _pigment_ends(real: InputPrecision) -> str:
     wavelength = real([400.0, 500.0, 600.0, 700.0])
     c_m, c_hd = real([0.0, 0.5])[:, None, None], real([0.0, 0.32])[:, None]
     value = tissue_optics.two_layer_reflectance(wavelength, c_m, c_hd)
     if not (np.all(value[0] > value[1]) and np.all(value[:, 0] >= value[:, 1])):
-        raise Unexpected("more pigment reflects more")
-    return within(value, 1e-5, 0.95, what="R")
+        raise ExpectationError("more pigment reflects more")
+    return expect_within(value, 1e-5, 0.95, label="R")
 
 
-def _pigment_beyond(real: Real) -> str:
-    return refused(
+def _pigment_beyond(real: InputPrecision) -> str:
+    return expect_error(
         lambda: tissue_optics.two_layer_reflectance(real(500.0), real(-0.01), real(0.05)),
         ValueError,
         "c_m",
     )
 
 
-def _table_far(real: Real) -> str:
-    refused(lambda: photon_table.reflectance(real(0.0), 0.05, 1.0), ValueError, "radius_mm")
+def _table_far(real: InputPrecision) -> str:
+    expect_error(lambda: photon_table.reflectance(real(0.0), 0.05, 1.0), ValueError, "radius_mm")
     r = real([1e-4, 0.5, 20.0, 1e3])
     value = photon_table.reflectance(r, real(0.05), real(1.0))
-    rising(-value[:-1], what="-R(r)")
-    return "r = 0 refused; " + within(value, 0.0, 1e6, what="R(r)")
+    expect_rising(-value[:-1], label="-R(r)")
+    return "r = 0 refused; " + expect_within(value, 0.0, 1e6, label="R(r)")
 
 
-def _profile_flat(real: Real) -> str:
+def _profile_flat(real: InputPrecision) -> str:
     r = np.linspace(1.0, 15.0, 28)
     fit = subsurface.invert(r, real(np.full((1, 28), 1e-3)))
-    clean(fit.sigma_tr_per_mm, fit.valid, what="sigma_tr")
-    return masked(fit.valid)
+    expect_finite(fit.sigma_tr_per_mm, fit.valid, label="sigma_tr")
+    return expect_valid_fraction(fit.valid)
 
 
-def _profile_dark(real: Real) -> str:
+def _profile_dark(real: InputPrecision) -> str:
     r = np.linspace(1.0, 15.0, 28)
     fit = subsurface.invert(r, real(np.zeros((1, 28))), variance=real(np.full((1, 28), 1e-12)))
-    clean(fit.sigma_tr_per_mm, fit.valid, what="sigma_tr")
-    return masked(fit.valid)
+    expect_finite(fit.sigma_tr_per_mm, fit.valid, label="sigma_tr")
+    return expect_valid_fraction(fit.valid)
 
 
-def _profile_broken(real: Real) -> str:
+def _profile_broken(real: InputPrecision) -> str:
     r = np.linspace(1.0, 15.0, 28)
     truth = photon_table.reflectance(r, 0.08, 1.2)
     profile = real(np.stack([truth, truth]))
     profile[1, 5] = np.nan
     fit = subsurface.invert(r, profile, valid=np.isfinite(profile))
     both = np.asarray(fit.sigma_tr_per_mm)
-    masked(fit.valid, share=(1.0, 1.0))
-    return near(both[1], both[0], relative=5e-3)
+    expect_valid_fraction(fit.valid, fraction_range=(1.0, 1.0))
+    return expect_near(both[1], both[0], relative=5e-3)
 
 
-def _one_photon(real: Real) -> str:
+def _one_photon(real: InputPrecision) -> str:
     stack = LayerStack((Layer(math.inf, 0.1, 10.0, 0.9, float(real(1.4))),))
-    found = transport(stack, photons=1, rng=np.random.default_rng(0))
-    return within(found.reflectance, 0.0, 1.0, what="share reflected")
+    found = trace_photons(stack, photons=1, rng=np.random.default_rng(0))
+    return expect_within(found.reflectance, 0.0, 1.0, label="share reflected")

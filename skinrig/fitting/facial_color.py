@@ -16,12 +16,12 @@ from reconstruction.correspondence import landmark_table
 from reconstruction.pipeline.flash import facial_color as facial_color_fit
 from reconstruction.pipeline.flash import state_images
 from reconstruction.pipeline.flash.facial_color import FacialColorFit, UnknownBloodError
-from reconstruction.pipeline.flash.state_images import Landmarks, Subject
+from reconstruction.pipeline.flash.state_images import Landmarks, SubjectImages
 from skinrig.appearances import dynamic as dynamic_appearance
-from skinrig.appearances.contents import jointly_valid
+from skinrig.appearances.contents import intersect_valid
 from skinrig.appearances.dynamic import FACIAL_COLOR
-from skinrig.appearances.state_truth import truth_of_state
-from skinrig.console import picked
+from skinrig.appearances.state_truth import find_state_truth
+from skinrig.console import select_attributes
 
 
 class FacialColorInputError(ValueError):
@@ -68,11 +68,13 @@ def fit_facial_color(
     if stored_size is not None and stored_size < 1:
         raise FacialColorInputError(f"stored size: got {stored_size} cells, expected 1 or more")
     dynamic_appearance.check_target(out)
-    subject = state_images.read(sessions, calibration=calibration, progress=progress)
+    subject = state_images.reconstruct_states(sessions, calibration=calibration, progress=progress)
     marks, marked_by, unmarked = _landmarks(subject, sessions, landmarks)
     try:
         how: dict[str, Any] = {"radius_px": radius_px, "stored_size": stored_size}
-        found = facial_color_fit.fit(subject, landmarks=marks, progress=progress, **how)
+        found = facial_color_fit.fit_facial_color(
+            subject, landmarks=marks, progress=progress, **how
+        )
     except (FacialColorError, UnknownBloodError) as error:
         if subject.has_white:
             raise
@@ -100,25 +102,25 @@ def fit_facial_color(
                 "alignment": facial_color_fit.alignment_document(found),
                 "repeatability": facial_color_fit.repeats_document(found),
                 "storage_error": {n: list(e) for n, e in found.rig.storage_error().items()},
-                **picked(subject, "camera", "illuminant"),
+                **select_attributes(subject, "camera", "illuminant"),
                 "assumed": list(subject.assumed),
                 "consent": [dict(one) for one in subject.consent],
                 "truth": truths,
             },
-            left_out=(*found.left_out, *unmarked),
-            **picked(subject, "inputs", "source", "seed"),
+            left_out=(*found.omitted, *unmarked),
+            **select_attributes(subject, "inputs", "source", "seed"),
         ),
     )
     return found
 
 
-def summary(found: FacialColorFit) -> list[tuple[str, str, str, str, str]]:
+def summarize_states(found: FacialColorFit) -> list[tuple[str, str, str, str, str]]:
     """Return state, mean change in percent, its share of the neutral's, scale, and alignment."""
     rows = []
     neutral = found.hemoglobin["neutral"]
     errors = {one.image.state: one.alignment for one in found.aligned if one.alignment is not None}
     for state, change in found.changes.items():
-        both = jointly_valid(change, neutral)
+        both = intersect_valid(change, neutral)
         level = float(neutral.values[both].mean()) if both.any() else float("nan")
         mean = float(change.values[both].mean()) if both.any() else float("nan")
         scale = found.rig.states[state]
@@ -130,7 +132,7 @@ def summary(found: FacialColorFit) -> list[tuple[str, str, str, str, str]]:
 
 
 def _landmarks(
-    subject: Subject, sessions: Sequence[Path], folder: Path | None
+    subject: SubjectImages, sessions: Sequence[Path], folder: Path | None
 ) -> tuple[Mapping[str, Landmarks] | None, str, list[tuple[str, str]]]:
     """Return the landmarks of each state, where they come from, and which states have none."""
     found: dict[str, Landmarks] = {}
@@ -140,7 +142,7 @@ def _landmarks(
                 f"landmarks: {folder} is no folder; expected one with STATE.csv for each state"
             )
         found = {
-            state: landmark_table.read(folder / f"{state}.csv")
+            state: landmark_table.read_landmark_table(folder / f"{state}.csv")
             for state in subject.states
             if (folder / f"{state}.csv").is_file()
         }
@@ -159,19 +161,19 @@ def _landmarks(
     return found, words, [(state, "landmarks: none, features were matched") for state in missing]
 
 
-def _truths(subject: Subject, sessions: Sequence[Path]) -> dict[str, Path | None]:
+def _truths(subject: SubjectImages, sessions: Sequence[Path]) -> dict[str, Path | None]:
     """Return the folder with each state's truth, beside the session that shows it first."""
     return {
-        state: truth_of_state(sessions[subject.of(state)[0].session], state)
+        state: find_state_truth(sessions[subject.images_of_state(state)[0].session], state)
         for state in subject.states
     }
 
 
-def _point(place: Path, name: str, value: Any) -> tuple[float, float]:
+def _point(table: Path, name: str, value: Any) -> tuple[float, float]:
     try:
         x, y = value
         return float(x), float(y)
     except (TypeError, ValueError) as error:
         raise FacialColorInputError(
-            f"{place}: landmark {name!r} is {json.dumps(value)}, expected two numbers"
+            f"{table}: landmark {name!r} is {json.dumps(value)}, expected two numbers"
         ) from error

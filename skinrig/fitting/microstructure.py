@@ -15,7 +15,7 @@ from model.skin import SkinAppearance, SkinMap
 from reconstruction.kernel_fit.table import KernelTableFitError, fit_table
 from reconstruction.pipeline.gradient.stages import KERNEL_FILE
 from skinrig.appearances import dynamic as dynamic_appearance
-from skinrig.appearances.contents import document_digest, made_of
+from skinrig.appearances.contents import derive_appearance, document_digest
 from skinrig.appearances.dynamic import MICROSTRUCTURE
 
 SITE_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,31}")
@@ -94,11 +94,11 @@ def fit_microstructure(
         raise MicrostructureFitError("appearances: got none, expected folders of caliper sessions")
     by_site: dict[str, list[tuple[Path, SkinAppearance]]] = {}
     for given in appearances:
-        site, path = _site_of(given)
+        site, path = _parse_site(given)
         by_site.setdefault(site, []).append((path, store.read(path)))
     fits = {site: _fit_site(site, group, paper_table) for site, group in by_site.items()}
     why = "its table of kernels is the paper's forehead: too few kernels were fitted"
-    part = made_of(
+    part = derive_appearance(
         *(one for group in by_site.values() for _, one in group),
         maps={f"microrelief_{site}": fit.height for site, fit in fits.items()},
         files={f"kernel_table_{site}.json": f.table.to_json().encode() for site, f in fits.items()},
@@ -114,17 +114,17 @@ def fit_microstructure(
     return fits
 
 
-def _site_of(given: Path) -> tuple[str, Path]:
-    site, equals, path = str(given).partition("=")
+def _parse_site(appearance: Path) -> tuple[str, Path]:
+    site, equals, path = str(appearance).partition("=")
     if equals and SITE_PATTERN.fullmatch(site):
         folder = Path(path)
     else:
-        folder = given
-        site = re.sub(r"^appearance-?(gradient-?)?", "", given.name) or "skin"
+        folder = appearance
+        site = re.sub(r"^appearance-?(gradient-?)?", "", appearance.name) or "skin"
     site = site.replace("-", "_").lower()
     if not SITE_PATTERN.fullmatch(site):
         raise MicrostructureFitError(
-            f"{given}: got site {site!r}, expected a-z, 0-9 and _; name it as SITE={folder}"
+            f"{appearance}: got site {site!r}, expected a-z, 0-9 and _; name it as SITE={folder}"
         )
     return site, folder
 

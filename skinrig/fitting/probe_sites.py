@@ -15,10 +15,10 @@ from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline.probe.stages import CHANNEL_NAMES, SUBSURFACE_FILE
 from reconstruction.subsurface import probe_sites, translucency
 from reconstruction.subsurface.translucency import TranslucencyMap
-from skinrig.appearances.contents import jointly_valid
+from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import Float32Array, Float64Array
 
-FROM_NOSE_MM: Final[Mapping[str, tuple[float, float]]] = {
+SITE_OFFSETS_FROM_NOSE_MM: Final[Mapping[str, tuple[float, float]]] = {
     "forehead": (0.0, 76.0),
     "cheek": (-48.0, 0.0),
     "cheek left": (-48.0, 0.0),
@@ -40,7 +40,7 @@ class ProbeSiteError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Site:
+class ProbeSite:
     """One place of the probe.
 
     Attributes
@@ -82,14 +82,14 @@ class PlacedTranslucency:
     """
 
     map: SkinMap
-    sites: tuple[Site, ...]
+    sites: tuple[ProbeSite, ...]
     left_out: tuple[tuple[str, str], ...]
     conflicts: tuple[tuple[str, str], ...]
     assumed: tuple[str, ...]
     p_value: tuple[float, ...]
 
 
-def place(
+def map_translucency(
     probe: SkinAppearance, position: SkinMap, *, landmarks: Path | None = None
 ) -> PlacedTranslucency:
     """Interpolate a probe's measurements over the texture of a face.
@@ -116,22 +116,22 @@ def place(
     """
     measured = _measured(probe)
     height, width = position.values.shape[:2]
-    known = jointly_valid(position)
+    known = intersect_valid(position)
     if not known.any():
         raise ProbeSiteError("position: got no valid texel, expected those of a face")
     given: dict[str, tuple[float, float]] = {}
     if landmarks is not None:
         given = probe_sites.read_landmarks(landmarks, texture_px=(height, width))
     at_mm = position.values.astype(np.float64)
-    sites: list[Site] = []
+    sites: list[ProbeSite] = []
     left_out: list[tuple[str, str]] = []
     guessed: list[str] = []
     for name, (sigma_tr, stderr) in measured.items():
         if name in given:
             column, row = given[name][0] * width, (1.0 - given[name][1]) * height
             wanted = at_mm[min(int(row), height - 1), min(int(column), width - 1)]
-        elif name in FROM_NOSE_MM:
-            wanted, off_mm = _mean_place(name, at_mm[known])
+        elif name in SITE_OFFSETS_FROM_NOSE_MM:
+            wanted, off_mm = _mean_site_position(name, at_mm[known])
             if off_mm > MAX_SITE_DISTANCE_MM:
                 left_out.append((name, f"the scan ends {off_mm:.0f} mm before it"))
                 continue
@@ -146,7 +146,7 @@ def place(
             continue
         found = at_mm[texel]
         sites.append(
-            Site(name, sigma_tr, stderr, (int(texel[0]), int(texel[1])), tuple(found.tolist()))
+            ProbeSite(name, sigma_tr, stderr, (int(texel[0]), int(texel[1])), tuple(found.tolist()))
         )
     if not sites:
         why = "; ".join(f"{name}: {reason}" for name, reason in left_out)
@@ -155,7 +155,7 @@ def place(
     assumed = (f"{', '.join(guessed)} {how}",) if guessed else ()
     chart = _Chart.of(at_mm[known], sites)
     found_map = _interpolated(chart, sites)
-    spread = chart.lay(found_map, at_mm)
+    spread = chart.interpolate(found_map, at_mm)
     valid = known & found_map.valid.all(axis=(0, 1)).all()
     return PlacedTranslucency(
         map=SkinMap(
@@ -166,7 +166,7 @@ def place(
             "1/sigma_tr of red, green and blue light, between measured sites by kriging",
         ),
         sites=tuple(sites),
-        left_out=(*left_out, *found_map.left_out),
+        left_out=(*left_out, *found_map.omitted),
         conflicts=found_map.conflicts,
         assumed=assumed,
         p_value=tuple(float(p) for p in found_map.p_value),
@@ -202,13 +202,13 @@ def _measured(probe: SkinAppearance) -> dict[str, tuple[tuple[float, ...], tuple
     }
 
 
-def _mean_place(name: str, points_mm: Float64Array) -> tuple[Float64Array, float]:
+def _mean_site_position(name: str, points_mm: Float64Array) -> tuple[Float64Array, float]:
     """Return the point at a mean face's distance from the foremost one, the nose, and how far off.
 
     Distances are as seen from the front; of what lies behind each other the foremost counts.
     """
     nose = points_mm[np.argmax(points_mm[:, 2])]
-    across, up = FROM_NOSE_MM[name]
+    across, up = SITE_OFFSETS_FROM_NOSE_MM[name]
     away = np.hypot(points_mm[:, 0] - nose[0] - across, points_mm[:, 1] - nose[1] - up)
     near = away < away.min() + 1.0
     return np.asarray(points_mm[near][np.argmax(points_mm[near, 2])]), float(away.min())
@@ -225,7 +225,7 @@ class _Chart:
     size_mm: Float64Array
 
     @staticmethod
-    def of(points_mm: Float64Array, sites: Sequence[Site]) -> _Chart:
+    def of(points_mm: Float64Array, sites: Sequence[ProbeSite]) -> _Chart:
         """Find the axis of a face: the centre of the circle nearest to its girth."""
         middle = np.median([site.position_mm[1] for site in sites])
         girth = points_mm[np.abs(points_mm[:, 1] - middle) < 60.0]
@@ -252,7 +252,7 @@ class _Chart:
             along = self.radius_mm * np.arctan2(points_mm[..., 0] - a, points_mm[..., 2] - b)
         return np.asarray(np.stack([along, points_mm[..., 1]], axis=-1) - self.corner_mm)
 
-    def lay(self, found: TranslucencyMap, points_mm: Float64Array) -> Float32Array:
+    def interpolate(self, found: TranslucencyMap, points_mm: Float64Array) -> Float32Array:
         """Return values and standard errors, (H, W, 6), at the places of texels, linear."""
         both = np.concatenate([found.values, found.stderr], axis=-1)
         share = self.coordinates(points_mm) / self.size_mm
@@ -265,7 +265,7 @@ class _Chart:
         return np.asarray(upper * (1.0 - p) + lower * p, np.float32)
 
 
-def _interpolated(chart: _Chart, sites: Sequence[Site]) -> TranslucencyMap:
+def _interpolated(chart: _Chart, sites: Sequence[ProbeSite]) -> TranslucencyMap:
     at = chart.coordinates(np.array([site.position_mm for site in sites])) / chart.size_mm
     sigma_tr = np.array([site.sigma_tr_per_mm for site in sites])
     good = np.isfinite(sigma_tr)

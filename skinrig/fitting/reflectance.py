@@ -10,7 +10,12 @@ from model.skin import SkinAppearance, SkinMap
 from model.skin_reflectance import TRANSLUCENCY_MAP, SkinReflectance
 from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
 from reconstruction.subsurface.translucency import population_prior
-from skinrig.appearances.contents import assumed_by, digest, document_digest, made_of
+from skinrig.appearances.contents import (
+    derive_appearance,
+    digest,
+    document_digest,
+    list_assumptions,
+)
 from skinrig.errors import UsageError
 from skinrig.fitting import probe_sites
 from skinrig.fitting.probe_sites import PlacedTranslucency
@@ -73,7 +78,7 @@ def fit_reflectance(
     surface = store.read(dome)
     inputs = {"dome": document_digest(dome)}
     placed = None
-    assumed = assumed_by(surface)
+    assumed = list_assumptions(surface)
     left_out = list(surface.left_out)
     files = dict(surface.files)
     sources = [surface]
@@ -82,17 +87,17 @@ def fit_reflectance(
         inputs["probe"] = document_digest(probe)
         sources.append(measured)
         try:
-            placed = probe_sites.place(measured, _position(surface), landmarks=landmarks)
+            placed = probe_sites.map_translucency(measured, _position(surface), landmarks=landmarks)
         except ValueError as error:
             raise ReflectanceInputError(f"{probe}: {error}") from error
         depth = placed.map
         if landmarks is not None:
             inputs["landmarks"] = digest(landmarks)
-        assumed += [f"probe: {text}" for text in assumed_by(measured)] + list(placed.assumed)
+        assumed += [f"probe: {text}" for text in list_assumptions(measured)] + list(placed.assumed)
         left_out += [(f"translucency of {what}", why) for what, why in placed.left_out]
         files[SUBSURFACE_FILE] = measured.files[SUBSURFACE_FILE]
     else:
-        depth, what = _of_people(_position(surface))
+        depth, what = _population_translucency(_position(surface))
         assumed.append(what)
     model = skin_reflectance.assemble(surface, translucency=depth)
     own: dict[str, object] = {
@@ -100,7 +105,7 @@ def fit_reflectance(
         "appearances": [path.name for path in (dome, probe) if path is not None],
         REFLECTANCE_KEY: _record(placed),
     }
-    appearance = made_of(
+    appearance = derive_appearance(
         *sources,
         maps={**surface.maps, TRANSLUCENCY_MAP: depth},
         parameters={**surface.parameters, **own},
@@ -112,7 +117,7 @@ def fit_reflectance(
     return FittedReflectance(model, placed, tuple(assumed), tuple(left_out))
 
 
-def summary(found: FittedReflectance) -> list[tuple[str, float, float, float]]:
+def summarize_medians(found: FittedReflectance) -> list[tuple[str, float, float, float]]:
     """Return rows for people: what, and its median in red, green and blue over valid texels."""
     model, coefficients = found.model, found.model.dipole()
 
@@ -130,17 +135,17 @@ def summary(found: FittedReflectance) -> list[tuple[str, float, float, float]]:
         ("1 - alpha'", *medians(coefficients.deficit)),
         ("sigma_a, 1/mm", *medians(coefficients.sigma_a_per_mm)),
         ("sigma_s', 1/mm", *medians(coefficients.sigma_s_prime_per_mm)),
-        ("share with R_d above 1 or below 0", *_share(model, coefficients.outlier)),
+        ("share with R_d above 1 or below 0", *_valid_fraction(model, coefficients.outlier)),
     ]
 
 
-def _share(model: SkinReflectance, where: np.ndarray) -> tuple[float, float, float]:
+def _valid_fraction(model: SkinReflectance, mask: np.ndarray) -> tuple[float, float, float]:
     count = max(int(np.count_nonzero(model.valid)), 1)
-    red, green, blue = (float(np.count_nonzero(where[..., c])) / count for c in range(3))
+    red, green, blue = (float(np.count_nonzero(mask[..., c])) / count for c in range(3))
     return red, green, blue
 
 
-def _of_people(position: SkinMap) -> tuple[SkinMap, str]:
+def _population_translucency(position: SkinMap) -> tuple[SkinMap, str]:
     """Return the mean translucency of people as a map, their spread as its standard error."""
     mean_mm, what = skin_reflectance.population_mean_mm()
     prior = population_prior()

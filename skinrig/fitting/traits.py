@@ -18,14 +18,14 @@ from skinrig import consent
 from skinrig.appearances import face_textures
 from skinrig.appearances.contents import digest, document_digest
 from skinrig.appearances.face_textures import Face
+from skinrig.atomic_file import write_atomically
 from skinrig.editing import surface_mixtures
 from skinrig.editing.surface_mixtures import SurfaceMixtureError
 from skinrig.errors import UsageError
 from skinrig.traits import albedo_vectors, regions
 from skinrig.traits import labels as trait_labels
 from skinrig.traits.albedo_vectors import AlbedoSample, VectorKind
-from skinrig.traits.labels import Labels
-from skinrig.whole_file import write_whole
+from skinrig.traits.labels import TraitLabels
 
 MAX_SURFACE_RANK: Final = 8
 """Lobes of a population's surface (Weyrich et al. 2005, figure 15)."""
@@ -116,7 +116,7 @@ def fit_traits(
         samples.append(albedo_sample(face, frame))
         tell(f"{face.name}: {100 * samples[-1].valid.mean():.0f} % of the common map")
     left_out: list[tuple[str, str]] = []
-    spaces = albedo_spaces(
+    spaces = fit_albedo_spaces(
         samples, table, frame, vectors, contrast=contrast, seed=seed, left_out=left_out
     )
     texture = spaces.pop("texture")
@@ -144,8 +144,8 @@ def fit_traits(
     )
     if out.is_dir():
         raise TraitFitError(f"{out}: is a folder, expected the name of a file such as traits.npz")
-    write_whole(out, library.to_bytes())
-    rows, warnings = summary(library)
+    write_atomically(out, library.to_bytes())
+    rows, warnings = summarize_traits(library)
     return TraitFit(
         library, tuple(f.name for f in faces), table.ignored, rows, warnings, tuple(left_out)
     )
@@ -154,13 +154,13 @@ def fit_traits(
 def albedo_sample(face: Face, frame: CommonFrame) -> AlbedoSample:
     """Return a face's albedo in the common map."""
     r_d = face.r_d
-    image, valid = face.chart(frame).gather(r_d.values, face_textures.valid_of(r_d))
+    image, valid = face.chart(frame).gather(r_d.values, face_textures.valid_texels(r_d))
     return AlbedoSample(image, valid)
 
 
-def albedo_spaces(
+def fit_albedo_spaces(
     samples: Sequence[AlbedoSample],
-    labels: Labels,
+    labels: TraitLabels,
     frame: CommonFrame,
     vectors: VectorKind,
     *,
@@ -175,11 +175,11 @@ def albedo_spaces(
     dict
         Name of each space to a `TraitSpace`, and "texture" to the `TextureSpace` common to all.
     """
-    encoded = [albedo_vectors.encoded(one.r_d, vectors) for one in samples]
+    encoded = [albedo_vectors.encode_albedo(one.r_d, vectors) for one in samples]
     texture = TextureSpace.fit(encoded, valid=[one.valid for one in samples])
     found: dict[str, Any] = {"texture": texture}
     for region in ("face", "beard", "no-beard"):
-        inside = common_regions.region(region, frame)
+        inside = common_regions.region_mask(region, frame)
         fewest = min(int((inside & one.valid).sum()) for one in samples)
         if fewest < MIN_REGION_PIXELS:
             left_out.append((f"albedo of {region}", f"a face shows {fewest} pixels of it"))
@@ -190,7 +190,7 @@ def albedo_spaces(
             )
             for one in samples
         ]
-        found[regions.space_name(region)] = albedo_vectors.fit(
+        found[regions.space_name(region)] = albedo_vectors.fit_albedo_traits(
             rows, labels.binary, labels.continuous, texture, vectors, contrast=contrast, seed=seed
         ).traits
     if len(found) == 1:
@@ -198,7 +198,7 @@ def albedo_spaces(
     return found
 
 
-def summary(
+def summarize_traits(
     library: TraitLibrary,
 ) -> tuple[tuple[tuple[str, str, int, int, float, float], ...], tuple[str, ...]]:
     """Return a row for each trait and part, and all warnings, each once."""
@@ -260,7 +260,7 @@ def _require_landmarks(faces: Sequence[Face]) -> None:
 
 def _surface(
     faces: Sequence[Face],
-    labels: Labels,
+    labels: TraitLabels,
     folder: Path | None,
     contrast: Contrast,
     seed: int,
@@ -277,10 +277,10 @@ def _surface(
         if (one.materials, one.light_radius_rad) != (first.materials, first.light_radius_rad):
             left_out.append(("surface", f"{face.name}: its lobes are of other materials"))
             return None
-    tables = surface_mixtures.materials_of(first.materials, first.light_radius_rad, folder)
+    tables = surface_mixtures.load_materials(first.materials, first.light_radius_rad, folder)
     strength = tables.strength()
     means = np.array([one.mean(strength) for one in found])
-    products = tables.kinship() * np.outer(strength, strength)
+    products = tables.cosine_similarity() * np.outer(strength, strength)
     rank = min(MAX_SURFACE_RANK, len(means) - 1)
     # the paper's: traits in the space of few non-negative lobes of the population
     mix = brdf_basis.reduce(means, rank, basis=tables, seed=seed)[1]

@@ -14,13 +14,13 @@ from model.wrinkles.evaluation import WRINKLE_FILE as WRINKLE_FILE
 from reconstruction.normal_maps import NormalMaps
 from reconstruction.pipeline.dome.stages import MESH_FILE
 from reconstruction.surface.tangent_space import SMOOTHING_MM, tangent_normals
-from reconstruction.wrinkles.fit import WrinkleFit, fit
-from reconstruction.wrinkles.zones import ZoneFit, amplitudes, fit_zones
+from reconstruction.wrinkles.fit import WrinkleFit, fit_wrinkle_map
+from reconstruction.wrinkles.zones import ZoneFit, estimate_amplitudes, fit_zones
 from skinrig.appearances import dynamic as dynamic_appearance
-from skinrig.appearances.contents import document_digest, jointly_valid, made_of
+from skinrig.appearances.contents import derive_appearance, document_digest, intersect_valid
 from skinrig.appearances.dynamic import WRINKLES
 from skinrig.arrays import BoolArray, Float32Array
-from skinrig.console import picked
+from skinrig.console import select_attributes
 
 STATE_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,31}")
 NORMAL_MAPS = ("normals_refined", "normals")
@@ -76,7 +76,7 @@ def fit_wrinkles(
     dynamic_appearance.check_target(out)
     read: dict[str, tuple[Path, SkinAppearance]] = {}
     for given in appearances:
-        state, folder = _state_of(given)
+        state, folder = _parse_state(given)
         if state in read:
             raise WrinkleInputError(f"{folder}: {state!r} is there twice: {read[state][0]}")
         read[state] = (folder, store.read(folder))
@@ -96,24 +96,24 @@ def fit_wrinkles(
     stack: Any
     if masks is None:
         small = min(mask_size, side)
-        height = amplitudes(neutral, measured, size=(small, small))
+        height = estimate_amplitudes(neutral, measured, size=(small, small))
         zones = fit_zones(height, zones=N_ZONES, rng=np.random.default_rng(seed))
         stack = zones.masks
     else:
         stack = _read_masks(masks)
-    found = fit(neutral, measured, stack, size=(min(size, side), min(size, side)))
+    found = fit_wrinkle_map(neutral, measured, stack, size=(min(size, side), min(size, side)))
     maps, document = found.model().to_maps()
     why = "whether its texture is that of the others: no mesh lies beside its maps"
-    part = made_of(
+    part = derive_appearance(
         *(one for _, one in read.values()),
         maps=maps,
         files={WRINKLE_FILE: document},
         parameters={
             "expressions": list(measured),
             "appearances": [folder.name for folder, _ in read.values()],
-            **picked(found, "explained", "rounds"),
+            **select_attributes(found, "explained", "rounds"),
             "zones": "given" if zones is None else "found in the data",
-            "rank_one_share": None if zones is None else zones.rank_one_share,
+            "rank_one_share": None if zones is None else zones.rank_one_fraction,
             "distinct_zones": None if zones is None else zones.distinct,
             "smoothing_mm": SMOOTHING_MM,
             "truth": {state: one.parameters.get("truth", "") for state, (_, one) in read.items()},
@@ -126,14 +126,14 @@ def fit_wrinkles(
     return FittedWrinkles(found, zones)
 
 
-def _state_of(given: Path) -> tuple[str, Path]:
-    state, equals, path = str(given).partition("=")
+def _parse_state(appearance: Path) -> tuple[str, Path]:
+    state, equals, path = str(appearance).partition("=")
     if equals and STATE_PATTERN.fullmatch(state):
         return state, Path(path)
-    told = store.read_document(given).parameters.get("state")
+    told = store.read_document(appearance).parameters.get("state")
     if not isinstance(told, str) or not told:
-        raise WrinkleInputError(f"{given}: says no state; name it as STATE={given}")
-    return told, given
+        raise WrinkleInputError(f"{appearance}: says no state; name it as STATE={appearance}")
+    return told, appearance
 
 
 def _check_textures(appearances: Mapping[str, SkinAppearance]) -> list[str]:
@@ -176,7 +176,7 @@ def _normals(folder: Path, appearance: SkinAppearance) -> NormalMaps:
     maps = appearance.maps
     if "normals_tangent" in maps:
         tangent = maps["normals_tangent"]
-        return _as_maps(tangent.values, tangent.stderr, jointly_valid(tangent))
+        return _build_normal_maps(tangent.values, tangent.stderr, intersect_valid(tangent))
     name = next((name for name in NORMAL_MAPS if name in maps), None)
     if name is None or "position" not in maps:
         raise WrinkleInputError(
@@ -184,12 +184,14 @@ def _normals(folder: Path, appearance: SkinAppearance) -> NormalMaps:
             "with `skinrig reconstruct SESSION --want normals_refined`"
         )
     normals, position = maps[name], maps["position"]
-    valid = jointly_valid(normals, position)
+    valid = intersect_valid(normals, position)
     found = tangent_normals(normals.values, position.values, valid, stderr=normals.stderr)
-    return _as_maps(found.normals, found.stderr, found.valid)
+    return _build_normal_maps(found.normals, found.stderr, found.valid)
 
 
-def _as_maps(normals: Float32Array, stderr: Float32Array | None, valid: BoolArray) -> NormalMaps:
+def _build_normal_maps(
+    normals: Float32Array, stderr: Float32Array | None, valid: BoolArray
+) -> NormalMaps:
     """Return normals with the angle that their components' errors make."""
     shape = valid.shape
     error = np.zeros(shape) if stderr is None else np.sqrt((stderr.astype(float) ** 2).sum(axis=2))
@@ -223,7 +225,7 @@ def _read_masks(paths: Sequence[Path]) -> Float32Array:
     return np.stack(planes)
 
 
-def summary(found: FittedWrinkles) -> list[tuple[str, ...]]:
+def summarize_expressions(found: FittedWrinkles) -> list[tuple[str, ...]]:
     """Return expression and its zones' weights with standard errors, for people."""
     return [
         (

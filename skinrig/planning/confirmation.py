@@ -7,12 +7,12 @@ from typing import Any
 from model import store
 from reconstruction.pipeline import recipes as pipeline
 from skinrig.calibrating.calibrate import calibrate
-from skinrig.planning.plans import Choice, planner
+from skinrig.planning.plans import PlanChoice, load_planner
 from skinrig.simulating.simulation import simulate_session
 
 
-def confirmed(
-    choice: Choice, out: Path, *, subject: str, seed: int, progress: Callable[[str], None]
+def confirm_choice(
+    choice: PlanChoice, out: Path, *, subject: str, seed: int, progress: Callable[[str], None]
 ) -> list[dict[str, Any]]:
     """Simulate a choice, reconstruct it, and compare what came out with the forecast.
 
@@ -27,7 +27,7 @@ def confirmed(
     progress
         Is told each step.
     """
-    rig = planner(choice.rig.name)
+    rig = load_planner(choice.rig.name)
     steps = rig.rehearsal(choice)
     calibrate_simulated(
         choice.rig.name, out, steps.targets, steps.calibrations, seed=seed, progress=progress

@@ -11,31 +11,31 @@ from dataclasses import replace
 import numpy as np
 
 from capture.plan import Plan
-from capture.plan.dome import EXPOSURES_S, dome_plan
-from capture.plan.rows import lights_of
+from capture.plan.dome import DOME_EXPOSURES_S, dome_plan
+from capture.plan.rows import step_lights
 from capture.rig import Rig
 from model.skin import SkinAppearance
 from reconstruction.photometric_stereo import light_selection
-from reconstruction.photometric_stereo.light_selection import Prediction
+from reconstruction.photometric_stereo.light_selection import ErrorPrediction
 from reconstruction.surface import errors as surface_errors
 from reconstruction.surface import estimates as surface_estimates
 from skinrig.arrays import Float64Array
 from skinrig.evaluating import surface as surface_evaluation
 from skinrig.planning import plans
-from skinrig.planning.dome_observation import LIGHT_ERROR, Observation, simulate_observation
-from skinrig.planning.plans import Choice, PlanRequest
+from skinrig.planning.dome_observation import LIGHT_ERROR, DomeObservation, simulate_observation
+from skinrig.planning.plans import PlanChoice, PlanRequest
 
 FORECAST_RELATIVE_SD = {"normals": 0.2, "r_d": 0.2}
 """Relative deviation of measured from predicted medians, see docs/planning.md."""
 SHARED_R_D_ERROR = 0.0095
 """Relative error of R_d that a face's points share or that follows nothing known, whatever the
-lights. With `GLOSS_R_D_ERROR` set on faces of seeds 1 to 3, types V, I and IV."""
-GLOSS_R_D_ERROR = 0.0022
+lights. With `SPECULAR_R_D_ERROR` set on faces of seeds 1 to 3, types V, I and IV."""
+SPECULAR_R_D_ERROR = 0.0022
 """What gloss outside the part that is left out adds to R_d by one light: the same on all skin, so
 much on dark skin. Lights' errors of R_d by it are as far from each other as their `LIGHT_ERROR`."""
 
 
-def choose(rig: Rig, asked: PlanRequest) -> Choice:
+def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
     """Choose the fewest lights, then the fewest cameras, that reach what is wanted.
 
     Parameters
@@ -52,43 +52,47 @@ def choose(rig: Rig, asked: PlanRequest) -> Choice:
             f"rig: got {len(rig.lights)} lights and {len(rig.views)} cameras, expected at least "
             f"{least} and {surface_estimates.MIN_VIEWS}"
         )
-    observation = simulate_observation(rig, asked.subject, seed=asked.seed)
+    observation = simulate_observation(rig, request.subject, seed=request.seed)
     every_view, every_light = list(range(len(rig.views))), list(range(len(rig.lights)))
     told = observation.information(every_view)
-    best = light_selection.predict(told, every_light, least=least)
-    if not asked.wants:
-        return _choice(rig, observation, (every_light, every_view), best, asked)
-    share = asked.valid_share * best.valid_share
-    selected = light_selection.select(
-        told, median_rad=_target_rad(asked), valid_share=share, least=least, most=asked.most_lights
+    best = light_selection.predict_errors(told, every_light, min_lights=least)
+    if not request.wants:
+        return _choice(rig, observation, (every_light, every_view), best, request)
+    share = request.valid_share * best.valid_fraction
+    selected = light_selection.select_lights(
+        told,
+        median_rad=_target_rad(request),
+        valid_fraction=share,
+        min_lights=least,
+        max_lights=request.most_lights,
     )
     lights, prediction = list(selected.lights), selected.prediction
-    while not _r_d_reached(prediction, observation, asked) and len(lights) < len(rig.lights):
-        selected = light_selection.select(
+    while not _is_r_d_reached(prediction, observation, request) and len(lights) < len(rig.lights):
+        selected = light_selection.select_lights(
             told,
             median_rad=0.0,
-            valid_share=2.0,
-            least=least,
-            most=len(lights) + 1,
+            valid_fraction=2.0,
+            min_lights=least,
+            max_lights=len(lights) + 1,
             fixed=tuple(lights),
         )
         lights, prediction = list(selected.lights), selected.prediction
-        if asked.most_lights is not None and len(lights) >= asked.most_lights:
+        if request.most_lights is not None and len(lights) >= request.most_lights:
             break
-    views, prediction = _fewer_views(observation, lights, prediction, asked, share)
-    reasons = _out_of_reach(best, observation, asked)
+    views, prediction = _remove_views(observation, lights, prediction, request, share)
+    reasons = _explain_shortfall(best, observation, request)
     path = tuple(
         {"lights": float(n), "normals_deg": math.degrees(error), "valid_share": share_now}
         for n, error, share_now in selected.path
     )
-    choice = _choice(rig, observation, (lights, views), prediction, asked)
+    choice = _choice(rig, observation, (lights, views), prediction, request)
     return replace(choice, path=path, reasons=reasons)
 
 
-def forecast(rig: Rig, plan: Plan, asked: PlanRequest) -> Choice:
+def forecast(rig: Rig, plan: Plan, request: PlanRequest) -> PlanChoice:
     """Return what a plan of the dome will give by its lights and cameras."""
     olat = [step for step in plan.steps if step.kind == "olat"]
-    lit = {name for step in olat for name in lights_of(step)}
+    lit = {name for step in olat for name in step_lights(step)}
     seen = {name for step in olat for name in step.cameras}
     lights = [k for k, light in enumerate(rig.lights) if light.name in lit]
     views = [k for k, view in enumerate(rig.views) if view.name in seen]
@@ -97,13 +101,15 @@ def forecast(rig: Rig, plan: Plan, asked: PlanRequest) -> Choice:
             f"plan: got {len(lights)} lights and {len(views)} cameras of this rig, expected at "
             f"least {surface_estimates.MIN_LIGHTS} and {surface_estimates.MIN_VIEWS}"
         )
-    observation = simulate_observation(rig, asked.subject, seed=asked.seed)
+    observation = simulate_observation(rig, request.subject, seed=request.seed)
     told = observation.information(views)
-    prediction = light_selection.predict(told, lights, least=surface_estimates.MIN_LIGHTS)
-    return _choice(rig, observation, (lights, views), prediction, asked, plan=plan)
+    prediction = light_selection.predict_errors(
+        told, lights, min_lights=surface_estimates.MIN_LIGHTS
+    )
+    return _choice(rig, observation, (lights, views), prediction, request, plan=plan)
 
 
-def rehearsal(choice: Choice) -> plans.Rehearsal:
+def rehearsal(choice: PlanChoice) -> plans.Rehearsal:
     """Return the dome's targets, under the lights and cameras of a choice."""
     width = {"width_px": choice.rig.views[0].width_px}
     return plans.Rehearsal(
@@ -115,28 +121,28 @@ def rehearsal(choice: Choice) -> plans.Rehearsal:
 
 
 def measured(
-    choice: Choice, appearance: SkinAppearance, truth: SkinAppearance, _: int
+    choice: PlanChoice, appearance: SkinAppearance, truth: SkinAppearance, _: int
 ) -> dict[str, tuple[float, float]]:
     """Return median error and valid share of normals and R_d over the face."""
-    pairs = surface_evaluation.match(appearance, truth)
+    pairs = surface_evaluation.match_texels(appearance, truth)
     found = {}
     for one in choice.forecasts:
-        error = np.abs(surface_evaluation.errors_at(one.name, appearance, truth, pairs))
+        error = np.abs(surface_evaluation.matched_errors(one.name, appearance, truth, pairs))
         found[one.name] = (float(np.nanmedian(error)), float(np.isfinite(error).mean()))
     return found
 
 
 def _choice(
     rig: Rig,
-    observation: Observation,
-    kept: tuple[list[int], list[int]],
-    prediction: Prediction,
-    asked: PlanRequest,
+    observation: DomeObservation,
+    selection: tuple[list[int], list[int]],
+    prediction: ErrorPrediction,
+    request: PlanRequest,
     *,
     plan: Plan | None = None,
-) -> Choice:
+) -> PlanChoice:
     """Return the choice of some lights and cameras, by their numbers."""
-    lights, views = kept
+    lights, views = selection
     small = rig.subset(
         lights=[rig.lights[k].name for k in lights], views=[rig.views[k].name for k in views]
     )
@@ -146,8 +152,8 @@ def _choice(
         "normals": math.degrees(prediction.median_rad),
         "r_d": 100.0 * _r_d_error(prediction, observation),
     }
-    forecasts = plans.forecasts_of(medians, FORECAST_RELATIVE_SD, asked, "dome")
-    left_out = plans.left_out_of(
+    forecasts = plans.build_forecasts(medians, FORECAST_RELATIVE_SD, request, "dome")
+    left_out = plans.list_omissions(
         "dome",
         (unlit, "lights", len(unlit), len(rig.lights), ", ".join(unlit)),
         (unseen, "cameras", len(unseen), len(rig.views), ", ".join(unseen)),
@@ -155,24 +161,24 @@ def _choice(
     knobs = {
         "lights": [rig.lights[k].name for k in sorted(lights)],
         "views": [rig.views[k].name for k in sorted(views)],
-        "valid_share": prediction.valid_share,
-        "exposures_s": list(EXPOSURES_S),
+        "valid_share": prediction.valid_fraction,
+        "exposures_s": list(DOME_EXPOSURES_S),
     }
-    full_s = dome_plan(rig).estimated_s(rig)
+    full_s = dome_plan(rig).estimate_duration_s(rig)
     plan = dome_plan(small) if plan is None else plan
-    return Choice(small, plan, forecasts, full_s, knobs, left_out)
+    return PlanChoice(small, plan, forecasts, full_s, knobs, left_out)
 
 
-def _target_rad(asked: PlanRequest) -> float:
-    return math.radians(asked.wants.get("normals", 90.0))
+def _target_rad(request: PlanRequest) -> float:
+    return math.radians(request.wants.get("normals", 90.0))
 
 
-def _r_d_error(prediction: Prediction, observation: Observation) -> float:
+def _r_d_error(prediction: ErrorPrediction, observation: DomeObservation) -> float:
     """Return the predicted median relative error of R_d."""
     if not prediction.valid.any():
         return math.inf
     good = prediction.valid
-    gloss = GLOSS_R_D_ERROR / LIGHT_ERROR / observation.r_d[good]
+    gloss = SPECULAR_R_D_ERROR / LIGHT_ERROR / observation.r_d[good]
     common = (
         SHARED_R_D_ERROR**2 + (surface_errors.R_D_ERROR_PER_RAD * prediction.tilt_rad[good]) ** 2
     )
@@ -194,35 +200,39 @@ def _median_magnitude(offset: Float64Array, sigma: Float64Array) -> float:
     return 0.5 * (low + high)
 
 
-def _r_d_reached(prediction: Prediction, observation: Observation, asked: PlanRequest) -> bool:
-    most = asked.wants.get("r_d")
+def _is_r_d_reached(
+    prediction: ErrorPrediction, observation: DomeObservation, request: PlanRequest
+) -> bool:
+    most = request.wants.get("r_d")
     return most is None or 100.0 * _r_d_error(prediction, observation) <= most
 
 
-def _fewer_views(
-    observation: Observation,
+def _remove_views(
+    observation: DomeObservation,
     lights: list[int],
-    prediction: Prediction,
-    asked: PlanRequest,
+    prediction: ErrorPrediction,
+    request: PlanRequest,
     valid_share: float,
-) -> tuple[list[int], Prediction]:
+) -> tuple[list[int], ErrorPrediction]:
     """Take off cameras, the one that is missed least first, while what is wanted is reached."""
     views = list(range(observation.variance.shape[2]))
     least = surface_estimates.MIN_LIGHTS
-    target = _target_rad(asked)
-    if prediction.median_rad > target or prediction.valid_share < valid_share:
+    target = _target_rad(request)
+    if prediction.median_rad > target or prediction.valid_fraction < valid_share:
         return views, prediction
     while len(views) > surface_estimates.MIN_VIEWS:
         tried = []
         for view in views:
             rest = [other for other in views if other != view]
-            now = light_selection.predict(observation.information(rest), lights, least=least)
+            now = light_selection.predict_errors(
+                observation.information(rest), lights, min_lights=least
+            )
             if (
                 now.median_rad <= target
-                and now.valid_share >= valid_share
-                and _r_d_reached(now, observation, asked)
+                and now.valid_fraction >= valid_share
+                and _is_r_d_reached(now, observation, request)
             ):
-                tried.append((-now.valid_share, now.median_rad, view, now))
+                tried.append((-now.valid_fraction, now.median_rad, view, now))
         if not tried:
             break
         _, _, view, prediction = min(tried, key=lambda one: one[:3])
@@ -230,14 +240,14 @@ def _fewer_views(
     return views, prediction
 
 
-def _out_of_reach(
-    best: Prediction, observation: Observation, asked: PlanRequest
+def _explain_shortfall(
+    best: ErrorPrediction, observation: DomeObservation, request: PlanRequest
 ) -> tuple[str, ...]:
     """Say why no number of lights gives what is wanted, where that is so."""
-    out, wants = [], asked.wants
+    out, wants = [], request.wants
     normals = math.degrees(best.median_rad)
     if normals > wants.get("normals", math.inf):
-        floor = math.degrees(light_selection.median_of_rayleigh(observation.systematic_rad))
+        floor = math.degrees(light_selection.rayleigh_mixture_median(observation.systematic_rad))
         out.append(
             f"normals: all lights and cameras leave {normals:.2f}°, {floor:.2f}° of it by "
             f"misplaced samples and fine relief at {observation.pixel_mm:.2g} mm a pixel; "

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capture.plan.dome import EXPOSURES_S
+from capture.plan.dome import DOME_EXPOSURES_S
 from capture.rig import Rig
 from reconstruction.photometric_stereo import light_selection
-from reconstruction.photometric_stereo.light_selection import Information
+from reconstruction.photometric_stereo.light_selection import FisherInformation
 from reconstruction.surface import errors as surface_errors
 from reconstruction.surface import estimates as surface_estimates
 from reconstruction.surface import model_normals
@@ -19,8 +19,8 @@ from rigsim.light.lateral import scatter_laterally
 from rigsim.light.led_light import white_intensity
 from rigsim.light.surface_brdf import skin_surface
 from rigsim.population import files as subject_file
-from rigsim.render import OFFSET_MM, Caster
-from rigsim.sensor import sensor_of
+from rigsim.render import RAY_OFFSET_MM, Caster
+from rigsim.sensor import make_sensor
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
 
 FACE_POINTS = 1500
@@ -37,7 +37,7 @@ TEXTURE_TEXELS = 512
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Observation:
+class DomeObservation:
     """What the dome's lights and cameras reach of a face."""
 
     normals: Float64Array
@@ -60,14 +60,14 @@ class Observation:
     """(P, 3): that albedo."""
     pixel_mm: float
 
-    def information(self, views: Sequence[int]) -> Information:
+    def information(self, views: Sequence[int]) -> FisherInformation:
         """Return what each light tells of each point through some of the cameras."""
         seen = self.variance[..., list(views)]
         with np.errstate(divide="ignore"):
             noise = 1.0 / np.sum(1.0 / seen, axis=-1)
         enough = self.seen[:, list(views)].sum(-1) >= surface_estimates.MIN_VIEWS
         noise = np.where(enough[:, None], noise + LIGHT_ERROR**2, np.inf)
-        return light_selection.information(
+        return light_selection.fisher_information(
             self.normals,
             self.to_light,
             noise,
@@ -79,7 +79,7 @@ class Observation:
 
 def simulate_observation(
     rig: Rig, subject: str, *, seed: int = 0, points: int | None = None
-) -> Observation:
+) -> DomeObservation:
     """Look at a simulated face from the dome.
 
     Parameters
@@ -108,11 +108,11 @@ def simulate_observation(
     r_d = rgb.mean(axis=-1)
 
     caster = Caster(face.mesh)
-    start = place + OFFSET_MM * normal
+    start = place + RAY_OFFSET_MM * normal
     lights = np.array([light.position_mm for light in rig.lights], np.float64)
     views = np.array([one.position_mm for one in rig.views], np.float64)
-    to_light, light_mm, lit = _toward(caster, start, normal, lights)
-    to_view, _, seen = _toward(caster, start, normal, views)
+    to_light, light_mm, lit = _trace_to_positions(caster, start, normal, lights)
+    to_view, _, seen = _trace_to_positions(caster, start, normal, views)
     cos_light = np.einsum("plk,pk->pl", to_light, normal)
     cos_view = np.einsum("pvk,pk->pv", to_view, normal)
     steep = cos_light > model_normals.MIN_NORMAL_COS_LIGHT
@@ -125,13 +125,13 @@ def simulate_observation(
 
     white = np.array([white_intensity(light, view).mean() for light in rig.lights])
     rate = r_d[:, None] * white * cos_light / light_mm**2  # full scales per second
-    chip = sensor_of(view)
+    chip = make_sensor(view)
     variance = _relative_variance(rate, chip.full_well_e, chip.read_noise_e)
     there = (lit & steep)[:, :, None] & (seen & facing)[:, None] & matte
     pixel = float(
         2.0 * np.median(np.linalg.norm(views, axis=-1)) * 1e-3 * view.pixel_um / view.focal_mm
     )  # mm on the subject, of a cell of the color filter
-    return Observation(
+    return DomeObservation(
         normal,
         to_light,
         np.where(there, variance[:, :, None], np.inf),
@@ -139,26 +139,26 @@ def simulate_observation(
         seen,
         np.ones(len(place)),
         np.hypot(
-            surface_errors.POSITION_SIGMA_PX * pixel * _bend(face, drawn, pixel),
+            surface_errors.POSITION_SIGMA_PX * pixel * _normal_bend_rate(face, drawn, pixel),
             surface_errors.UNRESOLVED_RELIEF_RAD,
         ),
-        _averaged(surface.r_d, face.atlas, BLUR_PX * pixel)[drawn] / rgb - 1.0,
+        _gaussian_mean(surface.r_d, face.atlas, BLUR_PX * pixel)[drawn] / rgb - 1.0,
         rgb,
         pixel,
     )
 
 
-def _toward(
-    caster: Any, start: Float64Array, normal: Float64Array, places_mm: Float64Array
+def _trace_to_positions(
+    caster: Any, start: Float64Array, normal: Float64Array, positions_mm: Float64Array
 ) -> tuple[Float64Array, Float64Array, BoolArray]:
     """Return unit vectors, distances and free sight from points to places."""
-    away = places_mm[None] - start[:, None]
+    away = positions_mm[None] - start[:, None]
     length = np.linalg.norm(away, axis=-1)
     way = away / length[..., None]
     front = np.einsum("pqk,pk->pq", way, normal) > 0
     free = np.zeros(front.shape, np.bool_)
     point, place = np.nonzero(front)
-    free[point, place] = ~caster.blocked(
+    free[point, place] = ~caster.is_blocked(
         start[point], way[point, place], 0.999 * length[point, place]
     )
     return way, length, free
@@ -167,7 +167,7 @@ def _toward(
 def _relative_variance(rate: Float64Array, full_well_e: float, read_noise_e: float) -> Float64Array:
     """Return the variance of merged brackets over the square of the light."""
     told = np.zeros(rate.shape)
-    for seconds in EXPOSURES_S:
+    for seconds in DOME_EXPOSURES_S:
         electrons = np.maximum(rate, 0.0) * seconds * full_well_e
         kept = (electrons > 0) & (electrons < 0.95 * full_well_e)
         told += np.where(kept, electrons**2 / (electrons + read_noise_e**2), 0.0)
@@ -175,7 +175,7 @@ def _relative_variance(rate: Float64Array, full_well_e: float, read_noise_e: flo
         return np.asarray(np.where(told > 0, 1.0 / told, np.inf))
 
 
-def _averaged(r_d: FloatArray, atlas: Any, sigma_mm: float) -> Float64Array:
+def _gaussian_mean(r_d: FloatArray, atlas: Any, sigma_mm: float) -> Float64Array:
     """Return the mean of an albedo about each texel, Gaussian over the surface, (N * N, 3)."""
     covered = atlas.covered[..., None]
     field = np.where(covered, r_d, 0.0).astype(np.float32)
@@ -183,7 +183,7 @@ def _averaged(r_d: FloatArray, atlas: Any, sigma_mm: float) -> Float64Array:
     return np.asarray(spread.reshape(-1, field.shape[-1]), np.float64)
 
 
-def _bend(face: Any, drawn: NDArray[np.intp], pixel_mm: float) -> Float64Array:
+def _normal_bend_rate(face: Any, texels: NDArray[np.intp], pixel_mm: float) -> Float64Array:
     """Return how fast the face's normals turn at texels, rad/mm, over edges as in the scan."""
     mesh = face.mesh
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]]])
@@ -195,5 +195,5 @@ def _bend(face: Any, drawn: NDArray[np.intp], pixel_mm: float) -> Float64Array:
         np.add.at(total, edges[:, side], squared)
         np.add.at(count, edges[:, side], 1.0)
     bend = np.sqrt(total / np.maximum(count, 1.0))
-    corner = mesh.faces[face.atlas.prim.reshape(-1)[drawn]]
+    corner = mesh.faces[face.atlas.prim.reshape(-1)[texels]]
     return np.asarray(bend[corner].mean(axis=1))

@@ -14,7 +14,7 @@ import numpy as np
 from capture.plan import Plan, flash_plan
 from capture.rig import Rig
 from model.skin import SkinAppearance
-from reconstruction.chromophores.pixel_checks import detectable
+from reconstruction.chromophores.pixel_checks import is_detectable
 from reconstruction.pipeline.flash.stages import MIN_SIGNAL_SIGMAS
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.evaluating import flash
@@ -23,10 +23,10 @@ from skinrig.planning import plans
 from skinrig.planning.flash_observation import (
     CHROMOPHORE_NAMES,
     CONFIRM_PX,
-    Observation,
+    FlashObservation,
     simulate_observation,
 )
-from skinrig.planning.plans import Choice, PlanRequest
+from skinrig.planning.plans import PlanChoice, PlanRequest
 
 REPEAT_CHOICES = (1, 2, 4, 8, 16)
 """Crossed frames of a state that are averaged: 16 of them take a minute and a half."""
@@ -42,7 +42,7 @@ is not that of faces in general (up to 10 %), and as color bends over errors of 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Prediction:
+class FlashPrediction:
     """Relative errors of the face's pixels, standard deviations, by chromophore."""
 
     sigma: Mapping[str, Float64Array]
@@ -53,14 +53,16 @@ class Prediction:
 
     def median(self, name: str) -> float:
         """Return the predicted median relative error."""
-        return plans.median_of_normals(self.sigma[name][self.valid[name]])
+        return plans.median_magnitude(self.sigma[name][self.valid[name]])
 
     def valid_share(self, name: str) -> float:
         """Return the share of the skin that keeps an estimate."""
         return float(self.valid[name].sum() / max(self.skin.sum(), 1))
 
 
-def predict(observation: Observation, *, repeats: int, power: float, darks: int) -> Prediction:
+def predict(
+    observation: FlashObservation, *, repeats: int, power: float, darks: int
+) -> FlashPrediction:
     """Return the errors that crossed frames of a face leave.
 
     Parameters
@@ -85,7 +87,7 @@ def predict(observation: Observation, *, repeats: int, power: float, darks: int)
         observation.melanin[skin],
         observation.hemoglobin[skin],
         relative[skin],
-        shading_spread=observation.light_spread,
+        log_shading_std=observation.light_spread,
         model_scale=observation.mixing,
     )
     sigma, valid = {}, {}
@@ -95,11 +97,11 @@ def predict(observation: Observation, *, repeats: int, power: float, darks: int)
         told = np.full(skin.shape, np.inf)
         told[skin] = ERROR_OVER_BOUND[name] * bound
         sigma[name] = told
-        valid[name] = detectable(truth, np.where(skin, told, 0.0) * truth, skin)
-    return Prediction(sigma, valid, observation.skin)
+        valid[name] = is_detectable(truth, np.where(skin, told, 0.0) * truth, skin)
+    return FlashPrediction(sigma, valid, observation.skin)
 
 
-def choose(rig: Rig, asked: PlanRequest) -> Choice:
+def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
     """Choose the quickest plan, and of those the one with the least light, for a face.
 
     Parameters
@@ -111,11 +113,11 @@ def choose(rig: Rig, asked: PlanRequest) -> Choice:
         percent; empty: the forecast of the rig's own plan. The share is of the skin that most light
         and most frames give an estimate.
     """
-    observation = simulate_observation(rig, asked.subject, seed=asked.seed)
+    observation = simulate_observation(rig, request.subject, seed=request.seed)
     best = predict(observation, repeats=REPEAT_CHOICES[-1], power=1.0, darks=DARK_CHOICES[-1])
-    if not asked.wants:
+    if not request.wants:
         whole = {"repeats": 1, "power": 1.0, "darks": 4, "parallel": True}
-        return _choice(rig, observation, flash_plan(rig), whole, asked)
+        return _choice(rig, observation, flash_plan(rig), whole, request)
     path = []
     for settings in _candidates(rig):
         found = predict(observation, **settings)
@@ -124,23 +126,23 @@ def choose(rig: Rig, asked: PlanRequest) -> Choice:
                 {name: float(settings[name]) for name in ("repeats", "darks")}
                 | {f"{name}_percent": 100.0 * found.median(name) for name in CHROMOPHORE_NAMES}
             )
-        if _good(found, best, asked):
+        if _is_reached(found, best, request):
             plan = crossed_plan(rig, **settings)
-            return _choice(rig, observation, plan, settings, asked, path=tuple(path))
+            return _choice(rig, observation, plan, settings, request, path=tuple(path))
     least = next(one for one in _candidates(rig) if one["power"] == 1.0)
-    reasons = _out_of_reach(best, observation, asked)
+    reasons = _explain_shortfall(best, observation, request)
     # what cannot be reached is not worth sixteen frames: the plan keeps those that still tell more
-    told = [name for name in asked.wants if np.isfinite(best.median(name))]
+    told = [name for name in request.wants if np.isfinite(best.median(name))]
     for settings in _candidates(rig) if told else ():  # less tells nothing as well
         now = predict(observation, **settings)
         if all(now.median(name) <= 1.05 * best.median(name) for name in told):
             least = settings
             break
     plan = crossed_plan(rig, **least)
-    return _choice(rig, observation, plan, least, asked, path=tuple(path), reasons=reasons)
+    return _choice(rig, observation, plan, least, request, path=tuple(path), reasons=reasons)
 
 
-def forecast(rig: Rig, plan: Plan, asked: PlanRequest) -> Choice:
+def forecast(rig: Rig, plan: Plan, request: PlanRequest) -> PlanChoice:
     """Return what a plan of the flash rig with crossed frames will give, in its first state."""
     shots = [step for step in plan.steps if step.kind == "subject"]
     crossed = [step for step in shots if step.index.get("polarizer") == "crossed"]
@@ -154,11 +156,11 @@ def forecast(rig: Rig, plan: Plan, asked: PlanRequest) -> Choice:
         "darks": sum(step.kind == "dark" for step in plan.steps),
         "parallel": len(shots) > len(crossed),
     }
-    observation = simulate_observation(rig, asked.subject, seed=asked.seed)
-    return _choice(rig, observation, plan, settings, asked)
+    observation = simulate_observation(rig, request.subject, seed=request.seed)
+    return _choice(rig, observation, plan, settings, request)
 
 
-def rehearsal(choice: Choice) -> plans.Rehearsal:
+def rehearsal(choice: PlanChoice) -> plans.Rehearsal:
     """Return the flash rig's targets, at the forecast's pixels."""
     width = {"width_px": min(choice.rig.views[0].width_px, CONFIRM_PX)}
     target_of = {"sensor": "flat", "white": "white", "polarization": "malus"}
@@ -168,7 +170,7 @@ def rehearsal(choice: Choice) -> plans.Rehearsal:
 
 
 def measured(
-    _: Choice, appearance: SkinAppearance, truth: SkinAppearance, seed: int
+    _: PlanChoice, appearance: SkinAppearance, truth: SkinAppearance, seed: int
 ) -> dict[str, tuple[float, float]]:
     """Return median error, percent, and valid share of the chromophores over the face."""
     rows = flash.compare(appearance, truth, rng=np.random.default_rng(seed))
@@ -187,7 +189,7 @@ def crossed_plan(rig: Rig, *, repeats: int, power: float, darks: int) -> Plan:
     >>> from capture.rig import load_rig
     >>> rig = load_rig("flash")
     >>> plan = crossed_plan(rig, repeats=2, power=0.5, darks=0)
-    >>> [step.index["polarizer"] for step in plan.steps], round(plan.estimated_s(rig), 1)
+    >>> [step.index["polarizer"] for step in plan.steps], round(plan.estimate_duration_s(rig), 1)
     (['crossed', 'crossed'], 11.4)
     """
     whole = flash_plan(rig, repeats=repeats, power=power, darks=darks)
@@ -205,38 +207,46 @@ def _candidates(rig: Rig) -> Iterator[dict[str, Any]]:
     ]
     yield from sorted(
         every,
-        key=lambda one: (crossed_plan(rig, **one | {"power": 1.0}).estimated_s(rig), one["power"]),
+        key=lambda one: (
+            crossed_plan(rig, **one | {"power": 1.0}).estimate_duration_s(rig),
+            one["power"],
+        ),
     )
 
 
-def _good(found: Prediction, best: Prediction, asked: PlanRequest) -> bool:
+def _is_reached(found: FlashPrediction, best: FlashPrediction, request: PlanRequest) -> bool:
     return all(
         100.0 * found.median(name) <= value
-        and found.valid_share(name) >= asked.valid_share * best.valid_share(name)
-        for name, value in asked.wants.items()
+        and found.valid_share(name) >= request.valid_share * best.valid_share(name)
+        for name, value in request.wants.items()
     )
 
 
 def _choice(
     rig: Rig,
-    observation: Observation,
+    observation: FlashObservation,
     plan: Plan,
     settings: Mapping[str, Any],
-    asked: PlanRequest,
+    request: PlanRequest,
     *,
     path: tuple[Mapping[str, float], ...] = (),
     reasons: tuple[str, ...] = (),
-) -> Choice:
+) -> PlanChoice:
     parallel = bool(settings.get("parallel", False))
     own = {name: settings[name] for name in ("repeats", "power", "darks")}
     found = predict(observation, **own)
     medians = {name: 100.0 * found.median(name) for name in CHROMOPHORE_NAMES}
-    forecasts = plans.forecasts_of(medians, FORECAST_RELATIVE_SD, asked, "flash")
-    left_out = plans.left_out_of(
+    forecasts = plans.build_forecasts(medians, FORECAST_RELATIVE_SD, request, "flash")
+    left_out = plans.list_omissions(
         "flash",
         (not parallel, "parallel", own["repeats"]),
         (own["darks"] < 4, "darks", 4 - own["darks"]),
-        (own["power"] < 1.0, "energy", 100.0 * (1.0 - own["power"]), plans.why_less(reasons)),
+        (
+            own["power"] < 1.0,
+            "energy",
+            100.0 * (1.0 - own["power"]),
+            plans.explain_less_light(reasons),
+        ),
     )
     powers = [float(step.settings.get("power", 0.0)) for step in plan.steps]
     pops = sum(power > 0 for power in powers)
@@ -245,23 +255,25 @@ def _choice(
         "pops": pops,
         "flash_ws": energy * sum(powers),
         "pops_per_min_limit": rig.max_pops_per_min,
-        "flashes_per_s": min(rig.max_pops_per_min / 60.0, pops / max(plan.estimated_s(rig), 1e-9)),
+        "flashes_per_s": min(
+            rig.max_pops_per_min / 60.0, pops / max(plan.estimate_duration_s(rig), 1e-9)
+        ),
     }
     knobs = {
         **own,
         "polarizers": ["parallel", "crossed"] if parallel else ["crossed"],
         "valid_share": {name: found.valid_share(name) for name in CHROMOPHORE_NAMES},
     }
-    full_s = flash_plan(rig, repeats=max(int(own["repeats"]), 1)).estimated_s(rig)
-    return Choice(rig, plan, forecasts, full_s, knobs, left_out, path, reasons, flashes)
+    full_s = flash_plan(rig, repeats=max(int(own["repeats"]), 1)).estimate_duration_s(rig)
+    return PlanChoice(rig, plan, forecasts, full_s, knobs, left_out, path, reasons, flashes)
 
 
-def _out_of_reach(
-    best: Prediction, observation: Observation, asked: PlanRequest
+def _explain_shortfall(
+    best: FlashPrediction, observation: FlashObservation, request: PlanRequest
 ) -> tuple[str, ...]:
     """Say why no number of frames gives what is wanted."""
     out = []
-    for name, value in asked.wants.items():
+    for name, value in request.wants.items():
         now = 100.0 * best.median(name)
         if now <= value:
             continue
@@ -276,6 +288,6 @@ def _out_of_reach(
             f"{name}: {REPEAT_CHOICES[-1]} frames at full power leave {now:.3g} %, of which the "
             f"model error alone, without any noise, leaves {model:.3g} %; {why}"
         )
-    if not out and not _good(best, best, asked):
+    if not out and not _is_reached(best, best, request):
         out.append("valid_share: too little of the skin keeps an estimate")
     return tuple(out)

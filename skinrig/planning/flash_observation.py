@@ -12,7 +12,7 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import shading_prior
 from rigsim.population import files as subject_file
 from rigsim.scenes.flash.scene import FlashScene
-from rigsim.sensor import sensor_of, vignetting_map
+from rigsim.sensor import make_sensor, vignetting_map
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.simulating.flash_truth import to_superpixels
 
@@ -30,7 +30,7 @@ that at 640."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Observation:
+class FlashObservation:
     """What the crossed camera sees of a face at full power, by superpixels."""
 
     melanin: Float64Array
@@ -57,7 +57,7 @@ class Observation:
 
 def simulate_observation(
     rig: Rig, subject: str, *, seed: int = 0, width_px: int = WIDTH_PX
-) -> Observation:
+) -> FlashObservation:
     """Look at a simulated face through the crossed polarizers.
 
     Parameters
@@ -75,7 +75,7 @@ def simulate_observation(
         small, subject_file.load_subject(subject).face(seed=seed, size=TEXTURE_TEXELS), seed=seed
     )
     truth = scene.truth()
-    chip = sensor_of(view)
+    chip = make_sensor(view)
     light = (
         scene.radiance("crossed")
         * vignetting_map(chip.vignetting, view.height_px, view.width_px)[..., None]
@@ -92,32 +92,32 @@ def simulate_observation(
     skin &= (melanin > 0) & (melanin <= table.c_m_max)
     skin &= (hemoglobin > 0) & (hemoglobin <= table.c_hd_max)
     gain, floor = chip.noise_profile(0.008)
-    return Observation(
+    return FlashObservation(
         melanin,
         hemoglobin,
         to_superpixels(light.astype(np.float64)),
         skin,
         gain,
         floor,
-        _shares(view.cfa),
+        _superpixel_variance_ratio(view.cfa),
         table,
-        light_spread(),
+        log_light_information(),
         max(1.0, CONFIRM_PX / rig.views[0].width_px) ** MIXING_POWER,
     )
 
 
-def light_spread() -> float:
+def log_light_information() -> float:
     """Return how well the prior tells the log of a pixel's light: Fisher's information of it.
 
     The prior has a steep edge, as hardly any skin gets more light than a tile in its place: it
     tells more than its variance says.
     """
-    prior = shading_prior.of_faces()
+    prior = shading_prior.face_prior()
     slope = np.gradient(prior.density, prior.step)
     return float(1.0 / np.sqrt(np.sum(slope**2 / prior.density) * prior.step))
 
 
-def _shares(pattern: str) -> Float64Array:
+def _superpixel_variance_ratio(pattern: str) -> Float64Array:
     """Return the variance of superpixels over that of the sensor's pixels, by channel, (3,)."""
     frame = raw.RawFrame(
         cfa=np.full((8, 8), 500, np.uint16), pattern=pattern, black=(0.0,) * 4, white=1000

@@ -13,20 +13,25 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture.plan import Plan, PlanError
-from capture.plan.gradient import DWELL_S, EXPOSURE_S, gradient_plan, state_of
+from capture.plan.gradient import PATTERN_DWELL_S, PATTERN_EXPOSURE_S, gradient_plan, strain_state
 from capture.plan.steps import LIGHT_PATTERNS
 from capture.rig import Rig
 from model import metrics
 from model.skin import SkinAppearance
 from reconstruction.gradient_normals import estimate_roughness, from_patterns
-from reconstruction.gradient_normals.patterns import MissingPatterns, require
-from reconstruction.photometric_stereo.light_selection import median_of_rayleigh
+from reconstruction.gradient_normals.patterns import MissingPatternsError, require_patterns
+from reconstruction.photometric_stereo.light_selection import rayleigh_mixture_median
 from reconstruction.pipeline.gradient.stages import SMOOTH_PX
-from skinrig.appearances.contents import jointly_valid
+from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import Float32Array
 from skinrig.planning import plans
-from skinrig.planning.gradient_observation import BORDER_PX, Key, Observation, simulate_observation
-from skinrig.planning.plans import Choice, PlanRequest
+from skinrig.planning.gradient_observation import (
+    BORDER_PX,
+    GradientObservation,
+    Key,
+    simulate_observation,
+)
+from skinrig.planning.plans import PlanChoice, PlanRequest
 
 PATTERN_SETS: tuple[tuple[str, ...], ...] = (
     ("x", "-x", "y", "z"),
@@ -44,12 +49,12 @@ UNMODELED_TILT_RAD = math.radians(0.2)
 is assumed; see docs/planning.md."""
 FORECAST_RELATIVE_SD = {"normals": 0.2}
 """Relative deviation of measured from predicted medians, see docs/planning.md."""
-WHOLE_READOUT_S = DWELL_S - EXPOSURE_S
+WHOLE_READOUT_S = PATTERN_DWELL_S - PATTERN_EXPOSURE_S
 """Between two exposures of patterns: read-out and settling of the LEDs."""
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class GradientScanSettings:
     """What of a plan the normals of one state hang on."""
 
     patterns: tuple[str, ...]
@@ -60,7 +65,7 @@ class Setting:
 
 
 @dataclass(frozen=True, slots=True)
-class Prediction:
+class GradientPrediction:
     """Errors of a patch's normals."""
 
     median_rad: float
@@ -69,7 +74,7 @@ class Prediction:
     valid_share: float
 
 
-def predict(observation: Observation, setting: Setting) -> Prediction:
+def predict(observation: GradientObservation, setting: GradientScanSettings) -> GradientPrediction:
     """Return the errors that a scan of one state leaves.
 
     Parameters
@@ -100,11 +105,11 @@ def predict(observation: Observation, setting: Setting) -> Prediction:
     inner = (slice(BORDER_PX, -BORDER_PX),) * 2
     valid = np.asarray(found.valid)[inner]
     tilt = np.asarray(found.stderr_rad, np.float64)[inner][valid] / math.sqrt(2.0)
-    median_rad = median_of_rayleigh(np.hypot(tilt, UNMODELED_TILT_RAD))
-    return Prediction(median_rad, median_of_rayleigh(tilt), float(valid.mean()))
+    median_rad = rayleigh_mixture_median(np.hypot(tilt, UNMODELED_TILT_RAD))
+    return GradientPrediction(median_rad, rayleigh_mixture_median(tilt), float(valid.mean()))
 
 
-def choose(rig: Rig, asked: PlanRequest) -> Choice:
+def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
     """Choose the quickest scan of the neutral skin that reaches what is wanted.
 
     Parameters
@@ -115,16 +120,16 @@ def choose(rig: Rig, asked: PlanRequest) -> Choice:
         Wants by name: "normals" in degrees, the median over the patch as the lens shows it; empty:
         the forecast of the rig's own plan. The share is of the patch.
     """
-    observation = simulate_observation(rig, asked.subject, seed=asked.seed)
-    if not asked.wants:
+    observation = simulate_observation(rig, request.subject, seed=request.seed)
+    if not request.wants:
         plan = gradient_plan(rig)
-        return _choice(rig, observation, plan, setting_of(plan), asked)
-    tried: list[tuple[Setting, Plan, Prediction]] = []
-    target = math.radians(asked.wants.get("normals", 90.0))
+        return _choice(rig, observation, plan, read_settings(plan), request)
+    tried: list[tuple[GradientScanSettings, Plan, GradientPrediction]] = []
+    target = math.radians(request.wants.get("normals", 90.0))
     for setting, plan in candidates(rig, observation):
         found = predict(observation, setting)
         tried.append((setting, plan, found))
-        if found.median_rad <= target and found.valid_share >= asked.valid_share:
+        if found.median_rad <= target and found.valid_share >= request.valid_share:
             break
     if not tried:
         raise plans.PlanningError("rig: got limits that no pattern keeps to")
@@ -134,7 +139,7 @@ def choose(rig: Rig, asked: PlanRequest) -> Choice:
             "patterns": float(len(one.patterns)),
             "exposure_s": one.exposure_s,
             "darks": float(one.darks),
-            "seconds": plan.estimated_s(rig),
+            "seconds": plan.estimate_duration_s(rig),
             "normals_deg": math.degrees(found.median_rad),
             "valid_share": found.valid_share,
         }
@@ -143,21 +148,23 @@ def choose(rig: Rig, asked: PlanRequest) -> Choice:
     setting, plan, found = tried[-1]
     reasons: tuple[str, ...] = ()
     if found.median_rad > target:
-        reasons = (_why(best, observation),)
+        reasons = (_explain_shortfall(best, observation),)
         # the quickest of those that are nearly as good as it gets
         setting, plan, found = next(
             one for one in tried if one[2].median_rad <= 1.05 * best.median_rad
         )
-    return _choice(rig, observation, plan, setting, asked, found=found, path=path, reasons=reasons)
+    return _choice(
+        rig, observation, plan, setting, request, found=found, path=path, reasons=reasons
+    )
 
 
-def forecast(rig: Rig, plan: Plan, asked: PlanRequest) -> Choice:
+def forecast(rig: Rig, plan: Plan, request: PlanRequest) -> PlanChoice:
     """Return what a plan of the gradient sphere will give, in its neutral state."""
-    observation = simulate_observation(rig, asked.subject, seed=asked.seed)
-    return _choice(rig, observation, plan, setting_of(plan), asked)
+    observation = simulate_observation(rig, request.subject, seed=request.seed)
+    return _choice(rig, observation, plan, read_settings(plan), request)
 
 
-def rehearsal(choice: Choice) -> plans.Rehearsal:
+def rehearsal(choice: PlanChoice) -> plans.Rehearsal:
     """Return the gradient sphere's targets, skin and flat field on few pixels."""
     width = {"width_px": min(choice.rig.views[0].width_px, 128)}
     of_ball = tuple((kind, ("ball",)) for kind in ("lights", "polarization"))
@@ -166,19 +173,21 @@ def rehearsal(choice: Choice) -> plans.Rehearsal:
 
 
 def measured(
-    choice: Choice, appearance: SkinAppearance, truth: SkinAppearance, _: int
+    choice: PlanChoice, appearance: SkinAppearance, truth: SkinAppearance, _: int
 ) -> dict[str, tuple[float, float]]:
     """Return median error, degrees, and valid share of the neutral skin's normals."""
-    state = next(name for name in map(state_of, choice.plan.steps) if name is not None)
+    state = next(name for name in map(strain_state, choice.plan.steps) if name is not None)
     made = appearance.maps[f"normals_{state}"]
     known = np.asarray(truth.maps[f"normals_seen_{state}"].values, np.float64)
     inner = (slice(BORDER_PX, -BORDER_PX),) * 2
-    good = jointly_valid(made)[inner]
+    good = intersect_valid(made)[inner]
     error = np.degrees(metrics.angular_error_rad(made.values, known))[inner]
     return {"normals": (float(np.median(error[good])), float(good.mean()))}
 
 
-def candidates(rig: Rig, observation: Observation | None = None) -> Iterator[tuple[Setting, Plan]]:
+def candidates(
+    rig: Rig, observation: GradientObservation | None = None
+) -> Iterator[tuple[GradientScanSettings, Plan]]:
     """Yield scans of the neutral skin that the rig's limits allow, the quickest first.
 
     Parameters
@@ -191,10 +200,10 @@ def candidates(rig: Rig, observation: Observation | None = None) -> Iterator[tup
     angle = _angles(rig)[0]
     rates = {} if observation is None else observation.rates
     brightest = max((float(np.quantile(rate, 0.999)) for rate in rates.values()), default=0.0)
-    found: list[tuple[float, int, Setting, Plan]] = []
+    found: list[tuple[float, int, GradientScanSettings, Plan]] = []
     for patterns in PATTERN_SETS:
         for share in EXPOSURE_CHOICES:
-            exposure_s = share * EXPOSURE_S
+            exposure_s = share * PATTERN_EXPOSURE_S
             if exposure_s * brightest > MAX_SIGNAL_FRACTION:
                 continue
             for darks in (0, 2):
@@ -210,13 +219,13 @@ def candidates(rig: Rig, observation: Observation | None = None) -> Iterator[tup
                     )
                 except PlanError:
                     continue  # beyond what an LED may do
-                setting = setting_of(plan)
-                found.append((plan.estimated_s(rig), len(patterns), setting, plan))
+                setting = read_settings(plan)
+                found.append((plan.estimate_duration_s(rig), len(patterns), setting, plan))
     for _, _, setting, plan in sorted(found, key=lambda one: one[:2]):
         yield setting, plan
 
 
-def setting_of(plan: Plan) -> Setting:
+def read_settings(plan: Plan) -> GradientScanSettings:
     """Return what the normals of a plan's first neutral state hang on.
 
     Raises
@@ -224,12 +233,12 @@ def setting_of(plan: Plan) -> Setting:
     plans.PlanningError
         Where its pictures do not tell light and three gradients, in both polarizations.
     """
-    shots = [step for step in plan.steps if step.kind == "gradient" and state_of(step)]
+    shots = [step for step in plan.steps if step.kind == "gradient" and strain_state(step)]
     neutral = [step for step in shots if int(step.index.get("caliper", 1)) == 0]
     if not neutral:
         raise plans.PlanningError("plan: got no neutral state of skin, expected one")
-    state = state_of(neutral[0])
-    own = [step for step in neutral if state_of(step) == state]
+    state = strain_state(neutral[0])
+    own = [step for step in neutral if strain_state(step) == state]
     sets = [
         {str(step.index["pattern"]) for step in own if step.index["polarizer"] == polarizer}
         for polarizer in ("parallel", "crossed")
@@ -237,13 +246,13 @@ def setting_of(plan: Plan) -> Setting:
     try:
         for polarizer, names in zip(("parallel", "crossed"), sets, strict=True):
             lit = dict.fromkeys(names - {"dark"})
-            require(lit, polarizer=polarizer, purpose="normals")
-    except MissingPatterns as error:
+            require_patterns(lit, polarizer=polarizer, purpose="normals")
+    except MissingPatternsError as error:
         raise plans.PlanningError(f"plan: {error}") from error
     both = sets[0] & sets[1]
     darks = sum(step.kind == "dark" or step.index.get("pattern") == "dark" for step in plan.steps)
     first = own[0].settings
-    return Setting(
+    return GradientScanSettings(
         tuple(name for name in LIGHT_PATTERNS if name in both),
         float(first["exposure_s"]),
         darks,
@@ -261,34 +270,34 @@ def _angles(rig: Rig) -> Sequence[float]:
 
 def _choice(
     rig: Rig,
-    observation: Observation,
+    observation: GradientObservation,
     plan: Plan,
-    setting: Setting,
-    asked: PlanRequest,
+    setting: GradientScanSettings,
+    request: PlanRequest,
     *,
-    found: Prediction | None = None,
+    found: GradientPrediction | None = None,
     path: tuple[Mapping[str, float], ...] = (),
     reasons: tuple[str, ...] = (),
-) -> Choice:
+) -> PlanChoice:
     found = predict(observation, setting) if found is None else found
     full = gradient_plan(rig)
     medians = {"normals": math.degrees(found.median_rad)}
-    predicted = plans.forecasts_of(medians, FORECAST_RELATIVE_SD, asked, "gradient")
+    predicted = plans.build_forecasts(medians, FORECAST_RELATIVE_SD, request, "gradient")
     missing = [name for name in LIGHT_PATTERNS if name not in setting.patterns]
-    states, every = ({state_of(s) for s in one.steps} - {None} for one in (plan, full))
-    lost_ms, full_ms = 1e3 * (EXPOSURE_S - setting.exposure_s), 1e3 * EXPOSURE_S
-    left_out = plans.left_out_of(
+    states, every = ({strain_state(s) for s in one.steps} - {None} for one in (plan, full))
+    lost_ms, full_ms = 1e3 * (PATTERN_EXPOSURE_S - setting.exposure_s), 1e3 * PATTERN_EXPOSURE_S
+    left_out = plans.list_omissions(
         "gradient",
         (missing, "patterns", ", ".join(missing)),
         (len(states) < len(every), "states", len(every) - len(states), len(every)),
-        (lost_ms > 0.0, "exposure", lost_ms, full_ms, plans.why_less(reasons)),
+        (lost_ms > 0.0, "exposure", lost_ms, full_ms, plans.explain_less_light(reasons)),
         (not setting.darks, "darks"),
     )
     reasons += (
         "normals are those that the lens shows; the relief's own are "
         f"{math.degrees(observation.lost_rad):.2g}° off them, which no pattern brings back",
     )
-    dwell_s = next(float(s.settings["dwell_s"]) for s in plan.steps if state_of(s))
+    dwell_s = next(float(s.settings["dwell_s"]) for s in plan.steps if strain_state(s))
     knobs = {
         "patterns": list(setting.patterns),
         "polarizers": ["parallel", "crossed"],
@@ -299,10 +308,12 @@ def _choice(
         "level": setting.level,
         "valid_share": found.valid_share,
     }
-    return Choice(rig, plan, predicted, full.estimated_s(rig), knobs, left_out, path, reasons)
+    return PlanChoice(
+        rig, plan, predicted, full.estimate_duration_s(rig), knobs, left_out, path, reasons
+    )
 
 
-def _why(best: Prediction, observation: Observation) -> str:
+def _explain_shortfall(best: GradientPrediction, observation: GradientObservation) -> str:
     floor = math.degrees(UNMODELED_TILT_RAD * math.sqrt(2.0 * math.log(2.0)))
     return (
         f"normals: the best scan leaves {math.degrees(best.median_rad):.2f}°; noise and "

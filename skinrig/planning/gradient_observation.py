@@ -12,9 +12,13 @@ from model.metrics import angular_error_rad
 from rigsim.as_built.sphere import nominal_sphere
 from rigsim.population import files as subject_file
 from rigsim.scenes.gradient.scene import GradientScene
-from rigsim.scenes.gradient.truth import appearance as ground_truth
+from rigsim.scenes.gradient.truth import gradient_truth as ground_truth
 from skinrig.arrays import Float32Array, Float64Array
-from skinrig.benchmarks.gradient_rig.gradient_normals import NEUTRAL, lights_of, pixel_geometry
+from skinrig.benchmarks.gradient_rig.gradient_normals import (
+    NEUTRAL,
+    ideal_light_calibration,
+    pixel_geometry,
+)
 
 Key = tuple[str, str]
 
@@ -25,7 +29,7 @@ BORDER_PX = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Observation:
+class GradientObservation:
     """What the sphere's camera sees of a patch of skin, and what the reconstruction must know."""
 
     rates: Mapping[Key, Float32Array]
@@ -43,7 +47,7 @@ class Observation:
 
 def simulate_observation(
     rig: Rig, subject: str, *, seed: int = 0, side_px: int = PATCH_PX
-) -> Observation:
+) -> GradientObservation:
     """Look at a patch of simulated skin, neutral, under all patterns.
 
     Parameters
@@ -72,5 +76,5 @@ def simulate_observation(
     )
     inner = (slice(BORDER_PX, -BORDER_PX),) * 2
     lost = float(np.median(angular_error_rad(seen[inner], sharp[inner])))
-    known = {"lights": lights_of(sphere), **pixel_geometry(small)}
-    return Observation(rates, known, scene.sensor(), seen, lost, seed)
+    known = {"lights": ideal_light_calibration(sphere), **pixel_geometry(small)}
+    return GradientObservation(rates, known, scene.sensor(), seen, lost, seed)

@@ -23,9 +23,9 @@ from capture.plan import Plan
 from capture.rig import Rig, load_rig
 from skinrig.capturing.light_safety import light_figures
 from skinrig.capturing.plan_choice import read_plan
-from skinrig.console import picked
+from skinrig.console import select_attributes
 from skinrig.errors import UsageError, one_of
-from skinrig.written_units import written
+from skinrig.unit_format import format_quantity
 
 SCHEMA = "skinrig.plan-choice/1"
 
@@ -40,7 +40,7 @@ WANTED_UNITS: Mapping[str, Mapping[str, str]] = {
 PERCENT_BY_SITE = "percent_by_site"
 """Knob of the probe's choices: error of sigma_tr by site, red, green and blue, %."""
 
-LEFT_OUT_TABLE = resources.files("skinrig").joinpath("data/left_out.toml")
+OMISSIONS_TABLE = resources.files("skinrig").joinpath("data/left_out.toml")
 
 _WANTED_LIMIT = re.compile(r"\s*([a-z_]+)\s*<=\s*([0-9.eE+-]+)\s*(deg|%)?\s*")
 
@@ -49,7 +49,7 @@ class PlanningError(ValueError):
     """What is wanted is not known, or no plan can be made for it."""
 
 
-class OptionsError(PlanningError, UsageError):
+class PlanOptionsError(PlanningError, UsageError):
     """What is wanted cannot be read, or options do not go together, or with the rig."""
 
 
@@ -74,7 +74,7 @@ class Forecast:
     def document(self) -> dict[str, Any]:
         """Return this as JSON values."""
         named = {"name": self.name, "unit": self.unit, "median": self.value}
-        return {**named, **picked(self, "interval", "wanted", "reached")}
+        return {**named, **select_attributes(self, "interval", "wanted", "reached")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +107,7 @@ class Rehearsal:
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class PlanChoice:
     """A plan, why it is as it is, and what it will give."""
 
     rig: Rig
@@ -130,7 +130,7 @@ class Choice:
     @property
     def seconds(self) -> float:
         """Time of the capture, as the box's times add up."""
-        return self.plan.estimated_s(self.rig)
+        return self.plan.estimate_duration_s(self.rig)
 
     @property
     def light(self) -> Mapping[str, Any]:
@@ -150,13 +150,13 @@ class Choice:
             "rig": self.rig.name,
             "reached": self.reached,
             "forecasts": [one.document() for one in self.forecasts],
-            **picked(self, "knobs", "seconds", "full_seconds"),
+            **select_attributes(self, "knobs", "seconds", "full_seconds"),
             "saved_seconds": self.full_seconds - self.seconds,
-            **picked(self, "left_out", "path", "reasons", "light"),
+            **select_attributes(self, "left_out", "path", "reasons", "light"),
         }
 
 
-def read_wants(text: str, rig: str) -> dict[str, float]:
+def parse_wants(text: str, rig: str) -> dict[str, float]:
     """Read what is wanted of a rig.
 
     Parameters
@@ -180,7 +180,7 @@ def read_wants(text: str, rig: str) -> dict[str, float]:
 
     Examples
     --------
-    >>> read_wants("normals<=1deg, r_d <= 3%", "dome")
+    >>> parse_wants("normals<=1deg, r_d <= 3%", "dome")
     {'normals': 1.0, 'r_d': 3.0}
     """
     units = WANTED_UNITS[one_of("rig", rig, WANTED_UNITS, PlanningError)]
@@ -189,7 +189,7 @@ def read_wants(text: str, rig: str) -> dict[str, float]:
     for part in filter(str.strip, text.split(",")):
         match = _WANTED_LIMIT.fullmatch(part)
         if match is None:
-            raise OptionsError(f"--want: got {part.strip()!r}, expected {known}")
+            raise PlanOptionsError(f"--want: got {part.strip()!r}, expected {known}")
         name, number, unit = match.groups()
         if name not in units:
             close = difflib.get_close_matches(name, units, 1)
@@ -199,7 +199,7 @@ def read_wants(text: str, rig: str) -> dict[str, float]:
                 hint = f"; {name} is planned for {', '.join(others)}"
             raise PlanningError(f"--want: got {name!r} of rig {rig!r}, expected {known}{hint}")
         if unit not in (None, units[name]):
-            raise OptionsError(f"--want: got {name} in {unit}, expected {units[name]}")
+            raise PlanOptionsError(f"--want: got {name} in {unit}, expected {units[name]}")
         try:
             value = float(number)
         except ValueError:
@@ -209,13 +209,13 @@ def read_wants(text: str, rig: str) -> dict[str, float]:
                 f"--want: got {name}<={number}{unit or ''}, expected a number above 0 and below 1e6"
             )
         if name in wants:
-            raise OptionsError(f"--want: got {name} twice, expected it once")
+            raise PlanOptionsError(f"--want: got {name} twice, expected it once")
         wants[name] = value
     return wants
 
 
-def forecasts_of(
-    medians: Mapping[str, float], spread: Mapping[str, float], asked: PlanRequest, rig: str
+def build_forecasts(
+    medians: Mapping[str, float], relative_sd: Mapping[str, float], request: PlanRequest, rig: str
 ) -> tuple[Forecast, ...]:
     """Return the forecasts of medians by name, each off by a relative spread."""
     return tuple(
@@ -223,14 +223,14 @@ def forecasts_of(
             name,
             WANTED_UNITS[rig][name],
             value,
-            interval_of(value, spread[name]),
-            asked.wants.get(name),
+            forecast_interval(value, relative_sd[name]),
+            request.wants.get(name),
         )
         for name, value in medians.items()
     )
 
 
-def left_out_of(rig: str, *rows: tuple[Any, ...]) -> tuple[tuple[str, str], ...]:
+def list_omissions(rig: str, *rows: tuple[Any, ...]) -> tuple[tuple[str, str], ...]:
     """Return what a plan leaves out and why.
 
     Parameters
@@ -240,12 +240,12 @@ def left_out_of(rig: str, *rows: tuple[Any, ...]) -> tuple[tuple[str, str], ...]
     rows
         Whether it is left out, its name in `data/left_out.toml`, and what fills its braces.
     """
-    table = tomllib.loads(LEFT_OUT_TABLE.read_text(encoding="utf-8"))[rig]
+    table = tomllib.loads(OMISSIONS_TABLE.read_text(encoding="utf-8"))[rig]
     named = [(table[name], words) for left, name, *words in rows if left]
     return tuple((row["what"].format(*words), row["why"].format(*words)) for row, words in named)
 
 
-def why_less(reasons: Sequence[str]) -> str:
+def explain_less_light(reasons: Sequence[str]) -> str:
     """Return why less light will do, where there are reasons why the wish is out of reach."""
     if reasons:
         return "what is left errs by at most a twentieth more"
@@ -259,7 +259,7 @@ def choose(
     width_px: int | None = None,
     forecast: Path | None = None,
     **request: Any,
-) -> Choice:
+) -> PlanChoice:
     """Choose the smallest plan of a rig that reaches what is wanted.
 
     Parameters
@@ -267,7 +267,7 @@ def choose(
     rig_name
         Out of :data:`WANTED_UNITS`.
     want
-        See `read_wants`.
+        See `parse_wants`.
     width_px
         Pixels across the cameras; None: the rig's own.
     forecast
@@ -280,30 +280,32 @@ def choose(
     PlanningError
         For what cannot be read or planned.
     """
-    asked = PlanRequest(read_wants(want, rig_name), **request)
+    asked = PlanRequest(parse_wants(want, rig_name), **request)
     most_lights = asked.most_lights
-    own = planner(rig_name)
+    own = load_planner(rig_name)
     rig = load_rig(rig_name)
     if width_px is not None:
         if rig_name == "probe":
-            raise OptionsError("--width: the probe's spots lie on its camera as it is; leave it")
+            raise PlanOptionsError(
+                "--width: the probe's spots lie on its camera as it is; leave it"
+            )
         # the gradient sphere keeps its pixels' size and gives up field, as its simulation does
         rig = rig.cropped(width_px) if rig_name == "gradient" else rig.resized(width_px)
     if most_lights is not None and most_lights < 1:
         raise PlanningError(f"--most-lights: got {most_lights}, expected 1 or more")
     if most_lights is not None and rig_name != "dome":
-        raise OptionsError(f"--most-lights: is for the dome, not the {rig_name} rig")
+        raise PlanOptionsError(f"--most-lights: is for the dome, not the {rig_name} rig")
     if forecast is not None:
         plan = read_plan(forecast)
         if plan.rig != rig.name:
             raise PlanningError(f"{forecast}: got a plan of {plan.rig!r}, expected {rig.name!r}")
-        found: Choice = own.forecast(rig, plan, asked)
+        found: PlanChoice = own.forecast(rig, plan, asked)
     else:
         found = own.choose(rig, asked)
     return found
 
 
-def planner(rig_name: str) -> Any:
+def load_planner(rig_name: str) -> Any:
     """Return the module that plans for a rig.
 
     It has `choose`, `forecast`, and for a confirmation `rehearsal` and `measured`.
@@ -311,18 +313,18 @@ def planner(rig_name: str) -> Any:
     return importlib.import_module(f"skinrig.planning.{rig_name}")
 
 
-def interval_of(value: float, spread: float) -> tuple[float, float]:
+def forecast_interval(value: float, relative_sd: float) -> tuple[float, float]:
     """Return the interval of a forecast that is off by a relative spread.
 
     Examples
     --------
-    >>> interval_of(1.2, 0.2)
+    >>> forecast_interval(1.2, 0.2)
     (1.0, 1.44)
     """
-    return value / (1.0 + spread), value * (1.0 + spread)
+    return value / (1.0 + relative_sd), value * (1.0 + relative_sd)
 
 
-def median_of_normals(scale: ArrayLike) -> float:
+def median_magnitude(scale: ArrayLike) -> float:
     """Return the median magnitude of a mixture of normal errors; infinite for none.
 
     Parameters
@@ -332,7 +334,7 @@ def median_of_normals(scale: ArrayLike) -> float:
 
     Examples
     --------
-    >>> round(median_of_normals([1.0, 1.0]), 4)
+    >>> round(median_magnitude([1.0, 1.0]), 4)
     0.6745
     """
     from scipy.special import erf
@@ -348,11 +350,13 @@ def median_of_normals(scale: ArrayLike) -> float:
     return 0.5 * (low + high)
 
 
-def lines(choice: Choice) -> list[str]:
+def format_choice(choice: PlanChoice) -> list[str]:
     """Return a choice as lines for people."""
     out = []
     for one in choice.forecasts:
-        asked = "" if one.wanted is None else f", wanted {written(f'{one.wanted:g}', one.unit)}"
+        asked = (
+            "" if one.wanted is None else f", wanted {format_quantity(f'{one.wanted:g}', one.unit)}"
+        )
         if not math.isfinite(one.value):
             out.append(
                 f"forecast: {one.name} keeps no estimate anywhere on this subject{asked}"
@@ -360,27 +364,29 @@ def lines(choice: Choice) -> list[str]:
             )
             continue
         out.append(
-            f"forecast: {one.name} {written(f'{one.value:.3g}', one.unit)} in the median "
+            f"forecast: {one.name} {format_quantity(f'{one.value:.3g}', one.unit)} in the median "
             f"({one.interval[0]:.3g} to {one.interval[1]:.3g}{asked}"
             f"{'' if one.reached else ': NOT REACHED'})"
         )
     out += [f"why: {reason}" for reason in choice.reasons]
     for name, value in choice.knobs.items():
         if name == PERCENT_BY_SITE:
-            out.append(f"percent by site: {_by_site(value)}")
+            out.append(f"percent by site: {_format_site_errors(value)}")
             continue
         shown = f"{len(value)}: {', '.join(map(str, value))}" if isinstance(value, list) else ""
-        out.append(f"{name.replace('_', ' ')}: {shown or _told(value)}")
+        out.append(f"{name.replace('_', ' ')}: {shown or _format_knob(value)}")
     out.append(
         f"capture: {choice.seconds:.1f} s, {choice.full_seconds - choice.seconds:.1f} s less than "
         "the whole rig's plan"
     )
     out += [f"left out: {what} ({why})" for what, why in choice.left_out]
-    out += [f"light: {name.replace('_', ' ')} {_told(v)}" for name, v in choice.light.items()]
+    out += [
+        f"light: {name.replace('_', ' ')} {_format_knob(v)}" for name, v in choice.light.items()
+    ]
     return out
 
 
-def _by_site(errors: Mapping[str, Sequence[float]]) -> str:
+def _format_site_errors(errors: Mapping[str, Sequence[float]]) -> str:
     """Return the errors of sites as people read them, each of its color.
 
     Parameters
@@ -390,7 +396,7 @@ def _by_site(errors: Mapping[str, Sequence[float]]) -> str:
 
     Examples
     --------
-    >>> _by_site({"chin": (0.444, 1.399, math.inf), "cheek": (0.5, 1.0, 2.0)})
+    >>> _format_site_errors({"chin": (0.444, 1.399, math.inf), "cheek": (0.5, 1.0, 2.0)})
     'chin red 0.444 %, green 1.4 %, blue not told; cheek red 0.5 %, green 1 %, blue 2 %'
     """
     return "; ".join(
@@ -403,18 +409,20 @@ def _by_site(errors: Mapping[str, Sequence[float]]) -> str:
     )
 
 
-def _told(value: Any) -> str:
+def _format_knob(value: Any) -> str:
     """Return a figure as people read it: four digits, names with their values.
 
     Examples
     --------
-    >>> _told(0.05926277112717791), _told({"melanin": 1.0, "r_d": 0.98765}), _told(True)
-    ('0.05926', 'melanin 1, r_d 0.9877', 'yes')
+    >>> _format_knob(0.05926277112717791), _format_knob({"melanin": 1.0, "r_d": 0.98765})
+    ('0.05926', 'melanin 1, r_d 0.9877')
+    >>> _format_knob(True)
+    'yes'
     """
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_told(item)}" for key, item in value.items())
+        return ", ".join(f"{key} {_format_knob(item)}" for key, item in value.items())
     return str(value)

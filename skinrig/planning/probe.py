@@ -12,15 +12,15 @@ import numpy as np
 
 from capture.plan import Plan, PlanError
 from capture.plan.probe import MAX_EXPOSURE_S, N_BRACKETS, exposure_series_s, probe_plan
-from capture.plan.suction import placement_of
+from capture.plan.suction import step_placement
 from capture.rig import Rig
 from model.skin import SkinAppearance
 from reconstruction.pipeline.probe.profile_fits import METHOD_NAMES
 from skinrig.evaluating import subsurface
 from skinrig.planning import plans
-from skinrig.planning.plans import Choice, PlanRequest
-from skinrig.planning.probe_forecast import Memory, Prediction, Setting, predict
-from skinrig.planning.probe_observation import Observation, simulate_observation
+from skinrig.planning.plans import PlanChoice, PlanRequest
+from skinrig.planning.probe_forecast import Memory, ProbePrediction, ProbeSettings, predict
+from skinrig.planning.probe_observation import ProbeObservation, simulate_observation
 
 MIN_EXPOSURE_S = exposure_series_s()[0]
 """Of the rig's own series: the nearest fibre must not saturate in it."""
@@ -32,7 +32,7 @@ REPEAT_CHOICES = (1, 2, 4)
 DARK_CHOICES = (1, 2)
 
 
-def choose(rig: Rig, asked: PlanRequest) -> Choice:
+def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
     """Choose the quickest plan that reaches what is wanted.
 
     Parameters
@@ -44,25 +44,25 @@ def choose(rig: Rig, asked: PlanRequest) -> Choice:
         colors; empty: the forecast of the rig's own plan. The share is of the fits that this plan
         makes valid.
     """
-    observation = simulate_observation(rig, asked.subject, seed=asked.seed)
-    own, wants, valid_share = probe_plan(rig), asked.wants, asked.valid_share
+    observation = simulate_observation(rig, request.subject, seed=request.seed)
+    own, wants, valid_share = probe_plan(rig), request.wants, request.valid_share
     if not wants:
-        setting = setting_of(own)
+        setting = read_settings(own)
         return _choice(rig, observation, own, setting, predict(observation, setting), wants)
     target = wants.get("sigma_tr", math.inf) / 100.0
     memory: Memory = {}
-    whole = predict(observation, setting_of(own), memory=memory)
+    whole = predict(observation, read_settings(own), memory=memory)
 
-    def good(found: Prediction) -> bool:
+    def good(found: ProbePrediction) -> bool:
         left = found.sigma[~found.measured]
         return (
             found.valid_share >= valid_share * whole.valid_share
             and found.median <= target
             # a site that is left out must be told by the others as well as is wanted
-            and (not left.size or plans.median_of_normals(left) <= target)
+            and (not left.size or plans.median_magnitude(left) <= target)
         )
 
-    tried: list[tuple[Setting, Plan, Prediction]] = []
+    tried: list[tuple[ProbeSettings, Plan, ProbePrediction]] = []
     for setting, plan in candidates(rig, observation):
         tried.append((setting, plan, predict(observation, setting, memory=memory)))
         if good(tried[-1][2]):
@@ -72,7 +72,7 @@ def choose(rig: Rig, asked: PlanRequest) -> Choice:
             "exposures": float(len(one.exposures_s)),
             "longest_s": one.exposures_s[-1],
             "repeats": float(one.repeats),
-            "seconds": plan.estimated_s(rig),
+            "seconds": plan.estimate_duration_s(rig),
             "sigma_tr_percent": 100.0 * found.median,
             "valid_share": found.valid_share,
         }
@@ -81,9 +81,9 @@ def choose(rig: Rig, asked: PlanRequest) -> Choice:
     setting, plan, found = tried[-1]
     reasons: tuple[str, ...] = ()
     if good(found):
-        setting, plan = without_sites(observation, setting, plan, good, memory=memory)
+        setting, plan = remove_sites(observation, setting, plan, good, memory=memory)
     else:
-        reasons = (_why(observation, whole, target),)
+        reasons = (_explain_shortfall(observation, whole, target),)
         least = valid_share * whole.valid_share
         best = min(one[2].median for one in tried if one[2].valid_share >= least)
         setting, plan, _ = next(
@@ -94,20 +94,20 @@ def choose(rig: Rig, asked: PlanRequest) -> Choice:
     return replace(choice, path=path, reasons=reasons)
 
 
-def forecast(rig: Rig, plan: Plan, asked: PlanRequest) -> Choice:
+def forecast(rig: Rig, plan: Plan, request: PlanRequest) -> PlanChoice:
     """Return what a plan of the probe will give at its sites."""
-    setting = setting_of(plan)
-    observation = simulate_observation(rig, asked.subject, seed=asked.seed, sites=setting.sites)
-    return _choice(rig, observation, plan, setting, predict(observation, setting), asked.wants)
+    setting = read_settings(plan)
+    observation = simulate_observation(rig, request.subject, seed=request.seed, sites=setting.sites)
+    return _choice(rig, observation, plan, setting, predict(observation, setting), request.wants)
 
 
-def rehearsal(_: Choice) -> plans.Rehearsal:
+def rehearsal(_: PlanChoice) -> plans.Rehearsal:
     """Return the probe's phantom."""
     return plans.Rehearsal({"phantom": {}}, (("fibre", ("phantom",)),), ("subsurface",))
 
 
 def measured(
-    _choice: Choice, appearance: SkinAppearance, truth: SkinAppearance, _: int
+    _choice: PlanChoice, appearance: SkinAppearance, truth: SkinAppearance, _: int
 ) -> dict[str, tuple[float, float]]:
     """Return median error, percent, and valid share of sigma_tr over sites and colors."""
     fits = subsurface.compare_fits(appearance, truth)
@@ -117,7 +117,7 @@ def measured(
     return {"sigma_tr": (median, len(good) / max(len(rows), 1))}
 
 
-def candidates(rig: Rig, observation: Observation) -> Iterator[tuple[Setting, Plan]]:
+def candidates(rig: Rig, observation: ProbeObservation) -> Iterator[tuple[ProbeSettings, Plan]]:
     """Yield plans of all sites in one direction that the rig allows, the quickest first."""
     found: list[tuple[float, Plan]] = []
     for brackets, longest_s, repeats, darks in itertools.product(
@@ -130,25 +130,25 @@ def candidates(rig: Rig, observation: Observation) -> Iterator[tuple[Setting, Pl
                 sites=observation.sites,
                 repeats=repeats,
                 brackets=brackets,
-                longest_s=longest_s,
+                max_exposure_s=longest_s,
                 step_ev=step_ev,
                 darks=darks,
             )
         except PlanError:
             continue  # beyond what the head may do
-        found.append((plan.estimated_s(rig), plan))
+        found.append((plan.estimate_duration_s(rig), plan))
     for _, plan in sorted(found, key=lambda one: one[0]):
-        yield setting_of(plan), plan
+        yield read_settings(plan), plan
 
 
-def without_sites(
-    observation: Observation,
-    setting: Setting,
+def remove_sites(
+    observation: ProbeObservation,
+    setting: ProbeSettings,
     plan: Plan,
-    good: Callable[[Prediction], bool],
+    is_sufficient: Callable[[ProbePrediction], bool],
     *,
     memory: Memory | None = None,
-) -> tuple[Setting, Plan]:
+) -> tuple[ProbeSettings, Plan]:
     """Take off sites that the others, and people in general, tell of as well as is wanted.
 
     Parameters
@@ -165,7 +165,7 @@ def without_sites(
     while len(setting.sites) > 1:
         for site in setting.sites:
             rest = tuple(other for other in setting.sites if other != site)
-            if good(predict(observation, replace(setting, sites=rest), memory=memory)):
+            if is_sufficient(predict(observation, replace(setting, sites=rest), memory=memory)):
                 kept = tuple(s for s in plan.steps if s.index.get("site") != site)
                 setting, plan = replace(setting, sites=rest), replace(plan, steps=kept)
                 break
@@ -174,7 +174,7 @@ def without_sites(
     return setting, plan
 
 
-def setting_of(plan: Plan) -> Setting:
+def read_settings(plan: Plan) -> ProbeSettings:
     """Return what of a plan sigma_tr hangs on.
 
     Raises
@@ -190,11 +190,11 @@ def setting_of(plan: Plan) -> Setting:
         raise plans.PlanningError(
             "plan: got no frame without light, expected some: the dark current"
         )
-    placements = list(dict.fromkeys(placement_of(step) for step in shots))
+    placements = list(dict.fromkeys(step_placement(step) for step in shots))
     sites = tuple(dict.fromkeys(str(step.index["site"]) for step in shots))
-    first = [step for step in shots if placement_of(step) == placements[0]]
+    first = [step for step in shots if step_placement(step) == placements[0]]
     times = {float(step.settings["exposure_s"]) for step in darks}
-    return Setting(
+    return ProbeSettings(
         sites,
         tuple(sorted(float(step.settings["exposure_s"]) for step in first)),
         max(1, len(placements) // len(sites)),
@@ -205,12 +205,12 @@ def setting_of(plan: Plan) -> Setting:
 
 def _choice(
     rig: Rig,
-    observation: Observation,
+    observation: ProbeObservation,
     plan: Plan,
-    setting: Setting,
-    found: Prediction,
+    setting: ProbeSettings,
+    found: ProbePrediction,
     wants: Mapping[str, float],
-) -> Choice:
+) -> PlanChoice:
     value = 100.0 * found.median
     low, high = found.interval()
     predicted = plans.Forecast(
@@ -221,7 +221,7 @@ def _choice(
     percent = [100.0 * float(np.median(sigma)) for sigma in found.sigma]
     sites = zip(observation.sites, percent, found.measured, strict=True)
     turned = {name for step in plan.steps for name in step.index if step.index[name]}
-    left_out = plans.left_out_of(
+    left_out = plans.list_omissions(
         "probe",
         (fewer > 0, "exposures", fewer, N_BRACKETS),
         (longest_s < 0.99 * MAX_EXPOSURE_S, "longest", longest_s),
@@ -240,14 +240,14 @@ def _choice(
             for k, site in enumerate(observation.sites)
         },
     }
-    full_s = probe_plan(rig, repeats=setting.repeats).estimated_s(rig)
-    return Choice(rig, plan, (predicted,), full_s, knobs, left_out)
+    full_s = probe_plan(rig, repeats=setting.repeats).estimate_duration_s(rig)
+    return PlanChoice(rig, plan, (predicted,), full_s, knobs, left_out)
 
 
-def _why(observation: Observation, whole: Prediction, target: float) -> str:
+def _explain_shortfall(observation: ProbeObservation, whole: ProbePrediction, target: float) -> str:
     """Say why no plan reaches what is wanted."""
-    stays = 100.0 * plans.median_of_normals(whole.misfit)
-    calibration = 100.0 * plans.median_of_normals(whole.common)
+    stays = 100.0 * plans.median_magnitude(whole.misfit)
+    calibration = 100.0 * plans.median_magnitude(whole.common)
     return (
         f"sigma_tr: the rig's own series leave {100.0 * whole.median:.2g} %; without any noise "
         f"layers unlike any homogeneous medium and the calibration (the phantom's certificate, far "

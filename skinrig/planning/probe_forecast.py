@@ -15,14 +15,14 @@ import numpy as np
 from capture.calibration.fiber.crosstalk import CrossTalk
 from capture.calibration.fiber.probe_calibration import FiberReflectance
 from capture.plan.probe import exposure_series_s
-from capture.plan.suction import Placement
+from capture.plan.suction import HeadPlacement
 from reconstruction.pipeline.probe.images import Measurement
-from reconstruction.pipeline.probe.profile_fits import Profile, fit_profiles
+from reconstruction.pipeline.probe.profile_fits import MeasuredProfile, fit_profiles
 from reconstruction.subsurface import translucency
 from reconstruction.subsurface.probe_sites import SITE_UV
 from skinrig.arrays import BoolArray, Float64Array
-from skinrig.planning.plans import median_of_normals
-from skinrig.planning.probe_observation import Observation, reading_variance
+from skinrig.planning.plans import median_magnitude
+from skinrig.planning.probe_observation import ProbeObservation, reading_variance
 
 CROSSTALK_ERROR = (0.0, 8.5e-6, 6.3e-6, 9.3e-7, 2.5e-7)
 """Standard error of the share of a fibre's light in a spot so many places away, the last of all
@@ -36,7 +36,7 @@ MAP_PX = 32
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class ProbeSettings:
     """What of a plan sigma_tr hangs on."""
 
     sites: tuple[str, ...]
@@ -48,7 +48,7 @@ class Setting:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Prediction:
+class ProbePrediction:
     """Relative errors of sigma_tr by site and color."""
 
     sites: tuple[str, ...]
@@ -74,7 +74,7 @@ class Prediction:
     @property
     def median(self) -> float:
         """Predicted median relative error over measured sites and colors."""
-        return median_of_normals(self.total)
+        return median_magnitude(self.total)
 
     @property
     def common(self) -> Float64Array:
@@ -107,13 +107,13 @@ class Prediction:
 
 
 Memory = dict[tuple[Any, ...], Sequence[Any]]
-"""Fits of one `Observation` by what they hang on: plans that differ in placements alone share
+"""Fits of one `ProbeObservation` by what they hang on: plans that differ in placements alone share
 them, and without noise nearly all do."""
 
 
 def predict(
-    observation: Observation, setting: Setting, *, memory: Memory | None = None
-) -> Prediction:
+    observation: ProbeObservation, setting: ProbeSettings, *, memory: Memory | None = None
+) -> ProbePrediction:
     """Return the errors that a plan leaves.
 
     Placements lower what the readings' noise leaves, and neither the misfit of layers nor what the
@@ -151,35 +151,35 @@ def predict(
         noise -= np.where(np.isfinite(stays), stays**2, 0.0) / setting.repeats
         still[k] = np.hypot(stays, common)
         sigma[k] = np.sqrt(still[k] ** 2 + noise)
-    rest = _between(observation, found, sigma, valid & measured[:, None])
+    rest = _interpolation_error(observation, found, sigma, valid & measured[:, None])
     sigma[~measured] = rest[~measured]
-    return Prediction(observation.sites, sigma, shared, still, valid, measured)
+    return ProbePrediction(observation.sites, sigma, shared, still, valid, measured)
 
 
 def _fits(
-    observation: Observation,
-    setting: Setting,
-    places: Sequence[int],
+    observation: ProbeObservation,
+    setting: ProbeSettings,
+    sites: Sequence[int],
     *,
     noise: bool,
     memory: Memory,
 ) -> Sequence[Any]:
     """Return the fits of each site's profile as a plan would read it, or without its noise."""
     how = (setting.exposures_s, setting.darks, setting.level)
-    read = [reading_variance(observation, observation.reflectance[k], *how) for k in places]
+    read = [reading_variance(observation, observation.reflectance[k], *how) for k in sites]
     # of the readings' noise a fit without it asks only which fibres are read at all
     told = np.array(read) if noise else np.isfinite(read)
     count = len(setting.exposures_s)
-    key = (noise, tuple(places), count, told.tobytes())
+    key = (noise, tuple(sites), count, told.tobytes())
     if key not in memory:
-        memory[key] = _fitted(observation, read, places, count, noise=noise)
+        memory[key] = _fit_noisy_profiles(observation, read, sites, count, noise=noise)
     return memory[key]
 
 
-def _fitted(
-    observation: Observation,
+def _fit_noisy_profiles(
+    observation: ProbeObservation,
     read: Sequence[Float64Array],
-    places: Sequence[int],
+    sites: Sequence[int],
     exposures: int,
     *,
     noise: bool,
@@ -195,7 +195,7 @@ def _fitted(
     gain += observation.phantom_error**2
     mixed = _crosstalk(len(radius))
     profiles = []
-    for k, own in zip(places, read, strict=True):
+    for k, own in zip(sites, read, strict=True):
         value = observation.reflectance[k]
         valid = np.isfinite(own)
         variance = np.where(valid, own, 0.0) if noise else np.zeros_like(own)
@@ -204,8 +204,10 @@ def _fitted(
         common = np.concatenate([value * observation.common, shared])
         variance += gain * value**2 + doubt
         reflectance = FiberReflectance(names, radius, value, variance, common, valid, ~valid)
-        head = Measurement(Placement(observation.sites[k], 0.0, 0), exposures, 1.0, math.nan, 5.0)
-        profiles.append(Profile(head, reflectance))
+        head = Measurement(
+            HeadPlacement(observation.sites[k], 0.0, 0), exposures, 1.0, math.nan, 5.0
+        )
+        profiles.append(MeasuredProfile(head, reflectance))
     return fit_profiles(profiles, observation.probe) if profiles else []
 
 
@@ -223,21 +225,21 @@ def _crosstalk(count: int) -> Any:
     return CrossTalk(np.eye(count), error, nothing, nothing, nothing, True)
 
 
-def _between(
-    observation: Observation, found: Float64Array, sigma: Float64Array, good: BoolArray
+def _interpolation_error(
+    observation: ProbeObservation, found: Float64Array, sigma: Float64Array, valid: BoolArray
 ) -> Float64Array:
     """Return the relative error of sigma_tr at each site by the map between the others, (S, 3)."""
     known = [k for k, site in enumerate(observation.sites) if site in SITE_UV]
-    measured = [k for k in known if good[k].any()]
+    measured = [k for k in known if valid[k].any()]
     out = np.full(found.shape, np.inf)
     if not measured:
         return out
     made = translucency.interpolate(
         [SITE_UV[observation.sites[k]] for k in measured],
-        np.where(good[measured], found[measured], 1.0),
-        np.where(good[measured], sigma[measured] * found[measured], np.inf),
+        np.where(valid[measured], found[measured], 1.0),
+        np.where(valid[measured], sigma[measured] * found[measured], np.inf),
         (MAP_PX, MAP_PX),
-        valid=good[measured],
+        valid=valid[measured],
     )
     for k in known:
         u, v = SITE_UV[observation.sites[k]]

@@ -11,10 +11,10 @@ from capture.plan.probe import PROBE_SITES
 from capture.rig import Rig
 from model import spectra
 from rigsim.as_built.probe import SPOT_RADIUS_PX
-from rigsim.fiber.probe_profile import Profiles
+from rigsim.fiber.probe_profile import ProfileCache
 from rigsim.population import files as subject_file
-from rigsim.scenes.probe.scene import DARK_E_PER_S, LENS_VIGNETTING, PROBE_METER_RATE_PER_S
-from rigsim.sensor import sensor_of
+from rigsim.scenes.probe.scene import DARK_CURRENT_E_PER_S, LENS_VIGNETTING, PROBE_METER_RATE_PER_S
+from rigsim.sensor import make_sensor
 from skinrig.arrays import Float64Array
 from skinrig.calibrating.phantom_reflectance import expected_reflectance, packaged_certificate
 from skinrig.planning.plans import PlanningError
@@ -25,7 +25,7 @@ MAX_READ_FRACTION = 0.95
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Observation:
+class ProbeObservation:
     """What the fibres take from simulated skin, and what the camera makes of it."""
 
     sites: tuple[str, ...]
@@ -49,7 +49,7 @@ class Observation:
 
 def simulate_observation(
     rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = PROBE_SITES
-) -> Observation:
+) -> ProbeObservation:
     """Look at simulated skin through the fibres.
 
     Parameters
@@ -57,14 +57,14 @@ def simulate_observation(
     rig
         The probe's.
     subject, seed
-        The tissue, see `rigsim.fiber.probe_tissue.parse_subject`.
+        The tissue, see `rigsim.fiber.probe_tissue.parse_tissue`.
     sites
         Where the head may be placed.
     """
     if rig.probe is None:
         raise PlanningError(f"rig: got {rig.name!r} without a probe, expected one with fibres")
-    tissue = subject_file.tissue(subject, seed=seed)
-    profiles = Profiles(rig, tissue, photons=TRUTH_PHOTONS["small"], seed=seed)
+    tissue = subject_file.load_tissue(subject, seed=seed)
+    profiles = ProfileCache(rig, tissue, photons=TRUTH_PHOTONS["small"], seed=seed)
     made = [profiles.profile(site, 0.0, rig.probe.suction_mbar) for site in sites]
     reflectance = np.stack([one.reflectance_per_mm2 for one in made])
     block = expected_reflectance(packaged_certificate(), rig)
@@ -72,7 +72,7 @@ def simulate_observation(
 
     white = spectra.camera_white(view.spectral_sensitivity, rig.lights[0].illuminant)
     area = math.pi * SPOT_RADIUS_PX**2
-    return Observation(
+    return ProbeObservation(
         tuple(sites),
         reflectance,
         block.per_mm2,
@@ -80,13 +80,13 @@ def simulate_observation(
         block.common,
         PROBE_METER_RATE_PER_S * np.asarray(white, np.float64),
         area * np.array([0.25, 0.5, 0.25]),
-        sensor_of(view, dark_e_per_s=DARK_E_PER_S, vignetting=LENS_VIGNETTING),
+        make_sensor(view, dark_e_per_s=DARK_CURRENT_E_PER_S, vignetting=LENS_VIGNETTING),
         rig.probe,
     )
 
 
 def reading_variance(
-    observation: Observation,
+    observation: ProbeObservation,
     value: Float64Array,
     exposures_s: Sequence[float],
     darks: int,

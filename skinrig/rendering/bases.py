@@ -17,7 +17,7 @@ DESCENT_SWEEPS: Final = 60
 """Passes over the shares of all texels; each sets one share to its best while others stand."""
 
 
-def reduced(model: SkinReflectance, rank: int, *, rng: np.random.Generator) -> SkinReflectance:
+def reduce_lobes(model: SkinReflectance, rank: int, *, rng: np.random.Generator) -> SkinReflectance:
     """Return the model with `rank` lobes that are mixtures of its own.
 
     The mixtures are found by non-negative factorization at some texels; then every texel gets the
@@ -50,12 +50,12 @@ def reduced(model: SkinReflectance, rank: int, *, rng: np.random.Generator) -> S
     drawn = np.sort(rng.permutation(known)[:FACTORIZED_TEXELS])
     seed = int(rng.integers(2**31))
     _, mix, _ = brdf_basis.reduce(shares[drawn], rank, basis=model.lobes, seed=seed)
-    fewer = nearest_shares(shares, mix, model.lobes)
+    fewer = fit_nearest_weights(shares, mix, model.lobes)
     weights = fewer.reshape(*model.shape, rank).astype(np.float32)
-    return dataclasses.replace(model, weights=weights, lobes=model.lobes.mixed(mix))
+    return dataclasses.replace(model, weights=weights, lobes=model.lobes.mix_materials(mix))
 
 
-def nearest_shares(shares: Float64Array, mix: Float64Array, lobes: BrdfBasis) -> Float64Array:
+def fit_nearest_weights(weights: Float64Array, mix: Float64Array, lobes: BrdfBasis) -> Float64Array:
     """Return non-negative shares of mixtures whose BRDFs are nearest to given ones.
 
     Parameters
@@ -73,9 +73,9 @@ def nearest_shares(shares: Float64Array, mix: Float64Array, lobes: BrdfBasis) ->
         Shape (n, R), by cyclic coordinate descent, whose error never grows.
     """
     strength = lobes.strength()
-    gram = lobes.kinship() * np.outer(strength, strength)
+    gram = lobes.cosine_similarity() * np.outer(strength, strength)
     square = mix @ gram @ mix.T
-    wanted = shares @ gram @ mix.T
+    wanted = weights @ gram @ mix.T
     size = np.maximum(np.diag(square), 1e-300)
     found = np.zeros_like(wanted)
     for _ in range(DESCENT_SWEEPS):

@@ -21,8 +21,8 @@ class RenderingError(ValueError):
     """What is asked for gives no picture, or cannot be compared."""
 
 
-def looking_at(
-    place_mm: ArrayLike,
+def look_at(
+    position_mm: ArrayLike,
     *,
     target_mm: ArrayLike = (0.0, 0.0, 0.0),
     up: ArrayLike = (0.0, 1.0, 0.0),
@@ -54,11 +54,11 @@ def looking_at(
 
     Examples
     --------
-    >>> camera = looking_at((0.0, 0.0, 700.0), size_px=(201, 101))
+    >>> camera = look_at((0.0, 0.0, 700.0), size_px=(201, 101))
     >>> camera.project([[0.0, 0.0, 0.0]]).tolist()
     [[100.0, 50.0]]
     """
-    place, target, upward = (np.asarray(v, np.float64) for v in (place_mm, target_mm, up))
+    place, target, upward = (np.asarray(v, np.float64) for v in (position_mm, target_mm, up))
     for field, given in (("place", place), ("target", target), ("up", upward)):
         if given.shape != (3,) or not np.isfinite(given).all():
             raise RenderingError(
@@ -86,7 +86,7 @@ def looking_at(
     return Camera(name, matrix, np.zeros(5), rotation, -rotation @ place, (columns, rows))
 
 
-def binned(camera: Camera, factor: float) -> Camera:
+def bin_pixels(camera: Camera, factor: float) -> Camera:
     """Return a camera whose pixels are larger: `factor` = 2 is the grid of 2 x 2 cells.
 
     Parameters
@@ -98,8 +98,8 @@ def binned(camera: Camera, factor: float) -> Camera:
 
     Examples
     --------
-    >>> camera = looking_at((0.0, 0.0, 700.0), size_px=(200, 100))
-    >>> half = binned(camera, 2)
+    >>> camera = look_at((0.0, 0.0, 700.0), size_px=(200, 100))
+    >>> half = bin_pixels(camera, 2)
     >>> half.image_size, half.project([[0.0, 0.0, 0.0]]).tolist()
     ((100, 50), [[49.5, 24.5]])
     """

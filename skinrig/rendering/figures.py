@@ -17,16 +17,16 @@ from skinrig.arrays import BoolArray, Float32Array, FloatArray
 from skinrig.drawing import png
 from skinrig.errors import UnusableError, UsageError
 from skinrig.rendering import folder, shadow
-from skinrig.rendering.bases import reduced
+from skinrig.rendering.bases import reduce_lobes
 from skinrig.rendering.camera import Camera, RenderingError
-from skinrig.rendering.folder import Panel, exposure_of, sheet, tone
-from skinrig.rendering.geometry import FittedSurface, own_mesh, read_mesh
+from skinrig.rendering.folder import Panel, apply_tone_curve, choose_exposure, encode_sheet
+from skinrig.rendering.geometry import FittedSurface, read_mesh, read_own_mesh
 from skinrig.rendering.interior import Interior
 from skinrig.rendering.lights import Light
-from skinrig.rendering.photographs.held_out import Photographs
-from skinrig.rendering.render import Rendering, Subsurface, render
+from skinrig.rendering.photographs.held_out import HeldOutPhotographs
+from skinrig.rendering.render import Rendering, Subsurface, render_surface
 from skinrig.rendering.request import read_model
-from skinrig.rendering.shadow import MAX_SIGMA_TR_PER_MM, MIN_SIGMA_TR_PER_MM, Boundary
+from skinrig.rendering.shadow import MAX_SIGMA_TR_PER_MM, MIN_SIGMA_TR_PER_MM, ShadowBoundary
 
 RADIANCE_UNIT = (
     "radiance over that of a perfect white Lambertian patch that faces a light of intensity 1; "
@@ -35,7 +35,7 @@ RADIANCE_UNIT = (
 
 
 @dataclass(frozen=True, slots=True)
-class Effort:
+class RenderSettings:
     """How a picture is rendered."""
 
     subsurface: Subsurface = "dipole"
@@ -54,20 +54,20 @@ class RenderModel:
 
     path: Path
     appearance: SkinAppearance
-    laid: FittedSurface
+    surface: FittedSurface
     mesh: str
     """Which mesh, for the record."""
 
     @property
     def model(self) -> SkinReflectance:
         """The model."""
-        return self.laid.model
+        return self.surface.model
 
     @staticmethod
     def of(path: Path, *, mesh: Path | None = None, translucency: str | None = None) -> RenderModel:
         """Read an appearance and lay its maps on its own mesh, or on another of the same layout."""
         appearance, model = read_model(path, translucency=translucency)
-        own = own_mesh(appearance)
+        own = read_own_mesh(appearance)
         if mesh is None:
             return RenderModel(path, appearance, FittedSurface.of(model, own), "own")
         laid = FittedSurface.of(model, read_mesh(mesh), rest=own)
@@ -75,48 +75,48 @@ class RenderModel:
 
     def record(self) -> dict[str, Any]:
         """Return what a rendering's record says of the model."""
-        valid = self.model.valid & self.laid.atlas.covered
+        valid = self.model.valid & self.surface.atlas.covered
         return {
             "appearance": self.path,
             "source": self.appearance.source,
             "mesh": self.mesh,
-            "normals_carried_along": self.laid.carried,
+            "normals_carried_along": self.surface.is_transferred,
             "lobes": self.model.lobes.size,
             "assumed": list(self.model.assumed),
             consent.CONSENT_KEY: consent.merge_consent(self.appearance),
-            "measured_share": float(valid.sum() / max(self.laid.atlas.covered.sum(), 1)),
+            "measured_share": float(valid.sum() / max(self.surface.atlas.covered.sum(), 1)),
         }
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class RenderRequest:
     """What a picture is to be of, where it is written, and how it is rendered."""
 
     camera: Camera
     lights: Sequence[Light]
     out: Path
-    effort: Effort
+    effort: RenderSettings
     assumed: Sequence[str] = ()
     """What else was taken for granted."""
 
-    def rendered(self, laid: FittedSurface, interior: Interior | None = None) -> Rendering:
+    def render(self, surface: FittedSurface, interior: Interior | None = None) -> Rendering:
         """Render a model, with the light inside it where that is known already."""
-        return render(
-            laid,
+        return render_surface(
+            surface,
             self.camera,
             self.lights,
             subsurface=self.effort.subsurface,
             subpixels=self.effort.subpixels,
             shadow_samples=self.effort.shadow_samples,
-            interior=None if interior is None else interior.of_surface(laid),
+            interior=None if interior is None else interior.with_surface(surface),
             progress=self.effort.progress,
         )
 
-    def exposure(self, seen: Rendering) -> float:
+    def exposure(self, rendering: Rendering) -> float:
         """Return the factor of the PNGs."""
-        return self.effort.exposure or exposure_of(seen.radiance, seen.coverage)
+        return self.effort.exposure or choose_exposure(rendering.radiance, rendering.coverage)
 
-    def record(self, subjects: Sequence[RenderModel], seen: Rendering) -> dict[str, Any]:
+    def record(self, subjects: Sequence[RenderModel], rendering: Rendering) -> dict[str, Any]:
         """Return what the record of a rendering says of it."""
         own: Mapping[str, Any] = subjects[0].record()
         names = [light.name for light in self.lights]
@@ -135,9 +135,9 @@ class Asked:
             "samples": self.effort.subpixels**2,
             "shadow_samples": self.effort.shadow_samples,
             "seed": self.effort.seed,
-            "skin_pixels": int(np.count_nonzero(seen.coverage > 0.5)),
-            "measured_pixels": int(np.count_nonzero(seen.covered)),
-            "lit_pixels": int(np.count_nonzero(seen.lit)),
+            "skin_pixels": int(np.count_nonzero(rendering.coverage > 0.5)),
+            "measured_pixels": int(np.count_nonzero(rendering.covered)),
+            "lit_pixels": int(np.count_nonzero(rendering.lit)),
         }
 
 
@@ -153,15 +153,17 @@ class _Drawing:
         images: Mapping[str, Float32Array],
         pictures: Mapping[str, bytes],
         record: Mapping[str, Any],
-        **told: Any,
+        **details: Any,
     ) -> dict[str, Any]:
         """Write the folder; see `skinrig.rendering.folder.write`."""
-        told["seconds"] = time.perf_counter() - self._start
-        document = {**record, **told}
+        details["seconds"] = time.perf_counter() - self._start
+        document = {**record, **details}
         return folder.write(self._out, images=images, pictures=pictures, document=document)
 
 
-def draw(subject: RenderModel, asked: Asked, *, components: bool = False) -> dict[str, Any]:
+def draw_rendering(
+    subject: RenderModel, request: RenderRequest, *, components: bool = False
+) -> dict[str, Any]:
     """Render one picture into a folder; see `skinrig.rendering.folder.write`.
 
     Parameters
@@ -171,18 +173,20 @@ def draw(subject: RenderModel, asked: Asked, *, components: bool = False) -> dic
     components
         Write light from inside and from the surface, too, and a sheet of the paper's figure 12.
     """
-    drawing = _Drawing(asked.out)
-    seen = asked.rendered(subject.laid)
-    exposure = asked.exposure(seen)
+    drawing = _Drawing(request.out)
+    seen = request.render(subject.surface)
+    exposure = request.exposure(seen)
     images: dict[str, Float32Array] = {"radiance": seen.radiance}
     shown = {"radiance": seen.radiance}
     if components:
         shown |= {"diffuse": seen.diffuse, "surface": seen.surface}
         images |= {**shown, "coverage": seen.coverage}
-    pictures = {name: png.encode(tone(image, exposure)) for name, image in shown.items()}
+    pictures = {
+        name: png.encode(apply_tone_curve(image, exposure)) for name, image in shown.items()
+    }
     if components:
-        pictures["components"] = sheet([component_panels(seen, exposure)])
-    record = asked.record([subject], seen)
+        pictures["components"] = encode_sheet([component_panels(seen, exposure)])
+    record = request.record([subject], seen)
     return drawing.write(images, pictures, record, kind="picture", exposure=exposure)
 
 
@@ -192,7 +196,7 @@ def draw_photograph(
     view: str,
     light: str,
     out: Path,
-    effort: Effort,
+    effort: RenderSettings,
     *,
     calibration: Path | None = None,
 ) -> dict[str, Any]:
@@ -207,7 +211,7 @@ def draw_photograph(
     view, light
         Names of its camera and light.
     out, effort
-        As of `Asked`.
+        As of `RenderRequest`.
     calibration
         CALIBRATION/ folder.
 
@@ -217,7 +221,7 @@ def draw_photograph(
         The session holds no such photograph that the model has not seen.
     """
     drawing = _Drawing(out)
-    photographs = Photographs.of(session, subject.appearance, calibration=calibration)
+    photographs = HeldOutPhotographs.of(session, subject.appearance, calibration=calibration)
     shot = next((s for s in photographs.shots if (s.view, s.light) == (view, light)), None)
     if shot is None:
         some = ", ".join(f"{s.view} {s.light}" for s in photographs.shots[:8])
@@ -226,9 +230,9 @@ def draw_photograph(
             f"has not seen; there are {some}{' ...' if len(photographs.shots) > 8 else ''}"
         )
     camera, lamp = photographs.camera(shot), photographs.light(shot)
-    asked = Asked(camera, [lamp], out, effort, photographs.assumed)
+    asked = RenderRequest(camera, [lamp], out, effort, photographs.assumed)
     photo = photographs.photograph(shot).rgb.astype(np.float32)
-    seen = asked.rendered(subject.laid)
+    seen = asked.render(subject.surface)
     exposure = asked.exposure(seen)
     left = np.where(seen.coverage[..., None] > 0.5, photo - seen.diffuse, 0.0).astype(np.float32)
     images = {
@@ -239,14 +243,14 @@ def draw_photograph(
         "surface": seen.surface,
         "coverage": seen.coverage,
     }
-    pictures = {"components": sheet([component_panels(seen, exposure, photo)])}
+    pictures = {"components": encode_sheet([component_panels(seen, exposure, photo)])}
     told = {"kind": "components", "exposure": exposure, "held_out": shot.held_out}
     record = asked.record([subject], seen)
     return drawing.write(images, pictures, record, session=session, **told)
 
 
 def component_panels(
-    seen: Rendering, exposure: float, photograph: FloatArray | None = None
+    rendering: Rendering, exposure: float, photograph: FloatArray | None = None
 ) -> list[Panel]:
     """Return the panels of the paper's figure 12, those that need a photograph where there is one.
 
@@ -261,20 +265,22 @@ def component_panels(
     """
 
     def panel(label: str, image: FloatArray) -> Panel:
-        return Panel(label, tone(image, exposure))
+        return Panel(label, apply_tone_curve(image, exposure))
 
     out = [] if photograph is None else [panel("(a) photograph", photograph)]
-    out.append(panel("(b) light from inside", seen.diffuse))
+    out.append(panel("(b) light from inside", rendering.diffuse))
     if photograph is not None:
-        skin = seen.coverage[..., None] > 0.5
-        out.append(panel("(c) photograph less (b)", np.where(skin, photograph - seen.diffuse, 0.0)))
-    out.append(panel("(d) model", seen.radiance))
-    out.append(panel("(e) surface reflection", seen.surface))
+        skin = rendering.coverage[..., None] > 0.5
+        out.append(
+            panel("(c) photograph less (b)", np.where(skin, photograph - rendering.diffuse, 0.0))
+        )
+    out.append(panel("(d) model", rendering.radiance))
+    out.append(panel("(e) surface reflection", rendering.surface))
     return out
 
 
 def draw_bases(
-    subjects: Sequence[RenderModel], ranks: Sequence[int], asked: Asked
+    subjects: Sequence[RenderModel], ranks: Sequence[int], request: RenderRequest
 ) -> dict[str, Any]:
     """Render one view with models of several ranks, complete and the surface alone: figure 7.
 
@@ -293,9 +299,9 @@ def draw_bases(
     RenderingError
         No model has as many lobes as a rank.
     """
-    drawing = _Drawing(asked.out)
-    effort = asked.effort
-    models = {rank: _of_rank(subjects, rank, effort) for rank in ranks}
+    drawing = _Drawing(request.out)
+    effort = request.effort
+    models = {rank: _reduce_subjects(subjects, rank, effort) for rank in ranks}
     if not models:
         raise UsageError("--bases: got none, expected numbers of lobes, as 1,2,4")
     interiors: dict[int, Interior] = {}
@@ -308,31 +314,31 @@ def draw_bases(
         effort.progress(f"render with {rank} lobes")
         if effort.subsurface == "dipole" and id(subject) not in interiors:
             interiors[id(subject)] = Interior.of(laid)
-        seen = pictures[rank] = asked.rendered(laid, interiors.get(id(subject)))
-        exposure = exposure or asked.exposure(seen)
-        how = "fitted" if laid is subject.laid else f"reduced from {subject.model.lobes.size}"
-        rows[0].append(Panel(f"{rank} lobes, {how}", tone(seen.radiance, exposure)))
-        rows[1].append(Panel("surface reflection", tone(seen.surface, exposure)))
+        seen = pictures[rank] = request.render(laid, interiors.get(id(subject)))
+        exposure = exposure or request.exposure(seen)
+        how = "fitted" if laid is subject.surface else f"reduced from {subject.model.lobes.size}"
+        rows[0].append(Panel(f"{rank} lobes, {how}", apply_tone_curve(seen.radiance, exposure)))
+        rows[1].append(Panel("surface reflection", apply_tone_curve(seen.surface, exposure)))
         images |= {f"radiance_{rank}": seen.radiance, f"surface_{rank}": seen.surface}
     best = pictures[against].surface
     bases = [
         {
             "lobes": rank,
             "appearance": subject.path,
-            "refitted": laid is subject.laid,
-            f"surface_difference_from_{against}": _difference(
+            "refitted": laid is subject.surface,
+            f"surface_difference_from_{against}": _relative_difference(
                 pictures[rank].surface, best, pictures[rank].lit
             ),
         }
         for rank, (subject, laid) in models.items()
     ]
     told = {"kind": "bases", "exposure": exposure, "bases": bases}
-    record = asked.record(subjects, seen)
-    return drawing.write(images, {"bases": sheet(rows)}, record, **told)
+    record = request.record(subjects, seen)
+    return drawing.write(images, {"bases": encode_sheet(rows)}, record, **told)
 
 
 def draw_shadow_boundary(
-    subject: RenderModel, out: Path, effort: Effort, *, size_px: int
+    subject: RenderModel, out: Path, effort: RenderSettings, *, size_px: int
 ) -> dict[str, Any]:
     """Render a shadow's edge by the paper's two extremes of sigma_tr, on face and flat patch.
 
@@ -352,19 +358,21 @@ def draw_shadow_boundary(
     rows, widths = [], []
     images: dict[str, Float32Array] = {}
     for boundary in (
-        Boundary.on_face(subject.laid, size_px=size_px),
-        Boundary.on_plane(subject.model, size_px=size_px),
+        ShadowBoundary.on_face(subject.surface, size_px=size_px),
+        ShadowBoundary.on_plane(subject.model, size_px=size_px),
     ):
         row: list[Panel] = []
         exposure = effort.exposure
         for name, sigma in [*media.items(), ("without_spreading", None)]:
             effort.progress(f"render {boundary.name}, {name.replace('_', ' ')}")
-            seen = boundary.shown(sigma, subpixels=effort.subpixels)
-            exposure = exposure or exposure_of(seen.radiance, seen.coverage)
+            seen = boundary.render(sigma, subpixels=effort.subpixels)
+            exposure = exposure or choose_exposure(seen.radiance, seen.coverage)
             words = "without spreading"
             if sigma is not None:
                 words = "sigma_tr " + ", ".join(f"{value:.4g}" for value in sigma)
-            row.append(Panel(f"{boundary.name}, {words}", tone(seen.radiance, exposure)))
+            row.append(
+                Panel(f"{boundary.name}, {words}", apply_tone_curve(seen.radiance, exposure))
+            )
             images[f"{boundary.name.replace(' ', '_')}_{name}"] = seen.radiance
             rise = shadow.rise_mm(*shadow.profile(seen))
             skin = {"skin": boundary.name, "name": name}
@@ -382,25 +390,25 @@ def draw_shadow_boundary(
         "labels": "the paper's figures 17 and 18 say translucency, 1/sigma_tr, and print "
         "sigma_tr: here everything is labelled by sigma_tr",
     }
-    pictures = {"shadow_boundary": sheet(rows, title=title)}
+    pictures = {"shadow_boundary": encode_sheet(rows, title=title)}
     return drawing.write(images, pictures, subject.record(), **told)
 
 
-def _of_rank(
-    subjects: Sequence[RenderModel], rank: int, effort: Effort
+def _reduce_subjects(
+    subjects: Sequence[RenderModel], rank: int, effort: RenderSettings
 ) -> tuple[RenderModel, FittedSurface]:
     enough = [s for s in subjects if s.model.lobes.size >= rank]
     if not enough:
-        reduced(subjects[0].model, rank, rng=np.random.default_rng(effort.seed))
+        reduce_lobes(subjects[0].model, rank, rng=np.random.default_rng(effort.seed))
         raise RenderingError(f"bases: got {rank}, which no given model has")
     subject = min(enough, key=lambda s: s.model.lobes.size)
     if subject.model.lobes.size == rank:
-        return subject, subject.laid
-    model = reduced(subject.model, rank, rng=np.random.default_rng(effort.seed))
-    return subject, subject.laid.with_lobes(model)
+        return subject, subject.surface
+    model = reduce_lobes(subject.model, rank, rng=np.random.default_rng(effort.seed))
+    return subject, subject.surface.with_lobes(model)
 
 
-def _difference(one: Float32Array, other: Float32Array, lit: BoolArray) -> float:
+def _relative_difference(one: Float32Array, other: Float32Array, lit: BoolArray) -> float:
     """Return the mean absolute difference over the mean, on lit pixels; NaN without any."""
     if not lit.any() or not other[lit].mean() > 0.0:
         return float("nan")

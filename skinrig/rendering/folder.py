@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 
 from model import store
 from skinrig.arrays import Float32Array, UInt8Array
-from skinrig.console import plain
+from skinrig.atomic_file import replace_folder_atomically
+from skinrig.console import to_json_value
 from skinrig.drawing import png
 from skinrig.rendering.camera import RenderingError
-from skinrig.whole_file import whole_folder
 
 BRIGHT_SKIN_LEVEL: Final = 0.75
 """Linear value at which the brightest skin is shown."""
@@ -27,7 +27,7 @@ MARGIN_PX: Final = 8
 LABEL_PX: Final = 26
 
 
-def exposure_of(radiance: ArrayLike, coverage: ArrayLike) -> float:
+def choose_exposure(radiance: ArrayLike, coverage: ArrayLike) -> float:
     """Return the factor that puts the brightest skin at `BRIGHT_SKIN_LEVEL`; 1 if it is dark.
 
     Parameters
@@ -39,7 +39,7 @@ def exposure_of(radiance: ArrayLike, coverage: ArrayLike) -> float:
 
     Examples
     --------
-    >>> exposure_of(np.full((4, 4, 3), 0.25), np.ones((4, 4)))
+    >>> choose_exposure(np.full((4, 4, 3), 0.25), np.ones((4, 4)))
     3.0
     """
     light = np.asarray(radiance, np.float64).max(axis=-1)[np.asarray(coverage) > 0.5]
@@ -47,7 +47,7 @@ def exposure_of(radiance: ArrayLike, coverage: ArrayLike) -> float:
     return BRIGHT_SKIN_LEVEL / top if top > 0.0 else 1.0
 
 
-def tone(radiance: ArrayLike, exposure: float) -> UInt8Array:
+def apply_tone_curve(radiance: ArrayLike, exposure: float) -> UInt8Array:
     """Return a picture for a screen: linear up to `TONE_KNEE`, highlights pressed together above.
 
     Parameters
@@ -78,7 +78,7 @@ class Panel:
     """(H, W, 3)."""
 
 
-def sheet(rows: Sequence[Sequence[Panel]], *, title: str = "") -> bytes:
+def encode_sheet(rows: Sequence[Sequence[Panel]], *, title: str = "") -> bytes:
     """Return a PNG of labelled pictures beside each other, not resampled.
 
     Parameters
@@ -181,13 +181,13 @@ def write(
         See `check`.
     """
     check(out)
-    with whole_folder(out) as fresh:
+    with replace_folder_atomically(out) as fresh:
         for name, image in images.items():
             store.write_exr(fresh / f"{name}.exr", np.asarray(image, np.float32))
         for name, data in pictures.items():
             (fresh / f"{name}.png").write_bytes(data)
         files = sorted(path.name for path in fresh.iterdir())
-        record = plain({"schema": SCHEMA, **document, "out": out, "files": files})
+        record = to_json_value({"schema": SCHEMA, **document, "out": out, "files": files})
         text = json.dumps(record, indent=1, sort_keys=True, allow_nan=False)
         (fresh / DOCUMENT_FILE).write_text(text + "\n", encoding="utf-8")
     return dict(record)

@@ -41,7 +41,7 @@ class GeometryError(ValueError):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rows:
+class SurfacePointSamples:
     """What the maps hold at n points."""
 
     r_d: Float32Array
@@ -78,7 +78,7 @@ class FittedSurface:
     mesh: Mesh
     atlas: Atlas
     normals: Float32Array
-    carried: bool
+    is_transferred: bool
     _values: Float32Array
     _known: BoolArray
     """Texels with a surface and valid maps."""
@@ -137,7 +137,7 @@ class FittedSurface:
             )
         normals = np.asarray(model.normals, np.float32)
         if moved and rest is not None:
-            normals = carried_normals(normals, unwrap(rest, width), atlas)
+            normals = transfer_normals(normals, unwrap(rest, width), atlas)
         depth = np.asarray(model.translucency_mm, np.float32)
         # where nothing is known light must spread, too
         usual = np.median(depth[model.valid], axis=0)
@@ -146,7 +146,7 @@ class FittedSurface:
         width = np.maximum(*atlas.texel_mm())
         return FittedSurface(model, mesh, atlas, normals, moved, np.nan_to_num(values), both, width)
 
-    def of_medium(self, sigma_tr_per_mm: ArrayLike) -> FittedSurface:
+    def with_sigma_tr(self, sigma_tr_per_mm: ArrayLike) -> FittedSurface:
         """Return the same surface above a medium of one sigma_tr, three channels, 1/mm."""
         depth = (1.0 / np.asarray(sigma_tr_per_mm, np.float64)).astype(np.float32)
         spread_out = np.broadcast_to(depth, self.model.translucency_mm.shape).copy()
@@ -164,7 +164,9 @@ class FittedSurface:
         own = dataclasses.replace(self.model, lobes=model.lobes, weights=model.weights)
         return dataclasses.replace(self, model=own, _values=values.astype(np.float32))
 
-    def at(self, uv: Float32Array, position_mm: Float32Array, normal: Float32Array) -> Rows:
+    def at(
+        self, uv: Float32Array, position_mm: Float32Array, normal: Float32Array
+    ) -> SurfacePointSamples:
         """Look the maps up at points of the mesh.
 
         Bilinearly among valid texels of the same place. Where there are none, what is known around
@@ -189,14 +191,14 @@ class FittedSurface:
         measured = share > MIN_BLEND_WEIGHT
         lost = np.flatnonzero(~measured)
         if len(lost):
-            rows[lost], near = self._around(point[lost])
+            rows[lost], near = self._sample_neighbors(point[lost])
             measured[lost] = near
             far = lost[~near]
             rows[far, 3 + lobes : 6 + lobes] = normal[far]
         r_d, weights, normals, translucency = np.split(rows, (3, 3 + lobes, 6 + lobes), axis=-1)
-        return Rows(r_d, weights, unit(normals), translucency, measured)
+        return SurfacePointSamples(r_d, weights, normalize_vectors(normals), translucency, measured)
 
-    def _around(self, point: Float32Array) -> tuple[Float32Array, BoolArray]:
+    def _sample_neighbors(self, point: Float32Array) -> tuple[Float32Array, BoolArray]:
         """Return means of known texels around points, and where one is within its own width."""
         if not self._trees:
             every = np.flatnonzero(self._known)
@@ -223,7 +225,7 @@ class FittedSurface:
         return np.einsum("nk,nkc->nc", weight, values).astype(np.float32), near
 
 
-def carried_normals(normals: Float32Array, rest: Atlas, moved: Atlas) -> Float32Array:
+def transfer_normals(normals: Float32Array, rest: Atlas, moved: Atlas) -> Float32Array:
     """Return normals of relief on a surface after the surface has moved below it.
 
     Relief keeps its height: a normal turns by the inverse transpose of the change of the frame of
@@ -248,7 +250,7 @@ def carried_normals(normals: Float32Array, rest: Atlas, moved: Atlas) -> Float32
     >>> flat = build_mesh([[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0]], faces, uv)
     >>> turned = build_mesh([[0, 0, 0], [0, 0, -9], [0, 9, -9], [0, 9, 0]], faces, uv)
     >>> tilted = np.full((8, 8, 3), (0.6, 0.0, 0.8), np.float32)
-    >>> carried = carried_normals(tilted, unwrap(flat, 8), unwrap(turned, 8))
+    >>> carried = transfer_normals(tilted, unwrap(flat, 8), unwrap(turned, 8))
     >>> carried[4, 4].round(3).tolist()
     [0.800000011920929, 0.0, -0.6000000238418579]
     """
@@ -262,10 +264,10 @@ def carried_normals(normals: Float32Array, rest: Atlas, moved: Atlas) -> Float32
     # frames have their vectors as rows: inverse transpose of the change is after^-1 before
     slopes = np.einsum("hwij,hwj->hwi", before, normals.astype(np.float64))
     turned = np.linalg.solve(np.where(whole, after, np.eye(3)), slopes[..., None])[..., 0]
-    return np.where(good[..., None], unit(turned), normals).astype(np.float32)
+    return np.where(good[..., None], normalize_vectors(turned), normals).astype(np.float32)
 
 
-def own_mesh(appearance: SkinAppearance) -> Mesh:
+def read_own_mesh(appearance: SkinAppearance) -> Mesh:
     """Return the mesh that an appearance's maps lie on.
 
     Raises
@@ -319,14 +321,14 @@ def parse_mesh(data: bytes, name: str) -> Mesh:
             "those of the appearance's own mesh"
         )
     try:
-        return build_mesh(vertices, faces, np.clip(uv, *_rounding(np.asarray(uv))))
+        return build_mesh(vertices, faces, np.clip(uv, *_rounding_margin(np.asarray(uv))))
     except MeshFileError:
         raise
     except MeshError as error:
         raise MeshError(f"{name}: {error}") from error
 
 
-def unit(vectors: ArrayLike) -> Float32Array:
+def normalize_vectors(vectors: ArrayLike) -> Float32Array:
     """Return vectors at length 1, shape (..., 3), in float32; (0, 0, 1) for those of none."""
     given = np.asarray(vectors)
     length = np.linalg.norm(given, axis=-1, keepdims=True)
@@ -341,7 +343,7 @@ def _frames(atlas: Atlas) -> Float64Array:
     return wide.reshape(atlas.size, atlas.size, 3, 3).astype(np.float64)
 
 
-def _rounding(uv: FloatArray) -> tuple[float, float]:
+def _rounding_margin(uv: FloatArray) -> tuple[float, float]:
     """Return the range that rounded coordinates are put into; what is farther out stays wrong."""
     low, high = float(uv.min()), float(uv.max())
     return (0.0 if low > -1e-5 else low), (1.0 if high < 1.0 + 1e-5 else high)

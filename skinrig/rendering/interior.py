@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike
 
 from model.dipole import gather as dipole_gather
 from model.dipole.gather import SourceTree
-from model.skin_reflectance import transmitted
+from model.skin_reflectance import transmittance
 from rigsim.geometry.atlas import unwrap
 from rigsim.render import Caster, thread_count, visibility
 from skinrig.arrays import Float32Array, Float64Array, Int32Array
-from skinrig.rendering.geometry import FittedSurface, Rows
+from skinrig.rendering.geometry import FittedSurface, SurfacePointSamples
 from skinrig.rendering.lights import Light
 
 POINTS_PER_SIDE: Final = 2
@@ -33,7 +33,7 @@ class Lighting:
     samples: int
     """Points on the disc of a light that has a radius."""
 
-    def entering(
+    def entering_radiance(
         self,
         lamp: Light,
         position_mm: Float32Array,
@@ -61,7 +61,7 @@ class Lighting:
         seen : ndarray of float64, shape (n,)
             Share of the light that is seen; 0 where the point does not face it.
         """
-        towards, white = lamp.reach(position_mm)
+        towards, white = lamp.directions_and_irradiance(position_mm)
         cosine = np.einsum("nk,nk->n", normals.astype(np.float64), towards)
         faced = np.flatnonzero((cosine > 0.0) & (white > 0.0).any(axis=-1))
         seen = np.zeros(len(cosine))
@@ -72,7 +72,7 @@ class Lighting:
             self.shadows, place, normal, center, radius_mm=radius, samples=samples
         )
         arriving = white * (np.maximum(cosine, 0.0) * seen)[:, None]
-        return arriving * transmitted(cosine, eta)[:, None], arriving, towards, seen
+        return arriving * transmittance(cosine, eta)[:, None], arriving, towards, seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,7 +104,10 @@ class Interior:
 
     @staticmethod
     def of(
-        laid: FittedSurface, *, finer: int = 1, near: tuple[ArrayLike, float] | None = None
+        surface: FittedSurface,
+        *,
+        subdivisions: int = 1,
+        region: tuple[ArrayLike, float] | None = None,
     ) -> Interior:
         """Divide the skin into texels.
 
@@ -117,10 +120,14 @@ class Interior:
         near
             A place, mm, and a distance, mm, within which the skin is taken; None: all of it.
         """
-        atlas = laid.atlas if finer == 1 else unwrap(laid.mesh, laid.atlas.size * finer)
+        atlas = (
+            surface.atlas
+            if subdivisions == 1
+            else unwrap(surface.mesh, surface.atlas.size * subdivisions)
+        )
         chosen = atlas.covered
-        if near is not None:
-            place, far = np.asarray(near[0], np.float32), near[1]
+        if region is not None:
+            place, far = np.asarray(region[0], np.float32), region[1]
             chosen = chosen & (np.linalg.norm(atlas.position_mm - place, axis=-1) < far)
         rows, columns = np.nonzero(chosen)
         uv = np.stack([(columns + 0.5) / atlas.size, 1.0 - (rows + 0.5) / atlas.size], axis=-1)
@@ -129,15 +136,15 @@ class Interior:
         )
         across, along = across / np.float32(atlas.size), along / np.float32(atlas.size)
         area = np.linalg.norm(np.cross(across.astype(np.float64), along), axis=-1)
-        held = laid.at(uv.astype(np.float32), position, atlas.normal[chosen])
+        held = surface.at(uv.astype(np.float32), position, atlas.normal[chosen])
         tree = SourceTree.of(position, area)
-        return Interior(laid, position, across, along, held.normals, atlas.prim[chosen], tree)
+        return Interior(surface, position, across, along, held.normals, atlas.prim[chosen], tree)
 
-    def of_surface(self, laid: FittedSurface) -> Interior:
+    def with_surface(self, surface: FittedSurface) -> Interior:
         """Return the same pieces below other maps on the same mesh with the same normals."""
-        return replace(self, laid=laid)
+        return replace(self, laid=surface)
 
-    def entered(self, lighting: Lighting) -> Float64Array:
+    def compute_entered_flux(self, lighting: Lighting) -> Float64Array:
         """Return what passes the surface by the pieces, over what a white patch shows, (S, 3)."""
         faces = lighting.shadows.face_normals[self.prim]
         total = np.zeros((len(self.prim), 3))
@@ -149,19 +156,23 @@ class Interior:
             for v in offsets:
                 place = self.position_mm + u * self.across_mm + v * self.along_mm
                 for lamp in lighting.lamps:
-                    light = lighting.entering(lamp, place, faces, self.normals, eta)[0]
+                    light = lighting.entering_radiance(lamp, place, faces, self.normals, eta)[0]
                     total += light / points**2
         return total
 
-    def leaving(
-        self, entered: Float64Array, position_mm: Float32Array, rows: Rows, entered_at: Float64Array
+    def compute_exitant_flux(
+        self,
+        entered: Float64Array,
+        position_mm: Float32Array,
+        rows: SurfacePointSamples,
+        entered_at: Float64Array,
     ) -> Float64Array:
         """Return what comes back to the surface from inside at points, before it leaves, (n, 3).
 
         Parameters
         ----------
         entered
-            By the pieces, see `entered`.
+            By the pieces, see `compute_entered_flux`.
         position_mm, rows
             Points, shape (n, 3), and what the maps hold there.
         entered_at

@@ -66,7 +66,7 @@ class Light:
         for name in ("intensity", "position_mm", "direction", "axis"):
             given = getattr(self, name)
             if given is not None:
-                object.__setattr__(self, name, _three(self.name, name, given))
+                object.__setattr__(self, name, _check_triple(self.name, name, given))
         if min(self.intensity) < 0.0:
             raise LightError(f"light {self.name!r}: got intensity {self.intensity}, expected >= 0")
         if not 0.0 <= self.radius < (math.inf if self.direction is None else 0.7):
@@ -92,7 +92,7 @@ class Light:
                 object.__setattr__(self, "axis", _unit(self.name, "axis", inward))
 
     @staticmethod
-    def of_table(table: LightTable, name: str, *, radius_mm: float) -> Light:
+    def from_table(table: LightTable, name: str, *, radius_mm: float) -> Light:
         """Return a calibrated light; renderings then have the unit of the images.
 
         Parameters
@@ -112,19 +112,19 @@ class Light:
         row = table.names.index(one_of("light", name, table.names, LightError))
         if not table.valid[row]:
             raise LightError(f"light {name!r}: is dead, or its calibration is not valid")
-        place = _three(name, "position_mm", table.position_mm[row])
+        place = _check_triple(name, "position_mm", table.position_mm[row])
         away = math.hypot(*place)
         return Light(
             name=name,
             position_mm=place,
             radius=radius_mm,
             reference_mm=away,
-            intensity=_three(name, "intensity", table.intensity[row] / away**2),
-            axis=_three(name, "axis", table.axis[row]),
+            intensity=_check_triple(name, "intensity", table.intensity[row] / away**2),
+            axis=_check_triple(name, "axis", table.axis[row]),
             exponent=float(table.exponent[row]),
         )
 
-    def reach(self, points_mm: ArrayLike) -> tuple[Float64Array, Float64Array]:
+    def directions_and_irradiance(self, points_mm: ArrayLike) -> tuple[Float64Array, Float64Array]:
         """Return the directions to the light and what a white that faces it would show.
 
         Parameters
@@ -192,16 +192,16 @@ class Light:
         for place in places:
             fields: dict[str, object] = {"radius": self.radius / math.sqrt(count)}
             if self.direction is not None:
-                fields["direction"] = _three(self.name, "direction", place)
+                fields["direction"] = _check_triple(self.name, "direction", place)
             else:
-                fields |= {"position_mm": _three(self.name, "position_mm", place)}
+                fields |= {"position_mm": _check_triple(self.name, "position_mm", place)}
                 fields |= {"reference_mm": self._reference}
             out.append(dataclasses.replace(self, intensity=share, **fields))  # type: ignore[arg-type]
         return tuple(out)
 
 
-def _three(owner: str, name: str, given: ArrayLike) -> Vector:
-    values = np.asarray(given, np.float64)
+def _check_triple(owner: str, name: str, triple: ArrayLike) -> Vector:
+    values = np.asarray(triple, np.float64)
     if values.shape != (3,) or not np.isfinite(values).all():
         raise LightError(
             f"light {owner!r}: got {name} {values.tolist()}, expected three finite numbers"
@@ -210,11 +210,11 @@ def _three(owner: str, name: str, given: ArrayLike) -> Vector:
     return x, y, z
 
 
-def _unit(owner: str, name: str, given: Vector) -> Vector:
-    length = math.hypot(*given)
+def _unit(owner: str, name: str, vector: Vector) -> Vector:
+    length = math.hypot(*vector)
     if not length > 0.0:
-        raise LightError(f"light {owner!r}: got {name} {given}, expected a direction")
-    return given[0] / length, given[1] / length, given[2] / length
+        raise LightError(f"light {owner!r}: got {name} {vector}, expected a direction")
+    return vector[0] / length, vector[1] / length, vector[2] / length
 
 
 MAX_LIGHT_RADIUS_RAD: Final = 0.35
@@ -304,8 +304,8 @@ def environment_lights(
     return tuple(
         Light(
             name="environment",
-            direction=_three("environment", "direction", towards.reshape(-1, 3)[pixel[k]]),
-            intensity=_three("environment", "intensity", color[k]),
+            direction=_check_triple("environment", "direction", towards.reshape(-1, 3)[pixel[k]]),
+            intensity=_check_triple("environment", "intensity", color[k]),
             radius=float(radius[k]),
             divisible=False,
         )

@@ -11,7 +11,7 @@ POINTS_PER_THREAD_BLOCK: Final = 1 << 12
 
 
 @njit(parallel=True, cache=True)
-def look_up(values, known, place, width, uv, point, out, share):  # type: ignore[no-untyped-def]
+def look_up(values, valid, position, width, uv, point, out, total_weight):  # type: ignore[no-untyped-def]
     """Blend the four texels around texture coordinates, without those of other places.
 
     Charts lie close together in a texture: the texels around a point near a chart's rim, or in a
@@ -21,19 +21,19 @@ def look_up(values, known, place, width, uv, point, out, share):  # type: ignore
     ----------
     values : float32 (H, W, C)
         Row 0 is at v = 1.
-    known : bool (H, W)
+    valid : bool (H, W)
         Texels that hold something.
-    place : float32 (H, W, 3)
+    position : float32 (H, W, 3)
         Surface point of each texel, mm.
     width : float32 (H, W)
         Longer side of the texel on the surface, mm.
     uv : float32 (n, 2)
         Texture coordinates.
     point : float32 (n, 3)
-        Surface points, mm, in the frame of `place`.
+        Surface points, mm, in the frame of `position`.
     out : float32 (n, C)
         Blends; 0 where no texel counts.
-    share : float32 (n,)
+    total_weight : float32 (n,)
         Sum of the weights of those that count, 0 to 1.
     """
     rows, columns, channels = values.shape
@@ -50,18 +50,18 @@ def look_up(values, known, place, width, uv, point, out, share):  # type: ignore
                 out[i, k] = 0.0
             for corner in range(4):
                 r, c = row + corner // 2, column + corner % 2
-                if not known[r, c]:
+                if not valid[r, c]:
                     continue
                 weight = (fy if corner // 2 else 1.0 - fy) * (fx if corner % 2 else 1.0 - fx)
                 away = 0.0
                 for k in range(3):
-                    away += (place[r, c, k] - point[i, k]) ** 2
+                    away += (position[r, c, k] - point[i, k]) ** 2
                 if weight <= 0.0 or away > (MAX_TEXEL_DISTANCE * width[r, c]) ** 2:
                     continue
                 total += weight
                 for k in range(channels):
                     out[i, k] += np.float32(weight) * values[r, c, k]
-            share[i] = total
+            total_weight[i] = total
             if total > 0.0:
                 for k in range(channels):
                     out[i, k] /= np.float32(total)

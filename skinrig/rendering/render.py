@@ -20,14 +20,14 @@ from typing import Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from model.skin_reflectance import lobe_brdf, transmitted
+from model.skin_reflectance import lobe_brdf, transmittance
 from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.render import Caster, GBuffer, trace
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.errors import one_of
 from skinrig.rendering import camera as rendering_camera
 from skinrig.rendering.camera import Camera, RenderingError
-from skinrig.rendering.geometry import FittedSurface, Rows
+from skinrig.rendering.geometry import FittedSurface, SurfacePointSamples
 from skinrig.rendering.interior import Interior, Lighting
 from skinrig.rendering.lights import Light
 
@@ -79,8 +79,8 @@ class Rendering:
     subsurface: Subsurface
 
 
-def render(
-    laid: FittedSurface,
+def render_surface(
+    surface: FittedSurface,
     camera: Camera,
     lights: Light | Sequence[Light],
     *,
@@ -134,12 +134,16 @@ def render(
     one_of("subsurface", subsurface, get_args(Subsurface), RenderingError)
     if shadow_samples < 1:
         raise RenderingError(f"shadow samples: got {shadow_samples}, expected at least 1")
-    rays = Caster(laid.mesh) if caster is None else caster
-    shadows = rays if blockers is None else Caster(joined(laid.mesh, blockers), choice=rays.choice)
+    rays = Caster(surface.mesh) if caster is None else caster
+    shadows = (
+        rays
+        if blockers is None
+        else Caster(join_meshes(surface.mesh, blockers), choice=rays.choice)
+    )
     columns, height = camera.image_size
     lighting = Lighting(lamps, shadows, shadow_samples)
-    inside = _inside(laid, subsurface, lighting, interior)
-    film = _Film(height, columns)
+    inside = _subsurface_radiance(surface, subsurface, lighting, interior)
+    film = _PixelAccumulator(height, columns)
     out = met = 0
     band = max(1, BAND_RAYS // (columns * subpixels**2))
     for top in range(0, height, band):
@@ -148,8 +152,8 @@ def render(
         facing = np.einsum("hwk,hwk->hw", buffers.face_normal, buffers.to_camera) > 0.0
         index = np.flatnonzero(buffers.mask & facing)
         out, met = out + len(index), met + int(np.count_nonzero(buffers.mask))
-        points = _Points.of(laid, buffers, index)
-        shaded = _shade(points, lighting, laid, inside)
+        points = _Points.of(surface, buffers, index)
+        shaded = _shade(points, lighting, surface, inside)
         film.put(part, subpixels, index, points, shaded)
         if progress is not None and part[1] < height:
             progress(f"render: {100 * part[1] // height} %")
@@ -160,7 +164,7 @@ def render(
     return Rendering(*light, film.coverage, *masks, film.uv, subsurface)
 
 
-def joined(*meshes: Mesh) -> Mesh:
+def join_meshes(*meshes: Mesh) -> Mesh:
     """Return meshes as one, for shadows."""
     starts = np.cumsum([0, *(len(mesh.vertices_mm) for mesh in meshes[:-1])])
     return build_mesh(
@@ -179,17 +183,17 @@ class _Points:
     face_normal: Float32Array
     view: Float32Array
     uv: Float32Array
-    rows: Rows
+    rows: SurfacePointSamples
 
     @staticmethod
-    def of(laid: FittedSurface, buffers: GBuffer, index: NDArray[np.intp]) -> _Points:
+    def of(surface: FittedSurface, buffers: GBuffer, index: NDArray[np.intp]) -> _Points:
         """Gather the rows of a G-buffer that count, and look the maps up there."""
 
         def flat(image: Float32Array) -> Float32Array:
             return image.reshape(-1, image.shape[-1])[index]
 
         uv, position = flat(buffers.uv), flat(buffers.position_mm)
-        rows = laid.at(uv, position, flat(buffers.normal))
+        rows = surface.at(uv, position, flat(buffers.normal))
         return _Points(position, flat(buffers.face_normal), flat(buffers.to_camera), uv, rows)
 
 
@@ -217,7 +221,7 @@ def _require_outside(out: int, inside: int, camera: Camera) -> None:
         )
 
 
-class _Film:
+class _PixelAccumulator:
     """Pixels that rays are averaged into."""
 
     def __init__(self, height: int, width: int) -> None:
@@ -258,23 +262,25 @@ class _Film:
             mask[rows] = (some & (total(good) == count)).reshape(tall, width)
 
 
-def _inside(
-    laid: FittedSurface, subsurface: Subsurface, lighting: Lighting, interior: Interior | None
+def _subsurface_radiance(
+    surface: FittedSurface, subsurface: Subsurface, lighting: Lighting, interior: Interior | None
 ) -> Callable[[_Points, Float64Array], Float64Array]:
     """Return what gives the light that comes from inside at points, of what enters there."""
     if subsurface == "none":
         return lambda points, entered: np.zeros_like(entered)
     if subsurface == "local":
         return lambda points, entered: entered * points.rows.r_d
-    below = Interior.of(laid) if interior is None else interior
-    light = below.entered(lighting)
-    return lambda points, entered: below.leaving(light, points.position_mm, points.rows, entered)
+    below = Interior.of(surface) if interior is None else interior
+    light = below.compute_entered_flux(lighting)
+    return lambda points, entered: below.compute_exitant_flux(
+        light, points.position_mm, points.rows, entered
+    )
 
 
 def _shade(
     points: _Points,
     lighting: Lighting,
-    laid: FittedSurface,
+    fitted_surface: FittedSurface,
     inside: Callable[[_Points, Float64Array], Float64Array],
 ) -> _Shaded:
     """Return what points send to the camera by all lights."""
@@ -285,14 +291,14 @@ def _shade(
     cos_view = np.einsum("nk,nk->n", rows.normals, points.view, dtype=np.float64)
     position, faces, normals = points.position_mm, points.face_normal, rows.normals
     for lamp in lighting.lamps:
-        through, arriving, towards, seen = lighting.entering(
-            lamp, position, faces, normals, laid.model.eta
+        through, arriving, towards, seen = lighting.entering_radiance(
+            lamp, position, faces, normals, fitted_surface.model.eta
         )
         entered += through
         lit |= seen >= MIN_LIT_FRACTION
         shown = np.flatnonzero((seen > 0.0) & (cos_view > 0.0))
         at = rows.weights[shown], towards[shown], points.view[shown], normals[shown]
-        lobe = lobe_brdf(laid.model.lobes, *at)
+        lobe = lobe_brdf(fitted_surface.model.lobes, *at)
         surface[shown] += np.pi * lobe[:, None] * arriving[shown]
-    leaving = transmitted(cos_view, laid.model.eta)[:, None]
+    leaving = transmittance(cos_view, fitted_surface.model.eta)[:, None]
     return _Shaded(leaving * inside(points, entered), surface, lit & (cos_view > 0.0))

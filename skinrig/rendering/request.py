@@ -70,24 +70,26 @@ class RenderRig:
         UnusableError
             The rig has no view of that name.
         """
-        place = numbers(text)
+        place = parse_triple(text)
         if place is not None:
-            target = numbers(target_mm)
+            target = parse_triple(target_mm)
             if target is None:
                 raise UsageError(f"--target: got {target_mm!r}, expected three numbers, mm: 0,0,0")
-            return rendering_camera.looking_at(
+            return rendering_camera.look_at(
                 place, target_mm=target, fov_deg=fov_deg, size_px=(size_px, size_px), name=text
             )
         try:
             view = self.rig.view(text)
         except RigError as error:
-            raise _unread(text)(f"--view: {error}; or give a place in mm, as 0,0,700") from error
+            raise _unreadable_error(text)(
+                f"--view: {error}; or give a place in mm, as 0,0,700"
+            ) from error
         camera = Camera.nominal(view)
         found = self._calibration("geometry", f"camera {text} stands as the rig's file draws it")
         if found is not None:
-            camera = geometry.poses_from(found, self.rig.subset(views=[text]))[text]
+            camera = geometry.cameras_from_calibration(found, self.rig.subset(views=[text]))[text]
         camera = dataclasses.replace(camera, serial=text)
-        return rendering_camera.binned(camera, camera.image_size[0] / size_px)
+        return rendering_camera.bin_pixels(camera, camera.image_size[0] / size_px)
 
     def light(self, text: str, *, radius_mm: float | None = None) -> Light:
         """Return a light: ``L017``, ``1,1,2`` (towards it) or ``at:300,200,600`` (mm).
@@ -113,17 +115,17 @@ class RenderRig:
         strength = (1.0, 1.0, 1.0) if not factor else _color(text, factor)
         radius = LED_RADIUS_MM if radius_mm is None else radius_mm
         if what.startswith(POSITION_PREFIX):
-            place = numbers(what.removeprefix(POSITION_PREFIX))
+            place = parse_triple(what.removeprefix(POSITION_PREFIX))
             if place is not None:
                 return Light(name=text, position_mm=place, intensity=strength, radius=radius)
-        direction = numbers(what)
+        direction = parse_triple(what)
         if direction is not None:
             far = radius / LED_DISTANCE_MM
             return Light(name=text, direction=direction, intensity=strength, radius=far)
         try:
             drawn = self.rig.light(what)
         except RigError as error:
-            raise _unread(what)(
+            raise _unreadable_error(what)(
                 f"--light: {error}; or give a direction, as 1,1,2, or a place in mm, as "
                 "at:300,200,600"
             ) from error
@@ -132,7 +134,7 @@ class RenderRig:
         found = self._calibration("lights", f"light {what} stands as the rig's file draws it")
         if found is not None:
             table = LightTable.from_calibration(found, rig)
-        lamp = Light.of_table(
+        lamp = Light.from_table(
             table, what, radius_mm=drawn.radius_mm if radius_mm is None else radius_mm
         )
         return dataclasses.replace(lamp, name=text, intensity=strength)
@@ -148,8 +150,8 @@ class RenderRig:
         return None
 
 
-def lights_of(
-    stage: RenderRig,
+def parse_lights(
+    rig: RenderRig,
     lights: Sequence[str],
     *,
     radius_mm: float | None,
@@ -164,7 +166,7 @@ def lights_of(
     UsageError
         There is none.
     """
-    found = [stage.light(text, radius_mm=radius_mm) for text in lights]
+    found = [rig.light(text, radius_mm=radius_mm) for text in lights]
     if environment is not None:
         rng = np.random.default_rng(seed)
         try:
@@ -201,10 +203,12 @@ def read_model(
     appearance = store.read(path)
     if translucency is None:
         return appearance, assemble(appearance)
-    return appearance, assemble(appearance, translucency=1.0 / np.array(sigma_of(translucency)))
+    return appearance, assemble(
+        appearance, translucency=1.0 / np.array(parse_sigma_tr(translucency))
+    )
 
 
-def sigma_of(text: str) -> Vector:
+def parse_sigma_tr(text: str) -> Vector:
     """Return sigma_tr of three channels, 1/mm.
 
     Raises
@@ -214,10 +218,10 @@ def sigma_of(text: str) -> Vector:
 
     Examples
     --------
-    >>> sigma_of("0.3558,0.7932,1.5173")
+    >>> parse_sigma_tr("0.3558,0.7932,1.5173")
     (0.3558, 0.7932, 1.5173)
     """
-    found = numbers(text)
+    found = parse_triple(text)
     if found is None or min(found) <= 0.0:
         raise UsageError(
             f"--translucency: got {text!r}, expected sigma_tr of red, green and blue in 1/mm, "
@@ -226,7 +230,7 @@ def sigma_of(text: str) -> Vector:
     return found
 
 
-def subpixels_of(samples: int) -> int:
+def parse_subpixels(samples: int) -> int:
     """Return rays along a pixel's side, of rays in a pixel.
 
     Raises
@@ -236,7 +240,7 @@ def subpixels_of(samples: int) -> int:
 
     Examples
     --------
-    >>> subpixels_of(4)
+    >>> parse_subpixels(4)
     2
     """
     side = round(samples**0.5) if samples > 0 else 0
@@ -245,7 +249,7 @@ def subpixels_of(samples: int) -> int:
     return side
 
 
-def numbers(text: str) -> Vector | None:
+def parse_triple(text: str) -> Vector | None:
     """Return three finite numbers joined by commas, or None where the text is something else."""
     try:
         values = [float(part) for part in text.split(",")]
@@ -257,13 +261,13 @@ def numbers(text: str) -> Vector | None:
     return x, y, z
 
 
-def _unread(text: str) -> type[UsageError] | type[UnusableError]:
+def _unreadable_error(text: str) -> type[UsageError] | type[UnusableError]:
     """Return what to raise for a text that is no name: numbers are joined by commas."""
     return UsageError if "," in text else UnusableError
 
 
 def _color(text: str, factor: str) -> Vector:
-    found = numbers(factor) or numbers(",".join([factor] * 3))
+    found = parse_triple(factor) or parse_triple(",".join([factor] * 3))
     if found is None or min(found) < 0.0:
         raise UsageError(
             f"--light: got {text!r}, expected after * one number or three, at least 0, as "

@@ -26,7 +26,7 @@ from skinrig.rendering.camera import Camera, RenderingError
 from skinrig.rendering.geometry import FittedSurface
 from skinrig.rendering.interior import Interior
 from skinrig.rendering.lights import Light, Vector
-from skinrig.rendering.render import Rendering, render
+from skinrig.rendering.render import Rendering, render_surface
 
 MIN_SIGMA_TR_PER_MM: Final = (0.3558, 0.7932, 1.5173)
 MAX_SIGMA_TR_PER_MM: Final = (0.9171, 1.5682, 1.6569)
@@ -51,11 +51,11 @@ FOREHEAD_SITE: Final = (0.12, 0.72)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Boundary:
+class ShadowBoundary:
     """A piece of skin half in the shadow of a card; the lit side is on the left."""
 
     name: str
-    laid: FittedSurface
+    surface: FittedSurface
     camera: Camera
     light: Light
     card: Mesh
@@ -64,7 +64,7 @@ class Boundary:
     interior: Interior
 
     @staticmethod
-    def on_face(laid: FittedSurface, *, size_px: int) -> Boundary:
+    def on_face(surface: FittedSurface, *, size_px: int) -> ShadowBoundary:
         """Put the shadow on the forehead of a face.
 
         Raises
@@ -72,8 +72,8 @@ class Boundary:
         RenderingError
             Nothing of the mesh is there.
         """
-        caster = Caster(laid.mesh)
-        low, high = laid.mesh.vertices_mm.min(axis=0), laid.mesh.vertices_mm.max(axis=0)
+        caster = Caster(surface.mesh)
+        low, high = surface.mesh.vertices_mm.min(axis=0), surface.mesh.vertices_mm.max(axis=0)
         span = high - low
         x = 0.5 * (low[0] + high[0]) + FOREHEAD_SITE[0] * span[0]
         y = low[1] + FOREHEAD_SITE[1] * span[1]
@@ -81,15 +81,15 @@ class Boundary:
         prim, share = caster.first_hit(origin, [[0.0, 0.0, -1.0]])
         if prim[0] < 0:
             raise RenderingError(f"mesh: nothing at x {x:.0f}, y {y:.0f} mm to cast a shadow on")
-        corners = laid.mesh.vertices_mm[laid.mesh.faces[prim[0]]].astype(np.float64)
+        corners = surface.mesh.vertices_mm[surface.mesh.faces[prim[0]]].astype(np.float64)
         one, two = (float(w) for w in share[0])
         target = np.array([1.0 - one - two, one, two]) @ corners
         normal = caster.face_normals[prim[0]].astype(np.float64)
-        finer = max(1, FACE_TEXELS // laid.atlas.size)
-        return _boundary("face", laid, caster, target, normal, size_px, finer=finer)
+        finer = max(1, FACE_TEXELS // surface.atlas.size)
+        return _boundary("face", surface, caster, target, normal, size_px, subdivisions=finer)
 
     @staticmethod
-    def on_plane(model: SkinReflectance, *, size_px: int) -> Boundary:
+    def on_plane(model: SkinReflectance, *, size_px: int) -> ShadowBoundary:
         """Put the shadow on a flat patch of a model's median skin."""
         corners = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
         mesh = build_mesh(PATCH_MM * corners, [[0, 1, 2], [0, 2, 3]], corners[:, :2] + 0.5)
@@ -109,10 +109,12 @@ class Boundary:
         up = np.array([0.0, 0.0, 1.0])
         return _boundary("flat patch", laid, Caster(mesh), np.zeros(3), up, size_px)
 
-    def shown(self, sigma_tr_per_mm: Vector | None, *, subpixels: int = 2) -> Rendering:
+    def render(self, sigma_tr_per_mm: Vector | None, *, subpixels: int = 2) -> Rendering:
         """Render it above a medium; None: light leaves where it entered."""
-        laid = self.laid if sigma_tr_per_mm is None else self.laid.of_medium(sigma_tr_per_mm)
-        return render(
+        laid = (
+            self.surface if sigma_tr_per_mm is None else self.surface.with_sigma_tr(sigma_tr_per_mm)
+        )
+        return render_surface(
             laid,
             self.camera,
             self.light,
@@ -120,20 +122,20 @@ class Boundary:
             subpixels=subpixels,
             blockers=self.card,
             caster=self.caster,
-            interior=self.interior.of_surface(laid),
+            interior=self.interior.with_surface(laid),
         )
 
 
 def _boundary(
     name: str,
-    laid: FittedSurface,
+    surface: FittedSurface,
     caster: Caster,
     target: Float64Array,
     normal: Float64Array,
     size_px: int,
     *,
-    finer: int = 1,
-) -> Boundary:
+    subdivisions: int = 1,
+) -> ShadowBoundary:
     """Put camera, light and card around a point of the skin."""
     up = np.array([0.0, 1.0, 0.0]) - normal[1] * normal
     up /= np.linalg.norm(up)
@@ -141,7 +143,7 @@ def _boundary(
     span = 2.0 * math.atan(0.5 * BOUNDARY_WIDTH_MM / CAMERA_DISTANCE_MM)
     size, fov = (size_px, size_px // 2), math.degrees(span)
     eye = target + CAMERA_DISTANCE_MM * normal
-    camera = rendering_camera.looking_at(
+    camera = rendering_camera.look_at(
         eye, target_mm=target, up=up, fov_deg=fov, size_px=size, name=name
     )
     towards = math.cos(LIGHT_SLANT_RAD) * normal - math.sin(LIGHT_SLANT_RAD) * right
@@ -151,22 +153,22 @@ def _boundary(
     card = build_mesh(corners, [[0, 1, 2], [0, 2, 3]], np.zeros((4, 2)))
     x, y, z = towards.tolist()
     light = Light(name="card", direction=(x, y, z), radius=SHADOW_LIGHT_RADIUS_RAD)
-    below = Interior.of(laid, finer=finer, near=(target, MAX_ENTRY_DISTANCE_MM))
-    return Boundary(name, laid, camera, light, card, caster, below)
+    below = Interior.of(surface, subdivisions=subdivisions, region=(target, MAX_ENTRY_DISTANCE_MM))
+    return ShadowBoundary(name, surface, camera, light, card, caster, below)
 
 
-def profile(seen: Rendering) -> tuple[Float64Array, Float64Array]:
+def profile(rendering: Rendering) -> tuple[Float64Array, Float64Array]:
     """Return places across the boundary in mm, (W,), and light from inside there, (W, 3).
 
     The mean over the middle half of the rows; the lit side is at negative places.
     """
-    height, width = seen.coverage.shape
-    rows = seen.diffuse[height // 4 : height - height // 4].astype(np.float64)
+    height, width = rendering.coverage.shape
+    rows = rendering.diffuse[height // 4 : height - height // 4].astype(np.float64)
     place = (np.arange(width) - 0.5 * (width - 1)) * BOUNDARY_WIDTH_MM / width
     return place, rows.mean(axis=0)
 
 
-def rise_mm(place_mm: Float64Array, level: Float64Array) -> Float64Array:
+def rise_mm(position_mm: Float64Array, level: Float64Array) -> Float64Array:
     """Return how far apart 90 % and 10 % of the fall from light to shadow lie, mm, (3,).
 
     Parameters
@@ -188,6 +190,6 @@ def rise_mm(place_mm: Float64Array, level: Float64Array) -> Float64Array:
     found = []
     for channel in range(level.shape[1]):
         falling = np.minimum.accumulate(share[:, channel])
-        at = [np.interp(-part, -falling, place_mm) for part in (0.9, 0.1)]
+        at = [np.interp(-part, -falling, position_mm) for part in (0.9, 0.1)]
         found.append(at[1] - at[0])
     return np.array(found)

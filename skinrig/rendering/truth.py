@@ -106,12 +106,12 @@ def _lobe(
 ) -> Float64Array:
     packed = np.array([0.0, 0.0, 0.0, roughness, oil, fuzz, 1.0], np.float32)
     up = np.array([0.0, 0.0, 1.0], np.float32)
-    to_light, to_view = (_raised(w.reshape(-1, 3)) for w in (light, view))
-    found = surface_brdf.evaluate(packed, up, to_light, to_view)[1]
+    to_light, to_view = (_above_horizon(w.reshape(-1, 3)) for w in (light, view))
+    found = surface_brdf.evaluate_brdf(packed, up, to_light, to_view)[1]
     return np.asarray(found.reshape(light.shape[:-1]), np.float64)
 
 
-def _raised(directions: Float64Array) -> Float32Array:
+def _above_horizon(directions: Float64Array) -> Float32Array:
     """Return directions above the horizon, where hair would glow without end."""
     up = np.maximum(directions[:, 2:], MIN_TABLE_COSINE)
     across = np.linalg.norm(directions[:, :2], axis=-1, keepdims=True)

@@ -18,7 +18,7 @@ class ReportError(ValueError):
 
 
 @dataclass(slots=True)
-class Findings:
+class ReportInputs:
     """What lies at the paths of a report."""
 
     appearances: dict[str, Path] = field(default_factory=dict)
@@ -31,16 +31,16 @@ class Findings:
     """JSON documents of commands: benchmarks and the demo's own."""
 
     @property
-    def empty(self) -> bool:
+    def is_empty(self) -> bool:
         """Whether there is nothing to tell of."""
         return not (self.appearances or self.sessions or self.documents or self.pictures)
 
-    def words(self) -> str:
+    def summary(self) -> str:
         """Return what there is, in a sentence.
 
         Examples
         --------
-        >>> Findings(sessions=[Path("one")], truths={"truth": Path("truth")}).words()
+        >>> ReportInputs(sessions=[Path("one")], truths={"truth": Path("truth")}).words()
         'About 1 truth and 1 session.'
         """
         kinds = (
@@ -56,10 +56,10 @@ class Findings:
             "About "
             + (" and ".join([", ".join(told[:-1]), told[-1]]) if told[1:] else told[0])
             + "."
-            + self._of_whom()
+            + self._describe_source()
         )
 
-    def _of_whom(self) -> str:
+    def _describe_source(self) -> str:
         """Return whether people or a simulation were captured, as far as the folders say so."""
         sources = []
         for path in (*self.appearances.values(), *self.sessions):
@@ -75,13 +75,13 @@ class Findings:
             return f" {simulated} of the {len(sources)} sets of maps and sessions are simulated."
         return " None of it is simulated."
 
-    def truth_of(self, appearance: SkinAppearance) -> SkinAppearance | None:
+    def find_truth(self, appearance: SkinAppearance) -> SkinAppearance | None:
         """Return the truth that an appearance names, where it was found."""
         path = self.truths.get(str(appearance.parameters.get("truth", "")))
         return store.read(path) if path else None
 
 
-def discover(paths: Sequence[Path]) -> Findings:
+def discover(paths: Sequence[Path]) -> ReportInputs:
     """Find appearances, truths, calibrations, sessions and documents at or below ``paths``.
 
     Raises
@@ -89,15 +89,15 @@ def discover(paths: Sequence[Path]) -> Findings:
     ReportError
         When a path does not exist, or nothing is found at all.
     """
-    found = Findings()
+    found = ReportInputs()
     for path in paths:
         if not path.exists():
             raise ReportError(f"{path}: does not exist; give a folder that skinrig wrote")
         below = [path, *sorted(path.iterdir())] if path.is_dir() else [path]
         for entry in below:
             if not entry.name.startswith("."):
-                _sort_in(entry, found)
-    if found.empty:
+                _classify_entry(entry, found)
+    if found.is_empty:
         raise ReportError(
             f"{', '.join(map(str, paths))}: holds no session, appearance or benchmark; "
             "`skinrig demo` makes all of them"
@@ -105,7 +105,7 @@ def discover(paths: Sequence[Path]) -> Findings:
     return found
 
 
-def _sort_in(entry: Path, found: Findings) -> None:
+def _classify_entry(entry: Path, found: ReportInputs) -> None:
     if entry.is_file() and entry.suffix == ".json" and entry.name != store.DOCUMENT_FILE:
         if (entry.parent / store.DOCUMENT_FILE).is_file():
             return  # of the appearance itself, which its section shows

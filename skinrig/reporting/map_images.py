@@ -10,7 +10,7 @@ from skinrig.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 from skinrig.drawing import png
 from skinrig.reporting import page
 from skinrig.reporting.page import number
-from skinrig.written_units import written
+from skinrig.unit_format import format_quantity
 
 SCALE_COLORS = 128
 """Colors of a map's picture: it tells a value to 1/128 of its scale."""
@@ -46,7 +46,7 @@ class MapDrawing:
     valid: BoolArray | None = None
     width: int = 280
 
-    def scalar(
+    def draw_scalar(
         self, title: str, values: FloatArray, low: float, high: float, scale: str = "viridis"
     ) -> page.Image:
         """Return an image of values, (H, W), by a color scale between its ends.
@@ -57,18 +57,18 @@ class MapDrawing:
         mask = None if self.valid is None else shrink(self.valid, self.width).astype(bool)
         data = png.Scale(low, high, scale).encode(small, mask, levels=SCALE_COLORS)
         named = f"{self.of}, {title}" if self.of else title
-        scale_words = f"color scale {number(low)} to {written(number(high), self.unit)}"
-        alt = f"{named}: {_told(small, mask, self.unit)}; {scale_words}"
+        scale_words = f"color scale {number(low)} to {format_quantity(number(high), self.unit)}"
+        alt = f"{named}: {_describe_values(small, mask, self.unit)}; {scale_words}"
         bar = page.ColorScale(png.SCALE_CLASSES[scale], number(low), number(high), self.unit)
-        return _stored(title, data, alt, small.shape, bar)
+        return _build_image(title, data, alt, small.shape, bar)
 
     def size(self, title: str, values: FloatArray, reach: float) -> page.Image:
         """Return an image of values from 0 on, such as errors and standard errors."""
-        return self.scalar(title, values, 0.0, reach, "magma")
+        return self.draw_scalar(title, values, 0.0, reach, "magma")
 
-    def signed(self, title: str, values: FloatArray, reach: float) -> page.Image:
+    def draw_signed(self, title: str, values: FloatArray, reach: float) -> page.Image:
         """Return an image of values around 0, such as differences."""
-        return self.scalar(title, values, -reach, reach, "RdBu_r")
+        return self.draw_scalar(title, values, -reach, reach, "RdBu_r")
 
     def normals(self, title: str, normals: FloatArray) -> page.Image:
         """Return an image of unit normals, (H, W, 3), as colors: x red, y green, z blue."""
@@ -83,23 +83,25 @@ class MapDrawing:
             length = np.linalg.norm(small[mask], axis=-1)
             tilt = np.degrees(np.arccos(np.clip(small[mask][:, 2] / np.fmax(length, 1e-9), -1, 1)))
             alt += f"; median tilt from the view {number(float(np.median(tilt)))}°"
-        return _stored(title, png.encode(image), alt + _missing(mask), image.shape[:2])
+        return _build_image(
+            title, png.encode(image), alt + _describe_missing(mask), image.shape[:2]
+        )
 
 
-def _missing(mask: BoolArray) -> str:
+def _describe_missing(mask: BoolArray) -> str:
     """Return how much of a picture has no value, in words; nothing where that is next to none."""
     missing = 1.0 - mask.mean()
     return f", {100 * missing:.0f} % without a value" if missing >= 0.005 else ""
 
 
-def _told(values: Float64Array, mask: BoolArray | None, unit: str) -> str:
+def _describe_values(values: Float64Array, mask: BoolArray | None, unit: str) -> str:
     """Return a map's median, its middle 90 %, and how much of it has no value."""
     shown = np.isfinite(values) if mask is None else mask & np.isfinite(values)
     if not shown.any():
         return "no pixel has a value"
     low, median, high = np.percentile(values[shown], [5, 50, 95])
     within = f"90 % of pixels within {number(low)} to {number(high)}"
-    return f"median {written(number(median), unit)}, {within}{_missing(shown)}"
+    return f"median {format_quantity(number(median), unit)}, {within}{_describe_missing(shown)}"
 
 
 def color_image(title: str, linear: FloatArray, *, width: int = 320, of: str = "") -> page.Image:
@@ -115,18 +117,18 @@ def color_image(title: str, linear: FloatArray, *, width: int = 320, of: str = "
 
 def plain_image(title: str, image: UInt8Array, *, alt: str = "") -> page.Image:
     """Return an 8-bit image, (H, W) or (H, W, 3), for the page as it is."""
-    return _stored(title, png.encode(image), alt or title, image.shape[:2])
+    return _build_image(title, png.encode(image), alt or title, image.shape[:2])
 
 
-def _stored(
+def _build_image(
     title: str, data: bytes, alt: str, shape: tuple[int, ...], scale: page.ColorScale | None = None
 ) -> page.Image:
-    return page.Image(title, png.address(data), alt, (shape[1], shape[0]), scale)
+    return page.Image(title, png.to_data_url(data), alt, (shape[1], shape[0]), scale)
 
 
-def reach_of(values: FloatArray, shown: BoolArray, percentile: float) -> float:
+def percentile_reach(values: FloatArray, mask: BoolArray, percentile: float) -> float:
     """Return how far a color scale must reach for that percentage of shown |values|."""
-    inside = np.abs(values[shown & np.isfinite(values)])
+    inside = np.abs(values[mask & np.isfinite(values)])
     return float(np.percentile(inside, percentile)) if inside.size else 1.0
 
 
@@ -157,13 +159,15 @@ def map_panel(
     joined = np.concatenate(of_scale)
     low, high = np.percentile(joined, [1, 99]) if joined.size else (0.0, 1.0)
     shown = MapDrawing(name, unit, mask)
-    parts = [shown.scalar("estimate", estimate, low, high)]
+    parts = [shown.draw_scalar("estimate", estimate, low, high)]
     if truth is not None:
         error = estimate - truth
-        parts.insert(0, shown.scalar("truth", truth, low, high))
-        parts.append(shown.signed("estimate − truth", error, reach_of(error, mask, 98)))
+        parts.insert(0, shown.draw_scalar("truth", truth, low, high))
+        parts.append(
+            shown.draw_signed("estimate − truth", error, percentile_reach(error, mask, 98))
+        )
     if standard_error is not None:
-        reach = reach_of(standard_error, mask, 98)
+        reach = percentile_reach(standard_error, mask, 98)
         parts.append(shown.size("standard error", standard_error, reach))
     yield page.Heading(name)
     yield page.Images(parts)

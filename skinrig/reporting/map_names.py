@@ -32,47 +32,47 @@ _PART_PREFIXES: Final = {
 }
 
 
-def words(name: str) -> str:
+def map_title(name: str) -> str:
     """Return a map's name, with or without a channel, as people read it.
 
     Examples
     --------
-    >>> words("r_d"), words("r_d red"), words("basis_weight_2"), words("melanin")
+    >>> map_title("r_d"), map_title("r_d red"), map_title("basis_weight_2"), map_title("melanin")
     ('diffuse reflectance R_d', 'diffuse reflectance R_d, red', 'share of lobe 2', 'melanin')
-    >>> words("diffuse_normals_a045_m2"), words("hemoglobin_anger")
+    >>> map_title("diffuse_normals_a045_m2"), map_title("hemoglobin_anger")
     ('diffuse normals, 45°, compressed 2', 'hemoglobin, anger')
     """
     key, _, channel = name.partition(" ")
     if channel:
-        return f"{words(key)}, {channel}"
+        return f"{map_title(key)}, {channel}"
     if key in MAP_WORDS:
         return MAP_WORDS[key]
     if found := _STATE_NAME.fullmatch(key):
-        return f"{found['map'].replace('_', ' ')}, {state_words(found['state'])}"
+        return f"{found['map'].replace('_', ' ')}, {state_title(found['state'])}"
     for head, told in (_NUMBERED_PREFIXES | _PART_PREFIXES).items():
         if key.startswith(head):
             return told + key.removeprefix(head).replace("_", " ")
     return key.replace("_", " ")
 
 
-def heading(name: str) -> str:
+def map_heading(name: str) -> str:
     """Return a map's name in words, with the name of its file where that is another.
 
     Examples
     --------
-    >>> heading("r_d"), heading("melanin")
+    >>> map_heading("r_d"), map_heading("melanin")
     ('diffuse reflectance R_d (r_d)', 'melanin')
     """
-    told = words(name)
+    told = map_title(name)
     return told if told == name else f"{told} ({name})"
 
 
-def state_words(state: str) -> str:
+def state_title(state: str) -> str:
     """Return a state's name in words.
 
     Examples
     --------
-    >>> state_words("a045_m2"), state_words("a000_n0")
+    >>> state_title("a045_m2"), state_title("a000_n0")
     ('45°, compressed 2', '0°, neutral')
     """
     angle, step = state.split("_")
@@ -80,10 +80,10 @@ def state_words(state: str) -> str:
     return f"{int(angle[1:])}°, {kinds[step[0]]}"
 
 
-def melanin_bands(levels: FloatArray, good: BoolArray) -> Iterator[tuple[str, BoolArray]]:
+def split_melanin_bands(levels: FloatArray, valid: BoolArray) -> Iterator[tuple[str, BoolArray]]:
     """Yield the bands of melanin that hold enough good pixels: name, and pixels, (H, W)."""
     for low, high in MELANIN_RANGES:
-        inside = good & (levels >= low) & (levels < high)
+        inside = valid & (levels >= low) & (levels < high)
         if np.count_nonzero(inside) >= MIN_BAND_PIXELS:
             yield melanin_band(low, high), inside
 

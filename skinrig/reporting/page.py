@@ -17,7 +17,7 @@ from markupsafe import Markup
 from model.skin import SkinAppearance
 from skinrig.drawing import png, templates
 from skinrig.reporting import map_names
-from skinrig.written_units import unit_sign, written
+from skinrig.unit_format import format_quantity, format_unit
 
 Row = TypeVar("Row")
 
@@ -61,7 +61,7 @@ class Check:
 
 
 @dataclass(frozen=True, slots=True)
-class Subject:
+class ReportedAppearance:
     """An appearance that a section tells of and judges."""
 
     name: str
@@ -71,17 +71,19 @@ class Subject:
     """Judgements are added to it."""
 
     def check(
-        self, what: str, got: float, bound: float, unit: str = "", note: str = "", **more: Any
+        self, quantity: str, got: float, bound: float, unit: str = "", note: str = "", **more: Any
     ) -> None:
         """Judge that a number stays within its limit."""
-        self.checks.append(Check(f"{self.name}: {what}", got, bound, "<=", unit, note, **more))
+        self.checks.append(Check(f"{self.name}: {quantity}", got, bound, "<=", unit, note, **more))
 
-    def check_share(self, what: str, got: float, bound: float, note: str = "", **more: Any) -> None:
+    def check_fraction(
+        self, quantity: str, got: float, bound: float, note: str = "", **more: Any
+    ) -> None:
         """Judge that a share stays within its limit, both told in percent."""
-        self.check(what, 100 * got, 100 * bound, "%", note, **more)
+        self.check(quantity, 100 * got, 100 * bound, "%", note, **more)
 
 
-def worst_of(rows: Iterable[Row], size: Callable[[Row], float]) -> Row | None:
+def find_worst(rows: Iterable[Row], size: Callable[[Row], float]) -> Row | None:
     """Return the row of the largest finite size, where there are several."""
     told = [row for row in rows if math.isfinite(size(row))]
     return max(told, key=size) if len(told) > 1 else None
@@ -209,10 +211,10 @@ class View(Block):
             "finite": lambda values: bool(np.isfinite(values).all()),
             "or_nan": lambda value: math.nan if value is None else float(value),
             "or_empty": lambda value: "" if value is None else float(value),
-            "words": map_names.words,
-            "state_words": map_names.state_words,
-            "unit_sign": unit_sign,
-            "written": written,
+            "words": map_names.map_title,
+            "state_words": map_names.state_title,
+            "unit_sign": format_unit,
+            "written": format_quantity,
         }
         name = f"reporting/templates/{self.template}.html"
         return Markup(templates.render(name, **helpers, **self.data))
@@ -301,12 +303,12 @@ def note(text: str) -> Paragraph:
     return Paragraph(text, "note")
 
 
-def one_skin(parameters: Mapping[str, object]) -> Paragraph:
+def single_subject_note(parameters: Mapping[str, object]) -> Paragraph:
     """Return a remark on whom errors are of, where a session holds one subject and has no bands.
 
     Examples
     --------
-    >>> one_skin({"preset": "III"}).text
+    >>> single_subject_note({"preset": "III"}).text
     'Errors are of one subject, III: there are no bands to tell apart.'
     """
     subject = next((f", {parameters[k]}" for k in ("subject", "preset") if parameters.get(k)), "")

@@ -9,26 +9,26 @@ from model import store
 from model.skin import SkinAppearance
 from skinrig import consent
 from skinrig.reporting import page
-from skinrig.reporting.folders import Findings
+from skinrig.reporting.folders import ReportInputs
 from skinrig.reporting.sections import images as image_section
 
 DIGEST_CHARS = 16
 """Characters of a digest that a table shows."""
 
 
-def flattened(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+def flatten_settings(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     """Return nested settings by their path, as text.
 
     Examples
     --------
-    >>> flattened({"fit": {"rank": 4, "seed": None}, "views": [1, 2]})
+    >>> flatten_settings({"fit": {"rank": 4, "seed": None}, "views": [1, 2]})
     {'fit.rank': '4', 'fit.seed': 'null', 'views': '[1, 2]'}
     """
     flat: dict[str, str] = {}
     for key, value in sorted(values.items()):
         name = f"{prefix}{key}"
         if isinstance(value, Mapping) and value:
-            flat |= flattened(value, f"{name}.")
+            flat |= flatten_settings(value, f"{name}.")
         elif isinstance(value, (list, tuple)) and len(json.dumps(value)) > 120:
             flat[name] = f"{len(value)} entries"
         else:
@@ -48,31 +48,31 @@ def section(appearance: SkinAppearance) -> Iterator[page.Block]:
     yield page.Heading("Provenance")
     yield page.facts(
         {"source": appearance.source, "seed": str(appearance.seed)}
-        | {f"input {k}": short(v) for k, v in sorted(appearance.inputs.items())}
+        | {f"input {k}": shorten_digest(v) for k, v in sorted(appearance.inputs.items())}
         | {f"version of {k}": v for k, v in sorted(appearance.versions.items())},
         caption=f"Inputs by the first {DIGEST_CHARS} digits of their SHA-256",
     )
     settings = {
         name: value
-        for name, value in flattened(appearance.parameters).items()
+        for name, value in flatten_settings(appearance.parameters).items()
         if not name.startswith(("stages.", "assumed"))
     }
     told = page.facts(settings, caption="Parameters that the folder records")
     yield page.Folded(f"{len(settings)} parameters", [told])
 
 
-def short(digest: str) -> str:
+def shorten_digest(digest: str) -> str:
     """Return the beginning of a digest, which tells two apart.
 
     Examples
     --------
-    >>> short("sha256:0123456789abcdef0123")
+    >>> shorten_digest("sha256:0123456789abcdef0123")
     '0123456789abcdef'
     """
     return digest.removeprefix("sha256:")[:DIGEST_CHARS]
 
 
-def records_of(found: Findings) -> Iterator[tuple[Path, dict[str, Any]]]:
+def read_consent_records(found: ReportInputs) -> Iterator[tuple[Path, dict[str, Any]]]:
     """Yield folder and record of each subject that was measured, see :mod:`skinrig.consent`."""
     for folder in found.appearances.values():
         for record in consent.merge_consent(store.read_document(folder)):
@@ -90,7 +90,7 @@ def records_of(found: Findings) -> Iterator[tuple[Path, dict[str, Any]]]:
                 yield folder, dict(record)
 
 
-def consent_section(sides: Sequence[Findings]) -> Iterator[page.Block]:
+def consent_section(sides: Sequence[ReportInputs]) -> Iterator[page.Block]:
     """Yield the table of subjects and what they agreed to; empty where nobody was measured.
 
     Parameters
@@ -100,7 +100,7 @@ def consent_section(sides: Sequence[Findings]) -> Iterator[page.Block]:
     """
     rows: dict[str, list[str]] = {}
     for found in sides:
-        for folder, record in records_of(found):
+        for folder, record in read_consent_records(found):
             (line,) = consent.format_consent([record])
             names = rows.setdefault(line, [])
             if folder.name not in names:

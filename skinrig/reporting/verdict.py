@@ -6,8 +6,8 @@ import numpy as np
 
 from model.skin import SkinAppearance, SkinMap
 from skinrig.reporting import page
-from skinrig.reporting.map_names import melanin_bands, words
-from skinrig.written_units import written
+from skinrig.reporting.map_names import map_title, split_melanin_bands
+from skinrig.unit_format import format_quantity
 
 MAX_NAMED_CLOSE = 3
 """Checks named that come closest to their limit."""
@@ -42,7 +42,7 @@ def headline(checks: Sequence[page.Check]) -> str:
 
 
 def section(
-    checks: Sequence[page.Check], about: str = "", unjudged: Sequence[str] = ()
+    checks: Sequence[page.Check], subject: str = "", unjudged: Sequence[str] = ()
 ) -> Iterator[page.Block]:
     """Yield the verdict, where it is worst, and all checks.
 
@@ -57,8 +57,8 @@ def section(
     """
     kind = "bad" if any(not check.passed for check in checks) else "good"
     yield page.Paragraph(headline(checks), f"verdict {kind if checks else ''}")
-    if about:
-        yield page.Paragraph(about)
+    if subject:
+        yield page.Paragraph(subject)
     weak = weaknesses(checks)
     if weak:
         yield page.Heading("Where it is worst", level=2)
@@ -92,7 +92,10 @@ def weaknesses(checks: Sequence[page.Check]) -> list[str]:
     missed = [check for check in checks if not check.passed]
     for check in missed[:MAX_NAMED_MISSED]:
         sign = "at most" if check.sense == "<=" else "at least"
-        out.append(f"missed: {check.name}, {_measured(check)}, {sign} {_bound(check)}{_at(check)}")
+        out.append(
+            f"missed: {check.name}, {_measured(check)}, {sign}"
+            f" {_bound(check)}{_format_worst(check)}"
+        )
     if len(missed) > MAX_NAMED_MISSED:
         out.append(f"missed: {len(missed) - MAX_NAMED_MISSED} more, in the table below")
     told: set[str] = set()
@@ -111,13 +114,13 @@ def weaknesses(checks: Sequence[page.Check]) -> list[str]:
     for check in close[:MAX_NAMED_CLOSE]:
         out.append(
             f"closest to its limit: {check.name}, {_measured(check)} of at most {_bound(check)} "
-            f"({100 * check.used:.0f} % of it used){_at(check)}"
+            f"({100 * check.used:.0f} % of it used){_format_worst(check)}"
         )
     for check in checks:
         if check.coverage < MIN_COVERAGE:
-            out.append(f"intervals too small: {_covered(check)}")
+            out.append(f"intervals too small: {_format_coverage(check)}")
         elif check.coverage > MAX_COVERAGE:
-            out.append(f"intervals too large: {_covered(check)}")
+            out.append(f"intervals too large: {_format_coverage(check)}")
     for check in checks:
         if check.masked > MAX_UNREMARKED_MASK:
             of_what = check.name.rsplit(",", 1)[0]  # without what is measured, such as the median
@@ -126,18 +129,18 @@ def weaknesses(checks: Sequence[page.Check]) -> list[str]:
 
 
 def _measured(check: page.Check) -> str:
-    return written(page.number(check.got), check.unit)
+    return format_quantity(page.number(check.got), check.unit)
 
 
 def _bound(check: page.Check) -> str:
-    return written(page.number(check.bound), check.unit)
+    return format_quantity(page.number(check.bound), check.unit)
 
 
-def _at(check: page.Check) -> str:
+def _format_worst(check: page.Check) -> str:
     return f"; worst at {check.worst}" if check.worst else ""
 
 
-def _covered(check: page.Check) -> str:
+def _format_coverage(check: page.Check) -> str:
     return f"{check.name}, {100 * check.coverage:.0f} % of truths lie inside the 68 % intervals"
 
 
@@ -150,7 +153,7 @@ MAX_NAMED_MAPS = 3
 """Maps of an appearance that are named first: those that know least."""
 
 
-def least_known(name: str, appearance: SkinAppearance) -> list[str]:
+def list_least_certain(name: str, appearance: SkinAppearance) -> list[str]:
     """Return what an appearance without a truth knows least of, by its own standard errors.
 
     Parameters
@@ -163,17 +166,17 @@ def least_known(name: str, appearance: SkinAppearance) -> list[str]:
     Examples
     --------
     >>> thickness = SkinMap(np.full((2, 2), 2.0), "mm", np.full((2, 2), 0.1))
-    >>> least_known("cheek", SkinAppearance({"thickness": thickness}, "measured"))
+    >>> list_least_certain("cheek", SkinAppearance({"thickness": thickness}, "measured"))
     ['cheek: thickness, median standard error 5 % of its value']
     """
     told: list[tuple[float, str]] = []
     angles: list[tuple[float, str]] = []
     for key, one in sorted(appearance.maps.items()):
-        row = _spread_of(key, one) if one.stderr is not None else None
+        row = _relative_stderr(key, one) if one.stderr is not None else None
         if row is None:
             continue
         share = float(str(row[2]))
-        of = f"{name}: {words(key)}, median standard error"
+        of = f"{name}: {map_title(key)}, median standard error"
         missing = f", {100 - share:.0f} % of pixels without a value" if share < 99.5 else ""
         if row[1] == "°":
             angle = float(str(row[4]))
@@ -186,7 +189,7 @@ def least_known(name: str, appearance: SkinAppearance) -> list[str]:
     return [text for _, text in first]
 
 
-def unjudged(appearance: SkinAppearance) -> Iterator[page.Block]:
+def uncertainty_blocks(appearance: SkinAppearance) -> Iterator[page.Block]:
     """Yield standard errors and residuals of maps, by melanin band where melanin is among them.
 
     Parameters
@@ -197,43 +200,43 @@ def unjudged(appearance: SkinAppearance) -> Iterator[page.Block]:
     spreads = [
         row
         for name, one in sorted(appearance.maps.items())
-        if one.stderr is not None and (row := _spread_of(name, one)) is not None
+        if one.stderr is not None and (row := _relative_stderr(name, one)) is not None
     ]
     residuals = [
         row
         for name, one in sorted(appearance.maps.items())
         if any(word in name for word in RESIDUAL_WORDS)
-        and (row := _residual_of(name, one)) is not None
+        and (row := _median_residual(name, one)) is not None
     ]
     bands = list(_by_band(appearance))
     yield page.view("unjudged", spreads=spreads, residuals=residuals, bands=bands)
 
 
-def _spread_of(name: str, one: SkinMap) -> tuple[object, ...] | None:
-    good = one.mask
-    if one.stderr is None or not good.any():
+def _relative_stderr(name: str, skin_map: SkinMap) -> tuple[object, ...] | None:
+    good = skin_map.mask
+    if skin_map.stderr is None or not good.any():
         return None
-    stderr = one.stderr[good].astype(np.float64)
+    stderr = skin_map.stderr[good].astype(np.float64)
     share = 100.0 * float(good.mean())
     if "normals" in name:
         stderr = np.degrees(stderr)
         high = float(np.percentile(stderr, 95))
-        return words(name), "°", share, "", float(np.median(stderr)), "", high
-    values = one.values[good].astype(np.float64)
+        return map_title(name), "°", share, "", float(np.median(stderr)), "", high
+    values = skin_map.values[good].astype(np.float64)
     size = np.abs(values)
     relative = stderr[size > 0] / size[size > 0]
     percent = 100.0 * float(np.median(relative)) if relative.size else float("nan")
     middle, high = np.percentile(stderr, [50, 95]).tolist()
     median = float(np.median(values))
-    return words(name), page.short_unit(one.unit), share, median, middle, percent, high
+    return map_title(name), page.short_unit(skin_map.unit), share, median, middle, percent, high
 
 
-def _residual_of(name: str, one: SkinMap) -> tuple[object, ...] | None:
-    if not one.mask.any():
+def _median_residual(name: str, skin_map: SkinMap) -> tuple[object, ...] | None:
+    if not skin_map.mask.any():
         return None
-    values = np.abs(one.values[one.mask].astype(np.float64))
+    values = np.abs(skin_map.values[skin_map.mask].astype(np.float64))
     low, middle, high = np.percentile(values, [50, 68.27, 95])
-    return (words(name), page.short_unit(one.unit), float(low), float(middle), float(high))
+    return (map_title(name), page.short_unit(skin_map.unit), float(low), float(middle), float(high))
 
 
 def _by_band(appearance: SkinAppearance) -> Iterator[tuple[object, ...]]:
@@ -247,7 +250,7 @@ def _by_band(appearance: SkinAppearance) -> Iterator[tuple[object, ...]]:
         if one is None or one.stderr is None or one.values.shape != levels.shape:
             continue
         size = np.abs(one.values.astype(np.float64))
-        for band, chosen in melanin_bands(levels, melanin.mask & one.mask & (size > 0)):
+        for band, chosen in split_melanin_bands(levels, melanin.mask & one.mask & (size > 0)):
             relative = 100.0 * one.stderr[chosen] / size[chosen]
             middle, most = np.percentile(relative, [50, 95]).tolist()
-            yield words(name), band, int(chosen.sum()), middle, most
+            yield map_title(name), band, int(chosen.sum()), middle, most

@@ -12,30 +12,30 @@ import numpy as np
 
 from capture.plan import Plan
 from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
-from capture.plan.rows import lights_of
+from capture.plan.rows import step_lights
 from capture.rig import Rig, load_rig
 from model.skin import SkinAppearance
-from rigsim.as_built.dome import build
-from rigsim.needs.effects import SceneEffects, longest_on_s
+from rigsim.as_built.dome import build_dome
+from rigsim.needs.effects import SceneEffects, max_on_time_s
 from rigsim.population import files as subject_file
-from rigsim.population.conditions import ConditionError, checked
-from rigsim.population.population import PopulationError, member
-from rigsim.scanner.flaws import binary_ply
-from rigsim.scanner.pods import Scanner, scan_face, wrap_template
+from rigsim.population.conditions import ConditionError, validate_conditions
+from rigsim.population.population import PopulationError, get_member
+from rigsim.scanner.flaws import encode_binary_ply
+from rigsim.scanner.pods import ScannerSettings, scan_face, wrap_template
 from rigsim.scenes.dome.scene import DomeScene
-from rigsim.scenes.dome.targets import TARGET_POSES, plate_normals, target_scene
-from rigsim.subject.head_motion import head_motion
+from rigsim.scenes.dome.targets import TARGET_POSES, make_target_scene, plate_normals
+from rigsim.subject.head_motion import draw_head_motion
 from rigsim.subject.perfusion import STATE_NAMES
 from rigsim.targets import make_target
-from skinrig.console import picked
+from skinrig.console import select_attributes
 from skinrig.errors import one_of
 from skinrig.evaluating.reflection_truth import TEST_FILE, make_test
 from skinrig.simulating import driving
 from skinrig.simulating.orders import (
     DomeOrder,
-    OptionsError,
-    Simulated,
     SimulationError,
+    SimulationOptionsError,
+    SimulationResult,
     truth_folder,
 )
 
@@ -59,7 +59,7 @@ SCAN_TRIANGLES = {"small": 12_000, "full": 40_000}
 TRACKING_EVERY = 24
 
 
-def simulate_dome(order: DomeOrder) -> Simulated:
+def simulate_dome(order: DomeOrder) -> SimulationResult:
     """Simulate a capture with the dome; see `simulation.simulate`."""
     one_of("state", order.state, STATE_NAMES, SimulationError)
     conditions = _conditions(order)
@@ -67,10 +67,10 @@ def simulate_dome(order: DomeOrder) -> Simulated:
     planned = order.plan if order.target is None else None
     plan = planned or _plan(rig, order.target, order.size)
     light = driving.announce_light(plan, rig, order)
-    asked = _asked(order, rig, conditions)
+    asked = _manifest_settings(order, rig, conditions)
     scene = _scene(rig, order, plan)
     session = driving.open_session(order, plan, rig, asked, scene)
-    with driving.released_on_error(session):
+    with driving.release_on_error(session):
         scan = _attach_scan(session, scene, order) if order.target is None else {}
 
     def prompt(world: Any, text: str) -> None:
@@ -79,7 +79,7 @@ def simulate_dome(order: DomeOrder) -> Simulated:
 
     # nobody sits in front of a target; a face is asked to close its eyes where that is needed
     safe = order.target is not None or light["open_eyes"] != "allowed"
-    rig_seconds = driving.drive(
+    rig_seconds = driving.drive_plan(
         order, session, rig, scene, prompt, eyes="closed" if safe else "open"
     )
     truth = None
@@ -93,13 +93,15 @@ def simulate_dome(order: DomeOrder) -> Simulated:
             session,
             dataclasses.replace(appearance, parameters=parameters),
             files=_truth_files(scene, appearance, order.seed),
-            **picked(order, "state", "movement"),
-            **picked(scene, "subsurface", "interreflections"),
+            **select_attributes(order, "state", "movement"),
+            **select_attributes(scene, "subsurface", "interreflections"),
         )
-    return driving.finish(order, session, scene, rig_seconds, truth, light=light)
+    return driving.build_result(order, session, scene, rig_seconds, truth, light=light)
 
 
-def _asked(order: DomeOrder, rig: Rig, conditions: Mapping[str, float]) -> dict[str, Any]:
+def _manifest_settings(
+    order: DomeOrder, rig: Rig, conditions: Mapping[str, float]
+) -> dict[str, Any]:
     """Return the settings of a simulation as its session's manifest keeps them."""
     asked: dict[str, Any] = {
         "width_px": rig.views[0].width_px,
@@ -107,19 +109,19 @@ def _asked(order: DomeOrder, rig: Rig, conditions: Mapping[str, float]) -> dict[
         "lights": len(rig.lights),
         "views": len(rig.views),
         "plan": "" if order.plan is None else order.plan.to_json(),
-        **picked(order, "move", "state", "movement", "wrapped"),
+        **select_attributes(order, "move", "state", "movement", "wrapped"),
     }
     if order.target is None:
-        asked |= picked(order, "subsurface", "interreflections")
+        asked |= select_attributes(order, "subsurface", "interreflections")
     if conditions:
         asked["conditions"] = conditions
-    return driving.asked_of(order, **asked)
+    return driving.manifest_settings(order, **asked)
 
 
 def _conditions(order: DomeOrder) -> dict[str, float]:
     """Return the conditions of the face, checked."""
     try:
-        return checked(order.conditions)
+        return validate_conditions(order.conditions)
     except ConditionError as error:
         raise SimulationError(str(error)) from error
 
@@ -129,9 +131,9 @@ def _member(order: DomeOrder) -> Member | None:
     if order.target is not None or not re.fullmatch(r"P\d+", order.subject):
         return None
     if order.mesh is not None:
-        raise OptionsError(f"mesh: {order.subject} has a head already; leave it out")
+        raise SimulationOptionsError(f"mesh: {order.subject} has a head already; leave it out")
     try:
-        return member(order.subject)
+        return get_member(order.subject)
     except PopulationError as error:
         raise SimulationError(f"subject: {error}") from error
 
@@ -140,7 +142,7 @@ def _truth_files(scene: Any, truth: SkinAppearance, seed: int) -> dict[str, byte
     """Return the true mesh, its expressions, and how it reflects where no light is."""
     mesh, landmarks = scene.subject.mesh, scene.subject.landmarks_mm()
     return {
-        TRUE_MESH_FILE: binary_ply(mesh.vertices_mm, mesh.faces),
+        TRUE_MESH_FILE: encode_binary_ply(mesh.vertices_mm, mesh.faces),
         BLEND_SHAPES_FILE: _blend_shapes(scene.subject),
         TEST_FILE: make_test(
             scene,
@@ -213,12 +215,12 @@ def small_dome(
     return rig if width_px in (None, rig.views[0].width_px) else rig.resized(int(width_px or 0))
 
 
-def farthest_point_sample(places: np.ndarray[Any, Any], count: int) -> list[int]:
+def farthest_point_sample(directions: np.ndarray[Any, Any], count: int) -> list[int]:
     """Return the numbers of ``count`` directions, each next one the farthest from those before.
 
     Parameters
     ----------
-    places : ndarray
+    directions : ndarray
         (N, 3), any length; the first chosen is the one most towards +z.
     count : int
         1 to N.
@@ -228,7 +230,7 @@ def farthest_point_sample(places: np.ndarray[Any, Any], count: int) -> list[int]
     >>> farthest_point_sample(np.array([[1.0, 0, 0], [0, 0, 1], [-1, 0, 0], [0.9, 0, 0.1]]), 3)
     [1, 0, 2]
     """
-    way = places / np.linalg.norm(places, axis=1)[:, None]
+    way = directions / np.linalg.norm(directions, axis=1)[:, None]
     chosen = [int(np.argmax(way[:, 2]))]
     while len(chosen) < count:
         nearest = (way @ way[chosen].T).max(axis=1)
@@ -246,7 +248,7 @@ def _rig(order: DomeOrder) -> Rig:
         return small_dome(
             dome, lights=order.lights or lights, views=order.views or views, width_px=width_px
         )
-    lit = {name for step in order.plan.steps for name in lights_of(step)}
+    lit = {name for step in order.plan.steps for name in step_lights(step)}
     seen = {name for step in order.plan.steps for name in step.cameras}
     return dome.subset(
         lights=[x.name for x in dome.lights if x.name in lit],
@@ -256,7 +258,7 @@ def _rig(order: DomeOrder) -> Rig:
 
 def _plan(rig: Rig, target: str | None, size: str) -> Plan:
     if target is None:
-        return dome_plan(rig, tracking_every=TRACKING_EVERY)
+        return dome_plan(rig, tracking_interval=TRACKING_EVERY)
     few = {"charuco": 10, "mirror": 3, "white": 3} if size == "small" else TARGET_POSES
     return dome_calibration_plan(
         rig,
@@ -269,11 +271,11 @@ def _plan(rig: Rig, target: str | None, size: str) -> Plan:
 
 
 def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
-    built = build(rig, seed=order.seed)
+    built = build_dome(rig, seed=order.seed)
     if order.target == "dark":
         return DomeScene(rig, make_target("dark"), dome=built, seed=order.seed)
     if order.target is not None:
-        return target_scene(order.target, rig, seed=order.seed, dome=built)  # type: ignore[arg-type]
+        return make_target_scene(order.target, rig, seed=order.seed, dome=built)  # type: ignore[arg-type]
     conditions = dict(order.conditions)
     if (one := _member(order)) is not None:
         person = one.face(TEXTURE_TEXELS)
@@ -281,7 +283,7 @@ def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
     else:
         subject = subject_file.load_subject(order.subject)
         person = subject.face(seed=order.seed, size=TEXTURE_TEXELS, mesh=order.mesh)
-    motion = head_motion(order.seed) if order.move else None
+    motion = draw_head_motion(order.seed) if order.move else None
     return DomeScene(
         rig,
         person,
@@ -291,12 +293,12 @@ def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
         movement=order.movement,
         seed=order.seed,
         conditions=conditions,
-        on_s=longest_on_s(plan),
-        effects=SceneEffects.from_switches(_light_of_skin(order)),
+        on_s=max_on_time_s(plan),
+        effects=SceneEffects.from_switches(_skin_light_effects(order)),
     )
 
 
-def _light_of_skin(order: DomeOrder) -> dict[str, Any]:
+def _skin_light_effects(order: DomeOrder) -> dict[str, Any]:
     """Return what of a face is built though it shows in no pixel, and what is not though it does.
 
     What changes pixels is built where nothing is asked for.
@@ -308,13 +310,13 @@ def _light_of_skin(order: DomeOrder) -> dict[str, Any]:
     without = order.scene_switches()
     for name in without:
         if asked.get(name):
-            raise OptionsError(f"leave_out: {name} was asked for, too")
+            raise SimulationOptionsError(f"leave_out: {name} was asked for, too")
     return {**asked, **without}
 
 
 def _attach_scan(session: Any, scene: Any, order: DomeOrder) -> dict[str, Any]:
     """Scan the face into the session; return what the truth keeps of it."""
-    scanner = Scanner(triangles=SCAN_TRIANGLES[order.size])
+    scanner = ScannerSettings(triangles=SCAN_TRIANGLES[order.size])
     mesh = scene.subject.mesh
     if order.wrapped:
         rng = np.random.default_rng([order.seed, 7, STATE_NAMES.index(order.state)])

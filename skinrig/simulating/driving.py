@@ -11,7 +11,7 @@ from capture.acquire import Operator, run_plan
 from capture.devices.camera import open_camera
 from capture.plan import Plan
 from capture.rig import Rig
-from capture.session import Session, Subject
+from capture.session import Session, SubjectRecord
 from model import store
 from model.skin import SkinAppearance
 from rigsim.world import World
@@ -21,22 +21,22 @@ from skinrig.simulating import subject_records
 from skinrig.simulating.exposure_log import SceneLog
 from skinrig.simulating.orders import (
     SIMULATED_USES,
-    Order,
-    Simulated,
     SimulationError,
+    SimulationOrder,
+    SimulationResult,
     truth_folder,
 )
-from skinrig.simulating.resumption import refusals, shots_made
+from skinrig.simulating.resumption import count_shots, list_refusals
 
 Log = TypeVar("Log", bound=SceneLog)
 
 
-def effects_of(scene: Any) -> tuple[Mapping[str, Any], ...]:
-    """Return what a scene builds and what not, as its manifest and `Simulated` hold it."""
+def list_effects(scene: Any) -> tuple[Mapping[str, Any], ...]:
+    """Return what a scene builds and what not, as its manifest and `SimulationResult` hold it."""
     return tuple(scene.needs.document())
 
 
-def asked_of(order: Order, **own: Any) -> dict[str, Any]:
+def manifest_settings(order: SimulationOrder, **rig_settings: Any) -> dict[str, Any]:
     """Return the settings of a simulation as its session's manifest keeps them.
 
     Parameters
@@ -48,18 +48,18 @@ def asked_of(order: Order, **own: Any) -> dict[str, Any]:
     """
     asked: dict[str, Any] = {
         "rig": order.rig,
-        "subject": subject_records.of_manifest(order.subject),
+        "subject": subject_records.manifest_record(order.subject),
         "target": order.target or "",
     }
     if order.plan is not None:
         asked["plan"] = order.plan.to_json()
     if order.leave_out:
         asked["leave_out"] = list(order.leave_out)
-    return asked | own
+    return asked | rig_settings
 
 
 @contextmanager
-def released_on_error(session: Session) -> Iterator[None]:
+def release_on_error(session: Session) -> Iterator[None]:
     """Release a session where what follows fails."""
     try:
         yield
@@ -68,22 +68,27 @@ def released_on_error(session: Session) -> Iterator[None]:
         raise
 
 
-def open_logged(
-    order: Order, plan: Plan, rig: Rig, asked: Mapping[str, Any], scene: Any, kind: type[Log]
+def open_logged_session(
+    order: SimulationOrder,
+    plan: Plan,
+    rig: Rig,
+    settings: Mapping[str, Any],
+    scene: Any,
+    kind: type[Log],
 ) -> tuple[Session, Log]:
     """Open the session of an order, and the log that stands before its scene."""
-    session = open_session(order, plan, rig, asked, scene)
-    with released_on_error(session):
+    session = open_session(order, plan, rig, settings, scene)
+    with release_on_error(session):
         return session, kind(scene, truth_folder(order.out), resume=order.resume, session=session)
 
 
 def open_session(
-    order: Order, plan: Plan, rig: Rig, asked: Mapping[str, Any], scene: Any
+    order: SimulationOrder, plan: Plan, rig: Rig, settings: Mapping[str, Any], scene: Any
 ) -> Session:
     """Begin the session of an order, or go on with it where it was begun with the same settings."""
     if order.resume:
         session = Session.resume(order.out)
-        lines = refusals(session, asked, order.seed, order.person)
+        lines = list_refusals(session, settings, order.seed, order.person)
         if lines:
             session.release()
             differing = "".join(f"\n  {line}" for line in lines)
@@ -103,15 +108,15 @@ def open_session(
             **{view.name: view.serial for view in rig.views},
         },
         subject=order.person
-        or Subject(subject_records.pseudonym(order.subject, order.seed), SIMULATED_USES),
+        or SubjectRecord(subject_records.pseudonym(order.subject, order.seed), SIMULATED_USES),
         source="simulated",
         seed=order.seed,
-        extra={"simulation": dict(asked), "effects": [dict(one) for one in effects_of(scene)]},
+        extra={"simulation": dict(settings), "effects": [dict(one) for one in list_effects(scene)]},
         now=None if created is None else (lambda: created),
     )
 
 
-def announce_light(plan: Plan, rig: Rig, order: Order) -> Mapping[str, float | str]:
+def announce_light(plan: Plan, rig: Rig, order: SimulationOrder) -> Mapping[str, float | str]:
     """Return figures of the LEDs' light, and report them before anything is captured."""
     if order.progress is not None:
         for line in light_lines(plan, rig):
@@ -121,12 +126,12 @@ def announce_light(plan: Plan, rig: Rig, order: Order) -> Mapping[str, float | s
 
 def write_truth(
     folder: Path,
-    order: Order,
+    order: SimulationOrder,
     session: Session,
     appearance: SkinAppearance,
     *,
     files: Mapping[str, bytes] | None = None,
-    **about: Any,
+    **own_parameters: Any,
 ) -> None:
     """Write the truth of a session, with its parameters and those of its simulation.
 
@@ -146,32 +151,37 @@ def write_truth(
     parameters = {
         "kind": "truth",
         "state": "neutral",
-        **about,
+        **own_parameters,
         **appearance.parameters,
-        **subject_records.of_truth(order.subject, order.rig, order.progress),
+        **subject_records.truth_parameters(order.subject, order.rig, order.progress),
     }
     inputs = {"session": session.content_hash}
     truth = replace(appearance, parameters=parameters, inputs=inputs, seed=order.seed)
     store.write(folder, truth if files is None else replace(truth, files=files))
 
 
-def finish(
-    order: Order, session: Session, scene: Any, rig_seconds: float, truth: Path | None, **more: Any
-) -> Simulated:
+def build_result(
+    order: SimulationOrder,
+    session: Session,
+    scene: Any,
+    rig_seconds: float,
+    truth: Path | None,
+    **more: Any,
+) -> SimulationResult:
     """Return what a simulation left behind; `more` are fields that only some rigs have."""
-    return Simulated(
+    return SimulationResult(
         order.out,
         truth,
         len(session.frames()),
         rig_seconds,
         tuple(scene.left_out),
-        effects=effects_of(scene),
+        effects=list_effects(scene),
         **more,
     )
 
 
-def drive(
-    order: Order,
+def drive_plan(
+    order: SimulationOrder,
     session: Session,
     rig: Rig,
     scene: Any,
@@ -211,7 +221,7 @@ def drive(
         Time that has passed on the rig, s.
     """
     world = World(
-        rig, seed=order.seed, clock="virtual", scene=scene, shots_made=shots_made(session)
+        rig, seed=order.seed, clock="virtual", scene=scene, shots_made=count_shots(session)
     )
     name = world.register(session.id)
     boxes = {

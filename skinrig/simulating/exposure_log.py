@@ -73,7 +73,7 @@ class SceneLog(ExposureLog):
     """Of frames whose exposures are logged."""
     max_lag_s: ClassVar[float]
     """Between an entry and the frame that it is of."""
-    lost: ClassVar[str] = "what was captured before"
+    lost_label: ClassVar[str] = "what was captured before"
     """What has no truth without the log."""
 
     def __init__(self, scene: Any, truth: Path, *, resume: bool, session: Session) -> None:
@@ -82,7 +82,7 @@ class SceneLog(ExposureLog):
         entries = self.read()
         if not entries and any(session.frames(kind) for kind in self.kinds):
             raise SimulationError(
-                f"{self._path}: is gone, and with it the truth of {self.lost}; simulate the "
+                f"{self._path}: is gone, and with it the truth of {self.lost_label}; simulate the "
                 "session anew"
             )
         self._run = 1 + max((int(entry["run"]) for entry in entries), default=0)
@@ -94,21 +94,21 @@ class SceneLog(ExposureLog):
 
     def exposure(self, view_name: str, *, pops: Sequence[Any], **exposed: Any) -> Any:
         """Expose the scene, and note what is lit."""
-        met = self.met(exposed) if pops else None
+        met = self.describe_exposure(exposed) if pops else None
         if met is not None:
             self.add({"run": self._run, "t_s": pops[0].t_on_s, **met})
         return self._scene.exposure(view_name, pops=pops, **exposed)
 
-    def met(self, exposed: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    def describe_exposure(self, exposed: Mapping[str, Any]) -> Mapping[str, Any] | None:
         """Return what is noted of an exposure; None: nothing."""
         raise NotImplementedError
 
     def at(
-        self, entries: Sequence[Mapping[str, Any]], run_id: str, record: FrameRecord, what: str
+        self, entries: Sequence[Mapping[str, Any]], run_id: str, record: FrameRecord, label: str
     ) -> Mapping[str, Any]:
         """Return the entry of a frame, of a run."""
         run, time_s = int(run_id.removeprefix("sim")), float(record.line.t_box_s or 0.0)
         for entry in entries:
             if entry["run"] == run and abs(entry["t_s"] - time_s) < self.max_lag_s:
                 return entry
-        raise SimulationError(f"{self._path}: tells nothing of the {what}")
+        raise SimulationError(f"{self._path}: tells nothing of the {label}")

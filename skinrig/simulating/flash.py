@@ -10,17 +10,17 @@ from rigsim.needs.effects import SceneEffects
 from rigsim.population import files as subject_file
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject.perfusion import STATE_NAMES
-from skinrig.capturing.plan_choice import OwnPlan
-from skinrig.console import picked
+from skinrig.capturing.plan_choice import DefaultPlan
+from skinrig.console import select_attributes
 from skinrig.errors import one_of
 from skinrig.simulating import subject_records
-from skinrig.simulating.driving import asked_of, drive, finish, open_session
-from skinrig.simulating.flash_truth import WIDTHS_PX, _stance_mm, truth_of
-from skinrig.simulating.orders import FlashOrder, Simulated, SimulationError, truth_folder
+from skinrig.simulating.driving import build_result, drive_plan, manifest_settings, open_session
+from skinrig.simulating.flash_truth import WIDTHS_PX, _stance_offset_mm, build_truth
+from skinrig.simulating.orders import FlashOrder, SimulationError, SimulationResult, truth_folder
 from skinrig.simulating.sequence import simulate_sequence
 
 
-def simulate_flash(order: FlashOrder) -> Simulated:
+def simulate_flash(order: FlashOrder) -> SimulationResult:
     """Simulate a capture with the flash rig; see `simulation.simulate`."""
     if order.sequence is not None:
         return simulate_sequence(order, order.sequence)
@@ -30,15 +30,19 @@ def simulate_flash(order: FlashOrder) -> Simulated:
     width = order.width_px or WIDTHS_PX[order.size]
     rig = load_rig("flash")
     rig = rig.resized(width) if width != rig.views[0].width_px else rig
-    asked = asked_of(
+    asked = manifest_settings(
         order,
         width_px=width,
         mesh=str(order.mesh or ""),
         states=list(states),
-        **picked(order, "repeats", "movement", *(["nearer_mm"] if order.nearer_mm else [])),
+        **select_attributes(
+            order, "repeats", "movement", *(["nearer_mm"] if order.nearer_mm else [])
+        ),
     )
     # what cannot be built must fail before a folder is made
-    plan = order.plan or OwnPlan(**picked(order, "target", "states", "repeats")).of(rig)
+    plan = order.plan or DefaultPlan(**select_attributes(order, "target", "states", "repeats")).of(
+        rig
+    )
     scenes = _scenes(rig, order, plan)
     first = next(iter(scenes.values()))
     session = open_session(order, plan, rig, asked, first)
@@ -46,17 +50,17 @@ def simulate_flash(order: FlashOrder) -> Simulated:
     def prompt(world: Any, state: str) -> None:
         world.scene = scenes[state]
 
-    rig_seconds = drive(order, session, rig, first, prompt)
+    rig_seconds = drive_plan(order, session, rig, first, prompt)
     if target is not None:
-        return finish(order, session, first, rig_seconds, None)
+        return build_result(order, session, first, rig_seconds, None)
     truth = truth_folder(order.out)
-    about = subject_records.of_truth(order.subject, "flash", order.progress)
+    about = subject_records.truth_parameters(order.subject, "flash", order.progress)
     for state, scene in scenes.items():
         folder = truth if state == states[0] else truth.with_name(f"{truth.name}-{state}")
-        appearance = truth_of(scene, order.seed, session.content_hash, state, about=about)
+        appearance = build_truth(scene, order.seed, session.content_hash, state, parameters=about)
         store.write(folder, appearance)
     blur_mm = tuple(float(width) for width in first.resolution_mm())
-    return finish(order, session, first, rig_seconds, truth, blur_mm=blur_mm)
+    return build_result(order, session, first, rig_seconds, truth, blur_mm=blur_mm)
 
 
 def _scenes(rig: Rig, order: FlashOrder, plan: Plan) -> dict[str, Any]:
@@ -67,7 +71,7 @@ def _scenes(rig: Rig, order: FlashOrder, plan: Plan) -> dict[str, Any]:
         state = "white" if order.target == "white" else ""
         return {state: FlashScene(rig, targets.make_target(order.target), seed=seed, power=power)}
     person = subject_file.load_subject(order.subject).face(seed=seed, mesh=order.mesh)
-    person = person.moved_by(_stance_mm(rig, order.nearer_mm))
+    person = person.translate(_stance_offset_mm(rig, order.nearer_mm))
     return {
         state: FlashScene(
             rig,

@@ -17,7 +17,7 @@ MAX_STANCE_FRACTION = 0.5
 what a lens of f/11 shows with any sharpness."""
 
 
-def _stance_mm(rig: Rig, nearer_mm: float) -> tuple[float, float, float]:
+def _stance_offset_mm(rig: Rig, nearer_mm: float) -> tuple[float, float, float]:
     """Return how far a face is off the tile's place that stands so much nearer to the camera."""
     view = rig.views[0]
     most = MAX_STANCE_FRACTION * view.distance_mm
@@ -70,7 +70,7 @@ _TRUTH_NAMES = {"diffuse": "diffuse_radiance", "specular": "specular_radiance", 
 """The simulator's light is in its own unit; an estimate's is relative to a white tile."""
 
 
-def landmarks_at_superpixels(pixels: Mapping[str, tuple[float, float]]) -> dict[str, list[float]]:
+def scale_landmarks(pixels: Mapping[str, tuple[float, float]]) -> dict[str, list[float]]:
     """Return where points are after 2 x 2 pixels have been averaged.
 
     Parameters
@@ -85,16 +85,16 @@ def landmarks_at_superpixels(pixels: Mapping[str, tuple[float, float]]) -> dict[
 
     Examples
     --------
-    >>> landmarks_at_superpixels({"chin": (0.5, 2.5)})
+    >>> scale_landmarks({"chin": (0.5, 2.5)})
     {'chin': [0.0, 1.0]}
     """
     return {name: [0.5 * (x - 0.5), 0.5 * (y - 0.5)] for name, (x, y) in pixels.items()}
 
 
-def truth_of(
-    scene: Any, seed: int, session: str, state: str, *, about: Mapping[str, Any] | None = None
+def build_truth(
+    scene: Any, seed: int, session: str, state: str, *, parameters: Mapping[str, Any] | None = None
 ) -> SkinAppearance:
-    """Return the truth of a scene of a face, at superpixels; `about` joins its parameters."""
+    """Return the truth of a scene of a face, at superpixels; `parameters` joins its parameters."""
     maps: Mapping[str, NDArray[Any]] = scene.truth()
     mask = np.asarray(maps["mask"], bool)
     # a superpixel on the outline mixes skin and background: no truth is claimed for it
@@ -122,8 +122,8 @@ def truth_of(
             "state": state,
             "movement": scene.movement,
             "nearer_mm": _nearer_mm(scene),
-            "landmarks_px": landmarks_at_superpixels(scene.landmarks_px()),
-            **(about or {}),
+            "landmarks_px": scale_landmarks(scene.landmarks_px()),
+            **(parameters or {}),
         },
         inputs={"session": session},
         left_out=tuple(scene.left_out),

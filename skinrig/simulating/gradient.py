@@ -5,22 +5,22 @@ from collections.abc import Mapping
 from typing import Any, cast
 
 from capture.plan import Plan
-from capture.plan.gradient import state_of, states
+from capture.plan.gradient import group_by_state, strain_state
 from capture.rig import Rig, load_rig
 from capture.session import Session
 from rigsim.as_built.sphere import build_sphere
-from rigsim.needs.effects import SceneEffects, longest_on_s
+from rigsim.needs.effects import SceneEffects, max_on_time_s
 from rigsim.population import files as subject_file
 from rigsim.scenes.gradient.scene import GradientScene
-from rigsim.scenes.gradient.truth import appearance as ground_truth
+from rigsim.scenes.gradient.truth import gradient_truth as ground_truth
 from rigsim.skin_patch.motion import PatchMotion
-from rigsim.skin_patch.stretch import size_for
+from rigsim.skin_patch.stretch import required_size_mm
 from rigsim.world.taped_skin import GripState
-from skinrig.capturing.plan_choice import OwnPlan
-from skinrig.console import picked
+from skinrig.capturing.plan_choice import DefaultPlan
+from skinrig.console import select_attributes
 from skinrig.simulating import driving
 from skinrig.simulating.exposure_log import SceneLog
-from skinrig.simulating.orders import GradientOrder, Simulated, truth_folder
+from skinrig.simulating.orders import GradientOrder, SimulationResult, truth_folder
 
 WIDTHS_PX = {"small": 256, "full": 2048}
 ANGLES_DEG: dict[str, tuple[float, ...] | None] = {"small": (0.0,), "full": None}
@@ -33,15 +33,17 @@ MAX_SHIFT_MM = 0.3
 """How far the patch may come to lie off the middle: five standard deviations of its motion."""
 
 
-def simulate_gradient(order: GradientOrder) -> Simulated:
+def simulate_gradient(order: GradientOrder) -> SimulationResult:
     """Simulate a capture with the gradient sphere; see `simulation.simulate`."""
     # a ball of 12 mm fills the whole sensor, however small all else is kept
     width_px = WIDTHS_PX["full" if order.target == "ball" else order.size]
     rig = load_rig("gradient").cropped(order.width_px or width_px)
     angles = ANGLES_DEG[order.size] if order.angles is None else order.angles
-    plan = order.plan or OwnPlan(angles=angles, **picked(order, "target", "steps")).of(rig)
+    plan = order.plan or DefaultPlan(
+        angles=angles, **select_attributes(order, "target", "steps")
+    ).of(rig)
     light = driving.announce_light(plan, rig, order)
-    asked = driving.asked_of(
+    asked = driving.manifest_settings(
         order,
         width_px=rig.views[0].width_px,
         site=order.site or DEFAULT_SITE,
@@ -57,16 +59,16 @@ def simulate_gradient(order: GradientOrder) -> Simulated:
         plan=plan,
         without=order.scene_switches(),
     )
-    session, log = driving.open_logged(order, plan, rig, asked, scene, GripLog)
-    rig_seconds = driving.drive(
+    session, log = driving.open_logged_session(order, plan, rig, asked, scene, GripLog)
+    rig_seconds = driving.drive_plan(
         order, session, rig, log, eyes="closed", force_limit_n=FORCE_LIMIT_N, run_id=log.run_id
     )
     truth = None
     if order.target is None:
         truth = truth_folder(order.out)
-        driving.write_truth(truth, order, session, ground_truth(scene, log.grips(session)))
+        driving.write_truth(truth, order, session, ground_truth(scene, log.list_grips(session)))
     log.remove()
-    return driving.finish(order, session, scene, rig_seconds, truth, light=light)
+    return driving.build_result(order, session, scene, rig_seconds, truth, light=light)
 
 
 def make_scene(
@@ -92,13 +94,13 @@ def make_scene(
     plan : Plan, optional
         By whose angles the skin must be large enough; any angle by default.
     without
-        What of the skin is not built, see `skinrig.simulating.leaving_out`.
+        What of the skin is not built, see `skinrig.simulating.effect_omission`.
     """
     sphere = build_sphere(rig, seed=seed)
     if target is not None:
         return GradientScene(rig, cast(Any, target), sphere=sphere, seed=seed)
-    angles = {float(s.index["angle"]) for s in plan.steps if state_of(s)} if plan else set()
-    size_mm = size_for(
+    angles = {float(s.index["angle"]) for s in plan.steps if strain_state(s)} if plan else set()
+    size_mm = required_size_mm(
         max(rig.views[0].field_mm),
         STRETCH_RANGE,
         angle_deg=angles.pop() if len(angles) == 1 else None,
@@ -107,7 +109,7 @@ def make_scene(
     skin = subject_file.load_subject(subject).patch(
         site or DEFAULT_SITE, seed=seed, size_mm=size_mm
     )
-    on_s = None if plan is None else longest_on_s(plan)
+    on_s = None if plan is None else max_on_time_s(plan)
     return GradientScene(
         rig,
         skin,
@@ -125,16 +127,16 @@ class GripLog(SceneLog):
     suffix, kinds, max_lag_s = "grips", ("gradient",), 0.05
     lost = "the states captured before"
 
-    def met(self, exposed: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    def describe_exposure(self, exposed: Mapping[str, Any]) -> Mapping[str, Any] | None:
         """Return the grip of what is lit."""
         grip = exposed["grip"]
         return {"grip": dataclasses.asdict(grip)} if grip.attached else None
 
-    def grips(self, session: Session) -> list[Any]:
+    def list_grips(self, session: Session) -> list[Any]:
         """Return what was held in each state that the session has, in the plan's order."""
         entries = self.read()
         found = []
-        for name, steps in states(session.plan):
+        for name, steps in group_by_state(session.plan):
             ids = {step.id for step in steps}
             lit = (
                 record

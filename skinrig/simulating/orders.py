@@ -11,10 +11,10 @@ from capture.plan import Plan
 from capture.plan.dome import DomeTarget
 from capture.plan.gradient import GradientTarget
 from capture.plan.probe import ProbeTarget
-from capture.session import Subject
+from capture.session import SubjectRecord
 from skinrig.capturing.sequences import SequenceOrder
 from skinrig.errors import UsageError, one_of
-from skinrig.simulating.leaving_out import left_out_of
+from skinrig.simulating.effect_omission import omission_arguments
 
 PICTURE_SIZES = ("small", "full")
 SIMULATED_USES = ("research", "publication")
@@ -28,12 +28,12 @@ class SimulationError(ValueError):
     """A simulation that cannot be set up as asked."""
 
 
-class OptionsError(SimulationError, UsageError):
+class SimulationOptionsError(SimulationError, UsageError):
     """Options of a simulation that do not go together, or with its rig."""
 
 
 @dataclass(frozen=True, slots=True)
-class Simulated:
+class SimulationResult:
     """What a simulated capture left behind."""
 
     session: Path
@@ -77,7 +77,7 @@ def truth_folder(session: Path) -> Path:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Order:
+class SimulationOrder:
     """What every simulation is asked for; each rig's order adds its own options.
 
     Raises
@@ -104,12 +104,12 @@ class Order:
     plan: Plan | None = None
     """What is captured of the subject instead of the rig's own plan."""
     leave_out: tuple[str, ...] = ()
-    """What of skin is not built although it changes pixels: `skinrig.simulating.leaving_out`."""
+    """Effects of skin that are not built: `skinrig.simulating.effect_omission`."""
     resume: bool = False
     """Go on with a session that was interrupted; what is on disk is kept."""
     created: datetime | None = None
     """Date of the session; None: now."""
-    person: Subject | None = None
+    person: SubjectRecord | None = None
     """Pseudonym and consent to record; None: one who agreed to :data:`SIMULATED_USES`, or, where a
     session is gone on with, as it was begun. Others than it was begun with are refused."""
     progress: Callable[[str], None] | None = None
@@ -134,8 +134,10 @@ class Order:
     def check(self) -> None:
         """Raise where options do not go together."""
         self.check_rig_of_plan()
-        if self.plan is not None and self.not_at_rest is not None:
-            raise OptionsError("plan: is for a subject; targets and sequences have their own")
+        if self.plan is not None and self.exclusive_subject is not None:
+            raise SimulationOptionsError(
+                "plan: is for a subject; targets and sequences have their own"
+            )
 
     def check_rig_of_plan(self) -> None:
         """Raise for a plan of another rig."""
@@ -143,16 +145,18 @@ class Order:
             raise SimulationError(f"plan: got one of {self.plan.rig!r}, expected {self.rig!r}")
 
     @property
-    def not_at_rest(self) -> str | None:
+    def exclusive_subject(self) -> str | None:
         """What is simulated instead of skin at rest or in a state; None for such skin."""
         return None if self.target is None else "a target"
 
-    def refuse_beside(self, what: str, *names: str) -> None:
-        """Raise where something was asked for that `what` has not."""
+    def refuse_options(self, subject: str, *names: str) -> None:
+        """Raise where something was asked for that `subject` has not."""
         unset = {one.name: one.default for one in fields(self)}
         for name in names:
             if getattr(self, name) != unset[name]:
-                raise OptionsError(f"{name}: the {what} rig knows nothing of it; leave it out")
+                raise SimulationOptionsError(
+                    f"{name}: the {subject} rig knows nothing of it; leave it out"
+                )
 
     def scene_switches(self) -> dict[str, Any]:
         """Return arguments of a scene of skin that leave out what is to be left out.
@@ -164,18 +168,18 @@ class Order:
         """
         if not self.leave_out:
             return {}
-        if self.not_at_rest is not None:
-            raise OptionsError(
-                f"leave_out: is of skin at rest or in a state, not of {self.not_at_rest}"
+        if self.exclusive_subject is not None:
+            raise SimulationOptionsError(
+                f"leave_out: is of skin at rest or in a state, not of {self.exclusive_subject}"
             )
         try:
-            return dict(left_out_of(self.rig, self.leave_out))
+            return dict(omission_arguments(self.rig, self.leave_out))
         except ValueError as exc:
             raise SimulationError(str(exc)) from exc
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FaceOrder(Order):
+class FaceOrder(SimulationOrder):
     """A face before a rig."""
 
     width_px: int | None = None
@@ -207,7 +211,7 @@ class FlashOrder(FaceOrder):
     """Time constant of its blood, s; None: of the state, see `rigsim.subject.perfusion_course`."""
 
     @property
-    def not_at_rest(self) -> str | None:
+    def exclusive_subject(self) -> str | None:
         """What is simulated instead of skin at rest or in a state; None for such skin."""
         if self.target is not None:
             return "a target"
@@ -217,15 +221,15 @@ class FlashOrder(FaceOrder):
         """Raise where options do not go together."""
         if not math.isfinite(self.nearer_mm):
             raise SimulationError(f"nearer: got {self.nearer_mm}, expected finite millimetres")
-        if self.nearer_mm != 0.0 and self.not_at_rest is not None:
-            raise OptionsError(
-                f"nearer: is of a face at rest or in a state, not of {self.not_at_rest}"
+        if self.nearer_mm != 0.0 and self.exclusive_subject is not None:
+            raise SimulationOptionsError(
+                f"nearer: is of a face at rest or in a state, not of {self.exclusive_subject}"
             )
-        Order.check(self)
+        SimulationOrder.check(self)
         if self.sequence is not None:
-            self.refuse_beside(self.rig, "target", "repeats", "states")
+            self.refuse_options(self.rig, "target", "repeats", "states")
         elif self.relaxation_s is not None:
-            raise OptionsError("relaxation: is for a sequence")
+            raise SimulationOptionsError("relaxation: is for a sequence")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -234,8 +238,8 @@ class DomeOrder(FaceOrder):
 
     "small" is 6 cameras, 320 pixels across, and 48 lights; "full" is all that it has. The subject
     may also be a member of the simulated population, P01 to P87
-    (`rigsim.population.population.table_1`), with what it wears. Lights and cameras of a plan are
-    those of targets, too.
+    (`rigsim.population.population.draw_population`), with what it wears. Lights and cameras of a
+    plan are those of targets, too.
     """
 
     rig: ClassVar[str] = "dome"
@@ -266,27 +270,29 @@ class DomeOrder(FaceOrder):
     def check(self) -> None:
         """Raise where options do not go together; a dome's plan is for targets, too."""
         if len(self.states) != 1:
-            raise OptionsError(
+            raise SimulationOptionsError(
                 f"states: got {', '.join(self.states) or 'none'}, expected one; a session of the "
                 "dome shows one face, capture each state into a session of its own"
             )
         if self.plan is not None and (self.lights, self.views) != (None, None):
-            raise OptionsError("lights, views: a plan names its own; leave them out")
+            raise SimulationOptionsError("lights, views: a plan names its own; leave them out")
         self.check_rig_of_plan()
         if self.target is None:
             return
         if self.state != "neutral":
-            raise OptionsError(f"state: got {self.state!r}, but a target has none")
+            raise SimulationOptionsError(f"state: got {self.state!r}, but a target has none")
         if self.conditions:
-            raise OptionsError(
+            raise SimulationOptionsError(
                 f"condition: got {', '.join(self.conditions)}, but a target has none"
             )
         if self.subsurface or self.interreflections:
-            raise OptionsError("subsurface, interreflections: are of a face; a target has neither")
+            raise SimulationOptionsError(
+                "subsurface, interreflections: are of a face; a target has neither"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class GradientOrder(Order):
+class GradientOrder(SimulationOrder):
     """A patch of skin in a caliper, or a target, in the gradient sphere.
 
     "small" is the middle 256 pixels and one angle of the caliper; "full" is all 2048, which the
@@ -307,13 +313,13 @@ class GradientOrder(Order):
 
     def check(self) -> None:
         """Raise where options do not go together."""
-        Order.check(self)
+        SimulationOrder.check(self)
         if self.target is not None:
-            self.refuse_beside("target of the gradient", "site", "angles", "steps")
+            self.refuse_options("target of the gradient", "site", "angles", "steps")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ProbeOrder(Order):
+class ProbeOrder(SimulationOrder):
     """Tissue under the fibre probe, or a target; "full" has more photons in its truth.
 
     The subject may also be "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G]" in 1/mm.
@@ -333,18 +339,18 @@ class ProbeOrder(Order):
 
     def check(self) -> None:
         """Raise where options do not go together."""
-        Order.check(self)
+        SimulationOrder.check(self)
         if self.target is not None:
-            self.refuse_beside("target of the probe", "sites", "angles")
+            self.refuse_options("target of the probe", "sites", "angles")
 
 
-ORDER_BY_RIG: Mapping[str, type[Order]] = {
+ORDER_BY_RIG: Mapping[str, type[SimulationOrder]] = {
     kind.rig: kind for kind in (FlashOrder, DomeOrder, GradientOrder, ProbeOrder)
 }
 """The class of each rig's orders."""
 
 
-def order_for(rig: str, **options: Any) -> Order:
+def order_for(rig: str, **options: Any) -> SimulationOrder:
     """Return a rig's order out of options by name.
 
     Parameters
@@ -373,5 +379,7 @@ def order_for(rig: str, **options: Any) -> Order:
         default = foreign[name].default
         if options.pop(name) not in ({} if default is MISSING else default, None):
             shown = name.removesuffix("_mm")
-            raise OptionsError(f"{shown}: the {rig} rig knows nothing of it; leave it out")
+            raise SimulationOptionsError(
+                f"{shown}: the {rig} rig knows nothing of it; leave it out"
+            )
     return ORDER_BY_RIG[rig](**options)

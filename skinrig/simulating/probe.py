@@ -3,57 +3,59 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from capture.plan.probe import PHANTOM_SITE, PROBE_SITES, all_series
-from capture.plan.suction import Placement
+from capture.plan.probe import PHANTOM_SITE, PROBE_SITES, group_by_series
+from capture.plan.suction import HeadPlacement
 from capture.rig import Rig, load_rig
 from capture.session import Session
 from rigsim.fiber.probe_tissue import PHANTOM_BLOCK as BLOCK
 from rigsim.fiber.probe_tissue import TissueError
 from rigsim.population import files as subject_file
-from rigsim.scenes.probe.scene import ProbeScene, Probing
-from rigsim.scenes.probe.scene import appearance as ground_truth
-from skinrig.capturing.plan_choice import OwnPlan, directions_of
-from skinrig.console import picked
+from rigsim.scenes.probe.scene import ProbePlacement, ProbeScene
+from rigsim.scenes.probe.scene import probe_truth as ground_truth
+from skinrig.capturing.plan_choice import DefaultPlan, parse_direction_count
+from skinrig.console import select_attributes
 from skinrig.simulating import driving
 from skinrig.simulating.exposure_log import SceneLog
-from skinrig.simulating.orders import ProbeOrder, Simulated, SimulationError, truth_folder
+from skinrig.simulating.orders import ProbeOrder, SimulationError, SimulationResult, truth_folder
 
 TRUTH_PHOTONS = {"small": 60_000, "full": 2_000_000}
 """Of each site and angle of skin: about two percent in the far fibres, or a third of one."""
 
 
-def simulate_probe(order: ProbeOrder) -> Simulated:
+def simulate_probe(order: ProbeOrder) -> SimulationResult:
     """Simulate a capture with the fibre probe; see `simulation.simulate`.
 
     Either size has all sites, brackets and pixels, which cost little; what "full" has more of are
     the photons of the truth.
     """
     rig = load_rig("probe")
-    asked_plan = OwnPlan(**picked(order, "target", "sites", "repeats", "angles"))
+    asked_plan = DefaultPlan(**select_attributes(order, "target", "sites", "repeats", "angles"))
     plan = order.plan or asked_plan.of(rig)
-    asked = driving.asked_of(
+    asked = driving.manifest_settings(
         order,
         sites=",".join(order.sites or PROBE_SITES),
-        angles=directions_of(order.angles),
-        **picked(order, "size", "repeats", "all_brackets"),
+        angles=parse_direction_count(order.angles),
+        **select_attributes(order, "size", "repeats", "all_brackets"),
     )
     photons = TRUTH_PHOTONS[order.size]
-    scene = make_scene(rig, order.target, **picked(order, "subject", "seed"), photons=photons)
+    scene = make_scene(
+        rig, order.target, **select_attributes(order, "subject", "seed"), photons=photons
+    )
     if order.target is None:
         _check_sites(scene.tissue, order.sites or PROBE_SITES, rig)
     light = driving.announce_light(plan, rig, order)
-    session, log = driving.open_logged(order, plan, rig, asked, scene, HeadLog)
+    session, log = driving.open_logged_session(order, plan, rig, asked, scene, HeadLog)
     # nobody has to place the head: the box is told where it is, and with it the world
-    rig_seconds = driving.drive(
+    rig_seconds = driving.drive_plan(
         order, session, rig, log, run_id=log.run_id, all_brackets=order.all_brackets
     )
     truth = None
     if order.target != "dark":
         truth = truth_folder(order.out)
-        appearance = ground_truth(scene, log.probings(session))
+        appearance = ground_truth(scene, log.list_placements(session))
         driving.write_truth(truth, order, session, appearance, subject=order.subject)
     log.remove()
-    return driving.finish(order, session, scene, rig_seconds, truth, light=light)
+    return driving.build_result(order, session, scene, rig_seconds, truth, light=light)
 
 
 def _check_sites(tissue: Any, sites: Sequence[str], rig: Rig) -> None:
@@ -88,7 +90,7 @@ def make_scene(rig: Rig, target: str | None, *, subject: str, seed: int, photons
         For a subject that is none.
     """
     try:
-        tissue = BLOCK if target == "phantom" else subject_file.tissue(subject, seed=seed)
+        tissue = BLOCK if target == "phantom" else subject_file.load_tissue(subject, seed=seed)
     except TissueError as error:
         raise SimulationError(str(error)) from error
     return ProbeScene(rig, tissue, seed=seed, photons=photons)
@@ -102,22 +104,22 @@ class HeadLog(SceneLog):
 
     suffix, kinds, max_lag_s = "heads", ("fibres", PHANTOM_SITE), 1e-3
 
-    def met(self, exposed: Mapping[str, Any]) -> Mapping[str, Any]:
+    def describe_exposure(self, exposed: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return the suction of what is lit."""
         return {"suction_mbar": exposed["head"].suction_mbar}
 
-    def probings(self, session: Session) -> list[Any]:
+    def list_placements(self, session: Session) -> list[Any]:
         """Return the placements that the session has series of, in the plan's order."""
         entries = self.read()
         frames = {record.step_id: record for record in session.frames()}
-        suctions: dict[Placement, list[float]] = {}
-        for placement, steps in all_series(session.plan):
+        suctions: dict[HeadPlacement, list[float]] = {}
+        for placement, steps in group_by_series(session.plan):
             for step in steps:
                 if step.kind != "mask" and (record := frames.get(step.id)) is not None:
                     run_id = str(record.actual["run"])
                     entry = self.at(entries, run_id, record, f"step {step.id}")
                     suctions.setdefault(placement, []).append(float(entry["suction_mbar"]))
         return [
-            Probing(place.site, place.repeat, place.angle_deg, sum(found) / len(found))
+            ProbePlacement(place.site, place.repeat, place.angle_deg, sum(found) / len(found))
             for place, found in suctions.items()
         ]

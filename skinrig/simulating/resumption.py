@@ -4,14 +4,14 @@ from collections import defaultdict
 from collections.abc import Mapping
 from typing import Any
 
-from capture.session import Session, Subject
+from capture.session import Session, SubjectRecord
 
 _MAX_SHOWN_CHARACTERS = 60
 """Characters of a value that are shown; of a plan nobody reads more."""
 
 
-def differences(
-    begun: Mapping[str, Any], asked: Mapping[str, Any], *, of: str = ""
+def describe_differences(
+    recorded: Mapping[str, Any], requested: Mapping[str, Any], *, of: str = ""
 ) -> tuple[str, ...]:
     """Return what of two settings differs, a line each.
 
@@ -25,17 +25,18 @@ def differences(
 
     Examples
     --------
-    >>> differences({"width_px": 64, "mesh": ""}, {"width_px": 96, "mesh": "", "nearer_mm": 5.0})
+    >>> describe_differences({"width_px": 64, "mesh": ""}, {"width_px": 96, "mesh": "",
+    ...     "nearer_mm": 5.0})
     ('width_px: begun with 64, got 96', 'nearer_mm: begun without, got 5.0')
-    >>> differences({"map": {"file": "m.npy", "sha256": "a"}},
+    >>> describe_differences({"map": {"file": "m.npy", "sha256": "a"}},
     ...             {"map": {"file": "m.npy", "sha256": "b"}}, of="subject")
     ('subject map: the file m.npy was changed since',)
     """
     lines: list[str] = []
-    for key in dict.fromkeys((*begun, *asked)):
+    for key in dict.fromkeys((*recorded, *requested)):
         name = f"{of} {key}" if of else key
-        was, now = begun.get(key), asked.get(key)
-        if was == now and (key in begun) == (key in asked):
+        was, now = recorded.get(key), requested.get(key)
+        if was == now and (key in recorded) == (key in requested):
             continue
         if isinstance(was, Mapping) and isinstance(now, Mapping) and key != "plan":
             if "sha256" in was and was.get("file") == now.get("file"):
@@ -43,18 +44,18 @@ def differences(
             else:
                 file = was.get("file")
                 same = file is not None and file == now.get("file")
-                lines += differences(was, now, of=f"{name} {file}" if same else name)
+                lines += describe_differences(was, now, of=f"{name} {file}" if same else name)
         elif key == "plan" and was and now:
-            lines.append(f"{name}: begun with {_short(was)}, got another")
+            lines.append(f"{name}: begun with {_shorten_value(was)}, got another")
         else:
-            old = f"with {_short(was)}" if key in begun else "without"
-            new = _short(now) if key in asked else "none"
+            old = f"with {_shorten_value(was)}" if key in recorded else "without"
+            new = _shorten_value(now) if key in requested else "none"
             lines.append(f"{name}: begun {old}, got {new}")
     return tuple(lines)
 
 
-def refusals(
-    session: Session, asked: Mapping[str, Any], seed: int, person: Subject | None
+def list_refusals(
+    session: Session, requested: Mapping[str, Any], seed: int, person: SubjectRecord | None
 ) -> tuple[str, ...]:
     """Return why a session cannot be gone on with as asked, a line each; empty where it can.
 
@@ -72,13 +73,15 @@ def refusals(
     begun = session.manifest.extra.get("simulation")
     if not isinstance(begun, Mapping):
         return ("it was not begun by a simulation",)
-    lines = list(differences({**begun, "seed": session.seed}, {**asked, "seed": seed}))
+    lines = list(describe_differences({**begun, "seed": session.seed}, {**requested, "seed": seed}))
     if person is not None:
-        lines += differences(_agreed(session.manifest.subject), _agreed(person))
+        lines += describe_differences(
+            _consent_record(session.manifest.subject), _consent_record(person)
+        )
     return tuple(lines)
 
 
-def shots_made(session: Session) -> Mapping[str, int]:
+def count_shots(session: Session) -> Mapping[str, int]:
     """Return how many shots each camera has made for a session, as far as anything came of them.
 
     The noise of a simulated frame is seeded by the number of the shot. A world that is made anew
@@ -109,7 +112,7 @@ def shots_made(session: Session) -> Mapping[str, int]:
     for record in session.frames():
         attempts[record.step_id][record.camera] = record.attempt
         tries[record.step_id] = max(tries[record.step_id], int(record.actual.get("tries", 1)))
-    skin_left_out = session.left_out() if session.rig.caliper is not None else {}
+    skin_left_out = session.omitted_steps() if session.rig.caliper is not None else {}
     for step in session.plan.steps:
         kept = min(attempts[step.id].get(name, 0) for name in step.cameras)
         shots = kept + max(tries[step.id] - 1, 0) if kept else 0
@@ -122,7 +125,7 @@ def shots_made(session: Session) -> Mapping[str, int]:
     return counts
 
 
-def _agreed(person: Subject) -> dict[str, Any]:
+def _consent_record(person: SubjectRecord) -> dict[str, Any]:
     """Return whom a session is of; uses sorted, since their order says nothing."""
     day = person.consent_expires
     return {
@@ -132,7 +135,7 @@ def _agreed(person: Subject) -> dict[str, Any]:
     }
 
 
-def _short(value: Any) -> str:
+def _shorten_value(value: Any) -> str:
     """Return a value as people read it: of files their name, of lists their members."""
     if isinstance(value, Mapping) and "file" in value:
         return str(value["file"])

@@ -13,25 +13,20 @@ from capture.rig import load_rig
 from capture.session import Session
 from model import store
 from rigsim.population import files as subject_file
-from rigsim.scenes.flash.course import FlashCourseScene, FlashTime
+from rigsim.scenes.flash.course import FlashCourseScene, FlashEvent
 from rigsim.subject.perfusion import STATE_NAMES
 from rigsim.subject.perfusion_course import EventCourse, PromptedCourse
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.capturing.sequences import SequenceOrder, sequence_lines, sequence_plan
 from skinrig.simulating import subject_records
-from skinrig.simulating.driving import drive, finish, open_session
+from skinrig.simulating.driving import build_result, drive_plan, open_session
 from skinrig.simulating.exposure_log import ExposureLog
-from skinrig.simulating.flash_truth import (
-    WIDTHS_PX,
-    landmarks_at_superpixels,
-    to_superpixels,
-    truth_of,
-)
+from skinrig.simulating.flash_truth import WIDTHS_PX, build_truth, scale_landmarks, to_superpixels
 from skinrig.simulating.orders import (
     FlashOrder,
-    OptionsError,
-    Simulated,
     SimulationError,
+    SimulationOptionsError,
+    SimulationResult,
     truth_folder,
 )
 
@@ -56,7 +51,7 @@ INTERRUPTION_S = 10.0
 """Time on the host's clock that a simulated interruption takes, s."""
 
 
-def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> Simulated:
+def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationResult:
     """Simulate a sequence with the flash rig; see `simulation.simulate`."""
     if sequence.state not in STATE_NAMES or sequence.state == "neutral":
         expected = ", ".join(state for state in STATE_NAMES if state != "neutral")
@@ -69,7 +64,7 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> Simulated:
     asked = {
         "rig": "flash",
         "width_px": width,
-        "subject": subject_records.of_manifest(order.subject),
+        "subject": subject_records.manifest_record(order.subject),
         "mesh": str(order.mesh or ""),
         "sequence": sequence.document(),
         "relaxation_s": constant_s,
@@ -78,9 +73,11 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> Simulated:
     reaction_s = sequence.reaction_s
     if reaction_s is not None and not 0 <= reaction_s < np.inf:
         raise SimulationError(f"reaction: got {reaction_s}, expected seconds >= 0")
-    if reaction_s is not None and not sequence.prompted:
-        raise OptionsError(f"reaction: is for prompts, and {sequence.state} follows an event")
-    if sequence.prompted:
+    if reaction_s is not None and not sequence.is_prompted:
+        raise SimulationOptionsError(
+            f"reaction: is for prompts, and {sequence.state} follows an event"
+        )
+    if sequence.is_prompted:
         own = {"rise_s": constant_s, "fall_s": constant_s, "reaction_s": reaction_s}
         known: dict[str, Any] = {name: v for name, v in own.items() if v is not None}
         course: Any = PromptedCourse(sequence.state, seed=seed, **known)
@@ -96,7 +93,7 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> Simulated:
     truth = truth_folder(order.out)
     log: ExposureLog | None = None
 
-    def note(flash: FlashTime) -> None:
+    def note(flash: FlashEvent) -> None:
         if log is not None:  # nothing flashes before the session is open
             log.add(dataclasses.asdict(flash))
 
@@ -105,7 +102,7 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> Simulated:
     log = ExposureLog(truth.with_name(f"{truth.name}.flashes.jsonl"), resume=order.resume)
     before_s = _event_s(session)
     begun_s = time.time() if before_s is None else _last_s(session) + INTERRUPTION_S
-    if before_s is not None and not sequence.prompted:
+    if before_s is not None and not sequence.is_prompted:
         course.tell(before_s - begun_s, sequence.state)  # it was over before this world began
 
     def prompt(world: Any, text: str) -> None:
@@ -115,12 +112,12 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> Simulated:
     def signal(world: Any, text: str) -> None:
         course.tell(world.now, text)
 
-    rig_seconds = drive(order, session, rig, scene, prompt, signal=signal, begun_s=begun_s)
-    about = subject_records.of_truth(order.subject, "flash", order.progress)
+    rig_seconds = drive_plan(order, session, rig, scene, prompt, signal=signal, begun_s=begun_s)
+    about = subject_records.truth_parameters(order.subject, "flash", order.progress)
     flashes = {str(entry["token"]): entry for entry in log.read()}
     _write_truth(truth, scene, session, sequence, flashes, seed, about)
     log.remove()
-    return finish(order, session, scene, rig_seconds, truth)
+    return build_result(order, session, scene, rig_seconds, truth)
 
 
 def _event_s(session: Session) -> float | None:
@@ -142,12 +139,12 @@ def _write_truth(
     sequence: SequenceOrder,
     flashes: Mapping[str, Mapping[str, Any]],
     seed: int,
-    about: Mapping[str, Any],
+    parameters: Mapping[str, Any],
 ) -> None:
     """Write the truth at rest, and with it what each frame's blood was; and that of the state."""
     poses = sorted({"neutral", *(str(flash["pose"]) for flash in flashes.values())})
     radius_px = DISC_RADIUS_FRACTION * session.rig.views[0].width_px / 2
-    places = {pose: landmarks_at_superpixels(scene.landmarks_px(pose)) for pose in poses}
+    places = {pose: scale_landmarks(scene.landmarks_px(pose)) for pose in poses}
     points = {
         pose: {name: at[of] for name, of in COURSE_LANDMARKS.items() if of in at}
         for pose, at in places.items()
@@ -180,15 +177,19 @@ def _write_truth(
         "frames": frames,
     }
     table = ["name,x,y", *(f"{name},{x:.3f},{y:.3f}" for name, (x, y) in places["neutral"].items())]
-    rest = truth_of(scene.at("neutral", 0.0), seed, session.content_hash, "neutral", about=about)
+    rest = build_truth(
+        scene.at("neutral", 0.0), seed, session.content_hash, "neutral", parameters=parameters
+    )
     files = {
         COURSE_FILE: (json.dumps(document, indent=1) + "\n").encode(),
         LANDMARKS_FILE: ("\n".join(table) + "\n").encode(),
     }
     store.write(folder, dataclasses.replace(rest, files=files))
-    pose = sequence.state if sequence.prompted else "neutral"
+    pose = sequence.state if sequence.is_prompted else "neutral"
     state = sequence.state
-    full = truth_of(scene.at(pose, 1.0), seed, session.content_hash, state, about=about)
+    full = build_truth(
+        scene.at(pose, 1.0), seed, session.content_hash, state, parameters=parameters
+    )
     store.write(folder.with_name(f"{folder.name}-{sequence.state}"), full)
 
 
@@ -198,10 +199,10 @@ def _constants(course: Any) -> dict[str, float]:
 
 
 def disc_mean(
-    values: Float64Array, valid: BoolArray, place: Sequence[float], radius: float
+    values: Float64Array, valid: BoolArray, center_px: Sequence[float], radius: float
 ) -> float | None:
     """Return the mean of a map's valid pixels within a disc about (x, y), px; None without any."""
     rows, columns = np.indices(values.shape)
-    near = (columns - place[0]) ** 2 + (rows - place[1]) ** 2 <= radius**2
+    near = (columns - center_px[0]) ** 2 + (rows - center_px[1]) ** 2 <= radius**2
     inside = valid & near
     return float(values[inside].mean()) if inside.any() else None

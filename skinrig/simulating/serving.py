@@ -12,22 +12,22 @@ from typing import TYPE_CHECKING, Any
 from capture.plan.probe import PHANTOM_SITE, PROBE_SITES
 from capture.rig import Probe, Rig, load_rig
 from capture.session import Session
-from rigsim.as_built.dome import build
+from rigsim.as_built.dome import build_dome
 from rigsim.population import files as subject_file
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene
-from rigsim.world.serve import serve
+from rigsim.world.serve import serve_world
 from rigsim.world.suction import HeadState
 from skinrig.arrays import UInt16Array
-from skinrig.console import Console, picked
+from skinrig.console import Console, select_attributes
 from skinrig.errors import EXIT_INTERRUPTED, UsageError
 from skinrig.next_steps import shell_quote
 from skinrig.simulating import dome as simulating_dome
 from skinrig.simulating import flash, gradient
 from skinrig.simulating import probe as simulating_probe
-from skinrig.simulating.orders import OptionsError, SimulationError, require_size
-from skinrig.simulating.resumption import shots_made
-from skinrig.simulating.subject_records import unused_subject_keys
+from skinrig.simulating.orders import SimulationError, SimulationOptionsError, require_size
+from skinrig.simulating.resumption import count_shots
+from skinrig.simulating.subject_records import find_unused_subject_keys
 
 if TYPE_CHECKING:
     from rigsim.scenes.probe.scene import ProbeScene
@@ -84,10 +84,10 @@ def serve_rig(rig_name: str, order: ServeOrder, console: Console) -> None:
     rig = load_rig(rig_name)
     made = _shots_made(order.resume, rig)
     if order.site is not None and rig.caliper is None:
-        raise OptionsError("site: only the gradient rig knows of it; leave it out")
-    rig, scene = _served(rig, order)
-    asked = picked(order, "pty", "tcp", "allow_remote", "seed")
-    with serve(rig, scene=scene, shots_made=made, **asked) as served:
+        raise SimulationOptionsError("site: only the gradient rig knows of it; leave it out")
+    rig, scene = _build_served_rig(rig, order)
+    asked = select_attributes(order, "pty", "tcp", "allow_remote", "seed")
+    with serve_world(rig, scene=scene, shots_made=made, **asked) as served:
         after = _next_step(rig_name, rig, served.addresses, order.resume)
         if console.as_json:
             addresses = {"addresses": dict(served.addresses), "next": after}
@@ -105,12 +105,12 @@ def serve_rig(rig_name: str, order: ServeOrder, console: Console) -> None:
             raise
 
 
-def _served(rig: Rig, order: ServeOrder) -> tuple[Rig, Any]:
+def _build_served_rig(rig: Rig, order: ServeOrder) -> tuple[Rig, Any]:
     """Return a rig as it is served, and what stands in it."""
     subject, seed = order.subject, order.seed
     # a rig's own file may have any name: what it sees hangs on what it is built of
     kind = "gradient" if "gradient_sphere" in rig.boxes else "probe" if rig.probe else "other"
-    unused_subject_keys(subject, kind, lambda text: print(text, file=sys.stderr))
+    find_unused_subject_keys(subject, kind, lambda text: print(text, file=sys.stderr))
     if kind == "gradient":
         if order.size != "small":
             raise SimulationError(
@@ -148,7 +148,7 @@ def _shots_made(session: Path | None, rig: Rig) -> Mapping[str, int]:
         raise SimulationError(
             f"resume: got a session of rig {opened.rig.name!r}, expected one of {rig.name!r}"
         )
-    return shots_made(opened)
+    return count_shots(opened)
 
 
 def _flash_scene(rig: Rig, subject: str, seed: int) -> Any:
@@ -160,7 +160,7 @@ def _flash_scene(rig: Rig, subject: str, seed: int) -> Any:
 
 def _dome_scene(rig: Rig, subject: str, seed: int) -> Any:
     person = subject_file.load_subject(subject).face(seed=seed)
-    return DomeScene(rig, person, dome=build(rig, seed=seed), seed=seed)
+    return DomeScene(rig, person, dome=build_dome(rig, seed=seed), seed=seed)
 
 
 def _probe_scene(rig: Rig, probe: Probe, subject: str, seed: int) -> Any:
@@ -172,7 +172,7 @@ def _probe_scene(rig: Rig, probe: Probe, subject: str, seed: int) -> Any:
     # skin meanwhile, and waits for its host for some seconds only
     for site in (*PROBE_SITES, PHANTOM_SITE):
         scene = block if site == PHANTOM_SITE else skin
-        scene.fibre_light(HeadState(site, 0.0, True, probe.suction_mbar, probe.camera_c))
+        scene.fiber_radiance(HeadState(site, 0.0, True, probe.suction_mbar, probe.camera_c))
     return _SkinAndBlock(skin, block, PHANTOM_SITE)
 
 

@@ -4,10 +4,10 @@ import importlib
 from pathlib import Path
 from typing import Any
 
-from skinrig.simulating.orders import Order, Simulated, order_for
+from skinrig.simulating.orders import SimulationOrder, SimulationResult, order_for
 
 
-def simulate(order: Order) -> Simulated:
+def simulate(order: SimulationOrder) -> SimulationResult:
     """Simulate a capture into SESSION/, and write its truth beside it.
 
     Parameters
@@ -22,11 +22,11 @@ def simulate(order: Order) -> Simulated:
     """
     # a module a rig, so that a run loads what its own rig needs
     rig = importlib.import_module(f"skinrig.simulating.{order.rig}")
-    done: Simulated = getattr(rig, f"simulate_{order.rig}")(order)
+    done: SimulationResult = getattr(rig, f"simulate_{order.rig}")(order)
     return done
 
 
-def simulate_session(rig: str, out: str | Path, **options: Any) -> Simulated:
+def simulate_session(rig: str, out: str | Path, **options: Any) -> SimulationResult:
     """Simulate a capture with a rig by its name; see `simulate`.
 
     Parameters

@@ -23,13 +23,13 @@ def pseudonym(subject: str, seed: int) -> str:
     return f"simulated-{name}-{seed}"
 
 
-def of_manifest(subject: str) -> str | dict[str, Any]:
+def manifest_record(subject: str) -> str | dict[str, Any]:
     """Return a subject as a session's manifest holds it: a preset, or all that its file says."""
-    return subject_file.record(subject)
+    return subject_file.record_subject(subject)
 
 
-def unused_subject_keys(
-    subject: str, rig: str, tell: Callable[[str], None] | None = None
+def find_unused_subject_keys(
+    subject: str, rig: str, progress: Callable[[str], None] | None = None
 ) -> tuple[str, ...]:
     """Return the keys of a subject's file of which a rig sees nothing; none of a preset.
 
@@ -42,15 +42,17 @@ def unused_subject_keys(
     tell
         Told of them, in one line, where there are any.
     """
-    if not subject_file.is_file(subject):
+    if not subject_file.is_subject_file(subject):
         return ()
-    keys = subject_file.read(subject).unused(rig)
-    if keys and tell is not None:
-        tell(f"{subject}: the {rig} rig sees nothing of {', '.join(keys)}")
+    keys = subject_file.read_subject_file(subject).unused_keys(rig)
+    if keys and progress is not None:
+        progress(f"{subject}: the {rig} rig sees nothing of {', '.join(keys)}")
     return keys
 
 
-def of_truth(subject: str, rig: str, progress: Callable[[str], None] | None) -> dict[str, Any]:
+def truth_parameters(
+    subject: str, rig: str, progress: Callable[[str], None] | None
+) -> dict[str, Any]:
     """Return parameters of a truth that tell of a subject's file; none of a preset.
 
     Parameters
@@ -62,10 +64,10 @@ def of_truth(subject: str, rig: str, progress: Callable[[str], None] | None) -> 
     progress
         Told what the file says and the rig does not see.
     """
-    if not subject_file.is_file(subject):
+    if not subject_file.is_subject_file(subject):
         return {}
     return {
         "subject": Path(subject).stem,
-        "subject_file": subject_file.record(subject),
-        "subject_unused": list(unused_subject_keys(subject, rig, progress)),
+        "subject_file": subject_file.record_subject(subject),
+        "subject_unused": list(find_unused_subject_keys(subject, rig, progress)),
     }

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from model import texture_statistics
 from model.texture_statistics.space import TextureSpace
 from model.traits import TraitSpace, histogram_transport
-from model.traits.feasible_sets import Free, Histograms
+from model.traits.feasible_sets import HistogramSet, UnconstrainedSet
 from model.traits.vectors import Contrast
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.errors import UnusableError, one_of
@@ -64,7 +64,7 @@ class AlbedoTraits:
         Parameters
         ----------
         histograms
-            (23808,), as `model.texture_statistics.describe` gives it of `encoded` albedo.
+            (23808,), as `model.texture_statistics.describe` gives it of `encode_albedo` albedo.
         amounts
             Trait to amount.
 
@@ -83,8 +83,8 @@ class AlbedoTraits:
                 self.traits.trait(name)
             return given, self.texture, 0.0
         if self.kind == "histograms":
-            found = self.traits.outcome(given, amounts)
-            return np.asarray(found.sample, np.float64), self.texture, float(found.share)
+            found = self.traits.edit_with_outcome(given, amounts)
+            return np.asarray(found.sample, np.float64), self.texture, float(found.clipped_fraction)
         change = sum(
             (amount * self.traits.trait(name).vector for name, amount in amounts.items()),
             np.zeros(self.texture.size),
@@ -92,8 +92,10 @@ class AlbedoTraits:
         before = self.texture.histograms(given)
         scale = response_scale(self.texture)[..., None]
         by = change.reshape(before.shape) * scale
-        wide = histogram_transport.widened(before, self.texture.edges, by)
-        after = histogram_transport.moved(before, self.texture.edges, by, onto=wide)
+        wide = histogram_transport.widen_edges(before, self.texture.edges, by)
+        after = histogram_transport.shift_quantiles(
+            before, self.texture.edges, by, target_edges=wide
+        )
         wanted = histogram_transport.quantiles(before, self.texture.edges) + by
         got = histogram_transport.quantiles(after, wide)
         asked = float(np.sqrt(np.mean((by / scale) ** 2)))
@@ -102,7 +104,7 @@ class AlbedoTraits:
         return after.reshape(-1), space, min(missed / asked, 1.0) if asked > 0 else 0.0
 
 
-def encoded(r_d: ArrayLike, kind: VectorKind) -> Float64Array:
+def encode_albedo(r_d: ArrayLike, kind: VectorKind) -> Float64Array:
     """Return what statistics are taken of: R_d for histograms, its logarithm for quantiles."""
     given = np.asarray(r_d, np.float64)
     if one_of("vectors", kind, VECTOR_KINDS) == "histograms":
@@ -123,7 +125,7 @@ def response_scale(texture: TextureSpace) -> Float64Array:
     return np.maximum(middle, MIN_RELATIVE_SCALE * float(middle[0, 0]))
 
 
-def telling(texture: TextureSpace) -> BoolArray:
+def informative_responses(texture: TextureSpace) -> BoolArray:
     """Return the responses of more than negligible spread, (C, responses)."""
     scale = response_scale(texture)
     return np.asarray(scale > 1.001 * MIN_RELATIVE_SCALE * scale[0, 0], np.bool_)
@@ -134,7 +136,7 @@ def vector(
 ) -> Float64Array:
     """Return the vector of an albedo map, (23808,); see `model.texture_statistics.describe`."""
     found = texture_statistics.describe(
-        encoded(r_d, kind), space=texture, valid=valid, region=region
+        encode_albedo(r_d, kind), space=texture, valid=valid, region=region
     )
     if kind == "histograms":
         return found
@@ -142,7 +144,7 @@ def vector(
     return (q / response_scale(texture)[..., None]).reshape(-1)
 
 
-def fit(
+def fit_albedo_traits(
     vectors: ArrayLike,
     labels: Mapping[str, ArrayLike],
     continuous: Mapping[str, ArrayLike],
@@ -153,7 +155,7 @@ def fit(
     seed: int = 0,
 ) -> AlbedoTraits:
     """Learn the traits of albedo vectors (n, 23808), see `model.traits.TraitSpace.fit`."""
-    inside = Free() if kind == "quantiles" else Histograms()
+    inside = UnconstrainedSet() if kind == "quantiles" else HistogramSet()
     found = TraitSpace.fit(
         vectors,
         labels,

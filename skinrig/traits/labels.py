@@ -13,7 +13,7 @@ from skinrig.errors import UnusableError
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Labels:
+class TraitLabels:
     """Labels of n faces.
 
     Attributes
@@ -34,7 +34,7 @@ class Labels:
     ignored: tuple[str, ...]
 
 
-def read(path: Path, faces: Sequence[str]) -> Labels:
+def read(path: Path, faces: Sequence[str]) -> TraitLabels:
     """Read a table of labels for some faces.
 
     Parameters
@@ -92,7 +92,7 @@ def read(path: Path, faces: Sequence[str]) -> Labels:
     table = np.array([values[name] for name in faces], np.float64)
     whole = np.array(list(values.values()), np.float64)
     kinds = [bool(np.isin(column, (0.0, 1.0)).all()) for column in whole.T]
-    return Labels(
+    return TraitLabels(
         tuple(faces),
         {t: table[:, k] > 0.5 for k, t in enumerate(traits) if kinds[k]},
         {t: table[:, k] for k, t in enumerate(traits) if not kinds[k]},
@@ -100,11 +100,11 @@ def read(path: Path, faces: Sequence[str]) -> Labels:
     )
 
 
-def _number(cell: str, where: str) -> float:
+def _number(cell: str, location: str) -> float:
     try:
         value = float(cell)
     except ValueError as error:
-        raise UnusableError(f"{where}: got {cell!r}, expected 0, 1 or a number") from error
+        raise UnusableError(f"{location}: got {cell!r}, expected 0, 1 or a number") from error
     if not math.isfinite(value):
-        raise UnusableError(f"{where}: got {cell!r}, expected a finite number")
+        raise UnusableError(f"{location}: got {cell!r}, expected a finite number")
     return value

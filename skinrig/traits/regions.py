@@ -40,7 +40,7 @@ def space_name(region: str) -> str:
 
 def library_parameters(frame: CommonFrame, kind: VectorKind, **more: Any) -> dict[str, Any]:
     """Return what a library says of its samples."""
-    return {"vectors": kind, "frame": frame.document(), **more}
+    return {"vectors": kind, "frame": frame.to_document(), **more}
 
 
 def texture_bytes(space: TextureSpace) -> bytes:
@@ -82,7 +82,7 @@ class LibraryParts:
         return tuple(sorted({name for space in spaces for name in space.traits}))
 
 
-def parts_of(library: TraitLibrary) -> LibraryParts:
+def open_library(library: TraitLibrary) -> LibraryParts:
     """Open a library.
 
     Raises
@@ -141,4 +141,4 @@ def load(path: Path | None) -> tuple[TraitLibrary, str]:
             "traits: no library comes with this package; name one with --space FILE "
             "(`skinrig fit traits` learns one)"
         )
-    return trait_storage.default(), hashlib.sha256(packaged.read_bytes()).hexdigest()
+    return trait_storage.load_packaged_traits(), hashlib.sha256(packaged.read_bytes()).hexdigest()

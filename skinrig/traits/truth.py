@@ -24,7 +24,7 @@ from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis, diffuse_albedo
 from reconstruction.correspondence import charts as common_charts
 from reconstruction.correspondence import common_parameterization as parameterization
-from reconstruction.correspondence.charts import Chart
+from reconstruction.correspondence.charts import TexelChart
 from reconstruction.correspondence.common_parameterization import CommonFrame
 from rigsim.light import surface_brdf
 from rigsim.population import conditions as skin_conditions
@@ -32,7 +32,7 @@ from rigsim.population.population import Member
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.traits.albedo_vectors import AlbedoSample
 
-Labels = dict[str, BoolArray]
+LabelMasks = dict[str, BoolArray]
 
 TRUTH_CAMERA: Final = "Nikon 5100 (NPL)"
 TRUTH_ILLUMINANT: Final = "D55"
@@ -45,7 +45,7 @@ ALBEDO_NOISE: Final = 0.01
 """Relative noise of R_d at a pixel of the common map."""
 
 
-def assigned(
+def assign_conditions(
     members: Sequence[Member],
     conditions: Sequence[str],
     *,
@@ -70,12 +70,12 @@ def assigned(
     for place, index in enumerate(order):
         name = conditions[place % len(conditions)]
         worn = {} if name == "normal" else {name: float(rng.uniform(*amounts))}
-        applied = tuple(skin_conditions.checked(worn).items())
+        applied = tuple(skin_conditions.validate_conditions(worn).items())
         given[index] = dataclasses.replace(members[index], applied=applied)
     return tuple(given)
 
 
-def labels_of(members: Sequence[Member], names: Sequence[str]) -> Labels:
+def label_members(members: Sequence[Member], names: Sequence[str]) -> LabelMasks:
     """Return which members have which labels, (n,) each."""
     return {name: np.array([name in person.labels for person in members]) for name in names}
 
@@ -113,10 +113,10 @@ def mean_mixture(
         Draws directions and noise.
     """
     shape = (len(points), pairs)
-    light, view = directions(shape, rng=rng), directions(shape, rng=rng)
+    light, view = sample_directions(shape, rng=rng), sample_directions(shape, rng=rng)
     up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
     each = zip(points, up, light, view, strict=True)
-    f = np.stack([surface_brdf.evaluate(*one)[0] for one in each]).astype(np.float64)
+    f = np.stack([surface_brdf.evaluate_brdf(*one)[0] for one in each]).astype(np.float64)
     cosine = light[..., 2:]
     sigma = noise * (f * cosine + 0.02 / np.pi) / cosine
     f += sigma * rng.standard_normal(f.shape)
@@ -127,7 +127,7 @@ def mean_mixture(
     return np.asarray(found.weights[found.valid].mean(axis=0))
 
 
-def directions(shape: tuple[int, ...], *, rng: np.random.Generator) -> Float64Array:
+def sample_directions(shape: tuple[int, ...], *, rng: np.random.Generator) -> Float64Array:
     """Draw unit vectors (..., 3) evenly over the cap above the horizon about +z."""
     z = rng.uniform(MIN_SAMPLED_COSINE, 1.0, shape)
     turn = rng.uniform(0.0, 2.0 * np.pi, shape)
@@ -181,7 +181,7 @@ def lobe_changes(
     rng
         Draws points and directions.
     """
-    light, view = directions((pairs,), rng=rng), directions((pairs,), rng=rng)
+    light, view = sample_directions((pairs,), rng=rng), sample_directions((pairs,), rng=rng)
     heights = zip(light[:, 2], view[:, 2], strict=True)
     through = np.array([surface_brdf.boundary_transmittance(*pair) for pair in heights])
     streams = [int(n) for n in rng.integers(2**31, size=len(before))]
@@ -191,9 +191,9 @@ def lobe_changes(
         for person, stream in zip(people, streams, strict=True):
             # the same stream draws the same points of the same face again
             packed = surface_points(person, points, rng=np.random.default_rng(stream))
-            floors = surface_brdf.surface_floor(packed) / np.pi
+            floors = surface_brdf.min_surface_reflection(packed) / np.pi
             for one, floor in zip(packed, floors, strict=True):
-                lobe = surface_brdf.evaluate(one, [0.0, 0.0, 1.0], light, view)[1]
+                lobe = surface_brdf.evaluate_brdf(one, [0.0, 0.0, 1.0], light, view)[1]
                 total += (lobe - floor * through) * light[:, 2]
         return total / (points * len(people))
 
@@ -215,7 +215,7 @@ class CommonFaces:
     """
 
     frame: CommonFrame
-    charts: Mapping[int, Chart]
+    charts: Mapping[int, TexelChart]
     size: int
 
     @classmethod
@@ -232,19 +232,19 @@ class CommonFaces:
         by_head = {person.head: person for person in members}
         faces = {head: person.face(size) for head, person in by_head.items()}
         marks = {head: face.landmarks_mm() for head, face in faces.items()}
-        names, places = parameterization.common_landmarks(list(marks.values()))
+        names, places = parameterization.average_landmarks(list(marks.values()))
         unrolled = [
             parameterization.Cylinder(marks[head]["nose tip"]).unroll(
                 face.atlas.position_mm[face.atlas.covered]
             )
             for head, face in faces.items()
         ]
-        frame = parameterization.frame_around(names, places, unrolled, size=common)
+        frame = parameterization.fit_common_frame(names, places, unrolled, size=common)
         charts = {
-            head: common_charts.chart(
+            head: common_charts.chart_texels(
                 face.atlas.position_mm,
                 face.atlas.covered,
-                parameterization.correspond(marks[head], frame),
+                parameterization.fit_correspondence(marks[head], frame),
                 frame,
             )
             for head, face in faces.items()

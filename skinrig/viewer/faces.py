@@ -12,18 +12,18 @@ import numpy as np
 
 from model import skin_reflectance, store
 from model.skin import SkinAppearance
-from rigsim.geometry.mesh import Mesh, build_mesh, centered
+from rigsim.geometry.mesh import Mesh, build_mesh, center_face
 from rigsim.subject import SimulatedSubject, make_subject
 from skinrig import consent
 from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.blend_shapes import meshes as blend_shapes
-from skinrig.rendering.geometry import own_mesh
+from skinrig.rendering.geometry import read_own_mesh
 from skinrig.viewer.assets import facial_color as facial_color_assets
 from skinrig.viewer.assets import fitted as fitted_assets
 from skinrig.viewer.assets import reflectance as reflectance_assets
 from skinrig.viewer.assets import surface as wrinkle_assets
 from skinrig.viewer.fine_skin import PERSON_PX, FineSkin
-from skinrig.viewer.holes import ClosedMesh, closed
+from skinrig.viewer.holes import ClosedMesh, close_holes
 from skinrig.viewer.microstructure import assets as microstructure_assets
 from skinrig.viewer.scene import MAX_TEXTURE_PX, Assets, Kind, SceneError, SceneSource, ViewerScene
 
@@ -69,7 +69,7 @@ def presets(names: Iterable[str]) -> dict[str, dict[str, float]]:
     basic = {name: _weights(name, known) for name in (*EMOTION_STATES, "smile", *GLOBAL_STATES)}
     # a combination of which a part is missing would be another one's
     combined = {
-        name: _joined(basic[part] for part in parts)
+        name: _add_weights(basic[part] for part in parts)
         for name, parts in COMBINED_STATES.items()
         if all(basic[part] for part in parts)
     }
@@ -78,19 +78,19 @@ def presets(names: Iterable[str]) -> dict[str, dict[str, float]]:
     return {"neutral": {}, **first, **combined, **last}
 
 
-def _weights(name: str, known: tuple[str, ...]) -> dict[str, float]:
+def _weights(name: str, shape_names: tuple[str, ...]) -> dict[str, float]:
     """Return the state of that name and, where there is no such shape, its action units."""
-    found = {name: 1.0} if name in known else {}
+    found = {name: 1.0} if name in shape_names else {}
     units = {
         shape: weight
         for unit, weight in ACTION_UNITS.get(name, {}).items()
-        for shape in known
+        for shape in shape_names
         if shape in (unit, f"{unit}_L", f"{unit}_R", f"{unit}Left", f"{unit}Right")
     }
     return {**found, **units}
 
 
-def _joined(parts: Iterable[Mapping[str, float]]) -> dict[str, float]:
+def _add_weights(parts: Iterable[Mapping[str, float]]) -> dict[str, float]:
     """Return weights added, no muscle beyond its full movement."""
     total: dict[str, float] = {}
     for part in parts:
@@ -110,7 +110,7 @@ ASSET_BUILDERS: Final[tuple[Callable[[SceneSource], Assets], ...]] = (
 """In the order in which their parts are listed; they do not see each other's."""
 
 
-def assemble(source: SceneSource, provenance: Mapping[str, Any]) -> ViewerScene:
+def assemble_scene(source: SceneSource, provenance: Mapping[str, Any]) -> ViewerScene:
     """Return the scene of a source."""
     scene = ViewerScene(mesh=source.mesh, provenance=provenance)
     for build in ASSET_BUILDERS:
@@ -195,8 +195,8 @@ def scene(
     source = SceneSource(kind, *of, landmarks, calibration)
     if not paths:
         provenance = {"source": "simulated", "kind": kind, "preset": preset, "seed": seed}
-        return assemble(source, provenance | ({} if mesh is None else {"mesh": mesh.name}))
-    found = assemble(source, _provenance(source, paths, whole, told))
+        return assemble_scene(source, provenance | ({} if mesh is None else {"mesh": mesh.name}))
+    found = assemble_scene(source, _provenance(source, paths, whole, told))
     movement = (
         "its movement was not captured: the blend shapes are those of the file, or simulated "
         "action units"
@@ -206,7 +206,7 @@ def scene(
     if whole is None:
         left_out.insert(0, ("geometry of this face", f"{told}; --mesh FILE shows another"))
     found = found.with_assets({"left_out": tuple(left_out)})
-    return found if whole is None else whole.painted(found)
+    return found if whole is None else whole.paint_scene(found)
 
 
 def _read(paths: Sequence[Path]) -> tuple[dict[str, Path], dict[str, SkinAppearance]]:
@@ -215,7 +215,7 @@ def _read(paths: Sequence[Path]) -> tuple[dict[str, Path], dict[str, SkinAppeara
     appearances: dict[str, SkinAppearance] = {}
     for path in paths:
         appearance = store.read(path)
-        kind = kind_of(path, appearance)
+        kind = detect_kind(path, appearance)
         if kind in folders:
             raise SceneError(f"{path}: {folders[kind]} is of the same kind ({kind}); show one")
         appearances[kind], folders[kind] = appearance, path
@@ -253,7 +253,9 @@ def load_mesh(path: Path) -> Mesh:
             f"{path}: texture coordinates reach from {loaded.uv.min():g} to {loaded.uv.max():g}, "
             "expected 0 to 1; export the tile of the face alone"
         )
-    return centered(build_mesh(loaded.vertices_mm, loaded.faces, loaded.uv, shapes=loaded.shapes))
+    return center_face(
+        build_mesh(loaded.vertices_mm, loaded.faces, loaded.uv, shapes=loaded.shapes)
+    )
 
 
 def viewer_mesh(subject: SimulatedSubject) -> Mesh:
@@ -264,7 +266,7 @@ def viewer_mesh(subject: SimulatedSubject) -> Mesh:
     return replace(subject.mesh, vertices_mm=rounded.astype(np.float32), shapes=shapes)
 
 
-def kind_of(path: Path, appearance: SkinAppearance) -> str:
+def detect_kind(path: Path, appearance: SkinAppearance) -> str:
     """Return "dynamic", "dome" or "model".
 
     Raises
@@ -272,7 +274,7 @@ def kind_of(path: Path, appearance: SkinAppearance) -> str:
     SceneError
         Nothing of it can be drawn on a face.
     """
-    if dynamic_appearance.parts_of(appearance):
+    if dynamic_appearance.describe_parts(appearance):
         return "dynamic"
     if skin_reflectance.BASIS_FILE in appearance.files and "reflectance_model" in (
         appearance.parameters
@@ -288,16 +290,16 @@ def kind_of(path: Path, appearance: SkinAppearance) -> str:
 
 
 def _mesh(
-    appearances: dict[str, SkinAppearance], asked: Path | None
+    appearances: dict[str, SkinAppearance], path: Path | None
 ) -> tuple[ClosedMesh | None, str]:
     """Return the mesh to show, None for the procedural head, and words for it.
 
     Holes of a scan are closed; another mesh may have them for a reason.
     """
-    if asked is not None:
-        return ClosedMesh(load_mesh(asked), (), ()), asked.name
+    if path is not None:
+        return ClosedMesh(load_mesh(path), (), ()), path.name
     for kind in ("model", "dome"):
         appearance = appearances.get(kind)
         if appearance is not None and MESH_FILE in appearance.files:
-            return closed(own_mesh(appearance)), f"{MESH_FILE} of the {kind}"
+            return close_holes(read_own_mesh(appearance)), f"{MESH_FILE} of the {kind}"
     return None, "the procedural head stands for the face"

@@ -10,9 +10,9 @@ import numpy as np
 
 from rigsim.geometry.atlas import unwrap
 from rigsim.subject import SimulatedSubject, face_regions, pigment, relief
-from rigsim.subject.perfusion import perfuse
+from rigsim.subject.perfusion import draw_perfusion
 from skinrig.arrays import Float32Array, Float64Array
-from skinrig.viewer.map_filling import filled
+from skinrig.viewer.map_filling import fill_holes
 
 PERSON_PX: Final = 512
 """Most texels a side of the person that everything else comes from: half a millimeter of a face."""
@@ -39,19 +39,19 @@ class FineSkin:
         """Texels with skin, (N, N)."""
         # noise is drawn point by point: those beside the face are left out
         surface = self._atlas.position_mm[self.covered]
-        self._points = np.asarray(face_regions.on_mean_head(surface, person.mesh), np.float32)
+        self._points = np.asarray(face_regions.to_mean_head(surface, person.mesh), np.float32)
         self._regions = face_regions.region_masks(self._points)
 
     def melanin(self) -> Float64Array:
         """Return the volume fraction of melanosomes in the epidermis, (N, N)."""
         base = pigment.MELANIN_PRESETS[self._person.preset]
         return self._on_texture(
-            pigment.melanin_map(self._points, self._regions, base, seed=self._person.seed)
+            pigment.draw_melanin_map(self._points, self._regions, base, seed=self._person.seed)
         )
 
     def hemoglobin(self) -> Float64Array:
         """Return the volume fraction of blood in the dermis of the neutral state, (N, N)."""
-        found = perfuse(self._points, self._regions, seed=self._person.seed)
+        found = draw_perfusion(self._points, self._regions, seed=self._person.seed)
         return self._on_texture(found.blood("neutral"))
 
     def height_um(self) -> Float64Array:
@@ -65,4 +65,4 @@ class FineSkin:
     def _on_texture(self, values: Float32Array) -> Float64Array:
         whole = np.zeros(self.covered.shape, np.float32)
         whole[self.covered] = values
-        return filled(whole, self.covered)
+        return fill_holes(whole, self.covered)

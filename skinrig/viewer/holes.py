@@ -31,7 +31,7 @@ MIN_EDGE_WEIGHT: Final = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Patch:
+class HolePatch:
     """A disc that closes a hole.
 
     Attributes
@@ -54,7 +54,7 @@ class Patch:
     inner_mm: Float64Array
     length_mm: float
 
-    def continued(self, values: Float64Array) -> Float64Array:
+    def interpolate_from_rim(self, values: Float64Array) -> Float64Array:
         """Return values of the rim, (n, C), at rim and new vertices, (n + m, C): harmonic in it.
 
         None lies beyond those of the rim.
@@ -65,7 +65,7 @@ class Patch:
         return np.concatenate([values, splu(inner).solve(-(weights[n:, :n] @ values))])
 
 
-def patches(vertices_mm: FloatArray, faces: NDArray[np.integer]) -> list[Patch]:
+def patches(vertices_mm: FloatArray, faces: NDArray[np.integer]) -> list[HolePatch]:
     """Return what closes the holes of a mesh that are small, the longest loop first.
 
     Parameters
@@ -130,13 +130,13 @@ def _neighbors(faces: Int64Array, count: int) -> sparse.csr_matrix:
 
 def _patch(
     points: Float64Array, neighbors: sparse.csr_matrix, loop: Int64Array, length: float
-) -> Patch:
+) -> HolePatch:
     disc, faces = _disc(len(loop), np.cumsum(_edges(points[loop])) / length)
     n, m = len(loop), len(disc) - len(loop)
     if m == 0:
-        return Patch(loop, disc, faces, np.zeros((0, 3)), length)
-    patch = Patch(loop, disc, faces, np.zeros((m, 3)), length)
-    flat = patch.continued(points[loop])
+        return HolePatch(loop, disc, faces, np.zeros((0, 3)), length)
+    patch = HolePatch(loop, disc, faces, np.zeros((m, 3)), length)
+    flat = patch.interpolate_from_rim(points[loop])
     # held besides the loop: vertices around it, each joined to those of the loop as the mesh has it
     beside = neighbors[loop].tocoo()
     outer = np.setdiff1d(beside.col, loop)
@@ -147,17 +147,17 @@ def _patch(
     whole = np.concatenate([flat, points[outer]])
     for _ in range(WEIGHT_ROUNDS):
         whole[n : n + m] = _smoothed(whole, faces, around, n, m)
-    return Patch(loop, disc, faces, whole[n : n + m].copy(), length)
+    return HolePatch(loop, disc, faces, whole[n : n + m].copy(), length)
 
 
-def _disc(count: int, way: Float64Array) -> tuple[Float64Array, Int64Array]:
+def _disc(count: int, angles: Float64Array) -> tuple[Float64Array, Int64Array]:
     """Return points of the unit disc, the rim's first, and their triangles.
 
     Rings have as many points as their radius has of the rim's.
     """
     from scipy.spatial import Delaunay
 
-    angle = 2.0 * np.pi * way
+    angle = 2.0 * np.pi * angles
     points = [np.stack([np.cos(angle), np.sin(angle)], axis=-1)]
     rings = max(1, round(count / (2.0 * np.pi)))
     for ring in range(1, rings):
@@ -186,7 +186,7 @@ def _uniform(faces: Int64Array, count: int) -> sparse.csr_matrix:
 
 
 def _smoothed(
-    points: Float64Array, faces: Int64Array, around: Int64Array, n: int, m: int
+    points: Float64Array, faces: Int64Array, rim: Int64Array, n: int, m: int
 ) -> Float64Array:
     """Return the m inner points of the least bending energy; the others are held."""
     total = len(points)
@@ -201,10 +201,10 @@ def _smoothed(
         columns += [faces[:, (k + 2) % 3], faces[:, (k + 1) % 3]]
         values += [weight, weight]
     # beyond the loop lengths alone are known: weights fall with them
-    size = np.linalg.norm(points[around[:, 0]] - points[around[:, 1]], axis=1)
+    size = np.linalg.norm(points[rim[:, 0]] - points[rim[:, 1]], axis=1)
     own = np.linalg.norm(points[np.roll(np.arange(n), -1)] - points[:n], axis=1).mean()
-    rows.append(around[:, 0])
-    columns.append(around[:, 1])
+    rows.append(rim[:, 0])
+    columns.append(rim[:, 1])
     values.append(own / np.maximum(size, 1e-3 * own))
     shape = (total, total)
     weights = sparse.coo_matrix(
@@ -230,7 +230,7 @@ MEASURED_TEXTURES: Final = ("albedo_map", "lobe_shares", "translucency", "albedo
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Chart:
+class PatchChart:
     """A disc of the texture that holds a patch.
 
     Attributes
@@ -244,7 +244,7 @@ class Chart:
         Where the patch's rim lies in the charts around.
     """
 
-    patch: Patch
+    patch: HolePatch
     center: Float64Array
     radius: float
     rim_uv: Float64Array
@@ -265,20 +265,20 @@ class ClosedMesh:
     """
 
     mesh: Mesh
-    charts: tuple[Chart, ...]
+    charts: tuple[PatchChart, ...]
     left_open_mm: tuple[float, ...]
 
-    def painted(self, scene: ViewerScene) -> ViewerScene:
+    def paint_scene(self, scene: ViewerScene) -> ViewerScene:
         """Return a scene whose measured textures continue into the patches."""
         if not self.charts:
             return scene
         textures: Mapping[str, Texture] = {
-            name: self.painted_texture(one) if name in MEASURED_TEXTURES else one
+            name: self.paint_texture(one) if name in MEASURED_TEXTURES else one
             for name, one in scene.textures.items()
         }
         return dataclasses.replace(scene, textures=textures)
 
-    def painted_texture(self, texture: Texture) -> Texture:
+    def paint_texture(self, texture: Texture) -> Texture:
         """Return a texture with the values of the rims continued into the patches."""
         values = texture.values.reshape(-1, *texture.values.shape[-3:]).copy()
         for layer in values:
@@ -304,7 +304,7 @@ class ClosedMesh:
         return tuple(rows.items())
 
 
-def closed(mesh: Mesh) -> ClosedMesh:
+def close_holes(mesh: Mesh) -> ClosedMesh:
     """Return a scanned mesh with its small holes closed.
 
     Parameters
@@ -321,7 +321,7 @@ def closed(mesh: Mesh) -> ClosedMesh:
     scale = float(np.sqrt(_area(flat, mesh.faces) / surface))  # texture over mm, by whole areas
     vertices, faces, uv = [mesh.vertices_mm], [mesh.faces], [mesh.uv]
     count = len(mesh.vertices_mm)
-    charts: list[Chart] = []
+    charts: list[PatchChart] = []
     open_mm: list[float] = []
     for patch in found:
         whole = np.concatenate([mesh.vertices_mm[patch.rim], patch.inner_mm])
@@ -331,7 +331,7 @@ def closed(mesh: Mesh) -> ClosedMesh:
             continue
         center, radius = place
         _take(taken, center, radius)
-        charts.append(Chart(patch, center, radius, mesh.uv[patch.rim].astype(np.float64)))
+        charts.append(PatchChart(patch, center, radius, mesh.uv[patch.rim].astype(np.float64)))
         vertices.append(whole.astype(np.float32))
         faces.append((patch.faces + count).astype(np.int32))
         uv.append((center + radius * patch.disc).astype(np.float32))
@@ -362,7 +362,7 @@ def _take(taken: BoolArray, center: Float64Array, radius: float) -> None:
     taken[far2 <= (radius + 1.0 / GRID_CELLS) ** 2] = True
 
 
-def _paint(layer: Float32Array, chart: Chart) -> None:
+def _paint(layer: Float32Array, chart: PatchChart) -> None:
     """Draw a patch into a map (H, W, C), row 0 at the top, in place."""
     from scipy.interpolate import LinearNDInterpolator
 
@@ -375,7 +375,7 @@ def _paint(layer: Float32Array, chart: Chart) -> None:
     at = [rows, columns]
     drawn = [ndimage.map_coordinates(one, at, order=1, mode="nearest") for one in planes]
     rim = np.stack(drawn, axis=-1)
-    values = chart.patch.continued(rim.astype(np.float64))
+    values = chart.patch.interpolate_from_rim(rim.astype(np.float64))
     reach = chart.radius + PATCH_MARGIN
     x0, y0 = chart.center
     j = np.arange(max(int((x0 - reach) * width), 0), min(int((x0 + reach) * width) + 1, width))

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from model.facial_color.coarse_maps import Cells, fitting
+from model.facial_color.coarse_maps import CoarseGrid, coarse_grid
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
 
 
-def filled(values: FloatArray, valid: BoolArray) -> Float64Array:
+def fill_holes(values: FloatArray, valid: BoolArray) -> Float64Array:
     """Return a map whose missing texels hold what surrounds them, so that filters stay clean.
 
     Means over ever larger cells are interpolated back until nothing is missing.
@@ -20,17 +20,18 @@ def filled(values: FloatArray, valid: BoolArray) -> Float64Array:
 
     Examples
     --------
-    >>> filled(np.array([[1.0, 7.0], [1.0, 1.0]]), np.array([[True, False], [True, True]])).tolist()
+    >>> fill_holes(np.array([[1.0, 7.0], [1.0, 1.0]]), np.array([[True, False], [True,
+    ...     True]])).tolist()
     [[1.0, 1.0], [1.0, 1.0]]
     """
     if values.ndim == 3:
-        return np.stack([filled(one, valid) for one in np.moveaxis(values, -1, 0)], axis=-1)
+        return np.stack([fill_holes(one, valid) for one in np.moveaxis(values, -1, 0)], axis=-1)
     out = np.where(valid, values, 0.0).astype(np.float64)
     missing = ~valid
     few = (values.shape[0], values.shape[1])
     while missing.any() and valid.any():
         few = (max(1, few[0] // 2), max(1, few[1] // 2))
-        cells = Cells(valid.shape, few)
+        cells = CoarseGrid(valid.shape, few)
         coarse, held = cells.coarsen(out, valid)
         (up,) = cells.refine(coarse, valid=held)
         known = missing & np.isfinite(up)
@@ -39,11 +40,11 @@ def filled(values: FloatArray, valid: BoolArray) -> Float64Array:
     return out
 
 
-def halved(values: Float64Array, size: int) -> Float64Array:
+def downsample(values: Float64Array, size: int) -> Float64Array:
     """Return means over cells, (size, size[, C]), of a larger map; a smaller one as it is."""
     if values.shape[0] <= size:
         return values
-    cells = fitting((values.shape[0], values.shape[1]), size)
+    cells = coarse_grid((values.shape[0], values.shape[1]), size)
     everywhere = np.ones(values.shape[:2], np.bool_)
     if values.ndim == 2:
         return cells.coarsen(values, everywhere)[0]

@@ -34,7 +34,7 @@ SHAPE_STEP_MM: Final = 2.5e-4
 
 
 @dataclass(frozen=True, slots=True)
-class Packed:
+class PackedScene:
     """A scene as bytes.
 
     Attributes
@@ -93,13 +93,13 @@ def dequantize(words: Words, low: Float32Array, high: Float32Array) -> Float32Ar
     return np.asarray(low[..., None, None, :] + span * (words.astype(np.float32) / top), np.float32)
 
 
-def stored(texture: Texture) -> tuple[Words, Float32Array, Float32Array]:
+def encode_texture(texture: Texture) -> tuple[Words, Float32Array, Float32Array]:
     """Return the words that the page holds of a texture, and their range."""
     if texture.fine == 1:
         return _quantize(texture.values, texture.storage)
     _, low, high = _quantize(texture.values, "u8")
-    coarse, steps = split(_unrounded(texture.values, low, high), texture.fine)
-    return joined(coarse, steps, texture.fine).reshape(texture.values.shape), low, high
+    coarse, steps = split_octave(_unrounded(texture.values, low, high), texture.fine)
+    return join_octave(coarse, steps, texture.fine).reshape(texture.values.shape), low, high
 
 
 def _unrounded(values: Float32Array, low: Float32Array, high: Float32Array) -> Float64Array:
@@ -114,7 +114,7 @@ def _shares(values: Float32Array, low: Float32Array, high: Float32Array) -> Floa
     return np.asarray(shares)
 
 
-def pack(scene: ViewerScene) -> Packed:
+def pack(scene: ViewerScene) -> PackedScene:
     """Return a scene as a header and one compressed payload."""
     chunks: list[bytes] = []
     errors: dict[str, float] = {}
@@ -122,7 +122,7 @@ def pack(scene: ViewerScene) -> Packed:
 
     def put(words: Words) -> dict[str, Any]:
         nonlocal offset
-        predictor, data = _predicted(words)
+        predictor, data = _choose_predictor(words)
         kind = words.dtype.str[1:]
         entry = {"offset": offset, "shape": list(words.shape), "type": kind, "predictor": predictor}
         # typed arrays want offsets in whole words of any size
@@ -139,19 +139,19 @@ def pack(scene: ViewerScene) -> Packed:
             "normals": put(np.rint(mesh.normals * NORMAL_STEPS).astype(np.int16)),
             "uv": put(mesh.uv),
             "faces": put(mesh.faces.astype(kind)),
-            "weld": put(welded(mesh.vertices_mm).astype(kind)[:, None]),
+            "weld": put(weld_vertices(mesh.vertices_mm).astype(kind)[:, None]),
             "shapes": {
                 name: {"step": float(np.float32(step)), "deltas": put(words)}
-                for name, (words, step) in shape_words(mesh).items()
+                for name, (words, step) in encode_shape(mesh).items()
             },
         },
         "textures": {},
         "tables": {name: put(np.asarray(table)) for name, table in sorted(scene.tables.items())},
     }
-    for name, (_, step) in shape_words(mesh).items():
+    for name, (_, step) in encode_shape(mesh).items():
         errors[f"shape {name}"] = 0.5 * float(step)
     for name, texture in sorted(scene.textures.items()):
-        words, low, high = stored(texture)
+        words, low, high = encode_texture(texture)
         off = dequantize(words, low, high) - texture.values
         errors[name] = float(np.abs(off).max())
         data: dict[str, Any]
@@ -160,7 +160,7 @@ def pack(scene: ViewerScene) -> Packed:
         else:
             errors[f"{name} rms"] = float(np.sqrt(np.mean(off.astype(np.float64) ** 2)))
             turned = np.ascontiguousarray(_unrounded(texture.values, low, high)[:, ::-1])
-            coarse, steps = split(turned, texture.fine)
+            coarse, steps = split_octave(turned, texture.fine)
             data = {"predictor": "octaves", "fine": texture.fine}
             data |= {"coarse": put(coarse), "steps": put(steps)}
         *layers, height, width, channels = texture.values.shape
@@ -184,19 +184,19 @@ def pack(scene: ViewerScene) -> Packed:
         "quantization_error": errors,
         "bytes": offset,
     }
-    payload = gzipped(chunks)
+    payload = gzip_parts(chunks)
     header["packed_bytes"] = len(payload)
     plain = json.loads(json.dumps(header, allow_nan=False, default=dict))
-    return Packed(plain, payload, errors)
+    return PackedScene(plain, payload, errors)
 
 
-def welded(positions: Float32Array) -> NDArray[np.intp]:
+def weld_vertices(positions: Float32Array) -> NDArray[np.intp]:
     """Return for each vertex the first that lies at the same place, shape (V,)."""
     _, first, inverse = np.unique(positions, axis=0, return_index=True, return_inverse=True)
     return np.asarray(first[inverse.reshape(-1)])
 
 
-def shape_words(mesh: Mesh) -> dict[str, tuple[NDArray[np.int16], np.float32]]:
+def encode_shape(mesh: Mesh) -> dict[str, tuple[NDArray[np.int16], np.float32]]:
     """Return the words of each blend shape's movement, (V, 3), and the step of one, mm."""
     out = {}
     for name, deltas in mesh.shapes.items():
@@ -205,7 +205,7 @@ def shape_words(mesh: Mesh) -> dict[str, tuple[NDArray[np.int16], np.float32]]:
     return out
 
 
-def _predicted(words: Words) -> tuple[str, bytes]:
+def _choose_predictor(words: Words) -> tuple[str, bytes]:
     """Return the predictor under which words compress best, and their bytes."""
     little = words.astype(words.dtype.newbyteorder("<"), copy=False)
     if words.ndim < 2:
@@ -214,7 +214,7 @@ def _predicted(words: Words) -> tuple[str, bytes]:
     little = np.ascontiguousarray(little).view(np.dtype(f"<u{words.dtype.itemsize}"))
     flat = little.reshape(-1, *words.shape[-3:]) if words.ndim >= 3 else little[None, :, None, :]
     tried = {name: _bytes_of(_differences(flat, name)) for name in PREDICTOR_NAMES}
-    return min(tried.items(), key=lambda one: guessed_size(one[1]))
+    return min(tried.items(), key=lambda one: estimate_gzip_size(one[1]))
 
 
 def _differences(words: NDArray[Any], predictor: str) -> NDArray[Any]:
@@ -244,7 +244,7 @@ MAX_MEASURED_BYTES: Final = 1 << 20
 """Bytes above which a size is guessed from codes and runs alone."""
 
 
-def gzipped(parts: Iterable[bytes]) -> bytes:
+def gzip_parts(parts: Iterable[bytes]) -> bytes:
     """Return parts behind each other as one gzip member, the same bytes for the same parts.
 
     Parameters
@@ -255,7 +255,7 @@ def gzipped(parts: Iterable[bytes]) -> bytes:
     Examples
     --------
     >>> import gzip
-    >>> gzip.decompress(gzipped([b"one " * 9, b"", b"two"])) == b"one " * 9 + b"two"
+    >>> gzip.decompress(gzip_parts([b"one " * 9, b"", b"two"])) == b"one " * 9 + b"two"
     True
     """
     out = [_GZIP_HEADER]
@@ -268,8 +268,8 @@ def gzipped(parts: Iterable[bytes]) -> bytes:
     return b"".join([*out, _EMPTY_LAST_BLOCK, struct.pack("<II", check, size & 0xFFFFFFFF)])
 
 
-def guessed_size(data: bytes) -> int:
-    """Return about how many bytes `gzipped` makes of data, quickly: to compare orders of it."""
+def estimate_gzip_size(data: bytes) -> int:
+    """Return about how many bytes `gzip_parts` makes of data, quickly: to compare orders of it."""
     if len(data) < MAX_MEASURED_BYTES:
         return len(zlib.compress(data, 1))
     return min(len(_deflated(data, 1, strategy)) for strategy in _WITHOUT_SEARCH)
@@ -292,7 +292,7 @@ def _deflated(part: bytes, level: int, strategy: int) -> bytes:
     return packer.compress(part) + packer.flush(zlib.Z_SYNC_FLUSH)
 
 
-def split(values: Float64Array, fine: int) -> tuple[UInt8Array, UInt8Array]:
+def split_octave(values: Float64Array, step_words: int) -> tuple[UInt8Array, UInt8Array]:
     """Return words of half as many texels a side, and the steps that the finest octave adds.
 
     Parameters
@@ -305,22 +305,22 @@ def split(values: Float64Array, fine: int) -> tuple[UInt8Array, UInt8Array]:
     Returns
     -------
     coarse, steps : ndarray of uint8
-        (L, H/2, W/2, C), and (L, H, W, C) modulo 256; `joined` makes words of them.
+        (L, H/2, W/2, C), and (L, H, W, C) modulo 256; `join_octave` makes words of them.
     """
     L, H, W, C = values.shape
     means = values.reshape(L, H // 2, 2, W // 2, 2, C).mean(axis=(2, 4))
     coarse = np.rint(means).astype(np.uint8)
-    steps = np.rint((values - _doubled(coarse)) / fine).astype(np.int64)
+    steps = np.rint((values - _upsample(coarse)) / step_words).astype(np.int64)
     return coarse, (steps % 256).astype(np.uint8)
 
 
-def joined(coarse: UInt8Array, steps: UInt8Array, fine: int) -> UInt8Array:
-    """Return the words of `split`, (L, H, W, C)."""
-    words = _doubled(coarse) + fine * steps.view(np.int8).astype(np.int64)
+def join_octave(coarse: UInt8Array, steps: UInt8Array, step_words: int) -> UInt8Array:
+    """Return the words of `split_octave`, (L, H, W, C)."""
+    words = _upsample(coarse) + step_words * steps.view(np.int8).astype(np.int64)
     return np.clip(words, 0, 255).astype(np.uint8)
 
 
-def _doubled(coarse: UInt8Array) -> Int64Array:
+def _upsample(coarse: UInt8Array) -> Int64Array:
     """Return twice as many texels a side, interpolated linearly and rounded half up, (L, H, W, C).
 
     Whole numbers throughout, so that the page comes to the same words.

@@ -11,10 +11,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from skinrig.atomic_file import write_atomically
 from skinrig.drawing import templates
-from skinrig.viewer.packing import Packed, pack
+from skinrig.viewer.packing import PackedScene, pack
 from skinrig.viewer.scene import SceneError, ViewerScene
-from skinrig.whole_file import write_whole
 
 SCRIPT_NAMES: Final = (
     "graph gl load mesh camera color shading shadow crowd strain wrinkles detail microstructure "
@@ -71,7 +71,7 @@ def build(scene: ViewerScene, *, connect: bool = False) -> str:
     return render(pack(scene), connect=connect)
 
 
-def render(packed: Packed, *, connect: bool = False) -> str:
+def render(packed: PackedScene, *, connect: bool = False) -> str:
     """Return the page of a packed scene."""
     here = resources.files("skinrig.viewer")
     style = here.joinpath("page.css").read_text(encoding="utf-8")
@@ -86,7 +86,7 @@ def render(packed: Packed, *, connect: bool = False) -> str:
         policy=policy,
         style=style,
         header=packed.header_bytes().decode("utf-8").replace("<", "\\u003c"),
-        payload=as_text(packed.payload),
+        payload=encode_as_text(packed.payload),
         script=code,
     )
 
@@ -108,7 +108,7 @@ def write(scene: ViewerScene, out: Path) -> dict[str, Any]:
     """
     packed = pack(scene)
     text = render(packed)
-    write_whole(out, text)
+    write_atomically(out, text)
     return {
         "path": out,
         "bytes": len(text.encode("utf-8")),
@@ -141,7 +141,7 @@ UNSAFE_CODES: Final = (0, 8, 9, 10, 11, 12, 13, 26, 27, 34, 38, 60, 127)
 with which markup begins."""
 
 
-def as_text(data: bytes) -> str:
+def encode_as_text(data: bytes) -> str:
     """Return bytes as text of which UTF-8 holds seven bits a byte (base64: six).
 
     A character below 128 is seven bits, the first the highest. Those that a page or an editor may
@@ -155,7 +155,7 @@ def as_text(data: bytes) -> str:
 
     Examples
     --------
-    >>> [ord(one) for one in as_text(bytes([131, 6]))]
+    >>> [ord(one) for one in encode_as_text(bytes([131, 6]))]
     [65, 65, 64]
     """
     bits = np.unpackbits(np.frombuffer(data, np.uint8))

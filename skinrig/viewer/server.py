@@ -19,7 +19,7 @@ from typing import Any, Final
 
 from skinrig.console import Console
 from skinrig.viewer import page
-from skinrig.viewer.microstructure.assets import with_displacement
+from skinrig.viewer.microstructure.assets import add_displacement_tiles
 from skinrig.viewer.microstructure.tiles import Pyramid, TileError, open_displacement
 from skinrig.viewer.scene import SceneError, ViewerScene
 
@@ -131,7 +131,7 @@ def serve_scene(
         if displacement is not None:
             console.progress(f"cutting {displacement.name} into tiles")
             pyramid = open_displacement(displacement, Path(name) / "levels")
-            scene = with_displacement(scene, pyramid)
+            scene = add_displacement_tiles(scene, pyramid)
         text = page.build(scene, connect=pyramid is not None).encode("utf-8")
         with serve(text, pyramid=pyramid, port=port) as served:
             document = {

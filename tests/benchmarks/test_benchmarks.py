@@ -9,7 +9,7 @@ import pytest
 
 from skinrig.benchmarks.document import SCHEMA
 from skinrig.benchmarks.stages import STAGES, BenchError, run_stages
-from skinrig.console import Console, plain
+from skinrig.console import Console, to_json_value
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 # simulated sessions, surveys and faces: over 5 s of processor time even when small
@@ -104,7 +104,7 @@ def problems(stage):
 def test_stage_result_satisfies_schema(stage, tmp_path, capsys):
     document = run_stages([stage], budget_s=60.0, toy=True, out=tmp_path, console=Console(True))
     written = json.loads((tmp_path / "bench.json").read_text())
-    assert written == plain(document)
+    assert written == to_json_value(document)
     assert written["schema"] == SCHEMA
     assert written["skin_bands"].keys() == MELANIN_BANDS.keys()
     assert list(written["stages"]) == [stage]
@@ -116,7 +116,7 @@ def sound():
     document = run_stages(
         ["subsurface-batch"], budget_s=60.0, toy=True, out=None, console=Console(True)
     )
-    return plain(document)["stages"]["subsurface-batch"]
+    return to_json_value(document)["stages"]["subsurface-batch"]
 
 
 def slower_and_worse(stage):

@@ -18,7 +18,7 @@ from twins.relief_growth import window as grown_window
 
 from model.microstructure import FOREHEAD
 from model.microstructure.convolution import LineKernels, convolve
-from model.microstructure.map_windows import Window
+from model.microstructure.map_windows import MapWindow
 from model.microstructure.mesh_strain import MeshStrain, strain
 from model.microstructure.strain_fields import TextureStrain, line_kernels, rasterize
 from skinrig.viewer.microstructure.relief_growth import GrownRelief
@@ -30,7 +30,7 @@ Float32 = NDArray[np.float32]
 class WindowReference:
     """Everything of a window, row 0 at the top."""
 
-    window: Window
+    window: MapWindow
     size: int
     fields: TextureStrain
     kernels: tuple[LineKernels, LineKernels]
@@ -64,7 +64,7 @@ def window_reference(
     level = int(place[2])
     size = facts["virtual_px"] >> level
     left, bottom = int(place[0]), int(place[1])
-    window = Window(size - bottom - side, size - bottom, left, left + side)
+    window = MapWindow(size - bottom - side, size - bottom, left, left + side)
     mesh, found = mesh_strain(scene, weights)
     fields = rasterize(found, mesh.faces, mesh.uv, (size, size), window=window)
     s, t = line_kernels(fields, FOREHEAD)
@@ -81,7 +81,7 @@ def window_reference(
 
 
 def fields_of(
-    found: MeshStrain, mesh: Any, size: int, window: Window
+    found: MeshStrain, mesh: Any, size: int, window: MapWindow
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return T - 1 and the texture's metric at pixels, between vertices; NaN outside of faces.
 

@@ -27,7 +27,7 @@ def test_window_shows_displacement_and_fetches_only_own_tiles(
     open_page, procedural_scene, displacement, tmp_path
 ):
     pyramid = tiles.build(displacement, tmp_path / "levels")
-    scene = microstructure_assets.with_displacement(procedural_scene, pyramid)
+    scene = microstructure_assets.add_displacement_tiles(procedural_scene, pyramid)
     assert scene.facts["microstructure"]["virtual_px"] == SIZE
     html = page.build(scene, connect=True).encode("utf-8")
     with server.serve(html, pyramid=pyramid) as served:

@@ -11,7 +11,7 @@ from fixtures.packed_scenes import as_packed
 from scipy import ndimage
 
 from model import wrinkles
-from model.wrinkles import Layer
+from model.wrinkles import WrinkleLayer
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import ExpressionTable
 from skinrig.viewer import page
@@ -41,7 +41,9 @@ def painted(procedural_scene) -> tuple[Any, WrinkleModel]:
     for number, rows in enumerate(TABLES):
         wrinkle = np.moveaxis(smooth((2, 64, 64), 1.5, 0.3), 0, 2)
         masks = np.clip(smooth((8, 16, 16), 1.5, 0.5) + 0.3, 0.0, 1.0)
-        layers.append(Layer(wrinkle, masks, ExpressionTable(ZONES, rows, f"painted {number}")))
+        layers.append(
+            WrinkleLayer(wrinkle, masks, ExpressionTable(ZONES, rows, f"painted {number}"))
+        )
     model = WrinkleModel(base, tuple(layers))
     bare = replace(
         procedural_scene,
@@ -56,7 +58,7 @@ def painted(procedural_scene) -> tuple[Any, WrinkleModel]:
     class Source:
         mesh = procedural_scene.mesh
 
-    added = wrinkle_assets.from_model(model, Source, origin="fitted")  # type: ignore[arg-type]
+    added = wrinkle_assets.build_model_assets(model, Source, origin="fitted")  # type: ignore[arg-type]
     return bare.with_assets(added), model
 
 
@@ -65,12 +67,12 @@ def painted_page(open_page, painted):
     return open_page(page.build(painted[0]))
 
 
-def packed_model(scene: Any, model: WrinkleModel) -> tuple[Any, list[Layer]]:
+def packed_model(scene: Any, model: WrinkleModel) -> tuple[Any, list[WrinkleLayer]]:
     """Return base and layers as the page holds them."""
     textures = as_packed(scene).textures
     masks = textures["wrinkle_masks"].values
     layers = [
-        Layer(textures["wrinkle_maps"].values[i], masks[2 * i : 2 * i + 2], layer.table)
+        WrinkleLayer(textures["wrinkle_maps"].values[i], masks[2 * i : 2 * i + 2], layer.table)
         for i, layer in enumerate(model.layers)
     ]
     return textures["wrinkle_base"].values, layers

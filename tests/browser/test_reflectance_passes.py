@@ -19,7 +19,7 @@ from model import skin_reflectance
 from model.brdf import tables as brdf_tables
 from skinrig.viewer.assets import fitted as trait_assets
 from skinrig.viewer.assets import reflectance as reflectance_assets
-from skinrig.viewer.assets.fitted import AlbedoTraits, LobeTraits
+from skinrig.viewer.assets.fitted import AlbedoTraitLayers, LobeTraits
 from skinrig.viewer.assets.reflectance import PageLobes
 from skinrig.viewer.scene import SceneSource, Texture
 
@@ -45,7 +45,7 @@ class FittedPage:
 
     viewer: Any
     traits: LobeTraits
-    albedo: AlbedoTraits
+    albedo: AlbedoTraitLayers
     scene: Any
 
 
@@ -65,18 +65,18 @@ def fitted_page(procedural_scene, open_page) -> FittedPage:
     from skinrig.viewer import page
 
     rng = np.random.default_rng(12345)
-    materials = brdf_tables.default()
+    materials = brdf_tables.default_basis()
     mix = rng.uniform(0.0, 1.0, (3, materials.size)) ** 6
     mix /= mix.sum(axis=1, keepdims=True)
     shares = np.maximum(0.3 + 0.4 * smooth((16, 16, 3), rng), 0.0).astype(np.float32)
-    face = PageLobes(materials.mixed(mix), shares, mix, materials.names, "fitted")
+    face = PageLobes(materials.mix_materials(mix), shares, mix, materials.names, "fitted")
     traits = trait_assets.surface_traits(face)
     assert traits is not None
-    base = reflectance_assets.assemble(
+    base = reflectance_assets.build_lobe_assets(
         SceneSource("dome", procedural_scene.mesh, 64, 0, None, None), traits.lobes
     )
     ends = (0.3 * smooth((16, 16, 12), rng)).astype(np.float32)
-    albedo = AlbedoTraits(
+    albedo = AlbedoTraitLayers(
         ("tan", "beard"),
         np.moveaxis(ends.reshape(16, 16, 4, 3), 2, 0).copy(),
         {"tan": 0.2, "beard": 0.1},
@@ -178,7 +178,7 @@ def expected_specular(
 @pytest.mark.parametrize("azimuth", [0.0, 35.0, -70.0])
 def test_page_reflection_matches_fitted_basis_brdfs(fitted, azimuth):
     params = fitted.viewer.set(specular_model="fitted", light_azimuth_deg=azimuth)
-    shares = reflectance_assets.rounded(fitted.traits.lobes.shares)  # shaders, not storage
+    shares = reflectance_assets.round_weights(fitted.traits.lobes.shares)  # shaders, not storage
     wanted = expected_specular(fitted, shares, params)
     found = fitted.viewer.read("specular")
     assert wanted.max() > 0.5
@@ -230,11 +230,11 @@ def test_surface_traits_change_weights_as_reference_does(fitted, amounts):
     fitted.viewer.set(traits=amounts)
     rows = as_packed(fitted.scene).textures["lobe_shares"].values
     rows = np.moveaxis(rows, 0, 2).reshape(16 * 16, -1)[:, : len(fitted.traits.scale)]
-    wanted = fitted.traits.projected(rows.astype(np.float64), amounts)
+    wanted = fitted.traits.apply_traits(rows.astype(np.float64), amounts)
     buffers = [fitted.viewer.read(f"lobe_shares_{i}") for i in range(2)]
     found = np.concatenate(buffers, axis=-1).reshape(16 * 16, -1)[:, : wanted.shape[1]]
     # compare light: shares of lobes that look alike are exchanged by rounding
-    strength = fitted.traits.lobes.mix @ brdf_tables.default().strength()
+    strength = fitted.traits.lobes.mix @ brdf_tables.default_basis().strength()
     asked = np.abs((wanted - rows) @ strength).max()
     assert asked > 0.0 or not amounts
     np.testing.assert_allclose(
@@ -247,7 +247,7 @@ def test_surface_traits_change_weights_as_reference_does(fitted, amounts):
 def test_trait_changes_image_according_to_its_weights(fitted):
     params = fitted.viewer.set(specular_model="fitted", traits={"lotion": 1.0})
     rows = fitted.traits.lobes.shares
-    moved = fitted.traits.projected(rows.reshape(256, -1).astype(np.float64), {"lotion": 1.0})
+    moved = fitted.traits.apply_traits(rows.reshape(256, -1).astype(np.float64), {"lotion": 1.0})
     wanted = expected_specular(fitted, moved.reshape(rows.shape), params)
     plain = expected_specular(fitted, rows, params)
     found = fitted.viewer.read("specular")[..., 0]

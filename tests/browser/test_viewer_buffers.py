@@ -106,7 +106,7 @@ def test_the_page_colors_skin_as_the_table_does(viewer):
 
 def test_page_moves_vertices_and_normals_like_simulation(viewer, scene):
     from rigsim.geometry.mesh import build_mesh
-    from rigsim.subject.expressions import moved
+    from rigsim.subject.expressions import displace_mesh
 
     weights = {"anger": 0.8, "happiness": 0.5}
     viewer.set(weights=weights)
@@ -114,7 +114,7 @@ def test_page_moves_vertices_and_normals_like_simulation(viewer, scene):
     mesh = scene.mesh
     deltas = sum(w * mesh.shapes[name] for name, w in weights.items())
     rest = build_mesh(mesh.vertices_mm, mesh.faces, mesh.uv, mesh.normals)
-    wanted = moved(rest, deltas.astype(np.float32))
+    wanted = displace_mesh(rest, deltas.astype(np.float32))
     assert np.abs(positions - wanted.vertices_mm).max() < 1e-4
     away = np.degrees(np.arccos(np.clip(np.sum(normals * wanted.normals, -1), -1.0, 1.0)))
     # normals are packed in 16 bits, and arccos of float32 knows 0.03 degrees

@@ -20,7 +20,7 @@ from capture.devices.port import (
 )
 from capture.devices.wire import Code
 from rigsim.boxes.controller import Controller
-from rigsim.world.serve import serve
+from rigsim.world.serve import serve_world
 
 
 @pytest.fixture(autouse=True)
@@ -136,7 +136,7 @@ def host_at_work():
         def host_at_work(script, rig, lease_s, *, pty, at_work):
             head = f"import sys\nfrom capture.devices.port import Port\nlease_s = {lease_s}\n"
             for _ in range(8):
-                served = started.enter_context(serve(rig, pty=pty))
+                served = started.enter_context(serve_world(rig, pty=pty))
                 command = [sys.executable, "-c", head + script, *served.addresses.values()]
                 host = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
                 started.callback(end, host)

@@ -10,7 +10,7 @@ import pytest
 from capture.plan import Plan, flash_plan
 from capture.rig import load_rig
 from capture.session import Session
-from rigsim.world.serve import serve
+from rigsim.world.serve import serve_world
 from skinrig.cli import main
 
 # a client that waits for its frames as no client does: a camera that waited with it would show,
@@ -37,7 +37,7 @@ def test_capture_killed_awaiting_frame_resumes_at_once(tmp_path, transport, caps
     plan = tmp_path / "plan.json"
     plan.write_text(json.dumps(Plan("flash", steps).to_json()))
     out = tmp_path / "s"
-    with serve(slow, pty=transport == "pty") as served:
+    with serve_world(slow, pty=transport == "pty") as served:
         argv = ["capture", "flash", "--plan", str(plan), "--out", str(out)]
         argv += ["--port", f"flash={served.addresses['flash']}"]
         argv += ["--camera", f"cam={served.addresses['cam']}"]

@@ -15,8 +15,8 @@ from capture import raw
 from capture.documents import InputError
 from capture.plan import Plan, Step
 from capture.rig import load_rig, rig_from_json
-from capture.session import NotASession, Session, SessionDamage, Subject, verify
-from capture.session.journal import frame_file
+from capture.session import NotASession, Session, SessionDamage, SubjectRecord, verify
+from capture.session.journal import frame_path
 from capture.session.manifest import seal
 
 RIG = load_rig("flash").resized(16)
@@ -24,9 +24,9 @@ PLAN = Plan("flash", tuple(Step(f"S{n:03d}", "subject", {}, {}, ("cam",)) for n 
 
 
 def write_session(path, *, closed=True, session_id="one", frames=4):
-    words = {"devices": {}, "subject": Subject("P1"), "source": "simulated"}
+    words = {"devices": {}, "subject": SubjectRecord("P1"), "source": "simulated"}
     with Session.create(path, plan=PLAN, rig=RIG, session_id=session_id, **words) as session:
-        for step, _ in session.todo()[:frames]:
+        for step, _ in session.pending_frames()[:frames]:
             values = np.full((10, 16), 600 + int(step.id[1:]), np.uint16)
             levels = {"pattern": "RGGB", "black": 512, "white": 16383}
             blob = raw.encode_dng(values, **levels, step_id=step.id, session_id=session.id)
@@ -126,8 +126,8 @@ def test_a_damaged_frame_is_not_handed_out(closed):
 
 def test_all_damaged_frames_are_listed_at_once(closed):
     for name in ("S000", "S002"):
-        flip(closed / frame_file(name, "cam", 1), 700, 1)
-    (closed / frame_file("S003", "cam", 1)).unlink()
+        flip(closed / frame_path(name, "cam", 1), 700, 1)
+    (closed / frame_path("S003", "cam", 1)).unlink()
     report = verify(closed)
     assert (len(report.problems), report.frames) == (3, 1)
 
@@ -202,7 +202,7 @@ def attachment(path):
 
 
 def frame(path):
-    return path / frame_file("S001", "cam", 1)
+    return path / frame_path("S001", "cam", 1)
 
 
 def link_the_frame(path):
@@ -222,7 +222,7 @@ def take_another_journal(path):
 
 
 def swap_two_frames(path):
-    other = path / frame_file("S002", "cam", 1)
+    other = path / frame_path("S002", "cam", 1)
     frame(path).rename(path / "x")
     other.rename(frame(path))
     (path / "x").rename(other)
@@ -287,7 +287,7 @@ BROKEN = {
     ),
     "journal with an unknown step": (
         lambda p: reseal(
-            p, journal=lambda r: r[1].update(step="S999", file=frame_file("S999", "cam", 1))
+            p, journal=lambda r: r[1].update(step="S999", file=frame_path("S999", "cam", 1))
         ),
         "got S999, expected a step of the plan",
     ),

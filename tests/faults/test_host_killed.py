@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from capture.plan.eye_light import eye_light
+from capture.plan.eye_light import eye_irradiance
 from capture.rig import Rig, load_rig
 
 EXACT_S = 0.001  # a box keeps its own time
@@ -58,7 +58,7 @@ while True:
 )
 
 DOME_RIG = load_rig("dome").subset(views=["C00"]).resized(16)
-UNSEEN = "+".join(str(k) for k in np.argsort(eye_light(DOME_RIG), kind="stable")[:60])
+UNSEEN = "+".join(str(k) for k in np.argsort(eye_irradiance(DOME_RIG), kind="stable")[:60])
 DOME = Work(
     DOME_RIG,
     f"""
@@ -133,7 +133,7 @@ while True:
         world.box("probe").device.lit and world.head_at(world.now).suction_mbar > 20.0
     ),
     over=lambda world: (
-        not (world.box("probe").device.lit or world.box("probe").device.pump.drawing)
+        not (world.box("probe").device.lit or world.box("probe").device.pump.is_pumping)
     ),
     ended_s=lambda world: {"probe": max(world.switched[-1].t_off_s, world.heads[-1][0])},
 )

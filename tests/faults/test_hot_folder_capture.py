@@ -12,7 +12,7 @@ from capture.devices.flash import FlashBox
 from capture.devices.port import Port
 from capture.plan import flash_plan
 from capture.rig import load_rig
-from capture.session import Session, Subject, verify
+from capture.session import Session, SubjectRecord, verify
 from rigsim.world import World
 
 LEVEL_DARK, LEVEL_LIT = 512, 3000
@@ -86,7 +86,7 @@ def capture(tmp_path, monkeypatch):
             plan=plan,
             rig=rig,
             devices={},
-            subject=Subject("p"),
+            subject=SubjectRecord("p"),
             source="simulated",
         ) as session:
             run_plan(plan, rig, boxes={"flash": box}, cameras={"cam": camera}, session=session)

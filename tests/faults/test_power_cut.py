@@ -19,7 +19,7 @@ import pytest
 from capture import raw
 from capture.plan import Plan, Step
 from capture.rig import load_rig
-from capture.session import Disk, Session, SessionError, Subject, verify
+from capture.session import Disk, Session, SessionError, SubjectRecord, verify
 
 RIG = load_rig("flash").resized(16)
 # what of unsynced data reaches the medium
@@ -267,7 +267,7 @@ def judge(path, acknowledged, plan):
             return "lost"
         with session:
             found = outcome(session, frames, plan)
-            for step, _ in session.todo():
+            for step, _ in session.pending_frames():
                 commit(session, step.id)
             if not session.attachments():
                 session.attach("scan.ply", SCAN)
@@ -308,7 +308,7 @@ class LoggedFrom(LoggedDisk):
 
 
 def create(path, plan, disk):
-    words = {"devices": {}, "subject": Subject("P1"), "source": "simulated"}
+    words = {"devices": {}, "subject": SubjectRecord("P1"), "source": "simulated"}
     return Session.create(path, plan=plan, rig=RIG, session_id="model", disk=disk, **words)
 
 

@@ -12,7 +12,7 @@ from capture.devices.flash import FlashBox
 from capture.devices.port import BoxRebooted, DeviceError, LinkLost, Port
 from capture.plan import Plan, Step, flash_plan
 from capture.rig import load_rig
-from capture.session import Session, Subject, verify
+from capture.session import Session, SubjectRecord, verify
 from rigsim.boxes.faults import Faults
 from rigsim.world import World
 
@@ -50,7 +50,7 @@ def session(tmp_path):
         plan=plan,
         rig=RIG,
         devices={},
-        subject=Subject("p"),
+        subject=SubjectRecord("p"),
         source="simulated",
         seed=0,
     )

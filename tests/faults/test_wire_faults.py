@@ -10,7 +10,7 @@ from capture.devices.port import LinkLost, Port, PortTimeout, WrongDevice
 from capture.rig import load_rig
 from rigsim.boxes.faults import FAULT_CATALOG, Faults
 from rigsim.world import World
-from rigsim.world.serve import serve
+from rigsim.world.serve import serve_world
 
 RIG = load_rig("flash").resized(16)
 NAMES = (f"faults-{number}" for number in itertools.count())
@@ -74,7 +74,7 @@ def test_nothing_is_done_twice_or_wrongly_acknowledged(world, ledger, number, fa
 )
 def test_fault_rules_hold_in_real_time_real_lines(ledger, transport, faults, error):
     world = World(RIG, seed=2, clock="real", faults=Faults(baud=0.0, **faults))
-    with serve(RIG, world=world, pty=transport == "pty") as served:
+    with serve_world(RIG, world=world, pty=transport == "pty") as served:
         host = ledger(world, served.addresses["flash"])
         host.open(retries=20, timeout_s=0.03)
         for _ in range(8):
@@ -90,7 +90,7 @@ def test_fault_rules_hold_in_real_time_real_lines(ledger, transport, faults, err
 def test_pulled_cable_is_lost_link_on_real_lines(transport):
     faults = Faults(baud=0.0, unplug_after=0.3)
     world = World(RIG, clock="real", faults=faults)
-    with serve(RIG, world=world, pty=transport == "pty") as served:
+    with serve_world(RIG, world=world, pty=transport == "pty") as served:
         port = Port(served.addresses["flash"], timeout_s=0.1)
         box = FlashBox(port)
         with pytest.raises(LinkLost):

@@ -53,7 +53,7 @@ def test_silent_host_leaves_controller_dark_and_disarmed(box):
     box.lamp_on(0.5)
     events = box.port.listen(0.45)
     assert "WDOG:TRIP" in [event.name for event in events]
-    assert not box.lamp_lit()
+    assert not box.is_lamp_lit()
     assert not box.is_armed()
 
 

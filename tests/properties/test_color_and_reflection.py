@@ -77,9 +77,9 @@ def test_coverage_counts_finite_trials_and_is_within_interval(values, level):
     found = metrics.coverage(values, 1.0, 0.0, level=level)
     assert found.count == int(np.isfinite(values).sum())
     if found.count:
-        assert 0.0 <= found.interval[0] <= found.share <= found.interval[1] <= 1.0
+        assert 0.0 <= found.interval[0] <= found.fraction <= found.interval[1] <= 1.0
     else:
-        assert np.isnan(found.share)
+        assert np.isnan(found.fraction)
 
 
 @CHEAP
@@ -180,7 +180,7 @@ def test_chromophores_of_any_pixels_are_numbers_or_masked(table, pixels, free):
     for name in ("melanin", "hemoglobin", "stderr_melanin", "stderr_hemoglobin", "residual"):
         assert np.isfinite(getattr(found, name)[found.valid]).all(), name
     assert not found.valid[~np.isfinite(rgb).all(axis=-1)].any()
-    weighed = chromophore_posterior.estimate(rgb, table, prior=shading_prior.of_faces())
+    weighed = chromophore_posterior.estimate(rgb, table, prior=shading_prior.face_prior())
     assert not weighed.valid[~np.isfinite(rgb).all(axis=-1)].any()
     for name in ("melanin", "hemoglobin", "stderr_melanin", "stderr_hemoglobin"):
         assert np.isfinite(getattr(weighed, name)[weighed.valid]).all(), name
@@ -190,7 +190,9 @@ def test_chromophores_of_any_pixels_are_numbers_or_masked(table, pixels, free):
 @given(noise=st.floats(1e-4, 0.1))
 def test_more_noise_leaves_chromophores_less_identifiable(table, noise):
     found = [
-        chromophores.identifiability(table, shading="known", variance=lambda c, n=n: (n * c) ** 2)
+        chromophores.compute_identifiability(
+            table, shading="known", variance=lambda c, n=n: (n * c) ** 2
+        )
         for n in (noise, 2.0 * noise)
     ]
     for name in ("stderr_melanin", "stderr_hemoglobin"):
@@ -205,7 +207,7 @@ def test_error_common_to_channels_has_no_color_weight(values):
     root = np.array(values).reshape(3, 3)
     plane = np.eye(3) - 1.0 / 3.0
     covariance = plane @ root @ root.T @ plane + 1e-4 * plane
-    found = chromophores.without_brightness(covariance)
+    found = chromophores.add_brightness_variance(covariance)
     assert np.linalg.eigvalsh(found).min() > 0.0
     # colors without brightness are as uncertain as before
     np.testing.assert_allclose(plane @ found @ plane, covariance, atol=1e-12)
@@ -216,9 +218,9 @@ def test_error_common_to_channels_has_no_color_weight(values):
 @CHEAP
 @given(center=st.floats(-2.0, 0.5), spread=st.floats(0.05, 1.0))
 def test_lognormal_prior_has_its_mean_and_deviation(center, spread):
-    prior = shading_prior.lognormal(np.exp(center), spread)
-    assert prior.spread == pytest.approx(spread, rel=0.05)
-    assert prior.broadened(1.5).spread >= prior.spread * (1.0 - 1e-9)
+    prior = shading_prior.lognormal_prior(np.exp(center), spread)
+    assert prior.sd == pytest.approx(spread, rel=0.05)
+    assert prior.broaden(1.5).sd >= prior.sd * (1.0 - 1e-9)
     assert np.isfinite(prior.mean)
     assert np.all(np.diff(prior.nodes) > 0.0)
 
@@ -227,14 +229,14 @@ def test_lognormal_prior_has_its_mean_and_deviation(center, spread):
 @given(counts=st.lists(st.integers(0, 1000), min_size=3, max_size=40), low=st.floats(-3.0, 0.0))
 def test_shading_prior_mean_is_within_sample_nodes(counts, low):
     assume(sum(counts) > 0)
-    prior = shading_prior.from_samples(low, 0.05, counts)
+    prior = shading_prior.prior_from_histogram(low, 0.05, counts)
     assert prior.nodes[0] <= prior.mean <= prior.nodes[-1]
 
 
 @CHEAP
 @given(cosine=st.floats(-1.0, 1.0))
 def test_surface_transmittance_is_between_zero_and_all(cosine):
-    share = skin_reflectance.transmitted(cosine)
+    share = skin_reflectance.transmittance(cosine)
     assert 0.0 <= share <= 1.0
 
 
@@ -285,7 +287,7 @@ def test_half_and_difference_angles_come_back_as_directions(light, view):
     angles = merl.to_angles(light, view, up)
     again = merl.to_angles(*merl.to_directions(*angles), up)
     np.testing.assert_allclose(again[:2], angles[:2], atol=1e-6)
-    for place, centers in zip(merl.bins(*angles), merl.bin_centers(), strict=True):
+    for place, centers in zip(merl.bin_indices(*angles), merl.bin_centers(), strict=True):
         assert 0 <= place < centers.size
 
 
@@ -299,8 +301,8 @@ def test_detectability_is_unit_invariant(seed, size, scale):
     rng = np.random.default_rng(seed)
     estimate, stderr = rng.standard_normal((12, 10)), rng.uniform(0.1, 3.0, (12, 10))
     valid = rng.uniform(size=(12, 10)) > 0.2
-    first = pixel_checks.detectable(estimate, stderr, valid, size_px=size)
-    scaled = pixel_checks.detectable(scale * estimate, scale * stderr, valid, size_px=size)
+    first = pixel_checks.is_detectable(estimate, stderr, valid, size_px=size)
+    scaled = pixel_checks.is_detectable(scale * estimate, scale * stderr, valid, size_px=size)
     np.testing.assert_array_equal(first, scaled)
     assert first.dtype == bool
 
@@ -336,11 +338,11 @@ def test_independent_components_of_image_are_exposure_invariant(seed, scale):
 @given(place=st.tuples(st.floats(-1.2, 1.2), st.floats(-1.2, 1.2)), view=VECTOR)
 def test_normal_positions_round_trip(place, view):
     at = np.array(place)
-    normal = sphere_lights.normal_at(at)
+    normal = sphere_lights.normal_from_disc(at)
     assert np.linalg.norm(normal) == pytest.approx(1.0)
     if normal[2] > 0.05:
-        np.testing.assert_allclose(sphere_lights.place_of(normal), at, atol=1e-6)
-    frame = sphere_lights.frame_of(unit(view))
+        np.testing.assert_allclose(sphere_lights.disc_from_normal(normal), at, atol=1e-6)
+    frame = sphere_lights.view_frame(unit(view))
     np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-9)
 
 
@@ -374,13 +376,13 @@ def test_lobe_response_to_lights_is_finite_in_domain(view, eta, vector, mirror):
 def test_lobes_of_nonfinite_values_raise_error(bad):
     up = np.array([0.0, 0.0, 1.0])
     with pytest.raises(sphere_lights.SphereLightsError, match="place"):
-        sphere_lights.normal_at(np.array([0.1, bad]))
+        sphere_lights.normal_from_disc(np.array([0.1, bad]))
     with pytest.raises(sphere_lights.SphereLightsError, match="normal"):
-        sphere_lights.place_of(np.array([0.1, bad, 1.0]))
+        sphere_lights.disc_from_normal(np.array([0.1, bad, 1.0]))
     with pytest.raises(sphere_lights.SphereLightsError, match="view"):
-        sphere_lights.frame_of([0.0, bad, 1.0])
+        sphere_lights.view_frame([0.0, bad, 1.0])
     with pytest.raises(sphere_lights.SphereLightsError, match="view"):
-        sphere_lights.frame_of([0.0, 0.0, 0.0])
+        sphere_lights.view_frame([0.0, 0.0, 0.0])
     with pytest.raises(sphere_lights.SphereLightsError, match="view"):
         lobe_response.facet_reflectance(RING, np.array([bad, 0.0, 1.0]), 1.4)
     with pytest.raises(sphere_lights.SphereLightsError, match="eta"):
@@ -388,11 +390,11 @@ def test_lobes_of_nonfinite_values_raise_error(bad):
     with pytest.raises(sphere_lights.SphereLightsError, match="vector"):
         lobe_response.direction_from_moments(np.array([[0.0, bad, 1.0]]), True)
     with pytest.raises(sphere_lights.SphereLightsError, match="alpha"):
-        lobe_response.specular(RING, view=up, alpha=bad, eta=1.4)
+        lobe_response.specular_response(RING, view=up, alpha=bad, eta=1.4)
     with pytest.raises(sphere_lights.SphereLightsError, match="alpha_stderr"):
-        lobe_response.specular(RING, view=up, alpha=0.3, eta=1.4, alpha_stderr=bad)
+        lobe_response.specular_response(RING, view=up, alpha=0.3, eta=1.4, alpha_stderr=bad)
     with pytest.raises(sphere_lights.SphereLightsError, match="eta"):
-        lobe_response.diffuse(RING, view=up, eta=bad)
+        lobe_response.diffuse_response(RING, view=up, eta=bad)
 
 
 @CHEAP
@@ -402,12 +404,14 @@ def test_topography_model_errors_only_widen_and_scale(seed, scale):
     height = (scale * rng.standard_normal((6, 5))).astype(np.float32)
     stderr = (scale * rng.uniform(0.01, 1.0, (6, 5))).astype(np.float32)
     valid = rng.uniform(size=(6, 5)) > 0.3
-    found = relief_errors.of_height(height, stderr, valid)
+    found = relief_errors.height_stderr(height, stderr, valid)
     assert np.all(found >= stderr)
     np.testing.assert_array_equal(found[~valid], stderr[~valid])
     normals = rng.standard_normal((6, 5, 3))
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     angles = rng.uniform(0.01, 1.0, (6, 5)).astype(np.float32)
-    wider = relief_errors.of_normals(normals, angles, valid)
+    wider = relief_errors.normal_stderr(normals, angles, valid)
     assert np.all(wider >= angles)
-    np.testing.assert_array_equal(relief_errors.of_normals(normals, angles, valid & False), angles)
+    np.testing.assert_array_equal(
+        relief_errors.normal_stderr(normals, angles, valid & False), angles
+    )

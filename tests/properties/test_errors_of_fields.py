@@ -55,10 +55,10 @@ def test_points_on_a_line_make_no_map(count, seed):
 def test_mean_error_has_value_units_and_ignores_origin(seed, side, unit, shift):
     rng = np.random.default_rng(seed)
     values, sizes = rng.normal(size=side**2), rng.integers(1, 50, side**2).astype(float)
-    error, growth = blocks.stderr_of_mean(values, sizes, grid(side))
+    error, growth = blocks.mean_stderr(values, sizes, grid(side))
     assert growth >= 1.0
     assert 0.3 / side < error < 6.0  # between independent blocks and one that stands for all
-    scaled, again = blocks.stderr_of_mean(unit * (values + shift), sizes, grid(side))
+    scaled, again = blocks.mean_stderr(unit * (values + shift), sizes, grid(side))
     assert scaled == pytest.approx(unit * error, rel=1e-4)
     assert again == pytest.approx(growth, rel=1e-4)
 
@@ -66,14 +66,16 @@ def test_mean_error_has_value_units_and_ignores_origin(seed, side, unit, shift):
 @CHEAP
 @given(count=st.integers(0, blocks.MIN_BLOCKS - 1))
 def test_too_few_blocks_have_an_endless_error(count):
-    told = blocks.stderr_of_mean(np.zeros(count), np.ones(count), np.zeros((count, 2)))
+    told = blocks.mean_stderr(np.zeros(count), np.ones(count), np.zeros((count, 2)))
     assert told == (np.inf, 1.0)
 
 
 @CHEAP
 @given(x=st.floats(0.0, 1e4), y=st.floats(0.0, 1e4))
 def test_interpolation_leaves_half_to_all_of_noise(x, y):
-    left = dense_flow.noise_left(np.array([[[x, y], [np.floor(x), np.floor(y)]]], np.float32))
+    left = dense_flow.interpolated_noise_variance(
+        np.array([[[x, y], [np.floor(x), np.floor(y)]]], np.float32)
+    )
     assert 0.3 < left[0, 0] <= 1.0 + 1e-5
     assert left[0, 1] == pytest.approx(1.0, abs=1e-6)
 
@@ -85,7 +87,7 @@ def test_vessel_blood_is_square_of_root_with_error(start, end, tau, seed):
     course = end + (start - end) * np.exp(-time / tau)
     noisy = course + 1e-3 * np.random.default_rng(seed).normal(size=20)
     roots = perfusion_fit.fit_course(time, noisy)
-    blood = perfusion_fit.of_vessels(roots)
+    blood = perfusion_fit.square_levels(roots)
     np.testing.assert_allclose(blood.start, np.maximum(roots.start, 0.0) ** 2)
     step = 1e-6
     slope = ((roots.end + step) ** 2 - (roots.end - step) ** 2) / (2.0 * step)
@@ -96,8 +98,8 @@ def test_vessel_blood_is_square_of_root_with_error(start, end, tau, seed):
 @given(seed=SEEDS, side=st.integers(24, 64), blocks=st.integers(3, 8))
 def test_map_blocks_have_error_of_their_means(seed, side, blocks):
     values = np.random.default_rng(seed).normal(size=side * side)
-    group, groups = normal_blocks.block_of(np.arange(side * side), (side, side), blocks)
-    error, growth = normal_blocks.block_error(values, group, groups, (side, side), blocks)
+    group, groups = normal_blocks.assign_blocks(np.arange(side * side), (side, side), blocks)
+    error, growth = normal_blocks.block_mean_stderr(values, group, groups, (side, side), blocks)
     # of samples that have nothing in common blocks tell about the error of independent ones
     assert 0.3 / side < error < 6.0 / side
     assert growth >= 1.0
@@ -149,7 +151,7 @@ def test_uniform_light_change_is_detected_despite_missing_pixels(seed, step, noi
     variance[1, gone], light[0, gone] = bad, np.nan
     good = np.ones(light.shape, bool)
     good[0, gone] = False
-    change, stiffness = light_change.smooth(
+    change, stiffness = light_change.smooth_light_changes(
         light.astype(np.float32), variance.astype(np.float32), good, (side, side), 6.0
     )
     assert np.isfinite(change).all()
@@ -174,8 +176,8 @@ def test_repeat_means_scale_with_unit_under_any_mask(seed, count, unit, noise, b
     variance = np.square(noise * rgb)
     valid = rng.random((count, 8, 9)) < 0.8
     rgb[~valid], variance[~valid] = bad, bad
-    mean, told, known = repeat_average.average(rgb, variance, valid)
-    scaled, told_scaled, _ = repeat_average.average(unit * rgb, unit**2 * variance, valid)
+    mean, told, known = repeat_average.average_repeats(rgb, variance, valid)
+    scaled, told_scaled, _ = repeat_average.average_repeats(unit * rgb, unit**2 * variance, valid)
     assert np.isfinite(mean).all()
     np.testing.assert_array_equal(known, valid.any(axis=0))
     np.testing.assert_allclose(scaled, unit * mean, rtol=1e-5)

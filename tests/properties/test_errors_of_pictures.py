@@ -35,10 +35,12 @@ def test_image_errors_are_covariances_scaling_with_terms(seed, factor, spread):
     rng = np.random.default_rng(seed)
     rgb = 0.3 * np.exp(spread * rng.standard_normal((9, 8, 3)))
     valid = rng.random((9, 8)) < 0.9
-    terms = model_error.color_errors()
+    terms = model_error.load_error_terms()
     wider = model_error.ColorErrors(
-        factor**2 * terms.transport, factor**2 * terms.fine, factor * terms.bounced
+        factor**2 * terms.transport, factor**2 * terms.fine, factor * terms.interreflection
     )
-    one, two = (model_error.of_picture(rgb, 0.0 * rgb, valid, errors=e) for e in (terms, wider))
+    one, two = (
+        model_error.image_covariance(rgb, 0.0 * rgb, valid, errors=e) for e in (terms, wider)
+    )
     np.testing.assert_allclose(two, factor**2 * one, rtol=1e-9, atol=1e-15)
     assert np.linalg.eigvalsh(one).min() > -1e-9 * np.abs(one).max()

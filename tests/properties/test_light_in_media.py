@@ -21,7 +21,9 @@ ETA = st.floats(1.0, 1.6)
 ANY_SIZE = st.floats(0.0, 1e100)  # subnormals among them
 USUAL = st.floats(1e-6, 1e3)
 SHARE = st.floats(0.0, 1.0)
-TABLE_G = st.floats(float(photon_medium.asymmetries()[0]), float(photon_medium.asymmetries()[-1]))
+TABLE_G = st.floats(
+    float(photon_medium.stored_asymmetries()[0]), float(photon_medium.stored_asymmetries()[-1])
+)
 
 
 @CHEAP
@@ -179,7 +181,7 @@ def test_photon_table_is_finite_and_reports_validity(radius, sigma_a, sigma_s, e
     assert np.isfinite(value)
     assert value >= 0.0
     error = photon_table.relative_error(radius, sigma_a, sigma_s, **told)
-    inside = photon_table.domain(radius, sigma_a, sigma_s, **told)
+    inside = photon_table.is_in_domain(radius, sigma_a, sigma_s, **told)
     assert not np.isnan(error)
     if inside:
         assert error <= 0.03
@@ -304,9 +306,9 @@ def test_averages_of_any_index_are_finite_or_refused(eta):
 @given(eta=st.one_of(st.floats(-1.0, 0.99), st.floats(1.61, 5.0), st.just(np.nan)))
 def test_photon_table_refuses_index_outside_table(eta):
     with pytest.raises(photon_medium.TableDomainError):
-        photon_medium.prepare(eta, 0.8, "all")
+        photon_medium.prepare_medium(eta, 0.8, "all")
     with pytest.raises(photon_medium.TableDomainError):
-        photon_medium.prepare(1.4, eta - 3.0, "all")
+        photon_medium.prepare_medium(1.4, eta - 3.0, "all")
 
 
 @CHEAP
@@ -441,9 +443,9 @@ MEDIUM = st.tuples(st.floats(0.0, 1.0), st.floats(1e-3, 1e3), ETA)
 @CHEAP
 @given(medium=MEDIUM, radius=st.floats(0.0, 1e4), reach=st.floats(0.0, 100.0))
 def test_scattered_light_fractions_grow_from_zero_to_all(medium, radius, reach):
-    media = dipole_sum.Media.of(medium[0], medium[1], eta=medium[2])
+    media = dipole_sum.DipoleMedia.of(medium[0], medium[1], eta=medium[2])
     radii = np.array([0.0, 0.5 * radius, radius])
-    share = dipole_sum.share_within(radii, media)
+    share = dipole_sum.encircled_fraction(radii, media)
     assert np.all((share >= 0.0) & (share <= 1.0 + 1e-9))
     assert np.all(np.diff(share) >= -1e-9)
     density = dipole_sum.profile(radii, media)
@@ -471,7 +473,7 @@ def test_uniform_light_returns_albedo_and_sums_agree(r_d, length, level, seed):
     np.testing.assert_allclose(even, r_d * level, rtol=dipole_gather.GATHER_TOL)
     light *= rng.uniform(0.0, 1.0, (40, 3))
     quick = dipole_gather.exitance(*args)
-    slow = dipole_sum.exitance_directly(*args)
+    slow = dipole_sum.sum_exitance(*args)
     np.testing.assert_allclose(quick, slow, atol=dipole_gather.GATHER_TOL * max(level, 1e-300))
     tree = dipole_gather.SourceTree.of(points, area)
     told = dipole_gather.gather(tree, light, points[:4], r_d, length)

@@ -65,7 +65,7 @@ def test_mixture_is_linear_reciprocal_and_dark_below_horizon(seed, factor):
     )
     same = skin_reflectance.lobe_brdf(basis, share, light, view, up)
     np.testing.assert_allclose(same, found, rtol=1e-12)
-    ball = brdf_basis.lit_sphere(share[0], basis, size_px=16)
+    ball = brdf_basis.render_lit_sphere(share[0], basis, size_px=16)
     assert (ball >= 0.0).all() or np.isnan(ball).any()
 
 
@@ -74,15 +74,15 @@ def test_mixture_is_linear_reciprocal_and_dark_below_horizon(seed, factor):
 def test_tables_keep_columns_and_refuse_nonfinite_ones(seed, bad):
     basis = three()
     columns = basis.table[..., : basis.size].copy()
-    again = brdf_tables.of_columns(columns, basis.names, light_radius_rad=0.0)
+    again = brdf_tables.basis_from_columns(columns, basis.names, light_radius_rad=0.0)
     np.testing.assert_array_equal(again.table, basis.table)
     place = seed % columns.size
     columns.flat[place] = -1.0
-    clipped = brdf_tables.of_columns(columns, basis.names, light_radius_rad=0.0)
+    clipped = brdf_tables.basis_from_columns(columns, basis.names, light_radius_rad=0.0)
     assert clipped.table[..., : basis.size].flat[place] == 0.0
     columns.flat[place] = bad
     with pytest.raises(brdf_tables.BasisError):
-        brdf_tables.of_columns(columns, basis.names, light_radius_rad=0.0)
+        brdf_tables.basis_from_columns(columns, basis.names, light_radius_rad=0.0)
 
 
 @FEW
@@ -128,19 +128,19 @@ def test_common_mixtures_sum_to_unity_refining_never_worsens(seed, rank, bad):
     for unit in (1e-320, 1e300):  # shares of some units have squares that no number holds
         _, _, same = brdf_basis.reduce(unit * shares, rank, basis=basis)
         assert same == pytest.approx(error, rel=0.1, abs=0.01)
-    gram = brdf_space.metric(basis)
+    gram = brdf_space.brdf_inner_products(basis)
     assert np.linalg.eigvalsh(gram).min() >= -1e-9 * np.abs(gram).max()
-    finer = brdf_space.refine(shares, mix, basis, sweeps=5)
+    finer = brdf_space.refine_mixtures(shares, mix, basis, sweeps=5)
     np.testing.assert_allclose(finer.sum(axis=1), 1.0)
     assert (finer >= 0.0).all()
     assert _left(shares, finer, gram) <= _left(shares, mix, gram) * (1 + 1e-9) + 1e-18
-    assert not brdf_space.usable(np.vstack([shares, 0.0 * shares[:1]]), basis)[-1]
-    assert brdf_space.repeatability(shares, shares, basis) == 0.0
-    twice = brdf_space.repeatability(shares, 1.1 * shares, basis)
+    assert not brdf_space.is_constrained(np.vstack([shares, 0.0 * shares[:1]]), basis)[-1]
+    assert brdf_space.repeat_distance(shares, shares, basis) == 0.0
+    twice = brdf_space.repeat_distance(shares, 1.1 * shares, basis)
     assert twice == pytest.approx(0.1 / np.sqrt(1.0 + 1.1**2), rel=1e-9)
     wrong = shares.copy()
     wrong[0, 0] = bad
-    for call in (brdf_space.usable, lambda w, b: brdf_basis.reduce(w, rank, basis=b)):
+    for call in (brdf_space.is_constrained, lambda w, b: brdf_basis.reduce(w, rank, basis=b)):
         with pytest.raises(ValueError, match="weights"):
             call(wrong, basis)
 
@@ -222,14 +222,14 @@ def test_texture_images_are_finite_where_valid(seed, sides, channels, bad, kind)
     image = (100 * rng.random(shape)).astype(kind)
     valid = rng.random(sides) < 0.7
     valid[0, 0] = True
-    values, mask = texture_space.checked_image(image, valid)
+    values, mask = texture_space.check_image(image, valid)
     assert values.shape == (*sides, channels or 1)
     assert values.dtype == (np.float64 if np.dtype(kind) == np.float64 else np.float32)
     np.testing.assert_array_equal(mask, valid)
     if image.dtype.kind == "f":
         image[0, 0] = bad
         with pytest.raises(texture_space.TextureError, match=r": got (nan|-?inf)"):
-            texture_space.checked_image(image, valid)
+            texture_space.check_image(image, valid)
 
 
 @functools.cache
@@ -242,11 +242,11 @@ def colors():
 def test_interpolated_colors_are_finite_and_match_derivatives(seed, step):
     rng = np.random.default_rng(seed)
     a, b = rng.uniform(0.05, 0.95, (2, 9))
-    color, by_a, by_b = chromophore_start.evaluate(colors(), a, b)
+    color, by_a, by_b = chromophore_start.evaluate_table(colors(), a, b)
     assert np.isfinite(color).all()
     for slope, da, db in ((by_a, step, 0.0), (by_b, 0.0, step)):
         up, down = (
-            chromophore_start.evaluate(colors(), a + s * da, b + s * db)[0] for s in (1, -1)
+            chromophore_start.evaluate_table(colors(), a + s * da, b + s * db)[0] for s in (1, -1)
         )
         np.testing.assert_allclose((up - down) / (2 * step), slope, rtol=1e-3, atol=1e-5)
 
@@ -262,13 +262,13 @@ def test_common_pixel_errors_add_in_squares_either_sign(steps):
 
     usual = face(-3.0, 0.4)
     moved = [(face(-3.0 - a, 0.4 - 0.1 * b), face(-3.0 + a, 0.4 + 0.1 * b)) for a, b in steps]
-    found = face_distribution.with_common_errors(usual, moved)
+    found = face_distribution.add_systematic_errors(usual, moved)
     assert found.melanin.mean == usual.melanin.mean
     assert found.melanin.stderr == pytest.approx(np.hypot.reduce([0.0, *(a for a, _ in steps)]))
     assert found.blood.stderr == pytest.approx(
         np.hypot.reduce([0.0, *(0.1 * b for _, b in steps)]), abs=1e-12
     )
-    turned = face_distribution.with_common_errors(usual, [pair[::-1] for pair in moved])
+    turned = face_distribution.add_systematic_errors(usual, [pair[::-1] for pair in moved])
     assert turned.melanin.stderr == pytest.approx(found.melanin.stderr)
 
 

@@ -23,7 +23,7 @@ def people(seed, count=9, numbers=5):
     rng = np.random.default_rng(seed)
     samples = rng.standard_normal((count, numbers))
     samples[: count // 2] += 2.0
-    (trait,) = trait_vectors.traits_of({"beard": np.arange(count) < count // 2}, {}, count)
+    (trait,) = trait_vectors.parse_traits({"beard": np.arange(count) < count // 2}, {}, count)
     return rng, samples, trait
 
 
@@ -33,7 +33,7 @@ def test_principal_components_hold_the_samples_in_any_unit(seed, unit, n, d, met
     rng = np.random.default_rng(seed)
     samples = unit * rng.standard_normal((n, d))
     weights = rng.uniform(0.5, 2.0, d) if metric else None
-    found = reduced_spaces.principal(
+    found = reduced_spaces.principal_components(
         samples, (), components=None, metric=weights, rng=np.random.default_rng(1)
     )
     again = found.center + found.coordinates @ found.basis
@@ -43,14 +43,16 @@ def test_principal_components_hold_the_samples_in_any_unit(seed, unit, n, d, met
     np.testing.assert_allclose(gram, np.eye(len(gram)), atol=1e-9)
     rank = len(found.basis)
     assert rank == min(n - 1, d)
-    one = reduced_spaces.principal(
+    one = reduced_spaces.principal_components(
         samples, (), components=1, metric=weights, rng=np.random.default_rng(1)
     )
     assert 0.0 <= one.lost <= math.sqrt(1.0 - 1.0 / rank) + 1e-9
     with pytest.raises(trait_vectors.TraitError, match="components"):
-        reduced_spaces.principal(samples, (), components=rank + 1, metric=weights, rng=rng)
+        reduced_spaces.principal_components(
+            samples, (), components=rank + 1, metric=weights, rng=rng
+        )
     with pytest.raises(trait_vectors.TraitError, match="same"):
-        reduced_spaces.principal(
+        reduced_spaces.principal_components(
             np.broadcast_to(samples[0], (n, d)), (), components=None, metric=weights, rng=rng
         )
 
@@ -59,12 +61,12 @@ def test_principal_components_hold_the_samples_in_any_unit(seed, unit, n, d, met
 @given(seed=SEED, unit=st.floats(5e-324, 1e308))
 def test_power_of_two_scales_numbers_to_unity_exactly(seed, unit):
     values = unit * np.random.default_rng(seed).uniform(-1.0, 1.0, 5)
-    exponent = trait_vectors.exponent_of(values, np.zeros(2))
+    exponent = trait_vectors.scale_exponent(values, np.zeros(2))
     scaled = np.ldexp(values, -exponent)
     assert 0.5 <= np.abs(scaled).max() < 1.0 or not values.any()
     np.testing.assert_array_equal(np.ldexp(scaled, exponent), values)
     with pytest.raises(trait_vectors.TraitError, match="got nan"):
-        trait_vectors.exponent_of(values, np.array([np.nan]))
+        trait_vectors.scale_exponent(values, np.array([np.nan]))
 
 
 @FEW
@@ -74,12 +76,20 @@ def test_useful_component_count_is_unit_invariant(seed, unit):
     off = samples - samples.mean(axis=0)
     u, s, _ = np.linalg.svd(off, full_matrices=False)
     scores = u * s
-    told = reduced_spaces.choose(scores, [trait], rng=np.random.default_rng(3))
+    told = reduced_spaces.choose_component_count(scores, [trait], rng=np.random.default_rng(3))
     assert 1 <= told <= scores.shape[1]
-    assert reduced_spaces.choose(unit * scores, [trait], rng=np.random.default_rng(3)) == told
+    assert (
+        reduced_spaces.choose_component_count(unit * scores, [trait], rng=np.random.default_rng(3))
+        == told
+    )
     # without a binary trait of two people on each side nothing can be chosen
-    assert reduced_spaces.choose(scores, (), rng=np.random.default_rng(3)) == scores.shape[1]
-    none = reduced_spaces.choose(np.zeros_like(scores), [trait], rng=np.random.default_rng(3))
+    assert (
+        reduced_spaces.choose_component_count(scores, (), rng=np.random.default_rng(3))
+        == scores.shape[1]
+    )
+    none = reduced_spaces.choose_component_count(
+        np.zeros_like(scores), [trait], rng=np.random.default_rng(3)
+    )
     assert none == scores.shape[1]
 
 
@@ -96,13 +106,15 @@ def test_basis_mixtures_recover_their_weights(seed, unit, n, size):
     below = reduced_spaces.mixture_coordinates(-samples, basis, None)
     np.testing.assert_allclose(below, 0.0, atol=1e-9)
     if np.ptp(samples, axis=0).max() > 0.01 * unit:
-        whole = reduced_spaces.mixtures(samples, basis, metric=None)
+        whole = reduced_spaces.fit_mixtures(samples, basis, metric=None)
         np.testing.assert_array_equal(whole.coordinates, found)
         assert 0.0 <= whole.lost < 1e-4
         # a mixture cannot be negative: then all that differs is lost
-        assert reduced_spaces.mixtures(-samples - unit, basis, metric=None).lost == pytest.approx(1)
+        assert reduced_spaces.fit_mixtures(
+            -samples - unit, basis, metric=None
+        ).lost == pytest.approx(1)
     with pytest.raises(trait_vectors.TraitError, match="same"):
-        reduced_spaces.mixtures(np.full((n, 6), unit), basis, metric=None)
+        reduced_spaces.fit_mixtures(np.full((n, 6), unit), basis, metric=None)
 
 
 @CHEAP
@@ -136,17 +148,17 @@ def test_invalid_basis_and_sample_are_refused(bad):
     wrong = basis.copy()
     wrong[0, 1] = bad
     with pytest.raises(trait_vectors.TraitError, match="basis"):
-        reduced_spaces.mixtures(samples, wrong, metric=None)
+        reduced_spaces.fit_mixtures(samples, wrong, metric=None)
     with pytest.raises(trait_vectors.TraitError, match="basis"):
-        reduced_spaces.mixtures(samples, np.zeros((1, 3)), metric=None)
+        reduced_spaces.fit_mixtures(samples, np.zeros((1, 3)), metric=None)
     if not np.isfinite(bad):
         wrong = samples.copy()
         wrong[0, 1] = bad
         rng = np.random.default_rng(0)
         with pytest.raises(trait_vectors.TraitError, match="samples"):
-            reduced_spaces.mixtures(wrong, basis, metric=None)
+            reduced_spaces.fit_mixtures(wrong, basis, metric=None)
         with pytest.raises(trait_vectors.TraitError, match="samples"):
-            reduced_spaces.principal(wrong, (), components=None, metric=None, rng=rng)
+            reduced_spaces.principal_components(wrong, (), components=None, metric=None, rng=rng)
 
 
 @FEW
@@ -154,16 +166,18 @@ def test_invalid_basis_and_sample_are_refused(bad):
 def test_trait_certainty_is_unit_invariant(seed, unit):
     _, samples, trait = people(seed)
     told = {"permutations": 39, "resamples": 20}
-    plain = trait_vectors.confidence(trait, samples, rng=np.random.default_rng(5), **told)
+    plain = trait_vectors.direction_confidence(trait, samples, rng=np.random.default_rng(5), **told)
     assert 1.0 / 40.0 <= plain.p_value <= 1.0
     assert 0.0 <= plain.expected_cosine <= 1.0
     low, middle, high = plain.bootstrap_cosine
     assert -1.0 - 1e-9 <= low <= middle <= high <= 1.0 + 1e-9
-    scaled = trait_vectors.confidence(trait, unit * samples, rng=np.random.default_rng(5), **told)
+    scaled = trait_vectors.direction_confidence(
+        trait, unit * samples, rng=np.random.default_rng(5), **told
+    )
     assert scaled.p_value == plain.p_value
     assert scaled.relative_noise == pytest.approx(plain.relative_noise, rel=1e-6)
     assert scaled.bootstrap_cosine == pytest.approx(plain.bootstrap_cosine, abs=1e-6)
-    nothing = trait_vectors.confidence(
+    nothing = trait_vectors.direction_confidence(
         trait, np.zeros_like(samples), rng=np.random.default_rng(5), **told
     )
     assert nothing.p_value == 1.0
@@ -214,7 +228,7 @@ def test_people_table_counts_each_once_in_any_unit(seed, unit, lost, people):
 @given(bad=st.sampled_from([0.0, -0.1, np.nan, np.inf]))
 def test_measurement_without_error_is_refused_by_person(bad):
     one = translucency_population.SiteMeasurement("Ada", "chin", (1.0, 1.0, 1.0), (0.1, bad, 0.1))
-    with pytest.raises(translucency_population.PopulationError, match="Ada"):
+    with pytest.raises(translucency_population.TranslucencyPopulationError, match="Ada"):
         translucency_population.summarize([one])
-    with pytest.raises(translucency_population.PopulationError, match="none"):
+    with pytest.raises(translucency_population.TranslucencyPopulationError, match="none"):
         translucency_population.summarize([])

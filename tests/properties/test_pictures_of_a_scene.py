@@ -46,7 +46,7 @@ def test_channels_are_summed_where_all_are_known(seed, sides, channels, bad):
     assert samples.channels == channels
     flat = gradient_channels.PatternSamples({"x": np.zeros(sides)}, None, None, None)
     assert flat.channels is None
-    whole = samples.summed()
+    whole = samples.sum_channels()
     found, noise = whole.patterns, whole.variance
     np.testing.assert_array_equal(images["x"], kept)
     for key, image in images.items():
@@ -56,7 +56,7 @@ def test_channels_are_summed_where_all_are_known(seed, sides, channels, bad):
         assert np.isnan(found[key][~known]).all()
     np.testing.assert_allclose(noise, variance.sum(axis=-1))
     noisy = gradient_channels.PatternSamples(images, SensorNoise(2.0, 3.0), None, None)
-    sensor = noisy.summed().variance
+    sensor = noisy.sum_channels().variance
     assert sensor.read_variance == 3.0 * channels
 
 
@@ -66,7 +66,7 @@ def test_channel_maps_are_separated_again(seed, sides, channels):
     rng = np.random.default_rng(seed)
     lights = unit_normals(rng, (5,))
     maps = [estimate_normals(rng.random((5, *sides)), lights) for _ in range(channels)]
-    whole = gradient_channels.joined(maps)
+    whole = gradient_channels.stack_channels(maps)
     for k, one in enumerate(maps):
         np.testing.assert_array_equal(whole.normals[..., k, :], one.normals)
         of_all = gradient_channels.PatternSamples({"albedo": whole.albedo}, None, None, None)
@@ -83,19 +83,19 @@ def test_restored_normals_are_unit_and_ignore_invalid_input(seed, spread, smooth
     rng = np.random.default_rng(seed)
     normals, valid = unit_normals(rng, (21, 17), spread), rng.random((21, 17)) < 0.9
     lens = lens_restoration.Aperture(18.0, 6.0)
-    first = lens_restoration.restore(normals, lens=lens, valid=valid, smooth_px=smooth)
+    first = lens_restoration.restore_normals(normals, lens=lens, valid=valid, smooth_px=smooth)
     np.testing.assert_allclose(np.linalg.norm(first.normals, axis=-1), 1.0, atol=1e-9)
     assert (first.normals[~valid] == (0.0, 0.0, 1.0)).all()
     assert 0.0 <= first.kept_noise <= lens_restoration.MAX_GAIN * first.noise * (1 + 1e-9)
     spoilt = np.where(valid[..., None], normals, bad)
-    again = lens_restoration.restore(spoilt, lens=lens, valid=valid, smooth_px=smooth)
+    again = lens_restoration.restore_normals(spoilt, lens=lens, valid=valid, smooth_px=smooth)
     np.testing.assert_array_equal(again.normals, first.normals)
     spoilt = normals.copy()
     spoilt[10, 8, 0] = bad  # a valid normal that is none counts as not valid
     without = valid.copy()
     without[10, 8] = False
-    one = lens_restoration.restore(spoilt, lens=lens, valid=valid, smooth_px=smooth)
-    other = lens_restoration.restore(normals, lens=lens, valid=without, smooth_px=smooth)
+    one = lens_restoration.restore_normals(spoilt, lens=lens, valid=valid, smooth_px=smooth)
+    other = lens_restoration.restore_normals(normals, lens=lens, valid=without, smooth_px=smooth)
     np.testing.assert_array_equal(one.normals, other.normals)
 
 
@@ -106,14 +106,14 @@ def test_waves_are_filtered_linearly_and_all_preserve_image(seed, sides, factor)
     sides = tuple(side + 31 for side in sides)
     values = rng.standard_normal(sides)
     transfer = rng.random([side + 2 * lens_restoration.PAD_PX for side in sides])
-    one = lens_restoration.filtered(values, transfer)
+    one = lens_restoration.filter_by_transfer(values, transfer)
     np.testing.assert_allclose(
-        lens_restoration.filtered(factor * values, transfer),
+        lens_restoration.filter_by_transfer(factor * values, transfer),
         factor * one,
         atol=1e-12 * max(1.0, abs(factor)),
     )
     np.testing.assert_allclose(
-        lens_restoration.filtered(values, np.ones_like(transfer)), values, atol=1e-12
+        lens_restoration.filter_by_transfer(values, np.ones_like(transfer)), values, atol=1e-12
     )
 
 
@@ -137,9 +137,9 @@ def test_sorted_list_is_recognized_in_any_unit(seed, lights, gain, dead, bad):
     seen[lights - dead :] = 0.0
     if lights - dead < 4:
         with pytest.raises(PhotometricStereoError, match="at least 4"):
-            light_check.check(seen, ways, rng=rng)
+            light_check.check_lights(seen, ways, rng=rng)
         return
-    found = light_check.check(seen, ways, rng=rng)
+    found = light_check.check_lights(seen, ways, rng=rng)
     assert found.order == "as listed"
     assert found.dead.sum() == dead
     assert np.isfinite(found.strength).all()
@@ -174,12 +174,12 @@ def test_points_are_chosen_once_per_cell_track_themselves(seed, count, bad):
     even = registration.normalize_local_contrast(rng.random((64, 72)))
     points = rng.uniform(-5.0, 80.0, (60, 2))
     points[7, 0] = bad
-    chosen = registration.textured(even, points, count=count)
+    chosen = registration.select_textured_points(even, points, count=count)
     assert len(chosen) <= count
     assert len(set(chosen.tolist())) == len(chosen)
     inside = points[chosen]
     assert ((inside >= 12) & (inside <= [72 - 13, 64 - 13])).all()
-    followed = registration.track(even, even, inside)
+    followed = registration.track_points(even, even, inside)
     assert followed.valid.all()
     np.testing.assert_allclose(followed.points_px, inside, atol=0.05)
 
@@ -189,10 +189,10 @@ def test_points_are_chosen_once_per_cell_track_themselves(seed, count, bad):
 def test_dense_flow_maps_image_onto_itself(seed, error):
     rng = np.random.default_rng(seed)
     even = registration.normalize_local_contrast(rng.random((40, 48)))
-    here, there = dense_flow.grid(even.shape), np.ones(even.shape, bool)
-    np.testing.assert_array_equal(dense_flow.bilinear(even, here), even)
+    here, there = dense_flow.pixel_grid(even.shape), np.ones(even.shape, bool)
+    np.testing.assert_array_equal(dense_flow.sample_image(even, here), even)
     valid = rng.random(even.shape) < 0.95
-    found = dense_flow.refine(
+    found = dense_flow.refine_flow(
         even, even, here, np.full(even.shape, error), valid=valid, valid_second=there
     )
     assert np.isfinite(found.source_px).all()
@@ -236,10 +236,10 @@ def test_derivative_texels_omit_invalid_values(seed, sides, bad):
     sides = tuple(side + 1 for side in sides)
     normals, valid = unit_normals(rng, sides), rng.random(sides) < 0.8
     stderr = rng.uniform(0.0, 0.1, sides)
-    first = wrinkle_texels.derivatives_of(normals, stderr_rad=stderr, valid=valid)
+    first = wrinkle_texels.measure_derivatives(normals, stderr_rad=stderr, valid=valid)
     assert not first.valid[~valid].any()
     spoilt = np.where(valid[..., None], normals, bad)
-    again = wrinkle_texels.derivatives_of(spoilt, stderr_rad=stderr, valid=valid)
+    again = wrinkle_texels.measure_derivatives(spoilt, stderr_rad=stderr, valid=valid)
     np.testing.assert_array_equal(again.values, first.values)
     np.testing.assert_array_equal(again.variance, first.variance)
 
@@ -258,12 +258,12 @@ def test_uniform_derivatives_give_uniform_texels_gathering_is_transpose(seed, si
     by, bx = (texture_resampling.reading_matrix(t, p) for t, p in zip(shape, sides, strict=True))
     texels, image = rng.standard_normal(shape), rng.standard_normal(sides)
     read = by @ texels @ bx.T
-    gathered = wrinkle_texels.gathered(by, bx, image)
+    gathered = wrinkle_texels.gather_texels(by, bx, image)
     assert float((read * image).sum()) == pytest.approx(float((texels * gathered).sum()), abs=1e-9)
     matrix = wrinkle_texels.normal_matrix(by, bx, weight, shape)
     np.testing.assert_allclose(
         (matrix @ texels.ravel()).reshape(shape),
-        wrinkle_texels.gathered(by, bx, weight * read),
+        wrinkle_texels.gather_texels(by, bx, weight * read),
         atol=1e-9,
     )
 
@@ -275,15 +275,15 @@ def test_plane_has_no_jump_invalid_values_are_unread(seed, sides, slope, bad):
     sides = tuple(side + 1 for side in sides)
     normals = np.broadcast_to([-slope[0], -slope[1], 1.0], (*sides, 3)).copy()
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    found = discontinuity_integration.integrate_broken(normals)
+    found = discontinuity_integration.integrate_with_discontinuities(normals)
     y, x = np.mgrid[: sides[0], : sides[1]]
     plane = slope[0] * x - slope[1] * y
     np.testing.assert_allclose(found.height, plane - plane.mean(), atol=1e-2)
     valid = rng.random(sides) < 0.9
     valid[0, 0] = True
-    first = discontinuity_integration.integrate_broken(normals, valid=valid)
+    first = discontinuity_integration.integrate_with_discontinuities(normals, valid=valid)
     spoilt = np.where(valid[..., None], normals, bad)
-    again = discontinuity_integration.integrate_broken(spoilt, valid=valid)
+    again = discontinuity_integration.integrate_with_discontinuities(spoilt, valid=valid)
     np.testing.assert_array_equal(again.height, first.height)
 
 
@@ -307,9 +307,9 @@ def test_landmarks_common_to_faces_are_centered_on_nose(seed, faces, size):
     places[0] = 0.0
     given_faces = [dict(zip(names, map(tuple, places), strict=True)) for _ in range(faces)]
     given_faces[0]["of one alone"] = (1.0, 2.0, 3.0)
-    found, where = common_parameterization.common_landmarks(given_faces)
+    found, where = common_parameterization.average_landmarks(given_faces)
     assert set(found) == set(names) | ({"of one alone"} if faces == 1 else set())
     assert (where[found.index("nose tip")] == 0.0).all()
     assert np.isfinite(where).all()
     with pytest.raises(common_parameterization.ParameterizationError, match="nose tip"):
-        common_parameterization.common_landmarks([{"chin": (0.0, 0.0, 0.0)}])
+        common_parameterization.average_landmarks([{"chin": (0.0, 0.0, 0.0)}])

@@ -14,7 +14,7 @@ from reconstruction.anisotropy import (
     profile_anisotropy,
 )
 from reconstruction.anisotropy import estimation as anisotropy
-from reconstruction.anisotropy.estimation import one_direction_bias
+from reconstruction.anisotropy.estimation import estimate_single_direction_bias
 from reconstruction.facial_color import perfusion_curves, perfusion_fit, repeatability
 from reconstruction.subsurface import smooth_misfit, translucency
 
@@ -85,8 +85,8 @@ def test_anisotropy_is_unit_invariant_and_rotates_with_skin(ratio, axis, level, 
     mean, by = diffusion_ellipse.mean_over_directions(parameters)
     assert values.min() - 1e-9 <= mean[0] <= values.max() + 1e-9
     assert np.isfinite(by).all()
-    assert diffusion_ellipse.all_directions().ndim == 1
-    bias = one_direction_bias(first, ANGLES)
+    assert diffusion_ellipse.uniform_axial_directions().ndim == 1
+    bias = estimate_single_direction_bias(first, ANGLES)
     expected = values[0] / mean[0] - 1.0
     np.testing.assert_allclose(bias.bias, expected, atol=1e-5)
     assert bias.lowest <= expected.min() + 1e-5
@@ -99,13 +99,13 @@ def test_lengths_and_directions_rotate_with_axes_unit_invariant(seed, unit, turn
     rng = np.random.default_rng(seed)
     pair, root = rng.standard_normal((7, 2)), rng.standard_normal((7, 2, 2))
     covariance = root @ root.transpose(0, 2, 1)
-    length, along, across = plane_vectors.length_and_errors(pair, covariance)
+    length, along, across = plane_vectors.estimate_length(pair, covariance)
     c, s = np.cos(turn), np.sin(turn)
     turned = np.array([[c, -s], [s, c]])
     moved = turned @ covariance @ turned.T
     for one, other in zip(
         (length, along, across),
-        plane_vectors.length_and_errors(unit * pair @ turned.T, unit**2 * moved),
+        plane_vectors.estimate_length(unit * pair @ turned.T, unit**2 * moved),
         strict=True,
     ):
         np.testing.assert_allclose(unit * one, other, rtol=1e-6, atol=1e-6 * unit)
@@ -124,29 +124,29 @@ def test_lengths_and_directions_rotate_with_axes_unit_invariant(seed, unit, turn
     np.testing.assert_allclose(
         stderr, plane_vectors.axis_stderr(unit * length, unit * across), rtol=1e-6
     )
-    angle = plane_vectors.within_period(np.arctan2(pair[:, 1], pair[:, 0]) + turn, np.pi)
+    angle = plane_vectors.wrap_angle(np.arctan2(pair[:, 1], pair[:, 0]) + turn, np.pi)
     assert np.all((angle >= 0.0) & (angle < np.pi))
 
 
 @CHEAP
 @given(coefficients=st.lists(st.floats(-1.0, 1.0), min_size=5, max_size=5))
 def test_harmonics_come_back_from_enough_directions(coefficients):
-    columns = direction_harmonics.design(ANGLES)
+    columns = direction_harmonics.design_matrix(ANGLES)
     values = (columns @ coefficients)[:, None]
     weight = np.ones_like(values)
-    count = direction_harmonics.different_directions(ANGLES, weight > 0)
+    count = direction_harmonics.count_distinct_directions(ANGLES, weight > 0)
     assert count.tolist() == [16]
-    kept, outliers = direction_harmonics.without_outliers(ANGLES, values, weight)
+    kept, outliers = direction_harmonics.exclude_outliers(ANGLES, values, weight)
     assert kept.shape == outliers.shape == (16, 1)
     assert outliers.sum() <= 2
-    found = direction_harmonics.fit(ANGLES, values, weight)
+    found = direction_harmonics.fit_harmonics(ANGLES, values, weight)
     np.testing.assert_allclose(found.coefficients[0], coefficients, atol=1e-6)
 
 
 @CHEAP
 @given(power=st.floats(1e-12, 1e12), residual=st.floats(1e-12, 1e12), dof=st.integers(1, 40))
 def test_tail_is_probability_decreasing_with_power(power, residual, dof):
-    tail = direction_harmonics.log_tail(
+    tail = direction_harmonics.log_p_value(
         np.array([power, 2.0 * power]), np.full(2, residual), np.full(2, dof)
     )
     assert np.all(tail <= 1e-12)
@@ -178,7 +178,7 @@ def test_time_course_is_unit_invariant(seed, constant, scale):
 def test_disc_means_scale_and_stay_within_pixel_range(seed, scale, radius):
     rng = np.random.default_rng(seed)
     maps, places = rng.uniform(1.0, 2.0, (2, 12, 12)), {"cheek": (5.0, 6.0)}
-    found = perfusion_curves.disc_means(scale * maps, places, radius)
+    found = perfusion_curves.average_discs(scale * maps, places, radius)
     assert np.all((found.mean >= scale) & (found.mean <= 2.0 * scale))
     rows, columns = perfusion_curves.disc_pixels((12, 12), "cheek", (5.0, 6.0), radius)
     assert 1 <= rows.size == columns.size
@@ -190,13 +190,15 @@ def test_periodic_levels_have_no_transition_and_repeat(seed, cycle):
     rng = np.random.default_rng(seed)
     phase = np.sort(rng.uniform(0.0, cycle, 30))
     values = np.where(phase < cycle / 2, 1.0, 2.0) + 1e-6 * rng.standard_normal(30)
-    groups = perfusion_curves.same_phase(phase, cycle_s=cycle)
+    groups = perfusion_curves.group_by_phase(phase, cycle_s=cycle)
     assert groups.shape == (30,)
     late = np.tile((np.arange(8) + 0.5) / 8 * cycle, 2)
     level = np.where(late < cycle / 2, 1.0, 2.0) + 1e-6 * rng.standard_normal(16)
-    found = perfusion_curves.transition(late, level, cycle_s=cycle, false_alarm=1e-9)
+    found = perfusion_curves.find_transition(late, level, cycle_s=cycle, false_alarm=1e-9)
     assert not found.seen
-    told = perfusion_curves.reproducibility(np.arange(16.0) * cycle, late, level, cycle_s=cycle)
+    told = perfusion_curves.estimate_reproducibility(
+        np.arange(16.0) * cycle, late, level, cycle_s=cycle
+    )
     assert told is not None
     assert values.size == 30
 
@@ -210,12 +212,12 @@ def test_repeats_are_judged_the_same_in_any_unit(seed, scale):
     states = ["neutral", "smile"] * 2
     for judge in (
         lambda k: (
-            repeatability.compare(k * maps, states, stderr=np.full(maps.shape, 0.1 * k))
+            repeatability.compare_states(k * maps, states, stderr=np.full(maps.shape, 0.1 * k))
             .region("whole face")
             .correlation
         ),
         lambda k: (
-            repeatability.drift(
+            repeatability.fit_drift(
                 k * maps, states, [0.0, 10.0, 20.0, 30.0], stderr=np.full(maps.shape, 0.1 * k)
             )[-1].slope_per_minute
             / k
@@ -248,7 +250,7 @@ def test_the_albedo_of_matte_points_comes_back(albedo, seed, scale):
     light, view = ways / np.linalg.norm(ways, axis=-1, keepdims=True)
     from model import skin_reflectance
 
-    through = skin_reflectance.transmitted(light[..., 2]) * skin_reflectance.transmitted(
+    through = skin_reflectance.transmittance(light[..., 2]) * skin_reflectance.transmittance(
         view[..., 2]
     )
     samples = np.repeat((scale * albedo * through / np.pi)[..., None], 3, axis=-1)
@@ -262,7 +264,7 @@ def test_the_albedo_of_matte_points_comes_back(albedo, seed, scale):
 @CHEAP
 @given(errors=st.lists(st.floats(0.0, 1e6), min_size=1, max_size=20), share=st.floats(0.0, 1.0))
 def test_plateau_is_within_valid_ranks(errors, share):
-    rank = brdf_basis.plateau(errors, share=share)
+    rank = brdf_basis.find_plateau_rank(errors, fraction=share)
     assert 1 <= rank <= len(errors)
 
 
@@ -325,17 +327,17 @@ def test_ellipse_fit_recovers_its_own_values(h, axis, level, drawn):
     shape, _ = diffusion_ellipse.relative_sigma_tr(TURNS, uv)
     values = np.exp(0.5 * level) * shape.T
     weight = np.random.default_rng(drawn).uniform(0.5, 2.0, (12, 1))
-    start = direction_harmonics.fit(TURNS, values, weight)
-    found, inverse, residual = diffusion_ellipse.fit(TURNS, values, weight, start)
-    assert start.told.all()
+    start = direction_harmonics.fit_harmonics(TURNS, values, weight)
+    found, inverse, residual = diffusion_ellipse.fit_ellipses(TURNS, values, weight, start)
+    assert start.determined.all()
     np.testing.assert_allclose(found[0, :3], [level, *uv[0]], atol=1e-5 * (1.0 + h))
     assert residual[0] < 1e-9
     assert np.isfinite(inverse).all()
     assert np.linalg.eigvalsh(inverse[0])[0] >= -1e-9
     # a series without a fit has zeros and no NaN
     few = np.where(np.arange(12)[:, None] < 3, weight, 0.0)
-    nothing = direction_harmonics.fit(TURNS, values, few)
-    p, covariance, left = diffusion_ellipse.fit(TURNS, values, few, nothing)
+    nothing = direction_harmonics.fit_harmonics(TURNS, values, few)
+    p, covariance, left = diffusion_ellipse.fit_ellipses(TURNS, values, few, nothing)
     assert not p.any()
     assert not covariance.any()
     assert left[0] == 0.0
@@ -348,12 +350,12 @@ def test_usual_positions_are_within_face_rectangle(seed, sides):
     skin = rng.uniform(size=sides) < 0.5
     skin[rng.integers(sides[0]), rng.integers(sides[1])] = True
     rows, columns = np.nonzero(skin)
-    for x, y in perfusion_curves.usual_places(skin).values():
+    for x, y in perfusion_curves.standard_positions(skin).values():
         assert columns.min() <= x <= columns.max()
         assert rows.min() <= y <= rows.max()
     for none in (np.zeros(sides, bool), np.ones(3, bool), np.ones((2, 2, 2), bool)):
         with pytest.raises(perfusion_curves.CurveError, match="skin"):
-            perfusion_curves.usual_places(none)
+            perfusion_curves.standard_positions(none)
 
 
 @CHEAP

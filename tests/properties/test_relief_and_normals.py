@@ -61,7 +61,7 @@ def test_slopes_are_invariant_to_unit_and_constant(seed, sides, scale):
     scaled = relief_slopes.slopes(scale * (height + 1.0), pixel=2.0 * scale, valid=valid)
     for a, b in zip(first, scaled, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9)
-    known = relief_slopes.stencil(height, valid) > 0
+    known = relief_slopes.slope_stencil(height, valid) > 0
     np.testing.assert_array_equal(first[2], known)
     assert not known[~valid].any()
     down = relief_slopes.slopes(
@@ -80,19 +80,19 @@ def test_slopes_are_invariant_to_unit_and_constant(seed, sides, scale):
 def test_every_normal_is_in_a_bucket_or_outside(slope, bins, limit, turn):
     x, y = np.array(slope).T
     normal_histogram.check_buckets(bins, limit)
-    counts, outside = normal_histogram.bucket_counts(x, y, bins=bins, limit=limit)
+    counts, outside = normal_histogram.count_normals(x, y, bins=bins, limit=limit)
     assert counts.sum() + outside == x.size
-    a, b = relief_slopes.turned(x, y, turn)
+    a, b = relief_slopes.rotate_components(x, y, turn)
     np.testing.assert_allclose(np.hypot(a, b), np.hypot(x, y), rtol=1e-9)
     if counts.sum():
         shares = normal_histogram.from_slopes(x, y, bins=bins, limit=limit)
-        np.testing.assert_array_equal(shares, normal_histogram.shares_of(counts))
+        np.testing.assert_array_equal(shares, normal_histogram.normalize_counts(counts))
         assert shares.sum() == pytest.approx(1.0)
         assert normal_histogram.distance(shares, shares) == 0.0
         floor = normal_histogram.noise_floor(shares, 50.0)
         assert 0.0 <= floor <= 2.0
         assert normal_histogram.noise_floor(shares, 500.0) <= floor + 1e-12
-        number = normal_blocks.effective_number(np.stack([counts.ravel()] * 3), 3 * x.size)
+        number = normal_blocks.effective_sample_count(np.stack([counts.ravel()] * 3), 3 * x.size)
         assert 0.0 < number <= 3 * x.size
 
 
@@ -113,9 +113,9 @@ def test_histograms_and_kernels_of_nonfinite_input_raise_error(bad):
     for pair in ((np.array([bad]), np.ones(1)), (np.ones(1), np.array([bad]))):
         for angle in (0.0, 0.3):
             with pytest.raises(relief_slopes.HistogramError, match=r"[ab]: got"):
-                relief_slopes.turned(*pair, angle)
+                relief_slopes.rotate_components(*pair, angle)
     with pytest.raises(relief_slopes.HistogramError, match="angle_rad"):
-        relief_slopes.turned(np.ones(1), np.ones(1), bad)
+        relief_slopes.rotate_components(np.ones(1), np.ones(1), bad)
     height = np.random.default_rng(0).standard_normal((12, 12))
     fit = partial(kernel_fit.fit_kernel, height, shares, stretch=1.0, axis="x", pixel_um=10.0)
     for name, wrong in (
@@ -125,12 +125,12 @@ def test_histograms_and_kernels_of_nonfinite_input_raise_error(bad):
     ):
         with pytest.raises(neutral_relief.KernelFitError, match=name):
             fit(bins=4, **wrong)
-    with pytest.raises(profile_length.ProfileError, match="height_um"):
-        profile_length.convolved([0.0, bad, 1.0], 0.5, 10.0, spacing_um=5.0)
-    with pytest.raises(profile_length.ProfileError, match="alpha"):
-        profile_length.convolved([0.0, 1.0, 0.5], bad, 10.0, spacing_um=5.0)
-    with pytest.raises(profile_length.ProfileError, match="spacing_um"):
-        profile_length.convolved([0.0, 1.0, 0.5], 0.5, 10.0, spacing_um=bad)
+    with pytest.raises(profile_length.SurfaceProfileError, match="height_um"):
+        profile_length.convolve_profile([0.0, bad, 1.0], 0.5, 10.0, spacing_um=5.0)
+    with pytest.raises(profile_length.SurfaceProfileError, match="alpha"):
+        profile_length.convolve_profile([0.0, 1.0, 0.5], bad, 10.0, spacing_um=5.0)
+    with pytest.raises(profile_length.SurfaceProfileError, match="spacing_um"):
+        profile_length.convolve_profile([0.0, 1.0, 0.5], 0.5, 10.0, spacing_um=bad)
 
 
 @CHEAP
@@ -142,7 +142,7 @@ def test_histograms_of_topography_and_its_normals_agree(seed, bins, angle):
     normals = np.stack([-x, -y, np.ones_like(x)], axis=-1)
     lengths = rng.uniform(0.1, 10.0, known.shape)[..., None]
     for ours, theirs in zip(
-        relief_slopes.slopes_of_normals(lengths * normals), (x, y), strict=False
+        relief_slopes.slopes_from_normals(lengths * normals), (x, y), strict=False
     ):
         np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12)
     told = {"bins": bins, "angle_rad": angle}
@@ -150,16 +150,16 @@ def test_histograms_of_topography_and_its_normals_agree(seed, bins, angle):
     of_normals = normal_histogram.from_normals(normals, valid=known, **told)
     # at the edge of a bucket rounding decides
     assert normal_histogram.halved_distance(of_height, of_normals) <= 4.0 / known.sum()
-    measured = normal_statistics.measure(height, pixel=1.0, **told)
+    measured = normal_statistics.measure_normals(height, pixel=1.0, **told)
     assert measured.histogram.sum() == pytest.approx(1.0)
 
 
 @CHEAP
 @given(rows=st.integers(1, 40), columns=st.integers(1, 40), blocks=st.integers(1, 9))
 def test_every_pixel_belongs_to_a_single_block(rows, columns, blocks):
-    number, count = normal_blocks.block_of(np.arange(rows * columns), (rows, columns), blocks)
+    number, count = normal_blocks.assign_blocks(np.arange(rows * columns), (rows, columns), blocks)
     assert set(number.tolist()) == set(range(count))
-    down, right = normal_blocks.grid_of((rows, columns), blocks)
+    down, right = normal_blocks.block_grid_shape((rows, columns), blocks)
     assert down * right == count
 
 
@@ -169,26 +169,26 @@ def test_counts_of_blocks_are_those_of_the_whole(seed, bins, angle, sides):
     rng = np.random.default_rng(seed)
     height, valid = rng.standard_normal(sides), masked(rng, sides)
     told = {"pixel": 1.5, "bins": bins, "limit": 0.7, "valid": valid, "angle_rad": angle}
-    parts = normal_blocks.block_counts(height, rng.integers(0, 5, sides), 5, **told)
+    parts = normal_blocks.count_block_normals(height, rng.integers(0, 5, sides), 5, **told)
     assert parts.shape == (5, bins, bins)
     if parts.any():
         whole = normal_histogram.histogram(height, **told)
         np.testing.assert_allclose(parts.sum(axis=0) / parts.sum(), whole, atol=1e-12)
-        residuals = normal_blocks.residuals_of(parts.reshape(5, -1).astype(np.float64))
+        residuals = normal_blocks.block_residuals(parts.reshape(5, -1).astype(np.float64))
         np.testing.assert_allclose(residuals.sum(axis=0), 0.0, atol=1e-12)
         empty = parts.sum(axis=(1, 2)) == 0
         assert not residuals[empty].any()
-    none = normal_blocks.block_counts(height, np.full(sides, -1), 5, **told)
+    none = normal_blocks.count_block_normals(height, np.full(sides, -1), 5, **told)
     assert not none.any()
     with pytest.raises(normal_histogram.HistogramError, match="block"):
-        normal_blocks.block_counts(height, np.zeros((1, 1, 1), int), 5, **told)
+        normal_blocks.count_block_normals(height, np.zeros((1, 1, 1), int), 5, **told)
 
 
 @CHEAP
 @given(seed=SEED, sides=SIDES)
 def test_parts_are_connected_and_cover_valid_area(seed, sides):
     valid = masked(np.random.default_rng(seed), sides, 0.6)
-    part = normal_integration.parts(valid)
+    part = normal_integration.label_parts(valid)
     np.testing.assert_array_equal(part > 0, valid)
     right = valid[:, 1:] & valid[:, :-1]
     np.testing.assert_array_equal(part[:, 1:][right], part[:, :-1][right])
@@ -238,9 +238,9 @@ def test_invalid_normals_are_omitted(bad, seed):
         assert np.isfinite(part).all()
     assert np.all(ax >= 0.0)
     assert np.all(ay >= 0.0)
-    hierarchy = weighted_poisson.Hierarchy(ax, ay)
+    hierarchy = weighted_poisson.MultigridHierarchy(ax, ay)
     x = np.zeros(dx.shape)
-    told = weighted_poisson.solve(hierarchy, dx, dy, x)
+    told = weighted_poisson.solve_poisson(hierarchy, dx, dy, x)
     assert np.isfinite(x).all()
     assert told.residual < 1e-3
     with pytest.raises(ERRORS):
@@ -278,11 +278,11 @@ def test_smoothed_slopes_are_numbers_within_those_given(seed, strength):
 @FEW
 @given(sides=st.tuples(st.integers(4, 40), st.integers(4, 40)), slope=st.floats(1e-6, 0.5))
 def test_expected_height_error_grows_with_noise(sides, slope):
-    first = relief_errors.expected_rms(sides, slope)
+    first = relief_errors.expected_height_rms(sides, slope)
     assert first > 0.0
-    assert relief_errors.expected_rms(sides, 2.0 * slope) == pytest.approx(2.0 * first)
-    assert relief_errors.expected_rms(sides, slope, pixel=3.0) == pytest.approx(3.0 * first)
-    assert relief_errors.expected_rms(sides, slope, cutoff=6.0) <= first * (1.0 + 1e-9)
+    assert relief_errors.expected_height_rms(sides, 2.0 * slope) == pytest.approx(2.0 * first)
+    assert relief_errors.expected_height_rms(sides, slope, pixel=3.0) == pytest.approx(3.0 * first)
+    assert relief_errors.expected_height_rms(sides, slope, cutoff=6.0) <= first * (1.0 + 1e-9)
 
 
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.6, 0, 0.8], [0, -0.6, 0.8]])
@@ -327,9 +327,9 @@ def test_lights_coplanar_with_point_are_refused(angle, flat):
     turned = lights @ turn.T
     if flat:
         with pytest.raises(ERRORS):
-            photometric_stereo.require_spread(turned)
+            photometric_stereo.require_noncoplanar(turned)
     else:
-        photometric_stereo.require_spread(turned)
+        photometric_stereo.require_noncoplanar(turned)
 
 
 @FEW
@@ -337,12 +337,16 @@ def test_lights_coplanar_with_point_are_refused(angle, flat):
 def test_more_lights_never_worsen_normals(seed, noise):
     rng = np.random.default_rng(seed)
     normals = unit_normals(rng, (6,))
-    found = light_selection.information(normals, LIGHTS, np.full((6, 5), noise))
-    few, many = (light_selection.predict(found, range(n), least=3).tilt_rad for n in (4, 5))
+    found = light_selection.fisher_information(normals, LIGHTS, np.full((6, 5), noise))
+    few, many = (
+        light_selection.predict_errors(found, range(n), min_lights=3).tilt_rad for n in (4, 5)
+    )
     assert np.all(many <= few + 1e-9)
-    chosen = light_selection.select(found, median_rad=10.0, valid_share=0.5, least=3)
+    chosen = light_selection.select_lights(found, median_rad=10.0, valid_fraction=0.5, min_lights=3)
     assert len(set(chosen.lights)) == len(chosen.lights)
-    assert light_selection.median_of_rayleigh([0.1, 0.1]) == pytest.approx(0.1 * 1.17741, rel=1e-3)
+    assert light_selection.rayleigh_mixture_median([0.1, 0.1]) == pytest.approx(
+        0.1 * 1.17741, rel=1e-3
+    )
 
 
 @CHEAP
@@ -359,7 +363,7 @@ def test_rotation_keeps_lengths_and_inverse_reverts_rotation(vector):
 def test_filtered_image_is_not_noisier_than_input(seed, noise):
     rng = np.random.default_rng(seed)
     image, valid = rng.standard_normal((20, 18)), masked(rng, (20, 18), 0.9)
-    found, share = gradient_wiener.filtered(image, noise, valid)
+    found, share = gradient_wiener.filter_image(image, noise, valid)
     assert np.isfinite(found).all()
     assert 0.0 <= share <= 1.0
 
@@ -369,11 +373,11 @@ def test_filtered_image_is_not_noisier_than_input(seed, noise):
 def test_patterns_give_finite_design_or_report_missing(names):
     given_names = dict.fromkeys(sorted(names))
     if gradient_patterns.redundancy(given_names) < 0:
-        with pytest.raises(gradient_patterns.MissingPatterns):
-            gradient_patterns.require(given_names, polarizer="parallel", purpose="normals")
+        with pytest.raises(gradient_patterns.MissingPatternsError):
+            gradient_patterns.require_patterns(given_names, polarizer="parallel", purpose="normals")
     lit = [name for name in given_names if name != "dark"]
     if lit:
-        assert np.isfinite(gradient_patterns.design(lit, dark=False)).all()
+        assert np.isfinite(gradient_patterns.design_matrix(lit, dark=False)).all()
 
 
 @FEW
@@ -390,7 +394,7 @@ def test_stretched_mesh_reports_stretch_in_any_orientation(seed, stretch, turn):
     found = mesh_strain.strain(rest, moved, faces, rest[:, :2] / 40.0)
     np.testing.assert_allclose(found.r_s, max(stretch, 1.0), rtol=1e-6)
     np.testing.assert_allclose(found.r_t, min(stretch, 1.0), rtol=1e-6)
-    place = mesh_strain.places_of(rest, moved)
+    place = mesh_strain.index_points(rest, moved)
     assert len(set(place.tolist())) == 16
     assert len(mesh_repair.boundary_edges(faces)) == 12
     again = mesh_repair.weld(mesh_repair.TriangleMesh(rest, faces))
@@ -437,17 +441,19 @@ def test_a_surface_is_never_shorter_than_its_ground(heights, spacing, alpha, sig
     assert length >= ground * (1.0 - 1e-12)
     shifted = profile_length.surface_length(-(height + 3.0), spacing_um=spacing)
     assert shifted == pytest.approx(float(length), rel=1e-9)
-    smooth = profile_length.convolved(height, alpha, sigma, spacing_um=spacing)
+    smooth = profile_length.convolve_profile(height, alpha, sigma, spacing_um=spacing)
     assert np.isfinite(smooth).all()
     # a kernel of sum 1 keeps the mean of a mirrored profile only roughly, and constants exactly
-    flat = profile_length.convolved(np.full(20, 7.0), alpha, sigma, spacing_um=spacing)
+    flat = profile_length.convolve_profile(np.full(20, 7.0), alpha, sigma, spacing_um=spacing)
     np.testing.assert_allclose(flat, 7.0, rtol=1e-9)
     change = profile_length.length_change(
         height, spacing_um=spacing, stretch=stretch, alpha=alpha, sigma_um=sigma
     )
     assert change.unchanged_ratio > 0.0
     assert change.convolved_ratio > 0.0
-    kept = profile_length.keep_length(height, spacing_um=spacing, stretch=stretch, sigma_um=sigma)
+    kept = profile_length.find_length_preserving_kernel(
+        height, spacing_um=spacing, stretch=stretch, sigma_um=sigma
+    )
     assert np.isfinite([kept.change.unchanged_ratio, kept.change.convolved_ratio]).all()
 
 
@@ -455,8 +461,8 @@ def test_a_surface_is_never_shorter_than_its_ground(heights, spacing, alpha, sig
 @given(seed=SEED, shift=st.tuples(*[st.floats(-50.0, 50.0)] * 2))
 def test_field_through_shifted_landmarks_is_uniform_shift(seed, shift):
     points = np.random.default_rng(seed).uniform(0.0, 100.0, (8, 2))
-    field = landmark_field.fit(points, points + shift, stderr_px=0.5)
-    found, _ = field.at([[10.0, 80.0], [55.0, 5.0]])[:2]
+    field = landmark_field.fit_landmark_field(points, points + shift, stderr_px=0.5)
+    found, _ = field.evaluate([[10.0, 80.0], [55.0, 5.0]])[:2]
     np.testing.assert_allclose(found, np.broadcast_to(shift, (2, 2)), atol=1e-6)
 
 
@@ -498,7 +504,7 @@ def test_texture_axes_are_orthonormal_and_rotate_with_texture(seed, turn):
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[0:14, 0:12] * 1.0
     place = np.stack([x, -y, 0.5 * np.sin(0.4 * x + rng.uniform(0, 6))], axis=-1)
-    axes, known = tangent_space.frames(place, np.ones((14, 12), bool))
+    axes, known = tangent_space.tangent_frames(place, np.ones((14, 12), bool))
     np.testing.assert_allclose(
         (axes @ np.swapaxes(axes, -1, -2))[known],
         np.broadcast_to(np.eye(3), (known.sum(), 3, 3)),

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from model import microstructure, wrinkles
 from model.displacement_synthesis import sources as synthesis_sources
 from model.microstructure import mesh_strain, strain_fields
-from model.microstructure.map_windows import Window
+from model.microstructure.map_windows import MapWindow
 from model.wrinkles import expressions as wrinkle_expressions
 from model.wrinkles import storage as wrinkle_storage
 from reconstruction.gradient_normals import channels as gradient_channels
@@ -54,12 +54,14 @@ def test_strain_texture_is_the_same_in_every_window(stretch, scale, size, window
     bottom, right = (
         min(a + b + 1, c) for a, b, c in zip((top, left), window[1], size, strict=True)
     )
-    part = strain_fields.rasterize(strain, faces, uv, size, window=Window(top, bottom, left, right))
+    part = strain_fields.rasterize(
+        strain, faces, uv, size, window=MapWindow(top, bottom, left, right)
+    )
     for name in ("stretch", "axes", "px_per_mm", "covered", "padded"):
         inside = getattr(whole, name)[top:bottom, left:right]
         np.testing.assert_array_equal(getattr(part, name), inside)
     with pytest.raises(mesh_strain.StrainError, match="window"):
-        strain_fields.rasterize(strain, faces, uv, size, window=Window(0, size[0] + 1, 0, 1))
+        strain_fields.rasterize(strain, faces, uv, size, window=MapWindow(0, size[0] + 1, 0, 1))
     with pytest.raises(mesh_strain.StrainError, match="size"):
         strain_fields.rasterize(strain, faces, uv, (0, 3))
 
@@ -114,9 +116,9 @@ def test_sources_contain_each_large_enough_patch_per_scale(seed, sides, zooms, w
     large = [[shape for shape in level if min(shape) >= window] for level in scaled]
     if not all(large):
         with pytest.raises(ValueError, match="patches"):
-            synthesis_sources.gather(patches, zooms, window=window, name="patches")
+            synthesis_sources.gather_sources(patches, zooms, window=window, name="patches")
         return
-    found = synthesis_sources.gather(patches, zooms, window=window, name="patches")
+    found = synthesis_sources.gather_sources(patches, zooms, window=window, name="patches")
     assert np.isfinite(found.heights).all()
     assert np.diff(found.level_first).tolist() == [len(level) for level in large]
     shapes = [shape for level in large for shape in level]
@@ -124,7 +126,7 @@ def test_sources_contain_each_large_enough_patch_per_scale(seed, sides, zooms, w
     assert found.heights.size == sum(h * w for h, w in shapes)
     for first, high, wide, entry, turned in found.table:
         patch = found.heights[first : first + high * wide].reshape(high, wide)
-        other = found.turned[turned : turned + high * wide].reshape(wide, high)
+        other = found.transposed[turned : turned + high * wide].reshape(wide, high)
         np.testing.assert_array_equal(other, patch.T)
         table = found.filled[entry : entry + (high + 1) * (wide + 1)].reshape(high + 1, wide + 1)
         assert 0 <= table[-1, -1] <= high * wide
@@ -165,7 +167,7 @@ def test_a_footprint_is_that_of_its_textures(wrinkle, mask, zones, mips, maps, m
 )
 def test_stored_masks_come_back_or_are_refused(seed, sides, zones, huge, encoding, bad):
     masks = np.random.default_rng(seed).uniform(size=(zones, *sides))
-    found = wrinkle_storage.stored_masks(masks, encoding)
+    found = wrinkle_storage.round_trip_masks(masks, encoding)
     assert found.shape == masks.shape
     assert found.dtype == np.float32
     worst = {"float32": 1e-7, "float16": 5e-4, "unit8": 0.51 / 255, "bc3": 0.5}[encoding]
@@ -174,13 +176,13 @@ def test_stored_masks_come_back_or_are_refused(seed, sides, zones, huge, encodin
     masks[0, 0, 0] = huge
     if huge > limit:
         with pytest.raises(wrinkle_expressions.WrinkleError, match="masks"):
-            wrinkle_storage.stored_masks(masks, encoding)
+            wrinkle_storage.round_trip_masks(masks, encoding)
     else:
-        stored = wrinkle_storage.stored_masks(masks, encoding)
+        stored = wrinkle_storage.round_trip_masks(masks, encoding)
         assert stored[0, 0, 0] == pytest.approx(huge, rel=1e-3)
     masks[0, 0, 0] = bad
     with pytest.raises(wrinkle_expressions.WrinkleError, match="masks"):
-        wrinkle_storage.stored_masks(masks, encoding)
+        wrinkle_storage.round_trip_masks(masks, encoding)
 
 
 @CHEAP
@@ -193,7 +195,7 @@ def test_stored_masks_come_back_or_are_refused(seed, sides, zones, huge, encodin
 )
 def test_widened_planes_read_back_their_values(seed, texels, pixels, kind, level):
     planes = np.random.default_rng(seed).standard_normal((2, *texels))
-    *wide, first, part = wrinkles.widened(planes, pixels, kind)
+    *wide, first, part = wrinkles.to_kernel_planes(planes, pixels, kind)
     assert first.shape == part.shape == (pixels[0],)
     assert ((part >= 0.0) & (part < 1.0)).all()
     for plane, given_plane in zip(wide, planes, strict=True):
@@ -204,7 +206,7 @@ def test_widened_planes_read_back_their_values(seed, texels, pixels, kind, level
         assert read.shape == pixels
         assert read.min() >= given_plane.min() - 1e-5
         assert read.max() <= given_plane.max() + 1e-5
-    even, *_ = wrinkles.widened(np.full((1, *texels), level), pixels, np.float64)
+    even, *_ = wrinkles.to_kernel_planes(np.full((1, *texels), level), pixels, np.float64)
     np.testing.assert_allclose(even, level, rtol=1e-12)
 
 
@@ -225,7 +227,7 @@ def test_collected_images_keep_samples_and_mask_invalid_ones(seed, sides, bad, k
     variance[keys[2]][0, 0] = -1.0
     top = None if level is None else 500.0
     given = PatternSamples(pictures, variance, None, top)
-    stack = gradient_channels.collect(given)["parallel"]
+    stack = gradient_channels.sort_by_polarization(given)["parallel"]
     samples = stack.samples(slice(None), np.float64)
     spread = stack.variances(slice(None), np.float64)
     assert (np.isfinite(spread) & (spread > 0.0)).all()
@@ -237,10 +239,10 @@ def test_collected_images_keep_samples_and_mask_invalid_ones(seed, sides, bad, k
             assert not shown[pictures[key] >= top].any()
     for wrong in (0.0, -1.0, bad):
         with pytest.raises(gradient_patterns.GradientError, match="variance"):
-            gradient_channels.collect(PatternSamples(pictures, wrong, None, None))
+            gradient_channels.sort_by_polarization(PatternSamples(pictures, wrong, None, None))
     misspelled = {("ful", "parallel"): pictures[keys[0]]}
     with pytest.raises(gradient_patterns.GradientError, match="ful"):
-        gradient_channels.collect(PatternSamples(misspelled, None, None, None))
+        gradient_channels.sort_by_polarization(PatternSamples(misspelled, None, None, None))
 
 
 @CHEAP
@@ -252,19 +254,19 @@ def test_kernel_direction_dependence_is_unit_invariant(seed, unit, bad):
     angle = np.tile([0.0, 0.8, 1.6], 4)
     alpha, sigma = microstructure.kernel_parameters(stretch, table)
     noise = rng.standard_normal((2, 12))
-    plain = kernel_table.direction_dependence(
+    plain = kernel_table.estimate_direction_dependence(
         table, stretch, alpha + noise[0], sigma + noise[1], angle
     )
     for p in (plain.p_alpha, plain.p_sigma):
         assert 0.0 <= p <= 1.0
     # residuals alone count: numbers far larger than the table's are residuals
     if unit > 1.0:
-        large = kernel_table.direction_dependence(
+        large = kernel_table.estimate_direction_dependence(
             table, stretch, unit * noise[0], unit * noise[1], angle
         )
         assert large.p_alpha == pytest.approx(plain.p_alpha, rel=1e-6)
         assert np.isfinite(large.alpha_offset).all()
-    turned = kernel_table.direction_dependence(
+    turned = kernel_table.estimate_direction_dependence(
         table,
         stretch,
         alpha + np.select([angle == 0.0, angle == 0.8], [0.0, 3.0], -3.0),
@@ -272,10 +274,10 @@ def test_kernel_direction_dependence_is_unit_invariant(seed, unit, bad):
         angle,
     )
     assert turned.p_alpha < 1e-6
-    exact = kernel_table.direction_dependence(table, stretch, alpha, sigma, angle)
+    exact = kernel_table.estimate_direction_dependence(table, stretch, alpha, sigma, angle)
     assert np.isfinite([exact.p_alpha, exact.p_sigma]).all()
     for k in range(4):
         told = [stretch.copy(), alpha.copy(), sigma.copy(), angle.copy()]
         told[k][3] = bad
         with pytest.raises(kernel_table.KernelTableFitError, match="finite"):
-            kernel_table.direction_dependence(table, *told)
+            kernel_table.estimate_direction_dependence(table, *told)

@@ -18,7 +18,7 @@ from capture.devices.port import Port
 from capture.rig import load_rig
 from rigsim.boxes.faults import Faults
 from rigsim.world import World
-from rigsim.world.serve import serve
+from rigsim.world.serve import serve_world
 
 NAMES = (f"protocol-{number}" for number in itertools.count())
 
@@ -123,7 +123,7 @@ def bench(request, rig):
         world.unregister()
         return
     world = World(rig, seed=5, clock="real", scene=Photometer(rig), faults=Faults(baud=0.0))
-    with serve(rig, world=world, pty=request.param == "pty") as served:
+    with serve_world(rig, world=world, pty=request.param == "pty") as served:
         if request.param == "rfc2217":
             with contextlib.closing(Gateway(served.addresses["flash"])) as gateway:
                 addresses = {**served.addresses, "flash": gateway.address}

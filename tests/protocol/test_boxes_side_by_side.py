@@ -8,8 +8,8 @@ from capture.devices.caliper import CaliperBox
 from capture.devices.gradient_sphere import GradientSphereBox
 from capture.devices.port import Port, PortBusy, WrongDevice
 from capture.rig import load_rig
-from rigsim.world.serve import ServeError, serve
-from skinrig.capturing.addresses import addresses, require_addresses
+from rigsim.world.serve import ServeError, serve_world
+from skinrig.capturing.addresses import parse_addresses, require_addresses
 from skinrig.errors import UsageError
 
 RIG = load_rig("gradient").cropped(16)
@@ -17,7 +17,7 @@ RIG = load_rig("gradient").cropped(16)
 
 @pytest.fixture(params=["pty", "tcp"])
 def served(request):
-    with serve(RIG, pty=request.param == "pty") as served:
+    with serve_world(RIG, pty=request.param == "pty") as served:
         yield served
 
 
@@ -54,7 +54,7 @@ def test_exchanged_addresses_are_noticed(served):
 
 def test_held_controller_is_busy_while_other_is_free():
     with (
-        serve(RIG, pty=True) as served,
+        serve_world(RIG, pty=True) as served,
         CaliperBox(Port(served.addresses["caliper"])),
         GradientSphereBox(Port(served.addresses["gradient_sphere"])),
         pytest.raises(PortBusy),
@@ -70,7 +70,7 @@ def test_controller_and_camera_addresses_are_required():
 
 
 def test_addresses_of_both_controllers_are_required():
-    given = addresses(["gradient_sphere=/dev/a"], "--port")
+    given = parse_addresses(["gradient_sphere=/dev/a"], "--port")
     with pytest.raises(UsageError, match="--port caliper=URL --camera cam=URL"):
         require_addresses(RIG, given, {})
     require_addresses(RIG, {**given, "caliper": "/dev/b"}, {"cam": "sim://x/cam"})
@@ -78,9 +78,9 @@ def test_addresses_of_both_controllers_are_required():
 
 def test_ports_are_consecutive_in_rig_order():
     for _ in range(5):  # another program may take a port meanwhile
-        with serve(RIG) as probe:
+        with serve_world(RIG) as probe:
             base = int(probe.addresses["gradient_sphere"].rpartition(":")[2])
-        with contextlib.suppress(ServeError), serve(RIG, tcp=f"127.0.0.1:{base}") as served:
+        with contextlib.suppress(ServeError), serve_world(RIG, tcp=f"127.0.0.1:{base}") as served:
             urls = [url.partition("://")[2].split("/")[0] for url in served.addresses.values()]
             assert [int(url.rpartition(":")[2]) for url in urls] == [base, base + 1, base + 2]
             return

@@ -13,7 +13,7 @@ from capture.rig import load_rig
 from rigsim.boxes import caliper as emulated
 from rigsim.boxes.faults import Faults
 from rigsim.world import World
-from rigsim.world.serve import serve
+from rigsim.world.serve import serve_world
 
 SLOW = load_rig("gradient").cropped(16)
 # fast jaws, so that a suite in real time does not wait for them
@@ -23,7 +23,7 @@ NAMES = (f"caliper-driver-{number}" for number in itertools.count())
 
 @pytest.fixture(autouse=True)
 def quick_ring(monkeypatch):
-    monkeypatch.setattr(emulated, "TURN_DEG_PER_S", 3600.0)
+    monkeypatch.setattr(emulated, "ROTATION_DEG_PER_S", 3600.0)
 
 
 @pytest.fixture(params=["sim", "pty", pytest.param("tcp", marks=pytest.mark.long)])
@@ -38,7 +38,7 @@ def bench(request):
         world.unregister()
         return
     world = World(RIG, seed=5, clock="real", faults=Faults(baud=0.0))
-    with serve(RIG, world=world, pty=request.param == "pty") as served:
+    with serve_world(RIG, world=world, pty=request.param == "pty") as served:
         box = CaliperBox(Port(served.addresses["caliper"]))
         yield SimpleNamespace(world=world, box=box)
         box.close()

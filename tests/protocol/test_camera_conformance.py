@@ -29,7 +29,7 @@ from capture.devices.port import LinkLost
 from capture.rig import load_rig
 from rigsim.boxes.faults import Faults
 from rigsim.world import World
-from rigsim.world.serve import serve
+from rigsim.world.serve import serve_world
 
 WANT = Exposure(0.008, 100)
 LIT, DARK = 10_512, 512
@@ -282,7 +282,7 @@ def test_unknown_view_of_world_is_reported(rig):
 
 
 def test_served_camera_has_single_client_and_known_views(rig):
-    with serve(rig) as served:
+    with serve_world(rig) as served:
         url = served.addresses["cam"]
         camera = open_camera(url)
         with pytest.raises(CameraBusy, match="another program"):
@@ -301,7 +301,7 @@ def test_nobody_listening_is_a_lost_link():
 
 
 def test_vanished_server_is_lost_link(rig):
-    with serve(rig) as served:
+    with serve_world(rig) as served:
         camera = open_camera(served.addresses["cam"])
     with pytest.raises(LinkLost):
         camera.clock_s()
@@ -321,7 +321,7 @@ def test_vanished_server_is_lost_link(rig):
     ],
 )
 def test_garbage_ends_own_connection_but_not_service(rig, garbage):
-    with serve(rig) as served:
+    with serve_world(rig) as served:
         host, _, port = served.addresses["cam"][6:].partition("/")[0].rpartition(":")
         with socket.create_connection((host, int(port)), timeout=5.0) as connection:
             connection.sendall(garbage)
@@ -344,7 +344,7 @@ def test_garbage_ends_own_connection_but_not_service(rig, garbage):
     ],
 )
 def test_invalid_request_is_answered_with_error(rig, request_):
-    with serve(rig) as served:
+    with serve_world(rig) as served:
         camera = open_camera(served.addresses["cam"])
         with pytest.raises(CameraError):
             camera._ask(request_.pop("do", "?"), **request_)

@@ -9,20 +9,20 @@ from fixtures.box_manuals import DOME
 
 from capture.devices import wire
 from capture.devices.wire import Code, Event, Request
-from capture.plan.dome import as_table, dome_plan
-from capture.plan.eye_light import eye_light
+from capture.plan.dome import dome_plan, to_box_rows
+from capture.plan.eye_light import eye_irradiance
 from capture.plan.flicker import flicker_of_rows
 from capture.plan.light_order import LIGHT_ORDERS
 from capture.plan.rows import LedRow, led_rows
 from capture.rig import load_rig
-from rigsim.boxes.led_table import LEVEL_STEPS, Row, table_crc
+from rigsim.boxes.led_table import LEVEL_STEPS, LedTableRow, table_crc
 
 WHOLE = load_rig("dome")
 RIG = DOME.rig
 
 
 def rows_of(leds, *, ms=80, level=LEVEL_STEPS, mask=7):
-    return [Row((led,), level, ms * 1000, mask) for led in leds]
+    return [LedTableRow((led,), level, ms * 1000, mask) for led in leds]
 
 
 @pytest.fixture
@@ -32,12 +32,12 @@ def bench():
 
 def front(count):
     """Numbers of the LEDs that the eyes see best."""
-    return [int(k) for k in np.argsort(-eye_light(RIG))[:count]]
+    return [int(k) for k in np.argsort(-eye_irradiance(RIG))[:count]]
 
 
 def behind(count):
     """Numbers of LEDs that the eyes do not see."""
-    return [int(k) for k in np.argsort(eye_light(RIG), kind="stable")[:count]]
+    return [int(k) for k in np.argsort(eye_irradiance(RIG), kind="stable")[:count]]
 
 
 def test_the_data_dictionary_holds_the_rigs_limits(bench):
@@ -52,7 +52,11 @@ def test_the_data_dictionary_holds_the_rigs_limits(bench):
 
 
 def test_table_checksum_covers_rows_in_canonical_spelling(bench):
-    rows = [Row((3, 17), 500, 83333, 7), Row((), 0, 50000, 0), Row((149,), 1000, 2000, 1)]
+    rows = [
+        LedTableRow((3, 17), 500, 83333, 7),
+        LedTableRow((), 0, 50000, 0),
+        LedTableRow((149,), 1000, 2000, 1),
+    ]
     bench.load(rows)
     text = "3+17:500:83333:7\n-:0:50000:0\n149:1000:2000:1"
     assert bench.ask("SEQ:CRC?") == f"3,{wire.crc16(text.encode()):04X}"
@@ -96,7 +100,7 @@ def test_leds_overlap_between_rows_but_not_during_release(bench):
 
 def test_led_in_consecutive_rows_stays_on(bench):
     a, b, c = behind(3)
-    rows = [Row(tuple(sorted(leds)), 300, 50_000, 7) for leds in ((a, b), (b, c), (b, c))]
+    rows = [LedTableRow(tuple(sorted(leds)), 300, 50_000, 7) for leds in ((a, b), (b, c), (b, c))]
     bench.run(rows)
     bench.wait(0.3)
     spans = {pulse.led: pulse.t_off_s - pulse.t_on_s for pulse in bench.world.switched}
@@ -106,7 +110,10 @@ def test_led_in_consecutive_rows_stays_on(bench):
 
 
 def test_only_cameras_in_row_and_mask_are_released(bench):
-    rows = [Row((led,), 1000, 50_000, mask) for led, mask in zip(behind(3), (7, 2, 5), strict=True)]
+    rows = [
+        LedTableRow((led,), 1000, 50_000, mask)
+        for led, mask in zip(behind(3), (7, 2, 5), strict=True)
+    ]
     bench.ask("CAM:MASK 3")
     bench.run(rows)
     bench.wait(0.3)
@@ -340,18 +347,18 @@ def test_planned_order_is_accepted_and_bad_order_refused():
     bench = DOME.bench(rig=WHOLE.resized(16))
     rig, plan = bench.world.rig, dome_plan(WHOLE)
     steps = [step for step in plan.steps if step.index.get("pass") == 0]
-    table = as_table(led_rows(steps, rig))
+    table = to_box_rows(led_rows(steps, rig))
     bench.ask("SYST:ARM")
-    bench.load([Row(tuple(sorted(leds)), level, us, 0xFFFF) for leds, level, us in table])
+    bench.load([LedTableRow(tuple(sorted(leds)), level, us, 0xFFFF) for leds, level, us in table])
     flashes, rms, duty, _, dose = (float(x) for x in bench.ask(f"SEQ:ARM {len(steps)}").split(","))
     # the box's own arithmetic, with one eye and Fourier sums, against the planner's two and FFT
-    host = flicker_of_rows(led_rows(steps, rig), eye_light(rig), overlap_s=rig.leds.overlap_s)
+    host = flicker_of_rows(led_rows(steps, rig), eye_irradiance(rig), overlap_s=rig.leds.overlap_s)
     assert rms == pytest.approx(host.rms, rel=0.05)
     assert abs(flashes - host.flashes_per_s) <= 0.5
     assert duty < rig.leds.max_duty
     assert dose < 1.0
     bad = [LedRow((k,), 1.0, 1 / 12) for k in LIGHT_ORDERS["name"](rig)]
-    bench.load([Row(r.leds, 1000, 83333, 0xFFFF) for r in bad])
+    bench.load([LedTableRow(r.leds, 1000, 83333, 0xFFFF) for r in bad])
     assert bench.code("SEQ:ARM 150") == Code.FLICKER
 
 

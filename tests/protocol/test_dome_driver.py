@@ -9,16 +9,16 @@ import pytest
 from capture.devices.dome import DomeBox, TableRow
 from capture.devices.port import BadAnswer, CommandRefused, Port, WrongDevice
 from capture.devices.wire import Code
-from capture.plan.eye_light import eye_light
+from capture.plan.eye_light import eye_irradiance
 from capture.rig import load_rig
 from rigsim.boxes.faults import Faults
 from rigsim.world import World
-from rigsim.world.serve import serve
+from rigsim.world.serve import serve_world
 
 RIG = load_rig("dome").subset(views=["C00", "C05"]).resized(16)
 NAMES = (f"dome-driver-{number}" for number in itertools.count())
-UNSEEN = [int(k) for k in np.argsort(eye_light(RIG), kind="stable")[:12]]
-SEEN = int(np.argmax(eye_light(RIG)))
+UNSEEN = [int(k) for k in np.argsort(eye_irradiance(RIG), kind="stable")[:12]]
+SEEN = int(np.argmax(eye_irradiance(RIG)))
 
 
 @pytest.fixture(params=["sim", "pty", "tcp"])
@@ -33,7 +33,7 @@ def bench(request):
         world.unregister()
         return
     world = World(RIG, seed=5, clock="real", faults=Faults(baud=0.0))
-    with serve(RIG, world=world, pty=request.param == "pty") as served:
+    with serve_world(RIG, world=world, pty=request.param == "pty") as served:
         box = DomeBox(Port(served.addresses["dome"]))
         yield SimpleNamespace(world=world, box=box)
         box.close()

@@ -9,7 +9,7 @@ from fixtures.box_manuals import FLASH
 
 from capture.devices import wire
 from capture.devices.wire import Code, Event
-from rigsim.boxes.controller import CACHED_REPLIES, ERROR_QUEUE
+from rigsim.boxes.controller import MAX_CACHED_REPLIES, MAX_QUEUED_ERRORS
 
 RIG = FLASH.rig
 
@@ -76,7 +76,7 @@ def test_the_last_eight_answers_are_remembered(bench):
     bench.ask("SYST:ARM")
     fire = bench.frame("FLAS:FIRE a1")
     first = bench.raw(fire)
-    for _ in range(CACHED_REPLIES - 1):
+    for _ in range(MAX_CACHED_REPLIES - 1):
         bench.ask("SYST:PING?")
     assert bench.raw(fire) == first
     assert bench.unit.count == 1
@@ -122,9 +122,9 @@ def test_overlong_lines_are_dropped_without_an_answer(bench):
 
 
 def test_errors_queue_up_to_sixteen_and_then_overflow(bench):
-    for _ in range(ERROR_QUEUE + 4):
+    for _ in range(MAX_QUEUED_ERRORS + 4):
         bench.code("NONSENSE")
-    codes = [int(bench.ask("SYST:ERR?").split(",")[0]) for _ in range(ERROR_QUEUE + 1)]
+    codes = [int(bench.ask("SYST:ERR?").split(",")[0]) for _ in range(MAX_QUEUED_ERRORS + 1)]
     assert codes == [Code.UNDEFINED_HEADER] * 15 + [Code.QUEUE_OVERFLOW, 0]
 
 

@@ -82,13 +82,13 @@ def test_lamps_go_out_by_themselves_and_by_command(bench):
     box = bench.box()
     box.arm()
     box.lamp_on(0.5)
-    assert box.lamp_lit()
+    assert box.is_lamp_lit()
     assert box.status().lit
     box.lamp_off()
-    assert not box.lamp_lit()
+    assert not box.is_lamp_lit()
     box.lamp_on(0.05)
     box.port.listen(0.2)
-    assert not box.lamp_lit()
+    assert not box.is_lamp_lit()
 
 
 def test_dark_disarms(bench):
@@ -98,7 +98,7 @@ def test_dark_disarms(bench):
     box.lamp_on(0.5)
     box.dark()
     assert not box.is_armed()
-    assert not box.lamp_lit()
+    assert not box.is_lamp_lit()
 
 
 def test_silence_trips_lease_until_deliberate_rearming(bench):

@@ -13,7 +13,7 @@ from capture.devices.flash import FlashBox
 from capture.devices.port import Port
 from capture.plan.multiplexed import course_plan, multiplexed_plan
 from capture.rig import load_rig
-from capture.session import Session, Subject
+from capture.session import Session, SubjectRecord
 from rigsim.boxes.faults import Faults
 from rigsim.world import World
 
@@ -34,7 +34,7 @@ def run(path, plan, *, faults=None, stop_after=None, resume=False, host_s=1e9):
             plan=plan,
             rig=RIG,
             devices={},
-            subject=Subject("nobody", ("research",)),
+            subject=SubjectRecord("nobody", ("research",)),
             source="simulated",
             seed=0,
         )

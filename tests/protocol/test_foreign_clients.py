@@ -11,7 +11,7 @@ from fixtures.box_manuals import ANY, BOXES, FLASH
 from capture.devices.flash import FlashBox
 from capture.devices.port import Port, PortBusy
 from rigsim.world import World
-from rigsim.world.serve import ServeError, serve
+from rigsim.world.serve import ServeError, serve_world
 
 UNFRAMED = '203,"Unframed command"'
 NO_ERROR = '0,"No error"'
@@ -25,7 +25,7 @@ def url_of(request):
     with contextlib.ExitStack() as stack:
 
         def url_of(manual):
-            served = stack.enter_context(serve(manual.rig, pty=request.param == "pty"))
+            served = stack.enter_context(serve_world(manual.rig, pty=request.param == "pty"))
             url_of.box = served.world.box(manual.name)
             return served.addresses[manual.name]
 
@@ -100,7 +100,7 @@ def test_serialx_asks_and_is_refused_a_bare_command(url_of, manual):
 
 @each_box
 def test_held_controller_is_busy(manual):
-    with serve(manual.rig, pty=True) as served:
+    with serve_world(manual.rig, pty=True) as served:
         url = served.addresses[manual.name]
         with contextlib.closing(Port(url)), pytest.raises(PortBusy):
             Port(url)
@@ -108,7 +108,7 @@ def test_held_controller_is_busy(manual):
 
 @pytest.fixture(params=["pty", "tcp"])
 def served(request, rig):
-    with serve(rig, pty=request.param == "pty") as served:
+    with serve_world(rig, pty=request.param == "pty") as served:
         yield served
 
 
@@ -132,7 +132,7 @@ def test_driver_works_on_serialx_instead_of_pyserial(served, monkeypatch):
 
 
 def test_served_addresses_name_controllers_first(rig):
-    with serve(rig) as served:
+    with serve_world(rig) as served:
         assert list(served.addresses) == ["flash", "cam"]
         assert served.addresses["flash"].startswith("socket://127.0.0.1:")
         assert served.addresses["cam"].startswith("tcp://127.0.0.1:")
@@ -141,27 +141,27 @@ def test_served_addresses_name_controllers_first(rig):
 @pytest.mark.parametrize("tcp", ["0.0.0.0:0", "192.0.2.1:5000", "example.org:1"])
 def test_an_address_that_others_reach_must_be_permitted(rig, tcp):
     with pytest.raises(ServeError, match="fire the lights"):
-        serve(rig, tcp=tcp)
+        serve_world(rig, tcp=tcp)
 
 
 def test_a_permitted_address_is_warned_about(rig, caplog):
-    with serve(rig, tcp="0.0.0.0:0", allow_remote=True):
+    with serve_world(rig, tcp="0.0.0.0:0", allow_remote=True):
         assert "other machines" in caplog.text
 
 
 @pytest.mark.parametrize("tcp", ["127.0.0.1", ":5", "127.0.0.1:x", "127.0.0.1:99999"])
 def test_invalid_serve_address_is_refused_with_expected_form(rig, tcp):
     with pytest.raises(ServeError, match="expected HOST:PORT"):
-        serve(rig, tcp=tcp)
+        serve_world(rig, tcp=tcp)
 
 
 def test_a_taken_port_is_named(rig):
-    with serve(rig) as served:
+    with serve_world(rig) as served:
         taken = served.addresses["flash"].removeprefix("socket://")
         with pytest.raises(ServeError, match="cannot listen"):
-            serve(rig, tcp=taken)
+            serve_world(rig, tcp=taken)
 
 
 def test_world_on_virtual_clock_is_not_served(rig):
     with pytest.raises(ServeError, match="clock"):
-        serve(rig, world=World(rig))
+        serve_world(rig, world=World(rig))

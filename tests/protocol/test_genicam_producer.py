@@ -48,11 +48,11 @@ def search_path(monkeypatch):
 def connection():
     library = genicam_producer.load_library("genicam:1")
     files = genicam_producer.producer_files("genicam:1", str(PRODUCER))
-    connection = genicam_producer.connect(library, "genicam:1", "1", files)
+    connection = genicam_producer.connect_camera(library, "genicam:1", "1", files)
     connection.library = library
     yield connection
     connection.close()
-    assert not genicam_producer._opened
+    assert not genicam_producer._opened_producers
 
 
 def test_unknown_camera_serial_error_lists_found_serials():
@@ -64,14 +64,16 @@ def test_camera_without_exposure_is_refused_and_released():
     for _ in range(2):  # one that were held would be busy
         with pytest.raises(CameraError, match="genicam:1: has no feature ExposureTime"):
             open_camera(f"genicam:1?producer={PRODUCER}&black=0")
-    assert not genicam_producer._opened
+    assert not genicam_producer._opened_producers
 
 
 def test_open_camera_is_busy_but_neighbor_is_not(connection):
     files = (PRODUCER.resolve(),)
     with pytest.raises(CameraBusy, match="close the other program"):
-        genicam_producer.connect(connection.library, "genicam:1", "1", files)
-    other = genicam_producer.connect(connection.library, "genicam:2", "VikyTL_DEV_blue", files)
+        genicam_producer.connect_camera(connection.library, "genicam:1", "1", files)
+    other = genicam_producer.connect_camera(
+        connection.library, "genicam:2", "VikyTL_DEV_blue", files
+    )
     assert other.identifier == "VikyTL_DEV_blue"
     other.close()
 
@@ -92,7 +94,7 @@ def test_library_features_are_read_set_and_refused(connection):
     # an entry that cannot be chosen now (Coord3D_ABC32f_Planar) is none
     assert features.choices("PixelFormat") == ["RGBa8", "Mono8"]
     features.set("PixelFormat", "Mono8")
-    assert (features.read("PixelFormat"), features.number_of("PixelFormat")) == (
+    assert (features.read("PixelFormat"), features.enum_number("PixelFormat")) == (
         "Mono8",
         0x01080001,
     )

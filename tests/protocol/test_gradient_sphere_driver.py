@@ -15,7 +15,7 @@ from capture.devices.wire import Code
 from capture.rig import load_rig
 from rigsim.boxes.faults import Faults
 from rigsim.world import World
-from rigsim.world.serve import serve
+from rigsim.world.serve import serve_world
 
 SLOW = load_rig("gradient").cropped(16)
 # fast jaws, so that a suite in real time does not wait for them
@@ -53,7 +53,7 @@ def bench(request):
         world.unregister()
         return
     world = World(RIG, seed=5, clock="real", scene=Witness(), faults=Faults(baud=0.0))
-    with serve(RIG, world=world, pty=request.param == "pty") as served:
+    with serve_world(RIG, world=world, pty=request.param == "pty") as served:
         box = GradientSphereBox(Port(served.addresses["gradient_sphere"]))
         yield SimpleNamespace(world=world, box=box, addresses=served.addresses)
         box.close()
@@ -237,7 +237,7 @@ def test_a_dead_led_is_named():
 def test_analyzer_that_never_arrives_is_abandoned(monkeypatch):
     with GradientSphereBox(Port("sim://gradient_sphere?seed=8")) as box:
         monkeypatch.setattr(
-            "rigsim.boxes.gradient_sphere.GradientSphereUnit.busy", lambda self, now: True
+            "rigsim.boxes.gradient_sphere.GradientSphereUnit.is_busy", lambda self, now: True
         )
         with pytest.raises(PortTimeout, match="still turns"):
             box.wait_settled(0.2)

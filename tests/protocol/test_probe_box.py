@@ -68,7 +68,7 @@ def test_dark_commands_need_neither_frame_nor_arming(bench, text):
         }[text]
     )
     assert not bench.unit.lit
-    assert bench.unit.pump.drawing == (text in ("SHUT CLOSE", "LED 0"))
+    assert bench.unit.pump.is_pumping == (text in ("SHUT CLOSE", "LED 0"))
 
 
 def test_the_data_dictionary_holds_the_rigs_limits(bench):
@@ -248,7 +248,7 @@ def test_a_retry_of_a_suction_sucks_once(bench):
     first = bench.raw(frame)
     bench.silence(1.0)
     assert bench.raw(frame) == first
-    assert (bench.unit.pump.count, bench.unit.pump.drawing) == (1, False)
+    assert (bench.unit.pump.count, bench.unit.pump.is_pumping) == (1, False)
 
 
 def test_stuck_shutter_is_reported_and_pulses_nothing():
@@ -407,7 +407,7 @@ def test_released_head_must_be_placed_again(bench, let_go):
         bench.ask(let_go)
     assert not bench.unit.lit
     assert len(bench.world.switched) == 1
-    assert not bench.unit.pump.drawing
+    assert not bench.unit.pump.is_pumping
     state = bench.world.head_at(bench.now)
     assert (state.site, state.placed) == ("", False)
     assert bench.ask("HEAD:SITE?") == "NONE"
@@ -455,7 +455,7 @@ def test_small_leak_sags_and_only_gauge_shows(leak, mbar):
     bench = PROBE_BOX.bench(pump_leak=leak)
     suck(bench)
     bench.wait(3.0)
-    assert bench.unit.pump.drawing
+    assert bench.unit.pump.is_pumping
     readings = [float(bench.ask("PRES?")) for _ in range(20)]
     # the rim's own leak is at most 2 %; the gauge's zero deviates by 0.7 mbar (4 sigma)
     assert 0.975 * mbar - 2.8 < np.mean(readings) < mbar + 2.8
@@ -478,7 +478,7 @@ def test_detached_head_is_vented_and_dark_at_once():
     bench.wait(PROBE.rest_s)
     bench.ask("PUMP ON,5000,60")
     bench.wait(3.0)
-    assert bench.unit.pump.drawing
+    assert bench.unit.pump.is_pumping
 
 
 def test_dead_gauge_bars_pump_and_ends_suction():

@@ -17,7 +17,7 @@ from rigsim.boxes import source_shutter
 from rigsim.boxes.faults import Faults
 from rigsim.boxes.probe import ProbeUnit
 from rigsim.world import World
-from rigsim.world.serve import serve
+from rigsim.world.serve import serve_world
 
 SHIPPED = load_rig("probe")
 # a short rest, so that a suite in real time does not wait for it
@@ -39,7 +39,7 @@ class Photometer:
 
 @pytest.fixture(autouse=True)
 def quick_cover(monkeypatch):
-    monkeypatch.setattr(source_shutter, "COVER_S", 0.05)
+    monkeypatch.setattr(source_shutter, "COVER_MOVE_S", 0.05)
 
 
 @pytest.fixture(params=["sim", "pty", pytest.param("tcp", marks=pytest.mark.long)])
@@ -54,7 +54,7 @@ def bench(request):
         world.unregister()
         return
     world = World(RIG, seed=5, clock="real", faults=Faults(baud=0.0), scene=Photometer())
-    with serve(RIG, world=world, pty=request.param == "pty") as served:
+    with serve_world(RIG, world=world, pty=request.param == "pty") as served:
         box = ProbeBox(Port(served.addresses["probe"]))
         yield SimpleNamespace(
             world=world, box=box, camera=lambda: open_camera(served.addresses["cam"])
@@ -103,7 +103,9 @@ def test_controller_reports_identity_and_limits(bench):
     assert (box.identity.kind, box.identity.serial) == ("probe", "PR-0001")
     assert (box.limits["fibres"], box.limits["suction_max_mbar"]) == (28, 150.0)
     assert (box.limits["shutter_max_ms"], box.limits["rest_ms"]) == (30_000.0, 300.0)
-    assert box.placement() is box.last_suction() is box.last_opening() is box.uncovered() is None
+    assert (
+        box.placement() is box.last_suction() is box.last_opening() is box.uncovered_fiber() is None
+    )
     assert (box.level(), box.openings(), box.dose_ws()) == (0.0, 0, 0.0)
     assert abs(box.pressure_mbar()) < 5.0
     assert box.camera_c() == pytest.approx(5.0, abs=0.2)
@@ -208,7 +210,7 @@ def test_single_uncovered_fiber_is_revealed_by_light(bench):
     light(box)
     for fibre in (3, 27, None):
         box.cover(fibre)
-        assert box.uncovered() == fibre
+        assert box.uncovered_fiber() == fibre
         box.open_shutter(0.05)
         box.listen(0.1)
     assert [seen.fibre for seen in bench.world.switched] == [3, 27, None]
@@ -251,7 +253,7 @@ def test_release_commands_end_light_and_suction(bench, end):
     getattr(bench.box, end)()
     assert len(bench.world.switched) == 1
     unit = bench.world.box("probe").device
-    assert (unit.lit, unit.pump.drawing) == (False, False)
+    assert (unit.lit, unit.pump.is_pumping) == (False, False)
     assert not bench.world.head_at(bench.world.now).placed
 
 
@@ -326,7 +328,7 @@ def test_a_cover_that_never_arrives_is_given_up(alone, monkeypatch):
         ("SHUT", "1", lambda box: box.open_shutter(0.1), "number,us"),
         ("SHUT:LAST?", "1,MELTED,5,6", lambda box: box.last_opening(), "number,END,us,us"),
         ("HEAD:SITE?", "cheek,x", lambda box: box.placement(), "a number"),
-        ("FIB?", "x", lambda box: box.uncovered(), "a number"),
+        ("FIB?", "x", lambda box: box.uncovered_fiber(), "a number"),
         ("CAM:TRIG", "other,5", lambda box: box.trigger_camera("d1"), "token,us"),
     ],
 )

@@ -171,4 +171,4 @@ def test_a_terminal_may_send_carriage_returns():
     [(b"@17:9f3a FLAS", True), (b"7:9f3a FLAS:FIRE a*68AB", True), (b"*IDN?", False)],
 )
 def test_damaged_frame_differs_from_bare_line(line, meant):
-    assert wire.looks_framed(line) is meant
+    assert wire.is_frame_like(line) is meant

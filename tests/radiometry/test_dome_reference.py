@@ -31,7 +31,7 @@ DISC_MM = 20.0
 @pytest.fixture(scope="module")
 def rig() -> Rig:
     dome = load_rig("dome").resized(96).subset(views=["C02", "C06"])
-    return dome_reference.point_rig(dome)
+    return dome_reference.point_light_rig(dome)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,9 @@ def worst_z(found, deviation, runs):
 
 def theirs(scene, view, light):
     return [
-        in_blocks(2.0 * dome_reference.mitsuba_image(scene, view, light, samples=SAMPLES, seed=k))
+        in_blocks(
+            2.0 * dome_reference.render_with_mitsuba(scene, view, light, samples=SAMPLES, seed=k)
+        )
         for k in range(RUNS)
     ]
 

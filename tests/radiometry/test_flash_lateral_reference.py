@@ -11,7 +11,7 @@ from twins.patterned_tissue import patterned_reflectance
 
 from rigsim.geometry.atlas import unwrap
 from rigsim.geometry.mesh import build_mesh
-from rigsim.light.subsurface_radiance import spread_pattern
+from rigsim.light.subsurface_radiance import scatter_patterned_light
 from rigsim.tissue.lateral_kernels import SIGMAS_MM
 from rigsim.tissue.skin_table import SkinTable
 
@@ -83,7 +83,7 @@ def test_stripe_reflectance_matches_full_walk_within_5_percent(wavelength_nm):
 
     sharp = image(c_m)
     even = np.ones((side, side), np.float32)
-    seen = spread_pattern(
+    seen = scatter_patterned_light(
         sharp, image(np.zeros(side)), even, unwrap(plate, side), kernels.gaussians(SIGMAS_MM)
     )
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rigsim import shading
-from rigsim.render import load
+from rigsim.render import load_mitsuba
 from rigsim.render.variant import choose_variant
 
 pytestmark = pytest.mark.render
@@ -21,7 +21,7 @@ def mitsuba() -> Any:
     choice = choose_variant("mono_polarized")
     if not choice.is_vectorized:
         pytest.skip(f"no vectorized polarized variant: {choice.why}")
-    return load(choice)
+    return load_mitsuba(choice)
 
 
 def directions_around_the_normal(count: int, rng: np.random.Generator) -> np.ndarray:

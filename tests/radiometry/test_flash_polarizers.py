@@ -30,9 +30,12 @@ def test_image_blocks_match_path_tracer_within_noise(name):
     """
     rig, view = reference.reference_rig(128)
     caster = Caster(reference.sphere_mesh(), choice=choose_variant("mono_polarized"))
-    ours = reference.closed_forms(rig, view, caster, subpixels=4)[name]
+    ours = reference.render_closed_forms(rig, view, caster, subpixels=4)[name]
     seeds = np.stack(
-        [reference.mitsuba_image(rig, view, name, samples=16, seed=seed + 1) for seed in range(12)]
+        [
+            reference.render_polarized_with_mitsuba(rig, view, name, samples=16, seed=seed + 1)
+            for seed in range(12)
+        ]
     )
 
     def blocks(images: np.ndarray) -> np.ndarray:
@@ -53,7 +56,7 @@ def test_image_blocks_match_path_tracer_within_noise(name):
 
 @pytest.mark.long
 def test_image_pair_beats_path_tracer_speed_and_noise():
-    result = reference.polarizer_reference(width_px=256, samples=64)
+    result = reference.compare_polarizer_models(width_px=256, samples=64)
     assert result.speed_up >= 8.0
     assert result.noise_ratio >= 20.0
     for name in reference.ANALYZER_AXIS_DEG:

@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 
 from rigsim import shading
-from rigsim.light.relief_shadow import hidden_share
-from rigsim.scenes.gradient.reference import NEUTRAL, picture, plain_scene, plain_skin, rendered
+from rigsim.light.relief_shadow import hidden_sky_fraction
+from rigsim.scenes.gradient.reference import (
+    NEUTRAL_GRIP,
+    plain_scene,
+    plain_skin,
+    render_pattern,
+    scene_pixels,
+)
 from rigsim.tissue.skin_layers import ETA
 
 pytestmark = pytest.mark.render
@@ -26,7 +32,7 @@ def skin():
 def ours(skin):
     every = np.arange(WIDTH**2)
     light = [
-        picture(plain_scene(skin, width_px=WIDTH, interreflections=on), every)[:, 0]
+        scene_pixels(plain_scene(skin, width_px=WIDTH, interreflections=on), every)[:, 0]
         for on in (True, False)
     ]
     return (light[0] - light[1]).reshape(WIDTH, WIDTH)
@@ -38,8 +44,8 @@ def traced(skin):
     scene = plain_scene(skin, width_px=WIDTH)
     return np.array(
         [
-            rendered(scene, "full", samples=96, seed=seed, depth=8, gloss=False)[0]
-            - rendered(scene, "full", samples=96, seed=seed, depth=2, gloss=False)[0]
+            render_pattern(scene, "full", samples=96, seed=seed, depth=8, specular=False)[0]
+            - render_pattern(scene, "full", samples=96, seed=seed, depth=2, specular=False)[0]
             for seed in range(SEEDS)
         ]
     )
@@ -66,9 +72,9 @@ def test_groove_wall_interreflection_distribution_matches_path_tracing(ours, tra
 def test_angle_independent_walls_receive_far_too_much_light(skin):
     """What goes along the surface passes the boundary badly: an average over all angles, which the
     test above refuses, is 1.5 times as much or more."""
-    patch = plain_scene(skin, width_px=WIDTH).surface(NEUTRAL, subpixels=1, border_px=40)
+    patch = plain_scene(skin, width_px=WIDTH).surface(NEUTRAL_GRIP, subpixels=1, border_px=40)
     shares = [
-        hidden_share(
+        hidden_sky_fraction(
             np.ascontiguousarray(1e3 * patch.height_mm),
             patch.normals,
             margin=0,

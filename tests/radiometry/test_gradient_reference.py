@@ -5,12 +5,12 @@ import pytest
 
 from rigsim.as_built.sphere import PATTERN_WEIGHTS
 from rigsim.scenes.gradient.reference import (
-    judge,
-    picture,
+    compare_with_reference,
     plain_scene,
     plain_skin,
-    rendered,
-    traced,
+    render_pattern,
+    scene_pixels,
+    trace_pixels,
 )
 
 pytestmark = pytest.mark.render
@@ -30,20 +30,22 @@ def pixels():
 
 @pytest.fixture(scope="module")
 def reference(skin, pixels):
-    return traced(plain_scene(skin, width_px=WIDTH), pixels, subpixels=3)[0]
+    return trace_pixels(plain_scene(skin, width_px=WIDTH), pixels, subpixels=3)[0]
 
 
 def test_horizon_moments_match_shadow_rays(skin, pixels, reference):
     """All four moments; horizons in 32 directions, table and samples err by less than 1 %."""
     scene = plain_scene(skin, width_px=WIDTH)
     for moment in range(4):
-        error = picture(scene, pixels)[:, moment] - reference[:, moment]
+        error = scene_pixels(scene, pixels)[:, moment] - reference[:, moment]
         assert np.sqrt(np.mean(error**2)) < 0.01 * reference[:, 0].mean()
 
 
 def test_leaving_shadows_out_is_worse(skin, pixels, reference):
     with_shadows, without = (
-        judge(picture(plain_scene(skin, width_px=WIDTH, shadows=on), pixels), reference, 0.0)
+        compare_with_reference(
+            scene_pixels(plain_scene(skin, width_px=WIDTH, shadows=on), pixels), reference, 0.0
+        )
         for on in (True, False)
     )
     assert without.error > 3.0 * with_shadows.error
@@ -55,8 +57,8 @@ def test_mitsuba_s_mean_is_ours(skin, pixels, pattern):
     """z-test of the mean over blocks of pixels: false alarm 1e-4 a pattern (|z| < 3.9)."""
     scene = plain_scene(skin, width_px=WIDTH)
     every = np.arange(WIDTH**2)
-    ours = picture(scene, every) @ np.array(PATTERN_WEIGHTS[pattern])
-    image, _ = rendered(scene, pattern, samples=64)
-    way = judge(image.reshape(-1).astype(float), ours, 0.0)
+    ours = scene_pixels(scene, every) @ np.array(PATTERN_WEIGHTS[pattern])
+    image, _ = render_pattern(scene, pattern, samples=64)
+    way = compare_with_reference(image.reshape(-1).astype(float), ours, 0.0)
     assert abs(way.mean_ratio - 1.0) < 3.9 * way.mean_ratio_stderr
     assert way.mean_ratio_stderr < 0.01

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.render
 
 @pytest.fixture(scope="module")
 def mi():
-    return render.load(choose_variant("rgb"))
+    return render.load_mitsuba(choose_variant("rgb"))
 
 
 def half_sphere(rng, count, *, lowest=0.1):
@@ -56,7 +56,9 @@ def test_mitsuba_evaluates_written_material_to_same_values(name, mi, rng, tmp_pa
     largest value; 0.06 RMS against the BRDF itself, for interpolation between elevations.
     """
     brdf = dict(brdf_recipe.materials())[name]
-    table = rgl.of_brdf(lambda to, at: brdf(to, at)[:, None] * [1.0, 0.5, 0.25], description=name)
+    table = rgl.tabulate_brdf(
+        lambda to, at: brdf(to, at)[:, None] * [1.0, 0.5, 0.25], description=name
+    )
     rgl.write(tmp_path / "a.bsdf", table)
     material = mi.load_dict({"type": "measured", "filename": str(tmp_path / "a.bsdf")})
     light, view = half_sphere(rng, 300), half_sphere(rng, 300)
@@ -94,7 +96,9 @@ def test_mitsuba_samples_of_white_matte_material_conserve_light(mi, rng, tmp_pat
     Expected: 0.8 within 5 standard errors (false alarms: 1 in 1.7 million), which are under 0.01,
     and 0.004 for the interpolation of the cosine at the horizon.
     """
-    white = rgl.of_brdf(lambda light, view: np.full(len(light), 0.8 / np.pi), description="white")
+    white = rgl.tabulate_brdf(
+        lambda light, view: np.full(len(light), 0.8 / np.pi), description="white"
+    )
     rgl.write(tmp_path / "a.bsdf", white)
     material = mi.load_dict({"type": "measured", "filename": str(tmp_path / "a.bsdf")})
     count = 20_000 if not mi.variant().startswith("scalar") else 4000

@@ -13,7 +13,7 @@ import pytest
 from scipy import stats
 from scipy.special import roots_legendre
 
-from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
+from rigsim.tissue.tissue_mc import Layer, LayerStack, trace_photons
 
 BATCHES = 40
 
@@ -30,7 +30,7 @@ MCML_SAMPLE = LayerStack(
 
 def traced(stack, photons, *, seed=1, **more):
     rng = np.random.default_rng(seed)
-    return transport(stack, photons=photons, rng=rng, batches=BATCHES, threads=2, **more)
+    return trace_photons(stack, photons=photons, rng=rng, batches=BATCHES, threads=2, **more)
 
 
 def agrees(value, stderr, published):

@@ -14,9 +14,9 @@ import pytest
 from scipy import stats
 from scipy.special import roots_legendre
 
-from rigsim.fiber.profile import fibre_profile
+from rigsim.fiber.profile import trace_fiber_profile
 from rigsim.tissue import photon_lanes
-from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportError, transport
+from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportError, trace_photons
 
 BATCHES = 40
 NEEDS_LANES = pytest.mark.skipif(
@@ -37,7 +37,7 @@ MCML_SAMPLE = LayerStack(
 
 def traced(stack, photons, engine, *, seed=1, **more):
     rng = np.random.default_rng(seed)
-    return transport(
+    return trace_photons(
         stack, photons=photons, rng=rng, batches=BATCHES, threads=2, engine=engine, **more
     )
 
@@ -132,7 +132,7 @@ def test_all_angle_fibers_match_mcml_sample_rings(test_data):
     area = 2.0 * pi * radii * 0.1
 
     def p_value(stack):
-        run = fibre_profile(
+        run = trace_fiber_profile(
             stack,
             radii_mm=radii,
             core_mm=0.1,
@@ -155,7 +155,7 @@ def test_all_angle_fibers_match_mcml_sample_rings(test_data):
 def all_light_in_a_cone(stack, photons, seed=1):
     """pi times the radiance along the normal, of all the surface: a fibre that covers it."""
     core = 400.0 / stack.layers[0].sigma_s_per_mm
-    run = fibre_profile(
+    run = trace_fiber_profile(
         stack,
         radii_mm=(0.0,),
         core_mm=core,

@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from reconstruction import subsurface
 from reconstruction.anisotropy import estimation as anisotropy
 from reconstruction.anisotropy import profile_anisotropy
-from reconstruction.anisotropy.estimation import one_direction_bias
+from reconstruction.anisotropy.estimation import estimate_single_direction_bias
 
 DIRECTIONS, RADIUS_MM, PITCH_MM = 16, 0.3 + 0.25 * np.arange(28), 0.25
 ANGLE = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
@@ -115,7 +115,7 @@ def test_directed_scattering_is_detected_by_fits_and_profiles(rng):
     far = np.log(decay(0.6, 1) / decay(0.6, 0)) * np.sinc(1 / 8)
     assert np.log(compared.ratio) == pytest.approx(far, rel=0.25)
     # a fit along one direction is off from the mean by more than its own standard error
-    bias = one_direction_bias(compared, [0.0, np.pi / 2])
+    bias = estimate_single_direction_bias(compared, [0.0, np.pi / 2])
     assert (np.abs(bias.bias) > 5 * bias.stderr).all()
     assert bias.bias[0] < -0.05
     assert bias.bias[1] > 0.05

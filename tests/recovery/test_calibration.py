@@ -17,14 +17,14 @@ from capture.calibration import polarization
 from capture.calibration.color import colorimetry
 from capture.calibration.color import matrix as color
 from capture.calibration.color.chart import find_chart, measure_patches
-from capture.calibration.sensor import photon_transfer
+from capture.calibration.sensor import calibrate_sensor
 from capture.calibration.sensor.transfer_curve import FlatPair
 from capture.plan import FLAT_POWERS, MALUS_ANGLES_DEG
 from capture.rig import load_rig
 from model import spectra
 from reconstruction.polarization import PolarizerAxes, separate
 from rigsim import shading
-from rigsim.sensor import Sensor, expose, sensor_of
+from rigsim.sensor import Sensor, expose_sensor, make_sensor
 from rigsim.targets import flat as targets
 from rigsim.tissue.skin_table import SkinTable
 
@@ -40,7 +40,7 @@ def white_rgb():
 
 def a_sensor(seed=0, width_px=192):
     view = load_rig("flash").resized(width_px).view("cam")
-    return sensor_of(replace(view, serial=f"T-{seed:04d}")), (view.height_px, view.width_px)
+    return make_sensor(replace(view, serial=f"T-{seed:04d}")), (view.height_px, view.width_px)
 
 
 def as_frame(cfa, sensor: Sensor):
@@ -62,11 +62,12 @@ def sensor_calibration(seed):
         pop = power * (1 + 0.005 * rng.normal(size=2))
         pairs.append(
             FlatPair(
-                *(expose(p * field, sensor=sensor, rng=rng, exposure_s=0.008) for p in pop), power
+                *(expose_sensor(p * field, sensor=sensor, rng=rng, exposure_s=0.008) for p in pop),
+                power,
             )
         )
-    darks = [expose(0 * field, sensor=sensor, rng=rng, exposure_s=0.008) for _ in range(4)]
-    return sensor, photon_transfer(pairs, darks, white_dn=sensor.white, block=8)
+    darks = [expose_sensor(0 * field, sensor=sensor, rng=rng, exposure_s=0.008) for _ in range(4)]
+    return sensor, calibrate_sensor(pairs, darks, white_dn=sensor.white, block=8)
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +113,7 @@ def chart_image(rng, sensor, shape, *, light=0.8):
     y = (np.arange(height) - (height - 1) / 2) * pixel_mm
     column = np.rint((x / 440.0 + 0.5) * n - 0.5).astype(int)
     row = np.rint((y / 440.0 + 0.5) * n - 0.5).astype(int)
-    return expose(light * texels[np.ix_(row, column)], sensor=sensor, rng=rng)
+    return expose_sensor(light * texels[np.ix_(row, column)], sensor=sensor, rng=rng)
 
 
 def chart_xyz():
@@ -275,7 +276,7 @@ def metal_frames(rng, *, zero_deg, light_extinction, analyser_extinction, jitter
     top = float(stokes[..., 0].max())
     frames, angles = [], []
     for degrees in np.repeat(MALUS_ANGLES_DEG, 2):
-        seen = shading.analyse(
+        seen = shading.apply_analyzer(
             stokes,
             n,
             passes_deg=90.0 + degrees - zero_deg,
@@ -284,7 +285,9 @@ def metal_frames(rng, *, zero_deg, light_extinction, analyser_extinction, jitter
             extinction=analyser_extinction,
         )
         light = 0.85 / top * (1 + jitter * rng.normal()) * seen.reshape(*shape, 1) * white_rgb()
-        frames.append(raw.linear_rgb(as_frame(expose(light, sensor=sensor, rng=rng), sensor)))
+        frames.append(
+            raw.linear_rgb(as_frame(expose_sensor(light, sensor=sensor, rng=rng), sensor))
+        )
         angles.append(np.deg2rad(degrees))
     return np.array(angles), frames
 
@@ -293,7 +296,7 @@ def malus_fit(seed, **films):
     angles, frames = metal_frames(np.random.default_rng([31, seed]), **films)
     images = [frame.rgb for frame in frames]
     valid = np.logical_and.reduce([frame.valid for frame in frames])
-    chosen = polarization.modulated_pixels(angles, images, valid=valid)
+    chosen = polarization.find_modulated_pixels(angles, images, valid=valid)
     mean = np.array([image[chosen].mean(axis=0) for image in images])
     count = int(chosen.sum())
     variance = np.array([f.variance[chosen].sum(axis=0) for f in frames]) / count**2
@@ -311,7 +314,7 @@ def test_analyzer_zero_and_extinction_are_within_errors():
     n, stokes = mirrored_light(1, 800.0)
     least, most = (
         float(
-            shading.analyse(
+            shading.apply_analyzer(
                 stokes, n, passes_deg=a, image_right=RIGHT, image_up=UP, extinction=1200.0
             )[0]
         )
@@ -359,7 +362,7 @@ def ball(size=96, *, extinction, alpha=0.3, eta=1.4):
 
 def seen_by(stokes, degrees, extinction):
     to_camera = np.broadcast_to(Z, stokes.shape)
-    return shading.analyse(
+    return shading.apply_analyzer(
         stokes, to_camera, passes_deg=degrees, image_right=RIGHT, image_up=UP, extinction=extinction
     )[:, None].astype(np.float64)
 
@@ -421,7 +424,7 @@ def test_targets_captured_by_full_rig_calibrate_to_truth(kind, tmp_path):
     serial = rig.views[0].serial
     get = made.calibration.quantity
     if kind == "sensor":
-        truth = sensor_of(rig.views[0])
+        truth = make_sensor(rig.views[0])
         for name in ("gain_e_per_dn", "read_noise_e", "prnu"):
             found = get(serial, name)
             assert (np.abs(found.value - getattr(truth, name)) < 5 * found.stderr).all(), name

@@ -20,9 +20,9 @@ from capture.calibration.lights.white_plate import PlateWindow, WhitePlate
 from capture.calibration.sensor.mosaic import channel_levels, neutral_mosaic
 from capture.raw import RawFrame, linear_rgb
 from capture.rig import load_rig
-from rigsim.as_built.dome import Tolerances, build, image_of
-from rigsim.scenes.dome.targets import target_scene
-from rigsim.sensor import sensor_of, vignetting_map
+from rigsim.as_built.dome import DomeTolerances, build_dome, project_points
+from rigsim.scenes.dome.targets import make_target_scene
+from rigsim.sensor import make_sensor, vignetting_map
 
 pytestmark = pytest.mark.long
 
@@ -49,7 +49,7 @@ def shot(scene, view_name, lights, *, exposure_s, level=1.0, seed=0):
         pattern=view.cfa,
         black=(float(view.black_level),) * 4,
         white=view.white_level,
-        noise_profile=sensor_of(view).noise_profile(exposure_s),
+        noise_profile=make_sensor(view).noise_profile(exposure_s),
     )
 
 
@@ -83,15 +83,15 @@ PROBES_MM = np.random.default_rng(8).uniform(-70, 70, (300, 3))
 
 def reprojection_px(camera, dome, name):
     """How far from the truth a camera puts points where the face will be, mean, px."""
-    truth = image_of(dome.rig.view(name), dome.distortion[name], PROBES_MM)
+    truth = project_points(dome.rig.view(name), dome.distortion[name], PROBES_MM)
     return float(np.linalg.norm(camera.project(PROBES_MM) - truth, axis=-1).mean())
 
 
 @pytest.fixture(scope="module")
 def geometry_of_dome():
     rig = small(["C03", "C05", "C07", "C10", "C11", "C14"])
-    dome = build(rig, seed=11, tolerances=Tolerances(distortion=0.3))
-    scene = target_scene("charuco", rig, seed=11, dome=dome)
+    dome = build_dome(rig, seed=11, tolerances=DomeTolerances(distortion=0.3))
+    scene = make_target_scene("charuco", rig, seed=11, dome=dome)
     sightings = boards_seen(scene, range(12))
     return rig, dome, sightings, bundle.adjust(sightings, BOARD, geometry.nominal_cameras(rig))
 
@@ -133,20 +133,20 @@ def test_a_moved_camera_is_named_from_new_images(geometry_of_dome):
     views = tuple(moved if v.name == "C07" else v for v in dome.rig.views)
     after = dataclasses.replace(dome, rig=dataclasses.replace(dome.rig, views=views))
     poses = (0, 1, 2, 4, 5)
-    seen = boards_seen(target_scene("charuco", rig, seed=12, dome=after), poses)
-    assert [m.name for m in bundle.find_moved(seen, BOARD, found.cameras)] == ["C07"]
-    same = boards_seen(target_scene("charuco", rig, seed=13, dome=dome), poses)
-    assert bundle.find_moved(same, BOARD, found.cameras) == ()
+    seen = boards_seen(make_target_scene("charuco", rig, seed=12, dome=after), poses)
+    assert [m.name for m in bundle.find_moved_cameras(seen, BOARD, found.cameras)] == ["C07"]
+    same = boards_seen(make_target_scene("charuco", rig, seed=13, dome=dome), poses)
+    assert bundle.find_moved_cameras(same, BOARD, found.cameras) == ()
 
 
 def mirrors_seen(dome, rig, spheres, *, groups, radius_mm=50.0):
     """Outlines, places and highlights of balls, with the true cameras."""
-    scene = target_scene("mirror", rig, seed=5, dome=dome)
+    scene = make_target_scene("mirror", rig, seed=5, dome=dome)
     cameras = {view.name: true_camera(dome, view.name) for view in rig.views}
     every = range(len(rig.lights))
     places, seen = {}, []
     for number in range(spheres):
-        scene.show(number)
+        scene.set_pose(number)
         outlines, colors = {}, {}
         for k, name in enumerate(cameras):
             frame = shot(scene, name, every, exposure_s=0.06, seed=100 * number + k)
@@ -175,14 +175,14 @@ def nominal_places(rig):
 @pytest.fixture(scope="module")
 def mirrors():
     rig = small(["C01", "C05", "C07", "C10", "C14"], lights=15, width_px=650)
-    dome = build(rig, seed=3)
+    dome = build_dome(rig, seed=3)
     return rig, dome, mirrors_seen(dome, rig, 3, groups=3)
 
 
 def test_balls_are_found_by_their_perspective_outlines(mirrors):
     _, _, (scene, _, places, _) = mirrors
     for number, place in places.items():
-        gap = place.center_mm - scene.ball_mm(number)
+        gap = place.center_mm - scene.ball_center_mm(number)
         assert np.linalg.norm(gap) < 0.02
         assert len(place.cameras) >= 3
         assert place.fitted_radius_mm == pytest.approx(50.0, abs=0.03)
@@ -219,13 +219,15 @@ def test_radius_error_of_percent_is_refused_misplaces_lights(mirrors):
         image = neutral_mosaic(frame, channel_levels(frame))
         edges[name] = mirror_sphere.find_outline(image, camera, 50.5)
     edges = {name: e for name, e in edges.items() if e is not None}
-    with pytest.raises(mirror_sphere.SphereError, match=r"radius_mm: got 50.5, but .* say 50\.0"):
+    with pytest.raises(
+        mirror_sphere.MirrorSphereError, match=r"radius_mm: got 50.5, but .* say 50\.0"
+    ):
         mirror_sphere.locate_sphere(edges, cameras, 50.5)
 
 
 def test_swapped_and_dead_lights_are_identified_by_balls():
     rig = small(["C05", "C07", "C14"], lights=12)
-    straight = build(rig, seed=6)
+    straight = build_dome(rig, seed=6)
     wiring = list(range(len(rig.lights)))
     front = [k for k in wiring if rig.lights[k].position_mm[2] > 100]
     a, b, dead = front[0], front[1], front[2]
@@ -236,26 +238,26 @@ def test_swapped_and_dead_lights_are_identified_by_balls():
     scene, cameras, places, seen = mirrors_seen(dome, rig, 2, groups=len(rig.lights))
     found = mirror_lights.locate_lights(seen, cameras, places, nominal_places(rig))
     names = [light.name for light in rig.lights]
-    assert found.answers == {names[a]: names[b], names[b]: names[a]}
-    assert found.unseen == (names[dead],)
+    assert found.swapped == {names[a]: names[b], names[b]: names[a]}
+    assert found.unobserved == (names[dead],)
     assert not found.valid[dead]
     truth = scene.truth()["position_mm"]
     assert np.linalg.norm(found.position_mm[a] - truth[b]) < 20.0
 
 
 def plates_seen(dome, rig, poses, *, exposure_s=0.03):
-    scene = target_scene("white", rig, seed=9, dome=dome)
+    scene = make_target_scene("white", rig, seed=9, dome=dome)
     cameras = {view.name: true_camera(dome, view.name) for view in rig.views}
     samples = []
     for pose in poses:
-        scene.show(pose)
+        scene.set_pose(pose)
         markers = {}
         for name in cameras:
             frame = shot(scene, name, range(0, len(rig.lights), 2), exposure_s=0.02, seed=pose)
             sighting = PLATE.find(linear_rgb(frame, demosaic="bilinear").rgb)
             if sighting is not None:
                 markers[name, pose] = sighting
-        place = bundle.place_board(markers, PLATE, cameras, pose)
+        place = bundle.estimate_board_pose(markers, PLATE, cameras, pose)
         for name in cameras:
             window = PlateWindow.of(cameras[name], place, PLATE)
             for k, light in enumerate(rig.lights) if window is not None else ():
@@ -283,7 +285,7 @@ def at_true_places(rig, scene):
 @pytest.fixture(scope="module")
 def plates():
     rig = small(["C03", "C07", "C11", "C14"], lights=15)
-    dome = build(rig, seed=7)
+    dome = build_dome(rig, seed=7)
     return rig, dome, plates_seen(dome, rig, (0, 1, 2))
 
 
@@ -336,14 +338,14 @@ def test_dead_and_swapped_lights_are_identified_by_shading(plates):
     dome = dataclasses.replace(straight, wiring=tuple(wiring), dead=frozenset([names[dead]]))
     _, cameras, samples = plates_seen(dome, rig.subset(views=["C07", "C14"]), (0, 1))
     fit = light_fit.fit_lights(samples, LightTable.nominal(rig), cameras)
-    assert fit.answers == {names[a]: names[b], names[b]: names[a]}
+    assert fit.swapped == {names[a]: names[b], names[b]: names[a]}
     assert fit.dead == (names[dead],)
     assert not fit.table.valid[[a, b, dead]].any()
 
 
 def test_lights_as_drawn_are_not_blamed(plates):
     rig, _, (_, _, samples) = plates
-    assert light_fit.check_order(samples, LightTable.nominal(rig)) == ({}, ())
+    assert light_fit.find_swapped_lights(samples, LightTable.nominal(rig)) == ({}, ())
 
 
 def test_lights_survive_their_calibration(plates, tmp_path):
@@ -357,7 +359,7 @@ def test_lights_survive_their_calibration(plates, tmp_path):
     assert again.names == table.names
     serial = rig.views[0].serial
     np.testing.assert_array_equal(again.cameras[serial].gain, table.cameras[serial].gain)
-    assert store.drift(made, made)[0].change == 0.0
+    assert store.measure_drift(made, made)[0].change == 0.0
 
 
 def test_frames_without_light_cannot_calibrate(plates):

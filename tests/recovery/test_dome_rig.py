@@ -38,7 +38,7 @@ class Judged:
 
     maps: SkinAppearance
     truth: SkinAppearance
-    errors: dict[str, surface_evaluation.SurfaceError]
+    errors: dict[str, surface_evaluation.SurfaceAccuracy]
 
     @staticmethod
     def of(folder, truth):
@@ -88,9 +88,9 @@ def judged(dome):
 def scan_error_deg(dome, judged):
     """Return the median error of the scan's own normals at the texels of the estimate."""
     record = judged.maps.parameters["registration"]
-    scan = scan_mesh.prepare(
+    scan = scan_mesh.prepare_scan(
         Session.open(dome / "session-face").attachment("scan.ply"), points=record["points"]
-    ).moved(np.array(record["rotation"]), np.array(record["translation_mm"]))
+    ).transform(np.array(record["rotation"]), np.array(record["translation_mm"]))
     count = len(scan.points_mm)
     size = judged.maps.maps["normals"].values.shape[0]
     drawn = SurfaceTexture.of(scan, size=size).normals(
@@ -171,9 +171,9 @@ def test_tracked_head_errs_less_than_ignored_motion(dome, monkeypatch):
     from rigsim.subject import head_motion
 
     # far enough to show at this size of a pixel
-    far = head_motion.head_motion(0, drift_mm=3.0, drift_deg=1.0)
+    far = head_motion.draw_head_motion(0, drift_mm=3.0, drift_deg=1.0)
     with monkeypatch.context() as patch:
-        patch.setattr("skinrig.simulating.dome.head_motion", lambda _: far)
+        patch.setattr("skinrig.simulating.dome.draw_head_motion", lambda _: far)
         # light between parts of the face would be worked out for each frame
         alone = {"leave_out": ("subsurface", "interreflections")}
         # every other light of the same dome: each frame of a head that moves is seen anew
@@ -206,7 +206,7 @@ def faulty(dome):
     ahead = sorted(range(len(names)), key=lambda k: -rig.lights[k].position_mm[2])
     dead, a, b = ahead[2], ahead[4], ahead[9]
     camera = max(rig.views, key=lambda view: view.position_mm[2]).name
-    sound = dome_build.build
+    sound = dome_build.build_dome
 
     def build(drawn, *, seed, tolerances=None):
         built = sound(drawn, seed=seed, tolerances=tolerances)
@@ -234,7 +234,7 @@ def faulty(dome):
     calibration = out / "calibration"
     shutil.copytree(dome / "calibration", calibration)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("skinrig.simulating.dome.build", build)
+        patch.setattr("skinrig.simulating.dome.build_dome", build)
         for target in ("charuco", "mirror", "white"):
             simulate_session("dome", out / f"session-{target}", target=target, **SMALL)
         simulate_session("dome", out / "session-face", **FACE)

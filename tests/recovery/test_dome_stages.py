@@ -19,7 +19,7 @@ from capture.calibration.geometry import CameraPose
 from capture.calibration.lights import LightTable
 from capture.plan import Plan, Step
 from capture.rig import load_rig
-from capture.session import Session, Subject
+from capture.session import Session, SubjectRecord
 from model import store
 from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.graph import StageError
@@ -184,7 +184,7 @@ def capture(folder, shoot):
         plan=Plan("dome", steps),
         rig=rig,
         devices={},
-        subject=Subject("ellipsoid", ("research",)),
+        subject=SubjectRecord("ellipsoid", ("research",)),
         source="simulated",
         seed=0,
         now=lambda: datetime(2026, 11, 21, tzinfo=UTC),

@@ -15,9 +15,9 @@ from reconstruction.correspondence import expression_alignment
 from reconstruction.facial_color import shared_melanin
 from rigsim.subject import make_subject
 from skinrig.benchmarks.flash_rig.alignment import (
-    displaced,
-    moved_face,
-    oval,
+    displace_face,
+    displace_map,
+    face_mask,
     smooth_displacement,
     table,
 )
@@ -34,7 +34,7 @@ def face():
 def smiling(face):
     rng = np.random.default_rng(7)
     away = smooth_displacement(SIDE, bend_px=28.0, rms_px=5.0, rng=rng)
-    return moved_face(face, away, state="smile", noise=0.004, rng=rng)
+    return displace_face(face, away, state="smile", noise=0.004, rng=rng)
 
 
 def laid_over(seen, **options):
@@ -83,7 +83,7 @@ def test_stated_position_error_covers_the_true_error(smiling, aligned):
 @pytest.mark.parametrize("state", ["exercise", "fear"])
 def test_varying_blood_is_not_read_as_motion(face, state):
     rng = np.random.default_rng(3)
-    seen = moved_face(face, np.zeros((SIDE, SIDE, 2)), state=state, noise=0.004, rng=rng)
+    seen = displace_face(face, np.zeros((SIDE, SIDE, 2)), state=state, noise=0.004, rng=rng)
     change = np.abs(seen.hemoglobin_at_rest - seen.hemoglobin)[seen.valid]
     assert np.median(change) > 0.002
     found = laid_over(seen)
@@ -113,7 +113,7 @@ def test_state_blood_is_mapped_onto_neutral_face(smiling, aligned):
 
 @pytest.mark.long
 def test_joint_inversion_of_aligned_states_improves_changes(smiling, aligned):
-    colors, prior = table(), shading_prior.of_faces()
+    colors, prior = table(), shading_prior.face_prior()
     rgb, seen = aligned.warp(smiling.moving, smiling.valid_moving)
     variance, _ = aligned.warp(smiling.variance_moving, smiling.valid_moving)
     both = np.stack([smiling.neutral, rgb])
@@ -156,11 +156,11 @@ def test_blends_tolerate_misaligned_maps_but_interpolated_maps_fail(face, state)
     """
     neutral = face.hemoglobin().astype(np.float64)
     truth = face.hemoglobin(state).astype(np.float64)
-    mask = oval(SIDE)
+    mask = face_mask(SIDE)
     size = np.sqrt(np.mean((truth - neutral)[mask] ** 2))
     blended, interpolated = {}, {}
     for off_px in (0.0, 1.0, 2.0, 4.0):
-        seen = displaced(truth, off_px, rng=np.random.default_rng(5))
+        seen = displace_map(truth, off_px, rng=np.random.default_rng(5))
         rig = HemoglobinRig.from_maps(neutral, {state: seen}, radius_px=12.0, valid=mask)
         blend = rig.blend({state: 1.0, "neutral": 0.0})
         blended[off_px] = np.sqrt(np.nanmean((blend - truth)[mask] ** 2)) / size

@@ -13,7 +13,7 @@ from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.flash.facial_color import UnknownBloodError
 from skinrig.applying.expression import hemoglobin_rig
 from skinrig.benchmarks.intervals import flash as interval_trials_flash
-from skinrig.benchmarks.intervals.trials import Subject
+from skinrig.benchmarks.intervals.trials import TrialSubject
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating.facial_color import PREDICTION_METHODS, compare, true_blood
 from skinrig.fitting.facial_color import fit_facial_color
@@ -96,7 +96,7 @@ def test_melanin_common_to_states_has_less_noise(fitted, folder, tmp_path):
     alone = chromophore_posterior.estimate(
         np.where(seen.valid[..., None], seen.values, np.nan),
         color_table.build(built["camera"], built["illuminant"], anisotropy=ANISOTROPY_SKIN),
-        prior=shading_prior.of_faces(),
+        prior=shading_prior.face_prior(),
         variance=np.square(seen.stderr),
     )
     both = alone.valid & fitted.shared.valid
@@ -127,7 +127,7 @@ def test_skin_without_blood_color_is_refused_with_alternatives(folder, tmp_path)
         )
     assert not (tmp_path / "moving").exists()
     (tmp_path / "calibration").symlink_to(folder / "calibration")
-    trials = interval_trials_flash._of_rig(done, tmp_path, "smile", Subject("a", "b"))
+    trials = interval_trials_flash._of_rig(done, tmp_path, "smile", TrialSubject("a", "b"))
     assert not list(trials)
 
 

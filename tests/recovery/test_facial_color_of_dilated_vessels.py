@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from model.facial_color import HemoglobinRig, blood_errors
+from model.facial_color import HemoglobinRig, prediction_errors
 from rigsim import subject
 
 STATES = ("smile", "anger", "exercise")
@@ -24,7 +24,9 @@ def errors(face, radius_px, moved_px=0):
         {name: np.roll(h, moved_px, axis=1) for name, h in truth.items()},
         radius_px=radius_px,
     )
-    return [blood_errors.compare(rig.blend({n: 1.0}), truth[n], neutral) for n in STATES]
+    return [
+        prediction_errors.compare_prediction(rig.blend({n: 1.0}), truth[n], neutral) for n in STATES
+    ]
 
 
 def test_scale_and_bias_beat_gain_and_neutral_map(face):
@@ -53,8 +55,10 @@ def test_mean_ratios_transfer_between_persons_absolute_means_fail(face):
     )
     found = {}
     for transfer in ("ratio", "absolute"):
-        blend = rig.applied_to(other.hemoglobin(), transfer=transfer).blend({"smile": 1.0})
-        found[transfer] = blood_errors.compare(blend, other.hemoglobin("smile"), other.hemoglobin())
+        blend = rig.transfer_to(other.hemoglobin(), transfer=transfer).blend({"smile": 1.0})
+        found[transfer] = prediction_errors.compare_prediction(
+            blend, other.hemoglobin("smile"), other.hemoglobin()
+        )
     # observation 3: the direction is shared between people, the pattern is their own
     assert found["ratio"].predicted < 0.6 * found["ratio"].neutral_kept
     assert found["absolute"].predicted > found["ratio"].predicted

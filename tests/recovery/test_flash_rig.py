@@ -103,7 +103,7 @@ def test_white_balance_error_of_5_percent_breaks_bounds(tmp_path, calibration, c
 def test_subject_is_reconstructed_only_as_far_as_requested(tmp_path, narrow):
     first = pipeline.reconstruct(narrow.session, want=["melanin"], out=tmp_path / "maps")
     assert first.ran == ("frames", "separation", "chromophores")
-    assert "tsumura" in {name for name, _ in first.left_out}
+    assert "tsumura" in {name for name, _ in first.omitted}
     assert any("white" in text for text in first.assumed)
     again = pipeline.reconstruct(narrow.session, want=["melanin"], out=tmp_path / "maps")
     assert again.ran == ()

@@ -9,10 +9,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from capture.calibration.fiber.spot_photometry import shot
+from capture.calibration.fiber.spot_photometry import make_spot_image
 from capture.calibration.led_sphere.glass_ball import BallError, GlassBall
 from capture.calibration.led_sphere.survey import survey_sphere
-from capture.plan.gradient import BALL_SERIES, EXPOSURE_S
+from capture.plan.gradient import BALL_SERIES, PATTERN_EXPOSURE_S
 from capture.raw import RawFrame
 from capture.rig import load_rig
 from rigsim import shading
@@ -21,7 +21,7 @@ from rigsim.as_built.sphere import build_sphere
 from rigsim.boxes.gradient_sphere import PatternLight
 from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.sensor import vignetting_map
-from rigsim.targets.glass_ball import ball_center_mm
+from rigsim.targets.glass_ball import draw_ball_center_mm
 
 pytestmark = pytest.mark.long
 
@@ -38,16 +38,22 @@ def shots_of(scene, *, series=BALL_SERIES, flat=True, seed=0, turned_deg=0.0):
     out = []
     for reading, levels in series.items():
         for level in levels:
-            light = PatternLight("full", level, 0.0, EXPOSURE_S, reading + turned_deg)
-            cfa = scene.exposure("cam", pops=[light], exposure_s=EXPOSURE_S, seed=seed + len(out))
+            light = PatternLight("full", level, 0.0, PATTERN_EXPOSURE_S, reading + turned_deg)
+            cfa = scene.exposure(
+                "cam", pops=[light], exposure_s=PATTERN_EXPOSURE_S, seed=seed + len(out)
+            )
             frame = RawFrame(
                 cfa=cfa,
                 pattern="MONO",
                 black=(float(sensor.black),),
                 white=sensor.white,
-                noise_profile=sensor.noise_profile(EXPOSURE_S),
+                noise_profile=sensor.noise_profile(PATTERN_EXPOSURE_S),
             )
-            out.append(shot(frame, amount_s=EXPOSURE_S * level, reading_deg=reading, flat=response))
+            out.append(
+                make_spot_image(
+                    frame, amount_s=PATTERN_EXPOSURE_S * level, reading_deg=reading, flat=response
+                )
+            )
     return out
 
 
@@ -87,7 +93,7 @@ def true_leakage(scene, zero_deg=FILMS.analyser_zero_deg):
             extinction=scene.films.light_extinction,
         )
         both = [
-            shading.analyse(
+            shading.apply_analyzer(
                 stokes,
                 to_camera,
                 passes_deg=90.0 + reading + zero_deg,
@@ -122,7 +128,7 @@ def test_calibrated_directions_err_below_fiftieth_degree_nominal_more(ball):
 
 def test_the_ball_is_found(ball):
     _, _, survey = ball
-    gap = survey.ball.center_mm - ball_center_mm(SEED)
+    gap = survey.ball.center_mm - draw_ball_center_mm(SEED)
     assert np.abs(gap[:2]).max() < 0.005
     full = np.append(gap, survey.ball.radius_mm - 6.0)
     # 18.5: 99.9 % of chi-square with 4 degrees of freedom
@@ -176,12 +182,12 @@ def test_analyzer_offset_of_ten_degrees_is_measured_reported(ball):
     scene, _, _ = ball
     survey = survey_sphere(shots_of(scene, seed=200, turned_deg=9.4), RIG)
     true = true_leakage(scene, 10.0)
-    zero = np.degrees(survey.films.misalignment_rad)
-    assert abs(zero - 10.0) < 4 * np.degrees(survey.films.misalignment_stderr_rad)
+    zero = np.degrees(survey.polarizers.misalignment_rad)
+    assert abs(zero - 10.0) < 4 * np.degrees(survey.polarizers.misalignment_stderr_rad)
     assert abs(zero - 10.0) < 0.4
     assert any("analyzer is +" in text for text in survey.findings)
-    leaked = survey.films.leakage[survey.films.valid]
-    assert np.median(leaked) == pytest.approx(np.median(true[survey.films.valid]), rel=0.03)
+    leaked = survey.polarizers.leakage[survey.polarizers.valid]
+    assert np.median(leaked) == pytest.approx(np.median(true[survey.polarizers.valid]), rel=0.03)
     assert np.median(leaked) > 0.03
 
 

@@ -16,7 +16,7 @@ from model.metrics import angular_error_rad
 from reconstruction.gradient_normals import SensorNoise, SphereLights, from_patterns
 from rigsim.as_built.sphere import PATTERN_WEIGHTS, build_sphere
 from rigsim.scenes.gradient.scene import GradientScene
-from rigsim.scenes.gradient.truth import appearance as ground_truth
+from rigsim.scenes.gradient.truth import gradient_truth as ground_truth
 from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.world.taped_skin import GripState
 

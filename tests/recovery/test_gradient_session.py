@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from capture.plan.gradient import state_of, states
+from capture.plan.gradient import group_by_state, strain_state
 from capture.session import Session, verify
 from model import store
 from skinrig.simulating.gradient import GripLog
@@ -31,7 +31,7 @@ def made(tmp_path_factory):
 def mean_dn(session, name, **index):
     """Mean of one frame of a state above black, DN."""
     for record in session.frames("gradient", **index):
-        if state_of(record.step) == name:
+        if strain_state(record.step) == name:
             return float(session.read(record).cfa.mean()) - 64.0
     raise AssertionError(name)
 
@@ -41,7 +41,7 @@ def test_skin_session_is_sound_and_truth_lists_states(made):
     assert session.closed
     assert verify(made.session).ok
     truth = store.read(made.truth)
-    captured = [name for name, _ in states(session.plan)]
+    captured = [name for name, _ in group_by_state(session.plan)]
     rows = truth.parameters["states"]
     assert [row["name"] for row in rows] == captured == ["a000_n0", "a000_m1", "a000_p1"]
     assert all(row["attached"] and not row["buckled"] for row in rows)
@@ -57,7 +57,7 @@ def test_skin_displacement_is_smaller_than_jaw_displacement(made):
     session = Session.open(made.session)
     assert rows["a000_n0"]["stretch_s"] == pytest.approx(1.0)
     for record in session.frames("gradient", pattern="full", polarizer="parallel"):
-        row = rows[state_of(record.step)]
+        row = rows[strain_state(record.step)]
         assert row["aperture_mm"] == pytest.approx(record.actual["aperture_mm"], abs=2e-3)
         reading = record.actual["aperture_mm"] / 8.0
         if reading != pytest.approx(1.0, abs=1e-3):
@@ -122,14 +122,14 @@ def test_interrupted_simulation_resumes_same_settings_and_complete_truth(
     again = simulate_session("gradient", out, **SMALL, resume=True)
     session = Session.open(out)
     assert verify(out).ok
-    assert session.left_out() == {}
+    assert session.omitted_steps() == {}
     cut, whole = (store.read(path).parameters["states"] for path in (again.truth, made.truth))
     # the same skin and tape, taped twice: the same stretches
     assert [row["name"] for row in cut] == [row["name"] for row in whole]
     for a, b in zip(cut, whole, strict=True):
         assert a["stretch_s"] == pytest.approx(b["stretch_s"], abs=1e-9)
         assert a["shift_mm"] == b["shift_mm"]
-    tapings = {state_of(r.step): r.actual["attachment"] for r in session.frames("gradient")}
+    tapings = {strain_state(r.step): r.actual["attachment"] for r in session.frames("gradient")}
     assert tapings["a000_p1"] == 2
 
 
@@ -144,7 +144,7 @@ def test_log_of_other_times_is_refused(made, tmp_path):
     truth = tmp_path / "truth-skin"
     (tmp_path / ".truth-skin.grips.jsonl").write_text('{"run": 1, "t_s": -5.0, "grip": {}}\n')
     with pytest.raises(SimulationError, match="tells nothing of the state a000_n0"):
-        GripLog(None, truth, resume=True, session=session).grips(session)
+        GripLog(None, truth, resume=True, session=session).list_grips(session)
 
 
 def test_same_seed_same_frames(made, tmp_path):

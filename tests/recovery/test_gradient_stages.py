@@ -10,7 +10,7 @@ from capture.session import Session
 from model import store
 from reconstruction.kernel_fit import fit_kernel
 from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM
-from reconstruction.normal_histogram.statistics import measure
+from reconstruction.normal_histogram.statistics import measure_normals
 from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.gradient.images import GradientImages
 from reconstruction.pipeline.inputs import InputsError
@@ -44,7 +44,7 @@ def made(captured):
 
 def test_every_state_that_was_captured_is_there(made):
     found, _ = made
-    assert evaluation.states_of(found) == STATES
+    assert evaluation.find_states(found) == STATES
     assert {"strain.json", "histograms.json", "kernels.json"} <= set(found.files)
 
 
@@ -82,7 +82,7 @@ def test_heights_follow_true_topography(made):
 
 
 def test_stretching_smooths_and_compression_roughens(made):
-    (rows,) = evaluation.variances(made[0]).values()
+    (rows,) = evaluation.normal_variances(made[0]).values()
     stretch, _, variance, stderr = np.array(rows).T
     assert (np.diff(stretch) > 0).all()
     assert (np.diff(variance) < 0).all()
@@ -98,7 +98,7 @@ def test_nothing_is_made_twice(captured, made):
 def test_unrequested_results_are_omitted(captured, tmp_path):
     outcome = pipeline.reconstruct(captured.session, want=["strain"], out=tmp_path / "maps")
     assert outcome.ran == ("strain",)
-    assert "kernels" in {name for name, _ in outcome.left_out}
+    assert "kernels" in {name for name, _ in outcome.omitted}
 
 
 def test_the_report_shows_states_and_trends(captured, made):
@@ -146,19 +146,21 @@ def test_documents_are_strict_json(made):
 def test_kernel_halves_histogram_distance_at_every_step():
     """On 7 mm of true relief, without camera: eq. (7) at the caliper's steps."""
     from rigsim.skin_patch.microrelief import make_micro_skin
-    from rigsim.skin_patch.stretch import deform, size_for
+    from rigsim.skin_patch.stretch import required_size_mm, stretch_skin
 
     side, pixel_um = 880, 8.0
-    skin = make_micro_skin("cheek", seed=5, size_mm=size_for(side * pixel_um / 1e3, 0.8))
+    skin = make_micro_skin("cheek", seed=5, size_mm=required_size_mm(side * pixel_um / 1e3, 0.8))
     rows, columns = np.mgrid[0:side, 0:side]
     x = (columns - (side - 1) / 2) * pixel_um / 1e3
     y = ((side - 1) / 2 - rows) * pixel_um / 1e3
-    neutral = deform(skin, stretch=1.0, angle_deg=0.0).sample(x, y).height_um
-    variance = {1.0: measure(neutral, pixel=pixel_um).variance_x}
+    neutral = stretch_skin(skin, stretch=1.0, angle_deg=0.0).sample(x, y).height_um
+    variance = {1.0: measure_normals(neutral, pixel=pixel_um).variance_x}
     for r in (0.8, 0.9, 1.1, 1.2):
-        state = deform(skin, stretch=r, angle_deg=0.0)
+        state = stretch_skin(skin, stretch=r, angle_deg=0.0)
         strained = state.sample(x * state.stretch_s, y * state.stretch_t).height_um
-        found = measure(strained, pixel=(pixel_um * state.stretch_t, pixel_um * state.stretch_s))
+        found = measure_normals(
+            strained, pixel=(pixel_um * state.stretch_t, pixel_um * state.stretch_s)
+        )
         variance[r] = found.variance_x
         fit = fit_kernel(
             neutral,

@@ -19,6 +19,6 @@ def test_drift_is_tracked_and_twitch_is_discarded():
     )
     assert found.usable.tolist() == (seen.twitch < 0.5).tolist()
     # a pixel is 1 mm at the face; a tenth of it, and much less than the head moved
-    assert seen.errors_mm(found).max() < 0.1
-    assert seen.moved_mm().max() > 0.5
-    assert np.median(seen.errors_mm(found) / seen.moved_mm()) < 0.1
+    assert seen.point_errors_mm(found).max() < 0.1
+    assert seen.true_motion_mm().max() > 0.5
+    assert np.median(seen.point_errors_mm(found) / seen.true_motion_mm()) < 0.1

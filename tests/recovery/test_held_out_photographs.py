@@ -20,11 +20,11 @@ from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.inputs import DomeOptions
 from rigsim.as_built import dome as dome_build
 from rigsim.light.led_light import lobe_exponent, white_intensity
-from rigsim.sensor import sensor_of, vignetting_map
+from rigsim.sensor import make_sensor, vignetting_map
 from skinrig.rendering.camera import RenderingError
 from skinrig.rendering.photographs import evaluation
 from skinrig.rendering.photographs.errors import MAX_MEDIAN_ERROR
-from skinrig.rendering.photographs.held_out import Photographs
+from skinrig.rendering.photographs.held_out import HeldOutPhotographs
 from skinrig.simulating.dome import small_dome
 from skinrig.simulating.simulation import simulate_session
 
@@ -46,7 +46,7 @@ def calibrate(folder):
     size = np.array([view.width_px, view.height_px])
     off = np.stack([column, row], axis=-1) - (size - 1) / 2
     r2 = (np.sum(off**2, axis=-1) / np.sum((size / 2) ** 2)).reshape(-1)
-    fall = vignetting_map(sensor_of(view).vignetting, view.height_px, view.width_px).reshape(-1)
+    fall = vignetting_map(make_sensor(view).vignetting, view.height_px, view.width_px).reshape(-1)
     middle = fall.max()
     terms = np.linalg.lstsq(np.stack([r2, r2**2], axis=-1), fall / middle - 1.0, rcond=None)[0]
     lights = LightTable(
@@ -70,11 +70,11 @@ def fitted(tmp_path_factory):
     """A face captured, and its maps fitted without three lights and one of four views."""
     out = tmp_path_factory.mktemp("photographs")
     lights, view = calibrate(out / "calibration")
-    exact = {field.name: 0.0 for field in dataclasses.fields(dome_build.Tolerances)}
-    build, drawn = dome_build.build, dome_build.Tolerances(**exact)
+    exact = {field.name: 0.0 for field in dataclasses.fields(dome_build.DomeTolerances)}
+    build, drawn = dome_build.build_dome, dome_build.DomeTolerances(**exact)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            "skinrig.simulating.dome.build",
+            "skinrig.simulating.dome.build_dome",
             lambda rig, seed: build(rig, seed=seed, tolerances=drawn),
         )
         simulate_session("dome", out / "session-face", subject=SUBJECT, width_px=WIDTH_PX, **DOME)
@@ -91,16 +91,18 @@ def fitted(tmp_path_factory):
 def test_held_out_photographs_are_predicted(fitted):
     out, lights, view = fitted
     appearance = store.read(out / "appearance")
-    photographs = Photographs.of(out / "session-face", appearance, calibration=out / "calibration")
+    photographs = HeldOutPhotographs.of(
+        out / "session-face", appearance, calibration=out / "calibration"
+    )
     assert photographs.assumed == ()
     assert {shot.light for shot in photographs.shots if shot.view != view} == set(lights)
     assert len(photographs.shots) == DOME["lights"] + (DOME["views"] - 1) * len(lights)
 
     def judge(model, *, ablation=False):
-        return evaluation.evaluate(
+        return evaluation.evaluate_photographs(
             appearance,
             photographs,
-            evaluation.Judging("local", count=6, ablation=ablation),
+            evaluation.EvaluationSettings("local", count=6, ablation=ablation),
             model=model,
         )
 
@@ -127,7 +129,7 @@ def test_photographs_that_were_all_fitted_to_judge_nothing(fitted):
     appearance = store.read(out / "appearance")
     seen = dataclasses.replace(appearance, parameters={"held_out": {"lights": [], "views": []}})
     with pytest.raises(RenderingError, match="--hold-out"):
-        Photographs.of(out / "session-face", seen, calibration=out / "calibration")
+        HeldOutPhotographs.of(out / "session-face", seen, calibration=out / "calibration")
 
 
 def test_head_repositioned_in_other_session_is_found(fitted):
@@ -139,11 +141,13 @@ def test_head_repositioned_in_other_session_is_found(fitted):
         [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
     )
     elsewhere = moved(appearance, turn, shift)
-    photographs = Photographs.of(out / "session-face", elsewhere, calibration=out / "calibration")
+    photographs = HeldOutPhotographs.of(
+        out / "session-face", elsewhere, calibration=out / "calibration"
+    )
     assert len(photographs.shots) == DOME["lights"] * DOME["views"]
     assert "the head sits" in photographs.assumed[0]
-    found, _ = evaluation.evaluate(
-        elsewhere, photographs, evaluation.Judging("local", count=4, ablation=False)
+    found, _ = evaluation.evaluate_photographs(
+        elsewhere, photographs, evaluation.EvaluationSettings("local", count=4, ablation=False)
     )
     assert found.passed
 

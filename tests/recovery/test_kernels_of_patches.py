@@ -5,11 +5,15 @@ import pytest
 
 from reconstruction.kernel_fit import fit_kernel
 from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM
-from reconstruction.normal_histogram.blocks import BLOCKS_PER_SIDE, block_counts, grid_of
-from reconstruction.normal_histogram.statistics import measure
+from reconstruction.normal_histogram.blocks import (
+    BLOCKS_PER_SIDE,
+    block_grid_shape,
+    count_block_normals,
+)
+from reconstruction.normal_histogram.statistics import measure_normals
 from reconstruction.normal_integration.height_filters import high_pass
 from rigsim.skin_patch.microrelief import make_micro_skin
-from rigsim.skin_patch.stretch import deform
+from rigsim.skin_patch.stretch import stretch_skin
 
 SITES = ("forehead", "cheek", "chin")
 PIXEL_UM, SIDE, PART = 6.0, 400, 128
@@ -24,7 +28,7 @@ def shown(state, shape):
 
 def blocks_of(rest, strained, sides):
     """Count a strained piece's normals in the blocks of the same skin at rest."""
-    grid = grid_of(rest.shape, BLOCKS_PER_SIDE)
+    grid = block_grid_shape(rest.shape, BLOCKS_PER_SIDE)
     rows, columns = np.indices(strained.shape)
     down, right = (
         np.floor((0.5 * n + (place - 0.5 * (m - 1)) / side) * parts / n).astype(int)
@@ -33,7 +37,7 @@ def blocks_of(rest, strained, sides):
         )
     )
     block = np.clip(down, 0, grid[0] - 1) * grid[1] + np.clip(right, 0, grid[1] - 1)
-    counts = block_counts(strained, block, grid[0] * grid[1], pixel=PIXEL_UM)
+    counts = count_block_normals(strained, block, grid[0] * grid[1], pixel=PIXEL_UM)
     return counts.reshape(*grid, *counts.shape[1:])
 
 
@@ -51,20 +55,20 @@ def test_small_patch_kernel_errors_have_nominal_coverage():
     held, held_95, narrower = [], [], []
     for seed in range(520, 532):
         skin = make_micro_skin(SITES[seed % 3], seed=seed, size_mm=3.4)
-        rest = shown(deform(skin, stretch=1.0, angle_deg=0.0), (SIDE, SIDE))
+        rest = shown(stretch_skin(skin, stretch=1.0, angle_deg=0.0), (SIDE, SIDE))
         for stretch in (0.81, 1.19):
-            state = deform(skin, stretch=stretch, angle_deg=0.0)
+            state = stretch_skin(skin, stretch=stretch, angle_deg=0.0)
             sides = float(state.gradient[1, 1]), float(state.gradient[0, 0])
             moved = shown(state, [round(SIDE * side) for side in sides])
             told = grid | {"stretch": sides[1], "stretch_across": sides[0]}
-            true = fit_kernel(rest, measure(moved, pixel=PIXEL_UM).histogram, **told)
+            true = fit_kernel(rest, measure_normals(moved, pixel=PIXEL_UM).histogram, **told)
             for corner in (0, SIDE - PART):
                 one = rest[corner : corner + PART, corner : corner + PART]
                 rows, columns = (
                     slice(round(corner * side), round((corner + PART) * side)) for side in sides
                 )
                 other = moved[rows, columns]
-                target = measure(other, pixel=PIXEL_UM)
+                target = measure_normals(other, pixel=PIXEL_UM)
                 about = {"target_samples": target.effective_samples}
                 fit = fit_kernel(
                     one,

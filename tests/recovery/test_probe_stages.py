@@ -39,7 +39,8 @@ def test_full_session_recovers_sigma_tr_and_dipole_misses(bench):
     )
     found, truth = store.read(bench / "appearance"), store.read(truth_folder(bench / "session"))
     errors = {
-        row.method: row for row in evaluation.by_method(evaluation.compare_fits(found, truth))
+        row.method: row
+        for row in evaluation.summarize_methods(evaluation.compare_fits(found, truth))
     }
     assert errors["photon_table"].median < evaluation.MAX_MEDIAN_ERROR
     assert errors["photon_table"].worst < evaluation.MAX_WORST_ERROR

@@ -8,11 +8,11 @@ from capture.calibration.lights import LightTable
 from capture.rig import load_rig
 from reconstruction.lumitexels.ray_casting import RayCaster
 from reconstruction.scan.mesh import FACE_BOX_MM, load_ply
-from reconstruction.scan.registration import align, register
-from reconstruction.scan.repair import crop, repair
-from reconstruction.scan.rough_normals import NormalEvidence, RegistrationError
+from reconstruction.scan.registration import align_scan, register_scan
+from reconstruction.scan.repair import crop, repair_mesh
+from reconstruction.scan.rough_normals import NormalEvidence, ScanRegistrationError
 from rigsim.render import Caster, g_buffer
-from rigsim.scanner.pods import Scanner, scan_face
+from rigsim.scanner.pods import ScannerSettings, scan_face
 from rigsim.subject.head import build_head
 
 RIG = load_rig("dome").resized(130)
@@ -54,10 +54,10 @@ def maps(head):
 
 
 def visible(head, maps):
-    from reconstruction.lumitexels import Surface, visibility
+    from reconstruction.lumitexels import SampledSurface, compute_visibility
 
-    return visibility(
-        Surface(head.vertices_mm, head.normals),
+    return compute_visibility(
+        SampledSurface(head.vertices_mm, head.normals),
         RayCaster(head.vertices_mm, head.faces),
         cameras_mm=np.array([view.camera.center_mm for view in maps]),
         lights_mm=np.zeros((0, 3)),
@@ -72,7 +72,7 @@ def test_a_motion_is_found_again_from_perfect_normals(head, maps, axis, degrees,
     """Pixels of 3.3 mm: a twentieth of a pixel and of a degree of error is their grid's."""
     turn = about(axis, degrees)
     points = (head.vertices_mm - shift) @ turn  # scan = turn^-1 (dome - shift)
-    fit = register(
+    fit = register_scan(
         points[::3], (head.normals @ turn)[::3], maps, visible=visible(head, maps)[:, ::3]
     )
     assert fit.converged
@@ -84,16 +84,16 @@ def test_a_motion_is_found_again_from_perfect_normals(head, maps, axis, degrees,
 def test_views_of_another_head_give_a_larger_residual(head, maps):
     other = build_head(np.random.default_rng(77), columns=80, rows=84)
     seen = visible(head, maps)[:, ::3]
-    own = register(head.vertices_mm[::3], head.normals[::3], maps, visible=seen)
-    foreign = register(other.vertices_mm[::3], other.normals[::3], maps, visible=seen)
+    own = register_scan(head.vertices_mm[::3], head.normals[::3], maps, visible=seen)
+    foreign = register_scan(other.vertices_mm[::3], other.normals[::3], maps, visible=seen)
     assert foreign.residual_deg > 1.5 * own.residual_deg
 
 
 def test_a_scan_outside_all_views_is_named(head, maps):
-    with pytest.raises(RegistrationError, match="at least 200"):
-        register(head.vertices_mm[::3] + 5000.0, head.normals[::3], maps)
-    with pytest.raises(RegistrationError, match="expected"):
-        register(np.zeros((3, 2)), np.zeros((3, 2)), maps)
+    with pytest.raises(ScanRegistrationError, match="at least 200"):
+        register_scan(head.vertices_mm[::3] + 5000.0, head.normals[::3], maps)
+    with pytest.raises(ScanRegistrationError, match="expected"):
+        register_scan(np.zeros((3, 2)), np.zeros((3, 2)), maps)
 
 
 @pytest.mark.long
@@ -110,10 +110,10 @@ def test_flawed_scan_registers_to_dome_within_standard_errors(seed):
     lights = LightTable.nominal(rig)
     caster = Caster(head)
     stacks = [_photographs(caster, view, lights, rng) for view in rig.views]
-    settings = Scanner(triangles=12_000, offset_mm=6.0, offset_deg=2.5)
+    settings = ScannerSettings(triangles=12_000, offset_mm=6.0, offset_deg=2.5)
     scan = scan_face(head, rng=rng, scanner=settings)
-    mesh, _ = repair(crop(load_ply(scan.ply), box_mm=FACE_BOX_MM))
-    fit = align(
+    mesh, _ = repair_mesh(crop(load_ply(scan.ply), box_mm=FACE_BOX_MM))
+    fit = align_scan(
         mesh, cameras=CAMERAS, lights=lights, stacks=lambda v: stacks[v], rng=rng, points=4000
     )
     true_turn, true_shift = scan.to_dome[:3, :3], scan.to_dome[:3, 3]
@@ -149,7 +149,7 @@ def _photographs(caster, view, lights, rng):
     leaving = entering(np.einsum("pk,pk->p", seen.to_camera[seen.mask], normals))
     for number, direction in enumerate(way):
         length = np.linalg.norm(lights.position_mm[number] - points, axis=1)
-        lit = ~caster.blocked(points + 0.05 * normals, direction, length)
+        lit = ~caster.is_blocked(points + 0.05 * normals, direction, length)
         half = direction + seen.to_camera[seen.mask]
         half /= np.linalg.norm(half, axis=1, keepdims=True)
         gloss = 0.8 * np.clip(np.einsum("pk,pk->p", half, normals), 0, 1) ** 60

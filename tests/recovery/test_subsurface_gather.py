@@ -14,7 +14,7 @@ import pytest
 from model import dipole
 from model.dipole.gather import exitance
 from model.fresnel import normal_reflectance
-from rigsim.tissue.tissue_mc import Layer, LayerStack, escape_paths
+from rigsim.tissue.tissue_mc import Layer, LayerStack, trace_escape_paths
 
 ETA = 1.4
 G = 0.8
@@ -30,7 +30,7 @@ def traced(sigma_a, sigma_s_prime, rng):
     """Return the edge's profile over its step with standard errors, and R_d of what entered."""
     stack = LayerStack((Layer(inf, sigma_a, sigma_s_prime / (1.0 - G), G, ETA),))
     profiles, totals = [], []
-    for batch in escape_paths(stack, photons=12_000, rng=rng):
+    for batch in trace_escape_paths(stack, photons=12_000, rng=rng):
         # a photon that came out at a radius did so in any direction: the share across the edge
         beyond = (
             np.arccos(np.clip(X_MM[:, None] / np.maximum(batch.radius_mm, 1e-12), -1, 1)) / np.pi

@@ -11,8 +11,8 @@ import pytest
 
 from model.dipole import effective_transport
 from reconstruction import subsurface
-from rigsim.fiber.profile import fibre_profile
-from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
+from rigsim.fiber.profile import trace_fiber_profile
+from rigsim.tissue.tissue_mc import Layer, LayerStack, trace_photons
 
 RADIUS = 0.3 + 0.25 * np.arange(28)
 FIBRE_ERROR, COMMON_ERROR, FLOOR = 0.012, 0.01, 1e-8
@@ -24,7 +24,7 @@ def medium(sigma_a, sigma_s_prime, g, eta=1.4, thickness=inf):
 
 
 def truth(*layers, photons, seed=1):
-    return fibre_profile(
+    return trace_fiber_profile(
         LayerStack(layers), radii_mm=RADIUS, photons=photons, rng=np.random.default_rng(seed)
     )
 
@@ -70,7 +70,7 @@ def test_layers_misfit_but_homogeneous_skin_fits(rng):
     layered = truth(medium(1.5, 2.5, 0.8, thickness=0.1), medium(0.05, 1.5, 0.8), photons=30_000)
     profiles, variance = readings(layered, rng, 10)
     found = fit(profiles, variance)
-    assert np.all(found.outcome & np.uint16(subsurface.Outcome.MISFIT))
+    assert np.all(found.outcome & np.uint16(subsurface.FitOutcome.MISFIT))
     assert np.all(found.model_error > 0.02)
     plain, variance = readings(truth(medium(0.05, 1.5, 0.8), photons=30_000), rng, 10)
     assert np.mean(fit(plain, variance).outcome == 0) >= 0.9
@@ -92,7 +92,7 @@ def test_nearly_forward_scattering_is_recovered(rng):
     """g = 0.99 lies outside the prior and the table; beyond a millimetre it looks like 0.95."""
     edges = np.linspace(0.175, 7.175, 29)
     stack = LayerStack((medium(0.1, 0.7, 0.99),))
-    run = transport(stack, photons=20_000, rng=np.random.default_rng(3), ring_edges_mm=edges)
+    run = trace_photons(stack, photons=20_000, rng=np.random.default_rng(3), ring_edges_mm=edges)
     expected = effective_transport(0.1, 0.7)
     found = subsurface.invert(
         0.5 * (edges[1:] + edges[:-1]),
@@ -109,7 +109,7 @@ def test_the_exitance_of_all_directions_is_inverted_alike(rng):
     """R(r) as counted in rings by the pencil beam's transport, ring by ring 0.1 mm wide."""
     edges = np.stack([RADIUS - 0.05, RADIUS + 0.05], axis=1).ravel()
     stack = LayerStack((medium(0.1, 1.2, 0.8),))
-    run = transport(stack, photons=600_000, rng=np.random.default_rng(3), ring_edges_mm=edges)
+    run = trace_photons(stack, photons=600_000, rng=np.random.default_rng(3), ring_edges_mm=edges)
     profile = run.reflectance_per_mm2[::2]
     variance = run.reflectance_per_mm2_stderr[::2] ** 2
     expected = effective_transport(0.1, 1.2)

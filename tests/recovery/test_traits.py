@@ -8,10 +8,10 @@ import pytest
 from model.brdf import tables as brdf_tables
 from model.traits import TraitSpace
 from reconstruction import brdf_basis
-from rigsim.population.population import shifted, table_1
+from rigsim.population.population import draw_population, shift_trait
 from skinrig.traits import truth as trait_truth
 
-PEOPLE = [person for person in table_1() if not person.applied]
+PEOPLE = [person for person in draw_population() if not person.applied]
 
 
 def population(samples, *, shift, noise, per_group, rng):
@@ -49,9 +49,9 @@ def test_cosine_with_truth_falls_with_fewer_noisier_faces():
 
 @pytest.mark.long
 def test_lotion_is_learned_from_fitted_lobes():
-    basis = brdf_tables.default()
+    basis = brdf_tables.default_basis()
     people = PEOPLE[:48:4]
-    dressed = shifted(people, "lotion", apply={"lotion": 0.9}, rng=np.random.default_rng(1))
+    dressed = shift_trait(people, "lotion", products={"lotion": 0.9}, rng=np.random.default_rng(1))
     label = np.array(["lotion" in person.marks for person in dressed])
     rng = np.random.default_rng(3)
     means = np.array(
@@ -67,7 +67,7 @@ def test_lotion_is_learned_from_fitted_lobes():
     found = trait_truth.lobe_changes(people[:3], {"lotion": worn}, points=8, pairs=1000, rng=draws)
     truth = found["lotion"]
     strength = basis.strength()
-    metric = basis.kinship() * np.outer(strength, strength)
+    metric = basis.cosine_similarity() * np.outer(strength, strength)
     mix = brdf_basis.reduce(means, 6, basis=basis)[1]
     for space in ("pca", "nmf"):
         learned = TraitSpace.fit(means, {"lotion": label}, space=space, basis=mix, metric=metric)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from reconstruction.normal_histogram.statistics import measure
+from reconstruction.normal_histogram.statistics import measure_normals
 from reconstruction.normal_integration.height_filters import high_pass
 from rigsim.skin_patch.microrelief import make_micro_skin
-from rigsim.skin_patch.stretch import deform
+from rigsim.skin_patch.stretch import stretch_skin
 
 SITES = ("forehead", "cheek", "chin")
 PIXEL_UM, SIDE, PART = 6.0, 448, 128
@@ -27,13 +27,13 @@ def test_small_patch_variance_errors_have_nominal_coverage():
     for seed in range(500, 515):
         skin = make_micro_skin(SITES[seed % 3], seed=seed, size_mm=3.4)
         for stretch in (1.0, 0.81, 1.19):
-            seen = deform(skin, stretch=stretch, angle_deg=0.0).sample(x, y)
+            seen = stretch_skin(skin, stretch=stretch, angle_deg=0.0).sample(x, y)
             height = high_pass(seen.height_um, pixel=PIXEL_UM, cutoff=1000.0, valid=seen.inside)
-            whole = measure(height, pixel=PIXEL_UM, valid=seen.inside)
+            whole = measure_normals(height, pixel=PIXEL_UM, valid=seen.inside)
             for top in (0, SIDE - PART):
                 for left in (0, SIDE - PART):
                     part = slice(top, top + PART), slice(left, left + PART)
-                    one = measure(height[part], pixel=PIXEL_UM, valid=seen.inside[part])
+                    one = measure_normals(height[part], pixel=PIXEL_UM, valid=seen.inside[part])
                     pull.append(
                         [
                             (one.variance_x - whole.variance_x) / one.stderr_x,

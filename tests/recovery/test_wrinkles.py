@@ -31,10 +31,10 @@ def part_of_neutral_s_error(model, neutral, states, covered):
 
 def test_deepening_narrowing_grooves_follow_weighted_single_map():
     rng = np.random.default_rng(0)
-    neutral, states = bench_wrinkles.furrowed_face(192, rng=rng)
+    neutral, states = bench_wrinkles.synthesize_wrinkled_face(192, rng=rng)
     masks = bench_wrinkles.zone_masks(32)
     covered = np.ones((192, 192), bool)
-    fit = wrinkle_fit.fit(neutral, states, masks, size=(96, 96), clamp="signed")
+    fit = wrinkle_fit.fit_wrinkle_map(neutral, states, masks, size=(96, 96), clamp="signed")
     left = part_of_neutral_s_error(fit.model(), neutral, states, covered)
     assert left < 0.4
     # weights follow the table that raised the furrows, up to each zone's scale and law
@@ -43,17 +43,17 @@ def test_deepening_narrowing_grooves_follow_weighted_single_map():
     for z in range(8):
         assert np.corrcoef(got[:, z], true[:, z])[0, 1] > 0.9
     # zones in wrong places must show: the test can fail
-    wrong = wrinkle_fit.fit(
+    wrong = wrinkle_fit.fit_wrinkle_map(
         neutral, states, np.roll(masks, 11, axis=1), size=(96, 96), clamp="signed"
     )
     assert part_of_neutral_s_error(wrong.model(), neutral, states, covered) > 1.5 * left
 
 
 def test_unfitted_expression_is_represented_by_bounded_weights():
-    neutral, states = bench_wrinkles.furrowed_face(192, rng=np.random.default_rng(1))
+    neutral, states = bench_wrinkles.synthesize_wrinkled_face(192, rng=np.random.default_rng(1))
     fear = states.pop("fear")
     masks = bench_wrinkles.zone_masks(32)
-    fit = wrinkle_fit.fit(neutral, states, masks, size=(96, 96), clamp="signed")
+    fit = wrinkle_fit.fit_wrinkle_map(neutral, states, masks, size=(96, 96), clamp="signed")
     weights = wrinkle_fit.fit_weights(fit.layer, neutral, fear)
     assert weights.explained > 0.8
     assert weights.weights.min() >= 0.0
@@ -75,18 +75,18 @@ def test_buckled_wrinkles_return_as_map_with_data_zones():
     face = make_subject("II", seed=5, size=size)
     covered = np.asarray(face.atlas.covered)
     neutral = face.tangent_normal()
-    states = {name: face.posed(name).tangent_normal() for name in EXPRESSIONS}
-    base = wrinkle_texels.derivatives_of(neutral, valid=covered)
-    measured = {n: wrinkle_texels.derivatives_of(s, valid=covered) for n, s in states.items()}
-    found = wrinkle_zones.amplitudes(base, measured, size=(32, 32))
+    states = {name: face.with_expression(name).tangent_normal() for name in EXPRESSIONS}
+    base = wrinkle_texels.measure_derivatives(neutral, valid=covered)
+    measured = {n: wrinkle_texels.measure_derivatives(s, valid=covered) for n, s in states.items()}
+    found = wrinkle_zones.estimate_amplitudes(base, measured, size=(32, 32))
     zones = wrinkle_zones.fit_zones(found, zones=8, rng=np.random.default_rng(0))
-    assert zones.rank_one_share > 0.85
-    fit = wrinkle_fit.fit(base, measured, zones.masks, size=(128, 128))
+    assert zones.rank_one_fraction > 0.85
+    fit = wrinkle_fit.fit_wrinkle_map(base, measured, zones.masks, size=(128, 128))
     assert fit.explained > 0.7
     assert part_of_neutral_s_error(fit.model(), neutral, states, covered) < 0.6
-    alone = wrinkle_fit.fit(base, measured, np.ones((1, 2, 2)), size=(128, 128))
+    alone = wrinkle_fit.fit_wrinkle_map(base, measured, np.ones((1, 2, 2)), size=(128, 128))
     assert alone.explained < 0.7 * fit.explained  # one zone cannot tell expressions apart
     held_out = {name: one for name, one in measured.items() if name != "fear"}
-    without = wrinkle_fit.fit(base, held_out, zones.masks, size=(128, 128))
+    without = wrinkle_fit.fit_wrinkle_map(base, held_out, zones.masks, size=(128, 128))
     weights = wrinkle_fit.fit_weights(without.layer, base, measured["fear"])
     assert weights.explained > 0.5

@@ -198,7 +198,7 @@ def test_blood_undetermined_without_white_reference_error_names_remedy(
     def untold(*args, **kwargs):
         raise FacialColorError("neutral: no pixel is valid, expected some")
 
-    monkeypatch.setattr(facial_color_fit, "fit", untold)
+    monkeypatch.setattr(facial_color_fit, "fit_facial_color", untold)
     argv = ["fit", "facial-color", str(sound), "--out", str(tmp_path / "out")]
     assert main(argv) == 3
     err = capsys.readouterr().err

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from skinrig.calibrating import white_tile
+from skinrig.calibrating import white_reference
 from skinrig.cli import main
 from skinrig.simulating.simulation import simulate_session
 
@@ -29,12 +29,12 @@ def test_small_simulated_white_reference_works_partial_is_reported(tmp_path, cap
     assert main(command) == 0
     assert "found:" not in capsys.readouterr().out
     assert (calibration / "white.json").exists()
-    monkeypatch.setattr(white_tile, "evenness", lambda rgb, valid: 0.9)
+    monkeypatch.setattr(white_reference, "even_fraction", lambda rgb, valid: 0.9)
     assert main(command) == 0
     assert (
         "found: frame S001 of state 'white': 90 % of the picture is even" in capsys.readouterr().out
     )
-    monkeypatch.setattr(white_tile, "evenness", lambda rgb, valid: 0.3)
+    monkeypatch.setattr(white_reference, "even_fraction", lambda rgb, valid: 0.3)
     assert main(command) == 3
     assert "shows no white tile: 30 %" in capsys.readouterr().err
 

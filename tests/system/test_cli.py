@@ -347,7 +347,7 @@ def test_the_readme_names_commands_that_exist(command):
 
 
 def test_simulated_world_is_captured_by_controller_camera_urls(tmp_path, monkeypatch):
-    monkeypatch.setattr("rigsim.world.world._BENCH", {})
+    monkeypatch.setattr("rigsim.world.world._WORLDS", {})
     out = tmp_path / "session"
     where = ["--port", "flash=sim://flash?seed=1&clock=virtual", "--camera", "cam=sim://flash/cam"]
     assert main(["capture", "flash", *where, "--target", "dark", "--out", str(out)]) == 0

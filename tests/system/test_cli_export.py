@@ -48,7 +48,7 @@ def dome(tmp_path):
             {"consent": [agreed]},
             files={
                 BASIS_FILE: _basis_bytes(lobes, 1, {1: (np.eye(1), 0.0)}),
-                "mesh.obj": FramedMesh.of(mesh).obj(1.0, "mm").encode(),
+                "mesh.obj": FramedMesh.of(mesh).to_obj(1.0, "mm").encode(),
             },
         ),
     )

@@ -146,7 +146,8 @@ def test_served_rig_prints_single_document_and_ends(monkeypatch, capsys):
             raise KeyboardInterrupt
 
     monkeypatch.setattr(
-        "skinrig.simulating.serving.serve", lambda *args, **settings: Served(addresses=addresses)
+        "skinrig.simulating.serving.serve_world",
+        lambda *args, **settings: Served(addresses=addresses),
     )
     monkeypatch.setattr("skinrig.simulating.serving._flash_scene", lambda *args: None)
     assert main(["serve", "flash", "--json"]) == errors.EXIT_INTERRUPTED

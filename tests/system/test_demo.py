@@ -68,7 +68,7 @@ def test_parallel_rig_threads_sleep_unless_user_sets_policy(own, expected, monke
         monkeypatch.setenv("OPENBLAS_NUM_THREADS", own)
     monkeypatch.setattr(demo, "_run_rig", os.getenv)  # a process says what it was given
     names = ["OMP_WAIT_POLICY", "OPENBLAS_NUM_THREADS"]
-    given = demo._side_by_side(names, ("not set",), 2)
+    given = demo._run_in_processes(names, ("not set",), 2)
     assert given == {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": expected}
     assert [os.environ.get(name) for name in names] == [None, own]
 

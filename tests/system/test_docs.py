@@ -168,10 +168,10 @@ def test_the_manual_lists_every_code():
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
 def test_shell_example_fires_served_controller():
     from capture.rig import load_rig
-    from rigsim.world.serve import serve
+    from rigsim.world.serve import serve_world
 
     (script,) = blocks(WIRE, "bash")
-    with serve(load_rig("flash").resized(16), seed=1) as served:
+    with serve_world(load_rig("flash").resized(16), seed=1) as served:
         host, port = served.addresses["flash"].removeprefix("socket://").rsplit(":", 1)
         run = subprocess.run(
             ["bash", "-c", script],
@@ -284,7 +284,7 @@ def recipes():
         heading: importlib.import_module(f"reconstruction.pipeline.{kind}.recipe").RECIPE
         for kind, heading in headings.items()
     }
-    return {**found, "Maps of pictures under listed lights": pipeline.light_list()}
+    return {**found, "Maps of pictures under listed lights": pipeline.light_list_recipe()}
 
 
 def test_maps_page_lists_every_map_of_every_recipe():
@@ -323,7 +323,7 @@ def test_dome_light_figures_match_its_plan():
     for claim in (
         f"plan of {len(plan.steps)} steps ({len(rig.lights)} lights",
         f"{count['tracking']} tracking frames, {count['dark']} darks;",
-        f"darks; {plan.estimated_s(rig):.0f} s)",
+        f"darks; {plan.estimate_duration_s(rig):.0f} s)",
         f"{figures['flashes_per_s']:.1f} flashes in the worst second",
         f"{figures['flicker_rms']:.2f} of light between 3 and 65 Hz",
         f"at most {figures['led_ws']:.3g} Ws from one LED",

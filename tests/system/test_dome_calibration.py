@@ -8,7 +8,7 @@ import pytest
 from capture.calibration import geometry, store
 from capture.calibration.lights import LightTable
 from capture.session import Session
-from rigsim.as_built.dome import build, image_of
+from rigsim.as_built.dome import build_dome, project_points
 from rigsim.light.led_light import lobe_exponent, white_intensity
 from skinrig.cli import main
 from skinrig.simulating.simulation import simulate_session
@@ -52,11 +52,11 @@ def test_a_dome_is_calibrated_from_its_sessions(folder, capsys):
     assert all("never faced" in text for text in findings)
 
     rig = Session.open(folder / "white").rig
-    dome = build(rig, seed=SEED)
-    cameras = geometry.poses_from(store.load(out, "geometry"), rig)
+    dome = build_dome(rig, seed=SEED)
+    cameras = geometry.cameras_from_calibration(store.load(out, "geometry"), rig)
     probes = np.random.default_rng(0).uniform(-60, 60, (200, 3))
     for view in dome.rig.views:
-        truth = image_of(view, dome.distortion[view.name], probes)
+        truth = project_points(view, dome.distortion[view.name], probes)
         gap = np.linalg.norm(cameras[view.name].project(probes) - truth, axis=1)
         assert gap.mean() < 0.3
     table = LightTable.from_calibration(store.load(out, "lights"), rig)

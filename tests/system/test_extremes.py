@@ -9,7 +9,7 @@ from skinrig.extremes import cases as extremes
 from skinrig.extremes import expectations
 from skinrig.report import build
 
-CASES = extremes.all_cases()
+CASES = extremes.read_cases()
 HEAVY = {"kernel of no relief"}  # searches all kernels twice
 
 
@@ -40,12 +40,15 @@ def broken(_):
 @pytest.mark.parametrize(
     ("run", "word"),
     [
-        (lambda real: expectations.near(real(1.0), 2.0), "got 1"),
-        (lambda real: expectations.within([real("nan")], 0.0, 1.0), "finite"),
-        (lambda real: expectations.clean([real("inf")], [True]), "NaN or infinity"),
-        (lambda real: expectations.masked([True, False]), "share of 0.5"),
-        (lambda real: expectations.refused(lambda: real(1.0), ValueError), "expected ValueError"),
-        (lambda real: expectations.rising([real(2.0), real(1.0)]), "rise"),
+        (lambda real: expectations.expect_near(real(1.0), 2.0), "got 1"),
+        (lambda real: expectations.expect_within([real("nan")], 0.0, 1.0), "finite"),
+        (lambda real: expectations.expect_finite([real("inf")], [True]), "NaN or infinity"),
+        (lambda real: expectations.expect_valid_fraction([True, False]), "share of 0.5"),
+        (
+            lambda real: expectations.expect_error(lambda: real(1.0), ValueError),
+            "expected ValueError",
+        ),
+        (lambda real: expectations.expect_rising([real(2.0), real(1.0)]), "rise"),
         (broken, "ZeroDivisionError"),
     ],
 )

@@ -121,7 +121,7 @@ def test_served_rig_is_captured_by_printed_command(tmp_path):
             session = Session.open(out)
             assert session.closed
             assert session.source == "simulated"
-            assert session.todo() == []
+            assert session.pending_frames() == []
             assert len(session.frames("gradient")) == 3 * 16
             assert verify(out).ok
         finally:

@@ -18,7 +18,7 @@ RIG = load_rig("probe")
 @pytest.mark.long
 @pytest.mark.timeout(180)
 def test_served_probe_is_captured_by_printed_command(tmp_path):
-    plan = probe_plan(RIG, sites=("cheek",), brackets=5, longest_s=0.3, step_ev=1.0, darks=1)
+    plan = probe_plan(RIG, sites=("cheek",), brackets=5, max_exposure_s=0.3, step_ev=1.0, darks=1)
     (tmp_path / "plan.json").write_text(json.dumps(plan.to_json()), encoding="utf-8")
     with subprocess.Popen(
         [*CLI, "serve", "probe", "--subject", "homogeneous:0.04,1.5", "--seed", "2"],
@@ -54,7 +54,7 @@ def test_served_probe_is_captured_by_printed_command(tmp_path):
             assert "place the head on the cheek at 0 degrees" in run.stderr
             session = Session.open(out)
             assert (session.closed, session.source) == (True, "simulated")
-            assert session.todo() == []
+            assert session.pending_frames() == []
             assert verify(out).ok
             # each exposure is twice the one before, and so is the light of the far fibres
             frames = session.frames("fibres")

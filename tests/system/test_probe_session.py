@@ -100,7 +100,7 @@ def test_tissue_is_captured_with_ground_truth_alongside(capsys, tmp_path):
     session = Session.open(out)
     assert document["frames"] == len(session.frames()) == 3 + len(session.frames("fibres"))
     assert verify(out).ok
-    assert session.todo() == []
+    assert session.pending_frames() == []
     truth = store.read(tmp_path / "truth-probe")
     assert truth.parameters["kind"] == "truth"
     (profile,) = truth.parameters["profiles"]
@@ -284,7 +284,7 @@ def test_served_probe_is_captured_by_printed_command(tmp_path):
             session = Session.open(out)
             assert session.closed
             assert session.source == "simulated"
-            assert session.todo() == []
+            assert session.pending_frames() == []
             assert len(session.frames("fibres")) == 9
             assert verify(out).ok
         finally:

@@ -14,7 +14,7 @@ from skinrig.rendering import camera as rendering_camera
 from skinrig.rendering.lights import Light
 from skinrig.rendering.photographs import held_out as photographs
 from skinrig.rendering.photographs.errors import Photograph
-from skinrig.rendering.photographs.held_out import Shot
+from skinrig.rendering.photographs.held_out import HeldOutShot
 
 SIZE = 32
 STEPS = 24
@@ -238,10 +238,10 @@ class OnePhotograph:
     """A session with one photograph that no fit has seen."""
 
     assumed = ("the head held still",)
-    shots = (Shot("C03", "L017", "light"),)
+    shots = (HeldOutShot("C03", "L017", "light"),)
 
     def camera(self, shot):
-        return rendering_camera.looking_at((200, 0, 600), size_px=(40, 30), name=shot.view)
+        return rendering_camera.look_at((200, 0, 600), size_px=(40, 30), name=shot.view)
 
     def light(self, shot):
         return Light(name=shot.light, direction=(1.0, 0.0, 1.0))
@@ -251,7 +251,7 @@ class OnePhotograph:
 
 
 def test_photograph_is_decomposed_alongside_its_rendering(folder, monkeypatch, capsys):
-    monkeypatch.setattr(photographs.Photographs, "of", lambda *_, **__: OnePhotograph())
+    monkeypatch.setattr(photographs.HeldOutPhotographs, "of", lambda *_, **__: OnePhotograph())
     words = ("face", "--against", "session", "--components", "--subsurface", "local", "--json")
     lit = ("--view", "C03", "--light", "L017", "--out", "apart")
     assert run(folder, monkeypatch, *words, *lit) == 0

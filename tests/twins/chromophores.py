@@ -15,7 +15,7 @@ from model.color_table import ColorTable
 from reconstruction.arrays import Float64Array
 from reconstruction.chromophores.face_distribution import FaceDistribution
 from reconstruction.chromophores.shading_prior import ShadingPrior
-from reconstruction.chromophores.start import MIN_AXIS_FRACTION, evaluate, start_for
+from reconstruction.chromophores.start import MIN_AXIS_FRACTION, evaluate_table, inverse_table_for
 
 _MAX_STEPS = 200
 
@@ -41,7 +41,7 @@ def fit(
     tuple of ndarray
         C_m, C_hd, shading and the weighted square sum of log differences, each of shape (n,).
     """
-    start = start_for(table, free_shading)
+    start = inverse_table_for(table, free_shading)
     place = np.log(rgb) @ start.projection[:, :3].T + start.projection[:, 3]
     i, j = np.clip(np.rint(place), 0, start.axes.shape[0] - 1).astype(np.intp).T
     x = np.clip(start.axes[i, j].astype(np.float64), MIN_AXIS_FRACTION, 1.0)
@@ -76,7 +76,7 @@ def _linearise(
     rgb: Float64Array, table: ColorTable, x: Float64Array, free_shading: bool
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return shading, relative residuals and the color's relative derivatives at x."""
-    color, by_a, by_b = evaluate(table, x[:, 0], x[:, 1])
+    color, by_a, by_b = evaluate_table(table, x[:, 0], x[:, 1])
     residual = np.log(rgb / color)
     shading = np.ones(len(x))
     if free_shading:
@@ -123,7 +123,7 @@ def estimate(
     """
     edges = [np.linspace(MIN_AXIS_FRACTION, 1.0, count + 1) for count in size]
     a, b = np.meshgrid(*[0.5 * (edge[1:] + edge[:-1]) for edge in edges], indexing="ij")
-    residual = np.log(rgb / evaluate(table, a, b)[0])
+    residual = np.log(rgb / evaluate_table(table, a, b)[0])
     weights = np.linalg.inv(covariance)
     whole = weights.sum()
     shading = residual @ weights.sum(axis=0) / whole

@@ -75,7 +75,7 @@ def patterned_reflectance(
             "expected > 0, at least one photon a batch, at least 8"
         )
     coats = [
-        skin_layers.skin(wavelength_nm, float(m), float(h)).layers
+        skin_layers.skin_layer_stack(wavelength_nm, float(m), float(h)).layers
         for m, h in zip(melanin.ravel(), blood.ravel(), strict=True)
     ]
     absorption = np.array([[layer.sigma_a_per_mm for layer in layers] for layers in coats])

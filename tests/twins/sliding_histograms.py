@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray
 from model.facial_color.disc_statistics import half_widths
-from model.facial_color.histogram_matching import HistogramMatch, _at_share, _checked, _gather
+from model.facial_color.histogram_matching import HistogramMatch, _checked, _gather, _quantile
 
 
 def match_sliding(
@@ -69,4 +69,4 @@ def _match_pixels(a: Any, b: Any, va: Any, vb: Any, half: Any, out: Any) -> None
             for value in source:
                 below += value < a[y, x]
                 same += value == a[y, x]
-            out[y, x] = _at_share(wanted, (below + 0.5 * same) / source.size)
+            out[y, x] = _quantile(wanted, (below + 0.5 * same) / source.size)

@@ -6,14 +6,14 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from capture.acquire.flash.shot import Moment, power_of, set_light, shoot
+from capture.acquire.flash.shot import ShotTiming, flash_power, set_light, shoot
 from capture.acquire.outcome import (
     MAX_ATTEMPTS,
-    Acquired,
     AcquisitionError,
+    AcquisitionResult,
     CaptureRun,
     Operator,
-    refuse_step,
+    step_limit_error,
 )
 from capture.devices.flash import FlashBox, FlashReport
 from capture.plan import Plan, Step, Value
@@ -43,11 +43,11 @@ def run_sequence(run: CaptureRun, box: FlashBox, steps: Sequence[Step]) -> None:
     limits = run.plan.limits
     period_s = float(limits.get("prompt_period_s", 0.0))
     if period_s > 0:
-        rhythm: _Rhythm = _Prompted(run, steps, period_s)
+        rhythm: _ShotSchedule = _PromptedSchedule(run, steps, period_s)
     else:
-        rhythm = _Once(run, steps)
+        rhythm = _EventSchedule(run, steps)
     spacing_s = float(limits.get("shot_period_s", 0.0))
-    waiting = deque((step, 1) for step in rhythm.possible(steps))
+    waiting = deque((step, 1) for step in rhythm.feasible_steps(steps))
     free_s = -math.inf
     if waiting:
         set_light(waiting[0][0], box)
@@ -61,17 +61,17 @@ def run_sequence(run: CaptureRun, box: FlashBox, steps: Sequence[Step]) -> None:
         free_s = due_s + spacing_s
         count = f"{number}/{number + len(waiting)}"
         run.operator.progress(f"{count} {step.id} {step.kind} t={due_s:g} s")
-        moment = _Timed(run, box, step, rhythm, due_s, waiting[0][0] if waiting else None)
+        moment = _ScheduledShot(run, box, step, rhythm, due_s, waiting[0][0] if waiting else None)
         why = shoot(run, moment, f"{run.operator.run_id}.t{number}", attempt)
         if why:
             if attempt == MAX_ATTEMPTS:
-                raise run.given_up(f"step {step.id}", why)
-            waiting.extend(rhythm.again(step, attempt, why))
+                raise run.retry_limit_error(f"step {step.id}", why)
+            waiting.extend(rhythm.reschedule(step, attempt, why))
             if waiting:
                 set_light(waiting[0][0], box)
 
 
-class _Rhythm:
+class _ShotSchedule:
     """The time of a sequence, and what happens in it beside the shots."""
 
     block = 0
@@ -82,7 +82,7 @@ class _Rhythm:
         self.operator: Operator = run.operator
         self._zero = 0.0
 
-    def possible(self, steps: Sequence[Step]) -> list[Step]:
+    def feasible_steps(self, steps: Sequence[Step]) -> list[Step]:
         """Return the steps that can still be taken."""
         return list(steps)
 
@@ -93,7 +93,7 @@ class _Rhythm:
         """Return the sequence's time, s."""
         return self.operator.timer.monotonic() - self._zero
 
-    def since_zero(self, timer_s: float) -> float:
+    def to_sequence_time_s(self, timer_s: float) -> float:
         """Return the sequence's time at a reading of the timer, s."""
         return timer_s - self._zero
 
@@ -101,7 +101,7 @@ class _Rhythm:
         """Return when a step is to be taken, s; not before ``free_s`` where that can be helped."""
         return float(step.settings["start_s"])
 
-    def again(self, step: Step, attempt: int, why: str) -> list[tuple[Step, int]]:
+    def reschedule(self, step: Step, attempt: int, why: str) -> list[tuple[Step, int]]:
         """Return the step and its next attempt where it can be taken later, else nothing."""
         raise NotImplementedError
 
@@ -111,15 +111,15 @@ class _Rhythm:
             self.operator.timer.sleep(min(rest_s, MAX_SLEEP_S))
             self.operator.stop_if_asked()
 
-    def find_quiet(self, span_s: float) -> None:
+    def wait_for_gap(self, span_s: float) -> None:
         """Let time pass until nothing is due for a while, s."""
 
-    def noted_at(self, time_s: float) -> dict[str, Value]:
+    def journal_entries(self, time_s: float) -> dict[str, Value]:
         """Return what is to be noted of a shot at a time, s."""
         return {"time_s": time_s, "block": self.block}
 
 
-class _Prompted(_Rhythm):
+class _PromptedSchedule(_ShotSchedule):
     """A subject who changes with every prompt."""
 
     def __init__(self, run: CaptureRun, steps: Sequence[Step], period_s: float) -> None:
@@ -155,7 +155,7 @@ class _Prompted(_Rhythm):
         behind_s = max(free_s, self._first_s) - due_s
         return due_s + cycle_s * max(0, math.ceil(behind_s / cycle_s - TIME_ROUNDING_S))
 
-    def again(self, step: Step, attempt: int, why: str) -> list[tuple[Step, int]]:
+    def reschedule(self, step: Step, attempt: int, why: str) -> list[tuple[Step, int]]:
         return [(step, attempt + 1)]
 
     def wait(self, until_s: float) -> None:
@@ -167,20 +167,20 @@ class _Prompted(_Rhythm):
             self._next += 1
         super().wait(until_s)
 
-    def find_quiet(self, span_s: float) -> None:
+    def wait_for_gap(self, span_s: float) -> None:
         if (prompt_s := self._next * self._period_s) <= self.now_s() + span_s:
             self.wait(prompt_s)
 
-    def noted_at(self, time_s: float) -> dict[str, Value]:
+    def journal_entries(self, time_s: float) -> dict[str, Value]:
         before = [entry for entry in self._given if entry[0] <= time_s]
         onsets = [given_s for given_s, state in before if state == self._states[0]]
-        noted = super().noted_at(time_s)
+        noted = super().journal_entries(time_s)
         if onsets:
             noted |= {"phase_s": time_s - onsets[-1], "prompt": before[-1][1]}
         return noted
 
 
-class _Once(_Rhythm):
+class _EventSchedule(_ShotSchedule):
     """What follows an event, which happens once."""
 
     def __init__(self, run: CaptureRun, steps: Sequence[Step]) -> None:
@@ -194,11 +194,11 @@ class _Once(_Rhythm):
                 self._elapsed_s = self.operator.clock() - zero
                 self.block = max(self.block, int(record.line.actual["block"]) + 1)
 
-    def possible(self, steps: Sequence[Step]) -> list[Step]:
+    def feasible_steps(self, steps: Sequence[Step]) -> list[Step]:
         if self.block == 0:
             return list(steps)
         passed = [s.id for s in steps if float(s.settings["start_s"]) < self._elapsed_s]
-        self._leave_out(passed, "its time passed while the capture was interrupted")
+        self._omit_steps(passed, "its time passed while the capture was interrupted")
         return [step for step in steps if step.id not in passed]
 
     def begin(self) -> None:
@@ -206,17 +206,17 @@ class _Once(_Rhythm):
             self.operator.prompt(self._state)
         self._zero = self.operator.timer.monotonic() - self._elapsed_s
 
-    def again(self, step: Step, attempt: int, why: str) -> list[tuple[Step, int]]:
-        self._leave_out([step.id], f"failed at its time, which does not come again: {why}")
+    def reschedule(self, step: Step, attempt: int, why: str) -> list[tuple[Step, int]]:
+        self._omit_steps([step.id], f"failed at its time, which does not come again: {why}")
         return []
 
-    def _leave_out(self, ids: Sequence[str], why: str) -> None:
+    def _omit_steps(self, ids: Sequence[str], why: str) -> None:
         if ids:
             log.warning("steps %s: %s", ", ".join(ids), why)
-            self._run.leave_out(ids, why, {})
+            self._run.omit_steps(ids, why, {})
 
 
-class _Timed(Moment):
+class _ScheduledShot(ShotTiming):
     """One shot's time: waited for, kept, and compared with the box's."""
 
     def __init__(
@@ -224,14 +224,14 @@ class _Timed(Moment):
         run: CaptureRun,
         box: FlashBox,
         step: Step,
-        rhythm: _Rhythm,
+        rhythm: _ShotSchedule,
         due_s: float,
         then: Step | None,
     ) -> None:
         super().__init__(step, box)
         self._rhythm, self._due_s, self._then = rhythm, due_s, then
         views = [run.rig.view(name) for name in step.cameras]
-        self._charged_s = run.rig.recycle_s * power_of(step)
+        self._charged_s = run.rig.recycle_s * flash_power(step)
         self._busy_s = float(step.settings["exposure_s"])
         self._busy_s += max(view.shutter_lag_s + view.readout_s for view in views)
 
@@ -242,34 +242,34 @@ class _Timed(Moment):
         """Wait until the shot is due."""
         self._rhythm.wait(self._due_s)
 
-    def look(self, report: FlashReport | None) -> None:
+    def use_readout_time(self, report: FlashReport | None) -> None:
         """Find out when the flash popped; make the light ready for the next shot; go on in time."""
         timer = self._rhythm.operator.timer
         before = timer.monotonic()
         box_s = self.box.ping()
         after = timer.monotonic()
         popped_s = before if report is None else 0.5 * (before + after) - box_s + report.t_box_s
-        time_s = self._rhythm.since_zero(popped_s)
+        time_s = self._rhythm.to_sequence_time_s(popped_s)
         self.noted = {
-            **self._rhythm.noted_at(time_s),
+            **self._rhythm.journal_entries(time_s),
             "late_s": time_s - self._due_s,
             "time_error_s": 0.5 * (after - before),
         }
         if self._then is not None:
             # waiting for the charge would keep a prompt waiting, and so would the commands
             self._rhythm.wait(time_s + self._charged_s)
-            self._rhythm.find_quiet(COMMAND_LEAD_S)
+            self._rhythm.wait_for_gap(COMMAND_LEAD_S)
             set_light(self._then, self.box)
         self._rhythm.wait(time_s + self._busy_s - PROMPT_LEAD_S)
 
 
-def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> Acquired:
+def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> AcquisitionResult:
     """Capture what the session still lacks of a plan of the flash rig; see `run_plan`."""
     box: FlashBox = boxes["flash"]
     operator = run.operator
     _check_limits(run.plan, box.limits)
     lag_s = _sync_delay_s(run.rig, box.limits)
-    missing = run.steps_to_do()
+    missing = run.pending_steps()
     state: str | None = None
     try:
         box.dark()  # whatever was going on before
@@ -284,22 +284,22 @@ def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> Acquired:
                 operator.prompt(state)
             index = " ".join(f"{name}={value}" for name, value in step.index.items())
             operator.progress(f"{number}/{len(missing)} {step.id} {step.kind} {index}")
-            _take(run, box, step, f"{operator.run_id}.{number}")
+            _take_step(run, box, step, f"{operator.run_id}.{number}")
         if timed := [step for step in missing if "start_s" in step.settings]:
             run_sequence(run, box, timed)
     finally:
         run.tear_down(box)
-    return run.account()
+    return run.summarize()
 
 
-def _take(run: CaptureRun, box: FlashBox, step: Step, prefix: str) -> None:
+def _take_step(run: CaptureRun, box: FlashBox, step: Step, prefix: str) -> None:
     """Take one step; it is shot again where it failed."""
     why = ""
     for attempt in range(1, MAX_ATTEMPTS + 1):
-        why = shoot(run, Moment(step, box), prefix, attempt)
+        why = shoot(run, ShotTiming(step, box), prefix, attempt)
         if not why:
             return
-    raise run.given_up(f"step {step.id}", why)
+    raise run.retry_limit_error(f"step {step.id}", why)
 
 
 def _check_limits(plan: Plan, limits: Mapping[str, Any]) -> None:
@@ -313,11 +313,11 @@ def _check_limits(plan: Plan, limits: Mapping[str, Any]) -> None:
             continue
         if not low <= power <= high:
             what = f"got power {power:g}, the box allows {low:g} to {high:g}"
-            raise refuse_step(step, what, done="fired")
+            raise step_limit_error(step, what, action="fired")
         angle_deg = float(step.settings.get("analyser_deg", first))
         if not first <= angle_deg <= last:
             what = f"got analyser_deg {angle_deg:g}, the box allows {first:g} to {last:g}"
-            raise refuse_step(step, what, done="fired")
+            raise step_limit_error(step, what, action="fired")
 
 
 def _sync_delay_s(rig: Rig, limits: Mapping[str, Any]) -> float:

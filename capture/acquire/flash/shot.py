@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Mapping
 
-from capture.acquire.frames import arm_cameras, collect, frame_timeout_s, wanted_exposure
+from capture.acquire.frames import arm_cameras, collect_frames, frame_timeout_s, requested_exposure
 from capture.acquire.outcome import CaptureRun, require_trigger_line
 from capture.devices.camera import Camera, CameraError, Frame, FrameRefused, FrameTimeout, Trigger
 from capture.devices.flash import FlashBox, FlashReport
@@ -18,7 +18,7 @@ MAX_TOKEN_CHARS = 48
 """Characters of the longest token that a box takes."""
 
 
-class Moment:
+class ShotTiming:
     """One shot's time: before it, at it, and while the cameras read out; here at once."""
 
     def __init__(self, step: Step, box: FlashBox) -> None:
@@ -32,11 +32,11 @@ class Moment:
     def wait(self) -> None:
         """Wait until the shot is due; all is ready but the flash not armed."""
 
-    def look(self, report: FlashReport | None) -> None:
+    def use_readout_time(self, report: FlashReport | None) -> None:
         """Use the time while the cameras read out; the report is what the box says of the flash."""
 
 
-def shoot(run: CaptureRun, moment: Moment, prefix: str, attempt: int) -> str:
+def shoot(run: CaptureRun, timing: ShotTiming, prefix: str, attempt: int) -> str:
     """Take a step with all its cameras and keep it, or none: one bad frame spoils the step.
 
     Parameters
@@ -55,40 +55,40 @@ def shoot(run: CaptureRun, moment: Moment, prefix: str, attempt: int) -> str:
     str
         Why the step can be tried again; nothing where it is kept.
     """
-    step = moment.step
+    step = timing.step
     try:
-        moment.prepare()
+        timing.prepare()
         # run, number in the run, try; then as much of the step as a box takes
         token = f"{prefix}.{attempt}.{step.id}"[:MAX_TOKEN_CHARS]
-        report, frames = _expose(run, moment, token)
+        report, frames = _expose(run, timing, token)
     except (FrameRefused, FrameTimeout, CommandRefused) as error:
         if isinstance(error, CommandRefused) and error.code != Code.HARDWARE:
             raise
-        why = run.missed(step, attempt, error)
-        _let_go(run, step, error)
+        why = run.note_retake(step, attempt, error)
+        _abort_cameras(run, step, error)
         return why
-    light = _light_of(report)
-    run.keep(
+    light = _describe_light(report)
+    run.commit_frames(
         step,
         frames,
         light=light,
         tries=attempt,
         t_box_s=None if report is None else float(report.t_box_s),
-        noted={**light, **moment.noted},
+        journal_entries={**light, **timing.noted},
     )
     return ""
 
 
 def _expose(
-    run: CaptureRun, moment: Moment, token: str
+    run: CaptureRun, timing: ShotTiming, token: str
 ) -> tuple[FlashReport | None, dict[str, Frame]]:
     """Set the cameras, make the exposure, and collect one frame a camera; the light is set."""
-    step, box = moment.step, moment.box
-    want, chosen = wanted_exposure(step), run.cameras_of(step)
-    lit = power_of(step) > 0
-    triggers = {name: _parse_trigger(name, camera, lit) for name, camera in chosen.items()}
+    step, box = timing.step, timing.box
+    want, chosen = requested_exposure(step), run.step_cameras(step)
+    lit = flash_power(step) > 0
+    triggers = {name: _choose_trigger(name, camera, lit) for name, camera in chosen.items()}
     armed_s = arm_cameras(chosen, want, triggers)
-    moment.wait()
+    timing.wait()
     for name, camera in chosen.items():
         if triggers[name] is Trigger.SOFTWARE:
             camera.fire()
@@ -109,13 +109,13 @@ def _expose(
                 f"at {want.exposure_s:g} s and ISO {want.iso}, without any light; within "
                 f"{SHUTTER_PRESS_TIMEOUT_S:g} s"
             )
-    moment.look(report)
-    frames, stale = collect(chosen, want, armed_s, timeouts_s)
+    timing.use_readout_time(report)
+    frames, stale = collect_frames(chosen, want, armed_s, timeouts_s)
     run.stale += stale
     return report, frames
 
 
-def _parse_trigger(name: str, camera: Camera, lit: bool) -> Trigger:
+def _choose_trigger(name: str, camera: Camera, lit: bool) -> Trigger:
     """Return what releases a camera for a step: the box where there is light to meet."""
     if not lit:
         for trigger in (Trigger.SOFTWARE, Trigger.EDGE, Trigger.HAND):
@@ -130,7 +130,7 @@ def _parse_trigger(name: str, camera: Camera, lit: bool) -> Trigger:
     return Trigger.EDGE
 
 
-def _light_of(report: FlashReport | None) -> dict[str, Value]:
+def _describe_light(report: FlashReport | None) -> dict[str, Value]:
     """Which light made a frame: what the box acknowledged, not what was asked for."""
     if report is None:
         return {"light": "none", "power": 0.0}
@@ -143,26 +143,26 @@ def _light_of(report: FlashReport | None) -> dict[str, Value]:
     }
 
 
-def power_of(step: Step) -> float:
+def flash_power(step: Step) -> float:
     """Return the power of a step's flash, 0 for none."""
     return 0.0 if step.kind == "dark" else float(step.settings.get("power", 1.0))
 
 
 def set_light(step: Step, box: FlashBox) -> None:
     """Turn the analyser, set the power, and wait until the flash could pop."""
-    power = power_of(step)
+    power = flash_power(step)
     if power > 0:
         if "analyser_deg" in step.settings:
-            box.set_analyser(float(step.settings["analyser_deg"]))
+            box.set_analyzer(float(step.settings["analyser_deg"]))
         else:
             box.set_polarizer(str(step.settings["polarizer"]))
         box.set_power(power)
         box.wait_charged(CHARGE_TIMEOUT_S)
 
 
-def _let_go(run: CaptureRun, step: Step, error: Exception) -> None:
+def _abort_cameras(run: CaptureRun, step: Step, error: Exception) -> None:
     """Make the cameras of a step that failed ready for the next one."""
-    for name, camera in run.cameras_of(step).items():
+    for name, camera in run.step_cameras(step).items():
         if isinstance(error, CommandRefused):
             # a misfire has pulsed the camera line: a dark frame is being read out, and
             # until it has come the camera would miss the next pulse

@@ -3,21 +3,21 @@
 from collections.abc import Mapping
 from typing import Any
 
-from capture.acquire.dome import begin_lit_run, check_dwell, check_safety, too_long
-from capture.acquire.gradient.skin_states import SkinStates, let_go
+from capture.acquire.dome import begin_lit_run, check_dwell, check_safety, row_overrun_error
+from capture.acquire.gradient.skin_states import SkinStates, release_skin
 from capture.acquire.outcome import (
-    Acquired,
     AcquisitionError,
+    AcquisitionResult,
     CaptureRun,
-    refuse_step,
     require_trigger_line,
+    step_limit_error,
 )
-from capture.acquire.pattern_scan import Scanner, reading_deg
+from capture.acquire.pattern_scan import PatternScanner, analyzer_reading_deg
 from capture.devices.caliper import CaliperBox
 from capture.devices.gradient_sphere import GradientSphereBox
 from capture.plan import Plan
-from capture.plan.gradient import state_of
-from capture.plan.rows import passes
+from capture.plan.gradient import strain_state
+from capture.plan.rows import split_passes
 from capture.rig import Rig
 
 
@@ -48,12 +48,12 @@ def check_sphere(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
         views = [rig.view(name) for name in step.cameras]
         over_s = max(view.shutter_lag_s + view.readout_s for view in views) + exposure_s
         if settle_s + exposure_s > dwell_s or over_s > dwell_s:
-            raise too_long(step, dwell_s)
-        angle_deg = reading_deg(step)
+            raise row_overrun_error(step, dwell_s)
+        angle_deg = analyzer_reading_deg(step)
         if not low_deg <= angle_deg <= high_deg:
             what = f"got analyser_deg {angle_deg:g}, the box turns from {low_deg:g} to {high_deg:g}"
-            raise refuse_step(step, what)
-    longest = max(len(piece) for piece in passes(plan.steps))
+            raise step_limit_error(step, what)
+    longest = max(len(piece) for piece in split_passes(plan.steps))
     if longest > int(limits["max_rows"]):
         raise AcquisitionError(
             f"plan: a scan has {longest} patterns, the box holds {limits['max_rows']}; nothing "
@@ -75,7 +75,7 @@ def check_caliper(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
     known = [float(angle) for angle in limits["angles_deg"]]
     low, high = int(limits["step_min"]), int(limits["step_max"])
     for step in plan.steps:
-        if state_of(step) is None:
+        if strain_state(step) is None:
             continue
         angle, position = float(step.index["angle"]), int(step.index["caliper"])
         if angle not in known or not low <= position <= high:
@@ -104,12 +104,12 @@ def check_force(limit_n: float | None, limits: Mapping[str, Any]) -> None:
 SPHERE_LEASE_S = 2.0
 
 
-def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> Acquired:
+def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> AcquisitionResult:
     """Capture what the session still lacks of a plan of the gradient sphere; see `run_plan`.
 
     Everything that can be refused is, before anything is lit or moves.
     """
-    skin = any(state_of(step) is not None for step in run.plan.steps)
+    skin = any(strain_state(step) is not None for step in run.plan.steps)
     sphere: GradientSphereBox = boxes["gradient_sphere"]
     caliper: CaliperBox | None = boxes.get("caliper") if skin else None
     check_eyes(run, skin=skin)
@@ -122,16 +122,18 @@ def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> Acquired:
             raise AcquisitionError("box 'caliper': no port was given; add --port caliper=URL")
         check_caliper(run.plan, run.rig, caliper.limits)
         check_force(run.force_limit_n, caliper.limits)
-    scanner = Scanner(run, sphere, caliper.ping if caliper is not None else lambda: None)
+    scanner = PatternScanner(run, sphere, caliper.ping if caliper is not None else lambda: None)
     try:
         begin_lit_run(run, sphere, SPHERE_LEASE_S)
-        for piece in passes([step for step in run.steps_to_do() if state_of(step) is None]):
+        for piece in split_passes(
+            [step for step in run.pending_steps() if strain_state(step) is None]
+        ):
             run.operator.stop_if_asked()
             scanner.commit(scanner.scan(piece), {})
         if caliper is not None and run.force_limit_n is not None:
             SkinStates(run, caliper, scanner, run.force_limit_n).scan()
     finally:
         if caliper is not None:
-            let_go(caliper)
+            release_skin(caliper)
         run.tear_down(sphere)
-    return run.account(sphere.failed_leds)
+    return run.summarize(sphere.failed_leds)

@@ -14,13 +14,13 @@ from itertools import groupby
 from typing import Literal, cast
 
 from capture.acquire.outcome import MAX_ATTEMPTS, AcquisitionError, CaptureRun
-from capture.acquire.pattern_scan import Scanner, Taken
+from capture.acquire.pattern_scan import PatternScanner, StepFrames
 from capture.devices.caliper import CaliperBox, MoveReport
 from capture.devices.port import CommandRefused, DeviceError
 from capture.devices.wire import Code
 from capture.plan import Plan, Step, Value
-from capture.plan.gradient import state_name, state_of
-from capture.plan.rows import passes
+from capture.plan.gradient import state_name, strain_state
+from capture.plan.rows import split_passes
 from capture.rig import Caliper
 from capture.session import Session
 
@@ -39,7 +39,7 @@ _END_DESCRIPTIONS: dict[EndKind, str] = {
 
 
 @dataclass(frozen=True, slots=True)
-class End:
+class BranchEnd:
     """Where a way ended."""
 
     kind: EndKind
@@ -51,7 +51,7 @@ class End:
     """Force then, N."""
 
 
-class EndOfSkin(Exception):
+class StrainLimitReached(Exception):
     """Skin cannot be moved further this way.
 
     Attributes
@@ -59,14 +59,14 @@ class EndOfSkin(Exception):
     end : End
     """
 
-    def __init__(self, end: End) -> None:
+    def __init__(self, end: BranchEnd) -> None:
         super().__init__(
             f"{_END_DESCRIPTIONS[end.kind]} at {end.reading_mm:.2f} mm ({end.force_n:+.3f} N)"
         )
         self.end = end
 
 
-class ForceWatch:
+class ForceMonitor:
     """Follows the force step by step one way from neutral.
 
     Parameters
@@ -100,9 +100,13 @@ class ForceWatch:
             Where this is one too far.
         """
         if report.ended == "detached":
-            raise EndOfSkin(End("detached", position, report.reading_mm, report.force_n))
+            raise StrainLimitReached(
+                BranchEnd("detached", position, report.reading_mm, report.force_n)
+            )
         if report.ended == "force":
-            raise EndOfSkin(End("force", position, report.reading_mm, report.force_n))
+            raise StrainLimitReached(
+                BranchEnd("force", position, report.reading_mm, report.force_n)
+            )
         if self._direction > 0:
             return
         pushes = self._pushes
@@ -116,7 +120,7 @@ class ForceWatch:
         # of two steps the first may already be on the plateau
         early = growth < PLATEAU_FORCE_RATIO * before and len(pushes) > 3
         first = position + 1 if early else position
-        raise EndOfSkin(End("buckled", first, report.reading_mm, force_n))
+        raise StrainLimitReached(BranchEnd("buckled", first, report.reading_mm, force_n))
 
 
 log = logging.getLogger(__name__)
@@ -126,12 +130,12 @@ CALIPER_LEASE_S = 5.0
 N_FORCE_READINGS = 8
 
 
-class _LetGo(Exception):
+class _SkinReleased(Exception):
     """The skin was let go though nothing ended; it can be taped again."""
 
 
 @dataclass(frozen=True, slots=True)
-class _State:
+class _StrainState:
     """A state of the skin that is to be scanned."""
 
     angle_deg: float
@@ -147,29 +151,29 @@ class SkinStates:
     """The states of one run: what is held, how far it went, what is left."""
 
     def __init__(
-        self, run: CaptureRun, caliper: CaliperBox, scanner: Scanner, force_limit_n: float
+        self, run: CaptureRun, caliper: CaliperBox, scanner: PatternScanner, force_limit_n: float
     ) -> None:
         self._run, self._session, self._operator = run, run.session, run.operator
         self._caliper, self._scanner = caliper, scanner
         self._drawn = cast(Caliper, run.rig.caliper)
         self._force_limit_n = force_limit_n
-        self._states = list(_states(run.session.plan))
-        self._attachment = _attachments_so_far(run.session)
+        self._states = list(_group_states(run.session.plan))
+        self._attachment = _count_attachments(run.session)
         self._position = 0
         self._reading_mm = self._force_n = 0.0
 
     def scan(self) -> None:
         """Scan what is missing, angle by angle, in the plan's order."""
         for angle_deg in dict.fromkeys(state.angle_deg for state in self._states):
-            self._angle(angle_deg)
+            self._complete_angle(angle_deg)
 
-    def _missing(self, angle_deg: float) -> list[_State]:
+    def _find_missing_states(self, angle_deg: float) -> list[_StrainState]:
         """Return the states of an angle that are not there, or not from one taping."""
-        left_out = self._session.left_out()
+        left_out = self._session.omitted_steps()
         frames: dict[str, set[object]] = {}
         for record in self._session.frames("gradient"):
             frames.setdefault(record.step_id, set()).add(record.actual.get("attachment"))
-        undone = {step.id for step in self._run.steps_to_do()}
+        undone = {step.id for step in self._run.pending_steps()}
         found = []
         for state in self._states:
             ids = [step.id for step in state.steps]
@@ -180,23 +184,23 @@ class SkinStates:
                 found.append(state)
         return found
 
-    def _angle(self, angle_deg: float) -> None:
+    def _complete_angle(self, angle_deg: float) -> None:
         """Scan an angle's states; tape the skin again where it was let go."""
-        before, tries = len(self._missing(angle_deg)), 0
+        before, tries = len(self._find_missing_states(angle_deg)), 0
         why = ""
-        while missing := self._missing(angle_deg):
+        while missing := self._find_missing_states(angle_deg):
             tries = tries + 1 if len(missing) == before else 1
             before = len(missing)
             if tries > MAX_ATTEMPTS:
-                raise self._run.given_up(f"state {missing[0].name}", why)
+                raise self._run.retry_limit_error(f"state {missing[0].name}", why)
             try:
                 self._attach(angle_deg)
                 self._scan_angle(angle_deg)
-            except _LetGo as stop:
+            except _SkinReleased as stop:
                 why = str(stop)
                 log.warning("%s; the skin is taped again", why)
             finally:
-                let_go(self._caliper)
+                release_skin(self._caliper)
 
     def _attach(self, angle_deg: float) -> None:
         """Bring empty jaws to step 0 at an angle and have a person tape them to the skin."""
@@ -229,25 +233,25 @@ class SkinStates:
         for state in self._states:
             if (state.angle_deg, state.position) != (angle_deg, 0):
                 continue
-            if state in self._missing(angle_deg):
-                self._take(state, "reached")
+            if state in self._find_missing_states(angle_deg):
+                self._scan_state(state, "reached")
             else:
-                self._picture_neutral(state)
+                self._photograph_neutral(state)
         for direction in (-1, 1):
-            self._branch(angle_deg, direction)
+            self._scan_branch(angle_deg, direction)
 
-    def _branch(self, angle_deg: float, direction: int) -> None:
+    def _scan_branch(self, angle_deg: float, direction: int) -> None:
         """Walk from neutral as far as states are missing, or as the skin lets itself be moved."""
         wanted = {
             state.position: state
-            for state in self._missing(angle_deg)
+            for state in self._find_missing_states(angle_deg)
             if state.position * direction > 0
         }
         if not wanted:
             return
         if self._position != 0:
             self._move(0)
-        watch = ForceWatch(self._drawn, direction, at_rest_n=self._force_n)
+        watch = ForceMonitor(self._drawn, direction, at_rest_n=self._force_n)
         farthest = max(wanted, key=abs)
         for position in range(direction, farthest + direction, direction):
             self._operator.stop_if_asked()
@@ -255,24 +259,26 @@ class SkinStates:
                 report = self._move(position)
                 watch.check(position, report, self._force_n)
                 if position in wanted:
-                    self._take(wanted[position], report.ended)
-            except EndOfSkin as end:
-                self._leave_out(angle_deg, direction, end)
+                    self._scan_state(wanted[position], report.ended)
+            except StrainLimitReached as end:
+                self._omit_states(angle_deg, direction, end)
                 break
-        if not self._caliper.attached() and self._missing(angle_deg):
-            raise _LetGo("the skin came off")
+        if not self._caliper.is_attached() and self._find_missing_states(angle_deg):
+            raise _SkinReleased("the skin came off")
 
     def _move(self, position: int) -> MoveReport:
-        """Move, and let the skin creep; raise `_LetGo` where it was let go for another reason."""
+        """Move and let the skin creep; raise `_SkinReleased` after any other release."""
         try:
-            self._scanner.turn_to(self._states[0].steps[0])  # while the jaws are on their way
+            self._scanner.rotate_analyzer(
+                self._states[0].steps[0]
+            )  # while the jaws are on their way
             report = self._caliper.move_to(position)
         except CommandRefused as error:
             if error.code not in (Code.WATCHDOG_TRIPPED, Code.NOT_ARMED):
                 raise
-            raise _LetGo(str(error)) from error
+            raise _SkinReleased(str(error)) from error
         if report.ended in ("stopped", "stall", "no_home"):
-            raise _LetGo(f"position {position}: the move ended as {report.ended!r}")
+            raise _SkinReleased(f"position {position}: the move ended as {report.ended!r}")
         self._position = report.step
         if report.ended == "reached":
             self._settle(report.reading_mm)
@@ -283,25 +289,27 @@ class SkinStates:
         readings = [self._caliper.force_n() for _ in range(N_FORCE_READINGS)]
         self._reading_mm, self._force_n = reading_mm, sum(readings) / len(readings)
 
-    def _take(self, state: _State, ended: str) -> None:
+    def _scan_state(self, state: _StrainState, ended: str) -> None:
         """Scan a state and commit it when it was held to the end."""
         self._operator.progress(
             f"{state.name}: {self._reading_mm:.2f} mm, {self._force_n:+.3f} N, {ended}"
         )
-        taken: list[Taken] = []
-        for piece in passes(state.steps):
+        taken: list[StepFrames] = []
+        for piece in split_passes(state.steps):
             taken += self._scanner.scan(piece)
-        self._still_held(state.position)
+        self._check_held(state.position)
         self._scanner.commit(taken, self._actual(ended))
 
-    def _still_held(self, position: int) -> None:
+    def _check_held(self, position: int) -> None:
         """Raise where the skin was lost while it was scanned."""
-        if self._caliper.attached():
+        if self._caliper.is_attached():
             return
         status = self._caliper.status()
         if position == 0 or status.tripped or status.stopped or not status.armed:
-            raise _LetGo(f"position {position}: the caliper let the skin go while it was scanned")
-        raise EndOfSkin(End("detached", position, self._reading_mm, self._force_n))
+            raise _SkinReleased(
+                f"position {position}: the caliper let the skin go while it was scanned"
+            )
+        raise StrainLimitReached(BranchEnd("detached", position, self._reading_mm, self._force_n))
 
     def _actual(self, ended: str) -> dict[str, Value]:
         return {
@@ -311,17 +319,17 @@ class SkinStates:
             "attachment": self._attachment,
         }
 
-    def _picture_neutral(self, neutral: _State) -> None:
+    def _photograph_neutral(self, neutral: _StrainState) -> None:
         """Attach one picture of newly taped neutral skin, by which tapings can be compared."""
         step = next((s for s in neutral.steps if s.settings["pattern"] == "full"), neutral.steps[0])
         (one,) = self._scanner.scan([step])
-        self._still_held(0)
+        self._check_held(0)
         number = "" if len(one.frames) == 1 else "{}-"
         for name in one.frames:
             file = f"neutral-a{round(neutral.angle_deg):03d}-{number.format(name)}"
             self._session.attach(
                 f"{file}{self._attachment}.dng",
-                self._scanner.encoded(one, name),
+                self._scanner.encode_frame(one, name),
                 about={
                     "kind": "neutral skin, taped again",
                     "state": neutral.name,
@@ -331,9 +339,9 @@ class SkinStates:
                 },
             )
 
-    def _leave_out(self, angle_deg: float, direction: int, end: EndOfSkin) -> None:
+    def _omit_states(self, angle_deg: float, direction: int, end: StrainLimitReached) -> None:
         """Note in the session that this way goes no further."""
-        left_out = self._session.left_out()
+        left_out = self._session.omitted_steps()
         first = direction * end.end.position
         ids = [
             step.id
@@ -354,26 +362,26 @@ class SkinStates:
                 "force_n": end.end.force_n,
                 "attachment": self._attachment,
             }
-            self._run.leave_out(ids, reason, about)
+            self._run.omit_steps(ids, reason, about)
 
 
-def _states(plan: Plan) -> Iterator[_State]:
-    for name, group in groupby(plan.steps, key=state_of):
+def _group_states(plan: Plan) -> Iterator[_StrainState]:
+    for name, group in groupby(plan.steps, key=strain_state):
         if name is not None:
             steps = tuple(group)
             index = steps[0].index
-            yield _State(float(index["angle"]), int(index["caliper"]), steps)
+            yield _StrainState(float(index["angle"]), int(index["caliper"]), steps)
 
 
-def _attachments_so_far(session: Session) -> int:
+def _count_attachments(session: Session) -> int:
     """Return how often the skin was taped before, as far as anything came of it."""
     lines = [session.attachment_line(name).about for name in session.attachments()]
     lines += [record.actual for record in session.frames("gradient")]
-    lines += [session.left_out_line(step).about for step in session.left_out()]
+    lines += [session.omission_line(step).about for step in session.omitted_steps()]
     return max((int(line.get("attachment", 0)) for line in lines), default=0)
 
 
-def let_go(caliper: CaliperBox) -> None:
+def release_skin(caliper: CaliperBox) -> None:
     """Release the skin and disarm; nothing here hides the error that led here."""
     try:
         caliper.dark()

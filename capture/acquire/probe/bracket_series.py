@@ -17,13 +17,13 @@ from capture.acquire.outcome import MAX_ATTEMPTS, CaptureRun
 from capture.acquire.probe.fiber_signal import (
     FiberSignal,
     describe_fibers,
-    masks_not_needed,
-    why_enough,
+    find_unneeded_masks,
+    stop_reason,
 )
-from capture.acquire.probe.head import Head, HeadLost, NotHeld
+from capture.acquire.probe.head import Head, HeadLost, HoldOutOfTolerance
 from capture.acquire.probe.source_exposure import (
-    Exposed,
     ShutterFault,
+    SourceExposure,
     expose,
     expose_dark,
     readout_s,
@@ -31,8 +31,8 @@ from capture.acquire.probe.source_exposure import (
 from capture.devices.camera import Frame, FrameRefused, FrameTimeout
 from capture.devices.probe import ProbeBox
 from capture.plan import Step, Value
-from capture.plan.probe import all_series
-from capture.plan.suction import Placement
+from capture.plan.probe import group_by_series
+from capture.plan.suction import HeadPlacement
 from capture.rig import Probe
 from capture.session import Session
 
@@ -40,10 +40,10 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class _Taken:
+class _TakenExposure:
     """An exposure that is to be kept."""
 
-    exposed: Exposed
+    exposed: SourceExposure
     actual: dict[str, Value]
     tries: int
 
@@ -55,7 +55,7 @@ class BracketSeries:
         self._run, self._session, self._operator = run, run.session, run.operator
         self._box = box
         self._probe: Probe = run.rig.probe  # type: ignore[assignment]
-        placements = _placements_so_far(run.session)
+        placements = _count_placements(run.session)
         self._head = Head(self._probe, box, run.operator, placements=placements)
         self._tokens = 0
 
@@ -63,7 +63,7 @@ class BracketSeries:
 
     def darks(self) -> None:
         """Take the frames without light that are missing, with the head capped."""
-        missing = [step for step in self._run.steps_to_do() if step.kind == "dark"]
+        missing = [step for step in self._run.pending_steps() if step.kind == "dark"]
         if missing:
             self._head.cap()
             self._box.cover(None)
@@ -71,9 +71,9 @@ class BracketSeries:
             self._operator.stop_if_asked()
             seconds = float(step.settings["exposure_s"])
             self._operator.progress(f"dark {number}/{len(missing)} {step.id} {seconds:.3g} s")
-            self._keep(self._dark(step), {})
+            self._commit_exposure(self._take_dark(step), {})
 
-    def _dark(self, step: Step) -> _Taken:
+    def _take_dark(self, step: Step) -> _TakenExposure:
         why = ""
         for attempt in range(1, MAX_ATTEMPTS + 1):
             before_c = self._head.temperature_c()
@@ -83,62 +83,66 @@ class BracketSeries:
             try:
                 exposed = expose_dark(self._run, self._box, step, token=token)
             except (FrameRefused, FrameTimeout) as error:
-                why = self._not_taken(step, attempt, error)
+                why = self._note_retake(step, attempt, error)
                 continue
             if not self._box.status().placed:
-                why = self._not_taken(step, attempt, ShutterFault("the box has let go of the cap"))
+                why = self._note_retake(
+                    step, attempt, ShutterFault("the box has let go of the cap")
+                )
                 continue
             after_c = self._head.temperature_c()
             actual: dict[str, Value] = {"light": "none", "camera_c": 0.5 * (before_c + after_c)}
-            return _Taken(exposed, actual, attempt)
-        raise self._run.given_up(f"step {step.id}", why)
+            return _TakenExposure(exposed, actual, attempt)
+        raise self._run.retry_limit_error(f"step {step.id}", why)
 
     # series -----------------------------------------------------------------------------------
 
     def run(self) -> None:
         """Take the series that are missing, in the plan's order, with the head placed as needed."""
-        for placement, steps in all_series(self._session.plan):
+        for placement, steps in group_by_series(self._session.plan):
             if steps[0].kind == "mask" and not self._run.all_brackets:
-                self._leave_out(*masks_not_needed(self._session))
+                self._omit_steps(*find_unneeded_masks(self._session))
             if self._is_missing(steps):
-                self._series(placement, steps)
+                self._complete_series(placement, steps)
 
     def _is_missing(self, steps: Sequence[Step]) -> bool:
         """Tell whether a series lacks frames, or has some of several placements."""
-        left_out = self._session.left_out()
+        left_out = self._session.omitted_steps()
         ids = {step.id for step in steps if step.id not in left_out}
         found = [record for record in self._session.frames() if record.step_id in ids]
         placements = {record.actual.get("placement") for record in found}
         return bool(ids) and ({record.step_id for record in found} != ids or len(placements) != 1)
 
-    def _series(self, placement: Placement, steps: Sequence[Step]) -> None:
-        left_out = self._session.left_out()
+    def _complete_series(self, placement: HeadPlacement, steps: Sequence[Step]) -> None:
+        left_out = self._session.omitted_steps()
         wanted = [step for step in steps if step.id not in left_out]
         for attempt in range(1, MAX_ATTEMPTS + 1):
             try:
-                taken, reason = self._once(placement, wanted)
+                taken, reason = self._take_series(placement, wanted)
             except HeadLost as lost:
                 log.warning("%s, placement %d: %s", placement, attempt, lost)
                 why = str(lost)
-                self._head.lost(why)
+                self._head.note_loss(why)
                 self._run.retakes += 1
                 continue
             for one in taken:
-                self._keep(one, {"placement": self._head.placements})
-            self._leave_out(wanted[len(taken) :], reason)
+                self._commit_exposure(one, {"placement": self._head.placements})
+            self._omit_steps(wanted[len(taken) :], reason)
             return
-        raise self._head.refusal(placement, why, captured=bool(self._session.frames()))
+        raise self._head.placement_error(placement, why, captured=bool(self._session.frames()))
 
-    def _once(self, placement: Placement, wanted: Sequence[Step]) -> tuple[list[_Taken], str]:
+    def _take_series(
+        self, placement: HeadPlacement, wanted: Sequence[Step]
+    ) -> tuple[list[_TakenExposure], str]:
         """Take a series of one placement; return it, and why the rest of it is not needed."""
         signal = FiberSignal(self._probe, self._run.rig.view(wanted[0].cameras[0]))
-        taken: list[_Taken] = []
-        self._head.at(placement)
+        taken: list[_TakenExposure] = []
+        self._head.require_placement(placement)
         fibre = wanted[0].settings.get("fibre")
         self._box.cover(None if fibre is None else int(fibre))
         for number, step in enumerate(wanted):
             self._operator.stop_if_asked()
-            taken.append(self._exposure(placement, step))
+            taken.append(self._take_exposure(placement, step))
             exposed, actual = taken[-1].exposed, taken[-1].actual
             self._operator.progress(
                 f"{placement}: {number + 1}/{len(wanted)} {step.id} "
@@ -149,14 +153,14 @@ class BracketSeries:
             if fibre is not None:
                 continue
             first = exposed.frames[step.cameras[0]]
-            signal.look(_pixels(first, step), float(step.settings["exposure_s"]))
+            signal.add_exposure(_pixels(first, step), float(step.settings["exposure_s"]))
             if not left:
-                self._tell_what_is_missing(placement, signal)
-            elif not self._run.all_brackets and (reason := why_enough(signal, step, left)):
+                self._report_missing_fibers(placement, signal)
+            elif not self._run.all_brackets and (reason := stop_reason(signal, step, left)):
                 return taken, f"{placement}: {reason}"
         return taken, ""
 
-    def _exposure(self, placement: Placement, step: Step) -> _Taken:
+    def _take_exposure(self, placement: HeadPlacement, step: Step) -> _TakenExposure:
         """Take one exposure with the head held before and after, or take it again."""
         why = ""
         needs_s = float(step.settings["exposure_s"]) + readout_s(self._run, step)
@@ -168,14 +172,14 @@ class BracketSeries:
                 before_mbar, before_c = self._head.readings()
                 exposed = expose(self._run, self._box, step)
                 after_mbar, after_c = self._head.readings()
-            except NotHeld as error:
-                why, held = self._not_taken(step, attempt, error), False
+            except HoldOutOfTolerance as error:
+                why, held = self._note_retake(step, attempt, error), False
                 continue
             except HeadLost:
                 self._drop_frames(step)
                 raise
             except (FrameRefused, FrameTimeout) as error:
-                why, held = self._not_taken(step, attempt, error), True
+                why, held = self._note_retake(step, attempt, error), True
                 continue
             actual: dict[str, Value] = {
                 "light": "source",
@@ -189,22 +193,22 @@ class BracketSeries:
             }
             if "fibre" in step.settings:
                 actual["fibre"] = step.settings["fibre"]
-            return _Taken(exposed, actual, attempt)
+            return _TakenExposure(exposed, actual, attempt)
         if held:
-            raise self._run.given_up(f"step {step.id}", why)
-        raise self._head.refusal(placement, why, captured=bool(self._session.frames()))
+            raise self._run.retry_limit_error(f"step {step.id}", why)
+        raise self._head.placement_error(placement, why, captured=bool(self._session.frames()))
 
-    def _not_taken(self, step: Step, attempt: int, error: Exception) -> str:
+    def _note_retake(self, step: Step, attempt: int, error: Exception) -> str:
         self._drop_frames(step)
-        return self._run.missed(step, attempt, error)
+        return self._run.note_retake(step, attempt, error)
 
     def _drop_frames(self, step: Step) -> None:
-        for camera in self._run.cameras_of(step).values():
+        for camera in self._run.step_cameras(step).values():
             camera.abort()
 
     # what is not needed -----------------------------------------------------------------------
 
-    def _tell_what_is_missing(self, placement: Placement, signal: FiberSignal) -> None:
+    def _report_missing_fibers(self, placement: HeadPlacement, signal: FiberSignal) -> None:
         """Say of a whole series which fibres it does not show."""
         verdict = signal.verdict([])
         for pairs, what in (
@@ -216,26 +220,26 @@ class BracketSeries:
                     f"{placement}: {describe_fibers(pairs, signal.probe)} {what}"
                 )
 
-    def _leave_out(self, steps: Sequence[Step], reason: str) -> None:
+    def _omit_steps(self, steps: Sequence[Step], reason: str) -> None:
         if not steps:
             return
         self._operator.progress(reason)
         log.info(reason)
-        self._run.leave_out([step.id for step in steps], reason, {})
+        self._run.omit_steps([step.id for step in steps], reason, {})
 
-    def _keep(self, one: _Taken, more: dict[str, Value]) -> None:
+    def _commit_exposure(self, one: _TakenExposure, more: dict[str, Value]) -> None:
         step = one.exposed.step
         light: dict[str, Value] = {
             "light": str(one.actual["light"]),
             "level": float(step.settings["level"]),
         }
-        self._run.keep(
+        self._run.commit_frames(
             step,
             one.exposed.frames,
             light=light,
             tries=one.tries,
             t_box_s=one.exposed.t_box_s,
-            noted={**one.actual, **more},
+            journal_entries={**one.actual, **more},
         )
 
 
@@ -246,6 +250,6 @@ def _pixels(frame: Frame, step: Step) -> np.ndarray:
     return frame.image
 
 
-def _placements_so_far(session: Session) -> int:
+def _count_placements(session: Session) -> int:
     """Return how often the head was placed in earlier runs, as far as anything came of it."""
     return max((int(r.actual.get("placement", 0)) for r in session.frames()), default=0)

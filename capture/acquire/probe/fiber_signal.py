@@ -35,7 +35,7 @@ COLOR_NAMES = ("red", "green", "blue")
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class SeriesVerdict:
     """Whether a series may end."""
 
     enough: bool
@@ -94,7 +94,7 @@ class FiberSignal:
         self._always_saturated = np.ones(shape, bool)
         self._looked = 0
 
-    def look(self, image: UInt16Array, exposure_s: float) -> None:
+    def add_exposure(self, image: UInt16Array, exposure_s: float) -> None:
         """Take an exposure into account: sensor values, shape (H, W), and its time, s."""
         view = self._view
         pixels = np.asarray(image).ravel()
@@ -126,7 +126,7 @@ class FiberSignal:
         """Signal to noise of all unsaturated exposures of each fibre and color, shape (F, C)."""
         return self._sum / np.sqrt(np.maximum(self._variance, 1e-12))
 
-    def verdict(self, left_s: Sequence[float]) -> Verdict:
+    def verdict(self, remaining_s: Sequence[float]) -> SeriesVerdict:
         """Tell whether the exposures that are left, s, can show more.
 
         Notes
@@ -140,17 +140,19 @@ class FiberSignal:
         seconds = np.maximum(self._seconds, 1e-12)
         error = np.sqrt(self._variance)
         rate = np.maximum((self._sum + MIN_MEASURABLE_SNR * error) / seconds, 0.0)
-        more_s = float(sum(left_s))
+        more_s = float(sum(remaining_s))
         signal = np.maximum(self._sum, 0.0) + rate * more_s
         per_frame = self._variance / max(self._looked, 1)
-        noise = self._variance + per_frame * len(left_s) + rate * more_s / self._view.gain_e_per_dn
+        noise = (
+            self._variance + per_frame * len(remaining_s) + rate * more_s / self._view.gain_e_per_dn
+        )
         hopeless = ~measured & ~saturated & (signal < MIN_MEASURABLE_SNR * np.sqrt(noise))
-        return Verdict(
+        return SeriesVerdict(
             bool((measured | hopeless | saturated).all()), _pairs(hopeless), _pairs(saturated)
         )
 
 
-def why_enough(signal: FiberSignal, last: Step, left: Sequence[Step]) -> str:
+def stop_reason(signal: FiberSignal, last: Step, remaining: Sequence[Step]) -> str:
     """Return why the exposures that are left after the last show no more; empty where they may.
 
     Parameters
@@ -158,13 +160,13 @@ def why_enough(signal: FiberSignal, last: Step, left: Sequence[Step]) -> str:
     signal : FiberSignal
         Of the exposures up to the last.
     last : Step
-    left : sequence of Step
+    remaining : sequence of Step
         At least one, by growing exposure.
     """
-    verdict = signal.verdict([float(one.settings["exposure_s"]) for one in left])
+    verdict = signal.verdict([float(one.settings["exposure_s"]) for one in remaining])
     if not verdict.enough:
         return ""
-    first, final = (int(left[k].index["bracket"]) for k in (0, -1))
+    first, final = (int(remaining[k].index["bracket"]) for k in (0, -1))
     span = f"bracket {first}" if first == final else f"brackets {first}-{final}"
     what = f"all {len(signal.probe.fibres)} fibres"
     what += " that can be measured" if verdict.hopeless or verdict.saturated else ""
@@ -268,14 +270,14 @@ def usable_exposures(steps: Sequence[Step], rate_per_s: Float64Array) -> set[str
     return kept
 
 
-def masks_not_needed(session: Session) -> tuple[list[Step], str]:
+def find_unneeded_masks(session: Session) -> tuple[list[Step], str]:
     """Return which exposures of covered heads a session can do without, and why.
 
     They are chosen once: where one was taken or left out before, or where the phantom has not been
     seen at its first placement, none.
     """
     masks = [step for step in session.plan.steps if step.kind == "mask"]
-    left_out = session.left_out()
+    left_out = session.omitted_steps()
     phantom = session.frames("phantom", repeat=0)
     chosen = session.frames("mask") or any(step.id in left_out for step in masks)
     if not phantom or chosen or session.rig.probe is None:
@@ -284,7 +286,9 @@ def masks_not_needed(session: Session) -> tuple[list[Step], str]:
     signal = FiberSignal(session.rig.probe, session.rig.view(camera))
     for record in phantom:
         if record.camera == camera:
-            signal.look(np.asarray(session.read(record).cfa), float(record.settings["exposure_s"]))
+            signal.add_exposure(
+                np.asarray(session.read(record).cfa), float(record.settings["exposure_s"])
+            )
     kept = usable_exposures(masks, signal.rate_per_s)
     rest = [step for step in masks if step.id not in kept]
     return rest, (

@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from capture.acquire.outcome import (
-    Acquired,
     AcquisitionError,
+    AcquisitionResult,
     CaptureRun,
-    refuse_step,
     require_trigger_line,
+    step_limit_error,
 )
 from capture.acquire.probe.bracket_series import BracketSeries
 from capture.devices.camera import CameraError
@@ -41,7 +41,7 @@ def check_probe(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
         exposure_s = float(step.settings["exposure_s"])
         if not low_s <= exposure_s <= high_s and step.kind != "dark":
             opens = f"the shutter opens for {low_s:g} to {high_s:g} s"
-            raise refuse_step(step, f"got exposure_s {exposure_s:g}, {opens}")
+            raise step_limit_error(step, f"got exposure_s {exposure_s:g}, {opens}")
         mbar = float(step.settings.get("suction_mbar", probe.suction_mbar))
         if abs(mbar - probe.suction_mbar) > 1e-6:
             raise AcquisitionError(
@@ -51,7 +51,7 @@ def check_probe(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
         fibre = step.settings.get("fibre")
         if fibre is not None and not int(fibre) < len(probe.fibres):
             has = f"the rig has {len(probe.fibres)}, counted from 0"
-            raise refuse_step(step, f"got fibre {fibre}, {has}")
+            raise step_limit_error(step, f"got fibre {fibre}, {has}")
     if probe.suction_mbar > most_mbar:
         raise AcquisitionError(
             f"suction_mbar: the rig file says {probe.suction_mbar:g}, the box draws at most "
@@ -87,7 +87,7 @@ PROBE_LEASE_S = 5.0
 """A frame may keep the host busy for a while; after this silence the box lets go."""
 
 
-def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> Acquired:
+def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> AcquisitionResult:
     """Capture what the session still lacks of a plan of the fibre probe; see `run_plan`.
 
     Everything that can be refused is, before anything is lit or sucked at. The dark frames come
@@ -113,4 +113,4 @@ def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> Acquired:
         series.run()
     finally:
         run.tear_down(box)
-    return run.account()
+    return run.summarize()

@@ -8,12 +8,12 @@ shutter says that its light lasted as long.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from capture.acquire.frames import arm_cameras, collect, wanted_exposure
+from capture.acquire.frames import arm_cameras, collect_frames, requested_exposure
 from capture.acquire.outcome import CaptureRun
 from capture.acquire.probe.head import HeadLost
 from capture.devices.camera import Frame, FrameRefused, Trigger
 from capture.devices.port import CommandRefused
-from capture.devices.probe import Opening, ProbeBox
+from capture.devices.probe import ProbeBox, ShutterOpening
 from capture.devices.wire import Code
 from capture.plan import Step
 
@@ -23,7 +23,7 @@ FRAME_TIMEOUT_S = 3.0
 """How long a frame may take after its read-out, s: the box waits a little longer for its host."""
 SHUTTER_REPORT_TIMEOUT_S = 0.2
 """How long the end of an opening may take to be told, s."""
-SHUTTER_DEVIATION = 0.02
+MAX_SHUTTER_DEVIATION = 0.02
 """How far the light's time may be off what was asked for, relative; a fibre's light is as much."""
 SHUTTER_MARGIN_S = 5e-5
 """And beyond that, s: of the shortest exposure this is within a stop's twentieth."""
@@ -34,7 +34,7 @@ class ShutterFault(FrameRefused):
 
 
 @dataclass(frozen=True, slots=True)
-class Exposed:
+class SourceExposure:
     """One exposure that is believed, one frame a camera."""
 
     step: Step
@@ -45,12 +45,12 @@ class Exposed:
     """How long the light lasted, s; 0 in the dark."""
 
 
-def expose_dark(run: CaptureRun, box: ProbeBox, step: Step, *, token: str) -> Exposed:
+def expose_dark(run: CaptureRun, box: ProbeBox, step: Step, *, token: str) -> SourceExposure:
     """Expose without light; see `expose`."""
     return _expose(run, box, step, lambda: (box.trigger_camera(token), 0.0))
 
 
-def expose(run: CaptureRun, box: ProbeBox, step: Step) -> Exposed:
+def expose(run: CaptureRun, box: ProbeBox, step: Step) -> SourceExposure:
     """Open the shutter once, and collect one frame a camera.
 
     Raises
@@ -85,7 +85,7 @@ def expose(run: CaptureRun, box: ProbeBox, step: Step) -> Exposed:
     return _expose(run, box, step, release)
 
 
-def _light_s(step: Step, box: ProbeBox, opening: Opening) -> float:
+def _light_s(step: Step, box: ProbeBox, opening: ShutterOpening) -> float:
     """Wait until the shutter has closed and return how long its light lasted, s."""
     seconds = float(step.settings["exposure_s"])
     box.listen(seconds, every_s=LEASE_RENEWAL_S)
@@ -102,7 +102,7 @@ def _light_s(step: Step, box: ProbeBox, opening: Opening) -> float:
         recover_shutter(box, step)
         raise ShutterFault(f"the shutter closed as {ended!r} instead of by its own end")
     open_s = last.t_shut_s - last.t_open_s
-    if abs(open_s - seconds) > SHUTTER_DEVIATION * seconds + SHUTTER_MARGIN_S:
+    if abs(open_s - seconds) > MAX_SHUTTER_DEVIATION * seconds + SHUTTER_MARGIN_S:
         raise ShutterFault(f"the shutter was open for {open_s:g} s, expected {seconds:g} s")
     return open_s
 
@@ -124,13 +124,13 @@ def readout_s(run: CaptureRun, step: Step) -> float:
 
 def _expose(
     run: CaptureRun, box: ProbeBox, step: Step, release: Callable[[], tuple[float, float]]
-) -> Exposed:
-    want, chosen = wanted_exposure(step), run.cameras_of(step)
+) -> SourceExposure:
+    want, chosen = requested_exposure(step), run.step_cameras(step)
     armed_s = arm_cameras(chosen, want, dict.fromkeys(chosen, Trigger.EDGE))
     t_box_s, open_s = release()
     # the lease is renewed up to the moment at which the frame should be there
     dark_s = 0.0 if open_s else want.exposure_s
     box.listen(dark_s + readout_s(run, step), every_s=LEASE_RENEWAL_S)
-    frames, stale = collect(chosen, want, armed_s, dict.fromkeys(chosen, FRAME_TIMEOUT_S))
+    frames, stale = collect_frames(chosen, want, armed_s, dict.fromkeys(chosen, FRAME_TIMEOUT_S))
     run.stale += stale
-    return Exposed(step, frames, t_box_s, open_s)
+    return SourceExposure(step, frames, t_box_s, open_s)

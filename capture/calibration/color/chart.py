@@ -79,7 +79,7 @@ def find_chart(image: NDArray, *, corners: ArrayLike | None = None) -> Float64Ar
 
 
 def measure_patches(
-    image: NDArray, centers: Float64Array, *, valid: BoolArray | None = None, share: float = 0.5
+    image: NDArray, centers: Float64Array, *, valid: BoolArray | None = None, fraction: float = 0.5
 ) -> Patches:
     """Average the pixels in the middle of every patch.
 
@@ -91,7 +91,7 @@ def measure_patches(
         From `find_chart`.
     valid : ndarray of bool, shape (H, W) or (H, W, 3), optional
         False where a pixel is saturated or must not be used.
-    share : float
+    fraction : float
         Side of the averaged square over the distance of neighbouring patches, at most 0.6 so that
         a chart at 45 degrees stays inside its patches.
 
@@ -99,9 +99,9 @@ def measure_patches(
     -------
     Patches
     """
-    if not 0 < share <= 0.6:
-        raise ValueError(f"share: got {share}, expected 0 < share <= 0.6")
-    half = max(0.5 * share * _pitch(centers), 0.5)
+    if not 0 < fraction <= 0.6:
+        raise ValueError(f"share: got {fraction}, expected 0 < share <= 0.6")
+    half = max(0.5 * fraction * _pitch(centers), 0.5)
     usable = np.logical_and.reduce(np.isfinite(image), axis=-1)
     if valid is not None:
         usable &= valid if valid.ndim == 2 else np.logical_and.reduce(valid, axis=-1)

@@ -15,7 +15,12 @@ from capture.calibration.color.colorimetry import (
     white_point,
     xyz_to_linear_srgb,
 )
-from capture.calibration.record import Calibration, Provenance, Quantity, of_one_device
+from capture.calibration.record import (
+    Calibration,
+    Provenance,
+    Quantity,
+    make_single_device_calibration,
+)
 
 Method: TypeAlias = Literal["linear", "root_polynomial"]
 
@@ -198,7 +203,7 @@ def neutral_white(
 
 def to_calibration(fit: ColorMatrix, white: Quantity, **about: Unpack[Provenance]) -> Calibration:
     """Return a fit as a `Calibration` of kind "color" for one camera."""
-    return of_one_device(
+    return make_single_device_calibration(
         "color",
         {
             "camera_to_xyz": Quantity(fit.matrix, fit.stderr),
@@ -224,7 +229,7 @@ def from_calibration(calibration: Calibration, serial: str) -> ColorMatrix:
     mean = calibration.quantity(serial, "delta_e_mean").value
     fitted = calibration.quantity(serial, "delta_e_fitted_mean").value
     held_out, illuminant = mean.reshape(1), calibration.notes["illuminant"]
-    errors = matrix.known_stderr
+    errors = matrix.stderr_or_zero
     return ColorMatrix(matrix.value, held_out, errors, method, illuminant, fitted.reshape(1))
 
 

@@ -8,7 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capture.arrays import BoolArray, Float32Array, Float64Array
-from capture.calibration.record import Calibration, Provenance, Quantity, of_one_device
+from capture.calibration.record import (
+    Calibration,
+    Provenance,
+    Quantity,
+    make_single_device_calibration,
+)
 from capture.calibration.sensor.flat_field import fit_smooth_field
 from capture.calibration.sensor.transfer_curve import block_sums
 
@@ -78,7 +83,7 @@ class WhiteReference:
     def to_calibration(self, **about: Unpack[Provenance]) -> Calibration:
         """Return this as a `Calibration` of kind "white" for one camera; not valid is 0 there."""
         white = np.nanmean(self.signal[self.valid].astype(np.float64), axis=0)
-        return of_one_device(
+        return make_single_device_calibration(
             "white",
             {"mean_signal": Quantity(white), "residual": Quantity(self.residual)},
             {"unit": "fraction of full scale for reflectance 1 at unit light"},

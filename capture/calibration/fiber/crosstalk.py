@@ -193,7 +193,7 @@ def measure_crosstalk(masks: Mapping[int, FiberReadings], phantom: FiberReadings
     for _ in range(MAX_CROSSTALK_ITERATIONS):
         # each pair by itself, given the stray light
         seen = np.einsum("jic,ic->ji", weight * (value - offset[:, None]), source)
-        matrix, variance = _pooled(seen, information, group)
+        matrix, variance = _shrink_to_group_mean(seen, information, group)
         # stray light, given the pairs; what is uncertain of a pair counts as noise
         doubt = weight / (1.0 + weight * source[None] ** 2 * variance[..., None])
         total = doubt.sum(axis=1)
@@ -206,13 +206,15 @@ def measure_crosstalk(masks: Mapping[int, FiberReadings], phantom: FiberReadings
             break
     np.fill_diagonal(matrix, 1.0)
     np.fill_diagonal(variance, 0.0)
-    leak, leak_stderr, offset, offset_stderr, common = _stray(offset, offset_variance, phantom)
+    leak, leak_stderr, offset, offset_stderr, common = _separate_stray_light(
+        offset, offset_variance, phantom
+    )
     return CrossTalk(
         matrix, np.sqrt(variance), offset, offset_stderr, common, True, leak, leak_stderr
     )
 
 
-def _stray(
+def _separate_stray_light(
     steady: Float64Array, variance: Float64Array, phantom: FiberReadings
 ) -> tuple[float, float, Float64Array, Float64Array, Float64Array]:
     """Part light that is the same in all masks into a cover's leak and stray light.
@@ -255,12 +257,12 @@ def _stray(
     return leak, float(np.sqrt(leak_variance)), stray, own, common
 
 
-def _pooled(
-    seen: Float64Array, information: Float64Array, group: NDArray[np.intp]
+def _shrink_to_group_mean(
+    observed: Float64Array, information: Float64Array, group: NDArray[np.intp]
 ) -> tuple[Float64Array, Float64Array]:
     """Return each pair drawn to its group's mean, and its variance."""
-    matrix, variance = np.zeros_like(seen), np.zeros_like(seen)
-    own = np.divide(seen, information, out=np.zeros_like(seen), where=information > 0)
+    matrix, variance = np.zeros_like(observed), np.zeros_like(observed)
+    own = np.divide(observed, information, out=np.zeros_like(observed), where=information > 0)
     last = 0.0
     overlap = own > MAX_SPOT_OVERLAP
     matrix[overlap] = own[overlap]
@@ -280,7 +282,7 @@ def _pooled(
 
 
 def shrink_to_mean(
-    value: Float64Array, information: Float64Array, least_scatter: float
+    value: Float64Array, information: Float64Array, min_scatter: float
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return values drawn to their mean as far as their own scatter tells, and standard errors.
 
@@ -291,7 +293,7 @@ def shrink_to_mean(
     value : ndarray of float64, shape (n,)
     information : ndarray of float64, shape (n,)
         Inverse variances; 0 where nothing was measured, 1 or more of them above 0.
-    least_scatter : float
+    min_scatter : float
         Standard deviation of the true values over their mean, at least: a few may agree by chance.
 
     Examples
@@ -306,7 +308,7 @@ def shrink_to_mean(
     spread = float((w * (x - mean) ** 2).sum()) - (len(x) - 1)
     scale = float(w.sum() - (w**2).sum() / w.sum())
     between = max(spread / scale, 0.0) if scale > 0 else mean**2
-    between = max(between, (least_scatter * mean) ** 2)
+    between = max(between, (min_scatter * mean) ** 2)
     both = 1.0 / (1.0 / w + between)
     mean, error = float((both * x).sum() / both.sum()), 1.0 / float(both.sum())
     share = between * information / (1.0 + between * information)

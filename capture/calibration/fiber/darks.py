@@ -13,19 +13,19 @@ from capture.arrays import BoolArray, Float64Array
 from capture.calibration.record import CalibrationError
 from capture.calibration.robust import SIGMA_PER_MAD, mad_sigma
 from capture.calibration.sensor import SensorCalibration
-from capture.documents import Checks
+from capture.documents import FaultCollector
 from capture.rig import CFA_PATTERNS, View
 
 HOT_FIT_SIGMAS: Final = 6.0
 MIN_HOT_DN: Final = 1.0
 """What no hot pixel stays below at the longest exposure."""
-DOUBLING_K: Final = 7.0
-DOUBLING_STDERR_K: Final = 1.0
+DARK_CURRENT_DOUBLING_K: Final = 7.0
+DARK_CURRENT_DOUBLING_STDERR_K: Final = 1.0
 """By how much a sensor warms until its dark current doubles; Widenhorn et al. 2002, doi
 10.1117/12.463446, find silicon near 0 C to double each 6 to 8 K."""
 MAX_TEMPERATURE_GAP_K: Final = 10.0
 """Beyond this a dark current is not carried from one temperature to another."""
-SAME_TEMPERATURE_K: Final = 0.5
+TEMPERATURE_TOL_K: Final = 0.5
 
 
 class DarkError(CalibrationError):
@@ -39,7 +39,7 @@ class CameraNoise:
     Examples
     --------
     >>> from capture.rig import load_rig
-    >>> noise = CameraNoise.of_view(load_rig("probe").view("cam"))
+    >>> noise = CameraNoise.from_view(load_rig("probe").view("cam"))
     >>> round(noise.gain_e_per_dn, 3), noise.span_dn, noise.origin
     (4.465, 4031.0, 'nominal')
     """
@@ -58,21 +58,23 @@ class CameraNoise:
     """"nominal" (of the rig's file) or "calibrated"."""
 
     def __post_init__(self) -> None:
-        checks = Checks("CameraNoise", DarkError)
-        checks.positive(gain_e_per_dn=self.gain_e_per_dn)
-        checks.that("read_noise_e", self.read_noise_e, 0 <= self.read_noise_e < np.inf, ">= 0")
-        checks.that("black_dn", self.black_dn, 0 <= self.black_dn < self.white_dn, "0 to white")
-        checks.that("pattern", self.pattern, self.pattern in CFA_PATTERNS, f"one of {CFA_PATTERNS}")
+        checks = FaultCollector("CameraNoise", DarkError)
+        checks.check_positive(gain_e_per_dn=self.gain_e_per_dn)
+        checks.check("read_noise_e", self.read_noise_e, 0 <= self.read_noise_e < np.inf, ">= 0")
+        checks.check("black_dn", self.black_dn, 0 <= self.black_dn < self.white_dn, "0 to white")
+        checks.check(
+            "pattern", self.pattern, self.pattern in CFA_PATTERNS, f"one of {CFA_PATTERNS}"
+        )
         checks.close()
 
     @classmethod
-    def of_view(cls, view: View) -> CameraNoise:
+    def from_view(cls, view: View) -> CameraNoise:
         """Return what the rig's file says of a camera."""
         levels = float(view.black_level), float(view.white_level)
         return cls(view.gain_e_per_dn, view.read_noise_e, *levels, view.cfa, "nominal")
 
     @classmethod
-    def of_sensor(cls, sensor: SensorCalibration) -> CameraNoise:
+    def from_sensor(cls, sensor: SensorCalibration) -> CameraNoise:
         """Return what a calibration of the sensor measured, averaged over its colors."""
         means = sensor.mean_gain_e_per_dn(), sensor.mean_read_noise_e()
         gain, read_noise = (float(mean.value) for mean in means)
@@ -151,7 +153,7 @@ class DarkModel:
         if temperature_c is None or self.temperature_c is None:
             return self
         apart = temperature_c - self.temperature_c
-        if abs(apart) <= SAME_TEMPERATURE_K:
+        if abs(apart) <= TEMPERATURE_TOL_K:
             return self
         if abs(apart) > MAX_TEMPERATURE_GAP_K:
             raise DarkError(
@@ -159,8 +161,8 @@ class DarkModel:
                 f" taken at {temperature_c:.1f} C, expected at most"
                 f" {MAX_TEMPERATURE_GAP_K:g} K apart; capture darks at the frames' temperature"
             )
-        factor = 2.0 ** (apart / DOUBLING_K)
-        relative = abs(np.log(factor)) * DOUBLING_STDERR_K / DOUBLING_K
+        factor = 2.0 ** (apart / DARK_CURRENT_DOUBLING_K)
+        relative = abs(np.log(factor)) * DARK_CURRENT_DOUBLING_STDERR_K / DARK_CURRENT_DOUBLING_K
         covariance = self.covariance * np.array([[1.0, factor], [factor, factor**2]])
         covariance[1, 1] += (relative * factor * self.mean_rate_dn_per_s) ** 2
         return replace(
@@ -212,21 +214,21 @@ def measure_darks(
     """
     times = np.asarray(exposures_s, np.float64)
     stack = [np.asarray(frame) for frame in frames]
-    checks = Checks("Dark frames", DarkError)
-    checks.that("frames", len(stack), len(stack) > 0, "at least one; capture darks first")
+    checks = FaultCollector("Dark frames", DarkError)
+    checks.check("frames", len(stack), len(stack) > 0, "at least one; capture darks first")
     shapes = sorted({frame.shape for frame in stack})
-    checks.that("frames", shapes, len(shapes) <= 1 and all(len(s) == 2 for s in shapes), "(H, W)")
-    checks.that("exposures_s", times.shape, times.shape == (len(stack),), f"{len(stack)} times")
+    checks.check("frames", shapes, len(shapes) <= 1 and all(len(s) == 2 for s in shapes), "(H, W)")
+    checks.check("exposures_s", times.shape, times.shape == (len(stack),), f"{len(stack)} times")
     good = bool(np.isfinite(times).all() and (times > 0).all())
-    checks.that("exposures_s", times.tolist(), good, "finite seconds > 0")
+    checks.check("exposures_s", times.tolist(), good, "finite seconds > 0")
     checks.close()
     distinct = tuple(float(t) for t in np.unique(times))
     longest = distinct[-1]
     if len(distinct) == 1:
         times = np.zeros_like(times)  # all is bias then
-    level = np.array([_middle(frame) for frame in stack]) - noise.black_dn
+    level = np.array([_clipped_mean(frame) for frame in stack]) - noise.black_dn
     bright = [frame >= noise.white_dn for frame in stack]
-    bias, rate, slope_error = _line(times, level, noise.floor_dn2 / stack[0].size)
+    bias, rate, slope_error = _fit_dark_line(times, level, noise.floor_dn2 / stack[0].size)
     variance = noise.floor_dn2 + max(rate, 0.0) * times / noise.gain_e_per_dn
     # sums of each pixel's residuals, and of residuals times time
     z0, z1 = np.zeros(stack[0].shape), np.zeros(stack[0].shape)
@@ -243,9 +245,9 @@ def measure_darks(
     error = np.linalg.inv(normal)
     own_bias, own_rate = error[0, 0] * z0 + error[0, 1] * z1, error[1, 0] * z0 + error[1, 1] * z1
     hot = np.logical_or.reduce(bright)
-    hot |= _outliers(own_bias, MIN_HOT_DN)
+    hot |= _find_outliers(own_bias, MIN_HOT_DN)
     if many:
-        hot |= _outliers(own_rate, MIN_HOT_DN / longest)
+        hot |= _find_outliers(own_rate, MIN_HOT_DN / longest)
     spread = np.zeros((2, 2))
     kept = ~hot
     for i, own in enumerate((own_bias, own_rate)):
@@ -268,7 +270,7 @@ def measure_darks(
     )
 
 
-def _middle(frame: NDArray[np.integer]) -> float:
+def _clipped_mean(frame: NDArray[np.integer]) -> float:
     """Return the mean of a frame without its outliers."""
     values = frame.astype(np.float64)
     center = float(np.median(values))
@@ -276,7 +278,9 @@ def _middle(frame: NDArray[np.integer]) -> float:
     return float(values[np.abs(values - center) <= 5.0 * scale].mean())
 
 
-def _line(times: Float64Array, level: Float64Array, variance: float) -> tuple[float, float, float]:
+def _fit_dark_line(
+    times: Float64Array, level: Float64Array, variance: float
+) -> tuple[float, float, float]:
     """Return bias, rate, and the rate's standard error with the scatter between frames."""
     centered = times - times.mean()
     square = float(centered @ centered)
@@ -289,8 +293,8 @@ def _line(times: Float64Array, level: Float64Array, variance: float) -> tuple[fl
     return bias, rate, float(np.sqrt(max(scatter, variance) / square))
 
 
-def _outliers(values: Float64Array, least: float) -> BoolArray:
+def _find_outliers(values: Float64Array, min_deviation: float) -> BoolArray:
     center = float(np.median(values))
     away = np.abs(values - center)
     limit = HOT_FIT_SIGMAS * SIGMA_PER_MAD * float(np.median(away))
-    return np.asarray(away > np.maximum(limit, least))
+    return np.asarray(away > np.maximum(limit, min_deviation))

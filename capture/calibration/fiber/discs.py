@@ -26,7 +26,7 @@ BORDER_PITCH: Final = 0.2
 """Nearer to the image's border than this no spot is sought, in distances between neighbors."""
 MAX_CENTER_STDERR_PITCH: Final = 0.04
 """Standard error of a place that is no place any more."""
-SPOT_STRUCTURE: Final = 0.03
+SPOT_SCATTER: Final = 0.03
 """How far pixels of a spot scatter about a smooth disc, relative."""
 SPOT_GRADIENT_PRIOR: Final = 0.1
 """Slopes and bend of the light over a spot, relative, as large as they may well be."""
@@ -53,7 +53,7 @@ def gray_image(merged: MergedSeries, pattern: str) -> GrayImage:
     return total, variance
 
 
-def candidates(image: GrayImage, pitch: float) -> Float64Array:
+def find_candidates(image: GrayImage, pitch: float) -> Float64Array:
     """Return the tops that stand out of noise and surroundings, brightest first, shape (n, 2)."""
     gray, variance = image
     blur = SEARCH_BLUR_PITCH * pitch
@@ -79,12 +79,12 @@ def candidates(image: GrayImage, pitch: float) -> Float64Array:
 
 
 def fit_disc(
-    merged: MergedSeries, image: GrayImage, pattern: str, place: Float64Array, pitch: float
+    merged: MergedSeries, image: GrayImage, pattern: str, position: Float64Array, pitch: float
 ) -> DiscFit | None:
     """Fit a disc with a blurred edge to the raw mosaic about a place; None where none fits."""
     height, width = merged.rate.shape
     half = int(0.5 * pitch)
-    x0, y0 = (round(float(v)) for v in place)
+    x0, y0 = (round(float(v)) for v in position)
     rows = slice(max(y0 - half, 0), min(y0 + half + 1, height))
     columns = slice(max(x0 - half, 0), min(x0 + half + 1, width))
     if rows.stop - rows.start < half or columns.stop - columns.start < half:
@@ -109,7 +109,7 @@ def fit_disc(
         [max(float(np.quantile(data[color == c], 0.9)), 0.0) for c in range(len(colors))]
     )
     scale = max(float(levels.max()), 1e-30)
-    sigma = np.sqrt(spread.ravel()[index] + (SPOT_STRUCTURE * levels[color]) ** 2) / scale
+    sigma = np.sqrt(spread.ravel()[index] + (SPOT_SCATTER * levels[color]) ** 2) / scale
     sigma = np.maximum(sigma, 1e-9)
     data = data / scale
 
@@ -146,9 +146,11 @@ def fit_disc(
         residuals, priors, _ = split(p)
         return np.concatenate([*residuals, *priors])
 
-    begin = np.array([*place, start_radius, max(0.1 * start_radius, 0.7)])
-    low = np.array([place[0] - 0.5 * pitch, place[1] - 0.5 * pitch, 1.0, 0.2])
-    high = np.array([place[0] + 0.5 * pitch, place[1] + 0.5 * pitch, 0.7 * pitch, 0.3 * pitch])
+    begin = np.array([*position, start_radius, max(0.1 * start_radius, 0.7)])
+    low = np.array([position[0] - 0.5 * pitch, position[1] - 0.5 * pitch, 1.0, 0.2])
+    high = np.array(
+        [position[0] + 0.5 * pitch, position[1] + 0.5 * pitch, 0.7 * pitch, 0.3 * pitch]
+    )
     begin = np.clip(begin, low + 1e-6, high - 1e-6)
     done = least_squares(misfit, begin, bounds=(low, high), x_scale=[1, 1, 1, 0.5], max_nfev=30)
     amplitude = split(done.x)[2]
@@ -172,10 +174,10 @@ def _standard_errors(done: Any, freedom: int) -> Float64Array | None:
     return error if np.isfinite(error).all() else None
 
 
-def distinct(fits: list[DiscFit], apart: float) -> list[DiscFit]:
+def drop_duplicate_fits(fits: list[DiscFit], min_distance: float) -> list[DiscFit]:
     """Return the fits without those that ended on an earlier one."""
     kept: list[DiscFit] = []
     for fit in fits:
-        if all(np.hypot(*(fit[0][:2] - other[0][:2])) > apart for other in kept):
+        if all(np.hypot(*(fit[0][:2] - other[0][:2])) > min_distance for other in kept):
             kept.append(fit)
     return kept

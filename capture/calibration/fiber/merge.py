@@ -10,8 +10,8 @@ from scipy.ndimage import uniform_filter
 
 from capture.arrays import BoolArray, Float64Array, Int64Array
 from capture.calibration.fiber.darks import CameraNoise, DarkModel
-from capture.calibration.sensor.transfer_curve import cfa_planes
-from capture.documents import Checks
+from capture.calibration.sensor.transfer_curve import cfa_offsets
+from capture.documents import FaultCollector
 from capture.hdr import BracketError
 
 NOISE_WINDOW_PX: Final = 3
@@ -117,16 +117,16 @@ def merge_series(
     series = _Series(stack, times, base, _usable(stack, noise), darks, noise)
     hot = darks.hot
     # first by read noise alone, then with the noise of the light that was found
-    guess, seen, _ = series.weigh(lit, np.zeros(stack[0].shape))
+    guess, seen, _ = series.estimate_rate(lit, np.zeros(stack[0].shape))
     smooth = _smooth(guess, seen & ~hot, noise.pattern)
     light = np.maximum(smooth, 0.0)
-    rate, seen, variance = series.weigh(lit, light)
+    rate, seen, variance = series.estimate_rate(lit, light)
     clear = np.flatnonzero(seen & ~hot & (rate > MIN_RIPPLE_SIGMAS * np.sqrt(variance)))
     scale, scale_stderr = np.ones(len(times)), np.zeros(len(times))
     if len(times) > 1 and clear.size:
-        scale, scale_stderr = series.scales(lit, rate, light, clear)
+        scale, scale_stderr = series.estimate_scales(lit, rate, light, clear)
         if (scale != 1.0).any():
-            rate, seen, variance = series.weigh(lit * scale, light)
+            rate, seen, variance = series.estimate_rate(lit * scale, light)
     valid = seen & ~hot
     rate, variance = np.where(valid, rate, 0.0), np.where(valid, variance, 0.0)
     span = noise.span_dn
@@ -143,7 +143,7 @@ def color_masks(shape: tuple[int, ...], pattern: str) -> list[BoolArray]:
     >>> [int(mask.sum()) for mask in color_masks((4, 6), "RGGB")]
     [6, 12, 6]
     """
-    planes = cfa_planes(pattern)
+    planes = cfa_offsets(pattern)
     step = 1 if pattern == "MONO" else 2
     masks = []
     for color in ("R", "G", "B") if step == 2 else tuple(planes):
@@ -160,16 +160,16 @@ def _check(
     darks: DarkModel,
     name: str = "exposures_s",
 ) -> None:
-    checks = Checks("Series of a probe", BracketError)
-    checks.that("frames", len(stack), len(stack) > 0, "at least one frame")
+    checks = FaultCollector("Series of a probe", BracketError)
+    checks.check("frames", len(stack), len(stack) > 0, "at least one frame")
     shapes = sorted({frame.shape for frame in stack})
     expected = darks.bias_dn.shape
-    checks.that("frames", shapes, shapes in ([], [expected]), f"the dark frames' shape {expected}")
+    checks.check("frames", shapes, shapes in ([], [expected]), f"the dark frames' shape {expected}")
     whole = all(np.issubdtype(frame.dtype, np.integer) for frame in stack)
-    checks.that("frames", [str(f.dtype) for f in stack][:3], whole, "raw DN, whole numbers")
-    checks.that(name, times.shape, times.shape == (len(stack),), f"{len(stack)} times")
+    checks.check("frames", [str(f.dtype) for f in stack][:3], whole, "raw DN, whole numbers")
+    checks.check(name, times.shape, times.shape == (len(stack),), f"{len(stack)} times")
     positive = bool(np.isfinite(times).all() and (times > 0).all())
-    checks.that(name, times.tolist(), positive, "finite seconds > 0")
+    checks.check(name, times.tolist(), positive, "finite seconds > 0")
     checks.close()
 
 
@@ -198,7 +198,7 @@ class _Series:
     darks: DarkModel
     noise: CameraNoise
 
-    def weigh(
+    def estimate_rate(
         self, lit: Float64Array, light: Float64Array
     ) -> tuple[Float64Array, BoolArray, Float64Array]:
         """Return rate, where any frame counts, and variance, DN/s, weighed for a rate of light."""
@@ -223,7 +223,7 @@ class _Series:
         variance = 1.0 / below + bias2 * by_bias**2 + 2.0 * both * by_bias * by_rate
         return signal / below, seen, variance + rate2 * by_rate**2
 
-    def scales(
+    def estimate_scales(
         self, lit: Float64Array, rate: Float64Array, light: Float64Array, clear: Int64Array
     ) -> tuple[Float64Array, Float64Array]:
         """Return the light of each frame over the mean, and its standard error.

@@ -8,7 +8,7 @@ import numpy as np
 
 from capture.arrays import Float64Array
 from capture.calibration.record import CalibrationError
-from capture.documents import Checks, Document, parse, read_json, shown
+from capture.documents import Document, FaultCollector, parse_document, read_json, short_repr
 
 SCHEMA: Final = "skinrig.phantom/1"
 
@@ -27,10 +27,10 @@ class CertificateUncertainty(Document):
     """Of the reduced scattering coefficients, 0 <= u < 0.5."""
 
     def __post_init__(self) -> None:
-        checks = Checks("Uncertainty of a phantom", CertificateError)
+        checks = FaultCollector("Uncertainty of a phantom", CertificateError)
         for name in ("sigma_a", "sigma_s_prime"):
             value = getattr(self, name)
-            checks.that(name, value, 0 <= value < 0.5, "relative, 0 <= u < 0.5")
+            checks.check(name, value, 0 <= value < 0.5, "relative, 0 <= u < 0.5")
         checks.close()
 
 
@@ -63,21 +63,21 @@ class PhantomCertificate(Document):
     """What is written on the block."""
 
     def __post_init__(self) -> None:
-        checks = Checks("Phantom", CertificateError)
-        checks.that("eta", self.eta, 1 <= self.eta <= 2, "1 to 2")
-        checks.that("g", self.g, -1 < self.g < 1, "-1 < g < 1")
+        checks = FaultCollector("Phantom", CertificateError)
+        checks.check("eta", self.eta, 1 <= self.eta <= 2, "1 to 2")
+        checks.check("g", self.g, -1 < self.g < 1, "-1 < g < 1")
         count = len(self.wavelength_nm)
-        checks.that("wavelength_nm", count, count >= 1, "at least one")
+        checks.check("wavelength_nm", count, count >= 1, "at least one")
         rising = all(
             a < b for a, b in zip(self.wavelength_nm, self.wavelength_nm[1:], strict=False)
         )
         inside = all(100 <= w <= 3000 for w in self.wavelength_nm)
-        checks.that("wavelength_nm", self.wavelength_nm, rising and inside, "ascending, in nm")
+        checks.check("wavelength_nm", self.wavelength_nm, rising and inside, "ascending, in nm")
         for field_name in ("sigma_a_per_mm", "sigma_s_prime_per_mm"):
             values = getattr(self, field_name)
-            checks.that(field_name, len(values), len(values) == count, f"{count} numbers")
+            checks.check(field_name, len(values), len(values) == count, f"{count} numbers")
             good = all(0 < v < 1e3 for v in values)
-            checks.that(field_name, values, good, "numbers > 0, in 1/mm")
+            checks.check(field_name, values, good, "numbers > 0, in 1/mm")
         checks.close()
 
     def at(self, wavelength_nm: Any) -> tuple[Float64Array, Float64Array]:
@@ -132,15 +132,15 @@ class ExpectedReflectance:
         stderr = np.array(self.stderr, np.float64)
         common = np.array(self.common, np.float64)
         common = np.zeros((0, *value.shape)) if common.shape[0] == 0 else common
-        checks = Checks("ExpectedReflectance", CertificateError)
-        checks.that("per_mm2", value.shape, value.ndim == 2, "(fibres, colors)")
+        checks = FaultCollector("ExpectedReflectance", CertificateError)
+        checks.check("per_mm2", value.shape, value.ndim == 2, "(fibres, colors)")
         good = bool(np.isfinite(value).all() and (value > 0).all())
-        checks.that("per_mm2", shown(value.tolist()), good, "finite numbers > 0")
-        checks.that("stderr", stderr.shape, stderr.shape == value.shape, f"shape {value.shape}")
+        checks.check("per_mm2", short_repr(value.tolist()), good, "finite numbers > 0")
+        checks.check("stderr", stderr.shape, stderr.shape == value.shape, f"shape {value.shape}")
         good = bool(np.isfinite(stderr).all() and (stderr >= 0).all())
-        checks.that("stderr", shown(stderr.tolist()), good, "finite numbers >= 0")
+        checks.check("stderr", short_repr(stderr.tolist()), good, "finite numbers >= 0")
         fits = common.shape[1:] == value.shape and bool(np.isfinite(common).all())
-        checks.that("common", common.shape, fits, f"finite, shape (T, {value.shape})")
+        checks.check("common", common.shape, fits, f"finite, shape (T, {value.shape})")
         checks.close()
         for name, array in (("per_mm2", value), ("stderr", stderr), ("common", common)):
             array.setflags(write=False)
@@ -172,7 +172,7 @@ def read_certificate(path: str | Path) -> PhantomCertificate:
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         found = data.get("schema") if isinstance(data, dict) else type(data).__name__
         raise CertificateError.at(
-            "is not a phantom's certificate", "schema", shown(found), repr(SCHEMA), where=where
+            "is not a phantom's certificate", "schema", short_repr(found), repr(SCHEMA), where=where
         )
     body = {key: value for key, value in data.items() if key != "schema"}
-    return parse(PhantomCertificate, body, where=where, error=CertificateError)
+    return parse_document(PhantomCertificate, body, where=where, error=CertificateError)

@@ -23,10 +23,10 @@ from capture.calibration.record import (
     Quantity,
     device_rows,
     freeze_arrays,
-    of_devices,
+    make_device_calibration,
 )
 from capture.calibration.store import load
-from capture.calibration.validity import require
+from capture.calibration.validity import require_valid
 from capture.rig import Rig
 
 
@@ -248,7 +248,7 @@ class FiberCalibration:
             "crosstalk": "row: what this spot reads of each fibre's light",
             "gain_common": "relative, at one standard uncertainty of each cause",
         }
-        return of_devices("fibre", values, notes, **about)
+        return make_device_calibration("fibre", values, notes, **about)
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, rig: Rig, serial: str) -> FiberCalibration:
@@ -270,14 +270,22 @@ class FiberCalibration:
             return calibration.quantity(serial, name).value
 
         shift, leak = camera("row_shift_px"), calibration.quantity(serial, "cover_leak")
-        discs = *table.both("spot_px"), *table.both("spot_radius_px"), table.values("spot_edge_px")
+        discs = (
+            *table.values_and_errors("spot_px"),
+            *table.values_and_errors("spot_radius_px"),
+            table.values("spot_edge_px"),
+        )
         moved = float(shift[0]), float(shift[1])
         aperture_px, turned = float(camera("aperture_px")), float(camera("row_rotation_rad"))
         spots = FiberSpots(table.names, *discs, table.flags("found"), aperture_px, moved, turned)
-        mixing = *table.both("crosstalk"), *table.both("stray"), table.values("stray_common")
-        leaks = float(leak.value), float(leak.known_stderr)
+        mixing = (
+            *table.values_and_errors("crosstalk"),
+            *table.values_and_errors("stray"),
+            table.values("stray_common"),
+        )
+        leaks = float(leak.value), float(leak.stderr_or_zero)
         mixed = CrossTalk(*mixing, bool(camera("crosstalk_measured")), *leaks)
-        gains = *table.both("gain"), table.values("gain_common").transpose(1, 0, 2)
+        gains = *table.values_and_errors("gain"), table.values("gain_common").transpose(1, 0, 2)
         flags = table.flags("valid"), table.flags("dead")
         light = table.values("phantom_light")
         return cls(spots, table.values("radius_mm"), *gains, light, mixed, *flags)
@@ -307,7 +315,7 @@ class FiberCalibration:
         serial = rig.view(view).serial
         found = load(folder, "fibre")
         if on is not None:
-            require(found, rig=rig.name, serials=[serial], on_date=on, kind="fibre")
+            require_valid(found, rig=rig.name, serials=[serial], on_date=on, kind="fibre")
         return cls.from_calibration(found, rig, serial)
 
 

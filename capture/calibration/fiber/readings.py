@@ -160,7 +160,7 @@ def sum_spots(merged: MergedSeries, spots: FiberSpots, *, noise: CameraNoise) ->
     hot = ~merged.valid & ~merged.saturated
     for i in range(count):
         inside = spots.mask(i, shape)
-        beside = _beside(spots, i, shape) & merged.valid
+        beside = _background_pixels(spots, i, shape) & merged.valid
         for c, color in enumerate(colors):
             pixels = inside & color
             number = int(pixels.sum())
@@ -189,7 +189,7 @@ def sum_spots(merged: MergedSeries, spots: FiberSpots, *, noise: CameraNoise) ->
     )
 
 
-def _beside(spots: FiberSpots, fibre: int, shape: tuple[int, ...]) -> BoolArray:
+def _background_pixels(spots: FiberSpots, fibre: int, shape: tuple[int, ...]) -> BoolArray:
     """Return the pixels above and below the row, near one spot."""
     height, width = shape[:2]
     center = spots.center_px[fibre]

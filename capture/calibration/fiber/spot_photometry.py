@@ -20,7 +20,7 @@ RING_RADII = (1.3, 1.8)  # inner and outer radius of the background, of the disc
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shot:
+class SpotImage:
     """One exposure, linear.
 
     Attributes
@@ -94,7 +94,7 @@ class Flux:
     whole: BoolArray
 
 
-def shot(
+def make_spot_image(
     frame: RawFrame,
     *,
     amount_s: float,
@@ -102,7 +102,7 @@ def shot(
     dark: Float32Array | float = 0.0,
     dark_variance: float = 0.0,
     flat: NDArray | float = 1.0,
-) -> Shot:
+) -> SpotImage:
     """Return an exposure of a monochrome camera.
 
     Parameters
@@ -110,7 +110,7 @@ def shot(
     frame : RawFrame
         "MONO", with a noise profile.
     amount_s, reading_deg
-        As in `Shot`.
+        As in `SpotImage`.
     dark : ndarray of float32, shape (H, W), or float
         What a frame without light shows above black, fraction of full scale.
     dark_variance : float
@@ -133,7 +133,7 @@ def shot(
     scale, offset = frame.noise_profile
     response = np.asarray(flat, np.float32)
     variance = np.float32(scale) * np.maximum(x, 0) + np.float32(offset + dark_variance)
-    return Shot(
+    return SpotImage(
         np.asarray((x - np.asarray(dark, np.float32)) / response, np.float32),
         np.asarray(variance / response**2, np.float32),
         frame.cfa < frame.white,
@@ -142,7 +142,7 @@ def shot(
     )
 
 
-def rate_image(shots: Sequence[Shot]) -> RateImage:
+def merge_spot_images(shots: Sequence[SpotImage]) -> RateImage:
     """Put exposures of one scene together, each pixel from those in which it is not saturated.
 
     Parameters
@@ -152,11 +152,11 @@ def rate_image(shots: Sequence[Shot]) -> RateImage:
 
     Examples
     --------
-    >>> dim = Shot(np.full((1, 1), 0.2, np.float32), np.ones((1, 1), np.float32),
+    >>> dim = SpotImage(np.full((1, 1), 0.2, np.float32), np.ones((1, 1), np.float32),
     ...            np.ones((1, 1), bool), 0.1, 0.0)
-    >>> bright = Shot(np.ones((1, 1), np.float32), np.ones((1, 1), np.float32),
+    >>> bright = SpotImage(np.ones((1, 1), np.float32), np.ones((1, 1), np.float32),
     ...               np.zeros((1, 1), bool), 1.0, 0.0)
-    >>> round(float(rate_image([dim, bright]).rate[0, 0]), 6)
+    >>> round(float(merge_spot_images([dim, bright]).rate[0, 0]), 6)
     2.0
     """
     if not shots:
@@ -176,7 +176,7 @@ def rate_image(shots: Sequence[Shot]) -> RateImage:
     return RateImage(signal / amount, variance / amount**2, valid)
 
 
-def measure_middles(
+def measure_centroids(
     image: RateImage, pixels: Float64Array, *, aperture_px: Float64Array
 ) -> tuple[Float64Array, Float64Array, BoolArray]:
     """Return the middles of spots, their intensity-weighted mean places.
@@ -228,7 +228,7 @@ def measure_middles(
     return middle, stderr, saturated
 
 
-def measure_flux(part: Shot, pixels: Float64Array, *, aperture_px: Float64Array) -> Flux:
+def measure_flux(part: SpotImage, pixels: Float64Array, *, aperture_px: Float64Array) -> Flux:
     """Sum the light of spots over discs, above the median of rings around them.
 
     Parameters
@@ -258,7 +258,7 @@ def measure_flux(part: Shot, pixels: Float64Array, *, aperture_px: Float64Array)
     return Flux(value, variance, saturated, whole)
 
 
-def share_within(aperture_px: ArrayLike, airy_px: float) -> Float64Array:
+def encircled_energy(aperture_px: ArrayLike, airy_px: float) -> Float64Array:
     """Return the share of a spot's light that `measure_flux` finds behind a perfect lens.
 
     Parameters
@@ -276,7 +276,7 @@ def share_within(aperture_px: ArrayLike, airy_px: float) -> Float64Array:
 
     Examples
     --------
-    >>> share_within([20.0, 40.0], 3.0).round(4).tolist()
+    >>> encircled_energy([20.0, 40.0], 3.0).round(4).tolist()
     [0.9654, 0.9827]
     """
     beyond = 2 / np.pi**2 * airy_px / np.asarray(aperture_px, np.float64)

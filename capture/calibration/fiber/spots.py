@@ -9,7 +9,13 @@ from typing import Final
 import numpy as np
 
 from capture.arrays import BoolArray, Float64Array, FloatArray, Int64Array
-from capture.calibration.fiber.discs import DiscFit, candidates, distinct, fit_disc, gray_image
+from capture.calibration.fiber.discs import (
+    DiscFit,
+    drop_duplicate_fits,
+    find_candidates,
+    fit_disc,
+    gray_image,
+)
 from capture.calibration.fiber.merge import MergedSeries
 from capture.calibration.record import CalibrationError, freeze_arrays
 
@@ -23,7 +29,7 @@ APERTURE_EDGE_WIDTHS: Final = 2.5
 """Widths of the blurred edge that an aperture reaches beyond the radius."""
 
 
-class SpotError(CalibrationError):
+class FiberSpotError(CalibrationError):
     """Spots in the image that are not those of the probe's fibres."""
 
 
@@ -81,11 +87,11 @@ class FiberSpots:
         np.fill_diagonal(apart, np.inf)
         return np.asarray(apart.min(axis=1) < 2.0 * self.aperture_px)
 
-    def mask(self, fibre: int, shape: tuple[int, ...]) -> BoolArray:
+    def mask(self, fiber: int, shape: tuple[int, ...]) -> BoolArray:
         """Return the pixels whose centres lie in a fibre's aperture, shape (H, W)."""
-        return _within(shape, self.center_px[fibre], self.aperture_px)
+        return _within(shape, self.center_px[fiber], self.aperture_px)
 
-    def moved(self, merged: MergedSeries, pattern: str) -> tuple[FiberSpots, Float64Array]:
+    def track(self, merged: MergedSeries, pattern: str) -> tuple[FiberSpots, Float64Array]:
         """Return the spots where they lie in another series, and how far they went.
 
         Parameters
@@ -156,13 +162,13 @@ def find_fiber_spots(
     pitch = _pitch(nominal)
     image = gray_image(merged, pattern)
     fits = []
-    for place in candidates(image, pitch):
+    for place in find_candidates(image, pitch):
         fit = fit_disc(merged, image, pattern, place, pitch)
         if fit is not None:
             fits.append(fit)
-    fits = distinct(fits, 0.25 * pitch)
+    fits = drop_duplicate_fits(fits, 0.25 * pitch)
     if not fits:
-        raise SpotError(
+        raise FiberSpotError(
             f"fibre spots: found none in the image, expected {count} in a row {pitch:.0f} px apart;"
             " check that the light was on, the head on the phantom, and the exposures"
         )
@@ -174,7 +180,7 @@ def find_fiber_spots(
     stray = [k for k in range(len(whole)) if k not in spot and k not in between]
     if stray:
         where = "; ".join(f"x {places[k][0]:.0f}, y {places[k][1]:.0f} px" for k in stray[:6])
-        raise SpotError(
+        raise FiberSpotError(
             f"fibre spots: found {len(whole)} spots, of which {len(stray)} lie where none of the"
             f" {count} fibres ends ({where}); check which way round the image is, that nothing else"
             " shines into the camera, and the places in the rig's file"
@@ -182,7 +188,7 @@ def find_fiber_spots(
     found = spot >= 0
     if found.sum() < max(MIN_SPOT_FRACTION * count, 2):
         where = ", ".join(f"{x:.0f}" for x in sorted(places[:, 0]))
-        raise SpotError(
+        raise FiberSpotError(
             f"fibre spots: found {int(found.sum())} (at x {where} px), expected {count}, at least"
             f" {int(np.ceil(MIN_SPOT_FRACTION * count))}; check the phantom's contact,"
             " the light and the exposures"
@@ -215,7 +221,7 @@ def _consult_masks(
         fit = best[i]
         doubtful = fit is None or apart[i].min() < 2.2 * size or not 0.8 < fit[2] / size < 1.25
         image = gray_image(series, pattern)
-        alone = candidates(image, pitch)
+        alone = find_candidates(image, pitch)
         if len(alone) == 0:
             continue  # too faint to tell
         brightest = alone[0]
@@ -226,7 +232,7 @@ def _consult_masks(
         ):
             if best[i] is None:
                 continue  # dark: what shows is a neighbor's leak
-            raise SpotError(
+            raise FiberSpotError(
                 f"fibre spots: with only {names[i]} uncovered the brightest spot is that of"
                 f" {names[nearest]} (x {brightest[0]:.0f}, y {brightest[1]:.0f} px); check the"
                 " cover, and the order of the fibres in the rig's file"
@@ -286,10 +292,10 @@ def _table(
 
 
 def _assign(
-    places: Float64Array, nominal: Float64Array, pitch: float
+    positions: Float64Array, nominal: Float64Array, pitch: float
 ) -> tuple[Int64Array, Float64Array]:
     """Return the spot of each fibre (-1: none), and where each fibre should end."""
-    offset = (places[:, None] - nominal[None]).reshape(-1, 2)
+    offset = (positions[:, None] - nominal[None]).reshape(-1, 2)
     offset = offset[(np.abs(offset) <= MAX_ROW_SHIFT_PITCH * pitch).all(axis=1)]
     spot = np.full(len(nominal), -1)
     if len(offset) == 0:
@@ -299,7 +305,7 @@ def _assign(
     votes = near.sum(axis=1) - 1e-3 * np.linalg.norm(offset, axis=1) / pitch
     model = nominal + offset[near[int(np.argmax(votes))]].mean(axis=0)
     for _ in range(4):
-        distance = np.linalg.norm(places[:, None] - model[None], axis=-1)
+        distance = np.linalg.norm(positions[:, None] - model[None], axis=-1)
         spot = np.full(len(nominal), -1)
         for i in range(len(nominal)):
             k = int(np.argmin(distance[:, i]))
@@ -308,36 +314,38 @@ def _assign(
         seen = np.flatnonzero(spot >= 0)
         if len(seen) < 4:
             break
-        model = _similar(nominal, seen, places[spot[seen]])
+        model = _fit_similarity(nominal, seen, positions[spot[seen]])
     return spot, model
 
 
 def _between(
-    places: Float64Array, spot: Int64Array, model: Float64Array, pitch: float
+    positions: Float64Array, spot: Int64Array, model: Float64Array, pitch: float
 ) -> dict[int, tuple[int, int]]:
     """Return the spots that lie between two neighbors of which neither has one of its own."""
     found = {}
-    for k in set(range(len(places))) - set(spot.tolist()):
+    for k in set(range(len(positions))) - set(spot.tolist()):
         for i in np.flatnonzero((spot[:-1] < 0) & (spot[1:] < 0)).tolist():
-            if np.linalg.norm(0.5 * (model[i] + model[i + 1]) - places[k]) < 0.3 * pitch:
+            if np.linalg.norm(0.5 * (model[i] + model[i + 1]) - positions[k]) < 0.3 * pitch:
                 found[k] = (i, i + 1)
     return found
 
 
-def _similar(nominal: Float64Array, seen: Int64Array, found: Float64Array) -> Float64Array:
+def _fit_similarity(
+    nominal: Float64Array, observed: Int64Array, found: Float64Array
+) -> Float64Array:
     """Return the nominal places turned, scaled and shifted onto those found (least squares)."""
-    one, two = nominal[seen] @ np.array([1, 1j]), found @ np.array([1, 1j])
+    one, two = nominal[observed] @ np.array([1, 1j]), found @ np.array([1, 1j])
     centered = one - one.mean()
     factor = (centered.conj() @ (two - two.mean())) / (centered.conj() @ centered)
     every = factor * (nominal @ np.array([1, 1j]) - one.mean()) + two.mean()
     return np.stack([every.real, every.imag], axis=1)
 
 
-def _pitch(places: Float64Array) -> float:
+def _pitch(positions: Float64Array) -> float:
     """Return the usual distance of neighbors, px."""
-    if len(places) < 2:
+    if len(positions) < 2:
         return 40.0
-    return float(np.median(np.linalg.norm(np.diff(places, axis=0), axis=1)))
+    return float(np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1)))
 
 
 def _within(shape: tuple[int, ...], center: Float64Array, radius: float) -> BoolArray:

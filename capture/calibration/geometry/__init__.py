@@ -3,9 +3,9 @@
 from capture.calibration.geometry.board import Intrinsics, calibrate_intrinsics
 from capture.calibration.geometry.intrinsics import (
     CameraPose,
+    cameras_from_calibration,
     distort,
     nominal_cameras,
-    poses_from,
     to_calibration,
 )
 
@@ -13,8 +13,8 @@ __all__ = [
     "CameraPose",
     "Intrinsics",
     "calibrate_intrinsics",
+    "cameras_from_calibration",
     "distort",
     "nominal_cameras",
-    "poses_from",
     "to_calibration",
 ]

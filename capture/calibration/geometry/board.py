@@ -124,7 +124,7 @@ class Board:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sighting:
+class CornerObservation:
     """Corners of a target found in an image.
 
     Attributes
@@ -194,7 +194,7 @@ def _gray8(image: NDArray) -> UInt8Array:
     return np.asarray(np.rint(scaled), np.uint8)
 
 
-def find_board(image: NDArray, board: Board) -> Sighting | None:
+def find_board(image: NDArray, board: Board) -> CornerObservation | None:
     """Find a board's inner corners to a fraction of a pixel.
 
     Parameters
@@ -216,7 +216,7 @@ def find_board(image: NDArray, board: Board) -> Sighting | None:
         if not found:
             return None
         pixels = np.asarray(corners, np.float64).reshape(-1, 2)
-        return Sighting(np.arange(len(pixels)), _refined(gray, pixels, board))
+        return CornerObservation(np.arange(len(pixels)), _refined(gray, pixels, board))
     corners, ids, _, _ = board.detector.detectBoard(gray)
     if ids is None or len(ids) < MIN_BOARD_CORNERS:
         return None
@@ -224,7 +224,7 @@ def find_board(image: NDArray, board: Board) -> Sighting | None:
     pixels = np.asarray(corners, np.float64).reshape(-1, 2)
     if np.linalg.matrix_rank(board.points_mm[number, :2] - board.points_mm[number[0], :2]) < 2:
         return None  # all on one line of the board
-    return Sighting(number, pixels)
+    return CornerObservation(number, pixels)
 
 
 def _refined(gray: UInt8Array, pixels: Float64Array, board: Board) -> Float64Array:
@@ -236,7 +236,7 @@ def _refined(gray: UInt8Array, pixels: Float64Array, board: Board) -> Float64Arr
     return points.astype(np.float64)
 
 
-def find_markers(image: NDArray, dictionary: str, ids: Iterable[int]) -> Sighting | None:
+def find_markers(image: NDArray, dictionary: str, ids: Iterable[int]) -> CornerObservation | None:
     """Find the corners of single markers.
 
     Parameters
@@ -270,7 +270,7 @@ def find_markers(image: NDArray, dictionary: str, ids: Iterable[int]) -> Sightin
                 rows += [(4 * wanted[int(number)] + k, place) for k, place in enumerate(places)]
     if len(rows) < 8:
         return None
-    return Sighting(np.array([row[0] for row in rows]), np.array([row[1] for row in rows]))
+    return CornerObservation(np.array([row[0] for row in rows]), np.array([row[1] for row in rows]))
 
 
 def _square_corners(gray: Float64Array, corners: Float64Array) -> Float64Array | None:
@@ -359,7 +359,7 @@ def calibrate_intrinsics(
     board = Board.of(pattern, square_mm=square_mm)
     used: list[str] = []
     missing: list[str] = []
-    sightings: list[Sighting] = []
+    sightings: list[CornerObservation] = []
     sizes: dict[str, tuple[int, int]] = {}
     for k, entry in enumerate(images):
         name = Path(entry).name if isinstance(entry, str | Path) else f"image {k}"

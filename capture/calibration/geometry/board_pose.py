@@ -8,11 +8,11 @@ from typing import Protocol
 import numpy as np
 
 from capture.arrays import Float64Array
-from capture.calibration.geometry.board import Board, Sighting
+from capture.calibration.geometry.board import Board, CornerObservation
 from capture.calibration.geometry.intrinsics import CameraPose
 
 
-class Target(Protocol):
+class FlatTarget(Protocol):
     """A flat target with known points."""
 
     @property
@@ -32,27 +32,27 @@ class BoardPose:
         return points_mm @ self.rotation.T + self.translation_mm
 
     @classmethod
-    def in_jig(cls, board: Board) -> BoardPose:
+    def to_jig_pose(cls, board: Board) -> BoardPose:
         """Return the jig's place: the board's middle in the rig's origin, its front towards +z."""
         width, height = board.size_mm
         rotation = np.diag([1.0, -1.0, -1.0])
         return cls(rotation, -rotation @ np.array([width / 2, height / 2, 0.0]))
 
 
-def gaps_px(
-    camera: CameraPose, place: BoardPose, board: Target, sighting: Sighting
+def corner_residuals_px(
+    camera: CameraPose, pose: BoardPose, board: FlatTarget, sighting: CornerObservation
 ) -> Float64Array:
     """Return how far corners are from where a camera and a place put them, px, shape (n,)."""
-    found = camera.project(place.to_rig(board.points_mm[sighting.ids]))
+    found = camera.project(pose.to_rig(board.points_mm[sighting.ids]))
     return np.asarray(np.linalg.norm(found - sighting.pixels, axis=-1))
 
 
-def motion_between(a: BoardPose, b: BoardPose) -> tuple[Float64Array, Float64Array]:
+def relative_motion(a: BoardPose, b: BoardPose) -> tuple[Float64Array, Float64Array]:
     """Return the rigid motion that takes place a to place b."""
     rotation = b.rotation @ a.rotation.T
     return rotation, b.translation_mm - rotation @ a.translation_mm
 
 
-def move_pose(place: BoardPose, rotation: Float64Array, shift: Float64Array) -> BoardPose:
+def move_pose(pose: BoardPose, rotation: Float64Array, shift: Float64Array) -> BoardPose:
     """Return a pose after a rotation, (3, 3), and a shift, mm, of its frame."""
-    return BoardPose(rotation @ place.rotation, rotation @ place.translation_mm + shift)
+    return BoardPose(rotation @ pose.rotation, rotation @ pose.translation_mm + shift)

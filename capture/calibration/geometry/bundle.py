@@ -17,24 +17,24 @@ from capture.arrays import Float64Array
 from capture.calibration.geometry.board import Board
 from capture.calibration.geometry.board_pose import (
     BoardPose,
-    Target,
-    gaps_px,
-    motion_between,
+    FlatTarget,
+    corner_residuals_px,
     move_pose,
+    relative_motion,
 )
 from capture.calibration.geometry.bundle_equations import (
-    Bundle,
+    BoardPoses,
     BundleError,
     BundleProblem,
+    BundleResult,
     Cameras,
     Gauge,
     LensPrior,
-    Places,
     Sightings,
 )
 from capture.calibration.geometry.intrinsics import CameraPose
 
-__all__ = ["Bundle", "BundleError", "adjust", "place_board"]
+__all__ = ["BundleError", "BundleResult", "adjust", "estimate_board_pose"]
 
 
 MIN_SHARED_POSES = 2  # places that a camera must share with others
@@ -47,7 +47,7 @@ def adjust(
     *,
     gauge: Gauge = "board",
     prior: LensPrior | None = None,
-) -> Bundle:
+) -> BundleResult:
     """Adjust all cameras and board places to all corners.
 
     Parameters
@@ -79,11 +79,11 @@ def adjust(
     """
     _check_shared(sightings, start, gauge)
     places = {
-        pose: place_board(sightings, board, start, pose)
+        pose: estimate_board_pose(sightings, board, start, pose)
         for pose in sorted({pose for _, pose in sightings})
     }
     if gauge == "board":
-        to_jig = motion_between(places[0], BoardPose.in_jig(board))
+        to_jig = relative_motion(places[0], BoardPose.to_jig_pose(board))
         places = {pose: move_pose(place, *to_jig) for pose, place in places.items()}
         cameras = {name: _moved_camera(camera, *to_jig) for name, camera in start.items()}
     else:
@@ -97,10 +97,12 @@ def adjust(
         rigid = _procrustes(found, wanted)
         cameras = {name: _moved_camera(camera, *rigid) for name, camera in cameras.items()}
         places = {pose: move_pose(place, *rigid) for pose, place in places.items()}
-    return problem.judged(cameras, places)
+    return problem.solution_with_errors(cameras, places)
 
 
-def place_board(sightings: Sightings, board: Target, cameras: Cameras, pose: int) -> BoardPose:
+def estimate_board_pose(
+    sightings: Sightings, board: FlatTarget, cameras: Cameras, pose: int
+) -> BoardPose:
     """Return where the board stood, from all its images, with the cameras as given.
 
     Each image alone gives a guess; the one that suits all images best is refined on all of them.
@@ -124,7 +126,9 @@ def place_board(sightings: Sightings, board: Target, cameras: Cameras, pose: int
                 camera.rotation.T @ local,
                 camera.rotation.T @ (np.ravel(shift) - camera.translation_mm),
             )
-            gaps = [gaps_px(cameras[other], place, board, s) for other, s in seen.items()]
+            gaps = [
+                corner_residuals_px(cameras[other], place, board, s) for other, s in seen.items()
+            ]
             misfit = np.minimum(np.nan_to_num(np.concatenate(gaps), nan=1e3), 100.0)
             if best is None or misfit.sum() < best[0]:
                 best = float(misfit.sum()), place
@@ -195,7 +199,7 @@ class MovedCamera:
         View and camera.
     rms_px : float
         Residual of the previous calibration, by the median.
-    shift_mm, turn_rad : float
+    shift_mm, rotation_rad : float
         How far its centre of projection went, and how it turned.
     """
 
@@ -203,23 +207,23 @@ class MovedCamera:
     serial: str
     rms_px: float
     shift_mm: float
-    turn_rad: float
+    rotation_rad: float
 
     def __str__(self) -> str:
         """Return one line for a terminal."""
         return (
             f"camera {self.name} ({self.serial}) moved: {self.rms_px:.2f} px off, by"
-            f" {self.shift_mm:.2f} mm and {np.degrees(self.turn_rad):.3f} degrees"
+            f" {self.shift_mm:.2f} mm and {np.degrees(self.rotation_rad):.3f} degrees"
         )
 
 
-def find_moved(
+def find_moved_cameras(
     sightings: Sightings,
     board: Board,
     previous: Cameras,
     *,
     ratio: float = 4.0,
-    least_px: float = 0.3,
+    min_residual_px: float = 0.3,
 ) -> tuple[MovedCamera, ...]:
     """Find cameras that moved since the previous calibration, by their residuals.
 
@@ -236,7 +240,7 @@ def find_moved(
         The cameras as calibrated before.
     ratio : float
         How many times the residual of the remaining cameras a moved camera's is, > 1.
-    least_px : float
+    min_residual_px : float
         Smaller residuals than this do not matter, px.
 
     Returns
@@ -259,7 +263,9 @@ def find_moved(
     left = list(names)
     while len(left) > max(2, len(names) // 2):
         trials = {name: _agreement(sightings, board, previous, left, without=name) for name in left}
-        judged = {n: own / max(rest, least_px / ratio) for n, (rest, own, _) in trials.items()}
+        judged = {
+            n: own / max(rest, min_residual_px / ratio) for n, (rest, own, _) in trials.items()
+        }
         culprit = max(judged, key=lambda name: judged[name] if judged[name] > 0 else 0.0)
         _, own_px, places = trials[culprit]
         if not judged[culprit] > ratio:
@@ -279,11 +285,13 @@ def _agreement(
     """Return the residual of all cameras but one, that one's own, and the boards' places."""
     rest = {k: s for k, s in sightings.items() if k[0] in names and k[0] != without}
     count = {pose: sum(p == pose for _, p in rest) for _, pose in rest}
-    places = {pose: place_board(rest, board, cameras, pose) for pose in count if count[pose] > 1}
+    places = {
+        pose: estimate_board_pose(rest, board, cameras, pose) for pose in count if count[pose] > 1
+    }
     others, own = [np.zeros(0)], [np.zeros(0)]
     for (name, pose), sighting in sightings.items():
         if pose in places and name in names:
-            gaps = gaps_px(cameras[name], places[pose], board, sighting)
+            gaps = corner_residuals_px(cameras[name], places[pose], board, sighting)
             (own if name == without else others).append(gaps)
     together, alone = np.concatenate(others), np.concatenate(own)
     if not together.size:
@@ -296,10 +304,12 @@ def _agreement(
     )
 
 
-def _resection(images: Sightings, board: Board, camera: CameraPose, places: Places) -> CameraPose:
+def _resection(
+    images: Sightings, board: Board, camera: CameraPose, poses: BoardPoses
+) -> CameraPose:
     """Return a camera's new place from boards whose places are known; the lens is kept."""
     points = np.concatenate(
-        [places[p].to_rig(board.points_mm[s.ids]) for (_, p), s in images.items()]
+        [poses[p].to_rig(board.points_mm[s.ids]) for (_, p), s in images.items()]
     )
     pixels = np.concatenate([s.pixels for s in images.values()])
     turn = Rotation.from_matrix(camera.rotation).as_rotvec()

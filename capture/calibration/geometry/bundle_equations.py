@@ -14,8 +14,8 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
 from capture.arrays import Float64Array
-from capture.calibration.geometry.board import MIN_BOARD_CORNERS, Sighting
-from capture.calibration.geometry.board_pose import BoardPose, Target
+from capture.calibration.geometry.board import MIN_BOARD_CORNERS, CornerObservation
+from capture.calibration.geometry.board_pose import BoardPose, FlatTarget
 from capture.calibration.geometry.intrinsics import CameraPose, distort
 from capture.calibration.record import CalibrationError
 from capture.calibration.robust import HUBER_SIGMAS, huber_weights, mad_sigma
@@ -23,11 +23,11 @@ from capture.calibration.robust import HUBER_SIGMAS, huber_weights, mad_sigma
 Gauge: TypeAlias = Literal["board", "cameras"]
 
 
-Sightings: TypeAlias = Mapping[tuple[str, int], Sighting]
+Sightings: TypeAlias = Mapping[tuple[str, int], CornerObservation]
 
 
 Cameras: TypeAlias = Mapping[str, CameraPose]
-Places: TypeAlias = Mapping[int, BoardPose]
+BoardPoses: TypeAlias = Mapping[int, BoardPose]
 Residuals: TypeAlias = Mapping[tuple[str, int], Float64Array]
 N_CAMERA, N_LENS, N_POSE = 15, 9, 6  # numbers of a camera, of these its lens, of a place
 
@@ -75,14 +75,14 @@ class LensPrior:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Bundle:
+class BundleResult:
     """What an adjustment found.
 
     Attributes
     ----------
     cameras : dict of str to CameraPose
         By view name, with standard errors.
-    places : dict of int to BoardPose
+    poses : dict of int to BoardPose
         By pose number.
     rms_px : dict of str to float
         Root mean square distance of a camera's corners to where the fit puts them.
@@ -97,7 +97,7 @@ class Bundle:
     """
 
     cameras: dict[str, CameraPose]
-    places: dict[int, BoardPose]
+    poses: dict[int, BoardPose]
     rms_px: dict[str, float]
     sigma_px: float
     corners: dict[str, int]
@@ -111,7 +111,7 @@ class BundleProblem:
     def __init__(
         self,
         sightings: Sightings,
-        board: Target,
+        board: FlatTarget,
         start: Cameras,
         prior: LensPrior,
         gauge: Gauge,
@@ -142,21 +142,21 @@ class BundleProblem:
         self.cameras_fixed = cameras_fixed
 
     def solve(
-        self, cameras: Cameras, places: Places
+        self, cameras: Cameras, poses: BoardPoses
     ) -> tuple[dict[str, CameraPose], dict[int, BoardPose]]:
         """Run Levenberg's method with Huber's weights; the scale is taken anew at each step."""
-        cameras, places = dict(cameras), dict(places)
+        cameras, poses = dict(cameras), dict(poses)
         damping = 1e-3
         for _ in range(MAX_BUNDLE_STEPS):
-            residuals = self._residuals(cameras, places)
+            residuals = self._residuals(cameras, poses)
             sigma = self._sigma(residuals)
             cost = self._cost(residuals, cameras, sigma)
-            H, g = self._equations(cameras, places, residuals, sigma)
+            H, g = self._equations(cameras, poses, residuals, sigma)
             while True:
                 step = np.zeros(self.total)
                 damped = H + damping * np.diag(np.diag(H))
                 step[self.free] = cho_solve(cho_factor(damped), -g)
-                trial = self._stepped(cameras, places, step)
+                trial = self._stepped(cameras, poses, step)
                 after = self._residuals(*trial)
                 new = self._cost(after, trial[0], sigma)
                 if new <= cost or damping > 1e8:
@@ -164,7 +164,7 @@ class BundleProblem:
                 damping *= 10.0
             if new > cost:
                 break
-            cameras, places = trial
+            cameras, poses = trial
             damping = max(damping / 10.0, 1e-12)
             if cost - new < COST_TOL * max(cost, 1e-300):
                 break
@@ -173,18 +173,20 @@ class BundleProblem:
                 f"bundle adjustment: still moving after {MAX_BUNDLE_STEPS} steps; show more"
                 " poses of the board, tilted more"
             )
-        return cameras, places
+        return cameras, poses
 
-    def judged(self, cameras: dict[str, CameraPose], places: dict[int, BoardPose]) -> Bundle:
+    def solution_with_errors(
+        self, cameras: dict[str, CameraPose], poses: dict[int, BoardPose]
+    ) -> BundleResult:
         """Return the solution with standard errors in the gauge."""
-        residuals = self._residuals(cameras, places)
+        residuals = self._residuals(cameras, poses)
         sigma = self._sigma(residuals)
         weights = {key: _huber(r, sigma) for key, r in residuals.items()}
         square = sum(float((weights[k][:, None] * r**2).sum()) for k, r in residuals.items())
         count = 2.0 * sum(float(w.sum()) for w in weights.values())
         unknown = len(self.free) - (N_POSE if self.gauge == "cameras" else 0)
         noise = float(np.sqrt(square / max(count - unknown, 1.0)))
-        H, _ = self._equations(cameras, places, residuals, max(noise, MIN_SIGMA_PX))
+        H, _ = self._equations(cameras, poses, residuals, max(noise, MIN_SIGMA_PX))
         covariance = np.zeros((self.total,) * 2)
         covariance[np.ix_(self.free, self.free)] = self._inverse(H, cameras)
         found, centers = {}, {}
@@ -213,7 +215,7 @@ class BundleProblem:
             for key, r in residuals.items()
         }
         outliers = {key: n for key, n in far.items() if n}
-        return Bundle(found, places, rms, noise, corners, outliers, centers)
+        return BundleResult(found, poses, rms, noise, corners, outliers, centers)
 
     def _inverse(self, H: Float64Array, cameras: Cameras) -> Float64Array:
         """Return the covariance; with free frame, that of the frame fixed by the centres."""
@@ -237,7 +239,7 @@ class BundleProblem:
         inverse = np.linalg.inv(bordered)[:n, :n]
         return np.asarray(inverse / np.outer(scale, scale))
 
-    def _residuals(self, cameras: Cameras, places: Places) -> Residuals:
+    def _residuals(self, cameras: Cameras, places: BoardPoses) -> Residuals:
         out = {}
         for (name, pose), s in self.images.items():
             r = cameras[name].project(places[pose].to_rig(self.board.points_mm[s.ids])) - s.pixels
@@ -267,7 +269,7 @@ class BundleProblem:
         return np.divide(gap, sigmas, out=np.zeros(N_LENS), where=sigmas > 0)
 
     def _equations(
-        self, cameras: Cameras, places: Places, residuals: Residuals, sigma: float
+        self, cameras: Cameras, places: BoardPoses, residuals: Residuals, sigma: float
     ) -> tuple[Float64Array, Float64Array]:
         """Return the normal matrix and the gradient of half the cost, free numbers only."""
         H, g = np.zeros((self.total, self.total)), np.zeros(self.total)
@@ -296,7 +298,7 @@ class BundleProblem:
         return H[np.ix_(self.free, self.free)], g[self.free]
 
     def _stepped(
-        self, cameras: Cameras, places: Places, step: Float64Array
+        self, cameras: Cameras, places: BoardPoses, step: Float64Array
     ) -> tuple[dict[str, CameraPose], dict[int, BoardPose]]:
         new_cameras, new_places = dict(cameras), dict(places)
         for i, name in enumerate(() if self.cameras_fixed else self.names):
@@ -311,23 +313,23 @@ class BundleProblem:
                 camera,
                 matrix=matrix,
                 distortion=camera.distortion + d[4:9],
-                rotation=_turned(camera.rotation, d[9:12]),
+                rotation=_rotate(camera.rotation, d[9:12]),
                 translation_mm=camera.translation_mm + d[12:15],
             )
         for j, pose in enumerate(self.poses):
             d = step[self.first + j * N_POSE : self.first + (j + 1) * N_POSE]
             new_places[pose] = BoardPose(
-                _turned(places[pose].rotation, d[:3]), places[pose].translation_mm + d[3:]
+                _rotate(places[pose].rotation, d[:3]), places[pose].translation_mm + d[3:]
             )
         return new_cameras, new_places
 
 
 def _derivatives(
-    camera: CameraPose, place: BoardPose, points_mm: Float64Array
+    camera: CameraPose, pose: BoardPose, points_mm: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
     """Return d pixel / d camera, shape (n, 2, 15), and d pixel / d place, shape (n, 2, 6)."""
-    on_board = points_mm @ place.rotation.T
-    turned = (on_board + place.translation_mm) @ camera.rotation.T
+    on_board = points_mm @ pose.rotation.T
+    turned = (on_board + pose.translation_mm) @ camera.rotation.T
     local = turned + camera.translation_mm
     x, y, z = local.T
     a, b = x / z, y / z
@@ -378,7 +380,7 @@ def _cross_matrix(v: Float64Array) -> Float64Array:
     return np.asarray(out - np.swapaxes(out, -1, -2))
 
 
-def _turned(rotation: Float64Array, turn: Float64Array) -> Float64Array:
+def _rotate(rotation: Float64Array, turn: Float64Array) -> Float64Array:
     """Return a rotation after a small turn, orthonormal again."""
     product = Rotation.from_rotvec(turn).as_matrix() @ rotation
     u, _, v = np.linalg.svd(product)

@@ -11,10 +11,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from capture.arrays import Float64Array
-from capture.calibration.record import Calibration, Origin, Quantity, freeze_arrays, of_devices
+from capture.calibration.record import (
+    Calibration,
+    Origin,
+    Quantity,
+    freeze_arrays,
+    make_device_calibration,
+)
 from capture.rig import Rig, View
 
-_LEFT_OUT: Any = None  # __post_init__ puts an array in its place
+_OMITTED: Any = None  # __post_init__ puts an array in its place
 
 MAX_UNDISTORT_STEPS = 50
 MAX_UNDISTORT_STEP = 10.0  # a step beyond it diverges
@@ -53,10 +59,10 @@ class CameraPose:
     rotation: Float64Array
     translation_mm: Float64Array
     image_size: tuple[int, int]
-    matrix_stderr: Float64Array = _LEFT_OUT
-    distortion_stderr: Float64Array = _LEFT_OUT
-    rotation_stderr_rad: Float64Array = _LEFT_OUT
-    translation_stderr_mm: Float64Array = _LEFT_OUT
+    matrix_stderr: Float64Array = _OMITTED
+    distortion_stderr: Float64Array = _OMITTED
+    rotation_stderr_rad: Float64Array = _OMITTED
+    translation_stderr_mm: Float64Array = _OMITTED
 
     def __post_init__(self) -> None:
         """Convert to float64 and refuse what is no camera."""
@@ -231,10 +237,10 @@ def to_calibration(
         "frame": "x_camera = rotation x_rig + translation_mm; x right, y down, z forward",
         "distortion": "k1 k2 p1 p2 k3 on normalized coordinates",
     }
-    return of_devices("geometry", values, notes, **about)
+    return make_device_calibration("geometry", values, notes, **about)
 
 
-def poses_from(calibration: Calibration, rig: Rig) -> dict[str, CameraPose]:
+def cameras_from_calibration(calibration: Calibration, rig: Rig) -> dict[str, CameraPose]:
     """Return the calibrated cameras of a rig's views, by view name.
 
     Raises
@@ -254,9 +260,9 @@ def poses_from(calibration: Calibration, rig: Rig) -> dict[str, CameraPose]:
             got("rotation").value,
             shift.value,
             (int(columns), int(rows)),
-            matrix.known_stderr,
-            distortion.known_stderr,
+            matrix.stderr_or_zero,
+            distortion.stderr_or_zero,
             got("rotation_stderr_rad").value,
-            shift.known_stderr,
+            shift.stderr_or_zero,
         )
     return poses

@@ -66,7 +66,7 @@ class GlassBall:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ball:
+class BallPosition:
     """Where the ball is.
 
     Attributes
@@ -107,7 +107,7 @@ class BallFit:
         Standard deviation of the lights about their nominal places, along an axis.
     """
 
-    ball: Ball
+    ball: BallPosition
     spot: Int64Array
     in_field: BoolArray
     stray: Int64Array
@@ -238,7 +238,7 @@ def locate_ball(
 
 def light_directions(
     camera: CameraPose,
-    ball: Ball,
+    ball: BallPosition,
     pixels: Float64Array,
     pixel_stderr: Float64Array,
     distance_mm: Float64Array,
@@ -372,7 +372,9 @@ def _refine(
             f" {MIN_LIGHT_FRACTION:.0%} or more; centre it"
         )
     stray = np.setdiff1d(np.arange(len(found)), spot)
-    return BallFit(Ball(place[:3], float(place[3]), covariance), spot, in_field, stray, scatter_mm)
+    return BallFit(
+        BallPosition(place[:3], float(place[3]), covariance), spot, in_field, stray, scatter_mm
+    )
 
 
 def _match(

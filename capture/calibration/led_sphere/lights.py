@@ -19,10 +19,10 @@ from capture.calibration.record import (
     Quantity,
     device_rows,
     freeze_arrays,
-    of_devices,
+    make_device_calibration,
 )
 from capture.calibration.store import load
-from capture.calibration.validity import require
+from capture.calibration.validity import require_valid
 from capture.rig import Rig
 
 
@@ -61,9 +61,9 @@ class SphereLightTable:
         """Convert and check the arrays against each other."""
         n = len(self.names)
         of = f" for {n} lights"
-        freeze_arrays(self, (n, 3), "directions", "directions_stderr", of=of)
-        freeze_arrays(self, (n,), "intensities", "intensities_stderr", of=of)
-        freeze_arrays(self, (n,), "seen", "valid", "dead", kind=np.bool_, of=of)
+        freeze_arrays(self, (n, 3), "directions", "directions_stderr", owner=of)
+        freeze_arrays(self, (n,), "intensities", "intensities_stderr", owner=of)
+        freeze_arrays(self, (n,), "seen", "valid", "dead", kind=np.bool_, owner=of)
         length = np.linalg.norm(self.directions, axis=1)
         if (np.abs(length - 1) > 1e-6).any():
             raise ValueError("SphereLightTable.directions: expected unit vectors")
@@ -117,7 +117,7 @@ class SphereLightTable:
         if ball:
             values["ball"] = dict(ball)
         notes = {"unit": "intensity: light at the origin over the mean of the measured lights"}
-        return of_devices("lights", values, notes, **about)
+        return make_device_calibration("lights", values, notes, **about)
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, rig: Rig) -> SphereLightTable:
@@ -131,8 +131,8 @@ class SphereLightTable:
         table = _columns(calibration, rig, "lights")
         return cls(
             table.names,
-            *table.both("direction"),
-            *table.both("intensity"),
+            *table.values_and_errors("direction"),
+            *table.values_and_errors("intensity"),
             table.flags("seen"),
             table.flags("valid"),
             table.flags("dead"),
@@ -140,7 +140,7 @@ class SphereLightTable:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SphereFilms:
+class SpherePolarizers:
     """What the films leak, as seen on glass, and as skin will.
 
     Attributes
@@ -184,8 +184,8 @@ class SphereFilms:
         n = len(self.names)
         arrays = (*_LEAKAGE_FIELDS, *(f"{name}_stderr" for name in _LEAKAGE_FIELDS[:2]))
         of = f" for {n} lights"
-        freeze_arrays(self, (n,), *arrays, "axis_error_stderr_rad", of=of)
-        freeze_arrays(self, (n,), "valid", kind=np.bool_, of=of)
+        freeze_arrays(self, (n,), *arrays, "axis_error_stderr_rad", owner=of)
+        freeze_arrays(self, (n,), "valid", kind=np.bool_, owner=of)
         if (self.leakage < 0).any() or not self.eta > 1:
             raise ValueError("SphereFilms: got a leakage < 0 or eta <= 1, expected >= 0 and > 1")
 
@@ -216,10 +216,10 @@ class SphereFilms:
             "leakage": "of a mirror reflection into the camera, crossed over parallel",
             "analyser_zero": "true angle of the analyser less its reading; from +x towards +y",
         }
-        return of_devices("polarization", values, notes, **about)
+        return make_device_calibration("polarization", values, notes, **about)
 
     @classmethod
-    def from_calibration(cls, calibration: Calibration, rig: Rig, serial: str) -> SphereFilms:
+    def from_calibration(cls, calibration: Calibration, rig: Rig, serial: str) -> SpherePolarizers:
         """Return the calibrated films of a rig and one of its cameras, in the rig's order.
 
         Raises
@@ -228,7 +228,7 @@ class SphereFilms:
             If the calibration is of another rig or camera, or lacks one of the rig's lights.
         """
         table = _columns(calibration, rig, "polarization")
-        leakage, glass, axis = (table.both(name) for name in _LEAKAGE_FIELDS)
+        leakage, glass, axis = (table.values_and_errors(name) for name in _LEAKAGE_FIELDS)
         zero, light, analyser = (
             calibration.quantity(serial, name)
             for name in ("analyser_zero_rad", "light_leak", "analyser_leak")
@@ -256,11 +256,11 @@ class SphereCalibration:
     Attributes
     ----------
     lights : SphereLightTable
-    films : SphereFilms
+    polarizers : SphereFilms
     """
 
     lights: SphereLightTable
-    films: SphereFilms
+    polarizers: SpherePolarizers
 
     @classmethod
     def load(
@@ -289,12 +289,12 @@ class SphereCalibration:
         names = [light.name for light in rig.lights]
         lights, films = load(folder, "lights"), load(folder, "polarization")
         if on is not None:
-            require(lights, rig=rig.name, serials=names, on_date=on, kind="lights")
+            require_valid(lights, rig=rig.name, serials=names, on_date=on, kind="lights")
             serials = [*names, serial]
-            require(films, rig=rig.name, serials=serials, on_date=on, kind="polarization")
+            require_valid(films, rig=rig.name, serials=serials, on_date=on, kind="polarization")
         return cls(
             SphereLightTable.from_calibration(lights, rig),
-            SphereFilms.from_calibration(films, rig, serial),
+            SpherePolarizers.from_calibration(films, rig, serial),
         )
 
     @property
@@ -318,4 +318,4 @@ def _one(value: float, stderr: float) -> Quantity:
 
 
 def _pair(quantity: Quantity) -> tuple[float, float]:
-    return float(quantity.value), float(quantity.known_stderr)
+    return float(quantity.value), float(quantity.stderr_or_zero)

@@ -16,35 +16,35 @@ from numpy.typing import ArrayLike
 
 from capture.arrays import BoolArray, Float64Array
 from capture.calibration.polarization import PolarizationError
-from capture.calibration.polarization.polarized_reflection import Reflection
+from capture.calibration.polarization.polarized_reflection import FacetReflection
 
-MAX_ZERO_DEG = 30  # of the analyser, searched
+MAX_ANALYZER_ZERO_DEG = 30  # of the analyser, searched
 TYPICAL_LEAK = 3e-4  # of film, its extinction 1e3 to 1e4
 LOG_LEAK_SCATTER = 1.5  # of its logarithm
-TYPICAL_TURN_RAD = np.radians(1.0)
-TURN_RANGE_RAD = (np.radians(0.02), np.radians(5.0))
-DEGREES_OF_FREEDOM = 4.0  # of Student's t that the lights' own axes scatter by: some may be far off
+TYPICAL_AXIS_ERROR_RAD = np.radians(1.0)
+AXIS_ERROR_RANGE_RAD = (np.radians(0.02), np.radians(5.0))
+AXIS_T_DOF = 4.0  # of Student's t that the lights' own axes scatter by: some may be far off
 MAX_POLARIZER_STEPS = 60
 POLARIZER_STEP_TOL = 1e-6
 POLARIZER_DERIVATIVE_STEP = 1e-5
 # widths of the axes' scatter within which a light may have a second answer
 MODE_SCATTER_WIDTHS = 6.0
-MAX_MODE_TURN_RAD = np.radians(30.0)
+MAX_MODE_AXIS_ERROR_RAD = np.radians(30.0)
 N_MODE_GRID = 41
 N_MODE_ITERATIONS = 5
-SAME_MODE_RAD = np.radians(0.01)
+MODE_TOL_RAD = np.radians(0.01)
 MIN_POLARIZED_LIGHTS = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FilmFit:
+class PolarizerFit:
     """The films, as the spots of all lights and readings say.
 
     Attributes
     ----------
     strength, strength_stderr : ndarray of float64, shape (L,)
         Flux of each light at an ideal mirror without an analyser, per second at level 1.
-    turn_rad, turn_stderr_rad : ndarray of float64, shape (L,)
+    axis_error_rad, axis_error_stderr_rad : ndarray of float64, shape (L,)
         How far each light's axis is off; where the readings leave its sign open it is drawn to 0.
     zero_rad, zero_stderr_rad : float
         What the analyser's reading lacks to its true angle.
@@ -52,7 +52,7 @@ class FilmFit:
         Inverse extinction ratios.
     covariance : ndarray of float64, shape (L, 4, 4)
         Of turn, zero and the logarithms of both leaks, for each light.
-    turn_scatter_rad : float
+    axis_scatter_rad : float
         Of the lights' axes about their nominal angles.
     chi2_per_dof : float
         Above 1 the errors have been widened.
@@ -60,14 +60,14 @@ class FilmFit:
 
     strength: Float64Array
     strength_stderr: Float64Array
-    turn_rad: Float64Array
-    turn_stderr_rad: Float64Array
+    axis_error_rad: Float64Array
+    axis_error_stderr_rad: Float64Array
     zero_rad: float
     zero_stderr_rad: float
     light_leak: float
     analyser_leak: float
     covariance: Float64Array
-    turn_scatter_rad: float
+    axis_scatter_rad: float
     chi2_per_dof: float
 
     @property
@@ -77,13 +77,13 @@ class FilmFit:
         return float(self.light_leak * a), float(self.analyser_leak * b)
 
 
-def fit_films(
+def fit_polarizers(
     readings_rad: ArrayLike,
     rates: Float64Array,
     variance: Float64Array,
     good: BoolArray,
-    reflection: Reflection,
-) -> FilmFit:
+    reflection: FacetReflection,
+) -> PolarizerFit:
     """Fit the films and the strengths of the lights to the spots' fluxes.
 
     Parameters
@@ -130,13 +130,13 @@ def fit_films(
     weight = np.where(good & seen, 1.0 / np.where(variance > 0, variance, 1.0), 0.0)
     values = np.where(weight > 0, rates, 0.0)
     fits = [
-        _Films(readings, values, weight, reflection, zero).settle()
+        _PolarizerProblem(readings, values, weight, reflection, zero).solve_all_modes()
         for zero in _starts(readings, values, weight, reflection)
     ]
     return min(fits, key=lambda fit: fit.cost).result(seen)
 
 
-def leakage(fit: FilmFit, reflection: Reflection) -> tuple[Float64Array, Float64Array]:
+def leakage(fit: PolarizerFit, reflection: FacetReflection) -> tuple[Float64Array, Float64Array]:
     """Return how much of a mirror reflection passes crossed, over parallel, with standard errors.
 
     Parameters
@@ -152,9 +152,9 @@ def leakage(fit: FilmFit, reflection: Reflection) -> tuple[Float64Array, Float64
         Readings 90 over 0. Its mean over the errors of the films, not its value at the best films:
         it is a square, and errors of angles of either sign add to it.
     """
-    count = len(fit.turn_rad)
+    count = len(fit.axis_error_rad)
     shared = (fit.zero_rad, np.log(fit.light_leak), np.log(fit.analyser_leak))
-    at = np.stack([fit.turn_rad, *(np.full(count, x) for x in shared)], axis=-1)
+    at = np.stack([fit.axis_error_rad, *(np.full(count, x) for x in shared)], axis=-1)
     root = np.linalg.cholesky(fit.covariance + 1e-18 * np.eye(4))
     values = []
     # cubature of third degree: 2 n points at sqrt(n) standard deviations
@@ -170,13 +170,13 @@ def leakage(fit: FilmFit, reflection: Reflection) -> tuple[Float64Array, Float64
 
 
 def _starts(
-    readings: Float64Array, values: Float64Array, weight: Float64Array, reflection: Reflection
+    readings: Float64Array, values: Float64Array, weight: Float64Array, reflection: FacetReflection
 ) -> list[float]:
     """Return the two best zeros of the analyser if the lights stood as drawn, rad."""
     # lights' own axes are off: their spots differ from this by some thousandths of their light
     slack = (3e-3 * np.abs(values).max(axis=0)) ** 2
     soft = np.where(weight > 0, weight / (1.0 + weight * slack), 0.0)
-    zeros = np.radians(np.arange(-MAX_ZERO_DEG, MAX_ZERO_DEG + 1.0, 1.0))
+    zeros = np.radians(np.arange(-MAX_ANALYZER_ZERO_DEG, MAX_ANALYZER_ZERO_DEG + 1.0, 1.0))
     cost = []
     for zero in zeros:
         u = reflection.transmit_through_analyzer(readings, 0.0, zero, TYPICAL_LEAK, TYPICAL_LEAK)
@@ -189,7 +189,7 @@ def _starts(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Arrow:
+class _ArrowSystem:
     """Normal equations of two numbers of each light, and of three that all lights share."""
 
     block: Float64Array  # of each light's own, (L, 2, 2)
@@ -219,7 +219,7 @@ class _Arrow:
         return inverse - both @ through.transpose(0, 2, 1), both, shared
 
 
-class _Films:
+class _PolarizerProblem:
     """One descent: strengths and turns of the lights, and three numbers that all share.
 
     The normal equations are an arrow: a 2 x 2 block for each light, and a border of three.
@@ -230,7 +230,7 @@ class _Films:
         readings: Float64Array,
         values: Float64Array,
         weight: Float64Array,
-        reflection: Reflection,
+        reflection: FacetReflection,
         zero: float,
     ) -> None:
         self.readings, self.values, self.weight = readings, values, weight
@@ -239,20 +239,20 @@ class _Films:
         count = values.shape[1]
         self.turn = np.zeros(count)
         self.shared = np.array([zero, np.log(TYPICAL_LEAK), np.log(TYPICAL_LEAK)])
-        self.scatter = float(TYPICAL_TURN_RAD)
+        self.scatter = float(TYPICAL_AXIS_ERROR_RAD)
         self.pull = np.ones(count)  # weight of each light's turn among all, from Student's t
-        u = self._through(self.turn, self.shared)
+        u = self._transmitted(self.turn, self.shared)
         power = np.sum(weight * u**2, axis=0)
         self.strength = np.sum(weight * u * values, axis=0) / np.where(power > 0, power, 1.0)
 
-    def _through(self, turn: Float64Array, shared: Float64Array) -> Float64Array:
+    def _transmitted(self, turn: Float64Array, shared: Float64Array) -> Float64Array:
         zero, light, analyser = shared
         return self.reflection.transmit_through_analyzer(
             self.readings, turn, zero, np.exp(light), np.exp(analyser)
         )
 
     def _objective(self, strength: Float64Array, turn: Float64Array, shared: Float64Array) -> float:
-        miss = self.values - strength * self._through(turn, shared)
+        miss = self.values - strength * self._transmitted(turn, shared)
         beyond = (shared[1:] - np.log(TYPICAL_LEAK)) / LOG_LEAK_SCATTER
         return float(
             np.sum(self.weight * miss**2)
@@ -265,19 +265,22 @@ class _Films:
         """Minus twice the logarithm of the posterior, up to a constant."""
         data = self._objective(self.strength, self.turn, self.shared)
         data -= float(np.sum(self.pull * self.turn**2)) / self.scatter**2
-        tails = np.log1p(self.turn[self.lit] ** 2 / (DEGREES_OF_FREEDOM * self.scatter**2))
+        tails = np.log1p(self.turn[self.lit] ** 2 / (AXIS_T_DOF * self.scatter**2))
         return data + float(
-            (DEGREES_OF_FREEDOM + 1) * tails.sum() + 2 * self.lit.sum() * np.log(self.scatter)
+            (AXIS_T_DOF + 1) * tails.sum() + 2 * self.lit.sum() * np.log(self.scatter)
         )
 
-    def _normal(self) -> _Arrow:
+    def _normal(self) -> _ArrowSystem:
         """Return blocks (L, 2, 2), borders (L, 2, 3), corner (3, 3), and both right sides."""
         h = POLARIZER_DERIVATIVE_STEP
-        u = self._through(self.turn, self.shared)
-        by_turn = self._through(self.turn + h, self.shared)
-        by_turn = (by_turn - self._through(self.turn - h, self.shared)) / (2 * h)
+        u = self._transmitted(self.turn, self.shared)
+        by_turn = self._transmitted(self.turn + h, self.shared)
+        by_turn = (by_turn - self._transmitted(self.turn - h, self.shared)) / (2 * h)
         by_shared = [
-            (self._through(self.turn, self.shared + e) - self._through(self.turn, self.shared - e))
+            (
+                self._transmitted(self.turn, self.shared + e)
+                - self._transmitted(self.turn, self.shared - e)
+            )
             / (2 * h)
             for e in h * np.eye(3)
         ]
@@ -295,9 +298,9 @@ class _Films:
         block[~self.lit, 0, 0] = 1.0
         corner[1:, 1:] += np.eye(2) / LOG_LEAK_SCATTER**2
         other[1:] -= (self.shared[1:] - np.log(TYPICAL_LEAK)) / LOG_LEAK_SCATTER**2
-        return _Arrow(block, border, corner, one, other)
+        return _ArrowSystem(block, border, corner, one, other)
 
-    def solve(self) -> _Films:
+    def solve(self) -> _PolarizerProblem:
         """Descend, with Marquardt's damping; between steps fit the scatter of the axes."""
         damping = 1e-3
         now = self._objective(self.strength, self.turn, self.shared)
@@ -320,9 +323,7 @@ class _Films:
             damping = max(damping / 10, 1e-9)
             wider = self._scatter(arrow.covariance()[0][:, 1, 1])
             self.pull = np.where(
-                self.lit,
-                (DEGREES_OF_FREEDOM + 1) / (DEGREES_OF_FREEDOM + (self.turn / wider) ** 2),
-                1.0,
+                self.lit, (AXIS_T_DOF + 1) / (AXIS_T_DOF + (self.turn / wider) ** 2), 1.0
             )
             settled = abs(wider / self.scatter - 1) < 1e-3
             self.scatter = wider
@@ -331,7 +332,7 @@ class _Films:
                 break
         return self
 
-    def settle(self) -> _Films:
+    def solve_all_modes(self) -> _PolarizerProblem:
         """Descend, and again from where single lights have a better answer on another side."""
         self.solve()
         for _ in range(6):
@@ -346,11 +347,11 @@ class _Films:
 
     def _light_cost(self, turn: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Return each light's own part of the cost at its best strength, and that strength."""
-        u = self._through(turn, self.shared)
+        u = self._transmitted(turn, self.shared)
         power = np.sum(self.weight * u**2, axis=0)
         strength = np.sum(self.weight * u * self.values, axis=0) / np.where(power > 0, power, 1.0)
         miss = np.sum(self.weight * (self.values - strength * u) ** 2, axis=0)
-        tail = (DEGREES_OF_FREEDOM + 1) * np.log1p(turn**2 / (DEGREES_OF_FREEDOM * self.scatter**2))
+        tail = (AXIS_T_DOF + 1) * np.log1p(turn**2 / (AXIS_T_DOF * self.scatter**2))
         return miss + tail, strength
 
     def _modes(self) -> tuple[Float64Array, Float64Array]:
@@ -358,7 +359,7 @@ class _Films:
         even = np.linspace(-1.0, 1.0, N_MODE_GRID)
         # closely where most axes are, coarsely where one far off may be
         grid = np.unique(
-            np.append(MODE_SCATTER_WIDTHS * self.scatter * even, MAX_MODE_TURN_RAD * even)
+            np.append(MODE_SCATTER_WIDTHS * self.scatter * even, MAX_MODE_AXIS_ERROR_RAD * even)
         )
         steps = np.maximum(np.diff(grid, prepend=grid[0]), np.diff(grid, append=grid[-1]))
         cost = np.array([self._light_cost(np.full_like(self.turn, g))[0] for g in grid])
@@ -379,30 +380,26 @@ class _Films:
         first = np.argsort(costs, axis=0)
         modes, costs = (np.take_along_axis(part, first, axis=0) for part in (modes, costs))
         # one valley only, or both descents into the same
-        single = (valley.sum(axis=0) < 2) | (np.abs(modes[0] - modes[1]) < SAME_MODE_RAD)
+        single = (valley.sum(axis=0) < 2) | (np.abs(modes[0] - modes[1]) < MODE_TOL_RAD)
         costs[1, single] = np.inf
         return modes, costs
 
     def _scatter(self, variance: Float64Array) -> float:
         """Return the width of the axes' scatter: one step of expectation and maximization."""
         square = (self.pull * (self.turn**2 + variance))[self.lit].mean()
-        return float(np.clip(np.sqrt(square), *TURN_RANGE_RAD))
+        return float(np.clip(np.sqrt(square), *AXIS_ERROR_RANGE_RAD))
 
-    def result(self, seen: BoolArray) -> FilmFit:
+    def result(self, observed: BoolArray) -> PolarizerFit:
         """Return the fit, with errors widened where the residuals are larger than the noise."""
         # how much the scattered axes tell: slope and spread of their pull (a sandwich), since
         # weights that follow the residuals would count their own scatter as knowledge
         z = self.turn[self.lit] / self.scatter
-        slope = (
-            (DEGREES_OF_FREEDOM + 1)
-            * (DEGREES_OF_FREEDOM - z**2)
-            / (DEGREES_OF_FREEDOM + z**2) ** 2
-        ).sum()
+        slope = ((AXIS_T_DOF + 1) * (AXIS_T_DOF - z**2) / (AXIS_T_DOF + z**2) ** 2).sum()
         spread = ((self.pull[self.lit] * z) ** 2).sum()
         known = np.clip(slope**2 / max(spread, 1e-9) / len(z), 0.2, 1.0)
         self.pull = np.full_like(self.pull, known)
         local, both, shared = self._normal().covariance()
-        u = self._through(self.turn, self.shared)
+        u = self._transmitted(self.turn, self.shared)
         chi2 = float(np.sum(self.weight * (self.values - self.strength * u) ** 2))
         told = 1.0 - self.pull * local[:, 1, 1] / self.scatter**2  # share that the data tell
         free = float(np.sum(self.weight > 0) - self.lit.sum() - told[self.lit].sum() - 3)
@@ -422,16 +419,16 @@ class _Films:
         covariance[:, 0, 1:] = covariance[:, 1:, 0] = both[:, 1]
         covariance[:, 1:, 1:] = shared
         covariance *= wide
-        return FilmFit(
-            strength=np.where(seen, self.strength, 0.0),
-            strength_stderr=np.where(seen, np.sqrt(wide * local[:, 0, 0]), 0.0),
-            turn_rad=self.turn,
-            turn_stderr_rad=np.sqrt(covariance[:, 0, 0]),
+        return PolarizerFit(
+            strength=np.where(observed, self.strength, 0.0),
+            strength_stderr=np.where(observed, np.sqrt(wide * local[:, 0, 0]), 0.0),
+            axis_error_rad=self.turn,
+            axis_error_stderr_rad=np.sqrt(covariance[:, 0, 0]),
             zero_rad=float(self.shared[0]),
             zero_stderr_rad=float(np.sqrt(covariance[0, 1, 1])),
             light_leak=float(np.exp(self.shared[1])),
             analyser_leak=float(np.exp(self.shared[2])),
             covariance=covariance,
-            turn_scatter_rad=self.scatter,
+            axis_scatter_rad=self.scatter,
             chi2_per_dof=per_dof,
         )

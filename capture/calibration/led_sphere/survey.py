@@ -9,31 +9,31 @@ from capture.arrays import BoolArray, Float64Array
 from capture.calibration.fiber.spot_photometry import (
     RING_RADII,
     RateImage,
-    Shot,
-    measure_middles,
-    rate_image,
-    share_within,
+    SpotImage,
+    encircled_energy,
+    measure_centroids,
+    merge_spot_images,
 )
 from capture.calibration.geometry import CameraPose
 from capture.calibration.led_sphere.glass_ball import (
-    Ball,
     BallError,
     BallFit,
+    BallPosition,
     GlassBall,
     find_spots,
     light_directions,
     locate_ball,
 )
-from capture.calibration.led_sphere.lights import SphereFilms, SphereLightTable
-from capture.calibration.led_sphere.polarization import FilmFit, fit_films
+from capture.calibration.led_sphere.lights import SphereLightTable, SpherePolarizers
+from capture.calibration.led_sphere.polarization import PolarizerFit, fit_polarizers
 from capture.calibration.led_sphere.strengths import (
     add_geometry_errors,
-    film_table,
     measure_intensities,
     measure_rates,
+    polarizer_table,
 )
 from capture.calibration.lights.reflection import mirror_lights
-from capture.calibration.polarization.polarized_reflection import Reflection
+from capture.calibration.polarization.polarized_reflection import FacetReflection
 from capture.rig import Rig
 
 MAX_ANALYZER_OFFSET_DEG = 2.0
@@ -49,7 +49,7 @@ MAX_DEAD_INTENSITY = 0.05  # of the mean: a light dimmer than this is dead
 MAX_INTENSITY_STDERR = 0.3  # relative error above which an intensity is not called measured
 # of a usual spot's peak: fainter ones are reflections of spots, or their rings
 STRAY_PEAK_RATIO = 0.2
-STRAY_MM = 0.4
+MIN_STRAY_DISTANCE_MM = 0.4
 SKIN_ETA = 1.4
 
 
@@ -60,7 +60,7 @@ class SphereSurvey:
     Attributes
     ----------
     lights : SphereLightTable
-    films : SphereFilms
+    polarizers : SphereFilms
     ball : Ball
         As found.
     light_scatter_mm : float
@@ -74,8 +74,8 @@ class SphereSurvey:
     """
 
     lights: SphereLightTable
-    films: SphereFilms
-    ball: Ball
+    polarizers: SpherePolarizers
+    ball: BallPosition
     light_scatter_mm: float
     turn_scatter_rad: float
     readings_deg: tuple[float, ...]
@@ -84,10 +84,10 @@ class SphereSurvey:
 
 def describe_findings(
     survey: SphereSurvey,
-    place: Float64Array,
+    position_mm: Float64Array,
     in_field: BoolArray,
     saturated: BoolArray,
-    films: FilmFit,
+    polarizers: PolarizerFit,
     strays: int,
 ) -> tuple[str, ...]:
     """Return what is wrong with the rig, one sentence each.
@@ -95,15 +95,15 @@ def describe_findings(
     Parameters
     ----------
     survey : SphereSurvey
-    place : ndarray of float64, shape (L, 3)
+    position_mm : ndarray of float64, shape (L, 3)
         Nominal places of the lights, mm.
     in_field, saturated : ndarray of bool, shape (L,)
         Lights mirrored within the image, and saturated in every exposure.
-    films : FilmFit
+    polarizers : FilmFit
     strays : int
         Number of bright spots that are not reflections of lights.
     """
-    lights, table = survey.lights, survey.films
+    lights, table = survey.lights, survey.polarizers
     names = np.array(lights.names)
     findings = []
 
@@ -120,9 +120,9 @@ def describe_findings(
     dim = ~lights.valid & ~outside & ~saturated
     if dim.any():
         findings.append(f"too dim in the ball to be measured: {listed(dim)}")
-    nominal = place / np.linalg.norm(place, axis=1, keepdims=True)
+    nominal = position_mm / np.linalg.norm(position_mm, axis=1, keepdims=True)
     off = np.linalg.norm(lights.directions - nominal, axis=1)
-    usual = np.sqrt(2) * survey.light_scatter_mm / np.linalg.norm(place, axis=1)
+    usual = np.sqrt(2) * survey.light_scatter_mm / np.linalg.norm(position_mm, axis=1)
     far = lights.seen & (
         off > np.maximum(MAX_LIGHT_OFFSET_SIGMAS * usual, np.radians(MAX_LIGHT_OFFSET_DEG))
     )
@@ -130,7 +130,7 @@ def describe_findings(
         findings.append(
             f"light {names[k]} is {np.degrees(off[k]):.2f} degrees off its nominal direction"
         )
-    zero, error = np.degrees([films.zero_rad, films.zero_stderr_rad])
+    zero, error = np.degrees([polarizers.zero_rad, polarizers.zero_stderr_rad])
     if abs(zero) > MAX_ANALYZER_OFFSET_DEG:
         findings.append(
             f"the analyzer is {zero:+.2f} ± {error:.2f} degrees off its reading: crossed leaks"
@@ -153,7 +153,7 @@ def describe_findings(
 
 
 def survey_sphere(
-    shots: Sequence[Shot],
+    shots: Sequence[SpotImage],
     rig: Rig,
     *,
     view: str = "cam",
@@ -205,17 +205,17 @@ def survey_sphere(
 
     glass = scene.reflection(scene.target.eta, shown.to_light, shown.to_camera, direction)
     airy_px = WAVELENGTH_MM * float(camera.matrix[0, 0]) / scene.pupil_mm
-    rates = measure_rates(shots, at, aperture_px, share_within(aperture_px, airy_px))
+    rates = measure_rates(shots, at, aperture_px, encircled_energy(aperture_px, airy_px))
     readings_rad = np.radians(rates.readings_deg)
-    films = fit_films(readings_rad, rates.rate, rates.variance, rates.good, glass)
+    films = fit_polarizers(readings_rad, rates.rate, rates.variance, rates.good, glass)
     angle_rad = np.linalg.norm(seen.stderr, axis=1) / np.sqrt(2)
     films = add_geometry_errors(films, glass, scene.target.eta_stderr, angle_rad)
     strength = measure_intensities(rig, camera, fit.ball, films, shown, direction)
-    lights = _light_table(rig, seen, rates.fluxed, strength)
+    lights = _light_table(rig, seen, rates.is_measured, strength)
     toward = np.tile(camera.center_mm / np.linalg.norm(camera.center_mm), (len(place), 1))
     skin = scene.reflection(eta, direction, toward, direction)
-    table = film_table(lights, films, skin, rates, eta)
-    scatters = fit.light_scatter_mm, films.turn_scatter_rad
+    table = polarizer_table(lights, films, skin, rates, eta)
+    scatters = fit.light_scatter_mm, films.axis_scatter_rad
     readings = tuple(sorted(set(rates.readings_deg.tolist())))
     result = SphereSurvey(lights, table, fit.ball, *scatters, readings, ())
     in_field = fit.in_field & (rates.good.any(axis=0) | rates.saturated)
@@ -225,7 +225,7 @@ def survey_sphere(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _SeenLights:
+class _ObservedLights:
     """The ball, its spots, and the lights' directions by them."""
 
     fit: BallFit
@@ -273,14 +273,14 @@ class _Scene:
         wide = lamp_px * pixel_mm + cone * np.maximum(*defocus)
         return np.asarray(0.5 * wide + SPOT_MARGIN_MM)
 
-    def find_lights(self, shots: Sequence[Shot], aperture_px: Float64Array) -> _SeenLights:
+    def find_lights(self, shots: Sequence[SpotImage], aperture_px: Float64Array) -> _ObservedLights:
         """Return the lights' directions by their spots; nominal ones where none is measured."""
-        total = _both_states(shots)
+        total = _sum_polarization_states(shots)
         spots = find_spots(total.rate, pixel_mm=self.pixel_mm)
         margin_mm = RING_RADII[1] * SPOT_MARGIN_MM
         fit = locate_ball(spots, self.camera, self.place, self.target, margin_mm=margin_mm)
         start = np.where((fit.spot >= 0)[:, None], spots[fit.spot], np.nan)
-        middle, noise_px, clipped = measure_middles(total, start, aperture_px=aperture_px)
+        middle, noise_px, clipped = measure_centroids(total, start, aperture_px=aperture_px)
         measured = np.asarray(np.isfinite(middle).all(axis=1), bool)
         if not measured.any():
             raise BallError("ball: no spot lies whole within the image; centre the ball")
@@ -302,22 +302,22 @@ class _Scene:
         found = light_directions(self.camera, fit.ball, middle, errors, distance)
         direction = np.where(measured[:, None], found.direction, self.place / distance[:, None])
         stderr = np.where(measured[:, None], found.stderr, fit.light_scatter_mm / distance[:, None])
-        return _SeenLights(fit, spots, total, middle, measured, direction, stderr)
+        return _ObservedLights(fit, spots, total, middle, measured, direction, stderr)
 
     def reflection(
         self, eta: float, to_light: Float64Array, to_camera: Float64Array, facing: Float64Array
-    ) -> Reflection:
+    ) -> FacetReflection:
         """Return the lights as facets of an index mirror them into the camera."""
         axis, name = self.view.analyser_axis_deg, self.view.name
         if axis is None:
             text = f"view {name!r}: has no analyser; this rig's films cannot be calibrated"
             raise BallError(text)
         toward = {"to_light": to_light, "to_camera": to_camera, "facing": facing}
-        return Reflection.of(self.rig.lights, self.camera, axis, eta, **toward)
+        return FacetReflection.of(self.rig.lights, self.camera, axis, eta, **toward)
 
 
 def _light_table(
-    rig: Rig, seen: _SeenLights, fluxed: BoolArray, strength: tuple[Float64Array, Float64Array]
+    rig: Rig, seen: _ObservedLights, fluxed: BoolArray, strength: tuple[Float64Array, Float64Array]
 ) -> SphereLightTable:
     """Return the lights with intensities over their mean, and which are dead."""
     intensity, stderr = strength
@@ -335,7 +335,7 @@ def _light_table(
     return SphereLightTable(names, seen.direction, seen.stderr, *shown, *flags)
 
 
-def _bright_strays(seen: _SeenLights, pixel_mm: float) -> int:
+def _bright_strays(seen: _ObservedLights, pixel_mm: float) -> int:
     """Return how many bright spots belong to no light and lie away from lights' spots."""
     if not len(seen.fit.stray):
         return 0
@@ -345,23 +345,23 @@ def _bright_strays(seen: _SeenLights, pixel_mm: float) -> int:
     own = seen.middle[np.isfinite(seen.middle).all(axis=1)]
     return sum(
         peak[k] > STRAY_PEAK_RATIO * usual_peak
-        and np.linalg.norm(own - spots[k], axis=1).min() > STRAY_MM / pixel_mm
+        and np.linalg.norm(own - spots[k], axis=1).min() > MIN_STRAY_DISTANCE_MM / pixel_mm
         for k in fit.stray
     )
 
 
-def _both_states(shots: Sequence[Shot]) -> RateImage:
+def _sum_polarization_states(shots: Sequence[SpotImage]) -> RateImage:
     """Return what comes parallel and crossed together, the light of each spot."""
-    by_reading: dict[float, list[Shot]] = {}
+    by_reading: dict[float, list[SpotImage]] = {}
     for shot in shots:
         by_reading.setdefault(shot.reading_deg, []).append(shot)
     if not by_reading:
         raise BallError("ball: got no frames with the lights on")
-    parallel = rate_image(by_reading[min(by_reading, key=lambda r: abs(r))])
+    parallel = merge_spot_images(by_reading[min(by_reading, key=lambda r: abs(r))])
     across = min(by_reading, key=lambda r: abs(r - 90.0))
     if len(by_reading) == 1:
         return parallel
-    crossed = rate_image(by_reading[across])
+    crossed = merge_spot_images(by_reading[across])
     return RateImage(
         parallel.rate + crossed.rate,
         parallel.variance + crossed.variance,

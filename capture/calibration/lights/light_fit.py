@@ -25,13 +25,15 @@ N_LIGHT, N_RESPONSE, N_TILT = 6, 5, 2
 MIN_INCIDENCE_COSINE = 0.25  # of incidence: flatter light shows the plate's waves
 N_LIGHT_FIT_STEPS = 6
 TILT_PRIOR_RAD = 0.05  # how far an LED may point past the rig's origin
-EXPONENT_PRIOR = 1.0
+EXPONENT_PRIOR_STD = 1.0
 NORMAL_PRIOR_RAD = 2e-3  # of the plate's normal as its markers show it
-GAIN_PRIOR = 0.2  # relative, of a camera's response
-VIGNETTING_PRIOR = 0.4
-FRAME_STDERR = 3e-3  # relative, of all parts of a frame: the LED's pulses, the plate's place
+GAIN_PRIOR_STD = 0.2  # relative, of a camera's response
+VIGNETTING_PRIOR_STD = 0.4
+FRAME_RELATIVE_STDERR = (
+    3e-3  # relative, of all parts of a frame: the LED's pulses, the plate's place
+)
 # relative, of a part's mean: responses of pixels, form of the vignetting, cleanness
-PART_STDERR = 3e-3
+PLATE_PART_RELATIVE_STDERR = 3e-3
 DEAD_LIGHT_BRIGHTNESS = 0.02  # of the usual brightness: a light below is dead
 DEAD_SIGMAS = 5.0
 MAX_SHADING_MISFIT = 3e-3  # part of a light's energy over all frames that its own shading may leave
@@ -53,10 +55,10 @@ class LightFit:
         others are not valid there.
     dead : tuple of str
         Lights that were on and gave no light.
-    answers : dict of str to str
+    swapped : dict of str to str
         Lights whose shading is that of another: by the name that was on, the name of the light
         that seems to have shone.
-    unseen : tuple of str
+    unobserved : tuple of str
         Lights of which no frame is usable (the plate never faced them).
     residual : float
         Root mean square relative residual of the parts.
@@ -66,13 +68,13 @@ class LightFit:
 
     table: LightTable
     dead: tuple[str, ...]
-    answers: dict[str, str]
-    unseen: tuple[str, ...]
+    swapped: dict[str, str]
+    unobserved: tuple[str, ...]
     residual: float
     frames: int
 
 
-def check_order(
+def find_swapped_lights(
     samples: Sequence[PlateSamples], table: LightTable
 ) -> tuple[dict[str, str], tuple[str, ...]]:
     """Say which lights' frames show another light's shading, and which show none.
@@ -167,7 +169,7 @@ def fit_lights(
     LightFitError
         If no frame is usable.
     """
-    answers, dead = check_order(samples, table)
+    answers, dead = find_swapped_lights(samples, table)
     fit = _Fit(table, cameras, plate or WhitePlate())
     for row in samples:
         if row.light in table.names and row.light not in dead and row.light not in answers:
@@ -234,20 +236,20 @@ class _Fit:
         toward = to_light[good] / distance[good, None]
         turns = toward @ row.rotation[:, :2] / cosine[good, None]
         known = np.log(self.plate.reflectance * cosine[good] / distance[good] ** 2)
-        relative = row.variance[good] / row.signal[good] ** 2 + PART_STDERR**2
+        relative = row.variance[good] / row.signal[good] ** 2 + PLATE_PART_RELATIVE_STDERR**2
         place = turns, known, -toward, r2[good]
         seen = np.log((row.signal / row.on_s)[good]), relative
         self.frames.append(_Frame(light, row.view, pose, row.part[good], *place, *seen))
 
-    def solve(self, dead: tuple[str, ...], answers: dict[str, str]) -> LightFit:
-        """Return the fit; `dead` and `answers` are of `check_order`."""
+    def solve(self, dead: tuple[str, ...], swapped: dict[str, str]) -> LightFit:
+        """Return the fit; `dead` and `swapped` are of `find_swapped_lights`."""
         lights, last = len(self.table.names), self._turns
         relief = last + N_TILT * (1 + max(f.pose for f in self.frames))
         total = relief + N_TILT * (1 + max(int(f.part.max()) for f in self.frames))
         middle, prior = np.zeros(total), np.zeros(total)
         middle[3 : self._responses : N_LIGHT] = self.table.exponent
-        of_light = [0.0] * 3 + [1 / EXPONENT_PRIOR**2] + [1 / TILT_PRIOR_RAD**2] * 2
-        of_response = [1 / GAIN_PRIOR**2] * 3 + [1 / VIGNETTING_PRIOR**2] * 2
+        of_light = [0.0] * 3 + [1 / EXPONENT_PRIOR_STD**2] + [1 / TILT_PRIOR_RAD**2] * 2
+        of_response = [1 / GAIN_PRIOR_STD**2] * 3 + [1 / VIGNETTING_PRIOR_STD**2] * 2
         prior[: self._responses] = np.tile(of_light, lights)
         prior[self._responses : last] = np.tile(of_response, len(self.views))
         prior[last:relief] = 1 / NORMAL_PRIOR_RAD**2
@@ -274,7 +276,7 @@ class _Fit:
                 JW = J * w[:, None]
                 # parts of a frame share an error: Woodbury's formula
                 ones = JW.sum(axis=0)
-                share = FRAME_STDERR**2 / (1 + FRAME_STDERR**2 * w.sum())
+                share = FRAME_RELATIVE_STDERR**2 / (1 + FRAME_RELATIVE_STDERR**2 * w.sum())
                 H[np.ix_(columns, columns)] += JW.T @ J - share * np.outer(ones, ones)
                 g[columns] += JW.T @ r - share * ones * (w @ r)
                 used[columns] = True
@@ -290,9 +292,9 @@ class _Fit:
         errors = np.sqrt(np.clip(np.diag(covariance), 0, None))
         table, seen = self._table(numbers, errors)
         silent = [name for name, ok in zip(table.names, seen, strict=True) if not ok]
-        unseen = tuple(name for name in silent if name not in dead and name not in answers)
+        unseen = tuple(name for name in silent if name not in dead and name not in swapped)
         rms = float(np.sqrt(square / max(count, 1)))
-        return LightFit(table, dead, answers, unseen, rms, len(self.frames))
+        return LightFit(table, dead, swapped, unseen, rms, len(self.frames))
 
     def _columns(self, f: _Frame) -> Int64Array:
         """Return where the numbers of a frame's light, camera and pose are."""

@@ -17,11 +17,11 @@ from capture.calibration.record import (
     Quantity,
     device_rows,
     freeze_arrays,
-    of_devices,
+    make_device_calibration,
 )
 from capture.rig import Rig
 
-_LEFT_OUT: Any = None  # __post_init__ puts an array in its place
+_OMITTED: Any = None  # __post_init__ puts an array in its place
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,11 +110,11 @@ class LightTable:
     intensity: Float64Array
     exponent: Float64Array
     names: tuple[str, ...]
-    axis: Float64Array = _LEFT_OUT
-    valid: BoolArray = _LEFT_OUT
-    position_stderr_mm: Float64Array = _LEFT_OUT
-    intensity_stderr: Float64Array = _LEFT_OUT
-    exponent_stderr: Float64Array = _LEFT_OUT
+    axis: Float64Array = _OMITTED
+    valid: BoolArray = _OMITTED
+    position_stderr_mm: Float64Array = _OMITTED
+    intensity_stderr: Float64Array = _OMITTED
+    exponent_stderr: Float64Array = _OMITTED
     cameras: Mapping[str, CameraResponse] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -228,7 +228,7 @@ class LightTable:
                 "vignetting": Quantity(camera.vignetting, camera.vignetting_stderr),
             }
         notes = {"unit": "intensity: fraction of full scale per second x mm^2 for a perfect white"}
-        return of_devices("lights", values, notes, **about)
+        return make_device_calibration("lights", values, notes, **about)
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, rig: Rig) -> LightTable:
@@ -245,7 +245,7 @@ class LightTable:
                 gain = calibration.quantity(view.serial, "gain")
                 vignetting = calibration.quantity(view.serial, "vignetting")
                 cameras[view.serial] = CameraResponse(
-                    gain.value, vignetting.value, gain.known_stderr, vignetting.known_stderr
+                    gain.value, vignetting.value, gain.stderr_or_zero, vignetting.stderr_or_zero
                 )
         table = DeviceColumns(calibration, [light.name for light in rig.lights])
         return cls(

@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from capture.arrays import BoolArray, Float64Array, Int64Array
 from capture.calibration.geometry import CameraPose
-from capture.calibration.lights.mirror_sphere import SphereError, SpherePosition, contour
+from capture.calibration.lights.mirror_sphere import MirrorSphereError, SpherePosition, contour
 from capture.calibration.lights.reflection import reflect, reflection_pixels, reflection_points
 from capture.calibration.robust import huber_weights, mad_sigma
 
@@ -54,12 +54,14 @@ class SphereWindow:
     inside: BoolArray
 
     @classmethod
-    def of(cls, camera: CameraPose, place: SpherePosition) -> SphereWindow:
+    def of(cls, camera: CameraPose, sphere: SpherePosition) -> SphereWindow:
         """Return the window of a sphere in a camera."""
-        outline = contour(camera, place.center_mm, place.radius_mm, 90)
+        outline = contour(camera, sphere.center_mm, sphere.radius_mm, 90)
         size = np.array(camera.image_size)
         if not np.isfinite(outline).all():
-            raise SphereError(f"sphere at {place.center_mm.tolist()}: behind {camera.serial}")
+            raise MirrorSphereError(
+                f"sphere at {sphere.center_mm.tolist()}: behind {camera.serial}"
+            )
         low = np.clip(np.floor(outline.min(axis=0)), 0, size).astype(int)
         high = np.clip(np.ceil(outline.max(axis=0)) + 1, 0, size).astype(int)
         x, y = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
@@ -67,10 +69,10 @@ class SphereWindow:
             empty = np.zeros((0, 0), bool)
             return cls(slice(0, 0), slice(0, 0), empty)
         rays = camera.rays(np.stack([x, y], axis=-1).astype(float))
-        offset = place.center_mm - camera.center_mm
+        offset = sphere.center_mm - camera.center_mm
         distance = float(np.linalg.norm(offset))
         angle = np.arccos(np.clip(rays @ offset / distance, -1, 1))
-        limit = np.arcsin(place.radius_mm / distance) - MIN_RIM_DISTANCE_PX / camera.matrix[0, 0]
+        limit = np.arcsin(sphere.radius_mm / distance) - MIN_RIM_DISTANCE_PX / camera.matrix[0, 0]
         rows, columns = slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
         return cls(rows, columns, angle < limit)
 
@@ -112,9 +114,9 @@ class LightPositions:
         How many cameras and highlights placed each light.
     valid : ndarray of bool, shape (L,)
         At least 2 cameras and 3 highlights.
-    unseen : tuple of str
+    unobserved : tuple of str
         Lights that were on and should have been seen, but never were: dead or not connected.
-    answers : dict of str to str
+    swapped : dict of str to str
         Lights at whose place another one shone: by the name that was switched on, the name of the
         light whose nominal place was seen. Their positions are those seen.
     sigma_px : float
@@ -127,8 +129,8 @@ class LightPositions:
     cameras: Int64Array
     highlights: Int64Array
     valid: BoolArray
-    unseen: tuple[str, ...]
-    answers: dict[str, str]
+    unobserved: tuple[str, ...]
+    swapped: dict[str, str]
     sigma_px: float
 
     @property
@@ -176,7 +178,7 @@ def find_highlights(image: NDArray, window: SphereWindow) -> Float64Array:
 
 
 def locate_lights(
-    seen: Sequence[Highlights],
+    highlights: Sequence[Highlights],
     cameras: Mapping[str, CameraPose],
     spheres: Mapping[int, SpherePosition],
     nominal: Mapping[str, Float64Array],
@@ -188,7 +190,7 @@ def locate_lights(
 
     Parameters
     ----------
-    seen : sequence of Highlights
+    highlights : sequence of Highlights
         Of all cameras, spheres and groups of lights.
     cameras : mapping of str to CameraPose
         Calibrated, by view name.
@@ -212,10 +214,11 @@ def locate_lights(
     """
     scene = _Scene(cameras, spheres, nominal)
     names, start = scene.names, scene.nominal_mm.copy()
-    matched, answers, unseen = scene.match(seen)
+    matched, answers, unseen = scene.match(highlights)
     if not matched:
-        raise SphereError(
-            f"highlights: none of {sum(len(s.pixels) for s in seen)} spots lies where one of the"
+        raise MirrorSphereError(
+            f"highlights: none of {sum(len(s.pixels) for s in highlights)} spots lies where one"
+            f" of the"
             f" {len(names)} lights would show; check the spheres, the cameras and the exposure"
         )
     for name, other in answers.items():
@@ -226,7 +229,7 @@ def locate_lights(
     valid = (count >= MIN_HIGHLIGHTS) & (by >= MIN_HIGHLIGHT_CAMERAS)
     used = [m for m in matched if valid[m[0]]]
     if not used:
-        raise SphereError(
+        raise MirrorSphereError(
             f"highlights: no light was seen by {MIN_HIGHLIGHT_CAMERAS} cameras in {MIN_HIGHLIGHTS}"
             " images; show the sphere at more places, to more cameras"
         )
@@ -252,7 +255,7 @@ class _Scene:
         self.nominal_mm = np.array([np.asarray(place, float) for place in nominal.values()])
 
     def match(
-        self, seen: Sequence[Highlights]
+        self, highlights: Sequence[Highlights]
     ) -> tuple[list[_Matched], dict[str, str], tuple[str, ...]]:
         """Say which light made which spot; lights that answer for others; lights never seen."""
         names, matched = self.names, list[_Matched]()
@@ -260,17 +263,17 @@ class _Scene:
         found: Counter[int] = Counter()
         instead: Counter[tuple[int, int]] = Counter()
         strange: list[tuple[int, _Matched]] = []
-        for shot in seen:
+        for shot in highlights:
             camera, sphere = self.cameras[shot.view], self.spheres[shot.sphere]
             lit = [names.index(name) for name in shot.lit]
             places = self.nominal_mm[lit]
             where = reflection_pixels(camera, sphere.center_mm, sphere.radius_mm, places)
             # lights well in view: their highlight is not squeezed at the rim
-            visible = _clear_of_rim(camera, sphere, where) if len(lit) else np.zeros(0, bool)
+            visible = _is_clear_of_rim(camera, sphere, where) if len(lit) else np.zeros(0, bool)
             expected.update(k for k, ok in zip(lit, visible, strict=True) if ok)
             if not len(shot.pixels):
                 continue
-            miss = _miss_mm(camera, sphere, shot.pixels, self.nominal_mm)
+            miss = _ray_distance_mm(camera, sphere, shot.pixels, self.nominal_mm)
             rows, columns = linear_sum_assignment(np.minimum(miss[:, lit], 10 * LIGHT_GATE_MM))
             free_spots = set(range(len(shot.pixels)))
             free_lights = set(lit)
@@ -386,7 +389,7 @@ class _Scene:
         return residual, J
 
 
-def _clear_of_rim(camera: CameraPose, sphere: SpherePosition, pixels: Float64Array) -> BoolArray:
+def _is_clear_of_rim(camera: CameraPose, sphere: SpherePosition, pixels: Float64Array) -> BoolArray:
     """Return which pixels lie in the inner nine tenths of a sphere and in the image."""
     inside = np.zeros(len(pixels), bool)
     good = np.isfinite(pixels).all(axis=1)
@@ -400,7 +403,7 @@ def _clear_of_rim(camera: CameraPose, sphere: SpherePosition, pixels: Float64Arr
     return inside
 
 
-def _miss_mm(
+def _ray_distance_mm(
     camera: CameraPose, sphere: SpherePosition, pixels: Float64Array, lights_mm: Float64Array
 ) -> Float64Array:
     """Return how far each light is from each reflected ray, mm, shape (spots, lights)."""

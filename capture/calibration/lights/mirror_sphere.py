@@ -34,7 +34,7 @@ MAX_RADIUS_SIGMAS = 5.0
 MAX_RADIUS_MISFIT = 0.002  # relative difference of the radius below which nothing is said
 
 
-class SphereError(CalibrationError):
+class MirrorSphereError(CalibrationError):
     """Images in which a mirror sphere cannot be located; the message names them."""
 
 
@@ -137,11 +137,13 @@ def locate_sphere(
         If there is no outline, or the outlines of several cameras contradict the radius.
     """
     if not outlines or not radius_mm > 0:
-        raise SphereError(
+        raise MirrorSphereError(
             f"sphere: got outlines of {len(outlines)} cameras and radius {radius_mm} mm, expected"
             " at least one outline and a radius > 0"
         )
-    start = np.mean([_alone(edges, cameras[n], radius_mm) for n, edges in outlines.items()], axis=0)
+    start = np.mean(
+        [_fit_single_outline(edges, cameras[n], radius_mm) for n, edges in outlines.items()], axis=0
+    )
     center, sigma, H = _fit(outlines, cameras, start, radius_mm)
     free_radius, free_stderr = np.inf, np.inf
     if len(outlines) > 1:
@@ -152,7 +154,7 @@ def locate_sphere(
         if check_radius and gap > max(
             MAX_RADIUS_SIGMAS * free_stderr, MAX_RADIUS_MISFIT * radius_mm
         ):
-            raise SphereError(
+            raise MirrorSphereError(
                 f"radius_mm: got {radius_mm:g}, but the outlines in {len(outlines)} cameras say"
                 f" {free_radius:.3f} ± {free_stderr:.3f} mm; measure the sphere, or calibrate the"
                 " cameras"
@@ -172,7 +174,9 @@ def contour(
     to_center = center_mm - camera.center_mm
     distance = float(np.linalg.norm(to_center))
     if distance <= radius_mm:
-        raise SphereError(f"sphere at {center_mm.tolist()}: camera {camera.serial} is inside it")
+        raise MirrorSphereError(
+            f"sphere at {center_mm.tolist()}: camera {camera.serial} is inside it"
+        )
     axis = to_center / distance
     side = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])
     side /= np.linalg.norm(side)
@@ -311,7 +315,7 @@ def _in_image(pixels: Float64Array, shape: tuple[int, ...], margin: float) -> Bo
     )
 
 
-def _alone(edges: Float64Array, camera: CameraPose, radius_mm: float) -> Float64Array:
+def _fit_single_outline(edges: Float64Array, camera: CameraPose, radius_mm: float) -> Float64Array:
     """Return a centre from one outline: by the axis and angle of its cone."""
     rays = camera.rays(edges)
     # rays of a cone end in a plane: rays @ a = 1 with a along the axis

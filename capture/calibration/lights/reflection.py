@@ -116,7 +116,7 @@ DERIVATIVE_STEP_MM = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mirrored:
+class MirroredLights:
     """How a ball shows lights to a camera.
 
     Attributes
@@ -146,7 +146,7 @@ class Mirrored:
 
 def mirror_lights(
     camera: CameraPose, center_mm: Float64Array, radius_mm: float, lights_mm: Float64Array
-) -> Mirrored:
+) -> MirroredLights:
     """Return where and how a ball mirrors lights into a camera.
 
     Parameters
@@ -162,7 +162,7 @@ def mirror_lights(
     centers = np.broadcast_to(np.asarray(center_mm, np.float64), lights.shape)
     point, seen = reflection_points(eyes, centers, radius_mm, lights)
     to_light, to_camera = _unit(lights - point), _unit(eyes - point)
-    first = np.cross(to_light, _least_axis(to_light))
+    first = np.cross(to_light, _smallest_axis(to_light))
     first = _unit(first)
     across = np.stack([first, np.cross(to_light, first)], axis=1)
     columns = []
@@ -172,13 +172,13 @@ def mirror_lights(
         columns.append((ends[0] - ends[1]) / (2 * DERIVATIVE_STEP_MM))
     pixels = np.where(seen[:, None], camera.project(point), np.nan)
     normal, by_mm = (point - centers) / radius_mm, np.stack(columns, axis=-1)
-    return Mirrored(pixels, to_light, to_camera, normal, by_mm, across)
+    return MirroredLights(pixels, to_light, to_camera, normal, by_mm, across)
 
 
 def _unit(vectors: Float64Array) -> Float64Array:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
-def _least_axis(vectors: Float64Array) -> Float64Array:
+def _smallest_axis(vectors: Float64Array) -> Float64Array:
     """Return the coordinate axis that each vector is least along."""
     return np.eye(3)[np.argmin(np.abs(vectors), axis=-1)]

@@ -11,7 +11,7 @@ from scipy.ndimage import binary_erosion
 
 from capture.arrays import BoolArray, Float64Array, Int64Array
 from capture.calibration.geometry import CameraPose
-from capture.calibration.geometry.board import Sighting, find_markers
+from capture.calibration.geometry.board import CornerObservation, find_markers
 from capture.calibration.geometry.board_pose import BoardPose
 
 PLATE_CELLS = (6, 4)  # columns and rows of parts into which the bare white is divided
@@ -72,7 +72,7 @@ class WhitePlate:
         inset = self.margin_mm + self.marker_mm + MARKER_MARGIN_MM
         return np.array([inset, inset]), np.array(self.size_mm) - inset
 
-    def find(self, image: NDArray) -> Sighting | None:
+    def find(self, image: NDArray) -> CornerObservation | None:
         """Return the corners of the markers in an image, or None."""
         ids = range(self.first_marker, self.first_marker + 8)
         return find_markers(image, self.dictionary, ids)
@@ -145,13 +145,13 @@ class PlateWindow:
     rotation: Float64Array
 
     @classmethod
-    def of(cls, camera: CameraPose, place: BoardPose, plate: WhitePlate) -> PlateWindow | None:
+    def of(cls, camera: CameraPose, pose: BoardPose, plate: WhitePlate) -> PlateWindow | None:
         """Return the window of a plate in a camera; None where it is not seen from its front."""
-        normal = -place.rotation[:, 2]
+        normal = -pose.rotation[:, 2]
         low, high = plate.bare_mm
         corners = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
-        px = camera.project(place.to_rig(corners))
-        if normal @ (camera.center_mm - place.translation_mm) <= 0 or not np.isfinite(px).all():
+        px = camera.project(pose.to_rig(corners))
+        if normal @ (camera.center_mm - pose.translation_mm) <= 0 or not np.isfinite(px).all():
             return None
         # pixel k of the half-size image has its middle at 2 k + 1/2
         half = (np.array(camera.image_size) // 2).astype(int)
@@ -161,8 +161,8 @@ class PlateWindow:
         if not x.size:
             return None
         pixels = 2.0 * np.stack([x, y], axis=-1) + 0.5
-        rays = camera.rays(pixels) @ place.rotation
-        eye = (camera.center_mm - place.translation_mm) @ place.rotation
+        rays = camera.rays(pixels) @ pose.rotation
+        eye = (camera.center_mm - pose.translation_mm) @ pose.rotation
         hit = eye[:2] - eye[2] * rays[..., :2] / rays[..., 2:]
         share = (hit - low) / (high - low)
         cell = np.floor(share * PLATE_CELLS).astype(np.int64)
@@ -179,8 +179,8 @@ class PlateWindow:
         ]
         flat = np.column_stack([means[0], means[1], np.zeros(len(count))])
         box = slice(int(first[1]), int(last[1])), slice(int(first[0]), int(last[0]))
-        middles = place.to_rig(flat), np.column_stack(means[2:])
-        return cls(*box, part, *middles, count, place.rotation)
+        middles = pose.to_rig(flat), np.column_stack(means[2:])
+        return cls(*box, part, *middles, count, pose.rotation)
 
     def sample(
         self,

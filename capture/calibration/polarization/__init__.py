@@ -4,14 +4,14 @@ from capture.calibration.polarization.malus import (
     MalusFit,
     PolarizationCalibration,
     PolarizationError,
+    find_modulated_pixels,
     fit_malus,
-    modulated_pixels,
 )
 
 __all__ = [
     "MalusFit",
     "PolarizationCalibration",
     "PolarizationError",
+    "find_modulated_pixels",
     "fit_malus",
-    "modulated_pixels",
 ]

@@ -15,7 +15,7 @@ from capture.calibration.record import (
     CalibrationError,
     Provenance,
     Quantity,
-    of_one_device,
+    make_single_device_calibration,
 )
 
 CONFIDENCE_LEVEL = 0.95
@@ -113,7 +113,7 @@ class PolarizationCalibration:
             values[f"extinction_{color.lower()}"] = Quantity(
                 np.array(float(middle)), interval=interval
             )
-        return of_one_device(
+        return make_single_device_calibration(
             "polarization",
             values,
             {
@@ -230,12 +230,12 @@ def fit_malus(
     return MalusFit(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
-def modulated_pixels(
+def find_modulated_pixels(
     angles_rad: ArrayLike,
     images: Sequence[NDArray],
     *,
     valid: BoolArray | None = None,
-    share: float = 0.5,
+    fraction: float = 0.5,
 ) -> BoolArray:
     """Return the pixels whose intensity follows the analyser most: the polarized target.
 
@@ -247,7 +247,7 @@ def modulated_pixels(
         Dark-subtracted images.
     valid : ndarray of bool, shape (H, W), optional
         Pixels that may be used (saturated in no frame).
-    share : float
+    fraction : float
         Least modulation over that of the strongest pixels.
 
     Returns
@@ -273,7 +273,7 @@ def modulated_pixels(
     amplitude = np.where(usable, np.hypot(total[1], total[2]), 0.0)
     # the strongest pixels without the noise of the single strongest
     top = float(np.quantile(amplitude[usable], 0.999))
-    return usable & (amplitude >= share * top) & (amplitude > 0)
+    return usable & (amplitude >= fraction * top) & (amplitude > 0)
 
 
 def _weighted(

@@ -45,7 +45,7 @@ def fresnel_amplitudes(cosine: ArrayLike, eta: float) -> tuple[Float64Array, Flo
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reflection:
+class FacetReflection:
     """Lights behind films, mirrored by facets into a camera behind an analyser.
 
     Attributes
@@ -80,7 +80,7 @@ class Reflection:
         cls,
         lights: tuple[Light, ...],
         camera: CameraPose,
-        analyser_deg: float,
+        analyzer_deg: float,
         eta: float,
         *,
         to_light: Float64Array,
@@ -94,7 +94,7 @@ class Reflection:
         lights : tuple of Light
             With polarizers.
         camera : CameraPose
-        analyser_deg : float
+        analyzer_deg : float
             Nominal axis of the analyser at reading 0, degrees from the image's x axis to its top.
         eta : float
             Refractive index, > 1.
@@ -120,10 +120,10 @@ class Reflection:
         normal = half / np.linalg.norm(half, axis=1, keepdims=True)
         axis_rad = np.radians([light.polarizer_axis_deg or 0.0 for light in lights])
         film, image = (right, np.cross(beam, right)), (camera.rotation[0], -camera.rotation[1])
-        analyser_rad = float(np.radians(analyser_deg))
+        analyser_rad = float(np.radians(analyzer_deg))
         return cls(to_light, to_camera, normal, *film, axis_rad, *image, analyser_rad, eta)
 
-    def moved(self, to_light: Float64Array, eta: float) -> Self:
+    def with_directions(self, to_light: Float64Array, eta: float) -> Self:
         """Return the reflection with lights in other directions, and of another index.
 
         Parameters
@@ -136,12 +136,12 @@ class Reflection:
         normal = _unit(light + self.to_camera)
         return replace(self, to_light=light, normal=normal, eta=eta)
 
-    def fields(self, turn_rad: ArrayLike = 0.0) -> Float64Array:
+    def reflected_fields(self, axis_error_rad: ArrayLike = 0.0) -> Float64Array:
         """Return the reflected fields, shape (L, 2, 2).
 
         Parameters
         ----------
-        turn_rad : array_like, shape (L,) or ()
+        axis_error_rad : array_like, shape (L,) or ()
             By how much each light's axis is off its nominal angle.
 
         Returns
@@ -151,7 +151,7 @@ class Reflection:
             components along the image's right and up, made perpendicular to the ray.
         """
         light, camera, normal = self.to_light, self.to_camera, self.normal
-        angle = (self.axis_rad + np.asarray(turn_rad, np.float64))[:, None]
+        angle = (self.axis_rad + np.asarray(axis_error_rad, np.float64))[:, None]
         absorbs = -np.sin(angle) * self.light_right + np.cos(angle) * self.light_up
         passed = _unit(_cross(absorbs, light))
         s = _cross(normal, light)
@@ -169,10 +169,10 @@ class Reflection:
     def transmit_through_analyzer(
         self,
         readings_rad: ArrayLike,
-        turn_rad: ArrayLike = 0.0,
+        axis_error_rad: ArrayLike = 0.0,
         zero_rad: ArrayLike = 0.0,
         light_leak: ArrayLike = 0.0,
-        analyser_leak: ArrayLike = 0.0,
+        analyzer_leak: ArrayLike = 0.0,
     ) -> Float64Array:
         """Return what reaches the sensor of each light, shape (E, L).
 
@@ -180,11 +180,11 @@ class Reflection:
         ----------
         readings_rad : array_like, shape (E,)
             Readings of the analyser.
-        turn_rad : array_like, shape (L,) or ()
-            As for `fields`.
+        axis_error_rad : array_like, shape (L,) or ()
+            As for `reflected_fields`.
         zero_rad : array_like, shape (L,) or ()
             What the analyser's reading lacks to its true angle.
-        light_leak, analyser_leak : array_like, shape (L,) or ()
+        light_leak, analyzer_leak : array_like, shape (L,) or ()
             Transmittance of the films along the absorbing axis over that along the passing one.
 
         Returns
@@ -192,11 +192,11 @@ class Reflection:
         ndarray of float64
             Over what comes polarized through the light's film: reflectance times the analyser.
         """
-        field = self.fields(turn_rad)
+        field = self.reflected_fields(axis_error_rad)
         axes = self._image_axes()
         whole = np.sum(field**2, axis=-1)
         light = np.asarray(light_leak, np.float64)
-        analyser = np.asarray(analyser_leak, np.float64)[..., None]
+        analyser = np.asarray(analyzer_leak, np.float64)[..., None]
         rows = []
         for reading in np.atleast_1d(np.asarray(readings_rad, np.float64)):
             angle = self.analyser_rad + reading + np.asarray(zero_rad, np.float64)

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from capture.arrays import BoolArray, Float64Array, UInt16Array
 from capture.calibration.robust import mad_sigma
-from capture.calibration.sensor.transfer_curve import plane
+from capture.calibration.sensor.transfer_curve import extract_cfa_plane
 
 HOT_PIXEL_SIGMAS = 6.0
 
 
 @dataclass(frozen=True, slots=True)
-class Darks:
+class DarkStatistics:
     """What the darks say of one color.
 
     Attributes
@@ -59,7 +59,7 @@ class Darks:
 
     def planes(self, frame: NDArray) -> list[Float64Array]:
         """Return the pixels of a frame at each position."""
-        return [plane(frame, position, self.pattern) for position in self.positions]
+        return [extract_cfa_plane(frame, position, self.pattern) for position in self.positions]
 
 
 def reduce_darks(
@@ -67,7 +67,7 @@ def reduce_darks(
     exposures_s: Sequence[float] | None,
     positions: tuple[tuple[int, int], ...],
     pattern: str,
-) -> Darks:
+) -> DarkStatistics:
     """Reduce the darks of one color.
 
     Parameters
@@ -90,7 +90,7 @@ def reduce_darks(
     squares = dof = 0.0
     spreads = []
     for position in positions:
-        stack = np.stack([plane(dark, position, pattern) for dark in darks])
+        stack = np.stack([extract_cfa_plane(dark, position, pattern) for dark in darks])
         level = stack.mean(axis=(1, 2))
         means += level / len(positions)
         residual = stack - level[:, None, None]
@@ -101,7 +101,7 @@ def reduce_darks(
         good.append(ok)
         squares += float(((residual - average) ** 2)[:, ok].sum())
         dof += (n - 1) * (int(ok.sum()) - 1)
-        spreads.append(_common_spread(residual[0::2].mean(0), residual[1::2].mean(0), ok))
+        spreads.append(_common_std(residual[0::2].mean(0), residual[1::2].mean(0), ok))
     variance = squares / dof
     pixels = dof / (n - 1)
     error = np.hypot(float(means.std(ddof=1)) / np.sqrt(n), np.sqrt(variance / (n * pixels)))
@@ -114,12 +114,12 @@ def reduce_darks(
         scatter = float(misfit @ misfit) / max(n - 2, 1)
         sigma2 = max(scatter, variance / pixels)
         slope = (rate, float(np.sqrt(sigma2 / (centered @ centered))))
-    return Darks(
+    return DarkStatistics(
         black_dn=tuple(black),
         black_stderr=float(error),
         variance_dn2=variance,
         dof=dof,
-        dsnu_dn=pool(spreads),
+        dsnu_dn=pool_estimates(spreads),
         slope_dn_per_s=slope,
         good=tuple(good),
         positions=positions,
@@ -127,7 +127,7 @@ def reduce_darks(
     )
 
 
-def _common_spread(a: Float64Array, b: Float64Array, ok: BoolArray) -> tuple[float, float]:
+def _common_std(a: Float64Array, b: Float64Array, ok: BoolArray) -> tuple[float, float]:
     """Spread common to two independent averages: root of their covariance, with its error."""
     x, y = a[ok] - a[ok].mean(), b[ok] - b[ok].mean()
     covariance = float(x @ y) / (x.size - 1)
@@ -138,12 +138,12 @@ def _common_spread(a: Float64Array, b: Float64Array, ok: BoolArray) -> tuple[flo
     return spread, min(error / (2.0 * spread), float(np.sqrt(error)))
 
 
-def pool(values: Sequence[tuple[float, float]]) -> tuple[float, float]:
+def pool_estimates(values: Sequence[tuple[float, float]]) -> tuple[float, float]:
     """Return the mean of independent (value, standard error) pairs and its standard error.
 
     Examples
     --------
-    >>> pool([(1.0, 0.3), (3.0, 0.4)])
+    >>> pool_estimates([(1.0, 0.3), (3.0, 0.4)])
     (2.0, 0.25)
     """
     v, e = np.array(values).T

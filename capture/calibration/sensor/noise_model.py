@@ -11,18 +11,23 @@ from typing import Unpack
 import numpy as np
 
 from capture.arrays import Float64Array, UInt16Array
-from capture.calibration.record import Calibration, Provenance, Quantity, of_one_device
-from capture.calibration.sensor.darks import Darks, pool, reduce_darks
+from capture.calibration.record import (
+    Calibration,
+    Provenance,
+    Quantity,
+    make_single_device_calibration,
+)
+from capture.calibration.sensor.darks import DarkStatistics, pool_estimates, reduce_darks
 from capture.calibration.sensor.flat_field import SmoothField, fit_smooth_field, pixel_response
 from capture.calibration.sensor.transfer_curve import (
-    CurveFit,
     FlatPair,
     PhotonTransferError,
+    TransferCurveFit,
     block_statistics,
     block_sums,
-    cfa_planes,
-    fit_curve,
-    plane,
+    cfa_offsets,
+    extract_cfa_plane,
+    fit_transfer_curve,
 )
 
 QUANTIZATION_DN2 = 1.0 / 12.0  # variance of rounding to whole DN
@@ -114,7 +119,7 @@ class SensorCalibration:
         """Return the flat field on the CFA, shape (H, W), 1 at the center of each color."""
         mosaic = np.empty((height, width))
         step = 1 if self.pattern == "MONO" else 2
-        for field, positions in zip(self.flat, cfa_planes(self.pattern).values(), strict=True):
+        for field, positions in zip(self.flat, cfa_offsets(self.pattern).values(), strict=True):
             full = field.evaluate(height, width)
             for row, column in positions:
                 mosaic[row::step, column::step] = full[row::step, column::step]
@@ -132,7 +137,7 @@ class SensorCalibration:
             np.stack([f.coefficients for f in self.flat]), np.stack([f.stderr for f in self.flat])
         )
         values["flat_residual"] = Quantity(np.array([f.residual for f in self.flat]))
-        return of_one_device(
+        return make_single_device_calibration(
             "sensor",
             values,
             {
@@ -148,7 +153,7 @@ class SensorCalibration:
         """Return the sensor calibration of one camera from a loaded `Calibration`."""
         get = calibration.quantity
         coefficients = get(serial, "flat_coefficients")
-        errors = coefficients.known_stderr
+        errors = coefficients.stderr_or_zero
         residuals = get(serial, "flat_residual").value
         has_dark = "dark_e_per_s" in calibration.values[serial]
         return cls(
@@ -170,7 +175,7 @@ class SensorCalibration:
 _PER_COLOR = tuple(field.name for field in fields(SensorCalibration) if field.type is Quantity)
 
 
-def photon_transfer(
+def calibrate_sensor(
     pairs: Sequence[FlatPair],
     darks: Sequence[UInt16Array],
     *,
@@ -214,7 +219,7 @@ def photon_transfer(
     Janesick, Photon Transfer, SPIE Press 2007, doi 10.1117/3.725073.
     """
     shape = _check_frames(pairs, darks, dark_exposures_s)
-    planes = cfa_planes(pattern)
+    planes = cfa_offsets(pattern)
     colors = []
     for positions in planes.values():
         dark = reduce_darks(darks, dark_exposures_s, positions, pattern)
@@ -227,7 +232,7 @@ def photon_transfer(
             ]
             for pair in pairs
         ]
-        fit = fit_curve(
+        fit = fit_transfer_curve(
             [blocks for level in levels for blocks in level],
             dark_variance_dn2=dark.variance_dn2,
             dark_dof=dark.dof,
@@ -246,7 +251,7 @@ def photon_transfer(
                 " least three amounts of light; take darker flats"
             )
         spread, field = _fixed_pattern(usable, dark, block=block, degree=flat_degree, shape=shape)
-        colors.append(_Color(fit, dark, fit_linearity(usable, dark), spread, field))
+        colors.append(_ColorStatistics(fit, dark, fit_linearity(usable, dark), spread, field))
     rows = [color.numbers() for color in colors]
     numbers = {name: _quantity([row[name] for row in rows]) for name in rows[0]}
     return SensorCalibration(
@@ -288,7 +293,12 @@ def _check_frames(
 
 
 def _fixed_pattern(
-    pairs: Sequence[FlatPair], dark: Darks, *, block: int, degree: int, shape: tuple[int, int]
+    pairs: Sequence[FlatPair],
+    dark: DarkStatistics,
+    *,
+    block: int,
+    degree: int,
+    shape: tuple[int, int],
 ) -> tuple[tuple[float, float], SmoothField]:
     """Pixel response and flat field from the sums of all first and all second frames."""
     step = 1 if dark.pattern == "MONO" else 2
@@ -296,7 +306,9 @@ def _fixed_pattern(
     for position, black, good in zip(dark.positions, *dark.levels, strict=True):
         sums = []
         for frames in ([p.first for p in pairs], [p.second for p in pairs]):
-            total = np.sum([plane(f, position, dark.pattern) - black for f in frames], axis=0)
+            total = np.sum(
+                [extract_cfa_plane(f, position, dark.pattern) - black for f in frames], axis=0
+            )
             sums.append(np.where(good, total, np.nan))
         spreads.append(pixel_response(sums[0], sums[1], block=block))
         total = np.where(good, sums[0] + sums[1], 0.0)
@@ -307,15 +319,15 @@ def _fixed_pattern(
         rows.append(position[0] + step * (r * side + (side - 1) / 2))
         columns.append(position[1] + step * (c * side + (side - 1) / 2))
     samples = (np.concatenate(part) for part in (values, rows, columns))
-    return pool(spreads), fit_smooth_field(*samples, shape=shape, degree=degree)
+    return pool_estimates(spreads), fit_smooth_field(*samples, shape=shape, degree=degree)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Color:
+class _ColorStatistics:
     """What the frames say of the pixels of one color."""
 
-    fit: CurveFit
-    dark: Darks
+    fit: TransferCurveFit
+    dark: DarkStatistics
     linear: tuple[float, float, float, float]
     prnu: tuple[float, float]
     flat: SmoothField
@@ -344,7 +356,7 @@ class _Color:
         return found
 
 
-def _read_noise(fit: CurveFit) -> tuple[float, float]:
+def _read_noise(fit: TransferCurveFit) -> tuple[float, float]:
     """Read noise in electrons: sqrt(V0 - 1/12) / K, with the error of both."""
     variance = fit.offset_dn2 - QUANTIZATION_DN2
     error = float(np.sqrt(fit.covariance[0, 0]))
@@ -369,7 +381,9 @@ def _combine(quantity: Quantity) -> Quantity:
     )
 
 
-def fit_linearity(pairs: Sequence[FlatPair], dark: Darks) -> tuple[float, float, float, float]:
+def fit_linearity(
+    pairs: Sequence[FlatPair], dark: DarkStatistics
+) -> tuple[float, float, float, float]:
     """Fit the response of one color to the amount of light.
 
     ``signal / light = a (1 + q light / light_max)``; the scatter is taken from the two frames of

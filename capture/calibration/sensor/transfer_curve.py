@@ -19,7 +19,7 @@ LOW_SIGNAL_LEVEL = 0.4  # of the white level: below it nothing saturates in a us
 SATURATED_VARIANCE_RATIO = 0.5
 # distance to saturation, in standard deviations, that a usable block keeps
 SATURATION_CLIP_SIGMAS = 6.0
-PIXEL_RESPONSE_SPREAD = 0.02  # pixel-to-pixel spread of sensitivity allowed for in that distance
+PIXEL_RESPONSE_STD = 0.02  # pixel-to-pixel spread of sensitivity allowed for in that distance
 
 
 class PhotonTransferError(CalibrationError):
@@ -54,7 +54,7 @@ class FlatPair:
 
 
 @dataclass(frozen=True, slots=True)
-class Blocks:
+class BlockStatistics:
     """Statistics of one pair in blocks of one CFA position.
 
     Attributes
@@ -79,7 +79,7 @@ class Blocks:
 
 
 @dataclass(frozen=True, slots=True)
-class CurveFit:
+class TransferCurveFit:
     """A straight photon transfer curve ``variance = offset + slope * signal``.
 
     Attributes
@@ -107,7 +107,7 @@ class CurveFit:
     points: int
 
 
-def cfa_planes(pattern: str) -> dict[str, tuple[tuple[int, int], ...]]:
+def cfa_offsets(pattern: str) -> dict[str, tuple[tuple[int, int], ...]]:
     """Return the (row, column) offsets of each color in a 2 x 2 pattern.
 
     Parameters
@@ -117,9 +117,9 @@ def cfa_planes(pattern: str) -> dict[str, tuple[tuple[int, int], ...]]:
 
     Examples
     --------
-    >>> cfa_planes("RGGB")
+    >>> cfa_offsets("RGGB")
     {'R': ((0, 0),), 'G': ((0, 1), (1, 0)), 'B': ((1, 1),)}
-    >>> cfa_planes("MONO")
+    >>> cfa_offsets("MONO")
     {'MONO': ((0, 0),)}
     """
     if pattern == "MONO":
@@ -131,7 +131,7 @@ def cfa_planes(pattern: str) -> dict[str, tuple[tuple[int, int], ...]]:
     }
 
 
-def plane(frame: NDArray, position: tuple[int, int], pattern: str) -> Float64Array:
+def extract_cfa_plane(frame: NDArray, position: tuple[int, int], pattern: str) -> Float64Array:
     """Return the pixels of one CFA position as float64, shape (H/2, W/2) (or all, for MONO)."""
     step = 1 if pattern == "MONO" else 2
     return np.asarray(frame[position[0] :: step, position[1] :: step], dtype=np.float64)
@@ -153,7 +153,7 @@ def block_statistics(
     white_dn: float,
     good: BoolArray,
     block: int,
-) -> Blocks:
+) -> BlockStatistics:
     """Reduce a pair of planes to signal and temporal variance in blocks.
 
     The second frame is scaled to the light of the first (flashes repeat to a percent or so), which
@@ -193,7 +193,7 @@ def block_statistics(
     d_variance = (block_sums(d * d, block) - d_sum**2 / n) / np.maximum(n - 1.0, 1.0)
     scale = 1.0 + ratio**2
     enough = n >= block * block / 2
-    return Blocks(
+    return BlockStatistics(
         signal=(mean * (1.0 + ratio) / scale)[enough],
         variance=(d_variance / scale)[enough],
         dof=(n - 1.0)[enough],
@@ -224,9 +224,9 @@ def _weighted_line(
     )
 
 
-def fit_curve(
-    levels: Sequence[Blocks], *, dark_variance_dn2: float, dark_dof: float, range_dn: float
-) -> CurveFit:
+def fit_transfer_curve(
+    levels: Sequence[BlockStatistics], *, dark_variance_dn2: float, dark_dof: float, range_dn: float
+) -> TransferCurveFit:
     """Fit the photon transfer line through blocks below saturation and the darks.
 
     Saturation is found where the variance collapses (the full well of the pixels) or where
@@ -287,10 +287,10 @@ def fit_curve(
     if collapsed.sum() >= 3:
         saturation, by = float(np.median(x[collapsed])), "full well"
     room = SATURATION_CLIP_SIGMAS * np.sqrt(
-        np.maximum(predicted, 0.0) + (PIXEL_RESPONSE_SPREAD * x) ** 2
+        np.maximum(predicted, 0.0) + (PIXEL_RESPONSE_STD * x) ** 2
     )
     line, covariance, chi2 = fit((x + room < saturation) & ~clipped)
-    return CurveFit(
+    return TransferCurveFit(
         offset_dn2=float(line[0]),
         slope_dn=float(line[1]),
         covariance=covariance * max(chi2, 1.0),

@@ -29,7 +29,7 @@ import numpy as np
 from capture.arrays import UInt16Array
 from capture.devices import wire
 from capture.devices.camera import CameraInfo, Exposure, Frame, Trigger
-from capture.documents import table_of
+from capture.documents import to_json_table
 
 CAMERA_WIRE_VERSION = 1
 MAX_HEADER_BYTES = 65_536
@@ -82,7 +82,7 @@ def check_blob(fields: Mapping[str, Any], blob: bytes) -> None:
 
 def info_to_json(info: CameraInfo) -> dict[str, Any]:
     """Return what a camera is as JSON values."""
-    return table_of(info)
+    return to_json_table(info)
 
 
 def info_from_json(table: Mapping[str, Any]) -> CameraInfo:

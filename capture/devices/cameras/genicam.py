@@ -27,12 +27,12 @@ from capture.devices.camera import (
 from capture.devices.cameras.genicam_producer import (
     Connection,
     Features,
-    Library,
-    connect,
+    GenicamLibrary,
+    connect_camera,
     load_library,
     producer_files,
 )
-from capture.devices.cameras.genicam_readout import Address, parse_address, prepare
+from capture.devices.cameras.genicam_readout import Address, parse_address, prepare_readout
 
 MAX_BUFFER_BYTES = 2**32
 """Most memory for the frames of a sequence, which are fetched when it is over."""
@@ -58,7 +58,7 @@ def open_camera(rest: str) -> GenicamCamera:
     address = parse_address(rest)
     library = load_library(address.url)
     files = producer_files(address.url, address.producer)
-    connection = connect(library, address.url, address.serial, files)
+    connection = connect_camera(library, address.url, address.serial, files)
     try:
         return GenicamCamera(library, connection, address)
     except BaseException:
@@ -89,7 +89,7 @@ class GenicamCamera:
 
     def __init__(
         self,
-        library: Library,
+        library: GenicamLibrary,
         connection: Connection,
         address: Address,
         *,
@@ -103,7 +103,7 @@ class GenicamCamera:
         self._host_clock = clock
         self._features = Features(connection.acquirer.remote_device.node_map, library, self._url)
         self._check_serial(address.serial)
-        self._readout = prepare(self._features, address, connection.model)
+        self._readout = prepare_readout(self._features, address, connection.model)
         self._info = self._readout.info
         self._got = self.configure(Exposure(0.01, self._base_iso))
         self._trigger: Trigger | None = None
@@ -156,14 +156,14 @@ class GenicamCamera:
             # another trigger left on would have to come first
             for other in features.choices("TriggerSelector"):
                 features.set("TriggerSelector", other)
-                features.set_if_there("TriggerMode", "Off")
+                features.set_if_present("TriggerMode", "Off")
             features.set("TriggerSelector", "FrameStart")
         features.set("TriggerMode", "On")
         if trigger is Trigger.SOFTWARE:
             features.set("TriggerSource", "Software")
         else:
             features.set("TriggerSource", self._readout.line)
-            features.set_if_there("TriggerActivation", "RisingEdge")
+            features.set_if_present("TriggerActivation", "RisingEdge")
         size = int(features.read("PayloadSize"))
         if (count + 1) * size > MAX_BUFFER_BYTES and count + 1 > MIN_BUFFERS:
             raise CameraError(
@@ -172,7 +172,7 @@ class GenicamCamera:
                 f"{MAX_BUFFER_BYTES / 1e9:.1f} GB at most; use a packed format or a smaller part "
                 "of the sensor"
             )
-        with self._library.translated(f"{self._url}: arming"):
+        with self._library.translate_errors(f"{self._url}: arming"):
             least = max(self._acquirer.min_num_buffers, MIN_BUFFERS)
             self._acquirer.num_buffers = max(count + 1, least)
             self._acquirer.start()
@@ -209,7 +209,7 @@ class GenicamCamera:
         until_s = self._host_clock() + timeout_s
         incomplete = 0
         while (left_s := until_s - self._host_clock()) > 0:
-            with self._library.translated(f"{self._url}: waiting for a frame"):
+            with self._library.translate_errors(f"{self._url}: waiting for a frame"):
                 buffer = self._acquirer.try_fetch(timeout=left_s, is_raw=True)
             if buffer is not None:
                 try:
@@ -232,7 +232,7 @@ class GenicamCamera:
     def abort(self) -> None:
         """Give up what was armed."""
         self._trigger, self._left = None, 0
-        with self._library.translated(f"{self._url}: stopping"):
+        with self._library.translate_errors(f"{self._url}: stopping"):
             self._acquirer.stop()
 
     def close(self) -> None:
@@ -250,7 +250,7 @@ class GenicamCamera:
 
     def _take(self, buffer: Any) -> Frame:
         """Return the frame in a buffer of the library."""
-        with self._library.translated(f"{self._url}: a frame"):
+        with self._library.translate_errors(f"{self._url}: a frame"):
             payload = int(buffer.payload_type)
             number = self._optional(buffer, "pixel_format", self._readout.format_number)
             size = (

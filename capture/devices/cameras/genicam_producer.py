@@ -29,8 +29,8 @@ _REFUSAL_ERRORS = tuple(f"{name}Exception" for name in _REFUSALS.split())
 _BUSY_ERRORS = ("AccessDeniedException", "ResourceInUseException", "BusyException")
 
 # the library logs what it then raises, with a traceback; the error says it once
-_quiet = logging.getLogger("capture.genicam_library")
-_quiet.setLevel(logging.CRITICAL + 1)
+_library_log = logging.getLogger("capture.genicam_library")
+_library_log.setLevel(logging.CRITICAL + 1)
 
 
 class MissingHarvesters(CameraError, ImportError):
@@ -38,7 +38,7 @@ class MissingHarvesters(CameraError, ImportError):
 
 
 @dataclass(frozen=True, slots=True)
-class Library:
+class GenicamLibrary:
     """What is used of the packages ``harvesters`` and ``genicam``."""
 
     core: Any
@@ -47,13 +47,13 @@ class Library:
     """What GenApi (features) and GenTL (transport) raise."""
 
     @contextlib.contextmanager
-    def translated(self, doing: str) -> Iterator[None]:
+    def translate_errors(self, action: str) -> Iterator[None]:
         """Raise the library's errors as those of a camera, with what was being done."""
         try:
             yield
         except self.errors as error:
             kind = type(error).__name__
-            text = f"{doing}: {' '.join(str(error).split()) or kind}"
+            text = f"{action}: {' '.join(str(error).split()) or kind}"
             if kind in _BUSY_ERRORS:
                 raise CameraBusy(f"{text}; close the other program that has the camera") from error
             if kind in _REFUSAL_ERRORS:
@@ -64,7 +64,7 @@ class Library:
             ) from error
 
 
-def load_library(url: str) -> Library:
+def load_library(url: str) -> GenicamLibrary:
     """Import the optional packages.
 
     Raises
@@ -78,7 +78,7 @@ def load_library(url: str) -> Library:
         raise MissingHarvesters(
             f"{url}: needs the optional part 'genicam': pip install 'skinrig[genicam]'"
         ) from error
-    return Library(core, (genapi.GenericException, gentl.GenericException))
+    return GenicamLibrary(core, (genapi.GenericException, gentl.GenericException))
 
 
 def producer_files(url: str, given: str) -> tuple[Path, ...]:
@@ -119,12 +119,12 @@ def producer_files(url: str, given: str) -> tuple[Path, ...]:
 
 
 @dataclass(slots=True)
-class _Opened:
+class _OpenedProducer:
     harvester: Any
     users: int = 0
 
 
-_opened: dict[Path, _Opened] = {}
+_opened_producers: dict[Path, _OpenedProducer] = {}
 
 
 class Connection:
@@ -146,7 +146,7 @@ class Connection:
     """
 
     def __init__(
-        self, library: Library, acquirer: Any, file: Path, *, model: str, identifier: str
+        self, library: GenicamLibrary, acquirer: Any, file: Path, *, model: str, identifier: str
     ) -> None:
         self.acquirer = acquirer
         self.model = model
@@ -163,11 +163,13 @@ class Connection:
             with contextlib.suppress(*self._library.errors):
                 self.acquirer.destroy()
         finally:
-            _opened[file].users -= 1
+            _opened_producers[file].users -= 1
             _close_unused(self._library, file)
 
 
-def connect(library: Library, url: str, serial: str, files: Sequence[Path]) -> Connection:
+def connect_camera(
+    library: GenicamLibrary, url: str, serial: str, files: Sequence[Path]
+) -> Connection:
     """Open the camera of a serial number.
 
     Parameters
@@ -202,12 +204,15 @@ def connect(library: Library, url: str, serial: str, files: Sequence[Path]) -> C
             continue
         try:
             for device in opened.harvester.device_info_list:
-                own, identifier = _told(library, device, "serial_number"), str(device.id_)
-                model = _told(library, device, "model")
+                own, identifier = (
+                    _read_device_attribute(library, device, "serial_number"),
+                    str(device.id_),
+                )
+                model = _read_device_attribute(library, device, "model")
                 if serial not in (own, identifier):
                     found.append(f"{model} {own or identifier}".strip())
                     continue
-                with library.translated(f"{url}: cannot be opened"):
+                with library.translate_errors(f"{url}: cannot be opened"):
                     acquirer = _create(library, opened.harvester, device)
                 opened.users += 1
                 return Connection(library, acquirer, file, model=model, identifier=identifier)
@@ -216,33 +221,33 @@ def connect(library: Library, url: str, serial: str, files: Sequence[Path]) -> C
     raise CameraUrlError(
         f"{url}: no such camera; found {', '.join(found) or 'none'} through "
         f"{', '.join(file.name for file in files)}; plug it in and switch it on"
-        + (", then close the other cameras, since they hide new ones" if _opened else "")
+        + (", then close the other cameras, since they hide new ones" if _opened_producers else "")
     )
 
 
-def _open(library: Library, url: str, file: Path) -> _Opened:
-    if file not in _opened:
-        harvester = library.core.Harvester(logger=_quiet)
+def _open(library: GenicamLibrary, url: str, file: Path) -> _OpenedProducer:
+    if file not in _opened_producers:
+        harvester = library.core.Harvester(logger=_library_log)
         try:
             harvester.add_file(str(file), check_existence=True, check_validity=True)
-            with library.translated(f"{url}: {file.name}"):
+            with library.translate_errors(f"{url}: {file.name}"):
                 harvester.update()
         except OSError as error:
             raise CameraUrlError(
                 f"{url}: the GenTL producer {file} cannot be loaded ({error}); it must be made for "
                 "this system and processor"
             ) from error
-        _opened[file] = _Opened(harvester)
-    return _opened[file]
+        _opened_producers[file] = _OpenedProducer(harvester)
+    return _opened_producers[file]
 
 
-def _close_unused(library: Library, file: Path) -> None:
-    if _opened[file].users == 0:
+def _close_unused(library: GenicamLibrary, file: Path) -> None:
+    if _opened_producers[file].users == 0:
         with contextlib.suppress(*library.errors):
-            _opened.pop(file).harvester.reset()
+            _opened_producers.pop(file).harvester.reset()
 
 
-def _create(library: Library, harvester: Any, device: Any) -> Any:
+def _create(library: GenicamLibrary, harvester: Any, device: Any) -> Any:
     """Open a device; the library takes Ctrl-C for itself then, which is given back."""
     core = library.core
     # chunks are not used, and one that cannot be read would cost its frame
@@ -257,7 +262,7 @@ def _create(library: Library, harvester: Any, device: Any) -> Any:
             signal.signal(signal.SIGINT, handler)
 
 
-def _told(library: Library, device: Any, name: str) -> str:
+def _read_device_attribute(library: GenicamLibrary, device: Any, name: str) -> str:
     try:
         return str(getattr(device, name) or "")
     except library.errors:  # optional in GenTL
@@ -283,7 +288,7 @@ class Features:
         The camera, for messages.
     """
 
-    def __init__(self, nodes: Any, library: Library, where: str) -> None:
+    def __init__(self, nodes: Any, library: GenicamLibrary, where: str) -> None:
         self._nodes = nodes
         self._library = library
         self._where = where
@@ -292,11 +297,11 @@ class Features:
         """Return whether the camera has all of these features now."""
         return all(self._access(name) not in _ABSENT_ACCESS_MODES for name in names)
 
-    def writable(self, name: str) -> bool:
+    def is_writable(self, name: str) -> bool:
         """Return whether the feature can be set now."""
         return self._access(name) in _WRITABLE_ACCESS_MODES
 
-    def read(self, name: str, *instead: str) -> Any:
+    def read(self, name: str, *alternatives: str) -> Any:
         """Return the value of the first of these features that the camera has.
 
         Raises
@@ -304,30 +309,31 @@ class Features:
         CameraError
             When it has none of them.
         """
-        for candidate in (name, *instead):
+        for candidate in (name, *alternatives):
             if self._access(candidate) in _READABLE_ACCESS_MODES:
-                with self._library.translated(f"{self._where}: {candidate}"):
+                with self._library.translate_errors(f"{self._where}: {candidate}"):
                     return getattr(self._nodes, candidate).value
         raise CameraError(
-            f"{self._where}: has no feature {' or '.join((name, *instead))} that can be read now"
+            f"{self._where}: has no feature {' or '.join((name, *alternatives))} that can be read"
+            f" now"
         )
 
     def unit(self, name: str) -> str:
         """Return the unit of a feature; empty where it tells none."""
-        with self._library.translated(f"{self._where}: {name}"):
+        with self._library.translate_errors(f"{self._where}: {name}"):
             return str(getattr(self._nodes, name).unit or "")
 
     def choices(self, name: str) -> list[str]:
         """Return the values that an enumeration can be set to now; none where it is missing."""
         if not self.has(name):
             return []
-        with self._library.translated(f"{self._where}: {name}"):
+        with self._library.translate_errors(f"{self._where}: {name}"):
             entries = getattr(self._nodes, name).entries
             return [e.symbolic for e in entries if e.get_access_mode() not in _ABSENT_ACCESS_MODES]
 
-    def number_of(self, name: str) -> int:
+    def enum_number(self, name: str) -> int:
         """Return the number behind an enumeration's present value."""
-        with self._library.translated(f"{self._where}: {name}"):
+        with self._library.translate_errors(f"{self._where}: {name}"):
             return int(getattr(self._nodes, name).get_int_value())
 
     def set(self, name: str, value: Any) -> None:
@@ -343,7 +349,7 @@ class Features:
         got = self.read(name)
         if got == value:
             return
-        if not self.writable(name):
+        if not self.is_writable(name):
             raise CameraError(
                 f"{self._where}: {name}: got {got!r}, expected {value!r}, and it cannot be set"
             )
@@ -352,7 +358,7 @@ class Features:
             raise CameraError(
                 f"{self._where}: {name}: got {value!r}, expected one of {', '.join(choices)}"
             )
-        with self._library.translated(f"{self._where}: {name} to {value!r}"):
+        with self._library.translate_errors(f"{self._where}: {name} to {value!r}"):
             getattr(self._nodes, name).value = value
         got = self.read(name)
         if got != value:
@@ -361,14 +367,14 @@ class Features:
                 "another setting"
             )
 
-    def set_if_there(self, name: str, value: Any) -> None:
+    def set_if_present(self, name: str, value: Any) -> None:
         """As :meth:`set`, for a feature that a camera need not have."""
         if self.has(name):
             self.set(name, value)
 
     def set_nearest(self, name: str, value: float) -> float:
         """Set a number within what the camera allows; return what it then is."""
-        with self._library.translated(f"{self._where}: {name} to {value:g}"):
+        with self._library.translate_errors(f"{self._where}: {name} to {value:g}"):
             node = getattr(self._nodes, name)
             low, high = float(node.min), float(node.max)
             value = min(max(value, low), high)
@@ -376,7 +382,7 @@ class Features:
             if integer or node.has_inc():
                 step = float(node.inc)
                 value = low + min(round((value - low) / step), (high - low) // step) * step
-            if self.writable(name):
+            if self.is_writable(name):
                 node.value = int(value) if integer else value
             return float(node.value)
 
@@ -384,7 +390,7 @@ class Features:
         """Do a command."""
         if not self.has(name):
             raise CameraError(f"{self._where}: has no command {name}")
-        with self._library.translated(f"{self._where}: {name}"):
+        with self._library.translate_errors(f"{self._where}: {name}"):
             getattr(self._nodes, name).execute()
 
     def _access(self, name: str) -> int:
@@ -392,5 +398,5 @@ class Features:
             node = getattr(self._nodes, name)
         except AttributeError:
             return 0
-        with self._library.translated(f"{self._where}: {name}"):
+        with self._library.translate_errors(f"{self._where}: {name}"):
             return int(node.get_access_mode())

@@ -86,7 +86,7 @@ def parse_address(rest: str) -> Address:
     twice = len({name for name, _ in pairs}) < len(pairs)
     if not serial or words or twice or "" in dict(pairs).values() or iso <= 0 or not black_good:
         raise CameraUrlError(f"{expected}; got {rest!r}")
-    if address.pixel_format and pixel_format.parse(address.pixel_format) is None:
+    if address.pixel_format and pixel_format.parse_pixel_format(address.pixel_format) is None:
         raise CameraUrlError(
             f"{expected}; format: got {address.pixel_format!r}, expected a raw one such as "
             "BayerRG12, BayerRG12p or Mono16"
@@ -139,7 +139,7 @@ class Readout:
     line: str
 
 
-def prepare(features: Features, address: Address, model: str) -> Readout:
+def prepare_readout(features: Features, address: Address, model: str) -> Readout:
     """Set a camera to raw values and return how it is read out.
 
     Parameters
@@ -158,7 +158,7 @@ def prepare(features: Features, address: Address, model: str) -> Readout:
     """
     where = address.url
     for name, value in _RAW_SETTINGS:
-        features.set_if_there(name, value)
+        features.set_if_present(name, value)
     _level_colors(features, where)
     exposure_feature = next(
         (name for name in ("ExposureTime", "ExposureTimeAbs") if features.has(name)), ""
@@ -171,7 +171,7 @@ def prepare(features: Features, address: Address, model: str) -> Readout:
     chosen = _choose_format(features, where, address.pixel_format)
     line = _choose_line(features, where, address.line)
     info = _describe(features, address, model, chosen, line)
-    number = features.number_of("PixelFormat")
+    number = features.enum_number("PixelFormat")
     return Readout(info, chosen, number, exposure_feature, latch, latched, tick_s, line)
 
 
@@ -201,27 +201,32 @@ def _clock_features(features: Features, where: str) -> tuple[str, str, float]:
     )
 
 
-def _choose_format(features: Features, where: str, asked: str) -> PixelFormat:
+def _choose_format(features: Features, where: str, requested: str) -> PixelFormat:
     offered = features.choices("PixelFormat")
-    chosen = pixel_format.parse(asked) if asked else pixel_format.deepest(offered)
+    chosen = (
+        pixel_format.parse_pixel_format(requested)
+        if requested
+        else pixel_format.choose_deepest_format(offered)
+    )
     if chosen is None or chosen.name not in offered:
         raise CameraError(
-            f"{where}: pixel format: got {asked or 'no raw one'}, expected a raw one of those that "
+            f"{where}: pixel format: got {requested or 'no raw one'}, expected a raw one of those"
+            f" that "
             f"the camera has: {', '.join(offered) or 'none'}"
         )
     features.set("PixelFormat", chosen.name)
     return chosen
 
 
-def _choose_line(features: Features, where: str, asked: str) -> str:
+def _choose_line(features: Features, where: str, requested: str) -> str:
     sources = features.choices("TriggerSource")
     lines = [name for name in sources if name.startswith("Line")]
-    if asked:
-        if asked not in sources:
+    if requested:
+        if requested not in sources:
             raise CameraUrlError(
-                f"{where}: line: got {asked!r}, expected one of {', '.join(sources) or 'none'}"
+                f"{where}: line: got {requested!r}, expected one of {', '.join(sources) or 'none'}"
             )
-        return asked
+        return requested
     now = str(features.read("TriggerSource")) if lines else ""
     return now if now in lines else next(iter(lines), "")
 

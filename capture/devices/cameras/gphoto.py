@@ -24,7 +24,7 @@ from capture.devices.camera import (
     FrameTimeout,
     Trigger,
 )
-from capture.devices.cameras.hot_folder import info_of
+from capture.devices.cameras.hot_folder import parse_camera_info
 
 EVENT_DRAIN_MS = 50
 """How long old events are waited for when the camera is armed, ms."""
@@ -102,7 +102,7 @@ class GphotoCamera:
         """What the camera is; takes one test picture the first time it is asked."""
         if self._info is None:
             picture = raw.decode(memoryview(self._capture()), where=f"gphoto2:{self._serial}")
-            self._info = info_of(picture, self._serial, Trigger.SOFTWARE, Trigger.EDGE)
+            self._info = parse_camera_info(picture, self._serial, Trigger.SOFTWARE, Trigger.EDGE)
         return self._info
 
     def clock_s(self) -> float:

@@ -43,7 +43,7 @@ def open_camera(rest: str) -> HotFolder:
     return HotFolder(Path(path), serial=serial, by_hand=release == "hand")
 
 
-def info_of(frame: raw.RawFrame, serial: str, *triggers: Trigger) -> CameraInfo:
+def parse_camera_info(frame: raw.RawFrame, serial: str, *triggers: Trigger) -> CameraInfo:
     """Return what a raw file says of the camera that took it."""
     height, width = frame.cfa.shape
     levels = (frame.pattern, frame.black, frame.white)
@@ -96,7 +96,7 @@ class HotFolder:
             )
         frame = raw.read(sample)
         known = serial or frame.camera_serial or frame.camera_model
-        self._info = info_of(frame, known, Trigger.HAND if by_hand else Trigger.EDGE)
+        self._info = parse_camera_info(frame, known, Trigger.HAND if by_hand else Trigger.EDGE)
 
     @property
     def info(self) -> CameraInfo:

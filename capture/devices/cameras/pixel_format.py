@@ -1,8 +1,8 @@
 """Raw pixel formats of industrial cameras, and their bytes as numbers.
 
 Names and layouts are those of the Pixel Format Naming Convention (EMVA, PFNC 2.4): a number alone
-is one pixel in one or two bytes, ``p`` is packed without gaps from the lowest bit on, ``Packed`` is
-GigE Vision's older packing of two pixels in three bytes.
+is one pixel in one or two bytes, ``p`` is packed without gaps from the lowest bit on,
+``Packed`` is GigE Vision's older packing of two pixels in three bytes.
 """
 
 import math
@@ -100,7 +100,8 @@ class PixelFormat:
 
         Examples
         --------
-        >>> parse("Mono12p").unpack(bytes([0x21, 0x43, 0x65]), width_px=2, height_px=1).tolist()
+        >>> parse_pixel_format("Mono12p").unpack(bytes([0x21, 0x43, 0x65]), width_px=2,
+        ...     height_px=1).tolist()
         [[801, 1620]]
         >>> [hex(value) for value in (801, 1620)]
         ['0x321', '0x654']
@@ -143,14 +144,14 @@ class PixelFormat:
             out[:, pixel::group_px] = (value >> shift) & ((1 << self.bits) - 1)
 
 
-def parse(name: str) -> PixelFormat | None:
+def parse_pixel_format(name: str) -> PixelFormat | None:
     """Return the raw format of that name, None for one that is no raw format of 8 to 16 bits.
 
     Examples
     --------
-    >>> parse("BayerGB10Packed")
+    >>> parse_pixel_format("BayerGB10Packed")
     PixelFormat(name='BayerGB10Packed', pattern='GBRG', bits=10, packing='Packed')
-    >>> parse("RGB8") is None
+    >>> parse_pixel_format("RGB8") is None
     True
     """
     match = _FORMAT_NAME.fullmatch(name)
@@ -162,7 +163,7 @@ def parse(name: str) -> PixelFormat | None:
     return PixelFormat(name, _CFA_PATTERNS[kind], bits, packing)
 
 
-def deepest(names: list[str]) -> PixelFormat | None:
+def choose_deepest_format(names: list[str]) -> PixelFormat | None:
     """Return the raw format with the most bits, of a filter array where the camera offers any.
 
     A color camera offers "Mono8" too, as a conversion of its own. Of formats as deep, the one that
@@ -170,10 +171,11 @@ def deepest(names: list[str]) -> PixelFormat | None:
 
     Examples
     --------
-    >>> deepest(["Mono8", "Mono16", "BayerRG8", "BayerRG12p", "BayerRG12", "RGB8"]).name
+    >>> choose_deepest_format(["Mono8", "Mono16", "BayerRG8", "BayerRG12p", "BayerRG12",
+    ...     "RGB8"]).name
     'BayerRG12'
     """
-    found = [format_ for name in names if (format_ := parse(name)) is not None]
+    found = [format_ for name in names if (format_ := parse_pixel_format(name)) is not None]
     return max(
         found, key=lambda f: (f.pattern != "MONO", f.bits, f.packing == "", f.name), default=None
     )

@@ -70,7 +70,7 @@ class RemoteCamera:
             raise LinkLost(f"cannot open {self._url}: {exc}; is it being served?") from exc
         try:
             answer = self._ask("open", version=camera_wire.CAMERA_WIRE_VERSION, view=view)
-            with self._understood():
+            with self._translate_errors():
                 self._info = camera_wire.info_from_json(answer["info"])
         except BaseException:
             self._drop()
@@ -83,13 +83,13 @@ class RemoteCamera:
 
     def clock_s(self) -> float:
         """Return the time on the clock that stamps its frames, s."""
-        with self._understood():
+        with self._translate_errors():
             return float(self._ask("clock")["clock_s"])
 
     def configure(self, want: Exposure) -> Exposure:
         """Set an exposure and return what was really set."""
         answer = self._ask("configure", exposure_s=want.exposure_s, iso=want.iso)
-        with self._understood():
+        with self._translate_errors():
             return Exposure(float(answer["exposure_s"]), int(answer["iso"]))
 
     def arm(self, count: int, trigger: Trigger) -> None:
@@ -102,7 +102,7 @@ class RemoteCamera:
 
     def frame(self, timeout_s: float) -> Frame:
         """Return the next frame, or raise `FrameTimeout`; a damaged one is `FrameRefused`."""
-        answer = self._ask("frame", patience_s=timeout_s, timeout_s=timeout_s)
+        answer = self._ask("frame", timeout_s=timeout_s, patience_s=timeout_s)
         try:
             camera_wire.check_blob(answer, answer["blob"])
             return camera_wire.frame_from_message(answer["frame"], answer["blob"])
@@ -124,22 +124,24 @@ class RemoteCamera:
                 connection.close()
 
     @contextlib.contextmanager
-    def _understood(self) -> Any:
+    def _translate_errors(self) -> Any:
         try:
             yield
         except (BadMessage, KeyError, TypeError, ValueError) as exc:
             self._drop()
             raise CameraError(f"{self._url}: an answer made no sense: {exc!r}") from exc
 
-    def _ask(self, what: str, *, patience_s: float = 0.0, **fields: Any) -> dict[str, Any]:
+    def _ask(self, request: str, *, timeout_s: float = 0.0, **fields: Any) -> dict[str, Any]:
         """Send one request and return the fields of its answer, its bytes under ``blob``."""
         connection = self._socket
         if connection is None:
             raise LinkLost(f"{self._url}: the connection is closed; open the camera again")
         self._id += 1
         try:
-            connection.settimeout(ANSWER_TIMEOUT_S + patience_s)
-            connection.sendall(camera_wire.encode_message({"id": self._id, "do": what, **fields}))
+            connection.settimeout(ANSWER_TIMEOUT_S + timeout_s)
+            connection.sendall(
+                camera_wire.encode_message({"id": self._id, "do": request, **fields})
+            )
             while True:
                 answer = self._message(connection)
                 if answer.get("id") != self._id:
@@ -149,7 +151,7 @@ class RemoteCamera:
                 connection.settimeout(DEVELOP_TIMEOUT_S)
         except (OSError, BadMessage) as exc:
             self._drop()
-            raise LinkLost(f"{self._url}: the link was lost in {what!r} ({exc})") from exc
+            raise LinkLost(f"{self._url}: the link was lost in {request!r} ({exc})") from exc
         if answer.get("ok") is not True:
             kind = _ERROR_CLASSES.get(str(answer.get("error")), CameraError)
             raise kind(f"{self._url}: {answer.get('text', 'refused without a reason')}")

@@ -11,12 +11,12 @@ from capture.calibration.geometry import CameraPose
 from capture.calibration.lights import LightTable
 from reconstruction.arrays import Float32Array, Float64Array
 from reconstruction.pipeline.dome.images import DomeImage, DomeImages
-from reconstruction.pipeline.graph import attributes_of
+from reconstruction.pipeline.graph import select_attributes
 from reconstruction.pipeline.inputs import Inputs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Dome:
+class CalibratedDome:
     """The dome as calibrated, or as drawn, with the images it took."""
 
     images: DomeImages
@@ -29,7 +29,7 @@ class Dome:
     """Response of each camera at the pixels of its images, (h, w, 3)."""
     absolute: bool
     """Whether the lights' intensities are known, and so the albedo."""
-    tell: Callable[[str, float], None]
+    report_progress: Callable[[str, float], None]
     """Says how far a stage is."""
 
     @property
@@ -49,7 +49,9 @@ class Dome:
         return DomeImage(image.rgb / response, image.variance / response**2, image.valid)
 
 
-def seen_from(dome: Dome, rotation: Float64Array, shift_mm: Float64Array) -> Dome:
+def transform_dome(
+    dome: CalibratedDome, rotation: Float64Array, shift_mm: Float64Array
+) -> CalibratedDome:
     """Return the dome in the frame of a mesh that stands in it at ``rotation @ p + shift_mm``.
 
     Parameters
@@ -75,7 +77,7 @@ def seen_from(dome: Dome, rotation: Float64Array, shift_mm: Float64Array) -> Dom
     return dataclasses.replace(dome, cameras=cameras, table=table(dome.table), lights=lights)
 
 
-def calibrated(inputs: Inputs, images: DomeImages) -> Dome:
+def load_dome(inputs: Inputs, images: DomeImages) -> CalibratedDome:
     """Return the dome of a session's images; what no calibration says is taken as drawn.
 
     Parameters
@@ -97,7 +99,7 @@ def calibrated(inputs: Inputs, images: DomeImages) -> Dome:
     if found is None:
         cameras = tuple(CameraPose.nominal(view) for view in views)
     else:
-        poses = geometry.poses_from(found, rig.subset(views=images.views))
+        poses = geometry.cameras_from_calibration(found, rig.subset(views=images.views))
         cameras = tuple(poses[view.name] for view in views)
     drawn = "the lights stand and shine as the rig's file draws them"
     lit = inputs.load("lights", images.lights, f"{drawn}; the albedo has no absolute scale")
@@ -114,12 +116,14 @@ def calibrated(inputs: Inputs, images: DomeImages) -> Dome:
         inputs.noted["lights_left_out"] = dead
     response = tuple(_response(lights, camera) for camera in cameras)
     absolute = lit is not None and "intensities" not in nominal
-    return Dome(images, cameras, lights, lights, response, absolute, inputs.tell)
+    return CalibratedDome(
+        images, cameras, lights, lights, response, absolute, inputs.report_progress
+    )
 
 
-def split_exposures(dome: Dome) -> Dome:
+def split_exposures(dome: CalibratedDome) -> CalibratedDome:
     """Return the dome with each exposure an image of its own, as a moving head needs them."""
-    images = dome.images.apart()
+    images = dome.images.split_exposures()
     order = [images.lights.index(light) for light, _ in images.captures]
     names = [f"{name} {exposure}" for name, exposure in images.captures]
     return dataclasses.replace(dome, images=images, lights=reorder_lights(dome.table, order, names))
@@ -131,7 +135,7 @@ def reorder_lights(lights: LightTable, order: list[int], names: list[str]) -> Li
         "position_mm intensity exponent axis valid position_stderr_mm intensity_stderr "
         "exponent_stderr"
     )
-    kept = {field: values[order] for field, values in attributes_of(lights, per_light).items()}
+    kept = {field: values[order] for field, values in select_attributes(lights, per_light).items()}
     return dataclasses.replace(lights, names=tuple(names), **kept)
 
 

@@ -13,9 +13,9 @@ from capture.session import FrameRecord, Session
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.pipeline.hold_out import NO_HOLD_OUT, HoldOut
 from reconstruction.pipeline.inputs import InputsError
-from reconstruction.pipeline.sensor_noise import SensorNoise
+from reconstruction.pipeline.sensor_noise import ElectronNoise
 
-__all__ = ["DomeImage", "DomeImages", "SensorNoise"]
+__all__ = ["DomeImage", "DomeImages", "ElectronNoise"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +84,7 @@ class DomeImages:
         self,
         session: Session,
         *,
-        noise: dict[str, SensorNoise] | None = None,
+        noise: dict[str, ElectronNoise] | None = None,
         kind: str = "olat",
         merge: bool = True,
         without: HoldOut = NO_HOLD_OUT,
@@ -95,7 +95,7 @@ class DomeImages:
         self._shots: dict[tuple[str, str], list[FrameRecord]] = {}
         for record in session.frames(kind):
             view, light = record.camera, str(record.index["light"])
-            if not without.holds(light, view):
+            if not without.is_held_out(light, view):
                 self._shots.setdefault((view, light), []).append(record)
         if not self._shots:
             raise InputsError(f"{session.path}: has no frames of kind {kind!r}")
@@ -109,7 +109,7 @@ class DomeImages:
         self.captures = tuple((light, exposure) for exposure in kept for light in self.lights)
         self._darks: dict[str, tuple[Float32Array, Float32Array] | None] = {}
 
-    def apart(self) -> DomeImages:
+    def split_exposures(self) -> DomeImages:
         """Return the same images with each exposure one of its own."""
         return DomeImages(
             self._session, noise=self._noise, kind=self._kind, merge=False, without=self._without
@@ -174,7 +174,7 @@ class DomeImages:
         """Merge mosaics to fractions of full scale per second at level 1."""
         first = frames[0]
         serial = self._session.rig.view(view).serial
-        noise = self._noise.get(serial) or SensorNoise.of(first)
+        noise = self._noise.get(serial) or ElectronNoise.of(first)
         times = []
         for frame, level in zip(frames, levels, strict=True):
             if frame.cfa.shape != first.cfa.shape or frame.pattern != first.pattern:

@@ -17,7 +17,7 @@ from reconstruction import brdf_basis
 from reconstruction.arrays import Float64Array
 from reconstruction.lumitexels import Lumitexels
 from reconstruction.lumitexels.store import LumitexelStore
-from reconstruction.pipeline.dome.calibrated import Dome
+from reconstruction.pipeline.dome.calibrated import CalibratedDome
 from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.scan.mesh import RefinedScan
 from reconstruction.surface import errors as surface_errors
@@ -58,14 +58,14 @@ N_REFINEMENTS = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Samples:
+class SurfaceSampleStore:
     """Lumitexels of the surface, and the folder that holds them where they are many."""
 
     store: LumitexelStore
     folder: Any
     lights: int
     """Lights of the dome: where exposures stay apart, several captures are of one."""
-    tell: Callable[[str, float], None]
+    report_progress: Callable[[str, float], None]
     """Says how far a stage is."""
 
     def chunks(self) -> Iterator[tuple[slice, Lumitexels]]:
@@ -89,17 +89,20 @@ class Samples:
         for part, samples in self.chunks():
             by_light = dataclasses.replace(samples, light=samples.light % self.lights)
             parts.append(estimate(part, by_light))
-            self.tell(stage, part.stop / max(len(self.store.surface), 1))
+            self.report_progress(stage, part.stop / max(len(self.store.surface), 1))
         arrays = zip(*((p.values, p.stderr, p.valid) for p in parts), strict=True)
         return PointValues(*map(np.concatenate, arrays))
 
 
 def fit_lobes(
-    inputs: Inputs, lumitexels: Samples, point_normals: PointValues, point_r_d: PointValues
+    inputs: Inputs,
+    lumitexels: SurfaceSampleStore,
+    point_normals: PointValues,
+    point_r_d: PointValues,
 ) -> Mapping[str, Any]:
     """Fit basis BRDFs to all points, reduce them, and return basis, weights and file."""
     folder = inputs.basis
-    materials = brdf_tables.default() if folder is None else brdf_tables.load(folder)
+    materials = brdf_tables.default_basis() if folder is None else brdf_tables.load(folder)
     rank = inputs.rank or BASIS_RANK
     good = np.flatnonzero(point_r_d.valid)
     if len(good) < rank:
@@ -110,10 +113,12 @@ def fit_lobes(
         points = drawn[(drawn >= part.start) & (drawn < part.stop)]
         if not len(points):
             continue
-        some = estimates.rows_of(samples, points - part.start)
-        shine = estimates.surface_samples(some, point_normals[points], point_r_d[points])
+        some = estimates.select_points(samples, points - part.start)
+        shine = estimates.specular_samples(some, point_normals[points], point_r_d[points])
         fitted.append(brdf_basis.fit_weights(shine, materials).weights)
-    shares = _comparable(np.concatenate(fitted), materials, least=max(rank, 2 * BASIS_RANK))
+    shares = _normalize_mixtures(
+        np.concatenate(fitted), materials, min_points=max(rank, 2 * BASIS_RANK)
+    )
     most = min(shares.shape)
     if rank > most:
         raise InputsError(f"rank: got {rank}, expected at most {most}; the data hold no more")
@@ -122,10 +127,10 @@ def fit_lobes(
         for k in sorted({*RECORDED_RANKS, rank})
         if k <= most
     }
-    basis = materials.mixed(mixes[rank][0])
+    basis = materials.mix_materials(mixes[rank][0])
     found = lumitexels.collect(
         "lobes",
-        lambda part, samples: estimates.lobe_weights(
+        lambda part, samples: estimates.fit_lobe_weights(
             samples, point_normals[part], point_r_d[part], basis
         ),
     )
@@ -136,7 +141,9 @@ def fit_lobes(
     }
 
 
-def _comparable(shares: Float64Array, materials: BrdfBasis, *, least: int) -> Float64Array:
+def _normalize_mixtures(
+    shares: Float64Array, materials: BrdfBasis, *, min_points: int
+) -> Float64Array:
     """Return mixtures scaled to reflect equally much, without those that no sample holds down.
 
     A lobe so narrow that no pair of light and view met it can have any share.
@@ -146,8 +153,8 @@ def _comparable(shares: Float64Array, materials: BrdfBasis, *, least: int) -> Fl
     usual = float(np.median(some)) if len(some) else 0.0
     kept = (total > 0) & (total < MAX_RELATIVE_STRENGTH * usual)
     got = f"{np.count_nonzero(kept)} of {len(shares)} points that show how the surface reflects"
-    expected = f"at least {least}; more lights or views would show it"
-    Checks(InputsError).require(np.count_nonzero(kept) >= least, "lobes", got, expected)
+    expected = f"at least {min_points}; more lights or views would show it"
+    Checks(InputsError).require(np.count_nonzero(kept) >= min_points, "lobes", got, expected)
     return shares[kept] / total[kept, None]
 
 
@@ -161,7 +168,7 @@ def _basis_bytes(
         stream,
         materials=np.array(materials.names),
         mix=mix,
-        table=materials.mixed(mix).table[..., :rank],
+        table=materials.mix_materials(mix).table[..., :rank],
         light_radius_rad=materials.light_radius_rad,
         ranks=np.array(list(mixes)),
         error_by_rank=np.array([error for _, error in mixes.values()]),
@@ -171,9 +178,9 @@ def _basis_bytes(
 
 
 def refine_normals(
-    dome: Dome,
+    dome: CalibratedDome,
     surface: RefinedScan,
-    lumitexels: Samples,
+    lumitexels: SurfaceSampleStore,
     point_normals: PointValues,
     point_r_d: PointValues,
     basis: BrdfBasis,
@@ -198,13 +205,13 @@ def refine_normals(
         of_turn = f"{turn + 1} of {N_REFINEMENTS}"
         found = lumitexels.collect(
             f"normals by all light, {of_turn}",
-            lambda part, samples, n=found.values, own=lobes: estimates.normals_from_all_light(  # type: ignore[misc]
-                samples, inside[part], point_r_d[part], own[part], now=n[part]
+            lambda part, samples, n=found.values, own=lobes: estimates.normals_from_full_model(  # type: ignore[misc]
+                samples, inside[part], point_r_d[part], own[part], initial_normals=n[part]
             ),
         )
         fitted = lumitexels.collect(
             f"lobes, {of_turn}",
-            lambda part, samples, n=found: estimates.lobe_weights(  # type: ignore[misc]
+            lambda part, samples, n=found: estimates.fit_lobe_weights(  # type: ignore[misc]
                 samples, n[part], point_r_d[part], basis
             ),
         )
@@ -214,6 +221,6 @@ def refine_normals(
         maps[name] = texture.map(fitted.values[:, k], fitted.stderr[:, k], good, "1", what)
     what = "weighted RMS of samples - model"
     maps["lobe_residual"] = texture.map(fitted.values[:, rank], None, good, "1/sr", what)
-    found = surface_errors.of_normals(found, surface, dome.pixel_mm)
+    found = surface_errors.add_normal_errors(found, surface, dome.pixel_mm)
     refined = texture.normals(found, "by the whole model, world frame")
     return {BASIS_FILE: basis_file, "normals_refined": refined, **maps}

@@ -20,7 +20,7 @@ MAX_STILL_MOTION_PX: Final = 0.15
 """Motion, in pixels of an image, below which the head counts as still."""
 
 
-class HalfPixels:
+class HalfResolutionCamera:
     """A camera seen through images of one pixel for each 2 x 2 cell of its sensor."""
 
     def __init__(self, camera: CameraPose) -> None:
@@ -33,7 +33,7 @@ class HalfPixels:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Motion:
+class DomeHeadMotion:
     """Where the head was in each image.
 
     Attributes
@@ -72,7 +72,7 @@ def follow_head(
     cameras: Sequence[CameraPose],
     surface: RefinedScan,
     pixel_mm: float,
-) -> Motion | None:
+) -> DomeHeadMotion | None:
     """Estimate the head's motion from a session's tracking frames.
 
     Parameters
@@ -107,7 +107,7 @@ def follow_head(
     points = surface.points_mm[::step].astype(np.float64)
     found = head_motion.estimate(
         frames,
-        [HalfPixels(camera) for camera in cameras],
+        [HalfResolutionCamera(camera) for camera in cameras],
         points,
         surface.normals[::step].astype(np.float64),
         times[order],
@@ -120,21 +120,21 @@ def follow_head(
             "this subject, and are the cameras calibrated?"
         )
     # the scan was laid onto all images together: it stands where the head was on average
-    turn, shift = found.at(when)
+    turn, shift = found.interpolate(when)
     mean = np.eye(4)
     mean[:3, :3] = head_motion.rotation_matrix(turn.mean(axis=0))
     mean[:3, 3] = shift.mean(axis=0)
     poses = found.matrices(when) @ np.linalg.inv(mean)
     moved = np.einsum("nij,pj->npi", poses[:, :3, :3], points) + poses[:, None, :3, 3] - points
     apart = np.sqrt(np.mean(np.sum(moved**2, axis=-1), axis=-1))
-    usable = found.covered(when)
+    usable = found.is_covered(when)
     still = bool(usable.all() and apart.max(initial=0.0) < MAX_STILL_MOTION_PX * pixel_mm)
     if not usable.any():
         raise InputsError(
             f"{session.path}: no image lies between two tracking frames that tell where the "
             "head was; capture again, with the face at rest"
         )
-    return Motion(poses, usable, found, apart, still)
+    return DomeHeadMotion(poses, usable, found, apart, still)
 
 
 def _time_s(record: Any) -> float:

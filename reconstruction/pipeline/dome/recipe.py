@@ -4,5 +4,5 @@ from reconstruction.pipeline.dome import stages
 from reconstruction.pipeline.recipe import Recipe
 
 RECIPE = Recipe(
-    stages.MAP_NAMES, stages.graph, stages.FILE_NAMES, ("position",), maps_of_rank=stages.maps_of
+    stages.MAP_NAMES, stages.graph, stages.FILE_NAMES, ("position",), maps_of_rank=stages.map_names
 )

@@ -6,21 +6,21 @@ import numpy as np
 
 from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
-from reconstruction.pipeline.dome.calibrated import Dome, reorder_lights
+from reconstruction.pipeline.dome.calibrated import CalibratedDome, reorder_lights
 from reconstruction.pipeline.inputs import InputsError
 from reconstruction.scan import registration as scan_registration
 from reconstruction.scan.registration import RigidFit
 from reconstruction.scan.repair import TriangleMesh
-from reconstruction.scan.rough_normals import RegistrationError
+from reconstruction.scan.rough_normals import ScanRegistrationError
 
-ALIGNING_LIGHTS: Final = 40
+N_REGISTRATION_LIGHTS: Final = 40
 """Lights whose images say where the mesh is."""
 MIN_SIGNAL_TO_NOISE: Final = 5.0
 """Times its noise from which on a pixel shows something."""
 
 
-def register(dome: Dome, mesh: TriangleMesh) -> RigidFit:
-    """Lay a mesh onto the images of a dome; see `reconstruction.scan.registration.align`.
+def register_mesh(dome: CalibratedDome, mesh: TriangleMesh) -> RigidFit:
+    """Lay a mesh onto the images of a dome; see `reconstruction.scan.registration.align_scan`.
 
     Parameters
     ----------
@@ -34,7 +34,9 @@ def register(dome: Dome, mesh: TriangleMesh) -> RigidFit:
     InputsError
         No light stands before the face, or the mesh is not found in the images.
     """
-    chosen = farthest_point_sample(dome.lights.position_mm, dome.lights.valid, ALIGNING_LIGHTS)
+    chosen = farthest_point_sample(
+        dome.lights.position_mm, dome.lights.valid, N_REGISTRATION_LIGHTS
+    )
     shares = []
 
     def stacks(view: int) -> Float32Array:
@@ -49,7 +51,7 @@ def register(dome: Dome, mesh: TriangleMesh) -> RigidFit:
         return np.asarray(layers, np.float32)
 
     try:
-        return scan_registration.align(
+        return scan_registration.align_scan(
             mesh,
             cameras=dome.cameras,
             lights=reorder_lights(dome.lights, chosen, [dome.lights.names[k] for k in chosen]),
@@ -57,7 +59,7 @@ def register(dome: Dome, mesh: TriangleMesh) -> RigidFit:
             binning=2,
             rng=np.random.default_rng(0),
         )
-    except RegistrationError as exc:
+    except ScanRegistrationError as exc:
         lost, seen = 100.0 * np.mean(shares, axis=0)
         raise InputsError(
             f"surface: the scan was not found in the images: {exc}; {lost:.1f} % of their pixels "

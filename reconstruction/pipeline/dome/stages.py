@@ -14,22 +14,22 @@ from model.skin import SkinMap
 from model.skin_reflectance import BASIS_FILE
 from model.vectors import unit_vectors
 from reconstruction import photometric_stereo
-from reconstruction.lumitexels import Surface
+from reconstruction.lumitexels import SampledSurface
 from reconstruction.lumitexels.ray_casting import RayCaster
 from reconstruction.lumitexels.store import LumitexelStore
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline.dome.calibrated import Dome, calibrated, split_exposures
+from reconstruction.pipeline.dome.calibrated import CalibratedDome, load_dome, split_exposures
 from reconstruction.pipeline.dome.images import DomeImages
 from reconstruction.pipeline.dome.lobes import (
     BASIS_RANK,
     RECORDED_RANKS,
-    Samples,
+    SurfaceSampleStore,
     fit_lobes,
     refine_normals,
     weight_names,
 )
-from reconstruction.pipeline.dome.motion import Motion, follow_head
-from reconstruction.pipeline.dome.registration import register
+from reconstruction.pipeline.dome.motion import DomeHeadMotion, follow_head
+from reconstruction.pipeline.dome.registration import register_mesh
 from reconstruction.pipeline.hold_out import HoldOutError
 from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.scan import mesh as scan_mesh
@@ -45,27 +45,27 @@ STAGE_REVISION = 4
 SCAN_FILE: Final = "scan.ply"
 MEMORY_BYTES: Final = 2**30
 """Size of the table of samples from which on it lies in files and not in memory."""
-FACE_MM2: Final = 60_000.0
+FACE_AREA_MM2: Final = 60_000.0
 """Area of a face; with the size of a pixel on it, it says how many points can be told apart."""
 POINT_LIMITS: Final = (8_000, 1_000_000)
 TEXTURE_LIMITS: Final = (128, 2048)
 
 
-def maps_of(rank: int = BASIS_RANK) -> tuple[str, ...]:
+def map_names(rank: int = BASIS_RANK) -> tuple[str, ...]:
     """Return the names of the maps that can be made of a dome session."""
     first = ("position", "half_vector_normals", "normals", "r_d")
     return (*first, *weight_names(rank), "lobe_residual", "normals_refined", "samples")
 
 
 WEIGHT_NAMES = weight_names()
-MAP_NAMES = maps_of()
+MAP_NAMES = map_names()
 """Maps that can be made of a dome session, unless another rank is asked for."""
 MESH_FILE = "mesh.obj"
 FILE_NAMES = (MESH_FILE, BASIS_FILE)
 """What goes along with the maps."""
 
 
-def graph(inputs: Inputs) -> list[stages.Stage]:
+def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     """Return the stages that a dome session can go through; see `stages.run`."""
     dome = _dome(inputs)
     stage = inputs.stage_maker(STAGE_REVISION)
@@ -99,10 +99,10 @@ def graph(inputs: Inputs) -> list[stages.Stage]:
     ]
 
 
-def _dome(inputs: Inputs) -> Dome:
+def _dome(inputs: Inputs) -> CalibratedDome:
     """Return the dome with the images that may be fitted to."""
     images = DomeImages(inputs.session)
-    held = inputs.hold_out = inputs.hold_out.within(images.lights, images.views)
+    held = inputs.hold_out = inputs.hold_out.resolve(images.lights, images.views)
     inputs.noted["held_out"] = held.record()
     if held:
         for field, there, least in (
@@ -116,10 +116,10 @@ def _dome(inputs: Inputs) -> Dome:
                     "hold out fewer"
                 )
         images = DomeImages(inputs.session, without=held)
-    return calibrated(inputs, images)
+    return load_dome(inputs, images)
 
 
-def _surface(inputs: Inputs, dome: Dome) -> RefinedScan:
+def _surface(inputs: Inputs, dome: CalibratedDome) -> RefinedScan:
     """Clean and refine the scan, and lay it onto the dome."""
     session = inputs.session
     if inputs.scan is None and SCAN_FILE not in session.attachments():
@@ -127,10 +127,10 @@ def _surface(inputs: Inputs, dome: Dome) -> RefinedScan:
         raise InputsError(f"session {session.id}: holds no scan; {hint}")
     _require(dome)
     footprint = dome.pixel_mm
-    points = int(np.clip(FACE_MM2 / footprint**2, *POINT_LIMITS))
+    points = int(np.clip(FACE_AREA_MM2 / footprint**2, *POINT_LIMITS))
     mesh = session.attachment(SCAN_FILE) if inputs.scan is None else inputs.scan
-    scan = scan_mesh.prepare(mesh, points=points)
-    fit = register(dome, scan.coarse)
+    scan = scan_mesh.prepare_scan(mesh, points=points)
+    fit = register_mesh(dome, scan.coarse)
     inputs.noted["registration"] = {
         "rotation": fit.rotation.tolist(),
         "translation_mm": fit.translation_mm.tolist(),
@@ -140,10 +140,10 @@ def _surface(inputs: Inputs, dome: Dome) -> RefinedScan:
         "points": len(scan.points_mm),
         "pixel_mm": footprint,
     }
-    return scan.moved(fit.rotation, fit.translation_mm)
+    return scan.transform(fit.rotation, fit.translation_mm)
 
 
-def _require(dome: Dome) -> None:
+def _require(dome: CalibratedDome) -> None:
     """Refuse fewer views or lights than any point needs, and lights that lie in a plane."""
     views, lights = len(dome.cameras), int(np.count_nonzero(dome.lights.valid))
     check = Checks(InputsError)
@@ -152,7 +152,7 @@ def _require(dome: Dome) -> None:
     least = estimates.MIN_LIGHTS
     check.require(lights >= least, "lights", f"{lights} that can be used", f"at least {least}")
     place = dome.lights.position_mm[dome.lights.valid]
-    photometric_stereo.require_spread(unit_vectors(place))
+    photometric_stereo.require_noncoplanar(unit_vectors(place))
 
 
 def _texture(surface: RefinedScan) -> Mapping[str, Any]:
@@ -163,15 +163,17 @@ def _texture(surface: RefinedScan) -> Mapping[str, Any]:
     return {"texture": texture, "position": position, MESH_FILE: texture.wavefront()}
 
 
-def _motion(inputs: Inputs, dome: Dome, surface: RefinedScan) -> Motion | None:
-    images = dome.images.apart()
+def _motion(inputs: Inputs, dome: CalibratedDome, surface: RefinedScan) -> DomeHeadMotion | None:
+    images = dome.images.split_exposures()
     found = follow_head(inputs.session, images, dome.cameras, surface, dome.pixel_mm)
     # without tracking frames nobody knows whether the head held still
     inputs.noted["motion"] = {"tracking_frames": 0} if found is None else found.record()
     return found
 
 
-def _lumitexels(dome: Dome, surface: RefinedScan, motion: Motion | None) -> Samples:
+def _lumitexels(
+    dome: CalibratedDome, surface: RefinedScan, motion: DomeHeadMotion | None
+) -> SurfaceSampleStore:
     if motion is not None and motion.still:
         motion = None
     if motion is not None:
@@ -179,7 +181,7 @@ def _lumitexels(dome: Dome, surface: RefinedScan, motion: Motion | None) -> Samp
     count = len(surface.points_mm) * len(dome.cameras) * len(dome.images.captures)
     folder = tempfile.TemporaryDirectory(prefix="skinrig-") if 12 * count > MEMORY_BYTES else None
     store = LumitexelStore(
-        Surface(surface.points_mm, surface.normals),
+        SampledSurface(surface.points_mm, surface.normals),
         cameras=dome.cameras,
         lights=dome.lights,
         caster=RayCaster(surface.coarse.vertices_mm, surface.coarse.faces),
@@ -189,19 +191,19 @@ def _lumitexels(dome: Dome, surface: RefinedScan, motion: Motion | None) -> Samp
     )
     usable = dome.lights.valid if motion is None else dome.lights.valid & motion.usable
     for view in range(len(dome.cameras)):
-        dome.tell("lumitexels", view / len(dome.cameras))
+        dome.report_progress("lumitexels", view / len(dome.cameras))
         for capture in np.flatnonzero(usable).tolist():
             image = dome.image(view, capture)
             store.add(view, capture, image.rgb, image.variance, image.valid)
-    return Samples(store, folder, len(dome.table.names), dome.tell)
+    return SurfaceSampleStore(store, folder, len(dome.table.names), dome.report_progress)
 
 
-def _counts(lumitexels: Samples, texture: SurfaceTexture) -> SkinMap:
-    found = lumitexels.collect("sample counts", estimates.sample_counts)
+def _counts(lumitexels: SurfaceSampleStore, texture: SurfaceTexture) -> SkinMap:
+    found = lumitexels.collect("sample counts", estimates.count_samples)
     return texture.map(found.values[:, 0], None, found.valid, "1", "samples a point")
 
 
-def _half_vectors(lumitexels: Samples, texture: SurfaceTexture) -> SkinMap:
+def _half_vectors(lumitexels: SurfaceSampleStore, texture: SurfaceTexture) -> SkinMap:
     found = lumitexels.collect(
         "half-vector normals", lambda _, samples: estimates.normals_from_half_vectors(samples)
     )
@@ -209,20 +211,23 @@ def _half_vectors(lumitexels: Samples, texture: SurfaceTexture) -> SkinMap:
 
 
 def _normals(
-    dome: Dome, surface: RefinedScan, lumitexels: Samples, texture: SurfaceTexture
+    dome: CalibratedDome,
+    surface: RefinedScan,
+    lumitexels: SurfaceSampleStore,
+    texture: SurfaceTexture,
 ) -> Mapping[str, Any]:
     found = lumitexels.collect(
         "normals",
         lambda part, samples: estimates.normals_from_shading(samples, surface.normals[part]),
     )
-    found = surface_errors.of_normals(found, surface, dome.pixel_mm)
+    found = surface_errors.add_normal_errors(found, surface, dome.pixel_mm)
     return {"point_normals": found, "normals": texture.normals(found, "world frame")}
 
 
 def _albedo(
-    dome: Dome,
+    dome: CalibratedDome,
     surface: RefinedScan,
-    lumitexels: Samples,
+    lumitexels: SurfaceSampleStore,
     point_normals: PointValues,
     texture: SurfaceTexture,
 ) -> Mapping[str, Any]:
@@ -230,9 +235,11 @@ def _albedo(
     typical = float(np.median(point_normals.stderr[good, 0])) if good.any() else 0.02
     found = lumitexels.collect(
         "albedo",
-        lambda part, samples: estimates.albedo(samples, point_normals[part], stderr_rad=typical),
+        lambda part, samples: estimates.estimate_albedo(
+            samples, point_normals[part], stderr_rad=typical
+        ),
     )
-    found = surface_errors.of_albedo(found, point_normals, surface, dome.pixel_mm)
+    found = surface_errors.add_albedo_errors(found, point_normals, surface, dome.pixel_mm)
     what = "diffuse reflectance, camera RGB over that of a perfect white"
     r_d = texture.map(found.values, found.stderr, found.valid, "1", what)
     return {"point_r_d": found, "r_d": r_d}

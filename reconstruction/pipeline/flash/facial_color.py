@@ -20,21 +20,26 @@ from model.facial_color import HemoglobinRig
 from model.skin import MAP_UNITS, SkinMap
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import model_error
-from reconstruction.chromophores.pixel_checks import detectable
+from reconstruction.chromophores.pixel_checks import is_detectable
 from reconstruction.correspondence import expression_alignment
 from reconstruction.correspondence.expression_alignment import Alignment
 from reconstruction.facial_color import registration_error as misplacement
 from reconstruction.facial_color import repeat_average, repeatability, shared_melanin
-from reconstruction.facial_color.repeatability import Drift, Repeatability, RepeatabilityError
+from reconstruction.facial_color.repeatability import MapDrift, Repeatability, RepeatabilityError
 from reconstruction.facial_color.shared_melanin import SharedMelanin
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline.flash.stages import NOISE_STDERR, colors_of_skin, stderr_of
-from reconstruction.pipeline.flash.state_images import NEUTRAL, Landmarks, StateImage, Subject
+from reconstruction.pipeline.flash.stages import NOISE_STDERR_SUFFIX, load_skin_colors, map_stderr
+from reconstruction.pipeline.flash.state_images import (
+    NEUTRAL_STATE,
+    Landmarks,
+    StateImage,
+    SubjectImages,
+)
 from reconstruction.pipeline.masked_map import masked_map
 
 NOISE_CORRELATION_PX: Final = 3.0
 """Pixels whose noise goes together after demosaicing and interpolation."""
-RADIUS_SHARE: Final = 1 / 32
+RADIUS_FRACTION: Final = 1 / 32
 """Radius of the disc over the larger side of the map, where none is given."""
 
 
@@ -82,7 +87,7 @@ class Repeats:
     """
 
     hemoglobin: Repeatability
-    melanin_drift: tuple[Drift, ...]
+    melanin_drift: tuple[MapDrift, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +110,7 @@ class FacialColorFit:
         The joint inversion.
     repeats
         How far states repeat; None where none was captured twice.
-    left_out
+    omitted
         What was not used, and why.
     """
 
@@ -116,11 +121,11 @@ class FacialColorFit:
     aligned: tuple[AlignedImage, ...]
     shared: SharedMelanin
     repeats: Repeats | None
-    left_out: tuple[tuple[str, str], ...]
+    omitted: tuple[tuple[str, str], ...]
 
 
-def fit(
-    subject: Subject,
+def fit_facial_color(
+    subject: SubjectImages,
     *,
     radius_px: float | None = None,
     landmarks: Mapping[str, Landmarks] | None = None,
@@ -156,9 +161,9 @@ def fit(
     alone, expected = "the neutral state alone", "at least one other to make a rig of"
     Checks(FacialColorFitError).require(len(states) > 1, "sessions", alone, expected)
     tell = progress or (lambda _: None)
-    base = subject.of(NEUTRAL)[0]
+    base = subject.images_of_state(NEUTRAL_STATE)[0]
     shape = base.maps["diffuse"].values.shape[:2]
-    radius = max(shape) * RADIUS_SHARE if radius_px is None else radius_px
+    radius = max(shape) * RADIUS_FRACTION if radius_px is None else radius_px
     aligned, left_out = _align(subject, base, landmarks or {}, tell)
     of_state: dict[str, list[AlignedImage]] = {
         state: own
@@ -171,7 +176,7 @@ def fit(
     tell("one melanin for all states")
     shared = _one_melanin(subject, list(of_state.values()))
     blood = {state: _blood(shared, k) for k, state in enumerate(of_state)}
-    if not blood[NEUTRAL].mask.any():
+    if not blood[NEUTRAL_STATE].mask.any():
         raise UnknownBloodError(
             "blood at rest: expected pixels that tell it, got a standard error of more than half "
             "of it all over the face, as of very dark skin or little light; take more light, or "
@@ -182,44 +187,46 @@ def fit(
     known = {state: np.where(mask[state], blood[state].values, np.nan) for state in blood}
     noise = dict(zip(blood, shared.noise_stderr_hemoglobin, strict=True))
     rig = HemoglobinRig.from_maps(
-        known[NEUTRAL],
-        {state: values for state, values in known.items() if state != NEUTRAL},
+        known[NEUTRAL_STATE],
+        {state: values for state, values in known.items() if state != NEUTRAL_STATE},
         radius_px=radius,
         valid=mask,
         stderr={state: np.where(mask[state], noise[state], np.nan) for state in blood},
         stored_size=stored_size,
     )
-    good = detectable(shared.melanin, shared.stderr_melanin, shared.valid)
+    good = is_detectable(shared.melanin, shared.stderr_melanin, shared.valid)
     what = f"shared by {len(blood)} states"
     return FacialColorFit(
         rig=rig,
         melanin=masked_map(shared.melanin, shared.stderr_melanin, good, MAP_UNITS["melanin"], what),
         hemoglobin=blood,
-        changes={state: _change(shared, k) for k, state in enumerate(blood) if state != NEUTRAL},
+        changes={
+            state: _change(shared, k) for k, state in enumerate(blood) if state != NEUTRAL_STATE
+        },
         aligned=tuple(aligned),
         shared=shared,
         repeats=_repeats(aligned, timed=subject.timed),
-        left_out=tuple(left_out),
+        omitted=tuple(left_out),
     )
 
 
-def _one_melanin(subject: Subject, of_states: list[list[AlignedImage]]) -> SharedMelanin:
+def _one_melanin(subject: SubjectImages, of_states: list[list[AlignedImage]]) -> SharedMelanin:
     """Average the images of each state, and fit one melanin to all."""
 
     def average(images: list[AlignedImage]) -> tuple[Float32Array, Float32Array, BoolArray]:
         parts = zip(*((one.rgb, one.variance, one.valid) for one in images), strict=True)
-        return repeat_average.average(*map(np.stack, parts))
+        return repeat_average.average_repeats(*map(np.stack, parts))
 
     averages = [average(images) for images in of_states]
     rgb, variance, valid = (np.stack(parts) for parts in zip(*averages, strict=True))
-    table, prior = colors_of_skin(subject.camera, subject.illuminant, has_white=subject.has_white)
+    table, prior = load_skin_colors(subject.camera, subject.illuminant, has_white=subject.has_white)
     return shared_melanin.estimate_shared_melanin(
         rgb,
         table,
         prior=prior,
         variance=variance,
         model_error=_model_error(averages),
-        own_error=np.stack([_own_error(images) for images in of_states]),
+        state_covariance=np.stack([_own_error(images) for images in of_states]),
         valid=valid,
         shading_window_px=shared_melanin.SHADING_WINDOW_PX,
         one_face=subject.has_white,
@@ -227,10 +234,10 @@ def _one_melanin(subject: Subject, of_states: list[list[AlignedImage]]) -> Share
 
 
 def _align(
-    subject: Subject,
+    subject: SubjectImages,
     base: StateImage,
     landmarks: Mapping[str, Landmarks],
-    tell: Callable[[str], None],
+    report_progress: Callable[[str], None],
 ) -> tuple[list[AlignedImage], list[tuple[str, str]]]:
     """Lay every image over the first neutral one."""
     found: list[AlignedImage] = []
@@ -241,8 +248,8 @@ def _align(
         if image is base:
             found.append(_aligned(image, diffuse, None))
             continue
-        tell(f"lay {image.name} over the neutral image")
-        marks = landmarks.get(image.state), landmarks.get(NEUTRAL)
+        report_progress(f"lay {image.name} over the neutral image")
+        marks = landmarks.get(image.state), landmarks.get(NEUTRAL_STATE)
         both = marks[0] is not None and marks[1] is not None
         try:
             alignment = expression_alignment.align(
@@ -267,7 +274,7 @@ def _repeats(aligned: list[AlignedImage], *, timed: bool) -> Repeats | None:
         return None
 
     def laid(one: AlignedImage, name: str) -> tuple[Any, Any, Any]:
-        found, noise = one.image.maps[name], one.image.maps[name + NOISE_STDERR]
+        found, noise = one.image.maps[name], one.image.maps[name + NOISE_STDERR_SUFFIX]
         if one.alignment is None:
             return found.values, noise.values, found.mask
         values, good = one.alignment.warp(found.values, found.mask)
@@ -279,14 +286,14 @@ def _repeats(aligned: list[AlignedImage], *, timed: bool) -> Repeats | None:
         return dict(of_maps, states=states, correlated_px=NOISE_CORRELATION_PX)
 
     try:
-        compared = repeatability.compare(**over("hemoglobin"))
+        compared = repeatability.compare_states(**over("hemoglobin"))
     except RepeatabilityError:
         return None
-    drifts: tuple[Drift, ...] = ()
+    drifts: tuple[MapDrift, ...] = ()
     if timed:
         with suppress(RepeatabilityError):
             times_s = [one.image.captured_s for one in aligned]
-            drifts = repeatability.drift(times_s=times_s, **over("melanin"))
+            drifts = repeatability.fit_drift(times_s=times_s, **over("melanin"))
     return Repeats(compared, drifts)
 
 
@@ -299,7 +306,7 @@ def _aligned(image: StateImage, diffuse: SkinMap, alignment: Alignment | None) -
     return AlignedImage(
         image,
         np.where(good[..., None], diffuse.values, 0.0),
-        np.where(good[..., None], stderr_of(diffuse) ** 2, 0.0),
+        np.where(good[..., None], map_stderr(diffuse) ** 2, 0.0),
         good,
         alignment,
     )
@@ -311,10 +318,12 @@ def _model_error(averages: list[tuple[Float32Array, Float32Array, BoolArray]]) -
     count = np.zeros(averages[0][2].shape)
     for rgb, variance, valid in averages:
         good = model_error.usable_pixels(rgb, valid)
-        total += np.where(good[..., None, None], model_error.of_picture(rgb, variance, valid), 0.0)
+        total += np.where(
+            good[..., None, None], model_error.image_covariance(rgb, variance, valid), 0.0
+        )
         count += good
     mean = total / np.maximum(count, 1.0)[..., None, None]
-    return np.where((count > 0)[..., None, None], mean, model_error.color_errors().transport)
+    return np.where((count > 0)[..., None, None], mean, model_error.load_error_terms().transport)
 
 
 def _own_error(images: list[AlignedImage]) -> Float64Array:
@@ -338,16 +347,16 @@ def _own_error(images: list[AlignedImage]) -> Float64Array:
 
 
 def _blood(shared: SharedMelanin, k: int) -> SkinMap:
-    good = shared.valid_states[k] & ~shared.misfits[k]
+    good = shared.valid_states[k] & ~shared.is_misfit[k]
     blood, stderr = shared.hemoglobin[k], shared.stderr_hemoglobin[k]
-    good &= detectable(blood, stderr, good)
+    good &= is_detectable(blood, stderr, good)
     what = "given the melanin that all states share"
     return masked_map(blood, stderr, good, MAP_UNITS["hemoglobin"], what)
 
 
 def _change(shared: SharedMelanin, k: int) -> SkinMap:
     both = shared.valid_states[k] & shared.valid_states[shared.reference]
-    good = both & ~shared.misfits[k] & np.isfinite(shared.stderr_change[k])
+    good = both & ~shared.is_misfit[k] & np.isfinite(shared.stderr_change[k])
     what = "less the neutral state; errors that both share are left out"
     change, stderr = shared.change[k], shared.stderr_change[k]
     return masked_map(change, stderr, good, MAP_UNITS["hemoglobin"], what)
@@ -361,7 +370,7 @@ def alignment_document(fit: FacialColorFit) -> list[dict[str, Any]]:
             continue
         error = found.error_px[found.valid]
         rows.append(
-            stages.attributes_of(one.image, "state repeat session")
+            stages.select_attributes(one.image, "state repeat session")
             | {
                 "by": found.by,
                 "landmark_rms_px": _number(found.landmark_rms_px),
@@ -388,7 +397,7 @@ def repeats_document(fit: FacialColorFit) -> dict[str, Any] | None:
     def rows(found: Sequence[Any], names: str) -> list[dict[str, Any]]:
         return [
             {"region": one.name}
-            | {name: _number(value) for name, value in stages.attributes_of(one, names).items()}
+            | {name: _number(value) for name, value in stages.select_attributes(one, names).items()}
             for one in found
         ]
 

@@ -32,7 +32,7 @@ CURVES_FILE = "perfusion_curves.json"
 MAP_NAMES = (*flash_stages.MAP_NAMES, CURVES_NAME)
 """What can be made of a flash session."""
 FILE_NAMES = (CURVES_FILE,)
-RADIUS_SHARE = 0.02
+RADIUS_FRACTION = 0.02
 """Radius of a place's disc, of the map's width: 5 mm of a face that fills the picture."""
 LANDMARK_ALIASES = {"cheek": "cheek left", "nose": "nose tip", "temple": "temple left"}
 """Landmarks that stand for a place where a table does not have the place itself."""
@@ -50,7 +50,7 @@ def products(session: Session) -> Mapping[str, tuple[str, ...]]:
     return {CURVES_NAME: (CURVES_FILE,)}
 
 
-def graph(inputs: Inputs) -> list[stages.Stage]:
+def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     """Return the stages that a flash session can go through; see `stages.run`."""
     session = inputs.session
     crossed = session.frames("subject", polarizer="crossed")
@@ -62,7 +62,7 @@ def graph(inputs: Inputs) -> list[stages.Stage]:
         refused = ""
     of_images = flash_stages.graph(inputs)
     stage = inputs.stage_maker(STAGE_REVISION)
-    curves, identity = partial(_curves, inputs), model_error.identity()
+    curves, identity = partial(_curves, inputs), model_error.data_hash()
     return [*of_images, stage(CURVES_NAME, "", CURVES_FILE, curves, refused, **identity)]
 
 
@@ -70,8 +70,8 @@ def _curves(inputs: Inputs) -> bytes:
     """Return the document of a sequence's curves."""
     session = inputs.session
     records = session.frames("subject", polarizer="crossed")
-    rig = flash_stages.rig_of(inputs)
-    maps = list(flash_stages.diffuse_of_each(rig, records))
+    rig = flash_stages.load_flash_rig(inputs)
+    maps = list(flash_stages.separate_each(rig, records))
     actual = [record.line.actual for record in records]
     time = np.array([float(a.get("time_s", np.nan)) for a in actual])
     phase = np.array([float(a.get("phase_s", np.nan)) for a in actual])
@@ -80,11 +80,11 @@ def _curves(inputs: Inputs) -> bytes:
     moved, warped = np.zeros(len(maps), bool), maps
     if prompt_s > 0:
         phase = phase % (2 * prompt_s)
-        moved, warped = _laid_over_rest(maps, phase, prompt_s, inputs)
+        moved, warped = _align_to_rest(maps, phase, prompt_s, inputs)
     places = _places(inputs, maps, ~moved)
-    radius_px = RADIUS_SHARE * maps[0].values.shape[1]
-    light = sequence_blood.Light.of(rig)
-    blood = sequence_blood.blood_of_discs(warped, places, radius_px, light, moved=moved)
+    radius_px = RADIUS_FRACTION * maps[0].values.shape[1]
+    light = sequence_blood.SkinColorModel.of(rig)
+    blood = sequence_blood.average_disc_blood(warped, places, radius_px, light, moved=moved)
     means = blood.means
     if not means.valid.any():
         hint = "check the landmarks" if rig.white else "give it a calibration of white"
@@ -111,10 +111,10 @@ def _curves(inputs: Inputs) -> bytes:
         },
     }
     if prompt_s > 0:
-        document |= _of_cycle(time, phase, blood, prompt_s, session, list(places))
+        document |= _cycle_document(time, phase, blood, prompt_s, session, list(places))
     else:
-        document |= _of_event(time, means, list(places))
-    return stages.document_bytes(document)
+        document |= _event_document(time, means, list(places))
+    return stages.serialize_document(document)
 
 
 def _state(records: Sequence[FrameRecord]) -> str:
@@ -131,8 +131,8 @@ def _places(
     if inputs.landmarks is None:
         outline = "places: by the face's outline; a table of landmarks says where they are"
         inputs.assumed.append(outline)
-        return perfusion_curves.usual_places(skin)
-    table, names = landmark_table.read(inputs.landmarks), perfusion_curves.FACE_PLACES
+        return perfusion_curves.standard_positions(skin)
+    table, names = landmark_table.read_landmark_table(inputs.landmarks), perfusion_curves.FACE_SITES
     named = {name: name if name in table else LANDMARK_ALIASES.get(name, name) for name in names}
     found = {name: table[place] for name, place in named.items() if place in table}
     got = ", ".join(table) or "nothing"
@@ -141,7 +141,7 @@ def _places(
     return found
 
 
-def _laid_over_rest(
+def _align_to_rest(
     maps: Sequence[SkinMap], phase: Float64Array, prompt_s: float, inputs: Inputs
 ) -> tuple[BoolArray, list[SkinMap]]:
     """Tell in which frames the face has moved, and lay those over the face at rest."""
@@ -164,7 +164,7 @@ def _laid_over_rest(
     if not alignment.valid.any() or np.median(shift[alignment.valid]) < MAX_STILL_MOTION_PX:
         return still, list(maps)
     both = on_valid & off_valid
-    moved = np.array([_more_like(m, on, off, both) for m in maps])
+    moved = np.array([_is_more_similar(m, on, off, both) for m in maps])
     # all moved frames are laid by one alignment: what it is off by is no noise from frame to frame,
     # but part of the step between poses
     laid = [alignment.warp_map(m) if is_on else m for m, is_on in zip(maps, moved, strict=True)]
@@ -178,7 +178,9 @@ def _mean(maps: Sequence[SkinMap], chosen: BoolArray) -> tuple[Float32Array, Boo
     return mean, np.asarray(valid, bool)
 
 
-def _more_like(image: SkinMap, one: Float32Array, other: Float32Array, both: BoolArray) -> bool:
+def _is_more_similar(
+    image: SkinMap, one: Float32Array, other: Float32Array, both: BoolArray
+) -> bool:
     """Tell whether a frame is more like one picture than like another, in red: blood's least."""
     good = both & image.mask
     if not good.any():
@@ -191,10 +193,10 @@ def _more_like(image: SkinMap, one: Float32Array, other: Float32Array, both: Boo
     return distance(one) < distance(other)
 
 
-def _of_cycle(
+def _cycle_document(
     time: Float64Array,
     phase: Float64Array,
-    blood: sequence_blood.PlaceBlood,
+    blood: sequence_blood.SiteBlood,
     prompt_s: float,
     session: Session,
     names: Sequence[str],
@@ -202,7 +204,7 @@ def _of_cycle(
     """Return the part of the document about a prompted cycle."""
     cycle_s = 2 * prompt_s
     known = np.isfinite(phase)
-    groups = perfusion_curves.same_phase(phase[known], cycle_s=cycle_s)
+    groups = perfusion_curves.group_by_phase(phase[known], cycle_s=cycle_s)
     ordered = np.sort(phase[known])
     gaps = np.diff(ordered, append=ordered[0] + cycle_s)
     grid = phase_grid(prompt_s, float(session.plan.limits["shot_period_s"]))
@@ -213,19 +215,19 @@ def _of_cycle(
     for k in usable:
         value, stderr = values[k]
         good = np.isfinite(value)
-        fits[names[k]] = _of_fit(_fit_prompts(phase[known], known, blood, [k], cycle_s), 0)
-        seen[names[k]] = _of_transition(
-            perfusion_curves.transition(
+        fits[names[k]] = _fit_document(_fit_prompts(phase[known], known, blood, [k], cycle_s), 0)
+        seen[names[k]] = _transition_document(
+            perfusion_curves.find_transition(
                 phase[known][good], value[good], cycle_s=cycle_s, stderr=stderr[good]
             ),
             np.flatnonzero(known)[good],
         )
-        again[names[k]] = perfusion_curves.reproducibility(
+        again[names[k]] = perfusion_curves.estimate_reproducibility(
             time[known][good], phase[known][good], value[good], cycle_s=cycle_s
         )
     of_all = None
     if usable:
-        of_all = _of_fit(_fit_prompts(phase[known], known, blood, usable, cycle_s), None)
+        of_all = _fit_document(_fit_prompts(phase[known], known, blood, usable, cycle_s), None)
     return {
         "cycle_s": cycle_s,
         "order": np.flatnonzero(known)[np.argsort(phase[known], kind="stable")],
@@ -234,7 +236,7 @@ def _of_cycle(
             "distinct": int(np.unique(groups).size),
             "interval_s": float(grid.interval_s),
             "largest_gap_s": float(gaps.max()),
-            "aliased": grid.aliased,
+            "aliased": grid.is_aliased,
         },
         "reproducibility": {name: asdict(one) for name, one in again.items()},
         "transition": seen,
@@ -246,7 +248,7 @@ def _of_cycle(
 def _fit_prompts(
     phase: Float64Array,
     known: BoolArray,
-    blood: sequence_blood.PlaceBlood,
+    blood: sequence_blood.SiteBlood,
     which: Sequence[int],
     cycle_s: float,
 ) -> perfusion_fit.RelaxationFit:
@@ -254,7 +256,7 @@ def _fit_prompts(
     means = blood.means.mean[which][:, known]
     root = np.sqrt(np.where(means > 0.0, means, np.nan))
     slope = 0.5 / root  # of the root over blood
-    stderr = np.array([_not_too_small(row) for row in blood.means.stderr[which][:, known] * slope])
+    stderr = np.array([_floor_stderr(row) for row in blood.means.stderr[which][:, known] * slope])
     of_pose = blood.stderr_of_pose[which] * np.nanmean(slope, axis=1)
     found = perfusion_fit.fit_cycle(
         phase,
@@ -264,17 +266,17 @@ def _fit_prompts(
         bend=BLOOD_CURVE_STDERR,
         pose=PoseStep(blood.moved[known], of_pose),
     )
-    return perfusion_fit.of_vessels(found)
+    return perfusion_fit.square_levels(found)
 
 
-def _not_too_small(stderr: Float64Array) -> Float64Array:
+def _floor_stderr(stderr: Float64Array) -> Float64Array:
     """Return standard errors that count no frame for much more than the usual one."""
     finite = stderr[np.isfinite(stderr)]
     usual = float(np.median(finite)) if finite.size else 0.0
     return np.asarray(np.hypot(stderr, usual))
 
 
-def _of_event(
+def _event_document(
     time: Float64Array, means: perfusion_curves.DiscMeans, names: Sequence[str]
 ) -> dict[str, Any]:
     """Return the part of the document about what follows an event."""
@@ -285,22 +287,22 @@ def _of_event(
 
     def fit(which: Any) -> perfusion_fit.RelaxationFit:
         found = perfusion_fit.fit_course(at, radius[which][..., known], bend=BLOOD_CURVE_STDERR)
-        return perfusion_fit.of_vessels(found)
+        return perfusion_fit.square_levels(found)
 
-    fits = {names[k]: _of_fit(fit(k), 0) for k in usable}
+    fits = {names[k]: _fit_document(fit(k), 0) for k in usable}
     before = {names[k]: float(np.nanmean(means.mean[k][~known])) for k in usable if (~known).any()}
-    of_all = _of_fit(fit(usable), None) if usable else None
+    of_all = _fit_document(fit(usable), None) if usable else None
     return {"before": before, "fits": fits, "fit_of_all": of_all}
 
 
-def _of_fit(fit: perfusion_fit.RelaxationFit, curve: int | None) -> dict[str, Any]:
+def _fit_document(fit: perfusion_fit.RelaxationFit, curve: int | None) -> dict[str, Any]:
     """Return a fit's document, and how many standard errors its levels lie apart."""
     names = "time_constant_s stderr_time_constant_s interval_s interval_68_s known delay_s"
-    document = stages.attributes_of(fit, f"{names} stderr_delay_s delay_interval_s")
+    document = stages.select_attributes(fit, f"{names} stderr_delay_s delay_interval_s")
     document["text"] = str(fit)
     if curve is not None:
         names = "start end stderr_start stderr_end stderr_change step stderr_step noise"
-        of_curves = stages.attributes_of(fit, names)
+        of_curves = stages.select_attributes(fit, names)
         titles = {"step": "step_of_pose", "stderr_step": "stderr_step_of_pose"}
         document |= {titles.get(name, name): all_[curve] for name, all_ in of_curves.items()}
         apart = abs(float(fit.end[curve] - fit.start[curve]))
@@ -308,6 +310,6 @@ def _of_fit(fit: perfusion_fit.RelaxationFit, curve: int | None) -> dict[str, An
     return document
 
 
-def _of_transition(found: perfusion_curves.Transition, indices: Int64Array) -> dict[str, Any]:
-    document = stages.attributes_of(found, "seen decided") | {"frames": indices[found.where]}
-    return document | stages.attributes_of(found, "tested false_alarm power high low noise")
+def _transition_document(found: perfusion_curves.Transition, indices: Int64Array) -> dict[str, Any]:
+    document = stages.select_attributes(found, "seen decided") | {"frames": indices[found.where]}
+    return document | stages.select_attributes(found, "tested false_alarm power high low noise")

@@ -20,12 +20,12 @@ from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.chromophores import model_error
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.facial_color import shared_melanin
-from reconstruction.facial_color.perfusion_curves import DiscMeans, disc_means, disc_pixels
+from reconstruction.facial_color.perfusion_curves import DiscMeans, average_discs, disc_pixels
 from reconstruction.pipeline.flash import stages as flash_stages
 
 LIGHT_RADII, LEAST_LIGHT_PX = 3.0, 6.0
 """How smoothly the light of a place changes between frames: in radii of its disc, and px."""
-POSE_SHARE = 0.10
+POSE_STDERR_FRACTION = 0.10
 """Standard error, beside noise, of the blood of a moved face against that at rest, of the blood:
 light, shadows and what lies under a pixel change with the pose. Most likely of the cheeks, where
 the expression moves skin most, of 19 smiles of seeds 0 to 18, 192 px across; of noses 0.03, of
@@ -35,7 +35,7 @@ MIN_VALID_FRAME_FRACTION = 0.9
 
 
 @dataclass(frozen=True, slots=True)
-class Light:
+class SkinColorModel:
     """What colors of skin are compared with."""
 
     table: ColorTable
@@ -44,15 +44,15 @@ class Light:
     """Relative covariance of the table's colors."""
 
     @staticmethod
-    def of(rig: flash_stages.FlashRig) -> Light:
+    def of(rig: flash_stages.FlashRig) -> SkinColorModel:
         """Return that of a session."""
         has_white = rig.white is not None
-        colors = flash_stages.colors_of_skin(rig.camera, rig.illuminant, has_white=has_white)
-        return Light(*colors, np.asarray(model_error.load()))
+        colors = flash_stages.load_skin_colors(rig.camera, rig.illuminant, has_white=has_white)
+        return SkinColorModel(*colors, np.asarray(model_error.load_covariance()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PlaceBlood:
+class SiteBlood:
     """Blood of P places in N frames."""
 
     means: DiscMeans
@@ -64,14 +64,14 @@ class PlaceBlood:
     """(N,): frames in which the face has moved."""
 
 
-def blood_of_discs(
+def average_disc_blood(
     maps: Sequence[SkinMap],
-    places: Mapping[str, tuple[float, float]],
+    positions: Mapping[str, tuple[float, float]],
     radius_px: float,
-    light: Light,
+    light: SkinColorModel,
     *,
     moved: BoolArray,
-) -> PlaceBlood:
+) -> SiteBlood:
     """Return the mean blood of discs in each of some frames.
 
     Parameters
@@ -88,11 +88,11 @@ def blood_of_discs(
         (N,): frames in which the face has moved.
     """
     found = [
-        _of_place(maps, name, place, radius_px, light, moved) for name, place in places.items()
+        _of_place(maps, name, place, radius_px, light, moved) for name, place in positions.items()
     ]
     parts = zip(*((one.mean, one.stderr, one.pixels) for one, _ in found), strict=True)
     joined = DiscMeans(*map(np.concatenate, parts))
-    return PlaceBlood(joined, np.array([of_pose for _, of_pose in found]), moved)
+    return SiteBlood(joined, np.array([of_pose for _, of_pose in found]), moved)
 
 
 def _of_place(
@@ -100,7 +100,7 @@ def _of_place(
     name: str,
     place: tuple[float, float],
     radius_px: float,
-    light: Light,
+    light: SkinColorModel,
     moved: BoolArray,
 ) -> tuple[DiscMeans, float]:
     shape = maps[0].values.shape[:2]
@@ -111,7 +111,7 @@ def _of_place(
     patch = np.s_[top:bottom, left:right]
     valid = np.array([m.mask[patch] for m in maps])
     rgb = np.array([m.values[patch] for m in maps])
-    variance = np.square([flash_stages.stderr_of(m)[patch] for m in maps])
+    variance = np.square([flash_stages.map_stderr(m)[patch] for m in maps])
     at = {name: (place[0] - left, place[1] - top)}
 
     def weighed(frames: BoolArray, smooth_px: float | None) -> DiscMeans:
@@ -124,10 +124,10 @@ def _of_place(
             valid=valid[frames],
             shading_window_px=smooth_px,
         )
-        good = blood.valid_states & ~blood.misfits & np.isfinite(blood.hemoglobin)
+        good = blood.valid_states & ~blood.is_misfit & np.isfinite(blood.hemoglobin)
         # a pixel counts in nearly all frames or in none: who is in it would change the mean
         good &= good.mean(axis=0) >= MIN_VALID_FRAME_FRACTION
-        return disc_means(
+        return average_discs(
             blood.hemoglobin, at, radius_px, stderr=blood.noise_stderr_hemoglobin, valid=good
         )
 
@@ -151,5 +151,5 @@ def _of_place(
     found = DiscMeans(mean[None], stderr[None], counted[None])
     if len(variances) < 2:  # one pose alone: nothing to be joined
         return found, 0.0
-    of_light = POSE_SHARE * float(np.nanmean(mean))
+    of_light = POSE_STDERR_FRACTION * float(np.nanmean(mean))
     return found, float(np.sqrt(np.sum(variances) + of_light**2))

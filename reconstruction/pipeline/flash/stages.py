@@ -27,7 +27,7 @@ from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import dark_spots, model_error, shading_prior, tsumura
 from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.chromophores.face import estimate_face
-from reconstruction.chromophores.pixel_checks import detectable
+from reconstruction.chromophores.pixel_checks import is_detectable
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.inputs import Inputs, InputsError
@@ -44,7 +44,7 @@ MAP_NAMES = tuple(
 
 
 @dataclass(frozen=True, slots=True)
-class Image:
+class FlashImage:
     """Linear light on superpixels: rgb and variance (H, W, 3), valid (H, W)."""
 
     rgb: Float32Array
@@ -78,13 +78,13 @@ class FlashRig:
         return "photographs" in self.session.manifest.extra
 
 
-def graph(inputs: Inputs) -> list[stages.Stage]:
+def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     """Return the stages that a flash session can go through; see `stages.run`."""
-    rig = rig_of(inputs)
+    rig = load_flash_rig(inputs)
     stage = inputs.stage_maker(STAGE_REVISION)
     table = {"camera": rig.camera, "illuminant": rig.illuminant}
     which = {"state": inputs.state, "repeat": inputs.repeat}
-    by_color = table | model_error.identity()
+    by_color = table | model_error.data_hash()
     of_skin = "melanin hemoglobin shading residual gamut_distance"
     of_skin += " melanin_noise_stderr hemoglobin_noise_stderr"
     both, shown = "diffuse specular", "picture specular_picture"
@@ -97,7 +97,7 @@ def graph(inputs: Inputs) -> list[stages.Stage]:
     ]
 
 
-def rig_of(inputs: Inputs) -> FlashRig:
+def load_flash_rig(inputs: Inputs) -> FlashRig:
     """Return what the stages of a flash session read, and note what is assumed."""
     session = inputs.session
     shots = session.frames("subject", state=inputs.state)
@@ -127,7 +127,7 @@ def rig_of(inputs: Inputs) -> FlashRig:
     )
 
 
-def colors_of_skin(
+def load_skin_colors(
     camera: str, illuminant: str, *, has_white: bool
 ) -> tuple[ColorTable, ShadingPrior]:
     """Return what colors of skin are compared with: the table, and how bright pixels may be.
@@ -140,15 +140,15 @@ def colors_of_skin(
         Whether a white tile says how long was exposed.
     """
     table = color_table.build(camera, illuminant, anisotropy=ANISOTROPY_SKIN)
-    prior = shading_prior.of_faces()
-    return table, prior if has_white else prior.broadened(EXPOSURE_SPREAD)
+    prior = shading_prior.face_prior()
+    return table, prior if has_white else prior.broaden(EXPOSURE_LOG_SD)
 
 
 def _frames(rig: FlashRig) -> Mapping[str, Any]:
     """Average the repeats of each polarizer state and subtract the darks."""
     session, state, repeat = rig.session, rig.inputs.state, rig.inputs.repeat
     mean_image = _image_reader(rig)
-    images: dict[str, Image | None] = {}
+    images: dict[str, FlashImage | None] = {}
     for polarizer in ("parallel", "crossed"):
         which: dict[str, str | int | float] = {"state": state, "polarizer": polarizer}
         if repeat is not None:
@@ -167,7 +167,7 @@ def _frames(rig: FlashRig) -> Mapping[str, Any]:
     return images
 
 
-def _image_reader(rig: FlashRig) -> Callable[[Sequence[FrameRecord]], Image]:
+def _image_reader(rig: FlashRig) -> Callable[[Sequence[FrameRecord]], FlashImage]:
     """Return what averages frames of one polarizer state and subtracts the darks."""
     session = rig.session
     # the cells of an imported picture are its pixels; a sensor's sites stand beside each other
@@ -187,7 +187,7 @@ def _image_reader(rig: FlashRig) -> Callable[[Sequence[FrameRecord]], Image]:
     dark = total(darks, "rgb") / count
     dark_variance = total(darks, "variance") / count / count
 
-    def mean_image(records: Sequence[FrameRecord]) -> Image:
+    def mean_image(records: Sequence[FrameRecord]) -> FlashImage:
         linear = linear_light(records)
         sizes, name = {image.rgb.shape for image in linear}, f"{records[0].index['polarizer']}"
         expected = "one camera setting"
@@ -195,7 +195,7 @@ def _image_reader(rig: FlashRig) -> Callable[[Sequence[FrameRecord]], Image]:
         power = sum(float(record.settings.get("power", 1.0)) for record in records)
         rgb = total(linear, "rgb") - len(linear) * dark
         variance = total(linear, "variance") + len(linear) ** 2 * dark_variance
-        return Image(
+        return FlashImage(
             (rgb / power).astype(np.float32),
             (variance / power**2).astype(np.float32),
             np.logical_and.reduce([image.valid for image in linear]),
@@ -204,7 +204,7 @@ def _image_reader(rig: FlashRig) -> Callable[[Sequence[FrameRecord]], Image]:
     return mean_image
 
 
-def diffuse_of_each(rig: FlashRig, records: Sequence[FrameRecord]) -> Iterator[SkinMap]:
+def separate_each(rig: FlashRig, records: Sequence[FrameRecord]) -> Iterator[SkinMap]:
     """Yield the diffuse reflectance that each of some crossed frames shows alone."""
     mean_image = _image_reader(rig)
     for record in records:
@@ -223,10 +223,12 @@ def _noise(sensor: SensorCalibration | None) -> tuple[float, float] | tuple[None
     return gain, float(np.hypot(read, gain * np.sqrt(QUANTIZATION_DN2)))
 
 
-def _separate(rig: FlashRig, parallel: Image | None, crossed: Image) -> Mapping[str, SkinMap]:
+def _separate(
+    rig: FlashRig, parallel: FlashImage | None, crossed: FlashImage
+) -> Mapping[str, SkinMap]:
     """Split into diffuse and specular light, relative to a white tile in the same place."""
     white = rig.white
-    diffuse = Image(2 * crossed.rgb, 4 * crossed.variance, crossed.valid)
+    diffuse = FlashImage(2 * crossed.rgb, 4 * crossed.variance, crossed.valid)
     specular = specular_error = np.zeros_like(crossed.rgb)
     specular_valid = np.zeros(crossed.valid.shape, bool)
     if parallel is not None:
@@ -246,7 +248,7 @@ def _separate(rig: FlashRig, parallel: Image | None, crossed: Image) -> Mapping[
         alone = (crossed.valid & ~specular_valid)[..., None]
         rgb = np.where(alone, diffuse.rgb, separated.diffuse)
         variance = np.where(alone, diffuse.variance, np.square(separated.stderr))
-        diffuse = Image(rgb, variance, crossed.valid)
+        diffuse = FlashImage(rgb, variance, crossed.valid)
     if white is not None:
         reflectance, variance, valid = white.balance(diffuse.rgb, variance=diffuse.variance)
         level = white.signal
@@ -265,16 +267,16 @@ def _separate(rig: FlashRig, parallel: Image | None, crossed: Image) -> Mapping[
 
 MIN_SIGNAL_SIGMAS = 5.0
 """Signal over noise below which a pixel is background, not skin."""
-ASSUMED_WHITE = 0.8
+ASSUMED_WHITE_LEVEL = 0.8
 """Share of the range that a white tile is taken to fill when no white reference is at hand."""
 
 
 def _assumed_white(rig: FlashRig) -> Float32Array:
     record = rig.session.frames("subject", state=rig.inputs.state)[0]
     neutral = rig.session.read(record).neutral
-    level = np.full(3, ASSUMED_WHITE)
+    level = np.full(3, ASSUMED_WHITE_LEVEL)
     if neutral is not None:
-        level = ASSUMED_WHITE * np.asarray(neutral, float) / max(neutral)
+        level = ASSUMED_WHITE_LEVEL * np.asarray(neutral, float) / max(neutral)
     return level.astype(np.float32)
 
 
@@ -285,17 +287,17 @@ def _map3(
     return masked_map(values, stderr, good, "1", f"camera RGB, {description}")
 
 
-def stderr_of(skin_map: SkinMap) -> Float32Array:
+def map_stderr(skin_map: SkinMap) -> Float32Array:
     """Return a map's standard error; 0 where it has none."""
     return np.zeros_like(skin_map.values) if skin_map.stderr is None else skin_map.stderr
 
 
 def _chromophores(rig: FlashRig, diffuse: SkinMap) -> Mapping[str, SkinMap]:
     has_white = rig.white is not None
-    table, prior = colors_of_skin(rig.camera, rig.illuminant, has_white=has_white)
+    table, prior = load_skin_colors(rig.camera, rig.illuminant, has_white=has_white)
     rgb = np.where(diffuse.mask[..., None], diffuse.values, np.nan)
-    variance = np.square(stderr_of(diffuse))
-    errors = model_error.of_picture(diffuse.values, variance, diffuse.mask)
+    variance = np.square(map_stderr(diffuse))
+    errors = model_error.image_covariance(diffuse.values, variance, diffuse.mask)
     whole = estimate_face(
         rgb, table, prior=prior, variance=variance, model_error=errors, has_white=has_white
     )
@@ -313,13 +315,13 @@ def _chromophores(rig: FlashRig, diffuse: SkinMap) -> Mapping[str, SkinMap]:
         noise = getattr(noise_alone, error)
         # spots are wide on purpose; they say nothing of what is known of the skin around them
         usual, usual_error = getattr(by_face, name), getattr(by_face, error)
-        good = detectable(usual, usual_error, usable & np.isfinite(noise))
+        good = is_detectable(usual, usual_error, usable & np.isfinite(noise))
         values, stderr = getattr(found, name), getattr(found, error)
         why = "invalid where noise and model error leave it unknown"
         alone = "standard error that noise alone would leave, without model error"
         return {
             name: masked_map(values, stderr, good, unit, why),
-            name + NOISE_STDERR: masked_map(noise, None, good, unit, alone),
+            name + NOISE_STDERR_SUFFIX: masked_map(noise, None, good, unit, alone),
         }
 
     what = "how far the color lies outside the model's, relative"
@@ -332,9 +334,9 @@ def _chromophores(rig: FlashRig, diffuse: SkinMap) -> Mapping[str, SkinMap]:
     }
 
 
-NOISE_STDERR = "_noise_stderr"
+NOISE_STDERR_SUFFIX = "_noise_stderr"
 """Ending of the maps of the standard errors that noise alone would leave."""
-EXPOSURE_SPREAD = 1.0
+EXPOSURE_LOG_SD = 1.0
 """Spread of log exposure when no white tile was captured and the exposure is not known."""
 
 

@@ -13,13 +13,13 @@ from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.flash import stages as flash_stages
 from reconstruction.pipeline.inputs import Inputs, InputsError
 
-NEUTRAL = "neutral"
+NEUTRAL_STATE = "neutral"
 SINGLE_MAPS = ("diffuse",)
 CHROMOPHORE_NAMES = ("melanin", "hemoglobin")
 REPEATED_MAPS = (
     *SINGLE_MAPS,
     *CHROMOPHORE_NAMES,
-    *(name + flash_stages.NOISE_STDERR for name in CHROMOPHORE_NAMES),
+    *(name + flash_stages.NOISE_STDERR_SUFFIX for name in CHROMOPHORE_NAMES),
 )
 """Where states are repeated each image's own chromophores tell how far they repeat."""
 
@@ -58,7 +58,7 @@ class StateImage:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Subject:
+class SubjectImages:
     """All that was captured of one subject.
 
     Attributes
@@ -96,19 +96,19 @@ class Subject:
     def states(self) -> tuple[str, ...]:
         """Names of the states, neutral first."""
         names = list(dict.fromkeys(image.state for image in self.images))
-        return (NEUTRAL, *(name for name in names if name != NEUTRAL))
+        return (NEUTRAL_STATE, *(name for name in names if name != NEUTRAL_STATE))
 
-    def of(self, state: str) -> list[StateImage]:
+    def images_of_state(self, state: str) -> list[StateImage]:
         """Return a state's images."""
         return [image for image in self.images if image.state == state]
 
 
-def read(
+def reconstruct_states(
     sessions: Sequence[Path],
     *,
     calibration: Path | None,
     progress: Callable[[str], None] | None = None,
-) -> Subject:
+) -> SubjectImages:
     """Reconstruct every state and repeat of flash sessions.
 
     Parameters
@@ -137,8 +137,11 @@ def read(
     pairs = [_pairs(session, path) for path, session in zip(sessions, opened, strict=True)]
     named = [state for group in pairs for state, _, _ in group]
     # told before minutes are spent on images
-    shown, expected = ", ".join(sorted(set(named))), f"{NEUTRAL!r}, which others are laid over"
-    check.require(NEUTRAL in named, "states of sessions", shown, expected)
+    shown, expected = (
+        ", ".join(sorted(set(named))),
+        f"{NEUTRAL_STATE!r}, which others are laid over",
+    )
+    check.require(NEUTRAL_STATE in named, "states of sessions", shown, expected)
     maps = REPEATED_MAPS if len(set(named)) < len(named) else SINGLE_MAPS
     for number, (path, session) in enumerate(zip(sessions, opened, strict=True)):
         began_s = (session.manifest.created_at - start).total_seconds()
@@ -147,7 +150,7 @@ def read(
                 progress(f"{path.name}: {state}, repeat {repeat}")
             inputs = Inputs.of(session, calibration, state=state)
             inputs.repeat = repeat
-            found = stages.run(flash_stages.graph(inputs), list(maps)).products
+            found = stages.run_stages(flash_stages.graph(inputs), list(maps)).products
             kept = MappingProxyType(dict(found))
             images.append(StateImage(state, repeat, number, began_s + since_s, kept))
             hashes = dict(inputs.hashes)
@@ -162,7 +165,7 @@ def read(
     check.require(len(shapes) == 1, "sessions", f"images of sizes {sorted(shapes)}", "one size")
     ((camera, illuminant),) = table
     simulated = any(session.source == "simulated" for session in opened)
-    return Subject(
+    return SubjectImages(
         images=tuple(sorted(images, key=lambda image: image.captured_s)),
         inputs=read_hashes,
         assumed=tuple(assumed),

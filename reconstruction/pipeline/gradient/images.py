@@ -12,7 +12,7 @@ from capture.plan.gradient import state_name
 from capture.session import FrameRecord, Session
 from reconstruction.arrays import BoolArray, Float32Array
 from reconstruction.pipeline.inputs import InputsError
-from reconstruction.pipeline.sensor_noise import SensorNoise
+from reconstruction.pipeline.sensor_noise import ElectronNoise
 
 Key = tuple[str, str]
 
@@ -38,7 +38,7 @@ class SkinState:
 
 
 @dataclass(frozen=True, slots=True)
-class Patterns:
+class StatePatterns:
     """The pictures of one state.
 
     Attributes
@@ -94,7 +94,7 @@ class GradientImages:
         When the session holds no such frames, or no neutral state to compare with.
     """
 
-    def __init__(self, session: Session, *, noise: SensorNoise | None = None) -> None:
+    def __init__(self, session: Session, *, noise: ElectronNoise | None = None) -> None:
         self._session = session
         self._noise = noise
         self._records: dict[str, dict[Key, list[FrameRecord]]] = {}
@@ -127,7 +127,7 @@ class GradientImages:
         """The first neutral state, which all strain is told against."""
         return self.states[0]
 
-    def of(self, state: SkinState) -> Patterns:
+    def of(self, state: SkinState) -> StatePatterns:
         """Return the pictures of a state.
 
         Frames of one pattern are averaged.
@@ -154,7 +154,7 @@ class GradientImages:
                 raise InputsError(f"state {state.name}: its frames differ in size")
         if valid is None:
             raise InputsError(f"state {state.name}: has no lit picture")
-        return Patterns(values, variance, valid)
+        return StatePatterns(values, variance, valid)
 
     def _mean(self, records: Sequence[FrameRecord]) -> tuple[Float32Array, Float32Array, BoolArray]:
         if not records:

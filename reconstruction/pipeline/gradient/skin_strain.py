@@ -47,12 +47,12 @@ class StateStrain:
     @property
     def stretch_s(self) -> tuple[float, float]:
         """Stretch ratio along the jaws, and its standard error."""
-        return self.strain.along(self.state.angle_rad)
+        return self.strain.stretch_along(self.state.angle_rad)
 
     @property
     def stretch_t(self) -> tuple[float, float]:
         """Stretch ratio across them, and its standard error."""
-        return self.strain.along(self.state.angle_rad + math.pi / 2)
+        return self.strain.stretch_along(self.state.angle_rad + math.pi / 2)
 
     def document(self, pixel_um: float) -> dict[str, Any]:
         """Return this as numbers, texts and arrays, lengths in um."""

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy import ndimage
 
-from capture.calibration.led_sphere.lights import SphereFilms, SphereLightTable
+from capture.calibration.led_sphere.lights import SphereLightTable, SpherePolarizers
 from capture.calibration.sensor import SensorCalibration
 from capture.session import Session
 from model.skin import MAP_UNITS, SkinMap
@@ -22,11 +22,15 @@ from reconstruction.gradient_normals.sphere_lights import SphereLights
 from reconstruction.normal_histogram.statistics import NormalStatistics
 from reconstruction.normal_integration import HeightMap, integrate_map, relief_errors
 from reconstruction.normal_integration.height_filters import high_pass
-from reconstruction.normal_integration.lens_restoration import Aperture, Restored, restore
+from reconstruction.normal_integration.lens_restoration import (
+    Aperture,
+    RestoredNormals,
+    restore_normals,
+)
 from reconstruction.normal_integration.slope_fields import Perspective
 from reconstruction.normal_maps import NormalMaps
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline.gradient.images import GradientImages, Patterns, SkinState
+from reconstruction.pipeline.gradient.images import GradientImages, SkinState, StatePatterns
 from reconstruction.pipeline.gradient.skin_strain import StateStrain, measure_states, skin_mask
 from reconstruction.pipeline.gradient.strain_kernels import (
     count_normals,
@@ -34,7 +38,7 @@ from reconstruction.pipeline.gradient.strain_kernels import (
     histogram_document,
 )
 from reconstruction.pipeline.inputs import Inputs
-from reconstruction.pipeline.sensor_noise import SensorNoise
+from reconstruction.pipeline.sensor_noise import ElectronNoise
 
 STAGE_REVISION = 7
 """Grows when the code of a stage changes its result, so that older maps are computed again."""
@@ -73,7 +77,7 @@ def products(session: Session) -> Mapping[str, tuple[str, ...]]:
 
 
 @dataclass(frozen=True, slots=True)
-class Rig:
+class GradientRig:
     """The session, its camera, and its lights as far as they are known."""
 
     images: GradientImages
@@ -104,7 +108,7 @@ class Rig:
         return Perspective(self.focal_px, ((shape[1] - 1) / 2, (shape[0] - 1) / 2))
 
 
-def graph(inputs: Inputs) -> list[stages.Stage]:
+def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     """Return the stages that a session of the gradient sphere can go through."""
     rig = _rig(inputs)
     stage = inputs.stage_maker(STAGE_REVISION)
@@ -130,7 +134,7 @@ def graph(inputs: Inputs) -> list[stages.Stage]:
     return made
 
 
-def _rig(inputs: Inputs) -> Rig:
+def _rig(inputs: Inputs) -> GradientRig:
     session = inputs.session
     shots = session.frames("gradient")
     view = session.rig.view(shots[0].camera) if shots else session.rig.views[0]
@@ -140,12 +144,14 @@ def _rig(inputs: Inputs) -> Rig:
     noise = None
     if sensor is not None:
         known = SensorCalibration.from_calibration(sensor, view.serial)
-        noise = SensorNoise(float(known.gain_e_per_dn.value[0]), float(known.read_noise_e.value[0]))
+        noise = ElectronNoise(
+            float(known.gain_e_per_dn.value[0]), float(known.read_noise_e.value[0])
+        )
     pixel_um = view.pixel_um * view.distance_mm / view.focal_mm
     inputs.noted["pixel_um"] = pixel_um
     images = GradientImages(session, noise=noise)
     inputs.noted["states"] = [state.name for state in images.states]
-    return Rig(
+    return GradientRig(
         images,
         pixel_um,
         view.focal_px,
@@ -176,7 +182,7 @@ def _lights(inputs: Inputs, serial: str) -> SphereLights:
     axis_deg = rig.views[0].analyser_axis_deg
     axis_rad = math.radians(90.0 if axis_deg is None else axis_deg)
     if leak is not None:
-        films = SphereFilms.from_calibration(leak, rig, serial)
+        films = SpherePolarizers.from_calibration(leak, rig, serial)
         leakage, leakage_stderr = films.leakage, films.leakage_stderr
         axis_rad += films.misalignment_rad
     return SphereLights(
@@ -191,7 +197,7 @@ def _lights(inputs: Inputs, serial: str) -> SphereLights:
     )
 
 
-def _strain(inputs: Inputs, rig: Rig) -> Mapping[str, Any]:
+def _strain(inputs: Inputs, rig: GradientRig) -> Mapping[str, Any]:
     found = measure_states(rig.images)
     lost = [each.state.name for each in found if not each.usable]
     if lost:
@@ -203,10 +209,10 @@ def _strain(inputs: Inputs, rig: Rig) -> Mapping[str, Any]:
         "pixel_um": rig.pixel_um,
         "states": [each.document(rig.pixel_um) for each in found],
     }
-    return {"_strains": found, STRAIN_FILE: stages.document_bytes(document)}
+    return {"_strains": found, STRAIN_FILE: stages.serialize_document(document)}
 
 
-def _crossed(rig: Rig, state: SkinState) -> SkinMap:
+def _crossed(rig: GradientRig, state: SkinState) -> SkinMap:
     patterns = rig.images.of(state)
     lit = [key for key in patterns.values if key[1] == "crossed"]
     variance = np.sum([patterns.variance[key] for key in lit], axis=0) / len(lit) ** 2
@@ -215,8 +221,8 @@ def _crossed(rig: Rig, state: SkinState) -> SkinMap:
 
 
 def _patterns_normals(
-    rig: Rig,
-    patterns: Patterns,
+    rig: GradientRig,
+    patterns: StatePatterns,
     component: Literal["specular", "diffuse"],
     *,
     smoothing: Smoothing = (0.0, CROSSED_SMOOTH_PX),
@@ -236,7 +242,7 @@ def _patterns_normals(
     )
 
 
-def _facets(inputs: Inputs, rig: Rig) -> Roughness:
+def _facets(inputs: Inputs, rig: GradientRig) -> Roughness:
     """Estimate the roughness of facets below a pixel, once: strain turns facets, not their own."""
     patterns = rig.images.of(rig.images.neutral)
     found = estimate_roughness(
@@ -251,7 +257,7 @@ def _facets(inputs: Inputs, rig: Rig) -> Roughness:
     return found
 
 
-def _normals(rig: Rig, state: SkinState, _facets: Roughness) -> Mapping[str, Any]:
+def _normals(rig: GradientRig, state: SkinState, _facets: Roughness) -> Mapping[str, Any]:
     """Return normals as the lens shows them, and the slopes of the surface before the lens."""
     patterns = rig.images.of(state)
     skin = skin_mask(patterns.crossed())
@@ -262,14 +268,14 @@ def _normals(rig: Rig, state: SkinState, _facets: Roughness) -> Mapping[str, Any
     normals = np.where(sharp.valid[..., None], sharp.normals, smooth.normals)
     known = (sharp.valid | smooth.valid) & skin
     shown = _normal_map(smooth, skin, "of the surface's reflection", relief=True)
-    restored = restore(normals, lens=rig.lens, valid=known)
+    restored = restore_normals(normals, lens=rig.lens, valid=known)
     return {
         f"normals_{state.name}": shown,
         f"_restored_{state.name}": (restored, known, smooth.stderr_rad),
     }
 
 
-def _diffuse(rig: Rig) -> SkinMap:
+def _diffuse(rig: GradientRig) -> SkinMap:
     patterns = rig.images.of(rig.images.neutral)
     found = _patterns_normals(rig, patterns, "diffuse", smoothing=DIFFUSE_SMOOTH_PX)
     what = "of the light from inside the skin, which spreads over tenths of a millimetre"
@@ -281,7 +287,7 @@ def _normal_map(found: NormalMaps, skin: BoolArray, what: str, *, relief: bool =
     # of each of the two directions across the normal, as everywhere
     stderr = np.where(valid, found.stderr_rad / math.sqrt(2.0), np.pi).astype(np.float32)
     if relief:
-        stderr = relief_errors.of_normals(found.normals, stderr, valid)
+        stderr = relief_errors.normal_stderr(found.normals, stderr, valid)
     return SkinMap(
         np.asarray(found.normals, np.float32),
         MAP_UNITS["normals"],
@@ -291,9 +297,9 @@ def _normal_map(found: NormalMaps, skin: BoolArray, what: str, *, relief: bool =
     )
 
 
-def _height(rig: Rig, state: SkinState, **made: Any) -> SkinMap:
+def _height(rig: GradientRig, state: SkinState, **made: Any) -> SkinMap:
     """Integrate what the lens's blur was taken out of; remove what is wider than a millimetre."""
-    restored: Restored
+    restored: RestoredNormals
     valid: BoolArray
     restored, valid, stderr_rad = made[f"_restored_{state.name}"]
     shape = valid.shape
@@ -312,7 +318,7 @@ def _height(rig: Rig, state: SkinState, **made: Any) -> SkinMap:
 
     found = relief(restored.normals, valid)
     by_noise = _height_stderr(restored, found.valid, relief)
-    stderr = relief_errors.of_height(found.height, by_noise, found.valid)
+    stderr = relief_errors.height_stderr(found.height, by_noise, found.valid)
     what = (
         "height towards the camera, the lens's blur undone as far as noise allows, without "
         f"what is longer than {CUTOFF_UM / 1e3:g} mm"
@@ -321,13 +327,15 @@ def _height(rig: Rig, state: SkinState, **made: Any) -> SkinMap:
 
 
 def _height_stderr(
-    restored: Restored, valid: BoolArray, relief: Callable[[FloatArray, BoolArray], HeightMap]
+    restored: RestoredNormals,
+    valid: BoolArray,
+    relief: Callable[[FloatArray, BoolArray], HeightMap],
 ) -> Float32Array:
     """Return the standard error of a height by what fields of noise become on the same way."""
     rng = np.random.default_rng(0)
     total = np.zeros(valid.shape)
     for _ in range(STDERR_SAMPLES):
-        x, y = restored.noise_field(rng)
+        x, y = restored.sample_noise(rng)
         field = np.stack([-x, -y, np.ones_like(x)], axis=-1)
         total += relief(field, valid).height.astype(np.float64) ** 2
     # the noise is about the same everywhere: its variance varies slowly, borders aside
@@ -336,24 +344,26 @@ def _height_stderr(
     return np.where(valid, np.sqrt(even / STDERR_SAMPLES), np.inf).astype(np.float32)
 
 
-def _histograms(rig: Rig, _strains: list[StateStrain], **heights: SkinMap) -> Mapping[str, Any]:
+def _histograms(
+    rig: GradientRig, _strains: list[StateStrain], **heights: SkinMap
+) -> Mapping[str, Any]:
     found = count_normals(_strains, _by_state(heights), pixel_um=rig.pixel_um)
     document = histogram_document(_strains, found)
-    return {"_histograms": found, HISTOGRAM_FILE: stages.document_bytes(document)}
+    return {"_histograms": found, HISTOGRAM_FILE: stages.serialize_document(document)}
 
 
 def _kernels(
     inputs: Inputs,
-    rig: Rig,
+    rig: GradientRig,
     _strains: list[StateStrain],
     _histograms: Mapping[str, NormalStatistics],
     **heights: SkinMap,
 ) -> bytes:
-    tell = partial(inputs.tell, "kernels")
+    tell = partial(inputs.report_progress, "kernels")
     document = fit_kernels(
-        _strains, _by_state(heights), _histograms, pixel_um=rig.pixel_um, tell=tell
+        _strains, _by_state(heights), _histograms, pixel_um=rig.pixel_um, report_progress=tell
     )
-    return stages.document_bytes(document)
+    return stages.serialize_document(document)
 
 
 def _by_state(heights: Mapping[str, SkinMap]) -> dict[str, SkinMap]:

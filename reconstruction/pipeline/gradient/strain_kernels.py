@@ -13,18 +13,26 @@ from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int64Ar
 from reconstruction.kernel_fit import fit_kernel
 from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM
 from reconstruction.kernel_fit.outcome import KernelFit
-from reconstruction.kernel_fit.table import KernelTableFitError, direction_dependence, fit_table
-from reconstruction.normal_histogram.blocks import BLOCKS_PER_SIDE, block_counts, grid_of
-from reconstruction.normal_histogram.statistics import NormalStatistics, measure
+from reconstruction.kernel_fit.table import (
+    KernelTableFitError,
+    estimate_direction_dependence,
+    fit_table,
+)
+from reconstruction.normal_histogram.blocks import (
+    BLOCKS_PER_SIDE,
+    block_grid_shape,
+    count_block_normals,
+)
+from reconstruction.normal_histogram.statistics import NormalStatistics, measure_normals
 from reconstruction.pipeline.gradient.skin_strain import StateStrain
-from reconstruction.pipeline.graph import attributes_of
+from reconstruction.pipeline.graph import select_attributes
 
 MIN_SAMPLES = 1000
 """Fewer pixels make no histogram."""
 MIN_STRAIN = 0.01
 """A state nearer to neutral than this has no kernel of its own: it would be that of the noise."""
 LINE_POINTS = 61
-FULL_GRID_PX = 1_000_000
+MAX_FULL_GRID_PX = 1_000_000
 """Patches of fewer pixels tell kernels no finer than by `COARSE_GRID_STEP` steps of the paper's
 grid."""
 COARSE_GRID_STEP = 3
@@ -59,7 +67,7 @@ def count_normals(
         height = heights[each.state.name]
         both = height.mask & _common(each, strains[0], heights, there=True)
         if np.count_nonzero(both) >= MIN_SAMPLES:
-            found[each.state.name] = measure(
+            found[each.state.name] = measure_normals(
                 height.values, pixel=pixel_um, valid=both, angle_rad=each.state.angle_rad
             )
     return found
@@ -87,7 +95,7 @@ def histogram_document(
                 "name": each.state.name,
                 "angle_deg": each.state.angle_deg,
                 "counts": one.histogram,
-                **attributes_of(one, of_samples),
+                **select_attributes(one, of_samples),
                 "variance_s": one.variance_x,
                 "variance_s_stderr": hidden(one.stderr_x, one.variance_x),
                 "variance_t": one.variance_y,
@@ -155,7 +163,7 @@ def _skin_blocks(
     middle = (shape[1] - 1) / 2, (shape[0] - 1) / 2
     x, y = column - middle[0], middle[1] - row
     row, column = middle[1] - (c * y - s * x), middle[0] + (c * x + s * y)
-    grid = grid_of(shape, BLOCKS_PER_SIDE)
+    grid = block_grid_shape(shape, BLOCKS_PER_SIDE)
     down, right = (
         np.floor((place + 0.5) * parts / side).astype(np.int64)
         for place, parts, side in zip((row, column), grid, shape, strict=True)
@@ -163,7 +171,7 @@ def _skin_blocks(
     inside = (down >= 0) & (down < grid[0]) & (right >= 0) & (right < grid[1])
     block = np.where(inside, down * grid[1] + right, -1)
     angle_rad, blocks = each.state.angle_rad, grid[0] * grid[1]
-    counts = block_counts(
+    counts = count_block_normals(
         height.values, block, blocks, pixel=pixel_um, valid=there, angle_rad=angle_rad
     )
     return counts.reshape(*grid, *counts.shape[1:])
@@ -197,7 +205,7 @@ def fit_kernels(
     statistics: Mapping[str, NormalStatistics],
     *,
     pixel_um: float,
-    tell: Callable[[float], None],
+    report_progress: Callable[[float], None],
 ) -> dict[str, Any]:
     """Fit a kernel to every strained state, and lines to the kernels of each angle.
 
@@ -221,14 +229,14 @@ def fit_kernels(
     todo = [each for each in counted if abs(each.stretch_s[0] - 1.0) >= MIN_STRAIN]
     fits = []
     for number, each in enumerate(todo):
-        tell(number / len(todo))
+        report_progress(number / len(todo))
         seen = height.mask & _common(each, neutral, heights, there=False)
         turned, inside = _along_x(height.values, seen, each.state.angle_rad)
         if np.count_nonzero(inside) < MIN_SAMPLES:
             continue
         target, strained = statistics[each.state.name], heights[each.state.name]
         there = strained.mask & _common(each, neutral, heights, there=True)
-        every = 1 if np.count_nonzero(inside) >= FULL_GRID_PX else COARSE_GRID_STEP
+        every = 1 if np.count_nonzero(inside) >= MAX_FULL_GRID_PX else COARSE_GRID_STEP
         fit = fit_kernel(
             turned,
             target.histogram,
@@ -259,11 +267,11 @@ def _entry(each: StateStrain, fit: KernelFit) -> dict[str, Any]:
         "stretch_s": each.stretch_s[0],
         "stretch_s_stderr": each.stretch_s[1],
         "stretch_t": each.stretch_t[0],
-        **attributes_of(fit, names),
+        **select_attributes(fit, names),
         "distance_noise": fit.noise,
         "noise_floor": fit.floor,
         "near_best_count": len(fit.near_best),
-        **attributes_of(fit, "at_edge aliased search valid reason"),
+        **select_attributes(fit, "at_edge aliased search valid reason"),
     }
 
 
@@ -288,9 +296,9 @@ def _table(fits: Sequence[Mapping[str, Any]], angle: float | None) -> dict[str, 
     lines = "alpha_breaks alpha_lines sigma_compression_um sigma_stretch_um"
     return {
         "name": "all angles" if angle is None else f"{angle:.0f} degrees",
-        **attributes_of(table, lines),
+        **select_attributes(table, lines),
         "stretch_range": (low, high),
-        **attributes_of(found, "alpha_rms sigma_rms_um"),
+        **select_attributes(found, "alpha_rms sigma_rms_um"),
         "lines": {"stretch": r, "alpha": alpha, "sigma_um": sigma},
     }
 
@@ -302,8 +310,8 @@ def _direction(fits: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     stretch, alpha, sigma, angle_deg = ([fit[name] for fit in chosen] for name in names)
     try:
         table = fit_table(stretch, alpha, sigma).table
-        found = direction_dependence(table, stretch, alpha, sigma, np.radians(angle_deg))
+        found = estimate_direction_dependence(table, stretch, alpha, sigma, np.radians(angle_deg))
     except (KernelTableFitError, KernelTableError):
         return None
     errors = "alpha_offset alpha_stderr sigma_offset_um sigma_stderr_um p_alpha p_sigma"
-    return {"angle_deg": np.degrees(found.angle_rad), **attributes_of(found, errors)}
+    return {"angle_deg": np.degrees(found.angle_rad), **select_attributes(found, errors)}

@@ -8,18 +8,18 @@ from numpy.typing import NDArray
 
 from capture.calibration.fiber.darks import CameraNoise, DarkModel, measure_darks
 from capture.calibration.fiber.merge import MergedSeries, merge_series
-from capture.plan.suction import Placement, placement_of
+from capture.plan.suction import HeadPlacement, step_placement
 from capture.session import FrameRecord, Session
 from model.checks import Checks
 from reconstruction.pipeline.inputs import InputsError
 
 
-def measurement_name(placement: Placement) -> str:
+def measurement_name(placement: HeadPlacement) -> str:
     """Return what the profile of one placement is called.
 
     Examples
     --------
-    >>> measurement_name(Placement("cheek", 22.5, 1))
+    >>> measurement_name(HeadPlacement("cheek", 22.5, 1))
     'cheek_r1_a022.5'
     """
     return f"{placement.site}_r{placement.repeat}_a{placement.angle_deg:05.1f}"
@@ -29,7 +29,7 @@ def measurement_name(placement: Placement) -> str:
 class Measurement:
     """One placement of the head, with what the box reported while it lasted."""
 
-    placement: Placement
+    placement: HeadPlacement
     brackets: int
     """Exposures taken."""
     level: float
@@ -71,15 +71,15 @@ class ProbeImages:
     def __init__(self, session: Session, *, noise: CameraNoise, kind: str = "fibres") -> None:
         self._session = session
         self._noise = noise
-        self._records: dict[Placement, list[FrameRecord]] = {}
+        self._records: dict[HeadPlacement, list[FrameRecord]] = {}
         for record in session.frames(kind):
-            placement = placement_of(record.step)
+            placement = step_placement(record.step)
             if placement is not None:
                 self._records.setdefault(placement, []).append(record)
         if not self._records:
             raise InputsError(f"{session.path}: has no frames of kind {kind!r}")
 
-        def measured(placement: Placement, records: list[FrameRecord]) -> Measurement:
+        def measured(placement: HeadPlacement, records: list[FrameRecord]) -> Measurement:
             means = _mean(records, "suction_mbar"), _mean(records, "camera_c")
             return Measurement(placement, len(records), _level(records), *means)
 

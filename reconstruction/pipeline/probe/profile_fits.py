@@ -25,7 +25,7 @@ tissue. What each fibre has off by itself, as by dirt on it, bends none."""
 
 
 @dataclass(frozen=True, slots=True)
-class Profile:
+class MeasuredProfile:
     """What the fibres took at one placement."""
 
     measurement: Measurement
@@ -50,7 +50,7 @@ class ProfileFit:
         Root sum square of such changes of log sigma_a and log sigma_s'.
     """
 
-    profile: Profile
+    profile: MeasuredProfile
     fit: SubsurfaceFit
     log_stderr: Float64Array
     log_common: Float64Array
@@ -82,7 +82,7 @@ class SiteValue:
 
 
 def fit_profiles(
-    profiles: Sequence[Profile], probe: Probe, method: Any = METHOD_NAMES[0]
+    profiles: Sequence[MeasuredProfile], probe: Probe, method: Any = METHOD_NAMES[0]
 ) -> list[ProfileFit]:
     """Fit all profiles and channels, also with each common error at its uncertainty."""
     first = profiles[0].reflectance
@@ -107,7 +107,7 @@ def fit_profiles(
             told |= {"method": method, "common_error": nearest_medium.LOG_FACTOR_SIGMA}
             other = subsurface.invert(first.radius_mm, every, **told)
         unlike = _layered(profiles, unlike, other.scale[0])
-        fit = _either(fit, other, np.broadcast_to(unlike, fit.valid.shape))
+        fit = _merge_fits(fit, other, np.broadcast_to(unlike, fit.valid.shape))
 
     def change_of(coefficient: Float64Array) -> Float64Array:
         logs = np.log(coefficient)
@@ -120,11 +120,15 @@ def fit_profiles(
     found = []
     for number, profile in enumerate(profiles):
         changes = change[:, number].reshape(causes, -1), shared[:, number]
-        found.append(ProfileFit(profile, _one(fit, (0, number)), log_stderr[number], *changes))
+        found.append(
+            ProfileFit(profile, _select_fits(fit, (0, number)), log_stderr[number], *changes)
+        )
     return found
 
 
-def _layered(profiles: Sequence[Profile], unlike: BoolArray, factor: Float64Array) -> BoolArray:
+def _layered(
+    profiles: Sequence[MeasuredProfile], unlike: BoolArray, factor: Float64Array
+) -> BoolArray:
     """Return which profiles are fitted as those of layers, (M, C); a turn is of one tissue.
 
     A layer on top dims in all directions. Tissue that scatters by direction is unlike any medium,
@@ -139,7 +143,7 @@ def _layered(profiles: Sequence[Profile], unlike: BoolArray, factor: Float64Arra
     return found
 
 
-def profile_groups(profiles: Sequence[Profile]) -> dict[tuple[str, int], list[int]]:
+def profile_groups(profiles: Sequence[MeasuredProfile]) -> dict[tuple[str, int], list[int]]:
     """Return the numbers of profiles of each site and repeat, in all directions of the head."""
     groups: dict[tuple[str, int], list[int]] = {}
     for number, profile in enumerate(profiles):
@@ -148,7 +152,7 @@ def profile_groups(profiles: Sequence[Profile]) -> dict[tuple[str, int], list[in
     return groups
 
 
-def _either(fit: SubsurfaceFit, other: SubsurfaceFit, there: BoolArray) -> SubsurfaceFit:
+def _merge_fits(fit: SubsurfaceFit, other: SubsurfaceFit, there: BoolArray) -> SubsurfaceFit:
     """Return one batch's fits, but another's where told to."""
     merged = {}
     for name in (field.name for field in dataclasses.fields(fit) if field.name != "method"):
@@ -158,7 +162,7 @@ def _either(fit: SubsurfaceFit, other: SubsurfaceFit, there: BoolArray) -> Subsu
     return dataclasses.replace(fit, **merged)
 
 
-def _one(fit: SubsurfaceFit, index: tuple[int, ...]) -> SubsurfaceFit:
+def _select_fits(fit: SubsurfaceFit, index: tuple[int, ...]) -> SubsurfaceFit:
     """Return some of a batch's fits."""
     names = [field.name for field in dataclasses.fields(fit) if field.name != "method"]
     return dataclasses.replace(fit, **{name: getattr(fit, name)[index] for name in names})

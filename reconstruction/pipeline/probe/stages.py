@@ -18,13 +18,13 @@ from model.fresnel import ETA_SKIN
 from model.skin import SkinMap
 from reconstruction.anisotropy import estimation as anisotropy
 from reconstruction.anisotropy.direction_harmonics import MIN_DIRECTIONS
-from reconstruction.anisotropy.estimation import one_direction_bias
+from reconstruction.anisotropy.estimation import estimate_single_direction_bias
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.probe.images import Measurement, ProbeImages
 from reconstruction.pipeline.probe.profile_fits import (
     METHOD_NAMES,
-    Profile,
+    MeasuredProfile,
     ProfileFit,
     SiteValue,
     fit_profiles,
@@ -44,7 +44,7 @@ FILE_NAMES = (PROFILE_FILE, SUBSURFACE_FILE, ANISOTROPY_FILE)
 
 CHANNEL_NAMES = ("red", "green", "blue")
 MAP_SHAPE = (256, 256)
-FALSE_ALARMS = 0.01
+FALSE_ALARM_RATE = 0.01
 """Chance at which isotropic tissue is called anisotropic, per site and channel."""
 
 
@@ -58,7 +58,7 @@ def products(_: Session) -> Mapping[str, tuple[str, ...]]:
     }
 
 
-def graph(inputs: Inputs) -> list[stages.Stage]:
+def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     """Return the stages that a session of the fibre probe can go through.
 
     Raises
@@ -75,9 +75,9 @@ def graph(inputs: Inputs) -> list[stages.Stage]:
     fibres = _fibres(inputs)
     places = _places(inputs)
     stage = inputs.stage_maker(STAGE_REVISION)
-    noise = CameraNoise.of_view(view)
+    noise = CameraNoise.from_view(view)
     if sensor is not None:
-        noise = CameraNoise.of_sensor(SensorCalibration.from_calibration(sensor, view.serial))
+        noise = CameraNoise.from_sensor(SensorCalibration.from_calibration(sensor, view.serial))
     uncalibrated = (
         "the fibres are not calibrated: capture a phantom of known optics (`--target phantom`), "
         "and give the folder that `skinrig calibrate fibre` makes of it as --calibration"
@@ -111,16 +111,18 @@ def _profiles(
     images = ProbeImages(inputs.session, noise=noise)
     found = []
     for number, measurement in enumerate(images.measurements):
-        inputs.tell("profiles", number / len(images.measurements))
+        inputs.report_progress("profiles", number / len(images.measurements))
         merged = images.merged(measurement)
         # the camera may have moved against the fibres since they were calibrated
-        spots, _ = fibres.spots.moved(merged, noise.pattern)
+        spots, _ = fibres.spots.track(merged, noise.pattern)
         readings = sum_spots(merged, spots, noise=noise)
-        found.append(Profile(measurement, fibres.reflectance(readings, level=measurement.level)))
-    return {"_profiles": found, PROFILE_FILE: stages.document_bytes(_profile_document(found))}
+        found.append(
+            MeasuredProfile(measurement, fibres.reflectance(readings, level=measurement.level))
+        )
+    return {"_profiles": found, PROFILE_FILE: stages.serialize_document(_profile_document(found))}
 
 
-def _profile_document(profiles: Sequence[Profile]) -> dict[str, Any]:
+def _profile_document(profiles: Sequence[MeasuredProfile]) -> dict[str, Any]:
     return {
         "schema": "skinrig.profiles/1",
         "unit": "1/mm^2, reflectance in the fibre",
@@ -129,7 +131,7 @@ def _profile_document(profiles: Sequence[Profile]) -> dict[str, Any]:
         "measurements": [
             {
                 **_head(profile.measurement),
-                **stages.attributes_of(profile.measurement, "brackets suction_mbar camera_c"),
+                **stages.select_attributes(profile.measurement, "brackets suction_mbar camera_c"),
                 "left_out": dict(profile.reflectance.reasons),
                 "channels": {
                     channel: {
@@ -146,7 +148,7 @@ def _profile_document(profiles: Sequence[Profile]) -> dict[str, Any]:
     }
 
 
-def _subsurface(probe: Probe, _profiles: Sequence[Profile]) -> Mapping[str, Any]:
+def _subsurface(probe: Probe, _profiles: Sequence[MeasuredProfile]) -> Mapping[str, Any]:
     fits = {method: fit_profiles(_profiles, probe, method) for method in METHOD_NAMES}
     sites = site_values(fits[METHOD_NAMES[0]])
     document = {
@@ -169,7 +171,7 @@ def _subsurface(probe: Probe, _profiles: Sequence[Profile]) -> Mapping[str, Any]
         "sites": [_site_document(site, c) for site in sites for c in range(len(CHANNEL_NAMES))],
     }
     made = {"_fits": fits[METHOD_NAMES[0]], "_sites": sites}
-    return made | {SUBSURFACE_FILE: stages.document_bytes(document)}
+    return made | {SUBSURFACE_FILE: stages.serialize_document(document)}
 
 
 def _fit_document(one: ProfileFit, c: int) -> dict[str, Any]:
@@ -204,7 +206,7 @@ def _fit_document(one: ProfileFit, c: int) -> dict[str, Any]:
 
 def _of_channel(record: Any, names: str, c: int) -> dict[str, Any]:
     """Return one channel of a record's attributes, by their names, parted by spaces."""
-    return {name: values[c] for name, values in stages.attributes_of(record, names).items()}
+    return {name: values[c] for name, values in stages.select_attributes(record, names).items()}
 
 
 def _site_document(site: SiteValue, c: int) -> dict[str, Any]:
@@ -237,7 +239,7 @@ def _anisotropy(_fits: Sequence[ProfileFit]) -> bytes:
         found = anisotropy.estimate(
             angle, np.where(valid, sigma_tr, 1.0), np.where(valid, stderr, np.inf), valid=valid
         )
-        bias = one_direction_bias(found, angle)
+        bias = estimate_single_direction_bias(found, angle)
         off = np.maximum(np.abs(bias.lowest), np.abs(bias.highest))
         for c, channel in enumerate(CHANNEL_NAMES):
             rows.append(
@@ -250,15 +252,15 @@ def _anisotropy(_fits: Sequence[ProfileFit]) -> bytes:
                     "axis_deg": math.degrees(found.axis_rad[c]),
                     "axis_stderr_deg": math.degrees(found.axis_stderr_rad[c]),
                     "p_value": found.p_value[c],
-                    "anisotropic": bool(found.valid[c] and found.p_value[c] < FALSE_ALARMS),
+                    "anisotropic": bool(found.valid[c] and found.p_value[c] < FALSE_ALARM_RATE),
                     **_of_channel(found, "mean_per_mm mean_stderr_per_mm tilt tilt_p_value", c),
                     "worst_direction_percent": 100.0 * off[c],
                     "valid": found.valid[c],
                     "reason": str(found.reason[c]),
                 }
             )
-    document = {"schema": "skinrig.anisotropy/1", "false_alarm_rate": FALSE_ALARMS}
-    return stages.document_bytes(document | {"sites": rows, "left_out": skipped})
+    document = {"schema": "skinrig.anisotropy/1", "false_alarm_rate": FALSE_ALARM_RATE}
+    return stages.serialize_document(document | {"sites": rows, "left_out": skipped})
 
 
 def _places(inputs: Inputs) -> Mapping[str, tuple[float, float]]:
@@ -291,7 +293,7 @@ def _translucency(
         names=[site.site for site in placed],
     )
     left_out = [f"{site}: its place on a face is not known" for site in unplaced]
-    left_out += [f"{site}: {why}" for site, why in found.left_out]
+    left_out += [f"{site}: {why}" for site, why in found.omitted]
     inputs.noted["translucency_left_out"] = left_out
     inputs.assumed += [f"translucency goes without {text}" for text in left_out]
     inputs.noted["translucency_conflicts"] = [": ".join(pair) for pair in found.conflicts]
@@ -300,5 +302,5 @@ def _translucency(
 
 
 def _head(measurement: Measurement) -> dict[str, Any]:
-    where = stages.attributes_of(measurement.placement, "site repeat angle_deg")
+    where = stages.select_attributes(measurement.placement, "site repeat angle_deg")
     return {"name": measurement.name} | where

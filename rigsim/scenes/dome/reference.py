@@ -18,12 +18,12 @@ from rigsim.arrays import BoolArray, Float32Array, Float64Array
 from rigsim.geometry.atlas import dilate_texture
 from rigsim.light.surface_brdf import ETA_OIL, OIL_SMOOTHING, SkinSurface
 from rigsim.needs.effects import SceneEffects
-from rigsim.render import MovedLight, radiance
+from rigsim.render import MovableLightScene, radiance
 from rigsim.render.scene_radiance import (
-    matt_plastic,
+    matte_plastic,
     perspective,
     plastic_scale,
-    point_rig,
+    point_light_rig,
     rough_metal,
 )
 from rigsim.scenes.dome.scene import DomeScene
@@ -34,7 +34,7 @@ Integrator = Literal["path", "direct"]
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class RenderTiming:
     """One way to render the dome's lights one by one."""
 
     seconds: float
@@ -48,18 +48,18 @@ class Way:
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class IntegratorComparison:
     """Three ways to render one view of the dome, with as many rays in a pixel."""
 
-    ours: Way
-    path: Way
+    ours: RenderTiming
+    path: RenderTiming
     """Mitsuba's path tracer, direct light alone."""
-    direct: Way
+    direct: RenderTiming
     """Mitsuba's direct integrator, which samples the light alone."""
 
-    def speed_up(self, way: Way) -> float:
+    def speed_up(self, timing: RenderTiming) -> float:
         """How many times faster ours is for no more noise; noisier is counted by its square."""
-        return way.seconds / self.ours.seconds * min(1.0, (way.error / self.ours.error) ** 2)
+        return timing.seconds / self.ours.seconds * min(1.0, (timing.error / self.ours.error) ** 2)
 
 
 def plain_face(preset: str = "III", *, size: int = 512) -> SimulatedSubject:
@@ -68,14 +68,14 @@ def plain_face(preset: str = "III", *, size: int = 512) -> SimulatedSubject:
     return dataclasses.replace(face, normal=face.atlas.normal)
 
 
-DIRECT_LIGHT: Final = SceneEffects(lateral=False, interreflections=False)
+DIRECT_LIGHT_EFFECTS: Final = SceneEffects(lateral=False, interreflections=False)
 
 
 class DirectScene(DomeScene):
     """A dome where light goes from an LED to the skin and to the camera, unless asked otherwise."""
 
     def __init__(self, rig: Rig, subject: SimulatedSubject, **settings: Any) -> None:
-        super().__init__(rig, subject, **({"effects": DIRECT_LIGHT} | settings))
+        super().__init__(rig, subject, **({"effects": DIRECT_LIGHT_EFFECTS} | settings))
 
 
 class PlainScene(DirectScene):
@@ -87,15 +87,15 @@ class PlainScene(DirectScene):
         return dataclasses.replace(surface, fuzz=none, bare=np.ones_like(none))
 
 
-def compare(
+def compare_integrators(
     *,
     width_px: int,
     lights: int,
     subpixels: int = 2,
-    fine: int = 6,
+    reference_subpixels: int = 6,
     rounds: int = 2,
     sampler: str = "stratified",
-) -> Comparison:
+) -> IntegratorComparison:
     """Render one view of the dome in three ways, light after light.
 
     Parameters
@@ -119,13 +119,13 @@ def compare(
         All three take turns at each light. Compiling, parsing and building of meshes are done
         before and not counted; tracing our camera rays is.
     """
-    rig = point_rig(load_rig("dome").resized(width_px).subset(views=["C02"]))
+    rig = point_light_rig(load_rig("dome").resized(width_px).subset(views=["C02"]))
     view, face = rig.views[0], plain_face()
     chosen = [int(k) for k in np.linspace(0, len(rig.lights) - 1, lights).round()]
-    fine_scene = PlainScene(rig, face, subpixels=fine)
+    fine_scene = PlainScene(rig, face, subpixels=reference_subpixels)
     reference = np.stack([_per_steradian(fine_scene, k) for k in chosen])
     theirs = {
-        name: MovedLight(describe(fine_scene, view, name, sampler=sampler), kind="rgb")
+        name: MovableLightScene(describe_dome(fine_scene, view, name, sampler=sampler), kind="rgb")
         for name in _INTEGRATOR_SETTINGS
     }
     del fine_scene
@@ -157,17 +157,19 @@ def compare(
         spent["ours"] += look * lights / len(rig.lights)
         best = {name: min(best[name], spent[name] / lights) for name in best}
 
-    def way(name: str) -> Way:
+    def way(name: str) -> RenderTiming:
         found = np.stack(images[name])
         difference = (found - reference).astype(np.float64)
         error = float(np.sqrt(np.mean(difference**2)) / reference.mean())
-        squared = _by_tile(difference / reference.mean(), reference > 0.0)
-        return Way(best[name], error, float(found.mean() / reference.mean()), squared)
+        squared = _mean_square_by_tile(difference / reference.mean(), reference > 0.0)
+        return RenderTiming(best[name], error, float(found.mean() / reference.mean()), squared)
 
-    return Comparison(way("ours"), way("path"), way("direct"))
+    return IntegratorComparison(way("ours"), way("path"), way("direct"))
 
 
-def _by_tile(difference: Float64Array, shown: BoolArray, side: int = 16) -> Float64Array:
+def _mean_square_by_tile(
+    difference: Float64Array, shown: BoolArray, side: int = 16
+) -> Float64Array:
     """Return the mean square of each tile of images (L, H, W, 3), those without skin left out."""
     squared = np.mean(difference**2, axis=(0, 3))
     seen = np.asarray(shown.any(axis=(0, 3)))
@@ -183,11 +185,11 @@ def _per_steradian(scene: PlainScene, light: int) -> Float32Array:
     return np.asarray(image / scene.intensity(light) / np.float32(math.pi), np.float32)
 
 
-def mitsuba_image(
+def render_with_mitsuba(
     scene: PlainScene, view: View, light: dict[str, Any], *, samples: int, seed: int
 ) -> Float32Array:
     """Return one image by Mitsuba's path tracer, shape (H, W, 3), for any described light."""
-    description = describe(scene, view, "path") | {"light": light}
+    description = describe_dome(scene, view, "path") | {"light": light}
     return radiance(description, kind="rgb", samples=samples, seed=seed)[..., :3]
 
 
@@ -197,7 +199,7 @@ _INTEGRATOR_SETTINGS: dict[Integrator, dict[str, Any]] = {
 }
 
 
-def describe(
+def describe_dome(
     scene: PlainScene, view: View, integrator: Integrator, *, sampler: str = "independent"
 ) -> dict[str, Any]:
     """Return Mitsuba's scene of a face in the dome, lit by a point of intensity 1 per steradian."""
@@ -239,7 +241,7 @@ def _skin(surface: SkinSurface, subject: SimulatedSubject) -> dict[str, Any]:
     return {
         "type": "blendbsdf",
         "weight": 0.5,
-        "inside": _matt(surface, subject),
+        "inside": _matte_material(surface, subject),
         "outside": {
             "type": "blendbsdf",
             "weight": _texture(surface.oil, covered),
@@ -249,10 +251,10 @@ def _skin(surface: SkinSurface, subject: SimulatedSubject) -> dict[str, Any]:
     }
 
 
-def _matt(surface: SkinSurface, subject: SimulatedSubject) -> dict[str, Any]:
+def _matte_material(surface: SkinSurface, subject: SimulatedSubject) -> dict[str, Any]:
     """Return the diffuse term behind the boundary, without the mirror that stands on it."""
     r_d = surface.r_d * np.float32(plastic_scale(ETA))
-    return matt_plastic(ETA, _texture(r_d, subject.atlas.covered))
+    return matte_plastic(ETA, _texture(r_d, subject.atlas.covered))
 
 
 def _texture(values: Float32Array, covered: BoolArray) -> dict[str, Any]:

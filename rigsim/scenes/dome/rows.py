@@ -9,14 +9,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from capture.rig import View
 from rigsim.arrays import Float32Array, Float64Array, Int32Array
-from rigsim.as_built.dome import BuiltDome
+from rigsim.as_built.dome import ActualDome
+from rigsim.caching import LruCache
 from rigsim.geometry.atlas import dilate_texture, sample, unwrap
-from rigsim.kept import Kept
 from rigsim.light.lateral_scattering import LateralScattering
 from rigsim.light.led_light import lobe_exponent
-from rigsim.light.olat import Hits, Lamp, Looking, find_hits
+from rigsim.light.olat import CameraSettings, Hits, Lamp, find_hits
 from rigsim.light.olat_kernels import MATT_ROWS, METAL_ROWS, SKIN_ROWS
-from rigsim.light.olat_vector import VectorLight
+from rigsim.light.olat_vector import VectorizedShader
 from rigsim.render import Caster, GBuffer
 from rigsim.scenes.exposing import SceneError
 from rigsim.subject import SimulatedSubject
@@ -25,11 +25,11 @@ from rigsim.targets import Target
 
 Float16Array = NDArray[np.float16]
 
-KEPT_GLOW_BYTES: Final = 2**29
+SUBSURFACE_CACHE_BYTES: Final = 2**29
 """Latest light from inside that is kept: it is the same for all cameras, which ask one after the
 other for many lights."""
 
-HALF_RANGE: Final = 1000.0
+FLOAT16_SCALE: Final = 1000.0
 """Its greatest value where it is kept with 11 bits, which resolve 1e-10 of that."""
 
 
@@ -52,20 +52,20 @@ class DomeRows:
 
     def __init__(
         self,
-        dome: BuiltDome,
+        dome: ActualDome,
         subject: SimulatedSubject | Target,
         caster: Caster,
         motion: HeadMotion | None,
-        how: Looking,
+        how: CameraSettings,
     ) -> None:
         self._dome, self._subject, self._caster = dome, subject, caster
         self._motion = motion if isinstance(subject, SimulatedSubject) else None
         self._how = how
         most = len(dome.rig.views) if self._motion is None else 2
-        self._hits: Kept[tuple[str, float], tuple[Hits, Caster]] = Kept(lambda _: most)
-        self._vector: Kept[tuple[str, float], VectorLight] = Kept(lambda _: most)
+        self._hits: LruCache[tuple[str, float], tuple[Hits, Caster]] = LruCache(lambda _: most)
+        self._vector: LruCache[tuple[str, float], VectorizedShader] = LruCache(lambda _: most)
 
-    def instant(self, t_s: float) -> float:
+    def pose_time_s(self, t_s: float) -> float:
         """Return the time that decides how the subject stands, s; 0 of one that holds still."""
         return 0.0 if self._motion is None else round(t_s, 4)
 
@@ -80,7 +80,7 @@ class DomeRows:
             radius_mm=led.radius_mm,
         )
 
-    def seen(
+    def visible_rows(
         self, view: View, t_s: float, texture: Callable[[str], Float32Array]
     ) -> tuple[Hits, Caster]:
         """Return a camera's rows and the mesh that casts shadows on them.
@@ -97,9 +97,11 @@ class DomeRows:
         """
         return self._hits.get((view.name, t_s), lambda: self._look(view, t_s, texture))
 
-    def vector_light(self, view: View, t_s: float, hits: Hits, caster: Caster) -> VectorLight:
-        """Return what lights rows of `seen` by compiled loops; kept as long as they are."""
-        return self._vector.get((view.name, t_s), lambda: VectorLight(hits, caster))
+    def vectorized_shader(
+        self, view: View, t_s: float, hits: Hits, caster: Caster
+    ) -> VectorizedShader:
+        """Return what lights rows of `visible_rows` by compiled loops; kept as long as they are."""
+        return self._vector.get((view.name, t_s), lambda: VectorizedShader(hits, caster))
 
     def _pose(self, t_s: float) -> tuple[Float64Array, Float64Array]:
         return (np.eye(3), np.zeros(3)) if self._motion is None else self._motion.pose(t_s)
@@ -119,16 +121,16 @@ class DomeRows:
         if isinstance(subject, Target):
             if subject.kind == "source":
                 raise SceneError(f"target {subject.name!r}: shines itself, no dome holds it")
-            return at_target(caster, moved, subject, how, distortion), caster
-        amount = 0.0 if self._motion is None else self._motion.twitch(t_s)
+            return observe_target(caster, moved, subject, how, distortion), caster
+        amount = 0.0 if self._motion is None else self._motion.twitch_amount(t_s)
         texture = texture_of(view.spectral_sensitivity)
         if amount > 0.0 and self._motion is not None:
-            mesh, atlas = self._motion.twitched(subject.mesh, amount), subject.atlas
+            mesh, atlas = self._motion.apply_twitch(subject.mesh, amount), subject.atlas
             caster = Caster(mesh, choice=caster.choice)
             # The relief turns with the surface below it.
             turned = dilate_texture(unwrap(mesh, atlas.size).normal - atlas.normal, atlas.covered)
             texture = np.concatenate([texture[..., :-3], texture[..., -3:] + turned], axis=-1)
-        return at_skin(caster, moved, texture, how, distortion), caster
+        return observe_face(caster, moved, texture, how, distortion), caster
 
 
 def _vector(values: Float64Array) -> tuple[float, float, float]:
@@ -147,8 +149,8 @@ class DomeSubsurfaceRadiance:
 
     def __init__(self, scattering: Callable[[str], LateralScattering]) -> None:
         self._scattering = scattering
-        self._kept: Kept[tuple[str, int, float], tuple[np.float32, Float16Array]] = Kept(
-            lambda glow: KEPT_GLOW_BYTES // glow[1].nbytes
+        self._kept: LruCache[tuple[str, int, float], tuple[np.float32, Float16Array]] = LruCache(
+            lambda glow: SUBSURFACE_CACHE_BYTES // glow[1].nbytes
         )
 
     def on_rows(self, hits: Hits, lamp: Lamp, view: View, light: int, t_s: float) -> Float32Array:
@@ -174,7 +176,7 @@ class DomeSubsurfaceRadiance:
 
         def lit() -> tuple[np.float32, Float16Array]:
             glow = self._scattering(camera).glow(lamp)
-            unit = np.float32(max(float(glow.max()), 1e-30) / HALF_RANGE)
+            unit = np.float32(max(float(glow.max()), 1e-30) / FLOAT16_SCALE)
             return unit, np.asarray(glow / unit, np.float16)
 
         unit, kept = self._kept.get((camera, light, t_s), lit)
@@ -182,8 +184,12 @@ class DomeSubsurfaceRadiance:
         return unit * sample(kept.astype(np.float32), uv, np.ones(len(uv), np.bool_))
 
 
-def at_skin(
-    caster: Caster, view: View, texture: Float32Array, how: Looking, distortion: ArrayLike | None
+def observe_face(
+    caster: Caster,
+    view: View,
+    texture: Float32Array,
+    settings: CameraSettings,
+    distortion: ArrayLike | None,
 ) -> Hits:
     """Look at a face.
 
@@ -202,16 +208,20 @@ def at_skin(
     def look_up(buffers: GBuffer, rows: Int32Array) -> tuple[Float32Array, Float32Array]:
         uv = buffers.uv.reshape(-1, 2)[rows]
         values = sample(texture, uv, np.ones(len(rows), np.bool_))
-        return unit(values[:, -3:]), np.maximum(values[:, :-3], 0.0)
+        return normalize(values[:, -3:]), np.maximum(values[:, :-3], 0.0)
 
-    return find_hits(caster, view, look_up, how, SKIN_ROWS, distortion)
+    return find_hits(caster, view, look_up, settings, SKIN_ROWS, distortion)
 
 
-def at_target(
-    caster: Caster, view: View, target: Target, how: Looking, distortion: ArrayLike | None
+def observe_target(
+    caster: Caster,
+    view: View,
+    target: Target,
+    settings: CameraSettings,
+    distortion: ArrayLike | None,
 ) -> Hits:
     """Look at a target that reflects."""
-    rgb = target.rgb(view.spectral_sensitivity, how.illuminant)
+    rgb = target.rgb(view.spectral_sensitivity, settings.illuminant)
 
     def look_up(buffers: GBuffer, rows: Int32Array) -> tuple[Float32Array, Float32Array]:
         uv = buffers.uv.reshape(-1, 2)[rows]
@@ -224,10 +234,10 @@ def at_target(
         return buffers.normal.reshape(-1, 3)[rows], surface
 
     kind = METAL_ROWS if target.kind == "metal" else MATT_ROWS
-    return find_hits(caster, view, look_up, how, kind, distortion)
+    return find_hits(caster, view, look_up, settings, kind, distortion)
 
 
-def unit(vectors: Float32Array) -> Float32Array:
+def normalize(vectors: Float32Array) -> Float32Array:
     """Return vectors of length 1, shape (..., 3); those of length 0 stay."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.asarray(vectors / np.maximum(length, np.float32(1e-6)), np.float32)

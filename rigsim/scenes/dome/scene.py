@@ -26,29 +26,29 @@ from capture.rig import Light, Rig, View
 from model import spectra
 from model.skin import SkinAppearance
 from rigsim.arrays import Float32Array, Float64Array, UInt16Array
-from rigsim.as_built.dome import BuiltDome
+from rigsim.as_built.dome import ActualDome
 from rigsim.boxes.led_table import LedPulse
+from rigsim.caching import LruCache, cached_method
 from rigsim.geometry.atlas import dilate_texture, sample
-from rigsim.kept import Kept, kept
 from rigsim.light import olat, surface_brdf
-from rigsim.light.interreflection import Bounces, interreflection_for
+from rigsim.light.interreflection import InterreflectionSettings, interreflection_for
 from rigsim.light.lateral_scattering import LateralScattering
 from rigsim.light.led_light import white_intensity
-from rigsim.light.olat import Hits, Lamp, Looking
+from rigsim.light.observed_skin import ObservedSkin
+from rigsim.light.olat import CameraSettings, Hits, Lamp
 from rigsim.light.olat_kernels import SKIN_ROWS
 from rigsim.light.relief_shadow import ReliefShadow
-from rigsim.light.seen_skin import SeenSkin
 from rigsim.light.surface_brdf import SkinSurface, skin_surface
 from rigsim.needs import face as face_needs
-from rigsim.needs.dome import dome_needs, least_noise
-from rigsim.needs.effect_sizes import exchange_share
-from rigsim.needs.effects import EFFECTS_BY_SIZE, Noise, SceneEffects
+from rigsim.needs.dome import min_noise, select_dome_effects
+from rigsim.needs.effect_sizes import max_exchange_fraction
+from rigsim.needs.effects import AUTOMATIC_EFFECTS, PixelNoise, SceneEffects
 from rigsim.population import conditions as skin_conditions
 from rigsim.render import Caster
 from rigsim.render.variant import VariantChoice
 from rigsim.scenes.dome import truth as dome_truth
-from rigsim.scenes.dome.rows import DomeRows, DomeSubsurfaceRadiance, unit
-from rigsim.scenes.exposing import FaceScene, SceneError, full_power_s
+from rigsim.scenes.dome.rows import DomeRows, DomeSubsurfaceRadiance, normalize
+from rigsim.scenes.exposing import FaceScene, SceneError, full_power_duration_s
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.head_motion import HeadMotion
 from rigsim.targets import Target
@@ -56,8 +56,8 @@ from rigsim.targets import Target
 LED_POWER_DEVIATION: Final = 0.001
 """Relative standard deviation of an LED's energy from pulse to pulse."""
 
-KEPT_FRAMES: Final = 16
-KEPT_FRAME_BYTES: Final = 2**28
+MAX_CACHED_FRAMES: Final = 16
+FRAME_CACHE_BYTES: Final = 2**28
 """Latest frames that are kept, the more of the two, so that a second exposure costs nothing."""
 
 
@@ -102,13 +102,13 @@ class DomeScene(FaceScene):
         rig: Rig,
         subject: SimulatedSubject | Target,
         *,
-        dome: BuiltDome | None = None,
+        dome: ActualDome | None = None,
         motion: HeadMotion | None = None,
         state: str = "neutral",
         movement: bool = True,
         conditions: Mapping[str, float] | None = None,
         seed: int = 0,
-        effects: SceneEffects = EFFECTS_BY_SIZE,
+        effects: SceneEffects = AUTOMATIC_EFFECTS,
         on_s: float | None = None,
         subpixels: int = 2,
         choice: VariantChoice | None = None,
@@ -117,22 +117,22 @@ class DomeScene(FaceScene):
             if light.power_w is None:
                 raise SceneError(f"light {light.name!r}: is no LED, it has no power_w")
         if dome is None:
-            dome = BuiltDome(rig, rig, np.array([_toward_origin(light) for light in rig.lights]))
+            dome = ActualDome(rig, rig, np.array([_toward_origin(light) for light in rig.lights]))
         self.dome = dome
-        self.conditions = skin_conditions.checked(conditions or {})
+        self.conditions = skin_conditions.validate_conditions(conditions or {})
         if isinstance(subject, SimulatedSubject):
-            subject = skin_conditions.conditioned_subject(subject, self.conditions)
+            subject = skin_conditions.condition_subject(subject, self.conditions)
         elif self.conditions:
             raise SceneError(f"conditions: got {', '.join(self.conditions)}, but a target has none")
         super().__init__(dome.rig, subject, state, movement, None, seed, subpixels)
         self.motion = motion
         self._effects = effects
         self._caster = Caster(self.subject.mesh, choice=choice)
-        noise = least_noise([Noise.of(sensor) for sensor in self._sensors.values()])
-        share = exchange_share(self._caster)
+        noise = min_noise([PixelNoise.of(sensor) for sensor in self._sensors.values()])
+        share = max_exchange_fraction(self._caster)
         scenery = self._scenery(rig.views[0], self._caster, share, noise, effects)
-        white = None if on_s is None else on_s * self._white_in_origin()
-        self.needs = dome_needs(rig, self.subject, state, scenery, white, movement, motion)
+        white = None if on_s is None else on_s * self._white_level_at_origin()
+        self.needs = select_dome_effects(rig, self.subject, state, scenery, white, movement, motion)
         self.interreflections = self.needs.builds(face_needs.INTERREFLECTION_EFFECT)
         self.subsurface = self.needs.builds(face_needs.LATERAL_EFFECT)
         self.optics = self.needs.builds(face_needs.LENS_EFFECT)
@@ -143,22 +143,24 @@ class DomeScene(FaceScene):
                 self._relief = ReliefShadow(self.subject)
             if self.subsurface or self.interreflections:
                 self._glow = DomeSubsurfaceRadiance(self._scattering)
-        how = Looking(subpixels, self._illuminant, self.optics)
+        how = CameraSettings(subpixels, self._illuminant, self.optics)
         self._rows = DomeRows(dome, self.subject, self._caster, motion, how)
         # a capture comes back to each light in its next pass
-        self._frames: Kept[tuple[str, int, float], Float32Array] = Kept(
-            lambda frame: max(KEPT_FRAMES, KEPT_FRAME_BYTES // frame.nbytes)
+        self._frames: LruCache[tuple[str, int, float], Float32Array] = LruCache(
+            lambda frame: max(MAX_CACHED_FRAMES, FRAME_CACHE_BYTES // frame.nbytes)
         )
 
-    @kept
+    @cached_method
     def _scattering(self, camera: str) -> LateralScattering:
         """Return the face, ready to be lit from within for a camera's colors."""
-        skin = SeenSkin(self._face(), "neutral", camera, self._illuminant)
+        skin = ObservedSkin(self._face(), "neutral", camera, self._illuminant)
         bounces = None
         if self.interreflections:
             spectral = self.needs.builds(face_needs.SPECTRAL_EFFECT)
             enough = self._last_bounce(self._effects)
-            bounces = Bounces(interreflection_for(self._caster), spectral, enough=enough)
+            bounces = InterreflectionSettings(
+                interreflection_for(self._caster), spectral, min_bounce_fraction=enough
+            )
         surface, spread = self._surface(camera), self.subsurface
         return LateralScattering(skin, surface, self._caster, spread, bounces, self._relief)
 
@@ -180,7 +182,7 @@ class DomeScene(FaceScene):
             return np.zeros(3, np.float32)
         return white_intensity(led, self._camera(view_name)).astype(np.float32)
 
-    def _white_in_origin(self) -> Float64Array:
+    def _white_level_at_origin(self) -> Float64Array:
         """Return full scales per second of a white plate that faces the brightest light."""
         each = [
             white_intensity(light, self.rig.views[0]) / float(np.square(light.position_mm).sum())
@@ -211,10 +213,10 @@ class DomeScene(FaceScene):
         view = self._camera(view_name)
         chosen = range(len(self.rig.lights)) if lights is None else lights
         if len(chosen) == 1:  # the usual stream, one light after the other, is not copied
-            return self._render(view, chosen[0], self._rows.instant(t_s))[None]
+            return self._render(view, chosen[0], self._rows.pose_time_s(t_s))[None]
         out = np.empty((len(chosen), view.height_px, view.width_px, 3), np.float32)
         for k, light in enumerate(chosen):
-            out[k] = self._render(view, light, self._rows.instant(t_s))
+            out[k] = self._render(view, light, self._rows.pose_time_s(t_s))
         return out
 
     def exposure(
@@ -241,15 +243,15 @@ class DomeScene(FaceScene):
         view = self._camera(view_name)
 
         def frame(pulse: LedPulse) -> Float32Array:
-            middle = self._rows.instant(0.5 * (pulse.t_on_s + pulse.t_off_s))
-            led = self.dome.answering(pulse.led)
+            middle = self._rows.pose_time_s(0.5 * (pulse.t_on_s + pulse.t_off_s))
+            led = self.dome.light_of_channel(pulse.led)
             render = partial(self._render, view, led, middle)
             return self._frames.get((view.name, led, middle), render)
 
         return self._expose(
             view,
             pops,
-            lambda pulse: full_power_s(pulse, f"LED {pulse.led}"),
+            lambda pulse: full_power_duration_s(pulse, f"LED {pulse.led}"),
             frame,
             deviation=LED_POWER_DEVIATION,
             exposure_s=exposure_s,
@@ -284,8 +286,8 @@ class DomeScene(FaceScene):
             A target stands there; only faces have these maps.
         """
         self._face()
-        hits, _ = self._rows.seen(self._camera(view_name), 0.0, self._texture)
-        return dome_truth.maps_of(hits)
+        hits, _ = self._rows.visible_rows(self._camera(view_name), 0.0, self._texture)
+        return dome_truth.image_truth_maps(hits)
 
     def truth_appearance(self, view_name: str | None = None) -> SkinAppearance:
         """Return the truth on the face's own texture, at time 0.
@@ -299,17 +301,17 @@ class DomeScene(FaceScene):
         -------
         SkinAppearance
             ``position`` in mm and ``normals`` with relief (rig frame), ``r_d``, ``r_d_floor``
-            (`rigsim.light.surface_brdf.surface_floor`: by how much eq. (6)'s minimum lies above r_d
-            even without noise), ``reflectance`` (at normal incidence), ``roughness``, ``oil``,
-            ``fuzz``, ``normals_tangent`` (`Subject.tangent_normal`: texture frame, relief and
-            wrinkles alone; comparable between states texel by texel); of a face that has moved also
+            (`rigsim.light.surface_brdf.min_surface_reflection`: by how much eq. (6)'s minimum lies
+            above r_d even without noise), ``reflectance`` (at normal incidence), ``roughness``,
+            ``oil``, ``fuzz``, ``normals_tangent`` (`Subject.tangent_normal`: texture frame, relief
+            and wrinkles alone; comparable between states texel by texel); of a moved face also
             ``position_at_rest``, of one under conditions its coating (`Coating`); valid on bare
             skin. All is that of the skin under its conditions.
         """
         surface = self.surface(self._camera(view_name))
-        left_out = tuple(self.left_out)
-        return dome_truth.appearance_of(
-            self._face(), surface, self.conditions, left_out=left_out, seed=self.seed
+        left_out = tuple(self.omitted)
+        return dome_truth.texture_truth(
+            self._face(), surface, self.conditions, omitted=left_out, seed=self.seed
         )
 
     def brdf(
@@ -343,7 +345,9 @@ class DomeScene(FaceScene):
         texture = self._texture(self._camera(view_name).spectral_sensitivity)
         points = np.atleast_2d(np.asarray(uv, np.float32))
         values = sample(texture, points, np.ones(len(points), np.bool_))
-        return surface_brdf.evaluate(values[:, :-3], unit(values[:, -3:]), to_light, to_camera)
+        return surface_brdf.evaluate_brdf(
+            values[:, :-3], normalize(values[:, -3:]), to_light, to_camera
+        )
 
     # inside -----------------------------------------------------------------------------------
 
@@ -351,13 +355,13 @@ class DomeScene(FaceScene):
         """Return how the face reflects for a camera, under its conditions."""
         return self._surface(view.spectral_sensitivity)
 
-    @kept
+    @cached_method
     def _surface(self, camera: str) -> SkinSurface:
         face = self._face()
         bare = skin_surface(face, camera, self._illuminant, state=self.state)
-        return skin_conditions.coated(face, bare, self.conditions)
+        return skin_conditions.apply_conditions(face, bare, self.conditions)
 
-    @kept
+    @cached_method
     def _texture(self, camera: str) -> Float32Array:
         """Return the surface and its normals with relief, shape (N, N, 10) or (N, N, 14)."""
         surface = self._surface(camera)
@@ -370,7 +374,7 @@ class DomeScene(FaceScene):
         shape = (view.height_px, view.width_px, 3)
         if isinstance(self.subject, Target) and self.subject.kind == "cap":
             return np.zeros(shape, np.float32)
-        hits, caster = self._rows.seen(view, t_s, self._texture)
+        hits, caster = self._rows.visible_rows(view, t_s, self._texture)
         lamp = self._rows.lamp(light, t_s)
         gain = np.float32(self.dome.gain.get(view.name, 1.0))
         color = gain * self.intensity(light, view_name=view.name)
@@ -380,17 +384,19 @@ class DomeScene(FaceScene):
         diffuse = not (self.subsurface and glow is not None)
         relief = self._relief_of(hits, lamp)
         if hits.kind == SKIN_ROWS and caster.scene is not None:
-            rows = self._rows.vector_light(view, t_s, hits, caster)
-            return rows.light_up(lamp, color, glow, diffuse=diffuse, relief=relief)
-        visible = olat.seen_from(hits, caster, lamp)
-        return olat.light_up(hits, lamp, visible, color, glow, diffuse=diffuse, relief=relief)
+            rows = self._rows.vectorized_shader(view, t_s, hits, caster)
+            return rows.shade_rows(lamp, color, glow, diffuse=diffuse, relief=relief)
+        visible = olat.is_lamp_visible(hits, caster, lamp)
+        return olat.shade_rows(hits, lamp, visible, color, glow, diffuse=diffuse, relief=relief)
 
     def _relief_of(self, hits: Hits, lamp: Lamp) -> Float32Array | None:
         """Return which part of a light the texture's relief leaves to each row."""
         if self._relief is None or hits.kind != SKIN_ROWS:
             return None
         uv = hits.texture_uv()
-        return self._relief.seen(uv, hits.position_mm, lamp.position_mm, radius_mm=lamp.radius_mm)
+        return self._relief.visible_fraction(
+            uv, hits.position_mm, lamp.position_mm, radius_mm=lamp.radius_mm
+        )
 
 
 def _toward_origin(light: Light) -> Float64Array:

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from capture.rig import Rig, View
 from rigsim.arrays import Float32Array, Float64Array, Int64Array, UInt16Array
-from rigsim.as_built.dome import BuiltDome, build, image_of, pixel_corner_rays
+from rigsim.as_built.dome import ActualDome, build_dome, pixel_corner_rays, project_points
 from rigsim.boxes.led_table import LedPulse
-from rigsim.kept import kept
+from rigsim.caching import cached_method
 from rigsim.light.led_light import lobe_exponent, white_intensity
-from rigsim.needs.effects import Effect, EffectSelection, Noise, decide, left_out_of
+from rigsim.needs.effects import Effect, EffectSelection, PixelNoise, decide_effect, omitted_effects
 from rigsim.package_data import package_table
 from rigsim.scenes.dome.scene import LED_POWER_DEVIATION
-from rigsim.scenes.exposing import RigScene, SceneError, full_power_s
-from rigsim.sensor import expose, sensor_of
+from rigsim.scenes.exposing import RigScene, SceneError, full_power_duration_s
+from rigsim.sensor import expose_sensor, make_sensor
 from rigsim.targets import mirror_ball, printed_plate
 from rigsim.targets.printed_plate import CELL_MM, Plate
 
@@ -32,25 +32,25 @@ Kind: TypeAlias = Literal["charuco", "mirror", "white"]
 BALL_RADIUS_MM: Final = 50.0
 WHITE_SLOPE_DEG: Final = 0.05
 """RMS slope of the white plate's surface in each direction."""
-LED_SIZES: Final = 2e-4
+MAX_LED_DISC_VARIATION: Final = 2e-4
 """By how much light of an LED's disc differs from that of its middle, relative, at most."""
 
-_Place: TypeAlias = tuple[float, float, float, float, float, float]
-BOARD_PLACES: Final[tuple[_Place, ...]] = package_table("dome_targets")["board_places"]
+_TargetPose: TypeAlias = tuple[float, float, float, float, float, float]
+BOARD_POSES: Final[tuple[_TargetPose, ...]] = package_table("dome_targets")["board_places"]
 """Azimuth and elevation of the front's normal, turn in its plane (degrees), middle (mm)."""
 
-PLATE_PLACES: Final[tuple[_Place, ...]] = package_table("dome_targets")["plate_places"]
+PLATE_POSES: Final[tuple[_TargetPose, ...]] = package_table("dome_targets")["plate_places"]
 """The same of the white plate; the first three face most lights."""
 
-BALL_PLACES: Final[tuple[tuple[float, float, float], ...]] = package_table("dome_targets")[
+BALL_POSITIONS: Final[tuple[tuple[float, float, float], ...]] = package_table("dome_targets")[
     "ball_places"
 ]
 """Middle of the ball, mm."""
 
 TARGET_POSES: Final[dict[str, int]] = {
-    "charuco": len(BOARD_PLACES),
-    "mirror": len(BALL_PLACES),
-    "white": len(PLATE_PLACES),
+    "charuco": len(BOARD_POSES),
+    "mirror": len(BALL_POSITIONS),
+    "white": len(PLATE_POSES),
 }
 """How many places each target has."""
 
@@ -75,7 +75,7 @@ class TargetScene(RigScene):
     """
 
     def __init__(
-        self, kind: Kind, dome: BuiltDome, *, seed: int, slope_deg: float = WHITE_SLOPE_DEG
+        self, kind: Kind, dome: ActualDome, *, seed: int, slope_deg: float = WHITE_SLOPE_DEG
     ) -> None:
         if kind not in get_args(Kind):
             raise SceneError(f"target: got {kind!r}, expected one of {', '.join(get_args(Kind))}")
@@ -97,8 +97,8 @@ class TargetScene(RigScene):
         self._exponent = np.array([lobe_exponent(light) for light in lights])
 
     def _needs(self) -> EffectSelection:
-        noise = Noise.of(sensor_of(self.rig.views[0]))
-        sizes = noise.share(LED_SIZES)
+        noise = PixelNoise.of(make_sensor(self.rig.views[0]))
+        sizes = noise.change_over_noise(MAX_LED_DISC_VARIATION)
         mirror = self.kind == "mirror"
         effects = [
             Effect(
@@ -106,18 +106,18 @@ class TargetScene(RigScene):
                 "built" if mirror else "absent",
                 "the ball mirrors them" if mirror else "paper is matt",
             ),
-            decide(
+            decide_effect(
                 "sizes of the LEDs in the light on plates",
                 sizes,
                 None,
                 switch="",
-                because=f"{100 * LED_SIZES:g} % of the light",
+                reason=f"{100 * MAX_LED_DISC_VARIATION:g} % of the light",
             ),
-            *left_out_of("dome_target"),
+            *omitted_effects("dome_target"),
         ]
         return EffectSelection(tuple(effects))
 
-    def show(self, pose: int) -> None:
+    def set_pose(self, pose: int) -> None:
         """Put the target into its place number ``pose``."""
         if not 0 <= pose < TARGET_POSES[self.kind]:
             raise SceneError(f"pose: got {pose}, expected 0 to {TARGET_POSES[self.kind] - 1}")
@@ -148,12 +148,12 @@ class TargetScene(RigScene):
         rng = np.random.default_rng([self.seed, seed])
         on_s = np.zeros(len(self.rig.lights))
         for pulse in pops:
-            energy = full_power_s(pulse, f"LED {pulse.led}")
-            light = self.dome.answering(pulse.led)
+            energy = full_power_duration_s(pulse, f"LED {pulse.led}")
+            light = self.dome.light_of_channel(pulse.led)
             if self.rig.lights[light].name not in self.dome.dead:
                 on_s[light] += energy * (1.0 + LED_POWER_DEVIATION * rng.standard_normal())
-        return expose(
-            self.light(view_name, on_s), sensor=sensor_of(view), rng=rng, exposure_s=exposure_s
+        return expose_sensor(
+            self.light(view_name, on_s), sensor=make_sensor(view), rng=rng, exposure_s=exposure_s
         )
 
     def light(self, view_name: str, on_s: Sequence[float] | Float64Array) -> Float32Array:
@@ -181,7 +181,7 @@ class TargetScene(RigScene):
             rays, eye = self._corner_rays(view), np.array(view.position_mm)
             paper = (self._plate.reflectance, CELL_MM, self._plate.waviness)
             how = (paper, lamps, EDGE_SUBPIXELS)
-            gray = printed_plate.plate_light(rays, eye, *self.plate_pose(), *how)
+            gray = printed_plate.render_plate(rays, eye, *self.plate_pose(), *how)
         return np.asarray(gray[..., None] * color.astype(np.float32))
 
     def plate_pose(self, pose: int | None = None) -> tuple[Float64Array, Float64Array]:
@@ -190,13 +190,13 @@ class TargetScene(RigScene):
         A plate's own axes are x right and y down as seen from its front, z into it.
         """
         number = self.pose if pose is None else pose
-        places = BOARD_PLACES if self.kind == "charuco" else PLATE_PLACES
+        places = BOARD_POSES if self.kind == "charuco" else PLATE_POSES
         values = np.array(places[number], np.float64)
         if number > 0 or self.kind == "white":
             hand = self._hand[number]
             values = values + hand * ([PLACEMENT_DEVIATION_DEG] * 3 + [PLACEMENT_DEVIATION_MM] * 3)
         azimuth, elevation, turn = np.radians(values[:3])
-        front = _front(azimuth, elevation)
+        front = _front_normal(azimuth, elevation)
         right = np.array([math.cos(azimuth), 0.0, -math.sin(azimuth)])
         down = -np.cross(front, right)
         x = math.cos(turn) * right + math.sin(turn) * down
@@ -204,10 +204,10 @@ class TargetScene(RigScene):
         width, height = self._plate.size_mm
         return rotation, values[3:] - rotation @ np.array([width / 2, height / 2, 0.0])
 
-    def ball_mm(self, pose: int | None = None) -> Float64Array:
+    def ball_center_mm(self, pose: int | None = None) -> Float64Array:
         """Return the middle of the mirror ball."""
         number = self.pose if pose is None else pose
-        return np.array(BALL_PLACES[number]) + PLACEMENT_DEVIATION_MM * self._hand[number, :3]
+        return np.array(BALL_POSITIONS[number]) + PLACEMENT_DEVIATION_MM * self._hand[number, :3]
 
     def truth(self) -> dict[str, Any]:
         """Return what calibration should find; lengths in mm, rig frame.
@@ -217,8 +217,8 @@ class TargetScene(RigScene):
         dict
             ``position_mm`` (L, 3), ``axis`` (L, 3), ``exponent`` (L,) of the lights in the order of
             the rig; ``intensity`` (L, 3) in the unit of `rigsim.light.led_light.white_intensity`, 0
-            where dead; ``gain`` by view; ``ball_mm`` (places, 3) or ``plate_pose`` (a list of
-            rotation and place).
+            where dead; ``gain`` by view; ``draw_ball_center_mm`` (places, 3) or ``plate_pose`` (a
+            list of rotation and place).
         """
         view = self.rig.views[0]
         alive = np.array([light.name not in self.dome.dead for light in self.rig.lights])
@@ -232,21 +232,23 @@ class TargetScene(RigScene):
         }
         places = range(TARGET_POSES[self.kind])
         if self.kind == "mirror":
-            out["ball_mm"] = np.array([self.ball_mm(k) for k in places])
+            out["ball_mm"] = np.array([self.ball_center_mm(k) for k in places])
         else:
             out["plate_pose"] = [self.plate_pose(k) for k in places]
         return out
 
-    @kept
+    @cached_method
     def _corner_rays(self, view: View) -> Float64Array:
         return pixel_corner_rays(view, self.dome.distortion.get(view.name, np.zeros(5)))
 
-    def _ball(self, view: View, lit: NDArray[np.intp], lamps: mirror_ball.Lamps) -> Float32Array:
+    def _ball(
+        self, view: View, lit: NDArray[np.intp], lamps: mirror_ball.LampArrays
+    ) -> Float32Array:
         rays, eye = self._corner_rays(view), np.array(view.position_mm)
-        place = self.ball_mm()
+        place = self.ball_center_mm()
         ball = (place, BALL_RADIUS_MM, mirror_ball.CHROMIUM_REFLECTANCE)
-        cloth = mirror_ball.light_on_cloth(lamps)
-        image = mirror_ball.surroundings(rays, eye, ball, cloth, EDGE_SUBPIXELS)
+        cloth = mirror_ball.cloth_radiance(lamps)
+        image = mirror_ball.render_cloth(rays, eye, ball, cloth, EDGE_SUBPIXELS)
         for index, lamp, axis, exponent, strength in zip(lit, *lamps, strict=True):
             radius = self.rig.lights[index].radius_mm
             led = (lamp, axis, float(exponent), radius, float(strength))
@@ -258,7 +260,7 @@ class TargetScene(RigScene):
         return np.asarray(image)
 
     def _box(
-        self, view: View, ball: Float64Array, led: mirror_ball.Led, reflected: bool
+        self, view: View, ball: Float64Array, led: mirror_ball.LedArrays, reflected: bool
     ) -> Int64Array | None:
         """Return rows and columns that an LED can cover, or None outside the image."""
         lamp, axis, _, radius, _ = led
@@ -272,7 +274,7 @@ class TargetScene(RigScene):
         if reflected:
             rim = [mirror_ball.reflection_point(eye, place, ball, BALL_RADIUS_MM) for place in rim]
         distortion = self.dome.distortion.get(view.name, np.zeros(5))
-        px = image_of(view, distortion, np.array(rim))
+        px = project_points(view, distortion, np.array(rim))
         if not np.isfinite(px).all():
             return None
         low = np.floor(px.min(axis=0)) - 1
@@ -290,7 +292,9 @@ SPOT_SUBPIXELS: Final = 12
 """Rays along each side of pixels near an LED's image."""
 
 
-def target_scene(kind: Kind, rig: Rig, *, seed: int, dome: BuiltDome | None = None) -> TargetScene:
+def make_target_scene(
+    kind: Kind, rig: Rig, *, seed: int, dome: ActualDome | None = None
+) -> TargetScene:
     """Return a target in a dome built after a drawing.
 
     Parameters
@@ -308,22 +312,22 @@ def target_scene(kind: Kind, rig: Rig, *, seed: int, dome: BuiltDome | None = No
     -------
     TargetScene
     """
-    return TargetScene(kind, dome or build(rig, seed=seed), seed=seed)
+    return TargetScene(kind, dome or build_dome(rig, seed=seed), seed=seed)
 
 
 def plate_normals() -> list[tuple[float, float, float]]:
     """Return where the white plate's front looks in each place, before the operator's hand."""
-    turns = np.radians([place[:2] for place in PLATE_PLACES])
-    return [tuple(_front(azimuth, elevation).tolist()) for azimuth, elevation in turns]
+    turns = np.radians([place[:2] for place in PLATE_POSES])
+    return [tuple(_front_normal(azimuth, elevation).tolist()) for azimuth, elevation in turns]
 
 
-def _front(azimuth: float, elevation: float) -> Float64Array:
+def _front_normal(azimuth: float, elevation: float) -> Float64Array:
     """Return where a plate's front looks that is turned by angles in rad."""
     x, z = math.sin(azimuth), math.cos(azimuth)
     return np.array([math.cos(elevation) * x, math.sin(elevation), math.cos(elevation) * z])
 
 
-def board(kind: Literal["charuco", "white"]) -> Plate:
+def make_board(kind: Literal["charuco", "white"]) -> Plate:
     """Return the printed target of a kind, its surface flat."""
     if kind == "charuco":
         return printed_plate.charuco_board()

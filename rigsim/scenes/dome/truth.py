@@ -11,17 +11,17 @@ from rigsim.light import olat, surface_brdf
 from rigsim.light.olat import Hits
 from rigsim.light.surface_brdf import SkinSurface
 from rigsim.population.population import MAX_SKIN_HAIR
-from rigsim.scenes.dome.rows import unit
+from rigsim.scenes.dome.rows import normalize
 from rigsim.subject import SimulatedSubject
 
 COATING_MAPS: Final = ("film", "film_alpha", "film_eta", "powder")
 """Names of a coating's maps, in the order of `SkinSurface.packed` (`rigsim.light.surface_brdf`)."""
 
 
-def maps_of(hits: Hits) -> dict[str, NDArray[np.generic]]:
+def image_truth_maps(hits: Hits) -> dict[str, NDArray[np.generic]]:
     """Return the maps of `rigsim.scenes.dome.scene.DomeScene.truth`: means over pixels, no lens."""
     surface = olat.unpack_surface(hits.surface)
-    normals = unit(hits.scatter(hits.normals()))
+    normals = normalize(hits.scatter(hits.normals()))
     maps = hits.scatter(surface)
     hair = hits.scatter(1.0 - surface[:, 6:7])[..., 0]
     coverage = hits.coverage()
@@ -41,18 +41,18 @@ def maps_of(hits: Hits) -> dict[str, NDArray[np.generic]]:
     }
 
 
-def appearance_of(
+def texture_truth(
     subject: SimulatedSubject,
     surface: SkinSurface,
     conditions: Mapping[str, float],
     *,
-    left_out: tuple[tuple[str, str], ...],
+    omitted: tuple[tuple[str, str], ...],
     seed: int,
 ) -> SkinAppearance:
     """Return the truth on a face's own texture, see `rigsim.scenes.dome.scene.DomeScene`."""
     valid = subject.atlas.covered & (subject.hair < MAX_SKIN_HAIR)
     floor = np.zeros(valid.shape, np.float32)
-    floor[valid] = surface_brdf.surface_floor(surface.packed()[valid])
+    floor[valid] = surface_brdf.min_surface_reflection(surface.packed()[valid])
     white = "camera RGB over that of a perfect white, without hair"
     maps = {
         "position": (subject.atlas.position_mm, MAP_UNITS["position"], "rig frame"),
@@ -91,6 +91,6 @@ def appearance_of(
             "subject_seed": subject.seed,
             "conditions": dict(conditions),
         },
-        left_out=left_out,
+        left_out=omitted,
         seed=seed,
     )

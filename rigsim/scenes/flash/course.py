@@ -16,20 +16,20 @@ from numpy.typing import NDArray
 from capture.rig import Rig
 from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.boxes.flash import FlashPop
-from rigsim.kept import kept
-from rigsim.needs.effects import EffectSelection, left_out_of
+from rigsim.caching import cached_method
+from rigsim.needs.effects import EffectSelection, omitted_effects
 from rigsim.scenes.exposing import RigScene, SceneError
 from rigsim.scenes.flash.scene import POP_ENERGY_DEVIATION, FlashScene, pop_energy
 from rigsim.sensor import Sensor
 from rigsim.subject import SimulatedSubject, landmarks
-from rigsim.subject.perfusion_course import Course, with_blood
+from rigsim.subject.perfusion_course import PerfusionCourse, fix_blood_level
 
 BLOOD_LEVELS: Final = (0.0, 0.5, 1.0)
 """Levels of the blood that are rendered."""
 
 
 @dataclass(frozen=True, slots=True)
-class FlashTime:
+class FlashEvent:
     """What a flash met."""
 
     token: str
@@ -65,33 +65,33 @@ class FlashCourseScene(RigScene):
         self,
         rig: Rig,
         subject: SimulatedSubject,
-        course: Course,
+        course: PerfusionCourse,
         *,
         seed: int = 0,
         movement: bool = True,
-        on_flash: Callable[[FlashTime], None] | None = None,
+        on_flash: Callable[[FlashEvent], None] | None = None,
     ) -> None:
         self.rig, self.subject, self.course = rig, subject, course
         self.seed, self.movement, self._on_flash = seed, movement, on_flash
 
-    def at(self, pose: str, level: float) -> FlashScene:
+    def scene_at(self, pose: str, level: float) -> FlashScene:
         """Return the scene of a pose and one of `BLOOD_LEVELS`; those of a pose share rays."""
         return self._scene(pose if self.movement else "neutral", level)
 
-    @kept
+    @cached_method
     def _scene(self, pose: str, level: float) -> FlashScene:
-        subject = with_blood(self.subject, self.course.state, level)
+        subject = fix_blood_level(self.subject, self.course.state, level)
         return FlashScene(self.rig, subject, state=pose, seed=self.seed)
 
     @cached_property
     def needs(self) -> EffectSelection:  # type: ignore[override]
         """What is built, what is not, and why."""
-        whole = self.at(self.course.state, 1.0).needs
-        return EffectSelection((*whole, *left_out_of("course")))
+        whole = self.scene_at(self.course.state, 1.0).needs
+        return EffectSelection((*whole, *omitted_effects("course")))
 
     def sensor(self, view_name: str | None = None) -> Sensor:
         """Return the sensor of a view; None takes the first."""
-        return self.at("neutral", BLOOD_LEVELS[0]).sensor(view_name)
+        return self.scene_at("neutral", BLOOD_LEVELS[0]).sensor(view_name)
 
     def radiance(
         self,
@@ -104,7 +104,7 @@ class FlashCourseScene(RigScene):
     ) -> Float32Array:
         """Return the light on the sensor at power 1 with blood at any level, shape (H, W, 3)."""
         total = None
-        for node, weight in zip(BLOOD_LEVELS, parabola_weights(level), strict=True):
+        for node, weight in zip(BLOOD_LEVELS, blood_level_weights(level), strict=True):
             if weight == 0.0:
                 continue
             shown = pose if self.movement else "neutral"
@@ -123,7 +123,7 @@ class FlashCourseScene(RigScene):
         def image(pop: FlashPop) -> Float32Array:
             level, pose = self.course.level(pop.t_s), self.course.pose(pop.t_s)
             if self._on_flash is not None:
-                self._on_flash(FlashTime(pop.token, pop.t_s, level, pose))
+                self._on_flash(FlashEvent(pop.token, pop.t_s, level, pose))
             return self.radiance(pose, level, pop.polarizer, pop.analyser_deg, view_name=view_name)
 
         return self._expose(
@@ -136,11 +136,11 @@ class FlashCourseScene(RigScene):
             seed=seed,
         )
 
-    @kept
+    @cached_method
     def _image(
         self, pose: str, level: float, polarizer: str, analyser_deg: float | None, view: str | None
     ) -> Float32Array:
-        return self.at(pose, level).radiance(polarizer, analyser_deg, view_name=view)
+        return self.scene_at(pose, level).radiance(polarizer, analyser_deg, view_name=view)
 
     def landmarks_px(self, pose: str = "neutral") -> dict[str, tuple[float, float]]:
         """Return where named points of the skin are in the first camera's image of a pose.
@@ -150,30 +150,30 @@ class FlashCourseScene(RigScene):
         dict
             Name to (x, y), px of the sensor, also of points that something stands before.
         """
-        face = self.at(pose, BLOOD_LEVELS[0]).subject
+        face = self.scene_at(pose, BLOOD_LEVELS[0]).subject
         if not isinstance(face, SimulatedSubject):
             raise SceneError(f"landmarks: got {face.name!r}, expected a face")
         points = face.surface_landmarks()
-        pixels = landmarks.project(points.on(face.mesh), self.rig.views[0])
+        pixels = landmarks.project_points(points.positions_on(face.mesh), self.rig.views[0])
         return {n: (float(x), float(y)) for n, (x, y) in zip(points.names, pixels, strict=True)}
 
     def hemoglobin(self, pose: str, levels: Sequence[float]) -> Float32Array:
         """Return the true blood seen by the first camera, shape (len(levels), H, W), 0 to 0.32."""
-        nodes = np.stack([self.at(pose, node).truth()["hemoglobin"] for node in BLOOD_LEVELS])
-        weights = np.array([parabola_weights(level) for level in levels])
+        nodes = np.stack([self.scene_at(pose, node).truth()["hemoglobin"] for node in BLOOD_LEVELS])
+        weights = np.array([blood_level_weights(level) for level in levels])
         return np.tensordot(weights, nodes, axes=1).astype(np.float32)
 
     def truth(self, pose: str, level: float) -> Mapping[str, NDArray[np.generic]]:
         """Return the truth maps of a pose at one of `BLOOD_LEVELS`; see `FlashScene.truth`."""
-        return self.at(pose, level).truth()
+        return self.scene_at(pose, level).truth()
 
 
-def parabola_weights(level: float) -> tuple[float, float, float]:
+def blood_level_weights(level: float) -> tuple[float, float, float]:
     """Return the weights of what is known at `BLOOD_LEVELS` for a level from 0 to 1; they sum to 1.
 
     Examples
     --------
-    >>> parabola_weights(0.25)
+    >>> blood_level_weights(0.25)
     (0.375, 0.75, -0.125)
     """
     a, b, c = BLOOD_LEVELS

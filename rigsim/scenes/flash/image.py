@@ -13,11 +13,15 @@ from rigsim import shading
 from rigsim.arrays import BoolArray, Float32Array, Float64Array
 from rigsim.as_built.polarizers import Polarizers, absorbing_axis
 from rigsim.geometry.atlas import dilate_texture, sample
+from rigsim.light.observed_skin import ObservedSkin
 from rigsim.light.olat import pixel_order
-from rigsim.light.seen_skin import SeenSkin
-from rigsim.light.subsurface_radiance import SubsurfaceRadiance, spread_through_pigment, toward
+from rigsim.light.subsurface_radiance import (
+    SubsurfaceRadiance,
+    direction_and_falloff,
+    scatter_through_pigment,
+)
 from rigsim.render import Caster, GBuffer, RenderError, g_buffer
-from rigsim.render.depth_of_field import LensPicture, LensSpread, before_focus
+from rigsim.render.depth_of_field import DefocusKernels, LensImage, depth_before_focus
 from rigsim.subject import SimulatedSubject
 from rigsim.targets import Target
 from rigsim.tissue.skin_layers import ETA
@@ -25,17 +29,17 @@ from rigsim.tissue.skin_layers import ETA
 RAYS_PER_BAND: Final = 1 << 21
 """Camera rays worked on at a time; bounds memory at full resolution."""
 
-WHITE_UNIT: Final = np.float32(4.0)
+WHITE_SCALE: Final = np.float32(4.0)
 """Stokes S0 of the white reference is 1 behind an ideal analyser when filtered light is counted in
 units of unfiltered irradiance over pi: the film takes half, the analyser another half."""
 
 _LIGHT_NAMES: Final = ("diffuse", "specular", "shading")
 
-Parts = dict[str, Float32Array]
+ImageLayers = dict[str, Float32Array]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Picture:
+class FlashImage:
     """What a camera gets, averaged over each pixel; light in units of the white reference."""
 
     diffuse: Float32Array
@@ -44,34 +48,34 @@ class Picture:
     """Light from the surface, shape (H, W, 3 Stokes), through the lens."""
     shading: Float32Array
     """Light from inside of a skin of reflectance 1, shape (H, W, 3 Stokes), without the lens."""
-    maps: Parts
+    maps: ImageLayers
     """Truth maps, averaged over each pixel's covered part."""
     coverage: Float32Array
     """Part of each pixel that is covered, shape (H, W), without the lens."""
-    reached: Float32Array
+    surface_fraction: Float32Array
     """Part of each pixel's light that comes from where there is a surface, shape (H, W)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Look:
+class FlashCamera:
     """One camera of the rig, looking."""
 
     rig: Rig
     """The rig."""
     view: View
     """The camera."""
-    films: Polarizers
+    polarizers: Polarizers
     """The polarizing films."""
     weights: Float64Array
     """Energy of each light over the sum that a plate at the origin gets, mm^2."""
     subpixels: int
     """Rays along each side of a pixel."""
-    spread: LensSpread | None = None
+    defocus: DefocusKernels | None = None
     """How the lens spreads light; None: it is sharp everywhere."""
 
-    def at_skin(
+    def observe_face(
         self, caster: Caster, subject: SimulatedSubject, state: str, glow: SubsurfaceRadiance
-    ) -> Picture:
+    ) -> FlashImage:
         """Look at a face.
 
         Parameters
@@ -91,7 +95,7 @@ class Look:
         textures = _textures(subject, state, glow)
         return self._in_bands(caster, lambda buffers: self._see_skin(buffers, textures))
 
-    def at_target(self, caster: Caster, target: Target) -> Picture:
+    def observe_target(self, caster: Caster, target: Target) -> FlashImage:
         """Look at a target that reflects.
 
         Parameters
@@ -108,10 +112,10 @@ class Look:
         """
         return self._in_bands(caster, lambda buffers: self._see_target(buffers, target))
 
-    def _in_bands(self, caster: Caster, see: Callable[[GBuffer], Parts]) -> Picture:
+    def _in_bands(self, caster: Caster, see: Callable[[GBuffer], ImageLayers]) -> FlashImage:
         k, view = self.subpixels, self.view
         rows_per_band = max(1, RAYS_PER_BAND // (view.width_px * k * k))
-        around = 0 if self.spread is None else self.spread.radius
+        around = 0 if self.defocus is None else self.defocus.radius
         bands = []
         for top in range(0, view.height_px, rows_per_band):
             bottom = min(top + rows_per_band, view.height_px)
@@ -121,11 +125,11 @@ class Look:
             parts = see(buffers)
             small, coverage = _shrink(parts, buffers.mask, k)
             small["reached"] = coverage
-            if self.spread is not None:
-                small |= _through_lens(parts, buffers, view, self.spread)
+            if self.defocus is not None:
+                small |= _blur_through_lens(parts, buffers, view, self.defocus)
             inner = slice(top - first, bottom - first)
             bands.append(({name: part[inner] for name, part in small.items()}, coverage[inner]))
-        maps: Parts = {
+        maps: ImageLayers = {
             name: np.concatenate([band[0][name] for band in bands]) for name in bands[0][0]
         }
         coverage = np.concatenate([band[1] for band in bands])
@@ -134,7 +138,7 @@ class Look:
                 raise RenderError(f"{name}: rendering gave values that are not finite")
         diffuse, specular, white = (maps.pop(name) for name in _LIGHT_NAMES)
         reached = maps.pop("reached")
-        return Picture(
+        return FlashImage(
             diffuse.reshape(*coverage.shape, 3, 3), specular, white, maps, coverage, reached
         )
 
@@ -156,19 +160,21 @@ class Look:
             Textures of shape (N, N[, 3]).
         """
         camera, light = self.view.spectral_sensitivity, self.rig.lights[0].illuminant
-        skin = SeenSkin(subject, state, camera, light)
+        skin = ObservedSkin(subject, state, camera, light)
         even = subject.atlas.covered.astype(np.float32)
-        blurred = spread_through_pigment(skin, glow.reflectance, even, glow.kernels)
-        melanin, blood = skin.color.nearest(blurred, subject.melanin, skin.blood)
+        blurred = scatter_through_pigment(skin, glow.reflectance, even, glow.kernels)
+        melanin, blood = skin.color.nearest_fractions(
+            blurred, subject.melanin, skin.blood_volume_fraction
+        )
         return {
             "reflectance_blurred": blurred,
             "melanin_blurred": melanin,
             "hemoglobin_blurred": blood,
         }
 
-    def at_maps(
+    def observe_maps(
         self, caster: Caster, subject: SimulatedSubject, maps: Mapping[str, Float32Array]
-    ) -> Picture:
+    ) -> FlashImage:
         """Look at maps of a face without light.
 
         Parameters
@@ -185,11 +191,11 @@ class Look:
         Picture
             With these truth maps only; no light.
         """
-        textures = _fillings(maps, subject)
+        textures = _dilate_textures(maps, subject)
         return self._in_bands(caster, lambda buffers: self._see_maps(buffers, textures))
 
-    def _see_maps(self, buffers: GBuffer, textures: dict[str, Float32Array]) -> Parts:
-        inside, uv, *_ = buffers.inside()
+    def _see_maps(self, buffers: GBuffer, textures: dict[str, Float32Array]) -> ImageLayers:
+        inside, uv, *_ = buffers.hit_samples()
         everywhere = np.ones(len(inside), np.bool_)
         parts = {"diffuse": np.zeros((len(inside), 3, 3), np.float32)}
         parts |= {name: np.zeros((len(inside), 3), np.float32) for name in _LIGHT_NAMES[1:]}
@@ -198,8 +204,8 @@ class Look:
             parts[name] = values[:, 0] if values.shape[1] == 1 else values
         return {name: _scatter(values, inside, buffers.mask) for name, values in parts.items()}
 
-    def _see_skin(self, buffers: GBuffer, textures: dict[str, Float32Array]) -> Parts:
-        inside, uv, position, _, to_camera = buffers.inside()
+    def _see_skin(self, buffers: GBuffer, textures: dict[str, Float32Array]) -> ImageLayers:
+        inside, uv, position, _, to_camera = buffers.hit_samples()
         everywhere = np.ones(len(inside), np.bool_)
         seen = {name: sample(layer, uv, everywhere) for name, layer in textures.items()}
         normal = seen["normals"]
@@ -210,7 +216,7 @@ class Look:
         bare = 1.0 - seen["hair"]  # hair hides the skin and its shine
         specular = np.zeros_like(leaving)
         for k, light in enumerate(self.rig.lights):
-            to_light, falloff = toward(light, position)
+            to_light, falloff = direction_and_falloff(light, position)
             lobe = shading.specular_stokes(
                 normal,
                 to_light,
@@ -219,15 +225,15 @@ class Look:
                 eta=ETA,
                 light_absorbs=absorbing_axis(light),
                 image_right=right,
-                extinction=self.films.light_extinction,
+                extinction=self.polarizers.light_extinction,
             )
             strength = np.float32(self.weights[k] * math.pi) * falloff * seen["visible"][:, k]
             specular += strength[:, None] * lobe
         scale = np.float32(shading.interior_scale(ETA))
         parts = {
-            "diffuse": WHITE_UNIT * leaving[:, :, None] * seen.pop("glow")[:, None, :],
-            "specular": WHITE_UNIT * bare * specular,
-            "shading": WHITE_UNIT * scale * seen.pop("entered") * leaving,
+            "diffuse": WHITE_SCALE * leaving[:, :, None] * seen.pop("glow")[:, None, :],
+            "specular": WHITE_SCALE * bare * specular,
+            "shading": WHITE_SCALE * scale * seen.pop("entered") * leaving,
             "position_mm": position,
             "uv": uv,
         }
@@ -237,16 +243,16 @@ class Look:
         }
         return {name: _scatter(values, inside, buffers.mask) for name, values in parts.items()}
 
-    def _see_target(self, buffers: GBuffer, target: Target) -> Parts:
-        inside, uv, position, normal, to_camera = buffers.inside()
+    def _see_target(self, buffers: GBuffer, target: Target) -> ImageLayers:
+        inside, uv, position, normal, to_camera = buffers.hit_samples()
         camera, spectrum = self.view.spectral_sensitivity, self.rig.lights[0].illuminant
         rgb = _nearest(target.rgb(camera, spectrum), uv)
-        leak = 1.0 / self.films.light_extinction
+        leak = 1.0 / self.polarizers.light_extinction
         diffuse = np.zeros((len(inside), 3, 3), np.float32)
         specular = np.zeros((len(inside), 3), np.float32)
         for k, light in enumerate(self.rig.lights):
-            to_light, falloff = toward(light, position)
-            strength = WHITE_UNIT * np.float32(self.weights[k]) * falloff
+            to_light, falloff = direction_and_falloff(light, position)
+            strength = WHITE_SCALE * np.float32(self.weights[k]) * falloff
             if target.kind == "metal":
                 lobe = shading.specular_stokes(
                     normal,
@@ -256,7 +262,7 @@ class Look:
                     eta=ETA,
                     light_absorbs=absorbing_axis(light),
                     image_right=self.view.axes[0],
-                    extinction=self.films.light_extinction,
+                    extinction=self.polarizers.light_extinction,
                     metal=float(target.palette.mean()),
                 )
                 specular += np.float32(math.pi) * strength[:, None] * lobe
@@ -273,7 +279,7 @@ def _textures(
 ) -> dict[str, Float32Array]:
     """Return what the camera samples from the face's texture, shape (N, N, C) each."""
     layers = {
-        "glow": glow.spread,
+        "glow": glow.scattered,
         "visible": glow.surface.visible,
         "reflectance": glow.reflectance,
         "normals": subject.normal,
@@ -286,10 +292,10 @@ def _textures(
     }
     if subject.rest is not None:
         layers["position_at_rest_mm"] = subject.rest.atlas.position_mm
-    return _fillings(layers, subject)
+    return _dilate_textures(layers, subject)
 
 
-def _fillings(
+def _dilate_textures(
     layers: Mapping[str, Float32Array], subject: SimulatedSubject
 ) -> dict[str, Float32Array]:
     """Return textures whose borders are filled, so that sampling may blend, (N, N, C) each."""
@@ -303,15 +309,17 @@ def _scatter(values: Float32Array, inside: NDArray[np.int_], mask: BoolArray) ->
     return out.reshape(*mask.shape, *values.shape[1:])
 
 
-def _through_lens(parts: Parts, buffers: GBuffer, view: View, spread: LensSpread) -> Parts:
+def _blur_through_lens(
+    parts: ImageLayers, buffers: GBuffer, view: View, spread: DefocusKernels
+) -> ImageLayers:
     """Return what of a picture the lens blurs, at the sensor's resolution."""
     k = spread.subpixels
     order, pixel, first, slot = pixel_order(buffers.mask, k)
     shape = (buffers.mask.shape[0] // k, buffers.mask.shape[1] // k)
-    toward = before_focus(view, buffers.position_mm.reshape(-1, 3)[order])
-    lens = LensPicture(spread, shape, pixel, first, slot, toward)
+    toward = depth_before_focus(view, buffers.position_mm.reshape(-1, 3)[order])
+    lens = LensImage(spread, shape, pixel, first, slot, toward)
     light = [parts[name].reshape(buffers.mask.size, -1)[order] for name in ("diffuse", "specular")]
-    seen = lens.see(np.concatenate([*light, np.ones((len(order), 1), np.float32)], axis=1))
+    seen = lens.render(np.concatenate([*light, np.ones((len(order), 1), np.float32)], axis=1))
     wide = light[0].shape[1]
     return {
         "diffuse": seen[..., :wide].reshape(*shape, *parts["diffuse"].shape[2:]),
@@ -320,7 +328,7 @@ def _through_lens(parts: Parts, buffers: GBuffer, view: View, spread: LensSpread
     }
 
 
-def _shrink(parts: Parts, mask: BoolArray, k: int) -> tuple[Parts, Float32Array]:
+def _shrink(parts: ImageLayers, mask: BoolArray, k: int) -> tuple[ImageLayers, Float32Array]:
     """Average over pixels: light over the whole pixel, maps over its covered part."""
 
     def mean(image: Float32Array) -> Float32Array:

@@ -18,7 +18,7 @@ from rigsim import shading
 from rigsim.arrays import BoolArray, Float32Array
 from rigsim.as_built.polarizers import absorbing_axis
 from rigsim.geometry.mesh import Mesh, build_mesh, grid_faces
-from rigsim.light.subsurface_radiance import toward
+from rigsim.light.subsurface_radiance import direction_and_falloff
 from rigsim.render import Caster, g_buffer, look_at, radiance
 from rigsim.render.scene_radiance import perspective
 from rigsim.render.variant import choose_variant
@@ -35,7 +35,7 @@ ANALYZER_AXIS_DEG: Final = {"parallel": 90.0, "crossed": 0.0}
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class PolarizerComparison:
     """Time and error of both ways, for the parallel and the crossed image together."""
 
     closed_form_s: float
@@ -60,9 +60,9 @@ class Comparison:
         return min(self.mitsuba_error[k] / self.closed_form_error[k] for k in ANALYZER_AXIS_DEG)
 
 
-def polarizer_reference(
+def compare_polarizer_models(
     *, width_px: int = 256, samples: int = 64, subpixels: int = 1, seed: int = 0
-) -> Comparison:
+) -> PolarizerComparison:
     """Render both polarization images of the flash rig in both ways.
 
     Parameters
@@ -87,29 +87,29 @@ def polarizer_reference(
     rig, view = reference_rig(width_px)
     # One variant for both, so that no time goes into changing it.
     caster = Caster(sphere_mesh(), choice=choose_variant("mono_polarized"))
-    closed_forms(rig, view, caster, subpixels=subpixels)
-    mitsuba_image(rig, view, "parallel", samples=samples, seed=seed)
+    render_closed_forms(rig, view, caster, subpixels=subpixels)
+    render_polarized_with_mitsuba(rig, view, "parallel", samples=samples, seed=seed)
 
     closed_form_s = mitsuba_s = math.inf
     for _ in range(3):
         start = time.perf_counter()
-        ours = closed_forms(rig, view, caster, subpixels=subpixels)
+        ours = render_closed_forms(rig, view, caster, subpixels=subpixels)
         between = time.perf_counter()
         theirs = {
-            name: mitsuba_image(rig, view, name, samples=samples, seed=seed + k)
+            name: render_polarized_with_mitsuba(rig, view, name, samples=samples, seed=seed + k)
             for k, name in enumerate(ANALYZER_AXIS_DEG)
         }
         closed_form_s = min(closed_form_s, between - start)
         mitsuba_s = min(mitsuba_s, time.perf_counter() - between)
 
-    truth = closed_forms(rig, view, caster, subpixels=12)
+    truth = render_closed_forms(rig, view, caster, subpixels=12)
     whole = _wholly_covered(view, caster)
 
     def error(image: Float32Array, name: str) -> float:
         difference = (image - truth[name])[whole].astype(np.float64)
         return float(np.sqrt(np.mean(difference**2)) / truth[name][whole].mean())
 
-    return Comparison(
+    return PolarizerComparison(
         closed_form_s=closed_form_s,
         mitsuba_s=mitsuba_s,
         closed_form_error={name: error(ours[name], name) for name in ANALYZER_AXIS_DEG},
@@ -121,17 +121,17 @@ def polarizer_reference(
     )
 
 
-def closed_forms(
+def render_closed_forms(
     rig: Rig, view: View, caster: Caster, *, subpixels: int
 ) -> dict[str, Float32Array]:
     """Return both images by closed forms, shape (H, W), in radiance."""
     buffers = g_buffer(caster, view, subpixels=subpixels)
-    inside, _, position, normal, to_camera = buffers.inside()
+    inside, _, position, normal, to_camera = buffers.hit_samples()
     right, up, _ = view.axes
     leaving = shading.exit_stokes(normal, to_camera, eta=ETA, image_right=right)
     stokes = np.zeros_like(leaving)
     for light in rig.lights:
-        to_light, falloff = toward(light, position)
+        to_light, falloff = direction_and_falloff(light, position)
         absorbs = absorbing_axis(light)
         cosine = np.maximum(np.einsum("ij,ij->i", normal, to_light), 0.0)
         entry = shading.entry_transmittance(normal, to_light, eta=ETA, light_absorbs=absorbs)
@@ -149,7 +149,7 @@ def closed_forms(
     images = {}
     for name, angle in ANALYZER_AXIS_DEG.items():
         full = np.zeros(buffers.mask.size, np.float32)
-        full[inside] = shading.analyse(
+        full[inside] = shading.apply_analyzer(
             stokes, to_camera, passes_deg=angle, image_right=right, image_up=up
         )
         shape = (view.height_px, subpixels, view.width_px, subpixels)
@@ -157,10 +157,12 @@ def closed_forms(
     return images
 
 
-def mitsuba_image(rig: Rig, view: View, name: str, *, samples: int, seed: int) -> Float32Array:
+def render_polarized_with_mitsuba(
+    rig: Rig, view: View, name: str, *, samples: int, seed: int
+) -> Float32Array:
     """Return one image by Mitsuba's path tracer through polarizing films, shape (H, W)."""
     image = radiance(
-        describe(rig, view, ANALYZER_AXIS_DEG[name]),
+        describe_polarized_rig(rig, view, ANALYZER_AXIS_DEG[name]),
         kind="mono_polarized",
         samples=samples,
         seed=seed,
@@ -168,7 +170,7 @@ def mitsuba_image(rig: Rig, view: View, name: str, *, samples: int, seed: int) -
     return np.asarray(image[..., 0], np.float32)
 
 
-def describe(rig: Rig, view: View, analyser_deg: float) -> dict[str, Any]:
+def describe_polarized_rig(rig: Rig, view: View, analyser_deg: float) -> dict[str, Any]:
     """Return Mitsuba's scene of the rig with films before the lights and the camera."""
     up = (0.0, 1.0, 0.0)
     place = np.asarray(view.position_mm)
@@ -177,7 +179,9 @@ def describe(rig: Rig, view: View, analyser_deg: float) -> dict[str, Any]:
         "type": "scene",
         "integrator": {"type": "volpath", "max_depth": 8},
         "sensor": perspective(view, "luminance", up=up),
-        "analyser": _film(place - [0.0, 0.0, 10.0], view.target_mm, 15.0 * half, analyser_deg),
+        "analyser": _polarizer_mesh(
+            place - [0.0, 0.0, 10.0], view.target_mm, 15.0 * half, analyser_deg
+        ),
         "ball": {
             "type": "sphere",
             "radius": SPHERE_RADIUS_MM,
@@ -201,7 +205,7 @@ def describe(rig: Rig, view: View, analyser_deg: float) -> dict[str, Any]:
         before = where * (1.0 - 2.0 / float(np.linalg.norm(where)))
         axis_deg = light.polarizer_axis_deg
         if axis_deg is not None:
-            scene[f"film {light.name}"] = _film(before, (0.0, 0.0, 0.0), 2.0, axis_deg)
+            scene[f"film {light.name}"] = _polarizer_mesh(before, (0.0, 0.0, 0.0), 2.0, axis_deg)
     return scene
 
 
@@ -225,8 +229,8 @@ def sphere_mesh(*, columns: int = 480, rows: int = 240) -> Mesh:
     return build_mesh(SPHERE_RADIUS_MM * flat, faces, np.clip(uv, 0.0, 1.0), flat)
 
 
-def _film(place: Any, faces: Any, half_mm: float, passes_deg: float) -> dict[str, Any]:
-    matrix = look_at(place, faces, (0.0, 1.0, 0.0))
+def _polarizer_mesh(position: Any, faces: Any, half_mm: float, passes_deg: float) -> dict[str, Any]:
+    matrix = look_at(position, faces, (0.0, 1.0, 0.0))
     matrix[:3, :3] *= half_mm
     return {
         "type": "rectangle",

@@ -5,8 +5,8 @@ through the surface; the surface's own reflection is added per pixel. Both are k
 vectors, so that every angle of the analyser is one weighted sum away.
 
 The unit of light is fixed by the rig alone: a perfect white diffuser at the rig's origin that faces
-the camera gives `METER_LEVEL` of full scale in the strongest channel at power 1, behind parallel as
-behind crossed films, whatever stands there later.
+the camera gives `METERING_LEVEL` of full scale in the strongest channel at power 1, behind
+parallel as behind crossed films, whatever stands there later.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,42 +21,42 @@ from rigsim import shading
 from rigsim.arrays import Float32Array, Float64Array, UInt16Array
 from rigsim.as_built.polarizers import Polarizers, draw_polarizers
 from rigsim.boxes.flash import FlashPop
+from rigsim.caching import cached_method
 from rigsim.geometry.mesh import Mesh
-from rigsim.kept import kept
-from rigsim.light.interreflection import Bounces
-from rigsim.light.lateral import line_spread_mm
+from rigsim.light.interreflection import InterreflectionSettings
+from rigsim.light.lateral import edge_width_mm
+from rigsim.light.observed_skin import ObservedSkin
 from rigsim.light.relief_shadow import ReliefShadow
-from rigsim.light.seen_skin import SeenSkin
 from rigsim.light.subsurface_radiance import (
     SubsurfaceRadiance,
-    SurfaceLight,
-    light_skin,
-    light_surface,
+    SurfaceIllumination,
+    illuminate_surface,
+    render_subsurface_radiance,
 )
 from rigsim.needs import face as face_needs
 from rigsim.needs.effects import (
-    EFFECTS_BY_SIZE,
+    AUTOMATIC_EFFECTS,
     EffectSelection,
-    Noise,
+    PixelNoise,
     SceneEffects,
     merge_selections,
 )
-from rigsim.needs.flash import flash_needs
+from rigsim.needs.flash import select_flash_effects
 from rigsim.render import camera_rays
-from rigsim.render.depth_of_field import facing_depths, lens_spread
+from rigsim.render.depth_of_field import depth_range, tabulate_defocus
 from rigsim.render.variant import VariantChoice
 from rigsim.scenes.exposing import FaceScene, SceneError
 from rigsim.scenes.flash import truth as flash_truth
-from rigsim.scenes.flash.image import Look, Picture
-from rigsim.scenes.flash.stage import flash_geometry
+from rigsim.scenes.flash.image import FlashCamera, FlashImage
+from rigsim.scenes.flash.stage import shared_flash_geometry
 from rigsim.sensor import Sensor
 from rigsim.subject import SimulatedSubject, landmarks
 from rigsim.targets import Target
 
-METER_LEVEL: Final = 0.8
+METERING_LEVEL: Final = 0.8
 """Fraction of full scale of the white reference in its strongest channel at power 1."""
 
-FLAT_LEVEL: Final = 0.9
+FLAT_FIELD_LEVEL: Final = 0.9
 """Fraction of full scale of the integrating sphere in its strongest channel at power 1."""
 
 POP_ENERGY_DEVIATION: Final = 0.002
@@ -107,7 +107,7 @@ class FlashScene(FaceScene):
         sensor: Sensor | None = None,
         films: Polarizers | None = None,
         seed: int = 0,
-        effects: SceneEffects = EFFECTS_BY_SIZE,
+        effects: SceneEffects = AUTOMATIC_EFFECTS,
         power: float = 1.0,
         subpixels: int = 2,
         choice: VariantChoice | None = None,
@@ -118,7 +118,7 @@ class FlashScene(FaceScene):
         self.films = draw_polarizers(rig) if films is None else films
         self._weights = _light_weights(rig)
         self._choice = choice
-        self._stage = flash_geometry(self.subject, choice)
+        self._stage = shared_flash_geometry(self.subject, choice)
         self._caster = self._stage.caster
         self._effects = effects
         self.needs = merge_selections([self._needs_of(view, power) for view in rig.views])
@@ -127,17 +127,17 @@ class FlashScene(FaceScene):
         self.optics = self.needs.builds(face_needs.LENS_EFFECT)
 
     def _needs_of(self, view: View, power: float) -> EffectSelection:
-        noise, share = Noise.of(self._sensors[view.name]), self._stage.share
+        noise, share = PixelNoise.of(self._sensors[view.name]), self._stage.exchange_fraction
         scenery = self._scenery(view, self._caster, share, noise, self._effects)
         white = np.asarray(self.white_rgb(view.name), np.float64) * power
         seen = (scenery, white, self._weights, self.movement)
-        return flash_needs(self.rig, self.subject, self.state, *seen)
+        return select_flash_effects(self.rig, self.subject, self.state, *seen)
 
     def white_rgb(self, view_name: str | None = None) -> Float32Array:
         """Return the camera RGB of the white reference at power 1, fraction of full scale, (3,)."""
         view = self._camera(view_name)
         white = spectra.camera_white(view.spectral_sensitivity, self._illuminant)
-        return np.asarray(METER_LEVEL * white / white.max(), np.float32)
+        return np.asarray(METERING_LEVEL * white / white.max(), np.float32)
 
     def radiance(
         self,
@@ -163,17 +163,17 @@ class FlashScene(FaceScene):
             Camera RGB without white balance, shape (H, W, 3), fraction of full scale.
         """
         view = self._camera(view_name)
-        passes_deg = self.films.passes_deg(view, polarizer, analyser_deg)
+        passes_deg = self.films.analyzer_axis_deg(view, polarizer, analyser_deg)
         white = self.white_rgb(view.name)
         shape = (view.height_px, view.width_px, 3)
         if isinstance(self.subject, Target) and self.subject.kind == "cap":
             return np.zeros(shape, np.float32)
         if isinstance(self.subject, Target) and self.subject.kind == "source":
-            level = np.float32(FLAT_LEVEL / METER_LEVEL) * white
+            level = np.float32(FLAT_FIELD_LEVEL / METERING_LEVEL) * white
             return np.broadcast_to(level, shape).copy()
         picture = self._picture(view)
-        diffuse = self._analysed(np.moveaxis(picture.diffuse, 2, 3), view, passes_deg)
-        specular = self._analysed(picture.specular, view, passes_deg)
+        diffuse = self._apply_analyzer(np.moveaxis(picture.diffuse, 2, 3), view, passes_deg)
+        specular = self._apply_analyzer(picture.specular, view, passes_deg)
         return np.maximum((diffuse + specular[..., None]) * white, 0.0)
 
     def exposure(
@@ -234,7 +234,7 @@ class FlashScene(FaceScene):
             ``roughness``: GGX alpha; ``uv``: texture coordinates, (H, W, 2);
             ``hair``: part covered by hair (brows, lashes);
             ``mask``: bool, pixels wholly on skin, whose light comes from skin within
-            `rigsim.scenes.flash.truth.MAX_FOREIGN_LIGHT`.
+            `rigsim.scenes.flash.truth.MAX_FOREIGN_LIGHT_FRACTION`.
 
             All are of the face as it has moved. For a state other than "neutral" there are also
             ``melanin_at_rest``, ``hemoglobin_at_rest``: the fractions of this state as they would
@@ -251,15 +251,15 @@ class FlashScene(FaceScene):
         self._face()
         view = self._camera(view_name)
         picture = self._picture(view)
-        passes_deg = self.films.passes_deg(view, "crossed", None)
-        truth = flash_truth.maps_of(
+        passes_deg = self.films.analyzer_axis_deg(view, "crossed", None)
+        truth = flash_truth.truth_maps(
             picture,
-            self._blurred(view),
-            shading=self._analysed(picture.shading, view, passes_deg),
+            self._blurred_maps(view),
+            shading=self._apply_analyzer(picture.shading, view, passes_deg),
             white_rgb=self.white_rgb(view.name),
         )
         if self.state != "neutral":
-            truth |= self._at_rest(view, truth)
+            truth |= self._fractions_at_rest(view, truth)
         return truth
 
     def landmarks_px(self, view_name: str | None = None) -> dict[str, tuple[float, float]]:
@@ -284,9 +284,9 @@ class FlashScene(FaceScene):
         """
         face, view = self._face("landmarks"), self._camera(view_name)
         points = face.surface_landmarks()
-        places = points.on(face.mesh)
-        pixels = landmarks.project(places, view)
-        visible = landmarks.seen(places, view, self._caster)
+        places = points.positions_on(face.mesh)
+        pixels = landmarks.project_points(places, view)
+        visible = landmarks.is_visible(places, view, self._caster)
         return {
             name: (float(x), float(y))
             for name, (x, y), shown in zip(points.names, pixels, visible, strict=True)
@@ -296,15 +296,15 @@ class FlashScene(FaceScene):
     def resolution_mm(self, view_name: str | None = None) -> Float64Array:
         """Return the widths from 10 to 90 % of an edge that lateral transport blurs, mm, (3,)."""
         glow = self._skin_glow(self._camera(view_name).spectral_sensitivity)
-        return line_spread_mm(glow.kernels.sigmas_mm, glow.kernels.weights)
+        return edge_width_mm(glow.kernels.sigmas_mm, glow.kernels.weights)
 
-    def _analysed(self, stokes: Float32Array, view: View, passes_deg: float) -> Float32Array:
+    def _apply_analyzer(self, stokes: Float32Array, view: View, passes_deg: float) -> Float32Array:
         """Apply the analyser to Stokes vectors of shape (H, W, 3) or (H, W, 3 RGB, 3)."""
         to_camera = -camera_rays(view)[1]
         right, up, _ = view.axes
         if stokes.ndim == 4:
             to_camera = to_camera[:, :, None]
-        return shading.analyse(
+        return shading.apply_analyzer(
             stokes,
             to_camera,
             passes_deg=passes_deg,
@@ -313,27 +313,33 @@ class FlashScene(FaceScene):
             extinction=self.films.analyser_extinction,
         )
 
-    @kept
+    @cached_method
     def _skin_glow(self, camera: str) -> SubsurfaceRadiance:
         face = self._face("skin")
-        skin = SeenSkin(face, self.state, camera, self._illuminant)
+        skin = ObservedSkin(face, self.state, camera, self._illuminant)
         surface, bounces = self._surface_light(face), self._bounces(skin)
-        return light_skin(skin, surface, lateral_transport=self.lateral, bounces=bounces)
+        return render_subsurface_radiance(
+            skin, surface, lateral_transport=self.lateral, interreflection=bounces
+        )
 
-    def _bounces(self, skin: SeenSkin) -> Bounces | None:
+    def _bounces(self, skin: ObservedSkin) -> InterreflectionSettings | None:
         if not self.interreflections:
             return None
         step, spectral = self._effects.spectral_step, self.needs.builds(face_needs.SPECTRAL_EFFECT)
         if step is None:
-            step, _ = face_needs.spectral_step(skin, self.needs[face_needs.INTERREFLECTION_EFFECT])
-        return Bounces(self._stage.exchange, spectral, step, self._last_bounce(self._effects))
+            step, _ = face_needs.choose_spectral_step(
+                skin, self.needs[face_needs.INTERREFLECTION_EFFECT]
+            )
+        return InterreflectionSettings(
+            self._stage.exchange, spectral, step, self._last_bounce(self._effects)
+        )
 
-    def _surface_light(self, subject: SimulatedSubject) -> SurfaceLight:
+    def _surface_light(self, subject: SimulatedSubject) -> SurfaceIllumination:
         wrinkled = self.needs.builds(face_needs.WRINKLE_SHADOW_EFFECT)
         key = (self.rig.lights, tuple(self._weights.tolist()), self.films, wrinkled)
         known = self._stage.light
         if key not in known:
-            known[key] = light_surface(
+            known[key] = illuminate_surface(
                 subject,
                 self.rig.lights,
                 self._weights,
@@ -343,47 +349,49 @@ class FlashScene(FaceScene):
             )
         return known[key]
 
-    @kept
-    def _blurred(self, view: View) -> Mapping[str, Float32Array]:
+    @cached_method
+    def _blurred_maps(self, view: View) -> Mapping[str, Float32Array]:
         """Return the maps that are blurred as the light is; nothing but the truth needs them."""
         if not self.lateral:
             return flash_truth.unblurred_maps(self._picture(view))
-        look = Look(self.rig, view, self.films, self._weights, self.subpixels)
-        return look.at_maps(self._stage.caster, self._face(), self._spread(view)).maps
+        look = FlashCamera(self.rig, view, self.films, self._weights, self.subpixels)
+        return look.observe_maps(self._stage.caster, self._face(), self._spread(view)).maps
 
-    @kept
+    @cached_method
     def _spread(self, view: View) -> Mapping[str, Float32Array]:
         """Return the textures of those maps, of the face as it has moved."""
-        look = Look(self.rig, view, self.films, self._weights, self.subpixels)
+        look = FlashCamera(self.rig, view, self.films, self._weights, self.subpixels)
         glow = self._skin_glow(view.spectral_sensitivity)
         return look.blurred_maps(self._face(), self.state, glow)
 
-    def _at_rest(
+    def _fractions_at_rest(
         self, view: View, moved: dict[str, NDArray[np.generic]]
     ) -> dict[str, NDArray[np.generic]]:
         """Return the fractions of this state as seen on the face at rest."""
         rest = self._face().rest
         if rest is None:
-            return flash_truth.unmoved_maps(moved)
-        caster = flash_geometry(rest, self._choice).caster
+            return flash_truth.rest_maps_of_unmoved_face(moved)
+        caster = shared_flash_geometry(rest, self._choice).caster
         spread = self._spread(view) if self.lateral else None
         look = self._look(view, rest.mesh)
-        return flash_truth.maps_at_rest(look, caster, rest, self.state, spread)
+        return flash_truth.truth_maps_at_rest(look, caster, rest, self.state, spread)
 
-    def _look(self, view: View, mesh: Mesh) -> Look:
+    def _look(self, view: View, mesh: Mesh) -> FlashCamera:
         spread = None
         if self.optics:
-            depths = facing_depths(view, mesh)
-            spread = lens_spread(view, self._illuminant, subpixels=self.subpixels, depths_mm=depths)
-        return Look(self.rig, view, self.films, self._weights, self.subpixels, spread)
+            depths = depth_range(view, mesh)
+            spread = tabulate_defocus(
+                view, self._illuminant, subpixels=self.subpixels, depths_mm=depths
+            )
+        return FlashCamera(self.rig, view, self.films, self._weights, self.subpixels, spread)
 
-    @kept
-    def _picture(self, view: View) -> Picture:
+    @cached_method
+    def _picture(self, view: View) -> FlashImage:
         look, subject = self._look(view, self.subject.mesh), self.subject
         if isinstance(subject, SimulatedSubject):
             glow = self._skin_glow(view.spectral_sensitivity)
-            return look.at_skin(self._caster, subject, self.state, glow)
-        return look.at_target(self._caster, subject)
+            return look.observe_face(self._caster, subject, self.state, glow)
+        return look.observe_target(self._caster, subject)
 
 
 def pop_energy(pop: FlashPop) -> float:

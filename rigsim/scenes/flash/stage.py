@@ -5,8 +5,8 @@ from weakref import WeakValueDictionary
 
 from rigsim.geometry.mesh import Mesh
 from rigsim.light.interreflection import Interreflection, interreflection_for
-from rigsim.light.subsurface_radiance import SurfaceLight
-from rigsim.needs.effect_sizes import exchange_share
+from rigsim.light.subsurface_radiance import SurfaceIllumination
+from rigsim.needs.effect_sizes import max_exchange_fraction
 from rigsim.render import Caster
 from rigsim.render.variant import VariantChoice
 from rigsim.subject import SimulatedSubject
@@ -26,12 +26,12 @@ class FlashGeometry:
 
     def __init__(self, held: tuple[Mesh, object], caster: Caster) -> None:
         self.held, self.caster = held, caster
-        self.light: dict[object, SurfaceLight] = {}  # on the face, by what it comes from
+        self.light: dict[object, SurfaceIllumination] = {}  # on the face, by what it comes from
 
     @cached_property
-    def share(self) -> float:
-        """`exchange_share` of the mesh."""
-        return exchange_share(self.caster)
+    def exchange_fraction(self) -> float:
+        """`max_exchange_fraction` of the mesh."""
+        return max_exchange_fraction(self.caster)
 
     @cached_property
     def exchange(self) -> Interreflection:
@@ -42,7 +42,7 @@ class FlashGeometry:
 _stages: WeakValueDictionary[tuple[object, ...], FlashGeometry] = WeakValueDictionary()
 
 
-def flash_geometry(
+def shared_flash_geometry(
     subject: SimulatedSubject | Target, choice: VariantChoice | None
 ) -> FlashGeometry:
     """Return the stage of a geometry; the same as long as any scene holds it.

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from rigsim.arrays import BoolArray, Float32Array
 from rigsim.population.population import MAX_SKIN_HAIR
 from rigsim.render import Caster
-from rigsim.scenes.flash.image import Look, Picture
+from rigsim.scenes.flash.image import FlashCamera, FlashImage
 from rigsim.subject import SimulatedSubject
 
-MAX_FOREIGN_LIGHT: Final = 0.01
+MAX_FOREIGN_LIGHT_FRACTION: Final = 0.01
 """Pixels that get more of their light than this from off the skin, by the lens, are not skin."""
 
 BLURRED_MAPS: Final = ("reflectance", "melanin", "hemoglobin")
@@ -25,8 +25,8 @@ VOLUME_FRACTIONS: Final = ("melanin", "hemoglobin")
 BLURRED_FRACTIONS: Final = ("melanin_blurred", "hemoglobin_blurred")
 
 
-def maps_of(
-    picture: Picture,
+def truth_maps(
+    image: FlashImage,
     blurred: Mapping[str, Float32Array],
     *,
     shading: Float32Array,
@@ -39,33 +39,33 @@ def maps_of(
     picture
         The face as the camera sees it.
     blurred
-        Maps as light spreads in the skin, by name, see `Look.blurred_maps`.
+        Maps as light spreads in the skin, by name, see `FlashCamera.blurred_maps`.
     shading
         (H, W[, 3]), the picture's shading through the crossed analyser.
     white_rgb
         (3,), camera RGB of the white reference, fraction of full scale.
     """
-    maps: dict[str, NDArray[np.generic]] = {**picture.maps, **blurred}
+    maps: dict[str, NDArray[np.generic]] = {**image.maps, **blurred}
     maps["shading"] = shading
-    maps["diffuse"] = picture.diffuse[:, :, 0] * white_rgb
-    maps["specular"] = picture.specular[:, :, :1] * white_rgb
-    maps["mask"] = whole_skin(picture)
+    maps["diffuse"] = image.diffuse[:, :, 0] * white_rgb
+    maps["specular"] = image.specular[:, :, :1] * white_rgb
+    maps["mask"] = fully_skin_pixels(image)
     return maps
 
 
 def unblurred_maps(
-    picture: Picture, names: Sequence[str] = BLURRED_MAPS
+    image: FlashImage, names: Sequence[str] = BLURRED_MAPS
 ) -> dict[str, Float32Array]:
     """Return maps of a face in which light does not spread, under the names of blurred ones."""
-    return {f"{name}_blurred": picture.maps[name] for name in names}
+    return {f"{name}_blurred": image.maps[name] for name in names}
 
 
-def maps_at_rest(
-    look: Look,
+def truth_maps_at_rest(
+    camera: FlashCamera,
     caster: Caster,
     rest: SimulatedSubject,
     state: str,
-    spread: Mapping[str, Float32Array] | None = None,
+    blurred: Mapping[str, Float32Array] | None = None,
 ) -> dict[str, NDArray[np.generic]]:
     """Return the fractions of a state as seen on the face at rest.
 
@@ -80,28 +80,32 @@ def maps_at_rest(
     state
         Whose blood it has.
     spread
-        Textures of the moved face, see `Look.blurred_maps`: light spreads on that, wherever the
-        skin is then looked for. None: light does not spread.
+        Textures of the moved face, see `FlashCamera.blurred_maps`: light spreads on that, wherever
+        the skin is then looked for. None: light does not spread.
     """
     layers = {"melanin": rest.melanin, "hemoglobin": rest.hemoglobin(state), "hair": rest.hair}
-    if spread is not None:
-        layers |= {name: spread[name] for name in BLURRED_FRACTIONS}
-    picture = look.at_maps(caster, rest, layers)
+    if blurred is not None:
+        layers |= {name: blurred[name] for name in BLURRED_FRACTIONS}
+    picture = camera.observe_maps(caster, rest, layers)
     seen = dict(picture.maps)
-    if spread is None:
+    if blurred is None:
         seen |= unblurred_maps(picture, VOLUME_FRACTIONS)
     maps = {f"{name}_at_rest": seen[name] for name in (*VOLUME_FRACTIONS, *BLURRED_FRACTIONS)}
-    return {**maps, "mask_at_rest": whole_skin(picture)}
+    return {**maps, "mask_at_rest": fully_skin_pixels(picture)}
 
 
-def unmoved_maps(maps: Mapping[str, NDArray[np.generic]]) -> dict[str, NDArray[np.generic]]:
-    """Return the same maps of a face that has not moved, from those of `maps_of`."""
+def rest_maps_of_unmoved_face(
+    maps: Mapping[str, NDArray[np.generic]],
+) -> dict[str, NDArray[np.generic]]:
+    """Return the same maps of a face that has not moved, from those of `truth_maps`."""
     return {
         f"{name}_at_rest": maps[name] for name in (*VOLUME_FRACTIONS, *BLURRED_FRACTIONS, "mask")
     }
 
 
-def whole_skin(picture: Picture) -> BoolArray:
+def fully_skin_pixels(image: FlashImage) -> BoolArray:
     """Return the pixels, (H, W), that are wholly on skin, and get light from there alone."""
-    whole = (picture.coverage > 1.0 - 1e-6) & (picture.reached > 1.0 - MAX_FOREIGN_LIGHT)
-    return whole & (picture.maps["hair"] < MAX_SKIN_HAIR)
+    whole = (image.coverage > 1.0 - 1e-6) & (
+        image.surface_fraction > 1.0 - MAX_FOREIGN_LIGHT_FRACTION
+    )
+    return whole & (image.maps["hair"] < MAX_SKIN_HAIR)

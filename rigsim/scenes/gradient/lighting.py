@@ -13,10 +13,15 @@ import scipy.fft
 
 from rigsim import shading
 from rigsim.arrays import BoolArray, Float32Array, Float64Array
-from rigsim.as_built.sphere import BuiltSphere
-from rigsim.light.lobe_moments import MomentTable, Surface, build_table, direct_moments
-from rigsim.light.relief_shadow import hidden_share, horizon_tangent
-from rigsim.light.shadowed_lights import remove_hidden
+from rigsim.as_built.sphere import ActualSphere
+from rigsim.light.lobe_moments import (
+    MicrofacetSurface,
+    MomentTable,
+    sum_led_moments,
+    tabulate_moments,
+)
+from rigsim.light.relief_shadow import hidden_sky_fraction, horizon_tangent
+from rigsim.light.shadowed_lights import subtract_hidden_led
 from rigsim.scenes.gradient.patch import PatchSurface
 from rigsim.skin_patch.microrelief import MicroSkin, lateral_kernel
 from rigsim.tissue.skin_layers import ETA
@@ -29,11 +34,11 @@ SMOOTH_ALPHA: Final = 0.15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lighting:
+class PatchLighting:
     """Everything about the light that does not change with the state."""
 
-    sphere: BuiltSphere
-    surface: Surface
+    sphere: ActualSphere
+    surface: MicrofacetSurface
     table: MomentTable
     leds: tuple[int, ...]
     """LEDs in the table; with shadows only those above the patch's plane."""
@@ -43,7 +48,7 @@ class Lighting:
     """Widths of the lateral kernel of light in skin; none: light leaves where it entered."""
     weights: Float64Array
     """Their shares, sum 1."""
-    furrow_sectors: int = 0
+    groove_sectors: int = 0
     """Directions in which the sky is looked for, for light from furrow to furrow; 0: none."""
 
     def stokes(
@@ -71,18 +76,18 @@ class Lighting:
         packed = np.empty((16, rows, columns), np.float32)
         for first in range(0, rows, BLOCK_ROWS):
             part = slice(first, first + BLOCK_ROWS)
-            found = self._unshadowed(patch, part)
+            found = self._unshadowed_moments(patch, part)
             packed[:, part] = found.T.reshape(16, -1, columns)
         if self.sectors:
             self._remove_hidden(patch, height_um, margin, pitch_um, packed)
         packed[:12, ~patch.skin] = 0.0
-        entering = self._spread(packed[12:], patch.skin, 1e-3 * pitch_um)
-        if self.furrow_sectors:
-            grid = {"margin": margin, "sectors": self.furrow_sectors}
-            hidden = hidden_share(
+        entering = self._scatter_laterally(packed[12:], patch.skin, 1e-3 * pitch_um)
+        if self.groove_sectors:
+            grid = {"margin": margin, "sectors": self.groove_sectors}
+            hidden = hidden_sky_fraction(
                 height_um, patch.normals, pixel_um=pitch_um, boundaries=True, **grid
             )
-            entering += self._from_furrows(hidden, entering, patch, 1e-3 * pitch_um)
+            entering += self._groove_interreflection(hidden, entering, patch, 1e-3 * pitch_um)
         right = self.surface.image_right
         eye = np.asarray(self.surface.eye_mm, np.float32)
         scale = np.float32(shading.interior_scale(ETA) / math.pi)
@@ -100,7 +105,7 @@ class Lighting:
                 out[3 * m : 3 * m + 3, part] += leaves * entering[m, part]
         return out
 
-    def _unshadowed(self, patch: PatchSurface, part: slice) -> Float32Array:
+    def _unshadowed_moments(self, patch: PatchSurface, part: slice) -> Float32Array:
         n = patch.normals[part].reshape(-1, 3)
         x, y = patch.x_mm[part].ravel(), patch.y_mm[part].ravel()
         alpha = patch.alpha[part].ravel()
@@ -108,7 +113,7 @@ class Lighting:
         steep = np.flatnonzero(~self.table.covers(n))
         if steep.size:
             places = np.column_stack([x[steep], y[steep], np.zeros(steep.size)])
-            found[steep] = direct_moments(
+            found[steep] = sum_led_moments(
                 n[steep], places, self.sphere, self.surface, leds=self.leds, alpha=alpha[steep]
             ).packed()
         return found
@@ -137,9 +142,9 @@ class Lighting:
                     full = horizon_tangent(height_um, pixel_um=pitch_um, azimuth_rad=angle)
                     tangents[k] = np.ascontiguousarray(full[inner, inner])
             horizon = (tangents[pair[0]], tangents[pair[1]], float(where[led]) - int(where[led]))
-            remove_hidden(packed, patch, horizon, self.sphere, led, self.surface)
+            subtract_hidden_led(packed, patch, horizon, self.sphere, led, self.surface)
 
-    def _from_furrows(
+    def _groove_interreflection(
         self, hidden: Float32Array, entering: Float32Array, patch: PatchSurface, pitch_mm: float
     ) -> Float32Array:
         """Return what enters by way of other walls of the relief, shape (4, H, W)."""
@@ -152,11 +157,13 @@ class Lighting:
             * patch.skin
         )
         further = 1.0 / (1.0 - float(once[patch.skin].mean()))
-        return self._spread(
+        return self._scatter_laterally(
             np.float32(further) * once.astype(np.float32) * entering, patch.skin, pitch_mm
         )
 
-    def _spread(self, entering: Float32Array, skin: BoolArray, pitch_mm: float) -> Float32Array:
+    def _scatter_laterally(
+        self, entering: Float32Array, skin: BoolArray, pitch_mm: float
+    ) -> Float32Array:
         """Spread light inside the skin; beyond the picture it goes on mirrored."""
         if not self.sigmas_mm.size:
             return entering
@@ -178,17 +185,17 @@ class Lighting:
         return out
 
 
-def light_skin(
+def tabulate_patch_lighting(
     skin: MicroSkin,
-    sphere: BuiltSphere,
-    surface: Surface,
+    sphere: ActualSphere,
+    surface: MicrofacetSurface,
     *,
     half_field_mm: float,
     sectors: int,
     table_size: int | None,
     lateral: bool = True,
-    furrow_sectors: int = 0,
-) -> Lighting:
+    groove_sectors: int = 0,
+) -> PatchLighting:
     """Tabulate the light on a patch of skin.
 
     Parameters
@@ -213,7 +220,7 @@ def light_skin(
     """
     leds = tuple(k for k, (_, _, z) in enumerate(sphere.position_mm) if not sectors or z > 0.0)
     alphas = (float(skin.alpha.min()), float(skin.alpha.max()))
-    table = build_table(
+    table = tabulate_moments(
         sphere,
         surface,
         half_field_mm=half_field_mm,
@@ -223,4 +230,4 @@ def light_skin(
         leds=leds,
     )
     sigmas, weights = lateral_kernel(skin) if lateral else (np.zeros(0), np.zeros(0))
-    return Lighting(sphere, surface, table, leds, sectors, sigmas, weights, furrow_sectors)
+    return PatchLighting(sphere, surface, table, leds, sectors, sigmas, weights, groove_sectors)

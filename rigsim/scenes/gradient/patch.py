@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from capture.rig import View
 from rigsim.arrays import BoolArray, Float32Array, Float64Array
-from rigsim.skin_patch.motion import Pose
+from rigsim.skin_patch.motion import PatchPose
 from rigsim.skin_patch.stretch import SurfaceSample
 from rigsim.world.taped_skin import GripState
 
@@ -75,7 +75,7 @@ class PatchSurface:
         """Height above the plane in focus, mm."""
         return np.asarray((self.relief_um + self.bulge_um) * np.float32(1e-3))
 
-    def inner(self, margin: int) -> PatchSurface:
+    def crop(self, margin: int) -> PatchSurface:
         """Return the patch without ``margin`` samples on all sides."""
         part = slice(margin, -margin or None)
         cut = (
@@ -98,8 +98,8 @@ def sample_grid(view: View, *, subpixels: int, border_px: int) -> Grid:
     return places[0], -places[1]
 
 
-def stand(
-    relief: Relief, grip: GripState, pose: Pose, grid: Grid, *, eye_mm: float, alpha: float
+def sample_patch(
+    relief: Relief, grip: GripState, pose: PatchPose, grid: Grid, *, eye_mm: float, alpha: float
 ) -> PatchSurface:
     """Return what the camera's samples meet.
 
@@ -119,14 +119,14 @@ def stand(
         Roughness where the relief states none.
     """
     ideal_x, ideal_y = np.meshgrid(*grid)
-    cosine, sine = math.cos(pose.turn_rad), math.sin(pose.turn_rad)
+    cosine, sine = math.cos(pose.rotation_rad), math.sin(pose.rotation_rad)
     x, y = ideal_x, ideal_y
     # tilts and view angles shrink the step to the surface's point 30-fold: once is enough
     for last in (False, True):
         own_x = cosine * (x - pose.x_mm) + sine * (y - pose.y_mm)
         own_y = cosine * (y - pose.y_mm) - sine * (x - pose.x_mm)
         found = relief.sample(own_x, own_y)
-        bulge_mm, bulge_x, bulge_y = bulge(grip, own_x, own_y)
+        bulge_mm, bulge_x, bulge_y = bulge_height_and_slopes(grip, own_x, own_y)
         if not last:
             nearer = 1.0 - (1e-3 * found.height_um + bulge_mm) / eye_mm
             x, y = ideal_x * nearer, ideal_y * nearer
@@ -152,7 +152,7 @@ def stand(
     )
 
 
-def bulge(
+def bulge_height_and_slopes(
     grip: GripState, x_mm: Float64Array, y_mm: Float64Array
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return how far skin stands out of its plane in mm, and its slopes in x and y.
@@ -168,20 +168,20 @@ def bulge(
     if grip.attached:
         half = 0.5 * grip.aperture_mm
         size = BULGE_MM * math.exp(-BULGE_EXPONENT * (grip.stretch - 1.0))
-        a, da = _hump(along, half)
-        b, db = _hump(across, BULGE_WIDTH_MM)
+        a, da = _cosine_bump(along, half)
+        b, db = _cosine_bump(across, BULGE_WIDTH_MM)
         height += size * (a * b - 1.0)
         d_along += size * da * b
         d_across += size * a * db
         if grip.buckled:
-            a, da = _hump(along - 0.2 * half, FOLD_WIDTH * grip.aperture_mm)
+            a, da = _cosine_bump(along - 0.2 * half, FOLD_WIDTH * grip.aperture_mm)
             height += FOLD_MM * a * b
             d_along += FOLD_MM * da * b
             d_across += FOLD_MM * a * db
     return height, cosine * d_along - sine * d_across, sine * d_along + cosine * d_across
 
 
-def _hump(x: Float64Array, half: float) -> tuple[Float64Array, Float64Array]:
+def _cosine_bump(x: Float64Array, half: float) -> tuple[Float64Array, Float64Array]:
     """Return cos^2 that ends at plus and minus ``half``, and its derivative."""
     phase = np.clip(0.5 * np.pi * x / half, -0.5 * np.pi, 0.5 * np.pi)
     return np.cos(phase) ** 2, -0.5 * np.pi / half * np.sin(2.0 * phase)

@@ -18,16 +18,16 @@ from capture.rig import load_rig
 from rigsim import shading
 from rigsim.arrays import Float32Array, Float64Array
 from rigsim.as_built.polarizers import Polarizers
-from rigsim.as_built.sphere import PATTERN_WEIGHTS, REFERENCE_MM
+from rigsim.as_built.sphere import PATTERN_WEIGHTS, REFERENCE_DISTANCE_MM
 from rigsim.geometry.mesh import Mesh, build_mesh, grid_faces
 from rigsim.light.lobe_moments import led_moments
 from rigsim.needs.effects import SceneEffects
-from rigsim.render import Caster, MovedLight
+from rigsim.render import Caster, MovableLightScene
 from rigsim.render.scene_radiance import (
-    matt_plastic,
+    matte_plastic,
     perspective,
     plastic_scale,
-    point_rig,
+    point_light_rig,
     rough_metal,
 )
 from rigsim.scenes.gradient.scene import GradientScene
@@ -35,18 +35,18 @@ from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
 from rigsim.tissue.skin_layers import ETA
 from rigsim.world.taped_skin import GripState
 
-NEUTRAL: Final = GripState(0.0, 0, 8.0, 1.0, True, False)
-NO_FILM: Final = Polarizers(1.0 + 1e-9, math.inf, 0.0)
+NEUTRAL_GRIP: Final = GripState(0.0, 0, 8.0, 1.0, True, False)
+NO_POLARIZERS: Final = Polarizers(1.0 + 1e-9, math.inf, 0.0)
 """Films that let everything through; the analyser's other half is the other state's."""
 
 PATCH_ALBEDO: Final = 0.2
 MESH_MARGIN_PX: Final = 64
-LIFT_MM: Final = 1e-4
+SHADOW_RAY_OFFSET_MM: Final = 1e-4
 """How far shadow rays begin above the surface; they begin at corners of its triangles."""
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class ReferenceComparison:
     """One way to make the pictures."""
 
     seconds: float
@@ -80,9 +80,9 @@ def plain_scene(
 ) -> GradientScene:
     """Return the patch under LEDs that are points without films, without lens and spreading."""
     return GradientScene(
-        point_rig(load_rig("gradient").cropped(width_px)),
+        point_light_rig(load_rig("gradient").cropped(width_px)),
         skin,
-        films=NO_FILM,
+        films=NO_POLARIZERS,
         effects=SceneEffects(
             optics=False, lateral=False, relief_shadows=shadows, interreflections=interreflections
         ),
@@ -94,7 +94,7 @@ def plain_scene(
 
 def relief_mesh(scene: GradientScene, *, subpixels: int = 2) -> Mesh:
     """Return the patch as triangles between its samples, mm, with its own normals."""
-    patch = scene.surface(NEUTRAL, subpixels=subpixels, border_px=MESH_MARGIN_PX)
+    patch = scene.surface(NEUTRAL_GRIP, subpixels=subpixels, border_px=MESH_MARGIN_PX)
     rows, columns = patch.skin.shape
     vertices = np.stack([patch.x_mm, patch.y_mm, patch.height_mm], axis=-1).reshape(-1, 3)
     v, u = np.mgrid[0:rows, 0:columns] / max(rows, columns)
@@ -102,7 +102,7 @@ def relief_mesh(scene: GradientScene, *, subpixels: int = 2) -> Mesh:
     return build_mesh(vertices, grid_faces(rows, columns), uv, patch.normals.reshape(-1, 3))
 
 
-def traced(
+def trace_pixels(
     scene: GradientScene, pixels: NDArray[np.intp], *, subpixels: int = 4
 ) -> tuple[Float64Array, Float64Array]:
     """Sum over LEDs one by one, with a shadow ray to each, in some pixels.
@@ -124,7 +124,7 @@ def traced(
         Part of the LEDs' light that is hidden, of moment 1, shape (n,).
     """
     view = scene.rig.views[0]
-    patch = scene.surface(NEUTRAL, subpixels=subpixels)
+    patch = scene.surface(NEUTRAL_GRIP, subpixels=subpixels)
     row, column = np.divmod(pixels, view.width_px)
     inside = np.arange(subpixels)
     rows = (subpixels * row)[:, None, None] + inside[:, None]
@@ -139,7 +139,7 @@ def traced(
     to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
     leaves = shading.exit_stokes(normals, to_camera, eta=ETA, image_right=surface.image_right)
     leaves = leaves[:, 0] * PATCH_ALBEDO * shading.interior_scale(ETA) / math.pi
-    start = points + LIFT_MM * normals
+    start = points + SHADOW_RAY_OFFSET_MM * normals
     total, lost = np.zeros((len(points), 4)), np.zeros(len(points))
     flat = np.column_stack([points[:, :2], np.zeros(len(points))])
     for led, place in enumerate(scene.sphere.position_mm):
@@ -150,7 +150,7 @@ def traced(
         way = place - points
         length = np.linalg.norm(way, axis=1)
         lit = np.flatnonzero(light > 0.0)
-        dark = caster.blocked(start[lit], way[lit] / length[lit, None], length[lit])
+        dark = caster.is_blocked(start[lit], way[lit] / length[lit, None], length[lit])
         lost[lit] += dark * light[lit]
         light[lit[dark]] = 0.0
         total += light[:, None] * scene.sphere.weights[led]
@@ -160,14 +160,14 @@ def traced(
     return mean, gone / (mean[:, 0] + gone)
 
 
-def picture(scene: GradientScene, pixels: NDArray[np.intp]) -> Float64Array:
-    """Return `GradientScene`'s own light in some pixels, as `traced` gives it."""
-    light = scene.stokes(NEUTRAL)[:, 0]
+def scene_pixels(scene: GradientScene, pixels: NDArray[np.intp]) -> Float64Array:
+    """Return `GradientScene`'s own light in some pixels, as `trace_pixels` gives it."""
+    light = scene.stokes(NEUTRAL_GRIP)[:, 0]
     return np.asarray(light.reshape(4, -1)[:, pixels].T, np.float64)
 
 
-def describe(
-    scene: GradientScene, pattern: str, *, depth: int = 2, gloss: bool = True
+def describe_patch(
+    scene: GradientScene, pattern: str, *, depth: int = 2, specular: bool = True
 ) -> dict[str, Any]:
     """Return Mitsuba's scene of the patch under a pattern, at half the skin's strength.
 
@@ -176,23 +176,27 @@ def describe(
     """
     view = scene.rig.views[0]
     r_d = PATCH_ALBEDO * shading.interior_scale(ETA) * plastic_scale(ETA)
-    inside = matt_plastic(ETA, {"type": "rgb", "value": [float(r_d)] * 3})
+    inside = matte_plastic(ETA, {"type": "rgb", "value": [float(r_d)] * 3})
     facets = rough_metal("ggx", ETA, float(np.median(scene.skin.alpha)))
     glossy = {"type": "blendbsdf", "weight": 0.5, "inside": inside, "surface": facets}
     description: dict[str, Any] = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": depth, "rr_depth": depth + 1},
         "sensor": perspective(view, "luminance", sampler="stratified"),
-        "patch": {"type": "mesh", "mesh": relief_mesh(scene), "bsdf": glossy if gloss else inside},
+        "patch": {
+            "type": "mesh",
+            "mesh": relief_mesh(scene),
+            "bsdf": glossy if specular else inside,
+        },
     }
     shares = scene.sphere.weights @ np.array(PATTERN_WEIGHTS[pattern])
-    name = "light"  # the entry that `MovedLight` moves, to where it is
+    name = "light"  # the entry that `MovableLightScene` moves, to where it is
     for place, power, share in zip(
         scene.sphere.position_mm, scene.sphere.intensity, shares, strict=True
     ):
         if place[2] <= 0.0 or share <= 0.0:
             continue
-        strength = float(power * share * REFERENCE_MM**2)
+        strength = float(power * share * REFERENCE_DISTANCE_MM**2)
         description[name] = {
             "type": "point",
             "position": [float(x) for x in place],
@@ -202,14 +206,14 @@ def describe(
     return description
 
 
-def rendered(
+def render_pattern(
     scene: GradientScene,
     pattern: str,
     *,
     samples: int,
     seed: int = 0,
     depth: int = 2,
-    gloss: bool = True,
+    specular: bool = True,
 ) -> tuple[Float32Array, float]:
     """Render a pattern by Mitsuba's path tracer.
 
@@ -222,37 +226,41 @@ def rendered(
     samples, seed
         Of Mitsuba.
     depth, gloss
-        See `describe`.
+        See `describe_patch`.
 
     Returns
     -------
     image : ndarray of float32
-        Shape (H, W), in the unit of `traced`.
+        Shape (H, W), in the unit of `trace_pixels`.
     seconds : float
         Processor time of the second rendering: all is built and compiled before.
     """
-    description = describe(scene, pattern, depth=depth, gloss=gloss)
+    description = describe_patch(scene, pattern, depth=depth, specular=specular)
     light_mm = description["light"]["position"]
-    renderer = MovedLight(description, kind="rgb")
+    renderer = MovableLightScene(description, kind="rgb")
     renderer.radiance(light_mm, samples=samples, seed=seed + 1)
     begin = time.process_time()
     image = renderer.radiance(light_mm, samples=samples, seed=seed)
     spent = time.process_time() - begin
-    strength = 2.0 if gloss else 1.0
+    strength = 2.0 if specular else 1.0
     return np.asarray(strength * scene.unit * image[..., 0], np.float32), spent
 
 
-def judge(found: Float64Array, reference: Float64Array, seconds: float, *, blocks: int = 40) -> Way:
+def compare_with_reference(
+    image: Float64Array, reference: Float64Array, seconds: float, *, blocks: int = 40
+) -> ReferenceComparison:
     """Compare a picture with the reference, both of shape (n,) or (n, k)."""
-    difference = found - reference
+    difference = image - reference
     error = float(np.sqrt(np.mean(difference**2)) / reference.mean())
     parts = [
         (a.mean(), b.mean())
         for a, b in zip(
-            np.array_split(found.reshape(len(found), -1)[:, 0], blocks),
+            np.array_split(image.reshape(len(image), -1)[:, 0], blocks),
             np.array_split(reference.reshape(len(reference), -1)[:, 0], blocks),
             strict=True,
         )
     ]
     ratios = np.array([a / b for a, b in parts])
-    return Way(seconds, error, float(ratios.mean()), float(ratios.std(ddof=1) / math.sqrt(blocks)))
+    return ReferenceComparison(
+        seconds, error, float(ratios.mean()), float(ratios.std(ddof=1) / math.sqrt(blocks))
+    )

@@ -18,20 +18,20 @@ from capture.rig import load_rig
 from rigsim.arrays import Float64Array
 from rigsim.needs.effects import SceneEffects
 from rigsim.scenes.gradient.patch import Relief
-from rigsim.scenes.gradient.reference import NEUTRAL
+from rigsim.scenes.gradient.reference import NEUTRAL_GRIP
 from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.skin_patch.stretch import SurfaceSample
 from rigsim.world.taped_skin import GripState
 
-LONG_UM: Final = 240.0
+REFERENCE_PERIOD_UM: Final = 240.0
 """Period of waves without lens and pixels that give the scale of the others."""
 
 FIELD_PX: Final = 96
 
 
 @dataclass(frozen=True, slots=True)
-class Waves:
+class SineRelief:
     """Even skin with waves along x; see `rigsim.scenes.gradient.patch.Relief`."""
 
     period_um: float
@@ -66,26 +66,26 @@ WAVE_ALPHA: Final = 0.25
 """Roughness of the waves."""
 
 
-class WavyScene(GradientScene):
-    """The rig with waves instead of skin; set `waves`, then call `show`."""
+class SineReliefScene(GradientScene):
+    """The rig with waves instead of skin; set `waves`, then call `set_waves`."""
 
-    waves = Waves(LONG_UM, 0.05)
+    waves = SineRelief(REFERENCE_PERIOD_UM, 0.05)
 
-    def show(self, waves: Waves) -> None:
+    def set_waves(self, waves: SineRelief) -> None:
         """Put other waves into the patch's place."""
         self.waves = waves
-        self.forget()
+        self.clear_caches()
 
     def _relief_at(self, grip: GripState) -> Relief:
         return self.waves
 
 
-def wavy_scene(*, optics: bool = True) -> WavyScene:
+def make_sine_relief_scene(*, optics: bool = True) -> SineReliefScene:
     """Return the gradient rig with waves, as drawn, two samples along a pixel's side."""
     skin = make_micro_skin("cheek", size_mm=0.1)  # gives the pigment that spreads light
     even = np.full_like(skin.height_um, WAVE_ALPHA)
     rig = load_rig("gradient").cropped(FIELD_PX)
-    return WavyScene(
+    return SineReliefScene(
         rig, dataclasses.replace(skin, alpha=even), effects=SceneEffects(optics=optics), subpixels=2
     )
 
@@ -104,19 +104,19 @@ def slope_transfer(periods_um: Sequence[float], *, slope: float = 0.05) -> Float
     -------
     ndarray
         Shape (n,): amplitude of the wave in the ratio of the surface reflection's moments x and 1,
-        over its slope, relative to waves of `LONG_UM` without lens and pixels.
+        over its slope, relative to waves of `REFERENCE_PERIOD_UM` without lens and pixels.
     """
-    scale = _amplitude(wavy_scene(optics=False), Waves(LONG_UM, slope))
-    scene = wavy_scene()
-    return np.array([_amplitude(scene, Waves(float(p), slope)) / scale for p in periods_um])
+    scale = _amplitude(make_sine_relief_scene(optics=False), SineRelief(REFERENCE_PERIOD_UM, slope))
+    scene = make_sine_relief_scene()
+    return np.array([_amplitude(scene, SineRelief(float(p), slope)) / scale for p in periods_um])
 
 
-def _amplitude(scene: WavyScene, waves: Waves) -> float:
-    scene.show(waves)
-    moments = scene.moments(NEUTRAL)
+def _amplitude(scene: SineReliefScene, waves: SineRelief) -> float:
+    scene.set_waves(waves)
+    moments = scene.moments(NEUTRAL_GRIP)
     specular = (moments["parallel"] - moments["crossed"]).astype(np.float64)
     ratio = specular[1] / specular[0]
-    x = scene.surface(NEUTRAL).x_mm[FIELD_PX // 2] * 1e3
+    x = scene.surface(NEUTRAL_GRIP).x_mm[FIELD_PX // 2] * 1e3
     # whole periods in the middle; the bulge and the view's own tilt are a parabola
     count = max(int(0.8 * FIELD_PX * 6.0 / waves.period_um), 1)
     inside = np.abs(x) <= 0.5 * count * waves.period_um

@@ -18,23 +18,29 @@ import numpy as np
 from capture.rig import Rig
 from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.as_built.polarizers import Polarizers, draw_polarizers
-from rigsim.as_built.sphere import PATTERN_WEIGHTS, BuiltSphere, diffuser_radiance, nominal_sphere
+from rigsim.as_built.sphere import PATTERN_WEIGHTS, ActualSphere, diffuser_radiance, nominal_sphere
 from rigsim.boxes.gradient_sphere import PatternLight
-from rigsim.kept import Kept
-from rigsim.light.lobe_moments import Surface
-from rigsim.needs.effects import EFFECTS_BY_SIZE, Noise, SceneEffects
+from rigsim.caching import LruCache
+from rigsim.light.lobe_moments import MicrofacetSurface
+from rigsim.needs.effects import AUTOMATIC_EFFECTS, PixelNoise, SceneEffects
 from rigsim.needs.face import INTERREFLECTION_EFFECT, LATERAL_EFFECT, SHADOW_EFFECT
-from rigsim.needs.gradient import OPTICS_EFFECT, gradient_needs
-from rigsim.render.lens_blur import Lens, blur, lens_of
-from rigsim.scenes.exposing import RigScene, SceneError, full_power_s
-from rigsim.scenes.gradient.analyser import GridAnalyser
-from rigsim.scenes.gradient.lighting import Lighting, light_skin
-from rigsim.scenes.gradient.patch import SHADOW_MARGIN_PX, PatchSurface, Relief, sample_grid, stand
+from rigsim.needs.gradient import OPTICS_EFFECT, select_gradient_effects
+from rigsim.render.lens_blur import Lens, blur_images, focused_lens
+from rigsim.scenes.exposing import RigScene, SceneError, full_power_duration_s
+from rigsim.scenes.gradient.analyzer import GridAnalyzer
+from rigsim.scenes.gradient.lighting import PatchLighting, tabulate_patch_lighting
+from rigsim.scenes.gradient.patch import (
+    SHADOW_MARGIN_PX,
+    PatchSurface,
+    Relief,
+    sample_grid,
+    sample_patch,
+)
 from rigsim.scenes.gradient.target import target_moments
-from rigsim.sensor import Sensor, sensor_of
+from rigsim.sensor import Sensor, make_sensor
 from rigsim.skin_patch.microrelief import MicroSkin
-from rigsim.skin_patch.motion import PatchMotion, Pose, shifted
-from rigsim.skin_patch.stretch import StretchedSkin, deform
+from rigsim.skin_patch.motion import PatchMotion, PatchPose, shift_image
+from rigsim.skin_patch.stretch import StretchedSkin, stretch_skin
 from rigsim.tissue.skin_layers import ETA
 from rigsim.world.taped_skin import GripState
 
@@ -50,17 +56,17 @@ PATTERN_POWER_DEVIATION: Final = 0.001
 DRIFT_MARGIN_PX: Final = 8
 """Pixels around the picture that may drift into it."""
 
-KEPT_IMAGE_BYTES: Final = 2**29
+IMAGE_CACHE_BYTES: Final = 2**29
 """Pictures of states that are kept; one at least."""
 
 
-KEPT_LIGHTINGS: Final = 2
+MAX_CACHED_LIGHTINGS: Final = 2
 """Tables of light that are kept: LEDs may change by gains and failures."""
 
-FURROW_SECTORS: Final = 16
+GROOVE_SECTORS: Final = 16
 """Directions in which the sky is looked for, for light from furrow to furrow."""
 
-KEPT_RELIEFS: Final = 4
+MAX_CACHED_RELIEFS: Final = 4
 """Stretched patches that are kept."""
 
 
@@ -104,10 +110,10 @@ class GradientScene(RigScene):
         subject: MicroSkin | TargetName,
         *,
         films: Polarizers | None = None,
-        sphere: BuiltSphere | None = None,
+        sphere: ActualSphere | None = None,
         motion: PatchMotion | None = None,
         seed: int = 0,
-        effects: SceneEffects = EFFECTS_BY_SIZE,
+        effects: SceneEffects = AUTOMATIC_EFFECTS,
         on_s: float | None = None,
         sectors: int = 32,
         subpixels: int = 1,
@@ -127,20 +133,24 @@ class GradientScene(RigScene):
         self.motion, self.seed = motion, seed
         self.sectors, self.subpixels, self.table_size = sectors, subpixels, table_size
         self._view = rig.views[0]
-        self._sensor = sensor_of(self._view)
-        self._lighting: Kept[tuple[float, ...], Lighting] = Kept(lambda _: KEPT_LIGHTINGS)
+        self._sensor = make_sensor(self._view)
+        self._lighting: LruCache[tuple[float, ...], PatchLighting] = LruCache(
+            lambda _: MAX_CACHED_LIGHTINGS
+        )
         # behind two ideal films, one of which the unit of radiance holds already
         white = float(diffuser_radiance(nominal_sphere(rig), np.zeros(1), np.zeros(1))[0, 0])
         # full scales per second for a unit of radiance of `rigsim.light.lobe_moments`
         self.unit = GRADIENT_METER_RATE_PER_S / (0.5 * white)
-        self._pictures: Kept[tuple[object, ...], Float32Array] = Kept(
-            lambda picture: KEPT_IMAGE_BYTES // picture.nbytes
+        self._pictures: LruCache[tuple[object, ...], Float32Array] = LruCache(
+            lambda picture: IMAGE_CACHE_BYTES // picture.nbytes
         )
-        self._reliefs: Kept[tuple[float, float], StretchedSkin] = Kept(lambda _: KEPT_RELIEFS)
-        self._analyser = GridAnalyser(self.films, self._view)
+        self._reliefs: LruCache[tuple[float, float], StretchedSkin] = LruCache(
+            lambda _: MAX_CACHED_RELIEFS
+        )
+        self._analyser = GridAnalyzer(self.films, self._view)
         level = math.inf if on_s is None else GRADIENT_METER_RATE_PER_S * on_s
-        seen = (self.sphere, self.lens, Noise.of(self._sensor), level)
-        self.needs = gradient_needs(rig, subject, *seen, motion is not None, effects)
+        seen = (self.sphere, self.lens, PixelNoise.of(self._sensor), level)
+        self.needs = select_gradient_effects(rig, subject, *seen, motion is not None, effects)
         """What is built, what is not, and why."""
         self.shadows = self.needs.builds(SHADOW_EFFECT)
         self.optics = self.needs.builds(OPTICS_EFFECT)
@@ -150,7 +160,7 @@ class GradientScene(RigScene):
     @property
     def lens(self) -> Lens:
         """Return the camera's lens."""
-        return lens_of(self._view, self.rig.lights[0].illuminant)
+        return focused_lens(self._view, self.rig.lights[0].illuminant)
 
     def sensor(self, view_name: str | None = None) -> Sensor:
         """Return the camera's sensor."""
@@ -194,7 +204,7 @@ class GradientScene(RigScene):
         """
         stokes = self.stokes(grip)
         return {
-            name: np.stack([self._analyser.analyse(s, reading) for s in stokes])
+            name: np.stack([self._analyser.analyze(s, reading) for s in stokes])
             for name, reading in (("parallel", 0.0), ("crossed", 90.0))
         }
 
@@ -245,10 +255,10 @@ class GradientScene(RigScene):
         )
         for m in np.flatnonzero(weights):
             stokes += weights[m] * wide[3 * m : 3 * m + 3, part, column]
-        image = self._analyser.analyse(stokes, analyser_deg, border_px=reach)
+        image = self._analyser.analyze(stokes, analyser_deg, border_px=reach)
         if reach:
             pixel_um = self.lens.pixel_on_subject_um
-            image = shifted(image, drift, pixel_um=pixel_um, border_px=reach)
+            image = shift_image(image, drift, pixel_um=pixel_um, border_px=reach)
         # light taken away LED by LED leaves rounding errors where none is left
         return np.maximum(image, np.float32(0.0))
 
@@ -284,7 +294,7 @@ class GradientScene(RigScene):
         return self._expose(
             self._camera(view_name),
             pops,
-            lambda pop: full_power_s(pop, f"pattern {pop.pattern!r}"),
+            lambda pop: full_power_duration_s(pop, f"pattern {pop.pattern!r}"),
             lambda pop: self.radiance(
                 pop.pattern,
                 grip=grip,
@@ -297,7 +307,7 @@ class GradientScene(RigScene):
             seed=seed,
         )
 
-    def forget(self) -> None:
+    def clear_caches(self) -> None:
         """Drop the pictures that are kept, which the subject's states are made again from."""
         self._pictures.clear()
 
@@ -314,23 +324,23 @@ class GradientScene(RigScene):
         """Return what stands at the camera's samples in a state, without drift."""
         grid = sample_grid(self._view, subpixels=subpixels, border_px=border_px)
         pose, alpha = self.pose(grip), float(np.median(self.skin.alpha))
-        moved = Pose(pose.x_mm + jump_mm[0], pose.y_mm + jump_mm[1], pose.turn_rad)
+        moved = PatchPose(pose.x_mm + jump_mm[0], pose.y_mm + jump_mm[1], pose.rotation_rad)
         eye_mm = self._view.distance_mm
-        return stand(self._relief_at(grip), grip, moved, grid, eye_mm=eye_mm, alpha=alpha)
+        return sample_patch(self._relief_at(grip), grip, moved, grid, eye_mm=eye_mm, alpha=alpha)
 
     def relief(self, grip: GripState) -> StretchedSkin:
         """Return the skin in a state, in its own frame."""
         skin = self.skin
         key = (grip.stretch, grip.angle_deg if grip.stretch != 1.0 else 0.0)
-        return self._reliefs.get(key, lambda: deform(skin, stretch=key[0], angle_deg=key[1]))
+        return self._reliefs.get(key, lambda: stretch_skin(skin, stretch=key[0], angle_deg=key[1]))
 
     def _relief_at(self, grip: GripState) -> Relief:
         return self.relief(grip)
 
-    def pose(self, grip: GripState) -> Pose:
+    def pose(self, grip: GripState) -> PatchPose:
         """Return where the skin lies in a state, drift and jumps aside."""
         if self.motion is None:
-            return Pose(0.0, 0.0, 0.0)
+            return PatchPose(0.0, 0.0, 0.0)
         return self.motion.pose(grip.angle_deg, grip.step)
 
     # inside -------------------------------------------------------------------------------------
@@ -363,12 +373,12 @@ class GradientScene(RigScene):
             if isinstance(self.subject, MicroSkin) and grip is not None:
                 picture = self._render(grip, jump_mm, shares)
             else:
-                sphere, extinction = self._lit(shares), self.films.light_extinction
+                sphere, extinction = self._make_lighting(shares), self.films.light_extinction
                 picture = target_moments(
                     str(self.subject), self._view, sphere, extinction, seed=self.seed
                 )
                 if self.subject == "ball" and self.optics:
-                    picture = blur(picture, self.lens, averaged=True)
+                    picture = blur_images(picture, self.lens, averaged=True)
             picture *= np.float32(self.unit)
             return picture
 
@@ -380,7 +390,7 @@ class GradientScene(RigScene):
         s = self.subpixels
         margin = SHADOW_MARGIN_PX if self.shadows or self.interreflections else 0
         wide = self.surface(grip, subpixels=s, border_px=DRIFT_MARGIN_PX + margin, jump_mm=jump_mm)
-        patch = wide.inner(s * margin)
+        patch = wide.crop(s * margin)
         raw = self.lighting(shares).stokes(
             patch,
             wide.relief_um + wide.bulge_um,
@@ -388,11 +398,11 @@ class GradientScene(RigScene):
             pitch_um=self.lens.pixel_on_subject_um / s,
         )
         if self.optics:
-            return blur(raw, self.lens, depth_mm=patch.height_mm, subpixels=s)
+            return blur_images(raw, self.lens, depth_mm=patch.height_mm, subpixels=s)
         k, h, w = raw.shape
         return np.asarray(raw.reshape(k, h // s, s, w // s, s).mean(axis=(2, 4)), np.float32)
 
-    def lighting(self, shares: tuple[float, ...] = ()) -> Lighting:
+    def lighting(self, led_fractions: tuple[float, ...] = ()) -> PatchLighting:
         """Return what the light does to this skin in any state.
 
         Parameters
@@ -401,30 +411,30 @@ class GradientScene(RigScene):
             What each LED gives of what the sphere says; empty: all of it.
         """
 
-        def make() -> Lighting:
-            return light_skin(
+        def make() -> PatchLighting:
+            return tabulate_patch_lighting(
                 self.skin,
-                self._lit(shares),
+                self._make_lighting(led_fractions),
                 self.optical_surface(float(np.median(self.skin.alpha))),
                 half_field_mm=0.5 * max(self._view.field_mm) + 0.1,
                 sectors=self.sectors if self.shadows else 0,
                 table_size=self.table_size,
                 lateral=self.lateral,
-                furrow_sectors=FURROW_SECTORS if self.interreflections else 0,
+                groove_sectors=GROOVE_SECTORS if self.interreflections else 0,
             )
 
-        return self._lighting.get(shares, make)
+        return self._lighting.get(led_fractions, make)
 
-    def _lit(self, shares: tuple[float, ...]) -> BuiltSphere:
+    def _make_lighting(self, shares: tuple[float, ...]) -> ActualSphere:
         if not shares:
             return self.sphere
         if len(shares) != len(self.sphere.intensity) or min(shares) < 0.0:
             raise SceneError(f"led_shares: got {len(shares)} numbers, expected one >= 0 per LED")
         return dataclasses.replace(self.sphere, intensity=self.sphere.intensity * np.array(shares))
 
-    def optical_surface(self, alpha: float) -> Surface:
+    def optical_surface(self, alpha: float) -> MicrofacetSurface:
         """Return how a surface of a roughness reflects, and who looks at it."""
-        return Surface(
+        return MicrofacetSurface(
             alpha, ETA, self._view.position_mm, self._view.axes[0], self.films.light_extinction
         )
 

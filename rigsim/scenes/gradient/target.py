@@ -6,16 +6,16 @@ import numpy as np
 
 from capture.rig import View
 from rigsim.arrays import Float32Array
-from rigsim.as_built.sphere import BuiltSphere, diffuser_radiance
+from rigsim.as_built.sphere import ActualSphere, diffuser_radiance
 from rigsim.scenes.gradient.patch import sample_grid
-from rigsim.targets.glass_ball import ball_center_mm, ball_stokes
+from rigsim.targets.glass_ball import draw_ball_center_mm, render_ball_stokes
 
 FLAT_REFLECTANCE: Final = 0.3
 """Of the diffuser in the patch's place: 30 ms at level 1 give 0.9 of full scale."""
 
 
 def target_moments(
-    name: str, view: View, sphere: BuiltSphere, extinction: float, *, seed: int
+    name: str, view: View, sphere: ActualSphere, extinction: float, *, seed: int
 ) -> Float32Array:
     """Return the Stokes vectors of a target for each moment of the light, before the lens.
 
@@ -36,7 +36,9 @@ def target_moments(
         Shape (12, H, W).
     """
     if name == "ball":
-        return ball_stokes(view, sphere, extinction=extinction, center_mm=ball_center_mm(seed))
+        return render_ball_stokes(
+            view, sphere, extinction=extinction, center_mm=draw_ball_center_mm(seed)
+        )
     out = np.zeros((12, view.height_px, view.width_px), np.float32)
     if name == "flat":
         x, y = sample_grid(view, subpixels=1, border_px=0)

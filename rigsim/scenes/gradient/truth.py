@@ -10,9 +10,9 @@ import numpy as np
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from rigsim import shading
 from rigsim.arrays import Float32Array, Float64Array
-from rigsim.as_built.sphere import BuiltSphere
-from rigsim.light.lobe_moments import Surface, led_moments
-from rigsim.render.lens_blur import blur
+from rigsim.as_built.sphere import ActualSphere
+from rigsim.light.lobe_moments import MicrofacetSurface, led_moments
+from rigsim.render.lens_blur import blur_images
 from rigsim.scenes.gradient.patch import PatchSurface
 from rigsim.world.taped_skin import GripState
 
@@ -20,19 +20,19 @@ if TYPE_CHECKING:
     from rigsim.scenes.gradient.scene import GradientScene
 
 
-def state_name(angle_deg: float, step: int) -> str:
+def format_state_name(angle_deg: float, step: int) -> str:
     """Return the name of a state of the caliper.
 
     Examples
     --------
-    >>> state_name(45.0, -2), state_name(0.0, 0), state_name(135.0, 3)
+    >>> format_state_name(45.0, -2), format_state_name(0.0, 0), format_state_name(135.0, 3)
     ('a045_m2', 'a000_n0', 'a135_p3')
     """
     sign = "n" if step == 0 else "m" if step < 0 else "p"
     return f"a{round(angle_deg):03d}_{sign}{abs(step)}"
 
 
-def appearance(scene: GradientScene, grips: Sequence[GripState]) -> SkinAppearance:
+def gradient_truth(scene: GradientScene, grips: Sequence[GripState]) -> SkinAppearance:
     """Return the truth of some states.
 
     Parameters
@@ -49,7 +49,7 @@ def appearance(scene: GradientScene, grips: Sequence[GripState]) -> SkinAppearan
         um; ``bulged_height_<state>`` with what bulges or folds below it; ``normals_<state>``, of
         both; ``normals_seen_<state>``, their slopes averaged as lens and pixels average light;
         ``albedo_<state>``. The neutral state's are also ``height`` and ``normals``. Valid on skin.
-        ``parameters``: ``states``, ``lights``, ``lens``.
+        ``parameters``: ``states``, ``led_truth``, ``lens``.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def appearance(scene: GradientScene, grips: Sequence[GripState]) -> SkinAppearan
     names = set()
     first = _placement(scene, neutral)
     for grip in grips:
-        name = state_name(grip.angle_deg, grip.step)
+        name = format_state_name(grip.angle_deg, grip.step)
         if name in names:
             continue
         names.add(name)
@@ -84,7 +84,7 @@ def appearance(scene: GradientScene, grips: Sequence[GripState]) -> SkinAppearan
                 "stretch_t": relief.stretch_t,
                 "gradient": (_placement(scene, grip) @ np.linalg.inv(first)).tolist(),
                 "shift_mm": [pose.x_mm, pose.y_mm],
-                "rotation_rad": pose.turn_rad,
+                "rotation_rad": pose.rotation_rad,
                 "membrane_strain": relief.membrane_strain,
                 "attached": grip.attached,
                 "buckled": grip.buckled,
@@ -99,7 +99,7 @@ def appearance(scene: GradientScene, grips: Sequence[GripState]) -> SkinAppearan
         "preset": skin.preset,
         "subject_seed": skin.seed,
         "alpha": rough,
-        "lights": lights(scene.sphere, scene.optical_surface(rough)),
+        "lights": led_truth(scene.sphere, scene.optical_surface(rough)),
         "lens": {
             "working_f_number": lens.working_f_number,
             "pixel_um": lens.pixel_on_subject_um,
@@ -110,13 +110,13 @@ def appearance(scene: GradientScene, grips: Sequence[GripState]) -> SkinAppearan
         "drift_um": 0.0 if scene.motion is None else scene.motion.drift_um,
     }
     return SkinAppearance(
-        maps, "simulated", parameters=parameters, left_out=tuple(scene.left_out), seed=scene.seed
+        maps, "simulated", parameters=parameters, left_out=tuple(scene.omitted), seed=scene.seed
     )
 
 
 def _placement(scene: GradientScene, grip: GripState) -> Float64Array:
     """Return the gradient of the map from relaxed skin to the rig, turn included, (2, 2)."""
-    turn = scene.pose(grip).turn_rad
+    turn = scene.pose(grip).rotation_rad
     c, s = np.cos(turn), np.sin(turn)
     return np.asarray(np.array([[c, -s], [s, c]]) @ np.asarray(scene.relief(grip).gradient))
 
@@ -128,7 +128,7 @@ def _maps(scene: GradientScene, patch: PatchSurface) -> dict[str, SkinMap]:
         return SkinMap(values, unit, valid=skin, description=text)
 
     slopes = -patch.normals[..., :2] / patch.normals[..., 2:]
-    seen = blur(np.moveaxis(slopes, -1, 0), scene.lens, depth_mm=patch.height_mm)
+    seen = blur_images(np.moveaxis(slopes, -1, 0), scene.lens, depth_mm=patch.height_mm)
     normals = np.stack([-seen[0], -seen[1], np.ones_like(seen[0])], axis=-1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     return {
@@ -142,7 +142,7 @@ def _maps(scene: GradientScene, patch: PatchSurface) -> dict[str, SkinMap]:
     }
 
 
-def lights(sphere: BuiltSphere, surface: Surface) -> list[dict[str, object]]:
+def led_truth(sphere: ActualSphere, surface: MicrofacetSurface) -> list[dict[str, object]]:
     """Return the LEDs' truth, to judge their calibration by.
 
     Parameters
@@ -173,7 +173,7 @@ def lights(sphere: BuiltSphere, surface: Surface) -> list[dict[str, object]]:
         if np.linalg.norm(facet) > 1e-3 and sphere.intensity[led] > 0.0:
             facet /= np.linalg.norm(facet)
             stokes, _ = led_moments(facet[None], np.zeros((1, 3)), sphere, led, surface)
-            through = _through(stokes, eye, surface)
+            through = _analyzer_transmittance(stokes, eye, surface)
             leakage = float(through[1] / through[0])
         out.append(
             {
@@ -186,12 +186,16 @@ def lights(sphere: BuiltSphere, surface: Surface) -> list[dict[str, object]]:
     return out
 
 
-def _through(stokes: Float32Array, eye: Float64Array, surface: Surface) -> tuple[float, float]:
+def _analyzer_transmittance(
+    stokes: Float32Array, eye: Float64Array, surface: MicrofacetSurface
+) -> tuple[float, float]:
     right = np.array(surface.image_right)
     up = np.cross(eye, right)
     parallel, crossed = (
         float(
-            shading.analyse(stokes, eye[None], passes_deg=angle, image_right=right, image_up=up)[0]
+            shading.apply_analyzer(
+                stokes, eye[None], passes_deg=angle, image_right=right, image_up=up
+            )[0]
         )
         for angle in (90.0, 180.0)
     )

@@ -20,36 +20,36 @@ from capture.rig import Rig
 from model import spectra
 from model.skin import SkinAppearance
 from rigsim.arrays import Float32Array, Float64Array, UInt16Array
-from rigsim.as_built.probe import ProbeBuild, build_probe, unit_images
+from rigsim.as_built.probe import ActualProbe, build_probe, fiber_unit_images
 from rigsim.boxes.source_shutter import SourceLight
-from rigsim.fiber.homogeneous_fit import nearest_medium
-from rigsim.fiber.probe_profile import Profile, Profiles, fibres_of
+from rigsim.fiber.homogeneous_fit import fit_homogeneous_medium
+from rigsim.fiber.probe_profile import BandProfile, ProfileCache, probe_fibers
 from rigsim.fiber.probe_tissue import HomogeneousTissue, ProbedTissue, TissueError
-from rigsim.needs.effects import Noise
-from rigsim.needs.probe import probe_needs
-from rigsim.scenes.exposing import RigScene, SceneError, full_power_s
-from rigsim.sensor import Sensor, expose, sensor_of
+from rigsim.needs.effects import PixelNoise
+from rigsim.needs.probe import select_probe_effects
+from rigsim.scenes.exposing import RigScene, SceneError, full_power_duration_s
+from rigsim.sensor import Sensor, expose_sensor, make_sensor
 from rigsim.world.suction import HeadState
 
 PROBE_METER_RATE_PER_S: Final = 0.8 / 2.0 / (30.0 * 2.0 ** (-44.0 / 3.0))
 """Full scales per second in a spot's middle per R_f in 1/mm^2."""
 
-DARK_E_PER_S: Final = 0.3
-"""Dark current at `DARK_C`, electrons per second and pixel."""
-DARK_C: Final = 5.0
-DARK_DOUBLES_K: Final = 6.5
+DARK_CURRENT_E_PER_S: Final = 0.3
+"""Dark current at `DARK_CURRENT_REFERENCE_C`, electrons per second and pixel."""
+DARK_CURRENT_REFERENCE_C: Final = 5.0
+DARK_CURRENT_DOUBLING_K: Final = 6.5
 """Warming that doubles the dark current, kelvin; typical of silicon near room temperature."""
 
 HOT_SHARE, HOT_E_PER_S = 1e-3, 10.0
-"""Share of hot pixels, and the mean of their further dark current at `DARK_C`."""
+"""Share of hot pixels, and the mean of their further dark current at `DARK_CURRENT_REFERENCE_C`."""
 
-ROOM_R_F_PER_MM2: Final = 1e-3
+ROOM_LIGHT_R_F_PER_MM2: Final = 1e-3
 """What the room's light on a head in the air is worth in reflectance at full level."""
 
 MAX_USUAL_EXPOSURE_S: Final = 30.0
 """The longest of the usual exposures, s."""
 
-CAP_SITE: Final = "cap"
+DARK_CAP_SITE: Final = "cap"
 """Site at which the head's fibres look into the dark."""
 
 LENS_VIGNETTING: Final = 0.1
@@ -70,7 +70,7 @@ class ProbeScene(RigScene):
         The probe as built; None: drawn by the camera's serial number and `seed` 0, so that
         sessions of one probe share it.
     sensor
-        The camera's sensor at `DARK_C`; None takes what the rig states.
+        The camera's sensor at `DARK_CURRENT_REFERENCE_C`; None takes what the rig states.
     seed
         Seeds the photons and what differs from exposure to exposure.
     photons
@@ -82,7 +82,7 @@ class ProbeScene(RigScene):
         rig: Rig,
         tissue: ProbedTissue,
         *,
-        build: ProbeBuild | None = None,
+        build: ActualProbe | None = None,
         sensor: Sensor | None = None,
         seed: int = 0,
         photons: int = PHOTONS_PER_ANGLE,
@@ -96,33 +96,36 @@ class ProbeScene(RigScene):
                 f"build: got {len(self.build.gain)} fibres, expected {len(rig.probe.fibres)}"
             )
         self._view = rig.views[0]
-        dark = {"dark_e_per_s": DARK_E_PER_S, "vignetting": LENS_VIGNETTING}
-        self._sensor = sensor_of(self._view, **dark) if sensor is None else sensor
-        self.profiles = Profiles(rig, tissue, photons=photons, seed=seed)
+        dark = {"dark_e_per_s": DARK_CURRENT_E_PER_S, "vignetting": LENS_VIGNETTING}
+        self._sensor = make_sensor(self._view, **dark) if sensor is None else sensor
+        self.profiles = ProfileCache(rig, tissue, photons=photons, seed=seed)
         self.white = spectra.camera_white(self._view.spectral_sensitivity, rig.lights[0].illuminant)
-        images = unit_images(self.build, self._view)
+        images = fiber_unit_images(self.build, self._view)
         self._images = np.ascontiguousarray(images.reshape(len(images), -1).T)
         self.hot_e_per_s = _hot_pixels(self._sensor, images.shape[1:])
-        """What hot pixels add to the dark current at `DARK_C`, electrons/s, shape (H, W)."""
+        """What hot pixels add to the dark current at `DARK_CURRENT_REFERENCE_C`, electrons/s,
+        shape (H, W)."""
         full_e = self._sensor.gain_e_per_dn * (self._sensor.white - self._sensor.black)
-        self.needs = probe_needs(
+        self.needs = select_probe_effects(
             rig,
             tissue,
             self.build,
-            noise=Noise.of(self._sensor),
+            noise=PixelNoise.of(self._sensor),
             hot=float(self.hot_e_per_s.max()) * MAX_USUAL_EXPOSURE_S / full_e,
         )
         """What is built, what is not, and why."""
 
-    def sensor(self, view_name: str | None = None, *, camera_c: float = DARK_C) -> Sensor:
+    def sensor(
+        self, view_name: str | None = None, *, camera_c: float = DARK_CURRENT_REFERENCE_C
+    ) -> Sensor:
         """Return the camera's sensor at a temperature in degrees Celsius."""
         self._check_view(view_name)
-        dark = self._sensor.dark_e_per_s * _warmth(camera_c)
+        dark = self._sensor.dark_e_per_s * _relative_dark_current(camera_c)
         return dataclasses.replace(self._sensor, dark_e_per_s=dark)
 
     # light --------------------------------------------------------------------------------------
 
-    def profile(self, head: HeadState) -> Profile | None:
+    def profile(self, head: HeadState) -> BandProfile | None:
         """Return what the fibres would take at full level; None where they touch nothing.
 
         Raises
@@ -130,22 +133,22 @@ class ProbeScene(RigScene):
         SceneError
             The tissue has no such site.
         """
-        if not head.placed or head.site in ("", CAP_SITE):
+        if not head.placed or head.site in ("", DARK_CAP_SITE):
             return None
         try:
             return self.profiles.profile(head.site, head.angle_deg, head.suction_mbar)
         except TissueError as error:
             raise SceneError(str(error)) from error
 
-    def fibre_light(self, head: HeadState, *, fibre: int | None = None) -> Float64Array:
-        """Return `through_fibres` of what the head touches; nothing where it is in the air."""
+    def fiber_radiance(self, head: HeadState, *, fiber: int | None = None) -> Float64Array:
+        """Return `transmit_through_fibers` of the touched skin; nothing if the head is in air."""
         profile = self.profile(head)
         if profile is None:
             return np.zeros((len(self.build.gain), 3))
-        return self.through_fibres(profile.reflectance_per_mm2, fibre=fibre)
+        return self.transmit_through_fibers(profile.reflectance_per_mm2, fiber=fiber)
 
-    def through_fibres(
-        self, reflectance_per_mm2: Float64Array, *, fibre: int | None = None
+    def transmit_through_fibers(
+        self, reflectance_per_mm2: Float64Array, *, fiber: int | None = None
     ) -> Float64Array:
         """Return the light that comes out of the fibres, in full scales per second at level 1.
 
@@ -169,18 +172,18 @@ class ProbeScene(RigScene):
         """
         count = len(self.build.gain)
         open_share = np.ones(count)
-        if fibre is not None:
-            if not 0 <= fibre < count:
-                raise SceneError(f"fibre: got {fibre}, expected 0 to {count - 1}")
+        if fiber is not None:
+            if not 0 <= fiber < count:
+                raise SceneError(f"fibre: got {fiber}, expected 0 to {count - 1}")
             open_share[:] = self.build.cover_leak
-            open_share[fibre] = 1.0
+            open_share[fiber] = 1.0
         taken = (open_share * self.build.gain)[:, None] * reflectance_per_mm2
         return np.asarray(PROBE_METER_RATE_PER_S * (self.build.crosstalk @ taken) * self.white)
 
-    def image(self, fibre_light: Float64Array) -> Float32Array:
+    def image(self, fiber_radiance: Float64Array) -> Float32Array:
         """Return the light on the sensor, shape (H, W, 3), of what comes out of the fibres."""
         height, width = self._view.height_px, self._view.width_px
-        light = self._images @ np.asarray(fibre_light, np.float32)
+        light = self._images @ np.asarray(fiber_radiance, np.float32)
         return np.asarray(light.reshape(height, width, 3))
 
     def exposure(
@@ -221,18 +224,20 @@ class ProbeScene(RigScene):
         rng = np.random.default_rng([self.seed, seed])
         total = np.zeros((len(self.build.gain), 3))
         for pop in pops:
-            energy = full_power_s(pop, "the source")
+            energy = full_power_duration_s(pop, "the source")
             energy *= 1.0 + self.build.ripple * float(rng.standard_normal())
-            total += max(energy, 0.0) * self.fibre_light(head, fibre=pop.fibre)
-        if (not head.placed and head.site != CAP_SITE) or not head.site:
-            room = np.full((len(self.build.gain), 3), ROOM_R_F_PER_MM2)
-            total += exposure_s * self.through_fibres(room)
+            total += max(energy, 0.0) * self.fiber_radiance(head, fiber=pop.fiber)
+        if (not head.placed and head.site != DARK_CAP_SITE) or not head.site:
+            room = np.full((len(self.build.gain), 3), ROOM_LIGHT_R_F_PER_MM2)
+            total += exposure_s * self.transmit_through_fibers(room)
         light = self.image(total)
         sensor = self.sensor(camera_c=head.camera_c)
         full_e = sensor.gain_e_per_dn * (sensor.white - sensor.black)
-        hot = self.hot_e_per_s * np.float32(exposure_s * _warmth(head.camera_c) / full_e)
+        hot = self.hot_e_per_s * np.float32(
+            exposure_s * _relative_dark_current(head.camera_c) / full_e
+        )
         light += hot[..., None]
-        return expose(light, sensor=sensor, rng=rng, exposure_s=exposure_s)
+        return expose_sensor(light, sensor=sensor, rng=rng, exposure_s=exposure_s)
 
     # inside -------------------------------------------------------------------------------------
 
@@ -241,20 +246,20 @@ class ProbeScene(RigScene):
             raise SceneError(f"view: got {name!r}, expected {self._view.name!r}")
 
 
-def _warmth(camera_c: float) -> float:
-    """Return the dark current relative to that at `DARK_C`."""
-    return math.pow(2.0, (camera_c - DARK_C) / DARK_DOUBLES_K)
+def _relative_dark_current(camera_c: float) -> float:
+    """Return the dark current relative to that at `DARK_CURRENT_REFERENCE_C`."""
+    return math.pow(2.0, (camera_c - DARK_CURRENT_REFERENCE_C) / DARK_CURRENT_DOUBLING_K)
 
 
 def _hot_pixels(sensor: Sensor, shape: tuple[int, ...]) -> Float32Array:
-    """Return the further dark current of hot pixels at `DARK_C`, electrons per second."""
+    """Return hot pixels' added dark current at `DARK_CURRENT_REFERENCE_C`, electrons/s."""
     rng = np.random.default_rng([0x686F74, *sensor.serial.encode()])
     hot = rng.random(shape) < HOT_SHARE
     return np.where(hot, rng.exponential(HOT_E_PER_S, shape), 0.0).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
-class Probing:
+class ProbePlacement:
     """One placement of the head on the skin, during one series of exposures."""
 
     site: str
@@ -267,7 +272,7 @@ class Probing:
     """Mean suction while it was lit, mbar below the air's pressure, >= 0."""
 
 
-def appearance(scene: ProbeScene, probings: Sequence[Probing]) -> SkinAppearance:
+def probe_truth(scene: ProbeScene, placements: Sequence[ProbePlacement]) -> SkinAppearance:
     """Return the truth of some placements of the head.
 
     Parameters
@@ -288,7 +293,7 @@ def appearance(scene: ProbeScene, probings: Sequence[Probing]) -> SkinAppearance
         ``fit_fibres``; ``spots_px``, ``gain``, ``crosstalk`` of the
         probe as built.
     """
-    profiles = [_profile(scene, probing) for probing in probings]
+    profiles = [_profile(scene, probing) for probing in placements]
     build = scene.build
     parameters: dict[str, object] = {
         "profiles": profiles,
@@ -297,11 +302,11 @@ def appearance(scene: ProbeScene, probings: Sequence[Probing]) -> SkinAppearance
         "crosstalk": build.crosstalk.tolist(),
     }
     return SkinAppearance(
-        {}, "simulated", parameters=parameters, left_out=tuple(scene.left_out), seed=scene.seed
+        {}, "simulated", parameters=parameters, left_out=tuple(scene.omitted), seed=scene.seed
     )
 
 
-def _profile(scene: ProbeScene, probing: Probing) -> dict[str, object]:
+def _profile(scene: ProbeScene, probing: ProbePlacement) -> dict[str, object]:
     made = scene.profiles.profile(probing.site, probing.angle_deg, probing.suction_mbar)
     tissue = scene.tissue
     out: dict[str, object] = {
@@ -320,9 +325,11 @@ def _profile(scene: ProbeScene, probing: Probing) -> dict[str, object]:
         sigma_tr = math.sqrt(3.0 * sigma_a * (sigma_a + scattering))
         media = [(sigma_a, scattering, sigma_tr)] * 3
     else:
-        kind = fibres_of(scene.profiles.probe)
+        kind = probe_fibers(scene.profiles.probe)
         dimmed = tissue.kind != "anisotropic"  # has no layer on top
-        fits = [nearest_medium(band, kind, dimmed=dimmed) for band in made.reflectance_per_mm2.T]
+        fits = [
+            fit_homogeneous_medium(band, kind, dimmed=dimmed) for band in made.reflectance_per_mm2.T
+        ]
         media = [(f.sigma_a_per_mm, f.sigma_s_prime_per_mm, f.sigma_tr_per_mm) for f in fits]
         out["fit_residual"] = [fit.residual for fit in fits]
         out["fit_factor"] = [fit.factor for fit in fits]

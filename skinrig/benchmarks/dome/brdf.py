@@ -17,19 +17,19 @@ from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis
 from reconstruction.brdf_basis import space as brdf_space
 from reconstruction.diffuse_albedo import estimation as diffuse_albedo
-from rigsim.population.population import table_1
+from rigsim.population.population import draw_population
 from skinrig.analysing import brdf_space_datasets
 from skinrig.analysing.brdf_space_datasets import Dataset
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.benchmarks.dome import brdf_truth
-from skinrig.benchmarks.measurement import LIMIT_CORES, once, spent
-from skinrig.benchmarks.resampling import drawn_again
-from skinrig.benchmarks.results import BandError, Knobs, Timing
-from skinrig.benchmarks.stage import Stage
+from skinrig.benchmarks.measurement import LIMIT_CORES, measure_once, measure_processor_time
+from skinrig.benchmarks.resampling import bootstrap_interval
+from skinrig.benchmarks.results import ErrorEstimate, Knobs, Timing
+from skinrig.benchmarks.stage import BenchmarkStage
 
 ETA = 1.3
-METHODS: tuple[diffuse_albedo.Method, ...] = ("envelope", "stable_minimum", "minimum")
-WAYS: tuple[Literal["cbrt", "none"], ...] = ("cbrt", "none")
+DIFFUSE_METHODS: tuple[diffuse_albedo.Method, ...] = ("envelope", "stable_minimum", "minimum")
+COMPRESSION_METHODS: tuple[Literal["cbrt", "none"], ...] = ("cbrt", "none")
 BAND_ALBEDOS: dict[str, tuple[float, float, float]] = {
     "light": brdf_truth.LIGHT_SKIN_ALBEDO,
     "medium": (0.315, 0.189, 0.133),
@@ -39,7 +39,7 @@ BAND_ALBEDOS: dict[str, tuple[float, float, float]] = {
 of the others."""
 
 
-def albedo(stage: Stage) -> None:
+def albedo(stage: BenchmarkStage) -> None:
     """Estimate R_d over noise and samples, by the fit and by the paper's minima."""
     rng = np.random.default_rng(0)
     count = 12 if stage.toy else 150
@@ -47,7 +47,7 @@ def albedo(stage: Stage) -> None:
         for noise in (0.02,) if stage.toy else (0.005, 0.02, 0.08):
             for samples in (60,) if stage.toy else (60, 240, 900):
                 p = brdf_truth.dome(count, r_d=r_d, noise=noise, samples=samples, rng=rng)
-                for method in METHODS:
+                for method in DIFFUSE_METHODS:
                     estimate = partial(diffuse_albedo.estimate, *p.samples, eta=ETA, method=method)
                     timing, found = stage.time(
                         lambda: estimate(variance=p.variance, valid=p.valid),
@@ -59,7 +59,7 @@ def albedo(stage: Stage) -> None:
                     channel = relative[:, int(np.argmax(worst))]
                     # 68 % interval of a median of `count` errors of this spread
                     half = 1.2533 * float(np.std(np.abs(channel))) / np.sqrt(count)
-                    outcome = BandError.of_size(float(worst.max()), half)
+                    outcome = ErrorEstimate.nonnegative(float(worst.max()), half)
                     knobs = {"skin": skin, "noise": noise, "samples": p.f.shape[1]}
                     also = {
                         "bias_percent": round(float(np.median(channel)), 2),
@@ -71,14 +71,14 @@ def albedo(stage: Stage) -> None:
                         stage.limits["error", skin] = outcome.error
 
 
-def surface(stage: Stage) -> None:
+def surface(stage: BenchmarkStage) -> None:
     """Fit surface BRDFs, and predict lights that were left out; beside GGX and SciPy."""
     rng = np.random.default_rng(0)
-    basis = brdf_tables.default()
+    basis = brdf_tables.default_basis()
     count = 12 if stage.toy else 120
     for samples in (100,) if stage.toy else (100, 300, 900):
-        given = _Given.draw(BAND_ALBEDOS["light"], count, samples, rng)
-        for compress in WAYS:
+        given = _KnownPoints.draw(BAND_ALBEDOS["light"], count, samples, rng)
+        for compress in COMPRESSION_METHODS:
             timing, fit = stage.time(
                 lambda: brdf_basis.fit_weights(given.samples, basis, compress=compress),
                 repeats=2,
@@ -91,27 +91,30 @@ def surface(stage: Stage) -> None:
         for rank in (2, 4) if stage.toy else (1, 2, 3, 4, 6, 8):
             if samples < 900 and not stage.toy:
                 continue
-            mixed = basis.mixed(brdf_basis.reduce(full, rank, basis=basis)[1])
+            mixed = basis.mix_materials(brdf_basis.reduce(full, rank, basis=basis)[1])
             quick = partial(brdf_basis.fit_weights, given.samples, mixed, compress="none")
             timing, _ = stage.time(quick, repeats=1, memory=False)
             fit = brdf_basis.fit_weights(given.samples, mixed, compress="cbrt")
             given.add(stage, "NMF, refitted", timing, given.lobes(fit, mixed), rank=rank)
-        for way, peer in (("GGX", _ggx), ("roots of elements", partial(_rooted, basis=basis))):
-            timing, lobe = once(lambda: peer(given.truth, given.samples))
+        for way, peer in (
+            ("GGX", _ggx),
+            ("roots of elements", partial(_fit_cube_roots, basis=basis)),
+        ):
+            timing, lobe = measure_once(lambda: peer(given.truth, given.samples))
             given.add(stage, way, timing, lobe)
     for skin, r_d in BAND_ALBEDOS.items():
-        given = _Given.draw(r_d, count, 100 if stage.toy else 300, rng)
+        given = _KnownPoints.draw(r_d, count, 100 if stage.toy else 300, rng)
         fit = brdf_basis.fit_weights(given.samples, basis, compress="cbrt")
         stage.by_band[skin] = given.error(given.lobes(fit, basis))
-    faster, excess = _beside_scipy(basis, toy=stage.toy)
+    faster, excess = _compare_with_scipy(basis, toy=stage.toy)
     stage.limits |= {"speed_up": faster, "residual": 100.0 * excess}
 
 
 @dataclass(frozen=True, slots=True)
-class _Given:
+class _KnownPoints:
     """Points, and what is known of them by samples that leave a fifth of the lights out."""
 
-    truth: brdf_truth.Points
+    truth: brdf_truth.TruePoints
     left_out: BoolArray
     samples: brdf_basis.SurfaceSamples
     diffuse: Float64Array
@@ -121,9 +124,9 @@ class _Given:
     @classmethod
     def draw(
         cls, r_d: tuple[float, float, float], count: int, samples: int, rng: np.random.Generator
-    ) -> _Given:
+    ) -> _KnownPoints:
         p = brdf_truth.dome(count, r_d=r_d, noise=0.02, samples=samples, rng=rng)
-        out = _left_out(p, rng)
+        out = _held_out_samples(p, rng)
         known: dict[str, Any] = {"eta": ETA, "variance": p.variance, "valid": p.valid & ~out}
         # R_d as it would be known: estimated, from the same samples
         found = diffuse_albedo.estimate(*p.samples, **known)
@@ -135,24 +138,24 @@ class _Given:
         rows = zip(fit.weights, *where, strict=True)
         return np.stack([brdf_basis.evaluate(x, basis, *at) for x, *at in rows])
 
-    def error(self, lobe: Float64Array) -> BandError:
+    def error(self, lobe: Float64Array) -> ErrorEstimate:
         """Return the median error of all light under the lights left out, %."""
         at = self.truth.valid & self.left_out
         true = self.truth.surface + _diffuse(self.truth, self.truth.r_d) + 1e-12
         relative = 100.0 * np.abs((lobe + self.diffuse) / true - 1.0)
         # The points are independent of each other, their samples are not.
         by_point = np.array([np.median(r[a]) for r, a in zip(relative, at, strict=True) if a.any()])
-        return BandError(float(np.median(by_point)), drawn_again(by_point, rng=self.rng))
+        return ErrorEstimate(float(np.median(by_point)), bootstrap_interval(by_point, rng=self.rng))
 
     def add(
-        self, stage: Stage, way: str, timing: Timing, lobe: Float64Array, **rank: int
-    ) -> BandError:
+        self, stage: BenchmarkStage, method: str, timing: Timing, lobe: Float64Array, **rank: int
+    ) -> ErrorEstimate:
         p = self.truth
         at = p.valid & self.left_out
         root = np.sqrt(np.mean((np.cbrt(lobe) - np.cbrt(p.surface))[at] ** 2))
         bright = at & (p.surface > 0.5 * _diffuse(p, p.r_d))
         highlight = np.median(np.abs(lobe[bright] / p.surface[bright] - 1.0))
-        knobs = {"way": way, "samples": p.f.shape[1], "points": len(p.f), **rank}
+        knobs = {"way": method, "samples": p.f.shape[1], "points": len(p.f), **rank}
         also = {
             "highlight_error_percent": round(float(highlight) * 100.0, 2),
             "cube_root_rms": round(float(root), 4),
@@ -160,13 +163,13 @@ class _Given:
         return stage.add(knobs, timing, self.error(lobe), also)
 
 
-def _left_out(p: brdf_truth.Points, rng: np.random.Generator) -> BoolArray:
+def _held_out_samples(p: brdf_truth.TruePoints, rng: np.random.Generator) -> BoolArray:
     """Return the samples of a fifth of the lights."""
     lights, which = np.unique(p.light.round(6).reshape(-1, 3), axis=0, return_inverse=True)
     return np.asarray((rng.random(len(lights)) < 0.2)[which].reshape(p.valid.shape))
 
 
-def _diffuse(p: brdf_truth.Points, r_d: Float64Array) -> Float64Array:
+def _diffuse(p: brdf_truth.TruePoints, r_d: Float64Array) -> Float64Array:
     """Return the green diffuse BRDF by the convention, (P, M)."""
     zero = np.zeros_like(p.f)
     s = brdf_basis.surface_samples(zero, *p.samples[1:], r_d, eta=ETA, valid=p.valid)
@@ -175,14 +178,14 @@ def _diffuse(p: brdf_truth.Points, r_d: Float64Array) -> Float64Array:
     return np.asarray(mean * (r_d[:, 1] / r_d.mean(axis=1))[:, None])
 
 
-def _cosines(p: brdf_truth.Points, point: int) -> tuple[Float64Array, ...]:
+def _cosines(p: brdf_truth.TruePoints, point: int) -> tuple[Float64Array, ...]:
     to, at, n = p.light[point], p.view[point], p.normals[point]
     mu_l, mu_v = to @ n, at @ n
     cos_d = np.sqrt(np.clip(0.5 * (1.0 + np.sum(to * at, axis=-1)), 0.0, 1.0))
     return mu_l, mu_v, np.clip((mu_l + mu_v) / np.maximum(2.0 * cos_d, 1e-9), 0.0, 1.0), cos_d
 
 
-def _ggx(p: brdf_truth.Points, s: brdf_basis.SurfaceSamples) -> Float64Array:
+def _ggx(p: brdf_truth.TruePoints, s: brdf_basis.SurfaceSamples) -> Float64Array:
     """Fit strength and roughness of one GGX lobe a point: the best of 60 roughnesses."""
     lobes = np.zeros(p.surface.shape)
     for point in range(len(lobes)):
@@ -201,7 +204,9 @@ def _ggx(p: brdf_truth.Points, s: brdf_basis.SurfaceSamples) -> Float64Array:
     return lobes
 
 
-def _rooted(p: brdf_truth.Points, s: brdf_basis.SurfaceSamples, basis: BrdfBasis) -> Float64Array:
+def _fit_cube_roots(
+    p: brdf_truth.TruePoints, s: brdf_basis.SurfaceSamples, basis: BrdfBasis
+) -> Float64Array:
     """Fit cube roots of the matrix' elements to cube roots of the samples, the paper's words."""
     lobes = np.zeros(p.surface.shape)
     for point in range(len(lobes)):
@@ -215,7 +220,7 @@ def _rooted(p: brdf_truth.Points, s: brdf_basis.SurfaceSamples, basis: BrdfBasis
     return lobes
 
 
-def _beside_scipy(basis: BrdfBasis, *, toy: bool) -> tuple[float, float]:
+def _compare_with_scipy(basis: BrdfBasis, *, toy: bool) -> tuple[float, float]:
     """Return how many times faster than SciPy, and the largest relative excess of the residual."""
     rng = np.random.default_rng(1)
     different, copies, subset = (20, 1, 3) if toy else (500, 10, 200)
@@ -240,8 +245,10 @@ def _beside_scipy(basis: BrdfBasis, *, toy: bool) -> tuple[float, float]:
     # Processor time, which does not see who else keeps the cores busy; SciPy uses one.
     ours, theirs = [], []
     for _ in range(1 if toy else 5):
-        ours_s, found = spent(lambda: brdf_basis.fit_weights(many, basis, compress="none"))
-        peer_s, least = spent(lambda: [nnls(a, y)[1] for a, y in problems])
+        ours_s, found = measure_processor_time(
+            lambda: brdf_basis.fit_weights(many, basis, compress="none")
+        )
+        peer_s, least = measure_processor_time(lambda: [nnls(a, y)[1] for a, y in problems])
         ours.append(ours_s / LIMIT_CORES)
         theirs.append(peer_s / subset * len(many.value))
     excess = [
@@ -251,7 +258,7 @@ def _beside_scipy(basis: BrdfBasis, *, toy: bool) -> tuple[float, float]:
     return float(np.median(theirs) / np.median(ours)), max(excess)
 
 
-SPACE_WAYS: Final[tuple[Literal["shares", "brdf"], ...]] = ("shares", "brdf")
+SPACE_METHODS: Final[tuple[Literal["shares", "brdf"], ...]] = ("shares", "brdf")
 SPACE_RANKS: Final = (1, 2, 3, 4, 6, 8, 12)
 NOISE_RANK: Final = 4
 """Lobes of a model of one face, whose error is to stay below what noise leaves."""
@@ -259,9 +266,9 @@ HELD_OUT_POINT_FRACTION: Final = 0.3
 """Part of the points that no mixture is made of."""
 
 
-def space(stage: Stage) -> None:
+def space(stage: BenchmarkStage) -> None:
     """Factor the mixtures of three datasets into ever more common ones, in two ways."""
-    basis = brdf_tables.default()
+    basis = brdf_tables.default_basis()
     ranks = (1, 2, 4) if stage.toy else SPACE_RANKS
     steepest, excess, beyond = -np.inf, 0.0, 0.0
     for number, data in enumerate(_datasets(toy=stage.toy)):
@@ -270,14 +277,16 @@ def space(stage: Stage) -> None:
         kept = round(HELD_OUT_POINT_FRACTION * len(order))
         tried, trained = data.weights[order[:kept]], data.weights[order[kept:]]
         whose = data.label[order[:kept]] if data.name == "dataset B" else None
-        for method, rank in itertools.product(SPACE_WAYS, ranks):
+        for method, rank in itertools.product(SPACE_METHODS, ranks):
             # Each rank alone, as somebody who asks for it would have it.
-            curve = partial(brdf_space.curve, trained, basis, ranks=(rank,), method=method)
+            curve = partial(
+                brdf_space.compute_error_curve, trained, basis, ranks=(rank,), method=method
+            )
             timing, found = stage.time(
                 lambda: curve(held_out=tried, groups=whose), repeats=1, memory=not stage.toy
             )
             inside, error = float(found.error[0]), 100.0 * float(found.held_out[0])
-            outcome = BandError.of_size(error, 100.0 * float(found.held_out_stderr[0]))
+            outcome = ErrorEstimate.nonnegative(error, 100.0 * float(found.held_out_stderr[0]))
             knobs: Knobs = {"set": data.name, "way": method, "rank": rank, "points": found.points}
             also = {
                 "own_points_error_percent": round(100.0 * inside, 3),
@@ -287,7 +296,8 @@ def space(stage: Stage) -> None:
             if method == "shares" and rank == NOISE_RANK:
                 beyond = max(beyond, inside / data.noise)
         shares, brdf = (
-            brdf_space.curve(trained, basis, ranks=ranks, method=way).error for way in SPACE_WAYS
+            brdf_space.compute_error_curve(trained, basis, ranks=ranks, method=way).error
+            for way in SPACE_METHODS
         )
         steepest = max(steepest, float(np.diff(brdf).max()))
         excess = max(excess, float((brdf / shares).max()))
@@ -298,9 +308,9 @@ def _datasets(*, toy: bool) -> tuple[Dataset, ...]:
 
     rng = np.random.default_rng(72)
     if toy:
-        return (brdf_space_datasets.one_person(60, rng=rng),)
+        return (brdf_space_datasets.sample_one_person(60, rng=rng),)
     return (
-        brdf_space_datasets.one_person(700, rng=rng),
-        brdf_space_datasets.dataset_a(1_400, rng=rng),
-        brdf_space_datasets.dataset_b(70, members=table_1()[::4], rng=rng),
+        brdf_space_datasets.sample_one_person(700, rng=rng),
+        brdf_space_datasets.build_dataset_a(1_400, rng=rng),
+        brdf_space_datasets.build_dataset_b(70, members=draw_population()[::4], rng=rng),
     )

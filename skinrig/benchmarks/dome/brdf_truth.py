@@ -13,7 +13,7 @@ DARK_SKIN_ALBEDO = (0.16, 0.085, 0.055)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Samples:
+class TrueSamples:
     """Samples of P points under a dome's lights, and their true surface.
 
     Attributes
@@ -45,7 +45,7 @@ class Samples:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Points(Samples):
+class TruePoints(TrueSamples):
     """The same with the diffuse reflectance that is true."""
 
     r_d: Float64Array
@@ -61,7 +61,7 @@ def dome(
     rng: np.random.Generator,
     eta: float = 1.3,
     tail: Literal["light", "heavy"] = "light",
-) -> Points:
+) -> TruePoints:
     """Return points with normals over the front, seen by 16 views under 150 lights.
 
     Parameters
@@ -122,7 +122,7 @@ def dome(
     # Noise of the radiance, hence of f times the light's cosine; white is 1/pi.
     sigma = noise * (clean * mu_l[..., None] + 0.02 / np.pi) / mu_l[..., None]
     f = clean + sigma * rng.standard_normal(clean.shape)
-    return Points(f, sigma**2, light, view, normals, valid, surface, albedo)
+    return TruePoints(f, sigma**2, light, view, normals, valid, surface, albedo)
 
 
 def _slopes(tan_h: Float64Array, m: Float64Array, tail: str) -> Float64Array:

@@ -12,23 +12,23 @@ import numpy as np
 
 from capture import hdr
 from capture.calibration.geometry import CameraPose, bundle, nominal_cameras
-from capture.calibration.geometry.board import Board, Sighting, find_board
+from capture.calibration.geometry.board import Board, CornerObservation, find_board
 from capture.calibration.lights import mirror_lights, mirror_sphere
 from capture.calibration.sensor.mosaic import channel_levels, neutral_mosaic
-from capture.plan.eye_light import eye_light
+from capture.plan.eye_light import eye_irradiance
 from capture.plan.flicker import FlickerReport, flicker_of_rows
 from capture.plan.light_order import LIGHT_ORDERS, best_order
 from capture.plan.rows import LedRow
 from capture.raw import RawFrame, linear_rgb
 from capture.rig import LedLimits, Rig, load_rig
-from rigsim.as_built.dome import Tolerances, build, image_of
+from rigsim.as_built.dome import DomeTolerances, build_dome, project_points
 from rigsim.boxes.led_table import LedPulse
-from rigsim.scenes.dome.targets import target_scene
-from rigsim.sensor import sensor_of
+from rigsim.scenes.dome.targets import make_target_scene
+from rigsim.sensor import make_sensor
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, UInt16Array
-from skinrig.benchmarks.resampling import drawn_rms
-from skinrig.benchmarks.results import BandError, Timing
-from skinrig.benchmarks.stage import Stage
+from skinrig.benchmarks.resampling import bootstrap_rms
+from skinrig.benchmarks.results import ErrorEstimate, Timing
+from skinrig.benchmarks.stage import BenchmarkStage
 
 if TYPE_CHECKING:
     from rigsim.scenes.dome.targets import TargetScene
@@ -39,7 +39,7 @@ DARK_TIME_FRACTION = 0.3
 """Share of each light's time that is dark where lights do not overlap."""
 
 
-def light_order(stage: Stage) -> None:
+def light_order(stage: BenchmarkStage) -> None:
     """Time each order of the lights and take the flicker of one pass at open eyes."""
     rig = load_rig("dome")
     rig = rig.subset(lights=[light.name for light in rig.lights[::3]]) if stage.toy else rig
@@ -54,7 +54,7 @@ def light_order(stage: Stage) -> None:
             stage.add(
                 {"order": name, "gaps": "dark" if gaps else "none"},
                 timing,
-                BandError.around(100.0 * flicker.rms, 0.0),
+                ErrorEstimate.symmetric(100.0 * flicker.rms, 0.0),
                 {"flashes a second": flicker.flashes_per_s},
             )
     chosen, worst = found["chosen", False], found["spiral", True]
@@ -65,15 +65,15 @@ def light_order(stage: Stage) -> None:
     }
 
 
-def _flicker(rig: Rig, shown: list[int], *, gaps: bool) -> FlickerReport:
+def _flicker(rig: Rig, order: list[int], *, gaps: bool) -> FlickerReport:
     rows = []
-    for light in shown:
+    for light in order:
         lit_s = DWELL_S * (1.0 - DARK_TIME_FRACTION * gaps)
         rows.append(LedRow((light,), 1.0, lit_s))
         if gaps:
             rows.append(LedRow((), 0.0, DWELL_S - lit_s))
     overlap_s = rig.leds.overlap_s if rig.leds is not None and not gaps else 0.0
-    return flicker_of_rows(rows, eye_light(rig), overlap_s=overlap_s)
+    return flicker_of_rows(rows, eye_irradiance(rig), overlap_s=overlap_s)
 
 
 GAIN_E_PER_DN, READ_NOISE_E, BLACK_DN, WHITE_DN = 2.0, 8.0, 512.0, 16383.0
@@ -83,7 +83,7 @@ EXPOSURE_RANGE_S = (1e-3, 1.0)
 Frames = list[UInt16Array]
 
 
-def merging(stage: Stage) -> None:
+def merging(stage: BenchmarkStage) -> None:
     """Merge brackets of 2 to 23 frames over three decades of exposure, four of radiance."""
     side = 64 if stage.toy else FULL_SIDE_PX
     rng = np.random.default_rng(0)
@@ -96,7 +96,7 @@ def merging(stage: Stage) -> None:
         times = np.geomspace(*EXPOSURE_RANGE_S, count)
         frames = [_expose(scene, t, rng) for t in times]
         timing, (radiance, _, valid) = stage.time(lambda: _merge(frames, times))
-        bound = _bound(scene, times)
+        bound = _minimum_variance(scene, times)
         # near a frame's saturation noise decides whether the frame counts
         settled = valid & ~np.any(
             [np.abs(scene * t / (WHITE_DN - BLACK_DN) - 1) < 0.05 for t in times], axis=0
@@ -106,9 +106,9 @@ def merging(stage: Stage) -> None:
         spread = 50 * float(squares.std() / np.sqrt(squares.size) / np.sqrt(squares.mean()))
         least = 100 * float(np.sqrt(((bound / scene**2)[settled]).mean()))
         worst = max(worst, error / least)
-        outcome = BandError.around(error, spread, least)
+        outcome = ErrorEstimate.symmetric(error, spread, least)
         stage.add({"frames": count}, timing, outcome)
-    ours, theirs, ratio = _beside_opencv(frames, times, rounds=1 if stage.toy else 15)
+    ours, theirs, ratio = _compare_with_opencv(frames, times, rounds=1 if stage.toy else 15)
     ours = replace(ours, peak_memory_mb=timing.peak_memory_mb)
     stage.add({"frames": N_FRAMES, "way": "beside"}, ours, outcome)
     stage.limits = {("speed_up", side, theirs): ratio, "over_bound": worst}
@@ -126,7 +126,7 @@ def _expose(scene: Float64Array, time_s: float, rng: np.random.Generator) -> UIn
     return np.clip(np.rint(electrons / GAIN_E_PER_DN + BLACK_DN), 0, WHITE_DN).astype(np.uint16)
 
 
-def _bound(scene: Float64Array, times: Sequence[float] | Float64Array) -> Float64Array:
+def _minimum_variance(scene: Float64Array, times: Sequence[float] | Float64Array) -> Float64Array:
     """Return the least variance of an unbiased estimate, from the frames that are not saturated."""
     information = np.zeros_like(scene)
     for t in times:
@@ -135,7 +135,7 @@ def _bound(scene: Float64Array, times: Sequence[float] | Float64Array) -> Float6
     return 1.0 / np.where(information > 0, information, np.nan)
 
 
-def _beside_opencv(
+def _compare_with_opencv(
     frames: Frames, times: Float64Array, *, rounds: int
 ) -> tuple[Timing, float, float]:
     """Time both in turn, so that both meet the same machine; return the ratio of the fastest."""
@@ -165,18 +165,18 @@ SPHERE_RADIUS_MM = 50.0
 DOME_SEED = 5
 
 
-def geometry(stage: Stage) -> None:
+def geometry(stage: BenchmarkStage) -> None:
     """Adjust cameras to 4 to 12 places of a simulated board."""
     views = (
         ["C03", "C07", "C11", "C14"] if stage.toy else ["C03", "C05", "C07", "C10", "C11", "C14"]
     )
     rig = load_rig("dome").subset(views=views).resized(324 if stage.toy else 650)
-    dome = build(rig, seed=DOME_SEED, tolerances=Tolerances(distortion=0.2))
-    scene = target_scene("charuco", rig, seed=DOME_SEED, dome=dome)
+    dome = build_dome(rig, seed=DOME_SEED, tolerances=DomeTolerances(distortion=0.2))
+    scene = make_target_scene("charuco", rig, seed=DOME_SEED, dome=dome)
     counts = (5, 6, 7, 8) if stage.toy else (6, 8, 10, 12)
-    sightings: dict[tuple[str, int], Sighting] = {}
+    sightings: dict[tuple[str, int], CornerObservation] = {}
     for pose in range(counts[-1]):
-        scene.show(pose)
+        scene.set_pose(pose)
         for name in views:
             frame = _frame(scene, name, range(0, 150, 8), 0.02, 1.0, pose)
             found = find_board(linear_rgb(frame, demosaic="bilinear").rgb, CHARUCO_BOARD)
@@ -192,27 +192,27 @@ def geometry(stage: Stage) -> None:
             view = dome.rig.view(name)
             gaps.append(np.mean((camera.center_mm - view.position_mm) ** 2))
             variances.append(np.trace(result.center_covariance_mm2[name]) / 3)
-            truth = image_of(view, dome.distortion[name], probes)
+            truth = project_points(view, dome.distortion[name], probes)
             projected.append(np.linalg.norm(camera.project(probes) - truth, axis=1).mean())
         stage.limits["reprojection"] = float(max(projected))
         timing, _ = stage.time(lambda: bundle.adjust(seen, CHARUCO_BOARD, start), repeats=3)
         stage.add({"places": count}, timing, _rms(np.array(gaps), np.array(variances)))
 
 
-def lights(stage: Stage) -> None:
+def lights(stage: BenchmarkStage) -> None:
     """Place lights by one to four places of a simulated mirror sphere."""
     views = ["C05", "C07", "C14"] if stage.toy else ["C01", "C05", "C07", "C10", "C11", "C14"]
     dome_rig = load_rig("dome")
     every = [light.name for light in dome_rig.lights][:: 30 if stage.toy else 10]
     rig = dome_rig.subset(views=views, lights=every).resized(324 if stage.toy else 1300)
-    dome = build(rig, seed=DOME_SEED)
-    scene = target_scene("mirror", rig, seed=DOME_SEED, dome=dome)
+    dome = build_dome(rig, seed=DOME_SEED)
+    scene = make_target_scene("mirror", rig, seed=DOME_SEED, dome=dome)
     cameras = {view.name: CameraPose.nominal(view) for view in dome.rig.views}
     spheres: dict[int, mirror_sphere.SpherePosition] = {}
     seen: list[mirror_lights.Highlights] = []
     most = 4
     for number in range(most):
-        scene.show(number)
+        scene.set_pose(number)
         outlines, colors = {}, {}
         for name, camera in cameras.items():
             frame = _frame(scene, name, range(len(every)), 0.06, 1.0, number)
@@ -255,10 +255,10 @@ def _frame(
         pattern=view.cfa,
         black=(float(view.black_level),) * 4,
         white=view.white_level,
-        noise_profile=sensor_of(view).noise_profile(exposure_s),
+        noise_profile=make_sensor(view).noise_profile(exposure_s),
     )
 
 
-def _rms(squares: Float64Array, variances: Float64Array) -> BandError:
+def _rms(squares: Float64Array, variances: Float64Array) -> ErrorEstimate:
     """Return the root of squares' mean beside that of the variances that errors state."""
-    return drawn_rms(squares, float(np.sqrt(variances.mean())), draws=400)
+    return bootstrap_rms(squares, float(np.sqrt(variances.mean())), draws=400)

@@ -13,11 +13,11 @@ from rigsim.boxes.led_table import LedPulse
 from rigsim.needs.effects import SceneEffects
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import make_subject
-from rigsim.subject.head_motion import head_motion as drawn
+from rigsim.subject.head_motion import draw_head_motion as drawn
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.resampling import mean_error
-from skinrig.benchmarks.results import BandError
-from skinrig.benchmarks.stage import Stage
+from skinrig.benchmarks.results import ErrorEstimate
+from skinrig.benchmarks.stage import BenchmarkStage
 from skinrig.evaluating.skin_bands import MelaninBand
 
 TRACKING_EXPOSURE_S = 0.03
@@ -27,7 +27,7 @@ TRACKING_EXPOSURE_S = 0.03
 class _Superpixels:
     """A camera whose image has one pixel for each 2 x 2 cell of its sensor."""
 
-    sensor: head_motion.Camera
+    sensor: head_motion.TrackingCamera
 
     @property
     def center_mm(self) -> Float64Array:
@@ -40,7 +40,7 @@ class _Superpixels:
 
 
 @dataclass(frozen=True, slots=True)
-class Drift:
+class DriftingCapture:
     """Tracking frames of one capture, with where the head was."""
 
     frames: Sequence[Sequence[Float64Array]]
@@ -63,12 +63,16 @@ class Drift:
             tracks_per_camera=tracks,
         )
 
-    def error(self, found: head_motion.HeadMotion) -> BandError:
+    def error(self, found: head_motion.HeadMotion) -> ErrorEstimate:
         """Return the mean error over the frames, mm."""
-        errors = self.errors_mm(found)
-        return mean_error(errors) if len(errors) > 1 else BandError.around(float(errors[0]), 0.0)
+        errors = self.point_errors_mm(found)
+        return (
+            mean_error(errors)
+            if len(errors) > 1
+            else ErrorEstimate.symmetric(float(errors[0]), 0.0)
+        )
 
-    def errors_mm(self, found: head_motion.HeadMotion) -> Float64Array:
+    def point_errors_mm(self, found: head_motion.HeadMotion) -> Float64Array:
         """Return how far the estimate puts the points from where they were, RMS, (T - 1,)."""
         turns = head_motion.rotation_matrix(found.rotation_rad)
         moved = zip(self.poses[1:], turns[1:], found.translation_mm[1:], strict=True)
@@ -79,7 +83,7 @@ class Drift:
             ]
         )
 
-    def moved_mm(self) -> Float64Array:
+    def true_motion_mm(self) -> Float64Array:
         """Return how far the points moved in truth, RMS, (T - 1,)."""
         return np.array(
             [
@@ -102,7 +106,7 @@ def simulate(
     twitch: bool = False,
     preset: str = "III",
     texels: int = 512,
-) -> Drift:
+) -> DriftingCapture:
     """Render tracking frames of a drifting head.
 
     Parameters
@@ -147,18 +151,18 @@ def simulate(
     chosen = np.random.default_rng(0).choice(
         len(mesh.vertices_mm), min(6000, len(mesh.vertices_mm)), replace=False
     )
-    return Drift(
+    return DriftingCapture(
         frames,
         [_Superpixels(CameraPose.nominal(view)) for view in rig.views],
         np.asarray(mesh.vertices_mm[chosen], np.float64),
         np.asarray(mesh.normals[chosen], np.float64),
         np.asarray(times_s, np.float64),
         [motion.pose(float(t)) for t in times_s],
-        np.array([motion.twitch(float(t)) for t in times_s]),
+        np.array([motion.twitch_amount(float(t)) for t in times_s]),
     )
 
 
-def motion(stage: Stage) -> None:
+def motion(stage: BenchmarkStage) -> None:
     """Follow heads that drift little and much, with few and many tracks."""
     width, views, times = (
         (160, 2, (0.0, 8.0, 16.0)) if stage.toy else (484, 3, (0.0, 5.0, 12.5, 20.0))
@@ -168,15 +172,15 @@ def motion(stage: Stage) -> None:
 
     for drift_mm in (1.0,) if stage.toy else (0.3, 1.0, 3.0):
         seen = drift(drift_mm=drift_mm, times_s=times)
-        moved_mm = round(float(seen.moved_mm().mean()), 3)
+        moved_mm = round(float(seen.true_motion_mm().mean()), 3)
         for tracks in (30, 60, 120, 200) if stage.toy else (30, 100, 300):
             knobs = {"drift mm": drift_mm, "tracks": tracks}
             follow = partial(seen.estimate, tracks)
             stage.measure(knobs, follow, seen.error, also={"moved_mm": moved_mm})
 
-    def on_skin(band: MelaninBand) -> BandError:
+    def on_skin(band: MelaninBand) -> ErrorEstimate:
         seen = drift(drift_mm=1.0, times_s=times[:3], preset=band.preset)
         return seen.error(seen.estimate(100))
 
-    stage.on_each_skin(on_skin)
+    stage.measure_bands(on_skin)
     stage.words = {"width": width // 2, "views": views}

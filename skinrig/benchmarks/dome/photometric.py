@@ -10,10 +10,10 @@ from threadpoolctl import threadpool_limits
 from model.metrics import angular_error_rad
 from reconstruction.photometric_stereo import NormalMaps, Robustness, estimate_normals
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
-from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds, spent
-from skinrig.benchmarks.resampling import drawn_again
-from skinrig.benchmarks.results import BandError, Knobs
-from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.benchmarks.measurement import LIMIT_CORES, measure_processor_time, processor_seconds
+from skinrig.benchmarks.resampling import bootstrap_interval
+from skinrig.benchmarks.results import ErrorEstimate, Knobs
+from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 from skinrig.evaluating.skin_bands import MelaninBand
 
 SAMPLE_NOISE = 0.005
@@ -21,7 +21,7 @@ SAMPLE_NOISE = 0.005
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class BallScene:
     """A glossy ball under many lights, with things between it and them."""
 
     images: Float32Array
@@ -38,7 +38,7 @@ class Scene:
 
 def glossy_ball(
     side: int, lights: int, *, noise: float, rng: np.random.Generator, albedo: float = 0.5
-) -> Scene:
+) -> BallScene:
     """Make a ball with painted albedo, highlights, attached shadows and shadows of three posts.
 
     Parameters
@@ -80,7 +80,7 @@ def glossy_ball(
         images[number] = np.where(dark, 0.0, paint * cosine + gloss)
         images[number] += noise * rng.standard_normal((side, side), np.float32)
         matte[number] = (cosine > 0) & ~dark & (gloss < noise)
-    return Scene(images, towards, n, inside, matte, paint)
+    return BallScene(images, towards, n, inside, matte, paint)
 
 
 def numpy_irls_l1(samples: Float64Array, lights: Float64Array) -> Float64Array:
@@ -119,7 +119,7 @@ def numpy_irls_l1(samples: Float64Array, lights: Float64Array) -> Float64Array:
     return normals
 
 
-def _mean_bound_deg(scene: Scene, noise: float) -> float:
+def _mean_bound_deg(scene: BallScene, noise: float) -> float:
     """Return the least mean error with the matte samples known: 0.886 of the RMS angle."""
     places = np.flatnonzero(scene.inside)[:: max(1, scene.inside.sum() // 2000)]
     flat = scene.matte.reshape(len(scene.lights), -1)[:, places].astype(np.float64)
@@ -132,21 +132,23 @@ def _mean_bound_deg(scene: Scene, noise: float) -> float:
     return float(np.degrees(np.sqrt(np.pi) / 2 * rms.mean()))
 
 
-def _mean_deg(found: NormalMaps, scene: Scene, noise: float, rng: np.random.Generator) -> BandError:
+def _mean_deg(
+    found: NormalMaps, scene: BallScene, noise: float, rng: np.random.Generator
+) -> ErrorEstimate:
     """Return the mean error of normals, degrees, beside the least."""
     seen = scene.inside & found.valid
     error = np.degrees(angular_error_rad(found.normals[seen], scene.normals[seen]))
     some = rng.choice(error, min(error.size, 20_000), replace=False)
-    interval = drawn_again(some, np.mean, draws=100, rng=rng)
-    return BandError(float(error.mean()), interval, _mean_bound_deg(scene, noise))
+    interval = bootstrap_interval(some, np.mean, draws=100, rng=rng)
+    return ErrorEstimate(float(error.mean()), interval, _mean_bound_deg(scene, noise))
 
 
-def normals(stage: Stage) -> None:
+def normals(stage: BenchmarkStage) -> None:
     """Estimate the normals of a glossy ball: lights, robust steps, noise; then at full size."""
     rng = np.random.default_rng(0)
     ball = partial(glossy_ball, 40 if stage.toy else 192, noise=SAMPLE_NOISE, rng=rng)
 
-    def add(knobs: Knobs, scene: Scene, noise: float = SAMPLE_NOISE, **options: Any) -> None:
+    def add(knobs: Knobs, scene: BallScene, noise: float = SAMPLE_NOISE, **options: Any) -> None:
         stage.measure(
             {"noise": noise} | knobs,
             lambda: estimate_normals(scene.images, scene.lights, **options),
@@ -164,18 +166,18 @@ def normals(stage: Stage) -> None:
     for noise in (0.02,) if stage.toy else (0.001, 0.02):
         add({"lights": count, "fit": "robust"}, ball(count, noise=noise), noise)
 
-    def on_skin(band: MelaninBand) -> BandError:
+    def on_skin(band: MelaninBand) -> ErrorEstimate:
         # gloss and noise stay as they are: on dark skin there is less of what is fitted
         scene = ball(count, albedo=float(band.reflectance()[1]))
         found = estimate_normals(scene.images, scene.lights)
         return _mean_deg(found, scene, SAMPLE_NOISE, rng)
 
-    stage.on_each_skin(on_skin)
+    stage.measure_bands(on_skin)
     if not stage.toy:
         stage.limits = _full_size(rng)
 
 
-def _full_size(rng: np.random.Generator) -> Findings:
+def _full_size(rng: np.random.Generator) -> LimitValues:
     """Measure 1024 x 1024 x 150, and the NumPy fit on some of its pixels."""
     side = 1024
     scene = glossy_ball(side, 150, noise=SAMPLE_NOISE, rng=rng)
@@ -185,7 +187,7 @@ def _full_size(rng: np.random.Generator) -> Findings:
     places = np.sort(rng.choice(np.flatnonzero(scene.inside), 300, replace=False))
     some = scene.images.reshape(150, -1)[:, places].astype(np.float64)
     with threadpool_limits(1):
-        peer_s, theirs = spent(lambda: numpy_irls_l1(some, scene.lights))
+        peer_s, theirs = measure_processor_time(lambda: numpy_irls_l1(some, scene.lights))
     peer_s *= side**2 / len(places)
     ours = estimate_normals(scene.images.reshape(150, -1)[:, places], scene.lights)
     truth = scene.normals.reshape(-1, 3)[places]

@@ -14,15 +14,15 @@ from rigsim.light import surface_brdf
 from rigsim.subject import make_subject
 from skinrig.arrays import BoolArray, Float64Array, Int64Array
 from skinrig.benchmarks.dome import texture as bench_texture
-from skinrig.benchmarks.dome.brdf_truth import Samples
-from skinrig.benchmarks.resampling import drawn_median
+from skinrig.benchmarks.dome.brdf_truth import TrueSamples
+from skinrig.benchmarks.resampling import bootstrap_median
 from skinrig.benchmarks.results import Knobs
-from skinrig.benchmarks.stage import Stage
+from skinrig.benchmarks.stage import BenchmarkStage
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 from skinrig.rendering.photographs.errors import luminance
 
 LOBE_RANKS: Final = (1, 2, 4, 8, 24)
-USUAL_RANK: Final = 4
+DEFAULT_RANK: Final = 4
 RELATIVE_NOISE: Final = 0.02
 HELD_OUT_LIGHT_FRACTION: Final = 0.2
 """Share of the lights that no fit sees."""
@@ -34,7 +34,7 @@ EXTREME_PRESETS: Final = ("palest", "darkest")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FacePoints(Samples):
+class FacePoints(TrueSamples):
     """Points of a simulated face."""
 
     left_out: BoolArray
@@ -67,13 +67,13 @@ def face_points(subject: str, *, points: int, samples: int, rng: np.random.Gener
     place = face.atlas.position_mm.reshape(-1, 3)[chosen].astype(np.float64)
     ends = [np.array([one.position_mm for one in rows]) for rows in (rig.lights, rig.views)]
     every = rng.permuted(np.tile(np.arange(len(ends[0]) * len(ends[1])), (len(chosen), 1)), axis=1)
-    pair = _above(every, ends, place, normals)[:, :samples]
+    pair = _pairs_above_horizon(every, ends, place, normals)[:, :samples]
     which = np.divmod(pair, len(ends[1]))
     to = [_unit(end[k] - place[:, None]) for end, k in zip(ends, which, strict=True)]
     cosines = [np.einsum("pmk,pk->pm", way, normals) for way in to]
     seen = (cosines[0] > MIN_COSINE) & (cosines[1] > MIN_COSINE)
     count = pair.shape[1]
-    total, specular = surface_brdf.evaluate(
+    total, specular = surface_brdf.evaluate_brdf(
         np.repeat(packed, count, axis=0),
         np.repeat(normals, count, axis=0).astype(np.float32),
         to[0].reshape(-1, 3),
@@ -95,10 +95,10 @@ def face_points(subject: str, *, points: int, samples: int, rng: np.random.Gener
     )
 
 
-def model(stage: Stage) -> None:
+def model(stage: BenchmarkStage) -> None:
     """Fit the surface term with few and many lobes, and predict lights that were left out."""
     rng = np.random.default_rng(0)
-    materials = brdf_tables.default()
+    materials = brdf_tables.default_basis()
     count, samples = (10, 120) if stage.toy else (150, 400)
     usual: list[float] = []
     for subject in BAND_PRESETS if stage.toy else (*BAND_PRESETS, *EXTREME_PRESETS):
@@ -113,23 +113,23 @@ def model(stage: Stage) -> None:
                 continue
 
             def reduced() -> tuple[BrdfBasis, Float64Array]:
-                lobes = materials.mixed(brdf_basis.reduce(full, rank, basis=materials)[1])
+                lobes = materials.mix_materials(brdf_basis.reduce(full, rank, basis=materials)[1])
                 return lobes, brdf_basis.fit_weights(given, lobes).weights
 
             timing, made = stage.time(reduced, repeats=1, memory=not stage.toy)
             surface, everything = _errors(p, *made, albedo.r_d)
-            outcome = drawn_median(surface, rng=rng)
+            outcome = bootstrap_median(surface, rng=rng)
             total = float(np.median(everything))
             knobs: Knobs = {"part": "lobes", "rank": rank, "subject": subject}
             knobs |= {"points": len(surface), "samples": samples}
             also = {"all_light_error_percent": round(total, 3)}
             stage.add(knobs, timing, outcome, also)
-            if rank == USUAL_RANK:
+            if rank == DEFAULT_RANK:
                 stage.by_band |= {
                     b: outcome for b, one in MELANIN_BANDS.items() if one.preset == subject
                 }
                 usual.append(total)
-    bench_texture.add_efforts(stage, {"part": "texture"})
+    bench_texture.measure_efforts(stage, {"part": "texture"})
     stage.limits["total"] = max(usual)
 
 
@@ -146,7 +146,9 @@ def _errors(
         to, view, n = p.light[point, rows], p.view[point, rows], p.normals[point]
         share = np.broadcast_to(weights[point], (len(to), lobes.size))
         lobe = skin_reflectance.lobe_brdf(lobes, share, to, view, n)
-        passed = np.prod([skin_reflectance.transmitted(way @ n, ETA) for way in (to, view)], axis=0)
+        passed = np.prod(
+            [skin_reflectance.transmittance(way @ n, ETA) for way in (to, view)], axis=0
+        )
         made = lobe[:, None] + passed[:, None] * r_d[point] / np.pi
         true = p.surface[point, rows]
         surface.append(np.sum(np.abs(lobe - true)) / np.sum(true))
@@ -155,16 +157,16 @@ def _errors(
     return 100.0 * np.array(surface), 100.0 * np.array(everything)
 
 
-def _above(
-    pairs: Int64Array, ends: list[Float64Array], place: Float64Array, normals: Float64Array
+def _pairs_above_horizon(
+    pairs: Int64Array, ends: list[Float64Array], position: Float64Array, normals: Float64Array
 ) -> Int64Array:
     """Return the pairs of each point with those above its horizon first, in their order."""
     up = [
-        np.einsum("pmk,pk->pm", _unit(end[None] - place[:, None]), normals) > MIN_COSINE
+        np.einsum("pmk,pk->pm", _unit(end[None] - position[:, None]), normals) > MIN_COSINE
         for end in ends
     ]
     light, view = np.divmod(pairs, len(ends[1]))
-    rows = np.arange(len(place))[:, None]
+    rows = np.arange(len(position))[:, None]
     good = up[0][rows, light] & up[1][rows, view]
     order = np.argsort(~good, axis=1, kind="stable")
     return np.take_along_axis(pairs, order, axis=1)

@@ -17,14 +17,14 @@ from rigsim.render import Caster
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import make_subject
 from skinrig.arrays import FloatArray
-from skinrig.benchmarks.resampling import tiled_rms
-from skinrig.benchmarks.results import BandError, Knobs
-from skinrig.benchmarks.stage import Stage
+from skinrig.benchmarks.resampling import bootstrap_tiled_rms
+from skinrig.benchmarks.results import ErrorEstimate, Knobs
+from skinrig.benchmarks.stage import BenchmarkStage
 from skinrig.evaluating.skin_bands import MelaninBand
 from skinrig.rendering.geometry import FittedSurface
 from skinrig.rendering.interior import Interior
 from skinrig.rendering.lights import Light
-from skinrig.rendering.render import Rendering, render
+from skinrig.rendering.render import Rendering, render_surface
 from skinrig.rendering.truth import true_light, true_model
 
 VIEW_NAME: Final = "C07"
@@ -34,7 +34,7 @@ MEAN_SIGMA_TR_PER_MM: Final = (0.598, 1.069, 1.672)
 """Of a mean face, 1/mm: Weyrich et al. 2005, table 2."""
 
 
-def model(stage: Stage) -> None:
+def model(stage: BenchmarkStage) -> None:
     """Render a simulated face's true maps, and compare with the simulator's own pictures.
 
     Rays and textures are judged by the simulator at 36 rays a pixel, with every light from inside
@@ -43,31 +43,31 @@ def model(stage: Stage) -> None:
     width, size, fine = (48, 128, 3) if stage.toy else (325, 512, REFERENCE_SUBPIXELS)
     rays = (1, 2) if stage.toy else (1, 2, 3, 4)
     rig = load_rig("dome").resized(width + width % 2).subset(views=[VIEW_NAME])
-    seen = _Seen.of("III", rig, size=size, fine=fine)
+    seen = _SimulatedFace.of("III", rig, size=size, subpixels=fine)
     binnings = (1, 2) if stage.toy else (1, 2, 4, 8)
-    laid = {k: seen.laid(binning=k) for k in binnings}
+    laid = {k: seen.fitted_surface(binning=k) for k in binnings}
 
     def add(knobs: Knobs, call: Callable[[], FloatArray], true: FloatArray, repeats: int) -> None:
         stage.measure(knobs, call, partial(_relative, true=true), repeats=repeats, memory=None)
 
     for k in rays:
         knobs: Knobs = {"vary": "rays", "rays": k**2}
-        add(knobs, lambda: seen.shown(laid[1], subpixels=k).radiance, seen.true, 2)
+        add(knobs, lambda: seen.render(laid[1], subpixels=k).radiance, seen.true, 2)
     for k in binnings[1:]:
         knobs = {"vary": "texture", "texels": size // k}
-        add(knobs, lambda: seen.shown(laid[k]).radiance, seen.true, 2)
-    skin = laid[1].of_medium(MEAN_SIGMA_TR_PER_MM)
+        add(knobs, lambda: seen.render(laid[k]).radiance, seen.true, 2)
+    skin = laid[1].with_sigma_tr(MEAN_SIGMA_TR_PER_MM)
     inside = Interior.of(skin)
 
     def spread(tolerance: float) -> FloatArray:
         aimed = dataclasses.replace(inside, tolerance=tolerance)
-        return seen.shown(skin, subsurface="dipole", interior=aimed, subpixels=1).diffuse
+        return seen.render(skin, subsurface="dipole", interior=aimed, subpixels=1).diffuse
 
     best = spread(0.001)
     for tolerance in (0.1, 0.01) if stage.toy else (3.0, 1.0, 0.3, 0.1, 0.01):
         knobs = {"vary": "spreading", "tolerance": tolerance}
         add(knobs, lambda: spread(tolerance), best, 1)
-    usual, true = seen.shown(laid[1]), seen.true
+    usual, true = seen.render(laid[1]), seen.true
     lit = usual.lit & usual.covered & (true.mean(axis=-1) > 0.0)
     gap = np.abs(usual.radiance - true).mean(axis=-1)[lit] / true.mean(axis=-1)[lit]
     color = np.array(seen.light.intensity)
@@ -75,13 +75,13 @@ def model(stage: Stage) -> None:
         dataclasses.replace(seen.light, name=n, intensity=tuple((w * color).tolist()))
         for n, w in (("a", 0.3), ("b", 0.7))
     ]
-    both = render(laid[1], seen.camera, two, subpixels=2, caster=seen.caster).radiance
+    both = render_surface(laid[1], seen.camera, two, subpixels=2, caster=seen.caster).radiance
 
-    def on_skin(band: MelaninBand) -> BandError:
-        other = _Seen.of(band.preset, rig, size=128 if stage.toy else 256, fine=fine)
-        return _relative(other.shown(other.laid()).radiance, other.true)
+    def on_skin(band: MelaninBand) -> ErrorEstimate:
+        other = _SimulatedFace.of(band.preset, rig, size=128 if stage.toy else 256, subpixels=fine)
+        return _relative(other.render(other.fitted_surface()).radiance, other.true)
 
-    stage.on_each_skin(on_skin)
+    stage.measure_bands(on_skin)
     stage.limits["median"] = 100.0 * float(np.median(gap))
     stage.limits["sum"] = _relative(both, usual.radiance).error
     stage.reference_error = stage.points[len(rays) - 1].error * rays[-1] / fine
@@ -89,7 +89,7 @@ def model(stage: Stage) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Seen:
+class _SimulatedFace:
     """A face in the dome under one light, as the simulator and as the fitted model show it."""
 
     scene: DomeScene
@@ -99,34 +99,34 @@ class _Seen:
     caster: Caster
 
     @classmethod
-    def of(cls, preset: str, rig: Rig, *, size: int, fine: int) -> _Seen:
+    def of(cls, preset: str, rig: Rig, *, size: int, subpixels: int) -> _SimulatedFace:
         face = make_subject(preset, seed=5, size=size)
         # as the model has it
         direct = partial(DomeScene, effects=SceneEffects(lateral=False, interreflections=False))
         scene = direct(rig, face)
         return cls(
             scene,
-            direct(rig, face, subpixels=fine).radiance(VIEW_NAME, [LIGHT_INDEX])[0],
+            direct(rig, face, subpixels=subpixels).radiance(VIEW_NAME, [LIGHT_INDEX])[0],
             CameraPose.nominal(rig.views[0]),
             true_light(scene, LIGHT_INDEX, VIEW_NAME),
             Caster(face.mesh),
         )
 
-    def laid(self, **binning: int) -> FittedSurface:
+    def fitted_surface(self, **binning: int) -> FittedSurface:
         """Return the true maps, laid over the face."""
         return FittedSurface.of(
             true_model(self.scene, VIEW_NAME, **binning), self.scene.subject.mesh
         )
 
-    def shown(self, on: FittedSurface, **settings: Any) -> Rendering:
+    def render(self, surface: FittedSurface, **settings: Any) -> Rendering:
         """Render with 4 rays a pixel where nothing else is set."""
-        return render(
-            on, self.camera, self.light, caster=self.caster, **{"subpixels": 2} | settings
+        return render_surface(
+            surface, self.camera, self.light, caster=self.caster, **{"subpixels": 2} | settings
         )
 
 
-def _relative(found: FloatArray, true: FloatArray) -> BandError:
+def _relative(found: FloatArray, true: FloatArray) -> ErrorEstimate:
     """Return the RMS error over the mean on skin, %, with its interval over 16 x 16 tiles."""
     skin = true.mean(axis=-1) > 0.0
     to_percent = 100.0 / float(true[skin].mean())
-    return tiled_rms((found.astype(np.float64) - true) * to_percent, skin)
+    return bootstrap_tiled_rms((found.astype(np.float64) - true) * to_percent, skin)

@@ -15,14 +15,14 @@ from scipy.ndimage import distance_transform_edt
 from capture.calibration.geometry import CameraPose
 from capture.calibration.lights import LightTable
 from capture.rig import load_rig
-from reconstruction.lumitexels import Surface
+from reconstruction.lumitexels import SampledSurface
 from reconstruction.lumitexels.ray_casting import RayCaster
 from reconstruction.lumitexels.store import LumitexelStore
 from reconstruction.surface import texture_fill
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.resampling import mean_error, tiled_rms
-from skinrig.benchmarks.results import BandError, Timing
-from skinrig.benchmarks.stage import Stage
+from skinrig.benchmarks.resampling import bootstrap_tiled_rms, mean_error
+from skinrig.benchmarks.results import ErrorEstimate, Timing
+from skinrig.benchmarks.stage import BenchmarkStage
 
 SPHERE_RADIUS_MM, SPHERE_ALBEDO = 80.0, 0.4
 N_FULL_SAMPLES = 500_000 * 16 * 150
@@ -30,7 +30,7 @@ N_ERROR_BLOCKS = 40
 """Of samples, whose means scatter independently."""
 
 
-def lumitexels(stage: Stage) -> None:
+def lumitexels(stage: BenchmarkStage) -> None:
     """Gather a Lambertian sphere, with tables in memory and on disk, of both precisions."""
     width, step = (130, 30) if stage.toy else (1300, 10)
     names = [f"L{k:03d}" for k in range(0, 150, step)]
@@ -40,12 +40,12 @@ def lumitexels(stage: Stage) -> None:
     lights = LightTable.nominal(rig)
     sphere = trimesh.creation.icosphere(subdivisions=4 if stage.toy else 6, radius=SPHERE_RADIUS_MM)
     caster = RayCaster(sphere.vertices, sphere.faces)
-    seen = [_seen(camera) for camera in cameras]
+    seen = [_visible_points(camera) for camera in cameras]
 
     def gathered(count: int, **table: Any) -> tuple[Timing, list[FloatArray]]:
         """Gather some points; return seconds and MB held, and relative errors of the samples."""
         where = sphere.vertices[:count]
-        surface = Surface(where, where / SPHERE_RADIUS_MM)
+        surface = SampledSurface(where, where / SPHERE_RADIUS_MM)
         tracemalloc.start()
         start = time.perf_counter()
         store = LumitexelStore(surface, cameras=cameras, lights=lights, caster=caster, **table)
@@ -76,13 +76,13 @@ def lumitexels(stage: Stage) -> None:
         samples = count * len(cameras) * len(names)
         # samples of a point err alike: blocks of points are drawn
         blocks = mean_error([part.mean() for part in np.array_split(off, N_ERROR_BLOCKS)])
-        outcome = BandError(float(off.mean()), blocks.error_interval)
+        outcome = ErrorEstimate(float(off.mean()), blocks.error_interval)
         stage.add({"points": count, "tables": kind}, timing, outcome)
     hours = timing.seconds / samples * N_FULL_SAMPLES / 3600
     stage.limits = {"memory": timing.peak_memory_mb or 0.0, "hours": hours}
 
 
-def filling(stage: Stage) -> None:
+def filling(stage: BenchmarkStage) -> None:
     """Fill a smooth texture of three channels of which a part of the texels is known."""
     side = 128 if stage.toy else 2048
     rng = np.random.default_rng(0)
@@ -92,9 +92,9 @@ def filling(stage: Stage) -> None:
         axis=-1,
     ).astype(np.float32)
 
-    def error(filled: FloatArray, unknown: BoolArray) -> BandError:
+    def error(filled: FloatArray, unknown: BoolArray) -> ErrorEstimate:
         off = 100 * (filled - truth) / truth.std()
-        return tiled_rms(off, unknown, tile_px=max(side // 16, 8))
+        return bootstrap_tiled_rms(off, unknown, tile_px=max(side // 16, 8))
 
     for share in (0.05, 0.15, 0.35, 0.75):
         weight = (rng.random((side, side)) < share).astype(np.float32)
@@ -117,7 +117,7 @@ def _nearest(values: Float32Array, weight: Float32Array) -> FloatArray:
     return np.asarray(values[rows, columns])
 
 
-def _seen(camera: CameraPose) -> Float64Array:
+def _visible_points(camera: CameraPose) -> Float64Array:
     """Return where the pixels of a camera meet the sphere, NaN elsewhere."""
     width, height = camera.image_size
     row, column = np.mgrid[0:height, 0:width]
@@ -128,12 +128,12 @@ def _seen(camera: CameraPose) -> Float64Array:
     return np.asarray(camera.center_mm + (-along - root)[..., None] * ways)
 
 
-def _image(seen: Float64Array, lights: LightTable, light: int) -> Float32Array:
+def _image(points: Float64Array, lights: LightTable, light: int) -> Float32Array:
     """Return the sphere under one light, written out here."""
-    way = lights.position_mm[light] - seen
+    way = lights.position_mm[light] - points
     distance = np.linalg.norm(way, axis=-1, keepdims=True)
     way /= distance
-    cosine = np.clip((way * seen).sum(axis=-1) / SPHERE_RADIUS_MM, 0.0, None)
+    cosine = np.clip((way * points).sum(axis=-1) / SPHERE_RADIUS_MM, 0.0, None)
     lobe = np.clip(-(way @ lights.axis[light]), 0.0, None) ** lights.exponent[light]
     strength = (cosine * lobe)[..., None] / distance**2
     return np.asarray(SPHERE_ALBEDO * lights.intensity[light] * strength, np.float32)

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.texture_statistics import describe, match, steerable_pyramid
-from model.texture_statistics.histograms import distance
+from model.texture_statistics.histograms import histogram_distance
 from model.texture_statistics.space import TextureSpace
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.benchmarks.resampling import mean_error
-from skinrig.benchmarks.results import BandError, Knobs
-from skinrig.benchmarks.stage import Stage
+from skinrig.benchmarks.results import ErrorEstimate, Knobs
+from skinrig.benchmarks.stage import BenchmarkStage
 
 MIN_SPEEDUP_OVER_PYRTOOLS = 10.0
 FULL_SIDE_PX, FULL_ITERATIONS = 1024, 4
@@ -59,18 +59,22 @@ def skin_texture(side: int, *, spots: float, rng: np.random.Generator) -> Float3
     return (_SKIN_COLOR * np.exp(-density)).astype(np.float32)
 
 
-def _error(images: list[Any], target: Float64Array, space: TextureSpace) -> BandError:
+def _error(images: list[Any], target: Float64Array, space: TextureSpace) -> ErrorEstimate:
     """Return the mean distance of images from a vector, and its interval over the images."""
     wanted = space.histograms(target)
     off = [
-        float(distance(space.histograms(describe(i, space=space)), wanted, space.edges).mean())
+        float(
+            histogram_distance(
+                space.histograms(describe(i, space=space)), wanted, space.edges
+            ).mean()
+        )
         for i in images
     ]
     return mean_error(off)
 
 
 def _add(
-    stage: Stage,
+    stage: BenchmarkStage,
     knobs: Knobs,
     levels: int = steerable_pyramid.LEVELS,
     dtype: type = np.float32,
@@ -94,7 +98,7 @@ def _add(
     stage.add(knobs, timing, outcome)
 
 
-def add_efforts(stage: Stage, knobs: Knobs) -> None:
+def measure_efforts(stage: BenchmarkStage, knobs: Knobs) -> None:
     """Measure pyramid depth and iterations (error: `matching`'s)."""
     at = knobs | {"side": _side(stage)}
     depths, counts = ((1, 7), (0, 2)) if stage.toy else ((1, 3, 5, 7), (0, 1, 2, 10, 20))
@@ -104,24 +108,24 @@ def add_efforts(stage: Stage, knobs: Knobs) -> None:
         _add(stage, at | {"levels": 7, "iterations": n}, iterations=n)
 
 
-def _side(stage: Stage) -> int:
+def _side(stage: BenchmarkStage) -> int:
     return 48 if stage.toy else 256
 
 
-def matching(stage: Stage) -> None:
+def matching(stage: BenchmarkStage) -> None:
     """Match textures: depth, iterations, precision, size, start; then one channel at full size."""
-    add_efforts(stage, {})
+    measure_efforts(stage, {})
     usual: Knobs = {"side": _side(stage), "levels": 7, "iterations": 5}
     _add(stage, usual | {"precision": "float64"}, dtype=np.float64)
     _add(stage, usual | {"start": "noise"}, start="noise")
     for other in (32,) if stage.toy else (128, 512):
         _add(stage, usual | {"side": other})
-    stage.reference_error = _same_texture(_side(stage))
+    stage.reference_error = _same_process_distance(_side(stage))
     if not stage.toy:
-        against_peer(stage)
+        compare_with_peer(stage)
 
 
-def _same_texture(side: int) -> float:
+def _same_process_distance(side: int) -> float:
     """Return how far apart two textures of one process are: what matching need not beat."""
     rng = np.random.default_rng(2)
     textures = [skin_texture(side, spots=10.0, rng=rng) for _ in range(1 + N_SOURCES)]
@@ -177,7 +181,7 @@ def peer_responses(image: ArrayLike) -> list[Float64Array]:
     return [found["residual_highpass"], *bands, found["residual_lowpass"] / 4.0**levels]
 
 
-def against_peer(stage: Stage, side: int = FULL_SIDE_PX) -> None:
+def compare_with_peer(stage: BenchmarkStage, side: int = FULL_SIDE_PX) -> None:
     """Match one channel by turns with the peer; take down limits, or what is left out and why."""
     try:
         peer_responses(np.zeros((512, 512)))
@@ -199,8 +203,8 @@ def against_peer(stage: Stage, side: int = FULL_SIDE_PX) -> None:
     ratios = []
     for _ in range(3):
         # ours measures how far the result is off as well, which the peer's does not
-        spent = [_spent(partial(ours, n)) for n in (0, FULL_ITERATIONS)]
-        ratios.append(FULL_ITERATIONS * _spent(theirs) / (spent[1] - spent[0]))
+        spent = [_measure_seconds(partial(ours, n)) for n in (0, FULL_ITERATIONS)]
+        ratios.append(FULL_ITERATIONS * _measure_seconds(theirs) / (spent[1] - spent[0]))
     wall, busy = np.median(ratios, axis=0)
     off = [_error([one.astype(np.float32)], vector, space).error for one in (own, peer)]
     apart = [
@@ -215,7 +219,7 @@ def against_peer(stage: Stage, side: int = FULL_SIDE_PX) -> None:
     }
 
 
-def _spent(call: Callable[[], Any]) -> Float64Array:
+def _measure_seconds(call: Callable[[], Any]) -> Float64Array:
     """Return seconds on the clock and of the processor."""
     begin = time.perf_counter(), time.process_time()
     call()

@@ -14,19 +14,19 @@ from model.traits import TraitSpace, cosine, lobe_edits, reduced_spaces
 from model.traits.reduced_spaces import SpaceKind
 from reconstruction import brdf_basis
 from reconstruction.correspondence import common_regions
-from reconstruction.correspondence.charts import Chart
-from rigsim.population.population import Member, shifted, table_1
+from reconstruction.correspondence.charts import TexelChart
+from rigsim.population.population import Member, draw_population, shift_trait
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.benchmarks import resident_memory
-from skinrig.benchmarks.resampling import mean_error, squares
-from skinrig.benchmarks.results import BandError, Knobs, Timing
-from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.benchmarks.resampling import mean_error, split_squares
+from skinrig.benchmarks.results import ErrorEstimate, Knobs, Timing
+from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 from skinrig.editing import albedo as editing_albedo
 from skinrig.fitting import traits as fitting_traits
 from skinrig.traits import albedo_vectors
 from skinrig.traits import truth as trait_truth
 from skinrig.traits.albedo_vectors import AlbedoSample, AlbedoTraits, VectorKind
-from skinrig.traits.labels import Labels
+from skinrig.traits.labels import TraitLabels
 from skinrig.traits.truth import CommonFaces
 
 TAN_MELANIN_FACTOR: Final = 1.5
@@ -35,21 +35,21 @@ N_EDITED_FACES: Final = 4
 """Faces that are edited; the traits are learned of others."""
 
 
-def editing(stage: Stage) -> None:
+def editing(stage: BenchmarkStage) -> None:
     """Edit faces over iterations of matching, noise and kinds of vectors."""
     count, size = (4, 64) if stage.toy else (28, 192)
     # heads take long to build: one of them is enough to see that this runs
-    everybody = [p for p in table_1() if not stage.toy or p.head == 0]
+    everybody = [p for p in draw_population() if not stage.toy or p.head == 0]
     order = np.random.default_rng(0).permutation(len(everybody))[: count + N_EDITED_FACES]
     people = [dataclasses.replace(everybody[k], applied=()) for k in order]
     faces = CommonFaces.of(people, size=size, common=64 if stage.toy else 128)
     learned, edited = people[:count], people[count:]
-    tanned = [p if k % 2 else _tanned(p) for k, p in enumerate(learned)]
+    tanned = [p if k % 2 else _add_tan(p) for k, p in enumerate(learned)]
     rng = np.random.default_rng(1)
     samples = [faces.albedo(p, noise=0.01, rng=rng) for p in tanned]
-    labels = Labels(tuple(p.name for p in learned), {"tan": np.arange(count) % 2 == 0}, {}, ())
+    labels = TraitLabels(tuple(p.name for p in learned), {"tan": np.arange(count) % 2 == 0}, {}, ())
     before = [faces.albedo(p, noise=0.0, rng=rng) for p in edited]
-    after = [faces.albedo(_tanned(p), noise=0.0, rng=rng) for p in edited]
+    after = [faces.albedo(_add_tan(p), noise=0.0, rng=rng) for p in edited]
     kept = {}
     usual = editing_albedo.MATCHING_NOISE
     settings: list[tuple[VectorKind, int, float]] = [
@@ -61,7 +61,9 @@ def editing(stage: Stage) -> None:
     spaces: dict[str, AlbedoTraits] = {}
     for kind, iterations, noise in settings:
         if kind not in spaces:
-            found = fitting_traits.albedo_spaces(samples, labels, faces.frame, kind, left_out=[])
+            found = fitting_traits.fit_albedo_spaces(
+                samples, labels, faces.frame, kind, left_out=[]
+            )
             spaces[kind] = AlbedoTraits(kind, found["texture"], found["albedo"])
         call = partial(_edit, spaces[kind], iterations, noise)
         errors, back = [], []
@@ -74,7 +76,7 @@ def editing(stage: Stage) -> None:
         first = partial(call, before[0].r_d, before[0].valid, 1.0)
         timing, _ = stage.time(first, memory=not stage.toy)
         if not stage.by_band:
-            stage.on_each_skin(lambda band: _on_skin(call, faces, band.melanin, people[0]))
+            stage.measure_bands(lambda band: _on_skin(call, faces, band.melanin, people[0]))
         knobs: Knobs = {"vectors": kind, "iterations": iterations, "noise": noise}
         outcome = stage.add(knobs, timing, mean_error(errors))
         kept[kind, iterations, noise] = outcome.error, float(np.mean(back))
@@ -89,27 +91,27 @@ def editing(stage: Stage) -> None:
 
 def _on_skin(
     edit: Callable[..., Float32Array], faces: CommonFaces, melanin: float, person: Member
-) -> BandError:
+) -> ErrorEstimate:
     """Return the error of a tan put on one face of so much melanin, %."""
     here = dataclasses.replace(person, melanin=melanin)
     rng = np.random.default_rng(2)
-    one, truth = (faces.albedo(p, noise=0.0, rng=rng) for p in (here, _tanned(here)))
+    one, truth = (faces.albedo(p, noise=0.0, rng=rng) for p in (here, _add_tan(here)))
     new = edit(one.r_d, one.valid, 1.0)
     good = one.valid & truth.valid
     sizes = 100 * np.abs(new / truth.r_d - 1)
     # neighbors err alike: the face is cut into squares
-    places = [at for at in squares(len(good)) if good[at].any()]
+    places = [at for at in split_squares(len(good)) if good[at].any()]
     medians = [float(np.median(sizes[at][good[at]])) for at in places]
     half = 1.2533 * float(np.std(medians)) / np.sqrt(len(medians))
-    return BandError.around(float(np.median(sizes[good])), half)
+    return ErrorEstimate.symmetric(float(np.median(sizes[good])), half)
 
 
-def _error_percent(r_d: FloatArray, one: AlbedoSample, truth: AlbedoSample) -> float:
+def _error_percent(r_d: FloatArray, sample: AlbedoSample, truth: AlbedoSample) -> float:
     """Return the median error of an edited R_d where both faces are known, %."""
-    return 100 * float(np.median(np.abs(r_d / truth.r_d - 1)[one.valid & truth.valid]))
+    return 100 * float(np.median(np.abs(r_d / truth.r_d - 1)[sample.valid & truth.valid]))
 
 
-def _tanned(person: Member) -> Member:
+def _add_tan(person: Member) -> Member:
     return dataclasses.replace(person, melanin=TAN_MELANIN_FACTOR * person.melanin)
 
 
@@ -125,7 +127,7 @@ def _edit(
     size = len(r_d)
     place = np.stack(np.meshgrid(np.arange(size), np.arange(size)), axis=-1).astype(np.float64)
     on = np.ones((size, size), np.bool_)
-    chart = Chart(size, place, on, on, np.zeros((size, size), np.float32))
+    chart = TexelChart(size, place, on, on, np.zeros((size, size), np.float32))
     found = editing_albedo.edit_albedo(
         r_d,
         valid,
@@ -133,7 +135,7 @@ def _edit(
         space,
         {"tan": amount},
         region=on,
-        share=np.ones((size, size)),
+        weight=np.ones((size, size)),
         iterations=iterations,
         noise=noise,
         rng=np.random.default_rng(int(amount < 0)),
@@ -151,24 +153,24 @@ SPACE_KINDS: tuple[SpaceKind, ...] = ("pca", "nmf")
 VECTOR_KINDS: tuple[VectorKind, ...] = ("quantiles", "histograms")
 
 
-def traits(stage: Stage) -> None:
+def traits(stage: BenchmarkStage) -> None:
     """Learn lotion from fitted lobes and tan from albedo maps, over people, spaces and noise."""
-    people = table_1()
+    people = draw_population()
     rng = np.random.default_rng(0)
     some = [people[i] for i in np.sort(rng.permutation(len(people))[: 8 if stage.toy else 40])]
     _surface(stage, some)
     _albedo(stage, some)
 
 
-def _surface(stage: Stage, people: Sequence[Member]) -> None:
-    basis = brdf_tables.default()
+def _surface(stage: BenchmarkStage, people: Sequence[Member]) -> None:
+    basis = brdf_tables.default_basis()
     strength = basis.strength()
-    metric = basis.kinship() * np.outer(strength, strength)
-    dressed = shifted(people, "lotion", apply={"lotion": 0.9}, rng=np.random.default_rng(1))
+    metric = basis.cosine_similarity() * np.outer(strength, strength)
+    dressed = shift_trait(people, "lotion", products={"lotion": 0.9}, rng=np.random.default_rng(1))
     label = np.array(["lotion" in person.marks for person in dressed])
     compared = [people[i] for i in range(0, len(people), 4 if stage.toy else 8)]
-    worn = shifted(
-        compared, "lotion", apply={"lotion": 0.9}, share=1.0, rng=np.random.default_rng(1)
+    worn = shift_trait(
+        compared, "lotion", products={"lotion": 0.9}, fraction=1.0, rng=np.random.default_rng(1)
     )
     bare = [p for p in compared if not p.applied]
     worn = tuple(w for w, p in zip(worn, compared, strict=True) if not p.applied)
@@ -200,7 +202,7 @@ def _surface(stage: Stage, people: Sequence[Member]) -> None:
     space = _fitted(means, label, "nmf", metric, basis, np.arange(len(means)))
     stage.limits["lotion"] = judged(space)
     stage.limits["false_alarms", "lobes"] = _false_alarms(stage, means, metric)
-    stage.limits |= _returned(means[~label], space, metric)
+    stage.limits |= _round_trip_error(means[~label], space, metric)
 
 
 def _fitted(
@@ -219,12 +221,12 @@ def _fitted(
 
 
 def _add(
-    stage: Stage,
+    stage: BenchmarkStage,
     knobs: Knobs,
     fit: Callable[[NDArray[np.intp]], TraitSpace],
     label: BoolArray,
     group: int,
-    judged: Callable[[TraitSpace], float],
+    error_of: Callable[[TraitSpace], float],
 ) -> float:
     """Learn from random groups of people; add and return the error, the median over them."""
     sides = [np.flatnonzero(label), np.flatnonzero(~label)]
@@ -236,18 +238,18 @@ def _add(
         np.sort(np.concatenate([s if whole else rng.choice(s, most, replace=False) for s in sides]))
         for _ in range(1 if whole else N_GROUP_DRAWS)
     ]
-    with resident_memory.watched() as rise:
+    with resident_memory.track_peak() as rise:
         fit(groups[0])
     for rows in groups:
         start = time.perf_counter()
         space = fit(rows)
         seconds.append(time.perf_counter() - start)
-        errors.append(1.0 - judged(space))
+        errors.append(1.0 - error_of(space))
         expected.append(space.trait("trait").confidence.expected_cosine)
         kept.append(len(space.basis))
     low, middle, high = (float(v) for v in np.quantile(errors, (0.16, 0.5, 0.84)))
     if whole:
-        half = _jackknife(lambda rows: 1.0 - judged(fit(rows)), groups[0])
+        half = _jackknife(lambda rows: 1.0 - error_of(fit(rows)), groups[0])
         low, high = max(middle - half, 0.0), middle + half
     spread = min(seconds), max(seconds)
     timing = Timing(float(np.median(seconds)), spread, seconds[0], rise.mb, "resident")
@@ -256,7 +258,7 @@ def _add(
         "components": int(np.median(kept)),
         "expected_cosine": round(float(np.median(expected)), 4),
     }
-    return stage.add(shown, timing, BandError(middle, (low, high)), also).error
+    return stage.add(shown, timing, ErrorEstimate(middle, (low, high)), also).error
 
 
 def _jackknife(value: Callable[[NDArray[np.intp]], float], rows: NDArray[np.intp]) -> float:
@@ -267,7 +269,9 @@ def _jackknife(value: Callable[[NDArray[np.intp]], float], rows: NDArray[np.intp
     return float(np.std(values) * np.sqrt(count - 1))
 
 
-def _false_alarms(stage: Stage, samples: Float64Array, metric: Float64Array | None) -> float:
+def _false_alarms(
+    stage: BenchmarkStage, samples: Float64Array, metric: Float64Array | None
+) -> float:
     """Return how often shuffled labels pass for a trait."""
     rng = np.random.default_rng(6)
     passed = []
@@ -278,9 +282,9 @@ def _false_alarms(stage: Stage, samples: Float64Array, metric: Float64Array | No
     return float(np.mean(passed))
 
 
-def _returned(faces: Float64Array, space: TraitSpace, metric: Float64Array) -> Findings:
+def _round_trip_error(faces: Float64Array, space: TraitSpace, metric: Float64Array) -> LimitValues:
     """Edit the lobes of faces without the trait, and back again."""
-    size = float(reduced_spaces.lengths(space.trait("trait").vector, metric))
+    size = float(reduced_spaces.metric_lengths(space.trait("trait").vector, metric))
     rng = np.random.default_rng(7)
     worst_zero, back, off = 0.0, [], []
     for face in faces[:6]:
@@ -293,9 +297,9 @@ def _returned(faces: Float64Array, space: TraitSpace, metric: Float64Array) -> F
         there = lobe_edits.edit_weights(weights, mix, space, {"trait": 0.6})
         again = lobe_edits.edit_weights(there.weights, there.mix, space, {"trait": -0.6})
         gap = again.weights @ again.mix - weights @ mix
-        back.append(reduced_spaces.lengths(gap, metric) / (0.6 * size))
+        back.append(reduced_spaces.metric_lengths(gap, metric) / (0.6 * size))
         miss = there.weights @ there.mix - weights @ mix - 0.6 * space.trait("trait").vector
-        off.append(reduced_spaces.lengths(miss, metric) / (0.6 * size))
+        off.append(reduced_spaces.metric_lengths(miss, metric) / (0.6 * size))
     return {
         "zero": worst_zero,
         "back": float(np.sqrt(np.mean(np.square(back)))),
@@ -303,15 +307,15 @@ def _returned(faces: Float64Array, space: TraitSpace, metric: Float64Array) -> F
     }
 
 
-def _albedo(stage: Stage, people: Sequence[Member]) -> None:
-    tanned = shifted(people, "tan", melanin=TAN_MELANIN_FACTOR, rng=np.random.default_rng(1))
+def _albedo(stage: BenchmarkStage, people: Sequence[Member]) -> None:
+    tanned = shift_trait(people, "tan", melanin=TAN_MELANIN_FACTOR, rng=np.random.default_rng(1))
     label = np.array(["tan" in person.marks for person in tanned])
     faces = CommonFaces.of(people, size=64 if stage.toy else 128, common=48 if stage.toy else 80)
-    inside = common_regions.region("face", faces.frame)
+    inside = common_regions.region_mask("face", faces.frame)
     compared = list(range(0, len(people), 4))
     seen = list(range(2, len(people), 4))
-    after = shifted(
-        people, "tan", melanin=TAN_MELANIN_FACTOR, share=1.0, rng=np.random.default_rng(1)
+    after = shift_trait(
+        people, "tan", melanin=TAN_MELANIN_FACTOR, fraction=1.0, rng=np.random.default_rng(1)
     )
     for noise in (0.01,) if stage.toy else (0.01, 0.1):
         maps = [
@@ -330,8 +334,8 @@ def _albedo(stage: Stage, people: Sequence[Member]) -> None:
         ]
         for kind in VECTOR_KINDS:
             names = tuple(p.name for p in people)
-            spaces = fitting_traits.albedo_spaces(
-                maps, Labels(names, {"trait": label}, {}, ()), faces.frame, kind, left_out=[]
+            spaces = fitting_traits.fit_albedo_spaces(
+                maps, TraitLabels(names, {"trait": label}, {}, ()), faces.frame, kind, left_out=[]
             )
             vectors = partial(_vectors, texture=spaces["texture"], kind=kind, inside=inside)
             before, with_it = (vectors(group) for group in clean)
@@ -357,14 +361,17 @@ def _albedo(stage: Stage, people: Sequence[Member]) -> None:
 
 
 def _vectors(
-    shown: Sequence[albedo_vectors.AlbedoSample], texture: Any, kind: VectorKind, inside: BoolArray
+    samples: Sequence[albedo_vectors.AlbedoSample],
+    texture: Any,
+    kind: VectorKind,
+    inside: BoolArray,
 ) -> Float64Array:
     return np.array(
         [
             albedo_vectors.vector(
                 one.r_d, texture, kind, valid=one.valid, region=inside & one.valid
             )
-            for one in shown
+            for one in samples
         ]
     )
 

@@ -13,8 +13,8 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.correspondence import expression_alignment
 from rigsim.subject import SimulatedSubject, make_subject
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
-from skinrig.benchmarks.results import BandError, Knobs
-from skinrig.benchmarks.stage import Stage
+from skinrig.benchmarks.results import ErrorEstimate, Knobs
+from skinrig.benchmarks.stage import BenchmarkStage
 
 Points = dict[str, tuple[float, float]]
 
@@ -51,7 +51,7 @@ def smooth_displacement(
 
 
 @dataclass(frozen=True, slots=True)
-class MovedFace:
+class DisplacedFace:
     """Two pictures of a simulated face's texture, with what is known of them.
 
     Attributes
@@ -109,20 +109,22 @@ def table() -> ColorTable:
     return color_table.build(TABLE_CAMERA, TABLE_ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
 
 
-def oval(side: int) -> BoolArray:
+def face_mask(side: int) -> BoolArray:
     """Return where a texture shows the face."""
     y, x = np.mgrid[:side, :side] / (side - 1.0) - 0.5
     return np.asarray((x / 0.34) ** 2 + (y / 0.40) ** 2 < 1.0)
 
 
-def seen_at(image: Float64Array, away: Float64Array, order: int = 3) -> Float64Array:
+def sample_displaced(
+    image: Float64Array, displacement_px: Float64Array, order: int = 3
+) -> Float64Array:
     """Return an image (N, N) at places that are away from each pixel by columns and rows."""
     rows, columns = np.indices(image.shape, np.float64)
-    at = [rows + away[..., 1], columns + away[..., 0]]
+    at = [rows + displacement_px[..., 1], columns + displacement_px[..., 0]]
     return np.asarray(map_coordinates(image, at, order=order, mode="nearest"))
 
 
-def moved_face(
+def displace_face(
     face: SimulatedSubject,
     displacement_px: Float64Array,
     *,
@@ -130,7 +132,7 @@ def moved_face(
     noise: float = 0.01,
     landmarks: int = 24,
     rng: np.random.Generator,
-) -> MovedFace:
+) -> DisplacedFace:
     """Picture a face in neutral, and moved in a state of its blood.
 
     Parameters
@@ -151,19 +153,21 @@ def moved_face(
     side = face.size
     back = np.zeros_like(displacement_px)
     for _ in range(60):
-        back = -np.stack([seen_at(displacement_px[..., k], back, 1) for k in range(2)], axis=-1)
+        back = -np.stack(
+            [sample_displaced(displacement_px[..., k], back, 1) for k in range(2)], axis=-1
+        )
     colors = table()
     light = 0.75 * np.clip(face.normal[..., 2], 0.05, 1.0)
     rest = face.hemoglobin(state)
-    mask = oval(side)
+    mask = face_mask(side)
     pictures, variances = [], []
     for blood, moved in ((face.hemoglobin(), False), (rest, True)):
         clean = colors.lookup(face.melanin, blood) * light[..., None]
         if moved:
-            clean = np.stack([seen_at(clean[..., k], back) for k in range(3)], axis=-1)
+            clean = np.stack([sample_displaced(clean[..., k], back) for k in range(3)], axis=-1)
         pictures.append((clean * (1.0 + noise * rng.standard_normal(clean.shape))).astype("f4"))
         variances.append(((noise * clean) ** 2).astype("f4"))
-    points = spread_points(mask, landmarks)
+    points = farthest_point_sample(mask, landmarks)
     gone = points + displacement_px[points[:, 1], points[:, 0]]
     placed = [
         {
@@ -172,24 +176,24 @@ def moved_face(
         }
         for p in (points.astype(np.float64), gone)
     ]
-    return MovedFace(
+    return DisplacedFace(
         pictures[0],
         pictures[1],
         variances[0],
         variances[1],
         mask,
-        seen_at(mask.astype(np.float64), back, 1) > 0.99,
+        sample_displaced(mask.astype(np.float64), back, 1) > 0.99,
         np.indices((side, side), np.float64)[::-1].transpose(1, 2, 0) + displacement_px,
         placed[0],
         placed[1],
         face.melanin,
         face.hemoglobin(),
         rest,
-        seen_at(rest.astype(np.float64), back).astype("f4"),
+        sample_displaced(rest.astype(np.float64), back).astype("f4"),
     )
 
 
-def spread_points(mask: BoolArray, count: int) -> NDArray[np.intp]:
+def farthest_point_sample(mask: BoolArray, count: int) -> NDArray[np.intp]:
     """Return points (count, 2), column and row, spread over a mask: each farthest from others."""
     inner = distance_transform_edt(mask) > 0.02 * mask.shape[0]
     places = np.argwhere(inner)[:, ::-1]
@@ -201,14 +205,14 @@ def spread_points(mask: BoolArray, count: int) -> NDArray[np.intp]:
     return places[chosen]
 
 
-def aligned(stage: Stage) -> None:
+def aligned(stage: BenchmarkStage) -> None:
     """Align moved faces by landmarks few and many, by features, with and without dense flow."""
     side = 128 if stage.toy else 512
     rng = np.random.default_rng(1)
     face = make_subject("III", seed=2, size=side)
     away = smooth_displacement(side, bend_px=side / 10, rms_px=side / 50, rng=rng)
-    seen = moved_face(face, away, state="exercise", noise=0.005, landmarks=48, rng=rng)
-    still = moved_face(face, np.zeros_like(away), state="exercise", noise=0.005, rng=rng)
+    seen = displace_face(face, away, state="exercise", noise=0.005, landmarks=48, rng=rng)
+    still = displace_face(face, np.zeros_like(away), state="exercise", noise=0.005, rng=rng)
     effort = [(8, 0), (24, 0), (48, 0), (24, 2)]
     if not stage.toy:
         both = [(n, rounds) for n in (48, 0) for rounds in (0, 2)]
@@ -222,7 +226,7 @@ def aligned(stage: Stage) -> None:
             covered = float((error < 2.0 * found.error_px[found.valid]).mean())
         knobs = {"by": found.by, "landmarks": count, "rounds": rounds}
         stage.add(knobs, timing, _rms(error, side))
-    stage.on_each_skin(lambda band: _on_skin(band.preset, 128 if stage.toy else 256))
+    stage.measure_bands(lambda band: _on_skin(band.preset, 128 if stage.toy else 256))
     stage.words["moved_px"] = side / 50
     if not stage.toy:
         bare, dense = (stage.at(landmarks=24, rounds=n) for n in (0, 2))
@@ -234,18 +238,18 @@ def aligned(stage: Stage) -> None:
         }
 
 
-def _on_skin(preset: str, side: int) -> BandError:
+def _on_skin(preset: str, side: int) -> ErrorEstimate:
     """Return the error on skin of a preset: 24 landmarks and dense flow, 1 % of noise."""
     rng = np.random.default_rng(4)
     away = smooth_displacement(side, bend_px=side / 10, rms_px=side / 50, rng=rng)
-    seen = moved_face(make_subject(preset, seed=2, size=side), away, state="exercise", rng=rng)
+    seen = displace_face(make_subject(preset, seed=2, size=side), away, state="exercise", rng=rng)
     return _rms(seen.errors_px(seen.align(24, 2)), side)
 
 
 MISALIGNMENTS_PX = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)
 
 
-def misaligned(stage: Stage) -> None:
+def misaligned(stage: BenchmarkStage) -> None:
     """Blend from maps that were put in a wrong place on purpose, beside interpolating them.
 
     The paper's claim (Jimenez et al. 2010, section 4.2) is that local statistics bear alignments
@@ -253,13 +257,13 @@ def misaligned(stage: Stage) -> None:
     """
     side = 128 if stage.toy else 512
     face = make_subject("III", seed=2, size=side)
-    mask = oval(side)
+    mask = face_mask(side)
     neutral = face.hemoglobin().astype(np.float64)
     for state in ("exercise",) if stage.toy else ("exercise", "smile"):
         truth = face.hemoglobin(state).astype(np.float64)
         size = _rms((truth - neutral)[mask], side).error
         for off_px in MISALIGNMENTS_PX[:3] if stage.toy else MISALIGNMENTS_PX:
-            map_of_state = displaced(truth, off_px, rng=np.random.default_rng(3))
+            map_of_state = displace_map(truth, off_px, rng=np.random.default_rng(3))
 
             def blended(radius: float) -> Float64Array:
                 if radius == 0.0:
@@ -283,18 +287,20 @@ def misaligned(stage: Stage) -> None:
             stage.limits["ratio", state] = kept.error / blend.error
 
 
-def displaced(image: Float64Array, rms_px: float, *, rng: np.random.Generator) -> Float64Array:
+def displace_map(image: Float64Array, rms_px: float, *, rng: np.random.Generator) -> Float64Array:
     """Return a map seen at places that are off by a smooth random displacement of so many px."""
     if rms_px == 0.0:
         return image
     side = image.shape[0]
-    return seen_at(image, smooth_displacement(side, bend_px=side / 12.8, rms_px=rms_px, rng=rng))
+    return sample_displaced(
+        image, smooth_displacement(side, bend_px=side / 12.8, rms_px=rms_px, rng=rng)
+    )
 
 
-def _rms(values: Float64Array, side: int) -> BandError:
+def _rms(values: Float64Array, side: int) -> ErrorEstimate:
     """Return a root mean square over pixels that go together in patches, with its interval."""
     squares = np.square(values)
     patches = max(values.size / (side / 10.0) ** 2, 2.0)
     mean, spread = float(squares.mean()), float(squares.std()) / np.sqrt(patches)
     low, high = np.sqrt([max(mean - spread, 0.0), mean + spread]).tolist()
-    return BandError(float(np.sqrt(mean)), (low, high))
+    return ErrorEstimate(float(np.sqrt(mean)), (low, high))

@@ -21,11 +21,11 @@ from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.facial_color import shared_melanin
 from rigsim.subject import make_subject
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.flash_rig.alignment import oval, table
+from skinrig.benchmarks.flash_rig.alignment import face_mask, table
 from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds
 from skinrig.benchmarks.resampling import median_error
-from skinrig.benchmarks.results import BandError, Knobs
-from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.benchmarks.results import ErrorEstimate, Knobs
+from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 from skinrig.evaluating.skin_bands import MelaninBand
 
 CHANNEL_NOISE = 0.01
@@ -34,7 +34,7 @@ MIN_MELANIN = 0.004
 """Volume fraction of the palest skin that is drawn."""
 
 
-def inversion(stage: Stage) -> None:
+def inversion(stage: BenchmarkStage) -> None:
     """Invert a noisy picture with the shading known and free, through tables of several sizes."""
     side, pixels = (96, 8) if stage.toy else (2048, 40)
     rng = np.random.default_rng(0)
@@ -59,12 +59,12 @@ def inversion(stage: Stage) -> None:
             outcome = _error(found, c_m, rng)
             stage.add({"shading": shading, "table": size}, timing, outcome)
         if shading == "free":
-            peer_s = _scipy_seconds(picture.reshape(-1, 3)[:: side * side // pixels], table)
+            peer_s = _time_scipy_fit(picture.reshape(-1, 3)[:: side * side // pixels], table)
             ours_s = timing.seconds / side**2
             stage.limits = {("seconds", side): timing.seconds, "speed_up": peer_s / ours_s}
     count = 500 if stage.toy else 20_000
 
-    def on_skin(band: MelaninBand) -> BandError:
+    def on_skin(band: MelaninBand) -> ErrorEstimate:
         low, high = band.melanin_range
         c_m = rng.uniform(max(low, MIN_MELANIN), min(high, table.c_m_max), count)
         c_hd = rng.uniform(0.02, 0.08, count)
@@ -77,12 +77,12 @@ def inversion(stage: Stage) -> None:
         )
         return _error(found, c_m)
 
-    stage.on_each_skin(on_skin)
+    stage.measure_bands(on_skin)
 
 
 def _error(
     found: chromophores.ChromophoreMaps, c_m: Float64Array, rng: np.random.Generator | None = None
-) -> BandError:
+) -> ErrorEstimate:
     """Return the median error of melanin, %."""
     off = 100 * np.abs(found.melanin / c_m - 1)[found.valid]
     # the median of |error| of a normal error of the bound's size
@@ -90,7 +90,7 @@ def _error(
     return median_error(off, bound, rng=rng)
 
 
-def _scipy_seconds(rgb: FloatArray, table: color_table.ColorTable) -> float:
+def _time_scipy_fit(rgb: FloatArray, table: color_table.ColorTable) -> float:
     """Return seconds a pixel of a plain fit of cube roots and log shading."""
     start = time.perf_counter()
     for color in rgb:
@@ -111,11 +111,11 @@ LIGHT_CHANGE = 0.05
 FULL_SIDE_PX = 1024
 
 
-def shared(stage: Stage) -> None:
+def shared(stage: BenchmarkStage) -> None:
     """Invert 1 to 7 states together, the light free or smooth, beside each state alone."""
     side = 64 if stage.toy else 192
-    model = _Model(table(), shading_prior.of_faces(), model_error.load())
-    seen = _States.of("II", side, STATE_NAMES, model)
+    model = _ChromophoreModel(table(), shading_prior.face_prior(), model_error.load_covariance())
+    seen = _StateImages.of("II", side, STATE_NAMES, model)
 
     def alone() -> Float64Array:
         each = [
@@ -132,7 +132,7 @@ def shared(stage: Stage) -> None:
         return np.asarray(each[1].hemoglobin - each[0].hemoglobin, np.float64)
 
     def together(count: int, window: float | None) -> shared_melanin.SharedMelanin:
-        return seen.together(count, window, model)
+        return seen.invert_jointly(count, window, model)
 
     def add(knobs: Knobs, call: Callable[[], Any], change: Callable[[Any], Float64Array]) -> None:
         timing, made = stage.time(call, repeats=1, memory=False)
@@ -145,7 +145,7 @@ def shared(stage: Stage) -> None:
     for count, window in settings:
         knobs: Knobs = {"way": "together", "states": count, "light": window or "free"}
         add(knobs, lambda: together(count, window), lambda made: made.change[1])
-    stage.on_each_skin(lambda band: _on_skin(band.preset, side, model))
+    stage.measure_bands(lambda band: _on_skin(band.preset, side, model))
     if not stage.toy:
         found = together(7, 3.0)
         stated = found.stderr_change[1][seen.mask]
@@ -157,7 +157,7 @@ def shared(stage: Stage) -> None:
         }
 
 
-def pictures(
+def simulate_colors(
     colors: ColorTable,
     melanin: FloatArray,
     blood: Float64Array,
@@ -185,15 +185,15 @@ def pictures(
     return seen.astype(np.float32), ((noise * clean) ** 2).astype(np.float32)
 
 
-def _on_skin(preset: str, side: int, model: _Model) -> BandError:
+def _on_skin(preset: str, side: int, model: _ChromophoreModel) -> ErrorEstimate:
     """Return the error of smile's change of blood on skin of a preset, three states together."""
-    seen = _States.of(preset, side, STATE_NAMES[:3], model)
-    found = seen.together(3, 3.0, model)
+    seen = _StateImages.of(preset, side, STATE_NAMES[:3], model)
+    found = seen.invert_jointly(3, 3.0, model)
     return median_error(seen.errors(found.change[1]))
 
 
 @dataclass(frozen=True, slots=True)
-class _Model:
+class _ChromophoreModel:
     """What inversions know of all faces."""
 
     colors: ColorTable
@@ -214,7 +214,7 @@ class _Model:
 
 
 @dataclass(frozen=True, slots=True)
-class _States:
+class _StateImages:
     """Pictures of a face in states of its blood."""
 
     rgb: Float32Array
@@ -223,15 +223,17 @@ class _States:
     mask: BoolArray
 
     @classmethod
-    def of(cls, preset: str, side: int, names: Sequence[str], model: _Model) -> _States:
+    def of(
+        cls, preset: str, side: int, names: Sequence[str], model: _ChromophoreModel
+    ) -> _StateImages:
         face = make_subject(preset, seed=3, size=side)
         blood = np.stack([face.hemoglobin(name) for name in names]).astype(np.float64)
         rng = np.random.default_rng(0)
-        seen = pictures(model.colors, face.melanin, blood, model.covariance, rng=rng)
-        return cls(*seen, blood, oval(side))
+        seen = simulate_colors(model.colors, face.melanin, blood, model.covariance, rng=rng)
+        return cls(*seen, blood, face_mask(side))
 
-    def together(
-        self, count: int, window: float | None, model: _Model
+    def invert_jointly(
+        self, count: int, window: float | None, model: _ChromophoreModel
     ) -> shared_melanin.SharedMelanin:
         """Invert the first states together, the light smooth in a window, px, or free."""
         valid = np.broadcast_to(self.mask, self.blood[:count].shape)
@@ -244,14 +246,14 @@ class _States:
         return np.asarray(np.abs(change - (self.blood[1] - self.blood[0]))[self.mask])
 
 
-def _dense_error(off: Float64Array) -> BandError:
+def _dense_error(errors: Float64Array) -> ErrorEstimate:
     """Return the median; its interval is by the density about it."""
-    off = off[np.isfinite(off)]
-    low, high = np.quantile(off, 0.5 + np.array([-0.5, 0.5]) / np.sqrt(off.size))
-    return BandError(float(np.median(off)), (float(low), float(high)))
+    errors = errors[np.isfinite(errors)]
+    low, high = np.quantile(errors, 0.5 + np.array([-0.5, 0.5]) / np.sqrt(errors.size))
+    return ErrorEstimate(float(np.median(errors)), (float(low), float(high)))
 
 
-def _melanin_limits(model: _Model) -> Findings:
+def _melanin_limits(model: _ChromophoreModel) -> LimitValues:
     """Check how melanin's variance by noise goes with the number of states."""
     rng = np.random.default_rng(1)
     variances = {}
@@ -265,12 +267,12 @@ def _melanin_limits(model: _Model) -> Findings:
     return {"melanin": variances[1] / variances[7]}
 
 
-def _full_size(model: _Model) -> Findings:
+def _full_size(model: _ChromophoreModel) -> LimitValues:
     """Time 7 states of a megapixel by a band of it."""
     rng = np.random.default_rng(2)
     band = 96
     melanin = np.full((band, FULL_SIDE_PX), 0.02)
     blood = 0.32 * rng.uniform(0.35, 0.5, (len(STATE_NAMES), band, FULL_SIDE_PX)) ** 3
-    seen = pictures(model.colors, melanin, blood, model.covariance, rng=rng)
+    seen = simulate_colors(model.colors, melanin, blood, model.covariance, rng=rng)
     run = partial(model.invert, *seen, shading_window_px=shared_melanin.SHADING_WINDOW_PX)
     return {"seconds": processor_seconds(run, 2) * FULL_SIDE_PX / band / LIMIT_CORES}

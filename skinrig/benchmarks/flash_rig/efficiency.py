@@ -18,13 +18,13 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import chromophores, diffuse_albedo, photometric_stereo, subsurface
 from reconstruction.photometric_stereo import light_selection
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.results import BandError, Knobs, Point
-from skinrig.benchmarks.stage import Stage
-from skinrig.evaluating.skin_bands import MELANIN_BANDS, melanin_band
+from skinrig.benchmarks.results import ErrorEstimate, Knobs, Point
+from skinrig.benchmarks.stage import BenchmarkStage
+from skinrig.evaluating.skin_bands import MELANIN_BANDS, classify_melanin
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class EstimatorTrial:
     """An estimator on draws of one subject."""
 
     squared_errors: Callable[[], Float64Array]
@@ -38,7 +38,7 @@ class Trial:
 
 
 @dataclass(frozen=True, slots=True)
-class Skin:
+class TypicalSkin:
     """Typical skin."""
 
     melanin: float
@@ -49,12 +49,12 @@ class Skin:
 
 
 SUBJECTS: Final = {
-    "palest": Skin(0.005, 0.03, 0.6, 0.02, 1.4),
-    "II": Skin(0.014, 0.05, 0.5, 0.03, 1.3),
-    "III": Skin(0.028, 0.05, 0.4, 0.05, 1.2),
-    "IV": Skin(0.047, 0.05, 0.3, 0.08, 1.2),
-    "V": Skin(0.085, 0.05, 0.2, 0.15, 1.1),
-    "VI": Skin(0.17, 0.05, 0.1, 0.3, 1.0),
+    "palest": TypicalSkin(0.005, 0.03, 0.6, 0.02, 1.4),
+    "II": TypicalSkin(0.014, 0.05, 0.5, 0.03, 1.3),
+    "III": TypicalSkin(0.028, 0.05, 0.4, 0.05, 1.2),
+    "IV": TypicalSkin(0.047, 0.05, 0.3, 0.08, 1.2),
+    "V": TypicalSkin(0.085, 0.05, 0.2, 0.15, 1.1),
+    "VI": TypicalSkin(0.17, 0.05, 0.1, 0.3, 1.0),
 }
 MIN_MEASURED_SIGMAS, MIN_EVALUATED_SIGMAS = 2.5, 10.0
 """Standard errors between a fraction and 0. Below the first an estimate that cannot be negative is
@@ -69,7 +69,7 @@ FIBER_NOISE = 0.01
 """Relative noise of each fibre."""
 
 
-def efficiency(stage: Stage) -> None:
+def efficiency(stage: BenchmarkStage) -> None:
     """Measure mean squared errors over Cramér-Rao bounds."""
     draws = 500 if stage.toy else 20_000
     worst = stage.by_band
@@ -82,11 +82,11 @@ def efficiency(stage: Stage) -> None:
             knobs: Knobs = {"estimator": name, "subject": subject}
             knobs["noise_percent"] = round(100 * trial.noise, 2)
             judged = trial.clear >= MIN_EVALUATED_SIGMAS
-            outcome = BandError.around(ratio, spread, 1.0)
+            outcome = ErrorEstimate.symmetric(ratio, spread, 1.0)
             stage.add(knobs, timing, outcome, {"judged": judged})
             if judged:
-                ratios[str(melanin_band(SUBJECTS[subject].melanin))].append((ratio, spread))
-        stage.left_out += _left_out(name, stage.points)
+                ratios[str(classify_melanin(SUBJECTS[subject].melanin))].append((ratio, spread))
+        stage.left_out += _excluded_subjects(name, stage.points)
         for band, pairs in ratios.items():
             if not pairs:
                 continue
@@ -96,10 +96,10 @@ def efficiency(stage: Stage) -> None:
             # what so many draws leave open of the ratio counts for the estimator
             stage.limits["ratio", name, band] = ratio - 2.0 * spread
             if band not in worst or ratio > worst[band].error:
-                worst[band] = BandError.around(ratio, spread, 1.0)
+                worst[band] = ErrorEstimate.symmetric(ratio, spread, 1.0)
 
 
-def _left_out(name: str, points: Sequence[Point]) -> list[tuple[str, str]]:
+def _excluded_subjects(name: str, points: Sequence[Point]) -> list[tuple[str, str]]:
     """Return the subjects of whom an estimator was not judged."""
     judged = {
         p.knobs["subject"] for p in points if p.knobs["estimator"] == name and p.also["judged"]
@@ -112,9 +112,9 @@ def _left_out(name: str, points: Sequence[Point]) -> list[tuple[str, str]]:
 
 
 def _chromophores(
-    which: Literal["melanin", "hemoglobin"], shading: Literal["known", "free"], draws: int
-) -> Iterator[tuple[str, Trial]]:
-    index = 0 if which == "melanin" else 1
+    name: Literal["melanin", "hemoglobin"], shading: Literal["known", "free"], draws: int
+) -> Iterator[tuple[str, EstimatorTrial]]:
+    index = 0 if name == "melanin" else 1
 
     table = color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
 
@@ -125,13 +125,13 @@ def _chromophores(
             shading="known" if shading == "known" else None,
             variance=np.broadcast_to(np.float32(sigma**2), noisy.shape),
         )
-        value = getattr(found, which)
+        value = getattr(found, name)
         return np.square(np.asarray(value, np.float64)[found.valid] - true)
 
     for number, (subject, skin) in enumerate(SUBJECTS.items()):
         truth = skin.melanin, skin.hemoglobin
         color = table.lookup(*truth).reshape(3)
-        slopes = differences(lambda p: table.lookup(p[0], p[1]).reshape(3), np.array(truth))
+        slopes = differentiate(lambda p: table.lookup(p[0], p[1]).reshape(3), np.array(truth))
         if shading == "free":
             slopes = np.column_stack([slopes, color])
         relative = slopes / color[:, None]
@@ -145,12 +145,12 @@ def _chromophores(
             rng = np.random.default_rng([1, number])
             noisy = color + sigma * rng.standard_normal((draws, 3))
             call = partial(squared, noisy, sigma, truth[index])
-            yield subject, Trial(call, float(noise**2 * least[index]), noise, clear)
+            yield subject, EstimatorTrial(call, float(noise**2 * least[index]), noise, clear)
             if clear >= MIN_EVALUATED_SIGMAS:
                 break
 
 
-def _normals(draws: int) -> Iterator[tuple[str, Trial]]:
+def _normals(draws: int) -> Iterator[tuple[str, EstimatorTrial]]:
     rng = np.random.default_rng(2)
     lights = rng.normal(size=(40, 3))
     lights[:, 2] = np.abs(lights[:, 2]) + 0.4
@@ -163,10 +163,12 @@ def _normals(draws: int) -> Iterator[tuple[str, Trial]]:
         albedo = skin.r_d
         # shot noise of 20,000 electrons at full scale, read noise of 5
         sigma = np.sqrt(albedo * lit / 20_000 + (5 / 20_000) ** 2)
-        information = light_selection.information(
+        information = light_selection.fisher_information(
             normal[None], lights, (sigma / (albedo * lit))[None] ** 2
         )
-        tilt = light_selection.predict(information, range(len(lights)), least=3).tilt_rad[0]
+        tilt = light_selection.predict_errors(
+            information, range(len(lights)), min_lights=3
+        ).tilt_rad[0]
         noisy = albedo * lit[:, None] + sigma[:, None] * rng.standard_normal((len(lights), draws))
 
         def squared() -> Float64Array:
@@ -176,10 +178,10 @@ def _normals(draws: int) -> Iterator[tuple[str, Trial]]:
             return np.asarray(np.sum(np.cross(found.normals, normal) ** 2, axis=-1), np.float64)
 
         noise = float(np.mean(sigma / (albedo * lit)))
-        yield subject, Trial(squared, 2.0 * float(tilt) ** 2, noise)
+        yield subject, EstimatorTrial(squared, 2.0 * float(tilt) ** 2, noise)
 
 
-def _albedo(draws: int) -> Iterator[tuple[str, Trial]]:
+def _albedo(draws: int) -> Iterator[tuple[str, EstimatorTrial]]:
     rng = np.random.default_rng(3)
     ways = rng.normal(size=(2, 60, 3))
     ways[..., 2] = np.abs(ways[..., 2]) + 0.4
@@ -207,19 +209,19 @@ def _albedo(draws: int) -> Iterator[tuple[str, Trial]]:
             )
             return np.square(found.r_d[found.valid, 0] - albedo)
 
-        yield subject, Trial(squared, float(bound), ALBEDO_NOISE)
+        yield subject, EstimatorTrial(squared, float(bound), ALBEDO_NOISE)
 
 
-def _subsurface(draws: int) -> Iterator[tuple[str, Trial]]:
+def _subsurface(draws: int) -> Iterator[tuple[str, EstimatorTrial]]:
     radius = np.linspace(1.0, 15.0, 28)
     count = draws // 20
     for number, (subject, skin) in enumerate(SUBJECTS.items()):
         truth = np.array([skin.sigma_a_per_mm, skin.sigma_s_per_mm])
         profile = photon_table.reflectance(radius, *truth)
         sigma = FIBER_NOISE * profile + 1e-3 * profile.max() * FIBER_NOISE
-        slopes = differences(lambda p: photon_table.reflectance(radius, p[0], p[1]), truth)
+        slopes = differentiate(lambda p: photon_table.reflectance(radius, p[0], p[1]), truth)
         covariance = np.linalg.inv((slopes / sigma[:, None]).T @ (slopes / sigma[:, None]))
-        along = differences(lambda p: np.atleast_1d(_sigma_tr(p)), truth)[0]
+        along = differentiate(lambda p: np.atleast_1d(_sigma_tr(p)), truth)[0]
         rng = np.random.default_rng([4, number])
         noisy = profile + sigma * rng.standard_normal((count, 28))
 
@@ -234,7 +236,7 @@ def _subsurface(draws: int) -> Iterator[tuple[str, Trial]]:
             )
             return np.square(fit.sigma_tr_per_mm[fit.valid] - _sigma_tr(truth))
 
-        yield subject, Trial(squared, float(along @ covariance @ along), FIBER_NOISE)
+        yield subject, EstimatorTrial(squared, float(along @ covariance @ along), FIBER_NOISE)
 
 
 def _sigma_tr(coefficients: Float64Array) -> float:
@@ -242,17 +244,19 @@ def _sigma_tr(coefficients: Float64Array) -> float:
     return float(np.sqrt(3.0 * sigma_a * (sigma_a + sigma_s)))
 
 
-def differences(value: Callable[[Float64Array], Float64Array], at: Float64Array) -> Float64Array:
+def differentiate(
+    value: Callable[[Float64Array], Float64Array], point: Float64Array
+) -> Float64Array:
     """Return derivatives of a vector by each parameter, by central differences."""
     columns = []
-    for k in range(len(at)):
-        step = np.zeros(len(at))
-        step[k] = 1e-3 * at[k]
-        columns.append((value(at + step) - value(at - step)) / (2.0 * step[k]))
+    for k in range(len(point)):
+        step = np.zeros(len(point))
+        step[k] = 1e-3 * point[k]
+        columns.append((value(point + step) - value(point - step)) / (2.0 * step[k]))
     return np.column_stack(columns)
 
 
-_ESTIMATOR_TRIALS: Final[dict[str, Callable[[int], Iterator[tuple[str, Trial]]]]] = {
+_ESTIMATOR_TRIALS: Final[dict[str, Callable[[int], Iterator[tuple[str, EstimatorTrial]]]]] = {
     "melanin, shading known": partial(_chromophores, "melanin", "known"),
     "melanin, shading free": partial(_chromophores, "melanin", "free"),
     "hemoglobin, shading known": partial(_chromophores, "hemoglobin", "known"),

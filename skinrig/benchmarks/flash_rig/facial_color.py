@@ -7,13 +7,13 @@ import cv2
 import numpy as np
 from scipy import fft, ndimage
 
-from model.facial_color import HemoglobinRig, blood_errors, disc_statistics, histogram_matching
+from model.facial_color import HemoglobinRig, disc_statistics, histogram_matching, prediction_errors
 from rigsim import subject
 from skinrig.arrays import BoolArray, Float32Array, FloatArray
 from skinrig.benchmarks.measurement import processor_seconds
 from skinrig.benchmarks.resampling import median_error
 from skinrig.benchmarks.results import Knobs
-from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 
 PREDICTED_STATES = ("smile", "anger", "fear", "disgust", "exercise", "alcohol")
 """States that are predicted."""
@@ -29,7 +29,7 @@ CROP_SIDES_PX = {16: 256, 32: 160, 64: 96}
 """Sides of the crops on which scipy.ndimage.convolve is timed; its work goes with the pixels."""
 
 
-def rig(stage: Stage) -> None:
+def rig(stage: BenchmarkStage) -> None:
     """Predict states whose vessels dilated; then time discs of 2048 x 2048 beside libraries."""
     rng = np.random.default_rng(0)
     face = subject.make_subject("III", seed=3, size=96 if stage.toy else 512)
@@ -41,7 +41,9 @@ def rig(stage: Stage) -> None:
         timing, _ = stage.time(lambda: predict(names[0]), memory=False)
         left = []
         for name in names:
-            found = blood_errors.compare(predict(name), truths[name], neutral, valid=covered)
+            found = prediction_errors.compare_prediction(
+                predict(name), truths[name], neutral, valid=covered
+            )
             left.append(100.0 * found.predicted / found.neutral_kept)
         stage.add({"misaligned_px": 0} | knobs, timing, median_error(left, rng=rng))
 
@@ -55,7 +57,10 @@ def rig(stage: Stage) -> None:
         )
 
     def gained(name: str) -> FloatArray:
-        return blood_errors.compare(neutral, truths[name], neutral, valid=covered).gain * neutral
+        return (
+            prediction_errors.compare_prediction(neutral, truths[name], neutral, valid=covered).gain
+            * neutral
+        )
 
     add({"method": "neutral map kept"}, lambda name: neutral)
     add({"method": "one gain"}, gained)
@@ -85,10 +90,12 @@ def rig(stage: Stage) -> None:
             ),
         )
     if not stage.toy:
-        stage.limits = _round_trip(neutral, covered) | _digits(rng) | _speed(rng)
+        stage.limits = (
+            _round_trip(neutral, covered) | _compare_precision(rng) | _time_statistics(rng)
+        )
 
 
-def _round_trip(neutral: Float32Array, covered: BoolArray) -> Findings:
+def _round_trip(neutral: Float32Array, covered: BoolArray) -> LimitValues:
     """Fit maps that eq. (6) made and make them again."""
     exact = neutral.astype(np.float64)
     states = {"first": 1.3 * exact + 0.004, "second": 0.7 * exact - 0.001}
@@ -100,7 +107,7 @@ def _round_trip(neutral: Float32Array, covered: BoolArray) -> Findings:
     return {"round_trip": float(error.max())}
 
 
-def _digits(rng: np.random.Generator) -> Findings:
+def _compare_precision(rng: np.random.Generator) -> LimitValues:
     """Compare deviations of a nearly constant map with two passes in extended precision."""
     side, radius = 256, 32
     exact = 0.3 + 1e-5 * rng.standard_normal((side, side))
@@ -111,7 +118,7 @@ def _digits(rng: np.random.Generator) -> Findings:
         inside = (y - row) ** 2 + (x - column) ** 2 <= radius**2
         values = exact[inside].astype(np.longdouble)
         truth.append(float(np.sqrt(np.mean((values - values.mean()) ** 2))))
-    limits: Findings = {}
+    limits: LimitValues = {}
     for kind, bound in (("float64", 1e-5), ("float32", 1e-3)):
         found = disc_statistics.measure(exact.astype(kind), radius).deviation[tuple(places.T)]
         worst = float(np.abs(found / truth - 1.0).max())
@@ -119,7 +126,7 @@ def _digits(rng: np.random.Generator) -> Findings:
     return limits
 
 
-def _speed(rng: np.random.Generator) -> Findings:
+def _time_statistics(rng: np.random.Generator) -> LimitValues:
     """Time mean and deviation of 2048 x 2048 in discs beside three libraries.
 
     The libraries are spared the border: dividing by the part of a disc within the map would be a
@@ -128,14 +135,14 @@ def _speed(rng: np.random.Generator) -> Findings:
     """
     white = rng.standard_normal((FULL_SIDE_PX, FULL_SIDE_PX), np.float32)
     h = np.asarray(0.03 + 0.02 * ndimage.gaussian_filter(white, 2.0), np.float32)
-    limits: Findings = {}
+    limits: LimitValues = {}
     for radius in DISC_RADII_PX:
         kernel = disc(radius)
         crop = np.ascontiguousarray(h[: CROP_SIDES_PX[radius], : CROP_SIDES_PX[radius]])
         ways: list[tuple[int, Callable[[], object]]] = [
             (PARALLEL_CORES, lambda: disc_statistics.measure(h, radius)),
-            (1, lambda: by_opencv(h, kernel)),
-            (PARALLEL_CORES, lambda: by_fft(h, kernel)),
+            (1, lambda: disc_statistics_opencv(h, kernel)),
+            (PARALLEL_CORES, lambda: disc_statistics_fft(h, kernel)),
         ]
         for _, way in ways:
             way()
@@ -143,7 +150,7 @@ def _speed(rng: np.random.Generator) -> Findings:
         for _ in range(N_TIMING_ROUNDS):
             for index, (cores, way) in enumerate(ways):
                 least[index] = min(least[index], processor_seconds(way) / cores)
-        convolve_s = processor_seconds(lambda: by_convolve(crop, kernel))
+        convolve_s = processor_seconds(lambda: disc_statistics_convolve(crop, kernel))
         convolve_s *= h.size / crop.size
         ours_s, opencv_s, fft_s = least
         limits |= {
@@ -161,19 +168,21 @@ def disc(radius_px: int) -> Float32Array:
     return np.asarray(inside / inside.sum(), np.float32)
 
 
-def by_convolve(h: Float32Array, kernel: Float32Array) -> tuple[FloatArray, FloatArray]:
+def disc_statistics_convolve(
+    h: Float32Array, kernel: Float32Array
+) -> tuple[FloatArray, FloatArray]:
     """Return mean and deviation as eq. (1) is written, by scipy.ndimage.convolve."""
     mean = ndimage.convolve(h, kernel)
     return mean, np.sqrt(np.maximum(ndimage.convolve(h * h, kernel) - mean * mean, 0.0))
 
 
-def by_opencv(h: Float32Array, kernel: Float32Array) -> tuple[FloatArray, FloatArray]:
+def disc_statistics_opencv(h: Float32Array, kernel: Float32Array) -> tuple[FloatArray, FloatArray]:
     """Return mean and deviation as eq. (1) is written, by cv2.filter2D."""
     mean = cv2.filter2D(h, -1, kernel)
     return mean, np.sqrt(np.maximum(cv2.filter2D(h * h, -1, kernel) - mean * mean, 0.0))
 
 
-def by_fft(h: Float32Array, kernel: Float32Array) -> tuple[FloatArray, FloatArray]:
+def disc_statistics_fft(h: Float32Array, kernel: Float32Array) -> tuple[FloatArray, FloatArray]:
     """Return mean and deviation as eq. (1) is written, by real float32 transforms."""
     side = kernel.shape[0]
     shape = [fft.next_fast_len(n + side - 1, real=True) for n in h.shape]

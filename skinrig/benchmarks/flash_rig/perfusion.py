@@ -7,19 +7,22 @@ import numpy as np
 from scipy.optimize import OptimizeWarning, curve_fit
 
 from capture.plan.multiplexed import multiplexed_plan
-from capture.plan.phases import phases
+from capture.plan.phases import phase_coverage
 from capture.rig import load_rig
 from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction.facial_color.perfusion_curves import TRANSITION_FALSE_ALARM_RATE, transition
+from reconstruction.facial_color.perfusion_curves import (
+    TRANSITION_FALSE_ALARM_RATE,
+    find_transition,
+)
 from reconstruction.facial_color.perfusion_fit import RelaxationFit, fit_cycle
 from rigsim.subject.perfusion_course import PromptedCourse
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.flash_rig.efficiency import differences
+from skinrig.benchmarks.flash_rig.efficiency import differentiate
 from skinrig.benchmarks.measurement import processor_seconds
-from skinrig.benchmarks.resampling import rms_of_draws
-from skinrig.benchmarks.results import BandError
-from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.benchmarks.resampling import gaussian_rms
+from skinrig.benchmarks.results import ErrorEstimate
+from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 PROMPT_S = 5.0
@@ -32,7 +35,7 @@ BLOOD_CHANGES = (0.0065, -0.002, 0.001, 0.004, 0.009)
 
 
 @dataclass(frozen=True, slots=True)
-class Train:
+class ShotSequence:
     """Shots of a sequence."""
 
     captures: int
@@ -53,7 +56,7 @@ class Train:
             reaction_spread_s=0.0,
         )
         for number in range(40):
-            course.tell(PROMPT_S * number, "smile" if number % 2 == 0 else "neutral")
+            course.prompt(PROMPT_S * number, "smile" if number % 2 == 0 else "neutral")
         settled_s = 10 * CYCLE_S
         return np.array([course.level(settled_s + phase) for phase in self.phase_s])
 
@@ -64,7 +67,7 @@ class Train:
         clean = REST_BLOOD + np.outer(BLOOD_CHANGES, self.levels(constant_s))
         return np.asarray(clean + noise * rng.standard_normal(clean.shape))
 
-    def bound_s(self) -> float:
+    def time_constant_bound_s(self) -> float:
         """Return the Cramér-Rao bound of the time constant, s; delay and levels unknown too."""
         step = 1e-4
         slope = (self.levels(TIME_CONSTANT_S + step) - self.levels(TIME_CONSTANT_S - step)) / (
@@ -106,11 +109,11 @@ def scipy_fit(phase_s: Float64Array, value: Float64Array) -> tuple[float, float]
     return float(found[3]), float(np.sqrt(covariance[3, 3]))
 
 
-def curves(stage: Stage) -> None:
+def curves(stage: BenchmarkStage) -> None:
     """Fit five places: number of shots, together or each alone, and scipy's fit beside it."""
-    trains = [Train(22, 5.5), Train(44, 10.25)]
+    trains = [ShotSequence(22, 5.5), ShotSequence(44, 10.25)]
     if not stage.toy:
-        trains = [Train(11, 5.5), *trains, Train(88, 10.25)]
+        trains = [ShotSequence(11, 5.5), *trains, ShotSequence(88, 10.25)]
     runs = 3 if stage.toy else 30
     for train in trains:
         phase = train.phase_s
@@ -125,7 +128,9 @@ def curves(stage: Stage) -> None:
                 return fit_cycle(phase, places, cycle_s=CYCLE_S).time_constant_s
 
             off = np.array([fitted_s(values) for values in draws]) - TIME_CONSTANT_S
-            outcome = rms_of_draws(off, bound=train.bound_s() if way == "five places" else None)
+            outcome = gaussian_rms(
+                off, bound=train.time_constant_bound_s() if way == "five places" else None
+            )
             timing, _ = stage.time(lambda: fitted_s(draws[0]))
             knobs = {"captures": train.captures, "every s": train.shot_period_s, "fit": way}
             stage.add(knobs, timing, outcome)
@@ -144,7 +149,7 @@ def noise_by_band() -> dict[str, float]:
     for name, band in MELANIN_BANDS.items():
         at = np.array([band.melanin, band.hemoglobin])
         color = table.lookup(*at)
-        slopes = differences(lambda p: table.lookup(*p).reshape(3), at)
+        slopes = differentiate(lambda p: table.lookup(*p).reshape(3), at)
         # shot noise: the variance goes with the light
         information = slopes.T @ (slopes / color.reshape(3, 1))
         found[name] = float(np.sqrt(np.linalg.inv(information)[1, 1]))
@@ -152,27 +157,31 @@ def noise_by_band() -> dict[str, float]:
     return {name: value / least for name, value in found.items()}
 
 
-def _on_skin(noisier: float, runs: int) -> BandError:
+def _on_skin(noise_factor: float, runs: int) -> ErrorEstimate:
     """Return the error of five places in 44 captures, with so many times the noise."""
-    train, rng = Train(44, 10.25), np.random.default_rng(0)
+    train, rng = ShotSequence(44, 10.25), np.random.default_rng(0)
     found = []
     for _ in range(runs):
-        values = train.draw(TIME_CONSTANT_S, rng, noisier * BLOOD_NOISE)
+        values = train.draw(TIME_CONSTANT_S, rng, noise_factor * BLOOD_NOISE)
         found.append(fit_cycle(train.phase_s, values, cycle_s=CYCLE_S).time_constant_s)
-    return rms_of_draws(np.array(found) - TIME_CONSTANT_S, bound=noisier * train.bound_s())
+    return gaussian_rms(
+        np.array(found) - TIME_CONSTANT_S, bound=noise_factor * train.time_constant_bound_s()
+    )
 
 
-def _limits(stage: Stage, runs: int) -> Findings:
+def _limits(stage: BenchmarkStage, runs: int) -> LimitValues:
     rig = load_rig("flash")
-    half, quarter = (phases(multiplexed_plan(rig, shot_period_s=s)) for s in ("5.5", "10.25"))
+    half, quarter = (
+        phase_coverage(multiplexed_plan(rig, shot_period_s=s)) for s in ("5.5", "10.25")
+    )
     rng = np.random.default_rng(1)
-    coarse, fine = Train(22, 5.5), Train(44, 10.25)
+    coarse, fine = ShotSequence(22, 5.5), ShotSequence(44, 10.25)
     quick: list[RelaxationFit] = []
     alarms = held = 0
     for _ in range(runs):
         values = coarse.draw(0.01, rng)
         quick.append(fit_cycle(coarse.phase_s, values, cycle_s=CYCLE_S))
-        found = transition(coarse.phase_s, values[-1], cycle_s=CYCLE_S)
+        found = find_transition(coarse.phase_s, values[-1], cycle_s=CYCLE_S)
         alarms += found.seen
         slow = fit_cycle(fine.phase_s, fine.draw(TIME_CONSTANT_S, rng), cycle_s=CYCLE_S)
         held += slow.interval_s[0] <= TIME_CONSTANT_S <= slow.interval_s[1]
@@ -189,7 +198,7 @@ def _limits(stage: Stage, runs: int) -> Findings:
         "quick": max(fit.interval_s[1] for fit in quick),
         "alarms": (alarms / runs, TRANSITION_FALSE_ALARM_RATE + beyond),
         "held": (held / runs, 0.95 - beyond),
-        "over_bound": (five / fine.bound_s(), 1.0 + 3 / float(np.sqrt(2 * runs))),
+        "over_bound": (five / fine.time_constant_bound_s(), 1.0 + 3 / float(np.sqrt(2 * runs))),
         "over_scipy": five / by_scipy,
         "seconds": spent_s,
     }

@@ -4,24 +4,24 @@ from functools import partial
 
 import numpy as np
 
-from capture.calibration.fiber.spot_photometry import Shot, shot
+from capture.calibration.fiber.spot_photometry import SpotImage, make_spot_image
 from capture.calibration.led_sphere.survey import survey_sphere
-from capture.plan.gradient import BALL_SERIES, EXPOSURE_S
+from capture.plan.gradient import BALL_SERIES, PATTERN_EXPOSURE_S
 from capture.raw import RawFrame
 from capture.rig import Rig, load_rig
 from rigsim.as_built.sphere import build_sphere
 from rigsim.boxes.gradient_sphere import PatternLight
 from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.sensor import vignetting_map
-from skinrig.benchmarks.measurement import once
-from skinrig.benchmarks.resampling import drawn_median
+from skinrig.benchmarks.measurement import measure_once
+from skinrig.benchmarks.resampling import bootstrap_median
 from skinrig.benchmarks.results import Knobs
-from skinrig.benchmarks.stage import Stage
+from skinrig.benchmarks.stage import BenchmarkStage
 
 SPHERE_SEED = 7
 
 
-def sphere_lights(stage: Stage) -> None:
+def sphere_lights(stage: BenchmarkStage) -> None:
     """Survey a simulated sphere with two and four readings of the analyser, and large pixels."""
     for width_px in (192,) if stage.toy else (512, 1024):
         rig = load_rig("gradient").resized(width_px)
@@ -34,8 +34,8 @@ def sphere_lights(stage: Stage) -> None:
 
             # nine tenths of a small survey's seconds are the LEDs': it is made once
             survey = partial(survey_sphere, part, rig)
-            timing, result = once(survey) if stage.toy else stage.time(survey)
-            lights, films = result.lights, result.films
+            timing, result = measure_once(survey) if stage.toy else stage.time(survey)
+            lights, films = result.lights, result.polarizers
             good = lights.valid & ~lights.dead
             place = sphere.position_mm
             true = sphere.intensity / np.sum(place**2, axis=1)
@@ -44,7 +44,7 @@ def sphere_lights(stage: Stage) -> None:
             # the median of a normal distribution's size is 0.674 of its deviation
             bound = float(0.674 * np.median(stated))
             knobs: Knobs = {"pixels": width_px, "readings": " ".join(map(str, readings))}
-            outcome = stage.add(knobs, timing, drawn_median(error, bound, draws=400))
+            outcome = stage.add(knobs, timing, bootstrap_median(error, bound, draws=400))
     aim = place / np.linalg.norm(place, axis=1, keepdims=True)
     off = np.degrees(np.linalg.norm(lights.directions - aim, axis=1))
     zero = np.degrees(films.misalignment_rad) - scene.films.analyser_zero_deg
@@ -55,23 +55,30 @@ def sphere_lights(stage: Stage) -> None:
     }
 
 
-def _shots(scene: GradientScene, rig: Rig) -> list[Shot]:
+def _shots(scene: GradientScene, rig: Rig) -> list[SpotImage]:
     view = rig.views[0]
     sensor = scene.sensor()
     flat = vignetting_map(sensor.vignetting, view.height_px, view.width_px)
-    shots: list[Shot] = []
+    shots: list[SpotImage] = []
     for reading, levels in BALL_SERIES.items():
         for level in levels:
-            light = PatternLight("full", level, 0.0, EXPOSURE_S, float(reading))
-            cfa = scene.exposure(view.name, pops=[light], exposure_s=EXPOSURE_S, seed=len(shots))
+            light = PatternLight("full", level, 0.0, PATTERN_EXPOSURE_S, float(reading))
+            cfa = scene.exposure(
+                view.name, pops=[light], exposure_s=PATTERN_EXPOSURE_S, seed=len(shots)
+            )
             frame = RawFrame(
                 cfa=cfa,
                 pattern=view.cfa,
                 black=(float(view.black_level),),
                 white=view.white_level,
-                noise_profile=sensor.noise_profile(EXPOSURE_S),
+                noise_profile=sensor.noise_profile(PATTERN_EXPOSURE_S),
             )
             shots.append(
-                shot(frame, amount_s=EXPOSURE_S * level, reading_deg=float(reading), flat=flat)
+                make_spot_image(
+                    frame,
+                    amount_s=PATTERN_EXPOSURE_S * level,
+                    reading_deg=float(reading),
+                    flat=flat,
+                )
             )
     return shots

@@ -12,17 +12,17 @@ from capture.rig import Rig, load_rig
 from model.metrics import angular_error_rad
 from reconstruction.gradient_normals import SensorNoise, SphereLights, from_patterns
 from reconstruction.normal_maps import NormalMaps
-from rigsim.as_built.sphere import BuiltSphere, nominal_sphere
+from rigsim.as_built.sphere import ActualSphere, nominal_sphere
 from rigsim.scenes.gradient.scene import GradientScene
-from rigsim.scenes.gradient.truth import appearance as ground_truth
+from rigsim.scenes.gradient.truth import gradient_truth as ground_truth
 from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.subject.pigment import MELANIN_PRESETS
 from rigsim.world.taped_skin import GripState
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds
-from skinrig.benchmarks.resampling import drawn_again
-from skinrig.benchmarks.results import BandError, Knobs
-from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.benchmarks.resampling import bootstrap_interval
+from skinrig.benchmarks.results import ErrorEstimate, Knobs
+from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 from skinrig.evaluating.skin_bands import MelaninBand
 
 Images = Mapping[tuple[str, str], FloatArray]
@@ -40,12 +40,12 @@ IGNORED_BORDER_PX = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Patch:
+class SkinPatch:
     """Skin in the gradient rig, without noise."""
 
     images: dict[tuple[str, str], Float32Array]
     """Fractions of full scale."""
-    seen: Float64Array
+    visible: Float64Array
     """Normals at the lens' resolution, (H, W, 3)."""
     sharp: Float64Array
     lights: SphereLights
@@ -54,7 +54,7 @@ class Patch:
     noise: SensorNoise
 
 
-def lights_of(sphere: BuiltSphere) -> SphereLights:
+def ideal_light_calibration(sphere: ActualSphere) -> SphereLights:
     """Return a sphere's lights as a perfect calibration would."""
     far = np.linalg.norm(sphere.position_mm, axis=1)
     ways = sphere.position_mm / far[:, None]
@@ -81,7 +81,7 @@ def pixel_geometry(rig: Rig) -> dict[str, Any]:
     return {"points_mm": points, "view": way / np.linalg.norm(way, axis=-1, keepdims=True)}
 
 
-def skin_patch(side: int, *, smooth: bool) -> Patch:
+def skin_patch(side: int, *, smooth: bool) -> SkinPatch:
     """Picture a patch of cheek, as it is or smoothed, by all sixteen conditions."""
     rig = load_rig("gradient").cropped(side)
     size_mm = max(0.006 * side + 0.8, 1.2)
@@ -101,17 +101,19 @@ def skin_patch(side: int, *, smooth: bool) -> Patch:
     view = rig.views[0]
     # as fractions of full scale; a full well is one
     noise = SensorNoise(1.0 / view.full_well_e, (view.read_noise_e / view.full_well_e) ** 2)
-    return Patch(
+    return SkinPatch(
         images,
         np.asarray(truth["normals_seen_a000_n0"].values, np.float64),
         np.asarray(truth["normals"].values, np.float64),
-        lights_of(sphere),
+        ideal_light_calibration(sphere),
         pixel_geometry(rig),
         noise,
     )
 
 
-def exposed(patch: Patch, rng: np.random.Generator) -> dict[tuple[str, str], Float32Array]:
+def add_sensor_noise(
+    patch: SkinPatch, rng: np.random.Generator
+) -> dict[tuple[str, str], Float32Array]:
     """Return the pictures with the sensor's noise."""
     read, gain = patch.noise.read_variance, patch.noise.gain
     return {
@@ -122,7 +124,7 @@ def exposed(patch: Patch, rng: np.random.Generator) -> dict[tuple[str, str], Flo
     }
 
 
-def vectors_alone(images: Images) -> Float64Array:
+def normals_without_corrections(images: Images) -> Float64Array:
     """Return normals by Ma et al.'s formula in plain NumPy, with complements, (H, W, 3)."""
     s = {
         name: images[name, "parallel"].astype(np.float64) - images[name, "crossed"]
@@ -133,26 +135,26 @@ def vectors_alone(images: Images) -> Float64Array:
     return np.asarray(n / np.linalg.norm(n, axis=-1, keepdims=True))
 
 
-def _judged(normals: FloatArray, valid: BoolArray, truth: Float64Array) -> BandError:
+def _evaluate(normals: FloatArray, valid: BoolArray, truth: Float64Array) -> ErrorEstimate:
     inner = (slice(IGNORED_BORDER_PX, -IGNORED_BORDER_PX),) * 2
     good = valid[inner]
     error = np.degrees(angular_error_rad(normals[inner][good], truth[inner][good]))
     # neighbours share their error: blocks of lines are drawn, not pixels
     parts = [part.mean() for part in np.array_split(error, 64) if part.size]
-    return BandError(float(error.mean()), drawn_again(parts, np.mean))
+    return ErrorEstimate(float(error.mean()), bootstrap_interval(parts, np.mean))
 
 
-def normals(stage: Stage) -> None:
+def normals(stage: BenchmarkStage) -> None:
     """Compute the normals of a patch of skin: patterns, corrections, filters; then all pixels."""
     rng = np.random.default_rng(0)
     side = 40 if stage.toy else 192
     patch = skin_patch(side, smooth=False)
-    noisy = exposed(patch, rng)
+    noisy = add_sensor_noise(patch, rng)
     corrections = {"lights": patch.lights, **patch.geometry}
 
     def add(knobs: Knobs, images: Images, **options: Any) -> float:
-        def error(found: NormalMaps) -> BandError:
-            outcome = _judged(found.normals, found.valid, patch.seen)
+        def error(found: NormalMaps) -> ErrorEstimate:
+            outcome = _evaluate(found.normals, found.valid, patch.visible)
             if "variance" not in options or "smoothing" in options:
                 return outcome
             # weighted least squares reaches it; the mean of a Rayleigh error over its RMS is 0.886
@@ -185,12 +187,12 @@ def normals(stage: Stage) -> None:
     add(knobs, noisy, variance=patch.noise, smoothing="wiener")
     add({"patterns": "16", "noise": "none"}, patch.images, **corrections)
     add({"patterns": "16", "noise": "none", "lights": "ideal"}, patch.images)
-    stage.on_each_skin(lambda band: _on_skin(patch, band))
+    stage.measure_bands(lambda band: _on_skin(patch, band))
     if not stage.toy:
         stage.limits = _limits(worst, rng)
 
 
-def _on_skin(patch: Patch, band: MelaninBand) -> BandError:
+def _on_skin(patch: SkinPatch, band: MelaninBand) -> ErrorEstimate:
     """Return the error on the same relief with a band's pigment: 16 patterns, all corrections.
 
     Crossed pictures hold half of the diffuse light and no specular; parallel ones hold the other
@@ -204,30 +206,30 @@ def _on_skin(patch: Patch, band: MelaninBand) -> BandError:
     }
     seen = replace(patch, images=images)
     found = from_patterns(
-        exposed(seen, np.random.default_rng(0)),
+        add_sensor_noise(seen, np.random.default_rng(0)),
         lights=patch.lights,
         variance=patch.noise,
         smoothing="wiener",
         **patch.geometry,
     )
-    return _judged(found.normals, found.valid, patch.seen)
+    return _evaluate(found.normals, found.valid, patch.visible)
 
 
-def _limits(worst: float, rng: np.random.Generator) -> Findings:
+def _limits(worst: float, rng: np.random.Generator) -> LimitValues:
     smooth = skin_patch(128, smooth=True)
     found = from_patterns(smooth.images, lights=smooth.lights, **smooth.geometry)
-    against = {"lens' resolution": smooth.seen, "as it is": smooth.sharp}
+    against = {"lens' resolution": smooth.visible, "as it is": smooth.sharp}
     big = {
         key: np.tile(image, (16, 16)).astype(np.float32)
-        for key, image in exposed(smooth, rng).items()
+        for key, image in add_sensor_noise(smooth, rng).items()
     }
     options: dict[str, Any] = {"lights": smooth.lights, "alpha": 0.26, "variance": smooth.noise}
     ours_s = processor_seconds(lambda: from_patterns(big, **options), 3) / LIMIT_CORES
     with threadpool_limits(1):
-        peer_s = processor_seconds(lambda: vectors_alone(big))
+        peer_s = processor_seconds(lambda: normals_without_corrections(big))
     return {
         **{
-            ("clean", name): _judged(found.normals, found.valid, true).error
+            ("clean", name): _evaluate(found.normals, found.valid, true).error
             for name, true in against.items()
         },
         "noisy": worst,

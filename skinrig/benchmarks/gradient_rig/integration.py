@@ -8,15 +8,20 @@ from numpy.typing import NDArray
 from scipy import fft, sparse
 from scipy.sparse.linalg import splu
 
-from reconstruction.normal_integration import Settings, integrate, integrate_map, slope_fields
-from reconstruction.normal_integration.discontinuities import integrate_broken
+from reconstruction.normal_integration import (
+    IntegrationSettings,
+    integrate,
+    integrate_map,
+    slope_fields,
+)
+from reconstruction.normal_integration.discontinuities import integrate_with_discontinuities
 from reconstruction.normal_integration.height_filters import high_pass
-from reconstruction.normal_integration.relief_errors import expected_rms
+from reconstruction.normal_integration.relief_errors import expected_height_rms
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
-from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds, spent
-from skinrig.benchmarks.resampling import drawn_rms, squares
-from skinrig.benchmarks.results import BandError, Knobs
-from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.benchmarks.measurement import LIMIT_CORES, measure_processor_time, processor_seconds
+from skinrig.benchmarks.resampling import bootstrap_rms, split_squares
+from skinrig.benchmarks.results import ErrorEstimate, Knobs
+from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 
 PIXEL_UM = 6.0
 CUTOFF_UM = 1000.0
@@ -95,7 +100,7 @@ def sparse_direct(normals: Float64Array, valid: BoolArray, *, pixel: float) -> F
     return height
 
 
-def integration(stage: Stage) -> None:
+def integration(stage: BenchmarkStage) -> None:
     """Integrate a relief's normals: tolerance, order, mask, noise, peers; then at full size."""
     rng = np.random.default_rng(0)
     side = 64 if stage.toy else 512
@@ -114,15 +119,15 @@ def integration(stage: Stage) -> None:
         bound = None
         if normals is noisy:
             slope = NORMAL_NOISE_RAD / np.sqrt(2.0)
-            bound = expected_rms(normals.shape[:2], slope, pixel=PIXEL_UM, cutoff=CUTOFF_UM)
+            bound = expected_height_rms(normals.shape[:2], slope, pixel=PIXEL_UM, cutoff=CUTOFF_UM)
 
-        def error(height: FloatArray) -> BandError:
+        def error(height: FloatArray) -> ErrorEstimate:
             off = _high_passed(height - truth, valid)
-            places = [at for at in squares(len(off)) if valid[at].any()]
+            places = [at for at in split_squares(len(off)) if valid[at].any()]
             tiles = [float(np.mean(off[at][valid[at]] ** 2)) for at in places]
-            low, high = drawn_rms(tiles, rng=rng).error_interval
+            low, high = bootstrap_rms(tiles, rng=rng).error_interval
             rms = float(np.sqrt(np.mean(off[valid] ** 2)))
-            return BandError(rms, (min(low, rms), max(high, rms)), bound)
+            return ErrorEstimate(rms, (min(low, rms), max(high, rms)), bound)
 
         about: Knobs = {
             "noise": "1.5 deg" if normals is noisy else "none",
@@ -136,14 +141,14 @@ def integration(stage: Stage) -> None:
 
     for normals in (clean, noisy):
         for tolerance in (1e-2, 1e-5) if stage.toy else (1e-1, 1e-2, 1e-3, 1e-5, 1e-7):
-            solve = ours(disc, settings=Settings(tolerance=tolerance))
+            solve = ours(disc, settings=IntegrationSettings(tolerance=tolerance))
             add("multigrid", solve, normals, disc, tolerance=tolerance)
-        add("multigrid", ours(disc, settings=Settings(order=2)), normals, disc, order=2)
+        add("multigrid", ours(disc, settings=IntegrationSettings(order=2)), normals, disc, order=2)
         add("cosines", ours(whole), normals, whole)
         by_fourier = partial(frankot_chellappa, pixel=PIXEL_UM)
         add("Frankot-Chellappa", by_fourier, normals, whole)
     denoised = ours(disc, stderr_rad=NORMAL_NOISE_RAD, denoise=1.0)
-    bilateral = partial(integrate_broken, pixel=PIXEL_UM, valid=disc)
+    bilateral = partial(integrate_with_discontinuities, pixel=PIXEL_UM, valid=disc)
     direct = partial(sparse_direct, valid=disc, pixel=PIXEL_UM)
     add("multigrid", denoised, noisy, disc, denoise=1)
     add("bilateral", lambda n: bilateral(n).height, noisy, disc)
@@ -165,7 +170,7 @@ def _disc(side: int) -> BoolArray:
     return np.asarray((x * x + y * y < (0.47 * side) ** 2) & ~holes)
 
 
-def _full_size(rng: np.random.Generator) -> Findings:
+def _full_size(rng: np.random.Generator) -> LimitValues:
     """Measure 2048 x 2048 with a mask, and 1024 x 1024 with jumps."""
     _, normals = relief(2048, rng=rng)
     noisy = (normals + NORMAL_NOISE_RAD / np.sqrt(2.0) * rng.standard_normal(normals.shape)).astype(
@@ -173,14 +178,16 @@ def _full_size(rng: np.random.Generator) -> Findings:
     )
     disc = _disc(2048)
     integrate_map(noisy[:64, :64], method="multigrid")
-    spent_s, found = spent(lambda: integrate_map(noisy, pixel=PIXEL_UM, valid=disc), 3)
+    spent_s, found = measure_processor_time(
+        lambda: integrate_map(noisy, pixel=PIXEL_UM, valid=disc), 3
+    )
     small = np.ascontiguousarray(noisy[:1024, :1024])
-    integrate_broken(small[:64, :64])
-    broken_s = processor_seconds(lambda: integrate_broken(small, pixel=PIXEL_UM), 3)
+    integrate_with_discontinuities(small[:64, :64])
+    broken_s = processor_seconds(lambda: integrate_with_discontinuities(small, pixel=PIXEL_UM), 3)
     part = _disc(512)
     flat = np.asarray(noisy[:512, :512], float)
-    ours_s, mine = spent(lambda: integrate(flat, pixel=PIXEL_UM, valid=part), 3)
-    peer_s, theirs = spent(lambda: sparse_direct(flat, part, pixel=PIXEL_UM))
+    ours_s, mine = measure_processor_time(lambda: integrate(flat, pixel=PIXEL_UM, valid=part), 3)
+    peer_s, theirs = measure_processor_time(lambda: sparse_direct(flat, part, pixel=PIXEL_UM))
     return {
         "seconds": spent_s / LIMIT_CORES,
         "residual": found.convergence.residual,

@@ -18,8 +18,8 @@ from reconstruction.normal_histogram import statistics as normal_statistics
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds
 from skinrig.benchmarks.resampling import mean_error
-from skinrig.benchmarks.results import BandError, Knobs
-from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.benchmarks.results import ErrorEstimate, Knobs
+from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 
 PIXEL_UM = 6.0
 STRETCH_RATIO = 0.88
@@ -48,7 +48,7 @@ def relief(side: int, *, rng: np.random.Generator) -> Float64Array:
     return np.asarray(field(2.0) + 5.0 * field(6.0) - 12.0 * furrows + 8.0 * field(25.0))
 
 
-def strained(height: Float64Array, *, rng: np.random.Generator) -> Float64Array:
+def strain_relief(height: Float64Array, *, rng: np.random.Generator) -> Float64Array:
     """Return a relief that no kernel makes: furrows deepen more than ridges rise, with noise."""
     about = height - height.mean()
     deeper = 1.12 * height - 0.02 * about**2 * (about < 0)
@@ -82,7 +82,7 @@ def _histogram(height: Float64Array) -> Float64Array:
 _fitted = partial(kernel_fit.fit_kernel, stretch=STRETCH_RATIO, axis="x", pixel_um=PIXEL_UM)
 
 
-def _spent(call: Callable[[], object], repeats: int = 1) -> float:
+def _minimum_processor_s(call: Callable[[], object], repeats: int = 1) -> float:
     """Return the least processor time of some calls on one thread, s.
 
     Of two threads the one that is done first spins until the other is, which counts as its time:
@@ -96,12 +96,12 @@ def _spent(call: Callable[[], object], repeats: int = 1) -> float:
         numba.set_num_threads(threads)
 
 
-def search(stage: Stage) -> None:
+def search(stage: BenchmarkStage) -> None:
     """Fit kernels: pixels used, search and its first sample; then 2000 x 2000 beside NumPy."""
     rng = np.random.default_rng(0)
     side = 64 if stage.toy else 256
     height = relief(side, rng=rng)
-    target = _histogram(strained(height, rng=rng))
+    target = _histogram(strain_relief(height, rng=rng))
     alphas, sigmas = (ALPHA_GRID[::50], SIGMAS_UM[::20]) if stage.toy else (ALPHA_GRID, SIGMAS_UM)
 
     def fit(
@@ -122,9 +122,9 @@ def search(stage: Stage) -> None:
     if not stage.toy:
         ways += [("hierarchical", side, 16_384, 1), ("exhaustive", side, 2, 10)]
 
-    def error(found: kernel_outcome.KernelFit) -> BandError:
+    def error(found: kernel_outcome.KernelFit) -> ErrorEstimate:
         there = whole.distances(found.sigma_um, np.array([found.alpha]))
-        return BandError.around(float(there[0]) - best.distance, 0.0)
+        return ErrorEstimate.symmetric(float(there[0]) - best.distance, 0.0)
 
     for way, part, first, thin in ways:
         only: Knobs = {"first sample": first} if way == "hierarchical" else {}
@@ -138,21 +138,23 @@ def search(stage: Stage) -> None:
 def _grid_of(
     height: Float64Array, target: Float64Array, sigmas_um: Float64Array = SIGMAS_UM
 ) -> kernel_search.KernelGrid:
-    whole = neutral_relief.relief_of(height, stretch=STRETCH_RATIO, axis="x", pixel_um=PIXEL_UM)
-    buckets = kernel_search.Buckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
+    whole = neutral_relief.prepare_relief(
+        height, stretch=STRETCH_RATIO, axis="x", pixel_um=PIXEL_UM
+    )
+    buckets = kernel_search.TargetBuckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
     return kernel_search.KernelGrid(whole, buckets, ALPHA_GRID, sigmas_um)
 
 
-def _full_size(rng: np.random.Generator) -> Findings:
+def _full_size(rng: np.random.Generator) -> LimitValues:
     """Measure 2000 x 2000: the default search, and the exhaustive ones by some candidates."""
     height = relief(FULL_SIDE_PX, rng=rng)
-    target = _histogram(strained(height, rng=rng))
+    target = _histogram(strain_relief(height, rng=rng))
     few = SIGMAS_UM[[10, 60, 150]]
     whole = _grid_of(height, target, few)
-    ours_s = _spent(lambda: kernel_search.exhaustive(whole))
+    ours_s = _minimum_processor_s(lambda: kernel_search.search_exhaustively(whole))
     ours_s *= SIGMAS_UM.size / few.size
     tried = [(-1.5, 6.0), (-0.2, 31.0), (0.7, 76.0)][:N_PEER_CANDIDATES]
-    peer_s = _spent(lambda: [numpy_distance(height, target, *k) for k in tried])
+    peer_s = _minimum_processor_s(lambda: [numpy_distance(height, target, *k) for k in tried])
     peer_s *= ALPHA_GRID.size * SIGMAS_UM.size / len(tried)
     mismatch = max(
         abs(
@@ -164,11 +166,13 @@ def _full_size(rng: np.random.Generator) -> Findings:
     default_s = []
     for made in ("no kernel", "a kernel"):
         if made == "a kernel":
-            moved = neutral_relief.convolved(height, -0.63, 17.5, axis="x", pixel_um=PIXEL_UM)
+            moved = neutral_relief.convolve_relief(height, -0.63, 17.5, axis="x", pixel_um=PIXEL_UM)
             target = _histogram(np.asarray(moved, np.float64))
 
         run = partial(_fitted, height, target)
-        default_s.append(_spent(run, repeats=2 if made == "no kernel" else 1) / LIMIT_CORES)
+        default_s.append(
+            _minimum_processor_s(run, repeats=2 if made == "no kernel" else 1) / LIMIT_CORES
+        )
     found = run()
     return {
         "seconds": default_s[0],
@@ -180,21 +184,21 @@ def _full_size(rng: np.random.Generator) -> Findings:
     }
 
 
-def histograms(stage: Stage) -> None:
+def histograms(stage: BenchmarkStage) -> None:
     """Make histograms of normals: pixels and buckets; beside numpy.histogram2d."""
     rng = np.random.default_rng(0)
     side = 96 if stage.toy else 1024
     truth_side = 256 if stage.toy else 2048
     truth_map = relief(truth_side, rng=rng)
     for bins in (32, 64) if stage.toy else (16, 32, 64, 128):
-        truth = normal_statistics.measure(truth_map, pixel=PIXEL_UM, bins=bins)
+        truth = normal_statistics.measure_normals(truth_map, pixel=PIXEL_UM, bins=bins)
         for part in (side // 2, side) if stage.toy else (128, 256, 512, 1024):
             patches = [
                 np.ascontiguousarray(truth_map[rows, columns])
                 for rows in (slice(part), slice(-part, None))
                 for columns in (slice(part), slice(-part, None))
             ]
-            measure_patch = partial(normal_statistics.measure, pixel=PIXEL_UM, bins=bins)
+            measure_patch = partial(normal_statistics.measure_normals, pixel=PIXEL_UM, bins=bins)
             timing, _ = stage.time(lambda: measure_patch(patches[0]), memory=part == side)
             off = [
                 normal_histogram.distance(measure_patch(patch).histogram, truth.histogram)
@@ -206,7 +210,7 @@ def histograms(stage: Stage) -> None:
     theirs = partial(numpy_histogram, dx, dy)
     ours = partial(normal_histogram.from_slopes, dx, dy)
     repeats = 1 if stage.toy else 3
-    times = _spent(theirs, repeats) / max(_spent(ours, repeats), 1e-9)
+    times = _minimum_processor_s(theirs, repeats) / max(_minimum_processor_s(ours, repeats), 1e-9)
     stage.limits = {"speed_up": times, "distance": normal_histogram.distance(ours(), theirs())}
     stage.reference_error = float(
         normal_histogram.noise_floor(truth.histogram, truth.effective_samples, 1e12)

@@ -18,21 +18,21 @@ from model.microstructure.convolution import (
     Sampling,
     convolve,
     convolve_tiled,
-    tiles_of,
+    list_tiles,
 )
-from model.microstructure.map_windows import Window
+from model.microstructure.map_windows import MapWindow
 from model.microstructure.mesh_strain import strain
 from model.microstructure.strain_fields import rasterize
 from reconstruction import kernel_fit, normal_histogram
 from reconstruction.kernel_fit import table as kernel_table
 from reconstruction.normal_histogram import relief_slopes
 from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
-from rigsim.skin_patch.stretch import StretchedSkin, deform
+from rigsim.skin_patch.stretch import StretchedSkin, stretch_skin
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
 from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds
 from skinrig.benchmarks.resampling import mean_error
 from skinrig.benchmarks.results import Knobs
-from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 from skinrig.extremes.inputs import sheet_faces
 
 TEXEL_UM = 10.0
@@ -57,16 +57,18 @@ GRADUAL_CHANGE_PER_SIGMA = 0.02
 N_WAVES = 60
 
 
-def slopes_under(height: NDArray[Any], state: StretchedSkin) -> tuple[Float64Array, Float64Array]:
+def strained_slopes(
+    height: NDArray[Any], state: StretchedSkin
+) -> tuple[Float64Array, Float64Array]:
     """Return slopes along and across the jaws of a relief that goes along with the skin."""
     dx, dy, known = relief_slopes.slopes(height, pixel=TEXEL_UM)
     inverse = np.linalg.inv(state.gradient)
     along_x = dx[known] * inverse[0, 0] + dy[known] * inverse[1, 0]
     along_y = dx[known] * inverse[0, 1] + dy[known] * inverse[1, 1]
-    return relief_slopes.turned(along_x, along_y, math.radians(state.angle_deg))
+    return relief_slopes.rotate_components(along_x, along_y, math.radians(state.angle_deg))
 
 
-def fitted_table(
+def fit_kernel_table(
     skins: list[MicroSkin], states: tuple[float, ...], *, every: int = 1
 ) -> KernelTable:
     """Fit a table as from caliper sessions: each state's kernel, then lines through them.
@@ -81,7 +83,7 @@ def fitted_table(
     found = []
     for skin in skins:
         for r in states:
-            settled = deform(skin, stretch=r, angle_deg=0.0, compensation="none")
+            settled = stretch_skin(skin, stretch=r, angle_deg=0.0, compensation="none")
             target = normal_histogram.histogram(
                 settled.height_um, pixel=(TEXEL_UM, TEXEL_UM * settled.stretch_s)
             )
@@ -98,7 +100,7 @@ def fitted_table(
     return kernel_table.fit_table(r, alpha, sigma, source="fitted to settled skin").table
 
 
-def strained_relief(
+def strain_relief(
     skin: MicroSkin, state: StretchedSkin, table: KernelTable, sampling: Sampling
 ) -> Float32Array:
     """Return the relief that a table's kernels make of a neutral one."""
@@ -118,20 +120,20 @@ def strained_relief(
 
 def _slope_errors(made: Float32Array, state: StretchedSkin) -> tuple[float, float]:
     """Return the distance of normals from settled skin's, and |log| of the ratio of variances."""
-    there, ours = slopes_under(state.height_um, state), slopes_under(made, state)
+    there, ours = strained_slopes(state.height_um, state), strained_slopes(made, state)
     distance = normal_histogram.distance(
         normal_histogram.from_slopes(*there), normal_histogram.from_slopes(*ours)
     )
     return distance, abs(math.log(ours[0].var() / there[0].var()))
 
 
-def truth(stage: Stage) -> None:
+def truth(stage: BenchmarkStage) -> None:
     """Judge convolved reliefs by skin whose stiff layer came to rest; then time the convolution."""
     patch = partial(
         make_micro_skin, "forehead", size_mm=0.8 if stage.toy else 2.4, texel_um=TEXEL_UM
     )
     states = (0.82, 0.94, 1.06, 1.18) if stage.toy else FITTED_STRETCHES
-    table = fitted_table([patch(seed=1)], states, every=4 if stage.toy else 1)
+    table = fit_kernel_table([patch(seed=1)], states, every=4 if stage.toy else 1)
     skins = [patch(seed=seed) for seed in ((7, 8) if stage.toy else (7, 8, 9))]
     ways: list[tuple[str, KernelTable | None, Sampling]] = [
         ("none", None, "cubic"),
@@ -142,7 +144,7 @@ def truth(stage: Stage) -> None:
     found: dict[tuple[str, str, str], tuple[float, float]] = {}
     for angle, across in JAW_CONDITIONS[-1:] if stage.toy else JAW_CONDITIONS:
         pairs = [
-            (skin, deform(skin, stretch=r, angle_deg=angle, compensation=across))
+            (skin, stretch_skin(skin, stretch=r, angle_deg=angle, compensation=across))
             for skin in skins
             for r in (EVALUATED_STRETCHES[::3] if stage.toy else EVALUATED_STRETCHES)
         ]
@@ -153,7 +155,7 @@ def truth(stage: Stage) -> None:
                 lambda: [
                     skin.height_um
                     if kernels is None
-                    else strained_relief(skin, state, kernels, sampling)
+                    else strain_relief(skin, state, kernels, sampling)
                     for skin, state in pairs
                 ],
                 repeats=1,
@@ -179,7 +181,9 @@ def truth(stage: Stage) -> None:
     stage.limits |= _full_size()
 
 
-def varying_fields(side: int, rows: int, *, first_row: int = 0) -> tuple[Float32Array, ...]:
+def synthesize_kernel_fields(
+    side: int, rows: int, *, first_row: int = 0
+) -> tuple[Float32Array, ...]:
     """Return axes, strengths and sigmas as a face has them: they turn, blur here, sharpen there.
 
     Parameters
@@ -228,11 +232,11 @@ def numpy_convolve(height: Float32Array, fields: tuple[Float32Array, ...]) -> Fl
     return height
 
 
-def _full_size() -> Findings:
+def _full_size() -> LimitValues:
     """Time 4096 x 4096 beside NumPy on a strip of it, a texture's fields, and tiles of 16K."""
     rng = np.random.default_rng(0)
     height = rng.standard_normal((FULL_SIDE_PX, FULL_SIDE_PX), np.float32)
-    fields = varying_fields(FULL_SIDE_PX, FULL_SIDE_PX)
+    fields = synthesize_kernel_fields(FULL_SIDE_PX, FULL_SIDE_PX)
     own: dict[str, float] = {}
     both: tuple[Sampling, ...] = ("cubic", "linear")
     for sampling in both:
@@ -275,13 +279,15 @@ def _rasterized(side: int) -> Callable[[], object]:
 def _tiles_of_16k() -> tuple[float, float]:
     """Return processor seconds a core for the whole of 16K, by two tiles, and MB held."""
     shape = (TILED_SIDE_PX, TILED_SIDE_PX)
-    count = len(tiles_of(shape, 2048))
+    count = len(list_tiles(shape, 2048))
     chosen = (0, count // 2 + 3)
 
-    def fields_at(window: Window) -> tuple[LineKernels, LineKernels]:
+    def fields_at(window: MapWindow) -> tuple[LineKernels, LineKernels]:
         s, t, alpha_s, sigma_s, alpha_t, sigma_t = (
             np.ascontiguousarray(values[:, window.columns])
-            for values in varying_fields(TILED_SIDE_PX, window.shape[0], first_row=window.top)
+            for values in synthesize_kernel_fields(
+                TILED_SIDE_PX, window.shape[0], first_row=window.top
+            )
         )
         return LineKernels(s, alpha_s, sigma_s), LineKernels(t, alpha_t, sigma_t)
 
@@ -320,9 +326,9 @@ def waves(
     return vectors, np.full(N_WAVES, N_WAVES**-0.5), rng.uniform(0.0, 2.0 * np.pi, N_WAVES)
 
 
-def two_passes_error(
+def measure_two_pass_error(
     *,
-    turn: float,
+    rotation_rad: float,
     growth: float,
     sigma_px: float = 3.0,
     side: int = 160,
@@ -336,7 +342,7 @@ def two_passes_error(
 
     Parameters
     ----------
-    turn, growth : float
+    rotation_rad, growth : float
         Turn of the axes, rad, and largest relative change of sigma, over one sigma.
     sigma_px : float
         Sigma in the middle of the map, px.
@@ -358,7 +364,7 @@ def two_passes_error(
     whole = side + 2 * margin
     y, x = np.mgrid[:whole, :whole].astype(np.float64) - 0.5 * (whole - 1)
     vectors, amplitudes, phases = waves(side, sigma_px, rng=rng)
-    angle = 0.4 + turn / sigma_px * (x * np.cos(0.9) + y * np.sin(0.9))
+    angle = 0.4 + rotation_rad / sigma_px * (x * np.cos(0.9) + y * np.sin(0.9))
     sigma = sigma_px * (1.0 + 0.5 * np.sin(2.0 * growth / sigma_px * (0.9 * x - 0.44 * y)))
     axis_s = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     axis_t = np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
@@ -382,7 +388,7 @@ def two_passes_error(
     return float(np.sqrt(np.mean(off**2) / np.mean(change**2))), call
 
 
-def passes(stage: Stage) -> None:
+def passes(stage: BenchmarkStage) -> None:
     """Compare two passes with the true convolution: turning axes, growing sigma, samples, sizes."""
     tried = [(0.0, 0.0), (0.1, 0.0), (0.0, 0.1)]
     if not stage.toy:
@@ -395,8 +401,8 @@ def passes(stage: Stage) -> None:
         ):
             found = []
             for seed in range(2 if stage.toy else 3):
-                error, call = two_passes_error(
-                    turn=turn,
+                error, call = measure_two_pass_error(
+                    rotation_rad=turn,
                     growth=growth,
                     sigma_px=sigma_px,
                     sampling=sampling,

@@ -8,21 +8,21 @@ from scipy import fft
 from scipy.special import ndtri
 
 from model.displacement_synthesis import growth as displacement_synthesis
-from model.displacement_synthesis.sources import leveled
+from model.displacement_synthesis.sources import level_patch
 from reconstruction import normal_histogram
 from reconstruction.normal_histogram import relief_slopes
 from rigsim.skin_patch.microrelief import make_micro_skin
 from skinrig.arrays import Float32Array, Float64Array
-from skinrig.benchmarks.measurement import measure, processor_seconds, spent
-from skinrig.benchmarks.results import BandError, Knobs
-from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.benchmarks.measurement import measure, measure_processor_time, processor_seconds
+from skinrig.benchmarks.results import ErrorEstimate, Knobs
+from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 
 PIXEL_UM = 10.0
-LARGEST_PX = 16_384
+MAX_SIDE_PX = 16_384
 N_THREADS = 2
 
 
-def blended(
+def blend_hexagonal_tiles(
     patches: Sequence[Float32Array], size_px: int, *, edge_px: int, rng: np.random.Generator
 ) -> Float32Array:
     """Grow patches by blending hexagonal tiles, their histogram of heights preserved.
@@ -102,12 +102,12 @@ def skewness_of_curvature(height: Float32Array) -> float:
     return float(((inner - inner.mean()) ** 3).mean() / inner.std() ** 3)
 
 
-def growth(stage: Stage) -> None:
+def growth(stage: BenchmarkStage) -> None:
     """Grow a map: cells, what they share, windows tried; beside blending; then the largest map."""
     site = "forehead"
     count, size_mm, side = (2, 1.6, 200) if stage.toy else (4, 8.0, 2048)
     patches = [
-        leveled(
+        level_patch(
             make_micro_skin(site, seed=seed, size_mm=size_mm, texel_um=PIXEL_UM).height_um,
             pixel_um=PIXEL_UM,
         )
@@ -129,7 +129,7 @@ def growth(stage: Stage) -> None:
         knobs: Knobs = {"method": "cut", "cell": cell, "overlap": overlap, "candidates": tried}
         stage.add(knobs, timing, _error(grown, truth))
     edge = 40 if stage.toy else 128
-    blend = partial(blended, patches, side, edge_px=edge)
+    blend = partial(blend_hexagonal_tiles, patches, side, edge_px=edge)
     timing, theirs = stage.time(
         lambda: blend(rng=np.random.default_rng(1)), repeats=1, memory=False
     )
@@ -137,10 +137,10 @@ def growth(stage: Stage) -> None:
     stage.reference_error = normal_histogram.halved_distance(*halves)
     stage.words = {"count": count, "size_mm": size_mm, "side": side}
     if not stage.toy:
-        stage.limits = _judged(patches, truth, theirs)
+        stage.limits = _evaluate_growth(patches, truth, theirs)
 
 
-def _error(height: Float32Array, truth: Float64Array) -> BandError:
+def _error(height: Float32Array, truth: Float64Array) -> ErrorEstimate:
     """Return the error of a map with the spread of its quarters as the interval."""
     error = normal_histogram.halved_distance(slope_histogram([height]), truth)
     half = height.shape[0] // 2
@@ -154,14 +154,18 @@ def _error(height: Float32Array, truth: Float64Array) -> BandError:
         normal_histogram.halved_distance((sum(quarters) - each) / 3.0, truth) for each in quarters
     ]
     spread = float(np.sqrt(0.75 * np.sum((np.array(left_out) - np.mean(left_out)) ** 2)))
-    return BandError.of_size(error, spread)
+    return ErrorEstimate.nonnegative(error, spread)
 
 
-def _judged(patches: Sequence[Float32Array], truth: Float64Array, theirs: Float32Array) -> Findings:
+def _evaluate_growth(
+    patches: Sequence[Float32Array], truth: Float64Array, reference_map: Float32Array
+) -> LimitValues:
     """Lay out the largest map, draw a band of its tiles, and judge them."""
     rng = np.random.default_rng(0)
-    laid_s, layout = spent(
-        lambda: displacement_synthesis.lay_out(patches, LARGEST_PX, rng=rng, threads=N_THREADS)
+    laid_s, layout = measure_processor_time(
+        lambda: displacement_synthesis.build_layout(
+            patches, MAX_SIDE_PX, rng=rng, threads=N_THREADS
+        )
     )
     tile = layout.tile(0, 0)
     rows, columns = tile.shape
@@ -172,18 +176,20 @@ def _judged(patches: Sequence[Float32Array], truth: Float64Array, theirs: Float3
     held = site.sources.heights.nbytes * 2 + site.sources.filled.nbytes
     held += site.cells.nbytes + site.across.nbytes + site.down.nbytes
     memory_gb = (
-        held + 1e6 * N_THREADS * (timing.peak_memory_mb or 0.0) + 4.0 * LARGEST_PX**2
+        held + 1e6 * N_THREADS * (timing.peak_memory_mb or 0.0) + 4.0 * MAX_SIDE_PX**2
     ) / 1e9
     part = layout.draw((0, 2 * rows), (0, 2 * columns))
-    cuts = layout.at_cuts((0, 2 * rows), (0, 2 * columns))
+    cuts = layout.cut_mask((0, 2 * rows), (0, 2 * columns))
     slope_x, slope_y, _ = relief_slopes.slopes(part, pixel=PIXEL_UM)
     square = slope_x**2 + slope_y**2
     ours = normal_histogram.halved_distance(slope_histogram([part]), truth)
-    skew = [skewness_of_curvature(h) for h in (part, theirs)]
+    skew = [skewness_of_curvature(h) for h in (part, reference_map)]
     ought = float(np.mean([skewness_of_curvature(patch) for patch in patches]))
     alike = np.mean([autocorrelation(patch) for patch in patches], axis=0)
-    apart = [float(np.sqrt(np.mean((autocorrelation(h) - alike) ** 2))) for h in (part, theirs)]
-    blend = normal_histogram.halved_distance(slope_histogram([theirs]), truth)
+    apart = [
+        float(np.sqrt(np.mean((autocorrelation(h) - alike) ** 2))) for h in (part, reference_map)
+    ]
+    blend = normal_histogram.halved_distance(slope_histogram([reference_map]), truth)
     return {
         "histogram": ours,
         "cuts": float(np.sqrt(square[cuts].mean() / square[~cuts].mean())),

@@ -10,24 +10,24 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from model import metrics, wrinkles
 from model import texture_resampling as resampling
-from model.wrinkles import JIMENEZ2011_TABLE, Layer
+from model.wrinkles import JIMENEZ2011_TABLE, WrinkleLayer
 from model.wrinkles import differences as wrinkle_differences
 from model.wrinkles import storage as wrinkle_storage
 from reconstruction.wrinkles import fit as wrinkle_fit
 from reconstruction.wrinkles import texels as wrinkle_texels
 from reconstruction.wrinkles import weights as wrinkle_weights
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.measurement import once, processor_seconds
-from skinrig.benchmarks.resampling import rms_of_draws, squares
-from skinrig.benchmarks.results import BandError, Knobs
-from skinrig.benchmarks.stage import Stage
+from skinrig.benchmarks.measurement import measure_once, processor_seconds
+from skinrig.benchmarks.resampling import gaussian_rms, split_squares
+from skinrig.benchmarks.results import ErrorEstimate, Knobs
+from skinrig.benchmarks.stage import BenchmarkStage
 
 ZONE_CENTERS_UV = (
     *((x, y) for y in (0.12, 0.3) for x in (0.3, 0.7)),
     *((0.25, 0.5), (0.75, 0.5), (0.5, 0.65), (0.5, 0.88)),
 )
 ZONE_RADIUS_UV = 0.12
-FURROWS_PER_FACE = 16
+GROOVES_PER_FACE = 16
 """Furrows over the height of the face, if it had them everywhere."""
 MAX_SLOPE = 0.6
 FULL_SIDE_PX = 2048
@@ -54,7 +54,7 @@ def zone_masks(side: int) -> Float64Array:
     return np.asarray(masks / np.maximum(masks.sum(axis=0), 1.0))
 
 
-def furrowed_face(
+def synthesize_wrinkled_face(
     side: int, *, rng: np.random.Generator
 ) -> tuple[Float64Array, dict[str, Float64Array]]:
     """Return normals of a face at rest and in the six expressions, made of heights.
@@ -77,7 +77,7 @@ def furrowed_face(
     """
     y = (np.mgrid[:side, :side][0] + 0.5) / side
     bend = gaussian_filter(rng.standard_normal((side, side)), side / 20, mode="wrap")
-    phase = 2 * np.pi * FURROWS_PER_FACE * (y + 0.012 * bend / bend.std())
+    phase = 2 * np.pi * GROOVES_PER_FACE * (y + 0.012 * bend / bend.std())
     grain = gaussian_filter(rng.standard_normal((side, side)), 1.5, mode="wrap")
     masks = zone_masks(side)
     rest = 0.15 * masks.sum(axis=0)
@@ -104,7 +104,7 @@ def furrowed_face(
 
 def _resized(texture: FloatArray, side: int) -> FloatArray:
     """Return a texture (H, W, 2) at (side, side, 2)."""
-    return np.moveaxis(resampling.resampled(np.moveaxis(texture, 2, 0), (side, side)), 0, 2)
+    return np.moveaxis(resampling.resample(np.moveaxis(texture, 2, 0), (side, side)), 0, 2)
 
 
 def numpy_combine(
@@ -149,23 +149,23 @@ def opencv_combine(
     return out
 
 
-def _error(normals: FloatArray, truth: FloatArray) -> BandError:
+def _error(normals: FloatArray, truth: FloatArray) -> ErrorEstimate:
     """Return the mean angle, degrees, and its interval over squares of the face."""
     angle = np.degrees(metrics.angular_error_rad(normals, truth))
-    parts = [float(angle[at].mean()) for at in squares(len(angle))]
-    return BandError.around(float(angle.mean()), float(np.std(parts) / np.sqrt(len(parts))))
+    parts = [float(angle[at].mean()) for at in split_squares(len(angle))]
+    return ErrorEstimate.symmetric(float(angle.mean()), float(np.std(parts) / np.sqrt(len(parts))))
 
 
-def _mean_error(model: Any, states: dict[str, Float64Array]) -> BandError:
+def _mean_error(model: Any, states: dict[str, Float64Array]) -> ErrorEstimate:
     errors = [_error(model.evaluate({name: 1.0}).normals, n) for name, n in states.items()]
     low, high = np.mean([one.error_interval for one in errors], axis=0).tolist()
-    return BandError(float(np.mean([one.error for one in errors])), (low, high))
+    return ErrorEstimate(float(np.mean([one.error for one in errors])), (low, high))
 
 
-def fitting(stage: Stage) -> None:
+def fitting(stage: BenchmarkStage) -> None:
     """Fit a map and weights to six expressions: sizes of map and masks, known masks or not."""
     side = 64 if stage.toy else 512
-    neutral, states = furrowed_face(side, rng=np.random.default_rng(0))
+    neutral, states = synthesize_wrinkled_face(side, rng=np.random.default_rng(0))
     sizes = (
         ((64, 16), (32, 16), (16, 16), (32, 8))
         if stage.toy
@@ -175,12 +175,12 @@ def fitting(stage: Stage) -> None:
         masks = zone_masks(mask_side)
 
         def fit() -> wrinkle_fit.WrinkleFit:
-            return wrinkle_fit.fit(
+            return wrinkle_fit.fit_wrinkle_map(
                 neutral, states, masks, size=(map_side, map_side), clamp="signed"
             )
 
-        cold, found = once(fit)
-        timing = dataclasses.replace(once(fit)[0], cold_s=cold.seconds)
+        cold, found = measure_once(fit)
+        timing = dataclasses.replace(measure_once(fit)[0], cold_s=cold.seconds)
         size = wrinkle_storage.footprint((map_side, map_side), (mask_side, mask_side))
         knobs: Knobs = {"map": map_side, "masks": mask_side}
         knobs["KB as BC5 and BC3"] = size.total_bytes / 1024
@@ -189,7 +189,7 @@ def fitting(stage: Stage) -> None:
     stage.limits["best"] = min(point.error for point in stage.points) / rest
 
 
-def summing(stage: Stage) -> None:
+def summing(stage: BenchmarkStage) -> None:
     """Add half of a wrinkle's relief to a base: derivatives, differences of normals, NumPy."""
     rng = np.random.default_rng(1)
     side, coarse, mask_side = (256, 32, 8) if stage.toy else (FULL_SIDE_PX, 256, 64)
@@ -240,12 +240,12 @@ def summing(stage: Stage) -> None:
     }
 
 
-def storing(stage: Stage) -> None:
+def storing(stage: BenchmarkStage) -> None:
     """Store a wrinkle map at sizes and encodings, and show it: angle, bytes, seconds."""
     side = 64 if stage.toy else 512
-    neutral, states = furrowed_face(side, rng=np.random.default_rng(0))
+    neutral, states = synthesize_wrinkled_face(side, rng=np.random.default_rng(0))
     base = wrinkles.encode(neutral).astype(np.float32)
-    fitted = wrinkle_fit.fit(
+    fitted = wrinkle_fit.fit_wrinkle_map(
         neutral, states, zone_masks(16 if stage.toy else 64), size=(side, side), clamp="signed"
     )
     wrinkle = np.clip(fitted.layer.wrinkle, -wrinkles.MAX_DERIVATIVE, wrinkles.MAX_DERIVATIVE)
@@ -256,9 +256,9 @@ def storing(stage: Stage) -> None:
     for at in (64, 32) if stage.toy else (512, 256, 128, 64):
         small = _resized(wrinkle, at)
         for maps_as, masks_as in ENCODINGS if at in (64, 256) else ENCODINGS[:1]:
-            layer = Layer(
-                wrinkle_storage.stored_map(small, maps_as),
-                wrinkle_storage.stored_masks(masks, masks_as),
+            layer = WrinkleLayer(
+                wrinkle_storage.round_trip_map(small, maps_as),
+                wrinkle_storage.round_trip_masks(masks, masks_as),
                 table,
             )
             size = wrinkle_storage.footprint(
@@ -273,7 +273,7 @@ def storing(stage: Stage) -> None:
             )
 
 
-def weighing(stage: Stage) -> None:
+def weighing(stage: BenchmarkStage) -> None:
     """Fit the weights of an expression that the model made, at several noises and sizes."""
     rng = np.random.default_rng(2)
     draws = 4 if stage.toy else 12
@@ -282,28 +282,28 @@ def weighing(stage: Stage) -> None:
     for side in (64, 96) if stage.toy else (128, 256):
         base = 0.1 * rng.standard_normal((side, side, 2))
         wrinkle = gaussian_filter(rng.standard_normal((64, 64, 2)), (1.5, 1.5, 0))
-        layer = Layer(0.5 * wrinkle / np.abs(wrinkle).max(), zone_masks(32))
-        neutral = wrinkle_texels.derivatives_of(wrinkles.decode(base))
+        layer = WrinkleLayer(0.5 * wrinkle / np.abs(wrinkle).max(), zone_masks(32))
+        neutral = wrinkle_texels.measure_derivatives(wrinkles.decode(base))
         clean = wrinkles.combine_layers(base, [layer], true)
         for noise in (0.005, NORMAL_NOISE_RAD) if stage.toy else (0.005, NORMAL_NOISE_RAD, 0.08):
             stderr = np.full((side, side), noise)
             bound = _bound(layer, clean, stderr)
 
             def run(seed: int = 0) -> wrinkle_weights.ZoneWeights:
-                noisy = _disturbed(clean, stderr, np.random.default_rng(seed))
-                seen = wrinkle_texels.derivatives_of(noisy, stderr_rad=stderr)
+                noisy = _add_normal_noise(clean, stderr, np.random.default_rng(seed))
+                seen = wrinkle_texels.measure_derivatives(noisy, stderr_rad=stderr)
                 return wrinkle_fit.fit_weights(layer, neutral, seen, clamp="signed")
 
             timing, _ = stage.time(run, repeats=1, memory=False)
             miss = np.array([run(seed).weights - true for seed in range(draws)])
             ratios.append(float(np.sqrt(np.mean((miss / bound) ** 2))))
-            outcome = rms_of_draws(miss, bound=float(np.sqrt(np.mean(bound**2))))
+            outcome = gaussian_rms(miss, bound=float(np.sqrt(np.mean(bound**2))))
             stage.add({"side": side, "noise, mrad": 1e3 * noise}, timing, outcome)
     # the mean of six ratios of 96 weights each scatters by 3 %: 1.1 is missed by chance in 1e-3
     stage.limits["over_bound"] = float(np.mean(ratios))
 
 
-def _disturbed(
+def _add_normal_noise(
     normals: FloatArray, stderr_rad: Float64Array, rng: np.random.Generator
 ) -> Float64Array:
     """Return normals turned by independent angles along two directions of the surface."""
@@ -315,7 +315,7 @@ def _disturbed(
     return np.asarray(n / np.linalg.norm(n, axis=-1, keepdims=True))
 
 
-def _bound(layer: Layer, clean: FloatArray, stderr_rad: Float64Array) -> Float64Array:
+def _bound(layer: WrinkleLayer, clean: FloatArray, stderr_rad: Float64Array) -> Float64Array:
     """Return the least standard error of each weight: information of all normals at once.
 
     In the normal's own two directions the errors are independent; derivatives of the normal by
@@ -326,7 +326,7 @@ def _bound(layer: Layer, clean: FloatArray, stderr_rad: Float64Array) -> Float64
     n = np.asarray(clean, np.float64)
     step = np.concatenate([read, np.zeros((side, side, 1))], axis=2) * n[..., 2:]
     step -= (step * n).sum(axis=2, keepdims=True) * n
-    full = resampling.resampled(np.asarray(layer.masks, np.float64), (side, side))
+    full = resampling.resample(np.asarray(layer.masks, np.float64), (side, side))
     density = (step**2).sum(axis=2) * 2.0 / stderr_rad**2
     information = np.einsum("ahw,bhw,hw->ab", full, full, density, optimize=True)
     return np.asarray(np.sqrt(np.diag(np.linalg.inv(information))))

@@ -22,7 +22,7 @@ GAUSSIAN_95: Final = 1.959964
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class IntervalTrial:
     """What one simulated subject says about the intervals of one quantity."""
 
     quantity: str
@@ -45,7 +45,7 @@ class Trial:
 
 
 @dataclass(frozen=True, slots=True)
-class Covered:
+class IntervalCoverage:
     """Coverage of the intervals of one quantity, over subjects."""
 
     quantity: str
@@ -69,7 +69,9 @@ class Covered:
         return "open" if self.interval[1] >= low and self.interval[0] <= high else "missed"
 
 
-def pooled(trials: Sequence[Trial], *, level: int, confidence: float = 0.95) -> Covered:
+def pool_trials(
+    trials: Sequence[IntervalTrial], *, level: int, confidence: float = 0.95
+) -> IntervalCoverage:
     """Return the coverage of the trials of one quantity.
 
     Parameters
@@ -88,9 +90,9 @@ def pooled(trials: Sequence[Trial], *, level: int, confidence: float = 0.95) -> 
 
     Examples
     --------
-    >>> ones = [Trial("x", str(k), "any", np.array([0.5, 0.9, 2.5]), 1.0, "", 1.96)
+    >>> ones = [IntervalTrial("x", str(k), "any", np.array([0.5, 0.9, 2.5]), 1.0, "", 1.96)
     ...         for k in range(3)]
-    >>> round(pooled(ones, level=68).share, 3), pooled(ones, level=68).verdict
+    >>> round(pool_trials(ones, level=68).share, 3), pool_trials(ones, level=68).verdict
     (0.667, 'kept')
     """
     quantities = {trial.quantity for trial in trials}
@@ -101,7 +103,7 @@ def pooled(trials: Sequence[Trial], *, level: int, confidence: float = 0.95) -> 
         )
     shares = np.array([trial.share(level) for trial in trials])
     bands = {trial.band for trial in trials}
-    return Covered(
+    return IntervalCoverage(
         trials[0].quantity,
         bands.pop() if len(bands) == 1 else "all",
         level,
@@ -113,26 +115,30 @@ def pooled(trials: Sequence[Trial], *, level: int, confidence: float = 0.95) -> 
     )
 
 
-def _interval(shares: Float64Array, truths: Float64Array, confidence: float) -> tuple[float, float]:
+def _interval(
+    fractions: Float64Array, truths: Float64Array, confidence: float
+) -> tuple[float, float]:
     """Return the interval of the mean share, no narrower than if truths had nothing in common.
 
     Subjects with a truth or two each may agree by chance: their scatter alone tells nothing then.
     """
     from scipy.stats import beta, t
 
-    if shares.size < 2:
+    if fractions.size < 2:
         return 0.0, 1.0
-    middle = float(shares.mean())
-    reach = t.ppf(0.5 + confidence / 2.0, shares.size - 1)
-    error = float(reach * shares.std(ddof=1) / math.sqrt(shares.size))
-    count, held = float(truths.sum()), float((shares * truths).sum())
+    middle = float(fractions.mean())
+    reach = t.ppf(0.5 + confidence / 2.0, fractions.size - 1)
+    error = float(reach * fractions.std(ddof=1) / math.sqrt(fractions.size))
+    count, held = float(truths.sum()), float((fractions * truths).sum())
     tail = (1.0 - confidence) / 2.0  # Clopper and Pearson 1934, doi:10.1093/biomet/26.4.404
     low = beta.ppf(tail, held, count - held + 1.0) if held > 0.5 else 0.0
     high = beta.ppf(1.0 - tail, held + 1.0, count - held) if held < count - 0.5 else 1.0
     return max(min(middle - error, float(low)), 0.0), min(max(middle + error, float(high)), 1.0)
 
 
-def by_band(trials: Sequence[Trial], *, level: int, confidence: float) -> list[Covered]:
+def by_band(
+    trials: Sequence[IntervalTrial], *, level: int, confidence: float
+) -> list[IntervalCoverage]:
     """Return the coverage of every quantity: over all subjects, then band by band.
 
     Parameters
@@ -140,14 +146,14 @@ def by_band(trials: Sequence[Trial], *, level: int, confidence: float) -> list[C
     trials
         Of any quantities and subjects; those without truths are left out.
     level, confidence
-        As of `pooled`.
+        As of `pool_trials`.
     """
-    rows: list[Covered] = []
+    rows: list[IntervalCoverage] = []
     counted = [trial for trial in trials if trial.deviation.size]
     for quantity in dict.fromkeys(trial.quantity for trial in counted):
         of_it = [trial for trial in counted if trial.quantity == quantity]
         bands = dict.fromkeys(trial.band for trial in of_it)
         of_bands = [[trial for trial in of_it if trial.band == band] for band in bands]
         groups = [of_it, *of_bands] if len(bands) > 1 else [of_it]
-        rows += [pooled(group, level=level, confidence=confidence) for group in groups]
+        rows += [pool_trials(group, level=level, confidence=confidence) for group in groups]
     return rows

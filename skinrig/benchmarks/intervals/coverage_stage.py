@@ -19,11 +19,16 @@ from pathlib import Path
 from typing import Any, Final
 
 from skinrig.benchmarks.intervals import dome, flash, gradient, probe, sequence
-from skinrig.benchmarks.intervals.coverage import COVERAGE_RANGES, Covered, Trial, by_band
+from skinrig.benchmarks.intervals.coverage import (
+    COVERAGE_RANGES,
+    IntervalCoverage,
+    IntervalTrial,
+    by_band,
+)
 from skinrig.benchmarks.intervals.trials import ANY_BAND
-from skinrig.benchmarks.measurement import once
+from skinrig.benchmarks.measurement import measure_once
 from skinrig.benchmarks.results import Point, Timing
-from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 
 FIRST_SEED: Final = 400
 FALSE_ALARM_RATE: Final = 0.05
@@ -49,10 +54,10 @@ ANISOTROPIC_MEDIA: Final = ("anisotropic:0.25,2,-1,35", "anisotropic:0.25,2,1,11
 cannot."""
 DOME_PRESETS: Final = ("I", "III", "V", "II", "IV", "VI")
 
-Trials = Iterable[Trial]
+Trials = Iterable[IntervalTrial]
 
 
-def intervals(stage: Stage) -> Iterator[None]:
+def intervals(stage: BenchmarkStage) -> Iterator[None]:
     """Count how often 68 and 95 % intervals of every rig's maps hold the truth.
 
     Yields
@@ -60,18 +65,20 @@ def intervals(stage: Stage) -> Iterator[None]:
     None
         After each kind of trial, when the stage holds what is known of all so far.
     """
-    trials: list[Trial] = []
+    trials: list[IntervalTrial] = []
     spent: dict[str, Timing] = {}
     for make in (_small() if stage.toy else _full()).values():
         with tempfile.TemporaryDirectory() as folder:
-            timing, made = once(lambda: list(make(Path(folder))))
+            timing, made = measure_once(lambda: list(make(Path(folder))))
         trials += made
         spent |= dict.fromkeys((trial.quantity for trial in made), timing)
-        _judge(stage, trials, spent)
+        _evaluate_trials(stage, trials, spent)
         yield
 
 
-def _judge(stage: Stage, trials: Sequence[Trial], spent: Mapping[str, Timing]) -> None:
+def _evaluate_trials(
+    stage: BenchmarkStage, trials: Sequence[IntervalTrial], spent: Mapping[str, Timing]
+) -> None:
     counted = len(by_band(trials, level=68, confidence=0.95))
     # one-sided at each end of the range, of two levels
     confidence = 1.0 - 2.0 * FALSE_ALARM_RATE / (4 * counted)
@@ -95,16 +102,18 @@ def _full() -> Mapping[str, Callable[[Path], Trials]]:
     moving = _subjects(FLASH_PRESETS[1:], 4, first=24)
     coarse: dict[str, Any] = {"moving": False, "resolution": ", half resolution"}
     return {
-        "flash": partial(flash.flash, subjects=_subjects(FLASH_PRESETS, 16), width_px=768),
+        "flash": partial(flash.run_trials, subjects=_subjects(FLASH_PRESETS, 16), width_px=768),
         "coarse": partial(
-            flash.flash, subjects=_subjects(FLASH_PRESETS, 8, first=16), width_px=384, **coarse
+            flash.run_trials, subjects=_subjects(FLASH_PRESETS, 8, first=16), width_px=384, **coarse
         ),
-        "event": partial(sequence.sequences, subjects=moving, width_px=192, state="exercise"),
-        "prompts": partial(sequence.sequences, subjects=moving, width_px=192, state="smile"),
-        "gradient": partial(gradient.gradient, subjects=_subjects(GRADIENT_SITES, 6), width_px=128),
-        "dome": partial(dome.dome, subjects=_subjects(DOME_PRESETS, 6), width_px=320),
+        "event": partial(sequence.run_trials, subjects=moving, width_px=192, state="exercise"),
+        "prompts": partial(sequence.run_trials, subjects=moving, width_px=192, state="smile"),
+        "gradient": partial(
+            gradient.run_trials, subjects=_subjects(GRADIENT_SITES, 6), width_px=128
+        ),
+        "dome": partial(dome.run_trials, subjects=_subjects(DOME_PRESETS, 6), width_px=320),
         "probe": partial(
-            probe.probe,
+            probe.run_trials,
             media=_subjects(PROBE_MEDIA, 8),
             skin=_subjects(PROBE_PRESETS, 6),
             directed=_subjects(ANISOTROPIC_MEDIA, 2),
@@ -114,10 +123,10 @@ def _full() -> Mapping[str, Callable[[Path], Trials]]:
 
 def _small() -> Mapping[str, Callable[[Path], Trials]]:
     faces = {FIRST_SEED + 1: "I"}
-    return {"flash": partial(flash.flash, subjects=faces, width_px=96, moving=False)}
+    return {"flash": partial(flash.run_trials, subjects=faces, width_px=96, moving=False)}
 
 
-def _point(row: Covered, timing: Timing) -> Point:
+def _point(row: IntervalCoverage, timing: Timing) -> Point:
     off = abs(100.0 * row.share - row.level)
     low, high = (100.0 * end - row.level for end in row.interval)
     # an interval of the coverage that holds the nominal one allows a distance of 0
@@ -140,7 +149,7 @@ def _point(row: Covered, timing: Timing) -> Point:
     )
 
 
-def _limits(row: Covered) -> Findings:
+def _limits(row: IntervalCoverage) -> LimitValues:
     low, high = COVERAGE_RANGES[row.level]
     skin = "" if row.band in ("all", ANY_BAND) else f", {row.band} skin"
     return {

@@ -10,10 +10,10 @@ import numpy as np
 from model import metrics
 from model.skin import SkinAppearance
 from reconstruction.pipeline.dome.stages import WEIGHT_NAMES
-from skinrig.appearances.contents import jointly_valid
+from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.intervals.coverage import Trial
-from skinrig.benchmarks.intervals.trials import Subject, maps_of, simulated
+from skinrig.benchmarks.intervals.coverage import IntervalTrial
+from skinrig.benchmarks.intervals.trials import TrialSubject, reconstruct_maps, resimulate
 from skinrig.evaluating import reflection, skin_bands
 from skinrig.evaluating import surface as surface_evaluation
 from skinrig.planning.confirmation import calibrate_simulated
@@ -29,7 +29,9 @@ NORMAL_MAP_NAMES: Final[Mapping[str, str]] = {
 CHANNEL_NAMES: Final = ("red", "green", "blue")
 
 
-def dome(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Iterator[Trial]:
+def run_trials(
+    folder: Path, subjects: Mapping[int, str], *, width_px: int
+) -> Iterator[IntervalTrial]:
     """Yield trials of normals, diffuse albedo and lobes of faces.
 
     Each seed has a dome of its own, built off the drawing, with its own calibration: errors of
@@ -41,12 +43,12 @@ def dome(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Iterato
         with tempfile.TemporaryDirectory(dir=folder) as name:
             own = Path(name)
             calibrate_simulated("dome", own, shown, kinds, seed=seed)
-            done = simulated("dome", own, subject=preset, seed=seed, width_px=width_px)
-            found, truth = maps_of(own, done, [*NORMAL_MAP_NAMES, "r_d", *WEIGHT_NAMES])
-        yield from of_face(found, truth, f"{preset} {seed}")
+            done = resimulate("dome", own, subject=preset, seed=seed, width_px=width_px)
+            found, truth = reconstruct_maps(own, done, [*NORMAL_MAP_NAMES, "r_d", *WEIGHT_NAMES])
+        yield from face_trials(found, truth, f"{preset} {seed}")
 
 
-def of_face(found: SkinAppearance, truth: SkinAppearance, name: str) -> Iterator[Trial]:
+def face_trials(found: SkinAppearance, truth: SkinAppearance, name: str) -> Iterator[IntervalTrial]:
     """Yield the trials of one face.
 
     Parameters
@@ -58,21 +60,21 @@ def of_face(found: SkinAppearance, truth: SkinAppearance, name: str) -> Iterator
     name
         Preset and seed.
     """
-    pairs = surface_evaluation.match(found, truth)
+    pairs = surface_evaluation.match_texels(found, truth)
     true_normals, true_albedo = (
         truth.maps[key].values.reshape(-1, 3).astype(np.float64)[pairs.truth]
         for key in ("normals", "r_d")
     )
-    band = str(skin_bands.bands_of(np.median(skin_bands.typology_angle_deg(true_albedo))))
-    subject = Subject(name, band)
+    band = str(skin_bands.classify_typology(np.median(skin_bands.typology_angle_deg(true_albedo))))
+    subject = TrialSubject(name, band)
     for name, quantity in NORMAL_MAP_NAMES.items():
         normals = found.maps[name]
-        good = jointly_valid(normals)[pairs.rows, pairs.columns]
+        good = intersect_valid(normals)[pairs.rows, pairs.columns]
         if normals.stderr is not None:
             at = (pairs.rows[good], pairs.columns[good])
             angle = metrics.angular_error_rad(normals.values[at], true_normals[good])
             factor = FACTORS_95["normals"]
-            yield subject.of_normals(quantity, angle, normals.stderr[at], factor_95=factor)
+            yield subject.normal_trial(quantity, angle, normals.stderr[at], factor_95=factor)
     albedo = found.maps["r_d"]
     shape = albedo.values.shape[:2]
     true = np.zeros((*shape, 3))
@@ -81,10 +83,10 @@ def of_face(found: SkinAppearance, truth: SkinAppearance, name: str) -> Iterator
     covered[pairs.rows, pairs.columns] = True
     for channel, color in enumerate(CHANNEL_NAMES):
         how: dict[str, Any] = {"channel": channel, "factor_95": FACTORS_95["R_d"]}
-        yield subject.of_map(f"R_d, {color}", albedo, true, covered, **how)
+        yield subject.map_trial(f"R_d, {color}", albedo, true, covered, **how)
     off, stderr = lobe_strength(found, truth)
     quantity, factor = "light from the surface, dome", FACTORS_95["surface"]
-    yield subject.of_errors(quantity, np.abs(off), stderr, factor_95=factor)
+    yield subject.error_trial(quantity, np.abs(off), stderr, factor_95=factor)
 
 
 def lobe_strength(
@@ -112,7 +114,7 @@ def lobe_strength(
     if test is None:
         return np.zeros(0), np.zeros(0)
     weights = [found.maps[name] for name in WEIGHT_NAMES]
-    valid = jointly_valid(weights[0]).reshape(-1)[test.texels]
+    valid = intersect_valid(weights[0]).reshape(-1)[test.texels]
     shares, errors = (
         np.stack([part.reshape(-1)[test.texels].astype(np.float64) for part in parts])
         for parts in (

@@ -15,20 +15,25 @@ from capture.rig import load_rig
 from model import store
 from reconstruction.chromophores import shading_prior
 from reconstruction.pipeline.flash.facial_color import UnknownBloodError
-from skinrig.appearances.contents import jointly_valid
-from skinrig.benchmarks.intervals.coverage import Trial
-from skinrig.benchmarks.intervals.trials import Subject, band_of, maps_of, simulated
+from skinrig.appearances.contents import intersect_valid
+from skinrig.benchmarks.intervals.coverage import IntervalTrial
+from skinrig.benchmarks.intervals.trials import (
+    TrialSubject,
+    reconstruct_maps,
+    resimulate,
+    skin_color_band,
+)
 from skinrig.evaluating import facial_color
 from skinrig.fitting.facial_color import fit_facial_color
 from skinrig.planning.confirmation import calibrate_simulated
-from skinrig.simulating.orders import Simulated, truth_folder
+from skinrig.simulating.orders import SimulationResult, truth_folder
 
 BLOOD_STATES: Final = ("smile", "anger", "fear", "exercise")
 FACTOR_95: Final = 2.4
 """Half width of a 95 % interval of a chromophore over that of the 68 % one, to 0.1, set on the
 subjects of seeds 0 to 15 at 384 and 768 px: tails are heavier than a Gaussian's."""
 
-STANCE_DEVIATION: Final = 0.5 * shading_prior.LOG_SHADING_SOFTNESS
+LOG_STANCE_STD: Final = 0.5 * shading_prior.LOG_SHADING_SOFTNESS
 """Standard deviation of how far subjects stand off the tile's place, over the camera's distance:
 what the stated errors take it for. Light goes with the square of the distance."""
 CALIBRATION_SEED: Final = 900
@@ -45,17 +50,17 @@ def nearer_mm(seed: int) -> float:
     True
     """
     drawn = np.random.default_rng([seed, _STANCE_STREAM]).standard_normal()
-    return float(STANCE_DEVIATION * load_rig("flash").views[0].distance_mm * drawn)
+    return float(LOG_STANCE_STD * load_rig("flash").views[0].distance_mm * drawn)
 
 
-def flash(
+def run_trials(
     folder: Path,
     subjects: Mapping[int, str],
     *,
     width_px: int,
     moving: bool = True,
     resolution: str = "",
-) -> Iterator[Trial]:
+) -> Iterator[IntervalTrial]:
     """Yield trials of melanin and hemoglobin, and of the hemoglobin rig's blood and its change.
 
     Parameters
@@ -75,7 +80,7 @@ def flash(
     calibrate_flash(folder, targets, width_px)
     for seed, preset in subjects.items():
         state = BLOOD_STATES[seed % len(BLOOD_STATES)]
-        done = simulated(
+        done = resimulate(
             "flash",
             folder,
             subject=preset,
@@ -84,13 +89,15 @@ def flash(
             states=("neutral", state) if moving else ("neutral",),
             nearer_mm=nearer_mm(seed),
         )
-        found, truth = maps_of(folder, done, ["melanin", "hemoglobin"])
+        found, truth = reconstruct_maps(folder, done, ["melanin", "hemoglobin"])
         skin = truth.maps["mask"].values > 0.5
-        subject = Subject(f"{preset} {seed}", band_of(truth, "reflectance_blurred", skin))
+        subject = TrialSubject(
+            f"{preset} {seed}", skin_color_band(truth, "reflectance_blurred", skin)
+        )
         for name in ("melanin", "hemoglobin"):
             true = truth.maps[f"{name}_blurred"].values
             quantity, estimate = f"{name}{resolution}", found.maps[name]
-            yield subject.of_map(quantity, estimate, true, skin, factor_95=FACTOR_95)
+            yield subject.map_trial(quantity, estimate, true, skin, factor_95=FACTOR_95)
         if moving:
             yield from _of_rig(done, folder, state, subject)
 
@@ -102,7 +109,9 @@ def calibrate_flash(folder: Path, targets: Mapping[str, str], width_px: int) -> 
     calibrate_simulated("flash", folder, shown, kinds, seed=CALIBRATION_SEED)
 
 
-def _of_rig(done: Simulated, folder: Path, state: str, subject: Subject) -> Iterator[Trial]:
+def _of_rig(
+    done: SimulationResult, folder: Path, state: str, subject: TrialSubject
+) -> Iterator[IntervalTrial]:
     try:
         fit_facial_color([done.session], out=folder / "moving", calibration=folder / "calibration")
     except UnknownBloodError:
@@ -116,8 +125,8 @@ def _of_rig(done: Simulated, folder: Path, state: str, subject: Subject) -> Iter
     )
     if blood is None or found is None or rest is None or moved is None:
         return
-    both = jointly_valid(rest, moved) & (moved.values > 0)
+    both = intersect_valid(rest, moved) & (moved.values > 0)
     change = moved.values.astype(np.float64) - rest.values
     quantity = "hemoglobin of the rig"
-    yield subject.of_map(quantity, blood, moved.values, both, factor_95=FACTOR_95)
-    yield subject.of_map("change of hemoglobin", found, change, both, over=rest.values)
+    yield subject.map_trial(quantity, blood, moved.values, both, factor_95=FACTOR_95)
+    yield subject.map_trial("change of hemoglobin", found, change, both, over=rest.values)

@@ -19,17 +19,17 @@ from model.skin import SkinAppearance
 from reconstruction.kernel_fit import fit_kernel
 from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM
 from reconstruction.kernel_fit.outcome import KernelFit
-from reconstruction.normal_histogram.statistics import measure
+from reconstruction.normal_histogram.statistics import measure_normals
 from reconstruction.normal_integration.height_filters import high_pass
 from reconstruction.pipeline.gradient.stages import CUTOFF_UM, KERNEL_FILE
 from reconstruction.pipeline.gradient.strain_kernels import COARSE_GRID_STEP
 from rigsim.skin_patch.microrelief import make_micro_skin
-from rigsim.skin_patch.stretch import deform
-from skinrig.appearances.contents import jointly_valid
-from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, Trial
-from skinrig.benchmarks.intervals.trials import Subject, maps_of, simulated
+from rigsim.skin_patch.stretch import stretch_skin
+from skinrig.appearances.contents import intersect_valid
+from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, IntervalTrial
+from skinrig.benchmarks.intervals.trials import TrialSubject, reconstruct_maps, resimulate
 from skinrig.evaluating.microrelief import compare_stretch, true_relief
-from skinrig.evaluating.subsurface import document_of
+from skinrig.evaluating.subsurface import read_document
 from skinrig.planning.confirmation import calibrate_simulated
 
 FACTORS_95: Final[Mapping[str, float]] = {"normals": 1.9, "height": 2.1, "stretch": GAUSSIAN_95}
@@ -45,7 +45,9 @@ SIMULATED_BORDER_MM: Final = 1.0
 """What is simulated besides: skin at the border of the simulation is not looked at."""
 
 
-def gradient(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Iterator[Trial]:
+def run_trials(
+    folder: Path, subjects: Mapping[int, str], *, width_px: int
+) -> Iterator[IntervalTrial]:
     """Yield trials of normals and heights at rest, and of stretch and kernels to either side.
 
     Each seed has a sphere of its own, built off the drawing, with its own calibration. Parameters
@@ -58,41 +60,41 @@ def gradient(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Ite
             own = Path(name)
             calibrate_simulated("gradient", own, {"ball": {}}, kinds, seed=seed)
             asked: dict[str, Any] = {"site": site, "seed": seed, "width_px": width_px, **jaws}
-            done = simulated("gradient", own, **asked)
-            found, truth = maps_of(own, done, ["normals", "height", "strain", "kernels"])
-        subject = Subject(f"{site} {seed}")
+            done = resimulate("gradient", own, **asked)
+            found, truth = reconstruct_maps(own, done, ["normals", "height", "strain", "kernels"])
+        subject = TrialSubject(f"{site} {seed}")
         state = next(
             key.removeprefix("normals_")
             for key in found.maps
             if key.startswith("normals_a") and key.endswith("_n0")
         )
         normals, seen = found.maps[f"normals_{state}"], truth.maps[f"normals_seen_{state}"]
-        good = jointly_valid(normals, seen)
+        good = intersect_valid(normals, seen)
         if normals.stderr is not None:
             angle = metrics.angular_error_rad(normals.values[good], seen.values[good])
             quantity, factor = "normals of the gradient sphere", FACTORS_95["normals"]
-            yield subject.of_normals(quantity, angle, normals.stderr[good], factor_95=factor)
+            yield subject.normal_trial(quantity, angle, normals.stderr[good], factor_95=factor)
         height = found.maps[f"height_{state}"]
         relief = true_relief(found, truth, state)
-        good = jointly_valid(height, truth.maps[f"height_{state}"])
+        good = intersect_valid(height, truth.maps[f"height_{state}"])
         if height.stderr is not None:
             stderr = height.stderr[good].astype(np.float64)
             off = np.abs(height.values.astype(np.float64)[good] - relief[good])
             factor = FACTORS_95["height"]
-            yield subject.of_errors("height", off, stderr, unit="um", factor_95=factor)
+            yield subject.error_trial("height", off, stderr, unit="um", factor_95=factor)
         # the neutral state is what stretch is told against: exact by definition
         rows = [row for row in compare_stretch(found, truth) if row.state != state]
         spread = np.array([row.stderr for row in rows])
         off = np.array([abs(row.error) for row in rows])
-        yield subject.of_errors("stretch ratio", off, spread, factor_95=FACTORS_95["stretch"])
+        yield subject.error_trial("stretch ratio", off, spread, factor_95=FACTORS_95["stretch"])
         yield from _kernels(found, truth, subject, site=site, seed=seed)
 
 
 def _kernels(
-    found: SkinAppearance, truth: SkinAppearance, subject: Subject, *, site: str, seed: int
-) -> Iterator[Trial]:
+    found: SkinAppearance, truth: SkinAppearance, subject: TrialSubject, *, site: str, seed: int
+) -> Iterator[IntervalTrial]:
     """Compare the kernels of strained states with those of more of the same skin."""
-    document = document_of(found, KERNEL_FILE)
+    document = read_document(found, KERNEL_FILE)
     fits = [fit for fit in document["fits"] if fit["valid"]] if document else []
     known = truth.parameters["states"]
     states = {str(s["name"]): s for s in known} if isinstance(known, list) else {}
@@ -100,7 +102,7 @@ def _kernels(
     rows: dict[str, list[tuple[float, float]]] = {"alpha": [], "sigma_um": []}
     for fit in fits:
         gradient = np.asarray(states[str(fit["name"])]["gradient"], np.float64)
-        true = kernel_of_skin(
+        true = fit_reference_kernel(
             site, seed=seed, stretch=float(np.linalg.norm(gradient[:, 0])), pixel_um=pixel_um
         )
         for key, half, half_95 in (
@@ -109,21 +111,21 @@ def _kernels(
         ):
             error = abs(float(fit[key]) - getattr(true, key))
             width = float(fit[half])
-            rows[key].append((deviation(error, width, float(fit[half_95])), width))
+            rows[key].append((normalized_deviation(error, width, float(fit[half_95])), width))
     for key, unit in (("alpha", ""), ("sigma_um", "um")):
         off, widths = np.array(rows[key], np.float64).reshape(-1, 2).T
         quantity = f"{key.removesuffix('_um')} of kernels"
-        yield subject.of_errors(quantity, off, np.ones(len(off)), unit=unit, widths=widths)
+        yield subject.error_trial(quantity, off, np.ones(len(off)), unit=unit, widths=widths)
 
 
-def deviation(error: float, half: float, half_95: float) -> float:
+def normalized_deviation(error: float, half: float, half_95: float) -> float:
     """Return an error in half widths of a 68 % interval whose 95 % one is stated by itself.
 
     Up to the first as it is, beyond so that the second is at a Gaussian's 1.96.
 
     Examples
     --------
-    >>> deviation(0.5, 1.0, 4.0), round(deviation(4.0, 1.0, 4.0), 2)
+    >>> normalized_deviation(0.5, 1.0, 4.0), round(normalized_deviation(4.0, 1.0, 4.0), 2)
     (0.5, 1.96)
     """
     if error <= half:
@@ -131,7 +133,7 @@ def deviation(error: float, half: float, half_95: float) -> float:
     return 1.0 + (GAUSSIAN_95 - 1.0) * (error - half) / (half_95 - half)
 
 
-def kernel_of_skin(site: str, *, seed: int, stretch: float, pixel_um: float) -> KernelFit:
+def fit_reference_kernel(site: str, *, seed: int, stretch: float, pixel_um: float) -> KernelFit:
     """Fit the kernel of `REFERENCE_SKIN_MM` of skin around the patch of a session.
 
     Parameters
@@ -144,10 +146,10 @@ def kernel_of_skin(site: str, *, seed: int, stretch: float, pixel_um: float) -> 
         Distance of the heights, um.
     """
     skin = make_micro_skin(site, seed=seed, size_mm=REFERENCE_SKIN_MM + SIMULATED_BORDER_MM)
-    strained = deform(skin, stretch=stretch, angle_deg=0.0)
+    strained = stretch_skin(skin, stretch=stretch, angle_deg=0.0)
     shown = []
     for state, sides in (
-        (deform(skin, stretch=1.0, angle_deg=0.0), (1.0, 1.0)),
+        (stretch_skin(skin, stretch=1.0, angle_deg=0.0), (1.0, 1.0)),
         (strained, (strained.gradient[0, 0], strained.gradient[1, 1])),
     ):
         columns, rows = (round(1e3 * REFERENCE_SKIN_MM * side / pixel_um) for side in sides)
@@ -157,7 +159,7 @@ def kernel_of_skin(site: str, *, seed: int, stretch: float, pixel_um: float) -> 
         )
         height = state.sample(x, y).height_um
         shown.append(high_pass(height, pixel=pixel_um, cutoff=CUTOFF_UM))
-    target = measure(shown[1], pixel=pixel_um)
+    target = measure_normals(shown[1], pixel=pixel_um)
     return fit_kernel(
         shown[0],
         target.histogram,

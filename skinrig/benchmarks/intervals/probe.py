@@ -13,12 +13,12 @@ from reconstruction.anisotropy import estimation as anisotropy
 from reconstruction.pipeline.probe.stages import ANISOTROPY_FILE, CHANNEL_NAMES, SUBSURFACE_FILE
 from rigsim.fiber.probe_tissue import PHANTOM_DEVIATIONS, phantom_certificate
 from rigsim.subject.pigment import MELANIN_PRESETS
-from skinrig.benchmarks.intervals.coverage import Trial
-from skinrig.benchmarks.intervals.trials import Subject, maps_of, simulated
+from skinrig.benchmarks.intervals.coverage import IntervalTrial
+from skinrig.benchmarks.intervals.trials import TrialSubject, reconstruct_maps, resimulate
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import skin_bands
 from skinrig.evaluating import subsurface as evaluation
-from skinrig.simulating.orders import Simulated
+from skinrig.simulating.orders import SimulationResult
 from skinrig.simulating.simulation import simulate_session
 
 PHOTON_BUDGET: Final = "full"
@@ -34,13 +34,13 @@ COEFFICIENT_LABELS: Final[Mapping[str, str]] = {
 }
 
 
-def probe(
+def run_trials(
     folder: Path,
     media: Mapping[int, str],
     *,
     skin: Mapping[int, str] | None = None,
     directed: Mapping[int, str] | None = None,
-) -> Iterator[Trial]:
+) -> Iterator[IntervalTrial]:
     """Yield trials of what the fibre probe tells of media, of skin and of directions.
 
     Parameters
@@ -57,24 +57,24 @@ def probe(
     """
     for seed, medium in media.items():
         done = _subject(folder, medium, seed, sites=("cheek",), size=PHOTON_BUDGET)
-        found, truth = maps_of(folder, done, ["subsurface"])
-        subject = Subject(f"{medium} {seed}")
-        yield of_decay("sigma_tr of media", found, truth, subject)
+        found, truth = reconstruct_maps(folder, done, ["subsurface"])
+        subject = TrialSubject(f"{medium} {seed}")
+        yield decay_trial("sigma_tr of media", found, truth, subject)
         for coefficient in COEFFICIENT_LABELS:
-            yield of_coefficient(coefficient, found, truth, subject)
+            yield coefficient_trial(coefficient, found, truth, subject)
     for seed, preset in (skin or {}).items():
         done = _subject(folder, preset, seed)
-        found, truth = maps_of(folder, done, ["subsurface"])
-        subject = Subject(f"{preset} {seed}", melanin_band_of(preset))
-        yield of_decay("sigma_tr of skin", found, truth, subject)
+        found, truth = reconstruct_maps(folder, done, ["subsurface"])
+        subject = TrialSubject(f"{preset} {seed}", preset_melanin_band(preset))
+        yield decay_trial("sigma_tr of skin", found, truth, subject)
     for seed, medium in (directed or {}).items():
         done = _subject(folder, medium, seed, sites=("cheek",), angles=(N_DIRECTIONS,))
-        found, truth = maps_of(folder, done, ["anisotropy"])
-        subject = Subject(f"{medium} {seed}")
-        yield from of_directions(found, truth, _farthest_deg(medium), subject)
+        found, truth = reconstruct_maps(folder, done, ["anisotropy"])
+        subject = TrialSubject(f"{medium} {seed}")
+        yield from direction_trials(found, truth, _farthest_deg(medium), subject)
 
 
-def _subject(folder: Path, subject: str, seed: int, **asked: Any) -> Simulated:
+def _subject(folder: Path, subject: str, seed: int, **options: Any) -> SimulationResult:
     """Simulate a subject under a probe that was calibrated for it, with a block of its own.
 
     Subjects that share a calibration share its errors, and the block's: they are one draw.
@@ -86,14 +86,12 @@ def _subject(folder: Path, subject: str, seed: int, **asked: Any) -> Simulated:
         "probe", phantom, target="phantom", seed=BLOCK_SEED_OFFSET + seed, size=PHOTON_BUDGET
     )
     paper = folder / "block.json"
-    paper.write_text(
-        json.dumps(drawn_certificate(np.random.default_rng([seed, BLOCK_SEED_OFFSET])))
-    )
+    paper.write_text(json.dumps(draw_certificate(np.random.default_rng([seed, BLOCK_SEED_OFFSET]))))
     calibrate("fibre", [phantom], folder / "calibration", phantom=paper)
-    return simulated("probe", folder, subject=subject, seed=seed, **asked)
+    return resimulate("probe", folder, subject=subject, seed=seed, **options)
 
 
-def drawn_certificate(rng: np.random.Generator) -> dict[str, Any]:
+def draw_certificate(rng: np.random.Generator) -> dict[str, Any]:
     """Return a certificate that is off the simulated block by errors as it states them.
 
     Parameters
@@ -103,7 +101,7 @@ def drawn_certificate(rng: np.random.Generator) -> dict[str, Any]:
 
     Examples
     --------
-    >>> one, two = (drawn_certificate(np.random.default_rng(k))["sigma_a_per_mm"] for k in (1, 2))
+    >>> one, two = (draw_certificate(np.random.default_rng(k))["sigma_a_per_mm"] for k in (1, 2))
     >>> round(one[0] / two[0], 3) == round(one[-1] / two[-1], 3) != 1.0
     True
     """
@@ -115,20 +113,20 @@ def drawn_certificate(rng: np.random.Generator) -> dict[str, Any]:
     return paper
 
 
-def melanin_band_of(preset: str) -> str:
+def preset_melanin_band(preset: str) -> str:
     """Return the band of melanin of a preset of the simulated people.
 
     Examples
     --------
-    >>> melanin_band_of("II"), melanin_band_of("VI")
+    >>> preset_melanin_band("II"), preset_melanin_band("VI")
     ('light', 'dark')
     """
-    return str(skin_bands.melanin_band(MELANIN_PRESETS[preset]))
+    return str(skin_bands.classify_melanin(MELANIN_PRESETS[preset]))
 
 
-def of_decay(
-    quantity: str, found: SkinAppearance, truth: SkinAppearance, subject: Subject
-) -> Trial:
+def decay_trial(
+    quantity: str, found: SkinAppearance, truth: SkinAppearance, subject: TrialSubject
+) -> IntervalTrial:
     """Compare valid fits of sigma_tr; their interval is one of the logarithm, its halves alike.
 
     Parameters
@@ -146,12 +144,12 @@ def of_decay(
     half = np.array([0.5 * np.log(fit.interval[1] / fit.interval[0]) for fit in fits])
     center = np.array([0.5 * np.log(fit.interval[1] * fit.interval[0]) for fit in fits])
     true = np.log(np.array([fit.truth for fit in fits]))
-    return subject.of_errors(quantity, np.abs(center - true), half)
+    return subject.error_trial(quantity, np.abs(center - true), half)
 
 
-def of_coefficient(
-    name: str, found: SkinAppearance, truth: SkinAppearance, subject: Subject
-) -> Trial:
+def coefficient_trial(
+    name: str, found: SkinAppearance, truth: SkinAppearance, subject: TrialSubject
+) -> IntervalTrial:
     """Compare sigma_a or sigma_s' of a homogeneous medium, where the fit says that it is told.
 
     Parameters
@@ -164,23 +162,23 @@ def of_coefficient(
         Of the trial.
     """
     known = evaluation.true_profiles(truth)
-    fitted = evaluation.document_of(found, SUBSURFACE_FILE) or {"measurements": []}
+    fitted = evaluation.read_document(found, SUBSURFACE_FILE) or {"measurements": []}
     off, stderr = [], []
     for entry in fitted["measurements"]:
-        true = known[evaluation.name_of(entry)][f"{name}_per_mm"]
+        true = known[evaluation.format_measurement_name(entry)][f"{name}_per_mm"]
         for fit in entry["fits"]:
             identified = fit["valid"] and fit["coefficients_identified"]
             if fit["method"] != evaluation.RECOMMENDED_METHOD or not identified:
                 continue
-            value = evaluation.number(fit[f"{name}_per_mm"])
+            value = evaluation.parse_number(fit[f"{name}_per_mm"])
             off.append(abs(value / true[CHANNEL_NAMES.index(fit["channel"])] - 1.0))
-            stderr.append(evaluation.number(fit[f"{name}_stderr"]) / value)
-    return subject.of_errors(COEFFICIENT_LABELS[name], np.array(off), np.array(stderr))
+            stderr.append(evaluation.parse_number(fit[f"{name}_stderr"]) / value)
+    return subject.error_trial(COEFFICIENT_LABELS[name], np.array(off), np.array(stderr))
 
 
-def of_directions(
-    found: SkinAppearance, truth: SkinAppearance, axis_deg: float, subject: Subject
-) -> Iterator[Trial]:
+def direction_trials(
+    found: SkinAppearance, truth: SkinAppearance, axis_deg: float, subject: TrialSubject
+) -> Iterator[IntervalTrial]:
     """Yield trials of axis and ratio of a medium that scatters by direction.
 
     Parameters
@@ -204,11 +202,11 @@ def of_directions(
     )
     turn = np.array([abs((row["axis_deg"] - axis_deg + 90.0) % 180.0 - 90.0) for row in rows])
     stderr = np.array([row["axis_stderr_deg"] for row in rows])
-    yield subject.of_errors("axis of anisotropy", turn, stderr, unit="degrees")
+    yield subject.error_trial("axis of anisotropy", turn, stderr, unit="degrees")
     ratio = np.array([true.ratio[CHANNEL_NAMES.index(row["channel"])] for row in rows])
     off = np.abs(np.array([row["ratio"] for row in rows]) - ratio)
     spread = np.array([row["ratio_stderr"] for row in rows])
-    yield subject.of_errors("ratio of anisotropy", off, spread, widths=spread / ratio)
+    yield subject.error_trial("ratio of anisotropy", off, spread, widths=spread / ratio)
 
 
 def _farthest_deg(medium: str) -> float:

@@ -16,9 +16,9 @@ import numpy as np
 
 from model import store
 from reconstruction.pipeline import recipes as pipeline
-from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, Trial
+from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, IntervalTrial
 from skinrig.benchmarks.intervals.flash import calibrate_flash
-from skinrig.benchmarks.intervals.trials import band_of, simulated, truth_of
+from skinrig.benchmarks.intervals.trials import resimulate, skin_color_band, truth_folder
 from skinrig.capturing.sequences import SequenceOrder
 from skinrig.simulating.sequence import COURSE_FILE
 
@@ -32,9 +32,9 @@ REACTION_RANGE_S: Final = (0.1, 0.4)
 one who knows the rhythm to that of one who is slow."""
 
 
-def sequences(
+def run_trials(
     folder: Path, subjects: Mapping[int, str], *, width_px: int, state: str
-) -> Iterator[Trial]:
+) -> Iterator[IntervalTrial]:
     """Yield trials of the time constant at each place of a face, and of the delay after prompts.
 
     Parameters
@@ -51,16 +51,16 @@ def sequences(
     calibrate_flash(folder, {"white": "white"}, width_px)
     for seed, preset in subjects.items():
         constant_s = TIME_CONSTANTS_S[state][seed % len(TIME_CONSTANTS_S[state])]
-        done = simulated(
+        done = resimulate(
             "flash",
             folder,
             subject=preset,
             seed=seed,
             width_px=width_px,
-            sequence=order_of(state, seed),
+            sequence=build_request(state, seed),
             relaxation_s=constant_s,
         )
-        truth = truth_of(done)
+        truth = truth_folder(done)
         pipeline.reconstruct(
             done.session,
             want=["perfusion_curves"],
@@ -71,14 +71,14 @@ def sequences(
         document = json.loads((folder / "maps" / "perfusion_curves.json").read_text("utf-8"))
         name, band = f"{preset} {seed}", _band(truth)
         fits = list(document["fits"].values())
-        yield of_fits(f"time constant after {state}", fits, constant_s, name, band)
+        yield fit_trial(f"time constant after {state}", fits, constant_s, name, band)
         course = json.loads((truth / COURSE_FILE).read_text("utf-8"))["constants_s"]
         if "reaction_s" in course:
             reaction_s = course["reaction_s"]
-            yield of_fits(f"delay of {state}", fits, reaction_s, name, band, delay=True)
+            yield fit_trial(f"delay of {state}", fits, reaction_s, name, band, delay=True)
 
 
-def order_of(state: str, seed: int) -> SequenceOrder:
+def build_request(state: str, seed: int) -> SequenceOrder:
     """Return the sequence of a subject, of prompts with a reaction time of their own.
 
     Parameters
@@ -89,13 +89,13 @@ def order_of(state: str, seed: int) -> SequenceOrder:
         Of the subject.
     """
     order = SequenceOrder(state=state)
-    if not order.prompted:
+    if not order.is_prompted:
         return order
     reaction_s = float(np.random.default_rng([seed, 16]).uniform(*REACTION_RANGE_S))
     return dataclasses.replace(order, reaction_s=reaction_s)
 
 
-def of_fits(
+def fit_trial(
     quantity: str,
     fits: Iterable[Mapping[str, Any]],
     true_s: float,
@@ -103,7 +103,7 @@ def of_fits(
     band: str,
     *,
     delay: bool = False,
-) -> Trial:
+) -> IntervalTrial:
     """Compare fits with the true time constant, or the true delay.
 
     A time constant counts by its own two intervals, which differ in length to both sides, and a
@@ -130,18 +130,18 @@ def of_fits(
         if delay:
             half = float(fit["stderr_delay_s"])
             best = float(fit["delay_s"])
-            inner, outer = (best - half, best + half), _ends(fit["delay_interval_s"])
+            inner, outer = (best - half, best + half), _interval_ends(fit["delay_interval_s"])
         else:
             best = float(fit["time_constant_s"])
-            inner, outer = _ends(fit["interval_68_s"]), _ends(fit["interval_s"])
-        off.append(deviation(best, true_s, inner, outer))
+            inner, outer = _interval_ends(fit["interval_68_s"]), _interval_ends(fit["interval_s"])
+        off.append(asymmetric_deviation(best, true_s, inner, outer))
         if fit["known"] == "estimated":
             widths.append(100.0 * 0.5 * (inner[1] - inner[0]) / true_s)
     width = float(np.median(widths)) if widths else float("nan")
-    return Trial(quantity, subject, band, np.array(off), width, "%", GAUSSIAN_95)
+    return IntervalTrial(quantity, subject, band, np.array(off), width, "%", GAUSSIAN_95)
 
 
-def deviation(
+def asymmetric_deviation(
     best: float, true: float, inner: tuple[float, float], outer: tuple[float, float]
 ) -> float:
     """Return how far off an estimate is in half widths of its 68 % interval to that side.
@@ -167,7 +167,7 @@ def deviation(
     return 2.0 * GAUSSIAN_95
 
 
-def _ends(interval: Sequence[float | None]) -> tuple[float, float]:
+def _interval_ends(interval: Sequence[float | None]) -> tuple[float, float]:
     """Return an interval as written, where null stands for an open upper end."""
     low, high = interval
     return 0.0 if low is None else float(low), math.inf if high is None else float(high)
@@ -176,4 +176,4 @@ def _ends(interval: Sequence[float | None]) -> tuple[float, float]:
 def _band(truth: Path) -> str:
     found = store.read(truth)
     name = "reflectance_blurred" if "reflectance_blurred" in found.maps else "reflectance"
-    return band_of(found, name, found.maps["mask"].values > 0.5)
+    return skin_color_band(found, name, found.maps["mask"].values > 0.5)

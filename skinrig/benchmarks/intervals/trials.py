@@ -16,19 +16,19 @@ import numpy as np
 from model.skin import SkinAppearance, SkinMap
 from model.store import read
 from reconstruction.pipeline.recipes import reconstruct
-from skinrig.appearances.contents import jointly_valid
+from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
-from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, Trial
+from skinrig.benchmarks.intervals.coverage import GAUSSIAN_95, IntervalTrial
 from skinrig.evaluating import skin_bands
 from skinrig.evaluating.surface import RAYLEIGH_68
-from skinrig.simulating.orders import Simulated
+from skinrig.simulating.orders import SimulationResult
 from skinrig.simulating.simulation import simulate_session
 
 ANY_BAND: Final = "any"
 """Band of quantities that do not depend on the color of the skin."""
 
 
-def band_of(truth: SkinAppearance, name: str, skin: BoolArray) -> str:
+def skin_color_band(truth: SkinAppearance, name: str, skin: BoolArray) -> str:
     """Return the band of the median color of a subject's skin.
 
     Parameters
@@ -41,27 +41,27 @@ def band_of(truth: SkinAppearance, name: str, skin: BoolArray) -> str:
         (H, W): pixels of skin.
     """
     color = truth.maps[name].values[skin]
-    return str(skin_bands.bands_of(np.median(skin_bands.typology_angle_deg(color))))
+    return str(skin_bands.classify_typology(np.median(skin_bands.typology_angle_deg(color))))
 
 
 @dataclass(frozen=True, slots=True)
-class Subject:
+class TrialSubject:
     """Whose intervals are tried."""
 
     name: str
     """Preset, site or medium, and seed."""
     band: str = ANY_BAND
 
-    def of_errors(
+    def error_trial(
         self,
         quantity: str,
-        off: FloatArray,
+        errors: FloatArray,
         half: FloatArray,
         *,
         unit: str = "%",
         widths: FloatArray | None = None,
         factor_95: float = GAUSSIAN_95,
-    ) -> Trial:
+    ) -> IntervalTrial:
         """Compare errors with the half widths of their 68 % intervals.
 
         Parameters
@@ -76,10 +76,10 @@ class Subject:
         shown = half if widths is None else widths
         to_unit = 100.0 if unit == "%" else 1.0
         width = float(to_unit * np.median(shown)) if shown.size else float("nan")
-        deviation = np.asarray(off / half, np.float64)
-        return Trial(quantity, self.name, self.band, deviation, width, unit, factor_95)
+        deviation = np.asarray(errors / half, np.float64)
+        return IntervalTrial(quantity, self.name, self.band, deviation, width, unit, factor_95)
 
-    def of_map(
+    def map_trial(
         self,
         quantity: str,
         estimate: SkinMap,
@@ -89,7 +89,7 @@ class Subject:
         channel: int | None = None,
         over: FloatArray | None = None,
         factor_95: float = GAUSSIAN_95,
-    ) -> Trial:
+    ) -> IntervalTrial:
         """Compare a map of numbers with the truth, where it is valid; widths are relative.
 
         Parameters
@@ -115,7 +115,7 @@ class Subject:
         """
         if estimate.stderr is None:
             raise ValueError(f"{quantity}: has no standard error, expected one")
-        good = skin & jointly_valid(estimate)
+        good = skin & intersect_valid(estimate)
         part = (good,) if channel is None else (good, channel)
         value, stderr, truth, whole = (
             np.asarray(values, np.float64)[part]
@@ -124,11 +124,11 @@ class Subject:
         with np.errstate(divide="ignore"):  # what is nothing has a width of infinity
             relative = np.asarray(stderr / np.abs(whole))
         off = np.abs(value - truth)
-        return self.of_errors(quantity, off, stderr, widths=relative, factor_95=factor_95)
+        return self.error_trial(quantity, off, stderr, widths=relative, factor_95=factor_95)
 
-    def of_normals(
+    def normal_trial(
         self, quantity: str, angle_rad: Float64Array, stderr_rad: FloatArray, *, factor_95: float
-    ) -> Trial:
+    ) -> IntervalTrial:
         """Compare directions: the 68 % region is a cone about the estimate.
 
         Parameters
@@ -142,18 +142,18 @@ class Subject:
         """
         reach = np.degrees(RAYLEIGH_68 * stderr_rad[:, 0].astype(np.float64))
         off = np.degrees(angle_rad)
-        return self.of_errors(quantity, off, reach, unit="degrees", factor_95=factor_95)
+        return self.error_trial(quantity, off, reach, unit="degrees", factor_95=factor_95)
 
 
-def simulated(rig: str, folder: Path, **asked: Any) -> Simulated:
+def resimulate(rig: str, folder: Path, **options: Any) -> SimulationResult:
     """Simulate a subject into a folder, where the one before it and its maps are taken away."""
     old = (folder / name for name in ("session-subject", "maps", "moving"))
     for place in (*old, *folder.glob("truth-subject*")):
         shutil.rmtree(place, ignore_errors=True)
-    return simulate_session(rig, folder / "session-subject", **asked)
+    return simulate_session(rig, folder / "session-subject", **options)
 
 
-def truth_of(done: Simulated) -> Path:
+def truth_folder(done: SimulationResult) -> Path:
     """Return the folder of a simulated session's truth.
 
     Raises
@@ -166,9 +166,9 @@ def truth_of(done: Simulated) -> Path:
     return done.truth
 
 
-def maps_of(
-    folder: Path, done: Simulated, want: Sequence[str]
+def reconstruct_maps(
+    folder: Path, done: SimulationResult, want: Sequence[str]
 ) -> tuple[SkinAppearance, SkinAppearance]:
     """Reconstruct a subject's maps into a folder's `maps`; return them and the truth."""
     reconstruct(done.session, want=want, out=folder / "maps", calibration=folder / "calibration")
-    return read(folder / "maps"), read(truth_of(done))
+    return read(folder / "maps"), read(truth_folder(done))

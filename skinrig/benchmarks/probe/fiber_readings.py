@@ -11,11 +11,11 @@ from capture.calibration.fiber.readings import FiberReadings, read_fibers
 from capture.calibration.fiber.spots import FiberSpots
 from capture.plan.probe import exposure_series_s
 from capture.rig import load_rig
-from rigsim.as_built.probe import ProbeTolerances, build_probe, unit_images
-from rigsim.sensor import expose, fixed_pattern, sensor_of
+from rigsim.as_built.probe import ProbeTolerances, build_probe, fiber_unit_images
+from rigsim.sensor import expose_sensor, fixed_pattern, make_sensor
 from skinrig.arrays import Float64Array, UInt16Array
-from skinrig.benchmarks.resampling import drawn_columns_median
-from skinrig.benchmarks.stage import Stage
+from skinrig.benchmarks.resampling import bootstrap_columns_median
+from skinrig.benchmarks.stage import BenchmarkStage
 
 PROBE_SEED = 5
 LIGHT_DECADES = 7.0
@@ -27,7 +27,7 @@ Frames = list[UInt16Array]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Bench:
+class _ProbeCamera:
     """A probe's camera and light of known amount."""
 
     frames: list[Frames]
@@ -42,18 +42,18 @@ class _Bench:
     """Of each fibre and color, summed over its aperture, (F, 3)."""
 
 
-def fibre_readings(stage: Stage) -> None:
+def fibre_readings(stage: BenchmarkStage) -> None:
     """Read 28 fibres whose light falls by seven decades with 1 to 23 exposures."""
     bench = _bench(draws=2 if stage.toy else N_NOISE_DRAWS)
     for count in (1, 3, 8, 23) if stage.toy else EXPOSURE_COUNTS:
-        chosen = _spread(len(bench.times), count)
+        chosen = _select_exposures(len(bench.times), count)
         results = [_read(bench, chosen, draw) for draw in range(len(bench.frames))]
         valid, signal, stderr = (
             np.array([getattr(r, name) for r in results]) for name in ("valid", "signal", "stderr")
         )
         # what is saturated in every exposure is not known at all
         miss = 100 * np.where(valid, np.abs(signal / bench.truth - 1), 1.0)
-        bound = np.sqrt(_bound(bench, chosen)) / bench.truth
+        bound = np.sqrt(_minimum_variance(bench, chosen)) / bench.truth
         # the median of a normal distribution's size is 0.674 of its deviation
         least = 67.4 * float(np.median(np.where(np.isfinite(bound), bound, 1 / 0.674)))
         timing, _ = stage.time(lambda: _read(bench, chosen, 0))
@@ -61,7 +61,7 @@ def fibre_readings(stage: Stage) -> None:
             "exposed_s": round(float(bench.times[chosen].sum()), 1),
             "measured_percent": round(float(100 * valid.mean()), 1),
         }
-        outcome = drawn_columns_median(miss.reshape(len(miss), -1), least, draws=400)
+        outcome = bootstrap_columns_median(miss.reshape(len(miss), -1), least, draws=400)
         stage.add({"exposures": count}, timing, outcome, also)
         away = ((signal - bench.truth) / np.where(valid, stderr, np.inf))[valid]
         relative = (signal / bench.truth - 1).reshape(-1, bench.truth.size)
@@ -72,21 +72,21 @@ def fibre_readings(stage: Stage) -> None:
     stage.limits |= {"rms": worst, "over_bound": ratio, "inside": inside, "inside_most": inside}
 
 
-def _bench(*, draws: int) -> _Bench:
+def _bench(*, draws: int) -> _ProbeCamera:
 
     rig = load_rig("probe")
     view = rig.views[0]
     build = build_probe(
         rig, seed=PROBE_SEED, tolerances=ProbeTolerances(crosstalk=0, wings=0, veil=0)
     )
-    sensor = sensor_of(view, dark_e_per_s=0.3, vignetting=0.1)
-    noise = CameraNoise.of_view(view)
+    sensor = make_sensor(view, dark_e_per_s=0.3, vignetting=0.1)
+    noise = CameraNoise.from_view(view)
     times = np.array(exposure_series_s())
     shape = (view.height_px, view.width_px)
     # the brightest reaches half of full scale in the shortest exposure
     light = 0.5 / times[0] * np.geomspace(1, 10.0**-LIGHT_DECADES, len(build.gain))[:, None]
     light = light * np.array([0.6, 1.0, 0.5])
-    images = unit_images(build, view).astype(np.float64)
+    images = fiber_unit_images(build, view).astype(np.float64)
     colors = color_masks(shape, view.cfa)
     response = fixed_pattern(sensor, shape).response.astype(np.float64)
     rate = np.zeros(shape)
@@ -116,24 +116,27 @@ def _bench(*, draws: int) -> _Bench:
     rng = np.random.default_rng(PROBE_SEED)
     dark_s = [times[k] for k in (0, 16, 22) for _ in range(4)]
     nothing = np.zeros((*shape, 3), np.float32)
-    darks = [expose(nothing, sensor=sensor, rng=rng, exposure_s=t) for t in dark_s]
+    darks = [expose_sensor(nothing, sensor=sensor, rng=rng, exposure_s=t) for t in dark_s]
     flat = np.divide(rate, response)[..., None] * np.ones(3)
     frames = [
-        [expose((flat * t).astype(np.float32), sensor=sensor, rng=rng, exposure_s=t) for t in times]
+        [
+            expose_sensor((flat * t).astype(np.float32), sensor=sensor, rng=rng, exposure_s=t)
+            for t in times
+        ]
         for _ in range(draws)
     ]
     model = measure_darks(darks, dark_s, noise=noise)
-    return _Bench(frames, times, spots, model, noise, rate, truth)
+    return _ProbeCamera(frames, times, spots, model, noise, rate, truth)
 
 
-def _read(bench: _Bench, chosen: Sequence[int], draw: int) -> FiberReadings:
+def _read(bench: _ProbeCamera, chosen: Sequence[int], draw: int) -> FiberReadings:
     frames = [bench.frames[draw][k] for k in chosen]
     return read_fibers(
         frames, bench.times[list(chosen)], spots=bench.spots, darks=bench.darks, noise=bench.noise
     )
 
 
-def _bound(bench: _Bench, chosen: Sequence[int]) -> Float64Array:
+def _minimum_variance(bench: _ProbeCamera, chosen: Sequence[int]) -> Float64Array:
     """Return the least variance of each fibre's light, infinite where a pixel is saturated.
 
     Of all pixels' light known from the frames that are not saturated, the dark signal known.
@@ -157,7 +160,7 @@ def _bound(bench: _Bench, chosen: Sequence[int]) -> Float64Array:
     )
 
 
-def _spread(total: int, count: int) -> list[int]:
+def _select_exposures(total: int, count: int) -> list[int]:
     """Return which exposures to take: the longest, or evenly from the shortest to the longest."""
     if count == 1:
         return [total - 1]

@@ -9,9 +9,9 @@ import numpy as np
 from model import store
 from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.probe.profile_fits import METHOD_NAMES
-from skinrig.benchmarks.resampling import drawn_median
-from skinrig.benchmarks.results import BandError, Knobs
-from skinrig.benchmarks.stage import Stage
+from skinrig.benchmarks.resampling import bootstrap_median
+from skinrig.benchmarks.results import ErrorEstimate, Knobs
+from skinrig.benchmarks.stage import BenchmarkStage
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import subsurface as evaluation
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
@@ -27,7 +27,7 @@ BAND_G = 0.8
 """g of the media that stand for bands of skin."""
 
 
-def session(stage: Stage) -> None:
+def session(stage: BenchmarkStage) -> None:
     """Capture, calibrate and invert media whose sigma_tr is known; seconds are of the inversion."""
     with tempfile.TemporaryDirectory(prefix="skinrig-probe-") as name:
         folder = Path(name)
@@ -47,9 +47,9 @@ def session(stage: Stage) -> None:
         for seed in () if stage.toy else range(FIRST_MEDIUM_SEED, FIRST_MEDIUM_SEED + N_MEDIA):
             last = _captured(folder, f"{seed}", medium(seed), seed)
             rows += _invert(folder, last)
-        stage.by_band |= {name: _best(some) for name, some in of_bands.items()}
+        stage.by_band |= {name: _default_method_error(some) for name, some in of_bands.items()}
         timing, _ = stage.time(lambda: _invert(folder, last, "again"), repeats=1, memory=False)
-    by_method = {row.method: row for row in evaluation.by_method(rows)}
+    by_method = {row.method: row for row in evaluation.summarize_methods(rows)}
     for method in (name for name in METHOD_NAMES if name in by_method):
         valid = [row for row in rows if row.method == method and row.valid]
         for channel in ("all", *sorted({row.channel for row in valid})):
@@ -88,7 +88,7 @@ def medium(seed: int) -> tuple[float, float, float]:
     return sigma_a, sigma_s_prime, g
 
 
-def _invert(folder: Path, session: Path, name: str = "") -> list[evaluation.FitError]:
+def _invert(folder: Path, session: Path, name: str = "") -> list[evaluation.FitAccuracy]:
     out = folder / f"appearance-{name or session.name}"
     pipeline.reconstruct(
         session,
@@ -113,13 +113,13 @@ def _captured(folder: Path, name: str, coefficients: tuple[float, float, float],
     return folder / f"session-{name}"
 
 
-def _best(rows: list[evaluation.FitError]) -> BandError:
+def _default_method_error(rows: list[evaluation.FitAccuracy]) -> ErrorEstimate:
     """Return the error of the usual method over the channels of one medium, %."""
     sizes = [abs(row.relative) for row in rows if row.method == METHOD_NAMES[0] and row.valid]
     return _error(sizes)
 
 
-def _error(sizes: list[float]) -> BandError:
+def _error(sizes: list[float]) -> ErrorEstimate:
     """Return the median in percent, with its interval."""
     percent = 100 * np.array(sizes)
-    return drawn_median(percent, draws=400)
+    return bootstrap_median(percent, draws=400)

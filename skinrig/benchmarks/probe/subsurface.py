@@ -9,13 +9,13 @@ from scipy.optimize import least_squares
 from model.dipole import kienle_patterson as diffusion
 from reconstruction import subsurface
 from reconstruction.subsurface.models import Method
-from rigsim.fiber.profile import fibre_profile
+from rigsim.fiber.profile import trace_fiber_profile
 from rigsim.tissue.tissue_mc import Layer, LayerStack
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.benchmarks.measurement import processor_seconds
-from skinrig.benchmarks.resampling import drawn_columns_median, median_error
-from skinrig.benchmarks.results import BandError, Knobs
-from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.benchmarks.resampling import bootstrap_columns_median, median_error
+from skinrig.benchmarks.results import ErrorEstimate, Knobs
+from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, MelaninBand
 
 FIBER_RADII_MM = 0.3 + 0.25 * np.arange(28)
@@ -44,7 +44,7 @@ def transport_profiles(*, toy: bool) -> tuple[Float64Array, Float64Array, Float6
     profiles, errors = np.empty((2, len(media), FIBER_RADII_MM.size))
     for n, (a, s) in enumerate(media):
         g = (0.8, 0.73, 0.9)[n % 3]
-        found = fibre_profile(
+        found = trace_fiber_profile(
             LayerStack((Layer(inf, a, s / (1.0 - g), g, 1.4),)),
             radii_mm=FIBER_RADII_MM,
             photons=3_000 if toy else 100_000,
@@ -56,7 +56,7 @@ def transport_profiles(*, toy: bool) -> tuple[Float64Array, Float64Array, Float6
     return sigma_tr, profiles, errors
 
 
-def tiers(stage: Stage) -> None:
+def tiers(stage: BenchmarkStage) -> None:
     """Fit Monte Carlo profiles by the three models, with all fibres and with fewer."""
     rng = np.random.default_rng(1)
     sigma_tr, profiles, errors = transport_profiles(toy=stage.toy)
@@ -98,7 +98,7 @@ def tiers(stage: Stage) -> None:
         radius = FIBER_RADII_MM[part]
         knobs: Knobs = {"model": method, "fibres": radius.size}
         knobs |= {"from mm": float(radius[0]), "to mm": float(radius[-1])}
-        stage.add(knobs, timing, drawn_columns_median(error))
+        stage.add(knobs, timing, bootstrap_columns_median(error))
         if part == slice(None):
             bias = np.median(relative[:, spread], axis=0)
             low, high = np.moveaxis(found.interval_per_mm, -1, 0)
@@ -111,7 +111,7 @@ def tiers(stage: Stage) -> None:
 
 def _tier_limits(
     method: Method, error: Float64Array, bias: Float64Array, inside: BoolArray, best: Float64Array
-) -> Findings:
+) -> LimitValues:
     """Return what is found of a model with all fibres; `best` is the photon table's bias."""
     if method == "dipole":
         over_table = float(np.median(np.abs(bias))) / max(float(np.median(np.abs(best))), 1e-9)
@@ -132,7 +132,7 @@ def _tier_limits(
     }
 
 
-def _least_error(
+def _minimum_error(
     sigma_a: Float64Array, sigma_s: Float64Array, variance: Float64Array
 ) -> Float64Array:
     """Return the Cramér-Rao bound of each profile's relative error of sigma_tr, (N,)."""
@@ -158,7 +158,7 @@ def _absorbs_like(sigma_a: Float64Array, band: MelaninBand) -> BoolArray:
     return np.asarray(np.abs(np.log(sigma_a / band.sigma_a_per_mm)) < np.log(2.0))
 
 
-def batches(stage: Stage) -> None:
+def batches(stage: BenchmarkStage) -> None:
     """Fit batches of 28 fibres by diffusion; 30,000 beside a loop of SciPy's least_squares."""
     rng = np.random.default_rng(2)
     count = 200 if stage.toy else N_BATCH_PROFILES
@@ -178,7 +178,7 @@ def batches(stage: Stage) -> None:
             model_error=model_error,
         )
 
-    drawn = np.abs(_least_error(a, s, variance) * rng.standard_normal(count))
+    drawn = np.abs(_minimum_error(a, s, variance) * rng.standard_normal(count))
     for model_error in (0.0, None):
         for n in (count // 10, count):
             timing, made = stage.time(lambda: ours(n, model_error))
@@ -190,11 +190,11 @@ def batches(stage: Stage) -> None:
             stage.add({"profiles": n, "model error": own}, timing, outcome)
             if not stage.by_band and n == count:
 
-                def on_skin(band: MelaninBand) -> BandError:
+                def on_skin(band: MelaninBand) -> ErrorEstimate:
                     some = _absorbs_like(a, band)
                     return median_error(error[some], float(np.median(drawn[some])))
 
-                stage.on_each_skin(on_skin)
+                stage.measure_bands(on_skin)
     if not stage.toy:
         found, above, apart = ours(), [], []
         start = np.log([0.1, 1.0])

@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from model.dipole import direct_sum as dipole_sum
-from model.dipole.direct_sum import Media, exitance_directly
+from model.dipole.direct_sum import DipoleMedia, sum_exitance
 from model.dipole.gather import GATHER_TOL, SourceTree, gather
 from model.fresnel import ETA_SKIN
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.measurement import measure, processor_seconds, spent
-from skinrig.benchmarks.resampling import drawn_rms
-from skinrig.benchmarks.results import BandError, Knobs, Timing
-from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.benchmarks.measurement import measure, measure_processor_time, processor_seconds
+from skinrig.benchmarks.resampling import bootstrap_rms
+from skinrig.benchmarks.results import ErrorEstimate, Knobs, Timing
+from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 from skinrig.evaluating.skin_bands import MelaninBand
 
 FULL_SIDE_PX = 512
@@ -30,17 +30,17 @@ EDGE_POSITIONS_MM = np.linspace(-3.0, 3.0, 60)
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class LitFace:
     """A face as texels, lit from one side, with a cast shadow."""
 
-    place: Float64Array
+    position_mm: Float64Array
     area: Float64Array
-    entered: Float64Array
+    irradiance: Float64Array
     r_d: Float64Array
     translucency_mm: Float64Array
 
 
-def face(side: int) -> Scene:
+def face(side: int) -> LitFace:
     """Make a face of 160 mm x 220 mm as side x side texels, albedo and translucency varying."""
     u, v = np.meshgrid(np.linspace(-1, 1, side), np.linspace(1, -1, side))
     x, y = 80.0 * u, 110.0 * v
@@ -50,7 +50,7 @@ def face(side: int) -> Scene:
     area = np.linalg.norm(across, axis=-1)
     lit = np.clip(across @ np.array([0.8, 0.3, 0.52]) / area, 0.0, None)
     lit[(x - y > 20.0) & (x - y < 50.0)] = 0.0
-    return Scene(
+    return LitFace(
         place.reshape(-1, 3),
         area.ravel(),
         lit.reshape(-1, 1) * np.array([1.0, 0.9, 0.8]),
@@ -59,7 +59,7 @@ def face(side: int) -> Scene:
     )
 
 
-def edge_profile(x_mm: Float64Array, media: Media) -> Float64Array:
+def edge_profile(x_mm: Float64Array, media: DipoleMedia) -> Float64Array:
     """Return the share of even light on x < 0 that comes out at x, by a 1-D integral."""
     widest = 40.0 / float(media.sigma_tr_per_mm)
     t = widest * np.linspace(0.0, 1.0, 20_001) ** 3
@@ -70,36 +70,36 @@ def edge_profile(x_mm: Float64Array, media: Media) -> Float64Array:
     return np.asarray(np.where(x_mm >= 0.0, beyond, 1.0 - beyond))
 
 
-def gathering(stage: Stage) -> None:
+def gathering(stage: BenchmarkStage) -> None:
     """Gather light over a face: tolerance of the tree; then a shadow's edge: number of sources."""
     rng = np.random.default_rng(0)
     _tolerances(stage, rng)
     _edges(stage, rng)
     if not stage.toy:
         stage.limits = _full_size(rng)
-    stage.on_each_skin(lambda band: _on_skin(band, rng))
+    stage.measure_bands(lambda band: _on_skin(band, rng))
 
 
-def _tolerances(stage: Stage, rng: np.random.Generator) -> None:
+def _tolerances(stage: BenchmarkStage, rng: np.random.Generator) -> None:
     side, steps = (48, 3) if stage.toy else (256, 6)
     scene = face(side)
     at = rng.choice(len(scene.area), 40 if stage.toy else 100, replace=False)
-    truth = _directly(scene, at)
+    truth = _sum_directly(scene, at)
     for tolerance in (10.0 ** (1.0 - k) for k in range(steps)):
-        tree = SourceTree.of(scene.place, scene.area)
+        tree = SourceTree.of(scene.position_mm, scene.area)
         timing, found = stage.time(lambda: _gathered(scene, tree, tolerance), repeats=1)
-        error = (found[at] - truth) / (scene.r_d[at] * scene.entered.max())
+        error = (found[at] - truth) / (scene.r_d[at] * scene.irradiance.max())
         knobs: Knobs = {"scene": "face", "texels": side**2, "tolerance": tolerance}
         stage.add(knobs, timing, _rms(error, rng))
-    direct = measure(lambda: _directly(scene, at[:10]), repeats=1, memory=False)
+    direct = measure(lambda: _sum_directly(scene, at[:10]), repeats=1, memory=False)
     seconds = direct.seconds * side**2 / 10
     why = "its seconds are extrapolated from those of 10 points"
     timing = Timing(seconds, (seconds, seconds), direct.cold_s, None, no_memory=why)
     knobs = {"scene": "face", "texels": side**2, "sum": "direct, NumPy, extrapolated"}
-    stage.add(knobs, timing, BandError.around(0.0, 0.0))
+    stage.add(knobs, timing, ErrorEstimate.symmetric(0.0, 0.0))
 
 
-def _edges(stage: Stage, rng: np.random.Generator) -> None:
+def _edges(stage: BenchmarkStage, rng: np.random.Generator) -> None:
     truth = _edge_truth(MEAN_R_D, MEAN_TRANSLUCENCY_MM)
     for step in (0.8, 0.4) if stage.toy else (1.6, 0.8, 0.4, 0.2):
         for known in (False, True):
@@ -111,11 +111,11 @@ def _edges(stage: Stage, rng: np.random.Generator) -> None:
 
 def _edge_truth(r_d: Float64Array, translucency_mm: Float64Array) -> Float64Array:
     """Return the true profile of a shadow's edge in three channels, (X, 3)."""
-    media = [Media.of(r, t, eta=ETA_SKIN) for r, t in zip(r_d, translucency_mm, strict=True)]
+    media = [DipoleMedia.of(r, t, eta=ETA_SKIN) for r, t in zip(r_d, translucency_mm, strict=True)]
     return np.stack([edge_profile(EDGE_POSITIONS_MM, medium) for medium in media], axis=-1)
 
 
-def _on_skin(band: MelaninBand, rng: np.random.Generator) -> BandError:
+def _on_skin(band: MelaninBand, rng: np.random.Generator) -> ErrorEstimate:
     """Return the error of a shadow's edge on skin, over its own R_d."""
     sigma_tr = np.sqrt(
         3.0 * band.sigma_a_per_mm * (band.sigma_a_per_mm + band.sigma_s_prime_per_mm)
@@ -126,7 +126,7 @@ def _on_skin(band: MelaninBand, rng: np.random.Generator) -> BandError:
 
 def _edge(
     step_mm: float,
-    known: bool,
+    exact_coefficients: bool,
     *,
     skin: tuple[Float64Array, Float64Array] = (MEAN_R_D, MEAN_TRANSLUCENCY_MM),
 ) -> Float64Array:
@@ -144,56 +144,65 @@ def _edge(
     )
     own = np.repeat(EDGE_POSITIONS_MM[:, None] < 0.0, 3, axis=1).astype(np.float64)
     tree = SourceTree.of(place, np.full(len(place), step_mm**2))
-    found = gather(tree, lit, at, *skin, entered_at=own if known else None)
+    found = gather(tree, lit, at, *skin, entered_at=own if exact_coefficients else None)
     return np.asarray(found.exitance / skin[0])
 
 
-def _gathered(scene: Scene, tree: SourceTree, tolerance: float = GATHER_TOL) -> Float64Array:
+def _gathered(scene: LitFace, tree: SourceTree, tolerance: float = GATHER_TOL) -> Float64Array:
     return gather(
-        tree, scene.entered, scene.place, scene.r_d, scene.translucency_mm, tolerance=tolerance
+        tree,
+        scene.irradiance,
+        scene.position_mm,
+        scene.r_d,
+        scene.translucency_mm,
+        tolerance=tolerance,
     ).exitance
 
 
-def _directly(scene: Scene, at: NDArray[np.intp]) -> Float64Array:
+def _sum_directly(scene: LitFace, at: NDArray[np.intp]) -> Float64Array:
     with threadpool_limits(1):
-        return exitance_directly(
-            scene.place,
+        return sum_exitance(
+            scene.position_mm,
             scene.area,
-            scene.entered,
-            scene.place[at],
+            scene.irradiance,
+            scene.position_mm[at],
             scene.r_d[at],
             scene.translucency_mm[at],
         )
 
 
-def _rms(error: Float64Array, rng: np.random.Generator) -> BandError:
+def _rms(error: Float64Array, rng: np.random.Generator) -> ErrorEstimate:
     """Return the root mean square in percent with its 68 % bootstrap interval over points."""
-    found = drawn_rms((error**2).mean(axis=-1), rng=rng)
+    found = bootstrap_rms((error**2).mean(axis=-1), rng=rng)
     low, high = found.error_interval
-    return BandError(100.0 * found.error, (100.0 * low, 100.0 * high))
+    return ErrorEstimate(100.0 * found.error, (100.0 * low, 100.0 * high))
 
 
-def _full_size(rng: np.random.Generator) -> Findings:
+def _full_size(rng: np.random.Generator) -> LimitValues:
     """Gather 512 x 512 texels at as many exit points, and some of them directly."""
     scene = face(FULL_SIDE_PX)
     gathered = partial(_gathered, scene)
-    spent_s = processor_seconds(lambda: gathered(SourceTree.of(scene.place, scene.area)), 2)
-    tree = SourceTree.of(scene.place, scene.area)
+    spent_s = processor_seconds(lambda: gathered(SourceTree.of(scene.position_mm, scene.area)), 2)
+    tree = SourceTree.of(scene.position_mm, scene.area)
     found = gathered(tree)
     at = rng.choice(len(scene.area), 80, replace=False)
-    peer_s, truth = spent(lambda: _directly(scene, at))
+    peer_s, truth = measure_processor_time(lambda: _sum_directly(scene, at))
     peer_s *= len(scene.area) / len(at)
-    seen = truth > MIN_RELATIVE_EXITANCE * (scene.r_d * scene.entered.max())[at]
+    seen = truth > MIN_RELATIVE_EXITANCE * (scene.r_d * scene.irradiance.max())[at]
     relative = np.abs(found[at] / np.where(seen, truth, 1.0) - 1.0)[seen]
     even = gather(
-        tree, np.ones_like(scene.entered), scene.place[at], scene.r_d[at], scene.translucency_mm[at]
+        tree,
+        np.ones_like(scene.irradiance),
+        scene.position_mm[at],
+        scene.r_d[at],
+        scene.translucency_mm[at],
     ).exitance
     plane = _plane_level()
     return {
         "seconds": spent_s,
         "local": float(100.0 * np.quantile(relative, 0.95)),
         "largest": float(
-            100.0 * np.max(np.abs(found[at] - truth) / (scene.r_d[at] * scene.entered.max()))
+            100.0 * np.max(np.abs(found[at] - truth) / (scene.r_d[at] * scene.irradiance.max()))
         ),
         "even": float(np.max(np.abs(even / scene.r_d[at] - 1.0))),
         "plane": 100.0 * plane,

@@ -11,15 +11,15 @@ from model.tissue_optics import layers as tissue_optics
 from rigsim.tissue.skin_table import SkinTable
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.resampling import median_error
-from skinrig.benchmarks.results import BandError, Knobs
-from skinrig.benchmarks.stage import Stage
-from skinrig.evaluating.skin_bands import MELANIN_BANDS, melanin_band
+from skinrig.benchmarks.results import ErrorEstimate, Knobs
+from skinrig.benchmarks.stage import BenchmarkStage
+from skinrig.evaluating.skin_bands import MELANIN_BANDS, classify_melanin
 
 BAND_TABLE_SIZE = 64
 """Of the table that errors by band are of."""
 
 
-def layered_reflectance(stage: Stage) -> None:
+def layered_reflectance(stage: BenchmarkStage) -> None:
     """Compare the tiers of the layered reflectance with the simulator's Monte Carlo table."""
     rng = np.random.default_rng(0)
     truth = SkinTable.load()
@@ -48,11 +48,11 @@ def layered_reflectance(stage: Stage) -> None:
         stage.measure(
             knobs, partial(evaluate, knobs), lambda found: median_error(relative(found), rng=rng)
         )
-    off, bands = relative(evaluate(tiers[-1])), melanin_band(c_m)
+    off, bands = relative(evaluate(tiers[-1])), classify_melanin(c_m)
     stage.by_band |= {band: median_error(off[bands == band]) for band in MELANIN_BANDS}
 
 
-def table(stage: Stage) -> None:
+def table(stage: BenchmarkStage) -> None:
     """Measure the color table's interpolation error in Delta E 2000 over its size."""
     rng = np.random.default_rng(0)
     count = 40 if stage.toy else 400
@@ -74,23 +74,23 @@ def table(stage: Stage) -> None:
             ("bilinear", _bilinear(made, c_m, c_hd)),
         ):
             difference = delta_e_2000(_lab(color), reference)
-            outcome = _largest(difference)
+            outcome = _max_error(difference)
             stage.add({"size": size, "between nodes": between}, timing, outcome)
             if (size, between) == (BAND_TABLE_SIZE, "spline"):
-                bands = melanin_band(c_m)
-                stage.by_band |= {b: _largest(difference[bands == b]) for b in MELANIN_BANDS}
+                bands = classify_melanin(c_m)
+                stage.by_band |= {b: _max_error(difference[bands == b]) for b in MELANIN_BANDS}
             if outcome.error < 0.5 and not np.isfinite(stage.limits["smallest", between]):
                 stage.limits["smallest", between] = size
 
 
-def _largest(difference: Float64Array) -> BandError:
+def _max_error(difference: Float64Array) -> ErrorEstimate:
     """Return the largest error; its 68 % interval is by the two largest seen.
 
     Robson and Whitlock 1964, Biometrika 51, 33, doi 10.1093/biomet/51.1-2.33.
     """
     second, worst = np.sort(difference)[-2:]
     most = float(worst + 0.68 / 0.32 * (worst - second))
-    return BandError(float(worst), (float(worst), most))
+    return ErrorEstimate(float(worst), (float(worst), most))
 
 
 def _bilinear(made: color_table.ColorTable, c_m: Float64Array, c_hd: Float64Array) -> Float64Array:

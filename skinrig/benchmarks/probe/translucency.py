@@ -16,13 +16,13 @@ from reconstruction.subsurface.probe_sites import SITE_UV
 from reconstruction.subsurface.translucency import TEXTURE_MM, TranslucencyPrior
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import processor_seconds
-from skinrig.benchmarks.resampling import rms_of_draws
-from skinrig.benchmarks.results import BandError
-from skinrig.benchmarks.stage import Stage
+from skinrig.benchmarks.resampling import gaussian_rms
+from skinrig.benchmarks.results import ErrorEstimate
+from skinrig.benchmarks.stage import BenchmarkStage
 from skinrig.evaluating.skin_bands import MelaninBand
 
-Way = Literal["sigma_tr", "profiles"]
-WAYS: tuple[Way, ...] = ("sigma_tr", "profiles")
+AnisotropyMethod = Literal["sigma_tr", "profiles"]
+ANISOTROPY_METHODS: tuple[AnisotropyMethod, ...] = ("sigma_tr", "profiles")
 
 FIBER_RADII_MM = 0.3 + 0.25 * np.arange(28)
 Medium = tuple[float, float]
@@ -65,11 +65,15 @@ def _profiles(
     return np.asarray(seen + DARK_NOISE * rng.standard_normal(shape))
 
 
-def _told(
-    way: Way, angle: Float64Array, profiles: Float64Array, *, medium: Medium = MEDIUM_PER_MM
+def _estimate_anisotropy(
+    method: AnisotropyMethod,
+    angle: Float64Array,
+    profiles: Float64Array,
+    *,
+    medium: Medium = MEDIUM_PER_MM,
 ) -> anisotropy.Anisotropy:
     variance = np.full(profiles.shape, DARK_NOISE**2)
-    if way == "profiles":
+    if method == "profiles":
         return profile_anisotropy.estimate_from_profiles(
             angle,
             FIBER_RADII_MM,
@@ -113,7 +117,7 @@ def _bound(count: int, medium: Medium = MEDIUM_PER_MM) -> float:
     return 2.0 * of_one * math.sqrt(2.0 / count)
 
 
-def directions(stage: Stage) -> None:
+def directions(stage: BenchmarkStage) -> None:
     """Tell ratios from 5 to 64 directions, by fits of each and by comparing profiles."""
     rng = np.random.default_rng(0)
     cases = 12 if stage.toy else 200
@@ -121,38 +125,40 @@ def directions(stage: Stage) -> None:
         angle = _directions(count)
         profiles = _profiles(angle, TRUE_RATIO, cases, rng=rng)
         one = profiles[:, :3]  # three channels of one measurement
-        for way in WAYS:
-            timing, _ = stage.time(lambda: _told(way, angle, one), memory=False)
-            outcome = _ratio_error(_told(way, angle, profiles), _bound(count))
+        for way in ANISOTROPY_METHODS:
+            timing, _ = stage.time(lambda: _estimate_anisotropy(way, angle, one), memory=False)
+            outcome = _ratio_error(_estimate_anisotropy(way, angle, profiles), _bound(count))
             stage.add({"way": way, "directions": count}, timing, outcome)
     angle = _directions(16)
 
-    def on_skin(band: MelaninBand) -> BandError:
+    def on_skin(band: MelaninBand) -> ErrorEstimate:
         medium = band.sigma_a_per_mm, band.sigma_s_prime_per_mm
         profiles = _profiles(angle, TRUE_RATIO, cases, medium=medium, rng=rng)
-        return _ratio_error(_told("profiles", angle, profiles, medium=medium), _bound(16, medium))
+        return _ratio_error(
+            _estimate_anisotropy("profiles", angle, profiles, medium=medium), _bound(16, medium)
+        )
 
-    stage.on_each_skin(on_skin)
+    stage.measure_bands(on_skin)
     if not stage.toy:
-        _judge_directions(stage, rng)
+        _evaluate_directions(stage, rng)
 
 
-def _ratio_error(found: anisotropy.Anisotropy, bound: float) -> BandError:
+def _ratio_error(found: anisotropy.Anisotropy, bound: float) -> ErrorEstimate:
     """Return the error of the log of the ratio, of cases of which one is used up."""
     off = np.log(found.ratio) - math.log(TRUE_RATIO)
-    return rms_of_draws(off, bound=bound, freedom=len(found.ratio) - 1)
+    return gaussian_rms(off, bound=bound, freedom=len(found.ratio) - 1)
 
 
-def _judge_directions(stage: Stage, rng: np.random.Generator) -> None:
+def _evaluate_directions(stage: BenchmarkStage, rng: np.random.Generator) -> None:
     cases = 1000
     angle = _directions(16)
     null = _profiles(angle, 1.0, cases, rng=rng)
     # an outlier left out by mistake may add its own rate
     most = float(stats.binom.isf(LIMIT_FALSE_ALARM_PROBABILITY, cases, FALSE_ALARM_RATE + 0.001))
-    for way in WAYS:
-        alarms = float((_told(way, angle, null).p_value < FALSE_ALARM_RATE).sum())
+    for way in ANISOTROPY_METHODS:
+        alarms = float((_estimate_anisotropy(way, angle, null).p_value < FALSE_ALARM_RATE).sum())
         stage.limits["alarms", str(cases), way] = (alarms, most)
-    fits, profiles = (stage.at(way=way, directions=16).error for way in WAYS)
+    fits, profiles = (stage.at(way=way, directions=16).error for way in ANISOTROPY_METHODS)
     stage.limits |= {"over_bound": profiles / _bound(16), "over_profiles": fits / profiles}
 
 
@@ -167,7 +173,7 @@ def _root(prior: TranslucencyPrior, uv: Float64Array) -> Float64Array:
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def sites(stage: Stage) -> None:
+def sites(stage: BenchmarkStage) -> None:
     """Map 1/sigma_tr from 1 to 16 sites, beside scikit-learn."""
     rng = np.random.default_rng(0)
     whole = translucency.population_prior()
@@ -204,12 +210,12 @@ def sites(stage: Stage) -> None:
         )
         error, bound = (math.sqrt(float(np.mean(part))) for part in (squares, stated))
         spread = float(np.std(squares)) / math.sqrt(faces) / (2 * error)
-        outcome = BandError.around(error, spread, bound)
+        outcome = ErrorEstimate.symmetric(error, spread, bound)
         stage.add({"sites": count, "side": size}, timing, outcome)
         if count == 3:
             within, three_sites = float(np.mean(inside)), error
     if not stage.toy:
-        times, mismatch = _beside_scikit_learn(prior, named)
+        times, mismatch = _compare_with_scikit_learn(prior, named)
         # of a patch without sites nothing is known but the population
         alone = math.hypot(float(prior.person_deviation[0]), float(prior.place_deviation[0]))
         stage.limits = {
@@ -221,7 +227,7 @@ def sites(stage: Stage) -> None:
         }
 
 
-def _beside_scikit_learn(prior: TranslucencyPrior, uv: Float64Array) -> tuple[float, float]:
+def _compare_with_scikit_learn(prior: TranslucencyPrior, uv: Float64Array) -> tuple[float, float]:
     """Return how many times faster than its Gaussian process, and the largest difference."""
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel

@@ -9,13 +9,13 @@ import numpy as np
 from numba import njit
 
 from capture.rig import load_rig
-from rigsim.fiber.profile import fibre_profile
+from rigsim.fiber.profile import trace_fiber_profile
 from rigsim.render import RenderError, look_at, radiance
-from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
+from rigsim.tissue.tissue_mc import Layer, LayerStack, trace_photons
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.measurement import LIMIT_CORES, spent
-from skinrig.benchmarks.results import BandError, Knobs
-from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.benchmarks.measurement import LIMIT_CORES, measure_processor_time
+from skinrig.benchmarks.results import ErrorEstimate, Knobs
+from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 from skinrig.evaluating.skin_bands import MelaninBand
 
 RED_MEDIUM_PER_MM = (
@@ -31,7 +31,7 @@ N_PEER_RUNS = 20
 
 
 @njit(cache=True, nogil=True)
-def plain_walk(sigma_a, sigma_s, g, eta, photons, seed, sine, edges2, rings):  # type: ignore[no-untyped-def]
+def trace_half_space(sigma_a, sigma_s, g, eta, photons, seed, sine, edges2, rings):  # type: ignore[no-untyped-def]
     """Trace photons in a half-space as MCML does, one event after another; the sum that leaves.
 
     `rings` gets the weights that leave within a cone of that sine, by r^2; nothing is made clever.
@@ -93,7 +93,7 @@ def plain_walk(sigma_a, sigma_s, g, eta, photons, seed, sine, edges2, rings):  #
     return total
 
 
-def photon_transport(stage: Stage) -> None:
+def photon_transport(stage: BenchmarkStage) -> None:
     """Trace the probe's fibres by next event and by photons that leave in the cone; then peers."""
     probe = load_rig("probe").probe
     if probe is None:
@@ -104,16 +104,16 @@ def photon_transport(stage: Stage) -> None:
     for photons in (1000, 2000) if stage.toy else (5000, 20_000, 80_000, 320_000):
         timing, run = timed(lambda: _next_event(stack, radii, photons))
         knobs: Knobs = {"quantity": "fibres", "score": "next event", "photons": photons}
-        stage.add(knobs, timing, _worst(run.stderr / run.reflectance_per_mm2))
+        stage.add(knobs, timing, _max_relative_stderr(run.stderr / run.reflectance_per_mm2))
     for photons in (1000, 2000) if stage.toy else (80_000, 320_000):
-        timing, relative = timed(lambda: _in_the_cone(radii, photons))
+        timing, relative = timed(lambda: _cone_relative_stderr(radii, photons))
         knobs = {"quantity": "fibres", "score": "leaves in the cone", "photons": photons}
-        stage.add(knobs, timing, _worst(relative))
+        stage.add(knobs, timing, _max_relative_stderr(relative))
     medium = LayerStack((Layer(inf, SPEED_MEDIUM[0], *SPEED_MEDIUM[1:]),))
     for engine in ("numba", "drjit"):
         with suppress(ValueError):  # no LLVM on this machine
             timing, total = timed(
-                lambda: transport(
+                lambda: trace_photons(
                     medium,
                     photons=2000 if stage.toy else 400_000,
                     rng=np.random.default_rng(2),
@@ -123,18 +123,20 @@ def photon_transport(stage: Stage) -> None:
             error = 100.0 * total.reflectance_stderr / total.reflectance
             knobs = {"quantity": "all that leaves", "engine": engine, "photons": total.photons}
             spread = error / sqrt(2.0 * (total.batches - 1))
-            stage.add(knobs, timing, BandError.around(error, spread))
+            stage.add(knobs, timing, ErrorEstimate.symmetric(error, spread))
     photons = 2000 if stage.toy else 20_000
-    stage.on_each_skin(lambda band: _on_skin(band, radii, photons))
+    stage.measure_bands(lambda band: _on_skin(band, radii, photons))
     if not stage.toy:
-        stage.limits = _one_percent(radii, stack) | _against_volpath(radii) | _rates(medium)
+        stage.limits = (
+            _one_percent(radii, stack) | _against_volpath(radii) | _compare_photon_rates(medium)
+        )
 
 
-def _on_skin(band: MelaninBand, radii: Float64Array, photons: int) -> BandError:
+def _on_skin(band: MelaninBand, radii: Float64Array, photons: int) -> ErrorEstimate:
     """Return the error of as many photons in skin that absorbs little or much."""
     stack = _half_space(band.sigma_a_per_mm, band.sigma_s_prime_per_mm)
     run = _next_event(stack, radii, photons)
-    return _worst(run.stderr / run.reflectance_per_mm2)
+    return _max_relative_stderr(run.stderr / run.reflectance_per_mm2)
 
 
 def _half_space(sigma_a: float, sigma_s_prime: float, eta: float = ETA) -> LayerStack:
@@ -144,22 +146,22 @@ def _half_space(sigma_a: float, sigma_s_prime: float, eta: float = ETA) -> Layer
 def _next_event(stack: LayerStack, radii: Float64Array, photons: int) -> Any:
     """Return what the fibres see by next event."""
     rng = np.random.default_rng(1)
-    return fibre_profile(stack, radii_mm=radii, photons=photons, rng=rng, threads=LIMIT_CORES)
+    return trace_fiber_profile(stack, radii_mm=radii, photons=photons, rng=rng, threads=LIMIT_CORES)
 
 
-def _worst(relative: Float64Array) -> BandError:
+def _max_relative_stderr(relative: Float64Array) -> ErrorEstimate:
     """Return the largest relative standard error, %, of 20 batches."""
     worst = float(100.0 * np.nan_to_num(relative, nan=1.0, posinf=1.0).max())
-    return BandError.around(worst, worst / sqrt(2.0 * 19.0))
+    return ErrorEstimate.symmetric(worst, worst / sqrt(2.0 * 19.0))
 
 
-def _in_the_cone(radii: Float64Array, photons: int) -> Float64Array:
+def _cone_relative_stderr(radii: Float64Array, photons: int) -> Float64Array:
     """Return relative standard errors of the plain walk in rings as wide as the fibres."""
     rings = np.zeros((20, 2 * len(radii)))
     edges = np.sort(np.concatenate([radii - 0.1, radii + 0.1]))
     for batch, row in enumerate(rings):
         counted = np.zeros(edges.size - 1)
-        plain_walk(
+        trace_half_space(
             RED_MEDIUM_PER_MM[0],
             RED_MEDIUM_PER_MM[1] / (1.0 - MEDIUM_G),
             MEDIUM_G,
@@ -176,10 +178,10 @@ def _in_the_cone(radii: Float64Array, photons: int) -> Float64Array:
     return np.divide(error, mean, out=np.full(len(mean), np.nan), where=mean > 0)
 
 
-def _one_percent(radii: Float64Array, stack: Any) -> Findings:
+def _one_percent(radii: Float64Array, stack: Any) -> LimitValues:
 
-    seconds, run = spent(
-        lambda: fibre_profile(
+    seconds, run = measure_processor_time(
+        lambda: trace_fiber_profile(
             stack, radii_mm=radii, photons=200_000, rng=np.random.default_rng(3), batches=100
         )
     )
@@ -187,14 +189,14 @@ def _one_percent(radii: Float64Array, stack: Any) -> Findings:
     return {"seconds": seconds * worst**2 / LIMIT_CORES}
 
 
-def _against_volpath(radii: Float64Array) -> Findings:
+def _against_volpath(radii: Float64Array) -> LimitValues:
     """Compare at n = 1: a disc of light on the surface, seen along the normal, square by fibre."""
     scene = volpath_scene(radii)
     try:
         radiance(scene, kind="mono", samples=16)
     except (RenderError, RuntimeError):  # no variant with volumes here
         return {}
-    peer_s, runs = spent(
+    peer_s, runs = measure_processor_time(
         lambda: [
             radiance(scene, kind="mono", samples=PEER_SAMPLES, seed=seed)[0, :, 0]
             for seed in range(N_PEER_RUNS)
@@ -206,8 +208,8 @@ def _against_volpath(radii: Float64Array) -> Findings:
     # 100 %, which flatters the peer.
     relative = np.where(mean > 0.0, 100.0 * error / np.maximum(mean, 1e-30), 100.0)
     stack = _half_space(*RED_MEDIUM_PER_MM, eta=1.0)
-    ours_s, run = spent(
-        lambda: fibre_profile(
+    ours_s, run = measure_processor_time(
+        lambda: trace_fiber_profile(
             stack,
             radii_mm=radii,
             photons=100_000,
@@ -277,16 +279,20 @@ def volpath_scene(radii: Float64Array) -> dict[str, Any]:
     }
 
 
-def _rates(medium: Any) -> Findings:
+def _compare_photon_rates(medium: Any) -> LimitValues:
     """Compare photons a processor second with the plain walk's; R_d with MCML's."""
     edges2, rings = np.array([0.0, 1.0]), np.zeros(1)
-    plain_walk(*SPEED_MEDIUM, 10, 0, 1.0, edges2, rings)
-    plain_s, _ = spent(lambda: plain_walk(*SPEED_MEDIUM, 40_000, 0, 1.0, edges2, rings), 3)
-    scalar_s, _ = spent(lambda: transport(medium, photons=40_000, rng=np.random.default_rng(5)), 3)
+    trace_half_space(*SPEED_MEDIUM, 10, 0, 1.0, edges2, rings)
+    plain_s, _ = measure_processor_time(
+        lambda: trace_half_space(*SPEED_MEDIUM, 40_000, 0, 1.0, edges2, rings), 3
+    )
+    scalar_s, _ = measure_processor_time(
+        lambda: trace_photons(medium, photons=40_000, rng=np.random.default_rng(5)), 3
+    )
     photons = 2_000_000
     try:
-        ours_s, run = spent(
-            lambda: transport(
+        ours_s, run = measure_processor_time(
+            lambda: trace_photons(
                 medium, photons=photons, rng=np.random.default_rng(6), engine="drjit", batches=40
             ),
             2,

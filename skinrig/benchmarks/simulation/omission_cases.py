@@ -13,17 +13,17 @@ from capture.rig import load_rig
 from model import spectra
 from rigsim.light.interreflection import Interreflection
 from rigsim.needs.effect_sizes import is_flat
-from rigsim.needs.effects import Noise, SceneEffects
+from rigsim.needs.effects import PixelNoise, SceneEffects
 from rigsim.needs.face import BAND_EFFECT, PIGMENT_EFFECT, RELIEF_EFFECT, WAVELENGTH_STEP_EFFECT
 from rigsim.render import Caster, visibility
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene
-from rigsim.scenes.gradient.reference import NEUTRAL
+from rigsim.scenes.gradient.reference import NEUTRAL_GRIP
 from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.subject import make_subject
 from rigsim.targets import make_target
 from skinrig.arrays import Float32Array, Float64Array
-from skinrig.benchmarks.measurement import spent
+from skinrig.benchmarks.measurement import measure_processor_time
 from skinrig.simulating.dome import small_dome
 from skinrig.simulating.gradient import make_scene
 
@@ -37,7 +37,7 @@ N_TIMED_PICTURES: Final = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Omission:
+class EffectComparison:
     """One effect of one scene, compared with and without."""
 
     rig: str
@@ -45,11 +45,11 @@ class Omission:
     effect: str
     verdict: str
     """As the scene's rule has it, see `rigsim.needs.effects.Verdict`."""
-    told: float | None
+    predicted_change: float | None
     """Largest change over noise as the rule told it."""
     found: float
     """Largest change of any pixel over its noise, as rendered."""
-    uncertain: float
+    change_stderr: float
     """Standard error of ``found`` by photons, and its rounding, in the same unit."""
     with_s: float
     """Processor seconds with the effect."""
@@ -57,9 +57,9 @@ class Omission:
     """Processor seconds without."""
 
     @property
-    def at_most(self) -> float:
+    def max_change(self) -> float:
         """Largest change over noise with three standard errors on top."""
-        return self.found + 3.0 * self.uncertain
+        return self.found + 3.0 * self.change_stderr
 
 
 Images = Float32Array | Float64Array
@@ -77,13 +77,13 @@ class ComparedScene:
     """As its needs decide."""
 
     @property
-    def noise(self) -> Noise:
+    def noise(self) -> PixelNoise:
         """The sensor's."""
-        return Noise.of(self.scene.sensor())
+        return PixelNoise.of(self.scene.sensor())
 
     def compare(
         self, render: Render, switched: Mapping[str, tuple[Any, Any]]
-    ) -> Iterator[Omission]:
+    ) -> Iterator[EffectComparison]:
         """Render the scene with and without each effect that has a switch.
 
         Parameters
@@ -99,35 +99,37 @@ class ComparedScene:
             # only of what is left out the seconds are a claim
             times = N_TIMED_PICTURES if effect.verdict == "negligible" else 1
             (with_s, have), (without_s, lack) = (
-                spent(lambda: render(**{effect.switch: how}), times)
+                measure_processor_time(lambda: render(**{effect.switch: how}), times)
                 for how in switched[effect.switch]
             )
-            yield self.changed(effect, have, lack, (with_s, without_s), full_scale=1.0)
+            yield self.compare_images(effect, have, lack, (with_s, without_s), full_scale=1.0)
 
-    def changed(
+    def compare_images(
         self,
         effect: Any,
-        have: Images,
-        lack: Images,
+        with_effect: Images,
+        without_effect: Images,
         seconds: tuple[float, float],
         *,
         full_scale: float = math.inf,
-    ) -> Omission:
+    ) -> EffectComparison:
         """Compare two images that one effect tells apart, as a sensor shows them."""
-        sigma = self.noise.sigma(have)
-        shown, bare = (np.minimum(one.astype(np.float64), full_scale) for one in (have, lack))
-        return Omission(
+        sigma = self.noise.sigma(with_effect)
+        shown, bare = (
+            np.minimum(one.astype(np.float64), full_scale) for one in (with_effect, without_effect)
+        )
+        return EffectComparison(
             self.rig,
             self.subject,
             effect.name,
             effect.verdict,
             effect.over_noise,
             float((np.abs(shown - bare) / sigma).max()),
-            FLOAT32_ROUNDING * float(np.max(have / sigma)),
+            FLOAT32_ROUNDING * float(np.max(with_effect / sigma)),
             *seconds,
         )
 
-    def plainer(self, render: Render) -> Iterator[Omission]:
+    def compare_simplified_face(self, render: Render) -> Iterator[EffectComparison]:
         """Compare a face with one of even pigment, one without relief, and three bands with one.
 
         Parameters
@@ -136,25 +138,25 @@ class ComparedScene:
             Called with a subject; returns images.
         """
         face, needs = self.scene.subject, self.scene.needs
-        with_s, have = spent(lambda: render(face))
+        with_s, have = measure_processor_time(lambda: render(face))
         even = np.full_like(face.melanin, np.median(face.melanin[face.atlas.covered]))
         for name, plain in (
             (RELIEF_EFFECT, dataclasses.replace(face, normal=face.atlas.normal)),
             (PIGMENT_EFFECT, dataclasses.replace(face, melanin=even)),
         ):
-            without_s, lack = spent(lambda: render(plain))
-            yield self.changed(needs[name], have, lack, (with_s, without_s))
+            without_s, lack = measure_processor_time(lambda: render(plain))
+            yield self.compare_images(needs[name], have, lack, (with_s, without_s))
         rig = self.scene.rig
         white = spectra.camera_white(rig.views[0].spectral_sensitivity, rig.lights[0].illuminant)
         gray = np.asarray(white / white.mean(), np.float32)
-        mean_s, one = spent(lambda: have.mean(axis=-1, keepdims=True) * gray)
+        mean_s, one = measure_processor_time(lambda: have.mean(axis=-1, keepdims=True) * gray)
         # a band alone would be a third of the sums over colors, which are not timed apart
-        yield self.changed(needs[BAND_EFFECT], have, one, (mean_s, mean_s))
+        yield self.compare_images(needs[BAND_EFFECT], have, one, (mean_s, mean_s))
 
 
-def flash_face(
+def compare_flash_face(
     preset: str, *, width_px: int, texels: int = FACE_TEXELS, light_deg: float | None = None
-) -> Iterator[Omission]:
+) -> Iterator[EffectComparison]:
     """Compare pictures of a face before the flash rig, parallel and crossed, at full power.
 
     Parameters
@@ -170,7 +172,10 @@ def flash_face(
     rig = load_rig("flash").resized(width_px)
     name = preset
     if light_deg is not None:
-        rig, name = _lit_from(rig, light_deg), f"{preset}, one light at {light_deg:g} degrees"
+        rig, name = (
+            _set_light_angle(rig, light_deg),
+            f"{preset}, one light at {light_deg:g} degrees",
+        )
     face = make_subject(preset, seed=0, size=texels)
     scene = FlashScene(rig, face)
 
@@ -190,10 +195,10 @@ def flash_face(
         },
     )
     if light_deg is None:
-        yield from compared.plainer(render)
+        yield from compared.compare_simplified_face(render)
 
 
-def _lit_from(rig: Any, angle_deg: float) -> Any:
+def _set_light_angle(rig: Any, angle_deg: float) -> Any:
     """Return a rig with the first of its lights alone, at an angle off +z towards +x."""
     light = rig.lights[0]
     far, angle = math.hypot(*light.position_mm), math.radians(angle_deg)
@@ -201,9 +206,9 @@ def _lit_from(rig: Any, angle_deg: float) -> Any:
     return dataclasses.replace(rig, lights=(dataclasses.replace(light, position_mm=place),))
 
 
-def dome_face(
+def compare_dome_face(
     preset: str, *, width_px: int, lights: int, state: str = "neutral"
-) -> Iterator[Omission]:
+) -> Iterator[EffectComparison]:
     """Compare pictures of a face in the dome under some lights, each exposed to full scale.
 
     A face that has moved is compared with and without shadows of its wrinkles.
@@ -233,19 +238,19 @@ def dome_face(
     yield from compared.compare(
         render, {**dict.fromkeys(names, (True, False)), "last_bounce": (1e-7, None)}
     )
-    yield from compared.plainer(render)
+    yield from compared.compare_simplified_face(render)
 
 
-def gradient_skin(site: str, *, width_px: int) -> Iterator[Omission]:
+def compare_gradient_skin(site: str, *, width_px: int) -> Iterator[EffectComparison]:
     """Compare pictures of a relaxed patch under all LEDs, parallel and crossed, at full scale."""
     rig = load_rig("gradient").cropped(width_px)
     base = make_scene(rig, site=site)
-    brightest = max(float(part[0].max()) for part in base.moments(NEUTRAL).values())
+    brightest = max(float(part[0].max()) for part in base.moments(NEUTRAL_GRIP).values())
 
     def render(**settings: Any) -> Images:
         effects = SceneEffects.from_switches(settings)
         made = GradientScene(rig, base.subject, sphere=base.sphere, effects=effects)
-        light = np.stack([part[0] for part in made.moments(NEUTRAL).values()])
+        light = np.stack([part[0] for part in made.moments(NEUTRAL_GRIP).values()])
         return np.asarray(light / np.float32(brightest), np.float32)
 
     names = ("shadows", "lateral", "interreflections", "optics")
@@ -253,7 +258,7 @@ def gradient_skin(site: str, *, width_px: int) -> Iterator[Omission]:
     yield from compared.compare(render, dict.fromkeys(names, (True, False)))
 
 
-def flat_targets() -> Iterator[Omission]:
+def check_flat_targets() -> Iterator[EffectComparison]:
     """Show that targets neither shade nor light themselves: rays between their own points."""
     flash = load_rig("flash").resized(64)
     dome = small_dome(load_rig("dome"), lights=4, views=1, width_px=64)
@@ -262,18 +267,20 @@ def flat_targets() -> Iterator[Omission]:
     ]
     scenes.append(("dome", "white", DomeScene(dome, make_target("white"))))
     for rig, name, scene in scenes:
-        noise = Noise.of(scene.sensor())
+        noise = PixelNoise.of(scene.sensor())
         caster = Caster(scene.subject.mesh)
-        told_s, flat = spent(lambda: is_flat(caster.mesh))  # all that leaving it out costs
+        told_s, flat = measure_processor_time(
+            lambda: is_flat(caster.mesh)
+        )  # all that leaving it out costs
 
         def exchanged() -> tuple[Interreflection, float]:
             bounce = Interreflection(caster, patches=24)
             return bounce, float(np.asarray(bounce.exchange.sum(axis=1)).max(initial=0.0))
 
-        seconds, (bounce, got) = spent(exchanged)
+        seconds, (bounce, got) = measure_processor_time(exchanged)
         points, normals = (part[0] for part in bounce.surface())
         cast = partial(visibility, caster, points, normals, samples=4)
-        shading_s, seen = spent(
+        shading_s, seen = measure_processor_time(
             lambda: min(
                 float(cast(light.position_mm, radius_mm=light.radius_mm).min())
                 for light in scene.rig.lights
@@ -284,14 +291,14 @@ def flat_targets() -> Iterator[Omission]:
             if effect.verdict != "negligible" or not flat:
                 continue
             lost, with_s = (got, seconds) if effect.switch else (1.0 - seen, shading_s)
-            yield Omission(
+            yield EffectComparison(
                 rig,
                 name,
                 effect.name,
                 effect.verdict,
                 effect.over_noise,
-                noise.share(lost),
-                noise.share(FLOAT32_ROUNDING),
+                noise.change_over_noise(lost),
+                noise.change_over_noise(FLOAT32_ROUNDING),
                 with_s,
                 max(told_s, 1e-6),
             )

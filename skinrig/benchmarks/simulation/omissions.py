@@ -14,15 +14,15 @@ from rigsim.needs.probe import COLOR_EFFECT, CROSSTALK_EFFECT, DARK_CURRENT_EFFE
 from rigsim.scenes.probe.scene import MAX_USUAL_EXPOSURE_S, ProbeScene
 from rigsim.world.suction import HeadState
 from skinrig.arrays import Float32Array
-from skinrig.benchmarks.measurement import spent
-from skinrig.benchmarks.results import BandError, Knobs, Timing
+from skinrig.benchmarks.measurement import measure_processor_time
+from skinrig.benchmarks.results import ErrorEstimate, Knobs, Timing
 from skinrig.benchmarks.simulation import omission_cases
-from skinrig.benchmarks.simulation.omission_cases import ComparedScene, Omission
-from skinrig.benchmarks.stage import Stage
+from skinrig.benchmarks.simulation.omission_cases import ComparedScene, EffectComparison
+from skinrig.benchmarks.stage import BenchmarkStage
 
-WHY_NO_MEMORY = "scenes share what they trace: a picture's memory is not its own"
+NO_MEMORY_REASON = "scenes share what they trace: a picture's memory is not its own"
 FLASH_PX = 192
-GRAZED_PX = 96
+GRAZING_LIGHT_PX = 96
 GRAZING_DEG = 88.0
 """A plate that faces the camera gets 1/29 of what faces the light."""
 DOME_PX = 100
@@ -30,7 +30,7 @@ GRADIENT_PX = 128
 N_DOME_LIGHTS = 3
 
 
-def omissions(stage: Stage) -> None:
+def omissions(stage: BenchmarkStage) -> None:
     """Render scenes of each rig with and without what their rules decide on.
 
     A point is one effect of one scene: its seconds are those of the picture without the effect, its
@@ -39,45 +39,52 @@ def omissions(stage: Stage) -> None:
     """
     found = list(_cases(stage.toy))
     for one in found:
-        timing = Timing.single(one.without_s, no_memory=WHY_NO_MEMORY)
+        timing = Timing.single(one.without_s, no_memory=NO_MEMORY_REASON)
         knobs: Knobs = {"rig": one.rig, "subject": one.subject}
         knobs |= {"effect": one.effect, "verdict": one.verdict}
         also: Knobs = {"seconds saved": one.with_s - one.without_s}
-        if one.told is not None:
-            also["told by the rule"] = one.told
-        stage.add(knobs, timing, BandError.of_size(one.found, one.uncertain), also)
+        if one.predicted_change is not None:
+            also["told by the rule"] = one.predicted_change
+        stage.add(knobs, timing, ErrorEstimate.nonnegative(one.found, one.change_stderr), also)
         if one.verdict == "negligible":
-            stage.limits["change", one.rig, one.subject, one.effect] = one.at_most
+            stage.limits["change", one.rig, one.subject, one.effect] = one.max_change
     built = [one for one in found if one.verdict == "built"]
-    told = [one for one in built if one.told is not None and not _other_shadows(one)]
+    told = [
+        one
+        for one in built
+        if one.predicted_change is not None and not _changes_more_than_effect(one)
+    ]
     stage.limits["over_rule"] = max(
-        ((one.found - one.uncertain) / (one.told or 1e-30) for one in told), default=0.0
+        ((one.found - one.change_stderr) / (one.predicted_change or 1e-30) for one in told),
+        default=0.0,
     )
-    stage.reference_error = max(one.uncertain for one in found)
+    stage.reference_error = max(one.change_stderr for one in found)
 
 
-def _other_shadows(one: Omission) -> bool:
+def _changes_more_than_effect(comparison: EffectComparison) -> bool:
     """Return whether switching an effect changes more than the effect."""
-    return one.rig == "dome" and one.effect == LATERAL_EFFECT
+    return comparison.rig == "dome" and comparison.effect == LATERAL_EFFECT
 
 
-def _cases(toy: bool) -> Iterator[Omission]:
-    yield from omission_cases.flat_targets()
-    yield from gray_tissue()
+def _cases(toy: bool) -> Iterator[EffectComparison]:
+    yield from omission_cases.check_flat_targets()
+    yield from compare_gray_tissue()
     if toy:
-        yield from omission_cases.flash_face("darkest", width_px=64, texels=64)
+        yield from omission_cases.compare_flash_face("darkest", width_px=64, texels=64)
         return
     for preset in ("II", "VI", "darkest"):
-        yield from omission_cases.flash_face(preset, width_px=FLASH_PX)
-    yield from omission_cases.flash_face("darkest", width_px=GRAZED_PX, light_deg=GRAZING_DEG)
-    dome_face = partial(omission_cases.dome_face, width_px=DOME_PX, lights=N_DOME_LIGHTS)
+        yield from omission_cases.compare_flash_face(preset, width_px=FLASH_PX)
+    yield from omission_cases.compare_flash_face(
+        "darkest", width_px=GRAZING_LIGHT_PX, light_deg=GRAZING_DEG
+    )
+    dome_face = partial(omission_cases.compare_dome_face, width_px=DOME_PX, lights=N_DOME_LIGHTS)
     for preset in ("II", "darkest"):
         yield from dome_face(preset)
     yield from dome_face("II", state="surprise")
-    yield from omission_cases.gradient_skin("forehead", width_px=GRADIENT_PX)
+    yield from omission_cases.compare_gradient_skin("forehead", width_px=GRADIENT_PX)
 
 
-def gray_tissue() -> Iterator[Omission]:
+def compare_gray_tissue() -> Iterator[EffectComparison]:
     """Take a gray medium as one color, and as 31 of which bands are made, of the same photons."""
     rig = load_rig("probe")
     gray = HomogeneousTissue(0.05, 1.5)
@@ -91,26 +98,28 @@ def gray_tissue() -> Iterator[Omission]:
         return made, made.profile(head)
 
     for tissue in (colored, gray):
-        spent_s, (made, profile) = spent(partial(profiled, tissue))
+        spent_s, (made, profile) = measure_processor_time(partial(profiled, tissue))
         seconds.append(spent_s)
         if profile is None:
             raise ValueError("gray tissue: the head touches nothing")
-        images.append(made.image(made.through_fibres(profile.reflectance_per_mm2)))
+        images.append(made.image(made.transmit_through_fibers(profile.reflectance_per_mm2)))
     brightest = np.float32(images[0].max())
     scene = ProbeScene(rig, gray)
     compared = ComparedScene("probe", "gray medium", scene)
     have, lack = (part / brightest for part in images)  # of stored photons: the same for both
-    yield compared.changed(scene.needs[COLOR_EFFECT], have, lack, (seconds[0], seconds[1]))
-    yield from _probe_build(compared, head)
+    yield compared.compare_images(scene.needs[COLOR_EFFECT], have, lack, (seconds[0], seconds[1]))
+    yield from _compare_probe_build(compared, head)
 
 
-def _probe_build(compared: ComparedScene, head: HeadState) -> Iterator[Omission]:
+def _compare_probe_build(compared: ComparedScene, head: HeadState) -> Iterator[EffectComparison]:
     """Compare the probe as built with one without cross-talk, wings, or dark current."""
     scene = compared.scene
     profile, build = scene.profile(head), scene.build
 
     def timed(made: ProbeScene) -> tuple[float, Float32Array]:
-        return spent(lambda: made.image(made.through_fibres(profile.reflectance_per_mm2)))
+        return measure_processor_time(
+            lambda: made.image(made.transmit_through_fibers(profile.reflectance_per_mm2))
+        )
 
     with_s, have = timed(scene)
     unit = np.float32(have.max())
@@ -120,11 +129,13 @@ def _probe_build(compared: ComparedScene, head: HeadState) -> Iterator[Omission]
     }
     for name, without in plain.items():
         without_s, lack = timed(ProbeScene(scene.rig, scene.tissue, build=without))
-        yield compared.changed(scene.needs[name], have / unit, lack / unit, (with_s, without_s))
+        yield compared.compare_images(
+            scene.needs[name], have / unit, lack / unit, (with_s, without_s)
+        )
     sensor = scene.sensor()
     full_e = sensor.gain_e_per_dn * (sensor.white - sensor.black)
-    hot_s, hot = spent(
+    hot_s, hot = measure_processor_time(
         lambda: np.asarray(scene.hot_e_per_s * MAX_USUAL_EXPOSURE_S / full_e, np.float32)
     )
-    none_s, none = spent(lambda: np.zeros_like(hot))
-    yield compared.changed(scene.needs[DARK_CURRENT_EFFECT], hot, none, (hot_s, none_s))
+    none_s, none = measure_processor_time(lambda: np.zeros_like(hot))
+    yield compared.compare_images(scene.needs[DARK_CURRENT_EFFECT], hot, none, (hot_s, none_s))

@@ -11,7 +11,7 @@ from scipy.ndimage import binary_erosion
 from capture.rig import load_rig
 from rigsim.as_built.sphere import PATTERN_WEIGHTS
 from rigsim.render import Caster
-from rigsim.render.scene_radiance import point_rig
+from rigsim.render.scene_radiance import point_light_rig
 from rigsim.render.variant import choose_variant
 from rigsim.scenes.dome import reference as dome_scenes
 from rigsim.scenes.flash import polarizer_reference as flash_scenes
@@ -19,15 +19,15 @@ from rigsim.scenes.gradient import reference as gradient_scenes
 from rigsim.skin_patch.microrelief import MicroSkin
 from skinrig.arrays import Float32Array, Float64Array, Int64Array
 from skinrig.benchmarks import resident_memory
-from skinrig.benchmarks.measurement import spent
-from skinrig.benchmarks.resampling import drawn_again, tiled_rms
-from skinrig.benchmarks.results import BandError, Knobs, Timing
-from skinrig.benchmarks.stage import Stage
+from skinrig.benchmarks.measurement import measure_processor_time
+from skinrig.benchmarks.resampling import bootstrap_interval, bootstrap_tiled_rms
+from skinrig.benchmarks.results import ErrorEstimate, Knobs, Timing
+from skinrig.benchmarks.stage import BenchmarkStage
 
-WHY_NO_MEMORY = "three ways take turns in one process, each with its scene held"
+NO_MEMORY_REASON = "three ways take turns in one process, each with its scene held"
 
 
-def dome(stage: Stage) -> None:
+def dome(stage: BenchmarkStage) -> None:
     """Time one view of the dome, light after light, in three ways.
 
     The full size is that of the rig's cameras. Mitsuba's samples are stratified, which makes them
@@ -37,18 +37,18 @@ def dome(stage: Stage) -> None:
     efforts = (1, 2) if stage.toy else (1, 3, 2)
     fine = 4 if stage.toy else 6
     for subpixels in efforts:
-        found = dome_scenes.compare(
+        found = dome_scenes.compare_integrators(
             width_px=width,
             lights=1 if subpixels != efforts[-1] else lights,
             subpixels=subpixels,
-            fine=fine,
+            reference_subpixels=fine,
             rounds=2 if subpixels == efforts[-1] else 1,
         )
         for name in ("ours", "path", "direct"):
             way = getattr(found, name)
-            timing = Timing.single(way.seconds, no_memory=WHY_NO_MEMORY)
-            stage.add({"way": name, "rays": subpixels**2}, timing, _way_error(way))
-    stage.on_each_skin(lambda band: _on_skin(band.preset, 64 if stage.toy else 650, fine))
+            timing = Timing.single(way.seconds, no_memory=NO_MEMORY_REASON)
+            stage.add({"way": name, "rays": subpixels**2}, timing, _method_error(way))
+    stage.measure_bands(lambda band: _on_skin(band.preset, 64 if stage.toy else 650, fine))
     stage.limits["over_path"] = found.speed_up(found.path)
     stage.limits["over_direct"] = found.speed_up(found.direct)
     finest = stage.at(way="ours", rays=max(efforts) ** 2)
@@ -56,18 +56,18 @@ def dome(stage: Stage) -> None:
     stage.words["rays"] = fine**2
 
 
-def _way_error(way: dome_scenes.Way) -> BandError:
+def _method_error(method: dome_scenes.RenderTiming) -> ErrorEstimate:
     """Return a way's error in percent, with its interval over tiles."""
-    error, tiles = 100.0 * way.error, way.squared_by_tile
+    error, tiles = 100.0 * method.error, method.squared_by_tile
     low, high = error * np.array(
-        drawn_again(tiles, lambda again, axis: np.sqrt(again.mean(axis=axis) / tiles.mean()))
+        bootstrap_interval(tiles, lambda again, axis: np.sqrt(again.mean(axis=axis) / tiles.mean()))
     )
-    return BandError(error, (min(float(low), error), max(float(high), error)))
+    return ErrorEstimate(error, (min(float(low), error), max(float(high), error)))
 
 
-def _on_skin(preset: str, width: int, fine: int) -> BandError:
+def _on_skin(preset: str, width: int, fine: int) -> ErrorEstimate:
     """Return our error with 4 rays a pixel on a face of a preset's melanin, one light, %."""
-    rig = point_rig(load_rig("dome").resized(width).subset(views=["C02"]))
+    rig = point_light_rig(load_rig("dome").resized(width).subset(views=["C02"]))
     face = dome_scenes.plain_face(preset, size=128 if width < 128 else 512)
     light = len(rig.lights) // 2
     found, true = (
@@ -75,31 +75,33 @@ def _on_skin(preset: str, width: int, fine: int) -> BandError:
         for n in (2, fine)
     )
     shown = true.mean(axis=-1) > 0.0
-    return tiled_rms((found - true) * (100.0 / float(true[shown].mean())), shown)
+    return bootstrap_tiled_rms((found - true) * (100.0 / float(true[shown].mean())), shown)
 
 
 REFERENCE_RAYS = 144
 
 
-def flash(stage: Stage) -> None:
+def flash(stage: BenchmarkStage) -> None:
     """Time both polarization images by closed forms and by Mitsuba's own polarizers."""
     efforts = ((1, 2), (2, 4)) if stage.toy else ((1, 4), (2, 16), (3, 64))
     width = 48 if stage.toy else 256
     rig, view = flash_scenes.reference_rig(width)
     caster = Caster(flash_scenes.sphere_mesh(), choice=choose_variant("mono_polarized"))
-    truth = flash_scenes.closed_forms(rig, view, caster, subpixels=round(REFERENCE_RAYS**0.5))
-    worse = partial(_worse, truth=truth)
+    truth = flash_scenes.render_closed_forms(
+        rig, view, caster, subpixels=round(REFERENCE_RAYS**0.5)
+    )
+    worse = partial(_larger_error, truth=truth)
     for subpixels, _ in efforts:
         stage.measure(
             {"way": "closed form", "subpixels": subpixels},
-            lambda: flash_scenes.closed_forms(rig, view, caster, subpixels=subpixels),
+            lambda: flash_scenes.render_closed_forms(rig, view, caster, subpixels=subpixels),
             worse,
             repeats=3,
             memory=None,
         )
     stage.reference_error = stage.points[-1].error * efforts[-1][0] / REFERENCE_RAYS**0.5
     for _, samples in efforts:
-        image = partial(flash_scenes.mitsuba_image, rig, view, samples=samples)
+        image = partial(flash_scenes.render_polarized_with_mitsuba, rig, view, samples=samples)
         stage.measure(
             {"way": "mitsuba", "samples": samples},
             lambda: {
@@ -110,19 +112,19 @@ def flash(stage: Stage) -> None:
             memory=None,
         )
     if not stage.toy:
-        final = flash_scenes.polarizer_reference(
+        final = flash_scenes.compare_polarizer_models(
             width_px=width, samples=efforts[-1][1], subpixels=1
         )
         stage.limits = {"speed_up": final.speed_up, "noise": final.noise_ratio}
 
 
-def _worse(found: dict[str, Float32Array], truth: dict[str, Float32Array]) -> BandError:
+def _larger_error(found: dict[str, Float32Array], truth: dict[str, Float32Array]) -> ErrorEstimate:
     """Return the larger of both images' relative errors, %, where the sphere fills pixels."""
     errors = []
     for name, true in truth.items():
         whole = binary_erosion(true > 0.0, iterations=2)
         difference = (found[name].astype(np.float64) - true) * 100.0 / true[whole].mean()
-        errors.append(tiled_rms(difference, whole, tile_px=8))
+        errors.append(bootstrap_tiled_rms(difference, whole, tile_px=8))
     return max(errors, key=lambda one: one.error)
 
 
@@ -132,7 +134,7 @@ N_LIT_CONDITIONS = 14
 BEST_KNOBS: Knobs = {"way": "moments", "subpixels": 2, "sectors": 32, "table": 65}
 
 
-def gradient(stage: Stage) -> None:
+def gradient(stage: BenchmarkStage) -> None:
     """Picture one state of skin under all conditions, and gradient its conditions one by one.
 
     Both sides are judged against sums over the LEDs with a shadow ray to each. Seconds are
@@ -144,18 +146,20 @@ def gradient(stage: Stage) -> None:
     rng = np.random.default_rng(0)
     pixels = np.sort(rng.choice(width * width, 200 if stage.toy else 1500, replace=False))
     plain = gradient_scenes.plain_scene(skin, width_px=width)
-    reference, _ = gradient_scenes.traced(plain, pixels, subpixels=2 if stage.toy else 4)
+    reference, _ = gradient_scenes.trace_pixels(plain, pixels, subpixels=2 if stage.toy else 4)
     best, without = _by_moments(stage, skin, width, pixels, reference)
     for samples in (4,) if stage.toy else (16, 64):
         ways = []
         for number, pattern in enumerate(("full", "x")):
-            with resident_memory.watched() as rise:
-                image, seconds = gradient_scenes.rendered(
+            with resident_memory.track_peak() as rise:
+                image, seconds = gradient_scenes.render_pattern(
                     plain, pattern, samples=samples, seed=number
                 )
             wanted = reference @ np.array(PATTERN_WEIGHTS[pattern])
             ways.append(
-                gradient_scenes.judge(image.reshape(-1)[pixels].astype(np.float64), wanted, seconds)
+                gradient_scenes.compare_with_reference(
+                    image.reshape(-1)[pixels].astype(np.float64), wanted, seconds
+                )
             )
         error = math.sqrt(sum(way.error**2 for way in ways) / 2.0)
         seconds = N_LIT_CONDITIONS * sum(way.seconds for way in ways) / 2.0
@@ -172,10 +176,10 @@ def gradient(stage: Stage) -> None:
 
 
 def _by_moments(
-    stage: Stage, skin: MicroSkin, width: int, pixels: Int64Array, reference: Float64Array
-) -> tuple[gradient_scenes.Way, gradient_scenes.Way]:
+    stage: BenchmarkStage, skin: MicroSkin, width: int, pixels: Int64Array, reference: Float64Array
+) -> tuple[gradient_scenes.ReferenceComparison, gradient_scenes.ReferenceComparison]:
     """Add our ways; return the best, and the usual one without shadows."""
-    gradient_scenes.picture(
+    gradient_scenes.scene_pixels(
         gradient_scenes.plain_scene(skin, width_px=width, table_size=17), pixels
     )  # compiles
     settings = [(1, 16, 33), (1, 32, 65), (2, 32, 65)]
@@ -185,25 +189,25 @@ def _by_moments(
         scene = gradient_scenes.plain_scene(
             skin, width_px=width, subpixels=subpixels, sectors=sectors, table_size=table
         )
-        with resident_memory.watched() as rise:
-            spent_s, (_, found) = spent(
-                lambda: (scene.lighting(), gradient_scenes.picture(scene, pixels))
+        with resident_memory.track_peak() as rise:
+            spent_s, (_, found) = measure_processor_time(
+                lambda: (scene.lighting(), gradient_scenes.scene_pixels(scene, pixels))
             )
         knobs: Knobs = {"way": "moments", "subpixels": subpixels}
         knobs |= {"sectors": sectors, "table": table}
-        way = gradient_scenes.judge(found, reference, spent_s)
+        way = gradient_scenes.compare_with_reference(found, reference, spent_s)
         _add(stage, knobs, spent_s, way.error, rise.mb, len(pixels))
         if knobs == BEST_KNOBS:
             best = way
-    bare = gradient_scenes.picture(
+    bare = gradient_scenes.scene_pixels(
         gradient_scenes.plain_scene(skin, width_px=width, shadows=False), pixels
     )
-    return best, gradient_scenes.judge(bare, reference, 0)
+    return best, gradient_scenes.compare_with_reference(bare, reference, 0)
 
 
 def _add(
-    stage: Stage, knobs: Knobs, seconds: float, error: float, mb: float | None, pixels: int
+    stage: BenchmarkStage, knobs: Knobs, seconds: float, error: float, mb: float | None, pixels: int
 ) -> None:
     timing = Timing.single(seconds, mb, memory_of="resident")
-    outcome = BandError.around(100.0 * error, 100.0 * error / math.sqrt(2.0 * pixels))
+    outcome = ErrorEstimate.symmetric(100.0 * error, 100.0 * error / math.sqrt(2.0 * pixels))
     stage.add(knobs, timing, outcome)

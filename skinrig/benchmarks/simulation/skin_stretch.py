@@ -6,11 +6,11 @@ from functools import partial
 import numpy as np
 
 from rigsim.skin_patch.microrelief import SITE_NAMES, MicroSkin, make_micro_skin
-from rigsim.skin_patch.stretch import FORCE_TOLERANCE, StretchedSkin, deform, size_for
+from rigsim.skin_patch.stretch import FORCE_TOLERANCE, StretchedSkin, required_size_mm, stretch_skin
 from skinrig.arrays import Float32Array
-from skinrig.benchmarks.measurement import processor_seconds, spent
+from skinrig.benchmarks.measurement import measure_processor_time, processor_seconds
 from skinrig.benchmarks.resampling import mean_error
-from skinrig.benchmarks.stage import Findings, Stage
+from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 
 CALIPER_STRETCHES = (0.73, 0.8, 0.87, 0.94, 1.07, 1.14, 1.21, 1.28)
 """Stretches of a series as the caliper gives them."""
@@ -27,7 +27,7 @@ def _variance(state: StretchedSkin, half_mm: float) -> float:
     return float(np.var(along, dtype=np.float64))
 
 
-def stretched(stage: Stage) -> None:
+def stretched(stage: BenchmarkStage) -> None:
     """Stop the search for the equilibrium at forces of several sizes; then time whole series."""
     size = 0.3 if stage.toy else 1.6
     half = 0.4 * size
@@ -38,11 +38,11 @@ def stretched(stage: Stage) -> None:
     )
     for stretch in (0.8, 1.25):
         truth = [
-            _variance(deform(s, stretch=stretch, angle_deg=90.0, tolerance=1e-5), half)
+            _variance(stretch_skin(s, stretch=stretch, angle_deg=90.0, tolerance=1e-5), half)
             for s in skins
         ]
         for tolerance in tolerances:
-            settle = partial(deform, stretch=stretch, angle_deg=90.0, tolerance=tolerance)
+            settle = partial(stretch_skin, stretch=stretch, angle_deg=90.0, tolerance=tolerance)
             timing, states = stage.time(
                 lambda: list(map(settle, skins)), repeats=1, memory=not stage.toy
             )
@@ -55,20 +55,20 @@ def stretched(stage: Stage) -> None:
         stage.limits = _limits()
 
 
-def _limits() -> Findings:
-    limits: Findings = {}
+def _limits() -> LimitValues:
+    limits: LimitValues = {}
     for site in SITE_NAMES:
         skin = make_micro_skin(site, seed=1, size_mm=2.8)
-        limits["seconds", site], states = spent(
-            lambda: {r: deform(skin, stretch=r, angle_deg=90.0) for r in CALIPER_STRETCHES}
+        limits["seconds", site], states = measure_processor_time(
+            lambda: {r: stretch_skin(skin, stretch=r, angle_deg=90.0) for r in CALIPER_STRETCHES}
         )
         variance = [_variance(state, 1.2) for state in states.values()]
         limits["flattening", site] = float((np.diff(variance) < 0.0).sum())
         strains = (abs(s.membrane_strain / (r - 1.0)) for r, s in states.items())
         limits["strain", site] = max(strains)
-    field = make_micro_skin("forehead", seed=1, size_mm=size_for(12.3, 1.0, angle_deg=0.0))
-    limits["field_s"] = processor_seconds(lambda: deform(field, stretch=1.2, angle_deg=90.0))
-    flat = deform(_flat(field), stretch=0.8, angle_deg=0.0)
+    field = make_micro_skin("forehead", seed=1, size_mm=required_size_mm(12.3, 1.0, angle_deg=0.0))
+    limits["field_s"] = processor_seconds(lambda: stretch_skin(field, stretch=1.2, angle_deg=90.0))
+    flat = stretch_skin(_flat(field), stretch=0.8, angle_deg=0.0)
     limits["flat"] = float(np.abs(flat.height_um).max())
     return limits
 

@@ -48,12 +48,12 @@ class Import:
     textures: tuple[tuple[str, str, float], ...] = ()
 
     @staticmethod
-    def of_channels(file: str, radius_mm: Sequence[float]) -> Import:
+    def from_channels(file: str, radius_mm: Sequence[float]) -> Import:
         """Return an import whose radius is the same all over, (3,), mm.
 
         Examples
         --------
-        >>> Import.of_channels("skin.glb", [0.5, 0.25, 0.125]).channels
+        >>> Import.from_channels("skin.glb", [0.5, 0.25, 0.125]).channels
         (1.0, 0.5, 0.25)
         """
         longest = max(radius_mm)

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from model.skin import SkinAppearance
 from skinrig.drawing import png
 from skinrig.errors import UnusableError, UsageError
-from skinrig.exporting.images import ImageFolder, coded
+from skinrig.exporting.images import ImageFolder, encode_png_codes
 from skinrig.exporting.materials import blender
 from skinrig.exporting.materials.material import Material
-from skinrig.exporting.options import M_PER_MM, Delivery
+from skinrig.exporting.options import M_PER_MM, ExportSettings
 
 GLB_FILE, DOCUMENT_FILE = "skin.glb", "glb.json"
 SCHEMA: Final = "skinrig.export.glb/1"
@@ -67,7 +67,9 @@ class _Binary:
         return len(self.file.accessors) - 1
 
 
-def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[tuple[str, str]]:
+def write(
+    appearance: SkinAppearance, folder: Path, delivery: ExportSettings
+) -> list[tuple[str, str]]:
     """Write skin.glb and a document of what it holds.
 
     Parameters
@@ -105,7 +107,7 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
             "alone; take mtlx or usd, or a mesh of tile 1001"
         )
     (folder / GLB_FILE).write_bytes(content(material))
-    script = blender.Import.of_channels(GLB_FILE, material.usual_radius_mm()).script()
+    script = blender.Import.from_channels(GLB_FILE, material.median_radius_mm()).script()
     (folder / blender.SCRIPT_FILE).write_text(script, encoding="utf-8")
     out = ImageFolder(folder, delivery)
     out.errors(material.error_images())
@@ -125,7 +127,7 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         },
     )
     in_blender = f"see extras; {blender.SCRIPT_FILE} sets it in Blender"
-    left_out = material.left_out_of_mesh(delivery)
+    left_out = material.list_mesh_omissions(delivery)
     left_out.append(("subsurface light", f"glTF has no place for it: {in_blender}"))
     if not material.shapes:
         left_out.append(("morph targets", "the mesh has no blend shapes; name one with --mesh"))
@@ -182,7 +184,7 @@ def _pictures(material: Material) -> list[tuple[str, bytes]]:
     """Return the textures' names and PNG files of 8 bits, in the order of their indices."""
 
     def codes(name: str) -> NDArray[Any]:
-        return coded(material.image(name, Delivery()), depth=8)[0]
+        return encode_png_codes(material.image(name, ExportSettings()), depth=8)[0]
 
     rough, weight = codes("specular_roughness"), codes("specular_weight")
     zero, white = np.zeros_like(rough), np.full_like(weight, 255)

@@ -10,15 +10,15 @@ import numpy as np
 
 from model import dipole, fresnel, skin_reflectance
 from model.skin import SkinAppearance
-from skinrig.appearances.contents import assumed_by
+from skinrig.appearances.contents import list_assumptions
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.errors import UsageError, one_of
-from skinrig.exporting.images import CAMERA_SPACE, DATA_SPACE, SRGB_SPACE, Image
+from skinrig.exporting.images import CAMERA_SPACE, DATA_SPACE, SRGB_SPACE, ExportImage
 from skinrig.exporting.materials import subsurface_radius, surface_fit, tangents, udim
 from skinrig.exporting.materials.tangents import FramedMesh
 from skinrig.exporting.materials.udim import TiledMesh
-from skinrig.exporting.options import FIRST_TILE, Delivery, ExportError
-from skinrig.rendering.geometry import FittedSurface, own_mesh
+from skinrig.exporting.options import FIRST_TILE, ExportError, ExportSettings
+from skinrig.rendering.geometry import FittedSurface, read_own_mesh
 
 COLOR_NOTE: Final = (
     "camera RGB, linear, over that of a perfect white: taken as linear sRGB where a format knows "
@@ -109,14 +109,14 @@ class Material:
             Naming the map or file that is missing or does not fit.
         """
         model = skin_reflectance.assemble(appearance)
-        own = own_mesh(appearance)
+        own = read_own_mesh(appearance)
         mesh = TiledMesh.of(own) if mesh_file is None else udim.read(mesh_file)
         surface = FittedSurface.of(model, mesh.first(), rest=own)
         framed = FramedMesh.of(mesh)
         # frames of the whole mesh: at a border of tiles a renderer has no others
         on_maps = framed.only(mesh.tile == FIRST_TILE)
         axes, covered = on_maps.texel_frames(surface.atlas.size)
-        turned = tangents.to_tangent(surface.normals, axes, covered)
+        turned = tangents.rotate_to_tangent(surface.normals, axes, covered)
         inside = 1.0 - fresnel.diffuse_external(model.eta)
         r_d = np.nan_to_num(model.r_d)
         stderr = model.r_d_stderr
@@ -128,15 +128,17 @@ class Material:
             shapes={n: d[framed.source].astype(np.float32) for n, d in mesh.shapes.items()},
             base_color=(inside * r_d).astype(np.float32),
             base_color_stderr=None if stderr is None else (inside * stderr).astype(np.float32),
-            normals=tangents.filled(turned, model.valid & covered),
+            normals=tangents.fill_tangent_normals(turned, model.valid & covered),
             normals_rig=np.asarray(surface.normals, np.float32),
             axes=axes,
             covered=covered,
             valid=model.valid & covered,
-            surface=surface_fit.fit(model.lobes, np.nan_to_num(model.weights), eta=model.eta),
+            surface=surface_fit.fit_ggx_lobe(
+                model.lobes, np.nan_to_num(model.weights), eta=model.eta
+            ),
             translucency_mm=np.where(known, depth, usual).astype(np.float32),
             translucency_stderr_mm=model.translucency_stderr_mm,
-            deficit=deficit_of(r_d, model.eta),
+            deficit=similarity_albedo_deficit(r_d, model.eta),
             eta=model.eta,
             assumed=model.assumed,
             source=appearance.source,
@@ -149,7 +151,7 @@ class Material:
         found = subsurface_radius.radius_mm(self.translucency_mm, self.base_color, self.deficit)
         return found.astype(np.float32)
 
-    def left_out_of_mesh(self, delivery: Delivery) -> list[tuple[str, str]]:
+    def list_mesh_omissions(self, delivery: ExportSettings) -> list[tuple[str, str]]:
         """Return what the mesh leaves out, and why: holes of a scan, maps of other tiles.
 
         Raises
@@ -163,7 +165,7 @@ class Material:
                 f"--udim: got none, but the mesh reaches over tiles {numbers}, expected dot or "
                 "underscore"
             )
-        holes = self.mesh.holes()
+        holes = self.mesh.count_holes()
         told = [
             (f"the surface at {holes} holes", "the scan has none there; --mesh takes a whole one")
         ]
@@ -172,7 +174,7 @@ class Material:
             for tile in self.tiles[1:]
         ]
 
-    def usual_radius_mm(self) -> list[float]:
+    def median_radius_mm(self) -> list[float]:
         """Return the median of `radius_mm` over the valid texels, red, green, blue."""
         shown = self.radius_mm[self.valid] if self.valid.any() else self.radius_mm
         return [float(r) for r in np.median(shown.reshape(-1, 3), axis=0)]
@@ -189,7 +191,7 @@ class Material:
         return {
             "sigma_tr_per_mm": [float(1.0 / d) for d in depth],
             "translucency_mm": [float(d) for d in depth],
-            "mean_free_path_mm": self.usual_radius_mm(),
+            "mean_free_path_mm": self.median_radius_mm(),
             "channels": "red, green, blue; median over the valid texels",
             "assumed": list(self.assumed),
         }
@@ -202,7 +204,7 @@ class Material:
             "subsurface": subsurface,
             "specular_ior": self.eta,
             "figures": self.figures(),
-            "assumed": list(dict.fromkeys([*assumed_by(appearance), *self.assumed])),
+            "assumed": list(dict.fromkeys([*list_assumptions(appearance), *self.assumed])),
         }
 
     def figures(self) -> dict[str, Any]:
@@ -217,7 +219,7 @@ class Material:
             "normals_behind_surface_share": float(np.mean(self.normals[on][:, 2] <= 1.1e-3)),
         }
 
-    def image(self, name: str, delivery: Delivery) -> Image:
+    def image(self, name: str, delivery: ExportSettings) -> ExportImage:
         """Return one of the material's textures.
 
         Parameters
@@ -229,10 +231,12 @@ class Material:
             Direction of the normals' green.
         """
         if name == "normal":
-            what = f"tangent space of the mesh's vertex frames, {delivery.green}"
+            what = f"tangent space of the mesh's vertex frames, {delivery.green_direction}"
             what = f"{what}, x and y and z in -1 to 1"
             up = (0.0, 0.0, 1.0)
-            return Image.of_normals(name, self.normals, delivery, what, valid=self.valid, filler=up)
+            return ExportImage.from_normals(
+                name, self.normals, delivery, what, valid=self.valid, filler=up
+            )
         # values, unit, color space, and the value of the PNG code 65535
         simple: dict[str, tuple[Float32Array, str, str, float]] = {
             "base_color": (self.base_color, "1", SRGB_SPACE, 1.0),
@@ -248,11 +252,11 @@ class Material:
         if name == "base_color":
             what = f"{what}; {COLOR_NOTE}"
         valid, filler = (None, (0.0,)) if name == "mask" else (self.valid, None)
-        return Image(name, values, unit, space, what, 0.0, high, valid, filler)
+        return ExportImage(name, values, unit, space, what, 0.0, high, valid, filler)
 
-    def error_images(self) -> list[Image]:
+    def error_images(self) -> list[ExportImage]:
         """Return standard errors of what has them, and the mask."""
-        out = [self.image("mask", Delivery())]
+        out = [self.image("mask", ExportSettings())]
         for name, values, unit in (
             ("base_color", self.base_color_stderr, "1"),
             ("translucency", self.translucency_stderr_mm, "mm"),
@@ -261,11 +265,13 @@ class Material:
                 what = f"standard error of {name}, 68 %"
                 space = CAMERA_SPACE if name == "base_color" else DATA_SPACE
                 known = np.nan_to_num(values)
-                out.append(Image(f"{name}_stderr", known, unit, space, what, valid=self.valid))
+                out.append(
+                    ExportImage(f"{name}_stderr", known, unit, space, what, valid=self.valid)
+                )
         return out
 
 
-def deficit_of(r_d: FloatArray, eta: float) -> Float64Array:
+def similarity_albedo_deficit(r_d: FloatArray, eta: float) -> Float64Array:
     """Return 1 - alpha' of the medium of an albedo, looked up between 1 000 exact values.
 
     Parameters
@@ -277,7 +283,7 @@ def deficit_of(r_d: FloatArray, eta: float) -> Float64Array:
 
     Examples
     --------
-    >>> deficit_of(np.array([0.436, 7.0]), 1.3).round(3).tolist()
+    >>> similarity_albedo_deficit(np.array([0.436, 7.0]), 1.3).round(3).tolist()
     [0.041, 0.0]
     """
     nodes = np.linspace(0.001, 0.999, 999)

@@ -8,9 +8,9 @@ import numpy as np
 
 from model.skin import SkinAppearance
 from skinrig.drawing import templates
-from skinrig.exporting.images import Image, ImageFolder
+from skinrig.exporting.images import ExportImage, ImageFolder
 from skinrig.exporting.materials.material import MAP_NOTES, Material
-from skinrig.exporting.options import FIRST_TILE, TILE_SEPARATORS, Delivery
+from skinrig.exporting.options import FIRST_TILE, TILE_SEPARATORS, ExportSettings
 from skinrig.exporting.sealing import IMAGE_ORIENTATION
 
 MATERIALX_FILE, DOCUMENT_FILE = "skin.mtlx", "material.json"
@@ -20,7 +20,9 @@ LINEAR_SRGB_NAME: Final = "lin_rec709"
 """MaterialX's name of linear sRGB; data get no color space."""
 
 
-def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[tuple[str, str]]:
+def write(
+    appearance: SkinAppearance, folder: Path, delivery: ExportSettings
+) -> list[tuple[str, str]]:
     """Write an OpenPBR material with its textures and the mesh.
 
     Parameters
@@ -43,11 +45,11 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         See :meth:`skinrig.exporting.materials.material.Material.of`.
     """
     material = Material.of(appearance, delivery.mesh)
-    left_out = material.left_out_of_mesh(delivery)
+    left_out = material.list_mesh_omissions(delivery)
     out = ImageFolder(folder, delivery, tiles=material.tiles)
     scale = write_textures(material, out)
     (folder / "skin.obj").write_text(
-        material.mesh.obj(delivery.per_mm, delivery.scene_unit), encoding="utf-8"
+        material.mesh.to_obj(delivery.units_per_mm, delivery.scene_unit), encoding="utf-8"
     )
     out.document(DOCUMENT_FILE, appearance, facts(material, appearance, delivery, SCHEMA, scale))
     return left_out
@@ -56,16 +58,17 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
 def write_textures(material: Material, out: ImageFolder) -> float:
     """Write the textures that `openpbr_document` names; return the largest radius, mm."""
     for name in ("base_color", "specular_roughness", "specular_weight", "translucency"):
-        out.exr(material.image(name, out.delivery), TEXTURE_FOLDER)
-    out.png(material.image("base_color", out.delivery), TEXTURE_FOLDER)
-    out.png(material.image("normal", out.delivery), TEXTURE_FOLDER)
+        out.write_exr(material.image(name, out.delivery), TEXTURE_FOLDER)
+    out.write_png(material.image("base_color", out.delivery), TEXTURE_FOLDER)
+    out.write_png(material.image("normal", out.delivery), TEXTURE_FOLDER)
     radius = material.radius_mm
     shown = radius[material.covered] if material.covered.any() else radius
     scale = float(shown.max())
     what = f"{MAP_NOTES['subsurface_radius']}; over {scale:.9g} mm, the largest"
     shares = np.clip(radius / scale, 0.0, 1.0)
-    out.exr(
-        Image("subsurface_radius_scale", shares, what=what, valid=material.valid), TEXTURE_FOLDER
+    out.write_exr(
+        ExportImage("subsurface_radius_scale", shares, what=what, valid=material.valid),
+        TEXTURE_FOLDER,
     )
     out.errors(material.error_images(), TEXTURE_FOLDER)
     text = openpbr_document(material, scale, out.delivery)
@@ -74,7 +77,11 @@ def write_textures(material: Material, out: ImageFolder) -> float:
 
 
 def facts(
-    material: Material, appearance: SkinAppearance, delivery: Delivery, schema: str, scale: float
+    material: Material,
+    appearance: SkinAppearance,
+    delivery: ExportSettings,
+    schema: str,
+    scale: float,
 ) -> dict[str, Any]:
     """Return what a document beside an exported material says of it.
 
@@ -94,15 +101,18 @@ def facts(
         **told,
         "schema": schema,
         "scene_unit": delivery.scene_unit,
-        "mm_per_scene_unit": 1.0 / delivery.per_mm,
+        "mm_per_scene_unit": 1.0 / delivery.units_per_mm,
         "orientation": IMAGE_ORIENTATION,
         "udim": {"tiles": list(material.tiles), "measured": [material.tiles[0]]},
         "frame": "+x right, +y up, +z towards the main camera",
-        "subsurface": {**told["subsurface"], "radius_in_scene_units": scale * delivery.per_mm},
+        "subsurface": {
+            **told["subsurface"],
+            "radius_in_scene_units": scale * delivery.units_per_mm,
+        },
     }
 
 
-def openpbr_document(material: Material, radius_mm: float, delivery: Delivery) -> str:
+def openpbr_document(material: Material, radius_mm: float, delivery: ExportSettings) -> str:
     """Return a material whose textures lie in `TEXTURE_FOLDER`.
 
     Parameters
@@ -117,7 +127,7 @@ def openpbr_document(material: Material, radius_mm: float, delivery: Delivery) -
     return templates.render(
         "exporting/templates/openpbr.mtlx",
         material=material,
-        radius=f"{radius_mm * delivery.per_mm:.9g}",
+        radius=f"{radius_mm * delivery.units_per_mm:.9g}",
         eta=f"{material.eta:.9g}",
         delivery=delivery,
         folder=TEXTURE_FOLDER,
@@ -125,7 +135,7 @@ def openpbr_document(material: Material, radius_mm: float, delivery: Delivery) -
 
 
 def images_document(
-    files: Mapping[str, tuple[str, str]], delivery: Delivery, *, tangent_normal: str | None
+    files: Mapping[str, tuple[str, str]], delivery: ExportSettings, *, tangent_normal: str | None
 ) -> str:
     """Return a node graph with an image node a map, so that a reader knows its color space.
 
@@ -145,8 +155,8 @@ def images_document(
     )
 
 
-def _all_tiles(file: str, delivery: Delivery) -> str:
+def _all_tiles(file: str, delivery: ExportSettings) -> str:
     """Return a file's name with the token of all tiles in place of the tile's number."""
     stem, dot, suffix = file.rpartition(".")
     tile = "" if delivery.udim == "none" else f"{TILE_SEPARATORS[delivery.udim]}{FIRST_TILE}"
-    return delivery.referred(stem.removesuffix(tile), suffix) if dot and tile else file
+    return delivery.format_reference(stem.removesuffix(tile), suffix) if dot and tile else file

@@ -51,7 +51,7 @@ class SurfaceFit:
     misfit: Float32Array
 
 
-def fit(lobes: BrdfBasis, weights: ArrayLike, *, eta: float) -> SurfaceFit:
+def fit_ggx_lobe(lobes: BrdfBasis, weights: ArrayLike, *, eta: float) -> SurfaceFit:
     """Fit roughness and weight to mixtures of lobes.
 
     Parameters
@@ -80,12 +80,12 @@ def fit(lobes: BrdfBasis, weights: ArrayLike, *, eta: float) -> SurfaceFit:
 
 
 def _fit(
-    share: Float64Array, gram: Float64Array, cross: Float64Array, own: Float64Array
+    weights: Float64Array, gram: Float64Array, cross: Float64Array, ggx_norm: Float64Array
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return roughness, weight and misfit of N mixtures, by the products of `_products`."""
-    energy = np.einsum("...k,kl,...l->...", share, gram, share)
-    along = share @ cross  # (N, R)
-    explained = np.maximum(along, 0.0) ** 2 / own
+    energy = np.einsum("...k,kl,...l->...", weights, gram, weights)
+    along = weights @ cross  # (N, R)
+    explained = np.maximum(along, 0.0) ** 2 / ggx_norm
     best = np.argmax(explained, axis=-1)
     inner = np.clip(best, 1, len(ROUGHNESS_NODES) - 2)
 
@@ -107,7 +107,7 @@ def _fit(
             part * np.take_along_axis(table, (low + 1)[..., None], -1)[..., 0]
         )
 
-    scale = np.maximum(between(along / own), 0.0)
+    scale = np.maximum(between(along / ggx_norm), 0.0)
     left = np.maximum(energy - np.maximum(here, explained.max(axis=-1)), 0.0)
     dark = energy <= 1e-30
     misfit = np.sqrt(left / np.where(dark, 1.0, energy))
@@ -137,7 +137,7 @@ def _directions() -> tuple[tuple[Float64Array, ...], Float64Array, BoolArray]:
 
     Beside them the solid angle of each node times both cosines, up to a factor, and which count.
     """
-    d, phi, h = brdf_tables.nodes()
+    d, phi, h = brdf_tables.grid_nodes()
     picked = np.meshgrid(d[::STRIDE_D], phi[::STRIDE_PHI], h[::STRIDE_H], indexing="ij")
     theta_d, phi_d, theta_h = (axis.reshape(-1) for axis in picked)
     light, view = (w[:, 2] for w in merl.to_directions(theta_h, theta_d, phi_d))

@@ -80,15 +80,15 @@ class FramedMesh:
             vertex = faces[:, corner]
             normal = normals[vertex]
             here = points[mesh.faces[:, corner]]
-            first = _across(points[mesh.faces[:, (corner + 1) % 3]] - here, normal)
-            last = _across(points[mesh.faces[:, (corner + 2) % 3]] - here, normal)
+            first = _project_across(points[mesh.faces[:, (corner + 1) % 3]] - here, normal)
+            last = _project_across(points[mesh.faces[:, (corner + 2) % 3]] - here, normal)
             angle = np.arccos(np.clip(np.sum(first * last, axis=1), -1.0, 1.0))
             known = np.abs(turn) > 0.0
-            np.add.at(total, vertex, (angle * known)[:, None] * _across(along_u, normal))
+            np.add.at(total, vertex, (angle * known)[:, None] * _project_across(along_u, normal))
         tangent = _unit(total)
         lost = np.linalg.norm(tangent, axis=1) < 0.5
         axis = np.eye(3)[np.argmin(np.abs(normals[lost]), axis=1)]
-        tangent[lost] = _across(axis, normals[lost])  # some direction
+        tangent[lost] = _project_across(axis, normals[lost])  # some direction
         frames = np.column_stack([tangent, signs]).astype(np.float32)
         own = mesh.vertices_mm[source], normals.astype(np.float32), mesh.uv[source]
         return FramedMesh(*own, frames, faces.astype(np.int32), source)
@@ -97,7 +97,7 @@ class FramedMesh:
         """Return the mesh with some of its faces, (F,), all vertices and their frames."""
         return replace(self, faces=self.faces[faces])
 
-    def obj(self, per_mm: float, unit: str) -> str:
+    def to_obj(self, per_mm: float, unit: str) -> str:
         """Return the mesh as Wavefront OBJ text with texture coordinates and normals.
 
         Parameters
@@ -115,7 +115,7 @@ class FramedMesh:
         lines += [f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}" for a, b, c in (self.faces + 1).tolist()]
         return "\n".join(lines) + "\n"
 
-    def holes(self) -> int:
+    def count_holes(self) -> int:
         """Return how many rims connected surfaces have beside one each, seams of charts apart.
 
         Examples
@@ -123,7 +123,7 @@ class FramedMesh:
         >>> from rigsim.geometry.mesh import build_mesh
         >>> square = [[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0]]
         >>> flat = build_mesh(square, [[0, 1, 2], [0, 2, 3]], [[0, 0], [1, 0], [1, 1], [0, 1]])
-        >>> FramedMesh.of(flat).holes()
+        >>> FramedMesh.of(flat).count_holes()
         0
         """
         from scipy.sparse import coo_array
@@ -172,7 +172,7 @@ class FramedMesh:
         return axes, covered
 
 
-def to_tangent(normals: ArrayLike, axes: Float64Array, covered: BoolArray) -> Float32Array:
+def rotate_to_tangent(normals: ArrayLike, axes: Float64Array, covered: BoolArray) -> Float32Array:
     """Return normals in their texels' frames.
 
     Parameters
@@ -185,9 +185,9 @@ def to_tangent(normals: ArrayLike, axes: Float64Array, covered: BoolArray) -> Fl
     Returns
     -------
     ndarray of float32, shape (H, W, 3)
-        Unit vectors whose decoding is :func:`from_tangent`; (0, 0, 1) where nothing is covered.
-        The third component is above 0 as a map must have it: normals that face away from the
-        surface are laid onto its horizon.
+        Unit vectors whose decoding is :func:`rotate_from_tangent`; (0, 0, 1) where nothing is
+        covered. The third component is above 0 as a map must have it: normals that face away from
+        the surface are laid onto its horizon.
     """
     given = np.asarray(normals)
     good = covered & np.isfinite(given).all(axis=-1)
@@ -208,7 +208,7 @@ def to_tangent(normals: ArrayLike, axes: Float64Array, covered: BoolArray) -> Fl
     return out
 
 
-def filled(tangent_normals: ArrayLike, valid: BoolArray) -> Float32Array:
+def fill_tangent_normals(tangent_normals: ArrayLike, valid: BoolArray) -> Float32Array:
     """Return tangent-space normals with what was not measured filled from around, (H, W, 3).
 
     In its texel's frame relief goes on beyond an edge. Filled in the frame of the rig instead, the
@@ -224,7 +224,7 @@ def filled(tangent_normals: ArrayLike, valid: BoolArray) -> Float32Array:
     Examples
     --------
     >>> tilted = np.full((8, 8, 3), (0.6, 0.0, 0.8)) * np.eye(8, dtype=bool)[..., None]
-    >>> filled(tilted, np.eye(8, dtype=bool))[0, 7].round(3).tolist()
+    >>> fill_tangent_normals(tilted, np.eye(8, dtype=bool))[0, 7].round(3).tolist()
     [0.6000000238418579, 0.0, 0.800000011920929]
     """
     given = np.asarray(tangent_normals, np.float32)
@@ -235,7 +235,7 @@ def filled(tangent_normals: ArrayLike, valid: BoolArray) -> Float32Array:
     return np.where(valid[..., None], given, _unit(spread)).astype(np.float32)
 
 
-def from_tangent(tangent_normals: ArrayLike, axes: Float64Array) -> Float64Array:
+def rotate_from_tangent(tangent_normals: ArrayLike, axes: Float64Array) -> Float64Array:
     """Return unit normals in the frame of the axes, as a renderer decodes a map, (H, W, 3)."""
     return _unit(np.einsum("hwk,hwkc->hwc", np.asarray(tangent_normals, np.float64), axes))
 
@@ -250,7 +250,7 @@ def _face_tangents(points: Float64Array, uv: Float64Array) -> tuple[Float64Array
     return _unit(along), area
 
 
-def _across(vectors: Float64Array, normals: Float64Array) -> Float64Array:
+def _project_across(vectors: Float64Array, normals: Float64Array) -> Float64Array:
     """Return unit vectors laid into the plane across normals; 0 for those along them."""
     return _unit(vectors - np.sum(vectors * normals, axis=1, keepdims=True) * normals)
 

@@ -82,7 +82,7 @@ class TiledMesh:
         )
 
 
-def tiles_of(uv: FloatArray, faces: NDArray[np.integer]) -> NDArray[np.intp]:
+def find_tiles(uv: FloatArray, faces: NDArray[np.integer]) -> NDArray[np.intp]:
     """Return the UDIM tile of each face.
 
     Parameters
@@ -100,7 +100,7 @@ def tiles_of(uv: FloatArray, faces: NDArray[np.integer]) -> NDArray[np.intp]:
     Examples
     --------
     >>> corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [2.0, 0.0], [1.0, 2.0]])
-    >>> tiles_of(corners, np.array([[0, 1, 2], [1, 3, 2]])).tolist()
+    >>> find_tiles(corners, np.array([[0, 1, 2], [1, 3, 2]])).tolist()
     [1001, 1002]
     """
     corners = np.asarray(uv, np.float64)[faces]
@@ -132,7 +132,7 @@ def read(path: Path) -> TiledMesh:
     rigsim.geometry.mesh.MeshError, rigsim.geometry.mesh.MeshError
         The file is missing, damaged, or no mesh that maps can be laid on.
     ExportError
-        See `tiles_of`.
+        See `find_tiles`.
     """
     vertices, faces, uv, shapes = _contents(path)
     if uv.min() >= -UV_ROUNDING and uv.max() <= 1.0 + UV_ROUNDING:
@@ -142,7 +142,7 @@ def read(path: Path) -> TiledMesh:
     lowest, span = float(uv.min()), max(float(np.ptp(uv)), 1.0)
     checked = build_mesh(vertices, faces, (uv - lowest) / (2.0 * span), shapes=shapes)
     points, corners = checked.vertices_mm, checked.faces
-    normals, tiles = vertex_normals(points, corners), tiles_of(uv, corners)
+    normals, tiles = vertex_normals(points, corners), find_tiles(uv, corners)
     wide = np.asarray(uv, np.float32)
     return TiledMesh(points, corners, wide, normals, tiles, dict(checked.shapes))
 
@@ -161,11 +161,11 @@ def _contents(path: Path) -> Contents:
         # texture coordinates over more than one tile are the one thing that is allowed here
         if "uv: got" not in str(error):
             raise
-        return _several_tiles(path)
+        return _read_tiles(path)
     return mesh.vertices_mm, mesh.faces, mesh.uv, dict(mesh.shapes)
 
 
-def _several_tiles(path: Path) -> Contents:
+def _read_tiles(path: Path) -> Contents:
     if path.suffix == ".npz":
         with np.load(path, allow_pickle=False) as arrays:
             shapes = {}

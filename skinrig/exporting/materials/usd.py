@@ -21,14 +21,16 @@ from skinrig.errors import MissingExtra
 from skinrig.exporting.images import ImageFolder
 from skinrig.exporting.materials import blender, materialx
 from skinrig.exporting.materials.material import Material
-from skinrig.exporting.options import UNITS_M, Delivery
+from skinrig.exporting.options import UNITS_M, ExportSettings
 
 USD_FILE, DOCUMENT_FILE = "skin.usdc", "usd.json"
 SCHEMA: Final = "skinrig.export.usd/1"
 ROOT_PRIM: Final = "/Skin"
 
 
-def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[tuple[str, str]]:
+def write(
+    appearance: SkinAppearance, folder: Path, delivery: ExportSettings
+) -> list[tuple[str, str]]:
     """Write skin.usdc with its textures.
 
     Parameters
@@ -58,12 +60,12 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     except ImportError as error:
         raise MissingExtra("export to USD", "usd") from error
     material = Material.of(appearance, delivery.mesh)
-    tiles = material.left_out_of_mesh(delivery)
+    tiles = material.list_mesh_omissions(delivery)
     out = ImageFolder(folder, delivery, tiles=material.tiles)
     scale = materialx.write_textures(material, out)
-    out.png(material.image("specular_roughness", delivery), materialx.TEXTURE_FOLDER)
+    out.write_png(material.image("specular_roughness", delivery), materialx.TEXTURE_FOLDER)
     names = {name: Tf.MakeValidIdentifier(name) for name in material.shapes}
-    _write_stage(folder / USD_FILE, material, names, scale * delivery.per_mm, delivery)
+    _write_stage(folder / USD_FILE, material, names, scale * delivery.units_per_mm, delivery)
     textures = (
         ("Subsurface Radius", _place(delivery, "subsurface_radius_scale", "exr"), 1.0),
         # Blender's level of 0.5 is the reflection of a dielectric
@@ -82,12 +84,16 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
 
 
 def _write_stage(
-    path: Path, material: Material, names: Mapping[str, str], radius: float, delivery: Delivery
+    path: Path,
+    material: Material,
+    names: Mapping[str, str],
+    radius: float,
+    delivery: ExportSettings,
 ) -> None:
     """Write the file; blend shapes bear their own names in it."""
     from pxr import Sdf, Vt
 
-    mesh, per_mm = material.mesh, delivery.per_mm
+    mesh, per_mm = material.mesh, delivery.units_per_mm
     points = mesh.vertices_mm * per_mm
     text = templates.render(
         "exporting/templates/skin.usda",
@@ -117,5 +123,5 @@ def _write_stage(
     layer.Export(str(path))
 
 
-def _place(delivery: Delivery, name: str, suffix: str) -> str:
-    return f"{materialx.TEXTURE_FOLDER}/{delivery.referred(name, suffix)}"
+def _place(delivery: ExportSettings, name: str, suffix: str) -> str:
+    return f"{materialx.TEXTURE_FOLDER}/{delivery.format_reference(name, suffix)}"

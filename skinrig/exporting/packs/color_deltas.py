@@ -8,13 +8,13 @@ import numpy as np
 
 from model import fresnel, store
 from model.skin import SkinAppearance
-from model.texture_resampling import resampled
+from model.texture_resampling import resample
 from reconstruction.correspondence import landmark_field, landmark_table
 from reconstruction.surface.texture_fill import push_pull
 from skinrig.applying import expression
 from skinrig.arrays import BoolArray, Float64Array
-from skinrig.exporting.images import CAMERA_SPACE, DATA_SPACE, SRGB_SPACE, Image, ImageFolder
-from skinrig.exporting.options import Delivery, ExportError
+from skinrig.exporting.images import CAMERA_SPACE, DATA_SPACE, SRGB_SPACE, ExportImage, ImageFolder
+from skinrig.exporting.options import ExportError, ExportSettings
 
 COLOR_SIZE, MAX_STATES = 512, 3
 NEUTRAL: Final = "neutral"
@@ -67,20 +67,24 @@ def write(appearance: SkinAppearance, out: ImageFolder) -> tuple[dict[str, Any],
     """
     rig = expression.hemoglobin_rig(appearance)
     have = sorted(rig.states)
-    states = chosen(have, "color", out)
+    states = select_states(have, "color", out)
     colors = _colors(appearance, rig, states, out)
     names = {f"cm{k}": state for k, state in enumerate(states, start=1)}
     what = f"neutral base color on {colors.layout}; {colors.space}; holes filled"
     filled = push_pull(colors.base, colors.valid.astype(np.float32)).values.astype(np.float64)
-    out.both(Image("base_color", filled, space=SRGB_SPACE, what=what, valid=colors.valid))
+    out.write_exr_and_png(
+        ExportImage("base_color", filled, space=SRGB_SPACE, what=what, valid=colors.valid)
+    )
     largest = {}
     for name, state in names.items():
         delta = colors.deltas[state]
         what = f"color of {state} at full strength less neutral, linear, on {colors.layout}"
-        out.both(Image(f"{name}_delta", delta, "1", DATA_SPACE, what, -1.0, 1.0, colors.valid))
+        out.write_exr_and_png(
+            ExportImage(f"{name}_delta", delta, "1", DATA_SPACE, what, -1.0, 1.0, colors.valid)
+        )
         shown = np.abs(delta[colors.valid])
         largest[name] = float(shown.max()) if shown.size else 0.0
-    out.errors([Image("color_mask", colors.valid.astype(float))])
+    out.errors([ExportImage("color_mask", colors.valid.astype(float))])
     told = {"layout": colors.layout, "space": colors.space, "maps": names, "largest_delta": largest}
     return {"size": COLOR_SIZE, **told, "valid_share": float(colors.valid.mean())}, have
 
@@ -93,7 +97,9 @@ def _colors(appearance: SkinAppearance, rig: Any, states: list[str], out: ImageF
         blends[state] = rig.evaluate({state: 1.0})
         seen &= blends[state].valid
     shown = {
-        state: expression.colors(melanin.values, blend.hemoglobin, seen).astype(np.float64)
+        state: expression.skin_reflectance(melanin.values, blend.hemoglobin, seen).astype(
+            np.float64
+        )
         for state, blend in blends.items()
     }
     neutral = shown[NEUTRAL]
@@ -102,9 +108,9 @@ def _colors(appearance: SkinAppearance, rig: Any, states: list[str], out: ImageF
             "they lie on the flash camera's picture; name the "
             "dome's maps with --onto, and two tables of landmarks"
         )
-        out.leave_out("colors on the face's texture", why)
-        base, valid = sized(neutral, seen, COLOR_SIZE)
-        deltas = {s: sized(shown[s] - neutral, seen, COLOR_SIZE)[0] for s in states}
+        out.record_omission("colors on the face's texture", why)
+        base, valid = resize_map(neutral, seen, COLOR_SIZE)
+        deltas = {s: resize_map(shown[s] - neutral, seen, COLOR_SIZE)[0] for s in states}
         height, width = seen.shape
         layout = f"the flash camera's picture, {width} x {height}, stretched to a square"
         return Colors(base, deltas, valid, layout, SRGB_SPACE)
@@ -112,7 +118,10 @@ def _colors(appearance: SkinAppearance, rig: Any, states: list[str], out: ImageF
 
 
 def _on_texture(
-    delivery: Delivery, shown: Mapping[str, Float64Array], seen: BoolArray, states: list[str]
+    delivery: ExportSettings,
+    colors: Mapping[str, Float64Array],
+    visible: BoolArray,
+    states: list[str],
 ) -> Colors:
     """Return colors on another appearance's texture: its albedo, and changes carried over."""
     if delivery.onto is None or len(delivery.landmarks) != 2:
@@ -128,14 +137,14 @@ def _on_texture(
             "among them"
         )
     inside = 1.0 - fresnel.diffuse_external(fresnel.ETA_SKIN)
-    base, valid = sized(inside * albedo.values.astype(np.float64), albedo.mask, COLOR_SIZE)
-    source = _places(delivery, albedo.values.shape[:2])
-    neutral = shown[NEUTRAL]
+    base, valid = resize_map(inside * albedo.values.astype(np.float64), albedo.mask, COLOR_SIZE)
+    source = _source_pixels(delivery, albedo.values.shape[:2])
+    neutral = colors[NEUTRAL]
     deltas: dict[str, Float64Array] = {}
     for state in states:
         # a ratio of colors is the skin's own; a difference would be that of another exposure
-        ratio = np.divide(shown[state], neutral, out=np.ones_like(neutral), where=neutral > 1e-3)
-        carried, told = _looked_up(ratio - 1.0, seen, source)
+        ratio = np.divide(colors[state], neutral, out=np.ones_like(neutral), where=neutral > 1e-3)
+        carried, told = _sample_map(ratio - 1.0, visible, source)
         deltas[state] = base * carried
         deltas[state][~told] = 0.0
         valid &= told
@@ -143,12 +152,12 @@ def _on_texture(
     return Colors(base, deltas, valid, layout, CAMERA_SPACE)
 
 
-def _places(delivery: Delivery, shape: tuple[int, int]) -> Float64Array:
+def _source_pixels(delivery: ExportSettings, shape: tuple[int, int]) -> Float64Array:
     """Return the flash picture's pixel under each pixel of the pack, column and row, (N, N, 2)."""
-    own, onto = (landmark_table.read(path) for path in delivery.landmarks)
+    own, onto = (landmark_table.read_landmark_table(path) for path in delivery.landmarks)
     names = sorted(set(own) & set(onto))
     try:
-        field = landmark_field.fit(
+        field = landmark_field.fit_landmark_field(
             [onto[n] for n in names], [own[n] for n in names], stderr_px=LANDMARK_STDERR_PX
         )
     except landmark_field.LandmarkFieldError as error:
@@ -158,7 +167,7 @@ def _places(delivery: Delivery, shape: tuple[int, int]) -> Float64Array:
     texel = np.stack(pixel, axis=-1)
     # the field is smooth: every eighth pixel, and linearly between
     step = texel[::8, ::8].reshape(-1, 2)
-    moved = field.at(step)[0].reshape(*texel[::8, ::8].shape)
+    moved = field.evaluate(step)[0].reshape(*texel[::8, ::8].shape)
     fine = np.moveaxis(_refined(np.moveaxis(moved, -1, 0)), 0, -1)
     return texel + fine
 
@@ -174,35 +183,35 @@ def _refined(coarse: Float64Array) -> Float64Array:
     return coarse
 
 
-def _looked_up(
-    values: Float64Array, seen: BoolArray, source: Float64Array
+def _sample_map(
+    values: Float64Array, visible: BoolArray, source: Float64Array
 ) -> tuple[Float64Array, BoolArray]:
     """Return values at places of a picture, bilinearly among what is known."""
     from scipy.ndimage import map_coordinates
 
     at = [source[..., 1], source[..., 0]]
-    share = map_coordinates(seen.astype(np.float64), at, order=1, cval=0.0)
+    share = map_coordinates(visible.astype(np.float64), at, order=1, cval=0.0)
     layers = [
-        map_coordinates(np.where(seen, values[..., c], 0.0), at, order=1, cval=0.0)
+        map_coordinates(np.where(visible, values[..., c], 0.0), at, order=1, cval=0.0)
         for c in range(values.shape[-1])
     ]
     told = share >= MIN_KNOWN_FRACTION
     return np.stack(layers, axis=-1) / np.where(told, share, 1.0)[..., None], told
 
 
-def chosen(have: list[str], what: str, out: ImageFolder) -> list[str]:
+def select_states(available: list[str], quantity: str, out: ImageFolder) -> list[str]:
     """Return up to three states, those asked for first of all."""
     only = out.delivery.only
-    names = [name for name in only if name in have] if only else have
+    names = [name for name in only if name in available] if only else available
     for name in names[MAX_STATES:]:
-        out.leave_out(f"{what} of {name}", f"a face has {MAX_STATES}; choose with --only")
+        out.record_omission(f"{quantity} of {name}", f"a face has {MAX_STATES}; choose with --only")
     return names[:MAX_STATES]
 
 
-def sized(values: Float64Array, valid: BoolArray, size: int) -> tuple[Float64Array, BoolArray]:
+def resize_map(values: Float64Array, valid: BoolArray, size: int) -> tuple[Float64Array, BoolArray]:
     """Return values at another size, means among what is known; 0 where nothing is."""
     layers = np.moveaxis(np.where(valid[..., None], values, 0.0), -1, 0)
-    share = resampled(valid.astype(np.float64), (size, size))
-    found = np.moveaxis(resampled(layers, (size, size)), 0, -1)
+    share = resample(valid.astype(np.float64), (size, size))
+    found = np.moveaxis(resample(layers, (size, size)), 0, -1)
     good = share >= MIN_KNOWN_FRACTION
     return np.where(good[..., None], found / np.where(good, share, 1.0)[..., None], 0.0), good

@@ -18,14 +18,14 @@ import numpy as np
 
 from model import wrinkles
 from model.skin import SkinAppearance
-from model.texture_resampling import resampled
+from model.texture_resampling import resample
 from model.wrinkles.evaluation import WRINKLE_FILE as WRINKLE_FILE
 from model.wrinkles.evaluation import WrinkleModel
 from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.appearances.dynamic import FACIAL_COLOR, MICROSTRUCTURE, WRINKLES
 from skinrig.arrays import BoolArray, Float64Array
-from skinrig.exporting.images import DATA_SPACE, Image, ImageFolder
-from skinrig.exporting.options import Delivery, ExportError
+from skinrig.exporting.images import DATA_SPACE, ExportImage, ImageFolder
+from skinrig.exporting.options import ExportError, ExportSettings
 from skinrig.exporting.packs import color_deltas, detail_maps
 from skinrig.exporting.sealing import IMAGE_ORIENTATION
 
@@ -45,7 +45,9 @@ NORMAL_CODING: Final = (
 )
 
 
-def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[tuple[str, str]]:
+def write(
+    appearance: SkinAppearance, folder: Path, delivery: ExportSettings
+) -> list[tuple[str, str]]:
     """Write the pack of a dynamic appearance.
 
     Parameters
@@ -68,7 +70,7 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     ExportError
         For a folder that holds neither part, or states that it lacks.
     """
-    parts = dynamic_appearance.parts_of(appearance)
+    parts = dynamic_appearance.describe_parts(appearance)
     if not {FACIAL_COLOR, WRINKLES, MICROSTRUCTURE} & set(parts):
         raise ExportError(
             f"metahuman: got {', '.join(parts) or 'maps that nothing was fitted to'}, expected "
@@ -89,8 +91,8 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     for part, what in PART_MAPS.items():
         if part not in parts:
             fit = f"skinrig fit {part.replace('_', '-')}"
-            out.leave_out(what, f"the folder holds no {part}: run `{fit}`")
-    told |= detail_maps.scatter(out)
+            out.record_omission(what, f"the folder holds no {part}: run `{fit}`")
+    told |= detail_maps.write_scatter(out)
     unknown = [name for name in delivery.only if name not in known]
     if unknown:
         raise ExportError(
@@ -102,7 +104,7 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         {
             "schema": SCHEMA,
             "orientation": IMAGE_ORIENTATION,
-            "normal_y": delivery.green,
+            "normal_y": delivery.green_direction,
             "color_coding": COLOR_CODING,
             "normal_coding": NORMAL_CODING,
             **told,
@@ -119,20 +121,22 @@ def _write_wrinkles(
     rows = sorted({str(row) for layer in model.layers for row in layer.table.rows})  # type: ignore[union-attr]
     fitted = [str(n) for n in parts[WRINKLES].get("expressions", [])]
     have = [name for name in fitted if name in rows] + [n for n in rows if n not in fitted]
-    chosen = color_deltas.chosen(have, "wrinkles", out)
+    chosen = color_deltas.select_states(have, "wrinkles", out)
     names = {f"wm{k}": row for k, row in enumerate(chosen, start=1)}
     known = np.ones(model.base.shape[:2], bool) if model.valid is None else model.valid
-    slopes, valid = color_deltas.sized(np.asarray(model.base, np.float64), known, NORMAL_SIZE)
+    slopes, valid = color_deltas.resize_map(np.asarray(model.base, np.float64), known, NORMAL_SIZE)
     sign = np.array([1.0, out.delivery.y])
     _write_normal("normal", slopes, valid, out, "neutral normals")
     clipped = {}
     for name, row in names.items():
         shown = model.evaluate({row: 1.0})
         moved = wrinkles.encode(shown.normals.astype(np.float64), limit=None) - model.base
-        delta, _ = color_deltas.sized(moved, shown.valid, NORMAL_SIZE)
+        delta, _ = color_deltas.resize_map(moved, shown.valid, NORMAL_SIZE)
         layers = np.concatenate([delta * sign, np.zeros((*delta.shape[:2], 1))], axis=-1)
         what = f"slopes that {row} adds at full strength: R n_x/n_z, G n_y/n_z, B 0"
-        out.both(Image(f"{name}_delta", layers, "1", DATA_SPACE, what, -1.0, 1.0, valid))
+        out.write_exr_and_png(
+            ExportImage(f"{name}_delta", layers, "1", DATA_SPACE, what, -1.0, 1.0, valid)
+        )
         clipped[name] = float(np.mean(np.abs(delta[valid]) > 1.0)) if valid.any() else 0.0
         _write_normal(f"{name}_normal", slopes + delta, valid, out, f"normals of {row}")
     masks = {}
@@ -140,12 +144,12 @@ def _write_wrinkles(
         zones = list(getattr(layer.table, "zones", ()))
         for zone, mask in enumerate(layer.masks):
             name = f"wrinkle_mask_{number}_{zone}"
-            sized = resampled(np.asarray(mask, np.float64), (NORMAL_SIZE, NORMAL_SIZE))
+            sized = resample(np.asarray(mask, np.float64), (NORMAL_SIZE, NORMAL_SIZE))
             told = zones[zone] if zone < len(zones) else str(zone)
-            out.png(Image(name, sized, low=0.0, high=1.0, what=f"zone {told}"))
+            out.write_png(ExportImage(name, sized, low=0.0, high=1.0, what=f"zone {told}"))
             masks[name] = told
-    hollows = detail_maps.cavity(np.asarray(model.base, np.float64), known, NORMAL_SIZE, out)
-    out.errors([Image("normal_mask", valid.astype(float))])
+    hollows = detail_maps.write_cavity(np.asarray(model.base, np.float64), known, NORMAL_SIZE, out)
+    out.errors([ExportImage("normal_mask", valid.astype(float))])
     return {
         "size": NORMAL_SIZE,
         "layout": "the dome's texture",
@@ -159,7 +163,13 @@ def _write_wrinkles(
 
 
 def _write_normal(
-    name: str, slopes: Float64Array, valid: BoolArray, out: ImageFolder, what: str
+    name: str, slopes: Float64Array, valid: BoolArray, out: ImageFolder, description: str
 ) -> None:
-    what = f"{what}, tangent space over the smooth shape, {out.delivery.green}"
-    out.png(Image.of_normals(name, wrinkles.decode(slopes), out.delivery, what, valid=valid))
+    description = (
+        f"{description}, tangent space over the smooth shape, {out.delivery.green_direction}"
+    )
+    out.write_png(
+        ExportImage.from_normals(
+            name, wrinkles.decode(slopes), out.delivery, description, valid=valid
+        )
+    )

@@ -18,16 +18,16 @@ from model import store, wrinkles
 from model.skin import SkinAppearance
 from reconstruction.normal_integration import integrate_map
 from reconstruction.surface.texture_fill import push_pull
-from skinrig.appearances.contents import assumed_by
+from skinrig.appearances.contents import list_assumptions
 from skinrig.arrays import BoolArray, Float64Array
-from skinrig.exporting.images import DATA_SPACE, Image, ImageFolder
+from skinrig.exporting.images import DATA_SPACE, ExportImage, ImageFolder
 from skinrig.exporting.packs import color_deltas
 
 FADE_DIVISOR: Final = 8
 """One part of so many of a tile is faded into what lies beyond its other end."""
 
 
-def periodic(image: ArrayLike) -> Float64Array:
+def make_periodic(image: ArrayLike) -> Float64Array:
     """Return an image that repeats without a seam: what is beyond its end fades into its beginning.
 
     By weights whose squares sum to 1, so that relief of independent places keeps its variance.
@@ -45,7 +45,7 @@ def periodic(image: ArrayLike) -> Float64Array:
     Examples
     --------
     >>> image = np.random.default_rng(0).normal(size=(64, 80))
-    >>> tile = periodic(image)
+    >>> tile = make_periodic(image)
     >>> tile.shape, np.array_equal(tile[8:, 10:], image[8:56, 10:70])
     ((56, 70), True)
     """
@@ -88,7 +88,9 @@ MAX_SCATTER_MM: Final = 16.0
 MM_PER_UM: Final = 0.001
 
 
-def cavity(slopes: Float64Array, valid: BoolArray, size: int, out: ImageFolder) -> dict[str, Any]:
+def write_cavity(
+    slopes: Float64Array, valid: BoolArray, size: int, out: ImageFolder
+) -> dict[str, Any]:
     """Write the share of light from all around that relief leaves to its own hollows.
 
     Parameters
@@ -108,21 +110,21 @@ def cavity(slopes: Float64Array, valid: BoolArray, size: int, out: ImageFolder) 
         JSON values; empty where it is left out.
     """
     if not valid.any():
-        out.leave_out("cavity", "no wrinkle normal is valid")
+        out.record_omission("cavity", "no wrinkle normal is valid")
         return {}
     found = integrate_map(wrinkles.decode(slopes), valid=valid)
     if not found.convergence.converged:
-        out.leave_out("cavity", "the normals could not be integrated to heights")
+        out.record_omission("cavity", "the normals could not be integrated to heights")
         return {}
-    seen = visible_share(found.height, found.part)
-    shown, known = color_deltas.sized(seen[..., None], found.valid, size)
+    seen = ambient_visibility(found.height, found.part)
+    shown, known = color_deltas.resize_map(seen[..., None], found.valid, size)
     values = np.where(known, shown[..., 0], 1.0)
     what = (
         "share of light from all around that relief leaves at a place: 1 on ridges and flat "
         f"skin; horizons of {HORIZON_REACH_PX} measured texels in {HORIZON_DIRECTIONS} "
         "directions; 1 where nothing was measured"
     )
-    out.both(Image("cavity", values, "1", DATA_SPACE, what, 0.0, 1.0, known))
+    out.write_exr_and_png(ExportImage("cavity", values, "1", DATA_SPACE, what, 0.0, 1.0, known))
     return {
         "cavity": {
             "of": "heights integrated from the neutral wrinkle normals",
@@ -134,7 +136,7 @@ def cavity(slopes: Float64Array, valid: BoolArray, size: int, out: ImageFolder) 
     }
 
 
-def visible_share(height: ArrayLike, part: ArrayLike) -> Float64Array:
+def ambient_visibility(height: ArrayLike, part: ArrayLike) -> Float64Array:
     """Return the share of cosine-weighted light from all around that reaches each texel.
 
     Parameters
@@ -155,7 +157,7 @@ def visible_share(height: ArrayLike, part: ArrayLike) -> Float64Array:
 
     >>> walls = np.abs(np.arange(41) - 20.0)
     >>> groove = np.broadcast_to(walls, (41, 41))
-    >>> float(visible_share(groove, np.zeros((41, 41), int))[20, 20].round(3))
+    >>> float(ambient_visibility(groove, np.zeros((41, 41), int))[20, 20].round(3))
     0.707
     """
     from scipy.ndimage import map_coordinates
@@ -169,25 +171,25 @@ def visible_share(height: ArrayLike, part: ArrayLike) -> Float64Array:
         for step in range(1, HORIZON_REACH_PX + 1):
             at = np.stack([rows + step * np.sin(angle), columns + step * np.cos(angle)])
             there = map_coordinates(z, at, order=1, mode="nearest")
-            same = _among(number, at)
+            same = _has_own_part(number, at)
             slope = np.where(same, np.maximum(slope, (there - z) / step), slope)
         total += slope**2 / (1.0 + slope**2)
     return np.asarray(1.0 - total / HORIZON_DIRECTIONS)
 
 
-def _among(number: NDArray[Any], at: Float64Array) -> BoolArray:
+def _has_own_part(number: NDArray[Any], positions: Float64Array) -> BoolArray:
     """Return whether all four texels around places, (2, H, W), are of the part of their own."""
     last = np.array(number.shape)[:, None, None] - 1
-    low = np.clip(np.floor(at).astype(int), 0, last)
+    low = np.clip(np.floor(positions).astype(int), 0, last)
     high = np.clip(low + 1, 0, last)
-    same = ((at >= 0.0) & (at <= last)).all(axis=0) & (number >= 0)
+    same = ((positions >= 0.0) & (positions <= last)).all(axis=0) & (number >= 0)
     for row in (low[0], high[0]):
         for column in (low[1], high[1]):
             same &= number[row, column] == number
     return np.asarray(same)
 
 
-def scatter(out: ImageFolder) -> dict[str, Any]:
+def write_scatter(out: ImageFolder) -> dict[str, Any]:
     """Write how far light spreads below the surface, of the model that colors are put on.
 
     Parameters
@@ -203,29 +205,31 @@ def scatter(out: ImageFolder) -> dict[str, Any]:
     onto = out.delivery.onto
     if onto is None:
         why = "it is of a model: name one of `skinrig fit reflectance` by --onto"
-        out.leave_out("scatter", why)
+        out.record_omission("scatter", why)
         return {}
     other = store.read(onto)
     depth = other.maps.get("translucency")
     if depth is None:
         makes = "`skinrig fit reflectance` makes it"
-        out.leave_out("scatter", f"{onto.name} holds no translucency: {makes}")
+        out.record_omission("scatter", f"{onto.name} holds no translucency: {makes}")
         return {}
     values = np.asarray(depth.values, np.float64)
     if not depth.mask.any():
-        out.leave_out("scatter", f"no translucency of {onto.name} is known")
+        out.record_omission("scatter", f"no translucency of {onto.name} is known")
         return {}
-    shown, valid = color_deltas.sized(values, depth.mask, SCATTER_SIZE)
+    shown, valid = color_deltas.resize_map(values, depth.mask, SCATTER_SIZE)
     usual = np.median(values[depth.mask], axis=0)
     what = "1/sigma_tr in red, green and blue; the median where it is not known"
     shown = np.where(valid[..., None], shown, usual)
-    out.both(Image("scatter", shown, "mm", DATA_SPACE, what, 0.0, MAX_SCATTER_MM, valid))
+    out.write_exr_and_png(
+        ExportImage("scatter", shown, "mm", DATA_SPACE, what, 0.0, MAX_SCATTER_MM, valid)
+    )
     return {
         "scatter": {
             "size": SCATTER_SIZE,
             "layout": f"the texture of {onto.name}",
             "median_mm": usual.tolist(),
-            "assumed": [t for t in assumed_by(other) if "translucency" in t],
+            "assumed": [t for t in list_assumptions(other) if "translucency" in t],
         }
     }
 
@@ -250,21 +254,21 @@ def micro_normals(
         JSON values; sites whose relief is not known are left out.
     """
     told: dict[str, Any] = {}
-    green = out.delivery.green
+    green = out.delivery.green_direction
     for site, entry in sorted(part.get("sites", {}).items()):
         relief = appearance.maps[entry["map"]]
         valid = relief.mask
         if not valid.any():
-            out.leave_out(f"micro normals of {site}", "no height is valid")
+            out.record_omission(f"micro normals of {site}", "no height is valid")
             continue
         filled = push_pull(np.nan_to_num(relief.values), valid.astype(np.float32)).values
         height = np.asarray(filled, np.float64).reshape(relief.values.shape)
         pixel_um = float(entry["pixel_um"])
-        tile = periodic(height - height.mean())
+        tile = make_periodic(height - height.mean())
         normals = periodic_normals(tile, pixel_um)
         name = f"micro_normal_{site}"
         what = f"relief of {site} at rest, tangent space, {green}, repeats without a seam"
-        out.both(Image.of_normals(name, normals, out.delivery, what))
+        out.write_exr_and_png(ExportImage.from_normals(name, normals, out.delivery, what))
         slope = normals[..., :2] / normals[..., 2:]
         told[name] = {
             "site": site,

@@ -9,17 +9,17 @@ from typing import Any
 
 from capture.plan import Value
 from capture.session import FrameRecord, Session
-from capture.session.contents import undamaged_contents
+from capture.session.contents import read_undamaged_contents
 from capture.session.view import check_file
 from reconstruction.pipeline.inputs import Inputs
-from skinrig.exporting.options import Delivery
+from skinrig.exporting.options import ExportSettings
 from skinrig.exporting.sealing import write_json
 
 FRAMES_FOLDER, DOCUMENTS_FILE = "frames", "documents.jsonl"
 
 
 def write_session_document(
-    path: Path, inputs: Inputs, told: Mapping[str, Any], left_out: Sequence[tuple[str, str]]
+    path: Path, inputs: Inputs, content: Mapping[str, Any], left_out: Sequence[tuple[str, str]]
 ) -> None:
     """Write what a document beside a session's images says, and of whom and what they are."""
     session = inputs.session
@@ -29,10 +29,10 @@ def write_session_document(
         "assumed": list(inputs.assumed),
         "consent": [session.manifest.to_json()["subject"]],
     }
-    write_json(path, {**told, **origin, "left_out": [list(row) for row in left_out]})
+    write_json(path, {**content, **origin, "left_out": [list(row) for row in left_out]})
 
 
-def write_session(session: Session, out: Path, delivery: Delivery) -> None:
+def write_session(session: Session, out: Path, delivery: ExportSettings) -> None:
     """Copy all of a session."""
     for name in ("session.json", "journal.jsonl"):
         shutil.copyfile(session.path / name, out / name)
@@ -40,18 +40,18 @@ def write_session(session: Session, out: Path, delivery: Delivery) -> None:
         if (session.path / folder).is_dir():
             (out / folder).mkdir()
     # all attempts, not the last alone: the journal names them
-    for line in undamaged_contents(session.path).file_lines:
+    for line in read_undamaged_contents(session.path).file_lines:
         (out / line.file).write_bytes(check_file(session.path / line.file, line))
 
 
-def write_frames(session: Session, out: Path, delivery: Delivery) -> None:
+def write_frames(session: Session, out: Path, delivery: ExportSettings) -> None:
     """Copy the DNG files alone."""
     (out / FRAMES_FOLDER).mkdir()
     for record in session.frames():
         (out / record.file).write_bytes(check_file(session.path / record.file, record.line))
 
 
-def write_events(session: Session, out: Path, delivery: Delivery) -> None:
+def write_events(session: Session, out: Path, delivery: ExportSettings) -> None:
     """Copy the frames, and write documents.jsonl as Bluesky's event model describes a run."""
     write_frames(session, out, delivery)
     with (out / DOCUMENTS_FILE).open("w", encoding="utf-8") as stream:
@@ -104,7 +104,7 @@ def documents(session: Session) -> Iterator[Document]:
         times = dict.fromkeys([*data, image], time_s)
         values = {"data": {**data, image: datum}, "timestamps": times, "filled": {image: False}}
         yield "event", {**event, "seq_num": counts[stream], "time": time_s, **values}
-    missing = len(session.todo())
+    missing = len(session.pending_frames())
     end = {
         "time": max([begin, *(record.line.t_host_s for record in records)]),
         "exit_status": "success" if session.closed and not missing else "abort",

@@ -11,12 +11,12 @@ import numpy as np
 
 from capture import raw
 from capture.session import Session
-from reconstruction.pipeline.dome.calibrated import calibrated
+from reconstruction.pipeline.dome.calibrated import load_dome
 from reconstruction.pipeline.dome.images import DomeImages
 from reconstruction.pipeline.inputs import Inputs
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray, UInt16Array
 from skinrig.errors import one_of
-from skinrig.exporting.options import Delivery, ExportError
+from skinrig.exporting.options import ExportError, ExportSettings
 from skinrig.exporting.sessions.copies import write_session_document
 
 LIST_FILE, POSITIONS_FILE, DOCUMENT_FILE = "lights.lp", "positions_mm.txt", "lights.json"
@@ -28,7 +28,7 @@ MAX_BRIGHT_FRACTION: Final = 1e-4
 _CAMERA_TO_LIST_SIGNS = np.array([1.0, -1.0, -1.0])  # from camera axes, x right, y down, z forward
 
 
-def write(session: Session, folder: Path, delivery: Delivery) -> list[tuple[str, str]]:
+def write(session: Session, folder: Path, delivery: ExportSettings) -> list[tuple[str, str]]:
     """Write one camera's images of a session with their light list.
 
     Parameters
@@ -62,7 +62,7 @@ def write(session: Session, folder: Path, delivery: Delivery) -> list[tuple[str,
         )
     inputs = Inputs.of(session, delivery.calibration, state="neutral", on_date=None)
     images = DomeImages(session)
-    dome = calibrated(inputs, images)
+    dome = load_dome(inputs, images)
     view = _view(images.views, dome.cameras, delivery.camera)
     pose = dome.cameras[view]
     good = [k for k in range(len(images.lights)) if dome.table.valid[k]]
@@ -84,7 +84,7 @@ def write(session: Session, folder: Path, delivery: Delivery) -> list[tuple[str,
         return found.rgb, found.valid
 
     # twice through the pictures instead of all of them in memory
-    top = max(_top(*picture(k)) for k in good)
+    top = max(_full_scale(*picture(k)) for k in good)
     scale = (SATURATED_CODE - 1) / top if top > 0.0 else 1.0
     clipped: dict[str, float] = {}
     for k, name in zip(good, names, strict=True):
@@ -131,10 +131,10 @@ def in_camera_frame(position_mm: FloatArray, rotation: FloatArray) -> Float64Arr
     return np.asarray((position_mm @ np.asarray(rotation).T) * _CAMERA_TO_LIST_SIGNS)
 
 
-def _view(names: tuple[str, ...], cameras: Any, wanted: str | None) -> int:
-    if wanted is None:
+def _view(names: tuple[str, ...], cameras: Any, requested: str | None) -> int:
+    if requested is None:
         return int(np.argmin([camera.rotation[2, 2] for camera in cameras]))
-    return names.index(one_of("--camera", wanted, names, ExportError))
+    return names.index(one_of("--camera", requested, names, ExportError))
 
 
 def _imported(session: Session, view: str, light: str) -> tuple[Float32Array, BoolArray]:
@@ -151,7 +151,7 @@ def _imported(session: Session, view: str, light: str) -> tuple[Float32Array, Bo
     return image.rgb * per_time, image.valid
 
 
-def _top(values: Float32Array, valid: BoolArray) -> float:
+def _full_scale(values: Float32Array, valid: BoolArray) -> float:
     shown = values[valid]
     return float(np.quantile(shown, 1.0 - MAX_BRIGHT_FRACTION)) if shown.size else 0.0
 

@@ -23,15 +23,15 @@ from capture.session import Session
 from model import color_table, spectra
 from model.skin import SkinAppearance
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
-from reconstruction.pipeline.gradient.images import GradientImages, Patterns
+from reconstruction.pipeline.gradient.images import GradientImages, StatePatterns
 from reconstruction.pipeline.gradient.stages import WAVELENGTH_UM
 from reconstruction.pipeline.inputs import Inputs
-from reconstruction.pipeline.sensor_noise import SensorNoise
+from reconstruction.pipeline.sensor_noise import ElectronNoise
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.errors import one_of
 from skinrig.exporting.images import write_channels
-from skinrig.exporting.options import Delivery, ExportError
-from skinrig.exporting.sealing import IMAGE_ORIENTATION, provenance, write_json
+from skinrig.exporting.options import ExportError, ExportSettings
+from skinrig.exporting.sealing import IMAGE_ORIENTATION, describe_provenance, write_json
 from skinrig.exporting.sessions.copies import write_session_document
 
 REFLECTANCE_FILE, STOKES_FILE, SPECTRAL_DOCUMENT = "reflectance.exr", "stokes.exr", "spectral.json"
@@ -41,7 +41,7 @@ LAYOUT_VERSION: Final = "1.0"
 
 
 def write_spectra(
-    appearance: SkinAppearance, folder: Path, delivery: Delivery
+    appearance: SkinAppearance, folder: Path, delivery: ExportSettings
 ) -> list[tuple[str, str]]:
     """Write what an appearance of the flash rig holds of spectra and polarization.
 
@@ -91,11 +91,11 @@ def write_spectra(
         "files": files,
     }
     told["left_out"] = [list(row) for row in left_out]
-    write_json(folder / SPECTRAL_DOCUMENT, {**provenance(appearance), **told})
+    write_json(folder / SPECTRAL_DOCUMENT, {**describe_provenance(appearance), **told})
     return left_out
 
 
-def channel(kind: str, wavelength_nm: float) -> str:
+def format_channel_name(kind: str, wavelength_nm: float) -> str:
     """Return a channel's name: a comma parts decimals, for dots part layers.
 
     Parameters
@@ -107,7 +107,7 @@ def channel(kind: str, wavelength_nm: float) -> str:
 
     Examples
     --------
-    >>> channel("S1", 550.5), channel("T", 400.0)
+    >>> format_channel_name("S1", 550.5), format_channel_name("T", 400.0)
     ('S1.550,5nm', 'T.400nm')
     """
     return f"{kind}.{f'{wavelength_nm:.6g}'.replace('.', ',')}nm"
@@ -140,7 +140,7 @@ def _reflectance(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
     for band, wavelength in enumerate(spectra.WAVELENGTH_NM):
         layer = np.zeros(valid.shape, np.float32)
         layer[valid] = found[:, band]
-        channels[channel("T", float(wavelength))] = layer
+        channels[format_channel_name("T", float(wavelength))] = layer
     what = (
         "modelled, not measured: diffuse reflectance at normal incidence without the surface's, of "
         "the two-layer skin with the estimated melanin and hemoglobin; 0 where they are not known"
@@ -165,8 +165,8 @@ def _stokes(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
     s1 = np.where(valid[..., None], specular.values, 0.0)
     channels = {}
     for band, wavelength in enumerate(means):
-        channels[channel("S0", float(wavelength))] = s0[..., band]
-        channels[channel("S1", float(wavelength))] = s1[..., band]
+        channels[format_channel_name("S0", float(wavelength))] = s0[..., band]
+        channels[format_channel_name("S1", float(wavelength))] = s1[..., band]
     what = (
         "measured, by a parallel and a crossed picture: S0 all light, S1 what passes the analyser "
         "along the flash's polarizer less what passes across it; S2 and S3 were not measured. "
@@ -185,23 +185,23 @@ def _stokes(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
     }
 
 
-def stokes_header(what: str) -> dict[str, str]:
+def stokes_header(description: str) -> dict[str, str]:
     """Return the attributes of a Stokes image in the published layout."""
     return {
         "spectralLayoutVersion": LAYOUT_VERSION,
         "emissiveUnits": "1",
         "polarisationHandedness": "right",
-        "comments": what,
+        "comments": description,
     }
 
 
 DOCUMENT_FILE: Final = "stokes.json"
 SCHEMA: Final = "skinrig.export.stokes/1"
 PARALLEL, CROSSED = "parallel", "crossed"
-CHANNELS: Final = [channel(kind, 1e3 * WAVELENGTH_UM) for kind in ("S0", "S1")]
+CHANNELS: Final = [format_channel_name(kind, 1e3 * WAVELENGTH_UM) for kind in ("S0", "S1")]
 
 
-def write_stokes(session: Session, folder: Path, delivery: Delivery) -> list[tuple[str, str]]:
+def write_stokes(session: Session, folder: Path, delivery: ExportSettings) -> list[tuple[str, str]]:
     """Write a gradient-sphere session's images as Stokes images.
 
     Parameters
@@ -277,7 +277,7 @@ def write_stokes(session: Session, folder: Path, delivery: Delivery) -> list[tup
 
 
 def _write_state(
-    state: str, patterns: Patterns, folder: Path, what: str, with_errors: bool
+    state: str, patterns: StatePatterns, folder: Path, description: str, with_errors: bool
 ) -> tuple[dict[str, Any], list[tuple[str, str]]]:
     """Write the images of one state; return what is in each file, and patterns left out."""
     files: dict[str, Any] = {}
@@ -291,7 +291,7 @@ def _write_state(
         one, other = patterns.values[along], patterns.values[across]
         found = one + other, one - other
         channels = dict(zip(CHANNELS, found, strict=True))
-        write_channels(folder / f"{stem}.exr", channels, stokes_header(what))
+        write_channels(folder / f"{stem}.exr", channels, stokes_header(description))
         stderr = np.sqrt(patterns.variance[along] + patterns.variance[across])
         figures = _figures(*found, stderr, patterns.valid)
         files[f"{stem}.exr"] = {"state": state, "pattern": pattern, **figures}
@@ -311,7 +311,7 @@ def _noise(inputs: Any, camera: str) -> Any:
     if found is None:
         return None
     known = SensorCalibration.from_calibration(found, serial)
-    return SensorNoise(float(known.gain_e_per_dn.value[0]), float(known.read_noise_e.value[0]))
+    return ElectronNoise(float(known.gain_e_per_dn.value[0]), float(known.read_noise_e.value[0]))
 
 
 def file_stem(state: str, pattern: str) -> str:

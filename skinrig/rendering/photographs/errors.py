@@ -23,7 +23,7 @@ from scipy import ndimage
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.console import Console
 from skinrig.drawing import png
-from skinrig.evaluating.skin_bands import bands_of
+from skinrig.evaluating.skin_bands import classify_typology
 from skinrig.rendering.camera import RenderingError
 from skinrig.rendering.render import Subsurface
 
@@ -65,7 +65,7 @@ class Photograph:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PairError:
+class PairErrors:
     """A rendering beside a photograph.
 
     Attributes
@@ -108,7 +108,7 @@ def luminance(rgb: ArrayLike) -> Float64Array:
     return np.asarray(np.asarray(rgb, np.float64) @ np.array(LUMINANCE_WEIGHTS))
 
 
-def lit_pixels(photograph: Photograph, *, covered: ArrayLike, lit: ArrayLike) -> BoolArray:
+def find_lit_pixels(photograph: Photograph, *, covered: ArrayLike, lit: ArrayLike) -> BoolArray:
     """Return which pixels count as lit, see this module.
 
     Parameters
@@ -128,9 +128,9 @@ def lit_pixels(photograph: Photograph, *, covered: ArrayLike, lit: ArrayLike) ->
     )
 
 
-def compare(
+def compare_pair(
     photograph: Photograph, rendering: ArrayLike, *, covered: ArrayLike, lit: ArrayLike
-) -> PairError:
+) -> PairErrors:
     """Compare a rendering with a photograph.
 
     Parameters
@@ -156,7 +156,7 @@ def compare(
         )
     if not skin.any():
         raise RenderingError("covered: got no pixel of measured skin that is not saturated")
-    chosen = lit_pixels(photograph, covered=covered, lit=lit)
+    chosen = find_lit_pixels(photograph, covered=covered, lit=lit)
     real, made = luminance(photograph.rgb), luminance(image)
     signed = np.full(real.shape, np.nan)
     signed[chosen] = made[chosen] / real[chosen] - 1.0
@@ -164,15 +164,15 @@ def compare(
     middle = float(np.median(noise)) if chosen.any() else float("nan")
     total = float(np.sum(np.abs(made - real)[skin]) / max(float(np.sum(real[skin])), 1e-30))
     alike = similarity(photograph.rgb, image, skin)
-    return PairError(np.abs(signed), signed, chosen, middle, total, alike)
+    return PairErrors(np.abs(signed), signed, chosen, middle, total, alike)
 
 
-def tone_mapped(rgb: ArrayLike, white: float) -> Float64Array:
+def tone_map(rgb: ArrayLike, white: float) -> Float64Array:
     """Return linear light by the sRGB curve, 0 to 1, with `white` as 1; brighter is 1.
 
     Examples
     --------
-    >>> tone_mapped([0.0, 0.5, 2.0], 1.0).round(4).tolist()
+    >>> tone_map([0.0, 0.5, 2.0], 1.0).round(4).tolist()
     [0.0, 0.7354, 1.0]
     """
     return png.srgb_curve(np.clip(np.asarray(rgb, np.float64) / white, 0.0, 1.0))
@@ -188,7 +188,7 @@ def similarity(photograph: ArrayLike, rendering: ArrayLike, skin: BoolArray) -> 
 
     light = luminance(photograph)[skin]
     white = max(float(np.percentile(light, WHITE_PERCENTILE)), 1e-30)
-    pair = [tone_mapped(image, white) * skin[..., None] for image in (photograph, rendering)]
+    pair = [tone_map(image, white) * skin[..., None] for image in (photograph, rendering)]
     if min(skin.shape) < 11:
         raise RenderingError(f"image: got {skin.shape}, expected at least 11 x 11 pixels")
     windows = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
@@ -213,7 +213,7 @@ class Summary:
     noise
         Median of what noise alone does, mean over the photographs.
     total_error, ssim
-        Means over the photographs, see `PairError`.
+        Means over the photographs, see `PairErrors`.
     """
 
     pairs: int
@@ -229,7 +229,7 @@ class Summary:
     ssim: float
 
 
-def summarize(pairs: Sequence[PairError], *, rng: np.random.Generator) -> Summary:
+def summarize(pairs: Sequence[PairErrors], *, rng: np.random.Generator) -> Summary:
     """Put pairs together.
 
     Raises
@@ -266,14 +266,14 @@ def summarize(pairs: Sequence[PairError], *, rng: np.random.Generator) -> Summar
 
 
 def by_band(
-    pairs: Sequence[PairError], bands: Sequence[NDArray[np.str_]]
+    pairs: Sequence[PairErrors], bands: Sequence[NDArray[np.str_]]
 ) -> Mapping[str, tuple[int, float]]:
     """Return lit pixels and their median relative error by the band that each pixel lies in.
 
     Parameters
     ----------
     pairs
-        See `compare`.
+        See `compare_pair`.
     bands
         Of each pair the names of bands, (H, W); "" is none.
     """
@@ -352,7 +352,7 @@ class Comparison:
         }
         return {
             **told,
-            "band": str(bands_of(self.typology_angle_deg)),
+            "band": str(classify_typology(self.typology_angle_deg)),
             "lit_pixels": (
                 "pixel and neighbors wholly on measured skin, every ray sees the whole light, not "
                 f"saturated, at least {MIN_SIGNAL_SIGMAS:g} times its noise"

@@ -20,21 +20,21 @@ from rigsim.geometry.mesh import Mesh
 from rigsim.render import Caster
 from skinrig.arrays import Float32Array
 from skinrig.drawing import png
-from skinrig.evaluating.skin_bands import bands_of, typology_angle_deg
+from skinrig.evaluating.skin_bands import classify_typology, typology_angle_deg
 from skinrig.rendering import folder
-from skinrig.rendering.folder import Panel, exposure_of, sheet, tone
-from skinrig.rendering.geometry import FittedSurface, own_mesh
+from skinrig.rendering.folder import Panel, apply_tone_curve, choose_exposure, encode_sheet
+from skinrig.rendering.geometry import FittedSurface, read_own_mesh
 from skinrig.rendering.interior import Interior
 from skinrig.rendering.photographs.errors import (
     Comparison,
-    PairError,
+    PairErrors,
     Photograph,
     by_band,
-    compare,
+    compare_pair,
     summarize,
 )
-from skinrig.rendering.photographs.held_out import Photographs, Shot
-from skinrig.rendering.render import Rendering, Subsurface, render
+from skinrig.rendering.photographs.held_out import HeldOutPhotographs, HeldOutShot
+from skinrig.rendering.render import Rendering, Subsurface, render_surface
 from skinrig.rendering.request import read_model
 
 N_PICTURES: Final = 6
@@ -44,7 +44,7 @@ MAX_SHOWN_ERROR: Final = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class Judging:
+class EvaluationSettings:
     """How photographs are compared with renderings."""
 
     subsurface: Subsurface = "dipole"
@@ -65,15 +65,17 @@ class _Surface:
     laid: FittedSurface
     caster: Caster
     interior: Interior | None
-    photographs: Photographs
+    photographs: HeldOutPhotographs
 
-    def render(self, shot: Shot, subsurface: Subsurface) -> Rendering:
+    def render(self, shot: HeldOutShot, subsurface: Subsurface) -> Rendering:
         shown = self.photographs.camera(shot), self.photographs.light(shot)
         below = self.interior
-        return render(self.laid, *shown, subsurface=subsurface, caster=self.caster, interior=below)
+        return render_surface(
+            self.laid, *shown, subsurface=subsurface, caster=self.caster, interior=below
+        )
 
-    def without(
-        self, made: Rendering, shot: Shot, fewer: Mapping[str, _Surface]
+    def render_ablations(
+        self, made: Rendering, shot: HeldOutShot, fewer: Mapping[str, _Surface]
     ) -> Iterator[tuple[str, Float32Array]]:
         """Yield renderings without parts, beside that of the whole."""
         yield "without the surface", made.diffuse
@@ -87,10 +89,10 @@ class _Surface:
                 yield name, less.render(shot, made.subsurface).radiance
 
 
-def evaluate(
+def evaluate_photographs(
     appearance: SkinAppearance,
-    photographs: Photographs,
-    how: Judging,
+    photographs: HeldOutPhotographs,
+    settings: EvaluationSettings,
     *,
     truth: SkinAppearance | None = None,
     model: SkinReflectance | None = None,
@@ -122,28 +124,32 @@ def evaluate(
         Where there is nothing to compare, or the model lacks a part.
     """
     begun = time.perf_counter()
-    rng = np.random.default_rng(how.seed)
+    rng = np.random.default_rng(settings.seed)
     whole = assemble(appearance) if model is None else model
-    mesh = own_mesh(appearance)
+    mesh = read_own_mesh(appearance)
     laid = FittedSurface.of(whole, mesh)
-    below = Caster(mesh), Interior.of(laid) if how.subsurface == "dipole" else None, photographs
+    below = (
+        Caster(mesh),
+        Interior.of(laid) if settings.subsurface == "dipole" else None,
+        photographs,
+    )
     surface = _Surface(laid, *below)
     fewer = {
         name: _Surface(FittedSurface.of(less, mesh), *below)
-        for name, less in (without_parts(whole, mesh) if how.ablation else {}).items()
+        for name, less in (build_ablations(whole, mesh) if settings.ablation else {}).items()
     }
-    chosen = photographs.chosen(how.count)
+    chosen = photographs.select_shots(settings.count)
     drawn = {chosen[int(k)] for k in np.linspace(0, len(chosen) - 1, min(N_PICTURES, len(chosen)))}
-    pairs: list[PairError] = []
+    pairs: list[PairErrors] = []
     bands: list[NDArray[np.str_]] = []
-    parts: dict[str, list[PairError]] = {}
-    kinds: dict[str, list[PairError]] = {}
+    parts: dict[str, list[PairErrors]] = {}
+    kinds: dict[str, list[PairErrors]] = {}
     pictures: dict[str, bytes] = {}
     rows: list[dict[str, Any]] = []
     for number, shot in enumerate(chosen):
-        how.progress(f"{number + 1}/{len(chosen)} {shot.view} {shot.light}")
+        settings.progress(f"{number + 1}/{len(chosen)} {shot.view} {shot.light}")
         photo = photographs.photograph(shot)
-        made = surface.render(shot, how.subsurface)
+        made = surface.render(shot, settings.subsurface)
         pair = _compare(photo, made, made.radiance)
         pairs.append(pair)
         if pair.lit.any():
@@ -152,11 +158,11 @@ def evaluate(
         told = {name: getattr(pair, name) for name in ("median", "noise", "ssim", "total_error")}
         lit = int(np.count_nonzero(pair.lit))
         rows.append({**dataclasses.asdict(shot), **told, "lit_pixels": lit})
-        for name, image in surface.without(made, shot, fewer) if how.ablation else ():
+        for name, image in surface.render_ablations(made, shot, fewer) if settings.ablation else ():
             parts.setdefault(name, []).append(_compare(photo, made, image))
         if shot in drawn:
             pictures[f"{shot.view}-{shot.light}"] = _sheet(photo, made, pair, shot)
-    angle, of = _angle(whole, truth)
+    angle, of = _typology_angle_deg(whole, truth)
     comparison = Comparison(
         subject=photographs.subject,
         full=summarize(pairs, rng=rng),
@@ -167,7 +173,7 @@ def evaluate(
         typology_of=of,
         shots=tuple(rows),
         assumed=(*photographs.assumed, *whole.assumed),
-        subsurface=how.subsurface,
+        subsurface=settings.subsurface,
         seconds=time.perf_counter() - begun,
     )
     return comparison, pictures
@@ -177,7 +183,7 @@ def evaluate_folders(
     appearance: Path,
     session: Path,
     out: Path,
-    how: Judging,
+    settings: EvaluationSettings,
     *,
     calibration: Path | None = None,
     translucency: str | None = None,
@@ -193,11 +199,13 @@ def evaluate_folders(
     """
     folder.check(out)
     read, model = read_model(appearance, translucency=translucency)
-    photographs = Photographs.of(session, read, calibration=calibration)
+    photographs = HeldOutPhotographs.of(session, read, calibration=calibration)
     named = str(read.parameters.get("truth", "") or "")
     beside = appearance.resolve().parent / named
     found = store.read(beside) if named and (beside / store.DOCUMENT_FILE).is_file() else None
-    comparison, pictures = evaluate(read, photographs, how, truth=found, model=model)
+    comparison, pictures = evaluate_photographs(
+        read, photographs, settings, truth=found, model=model
+    )
     document = {
         "kind": "comparison with photographs",
         "appearance": appearance,
@@ -208,41 +216,43 @@ def evaluate_folders(
     return folder.write(out, images={}, pictures=pictures, document=document)
 
 
-def _compare(photo: Photograph, made: Rendering, image: Float32Array) -> PairError:
-    return compare(photo, image, covered=made.covered, lit=made.lit)
+def _compare(photo: Photograph, made: Rendering, image: Float32Array) -> PairErrors:
+    return compare_pair(photo, image, covered=made.covered, lit=made.lit)
 
 
 def _bands(model: SkinReflectance, made: Rendering) -> NDArray[np.str_]:
     """Return the band of skin color of each pixel, "" beside measured skin."""
     height, width = made.covered.shape
     r_d = sample(np.asarray(model.r_d), made.uv.reshape(-1, 2), made.covered.reshape(-1))
-    angle = typology_angle_deg(r_d * reflectance_share(model.eta)).reshape(height, width)
-    return np.where(made.covered, bands_of(angle), "")
+    angle = typology_angle_deg(r_d * normal_reflectance_ratio(model.eta)).reshape(height, width)
+    return np.where(made.covered, classify_typology(angle), "")
 
 
-def reflectance_share(eta: float) -> float:
+def normal_reflectance_ratio(eta: float) -> float:
     """Return diffuse reflectance at normal incidence over R_d: light crosses the boundary twice.
 
     Examples
     --------
-    >>> round(1.0 / reflectance_share(1.4), 3)
+    >>> round(1.0 / normal_reflectance_ratio(1.4), 3)
     1.114
     """
     return (1.0 - fresnel.normal_reflectance(eta)) * (1.0 - fresnel.diffuse_external(eta))
 
 
-def _angle(model: SkinReflectance, truth: SkinAppearance | None) -> tuple[float, str]:
+def _typology_angle_deg(model: SkinReflectance, truth: SkinAppearance | None) -> tuple[float, str]:
     if truth is not None and "reflectance" in truth.maps:
         known = truth.maps["reflectance"]
         return float(np.median(typology_angle_deg(known.values[known.mask]))), "truth"
-    skin = model.r_d[model.valid] * reflectance_share(model.eta)
+    skin = model.r_d[model.valid] * normal_reflectance_ratio(model.eta)
     return float(np.median(typology_angle_deg(skin))), "r_d"
 
 
-def _sheet(photo: Photograph, made: Rendering, pair: PairError, shot: Shot) -> bytes:
-    exposure = exposure_of(np.where(made.covered[..., None], photo.rgb, 0.0), made.coverage)
+def _sheet(photo: Photograph, made: Rendering, pair: PairErrors, shot: HeldOutShot) -> bytes:
+    exposure = choose_exposure(np.where(made.covered[..., None], photo.rgb, 0.0), made.coverage)
     on = made.coverage[..., None] > 0.5
-    shown = [tone(np.where(on, image, 0.0), exposure) for image in (photo.rgb, made.radiance)]
+    shown = [
+        apply_tone_curve(np.where(on, image, 0.0), exposure) for image in (photo.rgb, made.radiance)
+    ]
     scale = png.Scale(-MAX_SHOWN_ERROR, MAX_SHOWN_ERROR, "RdBu_r")
     error = scale.colors(pair.signed, pair.lit)
     panels = [
@@ -251,10 +261,10 @@ def _sheet(photo: Photograph, made: Rendering, pair: PairError, shot: Shot) -> b
         Panel(f"error, red +{100 * MAX_SHOWN_ERROR:.0f} %", error),
     ]
     held_out = f"{shot.view} {shot.light} ({shot.held_out} held out)"
-    return sheet([panels], title=f"{held_out}: median {100 * pair.median:.1f} %")
+    return encode_sheet([panels], title=f"{held_out}: median {100 * pair.median:.1f} %")
 
 
-def without_parts(model: SkinReflectance, mesh: Mesh) -> Mapping[str, SkinReflectance]:
+def build_ablations(model: SkinReflectance, mesh: Mesh) -> Mapping[str, SkinReflectance]:
     """Return the models that have less, by what they have instead.
 
     Parameters
@@ -275,7 +285,7 @@ def without_parts(model: SkinReflectance, mesh: Mesh) -> Mapping[str, SkinReflec
     normals = np.where(length > 0.5, flat / np.maximum(length, 1e-9), model.normals)
     mean = model.r_d[model.valid].mean(axis=0, dtype=np.float64)
     return {
-        "one lobe": dataclasses.replace(model, weights=one_lobe(model)),
+        "one lobe": dataclasses.replace(model, weights=fit_one_lobe(model)),
         "scanned normals": dataclasses.replace(model, normals=normals.astype(np.float32)),
         "even albedo": dataclasses.replace(
             model, r_d=np.broadcast_to(mean, model.r_d.shape).astype(np.float32), r_d_stderr=None
@@ -283,7 +293,7 @@ def without_parts(model: SkinReflectance, mesh: Mesh) -> Mapping[str, SkinReflec
     }
 
 
-def one_lobe(model: SkinReflectance) -> Float32Array:
+def fit_one_lobe(model: SkinReflectance) -> Float32Array:
     """Return weights of one common mixture, scaled at each texel to reflect most like its own.
 
     Returns
@@ -292,7 +302,7 @@ def one_lobe(model: SkinReflectance) -> Float32Array:
         The least squares over the lobes' grid, directions counting by solid angle.
     """
     strength = model.lobes.strength()
-    gram = model.lobes.kinship() * np.outer(strength, strength)
+    gram = model.lobes.cosine_similarity() * np.outer(strength, strength)
     shares = model.weights.astype(np.float64)
     common = shares[model.valid].mean(axis=0)
     size = float(common @ gram @ common)

@@ -11,21 +11,21 @@ import numpy as np
 
 from capture.session import Session
 from model.skin import SkinAppearance
-from reconstruction.pipeline.dome.calibrated import Dome, calibrated, seen_from
+from reconstruction.pipeline.dome.calibrated import CalibratedDome, load_dome, transform_dome
 from reconstruction.pipeline.dome.images import DomeImages
-from reconstruction.pipeline.dome.registration import register
+from reconstruction.pipeline.dome.registration import register_mesh
 from reconstruction.pipeline.hold_out import HoldOut
 from reconstruction.pipeline.inputs import Inputs
 from reconstruction.scan.repair import TriangleMesh
 from reconstruction.surface.estimates import MIN_LIGHTS
-from skinrig.rendering.camera import Camera, RenderingError, binned
-from skinrig.rendering.geometry import own_mesh
+from skinrig.rendering.camera import Camera, RenderingError, bin_pixels
+from skinrig.rendering.geometry import read_own_mesh
 from skinrig.rendering.lights import Light
 from skinrig.rendering.photographs.errors import Photograph
 
 
 @dataclass(frozen=True, slots=True)
-class Shot:
+class HeldOutShot:
     """One photograph's names and why it is not in the fit."""
 
     view: str
@@ -35,7 +35,7 @@ class Shot:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Photographs:
+class HeldOutPhotographs:
     """The photographs that a fitted model can be judged by.
 
     Attributes
@@ -46,9 +46,9 @@ class Photographs:
         What was taken for granted, one line each.
     """
 
-    shots: tuple[Shot, ...]
+    shots: tuple[HeldOutShot, ...]
     assumed: tuple[str, ...]
-    _dome: Dome
+    _dome: CalibratedDome
     """In the frame of the maps."""
     _session: Session
     _white_mm: tuple[float, ...]
@@ -57,7 +57,7 @@ class Photographs:
     @staticmethod
     def of(
         session: str | Path, appearance: SkinAppearance, *, calibration: str | Path | None = None
-    ) -> Photographs:
+    ) -> HeldOutPhotographs:
         """Find the frames of a session that an appearance was not fitted to.
 
         Parameters
@@ -84,7 +84,7 @@ class Photographs:
                 "dome with a face"
             )
         inputs = Inputs.of(opened, calibration, state="neutral", on_date=None)
-        dome = calibrated(inputs, DomeImages(opened))
+        dome = load_dome(inputs, DomeImages(opened))
         same = appearance.inputs.get("session") == opened.content_hash
         held = _held_out(appearance) if same else HoldOut()
         if same and not held:
@@ -95,30 +95,30 @@ class Photographs:
             )
         good = {n for n, v in zip(dome.lights.names, dome.lights.valid, strict=True) if v}
         shots = [
-            Shot(view, light, _why(held, light, view) if same else "session")
+            HeldOutShot(view, light, _explain_held_out(held, light, view) if same else "session")
             for view in dome.images.views
             for light in dome.images.lights
-            if light in good and (not same or held.holds(light, view))
+            if light in good and (not same or held.is_held_out(light, view))
         ]
         if not shots:
             raise RenderingError(f"{opened.path}: none of its lights is calibrated")
         assumed = list(inputs.assumed)
         away = tuple(float(r) for r in np.linalg.norm(dome.table.position_mm, axis=1))
         if not same:
-            dome, told = _where_the_head_is(dome, appearance)
+            dome, told = _fitted_head_frame(dome, appearance)
             assumed.append(told)
         motion = appearance.parameters.get("motion", {})
         if isinstance(motion, dict) and motion.get("still") is False:
             moved = float(motion.get("displacement_mm_max", 0.0))
             assumed.append(f"the head held still; it moved by up to {moved:.1f} mm")
-        return Photographs(tuple(shots), tuple(assumed), dome, opened, away)
+        return HeldOutPhotographs(tuple(shots), tuple(assumed), dome, opened, away)
 
     @property
     def subject(self) -> str:
         """Pseudonym of the face."""
         return self._session.subject.pseudonym
 
-    def photograph(self, shot: Shot) -> Photograph:
+    def photograph(self, shot: HeldOutShot) -> Photograph:
         """Return a photograph in the unit of `skinrig.rendering.photographs.errors`."""
         images = self._dome.images
         capture = images.captures.index((shot.light, -1))
@@ -130,23 +130,23 @@ class Photographs:
             image.valid,
         )
 
-    def camera(self, shot: Shot) -> Camera:
+    def camera(self, shot: HeldOutShot) -> Camera:
         """Return the calibrated camera of a photograph, on its pixels."""
         pose = self._dome.cameras[self._dome.images.views.index(shot.view)]
-        return dataclasses.replace(binned(pose, 2), serial=shot.view)
+        return dataclasses.replace(bin_pixels(pose, 2), serial=shot.view)
 
-    def light(self, shot: Shot) -> Light:
+    def light(self, shot: HeldOutShot) -> Light:
         """Return the calibrated light of a photograph, of intensity 1 in all channels."""
         radius = self._session.rig.light(shot.light).radius_mm
-        lamp = Light.of_table(self._dome.table, shot.light, radius_mm=radius)
+        lamp = Light.from_table(self._dome.table, shot.light, radius_mm=radius)
         row = self._dome.table.names.index(shot.light)
         return dataclasses.replace(
             lamp, intensity=(1.0, 1.0, 1.0), reference_mm=self._white_mm[row]
         )
 
-    def chosen(self, count: int | None) -> tuple[Shot, ...]:
+    def select_shots(self, count: int | None) -> tuple[HeldOutShot, ...]:
         """Return so many of the shots, even over views and lights; None: all."""
-        return _evenly(self.shots, count)
+        return _select_evenly(self.shots, count)
 
     def _white(self, light: str) -> np.ndarray:
         """Return what white at the rig's origin shows in the images' unit, shape (3,)."""
@@ -154,12 +154,14 @@ class Photographs:
         return np.asarray(self._dome.table.intensity[row] / self._white_mm[row] ** 2, np.float64)
 
 
-def _where_the_head_is(dome: Dome, appearance: SkinAppearance) -> tuple[Dome, str]:
+def _fitted_head_frame(
+    dome: CalibratedDome, appearance: SkinAppearance
+) -> tuple[CalibratedDome, str]:
     """Return the dome about the head as it sat when it was fitted, and words for it.
 
     Only where the head is comes from the photographs, from their shading, and nothing of its skin.
     """
-    mesh = own_mesh(appearance)
+    mesh = read_own_mesh(appearance)
     welded, index = np.unique(mesh.vertices_mm.round(4), axis=0, return_inverse=True)
     lights = int(np.count_nonzero(dome.lights.valid))
     if lights < MIN_LIGHTS:
@@ -167,12 +169,14 @@ def _where_the_head_is(dome: Dome, appearance: SkinAppearance) -> tuple[Dome, st
             "the head sits where it sat in the session that was fitted: "
             f"{lights} lights are too few to find it, {MIN_LIGHTS} would do"
         )
-    fit = register(dome, TriangleMesh(welded.astype(np.float64), index.reshape(-1)[mesh.faces]))
+    fit = register_mesh(
+        dome, TriangleMesh(welded.astype(np.float64), index.reshape(-1)[mesh.faces])
+    )
     turn_deg = np.degrees(np.arccos(np.clip((np.trace(fit.rotation) - 1) / 2, -1, 1)))
     before = (fit.center_mm - fit.translation_mm) @ fit.rotation
     moved_mm = np.linalg.norm(fit.center_mm - before)
     off_mm, off_deg = np.linalg.norm(fit.stderr[3:]), np.degrees(np.linalg.norm(fit.stderr[:3]))
-    return seen_from(dome, fit.rotation, fit.translation_mm), (
+    return transform_dome(dome, fit.rotation, fit.translation_mm), (
         f"the head sits {moved_mm:.2f} +- {off_mm:.2f} mm and {turn_deg:.2f} +- {off_deg:.2f} "
         "degrees from where it sat in the session that was fitted, by the shading of these "
         "photographs"
@@ -186,14 +190,16 @@ def _held_out(appearance: SkinAppearance) -> HoldOut:
     return HoldOut(*(tuple(str(n) for n in record.get(name, ())) for name in ("lights", "views")))
 
 
-def _why(held: HoldOut, light: str, view: str) -> str:
+def _explain_held_out(hold_out: HoldOut, light: str, view: str) -> str:
     kinds = [
-        kind for kind, out in (("light", light in held.lights), ("view", view in held.views)) if out
+        kind
+        for kind, out in (("light", light in hold_out.lights), ("view", view in hold_out.views))
+        if out
     ]
     return " and ".join(kinds)
 
 
-def _evenly(shots: Sequence[Shot], count: int | None) -> tuple[Shot, ...]:
+def _select_evenly(shots: Sequence[HeldOutShot], count: int | None) -> tuple[HeldOutShot, ...]:
     if count is None or count >= len(shots):
         return tuple(shots)
     if count < 1:

@@ -17,7 +17,7 @@ from model import store
 from skinrig.arrays import Float64Array
 from skinrig.reporting import map_images, page, provenance
 from skinrig.reporting.comparison import runs
-from skinrig.reporting.comparison.runs import Run, paired
+from skinrig.reporting.comparison.runs import ComparedRun, pair_by_name
 from skinrig.reporting.sections import images as image_section
 
 MAX_DRAWN_IMAGES = 4
@@ -73,7 +73,7 @@ class ImageDifference:
         return bool(np.array_equal(self.a, self.b))
 
 
-def compared(a: Path, b: Path) -> tuple[list[ImageDifference], list[tuple[str, str]]]:
+def compare_folders(a: Path, b: Path) -> tuple[list[ImageDifference], list[tuple[str, str]]]:
     """Return the pictures of two folders, and those that cannot be subtracted with the reason.
 
     Parameters
@@ -112,12 +112,12 @@ def _difference(name: str, a: Path, b: Path) -> ImageDifference:
     return ImageDifference(name, "linear" if both[0] == "exr" else "8-bit codes", one, other)
 
 
-def sentence(a: Run, b: Run) -> str:
+def summarize_images(a: ComparedRun, b: ComparedRun) -> str:
     """Return how many pictures differ, empty without any that both have."""
     both = [
         one
-        for _, path_a, path_b in paired(a.pictures, b.pictures)
-        for one in compared(path_a, path_b)[0]
+        for _, path_a, path_b in pair_by_name(a.pictures, b.pictures)
+        for one in compare_folders(path_a, path_b)[0]
     ]
     if not both:
         return ""
@@ -125,10 +125,10 @@ def sentence(a: Run, b: Run) -> str:
     return f"{differ} of {len(both)} pictures of both differ."
 
 
-def section(a: Run, b: Run) -> Iterator[page.Block]:
+def section(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
     """Yield the pictures of two runs with their differences, and what their records differ in."""
-    for name, path_a, path_b in paired(a.pictures, b.pictures):
-        found, refused = compared(path_a, path_b)
+    for name, path_a, path_b in pair_by_name(a.pictures, b.pictures):
+        found, refused = compare_folders(path_a, path_b)
         yield page.Heading(f"Pictures: {name}", level=2)
         if found:
             order = sorted(found, key=lambda one: (-np.nan_to_num(one.relative_rms), one.name))
@@ -136,7 +136,7 @@ def section(a: Run, b: Run) -> Iterator[page.Block]:
             drawn = [one for one in order if not one.equal]
             for one in drawn[:MAX_DRAWN_IMAGES]:
                 yield page.Heading(one.name)
-                yield page.Images(list(_drawn(a, b, one)))
+                yield page.Images(list(_draw_difference(a, b, one)))
             if drawn[MAX_DRAWN_IMAGES:]:
                 rest = ", ".join(one.name for one in drawn[MAX_DRAWN_IMAGES:])
                 yield page.note(f"Not drawn, since they differ less: {rest}.")
@@ -145,28 +145,36 @@ def section(a: Run, b: Run) -> Iterator[page.Block]:
         yield _records(a, b, path_a, path_b)
 
 
-def _drawn(a: Run, b: Run, one: ImageDifference) -> Iterator[page.Image]:
+def _draw_difference(
+    a: ComparedRun, b: ComparedRun, difference: ImageDifference
+) -> Iterator[page.Image]:
     """Draw A | B | B − A: linear ones at one brightness for both."""
-    bright = float(np.percentile(np.concatenate([one.a, one.b]), SCALE_PERCENTILE)) or 1.0
-    for label, values in ((a.label, one.a), (b.label, one.b)):
+    bright = (
+        float(np.percentile(np.concatenate([difference.a, difference.b]), SCALE_PERCENTILE)) or 1.0
+    )
+    for label, values in ((a.label, difference.a), (b.label, difference.b)):
         shown = np.broadcast_to(values, (*values.shape[:2], 3))
-        if one.kind == "linear":
+        if difference.kind == "linear":
             shown = np.clip(shown / bright, 0.0, 1.0)
-            yield map_images.color_image(label, shown, width=200, of=one.name)
+            yield map_images.color_image(label, shown, width=200, of=difference.name)
         else:
             small = map_images.shrink(np.rint(MAX_CODE * shown).astype(np.uint8), 200)
             yield map_images.plain_image(
-                label, np.ascontiguousarray(small), alt=f"{one.name}, {label}"
+                label, np.ascontiguousarray(small), alt=f"{difference.name}, {label}"
             )
-    every = np.ones(one.difference.shape, bool)
-    reach = map_images.reach_of(one.difference, every, SCALE_PERCENTILE) or one.largest or 1.0
-    drawing = map_images.MapDrawing(one.name, width=200)
-    yield drawing.signed("B − A, mean of the channels", one.difference, reach)
+    every = np.ones(difference.difference.shape, bool)
+    reach = (
+        map_images.percentile_reach(difference.difference, every, SCALE_PERCENTILE)
+        or difference.largest
+        or 1.0
+    )
+    drawing = map_images.MapDrawing(difference.name, width=200)
+    yield drawing.draw_signed("B − A, mean of the channels", difference.difference, reach)
 
 
-def _records(a: Run, b: Run, path_a: Path, path_b: Path) -> page.Block:
-    sides = [provenance.flattened(_document(path)) for path in (path_a, path_b)]
-    rows = runs.unequal(*sides)
+def _records(a: ComparedRun, b: ComparedRun, path_a: Path, path_b: Path) -> page.Block:
+    sides = [provenance.flatten_settings(_document(path)) for path in (path_a, path_b)]
+    rows = runs.differing_entries(*sides)
     if not rows:
         return page.note("What was asked for, and all that the records say, is the same.")
     return page.table(

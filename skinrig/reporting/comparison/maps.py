@@ -12,7 +12,7 @@ from skinrig.evaluating import flash, microrelief, subsurface
 from skinrig.evaluating import surface as surface_evaluation
 from skinrig.evaluating.surface import errors_by_band
 from skinrig.reporting.page import short_unit
-from skinrig.written_units import unit_sign
+from skinrig.unit_format import format_unit
 
 SIGMA_LEVELS = (1.0, 2.0, 3.0)
 """Combined standard errors that shares of pixels beyond are told for."""
@@ -72,7 +72,7 @@ MAX_FRACTION_BEYOND = 0.01
 leaves 0.27 %, and as neighbors share errors, that share itself scatters."""
 
 
-def compare(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
+def compare_maps(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
     """Compare two estimates of one map, pixel by pixel.
 
     Parameters
@@ -98,7 +98,7 @@ def compare(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
     --------
     >>> one = SkinMap(np.full((2, 2), 1.0), "mm", np.full((2, 2), 0.3))
     >>> other = SkinMap(np.full((2, 2), 2.0), "mm", np.full((2, 2), 0.4))
-    >>> found = compare("thickness", one, other)
+    >>> found = compare_maps("thickness", one, other)
     >>> found.bias, round(found.combined, 3), found.sigmas.round(3).tolist()
     (1.0, 0.5, [[2.0, 2.0], [2.0, 2.0]])
     """
@@ -110,7 +110,9 @@ def compare(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
         raise ValueError(f"{name}: got units {a.unit!r} and {b.unit!r}, expected the same")
     both = a.mask & b.mask
     normals = "normals" in name and a.values.ndim == 3
-    difference, spread, sigmas = (_of_normals if normals else _of_values)(a, b, both)
+    difference, spread, sigmas = (_difference_of_normals if normals else _difference_of_values)(
+        a, b, both
+    )
     medians = np.nan, np.nan, np.nan
     if not normals:
         va, vb = (one.values[both].astype(np.float64) for one in (a, b))
@@ -145,7 +147,7 @@ Differing = tuple[Float64Array, Float64Array | None, Float64Array | None]
 """Difference, combined standard error, and the one over the other; None without errors."""
 
 
-def _of_values(a: SkinMap, b: SkinMap, both: BoolArray) -> Differing:
+def _difference_of_values(a: SkinMap, b: SkinMap, both: BoolArray) -> Differing:
     difference = b.values.astype(np.float64) - a.values
     if a.stderr is None or b.stderr is None:
         return difference, None, None
@@ -154,7 +156,7 @@ def _of_values(a: SkinMap, b: SkinMap, both: BoolArray) -> Differing:
         return difference, spread, np.where(difference == 0.0, 0.0, difference / spread)
 
 
-def _of_normals(a: SkinMap, b: SkinMap, both: BoolArray) -> Differing:
+def _difference_of_normals(a: SkinMap, b: SkinMap, both: BoolArray) -> Differing:
     from scipy.special import ndtri
 
     angle = np.full(both.shape, np.nan)
@@ -186,7 +188,7 @@ def _median(values: Float64Array) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class TruthError:
+class QuantityAccuracy:
     """One error against the truth.
 
     Attributes
@@ -211,7 +213,7 @@ class TruthError:
     coverage: float = float("nan")
 
 
-def truth_errors(appearance: SkinAppearance, truth: SkinAppearance) -> list[TruthError]:
+def truth_errors(appearance: SkinAppearance, truth: SkinAppearance) -> list[QuantityAccuracy]:
     """Return the errors of an appearance by quantity and skin.
 
     Parameters
@@ -221,10 +223,10 @@ def truth_errors(appearance: SkinAppearance, truth: SkinAppearance) -> list[Trut
     truth
         Of the same session.
     """
-    rows: list[TruthError] = []
+    rows: list[QuantityAccuracy] = []
     if "position" in appearance.maps:
         rows += _surface_errors(appearance, truth)
-    elif microrelief.states_of(appearance):
+    elif microrelief.find_states(appearance):
         rows += _microrelief_errors(appearance, truth)
     elif "melanin" in truth.maps:
         rows += _chromophore_errors(appearance, truth)
@@ -233,34 +235,42 @@ def truth_errors(appearance: SkinAppearance, truth: SkinAppearance) -> list[Trut
     return rows
 
 
-def _chromophore_errors(appearance: SkinAppearance, truth: SkinAppearance) -> Iterator[TruthError]:
+def _chromophore_errors(
+    appearance: SkinAppearance, truth: SkinAppearance
+) -> Iterator[QuantityAccuracy]:
     for row in flash.compare(appearance, truth, rng=np.random.default_rng(0)):
         name = f"{row.name}, median relative error against the {row.against} truth"
         interval = 100 * row.interval[0], 100 * row.interval[1]
         got = 100 * row.median_relative
-        yield TruthError(name, row.band_name, "%", got, interval, row.coverage.share)
+        yield QuantityAccuracy(name, row.band_name, "%", got, interval, row.coverage.fraction)
 
 
-def _surface_errors(appearance: SkinAppearance, truth: SkinAppearance) -> Iterator[TruthError]:
+def _surface_errors(
+    appearance: SkinAppearance, truth: SkinAppearance
+) -> Iterator[QuantityAccuracy]:
     for row in surface_evaluation.compare(appearance, truth, rng=np.random.default_rng(0)):
-        name, unit = f"{row.name}, median error", unit_sign(row.unit)
-        yield TruthError(name, "all", unit, row.median, row.interval, row.coverage.share)
+        name, unit = f"{row.name}, median error", format_unit(row.unit)
+        yield QuantityAccuracy(name, "all", unit, row.median, row.interval, row.coverage.fraction)
     for name, unit, band, _, _, middle, _ in errors_by_band(appearance, truth):
-        yield TruthError(f"{name}, median error", f"{band} skin", unit, middle)
+        yield QuantityAccuracy(f"{name}, median error", f"{band} skin", unit, middle)
 
 
-def _microrelief_errors(appearance: SkinAppearance, truth: SkinAppearance) -> Iterator[TruthError]:
+def _microrelief_errors(
+    appearance: SkinAppearance, truth: SkinAppearance
+) -> Iterator[QuantityAccuracy]:
     for one in microrelief.compare(appearance, truth, rng=np.random.default_rng(0)):
         angles = one.median_deg, one.interval_deg, one.coverage
-        yield TruthError("normals, median error", one.state, "°", *angles)
+        yield QuantityAccuracy("normals, median error", one.state, "°", *angles)
         if np.isfinite(one.height_um):
             name, got = "height, rms error of relief", 100 * one.height_relative
-            yield TruthError(name, one.state, "%", got, coverage=one.height_coverage)
+            yield QuantityAccuracy(name, one.state, "%", got, coverage=one.height_coverage)
 
 
-def _subsurface_errors(appearance: SkinAppearance, truth: SkinAppearance) -> Iterator[TruthError]:
+def _subsurface_errors(
+    appearance: SkinAppearance, truth: SkinAppearance
+) -> Iterator[QuantityAccuracy]:
     fits = subsurface.compare_fits(appearance, truth)
     for kind in dict.fromkeys(row.kind for row in fits):
-        for one in subsurface.by_method([row for row in fits if row.kind == kind]):
+        for one in subsurface.summarize_methods([row for row in fits if row.kind == kind]):
             name, skin = f"sigma_tr by {one.method}, median relative error", f"{kind} tissue"
-            yield TruthError(name, skin, "%", 100 * one.median, coverage=one.coverage)
+            yield QuantityAccuracy(name, skin, "%", 100 * one.median, coverage=one.coverage)

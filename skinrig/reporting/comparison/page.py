@@ -13,9 +13,9 @@ from skinrig.reporting.comparison import images as image_comparison
 from skinrig.reporting.comparison import maps as comparison_maps
 from skinrig.reporting.comparison import runs
 from skinrig.reporting.comparison.maps import MapDifference
-from skinrig.reporting.comparison.runs import Pair, Run, alone
-from skinrig.reporting.map_names import heading, melanin_bands, words
-from skinrig.written_units import written
+from skinrig.reporting.comparison.runs import ComparedRun, MapsPair, list_unpaired
+from skinrig.reporting.map_names import map_heading, map_title, split_melanin_bands
+from skinrig.unit_format import format_quantity
 
 IMAGE_WIDTH_PX = 200
 MAX_NAMED_MAPS = 10
@@ -26,16 +26,16 @@ MAX_SHOWN_SIGMAS = 5.0
 """End of the scale of differences in combined standard errors."""
 
 
-def lead(a: Run, b: Run, found: Sequence[Pair]) -> Iterator[page.Block]:
+def lead(a: ComparedRun, b: ComparedRun, found: Sequence[MapsPair]) -> Iterator[page.Block]:
     """Yield what changed in sentences, and the checks of both."""
-    rows = rows_of(a, b)
-    changed = [row for row in rows if row.changed]
+    rows = match_checks(a, b)
+    changed = [row for row in rows if row.verdict_change]
     disagree = [(pair.name, one) for pair in found for one in pair.differences if one.disagree]
     told = sum(bool(one.beyond) for pair in found for one in pair.differences)
     same = told and not any(one.high > 0.0 for pair in found for one in pair.differences)
     sentences = []
     if rows:
-        worse = sum(row.changed == "worse" for row in changed)
+        worse = sum(row.verdict_change == "worse" for row in changed)
         common = sum(row.a is not None and row.b is not None for row in rows)
         sentences.append(
             f"{len(changed)} of {common} checks of both changed their verdict"
@@ -47,15 +47,16 @@ def lead(a: Run, b: Run, found: Sequence[Pair]) -> Iterator[page.Block]:
         sentences.append(
             f"{len(disagree)} of {told} maps differ beyond their combined standard errors."
         )
-    drawn = image_comparison.sentence(a, b)
+    drawn = image_comparison.summarize_images(a, b)
     if drawn:
         sentences.append(drawn)
     if not sentences:
         sentences.append("Nothing that both have can be judged; see the tables.")
-    bad = any(row.changed == "worse" for row in changed)
+    bad = any(row.verdict_change == "worse" for row in changed)
     yield page.Paragraph(" ".join(sentences), f"verdict {'bad' if bad else ''}")
     yield page.Paragraph(
-        f"{a.label} is {_where(a)}; {b.label} is {_where(b)}. Differences are B less A."
+        f"{a.label} is {_format_run_path(a)}; {b.label} is {_format_run_path(b)}. Differences are"
+        f" B less A."
     )
     worst = sorted(disagree, key=lambda item: -item[1].beyond[-1])
     if worst:
@@ -64,24 +65,26 @@ def lead(a: Run, b: Run, found: Sequence[Pair]) -> Iterator[page.Block]:
             "Shares of pixels that lie more than three combined standard errors apart; chance "
             f"leaves 0.27 %. The {min(len(worst), MAX_NAMED_MAPS)} farthest of {len(worst)}."
         )
-        yield page.Bullets([f"{name}: {_in_words(one)}" for name, one in worst[:MAX_NAMED_MAPS]])
+        yield page.Bullets(
+            [f"{name}: {_describe_difference(one)}" for name, one in worst[:MAX_NAMED_MAPS]]
+        )
     yield from check_table(a, b, rows)
 
 
-def _in_words(one: MapDifference) -> str:
-    by = page.number(one.median if one.unit == "°" else one.bias)
+def _describe_difference(difference: MapDifference) -> str:
+    by = page.number(difference.median if difference.unit == "°" else difference.bias)
     return (
-        f"{words(one.name)} by {written(by, one.unit)} in the median, "
-        f"{100 * one.beyond[-1]:.3g} % of pixels"
+        f"{map_title(difference.name)} by {format_quantity(by, difference.unit)} in the median, "
+        f"{100 * difference.beyond[-1]:.3g} % of pixels"
     )
 
 
-def _where(run: Run) -> str:
+def _format_run_path(run: ComparedRun) -> str:
     """Return a run by the end of its path: the whole of it is nobody else's business."""
     return "/".join(run.path.resolve().parts[-2:])
 
 
-def sections(a: Run, b: Run, found: Sequence[Pair]) -> Iterator[page.Block]:
+def sections(a: ComparedRun, b: ComparedRun, found: Sequence[MapsPair]) -> Iterator[page.Block]:
     """Yield maps, errors against the truths, settings and times of both."""
     for pair in found:
         yield from _pair(a, b, pair)
@@ -89,7 +92,7 @@ def sections(a: Run, b: Run, found: Sequence[Pair]) -> Iterator[page.Block]:
     yield from runs.seconds(a, b)
     yield from runs.moved_calibrations(a, b)
     yield from image_comparison.section(a, b)
-    if missing := alone(a, b):
+    if missing := list_unpaired(a, b):
         yield page.Heading("Only in one", level=2)
         yield page.table(
             ("folder", "in"),
@@ -99,7 +102,7 @@ def sections(a: Run, b: Run, found: Sequence[Pair]) -> Iterator[page.Block]:
     yield from provenance.consent_section([a.found, b.found])
 
 
-def _pair(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
+def _pair(a: ComparedRun, b: ComparedRun, pair: MapsPair) -> Iterator[page.Block]:
     yield page.Heading(f"Maps: {pair.name}", level=2)
     common = pair.a.inputs.get("session") == pair.b.inputs.get("session")
     if common and "session" in pair.a.inputs:
@@ -107,7 +110,7 @@ def _pair(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
             "Both were made of the same frames: they share the frames' noise, so that every "
             "difference is the processing's, and combined standard errors are too large for it."
         )
-    yield page.view("compared_maps", maps=sorted(pair.differences, key=_farthest_first))
+    yield page.view("compared_maps", maps=sorted(pair.differences, key=_sort_key))
     if pair.refused:
         table = page.table(("map", "why"), pair.refused, caption="Maps that were not subtracted")
         yield page.Folded(f"{len(pair.refused)} maps not subtracted", [table])
@@ -117,25 +120,27 @@ def _pair(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
     yield from runs.settings(a, b, pair)
 
 
-def _farthest_first(one: MapDifference) -> tuple[float, str]:
-    return (-one.beyond[-1] if one.beyond else 1.0, one.name)
+def _sort_key(difference: MapDifference) -> tuple[float, str]:
+    return (-difference.beyond[-1] if difference.beyond else 1.0, difference.name)
 
 
-def _images(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
+def _images(a: ComparedRun, b: ComparedRun, pair: MapsPair) -> Iterator[page.Block]:
     """Yield A | B | difference | difference over the combined standard error."""
     told = [one for one in pair.differences if one.sigmas is not None and one.name != "position"]
-    order = sorted((one for one in told if one.high > 0.0), key=_farthest_first)
+    order = sorted((one for one in told if one.high > 0.0), key=_sort_key)
     for one in order[:MAX_DRAWN_MAPS]:
-        yield page.Heading(heading(one.name))
-        yield page.Images(list(_four(a, b, pair, one)))
+        yield page.Heading(map_heading(one.name))
+        yield page.Images(list(_difference_images(a, b, pair, one)))
     if len(order) > MAX_DRAWN_MAPS:
-        names = "; ".join(words(one.name) for one in order[MAX_DRAWN_MAPS:])
+        names = "; ".join(map_title(one.name) for one in order[MAX_DRAWN_MAPS:])
         yield page.note(f"Not drawn, since they disagree less: {names}.")
 
 
-def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[page.Image]:
-    maps = pair.a.maps[one.name], pair.b.maps[one.name]
-    both = ~np.isnan(one.difference)
+def _difference_images(
+    a: ComparedRun, b: ComparedRun, pair: MapsPair, difference: MapDifference
+) -> Iterator[page.Image]:
+    maps = pair.a.maps[difference.name], pair.b.maps[difference.name]
+    both = ~np.isnan(difference.difference)
     place = pair.a.maps.get("position")
 
     def laid(values: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -145,7 +150,7 @@ def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[page.Image
         rows, columns = np.nonzero(both & place.mask)
         points = place.values[rows, columns].astype(np.float64)
         view = FrontView.of(points, (points.min(axis=0), points.max(axis=0)))
-        return view.picture(np.nan_to_num(values[rows, columns].astype(np.float64)))
+        return view.rasterize(np.nan_to_num(values[rows, columns].astype(np.float64)))
 
     if not both.any():
         return
@@ -153,30 +158,33 @@ def _four(a: Run, b: Run, pair: Pair, one: MapDifference) -> Iterator[page.Image
     low, high = np.percentile(values[np.isfinite(values)], [1, 99])
     for label, skin_map in zip((a.label, b.label), maps, strict=True):
         image, mask = laid(skin_map.values)
-        shown = map_images.MapDrawing(one.name, one.unit, mask, IMAGE_WIDTH_PX)
-        if one.unit == "°":
+        shown = map_images.MapDrawing(difference.name, difference.unit, mask, IMAGE_WIDTH_PX)
+        if difference.unit == "°":
             yield shown.normals(label, image)
         elif image.ndim == 3:
             yield map_images.color_image(
-                label, np.where(mask[..., None], image, 0.2), width=IMAGE_WIDTH_PX, of=one.name
+                label,
+                np.where(mask[..., None], image, 0.2),
+                width=IMAGE_WIDTH_PX,
+                of=difference.name,
             )
         else:
-            yield shown.scalar(label, image, low, high)
-    image, mask = laid(one.difference)
-    reach = map_images.reach_of(image, mask, 98) or 1.0
-    drawing = map_images.MapDrawing(one.name, one.unit, mask, IMAGE_WIDTH_PX)
-    if one.unit == "°":
+            yield shown.draw_scalar(label, image, low, high)
+    image, mask = laid(difference.difference)
+    reach = map_images.percentile_reach(image, mask, 98) or 1.0
+    drawing = map_images.MapDrawing(difference.name, difference.unit, mask, IMAGE_WIDTH_PX)
+    if difference.unit == "°":
         yield drawing.size("angle between them", image, reach)
     else:
-        yield drawing.signed("B − A", image, reach)
-    if one.sigmas is not None:
-        image, mask = laid(one.sigmas)
-        drawing = map_images.MapDrawing(f"{one.name}, difference", "", mask, IMAGE_WIDTH_PX)
-        draw = drawing.size if one.unit == "°" else drawing.signed
+        yield drawing.draw_signed("B − A", image, reach)
+    if difference.sigmas is not None:
+        image, mask = laid(difference.sigmas)
+        drawing = map_images.MapDrawing(f"{difference.name}, difference", "", mask, IMAGE_WIDTH_PX)
+        draw = drawing.size if difference.unit == "°" else drawing.draw_signed
         yield draw("in combined standard errors", image, MAX_SHOWN_SIGMAS)
 
 
-def _by_band(pair: Pair) -> Iterator[page.Block]:
+def _by_band(pair: MapsPair) -> Iterator[page.Block]:
     """Yield differences of chromophores by band of the melanin that both find on average."""
     melanin = [side.maps.get("melanin") for side in (pair.a, pair.b)]
     if melanin[0] is None or melanin[1] is None:
@@ -189,16 +197,16 @@ def _by_band(pair: Pair) -> Iterator[page.Block]:
         if one.sigmas is None or one.difference.shape != level.shape:
             continue
         known = ~np.isnan(one.difference) & ~np.isnan(one.sigmas)
-        for band, inside in melanin_bands(level, known):
+        for band, inside in split_melanin_bands(level, known):
             off, sigmas = one.difference[inside], np.abs(one.sigmas[inside])
-            rows.append((words(one.name), band, one.unit, off, sigmas))
+            rows.append((map_title(one.name), band, one.unit, off, sigmas))
     if rows:
         yield page.view("compared_bands", bands=rows)
 
 
-def _errors(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
+def _errors(a: ComparedRun, b: ComparedRun, pair: MapsPair) -> Iterator[page.Block]:
     """Yield errors of both against their truths, where both truths are known."""
-    truths = a.found.truth_of(pair.a), b.found.truth_of(pair.b)
+    truths = a.found.find_truth(pair.a), b.found.find_truth(pair.b)
     if truths[0] is None or truths[1] is None:
         lacking = " and ".join(
             run.label for run, truth in zip((a, b), truths, strict=True) if truth is None
@@ -231,16 +239,16 @@ class CheckRow:
     b: page.Check | None
 
     @property
-    def changed(self) -> str:
+    def verdict_change(self) -> str:
         """Return "better" or "worse" where the verdict changed."""
         if self.a is None or self.b is None or self.a.passed == self.b.passed:
             return ""
         return "better" if self.b.passed else "worse"
 
     @property
-    def outcome(self) -> str:
+    def describe_outcome(self) -> str:
         """What became of the verdict, in words."""
-        return self.changed or ("no" if self.a and self.b else "only in one")
+        return self.verdict_change or ("no" if self.a and self.b else "only in one")
 
     @property
     def difference(self) -> float:
@@ -248,25 +256,27 @@ class CheckRow:
         return float("nan") if self.a is None or self.b is None else self.b.got - self.a.got
 
 
-def rows_of(a: Run, b: Run) -> list[CheckRow]:
+def match_checks(a: ComparedRun, b: ComparedRun) -> list[CheckRow]:
     """Return the checks of two runs by name, verdicts that changed first."""
     by_a = {_common_name(check, a, b): check for check in a.checks}
     by_b = {_common_name(check, b, a): check for check in b.checks}
     rows = [CheckRow(name, by_a.get(name), by_b.get(name)) for name in {**by_a, **by_b}]
-    return sorted(rows, key=lambda row: (row.changed != "worse", row.changed != "better"))
+    return sorted(
+        rows, key=lambda row: (row.verdict_change != "worse", row.verdict_change != "better")
+    )
 
 
-def _common_name(check: page.Check, run: Run, other: Run) -> str:
+def _common_name(check: page.Check, run: ComparedRun, other_run: ComparedRun) -> str:
     """Return a check's name without the folder's where the two folders are named differently."""
     name = check.name
-    if len(run.appearances) == len(other.appearances) == 1:
+    if len(run.appearances) == len(other_run.appearances) == 1:
         name = name.removeprefix(f"{next(iter(run.appearances))}: ")
-    if len(run.found.pictures) == len(other.found.pictures) == 1:
+    if len(run.found.pictures) == len(other_run.found.pictures) == 1:
         name = name.removeprefix(f"{run.found.pictures[0].name}: ")
     return name
 
 
-def check_table(a: Run, b: Run, rows: Sequence[CheckRow]) -> Iterator[page.Block]:
+def check_table(a: ComparedRun, b: ComparedRun, rows: Sequence[CheckRow]) -> Iterator[page.Block]:
     """Yield the section on checks of both; empty without any."""
     if not rows:
         return
@@ -274,13 +284,13 @@ def check_table(a: Run, b: Run, rows: Sequence[CheckRow]) -> Iterator[page.Block
     def told(check: page.Check | None) -> str:
         if check is None:
             return "not checked"
-        return written(page.number(check.got), check.unit) + (
+        return format_quantity(page.number(check.got), check.unit) + (
             ", kept" if check.passed else ", missed"
         )
 
     def limit(row: CheckRow) -> str:
         bounds = [
-            f"{'≤' if c.sense == '<=' else '≥'} {written(page.number(c.bound), c.unit)}"
+            f"{'≤' if c.sense == '<=' else '≥'} {format_quantity(page.number(c.bound), c.unit)}"
             for c in (row.a, row.b)
             if c is not None
         ]
@@ -290,7 +300,7 @@ def check_table(a: Run, b: Run, rows: Sequence[CheckRow]) -> Iterator[page.Block
     yield page.table(
         ("check", a.label, b.label, "difference", "limit", "changed"),
         [
-            (row.name, told(row.a), told(row.b), row.difference, limit(row), row.outcome)
+            (row.name, told(row.a), told(row.b), row.difference, limit(row), row.describe_outcome)
             for row in rows
         ],
         caption="Verdicts that changed stand first; limits that follow a bound may differ",

@@ -19,7 +19,7 @@ from skinrig.reporting import folders, page, provenance
 from skinrig.reporting import folders as report_folders
 from skinrig.reporting.comparison import maps as map_comparison
 from skinrig.reporting.comparison.maps import MapDifference
-from skinrig.reporting.folders import Findings, ReportError
+from skinrig.reporting.folders import ReportError, ReportInputs
 from skinrig.reporting.sections import bench
 from skinrig.reporting.sections import images as pictures
 
@@ -31,12 +31,12 @@ MAX_SAME_POINT_MM = 1.0
 
 
 @dataclass(slots=True)
-class Run:
+class ComparedRun:
     """One side of a comparison."""
 
     label: str
     path: Path
-    found: Findings
+    found: ReportInputs
     appearances: dict[str, SkinAppearance]
     checks: list[page.Check] = field(default_factory=list)
     """What its own report would judge."""
@@ -47,16 +47,16 @@ class Run:
         return {path.name: path for path in sorted(self.found.pictures)}
 
     @staticmethod
-    def of(label: str, path: Path, truths: Sequence[Path] = ()) -> Run:
+    def of(label: str, path: Path, truths: Sequence[Path] = ()) -> ComparedRun:
         """Read a run; ``truths`` serve it beside its own."""
         found = folders.discover([path])
         for truth in truths:
             found.truths.setdefault(truth.name, truth)
         appearances = {name: store.read(folder) for name, folder in found.appearances.items()}
-        return Run(label, path, found, appearances)
+        return ComparedRun(label, path, found, appearances)
 
 
-def kind_of(path: Path) -> Kind:
+def detect_kind(path: Path) -> Kind:
     """Return what a path holds, as far as comparing goes.
 
     "maps": one APPEARANCE/ folder; "truth": a TRUTH/ folder; "benchmark": a document of `skinrig
@@ -87,7 +87,9 @@ def _is_bench(path: Path) -> bool:
         return False
 
 
-def sides(paths: Sequence[Path], *, insist: bool | None = None) -> tuple[Run, Run] | None:
+def split_sides(
+    paths: Sequence[Path], *, require_comparison: bool | None = None
+) -> tuple[ComparedRun, ComparedRun] | None:
     """Return the two runs that paths ask to compare, or None where they are a collection.
 
     Exactly two paths of one kind, be it two sets of maps, two benchmarks, two folders of pictures
@@ -106,19 +108,19 @@ def sides(paths: Sequence[Path], *, insist: bool | None = None) -> tuple[Run, Ru
     ReportError
         When a comparison is insisted on, and paths are not two of one kind.
     """
-    if insist is False:
+    if require_comparison is False:
         return None
     missing = [path for path in paths if not path.exists()]
     if missing:
         raise ReportError(f"{missing[0]}: does not exist; give a folder that skinrig wrote")
-    kinds = {path: kind_of(path) for path in paths}
+    kinds = {path: detect_kind(path) for path in paths}
     truths = [path for path in paths if kinds[path] == "truth"]
     runs = [path for path in paths if kinds[path] != "truth"]
     fits = (
         len(runs) == 2 and kinds[runs[0]] == kinds[runs[1]] and kinds[runs[0]] in COMPARABLE_KINDS
     )
     if not fits:
-        if insist:
+        if require_comparison:
             told = ", ".join(f"{path} ({kinds[path]})" for path in paths)
             raise ReportError(
                 f"--compare: got {told}, expected two of one kind: two folders of maps, two "
@@ -127,7 +129,7 @@ def sides(paths: Sequence[Path], *, insist: bool | None = None) -> tuple[Run, Ru
             )
         return None
     first, second = _labels(*runs)
-    return Run.of(first, runs[0], truths), Run.of(second, runs[1], truths)
+    return ComparedRun.of(first, runs[0], truths), ComparedRun.of(second, runs[1], truths)
 
 
 def _labels(a: Path, b: Path) -> tuple[str, str]:
@@ -143,7 +145,7 @@ def _labels(a: Path, b: Path) -> tuple[str, str]:
     return f"A: {a.parent.name}/{a.name}", f"B: {b.parent.name}/{b.name}"
 
 
-def paired(one: Mapping[str, T], other: Mapping[str, T]) -> list[tuple[str, T, T]]:
+def pair_by_name(one: Mapping[str, T], other: Mapping[str, T]) -> list[tuple[str, T, T]]:
     """Return what belongs together of two runs: by name of its folder, or the only ones."""
     if len(one) == len(other) == 1:
         (name_a, a), (name_b, b) = *one.items(), *other.items()
@@ -151,7 +153,7 @@ def paired(one: Mapping[str, T], other: Mapping[str, T]) -> list[tuple[str, T, T
     return [(name, found, other[name]) for name, found in one.items() if name in other]
 
 
-def alone(a: Run, b: Run) -> list[tuple[str, str]]:
+def list_unpaired(a: ComparedRun, b: ComparedRun) -> list[tuple[str, str]]:
     """Return folders of maps or pictures that only one of two runs has: name, the run's label."""
     found = []
     for one, other in ((a.appearances, b.appearances), (a.pictures, b.pictures)):
@@ -162,7 +164,7 @@ def alone(a: Run, b: Run) -> list[tuple[str, str]]:
 
 
 @dataclass(frozen=True, slots=True)
-class Pair:
+class MapsPair:
     """Maps of two runs that belong together, and how they differ."""
 
     name: str
@@ -173,10 +175,10 @@ class Pair:
     """Maps that cannot be subtracted, and why."""
 
 
-def compared(a: Run, b: Run) -> list[Pair]:
+def compare_maps_of_runs(a: ComparedRun, b: ComparedRun) -> list[MapsPair]:
     """Return the pairs of two runs with the differences of every map that both have."""
     found = []
-    for name, one, other in paired(a.appearances, b.appearances):
+    for name, one, other in pair_by_name(a.appearances, b.appearances):
         differences, refused = [], []
         apart = _apart_mm(one, other)
         for key in sorted(set(one.maps) | set(other.maps)):
@@ -187,10 +189,10 @@ def compared(a: Run, b: Run) -> list[Pair]:
                     raise ValueError(f"only in {a.label if key in one.maps else b.label}")
                 if apart > MAX_SAME_POINT_MM:
                     raise ValueError(f"texels of the two meshes lie {apart:.1f} mm apart")
-                differences.append(map_comparison.compare(key, one.maps[key], other.maps[key]))
+                differences.append(map_comparison.compare_maps(key, one.maps[key], other.maps[key]))
             except ValueError as error:
                 refused.append((key, str(error)))
-        found.append(Pair(name, one, other, tuple(differences), tuple(refused)))
+        found.append(MapsPair(name, one, other, tuple(differences), tuple(refused)))
     return found
 
 
@@ -212,17 +214,19 @@ MAX_LISTED_DRIFTS = 3
 """Quantities told of each kind of calibration."""
 
 
-def settings(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
+def settings(a: ComparedRun, b: ComparedRun, pair: MapsPair) -> Iterator[page.Block]:
     """Yield what the two were made with, as far as it differs."""
     sides = []
     for side in (pair.a, pair.b):
-        told = {f"parameter {k}": v for k, v in provenance.flattened(side.parameters).items()}
-        told |= {f"input {k}": provenance.short(v) for k, v in side.inputs.items()}
+        told = {
+            f"parameter {k}": v for k, v in provenance.flatten_settings(side.parameters).items()
+        }
+        told |= {f"input {k}": provenance.shorten_digest(v) for k, v in side.inputs.items()}
         told |= {f"version of {k}": v for k, v in side.versions.items()}
         told |= {"source": side.source, "seed": str(side.seed)}
         told |= {f"left out: {what}": why for what, why in side.left_out}
         sides.append(told)
-    rows = unequal(*sides)
+    rows = differing_entries(*sides)
     stages = [row for row in rows if row[0].startswith("parameter stages.")]
     rest = [row for row in rows if not row[0].startswith("parameter stages.")]
     yield page.Heading("What differs in the making")
@@ -236,7 +240,7 @@ def settings(a: Run, b: Run, pair: Pair) -> Iterator[page.Block]:
         yield page.note(f"Stages whose code, settings or inputs differ: {names}.")
 
 
-def unequal(a: Mapping[str, str], b: Mapping[str, str]) -> list[tuple[str, str, str]]:
+def differing_entries(a: Mapping[str, str], b: Mapping[str, str]) -> list[tuple[str, str, str]]:
     """Return the entries that differ, with a dash where one lacks them."""
     return [
         (key, a.get(key, "–"), b.get(key, "–"))
@@ -245,7 +249,7 @@ def unequal(a: Mapping[str, str], b: Mapping[str, str]) -> list[tuple[str, str, 
     ]
 
 
-def benchmarks(a: Run, b: Run) -> Iterator[page.Block]:
+def benchmarks(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
     """Yield seconds and errors of settings that both measured, and a plot a stage."""
     documents = [_bench_of(run) for run in (a, b)]
     if documents[0] is None or documents[1] is None:
@@ -257,11 +261,17 @@ def benchmarks(a: Run, b: Run) -> Iterator[page.Block]:
             continue
         rows += _settings_of_stage(name, stage, other)
         if stage["points"] and other["points"]:
-            plots.append(bench_figures.compared_fronts(name, (a.label, stage), (b.label, other)))
+            plots.append(
+                bench_figures.plot_compared_fronts(name, (a.label, stage), (b.label, other))
+            )
     if not rows:
         return
-    machines = unequal(
-        *(provenance.flattened(document.get("machine", {})) for document in documents if document)
+    machines = differing_entries(
+        *(
+            provenance.flatten_settings(document.get("machine", {}))
+            for document in documents
+            if document
+        )
     )
     yield page.Heading("Error against run time", level=2)
     yield page.Plots(plots)
@@ -274,7 +284,7 @@ def benchmarks(a: Run, b: Run) -> Iterator[page.Block]:
     yield page.view("compared_benchmarks", settings=rows)
 
 
-def _bench_of(run: Run) -> dict[str, Any] | None:
+def _bench_of(run: ComparedRun) -> dict[str, Any] | None:
     for path in run.found.documents:
         document = report_folders.read_json(path)
         if document["schema"] == SCHEMA:
@@ -295,7 +305,7 @@ def _settings_of_stage(
     return rows
 
 
-def seconds(a: Run, b: Run) -> Iterator[page.Block]:
+def seconds(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
     """Yield the seconds that documents of both, such as a demo's, tell by step."""
     sides = [dict(_steps(run)) for run in (a, b)]
     common = [step for step in sides[0] if step in sides[1]]
@@ -314,14 +324,14 @@ def seconds(a: Run, b: Run) -> Iterator[page.Block]:
     )
 
 
-def _steps(run: Run) -> Iterator[tuple[str, float]]:
+def _steps(run: ComparedRun) -> Iterator[tuple[str, float]]:
     for path in run.found.documents:
         for entry in report_folders.read_json(path).get("tables", ()):
             if list(entry["head"]) == ["step", "seconds"]:
                 yield from ((str(step), float(seconds)) for step, seconds in entry["rows"])
 
 
-def moved_calibrations(a: Run, b: Run) -> Iterator[page.Block]:
+def moved_calibrations(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
     """Yield what moved most between calibrations of the same folder and kind."""
     folders: dict[str, Path] = {path.name: path for path in b.found.calibrations}
     rows: list[tuple[object, ...]] = []
@@ -332,7 +342,7 @@ def moved_calibrations(a: Run, b: Run) -> Iterator[page.Block]:
             try:
                 old = calibrations.load(folder, path.stem)
                 new = calibrations.load(folders[folder.name], path.stem)
-                moved = [one for one in calibrations.drift(old, new) if one.change != 0.0]
+                moved = [one for one in calibrations.measure_drift(old, new) if one.change != 0.0]
             except (CalibrationError, ValueError) as error:
                 rows.append((f"{folder.name}, {path.stem}", "", "", "", "", "", str(error)))
                 continue

@@ -23,7 +23,7 @@ MAX_LISTED_QUANTITIES = 60
 """Rows beyond which values stay in their file."""
 
 
-FIGURES_OF: Mapping[str, Callable[[Float64Array], float]] = {
+AGGREGATES: Mapping[str, Callable[[Float64Array], float]] = {
     "largest": lambda values: float(np.max(np.abs(values))),
     "mean": lambda values: float(np.mean(values)),
 }
@@ -46,7 +46,7 @@ def _quality_figures() -> dict[str, list[Figure]]:
     table = resources.files("skinrig").joinpath("data/calibration_figures.csv")
     found: dict[str, list[Figure]] = {}
     for row in csv.DictReader(table.read_text(encoding="utf-8").splitlines()):
-        of = FIGURES_OF[row["of"]]
+        of = AGGREGATES[row["of"]]
         worst = {"min": min, "max": max}[row["worst"]]
         words = row["quantity"], row["words"], row["unit"]
         found.setdefault(row["kind"], []).append(Figure(*words, of, float(row["factor"]), worst))
@@ -129,7 +129,7 @@ def _age(
             if (session := appearances[name].parameters.get("session")) in sessions
         }
     )
-    days = [_left(found, day) for day in captured]
+    days = [_days_left(found, day) for day in captured]
     if not captured:
         verdict = "no session here tells when it was used"
     elif min(days) < 0:
@@ -148,7 +148,7 @@ def _age(
     )
 
 
-def _left(found: Calibration, day: date) -> int:
+def _days_left(found: Calibration, day: date) -> int:
     """Return days until validity ends; negative, too, before it began."""
     before = (day - found.created).days
     return before if before < 0 else (found.valid_until - day).days

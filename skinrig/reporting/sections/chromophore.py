@@ -10,7 +10,7 @@ from model.skin import SkinAppearance, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import chromophores
 from reconstruction.chromophores import model_error
-from reconstruction.pipeline.flash.stages import NOISE_STDERR
+from reconstruction.pipeline.flash.stages import NOISE_STDERR_SUFFIX
 from skinrig.arrays import BoolArray
 from skinrig.drawing import figures
 from skinrig.evaluating import flash
@@ -28,14 +28,14 @@ def panels(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator
     """Yield each map of a single channel beside its truth, to one scale."""
     alone = []
     for key, skin_map in sorted(appearance.maps.items()):
-        if skin_map.values.ndim != 2 or key.startswith("_") or key.endswith(NOISE_STDERR):
+        if skin_map.values.ndim != 2 or key.startswith("_") or key.endswith(NOISE_STDERR_SUFFIX):
             continue
         true_map = truth.maps.get(key) if truth is not None else None
         if true_map is None and skin_map.stderr is None:
-            alone.append(_alone(key, skin_map))
+            alone.append(_single_image(key, skin_map))
             continue
         yield from map_images.map_panel(
-            map_names.heading(key),
+            map_names.map_heading(key),
             page.short_unit(skin_map.unit),
             estimate=skin_map.values,
             standard_error=skin_map.stderr,
@@ -47,7 +47,7 @@ def panels(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator
         yield page.Images(alone, small=True)
 
 
-def _alone(key: str, skin_map: SkinMap) -> page.Image:
+def _single_image(key: str, skin_map: SkinMap) -> page.Image:
     """Return the picture of a map that there is nothing to set beside."""
     mask = _shown(skin_map, None)
     inside = skin_map.values[np.isfinite(skin_map.values) if mask is None else mask]
@@ -55,7 +55,7 @@ def _alone(key: str, skin_map: SkinMap) -> page.Image:
     if max(abs(low), abs(high)) < MAX_ROUNDING_ERROR:
         low, high = 0.0, 1.0  # what rounding leaves is not to look like structure
     drawing = map_images.MapDrawing("", page.short_unit(skin_map.unit), mask, SMALL_WIDTH_PX)
-    return drawing.scalar(map_names.heading(key), skin_map.values, low, high)
+    return drawing.draw_scalar(map_names.map_heading(key), skin_map.values, low, high)
 
 
 def _shown(estimate: SkinMap, truth: SkinMap | None) -> BoolArray | None:
@@ -63,7 +63,7 @@ def _shown(estimate: SkinMap, truth: SkinMap | None) -> BoolArray | None:
     return np.logical_and.reduce(masks) if masks else None
 
 
-def errors(subject: page.Subject, truth: SkinAppearance) -> Iterator[page.Block]:
+def errors(subject: page.ReportedAppearance, truth: SkinAppearance) -> Iterator[page.Block]:
     """Yield the errors of melanin and hemoglobin against their truth, by melanin band.
 
     Parameters
@@ -76,13 +76,13 @@ def errors(subject: page.Subject, truth: SkinAppearance) -> Iterator[page.Block]
     for row in blurred:
         if row.band is None:
             worst, worst_got = _worst([r for r in blurred if r.name == row.name and r.band])
-            subject.check_share(
+            subject.check_fraction(
                 f"{row.name}, median error",
                 row.median_relative,
                 flash.limit(row),
                 f"Cramér-Rao bound {100 * flash.bound(row):.1f} %",
                 masked=row.masked,
-                coverage=row.coverage.share,
+                coverage=row.coverage.fraction,
                 worst=worst,
                 worst_got=worst_got,
             )
@@ -91,9 +91,9 @@ def errors(subject: page.Subject, truth: SkinAppearance) -> Iterator[page.Block]
     yield from _bars([row for row in blurred if row.band is not None], limits)
 
 
-def _worst(banded: Iterable[flash.MapError]) -> tuple[str, float]:
+def _worst(banded: Iterable[flash.MapAccuracy]) -> tuple[str, float]:
     """Return the melanin band of the largest error and its lower end, where there are several."""
-    worst = page.worst_of(banded, lambda row: row.median_relative)
+    worst = page.find_worst(banded, lambda row: row.median_relative)
     if worst is None:
         return "", float("nan")
     low, high = (100 * end for end in worst.interval)
@@ -101,7 +101,7 @@ def _worst(banded: Iterable[flash.MapError]) -> tuple[str, float]:
     return text, low
 
 
-def _bars(banded: list[flash.MapError], limits: Mapping[str, float]) -> Iterator[page.Block]:
+def _bars(banded: list[flash.MapAccuracy], limits: Mapping[str, float]) -> Iterator[page.Block]:
     labels = list(dict.fromkeys(row.band_name for row in banded))
     if not labels:
         return
@@ -148,11 +148,11 @@ def _plots_of_table(camera: str, illuminant: str) -> list[str]:
         ("known", "shading known"),
     )
     for shading, words in choices:
-        found = chromophores.identifiability(
+        found = chromophores.compute_identifiability(
             table,
             shading=shading,
             variance=lambda rgb: np.square(IDENTIFIABILITY_NOISE * rgb),
-            model_error=model_error.load(),
+            model_error=model_error.load_covariance(),
             size=48,
         )
         errors = {"melanin": found.stderr_melanin, "hemoglobin": found.stderr_hemoglobin}

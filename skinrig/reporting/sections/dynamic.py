@@ -10,20 +10,20 @@ from model.facial_color import HemoglobinRig
 from model.microstructure import KernelTable
 from model.skin import SkinAppearance, SkinMap
 from model.wrinkles.evaluation import WRINKLE_FILE, WrinkleModel
-from model.wrinkles.expressions import clamped, zone_sums
+from model.wrinkles.expressions import clamp_sums, zone_sums
 from skinrig.appearances.dynamic import (
     DYNAMIC_KIND,
     FACIAL_COLOR,
     MICROSTRUCTURE,
     WRINKLES,
-    parts_of,
+    describe_parts,
 )
-from skinrig.applying.expression import colors, hemoglobin_rig
+from skinrig.applying.expression import hemoglobin_rig, skin_reflectance
 from skinrig.arrays import Float64Array, FloatArray
 from skinrig.drawing import figures
 from skinrig.evaluating import facial_color as evaluation
 from skinrig.reporting import map_images, page
-from skinrig.reporting.map_names import melanin_bands
+from skinrig.reporting.map_names import split_melanin_bands
 
 MAX_SHOWN_EXPRESSIONS = 4
 """States drawn; the tables list all."""
@@ -48,7 +48,9 @@ def is_dynamic(appearance: SkinAppearance) -> bool:
     return appearance.parameters.get("kind") == DYNAMIC_KIND
 
 
-def section(subject: page.Subject, truths: Mapping[str, SkinAppearance]) -> Iterator[page.Block]:
+def section(
+    subject: page.ReportedAppearance, truths: Mapping[str, SkinAppearance]
+) -> Iterator[page.Block]:
     """Yield what was fitted, and how far it is from the truth.
 
     Parameters
@@ -59,7 +61,7 @@ def section(subject: page.Subject, truths: Mapping[str, SkinAppearance]) -> Iter
         True blood of each state, as far as it is there.
     """
     appearance = subject.appearance
-    parts = parts_of(appearance)
+    parts = describe_parts(appearance)
     if FACIAL_COLOR in parts:
         yield from facial_color(subject, parts[FACIAL_COLOR], truths)
     if WRINKLES in parts:
@@ -82,7 +84,7 @@ def _wrinkles(appearance: SkinAppearance, part: Mapping[str, Any]) -> Iterator[p
     table: Any = layer.table
     together = dict.fromkeys(list(table.rows)[:2], 1.0)
     sums = zone_sums(together, table)
-    clamps = {clamp: clamped(sums, clamp).tolist() for clamp in ("unit", "signed")}
+    clamps = {clamp: clamp_sums(sums, clamp).tolist() for clamp in ("unit", "signed")}
     yield page.Heading("Wrinkles")
     yield page.Images(images)
     stderr = model.weight_stderr
@@ -104,13 +106,13 @@ def _microstructure(appearance: SkinAppearance, part: Mapping[str, Any]) -> Iter
         low, high = table.stretch_range
         r = np.linspace(low, high, 61)
         alpha, sigma_um = microstructure.kernel_parameters(r, table)
-        alphas.append(figures.Curve(site, r.tolist(), alpha.tolist(), marks=False))
-        sigmas.append(figures.Curve(site, r.tolist(), sigma_um.tolist(), marks=False))
+        alphas.append(figures.PlotSeries(site, r.tolist(), alpha.tolist(), marks=False))
+        sigmas.append(figures.PlotSeries(site, r.tolist(), sigma_um.tolist(), marks=False))
         relief = appearance.maps[entry["map"]]
         spread = 2.5 * float(np.std(relief.values[relief.mask]))
         drawing = map_images.MapDrawing("", "um", relief.valid, WIDTH_PX)
         title = f"{site}: neutral relief"
-        images.append(drawing.scalar(title, relief.values, -spread, spread, "gray"))
+        images.append(drawing.draw_scalar(title, relief.values, -spread, spread, "gray"))
         kernels, stretch = entry["kernels"] or "the paper's table", f"{low:.2f} – {high:.2f}"
         rows.append((site, entry["pixel_um"], kernels, stretch, table.source))
     yield page.Heading("Microstructure")
@@ -133,7 +135,7 @@ MAX_SHOWN_STATES = 4
 
 
 def facial_color(
-    subject: page.Subject, part: Mapping[str, Any], truths: Mapping[str, SkinAppearance]
+    subject: page.ReportedAppearance, part: Mapping[str, Any], truths: Mapping[str, SkinAppearance]
 ) -> Iterator[page.Block]:
     """Yield the states of a face's blood, how they repeat, and how far off they are.
 
@@ -192,14 +194,14 @@ def _blends(appearance: SkinAppearance, rig: HemoglobinRig) -> Iterator[page.Blo
     for title, weights in asked.items():
         blend = rig.evaluate(weights)
         seen = blend.valid & melanin.mask
-        color = colors(melanin.values, np.where(seen, blend.hemoglobin, 0.0), seen)
+        color = skin_reflectance(melanin.values, np.where(seen, blend.hemoglobin, 0.0), seen)
         images.append(map_images.color_image(title, color, width=WIDTH_PX))
     yield page.Images(images)
     yield page.note("Diffuse color without shading, linear sRGB under D65.")
 
 
 def _color_errors(
-    subject: page.Subject, rig: HemoglobinRig, truths: Mapping[str, SkinAppearance]
+    subject: page.ReportedAppearance, rig: HemoglobinRig, truths: Mapping[str, SkinAppearance]
 ) -> Iterator[page.Block]:
     rng = np.random.default_rng(0)
     states, changes = evaluation.compare(subject.appearance, rig, truths, rng=rng)
@@ -207,14 +209,14 @@ def _color_errors(
         return
     banded = errors_by_band(rig, truths)
     for row in states:
-        if row.way == evaluation.PREDICTION_METHODS[1]:
+        if row.method == evaluation.PREDICTION_METHODS[1]:
             text = f"blood of {row.state} by the rig, median error"
             got, worst = row.median_relative, _worst_band(row.state, banded)
             limit = evaluation.MAX_LEVEL_ERROR
-            subject.check_share(text, got, limit, coverage=row.coverage, worst=worst)
+            subject.check_fraction(text, got, limit, coverage=row.coverage, worst=worst)
     yield page.view("facial_errors", states=states, changes=changes, banded=banded)
     labels = list(dict.fromkeys(row.state for row in states))
-    found = {(row.state, row.way): 100 * row.median_relative for row in reversed(states)}
+    found = {(row.state, row.method): 100 * row.median_relative for row in reversed(states)}
     series = {
         way: [found.get((label, way), float("nan")) for label in labels]
         for way in evaluation.PREDICTION_METHODS
@@ -251,7 +253,7 @@ def errors_by_band(
         if melanin.values.shape != blend.hemoglobin.shape:
             continue
         good = blend.valid & (true.values > 0) & true.mask
-        for band, inside in melanin_bands(melanin.values, good):
+        for band, inside in split_melanin_bands(melanin.values, good):
             found, real = blend.hemoglobin[inside], true.values[inside].astype(np.float64)
             relative = (found - real) / real
             held = np.abs(found - real) <= blend.stderr[inside]

@@ -5,10 +5,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from skinrig.console import Console, plain
+from skinrig.atomic_file import write_atomically
+from skinrig.console import Console, to_json_value
 from skinrig.extremes.cases import INPUT_PRECISIONS, SCHEMA, run_cases, to_document
 from skinrig.reporting import page
-from skinrig.whole_file import write_whole
 
 __all__ = ["SCHEMA", "run_extremes", "section"]
 
@@ -48,8 +48,8 @@ def run_extremes(
     failed = sum(not case["passed"] for case in document["cases"])
     console.say(f"{len(document['cases'])} extremes, {failed or 'none'} failed")
     if out is not None:
-        text = json.dumps(plain(document), indent=1, sort_keys=True)
-        write_whole(out / "extremes.json", text + "\n")
+        text = json.dumps(to_json_value(document), indent=1, sort_keys=True)
+        write_atomically(out / "extremes.json", text + "\n")
     return document
 
 

@@ -12,9 +12,9 @@ from reconstruction.pipeline.gradient.stages import HISTOGRAM_FILE, KERNEL_FILE,
 from skinrig.arrays import BoolArray, FloatArray
 from skinrig.drawing import figures
 from skinrig.evaluating import microrelief as evaluation
-from skinrig.evaluating.subsurface import document_of, number
+from skinrig.evaluating.subsurface import parse_number, read_document
 from skinrig.reporting import map_images, page
-from skinrig.reporting.map_names import state_words
+from skinrig.reporting.map_names import state_title
 
 T = TypeVar("T")
 WIDTH_PX = 200
@@ -26,10 +26,10 @@ SHOWN_HISTOGRAM_FRACTION = 0.75
 
 def is_microrelief(appearance: SkinAppearance) -> bool:
     """Return whether an appearance holds states of stretched skin."""
-    return bool(evaluation.states_of(appearance))
+    return bool(evaluation.find_states(appearance))
 
 
-def section(subject: page.Subject) -> Iterator[page.Block]:
+def section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
     """Yield the states of stretched skin, their histograms, kernels and errors.
 
     Parameters
@@ -47,17 +47,17 @@ def section(subject: page.Subject) -> Iterator[page.Block]:
 
 
 def _images(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator[page.Block]:
-    states = evaluation.states_of(appearance)
+    states = evaluation.find_states(appearance)
     order = sorted(states, key=_by_step)
     first = "a000_n0" if "a000_n0" in states else order[0]
     yield from _beside_truth(first, appearance, truth)
     one = [state for state in order if state[:4] == first[:4]]
-    chosen = _spread_over(one)
+    chosen = _select_states(one)
     series = []
     for kind in ("normals", "height"):
         maps = {state: appearance.maps.get(f"{kind}_{state}") for state in chosen}
         row = [
-            _shown(f"{kind}, {state_words(state)}", skin_map, appearance)
+            _map_image(f"{kind}, {state_title(state)}", skin_map, appearance)
             for state, skin_map in maps.items()
             if skin_map is not None
         ]
@@ -74,13 +74,13 @@ def _beside_truth(
     """Yield truth | estimate | error | standard error of one state's normals and height."""
     normals = appearance.maps.get(f"normals_{state}")
     true = None if truth is None else truth.maps.get(f"normals_{state}")
-    words = f"normals, {state_words(state)}"
+    words = f"normals, {state_title(state)}"
     if normals is not None:
-        parts = [_of(words, normals).normals("estimate", normals.values)]
+        parts = [_scalar_image(words, normals).normals("estimate", normals.values)]
         if true is not None:
             good = normals.mask & true.mask
             error = np.degrees(metrics.angular_error_rad(normals.values, true.values))
-            parts.insert(0, _of(words, true).normals("truth", true.values))
+            parts.insert(0, _scalar_image(words, true).normals("truth", true.values))
             parts.append(_angle_image("error", np.nan_to_num(error), good, words))
         if normals.stderr is not None:
             spread = np.degrees(normals.stderr[..., 0])
@@ -90,7 +90,7 @@ def _beside_truth(
     height = appearance.maps.get(f"height_{state}")
     if height is not None:
         yield from map_images.map_panel(
-            f"height, {state_words(state)}",
+            f"height, {state_title(state)}",
             "um",
             estimate=height.values,
             standard_error=height.stderr,
@@ -99,25 +99,25 @@ def _beside_truth(
         )
 
 
-def _shown(title: str, skin_map: SkinMap, appearance: SkinAppearance) -> page.Image:
+def _map_image(title: str, skin_map: SkinMap, appearance: SkinAppearance) -> page.Image:
     if skin_map.values.ndim == 3:
-        return _of("", skin_map, WIDTH_PX).normals(title, skin_map.values)
+        return _scalar_image("", skin_map, WIDTH_PX).normals(title, skin_map.values)
     heights = [m.values[m.mask] for k, m in appearance.maps.items() if k.startswith("height_a")]
     reach = float(np.percentile(np.abs(np.concatenate(heights)), 99)) if heights else 1.0
     drawing = map_images.MapDrawing("", "um", skin_map.mask, WIDTH_PX)
-    return drawing.signed(title, skin_map.values, reach)
+    return drawing.draw_signed(title, skin_map.values, reach)
 
 
-def _of(words: str, skin_map: SkinMap, width: int = 280) -> map_images.MapDrawing:
+def _scalar_image(words: str, skin_map: SkinMap, width: int = 280) -> map_images.MapDrawing:
     return map_images.MapDrawing(words, "", skin_map.mask, width)
 
 
 def _angle_image(title: str, degrees: FloatArray, valid: BoolArray, words: str) -> page.Image:
     drawing = map_images.MapDrawing(words, "°", valid)
-    return drawing.size(title, degrees, map_images.reach_of(degrees, valid, 98))
+    return drawing.size(title, degrees, map_images.percentile_reach(degrees, valid, 98))
 
 
-def _relief_errors(subject: page.Subject) -> Iterator[page.Block]:
+def _relief_errors(subject: page.ReportedAppearance) -> Iterator[page.Block]:
     truth = subject.truth
     if truth is None:
         return
@@ -126,45 +126,45 @@ def _relief_errors(subject: page.Subject) -> Iterator[page.Block]:
         return
     neutral = [row for row in rows if row.state.endswith("_n0")]
     where, worst_got = "", math.nan
-    if worst := page.worst_of(rows, lambda row: row.mean_deg):
-        where, worst_got = f"{state_words(worst.state)}: {worst.mean_deg:.3g}°", worst.mean_deg
+    if worst := page.find_worst(rows, lambda row: row.mean_deg):
+        where, worst_got = f"{state_title(worst.state)}: {worst.mean_deg:.3g}°", worst.mean_deg
     for row in neutral:
         subject.check(
             "specular normals at the lens's resolution, mean error",
             row.mean_deg,
             evaluation.MAX_NORMAL_ERROR_DEG,
             "°",
-            state_words(row.state),
+            state_title(row.state),
             masked=row.masked,
             coverage=row.coverage,
             worst=where,
             worst_got=worst_got,
         )
-    limit, skin = 100 * evaluation.MAX_HEIGHT_ERROR, page.one_skin(truth.parameters)
+    limit, skin = 100 * evaluation.MAX_HEIGHT_ERROR, page.single_subject_note(truth.parameters)
     yield page.view("relief_errors", states=rows, limit=limit, skin=skin)
 
 
-def _strain(subject: page.Subject) -> Iterator[page.Block]:
+def _strain(subject: page.ReportedAppearance) -> Iterator[page.Block]:
     appearance, truth = subject.appearance, subject.truth
-    document = document_of(appearance, STRAIN_FILE)
+    document = read_document(appearance, STRAIN_FILE)
     if document is None:
         return
     errors = [] if truth is None else evaluation.compare_stretch(appearance, truth)
     true = {row.state: row.truth for row in errors}
     if errors:
         worst = max(errors, key=lambda row: abs(row.error))
-        got, where = abs(worst.error), state_words(worst.state)
+        got, where = abs(worst.error), state_title(worst.state)
         text = "stretch of the skin, largest error"
         subject.check(text, got, evaluation.MAX_STRAIN_ERROR, worst=where)
     yield page.view("strain", states=document["states"], truths=true, degrees=math.degrees)
 
 
 def _histograms(appearance: SkinAppearance) -> Iterator[page.Block]:
-    document = document_of(appearance, HISTOGRAM_FILE)
+    document = read_document(appearance, HISTOGRAM_FILE)
     if document is None:
         return
     states = sorted(document["states"], key=lambda state: _by_step(state["name"]))
-    chosen = _spread_over(states)
+    chosen = _select_states(states)
     counts = [np.asarray(state["counts"], float) for state in chosen]
     top = max((float(np.sqrt(count).max()) for count in counts), default=1.0)
     panels = []
@@ -174,8 +174,8 @@ def _histograms(appearance: SkinAppearance) -> Iterator[page.Block]:
         # rows hold n across the jaws from -1: the page shows + at the top
         shown = np.sqrt(count)[::-1][cut : side - cut, cut : side - cut]
         drawing = map_images.MapDrawing("histogram of normals", width=WIDTH_PX)
-        panels.append(drawing.size(state_words(state["name"]), shown, top))
-    aliased = [state_words(state["name"]) for state in states if state["aliased"]]
+        panels.append(drawing.size(state_title(state["name"]), shown, top))
+    aliased = [state_title(state["name"]) for state in states if state["aliased"]]
     yield page.Heading("Histograms of normals, root of share")
     yield page.note("Along the jaws to the right, across them up.")
     yield page.Images(panels, small=True)
@@ -187,11 +187,11 @@ def _histograms(appearance: SkinAppearance) -> Iterator[page.Block]:
 
 
 def _variances(appearance: SkinAppearance) -> Iterator[page.Block]:
-    by_angle = evaluation.variances(appearance)
+    by_angle = evaluation.normal_variances(appearance)
     if not by_angle:
         return
     series = [
-        figures.Curve(
+        figures.PlotSeries(
             f"jaws at {angle:.0f}°",
             [row[0] for row in rows],
             [row[2] for row in rows],
@@ -205,7 +205,7 @@ def _variances(appearance: SkinAppearance) -> Iterator[page.Block]:
     yield page.Plots([plot])
 
 
-def _spread_over(states: Sequence[T]) -> list[T]:
+def _select_states(states: Sequence[T]) -> list[T]:
     """Return at most `MAX_SHOWN_STATES` of some states, evenly."""
     count = min(MAX_SHOWN_STATES, len(states))
     return [states[round(k)] for k in np.linspace(0, len(states) - 1, count)]
@@ -216,7 +216,7 @@ def _by_step(state: str) -> tuple[str, int]:
     return angle, int(step[1:]) * (-1 if step[0] == "m" else 1)
 
 
-def kernels(subject: page.Subject) -> Iterator[page.Block]:
+def kernels(subject: page.ReportedAppearance) -> Iterator[page.Block]:
     """Yield kernels by state and direction, and judge the distances that they leave.
 
     Parameters
@@ -224,18 +224,18 @@ def kernels(subject: page.Subject) -> Iterator[page.Block]:
     subject
         With the kernel document; without it nothing is returned.
     """
-    document = document_of(subject.appearance, KERNEL_FILE)
+    document = read_document(subject.appearance, KERNEL_FILE)
     if document is None or not document["fits"]:
         return
     fits: Sequence[Mapping[str, Any]] = sorted(document["fits"], key=lambda fit: fit["stretch_s"])
-    judged = [fit for fit in fits if fit["valid"] and _tells(fit)]
+    judged = [fit for fit in fits if fit["valid"] and _is_significant(fit)]
     if judged:
         worst = max(judged, key=lambda fit: fit["distance"] / fit["distance_before"])
         got = worst["distance"] / worst["distance_before"]
-        where = state_words(worst["name"])
+        where = state_title(worst["name"])
         text = "histogram distance after the kernel over that before, worst state"
         subject.check(text, got, evaluation.MAX_HISTOGRAM_DISTANCE, worst=where)
-    untold = [state_words(fit["name"]) for fit in fits if fit["valid"] and not _tells(fit)]
+    untold = [state_title(fit["name"]) for fit in fits if fit["valid"] and not _is_significant(fit)]
     yield page.view("kernels", fits=fits, untold=untold)
     yield page.Plots(_kernel_plots(fits, document.get("tables", [])))
     if direction := document.get("direction"):
@@ -255,24 +255,24 @@ def _kernel_plots(
         for fit in fits:
             if fit["valid"]:
                 points.setdefault(fit["angle_deg"], []).append(
-                    (fit["stretch_s"], number(fit[key]), number(fit[error]))
+                    (fit["stretch_s"], parse_number(fit[key]), parse_number(fit[error]))
                 )
         series = []
         for angle, rows in points.items():
             stretch, values, errors = (list(column) for column in zip(*rows, strict=True))
             name = f"jaws at {angle:.0f}°"
-            series.append(figures.Curve(name, stretch, values, errors, line=False))
+            series.append(figures.PlotSeries(name, stretch, values, errors, line=False))
         for table in tables:
             line = table["lines"]
-            drawn = [number(v) for v in line[key]]
+            drawn = [parse_number(v) for v in line[key]]
             series.append(
-                figures.Curve(f"lines, {table['name']}", line["stretch"], drawn, marks=False)
+                figures.PlotSeries(f"lines, {table['name']}", line["stretch"], drawn, marks=False)
             )
         if series:
             plots.append(figures.curves(title, "stretch ratio r of the skin", title, series))
     return plots
 
 
-def _tells(fit: Mapping[str, Any]) -> bool:
+def _is_significant(fit: Mapping[str, Any]) -> bool:
     """Return whether a strain changes the histogram by more than twice what chance does."""
-    return number(fit["distance_before"]) > 2.0 * number(fit["noise_floor"])
+    return parse_number(fit["distance_before"]) > 2.0 * parse_number(fit["noise_floor"])

@@ -9,7 +9,7 @@ import numpy as np
 from model.skin import SkinAppearance
 from reconstruction.pipeline.flash.sequence import CURVES_FILE
 from skinrig.drawing import figures
-from skinrig.evaluating.subsurface import number
+from skinrig.evaluating.subsurface import parse_number
 from skinrig.reporting import page
 
 PLACE_COLORS = ("#2a78b8", "#d1602b", "#3f8f4f", "#8153a8", "#b8912a", "#555555")
@@ -36,18 +36,18 @@ def section(appearance: SkinAppearance) -> Iterator[page.Block]:
     yield page.view("sequence", told=told, seen=_words)
 
 
-def _curves(told: Mapping[str, Any], cycle_s: float | None) -> page.Plots:
+def _curves(document: Mapping[str, Any], cycle_s: float | None) -> page.Plots:
     key, axis = ("phase_s", "phase, s") if cycle_s is not None else ("time_s", "time, s")
-    when = np.array([number(frame[key]) for frame in told["frames"]])
+    when = np.array([parse_number(frame[key]) for frame in document["frames"]])
     order = np.argsort(when)
     curves = []
-    for index, (place, one) in enumerate(told["curves"].items()):
-        values = 100.0 * np.array([number(v) for v in one["hemoglobin"]])
-        errors = 100.0 * np.array([number(v) for v in one["stderr"]])
+    for index, (place, one) in enumerate(document["curves"].items()):
+        values = 100.0 * np.array([parse_number(v) for v in one["hemoglobin"]])
+        errors = 100.0 * np.array([parse_number(v) for v in one["stderr"]])
         color, line = PLACE_COLORS[index % len(PLACE_COLORS)], cycle_s is None
         points = when[order], values[order], errors[order]
-        curves.append(figures.Curve(place, *points, line=line, color=color))
-    title = f"blood in {told['state']}"
+        curves.append(figures.PlotSeries(place, *points, line=line, color=color))
+    title = f"blood in {document['state']}"
     return page.Plots([figures.curves(title, axis, "blood, % of the dermis' volume", curves)])
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from skinrig.reporting import page
-from skinrig.simulating.leaving_out import may_be_left_out
+from skinrig.simulating.effect_omission import is_omittable
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class SessionFacts:
         return self.rig, self.day.isoformat(), self.source, seed, self.frames, self.megabytes
 
 
-def facts_of(folders: Sequence[Path]) -> dict[str, SessionFacts]:
+def read_session_facts(folders: Sequence[Path]) -> dict[str, SessionFacts]:
     """Return what sessions say of themselves, by folder name."""
     found = {}
     for folder in folders:
@@ -70,7 +70,7 @@ VERDICT_WORDS = {
 SESSION_FILE = "session.json"
 
 
-def effects_of(session: Path) -> list[Mapping[str, Any]]:
+def read_effects(session: Path) -> list[Mapping[str, Any]]:
     """Return the effects that a session's manifest holds; none where it was measured.
 
     Parameters
@@ -101,7 +101,7 @@ def omissions(sessions: Sequence[Path]) -> Iterator[page.Block]:
     """
     alike: dict[str, list[str]] = {}
     for session in sorted(sessions):
-        found = effects_of(session)
+        found = read_effects(session)
         if found:
             alike.setdefault(json.dumps(found, sort_keys=True), []).append(session.name)
     if not alike:
@@ -127,5 +127,5 @@ def _effect_row(effect: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
         VERDICT_WORDS.get(str(effect["verdict"]), str(effect["verdict"])),
         str(effect["reason"]),
         "" if over is None else f"{over:.3g}",
-        switch if may_be_left_out(switch) else "",
+        switch if is_omittable(switch) else "",
     )

@@ -24,7 +24,7 @@ from reconstruction.pipeline.probe.stages import (
 )
 from skinrig.drawing import figures
 from skinrig.evaluating import subsurface as evaluation
-from skinrig.evaluating.subsurface import document_of, number, numbers
+from skinrig.evaluating.subsurface import parse_number, parse_numbers, read_document
 from skinrig.reporting import map_images, page
 
 WIDTH_PX = 200
@@ -41,7 +41,7 @@ def is_probe(appearance: SkinAppearance) -> bool:
     return PROFILE_FILE in appearance.files or SUBSURFACE_FILE in appearance.files
 
 
-def section(subject: page.Subject) -> Iterator[page.Block]:
+def section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
     """Yield profiles with fits and residuals, sigma_tr by method, and their errors.
 
     Parameters
@@ -54,36 +54,38 @@ def section(subject: page.Subject) -> Iterator[page.Block]:
     yield from _plots(appearance)
     yield from _fits(appearance, subject.truth)
     yield from _errors(subject)
-    anisotropy = evaluation.document_of(appearance, ANISOTROPY_FILE)
+    anisotropy = evaluation.read_document(appearance, ANISOTROPY_FILE)
     if anisotropy is not None and anisotropy["sites"]:
         yield page.view("anisotropy", sites=anisotropy["sites"])
-    fitted = evaluation.document_of(appearance, SUBSURFACE_FILE)
+    fitted = evaluation.read_document(appearance, SUBSURFACE_FILE)
     if fitted is not None and fitted.get("sites"):
         yield page.view("sites", sites=fitted["sites"])
     yield from _map(appearance)
 
 
 def _plots(appearance: SkinAppearance) -> Iterator[page.Block]:
-    measured = evaluation.document_of(appearance, PROFILE_FILE)
-    fitted = evaluation.document_of(appearance, SUBSURFACE_FILE)
+    measured = evaluation.read_document(appearance, PROFILE_FILE)
+    fitted = evaluation.read_document(appearance, SUBSURFACE_FILE)
     if measured is None:
         return
     by_name = {} if fitted is None else {entry["name"]: entry for entry in fitted["measurements"]}
     radius = measured["radius_mm"]
     plots = []
-    for entry in _one_of_each_site(measured["measurements"])[:MAX_PLOTTED_MEASUREMENTS]:
+    for entry in _first_per_site(measured["measurements"])[:MAX_PLOTTED_MEASUREMENTS]:
         found = by_name.get(entry["name"])
         series = []
         for channel in CHANNEL_NAMES:
             one, color = entry["channels"][channel], CHANNEL_COLORS[channel]
-            value, stderr = numbers(one["reflectance_per_mm2"]), numbers(one["stderr"])
+            value, stderr = parse_numbers(one["reflectance_per_mm2"]), parse_numbers(one["stderr"])
             value = np.where(np.asarray(one["valid"], bool), value, np.nan)
             name = f"{channel}, measured"
-            series.append(figures.Curve(name, radius, value, stderr, line=False, color=color))
+            series.append(figures.PlotSeries(name, radius, value, stderr, line=False, color=color))
             for fit in [] if found is None else found["fits"]:
                 if fit["channel"] == channel and fit["method"] == evaluation.RECOMMENDED_METHOD:
-                    predicted, name = numbers(fit["predicted_per_mm2"]), f"{channel}, fit"
-                    series.append(figures.Curve(name, radius, predicted, marks=False, color=color))
+                    predicted, name = parse_numbers(fit["predicted_per_mm2"]), f"{channel}, fit"
+                    series.append(
+                        figures.PlotSeries(name, radius, predicted, marks=False, color=color)
+                    )
         title = f"{_words(entry)}: profile and photon-table fit"
         axes = "distance from the source, mm", "reflectance, 1/mm²"
         plots.append(figures.curves(title, *axes, series, log_y=True))
@@ -98,14 +100,16 @@ def _residuals(
     """Draw what each method leaves of the green channel, in percent of the reading."""
     channel = "green"
     one = entry["channels"][channel]
-    value, stderr = numbers(one["reflectance_per_mm2"]), numbers(one["stderr"])
+    value, stderr = parse_numbers(one["reflectance_per_mm2"]), parse_numbers(one["stderr"])
     told = np.asarray(one["valid"], bool) & (value > evaluation.MIN_SIGNAL_TO_NOISE * stderr)
     series = []
     for fit in [] if found is None else found["fits"]:
         if fit["channel"] == channel and fit["valid"]:
-            left = 100.0 * np.where(told, value / numbers(fit["predicted_per_mm2"]) - 1.0, np.nan)
+            left = 100.0 * np.where(
+                told, value / parse_numbers(fit["predicted_per_mm2"]) - 1.0, np.nan
+            )
             spread = 100.0 * stderr / np.where(told, value, np.nan)
-            series.append(figures.Curve(METHOD_NAMES[fit["method"]], radius, left, spread))
+            series.append(figures.PlotSeries(METHOD_NAMES[fit["method"]], radius, left, spread))
     if not series:
         return []
     title = f"{_words(entry)}, {channel}: measured less fitted"
@@ -113,7 +117,7 @@ def _residuals(
 
 
 def _fits(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator[page.Block]:
-    fitted = evaluation.document_of(appearance, SUBSURFACE_FILE)
+    fitted = evaluation.read_document(appearance, SUBSURFACE_FILE)
     if fitted is None:
         return
     true = {
@@ -129,14 +133,14 @@ def _fits(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator[
     yield page.view("fits", fits=fits, truths=true, methods=METHOD_NAMES)
 
 
-def _errors(subject: page.Subject) -> Iterator[page.Block]:
+def _errors(subject: page.ReportedAppearance) -> Iterator[page.Block]:
     appearance, truth = subject.appearance, subject.truth
     if truth is None:
         return
     rows = evaluation.compare_fits(appearance, truth)
-    yield page.one_skin(truth.parameters)
+    yield page.single_subject_note(truth.parameters)
     for kind in dict.fromkeys(row.kind for row in rows):
-        found = evaluation.by_method([row for row in rows if row.kind == kind])
+        found = evaluation.summarize_methods([row for row in rows if row.kind == kind])
         yield page.Heading(f"Error of sigma_tr against the truth, {kind} tissue")
         yield page.view("methods", errors=found, methods=METHOD_NAMES, kind=kind)
         yield from _by_channel([row for row in rows if row.kind == kind])
@@ -146,12 +150,12 @@ def _errors(subject: page.Subject) -> Iterator[page.Block]:
                 ("median", best.median, evaluation.MAX_MEDIAN_ERROR),
                 ("worst", best.worst, evaluation.MAX_WORST_ERROR),
             ):
-                subject.check_share(f"sigma_tr, {word} error", got, bound)
+                subject.check_fraction(f"sigma_tr, {word} error", got, bound)
     if profiles := evaluation.compare_profiles(appearance, truth):
         yield page.view("profiles", errors=profiles, measurement=_words_of_name)
 
 
-def _by_channel(rows: Sequence[evaluation.FitError]) -> Iterator[page.Block]:
+def _by_channel(rows: Sequence[evaluation.FitAccuracy]) -> Iterator[page.Block]:
     labels = [f"{name}, {c}" for name in dict.fromkeys(r.name for r in rows) for c in CHANNEL_NAMES]
     if len(labels) > 4 * len(CHANNEL_NAMES):
         return
@@ -177,7 +181,7 @@ def _map(appearance: SkinAppearance) -> Iterator[page.Block]:
         if not inside.size:
             continue
         low, high = float(inside.min()), float(inside.max())
-        images.append(drawing.scalar(f"translucency, {channel}", values, low, high))
+        images.append(drawing.draw_scalar(f"translucency, {channel}", values, low, high))
         if found.stderr is not None:
             spread = found.stderr[..., c]
             images.append(drawing.size("standard error", spread, float(spread.max())))
@@ -189,7 +193,7 @@ def _map(appearance: SkinAppearance) -> Iterator[page.Block]:
     yield page.Images(images)
 
 
-def _one_of_each_site(measurements: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+def _first_per_site(measurements: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     first: dict[str, Mapping[str, Any]] = {}
     for entry in measurements:
         first.setdefault(entry["site"], entry)
@@ -251,7 +255,7 @@ def over_people(
     people = {
         name: fits
         for name, appearance in appearances.items()
-        if (fits := document_of(appearance, SUBSURFACE_FILE)) is not None
+        if (fits := read_document(appearance, SUBSURFACE_FILE)) is not None
         and not _is_medium(appearance, truths or {})
     }
     if not people:
@@ -320,8 +324,8 @@ def _measured(name: str, fits: Mapping[str, Any]) -> list[SiteMeasurement]:
         SiteMeasurement(
             name,
             site,
-            tuple(number(entry["sigma_tr_per_mm"]) for entry in own),
-            tuple(number(entry["sigma_tr_stderr"]) for entry in own),
+            tuple(parse_number(entry["sigma_tr_per_mm"]) for entry in own),
+            tuple(parse_number(entry["sigma_tr_stderr"]) for entry in own),
         )
         for site, own in by_site.items()
         if all(entry["sigma_tr_stderr"] is not None for entry in own)

@@ -13,8 +13,8 @@ from skinrig.evaluating import reflection
 from skinrig.evaluating import surface as evaluation
 from skinrig.evaluating.surface import Banded, errors_by_band
 from skinrig.reporting import map_images, page
-from skinrig.reporting.map_names import heading, words
-from skinrig.written_units import unit_sign
+from skinrig.reporting.map_names import map_heading, map_title
+from skinrig.unit_format import format_unit
 
 SMALL_WIDTH_PX = 110
 """Of earlier normals, lobes, samples and residuals: every second pixel of the others."""
@@ -26,7 +26,7 @@ RELATIVE_ERROR_MAPS = ("r_d",)
 FIRST_MAPS = ("r_d", "normals_refined", "normals", "half_vector_normals")
 
 
-def section(subject: page.Subject) -> Iterator[page.Block]:
+def section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
     """Yield the maps of an appearance on a mesh, beside their truth where there is one.
 
     Parameters
@@ -46,7 +46,7 @@ def section(subject: page.Subject) -> Iterator[page.Block]:
     view = FrontView.of(points, box)
     true_view, known = None, np.zeros(0, np.intp)
     if truth is not None:
-        pairs = evaluation.match(appearance, truth)
+        pairs = evaluation.match_texels(appearance, truth)
         true_place = truth.maps["position"]
         usable = true_place.mask
         if "mask" in truth.maps:
@@ -74,16 +74,16 @@ def section(subject: page.Subject) -> Iterator[page.Block]:
             if true_name not in shown_truths:  # of all estimates of normals there is one truth
                 flat = truth.maps[true_name].values
                 flat = flat.reshape(-1, *flat.shape[2:])[known]
-                figures.append(_shown("truth", key, *true_view.picture(flat), width=width))
+                figures.append(_shown("truth", key, *true_view.rasterize(flat), width=width))
                 shown_truths.add(true_name)
-        figures.append(_shown("estimate", key, *view.picture(values, valid=good), width=width))
+        figures.append(_shown("estimate", key, *view.rasterize(values, valid=good), width=width))
         if truth is not None and known_truth:
             figures.append(_error(key, (appearance, truth), pairs, box, width))
         if skin_map.stderr is not None:
             stderr = skin_map.stderr[rows, columns]
-            figures.append(_spread(key, skin_map, stderr, view, (rows, columns), width))
+            figures.append(_stderr_image(key, skin_map, stderr, view, (rows, columns), width))
         if key in FIRST_MAPS:
-            yield page.Heading(heading(key))
+            yield page.Heading(map_heading(key))
             yield page.Images(figures, small=key not in large)
         else:
             minor += figures
@@ -102,7 +102,7 @@ def _shown(
     if image.ndim == 2:
         inside = image[valid & np.isfinite(image)]
         low, high = np.percentile(inside, [1, 99]) if inside.size else (0.0, 1.0)
-        return drawing.scalar(_title(title, key), image, low, high)
+        return drawing.draw_scalar(_title(title, key), image, low, high)
     if "normals" in key:
         return drawing.normals(title, image)
     return map_images.color_image(
@@ -112,51 +112,53 @@ def _shown(
 
 def _title(title: str, key: str) -> str:
     """Return what stands below a picture: of maps that share a heading, which one it is."""
-    return title if key in FIRST_MAPS else f"{words(key)}, {title}"
+    return title if key in FIRST_MAPS else f"{map_title(key)}, {title}"
 
 
 def _error(
     key: str,
     both: tuple[SkinAppearance, SkinAppearance],
-    pairs: evaluation.Match,
+    pairs: evaluation.TexelMatch,
     box: Box,
     width: int,
 ) -> page.Image:
-    error = evaluation.errors_at(key, *both, pairs)
+    error = evaluation.matched_errors(key, *both, pairs)
     points = both[0].maps["position"].values[pairs.rows, pairs.columns].astype(np.float64)
     good = np.isfinite(error)
-    image, valid = FrontView.of(points, box).picture(np.nan_to_num(error), valid=good)
-    reach = map_images.reach_of(error, good, 95)
+    image, valid = FrontView.of(points, box).rasterize(np.nan_to_num(error), valid=good)
+    reach = map_images.percentile_reach(error, good, 95)
     if key in evaluation.NORMAL_MAPS:
         return map_images.MapDrawing(key, "°", valid, width).size("error", image, reach)
-    return map_images.MapDrawing(key, "%", valid, width).signed("estimate − truth", image, reach)
+    return map_images.MapDrawing(key, "%", valid, width).draw_signed(
+        "estimate − truth", image, reach
+    )
 
 
-def _spread(
+def _stderr_image(
     key: str,
     skin_map: SkinMap,
     stderr: FloatArray,
     view: FrontView,
-    at: tuple[Index, Index],
+    texels: tuple[Index, Index],
     width: int,
 ) -> page.Image:
     unit = page.short_unit(skin_map.unit)
-    good = skin_map.mask[at]
+    good = skin_map.mask[texels]
     if key in RELATIVE_ERROR_MAPS:  # as errors are told, beside which it stands
-        size = np.abs(skin_map.values[at].astype(np.float64))
+        size = np.abs(skin_map.values[texels].astype(np.float64))
         good = good & (size > 0.0).reshape(len(good), -1).all(axis=-1)
         stderr, unit = 100.0 * stderr / np.where(size > 0.0, size, 1.0), "%"
     if stderr.ndim == 2:
         stderr = stderr.mean(axis=-1)
     if key in evaluation.NORMAL_MAPS:
         stderr, unit = np.degrees(stderr), "°"
-    image, valid = view.picture(stderr, valid=good)
-    reach = map_images.reach_of(image, valid, 98)
+    image, valid = view.rasterize(stderr, valid=good)
+    reach = map_images.percentile_reach(image, valid, 98)
     drawing = map_images.MapDrawing(key, unit, valid, width)
     return drawing.size(_title("standard error", key), image, reach)
 
 
-def _errors(subject: page.Subject, truth: SkinAppearance) -> Iterator[page.Block]:
+def _errors(subject: page.ReportedAppearance, truth: SkinAppearance) -> Iterator[page.Block]:
     appearance = subject.appearance
     found = evaluation.compare(appearance, truth, rng=np.random.default_rng(0))
     banded = errors_by_band(appearance, truth)
@@ -168,15 +170,15 @@ def _errors(subject: page.Subject, truth: SkinAppearance) -> Iterator[page.Block
             continue  # the published baseline, shown beside ours and held to nothing
         if row.unit == "deg" and coarse:
             continue
-        what, got, bound = row.judged
-        unit = unit_sign(row.unit)
+        what, got, bound = row.limit_check
+        unit = format_unit(row.unit)
         where, worst_got = _worst(row.name, banded)
         told: dict[str, Any] = {
             "masked": row.masked,
-            "coverage": row.coverage.share,
+            "coverage": row.coverage.fraction,
             "worst": where,
         }
-        name = f"{words(row.name)}, {what}"
+        name = f"{map_title(row.name)}, {what}"
         subject.check(name, got, bound, unit, worst_got=worst_got, **told)
     bounds = evaluation.MAX_NORMAL_ERROR_DEG, evaluation.MAX_EVALUATED_PIXEL_MM
     pixel = pixel_mm if coarse else None
@@ -186,18 +188,18 @@ def _errors(subject: page.Subject, truth: SkinAppearance) -> Iterator[page.Block
 def _worst(name: str, banded: list[Banded]) -> tuple[str, float]:
     """Return the skin color of the largest error and that error, where there are several."""
     own = [row for row in banded if row[0] == name.split()[0]]
-    worst = page.worst_of(own, lambda row: row[5])
+    worst = page.find_worst(own, lambda row: row[5])
     if worst is None:
         return "", float("nan")
     return f"{worst[2]} skin: {worst[5]:.3g} {worst[1]}", worst[5]
 
 
-def _reflection(subject: page.Subject, truth: SkinAppearance) -> Iterator[page.Block]:
+def _reflection(subject: page.ReportedAppearance, truth: SkinAppearance) -> Iterator[page.Block]:
     """Compare the fitted reflection with the true one, in held-out directions and on spheres."""
     held_out = reflection.compare(subject.appearance, truth, rng=np.random.default_rng(0))
     if held_out is None:
         return
-    subject.check_share(
+    subject.check_fraction(
         "reflection in held-out directions, median error",
         held_out.median,
         reflection.MAX_HELD_OUT_ERROR,
@@ -205,7 +207,7 @@ def _reflection(subject: page.Subject, truth: SkinAppearance) -> Iterator[page.B
     )
     yield page.view("reflection", found=held_out)
     figures = []
-    for site, true_image, image in reflection.spheres(subject.appearance, truth):
+    for site, true_image, image in reflection.render_spheres(subject.appearance, truth):
         bright = float(np.percentile(true_image.max(axis=-1), 99.5)) or 1.0
         figures.append(map_images.color_image(f"{site}: truth", true_image / bright))
         if image is not None:

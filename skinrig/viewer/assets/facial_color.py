@@ -19,11 +19,11 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.perfusion import STATE_NAMES
 from skinrig.appearances.contents import digest as sha256_of
-from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
+from skinrig.appearances.dynamic import FACIAL_COLOR, describe_parts
 from skinrig.arrays import Float64Array
-from skinrig.viewer.assets.placed_color import RIG_PX, FaceColor, placed
+from skinrig.viewer.assets.placed_color import RIG_PX, FaceColor, place_facial_color
 from skinrig.viewer.fine_skin import FineSkin
-from skinrig.viewer.map_filling import filled, halved
+from skinrig.viewer.map_filling import downsample, fill_holes
 from skinrig.viewer.scene import Assets, SceneSource, Texture
 
 COLOR_KIND: Final = "color"
@@ -52,7 +52,7 @@ class CameraColor:
     known: bool = True
 
 
-def camera_color_of(source: SceneSource) -> CameraColor:
+def find_camera_color(source: SceneSource) -> CameraColor:
     """Return the color of the camera that measured a scene's albedo.
 
     Raises
@@ -62,10 +62,10 @@ def camera_color_of(source: SceneSource) -> CameraColor:
     """
     kind = next(name for name in ("model", "dome") if name in source.appearances)
     appearance, path = source.appearances[kind], source.paths.get(kind)
-    folder = source.calibration or (None if path is None else _beside(appearance, path))
+    folder = source.calibration or (None if path is None else _find_calibration(appearance, path))
     if folder is not None:
-        return _calibrated(folder)
-    found = None if path is None else _tabulated(appearance, path)
+        return _calibrated_color(folder)
+    found = None if path is None else _tabulated_color(appearance, path)
     shown = (
         "its camera RGB is shown as if it were linear sRGB; --calibration names a folder with a "
         "color calibration"
@@ -73,7 +73,7 @@ def camera_color_of(source: SceneSource) -> CameraColor:
     return found or CameraColor(lambda rgb: rgb, shown, known=False)
 
 
-def _beside(appearance: SkinAppearance, path: Path) -> Path | None:
+def _find_calibration(appearance: SkinAppearance, path: Path) -> Path | None:
     """Return the calibration that an appearance was made with, if it lies beside and has color."""
     digests = {
         name.removeprefix(CALIBRATION_INPUT_PREFIX): digest
@@ -90,7 +90,7 @@ def _beside(appearance: SkinAppearance, path: Path) -> Path | None:
     return None
 
 
-def _calibrated(folder: Path) -> CameraColor:
+def _calibrated_color(folder: Path) -> CameraColor:
 
     found = store.load(folder, COLOR_KIND)
     cameras = [
@@ -109,7 +109,7 @@ def _calibrated(folder: Path) -> CameraColor:
     return CameraColor(convert, f"{folder.name}/{COLOR_KIND}.json{several}, {quality}")
 
 
-def _tabulated(appearance: SkinAppearance, path: Path) -> CameraColor | None:
+def _tabulated_color(appearance: SkinAppearance, path: Path) -> CameraColor | None:
     """Return a matrix between colors of skin, where a session beside names sensor and light."""
     name: Any = appearance.parameters.get("session")
     if not isinstance(name, str):
@@ -191,12 +191,14 @@ def assets(source: SceneSource) -> Assets:
 def _face(source: SceneSource, *, measured: bool) -> FaceColor:
     """Return the chromophores; beside a measured albedo, coarse: only their changes show."""
     subject, dynamic = source.subject, source.appearances.get("dynamic")
-    if dynamic is not None and FACIAL_COLOR in parts_of(dynamic):
-        return placed(source)
-    return simulated(subject, FineSkin(subject, subject.size) if measured else source.skin)
+    if dynamic is not None and FACIAL_COLOR in describe_parts(dynamic):
+        return place_facial_color(source)
+    return simulate_chromophores(
+        subject, FineSkin(subject, subject.size) if measured else source.skin
+    )
 
 
-def simulated(person: SimulatedSubject, skin: FineSkin) -> FaceColor:
+def simulate_chromophores(person: SimulatedSubject, skin: FineSkin) -> FaceColor:
     """Return the chromophores of a simulated person, with a rig of all of its states."""
     rig = HemoglobinRig.from_maps(
         person.hemoglobin(),
@@ -218,7 +220,7 @@ def _stored_states(rig: HemoglobinRig) -> dict[str, Float64Array]:
     """Return a rig's scale and bias maps by state, (h, w, 2), filled where they are not valid."""
     valid = {NEUTRAL: rig.neutral_mean_valid, **{name: m.valid for name, m in rig.states.items()}}
     return {
-        name: filled(np.stack([rig.scale[name], rig.bias[name]], axis=-1), valid[name])
+        name: fill_holes(np.stack([rig.scale[name], rig.bias[name]], axis=-1), valid[name])
         for name in (NEUTRAL, *rig.states)
     }
 
@@ -229,8 +231,8 @@ def _albedo(source: SceneSource) -> tuple[Texture, CameraColor] | None:
         if ALBEDO_MAP not in appearance.maps:
             continue
         found = appearance.maps[ALBEDO_MAP]
-        values = filled(found.values, found.mask)
-        seen = camera_color_of(source)
-        shown = np.clip(seen.convert(halved(values, source.size)), 0.0, 1.0)
+        values = fill_holes(found.values, found.mask)
+        seen = find_camera_color(source)
+        shown = np.clip(seen.convert(downsample(values, source.size)), 0.0, 1.0)
         return Texture(shown.astype(np.float32), "u8"), seen
     return None

@@ -27,7 +27,7 @@ from skinrig.editing import albedo as editing_albedo
 from skinrig.editing import masks
 from skinrig.traits import regions
 from skinrig.viewer.assets import reflectance as reflectance_assets
-from skinrig.viewer.assets.reflectance import LOBES_PER_LOOKUP, PageLobes, filled
+from skinrig.viewer.assets.reflectance import LOBES_PER_LOOKUP, PageLobes, fill_texels
 from skinrig.viewer.scene import Assets, SceneSource, Texture
 
 DESCENT_SWEEPS: Final = 96
@@ -57,8 +57,8 @@ class LobeTraits:
     misfit : mapping of str to float
         Share of each trait's vector that the lobes cannot show.
     held_error : mapping of str to (float, float)
-        RMS length by which `projected` misses `lobe_edits.edit_weights` at amounts -1 and 1, over
-        the trait's length. It stops before it is there, and may bring no further lobe.
+        RMS length by which `apply_traits` misses `lobe_edits.edit_weights` at amounts -1 and 1,
+        over the trait's length. It stops before it is there, and may bring no further lobe.
     """
 
     lobes: PageLobes
@@ -68,7 +68,7 @@ class LobeTraits:
     misfit: Mapping[str, float]
     held_error: Mapping[str, tuple[float, float]]
 
-    def projected(self, shares: Float64Array, amounts: Mapping[str, float]) -> Float32Array:
+    def apply_traits(self, weights: Float64Array, amounts: Mapping[str, float]) -> Float32Array:
         """Return the shares under some traits as the page computes them.
 
         Least squares over shares of at least 0 by `DESCENT_SWEEPS` sweeps of coordinate descent, in
@@ -81,12 +81,12 @@ class LobeTraits:
         amounts
             Trait to amount.
         """
-        given = np.asarray(shares, np.float32) * self.scale
+        given = np.asarray(weights, np.float32) * self.scale
         asked = np.zeros(len(self.scale), np.float32)
         for name, amount in amounts.items():
             asked += np.float32(amount) * self.pull[name]
         if not asked.any():
-            return np.asarray(shares, np.float32)
+            return np.asarray(weights, np.float32)
         wanted = given @ self.gram + asked
         found = given.copy()
         for _ in range(DESCENT_SWEEPS):
@@ -96,7 +96,7 @@ class LobeTraits:
         return np.asarray(found / self.scale, np.float32)
 
 
-def distinct_from_chance(traits: Mapping[str, TraitVector]) -> tuple[str, ...]:
+def select_significant_traits(traits: Mapping[str, TraitVector]) -> tuple[str, ...]:
     """Return the traits that are worth a slider, in the library's order.
 
     Those that a permutation of the labels brings about as easily are left out, and of two opposite
@@ -117,12 +117,12 @@ def surface_traits(found: PageLobes) -> LobeTraits | None:
     found
         Lobes with what they are mixtures of.
     """
-    traits = trait_storage.default().spaces["surface"]
-    materials = brdf_tables.default()
+    traits = trait_storage.load_packaged_traits().spaces["surface"]
+    materials = brdf_tables.default_basis()
     if found.materials != materials.names or (traits.names and traits.names != materials.names):
         return None
-    names = distinct_from_chance(traits.traits)
-    rows = _some(found.shares)
+    names = select_significant_traits(traits.traits)
+    rows = _sample_texels(found.shares)
     mix = np.asarray(found.mix, np.float64)
     most = -(-len(mix) // LOBES_PER_LOOKUP) * LOBES_PER_LOOKUP + MAX_ADDED_LOBES
     for name in sorted(names, key=lambda one: -_length(traits, one)):
@@ -138,7 +138,7 @@ def surface_traits(found: PageLobes) -> LobeTraits | None:
     height, width, count = found.shares.shape
     shares = np.zeros((height, width, len(mix)), np.float32)
     shares[..., :count] = found.shares
-    mixed = materials.mixed(mix)
+    mixed = materials.mix_materials(mix)
     table = np.array(mixed.table)
     table[..., :count] = found.lobes.table[..., :count]  # the face's own, bit for bit
     basis = BrdfBasis(table, mixed.names, found.lobes.light_radius_rad)
@@ -150,7 +150,10 @@ def surface_traits(found: PageLobes) -> LobeTraits | None:
     made = LobeTraits(lobes, *metric, single, misfit, {})
     tried = _padded(rows, len(mix))
     errors = {
-        name: (_held_error(made, tried, traits, name, -1.0), _held_error(made, tried, traits, name))
+        name: (
+            _held_out_error(made, tried, traits, name, -1.0),
+            _held_out_error(made, tried, traits, name),
+        )
         for name in names
     }
     return dataclasses.replace(made, held_error=errors)
@@ -166,12 +169,12 @@ def surface_facts(traits: LobeTraits) -> dict[str, Any]:
     return {"sweeps": DESCENT_SWEEPS, **numbers, "traits": found}
 
 
-def _some(shares: Float32Array) -> Float64Array:
+def _sample_texels(weights: Float32Array) -> Float64Array:
     """Return at most `SAMPLED_TEXELS` texels with any share, evenly taken, (n, K)."""
-    rows = shares.reshape(-1, shares.shape[-1]).astype(np.float64)
+    rows = weights.reshape(-1, weights.shape[-1]).astype(np.float64)
     rows = rows[rows.sum(axis=1) > 0.0]
     if not len(rows):
-        return np.ones((1, shares.shape[-1]))
+        return np.ones((1, weights.shape[-1]))
     return rows[:: -(-len(rows) // SAMPLED_TEXELS)]
 
 
@@ -180,22 +183,22 @@ def _padded(rows: Float64Array, count: int) -> Float64Array:
 
 
 def _length(space: TraitSpace, name: str) -> float:
-    return float(reduced_spaces.lengths(space.trait(name).vector, space.metric))
+    return float(reduced_spaces.metric_lengths(space.trait(name).vector, space.metric))
 
 
 def _misfit(mix: Float64Array, space: TraitSpace, name: str) -> float:
-    frame = reduced_spaces.framed(np.eye(mix.shape[1]), space.metric)
+    frame = reduced_spaces.to_euclidean_frame(np.eye(mix.shape[1]), space.metric)
     vector = space.trait(name).vector @ frame
     z = np.linalg.lstsq((mix @ frame).T, vector, rcond=1e-10)[0]
     return float(np.linalg.norm(z @ mix @ frame - vector) / np.linalg.norm(vector))
 
 
-def _held_error(
+def _held_out_error(
     made: LobeTraits, rows: Float64Array, space: TraitSpace, name: str, amount: float = 1.0
 ) -> float:
-    page = made.projected(rows, {name: amount}).astype(np.float64) @ made.lobes.mix
+    page = made.apply_traits(rows, {name: amount}).astype(np.float64) @ made.lobes.mix
     edited = lobe_edits.edit_weights(rows, made.lobes.mix, space, {name: amount})
-    off = reduced_spaces.lengths(page - edited.weights @ edited.mix, space.metric)
+    off = reduced_spaces.metric_lengths(page - edited.weights @ edited.mix, space.metric)
     return float(np.sqrt(np.mean(np.square(off)))) / _length(space, name)
 
 
@@ -210,7 +213,7 @@ MATCHING_ITERATIONS: Final = 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class AlbedoTraits:
+class AlbedoTraitLayers:
     """End points of traits over a texture.
 
     Attributes
@@ -245,7 +248,7 @@ class AlbedoTraits:
         }
 
 
-def albedo_traits(source: SceneSource) -> AlbedoTraits | str:
+def albedo_traits(source: SceneSource) -> AlbedoTraitLayers | str:
     """Return the albedo traits of a fitted face, or why there are none.
 
     Parameters
@@ -260,13 +263,13 @@ def albedo_traits(source: SceneSource) -> AlbedoTraits | str:
     if not {"position", "r_d"} <= set(face.appearance.maps):
         return f"{path.name} has no maps position and r_d"
     library, _ = regions.load(None)
-    parts = regions.parts_of(library)
+    parts = regions.open_library(library)
     space = parts.albedo["face"]
-    names = distinct_from_chance(space.traits.traits)
+    names = select_significant_traits(space.traits.traits)
     r_d = face.r_d.values
     valid = face.r_d.mask
     chart = face.chart(parts.frame)
-    region = masks.feathered("face", parts.frame)
+    region = masks.feather_region("face", parts.frame)
 
     def log_factor(name: str, amount: float) -> Float32Array:
         found = editing_albedo.edit_albedo(
@@ -276,7 +279,7 @@ def albedo_traits(source: SceneSource) -> AlbedoTraits | str:
             space,
             {name: amount},
             region=region > 0.0,
-            share=region,
+            weight=region,
             iterations=MATCHING_ITERATIONS,
             rng=np.random.default_rng([0, names.index(name)]),
         )
@@ -286,14 +289,14 @@ def albedo_traits(source: SceneSource) -> AlbedoTraits | str:
     for name in names:
         less, more = (log_factor(name, float(end)) for end in END_AMOUNTS)
         half = np.exp(log_factor(name, CHECKED_AMOUNT))
-        layers += [filled(one, valid, MAX_FACTOR_PX) for one in (less, more)]
+        layers += [fill_texels(one, valid, MAX_FACTOR_PX) for one in (less, more)]
         change[name] = _rms(np.exp(more[valid]) - 1.0)
-        shown = _refined(np.exp(CHECKED_AMOUNT * layers[-1]), valid.shape)
+        shown = _upsample(np.exp(CHECKED_AMOUNT * layers[-1]), valid.shape)
         between[name] = _rms((shown - half)[valid])
-    return AlbedoTraits(names, np.stack(layers), change, between)
+    return AlbedoTraitLayers(names, np.stack(layers), change, between)
 
 
-def _refined(values: Float32Array, shape: tuple[int, ...]) -> Float32Array:
+def _upsample(values: Float32Array, shape: tuple[int, ...]) -> Float32Array:
     """Return a map at more texels, linear between the centres, as the page samples it."""
     for axis, size in enumerate(shape[:2]):
         old = values.shape[axis]
@@ -323,7 +326,7 @@ def assets(source: SceneSource) -> Assets:
     SkinReflectanceError, SurfaceMixtureError
         For a fitted folder that is damaged.
     """
-    found = reflectance_assets.lobes_of(source)
+    found = reflectance_assets.read_lobes(source)
     left_out: dict[str, str] = {}
     textures: dict[str, Texture] = {}
     facts: dict[str, Any] = {}
@@ -344,7 +347,7 @@ def assets(source: SceneSource) -> Assets:
         textures["albedo_traits"] = albedo.texture()
         facts["albedo_traits"] = albedo.facts()
         names += [name for name in albedo.names if name not in names]
-    base = reflectance_assets.assemble(source, found)
+    base = reflectance_assets.build_lobe_assets(source, found)
     return {
         "textures": {**base["textures"], **textures},
         "params": {"traits": dict.fromkeys(names, 0.0)},

@@ -50,13 +50,15 @@ class GaussianProfile:
     edge_error: Float64Array
     radial_error: Float64Array
 
-    def facts(self, told: str) -> dict[str, Any]:
+    def facts(self, origin: str) -> dict[str, Any]:
         """Return what the page says of it, and where it comes from, as JSON values."""
         names = ("variances_mm2", "weights", "edge_error", "radial_error")
-        return {**{name: getattr(self, name).tolist() for name in names}, "told": told}
+        return {**{name: getattr(self, name).tolist() for name in names}, "told": origin}
 
 
-def fit(r_d: ArrayLike, sigma_tr_per_mm: ArrayLike, count: int = N_GAUSSIANS) -> GaussianProfile:
+def fit_gaussians(
+    r_d: ArrayLike, sigma_tr_per_mm: ArrayLike, count: int = N_GAUSSIANS
+) -> GaussianProfile:
     """Fit Gaussians to the dipoles of three channels.
 
     Parameters
@@ -81,7 +83,7 @@ def fit(r_d: ArrayLike, sigma_tr_per_mm: ArrayLike, count: int = N_GAUSSIANS) ->
 
     Examples
     --------
-    >>> found = fit([0.45, 0.3, 0.2], [0.5, 0.9, 1.1])
+    >>> found = fit_gaussians([0.45, 0.3, 0.2], [0.5, 0.9, 1.1])
     >>> bool((found.edge_error < 0.01).all()), found.weights.sum(axis=0).round(9).tolist()
     (True, [1.0, 1.0, 1.0])
     """
@@ -135,7 +137,7 @@ def _dipoles(albedo: Float64Array, transport: Float64Array) -> tuple[Float64Arra
     return radii, values / albedo
 
 
-def _edge_of(radii: Float64Array, profile: Float64Array, at: Float64Array) -> Float64Array:
+def _edge_of(radii: Float64Array, profile: Float64Array, positions: Float64Array) -> Float64Array:
     """Return how a radial profile spreads an edge: the share of it within half-planes.
 
     Of a ring of radius r, the share on the dark side of a line at distance x < r is
@@ -145,17 +147,17 @@ def _edge_of(radii: Float64Array, profile: Float64Array, at: Float64Array) -> Fl
     values = np.exp(np.interp(np.log(fine), np.log(radii), np.log(np.maximum(profile, 1e-300))))
     mass = 2.0 * np.pi * fine**2 * values * np.gradient(np.log(fine))
     mass /= mass.sum()  # what the last radii leave out
-    dark = np.arccos(np.minimum(at[:, None] / fine, 1.0)) / np.pi
+    dark = np.arccos(np.minimum(positions[:, None] / fine, 1.0)) / np.pi
     return np.asarray(1.0 - dark @ mass)
 
 
-def _edges(variances: Float64Array, at: Float64Array) -> Float64Array:
-    return np.asarray(0.5 + 0.5 * erf(at[:, None] / np.sqrt(2.0 * variances)))
+def _edges(variances: Float64Array, positions: Float64Array) -> Float64Array:
+    return np.asarray(0.5 + 0.5 * erf(positions[:, None] / np.sqrt(2.0 * variances)))
 
 
-def _weights(bases: Float64Array, wanted: Float64Array) -> Float64Array:
+def _weights(bases: Float64Array, target: Float64Array) -> Float64Array:
     """Return weights of at least 0 that add up to 1, (G, 3)."""
     firm = 1e3  # a row that holds the sum at 1
     rows = np.vstack([bases, np.full((1, bases.shape[1]), firm)])
-    found = np.stack([nnls(rows, np.append(one, firm))[0] for one in wanted.T], axis=-1)
+    found = np.stack([nnls(rows, np.append(one, firm))[0] for one in target.T], axis=-1)
     return np.asarray(found / found.sum(axis=0))

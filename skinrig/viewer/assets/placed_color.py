@@ -9,15 +9,15 @@ import numpy as np
 from scipy import ndimage
 
 from model import store
-from model.facial_color.coarse_maps import fitting
+from model.facial_color.coarse_maps import coarse_grid
 from model.facial_color.document import RIG_DOCUMENT, from_maps_and_document
 from model.facial_color.state_maps import NEUTRAL
 from reconstruction.correspondence import landmark_field, landmark_table
 from rigsim.geometry.atlas import unwrap
-from skinrig.appearances.dynamic import FACIAL_COLOR, parts_of
+from skinrig.appearances.dynamic import FACIAL_COLOR, describe_parts
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
 from skinrig.viewer.fine_skin import FineSkin
-from skinrig.viewer.map_filling import filled
+from skinrig.viewer.map_filling import fill_holes
 from skinrig.viewer.scene import SceneError, SceneSource
 
 Points2 = Mapping[str, tuple[float, float]]
@@ -32,14 +32,14 @@ LANDMARK_STDERR_PX: Final = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Placement:
+class TexelPlacement:
     """Where each texel of a mesh lies in a picture.
 
     Attributes
     ----------
     pixel : ndarray of float64, shape (N, N, 2)
         Column and row.
-    seen : ndarray of bool, shape (N, N)
+    visible : ndarray of bool, shape (N, N)
         Texels that the camera faced.
     leave_one_out_px : float
         Median distance of a landmark from where the others put it.
@@ -48,11 +48,11 @@ class Placement:
     """
 
     pixel: Float64Array
-    seen: BoolArray
+    visible: BoolArray
     leave_one_out_px: float
     landmarks: int
 
-    def sampled(self, values: FloatArray, valid: BoolArray) -> tuple[Float64Array, BoolArray]:
+    def sample(self, values: FloatArray, valid: BoolArray) -> tuple[Float64Array, BoolArray]:
         """Return a map of the picture in the texture, (N, N), and where it is known.
 
         Parameters
@@ -66,18 +66,18 @@ class Placement:
         share = ndimage.map_coordinates(valid.astype(np.float64), at, order=1, cval=0.0)
         held = np.where(valid, values, 0.0).astype(np.float64)
         total = ndimage.map_coordinates(held, at, order=1, cval=0.0)
-        known = self.seen & (share > 0.5)
+        known = self.visible & (share > 0.5)
         return np.where(known, total / np.maximum(share, 1e-9), 0.0), known
 
 
-def place(
+def place_texels(
     position_mm: FloatArray,
     normal: FloatArray,
     covered: BoolArray,
     *,
     landmarks_mm: Points3,
     landmarks_px: Points2,
-) -> Placement:
+) -> TexelPlacement:
     """Find where the texels of a mesh lie in a picture.
 
     Parameters
@@ -104,7 +104,9 @@ def place(
     flat = np.array([landmarks_px[name] for name in names], np.float64)
     camera = _camera(solid, flat)
     try:
-        field = landmark_field.fit(_project(camera, solid), flat, stderr_px=LANDMARK_STDERR_PX)
+        field = landmark_field.fit_landmark_field(
+            _project(camera, solid), flat, stderr_px=LANDMARK_STDERR_PX
+        )
     except landmark_field.LandmarkFieldError as error:
         raise SceneError(f"landmarks: {error}") from error
     pixel = np.zeros((*covered.shape, 2))
@@ -112,10 +114,10 @@ def place(
     low = np.floor(direct.min(axis=0))
     # the field is smooth: nodes some pixels apart are enough
     shape = np.ceil(direct.max(axis=0) - low).astype(int) + 1
-    nodes = landmark_field.fit(
+    nodes = landmark_field.fit_landmark_field(
         field.points_px - low, field.moved_px - low, stderr_px=field.stderr_px
     )
-    moved, _ = nodes.on_grid((int(shape[1]), int(shape[0])))
+    moved, _ = nodes.evaluate_grid((int(shape[1]), int(shape[0])))
     at = (direct - low).T[::-1]
     shift = np.stack([ndimage.map_coordinates(moved[..., k], at, order=1) for k in range(2)], -1)
     pixel[covered] = direct + shift
@@ -124,7 +126,7 @@ def place(
     way = eye - position_mm
     way /= np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-12)
     facing = np.sum(way * normal, axis=-1)
-    return Placement(
+    return TexelPlacement(
         pixel,
         covered & (facing > MIN_VIEW_COSINE),
         float(np.median(field.leave_one_out_px)),
@@ -191,7 +193,7 @@ class FaceColor:
     left_out: tuple[tuple[str, str], ...] = ()
 
 
-def placed(source: SceneSource) -> FaceColor:
+def place_facial_color(source: SceneSource) -> FaceColor:
     """Return the measured chromophores and rig on the texture of the scene's mesh.
 
     Parameters
@@ -206,18 +208,18 @@ def placed(source: SceneSource) -> FaceColor:
     """
     appearance, subject = source.appearances["dynamic"], source.subject
     rig = from_maps_and_document(appearance.maps, appearance.files[RIG_DOCUMENT])
-    marks = picture_landmarks(source, parts_of(appearance)[FACIAL_COLOR])
+    marks = read_image_landmarks(source, describe_parts(appearance)[FACIAL_COLOR])
     surface = subject.surface_landmarks()
     points = {
         name: (float(p[0]), float(p[1]), float(p[2]))
-        for name, p in zip(surface.names, surface.on(subject.mesh), strict=True)
+        for name, p in zip(surface.names, surface.positions_on(subject.mesh), strict=True)
     }
     size = min(source.size, 1 << (2 * max(rig.neutral.shape) - 1).bit_length())
     atlas = unwrap(subject.mesh, size)
-    where = place(
+    where = place_texels(
         atlas.position_mm, atlas.normal, atlas.covered, landmarks_mm=points, landmarks_px=marks
     )
-    neutral, known = where.sampled(rig.neutral, rig.valid)
+    neutral, known = where.sample(rig.neutral, rig.valid)
     aside = float((atlas.covered & ~known).mean() / atlas.covered.mean())
     left_out = {
         "color aside of the picture": f"{100 * aside:.0f} % of the skin did not face the camera; "
@@ -226,17 +228,17 @@ def placed(source: SceneSource) -> FaceColor:
     if MELANIN_MAP in appearance.maps:
         found = appearance.maps[MELANIN_MAP]
         valid = rig.valid if found.valid is None else found.valid
-        melanin, melanin_known = where.sampled(found.values, valid)
-        melanin = filled(melanin, melanin_known)
+        melanin, melanin_known = where.sample(found.values, valid)
+        melanin = fill_holes(melanin, melanin_known)
     else:
         left_out["melanin of this face"] = "no map of it is in the folder; simulated"
         melanin = FineSkin(subject, size).melanin()
-    cells = fitting((size, size), RIG_PX)
+    cells = coarse_grid((size, size), RIG_PX)
 
     def stored(kept: Float64Array, held: BoolArray) -> Float64Array:
         (fine,) = rig.cells.refine(kept, valid=held)
-        texels, seen = where.sampled(np.nan_to_num(fine), np.isfinite(fine) & rig.valid)
-        return filled(*cells.coarsen(texels, seen))
+        texels, seen = where.sample(np.nan_to_num(fine), np.isfinite(fine) & rig.valid)
+        return fill_holes(*cells.coarsen(texels, seen))
 
     states: dict[str, Float64Array] = {}
     for name in (NEUTRAL, *rig.states):
@@ -245,7 +247,7 @@ def placed(source: SceneSource) -> FaceColor:
         states[name] = np.stack(pair, axis=-1)
     return FaceColor(
         melanin=melanin,
-        hemoglobin=filled(neutral, known),
+        hemoglobin=fill_holes(neutral, known),
         states=states,
         global_states=rig.global_states,
         facts={
@@ -257,7 +259,9 @@ def placed(source: SceneSource) -> FaceColor:
     )
 
 
-def picture_landmarks(source: SceneSource, part: dict[str, Any]) -> dict[str, tuple[float, float]]:
+def read_image_landmarks(
+    source: SceneSource, part: dict[str, Any]
+) -> dict[str, tuple[float, float]]:
     """Return named points of the neutral picture that the flash rig's maps are drawn on, px.
 
     Raises
@@ -266,7 +270,7 @@ def picture_landmarks(source: SceneSource, part: dict[str, Any]) -> dict[str, tu
         There is no table, and no simulation's truth beside the folder.
     """
     if source.landmarks is not None:
-        return landmark_table.read(source.landmarks)
+        return landmark_table.read_landmark_table(source.landmarks)
     name = (part.get("truth") or {}).get("neutral")
     if isinstance(name, str):
         folder = source.paths["dynamic"].resolve().parent / Path(name).name

@@ -27,7 +27,7 @@ from skinrig.viewer.scene import Assets, SceneSource, Texture
 TRIED_SLABS: Final = (1, 2, 3, 4, 6, 12)
 MIN_STRONG_FRACTION: Final = 0.01
 """Values above this share of a lobe's peak count for the error of single values."""
-MAX_FORM_ERROR: Final = 0.01
+MAX_SHAPE_ERROR: Final = 0.01
 """Bound on both errors of a table that is chosen, relative."""
 LOBES_PER_LOOKUP: Final = 4
 """Lobes that one look-up reads."""
@@ -63,21 +63,21 @@ class CompactBrdf:
         return 2 * self.slabs * NODES_D * NODES_H * self.lookups * LOBES_PER_LOOKUP
 
 
-def chosen_table(lobes: BrdfBasis) -> CompactBrdf:
-    """Return the table with the fewest slabs whose errors are within `MAX_FORM_ERROR`.
+def choose_table(lobes: BrdfBasis) -> CompactBrdf:
+    """Return the table with the fewest slabs whose errors are within `MAX_SHAPE_ERROR`.
 
     The finest table is off by its 16 bits only, so that one always fits.
     """
     table = lobes.table[..., : lobes.size].astype(np.float64)
     for slabs in TRIED_SLABS:
-        back = in_slabs(table, slabs)
+        back = average_slabs(table, slabs)
         found = CompactBrdf(slabs, back, *table_errors(back, table))
-        if max(found.rms_error, found.strong_error) <= MAX_FORM_ERROR:
+        if max(found.rms_error, found.strong_error) <= MAX_SHAPE_ERROR:
             break
     return found
 
 
-def in_slabs(table: Float64Array, slabs: int) -> Float64Array:
+def average_slabs(table: Float64Array, slabs: int) -> Float64Array:
     """Return (32, 12, 90, K) with runs of phi_d nodes at their mean over the visible half-space."""
     if slabs not in TRIED_SLABS:
         raise ValueError(f"slabs: got {slabs}, expected one of {', '.join(map(str, TRIED_SLABS))}")
@@ -97,13 +97,13 @@ def atlas(found: CompactBrdf) -> Float32Array:
     along columns, lobe 4 g + c is channel c. Lobes that fill a group up are 0.
     """
     kept = found.table[:, :: NODES_PHI // found.slabs].astype(np.float32)
-    layers = in_fours(kept)
+    layers = pack_fours(kept)
     return np.ascontiguousarray(layers.transpose(0, 2, 1, 3, 4)).reshape(
         -1, NODES_H, LOBES_PER_LOOKUP
     )
 
 
-def in_fours(values: Float32Array) -> Float32Array:
+def pack_fours(values: Float32Array) -> Float32Array:
     """Return values (..., K) of lobes as layers of four, (L, ..., 4); what fills them up is 0."""
     groups = -(-values.shape[-1] // LOBES_PER_LOOKUP)
     missing = groups * LOBES_PER_LOOKUP - values.shape[-1]
@@ -112,7 +112,7 @@ def in_fours(values: Float32Array) -> Float32Array:
     return np.ascontiguousarray(np.moveaxis(split, -2, 0))
 
 
-def table_errors(back: Float64Array, table: Float64Array) -> tuple[float, float]:
+def table_errors(decoded: Float64Array, table: Float64Array) -> tuple[float, float]:
     """Return how far (32, 12, 90, K) values are from a table's, both of the worst lobe.
 
     Returns
@@ -123,8 +123,8 @@ def table_errors(back: Float64Array, table: Float64Array) -> tuple[float, float]
         95th percentile of the relative difference where a lobe exceeds `MIN_STRONG_FRACTION` of
         its peak.
     """
-    weight = (solid_weight() * _cosines())[..., None]
-    off = np.sum(weight * (back - table) ** 2, axis=(0, 1, 2))
+    weight = (solid_angle_weights() * _cosines())[..., None]
+    off = np.sum(weight * (decoded - table) ** 2, axis=(0, 1, 2))
     own = np.sum(weight * table**2, axis=(0, 1, 2))
     rms = float(np.sqrt(np.max(np.where(own > 0.0, off / np.maximum(own, 1e-300), 0.0))))
     worst = 0.0
@@ -132,21 +132,21 @@ def table_errors(back: Float64Array, table: Float64Array) -> tuple[float, float]
         one = table[..., k]
         strong = (one > MIN_STRONG_FRACTION * one.max()) & (_cosines() > 0.0)
         if strong.any():
-            relative = np.abs(back[..., k] - one)[strong] / one[strong]
+            relative = np.abs(decoded[..., k] - one)[strong] / one[strong]
             worst = max(worst, float(np.percentile(relative, 95.0)))
     return rms, worst
 
 
-def solid_weight() -> Float64Array:
+def solid_angle_weights() -> Float64Array:
     """Return the solid angle of each node up to a factor, (32, 12, 90)."""
-    d, _, h = brdf_tables.nodes()
+    d, _, h = brdf_tables.grid_nodes()
     solid = np.sin(2.0 * d)[:, None, None] * (np.sin(h) * np.gradient(h))
     return np.asarray(np.broadcast_to(solid, (NODES_D, NODES_PHI, NODES_H)))
 
 
 def _cosines() -> Float64Array:
     """Return the product of the cosines of light and view at the nodes, 0 below the horizon."""
-    d, phi, h = np.meshgrid(*brdf_tables.nodes(), indexing="ij")
+    d, phi, h = np.meshgrid(*brdf_tables.grid_nodes(), indexing="ij")
     light, view = merl.to_directions(h, d, phi)
     mu_l, mu_v = light[..., 2], view[..., 2]
     return np.asarray(np.where((mu_l > 0.0) & (mu_v > 0.0), mu_l * mu_v, 0.0))
@@ -194,22 +194,22 @@ class PageLobes:
     origin: Origin
 
 
-def assemble(source: SceneSource, found: PageLobes) -> Assets:
+def build_lobe_assets(source: SceneSource, found: PageLobes) -> Assets:
     """Return the assets of some lobes, which may hold those of traits too."""
-    compact = chosen_table(found.lobes)
+    compact = choose_table(found.lobes)
     profile, widths, told = _diffusion_of(source)
     # the packer turns pictures over; this one's rows stand as the shader counts them
     rows = np.ascontiguousarray(atlas(compact)[::-1])
     textures = {
         "lobe_atlas": Texture(rows, "f16"),
-        "lobe_shares": Texture(rounded(in_fours(found.shares)), "f16"),
+        "lobe_shares": Texture(round_weights(pack_fours(found.shares)), "f16"),
     }
     if widths is not None:
         textures["translucency"] = Texture(widths[..., None], "u8")
     return {
         "textures": textures,
         "facts": {"reflectance": _facts(found, compact), "profile": profile.facts(told)},
-        "left_out": _left_out(found, told),
+        "left_out": _list_omissions(found, told),
     }
 
 
@@ -219,36 +219,36 @@ def default_scattering(source: SceneSource) -> Assets:
     The page switches between it and that of the fitted reflectance.
     """
     depth_mm, told = skin_reflectance.population_mean_mm()
-    profile = gaussian_profiles.fit(FACIAL_R_D, 1.0 / depth_mm)
+    profile = gaussian_profiles.fit_gaussians(FACIAL_R_D, 1.0 / depth_mm)
     return {"facts": {"scattering": profile.facts(told)}}
 
 
-def lobes_of(source: SceneSource) -> PageLobes:
+def read_lobes(source: SceneSource) -> PageLobes:
     """Return the lobes of a face, or of the mean of a population."""
     for appearance in source.fitted:
         if skin_reflectance.BASIS_FILE in appearance.files:
-            lobes = skin_reflectance.lobes_of(appearance)
+            lobes = skin_reflectance.load_basis(appearance)
             mixtures = surface_mixtures.read(appearance)
-            shares = filled(mixtures.weights().astype(np.float32), mixtures.valid, SHARES_PX)
+            shares = fill_texels(mixtures.weights().astype(np.float32), mixtures.valid, SHARES_PX)
             shares = np.maximum(shares, np.float32(0.0))  # filling can undershoot
             return PageLobes(lobes, shares, mixtures.mix, mixtures.materials, "fitted")
-    space = trait_storage.default().spaces[POPULATION_SPACE]
-    materials = brdf_tables.default()
+    space = trait_storage.load_packaged_traits().spaces[POPULATION_SPACE]
+    materials = brdf_tables.default_basis()
     if space.names and space.names != materials.names:
         raise RuntimeError("the packaged traits are of other materials than this package's")
     mix = np.maximum(space.center, 0.0)[None, :]
     total = float(mix.sum())
     shares = np.full((1, 1, 1), total, np.float32)
-    lobes = materials.mixed(mix / total)
+    lobes = materials.mix_materials(mix / total)
     return PageLobes(lobes, shares, mix / total, materials.names, "population")
 
 
-def rounded(values: Float32Array) -> Float32Array:
+def round_weights(values: Float32Array) -> Float32Array:
     """Return numbers with `SHARE_BITS` binary digits, the nearest: a fit knows shares to percents.
 
     Examples
     --------
-    >>> rounded(np.array([0.0, 1.0, 1.01, -0.3], np.float32)).tolist()
+    >>> round_weights(np.array([0.0, 1.0, 1.01, -0.3], np.float32)).tolist()
     [0.0, 1.0, 1.015625, -0.30078125]
     """
     mantissa, exponent = np.frexp(values)
@@ -256,8 +256,8 @@ def rounded(values: Float32Array) -> Float32Array:
     return np.asarray(np.ldexp(np.rint(mantissa * steps) / steps, exponent), np.float32)
 
 
-def filled(values: Float32Array, valid: BoolArray, most: int) -> Float32Array:
-    """Return (h, w, C) with values in texels that have none, no more than `most` a side.
+def fill_texels(values: Float32Array, valid: BoolArray, max_px: int) -> Float32Array:
+    """Return (h, w, C) with values in texels that have none, no more than `max_px` a side.
 
     Parameters
     ----------
@@ -268,7 +268,7 @@ def filled(values: Float32Array, valid: BoolArray, most: int) -> Float32Array:
     most
         Texels a side; larger maps are averaged over whole blocks.
     """
-    step = -(-max(values.shape[:2]) // most)
+    step = -(-max(values.shape[:2]) // max_px)
     kept = valid.astype(np.float32)
     held = np.where(valid[..., None], values, np.float32(0.0))
     if step > 1:
@@ -293,21 +293,21 @@ def _diffusion_of(source: SceneSource) -> tuple[GaussianProfile, Float32Array | 
     """
     mean_mm, told = skin_reflectance.population_mean_mm()
     if not source.fitted:
-        return gaussian_profiles.fit(_typical_r_d(), 1.0 / mean_mm), None, told
+        return gaussian_profiles.fit_gaussians(_typical_r_d(), 1.0 / mean_mm), None, told
     appearance = source.fitted[0]
     r_d = _mean_albedo(appearance)
     depth = appearance.maps.get(TRANSLUCENCY_MAP)
     if depth is None or not (known := depth.mask & (depth.values > 0).all(-1)).any():
-        return gaussian_profiles.fit(r_d, 1.0 / mean_mm), None, told
+        return gaussian_profiles.fit_gaussians(r_d, 1.0 / mean_mm), None, told
     logs = np.log(np.where(known[..., None], depth.values, 1.0)).astype(np.float32)
     mean = logs[known].astype(np.float64).mean(axis=0)
     off = (logs - mean.astype(np.float32)).mean(axis=-1, keepdims=True)
-    widths = np.exp(filled(off, known, TRANSLUCENCY_PX)[..., 0])
+    widths = np.exp(fill_texels(off, known, TRANSLUCENCY_PX)[..., 0])
     record: Any = appearance.parameters.get("reflectance_model")
     if isinstance(record, dict) and record.get("translucency") == "measured":
         told = "a fibre probe on this face"
     even = float(np.ptp(widths)) < 1e-3
-    return gaussian_profiles.fit(r_d, np.exp(-mean)), None if even else widths, told
+    return gaussian_profiles.fit_gaussians(r_d, np.exp(-mean)), None if even else widths, told
 
 
 def _mean_albedo(appearance: SkinAppearance) -> Float64Array:
@@ -342,13 +342,13 @@ def _facts(found: PageLobes, compact: CompactBrdf) -> dict[str, Any]:
     }
 
 
-def _left_out(found: PageLobes, told: str) -> tuple[tuple[str, str], ...]:
+def _list_omissions(found: PageLobes, origin: str) -> tuple[tuple[str, str], ...]:
     rows = {}
     if found.origin == "population":
         rows["lobes of this face"] = (
             "none are fitted: the fitted reflectance shown is the mean surface of simulated "
             "people; `skinrig view MODEL` with a dome's maps shows a face's own"
         )
-    if "probe" not in told:
-        rows["translucency of this face"] = f"no probe measured it: {told}"
+    if "probe" not in origin:
+        rows["translucency of this face"] = f"no probe measured it: {origin}"
     return tuple(rows.items())

@@ -9,16 +9,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from model.texture_resampling import resampled
-from model.wrinkles import Layer, decode, encode, mask_textures
+from model.texture_resampling import resample
+from model.wrinkles import WrinkleLayer, decode, encode, mask_textures
 from model.wrinkles.evaluation import WRINKLE_FILE, WrinkleModel
 from model.wrinkles.expressions import as_table
-from reconstruction.wrinkles.fit import fit
-from reconstruction.wrinkles.zones import amplitudes, fit_zones
+from reconstruction.wrinkles.fit import fit_wrinkle_map
+from reconstruction.wrinkles.zones import estimate_amplitudes, fit_zones
 from rigsim.subject import SimulatedSubject, make_subject
 from rigsim.subject.expressions import EXPRESSION_STRENGTHS
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
-from skinrig.viewer.map_filling import filled, halved
+from skinrig.viewer.map_filling import downsample, fill_holes
 from skinrig.viewer.scene import Assets, SceneError, SceneSource, Texture
 
 MAP_PX: Final = 512
@@ -37,9 +37,11 @@ def assets(source: SceneSource) -> Assets:
     dynamic = source.appearances.get("dynamic")
     if dynamic is not None and WRINKLE_FILE in dynamic.files:
         found = WrinkleModel.from_maps(dynamic.maps, bytes(dynamic.files[WRINKLE_FILE]))
-        return from_model(found, source, origin="fitted")
+        return build_model_assets(found, source, origin="fitted")
     found = simulated_model(source.subject, size=min(source.size, MAP_PX))
-    return from_model(found, source, origin="simulated: fitted to the person's own expressions")
+    return build_model_assets(
+        found, source, origin="simulated: fitted to the person's own expressions"
+    )
 
 
 def simulated_model(subject: SimulatedSubject, *, size: int) -> WrinkleModel:
@@ -56,25 +58,25 @@ def simulated_model(subject: SimulatedSubject, *, size: int) -> WrinkleModel:
     if rest.size != size:
         rest = make_subject(rest.preset, seed=rest.seed, size=size, mesh=rest.mesh)
     neutral = rest.tangent_normal()
-    posed = {state: rest.posed(state).tangent_normal() for state in EXPRESSION_STRENGTHS}
+    posed = {state: rest.with_expression(state).tangent_normal() for state in EXPRESSION_STRENGTHS}
     few = min(MASK_PX, size)
-    moved = amplitudes(neutral, posed, size=(few, few))
+    moved = estimate_amplitudes(neutral, posed, size=(few, few))
     rng = np.random.default_rng(subject.seed)
     zones = fit_zones(moved, zones=ZONES_PER_LAYER, rng=rng)
     # weights hardly depend on detail: found on coarse normals, then one map is fitted to them
     coarse = (min(WEIGHTS_PX, size),) * 2
-    small = {name: _coarser(normals, coarse) for name, normals in posed.items()}
-    rough = fit(_coarser(neutral, coarse), small, zones.masks, size=coarse)
+    small = {name: _downsample_normals(normals, coarse) for name, normals in posed.items()}
+    rough = fit_wrinkle_map(_downsample_normals(neutral, coarse), small, zones.masks, size=coarse)
     table = as_table(rough.model().layers[0].table)
-    return fit(neutral, posed, zones.masks, size=(size, size), table=table).model()
+    return fit_wrinkle_map(neutral, posed, zones.masks, size=(size, size), table=table).model()
 
 
-def _coarser(normals: Float32Array, shape: tuple[int, int]) -> Float32Array:
+def _downsample_normals(normals: Float32Array, shape: tuple[int, int]) -> Float32Array:
     planes = np.moveaxis(encode(normals, limit=None), 2, 0)
-    return np.asarray(decode(np.moveaxis(resampled(planes, shape), 0, 2)), np.float32)
+    return np.asarray(decode(np.moveaxis(resample(planes, shape), 0, 2)), np.float32)
 
 
-def from_model(model: WrinkleModel, source: SceneSource, *, origin: str) -> Assets:
+def build_model_assets(model: WrinkleModel, source: SceneSource, *, origin: str) -> Assets:
     """Return textures and facts of a wrinkle model on a scene's mesh.
 
     A simulated face at rest keeps the relief that the surface's own assets bring: its base is left
@@ -103,7 +105,7 @@ def from_model(model: WrinkleModel, source: SceneSource, *, origin: str) -> Asse
     }
     if origin == "fitted":
         valid = np.ones(model.base.shape[:2], bool) if model.valid is None else model.valid
-        textures["wrinkle_base"] = Texture(filled(model.base, valid).astype(np.float32), "u8")
+        textures["wrinkle_base"] = Texture(fill_holes(model.base, valid).astype(np.float32), "u8")
     layers = [
         {"zones": list(table.zones), "rows": {n: list(table.rows[n]) for n in sorted(table.rows)}}
         for table in tables
@@ -135,7 +137,7 @@ def retained_rms(model: WrinkleModel, shape: tuple[int, int]) -> list[list[float
     for layer in model.layers:
         wrinkle = _plane(layer.wrinkle, shape).astype(np.float64)
         count = max(int(np.count_nonzero((wrinkle != 0).any(axis=2))), 1)
-        masks = resampled(np.asarray(layer.masks, np.float64), shape)
+        masks = resample(np.asarray(layer.masks, np.float64), shape)
         rows = [_level_rms(mask[..., None] * wrinkle, count) for mask in masks]
         found += rows + [[0.0] * len(rows[0])] * (ZONES_PER_LAYER - len(rows))
     return found
@@ -150,7 +152,7 @@ def _level_rms(derivatives: Float64Array, count: int) -> list[float]:
         found.append(float(np.sqrt(np.mean(np.sum(planes**2, axis=0)) / share)))
         if min(planes.shape[1:]) == 1:
             return found
-        planes = resampled(planes, (planes.shape[1] // 2, planes.shape[2] // 2))
+        planes = resample(planes, (planes.shape[1] // 2, planes.shape[2] // 2))
 
 
 def _map_shape(model: WrinkleModel) -> tuple[int, int]:
@@ -159,11 +161,11 @@ def _map_shape(model: WrinkleModel) -> tuple[int, int]:
 
 
 def _plane(wrinkle: Any, shape: tuple[int, int]) -> Float32Array:
-    planes = resampled(np.moveaxis(np.asarray(wrinkle, np.float32), 2, 0), shape)
+    planes = resample(np.moveaxis(np.asarray(wrinkle, np.float32), 2, 0), shape)
     return np.ascontiguousarray(np.moveaxis(planes, 0, 2))
 
 
-def _masks(layers: tuple[Layer, ...]) -> Float32Array:
+def _masks(layers: tuple[WrinkleLayer, ...]) -> Float32Array:
     """Return two RGBA textures a layer, of one size."""
     side = max(max(layer.masks.shape[1:]) for layer in layers)
     out = []
@@ -172,7 +174,7 @@ def _masks(layers: tuple[Layer, ...]) -> Float32Array:
             raise SceneError(
                 f"masks: got {len(layer.masks)} zones, expected at most {ZONES_PER_LAYER}"
             )
-        planes = resampled(np.asarray(layer.masks, np.float32), (side, side))
+        planes = resample(np.asarray(layer.masks, np.float32), (side, side))
         pair = mask_textures(planes)
         if len(pair) == 1:
             pair = np.concatenate([pair, np.zeros_like(pair)])
@@ -192,9 +194,9 @@ def surface_assets(source: SceneSource) -> Assets:
     covered = subject.atlas.covered
     height = source.skin.height_um()[..., None]
     # Beckmann's m and GGX's alpha give a peak of the same height, 1 / (pi m^2)
-    roughness = halved(filled(subject.roughness, covered), MAPS_PX)
+    roughness = downsample(fill_holes(subject.roughness, covered), MAPS_PX)
     # hair hides the skin's gloss, as the subject's own renderings have it
-    intensity = 1.0 - halved(filled(subject.hair, covered), MAPS_PX)
+    intensity = 1.0 - downsample(fill_holes(subject.hair, covered), MAPS_PX)
     maps = np.stack([roughness, intensity], axis=-1)
     why = "what is drawn of them is simulated; the analytic reflection uses it"
     captured = source.kind in ("dynamic", "dome", "model")

@@ -18,7 +18,7 @@ from model.microstructure.mesh_strain import strain
 from model.skin import SkinAppearance
 from rigsim.geometry.mesh import Mesh
 from rigsim.skin_patch.microrelief import make_micro_skin
-from skinrig.appearances.dynamic import MICROSTRUCTURE, parts_of
+from skinrig.appearances.dynamic import MICROSTRUCTURE, describe_parts
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.viewer.microstructure import relief_growth
 from skinrig.viewer.microstructure.relief_growth import (
@@ -55,36 +55,36 @@ class MicroRelief:
     source: str = "simulated"
 
 
-def fitted_relief(appearance: SkinAppearance) -> MicroRelief | None:
+def read_fitted_relief(appearance: SkinAppearance) -> MicroRelief | None:
     """Return the first site's relief of `skinrig fit microstructure`; None without that part."""
-    part = parts_of(appearance).get(MICROSTRUCTURE)
+    part = describe_parts(appearance).get(MICROSTRUCTURE)
     if part is None:
         return None
     site, entry = sorted(part["sites"].items())[0]
     found = appearance.maps[entry["map"]]
     text = bytes(appearance.files[entry["table"]]).decode("utf-8")
     return MicroRelief(
-        largest_square(np.squeeze(found.values).astype(np.float32), found.mask),
+        find_largest_square(np.squeeze(found.values).astype(np.float32), found.mask),
         float(entry["pixel_um"]),
         KernelTable.from_json(text),
         f"{part['source']}: {site}",
     )
 
 
-def simulated_relief(seed: int) -> MicroRelief:
+def simulate_relief(seed: int) -> MicroRelief:
     """Return relief of the simulated skin of a forehead, `PATCH_PX` a side."""
     site, pixel_um = "forehead", 15.0
     skin = make_micro_skin(site, seed=seed, size_mm=1e-3 * pixel_um * PATCH_PX, texel_um=pixel_um)
     return MicroRelief(skin.height_um, pixel_um, FOREHEAD, f"simulated: {site}")
 
 
-def largest_square(height: Float32Array, valid: BoolArray) -> Float32Array:
+def find_largest_square(height: Float32Array, valid: BoolArray) -> Float32Array:
     """Return the largest square without holes; the first one in reading order of several.
 
     Examples
     --------
     >>> holes = np.array([[0, 1, 1], [1, 1, 1]], bool)
-    >>> largest_square(np.arange(6, dtype=np.float32).reshape(2, 3), holes).tolist()
+    >>> find_largest_square(np.arange(6, dtype=np.float32).reshape(2, 3), holes).tolist()
     [[1.0, 2.0], [4.0, 5.0]]
     """
     good = np.asarray(valid, bool) & np.isfinite(height)
@@ -112,10 +112,10 @@ def assets(source: SceneSource) -> Assets:
     A fitted relief comes before a simulated one; what is simulated on a captured face is said.
     """
     dynamic = source.appearances.get("dynamic")
-    relief = None if dynamic is None else fitted_relief(dynamic)
+    relief = None if dynamic is None else read_fitted_relief(dynamic)
     if relief is not None:
-        return from_relief(relief, source.mesh, seed=source.seed)
-    made = from_relief(simulated_relief(source.seed), source.mesh, seed=source.seed)
+        return build_relief_assets(relief, source.mesh, seed=source.seed)
+    made = build_relief_assets(simulate_relief(source.seed), source.mesh, seed=source.seed)
     if source.kind in ("dynamic", "dome", "model"):
         told = "what is drawn of it is simulated, its kernels are the paper's forehead; "
         told += "`skinrig fit microstructure` adds its own"
@@ -123,7 +123,7 @@ def assets(source: SceneSource) -> Assets:
     return made
 
 
-def grown(relief: MicroRelief, *, seed: int = 0) -> GrownRelief:
+def grow_relief(relief: MicroRelief, *, seed: int = 0) -> GrownRelief:
     """Return what is grown in the page: the middle of the relief, without its mean and tilt.
 
     Raises
@@ -132,7 +132,7 @@ def grown(relief: MicroRelief, *, seed: int = 0) -> GrownRelief:
         For a relief too small to choose places from.
     """
     side = min(*relief.height_um.shape, PATCH_PX) // relief_growth.STEP_PX * relief_growth.STEP_PX
-    cell = min(CELL_PX, relief_growth.largest_cell_px(side))
+    cell = min(CELL_PX, relief_growth.max_cell_px(side))
     if cell < 2 * relief_growth.STEP_PX:
         raise SceneError(
             f"relief: got {relief.height_um.shape}, expected at least 96 pixels a side"
@@ -146,7 +146,7 @@ def grown(relief: MicroRelief, *, seed: int = 0) -> GrownRelief:
     return GrownRelief(part.astype(np.float32), relief.pixel_um, cell, seed % 2**32)
 
 
-def from_relief(relief: MicroRelief, mesh: Mesh, *, seed: int = 0) -> Assets:
+def build_relief_assets(relief: MicroRelief, mesh: Mesh, *, seed: int = 0) -> Assets:
     """Return textures, tables and parameters of a relief on a mesh.
 
     Parameters
@@ -162,7 +162,7 @@ def from_relief(relief: MicroRelief, mesh: Mesh, *, seed: int = 0) -> Assets:
         For a table of more lines than the shader holds, or a texture whose scale is so uneven
         that kernels reach too far.
     """
-    growth = grown(relief, seed=seed)
+    growth = grow_relief(relief, seed=seed)
     table = relief.table
     if len(table.alpha_breaks) > MAX_BREAKS:
         raise SceneError(
@@ -225,7 +225,7 @@ def reach_px(table: KernelTable, scale: Float64Array, virtual_px: int) -> int:
     return reach
 
 
-def with_displacement(scene: ViewerScene, pyramid: Pyramid) -> ViewerScene:
+def add_displacement_tiles(scene: ViewerScene, pyramid: Pyramid) -> ViewerScene:
     """Return a scene that fetches its relief as tiles in place of growing it from a patch.
 
     Parameters
@@ -238,14 +238,14 @@ def with_displacement(scene: ViewerScene, pyramid: Pyramid) -> ViewerScene:
     Raises
     ------
     SceneError
-        As of `from_relief`.
+        As of `build_relief_assets`.
     """
     scale = px_per_mm(scene.mesh)
     pixel_um = 1e3 / (pyramid.size * float(np.median(scale)))
     source = pyramid.levels[0]
     first = (pyramid.size - SAMPLE_PX) // 2
     middle = np.asarray(source[first : first + SAMPLE_PX, first : first + SAMPLE_PX], np.float32)
-    made = from_relief(MicroRelief(middle, pixel_um, FOREHEAD, "displacement"), scene.mesh)
+    made = build_relief_assets(MicroRelief(middle, pixel_um, FOREHEAD, "displacement"), scene.mesh)
     facts = dict(made["facts"]["microstructure"])
     for unused in ("patch_px", "cell_px", "choices", "seed"):
         del facts[unused]

@@ -81,7 +81,7 @@ class GrownRelief:
         if self.cell_px < 2 * STEP_PX or self.choices < MIN_MOVES:
             raise SceneError(
                 f"cell_px: got {self.cell_px} for a patch of {shape[0]} px, expected at least "
-                f"{2 * STEP_PX} and at most {largest_cell_px(shape[0])}"
+                f"{2 * STEP_PX} and at most {max_cell_px(shape[0])}"
             )
 
     @property
@@ -103,7 +103,7 @@ def _choices(side_px: int, cell_px: int) -> int:
     return (side_px - 2 * reach_px(cell_px)) // STEP_PX
 
 
-def largest_cell_px(side_px: int) -> int:
+def max_cell_px(side_px: int) -> int:
     """Return the largest cell that leaves `MIN_MOVES` moves in a patch of so many pixels."""
     fits = [c for c in range(1, side_px) if _choices(side_px, c) >= MIN_MOVES]
     return max(fits, default=0)

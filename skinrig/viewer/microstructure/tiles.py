@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from skinrig.whole_file import whole_folder
+from skinrig.atomic_file import replace_folder_atomically
 
 TILE_PX: Final = 256
 MIN_SIDE_PX: Final = 512
@@ -118,7 +118,7 @@ def build(source: Any, folder: Path) -> Pyramid:
             "times a power of two (such as 4096 or 16384)"
         )
     low, high = _range(source)
-    with whole_folder(folder) as part:
+    with replace_folder_atomically(folder) as part:
         level, number = source, 1
         while level.shape[0] > MIN_SIDE_PX and number < MAX_LEVELS:
             level = _halved(level, part / f"level_{number}.npy")

@@ -32,7 +32,7 @@ class FibreCamera:
         self.rng, self.rig, self.view = rng, rig, view
         self.nominal = np.array([fibre.spot_px for fibre in rig.probe.fibres])
         self.names = tuple(fibre.name for fibre in rig.probe.fibres)
-        self.noise = CameraNoise.of_view(view)
+        self.noise = CameraNoise.from_view(view)
         self.shape = (view.height_px, view.width_px)
         if places is None:
             middle = self.nominal.mean(axis=0)

@@ -63,7 +63,7 @@ def test_channel_mean_is_known_where_all_are(table, tmp_path):
 def test_entry_missing_any_channel_is_stored_as_unmeasured():
     values = np.ones((*merl.TABLE_SHAPE, 3))
     values[1, 2, 3, 2] = -0.5
-    stored = merl.MerlTable.of_values(values).stored
+    stored = merl.MerlTable.from_values(values).stored
     assert stored[:, 1, 2, 3].tolist() == [-1.0, -1.0, -1.0]
     np.testing.assert_allclose(stored[:, 0, 0, 0], 1.0 / merl.BRDF_SCALE, rtol=1e-15)
 

@@ -27,8 +27,8 @@ def test_correct_intervals_reach_coverage_and_halved_ones_fail(rng):
 
 def test_masked_and_undefined_trials_do_not_count():
     result = metrics.coverage([0, np.nan, 9], 1.0, 0.0, valid=[True, True, False])
-    assert (result.share, result.count) == (1.0, 1)
-    assert np.isnan(metrics.coverage([np.nan], [1.0], [0.0]).share)
+    assert (result.fraction, result.count) == (1.0, 1)
+    assert np.isnan(metrics.coverage([np.nan], [1.0], [0.0]).fraction)
 
 
 def test_median_interval_shrinks_with_root_of_count(rng):

@@ -149,7 +149,9 @@ def hemisphere(count=48):
 
 def local_diffuse(model, rows, light, view):
     """Return the diffuse reflection of light that leaves where it entered."""
-    passed = [skin_reflectance.transmitted(np.asarray(v)[..., 2], model.eta) for v in (light, view)]
+    passed = [
+        skin_reflectance.transmittance(np.asarray(v)[..., 2], model.eta) for v in (light, view)
+    ]
     r_d = model.r_d.reshape(-1, 3)[rows].astype(np.float64)
     return r_d * (passed[0] * passed[1])[..., None] / np.pi
 
@@ -162,7 +164,7 @@ def test_skin_never_reflects_more_than_incident_light(lobes, angle_deg):
     shares = model.weights.reshape(-1, lobes.size)[rows]
     surface = skin_reflectance.lobe_brdf(lobes, shares, light, view, [0.0, 0.0, 1.0]) @ weight
     inside = local_diffuse(model, rows, light, view).T @ weight
-    passed = skin_reflectance.transmitted(light[2])
+    passed = skin_reflectance.transmittance(light[2])
     # what enters once and leaves once, with the exact mean transmittance
     np.testing.assert_allclose(inside, passed * (1 - fresnel.diffuse_external(1.4)), rtol=1e-4)
     assert surface > 0.01

@@ -116,7 +116,7 @@ def test_hidden_or_clashing_file_name_is_refused(name):
 def test_missing_map_error_lists_available_maps(tmp_path, appearance):
     folder = store.write(tmp_path / "a", appearance)
     with pytest.raises(store.StoreError, match=r"no map 'normals'; it has diffuse, melanin"):
-        store.read(folder, only=("normals",))
+        store.read(folder, map_names=("normals",))
 
 
 def test_folder_that_is_not_appearance_is_reported(tmp_path):

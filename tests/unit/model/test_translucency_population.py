@@ -4,9 +4,9 @@ from scipy import stats
 
 from model.translucency_population import (
     CHANNEL_CORRELATION,
-    PopulationError,
     SiteMeasurement,
     TranslucencyPopulation,
+    TranslucencyPopulationError,
     summarize,
     table,
     weyrich_2005,
@@ -31,7 +31,7 @@ def test_printed_column_is_read_as_deviations_or_variances():
     np.testing.assert_allclose(literal.deviation_per_mm**2, read.deviation_per_mm, rtol=1e-15)
     assert read.deviation_per_mm[0, 0] == 0.1727
     assert read.mean_per_mm[2, 2] == 1.9159
-    with pytest.raises(PopulationError, match="reading"):
+    with pytest.raises(TranslucencyPopulationError, match="reading"):
         weyrich_2005(reading="sd")
 
 
@@ -163,35 +163,35 @@ def test_repeats_are_averaged_by_their_errors():
 
 def test_measurements_that_make_no_table_are_refused():
     one = SiteMeasurement("a", "cheek", (0.5,), (0.1,))
-    with pytest.raises(PopulationError, match="got none"):
+    with pytest.raises(TranslucencyPopulationError, match="got none"):
         summarize([])
-    with pytest.raises(PopulationError, match="got none at neck"):
+    with pytest.raises(TranslucencyPopulationError, match="got none at neck"):
         summarize([one], sites=("neck",), channels=("red",))
-    with pytest.raises(PopulationError, match="channels"):
+    with pytest.raises(TranslucencyPopulationError, match="channels"):
         summarize([one])
-    with pytest.raises(PopulationError, match="stderr_per_mm"):
+    with pytest.raises(TranslucencyPopulationError, match="stderr_per_mm"):
         summarize([SiteMeasurement("a", "cheek", (0.5,), (0.0,))], channels=("red",))
-    with pytest.raises(PopulationError, match="expected 2"):
+    with pytest.raises(TranslucencyPopulationError, match="expected 2"):
         SiteMeasurement("a", "cheek", (0.5, 0.6), (0.1,))
-    with pytest.raises(PopulationError, match="sigma_tr_per_mm, counted: got"):
+    with pytest.raises(TranslucencyPopulationError, match="sigma_tr_per_mm, counted: got"):
         table(np.full((2, 3, 3), -1.0))
-    with pytest.raises(PopulationError, match="shape"):
+    with pytest.raises(TranslucencyPopulationError, match="shape"):
         table(np.ones((2, 3)))
 
 
 def test_impossible_moments_and_correlations_are_refused():
     ones = np.ones((1, 2))
-    with pytest.raises(PopulationError, match="mean_per_mm: got 0"):
+    with pytest.raises(TranslucencyPopulationError, match="mean_per_mm: got 0"):
         TranslucencyPopulation(0 * ones, ones, ("a",), ("x", "y"))
-    with pytest.raises(PopulationError, match="shape"):
+    with pytest.raises(TranslucencyPopulationError, match="shape"):
         TranslucencyPopulation(ones, ones)
-    with pytest.raises(PopulationError, match="eigenvalues"):
+    with pytest.raises(TranslucencyPopulationError, match="eigenvalues"):
         TranslucencyPopulation(
             ones, ones, ("a",), ("x", "y"), channel_correlation=((1.0, 1.5), (1.5, 1.0))
         )
-    with pytest.raises(PopulationError, match="site_correlation"):
+    with pytest.raises(TranslucencyPopulationError, match="site_correlation"):
         TranslucencyPopulation(
             ones, ones, ("a",), ("x", "y"), 1.0, channel_correlation=((1.0, 0.5), (0.5, 1.0))
         )
-    with pytest.raises(PopulationError, match="n:"):
+    with pytest.raises(TranslucencyPopulationError, match="n:"):
         weyrich_2005().sample(0, rng=np.random.default_rng(0))

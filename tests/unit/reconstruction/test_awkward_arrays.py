@@ -102,11 +102,11 @@ def test_pixel_with_nan_noise_keeps_other_errors(skin, color, noise):
     variance, valid = np.full(skin.shape, 1e-5), np.ones(skin.shape[:2], bool)
     without = valid.copy()
     without[20, 20] = False
-    wanted = model_error.of_picture(skin, variance, without)
+    wanted = model_error.image_covariance(skin, variance, without)
     rgb, told = skin.copy(), variance.copy()
     rgb[20, 20, 1] = rgb[20, 20, 1] if color is None else color
     told[20, 20, 1] = told[20, 20, 1] if noise is None else noise
-    found = model_error.of_picture(rgb, told, valid)
+    found = model_error.image_covariance(rgb, told, valid)
     np.testing.assert_array_equal(found, wanted)
 
 
@@ -167,9 +167,9 @@ def test_nan_position_gets_ratio_of_others(rng, part, bad):
     held = np.ones(30, bool)
     without = held.copy()
     without[4] = False
-    wanted = deviation_ratio.estimate(*given, without)
+    wanted = deviation_ratio.estimate_ratio(*given, without)
     given[part][4] = bad
-    found = deviation_ratio.estimate(*given, held)
+    found = deviation_ratio.estimate_ratio(*given, held)
     assert np.isfinite(found.value).all()
     assert found.prior == wanted.prior
     np.testing.assert_array_equal(found.value, wanted.value)

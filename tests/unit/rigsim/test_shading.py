@@ -78,7 +78,7 @@ def test_highlight_behind_crossed_analyzer_is_only_polarizer_leak():
     )
     passed = {
         deg: float(
-            shading.analyse(
+            shading.apply_analyzer(
                 stokes, Z, passes_deg=deg, image_right=RIGHT, image_up=UP, extinction=2000.0
             )[0]
         )
@@ -93,7 +93,7 @@ def test_analyzer_follows_malus_law():
     stokes = np.array([[1.0, -1.0, 0.0]], np.float32)  # fully polarized along the vertical
     angles = np.linspace(0.0, 180.0, 13)
     got = [
-        float(shading.analyse(stokes, Z, passes_deg=a, image_right=RIGHT, image_up=UP)[0])
+        float(shading.apply_analyzer(stokes, Z, passes_deg=a, image_right=RIGHT, image_up=UP)[0])
         for a in angles
     ]
     np.testing.assert_allclose(got, np.sin(np.deg2rad(angles)) ** 2, atol=1e-6)

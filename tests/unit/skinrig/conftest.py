@@ -101,13 +101,13 @@ def face(seed=0, *, dark=0.0, oily=0.0, size=SIZE, wide=1.0, color=(0.32, 0.22, 
 
 def basis_file(mix):
     """Return the lobes' file."""
-    tables = brdf_tables.default()
+    tables = brdf_tables.default_basis()
     stream = io.BytesIO()
     np.savez_compressed(
         stream,
         materials=np.array(tables.names),
         mix=mix,
-        table=tables.mixed(mix).table[..., : len(mix)],
+        table=tables.mix_materials(mix).table[..., : len(mix)],
         light_radius_rad=tables.light_radius_rad,
         ranks=np.array([4]),
         error_by_rank=np.array([0.1]),

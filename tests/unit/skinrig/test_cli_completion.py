@@ -60,4 +60,4 @@ def test_completions_begin_with_typed_text(complete, typed, one):
 
 
 def test_name_is_completed_once_per_list():
-    assert "flash,flash" not in completion.several_rigs("flash,")
+    assert "flash,flash" not in completion.complete_rig_list("flash,")

@@ -18,7 +18,7 @@ def with_harvesters(monkeypatch):
 def producers():
     return [
         finding
-        for finding in doctor.examine(probe_renderer=False)
+        for finding in doctor.check_installation(probe_renderer=False)
         if finding.what == "GenTL producers"
     ]
 

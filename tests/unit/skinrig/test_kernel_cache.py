@@ -44,26 +44,26 @@ def test_cache_is_unchanged_with_writable_installation_or_home(tmp_path, read_on
     home.mkdir()
     packages.mkdir()
     told = {"HOME": str(home)}
-    assert kernel_cache.provide(told, packages) is None
+    assert kernel_cache.provide_kernel_cache(told, packages) is None
     read_only(packages)
-    assert kernel_cache.provide(told, packages) is None
+    assert kernel_cache.provide_kernel_cache(told, packages) is None
     assert told == {"HOME": str(home)}
 
 
 def test_named_cache_folder_is_kept(read_only):
     read_only("/")
     told = {"HOME": "/nowhere", "NUMBA_CACHE_DIR": "/kernels"}
-    assert kernel_cache.provide(told) is None
+    assert kernel_cache.provide_kernel_cache(told) is None
     assert told["NUMBA_CACHE_DIR"] == "/kernels"
 
 
 def test_cache_folder_is_not_writable_by_other_users(tmp_path, read_only):
     read_only(tmp_path)
     told = {"HOME": str(tmp_path)}
-    place = kernel_cache.provide(told, tmp_path)
+    place = kernel_cache.provide_kernel_cache(told, tmp_path)
     assert told["NUMBA_CACHE_DIR"] == str(place)
     assert stat.S_IMODE(place.stat().st_mode) == 0o700
-    assert kernel_cache.provide({"HOME": str(tmp_path)}, tmp_path) != place
+    assert kernel_cache.provide_kernel_cache({"HOME": str(tmp_path)}, tmp_path) != place
 
 
 def test_kernels_are_cached_until_process_ends(tmp_path):

@@ -7,7 +7,13 @@ from pathlib import Path
 import pytest
 
 from skinrig.cli import main
-from skinrig.next_steps import CALIBRATION_BY_TARGET, OPEN_COMMAND, after_session, suggest, welcome
+from skinrig.next_steps import (
+    CALIBRATION_BY_TARGET,
+    OPEN_COMMAND,
+    suggest,
+    suggest_after_session,
+    welcome,
+)
 from skinrig.reporting import page
 from skinrig.reporting.page import document
 from skinrig.workspace import scan
@@ -130,7 +136,7 @@ def test_damaged_documents_do_not_stop_next_steps():
     [(rig, target) for rig, kinds in CALIBRATION_BY_TARGET.items() for target in kinds],
 )
 def test_each_target_leads_to_a_calibration_that_exists(rig, target, capsys):
-    words = after_session(rig, "session", target).split()
+    words = suggest_after_session(rig, "session", target).split()
     assert words[:2] == ["skinrig", "calibrate"]
     assert main([*words[1:3], "missing"]) == 3
     assert "missing" in capsys.readouterr().err
@@ -149,10 +155,10 @@ def test_path_with_spaces_is_quoted_for_pasting():
     (folder / "anna.NEF").touch()
     for command in [
         *commands(folder),
-        after_session("flash", "my tile", "white", calibration="my rig"),
-        after_session("dome", "my ball", "mirror"),
-        after_session("gradient", "my skin", None, calibration="my rig"),
-        after_session("flash", "my smiles", "sequence"),
+        suggest_after_session("flash", "my tile", "white", calibration="my rig"),
+        suggest_after_session("dome", "my ball", "mirror"),
+        suggest_after_session("gradient", "my skin", None, calibration="my rig"),
+        suggest_after_session("flash", "my smiles", "sequence"),
     ]:
         words = shlex.split(command)
         assert words[0] in ("skinrig", OPEN_COMMAND)

@@ -14,9 +14,9 @@ from capture.devices.port import CommandRefused, LinkLost, Port
 from capture.devices.wire import Code
 from capture.plan import Plan, Step
 from capture.plan.dome import dome_calibration_plan, dome_plan
-from capture.plan.rows import lights_of
+from capture.plan.rows import step_lights
 from capture.rig import load_rig
-from capture.session import Session, Subject, verify
+from capture.session import Session, SubjectRecord, verify
 from rigsim.boxes.faults import Faults
 from rigsim.world.world import World
 
@@ -55,7 +55,7 @@ class Bench:
             plan=plan,
             rig=rig,
             devices={},
-            subject=Subject("p"),
+            subject=SubjectRecord("p"),
             source="simulated",
             seed=7,
         )
@@ -84,7 +84,7 @@ def make(tmp_path):
     made = []
 
     def make(plan=None, rig=RIG, **faults):
-        made.append(Bench(tmp_path, plan or dome_plan(RIG, tracking_every=10), rig, **faults))
+        made.append(Bench(tmp_path, plan or dome_plan(RIG, tracking_interval=10), rig, **faults))
         return made[-1]
 
     yield make
@@ -102,7 +102,7 @@ def check_frames(bench):
     """Fail unless every frame was lit by its own step's lights and taken by its own camera."""
     numbers = {light.name: number for number, light in enumerate(bench.rig.lights)}
     for record in bench.session.frames():
-        names = lights_of(record.step)
+        names = step_lights(record.step)
         count, last = lit_in(bench.session, record)
         assert count == len(names), record.step_id
         if names:
@@ -199,7 +199,7 @@ def test_frame_counting_would_assign_frames_to_wrong_light(make, monkeypatch):
     honest, count = body.edge, itertools.count()
     body.edge = lambda now: None if next(count) == 4 else honest(now)
     monkeypatch.setattr(
-        "capture.acquire.table_run.FrameStream._row_of", lambda self, frame: frame.seq
+        "capture.acquire.table_run.FrameStream._find_row", lambda self, frame: frame.seq
     )
 
     def run_and_check():
@@ -278,7 +278,7 @@ def test_row_lost_three_times_by_camera_ends_dark(make):
 
 def flickering():
     """Return a plan that shows its lights in an order that flashes at open eyes."""
-    plan = dome_plan(DOME, order=list(range(150)), tracking_every=0, darks=0)
+    plan = dome_plan(DOME, order=list(range(150)), tracking_interval=0, darks=0)
     return Plan("dome", plan.steps, plan.limits)
 
 
@@ -374,7 +374,7 @@ def test_quickly_moved_targets_keep_light_safe_for_eyes(make):
 
 
 def test_steps_flickering_when_retaken_use_single_flashes(make, monkeypatch):
-    bench = make(plan=dome_plan(RIG, tracking_every=0, darks=0))
+    bench = make(plan=dome_plan(RIG, tracking_interval=0, darks=0))
     kept = [step for step in bench.plan.steps if step.index["exposure"] == 0]
     eye = {light.name: light.position_mm[2] for light in RIG.lights}
     bright = sorted(kept, key=lambda step: eye[step.index["light"]])[-4:]
@@ -387,7 +387,7 @@ def test_steps_flickering_when_retaken_use_single_flashes(make, monkeypatch):
         plan=bench.plan,
         rig=RIG,
         devices={},
-        subject=Subject("p"),
+        subject=SubjectRecord("p"),
         source="simulated",
     )
     # the host's own figures are not asked here: the box's refusal is what is under test

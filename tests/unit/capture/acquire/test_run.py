@@ -17,7 +17,7 @@ from capture.devices.camera import (
 from capture.devices.port import LinkLost
 from capture.plan import Plan, flash_plan
 from capture.rig import load_rig
-from capture.session import Session, Subject, verify
+from capture.session import Session, SubjectRecord, verify
 
 RIG = load_rig("flash").resized(16)
 VIEW = RIG.views[0]
@@ -131,7 +131,12 @@ def plan():
 @pytest.fixture
 def session(tmp_path, plan):
     made = Session.create(
-        tmp_path / "s", plan=plan, rig=RIG, devices={}, subject=Subject("p"), source="measured"
+        tmp_path / "s",
+        plan=plan,
+        rig=RIG,
+        devices={},
+        subject=SubjectRecord("p"),
+        source="measured",
     )
     yield made
     made.release()
@@ -195,7 +200,12 @@ def test_token_fits_controller_for_any_step_name_length(tmp_path):
     )
     plan, log = Plan(RIG.name, steps), []
     with Session.create(
-        tmp_path / "s", plan=plan, rig=RIG, devices={}, subject=Subject("p"), source="measured"
+        tmp_path / "s",
+        plan=plan,
+        rig=RIG,
+        devices={},
+        subject=SubjectRecord("p"),
+        source="measured",
     ) as session:
         run(plan, session, Box(log), Camera())
     tokens = [entry.split()[1] for entry in log if entry.startswith("fire")]

@@ -90,19 +90,21 @@ def test_a_failed_write_keeps_the_old_calibration(calibration, tmp_path, monkeyp
 
 def test_calibration_of_other_rig_or_device_is_refused(calibration):
     today = date(2026, 11, 21)
-    assert store.require(calibration, rig="flash", serials=["N5100-1"], on_date=today)
+    assert store.require_valid(calibration, rig="flash", serials=["N5100-1"], on_date=today)
     with pytest.raises(store.CalibrationMismatch, match="rig 'dome'"):
-        store.require(calibration, rig="dome", serials=["N5100-1"], on_date=today)
+        store.require_valid(calibration, rig="dome", serials=["N5100-1"], on_date=today)
     with pytest.raises(store.CalibrationMismatch, match="calibrate these devices"):
-        store.require(calibration, rig="flash", serials=["N5100-2"], on_date=today)
+        store.require_valid(calibration, rig="flash", serials=["N5100-2"], on_date=today)
     with pytest.raises(store.CalibrationMismatch, match="expected 'color'"):
-        store.require(calibration, rig="flash", serials=["N5100-1"], on_date=today, kind="color")
+        store.require_valid(
+            calibration, rig="flash", serials=["N5100-1"], on_date=today, kind="color"
+        )
 
 
 @pytest.mark.parametrize("day", [date(2026, 10, 31), date(2027, 1, 31)])
 def test_a_calibration_outside_its_dates_is_refused(calibration, day):
     with pytest.raises(store.CalibrationExpired, match="skinrig calibrate sensor"):
-        store.require(calibration, rig="flash", serials=["N5100-1"], on_date=day)
+        store.require_valid(calibration, rig="flash", serials=["N5100-1"], on_date=day)
     assert issubclass(store.CalibrationExpired, ValueError)
 
 
@@ -174,7 +176,7 @@ def test_drift_is_counted_in_combined_standard_errors(calibration):
             "levels": Quantity(9.0),
         }
     }
-    rows = store.drift(calibration, Calibration(**fields))
+    rows = store.measure_drift(calibration, Calibration(**fields))
     assert rows[0].name == "gain_e_per_dn[2]"
     assert rows[0].sigmas == pytest.approx(0.1 / np.hypot(0.01, 0.01))
     assert "+7.1 sigma" in str(rows[0])
@@ -185,7 +187,7 @@ def test_drift_is_counted_in_combined_standard_errors(calibration):
 def test_drift_between_different_kinds_is_refused(calibration):
     fields = {f: getattr(calibration, f) for f in calibration.__dataclass_fields__}
     with pytest.raises(store.CalibrationMismatch, match="one kind"):
-        store.drift(calibration, Calibration(**{**fields, "kind": "color"}))
+        store.measure_drift(calibration, Calibration(**{**fields, "kind": "color"}))
 
 
 def test_not_a_number_never_enters_a_calibration():

@@ -56,8 +56,8 @@ def rti(tmp_path):
 
 def test_lp_file_pairs_images_by_name_any_order(rti):
     folder, lights, _, _ = rti
-    found = light_lists.find(folder)
-    numbers = [int(p.stem[3:]) for p in found.pictures]
+    found = light_lists.find_light_list(folder)
+    numbers = [int(p.stem[3:]) for p in found.images]
     assert sorted(numbers) == list(range(12))
     np.testing.assert_allclose(found.directions, lights[numbers], atol=1e-5)
     assert found.kind == "lp"
@@ -68,8 +68,8 @@ def test_unnamed_images_follow_natural_counting_order(tmp_path):
     write(tmp_path, images)
     rows = "\n".join(f"{x} {y} {z}" for x, y, z in directions(12))
     (tmp_path / "lights.txt").write_text("12\n" + rows)
-    found = light_lists.find(tmp_path)
-    assert [p.name for p in found.pictures][1:3] == ["img1.png", "img2.png"]
+    found = light_lists.find_light_list(tmp_path)
+    assert [p.name for p in found.images][1:3] == ["img1.png", "img2.png"]
     np.testing.assert_allclose(found.directions, directions(12))
 
 
@@ -104,7 +104,7 @@ def test_values_assumed_linear_equal_file_values(rti, tmp_path):
     session = Session.open(tmp_path / "s")
     record = session.frames("olat")[0]
     frame = session.read(record)
-    picture = light_lists.find(folder).pictures[0]
+    picture = light_lists.find_light_list(folder).images[0]
     green = cv2.imread(str(picture))[..., 1].astype(float) / 255
     np.testing.assert_allclose(frame.cfa[::2, 1::2] / frame.white, green, atol=2e-4)
 
@@ -117,8 +117,8 @@ def test_folders_of_other_habits_are_understood(tmp_path):
     rows = "\n".join(f"{x} {y} {z}" for x, y, z in lights[::-1])
     (tmp_path / "light_directions.txt").write_text(rows)
     (tmp_path / "light_intensities.txt").write_text("\n".join(["2 2 2"] * 5))
-    found = light_lists.find(tmp_path)
-    assert [p.stem for p in found.pictures] == ["004", "003", "002", "001", "000"]
+    found = light_lists.find_light_list(tmp_path)
+    assert [p.stem for p in found.images] == ["004", "003", "002", "001", "000"]
     assert found.intensity is not None
     assert import_light_list(tmp_path, out=tmp_path / "out" / "s").frames == 5
 
@@ -180,8 +180,8 @@ def test_invalid_light_list_input_is_refused_by_name(rti, tmp_path):
 
 def test_chrome_ball_substitutes_for_light_list(test_data):
     folder = test_data / "photometric_stereo"
-    listed = light_lists.find(folder / "buddha")
-    ball = light_lists.find(folder / "buddha", lights=folder / "chrome")
+    listed = light_lists.find_light_list(folder / "buddha")
+    ball = light_lists.find_light_list(folder / "buddha", lights=folder / "chrome")
     angle = np.degrees(np.arccos(np.clip((listed.directions * ball.directions).sum(1), -1, 1)))
     assert ball.kind == "chrome ball"
     assert angle.mean() < 3.5

@@ -10,7 +10,7 @@ from capture import raw
 from capture.importers.meshes import MeshImportError, import_mesh, read_mesh
 from capture.plan import flash_plan
 from capture.rig import load_rig
-from capture.session import Session, SessionError, Subject, verify
+from capture.session import Session, SessionError, SubjectRecord, verify
 from skinrig.cli import main
 
 HEAD = trimesh.creation.icosphere(subdivisions=3, radius=80.0)
@@ -35,11 +35,11 @@ FILES = {
     "ascii.ply": lambda: HEAD.export(file_type="ply", encoding="ascii"),
     "normals.ply": lambda: with_normals().export(file_type="ply", vertex_normal=True),
     "plain.obj": lambda: HEAD.export(file_type="obj").encode(),
-    "normals.obj": lambda: trimesh.exchange.obj.export_obj(
+    "normals.obj": lambda: trimesh.exchange.to_obj.export_obj(
         with_normals(), include_normals=True
     ).encode(),
     "uv.ply": lambda: textured().export(file_type="ply"),
-    "uv.obj": lambda: trimesh.exchange.obj.export_obj(textured()).encode(),
+    "uv.obj": lambda: trimesh.exchange.to_obj.export_obj(textured()).encode(),
 }
 
 
@@ -149,11 +149,11 @@ def session(tmp_path):
         plan=flash_plan(RIG, darks=1),
         rig=RIG,
         devices={},
-        subject=Subject("P1", ("research",)),
+        subject=SubjectRecord("P1", ("research",)),
         source="measured",
     )
     values = np.full((10, 16), 600, np.uint16)
-    step, camera = made.todo()[0]
+    step, camera = made.pending_frames()[0]
     blob = raw.encode_dng(
         values, pattern="RGGB", black=512, white=16383, step_id=step.id, session_id=made.id
     )

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from capture.plan import Plan, PlanError
-from capture.plan.dome import as_table, dome_calibration_plan, dome_plan, tracking_lights
+from capture.plan.dome import choose_tracking_lights, dome_calibration_plan, dome_plan, to_box_rows
 from capture.plan.dose import BLUE_LIMIT_J_M2_SR, dose_report
-from capture.plan.eye_light import EYES_MM, eye_light, radiant_intensity
+from capture.plan.eye_light import EYES_MM, eye_irradiance, radiant_intensity
 from capture.plan.flicker import (
     EYE_SAMPLE_S,
     average_over_flicker_fusion,
@@ -20,7 +20,7 @@ from capture.plan.flicker import (
     flicker_report,
 )
 from capture.plan.light_order import LIGHT_ORDERS, best_order, compare_orders
-from capture.plan.rows import LedRow, led_rows, lights_of, passes
+from capture.plan.rows import LedRow, led_rows, split_passes, step_lights
 from capture.rig import LedLimits, Light, RigError, load_rig
 
 DOME = load_rig("dome")
@@ -44,7 +44,7 @@ def test_light_ahead_follows_inverse_square_behind_gives_nothing():
     def at(z_mm):
         light = dataclasses.replace(LED, position_mm=(0.0, 25.0, z_mm), half_intensity_deg=None)
         rig = dataclasses.replace(DOME, lights=(light,))
-        return float(eye_light(rig, eyes_mm=[(0.0, 25.0, 80.0)])[0])
+        return float(eye_irradiance(rig, eyes_mm=[(0.0, 25.0, 80.0)])[0])
 
     assert at(1080.0) == pytest.approx(1.0 / (4.0 * np.pi))
     assert at(580.0) == pytest.approx(4.0 * at(1080.0))
@@ -52,7 +52,7 @@ def test_light_ahead_follows_inverse_square_behind_gives_nothing():
 
 
 def test_eye_light_is_even_left_and_right():
-    light = eye_light(DOME)
+    light = eye_irradiance(DOME)
     places = np.array([led.position_mm for led in DOME.lights])
     for number, place in enumerate(places):
         mirrored = np.linalg.norm(places - place * [-1, 1, 1], axis=1)
@@ -93,7 +93,7 @@ def test_light_above_fusion_rate_is_not_flashing():
     signal = np.tile([0.0, 2.0], 4000)  # 500 Hz
     seen = average_over_flicker_fusion(signal)
     assert np.ptp(seen[100:-100]) < 0.2 * 2.0
-    assert count_flashes(seen[100:-100], least=0.2 * 2.0) == 0.0
+    assert count_flashes(seen[100:-100], min_change=0.2 * 2.0) == 0.0
     assert band_rms(signal) < 1e-6
 
 
@@ -118,7 +118,7 @@ def test_dark_gaps_and_bad_orders_flicker_chosen_not():
     gaps = []
     for light in LIGHT_ORDERS["spiral"](DOME):
         gaps += [LedRow((light,), 1.0, 0.7 * dwell_s), LedRow((), 0.0, 0.3 * dwell_s)]
-    with_gaps = flicker_of_rows(gaps, eye_light(DOME))
+    with_gaps = flicker_of_rows(gaps, eye_irradiance(DOME))
     assert with_gaps.rms > 2.0 * found["spiral"].rms
     assert with_gaps.flashes_per_s > 6.0
     best = found["rise and fall"]
@@ -164,7 +164,7 @@ def test_light_keeps_same_position_in_every_pass():
 
 
 def test_tracking_frames_recur_regularly_and_are_not_flashes():
-    plan = dome_plan(DOME, tracking_every=25)
+    plan = dome_plan(DOME, tracking_interval=25)
     after = [s.index["after"] for s in plan.steps if s.kind == "tracking"]
     assert after == [0, 25, 50, 75, 100, 125, 150] * 2
     report = flicker_report(plan, DOME)
@@ -179,7 +179,7 @@ def test_tracking_frames_recur_regularly_and_are_not_flashes():
 
 
 def test_tracking_lights_are_spread_in_front():
-    lights = tracking_lights(DOME)
+    lights = choose_tracking_lights(DOME)
     places = np.array([DOME.lights[k].position_mm for k in lights])
     assert (places[:, 2] > 0).all()
     way = places / np.linalg.norm(places, axis=1)[:, None]
@@ -188,11 +188,11 @@ def test_tracking_lights_are_spread_in_front():
 
 
 def test_plan_piece_ends_where_camera_or_target_changes():
-    assert [len(piece) for piece in passes(dome_plan(DOME).steps)] == [2, 157, 2, 157]
+    assert [len(piece) for piece in split_passes(dome_plan(DOME).steps)] == [2, 157, 2, 157]
     board = dome_calibration_plan(DOME, "charuco", poses=3, darks=1)
-    assert [len(piece) for piece in passes(board.steps)] == [1, 1, 1, 1]
+    assert [len(piece) for piece in split_passes(board.steps)] == [1, 1, 1, 1]
     ball = dome_calibration_plan(DOME, "mirror", spheres=2, darks=1)
-    assert [len(piece) for piece in passes(ball.steps)] == [1, 19, 1, 19]
+    assert [len(piece) for piece in split_passes(ball.steps)] == [1, 19, 1, 19]
 
 
 def test_a_plan_survives_its_file():
@@ -217,7 +217,7 @@ def test_calibration_plan_contains_steps_required_by_target(target, steps, kinds
     assert {step.kind for step in plan.steps} == kinds
     assert flicker_report(plan, DOME).within(DOME.leds)
     for step in plan.steps:
-        assert (step.kind == "dark") == (lights_of(step) == ())
+        assert (step.kind == "dark") == (step_lights(step) == ())
 
 
 @pytest.mark.parametrize(
@@ -251,8 +251,8 @@ def test_an_unknown_light_in_a_plan_is_named():
 
 def test_rows_are_counted_as_by_controller():
     step = dome_plan(DOME).steps[2]
-    ((leds, level, dwell_us),) = as_table(led_rows([step], DOME))
-    assert leds == tuple(tracking_lights(DOME))
+    ((leds, level, dwell_us),) = to_box_rows(led_rows([step], DOME))
+    assert leds == tuple(choose_tracking_lights(DOME))
     assert level == round(1000 * step.settings["level"])
     assert dwell_us == 83_333
 
@@ -261,16 +261,16 @@ def test_rows_are_counted_as_by_controller():
 
 
 def test_dose_is_light_time_multiplied_by_level():
-    plan = dome_plan(DOME, tracking_every=0)
+    plan = dome_plan(DOME, tracking_interval=0)
     report = dose_report(plan, DOME)
     assert report.led_ws == pytest.approx(2 * 83_333e-6)
-    half = dose_report(dome_plan(DOME, tracking_every=0, level=0.5), DOME)
+    half = dose_report(dome_plan(DOME, tracking_interval=0, level=0.5), DOME)
     assert half.led_ws == pytest.approx(0.5 * report.led_ws)
     assert half.eye_j_m2 == pytest.approx(0.5 * report.eye_j_m2)
 
 
 def test_the_blue_light_bound_is_radiance_times_time():
-    report = dose_report(dome_plan(DOME, tracking_every=0), DOME)
+    report = dose_report(dome_plan(DOME, tracking_interval=0), DOME)
     led = DOME.lights[0]
     radiance = radiant_intensity(led) / (np.pi * (1e-3 * led.radius_mm) ** 2)
     assert report.blue_share == pytest.approx(radiance * report.led_ws / BLUE_LIMIT_J_M2_SR)

@@ -15,12 +15,12 @@ from capture.plan.gradient import (
     SCAN_ORDER,
     gradient_calibration_plan,
     gradient_plan,
+    group_by_state,
     scan_duty,
     state_name,
-    state_of,
-    states,
+    strain_state,
 )
-from capture.plan.rows import led_rows, passes, pattern_shares
+from capture.plan.rows import led_rows, pattern_weights, split_passes
 from capture.plan.steps import LIGHT_PATTERNS
 from capture.rig import load_rig
 
@@ -33,32 +33,32 @@ PLACES = [light.position_mm for light in RIG.lights]
 
 def test_complementary_patterns_sum_to_full():
     for axis in "xyz":
-        both = pattern_shares(PLACES, axis) + pattern_shares(PLACES, f"-{axis}")
-        np.testing.assert_allclose(both, pattern_shares(PLACES, "full"), atol=1e-15)
-    assert not pattern_shares(PLACES, "dark").any()
+        both = pattern_weights(PLACES, axis) + pattern_weights(PLACES, f"-{axis}")
+        np.testing.assert_allclose(both, pattern_weights(PLACES, "full"), atol=1e-15)
+    assert not pattern_weights(PLACES, "dark").any()
 
 
 def test_pattern_is_brightest_on_side_in_its_name():
     way = np.array(PLACES) / np.linalg.norm(PLACES, axis=1)[:, None]
     for axis, pattern in enumerate("xyz"):
         light = int(np.argmax(way[:, axis]))
-        assert int(np.argmax(pattern_shares(PLACES, pattern))) == light
-        assert int(np.argmin(pattern_shares(PLACES, f"-{pattern}"))) == light
-    assert pattern_shares([(0.0, 7.0, 0.0)], "y").tolist() == [1.0]  # +y is up
+        assert int(np.argmax(pattern_weights(PLACES, pattern))) == light
+        assert int(np.argmin(pattern_weights(PLACES, f"-{pattern}"))) == light
+    assert pattern_weights([(0.0, 7.0, 0.0)], "y").tolist() == [1.0]  # +y is up
 
 
 def test_mean_light_direction_is_recovered_from_four_patterns():
     """Sums over LEDs of x, y, z and full give the first moments: 2 x - full weighs with the way."""
     way = np.array(PLACES) / np.linalg.norm(PLACES, axis=1)[:, None]
     response = np.random.default_rng(1).random(len(way))
-    full = pattern_shares(PLACES, "full") @ response
-    moments = [2.0 * pattern_shares(PLACES, axis) @ response - full for axis in "xyz"]
+    full = pattern_weights(PLACES, "full") @ response
+    moments = [2.0 * pattern_weights(PLACES, axis) @ response - full for axis in "xyz"]
     np.testing.assert_allclose(moments, response @ way, atol=1e-12)
 
 
 def test_an_unknown_pattern_is_refused():
     with pytest.raises(PlanError, match="pattern"):
-        pattern_shares(PLACES, "w")
+        pattern_weights(PLACES, "w")
 
 
 # order ----------------------------------------------------------------------------------------
@@ -66,7 +66,7 @@ def test_an_unknown_pattern_is_refused():
 
 def test_angle_runs_neutral_then_compressed_then_stretched_stepwise():
     plan = gradient_plan(RIG)
-    names = [name for name, _ in states(plan)]
+    names = [name for name, _ in group_by_state(plan)]
     assert len(names) == 4 * 13
     assert names[:7] == [
         "a000_n0",
@@ -87,10 +87,10 @@ def test_angle_runs_neutral_then_compressed_then_stretched_stepwise():
 
 def test_state_is_eight_parallel_and_eight_crossed_patterns():
     plan = gradient_plan(RIG, angles=[45], steps=(-2, 3))
-    for name, steps in states(plan):
+    for name, steps in group_by_state(plan):
         assert [s.settings["polarizer"] for s in steps] == ["parallel"] * 8 + ["crossed"] * 8
         assert [s.settings["pattern"] for s in steps] == list(SCAN_ORDER) * 2
-        assert {state_of(s) for s in steps} == {name}
+        assert {strain_state(s) for s in steps} == {name}
         for step in steps:
             index, settings = dict(step.index), step.settings
             assert index["pattern"] == settings["pattern"]
@@ -116,19 +116,19 @@ def test_a_plan_survives_its_file():
 
 def test_state_takes_half_second_of_light_within_duty():
     plan = gradient_plan(RIG, angles=[0], steps=(-1, 1), darks=0)
-    for _, steps in states(plan):
+    for _, steps in group_by_state(plan):
         assert sum(s.settings["dwell_s"] for s in steps) == pytest.approx(0.5, rel=0.02)
         assert 0.24 < scan_duty(steps, RIG) <= RIG.leds.max_duty
 
 
 @pytest.mark.parametrize("led", [0, 60, 131])
 def test_duty_matches_light_summed_in_small_time_steps(led):
-    steps = next(iter(states(gradient_plan(RIG, angles=[0], steps=(0, 0)))))[1]
+    steps = next(iter(group_by_state(gradient_plan(RIG, angles=[0], steps=(0, 0)))))[1]
     one = dataclasses.replace(RIG, lights=(RIG.lights[led],))
     signal = []
     for number, row in enumerate(led_rows(steps, one)):
         signal += [0.0] * (1500 if number == 8 else 0)  # the analyser turns for 0.15 s
-        signal += [row.given(1)[0]] * round(row.dwell_s * 1e4)
+        signal += [row.light_levels(1)[0]] * round(row.dwell_s * 1e4)
     padded = np.r_[np.zeros(10_000), signal, np.zeros(10_000)]
     total = np.cumsum(padded)
     assert scan_duty(steps, one) == pytest.approx((total[10_000:] - total[:-10_000]).max() / 1e4)
@@ -147,7 +147,7 @@ def test_brightness_order_flickers_less_than_name_order():
 
 def test_states_are_pieces_of_their_own():
     plan = gradient_plan(RIG, angles=[0, 90], steps=(-1, 1), darks=1)
-    assert [len(piece) for piece in passes(plan.steps)] == [1] + [16] * 6
+    assert [len(piece) for piece in split_passes(plan.steps)] == [1] + [16] * 6
 
 
 def test_led_dose_is_its_fraction_of_state_light():
@@ -194,7 +194,7 @@ def test_plan_time_is_sum_of_light_rotations_moves():
     light = 4 * 16 * 0.031 + 4 * 0.15
     # 0.4 s a step of the jaws: one, one, three back across neutral; the analyser turns meanwhile
     moves = 0.4 * (1 + 1 + 3) + 4 * RIG.caliper.settle_s
-    assert plan.estimated_s(RIG) == pytest.approx(light + moves)
+    assert plan.estimate_duration_s(RIG) == pytest.approx(light + moves)
 
 
 # targets --------------------------------------------------------------------------------------

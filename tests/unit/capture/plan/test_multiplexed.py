@@ -13,8 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from capture.plan import Plan, PlanError, flash_plan
-from capture.plan.multiplexed import ReadOutError, course_plan, image_s, multiplexed_plan
-from capture.plan.phases import equivalent_period_s, phase_grid, phases, timed_steps
+from capture.plan.multiplexed import (
+    ReadOutError,
+    course_plan,
+    min_shot_interval_s,
+    multiplexed_plan,
+)
+from capture.plan.phases import equivalent_period_s, phase_coverage, phase_grid, timed_steps
 from capture.rig import load_rig
 
 FLASH = load_rig("flash")
@@ -26,17 +31,17 @@ def fast_camera(readout_s: float):
 
 
 def test_captures_22_meet_20_phases_half_second_apart():
-    found = phases(multiplexed_plan(FLASH, prompt_period_s=5.0, shot_period_s=5.5))
+    found = phase_coverage(multiplexed_plan(FLASH, prompt_period_s=5.0, shot_period_s=5.5))
     assert (found.captures, found.distinct, found.interval_s) == (22, 20, 0.5)
     assert found.largest_gap_s == 0.5
     assert sorted(found.repeats) == [1] * 18 + [2, 2]
 
 
 def test_captures_44_meet_40_phases_quarter_second_apart():
-    found = phases(multiplexed_plan(FLASH, prompt_period_s=5.0, shot_period_s=10.25))
+    found = phase_coverage(multiplexed_plan(FLASH, prompt_period_s=5.0, shot_period_s=10.25))
     assert (found.captures, found.distinct, found.interval_s) == (44, 40, 0.25)
     # the paper's own period, on a camera that could keep it
-    found = phases(multiplexed_plan(fast_camera(5.0), shot_period_s=5.25))
+    found = phase_coverage(multiplexed_plan(fast_camera(5.0), shot_period_s=5.25))
     assert (found.captures, found.distinct, found.interval_s) == (44, 40, 0.25)
 
 
@@ -47,7 +52,7 @@ def test_period_below_read_out_is_refused_with_equivalent():
     assert isinstance(caught.value, PlanError)
     again = multiplexed_plan(FLASH, shot_period_s=caught.value.equivalent_s)
     wanted = multiplexed_plan(FLASH, shot_period_s=5.25, read_out_s=1.0)
-    assert phases(again).covered_s == phases(wanted).covered_s
+    assert phase_coverage(again).covered_s == phase_coverage(wanted).covered_s
     assert isinstance(pickle.loads(pickle.dumps(caught.value)), ReadOutError)
 
 
@@ -58,7 +63,7 @@ def test_read_out_can_be_stated_if_rig_lacks():
 
 
 def test_rig_camera_needs_5_5_seconds_per_image():
-    assert 5.49 < image_s(FLASH, 0.008) <= Fraction("5.5")
+    assert 5.49 < min_shot_interval_s(FLASH, 0.008) <= Fraction("5.5")
     with pytest.raises(ReadOutError):
         multiplexed_plan(FLASH, shot_period_s=5.49)
 
@@ -95,16 +100,18 @@ def test_phase_grid_matches_counting(prompt, shot):
     ("shot_period_s", "distinct"), [(10, 1), (20, 1), (15, 2), (12.5, 4), (6, 5)]
 )
 def test_periods_with_large_common_divisor_alias_and_report(shot_period_s, distinct):
-    found = phases(multiplexed_plan(FLASH, shot_period_s=shot_period_s, captures=30))
+    found = phase_coverage(multiplexed_plan(FLASH, shot_period_s=shot_period_s, captures=30))
     assert found.distinct == found.possible == distinct
-    assert found.aliased
+    assert found.is_aliased
     assert "alias" in str(found)
-    assert not phases(multiplexed_plan(FLASH)).aliased
+    assert not phase_coverage(multiplexed_plan(FLASH)).is_aliased
 
 
 def test_decimal_periods_do_not_suffer_from_binary_rounding():
     # 0.1 + 0.2 is no tenth in binary; 5.1 has 51 tenths in common with nothing but a tenth
-    found = phases(multiplexed_plan(FLASH, prompt_period_s=5, shot_period_s=6.1, captures=110))
+    found = phase_coverage(
+        multiplexed_plan(FLASH, prompt_period_s=5, shot_period_s=6.1, captures=110)
+    )
     assert (found.distinct, found.interval_s) == (100, 0.1)
 
 
@@ -179,4 +186,4 @@ def test_interleaved_state_repeats_have_all_others_between():
 
 def test_sequence_lasts_from_lead_to_last_shot():
     plan = multiplexed_plan(FLASH, darks=0)
-    assert plan.estimated_s(FLASH) == pytest.approx(10.0 + 21 * 5.5 + 5.458)
+    assert plan.estimate_duration_s(FLASH) == pytest.approx(10.0 + 21 * 5.5 + 5.458)

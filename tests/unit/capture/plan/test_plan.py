@@ -75,7 +75,7 @@ def test_a_plan_survives_its_json_and_a_pickle(flash, target):
 def test_estimate_sums_frame_read_outs_and_rotations_between(flash):
     plan = flash_plan(flash, darks=1, exposure_s=0.5)
     # dark, parallel, crossed: three read-outs and exposures, the analyser set twice
-    assert plan.estimated_s(flash) == pytest.approx(3 * (5.45 + 0.5) + 2 * 0.5)
+    assert plan.estimate_duration_s(flash) == pytest.approx(3 * (5.45 + 0.5) + 2 * 0.5)
 
 
 def test_the_estimate_never_undercuts_the_pop_limit(flash):
@@ -85,7 +85,7 @@ def test_the_estimate_never_undercuts_the_pop_limit(flash):
         flash, views=tuple(dataclasses.replace(v, readout_s=0.0) for v in flash.views)
     )
     plan = flash_plan(quick, repeats=10, darks=0)
-    assert plan.estimated_s(quick) >= len(plan.steps) * 60 / quick.max_pops_per_min
+    assert plan.estimate_duration_s(quick) >= len(plan.steps) * 60 / quick.max_pops_per_min
 
 
 def test_a_step_is_frozen_down_to_its_settings():

@@ -10,12 +10,17 @@ from capture.plan import Plan, PlanError, Step
 from capture.plan.dose import fiber_light
 from capture.plan.probe import (
     MAX_MASK_EXPOSURE_S,
-    all_series,
     exposure_series_s,
+    group_by_series,
     probe_calibration_plan,
     probe_plan,
 )
-from capture.plan.suction import WIRE_SLACK_S, placement_of, room_s, spans
+from capture.plan.suction import (
+    WIRE_SLACK_S,
+    exposure_time_per_suction_s,
+    split_into_suctions,
+    step_placement,
+)
 from capture.rig import load_rig
 
 RIG = load_rig("probe")
@@ -41,19 +46,19 @@ def test_brackets_span_more_than_four_exposure_decades():
 
 def test_sites_repeats_and_angles_have_own_placement_series():
     plan = probe_plan(RIG, sites=["forehead", "chin"], repeats=2, angles=3, brackets=4)
-    places = [placement for placement, _ in all_series(plan)]
+    places = [placement for placement, _ in group_by_series(plan)]
     assert [(p.site, p.repeat, p.angle_deg) for p in places] == [
         (site, repeat, angle)
         for site in ("forehead", "chin")
         for repeat in (0, 1)
         for angle in (0.0, 120.0, 240.0)
     ]
-    assert {len(steps) for _, steps in all_series(plan)} == {4}
+    assert {len(steps) for _, steps in group_by_series(plan)} == {4}
 
 
 def test_sixteen_directions_go_all_round_in_equal_steps():
     plan = probe_plan(RIG, sites=["cheek"], angles=16, brackets=2)
-    angles = [placement.angle_deg for placement, _ in all_series(plan)]
+    angles = [placement.angle_deg for placement, _ in group_by_series(plan)]
     np.testing.assert_allclose(np.diff(angles), 22.5)
     assert angles[0] == 0.0
     assert angles[-1] == 337.5
@@ -79,29 +84,29 @@ def test_suction_stays_within_skin_limit_and_never_truncated():
     rng = np.random.default_rng(5)
     for _ in range(50):
         seconds = rng.uniform(0.3, 30.3, rng.integers(1, 40)).tolist()
-        found = spans(seconds, PROBE)
+        found = split_into_suctions(seconds, PROBE)
         assert [k for span in found for k in span] == list(range(len(seconds)))
         for span in found:
             used_s = sum(seconds[k] + WIRE_SLACK_S for k in span)
-            assert used_s <= room_s(PROBE) or len(span) == 1
+            assert used_s <= exposure_time_per_suction_s(PROBE) or len(span) == 1
         for one, other in itertools.pairwise(found):
             both_s = sum(seconds[k] + WIRE_SLACK_S for k in one) + seconds[other[0]] + WIRE_SLACK_S
-            assert both_s > room_s(PROBE)
+            assert both_s > exposure_time_per_suction_s(PROBE)
 
 
 def test_the_estimate_counts_exposures_pumping_and_rests():
     plan = probe_plan(RIG, sites=["cheek"], darks=0)
     frames_s = sum(s.settings["exposure_s"] + RIG.views[0].readout_s for s in plan.steps)
     held_s = 2 * (PROBE.settle_s + 2.0) + PROBE.rest_s
-    assert plan.estimated_s(RIG) == pytest.approx(frames_s + held_s)
+    assert plan.estimate_duration_s(RIG) == pytest.approx(frames_s + held_s)
     twice = probe_plan(RIG, sites=["cheek", "chin"], darks=0)
-    assert twice.estimated_s(RIG) == pytest.approx(2 * plan.estimated_s(RIG))
+    assert twice.estimate_duration_s(RIG) == pytest.approx(2 * plan.estimate_duration_s(RIG))
 
 
 def test_other_rigs_take_the_time_that_they_took():
     rig = dataclasses.replace(RIG, probe=None)
     step = Step("a", "dark", {}, {"exposure_s": 1.0}, ("cam",))
-    assert Plan(rig.name, (step,)).estimated_s(rig) == pytest.approx(1.3)
+    assert Plan(rig.name, (step,)).estimate_duration_s(rig) == pytest.approx(1.3)
 
 
 def test_calibration_has_whole_series_and_each_fiber_uncovered():
@@ -118,8 +123,8 @@ def test_calibration_has_whole_series_and_each_fiber_uncovered():
         assert MAX_MASK_EXPOSURE_S / 4 < seconds[-1] <= MAX_MASK_EXPOSURE_S
         assert set(seconds) <= set(exposure_series_s())
     # one placement serves the series and all covers
-    assert {placement_of(s) for s in (*kinds["phantom"], *kinds["mask"])} == {
-        placement_of(kinds["phantom"][0])
+    assert {step_placement(s) for s in (*kinds["phantom"], *kinds["mask"])} == {
+        step_placement(kinds["phantom"][0])
     }
     assert {s.kind for s in probe_calibration_plan(RIG, "dark").steps} == {"dark"}
 
@@ -178,5 +183,8 @@ def test_limited_pump_time_bounds_longest_exposure():
     weak = dataclasses.replace(RIG, probe=dataclasses.replace(PROBE, max_suction_s=20.0))
     with pytest.raises(PlanError, match="one suction of 20 s has room for"):
         probe_plan(weak)
-    plan = probe_plan(weak, sites=["cheek"], longest_s=15.0, darks=0)
-    assert len(spans([s.settings["exposure_s"] + 0.3 for s in plan.steps], weak.probe)) > 2
+    plan = probe_plan(weak, sites=["cheek"], max_exposure_s=15.0, darks=0)
+    assert (
+        len(split_into_suctions([s.settings["exposure_s"] + 0.3 for s in plan.steps], weak.probe))
+        > 2
+    )

@@ -8,7 +8,7 @@ import pytest
 from capture import raw
 from capture.plan import PlanError, flash_plan
 from capture.rig import load_rig
-from capture.session import Disk, Session, SessionDiskError, SessionError, Subject, verify
+from capture.session import Disk, Session, SessionDiskError, SessionError, SubjectRecord, verify
 
 RIG = load_rig("flash").resized(16)
 PLAN = flash_plan(RIG, states=("neutral", "anger"), darks=1)
@@ -22,7 +22,7 @@ def session(tmp_path):
         plan=PLAN,
         rig=RIG,
         devices={},
-        subject=Subject("P042", ("research",)),
+        subject=SubjectRecord("P042", ("research",)),
         source="measured",
     ) as made:
         yield made
@@ -52,8 +52,8 @@ def test_omitted_steps_are_not_pending_and_session_completes(session):
     session.close()
     again = Session.open(session.path)
     assert again.closed
-    assert again.left_out() == {"S002": WHY, "S003": WHY}
-    line = again.left_out_line("S003")
+    assert again.omitted_steps() == {"S002": WHY, "S003": WHY}
+    line = again.omission_line("S003")
     assert (line.about["aperture_mm"], line.t_host_s) == (5.6, 7.0)
     found = verify(session.path)
     assert found.ok
@@ -64,7 +64,7 @@ def test_omitted_steps_survive_interruption(session):
     session.leave_out(["S003"], reason=WHY, t_host_s=0.0)
     session.release()
     with Session.resume(session.path) as again:
-        assert again.left_out() == {"S003": WHY}
+        assert again.omitted_steps() == {"S003": WHY}
         commit_all(again)
         again.close()
     assert [r.step_id for r in Session.open(session.path).frames()] == [
@@ -144,7 +144,7 @@ def test_failing_disk_costs_reason_only_keeps_acknowledged_data(session):
     commit(again, "D000")
     disk.full = True
     with pytest.raises(SessionDiskError):
-        again.leave_out(["S003"], reason=WHY, t_host_s=0.0)
+        again.omit_steps(["S003"], reason=WHY, t_host_s=0.0)
     with Session.resume(session.path) as third:
-        assert third.left_out() == {}
+        assert third.omitted_steps() == {}
         assert [r.step_id for r in third.frames()] == ["D000"]

@@ -20,7 +20,7 @@ from capture.session import (
     SessionDiskError,
     SessionError,
     SessionLocked,
-    Subject,
+    SubjectRecord,
     reopen_copy,
     verify,
 )
@@ -35,7 +35,7 @@ def create(path, **changes):
         "plan": PLAN,
         "rig": RIG,
         "devices": {"flash": {"idn": "SKINRIG,FLASH,0001,1.0"}},
-        "subject": Subject("P042", ("research",), date(2031, 1, 1)),
+        "subject": SubjectRecord("P042", ("research",), date(2031, 1, 1)),
         "source": "measured",
         "now": lambda: NOON,
     }
@@ -127,7 +127,7 @@ def test_interrupted_session_continues_from_last_step(session):
     session.release()
     with Session.resume(session.path) as again:
         assert [record.step_id for record in again.frames()] == ["D000"]
-        assert len(again.todo()) == 4
+        assert len(again.pending_frames()) == 4
         commit_all(again)
         again.close()
     assert verify(session.path, today=NOON.date()).warnings == ()
@@ -196,7 +196,7 @@ def test_files_without_line_are_set_aside_never_lost(session):
     (session.path / "frames/S000+cam.dng").write_bytes(b"unacknowledged")
     (session.path / "frames/S001+cam.dng.part").write_bytes(b"half")
     with Session.resume(session.path) as again:
-        assert next(step.id for step, _ in again.todo()) == "S000"
+        assert next(step.id for step, _ in again.pending_frames()) == "S000"
     aside = sorted(file.read_bytes() for file in (session.path / "orphans").iterdir())
     assert aside == [b"half", b"unacknowledged"]
     assert [file.name for file in (session.path / "frames").iterdir()] == ["D000+cam.dng"]
@@ -291,7 +291,7 @@ def test_impossible_manifest_is_refused_before_creation(tmp_path, changes, reaso
 @pytest.mark.parametrize("name", ["Ada Lovelace", "", "a/b", "x" * 65])
 def test_a_subject_has_a_pseudonym_and_no_name(name):
     with pytest.raises(SessionError, match="pseudonym"):
-        Subject(name)
+        SubjectRecord(name)
 
 
 def test_a_plan_for_another_rig_starts_no_session(tmp_path):
@@ -312,7 +312,7 @@ def test_manifest_records_subject_plan_devices_and_source(tmp_path):
     opened = Session.open(tmp_path / "s")
     assert (opened.source, opened.seed) == ("simulated", 7)
     assert (opened.plan, opened.rig) == (PLAN, RIG)
-    assert opened.subject == Subject("P042", ("research",), date(2031, 1, 1))
+    assert opened.subject == SubjectRecord("P042", ("research",), date(2031, 1, 1))
     assert opened.manifest.calibrations == (reference,)
     assert opened.manifest.created_at == NOON
     assert opened.manifest.devices["flash"]["idn"].startswith("SKINRIG")
@@ -340,17 +340,17 @@ def test_the_content_hash_vouches_for_every_commit(session):
     ],
 )
 def test_consent_ends_with_scope_and_last_day(session, scope, today, allowed):
-    assert session.export_allowed(scope, today=today) == allowed
+    assert session.is_export_allowed(scope, today=today) == allowed
     if not allowed:
         with pytest.raises(ConsentError, match="P042 has not agreed"):
             session.require_consent(scope, today=today)
 
 
 def test_consent_to_any_use_covers_all_scopes(tmp_path):
-    subject = Subject("virtual-III", ("any",), date(2031, 1, 1))
+    subject = SubjectRecord("virtual-III", ("any",), date(2031, 1, 1))
     with create(tmp_path / "s", source="simulated", subject=subject) as made:
-        assert made.export_allowed("publication", today=date(2031, 1, 1))
-        assert not made.export_allowed("publication", today=date(2031, 1, 2))
+        assert made.is_export_allowed("publication", today=date(2031, 1, 1))
+        assert not made.is_export_allowed("publication", today=date(2031, 1, 2))
 
 
 def test_verify_warns_of_expired_and_of_missing_consent(closed, tmp_path):
@@ -358,7 +358,7 @@ def test_verify_warns_of_expired_and_of_missing_consent(closed, tmp_path):
     late = verify(closed, today=date(2031, 1, 2))
     assert late.ok
     assert ["consent expired on 2031-01-01" in warning for warning in late.warnings] == [True]
-    with create(tmp_path / "t", subject=Subject("P1")) as made:
+    with create(tmp_path / "t", subject=SubjectRecord("P1")) as made:
         assert any("no consent" in warning for warning in verify(made.path).warnings)
 
 

@@ -18,7 +18,7 @@ def directions(rng, count, *, lowest=0.1):
 
 @pytest.fixture(scope="module")
 def rough():
-    return rgl.of_brdf(dict(brdf_recipe.materials())["ggx 0.33 eta 1.4"], description="rough")
+    return rgl.tabulate_brdf(dict(brdf_recipe.materials())["ggx 0.33 eta 1.4"], description="rough")
 
 
 def adaptive(rng, *, spectral=False):
@@ -50,7 +50,7 @@ def adaptive(rng, *, spectral=False):
 def test_written_brdf_equals_its_source_brdf(name, rng, tmp_path):
     """Tolerance: linear interpolation between 45 elevations; the median is a third of a percent."""
     brdf = dict(brdf_recipe.materials())[name]
-    rgl.write(tmp_path / "a.bsdf", rgl.of_brdf(brdf, description=name))
+    rgl.write(tmp_path / "a.bsdf", rgl.tabulate_brdf(brdf, description=name))
     table = rgl.read(tmp_path / "a.bsdf")
     light, view = directions(rng, 3000), directions(rng, 3000)
     found, true = table.evaluate(light, view), brdf(light, view)
@@ -72,7 +72,7 @@ def test_written_brdf_equals_its_source_brdf(name, rng, tmp_path):
 
 
 def test_colors_stay_apart_and_nothing_shines_from_below(rough):
-    table = rgl.of_brdf(
+    table = rgl.tabulate_brdf(
         lambda light, view: np.tile([0.1, 0.2, 0.3], (len(light), 1)), description=""
     )
     z = np.array([[0.0, 0.0, 1.0]])
@@ -119,8 +119,8 @@ def test_flattening_an_uneven_density_spreads_its_samples_evenly(rng, tmp_path):
     at = (1 - v) * ((1 - u) * density[j, i] + u * density[j, i + 1])
     at += v * ((1 - u) * density[j + 1, i] + u * density[j + 1, i + 1])
     chosen = tries[rng.random(len(tries)) < at / density.max()][:20_000]
-    slices = rgl._Slices(*[np.full(len(chosen), 2)] * 2, np.zeros(len(chosen)))
-    flat = rgl._flattened(table.vndf, slices, chosen)
+    slices = rgl._Interpolation(*[np.full(len(chosen), 2)] * 2, np.zeros(len(chosen)))
+    flat = rgl._invert_sampling(table.vndf, slices, chosen)
     count, _, _ = np.histogram2d(flat[:, 0], flat[:, 1], bins=6, range=[[0, 1], [0, 1]])
     expected = len(chosen) / 36
     assert np.sum((count - expected) ** 2 / expected) < 66.6  # of 35 degrees of freedom
@@ -151,4 +151,4 @@ def test_invalid_isotropic_material_error_names_field(rng, tmp_path):
 def test_negative_or_nonfinite_brdf_is_refused():
     for value in (-1e-3, np.nan, np.inf):
         with pytest.raises(ValueError, match="brdf"):
-            rgl.of_brdf(lambda light, view, v=value: np.full(len(light), v), description="")
+            rgl.tabulate_brdf(lambda light, view, v=value: np.full(len(light), v), description="")

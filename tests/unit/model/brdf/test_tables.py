@@ -13,7 +13,7 @@ from reconstruction.brdf_basis import row_kernels
 
 @pytest.fixture(scope="module")
 def point_basis():
-    return brdf_tables.default(0.0)
+    return brdf_tables.default_basis(0.0)
 
 
 def directions(rng, n, least=0.3):
@@ -104,7 +104,7 @@ def test_a_folder_of_merl_files_becomes_a_basis(tmp_path, rng):
     light, view = merl.to_directions(h, d, phi)
     above = (light[..., 2] > 0.0) & (view[..., 2] > 0.0)
     values = np.where(above, brdf(light, view), -1.0)
-    merl.write(tmp_path / "a.binary", merl.MerlTable.of_values(values[..., None]))
+    merl.write(tmp_path / "a.binary", merl.MerlTable.from_values(values[..., None]))
     basis = brdf_tables.load(tmp_path, light_radius_rad=0.0)
     assert basis.names == ("a",)
     to, at = directions(rng, 300), directions(rng, 300)
@@ -141,7 +141,7 @@ def test_measured_folder_is_read_in_order_any_spelling(flaws, tmp_path, rng):
         ("a.binary", "spiked"),
         ("Z.Binary", "holes"),
     ):
-        merl.write(tmp_path / file, merl.MerlTable.of_values(flaws[which]))
+        merl.write(tmp_path / file, merl.MerlTable.from_values(flaws[which]))
     (tmp_path / "readme.txt").write_text("of the measurement")
     (tmp_path / "folder").mkdir()
     tracemalloc.start()
@@ -172,7 +172,7 @@ def test_file_without_light_or_beyond_float32_is_reported(flaws, tmp_path):
             values[0, 0] = 1e40
         elif which == "nothing":
             values = np.full(3, -1.0)
-        merl.write(tmp_path / "a.binary", merl.MerlTable.of_values(values))
+        merl.write(tmp_path / "a.binary", merl.MerlTable.from_values(values))
         with pytest.raises(brdf_tables.BasisError, match=rf"a\.binary: got {message}"):
             brdf_tables.load(tmp_path)
 
@@ -181,10 +181,10 @@ def test_a_mixed_basis_is_the_mixture(point_basis, rng):
     mix = rng.random((3, 59))
     light, view = directions(rng, 20), directions(rng, 20)
     whole = point_basis.evaluate(light, view, [0.0, 0.0, 1.0])
-    mixed = point_basis.mixed(mix).evaluate(light, view, [0.0, 0.0, 1.0])
+    mixed = point_basis.mix_materials(mix).evaluate(light, view, [0.0, 0.0, 1.0])
     np.testing.assert_allclose(mixed, whole @ mix.T, rtol=1e-5)
     with pytest.raises(brdf_tables.BasisError, match="mix"):
-        point_basis.mixed(-mix)
+        point_basis.mix_materials(-mix)
 
 
 def test_directions_below_horizon_reflect_nothing_degenerate_are_finite(point_basis):

@@ -10,7 +10,7 @@ from model import dipole
 from model.dipole import direct_sum as dipole_sum
 from model.dipole import gather as dipole_gather
 from model.dipole import source_tree_kernels
-from model.dipole.direct_sum import Media, exitance_directly
+from model.dipole.direct_sum import DipoleMedia, sum_exitance
 from model.dipole.gather import GatherError, SourceTree, exitance, gather
 from model.fresnel import ETA_SKIN
 
@@ -63,7 +63,7 @@ def test_uniform_light_returns_r_d_of_entering_light(length_mm, r_d):
 def test_tree_sum_matches_direct_sum_within_bound():
     points, area, light = bumpy_face()
     at = points[::37] + np.array([0.02, -0.03, 0.01])
-    expected = exitance_directly(points, area, light, at, R_D, LENGTH_MM, normalize=False)
+    expected = sum_exitance(points, area, light, at, R_D, LENGTH_MM, normalize=False)
     tree = SourceTree.of(points, area)
     worst, work = [], []
     for tolerance in (3.0, 0.3, 0.03):
@@ -86,7 +86,7 @@ def test_normalized_sums_and_own_light_match_direct_sum(known):
     rng = np.random.default_rng(3)
     r_d = rng.uniform(0.01, 0.99, (len(at), 3))
     length = np.exp(rng.uniform(-4.0, 3.0, (len(at), 3)))
-    expected = exitance_directly(points, area, light, at, r_d, length, entered_at=own)
+    expected = sum_exitance(points, area, light, at, r_d, length, entered_at=own)
     found = exitance(points, area, light, at, r_d, length, entered_at=own, tolerance=0.01)
     np.testing.assert_allclose(found, expected, atol=2e-4 * light.max())
     threaded = exitance(
@@ -98,7 +98,7 @@ def test_normalized_sums_and_own_light_match_direct_sum(known):
 @pytest.mark.parametrize("reach_mm", [1e-3, 0.1, 1.0, 30.0])
 @pytest.mark.parametrize("r_d", [1e-4, 0.5, 0.99999])
 def test_kernel_integrates_to_unity_at_any_reach(reach_mm, r_d):
-    media = Media.of(r_d, 1.3, eta=ETA_SKIN)
+    media = DipoleMedia.of(r_d, 1.3, eta=ETA_SKIN)
     ends = [1e-9, *np.geomspace(1e-4, 100.0, 13), reach_mm]
     ends.sort()
     total = sum(
@@ -113,7 +113,9 @@ def test_kernel_integrates_to_unity_at_any_reach(reach_mm, r_d):
 
 def test_shadow_edge_converges_to_dipole_profile_with_sources():
     x = np.array([-2.0, -1.0, -0.3, 0.3, 1.0, 2.0])
-    media = [Media.of(r, length, eta=ETA_SKIN) for r, length in zip(R_D, LENGTH_MM, strict=True)]
+    media = [
+        DipoleMedia.of(r, length, eta=ETA_SKIN) for r, length in zip(R_D, LENGTH_MM, strict=True)
+    ]
     truth = np.array([[edge_profile(place, medium) for medium in media] for place in x])
     worst = []
     for step in (0.8, 0.4, 0.2):
@@ -128,7 +130,7 @@ def test_shadow_edge_converges_to_dipole_profile_with_sources():
 
 def test_source_depth_inverts_eq_5_near_both_ends():
     r_d = np.concatenate([np.geomspace(1e-6, 0.5, 200), 1.0 - np.geomspace(0.49, 1e-9, 300)])
-    media = Media.of(r_d, 2.0, eta=ETA_SKIN)
+    media = DipoleMedia.of(r_d, 2.0, eta=ETA_SKIN)
     expected = 2.0 * np.sqrt(3.0 * dipole.invert_to_deficit(r_d, ETA_SKIN))
     np.testing.assert_allclose(media.depth_mm, expected, rtol=1e-5)
     assert (np.diff(media.depth_mm) < 0.0).all()
@@ -224,7 +226,7 @@ def test_source_tree_leaves_partition_and_nodes_bound_sources():
     rng = np.random.default_rng(5)
     # equal coordinates must not stop the halving
     place = np.concatenate([rng.normal(size=(300, 3)), np.zeros((50, 3))]).astype(np.float32)
-    order, low, high, skip = source_tree_kernels.split(place, 8)
+    order, low, high, skip = source_tree_kernels.split_sources(place, 8)
     assert np.array_equal(np.sort(order), np.arange(350))
     leaves = skip == np.arange(len(skip)) + 1
     covered = np.concatenate(
@@ -234,8 +236,13 @@ def test_source_tree_leaves_partition_and_nodes_bound_sources():
     assert (high[leaves] - low[leaves] <= 8).all()
     tree = SourceTree.of(place, rng.uniform(0.1, 1.0, 350))
     for node in range(len(tree.skip)):
-        inside = tree.place[tree.low[node] : tree.high[node]].astype(float) - tree.seen[node, :3]
-        assert np.linalg.norm(inside, axis=1).max() <= tree.seen[node, 3] * (1 + 1e-6) + 1e-7
+        inside = (
+            tree.position[tree.low[node] : tree.high[node]].astype(float)
+            - tree.node_summary[node, :3]
+        )
+        assert (
+            np.linalg.norm(inside, axis=1).max() <= tree.node_summary[node, 3] * (1 + 1e-6) + 1e-7
+        )
 
 
 @pytest.mark.parametrize(

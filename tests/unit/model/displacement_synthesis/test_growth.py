@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from model.displacement_synthesis import cut_kernels
 from model.displacement_synthesis import growth as synthesis
 from model.displacement_synthesis.layout import CellGrid
-from model.displacement_synthesis.sources import filled, leveled
+from model.displacement_synthesis.sources import fill_holes, level_patch
 from reconstruction import normal_histogram
 from rigsim.skin_patch.microrelief import make_micro_skin
 
@@ -19,7 +19,7 @@ SIDE = 640
 
 def measured(site, seed, size_mm=4.8):
     skin = make_micro_skin(site, seed=seed, size_mm=size_mm, texel_um=PIXEL_UM)
-    return leveled(skin.height_um, pixel_um=PIXEL_UM)
+    return level_patch(skin.height_um, pixel_um=PIXEL_UM)
 
 
 @pytest.fixture(scope="module")
@@ -57,10 +57,10 @@ def test_slopes_keep_the_distribution_of_the_patches(foreheads):
 
 
 def at_and_off_cuts(patches, **changes):
-    layout = synthesis.lay_out(patches, SIDE, rng=np.random.default_rng(2), **knobs(**changes))
+    layout = synthesis.build_layout(patches, SIDE, rng=np.random.default_rng(2), **knobs(**changes))
     whole = (0, SIDE), (0, SIDE)
     height = layout.draw(*whole)
-    cuts = layout.at_cuts(*whole)
+    cuts = layout.cut_mask(*whole)
     cuts[[0, -1]] = cuts[:, [0, -1]] = False  # the map ends there
     down, right = np.gradient(height.astype(np.float64))
     slope, bend = right**2 + down**2, curvature(height) ** 2
@@ -92,7 +92,7 @@ def test_threads_and_parts_do_not_change_a_byte(foreheads):
         synthesis.grow(foreheads, size, rng=np.random.default_rng(3), threads=n, **knobs())
         for n in (1, 3)
     ]
-    layout = synthesis.lay_out(foreheads, size, rng=np.random.default_rng(3), **knobs())
+    layout = synthesis.build_layout(foreheads, size, rng=np.random.default_rng(3), **knobs())
     part = layout.draw((1000, 1060), (900, 1200))
     assert maps[0].tobytes() == maps[1].tobytes()
     assert part.tobytes() == maps[0][1000:1060, 900:1200].tobytes()
@@ -183,7 +183,7 @@ def test_features_keep_skin_size_where_pixels_vary(foreheads):
 def test_windows_keep_off_holes_when_they_can(foreheads):
     holed = foreheads[0].copy()
     holed[100:140, :30] = np.nan
-    layout = synthesis.lay_out([holed], 300, rng=np.random.default_rng(11), **knobs())
+    layout = synthesis.build_layout([holed], 300, rng=np.random.default_rng(11), **knobs())
     assert layout.filled_fraction == 0.0
     assert np.isfinite(layout.draw((0, 300), (0, 300))).all()
 
@@ -191,7 +191,7 @@ def test_windows_keep_off_holes_when_they_can(foreheads):
 def test_pixels_that_were_filled_are_counted(foreheads):
     holed = foreheads[0].copy()
     holed[::16, ::16] = np.nan
-    layout = synthesis.lay_out([holed], 300, rng=np.random.default_rng(12), **knobs())
+    layout = synthesis.build_layout([holed], 300, rng=np.random.default_rng(12), **knobs())
     assert abs(layout.filled_fraction / (1 / 256) - 1.0) < 0.1
     assert np.isfinite(layout.draw((0, 300), (0, 300))).all()
 
@@ -200,7 +200,7 @@ def test_a_hole_is_bridged_between_its_borders():
     plane = np.add.outer(np.arange(40.0), np.zeros(40))
     known = np.ones((40, 40), bool)
     known[15:25, 15:25] = False
-    bridged = filled(plane, known)
+    bridged = fill_holes(plane, known)
     np.testing.assert_array_equal(bridged[known], plane[known])
     assert np.abs(bridged - plane).max() < 5.0
 
@@ -209,7 +209,7 @@ def test_leveling_halves_cutoff_wave_and_keeps_short_waves():
     x = np.arange(600) * 10.0
     for wave_um, kept in ((1000.0, 0.5), (100.0, 1.0), (8000.0, 0.01)):
         wave = np.tile(np.sin(2 * np.pi * x / wave_um), (600, 1))
-        part = leveled(wave, pixel_um=10.0)[200:400, 100:500]
+        part = level_patch(wave, pixel_um=10.0)[200:400, 100:500]
         gain = (part * wave[200:400, 100:500]).sum() / (wave[200:400, 100:500] ** 2).sum()
         assert abs(gain - kept) < 0.05
 
@@ -333,7 +333,7 @@ def test_map_may_be_line_or_below_cell_size():
 
 
 def test_a_part_outside_the_map_is_refused(foreheads):
-    layout = synthesis.lay_out(foreheads, 200, rng=np.random.default_rng(0), **knobs())
+    layout = synthesis.build_layout(foreheads, 200, rng=np.random.default_rng(0), **knobs())
     with pytest.raises(synthesis.SynthesisError, match=r"rows: got 100...201"):
         layout.draw((100, 201), (0, 10))
 

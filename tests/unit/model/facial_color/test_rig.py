@@ -252,7 +252,7 @@ def test_standard_error_covers_detail_omitted_by_eq_6(neutral, rng):
 
 def test_transfer_to_the_same_neutral_map_changes_nothing(rig, neutral):
     for transfer in ("ratio", "difference", "absolute"):
-        again = rig.applied_to(neutral, transfer=transfer)
+        again = rig.transfer_to(neutral, transfer=transfer)
         np.testing.assert_allclose(
             again.blend({"smile": 1.0}), rig.blend({"smile": 1.0}), rtol=1e-3
         )
@@ -267,7 +267,7 @@ def test_dilation_transfers_to_face_with_different_blood(neutral, rng):
     truth = factor * other
     errors = {
         transfer: np.sqrt(
-            np.mean((rig.applied_to(other, transfer=transfer).blend({"state": 1.0}) - truth) ** 2)
+            np.mean((rig.transfer_to(other, transfer=transfer).blend({"state": 1.0}) - truth) ** 2)
         )
         for transfer in ("ratio", "difference", "absolute")
     }
@@ -278,7 +278,7 @@ def test_transfer_to_another_size_and_mask(rig, neutral, rng):
     painted = np.kron(neutral[::2, ::2], np.ones((4, 4)))
     mask = np.ones(painted.shape, bool)
     mask[:30] = False
-    other = rig.applied_to(painted, valid=mask)
+    other = rig.transfer_to(painted, valid=mask)
     assert other.radius_px == pytest.approx(2 * rig.radius_px, rel=0.01)
     found = other.evaluate({"smile": 1.0})
     np.testing.assert_array_equal(found.valid, mask)
@@ -289,7 +289,7 @@ def test_transfer_to_another_size_and_mask(rig, neutral, rng):
         rtol=0.01,
     )
     with pytest.raises(FacialColorError, match="transfer: got 'x'"):
-        rig.applied_to(neutral, transfer="x")
+        rig.transfer_to(neutral, transfer="x")
 
 
 def test_rig_survives_its_folder(rig, tmp_path):

@@ -7,10 +7,10 @@ from model.microstructure.convolution import (
     LineKernels,
     convolve,
     convolve_tiled,
-    tiles_of,
+    list_tiles,
 )
 from model.microstructure.convolution_kernels import distance_to_invalid
-from model.microstructure.map_windows import Window
+from model.microstructure.map_windows import MapWindow
 
 X, Y = (1.0, 0.0), (0.0, 1.0)
 
@@ -246,7 +246,7 @@ def test_tiles_reproduce_whole_map_exactly_and_can_resume(rng):
         try:
             convolve_tiled(height, target, fields_at, progress=stop, **arguments)
         except KeyboardInterrupt:
-            left = [w for n, w in enumerate(tiles_of(shape, tile)) if n not in done]
+            left = [w for n, w in enumerate(list_tiles(shape, tile)) if n not in done]
             assert all((target[w.rows, w.columns] == -7.0).all() for w in left)
             convolve_tiled(height, target, fields_at, finished=done, **arguments)
         np.testing.assert_array_equal(target, whole)
@@ -302,8 +302,8 @@ def test_out_of_range_parameters_are_refused_by_name():
     with pytest.raises(ConvolutionError, match="source: got"):
         convolve_tiled(np.zeros((4, 5), np.float32)[:0], height, lambda w: None)
     with pytest.raises(ConvolutionError, match="tile"):
-        tiles_of((4, 4), 0)
-    assert Window(0, 2, 0, 2).grown(3, (4, 4)) == Window(0, 4, 0, 4)
+        list_tiles((4, 4), 0)
+    assert MapWindow(0, 2, 0, 2).expand(3, (4, 4)) == MapWindow(0, 4, 0, 4)
 
 
 def test_input_is_unmodified(rng):

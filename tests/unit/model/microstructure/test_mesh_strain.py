@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from model.microstructure.mesh_strain import StrainError, places_of, strain
+from model.microstructure.mesh_strain import StrainError, index_points, strain
 
 
 def sheet(n=6, size_mm=10.0):
@@ -278,4 +278,4 @@ def test_meshes_that_do_not_fit_are_refused():
             strain(*arguments)
     nothing = strain(np.zeros((3, 3)), np.ones((3, 3)), np.zeros((0, 3), int), np.zeros((3, 2)))
     assert not nothing.valid.any()
-    np.testing.assert_array_equal(places_of(np.array([[0.0], [-0.0], [1.0]])), [0, 0, 1])
+    np.testing.assert_array_equal(index_points(np.array([[0.0], [-0.0], [1.0]])), [0, 0, 1])

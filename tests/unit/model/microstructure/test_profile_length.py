@@ -6,7 +6,7 @@ from scipy.special import ellipe
 
 from model import microstructure
 from model.microstructure import profile_length
-from model.microstructure.profile_length import ProfileError
+from model.microstructure.profile_length import SurfaceProfileError
 from rigsim.skin_patch.microrelief import make_micro_skin
 
 SPACING_UM = 5.0
@@ -55,10 +55,10 @@ def test_a_kernel_is_found_that_keeps_the_length(profiles, used):
     """It sharpens under compression and smooths under stretch, here by half of the reserve."""
     for profile in profiles:
         stretch = 1.0 + used * (reserve_of(profile) - 1.0)
-        found = profile_length.keep_length(
+        found = profile_length.find_length_preserving_kernel(
             profile, spacing_um=SPACING_UM, stretch=stretch, sigma_um=60.0
         )
-        assert found.kept
+        assert found.is_preserved
         assert found.change.convolved_um == pytest.approx(found.change.neutral_um, rel=1e-10)
         assert abs(found.change.unchanged_ratio - 1.0) > 1e-4
         assert (found.change.alpha < 0) == (stretch < 1)
@@ -66,7 +66,7 @@ def test_a_kernel_is_found_that_keeps_the_length(profiles, used):
 
 def test_stronger_strain_needs_stronger_kernels(profiles):
     alphas = [
-        profile_length.keep_length(
+        profile_length.find_length_preserving_kernel(
             profiles[0], spacing_um=SPACING_UM, stretch=r, sigma_um=25.0
         ).change.alpha
         for r in (0.7, 0.8, 0.9, 1.0, 1.01, 1.02)
@@ -79,31 +79,31 @@ def test_stretch_beyond_reserve_is_reported(profiles):
     """No surface is shorter than the ground it stands on."""
     profile = profiles[0]
     stretch = 1.05 * reserve_of(profile)
-    found = profile_length.keep_length(
+    found = profile_length.find_length_preserving_kernel(
         profile, spacing_um=SPACING_UM, stretch=stretch, sigma_um=25.0
     )
-    assert not found.kept
+    assert not found.is_preserved
     assert 1.0 < found.change.convolved_ratio < found.change.unchanged_ratio
 
 
 def test_a_flat_profile_has_no_reserve():
     for stretch in (0.8, 1.2):
-        found = profile_length.keep_length(
+        found = profile_length.find_length_preserving_kernel(
             np.full(50, 3.0), spacing_um=1.0, stretch=stretch, sigma_um=5.0
         )
-        assert not found.kept
+        assert not found.is_preserved
         assert found.change.alpha == 0.0
         assert found.change.convolved_ratio == pytest.approx(stretch)
 
 
 def test_strength_beyond_kernel_range_is_reported(profiles):
-    weak = profile_length.keep_length(
+    weak = profile_length.find_length_preserving_kernel(
         profiles[0], spacing_um=SPACING_UM, stretch=0.6, sigma_um=SPACING_UM
     )
-    strong = profile_length.keep_length(
+    strong = profile_length.find_length_preserving_kernel(
         profiles[0], spacing_um=SPACING_UM, stretch=0.97, sigma_um=60.0
     )
-    assert weak.kept
+    assert weak.is_preserved
     assert not weak.within_limits
     assert strong.within_limits
 
@@ -128,7 +128,7 @@ def test_kernel_is_plain_sum_of_eq_6(rng):
     half = microstructure.gaussian_weights(2.0)
     padded = np.pad(height, half.size - 1, mode="symmetric")
     blurred = np.convolve(padded, np.concatenate([half[:0:-1], half]), mode="valid")
-    found = profile_length.convolved(height, -0.7, 8.0, spacing_um=4.0)
+    found = profile_length.convolve_profile(height, -0.7, 8.0, spacing_um=4.0)
     np.testing.assert_allclose(found, 1.7 * height - 0.7 * blurred, atol=1e-13)
 
 
@@ -148,5 +148,5 @@ WAVE = np.sin(np.arange(50.0))
 )
 def test_invalid_profile_length_input_is_refused_by_name(height, changes, message):
     given = {"spacing_um": 1.0, "stretch": 1.1, "sigma_um": 2.0, **changes}
-    with pytest.raises(ProfileError, match=message):
-        profile_length.keep_length(height, **given)
+    with pytest.raises(SurfaceProfileError, match=message):
+        profile_length.find_length_preserving_kernel(height, **given)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from model.microstructure.kernel_table import FOREHEAD, kernel_parameters
-from model.microstructure.map_windows import Window
+from model.microstructure.map_windows import MapWindow
 from model.microstructure.mesh_strain import StrainError, strain
 from model.microstructure.strain_fields import line_kernels, rasterize
 
@@ -93,7 +93,11 @@ def test_edge_sharing_triangles_leave_no_gap_windows_agree():
     u, v = (x + 0.5) / size[1], 1.0 - (y + 0.5) / size[0]
     inside = (u > 0.1) & (u < 0.9) & (v > 0.1) & (v < 0.9)
     np.testing.assert_array_equal(whole.covered, inside)
-    for window in (Window(0, 70, 0, 240), Window(33, 101, 77, 200), Window(150, 200, 190, 240)):
+    for window in (
+        MapWindow(0, 70, 0, 240),
+        MapWindow(33, 101, 77, 200),
+        MapWindow(150, 200, 190, 240),
+    ):
         part = rasterize(found_strain, faces, uv, size, window=window)
         for name in ("stretch", "axes", "px_per_mm", "covered", "padded"):
             np.testing.assert_array_equal(
@@ -132,7 +136,7 @@ def test_neutral_pose_leaves_every_kernel_at_nothing():
     _, faces, uv = wavy()
     points = np.concatenate([20.0 * uv, np.zeros((len(uv), 1))], axis=1)
     still = rasterize(strain(points, points, faces, uv), faces, uv, (32, 32))
-    assert all(line.nothing for line in line_kernels(still))
+    assert all(line.is_identity for line in line_kernels(still))
 
 
 def test_zero_area_or_strainless_triangles_cover_nothing():
@@ -149,7 +153,7 @@ def test_zero_area_or_strainless_triangles_cover_nothing():
 def test_mismatched_windows_and_meshes_are_refused():
     found, faces, uv = wavy()
     with pytest.raises(StrainError, match="window"):
-        rasterize(found, faces, uv, (10, 10), window=Window(0, 11, 0, 5))
+        rasterize(found, faces, uv, (10, 10), window=MapWindow(0, 11, 0, 5))
     with pytest.raises(StrainError, match="uv"):
         rasterize(found, faces, uv[:-1], (10, 10))
     with pytest.raises(StrainError, match="size"):

@@ -11,8 +11,8 @@ from model.photon_table import kernels
 from model.photon_table import medium as photon_medium
 from model.photon_table.disc_distances import distance_rule
 from model.tissue_optics import adding_doubling
-from rigsim.fiber.profile import fibre_profile
-from rigsim.tissue.tissue_mc import Layer, LayerStack, transport
+from rigsim.fiber.profile import trace_fiber_profile
+from rigsim.tissue.tissue_mc import Layer, LayerStack, trace_photons
 
 RADII = np.arange(0.3, 7.2, 0.25)
 LOG_RADII = np.linspace(np.log(1e-5), np.log(1e4), 4000)
@@ -79,7 +79,7 @@ def test_rings_agree_with_the_simulators_own_transport():
     worst = []
     for sigma_a in (0.01, 0.1, 1.0):
         tissue = LayerStack((Layer(np.inf, sigma_a, 5.0, 0.8, 1.4),))
-        run = transport(tissue, photons=24_000, rng=rng, ring_edges_mm=edges, batches=60)
+        run = trace_photons(tissue, photons=24_000, rng=rng, ring_edges_mm=edges, batches=60)
         node, weight = np.polynomial.legendre.leggauss(8)
         r = 0.5 * (edges[1:, None] * (1 + node) + edges[:-1, None] * (1 - node))
         at = photon_table.reflectance(r, sigma_a, 1.0)
@@ -96,7 +96,7 @@ def test_rings_agree_with_the_simulators_own_transport():
 
 def fibres(sigma_a, sigma_s, g, photons, rng):
     tissue = LayerStack((Layer(np.inf, sigma_a, sigma_s / (1.0 - g), g, 1.4),))
-    return fibre_profile(tissue, radii_mm=tuple(RADII), photons=photons, rng=rng)
+    return trace_fiber_profile(tissue, radii_mm=tuple(RADII), photons=photons, rng=rng)
 
 
 def z_scores(run, sigma_a, sigma_s, g, cores=(0.2, 0.2)):
@@ -130,7 +130,7 @@ def test_reflectance_is_positive_and_falls_with_absorption(collection):
     absorption = np.concatenate([[0.0], np.geomspace(1e-6, 10.0, 60)])[:, None]
     for eta in (1.0, 1.25, 1.4, 1.6):
         slopes = photon_table.derivatives(radius, absorption, 1.0, eta=eta, collection=collection)
-        holds = photon_table.domain(radius, absorption, 1.0, eta=eta, collection=collection)
+        holds = photon_table.is_in_domain(radius, absorption, 1.0, eta=eta, collection=collection)
         assert np.mean(holds) > 0.6
         assert np.all(slopes.reflectance_per_mm2 > 0.0)
         assert np.all(slopes.by_sigma_a[holds] < 0.0)
@@ -186,7 +186,7 @@ def test_rows_of_profiles_equal_single_evaluations(rng):
 
 
 def test_the_kernel_equals_a_spline_of_scipy():
-    medium = photon_medium.prepare(1.37, 0.83, "fibre")
+    medium = photon_medium.prepare_medium(1.37, 0.83, "fibre")
     radius, a, s = 2.3, 0.4, 1.7
     x = (np.log(radius * s) - kernels.RADIUS_START) / kernels.RADIUS_STEP
     u = np.sqrt(a / s)
@@ -285,7 +285,7 @@ def test_stated_errors_are_small_where_fibers_measure():
 
 
 def test_the_domain_ends_where_the_table_does():
-    holds = photon_table.domain
+    holds = photon_table.is_in_domain
     assert holds([0.3, 7.05], 0.05, 1.5).all()
     assert not holds(1.0, 20.0, 1.0)
     assert holds(0.1, 10.0, 1.0)

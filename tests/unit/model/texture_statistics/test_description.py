@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from model.texture_statistics.description import describe, match, statistics
-from model.texture_statistics.histograms import distance, project_to_histograms
+from model.texture_statistics.histograms import histogram_distance, project_to_histograms
 from model.texture_statistics.space import TextureError, TextureSpace
 
 
@@ -46,7 +46,7 @@ def test_matching_gives_an_image_the_statistics_of_another(rng):
     assert found.after.mean() < 0.25 * found.before.mean()
     # the distances are those of the image that is returned
     again = statistics(found.image, space=space).vector
-    expected = distance(
+    expected = histogram_distance(
         space.histograms(again), space.histograms(describe(target, space=space)), space.edges
     )
     np.testing.assert_allclose(found.after, expected, atol=2e-3)
@@ -84,7 +84,7 @@ def test_masked_texture_nearly_has_whole_texture_statistics(rng):
     black = np.where(valid[..., None], image, 0.0).astype(np.float32)
     plain = space.histograms(describe(black, space=space, region=valid))
     fine = slice(1, 14)  # the coarse levels have too few samples to tell
-    off = [distance(h, whole, space.edges)[:, fine].mean() for h in (masked, plain)]
+    off = [histogram_distance(h, whole, space.edges)[:, fine].mean() for h in (masked, plain)]
     assert off[0] < 0.06
     assert off[1] > 3.0 * off[0]
 
@@ -112,8 +112,8 @@ def test_region_of_few_texels_is_described_and_matched(rng):
     few[10, 7:10] = True
     space = TextureSpace.fit([image, target])
     found = statistics(image, space=space, region=few)
-    assert found.effective[0, 0] == pytest.approx(3.0)
-    assert (found.effective >= 1.0 - 1e-6).all()
+    assert found.n_effective[0, 0] == pytest.approx(3.0)
+    assert (found.n_effective >= 1.0 - 1e-6).all()
     matched = match(image, describe(target, space=space), space=space, region=few)
     np.testing.assert_array_equal(matched.image[~few], image[~few])
     assert np.isfinite(matched.image).all()
@@ -139,7 +139,7 @@ def test_coarsest_cell_shift_is_invariant_others_nearly(rng):
     shifted = space.histograms(describe(np.roll(image, (3, 11), (0, 1)), space=space))
     mirrored = space.histograms(describe(image.transpose(1, 0, 2), space=space))
     moved, turned = (
-        distance(h, space.histograms(vector), space.edges)[:, :14].mean()
+        histogram_distance(h, space.histograms(vector), space.edges)[:, :14].mean()
         for h in (shifted, mirrored)
     )
     assert moved < 0.02
@@ -296,7 +296,7 @@ def test_mismatched_description_input_is_refused_by_name(rng):
         ("start", lambda: match(image, vector, start="elsewhere")),
         ("vector", lambda: match(image, vector[:-1])),
         ("project_to_histograms", lambda: match(image, vector - 1e-3)),
-        ("channels", lambda: match(image[..., 0], vector, space=TextureSpace.standard(3))),
+        ("channels", lambda: match(image[..., 0], vector, space=TextureSpace.opponent(3))),
     ]
     for message, call in cases:
         with pytest.raises(TextureError, match=message):

@@ -94,7 +94,7 @@ def test_invalid_texture_space_file_is_reported(tmp_path, content):
 
 
 def test_parts_tile_vector_in_name_order():
-    space = TextureSpace.standard()
+    space = TextureSpace.opponent()
     assert space.size == 23808
     assert len(space.responses) == 31
     parts = [space.part(c, r) for c in range(3) for r in range(31)]
@@ -106,7 +106,7 @@ def test_parts_tile_vector_in_name_order():
 
 
 def test_vectors_are_checked():
-    space = TextureSpace.standard(1)
+    space = TextureSpace.opponent(1)
     good = np.tile(np.full(256, 1 / 256), 31)
     assert space.check(good).shape == (1, 31, 256)
     with pytest.raises(TextureError, match="shape"):
@@ -118,7 +118,7 @@ def test_vectors_are_checked():
 
 
 def test_a_space_that_fits_nothing_is_named(rng):
-    space = TextureSpace.standard()
+    space = TextureSpace.opponent()
     for mean, axes, edges in (
         (space.mean, 2 * space.axes, space.edges),
         (space.mean, space.axes, space.edges[:, :, ::-1]),
@@ -131,7 +131,7 @@ def test_a_space_that_fits_nothing_is_named(rng):
         with pytest.raises(TextureError, match="images"):
             TextureSpace.fit(images, valid=valid)
     with pytest.raises(TextureError, match="standard"):
-        TextureSpace.standard(5)
+        TextureSpace.opponent(5)
 
 
 def test_filled_area_continues_surroundings_without_detail(rng):

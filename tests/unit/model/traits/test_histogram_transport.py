@@ -18,19 +18,19 @@ def test_bell_quantiles_match_normal_distribution():
     from scipy.stats import norm
 
     found = transport.quantiles(bell(0.3, 0.5), EDGES)
-    expected = norm.ppf(transport.shares(), 0.3, 0.5)
+    expected = norm.ppf(transport.quantile_levels(), 0.3, 0.5)
     np.testing.assert_allclose(found[3:-3], expected[3:-3], atol=0.01)
 
 
 def test_shift_moves_bell_and_keeps_shape():
-    found = transport.moved(bell(-1.0, 0.4), EDGES, np.full(256, 1.5))
+    found = transport.shift_quantiles(bell(-1.0, 0.4), EDGES, np.full(256, 1.5))
     assert np.abs(np.cumsum(found) - np.cumsum(bell(0.5, 0.4))).max() < 0.01
 
 
 def test_a_wider_spread_is_a_change_too():
     source = bell(0.0, 0.4)
     change = 0.5 * transport.quantiles(source, EDGES)
-    found = transport.moved(source, EDGES, change)
+    found = transport.shift_quantiles(source, EDGES, change)
     assert np.abs(np.cumsum(found) - np.cumsum(bell(0.0, 0.6))).max() < 0.01
 
 
@@ -38,8 +38,8 @@ def test_a_wider_spread_is_a_change_too():
 def test_the_opposite_change_brings_back(mean, rng):
     source = bell(mean, 0.3)
     change = 0.2 + 0.3 * np.linspace(-1, 1, 256)
-    there = transport.moved(source, EDGES, change)
-    back = transport.moved(there, EDGES, -change)
+    there = transport.shift_quantiles(source, EDGES, change)
+    back = transport.shift_quantiles(there, EDGES, -change)
     assert np.abs(np.cumsum(back) - np.cumsum(source)).max() < 0.02
     assert np.abs(np.cumsum(there) - np.cumsum(source)).max() > 0.2
 
@@ -48,9 +48,9 @@ def test_null_change_is_identity_any_change_keeps_histogram(rng):
     several = rng.random((2, 3, 256)) * (rng.random((2, 3, 256)) > 0.5)
     several /= several.sum(axis=-1, keepdims=True)
     edges = np.broadcast_to(EDGES, (2, 3, 257))
-    np.testing.assert_array_equal(transport.moved(several, edges, np.zeros(256)), several)
+    np.testing.assert_array_equal(transport.shift_quantiles(several, edges, np.zeros(256)), several)
     wild = 10 * rng.standard_normal((2, 3, 256))
-    found = transport.moved(several, edges, wild)
+    found = transport.shift_quantiles(several, edges, wild)
     assert found.min() >= 0
     np.testing.assert_allclose(found.sum(axis=-1), 1.0, rtol=1e-12)
 
@@ -58,25 +58,25 @@ def test_null_change_is_identity_any_change_keeps_histogram(rng):
 def test_a_single_value_moves_as_a_whole():
     spike = np.zeros(256)
     spike[100] = 1.0
-    found = transport.moved(spike, EDGES, np.full(256, 3 * (EDGES[1] - EDGES[0])))
+    found = transport.shift_quantiles(spike, EDGES, np.full(256, 3 * (EDGES[1] - EDGES[0])))
     assert found[103] == pytest.approx(1.0, abs=1e-6)
 
 
 def test_wider_edges_contain_values_leaving_old_edges():
     source, change = bell(2.0, 0.3), np.full(256, 3.0)
-    wide = transport.widened(source, EDGES, change)
+    wide = transport.widen_edges(source, EDGES, change)
     assert wide[-1] > 5.0
     assert np.all(np.diff(wide) > 0)
-    found = transport.moved(source, EDGES, change, onto=wide)
+    found = transport.shift_quantiles(source, EDGES, change, target_edges=wide)
     middle = 0.5 * (wide[1:] + wide[:-1])
     assert found @ middle == pytest.approx(5.0, abs=0.03)
-    np.testing.assert_array_equal(transport.widened(source, EDGES, np.zeros(256)), EDGES)
+    np.testing.assert_array_equal(transport.widen_edges(source, EDGES, np.zeros(256)), EDGES)
 
 
 def test_invalid_histogram_is_refused():
-    with pytest.raises(transport.TransportError, match="edges: got"):
+    with pytest.raises(transport.HistogramTransportError, match="edges: got"):
         transport.quantiles(np.ones(4) / 4, np.arange(4.0))
-    with pytest.raises(transport.TransportError, match="sum"):
+    with pytest.raises(transport.HistogramTransportError, match="sum"):
         transport.quantiles(np.ones(4), np.arange(5.0))
-    with pytest.raises(transport.TransportError, match="finite"):
-        transport.moved(np.ones(4) / 4, np.arange(5.0), np.full(256, np.nan))
+    with pytest.raises(transport.HistogramTransportError, match="finite"):
+        transport.shift_quantiles(np.ones(4) / 4, np.arange(5.0), np.full(256, np.nan))

@@ -63,7 +63,7 @@ def test_edit_of_amount_0_is_bit_exact(rng):
         assert edit.weights.dtype == np.float32
         np.testing.assert_array_equal(edit.weights, weights)
         np.testing.assert_array_equal(edit.mix, mix)
-        assert edit.share == 0.0
+        assert edit.clipped_fraction == 0.0
 
 
 @pytest.mark.parametrize("amount", [0.7, -0.5, 30.0])
@@ -80,7 +80,7 @@ def test_edit_and_opposite_return_within_clipped_amount(rng, amount):
         assert lengths.max() < 1e-9
     else:  # lobes were used up: something is lost, and said so
         assert lengths.max() > 0.001 * there.moved.max()
-        assert 0.0 < there.share < 1.0
+        assert 0.0 < there.clipped_fraction < 1.0
 
 
 def test_weights_stay_non_negative_whatever_is_asked(rng):
@@ -169,5 +169,5 @@ def test_lengths_are_those_of_reflected_light(rng):
     m = bumps()
     v = rng.normal(size=(7, COUNT))
     np.testing.assert_allclose(
-        reduced_spaces.lengths(v, m.T @ m), np.linalg.norm(v @ m.T, axis=1), rtol=1e-9
+        reduced_spaces.metric_lengths(v, m.T @ m), np.linalg.norm(v @ m.T, axis=1), rtol=1e-9
     )

@@ -3,7 +3,7 @@ import pytest
 from scipy.optimize import nnls
 
 from model.traits import feasible_sets, nonnegative_kernels, reduced_spaces
-from model.traits.feasible_sets import Free, Histograms, NonNegative
+from model.traits.feasible_sets import HistogramSet, NonNegativeSet, UnconstrainedSet
 from model.traits.space import TraitSpace, cosine
 from model.traits.vectors import TraitError
 
@@ -120,7 +120,7 @@ def test_edit_of_amount_0_returns_sample_bit_exact(rng, space):
 def test_unclipped_edit_and_opposite_return_source(rng):
     samples, label, _ = population(rng)
     space = TraitSpace.fit(samples, {"tan": label})
-    there = space.outcome(samples[20], {"tan": 0.7})
+    there = space.edit_with_outcome(samples[20], {"tan": 0.7})
     assert there.clipped == 0.0
     np.testing.assert_allclose(space.edit(there.sample, {"tan": -0.7}), samples[20], atol=1e-12)
 
@@ -129,13 +129,13 @@ def test_unclipped_edit_and_opposite_return_source(rng):
 def test_edit_and_opposite_return_source_within_stated_bound(rng, amount):
     samples, label = histograms(rng)
     space = TraitSpace.fit(samples, {"tan": label})
-    there = space.outcome(samples, {"tan": amount})
+    there = space.edit_with_outcome(samples, {"tan": amount})
     back = space.edit(there.sample, {"tan": -amount})
     away = np.linalg.norm(back - samples, axis=1)
     assert (away <= there.return_bound + 1e-12).all()
     # the bound is no idle one: something was clipped, and the way back misses by some of it
     assert away.max() > 0.05 * there.return_bound.max() > 0.0
-    assert (there.share <= 1.0).all()
+    assert (there.clipped_fraction <= 1.0).all()
 
 
 def test_edited_mixtures_stay_nonnegative_and_return_within_bound(rng):
@@ -144,11 +144,11 @@ def test_edited_mixtures_stay_nonnegative_and_return_within_bound(rng):
     label = np.arange(30) < 12
     samples[label] += np.linspace(0.0, 0.8, 12)
     space = TraitSpace.fit(samples, {"lotion": label}, metric=g)
-    there = space.outcome(samples, {"lotion": -1.5})
+    there = space.edit_with_outcome(samples, {"lotion": -1.5})
     assert there.sample.min() >= 0.0
     assert there.clipped.max() > 0.0
     back = space.edit(there.sample, {"lotion": 1.5})
-    away = reduced_spaces.lengths(back - samples, g)
+    away = reduced_spaces.metric_lengths(back - samples, g)
     assert (away <= there.return_bound * (1 + 1e-6) + 1e-9).all()
 
 
@@ -156,9 +156,9 @@ def test_mixture_shortfall_is_taken_from_similar_components(rng):
     g = products(rng)
     wanted = np.zeros(12)
     wanted[5], wanted[6] = 1.0, -0.5
-    by_kin = NonNegative().project(wanted, g)
-    plain = NonNegative().project(wanted)
-    off = [float(reduced_spaces.lengths(p - wanted, g)) for p in (by_kin, plain)]
+    by_kin = NonNegativeSet().project(wanted, g)
+    plain = NonNegativeSet().project(wanted)
+    off = [float(reduced_spaces.metric_lengths(p - wanted, g)) for p in (by_kin, plain)]
     assert off[0] < 0.9 * off[1]
 
 
@@ -166,7 +166,7 @@ def test_mixture_shortfall_is_taken_from_similar_components(rng):
 def test_edited_histograms_are_histograms(rng, amount):
     samples, label = histograms(rng)
     space = TraitSpace.fit(samples, {"tan": label})
-    assert space.feasible == Histograms(256)
+    assert space.feasible == HistogramSet(256)
     edited = space.edit(samples[25], {"tan": amount}).reshape(-1, 256)
     assert edited.min() >= 0.0
     np.testing.assert_allclose(edited.sum(axis=1), 1.0, atol=1e-12)
@@ -323,7 +323,7 @@ def test_non_negative_nearest_mixtures_are_those_of_scipy(rng):
     a = rng.random((20, 9)) + 0.2
     a[:, 3] = a[:, 2] + 1e-3 * a[:, 3]
     wanted = rng.normal(size=(50, 9))
-    found = nonnegative_kernels.nearest(a.T @ a, wanted)
+    found = nonnegative_kernels.nearest_mixtures(a.T @ a, wanted)
     misfit = np.linalg.norm((found - wanted) @ a.T, axis=1)
     least = [nnls(a, a @ t)[1] for t in wanted]
     np.testing.assert_allclose(misfit, least, rtol=1e-6)
@@ -332,18 +332,20 @@ def test_non_negative_nearest_mixtures_are_those_of_scipy(rng):
 
 def test_nonnegative_mixtures_are_their_own_nearest(rng):
     wanted = rng.random((5, 6))
-    np.testing.assert_array_equal(nonnegative_kernels.nearest(np.ones((6, 6)), wanted), wanted)
+    np.testing.assert_array_equal(
+        nonnegative_kernels.nearest_mixtures(np.ones((6, 6)), wanted), wanted
+    )
 
 
 def test_histogram_projection_is_nearest_histogram(rng):
     given = rng.normal(size=7)
-    found = Histograms(7).project(given)
+    found = HistogramSet(7).project(given)
     near = np.linalg.norm(found - given)
     others = rng.dirichlet(np.ones(7), 2000)
     steps = found + 0.05 * (others - found)
     assert near <= np.linalg.norm(steps - given, axis=1).min()
     assert near <= np.linalg.norm(others - given, axis=1).min()
-    np.testing.assert_allclose(Histograms(7).project(found), found, atol=1e-15)
+    np.testing.assert_allclose(HistogramSet(7).project(found), found, atol=1e-15)
 
 
 def test_samples_outside_their_set_are_refused(rng):
@@ -353,13 +355,13 @@ def test_samples_outside_their_set_are_refused(rng):
         space.edit(samples[0] * 1.01, {"tan": 0.5})
     bad = np.vstack([samples[:-1], samples[-1:] * 1.01])
     with pytest.raises(TraitError, match="1 of 30 are not in the set"):
-        TraitSpace.fit(bad, {"tan": label}, feasible=Histograms())
+        TraitSpace.fit(bad, {"tan": label}, feasible=HistogramSet())
 
 
 def test_smallest_set_containing_samples_is_found(rng):
-    assert feasible_sets.smallest(histograms(rng)[0]) == Histograms(256)
-    assert feasible_sets.smallest(rng.random((3, 256))) == NonNegative()
-    assert feasible_sets.smallest(rng.normal(size=(3, 256))) == Free()
+    assert feasible_sets.smallest_feasible_set(histograms(rng)[0]) == HistogramSet(256)
+    assert feasible_sets.smallest_feasible_set(rng.random((3, 256))) == NonNegativeSet()
+    assert feasible_sets.smallest_feasible_set(rng.normal(size=(3, 256))) == UnconstrainedSet()
 
 
 def test_nmf_coordinates_are_nonnegative_vectors_within_basis(rng):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from model.traits import storage as trait_storage
-from model.traits.feasible_sets import Histograms, NonNegative
+from model.traits.feasible_sets import HistogramSet, NonNegativeSet
 from model.traits.space import TraitSpace
 from model.traits.storage import TraitFileError, TraitLibrary
 from model.traits.vectors import TraitError
@@ -85,9 +85,9 @@ def test_low_bit_edits_stay_feasible_amount_0_identity(library):
     back = trait_storage.from_bytes(library.to_bytes(precision="int8")).spaces["albedo"]
     source = library.spaces["albedo"].center
     edited = back.edit(source, {"tan": 0.8})
-    assert Histograms().contains(edited)
+    assert HistogramSet().contains(edited)
     np.testing.assert_array_equal(back.edit(source, {"tan": 0.0}), source)
-    assert Histograms().contains(back.mean_with("tan"))
+    assert HistogramSet().contains(back.mean_with("tan"))
     mixed = back.edit(source, {"tan": 1.0}, mode="convex")
     np.testing.assert_allclose(mixed, back.mean_with("tan"), atol=1e-12)
 
@@ -96,7 +96,7 @@ def test_short_samples_are_stored_exactly(library):
     back = trait_storage.from_bytes(library.to_bytes(precision="int8")).spaces["surface"]
     lotion = library.spaces["surface"].trait("lotion")
     np.testing.assert_array_equal(back.trait("lotion").vector, lotion.vector)
-    assert back.feasible == NonNegative()
+    assert back.feasible == NonNegativeSet()
     assert np.isinf(back.trait("rare").confidence.relative_noise) == np.isinf(
         library.spaces["surface"].trait("rare").confidence.relative_noise
     )
@@ -132,13 +132,13 @@ def test_damaged_files_are_refused(library, damage, tmp_path):
 
 
 def test_spaces_are_found_by_their_traits(library):
-    assert list(library.having("tan")) == ["albedo"]
+    assert list(library.spaces_with("tan")) == ["albedo"]
     with pytest.raises(TraitError, match="got 'sweat', expected one of age, lotion, rare, tan"):
-        library.having("sweat")
+        library.spaces_with("sweat")
 
 
 def test_packaged_traits_are_simulated_and_report_truth_error():
-    library = trait_storage.default()
+    library = trait_storage.load_packaged_traits()
     assert library.source == "simulated"
     worn = {"cold", "hot", "sweat", "lotion", "makeup", "powder"}
     assert worn <= set(library.spaces["surface"].traits)
@@ -156,14 +156,14 @@ def test_packaged_traits_are_simulated_and_report_truth_error():
 
 
 def test_packaged_lotion_sharpens_skin_and_is_removable():
-    space = trait_storage.default().spaces["surface"]
+    space = trait_storage.load_packaged_traits().spaces["surface"]
     bare = space.center - 0.5 * space.trait("lotion").vector
     bare = space.feasible.project(bare, space.metric)
-    oiled = space.outcome(bare, {"lotion": 0.6})
+    oiled = space.edit_with_outcome(bare, {"lotion": 0.6})
     sharp = np.array([n in ("ggx 0.14 eta 1.4", "ggx 0.18 eta 1.4") for n in space.names])
     kin = space.metric[sharp].sum(axis=0)
     assert oiled.sample @ kin > 1.05 * (bare @ kin)
     back = space.edit(oiled.sample, {"lotion": -0.6})
     gap = np.sqrt((back - bare) @ space.metric @ (back - bare))
     assert gap <= oiled.return_bound + 1e-9
-    assert oiled.share < 0.1
+    assert oiled.clipped_fraction < 0.1

@@ -10,18 +10,18 @@ from model import store, wrinkles
 from model.skin import SkinAppearance
 from model.wrinkles.evaluation import WRINKLE_FILE, WrinkleModel
 from model.wrinkles.expressions import JIMENEZ2011_TABLE, ExpressionTable, WrinkleError
-from model.wrinkles.partial_derivatives import Layer
+from model.wrinkles.partial_derivatives import WrinkleLayer
 
 
 @pytest.fixture
 def face(rng):
     rows = dict.fromkeys(JIMENEZ2011_TABLE.rows, (0.0,)) | {"lemon": (0.5,)}
-    lemon = Layer(
+    lemon = WrinkleLayer(
         rng.uniform(-0.3, 0.3, (4, 4, 2)).astype(np.float32),
         np.ones((1, 2, 2), np.float32),
         ExpressionTable(("all",), rows, "drawn"),
     )
-    first = Layer(
+    first = WrinkleLayer(
         rng.uniform(-0.3, 0.3, (8, 8, 2)).astype(np.float32),
         rng.random((8, 4, 4), np.float32),
         {**JIMENEZ2011_TABLE.rows, "lemon": (0.0,) * 8},

@@ -9,7 +9,7 @@ from model.wrinkles.expressions import (
     ROW_OF_STATE,
     ExpressionTable,
     WrinkleError,
-    clamped,
+    clamp_sums,
     read_table,
     zone_sums,
 )
@@ -80,7 +80,7 @@ def test_the_length_of_a_normal_does_not_matter(rng):
 def test_slopes_above_45_degrees_are_clamped_and_counted():
     angles = np.radians([0.0, 44.0, 46.0, 80.0, 89.999])
     n = np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=-1)
-    report = wrinkles.encoding_report(n)
+    report = wrinkles.encode_with_report(n)
     np.testing.assert_array_equal(report.clamped, [False, False, True, True, True])
     assert report.clamped_fraction == 0.6
     np.testing.assert_allclose(report.derivatives[2:, 0], 1.0)
@@ -92,7 +92,7 @@ def test_slopes_above_45_degrees_are_clamped_and_counted():
 def test_without_a_limit_steep_normals_come_back_too():
     angles = np.radians([46.0, 80.0, 89.999, 90.0 - 1e-9])
     n = np.stack([0 * angles, np.sin(angles), np.cos(angles)], axis=-1)
-    report = wrinkles.encoding_report(n, limit=None)
+    report = wrinkles.encode_with_report(n, limit=None)
     assert report.clamped_fraction == 0.0
     assert report.valid.all()
     np.testing.assert_allclose(wrinkles.decode(report.derivatives), n, atol=1e-15)
@@ -112,19 +112,19 @@ def test_unrepresentable_normals_are_masked_and_never_flat(limit):
     assert np.isnan(bare[:6]).all()
     np.testing.assert_allclose(bare[6], [0.0, 0.75])
     assert not wrinkles.decode(bare[:6]).any()
-    report = wrinkles.encoding_report(np.array([*lost, [0.0, 0.6, 0.8]]), limit=limit)
+    report = wrinkles.encode_with_report(np.array([*lost, [0.0, 0.6, 0.8]]), limit=limit)
     np.testing.assert_array_equal(report.valid, [False] * 6 + [True])
     assert not report.derivatives[:6].any()
     assert report.clamped_fraction == 0.0
-    none_left = wrinkles.encoding_report(np.array(lost), limit=limit)
+    none_left = wrinkles.encode_with_report(np.array(lost), limit=limit)
     assert none_left.clamped_fraction == 0.0
 
 
 def test_smallest_outward_component_is_clamped_not_lost():
-    report = wrinkles.encoding_report(np.array([1.0, -1.0, 5e-324]))
+    report = wrinkles.encode_with_report(np.array([1.0, -1.0, 5e-324]))
     assert report.valid
     np.testing.assert_array_equal(report.derivatives, [1.0, -1.0])
-    assert not wrinkles.encoding_report(np.array([1.0, -1.0, 5e-324]), limit=None).valid
+    assert not wrinkles.encode_with_report(np.array([1.0, -1.0, 5e-324]), limit=None).valid
 
 
 def test_nonfinite_derivatives_decode_to_zero_vector():
@@ -138,7 +138,7 @@ def test_inputs_stay_as_they_were(rng):
     before = [a.copy() for a in (n, base, wrinkle, masks)]
     wrinkles.encode(n)
     wrinkles.combine(base, wrinkle, masks, {"joy": 1.0})
-    layer = wrinkles.Layer(wrinkle, masks)
+    layer = wrinkles.WrinkleLayer(wrinkle, masks)
     wrinkles.combine_layers(base, [layer, layer], {"joy": 1.0})
     for a, b in zip((n, base, wrinkle, masks), before, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -180,14 +180,14 @@ def test_table_has_six_published_expressions_over_eight_zones():
 
 @pytest.mark.parametrize("clamp", ["unit", "signed"])
 def test_surprise_and_anger_leave_fifth_in_red_green(clamp):
-    sums = clamped(zone_sums({"surprise": 1.0, "anger": 1.0}), clamp)
+    sums = clamp_sums(zone_sums({"surprise": 1.0, "anger": 1.0}), clamp)
     np.testing.assert_allclose(sums[:4], [0.2, 0.2, 0.0, 0.0], atol=1e-15)
 
 
 def test_anger_forehead_vanishes_under_unit_flattens_under_signed():
     sums = zone_sums({"anger": 1.0})
-    np.testing.assert_array_equal(clamped(sums, "unit")[:4], 0.0)
-    np.testing.assert_allclose(clamped(sums, "signed")[:4], [-0.6, -0.6, -0.8, -0.8])
+    np.testing.assert_array_equal(clamp_sums(sums, "unit")[:4], 0.0)
+    np.testing.assert_allclose(clamp_sums(sums, "signed")[:4], [-0.6, -0.6, -0.8, -0.8])
     base, wrinkle = np.full((4, 4, 2), 0.1), np.full((2, 2, 2), 0.5)
     masks = np.ones((8, 1, 1)) * np.isin(np.arange(8), list(FOREHEAD.values()))[:, None, None]
     neutral = wrinkles.decode(base)
@@ -199,8 +199,10 @@ def test_anger_forehead_vanishes_under_unit_flattens_under_signed():
 
 @pytest.mark.parametrize("clamp", ["unit", "signed"])
 def test_zone_sum_is_clamped_after_all_blend_shapes(clamp):
-    one_by_one = clamped(zone_sums({"joy": 1}), clamp) + clamped(zone_sums({"fear": 1}), clamp)
-    together = clamped(zone_sums({"joy": 1.0, "fear": 1.0, "sad": 1.0}), clamp)
+    one_by_one = clamp_sums(zone_sums({"joy": 1}), clamp) + clamp_sums(
+        zone_sums({"fear": 1}), clamp
+    )
+    together = clamp_sums(zone_sums({"joy": 1.0, "fear": 1.0, "sad": 1.0}), clamp)
     assert one_by_one.max() > 1.0
     assert together.max() == 1.0
     base, wrinkle, masks = np.zeros((2, 2, 2)), np.full((1, 1, 2), 0.5), np.zeros((8, 1, 1))
@@ -258,7 +260,7 @@ def test_the_sum_is_listing_1_1_s(rng, shape, texels, mask_texels):
     base, wrinkle = rng.uniform(-0.5, 0.5, (*shape, 2)), rng.uniform(-0.5, 0.5, (*texels, 2))
     masks = rng.random((8, *mask_texels))
     weights = {"surprise": 0.7, "anger": 0.4, "sad": 0.9}
-    expected = listing_1_1(base, wrinkle, masks, clamped(zone_sums(weights)))
+    expected = listing_1_1(base, wrinkle, masks, clamp_sums(zone_sums(weights)))
     got = wrinkles.combine(base, wrinkle, masks, weights)
     np.testing.assert_allclose(got, expected, atol=1e-14)
     single = wrinkles.combine(base.astype(np.float32), wrinkle, masks, weights)
@@ -287,13 +289,13 @@ def test_layer_finer_than_base_is_averaged_without_aliasing():
 
 def test_wrinkle_maps_add_and_lemon_pose_flattens_neutral(rng):
     base = rng.uniform(-0.4, 0.4, (8, 8, 2))
-    first = wrinkles.Layer(rng.uniform(-0.4, 0.4, (4, 4, 2)), rng.random((8, 2, 2)))
+    first = wrinkles.WrinkleLayer(rng.uniform(-0.4, 0.4, (4, 4, 2)), rng.random((8, 2, 2)))
     rows = dict.fromkeys(JIMENEZ2011_TABLE.rows, (0.0,)) | {"lemon": (1.0,)}
-    lemon = wrinkles.Layer(-base, np.ones((1, 1, 1)), ExpressionTable(("all",), rows))
+    lemon = wrinkles.WrinkleLayer(-base, np.ones((1, 1, 1)), ExpressionTable(("all",), rows))
     both = {"lemon": 1.0, "joy": 0.5}
     with pytest.raises(WrinkleError, match="'lemon'"):
         wrinkles.combine_layers(base, [first, lemon], both)
-    first = wrinkles.Layer(
+    first = wrinkles.WrinkleLayer(
         first.wrinkle, first.masks, {**JIMENEZ2011_TABLE.rows, "lemon": (0.0,) * 8}
     )
     flat = wrinkles.combine_layers(base, [first, lemon], {"lemon": 1.0})
@@ -377,7 +379,7 @@ def test_leading_axes_of_base_and_wrinkle_broadcast(rng):
 def test_averaging_and_reading_keep_texture_mean(rng):
     texture = rng.random((9, 14))
     for shape in ((3, 7), (4, 5), (1, 1)):
-        small = texture_resampling.resampled(texture, shape)
+        small = texture_resampling.resample(texture, shape)
         assert small.mean() == pytest.approx(texture.mean(), rel=1e-12)
     flat = np.full((3, 4), 0.7)
-    np.testing.assert_allclose(texture_resampling.resampled(flat, (11, 2)), 0.7)
+    np.testing.assert_allclose(texture_resampling.resample(flat, (11, 2)), 0.7)

@@ -42,29 +42,29 @@ def test_counted_bytes_match_encoded_bytes(rng, encoding, bytes_):
 )
 def test_stored_map_errs_by_half_step_of_encoding(rng, encoding, largest):
     d = rng.uniform(-1, 1, (20, 20, 2))
-    assert np.abs(storage.stored_map(d, encoding) - d).max() <= largest
+    assert np.abs(storage.round_trip_map(d, encoding) - d).max() <= largest
 
 
 def test_eight_bits_cannot_store_flat_skin_blocks_nearly():
     flat = np.zeros((8, 8, 2))
-    eight = storage.stored_map(flat, "unit8")
+    eight = storage.round_trip_map(flat, "unit8")
     np.testing.assert_allclose(np.abs(eight), 1 / 255, rtol=1e-6)
-    assert np.abs(storage.stored_map(flat, "bc5")).max() < 1 / 255 / 3
+    assert np.abs(storage.round_trip_map(flat, "bc5")).max() < 1 / 255 / 3
 
 
 def test_steeper_maps_than_the_encoding_holds_are_refused():
     with pytest.raises(WrinkleError, match=r"derivatives \(of encode\): got"):
-        storage.stored_map(np.full((4, 4, 2), 1.5), "unit8")
+        storage.round_trip_map(np.full((4, 4, 2), 1.5), "unit8")
     with pytest.raises(WrinkleError, match="derivatives: got"):
-        storage.stored_map(np.full((4, 4, 2), 1e6), "float16")
+        storage.round_trip_map(np.full((4, 4, 2), 1e6), "float16")
     with pytest.raises(WrinkleError, match="masks as bc3: got"):
-        storage.stored_masks(np.full((8, 4, 4), 1.2), "bc3")
+        storage.round_trip_masks(np.full((8, 4, 4), 1.2), "bc3")
 
 
 @pytest.mark.parametrize("encoding", storage.MASK_BYTES)
 @pytest.mark.parametrize("zones", [8, 5])
 def test_masks_come_back_zone_by_zone(rng, encoding, zones):
     masks = np.clip(gaussian_filter(rng.standard_normal((zones, 16, 16)), (0, 4, 4)) * 6, 0, 1)
-    back = storage.stored_masks(masks, encoding)
+    back = storage.round_trip_masks(masks, encoding)
     assert back.shape == masks.shape
     assert np.abs(back - masks).max() < (0.35 if encoding == "bc3" else 0.003)

@@ -30,7 +30,7 @@ def test_lengths_scatter_as_their_errors_tell(rng):
     covariance = np.array([[0.04, 0.018], [0.018, 0.02]]) * 1e-4
     mean = np.array([0.6, -0.8])
     drawn = mean + rng.standard_normal((100_000, 2)) @ np.linalg.cholesky(covariance).T
-    length, along, across = plane_vectors.length_and_errors(mean[None], covariance[None])
+    length, along, across = plane_vectors.estimate_length(mean[None], covariance[None])
     assert length[0] == pytest.approx(1.0)
     assert np.hypot(*drawn.T).std() == pytest.approx(along[0], rel=0.012)
     assert np.arctan2(drawn[:, 1], drawn[:, 0]).std() == pytest.approx(across[0], rel=0.012)

@@ -14,7 +14,7 @@ from skinrig.benchmarks.dome import brdf_truth
 
 @pytest.fixture(scope="module")
 def basis():
-    return brdf_tables.default()
+    return brdf_tables.default_basis()
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +214,7 @@ def test_rank_3_points_need_exactly_3_mixtures(basis):
         mix[row, columns] = rng.uniform(0.3, 1.0, len(columns))
     shares = rng.exponential(size=(200, 3)) @ mix
     errors = [brdf_basis.reduce(shares, rank, basis=basis)[2] for rank in (1, 2, 3, 4, 5)]
-    assert brdf_basis.plateau(errors) == 3
+    assert brdf_basis.find_plateau_rank(errors) == 3
     assert errors[2] < 0.02 < errors[1]
     found, rows, _ = brdf_basis.reduce(shares, 3)
     assert found.shape == (200, 3)
@@ -227,7 +227,7 @@ def test_four_face_mixtures_fit_nearly_like_all_materials(face, basis):
     s = samples_of(face)
     full = brdf_basis.fit_weights(s, basis)
     _, mix, _ = brdf_basis.reduce(full, 4, basis=basis)
-    again = brdf_basis.fit_weights(s, basis.mixed(mix))
+    again = brdf_basis.fit_weights(s, basis.mix_materials(mix))
     assert again.weights.shape == (len(face.f), 4)
     assert np.median(again.residual / full.residual) < 1.1
 
@@ -242,7 +242,9 @@ def test_excessive_ranks_and_empty_weights_have_clear_outcomes():
 
 
 def test_a_sphere_shows_its_highlight_towards_the_light(basis):
-    image = brdf_basis.lit_sphere(np.eye(59)[16], basis, light_dir=(0.6, 0.6, 0.5), size_px=65)
+    image = brdf_basis.render_lit_sphere(
+        np.eye(59)[16], basis, light_dir=(0.6, 0.6, 0.5), size_px=65
+    )
     row, column = np.unravel_index(np.argmax(image), image.shape)
     assert row < 32 < column
     assert image[0, 0] == 0.0

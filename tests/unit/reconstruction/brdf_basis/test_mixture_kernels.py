@@ -13,11 +13,13 @@ def directions(rng, *shape):
 
 
 def test_mixtures_match_plain_ones_also_below_horizon(rng):
-    basis = brdf_tables.default().mixed(np.eye(brdf_tables.default().size)[[3, 20, 40, 55]])
+    basis = brdf_tables.default_basis().mix_materials(
+        np.eye(brdf_tables.default_basis().size)[[3, 20, 40, 55]]
+    )
     weights = rng.random((30, 4))
     light, view = directions(rng, 30, 50), directions(rng, 30, 50)
     normals = directions(rng, 30).astype(np.float64)
-    quick = mixture_kernels.evaluate(basis.table, weights, light, view, normals)
+    quick = mixture_kernels.evaluate_mixtures(basis.table, weights, light, view, normals)
     plain = brdf_basis.evaluate(
         weights[:, None], basis, light.astype(np.float64), view.astype(np.float64), normals[:, None]
     )
@@ -32,11 +34,11 @@ def test_mixtures_match_plain_ones_also_below_horizon(rng):
 
 
 def test_mirror_and_normal_directions_are_in_table(rng):
-    basis = brdf_tables.default().mixed(np.eye(brdf_tables.default().size)[[3]])
+    basis = brdf_tables.default_basis().mix_materials(np.eye(brdf_tables.default_basis().size)[[3]])
     up = np.array([[0.0, 0.0, 1.0]])
     light = np.array([[[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [1.0, 0.0, 0.0]]], np.float32)
     view = np.array([[[0.0, 0.0, 1.0], [-0.6, 0.0, 0.8], [-1.0, 0.0, 0.0]]], np.float32)
-    out = mixture_kernels.evaluate(basis.table, np.ones((1, 1)), light, view, up)
+    out = mixture_kernels.evaluate_mixtures(basis.table, np.ones((1, 1)), light, view, up)
     assert np.isfinite(out).all()
     assert out[0, 0] > 0
     assert out[0, 2] == 0

@@ -37,7 +37,7 @@ def smooth(rng, shape, length):
 
 def as_on_faces(field):
     """Return light that is distributed as on faces, in the order of a field."""
-    prior = shading_prior.of_faces(softness=shading_prior.MIN_SOFTNESS)
+    prior = shading_prior.face_prior(softness=shading_prior.MIN_SOFTNESS)
     below = np.concatenate([[0.0], np.cumsum(prior.density)])
     edges = prior.low + prior.step * (np.arange(below.size) - 0.5)
     ranks = (field.ravel().argsort().argsort() + 0.5) / field.size
@@ -79,12 +79,12 @@ def test_a_mole_is_not_explained_away_by_shade(table, melanin, mole_melanin, exp
     face = fit_face_distribution(
         rgb,
         table,
-        prior=shading_prior.of_faces(softness=shading_prior.MIN_SOFTNESS),
+        prior=shading_prior.face_prior(softness=shading_prior.MIN_SOFTNESS),
         common_light=0.1,
         variance=variance,
         model_error=error,
     )
-    prior = shading_prior.of_faces()
+    prior = shading_prior.face_prior()
     by_face = estimate(rgb, table, prior=prior, face=face, variance=variance, model_error=error)
     spots = is_locally_dark(rgb, variance=variance)
     alone = estimate(rgb, table, prior=prior, variance=variance, model_error=error, valid=spots)
@@ -122,11 +122,11 @@ def test_lips_are_not_fitted_as_low_blood_skin(table, melanin, rng):
     light = as_on_faces(smooth(rng, shape, 15.0))
     clean = light[..., None] * table.lookup(c_m, table.c_hd_max * blood**3)
     rgb = clean * (1 + NOISE * rng.standard_normal(clean.shape))
-    variance, error, prior = np.square(NOISE * rgb), 5e-5 * np.eye(3), shading_prior.of_faces()
+    variance, error, prior = np.square(NOISE * rgb), 5e-5 * np.eye(3), shading_prior.face_prior()
     face = fit_face_distribution(
         rgb,
         table,
-        prior=shading_prior.of_faces(softness=shading_prior.MIN_SOFTNESS),
+        prior=shading_prior.face_prior(softness=shading_prior.MIN_SOFTNESS),
         common_light=0.1,
         variance=variance,
         model_error=error,
@@ -148,9 +148,9 @@ def test_lips_are_not_fitted_as_low_blood_skin(table, melanin, rng):
 
 def test_mixture_has_moments_of_samples_from_both(table, rng):
     rgb = 0.7 * table.lookup(np.full((1, 8), 0.05), np.full((1, 8), 0.02))
-    first = estimate(rgb, table, prior=shading_prior.of_faces(), variance=np.square(0.01 * rgb))
+    first = estimate(rgb, table, prior=shading_prior.face_prior(), variance=np.square(0.01 * rgb))
     second = estimate(
-        0.5 * rgb, table, prior=shading_prior.of_faces(), variance=np.square(0.01 * rgb)
+        0.5 * rgb, table, prior=shading_prior.face_prior(), variance=np.square(0.01 * rgb)
     )
     found = average_hypotheses(first, second, np.ones((1, 8), bool))
     draws = np.concatenate(
@@ -202,7 +202,7 @@ def test_non_skin_is_not_spot_and_is_ignored():
 def pixels(count):
     """Weigh some pixels of one color."""
     table = color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
-    return estimate(np.full((count, 3), 0.3), table, prior=shading_prior.of_faces())
+    return estimate(np.full((count, 3), 0.3), table, prior=shading_prior.face_prior())
 
 
 @pytest.mark.parametrize(
@@ -221,6 +221,6 @@ def test_shapes_that_do_not_fit_are_named(call, what):
 
 def test_estimates_of_other_pixels_are_refused(table):
     rgb = table.lookup(np.full((2, 3), 0.05), np.full((2, 3), 0.02))
-    found = estimate(rgb, table, prior=shading_prior.of_faces())
+    found = estimate(rgb, table, prior=shading_prior.face_prior())
     with pytest.raises(ChromophoreError, match="where"):
         average_hypotheses(found, found, np.ones((3, 2), bool))

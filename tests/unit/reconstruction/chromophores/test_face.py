@@ -10,7 +10,7 @@ from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.chromophores import shading_prior
 from reconstruction.chromophores.face import fit_face_distribution
 from reconstruction.chromophores.face_distribution import ContaminatedNormal, FaceDistribution
-from reconstruction.chromophores.inversion import ChromophoreError, without_brightness
+from reconstruction.chromophores.inversion import ChromophoreError, add_brightness_variance
 from reconstruction.chromophores.posterior import estimate
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION
 
@@ -24,7 +24,7 @@ def table():
 
 @pytest.fixture(scope="module")
 def prior():
-    return shading_prior.of_faces(softness=shading_prior.MIN_SOFTNESS)
+    return shading_prior.face_prior(softness=shading_prior.MIN_SOFTNESS)
 
 
 def face(table, prior, melanin, count, rng, spread=0.15):
@@ -55,7 +55,7 @@ def test_face_kernel_sum_matches_plain_numpy(table, prior, rng):
     light = np.tile([0.9, 0.2, 0.6], 5)
     rgb = light[:, None] * table.lookup(melanin, np.tile([0.018, 0.03, 0.025], 5))
     rgb *= 1.0 + NOISE * rng.standard_normal(rgb.shape)
-    covariance = without_brightness(1e-12 * np.eye(3)) + NOISE**2 * np.eye(3)
+    covariance = add_brightness_variance(1e-12 * np.eye(3)) + NOISE**2 * np.eye(3)
     covariance += chromophore_posterior.MIN_RELATIVE_NOISE**2 * np.eye(3)
     for k in range(5):
         here = slice(3 * k, 3 * k + 3)
@@ -95,7 +95,7 @@ def test_shade_is_not_taken_for_darker_skin(melanin, table, prior, rng):
     known = fit_face_distribution(rgb, table, common_light=0.02, **given)
     # standard errors of 1500 pixels, dark ones with errors of a third: 0.01; of the spread 0.02
     assert abs(known.melanin.mean - np.log(melanin)) < 0.04
-    assert abs(known.melanin.spread - 0.15) < 0.05
+    assert abs(known.melanin.sd - 0.15) < 0.05
     assert abs(known.blood.mean - 0.4) < 0.03
     dim = light < np.quantile(light, 0.2)
     together, alone = (estimate(rgb, table, face=one, **given) for one in (known, None))

@@ -9,8 +9,8 @@ from reconstruction.chromophores.face_distribution import (
     MIN_SIGMAS,
     ContaminatedNormal,
     FaceDistribution,
-    fit,
-    with_common_errors,
+    add_systematic_errors,
+    fit_distribution,
 )
 
 MELANIN_ENDS = (-10.0, -0.69)
@@ -29,7 +29,7 @@ def seen(melanin, melanin_errors, blood, blood_errors, rng):
 
 
 def fitted(probability):
-    return fit(probability, (MELANIN, BLOOD), (MELANIN_ENDS, BLOOD_ENDS))
+    return fit_distribution(probability, (MELANIN, BLOOD), (MELANIN_ENDS, BLOOD_ENDS))
 
 
 @pytest.mark.parametrize("spread", [0.1, 0.3])
@@ -48,7 +48,7 @@ def test_means_and_deviations_are_recovered_under_pixel_errors(spread, rng):
         assert abs(bell.mean - mean) < 4.0 / np.sqrt((1.0 / variance).sum())
         of_spread = 4.0 / np.sqrt((2.0 * wide**2 / variance**2).sum())
         assert abs(bell.spread - wide) < of_spread + 0.05 * wide
-        assert bell.unexpected < 0.04
+        assert bell.contamination < 0.04
 
 
 def test_outlier_skin_is_identified_without_widening_the_rest(rng):
@@ -59,9 +59,9 @@ def test_outlier_skin_is_identified_without_widening_the_rest(rng):
     found = fitted(seen(truth, np.full(count, 0.1), blood, np.full(count, 0.03), rng))
     assert abs(found.melanin.mean + 3.5) < 0.03
     assert abs(found.melanin.spread - 0.15) < 0.03
-    assert 0.06 < found.melanin.unexpected < 0.2
+    assert 0.06 < found.melanin.contamination < 0.2
     assert abs(found.blood.mean - 0.4) < 0.01
-    assert 0.04 < found.blood.unexpected < 0.12
+    assert 0.04 < found.blood.contamination < 0.12
 
 
 def test_pixels_differing_by_errors_alone_have_least_deviations(rng):
@@ -77,14 +77,14 @@ def test_pixels_differing_by_errors_alone_have_least_deviations(rng):
     )
     assert MIN_SIGMAS[0] <= found.melanin.spread < 0.04
     assert found.blood.spread == pytest.approx(MIN_SIGMAS[1], rel=1e-3)
-    assert found.melanin.unexpected == pytest.approx(MIN_CONTAMINATION, abs=0.005)
+    assert found.melanin.contamination == pytest.approx(MIN_CONTAMINATION, abs=0.005)
 
 
 def test_densities_average_to_unity_even_in_wide_cells():
     for mean in (-3.0, -0.75):
         bell = ContaminatedNormal(mean, 0.02, 0.05, *MELANIN_ENDS, stderr=0.01)
         edges = np.linspace(*MELANIN_ENDS, 101)
-        assert bell.of_cells(edges).mean() == pytest.approx(1.0, rel=1e-6)
+        assert bell.cell_densities(edges).mean() == pytest.approx(1.0, rel=1e-6)
         fine = np.linspace(*MELANIN_ENDS, 200_001)
         assert bell.relative_density(fine).mean() == pytest.approx(1.0, rel=1e-3)
         assert bell.relative_density(fine).min() >= 0.05
@@ -97,12 +97,12 @@ def test_common_errors_widen_by_root_sum_of_squares():
             ContaminatedNormal(blood, 0.05, 0.01, *BLOOD_ENDS),
         )
 
-    known = with_common_errors(
+    known = add_systematic_errors(
         face(-3.0, 0.4), [(face(-3.3, 0.4), face(-2.7, 0.4)), (face(-2.6, 0.38), face(-3.4, 0.42))]
     )
     assert known.melanin.stderr == pytest.approx(0.5)
     assert known.blood.stderr == pytest.approx(0.02)
-    assert known.melanin.width == pytest.approx(np.hypot(0.3, 0.5))
+    assert known.melanin.total_sd == pytest.approx(np.hypot(0.3, 0.5))
 
 
 def test_mean_at_range_end_has_inward_uncertainty():
@@ -114,7 +114,7 @@ def test_mean_at_range_end_has_inward_uncertainty():
         return FaceDistribution(bell, ContaminatedNormal(0.4, 0.05, 0.01, *BLOOD_ENDS))
 
     for mean in (-1.0, -0.75, -0.70):
-        known = with_common_errors(face(mean), [(face(mean - 0.08), face(mean + 0.08))])
+        known = add_systematic_errors(face(mean), [(face(mean - 0.08), face(mean + 0.08))])
         assert known.melanin.stderr == pytest.approx(0.08), mean
 
 
@@ -125,10 +125,10 @@ def test_blood_that_ends_at_none_may_be_any(mean, told):
         ContaminatedNormal(-3.0, 0.3, 0.01, -9.0, -0.7),
         ContaminatedNormal(mean, 0.05, 0.1, 0.04, 1.0),
     )
-    known = with_common_errors(skin, [(skin, skin)])
+    known = add_systematic_errors(skin, [(skin, skin)])
     density = known.blood.relative_density(np.array([mean, 0.5]))
     assert (np.ptp(density) > 0.5) == told
-    assert known.blood.unexpected == (0.1 if told else 1.0)
+    assert known.blood.contamination == (0.1 if told else 1.0)
     assert known.melanin == skin.melanin
 
 

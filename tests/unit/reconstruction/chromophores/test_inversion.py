@@ -9,7 +9,7 @@ from twins import chromophores as chromophore_reference
 from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 from reconstruction.chromophores import inversion as chromophores
-from reconstruction.chromophores.inversion import ChromophoreError, identifiability, invert
+from reconstruction.chromophores.inversion import ChromophoreError, compute_identifiability, invert
 
 CAMERA = "Nikon 5100 (NPL)"
 MODES = [None, "known"]
@@ -200,7 +200,7 @@ def test_color_only_model_error_gives_its_implied_errors(table):
     maps = invert(color, table, variance=[0.0] * 3, model_error=covariance)
     np.testing.assert_allclose(maps.stderr_melanin, implied[0], rtol=0.02)
     np.testing.assert_allclose(maps.stderr_hemoglobin, implied[1], rtol=0.02)
-    bounds = identifiability(table, variance=[0.0] * 3, model_error=covariance)
+    bounds = compute_identifiability(table, variance=[0.0] * 3, model_error=covariance)
     assert np.isfinite(bounds.stderr_melanin).all()
 
 
@@ -267,7 +267,7 @@ def test_no_confident_number_for_blood_under_heavy_melanin(table):
 
 @pytest.mark.parametrize("shading", MODES)
 def test_bounds_are_standard_errors_of_fit(shading, table):
-    bounds = identifiability(table, shading=shading, size=24)
+    bounds = compute_identifiability(table, shading=shading, size=24)
     c_m, c_hd = np.broadcast_arrays(bounds.c_m[:, None], bounds.c_hd[None, :])
     inner = (slice(4, -1), slice(4, -1))
     maps = invert(
@@ -283,10 +283,10 @@ def test_bounds_are_standard_errors_of_fit(shading, table):
 
 
 def test_bounds_follow_the_noise_model(table):
-    few = identifiability(table, shading=1.0, variance=lambda rgb: 1e-4 * rgb, size=8)
-    many = identifiability(table, shading=1.0, variance=lambda rgb: 1e-6 * rgb, size=8)
+    few = compute_identifiability(table, shading=1.0, variance=lambda rgb: 1e-4 * rgb, size=8)
+    many = compute_identifiability(table, shading=1.0, variance=lambda rgb: 1e-6 * rgb, size=8)
     np.testing.assert_allclose(few.stderr_melanin, 10.0 * many.stderr_melanin, rtol=1e-3)
-    dim = identifiability(table, shading=0.25, variance=lambda rgb: 1e-6 * rgb, size=8)
+    dim = compute_identifiability(table, shading=0.25, variance=lambda rgb: 1e-6 * rgb, size=8)
     np.testing.assert_allclose(dim.stderr_melanin, 2.0 * many.stderr_melanin, rtol=1e-3)
 
 

@@ -10,7 +10,7 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error
 from reconstruction.chromophores.inversion import ChromophoreError
 from reconstruction.chromophores.posterior import estimate
-from reconstruction.chromophores.shading_prior import lognormal
+from reconstruction.chromophores.shading_prior import lognormal_prior
 
 SIZE = 48
 
@@ -72,20 +72,21 @@ def test_non_skin_pixels_keep_only_transport_term(table, rng):
     wild[:, 20:] = np.nan
     wild[:, 30:] = -1.0
     for other in (rgb, wild):
-        found = model_error.of_picture(other, 0.0 * rgb, valid)
+        found = model_error.image_covariance(other, 0.0 * rgb, valid)
         assert np.isfinite(found).all()
         np.testing.assert_allclose(
-            found[:, 20:], np.broadcast_to(model_error.color_errors().transport, (SIZE, 28, 3, 3))
+            found[:, 20:],
+            np.broadcast_to(model_error.load_error_terms().transport, (SIZE, 28, 3, 3)),
         )
-    assert np.median(found[:, :20, 0, 0]) > 1.5 * model_error.color_errors().transport[0, 0]
+    assert np.median(found[:, :20, 0, 0]) > 1.5 * model_error.load_error_terms().transport[0, 0]
 
 
 def test_interreflection_error_is_larger_on_light_skin(table):
-    transport = model_error.color_errors().transport
+    transport = model_error.load_error_terms().transport
     spreads = []
     for melanin in (0.006, 0.05, 0.4):
         rgb = picture(table, melanin)
-        found = model_error.of_picture(rgb, 0.0 * rgb, everywhere())[5, 5] - transport
+        found = model_error.image_covariance(rgb, 0.0 * rgb, everywhere())[5, 5] - transport
         spreads.append(np.trace(found))
         # all of it is of the skin's own color, less brightness
         own = rgb[5, 5] - rgb[5, 5].mean()
@@ -95,7 +96,7 @@ def test_interreflection_error_is_larger_on_light_skin(table):
 
 def test_the_error_of_colors_has_no_brightness(table, rng):
     rgb = picture(table, shading=np.exp(0.03 * rng.standard_normal((SIZE, SIZE))))
-    found = model_error.of_picture(rgb, 0.0 * rgb, everywhere())
+    found = model_error.image_covariance(rgb, 0.0 * rgb, everywhere())
     size = np.trace(found, axis1=-2, axis2=-1)
     assert np.abs(found.sum(axis=-1)).max() < 1e-6 * size.max()
     assert np.linalg.eigvalsh(found).min() > -1e-9 * size.max()
@@ -103,8 +104,8 @@ def test_the_error_of_colors_has_no_brightness(table, rng):
 
 def test_pixels_are_weighted_by_own_error(table):
     rgb = np.repeat(table.lookup([[0.01]], [[0.03]]), 2, axis=1)
-    prior, variance = lognormal(0.7, 0.6), (1e-3 * rgb) ** 2
-    errors = np.stack([model_error.load(), 9.0 * model_error.load()])[None]
+    prior, variance = lognormal_prior(0.7, 0.6), (1e-3 * rgb) ** 2
+    errors = np.stack([model_error.load_covariance(), 9.0 * model_error.load_covariance()])[None]
     found = estimate(rgb, table, prior=prior, variance=variance, model_error=errors)
     for k in range(2):
         alone = estimate(
@@ -119,7 +120,7 @@ def test_pixel_covariance_errors_are_covered_doubled_ones_not(table, rng):
     """68 % of 2304 pixels within 4 sigma of a share, and 5 points for the bend of the table."""
     texture = np.where(np.arange(SIZE) < SIZE // 2, 0.005, 0.03)[None, :]
     rgb = picture(table, shading=np.exp(texture * rng.standard_normal((SIZE, SIZE))))
-    covariance = model_error.of_picture(rgb, 0.0 * rgb, everywhere())
+    covariance = model_error.image_covariance(rgb, 0.0 * rgb, everywhere())
     values, vectors = np.linalg.eigh(covariance)
     drawn = rng.standard_normal((SIZE, SIZE, 3)) * np.sqrt(np.maximum(values, 0.0))
     error = np.einsum("hwij,hwj->hwi", vectors, drawn)
@@ -129,7 +130,7 @@ def test_pixel_covariance_errors_are_covered_doubled_ones_not(table, rng):
         found = estimate(
             seen,
             table,
-            prior=lognormal(1.0, 0.6),
+            prior=lognormal_prior(1.0, 0.6),
             variance=(1e-4 * seen) ** 2,
             model_error=covariance,
         )
@@ -149,7 +150,7 @@ def test_pixel_covariance_errors_are_covered_doubled_ones_not(table, rng):
 def test_mismatched_pixel_covariances_are_refused(table, errors):
     rgb = np.repeat(table.lookup([0.01], [0.03]), 4, axis=0)
     with pytest.raises(ChromophoreError, match="model_error"):
-        estimate(rgb, table, prior=lognormal(0.7, 0.6), variance=1e-6, model_error=errors)
+        estimate(rgb, table, prior=lognormal_prior(0.7, 0.6), variance=1e-6, model_error=errors)
 
 
 @pytest.mark.parametrize("pixels", [1, SIZE, 7 * SIZE])
@@ -158,16 +159,18 @@ def test_banded_image_matches_whole_image_bit_exact(table, rng, monkeypatch, pix
     valid = rng.random((SIZE, SIZE)) < 0.95
     valid[:12, :12] = False
     valid[5, 5] = True  # with nothing near by: gets the mean of all
-    whole = model_error.of_picture(rgb, (0.01 * rgb) ** 2, valid)
+    whole = model_error.image_covariance(rgb, (0.01 * rgb) ** 2, valid)
     monkeypatch.setattr(model_error, "_BAND_PIXELS", pixels)
-    np.testing.assert_array_equal(model_error.of_picture(rgb, (0.01 * rgb) ** 2, valid), whole)
+    np.testing.assert_array_equal(
+        model_error.image_covariance(rgb, (0.01 * rgb) ** 2, valid), whole
+    )
     assert np.ptp(whole[..., 0, 0]) > 0
 
 
 def test_image_error_uses_little_memory_beyond_itself(table, rng):
     rgb = np.tile(picture(table), (12, 12, 1)).astype(np.float32)
     tracemalloc.start()
-    found = model_error.of_picture(rgb, (0.01 * rgb) ** 2, np.ones(rgb.shape[:2], bool))
+    found = model_error.image_covariance(rgb, (0.01 * rgb) ** 2, np.ones(rgb.shape[:2], bool))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 2.0 * found.nbytes  # 2.5 times it when copies were made of the whole picture

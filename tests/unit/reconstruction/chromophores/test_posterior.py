@@ -5,9 +5,9 @@ from twins import chromophores as chromophore_reference
 from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error, shading_prior
-from reconstruction.chromophores.inversion import ChromophoreError, invert, without_brightness
+from reconstruction.chromophores.inversion import ChromophoreError, add_brightness_variance, invert
 from reconstruction.chromophores.posterior import estimate
-from reconstruction.chromophores.shading_prior import lognormal
+from reconstruction.chromophores.shading_prior import lognormal_prior
 
 NOISE = 0.004
 
@@ -19,7 +19,7 @@ def table():
 
 @pytest.fixture(scope="module")
 def prior():
-    return shading_prior.of_faces()
+    return shading_prior.face_prior()
 
 
 def skin(rng, count, prior):
@@ -44,9 +44,15 @@ def test_kernel_sum_matches_plain_numpy_over_dense_plane(table, prior, rng):
     noise = 0.006
     rgb = seen(table, c_m, c_hd, shading, rng, noise)
     found = estimate(
-        rgb, table, prior=prior, variance=(noise * rgb) ** 2, model_error=model_error.load()
+        rgb,
+        table,
+        prior=prior,
+        variance=(noise * rgb) ** 2,
+        model_error=model_error.load_covariance(),
     )
-    covariance = without_brightness(model_error.load() + 1e-12 * np.eye(3)) + noise**2 * np.eye(3)
+    covariance = add_brightness_variance(
+        model_error.load_covariance() + 1e-12 * np.eye(3)
+    ) + noise**2 * np.eye(3)
     slow = np.array(
         [chromophore_reference.estimate(c, table, covariance, prior, size=(900, 300)) for c in rgb]
     )
@@ -106,7 +112,7 @@ def test_brightness_separates_dark_skin_from_dimmer_light_skin(table):
     c_m, c_hd = np.array([0.2, 0.35]), np.array([0.05, 0.05])
     rgb = table.lookup(c_m, c_hd)
     noise = (0.004 * rgb) ** 2
-    rough = estimate(rgb, table, prior=lognormal(1.0, 0.15), variance=noise)
+    rough = estimate(rgb, table, prior=lognormal_prior(1.0, 0.15), variance=noise)
     np.testing.assert_allclose(rough.melanin, c_m, rtol=0.25)
     free = invert(rgb, table, variance=noise)
     assert (free.melanin < 0.6 * c_m).all()  # what a fit without any knowledge of the light says
@@ -118,7 +124,7 @@ def test_two_solutions_give_error_covering_both_and_truth(table):
     noise = (0.002 * rgb) ** 2
     lighter = invert(rgb, table, variance=noise)
     assert lighter.melanin[0] + 10.0 * lighter.stderr_melanin[0] < truth  # sure, and wrong
-    both = estimate(rgb, table, prior=lognormal(0.7, 1.0), variance=noise)
+    both = estimate(rgb, table, prior=lognormal_prior(0.7, 1.0), variance=noise)
     assert abs(both.melanin[0] - truth) < both.stderr_melanin[0]
     assert both.stderr_melanin[0] > 10.0 * lighter.stderr_melanin[0]
 
@@ -127,7 +133,7 @@ def test_two_solutions_give_error_covering_both_and_truth(table):
 def test_color_decides_for_light_skin_whatever_its_light(factor, table, rng):
     c_m, c_hd = np.array([0.01, 0.03]), np.array([0.05, 0.1])
     rgb = factor * table.lookup(c_m, c_hd)
-    found = estimate(rgb, table, prior=lognormal(0.7, 0.6), variance=(0.002 * rgb) ** 2)
+    found = estimate(rgb, table, prior=lognormal_prior(0.7, 0.6), variance=(0.002 * rgb) ** 2)
     assert np.all(np.abs(found.melanin - c_m) < found.stderr_melanin)
     np.testing.assert_allclose(found.shading, factor, rtol=0.05)
 

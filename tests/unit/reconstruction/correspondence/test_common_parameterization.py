@@ -38,16 +38,16 @@ def faces():
 
 @pytest.fixture(scope="module")
 def frame(faces):
-    names, places = common.common_landmarks([marks(face) for face in faces])
+    names, places = common.average_landmarks([marks(face) for face in faces])
     unrolled = [Cylinder(marks(f)["nose tip"]).unroll(f.reshape(-1, 3)) for f in faces]
-    return common.frame_around(names, places, unrolled, size=SIZE)
+    return common.fit_common_frame(names, places, unrolled, size=SIZE)
 
 
 def test_same_point_of_faces_maps_to_same_position(faces, frame):
     places = []
     for face in faces:
-        found = common.correspond(marks(face), frame, stderr_mm=0.05)
-        places.append(found.at(face[20:76:7, 20:76:7])[0])
+        found = common.fit_correspondence(marks(face), frame, stderr_mm=0.05)
+        places.append(found.map_points(face[20:76:7, 20:76:7])[0])
     spread = np.std(places, axis=0)
     unrolled = np.std(
         [Cylinder(marks(f)["nose tip"]).unroll(f[20:76:7, 20:76:7]) for f in faces], axis=0
@@ -60,20 +60,20 @@ def test_errors_grow_with_landmark_noise_and_cover_effect(faces, frame):
     rng = np.random.default_rng(4)
     face = faces[0]
     at = face[30:66:6, 30:66:6].reshape(-1, 3)
-    exact = common.correspond(marks(face), frame, stderr_mm=0.1).at(at)[0]
+    exact = common.fit_correspondence(marks(face), frame, stderr_mm=0.1).map_points(at)[0]
     fine, told = [], []
     for _ in range(24):
         noisy = {
             n: tuple(np.asarray(p) + (0 if n == "nose tip" else rng.normal(0, 1.0, 3)))
             for n, p in marks(face).items()
         }
-        place, error = common.correspond(noisy, frame, stderr_mm=1.0).at(at)
+        place, error = common.fit_correspondence(noisy, frame, stderr_mm=1.0).map_points(at)
         fine.append(place - exact)
         told.append(error)
     measured = np.sqrt(np.mean(np.square(fine)))
     said = np.sqrt(np.mean(np.square(told)))
     assert 0.3 < measured / said < 1.5
-    small = common.correspond(marks(face), frame, stderr_mm=0.1).at(at)[1]
+    small = common.fit_correspondence(marks(face), frame, stderr_mm=0.1).map_points(at)[1]
     assert small.mean() < 0.5 * np.mean(told)
 
 
@@ -82,7 +82,9 @@ def test_texture_round_trips_through_common_map(faces, frame):
     texture = np.stack([np.sin(face[..., 0] / 15), face[..., 1] / 90, face[..., 2] / 90], axis=-1)
     valid = np.ones(texture.shape[:2], bool)
     valid[40:50, 60:70] = False
-    chart = charts.chart(face, np.ones_like(valid), common.correspond(marks(face), frame), frame)
+    chart = charts.chart_texels(
+        face, np.ones_like(valid), common.fit_correspondence(marks(face), frame), frame
+    )
     image, known = chart.gather(np.where(valid[..., None], texture, 50.0), valid)
     assert known.mean() > 0.75
     assert np.abs(image[known]).max() < 1.5  # nothing of what is not valid
@@ -96,8 +98,11 @@ def test_ear_shadowed_texels_do_not_mix_with_ear(frame, faces):
     behind = front * [0.7, 1.0, 1.0] - [0.0, 0.0, 25.0]
     position = np.concatenate([front, behind])
     texture = np.concatenate([np.ones((SIZE, SIZE)), np.zeros((SIZE, SIZE))])
-    chart = charts.chart(
-        position, np.ones(texture.shape, bool), common.correspond(marks(front), frame), frame
+    chart = charts.chart_texels(
+        position,
+        np.ones(texture.shape, bool),
+        common.fit_correspondence(marks(front), frame),
+        frame,
     )
     image, known = chart.gather(texture)
     middle = slice(SIZE // 4, -SIZE // 4)
@@ -109,19 +114,19 @@ def test_left_and_right_exchanged_is_refused_by_name(faces, frame):
     wrong = marks(faces[0])
     wrong["p11"], wrong["p12"] = wrong["p12"], wrong["p11"]
     with pytest.raises(ParameterizationError, match=r"without folds .*'p1"):
-        common.correspond(wrong, frame)
+        common.fit_correspondence(wrong, frame)
 
 
 def test_too_few_and_collinear_landmarks_are_refused(faces, frame):
     all_marks = marks(faces[0])
     few = {n: all_marks[n] for n in list(all_marks)[:3]}
     with pytest.raises(ParameterizationError, match="got 3 that the common map knows"):
-        common.correspond(few, frame)
+        common.fit_correspondence(few, frame)
     line = {n: (0.0, 10.0 * k, 0.0) for k, n in enumerate(all_marks)}
     with pytest.raises(ParameterizationError, match="one line"):
-        common.correspond(line, frame)
+        common.fit_correspondence(line, frame)
     with pytest.raises(ParameterizationError, match="'nose tip' is missing"):
-        common.common_landmarks([{"chin": (0.0, 0.0, 0.0)}])
+        common.average_landmarks([{"chin": (0.0, 0.0, 0.0)}])
 
 
 def test_a_frame_comes_back_from_its_document(frame):
@@ -136,11 +141,11 @@ def test_a_frame_comes_back_from_its_document(frame):
 
 def test_beard_region_surrounds_mouth_but_excludes_lips():
     frame = common_regions.standard_frame(side_mm=240.0, center_mm=(0.0, 0.0), size=120)
-    beard = common_regions.region("beard", frame)
-    rest = common_regions.region("no-beard", frame)
+    beard = common_regions.region_mask("beard", frame)
+    rest = common_regions.region_mask("no-beard", frame)
 
     def at(u, v, mask):
-        column, row = np.round(frame.pixel((u, v))).astype(int)
+        column, row = np.round(frame.to_pixel((u, v))).astype(int)
         return bool(mask[row, column])
 
     assert at(0, -60, beard)
@@ -153,7 +158,7 @@ def test_beard_region_surrounds_mouth_but_excludes_lips():
     assert not (beard & rest).any()
     assert abs(int(beard[:, :60].sum()) - int(beard[:, 60:].sum())) < 0.02 * beard.sum()
     with pytest.raises(common_regions.RegionError, match="got 'ears'"):
-        common_regions.region("ears", frame)
+        common_regions.region_mask("ears", frame)
 
 
 def test_face_without_landmarks_is_unwrapped_from_foremost_texels():

@@ -111,7 +111,7 @@ def test_crossing_landmarks_fold_the_map_and_invalidate(rng):
         landmarks_moving=crossed,
         landmarks_neutral=neutral,
         landmark_stderr_px=0.05,
-        largest_error_px=100.0,
+        max_error_px=100.0,
     )
     assert found.folded_fraction > 0.01
     assert not found.valid[60, 44:52].any()
@@ -121,7 +121,7 @@ def test_crossing_landmarks_fold_the_map_and_invalidate(rng):
         landmarks_moving=neutral,
         landmarks_neutral=neutral,
         landmark_stderr_px=0.05,
-        largest_error_px=100.0,
+        max_error_px=100.0,
     )
     assert straight.folded_fraction == 0.0
 
@@ -259,24 +259,26 @@ def test_arguments_that_do_not_fit_are_named(rng):
 def test_collinear_or_nonfinite_landmarks_are_refused():
     line = np.stack([np.arange(6.0), 2 * np.arange(6.0)], axis=1)
     with pytest.raises(landmark_field.LandmarkFieldError, match="on one line"):
-        landmark_field.fit(line, line, stderr_px=1.0)
+        landmark_field.fit_landmark_field(line, line, stderr_px=1.0)
     with pytest.raises(landmark_field.LandmarkFieldError, match="on one line"):
-        landmark_field.fit(np.ones((6, 2)), np.ones((6, 2)), stderr_px=1.0)
+        landmark_field.fit_landmark_field(np.ones((6, 2)), np.ones((6, 2)), stderr_px=1.0)
     square = np.array([[0, 0], [0, 9], [9, 0], [9, 9.0]])
     with pytest.raises(landmark_field.LandmarkFieldError, match="landmarks: got"):
-        landmark_field.fit(square, np.where(square > 5, np.nan, square), stderr_px=1.0)
+        landmark_field.fit_landmark_field(
+            square, np.where(square > 5, np.nan, square), stderr_px=1.0
+        )
     with pytest.raises(landmark_field.LandmarkFieldError, match="stderr_px"):
-        landmark_field.fit(square, square, stderr_px=0.0)
+        landmark_field.fit_landmark_field(square, square, stderr_px=0.0)
 
 
 def test_affine_motion_is_exact_and_smoothed_under_noise(rng):
     points = rng.uniform(0, 200, (30, 2))
     turn = np.array([[1.02, 0.05], [-0.04, 0.97]])
     noisy = points @ turn + 3.0 + rng.normal(0.0, 1.0, points.shape)
-    exact = landmark_field.fit(points, points @ turn + 3.0, stderr_px=1.0)
+    exact = landmark_field.fit_landmark_field(points, points @ turn + 3.0, stderr_px=1.0)
     to = rng.uniform(0, 200, (50, 2))
-    np.testing.assert_allclose(exact.at(to)[0], to @ turn + 3.0 - to, atol=1e-3)
-    found, error = landmark_field.fit(points, noisy, stderr_px=1.0).at(to)
+    np.testing.assert_allclose(exact.evaluate(to)[0], to @ turn + 3.0 - to, atol=1e-3)
+    found, error = landmark_field.fit_landmark_field(points, noisy, stderr_px=1.0).evaluate(to)
     gap = found - (to @ turn + 3.0 - to)
     # through the points it would be off by the landmarks' own noise and more
     assert np.sqrt((gap**2).mean()) < 0.8
@@ -287,15 +289,17 @@ def test_misplaced_landmark_is_identified_by_others(rng):
     points = rng.uniform(0, 200, (25, 2))
     moved = points + 4.0
     moved[7] += [15.0, 0.0]
-    found = landmark_field.fit(points, moved, stderr_px=1.0)
+    found = landmark_field.fit_landmark_field(points, moved, stderr_px=1.0)
     assert int(np.argmax(found.leave_one_out_px)) == 7
 
 
 def test_grid_field_equals_field_at_points(rng):
     points = rng.uniform(0, 60, (12, 2))
-    field = landmark_field.fit(points, points + rng.normal(0, 3, points.shape), stderr_px=0.5)
-    moved, error = field.on_grid((61, 57))
-    at, stderr = field.at([[20.0, 33.0]])
+    field = landmark_field.fit_landmark_field(
+        points, points + rng.normal(0, 3, points.shape), stderr_px=0.5
+    )
+    moved, error = field.evaluate_grid((61, 57))
+    at, stderr = field.evaluate([[20.0, 33.0]])
     np.testing.assert_allclose(moved[33, 20], at[0], atol=0.1)
     np.testing.assert_allclose(error[33, 20], stderr[0], rtol=0.1)
 
@@ -303,7 +307,10 @@ def test_grid_field_equals_field_at_points(rng):
 def test_landmark_table_faults_name_line_and_column(tmp_path):
     path = tmp_path / "landmarks.csv"
     path.write_text('# somebody\nname,x,y\n\nnose tip, 10.5 ,20\n"chin, low",1,-2\n')
-    assert landmark_table.read(path) == {"nose tip": (10.5, 20.0), "chin, low": (1.0, -2.0)}
+    assert landmark_table.read_landmark_table(path) == {
+        "nose tip": (10.5, 20.0),
+        "chin, low": (1.0, -2.0),
+    }
     cases = (
         ("", "is empty"),
         ("label,x,y\n", "line 1: got columns"),
@@ -316,7 +323,7 @@ def test_landmark_table_faults_name_line_and_column(tmp_path):
     for text, message in cases:
         path.write_text(text)
         with pytest.raises(landmark_table.LandmarkError, match=message):
-            landmark_table.read(path)
+            landmark_table.read_landmark_table(path)
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(landmark_table.LandmarkError, match="UTF-8"):
-        landmark_table.read(path)
+        landmark_table.read_landmark_table(path)

@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 
 from reconstruction.facial_color.perfusion_curves import CurveError
-from reconstruction.facial_color.perfusion_fit import fit_course, fit_cycle, of_vessels
-from reconstruction.facial_color.perfusion_samples import PoseStep, Samples
+from reconstruction.facial_color.perfusion_fit import fit_course, fit_cycle, square_levels
+from reconstruction.facial_color.perfusion_samples import CurveSamples, PoseStep
 
 CYCLE_S = 10.0
 PHASE = (5.5 * np.arange(22)) % CYCLE_S + 0.007
@@ -213,7 +213,7 @@ def test_blood_root_finds_vessel_constant_that_blood_misses():
     blood = 0.028 * (1.0 + 0.24 * np.exp(-time / 20.0)) ** 2 + noise
     high = fit_course(time, blood).interval_s[1]
     assert high < 20.0
-    found = of_vessels(fit_course(time, np.sqrt(blood)))
+    found = square_levels(fit_course(time, np.sqrt(blood)))
     assert found.interval_s[0] <= 20.0 <= found.interval_s[1]
     for level, stderr, true in (
         (found.start[0], found.stderr_start[0], 0.028 * 1.24**2),
@@ -324,7 +324,7 @@ def test_prior_as_sample_covariance_gives_same_squares():
     rng = np.random.default_rng(15)
     value, noise2, spread = with_step(rng, constant_s=2.0, step=3e-3), 4e-8, 1e-3
     shape = relaxing(PHASE, 2.0)
-    samples = Samples.of(PHASE, value, None, PoseStep(MOVED, np.array([spread]))).with_prior(
+    samples = CurveSamples.of(PHASE, value, None, PoseStep(MOVED, np.array([spread]))).with_prior(
         np.array([noise2])
     )
     covariance = noise2 * np.eye(PHASE.size) + spread**2 * np.outer(MOVED, MOVED)

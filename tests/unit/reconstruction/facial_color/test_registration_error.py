@@ -172,12 +172,12 @@ def test_misplaced_face_coverage_requires_registration_error(rng):
         found = shared_melanin.estimate_shared_melanin(
             rgb,
             table,
-            prior=shading_prior.of_faces(),
+            prior=shading_prior.face_prior(),
             variance=variance,
-            own_error=own,
+            state_covariance=own,
             shading_window_px=shared_melanin.SHADING_WINDOW_PX,
         )
-        good = found.valid_states[1] & ~found.misfits[1]
+        good = found.valid_states[1] & ~found.is_misfit[1]
         shares.append(np.mean(np.abs(found.change[1]) < found.stderr_change[1], where=good))
     assert shares[0] > 0.6
     assert shares[1] < shares[0] - 0.1
@@ -192,7 +192,7 @@ def _texture(rng):
 def test_interpolated_noise_matches_stated_noise(rng, along):
     """Against noise that OpenCV interpolates; 3 % is 4 sigma of 40 000 pixels that share some."""
     noise = rng.standard_normal((200, 200)).astype(np.float32)
-    at = dense_flow.grid((200, 200)) + np.asarray(along, np.float32)
-    seen = dense_flow.bilinear(noise, at, interpolation=2)[5:-5, 5:-5]
-    told = dense_flow.noise_left(at)[5:-5, 5:-5]
+    at = dense_flow.pixel_grid((200, 200)) + np.asarray(along, np.float32)
+    seen = dense_flow.sample_image(noise, at, interpolation=2)[5:-5, 5:-5]
+    told = dense_flow.interpolated_noise_variance(at)[5:-5, 5:-5]
     assert seen.var() == pytest.approx(float(told.mean()), rel=0.05)

@@ -23,7 +23,7 @@ def repeats(rng, *, count=2, size=60, color=1.0, brightness=0.0):
 def test_mean_variance_is_that_of_its_errors(rng, count):
     """Tolerance: 5 standard errors of a variance of 10,800 numbers."""
     rgb, variance, valid, skin = repeats(rng, count=count)
-    mean, told, known = repeat_average.average(rgb, variance, valid)
+    mean, told, known = repeat_average.average_repeats(rgb, variance, valid)
     error = (mean - skin) / np.sqrt(told)
     assert known.all()
     assert np.mean(np.square(error)) == pytest.approx(1.0, abs=5 * np.sqrt(2 / error.size) + 0.02)
@@ -34,7 +34,7 @@ def test_colors_repeating_worse_than_noise_widen_error(rng, count):
     """Tolerance: the median of 3,600 chi-squared numbers is off by 3 % at most."""
     rgb, variance, valid, _ = repeats(rng, count=count, color=3.0)
     assert repeat_average.overdispersion(rgb, variance, valid) == pytest.approx(9.0, rel=0.09)
-    told = repeat_average.average(rgb, variance, valid)[1]
+    told = repeat_average.average_repeats(rgb, variance, valid)[1]
     assert np.median(told / variance[0]) == pytest.approx(9.0 / count, rel=0.1)
 
 
@@ -73,7 +73,7 @@ def test_pixel_is_mean_of_repeats_that_show_pixel(rng):
     one = variance[0].copy()
     valid[0, :10], valid[1, 5:20] = False, False
     rgb[~valid], variance[~valid] = np.nan, np.nan
-    mean, told, known = repeat_average.average(rgb, variance, valid)
+    mean, told, known = repeat_average.average_repeats(rgb, variance, valid)
     np.testing.assert_array_equal(known, valid.any(axis=0))
     np.testing.assert_array_equal(mean[:5], rgb[1, :5])
     np.testing.assert_array_equal(mean[10:20], rgb[0, 10:20])
@@ -85,7 +85,7 @@ def test_pixel_is_mean_of_repeats_that_show_pixel(rng):
 
 def test_single_image_is_its_own_average(rng):
     rgb, variance, valid, _ = repeats(rng, count=1, color=5.0)
-    mean, told, _ = repeat_average.average(rgb, variance, valid)
+    mean, told, _ = repeat_average.average_repeats(rgb, variance, valid)
     np.testing.assert_array_equal(mean, rgb[0])
     np.testing.assert_array_equal(told, variance[0])
 
@@ -101,4 +101,4 @@ def test_single_image_is_its_own_average(rng):
 )
 def test_mismatched_repeat_input_is_refused(rgb, variance, valid, match):
     with pytest.raises(ValueError, match=match):
-        repeat_average.average(rgb, variance, valid)
+        repeat_average.average_repeats(rgb, variance, valid)

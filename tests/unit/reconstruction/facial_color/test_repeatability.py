@@ -26,7 +26,7 @@ def test_noise_only_repeats_alarm_at_stated_rate(rng):
     sets = 300
     for _ in range(sets):
         maps, stderr = captures(rng)
-        found = repeatability.compare(maps, ORDER, stderr=stderr, false_alarm=0.05)
+        found = repeatability.compare_states(maps, ORDER, stderr=stderr, false_alarm=0.05)
         # the last region is all pixels of the others again
         alarms += any(region.scatters for region in found.regions)
     assert stats.binom.cdf(alarms, sets, 0.05) > 3e-5
@@ -37,14 +37,14 @@ def test_region_p_values_are_uniform_under_noise(rng):
     values = []
     for _ in range(300):
         maps, stderr = captures(rng, side=8)
-        found = repeatability.compare(maps, ORDER, stderr=stderr)
+        found = repeatability.compare_states(maps, ORDER, stderr=stderr)
         values.append(found.region("whole face").p_value)
     assert stats.kstest(values, "uniform").pvalue > 1e-4
 
 
 def test_captures_differing_beyond_noise_are_found(rng):
     maps, stderr = captures(rng, scatter=1e-3)
-    found = repeatability.compare(maps, ORDER, stderr=stderr).region("whole face")
+    found = repeatability.compare_states(maps, ORDER, stderr=stderr).region("whole face")
     assert found.scatters
     np.testing.assert_allclose(found.within, 1e-3, rtol=4 / np.sqrt(2 * (len(ORDER) - 3)))
 
@@ -55,15 +55,15 @@ def test_stated_correlated_noise_is_not_scatter(rng):
     noise = 2e-3 * np.repeat(np.repeat(coarse, 4, axis=1), 4, axis=2)
     maps = np.array([LEVELS[s] for s in order])[:, None, None] + noise
     stderr = np.full(maps.shape, 2e-3)
-    ignored = repeatability.compare(maps, order, stderr=stderr).region("whole face")
-    told = repeatability.compare(maps, order, stderr=stderr, correlated_px=16.0)
+    ignored = repeatability.compare_states(maps, order, stderr=stderr).region("whole face")
+    told = repeatability.compare_states(maps, order, stderr=stderr, correlated_px=16.0)
     assert ignored.scatters
     assert not told.region("whole face").scatters
 
 
 def test_between_states_variation_matches_state_differences(rng):
     maps, stderr = captures(rng, scatter=5e-4)
-    found = repeatability.compare(maps, ORDER, stderr=stderr).region("whole face")
+    found = repeatability.compare_states(maps, ORDER, stderr=stderr).region("whole face")
     truth = np.std(list(LEVELS.values()), ddof=1)
     np.testing.assert_allclose(found.between, truth, rtol=0.2)
     expected = truth**2 / (truth**2 + 5e-4**2)
@@ -79,7 +79,9 @@ def test_intraclass_correlation_error_is_its_scatter(rng):
         level = rng.standard_normal(states)
         maps = np.array([level[int(s)] for s in order]) + 0.7 * rng.standard_normal(len(order))
         maps = np.broadcast_to(maps[:, None, None], (len(order), 4, 4))
-        region = repeatability.compare(maps, order, stderr=np.full(maps.shape, 1e-3)).regions[-1]
+        region = repeatability.compare_states(
+            maps, order, stderr=np.full(maps.shape, 1e-3)
+        ).regions[-1]
         found.append((region.correlation, region.correlation_stderr))
     values, errors = np.array(found).T
     np.testing.assert_allclose(values.mean(), 1 / 1.49, atol=0.03)
@@ -90,12 +92,12 @@ def test_intraclass_correlation_error_is_its_scatter(rng):
 def test_drifting_melanin_is_separated_from_changing_blood(rng):
     maps, stderr = captures(rng, slope=2e-4)
     times = 30.0 * np.arange(len(ORDER))
-    found = repeatability.drift(maps, ORDER, times, stderr=stderr)[-1]
+    found = repeatability.fit_drift(maps, ORDER, times, stderr=stderr)[-1]
     assert found.name == repeatability.WHOLE_REGION
     assert found.drifts
     assert abs(found.slope_per_minute - 4e-4) < 4 * found.slope_stderr
     still, stderr = captures(rng)
-    found = repeatability.drift(still, ORDER, times, stderr=stderr)[-1]
+    found = repeatability.fit_drift(still, ORDER, times, stderr=stderr)[-1]
     assert not found.drifts
 
 
@@ -104,7 +106,7 @@ def test_states_captured_consecutively_are_not_drift(rng):
     order = tuple(sorted(ORDER, key=lambda s: LEVELS[s]))
     maps, stderr = captures(rng, order=order)
     times = 60.0 * np.arange(len(order))
-    found = repeatability.drift(maps, order, times, stderr=stderr)[-1]
+    found = repeatability.fit_drift(maps, order, times, stderr=stderr)[-1]
     assert not found.drifts
     alike = stats.linregress(times / 60.0, maps.mean(axis=(1, 2)))
     assert alike.pvalue < 1e-4
@@ -117,7 +119,7 @@ def test_drift_alarms_at_stated_rate_regardless_of_scatter(rng):
         for _ in range(300):
             maps, stderr = captures(rng, scatter=scatter, side=8)
             mask = {"all": np.ones((8, 8), bool)}
-            found = repeatability.drift(
+            found = repeatability.fit_drift(
                 maps, ORDER, times, stderr=stderr, regions=mask, false_alarm=0.05
             )
             alarms += any(region.drifts for region in found)
@@ -130,7 +132,7 @@ def test_pixels_invalid_in_any_capture_are_in_none(rng):
     valid[3, :5] = False
     maps[3, :5] = np.nan
     maps[5, 10, 10] = np.nan
-    found = repeatability.compare(maps, ORDER, stderr=stderr, valid=valid)
+    found = repeatability.compare_states(maps, ORDER, stderr=stderr, valid=valid)
     assert found.region("whole face").pixels == SIDE * (SIDE - 5) - 1
     assert np.isfinite(found.region("whole face").means).all()
 
@@ -140,21 +142,23 @@ def test_named_regions_are_measured_independently(rng):
     left = np.zeros((SIDE, SIDE), bool)
     left[:, :12] = True
     maps[:, left] += 0.01
-    found = repeatability.compare(
+    found = repeatability.compare_states(
         maps, ORDER, stderr=stderr, regions={"left": left, "dot": np.eye(SIDE) * left > 9}
     )
     gap = found.region("left").means - maps[:, :, :12].mean(axis=(1, 2))
     np.testing.assert_allclose(gap, 0.0, atol=1e-12)
-    assert found.left_out == (("dot", "0 pixels are valid in all captures"),)
+    assert found.omitted == (("dot", "0 pixels are valid in all captures"),)
 
 
 def test_maps_without_noise_or_change_give_no_nan():
     order = ("neutral", "smile") * 2
     flat = np.full((4, 8, 8), 0.02)
-    found = repeatability.compare(flat, order, stderr=np.zeros(flat.shape)).region("whole face")
+    found = repeatability.compare_states(flat, order, stderr=np.zeros(flat.shape)).region(
+        "whole face"
+    )
     assert found.correlation == 0.0
     assert not found.scatters
-    drifted = repeatability.drift(flat, order, [0, 1, 2, 3], stderr=np.zeros(flat.shape))[-1]
+    drifted = repeatability.fit_drift(flat, order, [0, 1, 2, 3], stderr=np.zeros(flat.shape))[-1]
     assert not drifted.drifts
 
 
@@ -177,10 +181,10 @@ def test_captures_that_cannot_be_compared_are_refused(rng):
     )
     for given, options, message in cases:
         with pytest.raises(RepeatabilityError, match=message):
-            repeatability.compare(*given, **options)
+            repeatability.compare_states(*given, **options)
     with pytest.raises(RepeatabilityError, match="leave no repeats over time"):
-        repeatability.drift(maps[:4], ORDER[:4], np.arange(4.0), stderr=stderr[:4])
+        repeatability.fit_drift(maps[:4], ORDER[:4], np.arange(4.0), stderr=stderr[:4])
     with pytest.raises(RepeatabilityError, match="times_s: got shape"):
-        repeatability.drift(maps, ORDER, [1.0], stderr=stderr)
+        repeatability.fit_drift(maps, ORDER, [1.0], stderr=stderr)
     with pytest.raises(RepeatabilityError, match="region: got 'chin', expected one of"):
-        repeatability.compare(maps, ORDER, stderr=stderr).region("chin")
+        repeatability.compare_states(maps, ORDER, stderr=stderr).region("chin")

@@ -38,7 +38,7 @@ def test_reddening_patch_transfers_to_same_landmark():
     shape = (220, 200)
     there = transfer_rig(rig, shape, landmarks_rig=MARKS, landmarks_onto=elsewhere(MARKS))
     other = np.full(shape, 0.03) + 0.003 * np.random.default_rng(9).standard_normal(shape)
-    found = there.applied_to(other).evaluate({"blush": 1.0})
+    found = there.transfer_to(other).evaluate({"blush": 1.0})
     ratio = np.where(found.valid, found.hemoglobin / other, np.nan)
 
     def near(x, y, ratio=ratio):
@@ -48,7 +48,7 @@ def test_reddening_patch_transfers_to_same_landmark():
     assert near(x, y) == pytest.approx(1.5, abs=0.06)
     assert near(*elsewhere({"b": (66.0, 12.0)})["b"]) == pytest.approx(1.0, abs=0.06)
     # without landmarks the patch would lie in the middle of the other picture
-    plain = rig.applied_to(other).evaluate({"blush": 1.0})
+    plain = rig.transfer_to(other).evaluate({"blush": 1.0})
     assert near(x, y, plain.hemoglobin / other) < 1.4
 
 

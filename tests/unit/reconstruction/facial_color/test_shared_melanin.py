@@ -21,7 +21,7 @@ def table():
 
 @pytest.fixture(scope="module")
 def prior():
-    return shading_prior.of_faces()
+    return shading_prior.face_prior()
 
 
 def pictures(table, rng, *, noise, pixels=2000, blood=BLOOD, melanin=MELANIN, bias=None, light=0.6):
@@ -113,7 +113,7 @@ def test_melanin_variance_falls_with_number_of_states(table, prior, rng):
 
 def test_model_error_stays_in_melanin_and_spares_changes(table, prior, rng):
     """The same error in all states: averaging keeps it, differences lose nearly all of it."""
-    covariance = model_error.load()
+    covariance = model_error.load_covariance()
     pixels = 1500
     drawn = rng.multivariate_normal(np.zeros(3), covariance, pixels)
     rgb, variance = pictures(table, rng, noise=3e-4, pixels=pixels, bias=drawn)
@@ -145,7 +145,12 @@ def test_pixels_of_large_errors_leave_others_unchanged(table, prior, rng):
 
     def maps(error):
         found = shared_melanin.estimate_shared_melanin(
-            rgb, table, prior=prior, variance=variance, model_error=error, own_share=0.0
+            rgb,
+            table,
+            prior=prior,
+            variance=variance,
+            model_error=error,
+            state_variance_fraction=0.0,
         )
         return np.stack(
             [
@@ -166,7 +171,7 @@ def test_pixels_of_large_errors_leave_others_unchanged(table, prior, rng):
 
 def test_single_state_matches_single_image_posterior(table, prior, rng):
     rgb, variance = pictures(table, rng, noise=3e-3, pixels=200, blood=BLOOD[:1])
-    covariance = model_error.load()
+    covariance = model_error.load_covariance()
     found = shared_melanin.estimate_shared_melanin(
         rgb, table, prior=prior, variance=variance, model_error=covariance
     )
@@ -226,11 +231,11 @@ def test_state_with_other_pixel_melanin_is_misfit(table, prior, rng):
     rgb, variance = pictures(table, rng, noise=1e-3, pixels=50)
     rgb[3] *= (np.array([1.12, 0.94, 1.0])).astype(np.float32)
     found = shared_melanin.estimate_shared_melanin(rgb, table, prior=prior, variance=variance)
-    assert found.misfits[3].mean() > 0.9
+    assert found.is_misfit[3].mean() > 0.9
     clean, variance = pictures(table, rng, noise=1e-3, pixels=50)
     assert not shared_melanin.estimate_shared_melanin(
         clean, table, prior=prior, variance=variance
-    ).misfits.any()
+    ).is_misfit.any()
 
 
 def smooth_light(shape, bend=0.08):
@@ -344,7 +349,7 @@ def test_state_registration_error_counts_as_correlated_noise(table, prior, rng):
     given = np.zeros((2, pixels, 3, 3))
     given[1] = own
     found = shared_melanin.estimate_shared_melanin(
-        rgb, table, prior=prior, variance=variance, own_error=given
+        rgb, table, prior=prior, variance=variance, state_covariance=given
     )
     low, high = chi_square_band(pixels)
     for error, stderr in (
@@ -361,7 +366,7 @@ def test_mismatched_registration_error_is_refused(table, prior, rng):
     for wrong in (np.zeros((4, 3, 3)), np.full((len(rgb), 4, 3, 3), np.nan)):
         with pytest.raises(ChromophoreError, match="own_error"):
             shared_melanin.estimate_shared_melanin(
-                rgb, table, prior=prior, variance=variance, own_error=wrong
+                rgb, table, prior=prior, variance=variance, state_covariance=wrong
             )
 
 
@@ -389,7 +394,7 @@ def test_face_pixels_constrain_common_melanin_but_keep_moles(table, prior, rng):
             prior=prior,
             variance=(3e-3 * clean) ** 2,
             one_face=one_face,
-            model_error=model_error.color_errors().transport,
+            model_error=model_error.load_error_terms().transport,
         )
         usual = found.valid.copy()
         usual[mole] = False

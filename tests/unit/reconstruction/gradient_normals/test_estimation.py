@@ -14,7 +14,11 @@ from model.metrics import angular_error_rad
 from reconstruction.gradient_normals import moment_kernels
 from reconstruction.gradient_normals.estimation import estimate_roughness, from_patterns
 from reconstruction.gradient_normals.noise import SensorNoise
-from reconstruction.gradient_normals.patterns import GradientError, MissingPatterns, design
+from reconstruction.gradient_normals.patterns import (
+    GradientError,
+    MissingPatternsError,
+    design_matrix,
+)
 from reconstruction.gradient_normals.sphere_lights import SphereLights, SphereLightsError
 
 VIEW = np.array([0.0, 0.0, 1.0])
@@ -218,9 +222,9 @@ def test_moments_are_weighted_least_squares_of_all_samples(rng, dark):
         there[7] &= dark
         y, v = rng.standard_normal(8), np.exp(rng.standard_normal(8))
         names = [name for name, here in zip(NAMES, there, strict=True) if here]
-        A = design(names, dark=dark)
+        A = design_matrix(names, dark=dark)
         out = np.empty((moment_kernels.MOMENT_ROWS, 1))
-        moment_kernels.moments(
+        moment_kernels.fit_moments(
             np.where(there, y, np.nan)[:, None], v[:, None], 0.0, 1.0, 1, dark, out
         )
         if len(names) == 0 or np.linalg.matrix_rank(A) < A.shape[1]:
@@ -258,17 +262,17 @@ def test_moments_are_weighted_least_squares_of_all_samples(rng, dark):
 )
 def test_too_few_patterns_are_refused_naming_sufficient_ones(scene, names, words):
     _, _, images = scene
-    with pytest.raises(MissingPatterns, match=words):
+    with pytest.raises(MissingPatternsError, match=words):
         from_patterns(only(images, NAMES, names) if names else only(images, NAMES, ("dark",)))
 
 
 def test_specular_normals_need_both_polarizers_diffuse_only_crossed(scene):
     _, normals, images = scene
-    with pytest.raises(MissingPatterns, match="no crossed"):
+    with pytest.raises(MissingPatternsError, match="no crossed"):
         from_patterns(only(images, NAMES, ()))
-    with pytest.raises(MissingPatterns, match="no parallel"):
+    with pytest.raises(MissingPatternsError, match="no parallel"):
         from_patterns(only(images, (), NAMES))
-    with pytest.raises(MissingPatterns, match="no crossed"):
+    with pytest.raises(MissingPatternsError, match="no crossed"):
         from_patterns(only(images, NAMES, ()), component="diffuse")
     found = from_patterns(only(images, (), NAMES), component="diffuse")
     # on a nearly whole sphere of lights, a matte surface's vector is its normal

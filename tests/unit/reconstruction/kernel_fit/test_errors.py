@@ -20,18 +20,18 @@ def case(rng, side=128):
     target = normal_histogram.histogram(
         1.1 * height + 0.2 * gaussian_filter(rng.standard_normal((side, side)), 1.0), pixel=6.0
     )
-    relief = neutral_relief.relief_of(height, stretch=1.0, axis="x", pixel_um=6.0)
-    buckets = kernel_search.Buckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
+    relief = neutral_relief.prepare_relief(height, stretch=1.0, axis="x", pixel_um=6.0)
+    buckets = kernel_search.TargetBuckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
     return kernel_search.KernelGrid(relief, buckets, ALPHAS, SIGMAS_UM)
 
 
 def test_counts_kept_by_search_cover_all_pixels(rng):
     grid = case(rng)
-    found = kernel_search.hierarchical(grid, first_sample=1024, rng=rng)
+    found = kernel_search.search_hierarchically(grid, first_sample=1024, rng=rng)
     assert set(found.counts) == set(map(tuple, np.argwhere(found.exact).tolist()))
     assert 0 < len(found.counts) < found.distance.size
     wanted = np.array([[0, 0], found.best, [19, 20], [0, 3]])
-    shares = found.shares(grid, wanted)
+    shares = found.histograms(grid, wanted)
     for row, (i, j) in zip(shares, wanted, strict=True):
         counts = grid.count(SIGMAS_UM[i], ALPHAS[[j]]).sum(axis=(0, 1))
         np.testing.assert_array_equal(row, counts / grid.relief.places.size)
@@ -42,29 +42,35 @@ def test_counts_kept_by_search_cover_all_pixels(rng):
 
 def test_errors_are_equal_from_kept_and_new_counts(rng):
     grid = case(rng)
-    found = kernel_search.hierarchical(grid, first_sample=1024, rng=rng)
+    found = kernel_search.search_hierarchically(grid, first_sample=1024, rng=rng)
     i, j = found.best
-    blocks = kernel_errors.of_kernel(grid, float(ALPHAS[j]), float(SIGMAS_UM[i]))
-    noise, scatter = blocks.noise(grid.buckets.target, 1e4), blocks.scatter(1e4)
-    drawn = [kernel_errors.Draws(grid, found, noise, np.random.default_rng(5)) for _ in range(2)]
-    with_counts = drawn[0].widths_of_best(scatter)
+    blocks = kernel_errors.count_blocks(grid, float(ALPHAS[j]), float(SIGMAS_UM[i]))
+    noise, scatter = (
+        blocks.distance_stderr(grid.buckets.target, 1e4),
+        blocks.block_contributions(1e4),
+    )
+    drawn = [
+        kernel_errors.HistogramResampling(grid, found, noise, np.random.default_rng(5))
+        for _ in range(2)
+    ]
+    with_counts = drawn[0].best_kernel_widths(scatter)
     found.counts.clear()
-    without = drawn[1].widths_of_best(scatter)
+    without = drawn[1].best_kernel_widths(scatter)
     assert with_counts == without
     assert with_counts.alpha[0] > 0.0
 
 
 def test_kept_counts_stay_within_granted_memory(rng, monkeypatch):
     grid = case(rng)
-    monkeypatch.setattr(kernel_search, "KEPT_BYTES", 3 * 4 * (64 * 64 + 1))
-    found = kernel_search.hierarchical(grid, first_sample=1024, rng=rng)
+    monkeypatch.setattr(kernel_search, "MAX_CACHED_COUNT_BYTES", 3 * 4 * (64 * 64 + 1))
+    found = kernel_search.search_hierarchically(grid, first_sample=1024, rng=rng)
     assert len(found.counts) == 3
 
 
 def test_the_valley_begins_with_the_best_and_rises(rng):
     grid = case(rng, side=48)
-    found = kernel_search.exhaustive(grid)
-    near = kernel_errors.nearly_as_good(grid, found, 0.05)
+    found = kernel_search.search_exhaustively(grid)
+    near = kernel_errors.near_best_kernels(grid, found, 0.05)
     assert tuple(near[0]) == found.best
     distance = found.distance[tuple(near.T)]
     assert (np.diff(distance[1:]) >= 0.0).all()
@@ -78,7 +84,7 @@ def test_bounds_are_the_sums_of_plain_numpy(rng):
         target = rng.dirichlet(np.ones(cells))
         signs = np.sign(rng.standard_normal((2, cells)))
         before, fresh, pixels = 5000, 9000, 100_000
-        found = kernels.bounds(first, second, target, before, fresh, pixels, signs)
+        found = kernels.distance_bounds(first, second, target, before, fresh, pixels, signs)
         x, y = first.sum(axis=0), second.sum(axis=0)
         gap = target - (x + y * (pixels - before) / fresh) / pixels
         lows = [np.sum(np.sign(target - x / before) * gap, axis=1), *(gap @ signs.T).T]
@@ -88,9 +94,9 @@ def test_bounds_are_the_sums_of_plain_numpy(rng):
 
 def paired(height, strained, blocks=normal_blocks.BLOCKS_PER_SIDE):
     """Return counts of a strained map in the blocks of the neutral one, pixel by pixel."""
-    rows, columns = normal_blocks.grid_of(height.shape, blocks)
-    group, groups = normal_blocks.block_of(np.arange(height.size), height.shape, blocks)
-    counts = normal_blocks.block_counts(
+    rows, columns = normal_blocks.block_grid_shape(height.shape, blocks)
+    group, groups = normal_blocks.assign_blocks(np.arange(height.size), height.shape, blocks)
+    counts = normal_blocks.count_block_normals(
         strained, group.reshape(height.shape), groups, pixel=6.0, bins=64
     )
     return counts.reshape(rows, columns, 64, 64)
@@ -99,7 +105,7 @@ def paired(height, strained, blocks=normal_blocks.BLOCKS_PER_SIDE):
 def strained_pair(rng, side=96):
     """Return a relief and what a kernel and a little of something else make of it."""
     height = 8.0 * gaussian_filter(rng.standard_normal((side, side)), 2.0)
-    deeper = neutral_relief.convolved(height, -0.4, 15.0, axis="x", pixel_um=6.0)
+    deeper = neutral_relief.convolve_relief(height, -0.4, 15.0, axis="x", pixel_um=6.0)
     return height, deeper + 0.3 * gaussian_filter(rng.standard_normal((side, side)), 1.0)
 
 
@@ -164,10 +170,10 @@ def test_pairs_without_resamples_are_refused_or_fall_back(rng):
 def test_normals_are_counted_in_blocks_of_any_shape(rng):
     height = 5.0 * gaussian_filter(rng.standard_normal((40, 50)), 2.0)
     block = rng.integers(-1, 3, height.shape)
-    counts = normal_blocks.block_counts(height, block, 3, pixel=6.0, angle_rad=0.3)
+    counts = normal_blocks.count_block_normals(height, block, 3, pixel=6.0, angle_rad=0.3)
     for k in range(3):
         a, b, _ = relief_slopes.slopes(height, pixel=6.0)
-        x, y = relief_slopes.turned(a[block == k], b[block == k], 0.3)
+        x, y = relief_slopes.rotate_components(a[block == k], b[block == k], 0.3)
         np.testing.assert_allclose(
             counts[k] / counts[k].sum(), normal_histogram.from_slopes(x, y), atol=1e-12
         )

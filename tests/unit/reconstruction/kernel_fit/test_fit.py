@@ -6,7 +6,7 @@ from model.microstructure.kernel_table import gaussian_weights
 from reconstruction import normal_histogram as nh
 from reconstruction.kernel_fit import search as ks
 from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM, KernelSearch, fit_kernel
-from reconstruction.kernel_fit.neutral_relief import KernelFitError, convolved, relief_of
+from reconstruction.kernel_fit.neutral_relief import KernelFitError, convolve_relief, prepare_relief
 from reconstruction.normal_histogram import kernels
 
 PIXEL_UM = 6.0
@@ -26,9 +26,9 @@ def skin(side, rng, *, slope=0.3):
 
 def convolved_histogram(height, alpha, sigma_um, *, stretch, axis):
     """Return the histogram that the search compares with its target."""
-    relief = relief_of(height, stretch=stretch, axis=axis, pixel_um=PIXEL_UM)
-    buckets = ks.Buckets(np.zeros(64 * 64 + 1), 64, 1.0)
-    start, change = (relief.along, relief.across), relief.change(sigma_um)
+    relief = prepare_relief(height, stretch=stretch, axis=axis, pixel_um=PIXEL_UM)
+    buckets = ks.TargetBuckets(np.zeros(64 * 64 + 1), 64, 1.0)
+    start, change = (relief.along, relief.across), relief.slope_change(sigma_um)
     counts = buckets.count(start, change, np.array([alpha])).sum(axis=0)[0]
     shares = counts[:-1].reshape(64, 64) / relief.places.size
     return shares.T if axis == "y" else shares
@@ -98,12 +98,12 @@ def compared(rng, side, first_sample, grid=(ALPHA_GRID, SIGMAS_UM)):
         target = scipy_target(
             height, rng.uniform(-2, 1), rng.uniform(3, 80), stretch=stretch, axis=int(axis == "x")
         )
-    relief = relief_of(height, stretch=stretch, axis=axis, pixel_um=PIXEL_UM)
+    relief = prepare_relief(height, stretch=stretch, axis=axis, pixel_um=PIXEL_UM)
     flat = (target.T if axis == "y" else target).reshape(-1)
-    buckets = ks.Buckets(np.append(flat, 0.0), 64, 1.0)
+    buckets = ks.TargetBuckets(np.append(flat, 0.0), 64, 1.0)
     kernels_tried = ks.KernelGrid(relief, buckets, *grid)
-    full = ks.exhaustive(kernels_tried)
-    part = ks.hierarchical(kernels_tried, first_sample=first_sample, rng=rng)
+    full = ks.search_exhaustively(kernels_tried)
+    part = ks.search_hierarchically(kernels_tried, first_sample=first_sample, rng=rng)
     return full, part
 
 
@@ -138,10 +138,10 @@ def test_kernel_lower_bounds_never_exceed_true_distances(rng):
     """The proof's inequality itself: over a whole grid, lower bounds lie below the distances."""
     height = skin(160, rng)
     target = nh.histogram(unlike(height, rng), pixel=PIXEL_UM)
-    relief = relief_of(height, stretch=1.0, axis="x", pixel_um=PIXEL_UM)
-    buckets = ks.Buckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
+    relief = prepare_relief(height, stretch=1.0, axis="x", pixel_um=PIXEL_UM)
+    buckets = ks.TargetBuckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
     grid = ks.KernelGrid(relief, buckets, *COARSE_GRID)
-    full = ks.exhaustive(grid)
+    full = ks.search_exhaustively(grid)
     race = ks._Race(grid)
     race.run([2048, 8192], rng)
     assert (race.low <= full.distance + 1e-12).all()
@@ -153,7 +153,7 @@ def test_results_are_independent_of_thread_count(rng, monkeypatch):
     target = nh.histogram(unlike(height, rng), pixel=PIXEL_UM)
     found = []
     for parts in (1, 2, 7):
-        monkeypatch.setattr(kernels, "threads", lambda parts=parts: parts)
+        monkeypatch.setattr(kernels, "thread_count", lambda parts=parts: parts)
         fit = fit_kernel(
             height,
             target,
@@ -171,10 +171,10 @@ def test_samples_are_changed_as_whole_maps_are(rng):
     height = skin(90, rng)
     valid = np.ones(height.shape, bool)
     valid[30:40, 20:50] = False
-    relief = relief_of(height, stretch=1.1, axis="y", pixel_um=PIXEL_UM, valid=valid)
+    relief = prepare_relief(height, stretch=1.1, axis="y", pixel_um=PIXEL_UM, valid=valid)
     chosen = rng.permutation(relief.places.size)[:1500]
     for sigma in (1.0, 7.0, 99.0):
-        whole = relief.change(sigma)
+        whole = relief.slope_change(sigma)
         part = ks._SampledChange(relief, chosen, 100.0).at(sigma)
         for a, b in zip(whole, part, strict=True):
             np.testing.assert_allclose(b, a[chosen], atol=2e-6)
@@ -183,14 +183,14 @@ def test_samples_are_changed_as_whole_maps_are(rng):
 def test_border_is_mirrored_and_holes_filled_along_axis(rng):
     height = skin(40, rng)
     for axis, number in (("x", 1), ("y", 0)):
-        ours = convolved(height, 0.7, 90.0, axis=axis, pixel_um=PIXEL_UM)
+        ours = convolve_relief(height, 0.7, 90.0, axis=axis, pixel_um=PIXEL_UM)
         theirs = 0.3 * height + 0.7 * gaussian_filter1d(height, 15.0, axis=number)
         np.testing.assert_allclose(ours, theirs, atol=1e-4)
     ramp = np.tile(np.arange(30.0), (8, 1))
     valid = np.ones(ramp.shape, bool)
     valid[:, 12:15] = False
     spoiled = np.where(valid, ramp, 99.0)
-    ours = convolved(spoiled, 1.0, 6.0, axis="x", pixel_um=PIXEL_UM, valid=valid)
+    ours = convolve_relief(spoiled, 1.0, 6.0, axis="x", pixel_um=PIXEL_UM, valid=valid)
     np.testing.assert_allclose(
         ours[:, 8:20][valid[:, 8:20]], ramp[:, 8:20][valid[:, 8:20]], atol=1e-4
     )
@@ -313,7 +313,7 @@ def test_standard_errors_predict_deviation_of_other_patch(rng):
     grid = {"grid": (np.round(np.arange(-1.6, 0.01, 0.05), 2), np.arange(8.0, 41, 2))}
     pulls = []
     for _ in range(10):
-        other = convolved(skin(128, rng), -0.8, 20.0, axis="x", pixel_um=PIXEL_UM)
+        other = convolve_relief(skin(128, rng), -0.8, 20.0, axis="x", pixel_um=PIXEL_UM)
         fit = fit_kernel(
             skin(128, rng),
             nh.histogram(other, pixel=PIXEL_UM),
@@ -357,4 +357,4 @@ def test_empty_or_misshapen_grid_is_reported(shape):
     alphas, sigmas_um = np.linspace(0.0, 1.0, min(shape[1], 3)), np.arange(1.0, 1.0 + shape[0])
     distance = np.zeros(shape if shape != (3, 2) else (2, 3))
     with pytest.raises(ks.KernelFitError, match=r"distance: got shape"):
-        ks.gentlest(distance, alphas, sigmas_um)
+        ks.find_best(distance, alphas, sigmas_um)

@@ -10,7 +10,7 @@ from model.microstructure.kernel_table import (
 from reconstruction.kernel_fit.table import (
     KernelTableFitError,
     alpha_rms,
-    direction_dependence,
+    estimate_direction_dependence,
     fit_table,
 )
 
@@ -113,12 +113,12 @@ def test_deviating_direction_is_separated_from_equal_ones(rng):
     chances = []
     for shift in (0.0, 0.4):
         noisy = alpha + 0.05 * rng.standard_normal(r.size) + shift * (angle > 2.0)
-        found = direction_dependence(FOREHEAD, r, noisy, sigma, angle)
+        found = estimate_direction_dependence(FOREHEAD, r, noisy, sigma, angle)
         assert abs(found.alpha_offset[3] - shift) < 5 * found.alpha_stderr[3]
         chances.append(found.p_alpha)
     assert chances[0] > 1e-3 > 1e-6 > chances[1]
     with pytest.raises(KernelTableFitError, match="directions"):
-        direction_dependence(FOREHEAD, r, alpha, sigma, np.zeros(r.size))
+        estimate_direction_dependence(FOREHEAD, r, alpha, sigma, np.zeros(r.size))
 
 
 def test_vanishing_sigma_line_is_clamped_to_smallest_sigma():

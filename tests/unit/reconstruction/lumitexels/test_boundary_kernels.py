@@ -21,7 +21,7 @@ def test_compiled_and_plain_transmittance_are_bit_equal(rng, eta, dtype):
     cosines[1, 0, 8:16] = special
     cosines = np.concatenate([cosines, cosines[::-1]], axis=1)
     before = cosines.copy()
-    found = boundary_kernels.transmitted(*cosines, eta)
+    found = boundary_kernels.boundary_transmittance(*cosines, eta)
     expected = plain(*cosines.astype(np.float64), eta)
     assert found.dtype == np.float64
     np.testing.assert_array_equal(found, expected)
@@ -30,20 +30,23 @@ def test_compiled_and_plain_transmittance_are_bit_equal(rng, eta, dtype):
 
 def test_matched_boundary_transmits_everything_and_grazing_light_nothing():
     up, low = np.ones(3), np.zeros(3)
-    np.testing.assert_array_equal(boundary_kernels.transmitted(up, low, 1.0), 1.0)
-    np.testing.assert_array_equal(boundary_kernels.transmitted(low, up, 1.4), 0.0)
+    np.testing.assert_array_equal(boundary_kernels.boundary_transmittance(up, low, 1.0), 1.0)
+    np.testing.assert_array_equal(boundary_kernels.boundary_transmittance(low, up, 1.4), 0.0)
 
 
 def test_transmittance_works_in_any_memory_order_or_empty(rng):
     cosines = rng.uniform(0.0, 1.0, (40, 30))
-    turned = boundary_kernels.transmitted(cosines.T, cosines.T[:, ::1])
+    turned = boundary_kernels.boundary_transmittance(cosines.T, cosines.T[:, ::1])
     np.testing.assert_array_equal(turned, plain(cosines.T, cosines.T, fresnel.ETA_SKIN))
-    assert boundary_kernels.transmitted(np.zeros((0, 4)), np.zeros((0, 4))).shape == (0, 4)
+    assert boundary_kernels.boundary_transmittance(np.zeros((0, 4)), np.zeros((0, 4))).shape == (
+        0,
+        4,
+    )
 
 
 @pytest.mark.parametrize("eta", [0.0, -1.0, np.nan, np.inf])
 def test_invalid_index_is_refused(eta):
     with pytest.raises(ValueError, match="eta: got"):
-        boundary_kernels.transmitted(np.ones(2), np.ones(2), eta)
+        boundary_kernels.boundary_transmittance(np.ones(2), np.ones(2), eta)
     with pytest.raises(ValueError, match="cos_light: got"):
-        boundary_kernels.transmitted(np.ones(2), np.ones(3))
+        boundary_kernels.boundary_transmittance(np.ones(2), np.ones(3))

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from reconstruction.lumitexels.ray_casting import RayCaster
-from reconstruction.lumitexels.samples import Surface, visibility
+from reconstruction.lumitexels.samples import SampledSurface, compute_visibility
 from reconstruction.lumitexels.store import LumitexelStore
 
 RADIUS = 80.0
@@ -91,7 +91,7 @@ CASTER = RayCaster(SPHERE.vertices, SPHERE.faces)
 
 def surface(stride=25):
     points = SPHERE.vertices[::stride]
-    return Surface(points, points / RADIUS)
+    return SampledSurface(points, points / RADIUS)
 
 
 def lambertian(view, light, *, lights=LIGHTS, camera=None):
@@ -157,7 +157,7 @@ def test_occluder_before_light_removes_only_its_samples():
     both = trimesh.util.concatenate([SPHERE, barrier])
     centers = np.array([c.center_mm for c in CAMERAS])
     free, shaded = (
-        visibility(where, c, cameras_mm=centers, lights_mm=LIGHTS.position_mm)
+        compute_visibility(where, c, cameras_mm=centers, lights_mm=LIGHTS.position_mm)
         for c in (CASTER, RayCaster(both.vertices, both.faces))
     )
     np.testing.assert_array_equal(free.light[[0, 1, 3]], shaded.light[[0, 1, 3]])
@@ -170,7 +170,7 @@ def test_occluder_before_light_removes_only_its_samples():
     assert 10 < lost.sum() < free.light[2].sum()
     assert lost[(off < 14) & free.light[2]].all()
     assert not lost[off > 16].any()
-    rim = visibility(
+    rim = compute_visibility(
         where,
         RayCaster(both.vertices, both.faces),
         cameras_mm=centers,
@@ -364,7 +364,7 @@ def test_memory_does_not_grow_with_the_tables(tmp_path):
     flat = np.ones((HEIGHT, WIDTH, 3), np.float32)
     peaks, tables = [], []
     for count in (5_000, 20_000):
-        where = Surface(points[:count], points[:count] / RADIUS)
+        where = SampledSurface(points[:count], points[:count] / RADIUS)
         folder = tmp_path / f"{count}"
         folder.mkdir()
         tracemalloc.start()
@@ -400,14 +400,14 @@ def test_arguments_that_do_not_fit_are_named(change, says):
 
 def test_surface_requires_unit_normal_per_point():
     with pytest.raises(ValueError, match="lengths of normals: got"):
-        Surface(np.zeros((2, 3)), np.ones((2, 3)))
+        SampledSurface(np.zeros((2, 3)), np.ones((2, 3)))
     with pytest.raises(ValueError, match="normals: got"):
-        Surface(np.zeros((2, 3)), np.zeros((3, 3)))
+        SampledSurface(np.zeros((2, 3)), np.zeros((3, 3)))
     with pytest.raises(ValueError, match="finite"):
-        Surface(np.full((2, 3), np.nan), np.zeros((2, 3)))
+        SampledSurface(np.full((2, 3), np.nan), np.zeros((2, 3)))
 
 
 def test_point_inside_mesh_has_no_valid_samples():
-    where = Surface(np.zeros((1, 3)), np.array([[0.0, 0, 1]]))
+    where = SampledSurface(np.zeros((1, 3)), np.array([[0.0, 0, 1]]))
     found = gather(where, cameras=CAMERAS, lights=LIGHTS, images=image, caster=CASTER)
     assert not found.valid.any()

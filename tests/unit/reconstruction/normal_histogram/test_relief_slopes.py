@@ -3,9 +3,9 @@ import pytest
 
 from reconstruction.normal_histogram.relief_slopes import (
     HistogramError,
+    slope_stencil,
     slopes,
-    slopes_of_normals,
-    stencil,
+    slopes_from_normals,
 )
 
 
@@ -53,25 +53,25 @@ def test_a_list_of_rows_is_a_map():
 )
 def test_non_real_map_is_refused(height, told):
     with pytest.raises(HistogramError, match=f"height: got {told}" if told[0] != "s" else told):
-        stencil(height)
+        slope_stencil(height)
 
 
 @pytest.mark.parametrize("valid", [np.ones((4, 4)), np.ones((4, 1), bool), True, [[1, 0]]])
 def test_masks_of_another_shape_or_type_are_refused(valid):
     with pytest.raises(HistogramError, match="valid: got"):
-        stencil(np.zeros((4, 4)), valid)
+        slope_stencil(np.zeros((4, 4)), valid)
     normals = np.broadcast_to([0.0, 0.0, 1.0], (4, 4, 3))
     with pytest.raises(HistogramError, match="valid: got"):
-        slopes_of_normals(normals, valid=valid)
+        slopes_from_normals(normals, valid=valid)
 
 
 def test_back_facing_or_nonfinite_normals_have_no_slope():
     normals = np.array([[0.3, -0.4, 1.0], [0.3, -0.4, 0.0], [0.0, 0.0, -1.0], [np.nan, 0.0, 1.0]])
     kept = normals.copy()
-    a, b, known = slopes_of_normals(2.0 * normals)
+    a, b, known = slopes_from_normals(2.0 * normals)
     assert known.tolist() == [True, False, False, False]
     np.testing.assert_allclose(a, [-0.3, 0, 0, 0], atol=1e-15)
     np.testing.assert_allclose(b, [0.4, 0, 0, 0], atol=1e-15)
     np.testing.assert_array_equal(normals, kept)
     with pytest.raises(HistogramError, match="normals: got shape"):
-        slopes_of_normals(np.zeros((3, 4)))
+        slopes_from_normals(np.zeros((3, 4)))

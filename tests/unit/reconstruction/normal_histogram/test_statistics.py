@@ -3,7 +3,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from reconstruction import normal_histogram as nh
-from reconstruction.normal_histogram.statistics import measure
+from reconstruction.normal_histogram.statistics import measure_normals
 
 
 def rough(side, rng, *, correlation_px=2.0, slope=0.3):
@@ -12,7 +12,7 @@ def rough(side, rng, *, correlation_px=2.0, slope=0.3):
 
 
 def test_flat_patch_fills_single_bucket_without_aliasing():
-    flat = measure(np.zeros((20, 20)), pixel=1.0)
+    flat = measure_normals(np.zeros((20, 20)), pixel=1.0)
     assert flat.occupied == 1
     assert flat.variance_x == flat.variance_y == flat.stderr_x == 0.0
     assert not flat.aliased
@@ -21,14 +21,14 @@ def test_flat_patch_fills_single_bucket_without_aliasing():
 
 def test_few_samples_for_many_buckets_are_called_aliased(rng):
     height = rough(32, rng)
-    assert measure(height, pixel=1.0).aliased
-    assert not measure(height, pixel=1.0, bins=4).aliased
+    assert measure_normals(height, pixel=1.0).aliased
+    assert not measure_normals(height, pixel=1.0, bins=4).aliased
 
 
 def test_normals_beyond_the_limit_are_counted_apart():
     height = np.tile(np.arange(8.0), (8, 1))
     height[:, 4:] = height[:, 4:5]  # steep on the left, flat on the right
-    found = measure(height, pixel=1.0, limit=0.6)
+    found = measure_normals(height, pixel=1.0, limit=0.6)
     assert found.outside == 4 * 8  # columns 0...3 rise by 1 a pixel: n_x = -0.71
     assert found.samples == height.size - found.outside
     assert found.histogram.sum() == pytest.approx(1.0)
@@ -43,7 +43,7 @@ def test_standard_error_of_variances_is_their_scatter(rng):
     found = []
     for _ in range(60):
         white = rng.standard_normal((160, 160))
-        found.append(measure(13.0 * gaussian_filter(white, 3.0, mode="wrap"), pixel=1.0))
+        found.append(measure_normals(13.0 * gaussian_filter(white, 3.0, mode="wrap"), pixel=1.0))
     scatter = np.std([m.variance_y for m in found], ddof=1)
     assert 0.7 < scatter / np.mean([m.stderr_y for m in found]) < 1.35
     plain = np.mean([np.sqrt(2 / m.samples) * m.variance_y for m in found])
@@ -52,7 +52,7 @@ def test_standard_error_of_variances_is_their_scatter(rng):
 
 def test_effective_normal_count_predicts_distance_of_two_patches(rng):
     pairs = [
-        [measure(rough(192, rng, correlation_px=5.0), pixel=1.0, bins=16) for _ in range(2)]
+        [measure_normals(rough(192, rng, correlation_px=5.0), pixel=1.0, bins=16) for _ in range(2)]
         for _ in range(12)
     ]
     real = np.mean([nh.distance(a.histogram, b.histogram) for a, b in pairs])

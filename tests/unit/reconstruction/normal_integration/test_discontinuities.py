@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
-from reconstruction.normal_integration.discontinuities import Bilateral, integrate_broken
+from reconstruction.normal_integration.discontinuities import (
+    BilateralSettings,
+    integrate_with_discontinuities,
+)
 from reconstruction.normal_integration.integration import integrate
 from reconstruction.normal_integration.weighted_poisson import IntegrationError
 
@@ -46,24 +49,30 @@ def plain_objective(height, normals, k):
 def test_bilateral_integration_raises_flap_joined_surface_flattens():
     truth, normals, _ = flap(96, 1.0)
     joined = rms(integrate(normals), truth)
-    found = integrate_broken(normals, settings=Bilateral(sharpness=20.0, stop=0.0))
+    found = integrate_with_discontinuities(
+        normals, settings=BilateralSettings(sharpness=20.0, stop=0.0)
+    )
     assert rms(found.height, truth) < joined / 2
     # too soft a setting leaves it joined
-    soft = integrate_broken(normals, settings=Bilateral(sharpness=0.01))
+    soft = integrate_with_discontinuities(normals, settings=BilateralSettings(sharpness=0.01))
     assert rms(soft.height, truth) > 0.85 * joined
 
 
 def test_the_objective_is_that_of_the_paper():
     _, normals, _ = flap(40, 1.0)
-    found = integrate_broken(normals, settings=Bilateral(sharpness=3.0, rounds=4, stop=0.0))
+    found = integrate_with_discontinuities(
+        normals, settings=BilateralSettings(sharpness=3.0, rounds=4, stop=0.0)
+    )
     assert found.energy == pytest.approx(plain_objective(found.height, normals, 3.0), rel=1e-5)
     assert found.rounds == 4
-    assert not found.settled
+    assert not found.converged
 
 
 def test_weights_within_unit_interval_open_at_jump():
     truth, normals, on = flap(96, 1.0)
-    found = integrate_broken(normals, settings=Bilateral(sharpness=20.0, stop=0.0))
+    found = integrate_with_discontinuities(
+        normals, settings=BilateralSettings(sharpness=20.0, stop=0.0)
+    )
     assert found.right.min() >= 0.0
     assert found.right.max() <= 1.0
     tip = np.flatnonzero(on[48])[-1]
@@ -77,9 +86,9 @@ def test_weights_within_unit_interval_open_at_jump():
 
 def test_smooth_surface_is_unchanged_to_first_order():
     truth, normals, _ = flap(64, 0.0)
-    found = integrate_broken(normals)
+    found = integrate_with_discontinuities(normals)
     assert rms(found.height, truth) < 0.02 * np.std(truth)
-    assert found.settled
+    assert found.converged
 
 
 def test_masks_and_parts_are_kept():
@@ -87,7 +96,7 @@ def test_masks_and_parts_are_kept():
     valid = np.ones((48, 48), bool)
     valid[:, 10] = False
     valid[5, 5] = False
-    found = integrate_broken(normals.astype(np.float32), valid=valid, stderr_rad=0.02)
+    found = integrate_with_discontinuities(normals.astype(np.float32), valid=valid, stderr_rad=0.02)
     assert found.height.dtype == np.float32
     np.testing.assert_array_equal(found.valid, valid)
     np.testing.assert_array_equal(found.height[~valid], 0.0)
@@ -98,18 +107,20 @@ def test_masks_and_parts_are_kept():
 
 def test_single_pixel_and_single_row_have_height():
     flat = np.broadcast_to([0.1, 0.0, 1.0], (1, 9, 3))
-    assert integrate_broken(flat[:, :1]).height.shape == (1, 1)
-    np.testing.assert_allclose(np.diff(integrate_broken(flat).height), -0.1, atol=1e-6)
+    assert integrate_with_discontinuities(flat[:, :1]).height.shape == (1, 1)
+    np.testing.assert_allclose(
+        np.diff(integrate_with_discontinuities(flat).height), -0.1, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("change", [{"sharpness": 0.0}, {"rounds": 0}, {"stop": 1.0}, {"inner": 0}])
 def test_settings_out_of_range_are_named(change):
     with pytest.raises(IntegrationError, match=f"Bilateral.{next(iter(change))}: got"):
-        Bilateral(**change)
+        BilateralSettings(**change)
 
 
 def test_nothing_to_integrate_is_named():
     with pytest.raises(IntegrationError, match="no pixel"):
-        integrate_broken(np.zeros((4, 4, 3)))
+        integrate_with_discontinuities(np.zeros((4, 4, 3)))
     with pytest.raises(IntegrationError, match="pixel: got"):
-        integrate_broken(np.ones((4, 4, 3)), pixel=-1.0)
+        integrate_with_discontinuities(np.ones((4, 4, 3)), pixel=-1.0)

@@ -6,7 +6,7 @@ import pytest
 from reconstruction.normal_integration import slope_fields
 from reconstruction.normal_integration.height_filters import denoise_slopes, high_pass
 from reconstruction.normal_integration.integration import integrate, integrate_map
-from reconstruction.normal_integration.relief_errors import expected_rms
+from reconstruction.normal_integration.relief_errors import expected_height_rms
 from reconstruction.normal_integration.weighted_poisson import IntegrationError
 
 
@@ -163,6 +163,6 @@ def test_errors_of_height_are_those_of_repeated_noise(cutoff, rng):
         squares.append(np.mean(height**2))
     found = np.sqrt(np.mean(squares))
     chance = 0.5 * np.std(squares) / np.sqrt(12) / np.mean(squares)  # relative, one sigma
-    spectral = expected_rms(shape, sigma / np.sqrt(2.0), pixel=pixel, cutoff=cutoff)
+    spectral = expected_height_rms(shape, sigma / np.sqrt(2.0), pixel=pixel, cutoff=cutoff)
     # 4 sigma of 12 draws (Student: 1 in 500); borders add up to 3 % behind a high-pass
     assert spectral == pytest.approx(found, rel=4 * chance + (0.03 if cutoff else 0.01))

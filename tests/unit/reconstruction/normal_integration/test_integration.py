@@ -7,13 +7,17 @@ from scipy.sparse.linalg import spsolve
 
 from reconstruction.normal_integration import slope_fields
 from reconstruction.normal_integration.integration import (
-    NotConverged,
-    Settings,
+    ConvergenceError,
+    IntegrationSettings,
     integrate,
     integrate_map,
 )
 from reconstruction.normal_integration.slope_fields import Perspective
-from reconstruction.normal_integration.weighted_poisson import Hierarchy, IntegrationError, solve
+from reconstruction.normal_integration.weighted_poisson import (
+    IntegrationError,
+    MultigridHierarchy,
+    solve_poisson,
+)
 from reconstruction.normal_maps import NormalMaps
 
 
@@ -71,7 +75,9 @@ def direct(ax, ay, dx, dy):
 @pytest.mark.parametrize("method", ["dct", "multigrid"])
 def test_asymmetric_surface_returns_correctly_oriented(method):
     truth, normals = crooked_surface(70, 90)
-    height = integrate(normals, pixel=6.0, method=method, settings=Settings(tolerance=1e-9))
+    height = integrate(
+        normals, pixel=6.0, method=method, settings=IntegrationSettings(tolerance=1e-9)
+    )
     error = height / 6.0 - centered(truth, np.ones(truth.shape, bool))
     # waves of 1/9 and 1/7 rad a pixel: third order at the border's edges
     assert np.abs(error).max() < 2e-3
@@ -90,7 +96,7 @@ def test_plane_is_exact_for_any_order_and_scale(rng):
     normals = np.broadcast_to(normals_of(np.array(0.4), np.array(-1.1)), (13, 17, 3))
     truth = 0.4 * x - 1.1 * y
     for order in (2, 4):
-        height = integrate(normals * 7.0, pixel=2.5, settings=Settings(order=order))
+        height = integrate(normals * 7.0, pixel=2.5, settings=IntegrationSettings(order=order))
         np.testing.assert_allclose(height, 2.5 * (truth - truth.mean()), atol=1e-10)
 
 
@@ -101,7 +107,9 @@ def test_fourth_order_leaves_thirtieth_of_second_order_error():
     normals = normals_of(-theta * np.sin(theta * (x + 0.5)), np.zeros((96, 96)))
     inner = slice(20, -20)
     error = {
-        order: np.abs(integrate(normals, settings=Settings(order=order)) - truth)[:, inner].max()
+        order: np.abs(integrate(normals, settings=IntegrationSettings(order=order)) - truth)[
+            :, inner
+        ].max()
         for order in (2, 4)
     }
     assert error[2] == pytest.approx(theta**2 / 12, rel=0.2)
@@ -131,7 +139,7 @@ def test_multigrid_matches_direct_solver(mask, weighted, rng):
     slopes = slope_fields.from_normals(noisy, valid=valid, stderr_rad=stderr)
     ax, ay, dx, dy = slope_fields.edges(slopes)
     expected = direct(ax, ay, dx, dy)[1:-1, 1:-1]
-    settings = Settings(tolerance=1e-10)
+    settings = IntegrationSettings(tolerance=1e-10)
     found = integrate_map(
         noisy, valid=valid, stderr_rad=stderr, method="multigrid", settings=settings
     )
@@ -145,7 +153,7 @@ def test_multigrid_matches_direct_solver(mask, weighted, rng):
 def test_cosines_and_multigrid_solve_the_same_equations(rng):
     _, normals = crooked_surface(41, 58)
     noisy = normals + 0.05 * rng.standard_normal(normals.shape)
-    tight = Settings(tolerance=1e-11)
+    tight = IntegrationSettings(tolerance=1e-11)
     a = integrate(noisy, method="dct", settings=tight)
     b = integrate(noisy, method="multigrid", settings=tight)
     np.testing.assert_allclose(a, b, atol=1e-8)
@@ -155,7 +163,7 @@ def test_a_cycle_is_a_symmetric_positive_preconditioner(rng):
     _, normals = crooked_surface(37, 29)
     valid = rng.random((37, 29)) > 0.2
     ax, ay, *_ = slope_fields.edges(slope_fields.from_normals(normals, valid=valid))
-    hierarchy = Hierarchy(ax, ay)
+    hierarchy = MultigridHierarchy(ax, ay)
     inside = np.pad(valid, 1)
 
     def cycle(b):
@@ -224,7 +232,7 @@ def test_weights_over_twelve_decades_are_solved(rng):
     _, normals = crooked_surface(48, 48)
     stderr = 10.0 ** rng.uniform(-4.0, 2.0, (48, 48))
     slopes = slope_fields.from_normals(normals, stderr_rad=stderr)
-    found = integrate_map(normals, stderr_rad=stderr, settings=Settings(tolerance=1e-8))
+    found = integrate_map(normals, stderr_rad=stderr, settings=IntegrationSettings(tolerance=1e-8))
     assert found.convergence.converged
     ax = slope_fields.edges(slopes)[0]
     assert ax[ax > 0].max() > 1e6 * ax[ax > 0].min()
@@ -281,7 +289,7 @@ def test_a_flat_patch_is_flat():
 @pytest.mark.parametrize("method", ["dct", "multigrid"])
 def test_narrow_images_are_integrated(shape, method):
     truth, normals = crooked_surface(*shape)
-    height = integrate(normals, method=method, settings=Settings(tolerance=1e-9))
+    height = integrate(normals, method=method, settings=IntegrationSettings(tolerance=1e-9))
     assert np.abs(height - (truth - truth.mean())).max() < 5e-3
 
 
@@ -379,9 +387,9 @@ def test_stacked_normals_are_integrated_independently(rng, kind):
 
 def test_settings_and_cameras_out_of_range_are_named():
     for make in (
-        lambda: Settings(tolerance=0.0),
-        lambda: Settings(iterations=0),
-        lambda: Settings(order=3),
+        lambda: IntegrationSettings(tolerance=0.0),
+        lambda: IntegrationSettings(iterations=0),
+        lambda: IntegrationSettings(order=3),
         lambda: Perspective(0.0, (1.0, 1.0)),
         lambda: Perspective(100.0, (np.nan, 1.0)),
     ):
@@ -392,17 +400,17 @@ def test_settings_and_cameras_out_of_range_are_named():
 def test_too_few_iterations_raise_not_converged(rng):
     _, normals = crooked_surface(64, 64)
     noisy = normals + 0.1 * rng.standard_normal(normals.shape)
-    with pytest.raises(NotConverged, match="after 1"):
-        integrate(noisy, valid=disc(64, 64), settings=Settings(iterations=1))
+    with pytest.raises(ConvergenceError, match="after 1"):
+        integrate(noisy, valid=disc(64, 64), settings=IntegrationSettings(iterations=1))
 
 
 def test_a_solution_at_hand_needs_no_iteration(rng):
     _, normals = crooked_surface(33, 35)
     ax, ay, dx, dy = slope_fields.edges(slope_fields.from_normals(normals, valid=disc(33, 35)))
     x = np.zeros(dx.shape)
-    hierarchy = Hierarchy(ax, ay)
-    first = solve(hierarchy, dx, dy, x, tolerance=1e-7)
-    again = solve(hierarchy, dx, dy, x, tolerance=1e-7)
+    hierarchy = MultigridHierarchy(ax, ay)
+    first = solve_poisson(hierarchy, dx, dy, x, tolerance=1e-7)
+    again = solve_poisson(hierarchy, dx, dy, x, tolerance=1e-7)
     assert first.iterations > 2
     assert again.iterations == 0
     assert again.residual == first.residual

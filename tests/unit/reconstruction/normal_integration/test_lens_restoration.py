@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 from scipy import fft
 
-from reconstruction.normal_integration.lens_restoration import Aperture, RestorationError, restore
+from reconstruction.normal_integration.lens_restoration import (
+    Aperture,
+    RestorationError,
+    restore_normals,
+)
 
 SIDE = 192
 LENS = Aperture(17.9, 6.0)
@@ -52,7 +56,7 @@ ALL = np.ones((SIDE, SIDE), bool)
 def test_waves_that_the_lens_weakens_come_back():
     true = bumps()
     blurred = seen(true, 1e-4)
-    left = slope_error(restore(normals_of(blurred), lens=LENS, valid=ALL), true)
+    left = slope_error(restore_normals(normals_of(blurred), lens=LENS, valid=ALL), true)
     inner = np.s_[24:-24, 24:-24]
     lost = np.sqrt(np.mean((blurred[0] - true[0])[inner] ** 2))
     assert left < 0.2 * lost
@@ -61,40 +65,40 @@ def test_waves_that_the_lens_weakens_come_back():
 def test_the_wrong_lens_gives_less_back():
     true = bumps()
     pictured = normals_of(seen(true, 1e-3))
-    right = slope_error(restore(pictured, lens=LENS, valid=ALL), true)
-    wrong = slope_error(restore(pictured, lens=Aperture(13.0, 6.0), valid=ALL), true)
+    right = slope_error(restore_normals(pictured, lens=LENS, valid=ALL), true)
+    wrong = slope_error(restore_normals(pictured, lens=Aperture(13.0, 6.0), valid=ALL), true)
     assert right < 0.7 * wrong
 
 
 def test_noise_is_estimated_beyond_lens_cutoff():
-    found = restore(normals_of(seen(bumps(slope=0.05), 0.02)), lens=LENS, valid=ALL)
+    found = restore_normals(normals_of(seen(bumps(slope=0.05), 0.02)), lens=LENS, valid=ALL)
     # about 9,000 independent powers beyond the cutoff: 1 % scatter; normals bend slopes by < 1 %
     assert found.noise == pytest.approx(0.02, rel=0.05)
     assert found.kept_noise < found.noise
 
 
 def test_remaining_noise_matches_sampled_fields():
-    found = restore(normals_of(seen(bumps(), 0.03)), lens=LENS, valid=ALL)
-    drawn = found.noise_field(np.random.default_rng(5))
+    found = restore_normals(normals_of(seen(bumps(), 0.03)), lens=LENS, valid=ALL)
+    drawn = found.sample_noise(np.random.default_rng(5))
     assert np.std(drawn[0]) == pytest.approx(found.kept_noise, rel=0.2)
 
 
 def test_a_flat_patch_stays_flat():
     flat = normals_of([np.zeros((SIDE, SIDE))] * 2)
-    found = restore(flat, lens=LENS, valid=ALL)
+    found = restore_normals(flat, lens=LENS, valid=ALL)
     assert np.array_equal(found.normals, flat)
 
 
 def test_pure_noise_is_omitted():
     rng = np.random.default_rng(2)
     noise = [0.05 * rng.standard_normal((SIDE, SIDE)) for _ in range(2)]
-    found = restore(normals_of(noise), lens=LENS, valid=ALL)
+    found = restore_normals(normals_of(noise), lens=LENS, valid=ALL)
     assert slope_error(found, [np.zeros((SIDE, SIDE))] * 2) < 0.5 * 0.05
 
 
 def test_a_mean_tilt_is_kept():
     x, y = bumps()
-    found = restore(normals_of([x + 0.2, y - 0.1]), lens=LENS, valid=ALL)
+    found = restore_normals(normals_of([x + 0.2, y - 0.1]), lens=LENS, valid=ALL)
     slopes = [-found.normals[..., k] / found.normals[..., 2] for k in (0, 1)]
     assert np.mean(slopes[0]) == pytest.approx(0.2, abs=2e-3)
     assert np.mean(slopes[1]) == pytest.approx(-0.1, abs=2e-3)
@@ -103,7 +107,7 @@ def test_a_mean_tilt_is_kept():
 def test_invalid_pixels_get_upright_normals():
     valid = ALL.copy()
     valid[40:60, 40:60] = False
-    found = restore(normals_of(bumps()), lens=LENS, valid=valid)
+    found = restore_normals(normals_of(bumps()), lens=LENS, valid=valid)
     assert (found.normals[~valid] == (0.0, 0.0, 1.0)).all()
 
 
@@ -112,4 +116,4 @@ def test_invalid_pixels_get_upright_normals():
 )
 def test_invalid_restoration_input_is_refused(lens, valid, words):
     with pytest.raises(RestorationError, match=words):
-        restore(normals_of(bumps()), lens=lens, valid=valid)
+        restore_normals(normals_of(bumps()), lens=lens, valid=valid)

@@ -18,7 +18,7 @@ def scene(rng, lights=24, points=800, noise=0.01):
 
 def test_the_right_order_is_left_alone(rng):
     samples, direction = scene(rng)
-    found = light_check.check(samples, direction, rng=rng)
+    found = light_check.check_lights(samples, direction, rng=rng)
     assert found.order == "as listed"
     assert not found.dead.any()
     np.testing.assert_allclose(found.strength, 1.0, atol=0.03)
@@ -41,7 +41,7 @@ def test_wrong_order_is_reported_and_corrected(name, rng):
     order = light_check._orders(24)[name]
     listed = np.empty_like(direction)
     listed[order] = direction
-    found = light_check.check(samples, listed, rng=rng)
+    found = light_check.check_lights(samples, listed, rng=rng)
     assert found.order == name
     np.testing.assert_array_equal(listed[found.permutation], direction)
     assert found.misfit[name] < 0.5 * found.misfit["as listed"]
@@ -49,7 +49,7 @@ def test_wrong_order_is_reported_and_corrected(name, rng):
 
 def test_implausible_order_is_called_unknown(rng):
     samples, direction = scene(rng)
-    found = light_check.check(samples, rng.permutation(direction), rng=rng)
+    found = light_check.check_lights(samples, rng.permutation(direction), rng=rng)
     assert found.order == "unknown"
 
 
@@ -57,7 +57,7 @@ def test_dead_light_is_found_and_weak_lights_measured(rng):
     samples, direction = scene(rng)
     samples[7] = 0.002 * rng.standard_normal(samples.shape[1])
     samples[11] *= 0.5
-    found = light_check.check(samples, direction, rng=rng)
+    found = light_check.check_lights(samples, direction, rng=rng)
     assert found.order == "as listed"
     assert np.flatnonzero(found.dead).tolist() == [7]
     assert found.strength[7] == 0
@@ -70,10 +70,10 @@ def test_a_light_from_behind_is_not_dead(rng):
     n = rng.standard_normal((800, 3)) * 0.4 + [0, 0, 1.0]
     n /= np.linalg.norm(n, axis=1, keepdims=True)
     samples = np.maximum(direction @ n.T, 0.0)
-    assert not light_check.check(samples, direction, rng=rng).dead.any()
+    assert not light_check.check_lights(samples, direction, rng=rng).dead.any()
 
 
 def test_a_dark_room_is_refused(rng):
     _, direction = scene(rng)
     with pytest.raises(PhotometricStereoError, match="lit"):
-        light_check.check(np.zeros((24, 50)), direction, rng=rng)
+        light_check.check_lights(np.zeros((24, 50)), direction, rng=rng)

@@ -33,13 +33,17 @@ def face(points=40, seed=1):
 
 def told(normals, lights, noise=0.01, **more):
     lit = normals @ lights.T
-    return selection.information(normals, lights, np.where(lit > 0.15, noise**2, np.inf), **more)
+    return selection.fisher_information(
+        normals, lights, np.where(lit > 0.15, noise**2, np.inf), **more
+    )
 
 
 @pytest.mark.parametrize("count", [4, 8, 20])
 @pytest.mark.parametrize("tilt_rad", [0.3, 0.8])
 def test_a_ring_of_lights_leaves_its_closed_form(count, tilt_rad):
-    found = selection.predict(told(UP[None], ring(count, tilt_rad)), range(count), least=3)
+    found = selection.predict_errors(
+        told(UP[None], ring(count, tilt_rad)), range(count), min_lights=3
+    )
     # sum of tan^2 cos^2(turn) over the ring is tan^2 N / 2
     expected = 0.01 / np.sqrt(count / 2) / np.tan(tilt_rad)
     assert found.tilt_rad[0] == pytest.approx(expected, rel=1e-6)
@@ -49,7 +53,7 @@ def test_a_ring_of_lights_leaves_its_closed_form(count, tilt_rad):
 def test_least_squares_scatters_as_predicted():
     lights, noise, trials = dome(12), 0.005, 4000
     normal = face(1, seed=4)[0]
-    found = selection.predict(told(normal[None], lights, noise), range(12), least=3)
+    found = selection.predict_errors(told(normal[None], lights, noise), range(12), min_lights=3)
     rng = np.random.default_rng(2)
     lit = lights @ normal
     used = lit > 0.15
@@ -65,10 +69,10 @@ def test_least_squares_scatters_as_predicted():
 
 def test_added_light_never_hurts_with_gain_as_difference():
     found = told(face(), dome(10))
-    few = selection.predict(found, range(5), least=3)
-    gain = selection._gains(found, list(range(5)), least=3)
+    few = selection.predict_errors(found, range(5), min_lights=3)
+    gain = selection._gains(found, list(range(5)), min_lights=3)
     for light in range(5, 10):
-        more = selection.predict(found, [*range(5), light], least=3)
+        more = selection.predict_errors(found, [*range(5), light], min_lights=3)
         assert np.all(more.tilt_rad <= few.tilt_rad + 1e-12)
         assert gain[light] >= 0
         if few.valid.all():
@@ -78,10 +82,12 @@ def test_added_light_never_hurts_with_gain_as_difference():
 
 def test_greedy_choice_is_nearly_optimal():
     found, least = told(face(), dome(11), systematic_rad=0.0), 3
-    greedy = selection.select(found, median_rad=0.0, valid_share=2.0, least=least, most=6)
+    greedy = selection.select_lights(
+        found, median_rad=0.0, valid_fraction=2.0, min_lights=least, max_lights=6
+    )
 
     def loss(lights):
-        now = selection.predict(found, lights, least=least)
+        now = selection.predict_errors(found, lights, min_lights=least)
         return float(np.mean(np.where(now.valid, now.tilt_rad, selection.UNKNOWN_ERROR_RAD) ** 2))
 
     every = sorted(loss(lights) for lights in itertools.combinations(range(11), 6))
@@ -91,20 +97,26 @@ def test_greedy_choice_is_nearly_optimal():
 
 def test_selection_stops_at_target_and_keeps_nothing_superfluous():
     found = told(face(), dome(60), 0.02)
-    chosen = selection.select(found, median_rad=np.radians(0.6), valid_share=0.95, least=6)
+    chosen = selection.select_lights(
+        found, median_rad=np.radians(0.6), valid_fraction=0.95, min_lights=6
+    )
     assert chosen.reached
     assert chosen.prediction.median_rad <= np.radians(0.6)
     for light in chosen.lights:
         rest = [other for other in chosen.lights if other != light]
-        without = selection.predict(found, rest, least=6)
-        assert without.median_rad > np.radians(0.6) or without.valid_share < 0.95
-    tighter = selection.select(found, median_rad=np.radians(0.4), valid_share=0.95, least=6)
+        without = selection.predict_errors(found, rest, min_lights=6)
+        assert without.median_rad > np.radians(0.6) or without.valid_fraction < 0.95
+    tighter = selection.select_lights(
+        found, median_rad=np.radians(0.4), valid_fraction=0.95, min_lights=6
+    )
     assert len(tighter.lights) > len(chosen.lights)
 
 
 def test_irreducible_error_is_reported_out_of_reach():
     found = told(face(), dome(30), systematic_rad=np.radians(1.0))
-    chosen = selection.select(found, median_rad=np.radians(0.9), valid_share=0.5, least=6)
+    chosen = selection.select_lights(
+        found, median_rad=np.radians(0.9), valid_fraction=0.5, min_lights=6
+    )
     assert not chosen.reached
     assert len(chosen.lights) == 30
 
@@ -113,9 +125,9 @@ def test_rayleigh_angle_median_matches_samples():
     rng = np.random.default_rng(3)
     scale = np.array([0.1, 0.3, 1.0])
     drawn = rng.rayleigh(np.repeat(scale, 40_000))
-    below = int(np.sum(drawn < selection.median_of_rayleigh(scale)))
+    below = int(np.sum(drawn < selection.rayleigh_mixture_median(scale)))
     assert stats.binomtest(below, drawn.size, 0.5).pvalue > 1e-4
-    assert selection.median_of_rayleigh([]) == pytest.approx(np.pi / 2)
+    assert selection.rayleigh_mixture_median([]) == pytest.approx(np.pi / 2)
 
 
 @pytest.mark.parametrize("broken", ["weight", "tilt", "negative", "shape"])
@@ -132,6 +144,6 @@ def test_bad_information_is_refused_by_name(broken):
     else:
         fields[broken].flat[0] = np.nan
     with pytest.raises(selection.SelectionError, match="got"):
-        selection.Information(**fields)
+        selection.FisherInformation(**fields)
     with pytest.raises(selection.SelectionError, match="least"):
-        selection.select(good, median_rad=1.0, valid_share=0.5, least=2)
+        selection.select_lights(good, median_rad=1.0, valid_fraction=0.5, min_lights=2)

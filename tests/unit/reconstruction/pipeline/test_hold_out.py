@@ -9,16 +9,16 @@ VIEWS = ("C00", "C03", "C07")
 
 
 def test_names_and_positions_select_lights_and_views():
-    held = HoldOut.parse("lights=L007, 2,L007,views=1").within(LIGHTS, VIEWS)
+    held = HoldOut.parse("lights=L007, 2,L007,views=1").resolve(LIGHTS, VIEWS)
     assert held == HoldOut(("L002", "L007"), ("C03",))
-    assert held.holds("L007", "C00")
-    assert held.holds("L000", "C03")
-    assert not held.holds("L000", "C00")
+    assert held.is_held_out("L007", "C00")
+    assert held.is_held_out("L000", "C03")
+    assert not held.is_held_out("L000", "C00")
 
 
 def test_nothing_held_out_holds_no_frame():
     assert not HoldOut()
-    assert not HoldOut().within(LIGHTS, VIEWS).holds("L000", "C00")
+    assert not HoldOut().resolve(LIGHTS, VIEWS).is_held_out("L000", "C00")
     assert HoldOut.parse("views=C00")
 
 
@@ -44,4 +44,4 @@ def test_ambiguous_hold_out_list_is_refused(text, named):
 )
 def test_hold_out_outside_session_is_refused_by_name(text, named):
     with pytest.raises(HoldOutError, match=named):
-        HoldOut.parse(text).within(LIGHTS, VIEWS)
+        HoldOut.parse(text).resolve(LIGHTS, VIEWS)

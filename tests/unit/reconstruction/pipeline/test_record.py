@@ -6,22 +6,24 @@ import numpy as np
 import pytest
 
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline.graph import Stage
+from reconstruction.pipeline.graph import PipelineStage
 from reconstruction.pipeline.inputs import InputsError
 
 
 def graph(gain=2.0):
     return [
-        Stage("frames", (), ("light",), lambda: {"light": np.ones(3)}),
-        Stage(
+        PipelineStage("frames", (), ("light",), lambda: {"light": np.ones(3)}),
+        PipelineStage(
             "separate",
             ("light",),
             ("diffuse",),
             lambda light: {"diffuse": gain * light},
             {"gain": gain},
         ),
-        Stage("invert", ("diffuse",), ("melanin",), lambda diffuse: {"melanin": diffuse.sum()}),
-        Stage("draw", ("diffuse",), ("picture",), lambda diffuse: {"picture": diffuse}),
+        PipelineStage(
+            "invert", ("diffuse",), ("melanin",), lambda diffuse: {"melanin": diffuse.sum()}
+        ),
+        PipelineStage("draw", ("diffuse",), ("picture",), lambda diffuse: {"picture": diffuse}),
     ]
 
 
@@ -34,8 +36,8 @@ def why(entries):
 
 
 def test_stage_unneeded_by_request_is_skipped():
-    outcome = stages.run(graph(), ["melanin"])
-    entries = stages.record(graph(), outcome, {})
+    outcome = stages.run_stages(graph(), ["melanin"])
+    entries = stages.record_run(graph(), outcome, {})
     assert done(entries) == {"frames": "run", "separate": "run", "invert": "run", "draw": "skipped"}
     assert why(entries)["draw"] == "nothing wanted depends on it"
     assert why(entries)["invert"] == "it was not made before"
@@ -44,10 +46,10 @@ def test_stage_unneeded_by_request_is_skipped():
 
 def test_repeated_run_is_reused_and_inputs_skipped():
     cache = {}
-    first = stages.run(graph(), ["melanin"], cache=cache)
+    first = stages.run_stages(graph(), ["melanin"], cache=cache)
     cache = {key: made for key, made in cache.items() if "melanin" in made}
-    again = stages.run(graph(), ["melanin"], cache=cache)
-    entries = stages.record(graph(), again, first.keys)
+    again = stages.run_stages(graph(), ["melanin"], cache=cache)
+    entries = stages.record_run(graph(), again, first.keys)
     assert done(entries) == {
         "frames": "skipped",
         "separate": "skipped",
@@ -60,9 +62,9 @@ def test_repeated_run_is_reused_and_inputs_skipped():
 
 def test_changed_setting_reruns_dependents_and_reports_reason():
     cache = {}
-    first = stages.run(graph(), ["melanin"], cache=cache)
-    again = stages.run(graph(gain=3.0), ["melanin"], cache=cache)
-    entries = stages.record(graph(gain=3.0), again, first.keys)
+    first = stages.run_stages(graph(), ["melanin"], cache=cache)
+    again = stages.run_stages(graph(gain=3.0), ["melanin"], cache=cache)
+    entries = stages.record_run(graph(gain=3.0), again, first.keys)
     assert done(entries)["separate"] == done(entries)["invert"] == "run"
     assert why(entries)["invert"] == "its inputs have changed"
     assert done(entries)["frames"] == "reused"

@@ -151,7 +151,7 @@ def test_twitch_is_not_head_motion_and_frame_unusable(rng):
         capture(rng, motions, twitches), CAMERAS, points, normals, np.arange(7.0)
     )
     assert found.usable.tolist() == [True, True, True, False, True, True, True]
-    assert found.covered([0.5, 2.5, 3.5, 4.5, 4.0, 9.0]).tolist() == [
+    assert found.is_covered([0.5, 2.5, 3.5, 4.5, 4.0, 9.0]).tolist() == [
         True,
         False,
         False,
@@ -159,7 +159,7 @@ def test_twitch_is_not_head_motion_and_frame_unusable(rng):
         True,
         False,
     ]
-    turn, shift = found.at([3.0])
+    turn, shift = found.interpolate([3.0])
     np.testing.assert_allclose(
         shift[0], (found.translation_mm[2] + found.translation_mm[4]) / 2, atol=1e-12
     )

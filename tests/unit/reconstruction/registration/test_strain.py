@@ -88,14 +88,14 @@ def test_stretch_shear_and_rotation_follow_from_gradient(pigment):
     gradient = turn @ (np.eye(2) + 0.08 * np.outer(axis, axis))
     first = picture(pigment, np.eye(2), np.zeros(2), seed=1)
     found = measure_strain(first, picture(pigment, gradient, np.zeros(2), seed=2))
-    r_s, r_s_error = found.along(angle)
-    r_t, _ = found.along(angle + math.pi / 2)
+    r_s, r_s_error = found.stretch_along(angle)
+    r_t, _ = found.stretch_along(angle + math.pi / 2)
     assert (r_s, r_t) == (pytest.approx(1.08, abs=5e-3), pytest.approx(1.0, abs=5e-3))
     assert 0 < r_s_error < 2e-3
     assert found.rotation[0] == pytest.approx(0.02, abs=2e-3)
     assert found.shear(angle)[0] == pytest.approx(0.0, abs=5e-3)
     # along another line it is something else
-    assert abs(found.along(0.0)[0] - 1.08) > 0.01
+    assert abs(found.stretch_along(0.0)[0] - 1.08) > 0.01
 
 
 def test_images_of_different_skin_have_no_strain(pigment):
@@ -116,8 +116,8 @@ def test_stationary_jaws_are_not_skin(pigment):
     bars = 0.1 + 0.05 * (np.indices(first.shape).sum(axis=0) // 8 % 2)
     first, second = (np.where(skin, shown, bars) for shown in (first, second))
     masked = measure_strain(first, second, valid=skin, valid_second=skin)
-    assert masked.along(0.0)[0] == pytest.approx(0.95, abs=0.005)
-    assert abs(measure_strain(first, second).along(0.0)[0] - 0.95) > 0.02
+    assert masked.stretch_along(0.0)[0] == pytest.approx(0.95, abs=0.005)
+    assert abs(measure_strain(first, second).stretch_along(0.0)[0] - 0.95) > 0.02
 
 
 @pytest.mark.parametrize("shape", [(256, 255), (40, 40)])

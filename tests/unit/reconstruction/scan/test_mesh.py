@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from reconstruction.scan.mesh import load_ply, prepare, refine, unwrap
+from reconstruction.scan.mesh import load_ply, prepare_scan, refine_mesh, unwrap_mesh
 from reconstruction.scan.repair import (
     ScanMeshError,
     TriangleMesh,
     boundary_edges,
     crop,
     largest_surface,
-    repair,
+    repair_mesh,
     weld,
 )
 
@@ -53,7 +53,7 @@ def area(mesh):
 
 def test_sound_surface_is_unchanged():
     before = cap()
-    after, report = repair(before, max_hole_mm=0.0)
+    after, report = repair_mesh(before, max_hole_mm=0.0)
     assert str(report) == "nothing to mend"
     assert len(after.faces) == len(before.faces)
     assert area(after) == pytest.approx(area(before))
@@ -66,7 +66,7 @@ def test_doubled_vertices_are_welded_and_doubled_triangles_go():
     )
     assert len(weld(torn).vertices_mm) == len(mesh.vertices_mm)
     twice = TriangleMesh(mesh.vertices_mm, np.concatenate([mesh.faces, mesh.faces[:5, ::-1]]))
-    after, report = repair(twice, max_hole_mm=0.0)
+    after, report = repair_mesh(twice, max_hole_mm=0.0)
     assert report.counts["doubled triangles"] == 5
     assert area(after) == pytest.approx(area(mesh))
 
@@ -79,7 +79,7 @@ def test_fin_is_removed_and_underlying_surface_stays():
         np.concatenate([mesh.faces, [[*mesh.faces[7, :2], len(mesh.vertices_mm)]]]),
     )
     assert edge_counts(fin).max() == 3
-    after, report = repair(fin, max_hole_mm=0.0)
+    after, report = repair_mesh(fin, max_hole_mm=0.0)
     assert report.counts["triangles on edges of three"] == 1
     assert edge_counts(after).max() == 2
     assert area(after) == pytest.approx(area(mesh))
@@ -90,7 +90,7 @@ def test_flipped_triangles_and_inside_out_scan_are_reoriented():
     faces = mesh.faces.copy()
     faces[::7] = faces[::7, ::-1]
     for scan in (faces, faces[:, ::-1]):
-        after, _ = repair(TriangleMesh(mesh.vertices_mm, scan), max_hole_mm=0.0)
+        after, _ = repair_mesh(TriangleMesh(mesh.vertices_mm, scan), max_hole_mm=0.0)
         assert trimesh.Trimesh(after.vertices_mm, after.faces, process=False).is_winding_consistent
         assert (np.einsum("vk,vk->v", after.normals(), after.vertices_mm) > 0).all()
 
@@ -101,7 +101,7 @@ def test_surfaces_touching_at_single_vertex_are_separated():
         np.concatenate([a.vertices_mm, b.vertices_mm + np.array([80.0, 80.0, 0.0])]),
         np.concatenate([a.faces, b.faces + len(a.vertices_mm)]),
     )
-    after, report = repair(both, max_hole_mm=0.0)
+    after, report = repair_mesh(both, max_hole_mm=0.0)
     assert report.counts["pinched vertices"] == 1
     assert len(after.faces) == len(a.faces)
 
@@ -116,9 +116,9 @@ def test_islands_go_and_small_holes_are_filled():
         np.concatenate([holed.faces, [len(holed.vertices_mm) + np.arange(3)]]),
     )
     rim = len(boundary_edges(holed.faces))
-    kept_open, _ = repair(scan, max_hole_mm=10.0)
+    kept_open, _ = repair_mesh(scan, max_hole_mm=10.0)
     assert len(boundary_edges(kept_open.faces)) == rim
-    after, report = repair(scan, max_hole_mm=150.0)
+    after, report = repair_mesh(scan, max_hole_mm=150.0)
     assert (report.counts["holes filled"], report.counts["triangles of islands"]) == (1, 1)
     assert len(boundary_edges(after.faces)) == len(boundary_edges(mesh.faces))
     assert (np.einsum("vk,vk->v", after.normals(), after.vertices_mm) > 0).all()
@@ -132,7 +132,7 @@ def test_degenerate_triangles_go_and_nothing_else():
         np.concatenate([mesh.vertices_mm, middle[None]]),
         np.concatenate([mesh.faces, [[a, a, b], [a, b, len(mesh.vertices_mm)]]]),
     )
-    after, report = repair(scan, max_hole_mm=0.0)
+    after, report = repair_mesh(scan, max_hole_mm=0.0)
     assert report.counts["degenerate triangles"] == 2
     assert area(after) == pytest.approx(area(mesh))
 
@@ -140,7 +140,7 @@ def test_degenerate_triangles_go_and_nothing_else():
 def test_nothing_sound_is_an_error():
     point = TriangleMesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
     with pytest.raises(ScanMeshError, match="no sound triangle"):
-        repair(point)
+        repair_mesh(point)
     with pytest.raises(ScanMeshError, match="crop"):
         crop(cap(), box_mm=((500, 500, 500), (600, 600, 600)))
     for bad in (b"", b"ply\n", b"hello"):
@@ -161,7 +161,7 @@ def test_cropping_keeps_region_inside_bounds():
 
 def test_plane_loop_subdivision_stays_planar_inside_its_rim():
     """Corner triangles have both ends of an inner edge on the rim: the case of `_split_chords`."""
-    fine = refine(unwrap(plane()), points=5000)
+    fine = refine_mesh(unwrap_mesh(plane()), points=5000)
     assert np.abs(fine.points_mm[:, 2]).max() < 1e-6
     assert np.abs(fine.points_mm).max() <= 40.0 + 1e-3
     np.testing.assert_allclose(fine.normals, np.broadcast_to([0, 0, 1.0], fine.normals.shape))
@@ -177,13 +177,13 @@ def test_without_split_chords_library_displaces_rim():
 
 @pytest.mark.parametrize("points", [700, 3000, 12_000, 50_000])
 def test_point_count_is_nearest_step_of_four(points):
-    fine = refine(unwrap(cap()), points=points)
+    fine = refine_mesh(unwrap_mesh(cap()), points=points)
     assert 0.4 < len(fine.points_mm) / points < 2.2
 
 
 def test_refined_sphere_is_smooth_and_slightly_smaller():
     """Loop's limit surface of an icosphere of 8 mm edges lies within 1 % under it."""
-    fine = refine(unwrap(cap()), points=20_000)
+    fine = refine_mesh(unwrap_mesh(cap()), points=20_000)
     inner = fine.points_mm[:, 2] > 25.0
     radius = np.linalg.norm(fine.points_mm[inner], axis=1)
     assert 0.985 * RADIUS < radius.min() < radius.max() <= RADIUS
@@ -195,7 +195,7 @@ def test_refined_sphere_is_smooth_and_slightly_smaller():
 def test_texture_coordinates_follow_their_triangles():
     """On a plane with given coordinates they stay an affine map of position, seam or no seam."""
     mesh = plane(uv=True)
-    fine = refine(mesh, points=4000)
+    fine = refine_mesh(mesh, points=4000)
     inner = np.abs(fine.points_mm[fine.faces]).max(axis=(1, 2)) < 20.0
     want = fine.points_mm[fine.faces][inner][..., :2] / 100 + 0.5
     np.testing.assert_allclose(fine.corner_uv[inner], want, atol=2e-4)
@@ -203,7 +203,7 @@ def test_texture_coordinates_follow_their_triangles():
 
 
 def test_a_layout_keeps_areas_and_does_not_overlap():
-    mesh = unwrap(cap())
+    mesh = unwrap_mesh(cap())
     uv = mesh.corner_uv
     a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     flat = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
@@ -214,9 +214,9 @@ def test_a_layout_keeps_areas_and_does_not_overlap():
 
 
 def test_moved_scan_moves_points_normals_and_ray_mesh():
-    fine = refine(unwrap(cap()), points=1000)
+    fine = refine_mesh(unwrap_mesh(cap()), points=1000)
     turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
-    moved = fine.moved(turn, np.array([1.0, 2, 3]))
+    moved = fine.transform(turn, np.array([1.0, 2, 3]))
     np.testing.assert_allclose(moved.points_mm, fine.points_mm @ turn.T + [1, 2, 3], atol=1e-4)
     np.testing.assert_allclose(moved.normals, fine.normals @ turn.T, atol=1e-6)
     assert moved.coarse.vertices_mm[:, 0].mean() > 30
@@ -224,23 +224,23 @@ def test_moved_scan_moves_points_normals_and_ray_mesh():
 
 def test_refinement_reports_missing_requirements():
     with pytest.raises(ScanMeshError, match="texture coordinates"):
-        refine(cap(), points=1000)
+        refine_mesh(cap(), points=1000)
     with pytest.raises(ScanMeshError, match="points"):
-        refine(unwrap(cap()), points=10**9)
+        refine_mesh(unwrap_mesh(cap()), points=10**9)
 
 
 def test_flawed_head_scan_becomes_manifold_near_truth():
-    from rigsim.scanner.pods import Scanner, scan_face
+    from rigsim.scanner.pods import ScannerSettings, scan_face
     from rigsim.subject.head import build_head
 
     head = build_head(np.random.default_rng(5))
-    settings = Scanner(triangles=8_000, resolution_mm=2.0)
+    settings = ScannerSettings(triangles=8_000, resolution_mm=2.0)
     scan = scan_face(head, rng=np.random.default_rng(0), scanner=settings)
-    made = prepare(scan.ply, points=20_000)
+    made = prepare_scan(scan.ply, points=20_000)
     assert made.report.counts["triangles on edges of three"] > 0
     assert edge_counts(made.coarse).max() == 2
     assert len(np.unique(made.faces)) == len(made.points_mm)
-    placed = made.moved(scan.to_dome[:3, :3], scan.to_dome[:3, 3])
+    placed = made.transform(scan.to_dome[:3, :3], scan.to_dome[:3, 3])
     assert placed.points_mm[:, 1].min() > -120  # no collar
     from scipy.spatial import cKDTree
 

@@ -11,16 +11,16 @@ from reconstruction.subsurface.inversion import SubsurfaceError
 from reconstruction.subsurface.models import (
     DIFFUSE_RATIO_RANGE,
     MIN_DIFFUSE_DISTANCE,
-    Optics,
+    FiberOptics,
     profile_model,
 )
-from reconstruction.subsurface.outcome import Outcome
+from reconstruction.subsurface.outcome import FitOutcome
 
 RADIUS = 0.3 + 0.25 * np.arange(28)
 
 
 def closed(method, eta=1.4):
-    return profile_model(method, Optics(eta, g=0.8, g_error=0.0), RADIUS)
+    return profile_model(method, FiberOptics(eta, g=0.8, g_error=0.0), RADIUS)
 
 
 @pytest.mark.parametrize("eta", [1.0, 1.4, 1.6])
@@ -94,7 +94,7 @@ def test_shapes_that_do_not_fit_are_named():
 
 def test_nothing_but_zeros_has_no_signal():
     fit = subsurface.fit_dipole(RADIUS, np.zeros(28), variance=np.ones(28))
-    assert fit.outcome == Outcome.NO_SIGNAL
+    assert fit.outcome == FitOutcome.NO_SIGNAL
     assert not fit.valid
     assert np.isnan(fit.sigma_tr_per_mm)
     assert "stand out" in fit.reason()
@@ -121,7 +121,7 @@ def fit_table(profile, variance, **settings):
 @pytest.mark.parametrize(("g_error", "limit"), [(0.0, 5e-3), (0.07, 1.5e-2)])
 def test_the_tables_layout_is_the_table(g_error, limit):
     """Within the table's domain, but for diffused light; between its g its noise is larger."""
-    model = profile_model("photon_table", Optics(g=0.825, g_error=g_error, **FIBRES), RADIUS)
+    model = profile_model("photon_table", FiberOptics(g=0.825, g_error=g_error, **FIBRES), RADIUS)
     rng = np.random.default_rng(5)
     theta = np.full((100, 4), [0.0, 0.0, 0.0, 0.825])
     theta[:, 1] = rng.uniform(np.log(0.1), np.log(7.0), 100)
@@ -145,7 +145,7 @@ def test_the_tables_layout_is_the_table(g_error, limit):
 @pytest.mark.parametrize("ratio", [1e-4, 3e-4, 2e-3])
 def test_far_weakly_absorbed_light_is_diffusion_to_factor(ratio):
     """At up to 350 transport lengths, where no table reaches; the factor is the fibre's, 5 %."""
-    model = profile_model("photon_table", Optics(g=0.8, g_error=0.0, **FIBRES), RADIUS)
+    model = profile_model("photon_table", FiberOptics(g=0.8, g_error=0.0, **FIBRES), RADIUS)
     for scattering in (8.0, 20.0, 50.0):
         theta = np.array([[np.log(ratio * scattering), np.log(scattering), 0.0, 0.8]])
         exact = diffusion.reflectance(RADIUS, ratio * scattering, scattering, 1.4)
@@ -268,7 +268,7 @@ def test_without_absorption_the_interval_reaches_zero(rng):
     profile, variance = noisy(table(0.0, 1.0), rng)
     fit = fit_table(profile, variance)
     assert not fit.valid
-    assert fit.outcome & Outcome.NOT_IDENTIFIED
+    assert fit.outcome & FitOutcome.NOT_IDENTIFIED
     assert fit.interval_per_mm[0] == 0.0
     assert fit.interval_per_mm[1] < 0.05
     assert fit.sigma_s_prime_per_mm == pytest.approx(1.0, rel=0.05)
@@ -278,7 +278,7 @@ def test_without_absorption_the_interval_reaches_zero(rng):
 def test_zero_scattering_gives_no_signal(sigma_s, rng):
     profile, variance = noisy(table(0.05, sigma_s), rng)
     fit = fit_table(profile, variance)
-    assert fit.outcome == Outcome.NO_SIGNAL
+    assert fit.outcome == FitOutcome.NO_SIGNAL
     assert np.isnan(fit.sigma_tr_per_mm)
     assert fit.interval_per_mm.tolist() == [0.0, np.inf]
 
@@ -290,7 +290,7 @@ def test_strong_absorption_is_beyond_diffusion_alone(rng):
     assert fit.sigma_tr_per_mm == pytest.approx(dipole.effective_transport(4.9, 0.5), rel=0.1)
     for method in ("diffusion", "dipole"):
         closed_form = fit_table(profile, variance, method=method)
-        assert closed_form.outcome & Outcome.OUTSIDE_DOMAIN
+        assert closed_form.outcome & FitOutcome.OUTSIDE_DOMAIN
         assert not closed_form.valid
         assert "beyond what the model is good for" in closed_form.reason()
 
@@ -329,7 +329,7 @@ def test_fiber_far_from_others_is_omitted(rng):
     profile, variance = noisy(table(0.1, 1.2), rng)
     profile[9] *= 2.0
     fit = fit_table(profile, variance)
-    assert fit.left_out[9] == subsurface.LeftOut.OUTLIER
+    assert fit.left_out[9] == subsurface.OmissionReason.OUTLIER
     assert fit.used.sum() == 27
     assert fit.valid
     assert abs(fit.sigma_tr_per_mm - dipole.effective_transport(0.1, 1.2)) < (
@@ -352,14 +352,14 @@ def test_negative_readings_far_out_are_used(rng):
 
 def test_too_few_fibers_are_refused():
     fit = subsurface.invert([1.0], [0.01], variance=[1e-8])
-    assert fit.outcome == Outcome.TOO_FEW_FIBRES
+    assert fit.outcome == FitOutcome.TOO_FEW_FIBRES
     assert not fit.valid
 
 
 def test_single_repeated_radius_does_not_determine_slope():
     fit = subsurface.invert(np.full(28, 1.0), np.full(28, 0.01), variance=1e-8)
     assert not fit.valid
-    assert fit.outcome & Outcome.NOT_IDENTIFIED
+    assert fit.outcome & FitOutcome.NOT_IDENTIFIED
 
 
 def test_radii_may_repeat(rng):
@@ -375,7 +375,7 @@ def test_a_scale_wrong_by_a_hundred_is_flagged(rng):
     for method in ("photon_table", "diffusion", "dipole"):
         fit = fit_table(100.0 * profile, 1e4 * variance, method=method, common_error=0.01)
         assert not fit.valid
-        assert fit.outcome & Outcome.WRONG_PROFILE
+        assert fit.outcome & FitOutcome.WRONG_PROFILE
         assert fit.p_value < 1e-6
 
 
@@ -383,9 +383,9 @@ def test_a_misfit_widens_the_interval(rng):
     profile, variance = noisy(table(0.1, 1.2), rng)
     bent = profile * np.exp(0.15 * np.sin(1.3 * RADIUS))
     good, bad = fit_table(profile, variance), fit_table(bent, variance)
-    assert not good.outcome & Outcome.MISFIT
+    assert not good.outcome & FitOutcome.MISFIT
     assert good.model_error == 0.0
-    assert bad.outcome & Outcome.MISFIT
+    assert bad.outcome & FitOutcome.MISFIT
     assert 0.03 < bad.model_error < 0.3
     assert bad.sigma_tr_stderr > 3.0 * good.sigma_tr_stderr
 

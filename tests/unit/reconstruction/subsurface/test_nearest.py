@@ -7,7 +7,7 @@ from scipy.optimize import least_squares
 from model import photon_table
 from reconstruction import subsurface
 from reconstruction.subsurface.nearest import MIN_REFLECTANCE_PER_MM2
-from reconstruction.subsurface.outcome import Outcome
+from reconstruction.subsurface.outcome import FitOutcome
 
 RADIUS = 0.3 + 0.25 * np.arange(28)
 CORES = {"core_mm": 0.2, "source_core_mm": 0.2}
@@ -96,7 +96,7 @@ def test_fiber_far_from_nearest_medium_is_not_omitted(layered):
     fit = subsurface.nearest_medium(RADIUS, bent, variance=(1e-3 * bent) ** 2, **CORES)
     assert fit.used.all()
     assert np.log(fit.sigma_tr_per_mm) == pytest.approx(by_definition(bent), abs=3e-3)
-    assert fit.outcome & Outcome.MISFIT
+    assert fit.outcome & FitOutcome.MISFIT
 
 
 def test_fibers_below_definition_light_level_are_ignored():
@@ -110,6 +110,6 @@ def test_fibers_below_definition_light_level_are_ignored():
 def test_too_little_light_gives_no_estimate(layered):
     fit = subsurface.nearest_medium(RADIUS, layered, variance=(3.0 * layered) ** 2, **CORES)
     assert not fit.valid
-    assert fit.outcome & (Outcome.NO_SIGNAL | Outcome.TOO_FEW_FIBRES)
+    assert fit.outcome & (FitOutcome.NO_SIGNAL | FitOutcome.TOO_FEW_FIBRES)
     assert np.isnan(fit.sigma_tr_per_mm)
     assert np.isinf(fit.sigma_tr_stderr)

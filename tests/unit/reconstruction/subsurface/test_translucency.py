@@ -192,7 +192,7 @@ def test_uncounted_positions_are_omitted_with_reasons():
     good[3, 0] = False
     found = interpolate(PLACES, sigma, stderr, (16, 16), valid=good, names=NAMES)
     assert found.used.sum() == 8
-    reasons = dict(found.left_out)
+    reasons = dict(found.omitted)
     assert reasons["forehead, channel 0"] == "sigma_tr or its standard error is not finite"
     assert reasons["cheek left, channel 1"] == "sigma_tr 1e-09 ± 1 per mm cannot be told from 0"
     assert "not finite" in reasons["cheek right, channel 2"]

@@ -61,9 +61,9 @@ def plain(surface, stderr=0.0):
 
 def test_plane_normal_error_from_misplacement_is_fine_relief():
     surface = sheet(flat)
-    found = surface_errors.of_normals(plain(surface), surface, 3.0)
+    found = surface_errors.add_normal_errors(plain(surface), surface, 3.0)
     np.testing.assert_allclose(found.stderr, surface_errors.UNRESOLVED_RELIEF_RAD, rtol=1e-6)
-    coarse = surface_errors.of_normals(plain(surface), surface, 30.0)
+    coarse = surface_errors.add_normal_errors(plain(surface), surface, 30.0)
     np.testing.assert_allclose(coarse.stderr, surface_errors.UNRESOLVED_RELIEF_RAD, rtol=1e-6)
 
 
@@ -72,7 +72,7 @@ def test_misplacement_error_is_curvature_times_misplacement():
     pixel = 2.0
     for radius in (40.0, 80.0, 160.0):
         surface = sheet(ball(radius), step=1.0)
-        found = surface_errors.of_normals(plain(surface, 0.001), surface, pixel)
+        found = surface_errors.add_normal_errors(plain(surface, 0.001), surface, pixel)
         turn = surface_errors.POSITION_SIGMA_PX * pixel / radius
         expected = np.sqrt(0.001**2 + surface_errors.UNRESOLVED_RELIEF_RAD**2 + turn**2)
         np.testing.assert_allclose(found.stderr, expected, rtol=0.01)
@@ -83,11 +83,11 @@ def test_normal_errors_without_neighbors_stay_finite():
     normals = plain(surface)
     here = np.arange(len(normals.valid)) == 200
     alone = PointValues(here[:, None] * normals.values, here[:, None] * normals.stderr, here)
-    found = surface_errors.of_normals(alone, surface, 3.0)
+    found = surface_errors.add_normal_errors(alone, surface, 3.0)
     assert_clean(found)
     assert np.count_nonzero(found.stderr.any(axis=1)) == 1
     none = dataclasses.replace(normals, valid=np.zeros(len(normals.valid), bool))
-    assert not surface_errors.of_normals(none, surface, 3.0).stderr.any()
+    assert not surface_errors.add_normal_errors(none, surface, 3.0).stderr.any()
 
 
 def skin_like(rng, side, roughness):
@@ -126,7 +126,7 @@ def test_albedo_error_matches_subject_albedo_detail(roughness):
     for _ in range(12):
         seen, true = seen_and_true(rng, roughness)
         values = np.tile(seen[:, None], (1, 3))
-        found = surface_errors.of_albedo(
+        found = surface_errors.add_albedo_errors(
             PointValues(values, np.full(values.shape, 1e-5), np.ones(len(seen), bool)),
             plain(surface),
             surface,
@@ -152,7 +152,7 @@ def test_albedo_error_with_similar_neighbors_is_not_reduced():
         seen, true = seen_and_true(rng, 0.1)
         values = np.tile(seen[:, None], (1, 3))
         point = PointValues(values, np.full(values.shape, 1e-5), np.ones(len(seen), bool))
-        found = surface_errors.of_albedo(point, plain(surface), surface, 2.0).stderr[:, 0]
+        found = surface_errors.add_albedo_errors(point, plain(surface), surface, 2.0).stderr[:, 0]
         own = (
             2.0
             * surface_errors.UNRESOLVED_R_D_PX
@@ -174,12 +174,12 @@ def test_albedo_detail_excludes_noise():
     surface = sheet(flat)
     noisy = 0.3 + 0.01 * rng.standard_normal((len(surface.points_mm), 3))
     good = np.ones(len(noisy), bool)
-    told = surface_errors.of_albedo(
+    told = surface_errors.add_albedo_errors(
         PointValues(noisy, np.full(noisy.shape, 0.01), good), plain(surface), surface, 2.0
     )
     # what is left after the noise is taken off scatters about nothing
     assert np.median(told.stderr) < 0.014
-    untold = surface_errors.of_albedo(
+    untold = surface_errors.add_albedo_errors(
         PointValues(noisy, np.full(noisy.shape, 1e-6), good), plain(surface), surface, 2.0
     )
     assert np.median(untold.stderr) > 0.015
@@ -189,11 +189,11 @@ def test_uniform_albedo_error_is_noise_and_scale_error():
     surface = sheet(ball(60.0))
     count = len(surface.points_mm)
     even = PointValues(np.full((count, 3), 0.3), np.full((count, 3), 0.002), np.ones(count, bool))
-    found = surface_errors.of_albedo(even, plain(surface), surface, 2.0)
+    found = surface_errors.add_albedo_errors(even, plain(surface), surface, 2.0)
     scale = 0.3 * surface_errors.SHARED_R_D_ERROR
     np.testing.assert_allclose(found.stderr, np.hypot(0.002, scale), rtol=1e-6)
     # normals off by 0.02 rad take 1 % of the albedo along
-    tilted = surface_errors.of_albedo(even, plain(surface, 0.02), surface, 2.0)
+    tilted = surface_errors.add_albedo_errors(even, plain(surface, 0.02), surface, 2.0)
     np.testing.assert_allclose(tilted.stderr, np.hypot(np.hypot(0.002, scale), 0.003), rtol=1e-6)
     none = dataclasses.replace(even, valid=np.zeros(count, bool))
-    assert not surface_errors.of_albedo(none, plain(surface), surface, 2.0).stderr.any()
+    assert not surface_errors.add_albedo_errors(none, plain(surface), surface, 2.0).stderr.any()

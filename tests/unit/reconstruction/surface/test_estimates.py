@@ -198,7 +198,7 @@ def test_half_vector_normals_are_accurate_to_light_spacing():
 def test_albedo_is_exact_with_exact_normals_and_lobe():
     truth = cap()
     samples = make(truth, lobe=shine)
-    found = estimates.albedo(samples, known(truth), stderr_rad=1e-3)
+    found = estimates.estimate_albedo(samples, known(truth), stderr_rad=1e-3)
     assert found.valid.all()
     assert np.abs(found.values / R_D - 1.0).max() < 0.01
     assert_clean(found)
@@ -213,12 +213,12 @@ def test_albedo_does_not_depend_on_scan_normal_error():
     # one light ring to a side, as on a cheek: errors of the cosine do not even out
     lights = spiral(60)[spiral(60)[:, 0] > -0.2]
     samples = make(truth, scan=scan, lights=lights)
-    found = estimates.albedo(samples, known(truth), stderr_rad=1e-3)
+    found = estimates.estimate_albedo(samples, known(truth), stderr_rad=1e-3)
     assert found.valid.all()
     np.testing.assert_allclose(found.values, np.tile(R_D, (len(truth), 1)), rtol=1e-3)
     # by the scan's cosines it is off by percents
     scanned = dataclasses.replace(samples, cos_light=make(truth, lights=lights).cos_light)
-    taken = estimates.albedo(scanned, known(truth), stderr_rad=1e-3)
+    taken = estimates.estimate_albedo(scanned, known(truth), stderr_rad=1e-3)
     assert np.median(np.abs(taken.values / R_D - 1.0)) > 0.01
 
 
@@ -245,7 +245,7 @@ def test_albedo_weights_oblique_views_beyond_point_less():
         valid=darker.valid,
         normal_stderr_rad=1e-3,
     )
-    found = estimates.albedo(darker, known(truth), stderr_rad=1e-3)
+    found = estimates.estimate_albedo(darker, known(truth), stderr_rad=1e-3)
     assert found.valid.all()
     assert off(found.values) < 0.75 * off(alike.r_d)
     assert 0.004 < off(found.values)  # what views from the front lose stays
@@ -254,7 +254,7 @@ def test_albedo_weights_oblique_views_beyond_point_less():
 def test_samples_at_other_normals_keep_their_radiance():
     truth = cap(20)
     samples = make(truth, scan=turned(truth, 0.1), noise=1e-3, rng=np.random.default_rng(2))
-    moved = estimates.at_normals(samples, known(truth))
+    moved = estimates.reproject_samples(samples, known(truth))
     assert moved.valid.any()
     assert not (moved.valid & ~samples.valid).any()
     at = moved.valid
@@ -266,24 +266,24 @@ def test_samples_at_other_normals_keep_their_radiance():
     assert np.isinf(moved.variance[~at]).all()
     # points without a normal have no samples
     none = dataclasses.replace(known(truth), valid=np.zeros(len(truth), bool))
-    assert not estimates.at_normals(samples, none).valid.any()
+    assert not estimates.reproject_samples(samples, none).valid.any()
 
 
 def test_albedo_without_normal_is_masked():
     truth = cap()
     normals = known(truth)
     normals = dataclasses.replace(normals, valid=np.arange(len(truth)) % 2 == 0)
-    found = estimates.albedo(make(truth), normals, stderr_rad=1e-3)
+    found = estimates.estimate_albedo(make(truth), normals, stderr_rad=1e-3)
     np.testing.assert_array_equal(found.valid, normals.valid)
     assert_clean(found)
 
 
 def test_lobe_subtraction_removes_highlight_bias_of_normals():
     truth = cap(40)
-    basis = brdf_tables.default()
+    basis = brdf_tables.default_basis()
     mix = np.zeros((1, len(basis.names)))
     mix[0, np.argmax([n == basis.names[len(basis.names) // 2] for n in basis.names])] = 1.0
-    one = basis.mixed(mix)
+    one = basis.mix_materials(mix)
     samples = make(truth)
     weights = np.full((len(truth), 1), 0.02 / one.strength()[0])
     from reconstruction import brdf_basis
@@ -317,15 +317,15 @@ def glossy(truth, one, share):
 
 def test_highlights_refine_only_normals_uncertain_from_subsurface_light():
     truth = cap(40)
-    basis = brdf_tables.default()
-    one = basis.mixed(np.eye(basis.size)[[basis.names.index("beckmann 0.3")]])
+    basis = brdf_tables.default_basis()
+    one = basis.mix_materials(np.eye(basis.size)[[basis.names.index("beckmann 0.3")]])
     samples, weights = glossy(truth, one, 0.2)
     start = known(turned(truth, np.radians(1.5)))
     stderr = np.full((40, 3), np.radians(2.0))
     stderr[::2] = np.radians(0.1)
     start = dataclasses.replace(start, stderr=stderr)
     r_d = dataclasses.replace(albedo_of(truth), values=np.full((40, 3), 0.02))
-    found = estimates.normals_from_all_light(samples, start, r_d, PointLobes(weights, one))
+    found = estimates.normals_from_full_model(samples, start, r_d, PointLobes(weights, one))
     np.testing.assert_array_equal(found.values[::2], start.values[::2])
     np.testing.assert_array_equal(found.stderr[::2], start.stderr[::2])
     assert np.median(angle_deg(found, truth)[1::2]) < 0.3 * 1.5
@@ -333,7 +333,7 @@ def test_highlights_refine_only_normals_uncertain_from_subsurface_light():
     assert (found.stderr[1::2] < start.stderr[1::2]).all()
     assert (found.stderr[1::2] > 0.9 * estimates.LOBE_TILT_RAD).all()
     # the same without the lobe: highlights then pull where nothing is
-    bare = estimates.normals_from_all_light(samples, start, r_d, PointLobes(0.0 * weights, one))
+    bare = estimates.normals_from_full_model(samples, start, r_d, PointLobes(0.0 * weights, one))
     assert np.median(angle_deg(bare, truth)[1::2]) > 2 * np.median(angle_deg(found, truth)[1::2])
 
 
@@ -345,15 +345,15 @@ def test_points_need_ten_lights_and_two_views(lights, views, enough):
     way = spiral(200)
     way = way[way[:, 2] > 0.3][:lights]
     samples = make(up, lights=way, views=VIEWS[:views])
-    np.testing.assert_array_equal(estimates.seen_enough(samples), enough)
+    np.testing.assert_array_equal(estimates.has_enough_samples(samples), enough)
     # nothing but the mask keeps a point off: hide one light of a point that has just enough
     hidden = dataclasses.replace(samples, valid=samples.valid & (samples.light != 0))
-    np.testing.assert_array_equal(estimates.seen_enough(hidden), enough and lights > 10)
+    np.testing.assert_array_equal(estimates.has_enough_samples(hidden), enough and lights > 10)
     if not enough:
         assert not estimates.normals_from_shading(samples, up).valid.any()
         assert not estimates.normals_from_half_vectors(samples).valid.any()
     assert (
-        estimates.sample_counts(slice(0, 3), samples).values[:, 0].tolist()
+        estimates.count_samples(slice(0, 3), samples).values[:, 0].tolist()
         == [float(lights * views)] * 3
     )
 
@@ -403,11 +403,11 @@ NOTHING = {emptied, all_saturated, by_one_light}
 def test_no_estimate_of_spoiled_samples_holds_a_nan(spoil):
     truth = cap(30)
     samples = spoil(make(truth))
-    basis = brdf_tables.default()
-    few = basis.mixed(np.eye(len(basis.names))[:2])
+    basis = brdf_tables.default_basis()
+    few = basis.mix_materials(np.eye(len(basis.names))[:2])
     normals = estimates.normals_from_shading(samples, truth)
-    r_d = estimates.albedo(samples, known(truth), stderr_rad=1e-3)
-    lobes = estimates.lobe_weights(samples, known(truth), albedo_of(truth), few)
+    r_d = estimates.estimate_albedo(samples, known(truth), stderr_rad=1e-3)
+    lobes = estimates.fit_lobe_weights(samples, known(truth), albedo_of(truth), few)
     made = [
         normals,
         r_d,
@@ -421,7 +421,7 @@ def test_no_estimate_of_spoiled_samples_holds_a_nan(spoil):
         assert_clean(found)
     if spoil in NOTHING:
         assert not normals.valid.any()
-        assert not estimates.albedo(samples, normals, stderr_rad=1e-3).valid.any()
+        assert not estimates.estimate_albedo(samples, normals, stderr_rad=1e-3).valid.any()
     if spoil is one_hot:
         assert angle_deg(normals, truth).max() < 0.3
 
@@ -432,7 +432,7 @@ def test_black_skin_has_invalid_normal_and_zero_albedo():
     normals = estimates.normals_from_shading(samples, truth)
     assert_clean(normals)
     assert np.mean(normals.valid & (normals.stderr[:, 0] < np.radians(5.0))) < 0.1
-    found = estimates.albedo(samples, known(truth), stderr_rad=1e-3)
+    found = estimates.estimate_albedo(samples, known(truth), stderr_rad=1e-3)
     assert_clean(found)
     good = found.values[found.valid] / found.stderr[found.valid]
     assert not len(good) or np.abs(np.median(good)) < 3.0
@@ -451,7 +451,7 @@ def test_coplanar_lights_give_invalid_normal():
 def test_rows_of_samples_are_those_of_their_points():
     samples = make(cap(10))
     rows = np.array([7, 2])
-    part = estimates.rows_of(samples, rows)
+    part = estimates.select_points(samples, rows)
     np.testing.assert_array_equal(part.f, samples.f[rows])
     np.testing.assert_array_equal(part.valid, samples.valid[rows])
     np.testing.assert_array_equal(part.light, samples.light)

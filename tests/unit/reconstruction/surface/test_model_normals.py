@@ -17,8 +17,8 @@ NOISE = 0.01
 
 @pytest.fixture(scope="module")
 def lobe():
-    basis = brdf_tables.default()
-    return basis.mixed(np.eye(basis.size)[[basis.names.index("beckmann 0.3")]])
+    basis = brdf_tables.default_basis()
+    return basis.mix_materials(np.eye(basis.size)[[basis.names.index("beckmann 0.3")]])
 
 
 def scene(lobe, r_d, *, points=30, lights=24, seed=1, noise=NOISE):

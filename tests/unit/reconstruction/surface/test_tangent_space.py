@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reconstruction.surface.tangent_space import TangentSpaceError, frames, tangent_normals
+from reconstruction.surface.tangent_space import TangentSpaceError, tangent_frames, tangent_normals
 
 
 def cylinder(shape=(96, 128), radius_mm=60.0, height_mm=80.0):
@@ -25,7 +25,7 @@ def test_smooth_shape_normal_is_tangent_z():
 
 def test_tangent_x_follows_u_and_y_points_up():
     points, _, angle = cylinder()
-    axes, known = frames(points, np.ones(points.shape[:2], bool), smoothing_mm=2.0)
+    axes, known = tangent_frames(points, np.ones(points.shape[:2], bool), smoothing_mm=2.0)
     middle = (48, 64)
     assert known[middle]
     around = [np.cos(angle[middle]), 0.0, -np.sin(angle[middle])]
@@ -78,8 +78,8 @@ def test_errors_rotate_with_frame_and_masks_are_kept():
 
 def test_shapes_that_do_not_fit_are_named():
     with pytest.raises(TangentSpaceError, match="position_mm"):
-        frames(np.zeros((4, 4)), np.ones((4, 4), bool))
+        tangent_frames(np.zeros((4, 4)), np.ones((4, 4), bool))
     with pytest.raises(TangentSpaceError, match="no texel"):
-        frames(np.zeros((4, 4, 3)), np.zeros((4, 4), bool))
+        tangent_frames(np.zeros((4, 4, 3)), np.zeros((4, 4), bool))
     with pytest.raises(TangentSpaceError, match="same point"):
-        frames(np.zeros((8, 8, 3)), np.ones((8, 8), bool))
+        tangent_frames(np.zeros((8, 8, 3)), np.ones((8, 8), bool))

@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 from model import texture_resampling as resampling
 from model import wrinkles
 from model.wrinkles.expressions import JIMENEZ2011_TABLE, WrinkleError
-from model.wrinkles.partial_derivatives import Layer
+from model.wrinkles.partial_derivatives import WrinkleLayer
 from reconstruction.normal_maps import NormalMaps
 from reconstruction.wrinkles import fit as wrinkle_fit
 from reconstruction.wrinkles import texels as wrinkle_texels
@@ -36,7 +36,7 @@ def face():
     y, x = np.mgrid[:16, :16] / 15.0
     masks = np.stack([np.exp(-((x - a) ** 2 + (y - b) ** 2) / 0.02) for a, b in CENTRES])
     masks /= masks.sum(axis=0) + 0.05
-    return base * 0.2 / base.std(), Layer(0.5 * wrinkle / np.abs(wrinkle).max(), masks)
+    return base * 0.2 / base.std(), WrinkleLayer(0.5 * wrinkle / np.abs(wrinkle).max(), masks)
 
 
 def shown(face, weights):
@@ -56,7 +56,7 @@ def disturbed(normals, sigma_rad, rng):
 
 
 def pixels(texels, shape):
-    return np.moveaxis(resampling.resampled(np.moveaxis(texels, 2, 0), shape), 0, 2)
+    return np.moveaxis(resampling.resample(np.moveaxis(texels, 2, 0), shape), 0, 2)
 
 
 def low_passed(derivatives, shape, *, variance=0.0, valid=True):
@@ -97,7 +97,7 @@ def test_detail_finer_than_texel_is_averaged_without_aliasing():
 def test_the_fitted_low_pass_reads_closer_than_averages(rng):
     d = gaussian_filter(rng.standard_normal((128, 128, 2)), (6, 6, 0))
     fitted = low_passed(d, (16, 16)).values
-    averaged = np.moveaxis(resampling.resampled(np.moveaxis(d, 2, 0), (16, 16)), 0, 2)
+    averaged = np.moveaxis(resampling.resample(np.moveaxis(d, 2, 0), (16, 16)), 0, 2)
     misfit = [np.mean((pixels(t, (128, 128)) - d) ** 2) for t in (fitted, averaged)]
     assert misfit[0] < 0.8 * misfit[1]
 
@@ -142,7 +142,7 @@ def test_errors_of_normals_become_errors_of_derivatives(rng):
     many = np.broadcast_to(n, (300, 300, 3))
     sigma = 0.01
     d = wrinkles.encode(disturbed(many, sigma, rng), limit=None)
-    stated = wrinkle_texels.derivatives_of(many, stderr_rad=np.full((300, 300), sigma))
+    stated = wrinkle_texels.measure_derivatives(many, stderr_rad=np.full((300, 300), sigma))
     ratio = d.var(axis=(0, 1)) / stated.variance[0, 0]
     np.testing.assert_allclose(ratio, 1.0, atol=4 * np.sqrt(2 / 90_000) + 5e-3)  # 4 sigma, bend
 
@@ -153,12 +153,12 @@ def test_grazing_normals_and_unknown_errors_are_masked_counted():
     n[0, 1] = [0.99, 0, np.sqrt(1 - 0.99**2)]
     n[0, 2] = np.nan
     stderr = np.array([[0.01, 0.01, 0.01, np.nan, 0.01]])
-    got = wrinkle_texels.derivatives_of(n, stderr_rad=stderr)
+    got = wrinkle_texels.measure_derivatives(n, stderr_rad=stderr)
     np.testing.assert_array_equal(got.valid, [[True, False, False, False, True]])
     assert got.too_steep_fraction == 0.25
     assert np.isfinite(got.values).all()
     assert np.isfinite(got.variance).all()
-    same = wrinkle_texels.derivatives_of(
+    same = wrinkle_texels.measure_derivatives(
         NormalMaps(n, n[..., 0], n[..., 0], np.ones((1, 5), bool), stderr)
     )
     np.testing.assert_array_equal(same.valid, got.valid)
@@ -182,7 +182,7 @@ def test_weights_of_a_new_expression_come_back(face, clamp):
 def test_weight_beyond_bounds_is_clamped_and_reported(face):
     base, layer = face
     asked = np.array([0.5, -0.6, 0.5, 0.5, 1.7, 0.5, 0.5, 0.5])
-    twice = Layer(2 * layer.wrinkle, layer.masks)
+    twice = WrinkleLayer(2 * layer.wrinkle, layer.masks)
     n = wrinkles.combine_layers(base, [twice], asked / 2, clamp="signed")
     got = wrinkle_fit.fit_weights(layer, wrinkles.decode(base), n)
     np.testing.assert_array_equal(got.weights[[1, 4]], [0.0, 1.0])
@@ -201,7 +201,7 @@ def test_weight_scatter_matches_stderr_and_cramer_rao_bound(face):
     z = []
     for seed in range(draws):
         noisy = disturbed(clean, sigma, np.random.default_rng(seed))
-        measured = wrinkle_texels.derivatives_of(noisy, stderr_rad=stderr_rad)
+        measured = wrinkle_texels.measure_derivatives(noisy, stderr_rad=stderr_rad)
         got = wrinkle_fit.fit_weights(layer, neutral, measured, clamp="signed")
         z.append((got.weights - true) / np.sqrt(np.diag(got.covariance)))
         assert np.all(got.stderr >= np.sqrt(np.diag(got.covariance)) * (1 - 1e-12))
@@ -211,9 +211,9 @@ def test_weight_scatter_matches_stderr_and_cramer_rao_bound(face):
     assert low < np.mean(z**2) < high * 1.05
     # the bound: inverse of the information of independent derivatives with known map and masks
     flat = shown(face, true)
-    exact = wrinkle_texels.derivatives_of(flat, stderr_rad=stderr_rad)
+    exact = wrinkle_texels.measure_derivatives(flat, stderr_rad=stderr_rad)
     read = pixels(np.asarray(layer.wrinkle), (SIDE, SIDE))
-    full = np.stack([resampling.resampled(m, (SIDE, SIDE)) for m in layer.masks])
+    full = np.stack([resampling.resample(m, (SIDE, SIDE)) for m in layer.masks])
     design = (full[..., None] * read / np.sqrt(exact.variance)).reshape(8, -1)
     bound = np.sqrt(np.diag(np.linalg.inv(design @ design.T)))
     ratio = np.sqrt(np.diag(got.covariance)) / bound
@@ -229,7 +229,7 @@ def test_zone_without_wrinkle_has_infinite_weight_error(face):
     masks[7] = 0.0
     masks[7, 10:, 10:] = 1.0
     wrinkle[18:, 18:] = 0.0
-    flat_there = Layer(wrinkle, masks)
+    flat_there = WrinkleLayer(wrinkle, masks)
     n = wrinkles.combine_layers(base, [flat_there], np.full(8, 0.5))
     got = wrinkle_fit.fit_weights(flat_there, wrinkles.decode(base), n)
     assert not got.valid[7]
@@ -245,12 +245,12 @@ def test_fully_masked_zone_is_reported_and_others_kept(face):
     masks = np.array(layer.masks)
     masks[0] = 0.0
     masks[0, :4, :4] = 1.0
-    near = resampling.resampled(masks[0], (SIDE, SIDE)) > 0
+    near = resampling.resample(masks[0], (SIDE, SIDE)) > 0
     valid[near] = False
-    cut = Layer(layer.wrinkle, masks)
+    cut = WrinkleLayer(layer.wrinkle, masks)
     n = wrinkles.combine_layers(base, [cut], np.full(8, 0.5))
     n[~valid] = np.nan
-    measured = wrinkle_texels.derivatives_of(n, valid=valid)
+    measured = wrinkle_texels.measure_derivatives(n, valid=valid)
     got = wrinkle_fit.fit_weights(cut, wrinkles.decode(base), measured)
     np.testing.assert_array_equal(got.valid, [False] + [True] * 7)
     np.testing.assert_allclose(got.weights, [0.0] + [0.5] * 7, atol=1e-6)
@@ -260,7 +260,7 @@ def test_zones_with_identical_masks_have_undetermined_weights(face):
     base, layer = face
     masks = np.array(layer.masks)
     masks[1] = masks[0]
-    twins = Layer(layer.wrinkle, masks)
+    twins = WrinkleLayer(layer.wrinkle, masks)
     n = wrinkles.combine_layers(base, [twins], np.full(8, 0.4))
     got = wrinkle_fit.fit_weights(twins, wrinkles.decode(base), n)
     np.testing.assert_array_equal(got.valid, [False, False] + [True] * 6)
@@ -277,7 +277,7 @@ def test_unmoved_face_has_zero_weights_and_explained_variance(face):
 
 def test_a_map_without_any_wrinkle_determines_nothing(face):
     base, layer = face
-    still = Layer(np.zeros_like(layer.wrinkle), layer.masks)
+    still = WrinkleLayer(np.zeros_like(layer.wrinkle), layer.masks)
     got = wrinkle_fit.fit_weights(still, wrinkles.decode(base), shown(face, np.ones(8)))
     assert not got.valid.any()
     assert np.isinf(got.stderr).all()
@@ -291,14 +291,16 @@ def test_a_map_without_any_wrinkle_determines_nothing(face):
 def fitted(face):
     base, layer = face
     states = {name: shown(face, {name: 1.0}) for name in JIMENEZ2011_TABLE.rows}
-    fit = wrinkle_fit.fit(wrinkles.decode(base), states, layer.masks, size=(32, 32), clamp="signed")
+    fit = wrinkle_fit.fit_wrinkle_map(
+        wrinkles.decode(base), states, layer.masks, size=(32, 32), clamp="signed"
+    )
     return states, fit
 
 
 def test_with_known_weights_the_map_comes_back(face):
     base, layer = face
     states = {name: shown(face, {name: 1.0}) for name in JIMENEZ2011_TABLE.rows}
-    got = wrinkle_fit.fit(
+    got = wrinkle_fit.fit_wrinkle_map(
         wrinkles.decode(base),
         states,
         layer.masks,
@@ -338,7 +340,9 @@ def test_weights_are_recovered_up_to_zone_scale(fitted):
 def test_single_expression_gives_own_map_with_unit_weights(face):
     base, layer = face
     joy = {"joy": shown(face, {"joy": 1.0})}
-    fit = wrinkle_fit.fit(wrinkles.decode(base), joy, layer.masks, size=(32, 32), clamp="signed")
+    fit = wrinkle_fit.fit_wrinkle_map(
+        wrinkles.decode(base), joy, layer.masks, size=(32, 32), clamp="signed"
+    )
     weights = fit.expressions["joy"]
     np.testing.assert_allclose(weights.weights[weights.valid], 1.0, atol=0.02)
     assert fit.explained > 0.999
@@ -348,13 +352,15 @@ def test_mismatched_names_sizes_or_tables_are_refused(face):
     base, layer = face
     n = wrinkles.decode(base)
     with pytest.raises(WrinkleError, match="expected at least one"):
-        wrinkle_fit.fit(n, {}, layer.masks, size=(8, 8))
+        wrinkle_fit.fit_wrinkle_map(n, {}, layer.masks, size=(8, 8))
     with pytest.raises(WrinkleError, match="got shape"):
-        wrinkle_fit.fit(n, {"joy": n[:64]}, layer.masks, size=(8, 8))
+        wrinkle_fit.fit_wrinkle_map(n, {"joy": n[:64]}, layer.masks, size=(8, 8))
     with pytest.raises(WrinkleError, match=r"table\['joy'\]: got"):
-        wrinkle_fit.fit(n, {"joy": n}, layer.masks[:5], size=(8, 8), table=JIMENEZ2011_TABLE)
+        wrinkle_fit.fit_wrinkle_map(
+            n, {"joy": n}, layer.masks[:5], size=(8, 8), table=JIMENEZ2011_TABLE
+        )
     with pytest.raises(WrinkleError, match="got 1 names"):
-        wrinkle_fit.fit(n, {"joy": n}, layer.masks, size=(8, 8), zones=("a",))
+        wrinkle_fit.fit_wrinkle_map(n, {"joy": n}, layer.masks, size=(8, 8), zones=("a",))
     with pytest.raises(WrinkleError, match="clamp"):
         wrinkle_fit.fit_weights(layer, n, n, clamp="tight")
 
@@ -365,8 +371,8 @@ def test_normal_equations_match_full_design(face, rng):
     weight = rng.random((SIDE, SIDE)).astype(np.float32)
     difference = wrinkle_weights.Difference(d, np.zeros_like(d), weight)
     read = pixels(np.asarray(layer.wrinkle), (SIDE, SIDE))
-    got = wrinkle_weights.equations_of(layer.masks, read, {"": difference})[""]
-    full = np.stack([resampling.resampled(m, (SIDE, SIDE)) for m in layer.masks])
+    got = wrinkle_weights.build_equations(layer.masks, read, {"": difference})[""]
+    full = np.stack([resampling.resample(m, (SIDE, SIDE)) for m in layer.masks])
     design = (full[..., None] * read).reshape(8, -1)
     v = np.repeat(weight.ravel().astype(float), 2)
     np.testing.assert_allclose(got.matrix, (design * v) @ design.T, rtol=1e-10, atol=1e-12)

@@ -10,16 +10,16 @@ from math import inf, pi
 import numpy as np
 import pytest
 
-from rigsim.fiber.anisotropic_tissue import AnisotropicTissue, anisotropic_profile
-from rigsim.fiber.profile import Fibres, fibre_profile
+from rigsim.fiber.anisotropic_tissue import AnisotropicTissue, trace_anisotropic_profile
+from rigsim.fiber.profile import FiberGeometry, trace_fiber_profile
 from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportError
 
-FIBRES = Fibres((0.3, 1.3, 3.3))
+FIBRES = FiberGeometry((0.3, 1.3, 3.3))
 ALONG = AnisotropicTissue(0.05, 7.5, strength=-1.2)
 
 
 def traced(tissue, azimuth_rad, *, seed, photons=40_000, fibres=FIBRES, **more):
-    return anisotropic_profile(
+    return trace_anisotropic_profile(
         tissue,
         fibres,
         azimuth_rad=azimuth_rad,
@@ -38,7 +38,7 @@ def worst(one, other):
 @pytest.mark.parametrize("harmonics", [8, None])
 def test_anisotropic_walk_without_preferred_direction_is_isotropic(harmonics):
     run = traced(replace(ALONG, strength=0.0), (0.4,), seed=1, harmonics=harmonics)
-    plain = fibre_profile(
+    plain = trace_fiber_profile(
         LayerStack((Layer(inf, 0.05, 7.5, 0.8, 1.4),)),
         radii_mm=FIBRES.radii_mm,
         photons=40_000,
@@ -52,7 +52,7 @@ def test_anisotropic_walk_without_preferred_direction_is_isotropic(harmonics):
 
 
 def test_light_travels_farther_along_fibers_than_across():
-    run = traced(ALONG, (0.0, 0.5 * pi), seed=3, photons=60_000, fibres=Fibres((7.0,)))
+    run = traced(ALONG, (0.0, 0.5 * pi), seed=3, photons=60_000, fibres=FiberGeometry((7.0,)))
     along, across = run.reflectance_per_mm2[0]
     assert along - across > 4.5 * np.hypot(*run.stderr[0])
 
@@ -79,7 +79,7 @@ def test_light_goes_both_ways_alike():
             (0.0, 1.0),
             seed=7 + k,
             photons=60_000,
-            fibres=Fibres((0.3, 0.8), detector[0], source[0], detector[1], source[1]),
+            fibres=FiberGeometry((0.3, 0.8), detector[0], source[0], detector[1], source[1]),
         )
         for k, (source, detector) in enumerate((((0.4, 0.9), (0.2, 0.2)), ((0.2, 0.2), (0.4, 0.9))))
     ]

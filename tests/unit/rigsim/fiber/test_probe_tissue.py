@@ -11,7 +11,7 @@ import pytest
 from capture.calibration.fiber.phantom import read_certificate
 from capture.rig import load_rig
 from rigsim.fiber import probe_tissue
-from rigsim.fiber.probe_profile import Profiles, fibres_of, smooth_profile
+from rigsim.fiber.probe_profile import ProfileCache, probe_fibers, smooth_profile
 from rigsim.fiber.probe_tissue import (
     PHANTOM_BLOCK,
     FibrousTissue,
@@ -19,10 +19,10 @@ from rigsim.fiber.probe_tissue import (
     SkinTissue,
     TissueError,
     make_phantom,
-    parse_subject,
+    parse_tissue,
     phantom_certificate,
 )
-from rigsim.fiber.profile import fibre_profile
+from rigsim.fiber.profile import trace_fiber_profile
 from rigsim.tissue import skin_layers
 
 RIG = load_rig("probe")
@@ -33,7 +33,7 @@ def test_suction_reduces_blood_to_residual_level():
     skin = SkinTissue("III", seed=4)
     blood = [skin.blood("cheek", p) for p in (0.0, 3.0, 30.0, 60.0, 1e4)]
     assert blood[0] == blood[1] > blood[2] > blood[3] > blood[4]
-    rest = blood[4] / probe_tissue.BLOOD_KEPT
+    rest = blood[4] / probe_tissue.INCOMPRESSIBLE_BLOOD_FRACTION
     assert blood[2] == pytest.approx(rest * (0.25 + 0.75 * math.exp(-1.0)))
     assert skin.blood("chin", 60.0) > 1.5 * skin.blood("forehead", 60.0)
 
@@ -44,7 +44,7 @@ def test_layers_contain_requested_melanin_and_blood():
     index = optics.wavelength_nm.index(560.0)
     got = [layer.sigma_a_per_mm for layer in optics.stacks[index].layers]
     got += optics.amount * optics.absorber[index]
-    whole = skin_layers.skin(560.0, skin.melanin("cheek"), skin.blood("cheek", 60.0))
+    whole = skin_layers.skin_layer_stack(560.0, skin.melanin("cheek"), skin.blood("cheek", 60.0))
     assert got == pytest.approx([layer.sigma_a_per_mm for layer in whole.layers], rel=1e-12)
     assert optics.stacks[index].layers[0].thickness_mm == skin.epidermis_mm("cheek")
 
@@ -52,12 +52,12 @@ def test_layers_contain_requested_melanin_and_blood():
 def test_profile_under_suction_uses_reduced_blood():
     """Reweighted paths against photons of the layers themselves."""
     skin = SkinTissue("II", seed=4)
-    profiles = Profiles(RIG, skin, photons=12_000, seed=2, threads=1)
+    profiles = ProfileCache(RIG, skin, photons=12_000, seed=2, threads=1)
     optics = skin.optics("cheek", 0.0, 10.0)
-    run = profiles._traced(optics)
+    run = profiles._trace(optics)
     weighed = run.profile(optics.amount)
     stacks = [
-        skin_layers.skin(nm, skin.melanin("cheek"), skin.blood("cheek", 10.0))
+        skin_layers.skin_layer_stack(nm, skin.melanin("cheek"), skin.blood("cheek", 10.0))
         for nm in optics.wavelength_nm
     ]
     tops = [stack.layers[0].thickness_mm for stack in optics.stacks]
@@ -65,10 +65,10 @@ def test_profile_under_suction_uses_reduced_blood():
         type(stack)((type(stack.layers[0])(top, *_rest(stack.layers[0])), stack.layers[1]))
         for stack, top in zip(stacks, tops, strict=True)
     ]
-    spectral = profiles.spectral(
+    spectral = profiles.spectral_stack(
         probe_tissue.TissueOptics(optics.wavelength_nm, tuple(layers), None, 0.0)
     )
-    own = fibre_profile(
+    own = trace_fiber_profile(
         spectral, radii_mm=RIG.probe.radius_mm, photons=12_000, rng=np.random.default_rng(9)
     )
 
@@ -88,17 +88,17 @@ def _rest(layer):
 
 def test_profiles_do_not_depend_on_earlier_requests():
     def made(sites):
-        profiles = Profiles(RIG, SkinTissue("II"), photons=200, seed=3, threads=1)
+        profiles = ProfileCache(RIG, SkinTissue("II"), photons=200, seed=3, threads=1)
         return [profiles.profile(site, 0.0, 60.0).reflectance_per_mm2 for site in sites]
 
     np.testing.assert_array_equal(made(["cheek"])[0], made(["chin", "cheek"])[1])
 
 
 def test_reflectance_is_zero_unscattered_and_maximal_unabsorbed():
-    none = Profiles(RIG, HomogeneousTissue(0.1, 0.0), photons=100, seed=0).profile("cheek")
+    none = ProfileCache(RIG, HomogeneousTissue(0.1, 0.0), photons=100, seed=0).profile("cheek")
     assert (none.reflectance_per_mm2 == 0.0).all()
     clear, grey = (
-        Profiles(RIG, HomogeneousTissue(a, 1.5), photons=100, seed=0).profile("cheek")
+        ProfileCache(RIG, HomogeneousTissue(a, 1.5), photons=100, seed=0).profile("cheek")
         for a in (0.0, 0.01)
     )
     assert (clear.reflectance_per_mm2 > grey.reflectance_per_mm2).all()
@@ -107,7 +107,7 @@ def test_reflectance_is_zero_unscattered_and_maximal_unabsorbed():
 def test_rotated_head_on_anisotropic_tissue_rotates_profile():
     photons = 20_000
     tissue = FibrousTissue(0.05, 1.5, -1.0, 30.0)
-    profiles = Profiles(RIG, tissue, photons=photons, seed=1, threads=1)
+    profiles = ProfileCache(RIG, tissue, photons=photons, seed=1, threads=1)
     along, across, between, again = (
         profiles.profile("abdomen", angle).reflectance_per_mm2[:, 0]
         for angle in (30.0, 120.0, 52.0, 210.0)
@@ -117,7 +117,7 @@ def test_rotated_head_on_anisotropic_tissue_rotates_profile():
     assert ratio[:4].mean() < -0.2
     assert ratio[20:].mean() > 0.2
     np.testing.assert_allclose(again, along, rtol=1e-9)
-    turned = Profiles(RIG, FibrousTissue(0.05, 1.5, -1.0, 0.0), photons=photons, seed=1)
+    turned = ProfileCache(RIG, FibrousTissue(0.05, 1.5, -1.0, 0.0), photons=photons, seed=1)
     error = turned.profile("abdomen", 22.0).stderr[:, 0]
     other = turned.profile("abdomen", 22.0).reflectance_per_mm2[:, 0]
     assert np.abs((between - other) / (math.sqrt(2.0) * error)).max() < 6.0
@@ -145,7 +145,7 @@ def test_certificate_is_readable_by_calibration(tmp_path):
 
 def test_smoothing_lowers_noise_with_residual_within_stated_error():
     rng = np.random.default_rng(5)
-    radii = np.array(fibres_of(RIG.probe).radii_mm)
+    radii = np.array(probe_fibers(RIG.probe).radii_mm)
     true = np.exp(-radii) / (radii * (radii + 0.5))
     noisy = true[:, None] * rng.normal(1.0, 0.05 * math.sqrt(20), (20, 28, 1))
     smooth, error = smooth_profile(radii, np.maximum(noisy, 0.0))
@@ -165,7 +165,7 @@ def test_wrong_subjects_are_refused():
         "anisotropic:0,1",
     ):
         with pytest.raises(TissueError):
-            parse_subject(text)
-    assert parse_subject("homogeneous:0.1,2,0.9").g == 0.9
+            parse_tissue(text)
+    assert parse_tissue("homogeneous:0.1,2,0.9").g == 0.9
     with pytest.raises(TissueError, match="site"):
         SkinTissue("III").optics("elbow", 0.0, 60.0)

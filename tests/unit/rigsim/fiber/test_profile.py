@@ -7,9 +7,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rigsim.fiber.profile import Fibres, SpectralStack, fibre_paths, fibre_profile
+from rigsim.fiber.profile import (
+    FiberGeometry,
+    SpectralStack,
+    trace_fiber_paths,
+    trace_fiber_profile,
+)
 from rigsim.fiber.rings import KERNEL_NODES, ring_kernels
-from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportError, transport
+from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportError, trace_photons
 
 RED = LayerStack((Layer(inf, 0.1, 7.5, 0.8, 1.4),))
 LAYERED = LayerStack(
@@ -29,7 +34,7 @@ def exit_profile(stack, radii_mm, *, core_mm, source_core_mm, photons, seed):
     The weights of the rings come from random points in the discs: no code is shared.
     """
     edges = np.linspace(0.0, 4.0, 401)
-    run = transport(
+    run = trace_photons(
         stack, photons=photons, rng=np.random.default_rng(seed), ring_edges_mm=edges, threads=2
     )
     rng = np.random.default_rng(seed + 1)
@@ -63,7 +68,7 @@ FORWARD = LayerStack((Layer(inf, 0.1, 7.5, 0.85, 1.4),))
 )
 def test_fibers_accepting_all_angles_collect_core_exitance(stack, twin, agree):
     # Independent runs; |z| < 4.5 for each of six radii: false alarms below 2e-3 (t, 19 dof).
-    seen = fibre_profile(
+    seen = trace_fiber_profile(
         stack,
         radii_mm=RADII_MM,
         photons=60_000,
@@ -80,11 +85,11 @@ def test_fibers_accepting_all_angles_collect_core_exitance(stack, twin, agree):
 
 
 def test_paths_reweighted_to_more_absorption_match_direct_run():
-    kept = fibre_paths(
-        RED, Fibres(RADII_MM), photons=40_000, rng=np.random.default_rng(2), threads=2
+    kept = trace_fiber_paths(
+        RED, FiberGeometry(RADII_MM), photons=40_000, rng=np.random.default_rng(2), threads=2
     ).profile(0.4)
     darker = LayerStack((Layer(inf, 0.5, 7.5, 0.8, 1.4),))
-    run = fibre_profile(
+    run = trace_fiber_profile(
         darker, radii_mm=RADII_MM, photons=40_000, rng=np.random.default_rng(3), threads=2
     )
     z = (kept.reflectance_per_mm2 - run.reflectance_per_mm2) / np.hypot(kept.stderr, run.stderr)
@@ -93,15 +98,15 @@ def test_paths_reweighted_to_more_absorption_match_direct_run():
 
 def test_paths_without_reweighting_give_profile_itself():
     rng = np.random.default_rng
-    kept = fibre_paths(RED, Fibres(RADII_MM), photons=2000, rng=rng(4)).profile()
-    run = fibre_profile(RED, radii_mm=RADII_MM, photons=2000, rng=rng(4))
+    kept = trace_fiber_paths(RED, FiberGeometry(RADII_MM), photons=2000, rng=rng(4)).profile()
+    run = trace_fiber_profile(RED, radii_mm=RADII_MM, photons=2000, rng=rng(4))
     np.testing.assert_allclose(kept.reflectance_per_mm2, run.reflectance_per_mm2, rtol=1e-5)
 
 
 def test_band_is_the_weighted_mean_of_its_wavelengths():
     stacks = tuple(LayerStack((Layer(inf, a, 7.5, 0.8, 1.4),)) for a in (0.05, 0.5))
     weights = np.array([[1.0, 0.25], [0.0, 0.75]])
-    both = fibre_profile(
+    both = trace_fiber_profile(
         SpectralStack((650.0, 550.0), stacks, weights),
         radii_mm=RADII_MM,
         photons=60_000,
@@ -109,7 +114,7 @@ def test_band_is_the_weighted_mean_of_its_wavelengths():
         threads=2,
     )
     apart = [
-        fibre_profile(
+        trace_fiber_profile(
             stack, radii_mm=RADII_MM, photons=30_000, rng=np.random.default_rng(6), threads=2
         )
         for stack in stacks
@@ -127,8 +132,8 @@ def test_band_is_the_weighted_mean_of_its_wavelengths():
 
 def test_profile_ignores_fiber_order_and_thread_count():
     rng = np.random.default_rng
-    run = fibre_profile(RED, radii_mm=RADII_MM, photons=2000, rng=rng(7))
-    other = fibre_profile(RED, radii_mm=RADII_MM[::-1], photons=2000, rng=rng(7), threads=3)
+    run = trace_fiber_profile(RED, radii_mm=RADII_MM, photons=2000, rng=rng(7))
+    other = trace_fiber_profile(RED, radii_mm=RADII_MM[::-1], photons=2000, rng=rng(7), threads=3)
     np.testing.assert_array_equal(run.reflectance_per_mm2, other.reflectance_per_mm2[::-1])
 
 
@@ -148,7 +153,7 @@ def test_profile_ignores_fiber_order_and_thread_count():
 def test_impossible_requests_are_refused_by_name(request_, field):
     arguments = {"radii_mm": (0.3,), "photons": 100, "rng": np.random.default_rng(0), **request_}
     with pytest.raises(TransportError, match=field):
-        fibre_profile(RED, **arguments)
+        trace_fiber_profile(RED, **arguments)
 
 
 @pytest.mark.parametrize(("detector_mm", "source_mm"), [(0.2, 0.2), (0.4, 0.1), (0.2, 0.0)])
@@ -177,7 +182,7 @@ def test_ring_fractions_match_random_points_in_cores(detector_mm, source_mm):
 def all_angle_z(layer, *, photons=40_000, radii_mm=(0.0, 0.3, 1.0), core_mm=0.2):
     """Standard errors between fibres that take all angles and the exitance of the plain walk."""
     stack = LayerStack((layer,))
-    seen = fibre_profile(
+    seen = trace_fiber_profile(
         stack,
         radii_mm=radii_mm,
         photons=photons,
@@ -217,7 +222,7 @@ def test_extreme_media_agree_with_the_plain_walk(layer):
 def test_vanishing_absorption_terminates_without_change_near_source():
     """A half-space without absorption keeps photons for ever; far ones end by roulette here."""
     runs = [
-        fibre_profile(
+        trace_fiber_profile(
             LayerStack((Layer(inf, sigma_a, 7.5, 0.8, 1.4),)),
             radii_mm=(0.3, 2.0, 7.0),
             photons=8000,
@@ -234,7 +239,9 @@ def test_vanishing_absorption_terminates_without_change_near_source():
 
 def test_tissue_that_does_not_scatter_sends_nothing_back():
     clear = LayerStack((Layer(inf, 0.1, 0.0, 0.8, 1.4),))
-    run = fibre_profile(clear, radii_mm=(0.0, 0.3), photons=1000, rng=np.random.default_rng(15))
+    run = trace_fiber_profile(
+        clear, radii_mm=(0.0, 0.3), photons=1000, rng=np.random.default_rng(15)
+    )
     np.testing.assert_array_equal(run.reflectance_per_mm2, 0.0)
     np.testing.assert_array_equal(run.stderr, 0.0)
 
@@ -242,7 +249,7 @@ def test_tissue_that_does_not_scatter_sends_nothing_back():
 def test_little_scattering_goes_as_its_amount():
     """Single scattering: half the scatterers, half the light (and 1 % of double scattering)."""
     one, half = (
-        fibre_profile(
+        trace_fiber_profile(
             LayerStack((Layer(inf, 1.0, sigma_s, 0.0, 1.0),)),
             radii_mm=(0.3,),
             photons=200_000,
@@ -263,7 +270,7 @@ def test_absorbing_film_of_one_micrometer_attenuates_twice():
     """Index matched, parallel light in and a narrow cone out: exp(-2 sigma_a d), nothing else."""
     tissue = Layer(inf, 0.1, 7.5, 0.8, 1.0)
     runs = [
-        fibre_profile(
+        trace_fiber_profile(
             LayerStack(layers),
             radii_mm=(0.3, 1.3),
             photons=40_000,
@@ -283,7 +290,7 @@ def test_absorbing_film_of_one_micrometer_attenuates_twice():
 def test_film_of_identical_tissue_changes_nothing():
     tissue = Layer(inf, 0.1, 7.5, 0.8, 1.4)
     runs = [
-        fibre_profile(
+        trace_fiber_profile(
             LayerStack(layers),
             radii_mm=RADII_MM,
             photons=30_000,
@@ -301,7 +308,7 @@ def test_light_goes_both_ways_alike(stack):
     """Helmholtz: a wide source with a wide cone and a thin fibre, or the fibres exchanged."""
     wide, thin = (0.4, 0.9), (0.1, 0.2)
     runs = [
-        fibre_profile(
+        trace_fiber_profile(
             stack,
             radii_mm=(0.3, 0.8),
             photons=80_000,
@@ -323,7 +330,7 @@ def test_light_goes_both_ways_alike(stack):
 @pytest.mark.long
 def test_standard_error_matches_scatter_of_repeated_profiles():
     rng = np.random.default_rng(23)
-    runs = [fibre_profile(RED, radii_mm=(0.3, 3.3), photons=2000, rng=rng) for _ in range(60)]
+    runs = [trace_fiber_profile(RED, radii_mm=(0.3, 3.3), photons=2000, rng=rng) for _ in range(60)]
     spread = np.var([run.reflectance_per_mm2 for run in runs], axis=0, ddof=1)
     stated = np.mean([run.stderr**2 for run in runs], axis=0)
     # Near normal batches would follow F(59, 60 x 19); tails are heavier, so this alarms at 1e-3.
@@ -336,7 +343,7 @@ def test_fiber_profile_reaches_one_percent_within_half_minute():
     radii = 0.3 + 0.25 * np.arange(27)
     red = LayerStack((Layer(inf, 0.04, 7.5, 0.8, 1.4),))
     begin = time.process_time()
-    run = fibre_profile(
+    run = trace_fiber_profile(
         red, radii_mm=radii, photons=20_000, rng=np.random.default_rng(24), batches=100
     )
     seconds = time.process_time() - begin

@@ -5,7 +5,7 @@ import pytest
 
 from rigsim.geometry.atlas import Atlas, unwrap
 from rigsim.geometry.mesh import build_mesh
-from rigsim.light.lateral import LateralError, line_spread_mm, scatter_laterally
+from rigsim.light.lateral import LateralError, edge_width_mm, scatter_laterally
 
 SIZE = 256
 
@@ -83,7 +83,7 @@ def test_kernels_far_below_texel_keep_field_unchanged():
 
 
 def test_gaussian_edge_width_is_2_56_sigma():
-    np.testing.assert_allclose(line_spread_mm([0.7], [[1.0]]), [2 * 1.2815516 * 0.7], rtol=1e-4)
+    np.testing.assert_allclose(edge_width_mm([0.7], [[1.0]]), [2 * 1.2815516 * 0.7], rtol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from capture.rig import load_rig
-from rigsim.light.relief_shadow import HORIZON_DIRECTIONS, SOFT_RAD, ReliefShadow
+from rigsim.light.relief_shadow import HORIZON_DIRECTIONS, HORIZON_SOFTNESS_RAD, ReliefShadow
 from rigsim.needs.effects import SceneEffects
 from rigsim.needs.face import WRINKLE_SHADOW_EFFECT
 from rigsim.render.variant import VariantChoice, choose_variant
@@ -81,7 +81,7 @@ def test_wall_shadows_light_to_height_over_tangent(azimuth_deg, before, across):
 def test_level_skin_and_high_lights_are_never_shadowed():
     ramp = np.abs(np.arange(SIDE) - 48.0)[None, :].repeat(SIDE, 0) * MM * 1e3 * 0.5
     assert seen_from(level(np.zeros((SIDE, SIDE))), 33.0, 1.0).min() == 1.0
-    steep_deg = math.degrees(math.atan(0.5) + 1.1 * SOFT_RAD)
+    steep_deg = math.degrees(math.atan(0.5) + 1.1 * HORIZON_SOFTNESS_RAD)
     assert seen_from(level(ramp), 0.0, steep_deg).min() == 1.0
     assert seen_from(level(ramp), 0.0, 10.0).min() == 0.0
     assert HORIZON_DIRECTIONS % 4 == 0

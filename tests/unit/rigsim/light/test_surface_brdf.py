@@ -35,7 +35,7 @@ def test_white_skin_reflects_less_light_than_received(angle_deg, roughness):
     """R_d of 1, the most oil and the densest fuzz: the worst case of all."""
     way, weight = hemisphere(200, 256)
     packed = [1.0, 1.0, 1.0, roughness, 0.6, surface_brdf.FUZZ_DEPTH, 1.0]
-    total, specular = surface_brdf.evaluate(packed, UP, slanted(angle_deg), way)
+    total, specular = surface_brdf.evaluate_brdf(packed, UP, slanted(angle_deg), way)
     assert 0.0 < weight @ specular < 0.75
     assert weight @ total[:, 0] < 1.0
 
@@ -45,8 +45,8 @@ def test_skin_brdf_is_reciprocal(rng):
     way[..., 2] = np.abs(way[..., 2]) + 1e-3
     way /= np.linalg.norm(way, axis=-1, keepdims=True)
     packed = rng.uniform(size=(500, 7)) * [1, 1, 1, 0.4, 0.6, 0.003, 1] + [0, 0, 0, 0.1, 0, 0, 0]
-    there = surface_brdf.evaluate(packed, UP, way[:, 0], way[:, 1])
-    back = surface_brdf.evaluate(packed, UP, way[:, 1], way[:, 0])
+    there = surface_brdf.evaluate_brdf(packed, UP, way[:, 0], way[:, 1])
+    back = surface_brdf.evaluate_brdf(packed, UP, way[:, 1], way[:, 0])
     for a, b in zip(there, back, strict=True):
         np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-7)
 
@@ -56,7 +56,7 @@ def test_smooth_white_metal_facets_reflect_almost_everything():
     way, weight = hemisphere(240, 120)
     light = slanted(30.0)
     nh = (way + light)[:, 2] / np.linalg.norm(way + light, axis=-1)
-    for lobe, lost in ((surface_brdf.beckmann, 0.004), (surface_brdf.ggx, 0.04)):
+    for lobe, lost in ((surface_brdf.beckmann_brdf, 0.004), (surface_brdf.ggx_brdf, 0.04)):
         f = [lobe(light[2], w[2], h, 0.15) for w, h in zip(way, nh, strict=True)]
         assert 1.0 - lost < weight @ np.array(f) < 1.0 + 1e-6
 
@@ -66,7 +66,7 @@ def test_r_d_without_surface_terms_matches_eq_6():
     way, _ = hemisphere(12, 16)
     packed = [0.6, 0.3, 0.05, 0.3, 0.0, 0.0, 0.0]
     light = slanted(40.0)
-    total, specular = surface_brdf.evaluate(packed, UP, light, way)
+    total, specular = surface_brdf.evaluate_brdf(packed, UP, light, way)
     passed = [surface_brdf.boundary_transmittance(light[2], w[2]) for w in way]
     np.testing.assert_allclose(
         math.pi * total / np.array(passed)[:, None],
@@ -81,7 +81,7 @@ def test_subsurface_reflectance_at_normal_incidence_matches_table():
     way, weight = hemisphere(64, 4)
     r = 0.5
     packed = [r * shading.interior_scale(1.4)] * 3 + [0.3, 0.0, 0.0, 0.0]
-    total, _ = surface_brdf.evaluate(packed, UP, UP, way)
+    total, _ = surface_brdf.evaluate_brdf(packed, UP, UP, way)
     assert weight @ total[:, 1] == pytest.approx(r, rel=1e-4)
 
 
@@ -98,7 +98,7 @@ def test_eq_6_error_without_specular_free_direction_small(preset, part):
     face = make_subject(preset, size=64)
     surface = surface_brdf.skin_surface(face, "Nikon 5100 (NPL)", "LED-B3")
     bare = face.hair == 0.0
-    floor = surface_brdf.surface_floor(surface.packed()[bare])
+    floor = surface_brdf.min_surface_reflection(surface.packed()[bare])
     assert floor.min() >= 0.0
     assert 0.0 < np.median(floor / surface.r_d[bare][:, 2]) < part
 
@@ -107,10 +107,10 @@ def test_single_lobe_does_not_fit_surface_terms():
     """Best multiple of a single lobe, over its roughness, misses by several percent."""
     way, weight = hemisphere(40, 32)
     light = slanted(50.0)
-    skin = surface_brdf.evaluate([0, 0, 0, 0.32, 0.3, 0.002, 1.0], UP, light, way)[1]
+    skin = surface_brdf.evaluate_brdf([0, 0, 0, 0.32, 0.3, 0.002, 1.0], UP, light, way)[1]
     errors = []
     for roughness in np.linspace(0.1, 0.5, 41):
-        one = surface_brdf.evaluate([0, 0, 0, roughness, 0.0, 0.0, 1.0], UP, light, way)[1]
+        one = surface_brdf.evaluate_brdf([0, 0, 0, roughness, 0.0, 0.0, 1.0], UP, light, way)[1]
         gain = (weight * one) @ skin / ((weight * one) @ one)
         errors.append(math.sqrt(weight @ (skin - gain * one) ** 2 / (weight @ skin**2)))
     assert min(errors) > 0.05
@@ -129,7 +129,7 @@ def test_face_specular_varies_and_stays_in_range():
 def test_directions_below_the_surface_reflect_nothing():
     packed = [0.5, 0.5, 0.5, 0.3, 0.2, 0.001, 1.0]
     for light, camera in ((-UP, UP), (UP, -UP), (slanted(90.1), UP)):
-        total, _ = surface_brdf.evaluate(packed, UP, light, camera)
+        total, _ = surface_brdf.evaluate_brdf(packed, UP, light, camera)
         assert not total.any()
     with pytest.raises(surface_brdf.SurfaceError, match="packed"):
-        surface_brdf.evaluate([0.5], UP, UP, UP)
+        surface_brdf.evaluate_brdf([0.5], UP, UP, UP)

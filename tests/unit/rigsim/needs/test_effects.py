@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from capture.rig import load_rig
-from rigsim.fiber.probe_tissue import HomogeneousTissue, parse_subject
+from rigsim.fiber.probe_tissue import HomogeneousTissue, parse_tissue
 from rigsim.geometry.mesh import build_mesh
-from rigsim.light.interreflection import WAVELENGTH_STEPS, step_error
+from rigsim.light.interreflection import WAVELENGTH_STEPS, wavelength_step_error
 from rigsim.light.lateral import scatter_laterally
-from rigsim.light.relief_shadow import hidden_share
-from rigsim.light.seen_skin import SeenSkin
+from rigsim.light.observed_skin import ObservedSkin
+from rigsim.light.relief_shadow import hidden_sky_fraction
 from rigsim.needs import effect_sizes
 from rigsim.needs import face as face_needs
 from rigsim.needs.effects import (
@@ -20,15 +20,15 @@ from rigsim.needs.effects import (
     Effect,
     EffectSelection,
     NeedsError,
-    Noise,
+    PixelNoise,
     SceneEffects,
-    decide,
+    decide_effect,
 )
 from rigsim.render.caster import Caster
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.scenes.probe.scene import ProbeScene
-from rigsim.sensor import expose, sensor_of
+from rigsim.sensor import expose_sensor, make_sensor
 from rigsim.subject.person import make_subject
 from rigsim.targets.flat import make_target
 
@@ -51,11 +51,11 @@ SQUARE = np.array([[0, 0, 0], [40, 0, 0], [40, 40, 0], [0, 40, 0]])
 
 def test_the_noise_is_that_of_exposures(rng):
     """4000 pixels; the sample deviation of n normal numbers scatters by 1 / sqrt(2 n), 1.1 %."""
-    sensor = sensor_of(load_rig("flash").views[0], prnu=0.0, dsnu_e=0.0, vignetting=0.0)
-    noise = Noise.of(sensor)
+    sensor = make_sensor(load_rig("flash").views[0], prnu=0.0, dsnu_e=0.0, vignetting=0.0)
+    noise = PixelNoise.of(sensor)
     for level in (0.02, 0.5):
         light = np.full((64, 64, 3), level, np.float32)
-        dn = expose(light, sensor=sensor, rng=rng).astype(float)
+        dn = expose_sensor(light, sensor=sensor, rng=rng).astype(float)
         found = dn.std(ddof=1) / (sensor.white - sensor.black)
         assert found == pytest.approx(float(noise.sigma(level)), rel=0.045)  # 1e-4 twice
 
@@ -67,8 +67,10 @@ def test_effect_record_rejects_wrong_negligible_verdict():
         Effect("bounces", "maybe", "flat")
     with pytest.raises(NeedsError, match="bounces twice"):
         EffectSelection((Effect("bounces", "built", "a"), Effect("bounces", "absent", "b")))
-    assert decide("b", NEGLIGIBLE_NOISE_RATIO, None, switch="", because="x").built
-    assert not decide("b", 0.999 * NEGLIGIBLE_NOISE_RATIO, None, switch="", because="x").built
+    assert decide_effect("b", NEGLIGIBLE_NOISE_RATIO, None, switch="", reason="x").is_built
+    assert not decide_effect(
+        "b", 0.999 * NEGLIGIBLE_NOISE_RATIO, None, switch="", reason="x"
+    ).is_built
 
 
 @pytest.mark.parametrize("texels", [3, 15])
@@ -97,12 +99,12 @@ def test_edge_light_loss_matches_lateral_scattering(texels):
 def test_interreflection_is_zero_on_plate_not_in_corner():
     flat = plate(SQUARE)
     assert effect_sizes.is_flat(flat.mesh)
-    assert effect_sizes.exchange_share(flat) == 0.0
+    assert effect_sizes.max_exchange_fraction(flat) == 0.0
     wall = SQUARE[:, [2, 1, 0]] - [0.01, 0.0, 0.0]
     corner = plate(SQUARE, wall[::-1])
     assert not effect_sizes.is_flat(corner.mesh)
     # beside the edge a patch sees up to half a hemisphere of wall, through two boundaries
-    assert 0.15 < effect_sizes.exchange_share(corner) < 0.5
+    assert 0.15 < effect_sizes.max_exchange_fraction(corner) < 0.5
 
 
 def test_groove_occludes_sky_like_two_walls():
@@ -114,12 +116,12 @@ def test_groove_occludes_sky_like_two_walls():
     slope = np.sign(np.arange(257) - 128.0)
     normals = np.zeros((1025, 257, 3), np.float32)
     normals[..., 0], normals[..., 2] = -slope / math.sqrt(2.0), 1.0 / math.sqrt(2.0)
-    found = hidden_share(height, normals, margin=0, pixel_um=1.0, sectors=64)
+    found = hidden_sky_fraction(height, normals, margin=0, pixel_um=1.0, sectors=64)
     d = np.arange(8, 60)
     told = 0.5 * (1.0 - d / np.hypot(128.0, d))
     np.testing.assert_allclose(found[512, 128 + d], told, rtol=0.06)
     assert (
-        hidden_share(
+        hidden_sky_fraction(
             np.zeros((4, 4), np.float32),
             np.float32([[[0, 0, 1]]]).repeat(4, 0).repeat(4, 1),
             margin=0,
@@ -149,7 +151,7 @@ def test_pale_skin_needs_effects_negligible_on_darkest(flash, faces):
 
 
 def test_a_noisier_sensor_needs_less(flash, faces):
-    sensor = sensor_of(flash.views[0])
+    sensor = make_sensor(flash.views[0])
     noisy = dataclasses.replace(sensor, read_noise_e=1e4)
     sharp = FlashScene(flash, faces["darkest"], sensor=sensor).needs
     coarse = FlashScene(flash, faces["darkest"], sensor=noisy).needs
@@ -186,7 +188,7 @@ def test_effect_sizes_are_bounds_under_grazing_light(flash, faces, power):
     """What faces the light is 29 times as bright as the plate, and beyond full scale."""
     rig, face = grazing(flash), faces["darkest"]
     scene = FlashScene(rig, face, power=power)
-    noise = Noise.of(scene.sensor())
+    noise = PixelNoise.of(scene.sensor())
 
     def light(**settings):
         made = FlashScene(rig, face, power=power, effects=SceneEffects(**settings))
@@ -208,7 +210,7 @@ def test_lens_effect_follows_highlight_brighter_than_dark_skin(flash, faces):
         shown = scene.radiance("parallel") - scene.radiance("crossed")
         rough = float(scene.subject.roughness[scene.subject.atlas.covered].min())
         places = [light.position_mm for light in rig.lights]
-        bound = effect_sizes.highlight(
+        bound = effect_sizes.max_highlight(
             scene.subject.mesh, places, scene._weights, rig.views[0].position_mm, rough
         )
         peak = float((bound * scene.white_rgb()).max())
@@ -219,7 +221,7 @@ def test_fewer_wavelengths_change_pixels_below_stated_bound(flash, faces):
     """Of light from skin to skin, whose share is told as a bound, between any two of its skins."""
     face = faces["II"]
     scene = FlashScene(flash, face)
-    noise, view = Noise.of(scene.sensor()), flash.views[0]
+    noise, view = PixelNoise.of(scene.sensor()), flash.views[0]
     effect = scene.needs[face_needs.WAVELENGTH_STEP_EFFECT]
     assert effect.verdict == "built"
     assert "each 20 nm would not be enough" in effect.reason
@@ -229,9 +231,9 @@ def test_fewer_wavelengths_change_pixels_below_stated_bound(flash, faces):
     assert coarse.verdict == "negligible"
     bounces = scene.needs[face_needs.INTERREFLECTION_EFFECT].over_noise
     changes = []
-    skin = SeenSkin(face, "neutral", view.spectral_sensitivity, "D55")
+    skin = ObservedSkin(face, "neutral", view.spectral_sensitivity, "D55")
     for step in WAVELENGTH_STEPS:
-        error = step_error(skin, step)
+        error = wavelength_step_error(skin, step)
         lack = FlashScene(flash, face, effects=SceneEffects(spectral_step=step)).radiance()
         changes.append(float((np.abs(lack - fine) / noise.sigma(fine)).max()))
         assert 0.0 < changes[-1] <= bounces * error.max()
@@ -273,7 +275,7 @@ def test_gray_tissue_is_traced_once_skin_by_color():
     gray = ProbeScene(rig, HomogeneousTissue(0.04, 1.5)).needs
     assert gray["tissue traced color by color"].verdict == "negligible"
     assert gray["layers of the tissue"].verdict == "absent"
-    skin = ProbeScene(rig, parse_subject("III", seed=0)).needs
+    skin = ProbeScene(rig, parse_tissue("III", seed=0)).needs
     assert skin.builds("tissue traced color by color")
     assert skin.builds("layers of the tissue")
 

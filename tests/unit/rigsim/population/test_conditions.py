@@ -11,9 +11,9 @@ from rigsim.light.surface_brdf import Coating, SurfaceError
 from rigsim.population.conditions import (
     CONDITION_NAMES,
     ConditionError,
-    coated,
-    conditioned,
-    conditioned_subject,
+    apply_condition,
+    apply_conditions,
+    condition_subject,
     conditioned_surface,
 )
 from rigsim.subject.person import make_subject
@@ -35,7 +35,7 @@ def bare(face):
 
 def gloss(surface, light, view, points):
     """Return the mean surface term of the chosen texels, 1/sr."""
-    return surface_brdf.evaluate(surface.packed()[points], UP, light, view)[1].mean()
+    return surface_brdf.evaluate_brdf(surface.packed()[points], UP, light, view)[1].mean()
 
 
 def slanted(angle_deg, turn_deg=0.0):
@@ -63,7 +63,7 @@ def test_coated_skin_reflects_less_light_than_received(angle_deg, powder, eta, a
     way, weight = hemisphere()
     r_d = (1.0 - powder) * 0.9 + powder * 0.55
     packed = [r_d, r_d, r_d, 0.3, 0.6, surface_brdf.FUZZ_DEPTH, 1.0, 1.0, alpha, eta, powder]
-    total, specular = surface_brdf.evaluate(packed, UP, slanted(angle_deg), way)
+    total, specular = surface_brdf.evaluate_brdf(packed, UP, slanted(angle_deg), way)
     assert 0.0 < weight @ specular
     assert weight @ total[:, 0] < 1.0
 
@@ -75,8 +75,8 @@ def test_coated_skin_brdf_is_reciprocal(rng):
     low = np.array([0, 0, 0, 0.1, 0, 0, 0, 0, 0.05, 1.2, 0])
     high = np.array([1, 1, 1, 0.5, 0.6, 0.003, 1, 1, 0.6, 1.7, 1])
     packed = rng.uniform(low, high, (500, 11))
-    there = surface_brdf.evaluate(packed, UP, way[:, 0], way[:, 1])
-    back = surface_brdf.evaluate(packed, UP, way[:, 1], way[:, 0])
+    there = surface_brdf.evaluate_brdf(packed, UP, way[:, 0], way[:, 1])
+    back = surface_brdf.evaluate_brdf(packed, UP, way[:, 1], way[:, 0])
     for a, b in zip(there, back, strict=True):
         np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-7)
 
@@ -84,8 +84,8 @@ def test_coated_skin_brdf_is_reciprocal(rng):
 def test_zero_film_and_no_grains_give_bare_skin(rng):
     way, _ = hemisphere(12, 16)
     bare = [0.5, 0.4, 0.3, 0.3, 0.3, 0.001, 0.9]
-    one = surface_brdf.evaluate(bare, UP, slanted(50.0), way)
-    two = surface_brdf.evaluate([*bare, 0.0, 0.2, 1.4, 0.0], UP, slanted(50.0), way)
+    one = surface_brdf.evaluate_brdf(bare, UP, slanted(50.0), way)
+    two = surface_brdf.evaluate_brdf([*bare, 0.0, 0.2, 1.4, 0.0], UP, slanted(50.0), way)
     for a, b in zip(one, two, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6)
 
@@ -94,11 +94,11 @@ def test_grains_match_closed_form_of_thick_layer():
     """Light from above and back: w p(pi) / (4 pi 2), p = (1 - g^2) / (1 + g)^3 for g < 0."""
     g, w = surface_brdf.POWDER_ASYMMETRY, surface_brdf.POWDER_ALBEDO
     packed = [0.0, 0.0, 0.0, 0.3, 0.2, 0.0, 1.0, 0.0, 0.2, 1.4, 1.0]
-    back = surface_brdf.evaluate(packed, UP, UP, UP)[1][0]
+    back = surface_brdf.evaluate_brdf(packed, UP, UP, UP)[1][0]
     assert back == pytest.approx(w * (1.0 - g * g) / (1.0 + g) ** 3 / (8.0 * math.pi), rel=1e-5)
     way, weight = hemisphere(64, 128)
     for angle in (0.0, 40.0, 85.0):
-        sent = weight @ surface_brdf.evaluate(packed, UP, slanted(angle), way)[1]
+        sent = weight @ surface_brdf.evaluate_brdf(packed, UP, slanted(angle), way)[1]
         assert sent < w
         # grains that scatter evenly send back w / 2 (1 - c ln(1 + 1 / c)); these ones more
         c = math.cos(math.radians(angle))
@@ -108,13 +108,13 @@ def test_grains_match_closed_form_of_thick_layer():
 
 @pytest.mark.parametrize("condition", CONDITION_NAMES)
 def test_condition_of_zero_amount_keeps_surface(condition, face, bare):
-    assert conditioned(bare, condition, 0.0) is bare
-    assert coated(face, bare, {condition: 0.0}) is bare
-    assert conditioned_subject(face, {condition: 0.0}) is face
+    assert apply_condition(bare, condition, 0.0) is bare
+    assert apply_conditions(face, bare, {condition: 0.0}) is bare
+    assert condition_subject(face, {condition: 0.0}) is face
 
 
 def test_normal_condition_keeps_surface(face, bare):
-    assert conditioned(bare, "normal") is bare
+    assert apply_condition(bare, "normal") is bare
     again = conditioned_surface(face, CAMERA, LIGHT, {"normal": 1.0})
     np.testing.assert_array_equal(again.packed(), bare.packed())
 
@@ -154,23 +154,23 @@ def test_heat_reddens_and_cold_pales(face, bare):
 
 def test_makeup_evens_color_and_covers_towards_own_color(face, bare):
     skin = (face.hair == 0.0) & face.atlas.covered
-    even = conditioned(bare, "makeup")
+    even = apply_condition(bare, "makeup")
     assert np.all(even.r_d[skin].std(axis=0) < 0.4 * bare.r_d[skin].std(axis=0))
     np.testing.assert_allclose(
         np.median(even.r_d[skin], axis=0), np.median(bare.r_d[skin], axis=0), rtol=0.01
     )
-    bronze = conditioned(bare, "makeup", foundation=[0.4, 0.2, 0.1])
+    bronze = apply_condition(bare, "makeup", foundation=[0.4, 0.2, 0.1])
     gap = np.abs(bare.r_d - [0.4, 0.2, 0.1])[skin]
     np.testing.assert_allclose(np.abs(bronze.r_d - [0.4, 0.2, 0.1])[skin], 0.3 * gap, atol=1e-5)
 
 
 def test_film_grows_with_condition_amount(face, bare):
-    film = [conditioned(bare, "lotion", a).coating.film.mean() for a in (0.3, 0.6, 1.0)]
+    film = [apply_condition(bare, "lotion", a).coating.film.mean() for a in (0.3, 0.6, 1.0)]
     np.testing.assert_allclose(np.array(film) / film[-1], [0.3, 0.6, 1.0], rtol=1e-5)
 
 
 def test_second_film_covers_remainder_of_first(bare):
-    both = conditioned(conditioned(bare, "lotion"), "sweat").coating
+    both = apply_condition(apply_condition(bare, "lotion"), "sweat").coating
     assert both.film.mean() == pytest.approx(1.0 - 0.25 * 0.3, rel=1e-5)
     assert ETA["water"] < both.film_eta.mean() < ETA["lotion"]
 
@@ -181,13 +181,13 @@ def test_the_darkest_face_under_everything_stays_in_range(face):
     packed = surface.packed()
     assert np.isfinite(packed).all()
     assert packed.min() >= 0.0
-    total, specular = surface_brdf.evaluate(packed.reshape(-1, 11), UP, slanted(40.0), UP)
+    total, specular = surface_brdf.evaluate_brdf(packed.reshape(-1, 11), UP, slanted(40.0), UP)
     assert np.all(total >= specular[:, None])
 
 
 def test_posed_face_keeps_pose_under_condition(face):
-    smiling = face.posed("smile")
-    hot = conditioned_subject(smiling, {"hot": 1.0})
+    smiling = face.with_expression("smile")
+    hot = condition_subject(smiling, {"hot": 1.0})
     assert hot.pose is smiling.pose
     assert hot.hemoglobin().mean() > 1.1 * smiling.hemoglobin().mean()
     assert hot.rest.hemoglobin().mean() == pytest.approx(hot.hemoglobin().mean())
@@ -199,7 +199,7 @@ def test_posed_face_keeps_pose_under_condition(face):
 )
 def test_an_unknown_condition_is_refused(condition, amount, match, bare):
     with pytest.raises(ConditionError, match=match):
-        conditioned(bare, condition, amount)
+        apply_condition(bare, condition, amount)
 
 
 def test_coating_or_foundation_out_of_range_is_refused(bare):
@@ -209,4 +209,4 @@ def test_coating_or_foundation_out_of_range_is_refused(bare):
     with pytest.raises(SurfaceError, match="powder: got"):
         Coating(even, 0.2 * even, 1.4 * even, dataclasses.replace(bare).oil)
     with pytest.raises(ConditionError, match="foundation"):
-        conditioned(bare, "makeup", foundation=[2.0, 0.0, 0.0])
+        apply_condition(bare, "makeup", foundation=[2.0, 0.0, 0.0])

@@ -8,8 +8,8 @@ import pytest
 from model.store import write_exr
 from rigsim.fiber.probe_tissue import SkinTissue, TissueError
 from rigsim.population import files as subject_file
-from rigsim.population.files import load_subject, read, record
-from rigsim.population.textures import SubjectFileError, texture
+from rigsim.population.files import load_subject, read_subject_file, record_subject
+from rigsim.population.textures import SubjectFileError, resample_texture
 from rigsim.subject import pigment
 from rigsim.subject.perfusion import STATE_NAMES
 from rigsim.subject.person import make_subject
@@ -28,7 +28,7 @@ def person(tmp_path):
 
 
 def test_file_without_settings_gives_default_preset(person):
-    assert read(person("")) == load_subject("III")
+    assert read_subject_file(person("")) == load_subject("III")
 
 
 def test_preset_name_gives_face_of_that_preset():
@@ -39,9 +39,13 @@ def test_preset_name_gives_face_of_that_preset():
 
 def test_melanin_between_two_presets_is_between_their_faces(person):
     low, high = (pigment.MELANIN_PRESETS[name] for name in ("III", "IV"))
-    face = read(person(f"melanin = {(low * high) ** 0.5}\nfreckles = 0.5")).face(seed=2, size=64)
+    face = read_subject_file(person(f"melanin = {(low * high) ** 0.5}\nfreckles = 0.5")).face(
+        seed=2, size=64
+    )
     below, above = (
-        read(person(f'preset = "{name}"\nfreckles = 0.5', name)).face(seed=2, size=64).melanin
+        read_subject_file(person(f'preset = "{name}"\nfreckles = 0.5', name))
+        .face(seed=2, size=64)
+        .melanin
         for name in ("III", "IV")
     )
     covered = face.atlas.covered
@@ -51,12 +55,12 @@ def test_melanin_between_two_presets_is_between_their_faces(person):
 
 
 def test_blood_is_factor_and_freckles_follow_requested_positions(person):
-    usual = read(person("")).face(seed=4, size=64)
-    more = read(person("blood = 2\nfreckles = 1\noil = 1.5")).face(seed=4, size=64)
+    usual = read_subject_file(person("")).face(seed=4, size=64)
+    more = read_subject_file(person("blood = 2\nfreckles = 1\noil = 1.5")).face(seed=4, size=64)
     np.testing.assert_allclose(
         more.perfusion.compartments, 2 * usual.perfusion.compartments, rtol=1e-6
     )
-    none = read(person("freckles = 0")).face(seed=4, size=64)
+    none = read_subject_file(person("freckles = 0")).face(seed=4, size=64)
     covered = usual.atlas.covered
     assert np.all(more.melanin[covered] >= none.melanin[covered])
     assert np.any(more.melanin[covered] > 1.2 * none.melanin[covered])
@@ -75,18 +79,18 @@ def test_file_textures_become_face_maps(person, tmp_path, rng, ending):
         else:
             write_exr(tmp_path / f"{name}.exr", values)
     text = "".join(f'{name} = "{name}.{ending}"\n' for name in own)
-    face = read(person(text)).face(seed=1, size=64)
+    face = read_subject_file(person(text)).face(seed=1, size=64)
     np.testing.assert_array_equal(face.melanin, own["melanin_map"])
     np.testing.assert_allclose(face.hemoglobin(), own["hemoglobin_map"], rtol=1e-5, atol=1e-9)
     assert all(np.isfinite(face.hemoglobin(state)).all() for state in STATE_NAMES)
-    finer = read(person(text)).face(seed=1, size=128)
+    finer = read_subject_file(person(text)).face(seed=1, size=128)
     inner = finer.melanin[1:-1, 1:-1]  # bilinear: a row is a quarter on from the first of the file
     down = 0.75 * own["melanin_map"][:-1] + 0.25 * own["melanin_map"][1:]
     np.testing.assert_allclose(inner[0, 0], 0.75 * down[0, 0] + 0.25 * down[0, 1], rtol=1e-5)
 
 
 def test_patch_and_tissue_belong_to_same_person(person):
-    ann = read(person("melanin = 0.1\nblood = 1.5"))
+    ann = read_subject_file(person("melanin = 0.1\nblood = 1.5"))
     patch, plain = (
         ann.patch("cheek", seed=1, size_mm=0.3),
         load_subject("V").patch("cheek", seed=1, size_mm=0.3),
@@ -97,19 +101,19 @@ def test_patch_and_tissue_belong_to_same_person(person):
     skin, usual = ann.tissue(seed=2), SkinTissue("III", seed=2)
     assert skin.melanin("cheek") / usual.melanin("cheek") == pytest.approx(0.1 / 0.028)
     assert skin.blood("cheek", 60.0) == pytest.approx(1.5 * usual.blood("cheek", 60.0))
-    assert ann.unused("gradient") == ("blood",)
-    assert ann.unused("probe") == ann.unused("flash") == ann.unused("dome") == ()
+    assert ann.unused_keys("gradient") == ("blood",)
+    assert ann.unused_keys("probe") == ann.unused_keys("flash") == ann.unused_keys("dome") == ()
 
 
 def test_record_distinguishes_files_of_same_name(person, tmp_path):
     path = person('preset = "IV"\nmelanin_map = "m.npy"')
     np.save(tmp_path / "m.npy", np.full((64, 64), 0.1, np.float32))
-    first = record(path)
+    first = record_subject(path)
     np.save(tmp_path / "m.npy", np.full((64, 64), 0.2, np.float32))
-    assert record(path)["melanin_map"]["sha256"] != first["melanin_map"]["sha256"]
+    assert record_subject(path)["melanin_map"]["sha256"] != first["melanin_map"]["sha256"]
     assert {key: first[key] for key in ("file", "preset")} == {"file": "ann.toml", "preset": "IV"}
     assert str(tmp_path) not in str(first)
-    assert record("IV") == "IV"
+    assert record_subject("IV") == "IV"
 
 
 @pytest.mark.parametrize(
@@ -164,14 +168,14 @@ def test_subject_file_error_names_fault(person, tmp_path, text, said):
     for name in ("flat.png", "text.npy", "text.exr", "text.npz", "text.obj"):
         (tmp_path / name).write_text("words", encoding="utf-8")
     with pytest.raises(SubjectFileError, match=said) as caught:
-        read(person(text))
+        read_subject_file(person(text))
     assert "ann.toml" in str(caught.value) or "_map" in str(caught.value)
     assert "pickle" not in str(caught.value)
 
 
 def test_subject_file_errors_are_reported_together(person):
     with pytest.raises(SubjectFileError) as caught:
-        read(person('melanin = 0.9\nblood = 9\npreset = "VII"'))
+        read_subject_file(person('melanin = 0.9\nblood = 9\npreset = "VII"'))
     assert all(name in str(caught.value) for name in ("melanin", "blood", "preset"))
 
 
@@ -181,7 +185,7 @@ def test_type_range_and_name_errors_are_reported_together(tmp_path):
         encoding="utf-8",
     )
     with pytest.raises(SubjectFileError, match="7 faults") as caught:
-        read(tmp_path / "ann.toml")
+        read_subject_file(tmp_path / "ann.toml")
     keys = [fault.path for fault in caught.value.faults]
     assert sorted(keys) == ["blood", "fre", "melanin", "mesh", "oil", "preset", "schema"]
     assert "preset: got 3, expected a valid string" in str(caught.value)
@@ -189,7 +193,7 @@ def test_type_range_and_name_errors_are_reported_together(tmp_path):
 
 def test_unknown_key_gives_single_error(person):
     with pytest.raises(SubjectFileError, match=r"a\.b.*an unknown key"):
-        read(person('"a.b" = 1\n"" = 2'))
+        read_subject_file(person('"a.b" = 1\n"" = 2'))
 
 
 @pytest.mark.parametrize("size", [64, 77, 100])
@@ -197,7 +201,7 @@ def test_downsampled_texels_are_area_means(tmp_path, rng, size):
     """Expected: means over a grid so fine that it divides both, in double precision."""
     values = rng.uniform(0.01, 0.3, (128, 128)).astype(np.float32)
     np.save(tmp_path / "m.npy", values)
-    small = texture("melanin_map", str(tmp_path / "m.npy"), size)
+    small = resample_texture("melanin_map", str(tmp_path / "m.npy"), size)
     parts = math.lcm(128, size)
     rows = np.arange(parts) * 128 // parts  # of the file, for each fine row
     by_row = values.astype(np.float64)[rows].reshape(size, -1, 128).mean(axis=1)
@@ -209,16 +213,16 @@ def test_fine_stripes_leave_no_coarse_ones(tmp_path):
     """Of 2.56 texels two, a bright and a dark one, make up for each other; 0.56 are left."""
     values = np.tile(np.array([0.01, 0.3], np.float32), (256, 128))
     np.save(tmp_path / "m.npy", values)
-    small = texture("melanin_map", str(tmp_path / "m.npy"), 100)
+    small = resample_texture("melanin_map", str(tmp_path / "m.npy"), 100)
     assert np.abs(small - 0.155).max() <= 0.145 * 0.56 / 2.56 * (1.0 + 1e-4)
     assert small.mean() == pytest.approx(0.155, rel=1e-5)
 
 
 def test_unknown_tissue_is_refused_with_hint_of_files():
     with pytest.raises(TissueError, match=r"got 'ann\.TOML'.*or a file NAME\.toml"):
-        subject_file.tissue("ann.TOML", seed=0)
+        subject_file.load_tissue("ann.TOML", seed=0)
     with pytest.raises(TissueError) as caught:
-        subject_file.tissue("homogeneous:-1,1", seed=0)
+        subject_file.load_tissue("homogeneous:-1,1", seed=0)
     assert "a file NAME" not in str(caught.value)
 
 
@@ -226,7 +230,7 @@ def test_file_with_other_or_missing_schema_is_refused(tmp_path):
     for text in ('schema = "skinrig.subject/2"\n', "melanin = 0.1\n"):
         (tmp_path / "ann.toml").write_text(text, encoding="utf-8")
         with pytest.raises(SubjectFileError, match="schema"):
-            read(tmp_path / "ann.toml")
+            read_subject_file(tmp_path / "ann.toml")
 
 
 @pytest.mark.parametrize("text", ["VII", "ann", "none.toml"])
@@ -239,4 +243,4 @@ def test_a_mesh_is_named_once(person, tmp_path):
     corners = "v 0 0 0\nv 9 0 0\nv 0 9 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
     (tmp_path / "face.obj").write_text(corners, encoding="utf-8")
     with pytest.raises(SubjectFileError, match="leave the other out"):
-        read(person('mesh = "face.obj"')).face(seed=0, size=64, mesh="other.obj")
+        read_subject_file(person('mesh = "face.obj"')).face(seed=0, size=64, mesh="other.obj")

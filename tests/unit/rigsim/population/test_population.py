@@ -11,13 +11,13 @@ from rigsim.population.population import (
     POPULATION_GROUPS,
     Member,
     PopulationError,
-    shifted,
-    table_1,
+    draw_population,
+    shift_trait,
 )
 from rigsim.subject import face_regions
 
 CAMERA, LIGHT = "Nikon 5100 (NPL)", "D55"
-PEOPLE = table_1()
+PEOPLE = draw_population()
 
 
 def test_the_groups_have_the_papers_numbers_and_ages():
@@ -33,8 +33,8 @@ def test_the_groups_have_the_papers_numbers_and_ages():
 
 
 def test_same_seed_draws_same_people_another_seed_others():
-    assert table_1() == PEOPLE
-    other = table_1(seed=1)
+    assert draw_population() == PEOPLE
+    other = draw_population(seed=1)
     assert not {p.melanin for p in other} & {p.melanin for p in PEOPLE}
 
 
@@ -64,7 +64,7 @@ def test_stubble_darkens_the_beard_and_nothing_else():
     bearded = dataclasses.replace(person, beard=0.9)
     skin, mask = person.r_d(128, CAMERA, LIGHT)
     shade = bearded.r_d(128, CAMERA, LIGHT)[0] / skin
-    points = face_regions.on_mean_head(person.face(128).atlas.position_mm, person.face(128).mesh)
+    points = face_regions.to_mean_head(person.face(128).atlas.position_mm, person.face(128).mesh)
     x, y = points[..., 0], points[..., 1]
     chin = mask & (np.abs(x) < 15.0) & (y < -58.0) & (y > -75.0)
     forehead = mask & (y > 50.0)
@@ -86,7 +86,7 @@ def test_age_adds_spots_and_deepens_grooves():
 
 
 def test_shift_changes_half_of_people_and_named_trait(rng):
-    tanned = shifted(PEOPLE, "tan", melanin=1.5, rng=rng)
+    tanned = shift_trait(PEOPLE, "tan", melanin=1.5, rng=rng)
     changed = [(p, q) for p, q in zip(PEOPLE, tanned, strict=True) if p != q]
     assert len(changed) == 44
     for person, other in changed:
@@ -98,7 +98,7 @@ def test_shift_changes_half_of_people_and_named_trait(rng):
 
 
 def test_a_shift_of_lotion_reaches_the_surface(rng):
-    worn = shifted(PEOPLE[:4], "glossy", apply={"lotion": 0.6}, share=1.0, rng=rng)
+    worn = shift_trait(PEOPLE[:4], "glossy", products={"lotion": 0.6}, fraction=1.0, rng=rng)
     assert all(p.conditions == {"lotion"} for p in worn)
     surface = worn[0].surface(64, CAMERA, LIGHT)
     assert surface.coating is not None
@@ -126,9 +126,9 @@ def test_faces_and_shifts_out_of_range_are_refused(rng):
     with pytest.raises(PopulationError, match="size: got 32"):
         PEOPLE[0].r_d(32, CAMERA, LIGHT)
     with pytest.raises(PopulationError, match="share"):
-        shifted(PEOPLE, "tan", share=1.5, rng=rng)
+        shift_trait(PEOPLE, "tan", fraction=1.5, rng=rng)
     with pytest.raises(PopulationError, match="seed"):
-        table_1(seed=-1)
+        draw_population(seed=-1)
 
 
 def test_palest_and_darkest_member_can_be_drawn():
@@ -141,6 +141,6 @@ def test_palest_and_darkest_member_can_be_drawn():
 
 
 def test_members_are_found_by_name():
-    assert population.member("P87") == PEOPLE[-1]
+    assert population.get_member("P87") == PEOPLE[-1]
     with pytest.raises(PopulationError, match="P01 to P87"):
-        population.member("P88")
+        population.get_member("P88")

@@ -12,16 +12,16 @@ from scipy.special import j1
 from capture.rig import Rig, load_rig
 from rigsim.light.olat import pixel_order
 from rigsim.needs import face as face_needs
-from rigsim.needs.effects import Noise, SceneEffects
+from rigsim.needs.effects import PixelNoise, SceneEffects
 from rigsim.render.caster import Caster
 from rigsim.render.depth_of_field import (
-    LensPicture,
-    LensSpread,
-    before_focus,
-    lens_spread,
-    spread_of,
+    DefocusKernels,
+    LensImage,
+    depth_before_focus,
+    tabulate_defocus,
+    tabulate_lens_defocus,
 )
-from rigsim.render.lens_blur import BlurError, lens_of
+from rigsim.render.lens_blur import BlurError, focused_lens
 from rigsim.render.rays import GBuffer, camera_rays, g_buffer, trace
 from rigsim.render.variant import VariantChoice
 from rigsim.scenes.flash.scene import FlashScene
@@ -42,23 +42,23 @@ def caster():
     return Caster(make_subject("II", seed=0, size=64).mesh, choice=EMBREE)
 
 
-def planes(spread: LensSpread, depth_mm: np.ndarray) -> LensPicture:
+def planes(spread: DefocusKernels, depth_mm: np.ndarray) -> LensImage:
     """Return a picture of what stands at depths given for each sample, NaN for nothing."""
     order, pixel, first, slot = pixel_order(np.isfinite(depth_mm), K)
     shape = (depth_mm.shape[0] // K, depth_mm.shape[1] // K)
     toward = depth_mm.reshape(-1)[order].astype(np.float32)
-    return LensPicture(spread, shape, pixel, first, slot, toward)
+    return LensImage(spread, shape, pixel, first, slot, toward)
 
 
-def see(spread: LensSpread, depth_mm: np.ndarray, light: np.ndarray) -> np.ndarray:
+def see(spread: DefocusKernels, depth_mm: np.ndarray, light: np.ndarray) -> np.ndarray:
     order = pixel_order(np.isfinite(depth_mm), K)[0]
     rows = np.ascontiguousarray(light.reshape(-1, 1)[order], np.float32)
-    return planes(spread, depth_mm).see(rows)[..., 0]
+    return planes(spread, depth_mm).render(rows)[..., 0]
 
 
-def wide_open(rig: Rig, f_number: float) -> LensSpread:
+def wide_open(rig: Rig, f_number: float) -> DefocusKernels:
     view = dataclasses.replace(rig.views[0], f_number=f_number)
-    return lens_spread(view, "D55", subpixels=K, depths_mm=[FAR_MM, NEAR_MM])
+    return tabulate_defocus(view, "D55", subpixels=K, depths_mm=[FAR_MM, NEAR_MM])
 
 
 @pytest.mark.parametrize("depth_mm", [0.0, 25.0, -85.0])
@@ -86,9 +86,9 @@ def test_center_of_focused_image_is_airy_disk(rig):
     square has a 32nd of the pixel's side, the integral 64 x 64 nodes: 1 % together.
     """
     view = dataclasses.replace(rig.views[0], f_number=64.0)
-    lens = dataclasses.replace(lens_of(view, "D55"), wavelengths_nm=(550.0,), weights=(1.0,))
+    lens = dataclasses.replace(focused_lens(view, "D55"), wavelengths_nm=(550.0,), weights=(1.0,))
     k = 31
-    spread = spread_of(lens, subpixels=k, depths_mm=[0.0])
+    spread = tabulate_lens_defocus(lens, subpixels=k, depths_mm=[0.0])
     wide, middle = 2 * spread.radius + 1, k * k // 2
     table = spread.table[0, :, middle].reshape(wide, wide)[::-1, ::-1]
     x = (np.arange(64) + 0.5) / 64 - 0.5
@@ -138,11 +138,11 @@ def test_defocused_face_matches_rays_through_whole_pupil(rig, caster, f_number):
     view = dataclasses.replace(rig.views[0], f_number=f_number)
     buffers = g_buffer(caster, view, subpixels=k)
     order, pixel, first, slot = pixel_order(buffers.mask, k)
-    toward = before_focus(view, buffers.position_mm.reshape(-1, 3)[order])
-    spread = lens_spread(view, "D55", subpixels=k, depths_mm=[toward.min(), toward.max()])
-    lens = LensPicture(spread, (view.height_px, view.width_px), pixel, first, slot, toward)
+    toward = depth_before_focus(view, buffers.position_mm.reshape(-1, 3)[order])
+    spread = tabulate_defocus(view, "D55", subpixels=k, depths_mm=[toward.min(), toward.max()])
+    lens = LensImage(spread, (view.height_px, view.width_px), pixel, first, slot, toward)
     light = patterned(buffers)
-    mine = lens.see(light.reshape(-1, 1)[order].astype(np.float32))[..., 0]
+    mine = lens.render(light.reshape(-1, 1)[order].astype(np.float32))[..., 0]
     sharp = light.reshape(view.height_px, k, view.width_px, k).mean(axis=(1, 3))
     truth = by_rays(caster, view, patterned, points=40, k=k)
     assert mine.sum() == pytest.approx(sharp.sum(), rel=1e-3)
@@ -155,7 +155,7 @@ def test_defocused_face_matches_rays_through_whole_pupil(rig, caster, f_number):
 def test_an_evenly_bright_face_stays_evenly_bright_inside(rig, caster):
     view = dataclasses.replace(rig.views[0], f_number=2.0)
     buffers = g_buffer(caster, view, subpixels=K)
-    depth = before_focus(view, buffers.position_mm.reshape(-1, 3)).reshape(buffers.mask.shape)
+    depth = depth_before_focus(view, buffers.position_mm.reshape(-1, 3)).reshape(buffers.mask.shape)
     spread = wide_open(rig, 2.0)
     ones = see(spread, np.where(buffers.mask, depth, np.nan), np.ones(buffers.mask.shape))
     cover = buffers.mask.reshape(view.height_px, K, view.width_px, K).mean(axis=(1, 3))
@@ -205,7 +205,7 @@ def test_scene_blurs_as_needed_and_truth_stays_sharp(rig):
     assert blurred.needs[face_needs.LENS_EFFECT].verdict == "built"
     assert sharp.needs[face_needs.LENS_EFFECT].verdict == "asked"
     change = np.abs(blurred.radiance() - sharp.radiance())
-    sigma = Noise.of(blurred.sensor()).sigma(blurred.radiance())
+    sigma = PixelNoise.of(blurred.sensor()).sigma(blurred.radiance())
     over = float((change / sigma).max())
     told = blurred.needs[face_needs.LENS_EFFECT].over_noise or 0.0
     assert 1.0 < over <= told
@@ -228,14 +228,14 @@ def test_small_holes_and_noisy_sensors_need_no_lens(rig):
 
 def test_depths_behind_the_camera_are_refused(rig):
     with pytest.raises(BlurError, match="depths_mm"):
-        lens_spread(rig.views[0], "D55", subpixels=2, depths_mm=[0.0, 1000.0])
+        tabulate_defocus(rig.views[0], "D55", subpixels=2, depths_mm=[0.0, 1000.0])
     with pytest.raises(BlurError, match="subpixels"):
-        lens_spread(rig.views[0], "D55", subpixels=0, depths_mm=[0.0])
+        tabulate_defocus(rig.views[0], "D55", subpixels=0, depths_mm=[0.0])
 
 
 def test_focus_is_at_target_unless_view_overrides(rig):
     cam = rig.views[0]
     nearer = dataclasses.replace(cam, focus_mm=cam.distance_mm - 25.0)
     tip = np.array([[0.0, 0.0, 25.0]], np.float32)
-    assert before_focus(cam, tip)[0] == pytest.approx(25.0, abs=1e-3)
-    assert before_focus(nearer, tip)[0] == pytest.approx(0.0, abs=1e-3)
+    assert depth_before_focus(cam, tip)[0] == pytest.approx(25.0, abs=1e-3)
+    assert depth_before_focus(nearer, tip)[0] == pytest.approx(0.0, abs=1e-3)

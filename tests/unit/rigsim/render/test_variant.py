@@ -8,7 +8,7 @@ import pytest
 
 from rigsim.render import variant
 
-INSTALLED = variant.find_libraries({})
+INSTALLED = variant.find_llvm_libraries({})
 
 
 def library(folder: Path, name: str) -> Path:
@@ -20,14 +20,14 @@ def library(folder: Path, name: str) -> Path:
 def test_libraries_too_old_by_name_skip_probe(tmp_path, monkeypatch):
     monkeypatch.setattr(variant, "probe_library", lambda *_, **__: pytest.fail("probed"))
     for name in ("libLLVM-14.so.1", "libLLVM-15.so.1", "libLLVM.so.16.0"):
-        verdict = variant.judge_library(library(tmp_path, name), cache=tmp_path / "cache")
+        verdict = variant.check_library(library(tmp_path, name), cache=tmp_path / "cache")
         assert not verdict.usable
         assert "older than 17" in verdict.why
 
 
 def test_non_library_file_ends_probe_not_this_process(tmp_path):
     path = library(tmp_path, "libLLVM.so.99.1")
-    verdict = variant.judge_library(path, cache=tmp_path / "cache")
+    verdict = variant.check_library(path, cache=tmp_path / "cache")
     assert not verdict.usable
     assert verdict.why
 
@@ -58,7 +58,7 @@ def test_first_usable_library_is_chosen_and_verdict_cached(tmp_path, monkeypatch
 
     def probe(path, **_):
         calls.append(path)
-        return variant.LibraryVerdict(str(path), "20" in path.name, "tried")
+        return variant.LibraryCheck(str(path), "20" in path.name, "tried")
 
     monkeypatch.setattr(variant, "probe_library", probe)
     paths = [library(tmp_path, "libLLVM.so.19.1"), library(tmp_path, "libLLVM.so.20.1")]
@@ -75,23 +75,23 @@ def test_a_changed_library_is_probed_again(tmp_path, monkeypatch):
 
     def probe(path, **_):
         calls.append(path)
-        return variant.LibraryVerdict(str(path), True, "tried")
+        return variant.LibraryCheck(str(path), True, "tried")
 
     monkeypatch.setattr(variant, "probe_library", probe)
     path = library(tmp_path, "libLLVM.so.19.1")
-    variant.judge_library(path, cache=tmp_path / "cache")
+    variant.check_library(path, cache=tmp_path / "cache")
     os.utime(path, ns=(1, 1))
-    variant.judge_library(path, cache=tmp_path / "cache")
+    variant.check_library(path, cache=tmp_path / "cache")
     assert len(calls) == 2
 
 
 @pytest.mark.parametrize("damage", ["", "[1, 2]", '{"a": 3}', "{"])
 def test_a_damaged_cache_costs_a_probe_only(tmp_path, monkeypatch, damage):
     monkeypatch.setattr(
-        variant, "probe_library", lambda path, **_: variant.LibraryVerdict(str(path), True, "tried")
+        variant, "probe_library", lambda path, **_: variant.LibraryCheck(str(path), True, "tried")
     )
     (tmp_path / "llvm.json").write_text(damage)
-    assert variant.judge_library(library(tmp_path, "libLLVM.so.19.1"), cache=tmp_path).usable
+    assert variant.check_library(library(tmp_path, "libLLVM.so.19.1"), cache=tmp_path).usable
     assert len(json.loads((tmp_path / "llvm.json").read_text())) == 1
 
 

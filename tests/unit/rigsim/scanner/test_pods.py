@@ -10,7 +10,7 @@ import trimesh
 from reconstruction.scan.mesh import load_ply
 from rigsim.geometry.mesh import MeshError, build_mesh
 from rigsim.render.caster import Caster
-from rigsim.scanner.pods import Scanner, scan_face, wrap_template
+from rigsim.scanner.pods import ScannerSettings, scan_face, wrap_template
 from rigsim.subject.head import build_head
 from rigsim.subject.person import make_subject
 
@@ -21,7 +21,7 @@ CLEAN = {"flaws": False, "clothes": False}
 @cache
 def scanned(seed=0, **changes):
     words = {"triangles": 12_000, "resolution_mm": 2.0} | changes
-    return scan_face(HEAD, rng=np.random.default_rng(seed), scanner=Scanner(**words))
+    return scan_face(HEAD, rng=np.random.default_rng(seed), scanner=ScannerSettings(**words))
 
 
 def in_dome(scan, points=None):
@@ -54,7 +54,7 @@ def clean_surface(scan):
 
 
 def test_same_seed_gives_same_bytes_another_seed_others():
-    scanner = Scanner(triangles=12_000, resolution_mm=2.0)
+    scanner = ScannerSettings(triangles=12_000, resolution_mm=2.0)
     again = scan_face(HEAD, rng=np.random.default_rng(0), scanner=scanner)
     assert again.ply == scanned().ply
     assert scanned(1).ply != scanned().ply
@@ -117,7 +117,9 @@ def test_features_below_resolution_are_lost_larger_ones_stay():
         plane = build_mesh(points, faces, uv)
         words = {"noise_mm": 0.0, "warp_mm": 0.0, "resolution_mm": 2.0}
         scan = scan_face(
-            plane, rng=np.random.default_rng(0), scanner=Scanner(triangles=30_000, **words, **CLEAN)
+            plane,
+            rng=np.random.default_rng(0),
+            scanner=ScannerSettings(triangles=30_000, **words, **CLEAN),
         )
         found = in_dome(scan)
         found = found[np.abs(found[:, :2]).max(axis=1) < 30]
@@ -174,7 +176,7 @@ def test_a_face_that_looks_away_cannot_be_scanned():
     points = np.array([[-50.0, -50, 0], [50, -50, 0], [0, 50, 0]])
     back = build_mesh(points, [[0, 2, 1]], np.clip(points[:, :2] / 100 + 0.5, 0, 1))
     with pytest.raises(MeshError, match="no triangle"):
-        scan_face(back, rng=np.random.default_rng(0), scanner=Scanner(**CLEAN))
+        scan_face(back, rng=np.random.default_rng(0), scanner=ScannerSettings(**CLEAN))
 
 
 @pytest.mark.parametrize(
@@ -182,14 +184,14 @@ def test_a_face_that_looks_away_cannot_be_scanned():
 )
 def test_settings_out_of_range_are_named(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
-        Scanner(**wrong)
+        ScannerSettings(**wrong)
 
 
 def test_wrapped_template_fits_face_keeping_texture_in_expressions():
     """Expected: off the surface by its noise, 0.06 mm rms, and the warp; along it by 0.25 mm."""
     face = make_subject("III", seed=0, size=64)
     for state in ("neutral", "surprise"):
-        mesh = face.posed(state).mesh
+        mesh = face.with_expression(state).mesh
         scan = wrap_template(mesh, rng=np.random.default_rng(2))
         loaded = load_ply(scan.ply)
         np.testing.assert_array_equal(loaded.faces, mesh.faces)

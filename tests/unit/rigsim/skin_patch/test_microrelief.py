@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rigsim.geometry.polygon_net import polygon_net
+from rigsim.geometry.polygon_net import polygon_edge_distance
 from rigsim.skin_patch.microrelief import SITE_NAMES, MicroSkin, MicroSkinError, make_micro_skin
 
 
@@ -78,7 +78,7 @@ def test_net_distance_is_distance_to_second_polygon_bisector() -> None:
     rng = np.random.default_rng(1)
     # Without jitter polygons are unit squares about half-integers.
     x, y = rng.uniform(-3.0, 3.0, (2, 100))
-    distance, _ = polygon_net(x, y, jitter=0.0, seed=0)
+    distance, _ = polygon_edge_distance(x, y, jitter=0.0, seed=0)
     expected = np.minimum(np.abs(x - np.round(x)), np.abs(y - np.round(y)))
     np.testing.assert_allclose(distance, expected, atol=1e-6)
 

@@ -8,20 +8,20 @@ from rigsim.skin_patch.equilibrium import (
     EquilibriumError,
     LayerProblem,
     find_equilibrium,
-    surface_rise,
+    surface_rise_factor,
 )
 from rigsim.skin_patch.microrelief import SITE_NAMES, MicroSkin, make_micro_skin
 from rigsim.skin_patch.stretch import (
     Compensation,
     StretchedSkin,
     StretchError,
-    deform,
     layer_problem,
     mean_gradient,
-    size_for,
-    stretches,
+    principal_stretches,
+    required_size_mm,
+    stretch_skin,
 )
-from rigsim.skin_patch.stretch_kernels import bending, membrane
+from rigsim.skin_patch.stretch_kernels import add_bending_forces, add_membrane_forces
 
 Floats = NDArray[np.float64]
 
@@ -78,7 +78,7 @@ def test_the_membranes_energy_is_that_of_its_metric(rng: np.random.Generator) ->
     v = p.affine() + 0.8 * rng.standard_normal((3, 12, 16))
     force = np.zeros_like(v)
     bulk = 3.0
-    got = membrane(v, p.neutral_um, p.membrane_um, p.gradient, bulk, p.texel_um, force)
+    got = add_membrane_forces(v, p.neutral_um, p.membrane_um, p.gradient, bulk, p.texel_um, force)
     expected = 0.0
     whole = np.linalg.det(p.gradient)
 
@@ -111,18 +111,22 @@ def test_squeeze_inverting_an_element_has_unbounded_energy(rng: np.random.Genera
     v = p.affine()
     v[0, 3, 3] += 30.0
     force = np.zeros_like(v)
-    assert membrane(v, p.neutral_um, p.membrane_um, p.gradient, 1.0, 10.0, force) >= 1e300
+    assert (
+        add_membrane_forces(v, p.neutral_um, p.membrane_um, p.gradient, 1.0, 10.0, force) >= 1e300
+    )
 
 
 def test_bending_costs_nothing_at_the_neutral_curvature(rng: np.random.Generator) -> None:
     p = problem_of(rng)
     work, force = np.empty((12, 16)), np.zeros((12, 16))
-    assert bending(p.neutral_um, p.neutral_um, p.bending_um3, 10.0, work, force) == 0.0
+    assert add_bending_forces(p.neutral_um, p.neutral_um, p.bending_um3, 10.0, work, force) == 0.0
     w = p.neutral_um + rng.standard_normal((12, 16))
     d = w - p.neutral_um
     laplacian = sum(np.roll(d, s, a) for s in (1, -1) for a in (0, 1)) - 4.0 * d
     expected = 0.5 * np.sum(p.bending_um3 * (laplacian / 100.0) ** 2)
-    assert bending(w, p.neutral_um, p.bending_um3, 10.0, work, force) == pytest.approx(expected)
+    assert add_bending_forces(w, p.neutral_um, p.bending_um3, 10.0, work, force) == pytest.approx(
+        expected
+    )
 
 
 def test_forces_are_the_energys_derivative_by_finite_differences(rng: np.random.Generator) -> None:
@@ -172,9 +176,9 @@ def test_tissue_under_pressure_wave_moves_as_half_space(rng: np.random.Generator
 
 
 def test_free_surface_rises_until_stress_free() -> None:
-    assert surface_rise(1.3, 1.0, 0.5) == pytest.approx(1.0 / 1.3)
+    assert surface_rise_factor(1.3, 1.0, 0.5) == pytest.approx(1.0 / 1.3)
     for nu in (0.1, 0.2, 0.45):
-        z = surface_rise(0.7, 1.1, nu)
+        z = surface_rise_factor(0.7, 1.1, nu)
         lame = 2.0 * nu / (1.0 - 2.0 * nu)
         assert z - 1.0 / z + lame * np.log(0.7 * 1.1 * z) / z == pytest.approx(0.0, abs=1e-10)
         assert 1.0 < z < 1.0 / 0.77
@@ -243,7 +247,7 @@ def test_interrupted_search_reports_its_progress() -> None:
 
 def test_stretch_one_is_the_neutral_relief_exactly() -> None:
     skin = make_micro_skin("chin", seed=2, size_mm=0.5)
-    state = deform(skin, stretch=1.0, angle_deg=45.0)
+    state = stretch_skin(skin, stretch=1.0, angle_deg=45.0)
     np.testing.assert_array_equal(state.height_um, skin.height_um)
     assert state.membrane_strain == 0.0
     place = 1e-3 * skin.texel_um * (np.arange(50) - 24.5)
@@ -259,7 +263,7 @@ def test_stretch_one_is_the_neutral_relief_exactly() -> None:
 @pytest.mark.parametrize("site", ONE_NOW)
 def test_stretching_smooths_and_compressing_roughens_along_the_jaws(site: str) -> None:
     skin = make_micro_skin(site, seed=1, size_mm=0.8)
-    states = [deform(skin, stretch=r, angle_deg=0.0) for r in SERIES]
+    states = [stretch_skin(skin, stretch=r, angle_deg=0.0) for r in SERIES]
     variance = np.array([slopes_along(state).var() for state in states])
     variance /= variance[SERIES.index(1.0)]
     assert (np.diff(variance) < 0.0).all()
@@ -282,7 +286,9 @@ def test_slope_variances_are_monotone_for_all_sites_angles(
 ) -> None:
     skin = make_micro_skin(site, seed=seed, size_mm=1.2)
     variance = [
-        slopes_along(deform(skin, stretch=r, angle_deg=angle_deg, compensation=compensation)).var()
+        slopes_along(
+            stretch_skin(skin, stretch=r, angle_deg=angle_deg, compensation=compensation)
+        ).var()
         for r in SERIES
     ]
     assert (np.diff(variance) < 0.0).all()
@@ -297,8 +303,8 @@ def test_rotating_skin_and_jaws_together_rotates_result() -> None:
             for name in ("height_um", "albedo", "alpha", "layer_um")
         },
     )
-    one = deform(skin, stretch=0.85, angle_deg=20.0, tolerance=1e-5)
-    other = deform(turned, stretch=0.85, angle_deg=110.0, tolerance=1e-5)
+    one = stretch_skin(skin, stretch=0.85, angle_deg=20.0, tolerance=1e-5)
+    other = stretch_skin(turned, stretch=0.85, angle_deg=110.0, tolerance=1e-5)
     # The mirrored surroundings are blended along x and y in turn: equal up to the border.
     np.testing.assert_allclose(
         other.height_um[4:-4, 4:-4], np.rot90(one.height_um)[4:-4, 4:-4], atol=0.1
@@ -308,7 +314,7 @@ def test_rotating_skin_and_jaws_together_rotates_result() -> None:
 
 def test_slopes_are_those_of_the_interpolated_height() -> None:
     skin = make_micro_skin("forehead", seed=1, size_mm=1.0)
-    state = deform(skin, stretch=1.15, angle_deg=45.0)
+    state = stretch_skin(skin, stretch=1.15, angle_deg=45.0)
     rng = np.random.default_rng(0)
     x, y = rng.uniform(-0.3, 0.3, (2, 200))
     step = 1e-3
@@ -323,7 +329,7 @@ def test_slopes_are_those_of_the_interpolated_height() -> None:
 
 def test_pigment_speck_moves_with_its_skin_position() -> None:
     skin = make_micro_skin("cheek", seed=6, size_mm=1.0)
-    state = deform(skin, stretch=0.85, angle_deg=0.0)
+    state = stretch_skin(skin, stretch=0.85, angle_deg=0.0)
     assert np.abs(state.displacement_um).max() > 2.0
     j, i = np.meshgrid(np.arange(20, 80), np.arange(20, 80))
     place = 1e-3 * skin.texel_um * np.stack([j - 49.5, 49.5 - i], -1)
@@ -338,7 +344,7 @@ def test_pigment_speck_moves_with_its_skin_position() -> None:
 def test_a_flat_patch_stays_flat_whatever_the_stretch() -> None:
     flat = patch(np.zeros((32, 32)))
     for stretch in (0.5, 0.8, 2.0):
-        state = deform(flat, stretch=stretch, angle_deg=10.0)
+        state = stretch_skin(flat, stretch=stretch, angle_deg=10.0)
         assert np.abs(state.height_um).max() < 1e-9
         assert state.membrane_strain == pytest.approx(stretch - 1.0)
 
@@ -347,18 +353,18 @@ def test_groove_across_jaws_opens_and_along_them_stays() -> None:
     x = 10.0 * (np.arange(80) - 39.5)
     furrow = -40.0 * np.exp(-((x / 50.0) ** 2))
     across = patch(np.broadcast_to(furrow[None, :], (80, 80)))
-    wide = deform(across, stretch=1.25, angle_deg=0.0, compensation="none")
-    narrow = deform(across, stretch=0.8, angle_deg=0.0, compensation="none")
+    wide = stretch_skin(across, stretch=1.25, angle_deg=0.0, compensation="none")
+    narrow = stretch_skin(across, stretch=0.8, angle_deg=0.0, compensation="none")
     depth = [
         float(np.ptp(s.height_um[40]))
-        for s in (narrow, deform(across, stretch=1.0, angle_deg=0.0), wide)
+        for s in (narrow, stretch_skin(across, stretch=1.0, angle_deg=0.0), wide)
     ]
     assert depth[0] > 1.05 * depth[1] > 1.05**2 * depth[2]
     # A furrow takes more of the stretch than its shoulders: points move away from its middle.
     moved = wide.displacement_um[40, :, 0]
     assert moved[45] > 0.5
     assert moved[34] < -0.5
-    along = deform(across, stretch=1.25, angle_deg=90.0, compensation="none")
+    along = stretch_skin(across, stretch=1.25, angle_deg=90.0, compensation="none")
     narrowed = np.ptp(along.height_um[40]) / depth[1]
     assert narrowed > depth[2] / depth[1]
 
@@ -367,7 +373,7 @@ def test_groove_across_jaws_opens_and_along_them_stays() -> None:
 @pytest.mark.parametrize("site", ONE_NOW)
 def test_half_and_twice_the_length_have_an_equilibrium(site: str, stretch: float) -> None:
     skin = make_micro_skin(site, seed=1, size_mm=0.5)
-    state = deform(skin, stretch=stretch, angle_deg=90.0, tolerance=0.02)
+    state = stretch_skin(skin, stretch=stretch, angle_deg=90.0, tolerance=0.02)
     assert np.isfinite(state.height_um).all()
     assert state.convergence.residual <= 0.02
     assert (state.excess_length > state.neutral_excess_length) == (stretch < 1.0)
@@ -378,7 +384,7 @@ def test_finer_and_coarser_texels_give_same_change(texel_um: float) -> None:
     got = []
     for texel in (10.0, texel_um):
         skin = make_micro_skin("chin", seed=3, size_mm=0.8, texel_um=texel)
-        one, other = (deform(skin, stretch=r, angle_deg=0.0) for r in (1.0, 1.2))
+        one, other = (stretch_skin(skin, stretch=r, angle_deg=0.0) for r in (1.0, 1.2))
         got.append(slopes_along(other).var() / slopes_along(one).var())
     assert got[1] == pytest.approx(got[0], rel=0.08)
 
@@ -388,7 +394,7 @@ def test_a_stiffer_layer_keeps_its_length_better() -> None:
     skin = make_micro_skin("forehead", seed=2, size_mm=0.5)
     strain = []
     for ratio in (0.01, 1.0, 10.0, 100.0):
-        state = deform(
+        state = stretch_skin(
             dataclasses.replace(skin, stiffness_ratio=ratio), stretch=1.03, angle_deg=90.0
         )
         strain.append(state.membrane_strain)
@@ -398,15 +404,17 @@ def test_a_stiffer_layer_keeps_its_length_better() -> None:
 
 def test_field_is_filled_only_by_requested_size() -> None:
     field, stretch = 0.6, 0.75
-    size = size_for(field, stretch, angle_deg=45.0)
+    size = required_size_mm(field, stretch, angle_deg=45.0)
     corner = 0.5 * field * np.array([-1.0, 1.0])
-    enough = deform(make_micro_skin("cheek", size_mm=size), stretch=stretch, angle_deg=45.0)
+    enough = stretch_skin(make_micro_skin("cheek", size_mm=size), stretch=stretch, angle_deg=45.0)
     assert enough.sample(corner[None, :], corner[:, None]).inside.all()
-    less = deform(make_micro_skin("cheek", size_mm=0.85 * size), stretch=stretch, angle_deg=45.0)
+    less = stretch_skin(
+        make_micro_skin("cheek", size_mm=0.85 * size), stretch=stretch, angle_deg=45.0
+    )
     found = less.sample(corner[None, :], corner[:, None])
     assert not found.inside.all()
     assert (found.height_um[~found.inside] == 0.0).all()
-    assert size_for(field, (0.75, 1.0, 1.2)) >= size
+    assert required_size_mm(field, (0.75, 1.0, 1.2)) >= size
 
 
 @pytest.mark.parametrize(
@@ -423,13 +431,13 @@ def test_field_is_filled_only_by_requested_size() -> None:
 def test_a_stretch_outside_the_domain_is_refused(change: dict[str, object], message: str) -> None:
     skin = make_micro_skin("cheek", size_mm=0.2)
     with pytest.raises(StretchError, match=message):
-        deform(skin, **({"stretch": 1.1, "angle_deg": 0.0} | change))  # type: ignore[arg-type]
+        stretch_skin(skin, **({"stretch": 1.1, "angle_deg": 0.0} | change))  # type: ignore[arg-type]
 
 
 def test_compensation_sets_the_stretch_across() -> None:
-    assert stretches(0.81) == pytest.approx((0.81, 1.0 / 0.9))
-    assert stretches(0.81, "none") == (0.81, 1.0)
-    assert stretches(0.8, 1.0) == pytest.approx((0.8, 1.25))
+    assert principal_stretches(0.81) == pytest.approx((0.81, 1.0 / 0.9))
+    assert principal_stretches(0.81, "none") == (0.81, 1.0)
+    assert principal_stretches(0.8, 1.0) == pytest.approx((0.8, 1.25))
     F = mean_gradient(0.8, 45.0)
     np.testing.assert_allclose(np.linalg.eigvalsh(F), [0.8, 0.8**-0.5])
     np.testing.assert_array_equal(F, F.T)

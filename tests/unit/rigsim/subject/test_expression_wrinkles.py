@@ -16,9 +16,9 @@ from rigsim.subject.expression_wrinkles import (
     WRINKLE_ZONES,
     WrinkleLines,
     Wrinkles,
-    depth_of,
-    raise_wrinkles,
-    wrinkle_lines,
+    draw_wrinkle_lines,
+    form_wrinkles,
+    wave_depth,
 )
 from rigsim.subject.person import SimulatedSubject, make_subject
 
@@ -34,7 +34,7 @@ def face() -> SimulatedSubject:
 
 @pytest.fixture(scope="module")
 def posed(face: SimulatedSubject) -> Callable[..., SimulatedSubject]:
-    return cache(face.posed)
+    return cache(face.with_expression)
 
 
 def brow_plate(stretch_x: float = 1.0, stretch_y: float = 1.0) -> Mesh:
@@ -51,8 +51,8 @@ def plate_wrinkles(
 ) -> tuple[Wrinkles, WrinkleLines, Atlas]:
     rest = unwrap(brow_plate(), PLATE)
     posed = unwrap(brow_plate(stretch_x, stretch_y), PLATE)
-    lines = wrinkle_lines(rest.position_mm, rest.covered, seed=seed)
-    return raise_wrinkles(lines, rest, posed), lines, posed
+    lines = draw_wrinkle_lines(rest.position_mm, rest.covered, seed=seed)
+    return form_wrinkles(lines, rest, posed), lines, posed
 
 
 def turned(mesh: Mesh, angle_rad: float) -> Mesh:
@@ -66,14 +66,14 @@ def turned(mesh: Mesh, angle_rad: float) -> Mesh:
 
 
 def test_nothing_wrinkles_that_is_not_shortened(face):
-    points = face_regions.on_mean_head(face.atlas.position_mm, face.mesh)
-    lines = wrinkle_lines(points, face.atlas.covered, seed=face.seed)
+    points = face_regions.to_mean_head(face.atlas.position_mm, face.mesh)
+    lines = draw_wrinkle_lines(points, face.atlas.covered, seed=face.seed)
     for mesh in (face.mesh, turned(face.mesh, 0.4)):
-        wrinkles = raise_wrinkles(lines, face.atlas, unwrap(mesh, SIZE))
+        wrinkles = form_wrinkles(lines, face.atlas, unwrap(mesh, SIZE))
         assert not wrinkles.height_um.any()
         assert not wrinkles.excess.any()
     grown = dataclasses.replace(face.mesh, vertices_mm=face.mesh.vertices_mm * np.float32(1.3))
-    assert not raise_wrinkles(lines, face.atlas, unwrap(grown, SIZE)).height_um.any()
+    assert not form_wrinkles(lines, face.atlas, unwrap(grown, SIZE)).height_um.any()
 
 
 def test_shortening_within_skin_tension_raises_no_wrinkles():
@@ -131,7 +131,7 @@ def test_the_depth_of_a_wave_gives_its_length():
     bell = np.exp(GROOVE_NARROWING * (np.cos(phase) - 1.0))
     shape = -bell / (1.0 - math.exp(-2.0 * GROOVE_NARROWING))
     for excess in (0.003, 0.05, 0.3):
-        depth = float(depth_of(excess))
+        depth = float(wave_depth(excess))
         line = np.hypot(np.diff(phase) / (2.0 * math.pi), np.diff(depth * shape)).sum()
         assert line - 1.0 == pytest.approx(excess, rel=2e-3)
         assert depth * np.ptp(shape) == pytest.approx(depth, rel=1e-6)
@@ -157,7 +157,7 @@ def test_wavelength_matches_stiff_layer_on_soft_substrate():
     ],
 )
 def test_each_expression_wrinkles_where_skin_is_shortened(face, posed, state, where):
-    points = face_regions.on_mean_head(face.atlas.position_mm, face.mesh)
+    points = face_regions.to_mean_head(face.atlas.position_mm, face.mesh)
     inside = where(points) & (points[..., 2] > -45.0)
     raised = np.abs(posed(state).pose.wrinkles.height_um)
     assert np.quantile(raised[inside], 0.9) > 60.0
@@ -168,12 +168,12 @@ def test_each_expression_wrinkles_where_skin_is_shortened(face, posed, state, wh
 def test_expressions_shortening_same_skin_raise_same_lines(face, posed):
     one = posed("surprise").pose.wrinkles.height_um
     other = posed("fear").pose.wrinkles.height_um
-    points = face_regions.on_mean_head(face.atlas.position_mm, face.mesh)
+    points = face_regions.to_mean_head(face.atlas.position_mm, face.mesh)
     both = (np.abs(one) > 0) & (np.abs(other) > 0) & (points[..., 1] > 46.0)
     assert both.sum() > 1000
     assert np.corrcoef(one[both], other[both])[0, 1] > 0.9
-    lines = wrinkle_lines(points, face.atlas.covered, seed=5)
-    stranger = raise_wrinkles(lines, face.atlas, posed("surprise").atlas).height_um
+    lines = draw_wrinkle_lines(points, face.atlas.covered, seed=5)
+    stranger = form_wrinkles(lines, face.atlas, posed("surprise").atlas).height_um
     shared = (np.abs(one) > 0) & (np.abs(stranger) > 0) & (points[..., 1] > 46.0)
     assert abs(np.corrcoef(one[shared], stranger[shared])[0, 1]) < 0.6
 
@@ -192,8 +192,8 @@ def test_wrinkles_deepen_with_expression_and_fine_relief_stays(face, posed):
 
 
 def test_coarse_texture_omits_fine_wrinkles_and_reports():
-    coarse = make_subject("II", seed=4, size=128).posed("happiness")
-    assert "crow's feet" in coarse.pose.wrinkles.left_out
+    coarse = make_subject("II", seed=4, size=128).with_expression("happiness")
+    assert "crow's feet" in coarse.pose.wrinkles.omitted
     assert np.isfinite(coarse.pose.wrinkles.height_um).all()
 
 
@@ -223,7 +223,7 @@ def test_tangent_normals_of_posed_face_change_by_wrinkles(face, posed):
     before, after = face.tangent_normal(), posed("surprise").tangent_normal()
     np.testing.assert_allclose(np.linalg.norm(after, axis=-1), 1.0, atol=1e-5)
     tilt = np.degrees(np.arccos(np.clip(np.sum(before * after, axis=-1), -1.0, 1.0)))
-    points = face_regions.on_mean_head(face.atlas.position_mm, face.mesh)
+    points = face_regions.to_mean_head(face.atlas.position_mm, face.mesh)
     forehead = (np.abs(points[..., 0]) < 25) & (np.abs(points[..., 1] - 58) < 8)
     cheek = (np.abs(np.abs(points[..., 0]) - 45) < 8) & (np.abs(points[..., 1] + 8) < 8)
     assert np.quantile(tilt[forehead], 0.9) > 10.0

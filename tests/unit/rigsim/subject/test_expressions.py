@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from twins.triangle_stretch import principal_stretches
 
-from rigsim.geometry.mesh import Mesh, MeshError, build_mesh, centered, load_mesh
+from rigsim.geometry.mesh import Mesh, MeshError, build_mesh, center_face, load_mesh
 from rigsim.subject import expressions, face_regions
 from rigsim.subject.expressions import EXPRESSION_STRENGTHS, ExpressionError, displacement_mm
 from rigsim.subject.head import LANDMARKS_MM, build_head
@@ -56,7 +56,7 @@ def test_each_expression_moves_its_regions_its_way(head, state, landmark, axis, 
 
 
 def test_anger_draws_the_brows_together(head):
-    points = face_regions.on_mean_head(head.vertices_mm, head)
+    points = face_regions.to_mean_head(head.vertices_mm, head)
     inner = [
         np.argmin(np.linalg.norm(points - np.array([x, 42.0, 4.0]), axis=-1)) for x in (-12, 12)
     ]
@@ -70,7 +70,9 @@ def test_whole_body_states_and_rest_keep_face_still(head):
     for state in ("neutral", "exercise", "alcohol"):
         assert not displacement_mm(head, state).any()
     assert not displacement_mm(head, "smile", amount=0.0).any()
-    assert {state for state in STATE_NAMES if expressions.moves(state)} == set(EXPRESSION_STRENGTHS)
+    assert {state for state in STATE_NAMES if expressions.is_moving_state(state)} == set(
+        EXPRESSION_STRENGTHS
+    )
 
 
 def test_the_back_of_the_head_stays(head):
@@ -135,7 +137,7 @@ def test_normals_rotate_with_surface(head):
 
     deltas = displacement_mm(head, "surprise")
     moving = np.linalg.norm(deltas, axis=-1)[head.faces].max(axis=1) > 1.0
-    rest, turned = away_deg(head)[moving], away_deg(expressions.moved(head, deltas))[moving]
+    rest, turned = away_deg(head)[moving], away_deg(expressions.displace_mesh(head, deltas))[moving]
     kept = away_deg(build_mesh(head.vertices_mm + deltas, head.faces, head.uv, head.normals))
     assert np.quantile(turned, 0.95) < np.quantile(rest, 0.95) + 1.0
     assert np.quantile(kept[moving], 0.95) > np.quantile(rest, 0.95) + 3.0
@@ -177,7 +179,7 @@ def test_file_shapes_are_loaded_and_must_fit_mesh(tmp_path, head):
         shape_names=np.array(["jawOpen"]),
         shape_deltas_mm=deltas,
     )
-    mesh = centered(load_mesh(path))
+    mesh = center_face(load_mesh(path))
     assert mesh.shapes["jawOpen"][5].tolist() == [2.0, 2.0, 2.0]
     with pytest.raises(MeshError, match=r"shapes\['jawOpen'\]: got shape"):
         build_mesh(head.vertices_mm, head.faces, head.uv, shapes={"jawOpen": deltas[0, :9]})
@@ -186,7 +188,7 @@ def test_file_shapes_are_loaded_and_must_fit_mesh(tmp_path, head):
 @pytest.mark.skipif(not SCANNED_HEAD.exists(), reason="the head with blend shapes is not here")
 def test_head_with_blend_shapes_smiles_and_opens_mouth():
     """Its own shapes fold a few of 18,460 triangles inside the lips, and stretch their rims."""
-    mesh = centered(load_mesh(SCANNED_HEAD))
+    mesh = center_face(load_mesh(SCANNED_HEAD))
     assert len(mesh.shapes) == 22
     way = at(mesh, "smile", "mouth corner right")
     assert way[0] > 2.0

@@ -12,7 +12,7 @@ from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject import face_regions, landmarks
 from rigsim.subject.expressions import displacement_mm
 from rigsim.subject.person import SimulatedSubject
-from skinrig.simulating.flash_truth import landmarks_at_superpixels, to_superpixels
+from skinrig.simulating.flash_truth import scale_landmarks, to_superpixels
 
 # Embree traces the rays, so these tests need no Mitsuba.
 EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")
@@ -54,7 +54,7 @@ def test_position_map_gives_landmarks_at_their_superpixels(scenes, state):
     """
     scene = scenes[state]
     truth = scene.truth()
-    named = landmarks_at_superpixels(scene.landmarks_px())
+    named = scale_landmarks(scene.landmarks_px())
     assert len(named) >= 20
     points = scene.subject.surface_landmarks()
     places = dict(zip(points.names, points.on(scene.subject.mesh), strict=True))
@@ -105,8 +105,8 @@ def test_expression_landmarks_shift_by_projected_movement(scenes, rig, face):
 def test_landmarks_hidden_by_head_are_not_visible(rig, face):
     caster = Caster(face.mesh, choice=EMBREE)
     points = face.surface_landmarks().on(face.mesh)
-    assert landmarks.seen(points, rig.views[0], caster).mean() > 0.9
+    assert landmarks.is_visible(points, rig.views[0], caster).mean() > 0.9
     behind = points - np.array([0.0, 0.0, 30.0])
-    assert landmarks.seen(behind, rig.views[0], caster).mean() < 0.1
+    assert landmarks.is_visible(behind, rig.views[0], caster).mean() < 0.1
     outside = points + np.array([400.0, 0.0, 0.0])
-    assert not landmarks.seen(outside, rig.views[0], caster).any()
+    assert not landmarks.is_visible(outside, rig.views[0], caster).any()

@@ -5,9 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rigsim.scenes.flash.course import BLOOD_LEVELS, parabola_weights
+from rigsim.scenes.flash.course import BLOOD_LEVELS, blood_level_weights
 from rigsim.subject.perfusion import StateError
-from rigsim.subject.perfusion_course import CourseError, EventCourse, PromptedCourse, with_blood
+from rigsim.subject.perfusion_course import (
+    CourseError,
+    EventCourse,
+    PromptedCourse,
+    fix_blood_level,
+)
 from rigsim.subject.person import make_subject
 
 
@@ -35,9 +40,9 @@ def test_level_is_continuous_and_between_rest_and_full():
 
 def test_past_levels_do_not_depend_on_later_prompts():
     course = PromptedCourse("smile", rise_s=2.0)
-    course.tell(0.0, "smile")
+    course.prompt(0.0, "smile")
     before = course.level(1.0)
-    course.tell(5.0, "neutral")
+    course.prompt(5.0, "neutral")
     assert course.level(1.0) == before
 
 
@@ -55,10 +60,10 @@ def test_reactions_follow_their_prompts_each_a_little_otherwise():
 def test_exercise_fades_from_peak_and_alcohol_rises():
     exercise, alcohol = EventCourse("exercise"), EventCourse("alcohol")
     for course in (exercise, alcohol):
-        course.tell(100.0, "neutral")
+        course.prompt(100.0, "neutral")
         assert course.level(150.0) == 0.0
-        course.tell(200.0, course.state)
-        course.tell(300.0, course.state)  # said twice, happened once
+        course.prompt(200.0, course.state)
+        course.prompt(300.0, course.state)  # said twice, happened once
     assert exercise.level(200.0) == 1.0
     assert exercise.level(260.0) == pytest.approx(np.exp(-60 / 40))
     assert alcohol.level(200.0) == 0.0
@@ -68,17 +73,17 @@ def test_exercise_fades_from_peak_and_alcohol_rises():
 def test_partial_blood_is_between_rest_and_state_inclusive():
     face = make_subject(size=64)
     rest, full = face.hemoglobin("neutral"), face.hemoglobin("smile")
-    np.testing.assert_array_equal(with_blood(face, "smile", 0.0).hemoglobin("smile"), rest)
-    np.testing.assert_array_equal(with_blood(face, "smile", 1.0).hemoglobin("neutral"), full)
-    half = with_blood(face, "smile", 0.5).hemoglobin()
+    np.testing.assert_array_equal(fix_blood_level(face, "smile", 0.0).hemoglobin("smile"), rest)
+    np.testing.assert_array_equal(fix_blood_level(face, "smile", 1.0).hemoglobin("neutral"), full)
+    half = fix_blood_level(face, "smile", 0.5).hemoglobin()
     assert np.all((half - rest) * (full - half) >= -1e-9)
 
 
 def test_parabola_is_exact_for_blood_quadratic_in_radius():
     level = 0.37
     values = [(1 + 0.3 * node) ** 2 for node in BLOOD_LEVELS]
-    assert np.dot(parabola_weights(level), values) == pytest.approx((1 + 0.3 * level) ** 2)
-    assert sum(parabola_weights(level)) == pytest.approx(1.0)
+    assert np.dot(blood_level_weights(level), values) == pytest.approx((1 + 0.3 * level) ** 2)
+    assert sum(blood_level_weights(level)) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("wrong", [{"rise_s": 0.0}, {"fall_s": -1.0}, {"reaction_s": np.nan}])
@@ -91,4 +96,4 @@ def test_unknown_states_and_levels_are_refused():
     with pytest.raises(StateError):
         PromptedCourse("neutral")
     with pytest.raises(CourseError):
-        with_blood(make_subject(size=64), "smile", 1.5)
+        fix_blood_level(make_subject(size=64), "smile", 1.5)

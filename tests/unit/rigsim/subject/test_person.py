@@ -18,7 +18,7 @@ SIZE = 256
 
 @pytest.fixture(scope="module")
 def regions(face: SimulatedSubject) -> dict[str, np.ndarray]:
-    return face_regions.region_masks(face_regions.on_mean_head(face.atlas.position_mm, face.mesh))
+    return face_regions.region_masks(face_regions.to_mean_head(face.atlas.position_mm, face.mesh))
 
 
 def test_same_seed_makes_same_face_another_seed_another(face):

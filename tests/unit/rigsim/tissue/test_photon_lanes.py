@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from rigsim.tissue import photon_lanes
-from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportError, transport
+from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportError, trace_photons
 
 needs_lanes = pytest.mark.skipif(
     not photon_lanes.is_usable(), reason="Dr.Jit finds no LLVM 17 or newer here"
@@ -29,7 +29,7 @@ FILM = LayerStack((Layer(0.001, 3.0, 100.0, 0.99, 1.6), Layer(inf, 0.5, 10.0, 0.
 def smallest_p_value(stack, twin, photons=200_000):
     """Dr.Jit on `stack`, numba on `twin`: p of the largest z of all parts, Sidak-corrected."""
     runs = [
-        transport(
+        trace_photons(
             each,
             photons=photons,
             rng=np.random.default_rng(seed),
@@ -71,7 +71,7 @@ def test_that_agreement_would_show_a_wrong_layer(wrong):
 @needs_lanes
 def test_no_weight_is_lost_in_lanes():
     for stack in (UNLIKE, ALONE, FILM):
-        run = transport(stack, photons=20_000, rng=np.random.default_rng(3), engine="drjit")
+        run = trace_photons(stack, photons=20_000, rng=np.random.default_rng(3), engine="drjit")
         # float32 weights: each of some hundred products may be off by 6e-8.
         assert run.balance == pytest.approx(1.0, abs=1e-6)
         assert run.ring_reflectance.sum() == pytest.approx(run.reflectance, rel=1e-6)
@@ -80,7 +80,7 @@ def test_no_weight_is_lost_in_lanes():
 @needs_lanes
 def test_same_seed_repeats_run_in_lanes_others_differ():
     one, two, other = (
-        transport(ALONE, photons=5000, rng=np.random.default_rng(seed), engine="drjit")
+        trace_photons(ALONE, photons=5000, rng=np.random.default_rng(seed), engine="drjit")
         for seed in (4, 4, 5)
     )
     assert one.reflectance == two.reflectance
@@ -90,7 +90,7 @@ def test_same_seed_repeats_run_in_lanes_others_differ():
 @needs_lanes
 def test_standard_error_of_lanes_matches_repeated_run_scatter():
     rng = np.random.default_rng(7)
-    runs = [transport(ALONE, photons=2000, rng=rng, engine="drjit") for _ in range(60)]
+    runs = [trace_photons(ALONE, photons=2000, rng=rng, engine="drjit") for _ in range(60)]
     spread = np.var([run.reflectance for run in runs], ddof=1)
     stated = np.mean([run.reflectance_stderr**2 for run in runs])
     # spread/stated follows F(59, 60 x 19); both tails together 1e-4.
@@ -101,13 +101,13 @@ def test_standard_error_of_lanes_matches_repeated_run_scatter():
 def test_automatic_choice_without_llvm_is_the_scalar_walk(monkeypatch):
     monkeypatch.setattr(photon_lanes, "is_usable", lambda: False)
     rng = np.random.default_rng
-    chosen = transport(FILM, photons=100_000, rng=rng(6), engine="auto", threads=2)
-    scalar = transport(FILM, photons=100_000, rng=rng(6), engine="numba", threads=2)
+    chosen = trace_photons(FILM, photons=100_000, rng=rng(6), engine="auto", threads=2)
+    scalar = trace_photons(FILM, photons=100_000, rng=rng(6), engine="numba", threads=2)
     assert chosen.reflectance == scalar.reflectance
     with pytest.raises(TransportError, match="LLVM"):
-        transport(FILM, photons=100, rng=rng(6), engine="drjit")
+        trace_photons(FILM, photons=100, rng=rng(6), engine="drjit")
 
 
 def test_unknown_engine_is_refused():
     with pytest.raises(TransportError, match="engine"):
-        transport(ALONE, photons=100, rng=np.random.default_rng(0), engine="abacus")
+        trace_photons(ALONE, photons=100, rng=np.random.default_rng(0), engine="abacus")

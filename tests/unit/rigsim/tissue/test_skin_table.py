@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from rigsim.tissue import skin_layers, skin_table
 from rigsim.tissue.lateral_kernels import GAUSSIAN_SIGMAS_MM, LateralKernels
 from rigsim.tissue.skin_table import SkinTable, SkinTableError
-from rigsim.tissue.tissue_mc import escape_paths, transport
+from rigsim.tissue.tissue_mc import trace_escape_paths, trace_photons
 
 # Wavelength (nm), C_m, C_hd, photons: fair to dark, bloodless to Soret peak, on and off the nodes.
 ENTRIES = (
@@ -36,8 +36,8 @@ def table():
 def traced(entries, *, seed):
     """Photons traced now, per entry."""
     return [
-        transport(
-            skin_layers.skin(nm, c_m, c_hd),
+        trace_photons(
+            skin_layers.skin_layer_stack(nm, c_m, c_hd),
             photons=photons,
             rng=np.random.default_rng([seed, index]),
             batches=40,
@@ -167,7 +167,7 @@ def test_table_was_made_with_the_optics_of_today(table):
     assert table.provenance["g"] == skin_layers.SKIN_ANISOTROPY
     assert table.provenance["eta"] == skin_layers.ETA
     assert table.provenance["epidermis_mm"] == skin_layers.EPIDERMIS_MM
-    assert table.provenance["epidermal_blood_share"] == skin_layers.EPIDERMAL_BLOOD_SHARE
+    assert table.provenance["epidermal_blood_share"] == skin_layers.EPIDERMAL_BLOOD_RATIO
 
 
 def test_spectra_pass_through_the_nodes(table):
@@ -193,11 +193,11 @@ def test_interpolation_between_nodes_is_exact_to_3e_4(nm):
     at = (np.arange(nodes - 1) + 0.5) / (nodes - 1)
     u = np.concatenate([np.linspace(0.0, 1.0, nodes), at])
     base, melanin, blood = (
-        np.array([layer.sigma_a_per_mm for layer in skin_layers.skin(nm, *c).layers])
+        np.array([layer.sigma_a_per_mm for layer in skin_layers.skin_layer_stack(nm, *c).layers])
         for c in ((0.0, 0.0), (0.5, 0.0), (0.0, 0.32))
     )
-    paths = escape_paths(
-        skin_layers.skin(nm, 0.0, 0.0), photons=20_000, rng=np.random.default_rng(4)
+    paths = trace_escape_paths(
+        skin_layers.skin_layer_stack(nm, 0.0, 0.0), photons=20_000, rng=np.random.default_rng(4)
     )
     live = np.zeros((u.size, u.size))
     for batch in paths:
@@ -313,8 +313,11 @@ def excess_deviation(table, nm, c_m, c_hd, photons, *, tabulated_nm):
     Noise: Kolmogorov's bound, 2.23 / sqrt(n) with a false-alarm rate of 1e-4, for the effective
     numbers of photons of the live run and of the table.
     """
-    batches = escape_paths(
-        skin_layers.skin(nm, c_m, c_hd), photons=photons, rng=np.random.default_rng(6), threads=2
+    batches = trace_escape_paths(
+        skin_layers.skin_layer_stack(nm, c_m, c_hd),
+        photons=photons,
+        rng=np.random.default_rng(6),
+        threads=2,
     )
     weight = np.concatenate([batch.weight for batch in batches])
     radius = np.concatenate([batch.radius_mm for batch in batches])

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportError, escape_paths, transport
+from rigsim.tissue.tissue_mc import (
+    Layer,
+    LayerStack,
+    TransportError,
+    trace_escape_paths,
+    trace_photons,
+)
 
 RINGS_MM = (0.0, 0.05, 0.15, 0.4, inf)
 
@@ -114,7 +120,9 @@ def scores(run):
 
 def smallest_p_value(stack):
     """Kernel on `stack`, NumPy walk on `STACK`: two-sided p of the largest z, Sidak-corrected."""
-    run = transport(stack, photons=400_000, rng=np.random.default_rng(1), ring_edges_mm=RINGS_MM)
+    run = trace_photons(
+        stack, photons=400_000, rng=np.random.default_rng(1), ring_edges_mm=RINGS_MM
+    )
     photons = 100_000
     twin = analog_walk(STACK, photons, np.random.default_rng(2))
     # A weighted photon's variance is at most that of a whole one, so this error is not too small.
@@ -135,14 +143,14 @@ def test_that_agreement_would_show_a_wrong_first_layer(wrong):
 
 
 def test_no_weight_is_lost():
-    run = transport(STACK, photons=20_000, rng=np.random.default_rng(3), ring_edges_mm=RINGS_MM)
+    run = trace_photons(STACK, photons=20_000, rng=np.random.default_rng(3), ring_edges_mm=RINGS_MM)
     assert run.balance == pytest.approx(1.0, abs=1e-12)
     assert run.ring_reflectance.sum() == pytest.approx(run.reflectance, abs=1e-12)
 
 
 def test_result_does_not_depend_on_thread_count():
     runs = [
-        transport(STACK, photons=8000, rng=np.random.default_rng(4), threads=threads)
+        trace_photons(STACK, photons=8000, rng=np.random.default_rng(4), threads=threads)
         for threads in (1, 2, 5)
     ]
     for other in runs[1:]:
@@ -153,14 +161,14 @@ def test_result_does_not_depend_on_thread_count():
 
 def test_another_seed_gives_another_sample():
     one, other = (
-        transport(STACK, photons=2000, rng=np.random.default_rng(seed)) for seed in (5, 6)
+        trace_photons(STACK, photons=2000, rng=np.random.default_rng(seed)) for seed in (5, 6)
     )
     assert one.reflectance != other.reflectance
 
 
 def test_standard_error_matches_scatter_of_repeated_runs():
     rng = np.random.default_rng(7)
-    runs = [transport(STACK, photons=2000, rng=rng) for _ in range(120)]
+    runs = [trace_photons(STACK, photons=2000, rng=rng) for _ in range(120)]
     spread = np.var([run.reflectance for run in runs], ddof=1)
     stated = np.mean([run.reflectance_stderr**2 for run in runs])
     # spread/stated follows F(119, 120 x 19); both tails together 1e-4.
@@ -170,7 +178,7 @@ def test_standard_error_matches_scatter_of_repeated_runs():
 
 def test_error_falls_with_the_square_root_of_photons():
     few, many = (
-        transport(STACK, photons=n, rng=np.random.default_rng(8), batches=200)
+        trace_photons(STACK, photons=n, rng=np.random.default_rng(8), batches=200)
         for n in (4000, 64_000)
     )
     # The variances' ratio follows 16 F(199, 199): both tails together 1e-4.
@@ -180,7 +188,7 @@ def test_error_falls_with_the_square_root_of_photons():
 
 def test_clear_plate_matches_fresnel_series_sums():
     plate = LayerStack((Layer(1.0, 0.0, 0.0, 0.0, 1.5),))
-    run = transport(plate, photons=400_000, rng=np.random.default_rng(9))
+    run = trace_photons(plate, photons=400_000, rng=np.random.default_rng(9))
     r = 0.04
     assert run.reflectance == 0.0
     # False alarms: 4 standard errors of 20 batches, 8e-4.
@@ -190,7 +198,7 @@ def test_clear_plate_matches_fresnel_series_sums():
 
 def test_purely_absorbing_slab_follows_beer_and_lambert():
     slab = LayerStack((Layer(0.5, 1.0, 0.0, 0.0, 1.0), Layer(0.5, 3.0, 0.0, 0.5, 1.0)))
-    run = transport(slab, photons=200_000, rng=np.random.default_rng(10))
+    run = trace_photons(slab, photons=200_000, rng=np.random.default_rng(10))
     # False alarms: 4 standard errors of 20 batches, 8e-4 each.
     assert abs(run.transmittance - exp(-2.0)) < 4.0 * run.transmittance_stderr
     deviation = np.abs(run.absorbed - [1.0 - exp(-0.5), exp(-0.5) - exp(-2.0)])
@@ -201,7 +209,7 @@ def test_splitting_a_layer_changes_nothing():
     whole = Layer(0.4, 0.3, 8.0, 0.7, 1.4)
     parts = tuple(replace(whole, thickness_mm=part) for part in (0.1, 0.25, 0.05))
     one, split = (
-        transport(LayerStack(layers), photons=200_000, rng=np.random.default_rng(seed))
+        trace_photons(LayerStack(layers), photons=200_000, rng=np.random.default_rng(seed))
         for layers, seed in (((whole,), 11), (parts, 12))
     )
     error = np.hypot(one.reflectance_stderr, split.reflectance_stderr)
@@ -212,7 +220,7 @@ def test_splitting_a_layer_changes_nothing():
 def test_reweighted_paths_give_reflectance_at_more_absorption():
     layers = (Layer(0.2, 0.1, 20.0, 0.8, 1.4), Layer(inf, 0.1, 10.0, 0.8, 1.4))
     extra = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 1.0], [2.0, 4.0]])
-    kept = escape_paths(LayerStack(layers), photons=60_000, rng=np.random.default_rng(13))
+    kept = trace_escape_paths(LayerStack(layers), photons=60_000, rng=np.random.default_rng(13))
     each = np.array(
         [np.exp(-extra @ batch.path_mm.T) @ batch.weight / batch.photons for batch in kept]
     )
@@ -222,15 +230,17 @@ def test_reweighted_paths_give_reflectance_at_more_absorption():
             replace(layer, sigma_a_per_mm=layer.sigma_a_per_mm + more)
             for layer, more in zip(layers, added, strict=True)
         )
-        run = transport(LayerStack(darker), photons=60_000, rng=np.random.default_rng(14 + index))
+        run = trace_photons(
+            LayerStack(darker), photons=60_000, rng=np.random.default_rng(14 + index)
+        )
         both = np.hypot(error[index], run.reflectance_stderr)
         # False alarms: 4 standard errors of 20 batches each, below 4e-4 for each of the four.
         assert abs(each[:, index].mean() - run.reflectance) < 4.0 * both
 
 
 def test_kept_paths_are_the_light_that_transport_counts():
-    kept = escape_paths(STACK, photons=4000, rng=np.random.default_rng(20))
-    run = transport(STACK, photons=4000, rng=np.random.default_rng(20))
+    kept = trace_escape_paths(STACK, photons=4000, rng=np.random.default_rng(20))
+    run = trace_photons(STACK, photons=4000, rng=np.random.default_rng(20))
     total = np.mean([batch.weight.sum() / batch.photons for batch in kept])
     assert total == pytest.approx(run.reflectance, rel=1e-12)
 
@@ -274,4 +284,4 @@ def test_impossible_stacks_are_refused():
 def test_impossible_requests_are_refused_by_name(request_, field):
     arguments = {"photons": 100, "rng": np.random.default_rng(0), **request_}
     with pytest.raises(TransportError, match=field):
-        transport(STACK, **arguments)
+        trace_photons(STACK, **arguments)

@@ -69,7 +69,7 @@ def test_light_is_clipped_to_the_exposure(make):
     (seen,) = world.light_between(middle_s, world.now)
     assert seen == dataclasses.replace(ended, t_on_s=middle_s)
     assert isinstance(seen, SourceLight)
-    assert (seen.level, seen.fibre) == (0.5, 4)
+    assert (seen.level, seen.fiber) == (0.5, 4)
     box.close()
 
 
@@ -155,7 +155,7 @@ def test_camera_warming_is_passed_to_scene(make):
 
 def test_a_world_without_a_probe_has_no_head():
     world = World(load_rig("dome").subset(views=["C00"]).resized(16))
-    assert (world.heads, world.head, world.switched) == ([], None, [])
+    assert (world.head_history, world.head, world.switched) == ([], None, [])
     with pytest.raises(ValueError, match="has none"):
         world.head_at(0.0)
 

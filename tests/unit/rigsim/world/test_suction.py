@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from rigsim.world.suction import (
-    OPEN_RIM_ML_PER_S_MBAR,
+    OPEN_RIM_LEAK_ML_PER_S_MBAR,
     CameraCooler,
     HeadState,
-    SuckedHead,
+    ProbeHead,
     SuctionError,
     SuctionMechanics,
 )
@@ -20,7 +20,7 @@ COOLER = CameraCooler(5.0)
 
 
 def head(mechanics=LAW, site="cheek", **more):
-    found = SuckedHead(COOLER, mechanics=mechanics, **more)
+    found = ProbeHead(COOLER, mechanics=mechanics, **more)
     found.place(site, 0.0, 0.0)
     return found
 
@@ -105,8 +105,8 @@ def test_detached_head_loses_suction_at_once():
     sucked.draw(60.0, 1.0)
     held_mbar = sucked.suction_mbar(4.0 - 1e-9)
     assert held_mbar > 58.0
-    tau_s = LAW.compliance_ml_per_mbar / (OPEN_RIM_ML_PER_S_MBAR + 8e-3)
-    left_mbar = 8e-3 * 60.0 / (OPEN_RIM_ML_PER_S_MBAR + 8e-3)
+    tau_s = LAW.compliance_ml_per_mbar / (OPEN_RIM_LEAK_ML_PER_S_MBAR + 8e-3)
+    left_mbar = 8e-3 * 60.0 / (OPEN_RIM_LEAK_ML_PER_S_MBAR + 8e-3)
     expected = left_mbar + (held_mbar - left_mbar) * math.exp(-0.003 / tau_s)
     assert sucked.suction_mbar(4.003) == pytest.approx(expected, rel=1e-6)
     assert sucked.state_at(3.9).placed
@@ -132,7 +132,7 @@ def test_one_big_time_step_equals_many_small_ones():
                 sucked.draw(150.0, until)
             elif act == "vent":
                 sucked.vent(until)
-        return [sucked.state_at(t) for t in np.linspace(0.0, 9.0, 301)], sucked.changes_s
+        return [sucked.state_at(t) for t in np.linspace(0.0, 9.0, 301)], sucked.change_times_s
 
     (states, changes), (states_finely, changes_finely) = play(10.0), play(0.0137)
     assert changes == pytest.approx(changes_finely)
@@ -142,18 +142,18 @@ def test_one_big_time_step_equals_many_small_ones():
 
 
 def test_suction_has_no_jumps_and_is_remembered():
-    sucked = SuckedHead(COOLER, seed=3)
+    sucked = ProbeHead(COOLER, seed=3)
     sucked.place("forehead", 22.5, 0.5)
-    sucked.draw(120.0, 1.0)
+    sucked.start_suction(120.0, 1.0)
     sucked.vent(3.0)
     sucked.advance(5.0)
-    for t_s in sucked.changes_s[1:]:
+    for t_s in sucked.change_times_s[1:]:
         before, after = sucked.state_at(t_s - 1e-9), sucked.state_at(t_s)
         assert before.suction_mbar == pytest.approx(after.suction_mbar, abs=1e-5)
     assert sucked.state_at(0.2) == HeadState("", 0.0, False, 0.0, 5.0)
     assert sucked.state_at(0.7) == HeadState("forehead", 22.5, True, 0.0, 5.0)
     kept = sucked.state_at(2.0)
-    sucked.take_away(6.0)
+    sucked.remove(6.0)
     sucked.advance(9.0)
     assert sucked.state_at(2.0) == kept
     assert sucked.state_at(7.0).site == ""
@@ -161,7 +161,7 @@ def test_suction_has_no_jumps_and_is_remembered():
 
 def test_loose_skin_takes_longest_and_block_least():
     def reached_s(site, seed):
-        sucked = SuckedHead(COOLER, seed=seed)
+        sucked = ProbeHead(COOLER, seed=seed)
         sucked.place(site, 0.0, 0.0)
         return sucked.mechanics.time_constant_s, sucked.mechanics.leak_ml_per_s_mbar / 8e-3
 
@@ -178,9 +178,9 @@ def test_loose_skin_takes_longest_and_block_least():
 @pytest.mark.parametrize("leak", [0.1, 1.0, 5.0])
 def test_the_leak_switch_bounds_the_suction_from_above(leak):
     for site in ("forehead", "phantom", "abdomen"):
-        sucked = SuckedHead(COOLER, seed=1, leak=leak)
+        sucked = ProbeHead(COOLER, seed=1, leak=leak)
         sucked.place(site, 0.0, 0.0)
-        sucked.draw(60.0, 0.0)
+        sucked.start_suction(60.0, 0.0)
         ends_mbar = sucked.suction_mbar(30.0)
         assert 60.0 / (1.03 + leak) < ends_mbar < 60.0 / (1.0 + leak)
 
@@ -203,7 +203,7 @@ def test_invalid_parameter_is_named():
         with pytest.raises(SuctionError, match=field):
             dataclasses.replace(LAW, **{field: value})
     with pytest.raises(SuctionError, match="leak"):
-        SuckedHead(COOLER, leak=-1.0)
+        ProbeHead(COOLER, leak=-1.0)
     sucked = head()
     with pytest.raises(SuctionError, match="angle_deg"):
         sucked.place("cheek", 360.0, 1.0)

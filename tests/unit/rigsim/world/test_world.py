@@ -16,7 +16,7 @@ from capture.devices.wire import Request, encode
 from capture.rig import load_rig
 from rigsim import world as worlds
 from rigsim.boxes.faults import Faults
-from rigsim.urlhandler.protocol_sim import Serial, world_of_url
+from rigsim.urlhandler.protocol_sim import Serial, world_from_url
 from rigsim.world.world import World
 
 RIG = load_rig("flash").resized(16)
@@ -86,48 +86,48 @@ def test_real_time_passes_without_waits():
 
 
 def test_a_name_belongs_to_one_world(world):
-    assert worlds.get("unit-world") is world
+    assert worlds.get_world("unit-world") is world
     assert world.register("unit-world") == "unit-world"
     with pytest.raises(ValueError, match="another world"):
         World(RIG).register("unit-world")
     world.unregister()
     world.unregister()
     with pytest.raises(KeyError, match="unit-world"):
-        worlds.get("unit-world")
+        worlds.get_world("unit-world")
 
 
 def test_url_without_world_makes_and_keeps_one():
     url = "sim://flash?seed=17&drop=0.25&reset_on_open=1"
-    made, name = world_of_url(url)
-    assert world_of_url(url) == (made, "flash")
+    made, name = world_from_url(url)
+    assert world_from_url(url) == (made, "flash")
     assert name == "flash"
     assert (made.seed, made.virtual, made.faults) == (17, True, Faults(drop=0.25, reset_on_open=1))
     made.unregister()
-    again, _ = world_of_url(url)
+    again, _ = world_from_url(url)
     assert again is not made
     again.unregister()
 
 
 def test_url_with_unknown_world_makes_world_so_named():
-    made, _ = world_of_url("sim://flash?world=unit-made&clock=real")
-    assert worlds.get("unit-made") is made
+    made, _ = world_from_url("sim://flash?world=unit-made&clock=real")
+    assert worlds.get_world("unit-made") is made
     assert not made.virtual
     made.unregister()
 
 
 def test_world_is_addressed_equally_by_name_or_world():
-    made, _ = world_of_url("sim://flash?name=unit-named")
-    assert world_of_url("sim://flash?world=unit-named")[0] is made
+    made, _ = world_from_url("sim://flash?name=unit-named")
+    assert world_from_url("sim://flash?world=unit-named")[0] is made
     made.unregister()
 
 
 @pytest.mark.parametrize("url", ["sim://probe", "sim://probe?seed=1&clock=virtual"])
 def test_cameras_of_unnamed_world_are_found_by_controller(url):
-    made, _ = world_of_url(url)
+    made, _ = world_from_url(url)
     camera = open_camera("sim://probe/cam")
     assert camera.info.serial == made.rig.view("cam").serial
     camera.close()
-    other, _ = world_of_url("sim://probe?seed=2")
+    other, _ = world_from_url("sim://probe?seed=2")
     with pytest.raises(CameraUrlError, match=r"of which there are 2, .* sim://BOX.world=NAME"):
         open_camera("sim://probe/cam")
     made.unregister()
@@ -151,7 +151,7 @@ def test_cameras_of_unnamed_world_are_found_by_controller(url):
 )
 def test_a_url_that_no_world_understands_is_named(url, match):
     with pytest.raises(ValueError, match=match):
-        world_of_url(url)
+        world_from_url(url)
 
 
 def test_rig_with_unknown_controller_or_clock_is_refused():

@@ -60,7 +60,7 @@ def test_labels_without_faces_are_refused(lab, capsys):
 
 @pytest.mark.long
 def test_simulated_population_is_darker_where_stated(tmp_path):
-    found = analysing_albedo.analyse_simulated(tmp_path / "out", people=6, size=96)
+    found = analysing_albedo.analyze_simulated(tmp_path / "out", people=6, size=96)
     told = found.document()
     assert told["groups"]["all"] == 6
     assert found.explained["face"].size == 5

@@ -15,15 +15,15 @@ from rigsim.population import population
 from skinrig.analysing import brdf as analysing_brdf
 from skinrig.analysing import brdf_space_datasets, brdf_space_figures
 from skinrig.analysing.brdf import AnalysisError
-from skinrig.analysing.brdf_space_datasets import Captured, DatasetError
+from skinrig.analysing.brdf_space_datasets import CapturedSamples, DatasetError
 from skinrig.cli import main
 
-PERSON = population.table_1()[4]
+PERSON = population.draw_population()[4]
 
 
 @pytest.fixture(scope="module")
 def basis():
-    return brdf_tables.default()
+    return brdf_tables.default_basis()
 
 
 @pytest.fixture(scope="module")
@@ -32,8 +32,8 @@ def skin():
 
 
 @pytest.fixture(scope="module")
-def seen(skin) -> Captured:
-    return brdf_space_datasets.capture(*skin, 120, rng=np.random.default_rng(1))
+def seen(skin) -> CapturedSamples:
+    return brdf_space_datasets.sample_surface(*skin, 120, rng=np.random.default_rng(1))
 
 
 def test_samples_are_true_reflection_with_stated_noise(seen):
@@ -50,7 +50,7 @@ def test_samples_are_true_reflection_with_stated_noise(seen):
 
 def test_mixtures_of_materials_hold_the_true_surface_term(seen, basis):
     """Root of the squared error over that of the surface term, in the pairs that were measured."""
-    fit = brdf_space_datasets.fitted(seen, basis)
+    fit = brdf_space_datasets.fit_materials(seen, basis)
     lobe = np.stack(
         [
             brdf_basis.evaluate(x, basis, to, at, n)
@@ -73,12 +73,12 @@ def test_mixtures_of_materials_hold_the_true_surface_term(seen, basis):
 def test_points_without_diffuse_are_fitted_by_lobes_alone(skin, basis):
     surface, place, where = skin
     black = dataclasses.replace(surface, r_d=np.zeros_like(surface.r_d))
-    seen = brdf_space_datasets.capture(black, place, where, 60, rng=np.random.default_rng(2))
+    seen = brdf_space_datasets.sample_surface(black, place, where, 60, rng=np.random.default_rng(2))
     found = diffuse_albedo.estimate(
         seen.f, seen.light, seen.view, seen.normals, eta=1.4, variance=seen.variance
     )
     assert np.median(np.abs(found.r_d)) < 0.01
-    fit = brdf_space_datasets.fitted(seen, basis)
+    fit = brdf_space_datasets.fit_materials(seen, basis)
     assert fit.valid.all()
     assert np.all(fit.weights @ basis.strength() > 0.0)
 
@@ -86,20 +86,20 @@ def test_points_without_diffuse_are_fitted_by_lobes_alone(skin, basis):
 def test_the_darkest_person_has_a_surface_too(basis):
     dark = dataclasses.replace(PERSON, melanin=population.POPULATION_MELANIN_RANGE[1])
     rng = np.random.default_rng(4)
-    data = brdf_space_datasets.dataset_b(60, members=(dark,), rng=rng)
+    data = brdf_space_datasets.build_dataset_b(60, members=(dark,), rng=rng)
     assert len(data.weights) + data.lost == 60
     assert data.lost < 6
-    found = analysing_brdf.analyse(data, basis, by_label=True, ranks=(1, 2, 4), rng=rng)
+    found = analysing_brdf.analyze(data, basis, by_label=True, ranks=(1, 2, 4), rng=rng)
     assert found.held_out == "points"  # one person cannot be left out
     assert np.all(np.diff(found.curve.error) < 0.0)
 
 
 def test_single_condition_is_dataset_and_conditions_share_points():
     rng = np.random.default_rng(5)
-    only = brdf_space_datasets.dataset_a(40, conditions=("lotion",), rng=rng)
+    only = brdf_space_datasets.build_dataset_a(40, conditions=("lotion",), rng=rng)
     assert only.labels == ("lotion",)
     assert set(only.label.tolist()) == {0}
-    two = brdf_space_datasets.dataset_a(41, conditions=("normal", "powder"), rng=rng)
+    two = brdf_space_datasets.build_dataset_a(41, conditions=("normal", "powder"), rng=rng)
     counts = np.bincount(two.label)
     assert abs(int(counts[0]) - int(counts[1])) <= 1 + two.lost
     assert 0.0 < two.noise < 1.0
@@ -107,12 +107,16 @@ def test_single_condition_is_dataset_and_conditions_share_points():
 
 def test_mean_brdf_peaks_higher_under_lotion_than_powder(basis):
     rng = np.random.default_rng(6)
-    data = brdf_space_datasets.dataset_a(90, conditions=("normal", "lotion", "powder"), rng=rng)
-    found = analysing_brdf.analyse(data, basis, by_label=False, ranks=(1, 2), rng=rng)
-    peak = {n: row[0].max() for n, row in brdf_space_figures.lit(found.means, basis).items()}
+    data = brdf_space_datasets.build_dataset_a(
+        90, conditions=("normal", "lotion", "powder"), rng=rng
+    )
+    found = analysing_brdf.analyze(data, basis, by_label=False, ranks=(1, 2), rng=rng)
+    peak = {
+        n: row[0].max() for n, row in brdf_space_figures.render_spheres(found.means, basis).items()
+    }
     assert peak["powder"] < peak["normal"] < peak["lotion"]
     for png in (
-        brdf_space_figures.spheres(found.means, basis),
+        brdf_space_figures.draw_spheres(found.means, basis),
         brdf_space_figures.curves({"some": found.curve}),
     ):
         assert png.startswith(b"\x89PNG")
@@ -121,13 +125,13 @@ def test_mean_brdf_peaks_higher_under_lotion_than_powder(basis):
 def test_unsampleable_input_is_refused(skin, rng):
     surface, place, where = skin
     with pytest.raises(DatasetError, match="samples: got 5000"):
-        brdf_space_datasets.capture(surface, place, where, 5, samples=5000, rng=rng)
+        brdf_space_datasets.sample_surface(surface, place, where, 5, samples=5000, rng=rng)
     with pytest.raises(DatasetError, match="samples"):
-        brdf_space_datasets.capture(surface, place, np.zeros_like(where), 5, rng=rng)
+        brdf_space_datasets.sample_surface(surface, place, np.zeros_like(where), 5, rng=rng)
     with pytest.raises(DatasetError, match="points: got 3 for 7"):
-        brdf_space_datasets.dataset_a(3, rng=rng)
+        brdf_space_datasets.build_dataset_a(3, rng=rng)
     with pytest.raises(DatasetError, match="points"):
-        brdf_space_datasets.dataset_b(0, rng=rng)
+        brdf_space_datasets.build_dataset_b(0, rng=rng)
 
 
 def appearance(basis, rank, rng, *, names=None):
@@ -190,9 +194,9 @@ def test_faces_without_usable_lobes_are_named(tmp_path, basis, capsys):
     store.write(tmp_path / "appearance-other", other)
     out = tmp_path / "out"
     with pytest.raises(AnalysisError, match="bare: holds no lobes"):
-        analysing_brdf.analyse_measured(out, [tmp_path / "appearance-bare"])
+        analysing_brdf.analyze_measured(out, [tmp_path / "appearance-bare"])
     with pytest.raises(AnalysisError, match="--basis DIR"):
-        analysing_brdf.analyse_measured(out, [tmp_path / "appearance-other"])
+        analysing_brdf.analyze_measured(out, [tmp_path / "appearance-other"])
     for argv, says in (
         ([], "Missing"),
         (["--out", str(out), "--labels", "x.csv"], "--labels"),

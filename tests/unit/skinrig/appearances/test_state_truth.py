@@ -5,7 +5,7 @@ import pytest
 
 from model import store
 from model.skin import SkinAppearance, SkinMap
-from skinrig.appearances.state_truth import truth_beside, truth_of_state
+from skinrig.appearances.state_truth import find_comparison_truth, find_state_truth
 
 
 def write(folder, state):
@@ -24,22 +24,22 @@ def session(tmp_path):
 
 
 def test_state_truth_is_own_or_missing_never_other(session):
-    assert truth_beside(session).name == "truth-face"
-    assert truth_beside(session, "smile").name == "truth-face-smile"
-    assert truth_beside(session, "anger") is None
+    assert find_comparison_truth(session).name == "truth-face"
+    assert find_comparison_truth(session, "smile").name == "truth-face-smile"
+    assert find_comparison_truth(session, "anger") is None
 
 
 def test_first_state_truth_of_session_has_no_suffix(tmp_path):
     write(tmp_path / "truth-face", "smile")
     write(tmp_path / "truth-face-neutral", "neutral")
     session = tmp_path / "session-face"
-    assert truth_beside(session, "smile").name == "truth-face"
-    assert truth_beside(session).name == "truth-face-neutral"
+    assert find_comparison_truth(session, "smile").name == "truth-face"
+    assert find_comparison_truth(session).name == "truth-face-neutral"
 
 
 def test_truth_without_requested_state_is_session_truth(tmp_path):
     session = tmp_path / "session-face"
-    assert truth_beside(session) is None
+    assert find_comparison_truth(session) is None
     write(tmp_path / "truth-face", "hot")
-    assert truth_of_state(session, "neutral") is None
-    assert truth_beside(session).name == "truth-face"
+    assert find_state_truth(session, "neutral") is None
+    assert find_comparison_truth(session).name == "truth-face"

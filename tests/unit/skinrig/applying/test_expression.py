@@ -10,13 +10,13 @@ from model.facial_color.state_maps import FacialColorError
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from model.wrinkles.evaluation import WRINKLE_FILE as WRINKLE_FILE
 from model.wrinkles.evaluation import WrinkleModel
-from model.wrinkles.partial_derivatives import Layer
+from model.wrinkles.partial_derivatives import WrinkleLayer
 from skinrig.appearances import dynamic
 from skinrig.applying import expression
 from skinrig.applying.expression import (
     ApplyError,
-    Expression,
-    OtherFace,
+    ExpressionRequest,
+    TargetFace,
     apply_expression,
     parse_weights,
 )
@@ -43,7 +43,7 @@ def face(tmp_path):
             maps, "simulated", {}, {}, files={facial_color_document.RIG_DOCUMENT: document}
         ),
     )
-    layer = Layer(np.full((8, 8, 2), 0.3), np.ones((8, 4, 4)) / 8.0)
+    layer = WrinkleLayer(np.full((8, 8, 2), 0.3), np.ones((8, 4, 4)) / 8.0)
     maps, document = WrinkleModel(np.zeros((16, 16, 2)), (layer,)).to_maps()
     dynamic.add(
         out,
@@ -65,11 +65,11 @@ def test_invalid_weight_is_named(text):
 
 def test_state_at_full_weight_has_its_blood(face, tmp_path):
     folder, neutral = face
-    apply_expression(folder, Expression({"smile": 1.0}), out=tmp_path / "out")
+    apply_expression(folder, ExpressionRequest({"smile": 1.0}), out=tmp_path / "out")
     found = store.read(tmp_path / "out").maps["hemoglobin"]
     np.testing.assert_allclose(found.values, 1.5 * neutral, rtol=0.02)
     # the neutral face has other blood
-    apply_expression(folder, Expression({"neutral": 1.0}), out=tmp_path / "rest")
+    apply_expression(folder, ExpressionRequest({"neutral": 1.0}), out=tmp_path / "rest")
     rest = store.read(tmp_path / "rest").maps["hemoglobin"].values
     np.testing.assert_allclose(rest, neutral, rtol=1e-5)
 
@@ -78,7 +78,7 @@ def test_more_blood_makes_skin_redder(face, tmp_path):
     folder, _ = face
     means = []
     for state in ("neutral", "smile"):
-        apply_expression(folder, Expression({state: 1.0}), out=tmp_path / state)
+        apply_expression(folder, ExpressionRequest({state: 1.0}), out=tmp_path / state)
         means.append(store.read(tmp_path / state).maps["color"].values.mean(axis=(0, 1)))
     lost = 1.0 - means[1] / means[0]
     # blood takes green most (its bands at 540 and 575 nm), blue next, red least
@@ -88,11 +88,14 @@ def test_more_blood_makes_skin_redder(face, tmp_path):
 def test_anger_and_surprise_wrinkle_by_the_papers_table(face, tmp_path):
     folder, _ = face
     done = apply_expression(
-        folder, Expression({"anger": 1.0}), out=tmp_path / "a", parts=("wrinkles",)
+        folder, ExpressionRequest({"anger": 1.0}), out=tmp_path / "a", parts=("wrinkles",)
     )
     assert done.figures["wrinkles"]["zone_weights"][0] == [0.0] * 4 + [0.8, 0.8, 1.0, 0.0]
     signed = apply_expression(
-        folder, Expression({"anger": 1.0}, clamp="signed"), out=tmp_path / "s", parts=("wrinkles",)
+        folder,
+        ExpressionRequest({"anger": 1.0}, clamp="signed"),
+        out=tmp_path / "s",
+        parts=("wrinkles",),
     )
     assert signed.figures["wrinkles"]["zone_weights"][0][:2] == [-0.6, -0.6]
     assert not np.array_equal(done.maps["normals"].values, signed.maps["normals"].values)
@@ -102,9 +105,11 @@ def test_weights_not_summing_to_one_write_nothing(face, tmp_path):
     folder, _ = face
     out = tmp_path / "out"
     with pytest.raises(FacialColorError, match="normalize"):
-        apply_expression(folder, Expression({"smile": 0.7, "anger": 0.7}), out=out)
+        apply_expression(folder, ExpressionRequest({"smile": 0.7, "anger": 0.7}), out=out)
     assert not out.exists()
-    apply_expression(folder, Expression({"smile": 0.7, "anger": 0.7}, normalize=True), out=out)
+    apply_expression(
+        folder, ExpressionRequest({"smile": 0.7, "anger": 0.7}, normalize=True), out=out
+    )
     assert (out / store.DOCUMENT_FILE).is_file()
 
 
@@ -112,65 +117,71 @@ def test_state_unknown_to_wrinkles_is_refused(face, tmp_path):
     folder, _ = face
     with pytest.raises(ApplyError, match="smiling"):
         apply_expression(
-            folder, Expression({"smiling": 1.0}), out=tmp_path / "out", parts=("wrinkles",)
+            folder, ExpressionRequest({"smiling": 1.0}), out=tmp_path / "out", parts=("wrinkles",)
         )
 
 
 def test_missing_face_parts_are_omitted_with_reason(face, tmp_path):
     folder, _ = face
-    done = apply_expression(folder, Expression({"smile": 1.0}), out=tmp_path / "out")
+    done = apply_expression(folder, ExpressionRequest({"smile": 1.0}), out=tmp_path / "out")
     assert ("microstructure", "the folder does not hold it") in done.left_out
     written = store.read(tmp_path / "out")
     assert ("microstructure", "the folder does not hold it") in written.left_out
     with pytest.raises(ApplyError, match="parts"):
-        apply_expression(folder, Expression({"smile": 1.0}), out=tmp_path / "o", parts=("hair",))
+        apply_expression(
+            folder, ExpressionRequest({"smile": 1.0}), out=tmp_path / "o", parts=("hair",)
+        )
 
 
 def test_a_rig_is_applied_to_another_faces_blood(face, tmp_path):
     folder, _ = face
     rng = np.random.default_rng(8)
     other = (0.04 + 0.002 * rng.standard_normal((60, 40))).astype(np.float32)
-    onto = OtherFace(
+    onto = TargetFace(
         SkinAppearance({"hemoglobin": SkinMap(other, MAP_UNITS["hemoglobin"])}, "measured")
     )
-    done = apply_expression(folder, Expression({"smile": 1.0}, onto=onto), out=tmp_path / "out")
+    done = apply_expression(
+        folder, ExpressionRequest({"smile": 1.0}, onto=onto), out=tmp_path / "out"
+    )
     found = done.maps["hemoglobin"]
     assert found.values.shape == other.shape
     ratio = found.values[found.valid] / other[found.valid]
     assert np.median(ratio) == pytest.approx(1.5, abs=0.03)
     assert ("color", "there is no melanin map") in done.left_out
-    empty = OtherFace(SkinAppearance({}, "measured"))
+    empty = TargetFace(SkinAppearance({}, "measured"))
     with pytest.raises(ApplyError, match="hemoglobin"):
-        apply_expression(folder, Expression({"smile": 1.0}, onto=empty), out=tmp_path / "no")
+        apply_expression(folder, ExpressionRequest({"smile": 1.0}, onto=empty), out=tmp_path / "no")
 
 
 def test_inputs_of_result_are_never_replaced(face, tmp_path):
     folder, _ = face
     before = (folder / store.DOCUMENT_FILE).read_bytes()
     with pytest.raises(ApplyError, match="the fitted folder itself"):
-        apply_expression(folder, Expression({"smile": 1.0}), out=folder)
+        apply_expression(folder, ExpressionRequest({"smile": 1.0}), out=folder)
     other = tmp_path / "truth"
     store.write(other, SkinAppearance({}, "simulated", parameters={"kind": "truth"}))
     with pytest.raises(ApplyError, match="nothing was touched"):
-        apply_expression(folder, Expression({"smile": 1.0}), out=other)
+        apply_expression(folder, ExpressionRequest({"smile": 1.0}), out=other)
     assert (folder / store.DOCUMENT_FILE).read_bytes() == before
     assert store.read(other).parameters["kind"] == "truth"
     # an older result is
     for _ in range(2):
-        apply_expression(folder, Expression({"smile": 1.0}), out=tmp_path / "out")
+        apply_expression(folder, ExpressionRequest({"smile": 1.0}), out=tmp_path / "out")
 
 
 def test_weights_are_normalized_for_wrinkles_as_for_blood(face, tmp_path):
     folder, _ = face
-    twice = Expression({"smile": 2.0, "anger": 2.0}, normalize=True)
-    half = Expression({"smile": 0.5, "anger": 0.5})
+    twice = ExpressionRequest({"smile": 2.0, "anger": 2.0}, normalize=True)
+    half = ExpressionRequest({"smile": 0.5, "anger": 0.5})
     done = apply_expression(folder, twice, out=tmp_path / "a")
     same = apply_expression(folder, half, out=tmp_path / "b")
     for name in ("hemoglobin", "normals"):
         np.testing.assert_array_equal(done.maps[name].values, same.maps[name].values)
     with pytest.raises(ApplyError, match="sum"):
         apply_expression(
-            folder, Expression({"smile": 1.0, "anger": -1.0}, normalize=True), out=tmp_path / "c"
+            folder,
+            ExpressionRequest({"smile": 1.0, "anger": -1.0}, normalize=True),
+            out=tmp_path / "c",
         )
 
 
@@ -178,20 +189,20 @@ def test_simulated_face_gives_simulated_result_sizes_must_fit(face, tmp_path):
     folder, _ = face
     blood = SkinMap(np.full((60, 40), 0.03, np.float32), MAP_UNITS["hemoglobin"])
     melanin = SkinMap(np.full((30, 40), 0.03, np.float32), MAP_UNITS["melanin"])
-    onto = OtherFace(SkinAppearance({"hemoglobin": blood}, "measured"), hashes={"onto": "abc"})
-    apply_expression(folder, Expression({"smile": 1.0}, onto=onto), out=tmp_path / "out")
+    onto = TargetFace(SkinAppearance({"hemoglobin": blood}, "measured"), hashes={"onto": "abc"})
+    apply_expression(folder, ExpressionRequest({"smile": 1.0}, onto=onto), out=tmp_path / "out")
     written = store.read(tmp_path / "out")
     assert written.source == "simulated"  # the rig is
     assert written.inputs["onto"] == "abc"
-    both = OtherFace(SkinAppearance({"hemoglobin": blood, "melanin": melanin}, "measured"))
+    both = TargetFace(SkinAppearance({"hemoglobin": blood, "melanin": melanin}, "measured"))
     with pytest.raises(ApplyError, match="one size"):
-        apply_expression(folder, Expression({"smile": 1.0}, onto=both), out=tmp_path / "no")
+        apply_expression(folder, ExpressionRequest({"smile": 1.0}, onto=both), out=tmp_path / "no")
 
 
 def test_the_same_evaluation_gives_the_same_bytes(face, tmp_path):
     folder, _ = face
     for name in ("one", "two"):
-        apply_expression(folder, Expression({"smile": 1.0}), out=tmp_path / name)
+        apply_expression(folder, ExpressionRequest({"smile": 1.0}), out=tmp_path / name)
     first, second = (
         {path.name: path.read_bytes() for path in sorted((tmp_path / name).iterdir())}
         for name in ("one", "two")

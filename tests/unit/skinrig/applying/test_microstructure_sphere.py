@@ -23,7 +23,7 @@ NOISE = VolumeNoise.draw(
 
 @pytest.fixture(scope="module")
 def relief():
-    return SPHERE.noise_relief(NOISE)
+    return SPHERE.sample_noise_relief(NOISE)
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,7 @@ def test_grown_patches_keep_their_slopes_over_the_chart(rng):
     twenty polygons a place."""
     skin = make_micro_skin("cheek", seed=1, size_mm=4.0, texel_um=16.0)
     patch = skin.height_um - skin.height_um.mean()
-    relief = SPHERE.grown_relief([patch], patch_pixel_um=16.0, rng=rng)
+    relief = SPHERE.grow_relief([patch], patch_pixel_um=16.0, rng=rng)
     neutral = spheres.deform(SPHERE, relief, DEFORMATION_RATIOS["neutral"])
     found = [sum(neutral.roughness(place, within_rad=0.4)) for place in ROUGHNESS_POINTS]
     assert max(found) / min(found) < 1.4
@@ -121,7 +121,7 @@ def test_grown_sphere_is_shinier_in_its_image(states):
 
 def test_highlight_is_on_light_side():
     flat = np.zeros((400, 400), np.float32)
-    picture = spheres.deform(SPHERE, flat, (1, 1, 1)).picture(size_px=65, light=(0.5, 0.5, 0.7))
+    picture = spheres.deform(SPHERE, flat, (1, 1, 1)).render(size_px=65, light=(0.5, 0.5, 0.7))
     row, column = np.unravel_index(picture.argmax(), picture.shape)
     half = np.array([0.5, 0.5, 0.7]) / np.linalg.norm([0.5, 0.5, 0.7]) + [0, 0, 1]
     half /= np.linalg.norm(half)

@@ -177,7 +177,7 @@ def test_the_surface_looks_out_and_covers_the_square():
 
 
 def test_probe_drags_skin_in_contact():
-    probe = Push(depth_mm=0.5, shift_mm=(0.3, -0.2), contact_mm=2.0, centre_mm=(1.0, 0.5))
+    probe = Push(depth_mm=0.5, shift_mm=(0.3, -0.2), contact_mm=2.0, center_mm=(1.0, 0.5))
     patch = pushed_patch.push(block(6), probe, steps=2)
     away = np.hypot(*(patch.rest_mm[:, :2] - (1.0, 0.5)).T)
     touched = (patch.rest_mm[:, 2] > -1e-9) & (away <= 2.0)
@@ -223,7 +223,7 @@ def test_push_beyond_equilibrium_is_reported():
         (lambda: Push(contact_mm=5.0), "contact_mm, tip_mm"),
         (lambda: Push(depth_mm=np.inf), "depth_mm"),
         (
-            lambda: pushed_patch.push(block(), Push(centre_mm=(4.9, 0.0))),
+            lambda: pushed_patch.push(block(), Push(center_mm=(4.9, 0.0))),
             "within the block's edges",
         ),
         (lambda: pushed_patch.solve(block(), np.zeros((3, 3))), "given_mm: got shape"),

@@ -7,8 +7,8 @@ from model import store
 from model.microstructure.kernel_table import FOREHEAD
 from model.skin import SkinAppearance, SkinMap
 from skinrig.appearances import dynamic
-from skinrig.applying.expression import ApplyError, Expression, apply_expression
-from skinrig.applying.relief import Relief, ReliefRequest
+from skinrig.applying.expression import ApplyError, ExpressionRequest, apply_expression
+from skinrig.applying.relief import ReliefEvaluator, ReliefRequest
 
 MICRO = (dynamic.MICROSTRUCTURE,)
 
@@ -61,8 +61,10 @@ def sheet(tmp_path):
 
 def applied(folder, sheet, out, weights, **other):
     options = {"size_px": 300, "site": "forehead", "extrapolate": "hold", "seed": 1} | other
-    relief = Relief.of(sheet, weights, ReliefRequest(**options), out=out, progress=lambda _: None)
-    return apply_expression(folder, Expression(weights), out=out, parts=MICRO, relief=relief)
+    relief = ReliefEvaluator.of(
+        sheet, weights, ReliefRequest(**options), out=out, progress=lambda _: None
+    )
+    return apply_expression(folder, ExpressionRequest(weights), out=out, parts=MICRO, relief=relief)
 
 
 def slopes(height, axis):

@@ -9,7 +9,7 @@ from skinrig.benchmarks import resident_memory
 from skinrig.benchmarks import table as bench_table
 from skinrig.benchmarks.document import knee, pareto_front, to_document
 from skinrig.benchmarks.measurement import measure
-from skinrig.benchmarks.results import BandError, Limit, Point, StageBenchmark, Timing
+from skinrig.benchmarks.results import ErrorEstimate, Limit, Point, StageBenchmark, Timing
 
 
 def point(seconds, error):
@@ -99,7 +99,7 @@ def test_reference_error_is_distinguished_from_exact_truth():
 
 def test_memory_of_slow_calls_is_process_growth(monkeypatch):
     monkeypatch.setattr("skinrig.benchmarks.measurement.MAX_TRACED_CALL_S", 0.0)
-    with resident_memory.watched() as seen:
+    with resident_memory.track_peak() as seen:
         pass
     if seen.mb is None:
         pytest.skip("this system does not count resident memory")
@@ -140,7 +140,10 @@ def test_document_reports_error_ratio_on_dark_skin():
         "truth",
         0.0,
         (point(1, 1),),
-        by_band={"light": BandError(2.0, (1.0, 4.0)), "dark": BandError(6.0, (4.0, 8.0), 3.0)},
+        by_band={
+            "light": ErrorEstimate(2.0, (1.0, 4.0)),
+            "dark": ErrorEstimate(6.0, (4.0, 8.0), 3.0),
+        },
     )
     told = to_document([stage])["stages"]["s"]
     assert [one["band"] for one in told["by_band"]] == ["light", "dark"]

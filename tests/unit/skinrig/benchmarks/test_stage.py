@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from skinrig.benchmarks.stage import Stage, descriptions
+from skinrig.benchmarks.stage import BenchmarkStage, descriptions
 
 
 @pytest.mark.parametrize("name", descriptions())
@@ -23,7 +23,7 @@ def test_stage_has_function_and_limits_of_its_module(name):
 
 
 def limit(name, found):
-    (limit,) = Stage(name, limits=found).benchmark().limits
+    (limit,) = BenchmarkStage(name, limits=found).to_benchmark().limits
     return limit
 
 

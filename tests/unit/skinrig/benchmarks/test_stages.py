@@ -10,7 +10,7 @@ from skinrig.benchmarks import plan as bench_plan
 from skinrig.benchmarks import stage as bench_stage
 from skinrig.benchmarks import stages as bench_stages
 from skinrig.benchmarks import table as bench_table
-from skinrig.benchmarks.results import BandError, Timing
+from skinrig.benchmarks.results import ErrorEstimate, Timing
 from skinrig.console import Console
 from skinrig.errors import MissingExtra
 
@@ -24,7 +24,7 @@ def stage(name, calls, seconds=0.0, error=None):
         if error is not None:
             raise error
         for n in (1.0, 2.0, 4.0, 8.0):
-            outcome = BandError(8 / n**2, (7 / n**2, 9 / n**2), 1 / n)
+            outcome = ErrorEstimate(8 / n**2, (7 / n**2, 9 / n**2), 1 / n)
             stage.add({"n": n}, Timing(n, (n, n), 3.0 * n, 1.0), outcome)
         stage.limits["kept at full size"] = 2.0 if stage.toy else 0.5
 

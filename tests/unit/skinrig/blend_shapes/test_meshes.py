@@ -112,13 +112,13 @@ def test_obj_folder_is_split_at_seams_and_triangulated(tmp_path):
     assert mesh.vertices_mm.shape == (8, 3)  # two vertices have two texture coordinates each
     assert mesh.faces.shape == (4, 3)
     assert list(mesh.shapes) == ["wide"]
-    found = strain(mesh.vertices_mm, mesh.deformed({"wide": 1.0}), mesh.faces, mesh.uv)
+    found = strain(mesh.vertices_mm, mesh.deform({"wide": 1.0}), mesh.faces, mesh.uv)
     width = np.hypot(10.0, 3.0)
     right = mesh.uv[:, 0] > 0.55
     outer = right & (mesh.uv[:, 0] > 0.7)
     np.testing.assert_allclose(found.r_s[outer], np.hypot(15.0, 3.0) / width, rtol=1e-6)
     seam = np.flatnonzero(mesh.vertices_mm[:, 0] == 10.0)
-    assert len(np.unique(found.place[seam])) == 2
+    assert len(np.unique(found.point_index[seam])) == 2
     assert load(tmp_path / "head" / "Neutral.obj").shapes.keys() == mesh.shapes.keys()
 
 
@@ -176,7 +176,7 @@ def test_gltf_targets_are_mm_in_scene_frame(tmp_path, kind):
     np.testing.assert_allclose(mesh.uv, [[0, 0], [1, 0], [1, 1], [0, 1]], atol=1e-6)
     np.testing.assert_allclose(mesh.shapes["pull"][1], [0.0, 8.0, 0.0], atol=1e-4)
     np.testing.assert_allclose(mesh.shapes["lift"], 10.0 * np.eye(4, 3)[[3, 3, 2, 3]], atol=1e-4)
-    found = strain(mesh.vertices_mm, mesh.deformed({"pull": 0.5}), mesh.faces, mesh.uv)
+    found = strain(mesh.vertices_mm, mesh.deform({"pull": 0.5}), mesh.faces, mesh.uv)
     np.testing.assert_allclose(found.r_s, 1.1, rtol=1e-5)
 
 
@@ -266,12 +266,12 @@ def test_incomplete_or_contradictory_npz_files_are_refused(tmp_path, change, wor
 def test_weights_add_up_and_unknown_shapes_suggest_nearest(tmp_path):
     np.savez(tmp_path / "m.npz", **arrays())
     mesh = load(tmp_path / "m.npz")
-    np.testing.assert_allclose(mesh.deformed({"up": -0.5}), mesh.vertices_mm - 0.5)
-    np.testing.assert_array_equal(mesh.deformed({}), mesh.vertices_mm)
+    np.testing.assert_allclose(mesh.deform({"up": -0.5}), mesh.vertices_mm - 0.5)
+    np.testing.assert_array_equal(mesh.deform({}), mesh.vertices_mm)
     with pytest.raises(MeshError, match="did you mean 'up'"):
-        mesh.deformed({"upp": 1.0})
+        mesh.deform({"upp": 1.0})
     with pytest.raises(MeshError, match="nan"):
-        mesh.deformed({"up": np.nan})
+        mesh.deform({"up": np.nan})
 
 
 def test_missing_files_or_unknown_kinds_are_refused(tmp_path):
@@ -290,14 +290,14 @@ def test_shared_face_smile_stretches_and_compresses_skin():
     mesh = load(ICT)
     found = strain(
         mesh.vertices_mm,
-        mesh.deformed({"mouthSmile_L": 1.0, "mouthSmile_R": 1.0}),
+        mesh.deform({"mouthSmile_L": 1.0, "mouthSmile_R": 1.0}),
         mesh.faces,
         mesh.uv,
     )
     assert found.valid.all()
     assert found.r_s.max() > 1.2
     assert found.r_t.min() < 0.8
-    order = np.argsort(found.place, kind="stable")
-    twins = np.diff(found.place[order]) == 0
+    order = np.argsort(found.point_index, kind="stable")
+    twins = np.diff(found.point_index[order]) == 0
     assert twins.sum() > 100
     np.testing.assert_array_equal(found.r_s[order][1:][twins], found.r_s[order][:-1][twins])

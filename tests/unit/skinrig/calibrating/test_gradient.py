@@ -11,7 +11,7 @@ from capture.calibration import store
 from capture.calibration.sensor.noise_model import SensorCalibration
 from capture.raw import RawFrame
 from capture.rig import load_rig
-from skinrig.calibrating.gradient import calibrate_gradient, of_a_gradient_sphere
+from skinrig.calibrating.gradient import calibrate_gradient, has_gradient_session
 from skinrig.calibrating.outcome import CalibratingError, TargetSessions
 
 RIG = load_rig("gradient").cropped(128)
@@ -90,5 +90,5 @@ def test_two_balls_rigs_or_other_kinds_are_refused(tmp_path):
 
 
 def test_rig_is_identified_by_its_controller():
-    assert of_a_gradient_sphere([Shelf()])
-    assert not of_a_gradient_sphere([Shelf(load_rig("dome")), Shelf(load_rig("flash"))])
+    assert has_gradient_session([Shelf()])
+    assert not has_gradient_session([Shelf(load_rig("dome")), Shelf(load_rig("flash"))])

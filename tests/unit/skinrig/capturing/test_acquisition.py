@@ -122,7 +122,7 @@ def test_files_foreign_to_session_are_never_removed(tmp_path):
         plan=flash_plan(RIG),
         rig=RIG,
         devices={},
-        subject=acquisition.Subject("p"),
+        subject=acquisition.SubjectRecord("p"),
         source="measured",
     )
     session.release()
@@ -163,7 +163,7 @@ def test_broken_device_is_not_retried():
 def test_addresses_of_the_wrong_form_are_usage_errors():
     for given in (["flash"], ["=x"], ["flash="], ["flash=a", "flash=b"]):
         with pytest.raises(UsageError, match="--port"):
-            addresses.addresses(given, "--port")
+            addresses.parse_addresses(given, "--port")
 
 
 def test_import_records_subject_and_rig_of_photographs(tmp_path, sim, capsys):

@@ -8,7 +8,7 @@ import pytest
 
 from model import store
 from model.skin import SkinMap
-from model.skin_reflectance import lobes_of
+from model.skin_reflectance import load_basis
 from model.traits.storage import load
 from skinrig.appearances import contents, face_textures
 from skinrig.cli import main
@@ -62,7 +62,7 @@ def test_an_edit_of_amount_zero_changes_no_bit(lab, capsys):
 
 
 def test_tan_edit_darkens_only_albedo_as_in_population(source, library):
-    done = editing.edited(source, EditRequest(traits={"tan": 1.0}), library)
+    done = editing.edit_face(source, EditRequest(traits={"tan": 1.0}), library)
     assert done.changed == ("r_d",)
     old, new = source.appearance.maps["r_d"], done.appearance.maps["r_d"]
     good = old.valid
@@ -78,10 +78,10 @@ def test_tan_edit_darkens_only_albedo_as_in_population(source, library):
 
 def test_edit_and_opposite_return_source_within_stated_error(source, library):
     order = EditRequest(traits={"tan": 0.8, "oily": 0.6})
-    there = editing.edited(source, order, library)
+    there = editing.edit_face(source, order, library)
     face = dataclasses.replace(source, appearance=there.appearance)
     opposite = EditRequest(traits={"tan": -0.8, "oily": -0.6}, seed=7)
-    back = editing.edited(face, opposite, library)
+    back = editing.edit_face(face, opposite, library)
     good = source.r_d.valid
     moved = rms(there.appearance.maps["r_d"].values, source.r_d.values, good)
     left = rms(back.appearance.maps["r_d"].values, source.r_d.values, good)
@@ -100,7 +100,7 @@ def test_edit_and_opposite_return_source_within_stated_error(source, library):
 
 
 def test_oil_edit_changes_only_lobes_as_in_population(source, library):
-    done = editing.edited(source, EditRequest(traits={"oily": 1.0}), library)
+    done = editing.edit_face(source, EditRequest(traits={"oily": 1.0}), library)
     assert "r_d" not in done.changed
     assert "lobe_residual" not in done.appearance.maps
     assert ("lobe_residual", "is of the lobes before the edit") in done.appearance.left_out
@@ -116,7 +116,7 @@ def test_oil_edit_changes_only_lobes_as_in_population(source, library):
     ]
     assert abs(change[0] - 0.3) < 0.06
     assert abs(change[3] + 0.6 * 0.35) < 0.08
-    lobes = lobes_of(done.appearance)  # maps and file go together
+    lobes = load_basis(done.appearance)  # maps and file go together
     assert lobes.size == done.record["surface"]["lobes"]
 
 
@@ -129,7 +129,7 @@ def test_mask_keeps_every_bit_where_black(traits, source, library, tmp_path):
     order = EditRequest(
         traits=traits, mask=tmp_path / "mask.png", spots=(SpotOrder("freckles", 1.0, 3.0),)
     )
-    done = editing.edited(source, order, library)
+    done = editing.edit_face(source, order, library)
     most = 0.0
     for name in set(done.changed) & set(source.appearance.maps) - {"lobe_residual"}:
         old, new = source.appearance.maps[name].values, done.appearance.maps[name].values
@@ -139,7 +139,7 @@ def test_mask_keeps_every_bit_where_black(traits, source, library, tmp_path):
 
 
 def test_region_edit_changes_beard_not_forehead(source, library):
-    done = editing.edited(source, EditRequest(traits={"tan": 1.0}, region="beard"), library)
+    done = editing.edit_face(source, EditRequest(traits={"tan": 1.0}, region="beard"), library)
     height = source.position[..., 1]
     good = source.r_d.valid
     ratio = done.appearance.maps["r_d"].values / source.r_d.values
@@ -150,7 +150,7 @@ def test_region_edit_changes_beard_not_forehead(source, library):
 
 def test_edit_has_no_seam_between_texture_islands(source, library):
     """Both sides of the cut at height 0 darken alike."""
-    done = editing.edited(source, EditRequest(traits={"tan": 1.0}), library)
+    done = editing.edit_face(source, EditRequest(traits={"tan": 1.0}), library)
     change = np.log(done.appearance.maps["r_d"].values / source.r_d.values).mean(axis=-1)
     half = change.shape[1] // 2
     across = change[4:-4, half - 3] - change[4:-4, half + 2]
@@ -167,9 +167,9 @@ def test_single_colors_darkest_and_whitest_faces_survive(kind, dome_faces, libra
     good = face.r_d.valid
     old = face.r_d.values[good]
     for amount in (2.0, -2.0):
-        new = editing.edited(face, EditRequest(traits={"tan": amount}), library)
+        new = editing.edit_face(face, EditRequest(traits={"tan": amount}), library)
         spotted = dataclasses.replace(face, appearance=new.appearance)
-        moles = editing.edited(
+        moles = editing.edit_face(
             spotted, EditRequest(traits={}, spots=(SpotOrder("moles", 1.0, 1.0),))
         )
         for one in (new, moles):
@@ -187,7 +187,7 @@ def test_reflectance_above_white_is_kept_but_never_made(source, library):
     values[20:23, 12:15] = 1.3
     maps = {**source.appearance.maps, "r_d": dataclasses.replace(r_d, values=values)}
     face = dataclasses.replace(source, appearance=dataclasses.replace(source.appearance, maps=maps))
-    done = editing.edited(face, EditRequest(traits={"tan": -1.0}), library)
+    done = editing.edit_face(face, EditRequest(traits={"tan": -1.0}), library)
     new = done.appearance.maps["r_d"].values
     assert new[r_d.valid].max() <= np.float32(1.3)
     outlier = (values > 1).any(axis=-1)
@@ -199,16 +199,16 @@ def test_face_without_lobes_is_edited_in_albedo(source, library):
     face = dataclasses.replace(
         source, appearance=dataclasses.replace(source.appearance, maps=maps, files={})
     )
-    assert editing.edited(face, EditRequest(traits={"tan": 0.5}), library).changed == ("r_d",)
+    assert editing.edit_face(face, EditRequest(traits={"tan": 0.5}), library).changed == ("r_d",)
     with pytest.raises(EditError, match="the appearance has albedo"):
-        editing.edited(face, EditRequest(traits={"oily": 1.0}, parts=("surface",)), library)
+        editing.edit_face(face, EditRequest(traits={"oily": 1.0}, parts=("surface",)), library)
 
 
 def test_the_same_seed_makes_the_same_face(source, library):
     order = EditRequest(traits={"tan": 1.0}, spots=(SpotOrder("freckles", 1.0),), seed=5)
-    one, two = (editing.edited(source, order, library).appearance.maps["r_d"] for _ in range(2))
+    one, two = (editing.edit_face(source, order, library).appearance.maps["r_d"] for _ in range(2))
     np.testing.assert_array_equal(one.values, two.values)
-    other = editing.edited(source, dataclasses.replace(order, seed=6), library)
+    other = editing.edit_face(source, dataclasses.replace(order, seed=6), library)
     assert not np.array_equal(other.appearance.maps["r_d"].values, one.values)
 
 
@@ -249,7 +249,7 @@ def test_invalid_masks_are_refused_by_name(source, library, tmp_path):
     (tmp_path / "text.png").write_text("no picture")
     for name, says in (("black", "black everywhere"), ("wide", "64 x 32"), ("text", "as PNG")):
         with pytest.raises(ValueError, match=says):
-            editing.edited(
+            editing.edit_face(
                 source, EditRequest(traits={"tan": 1.0}, mask=tmp_path / f"{name}.png"), library
             )
 
@@ -350,5 +350,5 @@ def test_map_without_error_or_mask_is_edited(source, library):
     }
     maps = {**bare, "position": source.appearance.maps["position"]}
     face = dataclasses.replace(source, appearance=dataclasses.replace(source.appearance, maps=maps))
-    done = editing.edited(face, EditRequest(traits={"tan": 1.0}), library)
+    done = editing.edit_face(face, EditRequest(traits={"tan": 1.0}), library)
     assert done.appearance.maps["r_d"].stderr is None

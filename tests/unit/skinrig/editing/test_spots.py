@@ -88,7 +88,7 @@ def test_spots_smaller_than_texel_darken_by_area(cheek):
 def chart_of(position, on):
     frame = common_regions.standard_frame(side_mm=60.0, center_mm=(0.0, 0.0), size=SIDE)
     cylinder = Cylinder((0.0, 0.0, 0.0))
-    return charts.chart(position, on, Correspondence(cylinder), frame), frame
+    return charts.chart_texels(position, on, Correspondence(cylinder), frame), frame
 
 
 @pytest.mark.parametrize(("kind", "density"), [("freckles", 1.5), ("moles", 0.3)])
@@ -97,7 +97,7 @@ def test_added_spots_are_found_and_removed(cheek, kind, density):
     spots = drawn(cheek, kind, density_per_cm2=density)
     spotted = skin * spots.gain
     chart, frame = chart_of(position, on)
-    found = spot_removal.find(
+    found = spot_removal.fill_spots(
         spotted, on, chart, pixel_mm=frame.pixel_mm, range_mm=SPOT_KINDS[kind].range_mm
     )
     share = found.share[..., None]
@@ -112,7 +112,7 @@ def test_added_spots_are_found_and_removed(cheek, kind, density):
 def test_skin_without_spots_is_left_alone(cheek):
     position, skin, on = cheek
     chart, frame = chart_of(position, on)
-    found = spot_removal.find(skin, on, chart, pixel_mm=frame.pixel_mm, range_mm=(0.8, 6.0))
+    found = spot_removal.fill_spots(skin, on, chart, pixel_mm=frame.pixel_mm, range_mm=(0.8, 6.0))
     assert found.spots == 0
     assert not found.share.any()
 
@@ -121,7 +121,7 @@ def test_brow_is_not_a_spot():
     image = np.full((80, 80, 3), 0.3)
     image[40:43, 10:70] = 0.08
     image[20:24, 20:24] = 0.1
-    spots, count = spot_removal.dark_spots(
+    spots, count = spot_removal.detect_dark_spots(
         image, np.ones((80, 80), bool), pixel_mm=0.8, range_mm=(0.8, 6.0)
     )
     assert count == 1

@@ -5,8 +5,8 @@ from model import color_table
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error, shading_prior
-from reconstruction.chromophores.inversion import identifiability
-from skinrig.evaluating.bounds import cramer_rao, relative_bounds
+from reconstruction.chromophores.inversion import compute_identifiability
+from skinrig.evaluating.bounds import chromophore_bounds, relative_bounds
 
 CAMERA, LIGHT = "Nikon 5100 (NPL)", "D55"
 
@@ -18,12 +18,15 @@ def table():
 
 def test_nearly_unknown_shading_has_bound_of_free_shading(table):
     noise = 0.005
-    free = identifiability(
-        table, variance=lambda rgb: (noise * rgb) ** 2, model_error=model_error.load(), size=24
+    free = compute_identifiability(
+        table,
+        variance=lambda rgb: (noise * rgb) ** 2,
+        model_error=model_error.load_covariance(),
+        size=24,
     )
     c_m, c_hd = np.meshgrid(free.c_m[6:16], free.c_hd[6:16], indexing="ij")
     melanin, blood = relative_bounds(
-        table, c_m.ravel(), c_hd.ravel(), np.full((100, 3), noise**2), shading_spread=200.0
+        table, c_m.ravel(), c_hd.ravel(), np.full((100, 3), noise**2), log_shading_std=200.0
     )
     np.testing.assert_allclose(melanin.reshape(10, 10), free.stderr_melanin[6:16, 6:16], rtol=0.02)
     np.testing.assert_allclose(blood.reshape(10, 10), free.stderr_hemoglobin[6:16, 6:16], rtol=0.02)
@@ -32,10 +35,10 @@ def test_nearly_unknown_shading_has_bound_of_free_shading(table):
 def test_bound_scales_with_noise_and_shrinks_with_knowledge(table):
     c_m, c_hd = np.array([0.02]), np.array([0.05])
     few, many = np.full((1, 3), 1e-2), np.full((1, 3), 4e-2)
-    loud = relative_bounds(table, c_m, c_hd, few, shading_spread=0.6)
-    louder = relative_bounds(table, c_m, c_hd, many, shading_spread=1.2)
+    loud = relative_bounds(table, c_m, c_hd, few, log_shading_std=0.6)
+    louder = relative_bounds(table, c_m, c_hd, many, log_shading_std=1.2)
     np.testing.assert_allclose(np.array(louder), 2.0 * np.array(loud), rtol=1e-3)
-    known = relative_bounds(table, c_m, c_hd, few, shading_spread=0.01)
+    known = relative_bounds(table, c_m, c_hd, few, log_shading_std=0.01)
     assert np.all(np.array(known) < np.array(loud))
 
 
@@ -65,16 +68,16 @@ def scene(table, melanin, stderr):
 
 def test_map_bound_is_evaluated_at_truth(table, rng):
     found, truth = scene(table, 0.02, 0.01)
-    bounds = cramer_rao(found, truth)
+    bounds = chromophore_bounds(found, truth)
     expected, _ = relative_bounds(
         table,
         np.array([0.02]),
         np.array([0.05]),
         np.full((1, 3), 0.005**2),
-        shading_spread=shading_prior.of_faces().spread,
+        log_shading_std=shading_prior.face_prior().sd,
     )
     np.testing.assert_allclose(bounds["melanin"], expected[0], rtol=1e-3)
-    assert cramer_rao(SkinAppearance({}, "simulated"), truth) == {}
+    assert chromophore_bounds(SkinAppearance({}, "simulated"), truth) == {}
 
 
 def test_inflated_standard_error_keeps_its_limit(table, rng):

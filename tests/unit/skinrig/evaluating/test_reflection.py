@@ -47,7 +47,7 @@ def truth(rng):
 
 
 def estimate(scale=1.0, **changes):
-    materials = brdf_tables.default()
+    materials = brdf_tables.default_basis()
     mix = np.full((BASIS_RANK, materials.size), 1 / materials.size)
     weights = {name: SkinMap(np.zeros((SIDE, SIDE)), "1") for name in WEIGHT_NAMES}
     found = maps() | weights | changes
@@ -80,7 +80,7 @@ def test_points_without_an_albedo_are_not_compared(truth, rng):
 
 
 def test_spheres_show_truth_and_estimate_alike(truth):
-    ((name, image, drawn),) = evaluation.spheres(estimate(), truth)
+    ((name, image, drawn),) = evaluation.render_spheres(estimate(), truth)
     assert name == "middle"
     np.testing.assert_allclose(drawn, image, atol=1e-6)
     # the light comes from the upper right
@@ -93,7 +93,7 @@ def test_sphere_is_same_for_spot_facing_aside():
         def reflect(light, camera):
             return np.repeat((np.maximum(light @ normal, 0) ** 3)[:, None], 3, axis=1)
 
-        return reflection_truth.sphere(reflect, normal)[0]
+        return reflection_truth.render_sphere(reflect, normal)[0]
 
     aside = np.array([0.6, 0.0, 0.8])
     np.testing.assert_allclose(facing(aside), facing(np.array([0.0, 0.0, 1.0])), atol=1e-12)
@@ -103,4 +103,4 @@ def test_without_test_or_lobes_nothing_is_claimed(truth, rng):
     bare = SkinAppearance(maps(), "simulated")
     assert evaluation.compare(bare, truth, rng=rng) is None
     assert evaluation.compare(estimate(), bare, rng=rng) is None
-    assert evaluation.spheres(bare, truth) == []
+    assert evaluation.render_spheres(bare, truth) == []

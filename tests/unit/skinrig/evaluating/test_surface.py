@@ -51,14 +51,14 @@ def test_known_tilt_is_measured_with_stated_coverage(rng):
     # mean of a Rayleigh distribution; 6400 draws know it to 0.7 %, 4 sigma are asked for
     assert row.mean == pytest.approx(0.8 * math.sqrt(math.pi / 2), rel=0.03)
     # a share of 0.6827 of 6400 has a deviation of 0.0058: 4 sigma
-    assert row.coverage.share == pytest.approx(0.6827, abs=0.024)
+    assert row.coverage.fraction == pytest.approx(0.6827, abs=0.024)
 
 
 def test_halved_standard_error_fails_coverage(rng):
     truth, maps = plane(60, rng), plane(80, rng)
     maps["normals"] = tilted(maps["normals"], 0.02, rng)
     found = appearance(maps, normals=np.full((80, 80, 3), 0.01))
-    assert evaluation.compare(found, appearance(truth), rng=rng)[0].coverage.share < 0.4
+    assert evaluation.compare(found, appearance(truth), rng=rng)[0].coverage.fraction < 0.4
 
 
 def test_albedo_is_evaluated_per_channel_relative_to_truth(rng):
@@ -69,13 +69,13 @@ def test_albedo_is_evaluated_per_channel_relative_to_truth(rng):
     assert red.bias == pytest.approx(2.0, abs=1e-4)
     assert green.median == pytest.approx(0.0, abs=1e-4)
     assert blue.median == pytest.approx(10.0, abs=1e-4)
-    assert blue.judged[1] > blue.judged[2] > red.judged[1]
+    assert blue.limit_check[1] > blue.limit_check[2] > red.limit_check[1]
 
 
 def test_texels_far_from_true_points_are_omitted(rng):
     truth, maps = plane(40, rng), plane(40, rng)
     maps["position"] = maps["position"] + [10.0, 0.0, 0.0]
-    pairs = evaluation.match(appearance(maps), appearance(truth))
+    pairs = evaluation.match_texels(appearance(maps), appearance(truth))
     assert 0 < len(pairs.rows) < 40 * 40
     assert pairs.distance_mm.max() <= evaluation.MAX_MATCH_DISTANCE_MM
 
@@ -83,4 +83,4 @@ def test_texels_far_from_true_points_are_omitted(rng):
 def test_a_scan_that_is_not_registered_is_named(rng):
     truth, maps = plane(10, rng), plane(10, rng, shift_mm=80.0)
     with pytest.raises(evaluation.SurfaceTruthError, match="is the scan registered"):
-        evaluation.match(appearance(maps), appearance(truth))
+        evaluation.match_texels(appearance(maps), appearance(truth))

@@ -70,7 +70,7 @@ def face(**more):
     }
     files = {
         BASIS_FILE: _basis_bytes(materials, 2, {2: (mix, 0.0)}),
-        "mesh.obj": FramedMesh.of(mesh).obj(1.0, "mm").encode(),
+        "mesh.obj": FramedMesh.of(mesh).to_obj(1.0, "mm").encode(),
     }
     fields = {"maps": maps, "source": "simulated", "files": files, "seed": 5, **more}
     return SkinAppearance(**fields)

@@ -14,7 +14,7 @@ from reconstruction.pipeline.dome.lobes import _basis_bytes
 from skinrig.cli import main
 from skinrig.exporting.brdfs import write
 from skinrig.exporting.export import export
-from skinrig.exporting.options import Delivery, ExportError, Place
+from skinrig.exporting.options import ExportError, ExportSettings, SkinPosition
 
 UP = np.array([0.0, 0.0, 1.0])
 R_D = np.array([0.5, 0.35, 0.25])
@@ -23,11 +23,11 @@ SIDE = 8
 
 @pytest.fixture(scope="module")
 def lobes():
-    materials = brdf_tables.default()
+    materials = brdf_tables.default_basis()
     mix = np.zeros((2, materials.size))
     mix[0, materials.names.index("ggx 0.22 eta 1.4")] = 1.0
     mix[1, materials.names.index("beckmann 0.5")] = 1.0
-    return materials, mix, materials.mixed(mix)
+    return materials, mix, materials.mix_materials(mix)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,12 @@ def looked_up(path, light, view):
 def exported(appearance, tmp_path_factory):
     folder = tmp_path_factory.mktemp("exports")
     for to in ("merl", "rgl"):
-        export(appearance, folder / to, to=to, delivery=Delivery(place=Place(0.2, 0.5, 0.9)))
+        export(
+            appearance,
+            folder / to,
+            to=to,
+            delivery=ExportSettings(place=SkinPosition(0.2, 0.5, 0.9)),
+        )
     return folder
 
 
@@ -121,8 +126,8 @@ def test_below_the_horizon_nothing_was_measured(exported):
 
 
 def test_a_region_is_the_mean_over_its_texels(appearance, tmp_path, lobes, rng):
-    place = Place(0.5, 0.5, radius_mm=100.0, diffuse=False)
-    done = export(appearance, tmp_path / "all", to="rgl", delivery=Delivery(place=place))
+    place = SkinPosition(0.5, 0.5, radius_mm=100.0, diffuse=False)
+    done = export(appearance, tmp_path / "all", to="rgl", delivery=ExportSettings(place=place))
     light, view = directions(rng, 500), directions(rng, 500)
     found = rgl.read(done.path / "place.bsdf").evaluate(light, view)[:, 0]
     true = lobes[2].evaluate(light, view, UP) @ [0.4, 0.5]
@@ -131,16 +136,16 @@ def test_a_region_is_the_mean_over_its_texels(appearance, tmp_path, lobes, rng):
 
 def test_positions_without_reflectance_are_named(appearance, tmp_path):
     with pytest.raises(ExportError, match="row 0, column 4"):
-        write(store.read(appearance), tmp_path, Place(0.5, 1.0), "rgl")
+        write(store.read(appearance), tmp_path, SkinPosition(0.5, 1.0), "rgl")
     with pytest.raises(ExportError, match=r"u 1\.5"):
-        Place(1.5, 0.0)
+        SkinPosition(1.5, 0.0)
     with pytest.raises(ExportError, match=r"expected one of .*merl, rgl"):
         export(appearance, tmp_path / "x", to="bsdf")
     read = store.read(appearance)
     dark = read.maps | {"r_d": SkinMap(np.full((SIDE, SIDE, 3), -0.01), "1")}
     store.write(tmp_path / "dark", SkinAppearance(dark, "simulated", files=read.files))
     with pytest.raises(ExportError, match="r_d is"):
-        write(store.read(tmp_path / "dark"), tmp_path, Place(0.5, 0.5), "rgl")
+        write(store.read(tmp_path / "dark"), tmp_path, SkinPosition(0.5, 0.5), "rgl")
 
 
 def test_command_line_exports_and_reports_errors(appearance, tmp_path, capsys):

@@ -7,12 +7,12 @@ from datetime import date
 
 import pytest
 
-from capture.session import ConsentError, Session, Subject
+from capture.session import ConsentError, Session, SubjectRecord
 from model import store
 from model.skin import SkinAppearance, SkinMap
 from model.traits.storage import load
 from skinrig import consent, report
-from skinrig.appearances.dynamic import parts_of
+from skinrig.appearances.dynamic import describe_parts
 from skinrig.cli import main
 from skinrig.editing import edit as editing
 from skinrig.editing.spots import SpotOrder
@@ -67,7 +67,7 @@ def test_model_of_two_sessions_needs_both_consents(dome, tmp_path):
     mixed = dataclasses.replace(model, parameters={**model.parameters, consent.CONSENT_KEY: both})
     for use, who in (("research", "P007"), ("teaching", "P042")):
         with pytest.raises(ConsentError, match=f"{who} has not agreed"):
-            consent.require(mixed, use, where="x", today=DAY)
+            consent.require_consent(mixed, use, folder="x", today=DAY)
 
 
 @pytest.fixture
@@ -89,7 +89,7 @@ def smiling(patch, tmp_path):
 def test_fitted_wrinkles_leave_within_the_consent_alone(dome, smiling, tmp_path):
     faces = [dome("n", state="neutral"), smiling("s")]
     fit_wrinkles(faces, out=tmp_path / "moving", size=32, mask_size=16)
-    (part,) = parts_of(store.read(tmp_path / "moving")).values()
+    (part,) = describe_parts(store.read(tmp_path / "moving")).values()
     assert part[consent.CONSENT_KEY] == [NARROW]
     refused_beyond(tmp_path / "moving", tmp_path, "metahuman")
 
@@ -122,7 +122,7 @@ def test_fitted_facial_color_leaves_within_the_consent_alone(tmp_path, monkeypat
     from skinrig.simulating.simulation import simulate_session
 
     create = Session.create
-    narrow = Subject("P042", ("research",), date(2030, 1, 1))
+    narrow = SubjectRecord("P042", ("research",), date(2030, 1, 1))
     monkeypatch.setattr(
         Session,
         "create",
@@ -151,14 +151,14 @@ def test_fitted_facial_color_leaves_within_the_consent_alone(tmp_path, monkeypat
         landmarks=marks,
         calibration=tmp_path / "calibration",
     )
-    (part,) = parts_of(store.read(tmp_path / "moving")).values()
+    (part,) = describe_parts(store.read(tmp_path / "moving")).values()
     assert part["source"] == "measured"
     refused_beyond(tmp_path / "moving", tmp_path, "metahuman")
 
 
 def test_an_edited_face_leaves_within_the_consent_alone(dome, tmp_path):
     order = editing.EditRequest(traits={}, spots=(SpotOrder("freckles", 1.0, 3.0),))
-    editing.edit(dome("dome"), order, out=tmp_path / "edited")
+    editing.edit_folder(dome("dome"), order, out=tmp_path / "edited")
     assert store.read(tmp_path / "edited").parameters["edit"]["spots"]
     refused_beyond(tmp_path / "edited", tmp_path, "mtlx")
 
@@ -180,16 +180,16 @@ def test_traits_carry_consent_of_their_training_subjects(tmp_path, dome_faces):
     space = tmp_path / "traits.npz"
     argv = ["fit", "traits", *map(str, paths), "--labels", str(labels), "--out", str(space)]
     assert main(argv) == 0
-    learned = consent.recorded(load(space))
+    learned = consent.read_consent(load(space))
     assert [one["pseudonym"] for one in learned] == [f"P{k:03d}" for k in range(len(paths) - 1)]
     edit = ["edit", str(target), "--space", str(space), "--out"]
     assert main([*edit, str(tmp_path / "tanned"), "--trait", "tan=0.5"]) == 0
-    assert consent.recorded(store.read(tmp_path / "tanned")) == learned
+    assert consent.read_consent(store.read(tmp_path / "tanned")) == learned
     with pytest.raises(ConsentError, match="P000 has not agreed"):
         export(tmp_path / "tanned", tmp_path / "out", to="maps", use="film", today=DAY)
     # an edit that takes nothing of them owes them nothing
     assert main([*edit, str(tmp_path / "same"), "--trait", "tan=0"]) == 0
-    assert consent.recorded(store.read(tmp_path / "same")) == []
+    assert consent.read_consent(store.read(tmp_path / "same")) == []
 
 
 @pytest.mark.long
@@ -242,15 +242,15 @@ def test_a_report_of_simulations_has_no_such_section(face_folder):
 
 
 def test_a_report_on_a_session_names_its_subject(tmp_path):
-    from skinrig.reporting.folders import Findings
+    from skinrig.reporting.folders import ReportInputs
 
     for name, source in (("measured", "measured"), ("simulated", "simulated")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "session.json").write_text(
             json.dumps({"source": source, "subject": NARROW})
         )
-    found = Findings(sessions=[tmp_path / "measured", tmp_path / "simulated"])
-    assert [(folder.name, one) for folder, one in provenance.records_of(found)] == [
+    found = ReportInputs(sessions=[tmp_path / "measured", tmp_path / "simulated"])
+    assert [(folder.name, one) for folder, one in provenance.read_consent_records(found)] == [
         ("measured", NARROW)
     ]
 

@@ -14,7 +14,7 @@ from skinrig import consent
 from skinrig.errors import UsageError
 from skinrig.exporting import export as exporting
 from skinrig.exporting.export import APPEARANCE_FORMATS
-from skinrig.exporting.options import Delivery, ExportError
+from skinrig.exporting.options import ExportError, ExportSettings
 
 NOW, DAY = datetime(2029, 5, 1, tzinfo=UTC), date(2029, 5, 1)
 LAST = date(2030, 1, 1)
@@ -71,16 +71,16 @@ def test_moving_face_needs_consent_of_every_part():
         "wrinkles": {"source": "measured", consent.CONSENT_KEY: [other]},
     }
     face = SkinAppearance({}, "measured", {"kind": "dynamic", "parts": parts})
-    assert consent.recorded(face) == [told, other]
-    consent.require(face, "research", where="x")
+    assert consent.read_consent(face) == [told, other]
+    consent.require_consent(face, "research", folder="x")
     with pytest.raises(ConsentError, match="subject b has not agreed"):
-        consent.require(face, "film", where="x")
+        consent.require_consent(face, "film", folder="x")
     del parts["wrinkles"][
         consent.CONSENT_KEY
     ]  # one part of a simulated face that was measured silently
     mixed = SkinAppearance({}, "simulated", {"kind": "dynamic", "parts": parts})
     with pytest.raises(ConsentError, match="does not record"):
-        consent.require(mixed, "research", where="x")
+        consent.require_consent(mixed, "research", folder="x")
 
 
 def test_result_of_measurements_without_consent_permits_no_use():
@@ -90,18 +90,18 @@ def test_result_of_measurements_without_consent_permits_no_use():
         {consent.CONSENT_KEY: consent.merge_consent(SkinAppearance({}, "measured"))},
     )
     with pytest.raises(ConsentError, match="unknown has not agreed"):
-        consent.require(made, "research", where="x")
+        consent.require_consent(made, "research", folder="x")
 
 
 def test_damaged_date_is_not_a_consent(patch):
     told = {**patch.consent, "consent_expires": "soon"}
     face = SkinAppearance({}, "measured", {consent.CONSENT_KEY: [told]})
     with pytest.raises(ConsentError, match="got 'soon'"):
-        consent.require(face, "research", where="x")
+        consent.require_consent(face, "research", folder="x")
 
 
 def test_target_texture_of_colors_needs_consent(measured, face_folder, tmp_path):
-    order = Delivery(onto=measured)
+    order = ExportSettings(onto=measured)
     with pytest.raises(ConsentError, match="P042"):
         exporting.export(
             face_folder, tmp_path / "out", to="maps", delivery=order, use="film", today=DAY
@@ -113,7 +113,7 @@ def test_the_same_appearance_gives_the_same_bytes(face_folder, tmp_path, to):
     if to == "usd":
         pytest.importorskip("pxr")
     for name in ("a", "b"):
-        order = Delivery(with_errors=True)
+        order = ExportSettings(with_errors=True)
         exporting.export(face_folder, tmp_path / name / "out", to=to, delivery=order, now=NOW)
     files = [p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*") if p.is_file()]
     assert len(files) > 4
@@ -155,7 +155,7 @@ def test_session_maps_carry_consent_and_older_are_updated(tmp_path):
     from capture import raw
     from capture.plan import flash_plan
     from capture.rig import load_rig
-    from capture.session import Session, Subject
+    from capture.session import Session, SubjectRecord
     from reconstruction.pipeline.recipes import reconstruct
 
     rig = load_rig("flash").resized(16)
@@ -164,10 +164,10 @@ def test_session_maps_carry_consent_and_older_are_updated(tmp_path):
         plan=flash_plan(rig, darks=2),
         rig=rig,
         devices={},
-        subject=Subject("P042", ("research",), LAST),
+        subject=SubjectRecord("P042", ("research",), LAST),
         source="measured",
     ) as made:
-        for number, (step, camera) in enumerate(made.todo()):
+        for number, (step, camera) in enumerate(made.pending_frames()):
             blob = raw.encode_dng(
                 np.full((10, 16), 600 + 300 * number, np.uint16),
                 pattern="RGGB",
@@ -209,7 +209,7 @@ def test_fitted_model_carries_consent_of_its_sources(measured, tmp_path):
 
     fit_reflectance(measured, out=tmp_path / "model")
     read = store.read(tmp_path / "model")
-    assert [one["pseudonym"] for one in consent.recorded(read)] == ["P042"]
+    assert [one["pseudonym"] for one in consent.read_consent(read)] == ["P042"]
 
 
 def test_an_expression_bears_the_consent_of_both_faces(tmp_path, rng):
@@ -239,7 +239,7 @@ def test_an_expression_bears_the_consent_of_both_faces(tmp_path, rng):
         "measured",
         {consent.CONSENT_KEY: [{"pseudonym": "other", **told}]},
     )
-    expression = applying.Expression({"smile": 1.0}, onto=applying.OtherFace(onto))
+    expression = applying.ExpressionRequest({"smile": 1.0}, onto=applying.TargetFace(onto))
     applying.apply_expression(tmp_path / "moving", expression, out=tmp_path / "shown")
-    shown = consent.recorded(store.read(tmp_path / "shown"))
+    shown = consent.read_consent(store.read(tmp_path / "shown"))
     assert [one["pseudonym"] for one in shown] == ["rig", "other"]

@@ -8,8 +8,14 @@ import OpenEXR
 import pytest
 
 from skinrig.errors import UnusableError
-from skinrig.exporting.images import CAMERA_SPACE, SRGB_SPACE, Image, ImageFolder, coded
-from skinrig.exporting.options import Delivery
+from skinrig.exporting.images import (
+    CAMERA_SPACE,
+    SRGB_SPACE,
+    ExportImage,
+    ImageFolder,
+    encode_png_codes,
+)
+from skinrig.exporting.options import ExportSettings
 
 
 @pytest.fixture
@@ -20,8 +26,8 @@ def ramp(rng):
 
 
 def test_exr_stores_values_exactly_with_unit(tmp_path, ramp):
-    out = ImageFolder(tmp_path, Delivery(udim="dot"))
-    name = out.exr(Image(name="depth", values=ramp, unit="mm", what="of the patch"))
+    out = ImageFolder(tmp_path, ExportSettings(udim="dot"))
+    name = out.write_exr(ExportImage(name="depth", values=ramp, unit="mm", what="of the patch"))
     assert name == "exr/depth.1001.exr"
     with OpenEXR.File(str(tmp_path / name)) as file:
         header = dict(file.header())
@@ -36,18 +42,20 @@ def test_exr_stores_values_exactly_with_unit(tmp_path, ramp):
 
 
 def test_only_linear_srgb_claims_srgb_primaries(tmp_path, ramp):
-    out = ImageFolder(tmp_path, Delivery())
+    out = ImageFolder(tmp_path, ExportSettings())
     claims = {}
     for space in (SRGB_SPACE, CAMERA_SPACE):
-        name = out.exr(Image(name=space[:3].lower(), values=ramp, unit="1", space=space))
+        name = out.write_exr(
+            ExportImage(name=space[:3].lower(), values=ramp, unit="1", space=space)
+        )
         with OpenEXR.File(str(tmp_path / name)) as file:
             claims[space] = "chromaticities" in file.header()
     assert claims == {SRGB_SPACE: True, CAMERA_SPACE: False}
 
 
 def test_16_bit_png_decodes_to_values_by_record(tmp_path, ramp):
-    out = ImageFolder(tmp_path, Delivery())
-    name = out.png(Image(name="depth", values=ramp, unit="mm", low=-0.5, high=3.5))
+    out = ImageFolder(tmp_path, ExportSettings())
+    name = out.write_png(ExportImage(name="depth", values=ramp, unit="mm", low=-0.5, high=3.5))
     told = out.records[name]
     codes = cv2.imread(str(tmp_path / name), cv2.IMREAD_UNCHANGED)[..., ::-1]
     assert codes.dtype == np.uint16
@@ -59,8 +67,8 @@ def test_16_bit_png_decodes_to_values_by_record(tmp_path, ramp):
 
 
 def test_color_png_uses_srgb_curve_and_counts_clipping(tmp_path, ramp):
-    out = ImageFolder(tmp_path, Delivery())
-    name = out.png(Image(name="color", values=ramp, unit="1", space=SRGB_SPACE))
+    out = ImageFolder(tmp_path, ExportSettings())
+    name = out.write_png(ExportImage(name="color", values=ramp, unit="1", space=SRGB_SPACE))
     codes = cv2.imread(str(tmp_path / name), cv2.IMREAD_UNCHANGED)[..., ::-1] / 65535.0
     linear = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
     inside = (ramp >= 0.0) & (ramp <= 1.0)
@@ -73,18 +81,18 @@ def test_color_png_uses_srgb_curve_and_counts_clipping(tmp_path, ramp):
 def test_value_range_uses_valid_values_only():
     values = np.array([[1.0, 2.0], [3.0, 1e6]])
     valid = np.array([[True, True], [True, False]])
-    codes, told = coded(Image(name="a", values=values, unit="1", valid=valid))
+    codes, told = encode_png_codes(ExportImage(name="a", values=values, unit="1", valid=valid))
     assert (told["low"], told["high"]) == (1.0, 3.0)
     assert codes.tolist() == [[0, 32768], [65535, 65535]]
 
 
 def test_constant_or_invalid_map_is_coded_without_division():
-    constant, told = coded(Image(name="a", values=np.full((2, 2), 4.0), unit="1"))
+    constant, told = encode_png_codes(ExportImage(name="a", values=np.full((2, 2), 4.0), unit="1"))
     assert (constant.tolist(), told["low"]) == ([[0, 0], [0, 0]], 4.0)
-    nothing = Image(
+    nothing = ExportImage(
         name="a", values=np.full((2, 2), np.nan), unit="1", valid=np.zeros((2, 2), bool)
     )
-    assert coded(nothing)[1]["clipped_share"] == 0.0
+    assert encode_png_codes(nothing)[1]["clipped_share"] == 0.0
 
 
 @pytest.mark.parametrize(
@@ -94,4 +102,4 @@ def test_invalid_option_value_is_refused_by_option_name(field, value):
     with pytest.raises(
         UnusableError, match=f"--{field.replace('_', '-')}: got '{value}', expected"
     ):
-        Delivery(**{field: value})
+        ExportSettings(**{field: value})

@@ -9,8 +9,8 @@ import pytest
 
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from skinrig.exporting import maps
-from skinrig.exporting.materials.tangents import FramedMesh, from_tangent
-from skinrig.exporting.options import Delivery, ExportError
+from skinrig.exporting.materials.tangents import FramedMesh, rotate_from_tangent
+from skinrig.exporting.options import ExportError, ExportSettings
 
 
 def read(path):
@@ -45,7 +45,7 @@ def picture(rng):
 
 
 def test_every_map_is_exported_with_values_and_record(picture, tmp_path):
-    assert maps.write(picture, tmp_path, Delivery()) == []
+    assert maps.write(picture, tmp_path, ExportSettings()) == []
     told = json.loads((tmp_path / "maps.json").read_text())
     for name, one in picture.maps.items():
         np.testing.assert_array_equal(read(tmp_path / f"exr/{name}.exr"), one.values)
@@ -59,7 +59,7 @@ def test_every_map_is_exported_with_values_and_record(picture, tmp_path):
 
 
 def test_chromophore_pngs_share_range_for_every_subject(picture, tmp_path):
-    maps.write(picture, tmp_path, Delivery(only=("melanin",)))
+    maps.write(picture, tmp_path, ExportSettings(only=("melanin",)))
     told = json.loads((tmp_path / "maps.json").read_text())["files"]["png/melanin.png"]
     assert (told["low"], told["high"]) == (0.0, 0.5)
     codes = cv2.imread(str(tmp_path / "png/melanin.png"), cv2.IMREAD_UNCHANGED)
@@ -68,7 +68,7 @@ def test_chromophore_pngs_share_range_for_every_subject(picture, tmp_path):
 
 
 def test_chromophores_are_packed_melanin_red_hemoglobin_green(picture, tmp_path):
-    maps.write(picture, tmp_path, Delivery())
+    maps.write(picture, tmp_path, ExportSettings())
     packed = read(tmp_path / "exr/chromophores.exr")
     np.testing.assert_array_equal(packed[..., 0], picture.maps["melanin"].values)
     np.testing.assert_array_equal(packed[..., 1], picture.maps["hemoglobin"].values)
@@ -82,7 +82,7 @@ def test_chromophores_are_packed_melanin_red_hemoglobin_green(picture, tmp_path)
 def test_camera_normals_green_is_flipped_for_directx_only(picture, tmp_path):
     for word in ("gl", "dx"):
         (tmp_path / word).mkdir()
-        maps.write(picture, tmp_path / word, Delivery(normal_y=word))
+        maps.write(picture, tmp_path / word, ExportSettings(normal_y=word))
     up, down = (read(tmp_path / word / "exr/normals.exr") for word in ("gl", "dx"))
     np.testing.assert_array_equal(up * [1, -1, 1], down)
     told = json.loads((tmp_path / "dx/maps.json").read_text())
@@ -91,19 +91,19 @@ def test_camera_normals_green_is_flipped_for_directx_only(picture, tmp_path):
 
 
 def test_dome_normals_keep_rig_frame_adding_tangent_frame(simulated_face, patch, tmp_path):
-    maps.write(simulated_face, tmp_path, Delivery(normal_y="dx"))
+    maps.write(simulated_face, tmp_path, ExportSettings(normal_y="dx"))
     world = simulated_face.maps["normals"].values
     np.testing.assert_array_equal(read(tmp_path / "exr/normals.exr"), world)
     tangent = read(tmp_path / "exr/normal_tangent.exr") * [1.0, -1.0, 1.0]
     axes, covered = FramedMesh.of(patch.mesh()).texel_frames(patch.side)
-    back = from_tangent(tangent, axes)
+    back = rotate_from_tangent(tangent, axes)
     known = covered & simulated_face.maps["normals"].valid
     assert np.linalg.norm(back - world, axis=-1)[known].max() < 1e-5
     assert (tmp_path / "files/mesh.obj").read_bytes() == simulated_face.files["mesh.obj"]
 
 
 def test_errors_and_masks_are_written_on_request(picture, tmp_path):
-    maps.write(picture, tmp_path, Delivery(with_errors=True, only=("melanin",)))
+    maps.write(picture, tmp_path, ExportSettings(with_errors=True, only=("melanin",)))
     np.testing.assert_array_equal(
         read(tmp_path / "exr/melanin.stderr.exr"), picture.maps["melanin"].stderr
     )
@@ -112,4 +112,4 @@ def test_errors_and_masks_are_written_on_request(picture, tmp_path):
 
 def test_missing_map_is_named_with_available_ones(picture, tmp_path):
     with pytest.raises(ExportError, match="got roughness, expected of diffuse, hemoglobin"):
-        maps.write(picture, tmp_path, Delivery(only=("roughness",)))
+        maps.write(picture, tmp_path, ExportSettings(only=("roughness",)))

@@ -46,10 +46,10 @@ def probe(measured=MEASURED, stderr=0.02, files=None):
 
 def test_sites_match_mean_face_distances_and_map_interpolates():
     position, nose = face()
-    found = probe_sites.place(probe(), position)
+    found = probe_sites.map_translucency(probe(), position)
     assert [site.name for site in found.sites] == list(MEASURED)
     for site in found.sites:
-        across, up = probe_sites.FROM_NOSE_MM[site.name]
+        across, up = probe_sites.SITE_OFFSETS_FROM_NOSE_MM[site.name]
         assert (
             np.hypot(site.position_mm[0] - nose[0] - across, site.position_mm[1] - nose[1] - up)
             < 4.0
@@ -66,10 +66,10 @@ def test_sites_match_mean_face_distances_and_map_interpolates():
 
 def test_the_layout_of_the_texture_does_not_matter():
     position, _ = face()
-    straight = probe_sites.place(probe(), position).map
+    straight = probe_sites.map_translucency(probe(), position).map
     order = np.random.default_rng(1).permutation(65 * 65)
     mixed = SkinMap(position.values.reshape(-1, 3)[order].reshape(65, 65, 3), "mm")
-    laid = probe_sites.place(probe(), mixed).map
+    laid = probe_sites.map_translucency(probe(), mixed).map
     np.testing.assert_allclose(
         laid.values.reshape(-1, 3), straight.values.reshape(-1, 3)[order], rtol=1e-5
     )
@@ -79,7 +79,7 @@ def test_table_sets_site_positions_and_names_others(tmp_path):
     position, _ = face()
     table = tmp_path / "sites.csv"
     table.write_text("name,x,y\ncheek,50,40\nscar,20,20\n")
-    found = probe_sites.place(
+    found = probe_sites.map_translucency(
         probe({**MEASURED, "scar": (0.6, 1.0, 1.5)}), position, landmarks=table
     )
     at = {site.name: site.texel for site in found.sites}
@@ -92,50 +92,50 @@ def test_table_sets_site_positions_and_names_others(tmp_path):
 def test_unknown_or_unscanned_sites_are_omitted_with_reason():
     position, _ = face()
     upper = SkinMap(position.values, "mm", valid=position.values[..., 1] > -20.0)
-    found = probe_sites.place(probe({**MEASURED, "elbow": (0.6, 1.0, 1.5)}), upper)
+    found = probe_sites.map_translucency(probe({**MEASURED, "elbow": (0.6, 1.0, 1.5)}), upper)
     why = dict(found.left_out)
     assert "not known" in why["elbow"]
     assert "the scan ends" in why["chin"]
     assert [site.name for site in found.sites] == ["forehead", "cheek"]
     np.testing.assert_array_equal(found.map.valid, upper.valid)
     with pytest.raises(ProbeSiteError, match="elbow: its place"):
-        probe_sites.place(probe({"elbow": (0.6, 1.0, 1.5)}), position)
+        probe_sites.map_translucency(probe({"elbow": (0.6, 1.0, 1.5)}), position)
 
 
 def test_missing_channel_fit_is_omitted_all_missing_masked():
     position, _ = face()
-    found = probe_sites.place(probe({**MEASURED, "cheek": (None, 1.1, 1.6)}), position)
+    found = probe_sites.map_translucency(probe({**MEASURED, "cheek": (None, 1.1, 1.6)}), position)
     assert [what for what, _ in found.left_out] == ["cheek, channel 0"]
     assert found.map.valid.all()
     without_red = {name: (None, *values[1:]) for name, values in MEASURED.items()}
-    assert not probe_sites.place(probe(without_red), position).map.valid.any()
+    assert not probe_sites.map_translucency(probe(without_red), position).map.valid.any()
     nothing = dict.fromkeys(MEASURED, (None, None, None))
     with pytest.raises(TranslucencyError, match="no usable measurement"):
-        probe_sites.place(probe(nothing), position)
+        probe_sites.map_translucency(probe(nothing), position)
 
 
 def test_flat_patches_and_single_texels_get_map():
     flat, _ = face(flat=True)
-    assert probe_sites.place(probe(), flat).map.valid.all()
+    assert probe_sites.map_translucency(probe(), flat).map.valid.all()
     one = SkinMap(np.zeros((1, 1, 3), np.float32), "mm")
     with pytest.raises(ProbeSiteError, match="the scan ends"):
-        probe_sites.place(probe(), one)
+        probe_sites.map_translucency(probe(), one)
     none = SkinMap(np.zeros((4, 4, 3), np.float32), "mm", valid=np.zeros((4, 4), bool))
     with pytest.raises(ProbeSiteError, match="no valid texel"):
-        probe_sites.place(probe(), none)
+        probe_sites.map_translucency(probe(), none)
 
 
 @pytest.mark.parametrize("files", [{}, {"subsurface.json": b"{}"}, {"subsurface.json": b"\xff"}])
 def test_a_probe_without_sites_is_named(files):
     with pytest.raises(ProbeSiteError, match=r"subsurface\.json"):
-        probe_sites.place(probe(files=files), face()[0])
+        probe_sites.map_translucency(probe(files=files), face()[0])
 
 
 @pytest.mark.parametrize("seed", [0, 5])
 def test_simulated_head_sites_are_found_within_a_centimeter(seed):
     mesh = build_head(np.random.default_rng(seed), columns=84, rows=90)
     points = mesh.vertices_mm[: len(mesh.vertices_mm) // 85 * 85]
-    found = probe_sites.place(probe(), SkinMap(points.reshape(-1, 85, 3), "mm"))
+    found = probe_sites.map_translucency(probe(), SkinMap(points.reshape(-1, 85, 3), "mm"))
     for site in found.sites:
         true = mesh.vertices_mm[np.argmin(np.linalg.norm(mesh.uv - SITE_UV[site.name], axis=1))]
         # below the chin skin faces down: places one behind the other are one height

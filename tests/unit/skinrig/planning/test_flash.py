@@ -67,7 +67,7 @@ def test_plan_omits_exposures_unneeded_for_wanted_errors(small, tmp_path, capsys
     assert document["knobs"]["power"] < 1.0
     assert document["saved_seconds"] > 20.0
     assert all(one["median"] <= one["wanted"] for one in document["forecasts"])
-    told = plans.lines(plans.choose("flash", want))  # figures as people read them
+    told = plans.format_choice(plans.choose("flash", want))  # figures as people read them
     assert not any(re.search(r"\d\.\d{5}|[{}_]", line) for line in told), told
     # half the light would not have been enough
     look = flash.simulate_observation(None, "III")

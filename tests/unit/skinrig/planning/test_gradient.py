@@ -13,7 +13,7 @@ from capture.plan.steps import LIGHT_PATTERNS
 from capture.rig import load_rig
 from skinrig.cli import main
 from skinrig.planning import gradient, plans
-from skinrig.planning.gradient import PATTERN_SETS, Setting
+from skinrig.planning.gradient import PATTERN_SETS, GradientScanSettings
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def small(monkeypatch, look):
 @pytest.mark.long
 def test_complements_and_longer_exposures_lower_the_error(look):
     def median(patterns, exposure_s):
-        return gradient.predict(look, Setting(patterns, exposure_s, 2)).median_rad
+        return gradient.predict(look, GradientScanSettings(patterns, exposure_s, 2)).median_rad
 
     least = median(PATTERN_SETS[0], 0.009)
     assert median(PATTERN_SETS[0], 0.018) < least
@@ -73,7 +73,7 @@ def test_unreachable_error_reports_reason(small, capsys, monkeypatch):
 def test_saturating_or_overloading_exposures_are_not_candidates(rig, look):
     bright = replace(look, rates={key: 1000.0 * rate for key, rate in look.rates.items()})
     assert not list(gradient.candidates(rig, bright))
-    seconds = [plan.estimated_s(rig) for _, plan in gradient.candidates(rig, look)]
+    seconds = [plan.estimate_duration_s(rig) for _, plan in gradient.candidates(rig, look)]
     assert seconds == sorted(seconds)
     assert len(seconds) > 10
 
@@ -81,7 +81,7 @@ def test_saturating_or_overloading_exposures_are_not_candidates(rig, look):
 def test_patterns_not_determining_gradient_are_refused(rig):
     plan = gradient_plan(rig, angles=[0], steps=(0, 0), patterns=("full", "x", "y"))
     with pytest.raises(plans.PlanningError, match="z or -z"):
-        gradient.setting_of(plan)
+        gradient.read_settings(plan)
 
 
 @pytest.mark.long
@@ -89,7 +89,7 @@ def test_normals_from_four_patterns_match_forecast_error(rig, tmp_path):
     from reconstruction.gradient_normals.estimation import estimate_roughness, from_patterns
 
     look = gradient.simulate_observation(rig, "III", seed=3, side_px=96)
-    setting = Setting(PATTERN_SETS[0], 0.018, 0)
+    setting = GradientScanSettings(PATTERN_SETS[0], 0.018, 0)
     found = gradient.predict(look, setting)
     rng = np.random.default_rng(1)
     gain, floor = look.chip.noise_profile(setting.exposure_s)

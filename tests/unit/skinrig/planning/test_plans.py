@@ -27,19 +27,19 @@ from skinrig.planning import dome, dome_observation, plans
 )
 def test_invalid_want_is_reported(text, word):
     with pytest.raises(plans.PlanningError, match=word):
-        plans.read_wants(text, "dome")
+        plans.parse_wants(text, "dome")
 
 
 def test_invalid_wanted_number_is_reported_as_written():
     with pytest.raises(plans.PlanningError, match="got melanin<=0%, expected a number above 0"):
-        plans.read_wants("melanin<=0%", "flash")
+        plans.parse_wants("melanin<=0%", "flash")
 
 
 def test_errors_by_site_are_reported_with_colors():
     rig = load_rig("flash")
     knobs = {plans.PERCENT_BY_SITE: {"chin": [0.444, 1.399, math.inf]}}
-    choice = plans.Choice(rig, flash_plan(rig), (), 2.0, knobs, ())
-    told = plans.lines(choice)
+    choice = plans.PlanChoice(rig, flash_plan(rig), (), 2.0, knobs, ())
+    told = plans.format_choice(choice)
     assert "percent by site: chin red 0.444 %, green 1.4 %, blue not told" in told
 
 
@@ -51,8 +51,8 @@ def test_rig_without_own_plans_is_reported(capsys):
 def test_quantity_without_estimate_is_reported_without_infinite_error():
     rig = load_rig("flash")
     told = plans.Forecast("hemoglobin", "%", math.inf, (math.inf, math.inf), 20.0)
-    choice = plans.Choice(rig, flash_plan(rig), (told,), 2.0, {}, ())
-    first = plans.lines(choice)[0]
+    choice = plans.PlanChoice(rig, flash_plan(rig), (told,), 2.0, {}, ())
+    first = plans.format_choice(choice)[0]
     assert "inf" not in first
     assert "hemoglobin keeps no estimate" in first
     assert "wanted 20 %: NOT REACHED" in first
@@ -89,7 +89,7 @@ def test_albedo_forecast_uses_subject_detail_and_specular(rig, look):
     every = range(len(rig.views)), range(len(rig.lights))
 
     def forecast(sight):
-        told = light_selection.predict(sight.information(every[0]), every[1], least=10)
+        told = light_selection.predict_errors(sight.information(every[0]), every[1], min_lights=10)
         return dome._r_d_error(told, sight)
 
     assert look.unresolved.shape == look.r_d.shape == (300, 3)

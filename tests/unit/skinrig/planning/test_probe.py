@@ -11,7 +11,7 @@ from capture.plan.probe import exposure_series_s, probe_plan
 from capture.rig import load_rig
 from skinrig.cli import main
 from skinrig.planning import plans, probe, probe_forecast, probe_observation
-from skinrig.planning.probe import Setting
+from skinrig.planning.probe import ProbeSettings
 
 SITES = ("forehead", "cheek")
 
@@ -35,7 +35,7 @@ def small(monkeypatch, look):
 
 def test_longer_exposures_and_placements_approach_common_error(look):
     def sigma(*exposures_s, repeats=1, darks=2):
-        found = probe.predict(look, Setting(SITES, exposures_s, repeats, darks))
+        found = probe.predict(look, ProbeSettings(SITES, exposures_s, repeats, darks))
         assert (found.sigma >= found.common).all()
         return np.median(found.sigma)
 
@@ -48,7 +48,7 @@ def test_longer_exposures_and_placements_approach_common_error(look):
 def test_fits_shared_by_plans_keep_forecast_bit_exactly(look):
     memory = {}
     settings = [
-        Setting(SITES, exposures_s, repeats, darks)
+        ProbeSettings(SITES, exposures_s, repeats, darks)
         for exposures_s in ((0.00115, 0.01), (0.00115, 0.1))
         for repeats in (1, 4)
         for darks in (1, 2)
@@ -68,7 +68,7 @@ def test_interval_is_wide_when_fits_share_error():
 
     def ends(shared):
         sigma, valid, measured = told
-        found = probe.Prediction(("x",) * 12, sigma, shared, sigma, valid, measured)
+        found = probe.ProbePrediction(("x",) * 12, sigma, shared, sigma, valid, measured)
         return np.array(found.interval()) / found.median
 
     # one error alone: |z| over its median 0.6745, of which 68 % lie between 0.299 and 2.083
@@ -103,7 +103,7 @@ def test_quickest_plan_reaching_error_omits_exposures(small, tmp_path, capsys):
     assert document["reached"]
     assert document["saved_seconds"] > 60.0
     assert any("exposures" in what for what, _ in document["left_out"])
-    assert document["path"][-1]["seconds"] <= plan.estimated_s(load_rig("probe")) + 1e-6
+    assert document["path"][-1]["seconds"] <= plan.estimate_duration_s(load_rig("probe")) + 1e-6
     assert main(["plan", "probe", "--forecast", str(file), "--json"]) == 0
     again = json.loads(capsys.readouterr().out)
     assert again["forecasts"][0]["median"] == pytest.approx(document["forecasts"][0]["median"])
@@ -117,7 +117,7 @@ def test_certificate_limit_reports_more_exposures_will_not_help(small, capsys):
 
 
 def test_site_is_omitted_only_if_others_determine_quantity(look):
-    setting = Setting(SITES, exposure_series_s(), 1, 2)
+    setting = ProbeSettings(SITES, exposure_series_s(), 1, 2)
     plan = probe_plan(load_rig("probe"), sites=SITES)
 
     def least(limit):
@@ -125,14 +125,14 @@ def test_site_is_omitted_only_if_others_determine_quantity(look):
             left = found.sigma[~found.measured]
             return not left.size or float(np.median(left)) <= limit
 
-        return probe.without_sites(look, setting, plan, good)
+        return probe.remove_sites(look, setting, plan, good)
 
     kept, whole = least(1e-3)
     assert kept.sites == SITES
     assert len(whole.steps) == len(plan.steps)
     kept, fewer = least(10.0)
     assert len(kept.sites) == 1
-    assert probe.setting_of(fewer).sites == kept.sites
+    assert probe.read_settings(fewer).sites == kept.sites
 
 
 def test_plans_without_skin_or_darks_are_refused(rig):
@@ -140,4 +140,4 @@ def test_plans_without_skin_or_darks_are_refused(rig):
     for kind, word in (("fibres", "no series on skin"), ("dark", "without light")):
         some = replace(plan, steps=tuple(s for s in plan.steps if s.kind != kind))
         with pytest.raises(plans.PlanningError, match=word):
-            probe.setting_of(some)
+            probe.read_settings(some)

@@ -14,7 +14,7 @@ from skinrig.rendering.lights import (
     environment_lights,
     read_environment,
 )
-from skinrig.rendering.request import RenderRig, lights_of, subpixels_of
+from skinrig.rendering.request import RenderRig, parse_lights, parse_subpixels
 
 
 @pytest.fixture
@@ -35,9 +35,9 @@ def test_rig_light_is_at_nominal_position_and_scale(stage):
 def test_calibrated_light_matches_its_table_everywhere():
     rig = load_rig("dome").subset(lights=["L010", "L020"])
     nominal = LightTable.nominal(rig, white_per_s=3.0)
-    lamp = Light.of_table(nominal, "L020", radius_mm=10.0)
+    lamp = Light.from_table(nominal, "L020", radius_mm=10.0)
     points = np.random.default_rng(0).normal(size=(20, 3)) * 80.0
-    towards, white = lamp.reach(points)
+    towards, white = lamp.directions_and_irradiance(points)
     expected_towards, expected = nominal.irradiance(points)
     np.testing.assert_allclose(towards, expected_towards[1], atol=1e-12)
     np.testing.assert_allclose(white, expected[1], rtol=1e-12)
@@ -82,10 +82,10 @@ def test_rig_view_keeps_field_at_any_size(stage):
 
 
 def test_numbers_of_rays_are_squares():
-    assert subpixels_of(9) == 3
+    assert parse_subpixels(9) == 3
     for wrong in (0, 2, -4, 1024):
         with pytest.raises(UnusableError, match="--samples"):
-            subpixels_of(wrong)
+            parse_subpixels(wrong)
 
 
 @pytest.mark.parametrize(
@@ -152,7 +152,7 @@ def test_an_environment_without_light_is_refused(image):
 def test_an_environment_is_read_from_a_file(tmp_path, stage):
     store.write_exr(tmp_path / "gray.exr", np.full((4, 8), 0.5, np.float32))
     assert read_environment(tmp_path / "gray.exr").shape == (4, 8, 3)
-    found = lights_of(
+    found = parse_lights(
         stage,
         ["0,0,1"],
         radius_mm=None,
@@ -162,4 +162,4 @@ def test_an_environment_is_read_from_a_file(tmp_path, stage):
     )
     assert [light.name for light in found] == ["0,0,1"] + 3 * ["environment"]
     with pytest.raises(UsageError, match="got none"):
-        lights_of(stage, [], radius_mm=None, environment=None, environment_count=3, seed=0)
+        parse_lights(stage, [], radius_mm=None, environment=None, environment_count=3, seed=0)

@@ -8,12 +8,12 @@ from model.brdf import tables as brdf_tables
 from model.skin_reflectance import SkinReflectance
 from rigsim.geometry.mesh import build_mesh
 from skinrig.rendering import folder, shadow
-from skinrig.rendering.bases import nearest_shares, reduced
+from skinrig.rendering.bases import fit_nearest_weights, reduce_lobes
 from skinrig.rendering.camera import RenderingError
-from skinrig.rendering.folder import TONE_KNEE, Panel, sheet, tone
+from skinrig.rendering.folder import TONE_KNEE, Panel, apply_tone_curve, encode_sheet
 from skinrig.rendering.geometry import FittedSurface
 from skinrig.rendering.lookup_kernels import MAX_TEXEL_DISTANCE, look_up
-from skinrig.rendering.shadow import MAX_SIGMA_TR_PER_MM, MIN_SIGMA_TR_PER_MM, Boundary
+from skinrig.rendering.shadow import MAX_SIGMA_TR_PER_MM, MIN_SIGMA_TR_PER_MM, ShadowBoundary
 
 SIZE = 48
 
@@ -89,30 +89,30 @@ def test_points_without_own_texel_use_surface_neighborhood(model):
 
 
 def test_weights_exact_with_fewer_mixtures_are_found(model):
-    two = reduced(model, 2, rng=np.random.default_rng(0))
+    two = reduce_lobes(model, 2, rng=np.random.default_rng(0))
     assert two.lobes.size == 2
     up = np.array([0.0, 0.0, 1.0])
     light = np.array([0.3, 0.1, 0.95]) / np.linalg.norm([0.3, 0.1, 0.95])
     old = model.weights @ model.lobes.evaluate(light, up, up)
     new = two.weights @ two.lobes.evaluate(light, up, up)
     np.testing.assert_allclose(new, old, rtol=0.02)
-    one = reduced(model, 1, rng=np.random.default_rng(0))
+    one = reduce_lobes(model, 1, rng=np.random.default_rng(0))
     worse = one.weights @ one.lobes.evaluate(light, up, up)
     assert np.abs(worse / old - 1.0).max() > 3.0 * np.abs(new / old - 1.0).max()
-    assert reduced(model, 3, rng=np.random.default_rng(0)) is model
+    assert reduce_lobes(model, 3, rng=np.random.default_rng(0)) is model
 
 
 def test_nearest_weights_are_nonnegative_and_keep_mixture_weights(model):
     mix = np.array([[1.0, 0.0, 0.0], [0.0, 0.3, 0.7]])
     shares = np.array([[2.0, 0.3, 0.7], [0.0, 0.0, 0.0], [0.0, 0.6, 1.4]])
-    found = nearest_shares(shares, mix, model.lobes)
+    found = fit_nearest_weights(shares, mix, model.lobes)
     np.testing.assert_allclose(found, [[2.0, 1.0], [0.0, 0.0], [0.0, 2.0]], atol=2e-3)
-    assert np.all(nearest_shares(np.eye(3), mix, model.lobes) >= 0.0)
+    assert np.all(fit_nearest_weights(np.eye(3), mix, model.lobes) >= 0.0)
 
 
 def test_more_lobes_than_a_model_has_are_refused(model):
     with pytest.raises(RenderingError, match="reconstruct SESSION --rank 24"):
-        reduced(model, 24, rng=np.random.default_rng(0))
+        reduce_lobes(model, 24, rng=np.random.default_rng(0))
 
 
 @pytest.mark.long
@@ -125,10 +125,10 @@ def test_shadow_widens_with_smaller_sigma_tr(model, monkeypatch):
     light is left, 0.1 mm and a pixel.
     """
     monkeypatch.setattr(shadow, "PATCH_TEXELS", 128)
-    boundary = Boundary.on_plane(model, size_px=160)
+    boundary = ShadowBoundary.on_plane(model, size_px=160)
     rise = {}
     for sigma in (MIN_SIGMA_TR_PER_MM, MAX_SIGMA_TR_PER_MM, None):
-        rise[sigma] = shadow.rise_mm(*shadow.profile(boundary.shown(sigma, subpixels=1)))
+        rise[sigma] = shadow.rise_mm(*shadow.profile(boundary.render(sigma, subpixels=1)))
     assert np.all(rise[None] < 0.35)
     assert np.all(rise[MIN_SIGMA_TR_PER_MM] > rise[MAX_SIGMA_TR_PER_MM])
     ratio = rise[MIN_SIGMA_TR_PER_MM][:2] / rise[MAX_SIGMA_TR_PER_MM][:2]
@@ -138,7 +138,7 @@ def test_shadow_widens_with_smaller_sigma_tr(model, monkeypatch):
 
 def test_shadow_is_right_of_middle(model, monkeypatch):
     monkeypatch.setattr(shadow, "PATCH_TEXELS", 32)
-    seen = Boundary.on_plane(model, size_px=48).shown(None, subpixels=1)
+    seen = ShadowBoundary.on_plane(model, size_px=48).render(None, subpixels=1)
     place, level = shadow.profile(seen)
     assert np.all(level[place < -0.6, 1] > 0.2)
     assert np.all(level[place > 0.6] == 0.0)
@@ -146,8 +146,10 @@ def test_shadow_is_right_of_middle(model, monkeypatch):
 
 def test_tones_are_linear_below_knee_and_grow_above():
     linear = np.array([0.0, 0.2, 0.4])
-    np.testing.assert_array_equal(tone(2.0 * linear, 0.5), tone(linear, 1.0))
-    bright = tone(np.array([TONE_KNEE, 1.0, 1.5, 2.0]), 1.0).astype(int)
+    np.testing.assert_array_equal(
+        apply_tone_curve(2.0 * linear, 0.5), apply_tone_curve(linear, 1.0)
+    )
+    bright = apply_tone_curve(np.array([TONE_KNEE, 1.0, 1.5, 2.0]), 1.0).astype(int)
     assert np.all(np.diff(bright) > 0)
 
 
@@ -157,13 +159,13 @@ def test_a_sheet_shows_its_panels_pixel_by_pixel():
 
     image = np.zeros((20, 150, 3), np.uint8)
     image[3, 5] = (255, 0, 0)
-    data = sheet([[Panel("one", image), Panel("two", image)]], title="both")
+    data = encode_sheet([[Panel("one", image), Panel("two", image)]], title="both")
     shown = matplotlib_image.imread(io.BytesIO(data), format="png")[..., :3]
     reds = np.argwhere((shown == (1.0, 0.0, 0.0)).all(axis=-1))
     assert len(reds) == 2
     assert reds[1, 1] - reds[0, 1] == 150 + 8
     with pytest.raises(ValueError, match="one"):
-        sheet([[Panel("one", image), Panel("two", image[:10])]])
+        encode_sheet([[Panel("one", image), Panel("two", image[:10])]])
 
 
 def test_rendering_replaces_only_older_rendering(tmp_path):

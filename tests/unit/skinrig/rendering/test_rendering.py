@@ -7,14 +7,20 @@ import pytest
 
 from model.brdf import microfacet
 from model.brdf import tables as brdf_tables
-from model.skin_reflectance import SkinReflectance, transmitted
+from model.skin_reflectance import SkinReflectance, transmittance
 from rigsim.geometry.atlas import dilate_texture, unwrap
 from rigsim.geometry.mesh import build_mesh
 from skinrig.rendering import camera as rendering_camera
 from skinrig.rendering.camera import RenderingError
-from skinrig.rendering.geometry import FittedSurface, GeometryError, own_mesh, parse_mesh, read_mesh
+from skinrig.rendering.geometry import (
+    FittedSurface,
+    GeometryError,
+    parse_mesh,
+    read_mesh,
+    read_own_mesh,
+)
 from skinrig.rendering.lights import Light
-from skinrig.rendering.render import render as render_laid
+from skinrig.rendering.render import render_surface as render_laid
 
 FRONT = (0.0, 0.0, 700.0)
 
@@ -90,7 +96,7 @@ def middle(image):
 
 
 def front_camera(size=33, fov=6.0):
-    return rendering_camera.looking_at(FRONT, fov_deg=fov, size_px=(size, size))
+    return rendering_camera.look_at(FRONT, fov_deg=fov, size_px=(size, size))
 
 
 def test_white_patch_facing_light_shows_double_boundary_transmittance(matt):
@@ -98,7 +104,7 @@ def test_white_patch_facing_light_shows_double_boundary_transmittance(matt):
     seen = render(
         model_on(mesh, matt), mesh, front_camera(), Light(name="front", direction=(0, 0, 1))
     )
-    passed = transmitted(1.0) ** 2
+    passed = transmittance(1.0) ** 2
     np.testing.assert_allclose(middle(seen.radiance), passed, rtol=1e-4)
     assert np.all(seen.surface == 0.0)
     assert seen.covered.all()
@@ -112,7 +118,7 @@ def test_patch_irradiance_follows_cosine_and_transmittance(matt):
     )
     seen = render(model_on(mesh, matt, r_d=(0.6, 0.4, 0.2)), mesh, front_camera(), light)
     cosine = np.cos(1.0)
-    expected = transmitted(cosine) * transmitted(1.0) * cosine * np.array([1.2, 0.4, 0.1])
+    expected = transmittance(cosine) * transmittance(1.0) * cosine * np.array([1.2, 0.4, 0.1])
     np.testing.assert_allclose(middle(seen.radiance), expected, rtol=1e-4)
 
 
@@ -120,7 +126,7 @@ def test_point_light_falls_with_squared_distance(matt):
     mesh = plane()
     near = Light(name="near", position_mm=(0.0, 0.0, 300.0), reference_mm=600.0)
     seen = render(model_on(mesh, matt), mesh, front_camera(), near)
-    np.testing.assert_allclose(middle(seen.radiance), 4.0 * transmitted(1.0) ** 2, rtol=1e-4)
+    np.testing.assert_allclose(middle(seen.radiance), 4.0 * transmittance(1.0) ** 2, rtol=1e-4)
 
 
 def test_surface_term_matches_tables_at_known_pixel(shiny):
@@ -157,7 +163,7 @@ def test_card_shadow_is_where_geometry_predicts(matt):
     corners = np.array([[0.0, -80, 40], [80, -80, 40], [80, 80, 40], [0, 80, 40]])
     card = build_mesh(corners, [[0, 1, 2], [0, 2, 3]], np.zeros((4, 2)))
     light = Light(name="aslant", direction=(1.0, 0.0, 1.0))  # shadow 40 mm to the left of the card
-    camera = rendering_camera.looking_at(FRONT, fov_deg=8.0, size_px=(61, 61))
+    camera = rendering_camera.look_at(FRONT, fov_deg=8.0, size_px=(61, 61))
     seen = render(model_on(mesh, matt), mesh, camera, light, blockers=card)
     column = round(float(camera.project([[-40.0, 0.0, 0.0]])[0, 0]))
     bright = seen.radiance[30, :, 1] > 0.1
@@ -171,7 +177,7 @@ def test_wide_light_soft_shadow_matches_geometry(matt):
     mesh = plane()
     corners = np.array([[0.0, -80, 40], [80, -80, 40], [80, 80, 40], [0, 80, 40]])
     card = build_mesh(corners, [[0, 1, 2], [0, 2, 3]], np.zeros((4, 2)))
-    camera = rendering_camera.looking_at((-100.0, 0.0, 700.0), fov_deg=7.0, size_px=(121, 3))
+    camera = rendering_camera.look_at((-100.0, 0.0, 700.0), fov_deg=7.0, size_px=(121, 3))
     light = Light(name="sun", direction=(0.0, 0.0, 1.0), radius=0.1)
     seen = render(
         model_on(mesh, matt), mesh, camera, light, blockers=card, subpixels=3, shadow_samples=16
@@ -216,7 +222,7 @@ def test_less_light_comes_back_than_arrives(shiny):
     room = [Light(name="room", direction=tuple(w), intensity=(2 / 200,) * 3) for w in directions]
     for tilt in (0.0, 1.2):
         place = 700.0 * np.array([np.sin(tilt), 0.0, np.cos(tilt)])
-        camera = rendering_camera.looking_at(place, fov_deg=1.0, size_px=(3, 3))
+        camera = rendering_camera.look_at(place, fov_deg=1.0, size_px=(3, 3))
         shown = middle(render(model, mesh, camera, room, subpixels=1).radiance)
         assert 0.5 < shown.max() < 1.05  # 200 directions leave 5 % of noise
 
@@ -241,7 +247,7 @@ def test_face_rotated_with_light_and_camera_looks_same(shiny):
     )
     turn = rotation()
     moved = build_mesh(mesh.vertices_mm @ turn.T, mesh.faces, mesh.uv)
-    camera = rendering_camera.looking_at(
+    camera = rendering_camera.look_at(
         turn @ FRONT, up=turn @ (0, 1, 0), fov_deg=8.0, size_px=(25, 25)
     )
     lamp = Light(name="a", direction=tuple(turn @ light))
@@ -267,7 +273,7 @@ def test_stretched_skin_has_flatter_relief(matt):
     laid = FittedSurface.of(model, wide, rest=mesh)
     normal = laid.normals[16, 16]
     # the slope 0.6 / 0.8 becomes half as steep; heights are kept, the smooth normal is not scaled
-    assert laid.carried
+    assert laid.is_transferred
     assert normal[0] / normal[2] == pytest.approx(0.375, rel=1e-4)
 
 
@@ -289,7 +295,7 @@ def test_unmeasured_texels_are_distinguished_from_measured(matt):
     assert not seen.covered[right].any()
     assert seen.covered[left].all()
     inner = left & (seen.uv[..., 0] > 0.5)
-    np.testing.assert_allclose(seen.radiance[inner], transmitted(1.0) ** 2, rtol=3e-3)
+    np.testing.assert_allclose(seen.radiance[inner], transmittance(1.0) ** 2, rtol=3e-3)
 
 
 @pytest.mark.parametrize(
@@ -299,7 +305,7 @@ def test_unmeasured_texels_are_distinguished_from_measured(matt):
 def test_camera_missing_face_is_refused(matt, place, says):
     mesh = plane()
     target = (0.0, 0.0, 0.0) if "behind" in says else (0.0, 3000.0, 0.0)
-    camera = rendering_camera.looking_at(place, target_mm=target, size_px=(16, 16))
+    camera = rendering_camera.look_at(place, target_mm=target, size_px=(16, 16))
     with pytest.raises(RenderingError, match=says):
         render(model_on(mesh, matt), mesh, camera, Light(name="a", direction=(0, 0, 1)))
 
@@ -344,7 +350,7 @@ def test_an_appearance_without_a_mesh_is_refused():
     from model.skin import SkinAppearance
 
     with pytest.raises(GeometryError, match="skinrig reconstruct"):
-        own_mesh(SkinAppearance({}, "simulated"))
+        read_own_mesh(SkinAppearance({}, "simulated"))
 
 
 def test_under_even_light_spreading_changes_nothing(matt):
@@ -374,7 +380,7 @@ def test_extreme_skin_gives_finite_images_proportional_to_albedo(matt, r_d, sigm
         subsurface="dipole",
         subpixels=1,
     )
-    passed = transmitted(1.0) ** 2
+    passed = transmittance(1.0) ** 2
     expected = np.array([r_d, 0.5, 0.1]) * passed
     np.testing.assert_allclose(middle(seen.radiance), expected, rtol=0.01, atol=1e-9)
 

@@ -9,7 +9,7 @@ import pytest
 
 from model import store
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
-from skinrig import whole_file
+from skinrig import atomic_file
 from skinrig.appearances.front_view import FRONT_VIEW_WIDTH_PX
 from skinrig.cli import main
 from skinrig.reporting import map_images, verdict
@@ -69,7 +69,7 @@ def test_failed_page_write_keeps_old_page_only(maps, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device", str(out))
 
-    monkeypatch.setattr(whole_file.os, "replace", full)
+    monkeypatch.setattr(atomic_file.os, "replace", full)
     assert main(["report", str(maps / "monday"), "-o", str(out)]) == 3
     assert out.read_text() == "old"
     assert [p.name for p in maps.iterdir() if p.name.startswith(".")] == []

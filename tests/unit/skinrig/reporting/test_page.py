@@ -127,7 +127,7 @@ def test_image_text_describes_content_shown_in_colors():
     valid = np.ones((10, 10), bool)
     valid[:2] = False
     drawing = map_images.MapDrawing("height", "um", valid)
-    shown = drawing.scalar("error", values, 0.0, 99.0)
+    shown = drawing.draw_scalar("error", values, 0.0, 99.0)
     assert shown.alt == (
         "height, error: median 59.5 um, 90 % of pixels within 23.95 to 95.05, 20 % without a "
         "value; color scale 0 to 99 um"
@@ -164,7 +164,7 @@ def test_colorbar_spans_colors_of_image(html):
 
 
 def test_plot_is_well_formed_and_states_numbers():
-    series = [figures.Curve("red", [1.0, 2.0, 3.0], [1.0, 0.1, 0.01], [0.1, 0.01, 0.02])]
+    series = [figures.PlotSeries("red", [1.0, 2.0, 3.0], [1.0, 0.1, 0.01], [0.1, 0.01, 0.02])]
     drawn = figures.curves("decay", "mm", "1/mm", series, log_y=True)
     root = ElementTree.fromstring(drawn)
     assert root.get("role") == "img"
@@ -176,7 +176,7 @@ def test_plot_is_well_formed_and_states_numbers():
 
 def test_plots_on_same_page_have_distinct_ids():
     plots = [
-        figures.curves(title, "x", "y", [figures.Curve("one", [0.0, 1.0], [0.0, 1.0])])
+        figures.curves(title, "x", "y", [figures.PlotSeries("one", [0.0, 1.0], [0.0, 1.0])])
         for title in ("first", "second")
     ]
     first, second = (set(re.findall(r' id="([^"]*)"', plot)) for plot in plots)
@@ -191,7 +191,7 @@ def test_simplified_plot_lines_keep_position():
     other = path.replace("10.004", "11").replace("30.5", "31")
     drawn = f'<svg width="9pt"><g id="g_1">{path}{other}</g></svg>'
     found = re.search(
-        r'<path d="([^"]*)" fill="none" stroke="#123456"/>', svg.simplified(drawn, alt="lines")
+        r'<path d="([^"]*)" fill="none" stroke="#123456"/>', svg.simplify_svg(drawn, alt="lines")
     )
     assert found[1] == "M10 20.01L30.5 40M11 20.01L31 40"
 

@@ -88,10 +88,10 @@ def test_first_screen_states_absence_of_measured_subjects(folder):
     assert "All of it is simulated: no person was measured." in report.build([folder])
     document = json.loads((folder / "appearance" / "appearance.json").read_text())
     found = discover([folder])
-    assert found.words().endswith("All of it is simulated: no person was measured.")
+    assert found.summary().endswith("All of it is simulated: no person was measured.")
     document["source"] = "measured"
     (folder / "appearance" / "appearance.json").write_text(json.dumps(document))
-    assert found.words().endswith("None of it is simulated.")
+    assert found.summary().endswith("None of it is simulated.")
 
 
 def test_map_of_rounding_alone_shows_no_structure(rng):

@@ -91,7 +91,7 @@ def test_simulation_resumes_only_with_same_settings(tmp_path):
     asked = {"target": "charuco", "lights": 8, "views": 2, "width_px": 64}
     with pytest.raises(Enough):
         simulate_session("dome", tmp_path / "s", **asked, progress=stop)
-    assert Session.open(tmp_path / "s").todo()
+    assert Session.open(tmp_path / "s").pending_frames()
     with pytest.raises(SimulationError, match="same settings"):
         simulate_session("dome", tmp_path / "s", **{**asked, "lights": 9}, resume=True)
     done = simulate_session("dome", tmp_path / "s", **asked, resume=True)
@@ -138,7 +138,7 @@ def test_flicker_and_dose_are_reported_before_capture(tmp_path, capsys):
 def test_plan_requiring_closed_eyes_is_reported():
     from capture.plan.dome import dome_plan
 
-    plan = dome_plan(DOME, order=list(range(150)), tracking_every=0)
+    plan = dome_plan(DOME, order=list(range(150)), tracking_interval=0)
     assert light_figures(plan, DOME)["open_eyes"] == "refused"
     assert "must be closed or shielded" in light_lines(plan, DOME)[0]
 

@@ -8,8 +8,8 @@ import pytest
 from capture.devices.camera import Exposure, Trigger, open_camera
 from capture.rig import load_rig
 from capture.session import Session
-from rigsim.world.serve import serve
-from skinrig.simulating.resumption import shots_made
+from rigsim.world.serve import serve_world
+from skinrig.simulating.resumption import count_shots
 from skinrig.simulating.simulation import simulate_session
 
 
@@ -97,7 +97,7 @@ def test_running_server_does_not_repeat_first_shot_noise():
     rig = load_rig("gradient").resized(16)
 
     def shots(count, **made):
-        with serve(rig, seed=5, **made) as served:
+        with serve_world(rig, seed=5, **made) as served:
             camera = open_camera(served.addresses["cam"])
             camera.configure(Exposure(0.001, 100))
             images = []
@@ -119,4 +119,4 @@ def test_running_server_does_not_repeat_first_shot_noise():
 def test_new_session_starts_at_shot_zero(tmp_path):
     simulate_session("flash", tmp_path / "s", **ASKED["flash"])
     session = Session.open(tmp_path / "s")
-    assert shots_made(session) == {"cam": len(session.frames())}
+    assert count_shots(session) == {"cam": len(session.frames())}

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 
 from model.brdf import tables as brdf_tables
-from rigsim.population.population import table_1
+from rigsim.population.population import draw_population
 from skinrig.traits import truth as trait_truth
 from skinrig.traits.truth import CommonFaces
 
-PEOPLE = table_1()
+PEOPLE = draw_population()
 
 
 def test_conditions_are_assigned_equally_replacing_earlier_ones():
     names = ("normal", "lotion", "powder")
-    given = trait_truth.assigned(PEOPLE[:60], names, rng=np.random.default_rng(0))
-    labels = trait_truth.labels_of(given, names[1:])
+    given = trait_truth.assign_conditions(PEOPLE[:60], names, rng=np.random.default_rng(0))
+    labels = trait_truth.label_members(given, names[1:])
     assert labels["lotion"].sum() == labels["powder"].sum() == 20
     assert not (labels["lotion"] & labels["powder"]).any()
     for one, other in zip(given, PEOPLE, strict=False):
@@ -22,7 +22,7 @@ def test_conditions_are_assigned_equally_replacing_earlier_ones():
 
 
 def test_directions_are_uniform_over_cap_above_horizon():
-    found = trait_truth.directions((20_000,), rng=np.random.default_rng(0))
+    found = trait_truth.sample_directions((20_000,), rng=np.random.default_rng(0))
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-12)
     assert found[:, 2].min() >= trait_truth.MIN_SAMPLED_COSINE
     # even in z: the mean of 20,000 has a deviation of 0.88 / sqrt(12 * 20,000)
@@ -47,7 +47,7 @@ def test_lotion_sharpens_surface_reflection():
     assert change.radiance[cos_h > 0.99].mean() > 0.0
     assert change.radiance[(cos_h > 0.8) & (cos_h < 0.93)].mean() < 0.0
     # and a basis' sharp lobe points along this change, a wide one against it
-    basis = brdf_tables.default()
+    basis = brdf_tables.default_basis()
     sharp, wide = (
         np.array([name == which for name in basis.names], float)
         for which in ("ggx 0.14 eta 1.4", "beckmann 0.4")
@@ -63,7 +63,7 @@ def test_faces_of_different_heads_align_in_common_map():
     assert both.mean() > 0.6
     # lips are redder than the face on every head, at the same place
     frame = faces.frame
-    column, row = np.rint(frame.pixel(frame.landmark("lower lip"))).astype(int)
+    column, row = np.rint(frame.to_pixel(frame.landmark("lower lip"))).astype(int)
     for one in seen:
         ratio = one.r_d[..., 1] / one.r_d[..., 0]
         assert ratio[row, column] < np.median(ratio[one.valid])

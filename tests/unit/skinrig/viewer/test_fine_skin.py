@@ -32,9 +32,9 @@ def test_gzipped_parts_are_recovered_from_single_member(count, rng):
     noise = rng.integers(0, 256, count, dtype=np.uint8).tobytes()
     steps = rng.choice(np.array([0, 0, 0, 1, 255], np.uint8), 3 * count).tobytes()
     text = b"vertex of a face, " * count
-    packed = arrays.gzipped([noise, b"", steps, text])
+    packed = arrays.gzip_parts([noise, b"", steps, text])
     assert gzip.decompress(packed) == noise + steps + text
-    assert packed == arrays.gzipped([noise, b"", steps, text])
+    assert packed == arrays.gzip_parts([noise, b"", steps, text])
     assert len(packed) < len(noise) + 0.3 * len(steps) + 0.1 * len(text) + 100
     # one member: what a browser's stream takes, which ends at the first
     reader = zlib.decompressobj(zlib.MAX_WBITS | 16)
@@ -45,6 +45,6 @@ def test_gzipped_parts_are_recovered_from_single_member(count, rng):
 
 def test_noise_packs_as_small_as_with_repetition_search(rng):
     noise = np.clip(rng.normal(128.0, 6.0, 300_000), 0, 255).astype(np.uint8).tobytes()
-    assert len(arrays.gzipped([noise])) <= len(gzip.compress(noise, 9))
+    assert len(arrays.gzip_parts([noise])) <= len(gzip.compress(noise, 9))
     repeated = noise[:1000] * 300
-    assert len(arrays.gzipped([repeated])) <= 1.01 * len(gzip.compress(repeated, 9)) + 16
+    assert len(arrays.gzip_parts([repeated])) <= 1.01 * len(gzip.compress(repeated, 9)) + 16

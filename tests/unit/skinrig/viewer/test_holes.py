@@ -45,7 +45,7 @@ def test_small_holes_close_and_the_rim_stays(scan):
     found = patch_charts.patches(scan.vertices_mm, scan.faces)
     assert [len(one.rim) for one in found] == sorted([len(one.rim) for one in found], reverse=True)
     assert len(found) == 2
-    closed = patch_charts.closed(scan)
+    closed = patch_charts.close_holes(scan)
     edges = patch_charts._loops(_welded(closed.mesh))
     assert len(edges) == 1
     rim = np.linalg.norm(closed.mesh.vertices_mm[edges[0]][:, :2], axis=1)
@@ -64,7 +64,7 @@ def test_a_patch_bends_on_as_the_surface_does(scan):
     for patch in patch_charts.patches(scan.vertices_mm, scan.faces):
         off = np.abs(np.linalg.norm(patch.inner_mm, axis=1) - RADIUS_MM)
         rim = scan.vertices_mm[patch.rim].astype(np.float64)
-        lid = patch.continued(rim)[len(rim) :]
+        lid = patch.interpolate_from_rim(rim)[len(rim) :]
         lid_off = np.abs(np.linalg.norm(lid, axis=1) - RADIUS_MM)
         assert off.max() < 0.5 * lid_off.max()
         a, b, c = (np.concatenate([rim, patch.inner_mm])[patch.faces[:, k]] for k in range(3))
@@ -73,7 +73,7 @@ def test_a_patch_bends_on_as_the_surface_does(scan):
 
 
 def test_patches_get_own_separate_charts(scan):
-    closed = patch_charts.closed(scan)
+    closed = patch_charts.close_holes(scan)
     assert closed.left_open_mm == ()
     new = closed.mesh.uv[len(scan.uv) :]
     assert new.min() > 0.0
@@ -91,11 +91,11 @@ def test_patches_get_own_separate_charts(scan):
 
 def test_measured_colors_continue_linearly_into_patches(scan):
     """A color that is linear in the texture is, on a small patch, linear across it."""
-    closed = patch_charts.closed(scan)
+    closed = patch_charts.close_holes(scan)
     size = 256
     v, u = 1.0 - (np.arange(size) + 0.5) / size, (np.arange(size) + 0.5) / size
     values = np.stack(np.broadcast_arrays(u[None, :], v[:, None]), axis=-1).astype(np.float32)
-    painted = closed.painted_texture(Texture(values, "f32")).values
+    painted = closed.paint_texture(Texture(values, "f32")).values
     for chart in closed.charts:
         column, row = int(chart.center[0] * size), int((1.0 - chart.center[1]) * size)
         middle = chart.rim_uv.mean(axis=0)
@@ -125,7 +125,7 @@ def test_texture_without_room_leaves_hole_open_and_reports(scan):
         ),
         np.concatenate([wide, [[0, 0], [1, 0], [1, 1], [0, 1]]]),
     )
-    closed = patch_charts.closed(mesh)
+    closed = patch_charts.close_holes(mesh)
     assert closed.charts == ()
     assert len(closed.left_open_mm) >= 2
     assert closed.summary()[0][0] == "holes that stay open"

@@ -38,14 +38,14 @@ def _scene(**textures):
 @pytest.mark.parametrize("count", [1, 2, 6, 7, 8, 1000, 1001])
 def test_text_gives_its_bytes_back(count, rng):
     data = rng.integers(0, 256, count, dtype=np.uint8).tobytes()
-    text = page.as_text(data)
+    text = page.encode_as_text(data)
     assert _bytes_of(text)[: len(data)] == data
     assert not {chr(code) for code in page.UNSAFE_CODES} & set(text)
 
 
 def test_text_of_only_unsafe_bytes_is_safe_small():
     for fill in (0, 255):
-        text = page.as_text(bytes([fill]) * 7001)
+        text = page.encode_as_text(bytes([fill]) * 7001)
         assert not {chr(code) for code in page.UNSAFE_CODES} & set(text)
         assert len(text.encode("utf-8")) <= 8 / 7 * 7001 + 2
         assert _bytes_of(text)[:7001] == bytes([fill]) * 7001
@@ -53,14 +53,14 @@ def test_text_of_only_unsafe_bytes_is_safe_small():
 
 def test_text_holds_seven_bits_a_byte(rng):
     data = rng.integers(0, 256, 70_000, dtype=np.uint8).tobytes()
-    assert len(page.as_text(data).encode("utf-8")) == pytest.approx(80_000, rel=1e-3)
+    assert len(page.encode_as_text(data).encode("utf-8")) == pytest.approx(80_000, rel=1e-3)
 
 
 @pytest.mark.parametrize(("storage", "top"), [("u8", 255.0), ("u16", 65535.0)])
 def test_a_quantized_texture_is_within_half_a_step(storage, top, rng):
     values = rng.normal(size=(3, 16, 8, 2)).astype(np.float32)
     texture = Texture(values, storage)
-    words, low, high = packing.stored(texture)
+    words, low, high = packing.encode_texture(texture)
     off = np.abs(packing.dequantize(words, low, high) - values)
     half = 0.5 * (high - low)[:, None, None, :] / top
     assert np.all(off <= half * (1.0 + 1e-3) + 1e-6)
@@ -69,7 +69,7 @@ def test_a_quantized_texture_is_within_half_a_step(storage, top, rng):
 
 def test_a_constant_texture_is_exact():
     values = np.full((4, 4, 1), 0.37, np.float32)
-    words, low, high = packing.stored(Texture(values))
+    words, low, high = packing.encode_texture(Texture(values))
     np.testing.assert_array_equal(packing.dequantize(words, low, high), values)
 
 
@@ -130,7 +130,7 @@ def test_blend_shapes_are_quantized_to_quarter_micrometer():
 
 def test_vertices_at_same_position_share_normal():
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 0]], np.float32)
-    assert packing.welded(points).tolist() == [0, 1, 0]
+    assert packing.weld_vertices(points).tolist() == [0, 1, 0]
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 
 from model.skin import SkinAppearance, SkinMap
 from rigsim.geometry.mesh import Mesh
-from skinrig import whole_file
+from skinrig import atomic_file
 from skinrig.viewer import faces, page
 from skinrig.viewer.scene import SceneError, Texture, ViewerScene
 
@@ -89,7 +89,7 @@ def test_page_with_failed_packing_leaves_older_page(scene, tmp_path, monkeypatch
     def full(*_):
         raise OSError(28, "No space left on device", "face.html")
 
-    monkeypatch.setattr(whole_file.os, "replace", full)
+    monkeypatch.setattr(atomic_file.os, "replace", full)
     with pytest.raises(OSError, match="No space"):
         page.write(scene, out)
     assert [p.name for p in tmp_path.iterdir()] == ["face.html"]

@@ -10,7 +10,7 @@ from model import store
 from model.facial_color.document import to_maps
 from model.facial_color.rig import HemoglobinRig
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
-from rigsim.subject.landmarks import find
+from rigsim.subject.landmarks import find_landmarks
 from rigsim.subject.person import make_subject
 from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.viewer import faces as procedural
@@ -26,11 +26,11 @@ def test_missing_texels_continue_their_neighbors(rng):
     values = rng.uniform(1.0, 2.0, (32, 32))
     valid = np.ones((32, 32), bool)
     valid[:, 20:] = False
-    found = facial_color_assets.filled(values, valid)
+    found = facial_color_assets.fill_holes(values, valid)
     np.testing.assert_array_equal(found[valid], values[valid])
     assert found[~valid].min() >= values[valid].min() - 1e-12
     assert found[~valid].max() <= values[valid].max() + 1e-12
-    assert np.all(facial_color_assets.filled(values, np.zeros((32, 32), bool)) == 0.0)
+    assert np.all(facial_color_assets.fill_holes(values, np.zeros((32, 32), bool)) == 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -73,8 +73,8 @@ def folder(subject, tmp_path_factory):
         dynamic_appearance.FACIAL_COLOR,
         SkinAppearance(maps, "simulated", {}, {}, files={"facial_color.json": document}, seed=3),
     )
-    marks = find(subject.mesh)
-    places = _pixel(marks.on(subject.mesh))
+    marks = find_landmarks(subject.mesh)
+    places = _pixel(marks.positions_on(subject.mesh))
     lines = [f"{n},{x},{y}" for n, (x, y) in zip(marks.names, places, strict=True)]
     (root / "landmarks.csv").write_text("\n".join(["name,x,y", *lines]) + "\n")
     return root
@@ -93,7 +93,7 @@ def test_blood_from_image_maps_to_its_face_position(subject, folder):
         paths={"dynamic": folder / "appearance"},
         landmarks=folder / "landmarks.csv",
     )
-    found = placed_color.placed(source)
+    found = placed_color.place_facial_color(source)
     front = subject.atlas.covered & (subject.atlas.normal[..., 2] > 0.6)
     wanted = subject.hemoglobin()
     off = np.abs(found.hemoglobin / wanted - 1.0)[front]

@@ -24,13 +24,13 @@ from skinrig.viewer.scene import SceneError, SceneSource
 def face() -> PageLobes:
     """Three lobes of two materials each over a 6 x 8 texture, some shares 0 as fits have them."""
     rng = np.random.default_rng(12345)
-    materials = brdf_tables.default()
+    materials = brdf_tables.default_basis()
     mix = np.zeros((3, materials.size))
     for row in mix:
         row[rng.choice(materials.size, 2, replace=False)] = rng.uniform(0.2, 0.8, 2)
     mix /= mix.sum(axis=1, keepdims=True)
     shares = np.maximum(rng.normal(0.25, 0.25, (6, 8, 3)), 0.0).astype(np.float32)
-    return PageLobes(materials.mixed(mix), shares, mix, materials.names, "fitted")
+    return PageLobes(materials.mix_materials(mix), shares, mix, materials.names, "fitted")
 
 
 @pytest.fixture(scope="module")
@@ -48,16 +48,16 @@ def traits(face):
 
 
 def test_chosen_table_meets_bound_and_next_coarser_misses(face):
-    found = reflectance_assets.chosen_table(face.lobes)
-    assert max(found.rms_error, found.strong_error) <= reflectance_assets.MAX_FORM_ERROR
+    found = reflectance_assets.choose_table(face.lobes)
+    assert max(found.rms_error, found.strong_error) <= reflectance_assets.MAX_SHAPE_ERROR
     coarser = reflectance_assets.TRIED_SLABS[reflectance_assets.TRIED_SLABS.index(found.slabs) - 1]
     table = face.lobes.table[..., :3].astype(np.float64)
-    back = reflectance_assets.in_slabs(table, coarser)
-    assert max(reflectance_assets.table_errors(back, table)) > reflectance_assets.MAX_FORM_ERROR
+    back = reflectance_assets.average_slabs(table, coarser)
+    assert max(reflectance_assets.table_errors(back, table)) > reflectance_assets.MAX_SHAPE_ERROR
 
 
 def test_factors_as_accurate_as_table_need_more_lookups(face, forms):
-    found = reflectance_assets.chosen_table(face.lobes)
+    found = reflectance_assets.choose_table(face.lobes)
     factors = [one for one in forms if one.lookups <= found.lookups]
     assert all(one.rms_error > found.rms_error for one in factors)
     more = [one for one in forms if one.form == "factors"]
@@ -70,7 +70,7 @@ def test_errors_of_factors_fall_with_their_rank(forms):
 
 
 def test_atlas_stores_each_lobe_at_its_position(face):
-    found = reflectance_assets.chosen_table(face.lobes)
+    found = reflectance_assets.choose_table(face.lobes)
     image = reflectance_assets.atlas(found)
     assert image.shape == (found.slabs * 32, 90, 4)
     slab, d, h = 5, 17, 40
@@ -81,12 +81,12 @@ def test_atlas_stores_each_lobe_at_its_position(face):
 
 def test_lambertian_lobes_need_no_slabs():
     flat = brdf_tables.tabulate({"flat": lambda light, view: 0.25 + 0.0 * light[..., 2]})
-    assert reflectance_assets.chosen_table(flat).slabs == 1
+    assert reflectance_assets.choose_table(flat).slabs == 1
 
 
 def test_slabs_not_dividing_nodes_are_refused(face):
     with pytest.raises(ValueError, match="slabs: got 5"):
-        reflectance_assets.in_slabs(face.lobes.table.astype(np.float64), 5)
+        reflectance_assets.average_slabs(face.lobes.table.astype(np.float64), 5)
 
 
 R_D = np.array([0.45, 0.30, 0.20])
@@ -109,7 +109,7 @@ def _dipole_edge(x_mm: float, channel: int) -> float:
 
 
 def test_gaussians_blur_light_edge_like_dipole():
-    found = gaussian_profiles.fit(R_D, SIGMA_TR)
+    found = gaussian_profiles.fit_gaussians(R_D, SIGMA_TR)
     spread = np.sqrt(2.0 * found.variances_mm2)
     for x in (0.0, 0.3, 1.0, 3.0):
         for channel in range(3):
@@ -119,13 +119,13 @@ def test_gaussians_blur_light_edge_like_dipole():
 
 
 def test_single_gaussian_misses_edge_far_more_than_four():
-    one, four = (gaussian_profiles.fit(R_D, SIGMA_TR, count=n) for n in (1, 4))
+    one, four = (gaussian_profiles.fit_gaussians(R_D, SIGMA_TR, count=n) for n in (1, 4))
     assert one.edge_error.max() > 0.05
     assert four.edge_error.max() < 0.002
 
 
 def test_uniform_light_is_kept_and_red_spreads_farthest():
-    found = gaussian_profiles.fit(R_D, SIGMA_TR)
+    found = gaussian_profiles.fit_gaussians(R_D, SIGMA_TR)
     np.testing.assert_allclose(found.weights.sum(axis=0), 1.0, atol=1e-12)
     assert (found.weights >= 0.0).all()
     spread = found.variances_mm2 @ found.weights
@@ -133,7 +133,10 @@ def test_uniform_light_is_kept_and_red_spreads_farthest():
 
 
 def test_a_profile_scales_with_the_translucency():
-    fine, coarse = gaussian_profiles.fit(R_D, SIGMA_TR), gaussian_profiles.fit(R_D, SIGMA_TR / 2)
+    fine, coarse = (
+        gaussian_profiles.fit_gaussians(R_D, SIGMA_TR),
+        gaussian_profiles.fit_gaussians(R_D, SIGMA_TR / 2),
+    )
     ratio = (coarse.variances_mm2 @ coarse.weights) / (fine.variances_mm2 @ fine.weights)
     np.testing.assert_allclose(ratio, 4.0, rtol=0.02)
 
@@ -143,7 +146,7 @@ def test_a_profile_scales_with_the_translucency():
 )
 def test_invalid_skin_is_refused(r_d, sigma_tr):
     with pytest.raises(SceneError, match="above 0"):
-        gaussian_profiles.fit(r_d, sigma_tr)
+        gaussian_profiles.fit_gaussians(r_d, sigma_tr)
 
 
 def test_traits_add_lobes_and_keep_face_bit_exactly(face, traits):
@@ -157,17 +160,17 @@ def test_traits_add_lobes_and_keep_face_bit_exactly(face, traits):
 def test_zero_traits_keep_weights(traits):
     found = traits
     rows = found.lobes.shares.reshape(-1, found.lobes.lobes.size)
-    np.testing.assert_array_equal(found.projected(rows, {}), rows)
+    np.testing.assert_array_equal(found.apply_traits(rows, {}), rows)
 
 
 @pytest.mark.parametrize("name", ["lotion", "powder", "sweat"])
 def test_page_traits_match_editor_within_stated_error(traits, name):
     found = traits
-    space = trait_storage.default().spaces["surface"]
+    space = trait_storage.load_packaged_traits().spaces["surface"]
     rows = found.lobes.shares.reshape(-1, found.lobes.lobes.size).astype(np.float64)
     edited = lobe_edits.edit_weights(rows, found.lobes.mix, space, {name: 0.5})
-    strength = brdf_tables.default().strength()
-    page = found.projected(rows, {name: 0.5}).astype(np.float64) @ found.lobes.mix @ strength
+    strength = brdf_tables.default_basis().strength()
+    page = found.apply_traits(rows, {name: 0.5}).astype(np.float64) @ found.lobes.mix @ strength
     wanted = edited.weights @ edited.mix @ strength
     asked = np.abs(wanted - rows @ found.lobes.mix @ strength)
     bound = max(found.held_error[name])
@@ -178,7 +181,7 @@ def test_page_traits_match_editor_within_stated_error(traits, name):
 
 
 def test_two_traits_can_each_bring_a_lobe(face):
-    space = trait_storage.default().spaces["surface"]
+    space = trait_storage.load_packaged_traits().spaces["surface"]
     rows = face.shares.reshape(-1, 3).astype(np.float64)
     edited = lobe_edits.edit_weights(rows, face.mix, space, {"lotion": 1.0, "sweat": 1.0})
     assert len(edited.mix) >= 3
@@ -193,17 +196,17 @@ def test_traits_of_other_materials_are_left_out(face):
 
 
 def test_opposite_traits_share_slider_chance_traits_have_none():
-    traits = trait_storage.default().spaces["albedo"].traits
-    names = trait_assets.distinct_from_chance(traits)
+    traits = trait_storage.load_packaged_traits().spaces["albedo"].traits
+    names = trait_assets.select_significant_traits(traits)
     assert "caucasian" not in names
     assert "freckles" not in names  # p = 1 in the packaged population
     assert "tan" in names
 
 
 def test_face_without_fits_shows_population_and_reports(procedural_source):
-    found = reflectance_assets.lobes_of(procedural_source)
+    found = reflectance_assets.read_lobes(procedural_source)
     assert found.origin == "population"
-    assets = reflectance_assets.assemble(procedural_source, found)
+    assets = reflectance_assets.build_lobe_assets(procedural_source, found)
     assert {what for what, _ in assets["left_out"]} == {
         "lobes of this face",
         "translucency of this face",
@@ -223,8 +226,8 @@ def test_filling_keeps_known_values_and_extends_them():
     values = np.zeros((16, 16, 1), np.float32)
     valid = np.zeros((16, 16), bool)
     valid[:, :8], values[:, :8] = True, 3.0
-    np.testing.assert_allclose(reflectance_assets.filled(values, valid, 16), 3.0, rtol=1e-5)
-    coarse = reflectance_assets.filled(values, valid, 4)
+    np.testing.assert_allclose(reflectance_assets.fill_texels(values, valid, 16), 3.0, rtol=1e-5)
+    coarse = reflectance_assets.fill_texels(values, valid, 4)
     assert coarse.shape == (4, 4, 1)
     np.testing.assert_allclose(coarse, 3.0, rtol=1e-5)
 

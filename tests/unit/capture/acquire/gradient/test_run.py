@@ -9,17 +9,22 @@ from fixtures.operators import by_operator
 
 from capture import raw
 from capture.acquire import AcquisitionError, Interrupted, run_plan
-from capture.acquire.gradient.skin_states import EndOfSkin, ForceWatch
-from capture.acquire.pattern_scan import reading_deg
+from capture.acquire.gradient.skin_states import ForceMonitor, StrainLimitReached
+from capture.acquire.pattern_scan import analyzer_reading_deg
 from capture.devices.caliper import CaliperBox, MoveReport
 from capture.devices.camera import CameraError, Trigger, open_camera
 from capture.devices.gradient_sphere import GradientSphereBox
 from capture.devices.port import DeviceError, LinkLost, Port
 from capture.plan import Plan, Step
-from capture.plan.gradient import gradient_calibration_plan, gradient_plan, state_of, states
+from capture.plan.gradient import (
+    gradient_calibration_plan,
+    gradient_plan,
+    group_by_state,
+    strain_state,
+)
 from capture.plan.steps import LIGHT_PATTERNS
 from capture.rig import load_rig
-from capture.session import Session, Subject, verify
+from capture.session import Session, SubjectRecord, verify
 from rigsim.boxes.faults import Faults
 from rigsim.world.world import World
 
@@ -58,7 +63,7 @@ class Bench:
             plan=plan,
             rig=rig,
             devices={},
-            subject=Subject("p"),
+            subject=SubjectRecord("p"),
             source="simulated",
             seed=seed,
         )
@@ -141,10 +146,10 @@ def check_frames(session):
         assert cfa[0, 0] == 64 + lit, record.step_id
         if lit:
             assert cfa[1, 0] == 1 + LIGHT_PATTERNS.index(settings["pattern"]), record.step_id
-            assert cfa[1, 1] == reading_deg(record.step), record.step_id
+            assert cfa[1, 1] == analyzer_reading_deg(record.step), record.step_id
             assert cfa[1, 2] == round(1000 * settings["level"])
             assert cfa[1, 3] == round(1e5 * settings["exposure_s"])
-        if (state := state_of(record.step)) is not None:
+        if (state := strain_state(record.step)) is not None:
             index = record.step.index
             assert cfa[2, 0] == 1000 + index["angle"], record.step_id
             assert cfa[2, 1] == 1000 + index["caliper"], record.step_id
@@ -162,7 +167,9 @@ def test_every_frame_shows_its_pattern_and_its_state(make):
     bench = make(short(steps=(-1, 1), patterns=LIGHT_PATTERNS))
     done = bench.run()
     assert (done.frames, done.retakes, done.stale) == (len(bench.plan.steps), 0, 0)
-    assert check_frames(bench.session) == dict.fromkeys([name for name, _ in states(bench.plan)], 1)
+    assert check_frames(bench.session) == dict.fromkeys(
+        [name for name, _ in group_by_state(bench.plan)], 1
+    )
     assert bench.asked == ["tape the skin at 0 degrees"]
     assert bench.at_rest
     bench.session.close()
@@ -210,7 +217,7 @@ def test_full_plan_ends_at_buckling_detachment_every_angle(make):
     check_frames(bench.session)
     ends = {
         (line.about["angle"], line.about["end"])
-        for line in map(bench.session.left_out_line, bench.session.left_out())
+        for line in map(bench.session.omission_line, bench.session.left_out())
     }
     assert ends == {(a, end) for a in (0, 45, 90, 135) for end in ("buckled", "detached")}
     bench.session.close()
@@ -231,7 +238,7 @@ def test_capture_takes_planned_time_plus_homing(make):
     bench.caliper.home = home
     bench.run()
     # what is over it is talk on the lines
-    assert 1.0 < (bench.world.now - sum(homing)) / bench.plan.estimated_s(RIG) < 1.6
+    assert 1.0 < (bench.world.now - sum(homing)) / bench.plan.estimate_duration_s(RIG) < 1.6
 
 
 def test_scan_takes_planned_time(make):
@@ -263,8 +270,8 @@ def test_compression_ends_at_buckling_and_stretching_at_detachment(make):
     assert set(reached) >= {"a000_n0", "a000_m1", "a000_m2", "a000_p1", "a000_p2", "a000_p3"}
     assert len(reached) < 13
     missing = set(bench.session.left_out())
-    assert {s.id for s in bench.plan.steps if state_of(s) not in {None, *reached}} == missing
-    abouts = [bench.session.left_out_line(step).about for step in sorted(missing)]
+    assert {s.id for s in bench.plan.steps if strain_state(s) not in {None, *reached}} == missing
+    abouts = [bench.session.omission_line(step).about for step in sorted(missing)]
     assert {about["end"] for about in abouts} == {"buckled", "detached"}
     for about in abouts:
         # r = 0.70 to 0.76, and 1.25 to 1.35, of 8 mm; the tape makes it a little more of the jaws
@@ -288,7 +295,7 @@ def test_frames_of_buckled_skin_are_never_kept(make, seed):
 
 def test_buckled_skin_would_show_without_the_watch(make, monkeypatch):
     """The test above can fail."""
-    monkeypatch.setattr(ForceWatch, "check", lambda self, position, report, force_n: None)
+    monkeypatch.setattr(ForceMonitor, "check", lambda self, position, report, force_n: None)
     bench = make(short(steps=(-4, 0), patterns=["full"]))
     bench.run()
     with pytest.raises(AssertionError):
@@ -326,12 +333,12 @@ PUSHES = [  # force at neutral and at each step, and the first step that is not 
 
 @pytest.mark.parametrize(("forces", "first"), PUSHES)
 def test_skin_buckles_where_push_force_stops_growing(forces, first):
-    watch = ForceWatch(RIG.caliper, -1, at_rest_n=forces[0])
+    watch = ForceMonitor(RIG.caliper, -1, at_rest_n=forces[0])
     found = None
     for k, force_n in enumerate(forces[1:], 1):
         try:
             watch.check(-k, MoveReport(k, "reached", -k, 8.0 - 0.8 * k, force_n, 0.0), force_n)
-        except EndOfSkin as end:
+        except StrainLimitReached as end:
             found = end.end.position
             break
     assert found == first
@@ -369,14 +376,14 @@ def test_capture_resumes_after_any_interruption(make, number):
     bench.run()
     assert bench.session.todo() == []
     tapings = check_frames(bench.session)
-    assert set(tapings) == {name for name, _ in states(bench.plan)}
+    assert set(tapings) == {name for name, _ in group_by_state(bench.plan)}
     assert bench.at_rest
     bench.session.close()
     found = verify(bench.session.path)
     assert found.ok, found.problems
     # a state that was whole is not touched again; a torn one is taken anew as a whole
-    for name, steps in states(bench.plan):
-        attempts = {r.attempt for r in bench.session.frames() if state_of(r.step) == name}
+    for name, steps in group_by_state(bench.plan):
+        attempts = {r.attempt for r in bench.session.frames() if strain_state(r.step) == name}
         torn = 0 < sum(s.id in _first(bench, number) for s in steps) < len(steps)
         assert (2 in attempts) == torn, name
 

@@ -9,7 +9,7 @@ from capture.rig import load_rig
 
 RIG = load_rig("probe")
 VIEW, PROBE = RIG.views[0], RIG.probe
-SERIES_S = exposure_series_s(8, longest_s=4.0, step_ev=1.0)
+SERIES_S = exposure_series_s(8, max_exposure_s=4.0, step_ev=1.0)
 EVERY = len(SERIES_S)
 
 
@@ -41,7 +41,7 @@ def frame(rates, exposure_s, rng, *, dark_e=0.0, hot=0):
 def looked(rates, rng, count=EVERY, **more):
     signal = FiberSignal(PROBE, VIEW)
     for exposure_s in SERIES_S[:count]:
-        signal.look(frame(rates, exposure_s, rng, **more), exposure_s)
+        signal.add_exposure(frame(rates, exposure_s, rng, **more), exposure_s)
     return signal
 
 

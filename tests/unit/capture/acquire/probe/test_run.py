@@ -12,9 +12,9 @@ from capture.acquire import AcquisitionError, Interrupted, run_plan
 from capture.devices.camera import CameraError, Trigger, open_camera
 from capture.devices.port import CommandRefused, DeviceError, Port
 from capture.devices.probe import ProbeBox
-from capture.plan.probe import all_series, probe_calibration_plan, probe_plan
+from capture.plan.probe import group_by_series, probe_calibration_plan, probe_plan
 from capture.rig import load_rig
-from capture.session import Session, Subject, verify
+from capture.session import Session, SubjectRecord, verify
 from rigsim.boxes.faults import Faults
 from rigsim.world.world import World
 
@@ -89,7 +89,7 @@ class Bench:
             plan=plan,
             rig=rig,
             devices={},
-            subject=Subject("p"),
+            subject=SubjectRecord("p"),
             source="simulated",
             seed=SEED,
         )
@@ -161,7 +161,7 @@ def short(sites=("cheek",), brackets=6, longest_s=0.5, step_ev=1.0, darks=1, **m
         RIG,
         sites=sites,
         brackets=brackets,
-        longest_s=longest_s,
+        max_exposure_s=longest_s,
         step_ev=step_ev,
         darks=darks,
         **more,
@@ -171,7 +171,7 @@ def short(sites=("cheek",), brackets=6, longest_s=0.5, step_ev=1.0, darks=1, **m
 def check_frames(session):
     """Fail unless each frame shows its own light and a held head, of one placement a series."""
     placements = {}
-    for placement, steps in all_series(session.plan):
+    for placement, steps in group_by_series(session.plan):
         ids = {step.id for step in steps}
         for record in session.frames():
             if record.step_id not in ids:
@@ -241,7 +241,7 @@ def test_whole_series_rests_once_and_takes_planned_time(make):
     assert gaps[20] > PROBE.rest_s
     frames_s = lit[-1].t_off_s - lit[0].t_on_s
     assert 85.0 < frames_s < 105.0
-    assert 0.9 < bench.world.now / plan.estimated_s(RIG) < 1.1
+    assert 0.9 < bench.world.now / plan.estimate_duration_s(RIG) < 1.1
 
 
 def test_no_suction_lasts_longer_than_skin_bears(make):
@@ -565,7 +565,7 @@ def test_capture_resumes_after_any_interruption(make, owner, name, number):
     assert bench.at_rest
     # a series that was whole is not touched again; the head is placed anew for each other one
     whole = 0
-    for _, steps in all_series(bench.plan):
+    for _, steps in group_by_series(bench.plan):
         left = [step.id for step in steps if step.id not in bench.session.left_out()]
         attempts = {r.attempt for r in bench.session.frames() if r.step_id in left}
         whole += set(left) <= set(before) and attempts == {1}
@@ -608,7 +608,7 @@ def test_operator_stop_between_exposures_leaves_all_dark(make):
 
 
 def test_phantom_is_placed_once_fibers_uncovered_singly(make):
-    plan = probe_calibration_plan(RIG, darks=1, brackets=10, longest_s=4.0, step_ev=1.0)
+    plan = probe_calibration_plan(RIG, darks=1, brackets=10, max_exposure_s=4.0, step_ev=1.0)
     bench = make(plan, Witness(bright=20.0, fall_mm=2.0))
     bench.run()
     assert bench.placings == ["place the head on the phantom at 0 degrees"]
@@ -637,7 +637,7 @@ def test_phantom_is_placed_once_fibers_uncovered_singly(make):
 
 
 def test_requested_masks_are_taken_dark_needs_no_head(make):
-    plan = probe_calibration_plan(RIG, darks=1, brackets=4, longest_s=0.1, step_ev=2.0)
+    plan = probe_calibration_plan(RIG, darks=1, brackets=4, max_exposure_s=0.1, step_ev=2.0)
     bench = make(plan, Witness(20.0))
     bench.run(all_brackets=True)
     assert len(bench.session.frames("mask")) == 6 * 2
@@ -657,7 +657,7 @@ def test_darks_need_a_capped_head_and_no_light(make):
 
 
 def test_mask_choice_continues_after_resume_without_choosing_again(make):
-    plan = probe_calibration_plan(RIG, darks=0, brackets=8, longest_s=1.0, step_ev=1.0)
+    plan = probe_calibration_plan(RIG, darks=0, brackets=8, max_exposure_s=1.0, step_ev=1.0)
     bench = make(plan, Witness(20.0))
     kill_at(bench, bench.box, "open_shutter", 8 + 7)
     with pytest.raises(Killed):
@@ -674,7 +674,7 @@ def test_mask_choice_continues_after_resume_without_choosing_again(make):
 
 
 def test_capped_dark_frames_are_taken_after_controller_release(make):
-    bench = make(probe_calibration_plan(RIG, "dark", darks=2, brackets=5, longest_s=0.1))
+    bench = make(probe_calibration_plan(RIG, "dark", darks=2, brackets=5, max_exposure_s=0.1))
 
     def late(honest, which):
         """Have the host busy for longer than the lease, at its n-th call of something."""

@@ -5,12 +5,12 @@ import pytest
 from scipy.stats import chi2
 
 from capture.calibration.fiber.spot_photometry import (
-    Shot,
+    SpotImage,
+    encircled_energy,
+    make_spot_image,
+    measure_centroids,
     measure_flux,
-    measure_middles,
-    rate_image,
-    share_within,
-    shot,
+    merge_spot_images,
 )
 from capture.raw import RawFrame
 
@@ -33,7 +33,7 @@ def exposed(light, rng, amount=1.0):
     valid = signal < WELL_E
     x = np.minimum(signal, WELL_E) / WELL_E
     variance = np.maximum(x, 0) / WELL_E + (READ_E / WELL_E) ** 2
-    return Shot(x.astype(np.float32), variance.astype(np.float32), valid, amount, 0.0)
+    return SpotImage(x.astype(np.float32), variance.astype(np.float32), valid, amount, 0.0)
 
 
 PIXELS = np.array([[40.3, 50.7], [120.5, 60.0], [70.2, 150.4], [150.9, 140.1]])
@@ -60,8 +60,8 @@ def test_middles_scatter_as_stated(rng):
     light = scene(PIXELS, electrons)
     pulls = []
     for _ in range(12):
-        image = rate_image([exposed(light, rng)])
-        middle, stderr, saturated = measure_middles(image, PIXELS.round(), aperture_px=APERTURE)
+        image = merge_spot_images([exposed(light, rng)])
+        middle, stderr, saturated = measure_centroids(image, PIXELS.round(), aperture_px=APERTURE)
         assert not saturated.any()
         pulls.append((middle - PIXELS) / stderr[:, None])
     assert np.sum(np.square(pulls)) < chi2.ppf(1 - ALARM, 96)
@@ -75,9 +75,9 @@ def test_saturated_spots_are_flagged_shorter_exposure_measures_them(rng):
     flux = measure_flux(long, PIXELS, aperture_px=APERTURE)
     np.testing.assert_array_equal(flux.saturated, [True, False, False, False])
     assert flux.value[0] < 0.9 * electrons[0] / WELL_E
-    both = rate_image([long, short])
+    both = merge_spot_images([long, short])
     assert both.valid.all()
-    assert not rate_image([long]).valid.all()
+    assert not merge_spot_images([long]).valid.all()
     again = measure_flux(short, PIXELS, aperture_px=APERTURE)
     assert not again.saturated[0]
     assert abs(again.value[0] - 0.1 * electrons[0] / WELL_E) < 4 * np.sqrt(again.variance[0])
@@ -89,7 +89,9 @@ def test_spots_at_border_or_unlit_are_not_measured(rng):
     flux = measure_flux(part, places, aperture_px=np.full(3, 16.0))
     np.testing.assert_array_equal(flux.whole, [False, True, False])
     assert abs(flux.value[1]) < 4 * np.sqrt(flux.variance[1])
-    middle, _, _ = measure_middles(rate_image([part]), places, aperture_px=np.full(3, 16.0))
+    middle, _, _ = measure_centroids(
+        merge_spot_images([part]), places, aperture_px=np.full(3, 16.0)
+    )
     assert np.isnan(middle).all()
 
 
@@ -103,7 +105,7 @@ def test_perfect_lens_light_beyond_disc_is_known():
     pattern = np.ones_like(v)
     np.divide(2 * j1(v), v, out=pattern, where=v > 0)
     pattern = pattern**2 * np.pi / (4 * airy_px**2)
-    part = Shot(
+    part = SpotImage(
         pattern.astype(np.float32),
         np.full(v.shape, 1e-4, np.float32),
         np.ones(v.shape, bool),
@@ -111,14 +113,14 @@ def test_perfect_lens_light_beyond_disc_is_known():
         0.0,
     )
     flux = measure_flux(part, np.array([[100.0, 100.0]]), aperture_px=np.array([aperture]))
-    assert flux.value[0] == pytest.approx(float(share_within(aperture, airy_px)), abs=2e-3)
+    assert flux.value[0] == pytest.approx(float(encircled_energy(aperture, airy_px)), abs=2e-3)
     assert flux.value[0] < 0.99
 
 
 def test_frames_of_color_cameras_are_refused():
     frame = RawFrame(cfa=np.zeros((4, 4), np.uint16), pattern="RGGB", black=(0.0,) * 4, white=100)
     with pytest.raises(ValueError, match="monochrome"):
-        shot(frame, amount_s=1.0, reading_deg=0.0)
+        make_spot_image(frame, amount_s=1.0, reading_deg=0.0)
 
 
 def test_dark_and_flat_are_taken_off():
@@ -129,6 +131,8 @@ def test_dark_and_flat_are_taken_off():
         white=1064,
         noise_profile=(1e-3, 1e-5),
     )
-    part = shot(frame, amount_s=1.0, reading_deg=0.0, dark=np.full((4, 4), 0.02), flat=0.5)
+    part = make_spot_image(
+        frame, amount_s=1.0, reading_deg=0.0, dark=np.full((4, 4), 0.02), flat=0.5
+    )
     np.testing.assert_allclose(part.signal, 0.16, rtol=1e-6)
     np.testing.assert_allclose(part.variance, (1e-4 + 1e-5) / 0.25, rtol=1e-5)

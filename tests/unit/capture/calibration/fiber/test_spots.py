@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from capture.calibration.fiber.merge import merge_series
-from capture.calibration.fiber.spots import SpotError, find_fiber_spots
+from capture.calibration.fiber.spots import FiberSpotError, find_fiber_spots
 
 SHORT_S = (0.01, 1.0, 30.0)
 
@@ -65,17 +65,17 @@ def test_foreign_spot_is_reported_with_position(rng, fibre_camera, falling):
     camera = fibre_camera(rng)
     camera.places[20, 1] -= 38.0
     other = fibre_camera(np.random.default_rng(3), places=camera.places)
-    with pytest.raises(SpotError, match=r"28 spots, of which 1 .*x 8\d\d, y 2\d px"):
+    with pytest.raises(FiberSpotError, match=r"28 spots, of which 1 .*x 8\d\d, y 2\d px"):
         find(other, falling)
 
 
 def test_missing_light_and_too_few_spots_are_distinguished(rng, fibre_camera, falling):
     camera = fibre_camera(rng)
-    with pytest.raises(SpotError, match="found none"):
+    with pytest.raises(FiberSpotError, match="found none"):
         find(camera, np.zeros((28, 3)))
     light = falling.copy()
     light[9:] = 0.0
-    with pytest.raises(SpotError, match=r"found 9 .*expected 28"):
+    with pytest.raises(FiberSpotError, match=r"found 9 .*expected 28"):
         find(camera, light)
 
 
@@ -104,7 +104,9 @@ def test_cover_over_wrong_fiber_is_error(rng, fibre_camera, falling):
     camera = fibre_camera(rng)
     alone = np.zeros_like(falling)
     alone[5] = falling[5]
-    with pytest.raises(SpotError, match="only F05 uncovered the brightest spot is that of F06"):
+    with pytest.raises(
+        FiberSpotError, match="only F05 uncovered the brightest spot is that of F06"
+    ):
         find(camera, falling, masks={4: merged(camera, alone, (0.01, 0.1))})
 
 

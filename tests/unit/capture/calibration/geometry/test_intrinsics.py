@@ -7,7 +7,12 @@ import pytest
 
 from capture.calibration import geometry, store
 from capture.calibration.geometry import board, bundle, bundle_equations
-from capture.calibration.geometry.board import Board, BoardError, Sighting, calibrate_intrinsics
+from capture.calibration.geometry.board import (
+    Board,
+    BoardError,
+    CornerObservation,
+    calibrate_intrinsics,
+)
 from capture.calibration.geometry.board_pose import BoardPose
 from capture.calibration.geometry.bundle_equations import LensPrior
 from capture.calibration.geometry.intrinsics import CameraPose
@@ -24,7 +29,7 @@ def bent(camera, distortion=LENS):
 
 def boards_in_view(rng, count):
     """Places of the board around the origin; the first in the jig."""
-    places = {0: BoardPose.in_jig(BOARD)}
+    places = {0: BoardPose.to_jig_pose(BOARD)}
     for pose in range(1, count):
         turn = cv2.Rodrigues(rng.uniform(-0.7, 0.7, 3))[0]
         rotation = turn @ places[0].rotation
@@ -35,7 +40,7 @@ def boards_in_view(rng, count):
 
 def sightings_of(cameras, places, rng, sigma_px):
     return {
-        (name, pose): Sighting(
+        (name, pose): CornerObservation(
             np.arange(24),
             camera.project(place.to_rig(BOARD.points_mm)) + sigma_px * rng.standard_normal((24, 2)),
         )
@@ -131,14 +136,14 @@ def test_cameras_survive_their_calibration(tmp_path):
         tmp_path,
     )
     loaded = store.load(tmp_path, "geometry")
-    again = geometry.poses_from(loaded, rig)
+    again = geometry.cameras_from_calibration(loaded, rig)
     for name, camera in poses.items():
         for field in dataclasses.fields(camera):
             np.testing.assert_array_equal(
                 getattr(again[name], field.name), getattr(camera, field.name)
             )
     with pytest.raises(store.CalibrationMismatch, match="calibrate this device"):
-        geometry.poses_from(loaded, DOME)
+        geometry.cameras_from_calibration(loaded, DOME)
 
 
 def test_bundle_derivatives_are_those_of_projection(rng):
@@ -148,7 +153,7 @@ def test_bundle_derivatives_are_those_of_projection(rng):
     of_camera, of_place = bundle_equations._derivatives(camera, place, points)
     start = geometry.nominal_cameras(DOME.subset(views=["C02"]))
     problem = bundle_equations.BundleProblem(
-        {("C02", 1): Sighting(np.arange(24), np.zeros((24, 2)))},
+        {("C02", 1): CornerObservation(np.arange(24), np.zeros((24, 2)))},
         BOARD,
         start,
         LensPrior(),
@@ -234,13 +239,15 @@ def test_only_moved_camera_is_reported(rng, culprit):
     before = geometry.nominal_cameras(DOME.subset(views=["C05", "C06", "C07", "C08"]))
     now = {**before, culprit: shifted(before[culprit], np.array([1.5, 0, 0]), [0, 0.004, 0])}
     seen = sightings_of(now, boards_in_view(rng, 6), rng, 0.1)
-    (moved,) = bundle.find_moved(seen, BOARD, before)
+    (moved,) = bundle.find_moved_cameras(seen, BOARD, before)
     assert moved.name == culprit
     assert moved.shift_mm == pytest.approx(1.5, abs=0.3)
-    assert moved.turn_rad == pytest.approx(0.004, abs=0.0005)
+    assert moved.rotation_rad == pytest.approx(0.004, abs=0.0005)
     assert culprit in str(moved)
     assert (
-        bundle.find_moved(sightings_of(before, boards_in_view(rng, 6), rng, 0.1), BOARD, before)
+        bundle.find_moved_cameras(
+            sightings_of(before, boards_in_view(rng, 6), rng, 0.1), BOARD, before
+        )
         == ()
     )
 

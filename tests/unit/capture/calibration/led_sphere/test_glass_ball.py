@@ -7,8 +7,8 @@ from scipy.stats import chi2
 
 from capture.calibration.geometry.intrinsics import CameraPose
 from capture.calibration.led_sphere.glass_ball import (
-    Ball,
     BallError,
+    BallPosition,
     GlassBall,
     find_spots,
     light_directions,
@@ -83,7 +83,11 @@ def test_directions_are_within_errors_and_beat_nominal(rng):
     assert np.sqrt(np.mean((error / stated) ** 2)) < 2.5  # most of it is the ball's, in common
     # with the ball's true place what is left is each spot's own
     true = light_directions(
-        CAMERA, Ball(center, 6.0, np.zeros((4, 4))), pixels, np.full(len(PLACE), 0.05), DISTANCE
+        CAMERA,
+        BallPosition(center, 6.0, np.zeros((4, 4))),
+        pixels,
+        np.full(len(PLACE), 0.05),
+        DISTANCE,
     )
     own = (true.direction - directions_of(places)) / np.sqrt(
         np.trace(true.covariance, axis1=1, axis2=2)

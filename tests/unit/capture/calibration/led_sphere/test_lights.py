@@ -7,7 +7,11 @@ import numpy as np
 import pytest
 
 from capture.calibration import store
-from capture.calibration.led_sphere.lights import SphereCalibration, SphereFilms, SphereLightTable
+from capture.calibration.led_sphere.lights import (
+    SphereCalibration,
+    SphereLightTable,
+    SpherePolarizers,
+)
 from capture.calibration.record import Quantity
 from capture.rig import load_rig
 
@@ -32,7 +36,7 @@ def table(rng):
 
 def films(rng):
     n = len(RIG.lights)
-    return SphereFilms(
+    return SpherePolarizers(
         tuple(light.name for light in RIG.lights),
         *rng.uniform(0, 0.01, (4, n)),
         *rng.uniform(-0.01, 0.01, (1, n)),
@@ -70,8 +74,10 @@ def test_sphere_calibration_round_trips_through_file(tmp_path, rng):
         "dead",
     ):
         np.testing.assert_array_equal(getattr(found.lights, name), getattr(lights, name))
-    for field in dataclasses.fields(SphereFilms):
-        np.testing.assert_array_equal(getattr(found.films, field.name), getattr(leaks, field.name))
+    for field in dataclasses.fields(SpherePolarizers):
+        np.testing.assert_array_equal(
+            getattr(found.polarizers, field.name), getattr(leaks, field.name)
+        )
     np.testing.assert_array_equal(found.usable, lights.valid & ~lights.dead)
 
 

@@ -5,10 +5,10 @@ import pytest
 from scipy.stats import chi2
 
 from capture.calibration.geometry.intrinsics import CameraPose
-from capture.calibration.led_sphere.polarization import fit_films, leakage
+from capture.calibration.led_sphere.polarization import fit_polarizers, leakage
 from capture.calibration.lights.reflection import mirror_lights
 from capture.calibration.polarization.malus import PolarizationError
-from capture.calibration.polarization.polarized_reflection import Reflection
+from capture.calibration.polarization.polarized_reflection import FacetReflection
 from capture.rig import load_rig
 
 RIG = load_rig("gradient")
@@ -21,7 +21,7 @@ TWO_STATES = ((0, 0.2), (0, 1.0), (0, 8.0), (90, 8.0), (90, 60.0))
 
 
 def reflection(eta, to_light, to_camera):
-    return Reflection.of(
+    return FacetReflection.of(
         RIG.lights, CAMERA, VIEW.analyser_axis_deg, eta, to_light=to_light, to_camera=to_camera
     )
 
@@ -58,7 +58,7 @@ def spots(
 @pytest.mark.parametrize("zero_deg", [0.0, 0.6, -10.0])
 def test_analyzer_polarizers_and_axes_are_within_their_errors(rng, zero_deg):
     *data, truth = spots(rng, zero_deg=zero_deg, turn_deg=0.3)
-    fit = fit_films(*data, GLASS)
+    fit = fit_polarizers(*data, GLASS)
     assert abs(np.degrees(fit.zero_rad - truth["zero"])) < 0.1
     assert abs(fit.zero_rad - truth["zero"]) < 4 * fit.zero_stderr_rad
     for leak, error, true in zip(
@@ -70,9 +70,9 @@ def test_analyzer_polarizers_and_axes_are_within_their_errors(rng, zero_deg):
     pull = (fit.strength - truth["strength"]) / fit.strength_stderr
     assert np.sum(pull**2) < bound
     # axes share the error of the analyser's zero, which all of them are measured against
-    gap = fit.turn_rad - truth["turn"]
+    gap = fit.axis_error_rad - truth["turn"]
     own = gap - np.median(gap)
-    assert np.sqrt(np.mean((own / fit.turn_stderr_rad) ** 2)) < 1.5
+    assert np.sqrt(np.mean((own / fit.axis_error_stderr_rad) ** 2)) < 1.5
     # it could have failed: lights as drawn leave a hundred times the noise
     readings, rates, variance, good, _ = (*data, truth)
     drawn = truth["strength"] * GLASS.transmit_through_analyzer(
@@ -84,7 +84,7 @@ def test_analyzer_polarizers_and_axes_are_within_their_errors(rng, zero_deg):
 @pytest.mark.parametrize("zero_deg", [0.6, -10.0])
 def test_skin_leakage_follows_from_glass_leakage(rng, zero_deg):
     *data, truth = spots(rng, zero_deg=zero_deg, turn_deg=0.3)
-    value, error = leakage(fit_films(*data, GLASS), SKIN)
+    value, error = leakage(fit_polarizers(*data, GLASS), SKIN)
     pull = (value - truth["leak"]) / error
     assert np.mean(np.abs(pull) < 2) > 0.85
     assert np.median(error / truth["leak"]) < 0.05
@@ -98,13 +98,13 @@ def test_skin_leakage_follows_from_glass_leakage(rng, zero_deg):
 @pytest.mark.long
 def test_two_readings_errors_reflect_open_signs(rng):
     *data, truth = spots(rng, zero_deg=0.6, turn_deg=0.3, series=TWO_STATES)
-    fit = fit_films(*data, GLASS)
+    fit = fit_polarizers(*data, GLASS)
     assert abs(fit.zero_rad - truth["zero"]) < 4 * fit.zero_stderr_rad
-    gap = np.abs(fit.turn_rad - truth["turn"])
-    assert np.mean(gap < 3 * fit.turn_stderr_rad) > 0.95
+    gap = np.abs(fit.axis_error_rad - truth["turn"])
+    assert np.mean(gap < 3 * fit.axis_error_stderr_rad) > 0.95
     *both, _ = spots(rng, zero_deg=0.6, turn_deg=0.3)
-    better = fit_films(*both, GLASS)
-    assert np.median(fit.turn_stderr_rad) > 2 * np.median(better.turn_stderr_rad)
+    better = fit_polarizers(*both, GLASS)
+    assert np.median(fit.axis_error_stderr_rad) > 2 * np.median(better.axis_error_stderr_rad)
 
 
 @pytest.mark.long
@@ -112,7 +112,7 @@ def test_zero_errors_match_stated_over_many_spheres(rng):
     pulls = []
     for _ in range(12):
         *data, truth = spots(rng, zero_deg=rng.normal(0, 0.7), turn_deg=0.5)
-        fit = fit_films(*data, GLASS)
+        fit = fit_polarizers(*data, GLASS)
         pulls.append((fit.zero_rad - truth["zero"]) / fit.zero_stderr_rad)
     low, high = chi2.ppf([ALARM / 2, 1 - ALARM / 2], len(pulls))
     assert low < np.sum(np.square(pulls)) < high
@@ -126,15 +126,15 @@ def test_single_outlier_light_does_not_rotate_analyzer(rng):
         readings, turn, truth["zero"], 1 / 2000, 1 / 3000
     )
     rates[:, 7] = off[:, 7]
-    fit = fit_films(readings, rates, variance, good, GLASS)
+    fit = fit_polarizers(readings, rates, variance, good, GLASS)
     assert abs(np.degrees(fit.zero_rad) - 0.5) < 0.02
-    assert abs(np.degrees(fit.turn_rad[7]) - 8.0) < 0.1
+    assert abs(np.degrees(fit.axis_error_rad[7]) - 8.0) < 0.1
 
 
 def test_dead_lights_have_no_strength_and_no_say(rng):
     readings, rates, variance, good, truth = spots(rng, zero_deg=0.5, turn_deg=0.2)
     rates[:, :13] = rng.standard_normal((len(readings), 13)) * np.sqrt(variance[:, :13])
-    fit = fit_films(readings, rates, variance, good, GLASS)
+    fit = fit_polarizers(readings, rates, variance, good, GLASS)
     # a strength is no better known than the turn that decides how much glass reflects
     assert (np.abs(fit.strength[:13]) < 5 * fit.strength_stderr[:13]).all()
     assert abs(fit.zero_rad - truth["zero"]) < 4 * fit.zero_stderr_rad
@@ -143,6 +143,6 @@ def test_dead_lights_have_no_strength_and_no_say(rng):
 def test_single_reading_or_saturated_spots_are_refused(rng):
     readings, rates, variance, good, _ = spots(rng, zero_deg=0.5, turn_deg=0.2)
     with pytest.raises(PolarizationError, match="two that differ"):
-        fit_films(readings[:3], rates[:3], variance[:3], good[:3], GLASS)
+        fit_polarizers(readings[:3], rates[:3], variance[:3], good[:3], GLASS)
     with pytest.raises(PolarizationError, match="shorter exposure"):
-        fit_films(readings, rates, variance, np.zeros_like(good), GLASS)
+        fit_polarizers(readings, rates, variance, np.zeros_like(good), GLASS)

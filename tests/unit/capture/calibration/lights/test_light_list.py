@@ -8,7 +8,7 @@ from capture.calibration.geometry.intrinsics import CameraPose, nominal_cameras
 from capture.calibration.lights import light_fit, mirror_lights, mirror_sphere, reflection
 from capture.calibration.lights.chrome_ball import ChromeBallError, directions_from_chrome_ball
 from capture.calibration.lights.light_list import CameraResponse, LightTable
-from capture.calibration.lights.mirror_sphere import SphereError, SpherePosition
+from capture.calibration.lights.mirror_sphere import MirrorSphereError, SpherePosition
 from capture.calibration.lights.white_plate import PlateSamples, WhitePlate
 from capture.rig import load_rig
 
@@ -98,7 +98,7 @@ def test_outline_is_ellipse_with_center_off_middle():
     assert np.linalg.norm(away) > 0.5
     place = mirror_sphere.locate_sphere({"C07": outline}, CAMERAS, RADIUS_MM)
     np.testing.assert_allclose(place.center_mm, center, atol=1e-5)
-    with pytest.raises(SphereError, match="inside"):
+    with pytest.raises(MirrorSphereError, match="inside"):
         mirror_sphere.contour(camera, camera.center_mm + 10.0, RADIUS_MM, 10)
 
 
@@ -116,7 +116,9 @@ def test_sphere_is_located_within_errors_wrong_radius_detected(rng):
         squares += gap @ np.linalg.solve(place.covariance_mm2, gap)
     # chi-square of 24 degrees of freedom, false alarm 1e-3 on each side
     assert 8.5 < squares < 51.2
-    with pytest.raises(SphereError, match=r"got 50.5, but the outlines in 5 cameras say 50\.0"):
+    with pytest.raises(
+        MirrorSphereError, match=r"got 50.5, but the outlines in 5 cameras say 50\.0"
+    ):
         mirror_sphere.locate_sphere(outlines, CAMERAS, 1.01 * RADIUS_MM)
 
 
@@ -150,7 +152,7 @@ def test_lights_are_placed_within_their_errors(rng):
     for _ in range(3):
         lights, true, spheres, seen = lights_and_highlights(rng, 0.05)
         found = mirror_lights.locate_lights(seen, CAMERAS, spheres, lights)
-        assert found.unseen == ()
+        assert found.unobserved == ()
         for k, name in enumerate(found.names):
             if found.valid[k]:
                 # one direction each: lights share the errors of the spheres' centres
@@ -169,7 +171,7 @@ def test_lights_visible_to_single_camera_keep_nominal_flagged(rng):
     name = next(iter(lights))
     kept = []
     for shot in seen:
-        miss = mirror_lights._miss_mm(
+        miss = mirror_lights._ray_distance_mm(
             CAMERAS[shot.view], spheres[shot.sphere], shot.pixels, np.array([lights[name]])
         )[:, 0]
         pixels = shot.pixels if shot.view == "C07" else shot.pixels[miss > 40.0]
@@ -180,7 +182,7 @@ def test_lights_visible_to_single_camera_keep_nominal_flagged(rng):
     np.testing.assert_array_equal(found.position_mm[0], lights[name])
     assert found.valid[1:].sum() > 10
     one = [shot for shot in seen if shot.view == "C07"]
-    with pytest.raises(SphereError, match="no light was seen by 2 cameras"):
+    with pytest.raises(MirrorSphereError, match="no light was seen by 2 cameras"):
         mirror_lights.locate_lights(one, CAMERAS, spheres, lights)
 
 
@@ -244,7 +246,7 @@ def test_powers_and_gains_are_separated(rng):
     np.testing.assert_allclose(fit.table.intensity[kept], table.intensity[kept], rtol=2e-3)
     for view, gain in gains.items():
         np.testing.assert_allclose(fit.table.cameras[CAMERAS[view].serial].gain, gain, rtol=1e-3)
-    assert (fit.dead, fit.answers) == ((), {})
+    assert (fit.dead, fit.swapped) == ((), {})
 
 
 def test_a_shading_that_is_anothers_is_named(rng):
@@ -260,10 +262,10 @@ def test_a_shading_that_is_anothers_is_named(rng):
         else s
         for s in crossed
     ]
-    answers, dead = light_fit.check_order(dark, table)
+    answers, dead = light_fit.find_swapped_lights(dark, table)
     assert answers == names
     assert dead == (off,)
-    assert light_fit.check_order(samples, table) == ({}, ())
+    assert light_fit.find_swapped_lights(samples, table) == ({}, ())
 
 
 def test_chrome_ball_photographs_give_the_list_of_lights(test_data):

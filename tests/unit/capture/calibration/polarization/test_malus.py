@@ -8,8 +8,8 @@ from capture.calibration import store
 from capture.calibration.polarization.malus import (
     PolarizationCalibration,
     PolarizationError,
+    find_modulated_pixels,
     fit_malus,
-    modulated_pixels,
 )
 
 ANGLES = np.deg2rad(np.arange(0.0, 181.0, 15.0))
@@ -140,8 +140,8 @@ def test_polarized_target_is_located_in_image():
         (np.where(target, malus(a), 0.3)[..., None] + 1e-3 * rng.normal(size=(30, 40, 3)))
         for a in ANGLES
     ]
-    np.testing.assert_array_equal(modulated_pixels(ANGLES, images), target)
-    masked = modulated_pixels(ANGLES, images, valid=~target | (np.arange(40) < 20))
+    np.testing.assert_array_equal(find_modulated_pixels(ANGLES, images), target)
+    masked = find_modulated_pixels(ANGLES, images, valid=~target | (np.arange(40) < 20))
     np.testing.assert_array_equal(masked, target & (np.arange(40) < 20))
 
 

@@ -7,7 +7,10 @@ from capture.calibration.geometry.intrinsics import CameraPose
 from capture.calibration.lights.reflection import mirror_lights
 from capture.calibration.polarization import polarized_reflection
 from capture.calibration.polarization.malus import PolarizationError
-from capture.calibration.polarization.polarized_reflection import Reflection, fresnel_amplitudes
+from capture.calibration.polarization.polarized_reflection import (
+    FacetReflection,
+    fresnel_amplitudes,
+)
 from capture.rig import load_rig
 from rigsim import shading
 from rigsim.as_built.polarizers import absorbing_axis
@@ -22,7 +25,7 @@ BALL = np.array([0.3, -0.2, -2.8])
 def by_ball(eta=1.52, lights=RIG.lights):
     place = np.array([light.position_mm for light in lights])
     shown = mirror_lights(CAMERA, BALL, 6.0, place)
-    return Reflection.of(
+    return FacetReflection.of(
         lights,
         CAMERA,
         VIEW.analyser_axis_deg,
@@ -35,7 +38,7 @@ def by_ball(eta=1.52, lights=RIG.lights):
 def by_skin(eta=1.4):
     to_light = PLACE / np.linalg.norm(PLACE, axis=1, keepdims=True)
     to_camera = np.tile([0.0, 0.0, 1.0], (len(PLACE), 1))
-    return Reflection.of(
+    return FacetReflection.of(
         RIG.lights, CAMERA, VIEW.analyser_axis_deg, eta, to_light=to_light, to_camera=to_camera
     )
 
@@ -102,7 +105,7 @@ def test_the_simulators_own_reflection_agrees():
             extinction=2000.0,
         )
         for e, reading in enumerate(readings):
-            behind = shading.analyse(
+            behind = shading.apply_analyzer(
                 stokes,
                 reflection.to_camera[k][None],
                 passes_deg=VIEW.analyser_axis_deg + reading + 0.7,

@@ -6,8 +6,8 @@ import pytest
 from scipy.stats import binom
 
 from capture.calibration import store
-from capture.calibration.sensor.noise_model import SensorCalibration, photon_transfer
-from capture.calibration.sensor.transfer_curve import FlatPair, PhotonTransferError, cfa_planes
+from capture.calibration.sensor.noise_model import SensorCalibration, calibrate_sensor
+from capture.calibration.sensor.transfer_curve import FlatPair, PhotonTransferError, cfa_offsets
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Bench:
         electrons = light * response * 36000.0
         if self.pattern != "MONO":
             filters = np.ones(self.shape)
-            for c, positions in enumerate(cfa_planes(self.pattern).values()):
+            for c, positions in enumerate(cfa_offsets(self.pattern).values()):
                 for row, column in positions:
                     filters[row::2, column::2] = self.color[c]
             electrons = electrons * filters
@@ -60,7 +60,7 @@ class Bench:
         light = np.linspace(top / levels, top, levels)
         pairs = [FlatPair(self.frame(x, fixed, rng), self.frame(x, fixed, rng), x) for x in light]
         times = [0.01] * darks if exposures_s is None else exposures_s
-        return photon_transfer(
+        return calibrate_sensor(
             pairs,
             [self.frame(0.0, fixed, rng, exposure_s=t) for t in times],
             white_dn=self.white,
@@ -198,7 +198,7 @@ def test_hot_pixels_are_omitted():
         for x in np.linspace(0.1, 0.9, 6)
     ]
     darks = [bench.frame(0.0, (response, offset), rng) for _ in range(4)]
-    result = photon_transfer(pairs, darks, white_dn=bench.white)
+    result = calibrate_sensor(pairs, darks, white_dn=bench.white)
     assert result.hot_pixels == 4
     assert np.abs(sigmas(result.black_dn, 512.0)).max() < 5
     assert np.abs(sigmas(result.gain_e_per_dn, 2.5)).max() < 4
@@ -264,7 +264,7 @@ def _frames(n, value=600):
 )
 def test_unusable_frames_error_names_required_frames(pairs, darks, says):
     with pytest.raises(PhotonTransferError, match=says):
-        photon_transfer(pairs(), darks(), white_dn=16383)
+        calibrate_sensor(pairs(), darks(), white_dn=16383)
 
 
 def test_identical_frames_are_not_pair():
@@ -273,7 +273,7 @@ def test_identical_frames_are_not_pair():
         FlatPair(*[(512 + x * 14000 * ramp).astype(np.uint16)] * 2, x) for x in (0.3, 0.6, 0.9)
     ]
     with pytest.raises(PhotonTransferError, match="identical"):
-        photon_transfer(pairs, [np.full((128, 128), 512, np.uint16)] * 2, white_dn=16383)
+        calibrate_sensor(pairs, [np.full((128, 128), 512, np.uint16)] * 2, white_dn=16383)
 
 
 def test_denoised_frames_are_refused_as_processed():
@@ -286,4 +286,4 @@ def test_denoised_frames_are_refused_as_processed():
 
     pairs = [FlatPair(frame(x), frame(x), x) for x in (0.3, 0.6, 0.9)]
     with pytest.raises(PhotonTransferError, match="does not grow"):
-        photon_transfer(pairs, [frame(0.0), frame(0.0)], white_dn=16383)
+        calibrate_sensor(pairs, [frame(0.0), frame(0.0)], white_dn=16383)

@@ -270,7 +270,7 @@ def bus(clock, body, tmp_path, monkeypatch):
         ParameterSet=dict,
         ParameterKey=SimpleNamespace(ENABLE_AUTO_CHUNK_DATA_UPDATE="chunks"),
     )
-    library = genicam_producer.Library(core, (GenericError,))
+    library = genicam_producer.GenicamLibrary(core, (GenericError,))
     monkeypatch.setattr(genicam, "load_library", lambda url: library)
     monkeypatch.setattr(genicam.GenicamCamera.__init__, "__kwdefaults__", {"clock": clock})
     monkeypatch.setenv("GENICAM_GENTL64_PATH", str(tmp_path))
@@ -452,7 +452,7 @@ def test_sequence_frames_match_light_rows_by_camera_clock(camera, body, clock):
         lag_s=0.0,
         timeout_s=1.0,
     )
-    frames = stream.until(5)
+    frames = stream.read_until(5)
     assert {row: int(frame.image[0, 0]) for row, frame in frames.items()} == {
         row: 65 + row for row in (0, 1, 3, 4, 5)
     }
@@ -688,7 +688,7 @@ def test_missing_format_or_line_error_lists_available(bus):
 
 
 def test_every_library_error_is_camera_error():
-    library = genicam_producer.Library(None, (GenericError,))
+    library = genicam_producer.GenicamLibrary(None, (GenericError,))
     kinds = {
         "AccessException": CameraError,
         "ResourceInUseException": CameraBusy,
@@ -698,5 +698,5 @@ def test_every_library_error_is_camera_error():
         "GenericException": LinkLost,
     }
     for (name, kind), doing in itertools.product(kinds.items(), ["a", "b"]):
-        with pytest.raises(kind, match=doing), library.translated(doing):
+        with pytest.raises(kind, match=doing), library.translate_errors(doing):
             raise error(name)

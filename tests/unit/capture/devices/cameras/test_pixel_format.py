@@ -29,7 +29,7 @@ def packed(values, bits, packing):
     "name", ["Mono8", "BayerRG8", "Mono10", "Mono12", "Mono14", "BayerGB16", *PACKED]
 )
 def test_every_value_comes_back_from_its_bytes(name, padding):
-    format_ = pixel_format.parse(name)
+    format_ = pixel_format.parse_pixel_format(name)
     rng = np.random.default_rng(3)
     values = rng.integers(0, 2**format_.bits, (6, 8)).astype(np.uint16)
     values[0, :2] = 0, 2**format_.bits - 1
@@ -53,7 +53,7 @@ def test_every_value_comes_back_from_its_bytes(name, padding):
 def test_packed_values_are_those_that_the_library_unpacks(name):
     pfnc = pytest.importorskip("harvesters.util.pfnc")
     data = np.random.default_rng(5).integers(0, 256, 840, dtype=np.uint8)
-    format_ = pixel_format.parse(name)
+    format_ = pixel_format.parse_pixel_format(name)
     pixels = 840 * 8 // (12 if format_.packing == "Packed" else format_.bits)
     theirs = getattr(pfnc, name)().expand(data)
     np.testing.assert_array_equal(
@@ -62,7 +62,7 @@ def test_packed_values_are_those_that_the_library_unpacks(name):
 
 
 def test_two_byte_numbers_may_be_big_endian():
-    got = pixel_format.parse("Mono12").unpack(
+    got = pixel_format.parse_pixel_format("Mono12").unpack(
         bytes([0x0A, 0xBC, 0x01, 0x02]), width_px=2, height_px=1, big_endian=True
     )
     assert got.tolist() == [[0xABC, 0x102]]
@@ -71,12 +71,12 @@ def test_two_byte_numbers_may_be_big_endian():
 @pytest.mark.parametrize(("width", "name"), [(6, "Mono10p"), (3, "Mono12p"), (5, "Mono12Packed")])
 def test_lines_that_end_within_a_group_are_refused(width, name):
     with pytest.raises(ValueError, match="multiple of"):
-        pixel_format.parse(name).unpack(bytes(100), width_px=width, height_px=2)
+        pixel_format.parse_pixel_format(name).unpack(bytes(100), width_px=width, height_px=2)
 
 
 @pytest.mark.parametrize("corner", BAYER)
 def test_the_filter_array_is_that_of_the_name(corner):
-    assert pixel_format.parse(f"Bayer{corner}12p").pattern == BAYER[corner]
+    assert pixel_format.parse_pixel_format(f"Bayer{corner}12p").pattern == BAYER[corner]
 
 
 @pytest.mark.parametrize(
@@ -96,10 +96,15 @@ def test_the_filter_array_is_that_of_the_name(corner):
     ],
 )
 def test_other_formats_are_not_raw(name):
-    assert pixel_format.parse(name) is None
+    assert pixel_format.parse_pixel_format(name) is None
 
 
 def test_deepest_raw_format_is_chosen_gray_conversion_never():
-    assert pixel_format.deepest(["Mono16", "BayerRG8", "BayerRG10p"]).name == "BayerRG10p"
-    assert pixel_format.deepest(["Mono12p", "Mono12", "Mono12Packed"]).name == "Mono12"
-    assert pixel_format.deepest(["RGB8", "YUV422_8"]) is None
+    assert (
+        pixel_format.choose_deepest_format(["Mono16", "BayerRG8", "BayerRG10p"]).name
+        == "BayerRG10p"
+    )
+    assert (
+        pixel_format.choose_deepest_format(["Mono12p", "Mono12", "Mono12Packed"]).name == "Mono12"
+    )
+    assert pixel_format.choose_deepest_format(["RGB8", "YUV422_8"]) is None

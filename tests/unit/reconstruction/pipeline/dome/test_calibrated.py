@@ -5,7 +5,7 @@ import numpy as np
 from capture.calibration.geometry.intrinsics import CameraPose
 from capture.calibration.lights.light_list import LightTable
 from capture.rig import load_rig
-from reconstruction.pipeline.dome.calibrated import Dome, seen_from
+from reconstruction.pipeline.dome.calibrated import CalibratedDome, transform_dome
 
 RIG = load_rig("dome").subset(lights=["L000", "L017", "L023"], views=["C00", "C07"]).resized(64)
 
@@ -19,11 +19,11 @@ def turn(axis, angle):
 def test_moved_head_projections_match_rig_frame(rng):
     cameras = tuple(CameraPose.nominal(view) for view in RIG.views)
     lights = LightTable.nominal(RIG)
-    dome = Dome(None, cameras, lights, lights, (), True, lambda *_: None)
+    dome = CalibratedDome(None, cameras, lights, lights, (), True, lambda *_: None)
     rotation, shift = turn((1, 2, -0.5), 0.2), np.array([12.0, -5.0, 3.0])
     points = rng.uniform(-60, 60, (20, 3))
     in_rig = points @ rotation.T + shift
-    moved = seen_from(dome, rotation, shift)
+    moved = transform_dome(dome, rotation, shift)
     for before, after in zip(dome.cameras, moved.cameras, strict=True):
         np.testing.assert_allclose(after.project(points), before.project(in_rig), atol=1e-6)
         assert np.abs(before.project(points) - before.project(in_rig)).max() > 0.5

@@ -8,10 +8,10 @@ import pytest
 from capture import raw
 from capture.plan import Plan, Step
 from capture.rig import load_rig
-from capture.session import Session, Subject
+from capture.session import Session, SubjectRecord
 from reconstruction.pipeline.dome.images import DomeImage, DomeImages
 from reconstruction.pipeline.inputs import InputsError
-from reconstruction.pipeline.sensor_noise import SensorNoise
+from reconstruction.pipeline.sensor_noise import ElectronNoise
 
 RIG = load_rig("dome").subset(lights=["L000", "L001"], views=["C00"]).resized(24)
 VIEW = RIG.views[0]
@@ -57,7 +57,7 @@ def make(path, rng, *, ambient=0.0, darks=0, profile=True):
         plan=Plan("dome", tuple(steps)),
         rig=RIG,
         devices={},
-        subject=Subject("P1", ("research",)),
+        subject=SubjectRecord("P1", ("research",)),
         source="simulated",
         seed=0,
         now=lambda: datetime(2026, 11, 21, tzinfo=UTC),
@@ -118,7 +118,7 @@ def test_sensor_of_unknown_noise_is_reported_calibrated_not(tmp_path, rng):
     session = make(tmp_path / "s", rng, profile=False)
     with pytest.raises(InputsError, match="calibrate the sensor"):
         DomeImages(session).image("C00", "L000")
-    noise = {VIEW.serial: SensorNoise(VIEW.gain_e_per_dn, VIEW.read_noise_e)}
+    noise = {VIEW.serial: ElectronNoise(VIEW.gain_e_per_dn, VIEW.read_noise_e)}
     assert DomeImages(session, noise=noise).image("C00", "L000").valid.all()
 
 

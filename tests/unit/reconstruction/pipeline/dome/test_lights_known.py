@@ -10,7 +10,7 @@ from capture.calibration import store
 from capture.calibration.lights.light_list import LightTable
 from capture.plan import Plan, Step
 from capture.rig import load_rig
-from capture.session import Session, Subject
+from capture.session import Session, SubjectRecord
 from reconstruction.pipeline.dome import stages as dome_stages
 from reconstruction.pipeline.inputs import Inputs
 
@@ -36,7 +36,7 @@ def session(tmp_path):
         plan=Plan("dome", steps),
         rig=RIG,
         devices={},
-        subject=Subject("P1", ("research",)),
+        subject=SubjectRecord("P1", ("research",)),
         source="simulated",
         seed=0,
         now=lambda: datetime(2026, 11, 21, tzinfo=UTC),

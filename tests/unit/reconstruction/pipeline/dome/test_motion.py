@@ -10,7 +10,7 @@ from capture.calibration.geometry.intrinsics import CameraPose
 from capture.raw import RawFrame
 from capture.rig import load_rig
 from reconstruction.pipeline.dome.images import DomeImage
-from reconstruction.pipeline.dome.motion import HalfPixels, follow_head
+from reconstruction.pipeline.dome.motion import HalfResolutionCamera, follow_head
 from reconstruction.pipeline.inputs import InputsError
 
 RADIUS_MM = 70.0
@@ -111,7 +111,7 @@ def follow(session):
 
 def test_half_resolution_cameras_project_to_full_image_positions():
     points = SURFACE.points_mm[:50]
-    half = HalfPixels(CAMERAS[0])
+    half = HalfResolutionCamera(CAMERAS[0])
     np.testing.assert_allclose(
         2.0 * half.project(points) + 0.5, CAMERAS[0].project(points), atol=1e-9
     )

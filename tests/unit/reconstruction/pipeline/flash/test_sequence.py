@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from model.skin import SkinMap
-from reconstruction.pipeline.flash.sequence import _laid_over_rest
+from reconstruction.pipeline.flash.sequence import _align_to_rest
 
 SIDE, NOISE, PROMPT_S = 128, 5e-4, 5.0
 PHASE = (5.5 * np.arange(22)) % (2 * PROMPT_S) + 0.007
@@ -35,7 +35,7 @@ def test_same_pose_frames_scatter_as_stated_without_alignment():
     """One alignment lays all of them: its error is theirs together, a step and no noise."""
     asked = PHASE < PROMPT_S
     evidence = SimpleNamespace(assumed=[])
-    moved, laid = _laid_over_rest(
+    moved, laid = _align_to_rest(
         frames(np.random.default_rng(20), asked), PHASE, PROMPT_S, evidence
     )
     assert evidence.assumed == []

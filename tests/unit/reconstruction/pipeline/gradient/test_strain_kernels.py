@@ -8,7 +8,12 @@ from scipy import ndimage
 
 from capture.plan.gradient import state_name
 from model.skin import SkinMap
-from reconstruction.normal_histogram.blocks import BLOCKS_PER_SIDE, block_counts, block_of, grid_of
+from reconstruction.normal_histogram.blocks import (
+    BLOCKS_PER_SIDE,
+    assign_blocks,
+    block_grid_shape,
+    count_block_normals,
+)
 from reconstruction.pipeline.gradient.images import SkinState
 from reconstruction.pipeline.gradient.skin_strain import StateStrain, skin_mask
 from reconstruction.pipeline.gradient.strain_kernels import (
@@ -80,7 +85,9 @@ def fitted(relief):
         heights[strains[-1].state.name] = as_map(middle(strained(relief, angle, r, alpha, sigma)))
     counted = count_normals(strains, heights, pixel_um=PIXEL_UM)
     told = []
-    document = fit_kernels(strains, heights, counted, pixel_um=PIXEL_UM, tell=told.append)
+    document = fit_kernels(
+        strains, heights, counted, pixel_um=PIXEL_UM, report_progress=told.append
+    )
     return strains, counted, document, told
 
 
@@ -140,9 +147,11 @@ def test_state_is_counted_in_blocks_that_show_skin(relief, angle_deg):
         each, as_map(whole[top : top + SIDE, left : left + SIDE]), pixel_um=PIXEL_UM, there=there
     )
     turned, inside = _along_x(middle(whole).astype(np.float32), there, each.state.angle_rad)
-    group, groups = block_of(np.arange(SIDE**2), (SIDE, SIDE), BLOCKS_PER_SIDE)
-    expected = block_counts(turned, group.reshape(SIDE, SIDE), groups, pixel=PIXEL_UM, valid=inside)
-    assert found.shape == (*grid_of((SIDE, SIDE), BLOCKS_PER_SIDE), 64, 64)
+    group, groups = assign_blocks(np.arange(SIDE**2), (SIDE, SIDE), BLOCKS_PER_SIDE)
+    expected = count_block_normals(
+        turned, group.reshape(SIDE, SIDE), groups, pixel=PIXEL_UM, valid=inside
+    )
+    assert found.shape == (*block_grid_shape((SIDE, SIDE), BLOCKS_PER_SIDE), 64, 64)
 
     def shares(counts):
         coarse = counts.reshape(-1, 16, 4, 16, 4).sum(axis=(2, 4)).reshape(len(counts), -1)
@@ -175,7 +184,9 @@ def test_state_near_neutral_or_unstrained_has_no_kernel(relief):
     strains = [state(0.0, 0, 1.0), state(0.0, 1, 1.004), lost]
     heights = {each.state.name: as_map(middle(relief)) for each in strains}
     counted = count_normals(strains, heights, pixel_um=PIXEL_UM)
-    document = fit_kernels(strains, heights, counted, pixel_um=PIXEL_UM, tell=lambda share: None)
+    document = fit_kernels(
+        strains, heights, counted, pixel_um=PIXEL_UM, report_progress=lambda share: None
+    )
     assert document["fits"] == []
     assert document["tables"] == []
 

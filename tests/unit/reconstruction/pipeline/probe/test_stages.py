@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from capture.calibration.fiber.probe_calibration import FiberReflectance
-from capture.plan.suction import Placement
+from capture.plan.suction import HeadPlacement
 from capture.rig import load_rig
 from model import photon_table
 from reconstruction.pipeline.probe import profile_fits
@@ -33,8 +33,8 @@ def profile(site="cheek", *, angle=0.0, repeat=0, scale=1.0, common=0.0, noise=0
     if rng is not None:
         value = value * (1 + noise * rng.standard_normal(value.shape))
     slope = common * (RADIUS - RADIUS.mean())[:, None] * np.ones(3)
-    return profile_fits.Profile(
-        Measurement(Placement(site, angle, repeat), 23, 1.0, 60.0, 5.0),
+    return profile_fits.MeasuredProfile(
+        Measurement(HeadPlacement(site, angle, repeat), 23, 1.0, 60.0, 5.0),
         FiberReflectance(
             tuple(fibre.name for fibre in PROBE.fibres),
             RADIUS,
@@ -140,7 +140,9 @@ def test_directions_are_judged_only_where_there_are_enough():
 
 
 def test_a_measurement_is_called_after_its_placement():
-    names = {measurement_name(Placement("cheek", 22.5 * k, r)) for k in range(16) for r in (0, 1)}
+    names = {
+        measurement_name(HeadPlacement("cheek", 22.5 * k, r)) for k in range(16) for r in (0, 1)
+    }
     assert len(names) == 32
 
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from capture.rig import Rig, load_rig
-from rigsim.as_built.dome import BuiltDome, Tolerances, bend, build
+from rigsim.as_built.dome import ActualDome, DomeTolerances, build_dome, distort
 from rigsim.light import olat
 from rigsim.light.led_light import DOME_METER_RATE_PER_S
 from rigsim.needs.effects import SceneEffects
 from rigsim.render.variant import VariantChoice, choose_variant
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.exposing import SceneError
-from rigsim.subject.head_motion import MotionError, head_motion
+from rigsim.subject.head_motion import HeadMotionError, draw_head_motion
 from rigsim.subject.person import make_subject
 from rigsim.targets.flat import make_target
 
@@ -98,7 +98,7 @@ def test_white_reference_facing_meter_led_gets_meter_rate(white):
 def test_actual_dome_has_own_gains_dead_lights_wires(rig, white):
     axes = np.array([-np.array(light.position_mm) for light in rig.lights])
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    built = BuiltDome(
+    built = ActualDome(
         rig, rig, axes, gain={"C": 0.5}, dead=frozenset({"top"}), wiring=(1, 0, 2, 3, 4)
     )
     scene = direct(rig, make_target("white"), dome=built)
@@ -112,7 +112,7 @@ def test_actual_dome_has_own_gains_dead_lights_wires(rig, white):
 
 def test_distorted_image_shows_points_at_lens_projection(rig, face):
     """Tolerance: the middle of what a pixel of 3 mm covers, and rows kept as float32."""
-    built = build(rig, seed=2, tolerances=Tolerances(distortion=0.2))
+    built = build_dome(rig, seed=2, tolerances=DomeTolerances(distortion=0.2))
     scene = direct(rig, face, dome=built)
     truth, view = scene.truth(), built.rig.views[0]
     rows, columns = np.nonzero(truth["mask"])
@@ -122,7 +122,7 @@ def test_distorted_image_shows_points_at_lens_projection(rig, face):
 
     def miss(distortion):
         middle = np.array([(view.width_px - 1) / 2, (view.height_px - 1) / 2])
-        px = bend(slopes, distortion) * view.focal_px + middle
+        px = distort(slopes, distortion) * view.focal_px + middle
         return np.abs(px - np.stack([columns, rows], axis=-1)).max()
 
     assert miss(built.distortion["C"]) < 0.02
@@ -238,14 +238,14 @@ def test_subpixels_change_edges_only(rig, face, scene):
 
 
 def test_head_matches_its_mesh_at_time_zero(rig, face, scene):
-    moving = direct(rig, face, motion=head_motion(3))
+    moving = direct(rig, face, motion=draw_head_motion(3))
     np.testing.assert_array_equal(moving.radiance("C", [0]), scene.radiance("C", [0]))
     assert (moving.radiance("C", [0], t_s=9.0) != scene.radiance("C", [0])).any()
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_drift_and_rotation_reach_drawn_sizes_smoothly(seed):
-    motion = head_motion(seed, drift_mm=2.0, drift_deg=0.5)
+    motion = draw_head_motion(seed, drift_mm=2.0, drift_deg=0.5)
     t = np.linspace(0.0, 25.0, 2001)
     poses = [motion.pose(float(x)) for x in t]
     pivot = np.array([0.0, 0.0, -70.0])
@@ -259,7 +259,7 @@ def test_drift_and_rotation_reach_drawn_sizes_smoothly(seed):
 
 def test_shifted_head_equals_still_head_in_shifted_rig(rig, face):
     """Moving the head by s is moving camera and lights by -s, apart from where LEDs point."""
-    motion = head_motion(3, drift_mm=3.0, drift_deg=1.0, twitch=False)
+    motion = draw_head_motion(3, drift_mm=3.0, drift_deg=1.0, twitch=False)
     rotation, shift = motion.pose(7.0)
     moved = direct(rig, face, motion=motion).radiance("C", [0, 1], t_s=7.0)
 
@@ -286,10 +286,10 @@ def test_shifted_head_equals_still_head_in_shifted_rig(rig, face):
 
 
 def test_twitch_moves_only_mouth_for_half_a_second(rig, face, scene):
-    motion = head_motion(3, drift_mm=0.0, drift_deg=0.0)
+    motion = draw_head_motion(3, drift_mm=0.0, drift_deg=0.0)
     start = motion.twitch_start_s
-    assert motion.twitch(start) == motion.twitch(start + 0.51) == 0.0
-    assert motion.twitch(start + 0.25) == pytest.approx(1.0)
+    assert motion.twitch_amount(start) == motion.twitch_amount(start + 0.51) == 0.0
+    assert motion.twitch_amount(start + 0.25) == pytest.approx(1.0)
     moving = direct(rig, face, motion=motion)
     rest = scene.radiance("C", [0])[0]
     np.testing.assert_array_equal(moving.radiance("C", [0], t_s=start - 0.01)[0], rest)
@@ -305,7 +305,7 @@ def test_twitch_moves_only_mouth_for_half_a_second(rig, face, scene):
 
 
 def test_target_stays_in_place(rig, white):
-    moving = direct(rig, make_target("white"), motion=head_motion(1))
+    moving = direct(rig, make_target("white"), motion=draw_head_motion(1))
     np.testing.assert_array_equal(moving.radiance("C", [1], t_s=5.0), white.radiance("C", [1]))
     assert not direct(rig, make_target("dark")).radiance("C", [0]).any()
 
@@ -368,14 +368,14 @@ def test_impossible_scene_requests_are_refused(rig, face, scene):
         direct(rig, make_target("white")).truth()
     with pytest.raises(SceneError, match="subpixels"):
         direct(rig, face, subpixels=0)
-    with pytest.raises(MotionError, match="drift_mm"):
-        head_motion(0, drift_mm=50.0)
+    with pytest.raises(HeadMotionError, match="drift_mm"):
+        draw_head_motion(0, drift_mm=50.0)
 
 
 def test_omitted_effects_are_named_and_built_are_not(rig, face, scene):
     names = {name for name, _ in scene.left_out}
     assert {"light from skin to skin", "movement of the head"} <= names
-    moving = {name for name, _ in direct(rig, face, motion=head_motion(0)).left_out}
+    moving = {name for name, _ in direct(rig, face, motion=draw_head_motion(0)).omitted}
     assert "movement of the head" not in moving
 
 

@@ -5,16 +5,23 @@ import numpy as np
 import pytest
 
 from capture.rig import load_rig
-from rigsim.as_built.dome import Tolerances, bend, build, image_of, pixel_corner_rays, unbend
+from rigsim.as_built.dome import (
+    DomeTolerances,
+    build_dome,
+    distort,
+    pixel_corner_rays,
+    project_points,
+    undistort,
+)
 from rigsim.light.led_light import white_intensity
-from rigsim.scenes.dome.targets import TARGET_POSES, TargetScene, plate_normals, target_scene
+from rigsim.scenes.dome.targets import TARGET_POSES, TargetScene, make_target_scene, plate_normals
 from rigsim.scenes.exposing import SceneError
 from rigsim.sensor import vignetting_map
 from rigsim.targets import mirror_ball, printed_plate
 
 RIG = load_rig("dome").subset(views=["C07", "C10"]).resized(324)
 FRONT = int(np.argmax([light.position_mm[2] for light in RIG.lights]))
-EXACT = Tolerances(**{f.name: 0.0 for f in dataclasses.fields(Tolerances)})
+EXACT = DomeTolerances(**{f.name: 0.0 for f in dataclasses.fields(DomeTolerances)})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,19 +50,19 @@ def test_the_printed_bits_are_those_of_the_dictionary():
 def test_a_lens_bends_and_unbends(rng):
     lens = np.array([-0.2, 0.1, 0.002, -0.003, 0.02])
     slopes = rng.uniform(-0.25, 0.25, (40, 2))
-    np.testing.assert_allclose(unbend(bend(slopes, lens), lens), slopes, atol=1e-12)
+    np.testing.assert_allclose(undistort(distort(slopes, lens), lens), slopes, atol=1e-12)
     view = RIG.views[0]
     corners = pixel_corner_rays(view, lens)
     middles = (corners[:-1, :-1] + corners[1:, 1:]) / 2
     places = np.array(view.position_mm) + 700.0 * middles
     rows, columns = np.mgrid[: view.height_px, : view.width_px]
     np.testing.assert_allclose(
-        image_of(view, lens, places), np.stack([columns, rows], axis=-1), atol=1e-3
+        project_points(view, lens, places), np.stack([columns, rows], axis=-1), atol=1e-3
     )
 
 
 def test_actual_dome_is_reproducible_and_near_nominal():
-    whole, part = build(load_rig("dome"), seed=4), build(RIG, seed=4)
+    whole, part = build_dome(load_rig("dome"), seed=4), build_dome(RIG, seed=4)
     assert whole.rig.view("C10").position_mm == part.rig.view("C10").position_mm
     assert whole.rig.light("L033") == part.rig.light("L033")
     shift = np.array(
@@ -66,17 +73,17 @@ def test_actual_dome_is_reproducible_and_near_nominal():
     )
     # 450 normal numbers of deviation 2.5: the root mean square is within 4.5 sigma of that
     assert np.sqrt(np.mean(shift**2)) == pytest.approx(2.5, rel=4.5 / np.sqrt(900))
-    exact = build(RIG, seed=4, tolerances=EXACT)
+    exact = build_dome(RIG, seed=4, tolerances=EXACT)
     assert exact.rig.views[0].position_mm == pytest.approx(RIG.views[0].position_mm)
 
 
 def test_white_plate_follows_inverse_square_and_cosine():
-    scene = TargetScene("white", build(RIG, seed=1, tolerances=EXACT), seed=1, slope_deg=0.0)
+    scene = TargetScene("white", build_dome(RIG, seed=1, tolerances=EXACT), seed=1, slope_deg=0.0)
     frontal = int(np.argmax([light.position_mm[2] for light in RIG.lights]))
     light = scene.light("C07", lit(frontal))
     rotation, place = scene.plate_pose(0)
     middle = rotation @ np.array([126.0, 99.0, 0.0]) + place
-    column, row = image_of(RIG.view("C07"), np.zeros(5), middle).round().astype(int)
+    column, row = project_points(RIG.view("C07"), np.zeros(5), middle).round().astype(int)
     to_light = np.array(RIG.lights[frontal].position_mm) - middle
     distance = np.linalg.norm(to_light)
     cosine = to_light @ -rotation[:, 2] / distance
@@ -87,22 +94,24 @@ def test_white_plate_follows_inverse_square_and_cosine():
 
 
 def test_plate_is_dark_from_behind_and_when_backlit():
-    scene = TargetScene("white", build(RIG, seed=1, tolerances=EXACT), seed=1)
+    scene = TargetScene("white", build_dome(RIG, seed=1, tolerances=EXACT), seed=1)
     behind = int(np.argmin([light.position_mm[2] for light in RIG.lights]))
     assert scene.light("C07", lit(behind)).max() == 0.0
-    scene.show(6)  # turned to -105 degrees; the camera at +80 sees its back
+    scene.set_pose(6)  # turned to -105 degrees; the camera at +80 sees its back
     assert scene.light("C10", lit(*range(150))).max() == 0.0
 
 
 def test_print_appears_at_its_position(rng):
-    scene = target_scene("charuco", RIG, seed=2)
+    scene = make_target_scene("charuco", RIG, seed=2)
     view, lens = scene.rig.views[0], scene.dome.distortion["C07"]
     image = scene.light("C07", lit(*range(0, 150, 10)))[..., 1]
     rotation, place = scene.plate_pose(0)
     reflectance = printed_plate.charuco_board().reflectance
     rows, columns = np.nonzero(reflectance[1:-1, 1:-1] > 0)
     cells = np.column_stack([columns + 1, rows + 1])
-    px = image_of(view, lens, np.column_stack([(cells + 0.5) * 4.5, 0 * rows]) @ rotation.T + place)
+    px = project_points(
+        view, lens, np.column_stack([(cells + 0.5) * 4.5, 0 * rows]) @ rotation.T + place
+    )
     seen = image[px[:, 1].round().astype(int), px[:, 0].round().astype(int)]
     light = reflectance[cells[:, 1], cells[:, 0]] > 0.5
     assert seen[light].min() > 2.0 * seen[~light].max()
@@ -125,7 +134,7 @@ def test_a_ball_shows_lights_where_angles_are_equal(rng):
 def test_light_of_led_in_ball_is_conserved():
     """Flux of a highlight in closed form: a convex mirror of radius r shows a small distant disc of
     radiance L and radius a at d as an image that is smaller by about r / (2 d)."""
-    scene = TargetScene("mirror", build(RIG, seed=1, tolerances=EXACT), seed=1)
+    scene = TargetScene("mirror", build_dome(RIG, seed=1, tolerances=EXACT), seed=1)
     view = RIG.view("C07")
     frontal = int(
         np.argmin(
@@ -136,10 +145,10 @@ def test_light_of_led_in_ball_is_conserved():
         )
     )
     image = scene.light("C07", lit(frontal))[..., 1].astype(float)
-    ball = scene.ball_mm(0)
+    ball = scene.ball_center_mm(0)
     eye, lamp = np.array(view.position_mm), np.array(RIG.lights[frontal].position_mm)
     point = mirror_ball.reflection_point(eye, lamp, ball, 50.0)
-    column, row = image_of(view, np.zeros(5), point).round().astype(int)
+    column, row = project_points(view, np.zeros(5), point).round().astype(int)
     part = image[row - 4 : row + 5, column - 4 : column + 5]
     flux = (part - np.median(part)).sum()
     d = np.linalg.norm(lamp - point)
@@ -152,7 +161,7 @@ def test_light_of_led_in_ball_is_conserved():
 
 
 def test_frames_have_sensor_noise_and_follow_seed():
-    scene = target_scene("white", RIG, seed=3)
+    scene = make_target_scene("white", RIG, seed=3)
     pops = [Pulse(FRONT, 1.0, 1.0, 1.03)]
     one = scene.exposure("C07", pops=pops, exposure_s=0.03, seed=1)
     assert (one == scene.exposure("C07", pops=pops, exposure_s=0.03, seed=1)).all()
@@ -170,7 +179,7 @@ def test_frames_have_sensor_noise_and_follow_seed():
 
 
 def test_dead_lights_are_dark_crossed_wires_light_others():
-    straight = build(RIG, seed=1)
+    straight = build_dome(RIG, seed=1)
     wiring = list(range(150))
     wiring[40], wiring[FRONT] = FRONT, 40
     crossed = dataclasses.replace(straight, wiring=tuple(wiring), dead=frozenset(["L040"]))
@@ -190,10 +199,10 @@ def test_dead_lights_are_dark_crossed_wires_light_others():
 
 def test_targets_that_do_not_exist_are_refused():
     with pytest.raises(SceneError, match="charuco, mirror, white"):
-        target_scene("cube", RIG, seed=0)
-    scene = target_scene("mirror", RIG, seed=0)
+        make_target_scene("cube", RIG, seed=0)
+    scene = make_target_scene("mirror", RIG, seed=0)
     with pytest.raises(SceneError, match="expected 0 to 3"):
-        scene.show(4)
+        scene.set_pose(4)
     with pytest.raises(SceneError, match="level"):
         scene.exposure("C07", pops=[Pulse(0, 1.5, 0, 1)], exposure_s=1.0, seed=0)
     with pytest.raises(SceneError, match="no view 'C00'"):

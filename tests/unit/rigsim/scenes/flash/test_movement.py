@@ -12,7 +12,7 @@ from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject import landmarks
 from rigsim.subject.person import SimulatedSubject, make_subject
 from skinrig.simulating.dome import small_dome
-from skinrig.simulating.flash_truth import truth_of
+from skinrig.simulating.flash_truth import build_truth
 
 EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")
 WIDTH = 192
@@ -71,7 +71,7 @@ def test_state_blood_warped_back_matches_blood_at_rest(smile, rig):
     """
     truth = smile.truth()
     inside = truth["mask"]
-    pixels = landmarks.project(
+    pixels = landmarks.project_points(
         truth["position_at_rest_mm"][inside].astype(np.float64), rig.views[0]
     )
     at = pixels[:, ::-1].T
@@ -136,7 +136,7 @@ def test_global_states_keep_pose_neutral_skips_rest_maps(rest, tired):
 
 
 def test_posed_subject_keeps_pose_when_blood_changes(rig, face, tired):
-    half = face.posed("smile", 0.5)
+    half = face.with_expression("smile", 0.5)
     scene = scene_of(rig, half, "exercise")
     assert scene.subject is half
     np.testing.assert_array_equal(
@@ -153,7 +153,7 @@ def test_scenes_sharing_light_match_scenes_alone(rig, rest, tired):
 
 
 def test_stored_truth_has_landmarks_and_masked_rest_blood(smile, rest):
-    truth = truth_of(smile, 4, "0" * 64, "smile")
+    truth = build_truth(smile, 4, "0" * 64, "smile")
     assert truth.parameters["state"] == "smile"
     assert truth.parameters["movement"] is True
     assert len(truth.parameters["landmarks_px"]) >= 20
@@ -165,7 +165,7 @@ def test_stored_truth_has_landmarks_and_masked_rest_blood(smile, rest):
     assert (own != at_rest).any()
     assert truth.maps["hemoglobin_at_rest"].unit == truth.maps["hemoglobin"].unit
     assert truth.maps["position_at_rest_mm"].unit == "mm"
-    neutral = truth_of(rest, 4, "0" * 64, "neutral")
+    neutral = build_truth(rest, 4, "0" * 64, "neutral")
     assert len(neutral.parameters["landmarks_px"]) >= 20
     assert "hemoglobin_at_rest" not in neutral.maps
 
@@ -177,7 +177,7 @@ def test_dome_renders_expression_with_texture_frame_normals(face):
         state: DomeScene(rig, face, state=state, choice=EMBREE) for state in ("neutral", "surprise")
     }
     truths = {state: scene.truth_appearance().maps for state, scene in scenes.items()}
-    posed = face.posed("surprise")
+    posed = face.with_expression("surprise")
     np.testing.assert_array_equal(truths["surprise"]["normals"].values, posed.normal)
     np.testing.assert_array_equal(
         truths["surprise"]["normals_tangent"].values, posed.tangent_normal()
@@ -192,4 +192,4 @@ def test_dome_renders_expression_with_texture_frame_normals(face):
     seen = scenes["surprise"].truth()["position_mm"][..., 1]
     assert np.abs(seen - scenes["neutral"].truth()["position_mm"][..., 1]).max() > 1.0
     still = DomeScene(rig, face, state="surprise", movement=False, choice=EMBREE)
-    assert dict(still.left_out)["movement of the face with the state"]
+    assert dict(still.omitted)["movement of the face with the state"]

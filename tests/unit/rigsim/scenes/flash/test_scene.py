@@ -13,8 +13,8 @@ from rigsim.as_built.polarizers import IDEAL_POLARIZERS, PolarizerError, Polariz
 from rigsim.needs.effects import SceneEffects
 from rigsim.render.variant import VariantChoice
 from rigsim.scenes.exposing import SceneError
-from rigsim.scenes.flash.scene import FLAT_LEVEL, METER_LEVEL, FlashScene
-from rigsim.sensor import sensor_of
+from rigsim.scenes.flash.scene import FLAT_FIELD_LEVEL, METERING_LEVEL, FlashScene
+from rigsim.sensor import make_sensor
 from rigsim.subject.person import SimulatedSubject
 from rigsim.targets.flat import make_target, patch_centers_mm
 
@@ -56,7 +56,7 @@ def test_white_reference_gives_metered_level_behind_both_polarizers(rig):
     crossed, parallel = scene.radiance("crossed"), scene.radiance("parallel")
     middle = crossed[rig.views[0].height_px // 2, WIDTH // 2]
     np.testing.assert_allclose(middle, 0.99 * scene.white_rgb(), rtol=1e-3)
-    assert middle.max() == pytest.approx(0.99 * METER_LEVEL, rel=1e-3)
+    assert middle.max() == pytest.approx(0.99 * METERING_LEVEL, rel=1e-3)
     np.testing.assert_allclose(parallel, crossed, rtol=1e-5)
 
 
@@ -107,9 +107,9 @@ def test_crossed_image_is_shading_times_reflectance_plus_leak(ideal):
     product = truth["shading"][..., None] * truth["reflectance"] * ideal.white_rgb()
     rest = (ideal.radiance("crossed") - product)[truth["mask"]]
     # Texels are blended after the product is taken, which shows at the borders of moles and hair.
-    assert np.quantile(np.abs(rest), 0.9) < 5e-4 * METER_LEVEL
-    assert np.quantile(rest, 0.02) > -5e-4 * METER_LEVEL
-    assert np.abs(rest).max() < 0.01 * METER_LEVEL
+    assert np.quantile(np.abs(rest), 0.9) < 5e-4 * METERING_LEVEL
+    assert np.quantile(rest, 0.02) > -5e-4 * METERING_LEVEL
+    assert np.abs(rest).max() < 0.01 * METERING_LEVEL
 
 
 def test_skin_facing_camera_is_brighter_than_lambertian(ideal):
@@ -160,7 +160,7 @@ def test_metal_target_is_dark_behind_crossed_analyzer(rig):
 def test_flat_is_uniform_unpolarized_and_cap_is_dark(rig):
     flat, dark = scene_of(rig, make_target("flat")), scene_of(rig, make_target("dark"))
     image = flat.radiance("parallel")
-    assert image.max() == pytest.approx(FLAT_LEVEL)
+    assert image.max() == pytest.approx(FLAT_FIELD_LEVEL)
     assert np.ptp(image, axis=(0, 1)).max() == 0.0
     np.testing.assert_array_equal(image, flat.radiance("crossed", 33.0))
     assert not dark.radiance("crossed").any()
@@ -178,7 +178,7 @@ def test_chart_is_found_at_its_position(rig):
 
 def test_exposures_scale_with_pop_power_and_add_up(rig, face):
     quiet = dataclasses.replace(
-        sensor_of(rig.views[0], prnu=0.0, dsnu_e=0.0, vignetting=0.0, dark_e_per_s=0.0),
+        make_sensor(rig.views[0], prnu=0.0, dsnu_e=0.0, vignetting=0.0, dark_e_per_s=0.0),
         read_noise_e=0.0,
     )
     scene = scene_of(rig, make_target("white"), sensor=quiet, films=IDEAL_POLARIZERS)
@@ -196,7 +196,7 @@ def test_exposures_scale_with_pop_power_and_add_up(rig, face):
 
 def test_without_a_pop_the_frame_is_dark(rig):
     view = load_rig("flash").views[0]  # its read noise is more than a DN; binned pixels' is not
-    sensor = sensor_of(view)
+    sensor = make_sensor(view)
     scene = scene_of(rig, make_target("white"), sensor=sensor)
     frame = scene.exposure("cam", pops=(), exposure_s=0.01, seed=1)
     noise_dn = math.hypot(view.read_noise_e, sensor.dsnu_e) / view.gain_e_per_dn
@@ -266,8 +266,8 @@ def test_polarizers_of_rig_follow_from_serial_number(rig):
 
 def test_omitted_effects_are_reported_with_reason(real, ideal, rig):
     for scene in (real, ideal, scene_of(rig, make_target("white"))):
-        assert len(scene.left_out) >= 3
-        assert all(what and why for what, why in scene.left_out)
+        assert len(scene.omitted) >= 3
+        assert all(what and why for what, why in scene.omitted)
     assert len(ideal.left_out) == len(real.left_out) + 2  # spreading, and the lens
 
 

@@ -6,7 +6,7 @@ import pytest
 from capture.rig import Rig, load_rig
 from rigsim.as_built.polarizers import IDEAL_POLARIZERS
 from rigsim.needs.effects import SceneEffects
-from rigsim.render.depth_of_field import facing_depths
+from rigsim.render.depth_of_field import depth_range
 from rigsim.render.variant import VariantChoice
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject import landmarks
@@ -30,7 +30,7 @@ def rig() -> Rig:
 
 @pytest.fixture(scope="module")
 def nearer(face: SimulatedSubject) -> SimulatedSubject:
-    return face.moved_by((0.0, 0.0, NEARER_MM))
+    return face.translate((0.0, 0.0, NEARER_MM))
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def places(
 
 
 def test_unmoved_face_is_same_object(face):
-    assert face.moved_by((0.0, 0.0, 0.0)) is face
+    assert face.translate((0.0, 0.0, 0.0)) is face
 
 
 def test_moved_face_differs_only_in_position(face, nearer):
@@ -55,13 +55,16 @@ def test_moved_face_differs_only_in_position(face, nearer):
     for name in ("melanin", "normal", "roughness", "hair", "height_um"):
         assert getattr(nearer, name) is getattr(face, name)
     assert nearer.offset_mm == (0.0, 0.0, NEARER_MM)
-    assert nearer.moved_by((0.0, 0.0, -NEARER_MM)).offset_mm == face.offset_mm
+    assert nearer.translate((0.0, 0.0, -NEARER_MM)).offset_mm == face.offset_mm
 
 
 def test_moving_and_building_face_commute(face, nearer):
-    first, last = face.posed("smile").moved_by((0.0, 0.0, NEARER_MM)), nearer.posed("smile")
+    first, last = (
+        face.with_expression("smile").translate((0.0, 0.0, NEARER_MM)),
+        nearer.with_expression("smile"),
+    )
     np.testing.assert_allclose(first.mesh.vertices_mm, last.mesh.vertices_mm, atol=1e-3)
-    way = last.mesh.vertices_mm - face.posed("smile").mesh.vertices_mm
+    way = last.mesh.vertices_mm - face.with_expression("smile").mesh.vertices_mm
     np.testing.assert_allclose(way, np.broadcast_to([0, 0, NEARER_MM], way.shape), atol=1e-3)
     assert last.offset_mm == first.offset_mm == nearer.offset_mm
 
@@ -69,7 +72,7 @@ def test_moving_and_building_face_commute(face, nearer):
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (0.0, 0.0, np.nan), (0.0, np.inf, 0.0)])
 def test_invalid_offset_is_refused_by_name(face, offset):
     with pytest.raises(SubjectError, match="offset_mm"):
-        face.moved_by(offset)
+        face.translate(offset)
 
 
 def test_light_on_moved_face_matches_its_position(rig, places):
@@ -101,7 +104,7 @@ def test_images_and_landmarks_follow_moved_face_truth(rig, places):
     for scene in places:
         truth = scene.truth()
         rows, columns = np.nonzero(truth["mask"])
-        seen = landmarks.project(truth["position_mm"][rows, columns].astype(float), view)
+        seen = landmarks.project_points(truth["position_mm"][rows, columns].astype(float), view)
         off = np.hypot(seen[:, 0] - columns, seen[:, 1] - rows)
         assert np.quantile(off, 0.95) < 0.5
         assert not (scene.radiance()[rows, columns] <= 0.0).any()
@@ -121,8 +124,8 @@ def test_lens_blurs_face_out_of_focus(rig, face):
     view = rig.views[0]
     kept = []
     for nearer_mm in (0.0, 200.0):
-        moved = face.moved_by((0.0, 0.0, nearer_mm))
-        depths = np.array(facing_depths(view, moved.mesh)) - facing_depths(view, face.mesh)
+        moved = face.translate((0.0, 0.0, nearer_mm))
+        depths = np.array(depth_range(view, moved.mesh)) - depth_range(view, face.mesh)
         assert depths[1] == pytest.approx(nearer_mm, abs=1e-2)
         sharp, blurred = (
             scene_of(rig, moved, optics=optics).radiance() for optics in (False, True)

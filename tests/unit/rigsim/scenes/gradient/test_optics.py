@@ -8,13 +8,19 @@ import pytest
 
 from capture.rig import load_rig
 from rigsim.as_built.sphere import SphereError, build_sphere, nominal_sphere
-from rigsim.light.lobe_moments import MomentError, Surface, build_table, direct_moments, ripple
+from rigsim.light.lobe_moments import (
+    MicrofacetSurface,
+    MomentError,
+    lattice_ripple,
+    sum_led_moments,
+    tabulate_moments,
+)
 from rigsim.light.relief_shadow import HorizonError, horizon_tangent
-from rigsim.render.lens_blur import BlurError, Lens, blur, lens_of
+from rigsim.render.lens_blur import BlurError, Lens, blur_images, focused_lens
 from rigsim.scenes.gradient.resolution import slope_transfer
 from rigsim.scenes.gradient.scene import GradientScene
-from rigsim.skin_patch.motion import PatchMotion, shifted
-from rigsim.targets.glass_ball import ball_center_mm
+from rigsim.skin_patch.motion import PatchMotion, shift_image
+from rigsim.targets.glass_ball import draw_ball_center_mm
 
 
 @pytest.fixture(scope="module")
@@ -29,12 +35,12 @@ def sphere(rig):
 
 def surface(rig, alpha):
     view = rig.views[0]
-    return Surface(alpha, 1.4, view.position_mm, view.axes[0], 3000.0)
+    return MicrofacetSurface(alpha, 1.4, view.position_mm, view.axes[0], 3000.0)
 
 
 @pytest.fixture(scope="module")
 def lens(rig):
-    return lens_of(rig.views[0], "LED-B3")
+    return focused_lens(rig.views[0], "LED-B3")
 
 
 def one_wavelength(lens, wavelength_nm=550.0):
@@ -73,7 +79,7 @@ def test_blurred_waves_keep_phase_with_otf_amplitude(lens, subpixels):
     x = (np.arange(side * subpixels) + 0.5) / subpixels - 0.5
     phase = 2.0 * math.pi / period_px
     wave = np.broadcast_to(1.0 + 0.5 * np.cos(phase * x), (side * subpixels,) * 2)
-    seen = blur(wave[None].astype(np.float32), lens, subpixels=subpixels)[0]
+    seen = blur_images(wave[None].astype(np.float32), lens, subpixels=subpixels)[0]
     f = 1e3 / (period_px * lens.pixel_on_subject_um)
     left = float(lens.transfer(f)) * np.sinc(1.0 / period_px)
     expected = 1.0 + 0.5 * left * np.cos(phase * np.arange(side))
@@ -84,9 +90,9 @@ def test_depth_slices_match_single_depth(lens, rng):
     """A step of 0.5 mm: far from it each side is blurred as if it were alone."""
     image = rng.random((1, 96, 96), np.float32)
     depth = np.where(np.arange(96) < 48, 0.0, 0.5).astype(np.float32) * np.ones((96, 1), np.float32)
-    both = blur(image, lens, depth_mm=depth)[0]
-    near = blur(image, lens, depth_mm=np.zeros((96, 96), np.float32))[0]
-    far = blur(image, lens, depth_mm=np.full((96, 96), 0.5, np.float32))[0]
+    both = blur_images(image, lens, depth_mm=depth)[0]
+    near = blur_images(image, lens, depth_mm=np.zeros((96, 96), np.float32))[0]
+    far = blur_images(image, lens, depth_mm=np.full((96, 96), 0.5, np.float32))[0]
     assert np.abs(both[:, :36] - near[:, :36]).max() < 2e-3
     assert np.abs(both[:, 60:] - far[:, 60:]).max() < 2e-3
     assert np.abs(near - far).max() > 5e-3
@@ -96,9 +102,11 @@ def test_invalid_lens_is_refused(lens):
     with pytest.raises(BlurError, match="weights"):
         Lens(30.0, 300.0, 0.9, 5.5, (550.0,), (0.5,))
     with pytest.raises(BlurError, match="images"):
-        blur(np.zeros((1, 9, 9), np.float32), lens, subpixels=2)
+        blur_images(np.zeros((1, 9, 9), np.float32), lens, subpixels=2)
     with pytest.raises(BlurError, match="depth_mm"):
-        blur(np.zeros((1, 9, 9), np.float32), lens, depth_mm=np.full((9, 9), np.nan, np.float32))
+        blur_images(
+            np.zeros((1, 9, 9), np.float32), lens, depth_mm=np.full((9, 9), np.nan, np.float32)
+        )
 
 
 def test_slope_transfer_matches_lens_and_pixel_mtf(lens):
@@ -181,15 +189,15 @@ def test_tables_match_sums_over_leds(rig, sphere, rng, alpha, size, most):
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     x, y = rng.uniform(-6.0, 6.0, (2, count)).astype(np.float32)
     look = surface(rig, alpha)
-    table = build_table(sphere, look, half_field_mm=6.2, size=size)
-    direct = direct_moments(normals, np.column_stack([x, y, 0 * x]), sphere, look).packed()
+    table = tabulate_moments(sphere, look, half_field_mm=6.2, size=size)
+    direct = sum_led_moments(normals, np.column_stack([x, y, 0 * x]), sphere, look).packed()
     held = table.covers(normals.astype(np.float32))
     assert held.mean() > 0.99
     found = table.lookup(normals.astype(np.float32), x, y)
     error = np.sqrt(np.mean((found - direct)[held] ** 2, axis=0))
     assert error[:12].max() < most * direct[:, 0].mean()
     assert error[12:].max() < 1e-3 * direct[:, 12].mean()
-    coarse = build_table(sphere, look, half_field_mm=6.2, size=17, fields=2)
+    coarse = tabulate_moments(sphere, look, half_field_mm=6.2, size=17, fields=2)
     rough = np.sqrt(np.mean((coarse.lookup(normals, x, y) - direct)[held] ** 2, axis=0))
     assert rough[0] > 2.0 * error[0]
 
@@ -197,26 +205,26 @@ def test_tables_match_sums_over_leds(rig, sphere, rng, alpha, size, most):
 def test_roughness_between_the_table_s_nodes_is_interpolated(rig, sphere, rng):
     normals = np.array([[0.1, -0.2, 0.97468]], np.float32)
     zero = np.zeros(1, np.float32)
-    table = build_table(
+    table = tabulate_moments(
         sphere, surface(rig, 0.25), half_field_mm=1.0, alpha_range=(0.22, 0.28), size=65, fields=2
     )
     for alpha in (0.22, 0.235, 0.26, 0.28):
-        direct = direct_moments(normals, np.zeros(3), sphere, surface(rig, alpha)).packed()
+        direct = sum_led_moments(normals, np.zeros(3), sphere, surface(rig, alpha)).packed()
         found = table.lookup(normals, zero, zero, np.array([alpha], np.float32))
         np.testing.assert_allclose(found, direct, rtol=1e-3, atol=0.003 * direct[0, 0])
 
 
 def test_the_leds_lattice_shows_in_narrow_lobes_only(rig, sphere):
     """About 2 % at roughness 0.2, three times as much at half of it."""
-    assert ripple(sphere, surface(rig, 0.2)) < 0.02
-    assert ripple(sphere, surface(rig, 0.1)) > 0.05
+    assert lattice_ripple(sphere, surface(rig, 0.2)) < 0.02
+    assert lattice_ripple(sphere, surface(rig, 0.1)) > 0.05
 
 
 def test_tables_without_nodes_are_refused(rig, sphere):
     with pytest.raises(MomentError, match="size"):
-        build_table(sphere, surface(rig, 0.25), half_field_mm=1.0, size=4)
+        tabulate_moments(sphere, surface(rig, 0.25), half_field_mm=1.0, size=4)
     with pytest.raises(MomentError, match="half_field_mm"):
-        build_table(sphere, surface(rig, 0.25), half_field_mm=0.0)
+        tabulate_moments(sphere, surface(rig, 0.25), half_field_mm=0.0)
 
 
 # sphere, motion, ball -----------------------------------------------------------------------------
@@ -245,7 +253,7 @@ def test_shifts_of_blurred_image_are_within_one_percent():
         return 1.0 + 0.5 * np.cos(2 * np.pi * (x + 0.3 * y) / 5.0)
 
     image = scene(x, y).astype(np.float32)
-    moved = shifted(image, (0.006 * 1.4, -0.006 * 0.7), pixel_um=6.0, border_px=8)
+    moved = shift_image(image, (0.006 * 1.4, -0.006 * 0.7), pixel_um=6.0, border_px=8)
     expected = scene(x - 1.4, y - 0.7)[8:-8, 8:-8]
     assert np.abs(moved - expected).max() < 0.01
     assert np.abs(image[8:-8, 8:-8] - expected).max() > 0.3
@@ -272,7 +280,7 @@ def test_ball_shows_leds_at_mirror_reflection_positions(rig):
     image = scene.radiance("full")
     spots, count = label(image > 0.05 * image.max())
     found = np.array(center_of_mass(image, spots, range(1, count + 1)))[:, ::-1]
-    eye, center = np.array(small.views[0].position_mm), ball_center_mm(2)
+    eye, center = np.array(small.views[0].position_mm), draw_ball_center_mm(2)
     expected = []
     for place in scene.sphere.position_mm:
         point = reflection_point(eye, place, center, 6.0)

@@ -11,10 +11,10 @@ from rigsim.as_built.polarizers import IDEAL_POLARIZERS
 from rigsim.as_built.sphere import PATTERN_WEIGHTS, build_sphere
 from rigsim.boxes.gradient_sphere import PatternLight
 from rigsim.scenes.exposing import SceneError
-from rigsim.scenes.gradient.resolution import Waves, wavy_scene
+from rigsim.scenes.gradient.resolution import SineRelief, make_sine_relief_scene
 from rigsim.scenes.gradient.scene import GRADIENT_METER_RATE_PER_S, GradientScene
 from rigsim.scenes.gradient.target import FLAT_REFLECTANCE
-from rigsim.scenes.gradient.truth import appearance as ground_truth
+from rigsim.scenes.gradient.truth import gradient_truth as ground_truth
 from rigsim.sensor import fixed_pattern
 from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.skin_patch.motion import PatchMotion
@@ -230,8 +230,8 @@ def test_invalid_scene_requests_are_refused(rig, skin, scene):
 
 def test_cliffs_of_75_degrees_are_dark_but_finite():
     """Steeper than the table goes, and in their own shadow; waves 0.12 mm long, 70 um high."""
-    scene = wavy_scene(optics=False)
-    scene.show(Waves(120.0, math.tan(math.radians(75.0))))
+    scene = make_sine_relief_scene(optics=False)
+    scene.set_waves(SineRelief(120.0, math.tan(math.radians(75.0))))
     light = scene.moments(NEUTRAL)
     normals = scene.surface(NEUTRAL).normals
     full = light["parallel"][0] + light["crossed"][0]

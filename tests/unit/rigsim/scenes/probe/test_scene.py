@@ -12,15 +12,15 @@ from capture.rig import load_rig
 from model import spectra
 from rigsim.as_built.probe import (
     SPOT_RADIUS_PX,
-    BuildError,
+    ProbeBuildError,
     ProbeTolerances,
     build_probe,
-    unit_images,
+    fiber_unit_images,
 )
 from rigsim.boxes.source_shutter import SourceLight
 from rigsim.fiber.probe_tissue import HomogeneousTissue
 from rigsim.scenes.exposing import SceneError
-from rigsim.scenes.probe.scene import DARK_E_PER_S, PROBE_METER_RATE_PER_S, ProbeScene
+from rigsim.scenes.probe.scene import DARK_CURRENT_E_PER_S, PROBE_METER_RATE_PER_S, ProbeScene
 from rigsim.world.suction import HeadState
 
 RIG = load_rig("probe")
@@ -29,9 +29,9 @@ AIR = HeadState("", 0.0, False, 0.0, 5.0)
 CHEEK = HeadState("cheek", 0.0, True, 60.0, 5.0)
 NOMINAL = ProbeTolerances(
     gain=0.0,
-    place_px=0.0,
+    position_px=0.0,
     shift_px=0.0,
-    turn_deg=0.0,
+    rotation_deg=0.0,
     radius=0.0,
     crosstalk=0.0,
     wings=0.0,
@@ -62,7 +62,11 @@ def lit(exposure_s, *, level=1.0, fibre=None):
 def test_spot_center_reaches_eight_tenths_in_shortest_exposure():
     build = build_probe(RIG, seed=0, tolerances=NOMINAL)
     scene = ProbeScene(RIG, HomogeneousTissue(0.04, 1.5), build=build, photons=1)
-    light = scene.image(scene.through_fibres(np.full((28, 3), 2.0))) * 30.0 * 2.0 ** (-22 * 2 / 3)
+    light = (
+        scene.image(scene.transmit_through_fibers(np.full((28, 3), 2.0)))
+        * 30.0
+        * 2.0 ** (-22 * 2 / 3)
+    )
     middle = light[64, 33]
     assert middle.max() == pytest.approx(0.8, rel=1e-4)
     white = spectra.camera_white(VIEW.spectral_sensitivity, RIG.lights[0].illuminant)
@@ -71,25 +75,25 @@ def test_spot_center_reaches_eight_tenths_in_shortest_exposure():
 
 def test_spot_flux_is_its_area_at_any_position():
     ideal = dataclasses.replace(build_probe(RIG, seed=3), wings=0.0, veil=0.0)
-    flux = unit_images(ideal, VIEW).sum(axis=(1, 2), dtype=np.float64)
+    flux = fiber_unit_images(ideal, VIEW).sum(axis=(1, 2), dtype=np.float64)
     np.testing.assert_allclose(flux, AREA_PX, rtol=1e-5)
 
 
 def test_wings_and_veil_add_stated_light():
     build = dataclasses.replace(build_probe(RIG, seed=3), wings=0.0, veil=5e-5)
-    image = unit_images(build, VIEW)[4]
+    image = fiber_unit_images(build, VIEW)[4]
     assert image[0, 1000] == np.float32(5e-5)
     winged = dataclasses.replace(build, wings=0.01, veil=0.0)
     # the sensor holds all of the disc and the part of the wings that a wide strip catches
-    flux = unit_images(winged, VIEW)[14].sum(dtype=np.float64) / AREA_PX
+    flux = fiber_unit_images(winged, VIEW)[14].sum(dtype=np.float64) / AREA_PX
     assert 0.997 < flux < 1.0
     place = build.spot_px[14].round().astype(int)
-    near, far = unit_images(winged, VIEW)[14][place[1], place[0] + np.array([150, 300])]
+    near, far = fiber_unit_images(winged, VIEW)[14][place[1], place[0] + np.array([150, 300])]
     assert near / far == pytest.approx(8.0, rel=0.05)
 
 
 def test_spots_are_at_actual_positions_off_nominal(scene):
-    images = unit_images(
+    images = fiber_unit_images(
         dataclasses.replace(scene.build, wings=0.0, veil=0.0, unevenness=np.zeros((28, 3))), VIEW
     )
     y, x = np.mgrid[: VIEW.height_px, : VIEW.width_px]
@@ -103,11 +107,11 @@ def test_spots_are_at_actual_positions_off_nominal(scene):
 
 def test_frame_is_linear_in_light_up_to_rounding(noiseless):
     head = CHEEK
-    light = noiseless.fibre_light(head)
+    light = noiseless.fiber_radiance(head)
     one, both = noiseless.image(light), noiseless.image(light + 2.0 * light[::-1])
     np.testing.assert_allclose(both, one + 2.0 * noiseless.image(light[::-1]), rtol=2e-4, atol=1e-9)
     half = [*lit(1.0, level=0.5), SourceLight(0.5, 1.0, 2.0, None)]
-    rng_free = [noiseless.image(noiseless.fibre_light(head) * e) for e in (1.0, 0.5)]
+    rng_free = [noiseless.image(noiseless.fiber_radiance(head) * e) for e in (1.0, 0.5)]
     np.testing.assert_allclose(rng_free[0], 2.0 * rng_free[1], rtol=1e-6)
     frames = [
         noiseless.exposure("cam", pops=pops, exposure_s=2.0, seed=s, head=head)
@@ -127,7 +131,7 @@ def test_reflectance_reaches_the_pixels_in_the_channels_ratio(noiseless):
     reflectance = noiseless.profile(CHEEK).reflectance_per_mm2
     taken = noiseless.build.crosstalk @ (noiseless.build.gain[:, None] * reflectance)
     light = PROBE_METER_RATE_PER_S * exposure_s * taken * noiseless.white
-    images = unit_images(noiseless.build, VIEW)
+    images = fiber_unit_images(noiseless.build, VIEW)
     x, y = noiseless.build.spot_px[2].round().astype(int)
     box = np.s_[y - 16 : y + 16, x - 16 : x + 16]
     full = VIEW.white_level - VIEW.black_level
@@ -164,7 +168,9 @@ def test_noise_is_that_of_electrons(scene):
 
 def test_dark_current_doubles_every_6_5_kelvin(scene):
     sensors = [scene.sensor(camera_c=c) for c in (5.0, 11.5, 18.0)]
-    assert [s.dark_e_per_s / DARK_E_PER_S for s in sensors] == pytest.approx([1.0, 2.0, 4.0])
+    assert [s.dark_e_per_s / DARK_CURRENT_E_PER_S for s in sensors] == pytest.approx(
+        [1.0, 2.0, 4.0]
+    )
     cold, warm = (
         np.median(
             scene.exposure(
@@ -174,7 +180,9 @@ def test_dark_current_doubles_every_6_5_kelvin(scene):
         )
         for c in (5.0, 31.0)
     )
-    assert warm - cold == pytest.approx(DARK_E_PER_S * 30.0 * 15.0 / VIEW.gain_e_per_dn, rel=0.04)
+    assert warm - cold == pytest.approx(
+        DARK_CURRENT_E_PER_S * 30.0 * 15.0 / VIEW.gain_e_per_dn, rel=0.04
+    )
 
 
 def test_hot_pixels_keep_same_positions(scene):
@@ -188,7 +196,7 @@ def test_hot_pixels_keep_same_positions(scene):
 
 
 def test_covered_fibers_transmit_a_hundred_thousandth(scene):
-    uncovered, masked = scene.fibre_light(CHEEK), scene.fibre_light(CHEEK, fibre=0)
+    uncovered, masked = scene.fiber_radiance(CHEEK), scene.fiber_radiance(CHEEK, fiber=0)
     share = masked[:, 1] / uncovered[:, 1]
     assert share[0] == pytest.approx(1.0, rel=2e-3)
     leak = scene.build.crosstalk[1, 0] * scene.build.gain[0]
@@ -237,5 +245,5 @@ def test_invalid_exposure_requests_are_refused(scene):
         scene.exposure("cam", pops=lit(1.0, fibre=28), exposure_s=1.0, seed=0, head=CHEEK)
     with pytest.raises(SceneError, match="contact probe"):
         ProbeScene(load_rig("dome"), scene.tissue)
-    with pytest.raises(BuildError, match="gain"):
+    with pytest.raises(ProbeBuildError, match="gain"):
         dataclasses.replace(scene.build, gain=np.zeros(28))

@@ -11,16 +11,16 @@ import pytest
 
 from capture.rig import load_rig
 from model import store
-from rigsim.fiber.homogeneous_fit import MIN_REFLECTANCE_PER_MM2, FitError, nearest_medium
+from rigsim.fiber.homogeneous_fit import MIN_REFLECTANCE_PER_MM2, FitError, fit_homogeneous_medium
 from rigsim.fiber.probe_tissue import PHANTOM_BLOCK, HomogeneousTissue
-from rigsim.fiber.profile import Fibres, fibre_profile
-from rigsim.fiber.white_fiber import WhiteFibre, WhiteFibreError
-from rigsim.scenes.probe.scene import ProbeScene, Probing
-from rigsim.scenes.probe.scene import appearance as ground_truth
+from rigsim.fiber.profile import FiberGeometry, trace_fiber_profile
+from rigsim.fiber.white_fiber import FiberTable, FiberTableError
+from rigsim.scenes.probe.scene import ProbePlacement, ProbeScene
+from rigsim.scenes.probe.scene import probe_truth as ground_truth
 from rigsim.tissue.tissue_mc import Layer, LayerStack
 
 RIG = load_rig("probe")
-FIBRES = Fibres(RIG.probe.radius_mm)
+FIBRES = FiberGeometry(RIG.probe.radius_mm)
 FALSE_ALARM = 4.5  # standard deviations; of some 100 normal values one in 1500 runs exceeds it
 
 
@@ -28,17 +28,17 @@ FALSE_ALARM = 4.5  # standard deviations; of some 100 normal values one in 1500 
 def test_stored_profile_matches_traced_photons(sigma_a, scattering):
     """28 z values; photons of their own with fibres of their own size against scaled points."""
     layer = Layer(inf, sigma_a, scattering / 0.2, 0.8, 1.4)
-    traced = fibre_profile(
+    traced = trace_fiber_profile(
         LayerStack((layer,)),
         radii_mm=FIBRES.radii_mm,
         photons=15_000,
         rng=np.random.default_rng(7),
         batches=40,
     )
-    value, error = WhiteFibre.load().profile(sigma_a, scattering, FIBRES)
+    value, error = FiberTable.load().profile(sigma_a, scattering, FIBRES)
     z = (traced.reflectance_per_mm2 - value) / np.hypot(traced.stderr, error)
     assert np.abs(z).max() < FALSE_ALARM
-    wrong, _ = WhiteFibre.load().profile(1.3 * sigma_a, scattering, FIBRES)
+    wrong, _ = FiberTable.load().profile(1.3 * sigma_a, scattering, FIBRES)
     assert np.abs((traced.reflectance_per_mm2 - wrong) / traced.stderr).max() > FALSE_ALARM
 
 
@@ -47,10 +47,10 @@ def test_stored_profile_matches_traced_photons(sigma_a, scattering):
 )
 def test_nearest_medium_of_homogeneous_medium_is_itself(sigma_a, scattering):
     """Photons' noise on every fibre; the fit's error is a fraction of one fibre's."""
-    value, _ = WhiteFibre.load().profile(sigma_a, scattering, FIBRES)
+    value, _ = FiberTable.load().profile(sigma_a, scattering, FIBRES)
     noise = 0.01
     noisy = value * (1.0 + noise * np.random.default_rng(3).standard_normal(28))
-    fit = nearest_medium(noisy, FIBRES)
+    fit = fit_homogeneous_medium(noisy, FIBRES)
     true = math.sqrt(3.0 * sigma_a * (sigma_a + scattering))
     # 1 % noise in 10 or more fibres over at least 2 mm: sigma_tr to well under a per cent
     assert fit.sigma_tr_per_mm == pytest.approx(true, rel=0.02)
@@ -60,17 +60,19 @@ def test_nearest_medium_of_homogeneous_medium_is_itself(sigma_a, scattering):
 
 
 def test_the_fit_finds_out_a_wrong_medium():
-    value, _ = WhiteFibre.load().profile(0.1, 2.0, FIBRES)
-    other, _ = WhiteFibre.load().profile(0.11, 2.0, FIBRES)
-    told = nearest_medium(other, FIBRES)
+    value, _ = FiberTable.load().profile(0.1, 2.0, FIBRES)
+    other, _ = FiberTable.load().profile(0.11, 2.0, FIBRES)
+    told = fit_homogeneous_medium(other, FIBRES)
     assert abs(told.sigma_a_per_mm / 0.1 - 1.0) > 0.08
-    bent = nearest_medium(value * (1.0 + 0.3 * np.cos(np.arange(28.0))), FIBRES)
+    bent = fit_homogeneous_medium(value * (1.0 + 0.3 * np.cos(np.arange(28.0))), FIBRES)
     assert bent.residual > 0.15
 
 
 def test_factor_is_free_only_where_layer_may_dim():
-    value, _ = WhiteFibre.load().profile(0.1, 2.0, FIBRES)
-    free, fixed = (nearest_medium(0.5 * value, FIBRES, dimmed=dimmed) for dimmed in (True, False))
+    value, _ = FiberTable.load().profile(0.1, 2.0, FIBRES)
+    free, fixed = (
+        fit_homogeneous_medium(0.5 * value, FIBRES, dimmed=dimmed) for dimmed in (True, False)
+    )
     assert free.factor == pytest.approx(0.5, rel=1e-3)
     assert free.residual < 1e-3
     # half the light at all distances is not what any medium gives
@@ -80,14 +82,14 @@ def test_factor_is_free_only_where_layer_may_dim():
 
 def test_unfittable_profile_is_refused():
     with pytest.raises(FitError, match="bright"):
-        nearest_medium(np.full(28, 1e-9), FIBRES)
-    with pytest.raises(WhiteFibreError, match="inside the table"):
-        WhiteFibre.load().profile(0.1, 9.0, FIBRES)
+        fit_homogeneous_medium(np.full(28, 1e-9), FIBRES)
+    with pytest.raises(FiberTableError, match="inside the table"):
+        FiberTable.load().profile(0.1, 9.0, FIBRES)
 
 
 def test_truth_of_gray_medium_is_its_own(tmp_path):
     scene = ProbeScene(RIG, HomogeneousTissue(0.1, 2.0), photons=1)
-    truth = ground_truth(scene, [Probing("cheek", 1, 22.5, 59.0)])
+    truth = ground_truth(scene, [ProbePlacement("cheek", 1, 22.5, 59.0)])
     (entry,) = truth.parameters["profiles"]
     assert (entry["site"], entry["repeat"], entry["angle_deg"]) == ("cheek", 1, 22.5)
     assert entry["sigma_a_per_mm"] == [0.1] * 3
@@ -105,7 +107,7 @@ def test_truth_of_gray_medium_is_its_own(tmp_path):
 
 def test_truth_of_spectral_medium_is_between_its_wavelengths():
     scene = ProbeScene(RIG, PHANTOM_BLOCK, photons=1)
-    (entry,) = ground_truth(scene, [Probing("phantom", 0, 0.0, 60.0)]).parameters["profiles"]
+    (entry,) = ground_truth(scene, [ProbePlacement("phantom", 0, 0.0, 60.0)]).parameters["profiles"]
     sigma_a = np.array(PHANTOM_BLOCK.sigma_a_per_mm)
     for value in entry["sigma_a_per_mm"]:
         assert 0.98 * sigma_a.min() < value < 1.02 * sigma_a.max()

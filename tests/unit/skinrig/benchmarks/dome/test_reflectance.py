@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from skinrig.benchmarks.dome import reflectance
-from skinrig.benchmarks.stage import Stage
+from skinrig.benchmarks.stage import BenchmarkStage
 
 
 def test_benchmark_points_are_above_horizon_with_separate_lights(rng):
@@ -21,11 +21,11 @@ def test_benchmark_points_are_above_horizon_with_separate_lights(rng):
 
 @pytest.mark.long
 def test_more_lobes_predict_held_out_lights_better():
-    stage = Stage("reflectance", toy=True)
+    stage = BenchmarkStage("reflectance", toy=True)
     reflectance.model(stage)
     by_rank = {p.knobs["rank"]: p.error for p in stage.points if p.knobs["part"] == "lobes"}
     assert by_rank[1] > 1.5 * by_rank[4]
-    assert stage.benchmark().limits[0].passed
+    assert stage.to_benchmark().limits[0].passed
     texture = [p.knobs for p in stage.points if p.knobs["part"] == "texture"]
     assert len({k["levels"] for k in texture}) > 1
     assert len({k["iterations"] for k in texture}) > 1

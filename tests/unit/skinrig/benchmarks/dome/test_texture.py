@@ -5,14 +5,14 @@ import pytest
 
 from model.texture_statistics.steerable_pyramid import analyze
 from skinrig.benchmarks.dome import texture
-from skinrig.benchmarks.stage import Stage
+from skinrig.benchmarks.stage import BenchmarkStage
 
 
 def test_missing_peer_is_reported_without_claimed_limit(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyrtools", None)
     monkeypatch.setitem(sys.modules, "pyrtools.pyramids", None)
-    stage = Stage("texture-matching")
-    texture.against_peer(stage)
+    stage = BenchmarkStage("texture-matching")
+    texture.compare_with_peer(stage)
     assert stage.limits == {}
     assert "10 x pyrtools" in stage.left_out[0][0]
     assert "skinrig[peers]" in stage.left_out[0][1]
@@ -29,10 +29,10 @@ def test_responses_match_peer(rng):
 @pytest.mark.long
 def test_matching_converges_as_close_as_peer():
     pytest.importorskip("pyrtools")
-    stage = Stage("texture-matching")
-    texture.against_peer(stage, 512)
+    stage = BenchmarkStage("texture-matching")
+    texture.compare_with_peer(stage, 512)
     assert stage.left_out == []
-    assert [limit.passed for limit in stage.benchmark().limits[2:]] == [True, True]
+    assert [limit.passed for limit in stage.to_benchmark().limits[2:]] == [True, True]
 
 
 def test_made_texture_is_periodic_with_distinct_spot_color(rng):

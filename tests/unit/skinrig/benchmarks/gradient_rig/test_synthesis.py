@@ -17,14 +17,14 @@ def patches(rng):
 
 def test_blended_tiles_keep_the_histogram_of_heights(patches, rng):
     """The peer does what its method promises: quantiles within a twentieth of the range."""
-    found = synthesis.blended(patches, 400, edge_px=40, rng=rng)
+    found = synthesis.blend_hexagonal_tiles(patches, 400, edge_px=40, rng=rng)
     shares = np.linspace(0.05, 0.95, 19)
     ought = np.quantile(patches, shares)
     assert np.abs(np.quantile(found, shares) - ought).max() < 0.05 * np.ptp(ought)
 
 
 def test_blended_tiles_have_no_edges(patches, rng):
-    found = synthesis.blended(patches, 400, edge_px=40, rng=rng)
+    found = synthesis.blend_hexagonal_tiles(patches, 400, edge_px=40, rng=rng)
     for axis in (0, 1):
         steps = np.abs(np.diff(found, axis=axis)).max()
         assert steps < 1.5 * max(np.abs(np.diff(p, axis=axis)).max() for p in patches)

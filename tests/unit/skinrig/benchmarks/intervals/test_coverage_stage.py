@@ -6,14 +6,14 @@ import pytest
 from reconstruction.anisotropy import estimation as anisotropy
 from skinrig.benchmarks.intervals import coverage_stage as intervals
 from skinrig.benchmarks.intervals import probe as interval_trials_probe
-from skinrig.benchmarks.intervals.coverage import Covered
+from skinrig.benchmarks.intervals.coverage import IntervalCoverage
 from skinrig.benchmarks.results import Timing
 
 ONCE = Timing(1.0, (1.0, 1.0), 1.0, None)
 
 
 def point(share, interval):
-    return intervals._point(Covered("x", "any", 68, share, interval, 6, 1.0, "%"), ONCE)
+    return intervals._point(IntervalCoverage("x", "any", 68, share, interval, 6, 1.0, "%"), ONCE)
 
 
 def test_interval_containing_nominal_coverage_allows_zero_distance():

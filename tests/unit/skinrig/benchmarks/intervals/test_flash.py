@@ -28,9 +28,9 @@ def test_each_subject_is_simulated_at_its_drawn_position(tmp_path, monkeypatch):
         raise Asked(given["seed"], given["nearer_mm"])
 
     monkeypatch.setattr(trials, "calibrate_flash", lambda *_, **__: None)
-    monkeypatch.setattr(trials, "simulated", simulate)
+    monkeypatch.setattr(trials, "resimulate", simulate)
     for seed in (520, 521):
         with pytest.raises(Asked) as asked:
-            next(trials.flash(tmp_path, {seed: "III"}, width_px=64))
+            next(trials.run_trials(tmp_path, {seed: "III"}, width_px=64))
         assert asked.value.args == (seed, trials.nearer_mm(seed))
     assert trials.nearer_mm(520) != trials.nearer_mm(521)

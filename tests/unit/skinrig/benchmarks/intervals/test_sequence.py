@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from reconstruction.facial_color.perfusion_fit import fit_course
-from skinrig.benchmarks.intervals.coverage import pooled
-from skinrig.benchmarks.intervals.sequence import REACTION_RANGE_S, of_fits, order_of
+from skinrig.benchmarks.intervals.coverage import pool_trials
+from skinrig.benchmarks.intervals.sequence import REACTION_RANGE_S, build_request, fit_trial
 
 CONSTANT_S = 20.0
 
@@ -28,7 +28,7 @@ def fit_of(rng, *, noise, too_sure=1.0):
 
 def trials(rng, **more):
     return [
-        of_fits("x", [fit_of(rng, **more) for _ in range(5)], CONSTANT_S, f"{k}", "any")
+        fit_trial("x", [fit_of(rng, **more) for _ in range(5)], CONSTANT_S, f"{k}", "any")
         for k in range(60)
     ]
 
@@ -36,14 +36,14 @@ def trials(rng, **more):
 def test_time_constants_in_noise_have_stated_coverage(rng):
     """300 fits: 4 sigma of a share of 68 % is 11 points, of 95 % 5."""
     made = trials(rng, noise=4e-4)
-    assert abs(pooled(made, level=68).share - 0.683) < 0.11
-    assert abs(pooled(made, level=95).share - 0.95) < 0.05
+    assert abs(pool_trials(made, level=68).share - 0.683) < 0.11
+    assert abs(pool_trials(made, level=95).share - 0.95) < 0.05
 
 
 def test_intervals_half_as_wide_are_found_out(rng):
     made = trials(rng, noise=4e-4, too_sure=2.0)
-    assert pooled(made, level=68, confidence=0.999).verdict == "missed"
-    assert pooled(made, level=95, confidence=0.999).verdict == "missed"
+    assert pool_trials(made, level=68, confidence=0.999).verdict == "missed"
+    assert pool_trials(made, level=95, confidence=0.999).verdict == "missed"
 
 
 def told(known, best, inner, outer):
@@ -68,7 +68,7 @@ def told(known, best, inner, outer):
 )
 def test_each_interval_counts_as_stated(inner, outer, held_68, held_95):
     fit = told("estimated", 35.0, inner, outer)
-    one = of_fits("x", [fit], CONSTANT_S, "a", "any")
+    one = fit_trial("x", [fit], CONSTANT_S, "a", "any")
     assert one.share(68) == held_68
     assert one.share(95) == held_95
 
@@ -83,7 +83,7 @@ def test_each_interval_counts_as_stated(inner, outer, held_68, held_95):
     ],
 )
 def test_bounds_are_one_sided_intervals(known, inner, outer, held):
-    one = of_fits(
+    one = fit_trial(
         "x",
         [told(known, 4.0 if known == "only below" else 90.0, inner, outer)],
         CONSTANT_S,
@@ -96,15 +96,15 @@ def test_bounds_are_one_sided_intervals(known, inner, outer, held):
 
 def test_uninformative_fits_are_omitted():
     fit = told("unknown", 0.1, [0.0, None], [0.0, None])
-    assert of_fits("x", [fit], CONSTANT_S, "a", "any").deviation.size == 0
+    assert fit_trial("x", [fit], CONSTANT_S, "a", "any").deviation.size == 0
 
 
 def test_each_subject_has_individual_reaction_time():
-    own = [order_of("smile", seed).reaction_s for seed in range(200)]
-    assert order_of("smile", 3).reaction_s == own[3]
+    own = [build_request("smile", seed).reaction_s for seed in range(200)]
+    assert build_request("smile", 3).reaction_s == own[3]
     low, high = REACTION_RANGE_S
     assert low <= min(own) < low + 0.05 < high - 0.05 < max(own) <= high
-    assert order_of("exercise", 3).reaction_s is None
+    assert build_request("exercise", 3).reaction_s is None
 
 
 @pytest.mark.parametrize(
@@ -120,6 +120,6 @@ def test_delays_count_by_their_own_interval(true_s, held_68, held_95):
         "stderr_delay_s": 0.14,
         "delay_interval_s": [0.01, 0.51],
     }
-    one = of_fits("x", [fit], true_s, "a", "any", delay=True)
+    one = fit_trial("x", [fit], true_s, "a", "any", delay=True)
     assert (one.share(68), one.share(95)) == (held_68, held_95)
     assert one.width == pytest.approx(100 * 0.14 / true_s)

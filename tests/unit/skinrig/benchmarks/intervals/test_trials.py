@@ -8,8 +8,8 @@ import pytest
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline.probe.stages import ANISOTROPY_FILE, SUBSURFACE_FILE
 from skinrig.benchmarks.intervals import probe
-from skinrig.benchmarks.intervals.coverage import pooled
-from skinrig.benchmarks.intervals.trials import Subject
+from skinrig.benchmarks.intervals.coverage import pool_trials
+from skinrig.benchmarks.intervals.trials import TrialSubject
 
 PLACE = {"site": "cheek", "repeat": 0, "angle_deg": 0.0}
 CHANNELS = ("red", "green", "blue")
@@ -57,11 +57,11 @@ def medium(rng, *, stated=1.0, told=True):
 
 
 def decays(found, truth, subject):
-    return probe.of_decay("sigma_tr of media", found, truth, Subject(subject))
+    return probe.decay_trial("sigma_tr of media", found, truth, TrialSubject(subject))
 
 
 def absorptions(found, truth, subject):
-    return probe.of_coefficient("sigma_a", found, truth, Subject(subject))
+    return probe.coefficient_trial("sigma_a", found, truth, TrialSubject(subject))
 
 
 @pytest.mark.parametrize("trial", [decays, absorptions])
@@ -69,10 +69,10 @@ def test_medium_intervals_keep_coverage_and_halved_ones_miss(trial):
     """80 media of 3 colors: 240 draws; the share is off by 0.08 with a chance of 1 % at most."""
     rng = np.random.default_rng(8)
     honest = [trial(*medium(rng), f"{k}") for k in range(80)]
-    assert pooled(honest, level=68).verdict == "kept"
+    assert pool_trials(honest, level=68).verdict == "kept"
     assert honest[0].width == pytest.approx(5.0, rel=0.01)
     halved = [trial(*medium(rng, stated=0.5), f"{k}") for k in range(80)]
-    assert pooled(halved, level=68).verdict == "missed"
+    assert pool_trials(halved, level=68).verdict == "missed"
 
 
 def test_indistinguishable_coefficients_are_not_evaluated():
@@ -113,14 +113,14 @@ def test_ellipse_parameters_are_evaluated_at_any_axis_direction(axis_deg):
     for stated, verdict in ((1.0, "kept"), (0.5, "missed")):
         made = [
             list(
-                probe.of_directions(
-                    *directed(rng, axis_deg=axis_deg, stated=stated), axis_deg, Subject(f"{k}")
+                probe.direction_trials(
+                    *directed(rng, axis_deg=axis_deg, stated=stated), axis_deg, TrialSubject(f"{k}")
                 )
             )
             for k in range(100)
         ]
         for trials in zip(*made, strict=True):
-            assert pooled(trials, level=68).verdict == verdict
+            assert pool_trials(trials, level=68).verdict == verdict
 
 
 def test_change_widths_are_reported_over_changing_pixels(rng):
@@ -133,7 +133,7 @@ def test_change_widths_are_reported_over_changing_pixels(rng):
         np.full(change.shape, 0.002, np.float32),
         np.ones(change.shape, bool),
     )
-    of_map = Subject("II 0", "light").of_map
+    of_map = TrialSubject("II 0", "light").map_trial
     everywhere = np.ones(change.shape, bool)
     alone = of_map("change", found, change, everywhere)
     over = of_map("change", found, change, everywhere, over=rest)

@@ -18,7 +18,7 @@ import pytest
 from skinrig.drawing.png import srgb_curve
 from skinrig.exporting.materials import blender, gltf, usd
 from skinrig.exporting.materials.material import Material
-from skinrig.exporting.options import Delivery
+from skinrig.exporting.options import ExportSettings
 
 READER = Path(__file__).with_name("read_in_blender.py")
 MM = 0.001
@@ -69,11 +69,11 @@ def in_blender(simulated_face, shapes_file, tmp_path_factory):
         if format_ not in kept:
             out = tmp_path_factory.mktemp(format_)
             if format_ == "glb":
-                gltf.write(simulated_face, out, Delivery(mesh=shapes_file))
+                gltf.write(simulated_face, out, ExportSettings(mesh=shapes_file))
             else:
                 pytest.importorskip("pxr")
                 told = {"unit": "cm", "normal_y": "dx", "udim": "dot"} if "dx" in format_ else {}
-                usd.write(simulated_face, out, Delivery(mesh=shapes_file, **told))
+                usd.write(simulated_face, out, ExportSettings(mesh=shapes_file, **told))
             kept[format_] = read(out / blender.SCRIPT_FILE, out / "read.npz")
         return kept[format_]
 
@@ -147,7 +147,7 @@ def test_script_sets_subsurface_scattering_in_meters(in_blender, material, forma
     in_mm = facts["subsurface_scale"] / MM / (4.0 * math.pi)
     if format_ == "glb":
         radius = in_mm * np.array(facts["subsurface_radius"])
-        np.testing.assert_allclose(radius, material.usual_radius_mm(), rtol=1e-5)
+        np.testing.assert_allclose(radius, material.median_radius_mm(), rtol=1e-5)
     else:
         assert facts["radius_space"] == "Non-Color"
         on = material.covered
@@ -160,12 +160,12 @@ def test_script_sets_subsurface_scattering_in_meters(in_blender, material, forma
 def test_gltf_subsurface_extras_become_property(in_blender, material):
     _, facts = in_blender("glb")
     told = facts["properties"]["subsurface"]
-    np.testing.assert_allclose(told["mean_free_path_mm"], material.usual_radius_mm(), rtol=1e-5)
+    np.testing.assert_allclose(told["mean_free_path_mm"], material.median_radius_mm(), rtol=1e-5)
 
 
 def test_blender_without_script_shows_no_subsurface_light(simulated_face, shapes_file, tmp_path):
     """The reason for the script: an importer that fills this in makes it needless."""
-    gltf.write(simulated_face, tmp_path, Delivery(mesh=shapes_file))
+    gltf.write(simulated_face, tmp_path, ExportSettings(mesh=shapes_file))
     _, facts = read(tmp_path / gltf.GLB_FILE, tmp_path / "read.npz", bake=0)
     assert facts["subsurface_weight"] == 0.0
 
@@ -180,7 +180,7 @@ def constants(script):
 
 
 def test_script_names_file_and_radii_without_blender():
-    script = blender.Import.of_channels("skin.glb", [0.2, 0.5, 0.1]).script()
+    script = blender.Import.from_channels("skin.glb", [0.2, 0.5, 0.1]).script()
     told = constants(script)
     assert told["CHANNELS"] == (0.4, 1.0, 0.2)
     assert told["RADIUS_M"] == pytest.approx(0.5e-3 * 4.0 * math.pi)
@@ -200,7 +200,7 @@ def test_blender_loads_a_texture_of_each_tile(simulated_face, patch, tmp_path):
         faces=np.concatenate([mesh.faces, mesh.faces[:, ::-1] + count]),
         uv=np.concatenate([mesh.uv, mesh.uv + np.array([1.0, 0.0])]),
     )
-    usd.write(simulated_face, tmp_path, Delivery(mesh=tmp_path / "head.npz", udim="dot"))
+    usd.write(simulated_face, tmp_path, ExportSettings(mesh=tmp_path / "head.npz", udim="dot"))
     found, facts = read(tmp_path / blender.SCRIPT_FILE, tmp_path / "read.npz", bake=0)
     for name in ("base_color", "roughness", "normal", "specular", "radius"):
         assert facts[f"{name}_tiles"] == [1001, 1002]

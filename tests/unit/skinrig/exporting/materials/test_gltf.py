@@ -16,7 +16,7 @@ from skinrig.drawing.png import srgb_curve
 from skinrig.errors import UsageError
 from skinrig.exporting.materials import gltf
 from skinrig.exporting.materials.material import Material
-from skinrig.exporting.options import Delivery
+from skinrig.exporting.options import ExportSettings
 
 MM = 0.001
 
@@ -29,7 +29,7 @@ def material(simulated_face, shapes_file):
 @pytest.fixture(scope="module")
 def folder(simulated_face, shapes_file, tmp_path_factory):
     out = tmp_path_factory.mktemp("glb")
-    left_out = gltf.write(simulated_face, out, Delivery(mesh=shapes_file, with_errors=True))
+    left_out = gltf.write(simulated_face, out, ExportSettings(mesh=shapes_file, with_errors=True))
     assert [what for what, _ in left_out] == ["subsurface light"]
     return out
 
@@ -171,10 +171,10 @@ def test_khronos_validator_reports_no_issues(folder, tmp_path):
 )
 def test_options_fixed_by_gltf_are_refused(simulated_face, tmp_path, wrong):
     with pytest.raises(UsageError, match="glTF knows"):
-        gltf.write(simulated_face, tmp_path, Delivery(**wrong))
+        gltf.write(simulated_face, tmp_path, ExportSettings(**wrong))
 
 
 def test_mesh_without_shapes_reports_missing_targets(simulated_face, tmp_path):
-    left_out = dict(gltf.write(simulated_face, tmp_path, Delivery()))
+    left_out = dict(gltf.write(simulated_face, tmp_path, ExportSettings()))
     assert "--mesh" in left_out["morph targets"]
     assert json.loads((tmp_path / "glb.json").read_text())["morph_targets"] == []

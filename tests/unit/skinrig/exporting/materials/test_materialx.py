@@ -11,7 +11,7 @@ import pytest
 from skinrig.exporting.materials import materialx
 from skinrig.exporting.materials.material import Material
 from skinrig.exporting.materials.subsurface_radius import translucency_mm
-from skinrig.exporting.options import Delivery
+from skinrig.exporting.options import ExportSettings
 
 MM = {"m": 1e-3, "cm": 0.1, "mm": 1.0}
 
@@ -34,7 +34,7 @@ def material(simulated_face):
 
 @pytest.fixture(params=list(MM))
 def written(request, simulated_face, tmp_path):
-    materialx.write(simulated_face, tmp_path, Delivery(unit=request.param))
+    materialx.write(simulated_face, tmp_path, ExportSettings(unit=request.param))
     return request.param, tmp_path
 
 
@@ -73,7 +73,7 @@ def test_materialx_validates_documents(simulated_face, tmp_path):
     for number, udim in enumerate(("none", "dot", "underscore")):
         folder = tmp_path / str(number)
         folder.mkdir()
-        delivery = Delivery(udim=udim, normal_y="dx")
+        delivery = ExportSettings(udim=udim, normal_y="dx")
         materialx.write(simulated_face, folder, delivery)
         maps.write(simulated_face, folder, delivery)
         library = mx.createDocument()
@@ -102,7 +102,7 @@ def test_an_essl_shader_is_generated_from_the_material(simulated_face, tmp_path)
     mx = pytest.importorskip("MaterialX")
     gen = pytest.importorskip("MaterialX.PyMaterialXGenGlsl")
     shading = pytest.importorskip("MaterialX.PyMaterialXGenShader")
-    materialx.write(simulated_face, tmp_path, Delivery())
+    materialx.write(simulated_face, tmp_path, ExportSettings())
     document = mx.createDocument()
     mx.readFromXmlFile(document, str(tmp_path / "skin.mtlx"))
     library = mx.createDocument()
@@ -120,7 +120,7 @@ def test_an_essl_shader_is_generated_from_the_material(simulated_face, tmp_path)
 def test_node_decodes_either_green_to_same_normals(
     simulated_face, material, tmp_path, normal_y, sign
 ):
-    materialx.write(simulated_face, tmp_path, Delivery(normal_y=normal_y))
+    materialx.write(simulated_face, tmp_path, ExportSettings(normal_y=normal_y))
     codes = cv2.imread(str(tmp_path / "textures/normal.png"), cv2.IMREAD_UNCHANGED)[..., ::-1]
     xyz = codes / 65535.0 * 2.0 - 1.0
     assert np.corrcoef(xyz[..., 1].ravel(), material.normals[..., 1].ravel())[0, 1] * sign > 0.999
@@ -132,7 +132,7 @@ def test_node_decodes_either_green_to_same_normals(
 
 
 def test_color_is_linear_srgb_and_data_untagged(simulated_face, tmp_path):
-    materialx.write(simulated_face, tmp_path, Delivery())
+    materialx.write(simulated_face, tmp_path, ExportSettings())
     graph = ElementTree.fromstring((tmp_path / "skin.mtlx").read_text()).find("nodegraph")
     spaces = {node.get("name"): node[0].get("colorspace") for node in graph.findall("image")}
     assert spaces == {
@@ -156,7 +156,7 @@ def test_base_color_is_model_subsurface_reflectance(simulated_face, material):
 
 
 def test_errors_and_mask_are_exported_on_request(simulated_face, tmp_path):
-    materialx.write(simulated_face, tmp_path, Delivery(with_errors=True, udim="underscore"))
+    materialx.write(simulated_face, tmp_path, ExportSettings(with_errors=True, udim="underscore"))
     mask = read(tmp_path / "textures/mask_1001.exr")
     assert (mask[0, 0], mask[32, 32]) == (0.0, 1.0)
     stderr = read(tmp_path / "textures/translucency_stderr_1001.exr")

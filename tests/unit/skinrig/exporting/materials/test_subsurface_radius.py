@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import brentq
 
 from model.tissue_optics.layers import layer_stack_reflectance
-from skinrig.exporting.materials.material import deficit_of
+from skinrig.exporting.materials.material import similarity_albedo_deficit
 from skinrig.exporting.materials.subsurface_radius import (
     decay,
     deficit_root,
@@ -76,7 +76,7 @@ def test_albedos_are_looked_up_as_they_are_inverted(rng):
 
     r_d = rng.uniform(0.002, 0.998, 200)
     exact = dipole.invert_to_deficit(r_d, 1.4)
-    np.testing.assert_allclose(deficit_of(r_d, 1.4), exact, rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(similarity_albedo_deficit(r_d, 1.4), exact, rtol=1e-4, atol=1e-7)
 
 
 def test_white_black_and_unknown_media_have_finite_radii():

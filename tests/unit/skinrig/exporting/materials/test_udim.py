@@ -10,7 +10,7 @@ from rigsim.geometry.mesh import Mesh, MeshError
 from skinrig.errors import UnusableError, UsageError
 from skinrig.exporting.materials import gltf, materialx, udim, usd
 from skinrig.exporting.materials.material import Material
-from skinrig.exporting.options import Delivery, ExportError
+from skinrig.exporting.options import ExportError, ExportSettings
 
 
 def two_tiles(patch, tile=(1.0, 0.0)):
@@ -43,7 +43,7 @@ def read(path):
 
 
 def test_each_tile_has_textures_and_first_has_maps(simulated_face, head, tmp_path):
-    left_out = materialx.write(simulated_face, tmp_path, Delivery(mesh=head, udim="dot"))
+    left_out = materialx.write(simulated_face, tmp_path, ExportSettings(mesh=head, udim="dot"))
     assert [what for what, _ in left_out] == ["maps of tile 1002"]
     material = Material.of(simulated_face, head)
     first, other = (read(tmp_path / f"textures/base_color.{n}.exr") for n in (1001, 1002))
@@ -66,7 +66,7 @@ def test_each_tile_has_textures_and_first_has_maps(simulated_face, head, tmp_pat
 def test_empty_tile_normal_map_is_flat_either_green(simulated_face, head, tmp_path):
     import cv2
 
-    order = Delivery(mesh=head, udim="underscore", normal_y="dx")
+    order = ExportSettings(mesh=head, udim="underscore", normal_y="dx")
     materialx.write(simulated_face, tmp_path, order)
     codes = cv2.imread(str(tmp_path / "textures/normal_1002.png"), cv2.IMREAD_UNCHANGED)[0, 0, ::-1]
     np.testing.assert_allclose(codes / 65535.0, [0.5, 0.5, 1.0], atol=1e-5)
@@ -92,7 +92,7 @@ def test_usd_keeps_all_faces_and_their_coordinates(simulated_face, head, tmp_pat
     pxr = pytest.importorskip("pxr.Usd")
     from pxr import UsdGeom
 
-    left_out = usd.write(simulated_face, tmp_path, Delivery(mesh=head, udim="dot"))
+    left_out = usd.write(simulated_face, tmp_path, ExportSettings(mesh=head, udim="dot"))
     assert "maps of tile 1002" in dict(left_out)
     stage = pxr.Stage.Open(str(tmp_path / "skin.usdc"))
     mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/Skin/Face"))
@@ -105,9 +105,9 @@ def test_multi_tile_mesh_needs_udim_and_rejects_gltf(simulated_face, head, tmp_p
     with pytest.raises(
         UsageError, match="--udim: got none, but the mesh reaches over tiles 1001, "
     ):
-        materialx.write(simulated_face, tmp_path, Delivery(mesh=head))
+        materialx.write(simulated_face, tmp_path, ExportSettings(mesh=head))
     with pytest.raises(UnusableError, match="tiles 1001, 1002, but glTF knows one"):
-        gltf.write(simulated_face, tmp_path, Delivery(mesh=head))
+        gltf.write(simulated_face, tmp_path, ExportSettings(mesh=head))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -122,13 +122,13 @@ def test_multi_tile_mesh_needs_udim_and_rejects_gltf(simulated_face, head, tmp_p
 )
 def test_coordinates_that_no_tile_has_are_named(uv, says):
     with pytest.raises(ExportError, match=says):
-        udim.tiles_of(np.array(uv), np.array([[0, 1, 2]]))
+        udim.find_tiles(np.array(uv), np.array([[0, 1, 2]]))
 
 
 def test_tiles_are_counted_by_tens_upwards():
     corner = np.array([[0.1, 0.1], [0.9, 0.1], [0.5, 0.9]])
     for shift, number in (((0, 0), 1001), ((9, 0), 1010), ((0, 1), 1011), ((2, 3), 1033)):
-        assert udim.tiles_of(corner + shift, np.array([[0, 1, 2]])).tolist() == [number]
+        assert udim.find_tiles(corner + shift, np.array([[0, 1, 2]])).tolist() == [number]
 
 
 def test_mesh_outside_first_tile_is_refused(patch, simulated_face, tmp_path):

@@ -8,7 +8,7 @@ import pytest
 from skinrig.errors import EXTRA_MISSING, MissingExtra, exit_code
 from skinrig.exporting.materials import usd
 from skinrig.exporting.materials.material import Material
-from skinrig.exporting.options import Delivery
+from skinrig.exporting.options import ExportSettings
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +20,7 @@ def material(simulated_face, shapes_file):
 def stage(simulated_face, shapes_file, tmp_path_factory):
     pxr = pytest.importorskip("pxr.Usd")
     out = tmp_path_factory.mktemp("usd")
-    order = Delivery(mesh=shapes_file, unit="cm", normal_y="dx", udim="dot", with_errors=True)
+    order = ExportSettings(mesh=shapes_file, unit="cm", normal_y="dx", udim="dot", with_errors=True)
     left_out = usd.write(simulated_face, out, order)
     assert ["blend shapes" in what for what, _ in left_out] == [False]
     return pxr.Stage.Open(str(out / "skin.usdc"))
@@ -98,7 +98,7 @@ def test_usd_validators_report_only_missing_plugin_nodes(simulated_face, shapes_
     validation = pytest.importorskip("pxr.UsdValidation")
     from pxr import Usd
 
-    usd.write(simulated_face, tmp_path, Delivery(mesh=shapes_file))
+    usd.write(simulated_face, tmp_path, ExportSettings(mesh=shapes_file))
     stage = Usd.Stage.Open(str(tmp_path / "skin.usdc"))
     registry = validation.ValidationRegistry()
     errors = validation.ValidationContext(registry.GetOrLoadAllValidators()).Validate(stage)
@@ -115,6 +115,6 @@ def test_sigma_tr_is_in_the_materials_custom_data(stage, material):
 def test_missing_usd_names_extra_and_writes_nothing(simulated_face, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
     with pytest.raises(MissingExtra, match=r"skinrig\[usd\]") as error:
-        usd.write(simulated_face, tmp_path, Delivery())
+        usd.write(simulated_face, tmp_path, ExportSettings())
     assert exit_code(error.value) == EXTRA_MISSING
     assert list(tmp_path.iterdir()) == []

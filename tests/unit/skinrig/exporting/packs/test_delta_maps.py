@@ -11,11 +11,11 @@ from model import store, wrinkles
 from model.facial_color.document import to_maps
 from model.facial_color.rig import HemoglobinRig
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
-from model.texture_resampling import resampled
+from model.texture_resampling import resample
 from model.wrinkles.evaluation import WRINKLE_FILE, WrinkleModel
 from model.wrinkles.expressions import ExpressionTable
 from skinrig.applying import expression
-from skinrig.exporting.options import Delivery, ExportError
+from skinrig.exporting.options import ExportError, ExportSettings
 from skinrig.exporting.packs import color_deltas, delta_maps
 
 SIDE = 64
@@ -46,7 +46,7 @@ def wrinkle_parts(rng):
     masks = np.zeros((2, SIDE, SIDE))
     masks[0, : SIDE // 2], masks[1, SIDE // 2 :] = 1.0, 1.0
     table = ExpressionTable(("upper", "lower"), {"smile": (1.0, 0.0), "anger": (0.5, 1.0)}, "test")
-    model = WrinkleModel(base, (wrinkles.Layer(wrinkle, masks, table),))
+    model = WrinkleModel(base, (wrinkles.WrinkleLayer(wrinkle, masks, table),))
     maps, document = model.to_maps()
     return model, maps, {WRINKLE_FILE: document}
 
@@ -84,15 +84,15 @@ def moving(rng):
 
 
 def test_base_color_plus_delta_gives_expression_color(moving, tmp_path):
-    left_out = dict(delta_maps.write(moving, tmp_path, Delivery(only=("fear", "smile"))))
+    left_out = dict(delta_maps.write(moving, tmp_path, ExportSettings(only=("fear", "smile"))))
     told = json.loads((tmp_path / "delta_maps.json").read_text())["color"]
     assert told["maps"] == {"cm1": "fear", "cm2": "smile"}
     rig = expression.hemoglobin_rig(moving)
     melanin = moving.maps["melanin"].values
     for name, state in told["maps"].items():
         blend = rig.evaluate({state: 1.0})
-        shown = expression.colors(melanin, blend.hemoglobin, blend.valid)
-        expected = np.moveaxis(resampled(np.moveaxis(shown, -1, 0).astype(float), (128, 128)), 0, 2)
+        shown = expression.skin_reflectance(melanin, blend.hemoglobin, blend.valid)
+        expected = np.moveaxis(resample(np.moveaxis(shown, -1, 0).astype(float), (128, 128)), 0, 2)
         found = read(tmp_path / "exr/base_color.exr") + read(tmp_path / f"exr/{name}_delta.exr")
         assert found.shape == (128, 128, 3)
         np.testing.assert_allclose(found, expected, atol=2e-6)
@@ -106,7 +106,7 @@ def test_base_color_plus_delta_gives_expression_color(moving, tmp_path):
 
 @pytest.mark.parametrize(("normal_y", "y"), [("gl", 1.0), ("dx", -1.0)])
 def test_normals_plus_wrinkle_delta_give_expression_normals(moving, tmp_path, normal_y, y):
-    delta_maps.write(moving, tmp_path, Delivery(normal_y=normal_y))
+    delta_maps.write(moving, tmp_path, ExportSettings(normal_y=normal_y))
     told = json.loads((tmp_path / "delta_maps.json").read_text())["wrinkles"]
     assert told["maps"] == {"wm1": "smile", "wm2": "anger"}
     assert told["measured_size"] == [SIDE, SIDE]
@@ -118,12 +118,12 @@ def test_normals_plus_wrinkle_delta_give_expression_normals(moving, tmp_path, no
         delta = read(tmp_path / f"exr/{name}_delta.exr")
         slopes = base[..., :2] / base[..., 2:] + delta[..., :2]
         shown = wrinkles.encode(model.evaluate({row: 1.0}).normals.astype(float), limit=None)
-        expected = np.moveaxis(resampled(np.moveaxis(shown, -1, 0), (128, 128)), 0, -1)
+        expected = np.moveaxis(resample(np.moveaxis(shown, -1, 0), (128, 128)), 0, -1)
         np.testing.assert_allclose(slopes * [1.0, y], expected, atol=2e-4)
 
 
 def test_zone_masks_are_named_with_row_0_top(moving, tmp_path):
-    delta_maps.write(moving, tmp_path, Delivery())
+    delta_maps.write(moving, tmp_path, ExportSettings())
     told = json.loads((tmp_path / "delta_maps.json").read_text())["wrinkles"]["masks"]
     assert told == {"wrinkle_mask_0_0": "upper", "wrinkle_mask_0_1": "lower"}
     upper = cv2.imread(str(tmp_path / "png/wrinkle_mask_0_0.png"), cv2.IMREAD_UNCHANGED)
@@ -131,10 +131,10 @@ def test_zone_masks_are_named_with_row_0_top(moving, tmp_path):
 
 
 def test_states_beyond_three_are_named_as_omitted(moving, tmp_path):
-    left_out = [what for what, _ in delta_maps.write(moving, tmp_path, Delivery())]
+    left_out = [what for what, _ in delta_maps.write(moving, tmp_path, ExportSettings())]
     assert "color of smile" in left_out  # the fourth by name
     with pytest.raises(ExportError, match="got 'joy', expected of anger, fear, sadness, smile"):
-        delta_maps.write(moving, tmp_path, Delivery(only=("joy",)))
+        delta_maps.write(moving, tmp_path, ExportSettings(only=("joy",)))
 
 
 def test_folder_without_wrinkles_or_color_reports_missing_part(moving, tmp_path):
@@ -146,10 +146,10 @@ def test_folder_without_wrinkles_or_color_reports_missing_part(moving, tmp_path)
         {"kind": "dynamic", "parts": parts},
         files=dict(moving.files),
     )
-    left_out = dict(delta_maps.write(alone, tmp_path, Delivery()))
+    left_out = dict(delta_maps.write(alone, tmp_path, ExportSettings()))
     assert "skinrig fit wrinkles" in left_out["normal, wm1 to wm3, masks, cavity"]
     with pytest.raises(ExportError, match="nothing was fitted to"):
-        delta_maps.write(SkinAppearance({}, "simulated"), tmp_path, Delivery())
+        delta_maps.write(SkinAppearance({}, "simulated"), tmp_path, ExportSettings())
 
 
 def test_colors_are_carried_onto_a_texture_by_landmarks(moving, tmp_path, rng):
@@ -167,7 +167,7 @@ def test_colors_are_carried_onto_a_texture_by_landmarks(moving, tmp_path, rng):
     )
     out = tmp_path / "out"
     out.mkdir()
-    order = Delivery(
+    order = ExportSettings(
         only=("fear",), onto=dome, landmarks=(tmp_path / "own.csv", tmp_path / "onto.csv")
     )
     delta_maps.write(moving, out, order)
@@ -176,7 +176,7 @@ def test_colors_are_carried_onto_a_texture_by_landmarks(moving, tmp_path, rng):
     shown = {}
     for state in ("neutral", "fear"):
         blend = rig.evaluate({state: 1.0})
-        shown[state] = expression.colors(melanin, blend.hemoglobin, blend.valid)
+        shown[state] = expression.skin_reflectance(melanin, blend.hemoglobin, blend.valid)
     ratio = shown["fear"] / shown["neutral"]
     for u, v in ((0.4, 0.5), (0.5, 0.6), (0.6, 0.4)):
         row, column = int(v * 128), int(u * 128)
@@ -187,7 +187,7 @@ def test_colors_are_carried_onto_a_texture_by_landmarks(moving, tmp_path, rng):
         assert np.abs(at - 1.0).max() > 0.03
     np.testing.assert_allclose(base[64, 64], 0.923188 * albedo[0, 0], rtol=1e-4)
     with pytest.raises(ExportError, match="expected two with --onto"):
-        delta_maps.write(moving, out, Delivery(onto=dome))
+        delta_maps.write(moving, out, ExportSettings(onto=dome))
 
 
 def test_sizes_are_those_of_engines(moving, tmp_path, monkeypatch):
@@ -201,5 +201,5 @@ def test_sizes_are_those_of_engines(moving, tmp_path, monkeypatch):
         {"kind": "dynamic", "parts": parts},
         files=dict(moving.files),
     )
-    delta_maps.write(color, tmp_path, Delivery(only=("fear",)))
+    delta_maps.write(color, tmp_path, ExportSettings(only=("fear",)))
     assert read(tmp_path / "exr/cm1_delta.exr").shape == (512, 512, 3)

@@ -11,9 +11,9 @@ import pytest
 from model import store
 from model.skin import SkinAppearance, SkinMap
 from skinrig.exporting.images import ImageFolder
-from skinrig.exporting.options import Delivery
+from skinrig.exporting.options import ExportSettings
 from skinrig.exporting.packs import color_deltas, delta_maps, detail_maps
-from skinrig.exporting.packs.detail_maps import periodic, periodic_normals, visible_share
+from skinrig.exporting.packs.detail_maps import ambient_visibility, make_periodic, periodic_normals
 
 SIDE = 48
 
@@ -34,23 +34,23 @@ def test_groove_occlusion_matches_closed_form_of_walls(slope, turned):
     walls = slope * np.abs(np.arange(65) - 32.0)
     height = np.broadcast_to(walls, (65, 65))
     height = height.T if turned else height
-    seen = visible_share(height, np.zeros((65, 65), int))
+    seen = ambient_visibility(height, np.zeros((65, 65), int))
     assert seen[32, 32] == pytest.approx(1.0 / np.sqrt(1.0 + slope**2), rel=2e-3)
 
 
 def test_ridges_and_flat_skin_keep_all_light():
     ridge = -np.abs(np.arange(33) - 16.0) * np.ones((33, 1))
     part = np.zeros((33, 33), int)
-    assert visible_share(ridge, part)[16, 16] == 1.0
-    assert np.array_equal(visible_share(np.full((9, 9), 3.0), part[:9, :9]), np.ones((9, 9)))
+    assert ambient_visibility(ridge, part)[16, 16] == 1.0
+    assert np.array_equal(ambient_visibility(np.full((9, 9), 3.0), part[:9, :9]), np.ones((9, 9)))
 
 
 def test_heights_of_other_texture_parts_shade_nothing():
     """Parts are integrated for themselves: their heights have no common zero."""
     height, part = np.zeros((16, 16)), np.zeros((16, 16), int)
     height[:, 8:], part[:, 8:] = 50.0, 1
-    assert np.array_equal(visible_share(height, part), np.ones((16, 16)))
-    assert visible_share(height, np.zeros_like(part))[8, 7] < 0.6
+    assert np.array_equal(ambient_visibility(height, part), np.ones((16, 16)))
+    assert ambient_visibility(height, np.zeros_like(part))[8, 7] < 0.6
 
 
 def test_cavity_map_is_dark_only_in_wrinkle_creases(tmp_path):
@@ -60,8 +60,8 @@ def test_cavity_map_is_dark_only_in_wrinkle_creases(tmp_path):
     slopes[..., 0] = -np.gradient(depth)
     valid = np.ones((SIDE, SIDE), bool)
     valid[:4] = False
-    out = ImageFolder(tmp_path, Delivery())
-    told = detail_maps.cavity(slopes, valid, 2 * SIDE, out)
+    out = ImageFolder(tmp_path, ExportSettings())
+    told = detail_maps.write_cavity(slopes, valid, 2 * SIDE, out)
     seen = read(tmp_path / "exr/cavity.exr")
     assert seen.shape == (2 * SIDE, 2 * SIDE)
     # its steepest way out rises by 0.85 at 3.4 texels, all along: 0.76 in closed form, and the
@@ -76,8 +76,8 @@ def test_cavity_map_is_dark_only_in_wrinkle_creases(tmp_path):
 
 
 def test_cavity_without_valid_normals_is_not_made(tmp_path):
-    out = ImageFolder(tmp_path, Delivery())
-    told = detail_maps.cavity(np.zeros((8, 8, 2)), np.zeros((8, 8), bool), 8, out)
+    out = ImageFolder(tmp_path, ExportSettings())
+    told = detail_maps.write_cavity(np.zeros((8, 8, 2)), np.zeros((8, 8), bool), 8, out)
     assert (told, out.left_out) == ({}, [("cavity", "no wrinkle normal is valid")])
     assert list(tmp_path.iterdir()) == []
 
@@ -95,7 +95,7 @@ def test_tiled_relief_has_no_seam_and_keeps_variance(rng):
         # of a larger field: its own border would be rougher
         relief = gaussian_filter(rng.standard_normal((136, 168)), 2.5)[20:-20, 20:-20]
         relief -= relief.mean()
-        tile = periodic(relief)
+        tile = make_periodic(relief)
         jump = np.diff(np.concatenate([tile[-2:], tile[:2]]), axis=0)
         across += [jump[1], np.diff(jump, axis=0)[0], np.diff(jump, axis=0)[1]]
         steps = np.diff(tile[20:60], axis=0)
@@ -149,7 +149,7 @@ def relief(rng):
 
 
 def test_relief_only_pack_has_micro_normals_with_size(relief, tmp_path):
-    left_out = dict(delta_maps.write(relief, tmp_path, Delivery(normal_y="dx")))
+    left_out = dict(delta_maps.write(relief, tmp_path, ExportSettings(normal_y="dx")))
     told = json.loads((tmp_path / "delta_maps.json").read_text())
     (entry,) = told["micro"].values()
     assert entry["tile_mm"] == pytest.approx([84 * 0.006, 42 * 0.006])  # an eighth is faded
@@ -166,7 +166,7 @@ def test_relief_only_pack_has_micro_normals_with_size(relief, tmp_path):
 def test_the_green_of_micro_normals_follows_the_order(relief, tmp_path):
     for name in ("gl", "dx"):
         (tmp_path / name).mkdir()
-        delta_maps.write(relief, tmp_path / name, Delivery(normal_y=name))
+        delta_maps.write(relief, tmp_path / name, ExportSettings(normal_y=name))
     up, down = (read(tmp_path / n / "exr/micro_normal_cheek.exr") for n in ("gl", "dx"))
     np.testing.assert_array_equal(up * [1.0, -1.0, 1.0], down)
 
@@ -175,16 +175,16 @@ def test_scatter_is_model_translucency_at_pack_size(patch, tmp_path, monkeypatch
     monkeypatch.setattr(detail_maps, "SCATTER_SIZE", patch.side)
     face = patch.face(parameters={"assumed": ["translucency is the population's", "other"]})
     onto = store.write(tmp_path / "model", face)
-    out = ImageFolder(tmp_path, Delivery(onto=onto))
-    told = detail_maps.scatter(out)
+    out = ImageFolder(tmp_path, ExportSettings(onto=onto))
+    told = detail_maps.write_scatter(out)
     shown, depth = read(tmp_path / "exr/scatter.exr"), face.maps["translucency"]
     np.testing.assert_allclose(shown[depth.valid], depth.values[depth.valid], rtol=1e-6)
     assert told["scatter"]["assumed"] == ["translucency is the population's"]
     assert out.left_out == []
     without = {n: m for n, m in face.maps.items() if n != "translucency"}
     bare = store.write(tmp_path / "bare", dataclasses.replace(face, maps=without))
-    out = ImageFolder(tmp_path, Delivery(onto=bare))
-    assert detail_maps.scatter(out) == {}
+    out = ImageFolder(tmp_path, ExportSettings(onto=bare))
+    assert detail_maps.write_scatter(out) == {}
     assert "skinrig fit reflectance" in out.left_out[0][1]
 
 

@@ -11,7 +11,7 @@ import pytest
 from capture import raw
 from capture.plan import flash_plan
 from capture.rig import load_rig
-from capture.session import ConsentError, Session, SessionDamage, Subject, verify
+from capture.session import ConsentError, Session, SessionDamage, SubjectRecord, verify
 from capture.session.mhl import c4_id
 from skinrig.cli import main
 from skinrig.exporting.export import export
@@ -30,10 +30,10 @@ def session(tmp_path):
         plan=flash_plan(RIG, darks=2),
         rig=RIG,
         devices={},
-        subject=Subject("P042", ("research",), DAY),
+        subject=SubjectRecord("P042", ("research",), DAY),
         source="measured",
     ) as made:
-        for number, (step, camera) in enumerate(made.todo()):
+        for number, (step, camera) in enumerate(made.pending_frames()):
             for attempt in (1, 2) if step.id == "S001" else (1,):
                 blob = raw.encode_dng(
                     np.full((10, 16), 600 + number, np.uint16),
@@ -220,7 +220,7 @@ def test_run_lacking_frames_reports_missing_frames(session, tmp_path):
         plan=flash_plan(RIG),
         rig=RIG,
         devices={},
-        subject=Subject("x", ("any",)),
+        subject=SubjectRecord("x", ("any",)),
         source="simulated",
     )
     unfinished.release()

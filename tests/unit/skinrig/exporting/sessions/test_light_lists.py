@@ -9,10 +9,10 @@ import tifffile
 
 from capture import raw
 from capture.importers import import_light_list
-from capture.importers.light_lists import find
-from capture.session import ConsentError, Subject
+from capture.importers.light_lists import find_light_list
+from capture.session import ConsentError, SubjectRecord
 from skinrig.exporting import export as exporting
-from skinrig.exporting.options import Delivery, ExportError
+from skinrig.exporting.options import ExportError, ExportSettings
 from skinrig.exporting.sessions.light_lists import in_camera_frame
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
@@ -45,7 +45,7 @@ def session(lights, rng, tmp_path):
         folder,
         out=tmp_path / "session",
         encoding="linear",
-        subject=Subject("P042", ("research",), date(2030, 1, 1)),
+        subject=SubjectRecord("P042", ("research",), date(2030, 1, 1)),
         now=lambda: NOW,
     )
     return Session.open(made.path)
@@ -58,7 +58,7 @@ def export(session, out, **more):
 
 def test_directions_and_images_survive_import(session, lights, tmp_path):
     export(session, tmp_path / "out")
-    found = find(tmp_path / "out")
+    found = find_light_list(tmp_path / "out")
     assert found.kind == "lp"
     np.testing.assert_allclose(found.directions, lights, atol=2e-9)
     import_light_list(tmp_path / "out", out=tmp_path / "again", encoding="linear", now=lambda: NOW)
@@ -86,8 +86,8 @@ def test_positions_are_there_for_near_lights(session, lights, tmp_path):
     np.testing.assert_allclose(
         rows / np.linalg.norm(rows, axis=1, keepdims=True), lights, atol=1e-6
     )
-    near = find(tmp_path / "out", lights=tmp_path / "out" / "positions_mm.txt")
-    assert not near.are_unit
+    near = find_light_list(tmp_path / "out", lights=tmp_path / "out" / "positions_mm.txt")
+    assert not near.has_unit_vectors
     assert json.loads((tmp_path / "out" / "lights.json").read_text())["source"] == "measured"
 
 
@@ -119,5 +119,5 @@ def test_images_are_exported_only_within_consent(session, tmp_path):
 
 def test_missing_camera_is_named_with_available_ones(session, tmp_path):
     with pytest.raises(ExportError, match="got 'C9', expected one of cam"):
-        export(session, tmp_path / "out", delivery=Delivery(camera="C9"))
+        export(session, tmp_path / "out", delivery=ExportSettings(camera="C9"))
     assert not (tmp_path / "out").exists()

@@ -10,7 +10,7 @@ import pytest
 from model import color_table, spectra
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN, two_layer_reflectance
-from skinrig.exporting.options import Delivery, ExportError
+from skinrig.exporting.options import ExportError, ExportSettings
 from skinrig.exporting.sessions import spectral as stokes
 
 CAMERA, LIGHT = "Nikon 5100 (NPL)", "D55"
@@ -52,7 +52,7 @@ def wavelengths(names, kind):
 
 
 def test_reflectance_matches_two_layer_model_per_wavelength(flash, tmp_path):
-    stokes.write_spectra(flash, tmp_path, Delivery())
+    stokes.write_spectra(flash, tmp_path, ExportSettings())
     header, found = channels(tmp_path / "reflectance.exr")
     named = wavelengths(found, "T")
     assert sorted(named.values()) == spectra.WAVELENGTH_NM.tolist()
@@ -87,7 +87,7 @@ def test_fractions_outside_the_table_have_no_spectrum():
 
 def test_stokes_components_give_parallel_and_crossed_images(flash, tmp_path):
     """An analyser along (across) the polarizer passes (S0 + S1) / 2 and (S0 - S1) / 2."""
-    stokes.write_spectra(flash, tmp_path, Delivery())
+    stokes.write_spectra(flash, tmp_path, ExportSettings())
     header, found = channels(tmp_path / "stokes.exr")
     assert header["comments"].startswith("measured")
     assert header["polarisationHandedness"] == "right"
@@ -105,7 +105,7 @@ def test_document_separates_measured_from_unmeasured(flash, tmp_path):
     left_out = stokes.write_spectra(
         SkinAppearance({n: flash.maps[n] for n in ("melanin", "hemoglobin")}, "simulated"),
         tmp_path,
-        Delivery(),
+        ExportSettings(),
     )
     assert [what for what, _ in left_out] == ["stokes.exr"]
     told = json.loads((tmp_path / "spectral.json").read_text())
@@ -116,6 +116,6 @@ def test_document_separates_measured_from_unmeasured(flash, tmp_path):
 def test_bands_without_a_camera_have_no_wavelength(flash, tmp_path):
     nameless = SkinAppearance(dict(flash.maps), "simulated")
     with pytest.raises(ExportError, match="which camera and light"):
-        stokes.write_spectra(nameless, tmp_path, Delivery())
+        stokes.write_spectra(nameless, tmp_path, ExportSettings())
     with pytest.raises(ExportError, match="expected melanin and hemoglobin"):
-        stokes.write_spectra(SkinAppearance({}, "simulated"), tmp_path, Delivery())
+        stokes.write_spectra(SkinAppearance({}, "simulated"), tmp_path, ExportSettings())

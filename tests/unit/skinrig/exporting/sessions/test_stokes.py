@@ -11,10 +11,10 @@ import pytest
 from capture import raw
 from capture.plan.gradient import gradient_plan
 from capture.rig import load_rig
-from capture.session import ConsentError, Session, Subject
+from capture.session import ConsentError, Session, SubjectRecord
 from skinrig.cli import main
 from skinrig.exporting.export import export
-from skinrig.exporting.options import Delivery, ExportError
+from skinrig.exporting.options import ExportError, ExportSettings
 from skinrig.exporting.sessions.spectral import file_stem
 
 RIG = load_rig("gradient").resized(16)
@@ -40,9 +40,9 @@ def made(tmp_path, patterns=("full", "x"), only=("parallel", "crossed")):
         rig=RIG,
         devices={},
         source="measured",
-        subject=Subject("P042", ("research",), DAY),
+        subject=SubjectRecord("P042", ("research",), DAY),
     ) as session:
-        for step, camera in session.todo():
+        for step, camera in session.pending_frames():
             lit = step.kind == "gradient" and step.index["polarizer"] in only
             shown = light(step, shape) if lit else np.zeros(shape)
             codes = np.rint(BLACK + (WHITE - BLACK) * shown + 5.0).astype(np.uint16)  # 5 of dark
@@ -103,7 +103,7 @@ def test_document_reports_axis_and_unmeasured_components(tmp_path):
         to="stokes",
         use="research",
         today=DAY,
-        delivery=Delivery(only=("a000_n0",), with_errors=True),
+        delivery=ExportSettings(only=("a000_n0",), with_errors=True),
     )
     told = json.loads((tmp_path / "out/stokes.json").read_text())
     assert told["reference_axis_deg"] == RIG.views[0].analyser_axis_deg == 90.0
@@ -129,7 +129,7 @@ def test_use_beyond_consent_and_other_inputs_are_refused(tmp_path, capsys):
             to="stokes",
             use="research",
             today=DAY,
-            delivery=Delivery(only=("a090_p3",)),
+            delivery=ExportSettings(only=("a090_p3",)),
         )
     assert not (tmp_path / "out").exists()
     argv = ["export", str(session), "--to", "stokes", "--out", str(tmp_path / "out")]
@@ -148,11 +148,11 @@ def test_session_of_other_rig_is_redirected(tmp_path):
         plan=flash_plan(rig, darks=1),
         rig=rig,
         devices={},
-        subject=Subject("P042", ("research",), DAY),
+        subject=SubjectRecord("P042", ("research",), DAY),
         source="measured",
     ) as session:
         view = rig.views[0]
-        for step, camera in session.todo():
+        for step, camera in session.pending_frames():
             blob = raw.encode_dng(
                 np.full((view.height_px, view.width_px), 600, np.uint16),
                 pattern="RGGB",

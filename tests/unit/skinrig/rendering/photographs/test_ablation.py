@@ -8,8 +8,8 @@ from model.skin_reflectance import SkinReflectance, lobe_brdf
 from rigsim.geometry.mesh import build_mesh
 from skinrig.evaluating import skin_bands
 from skinrig.rendering.camera import RenderingError
-from skinrig.rendering.photographs.evaluation import one_lobe, without_parts
-from skinrig.rendering.photographs.held_out import Shot, _evenly
+from skinrig.rendering.photographs.evaluation import build_ablations, fit_one_lobe
+from skinrig.rendering.photographs.held_out import HeldOutShot, _select_evenly
 
 SIDE = 8
 
@@ -40,12 +40,12 @@ def model(lobes, weights, rng):
 def test_single_lobe_skin_is_unchanged_by_ablation(lobes, rng):
     strength = rng.uniform(0.5, 2.0, (SIDE, SIDE, 1))
     weights = strength * np.array([0.3, 0.7])
-    np.testing.assert_allclose(one_lobe(model(lobes, weights, rng)), weights, rtol=1e-5)
+    np.testing.assert_allclose(fit_one_lobe(model(lobes, weights, rng)), weights, rtol=1e-5)
 
 
 def test_single_lobe_keeps_amount_and_loses_sharpness(lobes, rng):
     weights = rng.uniform(0.0, 1.0, (SIDE, SIDE, 2))
-    made = one_lobe(model(lobes, weights, rng)).reshape(-1, 2)
+    made = fit_one_lobe(model(lobes, weights, rng)).reshape(-1, 2)
     share = made / made.sum(axis=1, keepdims=True)
     np.testing.assert_allclose(share, share[:1] + 0 * share, rtol=1e-4)
     up = np.array([0.0, 0.0, 1.0])
@@ -62,7 +62,7 @@ def test_removed_parts_become_mesh_normal_and_mean_albedo(lobes, rng):
         [[0, 1, 2], [0, 2, 3]],
         [[0, 0], [1, 0], [1, 1], [0, 1]],
     )
-    less = without_parts(whole, mesh)
+    less = build_ablations(whole, mesh)
     np.testing.assert_allclose(less["scanned normals"].normals[4, 4], (0, 0, 1), atol=1e-6)
     np.testing.assert_allclose(
         less["even albedo"].r_d[3, 3], whole.r_d.reshape(-1, 3).mean(axis=0), rtol=1e-5
@@ -79,13 +79,13 @@ def test_lighter_skin_has_greater_angle_and_gray_neutral():
         [[0.7, 0.55, 0.45], [0.3, 0.2, 0.14], [0.06, 0.035, 0.02]]
     )
     assert (np.diff(skins) < 0).all()
-    assert skin_bands.bands_of(skins[[0, 2]]).tolist() == ["very light", "dark"]
+    assert skin_bands.classify_typology(skins[[0, 2]]).tolist() == ["very light", "dark"]
 
 
 def test_photographs_are_chosen_evenly_or_all():
-    shots = tuple(Shot("C00", f"L{k:03}", "light") for k in range(40))
-    assert _evenly(shots, None) == shots
-    chosen = [int(shot.light[1:]) for shot in _evenly(shots, 8)]
+    shots = tuple(HeldOutShot("C00", f"L{k:03}", "light") for k in range(40))
+    assert _select_evenly(shots, None) == shots
+    chosen = [int(shot.light[1:]) for shot in _select_evenly(shots, 8)]
     assert set(np.diff(chosen)) == {5}
     with pytest.raises(RenderingError, match="at least 1"):
-        _evenly(shots, 0)
+        _select_evenly(shots, 0)

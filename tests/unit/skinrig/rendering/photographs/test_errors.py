@@ -26,7 +26,7 @@ def scene(rng):
 
 def test_correct_rendering_differs_by_noise_alone(rng):
     rgb, photo, covered, lit = scene(rng)
-    pair = errors.compare(photo, rgb, covered=covered, lit=lit)
+    pair = errors.compare_pair(photo, rgb, covered=covered, lit=lit)
     count = np.count_nonzero(pair.lit)
     # the median of `count` absolute normal deviates, within 4 standard errors
     assert abs(pair.median / pair.noise - 1) < 4 * 1.17 / np.sqrt(count)
@@ -37,7 +37,7 @@ def test_correct_rendering_differs_by_noise_alone(rng):
 def test_rendering_too_bright_by_factor_errs_by_factor(rng, factor):
     rgb, photo, covered, lit = scene(rng)
     exact = Photograph(rgb, photo.variance, photo.valid)
-    pair = errors.compare(exact, factor * rgb, covered=covered, lit=lit)
+    pair = errors.compare_pair(exact, factor * rgb, covered=covered, lit=lit)
     assert pair.median == pytest.approx(abs(factor - 1))
     assert pair.total_error == pytest.approx(abs(factor - 1))
     assert np.sign(np.nanmedian(pair.signed)) == np.sign(factor - 1)
@@ -47,8 +47,8 @@ def test_missing_structure_lowers_similarity_beyond_uniform_error(rng):
     rgb, photo, covered, lit = scene(rng)
     fine = rgb * (1 + 0.03 * rng.choice([-1.0, 1.0], rgb.shape[:2]))[..., None]
     exact = Photograph(fine, photo.variance, photo.valid)
-    smooth = errors.compare(exact, rgb, covered=covered, lit=lit)
-    even = errors.compare(exact, 1.03 * fine, covered=covered, lit=lit)
+    smooth = errors.compare_pair(exact, rgb, covered=covered, lit=lit)
+    even = errors.compare_pair(exact, 1.03 * fine, covered=covered, lit=lit)
     assert smooth.median == pytest.approx(even.median, rel=0.1)
     assert smooth.ssim < even.ssim < 1.0
 
@@ -56,7 +56,7 @@ def test_missing_structure_lowers_similarity_beyond_uniform_error(rng):
 def test_pixels_count_as_lit_only_with_lit_neighbors(rng):
     _, photo, covered, lit = scene(rng)
     lit[10, 10] = False
-    found = errors.lit_pixels(photo, covered=covered, lit=lit)
+    found = errors.find_lit_pixels(photo, covered=covered, lit=lit)
     assert not found[9:12, 9:12].any()
     assert found[7, 7]
     assert not found[2].any()  # beside the skin's border
@@ -69,12 +69,12 @@ def test_saturated_and_noisy_pixels_do_not_count(rng):
     valid[8, 8] = False
     variance = np.array(photo.variance)
     variance[12, 12] = 1.0
-    found = errors.lit_pixels(Photograph(rgb, variance, valid), covered=covered, lit=lit)
+    found = errors.find_lit_pixels(Photograph(rgb, variance, valid), covered=covered, lit=lit)
     assert not found[8, 8]
     assert not found[12, 12]
     assert found[8, 9]
     # how well the two agree has no part in it
-    pair = errors.compare(Photograph(rgb, variance, valid), 7 * rgb, covered=covered, lit=lit)
+    pair = errors.compare_pair(Photograph(rgb, variance, valid), 7 * rgb, covered=covered, lit=lit)
     assert (pair.lit == found).all()
 
 
@@ -82,7 +82,8 @@ def test_photograph_summary_pools_pixels_with_interval_over_photographs(rng):
     rgb, photo, covered, lit = scene(rng)
     exact = Photograph(rgb, photo.variance, photo.valid)
     pairs = [
-        errors.compare(exact, f * rgb, covered=covered, lit=lit) for f in (1.01, 1.02, 1.03, 1.1)
+        errors.compare_pair(exact, f * rgb, covered=covered, lit=lit)
+        for f in (1.01, 1.02, 1.03, 1.1)
     ]
     found = errors.summarize(pairs, rng=rng)
     assert found.pairs == 4
@@ -97,7 +98,7 @@ def test_errors_by_band_use_pixels_of_band(rng):
     rgb, photo, covered, lit = scene(rng)
     exact = Photograph(rgb, photo.variance, photo.valid)
     factor = np.where(np.arange(SIDE)[:, None] < 12, 1.02, 1.2)[..., None]
-    pair = errors.compare(exact, factor * rgb, covered=covered, lit=lit)
+    pair = errors.compare_pair(exact, factor * rgb, covered=covered, lit=lit)
     bands = np.where(np.arange(SIDE)[:, None] < 12, "light", "dark") + np.zeros((1, SIDE), "U1")
     found = errors.by_band([pair], [np.where(covered, bands, "")])
     assert found["light"][1] == pytest.approx(0.02)
@@ -108,10 +109,10 @@ def test_errors_by_band_use_pixels_of_band(rng):
 def test_images_that_cannot_be_compared_are_refused(rng):
     rgb, photo, covered, lit = scene(rng)
     with pytest.raises(RenderingError, match="expected"):
-        errors.compare(photo, rgb[:5], covered=covered, lit=lit)
+        errors.compare_pair(photo, rgb[:5], covered=covered, lit=lit)
     with pytest.raises(RenderingError, match="no pixel"):
-        errors.compare(photo, rgb, covered=covered & False, lit=lit)
-    dark = errors.compare(photo, rgb, covered=covered, lit=lit & False)
+        errors.compare_pair(photo, rgb, covered=covered & False, lit=lit)
+    dark = errors.compare_pair(photo, rgb, covered=covered, lit=lit & False)
     assert np.isnan(dark.median)
     with pytest.raises(RenderingError, match="no lit pixel"):
         errors.summarize([dark], rng=rng)

@@ -32,19 +32,19 @@ def test_brighter_light_is_reported_by_factor_despite_similarity(light, tmp_path
     """A picture may be shown at a brightness of its own: codes would say that nothing differs."""
     a = folder(tmp_path / "a", light, shown=light)
     b = folder(tmp_path / "b", 1.25 * light, shown=light)
-    (one,), refused = image_comparison.compared(a, b)
+    (one,), refused = image_comparison.compare_folders(a, b)
     assert (one.kind, refused) == ("linear", [])
     assert one.mean_ratio == pytest.approx(1.25, rel=1e-6)
     assert one.relative_rms == pytest.approx(0.25, rel=1e-6)
     (a / "radiance.exr").unlink()
-    (codes,), _ = image_comparison.compared(a, b)
+    (codes,), _ = image_comparison.compare_folders(a, b)
     assert (codes.kind, codes.equal) == ("8-bit codes", True)
 
 
 def test_brightening_spot_is_located_with_its_channel(light, tmp_path):
     other = light.copy()
     other[5:8, 20:24, 0] += 0.3
-    (one,), _ = image_comparison.compared(
+    (one,), _ = image_comparison.compare_folders(
         folder(tmp_path / "a", light), folder(tmp_path / "b", other)
     )
     spot = np.zeros(light.shape[:2], bool)
@@ -58,14 +58,14 @@ def test_colors_of_png_files_keep_their_order(light, tmp_path):
     a, b = folder(tmp_path / "a", light), folder(tmp_path / "b", light)
     for one in (a, b):
         (one / "radiance.exr").unlink()
-    (found,), _ = image_comparison.compared(a, b)
+    (found,), _ = image_comparison.compare_folders(a, b)
     np.testing.assert_allclose(found.a, light, atol=0.51 / 255)
 
 
 def test_images_of_other_size_or_unpaired_are_named(light, tmp_path):
     a, b = folder(tmp_path / "a", light), folder(tmp_path / "b", light[:12])
     (b / "shadow.png").write_bytes(png.encode(np.zeros((4, 4), np.uint8)))
-    found, refused = image_comparison.compared(a, b)
+    found, refused = image_comparison.compare_folders(a, b)
     assert found == []
     assert dict(refused) == {"radiance": "sizes 24 x 32 x 3 and 12 x 32 x 3", "shadow": "only in B"}
 
@@ -88,11 +88,11 @@ def test_images_in_two_runs_pair_by_folder_name(light, tmp_path):
         folder(tmp_path / run / "pictures-front", gain * light)
     folder(tmp_path / "x" / "pictures-side", light)
     paths = [tmp_path / "x", tmp_path / "y"]
-    both = run_comparison.sides(paths)
+    both = run_comparison.split_sides(paths)
     assert both is not None
-    found = run_comparison.paired(*(run.pictures for run in both))
+    found = run_comparison.pair_by_name(*(run.pictures for run in both))
     assert [name for name, _, _ in found] == ["pictures-front"]
-    assert run_comparison.alone(*both) == [("pictures-side", "A: x")]
+    assert run_comparison.list_unpaired(*both) == [("pictures-side", "A: x")]
     html = report.make(paths).html
     assert "0 of 1 pictures of both differ" in html
     assert "all that the records say, is the same" in html
@@ -126,6 +126,6 @@ def test_damaged_image_is_named_and_rest_compared(light, tmp_path):
     a, b = folder(tmp_path / "a", light), folder(tmp_path / "b", light)
     for one in (a, b):
         (one / "broken.png").write_bytes(b"no picture")
-    found, refused = image_comparison.compared(a, b)
+    found, refused = image_comparison.compare_folders(a, b)
     assert [one.name for one in found] == ["radiance"]
     assert refused == [("broken", "cannot be read: is no picture")]

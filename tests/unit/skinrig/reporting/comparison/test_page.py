@@ -14,7 +14,7 @@ from skinrig.benchmarks.results import Limit, Point, StageBenchmark, Timing
 from skinrig.report import ReportError
 from skinrig.reporting.comparison import maps as map_comparison
 from skinrig.reporting.comparison import runs as run_comparison
-from skinrig.reporting.comparison.maps import CHANCE_FRACTIONS, compare
+from skinrig.reporting.comparison.maps import CHANCE_FRACTIONS, compare_maps
 
 SIDE = 200
 PIXELS = SIDE * SIDE
@@ -36,7 +36,7 @@ def two_estimates(rng, *, stated=1.0, spread=(0.3, 0.4)):
 
 
 def test_noise_of_stated_size_differs_as_expected(rng):
-    found = compare("thickness", *two_estimates(rng))
+    found = compare_maps("thickness", *two_estimates(rng))
     for share, expected in zip(found.beyond, CHANCE_FRACTIONS, strict=True):
         assert share_is(share, expected)
     assert found.combined == pytest.approx(0.5, rel=1e-5)
@@ -44,7 +44,7 @@ def test_noise_of_stated_size_differs_as_expected(rng):
 
 
 def test_noise_twice_stated_size_is_reported_as_disagreement(rng):
-    found = compare("thickness", *two_estimates(rng, stated=0.5))
+    found = compare_maps("thickness", *two_estimates(rng, stated=0.5))
     assert not share_is(found.beyond[0], CHANCE_FRACTIONS[0])
     assert found.disagree
 
@@ -53,7 +53,7 @@ def test_spot_shifted_by_five_standard_errors_is_located(rng):
     one, other = two_estimates(rng)
     values = other.values.copy()
     values[20:60, 100:140] += 2.5
-    found = compare("thickness", one, SkinMap(values, "mm", other.stderr))
+    found = compare_maps("thickness", one, SkinMap(values, "mm", other.stderr))
     assert found.disagree
     spot = np.zeros((SIDE, SIDE), bool)
     spot[20:60, 100:140] = True
@@ -77,17 +77,17 @@ def noisy_normals(rng, spread, stated):
 
 def test_normals_with_stated_errors_differ_as_expected(rng):
     honest = [noisy_normals(rng, 0.01, 0.01) for _ in range(2)]
-    found = compare("normals", *honest)
+    found = compare_maps("normals", *honest)
     assert found.unit == "°"
     for share, expected in zip(found.beyond, CHANCE_FRACTIONS, strict=True):
         assert share_is(share, expected)
     assert not found.disagree
-    assert compare("normals", *(noisy_normals(rng, 0.01, 0.005) for _ in range(2))).disagree
+    assert compare_maps("normals", *(noisy_normals(rng, 0.01, 0.005) for _ in range(2))).disagree
 
 
 def test_equal_maps_differ_by_zero_despite_zero_error():
     one = SkinMap(np.ones((3, 4)), "mm", np.zeros((3, 4)))
-    found = compare("thickness", one, one)
+    found = compare_maps("thickness", one, one)
     assert found.high == 0.0
     assert found.beyond == (0.0, 0.0, 0.0)
     assert not found.disagree
@@ -96,7 +96,7 @@ def test_equal_maps_differ_by_zero_despite_zero_error():
 def test_pixels_masked_in_either_estimate_are_counted_only():
     valid = np.array([[True, False, True]])
     one = SkinMap(np.ones((1, 3)), "mm", np.ones((1, 3)), valid)
-    found = compare("thickness", one, SkinMap(np.full((1, 3), 2.0), "mm", np.ones((1, 3))))
+    found = compare_maps("thickness", one, SkinMap(np.full((1, 3), 2.0), "mm", np.ones((1, 3))))
     assert (found.pixels, found.only_a, found.only_b) == (2, 0, 1)
     assert np.isnan(found.difference[0, 1])
 
@@ -104,7 +104,7 @@ def test_pixels_masked_in_either_estimate_are_counted_only():
 def test_color_map_shows_channel_of_largest_difference():
     one = SkinMap(np.zeros((1, 1, 3)), "1", np.ones((1, 1, 3)))
     other = SkinMap(np.array([[[0.0, -6.0, 3.0]]]), "1", np.ones((1, 1, 3)))
-    found = compare("r_d", one, other)
+    found = compare_maps("r_d", one, other)
     assert found.sigmas[0, 0] == pytest.approx(-6.0 / math.sqrt(2.0))
     assert found.difference[0, 0] == pytest.approx(-1.0)
 
@@ -118,7 +118,7 @@ def test_color_map_shows_channel_of_largest_difference():
 )
 def test_unsubtractable_maps_are_refused_with_difference(other, word):
     with pytest.raises(ValueError, match=word):
-        compare("thickness", SkinMap(np.ones((2, 2)), "mm"), other)
+        compare_maps("thickness", SkinMap(np.ones((2, 2)), "mm"), other)
 
 
 def write_maps(folder, rng, *, shift=0.0, **parameters):
@@ -179,8 +179,8 @@ def folders(tmp_path, rng):
 )
 def test_two_inputs_of_same_kind_make_a_comparison(folders, given, compared):
     paths = [folders[name] for name in given]
-    assert (run_comparison.sides(paths) is not None) == compared
-    assert run_comparison.sides(paths, insist=False) is None
+    assert (run_comparison.split_sides(paths) is not None) == compared
+    assert run_comparison.split_sides(paths, require_comparison=False) is None
 
 
 def test_comparison_of_other_than_two_runs_is_refused(folders):

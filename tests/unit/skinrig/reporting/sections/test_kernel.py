@@ -31,7 +31,9 @@ FIT = {
 def table_of(fit):
     text = json.dumps({"fits": [fit], "tables": []}).encode()
     appearance = SkinAppearance({}, "simulated", files={KERNEL_FILE: text})
-    html = page.fragment(microrelief.kernels(page.Subject("gradient", appearance, None, [])))
+    html = page.fragment(
+        microrelief.kernels(page.ReportedAppearance("gradient", appearance, None, []))
+    )
     head = re.findall(r"<th scope=\"col\"[^>]*>(.*?)</th>", html)
     cells = re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", html.split("<tbody>")[1])
     return list(zip(head, cells, strict=False))

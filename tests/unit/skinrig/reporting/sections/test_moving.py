@@ -11,7 +11,7 @@ from model.facial_color.rig import HemoglobinRig
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from model.wrinkles.evaluation import WRINKLE_FILE as WRINKLE_FILE
 from model.wrinkles.evaluation import WrinkleModel
-from model.wrinkles.partial_derivatives import Layer
+from model.wrinkles.partial_derivatives import WrinkleLayer
 from skinrig import report
 from skinrig.appearances import dynamic
 
@@ -40,7 +40,7 @@ def moving(folder, truths):
             maps, "simulated", parameters, {}, files={facial_color_document.RIG_DOCUMENT: document}
         ),
     )
-    layer = Layer(np.full((8, 8, 2), 0.3), np.ones((8, 4, 4)) / 8.0)
+    layer = WrinkleLayer(np.full((8, 8, 2), 0.3), np.ones((8, 4, 4)) / 8.0)
     maps, document = WrinkleModel(np.zeros((16, 16, 2)), (layer,)).to_maps()
     dynamic.add(
         folder,

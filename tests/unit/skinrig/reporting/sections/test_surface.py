@@ -13,7 +13,7 @@ BOX = np.array([0.0, 0.0, 0.0]), np.array([10.0, 20.0, 5.0])
 
 def test_up_is_up_and_right_is_right():
     view = FrontView.of(np.array([[0.01, 19.99, 0.0], [9.99, 0.01, 0.0]]), BOX)
-    image, valid = view.picture(np.array([1.0, 2.0]))
+    image, valid = view.rasterize(np.array([1.0, 2.0]))
     assert image.shape == (440, 220)
     assert image[0, 0] == 1.0
     assert image[-1, -1] == 2.0
@@ -24,14 +24,14 @@ def test_up_is_up_and_right_is_right():
 def test_the_frontmost_of_two_points_is_shown():
     points = np.array([[5.0, 10.0, 1.0], [5.0, 10.0, 4.0], [5.0, 10.0, 2.0]])
     view = FrontView.of(points, BOX)
-    image, _ = view.picture(np.array([1.0, 2.0, 3.0]))
+    image, _ = view.rasterize(np.array([1.0, 2.0, 3.0]))
     assert image[view.rows[0], view.columns[0]] == 2.0
 
 
 def test_points_outside_bounds_are_not_wrapped():
     view = FrontView.of(np.array([[-1.0, 10.0, 0.0], [5.0, 10.0, 0.0]]), BOX)
     assert view.rows[0] == view.columns[0] == -1
-    _, valid = view.picture(np.array([7.0, 1.0]))
+    _, valid = view.rasterize(np.array([7.0, 1.0]))
     assert not valid[220, -1]
 
 
@@ -60,7 +60,7 @@ def test_surface_section_checks_normals_and_albedo_not_baseline(sphere):
     }
     checks: list[page.Check] = []
     both = (SkinAppearance(one, "simulated") for one in (maps, truth))
-    body = page.fragment(section(page.Subject("head", *both, checks)))
+    body = page.fragment(section(page.ReportedAppearance("head", *both, checks)))
     assert [check.name for check in checks] == [
         "head: normals, mean error",
         "head: diffuse reflectance R_d, red, median error",
@@ -82,7 +82,7 @@ def test_surface_section_without_truth_shows_stderr_without_checks(sphere):
     }
     checks: list[page.Check] = []
     body = page.fragment(
-        section(page.Subject("head", SkinAppearance(maps, "simulated"), None, checks))
+        section(page.ReportedAppearance("head", SkinAppearance(maps, "simulated"), None, checks))
     )
     assert checks == []
     assert "standard error" in body

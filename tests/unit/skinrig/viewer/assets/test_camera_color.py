@@ -58,7 +58,7 @@ def test_a_color_calibration_brings_camera_colors_to_srgb(tmp_path, named):
     source = _source(tmp_path, inputs={} if named else {"calibration color": digest})
     if named:
         source = dataclasses.replace(source, calibration=tmp_path / "calibration")
-    found = facial_color.camera_color_of(source)
+    found = facial_color.find_camera_color(source)
     rgb = np.array([[0.5, 0.4, 0.3], [1.0, 1.0, 1.0]])
     np.testing.assert_allclose(found.convert(rgb), fit.to_linear_srgb(rgb * WHITE), rtol=1e-12)
     assert found.known
@@ -68,7 +68,9 @@ def test_a_color_calibration_brings_camera_colors_to_srgb(tmp_path, named):
 
 def test_calibration_of_neighboring_session_is_not_used(tmp_path):
     _calibration(tmp_path / "calibration")
-    found = facial_color.camera_color_of(_source(tmp_path, inputs={"calibration color": "0" * 64}))
+    found = facial_color.find_camera_color(
+        _source(tmp_path, inputs={"calibration color": "0" * 64})
+    )
     assert not found.known
     rgb = np.array([0.5, 0.4, 0.3])
     np.testing.assert_array_equal(found.convert(rgb), rgb)
@@ -85,7 +87,7 @@ def test_tabulated_sensor_renders_skin_like_srgb(tmp_path, monkeypatch):
             lights = (type("Light", (), {"illuminant": LIGHT}),)
 
     monkeypatch.setattr("capture.session.Session.open", lambda _: Named)
-    found = facial_color.camera_color_of(source)
+    found = facial_color.find_camera_color(source)
     assert found.known
     assert "no color calibration" in found.provenance
     table = color_table.build(CAMERA, LIGHT, size=9, anisotropy=ANISOTROPY_SKIN)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skinrig.viewer.assets.placed_color import place
+from skinrig.viewer.assets.placed_color import place_texels
 from skinrig.viewer.scene import SceneError
 
 SIZE = 48
@@ -40,7 +40,7 @@ def test_texels_find_their_pixels_through_exact_landmarks(dome, rng):
     position, normal = dome
     covered = np.ones((SIZE, SIZE), bool)
     solid, flat = _landmarks(position, rng)
-    found = place(position, normal, covered, landmarks_mm=solid, landmarks_px=flat)
+    found = place_texels(position, normal, covered, landmarks_mm=solid, landmarks_px=flat)
     assert np.abs(found.pixel - _pixel(position)).max() < 0.1
     assert found.leave_one_out_px < 0.1
 
@@ -48,7 +48,7 @@ def test_texels_find_their_pixels_through_exact_landmarks(dome, rng):
 def test_pixel_errors_stay_within_landmark_noise(dome, rng):
     position, normal = dome
     solid, flat = _landmarks(position, rng, noise_px=1.0, count=40)
-    found = place(
+    found = place_texels(
         position, normal, np.ones((SIZE, SIZE), bool), landmarks_mm=solid, landmarks_px=flat
     )
     middle = (slice(12, 36), slice(12, 36))
@@ -59,14 +59,14 @@ def test_pixel_errors_stay_within_landmark_noise(dome, rng):
 def test_map_is_recovered_where_visible_to_camera(dome, rng):
     position, normal = dome
     solid, flat = _landmarks(position, rng)
-    found = place(
+    found = place_texels(
         position, normal, np.ones((SIZE, SIZE), bool), landmarks_mm=solid, landmarks_px=flat
     )
     column, row = np.meshgrid(np.arange(256.0), np.arange(256.0))
     picture = 0.02 + 1e-4 * column + 5e-5 * row
-    values, known = found.sampled(picture, np.ones((256, 256), bool))
+    values, known = found.sample(picture, np.ones((256, 256), bool))
     inside = np.all((_pixel(position) > 1) & (_pixel(position) < 254), axis=-1)
-    assert np.array_equal(known, found.seen & inside) or known.sum() > 0.9 * inside.sum()
+    assert np.array_equal(known, found.visible & inside) or known.sum() > 0.9 * inside.sum()
     wanted = 0.02 + 1e-4 * _pixel(position)[..., 0] + 5e-5 * _pixel(position)[..., 1]
     assert np.abs(values - wanted)[known].max() < 2e-5
 
@@ -76,11 +76,11 @@ def test_skin_facing_away_from_camera_is_not_used(dome, rng):
     solid, flat = _landmarks(position, rng)
     turned = normal.copy()
     turned[:10] = (1.0, 0.0, 0.0)
-    found = place(
+    found = place_texels(
         position, turned, np.ones((SIZE, SIZE), bool), landmarks_mm=solid, landmarks_px=flat
     )
-    assert not found.seen[:10, SIZE // 2 :].any()
-    assert found.seen[20:28, 20:28].all()
+    assert not found.visible[:10, SIZE // 2 :].any()
+    assert found.visible[20:28, 20:28].all()
 
 
 def test_too_few_or_flat_landmarks_are_refused(dome, rng):
@@ -88,9 +88,9 @@ def test_too_few_or_flat_landmarks_are_refused(dome, rng):
     covered = np.ones((SIZE, SIZE), bool)
     solid, flat = _landmarks(position, rng, count=5)
     with pytest.raises(SceneError, match="expected at least"):
-        place(position, normal, covered, landmarks_mm=solid, landmarks_px=flat)
+        place_texels(position, normal, covered, landmarks_mm=solid, landmarks_px=flat)
     solid, _ = _landmarks(position, rng)
     level = {name: (x, y, 0.0) for name, (x, y, _) in solid.items()}
     flat = {name: tuple(_pixel(np.array(p)).tolist()) for name, p in level.items()}
     with pytest.raises(SceneError, match="plane"):
-        place(position, normal, covered, landmarks_mm=level, landmarks_px=flat)
+        place_texels(position, normal, covered, landmarks_mm=level, landmarks_px=flat)

@@ -9,20 +9,20 @@ import pytest
 
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import ExpressionTable
-from model.wrinkles.partial_derivatives import Layer
+from model.wrinkles.partial_derivatives import WrinkleLayer
 from skinrig.viewer.assets import surface as wrinkle_assets
 from skinrig.viewer.scene import SceneError
 
 ROWS = {"anger": (1.0, -0.5), "joy": (0.0, 1.0)}
 
 
-def layer(side: int = 16, zones: int = 2, seed: int = 0) -> Layer:
+def layer(side: int = 16, zones: int = 2, seed: int = 0) -> WrinkleLayer:
     rng = np.random.default_rng(seed)
     names = tuple(f"zone {i}" for i in range(zones))
     rows = {name: (*row, *([0.0] * (zones - 2))) for name, row in ROWS.items()}
     wrinkle = rng.normal(0.0, 0.2, (side, side, 2)).astype(np.float32)
     masks = rng.uniform(0.0, 1.0, (zones, 4, 4)).astype(np.float32)
-    return Layer(wrinkle, masks, ExpressionTable(names, rows))
+    return WrinkleLayer(wrinkle, masks, ExpressionTable(names, rows))
 
 
 def source(*shapes: str, **more: object) -> SimpleNamespace:
@@ -34,7 +34,7 @@ def source(*shapes: str, **more: object) -> SimpleNamespace:
 
 def test_zones_go_into_two_rgba_textures_a_layer():
     model = WrinkleModel(np.zeros((16, 16, 2), np.float32), (layer(), layer(zones=8, seed=1)))
-    made = wrinkle_assets.from_model(model, source("anger"), origin="simulated")
+    made = wrinkle_assets.build_model_assets(model, source("anger"), origin="simulated")
     masks = made["textures"]["wrinkle_masks"].values
     assert masks.shape == (4, 4, 4, 4)
     np.testing.assert_array_equal(masks[0, ..., :2], np.moveaxis(model.layers[0].masks, 0, 2))
@@ -48,7 +48,9 @@ def test_zones_go_into_two_rgba_textures_a_layer():
 def test_fitted_base_is_included_with_holes_filled():
     base = np.full((16, 16, 2), 0.3, np.float32)
     base[4:8, 4:8] = np.nan
-    made = wrinkle_assets.from_model(WrinkleModel(base, (layer(),)), source("joy"), origin="fitted")
+    made = wrinkle_assets.build_model_assets(
+        WrinkleModel(base, (layer(),)), source("joy"), origin="fitted"
+    )
     np.testing.assert_allclose(made["textures"]["wrinkle_base"].values, 0.3, rtol=1e-6)
 
 
@@ -57,9 +59,9 @@ def test_retained_rms_is_rms_of_zone_means():
     rows = wrinkle_assets.retained_rms(model, (16, 16))
     assert len(rows) == wrinkle_assets.ZONES_PER_LAYER
     assert [len(row) for row in rows] == [5] * wrinkle_assets.ZONES_PER_LAYER
-    from model.texture_resampling import resampled
+    from model.texture_resampling import resample
 
-    mask = resampled(model.layers[0].masks[1].astype(float), (16, 16))
+    mask = resample(model.layers[0].masks[1].astype(float), (16, 16))
     part = mask[..., None] * model.layers[0].wrinkle
     means = part.reshape(4, 4, 4, 4, 2).mean(axis=(1, 3))
     assert rows[1][2] == pytest.approx(np.sqrt(np.mean(np.sum(means**2, axis=2))), rel=1e-5)
@@ -68,7 +70,7 @@ def test_retained_rms_is_rms_of_zone_means():
 
 def test_expressions_missing_in_mesh_omit_wrinkles():
     model = WrinkleModel(np.zeros((16, 16, 2), np.float32), (layer(),))
-    made = wrinkle_assets.from_model(model, source("jawOpen"), origin="simulated")
+    made = wrinkle_assets.build_model_assets(model, source("jawOpen"), origin="simulated")
     assert "textures" not in made
     assert made["left_out"] == (
         ("wrinkles", "none of their expressions (anger, joy) is a blend shape of the mesh"),
@@ -78,11 +80,13 @@ def test_expressions_missing_in_mesh_omit_wrinkles():
 def test_maps_or_zones_beyond_shader_limit_are_refused():
     base = np.zeros((16, 16, 2), np.float32)
     with pytest.raises(SceneError, match="got 5 wrinkle maps, expected at most 4"):
-        wrinkle_assets.from_model(
+        wrinkle_assets.build_model_assets(
             WrinkleModel(base, tuple(layer(seed=i) for i in range(5))), source("anger"), origin=""
         )
     with pytest.raises(SceneError, match="got 9 zones, expected at most 8"):
-        wrinkle_assets.from_model(WrinkleModel(base, (layer(zones=9),)), source("anger"), origin="")
+        wrinkle_assets.build_model_assets(
+            WrinkleModel(base, (layer(zones=9),)), source("anger"), origin=""
+        )
 
 
 @pytest.mark.long
@@ -94,7 +98,7 @@ def test_wrinkles_of_simulated_person_explain_own_expressions():
     model = wrinkle_assets.simulated_model(person, size=256)
     rest = encode(person.tangent_normal(), limit=None).astype(np.float64)
     for state in ("anger", "surprise", "happiness"):
-        want = encode(person.posed(state).tangent_normal(), limit=None) - rest
+        want = encode(person.with_expression(state).tangent_normal(), limit=None) - rest
         got = encode(model.evaluate({state: 1.0}).normals, limit=None) - model.base
         other = encode(model.evaluate({"disgust": 1.0}).normals, limit=None) - model.base
         left = np.sum((got - want) ** 2) / np.sum(want**2)

@@ -17,7 +17,7 @@ from skinrig.viewer.scene import SceneError
 
 @pytest.fixture(scope="module")
 def relief() -> MicroRelief:
-    return assets.simulated_relief(3)
+    return assets.simulate_relief(3)
 
 
 def plate(side_mm: float = 250.0) -> Mesh:
@@ -36,7 +36,7 @@ def slope_variance(height, pixel, stretch=(1.0, 1.0)):
 
 @pytest.mark.parametrize(("r_s", "r_t"), [(1.25, 0.8125), (1.125, 1.0), (1.0, 0.75)])
 def test_slope_variance_under_strain_matches_convolved_relief(relief, r_s, r_t):
-    growth = assets.grown(relief)
+    growth = assets.grow_relief(relief)
     table = relief_growth.strained_variance(growth, relief.table)
     ratios = np.linspace(*relief_growth.STRETCH_RANGE, relief_growth.STRETCH_NODES)
     found = table[np.searchsorted(ratios, r_s), np.searchsorted(ratios, r_t)]
@@ -59,13 +59,13 @@ def test_slope_variance_under_strain_matches_convolved_relief(relief, r_s, r_t):
 
 
 def test_neutral_skin_keeps_its_variance(relief):
-    table = relief_growth.strained_variance(assets.grown(relief), relief.table)
+    table = relief_growth.strained_variance(assets.grow_relief(relief), relief.table)
     middle = relief_growth.STRETCH_NODES // 2
     np.testing.assert_allclose(table[middle, middle], 1.0, rtol=1e-9)
 
 
 def test_compressed_skin_is_rougher_and_stretched_skin_smoother(relief):
-    table = relief_growth.strained_variance(assets.grown(relief), relief.table)
+    table = relief_growth.strained_variance(assets.grow_relief(relief), relief.table)
     middle = relief_growth.STRETCH_NODES // 2
     along = table[:, middle, 0]
     assert along[middle - 6] > 1.5
@@ -73,14 +73,14 @@ def test_compressed_skin_is_rougher_and_stretched_skin_smoother(relief):
 
 
 def test_larger_pixels_show_less_of_the_slopes(relief):
-    rms = relief_growth.slope_rms(assets.grown(relief))
+    rms = relief_growth.slope_rms(assets.grow_relief(relief))
     assert len(rms) >= 5
     assert all(b < a for a, b in pairwise(rms))
     assert rms[5] < 0.1 * rms[0]
 
 
 def test_displacement_pixel_count_is_skin_length_over_pixel(relief):
-    facts = assets.from_relief(relief, plate(250.0))["facts"]["microstructure"]
+    facts = assets.build_relief_assets(relief, plate(250.0))["facts"]["microstructure"]
     assert facts["virtual_px"] == pytest.approx(250e3 / relief.pixel_um, abs=8)
     # 4 sigmas of the widest kernel, 22.4 um at r = 1.28, and two pixels for samples
     assert facts["reach_px"] == int(np.ceil(4.0 * 22.396 / relief.pixel_um + 0.5)) + 2
@@ -89,22 +89,22 @@ def test_displacement_pixel_count_is_skin_length_over_pixel(relief):
 def test_kernels_that_reach_over_the_window_are_refused(relief):
     wide = KernelTable((), ((1.0, -1.0),), (0.0, 900.0), (0.0, 900.0), (0.7, 1.3), "wide")
     with pytest.raises(SceneError, match="mesh: got kernels of 243 px"):
-        assets.from_relief(MicroRelief(relief.height_um, 15.0, wide), plate())
+        assets.build_relief_assets(MicroRelief(relief.height_um, 15.0, wide), plate())
 
 
 def test_a_relief_of_few_pixels_is_refused():
     small = MicroRelief(np.zeros((40, 40), np.float32), 15.0, FOREHEAD)
     with pytest.raises(SceneError, match="at least 96 pixels"):
-        assets.grown(small)
+        assets.grow_relief(small)
 
 
 def test_a_relief_without_a_valid_pixel_is_refused():
     with pytest.raises(SceneError, match="no valid pixel"):
-        assets.largest_square(np.zeros((4, 4), np.float32), np.zeros((4, 4), bool))
+        assets.find_largest_square(np.zeros((4, 4), np.float32), np.zeros((4, 4), bool))
 
 
 def test_the_patch_has_no_tilt_of_its_own(relief):
     tilted = relief.height_um + np.arange(relief.height_um.shape[1], dtype=np.float32)
-    a = assets.grown(MicroRelief(tilted, 15.0))
-    b = assets.grown(MicroRelief(relief.height_um, 15.0))
+    a = assets.grow_relief(MicroRelief(tilted, 15.0))
+    b = assets.grow_relief(MicroRelief(relief.height_um, 15.0))
     np.testing.assert_allclose(a.patch, b.patch, atol=1e-3)

@@ -11,11 +11,11 @@ BLOCKS_ACROSS: Final = 24
 """Along the shorter side of the picture; the noise of a pixel is averaged away in them."""
 MIN_BLOCK_PX: Final = 4
 """Pixels a side of a square, where a picture has room for three: 3 % noise becomes 0.8 %."""
-MAX_BEND: Final = 0.03
+MAX_NEIGHBOR_DIFFERENCE: Final = 0.03
 """Most that a block may differ from its four neighbors' mean, relative. Light of a lamp a metre
 away and the shading of a lens change over much of the field: even where they fall by 6 % from block
 to block they bend by 0.4 %. Cheeks, noses, hair and edges bend by tens of percent."""
-MAX_TINT: Final = 0.1
+MAX_COLOR_DIFFERENCE: Final = 0.1
 """Most that red or blue over green may differ from its median over the field, relative. A tile has
 one color under one kind of light, of which a lens that tints its corners leaves a few percent."""
 MIN_EVEN_FRACTION: Final = 0.8
@@ -26,11 +26,11 @@ MIN_FILLED_FRACTION: Final = 0.95
 that border on it, is a hundredth."""
 
 
-class NoTileError(ValueError):
+class NoWhiteReferenceError(ValueError):
     """A frame that is to show a white tile and shows something else."""
 
 
-def evenness(rgb: FloatArray, valid: BoolArray) -> float:
+def even_fraction(rgb: FloatArray, valid: BoolArray) -> float:
     """Return the share of a picture that is as even and as neutral as a lit white tile.
 
     Parameters
@@ -48,15 +48,15 @@ def evenness(rgb: FloatArray, valid: BoolArray) -> float:
     Notes
     -----
     The picture is cut into squares. Such a one is even where its green light differs from the mean
-    of its four neighbors by less than `MAX_BEND`, and its red and blue over green from those of the
-    median square by less than `MAX_TINT`. How bright it is and which color the light has play no
-    part: both are what a white tile is to tell.
+    of its four neighbors by less than `MAX_NEIGHBOR_DIFFERENCE`, and its red and blue over green
+    from those of the median square by less than `MAX_COLOR_DIFFERENCE`. How bright it is and which
+    color the light has play no part: both are what a white tile is to tell.
 
     Examples
     --------
     >>> light = np.linspace(0.4, 0.8, 96)[:, None, None] * np.array([0.6, 1.0, 0.7])
     >>> tile = np.broadcast_to(light, (96, 144, 3))
-    >>> evenness(tile, np.ones((96, 144), bool))
+    >>> even_fraction(tile, np.ones((96, 144), bool))
     1.0
     """
     shorter = min(valid.shape)
@@ -77,18 +77,18 @@ def evenness(rgb: FloatArray, valid: BoolArray) -> float:
     around = sum((green[place] for place in cross), np.zeros_like(green[inner])) / len(cross)
     tint = logs[..., (0, 2)] - green[..., None]
     usual = np.median(tint[lit], axis=0) if lit.any() else np.zeros(2)
-    even = (np.abs(green[inner] - around) < MAX_BEND) & bright
-    even &= (np.abs(tint[inner] - usual) < MAX_TINT).all(axis=-1)
+    even = (np.abs(green[inner] - around) < MAX_NEIGHBOR_DIFFERENCE) & bright
+    even &= (np.abs(tint[inner] - usual) < MAX_COLOR_DIFFERENCE).all(axis=-1)
     return float(np.count_nonzero(even & whole) / np.count_nonzero(whole))
 
 
-def examine(rgb: FloatArray, valid: BoolArray, what: str) -> tuple[str, ...]:
+def check_white_reference(rgb: FloatArray, valid: BoolArray, image_name: str) -> tuple[str, ...]:
     """Refuse a picture of something else than a white tile, and tell of one it does not fill.
 
     Parameters
     ----------
     rgb, valid
-        As of `evenness`.
+        As of `even_fraction`.
     what
         What the picture is called.
 
@@ -101,17 +101,19 @@ def examine(rgb: FloatArray, valid: BoolArray, what: str) -> tuple[str, ...]:
     ------
     NoTileError
     """
-    even = evenness(rgb, valid)
+    even = even_fraction(rgb, valid)
     share = f"{100 * even:.0f} % of the picture"
     if even < MIN_EVEN_FRACTION:
-        raise NoTileError(
-            f"sessions: {what} shows no white tile: {share} is even and neutral, expected all of"
+        raise NoWhiteReferenceError(
+            f"sessions: {image_name} shows no white tile: {share} is even and neutral, expected"
+            f" all of"
             " it; give a session of a tile that fills the picture (`skinrig capture flash"
             " --target white`, `skinrig simulate flash --target white`)"
         )
     if even < MIN_FILLED_FRACTION:
         return (
-            f"{what}: {share} is even and neutral; where the tile does not reach, or is dirty or"
+            f"{image_name}: {share} is even and neutral; where the tile does not reach, or is"
+            f" dirty or"
             " shadowed, maps will be wrong",
         )
     return ()

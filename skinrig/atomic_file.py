@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 
-def write_whole(path: Path, content: str | bytes) -> None:
+def write_atomically(path: Path, content: str | bytes) -> None:
     """Write a file whole or not at all; its folder is made, an older file replaced.
 
     Parameters
@@ -35,7 +35,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 
 @contextmanager
-def whole_folder(path: Path) -> Iterator[Path]:
+def replace_folder_atomically(path: Path) -> Iterator[Path]:
     """Yield an empty folder of that name, hidden beside, that replaces the older one in the end.
 
     Where the block or the replacement fails, the older folder stays as it was.

@@ -8,7 +8,7 @@ from capture.plan import flash_plan
 from capture.rig import load_rig
 from capture.session import Session
 from rigsim.needs.effects import SceneEffects
-from skinrig.simulating.leaving_out import SWITCHES_BY_RIG
+from skinrig.simulating.effect_omission import SWITCHES_BY_RIG
 from skinrig.simulating.orders import SimulationError
 from skinrig.simulating.simulation import simulate_session
 

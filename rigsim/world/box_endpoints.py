@@ -10,7 +10,7 @@ import tty
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 
-from rigsim.world.link import Link, LinkStalled, Unplugged
+from rigsim.world.link import Link, LinkStalled, LinkUnplugged
 from rigsim.world.world import World
 
 log = logging.getLogger(__name__)
@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 CHUNK_BYTES = 4096
 
 
-class BoxEnd(ABC):
+class BoxEndpoint(ABC):
     """Where the bytes of one box go in and out; those that it would not take yet wait here."""
 
     address: str
@@ -29,7 +29,7 @@ class BoxEnd(ABC):
         self._unsent = b""
 
     @property
-    def stalled(self) -> bool:
+    def is_stalled(self) -> bool:
         """Whether bytes wait that could not be passed on."""
         return bool(self._unsent)
 
@@ -56,7 +56,7 @@ class BoxEnd(ABC):
             self._link.attach(self._world.now)
 
     def _send(self, data: bytes) -> None:
-        """Pass bytes on; raise `Unplugged`."""
+        """Pass bytes on; raise `LinkUnplugged`."""
         self._unsent += data
         with self._world.lock:
             now = self._world.now
@@ -68,7 +68,7 @@ class BoxEnd(ABC):
                     self._world.advance(now)
 
     def _take(self) -> bytes:
-        """Return what the box said; raise `Unplugged`."""
+        """Return what the box said; raise `LinkUnplugged`."""
         if self._unsent:
             self._send(b"")
         with self._world.lock:
@@ -76,7 +76,7 @@ class BoxEnd(ABC):
             return self._link.take(self._link.waiting)
 
 
-class PtyEnd(BoxEnd):
+class PtyEndpoint(BoxEndpoint):
     """A box behind a pseudo-terminal."""
 
     def __init__(self, world: World, link: Link) -> None:
@@ -95,7 +95,7 @@ class PtyEnd(BoxEnd):
         self._attach()
 
     def _readable(self) -> None:
-        if not self.stalled:
+        if not self.is_stalled:
             with contextlib.suppress(BlockingIOError):
                 self._guarded(lambda: self._send(os.read(self._master, CHUNK_BYTES)))
 
@@ -115,7 +115,7 @@ class PtyEnd(BoxEnd):
     def _guarded(self, act: Callable[[], None]) -> None:
         try:
             act()
-        except Unplugged:
+        except LinkUnplugged:
             self.stop()
 
     def stop(self) -> None:
@@ -128,7 +128,7 @@ class PtyEnd(BoxEnd):
             self._forget()
 
 
-class TcpEnd(BoxEnd):
+class TcpEndpoint(BoxEndpoint):
     """A box behind a TCP port, for one client at a time."""
 
     def __init__(self, world: World, link: Link, host: str, port: int) -> None:
@@ -141,9 +141,9 @@ class TcpEnd(BoxEnd):
         self.address = f"socket://{host}:{self._listener.getsockname()[1]}"
 
     @property
-    def stalled(self) -> bool:
+    def is_stalled(self) -> bool:
         """Whether bytes wait that could not be passed on."""
-        return super().stalled or bool(self._unwritten)
+        return super().is_stalled or bool(self._unwritten)
 
     def start(self, selector: selectors.BaseSelector) -> None:
         """Begin to serve; `selector` calls back when bytes come."""
@@ -162,7 +162,7 @@ class TcpEnd(BoxEnd):
             return
         try:
             self._attach()
-        except Unplugged:
+        except LinkUnplugged:
             self._see_out(client)
             return
         client.setblocking(False)
@@ -171,7 +171,7 @@ class TcpEnd(BoxEnd):
         self._selector.register(client, selectors.EVENT_READ, self._readable)
 
     def _readable(self) -> None:
-        if self._client is None or super().stalled:
+        if self._client is None or super().is_stalled:
             return
         try:
             data = self._client.recv(CHUNK_BYTES)
@@ -180,7 +180,7 @@ class TcpEnd(BoxEnd):
             self._send(data)
         except BlockingIOError:
             return
-        except (OSError, Unplugged):
+        except (OSError, LinkUnplugged):
             self._hang_up()
 
     def pump(self) -> None:
@@ -194,7 +194,7 @@ class TcpEnd(BoxEnd):
                 self._unwritten = self._unwritten[self._client.send(self._unwritten) :]
         except BlockingIOError:
             return
-        except (OSError, Unplugged):
+        except (OSError, LinkUnplugged):
             self._hang_up()
 
     def _hang_up(self) -> None:

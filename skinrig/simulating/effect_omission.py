@@ -18,7 +18,7 @@ LATERAL_SWITCHES: Final = frozenset({"lateral", "subsurface"})
 """Names of light spreading sideways in skin: each rig's own, and the other's."""
 
 
-def left_out_of(rig: str, names: Sequence[str]) -> dict[str, bool]:
+def omission_arguments(rig: str, names: Sequence[str]) -> dict[str, bool]:
     """Return arguments for a rig's scene that leave effects out.
 
     Parameters
@@ -40,7 +40,7 @@ def left_out_of(rig: str, names: Sequence[str]) -> dict[str, bool]:
 
     Examples
     --------
-    >>> left_out_of("flash", ["optics", "subsurface"])
+    >>> omission_arguments("flash", ["optics", "subsurface"])
     {'optics': False, 'lateral': False}
     """
     known = SWITCHES_BY_RIG[rig]
@@ -54,12 +54,12 @@ def left_out_of(rig: str, names: Sequence[str]) -> dict[str, bool]:
     return out
 
 
-def may_be_left_out(switch: str) -> bool:
+def is_omittable(switch: str) -> bool:
     """Return whether some rig's scenes can leave the effect of a switch out.
 
     Examples
     --------
-    >>> may_be_left_out("optics"), may_be_left_out("last_bounce")
+    >>> is_omittable("optics"), is_omittable("last_bounce")
     (True, False)
     """
     return any(switch in known for known in SWITCHES_BY_RIG.values())

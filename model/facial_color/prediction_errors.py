@@ -10,7 +10,7 @@ from model.checks import Checks
 
 
 @dataclass(frozen=True, slots=True)
-class BloodErrors:
+class PredictionErrors:
     """Root mean square errors of one state's hemoglobin, volume fraction."""
 
     predicted: float
@@ -25,9 +25,9 @@ class BloodErrors:
     """That were compared."""
 
 
-def compare(
+def compare_prediction(
     predicted: ArrayLike, truth: ArrayLike, neutral: ArrayLike, *, valid: BoolArray | None = None
-) -> BloodErrors:
+) -> PredictionErrors:
     """Compare a predicted state with its truth, and with two ways to do without a rig.
 
     Parameters
@@ -49,7 +49,7 @@ def compare(
     Examples
     --------
     >>> neutral = np.array([[0.02, 0.04]])
-    >>> found = compare(1.5 * neutral, 1.5 * neutral, neutral)
+    >>> found = compare_prediction(1.5 * neutral, 1.5 * neutral, neutral)
     >>> found.predicted, round(found.gain, 6), round(found.neutral_kept, 6)
     (0.0, 1.5, 0.015811)
     """
@@ -68,4 +68,4 @@ def compare(
     def rms(error: Float64Array) -> float:
         return float(np.sqrt(np.mean(error**2)))
 
-    return BloodErrors(rms(h - t), rms(n - t), rms(gain * n - t), gain, int(h.size))
+    return PredictionErrors(rms(h - t), rms(n - t), rms(gain * n - t), gain, int(h.size))

@@ -8,22 +8,22 @@ from capture.rig import View
 from rigsim import shading
 from rigsim.arrays import Float32Array
 from rigsim.as_built.polarizers import Polarizers
-from rigsim.kept import Kept
+from rigsim.caching import LruCache
 from rigsim.scenes.gradient.patch import sample_grid
 
-MAX_KEPT_FRAMES: Final = 4
+MAX_CACHED_FRAMES: Final = 4
 
 
-class GridAnalyser:
+class GridAnalyzer:
     """Films before a camera that looks at the plane z = 0."""
 
     def __init__(self, films: Polarizers, view: View) -> None:
         self._films, self._view = films, view
-        self._frames: Kept[tuple[float, int], tuple[Float32Array, Float32Array]] = Kept(
-            lambda _: MAX_KEPT_FRAMES
+        self._frames: LruCache[tuple[float, int], tuple[Float32Array, Float32Array]] = LruCache(
+            lambda _: MAX_CACHED_FRAMES
         )
 
-    def analyse(
+    def analyze(
         self, stokes: Float32Array, reading_deg: float, *, border_px: int = 0
     ) -> Float32Array:
         """Apply the analyser to Stokes vectors of shape (3, H, W)."""
@@ -37,7 +37,7 @@ class GridAnalyser:
 
     def _frame(self, reading_deg: float, border_px: int) -> tuple[Float32Array, Float32Array]:
         view = self._view
-        passes_deg = self._films.passes_deg(view, "parallel", reading_deg)
+        passes_deg = self._films.analyzer_axis_deg(view, "parallel", reading_deg)
         x, y = sample_grid(view, subpixels=1, border_px=border_px)
         right, up, _ = view.axes
         to_camera = np.empty((len(y), len(x), 3), np.float32)
@@ -45,4 +45,4 @@ class GridAnalyser:
         to_camera[..., 2] = view.distance_mm
         to_camera /= np.linalg.norm(to_camera, axis=-1, keepdims=True)
         axes = {"image_right": right, "image_up": up}
-        return shading.analyser_frame(to_camera, passes_deg=passes_deg, **axes)
+        return shading.analyzer_frame(to_camera, passes_deg=passes_deg, **axes)

@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from skinrig.calibrating.white_tile import MIN_EVEN_FRACTION, NoTileError, evenness, examine
+from skinrig.calibrating.white_reference import (
+    MIN_EVEN_FRACTION,
+    NoWhiteReferenceError,
+    check_white_reference,
+    even_fraction,
+)
 
 
 def field(height=256, width=384):
@@ -26,20 +31,20 @@ def tile(rng, *, fall=1.0, tint=0.0, noise=0.02):
 @pytest.mark.parametrize("brightness", [1e-4, 1.0, 1e4])
 def test_tile_under_slanted_light_wide_lens_is_uniform(fall, tint, brightness, rng):
     picture = brightness * tile(rng, fall=fall, tint=tint)
-    assert evenness(picture, np.ones(picture.shape[:2], bool)) > 0.99
+    assert even_fraction(picture, np.ones(picture.shape[:2], bool)) > 0.99
 
 
 def test_dust_speck_and_saturated_pixels_do_not_matter(rng):
     picture, valid = tile(rng), np.ones((256, 384), bool)
     picture[100:108, 200:208] = 0.05
     picture[:60, :90], valid[:60, :90] = 50.0, False
-    assert evenness(picture, valid) > 0.95
+    assert even_fraction(picture, valid) > 0.95
 
 
 def test_margin_around_tile_counts_as_nonuniform(rng):
     picture = tile(rng)
     picture[:, 288:] = 0.001 * rng.random((256, 96, 3))
-    share = evenness(picture, np.ones((256, 384), bool))
+    share = even_fraction(picture, np.ones((256, 384), bool))
     assert share == pytest.approx(0.75, abs=0.04)
 
 
@@ -47,28 +52,28 @@ def test_lit_ball_before_darkness_is_not_a_tile(rng):
     y, x = field()
     depth = np.sqrt(np.clip(0.36 - x**2 - y**2, 0, None))
     picture = depth[..., None] * (0.9, 0.6, 0.4) + 1e-4 * rng.standard_normal((256, 384, 3))
-    assert evenness(picture, np.ones((256, 384), bool)) < MIN_EVEN_FRACTION
+    assert even_fraction(picture, np.ones((256, 384), bool)) < MIN_EVEN_FRACTION
 
 
 def test_evenly_lit_color_chart_is_not_a_tile(rng):
     patches = rng.uniform(0.05, 0.9, (8, 12, 3))
     picture = patches.repeat(32, axis=0).repeat(32, axis=1)
-    assert evenness(picture, np.ones((256, 384), bool)) < MIN_EVEN_FRACTION
+    assert even_fraction(picture, np.ones((256, 384), bool)) < MIN_EVEN_FRACTION
 
 
 def test_fully_saturated_image_gives_no_verdict():
-    assert evenness(np.ones((96, 96, 3)), np.zeros((96, 96), bool)) == 1.0
+    assert even_fraction(np.ones((96, 96, 3)), np.zeros((96, 96), bool)) == 1.0
 
 
 def test_images_of_few_pixels_are_evaluated(rng):
-    assert evenness(np.ones((8, 8, 3)), np.ones((8, 8), bool)) == 1.0
-    assert evenness(rng.random((8, 8, 3)), np.ones((8, 8), bool)) < MIN_EVEN_FRACTION
+    assert even_fraction(np.ones((8, 8, 3)), np.ones((8, 8), bool)) == 1.0
+    assert even_fraction(rng.random((8, 8, 3)), np.ones((8, 8), bool)) < MIN_EVEN_FRACTION
 
 
 def test_thumbnail_noise_is_not_unevenness(rng):
     picture = tile(rng, noise=0.0)[::6, ::6]
     picture = picture * (1 + 0.03 * rng.standard_normal(picture.shape))
-    assert evenness(picture, np.ones(picture.shape[:2], bool)) > 0.99
+    assert even_fraction(picture, np.ones(picture.shape[:2], bool)) > 0.99
 
 
 def test_face_before_uniform_wall_is_not_a_tile(rng):
@@ -77,5 +82,5 @@ def test_face_before_uniform_wall_is_not_a_tile(rng):
     inside = x**2 / 0.3**2 + y**2 / 0.45**2 < 1  # a sixth of the picture
     skin = np.sqrt(np.clip(1 - x**2 / 0.3**2 - y**2 / 0.45**2, 0, 1))[..., None] * (0.5, 0.4, 0.2)
     picture = np.where(inside[..., None], skin, picture)
-    with pytest.raises(NoTileError, match="frame 1 shows no white tile"):
-        examine(picture, np.ones((256, 384), bool), "frame 1")
+    with pytest.raises(NoWhiteReferenceError, match="frame 1 shows no white tile"):
+        check_white_reference(picture, np.ones((256, 384), bool), "frame 1")

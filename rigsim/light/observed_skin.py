@@ -13,7 +13,7 @@ from rigsim.tissue.skin_table import SkinTable
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SeenSkin:
+class ObservedSkin:
     """A face in a state, before a camera and under a light."""
 
     subject: SimulatedSubject
@@ -30,30 +30,30 @@ class SeenSkin:
         return skin_color(self.camera, self.illuminant)
 
     @property
-    def blood(self) -> Float32Array:
+    def blood_volume_fraction(self) -> Float32Array:
         """Fraction of hemoglobin, shape (N, N)."""
         return self.subject.hemoglobin(self.state)
 
     def reflectance(self) -> Float32Array:
         """Return the white-balanced reflectance, shape (N, N, 3)."""
-        return self.color.rgb(self.subject.melanin, self.blood)
+        return self.color.rgb(self.subject.melanin, self.blood_volume_fraction)
 
-    def without_melanin(self) -> Float32Array:
+    def reflectance_without_melanin(self) -> Float32Array:
         """Return the reflectance that it would have without melanin, shape (N, N, 3)."""
-        return self.color.rgb(np.zeros_like(self.subject.melanin), self.blood)
+        return self.color.rgb(np.zeros_like(self.subject.melanin), self.blood_volume_fraction)
 
-    def covered(self) -> tuple[Float32Array, Float32Array]:
+    def covered_chromophores(self) -> tuple[Float32Array, Float32Array]:
         """Return melanin and hemoglobin where the texture holds skin, shape (n,) each."""
         covered = self.subject.atlas.covered
-        return self.subject.melanin[covered], self.blood[covered]
+        return self.subject.melanin[covered], self.blood_volume_fraction[covered]
 
     def band_weights(self, step: int = 1) -> Float64Array:
         """Return each channel's weights of every so many wavelengths of the skin's table."""
         wavelength_nm = SkinTable.load().wavelength_nm[::step]
         return spectra.band_weights(self.camera, self.illuminant, wavelength_nm)
 
-    def kernels(self) -> GaussianSum:
+    def lateral_kernels(self) -> GaussianSum:
         """Return the lateral profile of its median melanin and hemoglobin, per channel."""
-        melanin, blood = (float(np.median(part)) for part in self.covered())
+        melanin, blood = (float(np.median(part)) for part in self.covered_chromophores())
         table = SkinTable.load()
         return table.lateral_kernels(melanin, blood, self.band_weights()).gaussians(SIGMAS_MM)

@@ -10,7 +10,7 @@ ValueT = TypeVar("ValueT")
 Key = ParamSpec("Key")
 
 
-class Kept(Generic[KeyT, ValueT]):
+class LruCache(Generic[KeyT, ValueT]):
     """The latest of what is slow to make.
 
     Parameters
@@ -38,7 +38,9 @@ class Kept(Generic[KeyT, ValueT]):
         self._values.clear()
 
 
-def kept(make: Callable[Concatenate[Any, Key], ValueT]) -> Callable[Concatenate[Any, Key], ValueT]:
+def cached_method(
+    make: Callable[Concatenate[Any, Key], ValueT],
+) -> Callable[Concatenate[Any, Key], ValueT]:
     """Have a method's result made once for the same arguments, and kept as long as its object."""
     name = f"_kept_{make.__name__}"
 

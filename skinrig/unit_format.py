@@ -6,7 +6,7 @@ DEGREE_SIGN: Final = "°"
 _SIGN_BY_UNIT: Final = {"deg": DEGREE_SIGN, "1": ""}
 
 
-def unit_sign(unit: str) -> str:
+def format_unit(unit: str) -> str:
     """Return a unit as people read it; none where it stands for a plain number.
 
     Parameters
@@ -16,13 +16,13 @@ def unit_sign(unit: str) -> str:
 
     Examples
     --------
-    >>> unit_sign("deg"), unit_sign("1"), unit_sign("1/mm")
+    >>> format_unit("deg"), format_unit("1"), format_unit("1/mm")
     ('°', '', '1/mm')
     """
     return _SIGN_BY_UNIT.get(unit, unit)
 
 
-def written(number: str, unit: str) -> str:
+def format_quantity(number: str, unit: str) -> str:
     """Return a number with its unit.
 
     A space stands between them, and none before the sign of degrees: SI Brochure, 9th edition,
@@ -37,8 +37,10 @@ def written(number: str, unit: str) -> str:
 
     Examples
     --------
-    >>> written("1.5", "deg"), written("1.5", "°"), written("12", "%"), written("3", "1")
-    ('1.5°', '1.5°', '12 %', '3')
+    >>> format_quantity("1.5", "deg"), format_quantity("1.5", "°")
+    ('1.5°', '1.5°')
+    >>> format_quantity("12", "%"), format_quantity("3", "1")
+    ('12 %', '3')
     """
-    sign = unit_sign(unit)
+    sign = format_unit(unit)
     return number + ("" if sign == DEGREE_SIGN or not sign else " ") + sign
