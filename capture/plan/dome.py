@@ -84,7 +84,7 @@ def dome_plan(
     >>> sum(step.kind == "olat" for step in plan.steps), round(plan.estimate_duration_s(dome), 1)
     (300, 26.5)
     """
-    require_argument(tracking_interval >= 0, "tracking_every", tracking_interval, ">= 0")
+    require_argument(tracking_interval >= 0, "tracking_interval", tracking_interval, ">= 0")
     require_argument(darks >= 0, "darks", darks, ">= 0")
     series = _Series(rig, frames_per_s=frames_per_s, iso=iso)
     shown = best_order(rig, dwell_s=series.dwell_s) if order is None else [int(k) for k in order]

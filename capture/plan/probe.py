@@ -231,7 +231,7 @@ class _Series(StepSeries):
         readout_s = max(view.readout_s for view in rig.views)
         most_s = min(probe.max_open_s, probe.max_suction_s - probe.settle_s - readout_s)
         room = f"<= {most_s:g}, which one suction of {probe.max_suction_s:g} s has room for"
-        require_argument(0 < longest_s <= most_s, "longest_s", longest_s, room)
+        require_argument(0 < longest_s <= most_s, "max_exposure_s", longest_s, room)
         require_argument(0 < level <= 1, "level", level, "0 < level <= 1")
         self._exposures_s = exposure_series_s(brackets, max_exposure_s=longest_s, step_ev=step_ev)
         super().__init__(rig, level=float(level), iso=iso)

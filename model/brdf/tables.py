@@ -114,7 +114,7 @@ class BrdfBasis:
 
     def mix_materials(self, weights: ArrayLike) -> BrdfBasis:
         """Return the basis whose R materials are the rows of `weights`, (R, K), at least 0."""
-        rows = Checks(BasisError).numbers("mix", weights, ("R", self.size), interval="[0, inf]")
+        rows = Checks(BasisError).numbers("weights", weights, ("R", self.size), interval="[0, inf]")
         table = self.table[..., : self.size].astype(np.float64) @ rows.T
         return _pad_table(table, [f"mix {i}" for i in range(len(rows))], self.light_radius_rad)
 

@@ -221,7 +221,7 @@ def gather(
     light = np.asarray(entered, np.float64)
     at = np.asarray(exit_mm, np.float64)
     _expect("entered", light, (tree.size, 3))
-    _expect("at_mm", at, (len(at), 3))
+    _expect("exit_mm", at, (len(at), 3))
     albedo = _broadcast("r_d", r_d, len(at))
     length = _broadcast("translucency_mm", translucency_mm, len(at))
     own = np.full((1, 3), np.nan)

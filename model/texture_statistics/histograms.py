@@ -155,7 +155,7 @@ def cumulate_fractions(fractions: ArrayLike) -> Float64Array:
     HistogramError
         For shares that are not finite, negative, or all 0.
     """
-    h = _check_fractions("shares", fractions)
+    h = _check_fractions("fractions", fractions)
     run = np.concatenate([np.zeros((*h.shape[:-1], 1)), np.cumsum(h, axis=-1)], axis=-1)
     run /= run[..., -1:]
     return np.asarray(np.minimum(run, 1.0))

@@ -88,7 +88,7 @@ class SpaceCurve:
         """
         among = [k for k, rank in enumerate(self.ranks) if max_rank is None or rank <= max_rank]
         if not among:
-            raise SpaceError(f"most: got {max_rank}, expected at least {self.ranks[0]}")
+            raise SpaceError(f"max_rank: got {max_rank}, expected at least {self.ranks[0]}")
         return self.ranks[brdf_basis.find_plateau_rank(self.error[among], fraction=fraction) - 1]
 
     def normalized(self) -> Float64Array:

@@ -151,7 +151,7 @@ def average_hypotheses(
     """
     doubtful = np.asarray(equally_likely, dtype=np.bool_)
     for estimate in (by_face, alone):
-        Checks(ChromophoreError).shape("where", doubtful, estimate.melanin.shape)
+        Checks(ChromophoreError).shape("equally_likely", doubtful, estimate.melanin.shape)
     mixed = {}
     for name in ("melanin", "hemoglobin"):
         first, second = getattr(by_face, name), getattr(alone, name)

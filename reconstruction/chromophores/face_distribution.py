@@ -65,7 +65,7 @@ class ContaminatedNormal:
     def __post_init__(self) -> None:
         """Refuse what is no distribution."""
         check = Checks()
-        check.settings(self, mean=FINITE, spread="(0, inf)", contamination="(0, 1]", low=FINITE)
+        check.settings(self, mean=FINITE, sd="(0, inf)", contamination="(0, 1]", low=FINITE)
         check.settings(self, high=f"({self.low}, inf)", stderr="[0, inf)")
 
     @property
@@ -158,7 +158,7 @@ def fit_distribution(
     >>> of_blood = np.exp(-0.5 * ((blood - 0.4) / 0.1) ** 2)
     >>> ends = (-9.0, -0.7), (0.04, 1.0)
     >>> found = fit_distribution(of_melanin * of_blood, (melanin, blood), ends).melanin
-    >>> bool(abs(found.mean + 3.0) < 0.03), bool(abs(found.spread - 0.2) < 0.03)
+    >>> bool(abs(found.mean + 3.0) < 0.03), bool(abs(found.sd - 0.2) < 0.03)
     (True, True)
     """
     Checks().shape("probability", probability, ("pixels", positions[0].size, positions[1].size))

@@ -83,7 +83,7 @@ class ShadingPrior:
         >>> round(prior.spread, 3)
         0.5
         """
-        Checks(ShadingPriorError).within("spread", log_sd, "(0, 2)")
+        Checks(ShadingPriorError).within("log_sd", log_sd, "(0, 2)")
         reach = np.arange(-math.ceil(4 * log_sd / self.step), math.ceil(4 * log_sd / self.step) + 1)
         kernel = np.exp(-0.5 * (reach * self.step / log_sd) ** 2)
         wide = np.convolve(self.density, kernel / kernel.sum())

@@ -176,7 +176,7 @@ def estimate_shared_melanin(
     if shading_window_px is not None:
         check.within("shading_window_px", shading_window_px, "(0, inf]")
         check.require(len(shape) == 2, "shading_window_px", f"rgb {colors.shape}", "(S, H, W, 3)")
-    check.within("own_share", state_variance_fraction, "[0, 1]")
+    check.within("state_variance_fraction", state_variance_fraction, "[0, 1]")
     seen = _States.of(colors, variance, valid)
     each_error, usual = _model_errors(model_error, shape, seen.usable)
     common = each_error * (1.0 - state_variance_fraction)
@@ -329,9 +329,9 @@ def _state_covariances(
     if state_covariance is None:
         return np.ascontiguousarray(np.broadcast_to(diagonal, (shape[0], 1, 6)))
     given = np.asarray(state_covariance, np.float64)
-    Checks(ChromophoreError).shape("own_error", given, (*shape, 3, 3))
+    Checks(ChromophoreError).shape("state_covariance", given, (*shape, 3, 3))
     flat = given.reshape(shape[0], -1, 3, 3)[..., _UPPER_TRIANGLE[0], _UPPER_TRIANGLE[1]]
-    Checks(ChromophoreError).within("own_error", flat[usable])
+    Checks(ChromophoreError).within("state_covariance", flat[usable])
     Checks(ChromophoreError).within(
         "variances of own_error", flat[usable][:, [0, 3, 5]], "[0, inf)"
     )

@@ -162,7 +162,7 @@ def normal_from_disc(position: Float64Array) -> Float64Array:
     >>> normal_from_disc(np.array([1.0, 0.0])).round(4).tolist()
     [0.866, 0.0, 0.5]
     """
-    Checks(SphereLightsError).within("place", position)
+    Checks(SphereLightsError).within("position", position)
     length = np.hypot(position[..., :1], position[..., 1:])
     seen = position * np.minimum(1.0, np.sqrt(2.0) / np.maximum(length, 1e-9))
     square = np.minimum(length, np.sqrt(2.0)) ** 2

@@ -130,7 +130,7 @@ def fit_table(
     w = np.broadcast_to(w[:, None] if w.ndim == 1 else w, (w.shape[0], 2))
     w = check.numbers("weights", w, (r.size, 2), interval="[0, inf)")
     check.within("max_segments", max_segments, "[1, 4]")
-    check.within("least_points", min_points, "[1, inf)")
+    check.within("min_points", min_points, "[1, inf)")
     for point, (stretched, strength, width) in enumerate(zip(r, a, s, strict=True)):
         check.within(f"point {point}, stretch", stretched, "(0, inf)")
         check.within(f"point {point}, alpha", strength, str(list(ALPHA_LIMITS)))

@@ -227,7 +227,7 @@ def select_lights(
         `reached` says whether what is wanted is predicted; if not, the selection holds the
         `max_lights` best lights.
     """
-    Checks(SelectionError).within("least", min_lights, "[3, inf)")
+    Checks(SelectionError).within("min_lights", min_lights, "[3, inf)")
     lights = information.weight.shape[1]
     max_lights = lights if max_lights is None else min(max_lights, lights)
     chosen = list(fixed)

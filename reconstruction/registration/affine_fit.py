@@ -57,10 +57,10 @@ def fit_affine(
     """
     count = len(points_px)
     if not (np.isfinite(points_px).all() and np.isfinite(displaced_px).all()):
-        raise ValueError("places, found: got what is no number, expected finite px")
+        raise ValueError("points_px, found: got what is no number, expected finite px")
     design = np.column_stack([points_px, np.ones(count)])
     if count < 7 or np.linalg.matrix_rank(design) < 3:
-        raise ValueError(f"places: got {count} points, expected at least 7, not all on one line")
+        raise ValueError(f"points_px: got {count} points, expected at least 7, not all on one line")
     apart = np.linalg.norm(points_px[:, None] - points_px[None], axis=-1) / window_px
     free = count - 3
     kept: list[tuple[float, Float64Array, Float64Array, Float64Array]] = []

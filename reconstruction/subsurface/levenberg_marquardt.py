@@ -184,7 +184,7 @@ def _fit_share(begin, end, curves, problem, found):  # type: ignore[no-untyped-d
                 p = active[r]
                 best += ((now[p] - prior[p, 0]) / prior[p, 1]) ** 2
             fresh = True
-            for _ in range(problem.most):
+            for _ in range(problem.max_steps):
                 if fresh:
                     _normal(y[n], m, jac, weight, logarithmic, active, count, h, g)
                     free = 0

@@ -201,7 +201,7 @@ class EffectSelection:
     ...     Effect("polarization", "built", "films before lights and camera"),
     ...     Effect("ambient light", "absent", "the room is dark"),
     ... ))
-    >>> needs.builds("polarization"), needs.left_out
+    >>> needs.builds("polarization"), needs.omitted
     (True, [('ambient light', 'the room is dark')])
     """
 

@@ -360,7 +360,7 @@ def shift_trait(
     44
     """
     if not 0.0 <= fraction <= 1.0:
-        raise PopulationError(f"share: got {fraction}, expected 0 to 1")
+        raise PopulationError(f"fraction: got {fraction}, expected 0 to 1")
     chosen = set(rng.permutation(len(members))[: round(fraction * len(members))].tolist())
     worn = validate_conditions({} if products is None else products)
     return tuple(

@@ -257,7 +257,7 @@ class ProbeHead:
     def start_suction(self, target_mbar: float, now: float) -> None:
         """Have the vent closed and the pump switched on."""
         if not 0.0 < target_mbar < math.inf:
-            raise SuctionError(f"wanted_mbar: got {target_mbar}, expected mbar > 0")
+            raise SuctionError(f"target_mbar: got {target_mbar}, expected mbar > 0")
         self.advance(now)
         self._vented, self._wanted_mbar = False, target_mbar
         if math.isinf(self._lifts_at_s):

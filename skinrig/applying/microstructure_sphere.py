@@ -146,7 +146,7 @@ class DeformedSphere:
         within_rad : float
             Angle around it on the neutral sphere, rad, 0.02 to 0.5.
         """
-        one_of("place", site, ROUGHNESS_POINTS, SphereError)
+        one_of("site", site, ROUGHNESS_POINTS, SphereError)
         if not 0.02 <= within_rad <= 0.5:
             raise SphereError(f"within_rad: got {within_rad}, expected 0.02...0.5")
         near = self.sphere.points_mm() @ np.asarray(ROUGHNESS_POINTS[site]) > (

@@ -193,7 +193,7 @@ def push(block: SkinBlock, probe: Push, *, steps: int = 2) -> PushedPatch:
     held = (nodes[:, 2] < 1e-9 - block.depth_mm) | edge
     if not touched.any() or (touched & held).any():
         raise PushError(
-            "centre_mm, contact_mm: expected a contact within the block's edges that has at least "
+            "center_mm, contact_mm: expected a contact within the block's edges that has at least "
             "one node of its surface"
         )
     given = np.full(nodes.shape, np.nan)

@@ -323,7 +323,7 @@ def _edit_albedo(work: _EditState, parts: LibraryParts, amounts: Mapping[str, fl
     share = masks.feather_region(order.region, parts.frame)
 
     def one(values: Float32Array, given: Mapping[str, float], stream: int) -> AlbedoEdit:
-        how: dict[str, Any] = {"region": region, "share": share, "iterations": order.iterations}
+        how: dict[str, Any] = {"region": region, "weight": share, "iterations": order.iterations}
         rng = np.random.default_rng([order.seed, stream])
         known = face_textures.valid_texels(source)
         return editing_albedo.edit_albedo(values, known, chart, space, given, **how, rng=rng)

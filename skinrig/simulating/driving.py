@@ -174,7 +174,7 @@ def build_result(
         truth,
         len(session.frames()),
         rig_seconds,
-        tuple(scene.left_out),
+        tuple(scene.omitted),
         effects=list_effects(scene),
         **more,
     )

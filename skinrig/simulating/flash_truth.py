@@ -126,6 +126,6 @@ def build_truth(
             **(parameters or {}),
         },
         inputs={"session": session},
-        left_out=tuple(scene.left_out),
+        left_out=tuple(scene.omitted),
         seed=seed,
     )

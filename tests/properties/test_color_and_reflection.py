@@ -375,7 +375,7 @@ def test_lobe_response_to_lights_is_finite_in_domain(view, eta, vector, mirror):
 @given(bad=st.sampled_from([np.nan, np.inf, -np.inf]))
 def test_lobes_of_nonfinite_values_raise_error(bad):
     up = np.array([0.0, 0.0, 1.0])
-    with pytest.raises(sphere_lights.SphereLightsError, match="place"):
+    with pytest.raises(sphere_lights.SphereLightsError, match="position"):
         sphere_lights.normal_from_disc(np.array([0.1, bad]))
     with pytest.raises(sphere_lights.SphereLightsError, match="normal"):
         sphere_lights.disc_from_normal(np.array([0.1, bad, 1.0]))

@@ -46,7 +46,7 @@ def test_affine_map_returns_with_error_in_position_units(seed, side, unit, noise
 def test_points_on_a_line_make_no_map(count, seed):
     along = np.random.default_rng(seed).normal(size=count)
     places = np.stack([along, 2.0 * along], axis=1)
-    with pytest.raises(ValueError, match="places"):
+    with pytest.raises(ValueError, match="points_px"):
         affine_fit.fit_affine(places, places, window_px=1.0)
 
 

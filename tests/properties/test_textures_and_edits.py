@@ -217,7 +217,7 @@ def test_histograms_of_nonfinite_textures_raise_error(bad):
             texture_histograms.histogram_distance(*pair, edges)
     with pytest.raises(error, match="edges"):
         texture_histograms.histogram_distance(even, even, bent)
-    with pytest.raises(error, match="shares"):
+    with pytest.raises(error, match="fractions"):
         texture_histograms.cumulate_fractions(wrong)
 
 

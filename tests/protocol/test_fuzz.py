@@ -91,7 +91,7 @@ def test_a_port_raises_only_device_errors_whatever_arrives(monkeypatch, rng, rig
     outcomes = {"answered": 0, "refused": 0}
     for _ in range(1500):
         try:
-            port.hello(patience_s=0.5)
+            port.hello(timeout_s=0.5)
             port.ask("STAT?")
             outcomes["answered"] += 1
         except DeviceError:

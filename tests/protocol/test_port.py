@@ -255,7 +255,7 @@ def test_controller_ignoring_hello_is_timeout(monkeypatch):
     line = Line([(greeting, b"")] * 4)
     monkeypatch.setattr(serial, "serial_for_url", lambda url, **_: line)
     with pytest.raises(PortTimeout, match="HELLO"):
-        Port("/dev/box", clock=StillClock(), first_seq=7).hello(patience_s=1.0)
+        Port("/dev/box", clock=StillClock(), first_seq=7).hello(timeout_s=1.0)
     assert not line.script
 
 

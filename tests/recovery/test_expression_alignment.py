@@ -62,7 +62,7 @@ def test_smile_motion_of_five_pixels_found_within_half(smiling, aligned):
     """Landmarks to 1 px leave more than that between them; not to align leaves all of it."""
     assert aligned.valid[smiling.valid].mean() > 0.93
     assert np.sqrt(np.mean(off(aligned, smiling) ** 2)) < 0.5
-    by_landmarks = laid_over(smiling, rounds=0, largest_error_px=50.0)
+    by_landmarks = laid_over(smiling, rounds=0, max_error_px=50.0)
     assert np.sqrt(np.mean(off(by_landmarks, smiling) ** 2)) > 1.0
     rows, columns = np.mgrid[:SIDE, :SIDE]
     moved = np.linalg.norm(smiling.source_px - np.dstack([columns, rows]), axis=-1)

@@ -24,7 +24,7 @@ FEW_PHOTONS = {"small": 2000, "full": 2000}
 @pytest.fixture
 def small(monkeypatch):
     """Few photons, and series of 8 exposures that end at half a second."""
-    short = {"brackets": 8, "longest_s": 0.5, "darks": 1}
+    short = {"brackets": 8, "max_exposure_s": 0.5, "darks": 1}
     monkeypatch.setattr(probe, "TRUTH_PHOTONS", FEW_PHOTONS)
     for name in ("probe_plan", "probe_calibration_plan"):
         honest = getattr(plan_choice, name)

@@ -100,7 +100,7 @@ def measure_patches(
     Patches
     """
     if not 0 < fraction <= 0.6:
-        raise ValueError(f"share: got {fraction}, expected 0 < share <= 0.6")
+        raise ValueError(f"fraction: got {fraction}, expected 0 < fraction <= 0.6")
     half = max(0.5 * fraction * _pitch(centers), 0.5)
     usable = np.logical_and.reduce(np.isfinite(image), axis=-1)
     if valid is not None:

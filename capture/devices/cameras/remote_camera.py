@@ -102,7 +102,7 @@ class RemoteCamera:
 
     def frame(self, timeout_s: float) -> Frame:
         """Return the next frame, or raise `FrameTimeout`; a damaged one is `FrameRefused`."""
-        answer = self._ask("frame", timeout_s=timeout_s, patience_s=timeout_s)
+        answer = self._ask("frame", timeout_s=timeout_s, reply_delay_s=timeout_s)
         try:
             camera_wire.check_blob(answer, answer["blob"])
             return camera_wire.frame_from_message(answer["frame"], answer["blob"])
@@ -131,14 +131,14 @@ class RemoteCamera:
             self._drop()
             raise CameraError(f"{self._url}: an answer made no sense: {exc!r}") from exc
 
-    def _ask(self, request: str, *, timeout_s: float = 0.0, **fields: Any) -> dict[str, Any]:
+    def _ask(self, request: str, *, reply_delay_s: float = 0.0, **fields: Any) -> dict[str, Any]:
         """Send one request and return the fields of its answer, its bytes under ``blob``."""
         connection = self._socket
         if connection is None:
             raise LinkLost(f"{self._url}: the connection is closed; open the camera again")
         self._id += 1
         try:
-            connection.settimeout(ANSWER_TIMEOUT_S + timeout_s)
+            connection.settimeout(ANSWER_TIMEOUT_S + reply_delay_s)
             connection.sendall(
                 camera_wire.encode_message({"id": self._id, "do": request, **fields})
             )

@@ -174,7 +174,7 @@ class ProbeScene(RigScene):
         open_share = np.ones(count)
         if fiber is not None:
             if not 0 <= fiber < count:
-                raise SceneError(f"fibre: got {fiber}, expected 0 to {count - 1}")
+                raise SceneError(f"fiber: got {fiber}, expected 0 to {count - 1}")
             open_share[:] = self.build.cover_leak
             open_share[fiber] = 1.0
         taken = (open_share * self.build.gain)[:, None] * reflectance_per_mm2

@@ -132,7 +132,7 @@ def test_nan_positions_are_refused_by_name(rng):
     for place in range(2):
         given = [grid.copy(), grid + 0.1 * rng.normal(size=grid.shape)]
         given[place][3, 1] = np.nan
-        with pytest.raises(ValueError, match="places, found"):
+        with pytest.raises(ValueError, match="points_px, found"):
             affine_fit.fit_affine(*given, window_px=1.0)
 
 

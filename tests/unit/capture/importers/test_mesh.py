@@ -35,11 +35,11 @@ FILES = {
     "ascii.ply": lambda: HEAD.export(file_type="ply", encoding="ascii"),
     "normals.ply": lambda: with_normals().export(file_type="ply", vertex_normal=True),
     "plain.obj": lambda: HEAD.export(file_type="obj").encode(),
-    "normals.obj": lambda: trimesh.exchange.to_obj.export_obj(
+    "normals.obj": lambda: trimesh.exchange.obj.export_obj(
         with_normals(), include_normals=True
     ).encode(),
     "uv.ply": lambda: textured().export(file_type="ply"),
-    "uv.obj": lambda: trimesh.exchange.to_obj.export_obj(textured()).encode(),
+    "uv.obj": lambda: trimesh.exchange.obj.export_obj(textured()).encode(),
 }
 
 
@@ -183,7 +183,7 @@ def test_open_session_accepts_mesh_stays_open_without_names(session, scan):
 
 def test_closed_session_is_unchanged_and_copy_gets_mesh(session, scan, tmp_path):
     with Session.resume(session) as made:
-        made.close(missing_because="the subject left")
+        made.close(missing_reason="the subject left")
     before = {file: file.read_bytes() for file in session.rglob("*") if file.is_file()}
     with pytest.raises(SessionError, match="--out COPY"):
         import_mesh(scan, session=session)

@@ -228,7 +228,7 @@ def test_calibration_plan_contains_steps_required_by_target(target, steps, kinds
         ({"frames_per_s": 0.0}, "frames_per_s"),
         ({"level": 1.5}, "level"),
         ({"order": [0, 1]}, "every light once"),
-        ({"tracking_every": -1}, "tracking_every"),
+        ({"tracking_interval": -1}, "tracking_interval"),
         ({"darks": -1}, "darks"),
         ({"frames_per_s": 3.0}, "level x dwell"),
     ],

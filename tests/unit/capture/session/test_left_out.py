@@ -89,7 +89,7 @@ def test_other_missing_steps_still_need_reason(session):
     session.leave_out(["S003"], reason=WHY, t_host_s=0.0)
     with pytest.raises(SessionError, match="4 missing"):
         session.close()
-    session.close(missing_because="the subject left")
+    session.close(missing_reason="the subject left")
     assert any("4 frames missing" in text for text in verify(session.path).warnings)
 
 

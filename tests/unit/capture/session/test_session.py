@@ -168,7 +168,7 @@ def test_an_incomplete_session_closes_only_with_a_reason(session):
     commit(session, "D000")
     with pytest.raises(SessionError, match="4 missing"):
         session.close()
-    session.close(missing_because="the subject left")
+    session.close(missing_reason="the subject left")
     report = verify(session.path, today=NOON.date())
     assert report.ok
     assert any("the subject left" in warning for warning in report.warnings)
@@ -505,11 +505,11 @@ def test_failing_disk_costs_attachment_only_keeps_acknowledged_data(session, ope
 def test_copy_of_closed_session_takes_attachment_original_unchanged(tmp_path, session):
     commit(session, "D000")
     session.attach("notes.txt", b"as captured")
-    session.close(missing_because="the subject left")
+    session.close(missing_reason="the subject left")
     before = files(session.path)
     copy, reason = reopen_copy(session.path, tmp_path / "copy")
     copy.attach("scan.ply", b"scan")
-    copy.close(missing_because=reason)
+    copy.close(missing_reason=reason)
     assert files(session.path) == before
     both = Session.open(session.path), Session.open(tmp_path / "copy")
     assert both[0].id == both[1].id
@@ -524,7 +524,7 @@ def test_only_a_closed_and_sound_session_is_copied(tmp_path, session):
     commit(session, "D000")
     with pytest.raises(SessionError, match="is not closed"):
         reopen_copy(session.path, tmp_path / "copy")
-    session.close(missing_because="the subject left")
+    session.close(missing_reason="the subject left")
     file = session.path / "frames/D000+cam.dng"
     file.write_bytes(file.read_bytes()[:-1] + b"\xff")
     with pytest.raises(SessionDamage, match="D000"):

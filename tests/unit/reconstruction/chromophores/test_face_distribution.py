@@ -137,7 +137,7 @@ def test_invalid_probability_or_bell_is_refused():
         fitted(np.ones((3, 5, 2)))
     with pytest.raises(ValueError, match="probability: got"):
         fitted(np.zeros((3, MELANIN.size, BLOOD.size)))
-    with pytest.raises(ValueError, match="spread"):
+    with pytest.raises(ValueError, match="sd"):
         ContaminatedNormal(0.0, 0.0, 0.1, -1.0, 1.0)
 
 

@@ -42,7 +42,7 @@ def test_an_unknown_exposure_adds_its_spread():
     ("make", "message"),
     [
         (lambda: lognormal_prior(0.0, 0.5), "center, spread"),
-        (lambda: lognormal_prior(0.7, 0.5).broaden(0.0), "spread"),
+        (lambda: lognormal_prior(0.7, 0.5).broaden(0.0), "log_sd"),
         (lambda: ShadingPrior(0.0, 0.1, np.array([1.0, 0.0])), "density"),
         (lambda: ShadingPrior(0.0, -0.1, np.ones(3)), "step"),
         (lambda: prior_from_histogram(-1.0, 0.1, [0, 0]), "counts"),

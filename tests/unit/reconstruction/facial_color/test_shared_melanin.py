@@ -327,7 +327,7 @@ def test_arguments_that_do_not_fit_are_named(table, prior):
         ({"variance": np.ones((2, 7, 3))}, "variance: got .* broadcasts"),
         ({"variance": -np.ones(3)}, "variance: got a negative"),
         ({"shading_window_px": 8.0}, r"shading_window_px: got rgb .*expected \(S, H, W, 3\)"),
-        ({"own_share": 2.0}, "own_share: got 2.0"),
+        ({"state_variance_fraction": 2.0}, "state_variance_fraction: got 2.0"),
     )
     for given, message in cases:
         with pytest.raises(ChromophoreError, match=message):
@@ -364,7 +364,7 @@ def test_state_registration_error_counts_as_correlated_noise(table, prior, rng):
 def test_mismatched_registration_error_is_refused(table, prior, rng):
     rgb, variance = pictures(table, rng, noise=3e-4, pixels=4)
     for wrong in (np.zeros((4, 3, 3)), np.full((len(rgb), 4, 3, 3), np.nan)):
-        with pytest.raises(ChromophoreError, match="own_error"):
+        with pytest.raises(ChromophoreError, match="state_covariance"):
             shared_melanin.estimate_shared_melanin(
                 rgb, table, prior=prior, variance=variance, state_covariance=wrong
             )

@@ -115,7 +115,7 @@ def test_single_pixel_and_single_row_have_height():
 
 @pytest.mark.parametrize("change", [{"sharpness": 0.0}, {"rounds": 0}, {"stop": 1.0}, {"inner": 0}])
 def test_settings_out_of_range_are_named(change):
-    with pytest.raises(IntegrationError, match=f"Bilateral.{next(iter(change))}: got"):
+    with pytest.raises(IntegrationError, match=f"BilateralSettings.{next(iter(change))}: got"):
         BilateralSettings(**change)
 
 

@@ -145,5 +145,5 @@ def test_bad_information_is_refused_by_name(broken):
         fields[broken].flat[0] = np.nan
     with pytest.raises(selection.SelectionError, match="got"):
         selection.FisherInformation(**fields)
-    with pytest.raises(selection.SelectionError, match="least"):
+    with pytest.raises(selection.SelectionError, match="min_lights"):
         selection.select_lights(good, median_rad=1.0, valid_fraction=0.5, min_lights=2)

@@ -125,7 +125,7 @@ def test_a_member_out_of_range_is_refused(change, match):
 def test_faces_and_shifts_out_of_range_are_refused(rng):
     with pytest.raises(PopulationError, match="size: got 32"):
         PEOPLE[0].r_d(32, CAMERA, LIGHT)
-    with pytest.raises(PopulationError, match="share"):
+    with pytest.raises(PopulationError, match="fraction"):
         shift_trait(PEOPLE, "tan", fraction=1.5, rng=rng)
     with pytest.raises(PopulationError, match="seed"):
         draw_population(seed=-1)

@@ -207,7 +207,7 @@ def test_invalid_parameter_is_named():
     sucked = head()
     with pytest.raises(SuctionError, match="angle_deg"):
         sucked.place("cheek", 360.0, 1.0)
-    with pytest.raises(SuctionError, match="wanted_mbar"):
+    with pytest.raises(SuctionError, match="target_mbar"):
         sucked.draw(0.0, 1.0)
     sucked.draw(60.0, 1.0)
     with pytest.raises(SuctionError, match="vented first"):

@@ -137,7 +137,7 @@ def test_highlight_is_on_light_side():
         (lambda: spheres.deform(SPHERE, np.zeros((4, 4)), (1, 1, 1)), "height_um: got shape"),
         (lambda: spheres.deform(SPHERE, np.zeros((400, 400)), (1, 1)), "ratios"),
         (lambda: spheres.deform(SPHERE, np.zeros((400, 400)), (1, 0, 1)), "ratios"),
-        (lambda: spheres.deform(SPHERE, np.zeros((400, 400)), (1, 1, 1)).roughness("x"), "place"),
+        (lambda: spheres.deform(SPHERE, np.zeros((400, 400)), (1, 1, 1)).roughness("x"), "site"),
         (
             lambda: spheres.deform(SPHERE, np.zeros((400, 400)), (1, 1, 1)).roughness(
                 "top", within_rad=1.0

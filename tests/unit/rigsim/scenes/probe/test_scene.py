@@ -241,7 +241,7 @@ def test_invalid_exposure_requests_are_refused(scene):
         scene.exposure(
             "cam", pops=[SourceLight(1.0, 1.0, 0.5, None)], exposure_s=1.0, seed=0, head=CHEEK
         )
-    with pytest.raises(SceneError, match="fibre: got 28"):
+    with pytest.raises(SceneError, match="fiber: got 28"):
         scene.exposure("cam", pops=lit(1.0, fibre=28), exposure_s=1.0, seed=0, head=CHEEK)
     with pytest.raises(SceneError, match="contact probe"):
         ProbeScene(load_rig("dome"), scene.tissue)
