@@ -248,7 +248,7 @@ def api_navigation() -> list[Any]:
     return [
         {
             package: [
-                {Path(uri).stem: uri}
+                {Path(uri).stem.removeprefix(f"{package}."): uri}
                 for uri in api_pages()
                 if Path(uri).stem.startswith(f"{package}.")
             ]
@@ -325,7 +325,8 @@ def schemas_page() -> str:
         "",
         "Every JSON document names its schema in the field `schema`. The number after the slash"
         " changes when a field changes its meaning or is removed. Files and the output of"
-        " `--json` use the same names.",
+        " `--json` use the same names. The fields are those that the module writes itself; a"
+        " document can have more.",
         "",
         "| schema | defined in | fields |",
         "| --- | --- | --- |",
