@@ -30,7 +30,7 @@ DECISIONS = sorted((DOCS / "decisions").glob("*.md"))
 PAGES = [page for page in sorted(DOCS.rglob("*.md")) if page not in DECISIONS]
 GENERATED = ("api", "command-line", "map-names.md", "schemas.md")
 """Pages and folders of the reference that tools/site_pages.py makes."""
-GUIDES = [ROOT / "README.md", *PAGES]
+GUIDES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 SPAN = re.compile(r"`([^`]+)`")
 
@@ -69,7 +69,7 @@ WIRE = DOCS / "reference" / "wire-protocol.md"
 # python ------------------------------------------------------------------------------------------
 
 
-@named([page for page in PAGES if ">>> " in page.read_text("utf-8")])
+@named([page for page in GUIDES if ">>> " in page.read_text("utf-8")])
 def test_python_examples_give_what_the_page_says(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     source = "\n".join(blocks(page, "python"))
@@ -81,7 +81,7 @@ def test_python_examples_give_what_the_page_says(page, tmp_path, monkeypatch):
 
 
 def test_every_python_block_is_an_example_that_runs():
-    silent = [page.name for page in PAGES for body in blocks(page, "python") if ">>> " not in body]
+    silent = [page.name for page in GUIDES for body in blocks(page, "python") if ">>> " not in body]
     assert silent == []
 
 

@@ -38,9 +38,13 @@ SEARCHED = {
         "concepts/skin-reflectance.html",
         "reference/glossary.html",
     ),
-    "ground truth": ("reference/maps.html", "validation/index.html", "reference/glossary.html"),
+    "ground truth": (
+        "concepts/ground-truth.html",
+        "reference/maps.html",
+        "reference/glossary.html",
+    ),
     "interreflection": ("concepts/omissions.html", "reference/glossary.html"),
-    "credible interval": ("validation/flash-rig.html", "reference/glossary.html"),
+    "credible interval": ("concepts/uncertainty.html", "validation/flash-rig.html"),
     "blood volume fraction": ("reference/maps.html", "reference/glossary.html"),
     "specular": ("concepts/dome-reconstruction.html", "reference/maps.html"),
 }
