@@ -7,6 +7,7 @@ import re
 import shlex
 import shutil
 import subprocess
+import textwrap
 from functools import cache
 from pathlib import Path
 
@@ -31,7 +32,7 @@ PAGES = [page for page in sorted(DOCS.rglob("*.md")) if page not in DECISIONS]
 GENERATED = ("api", "command-line", "map-names.md", "schemas.md")
 """Pages and folders of the reference that tools/site_pages.py makes."""
 GUIDES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
-FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+FENCE = re.compile(r"^ *```(\w*)\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
 SPAN = re.compile(r"`([^`]+)`")
 
 
@@ -41,7 +42,8 @@ def named(paths):
 
 
 def blocks(page, *languages):
-    return [body for kind, body in FENCE.findall(page.read_text("utf-8")) if kind in languages]
+    found = FENCE.findall(page.read_text("utf-8"))
+    return [textwrap.dedent(body) for kind, body in found if kind in languages]
 
 
 def prose(page):
