@@ -91,6 +91,18 @@ def test_tables_have_at_most_five_columns():
     assert found == WIDE_TABLES
 
 
+def test_rig_drawings_match_their_rig_files(tmp_path, monkeypatch):
+    spec = importlib.util.spec_from_file_location("drawings", ROOT / "tools/make_rig_drawings.py")
+    drawings = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(drawings)
+    monkeypatch.setattr(drawings, "IMAGES", tmp_path)
+    drawings.main()
+    made = sorted(tmp_path.iterdir())
+    assert len(made) == 4
+    for path in made:
+        assert path.read_text("utf-8") == (DOCS / "images" / path.name).read_text("utf-8")
+
+
 # the built site ----------------------------------------------------------------------------------
 
 needs_extra = pytest.mark.skipif(
