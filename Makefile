@@ -5,13 +5,14 @@ PYTEST := .venv/bin/python -m pytest
 # files in the order of tests/conftest.py, the longest first, not that of how many tests they have
 WORKERS := -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
-.PHONY: help setup browser demo test test-long lint bench clean
+.PHONY: help setup browser demo test test-long lint docs bench clean
 
 help:
 	@echo "make demo       simulate, capture, calibrate, reconstruct, report (leaves ./demo)"
 	@echo "make test       every test but the long ones"
 	@echo "make test-long  the long ones"
 	@echo "make lint       ruff, mypy and the import contracts"
+	@echo "make docs       the documentation site, into ./site (open site/index.html)"
 	@echo "make browser    Chromium and what else the tests in a browser need (else they skip)"
 	@echo "make bench      error against run time of each stage"
 	@echo "each sets up what it needs in .venv first"
@@ -39,8 +40,14 @@ test: .venv/.ready
 test-long: .venv/.ready
 	@$(PYTEST) -q $(WORKERS) --durations 25 -m long tests
 
+# the variable silences a note of mkdocs-material on its successor
+docs: .venv/.ready
+	@.venv/bin/python -c 'import material, mkdocs, mkdocstrings' 2>/dev/null || \
+	  .venv/bin/python -m pip install -q --disable-pip-version-check -c constraints.txt --no-build-isolation -e '.[docs]'
+	@NO_MKDOCS_2_WARNING=1 .venv/bin/python -m mkdocs build --quiet --strict --site-dir site
+
 bench: .venv/.ready
 	@$(SKINRIG) bench
 
 clean:
-	rm -rf .venv demo build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis node_modules
+	rm -rf .venv demo build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis node_modules site

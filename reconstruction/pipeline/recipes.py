@@ -68,7 +68,7 @@ def reconstruct(
     session
         SESSION/ folder.
     want
-        Names of maps; which there are depends on the rig, see docs/maps.md.
+        Names of maps; which there are depends on the rig, see docs/reference/maps.md.
     out
         The folder. Maps in it that are still current, by the hash of all that they depend on,
         are kept and not computed again.

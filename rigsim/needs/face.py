@@ -168,7 +168,7 @@ def wrinkle_shadow_effect(
     """Return whether the relief of a face that has moved hides lights from itself.
 
     Pores of a face at rest tilt less than 4 degrees and are not built: under a light that grazes
-    the skin they would take up to a tenth of its cosine away, see docs/leaving-out.md.
+    the skin they would take up to a tenth of its cosine away, see docs/concepts/omissions.md.
     """
     if subject.pose is None:
         return Effect(

@@ -211,7 +211,7 @@ def _packaged_certificate(session: Session) -> PhantomCertificate:
     if session.source != "simulated":
         raise CalibratingError(
             "phantom: its optics are not known; give the certificate of the block that was measured"
-            " as --phantom FILE.json (schema skinrig.phantom/1, see docs/probe-calibration.md)"
+            " as --phantom FILE.json (schema skinrig.phantom/1, see docs/how-to/calibrate-probe.md)"
         )
     return packaged_certificate()
 

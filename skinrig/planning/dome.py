@@ -26,7 +26,7 @@ from skinrig.planning.dome_observation import LIGHT_ERROR, DomeObservation, simu
 from skinrig.planning.plans import PlanChoice, PlanRequest
 
 FORECAST_RELATIVE_SD = {"normals": 0.2, "r_d": 0.2}
-"""Relative deviation of measured from predicted medians, see docs/planning.md."""
+"""Relative deviation of measured from predicted medians, see docs/validation/forecasts.md."""
 SHARED_R_D_ERROR = 0.0095
 """Relative error of R_d that a face's points share or that follows nothing known, whatever the
 lights. With `SPECULAR_R_D_ERROR` set on faces of seeds 1 to 3, types V, I and IV."""

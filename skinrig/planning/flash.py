@@ -34,7 +34,7 @@ DARK_CHOICES = (0, 1, 4)
 POWER_CHOICES = (0.03125, 0.0625, 0.125, 0.25, 0.5, 1.0)
 """Of the flashes' full energy; less is kinder to eyes and costs no time."""
 FORECAST_RELATIVE_SD: Mapping[str, float] = {"melanin": 0.2, "hemoglobin": 0.15}
-"""Relative deviation of measured from predicted medians, see docs/planning.md."""
+"""Relative deviation of measured from predicted medians, see docs/validation/forecasts.md."""
 ERROR_OVER_BOUND: Mapping[str, float] = {"melanin": 1.1, "hemoglobin": 1.0}
 """Errors over their bounds, medians of sessions. Melanin's exceed it as the light's prior tells
 less of most pixels than its information says in the mean (2 to 10 %), as the model error of a face

@@ -46,9 +46,9 @@ MAX_SIGNAL_FRACTION = 0.98
 """Of full scale, in the brightest thousandth of the pixels."""
 UNMODELED_TILT_RAD = math.radians(0.2)
 """Error of each tilt that is in no standard error: shadows in furrows, a lobe unlike the one that
-is assumed; see docs/planning.md."""
+is assumed; see docs/validation/forecasts.md."""
 FORECAST_RELATIVE_SD = {"normals": 0.2}
-"""Relative deviation of measured from predicted medians, see docs/planning.md."""
+"""Relative deviation of measured from predicted medians, see docs/validation/forecasts.md."""
 WHOLE_READOUT_S = PATTERN_DWELL_S - PATTERN_EXPOSURE_S
 """Between two exposures of patterns: read-out and settling of the LEDs."""
 

@@ -1,4 +1,4 @@
-"""Each benchmark once at toy size: it runs, and its document holds what docs/measuring.md says."""
+"""Each benchmark once at toy size; its document has the fields of docs/reference/benchmarks.md."""
 
 import copy
 import itertools
