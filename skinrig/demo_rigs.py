@@ -81,12 +81,12 @@ class DemoResults:
 
     def add_light(self, title: str, capture: SimulationResult) -> None:
         """Add a table of the light that a capture took."""
-        self.add_table(title, ["figure", "value"], light_rows(capture.light))
+        self.add_table(title, ["quantity", "value"], light_rows(capture.light))
 
     def add_omissions(self, rig: str, capture: SimulationResult) -> None:
         """Add a table of what a capture's simulator did not build."""
-        title = f"Left out by the simulator of the {rig}"
-        self.add_table(title, ["what", "why"], capture.left_out)
+        title = f"Effects omitted by the simulator of the {rig}"
+        self.add_table(title, ["effect", "reason"], capture.left_out)
 
 
 StepTimer = Callable[[str], AbstractContextManager[None]]
@@ -148,7 +148,7 @@ def _flash(run: RigDemo) -> None:
             captures.append(
                 run.simulate("flash", subject, subject=subject, width_px=width, states=states)
             )
-    with run.share("flash: reconstruct melanin and hemoglobin"):
+    with run.share("flash: reconstruct melanin and blood"):
         for capture in captures:
             name, _, maps, truth = run.reconstruct("flash", capture, FLASH_WANT)
             for row in flash.compare(maps, truth, rng=np.random.default_rng(0)):
@@ -161,7 +161,7 @@ def _flash(run: RigDemo) -> None:
         fit_facial_color([captures[0].session], out=moving, calibration=calibration)
         _evaluate_states(moving, found)
     found.add_table(
-        "Resolution lost as light spreads in the skin, 10 to 90 % of an edge, mm",
+        "Blur by lateral scattering in the skin, 10 to 90 % of an edge, mm",
         ["subject", "red", "green", "blue"],
         ([c.session.name, *(round(mm, 3) for mm in c.blur_mm)] for c in captures),
     )
@@ -202,7 +202,7 @@ def _dome(run: RigDemo) -> None:
             leave_out=DOME_OMITTED_EFFECTS,
             width_px=width,
         )
-    with run.share("dome: reconstruct normals, albedo and lobes"):
+    with run.share("dome: reconstruct normals, albedo and basis BRDFs"):
         name, folder, maps, truth = run.reconstruct("dome", capture, DOME_WANT, DOME_HOLD_OUT)
         for row in surface_evaluation.compare(maps, truth, rng=np.random.default_rng(0)):
             found.add(
@@ -212,7 +212,7 @@ def _dome(run: RigDemo) -> None:
         if held_out is not None:
             error = 100 * held_out.median
             found.add(name, "reflection, held out", error, "%", float("nan"), 0.0)
-    with run.share("dome: render photographs that no fit has seen"):
+    with run.share("dome: render held-out photographs"):
         compared = evaluate_folders(
             folder,
             capture.session,
@@ -222,7 +222,7 @@ def _dome(run: RigDemo) -> None:
         )
     models = {FULL_MODEL: compared[FULL_MODEL], **compared["ablation"]}
     found.add_table(
-        "Luminance of photographs that no fit has seen, on lit pixels",
+        "Luminance of held-out photographs, on lit pixels",
         ["model", "median error, %", "all skin, %"],
         ([name, 100 * row["median"], 100 * row["total_error"]] for name, row in models.items()),
     )
@@ -235,7 +235,7 @@ def _gradient(run: RigDemo) -> None:
     found = run.found
     with run.share("gradient: capture a ball of black glass"):
         run.simulate("gradient", "ball", target="ball")
-    with run.share("gradient: calibrate lights and films"):
+    with run.share("gradient: calibrate lights and polarizers"):
         for kind in ("lights", "polarization"):
             run.calibrate("gradient", kind, "ball")
     with run.share("gradient: stretch and capture a patch of skin"):
@@ -255,7 +255,7 @@ def _gradient(run: RigDemo) -> None:
             worst = max(strain, key=lambda row: abs(row.error))
             what, error = f"stretch, {state_title(worst.state)}", 100 * abs(worst.error)
             found.add(name, what, error, "%", float("nan"), 0.0)
-    found.add_light("Light of a state's scan in the gradient sphere", capture)
+    found.add_light("Light of one scan in the gradient sphere", capture)
     found.add_omissions("gradient sphere", capture)
 
 
@@ -263,14 +263,14 @@ def _probe(run: RigDemo) -> None:
     """Calibrate a fibre probe, and measure a medium and three sites of a face."""
     with run.share("probe: capture a phantom"):
         run.simulate("probe", "phantom", target="phantom")
-    with run.share("probe: calibrate its fibres"):
+    with run.share("probe: calibrate its fibers"):
         run.calibrate("probe", "fibre", "phantom")
     with run.share("probe: capture a medium and three sites of a face"):
         captures = [
             run.simulate("probe", "medium", subject=PROBE_MEDIUM, sites=("cheek",)),
             run.simulate("probe", PROBE_SUBJECT, subject=PROBE_SUBJECT),
         ]
-    with run.share("probe: reconstruct sigma_tr and translucency"):
+    with run.share("probe: reconstruct sigma_tr and diffuse mean free path"):
         for capture in captures:
             name, _, maps, truth = run.reconstruct("probe", capture, PROBE_WANT)
             fits = subsurface.compare_fits(maps, truth)

@@ -1,4 +1,4 @@
-"""One self-contained HTML page of what was measured, and how far from the truth it is."""
+"""One self-contained HTML page of measurements and their errors against ground truth."""
 
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,11 +9,12 @@ from typing import Any
 from model import store
 from model.skin import SkinAppearance
 from skinrig.appearances.dynamic import describe_parts
-from skinrig.reporting import map_images, page, provenance
+from skinrig.reporting import first_screen, map_images, page, provenance
 from skinrig.reporting import verdict as verdict_section
 from skinrig.reporting.comparison import page as comparison
 from skinrig.reporting.comparison import runs as run_comparison
 from skinrig.reporting.folders import ReportError, ReportInputs, discover, read_json
+from skinrig.reporting.map_names import map_title
 from skinrig.reporting.sections import (
     bench,
     calibration,
@@ -33,16 +34,16 @@ __all__ = ["Report", "ReportError", "build", "make"]
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A page, and what it says first."""
+    """A page and its verdict."""
 
     html: str
     checks: tuple[page.Check, ...]
     compared: tuple[str, str] | None
-    """Labels of the two runs that it compares; None: it is about one collection."""
+    """Labels of the two runs that are compared; None: the report is on one collection."""
 
     @property
     def verdict(self) -> str:
-        """Whether the checks kept their limits, in a sentence."""
+        """Number of checks that kept their limits, in a sentence."""
         return verdict_section.headline(self.checks)
 
 
@@ -68,7 +69,7 @@ def build(paths: Sequence[str | Path], *, title: str = "skinrig report") -> str:
 def make(
     paths: Sequence[str | Path], *, title: str = "skinrig report", compare: bool | None = None
 ) -> Report:
-    """Return the report on a collection, or on two runs beside each other.
+    """Return the report on a collection, or the comparison of two runs.
 
     Parameters
     ----------
@@ -82,8 +83,8 @@ def make(
     Raises
     ------
     ReportError
-        When a path does not exist, nothing is found, or a comparison is asked of what are not two
-        runs.
+        When a path does not exist, nothing is found, or a comparison is requested of paths that
+        are not two runs.
     """
     places = [Path(p) for p in paths]
     both = run_comparison.split_sides(places, require_comparison=compare)
@@ -99,31 +100,40 @@ def make(
     checks_of_all: list[page.Check] = []
     found = discover(places)
     body = sections(found, checks_of_all)
-    lead = verdict_section.section(checks_of_all, found.summary(), _list_least_certain(found))
+    lead = verdict_section.section(
+        checks_of_all, found.summary(), _list_least_certain(found), _first_screen(found)
+    )
     html = page.document(title, lead, body)
     return Report(html, tuple(checks_of_all), None)
 
 
+def _first_screen(found: ReportInputs) -> Iterator[page.Block]:
+    """Yield the images of the first screen."""
+    appearances = {name: store.read(folder) for name, folder in found.appearances.items()}
+    truths = {name: found.find_truth(appearance) for name, appearance in appearances.items()}
+    yield from first_screen.strip(appearances, truths)
+
+
 def _list_least_certain(found: ReportInputs) -> list[str]:
-    """Return what maps without a truth know least of."""
-    told = []
+    """Return the least certain maps without a ground truth, in sentences."""
+    sentences = []
     for name, folder in found.appearances.items():
         parameters: Mapping[str, Any] = store.read_document(folder).parameters
         states = parameters.get("parts", {}).get("facial_color", {}).get("truth", {})
         if not found.truths.keys() & {parameters.get("truth"), *states.values()}:
-            told += verdict_section.list_least_certain(name, store.read(folder))
-    return told
+            sentences += verdict_section.list_least_certain(name, store.read(folder))
+    return sentences
 
 
 def evaluate_checks(found: ReportInputs, checks: list[page.Check]) -> None:
-    """Judge all that was found as its report does, without what the report only shows.
+    """Add the checks of a report, without its blocks.
 
     Parameters
     ----------
     found
-        What lies at the paths of a report.
+        Contents of the paths of a report.
     checks
-        Judgements are added to it.
+        Checks are added to it.
     """
     appearances = {name: store.read(folder) for name, folder in found.appearances.items()}
     sessions = session.read_session_facts(found.sessions)
@@ -132,18 +142,18 @@ def evaluate_checks(found: ReportInputs, checks: list[page.Check]) -> None:
         _documents(found, checks),
         calibration.section(found.calibrations, appearances, sessions, checks),
     ):
-        deque(blocks, maxlen=0)  # each section judges while its blocks are made
+        deque(blocks, maxlen=0)  # each section adds its checks while its blocks are made
 
 
 def sections(found: ReportInputs, checks: list[page.Check]) -> list[page.Block]:
-    """Return the sections on all that was found, and judge it.
+    """Return the sections of a report, and add its checks.
 
     Parameters
     ----------
     found
-        What lies at the paths of a report.
+        Contents of the paths of a report.
     checks
-        Judgements are added to it.
+        Checks are added to it.
     """
     appearances = {name: store.read(folder) for name, folder in found.appearances.items()}
     sessions = session.read_session_facts(found.sessions)
@@ -189,8 +199,8 @@ def _appearance_section(subject: page.ReportedAppearance) -> Iterator[page.Block
     appearance, truth = subject.appearance, subject.truth
     yield page.Heading(f"Maps: {subject.name}", level=2)
     images = [
-        map_images.color_image(f"{label}, linear sRGB", appearance.maps[key].values)
-        for key, label in (("picture", "crossed polarizers"), ("specular_picture", "specular"))
+        map_images.color_image(f"{map_title(key)}, linear RGB", appearance.maps[key].values)
+        for key in ("picture", "specular_picture")
         if key in appearance.maps
     ]
     if images:

@@ -1,4 +1,4 @@
-"""Plots of benchmarks: error against seconds, of one and of two."""
+"""Plots of benchmarks: error against seconds, for one run and for two."""
 
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -57,10 +57,10 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     bounds = np.array([p.get("cramer_rao_bound") or np.nan for p in points], float)
     if np.isfinite(bounds).any():
         known = np.isfinite(bounds)
-        axes.plot(seconds[known], bounds[known], "_", color="0.5", ms=14, label="Cramér-Rao")
+        axes.plot(seconds[known], bounds[known], "_", color="0.5", ms=14, label="Cramér-Rao bound")
     if document.get("reference_error", 0) > 0:
         axes.axhline(
-            document["reference_error"], color="0.5", lw=0.8, ls=":", label="reference's own"
+            document["reference_error"], color="0.5", lw=0.8, ls=":", label="error of the reference"
         )
     axes.margins(x=0.25, y=0.2)
     small = document.get("size") == "small"
@@ -80,10 +80,10 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
         ],
         legend=legend,
     )
-    told = "; ".join(_summary(front, seconds, error) for front in fronts[:MAX_NAMED_FRONTS])
+    summaries = "; ".join(_summary(front, seconds, error) for front in fronts[:MAX_NAMED_FRONTS])
     alt = (
         f"{stage}: {document['error_name']}, {figures.format_range(error)}, against "
-        f"{figures.format_range(seconds)} seconds for {len(points)} settings; fronts: {told}"
+        f"{figures.format_range(seconds)} seconds for {len(points)} settings; fronts: {summaries}"
     )
     return figures.to_svg(figure, alt)
 
@@ -115,11 +115,11 @@ def _effort(
 
 
 def _summary(front: Mapping[str, Any], seconds: NDArray[Any], error: NDArray[Any]) -> str:
-    told = f"{_format_knobs(front['condition']) or 'front'}: {len(front['points'])} settings"
+    text = f"{_format_knobs(front['condition']) or 'front'}: {len(front['points'])} settings"
     bend = front["knee"]
     if bend is None:
-        return told
-    return f"{told}, knee at {seconds[bend]:.3g} s, error {error[bend]:.3g}"
+        return text
+    return f"{text}, knee at {seconds[bend]:.3g} s, error {error[bend]:.3g}"
 
 
 def _set_up_axes(axes: Any, title: str, error_name: str) -> None:
@@ -127,7 +127,7 @@ def _set_up_axes(axes: Any, title: str, error_name: str) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
     figures.format_log_axes(axes.xaxis, axes.yaxis)
-    axes.set_xlabel("seconds, warm, median")
+    axes.set_xlabel("median seconds per warm call")
     axes.set_ylabel("\n".join(textwrap.wrap(error_name, 36)))
     axes.set_title(title, fontsize=10)
 
@@ -163,7 +163,7 @@ def plot_compared_fronts(
     """
     figure, axes = figures.canvas(5.2, 3.4)
     places: list[dict[str, tuple[float, float]]] = []
-    told = []
+    summaries = []
     for number, (label, document) in enumerate((a, b)):
         points = [p for p in document["points"] if p["error"] > 0.0]
         seconds = np.array([p["seconds"] for p in points], float)
@@ -176,7 +176,7 @@ def plot_compared_fronts(
                 for p, s, e in zip(points, seconds.tolist(), error.tolist(), strict=True)
             }
         )
-        told.append(
+        summaries.append(
             f"{label}: errors {figures.format_range(error)} in {figures.format_range(seconds)}"
             f" seconds"
         )
@@ -186,4 +186,4 @@ def plot_compared_fronts(
     axes.margins(x=0.15, y=0.2)
     _set_up_axes(axes, stage, a[1]["error_name"])
     axes.legend(fontsize=7, frameon=False)
-    return figures.to_svg(figure, f"{stage}: {'; '.join(told)}")
+    return figures.to_svg(figure, f"{stage}: {'; '.join(summaries)}")

@@ -18,8 +18,17 @@ _POINT_COLUMNS = (
     "efficiency",
 )
 
-BAND_COLUMNS = ("stage", "skin", "error", "low", "high", "Cramér-Rao", "of light", "which is")
-"""Of the table of errors by band: the last but one is the error over that of the lightest band."""
+BAND_COLUMNS = (
+    "stage",
+    "skin",
+    "error",
+    "68 % low",
+    "68 % high",
+    "Cramér-Rao bound",
+    "over lightest",
+    "quantity",
+)
+"""Of the table of errors by band; "over lightest" is the error over that of the lightest band."""
 
 
 def print_tables(document: Mapping[str, Any], console: Console) -> None:

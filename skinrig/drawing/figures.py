@@ -31,7 +31,7 @@ def canvas(width_in: float, height_in: float) -> tuple[Any, Any]:
 
 
 def to_svg(figure: Any, alt: str) -> str:
-    """Return a figure as SVG text, with ``alt`` for those who do not see it."""
+    """Return a figure as SVG text, with ``alt`` as its alternative text."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     buffer = io.StringIO()
@@ -41,7 +41,7 @@ def to_svg(figure: Any, alt: str) -> str:
 
 
 def format_log_axes(*log_axes: Any) -> None:
-    """Label decades by plain numbers, and what lies between them where decades are too few."""
+    """Label decades by plain numbers, and ticks between them where decades are few."""
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
     for axis in log_axes:
@@ -83,8 +83,8 @@ def bars(
         if limits and name in limits:
             axes.axhline(limits[name], color=color, ls="--", lw=1)
         known = zip(labels, heights, strict=True)
-        told = (f"{' '.join(label.split())} {h:.3g}" for label, h in known if np.isfinite(h))
-        words.append(f"{name}: {', '.join(told)}")
+        shown = (f"{' '.join(label.split())} {h:.3g}" for label, h in known if np.isfinite(h))
+        words.append(f"{name}: {', '.join(shown)}")
     axes.set_xticks(position, labels, fontsize=8)
     _title(axes, title, y_name=unit)
     held = "".join(f"; limit of {name} {limit:.3g}" for name, limit in (limits or {}).items())
@@ -139,16 +139,16 @@ def curves(
         axes.set_yscale("log")
         format_log_axes(axes.yaxis)
     _title(axes, title, y_name, x_name)
-    told = "; ".join(
+    spans = "; ".join(
         f"{curve.name} {format_range(np.asarray(curve.y, float))} over "
         f"{format_range(np.asarray(curve.x, float))}"
         for curve in series
     )
-    return to_svg(figure, f"{title}: {y_name} against {x_name}; {told}")
+    return to_svg(figure, f"{title}: {y_name} against {x_name}; {spans}")
 
 
 def sensitivity(title: str, c_m: FloatArray, c_hd: FloatArray, percent: FloatArray) -> str:
-    """Draw the least relative standard error over melanin and hemoglobin, in percent.
+    """Draw the Cramér-Rao bound over melanin and blood volume fractions, in percent.
 
     Parameters
     ----------
@@ -182,14 +182,14 @@ def sensitivity(title: str, c_m: FloatArray, c_hd: FloatArray, percent: FloatArr
     axes.set_yticks(np.cbrt(ticks[:-1]), [f"{t:g}" for t in ticks[:-1]], fontsize=7)
     axes.set_xlim(np.cbrt(c_m[0]), np.cbrt(c_m[-1]))
     axes.set_ylim(np.cbrt(c_hd[0]), np.cbrt(c_hd[-1]))
-    axes.set_xlabel("melanin fraction C_m")
-    axes.set_ylabel("hemoglobin fraction C_hd")
+    axes.set_xlabel("melanosome volume fraction C_m")
+    axes.set_ylabel("blood volume fraction C_hd")
     axes.set_title(title, fontsize=10)
-    figure.colorbar(mesh, ax=axes, label="log10 of percent")
+    figure.colorbar(mesh, ax=axes, label="log10 of the bound in percent")
     row, column = np.unravel_index(int(np.argmin(shown)), shown.shape)
     alt = (
-        f"{title}: least relative standard error {shown[row, column]:.2g} % at melanin "
-        f"{c_m[column]:.2g}, hemoglobin {c_hd[row]:.2g}; below 10 % on "
+        f"{title}: smallest Cramér-Rao bound {shown[row, column]:.2g} % at melanin "
+        f"{c_m[column]:.2g}, blood {c_hd[row]:.2g}; below 10 % on "
         f"{100 * float(np.mean(shown < 10)):.0f} %, above 100 % on "
         f"{100 * float(np.mean(shown > 100)):.0f} % of the plane"
     )

@@ -1,4 +1,4 @@
-"""PNG images and color scales."""
+"""PNG and JPEG images, and color scales."""
 
 import base64
 import io
@@ -13,6 +13,8 @@ SCALE_CLASSES = {"viridis": "viridis", "magma": "magma", "RdBu_r": "diverging", 
 """matplotlib's color maps that maps are shown by, and what a style sheet calls them."""
 INVALID_GRAY = 128
 """Of pixels without a value."""
+MIN_SPAN = 1e-200
+"""Span of a color scale below which all values have its first color: division would overflow."""
 
 
 def encode(image: NDArray[np.generic], *, quick: bool = False) -> bytes:
@@ -61,6 +63,15 @@ def encode(image: NDArray[np.generic], *, quick: bool = False) -> bytes:
 def to_data_url(file: bytes) -> str:
     """Return a PNG file's bytes as a ``data:`` address."""
     return "data:image/png;base64," + base64.b64encode(file).decode("ascii")
+
+
+def jpeg_address(image: UInt8Array, *, quality: int = 88) -> str:
+    """Return an image, (H, W, 3), as a JPEG file in a ``data:`` address, for small previews."""
+    import cv2
+
+    stored = np.ascontiguousarray(image[..., ::-1])  # OpenCV has blue first
+    file = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+    return "data:image/jpeg;base64," + base64.b64encode(file).decode("ascii")
 
 
 def srgb8(linear: FloatArray) -> UInt8Array:
@@ -127,8 +138,8 @@ class Scale:
         values, valid
             (H, W); as for `colors`.
         levels
-            Colors of the scale, 2 to 255: the picture tells values to one part in so many of the
-            scale; its own color is for pixels without a value.
+            Colors of the scale, 2 to 255, which quantize the values; pixels without a value have a
+            color of their own.
         """
         from PIL import Image
 
@@ -147,7 +158,8 @@ class Scale:
     ) -> tuple[Float64Array, BoolArray]:
         """Return where values lie on the scale, in [0, 1], and which are shown."""
         values = np.asarray(values, np.float64)
-        span = self.high - self.low if self.high > self.low else 1.0
+        span = self.high - self.low
+        span = span if span > MIN_SPAN else 1.0
         finite = np.isfinite(values)
         position = np.clip((np.where(finite, values, self.low) - self.low) / span, 0.0, 1.0)
         return position, finite if valid is None else finite & np.asarray(valid, bool)

@@ -1,4 +1,4 @@
-"""Names of a plot's points, each where nothing else stands."""
+"""Labels of the points of a plot, placed without overlap."""
 
 import itertools
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ def name_points(
     lines: Sequence[FloatArray] = (),
     legend: Any = None,
 ) -> None:
-    """Write names beside points, each where nothing else stands; where there is no room, not.
+    """Write labels next to points, without overlap; labels without free space are omitted.
 
     Parameters
     ----------
@@ -43,8 +43,8 @@ def name_points(
 
     Notes
     -----
-    Of equal names the first stands for all that have no room. A name that is wider than the axes
-    is not written: tables and alt texts hold them all.
+    Of equal names, the first one is written where the others have no free space. A name that is
+    wider than the axes is omitted; tables and alt texts list all of them.
     """
     from matplotlib.transforms import Bbox
 

@@ -19,9 +19,9 @@ def simplify_svg(svg: str, *, alt: str) -> str:
     Parameters
     ----------
     drawn
-        What the writer wrote, with text as text.
+        Output of the writer, with text as text.
     alt
-        What the plot shows, for those who do not see it.
+        Alternative text of the plot.
 
     Returns
     -------
@@ -84,7 +84,7 @@ def _path(commands: str) -> str:
 
 
 def _own_ids(text: str) -> str:
-    """Drop ids that nothing refers to, and make the others this plot's own."""
+    """Drop ids without references, and make the others unique to this plot."""
     used = set(re.findall(r'href="#([^"]+)"|url\(#([^)]+)\)', text))
     names = sorted({one or other for one, other in used})
     prefix = "f" + hashlib.sha256(text.encode()).hexdigest()[:8]
@@ -101,15 +101,15 @@ def _own_ids(text: str) -> str:
 
 
 def _unnested(text: str) -> str:
-    """Take off groups that say nothing."""
+    """Remove groups without attributes."""
     pieces: list[str] = []
     kept: list[bool] = []
     for piece in re.split(r"(</?g\b[^>]*>)", text):
         if piece.startswith("<g"):
-            says = piece != "<g>"
+            kept_group = piece != "<g>"
             if not piece.endswith("/>"):
-                kept.append(says)
-                if says:
+                kept.append(kept_group)
+                if kept_group:
                     pieces.append(piece)
         elif piece == "</g>":
             if kept.pop():

@@ -1,4 +1,4 @@
-"""Templates of HTML pages, which hold all markup that is not a drawing."""
+"""Templates of HTML pages, with all markup except drawings."""
 
 import functools
 
@@ -6,14 +6,14 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 
 def render(name: str, **data: object) -> str:
-    """Fill a template of this package in; what is no ``Markup`` is escaped.
+    """Fill in a template of this package; values that are not ``Markup`` are escaped.
 
     Parameters
     ----------
     name
         Path inside the package, such as "viewer/page.html".
     data
-        What the template names; a name that is missing is an error.
+        Values of the names in the template; a missing name is an error.
     """
     return _environment().get_template(name).render(data)
 

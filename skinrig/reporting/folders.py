@@ -1,4 +1,4 @@
-"""What lies at the paths of a report: appearances, truths, calibrations, sessions, documents."""
+"""Contents of a report: appearances, ground truths, calibrations, sessions and documents."""
 
 import contextlib
 import json
@@ -14,12 +14,12 @@ from skinrig.reporting.sections import images as image_section
 
 
 class ReportError(ValueError):
-    """Nothing at the paths that a report could be made of."""
+    """The paths hold nothing to report."""
 
 
 @dataclass(slots=True)
 class ReportInputs:
-    """What lies at the paths of a report."""
+    """Contents of the paths of a report."""
 
     appearances: dict[str, Path] = field(default_factory=dict)
     truths: dict[str, Path] = field(default_factory=dict)
@@ -32,35 +32,35 @@ class ReportInputs:
 
     @property
     def is_empty(self) -> bool:
-        """Whether there is nothing to tell of."""
+        """Whether there is nothing to report."""
         return not (self.appearances or self.sessions or self.documents or self.pictures)
 
     def summary(self) -> str:
-        """Return what there is, in a sentence.
+        """Return the number of folders of each kind, in a sentence.
 
         Examples
         --------
-        >>> ReportInputs(sessions=[Path("one")], truths={"truth": Path("truth")}).words()
-        'About 1 truth and 1 session.'
+        >>> ReportInputs(sessions=[Path("one")], truths={"truth": Path("truth")}).summary()
+        'Contents: 1 ground truth and 1 session.'
         """
         kinds = (
             ("set of maps", "sets of maps", len(self.appearances)),
-            ("truth", "truths", len(self.truths)),
-            ("folder of pictures", "folders of pictures", len(self.pictures)),
+            ("ground truth", "ground truths", len(self.truths)),
+            ("folder of images", "folders of images", len(self.pictures)),
             ("calibration", "calibrations", len(self.calibrations)),
             ("session", "sessions", len(self.sessions)),
             ("document", "documents", len(self.documents)),
         )
-        told = [f"{n} {one if n == 1 else many}" for one, many, n in kinds if n]
+        parts = [f"{n} {one if n == 1 else many}" for one, many, n in kinds if n]
         return (
-            "About "
-            + (" and ".join([", ".join(told[:-1]), told[-1]]) if told[1:] else told[0])
+            "Contents: "
+            + (" and ".join([", ".join(parts[:-1]), parts[-1]]) if parts[1:] else parts[0])
             + "."
             + self._describe_source()
         )
 
     def _describe_source(self) -> str:
-        """Return whether people or a simulation were captured, as far as the folders say so."""
+        """Return whether people were measured, by the sources that the folders record."""
         sources = []
         for path in (*self.appearances.values(), *self.sessions):
             for name in (store.DOCUMENT_FILE, "session.json"):
@@ -70,13 +70,13 @@ class ReportInputs:
             return ""
         simulated = sources.count("simulated")
         if simulated == len(sources):
-            return " All of it is simulated: no person was measured."
+            return " All data are simulated; no person was measured."
         if simulated:
             return f" {simulated} of the {len(sources)} sets of maps and sessions are simulated."
-        return " None of it is simulated."
+        return " All data are measured."
 
     def find_truth(self, appearance: SkinAppearance) -> SkinAppearance | None:
-        """Return the truth that an appearance names, where it was found."""
+        """Return the ground truth that an appearance names, where it was found."""
         path = self.truths.get(str(appearance.parameters.get("truth", "")))
         return store.read(path) if path else None
 
@@ -109,8 +109,10 @@ def _classify_entry(entry: Path, found: ReportInputs) -> None:
     if entry.is_file() and entry.suffix == ".json" and entry.name != store.DOCUMENT_FILE:
         if (entry.parent / store.DOCUMENT_FILE).is_file():
             return  # of the appearance itself, which its section shows
+        if entry.name in image_section.DOCUMENT_FILES:
+            return  # of a folder of images, which its section shows
         if _is_of_a_calibration(entry):
-            return  # its folder's section tells all of them
+            return  # the section of its folder lists all of them
         text = entry.read_text(encoding="utf-8", errors="replace")
         if '"schema"' in text and '"skinrig.' in text and "session" not in entry.name:
             found.documents.append(entry)
@@ -128,7 +130,7 @@ def _classify_entry(entry: Path, found: ReportInputs) -> None:
 
 
 _SCHEMA_SEARCH_CHARS = 400
-"""Within which a document names its schema."""
+"""Characters searched for the schema of a document."""
 
 
 def _is_of_a_calibration(file: Path) -> bool:
@@ -147,7 +149,7 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise ReportError(f"{path}: cannot be read as JSON ({error}); write it anew") from error
+        raise ReportError(f"{path}: cannot be read as JSON ({error}); write it again") from error
     if not isinstance(document, dict) or not isinstance(document.get("schema"), str):
         raise ReportError(f'{path}: got no "schema", expected a document of a skinrig command')
     return document

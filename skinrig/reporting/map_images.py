@@ -1,6 +1,6 @@
-"""Pictures of maps for the report: what each shows is also told in numbers, as its alt text."""
+"""Images of maps for the report; the alt text of each lists its numbers."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,18 +8,20 @@ from numpy.typing import NDArray
 
 from skinrig.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 from skinrig.drawing import png
-from skinrig.reporting import page
+from skinrig.reporting import map_names, page
 from skinrig.reporting.page import number
 from skinrig.unit_format import format_quantity
 
+GRAY_LINEAR = float(png.INVALID_GRAY / 255.0) ** 2.2
+"""Linear value of the gray of pixels without a value."""
 SCALE_COLORS = 128
-"""Colors of a map's picture: it tells a value to 1/128 of its scale."""
+"""Colors of a map's image: it resolves 1/128 of its scale."""
 
 
 def shrink(image: NDArray[np.generic], width: int) -> NDArray[np.generic]:
     """Take every n-th pixel so that the image is at most ``width`` wide.
 
-    Pixels are left out, not averaged, so that noise is shown as large as it is.
+    Pixels are omitted, not averaged, so that the noise keeps its size.
     """
     step = max(1, -(-image.shape[1] // width))
     return image[step // 2 :: step, step // 2 :: step]
@@ -27,24 +29,27 @@ def shrink(image: NDArray[np.generic], width: int) -> NDArray[np.generic]:
 
 @dataclass(frozen=True, slots=True)
 class MapDrawing:
-    """How pictures of values on one map's pixels are drawn.
+    """How images of values on the pixels of one map are drawn.
 
     Attributes
     ----------
     of
-        What they are of, for the alt texts: a title alone rarely says it.
+        Quantity, for the alt texts.
     unit
-        Of values.
+        Unit of the values.
     valid
         (H, W); other pixels are gray.
     width
-        Pixels across; larger maps are thinned out.
+        Pixels across; larger maps are subsampled.
+    lossy
+        Store colors as JPEG, for previews of images that the page holds in full.
     """
 
     of: str = ""
     unit: str = ""
     valid: BoolArray | None = None
     width: int = 280
+    lossy: bool = False
 
     def draw_scalar(
         self, title: str, values: FloatArray, low: float, high: float, scale: str = "viridis"
@@ -58,12 +63,12 @@ class MapDrawing:
         data = png.Scale(low, high, scale).encode(small, mask, levels=SCALE_COLORS)
         named = f"{self.of}, {title}" if self.of else title
         scale_words = f"color scale {number(low)} to {format_quantity(number(high), self.unit)}"
-        alt = f"{named}: {_describe_values(small, mask, self.unit)}; {scale_words}"
+        alt = f"{named}: {_summary(small, mask, self.unit)}; {scale_words}"
         bar = page.ColorScale(png.SCALE_CLASSES[scale], number(low), number(high), self.unit)
-        return _build_image(title, data, alt, small.shape, bar)
+        return _build_image(title, png.to_data_url(data), alt, small.shape, bar)
 
     def size(self, title: str, values: FloatArray, reach: float) -> page.Image:
-        """Return an image of values from 0 on, such as errors and standard errors."""
+        """Return an image of values from 0 on, such as sizes of errors and uncertainties."""
         return self.draw_scalar(title, values, 0.0, reach, "magma")
 
     def draw_signed(self, title: str, values: FloatArray, reach: float) -> page.Image:
@@ -84,52 +89,66 @@ class MapDrawing:
             tilt = np.degrees(np.arccos(np.clip(small[mask][:, 2] / np.fmax(length, 1e-9), -1, 1)))
             alt += f"; median tilt from the view {number(float(np.median(tilt)))}°"
         return _build_image(
-            title, png.encode(image), alt + _describe_missing(mask), image.shape[:2]
+            title, _address(image, self.lossy), alt + _describe_missing(mask), image.shape[:2]
         )
 
 
 def _describe_missing(mask: BoolArray) -> str:
-    """Return how much of a picture has no value, in words; nothing where that is next to none."""
+    """Return the masked fraction of an image in words; empty below half a percent."""
     missing = 1.0 - mask.mean()
-    return f", {100 * missing:.0f} % without a value" if missing >= 0.005 else ""
+    return f", {100 * missing:.0f} % masked" if missing >= 0.005 else ""
 
 
-def _describe_values(values: Float64Array, mask: BoolArray | None, unit: str) -> str:
-    """Return a map's median, its middle 90 %, and how much of it has no value."""
+def _summary(values: Float64Array, mask: BoolArray | None, unit: str) -> str:
+    """Return the median of a map, its middle 90 % and its masked fraction."""
     shown = np.isfinite(values) if mask is None else mask & np.isfinite(values)
     if not shown.any():
-        return "no pixel has a value"
+        return "all pixels are masked"
     low, median, high = np.percentile(values[shown], [5, 50, 95])
     within = f"90 % of pixels within {number(low)} to {number(high)}"
     return f"median {format_quantity(number(median), unit)}, {within}{_describe_missing(shown)}"
 
 
-def color_image(title: str, linear: FloatArray, *, width: int = 320, of: str = "") -> page.Image:
-    """Return a linear sRGB image, (H, W, 3), for the page."""
+def color_image(
+    title: str, linear: FloatArray, *, width: int = 320, of: str = "", lossy: bool = False
+) -> page.Image:
+    """Return a linear sRGB image, (H, W, 3), for the page; ``lossy``: as JPEG."""
     small = shrink(np.asarray(linear), width).astype(float)
     finite = np.isfinite(small).all(axis=2)
-    seen = ""
+    level = ""
     if finite.any():
         middle = np.median(small[finite], axis=0)
-        seen = f": median linear red, green, blue {', '.join(number(float(v)) for v in middle)}"
-    return plain_image(title, png.srgb8(small), alt=(f"{of}, {title}" if of else title) + seen)
+        level = f": median linear red, green, blue {', '.join(number(float(v)) for v in middle)}"
+    alt = (f"{of}, {title}" if of else title) + level
+    return _build_image(title, _address(png.srgb8(small), lossy), alt, small.shape[:2])
 
 
 def plain_image(title: str, image: UInt8Array, *, alt: str = "") -> page.Image:
     """Return an 8-bit image, (H, W) or (H, W, 3), for the page as it is."""
-    return _build_image(title, png.encode(image), alt or title, image.shape[:2])
+    return _build_image(title, _address(image), alt or title, image.shape[:2])
+
+
+def _address(image: UInt8Array, lossy: bool = False) -> str:
+    return png.jpeg_address(image) if lossy else png.to_data_url(png.encode(image))
 
 
 def _build_image(
-    title: str, data: bytes, alt: str, shape: tuple[int, ...], scale: page.ColorScale | None = None
+    title: str, address: str, alt: str, shape: tuple[int, ...], scale: page.ColorScale | None = None
 ) -> page.Image:
-    return page.Image(title, png.to_data_url(data), alt, (shape[1], shape[0]), scale)
+    return page.Image(title, address, alt, (shape[1], shape[0]), scale)
 
 
 def percentile_reach(values: FloatArray, mask: BoolArray, percentile: float) -> float:
-    """Return how far a color scale must reach for that percentage of shown |values|."""
+    """Return that percentile of the shown |values|, as the end of a color scale."""
     inside = np.abs(values[mask & np.isfinite(values)])
     return float(np.percentile(inside, percentile)) if inside.size else 1.0
+
+
+def shared_range(maps: Sequence[FloatArray]) -> tuple[float, float]:
+    """Return the 1st and 99th percentile of all finite values of several maps."""
+    joined = np.concatenate([one[np.isfinite(one)] for one in maps])
+    low, high = np.percentile(joined, [1, 99]).tolist() if joined.size else (0.0, 1.0)
+    return low, high
 
 
 def map_panel(
@@ -140,34 +159,33 @@ def map_panel(
     standard_error: FloatArray | None = None,
     truth: FloatArray | None = None,
     valid: BoolArray | None = None,
+    uncertainty: str = map_names.STANDARD_UNCERTAINTY,
 ) -> Iterator[page.Block]:
-    """Yield truth | estimate | error | standard error of a map, truth and estimate to one scale.
+    """Yield ground truth | estimate | error | uncertainty; the first two share a color scale.
 
     Parameters
     ----------
     name, unit
         Of the map, for headings and scales.
     estimate, standard_error, truth
-        (H, W); what is None is left out of the row.
+        (H, W); None is omitted from the row.
     valid
         (H, W); other pixels are gray.
+    uncertainty
+        Label of the standard error.
     """
     mask = np.isfinite(estimate) if valid is None else np.asarray(valid, bool)
-    of_scale = [estimate[mask & np.isfinite(estimate)]]
-    if truth is not None:
-        of_scale.append(truth[mask & np.isfinite(truth)])
-    joined = np.concatenate(of_scale)
-    low, high = np.percentile(joined, [1, 99]) if joined.size else (0.0, 1.0)
+    low, high = shared_range([one[mask] for one in (estimate, truth) if one is not None])
     shown = MapDrawing(name, unit, mask)
     parts = [shown.draw_scalar("estimate", estimate, low, high)]
     if truth is not None:
         error = estimate - truth
-        parts.insert(0, shown.draw_scalar("truth", truth, low, high))
+        parts.insert(0, shown.draw_scalar("ground truth", truth, low, high))
         parts.append(
-            shown.draw_signed("estimate − truth", error, percentile_reach(error, mask, 98))
+            shown.draw_signed("estimate − ground truth", error, percentile_reach(error, mask, 98))
         )
     if standard_error is not None:
         reach = percentile_reach(standard_error, mask, 98)
-        parts.append(shown.size("standard error", standard_error, reach))
+        parts.append(shown.size(uncertainty, standard_error, reach))
     yield page.Heading(name)
     yield page.Images(parts)

@@ -1,4 +1,4 @@
-"""What maps, states of skin and bands are called where people read of them."""
+"""Labels of maps, strain steps and melanin bands in reports."""
 
 import re
 from collections.abc import Iterator
@@ -11,36 +11,42 @@ from skinrig.evaluating.flash import MELANIN_RANGES
 
 MAP_WORDS: Final = {
     "r_d": "diffuse reflectance R_d",
-    "normals_refined": "normals without gloss",
-    "half_vector_normals": "normals by half vectors",
-    "lobe_residual": "residual of the lobes",
-    "samples": "samples of a point",
-    "gamut_distance": "distance from colors of skin",
-    "tsumura_melanin": "melanin by independent components",
-    "tsumura_hemoglobin": "hemoglobin by independent components",
-    "specular_picture": "picture of gloss",
+    "melanin": "melanosome volume fraction",
+    "hemoglobin": "blood volume fraction",
+    "normals_refined": "normals, specular removed",
+    "half_vector_normals": "half-vector normals",
+    "lobe_residual": "residual of the basis BRDFs",
+    "samples": "samples per point",
+    "gamut_distance": "distance from the gamut of skin",
+    "translucency": "diffuse mean free path",
+    "tsumura_melanin": "melanin, independent components",
+    "tsumura_hemoglobin": "hemoglobin, independent components",
+    "picture": "captured image",
+    "specular_picture": "specular image",
 }
-"""Names in files to words; what is not here is a word already."""
+"""Labels by the name in files; other names are labels already."""
 MIN_BAND_PIXELS: Final = 20
-"""Of a melanin band that is told."""
+"""Pixels below which a melanin band is omitted."""
+CREDIBLE_HALF_WIDTH: Final = "68 % credible half-width"
+STANDARD_UNCERTAINTY: Final = "standard uncertainty"
 _STATE_NAME: Final = re.compile(r"(?P<map>[a-z_]+)_(?P<state>a\d+_[nmp]\d+)")
-_NUMBERED_PREFIXES: Final = {"basis_weight_": "share of lobe "}
+_NUMBERED_PREFIXES: Final = {"basis_weight_": "weight of basis BRDF "}
 _PART_PREFIXES: Final = {
-    "change_": "change of hemoglobin, ",
-    "hemoglobin_": "hemoglobin, ",
-    "microrelief_": "microrelief, ",
+    "change_": "change of blood volume fraction, ",
+    "hemoglobin_": "blood volume fraction, ",
+    "microrelief_": "surface topography, ",
 }
 
 
 def map_title(name: str) -> str:
-    """Return a map's name, with or without a channel, as people read it.
+    """Return the label of a map, with its channel where one is given.
 
     Examples
     --------
-    >>> map_title("r_d"), map_title("r_d red"), map_title("basis_weight_2"), map_title("melanin")
-    ('diffuse reflectance R_d', 'diffuse reflectance R_d, red', 'share of lobe 2', 'melanin')
+    >>> map_title("r_d red"), map_title("basis_weight_2")
+    ('diffuse reflectance R_d, red', 'weight of basis BRDF 2')
     >>> map_title("diffuse_normals_a045_m2"), map_title("hemoglobin_anger")
-    ('diffuse normals, 45°, compressed 2', 'hemoglobin, anger')
+    ('diffuse normals, 45°, compressed 2', 'blood volume fraction, anger')
     """
     key, _, channel = name.partition(" ")
     if channel:
@@ -49,26 +55,38 @@ def map_title(name: str) -> str:
         return MAP_WORDS[key]
     if found := _STATE_NAME.fullmatch(key):
         return f"{found['map'].replace('_', ' ')}, {state_title(found['state'])}"
-    for head, told in (_NUMBERED_PREFIXES | _PART_PREFIXES).items():
+    for head, label in (_NUMBERED_PREFIXES | _PART_PREFIXES).items():
         if key.startswith(head):
-            return told + key.removeprefix(head).replace("_", " ")
+            return label + key.removeprefix(head).replace("_", " ")
     return key.replace("_", " ")
 
 
 def map_heading(name: str) -> str:
-    """Return a map's name in words, with the name of its file where that is another.
+    """Return the label of a map, followed by the name of its file where that differs.
 
     Examples
     --------
-    >>> map_heading("r_d"), map_heading("melanin")
-    ('diffuse reflectance R_d (r_d)', 'melanin')
+    >>> map_heading("r_d"), map_heading("shading")
+    ('diffuse reflectance R_d (r_d)', 'shading')
     """
-    told = map_title(name)
-    return told if told == name else f"{told} ({name})"
+    label = map_title(name)
+    return label if label == name else f"{label} ({name})"
+
+
+def uncertainty(name: str) -> str:
+    """Return the label of a map's uncertainty: chromophores have a posterior.
+
+    Examples
+    --------
+    >>> uncertainty("melanin"), uncertainty("normals")
+    ('68 % credible half-width', 'standard uncertainty')
+    """
+    posterior = name.startswith(("melanin", "hemoglobin"))
+    return CREDIBLE_HALF_WIDTH if posterior else STANDARD_UNCERTAINTY
 
 
 def state_title(state: str) -> str:
-    """Return a state's name in words.
+    """Return the label of a strain step.
 
     Examples
     --------
@@ -81,7 +99,7 @@ def state_title(state: str) -> str:
 
 
 def split_melanin_bands(levels: FloatArray, valid: BoolArray) -> Iterator[tuple[str, BoolArray]]:
-    """Yield the bands of melanin that hold enough good pixels: name, and pixels, (H, W)."""
+    """Yield name and pixels, (H, W), of the melanin bands with enough valid pixels."""
     for low, high in MELANIN_RANGES:
         inside = valid & (levels >= low) & (levels < high)
         if np.count_nonzero(inside) >= MIN_BAND_PIXELS:
@@ -89,7 +107,7 @@ def split_melanin_bands(levels: FloatArray, valid: BoolArray) -> Iterator[tuple[
 
 
 def melanin_band(low: float, high: float) -> str:
-    """Return a band of the melanin fraction C_m, the volume fraction of the epidermis.
+    """Return the label of a band of the melanosome volume fraction C_m.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The pieces of the report page: checks, blocks that templates draw, the page itself."""
+"""Parts of the report page: checks, blocks drawn by templates, and the page itself."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ Row = TypeVar("Row")
 
 PAGE_STYLE = resources.files("skinrig").joinpath("data/report.css").read_text(encoding="utf-8")
 MAX_UNBROKEN_CHARS = 22
-"""Characters up to which a cell's text is not broken over lines."""
+"""Characters up to which the text of a cell is kept on one line."""
 BAR_STOPS = 17
-"""Colors that a scale's bar runs through; between them it is straight in sRGB."""
+"""Colors of the bar of a color scale; linear in sRGB between them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One promise, what was measured, and whether it was kept."""
+    """One limit and the measured value."""
 
     name: str
     got: float
@@ -39,22 +39,22 @@ class Check:
     unit: str = ""
     note: str = ""
     masked: float = float("nan")
-    """Share of what was to be measured that has no estimate; NaN: does not apply."""
+    """Fraction of pixels without an estimate; NaN: does not apply."""
     coverage: float = float("nan")
-    """Share of truths inside the 68 % intervals; NaN: not told."""
+    """Coverage of the 68 % intervals; NaN: unknown."""
     worst: str = ""
-    """Where it is worst, in words: a melanin band, a state, a channel."""
+    """Group with the largest error, in words: a melanin band, a strain step, a channel."""
     worst_got: float = float("nan")
-    """As large as it surely is there, in ``unit``; NaN where that is no number like ``got``."""
+    """Lower bound of the error in that group, in ``unit``; NaN where it is not comparable."""
 
     @property
     def passed(self) -> bool:
-        """Whether ``got`` keeps to ``bound``; NaN does not."""
+        """Whether ``got`` keeps ``bound``; NaN does not."""
         return self.got <= self.bound if self.sense == "<=" else self.got >= self.bound
 
     @property
     def used(self) -> float:
-        """Share of the limit that is used up: above 1 it is missed; NaN where it has no sense."""
+        """Measured value over the limit, above 1 where it is missed; NaN for lower limits."""
         if self.sense == ">=" or not self.bound > 0.0:
             return float("nan")
         return self.got / self.bound
@@ -62,31 +62,31 @@ class Check:
 
 @dataclass(frozen=True, slots=True)
 class ReportedAppearance:
-    """An appearance that a section tells of and judges."""
+    """An appearance with its ground truth and checks."""
 
     name: str
     appearance: SkinAppearance
     truth: SkinAppearance | None
     checks: list[Check]
-    """Judgements are added to it."""
+    """Sections append their checks."""
 
     def check(
         self, quantity: str, got: float, bound: float, unit: str = "", note: str = "", **more: Any
     ) -> None:
-        """Judge that a number stays within its limit."""
+        """Add the check of a number against its upper limit."""
         self.checks.append(Check(f"{self.name}: {quantity}", got, bound, "<=", unit, note, **more))
 
     def check_fraction(
         self, quantity: str, got: float, bound: float, note: str = "", **more: Any
     ) -> None:
-        """Judge that a share stays within its limit, both told in percent."""
+        """Add the check of a fraction against its upper limit, both in percent."""
         self.check(quantity, 100 * got, 100 * bound, "%", note, **more)
 
 
 def find_worst(rows: Iterable[Row], size: Callable[[Row], float]) -> Row | None:
     """Return the row of the largest finite size, where there are several."""
-    told = [row for row in rows if math.isfinite(size(row))]
-    return max(told, key=size) if len(told) > 1 else None
+    finite = [row for row in rows if math.isfinite(size(row))]
+    return max(finite, key=size) if len(finite) > 1 else None
 
 
 class Block:
@@ -168,7 +168,7 @@ class Image:
 
 @dataclass(frozen=True, slots=True)
 class Images(Block):
-    """Images side by side."""
+    """A row of images."""
 
     images: Sequence[Image]
     small: bool = False
@@ -176,7 +176,7 @@ class Images(Block):
 
 @dataclass(frozen=True, slots=True)
 class Plots(Block):
-    """SVG drawings side by side."""
+    """A row of SVG drawings."""
 
     drawings: Sequence[str]
 
@@ -191,7 +191,7 @@ class Folded(Block):
 
 @dataclass(frozen=True, slots=True)
 class View(Block):
-    """What a section found, laid out by a template of its own."""
+    """Results of a section, laid out by a template of its own."""
 
     template: str
     """Its name below ``reporting/templates``, without suffix."""
@@ -199,7 +199,7 @@ class View(Block):
 
     @property
     def html(self) -> Markup:
-        """The filled template, which writes tables by `table` and names by `map_names`."""
+        """The filled template; it writes tables by `table` and labels by `map_names`."""
         helpers: dict[str, Any] = {
             "as_table": table,
             "cell": Cell,
@@ -235,7 +235,7 @@ def number(value: float) -> str:
 
 
 def short_unit(unit: str) -> str:
-    """Return a unit as tables and scales have room for; none where it is a plain number.
+    """Return a short unit for tables and scales; empty for a plain number.
 
     Examples
     --------
@@ -260,7 +260,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]], *, caption: str
     rows
         Cells; the first of each row names it.
     caption
-        What the table tells.
+        Caption of the table.
     """
 
     def cell(value: object, first: bool) -> Cell:
@@ -284,17 +284,17 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]], *, caption: str
 
 def facts(values: Mapping[str, object], *, caption: str) -> Table:
     """Return a two-column table of names and values."""
-    return table(("what", "value"), list(values.items()), caption=caption)
+    return table(("quantity", "value"), list(values.items()), caption=caption)
 
 
 def assumptions(texts: Iterable[str]) -> Table:
-    """Return the table of what was taken for granted."""
+    """Return the table of assumptions."""
     rows = [[text] for text in texts]
-    return table(("assumption",), rows, caption="Taken for granted, not measured")
+    return table(("assumption",), rows, caption="Assumed, not measured")
 
 
 def view(template: str, **data: Any) -> View:
-    """Return what a section found, to be laid out by a template."""
+    """Return the results of a section, to be laid out by a template."""
     return View(template, data)
 
 
@@ -304,15 +304,15 @@ def note(text: str) -> Paragraph:
 
 
 def single_subject_note(parameters: Mapping[str, object]) -> Paragraph:
-    """Return a remark on whom errors are of, where a session holds one subject and has no bands.
+    """Return a remark on the subject, where a session holds one and has no bands.
 
     Examples
     --------
     >>> single_subject_note({"preset": "III"}).text
-    'Errors are of one subject, III: there are no bands to tell apart.'
+    'All errors are for one subject, III; the session has no melanin bands.'
     """
     subject = next((f", {parameters[k]}" for k in ("subject", "preset") if parameters.get(k)), "")
-    return note(f"Errors are of one subject{subject}: there are no bands to tell apart.")
+    return note(f"All errors are for one subject{subject}; the session has no melanin bands.")
 
 
 def fragment(blocks: Iterable[Block]) -> str:
@@ -326,11 +326,11 @@ def document(title: str, lead: Iterable[Block], sections: Iterable[Block]) -> st
     Parameters
     ----------
     title
-        Of the page.
+        Title of the page.
     lead
-        What stands first: the verdict.
+        First blocks: verdict and images.
     sections
-        The rest, below the contents.
+        Blocks below the contents.
     """
     style = PAGE_STYLE + _bars()
     digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii")
@@ -377,7 +377,7 @@ def _anchor(heading: str, taken: set[str]) -> str:
 
 
 def _bars() -> str:
-    """Return the style of the color scales' bars, of the same colors as the pictures."""
+    """Return the style of the color bars, with the colors of the images."""
     rules = []
     for scale, name in png.SCALE_CLASSES.items():
         stops = ",".join("#" + bytes(rgb).hex() for rgb in png.palette(scale, BAR_STOPS))

@@ -1,4 +1,4 @@
-"""What a map was made of, by what, with which settings, and what was left out: as tables."""
+"""Tables of inputs, versions, parameters, assumptions and omitted stages of a map."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,32 +37,34 @@ def flatten_settings(values: Mapping[str, Any], prefix: str = "") -> dict[str, s
 
 
 def section(appearance: SkinAppearance) -> Iterator[page.Block]:
-    """Yield what was assumed and left out, and where an appearance comes from."""
+    """Yield assumptions, omitted stages and provenance of an appearance."""
     assumed = appearance.parameters.get("assumed")
     if isinstance(assumed, (list, tuple)) and assumed:
-        yield page.Heading("Assumed")
+        yield page.Heading("Assumptions")
         yield page.assumptions(assumed)
     if appearance.left_out:
-        yield page.Heading("Left out")
-        yield page.table(("what", "why"), appearance.left_out, caption="Stages that were not run")
-    yield page.Heading("Provenance")
-    yield page.facts(
+        yield page.Heading("Omitted stages")
+        yield page.table(
+            ("stage", "reason"), appearance.left_out, caption="Stages that were not run"
+        )
+    origin = page.facts(
         {"source": appearance.source, "seed": str(appearance.seed)}
         | {f"input {k}": shorten_digest(v) for k, v in sorted(appearance.inputs.items())}
         | {f"version of {k}": v for k, v in sorted(appearance.versions.items())},
-        caption=f"Inputs by the first {DIGEST_CHARS} digits of their SHA-256",
+        caption=f"Inputs, by the first {DIGEST_CHARS} digits of their SHA-256",
     )
     settings = {
         name: value
         for name, value in flatten_settings(appearance.parameters).items()
         if not name.startswith(("stages.", "assumed"))
     }
-    told = page.facts(settings, caption="Parameters that the folder records")
-    yield page.Folded(f"{len(settings)} parameters", [told])
+    listed = page.facts(settings, caption="Parameters recorded in the folder")
+    title = f"Provenance: inputs, versions and {len(settings)} parameters"
+    yield page.Folded(title, [origin, listed])
 
 
 def shorten_digest(digest: str) -> str:
-    """Return the beginning of a digest, which tells two apart.
+    """Return the first characters of a digest.
 
     Examples
     --------
@@ -91,12 +93,12 @@ def read_consent_records(found: ReportInputs) -> Iterator[tuple[Path, dict[str, 
 
 
 def consent_section(sides: Sequence[ReportInputs]) -> Iterator[page.Block]:
-    """Yield the table of subjects and what they agreed to; empty where nobody was measured.
+    """Yield the table of subjects and their consent; empty where nobody was measured.
 
     Parameters
     ----------
     sides
-        What a report is about; of a comparison, both runs.
+        Contents of the report; of a comparison, of both runs.
     """
     rows: dict[str, list[str]] = {}
     for found in sides:
@@ -113,7 +115,7 @@ def consent_section(sides: Sequence[ReportInputs]) -> Iterator[page.Block]:
     ]
     yield page.Heading("Consent", level=2)
     yield page.table(
-        ("subject", "agreed to", "shown from"),
+        ("subject", "consent", "folders shown"),
         table,
-        caption="This report shows these people: hand it on for nothing else, and not after",
+        caption="This report shows these people; use it within their consent only",
     )

@@ -1,201 +1,214 @@
-"""What a report says first: did it work, how good is it, and where is it bad."""
+"""Verdict of a report: checks kept, largest errors, and uncertainties without ground truth."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
 from model.skin import SkinAppearance, SkinMap
 from skinrig.reporting import page
-from skinrig.reporting.map_names import map_title, split_melanin_bands
+from skinrig.reporting.map_names import map_title, split_melanin_bands, uncertainty
 from skinrig.unit_format import format_quantity
 
+MAX_NAME_WORDS = 9
+"""Words of a check's name up to which the verdict names it: the sentence has 25 at most."""
 MAX_NAMED_CLOSE = 3
-"""Checks named that come closest to their limit."""
+"""Checks closest to their limit that are named."""
 MAX_NAMED_MISSED = 8
 MIN_COVERAGE, MAX_COVERAGE = 0.5, 0.9
-"""Share of truths inside 68 % intervals beyond which intervals are called too small or large."""
+"""Coverage of 68 % intervals outside which they are called too narrow or too wide."""
 MAX_UNREMARKED_MASK = 0.2
-"""Share of pixels without a value that is worth a sentence."""
+"""Masked fraction of pixels above which a sentence names the map."""
 
 
 def headline(checks: Sequence[page.Check]) -> str:
-    """Return the verdict as one sentence.
+    """Return the verdict as one sentence, with the check that is closest to its limit.
 
     Examples
     --------
     >>> headline([])
-    'No limit was checked: there is no truth and no benchmark here.'
+    'No limit was checked: none applies to these results.'
     >>> headline([page.Check("error", 2.0, 1.0, "<=")])
     '1 of 1 checks missed its limit.'
     >>> headline([page.Check("error", 0.5, 1.0, "<=")])
     'The only check kept its limit.'
+    >>> headline([page.Check("red", 0.5, 1.0, "<="), page.Check("blue", 2.0, 1.0, "<=")])
+    '1 of 2 checks missed its limit; the worst is blue, at 200 % of its limit.'
     """
     missed = sum(not check.passed for check in checks)
     if not checks:
-        return "No limit was checked: there is no truth and no benchmark here."
+        return "No limit was checked: none applies to these results."
     if missed:
         whose = "its" if missed == 1 else "their"
-        return f"{missed} of {len(checks)} checks missed {whose} limit."
-    if len(checks) == 1:
-        return "The only check kept its limit."
-    return f"All {len(checks)} checks kept their limits."
+        verdict = f"{missed} of {len(checks)} checks missed {whose} limit"
+    elif len(checks) == 1:
+        verdict = "The only check kept its limit"
+    else:
+        count = "Both" if len(checks) == 2 else f"All {len(checks)}"
+        verdict = f"{count} checks kept their limits"
+    return f"{verdict}{_largest(checks)}."
+
+
+def _largest(checks: Sequence[page.Check]) -> str:
+    """Return the check that uses the largest fraction of its limit, as a clause."""
+    known = [check for check in checks if np.isfinite(check.used)]
+    if not known or len(checks) == 1:
+        return ""
+    worst = max(known, key=lambda check: check.used)
+    if len(worst.name.split()) > MAX_NAME_WORDS:
+        return ""
+    word = "closest" if worst.passed else "worst"
+    return f"; the {word} is {worst.name}, at {100 * worst.used:.0f} % of its limit"
 
 
 def section(
-    checks: Sequence[page.Check], subject: str = "", unjudged: Sequence[str] = ()
+    checks: Sequence[page.Check],
+    subject: str = "",
+    unjudged: Sequence[str] = (),
+    images: Iterable[page.Block] = (),
 ) -> Iterator[page.Block]:
-    """Yield the verdict, where it is worst, and all checks.
+    """Yield the verdict, the images of the first screen, the weakest results and all checks.
 
     Parameters
     ----------
     checks
-        All there are.
+        Checks of the report.
     about
-        Of what, as text.
+        Contents of the report, as text.
     unjudged
-        What maps without a truth know least of, in sentences.
+        Least certain maps without a ground truth, in sentences.
+    images
+        Blocks between the verdict and the rest.
     """
     kind = "bad" if any(not check.passed for check in checks) else "good"
     yield page.Paragraph(headline(checks), f"verdict {kind if checks else ''}")
+    yield from images
     if subject:
         yield page.Paragraph(subject)
     weak = weaknesses(checks)
     if weak:
-        yield page.Heading("Where it is worst", level=2)
-        yield page.Bullets(weak)
-    if unjudged:
-        yield page.Heading("Without a truth: least known", level=2)
-        yield page.note(
-            "By their own standard errors; how far they are from the truth is not known."
+        yield page.Heading("Where errors are largest", level=2)
+        yield page.table(
+            ("finding", "check", "measured", "limit", "largest for"),
+            [[cell.replace(" %", "\N{NO-BREAK SPACE}%") for cell in row] for row in weak],
+            caption="Missed limits, checks close to their limit, and unusual coverage or masks",
         )
+    if unjudged:
+        yield page.Heading("Largest uncertainties of maps without ground truth", level=2)
+        yield page.note("Uncertainties are the estimates' own; their errors are unknown.")
         yield page.Bullets(unjudged)
     if checks:
         yield page.Heading("Checks", level=2)
         yield page.checks_table(checks)
 
 
-def weaknesses(checks: Sequence[page.Check]) -> list[str]:
-    """Return what a reader should look at first, in sentences.
+def weaknesses(checks: Sequence[page.Check]) -> list[tuple[str, str, str, str, str]]:
+    """Return the weakest results: finding, check, measured value, limit, group of largest error.
 
-    Missed limits; skin or states whose own error lies beyond the limit that the whole keeps; what
-    comes closest to its limit; intervals that hold far too few or too many truths; maps with many
-    pixels that have no value.
+    Missed limits; checks with one skin band or strain step above the limit of the whole; the
+    checks closest to their limits; intervals with too small or too large coverage; maps with many
+    masked pixels.
 
     Examples
     --------
     >>> one = page.Check("melanin", 9.0, 10.0, "<=", "%", coverage=0.4, worst="dark: 40 %")
-    >>> for text in weaknesses([one]): print(text)
-    closest to its limit: melanin, 9 % of at most 10 % (90 % of it used); worst at dark: 40 %
-    intervals too small: melanin, 40 % of truths lie inside the 68 % intervals
+    >>> for row in weaknesses([one]): print(row)
+    ('close to its limit', 'melanin', '9 %', '≤ 10 %', 'dark: 40 %')
+    ('68 % intervals too narrow', 'melanin', 'coverage 40 %', '', '')
     """
     out = []
     missed = [check for check in checks if not check.passed]
     for check in missed[:MAX_NAMED_MISSED]:
-        sign = "at most" if check.sense == "<=" else "at least"
-        out.append(
-            f"missed: {check.name}, {_measured(check)}, {sign}"
-            f" {_bound(check)}{_format_worst(check)}"
-        )
+        out.append(("limit missed", *_compared(check)))
     if len(missed) > MAX_NAMED_MISSED:
-        out.append(f"missed: {len(missed) - MAX_NAMED_MISSED} more, in the table below")
-    told: set[str] = set()
+        out.append(
+            ("limit missed", f"{len(missed) - MAX_NAMED_MISSED} more, see below", "", "", "")
+        )
+    named: set[str] = set()
     for check in checks:
         beyond = check.passed and check.sense == "<=" and check.worst_got > check.bound
-        if beyond and check.worst not in told:  # channels of a map share their worst place
-            told.add(check.worst)
-            out.append(
-                f"beyond the limit of the whole: {check.name}, {check.worst} where at most "
-                f"{_bound(check)} is allowed over all, and {_measured(check)} found"
-            )
+        if beyond and check.worst not in named:  # channels of a map share their group
+            named.add(check.worst)
+            out.append(("one group above the limit", *_compared(check)))
     close = sorted(
         (check for check in checks if check.passed and np.isfinite(check.used)),
         key=lambda check: -check.used,
     )
     for check in close[:MAX_NAMED_CLOSE]:
-        out.append(
-            f"closest to its limit: {check.name}, {_measured(check)} of at most {_bound(check)} "
-            f"({100 * check.used:.0f} % of it used){_format_worst(check)}"
-        )
+        out.append(("close to its limit", *_compared(check)))
     for check in checks:
+        share = f"coverage {100 * check.coverage:.0f} %"
         if check.coverage < MIN_COVERAGE:
-            out.append(f"intervals too small: {_format_coverage(check)}")
+            out.append(("68 % intervals too narrow", check.name, share, "", ""))
         elif check.coverage > MAX_COVERAGE:
-            out.append(f"intervals too large: {_format_coverage(check)}")
+            out.append(("68 % intervals too wide", check.name, share, "", ""))
     for check in checks:
         if check.masked > MAX_UNREMARKED_MASK:
-            of_what = check.name.rsplit(",", 1)[0]  # without what is measured, such as the median
-            out.append(f"masked: {of_what}: {100 * check.masked:.0f} % of pixels have no value")
+            of_what = check.name.rsplit(",", 1)[0]  # without the statistic, such as the median
+            out.append(("many masked pixels", of_what, f"{100 * check.masked:.0f} %", "", ""))
     return out
 
 
-def _measured(check: page.Check) -> str:
-    return format_quantity(page.number(check.got), check.unit)
-
-
-def _bound(check: page.Check) -> str:
-    return format_quantity(page.number(check.bound), check.unit)
-
-
-def _format_worst(check: page.Check) -> str:
-    return f"; worst at {check.worst}" if check.worst else ""
-
-
-def _format_coverage(check: page.Check) -> str:
-    return f"{check.name}, {100 * check.coverage:.0f} % of truths lie inside the 68 % intervals"
+def _compared(check: page.Check) -> tuple[str, str, str, str]:
+    """Return name, measured value, limit, and the group with the largest error."""
+    sign = "≤" if check.sense == "<=" else "≥"
+    measured, bound = (
+        format_quantity(page.number(one), check.unit) for one in (check.got, check.bound)
+    )
+    return check.name, measured, f"{sign} {bound}", check.worst
 
 
 RESIDUAL_WORDS = ("residual", "misfit", "gamut_distance")
-"""Words in the names of maps that tell how badly a model fits."""
+"""Words in the names of maps of model misfit."""
 BANDED_MAPS = ("melanin", "hemoglobin")
 
 
 MAX_NAMED_MAPS = 3
-"""Maps of an appearance that are named first: those that know least."""
+"""Maps of an appearance that are named first: the least certain."""
 
 
 def list_least_certain(name: str, appearance: SkinAppearance) -> list[str]:
-    """Return what an appearance without a truth knows least of, by its own standard errors.
+    """Return the maps with the largest uncertainties, in sentences.
 
     Parameters
     ----------
     name
-        Of the appearance.
+        Name of the appearance.
     appearance
-        Its maps; those without standard errors say nothing.
+        Its maps; those without uncertainties are omitted.
 
     Examples
     --------
     >>> thickness = SkinMap(np.full((2, 2), 2.0), "mm", np.full((2, 2), 0.1))
     >>> list_least_certain("cheek", SkinAppearance({"thickness": thickness}, "measured"))
-    ['cheek: thickness, median standard error 5 % of its value']
+    ['cheek: thickness, median standard uncertainty 5 % of its value']
     """
-    told: list[tuple[float, str]] = []
+    relative: list[tuple[float, str]] = []
     angles: list[tuple[float, str]] = []
     for key, one in sorted(appearance.maps.items()):
         row = _relative_stderr(key, one) if one.stderr is not None else None
         if row is None:
             continue
         share = float(str(row[2]))
-        of = f"{name}: {map_title(key)}, median standard error"
-        missing = f", {100 - share:.0f} % of pixels without a value" if share < 99.5 else ""
+        of = f"{name}: {map_title(key)}, median {uncertainty(key)}"
+        missing = f", {100 - share:.0f} % of pixels masked" if share < 99.5 else ""
         if row[1] == "°":
             angle = float(str(row[4]))
             text = f"{of} {page.number(angle)}°"
             angles.append((angle, text + missing))
         elif np.isfinite(percent := float(str(row[5]))):
             text = f"{of} {page.number(percent)} % of its value"
-            told.append((percent, text + missing))
-    first = sorted(told, reverse=True)[:MAX_NAMED_MAPS] + sorted(angles, reverse=True)[:1]
+            relative.append((percent, text + missing))
+    first = sorted(relative, reverse=True)[:MAX_NAMED_MAPS] + sorted(angles, reverse=True)[:1]
     return [text for _, text in first]
 
 
 def uncertainty_blocks(appearance: SkinAppearance) -> Iterator[page.Block]:
-    """Yield standard errors and residuals of maps, by melanin band where melanin is among them.
+    """Yield uncertainties and residuals of maps, by melanin band where melanin is estimated.
 
     Parameters
     ----------
     appearance
-        Without a truth: errors and coverage of intervals cannot be told, and are not.
+        Without a ground truth: errors and coverage are unknown.
     """
     spreads = [
         row
@@ -240,7 +253,7 @@ def _median_residual(name: str, skin_map: SkinMap) -> tuple[object, ...] | None:
 
 
 def _by_band(appearance: SkinAppearance) -> Iterator[tuple[object, ...]]:
-    """Yield relative standard errors, %, by band of the melanin where that is among the maps."""
+    """Yield relative uncertainties, %, by melanin band where melanin is estimated."""
     melanin = appearance.maps.get("melanin")
     if melanin is None:
         return

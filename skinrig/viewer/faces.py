@@ -197,10 +197,7 @@ def scene(
         provenance = {"source": "simulated", "kind": kind, "preset": preset, "seed": seed}
         return assemble_scene(source, provenance | ({} if mesh is None else {"mesh": mesh.name}))
     found = assemble_scene(source, _provenance(source, paths, whole, told))
-    movement = (
-        "its movement was not captured: the blend shapes are those of the file, or simulated "
-        "action units"
-    )
+    movement = "the movement was not captured; blend shapes are from the file or simulated"
     holes = () if whole is None else whole.summary()
     left_out = [*holes, ("expressions of this face", movement)]
     if whole is None:
@@ -302,4 +299,4 @@ def _mesh(
         appearance = appearances.get(kind)
         if appearance is not None and MESH_FILE in appearance.files:
             return close_holes(read_own_mesh(appearance)), f"{MESH_FILE} of the {kind}"
-    return None, "the procedural head stands for the face"
+    return None, "the procedural head replaces the face"

@@ -294,10 +294,10 @@ class ClosedMesh:
             rows["surface in holes of the scan"] = (
                 f"{len(lengths)} {'hole' if len(lengths) == 1 else 'holes'} of "
                 f"{min(lengths):.0f} to {max(lengths):.0f} mm around "
-                "could not be measured: smooth patches close them, colored from their rims"
+                "were not measured; smooth patches close them, with colors from their rims"
             )
         if self.left_open_mm:
-            rows["holes that stay open"] = (
+            rows["open holes"] = (
                 f"the texture has no room for {len(self.left_open_mm)} of up to "
                 f"{max(self.left_open_mm):.0f} mm around"
             )

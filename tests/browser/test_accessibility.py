@@ -57,7 +57,7 @@ def test_axe_finds_nothing_serious(open_page, procedural_html, axe, scheme, widt
     assert (red + green + blue > 600) == (scheme == "light")  # colors follow the system
     open_all(viewer.page)
     viewer.page.locator("button[data-tool=probe]").click()
-    viewer.page.get_by_role("button", name="Keep this as B").click()
+    viewer.page.get_by_role("button", name="Store as B").click()
     viewer.page.get_by_role("button", name="Measure a frame").click()
     viewer.page.locator("#group-cost table").wait_for(timeout=60_000)
     assert violations(viewer.page, axe) == []

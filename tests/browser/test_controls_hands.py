@@ -110,9 +110,9 @@ def test_pixel_probe_reads_buffer_values(viewer):
             strict=True,
         )
     )
-    assert rows["Melanin"] == f"{100 * inspect[2]:.2f} %"
-    assert rows["Hemoglobin"] == f"{100 * inspect[3]:.2f} %"
-    assert f"Melanin {rows['Melanin']}" in spoken(viewer)
+    assert rows["Melanosome volume fraction"] == f"{100 * inspect[2]:.2f} %"
+    assert rows["Blood volume fraction"] == f"{100 * inspect[3]:.2f} %"
+    assert f"Melanosome volume fraction {rows['Melanosome volume fraction']}" in spoken(viewer)
     viewer.set(melanin_gain=2)
     viewer.page.wait_for_timeout(400)
     changed = viewer.page.locator("#reading dd").first.text_content()
@@ -125,7 +125,7 @@ def test_click_outside_face_is_reported(viewer):
     box = viewer.page.locator("#port").bounding_box()
     side = min(box["width"], box["height"])
     viewer.page.mouse.click(x - 0.48 * side, y - 0.48 * side)
-    assert "Beside the face" in viewer.page.locator("#reading").text_content()
+    assert "Outside the face" in viewer.page.locator("#reading").text_content()
 
 
 def test_sliders_follow_keys_and_speak_their_value(viewer):
@@ -165,7 +165,7 @@ def test_each_kind_of_preset_changes_the_blood(viewer, preset):
 def test_comparison_shows_a_left_and_b_right(viewer):
     viewer.set(melanin_gain=3)
     dark = screen(viewer)
-    opened(viewer, "view").get_by_role("button", name="Keep this as B").click()
+    opened(viewer, "view").get_by_role("button", name="Store as B").click()
     viewer.set(melanin_gain=1, split=0.5)
     light = screen(viewer, alone=True)
     both = screen(viewer)
@@ -268,8 +268,8 @@ def test_costs_count_drawn_passes_and_grow_with_heads(viewer):
     ]
     assert 95 <= sum(shares) <= 105
     note = group.locator(".help").first.text_content()
-    assert "software GL" in note
-    assert "only the light moved" in note
+    assert "Software rendering" in note
+    assert "After a change of light" in note
     group.get_by_role("button", name="Measure five heads").click()
     group.locator("caption", has_text="5 heads").wait_for(timeout=60_000)
     assert params(viewer)["heads"] == 1

@@ -111,6 +111,23 @@ def test_report_makes_no_requests_and_policy_blocks_nothing(browser, pages):
         context.close()
 
 
+@pytest.mark.parametrize("width", WIDTHS)
+def test_first_screen_shows_images_below_the_verdict(browser, pages, width):
+    for path in pages:
+        context, page, _ = opened(browser, path, width=width)
+        places = page.evaluate(
+            "[...document.querySelectorAll('.first img')].map(i => "
+            "[i.getBoundingClientRect().top, i.getBoundingClientRect().right, i.alt.length])"
+        )
+        verdict = page.evaluate("document.querySelector('.verdict').getBoundingClientRect().bottom")
+        assert len(places) >= 4
+        assert verdict < places[0][0] < 400
+        assert sum(top < 900 for top, _, _ in places) >= 2
+        assert all(right <= width and alt > 20 for _, right, alt in places)
+        assert page.locator(".first .bar").count() >= 2
+        context.close()
+
+
 def test_policy_refuses_foreign_content(browser, pages, tmp_path):
     path = tmp_path / "changed.html"
     text = pages[0].read_text(encoding="utf-8")

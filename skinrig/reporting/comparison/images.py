@@ -1,8 +1,7 @@
-"""Folders of pictures of two runs beside each other: renderings and analyses.
+"""Comparison of image folders of two runs: renderings and analyses.
 
-Pictures are compared by the values of their OpenEXR files, where both have one, since those are in
-proportion to light; else by the codes of their PNG files, whose brightness each run may have chosen
-for itself.
+Images are compared by their OpenEXR files where both have one, since those are linear; otherwise by
+the codes of their PNG files, whose exposure may differ between runs.
 """
 
 import json
@@ -21,16 +20,16 @@ from skinrig.reporting.comparison.runs import ComparedRun, pair_by_name
 from skinrig.reporting.sections import images as image_section
 
 MAX_DRAWN_IMAGES = 4
-"""Pictures of a folder that are drawn: those that differ most."""
+"""Images of a folder that are drawn: those with the largest differences."""
 IGNORED_ENTRIES = ("seconds", "out", "files", "schema", "consent")
-"""Entries of a record that two equal renderings may differ in, or that stand elsewhere."""
+"""Entries of a record that may differ between equal renderings, or are shown elsewhere."""
 MAX_CODE = 255.0
 SCALE_PERCENTILE = 98.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageDifference:
-    """One picture of two runs.
+    """One image of two runs.
 
     Attributes
     ----------
@@ -49,12 +48,12 @@ class ImageDifference:
 
     @property
     def difference(self) -> Float64Array:
-        """B less A, mean over the channels, (H, W)."""
+        """B minus A, mean over the channels, (H, W)."""
         return np.asarray((self.b - self.a).mean(axis=-1))
 
     @property
     def relative_rms(self) -> float:
-        """Root mean square of B less A over that of A; NaN where A is black, or lit up to inf."""
+        """Root mean square of B minus A over that of A; NaN where A is black or infinite."""
         return _ratio(_rms(self.b - self.a), _rms(self.a))
 
     @property
@@ -69,12 +68,12 @@ class ImageDifference:
 
     @property
     def equal(self) -> bool:
-        """Whether not a value differs."""
+        """Whether all values are equal."""
         return bool(np.array_equal(self.a, self.b))
 
 
 def compare_folders(a: Path, b: Path) -> tuple[list[ImageDifference], list[tuple[str, str]]]:
-    """Return the pictures of two folders, and those that cannot be subtracted with the reason.
+    """Return the images of two folders, and those that cannot be subtracted with the reason.
 
     Parameters
     ----------
@@ -96,7 +95,7 @@ def compare_folders(a: Path, b: Path) -> tuple[list[ImageDifference], list[tuple
 
 
 def _difference(name: str, a: Path, b: Path) -> ImageDifference:
-    """Return a picture of two folders; raise a ValueError why it cannot be subtracted."""
+    """Return an image of two folders; raise ValueError where it cannot be subtracted."""
     both = [s for s in ("exr", "png") if all((f / f"{name}.{s}").is_file() for f in (a, b))]
     if not both:
         raise ValueError("one is OpenEXR, the other PNG")
@@ -108,12 +107,12 @@ def _difference(name: str, a: Path, b: Path) -> ImageDifference:
     if one.shape != other.shape:
         raise ValueError(f"sizes {_size(one)} and {_size(other)}")
     if not (np.isfinite(one).all() and np.isfinite(other).all()):
-        raise ValueError("holds values that are not finite")
+        raise ValueError("values that are not finite")
     return ImageDifference(name, "linear" if both[0] == "exr" else "8-bit codes", one, other)
 
 
 def summarize_images(a: ComparedRun, b: ComparedRun) -> str:
-    """Return how many pictures differ, empty without any that both have."""
+    """Return how many images differ, in a sentence; empty without common images."""
     both = [
         one
         for _, path_a, path_b in pair_by_name(a.pictures, b.pictures)
@@ -122,14 +121,14 @@ def summarize_images(a: ComparedRun, b: ComparedRun) -> str:
     if not both:
         return ""
     differ = sum(not one.equal for one in both)
-    return f"{differ} of {len(both)} pictures of both differ."
+    return f"{differ} of {len(both)} images differ."
 
 
 def section(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
-    """Yield the pictures of two runs with their differences, and what their records differ in."""
+    """Yield the images of two runs with their differences, and differing records."""
     for name, path_a, path_b in pair_by_name(a.pictures, b.pictures):
         found, refused = compare_folders(path_a, path_b)
-        yield page.Heading(f"Pictures: {name}", level=2)
+        yield page.Heading(f"Images: {name}", level=2)
         if found:
             order = sorted(found, key=lambda one: (-np.nan_to_num(one.relative_rms), one.name))
             yield page.view("compared_images", pictures=order)
@@ -139,9 +138,11 @@ def section(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
                 yield page.Images(list(_draw_difference(a, b, one)))
             if drawn[MAX_DRAWN_IMAGES:]:
                 rest = ", ".join(one.name for one in drawn[MAX_DRAWN_IMAGES:])
-                yield page.note(f"Not drawn, since they differ less: {rest}.")
+                yield page.note(f"Images with smaller differences are not drawn: {rest}.")
         if refused:
-            yield page.table(("picture", "why"), refused, caption="Pictures not subtracted")
+            yield page.table(
+                ("image", "reason"), refused, caption="Images that were not subtracted"
+            )
         yield _records(a, b, path_a, path_b)
 
 
@@ -176,16 +177,18 @@ def _records(a: ComparedRun, b: ComparedRun, path_a: Path, path_b: Path) -> page
     sides = [provenance.flatten_settings(_document(path)) for path in (path_a, path_b)]
     rows = runs.differing_entries(*sides)
     if not rows:
-        return page.note("What was asked for, and all that the records say, is the same.")
+        return page.note("Settings and records are equal.")
     return page.table(
-        ("entry", a.label, b.label), rows, caption="What the records differ in, without run times"
+        ("entry", a.label, b.label),
+        rows,
+        caption="Differing entries of the records, without run times",
     )
 
 
 def _document(folder: Path) -> Mapping[str, Any]:
     path = image_section.folder_document(folder)
-    told = {} if path is None else json.loads(path.read_text(encoding="utf-8"))
-    return {key: value for key, value in told.items() if key not in IGNORED_ENTRIES}
+    found = {} if path is None else json.loads(path.read_text(encoding="utf-8"))
+    return {key: value for key, value in found.items() if key not in IGNORED_ENTRIES}
 
 
 def _linear(path: Path) -> Float64Array:
@@ -197,7 +200,7 @@ def _codes(path: Path) -> Float64Array:
 
     read = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
     if read is None:
-        raise ValueError("is no picture")
+        raise ValueError("not an image")
     top = float(np.iinfo(read.dtype).max)
     layers = np.atleast_3d(read.astype(np.float64))
     return layers[..., [2, 1, 0]] / top if layers.shape[-1] >= 3 else layers / top

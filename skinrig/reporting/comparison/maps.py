@@ -1,4 +1,4 @@
-"""Two estimates of one map: how far apart they are, in the unit and in their standard errors."""
+"""Difference of two estimates of one map, in its unit and in standard uncertainties."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,15 +11,16 @@ from skinrig.arrays import BoolArray, Float64Array
 from skinrig.evaluating import flash, microrelief, subsurface
 from skinrig.evaluating import surface as surface_evaluation
 from skinrig.evaluating.surface import errors_by_band
+from skinrig.reporting.map_names import map_title
 from skinrig.reporting.page import short_unit
 from skinrig.unit_format import format_unit
 
 SIGMA_LEVELS = (1.0, 2.0, 3.0)
-"""Combined standard errors that shares of pixels beyond are told for."""
+"""Combined standard uncertainties; fractions of pixels beyond them are listed."""
 CHANCE_FRACTIONS = (0.3173, 0.0455, 0.0027)
 """Shares beyond them of two estimates with independent normal errors of the stated size."""
 MAX_SIGMAS = 35.0
-"""Differences of more standard errors are told as this many: tails beyond are no numbers."""
+"""Cap of differences in standard uncertainties: probabilities beyond underflow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +118,7 @@ def compare_maps(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
     if not normals:
         va, vb = (one.values[both].astype(np.float64) for one in (a, b))
         medians = _median(va), _median(vb), _median(difference[both])
-    told = np.abs(difference[both])
+    size = np.abs(difference[both])
     combined = float("nan")
     beyond: tuple[float, ...] = ()
     if spread is not None and sigmas is not None:
@@ -134,8 +135,8 @@ def compare_maps(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
         int((a.mask & ~b.mask).sum()),
         int((b.mask & ~a.mask).sum()),
         *medians,
-        _median(told),
-        float(np.percentile(told, 95)) if told.size else float("nan"),
+        _median(size),
+        float(np.percentile(size, 95)) if size.size else float("nan"),
         combined,
         beyond,
         np.where(both, flat, np.nan),
@@ -176,10 +177,10 @@ def _difference_of_normals(a: SkinMap, b: SkinMap, both: BoolArray) -> Differing
 
 
 def _beyond(sigmas: Float64Array) -> tuple[float, ...]:
-    told = np.abs(sigmas[~np.isnan(sigmas)])
-    if not told.size:
+    size = np.abs(sigmas[~np.isnan(sigmas)])
+    if not size.size:
         return ()
-    return tuple(float(np.mean(told > level)) for level in SIGMA_LEVELS)
+    return tuple(float(np.mean(size > level)) for level in SIGMA_LEVELS)
 
 
 def _median(values: Float64Array) -> float:
@@ -202,7 +203,7 @@ class QuantityAccuracy:
     interval
         68 % bootstrap interval; NaN where none is known.
     coverage
-        Share of truths inside the 68 % intervals; NaN where it is not told.
+        Coverage of the 68 % intervals; NaN where unknown.
     """
 
     quantity: str
@@ -239,7 +240,9 @@ def _chromophore_errors(
     appearance: SkinAppearance, truth: SkinAppearance
 ) -> Iterator[QuantityAccuracy]:
     for row in flash.compare(appearance, truth, rng=np.random.default_rng(0)):
-        name = f"{row.name}, median relative error against the {row.against} truth"
+        name = (
+            f"{map_title(row.name)}, median relative error against the {row.against} ground truth"
+        )
         interval = 100 * row.interval[0], 100 * row.interval[1]
         got = 100 * row.median_relative
         yield QuantityAccuracy(name, row.band_name, "%", got, interval, row.coverage.fraction)
@@ -249,10 +252,10 @@ def _surface_errors(
     appearance: SkinAppearance, truth: SkinAppearance
 ) -> Iterator[QuantityAccuracy]:
     for row in surface_evaluation.compare(appearance, truth, rng=np.random.default_rng(0)):
-        name, unit = f"{row.name}, median error", format_unit(row.unit)
+        name, unit = f"{map_title(row.name)}, median error", format_unit(row.unit)
         yield QuantityAccuracy(name, "all", unit, row.median, row.interval, row.coverage.fraction)
     for name, unit, band, _, _, middle, _ in errors_by_band(appearance, truth):
-        yield QuantityAccuracy(f"{name}, median error", f"{band} skin", unit, middle)
+        yield QuantityAccuracy(f"{map_title(name)}, median error", f"{band} skin", unit, middle)
 
 
 def _microrelief_errors(
@@ -262,7 +265,7 @@ def _microrelief_errors(
         angles = one.median_deg, one.interval_deg, one.coverage
         yield QuantityAccuracy("normals, median error", one.state, "°", *angles)
         if np.isfinite(one.height_um):
-            name, got = "height, rms error of relief", 100 * one.height_relative
+            name, got = "height, relative rms error", 100 * one.height_relative
             yield QuantityAccuracy(name, one.state, "%", got, coverage=one.height_coverage)
 
 

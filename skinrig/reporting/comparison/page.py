@@ -1,4 +1,4 @@
-"""The report on two runs: what changed, where estimates disagree, and what made the difference."""
+"""Comparison of two runs: changed checks, differing maps, and differing settings."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinrig.appearances.front_view import FrontView
-from skinrig.reporting import map_images, page, provenance
+from skinrig.reporting import first_screen, map_images, page, provenance
 from skinrig.reporting.comparison import images as image_comparison
 from skinrig.reporting.comparison import maps as comparison_maps
 from skinrig.reporting.comparison import runs
@@ -19,51 +19,52 @@ from skinrig.unit_format import format_quantity
 
 IMAGE_WIDTH_PX = 200
 MAX_NAMED_MAPS = 10
-"""Maps that are named first."""
+"""Maps named in the lead."""
 MAX_DRAWN_MAPS = 4
-"""Maps of a pair that are drawn: of those with standard errors the ones that disagree most."""
+"""Maps of a pair that are drawn: those with the largest differences over their uncertainties."""
 MAX_SHOWN_SIGMAS = 5.0
-"""End of the scale of differences in combined standard errors."""
+"""End of the scale of differences in combined standard uncertainties."""
 
 
 def lead(a: ComparedRun, b: ComparedRun, found: Sequence[MapsPair]) -> Iterator[page.Block]:
-    """Yield what changed in sentences, and the checks of both."""
+    """Yield the verdict on the differences, and the checks of both runs."""
     rows = match_checks(a, b)
     changed = [row for row in rows if row.verdict_change]
     disagree = [(pair.name, one) for pair in found for one in pair.differences if one.disagree]
-    told = sum(bool(one.beyond) for pair in found for one in pair.differences)
-    same = told and not any(one.high > 0.0 for pair in found for one in pair.differences)
+    compared = sum(bool(one.beyond) for pair in found for one in pair.differences)
+    same = compared and not any(one.high > 0.0 for pair in found for one in pair.differences)
     sentences = []
     if rows:
         worse = sum(row.verdict_change == "worse" for row in changed)
         common = sum(row.a is not None and row.b is not None for row in rows)
         sentences.append(
-            f"{len(changed)} of {common} checks of both changed their verdict"
-            + (f", {worse} for the worse." if changed else ".")
+            f"{len(changed)} of {common} checks changed their verdict"
+            + (f", {worse} from kept to missed." if changed else ".")
         )
     if same:
-        sentences.append(f"All {told} maps with standard errors are equal.")
-    elif told:
-        sentences.append(
-            f"{len(disagree)} of {told} maps differ beyond their combined standard errors."
-        )
+        sentences.append(f"All {compared} maps with uncertainties are equal.")
+    elif compared:
+        sentences.append(f"{len(disagree)} of {compared} maps differ significantly.")
     drawn = image_comparison.summarize_images(a, b)
     if drawn:
         sentences.append(drawn)
     if not sentences:
-        sentences.append("Nothing that both have can be judged; see the tables.")
+        sentences.append("The runs have neither checks nor maps with uncertainties in common.")
     bad = any(row.verdict_change == "worse" for row in changed)
     yield page.Paragraph(" ".join(sentences), f"verdict {'bad' if bad else ''}")
+    yield from first_screen.compared(
+        [(pair.name, pair.a, pair.b) for pair in found], (a.label, b.label)
+    )
     yield page.Paragraph(
         f"{a.label} is {_format_run_path(a)}; {b.label} is {_format_run_path(b)}. Differences are"
-        f" B less A."
+        f" B minus A."
     )
     worst = sorted(disagree, key=lambda item: -item[1].beyond[-1])
     if worst:
-        yield page.Heading("Where they disagree", level=2)
+        yield page.Heading("Largest differences", level=2)
         yield page.note(
-            "Shares of pixels that lie more than three combined standard errors apart; chance "
-            f"leaves 0.27 %. The {min(len(worst), MAX_NAMED_MAPS)} farthest of {len(worst)}."
+            "Fraction of pixels with a difference above three combined standard uncertainties; "
+            f"0.27 % is expected by chance. {min(len(worst), MAX_NAMED_MAPS)} of {len(worst)} maps."
         )
         yield page.Bullets(
             [f"{name}: {_describe_difference(one)}" for name, one in worst[:MAX_NAMED_MAPS]]
@@ -74,18 +75,18 @@ def lead(a: ComparedRun, b: ComparedRun, found: Sequence[MapsPair]) -> Iterator[
 def _describe_difference(difference: MapDifference) -> str:
     by = page.number(difference.median if difference.unit == "°" else difference.bias)
     return (
-        f"{map_title(difference.name)} by {format_quantity(by, difference.unit)} in the median, "
+        f"{map_title(difference.name)}, median difference {format_quantity(by, difference.unit)}, "
         f"{100 * difference.beyond[-1]:.3g} % of pixels"
     )
 
 
 def _format_run_path(run: ComparedRun) -> str:
-    """Return a run by the end of its path: the whole of it is nobody else's business."""
+    """Return the last two parts of the path of a run: the rest is private."""
     return "/".join(run.path.resolve().parts[-2:])
 
 
 def sections(a: ComparedRun, b: ComparedRun, found: Sequence[MapsPair]) -> Iterator[page.Block]:
-    """Yield maps, errors against the truths, settings and times of both."""
+    """Yield maps, errors against ground truth, settings and times of both runs."""
     for pair in found:
         yield from _pair(a, b, pair)
     yield from runs.benchmarks(a, b)
@@ -93,11 +94,11 @@ def sections(a: ComparedRun, b: ComparedRun, found: Sequence[MapsPair]) -> Itera
     yield from runs.moved_calibrations(a, b)
     yield from image_comparison.section(a, b)
     if missing := list_unpaired(a, b):
-        yield page.Heading("Only in one", level=2)
+        yield page.Heading("Only in one run", level=2)
         yield page.table(
-            ("folder", "in"),
+            ("folder", "run"),
             missing,
-            caption="Folders of maps or pictures without one of the same name",
+            caption="Folders of maps or images without a partner of the same name",
         )
     yield from provenance.consent_section([a.found, b.found])
 
@@ -107,12 +108,12 @@ def _pair(a: ComparedRun, b: ComparedRun, pair: MapsPair) -> Iterator[page.Block
     common = pair.a.inputs.get("session") == pair.b.inputs.get("session")
     if common and "session" in pair.a.inputs:
         yield page.note(
-            "Both were made of the same frames: they share the frames' noise, so that every "
-            "difference is the processing's, and combined standard errors are too large for it."
+            "Both estimates are from the same frames. Differences are due to processing, and the "
+            "combined standard uncertainties are too large because both share the noise."
         )
     yield page.view("compared_maps", maps=sorted(pair.differences, key=_sort_key))
     if pair.refused:
-        table = page.table(("map", "why"), pair.refused, caption="Maps that were not subtracted")
+        table = page.table(("map", "reason"), pair.refused, caption="Maps that were not subtracted")
         yield page.Folded(f"{len(pair.refused)} maps not subtracted", [table])
     yield from _images(a, b, pair)
     yield from _by_band(pair)
@@ -125,15 +126,15 @@ def _sort_key(difference: MapDifference) -> tuple[float, str]:
 
 
 def _images(a: ComparedRun, b: ComparedRun, pair: MapsPair) -> Iterator[page.Block]:
-    """Yield A | B | difference | difference over the combined standard error."""
-    told = [one for one in pair.differences if one.sigmas is not None and one.name != "position"]
-    order = sorted((one for one in told if one.high > 0.0), key=_sort_key)
+    """Yield A | B | difference | difference over the combined standard uncertainty."""
+    known = [one for one in pair.differences if one.sigmas is not None and one.name != "position"]
+    order = sorted((one for one in known if one.high > 0.0), key=_sort_key)
     for one in order[:MAX_DRAWN_MAPS]:
         yield page.Heading(map_heading(one.name))
         yield page.Images(list(_difference_images(a, b, pair, one)))
     if len(order) > MAX_DRAWN_MAPS:
         names = "; ".join(map_title(one.name) for one in order[MAX_DRAWN_MAPS:])
-        yield page.note(f"Not drawn, since they disagree less: {names}.")
+        yield page.note(f"Maps with smaller differences are not drawn: {names}.")
 
 
 def _difference_images(
@@ -144,7 +145,7 @@ def _difference_images(
     place = pair.a.maps.get("position")
 
     def laid(values: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return values as a picture, from the front where they lie on a mesh."""
+        """Return values as an image, projected to the front for a mesh."""
         if place is None:
             return np.nan_to_num(values), both
         rows, columns = np.nonzero(both & place.mask)
@@ -158,7 +159,9 @@ def _difference_images(
     low, high = np.percentile(values[np.isfinite(values)], [1, 99])
     for label, skin_map in zip((a.label, b.label), maps, strict=True):
         image, mask = laid(skin_map.values)
-        shown = map_images.MapDrawing(difference.name, difference.unit, mask, IMAGE_WIDTH_PX)
+        shown = map_images.MapDrawing(
+            map_title(difference.name), difference.unit, mask, IMAGE_WIDTH_PX
+        )
         if difference.unit == "°":
             yield shown.normals(label, image)
         elif image.ndim == 3:
@@ -166,26 +169,30 @@ def _difference_images(
                 label,
                 np.where(mask[..., None], image, 0.2),
                 width=IMAGE_WIDTH_PX,
-                of=difference.name,
+                of=map_title(difference.name),
             )
         else:
             yield shown.draw_scalar(label, image, low, high)
     image, mask = laid(difference.difference)
     reach = map_images.percentile_reach(image, mask, 98) or 1.0
-    drawing = map_images.MapDrawing(difference.name, difference.unit, mask, IMAGE_WIDTH_PX)
+    drawing = map_images.MapDrawing(
+        map_title(difference.name), difference.unit, mask, IMAGE_WIDTH_PX
+    )
     if difference.unit == "°":
         yield drawing.size("angle between them", image, reach)
     else:
         yield drawing.draw_signed("B − A", image, reach)
     if difference.sigmas is not None:
         image, mask = laid(difference.sigmas)
-        drawing = map_images.MapDrawing(f"{difference.name}, difference", "", mask, IMAGE_WIDTH_PX)
+        drawing = map_images.MapDrawing(
+            f"{map_title(difference.name)}, difference", "", mask, IMAGE_WIDTH_PX
+        )
         draw = drawing.size if difference.unit == "°" else drawing.draw_signed
-        yield draw("in combined standard errors", image, MAX_SHOWN_SIGMAS)
+        yield draw("in combined standard uncertainties", image, MAX_SHOWN_SIGMAS)
 
 
 def _by_band(pair: MapsPair) -> Iterator[page.Block]:
-    """Yield differences of chromophores by band of the melanin that both find on average."""
+    """Yield differences of chromophores by band of the mean melanin of both."""
     melanin = [side.maps.get("melanin") for side in (pair.a, pair.b)]
     if melanin[0] is None or melanin[1] is None:
         return
@@ -205,15 +212,13 @@ def _by_band(pair: MapsPair) -> Iterator[page.Block]:
 
 
 def _errors(a: ComparedRun, b: ComparedRun, pair: MapsPair) -> Iterator[page.Block]:
-    """Yield errors of both against their truths, where both truths are known."""
+    """Yield errors of both against ground truth, where both are given."""
     truths = a.found.find_truth(pair.a), b.found.find_truth(pair.b)
     if truths[0] is None or truths[1] is None:
         lacking = " and ".join(
             run.label for run, truth in zip((a, b), truths, strict=True) if truth is None
         )
-        yield page.note(
-            f"No truth lies beside {lacking}: what differs can be told, what is right cannot."
-        )
+        yield page.note(f"No ground truth is given for {lacking}; errors are unknown.")
         return
     found_a, found_b = (
         {(row.quantity, row.skin): row for row in comparison_maps.truth_errors(side, truth)}
@@ -247,12 +252,12 @@ class CheckRow:
 
     @property
     def describe_outcome(self) -> str:
-        """What became of the verdict, in words."""
-        return self.verdict_change or ("no" if self.a and self.b else "only in one")
+        """Change of the verdict, in words."""
+        return self.verdict_change or ("no" if self.a and self.b else "only in one run")
 
     @property
     def difference(self) -> float:
-        """What B measured less what A did; NaN where one did not."""
+        """Value of B minus that of A; NaN where one is missing."""
         return float("nan") if self.a is None or self.b is None else self.b.got - self.a.got
 
 
@@ -267,7 +272,7 @@ def match_checks(a: ComparedRun, b: ComparedRun) -> list[CheckRow]:
 
 
 def _common_name(check: page.Check, run: ComparedRun, other_run: ComparedRun) -> str:
-    """Return a check's name without the folder's where the two folders are named differently."""
+    """Return the name of a check, without folder names that differ."""
     name = check.name
     if len(run.appearances) == len(other_run.appearances) == 1:
         name = name.removeprefix(f"{next(iter(run.appearances))}: ")
@@ -281,7 +286,7 @@ def check_table(a: ComparedRun, b: ComparedRun, rows: Sequence[CheckRow]) -> Ite
     if not rows:
         return
 
-    def told(check: page.Check | None) -> str:
+    def measured(check: page.Check | None) -> str:
         if check is None:
             return "not checked"
         return format_quantity(page.number(check.got), check.unit) + (
@@ -296,12 +301,19 @@ def check_table(a: ComparedRun, b: ComparedRun, rows: Sequence[CheckRow]) -> Ite
         ]
         return " and ".join(dict.fromkeys(bounds))
 
-    yield page.Heading("Checks of both", level=2)
+    yield page.Heading("Checks of both runs", level=2)
     yield page.table(
         ("check", a.label, b.label, "difference", "limit", "changed"),
         [
-            (row.name, told(row.a), told(row.b), row.difference, limit(row), row.describe_outcome)
+            (
+                row.name,
+                measured(row.a),
+                measured(row.b),
+                row.difference,
+                limit(row),
+                row.describe_outcome,
+            )
             for row in rows
         ],
-        caption="Verdicts that changed stand first; limits that follow a bound may differ",
+        caption="Changed verdicts first; limits that depend on a Cramér-Rao bound may differ",
     )

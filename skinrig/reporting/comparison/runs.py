@@ -1,4 +1,4 @@
-"""Two runs beside each other: which results belong together, and what they were made with."""
+"""Two runs of a comparison: pairs of results and their settings."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class ComparedRun:
 
     @staticmethod
     def of(label: str, path: Path, truths: Sequence[Path] = ()) -> ComparedRun:
-        """Read a run; ``truths`` serve it beside its own."""
+        """Read a run; ``truths`` are added to its own."""
         found = folders.discover([path])
         for truth in truths:
             found.truths.setdefault(truth.name, truth)
@@ -90,10 +90,10 @@ def _is_bench(path: Path) -> bool:
 def split_sides(
     paths: Sequence[Path], *, require_comparison: bool | None = None
 ) -> tuple[ComparedRun, ComparedRun] | None:
-    """Return the two runs that paths ask to compare, or None where they are a collection.
+    """Return the two runs to compare, or None where the paths are a collection.
 
     Exactly two paths of one kind, be it two sets of maps, two benchmarks, two folders of pictures
-    or two folders of runs, are compared; truths given beside them serve both. Everything else is a
+    or two folders of runs, are compared; truths among the paths serve both. Everything else is a
     collection, shown one after the other.
 
     Parameters
@@ -124,8 +124,8 @@ def split_sides(
             told = ", ".join(f"{path} ({kinds[path]})" for path in paths)
             raise ReportError(
                 f"--compare: got {told}, expected two of one kind: two folders of maps, two "
-                "benchmarks, two folders of pictures or two folders of runs; truths beside them "
-                "are welcome"
+                "benchmarks, two folders of images or two folders of runs; ground truths of "
+                "either may be added"
             )
         return None
     first, second = _labels(*runs)
@@ -188,7 +188,7 @@ def compare_maps_of_runs(a: ComparedRun, b: ComparedRun) -> list[MapsPair]:
                 if key not in one.maps or key not in other.maps:
                     raise ValueError(f"only in {a.label if key in one.maps else b.label}")
                 if apart > MAX_SAME_POINT_MM:
-                    raise ValueError(f"texels of the two meshes lie {apart:.1f} mm apart")
+                    raise ValueError(f"texels of the two meshes differ by {apart:.1f} mm")
                 differences.append(map_comparison.compare_maps(key, one.maps[key], other.maps[key]))
             except ValueError as error:
                 refused.append((key, str(error)))
@@ -211,33 +211,33 @@ def _apart_mm(a: SkinAppearance, b: SkinAppearance) -> float:
 
 
 MAX_LISTED_DRIFTS = 3
-"""Quantities told of each kind of calibration."""
+"""Quantities listed for each kind of calibration."""
 
 
 def settings(a: ComparedRun, b: ComparedRun, pair: MapsPair) -> Iterator[page.Block]:
-    """Yield what the two were made with, as far as it differs."""
+    """Yield the settings that differ."""
     sides = []
     for side in (pair.a, pair.b):
-        told = {
+        listed = {
             f"parameter {k}": v for k, v in provenance.flatten_settings(side.parameters).items()
         }
-        told |= {f"input {k}": provenance.shorten_digest(v) for k, v in side.inputs.items()}
-        told |= {f"version of {k}": v for k, v in side.versions.items()}
-        told |= {"source": side.source, "seed": str(side.seed)}
-        told |= {f"left out: {what}": why for what, why in side.left_out}
-        sides.append(told)
+        listed |= {f"input {k}": provenance.shorten_digest(v) for k, v in side.inputs.items()}
+        listed |= {f"version of {k}": v for k, v in side.versions.items()}
+        listed |= {"source": side.source, "seed": str(side.seed)}
+        listed |= {f"omitted: {what}": why for what, why in side.left_out}
+        sides.append(listed)
     rows = differing_entries(*sides)
     stages = [row for row in rows if row[0].startswith("parameter stages.")]
     rest = [row for row in rows if not row[0].startswith("parameter stages.")]
-    yield page.Heading("What differs in the making")
+    yield page.Heading("Differing settings")
     if not rows:
-        yield page.note("Parameters, inputs, versions and seeds are the same.")
+        yield page.note("Parameters, inputs, versions and seeds are equal.")
         return
     if rest:
-        yield page.table(("what", a.label, b.label), rest, caption="Settings that are not equal")
+        yield page.table(("setting", a.label, b.label), rest, caption="Settings that differ")
     if stages:
         names = ", ".join(row[0].removeprefix("parameter stages.") for row in stages)
-        yield page.note(f"Stages whose code, settings or inputs differ: {names}.")
+        yield page.note(f"Stages with different code, settings or inputs: {names}.")
 
 
 def differing_entries(a: Mapping[str, str], b: Mapping[str, str]) -> list[tuple[str, str, str]]:
@@ -250,7 +250,7 @@ def differing_entries(a: Mapping[str, str], b: Mapping[str, str]) -> list[tuple[
 
 
 def benchmarks(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
-    """Yield seconds and errors of settings that both measured, and a plot a stage."""
+    """Yield seconds and errors of common settings, and one plot per stage."""
     documents = [_bench_of(run) for run in (a, b)]
     if documents[0] is None or documents[1] is None:
         return
@@ -279,7 +279,7 @@ def benchmarks(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
         yield page.table(
             ("machine", a.label, b.label),
             machines,
-            caption="Measured on different machines: seconds compare those, too",
+            caption="The machines differ: their speed is part of the seconds",
         )
     yield page.view("compared_benchmarks", settings=rows)
 
@@ -306,7 +306,7 @@ def _settings_of_stage(
 
 
 def seconds(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
-    """Yield the seconds that documents of both, such as a demo's, tell by step."""
+    """Yield the seconds of steps that the documents of both record."""
     sides = [dict(_steps(run)) for run in (a, b)]
     common = [step for step in sides[0] if step in sides[1]]
     if not common:
@@ -315,12 +315,12 @@ def seconds(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
         (step, sides[0][step], sides[1][step], sides[1][step] - sides[0][step]) for step in common
     ]
     total = [sum(side[step] for step in common) for side in sides]
-    rows.append(("all of these", total[0], total[1], total[1] - total[0]))
+    rows.append(("sum", total[0], total[1], total[1] - total[0]))
     yield page.Heading("Seconds", level=2)
     yield page.table(
         ("step", a.label, b.label, "difference"),
         rows,
-        caption="Wall-clock seconds of steps that both tell; other work of the machine is in them",
+        caption="Wall-clock seconds of common steps; other load on the machine adds to them",
     )
 
 
@@ -332,7 +332,7 @@ def _steps(run: ComparedRun) -> Iterator[tuple[str, float]]:
 
 
 def moved_calibrations(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
-    """Yield what moved most between calibrations of the same folder and kind."""
+    """Yield the largest changes between calibrations of the same folder and kind."""
     folders: dict[str, Path] = {path.name: path for path in b.found.calibrations}
     rows: list[tuple[object, ...]] = []
     for folder in a.found.calibrations:
@@ -348,13 +348,21 @@ def moved_calibrations(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
                 continue
             for one in moved[:MAX_LISTED_DRIFTS]:
                 apart = float("nan") if one.sigmas is None else one.sigmas
-                moves = (one.serial, one.name, one.old, one.new, apart, f"{len(moved)} moved")
+                moves = (one.serial, one.name, one.old, one.new, apart, f"{len(moved)} changed")
                 rows.append((f"{folder.name}, {path.stem}", *moves))
     if not rows:
         return
-    yield page.Heading("Calibrations that moved", level=2)
+    yield page.Heading("Changed calibrations", level=2)
     yield page.table(
-        ("calibration", "device", "quantity", "A", "B", "in combined standard errors", "remark"),
+        (
+            "calibration",
+            "device",
+            "quantity",
+            "A",
+            "B",
+            "in combined standard uncertainties",
+            "remark",
+        ),
         rows,
-        caption="The farthest of each kind",
+        caption="Largest changes of each kind",
     )

@@ -1,4 +1,4 @@
-"""The report's section on benchmarks: error against seconds, by setting and by skin."""
+"""Report section on benchmarks: error against seconds, by setting and by skin."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -12,7 +12,7 @@ SCHEMA_FAMILY = SCHEMA.split("/")[0]
 
 
 def is_bench(document: Mapping[str, Any]) -> bool:
-    """Return whether a document is a benchmark's, of whatever version."""
+    """Return whether a document is a benchmark of any version."""
     return str(document.get("schema", "")).startswith(f"{SCHEMA_FAMILY}/")
 
 
@@ -22,15 +22,15 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> Iterator[p
     Parameters
     ----------
     document
-        ``skinrig.bench/2``; of another version only that is said.
+        ``skinrig.bench/2``; of another version, only a note is yielded.
     checks
-        The report's.
+        Checks of the report.
     """
     yield page.Heading("Error against run time", level=2)
     if document["schema"] != SCHEMA:
         yield page.note(
-            f"Measured by another version ({document['schema']}, this one reads {SCHEMA}): "
-            "`skinrig bench` measures anew."
+            f"The file has schema {document['schema']}, expected {SCHEMA}; "
+            "run `skinrig bench` again."
         )
         return
     for name, stage in document["stages"].items():
@@ -48,33 +48,31 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> Iterator[p
     bands = bench_table.bands(document)
     if bands:
         yield page.table(
-            bench_table.BAND_COLUMNS,
-            bands,
-            caption="Error of the usual setting by melanin band; of light: over the lightest one",
+            bench_table.BAND_COLUMNS, bands, caption="Error at the default setting by melanin band"
         )
     yield from _left_out(document)
 
 
 def _worst(stage: Mapping[str, Any]) -> str:
-    told = [one for one in stage["by_band"] if one["error"] is not None]
-    if len(told) < 2:
+    known = [one for one in stage["by_band"] if one["error"] is not None]
+    if len(known) < 2:
         return ""
-    worst = max(told, key=lambda one: float(one["error"]))
+    worst = max(known, key=lambda one: float(one["error"]))
     return f"{worst['band']}: {float(worst['error']):.3g}"
 
 
 def _left_out(document: Mapping[str, Any]) -> Iterator[page.Block]:
-    rows = [(f"{what}, all of it", why) for what, why in document.get("left_out", ())]
+    rows = [(f"{what}, whole stage", why) for what, why in document.get("left_out", ())]
     rows += [
         (f"{name}: {what}", why)
         for name, stage in document["stages"].items()
         for what, why in stage.get("left_out", ())
     ]
     if rows:
-        table = page.table(("what", "why"), rows, caption="What was not measured")
-        yield page.Folded(f"{len(rows)} left out", [table])
+        table = page.table(("setting", "reason"), rows, caption="Settings that were not measured")
+        yield page.Folded(f"{len(rows)} settings not measured", [table])
     if document.get("not_judged"):
         yield page.note(
-            "Measured at small size, so that limits were not judged: "
+            "Measured at small size; their limits are not checked: "
             f"{', '.join(document['not_judged'])}."
         )

@@ -1,4 +1,4 @@
-"""The report's section on calibrations: how good they are, and whether they were in force."""
+"""Report section on calibrations: quality and validity at capture."""
 
 import csv
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,7 +18,7 @@ from skinrig.reporting import page
 from skinrig.reporting.sections.session import SessionFacts
 
 MAX_LISTED_NUMBERS = 12
-"""Numbers of a quantity up to which a table lists it."""
+"""Values up to which a table lists a quantity."""
 MAX_LISTED_QUANTITIES = 60
 """Rows beyond which values stay in their file."""
 
@@ -27,12 +27,12 @@ AGGREGATES: Mapping[str, Callable[[Float64Array], float]] = {
     "largest": lambda values: float(np.max(np.abs(values))),
     "mean": lambda values: float(np.mean(values)),
 }
-"""Numbers of a device by one number."""
+"""Statistics of the values of one device."""
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One number by which a calibration is judged, for each device that has it."""
+    """One number for the quality of a calibration, for each device that has it."""
 
     quantity: str
     words: str
@@ -54,7 +54,7 @@ def _quality_figures() -> dict[str, list[Figure]]:
 
 
 QUALITY_FIGURES = _quality_figures()
-"""Figures of each kind; what a calibration lacks is left out."""
+"""Figures of each kind; quantities that a calibration lacks are omitted."""
 
 
 def section(
@@ -70,16 +70,16 @@ def section(
     folders
         CALIBRATION/ folders.
     appearances
-        By name: whose inputs tell which calibration made them.
+        By name; their inputs name the calibrations.
     sessions
-        By name: whose days tell how old a calibration was.
+        By name; their days give the age of a calibration.
     checks
-        Gets, for each folder that something here was made with, how long it would still have held.
+        Gets the remaining validity of each folder that was used.
 
     Notes
     -----
-    Ages are told at the day of capture, not of today: that is what the maps depend on, and a
-    report of the same input is the same on any day.
+    Ages refer to the day of capture: maps depend on it, and a report of the same input is the
+    same on any day.
     """
     if not folders:
         return
@@ -101,9 +101,9 @@ def section(
             figures += _figures(folder.name, found)
             values.append(_values(folder.name, found))
         if left:
-            name = f"{folder.name}: days that it would still have held at capture, least"
+            name = f"{folder.name}: days of validity left at capture"
             checks.append(page.Check(name, float(np.min(left)), 0.0, ">=", "d"))
-    yield page.Heading("Calibration: quality and age", level=2)
+    yield page.Heading("Calibrations", level=2)
     yield page.view("calibrations", ages=ages, figures=figures)
     yield from values
 
@@ -115,7 +115,7 @@ def _age(
     appearances: Mapping[str, SkinAppearance],
     sessions: Mapping[str, SessionFacts],
 ) -> tuple[list[float], tuple[object, ...]]:
-    """Return the days that were left at each capture, and the table's row."""
+    """Return the days left at each capture, and the row of the table."""
     made_of = digest(path)
     users = sorted(
         name
@@ -131,17 +131,17 @@ def _age(
     )
     days = [_days_left(found, day) for day in captured]
     if not captured:
-        verdict = "no session here tells when it was used"
+        verdict = "date of use unknown"
     elif min(days) < 0:
-        verdict = "not in force at capture"
+        verdict = "not valid at capture"
     else:
-        verdict = f"in force, {min(days)} days left"
+        verdict = f"valid, {min(days)} days left"
     ages = [(day - found.created).days for day in captured]
     return [float(d) for d in days], (
         f"{folder}, {found.kind}",
         found.created.isoformat(),
         found.valid_until.isoformat(),
-        ", ".join(users) or "nothing here",
+        ", ".join(users) or "not used",
         ", ".join(day.isoformat() for day in captured),
         ", ".join(map(str, ages)),
         f"{verdict}; {found.source}",
@@ -163,21 +163,21 @@ def _figures(folder: str, found: Calibration) -> list[tuple[object, ...]]:
             for serial, names in sorted(found.values.items())
             if figure.quantity in names
         }
-        told = {
+        values = {
             serial: figure.factor * figure.of(value)
             for serial, (value, _) in held.items()
             if np.isfinite(value).all()
         }
-        if not told or (found.kind == "white" and not any(told.values())):
-            continue  # a white reference that nothing smoothed leaves nothing
+        if not values or (found.kind == "white" and not any(values.values())):
+            continue  # a white reference without smoothing has no residual
         errors = [
             figure.factor * float(np.max(stderr))
             for _, stderr in held.values()
             if stderr is not None and np.isfinite(stderr).all()
         ]
-        median, worst = float(np.median(list(told.values()))), figure.worst(list(told.values()))
-        device = next(serial for serial, value in told.items() if value == worst)
-        of_all = len(told), median, worst, device, max(errors) if errors else ""
+        median, worst = float(np.median(list(values.values()))), figure.worst(list(values.values()))
+        device = next(serial for serial, value in values.items() if value == worst)
+        of_all = len(values), median, worst, device, max(errors) if errors else ""
         rows.append((calibration, figure.words, figure.unit, *of_all))
     valid = {
         serial: np.asarray(names["valid"].value, bool).all()
@@ -188,7 +188,7 @@ def _figures(folder: str, found: Calibration) -> list[tuple[object, ...]]:
         flagged = [serial for serial, good in valid.items() if not good]
         count = float(len(flagged))
         of_all = len(valid), count, count, ", ".join(flagged[:6]), ""
-        rows.append((calibration, "devices found not valid", "", *of_all))
+        rows.append((calibration, "devices marked invalid", "", *of_all))
     return rows
 
 
@@ -201,14 +201,14 @@ def _values(folder: str, found: Calibration) -> page.Folded:
     ]
     listed: page.Block
     if len(rows) > MAX_LISTED_QUANTITIES:
-        listed = page.note(f"{len(rows)} quantities of its devices stand in {found.kind}.json.")
+        listed = page.note(f"{found.kind}.json lists {len(rows)} quantities of its devices.")
     else:
         listed = page.table(
-            ("device", "quantity", "value", "standard error"),
+            ("device", "quantity", "value", "standard uncertainty"),
             rows,
-            caption=f"Values of {folder}, {found.kind}, made {found.created}",
+            caption=f"Values of {folder}, {found.kind}, {found.created}",
         )
-    noted = page.facts(dict(sorted(found.notes.items())), caption="What its makers noted")
+    noted = page.facts(dict(sorted(found.notes.items())), caption="Notes of the calibration")
     return page.Folded(f"{folder}, {found.kind}: notes and values", [noted, listed])
 
 

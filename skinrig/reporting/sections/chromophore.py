@@ -1,4 +1,4 @@
-"""The report's section on chromophores: errors by melanin band, and where they can be told."""
+"""Report section on chromophores: errors by melanin band, and identifiability."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Literal
@@ -19,15 +19,19 @@ from skinrig.reporting import map_images, map_names, page
 IDENTIFIABILITY_NOISE = 0.005
 """Relative noise of each channel that the identifiability plots are drawn for."""
 SMALL_WIDTH_PX = 200
-"""Largest width of maps that stand alone."""
+"""Largest width of maps without ground truth and uncertainty."""
 MAX_ROUNDING_ERROR = 1e-6
-"""Fractions below this are zero but for rounding."""
+"""Fractions below this are rounding errors."""
+VECTOR_MAPS = ("normals", "albedo")
+"""Maps of three channels that are drawn."""
 
 
 def panels(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator[page.Block]:
-    """Yield each map of a single channel beside its truth, to one scale."""
+    """Yield each map of one channel with its ground truth, to one color scale; normals, albedo."""
     alone = []
     for key, skin_map in sorted(appearance.maps.items()):
+        if key in VECTOR_MAPS and skin_map.values.ndim == 3:
+            yield from _vectors(key, skin_map)
         if skin_map.values.ndim != 2 or key.startswith("_") or key.endswith(NOISE_STDERR_SUFFIX):
             continue
         true_map = truth.maps.get(key) if truth is not None else None
@@ -41,19 +45,43 @@ def panels(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator
             standard_error=skin_map.stderr,
             truth=None if true_map is None else true_map.values,
             valid=_shown(skin_map, true_map),
+            uncertainty=map_names.uncertainty(key),
         )
     if alone:
-        yield page.Heading("Maps without standard errors")
+        yield page.Heading("Maps without uncertainties")
         yield page.Images(alone, small=True)
 
 
+def _vectors(key: str, skin_map: SkinMap) -> Iterator[page.Block]:
+    """Yield the colors of a map of three channels, and its uncertainty."""
+    normals, unit = key == "normals", page.short_unit(skin_map.unit)
+    drawing = map_images.MapDrawing(
+        map_names.map_title(key), "°" if normals else unit, skin_map.mask
+    )
+    if normals:
+        images = [drawing.normals("estimate", skin_map.values)]
+    else:
+        bright = (
+            map_images.percentile_reach(skin_map.values.max(axis=-1), skin_map.mask, 99.5) or 1.0
+        )
+        shown = np.where(skin_map.mask[..., None], skin_map.values / bright, map_images.GRAY_LINEAR)
+        images = [map_images.color_image("estimate", shown, of=map_names.map_title(key))]
+    if skin_map.stderr is not None:
+        stderr = skin_map.stderr.reshape(*skin_map.mask.shape, -1).mean(axis=-1)
+        stderr = np.degrees(stderr) if normals else stderr
+        reach = map_images.percentile_reach(stderr, skin_map.mask, 98)
+        images.append(drawing.size(map_names.uncertainty(key), stderr, reach))
+    yield page.Heading(map_names.map_heading(key))
+    yield page.Images(images)
+
+
 def _single_image(key: str, skin_map: SkinMap) -> page.Image:
-    """Return the picture of a map that there is nothing to set beside."""
+    """Return the image of a map without ground truth and uncertainty."""
     mask = _shown(skin_map, None)
     inside = skin_map.values[np.isfinite(skin_map.values) if mask is None else mask]
     low, high = np.percentile(inside, [1, 99]) if inside.size else (0.0, 1.0)
     if max(abs(low), abs(high)) < MAX_ROUNDING_ERROR:
-        low, high = 0.0, 1.0  # what rounding leaves is not to look like structure
+        low, high = 0.0, 1.0  # rounding errors would look like structure
     drawing = map_images.MapDrawing("", page.short_unit(skin_map.unit), mask, SMALL_WIDTH_PX)
     return drawing.draw_scalar(map_names.map_heading(key), skin_map.values, low, high)
 
@@ -64,7 +92,7 @@ def _shown(estimate: SkinMap, truth: SkinMap | None) -> BoolArray | None:
 
 
 def errors(subject: page.ReportedAppearance, truth: SkinAppearance) -> Iterator[page.Block]:
-    """Yield the errors of melanin and hemoglobin against their truth, by melanin band.
+    """Yield the errors of melanin and blood against their ground truth, by melanin band.
 
     Parameters
     ----------
@@ -77,7 +105,7 @@ def errors(subject: page.ReportedAppearance, truth: SkinAppearance) -> Iterator[
         if row.band is None:
             worst, worst_got = _worst([r for r in blurred if r.name == row.name and r.band])
             subject.check_fraction(
-                f"{row.name}, median error",
+                f"{map_names.map_title(row.name)}, median error",
                 row.median_relative,
                 flash.limit(row),
                 f"Cramér-Rao bound {100 * flash.bound(row):.1f} %",
@@ -87,7 +115,9 @@ def errors(subject: page.ReportedAppearance, truth: SkinAppearance) -> Iterator[
                 worst_got=worst_got,
             )
     yield page.view("chromophore_errors", errors=rows)
-    limits = {row.name: 100 * flash.limit(row) for row in blurred if row.band is None}
+    limits = {
+        map_names.map_title(row.name): 100 * flash.limit(row) for row in blurred if row.band is None
+    }
     yield from _bars([row for row in blurred if row.band is not None], limits)
 
 
@@ -107,20 +137,20 @@ def _bars(banded: list[flash.MapAccuracy], limits: Mapping[str, float]) -> Itera
         return
     found = {(row.name, row.band_name): 100 * row.median_relative for row in banded}
     series = {
-        key: [found.get((key, label), float("nan")) for label in labels]
+        map_names.map_title(key): [found.get((key, label), float("nan")) for label in labels]
         for key in dict.fromkeys(row.name for row in banded)
     }
-    title = "median error by melanin band; dashed: limit of all bands together"
+    title = "median error by melanin band; dashed: limit over all bands"
     yield page.Plots([figures.bars(title, labels, series, unit="%", limits=limits)])
 
 
 def identifiability(appearances: Iterable[SkinAppearance]) -> Iterator[page.Block]:
-    """Draw where the Cramer-Rao bound says that a chromophore can be seen at all.
+    """Draw the Cramér-Rao bound of each chromophore.
 
     Parameters
     ----------
     appearances
-        Each color table that chromophores of one were looked up in is drawn once.
+        Each color table that one of them was inverted with is drawn once.
     """
     tables = {
         (str(built["camera"]), str(built["illuminant"]))
@@ -130,10 +160,10 @@ def identifiability(appearances: Iterable[SkinAppearance]) -> Iterator[page.Bloc
     }
     if not tables:
         return
-    yield page.Heading("Where chromophores can be told", level=2)
+    yield page.Heading("Identifiability of chromophores", level=2)
     yield page.note(
-        "Least relative standard error that any unbiased estimator could have, for "
-        f"{100 * IDENTIFIABILITY_NOISE:g} % of noise in each channel and the model's error."
+        "Cramér-Rao bound on the relative standard uncertainty of an unbiased estimator, for "
+        f"{100 * IDENTIFIABILITY_NOISE:g} % noise per channel and the model error."
     )
     for camera, illuminant in sorted(tables):
         yield page.Heading(f"{camera}, {illuminant}")
@@ -155,7 +185,7 @@ def _plots_of_table(camera: str, illuminant: str) -> list[str]:
             model_error=model_error.load_covariance(),
             size=48,
         )
-        errors = {"melanin": found.stderr_melanin, "hemoglobin": found.stderr_hemoglobin}
+        errors = {"melanin": found.stderr_melanin, "blood": found.stderr_hemoglobin}
         plots += [
             figures.sensitivity(f"{name}, {words}", found.c_m, found.c_hd, 100 * relative)
             for name, relative in errors.items()

@@ -1,4 +1,4 @@
-"""The report's section on a moving face: blood of its states, wrinkle zones, kernels by site."""
+"""Report section on a moving face: blood by expression, wrinkle zones, kernels by site."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -26,7 +26,7 @@ from skinrig.reporting import map_images, page
 from skinrig.reporting.map_names import split_melanin_bands
 
 MAX_SHOWN_EXPRESSIONS = 4
-"""States drawn; the tables list all."""
+"""Expressions drawn; the tables list all."""
 WIDTH_PX = 240
 ZONE_COLORS = np.array(
     [
@@ -51,14 +51,14 @@ def is_dynamic(appearance: SkinAppearance) -> bool:
 def section(
     subject: page.ReportedAppearance, truths: Mapping[str, SkinAppearance]
 ) -> Iterator[page.Block]:
-    """Yield what was fitted, and how far it is from the truth.
+    """Yield the fitted parts and their errors.
 
     Parameters
     ----------
     subject
         Folder of `skinrig.appearances.dynamic`.
     truths
-        True blood of each state, as far as it is there.
+        True blood volume fraction by expression, where given.
     """
     appearance = subject.appearance
     parts = describe_parts(appearance)
@@ -111,9 +111,9 @@ def _microstructure(appearance: SkinAppearance, part: Mapping[str, Any]) -> Iter
         relief = appearance.maps[entry["map"]]
         spread = 2.5 * float(np.std(relief.values[relief.mask]))
         drawing = map_images.MapDrawing("", "um", relief.valid, WIDTH_PX)
-        title = f"{site}: neutral relief"
+        title = f"{site}: neutral topography"
         images.append(drawing.draw_scalar(title, relief.values, -spread, spread, "gray"))
-        kernels, stretch = entry["kernels"] or "the paper's table", f"{low:.2f} – {high:.2f}"
+        kernels, stretch = entry["kernels"] or "published table", f"{low:.2f} – {high:.2f}"
         rows.append((site, entry["pixel_um"], kernels, stretch, table.source))
     yield page.Heading("Microstructure")
     yield page.Images(images)
@@ -124,36 +124,36 @@ def _microstructure(appearance: SkinAppearance, part: Mapping[str, Any]) -> Iter
         ]
     )
     yield page.table(
-        ("site", "pixel, um", "kernels fitted", "stretch", "table from"),
+        ("site", "pixel, um", "kernels fitted", "stretch ratio", "source of the table"),
         rows,
         caption="Sites with microstructure",
     )
 
 
 MAX_SHOWN_STATES = 4
-"""States drawn; the tables list all."""
+"""Expressions drawn; the tables list all."""
 
 
 def facial_color(
     subject: page.ReportedAppearance, part: Mapping[str, Any], truths: Mapping[str, SkinAppearance]
 ) -> Iterator[page.Block]:
-    """Yield the states of a face's blood, how they repeat, and how far off they are.
+    """Yield the blood volume fraction of each expression, its repeatability and its errors.
 
     Parameters
     ----------
     subject
         Folder of `skinrig.appearances.dynamic`.
     part
-        What it records of the blood's fit.
+        Record of the fit.
     truths
-        True blood of each state, as far as it is there.
+        True blood volume fraction by expression, where given.
     """
     appearance = subject.appearance
     rig = hemoglobin_rig(appearance)
     yield page.Heading("Hemoglobin rig")
     yield page.note(
-        "Each state is a scale and a bias of the neutral "
-        f"map, over discs of {rig.radius_px:.1f} px; a blend is an affine combination."
+        "Each expression scales and offsets the neutral map over discs of "
+        f"{rig.radius_px:.1f} px. Blends are affine combinations."
     )
     yield from _blends(appearance, rig)
     mean = {state: _mean_change(appearance.maps.get(f"change_{state}")) for state in rig.states}
@@ -171,7 +171,7 @@ def facial_color(
         blend = rig.evaluate({state: 1.0})
         seen = blend.valid if true is None else blend.valid & true.mask
         yield from map_images.map_panel(
-            f"blood of {state}, by the rig",
+            f"blood volume fraction of {state}, by the rig",
             "volume fraction",
             estimate=np.where(blend.valid, blend.hemoglobin, 0.0),
             standard_error=np.where(blend.valid, blend.stderr, 0.0),
@@ -181,7 +181,7 @@ def facial_color(
 
 
 def _blends(appearance: SkinAppearance, rig: HemoglobinRig) -> Iterator[page.Block]:
-    """Draw the face's color in each state and in the first two together."""
+    """Draw the skin color of each expression and of the first two together."""
     melanin = appearance.maps.get("melanin")
     if melanin is None:
         return
@@ -197,7 +197,7 @@ def _blends(appearance: SkinAppearance, rig: HemoglobinRig) -> Iterator[page.Blo
         color = skin_reflectance(melanin.values, np.where(seen, blend.hemoglobin, 0.0), seen)
         images.append(map_images.color_image(title, color, width=WIDTH_PX))
     yield page.Images(images)
-    yield page.note("Diffuse color without shading, linear sRGB under D65.")
+    yield page.note("Diffuse reflectance without shading, linear sRGB under D65.")
 
 
 def _color_errors(
@@ -210,7 +210,7 @@ def _color_errors(
     banded = errors_by_band(rig, truths)
     for row in states:
         if row.method == evaluation.PREDICTION_METHODS[1]:
-            text = f"blood of {row.state} by the rig, median error"
+            text = f"blood volume fraction of {row.state}, median error"
             got, worst = row.median_relative, _worst_band(row.state, banded)
             limit = evaluation.MAX_LEVEL_ERROR
             subject.check_fraction(text, got, limit, coverage=row.coverage, worst=worst)
@@ -221,26 +221,28 @@ def _color_errors(
         way: [found.get((label, way), float("nan")) for label in labels]
         for way in evaluation.PREDICTION_METHODS
     }
-    yield page.Plots([figures.bars("median error of a state's blood", labels, series, unit="%")])
+    yield page.Plots(
+        [figures.bars("median error of the blood volume fraction", labels, series, unit="%")]
+    )
 
 
 def errors_by_band(
     rig: HemoglobinRig, truths: Mapping[str, SkinAppearance]
 ) -> list[tuple[object, ...]]:
-    """Return the errors of each state's blood by the rig, by band of true melanin.
+    """Return the errors of the rig by expression and band of true melanin.
 
     Parameters
     ----------
     rig
         Its states.
     truths
-        Of each state; a state whose truth has no "melanin", at rest, is left out.
+        By expression; those without "melanin" at rest are omitted.
 
     Returns
     -------
     list of tuple
-        State, band, pixels, median size of the relative error in percent, bias in percent, share
-        of truths within one standard error in percent.
+        Expression, band, pixels; in percent: median relative |error|, bias, coverage of one
+        standard uncertainty.
     """
     rows: list[tuple[object, ...]] = []
     for state in rig.states:
@@ -264,7 +266,7 @@ def errors_by_band(
 
 
 def _worst_band(state: str, banded: list[tuple[object, ...]]) -> str:
-    """Return the band of a state's largest error, where there are several."""
+    """Return the band of the largest error, where there are several."""
     own = [(float(str(row[3])), str(row[1])) for row in banded if row[0] == state]
     if len(own) < 2:
         return ""

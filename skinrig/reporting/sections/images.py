@@ -1,4 +1,4 @@
-"""The report's section on rendered models and analyses: their pictures, and what they were told."""
+"""Report section on renderings and analyses: their images and settings."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,10 +9,10 @@ from skinrig.drawing import png
 from skinrig.reporting import page
 
 DOCUMENT_FILES = ("render.json", "analysis.json")
-"""Files that tell a folder of pictures."""
+"""Files that mark a folder of images."""
 SCHEMA_PREFIXES = ("skinrig.render/", "skinrig.analyse")
 MAX_IMAGE_BYTES = 600_000
-"""Larger pictures stay in their folder: a report is to be sent by mail."""
+"""Larger images stay in their folder, so that a report can be sent by mail."""
 FULL_MODEL = "full model"
 
 
@@ -26,14 +26,14 @@ def folder_document(folder: Path) -> Path | None:
 
 
 def section(folder: Path, checks: list[page.Check]) -> Iterator[page.Block]:
-    """Yield what lies in a folder that `skinrig render` or `skinrig analyse` wrote.
+    """Yield the contents of a folder of `skinrig render` or `skinrig analyse`.
 
     Parameters
     ----------
     folder
-        With its document beside the pictures.
+        With its document and images.
     checks
-        The report's; a comparison with photographs adds its limit.
+        Checks of the report; a comparison with photographs adds one.
     """
     path = folder_document(folder)
     if path is None:
@@ -49,23 +49,23 @@ def section(folder: Path, checks: list[page.Check]) -> Iterator[page.Block]:
             {
                 "view": document["view"].get("name", ""),
                 "lights": ", ".join(document.get("lights", {})),
-                "light inside the skin": document.get("subsurface", ""),
-                "lobes": document.get("lobes", ""),
+                "subsurface scattering": document.get("subsurface", ""),
+                "basis BRDFs": document.get("lobes", ""),
                 "unit": document.get("unit", ""),
             },
-            caption="What was asked for",
+            caption="Settings of the rendering",
         )
     for one in document.get("datasets", ()):
         yield from _data_set(one)
     yield from _images(folder)
     if document.get("assumed"):
-        yield page.Heading("Assumed")
+        yield page.Heading("Assumptions")
         yield page.assumptions(document["assumed"])
 
 
 def _heading(document: Mapping[str, Any]) -> str:
     if FULL_MODEL in document:
-        return "Renderings beside photographs"
+        return "Renderings and photographs"
     return "Rendering" if "view" in document else "Analysis"
 
 
@@ -73,8 +73,8 @@ def _comparison(
     name: str, document: Mapping[str, Any], checks: list[page.Check]
 ) -> Iterator[page.Block]:
     full = document[FULL_MODEL]
-    what = f"{name}: luminance of held-out photographs, median error on lit pixels"
-    note = f"noise alone makes {100 * full['noise']:.2f} %"
+    what = f"{name}: luminance of held-out photographs, median error"
+    note = f"noise alone: {100 * full['noise']:.2f} %"
     judged = 100 * full["median"], 100 * document["limit"]
     checks.append(page.Check(what, *judged, "<=", "%", note))
     kinds = {f"{kind} held out": row for kind, row in document["by_kind"].items()}
@@ -91,8 +91,8 @@ def _data_set(one: Mapping[str, Any]) -> Iterator[page.Block]:
         (rank, *(float("nan") if one[key][k] is None else one[key][k] for key in head))
         for k, rank in enumerate(ranks)
     ]
-    caption = f"Errors by number of lobes: {one.get('name', '')}"
-    yield page.table(("lobes", *(n.replace("_", " ") for n in head)), rows, caption=caption)
+    caption = f"Errors by number of basis BRDFs: {one.get('name', '')}"
+    yield page.table(("basis BRDFs", *(n.replace("_", " ") for n in head)), rows, caption=caption)
 
 
 def _images(folder: Path) -> Iterator[page.Block]:
@@ -107,4 +107,4 @@ def _images(folder: Path) -> Iterator[page.Block]:
         figures.append(page.Image(title, png.to_data_url(data), title))
     yield page.Images(figures)
     if kept:
-        yield page.note(f"Too large for here: {', '.join(kept)}.")
+        yield page.note(f"Too large for this report: {', '.join(kept)}.")

@@ -1,4 +1,4 @@
-"""The report's section on microrelief: states of strain beside their truths, and their trends."""
+"""Report section on microrelief: strain steps with ground truth, and trends."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,24 +19,24 @@ from skinrig.reporting.map_names import state_title
 T = TypeVar("T")
 WIDTH_PX = 200
 MAX_SHOWN_STATES = 7
-"""States shown as pictures, spread evenly over those there are."""
+"""Strain steps drawn, at even intervals."""
 SHOWN_HISTOGRAM_FRACTION = 0.75
-"""Part of a histogram's side that is shown, from its middle."""
+"""Central fraction of each side of a histogram that is shown."""
 
 
 def is_microrelief(appearance: SkinAppearance) -> bool:
-    """Return whether an appearance holds states of stretched skin."""
+    """Return whether an appearance holds strain steps of skin."""
     return bool(evaluation.find_states(appearance))
 
 
 def section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
-    """Yield the states of stretched skin, their histograms, kernels and errors.
+    """Yield the strain steps of skin, their histograms, kernels and errors.
 
     Parameters
     ----------
     subject
         With maps "normals_<state>" and "height_<state>".
-        Its truth is of the same session; None: standard errors only.
+        Its truth is of the same session; None: uncertainties only.
     """
     yield from _images(subject.appearance, subject.truth)
     yield from _relief_errors(subject)
@@ -71,7 +71,7 @@ def _images(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterato
 def _beside_truth(
     state: str, appearance: SkinAppearance, truth: SkinAppearance | None
 ) -> Iterator[page.Block]:
-    """Yield truth | estimate | error | standard error of one state's normals and height."""
+    """Yield ground truth | estimate | error | uncertainty of normals and height of one step."""
     normals = appearance.maps.get(f"normals_{state}")
     true = None if truth is None else truth.maps.get(f"normals_{state}")
     words = f"normals, {state_title(state)}"
@@ -80,11 +80,11 @@ def _beside_truth(
         if true is not None:
             good = normals.mask & true.mask
             error = np.degrees(metrics.angular_error_rad(normals.values, true.values))
-            parts.insert(0, _scalar_image(words, true).normals("truth", true.values))
+            parts.insert(0, _scalar_image(words, true).normals("ground truth", true.values))
             parts.append(_angle_image("error", np.nan_to_num(error), good, words))
         if normals.stderr is not None:
             spread = np.degrees(normals.stderr[..., 0])
-            parts.append(_angle_image("standard error", spread, normals.mask, words))
+            parts.append(_angle_image("standard uncertainty", spread, normals.mask, words))
         yield page.Heading(words)
         yield page.Images(parts)
     height = appearance.maps.get(f"height_{state}")
@@ -130,7 +130,7 @@ def _relief_errors(subject: page.ReportedAppearance) -> Iterator[page.Block]:
         where, worst_got = f"{state_title(worst.state)}: {worst.mean_deg:.3g}°", worst.mean_deg
     for row in neutral:
         subject.check(
-            "specular normals at the lens's resolution, mean error",
+            "specular normals, mean error",
             row.mean_deg,
             evaluation.MAX_NORMAL_ERROR_DEG,
             "°",
@@ -154,7 +154,7 @@ def _strain(subject: page.ReportedAppearance) -> Iterator[page.Block]:
     if errors:
         worst = max(errors, key=lambda row: abs(row.error))
         got, where = abs(worst.error), state_title(worst.state)
-        text = "stretch of the skin, largest error"
+        text = "stretch ratio, largest error"
         subject.check(text, got, evaluation.MAX_STRAIN_ERROR, worst=where)
     yield page.view("strain", states=document["states"], truths=true, degrees=math.degrees)
 
@@ -176,13 +176,13 @@ def _histograms(appearance: SkinAppearance) -> Iterator[page.Block]:
         drawing = map_images.MapDrawing("histogram of normals", width=WIDTH_PX)
         panels.append(drawing.size(state_title(state["name"]), shown, top))
     aliased = [state_title(state["name"]) for state in states if state["aliased"]]
-    yield page.Heading("Histograms of normals, root of share")
-    yield page.note("Along the jaws to the right, across them up.")
+    yield page.Heading("Histograms of normals, square root of frequency")
+    yield page.note("Horizontal: along the jaws. Vertical: across the jaws.")
     yield page.Images(panels, small=True)
     if aliased:
         yield page.note(
-            f"Too few samples a bucket in {'; '.join(aliased)}: distances between these "
-            "histograms show chance."
+            f"Too few samples per bin in {'; '.join(aliased)}. Distances between these "
+            "histograms are sampling noise."
         )
 
 
@@ -206,7 +206,7 @@ def _variances(appearance: SkinAppearance) -> Iterator[page.Block]:
 
 
 def _select_states(states: Sequence[T]) -> list[T]:
-    """Return at most `MAX_SHOWN_STATES` of some states, evenly."""
+    """Return at most `MAX_SHOWN_STATES` strain steps at even intervals."""
     count = min(MAX_SHOWN_STATES, len(states))
     return [states[round(k)] for k in np.linspace(0, len(states) - 1, count)]
 
@@ -217,12 +217,12 @@ def _by_step(state: str) -> tuple[str, int]:
 
 
 def kernels(subject: page.ReportedAppearance) -> Iterator[page.Block]:
-    """Yield kernels by state and direction, and judge the distances that they leave.
+    """Yield kernels by strain step and direction, and check their residual distances.
 
     Parameters
     ----------
     subject
-        With the kernel document; without it nothing is returned.
+        With the kernel document; without it nothing is yielded.
     """
     document = read_document(subject.appearance, KERNEL_FILE)
     if document is None or not document["fits"]:
@@ -233,7 +233,7 @@ def kernels(subject: page.ReportedAppearance) -> Iterator[page.Block]:
         worst = max(judged, key=lambda fit: fit["distance"] / fit["distance_before"])
         got = worst["distance"] / worst["distance_before"]
         where = state_title(worst["name"])
-        text = "histogram distance after the kernel over that before, worst state"
+        text = "ratio of histogram distances after and before the kernel, largest"
         subject.check(text, got, evaluation.MAX_HISTOGRAM_DISTANCE, worst=where)
     untold = [state_title(fit["name"]) for fit in fits if fit["valid"] and not _is_significant(fit)]
     yield page.view("kernels", fits=fits, untold=untold)
@@ -266,7 +266,7 @@ def _kernel_plots(
             line = table["lines"]
             drawn = [parse_number(v) for v in line[key]]
             series.append(
-                figures.PlotSeries(f"lines, {table['name']}", line["stretch"], drawn, marks=False)
+                figures.PlotSeries(f"fit, {table['name']}", line["stretch"], drawn, marks=False)
             )
         if series:
             plots.append(figures.curves(title, "stretch ratio r of the skin", title, series))
@@ -274,5 +274,5 @@ def _kernel_plots(
 
 
 def _is_significant(fit: Mapping[str, Any]) -> bool:
-    """Return whether a strain changes the histogram by more than twice what chance does."""
+    """Return whether strain changes the histogram by more than twice the sampling noise."""
     return parse_number(fit["distance_before"]) > 2.0 * parse_number(fit["noise_floor"])

@@ -1,4 +1,4 @@
-"""The report's section on a sequence in time: blood at places against phase, and how fast it is."""
+"""Report section on a sequence: blood by region and phase, with time constants."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -21,16 +21,16 @@ def is_sequence(appearance: SkinAppearance) -> bool:
 
 
 def section(appearance: SkinAppearance) -> Iterator[page.Block]:
-    """Yield the curves of all places, their levels and time constants, and what is covered."""
+    """Yield the curves of all regions, their levels, time constants and phase coverage."""
     told = json.loads(appearance.files[CURVES_FILE])
     cycle_s = told.get("cycle_s")
-    yield page.Heading(f"Blood in time: {told['state']}")
+    yield page.Heading(f"Blood volume fraction in time: {told['state']}")
     if cycle_s is not None:
         phases = told["phases"]
         yield page.note(
-            f"{phases['captures']} images meet {phases['distinct']} phases of a "
-            f"cycle of {cycle_s:g} s, {phases['interval_s']:g} s apart, one every "
-            f"{told['shot_period_s']:g} s; ordered by the flash's true time."
+            f"{phases['captures']} images, one every {told['shot_period_s']:g} s, sample "
+            f"{phases['distinct']} phases of a cycle of {cycle_s:g} s. The phases are "
+            f"{phases['interval_s']:g} s apart. Images are ordered by flash time."
         )
     yield _curves(told, cycle_s)
     yield page.view("sequence", told=told, seen=_words)
@@ -47,13 +47,15 @@ def _curves(document: Mapping[str, Any], cycle_s: float | None) -> page.Plots:
         color, line = PLACE_COLORS[index % len(PLACE_COLORS)], cycle_s is None
         points = when[order], values[order], errors[order]
         curves.append(figures.PlotSeries(place, *points, line=line, color=color))
-    title = f"blood in {document['state']}"
-    return page.Plots([figures.curves(title, axis, "blood, % of the dermis' volume", curves)])
+    title = f"blood volume fraction, {document['state']}"
+    return page.Plots(
+        [figures.curves(title, axis, "blood volume fraction, % of the dermis", curves)]
+    )
 
 
 def _words(transition: Mapping[str, Any]) -> str:
     if not transition["decided"]:
-        return "cannot be told"
+        return "undetermined"
     power = transition.get("power")
-    certain = "" if power is None else f" (would be seen with a chance of {100 * power:.0f} %)"
+    certain = "" if power is None else f" (power of the test: {100 * power:.0f} %)"
     return "yes" if transition["seen"] else f"no{certain}"

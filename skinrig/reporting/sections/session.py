@@ -1,4 +1,4 @@
-"""The report's section on sessions: what was captured, when, on what."""
+"""Report section on sessions: rig, date, source and frames."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +13,7 @@ from skinrig.simulating.effect_omission import is_omittable
 
 @dataclass(frozen=True, slots=True)
 class SessionFacts:
-    """What a session says of itself."""
+    """Facts that a session records."""
 
     rig: str
     day: date
@@ -24,13 +24,13 @@ class SessionFacts:
 
     @property
     def cells(self) -> tuple[object, ...]:
-        """What a row of the table says of it."""
+        """Row of the table."""
         seed = "" if self.seed is None else self.seed
         return self.rig, self.day.isoformat(), self.source, seed, self.frames, self.megabytes
 
 
 def read_session_facts(folders: Sequence[Path]) -> dict[str, SessionFacts]:
-    """Return what sessions say of themselves, by folder name."""
+    """Return the facts that sessions record, by folder name."""
     found = {}
     for folder in folders:
         document = json.loads((folder / "session.json").read_text(encoding="utf-8"))
@@ -54,16 +54,16 @@ def section(sessions: Mapping[str, SessionFacts]) -> Iterator[page.Block]:
     yield page.table(
         ("session", "rig", "captured", "source", "seed", "frames", "MB"),
         [(name, *one.cells) for name, one in sessions.items()],
-        caption="Frames on disk; `skinrig verify` checks every one of them",
+        caption="Frames on disk; `skinrig verify` checks each of them",
     )
 
 
 VERDICT_WORDS = {
-    "asked": "left out as asked",
-    "negligible": "left out, too small",
+    "asked": "omitted by option",
+    "negligible": "omitted, negligible",
     "unmodeled": "not modeled",
-    "absent": "not there",
-    "built": "built",
+    "absent": "absent",
+    "built": "simulated",
 }
 """In the order in which verdicts are listed, see `rigsim.needs.effects.VERDICT_MEANINGS`."""
 
@@ -87,17 +87,17 @@ def read_effects(session: Path) -> list[Mapping[str, Any]]:
 
 
 def omissions(sessions: Sequence[Path]) -> Iterator[page.Block]:
-    """Yield what the scenes of simulated sessions hold; empty where no session tells.
+    """Yield the effects of simulated scenes; empty where no session records them.
 
     Parameters
     ----------
     sessions
-        SESSION/ folders. Those whose scenes are alike share a table.
+        SESSION/ folders. Sessions with equal scenes share a table.
 
     Yields
     ------
     Block
-        HTML, the same for the same sessions in any order.
+        The same for the same sessions in any order.
     """
     alike: dict[str, list[str]] = {}
     for session in sorted(sessions):
@@ -106,7 +106,7 @@ def omissions(sessions: Sequence[Path]) -> Iterator[page.Block]:
             alike.setdefault(json.dumps(found, sort_keys=True), []).append(session.name)
     if not alike:
         return
-    yield page.Heading("What simulated scenes leave out", level=2)
+    yield page.Heading("Effects in simulated scenes", level=2)
     yield page.view("omissions")
     order = list(VERDICT_WORDS.values())
     for text, names in alike.items():
@@ -114,9 +114,9 @@ def omissions(sessions: Sequence[Path]) -> Iterator[page.Block]:
         rows = [_effect_row(effect) for effect in effects]
         rows.sort(key=lambda row: (*order, row[1]).index(row[1]))
         out = sum(not effect["verdict"] == "built" for effect in effects)
-        title = f"{', '.join(names)}: of {len(effects)} effects {len(effects) - out} built"
-        head = ("effect", "what became of it", "why", "change over noise", "--leave-out")
-        table = page.table(head, rows, caption="Effects of light in the scene")
+        title = f"{', '.join(names)}: {len(effects) - out} of {len(effects)} effects simulated"
+        head = ("effect", "treatment", "reason", "change over noise", "option name")
+        table = page.table(head, rows, caption="Optical effects of the scene")
         yield page.Folded(title, [table])
 
 

@@ -1,4 +1,4 @@
-"""The report's section on a fibre probe: profiles with fits and residuals, sigma_tr by method."""
+"""Report section on a fiber probe: profiles with fits and residuals, sigma_tr by method."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,7 +37,7 @@ METHOD_NAMES = {"photon_table": "photon table", "diffusion": "diffusion", "dipol
 
 
 def is_probe(appearance: SkinAppearance) -> bool:
-    """Return whether an appearance holds profiles of a fibre probe."""
+    """Return whether an appearance holds profiles of a fiber probe."""
     return PROFILE_FILE in appearance.files or SUBSURFACE_FILE in appearance.files
 
 
@@ -48,7 +48,7 @@ def section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
     ----------
     subject
         With the documents of `reconstruction.pipeline.probe.stages`.
-        Its truth is of the same session; None: standard errors only.
+        Its truth is of the same session; None: uncertainties only.
     """
     appearance = subject.appearance
     yield from _plots(appearance)
@@ -65,54 +65,73 @@ def section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
 
 def _plots(appearance: SkinAppearance) -> Iterator[page.Block]:
     measured = evaluation.read_document(appearance, PROFILE_FILE)
-    fitted = evaluation.read_document(appearance, SUBSURFACE_FILE)
     if measured is None:
         return
-    by_name = {} if fitted is None else {entry["name"]: entry for entry in fitted["measurements"]}
+    fits = _fits_by_name(appearance)
     radius = measured["radius_mm"]
     plots = []
     for entry in _first_per_site(measured["measurements"])[:MAX_PLOTTED_MEASUREMENTS]:
-        found = by_name.get(entry["name"])
-        series = []
-        for channel in CHANNEL_NAMES:
-            one, color = entry["channels"][channel], CHANNEL_COLORS[channel]
-            value, stderr = parse_numbers(one["reflectance_per_mm2"]), parse_numbers(one["stderr"])
-            value = np.where(np.asarray(one["valid"], bool), value, np.nan)
-            name = f"{channel}, measured"
-            series.append(figures.PlotSeries(name, radius, value, stderr, line=False, color=color))
-            for fit in [] if found is None else found["fits"]:
-                if fit["channel"] == channel and fit["method"] == evaluation.RECOMMENDED_METHOD:
-                    predicted, name = parse_numbers(fit["predicted_per_mm2"]), f"{channel}, fit"
-                    series.append(
-                        figures.PlotSeries(name, radius, predicted, marks=False, color=color)
-                    )
+        found = fits.get(entry["name"])
         title = f"{_words(entry)}: profile and photon-table fit"
-        axes = "distance from the source, mm", "reflectance, 1/mm²"
-        plots.append(figures.curves(title, *axes, series, log_y=True))
+        plots.append(_profile(title, entry, found, radius))
         plots += _residuals(entry, found, radius)
     yield page.Heading("Radial profiles")
     yield page.Plots(plots)
 
 
+def first_profile(appearance: SkinAppearance) -> str:
+    """Return the plot of a probe's first radial profile as SVG; empty where there is none."""
+    measured = evaluation.read_document(appearance, PROFILE_FILE)
+    if measured is None or not measured["measurements"]:
+        return ""
+    entry = measured["measurements"][0]
+    found = _fits_by_name(appearance).get(entry["name"])
+    return _profile(_words(entry), entry, found, measured["radius_mm"])
+
+
+def _fits_by_name(appearance: SkinAppearance) -> Mapping[str, Mapping[str, Any]]:
+    fitted = evaluation.read_document(appearance, SUBSURFACE_FILE)
+    return {} if fitted is None else {entry["name"]: entry for entry in fitted["measurements"]}
+
+
+def _profile(
+    title: str, entry: Mapping[str, Any], found: Mapping[str, Any] | None, radius: Sequence[float]
+) -> str:
+    """Draw the measured profile of each channel and its fit by the recommended method."""
+    series = []
+    for channel in CHANNEL_NAMES:
+        one, color = entry["channels"][channel], CHANNEL_COLORS[channel]
+        value, stderr = parse_numbers(one["reflectance_per_mm2"]), parse_numbers(one["stderr"])
+        value = np.where(np.asarray(one["valid"], bool), value, np.nan)
+        name = f"{channel}, measured"
+        series.append(figures.PlotSeries(name, radius, value, stderr, line=False, color=color))
+        for fit in [] if found is None else found["fits"]:
+            if fit["channel"] == channel and fit["method"] == evaluation.RECOMMENDED_METHOD:
+                predicted, name = parse_numbers(fit["predicted_per_mm2"]), f"{channel}, fit"
+                series.append(figures.PlotSeries(name, radius, predicted, marks=False, color=color))
+    axes = "distance from the source, mm", "reflectance, 1/mm²"
+    return figures.curves(title, *axes, series, log_y=True)
+
+
 def _residuals(
     entry: Mapping[str, Any], found: Mapping[str, Any] | None, radius: Sequence[float]
 ) -> list[str]:
-    """Draw what each method leaves of the green channel, in percent of the reading."""
+    """Draw the residuals of each method in the green channel, in percent."""
     channel = "green"
     one = entry["channels"][channel]
     value, stderr = parse_numbers(one["reflectance_per_mm2"]), parse_numbers(one["stderr"])
-    told = np.asarray(one["valid"], bool) & (value > evaluation.MIN_SIGNAL_TO_NOISE * stderr)
+    clear = np.asarray(one["valid"], bool) & (value > evaluation.MIN_SIGNAL_TO_NOISE * stderr)
     series = []
     for fit in [] if found is None else found["fits"]:
         if fit["channel"] == channel and fit["valid"]:
             left = 100.0 * np.where(
-                told, value / parse_numbers(fit["predicted_per_mm2"]) - 1.0, np.nan
+                clear, value / parse_numbers(fit["predicted_per_mm2"]) - 1.0, np.nan
             )
-            spread = 100.0 * stderr / np.where(told, value, np.nan)
+            spread = 100.0 * stderr / np.where(clear, value, np.nan)
             series.append(figures.PlotSeries(METHOD_NAMES[fit["method"]], radius, left, spread))
     if not series:
         return []
-    title = f"{_words(entry)}, {channel}: measured less fitted"
+    title = f"{_words(entry)}, {channel}: measured minus fitted"
     return [figures.curves(title, "distance from the source, mm", "% of the fit", series)]
 
 
@@ -141,14 +160,14 @@ def _errors(subject: page.ReportedAppearance) -> Iterator[page.Block]:
     yield page.single_subject_note(truth.parameters)
     for kind in dict.fromkeys(row.kind for row in rows):
         found = evaluation.summarize_methods([row for row in rows if row.kind == kind])
-        yield page.Heading(f"Error of sigma_tr against the truth, {kind} tissue")
+        yield page.Heading(f"Error of sigma_tr against the ground truth, {kind} tissue")
         yield page.view("methods", errors=found, methods=METHOD_NAMES, kind=kind)
         yield from _by_channel([row for row in rows if row.kind == kind])
         best = next((row for row in found if row.method == evaluation.RECOMMENDED_METHOD), None)
         if kind == "homogeneous" and best is not None:
             for word, got, bound in (
                 ("median", best.median, evaluation.MAX_MEDIAN_ERROR),
-                ("worst", best.worst, evaluation.MAX_WORST_ERROR),
+                ("largest", best.worst, evaluation.MAX_WORST_ERROR),
             ):
                 subject.check_fraction(f"sigma_tr, {word} error", got, bound)
     if profiles := evaluation.compare_profiles(appearance, truth):
@@ -169,7 +188,7 @@ def _by_channel(rows: Sequence[evaluation.FitAccuracy]) -> Iterator[page.Block]:
 
 
 def _map(appearance: SkinAppearance) -> Iterator[page.Block]:
-    """Yield 1/sigma_tr over the face's texture, each channel beside its standard error."""
+    """Yield the diffuse mean free path over the face texture, with its uncertainty."""
     found = appearance.maps.get("translucency")
     if found is None:
         return
@@ -181,14 +200,14 @@ def _map(appearance: SkinAppearance) -> Iterator[page.Block]:
         if not inside.size:
             continue
         low, high = float(inside.min()), float(inside.max())
-        images.append(drawing.draw_scalar(f"translucency, {channel}", values, low, high))
+        images.append(drawing.draw_scalar(f"diffuse mean free path, {channel}", values, low, high))
         if found.stderr is not None:
             spread = found.stderr[..., c]
-            images.append(drawing.size("standard error", spread, float(spread.max())))
-    yield page.Heading("Translucency map")
+            images.append(drawing.size("standard uncertainty", spread, float(spread.max())))
+    yield page.Heading("Map of the diffuse mean free path")
     yield page.note(
-        "1/sigma_tr over the face's texture, between the measured sites by kriging; away from "
-        "them the error grows to what people differ by."
+        "1/sigma_tr over the face texture, interpolated between the measured sites by kriging. "
+        "Far from the sites, the uncertainty is the variation between people."
     )
     yield page.Images(images)
 
@@ -201,7 +220,7 @@ def _first_per_site(measurements: Sequence[Mapping[str, Any]]) -> list[Mapping[s
 
 
 def _words_of_name(name: str) -> str:
-    """Return a measurement in words, from its name in documents.
+    """Return the label of a measurement, from its name in documents.
 
     Examples
     --------
@@ -218,7 +237,7 @@ def _words_of_name(name: str) -> str:
 
 
 def _words(entry: Mapping[str, Any]) -> str:
-    """Return a measurement in words.
+    """Return the label of a measurement.
 
     Examples
     --------
@@ -234,9 +253,9 @@ def _words(entry: Mapping[str, Any]) -> str:
 
 
 POPULATION_SIZE = 87
-"""As many as Weyrich et al. 2005 measured."""
+"""Subjects of Weyrich et al. 2005."""
 MEDIUM_PREFIXES = ("homogeneous:", "anisotropic:")
-"""How simulated subjects that are media are named."""
+"""Prefixes of the names of simulated media."""
 
 
 def over_people(
@@ -247,10 +266,10 @@ def over_people(
     Parameters
     ----------
     appearances
-        By name; each that holds fits of a fibre probe counts as a person, unless its truth says
-        that it is a medium.
+        By name; each with fits of a fiber probe counts as a person, unless its ground truth is
+        a medium.
     truths
-        Folders of truths by name.
+        Folders of ground truths by name.
     """
     people = {
         name: fits
@@ -264,12 +283,11 @@ def over_people(
     drawn = table(
         published.sample(POPULATION_SIZE, rng=np.random.default_rng(0)), sites=published.sites
     )
-    yield page.Heading("sigma_tr over people, 1/mm", level=2)
+    yield page.Heading("sigma_tr by person, 1/mm", level=2)
     yield page.note(
-        "Deviations are over people. The publication heads its second column "
-        "“Var.”; as variances its numbers would contradict the extremes that it shows, so that "
-        "they are read as standard deviations. The smallest sigma_tr is the most translucent "
-        "skin."
+        "Standard deviations are over people. The second column of the published table has the "
+        "heading “Var.”. Variances would contradict the published extremes, so these values are "
+        "used as standard deviations."
     )
     rows: list[tuple[object, ...]] = []
     for c, channel in enumerate(CHANNEL_NAMES):
@@ -277,22 +295,24 @@ def over_people(
         cells = (float(one) for pair in pairs for one in pair)
         rows.append(("published (Weyrich et al. 2005, table 2)", channel, *cells))
     rows += _people_rows(
-        f"simulated, {POPULATION_SIZE} people drawn from it", drawn, published.sites
+        f"simulated, {POPULATION_SIZE} people drawn from the published table",
+        drawn,
+        published.sites,
     )
     measured = [one for name, fits in people.items() for one in _measured(name, fits)]
     if measured:
         found = summarize(measured)
         many = "session" if len(people) == 1 else "sessions"
-        rows += _people_rows(f"measured here, {len(people)} {many}", found, published.sites)
+        rows += _people_rows(f"this report, {len(people)} {many}", found, published.sites)
     columns = [f"{site}, {word}" for site in published.sites for word in ("mean", "deviation")]
-    head = ("who", "channel", *columns)
+    head = ("population", "channel", *columns)
     yield page.table(
         head, rows, caption="Mean and standard deviation over people, red, green and blue light"
     )
 
 
 def _is_medium(appearance: SkinAppearance, truths: Mapping[str, Path]) -> bool:
-    """Tell a simulated medium of given coefficients, which is nobody's skin."""
+    """Return whether an appearance is of a simulated medium."""
     folder = truths.get(str(appearance.parameters.get("truth", "")))
     if folder is None:
         return False
@@ -316,7 +336,7 @@ def _people_rows(
 
 
 def _measured(name: str, fits: Mapping[str, Any]) -> list[SiteMeasurement]:
-    """Return the sites of a person that are known in every channel."""
+    """Return the sites of a person with a value in every channel."""
     by_site: dict[str, list[Mapping[str, Any]]] = {}
     for entry in fits["sites"]:
         by_site.setdefault(entry["site"], []).append(entry)

@@ -1,4 +1,4 @@
-"""The report's section on a surface: maps seen from the front beside their truth."""
+"""Report section on a surface: maps projected to the front, with their ground truth."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -17,23 +17,23 @@ from skinrig.reporting.map_names import map_heading, map_title
 from skinrig.unit_format import format_unit
 
 SMALL_WIDTH_PX = 110
-"""Of earlier normals, lobes, samples and residuals: every second pixel of the others."""
+"""Width of half-vector normals, weights, samples and residuals."""
 BACKGROUND_CODE = 0.5
 Box = tuple[FloatArray, FloatArray]
 Index = NDArray[np.intp]
 RELATIVE_ERROR_MAPS = ("r_d",)
-"""Maps whose standard errors are shown in percent of the estimate."""
+"""Maps with uncertainties in percent of the estimate."""
 FIRST_MAPS = ("r_d", "normals_refined", "normals", "half_vector_normals")
 
 
 def section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
-    """Yield the maps of an appearance on a mesh, beside their truth where there is one.
+    """Yield the maps of an appearance on a mesh, with their ground truth where given.
 
     Parameters
     ----------
     subject
         With a map "position".
-        Its truth is of the same subject, on an atlas of its own; None: standard errors only.
+        Its truth is of the same subject, on an atlas of its own; None: uncertainties only.
     """
     appearance, truth = subject.appearance, subject.truth
     place = appearance.maps["position"]
@@ -56,7 +56,7 @@ def section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
     best = next((key for key in FIRST_MAPS[1:] if key in appearance.maps), "")
     large = {"r_d", best}
     shown_truths: set[str] = set()
-    # what people look for first, then by name
+    # main maps first, then by name
     keys = [key for key in FIRST_MAPS if key in appearance.maps]
     keys += sorted(set(appearance.maps) - set(keys))
     minor = []
@@ -74,7 +74,7 @@ def section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
             if true_name not in shown_truths:  # of all estimates of normals there is one truth
                 flat = truth.maps[true_name].values
                 flat = flat.reshape(-1, *flat.shape[2:])[known]
-                figures.append(_shown("truth", key, *true_view.rasterize(flat), width=width))
+                figures.append(_shown("ground truth", key, *true_view.rasterize(flat), width=width))
                 shown_truths.add(true_name)
         figures.append(_shown("estimate", key, *view.rasterize(values, valid=good), width=width))
         if truth is not None and known_truth:
@@ -88,7 +88,7 @@ def section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
         else:
             minor += figures
     if minor:
-        yield page.Heading("Lobes, samples and residuals")
+        yield page.Heading("Basis BRDFs, samples and residuals")
         yield page.Images(minor, small=True)
     if truth is not None:
         yield from _errors(subject, truth)
@@ -98,7 +98,7 @@ def section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
 def _shown(
     title: str, key: str, image: Float64Array, valid: BoolArray, *, width: int
 ) -> page.Image:
-    drawing = map_images.MapDrawing(key, "", valid, width)
+    drawing = map_images.MapDrawing(map_title(key), "", valid, width)
     if image.ndim == 2:
         inside = image[valid & np.isfinite(image)]
         low, high = np.percentile(inside, [1, 99]) if inside.size else (0.0, 1.0)
@@ -106,12 +106,14 @@ def _shown(
     if "normals" in key:
         return drawing.normals(title, image)
     return map_images.color_image(
-        title, np.where(valid[..., None], image, BACKGROUND_CODE**2.2), of=f"{key}, linear sRGB"
+        title,
+        np.where(valid[..., None], image, BACKGROUND_CODE**2.2),
+        of=f"{map_title(key)}, linear sRGB",
     )
 
 
 def _title(title: str, key: str) -> str:
-    """Return what stands below a picture: of maps that share a heading, which one it is."""
+    """Return the caption of an image, with its map where several share a heading."""
     return title if key in FIRST_MAPS else f"{map_title(key)}, {title}"
 
 
@@ -128,9 +130,9 @@ def _error(
     image, valid = FrontView.of(points, box).rasterize(np.nan_to_num(error), valid=good)
     reach = map_images.percentile_reach(error, good, 95)
     if key in evaluation.NORMAL_MAPS:
-        return map_images.MapDrawing(key, "°", valid, width).size("error", image, reach)
-    return map_images.MapDrawing(key, "%", valid, width).draw_signed(
-        "estimate − truth", image, reach
+        return map_images.MapDrawing(map_title(key), "°", valid, width).size("error", image, reach)
+    return map_images.MapDrawing(map_title(key), "%", valid, width).draw_signed(
+        "estimate − ground truth", image, reach
     )
 
 
@@ -144,7 +146,7 @@ def _stderr_image(
 ) -> page.Image:
     unit = page.short_unit(skin_map.unit)
     good = skin_map.mask[texels]
-    if key in RELATIVE_ERROR_MAPS:  # as errors are told, beside which it stands
+    if key in RELATIVE_ERROR_MAPS:  # as its errors
         size = np.abs(skin_map.values[texels].astype(np.float64))
         good = good & (size > 0.0).reshape(len(good), -1).all(axis=-1)
         stderr, unit = 100.0 * stderr / np.where(size > 0.0, size, 1.0), "%"
@@ -154,8 +156,8 @@ def _stderr_image(
         stderr, unit = np.degrees(stderr), "°"
     image, valid = view.rasterize(stderr, valid=good)
     reach = map_images.percentile_reach(image, valid, 98)
-    drawing = map_images.MapDrawing(key, unit, valid, width)
-    return drawing.size(_title("standard error", key), image, reach)
+    drawing = map_images.MapDrawing(map_title(key), unit, valid, width)
+    return drawing.size(_title("standard uncertainty", key), image, reach)
 
 
 def _errors(subject: page.ReportedAppearance, truth: SkinAppearance) -> Iterator[page.Block]:
@@ -167,26 +169,26 @@ def _errors(subject: page.ReportedAppearance, truth: SkinAppearance) -> Iterator
     coarse = float(pixel_mm) > evaluation.MAX_EVALUATED_PIXEL_MM
     for row in found:
         if row.name == "half_vector_normals":
-            continue  # the published baseline, shown beside ours and held to nothing
+            continue  # the published baseline has no limit
         if row.unit == "deg" and coarse:
             continue
         what, got, bound = row.limit_check
         unit = format_unit(row.unit)
         where, worst_got = _worst(row.name, banded)
-        told: dict[str, Any] = {
+        more: dict[str, Any] = {
             "masked": row.masked,
             "coverage": row.coverage.fraction,
             "worst": where,
         }
         name = f"{map_title(row.name)}, {what}"
-        subject.check(name, got, bound, unit, worst_got=worst_got, **told)
+        subject.check(name, got, bound, unit, worst_got=worst_got, **more)
     bounds = evaluation.MAX_NORMAL_ERROR_DEG, evaluation.MAX_EVALUATED_PIXEL_MM
     pixel = pixel_mm if coarse else None
     yield page.view("surface_errors", errors=found, banded=banded, pixel_mm=pixel, bounds=bounds)
 
 
 def _worst(name: str, banded: list[Banded]) -> tuple[str, float]:
-    """Return the skin color of the largest error and that error, where there are several."""
+    """Return the skin color with the largest error, and that error."""
     own = [row for row in banded if row[0] == name.split()[0]]
     worst = page.find_worst(own, lambda row: row[5])
     if worst is None:
@@ -195,12 +197,12 @@ def _worst(name: str, banded: list[Banded]) -> tuple[str, float]:
 
 
 def _reflection(subject: page.ReportedAppearance, truth: SkinAppearance) -> Iterator[page.Block]:
-    """Compare the fitted reflection with the true one, in held-out directions and on spheres."""
+    """Compare the fitted reflectance with the true one, in held-out directions and on spheres."""
     held_out = reflection.compare(subject.appearance, truth, rng=np.random.default_rng(0))
     if held_out is None:
         return
     subject.check_fraction(
-        "reflection in held-out directions, median error",
+        "reflectance in held-out directions, median error",
         held_out.median,
         reflection.MAX_HELD_OUT_ERROR,
         f"{held_out.points} points × {held_out.directions} directions",
@@ -209,9 +211,9 @@ def _reflection(subject: page.ReportedAppearance, truth: SkinAppearance) -> Iter
     figures = []
     for site, true_image, image in reflection.render_spheres(subject.appearance, truth):
         bright = float(np.percentile(true_image.max(axis=-1), 99.5)) or 1.0
-        figures.append(map_images.color_image(f"{site}: truth", true_image / bright))
+        figures.append(map_images.color_image(f"{site}: ground truth", true_image / bright))
         if image is not None:
             figures.append(map_images.color_image(f"{site}: estimate", image / bright))
     if figures:
-        yield page.Heading("Reflection on spheres")
+        yield page.Heading("Reflectance on spheres")
         yield page.Images(figures)

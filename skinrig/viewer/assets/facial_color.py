@@ -66,10 +66,7 @@ def find_camera_color(source: SceneSource) -> CameraColor:
     if folder is not None:
         return _calibrated_color(folder)
     found = None if path is None else _tabulated_color(appearance, path)
-    shown = (
-        "its camera RGB is shown as if it were linear sRGB; --calibration names a folder with a "
-        "color calibration"
-    )
+    shown = "camera RGB is displayed as linear sRGB; give --calibration with a color calibration"
     return found or CameraColor(lambda rgb: rgb, shown, known=False)
 
 
@@ -130,8 +127,8 @@ def _tabulated_color(appearance: SkinAppearance, path: Path) -> CameraColor | No
     error = float(np.sqrt(np.mean((measured @ matrix - shown) ** 2)))
     return CameraColor(
         lambda rgb: np.asarray(rgb @ matrix),
-        f"a matrix between the colors of skin that the tabulated sensor {camera} and {light} and "
-        f"linear sRGB see, {error:.4f} RMS; no color calibration was found",
+        f"no color calibration was found; matrix for skin colors from the tabulated sensor "
+        f"{camera} under {light} to linear sRGB, {error:.4f} RMS",
     )
 
 
@@ -176,7 +173,7 @@ def assets(source: SceneSource) -> Assets:
         if not seen.known:
             left_out["colors of this face"] = seen.provenance
         left_out["chromophores of this face"] = (
-            "the dome measures color alone: states change it by the ratio of simulated blood"
+            "the dome measures color only; expressions scale it by the ratio of simulated blood"
         )
     return {
         "textures": textures,

@@ -258,7 +258,7 @@ def albedo_traits(source: SceneSource) -> AlbedoTraitLayers | str:
     """
     path = next((source.paths[kind] for kind in ("model", "dome") if kind in source.paths), None)
     if path is None:
-        return "edits of an albedo need one that was measured: the map R_d of a dome's session"
+        return "albedo edits need a measured albedo: the map R_d of a dome session"
     face = face_textures.read(path)
     if not {"position", "r_d"} <= set(face.appearance.maps):
         return f"{path.name} has no maps position and r_d"
@@ -334,7 +334,7 @@ def assets(source: SceneSource) -> Assets:
     surface = surface_traits(found)
     if surface is None:
         left_out["traits of the surface"] = (
-            "the lobes were fitted with other materials than the traits were learned with"
+            "the basis BRDFs of this fit differ from those of the traits"
         )
     else:
         found = surface.lobes

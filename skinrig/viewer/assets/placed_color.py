@@ -222,8 +222,8 @@ def place_facial_color(source: SceneSource) -> FaceColor:
     neutral, known = where.sample(rig.neutral, rig.valid)
     aside = float((atlas.covered & ~known).mean() / atlas.covered.mean())
     left_out = {
-        "color aside of the picture": f"{100 * aside:.0f} % of the skin did not face the camera; "
-        "it continues what is beside it"
+        "color outside the image": f"{100 * aside:.0f} % of the skin did not face the camera; "
+        "its color is extrapolated"
     }
     if MELANIN_MAP in appearance.maps:
         found = appearance.maps[MELANIN_MAP]
@@ -231,7 +231,7 @@ def place_facial_color(source: SceneSource) -> FaceColor:
         melanin, melanin_known = where.sample(found.values, valid)
         melanin = fill_holes(melanin, melanin_known)
     else:
-        left_out["melanin of this face"] = "no map of it is in the folder; simulated"
+        left_out["melanin of this face"] = "the folder has no melanin map; it is simulated"
         melanin = FineSkin(subject, size).melanin()
     cells = coarse_grid((size, size), RIG_PX)
 

@@ -305,7 +305,7 @@ def _diffusion_of(source: SceneSource) -> tuple[GaussianProfile, Float32Array | 
     widths = np.exp(fill_texels(off, known, TRANSLUCENCY_PX)[..., 0])
     record: Any = appearance.parameters.get("reflectance_model")
     if isinstance(record, dict) and record.get("translucency") == "measured":
-        told = "a fibre probe on this face"
+        told = "a fiber probe on this face"
     even = float(np.ptp(widths)) < 1e-3
     return gaussian_profiles.fit_gaussians(r_d, np.exp(-mean)), None if even else widths, told
 
@@ -345,10 +345,10 @@ def _facts(found: PageLobes, compact: CompactBrdf) -> dict[str, Any]:
 def _list_omissions(found: PageLobes, origin: str) -> tuple[tuple[str, str], ...]:
     rows = {}
     if found.origin == "population":
-        rows["lobes of this face"] = (
-            "none are fitted: the fitted reflectance shown is the mean surface of simulated "
-            "people; `skinrig view MODEL` with a dome's maps shows a face's own"
+        rows["basis BRDFs of this face"] = (
+            "not fitted; the mean of simulated people is shown. `skinrig view MODEL` with the maps "
+            "of a dome shows those of a face"
         )
     if "probe" not in origin:
-        rows["translucency of this face"] = f"no probe measured it: {origin}"
+        rows["diffuse mean free path of this face"] = f"not measured by a probe: {origin}"
     return tuple(rows.items())

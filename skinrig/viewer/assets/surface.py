@@ -198,7 +198,7 @@ def surface_assets(source: SceneSource) -> Assets:
     # hair hides the skin's gloss, as the subject's own renderings have it
     intensity = 1.0 - downsample(fill_holes(subject.hair, covered), MAPS_PX)
     maps = np.stack([roughness, intensity], axis=-1)
-    why = "what is drawn of them is simulated; the analytic reflection uses it"
+    why = "simulated; used by the analytic specular model"
     captured = source.kind in ("dynamic", "dome", "model")
     fine = RELIEF_STEP_WORDS if len(height) >= 2048 else 1
     return {

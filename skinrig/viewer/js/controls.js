@@ -8,17 +8,17 @@
 //     kind "own"     build(box) => update(p) or nothing
 //   V.say(text) speaks through the live region; V.afterStart.push(fn) runs behind the first frame.
 V.groups = [
-  ["view", "View", "What the picture shows: the face, or any buffer on the way to it.", true],
-  ["expression", "Expression", "Blend shapes move the mesh; blood, wrinkles and strain follow.", true],
+  ["view", "View", "The final image, or a buffer of one render pass.", true],
+  ["expression", "Expression", "Weights of the blend shapes; blood, wrinkles and strain follow.", true],
   ["blood", "Blood and melanin",
-    "Hemoglobin is blended from small maps of scale and bias; a table turns both into color.", true],
-  ["reflection", "Reflection", "Light that the surface turns back.", true],
-  ["scattering", "Scattering", "Light that enters, spreads in the skin and leaves again.", false],
-  ["traits", "Traits", "Directions in which faces of a population differ: more or less of each.", false],
-  ["relief", "Fine surface", "Pores, wrinkles and microstructure that no mesh holds.", false],
-  ["light", "Light and tone", "One distant light and an even one; how light becomes screen.", false],
-  ["cost", "Size and cost", "Passes, texture reads, bytes and time of a frame.", false],
-  ["about", "About this face", "Where it comes from, stated errors, and what the page lacks.", false],
+    "Blood is blended from maps of scale and bias. A table converts blood and melanin to color.", true],
+  ["reflection", "Reflection", "Specular reflection of the skin surface.", true],
+  ["scattering", "Scattering", "Subsurface scattering of light in the skin.", false],
+  ["traits", "Traits", "Principal differences between the faces of a population.", false],
+  ["relief", "Surface topography", "Pores, wrinkles and microstructure below the resolution of the mesh.", false],
+  ["light", "Light and tone", "One distant light, ambient light and tone mapping.", false],
+  ["cost", "Resolution and cost", "Passes, texture reads, bytes and time per frame.", false],
+  ["about", "About this face", "Provenance, errors, and omitted parts.", false],
 ];
 V.controls = [];
 V.afterStart = [];
@@ -159,7 +159,7 @@ V.reset = () => {
   }
   for (const name of Object.keys(back)) if (V.transient(name)) delete back[name];
   V.set(back);
-  V.say("All controls are as they were at first.");
+  V.say("All controls are reset.");
 };
 
 V.start.push(() => {
@@ -182,9 +182,9 @@ V.start.push(() => {
     V.rememberNow(V.params);
     try {
       await navigator.clipboard.writeText(location.href);
-      V.say("The link with all settings is in the clipboard.");
+      V.say("Link with all settings copied.");
     } catch {
-      V.say("The address of this page now holds all settings: copy it from the address bar.");
+      V.say("Copy the link with all settings from the address bar.");
     }
   };
 });

@@ -137,7 +137,7 @@ V.buildCosts = box => {
 };
 
 V.showCosts = (found, result, note) => {
-  const head = ["Pass", "Size", "Reads", "MB", "ms", "Share"];
+  const head = ["Pass", "Size", "Reads", "MB", "ms", "Fraction"];
   const row = (cells, tag = "td") => V.element("tr", {}, ...cells.map((cell, i) =>
     V.element(tag, i ? {className: "n"} : {}, cell)));
   const share = ms => found.ms > 0 ? `${Math.round(100 * ms / found.ms)} %` : "–";
@@ -148,12 +148,12 @@ V.showCosts = (found, result, note) => {
   const heading = row(head, "th");
   for (const cell of heading.children) cell.setAttribute("scope", "col");
   result.replaceChildren(V.element("table", {},
-    V.element("caption", {}, `${found.heads === 1 ? "One head" : `${found.heads} heads`}, every pass drawn anew`),
+    V.element("caption", {}, `${found.heads === 1 ? "One head" : `${found.heads} heads`}, all passes redrawn`),
     V.element("thead", {}, heading), V.element("tbody", {}, ...lines, total)));
   result.hidden = false;
-  note.textContent = `${found.software ? "The processor draws here (software GL): read shares, not milliseconds. " : ""}` +
-    `A whole frame took ${found.frame_ms.toFixed(1)} ms; with only the light moved, ${found.light_passes} passes ` +
-    `were drawn in ${found.light_ms.toFixed(1)} ms, the others were kept. ${V.renderer}.`;
+  note.textContent = `${found.software ? "Software rendering: fractions are meaningful, milliseconds are not. " : ""}` +
+    `A full frame takes ${found.frame_ms.toFixed(1)} ms. After a change of light, ${found.light_passes} passes ` +
+    `are redrawn in ${found.light_ms.toFixed(1)} ms. ${V.renderer}.`;
   V.say(`${found.passes} passes, ${V.thousands(found.taps)} texture reads, ${(found.bytes / 1e6).toFixed(1)} megabytes, ` +
     `${found.frame_ms.toFixed(0)} milliseconds`);
 };

@@ -3,9 +3,9 @@ Object.assign(V.defaults, {resolution: 0});
 V.tool = "orbit";
 
 V.TOOLS = {
-  orbit: "Drag or arrow keys: turn. Wheel, two fingers, + and −: nearer, farther. Shift and drag: shift the picture.",
+  orbit: "Drag or arrow keys: rotate. Wheel, pinch, + and −: zoom. Shift and drag: pan.",
   light: "Drag or arrow keys: move the light around the face.",
-  probe: "Click, or arrow keys (Shift: ten pixels) and Enter: read melanin and hemoglobin at a pixel.",
+  probe: "Click, or arrow keys (Shift: ten pixels) and Enter: read volume fractions at a pixel.",
 };
 
 V.setTool = name => {

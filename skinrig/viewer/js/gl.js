@@ -13,11 +13,11 @@ V.openContext = canvas => {
     alpha: false, antialias: false, depth: false, stencil: false, preserveDrawingBuffer: true,
   });
   if (!gl) {
-    throw new Error("this browser offers no WebGL2; open the page in a current Chrome, Firefox " +
-      "or Safari with hardware acceleration on");
+    throw new Error("this browser does not support WebGL2; open the page in a current Chrome, Firefox " +
+      "or Safari with hardware acceleration");
   }
   if (!gl.getExtension("EXT_color_buffer_float")) {
-    throw new Error("this graphics driver cannot draw into float buffers " +
+    throw new Error("this graphics driver does not support float render targets " +
       "(EXT_color_buffer_float); try another browser or device");
   }
   V.gl = gl;

@@ -3,16 +3,16 @@ V.has = (...names) => names.every(name => name in V.params);
 V.only = (...values) => values.filter(Boolean);
 
 V.BUFFERS = {
-  display: "Final picture", radiance: "Radiance before the tone map", irradiance: "Irradiance (depth in alpha)",
+  display: "Final image", radiance: "Radiance before tone mapping", irradiance: "Irradiance; depth in alpha",
   albedo: "Albedo", specular: "Specular reflection", normal: "Normals", inspect: "Texture coordinates, melanin",
-  hemoglobin_rig: "Hemoglobin: scale, bias", chromophores: "Melanin, hemoglobin", color: "Skin color",
-  scatter_source: "Light into the skin", albedo_factor: "Albedo traits: factor",
+  hemoglobin_rig: "Hemoglobin: scale, bias", chromophores: "Melanosome and blood volume fractions", color: "Skin color",
+  scatter_source: "Irradiance before scattering", relief: "Surface topography", albedo_factor: "Albedo factor of the traits",
 };
 V.bufferLabel = name => {
   const blur = /^scatter_(\d+)_([xy])$/.exec(name);
   if (blur) return `Scattering: Gaussian ${Number(blur[1]) + 1} along ${blur[2]}`;
   const shares = /^lobe_shares_(\d+)$/.exec(name);
-  if (shares) return `Lobe shares ${4 * shares[1] + 1} to ${4 * shares[1] + 4}`;
+  if (shares) return `Basis BRDF weights ${4 * shares[1] + 1} to ${4 * shares[1] + 4}`;
   return V.BUFFERS[name] ?? V.capital(V.words(name));
 };
 
@@ -40,7 +40,7 @@ V.globalStates = () => V.scene.facts.facial_color?.global_states ?? [];
 
 V.registerView = () => V.controls.push(
   {group: "view", kind: "choice", path: ["view"], label: "Buffer",
-    help: "A buffer is spread from black to white over its own range.",
+    help: "Values are scaled from black (minimum) to white (maximum).",
     options: () => V.bufferNames(V.params).map(name => [name, V.bufferLabel(name)])
       .sort(([a], [b]) => (b === "display") - (a === "display")),
     change: name => ({view: name, ...V.rangeOf(name)})},
@@ -49,13 +49,13 @@ V.registerView = () => V.controls.push(
 
 V.registerSize = () => V.controls.push(
   {group: "cost", kind: "choice", path: ["heads"], label: "Heads",
-    help: "Five heads at once are the paper's test of speed.",
+    help: "Jimenez et al. (2010) measure speed with five heads.",
     options: () => [[1, "One"], [2, "Two"], [3, "Three"], [5, "Five"]],
     change: heads => ({heads, ...V.framed(heads)})},
   {group: "cost", kind: "toggle", path: ["crowd"], label: "An expression for each head", off: p => p.heads < 2,
-    help: "The one in the middle follows the controls; the others add an emotion or a state to it."},
+    help: "The middle head follows the controls. The other heads add one expression each."},
   {group: "cost", kind: "choice", path: ["resolution"], label: "Resolution",
-    help: "Automatic keeps a frame quick: fewer pixels where the processor draws.",
+    help: "Automatic: fewer pixels without a graphics processor.",
     options: () => [[0, "Automatic"], [256, "256 pixels"], [384, "384 pixels"], [512, "512 pixels"],
       [768, "768 pixels"], [1024, "1024 pixels"]]},
 );
@@ -69,42 +69,42 @@ V.registerExpression = () => {
 };
 
 V.registerBlood = () => {
-  const why = {exercise: "Whole face, cheeks most: vessels open under load.",
-    alcohol: "Whole face, nose and cheeks most."};
+  const why = {exercise: "Vasodilation of the whole face, strongest on the cheeks.",
+    alcohol: "Vasodilation of the whole face, strongest on nose and cheeks."};
   for (const name of V.globalStates()) {
     V.controls.push({group: "blood", kind: "range", path: ["weights", name], min: 0, max: 1.5,
       label: V.capital(V.words(name)), show: V.percent, help: why[name]});
   }
   V.controls.push(
-    {group: "blood", kind: "range", path: ["hemoglobin_gain"], min: 0, max: 3, zero: 1, label: "Hemoglobin",
-      show: v => `× ${v.toFixed(2)}`, help: "Factor of the blood everywhere; the table is spaced by cube roots."},
-    {group: "blood", kind: "range", path: ["melanin_gain"], min: 0, max: 4, zero: 1, label: "Melanin",
-      show: v => `× ${v.toFixed(2)}`, help: "Factor of the pigment everywhere."},
+    {group: "blood", kind: "range", path: ["hemoglobin_gain"], min: 0, max: 3, zero: 1, label: "Blood volume fraction",
+      show: v => `× ${v.toFixed(2)}`, help: "Factor on the blood volume fraction of the whole face."},
+    {group: "blood", kind: "range", path: ["melanin_gain"], min: 0, max: 4, zero: 1, label: "Melanosome volume fraction",
+      show: v => `× ${v.toFixed(2)}`, help: "Factor on the melanosome volume fraction of the whole face."},
   );
 };
 
 V.registerReflection = () => {
   const fitted = () => Boolean(V.surface.specular.fitted);
-  const told = V.scene.facts.reflectance;
-  const error = told ? ` The table of ${told.lobes} lobes is within ${(100 * told.rms_error).toFixed(2)} % ` +
-    `RMS of the fitted ones (${Math.round(told.table_bytes / 1024)} KB, ${told.lookups} look-ups).` : "";
-  const origin = told?.origin === "population" ? "the mean surface of simulated people"
-    : "the lobes fitted to this face";
+  const fit = V.scene.facts.reflectance;
+  const error = fit ? ` The table of ${fit.lobes} basis BRDFs has an RMS error of ` +
+    `${(100 * fit.rms_error).toFixed(2)} % (${Math.round(fit.table_bytes / 1024)} KB, ${fit.lookups} look-ups).` : "";
+  const origin = fit?.origin === "population" ? "the mean basis BRDFs of simulated people"
+    : "the basis BRDFs fitted to this face";
   V.controls.push(
     {group: "reflection", kind: "choice", path: ["specular_model"], label: "Specular model", when: fitted,
-      help: `Kelemen and Szirmay-Kalos' formula, or ${origin}.${error}`,
-      options: () => [["analytic", "Analytic (Kelemen, Szirmay-Kalos)"], ["fitted", "Fitted lobes (Weyrich)"]]},
+      help: `The formula of Kelemen and Szirmay-Kalos, or ${origin}.${error}`,
+      options: () => [["analytic", "Analytic (Kelemen, Szirmay-Kalos)"], ["fitted", "Fitted basis BRDFs (Weyrich)"]]},
     {group: "reflection", kind: "range", path: ["roughness"], min: 0.3, max: 2.5, zero: 1, label: "Roughness",
       show: v => `× ${v.toFixed(2)}`, off: p => p.specular_model !== "analytic",
-      help: "Factor of the roughness map, of the analytic model alone."},
+      help: "Factor on the roughness map (analytic model only)."},
     {group: "reflection", kind: "range", path: ["lobe_slope_rms"], min: 0, max: 0.5, step: 0.005, when: fitted,
-      label: "Widening of fitted lobes", show: v => v.toFixed(3), off: p => p.specular_model !== "fitted",
-      help: "RMS of further slopes that no pixel shows, over which the lobes are averaged."},
+      label: "RMS of unresolved slopes", show: v => v.toFixed(3), off: p => p.specular_model !== "fitted",
+      help: "Fitted basis BRDFs are averaged over these slopes."},
     {group: "reflection", kind: "range", path: ["specular_intensity"], min: 0, max: 3, zero: 1, label: "Intensity",
-      show: v => `× ${v.toFixed(2)}`, help: "Factor of the intensity map."},
+      show: v => `× ${v.toFixed(2)}`, help: "Factor on the intensity map."},
     {group: "reflection", kind: "range", path: ["f0"], min: 0, max: 0.1, step: 0.001, zero: 0.028,
       label: "Reflectance at normal incidence", show: v => v.toFixed(3),
-      off: p => p.specular_model !== "analytic", help: "0.028 is that of skin (index 1.4)."},
+      off: p => p.specular_model !== "analytic", help: "Skin: 0.028 (refractive index 1.4)."},
   );
 };
 
@@ -113,16 +113,16 @@ V.registerScattering = () => {
   const edge = profile ? (100 * Math.max(...profile.edge_error)).toFixed(2) : "";
   V.controls.push(
     {group: "scattering", kind: "toggle", path: ["scattering"], label: "Subsurface scattering",
-      help: "Sum of Gaussians on the screen, as wide as depth and slant make them."},
+      help: "Screen-space sum of Gaussians; widths follow depth and slope."},
     {group: "scattering", kind: "range", path: ["scattering_scale"], min: 0, max: 3, zero: 1, label: "Width",
-      show: v => `× ${v.toFixed(2)}`, off: p => !p.scattering, help: "Factor of all widths."},
-    {group: "scattering", kind: "toggle", path: ["measured_translucency"], label: "Translucency of this face",
+      show: v => `× ${v.toFixed(2)}`, off: p => !p.scattering, help: "Factor on all widths."},
+    {group: "scattering", kind: "toggle", path: ["measured_translucency"], label: "Diffuse mean free path of this face",
       when: () => Boolean(profile), off: p => !p.scattering,
-      help: profile ? `Widths from 1/σtr: ${profile.told}. The Gaussians spread an edge of light within ` +
+      help: profile ? `Widths from 1/σtr: ${profile.told}. The edge response of the Gaussians is within ` +
         `${edge} % of the dipole.` : ""},
     {group: "scattering", kind: "choice", path: ["texturing"], label: "Texturing", off: p => !p.scattering,
-      help: "A measured color map is blurred already: blurring it again loses detail that post-scatter texturing keeps.",
-      options: () => [["post", "Post-scatter: color after the blur"], ["pre", "Pre-scatter: color blurred twice"],
+      help: "A measured color map already contains scattering. Post-scatter texturing does not blur it twice.",
+      options: () => [["post", "Post-scatter: color after the blur"], ["pre", "Pre-scatter: color before the blur"],
         ["both", "Half before, half after"]]},
   );
 };
@@ -131,21 +131,20 @@ V.registerTraits = () => {
   const surface = V.scene.facts.surface_traits?.traits ?? {};
   const albedo = V.scene.facts.albedo_traits?.traits ?? {};
   for (const name of Object.keys(V.scene.params.traits ?? {})) {
-    const said = V.only(
-      surface[name] && `surface: within ${surface[name].held_error.map(V.percent).join(" (less) and ")} (more) ` +
-        "of the editor's",
-      albedo[name] && `albedo: half a trait within ${(100 * albedo[name].between_error).toFixed(1)} % of R_d`,
+    const errors = V.only(
+      surface[name] && `surface error: ${surface[name].held_error.map(V.percent).join(" (less), ")} (more)`,
+      albedo[name] && `albedo error: ${(100 * albedo[name].between_error).toFixed(1)} % of R_d at half strength`,
     );
     V.controls.push({group: "traits", kind: "range", path: ["traits", name], min: -1, max: 1,
-      label: V.capital(name), show: V.signed, help: V.capital(said.join("; ")) + ".",
+      label: V.capital(name), show: V.signed, help: V.capital(errors.join("; ")) + ".",
       off: p => !albedo[name] && p.specular_model !== "fitted"});
   }
   if (Object.keys(surface).length) {
     V.controls.push({group: "traits", kind: "own", build: box => {
-      const use = V.element("button", {type: "button"}, "Show with fitted lobes");
-      use.onclick = () => { V.set({specular_model: "fitted"}); V.say("Specular model: fitted lobes"); };
+      const use = V.element("button", {type: "button"}, "Use fitted basis BRDFs");
+      use.onclick = () => { V.set({specular_model: "fitted"}); V.say("Specular model: fitted basis BRDFs"); };
       box.append(V.element("p", {className: "help"},
-        "Traits of the surface change fitted lobes: they show with that specular model."),
+        "Surface traits change the fitted basis BRDFs only."),
       V.element("div", {className: "buttons"}, use));
       return p => { box.hidden = p.specular_model === "fitted"; };
     }});
@@ -154,42 +153,42 @@ V.registerTraits = () => {
 
 V.registerRelief = () => V.controls.push(
   {group: "relief", kind: "range", path: ["relief"], min: 0, max: 2, zero: 1, label: "Pores and lines at rest",
-    show: v => `× ${v.toFixed(2)}`, help: "Factor of the slopes of the static relief."},
+    show: v => `× ${v.toFixed(2)}`, help: "Factor on the slopes of the static surface topography."},
   {group: "relief", kind: "range", path: ["wrinkles"], min: 0, max: 2, zero: 1, label: "Wrinkles",
     show: v => `× ${v.toFixed(2)}`, when: () => Boolean(V.scene.facts.wrinkles),
-    help: "Eight zones, each the sum of the expressions' signed weights."},
+    help: "Eight zones; each weight is the sum over expressions."},
   {group: "relief", kind: "choice", path: ["wrinkle_clamp"], label: "Weights of the zones",
     when: () => Boolean(V.scene.facts.wrinkles),
-    options: () => [["unit", "Held in 0 to 1"], ["signed", "Held in −1 to 1: some smooth the skin"]]},
+    options: () => [["unit", "Clamped to 0 to 1"], ["signed", "Clamped to −1 to 1; negative weights smooth the skin"]]},
   {group: "relief", kind: "toggle", path: ["hybrid_normals"], label: "Hybrid normals",
-    help: "Diffuse normals softened for each color by how far its light spreads; sharp ones for the highlight."},
+    help: "Diffuse normals are blurred per color by its scattering; specular normals are not."},
   {group: "relief", kind: "choice", path: ["microstructure"], label: "Microstructure",
-    help: "Ten-micrometer relief, and how strain sharpens or blurs it; look closely to see it.",
+    help: "Surface topography at ten micrometers; strain sharpens or blurs it. Visible at close range.",
     options: () => [[0, "None (mesostructure)"], [1, "Static"], [2, "Dynamic: follows the strain"],
       [3, "Side by side: none, static, dynamic"]]},
   {group: "relief", kind: "choice", path: ["microstructure_sampling"], label: "Sampling of the convolution",
     options: () => [[0, "Bilinear"], [1, "Cubic"]]},
   {group: "relief", kind: "toggle", path: ["detail"], label: "Level of detail",
-    help: "From afar, wrinkles and microstructure are left out where that changes no pixel visibly."},
+    help: "At a distance, wrinkles and microstructure without visible effect are omitted."},
 );
 
 V.registerLight = () => V.controls.push(
   {group: "light", kind: "range", path: ["light_azimuth_deg"], min: -180, max: 180, step: 1,
-    label: "Light: to the side", show: V.degrees, help: "Or drag with the tool Light."},
+    label: "Light azimuth", show: V.degrees, help: "Also by dragging with the tool Light."},
   {group: "light", kind: "range", path: ["light_elevation_deg"], min: -89, max: 89, step: 1,
-    label: "Light: upwards", show: V.degrees},
-  {group: "light", kind: "range", path: ["light_intensity"], min: 0, max: 10, step: 0.1, label: "Light: strength"},
+    label: "Light elevation", show: V.degrees},
+  {group: "light", kind: "range", path: ["light_intensity"], min: 0, max: 10, step: 0.1, label: "Light intensity"},
   {group: "light", kind: "toggle", path: ["shadows"], label: "Shadows",
-    help: "Of the head on itself: one depth pass along the light, drawn anew when mesh or light change."},
-  {group: "light", kind: "range", path: ["shadow_softness_mm"], min: 0, max: 8, step: 0.1, label: "Softness of shadows",
+    help: "Shadows of the head on itself, from one depth map."},
+  {group: "light", kind: "range", path: ["shadow_softness_mm"], min: 0, max: 8, step: 0.1, label: "Shadow softness",
     zero: 0, show: v => `${v.toFixed(1)} mm`, off: p => !p.shadows},
-  {group: "light", kind: "range", path: ["ambient"], min: 0, max: 1, label: "Even light"},
-  {group: "light", kind: "range", path: ["camera_distance_mm"], min: 45, max: V.FARTHEST_MM, step: 5, label: "Camera: distance",
-    show: v => `${Math.round(v)} mm`, help: "Or the wheel, two fingers, + and −."},
+  {group: "light", kind: "range", path: ["ambient"], min: 0, max: 1, label: "Ambient light"},
+  {group: "light", kind: "range", path: ["camera_distance_mm"], min: 45, max: V.FARTHEST_MM, step: 5, label: "Camera distance",
+    show: v => `${Math.round(v)} mm`, help: "Also by wheel, pinch, + and −."},
   {group: "light", kind: "range", path: ["exposure"], min: 0.1, max: 4, zero: 1, label: "Exposure",
     show: v => `× ${v.toFixed(2)}`},
   {group: "light", kind: "toggle", path: ["filmic"], label: "Filmic tone map",
-    help: "Off: linear light in sRGB, clipped at white."},
+    help: "Off: linear sRGB, clipped at white."},
 );
 
 V.buildPresets = box => {
@@ -218,24 +217,24 @@ V.presetsInOrder = () => {
 
 // Two sets of parameters side by side.
 V.buildComparison = box => {
-  const keep = V.element("button", {type: "button"}, "Keep this as B");
+  const keep = V.element("button", {type: "button"}, "Store as B");
   const swap = V.element("button", {type: "button"}, "Swap A and B");
   const end = V.element("button", {type: "button"}, "End");
   const slider = V.buildControl({kind: "range", path: ["split"], min: 0, max: 1, zero: 0, label: "Divider",
     show: V.percent}, "split");
   keep.onclick = () => {
     V.set({compare: V.faceOf(V.params)});
-    V.say("B keeps what is shown; controls change A, left of the divider.");
+    V.say("B keeps the current settings; controls change A, left of the divider.");
   };
   swap.onclick = () => {
     const held = V.params.compare;
     V.set({...held, compare: V.faceOf(V.params)});
     V.say("A and B are swapped.");
   };
-  end.onclick = () => { V.set({compare: null}); V.say("The comparison has ended."); keep.focus(); };
+  end.onclick = () => { V.set({compare: null}); V.say("Comparison ended."); keep.focus(); };
   box.append(V.element("p", {className: "label"}, "Compare A with B"),
     V.element("div", {className: "buttons"}, keep, swap, end), slider.box,
-    V.element("p", {className: "help"}, "A, left of the divider, is what the controls change; B is held."));
+    V.element("p", {className: "help"}, "Controls change A, left of the divider. B is fixed."));
   return p => {
     slider.update(p);
     slider.box.hidden = swap.hidden = end.hidden = !p.compare;
@@ -265,15 +264,15 @@ V.describeScene = () => {
       `${Object.keys(V.scene.mesh.shapes).length} blend shapes`);
     const errors = Object.entries(V.scene.quantization_error ?? {}).filter(([name]) => !name.startsWith("shape "));
     if (errors.length) {
-      add("Largest rounding of the packed maps", errors.map(([name, error]) =>
+      add("Largest quantization error of the maps", errors.map(([name, error]) =>
         `${V.words(name)} ${V.plain(error)}`).join(", "));
     }
     if (facts.reflectance) {
-      add("Fitted lobes", `table of ${facts.reflectance.slabs} slabs, RMS error ` +
-        `${(100 * facts.reflectance.rms_error).toFixed(3)} %, 95 % of strong values within ` +
+      add("Fitted basis BRDFs", `table of ${facts.reflectance.slabs} slabs, RMS error ` +
+        `${(100 * facts.reflectance.rms_error).toFixed(3)} %, 95th percentile of strong values ` +
         `${(100 * facts.reflectance.strong_error).toFixed(3)} %`);
     }
-    leftOut.forEach(([what, why]) => add(`Left out: ${what}`, why));
+    leftOut.forEach(([what, why]) => add(`Omitted: ${what}`, why));
     box.append(list);
   }});
   [V.registerView, V.registerExpression, V.registerBlood, V.registerReflection, V.registerScattering,

@@ -25,18 +25,18 @@ V.pixels = (names, x, y) => {
 V.fraction = value => `${(100 * value).toFixed(2)} %`;
 V.triple = values => values.slice(0, 3).map(value => value.toFixed(3)).join(" ");
 
-// Rows [what, value]; empty beside the face.
+// Rows [what, value]; empty outside the face.
 V.readings = (x, y) => {
   const found = V.pixels(["inspect", "normal", "albedo", "irradiance", "specular"], x, y);
   if (!found.irradiance || found.irradiance[3] <= 0) return [];
   const rows = [];
   if (found.inspect) {
-    rows.push(["Melanin", V.fraction(found.inspect[2])], ["Hemoglobin", V.fraction(found.inspect[3])]);
+    rows.push(["Melanosome volume fraction", V.fraction(found.inspect[2])], ["Blood volume fraction", V.fraction(found.inspect[3])]);
   }
   if (found.albedo) rows.push(["Albedo (linear sRGB)", V.triple(found.albedo)]);
   if (found.specular) rows.push(["Specular", V.triple(found.specular)]);
   if (found.normal) rows.push(["Normal", V.triple(found.normal)]);
-  if (found.inspect) rows.push(["Texture u v", found.inspect.slice(0, 2).map(v => v.toFixed(3)).join(" ")]);
+  if (found.inspect) rows.push(["Texture coordinates u, v", found.inspect.slice(0, 2).map(v => v.toFixed(3)).join(" ")]);
   rows.push(["Depth", `${found.irradiance[3].toFixed(1)} mm`]);
   return rows;
 };
@@ -56,9 +56,9 @@ V.readAt = (x, y) => {
   const rows = V.readings(x, y);
   const list = document.getElementById("reading");
   list.hidden = false;
-  list.replaceChildren(...(rows.length ? rows : [["Beside the face", "–"]]).map(([what, value]) =>
+  list.replaceChildren(...(rows.length ? rows : [["Outside the face", "–"]]).map(([what, value]) =>
     V.element("div", {}, V.element("dt", {}, what), V.element("dd", {}, value))));
-  V.say(rows.length ? rows.slice(0, 2).map(row => row.join(" ")).join(", ") : "Beside the face");
+  V.say(rows.length ? rows.slice(0, 2).map(row => row.join(" ")).join(", ") : "Outside the face");
   return rows;
 };
 V.moveProbe = (right, down) => {

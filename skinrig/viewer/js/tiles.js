@@ -18,7 +18,7 @@ V.tiles.of = (level, row, column) => {
     // what failed is not asked for again: the coarser level stays
     V.tiles.fetch(name).catch(() => {
       V.tiles.failed += 1;
-      V.say?.("A part of the displacement could not be fetched: is the server still running?");
+      V.say?.("A displacement tile is missing; check that the server is running.");
     });
   }
   return null;

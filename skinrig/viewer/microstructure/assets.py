@@ -117,8 +117,8 @@ def assets(source: SceneSource) -> Assets:
         return build_relief_assets(relief, source.mesh, seed=source.seed)
     made = build_relief_assets(simulate_relief(source.seed), source.mesh, seed=source.seed)
     if source.kind in ("dynamic", "dome", "model"):
-        told = "what is drawn of it is simulated, its kernels are the paper's forehead; "
-        told += "`skinrig fit microstructure` adds its own"
+        told = "simulated, with the published kernels of a forehead; "
+        told += "`skinrig fit microstructure` adds measured ones"
         made["left_out"] = (("microstructure of this face", told),)
     return made
 

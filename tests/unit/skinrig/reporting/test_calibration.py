@@ -55,7 +55,7 @@ def write_run(folder, *, captured="2026-03-10", valid_until=date(2026, 6, 1), wo
 def test_calibration_age_is_age_at_capture(tmp_path):
     html = report.build([write_run(tmp_path)])
     assert "The only check kept its limit" in html
-    assert "in force, 83 days left" in html  # 10 March to 1 June
+    assert "valid, 83 days left" in html  # 10 March to 1 June
     assert ">9<" in html  # days from 1 to 10 March
 
 
@@ -63,12 +63,12 @@ def test_calibration_age_is_age_at_capture(tmp_path):
 def test_calibration_not_in_force_is_missed_check(tmp_path, captured):
     html = report.build([write_run(tmp_path, captured=captured)])
     assert "1 of 1 checks missed" in html
-    assert "not in force at capture" in html
+    assert "not valid at capture" in html
 
 
 def test_the_worst_device_is_named(tmp_path):
     html = report.build([write_run(tmp_path)])
-    row = html[html.index("reprojection</td>") :]
+    row = html[html.index("reprojection error</td>") :]
     assert row.index("C2") < row.index("</tr>")
     assert "0.3" in row[: row.index("</tr>")]
 
@@ -85,7 +85,7 @@ def test_without_a_session_no_age_is_claimed(tmp_path):
     folder = write_run(tmp_path)
     (folder / "session" / "session.json").unlink()
     html = report.build([folder])
-    assert "no session here tells when it was used" in html
+    assert "date of use unknown" in html
     assert "No limit was checked" in html
 
 
@@ -95,5 +95,5 @@ def test_calibration_is_identified_by_contents_not_folder_name(tmp_path, given):
     (folder / "calibration").rename(folder / "mine")
     places = [folder] if given == "folder" else [folder / "maps", folder / "mine"]
     html = report.build([*places, folder / "session"])
-    assert "in force, 83 days left" in html
+    assert "valid, 83 days left" in html
     assert ">skinrig.calibration/1<" not in html

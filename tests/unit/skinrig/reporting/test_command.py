@@ -37,11 +37,11 @@ def test_report_states_whether_runs_are_reported_or_compared(maps, capsys):
     out = maps / "page.html"
     assert main(["report", str(maps / "monday"), "-o", str(out)]) == 0
     assert "No limit was checked" in capsys.readouterr().out
-    assert "least known" in out.read_text("utf-8")
+    assert "Largest uncertainties" in out.read_text("utf-8")
     both = [str(maps / "monday"), str(maps / "tuesday")]
     assert main(["report", *both, "-o", str(out)]) == 0
     assert "compared A: monday with B: tuesday; --no-compare" in capsys.readouterr().out
-    assert "in combined standard errors" in out.read_text("utf-8")
+    assert "in combined standard uncertainties" in out.read_text("utf-8")
     assert main(["report", *both, "--no-compare", "-o", str(out), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["compared"] is None
@@ -87,9 +87,9 @@ def test_a_document_that_is_damaged_is_named(maps, capsys):
     ("words", "value"),
     [
         (r"fewer than (\d+) %", 100 * verdict.MIN_COVERAGE),
-        (r"or more than (\d+) % of truths", 100 * verdict.MAX_COVERAGE),
+        (r"coverage of more than (\d+) %", 100 * verdict.MAX_COVERAGE),
         (r"more than (\d+) % are masked", 100 * verdict.MAX_UNREMARKED_MASK),
-        (r"more than (\d+) % lie beyond 3", 100 * map_comparison.MAX_FRACTION_BEYOND),
+        (r"more than (\d+) % of pixels exceed 3", 100 * map_comparison.MAX_FRACTION_BEYOND),
         (r"within (\d+) mm in the median", run_comparison.MAX_SAME_POINT_MM),
         (r"has (\d+) colors", map_images.SCALE_COLORS),
         (r"faces from the front (\d+)", FRONT_VIEW_WIDTH_PX),

@@ -55,7 +55,12 @@ def test_page_is_reproducible_and_requests_nothing(folder):
 
 def test_truth_estimate_error_and_stderr_are_adjacent(folder):
     html = report.build([folder])
-    for title in ("truth", "estimate", "estimate − truth", "standard error"):
+    for title in (
+        "ground truth",
+        "estimate",
+        "estimate − ground truth",
+        "68 % credible half-width",
+    ):
         assert f"<figcaption>{title}</figcaption>" in html
 
 
@@ -73,8 +78,8 @@ def test_text_from_files_cannot_become_markup(folder):
 
 def test_maps_without_truth_are_reported_with_stderr(folder):
     html = report.build([folder / "appearance"])
-    assert "No truth lies beside" in html
-    assert "estimate − truth" not in html
+    assert "No ground truth is given" in html
+    assert "estimate − ground truth" not in html
 
 
 def test_empty_folder_is_refused_with_remedy(tmp_path):
@@ -85,13 +90,13 @@ def test_empty_folder_is_refused_with_remedy(tmp_path):
 
 
 def test_first_screen_states_absence_of_measured_subjects(folder):
-    assert "All of it is simulated: no person was measured." in report.build([folder])
+    assert "All data are simulated; no person was measured." in report.build([folder])
     document = json.loads((folder / "appearance" / "appearance.json").read_text())
     found = discover([folder])
-    assert found.summary().endswith("All of it is simulated: no person was measured.")
+    assert found.summary().endswith("All data are simulated; no person was measured.")
     document["source"] = "measured"
     (folder / "appearance" / "appearance.json").write_text(json.dumps(document))
-    assert found.summary().endswith("None of it is simulated.")
+    assert found.summary().endswith("All data are measured.")
 
 
 def test_map_of_rounding_alone_shows_no_structure(rng):
@@ -121,8 +126,8 @@ def test_a_medium_is_not_counted_as_a_person(tmp_path):
         appearances[subject] = SkinAppearance(
             {}, "simulated", parameters={"truth": name}, files=files
         )
-    assert "measured here, 1 session<" in page.fragment(subsurface.over_people(appearances, truths))
+    assert "this report, 1 session<" in page.fragment(subsurface.over_people(appearances, truths))
     no_truth_tells = page.fragment(subsurface.over_people(appearances))
-    assert "measured here, 2 sessions<" in no_truth_tells
+    assert "this report, 2 sessions<" in no_truth_tells
     del appearances["III"]
     assert not list(subsurface.over_people(appearances, truths))

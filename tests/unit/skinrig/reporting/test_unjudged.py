@@ -24,9 +24,9 @@ def test_standard_errors_are_reported_by_estimated_band():
 def test_coverage_is_not_claimed_and_residuals_are_reported():
     residual = SkinMap(np.full((20, 30), 0.25), "1")
     body = page.fragment(verdict.uncertainty_blocks(maps(residual=residual)))
-    assert "is not claimed here" in body
-    assert "coverage" not in body
-    assert "Residuals: what models leave of the images" in body
+    assert "errors and coverage are unknown" in body
+    assert "coverage, %" not in body
+    assert "Residuals of the models" in body
     assert '<th scope="row" class="k">residual</th>' in body
 
 

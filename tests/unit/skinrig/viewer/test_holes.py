@@ -128,4 +128,4 @@ def test_texture_without_room_leaves_hole_open_and_reports(scan):
     closed = patch_charts.close_holes(mesh)
     assert closed.charts == ()
     assert len(closed.left_open_mm) >= 2
-    assert closed.summary()[0][0] == "holes that stay open"
+    assert closed.summary()[0][0] == "open holes"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -120,3 +121,13 @@ def test_maps_unusable_on_face_are_refused_with_remedy(tmp_path):
     store.write(tmp_path / "appearance", flat)
     with pytest.raises(SceneError, match="skinrig fit facial-color"):
         faces.scene([tmp_path / "appearance"], size=64)
+
+
+@pytest.mark.parametrize("name", ["panel", "controls", "costs", "drag", "probes", "tiles"])
+def test_texts_of_the_page_use_terms_of_the_field(name):
+    code = Path(page.__file__).with_name("js").joinpath(f"{name}.js").read_text(encoding="utf-8")
+    code = re.sub(r"^\s*//.*$|\$\{[^}]*\}", "", code, flags=re.MULTILINE)
+    texts = [text for text in re.findall(r'"[^"\n]*"|`[^`]*`', code) if " " in text]
+    words = r"\b(told|tells|says|stands|lies|beside|anew|mend|pictures?|gloss|lobes?|left out)\b"
+    assert texts
+    assert [text for text in texts if re.search(words, text, re.IGNORECASE)] == []

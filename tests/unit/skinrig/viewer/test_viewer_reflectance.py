@@ -208,8 +208,8 @@ def test_face_without_fits_shows_population_and_reports(procedural_source):
     assert found.origin == "population"
     assets = reflectance_assets.build_lobe_assets(procedural_source, found)
     assert {what for what, _ in assets["left_out"]} == {
-        "lobes of this face",
-        "translucency of this face",
+        "basis BRDFs of this face",
+        "diffuse mean free path of this face",
     }
     assert "translucency" not in assets["textures"]
 

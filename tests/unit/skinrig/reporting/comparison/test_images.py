@@ -75,7 +75,7 @@ def test_report_on_two_image_folders_compares_images(light, tmp_path):
     b = folder(tmp_path / "tuesday", 1.1 * light, samples=16, seconds=9.0)
     done = report.make([a, b])
     assert done.compared == ("A: monday", "B: tuesday")
-    assert "1 of 1 pictures of both differ" in done.html
+    assert "1 of 1 images differ" in done.html
     assert "monday and tuesday" in done.html
     assert ">samples<" in done.html
     assert ">seconds<" not in done.html
@@ -94,8 +94,8 @@ def test_images_in_two_runs_pair_by_folder_name(light, tmp_path):
     assert [name for name, _, _ in found] == ["pictures-front"]
     assert run_comparison.list_unpaired(*both) == [("pictures-side", "A: x")]
     html = report.make(paths).html
-    assert "0 of 1 pictures of both differ" in html
-    assert "all that the records say, is the same" in html
+    assert "0 of 1 images differ" in html
+    assert "Settings and records are equal" in html
 
 
 def test_photograph_check_failing_once_is_reported_as_changed(light, tmp_path):
@@ -119,7 +119,7 @@ def test_photograph_check_failing_once_is_reported_as_changed(light, tmp_path):
         }
         folder(tmp_path / name, light, **told)
     html = report.make([tmp_path / "a", tmp_path / "b"]).html
-    assert "1 of 1 checks of both changed their verdict, 1 for the worse" in html
+    assert "1 of 1 checks changed their verdict, 1 from kept to missed" in html
 
 
 def test_damaged_image_is_named_and_rest_compared(light, tmp_path):
@@ -128,4 +128,4 @@ def test_damaged_image_is_named_and_rest_compared(light, tmp_path):
         (one / "broken.png").write_bytes(b"no picture")
     found, refused = image_comparison.compare_folders(a, b)
     assert [one.name for one in found] == ["radiance"]
-    assert refused == [("broken", "cannot be read: is no picture")]
+    assert refused == [("broken", "cannot be read: not an image")]

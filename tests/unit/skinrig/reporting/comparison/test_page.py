@@ -193,17 +193,17 @@ def test_comparison_of_other_than_two_runs_is_refused(folders):
 def test_worsened_check_is_reported_first(folders):
     done = report.make([folders["a"], folders["b"], folders["truth"]])
     assert done.compared == ("A: a", "B: b")
-    assert "1 of 1 checks of both changed their verdict, 1 for the worse." in done.html
-    assert "1 of 1 maps differ beyond their combined standard errors." in done.html
-    assert "Errors against the truths" in done.html
+    assert "1 of 1 checks changed their verdict, 1 from kept to missed." in done.html
+    assert "1 of 1 maps differ significantly." in done.html
+    assert "Errors against the ground truths" in done.html
     assert "parameter step" in done.html
     assert done.html == report.make([folders["a"], folders["b"], folders["truth"]]).html
 
 
 def test_comparison_without_truth_leaves_better_run_undecided(folders):
     html = report.make([folders["a"], folders["b"]]).html
-    assert "what differs can be told, what is right cannot" in html
-    assert "Errors against the truths" not in html
+    assert "errors are unknown" in html
+    assert "Errors against the ground truths" not in html
 
 
 def test_two_runs_are_paired_by_folder_names(tmp_path, rng):
@@ -221,13 +221,16 @@ def test_runs_of_same_frames_are_reported_as_correlated(tmp_path, rng):
     for run in ("one", "two"):
         (tmp_path / run).mkdir()
         write_maps(tmp_path / run / "face", rng)
-    assert "made of the same frames" in report.make([tmp_path / "one", tmp_path / "two"]).html
+    assert (
+        "Both estimates are from the same frames"
+        in report.make([tmp_path / "one", tmp_path / "two"]).html
+    )
 
 
 def test_two_benchmarks_are_compared_setting_by_setting(tmp_path):
     paths = [write_bench(tmp_path / name / "bench.json", s) for name, s in (("x", 1.0), ("y", 2.0))]
     html = report.make(paths).html
-    assert "Settings that both measured" in html
+    assert "Settings measured in both runs" in html
     assert '<td class="n">2</td>' in html  # seconds of B over those of A
 
 
@@ -241,7 +244,7 @@ def test_meshes_at_other_positions_are_not_subtracted(tmp_path, rng):
         }
         store.write(tmp_path / name, SkinAppearance(maps, "simulated"))
     html = report.make([tmp_path / "a", tmp_path / "b"]).html
-    assert "texels of the two meshes lie 8.0 mm apart" in html
+    assert "texels of the two meshes differ by 8.0 mm" in html
 
 
 def test_errors_against_the_truth_come_with_their_band(folders):

@@ -63,7 +63,7 @@ def test_large_images_stay_in_their_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(pictures, "MAX_IMAGE_BYTES", 10)
     folder = a_folder(tmp_path / "pictures", view={"name": "C03"}, lights={})
     body = page.fragment(pictures.section(folder, []))
-    assert "Too large for here: radiance.png" in body
+    assert "Too large for this report: radiance.png" in body
     assert "data:image" not in body
 
 

@@ -42,11 +42,11 @@ def table_of(fit):
 def test_kernels_are_reported_with_stderr_and_half_widths():
     assert table_of(FIT)[2:8] == [
         ("alpha", "-0.17"),
-        ("standard error", "0.12"),
-        ("95 % half width", "0.69"),
+        ("standard uncertainty", "0.12"),
+        ("95 % half-width", "0.69"),
         ("sigma, um", "41.5"),
-        ("standard error, um", "19.5"),
-        ("95 % half width, um", "38.2"),
+        ("standard uncertainty, um", "19.5"),
+        ("95 % half-width, um", "38.2"),
     ]
 
 

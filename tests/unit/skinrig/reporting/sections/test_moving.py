@@ -71,7 +71,7 @@ def test_rig_with_true_blood_passes_limit_other_misses(tmp_path):
     page = report.build([tmp_path])
     assert "Moving face: moving" in page
     assert "The only check kept its limit." in page
-    assert "blood of smile, by the rig" in page
+    assert "blood volume fraction of smile, by the rig" in page
     write_truth(tmp_path / "truth-smile", "smile", "hemoglobin_at_rest", 2.5 * neutral)
     assert "1 of 1 checks missed its limit." in report.build([tmp_path])
 
@@ -81,9 +81,9 @@ def test_face_without_truth_is_shown_with_own_errors(tmp_path):
     page = report.build([tmp_path / "moving"])
     assert "No limit was checked" in page
     assert "Hemoglobin rig" in page
-    assert "error by way" not in page
+    assert "error by method" not in page
     # surprise and anger in the forehead: the table's 0.8 - 0.6 and 0.8 - 0.8
-    assert "zones' sums" in unescape(page)
+    assert "sums over zones" in unescape(page)
 
 
 def test_sequence_shows_positions_and_bounded_quantities(tmp_path):
@@ -120,7 +120,7 @@ def test_sequence_shows_positions_and_bounded_quantities(tmp_path):
         ),
     )
     page = report.build([tmp_path])
-    assert "22 images meet 20 phases" in page
+    assert "sample 20 phases" in page
     assert "below 0.137 s" in page
-    assert "no (would be seen with a chance of 80 %)" in page
-    assert "cannot be told" in page
+    assert "no (power of the test: 80 %)" in page
+    assert "undetermined" in page

@@ -35,7 +35,7 @@ def test_omitted_effects_are_listed_before_built_ones(session):
     html = page.fragment(sections_session.omissions([session("session-a", {"effects": EFFECTS})]))
     places = [html.index(word) for word in ("bounces", "lens", "shadows")]
     assert places == sorted(places)
-    assert "of 3 effects 1 built" in html
+    assert "1 of 3 effects simulated" in html
     assert "&lt;flat&gt;" in html
     assert "<flat>" not in html
 

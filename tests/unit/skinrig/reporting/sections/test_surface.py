@@ -68,9 +68,9 @@ def test_surface_section_checks_normals_and_albedo_not_baseline(sphere):
         "head: diffuse reflectance R_d, blue, median error",
     ]
     assert [check.passed for check in checks] == [True, False, False, False]
-    assert "normals by half vectors (half_vector_normals)" in body
+    assert "half-vector normals (half_vector_normals)" in body
     # 0.01 of 1.05 x 0.4, in the unit of the errors beside it
-    assert "r_d, standard error: median 2.381 %" in body
+    assert "R_d, standard uncertainty: median 2.381 %" in body
     assert body.count("<img") > 8
 
 
@@ -85,5 +85,5 @@ def test_surface_section_without_truth_shows_stderr_without_checks(sphere):
         section(page.ReportedAppearance("head", SkinAppearance(maps, "simulated"), None, checks))
     )
     assert checks == []
-    assert "standard error" in body
+    assert "standard uncertainty" in body
     assert "truth" not in body

@@ -74,7 +74,7 @@ def test_calibration_of_neighboring_session_is_not_used(tmp_path):
     assert not found.known
     rgb = np.array([0.5, 0.4, 0.3])
     np.testing.assert_array_equal(found.convert(rgb), rgb)
-    assert "as if it were linear sRGB" in found.provenance
+    assert "displayed as linear sRGB" in found.provenance
 
 
 def test_tabulated_sensor_renders_skin_like_srgb(tmp_path, monkeypatch):
