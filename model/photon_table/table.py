@@ -29,6 +29,9 @@ NUMERICAL_APERTURE = 0.22
 """Of the source and of the detectors in the collection "fibre", in air."""
 MAX_QUANTITY = 1e50
 """Largest length, mm, and coefficient, 1/mm: their squares and cubes are still finite numbers."""
+MIN_SCATTERING_PER_MM = 1e-100
+"""Smallest sigma_s' that scatters: below it the reciprocal's powers overflow in the spline, and the
+reflectance, at most sigma_s'/r, is below 1e-50 per mm^2 at every admitted radius."""
 MAX_ABSORPTION_RATIO = 10.0
 """Largest sigma_a/sigma_s' in the domain."""
 MIN_REDUCED_RADIUS, MAX_REDUCED_RADIUS = 0.02, 50.0
@@ -147,8 +150,7 @@ def derivatives(
         group = index.reshape(-1, 1)
         sigma_a, sigma_s = sigma_a.ravel(), sigma_s.ravel()
     starts, log_distance, weight = distance_rules(unique, core_mm, source_core_mm)
-    # the reciprocal of a subnormal coefficient overflows; it scatters as little as none
-    scatters = sigma_s >= np.finfo(np.float64).tiny
+    scatters = sigma_s >= MIN_SCATTERING_PER_MM
     out = np.empty((3, sigma_a.size, group.shape[1]))
     kernels.evaluate(
         np.ascontiguousarray(sigma_a),
@@ -187,7 +189,7 @@ def relative_error(
     medium = prepare_medium(eta, g, collection)
     given = (radius_mm, sigma_a_per_mm, sigma_s_prime_per_mm)
     radius, sigma_a, sigma_s = np.broadcast_arrays(*_not_negative(*given))
-    scatters = (sigma_s >= np.finfo(np.float64).tiny) & (radius > 0.0)
+    scatters = (sigma_s >= MIN_SCATTERING_PER_MM) & (radius > 0.0)
     s = np.where(scatters, sigma_s, 1.0)
     rho = np.where(scatters, radius * s, 1.0)
     u = np.sqrt(sigma_a / s)

@@ -215,6 +215,10 @@ def test_the_photon_table_scales_with_the_length(radius, sigma_a, sigma_s, scale
 @example(radius=1e-50, sigma_a=1e50, sigma_s=1e50, core=0.0)
 @example(radius=1.0, sigma_a=5e-324, sigma_s=5e-324, core=1e50)
 @example(radius=1.0, sigma_a=0.0, sigma_s=5e-324, core=0.0)
+@example(radius=1e-50, sigma_a=0.0, sigma_s=4.757e-289, core=0.0)
+@example(radius=1e-50, sigma_a=0.0, sigma_s=1e-100, core=0.0)
+@example(radius=1e-50, sigma_a=1e50, sigma_s=1e-100, core=0.0)
+@example(radius=1e50, sigma_a=0.0, sigma_s=1e-100, core=0.0)
 def test_photon_table_is_finite_far_beyond_rings(radius, sigma_a, sigma_s, core):
     slopes = photon_table.derivatives(radius, sigma_a, sigma_s, core_mm=core)
     assert slopes.reflectance_per_mm2 >= 0.0
