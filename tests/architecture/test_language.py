@@ -1,0 +1,219 @@
+"""Names, texts and manuals use the field's words; the dialect of earlier versions stays out."""
+
+import ast
+import io
+import re
+import tokenize
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("capture", "model", "reconstruction", "rigsim", "skinrig")
+HISTORY = ("CHANGELOG.md", "docs/decisions")
+"""Quoted history keeps its words."""
+
+WORDS = {
+    "told, tells": re.compile(r"\b(tell|tells|told|telling)\b", re.IGNORECASE),
+    "says, said": re.compile(r"\b(say|says|said|saying)\b", re.IGNORECASE),
+    "stands": re.compile(r"\b(stands|stood)\b", re.IGNORECASE),
+    "anew": re.compile(r"\banew\b", re.IGNORECASE),
+    "mend": re.compile(r"\bmend(s|ed|ing)?\b", re.IGNORECASE),
+    "beside": re.compile(r"\bbeside\b", re.IGNORECASE),
+    "hangs on": re.compile(r"\bhangs? on\b", re.IGNORECASE),
+    "set nothing": re.compile(r"\bset nothing\b", re.IGNORECASE),
+    "is no": re.compile(
+        r"\b(is|are|was|were) no (?!longer|more|less|larger|smaller|greater|worse|better)",
+        re.IGNORECASE,
+    ),
+    "a light for per light": re.compile(
+        r"\b(one|two|three|four|[0-9.]+|mm|um|px|seconds|pixels|texels|points|images|frames|shots"
+        r"|lights|cameras|rays|samples|lines|files|folders|values|numbers|pairs|steps|exposures"
+        r"|maps|rows|columns|colors|photographs|names|placements|directions|faces|lobes|sides)"
+        r" an? (light|pixel|texel|side|image|picture|frame|shot|point|band|state|step|site|camera"
+        r"|view|rig|stage|case|color|channel|session|face|person|subject|row|line|file|folder"
+        r"|second|minute|direction|placement|exposure|fiber|angle|condition|region)\b",
+        re.IGNORECASE,
+    ),
+}
+"""A dialect's word or idiom, and where it begins and ends."""
+
+QUESTION = re.compile(r"(What|How|Where|Whether|Which|Who|Why|When)\b")
+FIELD_SYMBOLS = frozenset(
+    "ETA ISO F0 SCHEMA CASES RIGS STAGES FORMATS BOXES KIND DRIVER RECIPE NEUTRAL".split()
+)
+"""One-word constants that are symbols of the field, or what the house finds a part by."""
+PARTICIPLES = frozenset(
+    "told seen shown drawn known held kept built made laid lit given taken worn born sold spent"
+    " meant lost found sought once twice alone together apart beside anew ahead away either neither"
+    " both enough often always never".split()
+)
+
+
+def documents() -> list[Path]:
+    """Return the manuals, history apart."""
+    found = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    return [
+        path
+        for path in found
+        if path.exists() and not str(path.relative_to(ROOT)).startswith(HISTORY)
+    ]
+
+
+@cache
+def modules(*packages: str) -> tuple[tuple[Path, ast.Module], ...]:
+    """Return the modules of packages with their syntax trees."""
+    paths = [path for package in packages for path in sorted((ROOT / package).rglob("*.py"))]
+    return tuple((path, ast.parse(path.read_text("utf-8"))) for path in paths)
+
+
+def identifier_words(name: str) -> str:
+    """Return an identifier as separate words.
+
+    >>> identifier_words("MAX_toldOf")
+    'MAX told Of'
+    """
+    return " ".join(re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name))
+
+
+def names(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Yield each name that a module defines, with its line."""
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            yield node.lineno, node.name
+        elif isinstance(node, ast.arg):
+            yield node.lineno, node.arg
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.lineno, node.id
+
+
+def texts(path: Path, tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Yield strings and comments of a module, line by line, and the words of its names."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            for offset, line in enumerate(node.value.splitlines()):
+                yield node.lineno + offset, line
+    with tokenize.open(path) as file:
+        for token in tokenize.generate_tokens(io.StringIO(file.read()).readline):
+            if token.type == tokenize.COMMENT:
+                yield token.start[0], token.string
+    for line, name in names(tree):
+        yield line, identifier_words(name)
+
+
+def hits(lines: Iterator[tuple[int, str]]) -> Iterator[tuple[int, str]]:
+    """Yield lines that hold a word of the list, with the word."""
+    for number, line in lines:
+        for word, pattern in WORDS.items():
+            for found in pattern.finditer(line):
+                yield (
+                    number,
+                    f"{word}: {line[max(found.start() - 30, 0) : found.end() + 30].strip()}",
+                )
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_package_texts_and_names_hold_no_dialect(package):
+    lines = [(path, hits(texts(path, tree))) for path, tree in modules(package)]
+    lines += [
+        (path, hits(enumerate(path.read_text("utf-8").splitlines(), 1)))
+        for kind in ("html", "js", "toml")
+        for path in sorted((ROOT / package).rglob(f"*.{kind}"))
+    ]
+    found = [
+        f"{path.relative_to(ROOT)}:{line}: {text}" for path, some in lines for line, text in some
+    ]
+    assert not found, "\n".join(found)
+
+
+def test_manuals_hold_no_dialect():
+    found = [
+        f"{path.relative_to(ROOT)}:{line}: {text}"
+        for path in documents()
+        for line, text in hits(enumerate(path.read_text().splitlines(), 1))
+    ]
+    assert not found, "\n".join(found)
+
+
+def test_names_of_tests_hold_no_dialect_and_at_most_eight_words():
+    found = []
+    for path, tree in modules("tests"):
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
+                words = node.name.removeprefix("test_").split("_")
+                named = [text for _, text in hits(iter([(0, " ".join(words))]))]
+                if named or len(words) > 8:
+                    found.append(f"{path.relative_to(ROOT)}:{node.lineno}: {node.name}")
+    assert not found, "\n".join(found)
+
+
+def test_module_docstrings_state_and_do_not_ask():
+    found = [
+        str(path.relative_to(ROOT))
+        for path, tree in modules(*PACKAGES, "tests", "tools")
+        if QUESTION.match(ast.get_docstring(tree) or "")
+    ]
+    assert not found, "\n".join(found)
+
+
+def test_constants_have_more_than_one_word():
+    found = [
+        f"{path.relative_to(ROOT)}:{node.lineno}: {target.id}"
+        for path, tree in modules(*PACKAGES)
+        for node in tree.body
+        if isinstance(node, (ast.Assign, ast.AnnAssign))
+        for target in (node.targets if isinstance(node, ast.Assign) else [node.target])
+        if isinstance(target, ast.Name)
+        and re.fullmatch(r"[A-Z][A-Z0-9]+", target.id)
+        and target.id not in FIELD_SYMBOLS
+    ]
+    assert not found, "\n".join(found)
+
+
+def test_public_names_are_no_lone_adverb_or_participle():
+    found = [
+        f"{path.relative_to(ROOT)}:{node.lineno}: {node.name}"
+        for path, tree in modules(*PACKAGES)
+        for node in tree.body
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef))
+        and not node.name.startswith("_")
+        and is_lone_adverb_or_participle(node.name)
+    ]
+    assert not found, "\n".join(found)
+
+
+def is_lone_adverb_or_participle(name: str) -> bool:
+    """Return whether a name is one word that is an adverb or a participle.
+
+    >>> [is_lone_adverb_or_participle(name) for name in ("patiently", "told", "read", "seed")]
+    [True, True, False, False]
+    """
+    word = name.lower()
+    if "_" in name or identifier_words(name).count(" "):
+        return False
+    ending = re.fullmatch(r"\w{2,}(ly|[^e]ed)", word) is not None
+    return word in PARTICIPLES or (ending and word not in {"assembly", "seed", "speed", "apply", "reply"})
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "each picture tells how much there is",
+        "what stands above it",
+        "the folder is no session",
+        "rays a pixel",
+        "2.1 mm a pixel",
+        "measured anew",
+    ],
+)
+def test_dialect_would_be_found(text):
+    assert list(hits(iter([(1, text)])))
+
+
+@pytest.mark.parametrize(
+    "text", ["this is no longer read", "switch on a light", "rays per pixel", "recommended"]
+)
+def test_plain_sentences_pass(text):
+    assert not list(hits(iter([(1, text)])))
