@@ -93,7 +93,7 @@ class CaliperUnit(Device):
     Parameters
     ----------
     wiring
-            The caliper's travel (at most 15 steps in either direction), angles and speed; the skin.
+        The caliper's travel (at most 15 steps in either direction), angles and speed; the skin.
     """
 
     kind = "caliper"

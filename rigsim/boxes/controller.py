@@ -40,9 +40,9 @@ class Controller:
     Parameters
     ----------
     device
-            The controlled device.
+        The controlled device.
     serial
-            Serial number; it identifies the controller, whatever its port's name.
+        Serial number; it identifies the controller, whatever its port's name.
     rng
         Draws the boot epochs.
     """

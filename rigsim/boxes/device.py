@@ -76,8 +76,7 @@ class Wiring:
     """Called with each pop, and with each interval of other light when it has ended."""
     on_trigger: Callable[..., None] = _ignore
     """Called with the world time in s of each pulse on the camera line. Where each camera has its
-    own
-    line, the mask of the pulsed cameras is also passed."""
+    own line, the mask of the pulsed cameras is also passed."""
     on_grip: Callable[[float], None] = _ignore
     """Called with the world time in s after each change of the load that the caliper's jaws
     hold."""
@@ -93,7 +92,7 @@ class Device(ABC):
     Parameters
     ----------
     wiring
-            The driven rig, its faults, and observers of its actions.
+        The driven rig, its faults, and observers of its actions.
     """
 
     kind: str

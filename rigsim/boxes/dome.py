@@ -36,7 +36,7 @@ class DomeUnit(LedSequencer[LedTableRow]):
     Parameters
     ----------
     wiring
-            Its LEDs with their limits, and its cameras; each interval of light is a `LedPulse`.
+        Its LEDs with their limits, and its cameras; each interval of light is a `LedPulse`.
     """
 
     kind = "dome"

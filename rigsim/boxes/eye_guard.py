@@ -32,7 +32,7 @@ class EyeFlickerMonitor:
     Parameters
     ----------
     lights
-            The LEDs with their positions.
+        The LEDs with their positions.
     """
 
     def __init__(self, lights: Sequence[Light]) -> None:

@@ -43,8 +43,7 @@ class Faults:
     glue: Probability = 0.0
     """Probability that the newline of a line is lost, so that two lines become one."""
     cut: Probability = 0.0
-    """Probability that a line is cut at a random position and its rest, newline included, is
-    lost."""
+    """Probability that a line is cut at random; its rest, newline included, is lost."""
     late: Probability = 0.0
     """Probability that an answer is late (with all that follow it: the line keeps its order)."""
     late_s: Seconds = 0.6
@@ -179,7 +178,7 @@ class Faults:
         Raises
         ------
         ValueError
-                For an unknown switch, with the nearest known one, or a value out of range.
+            For an unknown switch, with the nearest known one, or a value out of range.
         """
         fields = {field.name: field for field in dataclasses.fields(cls)}
         values: dict[str, float | int | bool | str] = {}

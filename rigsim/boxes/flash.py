@@ -80,7 +80,7 @@ class FlashUnit(Device):
     Parameters
     ----------
     wiring
-            Its recycling, pops per minute and analyzer; each pop is passed on as a `FlashPop`.
+        Its recycling, pops per minute and analyzer; each pop is passed on as a `FlashPop`.
     """
 
     kind = "flash"

@@ -54,8 +54,7 @@ class PatternLight:
     """Reading of the analyzer meanwhile, degrees; 0 parallel, 90 crossed."""
     led_shares: tuple[float, ...] = ()
     """Light of each LED relative to the pattern at this level: its gain, times its health (0 when
-    dead,
-    less than 1 when weak); empty: 1 for all."""
+    dead, less than 1 when weak); empty: 1 for all."""
 
 
 class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
@@ -64,7 +63,7 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
     Parameters
     ----------
     wiring
-            Its LEDs with limits, analyzer and cameras; each interval of light is a `PatternLight`.
+        Its LEDs with limits, analyzer and cameras; each interval of light is a `PatternLight`.
     """
 
     kind = "gradient_sphere"

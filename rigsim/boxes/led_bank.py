@@ -22,11 +22,11 @@ class LedBank:
     Parameters
     ----------
     rig
-            Rig of the LEDs, with their limits.
+        Rig of the LEDs, with their limits.
     on_light
-            Called with each interval of light when it ends: LED, level, start and end in s.
+        Called with each interval of light when it ends: LED, level, start and end in s.
     faults
-            Dead LEDs; weak LEDs, which the driver does not detect; and the heat of all at power-up.
+        Dead LEDs; weak LEDs, which the driver does not detect; and the heat of all at power-up.
     """
 
     def __init__(self, rig: Rig, faults: Faults, on_light: Callable[[LedPulse], None]) -> None:

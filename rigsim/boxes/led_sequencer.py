@@ -63,9 +63,9 @@ class LedSequencer(Device, Generic[RowT]):
     Parameters
     ----------
     wiring
-            Its LEDs with their limits, and its cameras.
+        Its LEDs with their limits, and its cameras.
     on_light
-            Called with each interval of an LED's light when it has ended.
+        Called with each interval of an LED's light when it has ended.
     """
 
     def __init__(self, wiring: Wiring, on_light: Callable[[LedPulse], None]) -> None:
@@ -79,7 +79,7 @@ class LedSequencer(Device, Generic[RowT]):
         # tokens and times of all sequences since the controller was built
         self.runs: list[tuple[str, float]] = []
 
-    # specific to the kind of controller -------------------------------------------------------
+    # specific to the kind of box ----------------------------------------------------------------
 
     @abstractmethod
     def _parse_rows(self, text: str) -> list[RowT]:

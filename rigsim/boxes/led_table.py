@@ -252,9 +252,9 @@ def pattern_start_times(
     rows
         The scan; it begins at 0 s.
     reading_deg
-            Reading of the analyzer before the scan, degrees.
+        Reading of the analyzer before the scan, degrees.
     s_per_deg
-            Rotation time per degree, s.
+        Rotation time per degree, s.
     """
     found = []
     t_s = 0.0

@@ -59,8 +59,7 @@ class ProbeUnit(Device):
     Parameters
     ----------
     wiring
-            Its probe, the LED at the source fiber, the head; each interval of light is a
-            `SourceLight`.
+        Its probe, the LED at the source fiber, the head; each interval of light is a `SourceLight`.
     """
 
     kind = "probe"

@@ -54,11 +54,10 @@ class SourceShutter:
     Parameters
     ----------
     box
-            Sender of events.
+        Sender of events.
     wiring
-            The rig with fibers and LED, the faults, and the observers of light; the camera line is
-            pulsed
-            when the blades have cleared the fiber.
+        The rig with fibers and LED, the faults, and the observers of light; the camera line is
+        pulsed when the blades have cleared the fiber.
     """
 
     def __init__(self, box: Device, wiring: Wiring) -> None:

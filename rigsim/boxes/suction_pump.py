@@ -39,9 +39,9 @@ class Gauge:
     Parameters
     ----------
     rng
-            Draws both.
+        Draws both.
     dead_after_s
-            World time from which it draws no current, s.
+        World time from which it draws no current, s.
     """
 
     def __init__(self, *, rng: np.random.Generator, dead_after_s: float = math.inf) -> None:
@@ -79,15 +79,15 @@ class SuctionPump:
     Parameters
     ----------
     box
-            Sender of events.
+        Sender of events.
     probe
-            Its limits and the skin's rest time.
+        Its limits and the skin's rest time.
     load
         The head on the skin.
     gauge
-            Gauge of the suction under the head.
+        Gauge of the suction under the head.
     shutter
-            Closes when the suction has ended, whatever the reason.
+        Closes when the suction has ended, whatever the reason.
     """
 
     def __init__(

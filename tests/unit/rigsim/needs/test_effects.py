@@ -158,7 +158,7 @@ def test_a_noisier_sensor_needs_less(flash, faces):
     for name in (face_needs.INTERREFLECTION_EFFECT, face_needs.LATERAL_EFFECT):
         assert sharp.builds(name)
         assert coarse[name].verdict == "negligible"
-    assert coarse[face_needs.SPECTRAL_EFFECT].reason.startswith("there is no such light")
+    assert coarse[face_needs.SPECTRAL_EFFECT].reason.startswith("interreflection is absent")
 
 
 def test_requested_effect_is_built_and_reported(flash, faces):
@@ -168,11 +168,11 @@ def test_requested_effect_is_built_and_reported(flash, faces):
     for name in (face_needs.INTERREFLECTION_EFFECT, face_needs.LATERAL_EFFECT):
         effect = asked.needs[name]
         assert effect.verdict == "asked"
-        assert f"{effect.switch}=False asks for it" in effect.reason
+        assert f"{effect.switch}=False requests it" in effect.reason
     assert (asked.lateral, asked.interreflections) == (False, False)
     forced = FlashScene(flash, faces["darkest"], effects=SceneEffects(spectral=True))
     assert forced.needs[face_needs.SPECTRAL_EFFECT].verdict == "built"
-    assert "spectral=True asks for it" in forced.needs[face_needs.SPECTRAL_EFFECT].reason
+    assert "spectral=True requests it" in forced.needs[face_needs.SPECTRAL_EFFECT].reason
 
 
 def grazing(rig, angle_deg=88.0):
