@@ -137,8 +137,8 @@ def interreflection_over_direct(exchange_fraction: float, reflectance: float) ->
     once = exchange_fraction * reflectance
     if not 0.0 <= once < 1.0:
         raise ValueError(
-            f"exchange_fraction, reflectance: got {exchange_fraction}, {reflectance},"
-            " expected 0 to 1"
+            f"exchange_fraction, reflectance: got {exchange_fraction}, {reflectance}, "
+            "expected 0 to 1"
         )
     return once / (1.0 - once)
 
