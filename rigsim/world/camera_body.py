@@ -177,7 +177,9 @@ class CameraBody:
             self.world.advance(self.world.now)
             now = self.world.now
             if self._trigger is not Trigger.SOFTWARE or not self._armed:
-                raise CameraError(f"camera {self.view.serial}: arm it for software triggers first")
+                raise CameraError(
+                    f"camera {self.view.serial}: not armed for software triggers; arm it"
+                )
             if now < self._busy_until:
                 raise CameraError(f"camera {self.view.serial}: still reading out; retry later")
             self._open_shutter(now)
