@@ -284,5 +284,6 @@ def vignetting_map(loss: float, rows: int, columns: int) -> Float32Array:
     x = np.linspace(-1.0, 1.0, columns) if columns > 1 else np.zeros(1)
     diagonal2 = rows**2 + columns**2
     r2 = ((y * rows) ** 2)[:, None] / diagonal2 + ((x * columns) ** 2)[None, :] / diagonal2
+    # cos^4 = (1 + tan^2)^-2 with tan^2 proportional to r^2; r = 1 in the corner sets k.
     k = 1.0 / math.sqrt(1.0 - loss) - 1.0
     return ((1.0 + k * r2) ** -2).astype(np.float32)

@@ -54,16 +54,9 @@ def specular_stokes_element(  # type: ignore[no-untyped-def]
             s2 = right[0] * l1 - right[1] * l0
             length = math.sqrt(s0 * s0 + s1 * s1 + s2 * s2)
         s0, s1, s2 = s0 / length, s1 / length, s2 / length
-        i0, i1, i2 = (
-            s1 * l2 - s2 * l1,
-            s2 * l0 - s0 * l2,
-            s0 * l1 - s1 * l0,
-        )  # incident p axis: -l x s
-        o0, o1, o2 = (
-            v1 * s2 - v2 * s1,
-            v2 * s0 - v0 * s2,
-            v0 * s1 - v1 * s0,
-        )  # reflected p axis: v x s
+        # The p axes complete the frames of both rays: incident -l x s, reflected v x s.
+        i0, i1, i2 = s1 * l2 - s2 * l1, s2 * l0 - s0 * l2, s0 * l1 - s1 * l0
+        o0, o1, o2 = v1 * s2 - v2 * s1, v2 * s0 - v0 * s2, v0 * s1 - v1 * s0
         # Field transmitted by the polarizer: perpendicular to its absorbing axis and the ray.
         e0 = absorbs[1] * l2 - absorbs[2] * l1
         e1 = absorbs[2] * l0 - absorbs[0] * l2

@@ -43,6 +43,8 @@ class EyeFlickerMonitor:
         times, integral = self._integral(light)
         if times.size == 0:
             return 0.0
+        # The eye averages over the fusion time: a difference of the integral at both ends of the
+        # window.
         grid = np.arange(times[0] - 0.1, times[-1] + 0.1, FLICKER_SAMPLE_S)
         upper = np.interp(grid + 0.5 * FLICKER_FUSION_S, times, integral)
         seen = (
@@ -77,6 +79,9 @@ class EyeFlickerMonitor:
         orders = np.arange(
             math.ceil(FLICKER_BAND_HZ[0] * span), math.floor(FLICKER_BAND_HZ[1] * span) + 1
         )
+        # A pulse's Fourier coefficient over the span is (exp(-i w off) - exp(-i w on)) / (-i w
+        # span). By Parseval the band's mean square is twice the sum of |c_n|^2 over positive
+        # orders.
         omega = 2.0 * np.pi * orders / span
         power = 0.0
         for part in np.array_split(omega, max(1, omega.size * on.size // 200_000)):
@@ -106,6 +111,8 @@ def _irradiance_at_eye(light: Light) -> float:
     cosine = max(-z / distance_mm, 0.0)
     px, py, pz = light.position_mm
     along = -(x * px + y * py + z * pz) / (distance_mm * math.hypot(px, py, pz))
+    # The lobe cos^n halves at the half-intensity angle: n = -ln 2 / ln cos(half). Its integral over
+    # the hemisphere is 2 pi / (n + 1), which normalizes it to the LED's power.
     half_rad = math.radians(light.half_intensity_deg or 60.0)
     order = -math.log(2.0) / math.log(math.cos(half_rad))
     spread = (order + 1.0) / (2.0 * math.pi) * max(along, 0.0) ** order

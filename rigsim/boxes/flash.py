@@ -259,6 +259,7 @@ class FlashUnit(Device):
         return self._voltage(now) ** 2
 
     def _voltage(self, now: float) -> float:
+        # V(t) = V_end - (V_end - V_0) exp(-t / tau), cut at full; the energy is V^2.
         gap = CHARGER_HEADROOM - self._volt
         return min(
             1.0, CHARGER_HEADROOM - gap * math.exp(-(now - self._volt_at) / self._charge_tau_s)
@@ -266,6 +267,8 @@ class FlashUnit(Device):
 
     def _wait_for_fire(self, now: float) -> tuple[float, Code, str]:
         """Return the time until FIRE is accepted, in s, with the code and text of the refusal."""
+        # The charge suffices from V = sqrt(power) on: t = tau ln((V_end - V) / (V_end -
+        # sqrt(power))).
         need = math.sqrt(self.power)
         gap = (CHARGER_HEADROOM - self._voltage(now)) / (CHARGER_HEADROOM - need)
         full = len(self._pops) == self._pops_per_min

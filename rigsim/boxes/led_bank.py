@@ -92,6 +92,7 @@ class LedBank:
     def _heat_until(self, now: float) -> None:
         if now <= self._heat_at:
             return
+        # dT/dt = (level - T) / tau: each temperature relaxes exponentially toward its LED's level.
         goal = np.zeros(self.count)
         for led, (level, _, _) in self._lit.items():
             goal[led] = level

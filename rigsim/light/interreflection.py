@@ -106,6 +106,8 @@ class Interreflection:
             Light that enters after one or more bounces, same unit, on the coarse texture, shape
             (N, N, C), 0 where the texture has no surface.
         """
+        # Neumann series over bounces: sum of (X R)^n E for n >= 1, with X the exchange and R the
+        # R_d.
         latest = self.exchange @ (r_d * entered[:, None])
         total = latest.copy()
         least = min_bounce_fraction * float(np.abs(latest).max(initial=0.0))
@@ -155,7 +157,8 @@ def _exchange(
         share = strength[i, j]
         # both directions between two patches share one visibility ray
         for here, there in ((block[i], first + j), (first + j, block[i])):
-            # A near patch is not a point: the sum over its hemisphere must not exceed all light.
+            # A distant patch of area A receives f = cos cos T T A / (pi d^2). A near patch is
+            # not a point: f / (1 + f) keeps its fraction below 1.
             values.append(share * area[there] / (math.pi + share * area[there]))
             rows.append(here)
             columns.append(there)
@@ -266,6 +269,8 @@ class InterreflectionColor:
         )
         covered = self._bounce.atlas.covered
         out = np.zeros((*covered.shape, self._weights.shape[1]), np.float32)
+        # The last reflection is included per wavelength and divided out per channel, so that the
+        # caller's product with the channel's reflectance restores it.
         out[covered] = ((each[covered] * self._spectrum) @ self._weights) / self._channel
         return out
 

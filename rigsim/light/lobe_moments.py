@@ -293,6 +293,8 @@ def tabulate_moments(
     reach = edge * (size - 1) / (size - 1 - 4)
     axis = np.linspace(-reach, reach, size)
     py, px = np.meshgrid(axis, axis, indexing="ij")
+    # p is the stereographic projection of the normal, with the inverse n = (2 p, 1 - p^2) / (1 +
+    # p^2).
     square = px**2 + py**2
     inside = square <= (edge + 2.1 * math.sqrt(2.0) * (axis[1] - axis[0])) ** 2
     normals = (np.stack([2 * px, 2 * py, 1 - square], axis=-1) / (1 + square)[..., None])[inside]

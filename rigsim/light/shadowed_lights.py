@@ -93,6 +93,8 @@ def _remove(packed, elements, edge, led, look):  # type: ignore[no-untyped-def]
         tangent = first[i] + between * (second[i] - first[i])
         if tangent <= low or not skin[i]:
             continue
+        # Linear in elevation: 0 where the horizon touches the disc's lower edge, 1 at its upper
+        # edge.
         part = min(0.5 + 0.5 * (math.atan(tangent) - elevation) / radius, 1.0)
         n0, n1, n2 = float(normals[i, 0]), float(normals[i, 1]), float(normals[i, 2])
         l0, l1, l2 = place[0] - x[i], place[1] - y[i], place[2]

@@ -372,6 +372,8 @@ def _facets(nl, nv, nh, lh, roughness, oil):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, inline="always")
 def _down(nl, nv, fuzz):  # type: ignore[no-untyped-def]
+    # Chandrasekhar's isotropic single scattering of a layer of optical depth tau: w / (4 pi) (1 -
+    # exp(-tau (1 / nl + 1 / nv))) / (nl + nv).
     through = 1.0 - math.exp(-fuzz * (1.0 / nl + 1.0 / nv))
     return FUZZ_ALBEDO / (4.0 * math.pi) * through / (nl + nv)
 

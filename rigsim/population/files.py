@@ -155,7 +155,8 @@ class SubjectFile(Document):
             )
         if self.hemoglobin_map is not None:
             blood = resample_texture("hemoglobin_map", self.hemoglobin_map, size).astype(np.float64)
-            # inverse of the fold in `Perfusion.blood`: compartments keep their fractions
+            # The fold b = t / (1 + (t / m)^4)^(1/4) of `Perfusion.blood` has the inverse
+            # t = b / (1 - (b / m)^4)^(1/4); compartments keep their fractions.
             wanted = blood / (1.0 - (blood / MAX_HEMOGLOBIN) ** 4) ** 0.25
             factor = wanted / perfusion.compartments.sum(axis=-1)
             perfusion = dataclasses.replace(

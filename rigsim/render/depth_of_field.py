@@ -209,6 +209,8 @@ def _weights(lens: Lens, depth_mm: float, radius: int, subpixels: int) -> Float6
     cutoff = 1e6 * lens.magnification / (min(lens.wavelengths_nm) * lens.working_f_number)
     most = min(cutoff * pixel_mm, MAX_FREQUENCY * subpixels)
     frequency = np.arange(math.ceil(most * period) + 1) / period  # cycles per pixel
+    # The weights are the inverse Fourier transform of the OTF times the sincs of pixel and sample.
+    # The sum over frequencies repeats after a period that keeps the copies apart.
     squares = np.sinc(frequency) * np.sinc(frequency / subpixels)
     squares *= np.where(frequency > 0.0, 2.0, 1.0)  # negative frequencies contribute equally
     waves = np.cos(2.0 * np.pi * offset[:, None] * frequency) * squares

@@ -315,6 +315,8 @@ def form_wrinkles(lines: WrinkleLines, rest: Atlas, posed: Atlas) -> Wrinkles:
         before = _density(_metric(rest, one.texel), one.slope)
         after = _density(_metric(posed, one.texel), one.slope)
         steady = (before > 1e-6) & (after > 1e-6)
+        # A length L at rest spans stretch L after the movement; its slack length is (1 - tension)
+        # L. What exceeds the span goes into the wrinkle.
         stretch = np.where(steady, before / np.maximum(after, 1e-9), 1.0)
         slack = (1.0 - one.zone.tension * lines.tension) / np.maximum(stretch, 1e-3) - 1.0
         excess = one.wrinkling_fraction * np.maximum(slack, 0.0)
@@ -374,6 +376,7 @@ def _waves() -> tuple[float, Float64Array, Float64Array]:
         / (1.0 - math.exp(-2.0 * GROOVE_NARROWING))
     )
     depth = np.concatenate([[0.0], np.geomspace(1e-4, 3.0, 400)])
+    # Arc length of one period of unit wavelength: the mean of sqrt(1 + (depth h')^2).
     length = np.sqrt(1.0 + (depth[:, None] * slope) ** 2).mean(axis=1)
     return float(bell.mean()), length - 1.0, depth
 
@@ -393,6 +396,7 @@ def _metric(atlas: Atlas, texel: NDArray[np.intp]) -> Float64Array:
 
 def _density(inverse: Float64Array, slope: Float64Array) -> Float64Array:
     """Return the length of a phase's gradient on the surface, rad/mm."""
+    # |grad phase|^2 = g^ij d_i d_j with the inverse of the first fundamental form.
     u, v = slope[:, 0], slope[:, 1]
     squared = inverse[:, 0] * u * u + 2.0 * inverse[:, 1] * u * v + inverse[:, 2] * v * v
     return np.sqrt(np.maximum(squared, 0.0))

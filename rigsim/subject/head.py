@@ -270,6 +270,7 @@ def _pack(
 def _solid_distance(x, y, z, s):  # type: ignore[no-untyped-def]
     px, py, pz = x - s[0], y - s[1], z - s[2]
     if s[6] > 0.0:
+        # First-order distance to the level set k0 = 1: (k0 - 1) over its gradient's length k1 / k0.
         k0 = math.sqrt((px / s[6]) ** 2 + (py / s[7]) ** 2 + (pz / s[8]) ** 2)
         k1 = math.sqrt((px / s[6] ** 2) ** 2 + (py / s[7] ** 2) ** 2 + (pz / s[8] ** 2) ** 2)
         # At the center k1 = 0; the nearest surface is at the shortest radius.
@@ -295,7 +296,8 @@ def _distance(x, y, z, solids, parts, segments, grooves):  # type: ignore[no-unt
         own = 1e9
         for i in range(int(parts[p, 2]), int(parts[p, 3])):
             own = min(own, _solid_distance(x, y, z, solids[i]))
-        # Polynomial smooth minimum, or smooth maximum with the complement when carved.
+        # Polynomial smooth minimum min(a, b) - k h^2 / 4 with h = max(k - |a - b|, 0) / k; carved
+        # parts are a smooth maximum with their complement.
         if p == 0:
             total = own
         elif carve:

@@ -152,6 +152,7 @@ class _Phase:
 
     def suction_mbar(self, t_s: float) -> float:
         """Return the suction at a time of this phase, mbar."""
+        # dp/dt = drive - rate p has the solution p0 + (drive - rate p0) (1 - exp(-rate t)) / rate.
         passed_s = max(0.0, t_s - self.t_s)
         slope = self.drive_mbar_per_s - self.rate_per_s * self.from_mbar
         if self.rate_per_s == 0.0:
@@ -323,7 +324,8 @@ class ProbeHead:
         elif self._wanted_mbar is not None and not self._pump_dead:
             falls = law.free_flow_ml_per_s / law.dead_head_mbar
             gain = law.regulator_ml_per_s_mbar
-            # below this suction the regulator requests more than the pump's maximum flow
+            # The regulator requests K (wanted - p), the pump's maximum is F - falls p. Below the
+            # suction at which both are equal the pump runs at its maximum.
             regulated_mbar = (gain * self._wanted_mbar - law.free_flow_ml_per_s) / (gain - falls)
             if from_mbar >= regulated_mbar - 1e-9:
                 drive, rate = gain * self._wanted_mbar, rate + gain

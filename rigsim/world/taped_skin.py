@@ -97,6 +97,7 @@ class TapeMechanics:
         >>> skin.force_n(1.2) - skin.force_n(1.1) > skin.force_n(1.1) > 0.0
         True
         """
+        # Fung: dF/dr = k exp(a (r - 1)) integrates to F = k (exp(a (r - 1)) - 1) / a from r = 1.
         strain = max(stretch, self.buckles_at) - 1.0
         if strain <= 0.0 or self.stiffening == 0.0:
             return self.stiffness_n * strain
@@ -251,7 +252,8 @@ class TapedSkin:
         stretch, force_n = self._balance(self._slip_mm, 0.0)
         excess_n = force_n - law.hardening_n_per_mm * self._slip_mm
         if abs(excess_n) > law.slips_at_n:
-            # the tape slips until its hardening holds the force
+            # The tape slips until its hardening balances the force: |F| = slips_at + hardening |s|,
+            # so the slip s = soft F - soft yields is linear in F with soft = 1 / hardening.
             yields_n = math.copysign(law.slips_at_n, excess_n)
             soft = 1.0 / law.hardening_n_per_mm
             stretch, force_n = self._balance(-yields_n * soft, soft)

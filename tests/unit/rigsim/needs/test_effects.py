@@ -273,10 +273,10 @@ def test_polarizers_alone_require_polarization(flash, faces):
 def test_gray_tissue_is_traced_once_skin_by_color():
     rig = load_rig("probe")
     gray = ProbeScene(rig, HomogeneousTissue(0.04, 1.5)).needs
-    assert gray["tissue traced color by color"].verdict == "negligible"
+    assert gray["tissue traced per color band"].verdict == "negligible"
     assert gray["layers of the tissue"].verdict == "absent"
     skin = ProbeScene(rig, parse_tissue("III", seed=0)).needs
-    assert skin.builds("tissue traced color by color")
+    assert skin.builds("tissue traced per color band")
     assert skin.builds("layers of the tissue")
 
 
