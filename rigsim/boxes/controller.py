@@ -55,7 +55,7 @@ class Controller:
         self._rng = rng
         self._announce = False
         self.commands: dict[str, Command] = {**self._own_commands(), **device.commands()}
-        self._forget(0.0, boot_s=0.0)
+        self._reset_state(0.0, boot_s=0.0)
 
     # power ------------------------------------------------------------------------------------
 
@@ -66,10 +66,10 @@ class Controller:
         """
         self.device.advance(now)
         self.device.go_dark(now)
-        self._forget(now, boot_s=boot_s)
+        self._reset_state(now, boot_s=boot_s)
         self._announce = announce
 
-    def _forget(self, now: float, *, boot_s: float) -> None:
+    def _reset_state(self, now: float, *, boot_s: float) -> None:
         fresh = [self.boot, wire.UNKNOWN_BOOT]
         while self.boot in fresh:
             self.boot = int(self._rng.integers(1, 0x10000))
@@ -155,7 +155,7 @@ class Controller:
                 return answer
             if seq == frame.seq:
                 refused = CommandRefused(Code.SEQ_REUSED)
-                self._remember(refused)
+                self._record_error(refused)
                 return wire.encode(Reply(frame.seq, self.boot, refused.code, refused.reason))
         try:
             outcome = self._execute(frame.text, now)
@@ -169,7 +169,7 @@ class Controller:
 
     def _answer(self, request: Request, outcome: str | CommandRefused, now: float) -> bytes:
         if isinstance(outcome, CommandRefused):
-            self._remember(outcome)
+            self._record_error(outcome)
             reply = Reply(request.seq, self.boot, outcome.code, outcome.reason)
         else:
             reply = Reply(request.seq, self.boot, Code.OK, outcome)
@@ -189,7 +189,7 @@ class Controller:
                 CommandRefused.raise_if(not (header.endswith("?") or dark), Code.UNFRAMED)
             payload = self._execute(text, now)
         except CommandRefused as refused:
-            self._remember(refused)
+            self._record_error(refused)
             return b""
         return f"{payload}\n".encode() if header.endswith("?") else b""
 
@@ -216,7 +216,7 @@ class Controller:
         number, self._events = self._events, wire.next_seq(self._events)
         return wire.encode(Event(number, self.boot, name, payload))
 
-    def _remember(self, refused: CommandRefused) -> None:
+    def _record_error(self, refused: CommandRefused) -> None:
         if len(self._errors) == MAX_QUEUED_ERRORS:
             self._errors.pop()
             refused = CommandRefused(Code.QUEUE_OVERFLOW)
@@ -242,8 +242,8 @@ class Controller:
             "*OPC?": lambda _, now: "0" if self.device.is_busy(now) else "1",
             "SYST:ERR?": self._error,
             "SYST:HELLO?": lambda *_: self._hello(),
-            "SYST:CAP?": self._capable,
-            "SYST:CAP:PART?": self._capable_part,
+            "SYST:CAP?": self._get_capabilities,
+            "SYST:CAP:PART?": self._get_capability_chunk,
             "SYST:WDOG": self._set_lease,
             "SYST:WDOG?": lambda *_: str(self._lease_ms),
             "SYST:ARM": self._arm,
@@ -266,7 +266,7 @@ class Controller:
         code, text = self._errors.popleft() if self._errors else (0, "No error")
         return f'{code},"{text}"'
 
-    def _capable(self, _: str, now: float) -> str:
+    def _get_capabilities(self, _: str, now: float) -> str:
         table = {
             "kind": self.device.kind,
             "protocol": self._protocol,
@@ -276,8 +276,8 @@ class Controller:
         }
         return wire.seal(json.dumps(table, separators=(",", ":"), allow_nan=False))
 
-    def _capable_part(self, arguments: str, now: float) -> str:
-        text = self._capable("", now)
+    def _get_capability_chunk(self, arguments: str, now: float) -> str:
+        text = self._get_capabilities("", now)
         last = (len(text) - 1) // CAPABILITY_CHUNK_CHARS
         part = int(parse_number(arguments, 0, last, "parts"))
         start = part * CAPABILITY_CHUNK_CHARS

@@ -67,7 +67,7 @@ class DomeUnit(LedSequencer[LedTableRow]):
             max_us=self._row_max_us,
         )
 
-    def _lit_by(self, rows: Sequence[LedTableRow], now: float) -> list[LedPulse]:
+    def _pulses_from_table(self, rows: Sequence[LedTableRow], now: float) -> list[LedPulse]:
         return led_table.pulses_from_rows(rows, now, overlap_s=self._limits.overlap_s)
 
     def _schedule(self, rows: Sequence[LedTableRow]) -> list[SequenceEvent]:
@@ -128,7 +128,7 @@ class DomeUnit(LedSequencer[LedTableRow]):
         end_s = now + span_ms / 1e3
         wanted = [LedPulse(led, level, now, end_s) for led in leds]
         self.bank.require_within_limits(wanted, now)
-        self._require_calm(wanted, now)
+        self._require_flicker_limits(wanted, now)
         self._sequence_armed = False
         for led in leds:
             self.bank.switch_on(led, level, now, end_s=end_s)

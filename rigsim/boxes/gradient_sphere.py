@@ -81,7 +81,7 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         self._shining: PatternLight | None = None  # light in progress; its end is not known yet
         self.analyser_deg = 0.0
         self._settled_at = 0.0
-        super().__init__(wiring, self._ended)
+        super().__init__(wiring, self._on_pulse_end)
         self.reset(0.0, power_up=True)
 
     def reset(self, now: float, *, power_up: bool) -> None:
@@ -157,16 +157,16 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         shining = self._shining
         if shining is None or not self.lit:
             return []
-        return [self._until(shining, max(now, shining.t_on_s))]
+        return [self._with_end(shining, max(now, shining.t_on_s))]
 
-    def _until(self, light: PatternLight, t_off_s: float) -> PatternLight:
+    def _with_end(self, light: PatternLight, t_off_s: float) -> PatternLight:
         return replace(light, t_off_s=t_off_s)
 
-    def _ended(self, lit: LedPulse) -> None:
+    def _on_pulse_end(self, lit: LedPulse) -> None:
         """Report a pattern when its first LED goes out: all LEDs go out at once."""
         shining, self._shining = self._shining, None
         if shining is not None:
-            self._on_light(self._until(shining, lit.t_off_s))
+            self._on_light(self._with_end(shining, lit.t_off_s))
 
     def _levels(self, pattern: str, level: float) -> list[float]:
         """Return the drive level of each LED."""
@@ -174,7 +174,9 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         driven: list[float] = (level * gains * self._shares[pattern]).tolist()
         return driven
 
-    def _shine(self, pattern: str, level: float, now: float, *, end_s: float = math.inf) -> None:
+    def _start_pattern(
+        self, pattern: str, level: float, now: float, *, end_s: float = math.inf
+    ) -> None:
         """Replace the light in progress by a pattern."""
         self.bank.all_off(now)
         if pattern == "dark":
@@ -187,7 +189,9 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         given = () if (shares == 1.0).all() else tuple(shares.tolist())
         self._shining = PatternLight(pattern, level, now, now, self.analyser_deg, given)
 
-    def _wanted(self, pattern: str, level: float, on_s: float, off_s: float) -> list[LedPulse]:
+    def _requested_pulses(
+        self, pattern: str, level: float, on_s: float, off_s: float
+    ) -> list[LedPulse]:
         levels = self._levels(pattern, level)
         return [
             LedPulse(led, driven, on_s, off_s) for led, driven in enumerate(levels) if driven > 0.0
@@ -210,12 +214,12 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         self._require_closed_stop()
         self._require_settled(now)
         end_s = now + span_ms / 1e3
-        wanted = self._wanted(pattern, level, now, end_s)
+        wanted = self._requested_pulses(pattern, level, now, end_s)
         self.bank.require_within_limits(wanted, now)
-        self._require_calm(wanted, now)
+        self._require_flicker_limits(wanted, now)
         self._sequence_armed = False
         self._failed = set()
-        self._shine(pattern, level, now, end_s=end_s)
+        self._start_pattern(pattern, level, now, end_s=end_s)
 
     def _lit_now(self, _: str, now: float) -> str:
         shining = self._shining
@@ -226,7 +230,9 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
     def _parse_rows(self, text: str) -> list[led_table.PatternRow]:
         return led_table.parse_pattern_rows(text, cameras=self._cameras, max_us=self._row_max_us)
 
-    def _lit_by(self, rows: Sequence[led_table.PatternRow], now: float) -> list[LedPulse]:
+    def _pulses_from_table(
+        self, rows: Sequence[led_table.PatternRow], now: float
+    ) -> list[LedPulse]:
         self._require_settled(now)
         times = led_table.pattern_start_times(
             rows, reading_deg=self.analyser_deg, s_per_deg=self._s_per_deg
@@ -234,7 +240,9 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         found: list[LedPulse] = []
         for row, (_, lit_s) in zip(rows, times, strict=True):
             start_s = now + lit_s
-            found += self._wanted(row.pattern, row.level, start_s, start_s + row.dwell_us * 1e-6)
+            found += self._requested_pulses(
+                row.pattern, row.level, start_s, start_s + row.dwell_us * 1e-6
+            )
         return found
 
     def _schedule(self, rows: Sequence[led_table.PatternRow]) -> list[SequenceEvent]:
@@ -254,7 +262,7 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
             self.bank.all_off(now)
             self._turn(row.analyser_deg, now)
         else:
-            self._shine(row.pattern, row.level, now)
+            self._start_pattern(row.pattern, row.level, now)
 
     # gains ------------------------------------------------------------------------------------
 

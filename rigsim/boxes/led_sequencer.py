@@ -86,7 +86,7 @@ class LedSequencer(Device, Generic[RowT]):
         """Parse the rows of ``SEQ:DEF``, or refuse."""
 
     @abstractmethod
-    def _lit_by(self, rows: Sequence[RowT], now: float) -> list[LedPulse]:
+    def _pulses_from_table(self, rows: Sequence[RowT], now: float) -> list[LedPulse]:
         """Return the light of a sequence that would begin at `now`."""
 
     @abstractmethod
@@ -168,13 +168,13 @@ class LedSequencer(Device, Generic[RowT]):
     def advance(self, now: float) -> None:
         """Advance time to `now`, in s."""
         while (due := self.deadline()) <= now:
-            self._pass_until(due)
+            self._advance_bank(due)
             run = self._run
             while run is not None and run.pending and run.start_s + run.pending[0].t_s <= due:
                 self._switch(run, run.pending.pop(0), due)
-        self._pass_until(now)
+        self._advance_bank(now)
 
-    def _pass_until(self, now: float) -> None:
+    def _advance_bank(self, now: float) -> None:
         tripped = self.bank.advance(now)
         if tripped:
             self._events += [("LED:HOT", str(led)) for led in tripped]
@@ -255,13 +255,15 @@ class LedSequencer(Device, Generic[RowT]):
         if rows != len(self.table):
             raise CommandRefused(Code.OUT_OF_RANGE, f"the table has {len(self.table)} rows")
         self._require_closed_stop()
-        wanted = self._lit_by(self.table, now)
+        wanted = self._pulses_from_table(self.table, now)
         duty, heat, dose_ws = self.bank.require_within_limits(wanted, now)
-        flashes, rms = self._require_calm(wanted, now)
+        flashes, rms = self._require_flicker_limits(wanted, now)
         self._sequence_armed = True
         return f"{flashes:.2f},{rms:.4f},{duty:.4f},{heat:.4f},{dose_ws:.4f}"
 
-    def _require_calm(self, wanted: Sequence[LedPulse], now: float) -> tuple[float, float]:
+    def _require_flicker_limits(
+        self, wanted: Sequence[LedPulse], now: float
+    ) -> tuple[float, float]:
         """Return flashes per second and rms of the request, or refuse it for open eyes.
 
         Flashes are counted together with those of the last second.
@@ -286,7 +288,7 @@ class LedSequencer(Device, Generic[RowT]):
             not self._sequence_armed, Code.NOT_ARMED, "SEQ:ARM checks the table first"
         )
         # light in progress at SEQ:ARM, or switched on after it, has been emitted by now
-        self.bank.require_within_limits(self._lit_by(self.table, now), now)
+        self.bank.require_within_limits(self._pulses_from_table(self.table, now), now)
         self._sequence_armed = False
         self.bank.all_off(now)
         rows = list(self.table)

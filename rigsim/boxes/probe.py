@@ -112,7 +112,7 @@ class ProbeUnit(Device):
         acts: dict[str, CommandHandler] = {
             "HEAD:SITE": self._place,
             "HEAD:SITE?": self._get_place,
-            "HEAD:FREE": self._take_away,
+            "HEAD:FREE": self._remove_head,
             "PUMP": self._pump,
             "PUMP?": lambda _, now: self.pump.state(now),
             "PUMP:LAST?": lambda *_: self.pump.last_report or "NONE",
@@ -145,13 +145,13 @@ class ProbeUnit(Device):
         while (due := self.deadline()) <= now:
             if self._stop_opens_s() <= due:
                 self.interlock = True
-                self._let_go(due, "INTERLOCK")
+                self._release_head(due, "INTERLOCK")
             self.shutter.advance(due)
             self.pump.advance(due)
 
     def go_dark(self, now: float) -> None:
         """Close the shutter, switch off the LED, vent, and clear the head's site."""
-        self._let_go(now, "DARK")
+        self._release_head(now, "DARK")
 
     def light_now(self, now: float) -> list[SourceLight]:
         """Return the light that has not ended, as emitted so far."""
@@ -172,7 +172,7 @@ class ProbeUnit(Device):
         lit = {16: self.is_busy(now), 32: pump.is_pumping, 64: shutter.lit, 2048: shutter.jammed}
         return lit | {512: pump.placement is not None, 1024: pump.remaining_rest_ms(now) > 0}
 
-    def _let_go(self, now: float, how: str) -> None:
+    def _release_head(self, now: float, how: str) -> None:
         self.shutter.go_dark(now, how)
         self.pump.vent(now, how)
         self.pump.remove_head(now)
@@ -195,7 +195,7 @@ class ProbeUnit(Device):
         site, angle_deg = self.pump.placement
         return f"{site},{angle_deg:g}"
 
-    def _take_away(self, _: str, now: float) -> None:
+    def _remove_head(self, _: str, now: float) -> None:
         self.shutter.abort_opening(now, "ASKED")
         self.pump.vent(now, "ASKED")
         self.pump.remove_head(now)

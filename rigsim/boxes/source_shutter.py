@@ -100,14 +100,14 @@ class SourceShutter:
         """Return the light that has not ended, as emitted so far."""
         if self._light_since is None:
             return []
-        return [self._stretch(self._light_since, max(now, self._light_since))]
+        return [self._light_interval(self._light_since, max(now, self._light_since))]
 
     def remaining_ms(self, now: float) -> int:
         """Return the remaining open time of the shutter, ms."""
         left_s = 0.0 if self._opening is None else self._opening.ends_s - now
         return max(0, math.ceil(left_s * 1e3)) if math.isfinite(left_s) else 0
 
-    def _stretch(self, t_on_s: float, t_off_s: float) -> SourceLight:
+    def _light_interval(self, t_on_s: float, t_off_s: float) -> SourceLight:
         return SourceLight(self.level / LEVEL_STEPS * self._weak, t_on_s, t_off_s, self.fibre)
 
     # time -------------------------------------------------------------------------------------
@@ -169,7 +169,7 @@ class SourceShutter:
     def _end_light(self, now: float) -> None:
         if self._light_since is None:
             return
-        light = self._stretch(self._light_since, now)
+        light = self._light_interval(self._light_since, now)
         self._light_since = None
         self.dose_ws += self._power_w * self.level / LEVEL_STEPS * (now - light.t_on_s)
         if light.t_off_s > light.t_on_s:

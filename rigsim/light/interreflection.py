@@ -146,7 +146,7 @@ def _exchange(
     for first in range(0, count, step):
         block = np.arange(first, min(first + step, count))
         strength = np.zeros((len(block), count - first), np.float32)
-        _form(point, normal, first, strength)
+        _pair_transfer(point, normal, first, strength)
         i, j = np.nonzero(strength)
         start = point[block[i]] + np.float32(RAY_OFFSET_MM) * normal[block[i]]
         way = point[first + j] + np.float32(RAY_OFFSET_MM) * normal[first + j] - start
@@ -168,7 +168,7 @@ def _exchange(
 
 
 @njit(parallel=True, cache=True)
-def _form(point, normal, first, out):  # type: ignore[no-untyped-def]
+def _pair_transfer(point, normal, first, out):  # type: ignore[no-untyped-def]
     """Write cos cos T T / d^2 for mutually facing pairs, one direction of each pair."""
     for n in prange(out.shape[0]):
         i = first + n
@@ -229,7 +229,7 @@ class InterreflectionColor:
         r_d: Float32Array,
         reflectance: Float32Array,
     ) -> None:
-        self._bounce, self._enough = bounces.exchange, bounces.min_bounce_fraction
+        self._bounce, self._min_bounce_fraction = bounces.exchange, bounces.min_bounce_fraction
         subject = skin.subject
         covered = subject.atlas.covered.astype(np.float32)
         factor = r_d / np.maximum(reflectance, np.float32(MIN_REFLECTANCE))
@@ -262,10 +262,10 @@ class InterreflectionColor:
         """
         if self._weights is None:
             return self._bounce.indirect_irradiance(
-                direct, self._r_d, min_bounce_fraction=self._enough
+                direct, self._r_d, min_bounce_fraction=self._min_bounce_fraction
             )
         each = self._bounce.indirect_irradiance(
-            direct, self._spectrum, min_bounce_fraction=self._enough
+            direct, self._spectrum, min_bounce_fraction=self._min_bounce_fraction
         )
         covered = self._bounce.atlas.covered
         out = np.zeros((*covered.shape, self._weights.shape[1]), np.float32)

@@ -332,7 +332,7 @@ def surface_terms(nl, nv, nh, lh, roughness, oil, fuzz):  # type: ignore[no-unty
     """Return the surface terms of f_r for cosines above zero."""
     total = _facets(nl, nv, nh, lh, roughness, oil)
     if fuzz > 0.0:
-        total += _down(nl, nv, fuzz)
+        total += _vellus_scattering(nl, nv, fuzz)
     return total
 
 
@@ -347,7 +347,7 @@ def coated_terms(  # type: ignore[no-untyped-def]
     if film > 0.0:
         total += film * _fresnel(lh, film_eta) * ggx_brdf(nl, nv, nh, film_alpha)
     if fuzz > 0.0:
-        total += _down(nl, nv, fuzz)
+        total += _vellus_scattering(nl, nv, fuzz)
     if powder > 0.0:
         total = (1.0 - powder) * total + powder * powder_scattering(nl, nv, lh)
     return total
@@ -371,7 +371,7 @@ def _facets(nl, nv, nh, lh, roughness, oil):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def _down(nl, nv, fuzz):  # type: ignore[no-untyped-def]
+def _vellus_scattering(nl, nv, fuzz):  # type: ignore[no-untyped-def]
     # Chandrasekhar's isotropic single scattering of a layer of optical depth tau: w / (4 pi) (1 -
     # exp(-tau (1 / nl + 1 / nv))) / (nl + nv).
     through = 1.0 - math.exp(-fuzz * (1.0 / nl + 1.0 / nv))

@@ -232,9 +232,9 @@ def max_highlight(
         to_light = place - points
         to_light /= np.linalg.norm(to_light, axis=1, keepdims=True)
         between = float(np.einsum("ij,ij->i", to_light, to_camera).min())
-        cosine = math.sqrt(
-            max(0.5 * (1.0 + between), 0.0)
-        )  # half-angle formula: cos^2(x / 2) = (1 + cos x) / 2
+        # The angle of incidence is half the angle between light and camera:
+        # cos^2(x / 2) = (1 + cos x) / 2.
+        cosine = math.sqrt(max(0.5 * (1.0 + between), 0.0))
         inside = math.sqrt(ETA**2 - 1.0 + cosine**2)
         across = ((cosine - inside) / (cosine + inside)) ** 2
         total += 2.0 * across * max_irradiance(mesh, [place], [weight])

@@ -39,7 +39,7 @@ def select_flash_effects(
     view, mesh = scenery.view, scenery.caster.mesh
     made = [face.polarization_effect(rig, view), face.band_effect(view)]
     if isinstance(subject, Target):
-        made += _of_target(subject, scenery)
+        made += _target_effects(subject, scenery)
         if subject.kind not in ("source", "cap"):
             made += [face.lens_effect(scenery, float(white_rgb.max())), *omitted_effects("glare")]
         else:
@@ -61,7 +61,7 @@ def select_flash_effects(
     return EffectSelection((*made, *omitted_effects("flash", "flash_face")))
 
 
-def _of_target(target: Target, scenery: face.ViewingConditions) -> list[Effect]:
+def _target_effects(target: Target, scenery: face.ViewingConditions) -> list[Effect]:
     """Return the effects of flat targets, which have none of depth."""
     size, because = face.target_interreflection_size(scenery)
     return [

@@ -79,7 +79,7 @@ def select_gradient_effects(
             made.append(decide_effect(name, 0.0, None, switch=switch, reason=flat))
         made.append(Effect(face.LATERAL_EFFECT, "absent", f"{subject} is glass, gray or absent"))
         return EffectSelection((*made, *omitted_effects("gradient")))
-    made += _of_skin(subject, sphere, lens, noise, white, effects)
+    made += _skin_effects(subject, sphere, lens, noise, white, effects)
     still = Effect("movement of the patch", "absent", "motion=None", switch="motion")
     if not is_moving:
         return EffectSelection((*made, still, *omitted_effects("gradient", "gradient_skin")))
@@ -102,7 +102,7 @@ def _optics(lens: Lens, asked: bool | None, noise: PixelNoise) -> Effect:
     )
 
 
-def _of_skin(
+def _skin_effects(
     skin: MicroSkin,
     sphere: ActualSphere,
     lens: Lens,

@@ -244,9 +244,8 @@ def visibility(
     other = np.cross(axis, side)
     start = points[index] + np.float32(RAY_OFFSET_MM) * normals[index]
     golden = np.pi * (3.0 - np.sqrt(5.0))
-    turn = (
-        (index * 0.754877666) % 1.0 * 2.0 * np.pi
-    )  # inverse of the plastic number, a low-discrepancy sequence
+    # Multiples of the inverse plastic number modulo 1 are a low-discrepancy sequence.
+    turn = (index * 0.754877666) % 1.0 * 2.0 * np.pi
     for k in range(samples):
         r = radius_mm * np.sqrt((k + 0.5) / samples) if samples > 1 else 0.0
         angle = turn + k * golden

@@ -123,7 +123,7 @@ def displacement_mm(mesh: Mesh, state: str, *, amount: float = 1.0, seed: int = 
         return total.astype(np.float32)
     points = to_mean_head(mesh.vertices_mm, mesh).astype(np.float64)
     scale = mean_head_scale(mesh)
-    sides = _sides(seed)
+    sides = _side_strengths(seed)
     for action, strength in EXPRESSION_STRENGTHS[state].items():
         left, right = (amount * strength * side for side in sides[action])
         own = _own_shapes(mesh.shapes, action, left, right)
@@ -161,7 +161,7 @@ def displace_mesh(mesh: Mesh, deltas_mm: Float32Array) -> Mesh:
     return build_mesh(vertices, mesh.faces, mesh.uv, normals)
 
 
-def _sides(seed: int) -> dict[str, tuple[float, float]]:
+def _side_strengths(seed: int) -> dict[str, tuple[float, float]]:
     """Return a person's strength in each action, on the image's left and right."""
     rng = np.random.default_rng([seed, 21])
     own = rng.uniform(*STRENGTH_RANGE, len(ACTION_NAMES))

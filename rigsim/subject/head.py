@@ -86,7 +86,7 @@ def build_head(rng: np.random.Generator, *, columns: int = 168, rows: int = 178)
     u = np.linspace(0.0, 1.0, columns + 1)
     v = np.linspace(0.0, 1.0, rows + 1)
     start, way = _rays(u[None, :], v[:, None])
-    points, normals = _meet(start.reshape(-1, 3), way.reshape(-1, 3), *model)
+    points, normals = _march_rays(start.reshape(-1, 3), way.reshape(-1, 3), *model)
     uv = np.stack(np.broadcast_arrays(u[None, :], v[:, None]), axis=-1)
     at = np.arange((rows + 1) * (columns + 1)).reshape(rows + 1, columns + 1)
     a, b, c, d = at[:-1, :-1], at[:-1, 1:], at[1:, :-1], at[1:, 1:]
@@ -325,7 +325,7 @@ def _distance(x, y, z, solids, parts, segments, grooves):  # type: ignore[no-unt
 
 
 @njit(parallel=True, cache=True)
-def _meet(start, way, solids, parts, segments, grooves):  # type: ignore[no-untyped-def]
+def _march_rays(start, way, solids, parts, segments, grooves):  # type: ignore[no-untyped-def]
     """March each ray inwards to the outermost surface point; return points and normals."""
     points, normals = np.empty_like(start), np.empty_like(start)
     step = 0.1

@@ -172,7 +172,7 @@ class SimulatedSubject:
         SubjectError
             The offset is not three finite numbers.
         """
-        x, y, z = _three(offset_mm)
+        x, y, z = _validate_offset(offset_mm)
         if (x, y, z) == (0.0, 0.0, 0.0):
             return self
         rest = self if self.rest is None else self.rest
@@ -223,7 +223,7 @@ class SimulatedSubject:
         return landmarks.find_landmarks(self.mesh if self.rest is None else self.rest.mesh)
 
 
-def _three(offset_mm: tuple[float, float, float]) -> tuple[float, float, float]:
+def _validate_offset(offset_mm: tuple[float, float, float]) -> tuple[float, float, float]:
     given = np.asarray(offset_mm, np.float64)
     if given.shape != (3,) or not np.isfinite(given).all():
         raise SubjectError(f"offset_mm: got {offset_mm!r}, expected three finite numbers")

@@ -158,12 +158,12 @@ class TcpEndpoint(BoxEndpoint):
         self._readable()  # detects a client that was killed
         if self._client is not None:
             log.warning("%s: refused %s, another host is connected", self.address, peer)
-            self._see_out(client)
+            self._close_gracefully(client)
             return
         try:
             self._attach()
         except LinkUnplugged:
-            self._see_out(client)
+            self._close_gracefully(client)
             return
         client.setblocking(False)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -181,7 +181,7 @@ class TcpEndpoint(BoxEndpoint):
         except BlockingIOError:
             return
         except (OSError, LinkUnplugged):
-            self._hang_up()
+            self._disconnect()
 
     def pump(self) -> None:
         """Pass on the controller's output."""
@@ -195,17 +195,17 @@ class TcpEndpoint(BoxEndpoint):
         except BlockingIOError:
             return
         except (OSError, LinkUnplugged):
-            self._hang_up()
+            self._disconnect()
 
-    def _hang_up(self) -> None:
+    def _disconnect(self) -> None:
         client, self._client = self._client, None
         if client is not None:
             self._selector.unregister(client)
-            self._see_out(client)
+            self._close_gracefully(client)
             self._unwritten = b""
             self._forget()
 
-    def _see_out(self, client: socket.socket) -> None:
+    def _close_gracefully(self, client: socket.socket) -> None:
         """Shut a connection down and wait for the client's own end: closing at once is a reset."""
 
         def drain() -> None:
@@ -230,7 +230,7 @@ class TcpEndpoint(BoxEndpoint):
 
     def stop(self) -> None:
         """Stop serving; a second call is allowed."""
-        self._hang_up()
+        self._disconnect()
         for client in self._leaving:
             client.close()
         self._listener.close()

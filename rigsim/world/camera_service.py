@@ -110,17 +110,13 @@ class CameraService:
                 fault = f"version: got {got!r}, expected {expected}"
             elif name not in self.addresses:
                 fault = f"view: got {name!r}, expected one of {', '.join(self.addresses)}"
-            elif current is not None or (holder is not None and not _hung_up(holder)):
-                fault, error = (
-                    f"view {name!r}: another program has this camera; close it there",
-                    "CameraBusy",
-                )
+            elif current is not None or (holder is not None and not _is_disconnected(holder)):
+                fault = f"view {name!r}: another program has this camera; close it there"
+                error = "CameraBusy"
             elif self.world.camera(name).is_exposing:
                 # a camera armed now would miss its trigger
-                fault, error = (
-                    f"view {name!r}: still reading out a frame; retry later",
-                    "CameraBusy",
-                )
+                fault = f"view {name!r}: still reading out a frame; retry later"
+                error = "CameraBusy"
             else:
                 # a client that died while its frame was pending loses the camera at once
                 self._holders[name] = connection
@@ -143,14 +139,14 @@ class CameraService:
             with self._lock:
                 if self._holders.get(view) is not connection:
                     raise ConnectionResetError("the camera has gone to another client")
-            fields, blob = self._do(connection, self.world.camera(view), request)
+            fields, blob = self._run_command(connection, self.world.camera(view), request)
         except (CameraError, KeyError, TypeError, ValueError) as exc:
             kind = "FrameTimeout" if isinstance(exc, FrameTimeout) else "CameraError"
             _send(connection, request, ok=False, error=kind, text=str(exc))
         else:
             _send(connection, request, blob=blob, ok=True, **fields)
 
-    def _do(
+    def _run_command(
         self, connection: socket.socket, camera: CameraBody, request: Mapping[str, Any]
     ) -> tuple[dict[str, Any], bytes | None]:
         match request.get("do"):
@@ -184,7 +180,9 @@ class CameraService:
         while True:
             left_s = max(0.0, until - time.monotonic())
             with self._waits[body.view.name]:
-                if self._holders.get(body.view.name) is not connection or _hung_up(connection):
+                if self._holders.get(body.view.name) is not connection or _is_disconnected(
+                    connection
+                ):
                     raise ConnectionResetError("the client is gone")
                 with contextlib.suppress(FrameTimeout):
                     return body.next_shot(min(left_s, CLIENT_POLL_S))
@@ -192,7 +190,7 @@ class CameraService:
                 raise FrameTimeout(f"camera {body.view.serial}: no frame in {timeout_s:g} s")
 
 
-def _hung_up(connection: socket.socket) -> bool:
+def _is_disconnected(connection: socket.socket) -> bool:
     """Return whether the peer has closed a connection."""
     try:
         return not connection.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)

@@ -95,7 +95,7 @@ class Link:
         if self._stall_end(now) > now and waiting + len(data) > STALL_BUFFER_BYTES:
             raise LinkStalled
         for line in data.splitlines(keepends=True):
-            for copy in self._mangled(line):
+            for copy in self._apply_faults(line):
                 self._box_free = max(now, self._box_free) + len(copy) * self._byte_s
                 self._to_box.append((self._box_free + self._faults.latency, copy))
 
@@ -132,7 +132,7 @@ class Link:
         while self._to_box and self._to_box[0][0] <= now and self._stall_end(now) <= now:
             _, data = self._to_box.popleft()
             self._record(now, ">", data)
-            if self._strikes(self._faults.brownout):
+            if self._occurs(self._faults.brownout):
                 self.box.power_cycle(now, boot_s=self._faults.boot_s, announce=False)
             self._answer(self.box.feed(data, now), now)
         while self._to_host and self._to_host[0][0] <= now:
@@ -142,13 +142,13 @@ class Link:
 
     def _answer(self, data: bytes, now: float) -> None:
         for line in data.splitlines(keepends=True):
-            if not self.attached or self._strikes(self._faults.lose_answer):
+            if not self.attached or self._occurs(self._faults.lose_answer):
                 continue
-            output = [BOOT_BANNER] if self._strikes(self._faults.babble) else []
+            output = [BOOT_BANNER] if self._occurs(self._faults.babble) else []
             delay_s = self._faults.latency
-            if self._strikes(self._faults.late):
+            if self._occurs(self._faults.late):
                 delay_s += self._faults.late_s
-            for copy in [*output, *self._mangled(line)]:
+            for copy in [*output, *self._apply_faults(line)]:
                 start = max(now + delay_s, self._host_free)
                 self._host_free = start + len(copy) * self._byte_s
                 self._to_host.append((self._host_free, copy))
@@ -159,19 +159,19 @@ class Link:
 
     # faults on bytes --------------------------------------------------------------------
 
-    def _strikes(self, probability: float) -> bool:
+    def _occurs(self, probability: float) -> bool:
         return probability > 0.0 and bool(self._rng.random() < probability)
 
-    def _mangled(self, line: bytes) -> list[bytes]:
+    def _apply_faults(self, line: bytes) -> list[bytes]:
         faults = self._faults
-        copies = 1 + self._strikes(faults.duplicate)
-        return [damaged for _ in range(copies) if (damaged := self._damaged(line))]
+        copies = 1 + self._occurs(faults.duplicate)
+        return [damaged for _ in range(copies) if (damaged := self._corrupt(line))]
 
-    def _damaged(self, line: bytes) -> bytes:
+    def _corrupt(self, line: bytes) -> bytes:
         faults = self._faults
-        if self._strikes(faults.glue):
+        if self._occurs(faults.glue):
             line = line.removesuffix(b"\n")
-        if self._strikes(faults.cut):
+        if self._occurs(faults.cut):
             line = line[: int(self._rng.integers(0, len(line) + 1))]
         if not (faults.drop or faults.flip):
             return line

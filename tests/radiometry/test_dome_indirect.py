@@ -49,7 +49,7 @@ def matt_image(
         Of Mitsuba.
     """
     subject = dome_reference._face(scene)
-    description = dome_reference._look(view) | {
+    description = dome_reference._camera_and_light(view) | {
         "integrator": {"type": "path", "max_depth": depth, "rr_depth": depth + 1},
         "face": {
             "type": "mesh",

@@ -204,13 +204,13 @@ def describe_dome(
 ) -> dict[str, Any]:
     """Return Mitsuba's scene of a face in the dome, lit by a point of intensity 1 per steradian."""
     subject = _face(scene)
-    return _look(view, sampler) | {
+    return _camera_and_light(view, sampler) | {
         "integrator": _INTEGRATOR_SETTINGS[integrator],
         "face": {"type": "mesh", "mesh": subject.mesh, "bsdf": _skin(scene.surface(view), subject)},
     }
 
 
-def _look(view: View, sampler: str = "independent") -> dict[str, Any]:
+def _camera_and_light(view: View, sampler: str = "independent") -> dict[str, Any]:
     """Return a scene with a camera and a point of intensity 1 per steradian."""
     return {
         "type": "scene",

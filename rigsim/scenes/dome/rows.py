@@ -95,7 +95,7 @@ class DomeRows:
             Returns the face's reflection for a camera's colors with its normals, (N, N, C); not
             called for a target.
         """
-        return self._hits.get((view.name, t_s), lambda: self._look(view, t_s, texture))
+        return self._hits.get((view.name, t_s), lambda: self._trace_rows(view, t_s, texture))
 
     def vectorized_shader(
         self, view: View, t_s: float, hits: Hits, caster: Caster
@@ -106,7 +106,7 @@ class DomeRows:
     def _pose(self, t_s: float) -> tuple[Float64Array, Float64Array]:
         return (np.eye(3), np.zeros(3)) if self._motion is None else self._motion.pose(t_s)
 
-    def _look(
+    def _trace_rows(
         self, view: View, t_s: float, texture_of: Callable[[str], Float32Array]
     ) -> tuple[Hits, Caster]:
         rotation, shift = self._pose(t_s)

@@ -170,7 +170,7 @@ class FlashScene(FaceScene):
         if isinstance(self.subject, Target) and self.subject.kind == "source":
             level = np.float32(FLAT_FIELD_LEVEL / METERING_LEVEL) * white
             return np.broadcast_to(level, shape).copy()
-        picture = self._picture(view)
+        picture = self._flash_image(view)
         diffuse = self._apply_analyzer(np.moveaxis(picture.diffuse, 2, 3), view, passes_deg)
         specular = self._apply_analyzer(picture.specular, view, passes_deg)
         return np.maximum((diffuse + specular[..., None]) * white, 0.0)
@@ -249,7 +249,7 @@ class FlashScene(FaceScene):
         """
         self._face()
         view = self._camera(view_name)
-        picture = self._picture(view)
+        picture = self._flash_image(view)
         passes_deg = self.films.analyzer_axis_deg(view, "crossed", None)
         truth = flash_truth.truth_maps(
             picture,
@@ -352,12 +352,14 @@ class FlashScene(FaceScene):
     def _blurred_maps(self, view: View) -> Mapping[str, Float32Array]:
         """Return the maps that are blurred like the light; only the ground truth requires them."""
         if not self.lateral:
-            return flash_truth.unblurred_maps(self._picture(view))
+            return flash_truth.unblurred_maps(self._flash_image(view))
         look = FlashCamera(self.rig, view, self.films, self._weights, self.subpixels)
-        return look.observe_maps(self._stage.caster, self._face(), self._spread(view)).maps
+        return look.observe_maps(
+            self._stage.caster, self._face(), self._blurred_textures(view)
+        ).maps
 
     @cached_method
-    def _spread(self, view: View) -> Mapping[str, Float32Array]:
+    def _blurred_textures(self, view: View) -> Mapping[str, Float32Array]:
         """Return the textures of those maps, of the moved face."""
         look = FlashCamera(self.rig, view, self.films, self._weights, self.subpixels)
         glow = self._skin_glow(view.spectral_sensitivity)
@@ -371,11 +373,11 @@ class FlashScene(FaceScene):
         if rest is None:
             return flash_truth.rest_maps_of_unmoved_face(moved)
         caster = shared_flash_geometry(rest, self._choice).caster
-        spread = self._spread(view) if self.lateral else None
-        look = self._look(view, rest.mesh)
+        spread = self._blurred_textures(view) if self.lateral else None
+        look = self._flash_camera(view, rest.mesh)
         return flash_truth.truth_maps_at_rest(look, caster, rest, self.state, spread)
 
-    def _look(self, view: View, mesh: Mesh) -> FlashCamera:
+    def _flash_camera(self, view: View, mesh: Mesh) -> FlashCamera:
         spread = None
         if self.optics:
             depths = depth_range(view, mesh)
@@ -385,8 +387,8 @@ class FlashScene(FaceScene):
         return FlashCamera(self.rig, view, self.films, self._weights, self.subpixels, spread)
 
     @cached_method
-    def _picture(self, view: View) -> FlashImage:
-        look, subject = self._look(view, self.subject.mesh), self.subject
+    def _flash_image(self, view: View) -> FlashImage:
+        look, subject = self._flash_camera(view, self.subject.mesh), self.subject
         if isinstance(subject, SimulatedSubject):
             glow = self._skin_glow(view.spectral_sensitivity)
             return look.observe_face(self._caster, subject, self.state, glow)

@@ -184,7 +184,7 @@ class GradientScene(RigScene):
             level 1 (an analyzer transmits half of it, see `moments`); without drift.
         """
         h, w = self._view.height_px, self._view.width_px
-        wide = self._picture(grip)
+        wide = self._bordered_image(grip)
         border = (wide.shape[1] - h) // 2
         return wide[:, border : border + h, border : border + w].reshape(4, 3, h, w)
 
@@ -244,7 +244,7 @@ class GradientScene(RigScene):
         jump, drift = (0.0, 0.0), (0.0, 0.0)
         if self.motion is not None and t_s is not None and isinstance(self.subject, MicroSkin):
             jump, drift = self.motion.jump_mm(t_s), self.motion.drift_mm(t_s)
-        wide = self._picture(grip, jump_mm=jump, shares=led_shares)
+        wide = self._bordered_image(grip, jump_mm=jump, shares=led_shares)
         border = (wide.shape[1] - shape[0]) // 2
         reach = border if any(drift) else 0
         part = slice(border - reach, wide.shape[1] - border + reach)
@@ -352,7 +352,7 @@ class GradientScene(RigScene):
             raise SceneError(f"skin: got the target {self.subject!r}, expected a patch of skin")
         return self.subject
 
-    def _picture(
+    def _bordered_image(
         self,
         grip: GripState | None,
         *,
